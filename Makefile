@@ -1,0 +1,44 @@
+# Every target does its own set-up: `make test` on a fresh clone is enough.
+
+PYTHON ?= python3
+VENV := .venv
+BIN := $(VENV)/bin
+READY := $(VENV)/.ready
+
+# Other targets' arguments: make test PYTEST='-k gate', make demo DEMO='--out runs/other'
+PYTEST ?=
+DEMO ?=
+
+# One torch thread a worker: small tensors gain nothing by more, and two workers fill two cores.
+WORKERS ?= 2
+
+.PHONY: demo test lint format env clean
+
+demo: $(READY)
+	$(BIN)/leco demo $(DEMO)
+
+test: $(READY)
+	OMP_NUM_THREADS=1 $(BIN)/python -m pytest --numprocesses $(WORKERS) --dist loadgroup $(PYTEST)
+
+lint: $(READY)
+	$(BIN)/ruff format --check .
+	$(BIN)/ruff check .
+	$(BIN)/mypy
+
+format: $(READY)
+	$(BIN)/ruff format .
+	$(BIN)/ruff check --fix .
+
+env: $(READY)
+
+# Entry points and requirements stand in pyproject.toml, so the installation is as old as it is.
+$(READY): pyproject.toml
+	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 10))' || \
+		{ echo "leco_plugin needs Python 3.10 or newer; try: make PYTHON=python3.11" >&2; exit 2; }
+	@test -x $(BIN)/python || $(PYTHON) -m venv $(VENV) || \
+		{ echo "no virtual environment can be made; on Debian: apt-get install python3-venv" >&2; exit 2; }
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[dev]'
+	@touch $@
+
+clean:
+	rm -rf $(VENV)

@@ -1,0 +1,83 @@
+"""Builds a nerfstudio model without a network: its LPIPS is loaded at first use, if at all.
+
+Every built-in method makes LPIPS in `populate_modules`, and LPIPS fetches its AlexNet then.
+"""
+
+from __future__ import annotations
+
+import functools
+import math
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import TYPE_CHECKING, Any
+
+import torch
+from torch import Tensor, nn
+
+from leco_plugin.evaluation.metrics import LPIPS_MINIMUM_SIDE, LpipsBackbone, lpips_metric
+
+if TYPE_CHECKING:
+    from nerfstudio.models.base_model import Model, ModelConfig
+
+
+class LazyLpipsNetwork(nn.Module):
+    """Stands where torchmetrics keeps its LPIPS network, and loads that network when it is called.
+
+    It holds no parameters, so that a checkpoint is the same whether or not LPIPS was ever computed.
+    """
+
+    def __init__(self, net: LpipsBackbone = "alex", **_: Any) -> None:
+        super().__init__()
+        self.backbone: LpipsBackbone = net
+
+    def forward(self, first: Tensor, second: Tensor, **options: Any) -> Tensor:
+        """[N, 1, 1, 1] distances of two [N, 3, H, W] batches; NaN where LPIPS cannot be had."""
+        metric = (
+            lpips_metric(self.backbone) if min(first.shape[-2:]) >= LPIPS_MINIMUM_SIDE else None
+        )
+        if metric is None:
+            return first.new_full((len(first), 1, 1, 1), math.nan)
+        return metric.to(first.device).net(first, second, **options)
+
+
+@contextmanager
+def lazy_lpips() -> Iterator[None]:
+    """While this lasts, every `LearnedPerceptualImagePatchSimilarity` that is made loads lazily.
+
+    The network's class is exchanged rather than the metric's, so that it also reaches a host that
+    imported the metric long before.
+    """
+    from torchmetrics.image import lpip
+
+    eager_network = lpip._NoTrainLpips
+    lpip._NoTrainLpips = LazyLpipsNetwork  # type: ignore[assignment, misc]
+    try:
+        yield
+    finally:
+        lpip._NoTrainLpips = eager_network  # type: ignore[misc]
+
+
+def setup_with_lazy_lpips(config: ModelConfig, **arguments: Any) -> Model:
+    """`config.setup(**arguments)` for a model that builds LPIPS, without a network.
+
+    The model's `get_image_metrics_and_images` then leaves an LPIPS out that could not be computed:
+    ns-eval would write its NaN, which is no JSON.
+    """
+    with lazy_lpips():
+        model: Model = config.setup(**arguments)
+    with_every_metric = model.get_image_metrics_and_images
+
+    @functools.wraps(with_every_metric)
+    def get_image_metrics_and_images(
+        outputs: dict[str, Tensor], batch: dict[str, Tensor]
+    ) -> tuple[dict[str, float], dict[str, Tensor]]:
+        metrics, images = with_every_metric(outputs, batch)
+        kept = {
+            name: value
+            for name, value in metrics.items()
+            if "lpips" not in name or bool(torch.isfinite(torch.as_tensor(value)))
+        }
+        return kept, images
+
+    model.get_image_metrics_and_images = get_image_metrics_and_images  # type: ignore[method-assign]
+    return model

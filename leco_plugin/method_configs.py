@@ -1,0 +1,95 @@
+"""The methods that `ns-train` finds. Imported whenever any ns-* command starts, so it stays light."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import torch
+from nerfstudio.configs.base_config import MachineConfig, ViewerConfig
+from nerfstudio.data.datamanagers.base_datamanager import VanillaDataManagerConfig
+from nerfstudio.engine.schedulers import ExponentialDecaySchedulerConfig
+from nerfstudio.engine.trainer import TrainerConfig
+from nerfstudio.pipelines.base_pipeline import VanillaPipelineConfig
+from nerfstudio.plugins.types import MethodSpecification
+
+from leco_plugin.compat.atomic_trainer import AtomicTrainer
+from leco_plugin.models.leco import LecoModelConfig
+from leco_plugin.models.optimizers import FusedAdamConfig
+from leco_plugin.models.phases import ScheduleConfig
+from leco_plugin.models.sizes import PAPER, sizes_for
+from leco_plugin.scenes.held_out_pixels import HeldOutPixelSamplerConfig
+from leco_plugin.scenes.photographs import LecoPhotographsDataParserConfig
+
+
+def best_device() -> str:
+    """`cuda` where there is one, else `cpu`: nobody should need a flag for that."""
+    return "cuda" if torch.cuda.is_available() else "cpu"
+
+
+def _optimizers(steps: int, table_lr: float, lr: float, gate_lr: float) -> dict[str, object]:
+    """Adam for each parameter group, decayed to a tenth over the run."""
+    return {
+        name: {
+            "optimizer": FusedAdamConfig(lr=rate),
+            "scheduler": ExponentialDecaySchedulerConfig(lr_final=rate / 10.0, max_steps=steps),
+        }
+        for name, rate in (("encoding", table_lr), ("field", lr), ("gate", gate_lr))
+    }
+
+
+ON_GPU = best_device() == "cuda"
+STEPS = 30_000 if ON_GPU else 4_000
+
+_leco_occupancy = TrainerConfig(
+    _target=AtomicTrainer,
+    method_name="leco-occupancy",
+    machine=MachineConfig(device_type=best_device()),
+    max_num_iterations=STEPS,
+    steps_per_save=500,
+    steps_per_eval_batch=0,
+    steps_per_eval_image=500,
+    steps_per_eval_all_images=0,
+    mixed_precision=False,  # the model chooses its precision itself, on CPU and CUDA alike
+    pipeline=VanillaPipelineConfig(
+        datamanager=VanillaDataManagerConfig(
+            dataparser=LecoPhotographsDataParserConfig(),
+            train_num_rays_per_batch=4096 if ON_GPU else 512,
+            eval_num_rays_per_batch=1024,
+            pixel_sampler=HeldOutPixelSamplerConfig(),
+        ),
+        model=LecoModelConfig(
+            sizes=sizes_for(best_device()),
+            schedule=ScheduleConfig(learn_steps=2_000 if ON_GPU else 400),
+            eval_num_rays_per_chunk=1 << 15 if ON_GPU else 1 << 12,
+        ),
+    ),
+    optimizers=_optimizers(STEPS, 1e-2, 5e-3, 3e-3),
+    viewer=ViewerConfig(num_rays_per_chunk=1 << 12, quit_on_train_completion=True),
+    vis="viewer+tensorboard",
+)
+
+leco_occupancy = MethodSpecification(
+    config=_leco_occupancy,
+    description="Learned occupancy: learn it, freeze and calibrate it, go on guided by it.",
+)
+
+leco_occupancy_paper = MethodSpecification(
+    config=replace(
+        _leco_occupancy,
+        method_name="leco-occupancy-paper",
+        max_num_iterations=540_000,
+        pipeline=replace(
+            _leco_occupancy.pipeline,
+            datamanager=replace(
+                _leco_occupancy.pipeline.datamanager, train_num_rays_per_batch=1024
+            ),
+            model=replace(
+                _leco_occupancy.pipeline.model,
+                sizes=PAPER,
+                schedule=ScheduleConfig(learn_steps=40_000, steps_per_check=500),
+            ),
+        ),
+        optimizers=_optimizers(540_000, 5e-4, 5e-4, 5e-4),
+    ),
+    description="The same with the sizes of the paper: 8 experts of 7 x 256, 257 samples.",
+)

@@ -1,0 +1,156 @@
+"""The threshold: the largest one whose price, measured on held-out rays, is within its bounds.
+
+A dense rendering is the reference. Skipping every sample with o(x) < tau loses weight near surfaces
+(lost surface mass) and changes the image (image price); both are measured, not hoped for.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from leco_plugin.models.rendering import Intervals, Shaded
+from leco_plugin.samplers.packed import accumulate_along_rays, inclusive_sum
+
+THRESHOLDS = tuple(0.75 * 0.8**i for i in range(32))
+"""Tried from the largest down, to 0.0007; below that a gate that fails is kept out of use (0)."""
+
+SURFACE_STEPS = 2.0
+"""Weight within this many steps of a ray's median depth counts as surface, the rest as haze."""
+
+
+@dataclass(frozen=True)
+class CalibrationConfig:
+    """What skipping may cost."""
+
+    lost_surface_mass: float = 5e-4
+    """Largest share of the weight near surfaces that may fall on skipped samples."""
+    image_price_db: float = 0.03
+    """Largest loss of PSNR on the calibration rays, in dB."""
+    rays: int = 4096
+    """Held-out training rays to measure with."""
+    rays_at_once: int = 1024
+    """Rays rendered at a time."""
+
+
+class Measured(NamedTuple):
+    """What a threshold does, on one set of rays."""
+
+    threshold: float
+    lost_surface_mass: float
+    lost_mass: float
+    image_price_db: float
+    empty_fraction: float
+    """Share of all candidates between near and far that are skipped."""
+
+    def within(self, config: CalibrationConfig) -> bool:
+        """Whether both prices are within their bounds."""
+        return (
+            self.lost_surface_mass <= config.lost_surface_mass
+            and self.image_price_db <= config.image_price_db
+        )
+
+
+class Reference(NamedTuple):
+    """A dense rendering of some rays, and what the gate says about its samples."""
+
+    intervals: Intervals
+    weights: Tensor
+    """[M] rendering weights."""
+    occupancies: Tensor
+    """[M] o(x)."""
+    near_surface: Tensor
+    """[M] bool: within `SURFACE_STEPS` steps of the ray's median depth."""
+    rgb: Tensor
+    """[R, 3] rendered."""
+
+
+def near_median_depth(shaded: Shaded, intervals: Intervals) -> Tensor:
+    """Which samples lie within `SURFACE_STEPS` steps of the depth that halves their ray's weight.
+
+    Returns:
+        [M] bool.
+    """
+    num_rays = len(shaded.packed_info)
+    below_half = (
+        inclusive_sum(shaded.weights, packed_info=shaded.packed_info)
+        < 0.5 * shaded.accumulation[intervals.ray_indices]
+    )
+    ahead = accumulate_along_rays(
+        below_half.float(), None, intervals.ray_indices, num_rays
+    )[:, 0].long()
+    starts, counts = shaded.packed_info.unbind(dim=-1)
+    median = starts + torch.minimum(ahead, (counts - 1).clamp(min=0))
+    median = median.clamp(max=max(len(shaded.weights) - 1, 0))[intervals.ray_indices]
+    middles = 0.5 * (intervals.t_starts + intervals.t_ends)
+    steps = (intervals.t_ends - intervals.t_starts)[median]
+    return (middles - middles[median]).abs() <= SURFACE_STEPS * steps * 1.001
+
+
+def measure(
+    references: list[Reference],
+    truths: list[Tensor],
+    render_kept: Callable[[int, Tensor], Tensor],
+    threshold: float,
+    with_image: bool = True,
+) -> Measured:
+    """What skipping below `threshold` costs and saves.
+
+    Args:
+        references: dense renderings of chunks of rays.
+        truths: their true pixels, [R, 3] each.
+        render_kept: renders chunk i with only the samples of a mask [M]: returns [R, 3].
+        with_image: whether to render at all; the image price is NaN otherwise.
+    """
+    surface = lost_surface = total = lost = dense_error = gated_error = 0.0
+    skipped = candidates = pixels = 0
+    for i, (reference, truth) in enumerate(zip(references, truths)):
+        gone = reference.occupancies < threshold
+        on_surface = reference.weights * reference.near_surface
+        surface += float(on_surface.sum(dtype=torch.float64))
+        lost_surface += float(on_surface[gone].sum(dtype=torch.float64))
+        total += float(reference.weights.sum(dtype=torch.float64))
+        lost += float(reference.weights[gone].sum(dtype=torch.float64))
+        skipped, candidates = skipped + int(gone.sum()), candidates + len(gone)
+        if with_image:
+            gated = render_kept(i, ~gone)
+            dense_error += float(((reference.rgb - truth) ** 2).sum(dtype=torch.float64))
+            gated_error += float(((gated - truth) ** 2).sum(dtype=torch.float64))
+            pixels += truth.numel()
+    price = float("nan")
+    if with_image and pixels:
+        floor = 1e-10 * pixels  # 100 dB: below it both renderings are exact
+        ratio = torch.tensor((gated_error + floor) / (dense_error + floor))
+        price = 10.0 * float(torch.log10(ratio))
+    return Measured(
+        threshold,
+        lost_surface / max(surface, 1e-12),
+        lost / max(total, 1e-12),
+        price,
+        skipped / max(candidates, 1),
+    )
+
+
+def calibrate(
+    references: list[Reference],
+    truths: list[Tensor],
+    render_kept: Callable[[int, Tensor], Tensor],
+    config: CalibrationConfig,
+) -> Measured:
+    """The largest threshold of `THRESHOLDS` within the bounds, with what it costs.
+
+    Arguments as for `measure`. When none is within them, the threshold is 0: everything is kept,
+    which is slow and never wrong.
+    """
+    for threshold in THRESHOLDS:
+        cheap = measure(references, truths, render_kept, threshold, with_image=False)
+        if cheap.lost_surface_mass > config.lost_surface_mass:
+            continue
+        measured = measure(references, truths, render_kept, threshold)
+        if measured.within(config):
+            return measured
+    return measure(references, truths, render_kept, 0.0)

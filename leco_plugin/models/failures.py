@@ -1,0 +1,36 @@
+"""Names the likely cause when a loss is not finite."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import torch
+from torch import Tensor
+
+if TYPE_CHECKING:
+    from leco_plugin.models.leco import LecoModel
+
+
+def explain_non_finite(name: str, model: LecoModel, outputs: dict[str, Any], image: Tensor) -> str:
+    """One line: which loss, and the first thing on its way that was not finite."""
+    suspects: list[tuple[str, Tensor]] = [
+        ("the training image holds values that are not finite", image),
+        ("a ray is not finite: check the camera poses", outputs["rays"].directions),
+        ("a ray is not finite: check the camera poses", outputs["rays"].origins),
+    ]
+    suspects += [
+        (f"parameter {key} is not finite: the learning rate is probably too high", value)
+        for key, value in model.named_parameters()
+        if value.numel()
+    ]
+    shaded = outputs["shaded"]
+    suspects += [
+        ("the gate's logits overflowed", shaded.logits),
+        ("a density overflowed: the learning rate is probably too high", shaded.sigmas),
+        ("a colour overflowed", shaded.rgb),
+    ]
+    cause = next(
+        (text for text, value in suspects if not bool(torch.isfinite(value).all())),
+        "all inputs and parameters are finite; the loss itself overflowed",
+    )
+    return f"{name} is not finite: {cause}. The step was not taken; the last checkpoint is good."

@@ -1,0 +1,134 @@
+"""The moment of freezing: calibrate on held-out rays, fix the threshold, write the occupancy file."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import torch
+from nerfstudio.utils.rich_utils import CONSOLE
+from torch import Tensor
+
+from leco_plugin.models.calibration import (
+    Measured,
+    Reference,
+    calibrate,
+    near_median_depth,
+)
+from leco_plugin.models.gate import occupancy_from_logits
+from leco_plugin.models.rendering import Intervals, Rays
+from leco_plugin.scenes.held_out_pixels import HeldOutPixelSampler
+from leco_plugin.scenes.survey import Survey
+
+if TYPE_CHECKING:
+    from leco_plugin.models.leco import LecoModel
+
+FILE_NAME = "occupancy.safetensors"
+
+
+@torch.no_grad()
+def freeze(
+    model: LecoModel,
+    datamanager: Any,
+    survey: Survey,
+    folder: Path | None,
+    step: int,
+    learn_seconds: float,
+) -> Measured:
+    """Calibrates the gate, freezes it, and leaves `occupancy.safetensors` in the run's folder."""
+    rays, truth = calibration_rays(model, datamanager)
+    measured = calibrate_on(model, rays, truth)
+    model.threshold.fill_(measured.threshold)
+    model.frozen.fill_(True)
+    model.gate.requires_grad_(False)
+    model.report = {
+        "step": step,
+        "train_seconds": round(learn_seconds, 2),
+        "params": sum(p.numel() for p in model.gate.parameters()),
+        "threshold": measured.threshold,
+        "lost_surface_mass": measured.lost_surface_mass,
+        "lost_mass": measured.lost_mass,
+        "image_price_db": measured.image_price_db,
+        "empty_fraction": measured.empty_fraction,
+        "calibration_rays": len(truth),
+        "held_out": held_out_sampler(datamanager) is not None,
+        "bounds": survey.bounds.reason,
+        "near": float(model.march_range[0]),
+        "far": float(model.march_range[1]),
+        "step_size": float(model.march_range[2]),
+        "cone_angle": float(model.march_range[4]),
+        "aabb": model.aabb.tolist(),
+    }
+    CONSOLE.log(
+        f"[leco] occupancy learned in {learn_seconds:.0f} s: threshold {measured.threshold:.4f} "
+        f"skips {measured.empty_fraction:.1%} of all candidates for {measured.image_price_db:+.3f} "
+        f"dB and {measured.lost_surface_mass:.2e} of the surface mass ({measured.lost_mass:.2e} of all)"
+    )
+    if measured.threshold == 0.0:
+        CONSOLE.log(
+            "[leco] no threshold keeps the price within its bounds, so nothing is skipped; more "
+            "--pipeline.model.schedule.learn-steps usually help"
+        )
+    if folder is not None:
+        folder.mkdir(parents=True, exist_ok=True)
+        model.occupancy().save(folder / FILE_NAME)
+        CONSOLE.log(f"[leco] wrote {folder / FILE_NAME}")
+    return measured
+
+
+def held_out_sampler(datamanager: Any) -> HeldOutPixelSampler | None:
+    """The data manager's pixel sampler, if it keeps pixels back for calibration."""
+    sampler = getattr(datamanager, "train_pixel_sampler", None)
+    return sampler if isinstance(sampler, HeldOutPixelSampler) else None
+
+
+def calibration_rays(model: LecoModel, datamanager: Any) -> tuple[Rays, Tensor]:
+    """Rays of held-out training pixels, cut to the bounds, and their true colours [R, 3 or 4].
+
+    A data manager without held-out pixels gives ordinary training rays; the report says so.
+    """
+    sampler = held_out_sampler(datamanager)
+    count = model.config.calibration.rays
+    if sampler is not None:
+        images = next(datamanager.iter_train_image_dataloader)
+        batch = sampler.sample_held_out(images, count, seed=0)
+        bundle = datamanager.train_ray_generator(batch["indices"])
+    else:
+        bundle, batch = datamanager.next_train(0)
+    rays = model.rays_of(bundle.to(model.device))
+    return rays, batch["image"].to(model.device).float()
+
+
+@torch.no_grad()
+def calibrate_on(model: LecoModel, rays: Rays, truth: Tensor) -> Measured:
+    """Finds the threshold of a model's gate on given rays; the model is left as it was."""
+    config = model.config.calibration
+    was_training = model.training
+    model.eval()
+    chunks = [
+        Rays(*(None if part is None else part[i : i + config.rays_at_once] for part in rays))
+        for i in range(0, len(truth), config.rays_at_once)
+    ]
+    references = [dense_reference(model, chunk) for chunk in chunks]
+
+    def render_kept(number: int, mask: Tensor) -> Tensor:
+        kept = Intervals(*(part[mask] for part in references[number].intervals))
+        return model.shade(chunks[number], kept).rgb
+
+    truths = list(model.renderer_rgb.blend_background(truth).split(config.rays_at_once))
+    measured = calibrate(references, truths, render_kept, config)
+    model.train(was_training)
+    return measured
+
+
+def dense_reference(model: LecoModel, rays: Rays) -> Reference:
+    """All candidates of some rays rendered, as the reference that skipping is measured against."""
+    intervals = model.intervals_of(rays, guided=False, learning=False)
+    shaded = model.shade(rays, intervals)
+    return Reference(
+        intervals,
+        shaded.weights,
+        occupancy_from_logits(shaded.logits),
+        near_median_depth(shaded, intervals),
+        shaded.rgb,
+    )

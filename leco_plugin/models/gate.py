@@ -1,0 +1,104 @@
+"""The gating network: an MLP from a mapped position to one logit for emptiness and one per scene expert.
+
+Torch only, so that a frozen gate can be used without nerfstudio.
+"""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass, field
+
+import torch
+from torch import Tensor, nn
+
+from leco_plugin.models.encodings import EncodingConfig, build_encoding
+
+EMPTY = 0
+"""Index of the empty-space expert in logits, probabilities and routes."""
+
+
+@dataclass(frozen=True)
+class GateConfig:
+    """The shape of a gate."""
+
+    encoding: EncodingConfig = field(default_factory=EncodingConfig)
+    """Encoding of the mapped position."""
+    width: int = 64
+    """Units of each hidden layer."""
+    layers: int = 3
+    """Hidden layers."""
+    scene_experts: int = 4
+    """n: logits beside the one of the empty-space expert."""
+
+    def to_dict(self) -> dict[str, object]:
+        return asdict(self)
+
+    @staticmethod
+    def from_dict(values: dict[str, object]) -> GateConfig:
+        """Inverse of `to_dict`.
+
+        Raises:
+            TypeError: for unknown or missing fields.
+        """
+        encoding = values["encoding"]
+        if not isinstance(encoding, dict):
+            raise TypeError(f"the gate's encoding must be a mapping, got {type(encoding).__name__}")
+        return GateConfig(**{**values, "encoding": EncodingConfig(**encoding)})  # type: ignore[arg-type]
+
+
+class Gate(nn.Module):
+    """G(x) = softmax(W LN(MLP(gamma_g(x)))), returned as logits (DESIGN, section 3)."""
+
+    def __init__(self, config: GateConfig) -> None:
+        super().__init__()
+        self.config = config
+        self.encoding = build_encoding(config.encoding)
+        widths = [self.encoding.out_dim] + [config.width] * config.layers
+        self.hidden = nn.ModuleList(nn.Linear(a, b) for a, b in zip(widths[:-1], widths[1:]))
+        self.norm = nn.LayerNorm(widths[-1])
+        self.head = nn.Linear(widths[-1], 1 + config.scene_experts)
+
+    def forward(self, mapped: Tensor) -> Tensor:
+        """Mapped positions [N, 3] in [-1, 1] to logits [N, 1 + n] float32; column 0 is emptiness."""
+        features = self.encoding(mapped)
+        for layer in self.hidden:
+            features = torch.relu(layer(features))
+        # a decision at a threshold needs more digits than bf16 has, so the last step is in float32
+        with torch.autocast(mapped.device.type, enabled=False):
+            features = self.norm(features.float())
+            return nn.functional.linear(features, self.head.weight.float(), self.head.bias.float())
+
+    def occupancy(self, mapped: Tensor) -> Tensor:
+        """o(x) = 1 - G_0(x): mapped positions [N, 3] to [N] float32 in [0, 1]."""
+        return occupancy_from_logits(self(mapped))
+
+
+def occupancy_from_logits(logits: Tensor) -> Tensor:
+    """1 - softmax(logits)[:, 0], computed as a sigmoid so that neither end loses digits.
+
+    Args:
+        logits: [N, 1 + n] float.
+    Returns:
+        [N] float in [0, 1].
+    """
+    return torch.sigmoid(occupancy_logit(logits))
+
+
+def occupancy_logit(logits: Tensor) -> Tensor:
+    """The logit of o(x): log-sum-exp of the scene logits minus the empty logit; [N, 1 + n] to [N]."""
+    return logits[:, 1:].logsumexp(dim=-1) - logits[:, EMPTY]
+
+
+def route(logits: Tensor, empty_below: float | None) -> Tensor:
+    """Top-1 routing: which expert each point is sent to.
+
+    Args:
+        logits: [N, 1 + n].
+        empty_below: a point goes to the empty-space expert when o(x) is below this; None is the argmax
+            over all experts (the paper's rule).
+    Returns:
+        [N] int64 in [0, n].
+    """
+    if empty_below is None:
+        return logits.argmax(dim=-1)
+    best_scene_expert = logits[:, 1:].argmax(dim=-1) + 1
+    return torch.where(occupancy_from_logits(logits) < empty_below, EMPTY, best_scene_expert)

@@ -1,0 +1,101 @@
+"""The heterogeneous mixture of experts: large scene experts, a tiny empty-space expert, dropless top-1 dispatch."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal, Optional
+
+import torch
+from torch import Tensor, nn
+
+from leco_plugin.models.gate import EMPTY
+
+
+@dataclass(frozen=True)
+class HMoEConfig:
+    """The shape of the experts."""
+
+    scene_experts: int = 4
+    """n: number of scene experts."""
+    width: int = 64
+    """Units of each layer of a scene expert, and of its output."""
+    layers: int = 2
+    """Layers of a scene expert."""
+    skip: Optional[int] = None
+    """Layer that sees the input again (3 in Switch-NeRF), or None."""
+    empty_expert: Literal["identity", "mlp", "none"] = "identity"
+    """What points of empty space go through: the identity, a small MLP, or nothing (zero features and zero density)."""
+    empty_layers: int = 1
+    """Layers of the empty-space expert when it is an MLP."""
+
+
+class Expert(nn.Module):
+    """An MLP of constant width with an optional skip connection; [M, width] to [M, width]."""
+
+    def __init__(self, width: int, layers: int, skip: Optional[int] = None) -> None:
+        super().__init__()
+        self.skip = skip
+        self.layers = nn.ModuleList(
+            nn.Linear(2 * width if i == skip else width, width) for i in range(layers)
+        )
+
+    def forward(self, features: Tensor) -> Tensor:
+        hidden = features
+        for i, layer in enumerate(self.layers):
+            if i == self.skip:
+                hidden = torch.cat([features, hidden], dim=-1)
+            hidden = torch.relu(layer(hidden))
+        return hidden
+
+
+class HMoE(nn.Module):
+    """h(x) = G_i*(x) E_i*(x): each point through the one expert it is routed to (DESIGN, section 3)."""
+
+    def __init__(self, config: HMoEConfig) -> None:
+        super().__init__()
+        self.config = config
+        empty: nn.Module = nn.Identity()
+        if config.empty_expert == "mlp":
+            empty = Expert(config.width, config.empty_layers)
+        scene = (
+            Expert(config.width, config.layers, config.skip) for _ in range(config.scene_experts)
+        )
+        self.experts = nn.ModuleList([empty, *scene])
+
+    def forward(self, features: Tensor, routes: Tensor, gate_values: Tensor) -> Tensor:
+        """Dispatches, applies the experts, and brings the points back in order.
+
+        No capacity factor: a dropped 3-D point would be a hole.
+
+        Args:
+            features: [N, width] A gamma(x).
+            routes: [N] int64 in [0, n].
+            gate_values: [N] G_i*(x), in the precision of the gate.
+        Returns:
+            [N, width] in the dtype of the experts' output.
+        """
+        order = routes.argsort(stable=True)
+        counts = torch.bincount(
+            routes, minlength=len(self.experts)
+        ).tolist()  # the one synchronisation
+        parts = [
+            expert(part) if len(part) else part
+            for expert, part in zip(self.experts, features[order].split(counts))
+        ]
+        if self.config.empty_expert == "none":
+            parts[EMPTY] = torch.zeros_like(parts[EMPTY])
+        dtype = next((p.dtype for p in parts[1:] if len(p)), features.dtype)
+        hidden = torch.cat([part.to(dtype) for part in parts])
+        back = torch.empty_like(order).scatter_(
+            0, order, torch.arange(len(order), device=order.device)
+        )
+        return hidden[back] * gate_values[:, None].to(dtype)
+
+
+def dense_hmoe(hmoe: HMoE, features: Tensor, routes: Tensor, gate_values: Tensor) -> Tensor:
+    """The slow twin of `HMoE.forward`: every expert on every point, selected by a one-hot mask."""
+    outputs = torch.stack([expert(features) for expert in hmoe.experts])
+    if hmoe.config.empty_expert == "none":
+        outputs = torch.cat([torch.zeros_like(outputs[:1]), outputs[1:]])
+    chosen = torch.nn.functional.one_hot(routes, len(hmoe.experts)).t()[..., None]
+    return (outputs * chosen).sum(dim=0) * gate_values[:, None].to(outputs.dtype)

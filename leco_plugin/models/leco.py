@@ -1,0 +1,343 @@
+"""`leco-occupancy` as a nerfstudio model: an HMoE that learns the occupancy, then is guided by it."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+from typing import Any, Literal
+
+import torch
+from nerfstudio.cameras.rays import RayBundle
+from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackAttributes
+from nerfstudio.model_components.renderers import RGBRenderer
+from nerfstudio.models.base_model import Model, ModelConfig
+from torch import Tensor, nn
+
+from leco_plugin.compat.checkpoints import allow_checkpoint_globals
+from leco_plugin.evaluation.metrics import image_metrics
+from leco_plugin.models.calibration import CalibrationConfig
+from leco_plugin.models.field import HMoEField
+from leco_plugin.models.gate import Gate
+from leco_plugin.models.losses import (
+    balance_loss,
+    contribution_loss,
+    density_loss,
+    distortion_loss,
+    imbalanced_gate_loss,
+)
+from leco_plugin.models.phases import ScheduleConfig, ramp
+from leco_plugin.models.precision import fast_precision, keep_freed_memory
+from leco_plugin.models.rendering import (
+    Intervals,
+    Rays,
+    Routing,
+    Shaded,
+    per_ray_pictures,
+    shade,
+)
+from leco_plugin.models.sizes import SMALL, Sizes
+from leco_plugin.occupancy import Occupancy, gate_precision
+from leco_plugin.samplers.estimator import LearnedOccupancyEstimator
+from leco_plugin.samplers.marching import march
+from leco_plugin.samplers.rays import intersect_box
+from leco_plugin.scenes.bounds import SceneBounds
+from leco_plugin.space import Space
+
+
+@dataclass
+class GateLossConfig:
+    """What teaches the gate."""
+
+    form: Literal["logit", "paper"] = "logit"
+    """Contribution in logit form, or imbalanced gate loss and density loss as in the paper."""
+    contribution: float = 0.02
+    """Weight of the contribution loss (logit form)."""
+    weight_at_full: float = 0.05
+    """w_0: rendering weight that makes a sample fully occupied (logit form)."""
+    emphasis: float = 4.0
+    """k: how much dearer a lost contribution is than a needless sample (logit form)."""
+    empty_below: float = 0.2
+    """o(x) below which a point goes to the empty-space expert (logit form; the paper's is the argmax)."""
+    balance: float = 5e-4
+    """Weight of the balance among scene experts (logit form, and the homogeneous mixture)."""
+    imbalance: float = 5e-3
+    """lambda_g, weight of the imbalanced gate loss (paper form)."""
+    empty_ratio: float = 0.9
+    """rho, the target empty ratio (paper form)."""
+    density: float = 1.0
+    """lambda_d, weight of the density loss (paper form)."""
+
+
+@dataclass
+class LecoModelConfig(ModelConfig):
+    """Learned occupancy: learn, freeze and calibrate, go on guided"""
+
+    _target: type = field(default_factory=lambda: LecoModel)
+    """target class to instantiate"""
+    enable_collider: bool = False
+    """Rays are cut at the scene's own bounds instead."""
+    eval_num_rays_per_chunk: int = 4096
+    """Rays rendered at a time."""
+    sizes: Sizes = field(default_factory=lambda: SMALL)
+    """Sizes of gate, field and batches."""
+    schedule: ScheduleConfig = field(default_factory=ScheduleConfig)
+    """When the gate is frozen."""
+    gate_loss: GateLossConfig = field(default_factory=GateLossConfig)
+    """What teaches the gate."""
+    calibration: CalibrationConfig = field(default_factory=CalibrationConfig)
+    """What skipping may cost."""
+    distortion: float = 0.01
+    """Weight of the distortion loss, which clears haze (mip-NeRF 360, eq. 15)."""
+    homogeneous: bool = False
+    """A mixture of scene experts only, for comparison: no empty-space expert, nothing to freeze."""
+    near: float | None = None
+    """Where rays begin, scene units; None is found from the data."""
+    far: float | None = None
+    """Where rays end, scene units; None is found from the data."""
+
+
+class LecoModel(Model):
+    """HMoE, gate and frozen occupancy behind nerfstudio's model interface."""
+
+    config: LecoModelConfig
+    frozen: Tensor
+    threshold: Tensor
+    bounds_known: Tensor
+    march_range: Tensor
+    aabb: Tensor
+
+    def populate_modules(self) -> None:
+        """Builds gate, field and the buffers that a checkpoint restores."""
+        super().populate_modules()
+        allow_checkpoint_globals()
+        device = self.kwargs.get("device", "cpu")
+        if torch.device(device).type == "cpu":
+            keep_freed_memory()
+        self.precision = fast_precision(device)
+        sizes = self.config.sizes
+        self.gate = Gate(sizes.gate)
+        self.field = HMoEField(sizes.field, self.num_train_data)
+        self.space = Space()
+        # buffers, because nerfstudio tells a model its step before it restores its state
+        self.register_buffer("frozen", torch.tensor(False))
+        self.register_buffer("threshold", torch.tensor(0.0))
+        self.register_buffer("bounds_known", torch.tensor(False))
+        # near, far, step at `candidates`, step at `learn_candidates`, cone angles of both
+        self.register_buffer("march_range", torch.tensor([0.05, 4.0, 0.03, 0.06, 0.0, 0.0]))
+        self.register_buffer("aabb", torch.tensor([-1.0] * 3 + [1.0] * 3))
+        self.renderer_rgb = RGBRenderer(background_color="random")
+        self.ramped = 0.0
+        self.routing = self._routing()
+        # held in a tuple: the estimator shares the gate, which must not be registered twice
+        self._estimator: tuple[LearnedOccupancyEstimator, ...] = ()
+        self.report: dict[str, Any] = {}
+
+    def _routing(self) -> Routing:
+        losses = self.config.gate_loss
+        return Routing(losses.empty_below if losses.form == "logit" else None, self.config.homogeneous)
+
+    def get_param_groups(self) -> dict[str, list[nn.Parameter]]:
+        """`encoding` (tables, if any), `field` (everything else that shades) and `gate`."""
+        tables = list(self.field.encoding.parameters())
+        known = {id(parameter) for parameter in tables}
+        rest = [p for p in self.field.parameters() if id(p) not in known]
+        # a frequency encoding has no parameters, and an optimizer needs one
+        tables = tables or [self.device_indicator_param]
+        return {"encoding": tables, "field": rest, "gate": list(self.gate.parameters())}
+
+    def get_training_callbacks(
+        self, training_callback_attributes: TrainingCallbackAttributes
+    ) -> list[TrainingCallback]:
+        """Finds the scene's bounds now, and returns what runs around each step."""
+        from leco_plugin.models.lifecycle import Lifecycle
+
+        return Lifecycle(self, training_callback_attributes).callbacks()
+
+    @torch.no_grad()
+    def set_bounds(self, bounds: SceneBounds, median_length: float) -> None:
+        """Fixes the space mapping and the marching rule of the scene.
+
+        Args:
+            bounds: of the scene.
+            median_length: median length of rays inside the bounds, scene units.
+        """
+        near = self.config.near if self.config.near is not None else bounds.near
+        far = self.config.far if self.config.far is not None else bounds.far
+        self.space.set(bounds.kind, bounds.center, bounds.half_extent)
+        self.aabb.copy_(bounds.aabb)
+        steps, cones = [], []
+        for candidates in (self.config.sizes.candidates, self.config.sizes.learn_candidates):
+            # a box is marched evenly; an unbounded scene in steps that grow with distance
+            cone = 0.0 if bounds.kind == "box" else (far / near) ** (1.0 / candidates) - 1.0
+            steps.append(near * cone if cone else median_length / candidates)
+            cones.append(cone)
+        self.march_range.copy_(torch.tensor([near, far, *steps, *cones]))
+        self.bounds_known.fill_(True)
+
+    def rays_of(self, bundle: RayBundle) -> Rays:
+        """The bundle's rays, cut to the scene's bounds."""
+        near, far = self.march_range[:2]
+        enters, leaves = intersect_box(bundle.origins, bundle.directions, self.aabb)
+        images = bundle.camera_indices
+        return Rays(
+            bundle.origins,
+            bundle.directions,
+            enters.clamp(min=near),
+            leaves.clamp(max=far),
+            images[:, 0] if images is not None and self.training else None,
+        )
+
+    @property
+    def estimator(self) -> LearnedOccupancyEstimator:
+        """Samples where the frozen gate says so; built on first use, also after a checkpoint."""
+        if not self._estimator:
+            occupancy = self.occupancy()
+            self._estimator = (LearnedOccupancyEstimator(occupancy).to(self.device),)
+            self._estimator[0].requires_grad_(False)
+        return self._estimator[0]
+
+    def occupancy(self) -> Occupancy:
+        """The gate as an `Occupancy`; it shares this model's parameters."""
+        return Occupancy(
+            self.gate, self.space, float(self.threshold), self.precision, self.report
+        ).to(self.device)
+
+    def intervals_of(self, rays: Rays, guided: bool, learning: bool) -> Intervals:
+        """Candidates along the rays; guided, only those that the occupancy keeps."""
+        _, _, step, learn_step, cone, learn_cone = self.march_range.tolist()
+        samples = march(
+            rays.origins,
+            rays.directions,
+            rays.t_mins,
+            rays.t_maxs,
+            step_size=learn_step if learning else step,
+            cone_angle=learn_cone if learning else cone,
+            jitter=torch.rand_like(rays.t_mins) if self.training else None,
+            occupied=self.estimator.occupied if guided else None,
+            near_occupied=self.estimator.questions()[1] if guided else None,
+        )
+        return Intervals(*samples)
+
+    def shade(self, rays: Rays, intervals: Intervals) -> Shaded:
+        """Renders intervals in this device's fastest precision."""
+        with gate_precision(self.device.type, self.precision):
+            return shade(
+                self.field,
+                self.gate,
+                self.space,
+                rays,
+                intervals,
+                self.routing,
+                freeze_gate=bool(self.frozen),
+            )
+
+    def get_outputs(self, ray_bundle: RayBundle) -> dict[str, Any]:  # type: ignore[override]
+        """Pixels of rays; in training also what the losses need (`shaded`, `intervals`, `rays`)."""
+        rays = self.rays_of(ray_bundle)
+        guided = bool(self.frozen)
+        intervals = self.intervals_of(rays, guided, learning=self.training and self.is_learning())
+        shaded = self.shade(rays, intervals)
+        outputs: dict[str, Any] = {
+            "rgb": shaded.rgb,
+            "depth": shaded.depth[:, None],
+            "accumulation": shaded.accumulation[:, None],
+        }
+        if self.training:
+            return outputs | {"shaded": shaded, "intervals": intervals, "rays": rays}
+        return outputs | per_ray_pictures(shaded, intervals.ray_indices, len(rays.origins))
+
+    def is_learning(self) -> bool:
+        """Whether the coarse candidates of the first phase are still used."""
+        return self.ramped < 1.0 or not (bool(self.frozen) or self.learned)
+
+    learned = False
+    """Whether the first phase is over although nothing was frozen (`schedule.freeze` off)."""
+
+    def get_loss_dict(
+        self, outputs: dict[str, Any], batch: dict[str, Tensor], metrics_dict: Any = None
+    ) -> dict[str, Tensor]:
+        """Colour loss, distortion loss, and before the gate is frozen what teaches it.
+
+        Raises:
+            FloatingPointError: a loss is not finite; the step was not taken.
+        """
+        shaded: Shaded = outputs["shaded"]
+        image = batch["image"].to(self.device)
+        background = torch.rand_like(shaded.rgb) * self.ramped
+        predicted = shaded.rgb + background * (1.0 - shaded.accumulation[:, None])
+        truth = image[..., :3]
+        if image.shape[-1] == 4:
+            truth = torch.lerp(background, truth, image[..., 3:])
+        losses = {"rgb_loss": torch.nn.functional.mse_loss(predicted, truth)}
+        weight = self.config.distortion * self.ramped
+        if weight > 0.0:
+            near, far = self.march_range[:2]
+            starts, ends = ((t - near) / (far - near) for t in outputs["intervals"][1:])
+            losses["distortion_loss"] = weight * distortion_loss(
+                shaded.weights, starts, ends, shaded.packed_info
+            )
+        if not bool(self.frozen):
+            losses |= self._gate_losses(shaded, outputs["intervals"])
+        for name, value in losses.items():
+            if not math.isfinite(float(value)):
+                from leco_plugin.models.failures import explain_non_finite
+
+                raise FloatingPointError(explain_non_finite(name, self, outputs, image))
+        return losses
+
+    def _gate_losses(self, shaded: Shaded, intervals: Intervals) -> dict[str, Tensor]:
+        config, logits, routes = self.config.gate_loss, shaded.logits, shaded.routes
+        on_scene = (routes > 0).nonzero()[:, 0]
+        balance = logits.new_zeros(())
+        if len(on_scene) > 0 and logits.shape[-1] > 2:
+            probabilities = logits[on_scene, 1:].softmax(dim=-1)
+            balance = config.balance * balance_loss(probabilities, routes[on_scene] - 1)
+        if self.config.homogeneous:
+            return {"balance_loss": balance}
+        if config.form == "logit":
+            contribution = contribution_loss(
+                logits, shaded.weights, config.weight_at_full, config.emphasis
+            )
+            return {
+                "contribution_loss": config.contribution * contribution,
+                "balance_loss": balance,
+            }
+        probabilities = logits.softmax(dim=-1)
+        lengths = (intervals.t_ends - intervals.t_starts) / self.space.half_extent
+        alphas = 1.0 - torch.exp(-shaded.sigmas * lengths)
+        return {
+            "gate_loss": config.imbalance
+            * imbalanced_gate_loss(probabilities, routes, config.empty_ratio),
+            "density_loss": config.density * density_loss(probabilities[:, 0], alphas),
+        }
+
+    @torch.no_grad()
+    def get_metrics_dict(
+        self, outputs: dict[str, Any], batch: dict[str, Tensor]
+    ) -> dict[str, Tensor]:
+        """PSNR of the batch, and what the gate does: kept fraction, share and density per expert."""
+        from leco_plugin.models.statistics import gate_statistics
+
+        truth = self.renderer_rgb.blend_background(batch["image"].to(self.device))
+        error = torch.nn.functional.mse_loss(outputs["rgb"], truth)
+        metrics = {"psnr": -10.0 * torch.log10(error.clamp(min=1e-12))}
+        if "shaded" in outputs:
+            metrics |= gate_statistics(outputs["shaded"], self.config.sizes.gate.scene_experts)
+        return metrics
+
+    def get_image_metrics_and_images(
+        self, outputs: dict[str, Tensor], batch: dict[str, Tensor]
+    ) -> tuple[dict[str, float], dict[str, Tensor]]:
+        """Figures of one image, and pictures for the log."""
+        from nerfstudio.utils import colormaps
+
+        truth = self.renderer_rgb.blend_background(batch["image"].to(outputs["rgb"].device))
+        predicted = outputs["rgb"].clamp(0.0, 1.0)
+        pictures = {
+            "img": torch.cat([truth, predicted], dim=1),
+            "accumulation": colormaps.apply_colormap(outputs["accumulation"]),
+            "depth": colormaps.apply_depth_colormap(
+                outputs["depth"], accumulation=outputs["accumulation"]
+            ),
+        }
+        return image_metrics(predicted, truth), pictures

@@ -1,0 +1,156 @@
+"""What happens around training steps: bounds before the first, ramps, freezing, calibration, healing."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import torch
+from nerfstudio.engine.callbacks import (
+    TrainingCallback,
+    TrainingCallbackAttributes,
+    TrainingCallbackLocation,
+)
+from nerfstudio.utils.rich_utils import CONSOLE
+from torch import Tensor
+
+from leco_plugin.models.freezing import freeze
+from leco_plugin.models.phases import (
+    PROBES,
+    converged,
+    decisions_agree,
+    find_collapse,
+    ramp,
+    reset_gate_head,
+)
+from leco_plugin.models.rendering import Rays
+from leco_plugin.models.gate import occupancy_from_logits, route
+from leco_plugin.models.losses import expert_shares
+from leco_plugin.models.statistics import KEPT_ABOVE
+from leco_plugin.scenes.survey import survey
+
+if TYPE_CHECKING:
+    from leco_plugin.models.leco import LecoModel
+
+MOST_RECOVERIES = 3
+
+
+class Lifecycle:
+    """Carries one run of a `LecoModel` from its first step to its last."""
+
+    def __init__(self, model: LecoModel, attributes: TrainingCallbackAttributes) -> None:
+        assert attributes.pipeline is not None
+        self.model = model
+        self.pipeline: Any = attributes.pipeline
+        self.trainer: Any = attributes.trainer
+        self.schedule = model.config.schedule
+        if self.trainer is not None:
+            # a short run still passes through both phases
+            most = max(2, int(0.5 * self.trainer.config.max_num_iterations))
+            self.schedule = replace(self.schedule, learn_steps=min(self.schedule.learn_steps, most))
+        self.survey = survey(self.pipeline.datamanager)
+        if not bool(model.bounds_known):
+            model.set_bounds(self.survey.bounds, self.survey.median_length)
+            CONSOLE.log(f"[leco] {self.survey.describe()}")
+        self.rays_per_batch = int(self.pipeline.datamanager.get_train_rays_per_batch())
+        self.decisions = torch.zeros(0, dtype=torch.bool)
+        self.recoveries = 0
+        self.learn_seconds = 0.0
+        self.step_started = 0.0
+
+    def callbacks(self) -> list[TrainingCallback]:
+        """What nerfstudio's trainer calls before and after each step."""
+        before, after = (
+            TrainingCallbackLocation.BEFORE_TRAIN_ITERATION,
+            TrainingCallbackLocation.AFTER_TRAIN_ITERATION,
+        )
+        return [
+            TrainingCallback([before], self.before_step),
+            TrainingCallback([after], self.after_step),
+        ]
+
+    def before_step(self, step: int) -> None:
+        """Sets what follows from the step alone, so that a resumed run is where it was."""
+        model = self.model
+        model.ramped = ramp(step, self.schedule)
+        model.learned = not self.schedule.freeze and step >= self.schedule.learn_steps
+        past_learning = bool(model.frozen) or model.learned
+        self._set_rays(model.config.sizes.guided_batch if bool(model.frozen) else 1.0)
+        if not past_learning:
+            self.step_started = time.monotonic()
+
+    def _set_rays(self, factor: float) -> None:
+        sampler = getattr(self.pipeline.datamanager, "train_pixel_sampler", None)
+        wanted = round(self.rays_per_batch * factor)
+        if sampler is not None and sampler.num_rays_per_batch != wanted:
+            sampler.set_num_rays_per_batch(wanted)
+
+    def after_step(self, step: int) -> None:
+        """Looks at the gate now and then, and freezes it when its decisions have settled."""
+        model, schedule = self.model, self.schedule
+        if bool(model.frozen) or model.learned or model.config.homogeneous:
+            return
+        self.learn_seconds += time.monotonic() - self.step_started
+        last = step + 1 >= schedule.learn_steps
+        if (step + 1) % schedule.steps_per_check and not last:
+            return
+        logits = self._probe()
+        kept = occupancy_from_logits(logits) >= KEPT_ABOVE
+        agreement = decisions_agree(self.decisions, kept)
+        self.decisions = kept
+        if self._heal(step, logits, kept) or not schedule.freeze:
+            return
+        if converged(step, agreement, schedule):
+            CONSOLE.log(
+                f"[leco] step {step}: {agreement:.1%} of {len(kept)} decisions are those of "
+                f"{schedule.steps_per_check} steps ago; freezing the gate"
+            )
+            folder = Path(self.trainer.base_dir) if self.trainer is not None else None
+            freeze(model, self.pipeline.datamanager, self.survey, folder, step, self.learn_seconds)
+
+    @torch.no_grad()
+    def _probe(self) -> Tensor:
+        """The gate's logits [P, 1 + n] at candidates of a fixed set of training rays."""
+        model = self.model
+        rays = self.survey.probe_rays(model.device, model.aabb, model.march_range)
+        generator = torch.Generator().manual_seed(0)
+        which = torch.randint(len(rays.origins), (PROBES,), generator=generator)
+        along = torch.rand(PROBES, generator=generator).to(model.device)
+        which = which.to(model.device)
+        distance = torch.lerp(rays.t_mins[which], rays.t_maxs[which], along)
+        positions = rays.origins[which] + rays.directions[which] * distance[:, None]
+        mapped = model.space.map(positions).clamp(-1.0, 1.0)
+        with torch.autocast(
+            model.device.type, torch.bfloat16, enabled=model.precision == "bfloat16"
+        ):
+            logits: Tensor = model.gate(mapped)
+        return logits
+
+    def _heal(self, step: int, logits: Tensor, kept: Tensor) -> bool:
+        """Resets a collapsed gate; returns whether it had to.
+
+        Raises:
+            RuntimeError: the gate has collapsed more often than it may.
+        """
+        routes = route(logits, self.model.routing.empty_below)
+        shares = expert_shares(routes, logits.shape[-1])
+        collapse = find_collapse(float(kept.float().mean()), shares, self.model.ramped)
+        if collapse is None:
+            return False
+        if self.recoveries == MOST_RECOVERIES:
+            raise RuntimeError(
+                f"step {step}: {collapse.cause}, after {MOST_RECOVERIES} recoveries. Check the "
+                "scene's bounds in the log above, and the weights under --pipeline.model.gate-loss"
+            )
+        self.recoveries += 1
+        CONSOLE.log(
+            f"[leco] step {step}: {collapse.cause}; its last layer starts anew, on dense samples "
+            f"(recovery {self.recoveries} of {MOST_RECOVERIES})"
+        )
+        reset_gate_head(self.model.gate.head)
+        steps = self.schedule.learn_steps + max(50, self.schedule.learn_steps // 4)
+        self.schedule = replace(self.schedule, learn_steps=steps)
+        self.decisions = torch.zeros(0, dtype=torch.bool)
+        return True

@@ -1,0 +1,104 @@
+"""What teaches the gate: the paper's two losses, the same two forces in logit form, and the helpers of the field.
+
+All of them run in float32 and are means over the points given, so that their weights do not depend
+on the batch.
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from leco_plugin.models.gate import EMPTY, occupancy_logit
+from leco_plugin.samplers.packed import exclusive_sum
+
+
+def expert_shares(routes: Tensor, num_experts: int) -> Tensor:
+    """f_i: the share of points sent to each expert; routes [N] int64 to [num_experts] float32."""
+    return torch.bincount(routes, minlength=num_experts).float() / max(len(routes), 1)
+
+
+def imbalanced_gate_loss(probabilities: Tensor, routes: Tensor, empty_ratio: float) -> Tensor:
+    """L_g = sum_i w_i f_i P_i with w_0 = 1 / rho and w_i = n / (1 - rho) (DESIGN, section 3).
+
+    Stationary where f_0 = rho and f_i = (1 - rho) / n, so rho is the target empty ratio;
+    rho = 1 / (1 + n) gives back the balanced loss of Switch-NeRF, whose value at balance is one.
+
+    Args:
+        probabilities: [N, 1 + n] softmax of the gate.
+        routes: [N] int64, where each point was sent.
+        empty_ratio: rho, in (0, 1).
+    Returns:
+        Scalar; one at the stationary point.
+    Raises:
+        ValueError: when rho is not inside (0, 1).
+    """
+    if not 0.0 < empty_ratio < 1.0:
+        raise ValueError(f"the target empty ratio must lie in (0, 1), got {empty_ratio}")
+    num_experts = probabilities.shape[-1]
+    weights = torch.full(
+        (num_experts,), (num_experts - 1) / (1.0 - empty_ratio), device=probabilities.device
+    )
+    weights[EMPTY] = 1.0 / empty_ratio
+    return (weights * expert_shares(routes, num_experts) * probabilities.mean(dim=0)).sum()
+
+
+def balance_loss(probabilities: Tensor, routes: Tensor) -> Tensor:
+    """The balanced loss of Switch-NeRF: m sum_i f_i P_i over m experts; one when all get the same.
+
+    Args:
+        probabilities: [N, m] softmax over the experts to be balanced.
+        routes: [N] int64 in [0, m).
+    """
+    num_experts = probabilities.shape[-1]
+    return num_experts * (expert_shares(routes, num_experts) * probabilities.mean(dim=0)).sum()
+
+
+def density_loss(empty_probability: Tensor, alphas: Tensor) -> Tensor:
+    """L_d = mean[G_0 stop_gradient(alpha)]: the gate must not call a dense point empty.
+
+    Args:
+        empty_probability: [N] G_0(x).
+        alphas: [N] opacity 1 - exp(-sigma delta) of each sample.
+    """
+    return (empty_probability * alphas.detach()).mean()
+
+
+def contribution_loss(
+    logits: Tensor, weights: Tensor, weight_at_full: float = 0.05, emphasis: float = 4.0
+) -> Tensor:
+    """Both forces in logit form: mean[-k y log(1 - G_0) - (1 - y) log G_0], y = min(w / w_0, 1).
+
+    The field teaches the gate what each sample contributes to its ray. Unlike the paper's form its
+    gradient does not die when the gate saturates, and no empty ratio has to be guessed.
+
+    Args:
+        logits: [N, 1 + n] of the gate.
+        weights: [N] rendering weight T alpha of each sample.
+        weight_at_full: w_0, the weight that makes a sample fully occupied.
+        emphasis: k, how much dearer a lost contribution is than a needless sample.
+    """
+    target = (weights.detach() / weight_at_full).clamp(max=1.0)
+    occupied = occupancy_logit(logits)
+    return (
+        emphasis * target * torch.nn.functional.softplus(-occupied)
+        + (1.0 - target) * torch.nn.functional.softplus(occupied)
+    ).mean()
+
+
+def distortion_loss(
+    weights: Tensor, t_starts: Tensor, t_ends: Tensor, packed_info: Tensor
+) -> Tensor:
+    """Distortion of packed samples (mip-NeRF 360, eq. 15): mean over rays, in linear time.
+
+    Args:
+        weights, t_starts, t_ends: [M] samples sorted by ray; t in units in which near to far is one.
+        packed_info: [R, 2] start and count of each ray.
+    """
+    middles = 0.5 * (t_starts + t_ends)
+    weight_before = exclusive_sum(weights, packed_info)
+    moment_before = exclusive_sum(weights * middles, packed_info)
+    # pairs (i, j < i) counted twice, which is the full double sum because it is symmetric
+    between = 2.0 * weights * (middles * weight_before - moment_before)
+    within = weights**2 * (t_ends - t_starts) / 3.0
+    return (between + within).sum() / max(len(packed_info), 1)

@@ -1,0 +1,93 @@
+"""The two phases of a run: what changes while the occupancy is learned, and when that is over."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+PROBES = 16384
+"""Positions at which the gate's decisions are compared between two checks."""
+
+
+@dataclass(frozen=True)
+class ScheduleConfig:
+    """When the gate is frozen."""
+
+    freeze: bool = True
+    """Whether the gate is ever frozen; False is the plain HMoE, for comparison."""
+    learn_steps: int = 400
+    """Steps after which the gate is frozen even if its decisions still change."""
+    earliest: float = 0.6
+    """Share of `learn_steps` before which it is never frozen."""
+    ramp: float = 0.4
+    """Share of `learn_steps` over which the random background and the distortion loss come in."""
+    steps_per_check: int = 25
+    """Steps between two looks at the gate."""
+    agreement: float = 0.99
+    """Share of probe positions whose decision must be the same in two checks running."""
+
+
+def ramp(step: int, config: ScheduleConfig) -> float:
+    """How far the opaque-surface forces have come in: 0 at the start, 1 from `ramp` on.
+
+    At first the field may be as transparent as it likes, and the images are fitted by a haze that
+    is densest near the true surfaces. A random background behind it then asks for opacity ever
+    more strongly, and the haze condenses there. Asking for opacity at once makes plates in front of
+    the cameras instead.
+    """
+    return min(1.0, step / max(1.0, config.ramp * config.learn_steps))
+
+
+def converged(step: int, agreement: float, config: ScheduleConfig) -> bool:
+    """Whether to freeze at this check.
+
+    Args:
+        step: training step.
+        agreement: share of probe decisions equal to those of the check before; 0 at the first.
+    """
+    if step + 1 >= config.learn_steps:
+        return True
+    return step + 1 >= config.earliest * config.learn_steps and agreement >= config.agreement
+
+
+def decisions_agree(before: Tensor, now: Tensor) -> float:
+    """Share of equal decisions of two bool [P] tensors; 0 when there were none before."""
+    if len(before) != len(now) or len(now) == 0:
+        return 0.0
+    return float((before == now).float().mean())
+
+
+@dataclass(frozen=True)
+class Collapse:
+    """A gate that has stopped deciding, and why it is thought so."""
+
+    cause: str
+
+
+def find_collapse(kept_fraction: float, shares: Tensor, ramped: float) -> Collapse | None:
+    """Names the collapse of a gate, if it has collapsed.
+
+    Args:
+        kept_fraction: share of candidates whose o(x) is at least 0.1.
+        shares: [1 + n] share of points at each expert.
+        ramped: how far `ramp` has come; before 1 a gate has not had what it needs to decide.
+    """
+    if ramped < 1.0:
+        return None
+    if kept_fraction < 2e-4:
+        return Collapse("the gate calls all space empty")
+    if kept_fraction > 0.9995:
+        return Collapse("the gate calls all space occupied")
+    scene = shares[1:]
+    if len(scene) > 1 and float(scene.sum()) > 0.01 and float(scene.max() / scene.sum()) > 0.999:
+        return Collapse(f"scene expert {int(scene.argmax()) + 1} takes all points")
+    return None
+
+
+@torch.no_grad()
+def reset_gate_head(head: torch.nn.Linear) -> None:
+    """Gives a collapsed gate an undecided last layer; what its hidden layers know stays."""
+    torch.nn.init.normal_(head.weight, std=0.05)
+    torch.nn.init.zeros_(head.bias)

@@ -1,0 +1,41 @@
+"""Which type matrix products are fastest in on this device, and memory that is kept between steps."""
+
+from __future__ import annotations
+
+import ctypes
+import sys
+
+import torch
+
+from leco_plugin.occupancy import Precision
+
+
+def fast_precision(device: torch.device | str) -> Precision:
+    """bfloat16 where the hardware multiplies it faster than float32.
+
+    On CUDA that is Ampere and later; on x86 it is AMX (9 times faster there), while without AMX
+    bfloat16 is emulated and slower.
+    """
+    kind = torch.device(device).type
+    if kind == "cuda":
+        return "bfloat16" if torch.cuda.is_bf16_supported(including_emulation=False) else "float32"
+    if kind == "cpu" and torch.cpu._is_amx_tile_supported():
+        return "bfloat16"
+    return "float32"
+
+
+def keep_freed_memory() -> None:
+    """Tells glibc to keep large freed blocks for the next training step instead of unmapping them.
+
+    A step allocates and frees the same few large tensors; mapping them anew costs a page fault for
+    each 4 kB. Acts on this process; does nothing where the C library is not glibc.
+    """
+    if not sys.platform.startswith("linux"):
+        return
+    try:
+        mallopt = ctypes.CDLL("libc.so.6").mallopt
+    except (OSError, AttributeError):
+        return
+    m_trim_threshold, m_mmap_threshold = -1, -3
+    mallopt(m_mmap_threshold, 1 << 30)
+    mallopt(m_trim_threshold, (1 << 31) - 1)

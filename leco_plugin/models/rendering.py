@@ -1,0 +1,151 @@
+"""From intervals along rays to pixels: gate, field and volume rendering of packed samples."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from leco_plugin.models.field import HMoEField
+from leco_plugin.models.gate import Gate, occupancy_from_logits, route
+from leco_plugin.samplers.packed import (
+    accumulate_along_rays,
+    pack_info,
+    render_weight_from_density,
+)
+from leco_plugin.space import Space
+
+VISIBLE = 1e-4
+"""Samples whose rendering weight is below this are not coloured: all of a ray's together change a
+pixel by at most one step of an 8-bit image."""
+
+
+class Rays(NamedTuple):
+    """A batch of rays."""
+
+    origins: Tensor
+    """[R, 3] scene units."""
+    directions: Tensor
+    """[R, 3] unit vectors."""
+    t_mins: Tensor
+    """[R] where each ray begins, scene units."""
+    t_maxs: Tensor
+    """[R] where each ray ends."""
+    images: Tensor | None
+    """[R] int64 of the training image, or None at evaluation."""
+
+
+class Intervals(NamedTuple):
+    """Packed intervals, sorted by ray and distance."""
+
+    ray_indices: Tensor
+    """[M] int64."""
+    t_starts: Tensor
+    """[M] scene units."""
+    t_ends: Tensor
+    """[M] scene units."""
+
+
+class Shaded(NamedTuple):
+    """What the field says about packed intervals, and the pixels it gives."""
+
+    rgb: Tensor
+    """[R, 3] without background."""
+    accumulation: Tensor
+    """[R]."""
+    depth: Tensor
+    """[R] expected distance, scene units; the end of the ray where it meets nothing."""
+    weights: Tensor
+    """[M] rendering weights."""
+    sigmas: Tensor
+    """[M] densities per half extent."""
+    logits: Tensor
+    """[M, 1 + n] of the gate."""
+    routes: Tensor
+    """[M] int64, the expert of each sample."""
+    packed_info: Tensor
+    """[R, 2] start and count of each ray."""
+
+
+class Routing(NamedTuple):
+    """How samples are sent to experts."""
+
+    empty_below: float | None
+    """See `gate.route`."""
+    homogeneous: bool
+    """No empty-space expert at all: the gate chooses among the scene experts."""
+
+
+def gate_values_and_routes(logits: Tensor, routing: Routing) -> tuple[Tensor, Tensor]:
+    """G_i*(x) [M] float32 and i*(x) [M] int64."""
+    if routing.homogeneous:
+        scene = logits[:, 1:]
+        routes = scene.argmax(dim=-1)
+        values = scene.softmax(dim=-1).gather(1, routes[:, None])[:, 0]
+        return values, routes + 1
+    routes = route(logits, routing.empty_below)
+    return logits.softmax(dim=-1).gather(1, routes[:, None])[:, 0], routes
+
+
+def shade(
+    field: HMoEField,
+    gate: Gate,
+    space: Space,
+    rays: Rays,
+    intervals: Intervals,
+    routing: Routing,
+    freeze_gate: bool,
+) -> Shaded:
+    """Renders packed intervals; only visible samples are coloured.
+
+    Args:
+        freeze_gate: no gradient reaches the gate.
+    """
+    num_rays = len(rays.origins)
+    ray_indices, t_starts, t_ends = intervals
+    middles = 0.5 * (t_starts + t_ends)
+    positions = torch.addcmul(
+        rays.origins[ray_indices], rays.directions[ray_indices], middles[:, None]
+    )
+    mapped = space.map(positions).clamp(-1.0, 1.0)
+    with torch.set_grad_enabled(torch.is_grad_enabled() and not freeze_gate):
+        logits = gate(mapped)
+        gate_values, routes = gate_values_and_routes(logits, routing)
+    sigmas, features = field.density(mapped, routes, gate_values)
+    packed_info = pack_info(ray_indices, num_rays)
+    scale = space.half_extent
+    weights, _, _ = render_weight_from_density(
+        t_starts / scale, t_ends / scale, sigmas, packed_info=packed_info
+    )
+    visible = (weights.detach() > VISIBLE).nonzero()[:, 0]
+    rays_seen = ray_indices[visible]
+    images = rays.images[rays_seen] if rays.images is not None else None
+    colors = field.color(features[visible], rays.directions[rays_seen], images)
+    rgb = accumulate_along_rays(weights[visible], colors, rays_seen, num_rays)
+    sums = accumulate_along_rays(
+        weights, torch.stack([torch.ones_like(middles), middles], dim=-1), ray_indices, num_rays
+    )
+    accumulation = sums[:, 0]
+    depth = torch.where(
+        accumulation > 1e-6, sums[:, 1] / accumulation.clamp(min=1e-6), rays.t_maxs
+    )
+    return Shaded(rgb, accumulation, depth, weights, sigmas, logits, routes, packed_info)
+
+
+def per_ray_pictures(shaded: Shaded, ray_indices: Tensor, num_rays: int) -> dict[str, Tensor]:
+    """What the gate did along each ray, for the viewer: each [R, 1] float32.
+
+    `occupancy` is o(x) and `expert` the number of the expert, both averaged with the rendering
+    weights; `samples_per_ray` is a float because nerfstudio cannot show integers.
+    """
+    seen = torch.stack(
+        [occupancy_from_logits(shaded.logits), shaded.routes.to(shaded.weights.dtype)], dim=-1
+    )
+    sums = accumulate_along_rays(shaded.weights, seen, ray_indices, num_rays)
+    means = sums / shaded.accumulation.clamp(min=1e-6)[:, None]
+    return {
+        "occupancy": means[:, :1],
+        "expert": means[:, 1:],
+        "samples_per_ray": shaded.packed_info[:, 1:].float(),
+    }

@@ -1,0 +1,64 @@
+"""Sizes that fit the device: what `leco-occupancy` builds where the user has not said otherwise."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+from leco_plugin.models.encodings import EncodingConfig
+from leco_plugin.models.field import FieldConfig
+from leco_plugin.models.gate import GateConfig
+from leco_plugin.models.hmoe import HMoEConfig
+
+
+@dataclass(frozen=True)
+class Sizes:
+    """Everything whose best value depends on how much the machine can compute."""
+
+    gate: GateConfig = field(default_factory=GateConfig)
+    """The gating network."""
+    field: FieldConfig = field(default_factory=FieldConfig)
+    """The radiance field with its experts."""
+    learn_candidates: int = 64
+    """Candidates along a ray while the occupancy is learned."""
+    guided_batch: float = 2.0
+    """Rays of a batch once the occupancy guides, as a multiple of those before: most of their
+    samples are skipped."""
+    candidates: int = 128
+    """Candidates along a ray once the occupancy guides, and in every rendering."""
+
+
+SMALL = Sizes()
+"""Two CPU cores: a training step of a tenth of a second."""
+
+LARGE = Sizes(
+    gate=GateConfig(EncodingConfig(octaves=8), width=64, layers=3, scene_experts=8),
+    field=FieldConfig(
+        EncodingConfig(kind="hash", levels=12, features=4, log2_table=19, finest=4096),
+        HMoEConfig(scene_experts=8, width=128, layers=3),
+        appearance_dim=32,
+        color_width=128,
+    ),
+    learn_candidates=128,
+    candidates=512,
+)
+"""One GPU."""
+
+PAPER = Sizes(
+    gate=GateConfig(EncodingConfig(octaves=12), width=256, layers=3, scene_experts=8),
+    field=FieldConfig(
+        EncodingConfig(kind="frequency", octaves=12),
+        HMoEConfig(scene_experts=8, width=256, layers=7, skip=3),
+        appearance_dim=48,
+        color_width=128,
+        direction_octaves=4,
+    ),
+    learn_candidates=257,
+    guided_batch=1.0,
+    candidates=257,
+)
+"""The sizes of the paper: 8 scene experts of 7 layers of 256 units, 257 samples."""
+
+
+def sizes_for(device_type: str) -> Sizes:
+    """The default sizes of a device: `cpu`, `cuda` or `mps`."""
+    return LARGE if device_type == "cuda" else SMALL

@@ -1,0 +1,182 @@
+"""`Occupancy`: a frozen gate with its space, threshold and report, as one module and one small file.
+
+Torch and safetensors only: any project that samples rays can load `occupancy.safetensors`. Nothing
+in such a file is ever executed, and a file that is not sound is refused in one line.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+from pathlib import Path
+from typing import Any, Literal
+
+import torch
+from safetensors import SafetensorError, safe_open
+from safetensors.torch import save_file
+from torch import Tensor, nn
+
+from leco_plugin.models.gate import Gate, GateConfig
+from leco_plugin.space import Space
+
+FORMAT = "leco-occupancy"
+VERSION = 1
+LARGEST_FILE = 64 * 2**20
+"""Bytes; a thousand times a usual gate. A larger file is another thing by mistake."""
+
+Precision = Literal["float32", "bfloat16"]
+
+
+class Occupancy(nn.Module):
+    """Where a scene is occupied: o(x) = 1 - G_0(x), and whether o(x) reaches the threshold.
+
+    Attributes:
+        gate: the frozen gating network.
+        space: scene positions to the gate's cube.
+        precision: the type of matrix products it was trained and calibrated in; queries keep to it,
+            because the same weights decide otherwise in another one (DESIGN, section 3).
+        report: what was measured when it was calibrated, JSON values only.
+    """
+
+    threshold_value: Tensor
+
+    def __init__(
+        self,
+        gate: Gate,
+        space: Space,
+        threshold: float,
+        precision: Precision = "float32",
+        report: dict[str, Any] | None = None,
+    ) -> None:
+        super().__init__()
+        self.gate = gate
+        self.space = space
+        self.precision: Precision = precision
+        self.report = dict(report or {})
+        self.register_buffer("threshold_value", torch.tensor(float(threshold)))
+        self.requires_grad_(False)
+
+    @property
+    def threshold(self) -> float:
+        """tau: positions with o(x) >= tau are kept."""
+        return float(self.threshold_value)
+
+    @torch.no_grad()
+    def query(self, positions: Tensor) -> Tensor:
+        """o(x) of scene positions.
+
+        Args:
+            positions: [N, 3] float, scene units, on the module's device.
+        Returns:
+            [N] float32 in [0, 1]; 0 outside a bounded space and where a position is not finite.
+        """
+        mapped = self.space.map(positions)
+        inside = (mapped.abs() <= 1.0).all(dim=-1)  # false for NaN
+        with gate_precision(mapped.device.type, self.precision):
+            values = self.gate.occupancy(torch.where(inside[:, None], mapped, 0.0))
+        return torch.where(inside, values, 0.0)
+
+    def occupied(self, positions: Tensor) -> Tensor:
+        """Whether scene positions [N, 3] are kept: bool [N]."""
+        return self.query(positions) >= self.threshold_value
+
+    @property
+    def num_params(self) -> int:
+        """Learned numbers in the gate."""
+        return sum(parameter.numel() for parameter in self.gate.parameters())
+
+    def save(self, path: str | Path) -> None:
+        """Writes the file whole or not at all.
+
+        Raises:
+            OSError: the folder cannot be written to.
+        """
+        path = Path(path)
+        header = {
+            "format": FORMAT,
+            "version": str(VERSION),
+            "gate": json.dumps(self.gate.config.to_dict()),
+            "precision": self.precision,
+            "report": json.dumps(self.report),
+        }
+        tensors = {name: value.detach().cpu().contiguous() for name, value in self.state_dict().items()}
+        unfinished = path.with_name(f".{path.name}.{os.getpid()}.unfinished")
+        try:
+            save_file(tensors, unfinished, metadata=header)
+            unfinished.replace(path)
+        finally:
+            unfinished.unlink(missing_ok=True)
+
+    @classmethod
+    def load(cls, path: str | Path, device: str | torch.device = "cpu") -> Occupancy:
+        """Reads and checks a file written by `save`.
+
+        Raises:
+            OSError: there is no such file, or it cannot be read.
+            ValueError: the file is truncated, oversized, foreign, of another version, or holds
+                tensors that are missing, misshapen or not finite. One line each.
+        """
+        path = Path(path)
+        size = path.stat().st_size
+        if size > LARGEST_FILE:
+            raise ValueError(f"{path} has {size} bytes; an occupancy has at most {LARGEST_FILE}")
+        try:
+            with safe_open(path, framework="pt", device="cpu") as file:
+                header = file.metadata() or {}
+                tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
+        except (SafetensorError, ValueError, KeyError, TypeError, RuntimeError) as error:
+            reason = str(error).splitlines()[0]
+            raise ValueError(f"{path} is not a whole safetensors file: {reason}") from None
+        return cls._checked(path, header, tensors).to(device)
+
+    @classmethod
+    def _checked(cls, path: Path, header: dict[str, str], tensors: dict[str, Tensor]) -> Occupancy:
+        if header.get("format") != FORMAT:
+            raise ValueError(f"{path} is a safetensors file, but not an occupancy of leco_plugin")
+        if header.get("version") != str(VERSION):
+            raise ValueError(f"{path} has format version {header.get('version')}; this reads {VERSION}")
+        precision = header.get("precision")
+        if precision not in ("float32", "bfloat16"):
+            raise ValueError(f"{path} names an unknown precision {precision!r}")
+        try:
+            config = GateConfig.from_dict(json.loads(header["gate"]))
+            report = json.loads(header["report"])
+            expected = _expected_shapes(config)
+        except (KeyError, TypeError, ValueError, RuntimeError, OverflowError, RecursionError) as error:
+            raise ValueError(f"{path} has a damaged header: {str(error).splitlines()[0]}") from None
+        found = {name: (tuple(tensor.shape), tensor.dtype) for name, tensor in tensors.items()}
+        for name in sorted(expected.keys() | found.keys()):
+            if expected.get(name) != found.get(name):
+                raise ValueError(
+                    f"{path}: tensor {name} is {found.get(name)}, the header asks for {expected.get(name)}"
+                )
+        for name, tensor in tensors.items():
+            if tensor.is_floating_point() and not bool(tensor.isfinite().all()):
+                raise ValueError(f"{path}: tensor {name} holds values that are not finite")
+        if not 0.0 <= float(tensors["threshold_value"]) <= 1.0:
+            raise ValueError(f"{path}: the threshold {float(tensors['threshold_value'])} is not in [0, 1]")
+        if not float(tensors["space.half_extent"]) > 0.0:
+            raise ValueError(f"{path}: the half extent of its space is not positive")
+        occupancy = cls(Gate(config), Space(), 0.0, precision, report if isinstance(report, dict) else {})
+        occupancy.load_state_dict(tensors)
+        return occupancy.eval()
+
+
+def _expected_shapes(config: GateConfig) -> dict[str, tuple[tuple[int, ...], torch.dtype]]:
+    """Names, shapes and types that a file with this gate must hold, found without allocating it."""
+    encoding = config.encoding
+    counts = (config.width, config.layers, config.scene_experts, encoding.octaves, encoding.levels)
+    sizes = (*counts, encoding.features, encoding.log2_table, encoding.coarsest, encoding.finest)
+    if not all(type(size) is int and 0 < size < 2**20 for size in sizes) or max(counts[1:]) > 64:
+        raise ValueError(f"sizes out of range {sizes}")
+    if encoding.kind not in ("frequency", "hash") or not math.prod((2**min(encoding.log2_table, 40), 1)) < 2**25:
+        raise ValueError("an unknown encoding, or a table out of range")
+    with torch.device("meta"):
+        module = Occupancy(Gate(config), Space(), 0.0)
+    return {name: (tuple(value.shape), value.dtype) for name, value in module.state_dict().items()}
+
+
+def gate_precision(device_type: str, precision: Precision) -> torch.autocast:
+    """The context in which a gate of this precision is asked."""
+    return torch.autocast(device_type, dtype=torch.bfloat16, enabled=precision == "bfloat16")

@@ -1,0 +1,167 @@
+"""The interface that a packed host asks: two verbs, `sampling` and `update_every_n_steps`.
+
+Argument for argument that of nerfacc's `OccGridEstimator`, so that any estimator here can stand
+where a host has one. It is a plain `nn.Module` and no subclass of nerfacc's `AbstractEstimator`:
+neither nerfacc nor nerfstudio asks for that type, and a class whose ancestors depend on what is
+installed would differ between the machine that trains and the one that loads.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+from leco_plugin.samplers.marching import NearFn, OccupiedFn, Samples, march, plan
+from leco_plugin.samplers.rays import intersect_box
+from leco_plugin.samplers.visibility import SampleFn, front_to_back, prune
+
+
+class Estimator(nn.Module):
+    """Marches rays and keeps what a subclass calls occupied.
+
+    Attributes:
+        density_fn: density of a position, [N, 3] to [N] or [N, 1]. When a host sets it, evaluation
+            goes front to back and hands out no sample behind an opaque surface.
+        chunk_size: most candidates worked on at once; None chooses by device.
+    """
+
+    _place: Tensor
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.register_buffer("_place", torch.empty(0), persistent=False)
+        self.density_fn: Callable[[Tensor], Tensor] | None = None
+        self.chunk_size: int | None = None
+
+    @property
+    def device(self) -> torch.device:
+        """Where the estimator lives, and where rays must be."""
+        return self._place.device
+
+    def questions(self) -> tuple[OccupiedFn | None, NearFn | None]:
+        """What to ask of positions, and the coarse question if there is one, as for `march`."""
+        raise NotImplementedError
+
+    def bounds(self) -> Tensor | None:
+        """The box outside which nothing is occupied, [6] of (min, max); None is unbounded."""
+        raise NotImplementedError
+
+    def alpha_cap(self, alphas: Tensor) -> Tensor:
+        """The highest opacity threshold that pruning may use, from the opacities at hand.
+
+        A fixed threshold rejects every sample of a field that has just begun to learn, which then
+        gets no gradient and never learns; the mean never rejects them all.
+        """
+        return alphas.mean()
+
+    def update_every_n_steps(self, *args: Any, **kwargs: Any) -> None:
+        """Called by hosts before each training step."""
+        raise NotImplementedError
+
+    @torch.no_grad()
+    def sampling(
+        self,
+        rays_o: Tensor,
+        rays_d: Tensor,
+        sigma_fn: SampleFn | None = None,
+        alpha_fn: SampleFn | None = None,
+        near_plane: float = 0.0,
+        far_plane: float = 1e10,
+        t_min: Tensor | None = None,
+        t_max: Tensor | None = None,
+        render_step_size: float = 1e-3,
+        early_stop_eps: float = 1e-4,
+        alpha_thre: float = 0.0,
+        stratified: bool = False,
+        cone_angle: float = 0.0,
+    ) -> Samples:
+        """Samples along rays in occupied space.
+
+        Args:
+            rays_o, rays_d: origins and directions, world units, [n_rays, 3].
+            sigma_fn, alpha_fn: density or opacity of samples (t_starts [N], t_ends [N],
+                ray_indices [N]) -> [N]; with one of them, samples that cannot be seen are dropped.
+            near_plane, far_plane: where all rays begin and end, world units.
+            t_min, t_max: where each ray begins and ends, [n_rays]; the narrower range holds.
+            render_step_size: shortest step, world units.
+            early_stop_eps: transmittance below which a sample is unseen; 0 turns that off.
+            alpha_thre: opacity below which a sample is unseen, see `alpha_cap`; 0 turns it off.
+            stratified: shift each ray's samples by a random share of a step.
+            cone_angle: growth of the step with distance.
+
+        Returns:
+            ray_indices int64 [n_samples], t_starts [n_samples], t_ends [n_samples].
+
+        Raises:
+            ValueError: rays do not fit each other or this estimator's device, or have no end.
+        """
+        if rays_o.device != self.device:
+            raise ValueError(f"rays are on {rays_o.device}, the estimator on {self.device}")
+        t_mins = torch.full_like(rays_o[..., 0], near_plane)
+        t_maxs = torch.full_like(rays_o[..., 0], far_plane)
+        for name, limit in (("t_min", t_min), ("t_max", t_max)):
+            if limit is not None and limit.shape != t_mins.shape:
+                raise ValueError(f"{name} must be {list(t_mins.shape)}, got {list(limit.shape)}")
+        t_mins = t_mins if t_min is None else t_mins.maximum(t_min.to(t_mins))
+        t_maxs = t_maxs if t_max is None else t_maxs.minimum(t_max.to(t_maxs))
+        jitter = torch.rand_like(t_mins) if stratified else None
+        t_enters = None
+        bounds = self.bounds()
+        if bounds is not None and rays_o.dim() == 2 and rays_o.shape == rays_d.shape:
+            t_enters, t_leaves = intersect_box(rays_o, rays_d, bounds.to(rays_o))
+            t_maxs = t_maxs.minimum(t_leaves)
+
+        occupied, near_occupied = self.questions()
+        asked = sigma_fn is not None or alpha_fn is not None
+        if self.density_fn is not None and not (self.training or asked) and early_stop_eps > 0.0:
+            candidates, _, longest = plan(
+                rays_o, rays_d, t_mins, t_maxs, render_step_size, cone_angle, jitter, t_enters
+            )
+            return front_to_back(
+                candidates,
+                longest,
+                occupied=occupied,
+                near_occupied=near_occupied,
+                sigma_fn=densities_of_samples(self.density_fn, rays_o, rays_d),
+                early_stop_eps=early_stop_eps,
+            )
+        samples = march(
+            rays_o,
+            rays_d,
+            t_mins,
+            t_maxs,
+            step_size=render_step_size,
+            cone_angle=cone_angle,
+            jitter=jitter,
+            occupied=occupied,
+            near_occupied=near_occupied,
+            t_enters=t_enters,
+            chunk_size=self.chunk_size,
+        )
+        if not asked or (early_stop_eps <= 0.0 and alpha_thre <= 0.0):
+            return samples
+        return prune(
+            samples,
+            len(rays_o),
+            sigma_fn=sigma_fn,
+            alpha_fn=alpha_fn,
+            early_stop_eps=early_stop_eps,
+            alpha_thre=alpha_thre,
+            alpha_cap=self.alpha_cap,
+        )
+
+
+def densities_of_samples(
+    density_fn: Callable[[Tensor], Tensor], rays_o: Tensor, rays_d: Tensor
+) -> SampleFn:
+    """Density of samples from the density of positions, asked at the midpoints."""
+
+    def sigma_fn(t_starts: Tensor, t_ends: Tensor, ray_indices: Tensor) -> Tensor:
+        midpoints = ((t_starts + t_ends) * 0.5)[:, None]
+        origins, directions = (rays.index_select(0, ray_indices) for rays in (rays_o, rays_d))
+        return density_fn(torch.addcmul(origins, directions, midpoints)).reshape(-1)
+
+    return sigma_fn

@@ -1,0 +1,229 @@
+"""A frozen gate's decisions on cells, so that only positions near its boundary ask the gate itself.
+
+Three levels in the mapped cube [-1, 1]^3, so that unbounded scenes are covered. A coarse cell is
+empty, occupied or mixed. A mixed one owns a brick of 4^3 fine cells, each again empty, occupied or
+mixed. A mixed fine cell holds a plane, the gate's logit to first order, with the error to expect
+of it: beside the plane it decides, on it the gate is asked, as it is outside the cube. Where a
+2-bit state for each cell would leave 2% of the cube to the gate, a plane for each mixed cell of
+half the resolution leaves 0.5% in the same memory. How cells are judged: `cache_build.py`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Literal, NamedTuple, Protocol
+
+import torch
+from torch import Tensor, nn
+
+EMPTY, OCCUPIED, MIXED = 0, 1, 2
+
+BRICK = 4
+"""Fine cells along a coarse one."""
+
+COARSE_EMPTY, COARSE_OCCUPIED, COARSE_OUTSIDE = -1, -2, -3
+"""Values of the coarse table beside the numbers of bricks, which are >= 0."""
+
+FINE_EMPTY, FINE_OCCUPIED = 64, 65
+"""Values of the fine table beside the numbers of planes within a brick, 0 to 63."""
+
+FARTHEST = 15
+"""Largest clearance that is stored, in half coarse cells: what four bits hold."""
+
+
+class SpaceLike(Protocol):
+    """What the cache asks of a space mapping."""
+
+    @property
+    def kind(self) -> Literal["box", "contraction"]: ...
+    @property
+    def center(self) -> Tensor: ...
+    @property
+    def half_extent(self) -> Tensor: ...
+    def map(self, positions: Tensor) -> Tensor: ...
+    def unmap(self, mapped: Tensor) -> Tensor: ...
+
+
+class OccupancyLike(Protocol):
+    """What the samplers ask of a frozen occupancy."""
+
+    @property
+    def space(self) -> SpaceLike: ...
+    @property
+    def threshold(self) -> float: ...
+    def query(self, positions: Tensor) -> Tensor: ...
+    def occupied(self, positions: Tensor) -> Tensor: ...
+
+
+@dataclass(frozen=True)
+class CacheReport:
+    """What building a cache found; stored beside it."""
+
+    resolution: int
+    """Coarse cells along the cube; there are four times as many fine ones."""
+    bytes: int
+    """Memory of the tables."""
+    differing: float
+    """Share of random decisions in the cube that differ from the gate's, as measured."""
+    differing_bound: float
+    """The same plus two standard deviations: what is compared with the tolerance."""
+    checked: int
+    """Number of decisions behind these figures."""
+    asked: float
+    """Share of the cube for which the gate is still asked."""
+    margin: float
+    """How far from the threshold a cell's logits had to stay, in units of their spread."""
+    caution: float
+    """Errors of a plane, as measured, within which it does not decide."""
+
+
+class Tables(NamedTuple):
+    """What a cache holds."""
+
+    coarse: Tensor
+    """(resolution + 2)^3 values as above, COARSE_OUTSIDE around the cube; int16 or int32, flat."""
+    fine: Tensor
+    """Values as above of the fine cells of each brick; uint8 [n_bricks, 64]."""
+    first_plane: Tensor
+    """Number of each brick's first plane, int32 [n_bricks]."""
+    planes: Tensor
+    """Plane a + b.u over a fine cell, u in [-1, 1]^3, and the height |a + b.u| up to which it does
+    not decide, in one unit; int8 [5, n_planes], a column contiguous because each is read alone."""
+    clearance: Tensor
+    """Whole empty half coarse cells around each half coarse cell (maximum norm), up to 15; two to
+    a byte, uint8 [4 resolution^3], flat."""
+
+    @property
+    def bytes(self) -> int:
+        """Memory of all tables."""
+        return sum(table.numel() * table.element_size() for table in self)
+
+
+class CellCache(nn.Module):
+    """Lookup of cell decisions; build one with `cache_build.build_cache`.
+
+    Args:
+        tables: the cells.
+        space: the mapping of the occupancy that they were judged by.
+        report: what building found.
+    """
+
+    coarse: Tensor
+    fine: Tensor
+    first_plane: Tensor
+    planes: Tensor
+    clearance: Tensor
+    scale: Tensor
+    shift: Tensor
+
+    def __init__(self, tables: Tables, space: SpaceLike, report: CacheReport) -> None:
+        super().__init__()
+        self.report = report
+        self.resolution = report.resolution
+        self._map: Callable[[Tensor], Tensor] | None = None
+        scale = torch.full((1,), report.resolution / 2.0)
+        shift = torch.full((3,), report.resolution / 2.0 + 1.0)
+        if space.kind == "box":
+            # An affine mapping folds into the scaling to cells.
+            scale = scale / space.half_extent.detach().cpu()
+            shift = shift - space.center.detach().cpu() * scale
+        else:
+            self._map = space.map
+        self.half_extent = float(space.half_extent)
+        self.center = [float(value) for value in space.center]
+        for name, table in tables._asdict().items():
+            self.register_buffer(name, table, persistent=False)
+        self.register_buffer("scale", scale.float().view(1, 1), persistent=False)
+        self.register_buffer("shift", shift.float().view(3, 1), persistent=False)
+
+    def tables(self) -> Tables:
+        """The tables, where they are now."""
+        return Tables(self.coarse, self.fine, self.first_plane, self.planes, self.clearance)
+
+    def decide(self, positions: Tensor) -> tuple[Tensor, Tensor]:
+        """Decisions as far as cells know them.
+
+        Args:
+            positions: world units, [N, 3].
+
+        Returns:
+            occupied bool [N], False where open; and the indices of positions that are left open,
+            int64 [n_open]: the gate's to answer.
+        """
+        cells = self._cells(positions)
+        corners = cells.floor()
+        width = self.resolution + 2
+        known = self.coarse.index_select(0, _flat(corners, width))
+        occupied = known == COARSE_OCCUPIED
+        refer = torch.logical_or(known >= 0, known == COARSE_OUTSIDE).nonzero()[:, 0]
+        if refer.numel() == 0 or self.fine.numel() == 0:
+            return occupied, refer
+
+        brick = known.index_select(0, refer).to(torch.int32)
+        within = cells.index_select(1, refer).sub_(corners.index_select(1, refer)).mul_(BRICK)
+        corners = within.floor()
+        at = brick.clamp(min=0) * BRICK**3 + _flat(corners, BRICK)
+        known = self.fine.view(-1).index_select(0, at).masked_fill_(brick < 0, 0)
+        occupied.index_put_((refer,), known == FINE_OCCUPIED)
+        chosen = (known < FINE_EMPTY).nonzero()[:, 0]
+        refer, brick = refer.index_select(0, chosen), brick.index_select(0, chosen)
+        within = within.index_select(1, chosen).sub_(corners.index_select(1, chosen))
+
+        outside = brick < 0
+        plane = self.first_plane.index_select(0, brick.clamp_(min=0))
+        plane += known.index_select(0, chosen)
+        if self.planes.shape[1] == 0:
+            return occupied, refer
+        offset, *slopes, error = (row.index_select(0, plane).float() for row in self.planes)
+        for slope, along in zip(slopes, within.mul_(2.0).sub_(1.0), strict=True):
+            offset.addcmul_(slope, along)
+        occupied.index_put_((refer,), offset > 0.0)
+        still_open = torch.logical_or(offset.abs() <= error, outside).nonzero()[:, 0]
+        return occupied, refer.index_select(0, still_open)
+
+    def near(self, positions: Tensor, radii: Tensor) -> Tensor:
+        """Whether anything within `radii` of `positions` may be occupied (the coarse question).
+
+        Args:
+            positions: world units, [N, 3].
+            radii: world units, [N].
+
+        Returns:
+            bool [N]; False is certain as far as the cells are.
+        """
+        halves = self._cells(positions).sub_(1.0).mul_(2.0).floor_()
+        width = 2 * self.resolution
+        inside = ((halves >= 0.0) & (halves < width)).all(dim=0)
+        index = _flat(halves.clamp_(0.0, width - 1.0), width)
+        pair = self.clearance.index_select(0, index >> 1)
+        clear = (pair >> ((index & 1) << 2).to(torch.uint8)) & 15
+        # The ball's centre lies anywhere in its cell, so it reaches past `clear` whole cells only
+        # when it is wider than they are.
+        reach = radii * self._stretch(positions, radii) * 2.0
+        return (reach >= clear).logical_or_(inside.logical_not_())
+
+    def _stretch(self, positions: Tensor, radii: Tensor) -> Tensor:
+        """Bound on cells per world unit (maximum norm) within the balls.
+
+        The contraction f(x) = x (2 - 1/m) / m, m = max|x|, has Jacobian rows whose absolute sum is
+        at most (4m - 3) / m^2, which grows to 4/3 at m = 3/2 and falls after.
+        """
+        if self._map is None:
+            return self.scale[0]
+        distance = positions.new_tensor(self.center)[:, None].sub(positions.T).abs().amax(dim=0)
+        inner = ((distance - radii) / self.half_extent).clamp(min=1.5)
+        return (0.5 / self.half_extent) * self.scale[0] * (4.0 * inner - 3.0) / inner.square()
+
+    def _cells(self, positions: Tensor) -> Tensor:
+        """Coordinates in coarse cells, of which the border is the first and the last; [3, N]."""
+        if self._map is not None:
+            positions = self._map(positions)
+        cells = torch.addcmul(self.shift, positions.T, self.scale)
+        return cells.nan_to_num_(nan=0.0).clamp_(0.0, self.resolution + 1.5)
+
+
+def _flat(corners: Tensor, width: int) -> Tensor:
+    """Index of cells [3, N] in a flat table; whole floats are exact up to a width of 256."""
+    index = torch.add(corners[1], corners[0], alpha=width)
+    return torch.add(corners[2], index, alpha=width).to(torch.int32)

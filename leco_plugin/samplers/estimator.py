@@ -1,0 +1,107 @@
+"""The frozen gate in the place of an occupancy grid.
+
+A host calls it as it calls nerfacc's `OccGridEstimator`; there is nothing to update, no box to
+guess, and the cells of a cache answer for the gate wherever they are sure.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from leco_plugin.samplers.base import Estimator
+from leco_plugin.samplers.cache import CellCache, OccupancyLike
+from leco_plugin.samplers.cache_build import build_cache
+from leco_plugin.samplers.marching import NearFn, OccupiedFn
+
+ANSWER_RESOLUTION = 64
+"""Cells along each axis in which `binaries` and `occs` answer."""
+
+
+class LearnedOccupancyEstimator(Estimator):
+    """Samples where a frozen gate says that there is something.
+
+    Args:
+        occupancy: the frozen gate with its space and threshold.
+        aabb: box (min, max) to which rays are clipped, world units, [6]; None is the box of a
+            bounded space, and no box for an unbounded one.
+        cache_bytes: budget of the cell cache; 0 asks the gate about every candidate.
+        tolerance: largest share of decisions by which the cache may differ from the gate.
+
+    Raises:
+        ValueError: see `cache_build.build_cache`.
+    """
+
+    def __init__(
+        self,
+        occupancy: OccupancyLike,
+        aabb: Sequence[float] | Tensor | None = None,
+        *,
+        cache_bytes: int = 1 << 20,
+        tolerance: float = 1e-4,
+    ) -> None:
+        super().__init__()
+        self.occupancy = occupancy
+        self.to(occupancy.space.center.device)
+        box = torch.empty(0, 6) if aabb is None else torch.as_tensor(aabb).detach().reshape(1, 6)
+        if aabb is None and occupancy.space.kind == "box":
+            box = self._uncontracted_box()
+        self.register_buffer("_box", box.float().to(self.device), persistent=False)
+        self.cache: CellCache | None = None
+        if cache_bytes > 0:
+            self.cache = build_cache(occupancy, budget=cache_bytes, tolerance=tolerance)
+
+    _box: Tensor
+
+    def _uncontracted_box(self) -> Tensor:
+        space = self.occupancy.space
+        return torch.cat(
+            [space.center - space.half_extent, space.center + space.half_extent]
+        ).reshape(1, 6)
+
+    def questions(self) -> tuple[OccupiedFn | None, NearFn | None]:
+        return self.occupied, None if self.cache is None else self.cache.near
+
+    def bounds(self) -> Tensor | None:
+        return self._box[0] if len(self._box) else None
+
+    @torch.no_grad()
+    def occupied(self, positions: Tensor) -> Tensor:
+        """The gate's decision, from the cache where it is sure; positions [N, 3] to bool [N]."""
+        if self.cache is None:
+            return self.occupancy.occupied(positions)
+        decided, left_open = self.cache.decide(positions)
+        if left_open.numel():
+            decided[left_open] = self.occupancy.occupied(positions.index_select(0, left_open))
+        return decided
+
+    def update_every_n_steps(self, *args: Any, **kwargs: Any) -> None:
+        """Nothing to update: the gate is frozen."""
+
+    @property
+    def aabbs(self) -> Tensor:
+        """Boxes as `OccGridEstimator` has them, [1, 6]; of an unbounded space the inner cube."""
+        return self._box if len(self._box) else self._uncontracted_box()
+
+    @property
+    def resolution(self) -> Tensor:
+        """Cells along each axis of `binaries`, int32 [3]."""
+        return torch.full((3,), ANSWER_RESOLUTION, dtype=torch.int32, device=self.device)
+
+    @property
+    def occs(self) -> Tensor:
+        """o at the cell centres of `aabbs`, [resolution^3]; asked anew at each call."""
+        axis = (torch.arange(ANSWER_RESOLUTION, device=self.device) + 0.5) / ANSWER_RESOLUTION
+        units = torch.stack(torch.meshgrid(axis, axis, axis, indexing="ij"), dim=-1).view(-1, 3)
+        low, high = self.aabbs[0].view(2, 3)
+        with torch.no_grad():
+            return self.occupancy.query(low + units * (high - low))
+
+    @property
+    def binaries(self) -> Tensor:
+        """Decisions at the cell centres of `aabbs`, bool [1, resolution, resolution, resolution]."""
+        occupied = self.occs >= self.occupancy.threshold
+        return occupied.view(1, *[ANSWER_RESOLUTION] * 3)

@@ -1,0 +1,70 @@
+"""What counts as a ray: shapes, types and devices that fit, and which rays can be marched at all.
+
+A ray that is not finite, has no direction or ends before it begins gets no samples rather than an
+error: one bad pixel of a batch must not end a training run.
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+
+def check_rays(
+    origins: Tensor,
+    directions: Tensor,
+    t_mins: Tensor,
+    t_maxs: Tensor,
+    jitter: Tensor | None = None,
+    t_enters: Tensor | None = None,
+) -> None:
+    """Raise unless the tensors describe one batch of rays.
+
+    Raises:
+        ValueError: a tensor is not [n_rays, 3] or [n_rays] as it should be, its type or device
+            differs from that of `origins`, or the type is not float32 or float64 (half precision
+            cannot tell neighbouring steps apart).
+    """
+    if origins.dtype not in (torch.float32, torch.float64):
+        raise ValueError(f"rays must be float32 or float64, got {origins.dtype}")
+    n_rays = origins.shape[0] if origins.dim() else 0
+    named = {"t_mins": t_mins, "t_maxs": t_maxs, "jitter": jitter, "t_enters": t_enters}
+    shapes: dict[str, tuple[Tensor | None, tuple[int, ...]]] = {
+        "origins": (origins, (n_rays, 3)),
+        "directions": (directions, (n_rays, 3)),
+        **{name: (tensor, (n_rays,)) for name, tensor in named.items()},
+    }
+    for name, (tensor, shape) in shapes.items():
+        if tensor is None:
+            continue
+        if tensor.shape != shape:
+            raise ValueError(f"{name} must be {list(shape)}, got {list(tensor.shape)}")
+        if tensor.dtype != origins.dtype or tensor.device != origins.device:
+            raise ValueError(
+                f"{name} is {tensor.dtype} on {tensor.device}, but origins are {origins.dtype} on "
+                f"{origins.device}"
+            )
+
+
+def usable_rays(origins: Tensor, directions: Tensor, t_mins: Tensor, t_maxs: Tensor) -> Tensor:
+    """Which rays are finite, go somewhere and begin before they end: bool [n_rays]."""
+    finite = (origins.isfinite() & directions.isfinite()).all(dim=-1) & t_mins.isfinite()
+    return finite & (directions != 0).any(dim=-1) & (t_mins < t_maxs)
+
+
+def intersect_box(origins: Tensor, directions: Tensor, aabb: Tensor) -> tuple[Tensor, Tensor]:
+    """Where rays enter and leave an axis-aligned box (the slab method).
+
+    Args:
+        origins, directions: [n_rays, 3].
+        aabb: (min, max) corners, [6].
+
+    Returns:
+        t of entry and of exit, [n_rays]; a ray that misses enters after it leaves. Entry is
+        negative where the origin lies inside.
+    """
+    to_low, to_high = (aabb[:3] - origins) / directions, (aabb[3:] - origins) / directions
+    # 0/0 on a face that the ray runs along: neither bound on this axis.
+    near = torch.minimum(to_low, to_high).nan_to_num(nan=-torch.inf)
+    far = torch.maximum(to_low, to_high).nan_to_num(nan=torch.inf)
+    return near.amax(dim=-1), far.amin(dim=-1)

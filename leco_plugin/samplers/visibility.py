@@ -1,0 +1,157 @@
+"""Samples that no light reaches the camera from need no shading: pruning by transmittance.
+
+Two ways to the same answer. `prune` asks the density of all samples at once, as nerfacc does.
+`front_to_back` asks it in slabs and stops a ray when its transmittance falls below the threshold,
+so that nothing behind an opaque surface is ever asked.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+
+import torch
+from torch import Tensor
+
+from leco_plugin.samplers.marching import Candidates, NearFn, OccupiedFn, Samples, join, keep
+from leco_plugin.samplers.packed import (
+    render_transmittance_from_alpha,
+    render_transmittance_from_density,
+)
+
+SampleFn = Callable[[Tensor, Tensor, Tensor], Tensor]
+"""t_starts [N], t_ends [N], ray_indices [N] to densities or opacities [N]."""
+
+AlphaCapFn = Callable[[Tensor], Tensor]
+"""Opacities [N] to the highest opacity threshold that may be asked for, a scalar tensor."""
+
+
+def transmittance_of(
+    samples: Samples, n_rays: int, sigma_fn: SampleFn | None, alpha_fn: SampleFn | None
+) -> tuple[Tensor, Tensor]:
+    """Transmittance in front of each sample and its opacity, from whichever function is given.
+
+    Raises:
+        ValueError: the function's answer is not one number for each sample.
+    """
+    ray_indices, t_starts, t_ends = samples
+    query = sigma_fn if sigma_fn is not None else alpha_fn
+    assert query is not None
+    answers = query(t_starts, t_ends, ray_indices)
+    if answers.shape != t_starts.shape:
+        raise ValueError(
+            f"sigma_fn or alpha_fn must answer {list(t_starts.shape)}, got {list(answers.shape)}"
+        )
+    if sigma_fn is None:
+        trans = render_transmittance_from_alpha(answers, ray_indices=ray_indices, n_rays=n_rays)
+        return trans, answers
+    return render_transmittance_from_density(
+        t_starts, t_ends, answers, ray_indices=ray_indices, n_rays=n_rays
+    )
+
+
+@torch.no_grad()
+def prune(
+    samples: Samples,
+    n_rays: int,
+    *,
+    sigma_fn: SampleFn | None = None,
+    alpha_fn: SampleFn | None = None,
+    early_stop_eps: float = 1e-4,
+    alpha_thre: float = 0.0,
+    alpha_cap: AlphaCapFn | None = None,
+) -> Samples:
+    """Samples with T >= early_stop_eps and alpha >= alpha_thre.
+
+    Args:
+        samples: as `march` returns them.
+        n_rays: number of rays.
+        sigma_fn, alpha_fn: densities or opacities of samples; one of the two.
+        alpha_cap: keeps `alpha_thre` from rejecting everything, see `Estimator.alpha_cap`.
+
+    Returns:
+        The samples that are left, in the same order.
+    """
+    if samples[0].numel() == 0:
+        return samples
+    trans, alphas = transmittance_of(samples, n_rays, sigma_fn, alpha_fn)
+    left = _visible(trans, alphas, early_stop_eps, alpha_thre, alpha_cap).nonzero()[:, 0]
+    ray_indices, t_starts, t_ends = (tensor.index_select(0, left) for tensor in samples)
+    return ray_indices, t_starts, t_ends
+
+
+def _visible(
+    trans: Tensor,
+    alphas: Tensor,
+    early_stop_eps: float,
+    alpha_thre: float,
+    alpha_cap: AlphaCapFn | None,
+) -> Tensor:
+    visible = trans >= early_stop_eps
+    if alpha_thre > 0.0:
+        threshold = alphas.new_tensor(alpha_thre)
+        if alpha_cap is not None:
+            threshold = threshold.minimum(alpha_cap(alphas).to(threshold))
+        visible &= alphas >= threshold
+    return visible
+
+
+@torch.no_grad()
+def front_to_back(
+    candidates: Candidates,
+    n_steps: int,
+    *,
+    occupied: OccupiedFn | None,
+    sigma_fn: SampleFn,
+    early_stop_eps: float,
+    near_occupied: NearFn | None = None,
+    slab: int = 64,
+) -> Samples:
+    """The samples of `march` with T >= early_stop_eps, asking densities only as far as light goes.
+
+    Args:
+        candidates, n_steps: as `plan` returns them: of which rays, and the most of any ray.
+        occupied, near_occupied: as for `march`.
+        sigma_fn: densities of samples; `ray_indices` are those of the rays in `candidates`.
+        early_stop_eps: transmittance in (0, 1) below which a ray is given up; the colour of a
+            pixel changes by no more than this.
+        slab: candidates by which each ray advances between two looks at its transmittance.
+
+    Returns:
+        Samples sorted by ray, then t.
+    """
+    if not 0.0 < early_stop_eps < 1.0:
+        raise ValueError(f"front-to-back needs early_stop_eps in (0, 1), got {early_stop_eps}")
+    opaque = -math.log(early_stop_eps)
+    n_rays = len(candidates.counts)
+    alive = torch.arange(n_rays, device=candidates.counts.device)
+    depths = torch.zeros_like(candidates.t_mins)
+    kept: list[Samples] = []
+    for first_step in range(0, n_steps, slab):
+        ahead = candidates.counts.index_select(0, alive) > first_step
+        ahead &= depths.index_select(0, alive) <= opaque
+        alive = alive.index_select(0, ahead.nonzero()[:, 0])
+        if alive.numel() == 0:
+            break
+        part = candidates.of_rays(alive).window(first_step, slab)
+        ray_indices, t_starts, t_ends = keep(part, slab, False, occupied, near_occupied)
+        if ray_indices.numel() == 0:
+            continue
+        ray_indices = alive.index_select(0, ray_indices)
+        sigmas = sigma_fn(t_starts, t_ends, ray_indices)
+        trans, _ = render_transmittance_from_density(
+            t_starts, t_ends, sigmas, ray_indices=ray_indices, n_rays=n_rays
+        )
+        trans = trans * torch.exp(-depths).index_select(0, ray_indices)
+        seen = (trans >= early_stop_eps).nonzero()[:, 0]
+        kept.append(
+            (
+                ray_indices.index_select(0, seen),
+                t_starts.index_select(0, seen),
+                t_ends.index_select(0, seen),
+            )
+        )
+        depths.index_add_(0, ray_indices, (sigmas * (t_ends - t_starts)).to(depths.dtype))
+    ray_indices, t_starts, t_ends = join(kept, candidates.t_mins)
+    ray_indices, order = ray_indices.sort(stable=True)
+    return ray_indices, t_starts.index_select(0, order), t_ends.index_select(0, order)

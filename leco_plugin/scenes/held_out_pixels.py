@@ -1,0 +1,83 @@
+"""Training pixels that are never trained on: what the threshold of the gate is calibrated with.
+
+A thin lattice of pixels of the training images is left out of every batch. It needs no memory, and
+is the same on every process and after every resume.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any
+
+import torch
+from nerfstudio.data.pixel_samplers import PixelSampler, PixelSamplerConfig
+from torch import Tensor
+
+PERIOD = 11
+"""Of 121 pixels one is held out."""
+_OFFSET = 5
+
+
+def is_held_out(indices: Tensor) -> Tensor:
+    """Whether pixels (image, row, column) [N, 3] are held out: bool [N]."""
+    return ((indices[:, 1] % PERIOD == _OFFSET) & (indices[:, 2] % PERIOD == _OFFSET)).bool()
+
+
+@dataclass
+class HeldOutPixelSamplerConfig(PixelSamplerConfig):
+    """Samples pixels uniformly, except for a lattice that calibration keeps to itself."""
+
+    _target: type = field(default_factory=lambda: HeldOutPixelSampler)
+    """target class to instantiate"""
+
+
+class HeldOutPixelSampler(PixelSampler):
+    """nerfstudio's sampler with a lattice of pixels left out of training."""
+
+    def sample_method(
+        self,
+        batch_size: int,
+        num_images: int,
+        image_height: int,
+        image_width: int,
+        mask: Tensor | None = None,
+        device: torch.device | str = "cpu",
+    ) -> Tensor:
+        """[batch_size, 3] of (image, row, column); a held-out pixel gives way to its neighbour."""
+        indices = super().sample_method(
+            batch_size, num_images, image_height, image_width, mask, device
+        )
+        columns = indices[:, 2]
+        aside = torch.where(columns + 1 < image_width, columns + 1, columns - 1)
+        indices[:, 2] = torch.where(is_held_out(indices), aside, columns)
+        return indices
+
+    def sample_held_out(self, images: dict[str, Any], count: int, seed: int) -> dict[str, Tensor]:
+        """A batch of held-out pixels, as `sample` returns it for training; the same for a seed.
+
+        Args:
+            images: a batch of the image data loader: `image` [K, H, W, C] (or a list of [H, W, C]),
+                `image_idx` [K], and `mask` where there are masks.
+            count: pixels wanted; fewer come back where masks leave fewer.
+        Returns:
+            `image` [N, C] and `indices` [N, 3] int64 (image, row, column).
+        """
+        generator = torch.Generator().manual_seed(seed)
+        pictures = images["image"]
+        which = torch.randint(len(pictures), (count,), generator=generator)
+        sizes = torch.tensor([picture.shape[:2] for picture in pictures])[which]
+        cells = ((sizes - _OFFSET - 1) // PERIOD + 1).clamp(min=1)
+        places = (torch.rand(count, 2, generator=generator) * cells).long() * PERIOD + _OFFSET
+        rows, columns = torch.minimum(places, sizes - 1).unbind(dim=-1)
+        if "mask" in images:
+            masks = images["mask"]
+            seen = torch.tensor(
+                [bool(masks[i][r, c].all()) for i, r, c in zip(which, rows, columns)]
+            )
+            which, rows, columns = which[seen], rows[seen], columns[seen]
+        if isinstance(pictures, Tensor):
+            colors = pictures[which, rows, columns]
+        else:
+            colors = torch.stack([pictures[i][r, c] for i, r, c in zip(which, rows, columns)])
+        numbers = torch.as_tensor(images["image_idx"]).cpu()[which]
+        return {"image": colors, "indices": torch.stack([numbers, rows, columns], dim=-1)}

@@ -1,0 +1,14 @@
+"""The error for what a user can mend: one line on the terminal, and no traceback."""
+
+from __future__ import annotations
+
+
+class InputError(SystemExit, ValueError):
+    """Something given to a command is wrong; the message names the cause and the remedy.
+
+    As a `SystemExit` it ends any `ns-*` command with its one line and status 1; as a `ValueError`
+    it is caught by whoever calls these functions as a library.
+    """
+
+    def __str__(self) -> str:
+        return str(self.code)

@@ -1,0 +1,147 @@
+"""The default reader of photographs: nerfstudio's own format, with the usual mistakes named in one line.
+
+Beyond nerfstudio's parser it checks the folder before anything is loaded, leaves scenes that are
+already upright as they are, and reads the sparse points without open3d.
+"""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from nerfstudio.data.dataparsers.base_dataparser import DataparserOutputs
+from nerfstudio.data.dataparsers.nerfstudio_dataparser import Nerfstudio, NerfstudioDataParserConfig
+from nerfstudio.plugins.registry_dataparser import DataParserSpecification
+from torch import Tensor
+
+from leco_plugin.scenes.input_error import InputError
+
+POINTS = "leco_sparse_points"
+"""Key of the dataset's metadata with the sparse points [P, 3] in model coordinates."""
+
+
+@dataclass
+class LecoPhotographsDataParserConfig(NerfstudioDataParserConfig):
+    """A nerfstudio scene, checked before it is loaded"""
+
+    _target: type = field(default_factory=lambda: LecoPhotographs)
+    """target class to instantiate"""
+
+
+class LecoPhotographs(Nerfstudio):
+    """Reads transforms.json and its images."""
+
+    config: LecoPhotographsDataParserConfig
+
+    def _generate_dataparser_outputs(self, split: str = "train") -> DataparserOutputs:
+        meta = check_scene(self.config.data)
+        if "orientation_override" not in meta and self.config.orientation_method == "up":
+            poses = np.array([frame["transform_matrix"] for frame in meta["frames"]], dtype=float)
+            if taken_from_above(poses):
+                # nerfstudio's "up" would take the photographs' top edges for up, and tip the scene
+                self.config.orientation_method = "none"
+        outputs: DataparserOutputs = super()._generate_dataparser_outputs(split)
+        if len(outputs.image_filenames) == 0:
+            raise InputError(f"{self.config.data}: no image is left for the split {split!r}")
+        points = read_points(meta, folder_of(self.config.data))
+        if points is not None:
+            transform, scale = outputs.dataparser_transform, outputs.dataparser_scale
+            outputs.metadata[POINTS] = scale * (points @ transform[:, :3].T + transform[:, 3])
+        return outputs
+
+
+def folder_of(data: Path) -> Path:
+    """The folder that a scene's paths are relative to; `data` is it, or the json file in it."""
+    return data.parent if data.suffix == ".json" else data
+
+
+def taken_from_above(poses: np.ndarray) -> bool:
+    """Whether nearly all cameras [C, 4, 4] look down along -z: then +z is already up."""
+    return bool(np.mean(poses[:, 2, 2] > 0.7) > 0.75)
+
+
+def check_scene(data: Path) -> dict[str, Any]:
+    """Reads the description of a scene and says what is wrong with it, if anything is.
+
+    Raises:
+        InputError: one line: no such folder, no cameras, missing images, images that disagree with
+            the intrinsics, poses that are not poses.
+    """
+    if not data.exists():
+        raise InputError(f"there is no folder {data}; give one with --data")
+    description = data if data.suffix == ".json" else data / "transforms.json"
+    if not description.exists():
+        raise InputError(
+            f"{data} holds no transforms.json; make one from photographs with ns-process-data"
+        )
+    try:
+        meta = json.loads(description.read_text())
+        frames = meta["frames"]
+        paths = [frame["file_path"] for frame in frames]
+        poses = np.array([frame["transform_matrix"] for frame in frames], dtype=float)
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        reason = f"{type(error).__name__}: {str(error).splitlines()[0] if str(error) else ''}"
+        raise InputError(f"{description} is not a scene in nerfstudio's format ({reason})") from None
+    if len(frames) == 0:
+        raise InputError(f"{description} has no cameras: its list of frames is empty")
+    if poses.shape[1:] not in ((4, 4), (3, 4)) or not np.isfinite(poses).all():
+        raise InputError(f"{description} holds a transform_matrix that is no finite 4 x 4 matrix")
+    determinants = np.linalg.det(poses[:, :3, :3])
+    if np.abs(determinants - 1.0).max() > 0.05:
+        worst = paths[int(np.abs(determinants - 1.0).argmax())]
+        raise InputError(f"{description}: the transform_matrix of {worst} is no rotation")
+    _check_images(meta, frames, folder_of(data))
+    return dict(meta)
+
+
+def _check_images(meta: dict[str, Any], frames: list[dict[str, Any]], folder: Path) -> None:
+    """Every image is there, and has the size that its intrinsics are for."""
+    from PIL import Image, UnidentifiedImageError
+
+    missing = [f["file_path"] for f in frames if not (folder / f["file_path"]).exists()]
+    if missing:
+        raise InputError(
+            f"{len(missing)} of {len(frames)} images are not there, the first is {folder / missing[0]}"
+        )
+    for frame in frames:
+        width, height = frame.get("w", meta.get("w")), frame.get("h", meta.get("h"))
+        path = folder / frame["file_path"]
+        try:
+            with Image.open(path) as image:
+                size = image.size
+        except (OSError, UnidentifiedImageError):
+            raise InputError(f"{path} cannot be read as an image") from None
+        if width is None or height is None:
+            raise InputError(f"the size (w, h) of {frame['file_path']} is not in transforms.json")
+        if size != (int(width), int(height)):
+            raise InputError(
+                f"{path} has {size[0]} x {size[1]} pixels, its intrinsics are for {int(width)} x {int(height)}"
+            )
+
+
+def read_points(meta: dict[str, Any], folder: Path) -> Tensor | None:
+    """Sparse points [P, 3] float32 in the scene's coordinates, or None when there are none.
+
+    Raises:
+        InputError: a file is named, but cannot be read as points.
+    """
+    name = meta.get("ply_file_path")
+    if name is None or not (folder / name).exists():
+        return None
+    import trimesh
+
+    try:
+        vertices = np.asarray(trimesh.load(folder / name).vertices, dtype=np.float32)
+    except Exception as error:  # noqa: BLE001  trimesh raises whatever its parsers meet
+        raise InputError(f"{folder / name} cannot be read as sparse points: {error}") from None
+    return torch.from_numpy(vertices.reshape(-1, 3).copy())
+
+
+leco_photographs_dataparser = DataParserSpecification(
+    config=LecoPhotographsDataParserConfig(),
+    description="A scene in nerfstudio's format, checked, upright, with its sparse points.",
+)

@@ -1,0 +1,98 @@
+"""Claims about `leco_plugin.evaluation.metrics`."""
+
+from __future__ import annotations
+
+import json
+import math
+import warnings
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+import torch
+import torchvision
+from torchmetrics.image import PeakSignalNoiseRatio
+
+from leco_plugin.evaluation import metrics
+from leco_plugin.evaluation.metrics import LPIPS_MINIMUM_SIDE, LpipsUnavailable
+
+
+@pytest.fixture(autouse=True)
+def hub(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
+    """An empty folder where torch keeps downloaded weights, and no way to fetch any."""
+
+    def refuse(url: str, *_: object, **__: object) -> None:
+        raise AssertionError(f"{url} would have been downloaded")
+
+    monkeypatch.setattr(torch.hub, "download_url_to_file", refuse)
+    monkeypatch.setattr(torch.hub, "get_dir", lambda: str(tmp_path))
+    metrics.lpips_metric.cache_clear()
+    yield tmp_path
+    metrics.lpips_metric.cache_clear()
+
+
+@pytest.fixture
+def backbone(hub: Path) -> Path:
+    """An AlexNet of random weights where the trained one would lie."""
+    torch.manual_seed(0)
+    path = hub / "checkpoints" / "alexnet-owt-7be5be79.pth"
+    path.parent.mkdir()
+    torch.save(torchvision.models.alexnet(weights=None).state_dict(), path)
+    return path
+
+
+def images(side: int = 40) -> tuple[torch.Tensor, torch.Tensor]:
+    truth = torch.rand(side, side + 3, 3)
+    return (truth + 0.1 * torch.randn_like(truth)).clamp(0, 1), truth
+
+
+def test_psnr_is_that_of_torchmetrics() -> None:
+    predicted, truth = images()
+    expected = PeakSignalNoiseRatio(data_range=1.0)(predicted, truth)
+    assert metrics.psnr(predicted, truth) == pytest.approx(float(expected), abs=1e-4)
+
+
+def test_psnr_of_equal_images_is_infinite() -> None:
+    _, truth = images()
+    assert metrics.psnr(truth, truth) == math.inf
+
+
+def test_ssim_is_one_for_equal_images_and_less_for_others() -> None:
+    predicted, truth = images()
+    assert metrics.ssim(truth, truth) == pytest.approx(1.0, abs=1e-5)
+    assert metrics.ssim(predicted, truth) < 0.999
+
+
+def test_lpips_is_that_of_torchmetrics(backbone: Path) -> None:
+    predicted, truth = images()
+    metric = metrics.lpips_metric("alex")
+    assert metric is not None
+    expected = type(metric)(net_type="alex", normalize=True)(
+        predicted.permute(2, 0, 1)[None], truth.permute(2, 0, 1)[None]
+    )
+    assert metrics.lpips(predicted, truth) == pytest.approx(float(expected), rel=1e-5)
+    assert metrics.image_metrics(predicted, truth).keys() == {"psnr", "ssim", "lpips"}
+
+
+def test_without_its_weights_lpips_is_left_out_with_one_warning_that_names_the_file() -> None:
+    predicted, truth = images()
+    with pytest.warns(LpipsUnavailable, match=r"put .*alexnet.* at .*checkpoints") as caught:
+        first = metrics.image_metrics(predicted, truth)
+        second = metrics.image_metrics(predicted, truth)
+    assert len(caught) == 1
+    assert first.keys() == second.keys() == {"psnr", "ssim"}
+    json.dumps(first, allow_nan=False)
+
+
+def test_a_truncated_backbone_is_a_missing_one(backbone: Path) -> None:
+    backbone.write_bytes(backbone.read_bytes()[:1000])
+    predicted, truth = images()
+    with pytest.warns(LpipsUnavailable, match="LPIPS is left out"):
+        assert metrics.lpips(predicted, truth) is None
+
+
+def test_the_smallest_image_that_lpips_takes_is_known(backbone: Path) -> None:
+    assert metrics.lpips(*images(LPIPS_MINIMUM_SIDE)) is not None
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert metrics.lpips(*images(LPIPS_MINIMUM_SIDE - 1)) is None

@@ -1,0 +1,97 @@
+"""nerfstudio loads the city by name, and the truth follows it into model coordinates."""
+
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+import torch
+from nerfstudio.data.dataparsers.base_dataparser import DataparserOutputs
+from nerfstudio.plugins.registry_dataparser import DataParserSpecification
+
+from leco_plugin.scenes.city_dataparser import LecoCityDataParserConfig, leco_city_dataparser
+from leco_plugin.scenes.city_truth import CityTruth
+
+
+@pytest.fixture(scope="module")
+def config(tmp_path_factory: pytest.TempPathFactory) -> LecoCityDataParserConfig:
+    folder = tmp_path_factory.mktemp("scenes") / "city"
+    return LecoCityDataParserConfig(data=folder, blocks=1, seed=5, width=40, height=30)
+
+
+@pytest.fixture(scope="module")
+def outputs(config: LecoCityDataParserConfig) -> DataparserOutputs:
+    return config.setup().get_dataparser_outputs("train")
+
+
+@pytest.fixture(scope="module")
+def truth(config: LecoCityDataParserConfig, outputs: DataparserOutputs) -> CityTruth:
+    return CityTruth.from_dataparser(config.folder(), outputs)
+
+
+def test_the_city_is_written_and_loaded(
+    config: LecoCityDataParserConfig, outputs: DataparserOutputs
+) -> None:
+    held_out = config.setup().get_dataparser_outputs("test")
+    assert len(outputs.image_filenames) > 4 * len(held_out.image_filenames) > 0
+    assert all(path.is_file() for path in outputs.image_filenames)
+    assert int(outputs.cameras.width[0]) == 40
+    assert len(outputs.metadata["depth_filenames"]) == len(outputs.image_filenames)
+
+
+def test_by_default_each_kind_of_city_has_its_folder(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    folders = {
+        LecoCityDataParserConfig(**change).folder()
+        for change in ({}, {"blocks": 2}, {"seed": 1}, {"sky": True}, {"width": 200})
+    }
+    assert len(folders) == 5
+    assert all(folder.parent == Path("data/leco-city") for folder in folders)
+
+
+def test_up_stays_up(outputs: DataparserOutputs) -> None:
+    torch.testing.assert_close(outputs.dataparser_transform[:, :3], torch.eye(3))
+
+
+def test_model_coordinates_lead_back_to_metres(truth: CityTruth) -> None:
+    metres = torch.rand(50, 3, dtype=torch.float64) * 60 - 30
+    model = truth.to_model(metres.numpy())
+    torch.testing.assert_close(
+        torch.from_numpy(truth.to_metres(model)), metres, atol=1e-4, rtol=1e-5
+    )
+
+
+def test_visible_points_lie_on_the_surface_and_cameras_in_the_air(
+    truth: CityTruth, outputs: DataparserOutputs
+) -> None:
+    surface = truth.visible_surface("test")
+    assert len(surface) > 500
+    assert truth.distance(surface).max() < 1e-3
+    cameras = outputs.cameras.camera_to_worlds[:, :, 3]
+    assert not truth.occupied(cameras).any()
+    assert truth.distance(cameras).min() > 0.5
+    assert truth.occupied(cameras[:, None]).shape == (len(cameras), 1)
+
+
+def test_points_below_the_visible_ground_are_matter(truth: CityTruth) -> None:
+    surface = truth.visible_surface("train")
+    metres = truth.to_metres(surface)
+    ground = surface[abs(metres[:, 2]) < 1e-3]
+    assert len(ground) > 100
+    down = torch.tensor([0.0, 0.0, 0.1 * truth.scale])
+    assert truth.occupied(ground - down).all()
+
+
+def test_the_entry_point_is_light_to_import() -> None:
+    """Every ns-* command imports it: nothing that draws or builds may come along."""
+    code = (
+        "import sys, leco_plugin.scenes.city_dataparser;"
+        "print(*(m for m in sys.modules if m.startswith('leco_plugin.scenes.') or m == 'trimesh'))"
+    )
+    loaded = subprocess.run(
+        [sys.executable, "-W", "ignore", "-c", code], capture_output=True, text=True, check=True
+    )
+    assert loaded.stdout.split() == ["leco_plugin.scenes.city_dataparser"]
+    assert isinstance(leco_city_dataparser, DataParserSpecification)

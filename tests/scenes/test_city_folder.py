@@ -1,0 +1,130 @@
+"""A folder is written whole or not at all, never twice, and never over something else."""
+
+import dataclasses
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+import trimesh
+from PIL import Image
+
+from leco_plugin.scenes.city import City, CityConfig
+from leco_plugin.scenes.city_folder import CaptureConfig, write_city
+from leco_plugin.scenes.city_render import Tracer
+
+CITY = CityConfig(blocks=1, seed=3, sky=True)
+CAPTURE = CaptureConfig(40, 30, aerial_per_block=6, street_per_block=3, test_every=3)
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_city(CITY, tmp_path_factory.mktemp("scenes") / "city", CAPTURE, progress=False)
+
+
+@pytest.fixture
+def copy(folder: Path, tmp_path: Path) -> Path:
+    """A folder that a test may damage."""
+    return write_city(CITY, tmp_path / "city", CAPTURE, progress=False)
+
+
+def test_the_city_is_rebuilt_from_its_folder(folder: Path) -> None:
+    assert City.from_folder(folder).config == CITY
+    transforms = json.loads((folder / "transforms.json").read_text())
+    frame = transforms["frames"][5]
+    picture = np.array(Image.open(folder / frame["file_path"]))
+    pose = np.array(frame["transform_matrix"])[:3]
+    image, depth = Tracer(City.from_folder(folder)).photograph(pose, CAPTURE.lens)
+    assert np.array_equal(picture, image)
+    stored = CAPTURE.lens.along_ray(np.load(folder / frame["depth_file_path"]))
+    np.testing.assert_allclose(stored, depth, rtol=1e-6)
+
+
+def test_splits_share_the_pictures_without_overlap(folder: Path) -> None:
+    transforms = json.loads((folder / "transforms.json").read_text())
+    paths = {frame["file_path"] for frame in transforms["frames"]}
+    train, test = set(transforms["train_filenames"]), set(transforms["test_filenames"])
+    assert train | test == paths
+    assert not train & test
+    assert len(paths) == 9
+    assert len(test) == 3
+    assert transforms["orientation_override"] == "none"
+
+
+def test_the_sparse_points_lie_on_surfaces(folder: Path) -> None:
+    cloud = trimesh.load(folder / "sparse_pc.ply")
+    points = np.asarray(cloud.vertices)
+    assert len(points) > 500
+    assert City.from_folder(folder).distance(points).max() < 1e-4
+    assert np.asarray(cloud.colors).std() > 5
+
+
+def test_a_folder_of_the_same_city_is_left_as_it_is(folder: Path) -> None:
+    before = {path: path.stat().st_mtime_ns for path in folder.rglob("*")}
+    assert write_city(CITY, folder, CAPTURE) == folder
+    assert {path: path.stat().st_mtime_ns for path in folder.rglob("*")} == before
+
+
+@pytest.mark.parametrize("change", [{"blocks": 2}, {"seed": 9}, {"sky": False}])
+def test_a_folder_of_another_city_is_refused(folder: Path, change: dict) -> None:
+    (name,) = change
+    with pytest.raises(FileExistsError, match=rf"^[^\n]*another city \({name} is[^\n]*$"):
+        write_city(dataclasses.replace(CITY, **change), folder, CAPTURE)
+    with pytest.raises(FileExistsError, match="width is 40 there, not 80"):
+        write_city(CITY, folder, dataclasses.replace(CAPTURE, width=80))
+
+
+def test_a_folder_or_file_of_something_else_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "holiday.jpg").write_text("precious")
+    for place in (tmp_path, tmp_path / "holiday.jpg"):
+        with pytest.raises(FileExistsError, match=r"^[^\n]*is not a city[^\n]*$"):
+            write_city(CITY, place, CAPTURE)
+    assert [path.name for path in tmp_path.iterdir()] == ["holiday.jpg"]
+
+
+@pytest.mark.parametrize("damage", ["picture", "depth", "transforms", "frames", "json", "config"])
+def test_a_damaged_folder_gets_one_line(copy: Path, damage: str) -> None:
+    if damage in ("picture", "depth"):
+        next((copy / ("images" if damage == "picture" else "depths")).iterdir()).unlink()
+    elif damage == "transforms":
+        (copy / "transforms.json").unlink()
+    elif damage == "frames":
+        (copy / "transforms.json").write_text('{"frames": [{"file_path": "images/a.png"}]}')
+    elif damage == "json":
+        (copy / "city.json").write_text("{")
+    else:
+        (copy / "city.json").write_text('{"format": 1, "city": {"bricks": 7}}')
+    with pytest.raises(ValueError, match=r"^[^\n]+$"):
+        write_city(CITY, copy, CAPTURE)
+
+
+def test_an_interrupted_write_leaves_nothing_behind(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def interrupt(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(Tracer, "photograph", interrupt)
+    with pytest.raises(KeyboardInterrupt):
+        write_city(CITY, tmp_path / "city", CAPTURE, progress=False)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_no_city_at_all_is_said_in_one_line(tmp_path: Path) -> None:
+    with pytest.raises(FileNotFoundError, match=r"^[^\n]*holds no city[^\n]*$"):
+        City.from_folder(tmp_path)
+
+
+@pytest.mark.parametrize(
+    "bad",
+    [
+        {"width": 0},
+        {"field_of_view": 180.0},
+        {"aerial_per_block": -1.0},
+        {"aerial_per_block": 0.0, "street_per_block": 0.0},
+        {"test_every": 1},
+    ],
+)
+def test_pictures_that_cannot_be_taken_are_refused_in_one_line(bad: dict) -> None:
+    with pytest.raises(ValueError, match=r"^[^\n]+$"):
+        CaptureConfig(**bad)

@@ -1,0 +1,49 @@
+"""Claims about the package as a whole: what it exports, and what importing it costs."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from importlib.metadata import entry_points, version
+
+import pytest
+
+import leco_plugin
+
+
+def modules_after(statement: str) -> set[str]:
+    """Names of the modules that a fresh interpreter holds after `statement`."""
+    code = f"import sys; {statement}; print('\\n'.join(sys.modules))"
+    listed = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, check=True
+    )
+    return set(listed.stdout.split())
+
+
+def test_every_public_name_can_be_had() -> None:
+    for name in leco_plugin.__all__:
+        assert getattr(leco_plugin, name) is not None
+
+
+def test_an_unknown_name_is_an_attribute_error() -> None:
+    with pytest.raises(AttributeError, match="nothing_of_the_kind"):
+        leco_plugin.nothing_of_the_kind  # noqa: B018
+
+
+def test_importing_the_package_loads_no_other() -> None:
+    assert modules_after("import leco_plugin").isdisjoint({"torch", "numpy", "nerfstudio"})
+
+
+def test_the_version_is_that_of_the_distribution() -> None:
+    assert leco_plugin.__version__ == version("leco-plugin")
+
+
+@pytest.mark.parametrize(
+    "group", ["nerfstudio.method_configs", "nerfstudio.dataparser_configs", "leco_plugin.samplers"]
+)
+def test_every_entry_point_loads(group: str) -> None:
+    """An exception in one of them would end every ns-* command, for other methods too."""
+    ours = [entry for entry in entry_points(group=group) if entry.value.startswith("leco_plugin.")]
+    assert ours
+    for entry in ours:
+        entry.load()
