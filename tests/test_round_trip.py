@@ -20,18 +20,31 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 import trimesh
 from PIL import Image
+
+from leco_plugin.occupancy import Occupancy
 
 pytestmark = [pytest.mark.slow, pytest.mark.xdist_group("round_trip")]
 
 METHOD = "leco-occupancy"
 
-# As few steps and samples as still pass through every phase.
+# As few steps and as small a gate as still pass through every phase: each command asks the gate
+# about a few million places before it renders.
 STEPS = 30
-TINY = [f"--max-num-iterations={STEPS}"]
-TINY += ["--pipeline.datamanager.train-num-rays-per-batch=256"]
-TINY += ["--pipeline.datamanager.eval-num-rays-per-batch=256"]
+TINY = [
+    f"--max-num-iterations={STEPS}",
+    "--pipeline.datamanager.train-num-rays-per-batch=256",
+    "--pipeline.datamanager.eval-num-rays-per-batch=256",
+    "--pipeline.model.calibration.rays=512",
+    "--pipeline.model.sizes.candidates=64",
+    "--pipeline.model.sizes.learn-candidates=32",
+    "--pipeline.model.sizes.field.encoding.log2-table=12",
+    "--pipeline.model.sizes.gate.encoding.octaves=1",
+    "--pipeline.model.sizes.gate.layers=1",
+    "--pipeline.model.sizes.gate.width=8",
+]
 
 OUTPUTS = {"rgb", "depth", "accumulation", "occupancy", "expert", "samples_per_ray"}
 
@@ -92,9 +105,8 @@ def run(environment: dict[str, str], tmp_path_factory: pytest.TempPathFactory) -
 
 def train(run: Runner, output: Path, scene: Path, *arguments: object) -> str:
     return run(
-        *("ns-train", METHOD, *TINY, *arguments, "--vis", "tensorboard"),
+        *("ns-train", METHOD, "--data", scene, *TINY, *arguments, "--vis", "tensorboard"),
         *("--output-dir", output, "--experiment-name", "tiny", "--timestamp", "run"),
-        *("nerfstudio-data", "--data", scene),
     )
 
 
@@ -115,7 +127,9 @@ def trained(run: Runner, tiny_scene: Path, tmp_path_factory: pytest.TempPathFact
 def test_training_leaves_a_config_a_checkpoint_and_the_occupancy(trained: Path) -> None:
     assert (trained / "config.yml").is_file()
     assert checkpoints(trained) == [STEPS - 1]
-    assert (trained / "occupancy.safetensors").is_file()
+    occupancy = Occupancy.load(trained / "occupancy.safetensors")
+    asked = occupancy.query(torch.rand(10, 3) - 0.5)
+    assert ((asked >= 0) & (asked <= 1)).all()
 
 
 def test_resuming_goes_on_at_the_next_step(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import shutil
 
 from nerfstudio.engine.trainer import Trainer
 from nerfstudio.utils.decorators import check_main_thread
@@ -22,16 +23,18 @@ class AtomicTrainer(Trainer):
         Beside, because nerfstudio reads a step out of every file name in that folder.
         """
         checkpoints = self.checkpoint_dir
-        self.checkpoint_dir = checkpoints.with_name(f"{checkpoints.name}.unfinished")
+        beside = checkpoints.with_name(f"{checkpoints.name}.unfinished")
+        self.checkpoint_dir = beside
         try:
             super().save_checkpoint(step)
-            unfinished = self.checkpoint_dir / f"step-{step:09d}.ckpt"
         finally:
             self.checkpoint_dir = checkpoints
+        unfinished = beside / f"step-{step:09d}.ckpt"
         with unfinished.open("rb") as file:
             os.fsync(file.fileno())
         checkpoints.mkdir(parents=True, exist_ok=True)
         finished = unfinished.replace(checkpoints / unfinished.name)
+        shutil.rmtree(beside)  # with whatever a killed process has left there
         if self.config.save_only_latest_checkpoint:
             for older in checkpoints.glob("*.ckpt"):
                 if older != finished:

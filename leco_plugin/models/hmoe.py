@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal, Optional
+from typing import Literal
 
 import torch
 from torch import Tensor, nn
@@ -21,8 +21,11 @@ class HMoEConfig:
     """Units of each layer of a scene expert, and of its output."""
     layers: int = 2
     """Layers of a scene expert."""
-    skip: Optional[int] = None
+    skip: int | None = None
     """Layer that sees the input again (3 in Switch-NeRF), or None."""
+    residual: bool = True
+    """Whether a scene expert adds to its input, starting from adding nothing: it is then the
+    identity at first, as the empty-space expert is, and a point that changes experts does not jump."""
     empty_expert: Literal["identity", "mlp", "none"] = "identity"
     """What points of empty space go through: the identity, a small MLP, or nothing (zero features and zero density)."""
     empty_layers: int = 1
@@ -30,22 +33,32 @@ class HMoEConfig:
 
 
 class Expert(nn.Module):
-    """An MLP of constant width with an optional skip connection; [M, width] to [M, width]."""
+    """An MLP of constant width, as it is or added to its input; [M, width] to [M, width]."""
 
-    def __init__(self, width: int, layers: int, skip: Optional[int] = None) -> None:
+    def __init__(
+        self, width: int, layers: int, skip: int | None = None, residual: bool = False
+    ) -> None:
         super().__init__()
         self.skip = skip
+        self.residual = residual
         self.layers = nn.ModuleList(
             nn.Linear(2 * width if i == skip else width, width) for i in range(layers)
         )
 
+        if residual:
+            nn.init.zeros_(self.layers[-1].weight)
+            nn.init.zeros_(self.layers[-1].bias)
+
     def forward(self, features: Tensor) -> Tensor:
         hidden = features
+        last = len(self.layers) - 1
         for i, layer in enumerate(self.layers):
             if i == self.skip:
                 hidden = torch.cat([features, hidden], dim=-1)
-            hidden = torch.relu(layer(hidden))
-        return hidden
+            hidden = layer(hidden)
+            if i < last or not self.residual:
+                hidden = torch.relu(hidden)
+        return features + hidden if self.residual else hidden
 
 
 class HMoE(nn.Module):
@@ -58,7 +71,8 @@ class HMoE(nn.Module):
         if config.empty_expert == "mlp":
             empty = Expert(config.width, config.empty_layers)
         scene = (
-            Expert(config.width, config.layers, config.skip) for _ in range(config.scene_experts)
+            Expert(config.width, config.layers, config.skip, config.residual)
+            for _ in range(config.scene_experts)
         )
         self.experts = nn.ModuleList([empty, *scene])
 

@@ -263,12 +263,8 @@ class LecoModel(Model):
         """
         shaded: Shaded = outputs["shaded"]
         image = batch["image"].to(self.device)
-        background = torch.rand_like(shaded.rgb) * self.ramped
-        predicted = shaded.rgb + background * (1.0 - shaded.accumulation[:, None])
-        truth = image[..., :3]
-        if image.shape[-1] == 4:
-            truth = torch.lerp(background, truth, image[..., 3:])
-        losses = {"rgb_loss": torch.nn.functional.mse_loss(predicted, truth)}
+        truth = self.renderer_rgb.blend_background(image)
+        losses = {"rgb_loss": torch.nn.functional.mse_loss(shaded.rgb, truth)}
         weight = self.config.distortion * self.ramped
         if weight > 0.0:
             near, far = self.march_range[:2]

@@ -35,6 +35,8 @@ if TYPE_CHECKING:
     from leco_plugin.models.leco import LecoModel
 
 MOST_RECOVERIES = 3
+FEWEST_STEPS = 100
+"""A gate is not called collapsed before it has had this many steps."""
 
 
 class Lifecycle:
@@ -57,6 +59,7 @@ class Lifecycle:
         self.rays_per_batch = int(self.pipeline.datamanager.get_train_rays_per_batch())
         self.decisions = torch.zeros(0, dtype=torch.bool)
         self.recoveries = 0
+        self.suspected = False
         self.learn_seconds = 0.0
         self.step_started = 0.0
 
@@ -100,7 +103,7 @@ class Lifecycle:
         kept = occupancy_from_logits(logits) >= KEPT_ABOVE
         agreement = decisions_agree(self.decisions, kept)
         self.decisions = kept
-        if self._heal(step, logits, kept) or not schedule.freeze:
+        if self._heal(step, logits, kept, last) or not schedule.freeze:
             return
         if converged(step, agreement, schedule):
             CONSOLE.log(
@@ -128,16 +131,19 @@ class Lifecycle:
             logits: Tensor = model.gate(mapped)
         return logits
 
-    def _heal(self, step: int, logits: Tensor, kept: Tensor) -> bool:
-        """Resets a collapsed gate; returns whether it had to.
+    def _heal(self, step: int, logits: Tensor, kept: Tensor, last: bool) -> bool:
+        """Resets a gate that is found collapsed in two looks running; returns whether it did.
 
         Raises:
             RuntimeError: the gate has collapsed more often than it may.
         """
+        if self.model.ramped < 1.0 or step + 1 < FEWEST_STEPS:
+            return False
         routes = route(logits, self.model.routing.empty_below)
         shares = expert_shares(routes, logits.shape[-1])
-        collapse = find_collapse(float(kept.float().mean()), shares, self.model.ramped)
-        if collapse is None:
+        collapse = find_collapse(float(kept.float().mean()), shares, last)
+        if collapse is None or not (last or self.suspected):
+            self.suspected = collapse is not None
             return False
         if self.recoveries == MOST_RECOVERIES:
             raise RuntimeError(
@@ -150,7 +156,7 @@ class Lifecycle:
             f"(recovery {self.recoveries} of {MOST_RECOVERIES})"
         )
         reset_gate_head(self.model.gate.head)
-        steps = self.schedule.learn_steps + max(50, self.schedule.learn_steps // 4)
-        self.schedule = replace(self.schedule, learn_steps=steps)
+        self.schedule = replace(self.schedule, learn_steps=step + 1 + self.schedule.learn_steps // 2)
         self.decisions = torch.zeros(0, dtype=torch.bool)
+        self.suspected = False
         return True

@@ -19,10 +19,12 @@ class ScheduleConfig:
     """Whether the gate is ever frozen; False is the plain HMoE, for comparison."""
     learn_steps: int = 400
     """Steps after which the gate is frozen even if its decisions still change."""
-    earliest: float = 0.6
+    earliest: float = 0.85
     """Share of `learn_steps` before which it is never frozen."""
-    ramp: float = 0.4
-    """Share of `learn_steps` over which the random background and the distortion loss come in."""
+    ramp_from: float = 0.4
+    """Share of `learn_steps` at which the distortion loss begins to come in."""
+    ramp_to: float = 0.8
+    """Share of `learn_steps` from which it has its full weight."""
     steps_per_check: int = 25
     """Steps between two looks at the gate."""
     agreement: float = 0.99
@@ -30,14 +32,13 @@ class ScheduleConfig:
 
 
 def ramp(step: int, config: ScheduleConfig) -> float:
-    """How far the opaque-surface forces have come in: 0 at the start, 1 from `ramp` on.
+    """How far the distortion loss has come in: 0 at first, 1 from `ramp_to` on.
 
-    At first the field may be as transparent as it likes, and the images are fitted by a haze that
-    is densest near the true surfaces. A random background behind it then asks for opacity ever
-    more strongly, and the haze condenses there. Asking for opacity at once makes plates in front of
-    the cameras instead.
+    At once it would press all weight onto the ends of the rays, which is a flat picture behind the
+    scene; first the views have to find the surfaces between them.
     """
-    return min(1.0, step / max(1.0, config.ramp * config.learn_steps))
+    start, end = (share * config.learn_steps for share in (config.ramp_from, config.ramp_to))
+    return min(1.0, max(0.0, (step - start) / max(1.0, end - start)))
 
 
 def converged(step: int, agreement: float, config: ScheduleConfig) -> bool:
@@ -66,19 +67,18 @@ class Collapse:
     cause: str
 
 
-def find_collapse(kept_fraction: float, shares: Tensor, ramped: float) -> Collapse | None:
+def find_collapse(kept_fraction: float, shares: Tensor, at_the_end: bool) -> Collapse | None:
     """Names the collapse of a gate, if it has collapsed.
 
     Args:
         kept_fraction: share of candidates whose o(x) is at least 0.1.
         shares: [1 + n] share of points at each expert.
-        ramped: how far `ramp` has come; before 1 a gate has not had what it needs to decide.
+        at_the_end: whether the first phase is over. Before, a gate that keeps everything has only
+            not learned enough yet.
     """
-    if ramped < 1.0:
-        return None
     if kept_fraction < 2e-4:
         return Collapse("the gate calls all space empty")
-    if kept_fraction > 0.9995:
+    if kept_fraction > 0.9995 and at_the_end:
         return Collapse("the gate calls all space occupied")
     scene = shares[1:]
     if len(scene) > 1 and float(scene.sum()) > 0.01 and float(scene.max() / scene.sum()) > 0.999:

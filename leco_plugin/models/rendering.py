@@ -21,6 +21,10 @@ VISIBLE = 1e-4
 pixel by at most one step of an 8-bit image."""
 
 
+OPAQUE = 1e6
+"""Density, per half extent, that is added to the interval at the end of a ray."""
+
+
 class Rays(NamedTuple):
     """A batch of rays."""
 
@@ -72,20 +76,29 @@ class Routing(NamedTuple):
     """How samples are sent to experts."""
 
     empty_below: float | None
-    """See `gate.route`."""
+    """See `gate.route`; None is the paper's rule, and scales features by G_i* as the paper does."""
     homogeneous: bool
     """No empty-space expert at all: the gate chooses among the scene experts."""
 
 
 def gate_values_and_routes(logits: Tensor, routing: Routing) -> tuple[Tensor, Tensor]:
-    """G_i*(x) [M] float32 and i*(x) [M] int64."""
+    """The factor of each sample's features [M] float32, and its expert [M] int64.
+
+    The paper's factor is G_i*(x), which jumps when a sample changes from an expert to another. With
+    a threshold rule the factor is one, and only its gradient is that of the scene expert's share
+    (straight-through): a route that changes then changes the image little.
+    """
+    if routing.empty_below is None and not routing.homogeneous:
+        routes = route(logits, None)
+        return logits.softmax(dim=-1).gather(1, routes[:, None])[:, 0], routes
+    scene = logits[:, 1:]
+    best = scene.argmax(dim=-1)
+    share = scene.softmax(dim=-1).gather(1, best[:, None])[:, 0]
     if routing.homogeneous:
-        scene = logits[:, 1:]
-        routes = scene.argmax(dim=-1)
-        values = scene.softmax(dim=-1).gather(1, routes[:, None])[:, 0]
-        return values, routes + 1
+        return share, best + 1
     routes = route(logits, routing.empty_below)
-    return logits.softmax(dim=-1).gather(1, routes[:, None])[:, 0], routes
+    on_scene = (routes > 0).to(share.dtype)
+    return 1.0 + on_scene * (share / share.detach() - 1.0), routes
 
 
 def shade(
@@ -98,6 +111,10 @@ def shade(
     freeze_gate: bool,
 ) -> Shaded:
     """Renders packed intervals; only visible samples are coloured.
+
+    The interval that holds the end of its ray is opaque. What is not explained on the way is then
+    explained there, behind everything, and surfaces grow in front of it where views disagree about
+    it; rays that could stay transparent would be filled with fog from the front.
 
     Args:
         freeze_gate: no gradient reaches the gate.
@@ -114,6 +131,8 @@ def shade(
         gate_values, routes = gate_values_and_routes(logits, routing)
     sigmas, features = field.density(mapped, routes, gate_values)
     packed_info = pack_info(ray_indices, num_rays)
+    at_the_end = t_ends + 0.501 * (t_ends - t_starts) > rays.t_maxs[ray_indices]
+    sigmas = torch.where(at_the_end, sigmas + OPAQUE, sigmas)
     scale = space.half_extent
     weights, _, _ = render_weight_from_density(
         t_starts / scale, t_ends / scale, sigmas, packed_info=packed_info

@@ -47,7 +47,7 @@ PAPER = Sizes(
     gate=GateConfig(EncodingConfig(octaves=12), width=256, layers=3, scene_experts=8),
     field=FieldConfig(
         EncodingConfig(kind="frequency", octaves=12),
-        HMoEConfig(scene_experts=8, width=256, layers=7, skip=3),
+        HMoEConfig(scene_experts=8, width=256, layers=7, skip=3, residual=False),
         appearance_dim=48,
         color_width=128,
         direction_octaves=4,

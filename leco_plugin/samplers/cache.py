@@ -3,9 +3,10 @@
 Three levels in the mapped cube [-1, 1]^3, so that unbounded scenes are covered. A coarse cell is
 empty, occupied or mixed. A mixed one owns a brick of 4^3 fine cells, each again empty, occupied or
 mixed. A mixed fine cell holds a plane, the gate's logit to first order, with the error to expect
-of it: beside the plane it decides, on it the gate is asked, as it is outside the cube. Where a
+of it: beside the plane it decides, on it the gate is asked. Where a
 2-bit state for each cell would leave 2% of the cube to the gate, a plane for each mixed cell of
-half the resolution leaves 0.5% in the same memory. How cells are judged: `cache_build.py`.
+half the resolution leaves 0.5% in the same memory. See `cache_cells.py` for how cells are
+judged and `cache_build.py` for how many there are.
 """
 
 from __future__ import annotations
@@ -22,7 +23,7 @@ EMPTY, OCCUPIED, MIXED = 0, 1, 2
 BRICK = 4
 """Fine cells along a coarse one."""
 
-COARSE_EMPTY, COARSE_OCCUPIED, COARSE_OUTSIDE = -1, -2, -3
+COARSE_EMPTY, COARSE_OCCUPIED = -1, -2
 """Values of the coarse table beside the numbers of bricks, which are >= 0."""
 
 FINE_EMPTY, FINE_OCCUPIED = 64, 65
@@ -46,7 +47,7 @@ class SpaceLike(Protocol):
 
 
 class OccupancyLike(Protocol):
-    """What the samplers ask of a frozen occupancy."""
+    """What the samplers ask of a frozen occupancy; outside a bounded space o is 0."""
 
     @property
     def space(self) -> SpaceLike: ...
@@ -65,13 +66,13 @@ class CacheReport:
     bytes: int
     """Memory of the tables."""
     differing: float
-    """Share of random decisions in the cube that differ from the gate's, as measured."""
+    """Share of random decisions, half of them where it is not empty, that differ from the gate."""
     differing_bound: float
     """The same plus two standard deviations: what is compared with the tolerance."""
     checked: int
     """Number of decisions behind these figures."""
     asked: float
-    """Share of the cube for which the gate is still asked."""
+    """Share of these decisions for which the gate is still asked."""
     margin: float
     """How far from the threshold a cell's logits had to stay, in units of their spread."""
     caution: float
@@ -82,7 +83,8 @@ class Tables(NamedTuple):
     """What a cache holds."""
 
     coarse: Tensor
-    """(resolution + 2)^3 values as above, COARSE_OUTSIDE around the cube; int16 or int32, flat."""
+    """(resolution + 2)^3 values as above; int16 or int32, flat. Around the cube they are
+    COARSE_EMPTY for a bounded space, and else a brick whose one plane never decides."""
     fine: Tensor
     """Values as above of the fine cells of each brick; uint8 [n_bricks, 64]."""
     first_plane: Tensor
@@ -153,34 +155,30 @@ class CellCache(nn.Module):
         """
         cells = self._cells(positions)
         corners = cells.floor()
-        width = self.resolution + 2
-        known = self.coarse.index_select(0, _flat(corners, width))
+        known = self.coarse.index_select(0, _flat(corners, self.resolution + 2))
         occupied = known == COARSE_OCCUPIED
-        refer = torch.logical_or(known >= 0, known == COARSE_OUTSIDE).nonzero()[:, 0]
-        if refer.numel() == 0 or self.fine.numel() == 0:
+        refer = (known >= 0).nonzero()[:, 0]
+        if refer.numel() == 0:
             return occupied, refer
 
         brick = known.index_select(0, refer).to(torch.int32)
         within = cells.index_select(1, refer).sub_(corners.index_select(1, refer)).mul_(BRICK)
         corners = within.floor()
-        at = brick.clamp(min=0) * BRICK**3 + _flat(corners, BRICK)
-        known = self.fine.view(-1).index_select(0, at).masked_fill_(brick < 0, 0)
+        at = torch.add(_flat(corners, BRICK), brick, alpha=BRICK**3)
+        known = self.fine.view(-1).index_select(0, at)
         occupied.index_put_((refer,), known == FINE_OCCUPIED)
         chosen = (known < FINE_EMPTY).nonzero()[:, 0]
+        if chosen.numel() == 0:
+            return occupied, chosen
+
         refer, brick = refer.index_select(0, chosen), brick.index_select(0, chosen)
         within = within.index_select(1, chosen).sub_(corners.index_select(1, chosen))
-
-        outside = brick < 0
-        plane = self.first_plane.index_select(0, brick.clamp_(min=0))
-        plane += known.index_select(0, chosen)
-        if self.planes.shape[1] == 0:
-            return occupied, refer
+        plane = self.first_plane.index_select(0, brick).add_(known.index_select(0, chosen))
         offset, *slopes, error = (row.index_select(0, plane).float() for row in self.planes)
         for slope, along in zip(slopes, within.mul_(2.0).sub_(1.0), strict=True):
             offset.addcmul_(slope, along)
         occupied.index_put_((refer,), offset > 0.0)
-        still_open = torch.logical_or(offset.abs() <= error, outside).nonzero()[:, 0]
-        return occupied, refer.index_select(0, still_open)
+        return occupied, refer.index_select(0, (offset.abs_() <= error).nonzero()[:, 0])
 
     def near(self, positions: Tensor, radii: Tensor) -> Tensor:
         """Whether anything within `radii` of `positions` may be occupied (the coarse question).

@@ -6,6 +6,7 @@ guess, and the cells of a cache answer for the gate wherever they are sure.
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Sequence
 from typing import Any
 
@@ -16,6 +17,8 @@ from leco_plugin.samplers.base import Estimator
 from leco_plugin.samplers.cache import CellCache, OccupancyLike
 from leco_plugin.samplers.cache_build import build_cache
 from leco_plugin.samplers.marching import NearFn, OccupiedFn
+
+_log = logging.getLogger(__name__)
 
 ANSWER_RESOLUTION = 64
 """Cells along each axis in which `binaries` and `occs` answer."""
@@ -29,11 +32,11 @@ class LearnedOccupancyEstimator(Estimator):
         aabb: box (min, max) to which rays are clipped, world units, [6]; None is the box of a
             bounded space, and no box for an unbounded one.
         cache_bytes: budget of the cell cache; 0 asks the gate about every candidate.
-        tolerance: largest share of decisions by which the cache may differ from the gate.
-
-    Raises:
-        ValueError: see `cache_build.build_cache`.
+        tolerance: largest share of decisions by which the cache may differ from the gate. Where no
+            cache keeps it, the gate is asked about every candidate, and the log says so.
     """
+
+    _box: Tensor
 
     def __init__(
         self,
@@ -52,9 +55,10 @@ class LearnedOccupancyEstimator(Estimator):
         self.register_buffer("_box", box.float().to(self.device), persistent=False)
         self.cache: CellCache | None = None
         if cache_bytes > 0:
-            self.cache = build_cache(occupancy, budget=cache_bytes, tolerance=tolerance)
-
-    _box: Tensor
+            try:
+                self.cache = build_cache(occupancy, budget=cache_bytes, tolerance=tolerance)
+            except ValueError as reason:
+                _log.warning("no cell cache, sampling will be slower: %s", reason)
 
     def _uncontracted_box(self) -> Tensor:
         space = self.occupancy.space
@@ -75,7 +79,8 @@ class LearnedOccupancyEstimator(Estimator):
             return self.occupancy.occupied(positions)
         decided, left_open = self.cache.decide(positions)
         if left_open.numel():
-            decided[left_open] = self.occupancy.occupied(positions.index_select(0, left_open))
+            asked = positions.T.index_select(1, left_open).T
+            decided.index_put_((left_open,), self.occupancy.occupied(asked))
         return decided
 
     def update_every_n_steps(self, *args: Any, **kwargs: Any) -> None:
@@ -102,6 +107,6 @@ class LearnedOccupancyEstimator(Estimator):
 
     @property
     def binaries(self) -> Tensor:
-        """Decisions at the cell centres of `aabbs`, bool [1, resolution, resolution, resolution]."""
+        """Decisions at the cell centres of `aabbs`, bool [1, n, n, n]."""
         occupied = self.occs >= self.occupancy.threshold
         return occupied.view(1, *[ANSWER_RESOLUTION] * 3)

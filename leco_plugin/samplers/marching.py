@@ -30,7 +30,7 @@ Samples = tuple[Tensor, Tensor, Tensor]
 MAX_CANDIDATES_PER_RAY = 1 << 24
 """Above this a float32 cannot number the candidates of a ray; nobody means to march so far."""
 
-CPU_CHUNK = 1 << 17
+CPU_CHUNK = 1 << 19
 DEVICE_CHUNK = 1 << 22
 """Candidates worked on at once: what fits the cache of a CPU core; elsewhere a training batch,
 because each chunk there waits for the device once."""
@@ -110,7 +110,7 @@ def march(
             answers False, `occupied` would deny them all. It changes the time, not the result.
         t_enters: leave out candidates whose midpoint lies in front of this, [n_rays]: where a ray
             enters a box, without moving the candidates inside it.
-        chunk_size: most candidates held at once.
+        chunk_size: most candidates held at once (a run of 16 at least).
 
     Returns:
         ray_indices int64 [n_samples], t_starts [n_samples], t_ends [n_samples], sorted by ray,
@@ -125,8 +125,8 @@ def march(
     )
     if chunk_size is None:
         chunk_size = CPU_CHUNK if origins.device.type == "cpu" else DEVICE_CHUNK
-    rays_at_once = max(1, chunk_size // max(longest, 1))
-    steps_at_once = min(longest, max(1, chunk_size))
+    rays_at_once = max(1, chunk_size // max(RUN, -(-longest // RUN) * RUN))  # in whole runs
+    steps_at_once = min(longest, max(RUN, chunk_size // RUN * RUN))
     kept: list[Samples] = []
     for first_ray in range(0, len(origins) if longest else 0, rays_at_once):
         rays = candidates.of_rays(slice(first_ray, first_ray + rays_at_once))

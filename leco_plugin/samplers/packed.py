@@ -81,9 +81,10 @@ class _DensityWeights(torch.autograd.Function):
 def _exclusive(values: Tensor, rays: Segments | None, reverse: bool = False) -> Tensor:
     if rays is not None:
         return segment_scan(values, rays, exclusive=True, reverse=reverse)
-    wide = values if values.device.type == "mps" else values.double()
-    inclusive = wide.cumsum(dim=-1)
-    return inclusive[..., -1:] - inclusive if reverse else inclusive - wide
+    # Few samples lie on one ray: a shifted sum needs no wider type, as a difference of sums would.
+    ahead = values.flip(-1) if reverse else values
+    sums = torch.nn.functional.pad(ahead[..., :-1], (1, 0)).cumsum(dim=-1)
+    return sums.flip(-1) if reverse else sums
 
 
 def _depths(t_starts: Tensor, t_ends: Tensor, sigmas: Tensor) -> Tensor:

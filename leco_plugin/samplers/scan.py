@@ -3,7 +3,8 @@
 One scan over *all* samples costs one call on any device, so a sum along a ray is the difference
 of two entries of a global prefix sum. The scan runs in float64: the difference then loses about
 1e-16 of the grand total, which is below float32's own rounding up to tens of millions of
-samples, whereas a float32 scan of ten million samples keeps no correct digit.
+samples, whereas a float32 scan of ten million samples keeps few correct digits. Devices without
+float64 scan rays side by side in a padded matrix instead.
 """
 
 from __future__ import annotations
@@ -83,15 +84,17 @@ def segment_scan(
     """Sum of each sample's predecessors on its ray (successors when `reverse`), no gradient.
 
     Args:
-        values: finite, [n_samples], any floating or integer type.
+        values: finite, [n_samples, ...], any floating or integer type.
         exclusive: leave the sample itself out.
 
     Returns:
-        float64 [n_samples] (float32 on devices without float64, int64 for integer values).
+        Like `values`, float64 (float32 on devices without it, int64 for integer values).
     """
     if values.numel() == 0:
         return values.to(_scan_dtype(values))
     values = values.to(_scan_dtype(values))
+    if values.dtype == torch.float32:
+        return _padded_scan(values, rays, exclusive, reverse)
     inclusive = torch.cumsum(values, dim=0)
     before = inclusive - values  # everything in front of a sample, on all rays
     if not reverse:
@@ -104,10 +107,25 @@ def segment_scan(
     return total - (inclusive if exclusive else before)
 
 
+def _padded_scan(values: Tensor, rays: Segments, exclusive: bool, reverse: bool) -> Tensor:
+    """`segment_scan` over a [n_rays, longest] matrix: its width waits for the device once."""
+    places = torch.arange(len(values), device=values.device)
+    places = places - rays.starts.index_select(0, rays.ray_indices)
+    longest = int(rays.counts.max())
+    rows = values.new_zeros(len(rays.counts), longest, *values.shape[1:])
+    rows[rays.ray_indices, places] = values
+    sums = rows.flip(1).cumsum(dim=1).flip(1) if reverse else rows.cumsum(dim=1)
+    return (sums - rows if exclusive else sums)[rays.ray_indices, places]
+
+
 def _scan_dtype(values: Tensor) -> torch.dtype:
     if not values.is_floating_point():
         return torch.int64
-    return torch.float32 if values.device.type == "mps" else torch.float64
+    return torch.float64 if _has_float64(values.device) else torch.float32
+
+
+def _has_float64(device: torch.device) -> bool:
+    return device.type != "mps"
 
 
 class _PackedSum(torch.autograd.Function):
@@ -176,15 +194,13 @@ def _scan(
     exclusive: bool,
     product: bool,
 ) -> Tensor:
-    rays = segments(inputs.shape[-1] if inputs.dim() else 0, packed_info, indices)
-    if rays is None:
-        if exclusive:
-            first = torch.full_like(inputs[..., :1], 1 if product else 0)
-            inputs = torch.cat([first, inputs[..., :-1]], dim=-1)
-        return inputs.cumprod(dim=-1) if product else inputs.cumsum(dim=-1)
-    if inputs.dim() != 1:
-        raise ValueError(f"packed inputs must be [n_samples], got {tuple(inputs.shape)}")
-    return (_PackedProduct if product else _PackedSum).apply(inputs, rays, exclusive)
+    rays = segments(len(inputs) if inputs.dim() else 0, packed_info, indices)
+    if rays is not None:
+        return (_PackedProduct if product else _PackedSum).apply(inputs, rays, exclusive)
+    if exclusive:
+        first = torch.full_like(inputs[..., :1], 1 if product else 0)
+        inputs = torch.cat([first, inputs[..., :-1]], dim=-1)
+    return inputs.cumprod(dim=-1) if product else inputs.cumsum(dim=-1)
 
 
 def inclusive_sum(
@@ -193,7 +209,8 @@ def inclusive_sum(
     """y_i = sum of x_j over j <= i on the same ray.
 
     Args:
-        inputs: [n_samples] with one of the two arguments below, else batched [..., n_samples].
+        inputs: [n_samples, ...] with one of the two arguments below, else batched
+            [..., n_samples].
         packed_info: int64 [n_rays, 2] of (start, count), as `pack_info` gives it.
         indices: ray of each sample, int64 [n_samples], non-decreasing.
 

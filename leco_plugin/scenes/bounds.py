@@ -75,7 +75,8 @@ def _slab(
 ) -> SceneBounds:
     """A bounded scene between two levels; points may miss a cellar or a mast, hence the margins."""
     relief = max(high - low, 0.02 * far)
-    ground, top = low - 0.5 * relief, high + 0.75 * relief
+    # far below, so that a flat picture on the lower plane, seen from two places, is plainly wrong
+    ground, top = low - max(0.5 * relief, 0.2 * far), high + 0.75 * relief
     down = directions[..., 2] < -0.05
     reach = ((ground - poses[:, None, 2, 3]) / directions[..., 2]).clamp(0.0, far)[down]
     origins = poses[:, None, :, 3].expand_as(directions)[down]

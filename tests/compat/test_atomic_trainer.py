@@ -58,4 +58,5 @@ def test_a_run_that_dies_while_it_saves_keeps_the_checkpoint_before(
 
     trainer.save_checkpoint(30)
     assert names(trainer.checkpoint_dir) == ["step-000000030.ckpt"]
+    assert names(trainer.checkpoint_dir.parent) == ["nerfstudio_models"]
     assert torch.load(trainer.checkpoint_dir / "step-000000030.ckpt")["step"] == 30

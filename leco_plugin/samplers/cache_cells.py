@@ -1,0 +1,147 @@
+"""How cells are judged by a frozen gate: from its logits at their corners, centres and within.
+
+A cell is called empty or occupied when all logits seen in it lie on one side of the threshold by
+a margin proportional to their spread. A fine cell that is neither gets a plane.
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+from torch.nn.functional import max_pool3d, pad
+
+from leco_plugin.samplers.cache import (
+    BRICK,
+    EMPTY,
+    FARTHEST,
+    MIXED,
+    OCCUPIED,
+    OccupancyLike,
+)
+
+POINTS_AT_ONCE = 1 << 17
+"""Positions that the gate is asked about in one call."""
+TRIALS = 24
+"""Random points of a cell to which its plane is fitted, and which show where it errs."""
+
+
+def judge_coarse(occupancy: OccupancyLike, resolution: int, margin: float) -> tuple[Tensor, Tensor]:
+    """States of the coarse cells [n, n, n], and logits at the corners of the fine ones, [4n + 1]^3.
+
+    A coarse cell is judged by the 5^3 corners of its fine ones.
+    """
+    intervals = BRICK * resolution
+    points = _lattice(intervals, occupancy.space.center.device)
+    corners = logits_above(occupancy, points).view(1, 1, *[intervals + 1] * 3)
+    high = max_pool3d(corners, BRICK + 1, BRICK)
+    low = -max_pool3d(-corners, BRICK + 1, BRICK)
+    return _judge(low, high, margin)[0, 0], corners[0, 0]
+
+
+def _lattice(intervals: int, device: torch.device) -> Tensor:
+    """Points of a lattice over the mapped cube, [(intervals + 1)^3, 3]."""
+    axis = torch.linspace(-1.0, 1.0, intervals + 1, device=device)
+    return torch.stack(torch.meshgrid(axis, axis, axis, indexing="ij"), dim=-1).view(-1, 3)
+
+
+def logits_above(occupancy: OccupancyLike, mapped: Tensor) -> Tensor:
+    """How far the logit of o lies above that of the threshold at mapped positions [N, 3]; [N].
+
+    Finite: float32 says o = 1 from a logit of 17 on.
+    """
+    threshold = torch.tensor(occupancy.threshold, device=mapped.device).logit(eps=1e-7)
+    values = [
+        occupancy.query(occupancy.space.unmap(part)).float().logit(eps=1e-7) - threshold
+        for part in mapped.split(POINTS_AT_ONCE)
+    ]
+    return torch.cat(values)
+
+
+def _judge(low: Tensor, high: Tensor, margin: float) -> Tensor:
+    """States of cells from the lowest and highest logit seen in each; uint8, of their shape."""
+    room = (high - low) * margin
+    states = torch.full_like(high, MIXED, dtype=torch.uint8)
+    states[high + room < 0.0] = EMPTY
+    states[low - room >= 0.0] = OCCUPIED
+    return states
+
+
+def judge_fine(
+    occupancy: OccupancyLike, corners: Tensor, cells: Tensor, margin: float
+) -> tuple[Tensor, Tensor, Tensor]:
+    """The fine cells of some mixed coarse cells [n, 3], judged at their corners and centres.
+
+    Returns:
+        their states [n, 64]; of the mixed ones, the logits at the nine points [m, 9] and the
+        mapped positions of the lowest corners [m, 3].
+    """
+    n, device = len(cells), corners.device
+    size = 2.0 / (len(corners) - 1)
+    steps = torch.arange(BRICK, device=device)
+    within = torch.stack(torch.meshgrid(steps, steps, steps, indexing="ij"), dim=-1).view(-1, 3)
+    places = (cells[:, None, :] * BRICK + within) * size - 1.0
+    centres = logits_above(occupancy, (places + 0.5 * size).reshape(-1, 3)).view(n, BRICK**3, 1)
+    eight = corners.unfold(0, 2, 1).unfold(1, 2, 1).unfold(2, 2, 1)
+    x, y, z = (cells[:, None, :] * BRICK + within).unbind(-1)
+    values = torch.cat([eight[x, y, z].flatten(2), centres], dim=-1)
+    states = _judge(values.amin(dim=-1), values.amax(dim=-1), margin)
+    mixed = states == MIXED
+    return states, values[mixed], places[mixed]
+
+
+def fit_planes(
+    occupancy: OccupancyLike, values: Tensor, places: Tensor, size: float
+) -> tuple[Tensor, Tensor]:
+    """Planes through the logits of fine cells, and how high above them they may err.
+
+    Args:
+        values: logits at the corners and the centre of each cell, [m, 9].
+        places: mapped positions of the lowest corners, [m, 3].
+        size: width of a cell in the mapped cube.
+
+    Returns:
+        planes (a, b) in units of which the largest is 127, [m, 4], and doubts in these units [m]:
+        the height at which points of the cell show an error, and half the spread of residuals.
+        Few cells bend sharply; only there the two differ much.
+    """
+    device = values.device
+    generator = torch.Generator(device).manual_seed(len(values))
+    random = torch.rand(len(values), TRIALS, 3, device=device, generator=generator)
+    mapped = (places[:, None, :] + random * size).reshape(-1, 3)
+    values = torch.cat([values, logits_above(occupancy, mapped).view(len(values), TRIALS)], dim=1)
+    nine = torch.cat([_lattice(1, device), torch.zeros(1, 3, device=device)])
+    units = torch.cat([nine.expand(len(values), 9, 3), random * 2.0 - 1.0], dim=1)
+    design = pad(units, (1, 0), value=1.0)  # [m, points, 4]
+
+    # Only where the plane is zero matters: points far from the threshold count for less.
+    scale = (values.amax(dim=1) - values.amin(dim=1)).clamp(min=1e-6) / 4.0
+    weights = 1.0 / (1.0 + (values / scale[:, None]).square())
+    weighted = (weights[:, :, None] * design).mT
+    system = weighted @ design + 1e-6 * torch.eye(4, device=device)
+    planes = torch.linalg.solve(system, weighted @ values[:, :, None])[..., 0]
+    unit = planes.abs().amax(dim=1, keepdim=True).clamp(min=1e-6) / 127.0
+    planes = (planes / unit).round()
+
+    heights = (design @ planes[:, :, None])[..., 0]
+    spread = (heights - values / unit).square().mean(dim=1).sqrt()
+    wrong = (heights > 0.0) != (values >= 0.0)
+    return planes, (heights.abs() * wrong).amax(dim=1) + 0.5 * spread
+
+
+def clearance_of(states: Tensor, mixed: Tensor, fine_states: Tensor) -> Tensor:
+    """The clearance table, from the states of coarse [n, n, n] and fine [n_mixed, 64] cells."""
+    half = BRICK // 2
+    taken = (states != EMPTY).repeat_interleave(2, 0).repeat_interleave(2, 1)
+    taken = taken.repeat_interleave(2, 2).float()
+    bricks = (fine_states != EMPTY).float().view(-1, 1, BRICK, BRICK, BRICK)
+    inner = max_pool3d(bricks, half)[:, 0] if len(bricks) else bricks[:, 0]
+    for x, y, z in ((x, y, z) for x in (0, 1) for y in (0, 1) for z in (0, 1)):
+        at = mixed * 2 + torch.tensor([x, y, z], device=mixed.device)
+        taken[at[:, 0], at[:, 1], at[:, 2]] = inner[:, x, y, z]
+    reach, clearance = taken[None, None], torch.zeros_like(taken)
+    for _ in range(FARTHEST):
+        clearance += 1.0 - reach[0, 0]
+        # Beyond the cube only the gate knows: it counts as occupied.
+        reach = max_pool3d(pad(reach, [1] * 6, value=1.0), 3, stride=1)
+    pairs = clearance.to(torch.uint8).view(-1, 2)
+    return pairs[:, 0] | pairs[:, 1] << 4

@@ -1,0 +1,108 @@
+"""The frozen gate in the place of proposal networks: a fixed number of samples on every ray.
+
+A host calls it as it calls nerfstudio's `ProposalNetworkSampler`. Candidates are laid along each
+ray as the host lays them, the cells of the cache and the gate say what each is worth, and samples
+are drawn from that distribution. There is no proposal network to train.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import torch
+from nerfstudio.cameras.rays import RayBundle, RaySamples
+from nerfstudio.model_components.ray_samplers import (
+    PDFSampler,
+    Sampler,
+    UniformLinDispPiecewiseSampler,
+)
+from torch import Tensor
+
+from leco_plugin.samplers.cache import OccupancyLike
+from leco_plugin.samplers.estimator import LearnedOccupancyEstimator
+
+
+class LearnedOccupancySampler(Sampler):
+    """Draws samples from the gate's distribution along each ray.
+
+    Args:
+        occupancy: the frozen gate with its space and threshold.
+        num_samples: samples of each ray.
+        num_candidates: places along a ray where the gate is asked, in the spacing of
+            `initial_sampler`.
+        initial_sampler: lays the candidates; None is nerfstudio's default for proposal hosts.
+        single_jitter: shift all samples of a ray by the same random share.
+        cache_bytes: budget of the cell cache; 0 asks the gate about every candidate.
+    """
+
+    def __init__(
+        self,
+        occupancy: OccupancyLike,
+        num_samples: int = 48,
+        num_candidates: int = 256,
+        initial_sampler: Sampler | None = None,
+        single_jitter: bool = False,
+        cache_bytes: int = 1 << 20,
+    ) -> None:
+        super().__init__()
+        self.estimator = LearnedOccupancyEstimator(occupancy, cache_bytes=cache_bytes)
+        self.num_samples = num_samples
+        self.num_candidates = num_candidates
+        if initial_sampler is None:
+            initial_sampler = UniformLinDispPiecewiseSampler(single_jitter=single_jitter)
+        self.initial_sampler = initial_sampler
+        # No padding: it would spend samples on empty space. A ray without any weight gets equal
+        # ones, which is uniform sampling.
+        self.pdf_sampler = PDFSampler(
+            include_original=False, single_jitter=single_jitter, histogram_padding=0.0
+        )
+
+    def set_anneal(self, anneal: float) -> None:
+        """Called by hosts for proposal networks; a frozen gate needs no annealing."""
+
+    def step_cb(self, step: int) -> None:
+        """Called by hosts after a training step; nothing is scheduled here."""
+
+    def generate_ray_samples(
+        self,
+        ray_bundle: RayBundle | None = None,
+        density_fns: list[Callable[..., Any]] | None = None,
+    ) -> tuple[RaySamples, list[Tensor], list[RaySamples]]:
+        """Samples for a host.
+
+        Args:
+            ray_bundle: rays with nears and fars, [n_rays].
+            density_fns: the host's proposal densities. They are not called; their number tells how
+                many levels of weights the host's losses and depth outputs expect.
+
+        Returns:
+            the samples [n_rays, num_samples], sorted and between near and far; and for each level
+            the weights of the candidates [n_rays, num_candidates, 1], which sum to 1 on a ray that
+            meets something occupied and to 0 on others, and the candidates.
+
+        Raises:
+            ValueError: there are no rays to sample, or they have no nears and fars.
+        """
+        if ray_bundle is None or ray_bundle.nears is None or ray_bundle.fars is None:
+            raise ValueError("samples need a ray bundle with nears and fars (set by a collider)")
+        candidates = self.initial_sampler(ray_bundle, num_samples=self.num_candidates)
+        worth = self.worth(candidates.frustums.get_positions())
+        weights = worth / worth.sum(dim=-2, keepdim=True).clamp(min=1e-12)
+        samples = self.pdf_sampler(ray_bundle, candidates, weights, num_samples=self.num_samples)
+        levels = 1 if density_fns is None else len(density_fns)
+        return samples, [weights] * levels, [candidates] * levels
+
+    @torch.no_grad()
+    def worth(self, positions: Tensor) -> Tensor:
+        """o at occupied positions, 0 elsewhere; positions [..., 3] to [..., 1].
+
+        The cache decides first, so that the gate is asked only where it lets something through.
+        """
+        flat = positions.reshape(-1, 3)
+        kept = self.estimator.occupied(flat).nonzero()[:, 0]
+        worth = flat.new_zeros(len(flat))
+        if kept.numel():
+            values = self.estimator.occupancy.query(flat.index_select(0, kept))
+            worth.index_put_((kept,), values.to(worth.dtype))
+        return worth.view(*positions.shape[:-1], 1)

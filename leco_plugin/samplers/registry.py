@@ -1,0 +1,127 @@
+"""Samplers by name, ours and those of other packages (entry-point group `leco_plugin.samplers`).
+
+An entry point names a `SamplerSpec`. Ours are listed here too, so that a checkout that is not
+installed knows them, and modules are imported when a sampler is built, not when it is listed.
+"""
+
+from __future__ import annotations
+
+import importlib
+import warnings
+from collections.abc import Callable
+from dataclasses import dataclass
+from importlib.metadata import entry_points
+from typing import Any
+
+from torch import nn
+
+GROUP = "leco_plugin.samplers"
+
+
+@dataclass(frozen=True)
+class SamplerSpec:
+    """How to build a sampler for each of the two kinds of hosts."""
+
+    description: str
+    """One line for lists and help."""
+    estimator: Callable[..., nn.Module] | str | None = None
+    """Builds what a packed host calls (`base.Estimator`), or "module:attribute" of such. Called
+    with `aabb` (the host's box, [6]), `occupancy` (None when there is none) and options."""
+    proposal: Callable[..., nn.Module] | str | None = None
+    """Builds what a proposal host calls (`proposal.LearnedOccupancySampler`), likewise."""
+    needs_occupancy: bool = False
+    """Whether it asks a frozen gate."""
+
+
+DENSE = SamplerSpec(
+    description="every candidate is kept: the reference",
+    estimator="leco_plugin.samplers.registry:build_dense",
+)
+OCCUPANCY_GRID = SamplerSpec(
+    description="Instant-NGP's occupancy grid as in nerfacc; options resolution, levels",
+    estimator="leco_plugin.samplers.registry:build_grid",
+)
+LEARNED_OCCUPANCY = SamplerSpec(
+    description="a frozen gate with a cell cache; options cache_bytes, tolerance",
+    estimator="leco_plugin.samplers.registry:build_learned",
+    proposal="leco_plugin.samplers.registry:build_learned_proposal",
+    needs_occupancy=True,
+)
+OURS = {
+    "dense": DENSE,
+    "occupancy-grid": OCCUPANCY_GRID,
+    "learned-occupancy": LEARNED_OCCUPANCY,
+}
+
+
+def samplers() -> dict[str, SamplerSpec]:
+    """All samplers by name. A broken entry point of another package is left out with a warning."""
+    found: dict[str, SamplerSpec] = {}
+    for entry in entry_points(group=GROUP):
+        if entry.name in OURS:
+            continue
+        try:
+            found[entry.name] = entry.load()
+        except Exception as error:  # noqa: BLE001 (whatever a foreign module raises)
+            warnings.warn(f"sampler {entry.name!r} ({entry.value}): {error!r}", stacklevel=2)
+    return {**OURS, **found}
+
+
+def build_estimator(name: str, **options: Any) -> nn.Module:
+    """What a packed host calls; see `SamplerSpec.estimator` for the options.
+
+    Raises:
+        ValueError: there is no such sampler, it does not serve packed hosts, or it needs an
+            occupancy and none is given.
+    """
+    return _build(name, "estimator", options)
+
+
+def build_proposal(name: str, **options: Any) -> nn.Module:
+    """What a proposal host calls; options and errors as for `build_estimator`."""
+    return _build(name, "proposal", options)
+
+
+def _build(name: str, kind: str, options: dict[str, Any]) -> nn.Module:
+    known = samplers()
+    if name not in known:
+        raise ValueError(f"there is no sampler {name!r}; there are {', '.join(sorted(known))}")
+    spec = known[name]
+    builder = getattr(spec, kind)
+    if builder is None:
+        raise ValueError(f"sampler {name!r} has nothing for hosts that call a {kind}")
+    if spec.needs_occupancy and options.get("occupancy") is None:
+        raise ValueError(f"sampler {name!r} needs an occupancy")
+    if isinstance(builder, str):
+        module, _, attribute = builder.partition(":")
+        builder = getattr(importlib.import_module(module), attribute)
+    estimator: nn.Module = builder(**options)
+    return estimator
+
+
+def build_dense(aabb: Any = None, occupancy: Any = None) -> nn.Module:
+    """`grid.DenseEstimator` in the host's box."""
+    from leco_plugin.samplers.grid import DenseEstimator
+
+    return DenseEstimator(aabb)
+
+
+def build_grid(aabb: Any, occupancy: Any = None, **options: Any) -> nn.Module:
+    """`grid.OccupancyGridEstimator` whose innermost level is the host's box."""
+    from leco_plugin.samplers.grid import OccupancyGridEstimator
+
+    return OccupancyGridEstimator(aabb, **options)
+
+
+def build_learned(occupancy: Any, aabb: Any = None, **options: Any) -> nn.Module:
+    """`estimator.LearnedOccupancyEstimator`; it needs no box, so the host's is left aside."""
+    from leco_plugin.samplers.estimator import LearnedOccupancyEstimator
+
+    return LearnedOccupancyEstimator(occupancy, **options)
+
+
+def build_learned_proposal(occupancy: Any, aabb: Any = None, **options: Any) -> nn.Module:
+    """`proposal.LearnedOccupancySampler`."""
+    from leco_plugin.samplers.proposal import LearnedOccupancySampler
+
+    return LearnedOccupancySampler(occupancy, **options)

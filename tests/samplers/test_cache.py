@@ -1,0 +1,113 @@
+"""The cell cache decides as the gate does, within its budget, and is conservative."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from samplers.analytic_occupancy import Balls
+
+from leco_plugin.samplers.cache import CellCache
+from leco_plugin.samplers.cache_build import build_cache
+
+BUDGET = 1 << 17
+
+
+@pytest.fixture(scope="module", params=["box", "contraction"])
+def balls(request):
+    return Balls(request.param, half_extent=1.3)
+
+
+@pytest.fixture(scope="module")
+def cache(balls) -> CellCache:
+    return build_cache(balls, budget=BUDGET, check_points=1 << 18)
+
+
+def decide(cache, balls, positions):
+    decided, left_open = cache.decide(positions)
+    decided[left_open] = balls.occupied(positions[left_open])
+    return decided
+
+
+def test_decisions_are_the_gates_but_for_the_tolerance(cache, balls):
+    mapped = torch.rand(1 << 18, 3, generator=torch.Generator().manual_seed(7)) * 2.0 - 1.0
+    positions = balls.space.unmap(mapped)
+    differing = (decide(cache, balls, positions) != balls.occupied(positions)).float().mean()
+    assert differing <= 1e-4
+
+
+def test_the_report_says_what_is_held_and_what_was_measured(cache):
+    report = cache.report
+    assert cache.tables().bytes == report.bytes <= BUDGET
+    assert report.differing <= report.differing_bound <= 1e-4
+    assert report.checked == 1 << 18
+
+
+def test_few_positions_are_left_to_the_gate(cache, balls):
+    assert cache.report.asked < 0.05
+    balls.asked = 0
+    decide(cache, balls, balls.space.unmap(torch.rand(10_000, 3) * 2.0 - 1.0))
+    assert balls.asked < 200
+
+
+def test_a_larger_budget_buys_finer_cells(balls):
+    small = build_cache(balls, budget=1 << 15, check_points=1 << 16)
+    assert small.report.bytes <= 1 << 15
+    assert small.report.asked > build_cache(balls, budget=BUDGET, check_points=1 << 16).report.asked
+
+
+def test_positions_outside_a_box_or_nowhere_are_empty(balls, cache):
+    positions = torch.tensor([[50.0, 0.0, 0.0], [0.0, -9.0, 0.0], [torch.nan, 0.0, 0.0]])
+    decided, left_open = cache.decide(positions)
+    assert not decided.any()
+    if balls.space.kind == "box":
+        assert left_open.numel() == 0
+    assert cache.near(positions, torch.zeros(3)).shape == (3,)
+
+
+@pytest.mark.parametrize("radius", [0.0, 0.01, 0.1, 0.5])
+def test_nothing_is_occupied_within_a_radius_that_is_called_clear(cache, balls, radius):
+    generator = torch.Generator().manual_seed(3)
+    centers = torch.randn(4000, 3, generator=generator) * 1.5
+    near = cache.near(centers, torch.full((4000,), radius))
+    offsets = torch.nn.functional.normalize(torch.randn(4000, 16, 3, generator=generator), dim=-1)
+    around = centers[:, None] + offsets * radius
+    occupied = balls.occupied(around.reshape(-1, 3)).view(4000, 16).any(dim=-1)
+    assert near[occupied].all()
+    if radius <= 0.1:
+        inside = (balls.space.map(centers).abs() <= 1.0).all(dim=-1)
+        assert near[inside].float().mean() < 0.7
+
+
+def test_the_stretch_bounds_the_mapping_everywhere(cache, balls):
+    generator = torch.Generator().manual_seed(4)
+    positions = torch.randn(20_000, 3, generator=generator) * 4.0
+    radii = torch.rand(20_000, generator=generator) * 2.0
+    offsets = torch.nn.functional.normalize(torch.randn(20_000, 3, generator=generator), dim=-1)
+    moved = balls.space.map(positions + offsets * radii[:, None]) - balls.space.map(positions)
+    cells = moved.abs().amax(dim=-1) * cache.resolution / 2.0
+    bound = cache._stretch(positions, radii) * radii
+    assert (cells <= bound * (1.0 + 1e-4) + 1e-4).all()
+
+
+@pytest.mark.parametrize("constant", [0.0, 1.0])
+def test_a_constant_gate_needs_no_bricks(constant):
+    balls = Balls()
+    balls.query = lambda positions: torch.full((len(positions),), constant)
+    cache = build_cache(balls, budget=BUDGET, check_points=1 << 14, tolerance=1e-2)
+    decided, left_open = cache.decide(torch.rand(1000, 3) - 0.5)
+    assert len(cache.fine) == len(left_open) == 0
+    assert decided.float().mean() == constant
+
+
+def test_a_gate_that_no_cells_can_hold_is_refused():
+    balls = Balls()
+    # The decision flips a thousand times across the cube.
+    balls.query = lambda positions: (positions[:, 0] * 3000.0).sin() * 0.5 + 0.5
+    with pytest.raises(ValueError, match="too rough to be held in cells"):
+        build_cache(balls, check_points=1 << 14)
+    # Specks smaller than any cell, which no lattice meets.
+    balls.query = lambda positions: ((positions * 997.0).sin().prod(dim=-1) > 0.99).float()
+    with pytest.raises(ValueError, match="of the decisions differ"):
+        build_cache(balls, check_points=1 << 18)
+    with pytest.raises(ValueError, match="fits 100 bytes"):
+        build_cache(Balls(), budget=100, check_points=1 << 14)

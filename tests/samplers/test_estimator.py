@@ -1,0 +1,204 @@
+"""The estimators answer as nerfacc's does, argument for argument."""
+
+from __future__ import annotations
+
+import inspect
+
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from samplers.analytic_occupancy import Balls, camera_rays, slow_march
+
+from leco_plugin.samplers import packed
+from leco_plugin.samplers.estimator import LearnedOccupancyEstimator
+from leco_plugin.samplers.grid import DenseEstimator, OccupancyGridEstimator
+
+BUDGET = 1 << 16
+
+
+@pytest.fixture(scope="module", params=["box", "contraction"])
+def learned(request):
+    return LearnedOccupancyEstimator(Balls(request.param), cache_bytes=BUDGET)
+
+
+@pytest.fixture(scope="module")
+def bare():
+    return LearnedOccupancyEstimator(Balls(), cache_bytes=0)
+
+
+def test_the_interface_is_that_of_nerfaccs_grid():
+    nerfacc = pytest.importorskip("nerfacc")
+    theirs = inspect.signature(nerfacc.OccGridEstimator.sampling).parameters
+    ours = inspect.signature(LearnedOccupancyEstimator.sampling).parameters
+    assert [(p.name, p.default) for p in ours.values()] == [
+        (p.name, p.default) for p in theirs.values()
+    ]
+
+
+def test_samples_are_the_occupied_candidates(bare):
+    origins, directions = camera_rays(40)
+    near = torch.full((40,), 0.7)
+    samples = bare.sampling(
+        origins, directions, t_min=near, near_plane=0.5, far_plane=2.5, render_step_size=0.03
+    )
+    expected = slow_march(
+        origins, directions, near, torch.full((40,), 2.5), 0.03, 0.0, bare.occupancy.occupied
+    )
+    assert samples[0].tolist() == [ray for ray, _, _ in expected]
+    assert samples[1].tolist() == pytest.approx([start for _, start, _ in expected], abs=1e-5)
+
+
+def test_the_cache_changes_almost_no_sample(learned):
+    bare = LearnedOccupancyEstimator(learned.occupancy, cache_bytes=0)
+    origins, directions = camera_rays(3000)
+    options = {"render_step_size": 0.01, "far_plane": 6.0}
+    with_cache = learned.sampling(origins, directions, **options)
+    learned.occupancy.asked = 0
+    without = bare.sampling(origins, directions, **options)
+    kept = [set(zip(s[0].tolist(), s[1].tolist(), strict=True)) for s in (with_cache, without)]
+    assert len(kept[0] ^ kept[1]) <= 1e-4 * learned.occupancy.asked
+
+
+def test_every_sample_is_occupied_when_asked_again(bare):
+    origins, directions = camera_rays(200)
+    ray_indices, t_starts, t_ends = bare.sampling(origins, directions, render_step_size=0.01)
+    middles = (t_starts + t_ends)[:, None] / 2.0
+    positions = origins[ray_indices] + directions[ray_indices] * middles
+    assert bare.occupancy.occupied(positions).float().mean() > 0.999  # but for rounding
+
+
+def test_stratified_sampling_shifts_by_less_than_a_step(bare):
+    origins, directions = camera_rays(50)
+    options = {"render_step_size": 0.1, "near_plane": 1.0, "far_plane": 3.0}
+    dense = DenseEstimator()
+    torch.manual_seed(0)
+    one = dense.sampling(origins, directions, stratified=True, **options)
+    torch.manual_seed(1)
+    other = dense.sampling(origins, directions, stratified=True, **options)
+    still = dense.sampling(origins, directions, **options)
+    first = [samples[1][packed.pack_info(samples[0], 50)[:, 0]] for samples in (one, other, still)]
+    assert not torch.equal(first[0], first[1])
+    for start in first[:2]:
+        assert ((start - first[2] >= 0.0) & (start - first[2] < 0.1)).all()
+
+
+def test_densities_prune_what_cannot_be_seen(bare):
+    origins, directions = camera_rays(100)
+    plain = bare.sampling(origins, directions, render_step_size=0.01)
+
+    def sigma_fn(t_starts, t_ends, ray_indices):
+        return torch.full_like(t_starts, 100.0)
+
+    seen = bare.sampling(origins, directions, sigma_fn=sigma_fn, render_step_size=0.01)
+    counts = packed.pack_info(seen[0], 100)[:, 1]
+    # An opacity of 1 - 1/e each: transmittance passes 1e-4 after ten samples.
+    assert counts.equal(packed.pack_info(plain[0], 100)[:, 1].clamp(max=10))
+    alphas = bare.sampling(
+        origins,
+        directions,
+        alpha_fn=lambda t, *_: torch.full_like(t, 1.0 - torch.e**-1),
+        render_step_size=0.01,
+    )
+    assert alphas[0].equal(seen[0])
+
+
+def test_a_field_that_knows_nothing_yet_loses_no_sample(bare):
+    origins, directions = camera_rays(100)
+    plain = bare.sampling(origins, directions, render_step_size=0.01)
+    pruned = bare.sampling(
+        origins,
+        directions,
+        sigma_fn=lambda t, *_: torch.full_like(t, 1e-3),
+        alpha_thre=0.01,
+        render_step_size=0.01,
+    )
+    assert len(pruned[0]) == len(plain[0])
+
+
+def test_evaluation_goes_front_to_back_once_it_knows_the_density(bare):
+    origins, directions = camera_rays(100)
+    plain = bare.eval().sampling(origins, directions, render_step_size=0.01)
+    bare.density_fn = lambda positions: torch.full((len(positions), 1), 100.0)
+    try:
+        seen = bare.sampling(origins, directions, render_step_size=0.01)
+        trained = bare.train().sampling(origins, directions, render_step_size=0.01)
+    finally:
+        bare.density_fn = None
+    assert len(trained[0]) == len(plain[0])
+    counts = packed.pack_info(plain[0], 100)[:, 1].clamp(max=10)
+    assert packed.pack_info(seen[0], 100)[:, 1].equal(counts)
+
+
+def test_a_frozen_gate_is_not_updated_and_answers_like_a_grid(learned):
+    learned.update_every_n_steps(step=0, occ_eval_fn=None)
+    resolution = learned.resolution.tolist()
+    assert learned.binaries.shape == (1, *resolution)
+    assert learned.occs.shape == (resolution[0] ** 3,)
+    assert learned.aabbs.shape == (1, 6)
+    filled = OccupancyGridEstimator(learned.aabbs[0], resolution=resolution)
+    filled.binaries.copy_(learned.binaries)
+    positions = torch.rand(5000, 3) * 1.6 - 0.8
+    agreement = filled.occupied(positions) == learned.occupancy.occupied(positions)
+    assert agreement.float().mean() > 0.98
+
+
+def test_no_box_is_needed_and_one_may_be_given():
+    balls = Balls("contraction")
+    origins, directions = camera_rays(50)
+    free = LearnedOccupancyEstimator(balls, cache_bytes=0)
+    boxed = LearnedOccupancyEstimator(balls, [-0.1, -1.0, -1.0, 1.0, 1.0, 1.0], cache_bytes=0)
+    options = {"render_step_size": 0.01, "cone_angle": 0.004}
+    assert free.bounds() is None
+    everything = free.sampling(origins, directions, far_plane=1e10, **options)
+    part = boxed.sampling(origins, directions, **options)
+    assert 0 < len(part[0]) < len(everything[0])
+    positions = origins[part[0]] + directions[part[0]] * ((part[1] + part[2]) / 2)[:, None]
+    assert positions[:, 0].min() > -0.1 - 1e-4
+
+
+def test_an_impossible_cache_is_done_without_and_said(caplog):
+    balls = Balls()
+    balls.query = lambda positions: (positions[:, 0] * 3000.0).sin() * 0.5 + 0.5
+    estimator = LearnedOccupancyEstimator(balls, cache_bytes=1 << 15)
+    assert estimator.cache is None
+    assert "no cell cache, sampling will be slower" in caplog.text
+
+
+@settings(deadline=None, max_examples=30)
+@given(
+    n_rays=st.integers(0, 5),
+    bad=st.sampled_from(["none", "nan", "inf", "no direction", "backwards"]),
+    cone_angle=st.sampled_from([0.0, 0.01]),
+)
+def test_bad_rays_give_well_formed_samples_that_can_be_rendered(learned, n_rays, bad, cone_angle):
+    origins, directions = camera_rays(n_rays)
+    t_min, t_max = torch.zeros(n_rays), torch.full((n_rays,), 4.0)
+    if n_rays:
+        origins[0] = {"nan": torch.nan, "inf": torch.inf}.get(bad, 0.0) + origins[0]
+        directions[0] = directions[0] * (bad != "no direction")
+        t_min[0] = 5.0 if bad == "backwards" else 0.0
+    ray_indices, t_starts, t_ends = learned.sampling(
+        origins, directions, t_min=t_min, t_max=t_max, render_step_size=0.05, cone_angle=cone_angle
+    )
+    assert ray_indices.dtype == torch.int64
+    assert ray_indices.shape == t_starts.shape == t_ends.shape
+    assert bad == "none" or not (ray_indices == 0).any()
+    sigmas = torch.ones_like(t_starts).requires_grad_()
+    weights, *_ = packed.render_weight_from_density(
+        t_starts, t_ends, sigmas, ray_indices=ray_indices, n_rays=n_rays
+    )
+    packed.accumulate_along_rays(weights, None, ray_indices, n_rays).sum().backward()
+    assert sigmas.grad is not None
+
+
+def test_rays_that_do_not_fit_are_named(bare):
+    origins, directions = camera_rays(3)
+    with pytest.raises(ValueError, match=r"t_min must be \[3\], got \[2\]"):
+        bare.sampling(origins, directions, t_min=torch.zeros(2))
+    with pytest.raises(ValueError, match="rays are on meta"):
+        bare.sampling(origins.to("meta"), directions.to("meta"))
+    with pytest.raises(ValueError, match=r"directions must be \[3, 3\]"):
+        bare.sampling(origins, directions[:2])
+    with pytest.raises(ValueError, match="give a far plane"):
+        DenseEstimator().sampling(origins, directions)

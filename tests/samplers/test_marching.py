@@ -1,0 +1,208 @@
+"""The marching rule against one step at a time, and what bad rays get."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from samplers.analytic_occupancy import Balls, camera_rays, slow_march
+
+from leco_plugin.samplers.marching import RUN, candidate_counts, candidate_edges, march
+from leco_plugin.samplers.rays import intersect_box
+
+finite = st.floats(-2.0, 4.0)
+
+
+def assert_marched(samples, expected) -> None:
+    ray_indices, t_starts, t_ends = samples
+    assert ray_indices.tolist() == [ray for ray, _, _ in expected]
+    assert t_starts.tolist() == pytest.approx([start for _, start, _ in expected], abs=1e-9)
+    assert t_ends.tolist() == pytest.approx([end for _, _, end in expected], abs=1e-9)
+
+
+@settings(deadline=None, max_examples=60)
+@given(
+    bounds=st.lists(st.tuples(finite, finite), min_size=0, max_size=6),
+    step_size=st.floats(0.01, 0.5),
+    cone_angle=st.sampled_from([0.0, 0.004, 0.1, 1.0]),
+    chunk_size=st.sampled_from([1, 7, 100, 10**6]),
+    asked=st.booleans(),
+)
+def test_marching_is_one_step_after_the_other(bounds, step_size, cone_angle, chunk_size, asked):
+    origins, directions = (rays.double() for rays in camera_rays(len(bounds)))
+    t_mins, t_maxs = torch.tensor(bounds, dtype=torch.float64).reshape(-1, 2).unbind(-1)
+    occupied = (lambda positions: positions[:, 0] > 0.0) if asked else None
+    samples = march(
+        origins,
+        directions,
+        t_mins,
+        t_maxs,
+        step_size=step_size,
+        cone_angle=cone_angle,
+        occupied=occupied,
+        chunk_size=chunk_size,
+    )
+    expected = slow_march(origins, directions, t_mins, t_maxs, step_size, cone_angle, occupied)
+    assert_marched(samples, expected)
+
+
+@pytest.mark.parametrize("cone_angle", [0.0, 0.02])
+def test_float32_edges_stay_within_rounding_of_float64(cone_angle):
+    t_mins = torch.rand(50, 1) * 0.1
+    steps = torch.arange(2000.0)
+    edges = candidate_edges(t_mins, steps, 1e-3, cone_angle)
+    exact = candidate_edges(t_mins.double(), steps.double(), 1e-3, cone_angle)
+    torch.testing.assert_close(edges.double(), exact, rtol=5e-6, atol=1e-7)
+
+
+@settings(deadline=None)
+@given(seed=st.integers(0, 2**16), cone_angle=st.sampled_from([0.0, 0.003]))
+def test_the_last_candidate_is_the_last_midpoint_in_front_of_the_end(seed, cone_angle):
+    torch.manual_seed(seed)
+    t_mins = torch.rand(100)
+    t_maxs = t_mins + torch.rand(100) * 5.0
+    counts = candidate_counts(t_mins, t_maxs, 0.01, cone_angle)
+    edges = candidate_edges(t_mins[:, None], torch.arange(1003.0), 0.01, cone_angle)
+    midpoints = (edges[:, :-1] + edges[:, 1:]) * 0.5
+    assert counts.equal((midpoints < t_maxs[:, None]).sum(dim=-1).float())
+
+
+def test_neighbours_share_their_edge_exactly():
+    origins, directions = camera_rays(20)
+    for cone_angle in (0.0, 0.01):
+        ray_indices, t_starts, t_ends = march(
+            origins,
+            directions,
+            torch.zeros(20),
+            torch.full((20,), 3.0),
+            step_size=0.01,
+            cone_angle=cone_angle,
+            chunk_size=50,
+        )
+        same_ray = ray_indices[1:] == ray_indices[:-1]
+        assert t_starts[1:][same_ray].equal(t_ends[:-1][same_ray])
+
+
+def test_jitter_shifts_a_ray_by_a_share_of_a_step():
+    origins, directions = camera_rays(10)
+    bounds = torch.zeros(10), torch.full((10,), 2.0)
+    jitter = torch.rand(10)
+    shifted = march(origins, directions, *bounds, step_size=0.1, jitter=jitter)
+    by_hand = march(origins, directions, jitter * 0.1, bounds[1], step_size=0.1)
+    for one, other in zip(shifted, by_hand, strict=True):
+        assert one.equal(other)
+
+
+@pytest.mark.parametrize("cone_angle", [0.0, 0.02])
+def test_entering_late_leaves_candidates_where_they_are(cone_angle):
+    origins, directions = camera_rays(30)
+    t_mins, t_maxs = torch.zeros(30), torch.full((30,), 3.0)
+    t_enters, _ = intersect_box(origins, directions, torch.tensor([-0.5] * 3 + [0.5] * 3))
+    samples = march(
+        origins,
+        directions,
+        t_mins,
+        t_maxs,
+        step_size=0.05,
+        cone_angle=cone_angle,
+        t_enters=t_enters,
+    )
+    expected = slow_march(
+        origins.double(), directions.double(), t_mins, t_maxs, 0.05, cone_angle, None, t_enters
+    )
+    assert samples[0].tolist() == [ray for ray, _, _ in expected]
+    assert samples[1].tolist() == pytest.approx([start for _, start, _ in expected], abs=1e-5)
+
+
+@pytest.mark.parametrize("uniform", [True, False])
+def test_a_coarse_question_changes_the_time_and_not_the_result(uniform):
+    balls = Balls()
+    origins, directions = camera_rays(200)
+    t_mins = torch.zeros(200)
+    t_maxs = torch.full((200,), 4.0) if uniform else torch.rand(200) * 4.0
+    asked = {"coarse": 0, "near": 0}
+
+    def near(positions, radii):
+        distances = (positions[:, None] - balls.centers).norm(dim=-1) - balls.radii - 0.1
+        answers = (distances < radii[:, None]).any(dim=-1)
+        asked["coarse"] += len(answers)
+        asked["near"] += int(answers.sum())
+        return answers
+
+    bounds = (origins, directions, t_mins, t_maxs)
+    plain = march(*bounds, step_size=0.01, occupied=balls.occupied)
+    questions = balls.asked
+    balls.asked = 0
+    coarse = march(*bounds, step_size=0.01, occupied=balls.occupied, near_occupied=near)
+    for one, other in zip(plain, coarse, strict=True):
+        assert one.equal(other)
+    assert balls.asked <= asked["near"] * RUN < 0.5 * questions
+
+
+def test_bad_rays_have_no_samples_and_good_ones_keep_theirs():
+    origins, directions = camera_rays(8)
+    t_mins, t_maxs = torch.zeros(8), torch.ones(8)
+    clean = march(origins, directions, t_mins, t_maxs, step_size=0.1)
+    origins[0, 1], directions[1, 2], origins[2, 0] = torch.nan, torch.nan, torch.inf
+    directions[3] = 0.0
+    t_mins[4], t_maxs[5] = 2.0, torch.nan
+    ray_indices, t_starts, _ = march(origins, directions, t_mins, t_maxs, step_size=0.1)
+    assert set(ray_indices.tolist()) == {6, 7}
+    assert t_starts[ray_indices == 7].equal(clean[1][clean[0] == 7])
+
+
+def test_no_rays_is_no_samples():
+    nothing = torch.zeros(0, 3), torch.zeros(0, 3), torch.zeros(0), torch.zeros(0)
+    ray_indices, t_starts, t_ends = march(*nothing, step_size=0.1)
+    assert ray_indices.dtype == torch.int64
+    assert ray_indices.shape == t_starts.shape == t_ends.shape == (0,)
+
+
+def test_rays_that_cannot_be_marched_are_refused_in_one_line():
+    origins, directions = camera_rays(3)
+    ones, zeros = torch.ones(3), torch.zeros(3)
+    for far in (1e10, torch.inf):
+        with pytest.raises(ValueError, match="give a far plane"):
+            march(origins, directions, zeros, ones * far, step_size=1e-3)
+    with pytest.raises(ValueError, match=r"directions must be \[3, 3\], got \[2, 3\]"):
+        march(origins, directions[:2], zeros, ones, step_size=0.1)
+    with pytest.raises(ValueError, match=r"t_mins must be \[3\], got \[3, 1\]"):
+        march(origins, directions, zeros[:, None], ones, step_size=0.1)
+    with pytest.raises(ValueError, match=r"t_maxs is torch\.float64"):
+        march(origins, directions, zeros, ones.double(), step_size=0.1)
+    with pytest.raises(ValueError, match=r"float32 or float64, got torch\.float16"):
+        march(origins.half(), directions.half(), zeros.half(), ones.half(), step_size=0.1)
+    for step_size, cone_angle in ((0.0, 0.0), (torch.nan, 0.0), (0.1, -1.0)):
+        with pytest.raises(ValueError, match="got"):
+            march(origins, directions, zeros, ones, step_size=step_size, cone_angle=cone_angle)
+
+
+@pytest.mark.parametrize("length", [0.05, 10.0])
+def test_memory_is_bounded_by_the_chunk(length):
+    origins, directions = camera_rays(100)
+    largest = 0
+
+    def occupied(positions):
+        nonlocal largest
+        largest = max(largest, len(positions))
+        return positions[:, 0] > 10.0
+
+    bounds = torch.zeros(100), torch.linspace(0.0, length, 100)
+    march(origins, directions, *bounds, step_size=0.01, occupied=occupied, chunk_size=500)
+    assert largest <= 500
+
+
+@given(seed=st.integers(0, 2**16))
+def test_boxes_are_entered_and_left_where_they_are_cut(seed):
+    torch.manual_seed(seed)
+    origins, directions = torch.randn(20, 3), torch.randn(20, 3)
+    directions[0], origins[0, 1] = torch.tensor([1.0, 0.0, 0.0]), 0.3
+    box = torch.tensor([-0.5, -0.7, -0.3, 0.4, 0.9, 0.6])
+    enters, leaves = intersect_box(origins, directions, box)
+    for ray in range(20):
+        t = torch.linspace(-6.0, 6.0, 2001)
+        points = origins[ray] + directions[ray] * t[:, None]
+        inside = ((points >= box[:3]) & (points <= box[3:])).all(dim=-1)
+        by_bounds = (t >= enters[ray]) & (t <= leaves[ray])
+        assert (inside != by_bounds).sum() <= 2  # rounding on the two faces

@@ -1,0 +1,178 @@
+"""nerfacc on a machine without CUDA: answers by its definitions, and a stock host that runs."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from samplers.analytic_occupancy import camera_rays, slow_march, slow_weights
+
+from leco_plugin.samplers import nerfacc_cpu
+from leco_plugin.samplers.grid import OccupancyGridEstimator
+
+nerfacc = pytest.importorskip("nerfacc")
+
+
+@pytest.fixture
+def installed():
+    nerfacc_cpu.install()
+    yield
+    nerfacc_cpu.uninstall()
+
+
+def stock_grid(levels: int = 2, resolution: int = 8):
+    torch.manual_seed(0)
+    grid = nerfacc.OccGridEstimator([-0.5] * 3 + [0.5] * 3, resolution=resolution, levels=levels)
+    grid.binaries = torch.rand(grid.binaries.shape) < 0.3
+    return grid
+
+
+def test_nothing_is_patched_by_an_import_and_everything_is_given_back():
+    before = (nerfacc.pack_info, nerfacc.volrend.exclusive_sum, nerfacc.grid.traverse_grids)
+    with pytest.raises(NotImplementedError):
+        nerfacc.pack_info(torch.tensor([0, 1]))
+    nerfacc_cpu.install()
+    nerfacc_cpu.install()
+    assert nerfacc.pack_info(torch.tensor([0, 1])).tolist() == [[0, 1], [1, 1]]
+    assert nerfacc.estimators.occ_grid.traverse_grids is nerfacc.traverse_grids
+    nerfacc_cpu.uninstall()
+    assert before == (nerfacc.pack_info, nerfacc.volrend.exclusive_sum, nerfacc.grid.traverse_grids)
+
+
+@pytest.mark.usefixtures("installed")
+@pytest.mark.parametrize("cone_angle", [0.0, 0.01])
+def test_the_stock_grid_samples_what_its_cells_say(cone_angle):
+    grid = stock_grid()
+    origins, directions = camera_rays(60)
+    ray_indices, t_starts, _ = grid.sampling(
+        origins, directions, render_step_size=0.03, cone_angle=cone_angle, far_plane=4.0
+    )
+    ours = OccupancyGridEstimator([-0.5] * 3 + [0.5] * 3, resolution=8, levels=2)
+    ours.binaries.copy_(grid.binaries)
+    expected = slow_march(
+        origins,
+        directions,
+        torch.zeros(60),
+        torch.full((60,), 4.0),
+        0.03,
+        cone_angle,
+        ours.occupied,
+    )
+    kept = set(zip(ray_indices.tolist(), t_starts.mul(1e3).round().tolist(), strict=True))
+    wanted = {(ray, round(start * 1e3)) for ray, start, _ in expected}
+    assert len(wanted ^ kept) <= 0.002 * len(wanted)  # midpoints a rounding from a face
+
+
+@pytest.mark.usefixtures("installed")
+def test_intervals_share_edges_as_nerfacc_has_them():
+    grid = stock_grid(levels=1)
+    origins, directions = camera_rays(60)
+    intervals, samples = nerfacc.traverse_grids(
+        origins, directions, grid.binaries, grid.aabbs, step_size=0.03
+    )
+    t_starts, t_ends = intervals.vals[intervals.is_left], intervals.vals[intervals.is_right]
+    torch.testing.assert_close((t_starts + t_ends) / 2.0, samples.vals)
+    assert intervals.ray_indices[intervals.is_left].equal(samples.ray_indices)
+    assert int(samples.packed_info[:, 1].sum()) == len(samples.vals)
+    assert int(intervals.packed_info[:, 1].sum()) == len(intervals.vals)
+    shared = intervals.is_left & intervals.is_right
+    assert 0 < int(shared.sum()) < len(samples.vals)
+    assert len(intervals.vals) == 2 * len(samples.vals) - int(shared.sum())
+
+
+@pytest.mark.usefixtures("installed")
+def test_boxes_are_hit_where_the_slabs_meet():
+    origins, directions = camera_rays(200)
+    directions[:100] = -directions[:100]  # away from the boxes
+    boxes = torch.tensor([[-0.5] * 3 + [0.5] * 3, [0.2, -1.0, -1.0, 0.3, 1.0, 1.0]])
+    t_mins, t_maxs, hits = nerfacc.ray_aabb_intersect(origins, directions, boxes, 0.0, 1e10, -7.0)
+    expected = nerfacc.grid._ray_aabb_intersect(origins, directions, boxes, 0.0, 1e10, -7.0)
+    torch.testing.assert_close(t_mins, expected[0])
+    torch.testing.assert_close(t_maxs, expected[1])
+    assert hits.equal(expected[2])
+    assert 0 < hits.sum() < 300
+
+
+@pytest.mark.usefixtures("installed")
+def test_rendering_is_the_sum_of_the_definition():
+    ray_indices = torch.tensor([0, 0, 0, 2, 2])
+    t_starts, sigmas = torch.arange(5.0), torch.rand(5)
+    colors, opacities, _, extras = nerfacc.rendering(
+        t_starts,
+        t_starts + 0.5,
+        ray_indices,
+        n_rays=3,
+        rgb_sigma_fn=lambda *_: (torch.ones(5, 3), sigmas),
+    )
+    weights, _, _ = slow_weights(sigmas * 0.5, ray_indices)
+    assert extras["weights"].tolist() == pytest.approx(weights, abs=1e-6)
+    assert opacities[:, 0].tolist() == pytest.approx([sum(weights[:3]), 0.0, sum(weights[3:])])
+    torch.testing.assert_close(colors, opacities.expand(3, 3))
+
+
+@pytest.mark.gpu
+def test_samples_are_those_of_nerfaccs_kernels():
+    grid = stock_grid(levels=3).cuda()
+    origins, directions = (rays.cuda() for rays in camera_rays(2000))
+    theirs = grid.sampling(origins, directions, render_step_size=0.01)
+    grid, origins, directions = grid.cpu(), origins.cpu(), directions.cpu()
+    nerfacc_cpu.install()
+    ours = grid.sampling(origins, directions, render_step_size=0.01)
+    nerfacc_cpu.uninstall()
+    kept = [
+        set(zip(s[0].tolist(), (s[1] * 1e3).round().tolist(), strict=True)) for s in (theirs, ours)
+    ]
+    assert len(kept[0] ^ kept[1]) <= 1e-3 * len(kept[0])
+
+
+@pytest.mark.usefixtures("installed")
+def test_stock_instant_ngp_trains_and_renders():
+    pytest.importorskip("nerfstudio")
+    from nerfstudio.cameras.cameras import Cameras
+    from nerfstudio.cameras.rays import RayBundle
+    from nerfstudio.data.scene_box import SceneBox
+    from nerfstudio.models.instant_ngp import InstantNGPModelConfig
+
+    from leco_plugin.compat.host_lpips import setup_with_lazy_lpips
+
+    torch.manual_seed(0)
+    config = InstantNGPModelConfig(
+        grid_resolution=16,
+        grid_levels=1,
+        max_res=64,
+        log2_hashmap_size=10,
+        render_step_size=0.05,
+        background_color="white",
+        disable_scene_contraction=True,
+        cone_angle=0.0,
+        eval_num_rays_per_chunk=1024,
+    )
+    box = SceneBox(torch.tensor([[-1.0] * 3, [1.0] * 3]))
+    model = setup_with_lazy_lpips(config, scene_box=box, num_train_data=1)
+    optimizer = torch.optim.Adam(model.get_param_groups()["fields"], lr=1e-2)
+    losses = []
+    for step in range(40):
+        origins, directions = camera_rays(128, seed=step)
+        bundle = RayBundle(
+            origins=origins,
+            directions=directions,
+            pixel_area=torch.ones(128, 1),
+            camera_indices=torch.zeros(128, 1, dtype=torch.int64),
+        )
+        model.occupancy_grid.update_every_n_steps(
+            step, lambda x: model.field.density_fn(x) * config.render_step_size
+        )
+        # A dark ball before a white sky.
+        nearest = origins - directions * (origins * directions).sum(dim=-1, keepdim=True)
+        image = 1.0 - 0.9 * (nearest.norm(dim=-1, keepdim=True) < 0.5).float().expand(-1, 3)
+        loss = sum(model.get_loss_dict(model(bundle), {"image": image}).values())
+        optimizer.zero_grad()
+        loss.backward()
+        optimizer.step()
+        losses.append(loss.item())
+    assert sum(losses[-5:]) < 0.5 * sum(losses[:5])
+    pose = torch.eye(4)[None, :3]
+    pose[0, 2, 3] = 2.0
+    camera = Cameras(pose, fx=30.0, fy=30.0, cx=8.0, cy=8.0, width=16, height=16)
+    outputs = model.eval().get_outputs_for_camera(camera)
+    assert outputs["rgb"].shape == (16, 16, 3)
+    assert outputs["rgb"][8, 8].mean() < outputs["rgb"][0, 0].mean()

@@ -1,0 +1,122 @@
+"""The sampler for proposal hosts draws from the gate's distribution and keeps its host working."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from samplers.analytic_occupancy import Balls, camera_rays
+
+pytest.importorskip("nerfstudio")
+
+from nerfstudio.cameras.rays import RayBundle
+from nerfstudio.model_components.losses import distortion_loss, interlevel_loss
+from nerfstudio.model_components.ray_samplers import UniformSampler
+from nerfstudio.model_components.renderers import DepthRenderer
+
+from leco_plugin.samplers.proposal import LearnedOccupancySampler
+
+NEAR, FAR = 0.5, 4.0
+
+
+def bundle(n_rays: int = 200) -> RayBundle:
+    origins, directions = camera_rays(n_rays)
+    return RayBundle(
+        origins=origins,
+        directions=directions,
+        pixel_area=torch.ones(n_rays, 1),
+        nears=torch.full((n_rays, 1), NEAR),
+        fars=torch.full((n_rays, 1), FAR),
+    )
+
+
+@pytest.fixture(scope="module")
+def sampler():
+    return LearnedOccupancySampler(
+        Balls(),
+        num_samples=32,
+        num_candidates=128,
+        initial_sampler=UniformSampler(),
+        cache_bytes=1 << 16,
+    )
+
+
+@pytest.mark.parametrize("training", [True, False])
+def test_samples_are_sorted_between_near_and_far_and_fixed_in_number(sampler, training):
+    samples, _, _ = sampler.train(training)(bundle())
+    starts, ends = samples.frustums.starts[..., 0], samples.frustums.ends[..., 0]
+    assert starts.shape == (200, 32)
+    assert (starts >= NEAR).all()
+    assert (ends <= FAR).all()
+    assert (ends >= starts).all()
+    torch.testing.assert_close(starts[:, 1:], ends[:, :-1])
+
+
+def test_samples_lie_where_the_gate_says(sampler):
+    rays = bundle()
+    samples, weights, candidates = sampler.eval()(rays)
+    meets = weights[0].sum(dim=1)[:, 0] > 0.5
+    positions = samples.frustums.get_positions()[meets]
+    occupied = sampler.estimator.occupancy.occupied(positions.reshape(-1, 3))
+    # Half a candidate on either side of each ball is as near as a histogram gets.
+    assert occupied.float().mean() > 0.8
+    uniform = candidates[0].frustums.get_positions()[meets]
+    assert sampler.estimator.occupancy.occupied(uniform.reshape(-1, 3)).float().mean() < 0.25
+
+
+def test_weights_are_the_normalised_worth_of_candidates(sampler):
+    rays = bundle(50)
+    _, weights, candidates = sampler.eval()(rays)
+    positions = candidates[0].frustums.get_positions()
+    values = sampler.estimator.occupancy.query(positions.reshape(-1, 3)).view(50, 128, 1)
+    worth = values * (values >= sampler.estimator.occupancy.threshold)
+    expected = worth / worth.sum(dim=1, keepdim=True).clamp(min=1e-12)
+    torch.testing.assert_close(weights[0], expected, rtol=1e-4, atol=1e-4)
+
+
+def test_an_empty_ray_is_sampled_uniformly(sampler):
+    rays = bundle(5)
+    rays.directions = rays.origins / 2.0  # away from the scene
+    samples, weights, _ = sampler.eval()(rays)
+    assert weights[0].sum() == 0.0
+    widths = samples.deltas[..., 0]
+    torch.testing.assert_close(widths, widths.mean().expand_as(widths), rtol=1e-2, atol=1e-3)
+
+
+def test_the_hosts_losses_and_depths_keep_working(sampler):
+    def never(*_):
+        raise AssertionError("there is no proposal network to ask")
+
+    samples, weights, candidates = sampler.train()(bundle(), density_fns=[never, never])
+    assert len(weights) == len(candidates) == 2
+    densities = torch.rand(200, 32, 1, requires_grad=True)
+    weights.append(samples.get_weights(densities))
+    candidates.append(samples)
+    loss = interlevel_loss(weights, candidates) + distortion_loss(weights, candidates)
+    loss.backward()
+    assert loss.isfinite()
+    assert densities.grad is not None
+    depth = DepthRenderer(method="median")(weights=weights[0], ray_samples=candidates[0])
+    assert depth.shape == (200, 1)
+    assert depth.isfinite().all()
+    sampler.set_anneal(0.5)
+    sampler.step_cb(3)
+
+
+def test_the_cache_spares_the_gate(sampler):
+    sampler.estimator.occupancy.asked = 0
+    _, weights, _ = sampler.eval()(bundle())
+    kept = int((weights[0] > 0.0).sum())
+    assert sampler.estimator.occupancy.asked < kept + 0.05 * weights[0].numel()
+
+
+def test_rays_without_bounds_are_refused(sampler):
+    rays = bundle(3)
+    rays.nears = None
+    with pytest.raises(ValueError, match="nears and fars"):
+        sampler(rays)
+
+
+def test_no_rays_is_no_samples(sampler):
+    samples, weights, _ = sampler(bundle(0))
+    assert samples.frustums.starts.shape == (0, 32, 1)
+    assert weights[0].shape == (0, 128, 1)

@@ -1,0 +1,77 @@
+"""Samplers are found by name, and a broken one of another package harms nobody."""
+
+from __future__ import annotations
+
+from importlib.metadata import EntryPoint
+
+import pytest
+import torch
+from samplers.analytic_occupancy import Balls, camera_rays
+
+from leco_plugin.samplers import registry
+from leco_plugin.samplers.base import Estimator
+from leco_plugin.samplers.registry import SamplerSpec, build_estimator, build_proposal, samplers
+
+BOX = torch.tensor([-1.0] * 3 + [1.0] * 3)
+FOREIGN = SamplerSpec("another package's", estimator=lambda aabb, occupancy: torch.nn.Identity())
+
+
+@pytest.mark.parametrize("name", ["dense", "occupancy-grid", "learned-occupancy"])
+def test_ours_are_estimators_that_sample(name):
+    estimator = build_estimator(name, aabb=BOX, occupancy=Balls())
+    assert isinstance(estimator, Estimator)
+    samples = estimator.sampling(*camera_rays(10), render_step_size=0.1)
+    assert len(samples) == 3
+
+
+def test_options_reach_the_sampler():
+    grid = build_estimator("occupancy-grid", aabb=BOX, resolution=16, levels=2)
+    assert grid.binaries.shape == (2, 16, 16, 16)
+    learned = build_estimator("learned-occupancy", occupancy=Balls(), cache_bytes=0)
+    assert learned.cache is None
+
+
+def test_a_proposal_host_gets_a_sampler():
+    pytest.importorskip("nerfstudio")
+    sampler = build_proposal("learned-occupancy", occupancy=Balls(), num_samples=8, cache_bytes=0)
+    assert sampler.num_samples == 8
+
+
+def test_mistakes_are_named():
+    with pytest.raises(ValueError, match="no sampler 'grid'; there are dense, learned-occ"):
+        build_estimator("grid")
+    with pytest.raises(ValueError, match="'learned-occupancy' needs an occupancy"):
+        build_estimator("learned-occupancy", aabb=BOX)
+    with pytest.raises(ValueError, match="'dense' has nothing for hosts that call a proposal"):
+        build_proposal("dense")
+
+
+def test_entry_points_of_other_packages_are_found_and_broken_ones_left_out(monkeypatch):
+    here = "leco_plugin.samplers.registry"
+    entries = [
+        EntryPoint("foreign", f"{here}:FOREIGN", registry.GROUP),
+        EntryPoint("broken", "no_such_module:spec", registry.GROUP),
+        EntryPoint("dense", "no_such_module:spec", registry.GROUP),  # ours stay ours
+    ]
+    monkeypatch.setattr(registry, "entry_points", lambda group: entries)
+    monkeypatch.setattr(registry, "FOREIGN", FOREIGN, raising=False)
+    with pytest.warns(UserWarning, match="sampler 'broken'"):
+        found = samplers()
+    assert set(found) == {"dense", "occupancy-grid", "learned-occupancy", "foreign"}
+    with pytest.warns(UserWarning, match="broken"):
+        assert isinstance(build_estimator("foreign", aabb=BOX, occupancy=None), torch.nn.Identity)
+
+
+def test_the_torch_core_imports_nothing_of_nerfstudio_or_nerfacc():
+    import subprocess
+    import sys
+
+    names = ["estimator", "cache", "cache_build", "marching", "packed", "grid", "registry", "base"]
+    names += ["visibility", "nerfacc_cpu"]
+    code = f"""
+import importlib, sys
+for name in {names}:
+    importlib.import_module("leco_plugin.samplers." + name)
+assert not [m for m in sys.modules if m.split(".")[0] in ("nerfstudio", "nerfacc", "tyro")]
+"""
+    subprocess.run([sys.executable, "-c", code], check=True)

@@ -1,0 +1,133 @@
+"""Both ways of leaving out what cannot be seen give what the definition gives."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from samplers.analytic_occupancy import Balls, camera_rays
+
+from leco_plugin.samplers import packed
+from leco_plugin.samplers.base import densities_of_samples
+from leco_plugin.samplers.marching import march, plan
+from leco_plugin.samplers.visibility import front_to_back, prune
+
+N_RAYS, STEP = 150, 0.01
+BALLS = Balls()
+
+
+def density(positions):
+    return BALLS.query(positions) * 100.0
+
+
+@pytest.fixture
+def scene():
+    origins, directions = camera_rays(N_RAYS)
+    return origins, directions, torch.zeros(N_RAYS), torch.rand(N_RAYS) * 3.0 + 1.0
+
+
+def render(samples, sigma_fn):
+    ray_indices, t_starts, t_ends = samples
+    weights, _, _ = packed.render_weight_from_density(
+        t_starts, t_ends, sigma_fn(t_starts, t_ends, ray_indices), None, ray_indices, N_RAYS
+    )
+    values = torch.stack([t_starts, torch.ones_like(t_starts)], dim=-1)
+    return packed.accumulate_along_rays(weights, values, ray_indices, N_RAYS)
+
+
+@pytest.mark.parametrize("slab", [1, 7, 64, 1000])
+@pytest.mark.parametrize("cone_angle", [0.0, 0.01])
+def test_front_to_back_is_pruning_with_fewer_questions(scene, slab, cone_angle):
+    sigma_fn = densities_of_samples(density, *scene[:2])
+    samples = march(*scene, step_size=STEP, cone_angle=cone_angle, occupied=BALLS.occupied)
+    visible = prune(samples, N_RAYS, sigma_fn=sigma_fn, early_stop_eps=1e-3)
+    candidates, _, longest = plan(*scene, STEP, cone_angle)
+    asked = 0
+
+    def counting(*sample):
+        nonlocal asked
+        asked += len(sample[0])
+        return sigma_fn(*sample)
+
+    found = front_to_back(
+        candidates,
+        longest,
+        occupied=BALLS.occupied,
+        sigma_fn=counting,
+        early_stop_eps=1e-3,
+        slab=slab,
+    )
+    for one, other in zip(found, visible, strict=True):
+        torch.testing.assert_close(one, other, rtol=0.0, atol=1e-6)
+    assert len(visible[0]) <= asked <= len(samples[0])
+    if slab <= 7:
+        assert asked < 0.6 * len(samples[0])
+
+
+def test_the_image_changes_by_no_more_than_the_threshold(scene):
+    sigma_fn = densities_of_samples(density, *scene[:2])
+    samples = march(*scene, step_size=STEP, occupied=BALLS.occupied)
+    candidates, _, longest = plan(*scene, STEP)
+    visible = front_to_back(
+        candidates, longest, occupied=BALLS.occupied, sigma_fn=sigma_fn, early_stop_eps=1e-4
+    )
+    difference = (render(samples, sigma_fn) - render(visible, sigma_fn)).abs().max()
+    assert len(visible[0]) < len(samples[0])
+    assert difference <= 1e-3
+
+
+def test_pruning_is_two_comparisons(scene):
+    sigma_fn = densities_of_samples(density, *scene[:2])
+    samples = march(*scene, step_size=STEP)
+    ray_indices, t_starts, t_ends = samples
+    sigmas = sigma_fn(t_starts, t_ends, ray_indices)
+    expected = packed.render_visibility_from_density(
+        t_starts, t_ends, sigmas, None, ray_indices, N_RAYS, early_stop_eps=0.01, alpha_thre=0.1
+    )
+    limits = {"early_stop_eps": 0.01, "alpha_thre": 0.1}
+    by_density = prune(samples, N_RAYS, sigma_fn=sigma_fn, **limits)
+    alphas = 1.0 - torch.exp(-sigmas * (t_ends - t_starts))
+    by_alpha = prune(samples, N_RAYS, alpha_fn=lambda *_: alphas, **limits)
+    for pruned in (by_density, by_alpha):
+        assert pruned[0].equal(ray_indices[expected])
+        assert pruned[1].equal(t_starts[expected])
+
+
+def test_a_capped_threshold_never_rejects_everything(scene):
+    samples = march(*scene, step_size=STEP)
+    pruned = prune(
+        samples,
+        N_RAYS,
+        sigma_fn=lambda *_: torch.full_like(samples[1], 1e-4),  # a field that knows nothing yet
+        alpha_thre=0.01,
+        alpha_cap=lambda alphas: alphas.mean() * 0.1,
+    )
+    assert len(pruned[0]) == len(samples[0])
+
+
+def test_nothing_to_see_is_no_samples(scene):
+    def never(*_):
+        raise AssertionError("the field must not be asked about nothing")
+
+    nowhere = march(*scene, step_size=STEP, occupied=lambda p: torch.zeros(len(p)).bool())
+    assert len(prune(nowhere, N_RAYS, sigma_fn=never)[0]) == 0
+    candidates, _, longest = plan(*scene, STEP)
+    none = front_to_back(
+        candidates,
+        longest,
+        occupied=lambda p: torch.zeros(len(p)).bool(),
+        sigma_fn=never,
+        early_stop_eps=1e-4,
+    )
+    assert [tensor.shape for tensor in none] == [(0,)] * 3
+
+
+def test_answers_of_another_shape_are_named(scene):
+    samples = march(*scene, step_size=STEP)
+    n = len(samples[0])
+    with pytest.raises(ValueError, match=rf"must answer \[{n}\], got \[{n}, 1\]"):
+        prune(samples, N_RAYS, sigma_fn=lambda *_: torch.ones(n, 1))
+    candidates, _, longest = plan(*scene, STEP)
+    with pytest.raises(ValueError, match=r"early_stop_eps in \(0, 1\)"):
+        front_to_back(
+            candidates, longest, occupied=None, sigma_fn=lambda *s: s[0], early_stop_eps=0.0
+        )
