@@ -1,4 +1,4 @@
-"""A learned occupancy in a plain torch + nerfacc loop: `plain_torch_nerfacc_loop.py FILE [STEPS]`."""
+"""Learned occupancy in a plain torch + nerfacc loop: plain_torch_nerfacc_loop.py FILE [STEPS]."""
 
 import sys
 

@@ -1,8 +1,9 @@
-"""The methods that `ns-train` finds. Imported whenever any ns-* command starts, so it stays light."""
+"""The methods that `ns-train` finds. Any ns-* command imports this, so it stays light."""
 
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Literal, cast
 
 import torch
 from nerfstudio.configs.base_config import MachineConfig, ViewerConfig
@@ -21,7 +22,7 @@ from leco_plugin.scenes.held_out_pixels import HeldOutPixelSamplerConfig
 from leco_plugin.scenes.photographs import LecoPhotographsDataParserConfig
 
 
-def best_device() -> str:
+def best_device() -> Literal["cpu", "cuda"]:
     """`cuda` where there is one, else `cpu`: nobody should need a flag for that."""
     return "cuda" if torch.cuda.is_available() else "cpu"
 
@@ -59,11 +60,11 @@ _leco_occupancy = TrainerConfig(
         ),
         model=LecoModelConfig(
             sizes=sizes_for(best_device()),
-            schedule=ScheduleConfig(learn_steps=2_000 if ON_GPU else 400),
+            schedule=ScheduleConfig(learn_steps=2_000 if ON_GPU else 300),
             eval_num_rays_per_chunk=1 << 15 if ON_GPU else 1 << 12,
         ),
     ),
-    optimizers=_optimizers(STEPS, 1e-2, 5e-3, 3e-3),
+    optimizers=_optimizers(STEPS, 1e-2, 5e-3, 5e-3),
     viewer=ViewerConfig(num_rays_per_chunk=1 << 12, quit_on_train_completion=True),
     vis="viewer+tensorboard",
 )
@@ -81,10 +82,11 @@ leco_occupancy_paper = MethodSpecification(
         pipeline=replace(
             _leco_occupancy.pipeline,
             datamanager=replace(
-                _leco_occupancy.pipeline.datamanager, train_num_rays_per_batch=1024
+                cast(VanillaDataManagerConfig, _leco_occupancy.pipeline.datamanager),
+                train_num_rays_per_batch=1024,
             ),
             model=replace(
-                _leco_occupancy.pipeline.model,
+                cast(LecoModelConfig, _leco_occupancy.pipeline.model),
                 sizes=PAPER,
                 schedule=ScheduleConfig(learn_steps=40_000, steps_per_check=500),
             ),

@@ -1,4 +1,4 @@
-"""`Occupancy`: a frozen gate with its space, threshold and report, as one module and one small file.
+"""`Occupancy`: a frozen gate with its space, threshold and report, a module and one small file.
 
 Torch and safetensors only: any project that samples rays can load `occupancy.safetensors`. Nothing
 in such a file is ever executed, and a file that is not sound is refused in one line.
@@ -6,15 +6,15 @@ in such a file is ever executed, and a file that is not sound is refused in one 
 
 from __future__ import annotations
 
+import hashlib
 import json
-import math
 import os
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, cast
 
 import torch
 from safetensors import SafetensorError, safe_open
-from safetensors.torch import save_file
+from safetensors.torch import save
 from torch import Tensor, nn
 
 from leco_plugin.models.gate import Gate, GateConfig
@@ -100,10 +100,13 @@ class Occupancy(nn.Module):
             "precision": self.precision,
             "report": json.dumps(self.report),
         }
-        tensors = {name: value.detach().cpu().contiguous() for name, value in self.state_dict().items()}
+        state = self.state_dict()
+        tensors = {name: value.detach().cpu().contiguous() for name, value in state.items()}
+        header["sha256"] = _digest(header, tensors)
         unfinished = path.with_name(f".{path.name}.{os.getpid()}.unfinished")
         try:
-            save_file(tensors, unfinished, metadata=header)
+            # not save_file: that leaves a file which only its owner can read
+            unfinished.write_bytes(save(tensors, metadata=header))
             unfinished.replace(path)
         finally:
             unfinished.unlink(missing_ok=True)
@@ -125,9 +128,8 @@ class Occupancy(nn.Module):
             with safe_open(path, framework="pt", device="cpu") as file:
                 header = file.metadata() or {}
                 tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
-        except (SafetensorError, ValueError, KeyError, TypeError, RuntimeError) as error:
-            reason = str(error).splitlines()[0]
-            raise ValueError(f"{path} is not a whole safetensors file: {reason}") from None
+        except _UNREADABLE as error:
+            raise ValueError(f"{path} is not a whole safetensors file: {_line(error)}") from None
         return cls._checked(path, header, tensors).to(device)
 
     @classmethod
@@ -135,7 +137,8 @@ class Occupancy(nn.Module):
         if header.get("format") != FORMAT:
             raise ValueError(f"{path} is a safetensors file, but not an occupancy of leco_plugin")
         if header.get("version") != str(VERSION):
-            raise ValueError(f"{path} has format version {header.get('version')}; this reads {VERSION}")
+            version = header.get("version")
+            raise ValueError(f"{path} has format version {version!r}; this reads {VERSION}")
         precision = header.get("precision")
         if precision not in ("float32", "bfloat16"):
             raise ValueError(f"{path} names an unknown precision {precision!r}")
@@ -143,24 +146,59 @@ class Occupancy(nn.Module):
             config = GateConfig.from_dict(json.loads(header["gate"]))
             report = json.loads(header["report"])
             expected = _expected_shapes(config)
-        except (KeyError, TypeError, ValueError, RuntimeError, OverflowError, RecursionError) as error:
-            raise ValueError(f"{path} has a damaged header: {str(error).splitlines()[0]}") from None
+        except _UNREADABLE as error:
+            raise ValueError(f"{path} has a damaged header: {_line(error)}") from None
         found = {name: (tuple(tensor.shape), tensor.dtype) for name, tensor in tensors.items()}
         for name in sorted(expected.keys() | found.keys()):
             if expected.get(name) != found.get(name):
                 raise ValueError(
-                    f"{path}: tensor {name} is {found.get(name)}, the header asks for {expected.get(name)}"
+                    f"{path}: tensor {name!r} is {found.get(name)}, "
+                    f"the header asks for {expected.get(name)}"
                 )
         for name, tensor in tensors.items():
             if tensor.is_floating_point() and not bool(tensor.isfinite().all()):
                 raise ValueError(f"{path}: tensor {name} holds values that are not finite")
-        if not 0.0 <= float(tensors["threshold_value"]) <= 1.0:
-            raise ValueError(f"{path}: the threshold {float(tensors['threshold_value'])} is not in [0, 1]")
+        threshold = float(tensors["threshold_value"])
+        if not 0.0 <= threshold <= 1.0:
+            raise ValueError(f"{path}: the threshold {threshold} is not in [0, 1]")
         if not float(tensors["space.half_extent"]) > 0.0:
             raise ValueError(f"{path}: the half extent of its space is not positive")
-        occupancy = cls(Gate(config), Space(), 0.0, precision, report if isinstance(report, dict) else {})
+        if header.get("sha256") != _digest(header, tensors):
+            raise ValueError(f"{path} is damaged: its contents do not match its checksum")
+        report = report if isinstance(report, dict) else {}
+        occupancy = cls(Gate(config), Space(), 0.0, cast(Precision, precision), report)
         occupancy.load_state_dict(tensors)
         return occupancy.eval()
+
+
+_UNREADABLE = (
+    SafetensorError,
+    AttributeError,
+    KeyError,
+    MemoryError,
+    OverflowError,
+    RuntimeError,  # RecursionError among them
+    TypeError,
+    ValueError,
+)
+"""What safetensors, json and torch raise when they meet nonsense."""
+
+
+def _line(error: BaseException) -> str:
+    """The first line of an error's message, or the name of its type."""
+    return next(iter(str(error).splitlines()), type(error).__name__)
+
+
+def _digest(header: dict[str, str], tensors: dict[str, Tensor]) -> str:
+    """SHA-256 of everything in a file: a flipped bit would else be a gate that decides wrongly."""
+    digest = hashlib.sha256()
+    for name in sorted(header.keys() - {"sha256"}):
+        digest.update(json.dumps([name, header[name]]).encode())
+    for name in sorted(tensors):
+        tensor = tensors[name].contiguous()
+        digest.update(json.dumps([name, list(tensor.shape), str(tensor.dtype)]).encode())
+        digest.update(tensor.reshape(-1).view(torch.uint8).numpy().tobytes())
+    return digest.hexdigest()
 
 
 def _expected_shapes(config: GateConfig) -> dict[str, tuple[tuple[int, ...], torch.dtype]]:
@@ -170,7 +208,7 @@ def _expected_shapes(config: GateConfig) -> dict[str, tuple[tuple[int, ...], tor
     sizes = (*counts, encoding.features, encoding.log2_table, encoding.coarsest, encoding.finest)
     if not all(type(size) is int and 0 < size < 2**20 for size in sizes) or max(counts[1:]) > 64:
         raise ValueError(f"sizes out of range {sizes}")
-    if encoding.kind not in ("frequency", "hash") or not math.prod((2**min(encoding.log2_table, 40), 1)) < 2**25:
+    if encoding.kind not in ("frequency", "hash") or encoding.log2_table > 24:
         raise ValueError("an unknown encoding, or a table out of range")
     with torch.device("meta"):
         module = Occupancy(Gate(config), Space(), 0.0)

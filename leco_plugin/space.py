@@ -1,4 +1,4 @@
-"""The space mapping: from scene positions to the cube [-1, 1]^3 in which the gate and the field live.
+"""The space mapping: from scene positions to the cube [-1, 1]^3 in which gate and field live.
 
 A bounded scene is centred and divided by one number; an unbounded one is also contracted
 (mip-NeRF 360, eq. 10, in the max norm, so that the cube is filled and a grid wastes no corner).
@@ -87,7 +87,8 @@ class Space(nn.Module):
     def map(self, positions: Tensor) -> Tensor:
         """Scene positions [..., 3] to mapped positions [..., 3].
 
-        In a box, positions outside it leave [-1, 1]: nothing is clipped, so that "outside" stays visible.
+        In a box, positions outside it leave [-1, 1]: nothing is clipped, so that "outside" stays
+        visible.
         """
         scaled = (positions - self.center) / self.half_extent
         return torch.where(self.unbounded, contract(scaled) * 0.5, scaled)

@@ -1,4 +1,7 @@
-"""One training run for a fixed wall-clock time through nerfstudio's own trainer, evaluated off the clock."""
+"""One training run for a fixed wall-clock time through nerfstudio's own trainer.
+
+Evaluation is off the clock.
+"""
 
 from __future__ import annotations
 
@@ -9,7 +12,6 @@ import sys
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from pathlib import Path
 from typing import Any
 
 import torch
@@ -117,7 +119,7 @@ def timed_run(
     writer.EVENT_WRITERS.clear()
     trainer: Trainer = config.setup(local_rank=0, world_size=1)
     trainer.setup()
-    run = TimedRun(config.method_name, sampler, seed)
+    run = TimedRun(config.method_name or "", sampler, seed)
     clock = Clock()
     rates = {
         name: [group["lr"] for group in optimizer.param_groups]
@@ -176,7 +178,7 @@ def psnr_on_rays(trainer: Trainer, rays: int, seed: int = 0) -> float:
     """
     pipeline = trainer.pipeline
     pipeline.eval()
-    dataset = pipeline.datamanager.eval_dataset
+    dataset: Any = pipeline.datamanager.eval_dataset
     generator = torch.Generator().manual_seed(seed)
     per_image = -(-rays // len(dataset))
     squared_error, count = 0.0, 0
@@ -200,7 +202,7 @@ def evaluate_images(trainer: Trainer, most_images: int) -> dict[str, float]:
     """Mean figures over whole test images, evenly chosen; rendering alone is timed."""
     pipeline = trainer.pipeline
     pipeline.eval()
-    dataset = pipeline.datamanager.eval_dataset
+    dataset: Any = pipeline.datamanager.eval_dataset
     count = min(most_images, len(dataset))
     chosen = torch.linspace(0, len(dataset) - 1, count).round().long().tolist()
     sums: dict[str, float] = {}

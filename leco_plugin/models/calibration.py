@@ -27,9 +27,9 @@ SURFACE_STEPS = 2.0
 class CalibrationConfig:
     """What skipping may cost."""
 
-    lost_surface_mass: float = 5e-4
+    lost_surface_mass: float = 8e-4
     """Largest share of the weight near surfaces that may fall on skipped samples."""
-    image_price_db: float = 0.03
+    image_price_db: float = 0.04
     """Largest loss of PSNR on the calibration rays, in dB."""
     rays: int = 4096
     """Held-out training rays to measure with."""
@@ -80,9 +80,9 @@ def near_median_depth(shaded: Shaded, intervals: Intervals) -> Tensor:
         inclusive_sum(shaded.weights, packed_info=shaded.packed_info)
         < 0.5 * shaded.accumulation[intervals.ray_indices]
     )
-    ahead = accumulate_along_rays(
-        below_half.float(), None, intervals.ray_indices, num_rays
-    )[:, 0].long()
+    ahead = accumulate_along_rays(below_half.float(), None, intervals.ray_indices, num_rays)[
+        :, 0
+    ].long()
     starts, counts = shaded.packed_info.unbind(dim=-1)
     median = starts + torch.minimum(ahead, (counts - 1).clamp(min=0))
     median = median.clamp(max=max(len(shaded.weights) - 1, 0))[intervals.ray_indices]

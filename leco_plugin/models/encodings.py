@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import asdict, dataclass
-from typing import Literal, Protocol
+from typing import Any, Literal, Protocol
 
 import torch
 from torch import Tensor, nn
@@ -65,7 +65,7 @@ class _InterpolateTable(torch.autograd.Function):
     """
 
     @staticmethod
-    def forward(ctx, rows: Tensor, weights: Tensor, table: Tensor) -> Tensor:  # type: ignore[override]
+    def forward(ctx: Any, rows: Tensor, weights: Tensor, table: Tensor) -> Tensor:
         ctx.save_for_backward(rows, weights)
         ctx.table_shape = table.shape
         return torch.nn.functional.embedding_bag(
@@ -73,7 +73,9 @@ class _InterpolateTable(torch.autograd.Function):
         )
 
     @staticmethod
-    def backward(ctx, gradient: Tensor):  # type: ignore[override]
+    def backward(  # type: ignore[override]
+        ctx: Any, gradient: Tensor
+    ) -> tuple[None, None, Tensor]:
         rows, weights = ctx.saved_tensors
         size, features = ctx.table_shape
         flat = rows.flatten()

@@ -1,8 +1,9 @@
-"""The radiance field of the HMoE: encoding, projection A, experts, and the shared density and colour heads."""
+"""The radiance field of the HMoE: encoding, projection A, experts, density and colour heads."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -31,12 +32,12 @@ class _TruncatedExponential(torch.autograd.Function):
     """exp forward; the gradient is clamped at exp(15) so that one bad step cannot overflow."""
 
     @staticmethod
-    def forward(ctx, x: Tensor) -> Tensor:  # type: ignore[override]
+    def forward(ctx: Any, x: Tensor) -> Tensor:
         ctx.save_for_backward(x)
         return x.exp()
 
     @staticmethod
-    def backward(ctx, gradient: Tensor) -> Tensor:  # type: ignore[override]
+    def backward(ctx: Any, gradient: Tensor) -> Tensor:  # type: ignore[override]
         (x,) = ctx.saved_tensors
         return gradient * x.clamp(max=15.0).exp()
 

@@ -1,4 +1,4 @@
-"""The moment of freezing: calibrate on held-out rays, fix the threshold, write the occupancy file."""
+"""The moment of freezing: calibrate on held-out rays, fix the threshold, write the file."""
 
 from __future__ import annotations
 
@@ -60,19 +60,20 @@ def freeze(
         "aabb": model.aabb.tolist(),
     }
     CONSOLE.log(
-        f"[leco] occupancy learned in {learn_seconds:.0f} s: threshold {measured.threshold:.4f} "
+        f"\\[leco] occupancy learned in {learn_seconds:.0f} s: threshold {measured.threshold:.4f} "
         f"skips {measured.empty_fraction:.1%} of all candidates for {measured.image_price_db:+.3f} "
-        f"dB and {measured.lost_surface_mass:.2e} of the surface mass ({measured.lost_mass:.2e} of all)"
+        f"dB and {measured.lost_surface_mass:.2e} of the surface mass "
+        f"({measured.lost_mass:.2e} of all)"
     )
     if measured.threshold == 0.0:
         CONSOLE.log(
-            "[leco] no threshold keeps the price within its bounds, so nothing is skipped; more "
+            "\\[leco] no threshold keeps the price within its bounds, so nothing is skipped; more "
             "--pipeline.model.schedule.learn-steps usually help"
         )
     if folder is not None:
         folder.mkdir(parents=True, exist_ok=True)
         model.occupancy().save(folder / FILE_NAME)
-        CONSOLE.log(f"[leco] wrote {folder / FILE_NAME}")
+        CONSOLE.log(f"\\[leco] wrote {folder / FILE_NAME}")
     return measured
 
 
@@ -106,7 +107,7 @@ def calibrate_on(model: LecoModel, rays: Rays, truth: Tensor) -> Measured:
     was_training = model.training
     model.eval()
     chunks = [
-        Rays(*(None if part is None else part[i : i + config.rays_at_once] for part in rays))
+        Rays._make(None if part is None else part[i : i + config.rays_at_once] for part in rays)
         for i in range(0, len(truth), config.rays_at_once)
     ]
     references = [dense_reference(model, chunk) for chunk in chunks]

@@ -1,4 +1,4 @@
-"""The gating network: an MLP from a mapped position to one logit for emptiness and one per scene expert.
+"""The gating network: an MLP from a mapped position to logits of emptiness and the scene experts.
 
 Torch only, so that a frozen gate can be used without nerfstudio.
 """
@@ -6,6 +6,7 @@ Torch only, so that a frozen gate can be used without nerfstudio.
 from __future__ import annotations
 
 from dataclasses import asdict, dataclass, field
+from itertools import pairwise
 
 import torch
 from torch import Tensor, nn
@@ -53,12 +54,12 @@ class Gate(nn.Module):
         self.config = config
         self.encoding = build_encoding(config.encoding)
         widths = [self.encoding.out_dim] + [config.width] * config.layers
-        self.hidden = nn.ModuleList(nn.Linear(a, b) for a, b in zip(widths[:-1], widths[1:]))
+        self.hidden = nn.ModuleList(nn.Linear(a, b) for a, b in pairwise(widths))
         self.norm = nn.LayerNorm(widths[-1])
         self.head = nn.Linear(widths[-1], 1 + config.scene_experts)
 
     def forward(self, mapped: Tensor) -> Tensor:
-        """Mapped positions [N, 3] in [-1, 1] to logits [N, 1 + n] float32; column 0 is emptiness."""
+        """Mapped positions [N, 3] in [-1, 1] to logits [N, 1 + n] float32; 0 is emptiness."""
         features = self.encoding(mapped)
         for layer in self.hidden:
             features = torch.relu(layer(features))
@@ -84,7 +85,7 @@ def occupancy_from_logits(logits: Tensor) -> Tensor:
 
 
 def occupancy_logit(logits: Tensor) -> Tensor:
-    """The logit of o(x): log-sum-exp of the scene logits minus the empty logit; [N, 1 + n] to [N]."""
+    """The logit of o(x): log-sum-exp of the scene logits minus the empty one; [N, 1 + n] to [N]."""
     return logits[:, 1:].logsumexp(dim=-1) - logits[:, EMPTY]
 
 
@@ -93,8 +94,8 @@ def route(logits: Tensor, empty_below: float | None) -> Tensor:
 
     Args:
         logits: [N, 1 + n].
-        empty_below: a point goes to the empty-space expert when o(x) is below this; None is the argmax
-            over all experts (the paper's rule).
+        empty_below: a point goes to the empty-space expert when o(x) is below this; None is the
+            argmax over all experts (the paper's rule).
     Returns:
         [N] int64 in [0, n].
     """

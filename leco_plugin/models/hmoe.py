@@ -1,4 +1,7 @@
-"""The heterogeneous mixture of experts: large scene experts, a tiny empty-space expert, dropless top-1 dispatch."""
+"""The heterogeneous mixture of experts: large scene experts and a tiny empty-space expert.
+
+Dispatch is top-1 and dropless: every point goes through the expert it is routed to.
+"""
 
 from __future__ import annotations
 
@@ -25,9 +28,11 @@ class HMoEConfig:
     """Layer that sees the input again (3 in Switch-NeRF), or None."""
     residual: bool = True
     """Whether a scene expert adds to its input, starting from adding nothing: it is then the
-    identity at first, as the empty-space expert is, and a point that changes experts does not jump."""
+    identity at first, as the empty-space expert is, and a point that changes experts does not
+    jump."""
     empty_expert: Literal["identity", "mlp", "none"] = "identity"
-    """What points of empty space go through: the identity, a small MLP, or nothing (zero features and zero density)."""
+    """What points of empty space go through: the identity, a small MLP, or nothing (zero features
+    and zero density)."""
     empty_layers: int = 1
     """Layers of the empty-space expert when it is an MLP."""
 
@@ -41,13 +46,11 @@ class Expert(nn.Module):
         super().__init__()
         self.skip = skip
         self.residual = residual
-        self.layers = nn.ModuleList(
-            nn.Linear(2 * width if i == skip else width, width) for i in range(layers)
-        )
-
+        linears = [nn.Linear(2 * width if i == skip else width, width) for i in range(layers)]
+        self.layers = nn.ModuleList(linears)
         if residual:
-            nn.init.zeros_(self.layers[-1].weight)
-            nn.init.zeros_(self.layers[-1].bias)
+            nn.init.zeros_(linears[-1].weight)
+            nn.init.zeros_(linears[-1].bias)
 
     def forward(self, features: Tensor) -> Tensor:
         hidden = features
@@ -62,7 +65,7 @@ class Expert(nn.Module):
 
 
 class HMoE(nn.Module):
-    """h(x) = G_i*(x) E_i*(x): each point through the one expert it is routed to (DESIGN, section 3)."""
+    """h(x) = G_i*(x) E_i*(x): each point through the one expert it is routed to."""
 
     def __init__(self, config: HMoEConfig) -> None:
         super().__init__()

@@ -24,6 +24,7 @@ from leco_plugin.models.losses import (
     density_loss,
     distortion_loss,
     imbalanced_gate_loss,
+    widen,
 )
 from leco_plugin.models.phases import ScheduleConfig, ramp
 from leco_plugin.models.precision import fast_precision, keep_freed_memory
@@ -86,7 +87,7 @@ class LecoModelConfig(ModelConfig):
     """What teaches the gate."""
     calibration: CalibrationConfig = field(default_factory=CalibrationConfig)
     """What skipping may cost."""
-    distortion: float = 0.01
+    distortion: float = 0.03
     """Weight of the distortion loss, which clears haze (mip-NeRF 360, eq. 15)."""
     homogeneous: bool = False
     """A mixture of scene experts only, for comparison: no empty-space expert, nothing to freeze."""
@@ -292,7 +293,9 @@ class LecoModel(Model):
             return {"balance_loss": balance}
         if config.form == "logit":
             contribution = contribution_loss(
-                logits, shaded.weights, config.weight_at_full, config.emphasis
+                logits,
+                widen(shaded.weights.detach(), intervals.ray_indices),
+                config.weight_at_full, config.emphasis
             )
             return {
                 "contribution_loss": config.contribution * contribution,

@@ -1,4 +1,4 @@
-"""What happens around training steps: bounds before the first, ramps, freezing, calibration, healing."""
+"""What happens around training steps: bounds before the first, ramps, freezing, healing."""
 
 from __future__ import annotations
 
@@ -17,6 +17,8 @@ from nerfstudio.utils.rich_utils import CONSOLE
 from torch import Tensor
 
 from leco_plugin.models.freezing import freeze
+from leco_plugin.models.gate import occupancy_from_logits, route
+from leco_plugin.models.losses import expert_shares
 from leco_plugin.models.phases import (
     PROBES,
     converged,
@@ -25,9 +27,6 @@ from leco_plugin.models.phases import (
     ramp,
     reset_gate_head,
 )
-from leco_plugin.models.rendering import Rays
-from leco_plugin.models.gate import occupancy_from_logits, route
-from leco_plugin.models.losses import expert_shares
 from leco_plugin.models.statistics import KEPT_ABOVE
 from leco_plugin.scenes.survey import survey
 
@@ -55,7 +54,7 @@ class Lifecycle:
         self.survey = survey(self.pipeline.datamanager)
         if not bool(model.bounds_known):
             model.set_bounds(self.survey.bounds, self.survey.median_length)
-            CONSOLE.log(f"[leco] {self.survey.describe()}")
+            CONSOLE.log(f"\\[leco] {self.survey.describe()}")
         self.rays_per_batch = int(self.pipeline.datamanager.get_train_rays_per_batch())
         self.decisions = torch.zeros(0, dtype=torch.bool)
         self.recoveries = 0
@@ -107,7 +106,7 @@ class Lifecycle:
             return
         if converged(step, agreement, schedule):
             CONSOLE.log(
-                f"[leco] step {step}: {agreement:.1%} of {len(kept)} decisions are those of "
+                f"\\[leco] step {step}: {agreement:.1%} of {len(kept)} decisions are those of "
                 f"{schedule.steps_per_check} steps ago; freezing the gate"
             )
             folder = Path(self.trainer.base_dir) if self.trainer is not None else None
@@ -152,11 +151,13 @@ class Lifecycle:
             )
         self.recoveries += 1
         CONSOLE.log(
-            f"[leco] step {step}: {collapse.cause}; its last layer starts anew, on dense samples "
+            f"\\[leco] step {step}: {collapse.cause}; its last layer starts anew, on dense samples "
             f"(recovery {self.recoveries} of {MOST_RECOVERIES})"
         )
         reset_gate_head(self.model.gate.head)
-        self.schedule = replace(self.schedule, learn_steps=step + 1 + self.schedule.learn_steps // 2)
+        self.schedule = replace(
+            self.schedule, learn_steps=step + 1 + self.schedule.learn_steps // 2
+        )
         self.decisions = torch.zeros(0, dtype=torch.bool)
         self.suspected = False
         return True

@@ -1,7 +1,7 @@
-"""What teaches the gate: the paper's two losses, the same two forces in logit form, and the helpers of the field.
+"""What teaches the gate: the paper's two losses and the same two forces in logit form.
 
-All of them run in float32 and are means over the points given, so that their weights do not depend
-on the batch.
+Beside them stands the distortion loss of the field. All of them run in float32 and are means
+over the points given, so that their weights do not depend on the batch.
 """
 
 from __future__ import annotations
@@ -54,6 +54,19 @@ def balance_loss(probabilities: Tensor, routes: Tensor) -> Tensor:
     return num_experts * (expert_shares(routes, num_experts) * probabilities.mean(dim=0)).sum()
 
 
+def widen(weights: Tensor, ray_indices: Tensor) -> Tensor:
+    """The largest of each sample's weight and those of its two neighbours on the ray: [M] to [M].
+
+    A surface that is taught with a margin of one step is found again by rays whose steps fall
+    elsewhere.
+    """
+    same_ray = (ray_indices[1:] == ray_indices[:-1]).to(weights.dtype)
+    widened = weights.clone()
+    widened[1:] = torch.maximum(widened[1:], weights[:-1] * same_ray)
+    widened[:-1] = torch.maximum(widened[:-1], weights[1:] * same_ray)
+    return widened
+
+
 def density_loss(empty_probability: Tensor, alphas: Tensor) -> Tensor:
     """L_d = mean[G_0 stop_gradient(alpha)]: the gate must not call a dense point empty.
 
@@ -92,7 +105,7 @@ def distortion_loss(
     """Distortion of packed samples (mip-NeRF 360, eq. 15): mean over rays, in linear time.
 
     Args:
-        weights, t_starts, t_ends: [M] samples sorted by ray; t in units in which near to far is one.
+        weights, t_starts, t_ends: [M] samples sorted by ray; near to far is one unit of t.
         packed_info: [R, 2] start and count of each ray.
     """
     middles = 0.5 * (t_starts + t_ends)

@@ -1,4 +1,4 @@
-"""Adam as nerfstudio configures it, in torch's fused form, which takes a third of the time on a CPU."""
+"""Adam as nerfstudio configures it, in torch's fused form: a third of the time on a CPU."""
 
 from __future__ import annotations
 

@@ -17,13 +17,13 @@ class ScheduleConfig:
 
     freeze: bool = True
     """Whether the gate is ever frozen; False is the plain HMoE, for comparison."""
-    learn_steps: int = 400
+    learn_steps: int = 300
     """Steps after which the gate is frozen even if its decisions still change."""
     earliest: float = 0.85
     """Share of `learn_steps` before which it is never frozen."""
-    ramp_from: float = 0.4
+    ramp_from: float = 0.3
     """Share of `learn_steps` at which the distortion loss begins to come in."""
-    ramp_to: float = 0.8
+    ramp_to: float = 0.7
     """Share of `learn_steps` from which it has its full weight."""
     steps_per_check: int = 25
     """Steps between two looks at the gate."""

@@ -1,4 +1,4 @@
-"""Which type matrix products are fastest in on this device, and memory that is kept between steps."""
+"""Which type matrix products are fastest in on a device; memory that is kept between steps."""
 
 from __future__ import annotations
 
@@ -19,8 +19,10 @@ def fast_precision(device: torch.device | str) -> Precision:
     kind = torch.device(device).type
     if kind == "cuda":
         return "bfloat16" if torch.cuda.is_bf16_supported(including_emulation=False) else "float32"
-    if kind == "cpu" and torch.cpu._is_amx_tile_supported():
-        return "bfloat16"
+    if kind == "cpu":
+        # private in torch, so it may go; without it the answer is the safe one
+        has_amx = getattr(torch.cpu, "_is_amx_tile_supported", lambda: False)
+        return "bfloat16" if has_amx() else "float32"
     return "float32"
 
 

@@ -101,6 +101,10 @@ class Tables(NamedTuple):
         """Memory of all tables."""
         return sum(table.numel() * table.element_size() for table in self)
 
+    def to(self, device: torch.device) -> Tables:
+        """The same on another device."""
+        return Tables(*(table.to(device) for table in self))
+
 
 class CellCache(nn.Module):
     """Lookup of cell decisions; build one with `cache_build.build_cache`.
@@ -118,6 +122,8 @@ class CellCache(nn.Module):
     clearance: Tensor
     scale: Tensor
     shift: Tensor
+    center: Tensor
+    half_extent: Tensor
 
     def __init__(self, tables: Tables, space: SpaceLike, report: CacheReport) -> None:
         super().__init__()
@@ -132,12 +138,14 @@ class CellCache(nn.Module):
             shift = shift - space.center.detach().cpu() * scale
         else:
             self._map = space.map
-        self.half_extent = float(space.half_extent)
-        self.center = [float(value) for value in space.center]
         for name, table in tables._asdict().items():
             self.register_buffer(name, table, persistent=False)
         self.register_buffer("scale", scale.float().view(1, 1), persistent=False)
         self.register_buffer("shift", shift.float().view(3, 1), persistent=False)
+        center, half_extent = space.center.detach().clone(), space.half_extent.detach().clone()
+        self.register_buffer("center", center.view(3, 1), persistent=False)
+        self.register_buffer("half_extent", half_extent, persistent=False)
+        self.to(tables.coarse.device)
 
     def tables(self) -> Tables:
         """The tables, where they are now."""
@@ -209,7 +217,7 @@ class CellCache(nn.Module):
         """
         if self._map is None:
             return self.scale[0]
-        distance = positions.new_tensor(self.center)[:, None].sub(positions.T).abs().amax(dim=0)
+        distance = (positions.T - self.center).abs().amax(dim=0)
         inner = ((distance - radii) / self.half_extent).clamp(min=1.5)
         return (0.5 / self.half_extent) * self.scale[0] * (4.0 * inner - 3.0) / inner.square()
 

@@ -7,6 +7,7 @@ planes decide grows, then the margin with which cells are judged (`cache_cells.p
 
 from __future__ import annotations
 
+import copy
 import dataclasses
 import math
 
@@ -78,6 +79,13 @@ def build_cache(
         ValueError: no cache fits the budget, or none keeps the tolerance (the gate then varies
             within the smallest cells; ask it without a cache).
     """
+    device = occupancy.space.center.device
+    if device.type == "mps":  # lacks some of what judging takes, none of what looking up takes
+        cpu = copy.deepcopy(occupancy).to("cpu")  # type: ignore[attr-defined]
+        cache = build_cache(
+            cpu, budget=budget, tolerance=tolerance, check_points=check_points, seed=seed
+        )
+        return CellCache(cache.tables().to(device), occupancy.space, cache.report)
     probe = judge_coarse(occupancy, PROBE, MARGINS[0])[0]
     mixed = int((probe == MIXED).sum())
     if mixed > ROUGH * PROBE**3:

@@ -106,6 +106,7 @@ def front_to_back(
     early_stop_eps: float,
     near_occupied: NearFn | None = None,
     slab: int = 64,
+    chunk_size: int = 1 << 20,
 ) -> Samples:
     """The samples of `march` with T >= early_stop_eps, asking densities only as far as light goes.
 
@@ -116,12 +117,42 @@ def front_to_back(
         early_stop_eps: transmittance in (0, 1) below which a ray is given up; the colour of a
             pixel changes by no more than this.
         slab: candidates by which each ray advances between two looks at its transmittance.
+        chunk_size: most candidates held at once.
 
     Returns:
         Samples sorted by ray, then t.
+
+    Raises:
+        ValueError: `early_stop_eps` is not in (0, 1).
     """
     if not 0.0 < early_stop_eps < 1.0:
         raise ValueError(f"front-to-back needs early_stop_eps in (0, 1), got {early_stop_eps}")
+    rays_at_once = max(1, chunk_size // slab)
+    kept: list[Samples] = []
+    for first in range(0, len(candidates.counts), rays_at_once):
+        rays = candidates.of_rays(slice(first, first + rays_at_once))
+
+        def sigmas_of_rays(
+            t_starts: Tensor, t_ends: Tensor, ray_indices: Tensor, first: int = first
+        ) -> Tensor:
+            return sigma_fn(t_starts, t_ends, ray_indices + first)
+
+        ray_indices, t_starts, t_ends = _front_to_back(
+            rays, n_steps, slab, occupied, near_occupied, sigmas_of_rays, early_stop_eps
+        )
+        kept.append((ray_indices + first, t_starts, t_ends))
+    return join(kept, candidates.t_mins)
+
+
+def _front_to_back(
+    candidates: Candidates,
+    n_steps: int,
+    slab: int,
+    occupied: OccupiedFn | None,
+    near_occupied: NearFn | None,
+    sigma_fn: SampleFn,
+    early_stop_eps: float,
+) -> Samples:
     opaque = -math.log(early_stop_eps)
     n_rays = len(candidates.counts)
     alive = torch.arange(n_rays, device=candidates.counts.device)

@@ -1,4 +1,4 @@
-"""The default reader of photographs: nerfstudio's own format, with the usual mistakes named in one line.
+"""The default reader of photographs: nerfstudio's own format, the usual mistakes named in one line.
 
 Beyond nerfstudio's parser it checks the folder before anything is loaded, leaves scenes that are
 already upright as they are, and reads the sparse points without open3d.
@@ -37,7 +37,9 @@ class LecoPhotographs(Nerfstudio):
 
     config: LecoPhotographsDataParserConfig
 
-    def _generate_dataparser_outputs(self, split: str = "train") -> DataparserOutputs:
+    def _generate_dataparser_outputs(
+        self, split: str = "train", **kwargs: Any
+    ) -> DataparserOutputs:
         meta = check_scene(self.config.data)
         if "orientation_override" not in meta and self.config.orientation_method == "up":
             poses = np.array([frame["transform_matrix"] for frame in meta["frames"]], dtype=float)
@@ -85,7 +87,9 @@ def check_scene(data: Path) -> dict[str, Any]:
         poses = np.array([frame["transform_matrix"] for frame in frames], dtype=float)
     except (OSError, ValueError, KeyError, TypeError) as error:
         reason = f"{type(error).__name__}: {str(error).splitlines()[0] if str(error) else ''}"
-        raise InputError(f"{description} is not a scene in nerfstudio's format ({reason})") from None
+        raise InputError(
+            f"{description} is not a scene in nerfstudio's format ({reason})"
+        ) from None
     if len(frames) == 0:
         raise InputError(f"{description} has no cameras: its list of frames is empty")
     if poses.shape[1:] not in ((4, 4), (3, 4)) or not np.isfinite(poses).all():
@@ -105,7 +109,8 @@ def _check_images(meta: dict[str, Any], frames: list[dict[str, Any]], folder: Pa
     missing = [f["file_path"] for f in frames if not (folder / f["file_path"]).exists()]
     if missing:
         raise InputError(
-            f"{len(missing)} of {len(frames)} images are not there, the first is {folder / missing[0]}"
+            f"{len(missing)} of {len(frames)} images are not there, "
+            f"the first is {folder / missing[0]}"
         )
     for frame in frames:
         width, height = frame.get("w", meta.get("w")), frame.get("h", meta.get("h"))
@@ -119,7 +124,8 @@ def _check_images(meta: dict[str, Any], frames: list[dict[str, Any]], folder: Pa
             raise InputError(f"the size (w, h) of {frame['file_path']} is not in transforms.json")
         if size != (int(width), int(height)):
             raise InputError(
-                f"{path} has {size[0]} x {size[1]} pixels, its intrinsics are for {int(width)} x {int(height)}"
+                f"{path} has {size[0]} x {size[1]} pixels, "
+                f"its intrinsics are for {int(width)} x {int(height)}"
             )
 
 
@@ -135,7 +141,8 @@ def read_points(meta: dict[str, Any], folder: Path) -> Tensor | None:
     import trimesh
 
     try:
-        vertices = np.asarray(trimesh.load(folder / name).vertices, dtype=np.float32)
+        loaded: Any = trimesh.load(folder / name)
+        vertices = np.asarray(loaded.vertices, dtype=np.float32)
     except Exception as error:  # noqa: BLE001  trimesh raises whatever its parsers meet
         raise InputError(f"{folder / name} cannot be read as sparse points: {error}") from None
     return torch.from_numpy(vertices.reshape(-1, 3).copy())

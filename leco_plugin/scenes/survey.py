@@ -96,7 +96,8 @@ def covering_rays(cameras: Cameras) -> tuple[Tensor, Tensor]:
     origins, directions = [], []
     for number in chosen.tolist():
         height, width = float(cameras.height[number]), float(cameras.width[number])
-        rows, columns = torch.linspace(0.5, height - 0.5, SIDE), torch.linspace(0.5, width - 0.5, SIDE)
+        rows = torch.linspace(0.5, height - 0.5, SIDE)
+        columns = torch.linspace(0.5, width - 0.5, SIDE)
         coords = torch.stack(torch.meshgrid(rows, columns, indexing="ij"), dim=-1).view(-1, 2)
         bundle = cameras.generate_rays(camera_indices=number, coords=coords)
         origins.append(bundle.origins.float())

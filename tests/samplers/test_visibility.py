@@ -55,6 +55,7 @@ def test_front_to_back_is_pruning_with_fewer_questions(scene, slab, cone_angle):
         sigma_fn=counting,
         early_stop_eps=1e-3,
         slab=slab,
+        chunk_size=4096,
     )
     for one, other in zip(found, visible, strict=True):
         torch.testing.assert_close(one, other, rtol=0.0, atol=1e-6)

@@ -1,0 +1,242 @@
+"""`leco demo`: a city, its occupancy learned and frozen, and the same model never frozen, on equal time."""
+
+from __future__ import annotations
+
+import copy
+import math
+import shutil
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import torch
+from nerfstudio.engine.trainer import Trainer, TrainerConfig
+from nerfstudio.utils.rich_utils import CONSOLE
+from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+
+from leco_plugin.evaluation.charts import psnr_against_seconds
+from leco_plugin.evaluation.inspection import ViewBox
+from leco_plugin.evaluation.json_file import write_json
+from leco_plugin.evaluation.machine import describe_machine
+from leco_plugin.evaluation.occupancy_picture import draw_slice
+from leco_plugin.evaluation.occupancy_truth import compare_with_truth
+from leco_plugin.evaluation.timed_run import timed_run, true_image
+from leco_plugin.method_configs import leco_occupancy
+from leco_plugin.models.freezing import FILE_NAME
+from leco_plugin.occupancy import Occupancy
+from leco_plugin.scenes.city import CityConfig
+from leco_plugin.scenes.city_folder import CaptureConfig, write_city
+from leco_plugin.scenes.city_truth import CityTruth
+
+SECONDS = 110.0
+"""Training time of each of the two runs; the whole demo then takes under six minutes on two cores."""
+FEWEST_LEARN_STEPS = 10
+SLICE_HEIGHT = 4.0
+"""Metres over the ground at which the occupancy is shown: through walls, poles and crowns."""
+
+GUIDED, NEVER_FROZEN = "leco-occupancy", "leco-occupancy-never-frozen"
+
+
+def run_demo(
+    out: Path,
+    seconds: float = SECONDS,
+    city: CityConfig | None = None,
+    capture: CaptureConfig | None = None,
+) -> dict[str, Any]:
+    """Writes `report.json`, `chart.png`, `picture.png`, the occupancy, the city and both runs.
+
+    Args:
+        out: folder; an earlier demo's city in it is used again, its results are replaced.
+        seconds: training time of each run.
+        city: 3 x 3 blocks by default.
+        capture: how it is photographed.
+    Returns:
+        The report (DESIGN, section 8).
+    Raises:
+        ValueError, OSError: the time is no positive number, or `out` cannot be used.
+        RuntimeError: the time was over before the occupancy was learned.
+    """
+    if not 0.0 < seconds < math.inf:
+        raise ValueError(f"the training time is a positive number of seconds, not {seconds}")
+    city, capture = city or CityConfig(), capture or CaptureConfig()
+    folder = write_city(city, out / "city", capture)
+
+    guided = _config(folder, out, seconds)
+    with _bar("Guided: learns, freezes, goes on") as show:
+        guided_run, trainer = timed_run(
+            guided, seconds, sampler="learned-occupancy", on_progress=show
+        )
+    occupancy, facts, truth = _frozen_occupancy(trainer, folder, out)
+    _draw_picture(trainer, occupancy, truth, out / "picture.png")
+    del trainer
+
+    with _bar("The same, never frozen") as show:
+        other_run, trainer = timed_run(
+            never_frozen(guided), seconds, sampler="dense", on_progress=show
+        )
+    report = {
+        "format": 1,
+        "machine": describe_machine(),
+        "scene": {
+            "name": "city",
+            "blocks": city.blocks,
+            "seed": city.seed,
+            "width": capture.width,
+            "height": capture.height,
+            "train_images": len(trainer.pipeline.datamanager.train_dataset),
+            "test_images": len(trainer.pipeline.datamanager.eval_dataset),
+        },
+        "occupancy": facts,
+        "runs": [_strict(run.to_dict()) for run in (guided_run, other_run)],
+    }
+    write_json(out / "report.json", report)
+    draw_chart(report, out / "chart.png")
+    return report
+
+
+def draw_chart(report: dict[str, Any], path: Path) -> Path:
+    """The demo's chart from its stored report."""
+    blocks, cores = report["scene"]["blocks"], report["machine"]["cores"]
+    where = f"{cores} CPU cores" if report["machine"]["device"] == "cpu" else "one GPU"
+    title = f"Procedural city of {blocks} × {blocks} blocks, {where}"
+    labels = ["learn, freeze, go on guided", "never frozen"]
+    return psnr_against_seconds(report["runs"], path, title, labels)
+
+
+def never_frozen(config: TrainerConfig) -> TrainerConfig:
+    """The same method with its gate trained to the end and nothing skipped."""
+    config = copy.deepcopy(config)
+    config.method_name = NEVER_FROZEN
+    model: Any = config.pipeline.model
+    model.schedule = replace(model.schedule, freeze=False)
+    return config
+
+
+def _config(folder: Path, out: Path, seconds: float) -> TrainerConfig:
+    """`leco-occupancy` on this city; in less time it learns for fewer steps, of which all decays."""
+    config = copy.deepcopy(leco_occupancy.config)
+    config.output_dir = out / "runs"
+    config.experiment_name = "city"
+    config.data = folder
+    pipeline: Any = config.pipeline
+    pipeline.datamanager.data = folder
+    schedule = pipeline.model.schedule
+    share = min(1.0, seconds / SECONDS)
+    steps = max(FEWEST_LEARN_STEPS, round(share * schedule.learn_steps))
+    pipeline.model.schedule = replace(schedule, learn_steps=steps)
+    return config
+
+
+def _frozen_occupancy(
+    trainer: Trainer, folder: Path, out: Path
+) -> tuple[Occupancy, dict[str, Any], CityTruth]:
+    """The occupancy that the run left, what is known and measured of it, and the exact city."""
+    model: Any = trainer.pipeline.model
+    written = trainer.base_dir / FILE_NAME
+    if not bool(model.frozen) or not written.exists():
+        raise RuntimeError(
+            "the time was over before the occupancy was learned: give more with --seconds"
+        )
+    kept_file = out / FILE_NAME
+    shutil.copyfile(written, kept_file)
+    occupancy = Occupancy.load(kept_file, model.device)
+    manager: Any = trainer.pipeline.datamanager
+    truth = CityTruth.from_dataparser(folder, manager.train_dataparser_outputs)
+    highest = float(manager.train_dataset.cameras.camera_to_worlds[:, 2, 3].max())
+    report = occupancy.report
+    measured = compare_with_truth(occupancy, truth, model.aabb, report["step_size"], highest)
+    names = ("train_seconds", "empty_fraction", "lost_mass", "threshold", "lost_surface_mass")
+    facts = {
+        "params": occupancy.num_params,
+        "bytes": kept_file.stat().st_size,
+        **{name: report[name] for name in (*names, "image_price_db")},
+        **measured,
+    }
+    return occupancy, _strict(facts), truth
+
+
+@torch.no_grad()
+def _draw_picture(trainer: Trainer, occupancy: Occupancy, truth: CityTruth, path: Path) -> None:
+    """Photograph, guided rendering, its depth, and a slice of the occupancy with the true walls."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    pipeline: Any = trainer.pipeline
+    model = pipeline.model
+    dataset = pipeline.datamanager.eval_dataset
+    # at 45 degrees one sees roofs, walls and ground
+    number = int((dataset.cameras.camera_to_worlds[:, 2, 2] - 0.7).abs().argmin())
+    pipeline.eval()
+    outputs = model.get_outputs_for_camera(dataset.cameras[number : number + 1].to(model.device))
+    pipeline.train()
+    rgb = outputs["rgb"].clamp(0.0, 1.0)
+    photograph = true_image(model, dataset.get_data(number)["image"], rgb)
+    depth = (outputs["depth"][..., 0] / truth.scale).cpu()
+    seen = torch.quantile(depth, torch.tensor([0.01, 0.95])).tolist()
+
+    figure = Figure(figsize=(16, 3.7), layout="constrained", facecolor="white")
+    FigureCanvasAgg(figure)
+    axes = figure.subplots(1, 4, gridspec_kw={"width_ratios": [4, 4, 4.6, 3.2]})
+    axes[0].imshow(photograph.cpu())
+    axes[0].set_title("photograph (held out)")
+    axes[1].imshow(rgb.cpu())
+    samples = float(outputs["samples_per_ray"].mean())
+    axes[1].set_title(f"guided rendering, {samples:.0f} samples a ray")
+    shown = axes[2].imshow(depth, cmap="turbo_r", vmin=seen[0], vmax=seen[1])
+    axes[2].set_title("its depth")
+    figure.colorbar(shown, ax=axes[2], label="metres", shrink=0.8, pad=0.01)
+    _draw_city_slice(axes[3], occupancy, truth)
+    for panel in axes:
+        panel.set(xticks=[], yticks=[], xlabel="", ylabel="")
+    figure.savefig(path, dpi=110)
+
+
+def _draw_city_slice(axes: Any, occupancy: Occupancy, truth: CityTruth) -> None:
+    surface = truth.visible_surface("test")
+    low, high = surface.amin(dim=0), surface.amax(dim=0)
+    ground = truth.to_metres(torch.zeros(3))
+    ground[2] = SLICE_HEIGHT
+    height = float(truth.to_model(ground)[2])
+    draw_slice(axes, occupancy, ViewBox(low, high), 2, height, solid=truth.occupied)
+    axes.set_title(f"occupancy {SLICE_HEIGHT:.0f} m up, true walls white")
+
+
+@contextmanager
+def _bar(what: str) -> Iterator[Callable[[float], None]]:
+    """A progress bar under nerfstudio's log; yields what takes the share that is done."""
+    columns = (TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn())
+    with Progress(*columns, TimeRemainingColumn(), console=CONSOLE, transient=True) as progress:
+        task = progress.add_task(what, total=1.0)
+        yield lambda share: progress.update(task, completed=share)
+
+
+def _strict(values: dict[str, Any]) -> dict[str, Any]:
+    """NaN and infinity are no JSON: null in their place."""
+    return {
+        name: None if isinstance(value, float) and not math.isfinite(value) else value
+        for name, value in values.items()
+    }
+
+
+def summary(report: dict[str, Any]) -> list[str]:
+    """The report in a few lines, for the terminal."""
+    facts = report["occupancy"]
+    guided, other = report["runs"]
+    recall = facts["kept_surface_recall"]
+    lines = [
+        f"occupancy: {facts['params']} parameters, {facts['bytes'] / 1000:.0f} kB, "
+        f"learned in {facts['train_seconds']:.0f} s",
+        f"  skips {facts['empty_fraction']:.1%} of all candidates for "
+        f"{facts['image_price_db']:+.3f} dB"
+        + (f", keeps {recall:.2%} of the true surface" if recall is not None else ""),
+    ]
+    lines += [
+        f"{run['method']}: {run['psnr']:.2f} dB after {run['train_seconds']:.0f} s, "
+        f"{run['render_seconds_per_image']:.2f} s an image"
+        for run in (guided, other)
+    ]
+    return lines
+
+

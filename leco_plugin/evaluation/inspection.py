@@ -1,0 +1,100 @@
+"""What an occupancy file says about itself, and the part of space that is worth looking at."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from leco_plugin.occupancy import Occupancy
+
+WALL = 1e5
+"""A side of the report's `aabb` beyond this is no wall."""
+
+
+@dataclass(frozen=True)
+class ViewBox:
+    """The box of scene positions that is drawn or measured."""
+
+    low: Tensor
+    """[3] scene units."""
+    high: Tensor
+    """[3] scene units."""
+
+    def cells(self, longest: int) -> tuple[int, int, int]:
+        """Numbers of nearly cubic cells, `longest` along the longest side."""
+        sides = self.high - self.low
+        x, y, z = (sides / sides.max() * longest).round().clamp(min=2).int().tolist()
+        return x, y, z
+
+    def axis(self, number: int, count: int) -> Tensor:
+        """Middles of `count` cells along an axis: [count]."""
+        shares = (torch.arange(count) + 0.5) / count
+        return torch.lerp(self.low[number], self.high[number], shares)
+
+
+def describe(occupancy: Occupancy) -> dict[str, Any]:
+    """Sizes, space, threshold, kept share of its box, and the report of calibration: JSON values."""
+    box = whole_box(occupancy)
+    points = torch.rand(1 << 16, 3, generator=torch.Generator().manual_seed(0))
+    values = query(occupancy, torch.lerp(box.low, box.high, points))
+    return {
+        "format": 1,
+        "params": occupancy.num_params,
+        "bytes_of_weights": sum(
+            value.numel() * value.element_size() for value in occupancy.state_dict().values()
+        ),
+        "threshold": occupancy.threshold,
+        "precision": occupancy.precision,
+        "space": {
+            "kind": occupancy.space.kind,
+            "center": occupancy.space.center.tolist(),
+            "half_extent": float(occupancy.space.half_extent),
+        },
+        "box": [*box.low.tolist(), *box.high.tolist()],
+        "kept_share_of_box": float((values >= occupancy.threshold).double().mean()),
+        "gate": occupancy.gate.config.to_dict(),
+        "report": occupancy.report,
+    }
+
+
+def whole_box(occupancy: Occupancy) -> ViewBox:
+    """The space's inner cube, cut by the walls between which rays were marched, if there are any."""
+    center = occupancy.space.center.cpu()
+    half = float(occupancy.space.half_extent)
+    low, high = center - half, center + half
+    walls = numbers(occupancy.report.get("aabb"))
+    if len(walls) == 6:
+        wall = torch.tensor(walls)
+        cut_low, cut_high = torch.maximum(low, wall[:3]), torch.minimum(high, wall[3:])
+        if bool((cut_low < cut_high).all()):
+            return ViewBox(cut_low, cut_high)
+    return ViewBox(low, high)
+
+
+def cameras_of(occupancy: Occupancy) -> Tensor:
+    """Camera centres [C, 3] that the report names, scene units; [0, 3] if it names none."""
+    listed = occupancy.report.get("cameras")
+    rows = [numbers(row) for row in listed] if isinstance(listed, list) else []
+    return torch.tensor([row for row in rows if len(row) == 3]).reshape(-1, 3)
+
+
+def numbers(value: Any) -> list[float]:
+    """A list of finite numbers from a file as it is; empty for anything else."""
+    if not isinstance(value, list):
+        return []
+    sound = all(isinstance(x, (int, float)) and math.isfinite(x) and abs(x) < 1e30 for x in value)
+    return [float(x) for x in value] if sound else []
+
+
+@torch.no_grad()
+def query(occupancy: Occupancy, positions: Tensor) -> Tensor:
+    """o(x) of positions [..., 3] in pieces: [...] float32 on the CPU."""
+    device = occupancy.threshold_value.device
+    parts = [
+        occupancy.query(part.to(device)).cpu() for part in positions.reshape(-1, 3).split(1 << 16)
+    ]
+    return torch.cat(parts).reshape(positions.shape[:-1])

@@ -1,0 +1,88 @@
+"""The encodings against slow twins written from their definitions."""
+
+from __future__ import annotations
+
+import itertools
+import math
+
+import torch
+from torch import Tensor
+
+from leco_plugin.models.encodings import EncodingConfig, HashEncoding, build_encoding
+
+PRIMES = (1, 2654435761, 805459861)
+
+
+def slow_frequency(x: list[float], octaves: int) -> list[float]:
+    """NeRF, eq. 4."""
+    angles = [2.0**k * math.pi * value for k in range(octaves) for value in x]
+    return [*x, *map(math.sin, angles), *map(math.cos, angles)]
+
+
+def slow_hash(encoding: HashEncoding, x: list[float], table: Tensor) -> Tensor:
+    """Instant-NGP, section 3, for one point in [-1, 1]^3."""
+    size, parts = encoding.mask + 1, []
+    for level, resolution in enumerate(encoding.resolutions.tolist()):
+        cell = [(value * 0.5 + 0.5) * resolution for value in x]
+        total = torch.zeros(table.shape[1], dtype=table.dtype)
+        for corner in itertools.product((0, 1), repeat=3):
+            number, weight = 0, 1.0
+            for value, up, prime in zip(cell, corner, PRIMES):
+                base = math.floor(value)
+                number ^= (base + up) * prime
+                weight *= value - base if up else 1.0 - (value - base)
+            total = total + weight * table[level * size + number % size]
+        parts.append(total)
+    return torch.cat(parts)
+
+
+def hash_encoding() -> HashEncoding:
+    torch.manual_seed(0)
+    encoding = HashEncoding(levels=3, features=2, log2_table=6, coarsest=4, finest=50)
+    return encoding.double()
+
+
+def test_frequencies_are_those_of_the_definition() -> None:
+    x = (torch.rand(50, 3) * 2 - 1).double()
+    encoding = build_encoding(EncodingConfig(octaves=5)).double()
+    expected = torch.tensor([slow_frequency(row, 5) for row in x.tolist()], dtype=torch.float64)
+    assert encoding(x).shape == (50, encoding.out_dim)
+    torch.testing.assert_close(encoding(x), expected, rtol=0, atol=1e-5)  # scales are float32
+
+
+def test_hash_features_are_those_of_the_definition() -> None:
+    encoding, x = hash_encoding(), torch.rand(40, 3) * 2 - 1
+    x = torch.cat([x, torch.tensor([[-1.0] * 3, [1.0] * 3, [0.0] * 3])])
+    table = encoding.table.detach()
+    expected = torch.stack([slow_hash(encoding, row, table) for row in x.tolist()])
+    torch.testing.assert_close(encoding(x), expected, rtol=0, atol=1e-8)
+
+
+def test_hash_gradients_are_those_of_the_definition() -> None:
+    encoding, x = hash_encoding(), torch.rand(40, 3) * 2 - 1
+    weights = torch.randn(40, encoding.out_dim, dtype=torch.float64)
+    (encoding(x) * weights).sum().backward()
+    table = encoding.table.detach().requires_grad_()
+    slow = torch.stack([slow_hash(encoding, row, table) for row in x.tolist()])
+    (slow * weights).sum().backward()
+    torch.testing.assert_close(encoding.table.grad, table.grad, rtol=0, atol=1e-5)
+
+
+def test_trilinear_weights_sum_to_one() -> None:
+    _, weights = hash_encoding().rows_and_weights(torch.rand(100, 3) * 2 - 1)
+    torch.testing.assert_close(weights.sum(dim=-1), torch.ones_like(weights[:, 0]))
+
+
+def test_rows_stay_in_the_table_of_their_level() -> None:
+    encoding = hash_encoding()
+    rows, _ = encoding.rows_and_weights(torch.rand(100, 3) * 2 - 1)
+    size = encoding.mask + 1
+    assert torch.equal(rows.view(100, 3, 8) // size, torch.arange(3).view(1, 3, 1).expand(100, 3, 8))
+
+
+def test_no_points_give_no_features_and_a_zero_gradient() -> None:
+    encoding = hash_encoding()
+    features = encoding(torch.zeros(0, 3))
+    features.sum().backward()
+    assert features.shape == (0, encoding.out_dim)
+    assert encoding.table.grad is not None and not bool(encoding.table.grad.any())

@@ -1,0 +1,127 @@
+"""The losses have the stationary points, limits and gradients that they are chosen for."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from leco_plugin.models.losses import (
+    balance_loss,
+    contribution_loss,
+    density_loss,
+    distortion_loss,
+    expert_shares,
+    imbalanced_gate_loss,
+)
+from leco_plugin.samplers.packed import pack_info
+
+
+def routes_with_shares(counts: list[int]) -> torch.Tensor:
+    return torch.repeat_interleave(torch.arange(len(counts)), torch.tensor(counts))
+
+
+def gate_gradient(counts: list[int], empty_ratio: float) -> tuple[float, torch.Tensor]:
+    """Loss, and its gradient [1 + n] to the mean logits, with so many points at each expert."""
+    torch.manual_seed(0)
+    logits = torch.randn(sum(counts), len(counts), dtype=torch.float64, requires_grad=True)
+    loss = imbalanced_gate_loss(logits.softmax(dim=-1), routes_with_shares(counts), empty_ratio)
+    loss.backward()
+    assert logits.grad is not None
+    return float(loss), logits.grad.sum(dim=0)
+
+
+def test_target_ratio_is_the_stationary_point() -> None:
+    loss, gradient = gate_gradient([80, 5, 5, 5, 5], 0.8)
+    assert loss == pytest.approx(1.0, abs=1e-6)
+    torch.testing.assert_close(gradient, torch.zeros_like(gradient), rtol=0, atol=1e-6)
+
+
+def test_the_gate_is_pushed_back_to_the_target_ratio_from_both_sides() -> None:
+    _, too_empty = gate_gradient([92, 2, 2, 2, 2], 0.8)
+    _, too_full = gate_gradient([60, 10, 10, 10, 10], 0.8)
+    assert too_empty[0] > 1e-3 and too_full[0] < -1e-3
+
+
+@settings(deadline=None, max_examples=30)
+@given(seed=st.integers(0, 2**16), experts=st.integers(1, 8))
+def test_ratio_of_one_in_all_experts_gives_back_the_balanced_loss(seed: int, experts: int) -> None:
+    torch.manual_seed(seed)
+    probabilities = torch.randn(200, 1 + experts).softmax(dim=-1)
+    routes = torch.randint(1 + experts, (200,))
+    torch.testing.assert_close(
+        imbalanced_gate_loss(probabilities, routes, 1.0 / (1 + experts)),
+        balance_loss(probabilities, routes),
+    )
+
+
+@pytest.mark.parametrize("ratio", [0.0, 1.0, -0.5, float("nan")])
+def test_a_target_ratio_outside_0_to_1_is_refused(ratio: float) -> None:
+    with pytest.raises(ValueError, match="empty ratio"):
+        imbalanced_gate_loss(torch.ones(1, 2) / 2, torch.zeros(1, dtype=torch.int64), ratio)
+
+
+def test_shares_sum_to_one_and_are_zero_without_points() -> None:
+    assert float(expert_shares(torch.tensor([0, 2, 2]), 4).sum()) == pytest.approx(1.0)
+    assert expert_shares(torch.zeros(0, dtype=torch.int64), 3).tolist() == [0.0, 0.0, 0.0]
+
+
+def test_density_loss_asks_only_the_gate() -> None:
+    empty = torch.tensor([0.9, 0.1], requires_grad=True)
+    alphas = torch.tensor([1.0, 0.0], requires_grad=True)
+    density_loss(empty, alphas).backward()
+    assert alphas.grad is None and empty.grad is not None
+    assert empty.grad.tolist() == [0.5, 0.0]
+
+
+def test_a_saturated_gate_still_learns_in_logit_form_but_not_in_the_papers() -> None:
+    """It calls one point empty that carries all of its ray's weight."""
+    logits = torch.tensor([[40.0, -40.0, -40.0]], requires_grad=True)
+    contribution_loss(logits, torch.ones(1), emphasis=4.0).backward()
+    assert logits.grad is not None and float(logits.grad[0, 0]) == pytest.approx(4.0)
+    logits.grad = None
+    density_loss(logits.softmax(dim=-1)[:, 0], torch.ones(1)).backward()
+    assert logits.grad is not None and float(logits.grad.abs().max()) < 1e-12
+
+
+def test_contribution_loss_is_least_at_the_emphasised_odds() -> None:
+    """d/do of -k y log o - (1 - y) log(1 - o) vanishes at o = k y / (k y + 1 - y)."""
+    y, k = 0.3, 4.0
+    best = k * y / (k * y + 1.0 - y)
+    logit = torch.tensor([[0.0, float(torch.tensor(best / (1 - best)).log())]], requires_grad=True)
+    contribution_loss(logit, torch.tensor([y * 0.05]), 0.05, k).backward()
+    assert logit.grad is not None and float(logit.grad.abs().max()) < 1e-6
+
+
+def test_contribution_loss_does_not_teach_the_field() -> None:
+    weights = torch.rand(5, requires_grad=True)
+    assert contribution_loss(torch.randn(5, 3, requires_grad=True), weights).requires_grad
+    contribution_loss(torch.randn(5, 3, requires_grad=True), weights).backward()
+    assert weights.grad is None
+
+
+@settings(deadline=None, max_examples=30)
+@given(seed=st.integers(0, 2**16))
+def test_distortion_is_the_double_sum_of_its_definition(seed: int) -> None:
+    torch.manual_seed(seed)
+    ray_indices = torch.randint(6, (40,)).sort().values
+    edges = torch.cumsum(torch.rand(40, 2, dtype=torch.float64).flatten(), 0).view(40, 2)
+    starts, ends = edges.unbind(dim=-1)
+    weights = torch.rand(40, dtype=torch.float64, requires_grad=True)
+    fast = distortion_loss(weights, starts, ends, pack_info(ray_indices, 7))
+    middles = 0.5 * (starts + ends)
+    same_ray = ray_indices[:, None] == ray_indices[None]
+    pairs = weights[:, None] * weights[None] * (middles[:, None] - middles[None]).abs()
+    slow = ((pairs * same_ray).sum() + (weights**2 * (ends - starts)).sum() / 3.0) / 7
+    torch.testing.assert_close(fast, slow, rtol=1e-10, atol=1e-10)
+    (of_fast,) = torch.autograd.grad(fast, weights)
+    (of_slow,) = torch.autograd.grad(slow, weights)
+    torch.testing.assert_close(of_fast, of_slow, rtol=1e-9, atol=1e-9)
+
+
+def test_distortion_of_nothing_is_zero() -> None:
+    nothing = torch.zeros(0)
+    for rays in (0, 3):
+        info = pack_info(torch.zeros(0, dtype=torch.int64), rays)
+        assert float(distortion_loss(nothing, nothing, nothing, info)) == 0.0

@@ -1,0 +1,227 @@
+"""A saved occupancy decides as before; whatever else is in a file is refused in one line."""
+
+from __future__ import annotations
+
+import json
+import os
+import random
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+import torch
+from safetensors import safe_open
+from safetensors.torch import save
+from torch import Tensor
+
+from leco_plugin.models.encodings import EncodingConfig
+from leco_plugin.models.gate import Gate, GateConfig
+from leco_plugin.occupancy import LARGEST_FILE, Occupancy
+from leco_plugin.space import Space
+
+GATES = {
+    "frequency": GateConfig(EncodingConfig(octaves=2), width=8, layers=1, scene_experts=2),
+    "hash": GateConfig(EncodingConfig("hash", levels=2, log2_table=5), width=8, layers=1),
+}
+
+
+def occupancy(kind: str = "frequency", **options) -> Occupancy:
+    torch.manual_seed(0)
+    report = {"image_price_db": 0.01, "bounds": "a box, 2 × 2"}
+    space = Space("contraction", (0.1, 0.2, 0.3), 1.5)
+    return Occupancy(Gate(GATES[kind]), space, 0.3, report=report, **options).eval()
+
+
+@pytest.fixture(scope="module")
+def sound(tmp_path_factory: pytest.TempPathFactory) -> bytes:
+    path = tmp_path_factory.mktemp("sound") / "occupancy.safetensors"
+    occupancy().save(path)
+    return path.read_bytes()
+
+
+def parts(content: bytes, folder: Path) -> tuple[dict[str, str], dict[str, Tensor]]:
+    path = folder / "parts.safetensors"
+    path.write_bytes(content)
+    with safe_open(path, framework="pt") as file:
+        return file.metadata(), {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
+
+
+@pytest.mark.parametrize("kind", GATES)
+@pytest.mark.parametrize("precision", ["float32", "bfloat16"])
+def test_a_loaded_occupancy_decides_as_the_saved_one(kind, precision, tmp_path: Path) -> None:
+    saved = occupancy(kind, precision=precision)
+    saved.save(tmp_path / "o.safetensors")
+    loaded = Occupancy.load(tmp_path / "o.safetensors")
+    positions = torch.randn(2000, 3) * 3
+    assert torch.equal(loaded.query(positions), saved.query(positions))
+    assert torch.equal(loaded.occupied(positions), saved.occupied(positions))
+    assert (loaded.threshold, loaded.report, loaded.precision, loaded.num_params) == (
+        saved.threshold,
+        saved.report,
+        precision,
+        saved.num_params,
+    )
+    assert not any(parameter.requires_grad for parameter in loaded.parameters())
+
+
+def test_outside_a_box_and_where_a_position_is_not_finite_space_is_empty() -> None:
+    boxed = Occupancy(Gate(GATES["frequency"]), Space("box"), 0.0)
+    nowhere = torch.tensor([[1.01, 0.0, 0.0], [float("nan"), 0.0, 0.0], [0.0, float("inf"), 0.0]])
+    assert boxed.query(nowhere).tolist() == [0.0, 0.0, 0.0]
+    assert boxed.query(torch.zeros(0, 3)).shape == (0,)
+
+
+def test_a_file_has_the_mode_of_an_ordinary_file_and_leaves_no_other(tmp_path: Path) -> None:
+    before = os.umask(0o022)
+    try:
+        occupancy().save(tmp_path / "o.safetensors")
+    finally:
+        os.umask(before)
+    assert (tmp_path / "o.safetensors").stat().st_mode & 0o777 == 0o644
+    assert [path.name for path in tmp_path.iterdir()] == ["o.safetensors"]
+
+
+def test_a_folder_that_is_not_there_is_an_os_error(tmp_path: Path) -> None:
+    with pytest.raises(OSError):
+        occupancy().save(tmp_path / "nowhere" / "o.safetensors")
+    with pytest.raises(OSError):
+        Occupancy.load(tmp_path / "nowhere.safetensors")
+    with pytest.raises((OSError, ValueError)):
+        Occupancy.load(tmp_path)
+
+
+def damaged(content: bytes, count: int) -> Iterator[bytes]:
+    """Files cut short, with flipped bits, with bytes overwritten, inserted or appended."""
+    dice = random.Random(0)
+    for _ in range(count):
+        data = bytearray(content)
+        at = dice.randrange(len(data))
+        kind = dice.choice(["cut", "flip", "flip", "flip early", "zero", "insert", "append"])
+        if kind == "cut":
+            del data[at:]
+        elif kind == "flip":
+            data[at] ^= 1 << dice.randrange(8)
+        elif kind == "flip early":  # in the header
+            data[dice.randrange(600)] ^= 1 << dice.randrange(8)
+        elif kind == "zero":
+            data[at : at + 16] = bytes(len(data[at : at + 16]))
+        elif kind == "insert":
+            data[at:at] = dice.randbytes(dice.randrange(1, 9))
+        else:
+            data += dice.randbytes(dice.randrange(1, 100))
+        yield bytes(data)
+
+
+def is_refused_or_the_same(path: Path, state: dict[str, Tensor]) -> bool:
+    """Whether the file is refused; fails when it is neither refused in one line nor the same."""
+    try:
+        loaded = Occupancy.load(path).state_dict()
+    except (ValueError, OSError) as error:
+        assert str(error) and "\n" not in str(error)
+        return True
+    assert loaded.keys() == state.keys()
+    assert all(torch.equal(loaded[name], value) for name, value in state.items())
+    return False
+
+
+def test_damaged_files_are_refused_or_load_to_the_same_tensors(sound, tmp_path: Path) -> None:
+    state, path = occupancy().state_dict(), tmp_path / "o.safetensors"
+    refused = 0
+    for content in damaged(sound, 400):
+        path.write_bytes(content)
+        refused += is_refused_or_the_same(path, state)
+    assert refused > 380
+
+
+FOREIGN = {
+    "empty": b"",
+    "zeros": bytes(1000),
+    "text": b"not a safetensors file\n" * 10,
+    "pickle": b"\x80\x04\x95" + bytes(100),
+    "huge header": (2**60).to_bytes(8, "little") + b"{}",
+    "tensors of another project": save({"weight": torch.zeros(3)}),
+    "no tensors": save({}, metadata={"format": "leco-occupancy", "version": "1"}),
+}
+
+
+@pytest.mark.parametrize("name", FOREIGN)
+def test_foreign_files_are_refused_in_one_line(name: str, tmp_path: Path) -> None:
+    path = tmp_path / "o.safetensors"
+    path.write_bytes(FOREIGN[name])
+    assert is_refused_or_the_same(path, {})
+
+
+def test_an_oversized_file_is_refused_unread(sound: bytes, tmp_path: Path) -> None:
+    path = tmp_path / "o.safetensors"
+    path.write_bytes(sound)
+    os.truncate(path, LARGEST_FILE + 1)
+    with pytest.raises(ValueError, match="bytes"):
+        Occupancy.load(path)
+
+
+HEADERS = {
+    "format": ["other", ""],
+    "version": ["0", "2", "1\n2", ""],
+    "precision": ["float16", "a\nb"],
+    "report": ["", "{", "[" * 5000],
+    "gate": [
+        "",
+        "[]",
+        "null",
+        '"a"',
+        "{}",
+        '{"encoding": 3}',
+        '{"encoding": {"kind": "frequency"}, "a\\nb": 1}',
+        *(
+            json.dumps({"encoding": {"kind": kind, name: size}})
+            for kind in ("frequency", "hash")
+            for name in ("octaves", "levels", "features", "log2_table", "finest")
+            for size in (0, -1, 10**6, 10**400, 1.5, "a\nb", None, True)
+        ),
+        *(
+            json.dumps({"encoding": {}, name: size})
+            for name in ("width", "layers", "scene_experts")
+            for size in (0, -1, 63, 10**6, 10**400, 1.5, "3", None, [1])
+        ),
+        '{"encoding": {"kind": ["hash"]}}',
+    ],
+    "sha256": ["", "0" * 64],
+}
+
+
+@pytest.mark.parametrize("key", HEADERS)
+def test_a_header_of_nonsense_is_refused_in_one_line(key: str, sound, tmp_path: Path) -> None:
+    header, tensors = parts(sound, tmp_path)
+    path = tmp_path / "o.safetensors"
+    for value in HEADERS[key]:
+        path.write_bytes(save(tensors, metadata=header | {key: value}))
+        assert is_refused_or_the_same(path, tensors), value
+    path.write_bytes(save(tensors, metadata={k: v for k, v in header.items() if k != key}))
+    assert is_refused_or_the_same(path, tensors)
+
+
+def test_tensors_that_do_not_fit_the_header_are_refused(sound: bytes, tmp_path: Path) -> None:
+    header, tensors = parts(sound, tmp_path)
+    path = tmp_path / "o.safetensors"
+    for name, value in tensors.items():
+        others = [value[None], value.double() if value.is_floating_point() else value.int()]
+        if value.is_floating_point():
+            others += [torch.full_like(value, bad) for bad in (float("nan"), float("inf"))]
+            others += [value.half(), value + 1.0]
+        for other in others:
+            path.write_bytes(save(tensors | {name: other.contiguous()}, metadata=header))
+            assert is_refused_or_the_same(path, tensors), name
+        rest = {key: tensor for key, tensor in tensors.items() if key != name}
+        path.write_bytes(save(rest, metadata=header))
+        assert is_refused_or_the_same(path, tensors), name
+    path.write_bytes(save(tensors | {"one\nmore": torch.zeros(1)}, metadata=header))
+    assert is_refused_or_the_same(path, tensors)
+
+
+@pytest.mark.parametrize("threshold", [-0.1, 1.1])
+def test_a_threshold_outside_0_to_1_is_refused(threshold: float, tmp_path: Path) -> None:
+    wrong = occupancy()
+    wrong.threshold_value.fill_(threshold)
+    wrong.save(tmp_path / "o.safetensors")
+    with pytest.raises(ValueError, match="threshold"):
+        Occupancy.load(tmp_path / "o.safetensors")
