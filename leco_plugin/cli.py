@@ -59,12 +59,16 @@ def inspect(
     facts = {**describe(occupancy), "bytes": file.stat().st_size}
     space = facts["space"]
     print(f"{file}: {facts['params']} parameters in {facts['bytes'] / 1000:.1f} kB")
-    print(f"space: {space['kind']} around {_listed(space['center'])}, {space['half_extent']:.4g} half")
+    print(
+        f"space: {space['kind']} around {_listed(space['center'])}, {space['half_extent']:.4g} half"
+    )
     print(f"kept where o(x) >= {facts['threshold']:.4g}, asked in {facts['precision']}")
     print(f"kept share of its box: {facts['kept_share_of_box']:.2%}")
     for name, value in facts["report"].items():
         if isinstance(value, (int, float, str)) and name not in ("params", "threshold"):
-            print(f"{name.replace('_', ' ')}: {value if isinstance(value, str) else f'{value:.4g}'}")
+            print(
+                f"{name.replace('_', ' ')}: {value if isinstance(value, str) else f'{value:.4g}'}"
+            )
     if picture is not None:
         from leco_plugin.evaluation.occupancy_picture import draw
 
@@ -73,9 +77,7 @@ def inspect(
     _write_json(json, facts)
 
 
-def demo(
-    out: Path = Path("runs/demo"), seconds: float = 110.0, json: Path | None = None
-) -> None:
+def demo(out: Path = Path("runs/demo"), seconds: float = 110.0, json: Path | None = None) -> None:
     """Learn the occupancy of a small city, go on guided, and compare with never freezing.
 
     Writes report.json, chart.png, picture.png and occupancy.safetensors. Under six minutes on two

@@ -238,5 +238,3 @@ def summary(report: dict[str, Any]) -> list[str]:
         for run in (guided, other)
     ]
     return lines
-
-

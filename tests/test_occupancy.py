@@ -27,7 +27,7 @@ GATES = {
 
 def occupancy(kind: str = "frequency", **options) -> Occupancy:
     torch.manual_seed(0)
-    report = {"image_price_db": 0.01, "bounds": "a box, 2 × 2"}
+    report = {"image_price_db": 0.01, "bounds": "a box of 2 m²"}
     space = Space("contraction", (0.1, 0.2, 0.3), 1.5)
     return Occupancy(Gate(GATES[kind]), space, 0.3, report=report, **options).eval()
 

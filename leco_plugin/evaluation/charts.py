@@ -35,7 +35,12 @@ def psnr_against_seconds(
         colour = COLOURS[i % len(COLOURS)]
         label = labels[i] if labels else run["method"]
         axes.plot(
-            seconds, values, color=colour, marker=MARKERS[i % len(MARKERS)], linewidth=2.4, label=label
+            seconds,
+            values,
+            color=colour,
+            marker=MARKERS[i % len(MARKERS)],
+            linewidth=2.4,
+            label=label,
         )
         axes.annotate(
             f" {values[-1]:.1f} dB",

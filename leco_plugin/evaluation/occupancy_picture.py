@@ -14,13 +14,13 @@ from leco_plugin.occupancy import Occupancy
 
 SEARCH_CELLS = 64
 """Along the longest side, to find where anything is kept at all."""
-CELLS = 112
+CELLS = 128
 """Along the longest side, for the points in space."""
 PIXELS = 640
 """Along the longer side of a slice."""
-MOST_POINTS = 24_000
-HORIZONTAL = (0.12, 0.5)
-"""Heights of the horizontal slices as shares of the kept range."""
+MOST_POINTS = 50_000
+HORIZONTAL = (0.12, 0.4)
+"""Heights of the horizontal slices, as shares of the way from the ground to the highest roofs."""
 
 COLOURS = "magma"
 CONTOUR = "#4fd8eb"
@@ -44,14 +44,14 @@ def draw(occupancy: Occupancy, path: str | Path, cameras: Tensor | None = None) 
 
     cameras = cameras_of(occupancy) if cameras is None else cameras.detach().cpu().float()
     box = interesting_box(occupancy, cameras)
-    points, normals = surface_points(occupancy, box)
+    low, high = heights_seen_from_above(occupancy, box)
+    points, normals = surface_points(occupancy, box, low)
     figure = Figure(figsize=(15, 9.4), layout="constrained", facecolor="white")
     FigureCanvasAgg(figure)
     wide, tall = (box.high - box.low)[[0, 2]].tolist()
     grid = figure.add_gridspec(
         2, 6, height_ratios=(1.0, min(1.0, max(0.4, 1.6 * tall / wide))), hspace=0.04
     )
-    low, high = _kept_range(points, box)
     shown = None
     for i, share in enumerate(HORIZONTAL):
         axes = figure.add_subplot(grid[0, 2 * i : 2 * i + 2])
@@ -61,12 +61,12 @@ def draw(occupancy: Occupancy, path: str | Path, cameras: Tensor | None = None) 
     for i, normal in enumerate((1, 0)):
         axes = figure.add_subplot(grid[1, 3 * i : 3 * i + 3])
         draw_slice(axes, occupancy, box, normal, float(middle[normal]), cameras=cameras)
-    _draw_points(figure.add_subplot(grid[0, 4:6], projection="3d"), points, normals, box)
+    _draw_points(figure.add_subplot(grid[0, 4:6], projection="3d"), points, normals, (low, high))
     assert shown is not None
     bar = figure.colorbar(shown, ax=figure.axes[2:4], shrink=0.9, pad=0.01, fraction=0.03)
     bar.ax.axhline(occupancy.threshold, color=CONTOUR, linewidth=2)
     bar.set_label("o(x)")
-    figure.suptitle(_title(occupancy), fontsize=13)
+    figure.suptitle(_title(occupancy, cameras), fontsize=13)
     figure.savefig(path, dpi=110)
     return Path(path)
 
@@ -134,7 +134,20 @@ def interesting_box(occupancy: Occupancy, cameras: Tensor) -> ViewBox:
     return ViewBox(torch.maximum(low - margin, whole.low), torch.minimum(high + margin, whole.high))
 
 
-def surface_points(occupancy: Occupancy, box: ViewBox) -> tuple[Tensor, Tensor]:
+def heights_seen_from_above(occupancy: Occupancy, box: ViewBox) -> tuple[float, float]:
+    """Heights between which nearly all of what a look straight down meets lies, scene units.
+
+    What is kept below the ground, where no camera sees, would otherwise be taken for the scene.
+    """
+    _, positions, kept = _kept_cells(occupancy, box, CELLS)
+    heights = torch.where(kept, positions[..., 2], -torch.inf).amax(dim=-1)
+    heights = heights[heights.isfinite()].sort().values
+    if len(heights) == 0:
+        return float(box.low[2]), float(box.high[2])
+    return float(heights[len(heights) // 20]), float(heights[-1 - len(heights) // 200])
+
+
+def surface_points(occupancy: Occupancy, box: ViewBox, lowest: float) -> tuple[Tensor, Tensor]:
     """Kept positions next to skipped ones, and the directions [P, 3] in which o(x) falls there."""
     values, positions, kept = _kept_cells(occupancy, box, CELLS)
     skipped = torch.nn.functional.pad(~kept, (1, 1) * 3)
@@ -144,7 +157,8 @@ def surface_points(occupancy: Occupancy, box: ViewBox) -> tuple[Tensor, Tensor]:
             window = [slice(1, -1)] * 3
             window[axis] = slice(side, side - 2 or None)
             exposed |= skipped[tuple(window)]
-    chosen = (kept & exposed).nonzero()
+    margin = 2.0 * float((box.high - box.low).max()) / CELLS
+    chosen = (kept & exposed & (positions[..., 2] > lowest - margin)).nonzero()
     order = torch.randperm(len(chosen), generator=torch.Generator().manual_seed(0))
     chosen = chosen[order[:MOST_POINTS]]
     falls = -torch.stack(torch.gradient(values), dim=-1)
@@ -152,9 +166,7 @@ def surface_points(occupancy: Occupancy, box: ViewBox) -> tuple[Tensor, Tensor]:
     return positions[at], torch.nn.functional.normalize(falls[at], dim=-1)
 
 
-def _kept_cells(
-    occupancy: Occupancy, box: ViewBox, longest: int
-) -> tuple[Tensor, Tensor, Tensor]:
+def _kept_cells(occupancy: Occupancy, box: ViewBox, longest: int) -> tuple[Tensor, Tensor, Tensor]:
     """o(x) at the middles of cells [X, Y, Z], those positions [X, Y, Z, 3], and which are kept."""
     axes = [box.axis(number, count) for number, count in enumerate(box.cells(longest))]
     positions = torch.stack(torch.meshgrid(*axes, indexing="ij"), dim=-1)
@@ -162,15 +174,7 @@ def _kept_cells(
     return values, positions, values >= occupancy.threshold
 
 
-def _kept_range(points: Tensor, box: ViewBox) -> tuple[float, float]:
-    """Heights between which nearly all kept points lie."""
-    if len(points) == 0:
-        return float(box.low[2]), float(box.high[2])
-    heights = points[:, 2].sort().values
-    return float(heights[len(heights) // 50]), float(heights[-1 - len(heights) // 200])
-
-
-def _draw_points(axes: Any, points: Tensor, normals: Tensor, box: ViewBox) -> None:
+def _draw_points(axes: Any, points: Tensor, normals: Tensor, heights: tuple[float, float]) -> None:
     """The kept points, coloured by height and lit from above, so that shapes can be read."""
     from matplotlib import colormaps
 
@@ -178,22 +182,25 @@ def _draw_points(axes: Any, points: Tensor, normals: Tensor, box: ViewBox) -> No
     axes.set_axis_off()
     if len(points) == 0:
         return
-    low, high = _kept_range(points, box)
-    heights = ((points[:, 2] - low) / max(high - low, 1e-9)).clamp(0, 1)
+    low, high = heights
+    shares = ((points[:, 2] - low) / max(high - low, 1e-9)).clamp(0, 1)
     light = torch.nn.functional.normalize(torch.tensor([0.35, -0.55, 0.75]), dim=0)
     shade = 0.55 + 0.45 * (normals @ light).clamp(min=0)
-    colours = torch.from_numpy(colormaps["viridis"](heights.numpy())[:, :3]) * shade[:, None]
+    colours = torch.from_numpy(colormaps["viridis"](shares.numpy())[:, :3]) * shade[:, None]
     x, y, z = points.T.numpy()
-    axes.scatter(x, y, z, c=colours.numpy(), s=3.5, linewidths=0, depthshade=False)
-    axes.set_box_aspect((box.high - box.low).tolist(), zoom=1.45)
+    axes.scatter(x, y, z, c=colours.numpy(), s=3.0, linewidths=0, depthshade=False)
+    axes.set_box_aspect(
+        (points.amax(dim=0) - points.amin(dim=0)).clamp(min=1e-6).tolist(), zoom=1.4
+    )
     axes.view_init(elev=38, azim=-58)
 
 
-def _title(occupancy: Occupancy) -> str:
+def _title(occupancy: Occupancy, cameras: Tensor) -> str:
     """What one should know beside the picture."""
     parts = [f"occupancy with {occupancy.num_params} parameters"]
     parts.append(f"kept where o(x) ≥ {occupancy.threshold:.3g}")
     skipped = occupancy.report.get("empty_fraction")
     if isinstance(skipped, float):
         parts.append(f"{skipped:.1%} of all candidates skipped")
+    parts.append("threshold blue" + (", cameras green" if len(cameras) else ""))
     return " · ".join(parts)

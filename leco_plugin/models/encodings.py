@@ -60,8 +60,9 @@ class FrequencyEncoding(nn.Module):
 class _InterpolateTable(torch.autograd.Function):
     """Weighted sum of 8 table rows per point and level; the backward is a histogram.
 
-    `embedding_bag` is the fastest forward that plain torch has on a CPU, but its backward sorts the
-    indices; a weighted `bincount` per feature is 9 times faster there. On CUDA `index_add_` is right.
+    `embedding_bag` is the fastest forward that plain torch has on a CPU, but its backward sorts
+    the indices; a weighted `bincount` per feature is 9 times faster there. On CUDA `index_add_` is
+    right.
     """
 
     @staticmethod

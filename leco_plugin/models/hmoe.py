@@ -6,7 +6,7 @@ Dispatch is top-1 and dropless: every point goes through the expert it is routed
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal
+from typing import Any, Literal
 
 import torch
 from torch import Tensor, nn
@@ -64,6 +64,19 @@ class Expert(nn.Module):
         return features + hidden if self.residual else hidden
 
 
+class _Permute(torch.autograd.Function):
+    """Rows in another order; the backward is the inverse order, where autograd would add up rows."""
+
+    @staticmethod
+    def forward(ctx: Any, rows: Tensor, order: Tensor, inverse: Tensor) -> Tensor:
+        ctx.inverse = inverse
+        return rows.index_select(0, order)
+
+    @staticmethod
+    def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor, None, None]:
+        return gradient.index_select(0, ctx.inverse), None, None
+
+
 class HMoE(nn.Module):
     """h(x) = G_i*(x) E_i*(x): each point through the one expert it is routed to."""
 
@@ -92,21 +105,20 @@ class HMoE(nn.Module):
             [N, width] in the dtype of the experts' output.
         """
         order = routes.argsort(stable=True)
-        counts = torch.bincount(
-            routes, minlength=len(self.experts)
-        ).tolist()  # the one synchronisation
+        inverse = torch.empty_like(order).scatter_(
+            0, order, torch.arange(len(order), device=order.device)
+        )
+        counts = torch.bincount(routes, minlength=len(self.experts)).tolist()  # one synchronisation
+        ordered = _Permute.apply(features, order, inverse)
         parts = [
             expert(part) if len(part) else part
-            for expert, part in zip(self.experts, features[order].split(counts))
+            for expert, part in zip(self.experts, ordered.split(counts))
         ]
         if self.config.empty_expert == "none":
             parts[EMPTY] = torch.zeros_like(parts[EMPTY])
         dtype = next((p.dtype for p in parts[1:] if len(p)), features.dtype)
         hidden = torch.cat([part.to(dtype) for part in parts])
-        back = torch.empty_like(order).scatter_(
-            0, order, torch.arange(len(order), device=order.device)
-        )
-        return hidden[back] * gate_values[:, None].to(dtype)
+        return _Permute.apply(hidden, inverse, order) * gate_values[:, None].to(dtype)
 
 
 def dense_hmoe(hmoe: HMoE, features: Tensor, routes: Tensor, gate_values: Tensor) -> Tensor:

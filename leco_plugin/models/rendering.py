@@ -123,7 +123,9 @@ def shade(
     ray_indices, t_starts, t_ends = intervals
     middles = 0.5 * (t_starts + t_ends)
     positions = torch.addcmul(
-        rays.origins[ray_indices], rays.directions[ray_indices], middles[:, None]
+        rays.origins.index_select(0, ray_indices),
+        rays.directions.index_select(0, ray_indices),
+        middles[:, None],
     )
     mapped = space.map(positions).clamp(-1.0, 1.0)
     with torch.set_grad_enabled(torch.is_grad_enabled() and not freeze_gate):

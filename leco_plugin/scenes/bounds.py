@@ -76,7 +76,7 @@ def _slab(
     """A bounded scene between two levels; points may miss a cellar or a mast, hence the margins."""
     relief = max(high - low, 0.02 * far)
     # far below, so that a flat picture on the lower plane, seen from two places, is plainly wrong
-    ground, top = low - max(0.5 * relief, 0.2 * far), high + 0.75 * relief
+    ground, top = low - max(0.5 * relief, 0.2 * far), high + 0.3 * relief
     down = directions[..., 2] < -0.05
     reach = ((ground - poses[:, None, 2, 3]) / directions[..., 2]).clamp(0.0, far)[down]
     origins = poses[:, None, :, 3].expand_as(directions)[down]

@@ -47,9 +47,50 @@ class HeldOutPixelSampler(PixelSampler):
         indices = super().sample_method(
             batch_size, num_images, image_height, image_width, mask, device
         )
-        columns = indices[:, 2]
+        return self._step_aside(indices, image_width, mask)
+
+    def sample_method_equirectangular(
+        self,
+        batch_size: int,
+        num_images: int,
+        image_height: int,
+        image_width: int,
+        mask: Tensor | None = None,
+        device: torch.device | str = "cpu",
+    ) -> Tensor:
+        """The same for panoramas."""
+        indices = super().sample_method_equirectangular(
+            batch_size, num_images, image_height, image_width, mask, device
+        )
+        return self._step_aside(indices, image_width, mask)
+
+    def sample_method_fisheye(
+        self,
+        batch_size: int,
+        num_images: int,
+        image_height: int,
+        image_width: int,
+        mask: Tensor | None = None,
+        device: torch.device | str = "cpu",
+    ) -> Tensor:
+        """The same for the disc of a fisheye image."""
+        indices = super().sample_method_fisheye(
+            batch_size, num_images, image_height, image_width, mask, device
+        )
+        return self._step_aside(indices, image_width, mask)
+
+    def _step_aside(self, indices: Tensor, image_width: int, mask: Tensor | None) -> Tensor:
+        """Moves held-out pixels [N, 3] to their neighbours, or to others where those are masked."""
+        held_out, columns = is_held_out(indices), indices[:, 2]
         aside = torch.where(columns + 1 < image_width, columns + 1, columns - 1)
-        indices[:, 2] = torch.where(is_held_out(indices), aside, columns)
+        indices[:, 2] = torch.where(held_out, aside, columns)
+        if isinstance(mask, Tensor) and not self.config.ignore_mask:
+            image, row, column = indices.to(mask.device).unbind(dim=-1)
+            seen = mask[image, row, column].bool().flatten().to(indices.device)
+            others = seen.nonzero()[:, 0]
+            if len(others) > 0:
+                drawn = torch.randint(len(others), (len(indices),), device=indices.device)
+                indices = torch.where(seen[:, None], indices, indices[others[drawn]])
         return indices
 
     def sample_held_out(self, images: dict[str, Any], count: int, seed: int) -> dict[str, Tensor]:

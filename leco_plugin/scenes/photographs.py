@@ -94,9 +94,11 @@ def check_scene(data: Path) -> dict[str, Any]:
         raise InputError(f"{description} has no cameras: its list of frames is empty")
     if poses.shape[1:] not in ((4, 4), (3, 4)) or not np.isfinite(poses).all():
         raise InputError(f"{description} holds a transform_matrix that is no finite 4 x 4 matrix")
-    determinants = np.linalg.det(poses[:, :3, :3])
-    if np.abs(determinants - 1.0).max() > 0.05:
-        worst = paths[int(np.abs(determinants - 1.0).argmax())]
+    rotations = poses[:, :3, :3]
+    distortions = np.abs(rotations @ rotations.swapaxes(1, 2) - np.eye(3)).max(axis=(1, 2))
+    distortions = np.maximum(distortions, np.abs(np.linalg.det(rotations) - 1.0))
+    if distortions.max() > 0.05:
+        worst = paths[int(distortions.argmax())]
         raise InputError(f"{description}: the transform_matrix of {worst} is no rotation")
     _check_images(meta, frames, folder_of(data))
     return dict(meta)

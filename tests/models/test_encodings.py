@@ -77,7 +77,9 @@ def test_rows_stay_in_the_table_of_their_level() -> None:
     encoding = hash_encoding()
     rows, _ = encoding.rows_and_weights(torch.rand(100, 3) * 2 - 1)
     size = encoding.mask + 1
-    assert torch.equal(rows.view(100, 3, 8) // size, torch.arange(3).view(1, 3, 1).expand(100, 3, 8))
+    assert torch.equal(
+        rows.view(100, 3, 8) // size, torch.arange(3).view(1, 3, 1).expand(100, 3, 8)
+    )
 
 
 def test_no_points_give_no_features_and_a_zero_gradient() -> None:

@@ -29,7 +29,7 @@ def gate_gradient(counts: list[int], empty_ratio: float) -> tuple[float, torch.T
     loss = imbalanced_gate_loss(logits.softmax(dim=-1), routes_with_shares(counts), empty_ratio)
     loss.backward()
     assert logits.grad is not None
-    return float(loss), logits.grad.sum(dim=0)
+    return loss.item(), logits.grad.sum(dim=0)
 
 
 def test_target_ratio_is_the_stationary_point() -> None:

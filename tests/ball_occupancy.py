@@ -1,0 +1,37 @@
+"""An occupancy that is known: a ball, whose gate was fitted to it in a second."""
+
+from __future__ import annotations
+
+import functools
+
+import torch
+
+from leco_plugin.models.encodings import EncodingConfig
+from leco_plugin.models.gate import Gate, GateConfig, occupancy_logit
+from leco_plugin.occupancy import Occupancy
+from leco_plugin.space import Space
+
+CENTRE, RADIUS, HALF = (1.0, 2.0, 0.5), 1.0, 2.0
+
+
+@functools.cache
+def ball() -> Occupancy:
+    """Kept within `RADIUS` of `CENTRE`, to some hundredths; its report names walls and cameras."""
+    torch.manual_seed(0)
+    gate = Gate(GateConfig(EncodingConfig(kind="frequency", octaves=2), 32, 2, 2))
+    optimizer = torch.optim.Adam(gate.parameters(), 1e-2)
+    for _ in range(200):
+        mapped = 2.0 * torch.rand(1024, 3) - 1.0
+        inside = (mapped.norm(dim=-1) < RADIUS / HALF).float()
+        loss = torch.nn.functional.binary_cross_entropy_with_logits(
+            occupancy_logit(gate(mapped)), inside
+        )
+        optimizer.zero_grad()
+        loss.backward()
+        optimizer.step()
+    report = {
+        "aabb": [-1e6, -1e6, -1.0, 1e6, 1e6, 2.0],
+        "cameras": [[1.0, 0.5, 1.8], [2.5, 2.0, 1.8], [1.0, 3.5, 1.8]],
+        "empty_fraction": 0.9,
+    }
+    return Occupancy(gate, Space("box", CENTRE, HALF), 0.5, report=report).eval()

@@ -1,0 +1,74 @@
+"""Claims about what an occupancy says of itself, and about its picture."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from ball_occupancy import CENTRE, HALF, RADIUS, ball
+from PIL import Image
+
+from leco_plugin.evaluation.inspection import cameras_of, describe, whole_box
+from leco_plugin.evaluation.occupancy_picture import draw, interesting_box, surface_points
+from leco_plugin.occupancy import Occupancy
+
+NO_CAMERAS = torch.zeros(0, 3)
+
+
+def with_report(**report: object) -> Occupancy:
+    """The ball with another report."""
+    known = ball()
+    return Occupancy(known.gate, known.space, known.threshold, report=report)
+
+
+def test_the_kept_share_is_that_of_the_ball_in_the_box_between_the_walls() -> None:
+    volume = 4 / 3 * math.pi * RADIUS**3 / (2 * HALF * 2 * HALF * 3.0)
+    assert describe(ball())["kept_share_of_box"] == pytest.approx(volume, rel=0.15)
+
+
+def test_far_walls_do_not_widen_the_box() -> None:
+    box = whole_box(ball())
+    assert box.low.tolist() == [-1.0, 0.0, -1.0] and box.high.tolist() == [3.0, 4.0, 2.0]
+
+
+@pytest.mark.parametrize(
+    "report",
+    [
+        {},
+        {"aabb": None, "cameras": 3},
+        {"aabb": [0.0, 1.0], "cameras": [[1.0], "x"]},
+        {"aabb": ["a"] * 6, "cameras": [[float("nan"), 0.0, 0.0]]},
+        {"aabb": [9.0] * 3 + [8.0] * 3, "cameras": []},
+    ],
+)
+def test_a_report_that_says_nothing_useful_is_done_without(report: dict[str, object]) -> None:
+    occupancy = with_report(**report)
+    assert whole_box(occupancy).low.tolist() == [-1.0, 0.0, -1.5]
+    assert len(cameras_of(occupancy)) == 0
+
+
+def test_what_is_drawn_is_what_is_kept_and_the_cameras() -> None:
+    alone, watched = (interesting_box(ball(), c) for c in (NO_CAMERAS, cameras_of(ball())))
+    low, high = torch.tensor(CENTRE) - RADIUS, torch.tensor(CENTRE) + RADIUS
+    assert bool(((alone.low - low).abs() < 0.3).all() and ((alone.high - high).abs() < 0.3).all())
+    assert float(watched.high[2]) > 1.8
+
+
+def test_points_are_on_the_surface_and_face_outwards() -> None:
+    points, normals = surface_points(ball(), whole_box(ball()), -10.0)
+    offsets = points - torch.tensor(CENTRE)
+    assert len(points) > 1000
+    assert float((offsets.norm(dim=-1) - RADIUS).abs().mean()) < 0.08
+    outwards = torch.nn.functional.normalize(offsets, dim=-1)
+    assert float((normals * outwards).sum(dim=-1).mean()) > 0.9
+
+
+@pytest.mark.parametrize("threshold", [0.0, 0.5, 1.0])
+def test_a_picture_is_made_whatever_is_kept(tmp_path: Path, threshold: float) -> None:
+    known = ball()
+    occupancy = Occupancy(known.gate, known.space, threshold, report=known.report)
+    image = np.asarray(Image.open(draw(occupancy, tmp_path / "picture.png")).convert("L"))
+    assert min(image.shape) > 600 and image.std() > 30

@@ -1,0 +1,40 @@
+"""Claims about the description of the machine, stored JSON, and the chart."""
+
+from __future__ import annotations
+
+import json
+import platform
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from leco_plugin.evaluation.charts import psnr_against_seconds
+from leco_plugin.evaluation.json_file import write_json
+from leco_plugin.evaluation.machine import describe_machine
+
+
+def test_the_machine_is_described_without_its_name() -> None:
+    text = json.dumps(describe_machine())
+    assert {"cpu", "cores", "device", "torch"} <= json.loads(text).keys()
+    assert "/" not in json.loads(text)["device"]
+    assert not platform.node() or platform.node() not in text
+
+
+def test_what_is_no_json_leaves_no_file(tmp_path: Path) -> None:
+    with pytest.raises(ValueError):
+        write_json(tmp_path / "report.json", {"psnr": float("nan")})
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_the_chart_marks_both_runs_and_the_freezing(tmp_path: Path) -> None:
+    curve = [[10.0 * i, 18.0 + i] for i in range(1, 6)]
+    runs = [
+        {"method": "a", "train_seconds": 50.0, "curve": curve, "freeze_seconds": 12.0},
+        {"method": "b", "train_seconds": 50.0, "curve": [[t, p - 1.0] for t, p in curve]},
+    ]
+    path = psnr_against_seconds(runs, tmp_path / "chart.png", "A city")
+    image = np.asarray(Image.open(path).convert("RGB")).reshape(-1, 3).astype(int)
+    for colour in ((0x0B, 0x6E, 0x8F), (0xD1, 0x60, 0x2B)):
+        assert (np.abs(image - colour).max(axis=1) < 8).sum() > 500

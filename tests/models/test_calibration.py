@@ -1,0 +1,163 @@
+"""The threshold is the largest whose measured price is within its bounds."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from torch import Tensor
+
+from leco_plugin.models.calibration import (
+    SURFACE_STEPS,
+    THRESHOLDS,
+    CalibrationConfig,
+    Reference,
+    calibrate,
+    measure,
+    near_median_depth,
+)
+from leco_plugin.models.rendering import Intervals, Shaded
+from leco_plugin.samplers.packed import accumulate_along_rays, pack_info
+
+RAYS, SAMPLES = 20, 30
+
+
+class Chunk:
+    """Synthetic rays with grey samples, whose pixels are their weights times their greys."""
+
+    def __init__(self, seed: int) -> None:
+        generator = torch.Generator().manual_seed(seed)
+        self.ray_indices = torch.arange(RAYS).repeat_interleave(SAMPLES)
+        starts = torch.arange(SAMPLES).float().repeat(RAYS)
+        logits = torch.randn(RAYS, SAMPLES, generator=generator) * 3
+        weights = (0.9 * logits.softmax(dim=-1)).flatten()
+        # the gate knows the weights, up to some noise
+        noise = torch.rand(len(weights), generator=generator) ** 4
+        occupancies = (weights * 10).clamp(max=1.0) * (1.0 - noise)
+        self.greys = torch.rand(len(weights), 3, generator=generator)
+        near = weights > 0.01
+        intervals = Intervals(self.ray_indices, starts, starts + 1.0)
+        self.reference = Reference(intervals, weights, occupancies, near, self.render(weights))
+        self.truth = self.reference.rgb + 0.05 * torch.randn(RAYS, 3, generator=generator)
+
+    def render(self, weights: Tensor) -> Tensor:
+        return accumulate_along_rays(weights, self.greys, self.ray_indices, RAYS)
+
+
+class Problem:
+    def __init__(self, seed: int) -> None:
+        self.chunks = [Chunk(seed), Chunk(seed + 1)]
+        self.references = [chunk.reference for chunk in self.chunks]
+        self.truths = [chunk.truth for chunk in self.chunks]
+
+    def render_kept(self, number: int, mask: Tensor) -> Tensor:
+        chunk = self.chunks[number]
+        return chunk.render(chunk.reference.weights * mask)
+
+    def arguments(self) -> tuple:
+        return self.references, self.truths, self.render_kept
+
+
+@settings(deadline=None, max_examples=20)
+@given(
+    seed=st.integers(0, 2**16),
+    mass=st.sampled_from([1e-4, 1e-2, 0.2]),
+    price=st.sampled_from([0.01, 0.1, 1.0]),
+)
+def test_the_threshold_is_the_largest_within_the_bounds(
+    seed: int, mass: float, price: float
+) -> None:
+    problem, config = Problem(seed), CalibrationConfig(mass, price)
+    found = calibrate(*problem.arguments(), config)
+    fitting = [t for t in THRESHOLDS if measure(*problem.arguments(), t).within(config)]
+    assert found.threshold == max(fitting, default=0.0)
+    assert found.threshold == 0.0 or found.within(config)
+
+
+def test_nothing_is_skipped_when_no_threshold_fits() -> None:
+    problem = Problem(0)
+    for reference in problem.references:
+        reference.occupancies.zero_()  # a gate that calls the whole scene empty
+    found = calibrate(*problem.arguments(), CalibrationConfig())
+    assert found == (0.0, 0.0, 0.0, 0.0, 0.0)
+
+
+def test_a_perfect_gate_gets_the_largest_threshold_for_nothing() -> None:
+    problem = Problem(0)
+    for chunk in problem.chunks:
+        empty = torch.rand(len(chunk.reference.weights)) < 0.5
+        chunk.reference.weights[empty] = 0.0
+        chunk.reference.rgb.copy_(chunk.render(chunk.reference.weights))
+        chunk.reference.occupancies.copy_((~empty).float())
+    found = calibrate(*problem.arguments(), CalibrationConfig(0.0, 0.0))
+    assert found.threshold == max(THRESHOLDS)
+    assert found[1:4] == (0.0, 0.0, 0.0)
+    assert 0.4 < found.empty_fraction < 0.6
+
+
+def test_prices_are_those_of_their_definitions() -> None:
+    problem, threshold = Problem(3), 0.3
+    weights = torch.cat([reference.weights for reference in problem.references]).double()
+    near = torch.cat([reference.near_surface for reference in problem.references])
+    gone = torch.cat([reference.occupancies for reference in problem.references]) < threshold
+    masks = gone.view(2, -1)
+    errors = [
+        torch.cat(
+            [(image - truth).double() ** 2 for image, truth in zip(images, problem.truths)]
+        ).mean()
+        for images in (
+            [reference.rgb for reference in problem.references],
+            [problem.render_kept(i, ~masks[i]) for i in range(2)],
+        )
+    ]
+    found = measure(*problem.arguments(), threshold)
+    assert found.lost_mass == pytest.approx(float(weights[gone].sum() / weights.sum()), rel=1e-5)
+    expected = float(weights[gone & near].sum() / weights[near].sum())
+    assert found.lost_surface_mass == pytest.approx(expected, rel=1e-5)
+    assert found.image_price_db == pytest.approx(
+        float(10 * (errors[1] / errors[0]).log10()), abs=1e-4
+    )
+    assert found.empty_fraction == pytest.approx(float(gone.float().mean()))
+
+
+def test_without_an_image_there_is_no_image_price() -> None:
+    assert math.isnan(measure(*Problem(0).arguments(), 0.1, with_image=False).image_price_db)
+
+
+def test_no_rays_at_all_cost_nothing() -> None:
+    found = measure([], [], lambda i, mask: mask, 0.5)
+    assert found.lost_surface_mass == found.lost_mass == found.empty_fraction == 0.0
+
+
+@settings(deadline=None, max_examples=30)
+@given(seed=st.integers(0, 2**16))
+def test_near_the_median_depth_is_within_two_steps_of_it(seed: int) -> None:
+    torch.manual_seed(seed)
+    counts = torch.tensor([7, 0, 12, 1, 30])
+    ray_indices = torch.arange(5).repeat_interleave(counts)
+    starts = torch.cat([torch.arange(int(count)) * 0.5 for count in counts])
+    intervals = Intervals(ray_indices, starts, starts + 0.5)
+    weights = torch.rand(50) ** 8 / 30
+    accumulation = accumulate_along_rays(weights, None, ray_indices, 5)[:, 0]
+    none = torch.zeros(0)
+    shaded = Shaded(none, accumulation, none, weights, none, none, none, pack_info(ray_indices, 5))
+    near = near_median_depth(shaded, intervals)
+    for ray in range(5):
+        mine = (ray_indices == ray).nonzero()[:, 0].tolist()
+        total = 0.0
+        for median in mine:
+            total += float(weights[median])
+            if total >= 0.5 * float(accumulation[ray]) * (1 - 1e-6):
+                break
+        for sample in mine:
+            expected = abs(sample - median) <= SURFACE_STEPS
+            assert bool(near[sample]) == expected
+
+
+def test_no_samples_have_no_median() -> None:
+    none, no_rays = torch.zeros(0), torch.zeros(0, dtype=torch.int64)
+    shaded = Shaded(none, torch.zeros(3), none, none, none, none, none, pack_info(no_rays, 3))
+    assert near_median_depth(shaded, Intervals(no_rays, none, none)).shape == (0,)

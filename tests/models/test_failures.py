@@ -1,0 +1,62 @@
+"""A loss that is not finite names its cause."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+import torch
+
+from leco_plugin.models.failures import explain_non_finite
+
+
+def sound() -> tuple[torch.nn.Module, dict[str, Any], torch.Tensor]:
+    """A model, outputs and an image in which everything is finite."""
+    rays = SimpleNamespace(origins=torch.zeros(4, 3), directions=torch.ones(4, 3))
+    shaded = SimpleNamespace(
+        logits=torch.zeros(9, 3),
+        sigmas=torch.zeros(9),
+        rgb=torch.zeros(4, 3),
+        weights=torch.zeros(9),
+    )
+    model = torch.nn.Sequential(torch.nn.Linear(2, 2), torch.nn.Embedding(0, 3))
+    return model, {"rays": rays, "shaded": shaded}, torch.zeros(4, 3)
+
+
+Spoil = Callable[[torch.nn.Module, dict[str, Any], torch.Tensor], object]
+
+CAUSES: dict[str, tuple[Spoil, str]] = {
+    "image": (lambda model, outputs, image: image.fill_(torch.nan), "training image"),
+    "origin": (lambda model, outputs, image: outputs["rays"].origins.fill_(torch.inf), "poses"),
+    "direction": (
+        lambda model, outputs, image: outputs["rays"].directions.fill_(torch.nan),
+        "poses",
+    ),
+    "parameter": (
+        lambda model, outputs, image: model.get_parameter("0.bias").data.fill_(torch.nan),
+        "parameter 0.bias is not finite: the learning rate",
+    ),
+    "logits": (lambda model, outputs, image: outputs["shaded"].logits.fill_(torch.inf), "logits"),
+    "density": (lambda model, outputs, image: outputs["shaded"].sigmas.fill_(torch.inf), "density"),
+    "colour": (lambda model, outputs, image: outputs["shaded"].rgb.fill_(torch.nan), "colour"),
+    "nothing": (lambda model, outputs, image: None, "the loss itself overflowed"),
+}
+
+
+@pytest.mark.parametrize("name", CAUSES)
+def test_the_cause_is_named_in_one_line(name: str) -> None:
+    spoil, cause = CAUSES[name]
+    model, outputs, image = sound()
+    spoil(model, outputs, image)
+    message = explain_non_finite("rgb_loss", model, outputs, image)  # type: ignore[arg-type]
+    assert message.startswith("rgb_loss is not finite: ") and cause in message
+    assert "\n" not in message
+
+
+def test_the_first_cause_on_the_way_is_named() -> None:
+    model, outputs, image = sound()
+    image.fill_(torch.nan)
+    outputs["shaded"].rgb.fill_(torch.nan)
+    assert "training image" in explain_non_finite("rgb_loss", model, outputs, image)  # type: ignore[arg-type]

@@ -1,0 +1,134 @@
+"""Volume rendering through gate and field: skipping nothing changes nothing."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from torch import Tensor
+
+from leco_plugin.models.encodings import EncodingConfig
+from leco_plugin.models.field import FieldConfig, HMoEField
+from leco_plugin.models.gate import Gate, GateConfig
+from leco_plugin.models.hmoe import HMoEConfig
+from leco_plugin.models.rendering import (
+    Intervals,
+    Rays,
+    Routing,
+    Shaded,
+    gate_values_and_routes,
+    per_ray_pictures,
+    shade,
+)
+from leco_plugin.samplers.marching import march
+from leco_plugin.space import Space
+
+ROUTINGS = {
+    "threshold": Routing(0.2, False),
+    "paper": Routing(None, False),
+    "homogeneous": Routing(None, True),
+}
+
+
+class Scene:
+    """A small gate and field, as they are when training begins."""
+
+    def __init__(self) -> None:
+        torch.manual_seed(0)
+        encoding = EncodingConfig("hash", levels=2, log2_table=6, coarsest=4, finest=16)
+        experts = HMoEConfig(scene_experts=3, width=16)
+        self.field = HMoEField(FieldConfig(encoding, experts, appearance_dim=4), num_images=3)
+        self.gate = Gate(GateConfig(EncodingConfig(octaves=2), width=8, scene_experts=3))
+        self.space = Space("contraction", half_extent=0.5)
+
+    def shade(self, rays: Rays, intervals: Intervals, routing: Routing, freeze=False) -> Shaded:
+        return shade(self.field, self.gate, self.space, rays, intervals, routing, freeze)
+
+    def parameters(self) -> list[Tensor]:
+        return [*self.field.parameters(), *self.gate.parameters()]
+
+
+def some_rays(count: int) -> Rays:
+    directions = torch.nn.functional.normalize(torch.randn(count, 3), dim=-1)
+    return Rays(
+        torch.rand(count, 3) - 0.5,
+        directions,
+        torch.full((count,), 0.1),
+        torch.full((count,), 3.0),
+        torch.arange(count) % 3,
+    )
+
+
+def intervals_of(rays: Rays, occupied=None) -> Intervals:
+    return Intervals(*march(*rays[:4], step_size=0.05, occupied=occupied))
+
+
+@pytest.mark.parametrize("routing", ROUTINGS.values(), ids=ROUTINGS)
+def test_a_gate_that_keeps_everything_renders_what_no_gate_renders(routing: Routing) -> None:
+    scene, rays = Scene(), some_rays(9)
+    everything = intervals_of(rays, lambda x: torch.ones(len(x), dtype=torch.bool))
+    dense = scene.shade(rays, intervals_of(rays), routing)
+    for ours, expected in zip(scene.shade(rays, everything, routing), dense):
+        assert torch.equal(ours, expected)
+
+
+@pytest.mark.parametrize("routing", ROUTINGS.values(), ids=ROUTINGS)
+def test_weights_of_a_ray_are_opacities_that_sum_to_one_at_most(routing: Routing) -> None:
+    shaded = Scene().shade(some_rays(9), intervals_of(some_rays(9)), routing)
+    assert float(shaded.weights.min()) >= 0.0
+    assert float(shaded.accumulation.max()) <= 1.0 + 1e-5
+    torch.testing.assert_close(shaded.weights.sum(), shaded.accumulation.sum())
+    assert float(shaded.rgb.min()) >= 0.0 and float(shaded.rgb.max()) <= 1.0 + 1e-5
+
+
+@pytest.mark.parametrize("routing", ROUTINGS.values(), ids=ROUTINGS)
+@pytest.mark.parametrize(("rays", "kept"), [(0, False), (5, False), (5, True)])
+def test_there_may_be_no_rays_and_no_samples(routing: Routing, rays: int, kept: bool) -> None:
+    scene, batch = Scene(), some_rays(rays)
+    intervals = intervals_of(batch, lambda x: torch.full((len(x),), kept))
+    shaded = scene.shade(batch, intervals, routing)
+    assert shaded.rgb.shape == (rays, 3)
+    assert shaded.accumulation.shape == shaded.depth.shape == (rays,)
+    assert shaded.packed_info.shape == (rays, 2)
+    assert len(shaded.weights) == len(intervals.ray_indices)
+    if not kept:
+        assert not bool(shaded.rgb.any()) and torch.equal(shaded.depth, batch.t_maxs)
+    for picture in per_ray_pictures(shaded, intervals.ray_indices, rays).values():
+        assert picture.shape == (rays, 1) and picture.dtype == torch.float32
+        assert bool(picture.isfinite().all())
+    (shaded.rgb.sum() + shaded.depth.sum() + shaded.accumulation.sum()).backward()
+    for parameter in scene.parameters():
+        assert parameter.grad is None or bool(parameter.grad.isfinite().all())
+
+
+def test_a_sample_behind_an_opaque_one_has_no_weight() -> None:
+    scene, rays = Scene(), some_rays(4)
+    torch.nn.init.constant_(scene.field.density_head.bias, 12.0)
+    shaded = scene.shade(rays, intervals_of(rays), ROUTINGS["threshold"])
+    first = shaded.packed_info[:, 0]
+    torch.testing.assert_close(shaded.weights[first], torch.ones(4), rtol=0, atol=1e-3)
+    torch.testing.assert_close(shaded.depth, torch.full((4,), 0.125), rtol=0, atol=1e-3)
+
+
+def test_no_gradient_reaches_a_frozen_gate() -> None:
+    scene, rays = Scene(), some_rays(4)
+    scene.shade(rays, intervals_of(rays), ROUTINGS["paper"], freeze=True).rgb.sum().backward()
+    assert all(parameter.grad is None for parameter in scene.gate.parameters())
+    assert scene.field.density_head.weight.grad is not None
+
+
+@pytest.mark.parametrize("routing", ROUTINGS.values(), ids=ROUTINGS)
+def test_routes_are_experts_and_factors_teach_the_gate(routing: Routing) -> None:
+    torch.manual_seed(0)
+    logits = torch.randn(200, 4, requires_grad=True)
+    values, routes = gate_values_and_routes(logits, routing)
+    assert set(routes.tolist()) == ({1, 2, 3} if routing.homogeneous else {0, 1, 2, 3})
+    assert bool(((values > 0) & (values <= 1)).all())
+    values.square().sum().backward()
+    assert logits.grad is not None and bool(logits.grad[routes > 0].any(dim=-1).all())
+
+
+def test_the_papers_factor_is_the_probability_of_the_chosen_expert() -> None:
+    logits = torch.randn(200, 4)
+    values, routes = gate_values_and_routes(logits, ROUTINGS["paper"])
+    assert torch.equal(routes, logits.argmax(dim=-1))
+    assert torch.equal(values, logits.softmax(dim=-1).amax(dim=-1))

@@ -1,0 +1,123 @@
+"""Bounds hold what the cameras see, however the scene was photographed."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from tiny_scene import camera_to_world
+from torch import Tensor
+
+from leco_plugin.samplers.rays import intersect_box
+from leco_plugin.scenes.bounds import SceneBounds, find_bounds
+
+
+def image_rays(poses: Tensor) -> Tensor:
+    """[C, 25, 3] unit directions that cover images of 53 degrees."""
+    side = torch.linspace(-0.5, 0.5, 5)
+    local = torch.cartesian_prod(side, side)
+    local = torch.nn.functional.normalize(torch.cat([local, -torch.ones(25, 1)], dim=-1), dim=-1)
+    return local @ poses[:, :, :3].mT
+
+
+def from_above(scale: float = 1.0) -> tuple[Tensor, Tensor, Tensor]:
+    """16 cameras 10 above a ground with hills of 1, looking down: poses, directions, points."""
+    poses = torch.eye(4)[:3].repeat(16, 1, 1)
+    poses[:, :2, 3] = torch.cartesian_prod(*[torch.linspace(-6.0, 6.0, 4)] * 2)
+    poses[:, 2, 3] = 10.0
+    generator = torch.Generator().manual_seed(0)
+    points = torch.rand(2000, 3, generator=generator) * torch.tensor([16.0, 16.0, 1.0])
+    points[:, :2] -= 8.0
+    poses[:, :, 3] *= scale
+    return poses, image_rays(poses), points * scale
+
+
+def around() -> tuple[Tensor, Tensor, Tensor]:
+    """12 cameras in a ring around a ball of points."""
+    poses = torch.stack([torch.tensor(camera_to_world(i)).float()[:3] for i in range(12)])
+    points = torch.randn(2000, 3, generator=torch.Generator().manual_seed(0))
+    ball = torch.nn.functional.normalize(points, dim=-1) * 0.3 + torch.tensor([0.0, 0.0, 0.3])
+    return poses, image_rays(poses), ball
+
+
+def ranges(bounds: SceneBounds, poses: Tensor, directions: Tensor) -> tuple[Tensor, Tensor]:
+    """Where each ray begins and ends."""
+    origins = poses[:, None, :, 3].expand_as(directions).reshape(-1, 3)
+    enters, leaves = intersect_box(origins, directions.reshape(-1, 3), bounds.aabb)
+    return enters.clamp(min=bounds.near), leaves.clamp(max=bounds.far)
+
+
+def test_a_scene_seen_from_above_is_a_box_that_holds_its_points() -> None:
+    poses, directions, points = from_above()
+    bounds = find_bounds(poses, directions, points)
+    assert bounds.kind == "box"
+    assert bool((points >= bounds.aabb[:3]).all()) and bool((points <= bounds.aabb[3:]).all())
+    begins, ends = ranges(bounds, poses, directions)
+    assert bool((ends > begins).all())
+
+
+def test_marched_samples_of_a_box_lie_in_its_space() -> None:
+    poses, directions, points = from_above()
+    bounds = find_bounds(poses, directions, points)
+    begins, ends = ranges(bounds, poses, directions)
+    origins = poses[:, None, :, 3].expand_as(directions).reshape(-1, 3)
+    for t in (begins, ends):
+        mapped = (origins + directions.reshape(-1, 3) * t[:, None] - bounds.center).abs()
+        assert float(mapped.max()) <= bounds.half_extent * 1.0001
+
+
+def test_a_scene_seen_from_around_is_contracted_with_its_points_in_the_inner_cube() -> None:
+    poses, directions, points = around()
+    bounds = find_bounds(poses, directions, points)
+    assert bounds.kind == "contraction"
+    inside = ((points - bounds.center).abs() <= bounds.half_extent * 1.05).all(dim=-1)
+    assert float(inside.float().mean()) > 0.99
+
+
+@pytest.mark.parametrize("scene", [from_above, around])
+def test_points_lie_between_near_and_far_of_the_cameras(scene) -> None:
+    poses, directions, points = scene()
+    bounds = find_bounds(poses, directions, points)
+    ahead = (points[None] - poses[:, None, :, 3]).norm(dim=-1)
+    visible = ((points[None] - poses[:, None, :, 3]) @ -poses[:, :, 2, None])[..., 0] > 0.9 * ahead
+    within = (ahead >= bounds.near) & (ahead <= bounds.far)
+    assert float(within[visible].float().mean()) > 0.98
+
+
+def test_bounds_grow_with_the_scene() -> None:
+    one, ten = find_bounds(*from_above()), find_bounds(*from_above(10.0))
+    assert ten.half_extent == pytest.approx(10.0 * one.half_extent, rel=1e-3)
+    assert ten.near == pytest.approx(10.0 * one.near, rel=1e-3)
+    assert ten.far == pytest.approx(10.0 * one.far, rel=1e-3)
+
+
+@pytest.mark.parametrize("points", [None, torch.zeros(3, 3), torch.full((99, 3), float("nan"))])
+def test_without_points_the_cameras_bound_the_scene(points) -> None:
+    poses, directions, _ = around()
+    bounds = find_bounds(poses, directions, points)
+    assert 0.0 < bounds.near < bounds.far < float("inf")
+    assert bool(((poses[:, :, 3] - bounds.center).abs() <= bounds.half_extent * 1.001).all())
+
+
+def test_one_camera_without_points_still_has_bounds() -> None:
+    poses, directions, _ = around()
+    bounds = find_bounds(poses[:1], directions[:1], None)
+    assert bounds.half_extent > 0.0 and 0.0 < bounds.near < bounds.far
+
+
+def test_no_cameras_and_broken_poses_are_refused() -> None:
+    poses, directions, points = around()
+    with pytest.raises(ValueError, match="no cameras"):
+        find_bounds(poses[:0], directions[:0], points)
+    with pytest.raises(ValueError, match="not finite"):
+        find_bounds(poses * float("nan"), directions, points)
+
+
+def test_points_that_no_camera_sees_are_refused() -> None:
+    poses, directions, points = around()
+    with pytest.raises(ValueError, match="no camera sees"):
+        find_bounds(poses, directions, points + torch.tensor([0.0, 0.0, 500.0]))
+
+
+def test_the_reason_is_one_line() -> None:
+    for scene in (from_above, around):
+        assert "\n" not in find_bounds(*scene()).reason

@@ -1,0 +1,87 @@
+"""Training and calibration never see the same pixel."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+
+from leco_plugin.scenes.held_out_pixels import (
+    PERIOD,
+    HeldOutPixelSampler,
+    HeldOutPixelSamplerConfig,
+    is_held_out,
+)
+
+
+def images(masked: bool = False) -> dict[str, torch.Tensor]:
+    """Three images whose colours are their pixels' places; their own numbers are 7, 8, 9."""
+    places = torch.meshgrid(torch.arange(3), torch.arange(40), torch.arange(39), indexing="ij")
+    batch = {"image": torch.stack(places, dim=-1).float(), "image_idx": torch.tensor([7, 8, 9])}
+    if masked:  # neighbours of some held-out pixels, and some held-out pixels, are masked
+        batch["mask"] = torch.rand(3, 40, 39, 1, generator=torch.Generator().manual_seed(0)) > 0.5
+    return batch
+
+
+def sampler(**options) -> HeldOutPixelSampler:
+    config = HeldOutPixelSamplerConfig(num_rays_per_batch=5000, **options)
+    made = config.setup()
+    assert isinstance(made, HeldOutPixelSampler)
+    return made
+
+
+@pytest.mark.parametrize("masked", [False, True])
+@pytest.mark.parametrize("options", [{}, {"is_equirectangular": True}, {"fisheye_crop_radius": 15}])
+def test_training_never_samples_a_held_out_pixel(masked: bool, options) -> None:
+    made, batch = sampler(**options), images(masked)
+    for seed in range(5):
+        torch.manual_seed(seed)
+        samples = made.sample(dict(batch))
+        places = samples["image"].long()
+        assert len(places) == 5000
+        assert not bool(is_held_out(places).any())
+        assert torch.equal(samples["indices"][:, 0], batch["image_idx"][places[:, 0]])
+        if masked:
+            assert bool(batch["mask"][tuple(places.unbind(dim=-1))].all())
+
+
+def test_training_reaches_every_other_pixel() -> None:
+    torch.manual_seed(0)
+    places = torch.cat([sampler().sample(images())["image"].long() for _ in range(20)]).unique(
+        dim=0
+    )
+    assert len(places) == 3 * 40 * 39 - int(is_held_out(images()["image"].view(-1, 3)).sum())
+
+
+@pytest.mark.parametrize("masked", [False, True])
+def test_held_out_sampling_only_gives_held_out_pixels(masked: bool) -> None:
+    batch = images(masked)
+    samples = sampler().sample_held_out(batch, 1000, seed=0)
+    places, indices = samples["image"].long(), samples["indices"]
+    assert bool(is_held_out(places).all()) and bool(is_held_out(indices).all())
+    assert torch.equal(indices[:, 1:], places[:, 1:])
+    assert torch.equal(indices[:, 0], batch["image_idx"][places[:, 0]])
+    if masked:
+        assert 0 < len(places) < 1000
+        assert bool(batch["mask"][tuple(places.unbind(dim=-1))].all())
+    else:
+        all_held_out = batch["image"].view(-1, 3)[is_held_out(batch["image"].view(-1, 3))]
+        assert torch.equal(places.unique(dim=0), all_held_out.long().unique(dim=0))
+
+
+def test_held_out_samples_are_the_same_for_a_seed() -> None:
+    first, again = (sampler().sample_held_out(images(), 100, seed=3)["indices"] for _ in range(2))
+    assert torch.equal(first, again)
+
+
+def test_images_of_many_sizes_are_sampled_as_a_list() -> None:
+    pictures = [torch.rand(20, 30, 3), torch.rand(50, 12, 3)]
+    batch = {"image": pictures, "image_idx": torch.tensor([0, 1])}
+    samples = sampler().sample_held_out(batch, 50, seed=0)
+    assert bool(is_held_out(samples["indices"]).all())
+    for color, (image, row, column) in zip(samples["image"], samples["indices"].tolist()):
+        assert torch.equal(color, pictures[image][row, column])
+
+
+def test_one_pixel_in_a_period_squared_is_held_out() -> None:
+    places = torch.cartesian_prod(torch.zeros(1).long(), *[torch.arange(5 * PERIOD)] * 2)
+    assert int(is_held_out(places).sum()) == 25

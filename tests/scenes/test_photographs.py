@@ -1,0 +1,157 @@
+"""What is wrong with a folder of photographs is said in one line, before anything is loaded."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+import trimesh
+from PIL import Image
+
+from leco_plugin.scenes.input_error import InputError
+from leco_plugin.scenes.photographs import (
+    POINTS,
+    LecoPhotographsDataParserConfig,
+    check_scene,
+    read_points,
+    taken_from_above,
+)
+
+
+@pytest.fixture
+def scene(tiny_scene: Path, tmp_path: Path) -> Path:
+    """A scene of its own for each test."""
+    return shutil.copytree(tiny_scene, tmp_path / "scene")
+
+
+def change(scene: Path, edit: Callable[[dict[str, Any]], None]) -> None:
+    path = scene / "transforms.json"
+    meta = json.loads(path.read_text())
+    edit(meta)
+    path.write_text(json.dumps(meta))
+
+
+def scale_pose(meta: dict[str, Any]) -> None:
+    pose = np.array(meta["frames"][1]["transform_matrix"])
+    pose[:3, :3] *= 2.0
+    meta["frames"][1]["transform_matrix"] = pose.tolist()
+
+
+def shear_pose(meta: dict[str, Any]) -> None:
+    """Keeps the determinant at one."""
+    pose = np.array(meta["frames"][1]["transform_matrix"])
+    pose[:3, :3] @= np.diag([2.0, 0.5, 1.0])
+    meta["frames"][1]["transform_matrix"] = pose.tolist()
+
+
+def set_pose(value: Any) -> Callable[[dict[str, Any]], None]:
+    return lambda meta: meta["frames"][1].update(transform_matrix=value)
+
+
+BAD_MEASURES: dict[str, tuple[Callable[[Path], object], str]] = {
+    "no such folder": (shutil.rmtree, "there is no folder"),
+    "no transforms.json": (lambda s: (s / "transforms.json").unlink(), "holds no transforms.json"),
+    "transforms.json is no json": (
+        lambda s: (s / "transforms.json").write_text("{\n\n"),
+        "not a scene in nerfstudio's format",
+    ),
+    "transforms.json is no mapping": (
+        lambda s: (s / "transforms.json").write_text("[]"),
+        "not a scene in nerfstudio's format",
+    ),
+    "transforms.json is no text": (
+        lambda s: (s / "transforms.json").write_bytes(b"\xff\xfe\x00"),
+        "not a scene in nerfstudio's format",
+    ),
+    "zero frames": (lambda s: change(s, lambda m: m.update(frames=[])), "has no cameras"),
+    "no frames": (lambda s: change(s, lambda m: m.pop("frames")), "not a scene in nerf"),
+    "a frame without a pose": (
+        lambda s: change(s, lambda m: m["frames"][0].pop("transform_matrix")),
+        "not a scene in nerfstudio's format",
+    ),
+    "a missing image": (
+        lambda s: (s / "images" / "003.png").unlink(),
+        "1 of 9 images are not there, the first is .*003.png",
+    ),
+    "an image that is none": (
+        lambda s: (s / "images" / "003.png").write_bytes(b"nothing"),
+        "003.png cannot be read as an image",
+    ),
+    "an image of another size": (
+        lambda s: Image.new("RGB", (16, 31)).save(s / "images" / "003.png"),
+        "003.png has 16 x 31 pixels, its intrinsics are for 32 x 32",
+    ),
+    "no image size": (lambda s: change(s, lambda m: m.pop("w")), r"size \(w, h\)"),
+    "a scaled pose": (lambda s: change(s, scale_pose), "001.png is no rotation"),
+    "a sheared pose": (lambda s: change(s, shear_pose), "001.png is no rotation"),
+    "a mirrored pose": (
+        lambda s: change(s, set_pose(np.diag([1.0, 1.0, -1.0, 1.0]).tolist())),
+        "001.png is no rotation",
+    ),
+    "a pose of NaN": (
+        lambda s: change(s, set_pose([[float("nan")] * 4] * 4)),
+        "no finite 4 x 4 matrix",
+    ),
+    "a pose of another shape": (lambda s: change(s, set_pose([[1.0]])), "transforms.json"),
+    "poses of words": (lambda s: change(s, set_pose("north")), "not a scene in nerfstudio"),
+}
+
+
+@pytest.mark.parametrize("name", BAD_MEASURES)
+def test_bad_input_gets_one_line(name: str, scene: Path) -> None:
+    spoil, message = BAD_MEASURES[name]
+    spoil(scene)
+    with pytest.raises(InputError, match=message) as caught:
+        check_scene(scene)
+    assert "\n" not in str(caught.value)
+
+
+def test_an_input_error_ends_a_command_and_is_a_value_error() -> None:
+    error = InputError("a line")
+    assert isinstance(error, SystemExit) and isinstance(error, ValueError)
+    assert str(error) == error.code == "a line"
+
+
+def test_a_sound_scene_passes_as_a_folder_and_as_a_file(scene: Path) -> None:
+    assert len(check_scene(scene)["frames"]) == 9
+    assert check_scene(scene / "transforms.json") == check_scene(scene)
+
+
+@pytest.mark.filterwarnings("ignore::ResourceWarning")  # nerfstudio leaves an image open
+@pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
+def test_sparse_points_follow_the_cameras_into_model_coordinates(scene: Path) -> None:
+    """A point at each camera's position lies at that camera's position after parsing."""
+    meta = check_scene(scene)
+    places = np.array([frame["transform_matrix"] for frame in meta["frames"]])[:, :3, 3]
+    trimesh.PointCloud(places).export(scene / "points.ply")
+    change(scene, lambda m: m.update(ply_file_path="points.ply"))
+    outputs = LecoPhotographsDataParserConfig(data=scene).setup().get_dataparser_outputs("train")
+    distances = torch.cdist(outputs.cameras.camera_to_worlds[:, :, 3], outputs.metadata[POINTS])
+    assert len(outputs.metadata[POINTS]) == 9
+    assert float(distances.amin(dim=1).max()) < 1e-5
+
+
+def test_a_file_that_holds_no_points_is_named(scene: Path) -> None:
+    (scene / "points.ply").write_bytes(b"ply\nnothing of use\n")
+    with pytest.raises(InputError, match=r"points\.ply cannot be read as sparse points") as caught:
+        read_points({"ply_file_path": "points.ply"}, scene)
+    assert "\n" not in str(caught.value)
+
+
+def test_a_scene_without_points_has_none(scene: Path) -> None:
+    assert read_points({}, scene) is None
+    assert read_points({"ply_file_path": "nowhere.ply"}, scene) is None
+
+
+def test_only_cameras_that_look_down_are_above() -> None:
+    down = np.tile(np.eye(4), (8, 1, 1))  # a camera looks along its -z
+    across = down.copy()
+    across[:, :3, :3] = [[1, 0, 0], [0, 0, -1], [0, 1, 0]]
+    assert taken_from_above(down)
+    assert not taken_from_above(across)

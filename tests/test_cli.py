@@ -1,0 +1,104 @@
+"""Claims about the command `leco`: what it writes, and how it ends."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from ball_occupancy import ball
+
+from leco_plugin import cli
+
+
+@pytest.fixture(scope="module")
+def file(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("occupancy") / "occupancy.safetensors"
+    ball().save(path)
+    return path
+
+
+def run(*arguments: object) -> int:
+    return cli.main([str(argument) for argument in arguments])
+
+
+def test_help_loads_neither_torch_nor_nerfstudio() -> None:
+    code = (
+        "import sys\nfrom leco_plugin import cli\n"
+        "try: cli.main(['--help'])\nexcept SystemExit as end: assert not end.code\n"
+        "assert not {'torch', 'nerfstudio', 'matplotlib', 'numpy'} & set(sys.modules)"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    assert all(name in done.stdout for name in cli.COMMANDS)
+
+
+def test_inspect_says_draws_and_writes(
+    file: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    picture, report = tmp_path / "new" / "picture.png", tmp_path / "other" / "report.json"
+    assert run("inspect", file, "--picture", picture, "--json", report) == 0
+    assert "o(x) >= 0.5" in capsys.readouterr().out
+    assert picture.stat().st_size > 20_000
+    facts = json.loads(report.read_text())
+    assert facts["format"] == 1 and facts["bytes"] == file.stat().st_size
+    assert facts["params"] == ball().num_params
+    assert facts["report"]["empty_fraction"] == 0.9
+
+
+def test_city_writes_a_scene_and_says_so(tmp_path: Path) -> None:
+    out, report = tmp_path / "city", tmp_path / "city.json"
+    assert run("city", "--blocks", 1, "--out", out, "--json", report) == 0
+    facts = json.loads(report.read_text())
+    assert facts["images"] == len(list((out / "images").iterdir()))
+    assert 0 < facts["test_images"] < facts["images"]
+
+
+def bad_inputs(folder: Path, file: Path) -> dict[str, list[object]]:
+    """Arguments that a user may well give, by what is wrong with them."""
+    (folder / "text.safetensors").write_text("not an occupancy")
+    (folder / "cut.safetensors").write_bytes(file.read_bytes()[:1000])
+    (folder / "taken").mkdir()
+    (folder / "taken" / "thesis.txt").write_text("")
+    return {
+        "no such file": ["inspect", folder / "none.safetensors"],
+        "a folder": ["inspect", folder],
+        "a foreign file": ["inspect", folder / "text.safetensors"],
+        "a truncated file": ["inspect", folder / "cut.safetensors"],
+        "an unknown kind of picture": ["inspect", file, "--picture", folder / "picture.xyz"],
+        "json where a folder is": ["inspect", file, "--json", folder / "taken"],
+        "no blocks": ["city", "--blocks", 0, "--out", folder / "city"],
+        "a folder of other things": ["city", "--out", folder / "taken"],
+        "no time": ["demo", "--seconds", 0, "--out", folder / "demo"],
+        "no number of seconds": ["demo", "--seconds", "nan", "--out", folder / "demo"],
+    }
+
+
+def test_bad_input_ends_with_one_line_and_status_2(
+    file: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for what, arguments in bad_inputs(tmp_path, file).items():
+        assert run(*arguments) == 2, what
+        said = capsys.readouterr().err
+        assert said.startswith("leco: ") and said.count("\n") == 1, (what, said)
+
+
+@pytest.mark.parametrize("arguments", [[], ["fly"], ["inspect"], ["city", "--blocks", "many"]])
+def test_a_wrong_command_line_is_bad_input_too(arguments: list[str]) -> None:
+    with pytest.raises(SystemExit) as end:
+        cli.main(arguments)
+    assert end.value.code == 2
+
+
+def test_a_failure_ends_with_one_line_and_status_1(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def fail() -> None:
+        """Fails."""
+        raise RuntimeError("the gate calls\nall space empty")
+
+    monkeypatch.setitem(cli.COMMANDS, "fail", fail)
+    assert run("fail") == 1
+    assert capsys.readouterr().err == "leco: the gate calls all space empty\n"

@@ -1,0 +1,55 @@
+"""Claims about `leco demo`, on a city of one block and a few seconds."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from leco_plugin.occupancy import Occupancy
+
+SECONDS = 4.0
+OCCUPANCY = {
+    *("params", "bytes", "train_seconds", "empty_fraction", "lost_mass", "threshold"),
+    *("lost_surface_mass", "image_price_db", "kept_surface_recall"),
+}
+RUN = {
+    *("method", "sampler", "seed", "steps", "train_seconds", "psnr", "ssim", "lpips"),
+    *("samples_per_ray", "field_queries_per_ray", "render_seconds_per_image"),
+    *("peak_memory_bytes", "curve"),
+}
+
+
+@pytest.mark.slow
+def test_the_demo_reports_both_runs_in_the_agreed_form(tmp_path: Path) -> None:
+    from leco_plugin.demo import run_demo, summary
+    from leco_plugin.scenes.city import CityConfig
+    from leco_plugin.scenes.city_folder import CaptureConfig
+
+    capture = CaptureConfig(48, 36)
+    report = run_demo(tmp_path, SECONDS, CityConfig(blocks=1), capture)
+    assert json.loads((tmp_path / "report.json").read_text()) == report
+    assert report["format"] == 1 and report["scene"]["blocks"] == 1
+    assert {"machine", "scene", "occupancy", "runs"} <= report.keys()
+    assert report["occupancy"].keys() >= OCCUPANCY
+    methods = [(run["method"], run["sampler"]) for run in report["runs"]]
+    assert methods == [
+        ("leco-occupancy", "learned-occupancy"),
+        ("leco-occupancy-never-frozen", "dense"),
+    ]
+    guided, other = report["runs"]
+    for run in (guided, other):
+        assert run.keys() >= RUN
+        assert run["train_seconds"] >= SECONDS
+        assert run["curve"][-1][0] == pytest.approx(run["train_seconds"], abs=0.01)
+    assert guided["freeze_seconds"] is not None and other["freeze_seconds"] is None
+
+    file = tmp_path / "occupancy.safetensors"
+    assert report["occupancy"]["bytes"] == file.stat().st_size
+    assert report["occupancy"]["params"] == Occupancy.load(file).num_params
+    for name in ("chart.png", "picture.png"):
+        assert np.asarray(Image.open(tmp_path / name)).std() > 10
+    assert any("leco-occupancy-never-frozen" in line for line in summary(report))
