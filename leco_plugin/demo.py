@@ -1,4 +1,4 @@
-"""`leco demo`: a city, its occupancy learned and frozen, and the same model never frozen, on equal time."""
+"""`leco demo`: a city learned, frozen and gone on with, and the same never frozen; equal time."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ from leco_plugin.scenes.city_folder import CaptureConfig, write_city
 from leco_plugin.scenes.city_truth import CityTruth
 
 SECONDS = 110.0
-"""Training time of each of the two runs; the whole demo then takes under six minutes on two cores."""
+"""Training time of each of the two runs; all of it then takes under six minutes on two cores."""
 FEWEST_LEARN_STEPS = 10
 SLICE_HEIGHT = 4.0
 """Metres over the ground at which the occupancy is shown: through walls, poles and crowns."""
@@ -76,6 +76,7 @@ def run_demo(
         other_run, trainer = timed_run(
             never_frozen(guided), seconds, sampler="dense", on_progress=show
         )
+    manager: Any = trainer.pipeline.datamanager
     report = {
         "format": 1,
         "machine": describe_machine(),
@@ -85,8 +86,8 @@ def run_demo(
             "seed": city.seed,
             "width": capture.width,
             "height": capture.height,
-            "train_images": len(trainer.pipeline.datamanager.train_dataset),
-            "test_images": len(trainer.pipeline.datamanager.eval_dataset),
+            "train_images": len(manager.train_dataset),
+            "test_images": len(manager.eval_dataset),
         },
         "occupancy": facts,
         "runs": [_strict(run.to_dict()) for run in (guided_run, other_run)],
@@ -100,7 +101,7 @@ def draw_chart(report: dict[str, Any], path: Path) -> Path:
     """The demo's chart from its stored report."""
     blocks, cores = report["scene"]["blocks"], report["machine"]["cores"]
     where = f"{cores} CPU cores" if report["machine"]["device"] == "cpu" else "one GPU"
-    title = f"Procedural city of {blocks} × {blocks} blocks, {where}"
+    title = f"Procedural city of {blocks} x {blocks} blocks, {where}"
     labels = ["learn, freeze, go on guided", "never frozen"]
     return psnr_against_seconds(report["runs"], path, title, labels)
 
@@ -115,7 +116,7 @@ def never_frozen(config: TrainerConfig) -> TrainerConfig:
 
 
 def _config(folder: Path, out: Path, seconds: float) -> TrainerConfig:
-    """`leco-occupancy` on this city; in less time it learns for fewer steps, of which all decays."""
+    """`leco-occupancy` on this city; in less time than usual it learns for fewer steps."""
     config = copy.deepcopy(leco_occupancy.config)
     config.output_dir = out / "runs"
     config.experiment_name = "city"
@@ -178,7 +179,7 @@ def _draw_picture(trainer: Trainer, occupancy: Occupancy, truth: CityTruth, path
 
     figure = Figure(figsize=(16, 3.7), layout="constrained", facecolor="white")
     FigureCanvasAgg(figure)
-    axes = figure.subplots(1, 4, gridspec_kw={"width_ratios": [4, 4, 4.6, 3.2]})
+    axes = figure.subplots(1, 4, gridspec_kw={"width_ratios": [4, 4, 4.3, 3.1]})
     axes[0].imshow(photograph.cpu())
     axes[0].set_title("photograph (held out)")
     axes[1].imshow(rgb.cpu())

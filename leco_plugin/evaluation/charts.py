@@ -71,7 +71,7 @@ def psnr_against_seconds(
     axes.set_title(title, fontsize=13, loc="left")
     axes.grid(color="#dddddd")
     axes.spines[["top", "right"]].set_visible(False)
-    axes.legend(frameon=False, fontsize=12, loc="lower right")
+    axes.legend(frameon=False, fontsize=12, loc="best")
     figure.savefig(path, dpi=120)
     return Path(path)
 

@@ -37,7 +37,7 @@ class ViewBox:
 
 
 def describe(occupancy: Occupancy) -> dict[str, Any]:
-    """Sizes, space, threshold, kept share of its box, and the report of calibration: JSON values."""
+    """Sizes, space, threshold, kept share of its box, report of calibration: JSON values."""
     box = whole_box(occupancy)
     points = torch.rand(1 << 16, 3, generator=torch.Generator().manual_seed(0))
     values = query(occupancy, torch.lerp(box.low, box.high, points))
@@ -62,7 +62,7 @@ def describe(occupancy: Occupancy) -> dict[str, Any]:
 
 
 def whole_box(occupancy: Occupancy) -> ViewBox:
-    """The space's inner cube, cut by the walls between which rays were marched, if there are any."""
+    """The space's inner cube, cut by the walls between which rays were marched, if any."""
     center = occupancy.space.center.cpu()
     half = float(occupancy.space.half_extent)
     low, high = center - half, center + half

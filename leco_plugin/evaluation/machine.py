@@ -1,4 +1,4 @@
-"""What a measurement was made on: the parts of a machine that its figures depend on, and no more."""
+"""What a measurement was made on: the parts of a machine that figures depend on, and no more."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""An occupancy against the exact city: what it keeps of the surfaces, and what it skips of the air."""
+"""An occupancy against the exact city: what it keeps of surfaces, and what it skips of air."""
 
 from __future__ import annotations
 

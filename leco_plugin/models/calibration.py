@@ -67,6 +67,8 @@ class Reference(NamedTuple):
     """[M] bool: within `SURFACE_STEPS` steps of the ray's median depth."""
     rgb: Tensor
     """[R, 3] rendered."""
+    always_kept: Tensor
+    """[M] bool: the backdrop, which no threshold skips."""
 
 
 def near_median_depth(shaded: Shaded, intervals: Intervals) -> Tensor:
@@ -109,7 +111,7 @@ def measure(
     surface = lost_surface = total = lost = dense_error = gated_error = 0.0
     skipped = candidates = pixels = 0
     for i, (reference, truth) in enumerate(zip(references, truths)):
-        gone = reference.occupancies < threshold
+        gone = (reference.occupancies < threshold) & ~reference.always_kept
         on_surface = reference.weights * reference.near_surface
         surface += float(on_surface.sum(dtype=torch.float64))
         lost_surface += float(on_surface[gone].sum(dtype=torch.float64))

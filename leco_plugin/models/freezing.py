@@ -16,7 +16,7 @@ from leco_plugin.models.calibration import (
     near_median_depth,
 )
 from leco_plugin.models.gate import occupancy_from_logits
-from leco_plugin.models.rendering import Intervals, Rays
+from leco_plugin.models.rendering import Intervals, Rays, backdrop_of
 from leco_plugin.scenes.held_out_pixels import HeldOutPixelSampler
 from leco_plugin.scenes.survey import Survey
 
@@ -58,6 +58,7 @@ def freeze(
         "step_size": float(model.march_range[2]),
         "cone_angle": float(model.march_range[4]),
         "aabb": model.aabb.tolist(),
+        "cameras": survey.positions.tolist(),
     }
     CONSOLE.log(
         f"\\[leco] occupancy learned in {learn_seconds:.0f} s: threshold {measured.threshold:.4f} "
@@ -132,4 +133,5 @@ def dense_reference(model: LecoModel, rays: Rays) -> Reference:
         occupancy_from_logits(shaded.logits),
         near_median_depth(shaded, intervals),
         shaded.rgb,
+        backdrop_of(intervals, rays),
     )

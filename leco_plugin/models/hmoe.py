@@ -65,7 +65,7 @@ class Expert(nn.Module):
 
 
 class _Permute(torch.autograd.Function):
-    """Rows in another order; the backward is the inverse order, where autograd would add up rows."""
+    """Rows in another order; backward is the inverse order, where autograd would add up rows."""
 
     @staticmethod
     def forward(ctx: Any, rows: Tensor, order: Tensor, inverse: Tensor) -> Tensor:

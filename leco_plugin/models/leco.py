@@ -26,15 +26,17 @@ from leco_plugin.models.losses import (
     imbalanced_gate_loss,
     widen,
 )
-from leco_plugin.models.phases import ScheduleConfig, ramp
+from leco_plugin.models.phases import ScheduleConfig
 from leco_plugin.models.precision import fast_precision, keep_freed_memory
 from leco_plugin.models.rendering import (
     Intervals,
     Rays,
     Routing,
     Shaded,
+    backdrop_of,
     per_ray_pictures,
     shade,
+    with_backdrop,
 )
 from leco_plugin.models.sizes import SMALL, Sizes
 from leco_plugin.occupancy import Occupancy, gate_precision
@@ -135,7 +137,9 @@ class LecoModel(Model):
 
     def _routing(self) -> Routing:
         losses = self.config.gate_loss
-        return Routing(losses.empty_below if losses.form == "logit" else None, self.config.homogeneous)
+        return Routing(
+            losses.empty_below if losses.form == "logit" else None, self.config.homogeneous
+        )
 
     def get_param_groups(self) -> dict[str, list[nn.Parameter]]:
         """`encoding` (tables, if any), `field` (everything else that shades) and `gate`."""
@@ -197,6 +201,15 @@ class LecoModel(Model):
             self._estimator[0].requires_grad_(False)
         return self._estimator[0]
 
+    def get_extra_state(self) -> dict[str, Any]:
+        """The calibration report travels with a checkpoint, as plain values."""
+        return {"report": self.report}
+
+    def set_extra_state(self, state: dict[str, Any]) -> None:
+        """Restores what `get_extra_state` gave."""
+        self.report = dict(state.get("report", {}))
+        self._estimator = ()
+
     def occupancy(self) -> Occupancy:
         """The gate as an `Occupancy`; it shares this model's parameters."""
         return Occupancy(
@@ -206,18 +219,19 @@ class LecoModel(Model):
     def intervals_of(self, rays: Rays, guided: bool, learning: bool) -> Intervals:
         """Candidates along the rays; guided, only those that the occupancy keeps."""
         _, _, step, learn_step, cone, learn_cone = self.march_range.tolist()
+        size, angle = (learn_step, learn_cone) if learning else (step, cone)
         samples = march(
             rays.origins,
             rays.directions,
             rays.t_mins,
             rays.t_maxs,
-            step_size=learn_step if learning else step,
-            cone_angle=learn_cone if learning else cone,
+            step_size=size,
+            cone_angle=angle,
             jitter=torch.rand_like(rays.t_mins) if self.training else None,
             occupied=self.estimator.occupied if guided else None,
             near_occupied=self.estimator.questions()[1] if guided else None,
         )
-        return Intervals(*samples)
+        return with_backdrop(Intervals(*samples), rays, size, angle)
 
     def shade(self, rays: Rays, intervals: Intervals) -> Shaded:
         """Renders intervals in this device's fastest precision."""
@@ -274,15 +288,15 @@ class LecoModel(Model):
                 shaded.weights, starts, ends, shaded.packed_info
             )
         if not bool(self.frozen):
-            losses |= self._gate_losses(shaded, outputs["intervals"])
+            losses |= self._gate_losses(shaded, outputs["intervals"], outputs["rays"])
         for name, value in losses.items():
-            if not math.isfinite(float(value)):
+            if not math.isfinite(float(value.detach())):
                 from leco_plugin.models.failures import explain_non_finite
 
                 raise FloatingPointError(explain_non_finite(name, self, outputs, image))
         return losses
 
-    def _gate_losses(self, shaded: Shaded, intervals: Intervals) -> dict[str, Tensor]:
+    def _gate_losses(self, shaded: Shaded, intervals: Intervals, rays: Rays) -> dict[str, Tensor]:
         config, logits, routes = self.config.gate_loss, shaded.logits, shaded.routes
         on_scene = (routes > 0).nonzero()[:, 0]
         balance = logits.new_zeros(())
@@ -292,10 +306,14 @@ class LecoModel(Model):
         if self.config.homogeneous:
             return {"balance_loss": balance}
         if config.form == "logit":
+            # the backdrop is kept anyway, and says nothing about the place where a ray happens to end
+            before = (~backdrop_of(intervals, rays)).nonzero()[:, 0]
+            weights = widen(
+                shaded.weights.detach().index_select(0, before),
+                intervals.ray_indices.index_select(0, before),
+            )
             contribution = contribution_loss(
-                logits,
-                widen(shaded.weights.detach(), intervals.ray_indices),
-                config.weight_at_full, config.emphasis
+                logits.index_select(0, before), weights, config.weight_at_full, config.emphasis
             )
             return {
                 "contribution_loss": config.contribution * contribution,

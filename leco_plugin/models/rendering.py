@@ -22,7 +22,7 @@ pixel by at most one step of an 8-bit image."""
 
 
 OPAQUE = 1e6
-"""Density, per half extent, that is added to the interval at the end of a ray."""
+"""Density, per half extent, that is added to the backdrop."""
 
 
 class Rays(NamedTuple):
@@ -101,6 +101,49 @@ def gate_values_and_routes(logits: Tensor, routing: Routing) -> tuple[Tensor, Te
     return 1.0 + on_scene * (share / share.detach() - 1.0), routes
 
 
+def with_backdrop(
+    intervals: Intervals, rays: Rays, step_size: float, cone_angle: float
+) -> Intervals:
+    """Ends each ray in an opaque interval, its backdrop, whatever a gate thinks of the place.
+
+    What is not explained on the way is then explained there, behind everything, and surfaces grow
+    in front of it where views disagree about it; rays that could stay transparent would be filled
+    with fog from the front. Sky and whatever lies beyond the bounds is the backdrop's to keep.
+
+    Args:
+        intervals: [M] packed; those whose middle lies in the backdrop give way to it.
+        step_size, cone_angle: of the march, which give the backdrop's length.
+    Returns:
+        [M' + R] packed.
+    """
+    num_rays = len(rays.origins)
+    starts = rays.t_maxs - (rays.t_maxs * cone_angle).clamp(min=step_size)
+    middles = 0.5 * (intervals.t_starts + intervals.t_ends)
+    inside = (middles < starts.index_select(0, intervals.ray_indices)).nonzero()[:, 0]
+    ray_indices, t_starts, t_ends = (part.index_select(0, inside) for part in intervals)
+    # every ray gets one more sample, so a sample moves back by the number of rays before it
+    slots = torch.arange(len(inside), device=inside.device) + ray_indices
+    counts = torch.bincount(ray_indices, minlength=num_rays)
+    numbers = torch.arange(num_rays, device=inside.device)
+    last_slots = counts.cumsum(0) + numbers
+    merged = []
+    for of_samples, of_rays in (
+        (ray_indices, numbers),
+        (t_starts, starts),
+        (t_ends, rays.t_maxs),
+    ):
+        together = of_samples.new_empty(len(inside) + num_rays)
+        together[slots], together[last_slots] = of_samples, of_rays.to(of_samples.dtype)
+        merged.append(together)
+    return Intervals(*merged)
+
+
+def backdrop_of(intervals: Intervals, rays: Rays) -> Tensor:
+    """Which intervals [M] are the backdrop of a ray that meets the scene."""
+    ends = rays.t_maxs.masked_fill(rays.t_maxs <= rays.t_mins, torch.inf)
+    return intervals.t_ends >= ends.index_select(0, intervals.ray_indices)
+
+
 def shade(
     field: HMoEField,
     gate: Gate,
@@ -111,10 +154,6 @@ def shade(
     freeze_gate: bool,
 ) -> Shaded:
     """Renders packed intervals; only visible samples are coloured.
-
-    The interval that holds the end of its ray is opaque. What is not explained on the way is then
-    explained there, behind everything, and surfaces grow in front of it where views disagree about
-    it; rays that could stay transparent would be filled with fog from the front.
 
     Args:
         freeze_gate: no gradient reaches the gate.
@@ -133,8 +172,7 @@ def shade(
         gate_values, routes = gate_values_and_routes(logits, routing)
     sigmas, features = field.density(mapped, routes, gate_values)
     packed_info = pack_info(ray_indices, num_rays)
-    at_the_end = t_ends + 0.501 * (t_ends - t_starts) > rays.t_maxs[ray_indices]
-    sigmas = torch.where(at_the_end, sigmas + OPAQUE, sigmas)
+    sigmas = torch.where(backdrop_of(intervals, rays), sigmas + OPAQUE, sigmas)
     scale = space.half_extent
     weights, _, _ = render_weight_from_density(
         t_starts / scale, t_ends / scale, sigmas, packed_info=packed_info
@@ -148,9 +186,7 @@ def shade(
         weights, torch.stack([torch.ones_like(middles), middles], dim=-1), ray_indices, num_rays
     )
     accumulation = sums[:, 0]
-    depth = torch.where(
-        accumulation > 1e-6, sums[:, 1] / accumulation.clamp(min=1e-6), rays.t_maxs
-    )
+    depth = torch.where(accumulation > 1e-6, sums[:, 1] / accumulation.clamp(min=1e-6), rays.t_maxs)
     return Shaded(rgb, accumulation, depth, weights, sigmas, logits, routes, packed_info)
 
 

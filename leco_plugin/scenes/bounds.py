@@ -37,9 +37,7 @@ class SceneBounds:
     """One line for the log: what was seen in the data."""
 
 
-def find_bounds(
-    camera_to_worlds: Tensor, directions: Tensor, points: Tensor | None
-) -> SceneBounds:
+def find_bounds(camera_to_worlds: Tensor, directions: Tensor, points: Tensor | None) -> SceneBounds:
     """Bounds from camera poses, some of the cameras' rays, and sparse points.
 
     Args:

@@ -33,6 +33,8 @@ class Survey:
     """Share of those rays that meet the bounds."""
     median_length: float
     """Median length of those rays inside the bounds, scene units."""
+    positions: Tensor
+    """[C, 3] of up to `MOST_CAMERAS` cameras."""
 
     def describe(self) -> str:
         """One line for the log."""
@@ -82,6 +84,7 @@ def survey(datamanager: Any) -> Survey:
         flat_directions[hits],
         float(hits.float().mean()),
         float(lengths[hits].median()),
+        origins[:, 0],
     )
 
 

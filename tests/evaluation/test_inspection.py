@@ -66,7 +66,7 @@ def test_points_are_on_the_surface_and_face_outwards() -> None:
     assert float((normals * outwards).sum(dim=-1).mean()) > 0.9
 
 
-@pytest.mark.parametrize("threshold", [0.0, 0.5, 1.0])
+@pytest.mark.parametrize("threshold", [0.0, 1.0])
 def test_a_picture_is_made_whatever_is_kept(tmp_path: Path, threshold: float) -> None:
     known = ball()
     occupancy = Occupancy(known.gate, known.space, threshold, report=known.report)

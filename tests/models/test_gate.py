@@ -34,7 +34,7 @@ def test_occupancy_is_one_minus_the_probability_of_emptiness(seed: int, experts:
 
 def test_occupancy_keeps_its_digits_where_the_gate_is_sure_of_emptiness() -> None:
     value = occupancy_from_logits(torch.tensor([[40.0, 0.0, 0.0]]))
-    assert float(value) == pytest.approx(2.0 * torch.tensor(-40.0).double().exp().item(), rel=1e-5)
+    assert value.item() == pytest.approx(2.0 * torch.tensor(-40.0).double().exp().item(), rel=1e-5)
 
 
 @settings(deadline=None, max_examples=30)

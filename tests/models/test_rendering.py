@@ -73,7 +73,8 @@ def test_a_gate_that_keeps_everything_renders_what_no_gate_renders(routing: Rout
 
 @pytest.mark.parametrize("routing", ROUTINGS.values(), ids=ROUTINGS)
 def test_weights_of_a_ray_are_opacities_that_sum_to_one_at_most(routing: Routing) -> None:
-    shaded = Scene().shade(some_rays(9), intervals_of(some_rays(9)), routing)
+    with torch.no_grad():
+        shaded = Scene().shade(some_rays(9), intervals_of(some_rays(9)), routing)
     assert float(shaded.weights.min()) >= 0.0
     assert float(shaded.accumulation.max()) <= 1.0 + 1e-5
     torch.testing.assert_close(shaded.weights.sum(), shaded.accumulation.sum())
