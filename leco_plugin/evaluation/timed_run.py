@@ -49,12 +49,15 @@ class TimedRun:
     curve: list[tuple[float, float]] = field(default_factory=list)
 
     def to_dict(self) -> dict[str, Any]:
-        """JSON values, rounded to what the measurement means."""
+        """JSON values, rounded to what the measurement means; None where there is no number."""
         values = dict(vars(self))
         for name in ("train_seconds", "psnr", "ssim", "samples_per_ray", "field_queries_per_ray"):
             values[name] = round(values[name], 4)
         values["curve"] = [[round(seconds, 2), round(psnr, 3)] for seconds, psnr in self.curve]
-        return values
+        return {
+            name: None if isinstance(value, float) and not math.isfinite(value) else value
+            for name, value in values.items()
+        }
 
 
 class Clock:

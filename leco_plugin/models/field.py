@@ -57,6 +57,9 @@ class HMoEField(nn.Module):
         self.appearance = (
             nn.Embedding(num_images, config.appearance_dim) if config.appearance_dim else None
         )
+        if self.appearance is not None:
+            # alike at first: what differs between images is learned, not drawn
+            nn.init.zeros_(self.appearance.weight)
         self.color_head = nn.Sequential(
             nn.Linear(
                 width + self.direction_encoding.out_dim + config.appearance_dim, config.color_width

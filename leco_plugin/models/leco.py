@@ -1,4 +1,4 @@
-"""`leco-occupancy` as a nerfstudio model: an HMoE that learns the occupancy, then is guided by it."""
+"""`leco-occupancy` as a nerfstudio model: an HMoE that learns occupancy, then is guided by it."""
 
 from __future__ import annotations
 
@@ -60,8 +60,8 @@ class GateLossConfig:
     emphasis: float = 4.0
     """k: how much dearer a lost contribution is than a needless sample (logit form)."""
     empty_below: float = 0.2
-    """o(x) below which a point goes to the empty-space expert (logit form; the paper's is the argmax)."""
-    balance: float = 5e-4
+    """o(x) below which a point goes to the empty-space expert (logit form; the paper: argmax)."""
+    balance: float = 5e-3
     """Weight of the balance among scene experts (logit form, and the homogeneous mixture)."""
     imbalance: float = 5e-3
     """lambda_g, weight of the imbalanced gate loss (paper form)."""
@@ -89,7 +89,7 @@ class LecoModelConfig(ModelConfig):
     """What teaches the gate."""
     calibration: CalibrationConfig = field(default_factory=CalibrationConfig)
     """What skipping may cost."""
-    distortion: float = 0.03
+    distortion: float = 0.05
     """Weight of the distortion loss, which clears haze (mip-NeRF 360, eq. 15)."""
     homogeneous: bool = False
     """A mixture of scene experts only, for comparison: no empty-space expert, nothing to freeze."""
@@ -306,7 +306,7 @@ class LecoModel(Model):
         if self.config.homogeneous:
             return {"balance_loss": balance}
         if config.form == "logit":
-            # the backdrop is kept anyway, and says nothing about the place where a ray happens to end
+            # the backdrop is kept anyway, and says nothing about where a ray happens to end
             before = (~backdrop_of(intervals, rays)).nonzero()[:, 0]
             weights = widen(
                 shaded.weights.detach().index_select(0, before),
@@ -332,7 +332,7 @@ class LecoModel(Model):
     def get_metrics_dict(
         self, outputs: dict[str, Any], batch: dict[str, Tensor]
     ) -> dict[str, Tensor]:
-        """PSNR of the batch, and what the gate does: kept fraction, share and density per expert."""
+        """PSNR of the batch; of the gate: kept fraction, share and density per expert."""
         from leco_plugin.models.statistics import gate_statistics
 
         truth = self.renderer_rgb.blend_background(batch["image"].to(self.device))

@@ -26,6 +26,7 @@ from leco_plugin.models.phases import (
     find_collapse,
     ramp,
     reset_gate_head,
+    spread_scene_experts,
 )
 from leco_plugin.models.statistics import KEPT_ABOVE
 from leco_plugin.scenes.survey import survey
@@ -79,9 +80,16 @@ class Lifecycle:
         model.ramped = ramp(step, self.schedule)
         model.learned = not self.schedule.freeze and step >= self.schedule.learn_steps
         past_learning = bool(model.frozen) or model.learned
-        self._set_rays(model.config.sizes.guided_batch if bool(model.frozen) else 1.0)
+        self._set_rays(self._guided_batch() if bool(model.frozen) else 1.0)
         if not past_learning:
             self.step_started = time.monotonic()
+
+    def _guided_batch(self) -> float:
+        """Rays of a guided batch as a multiple: about as many samples are shaded as before."""
+        sizes = self.model.config.sizes
+        kept = 1.0 - float(self.model.report.get("empty_fraction", 0.0))
+        same_samples = sizes.learn_candidates / max(1.0, kept * sizes.candidates)
+        return min(sizes.guided_batch, max(0.5, same_samples))
 
     def _set_rays(self, factor: float) -> None:
         sampler = getattr(self.pipeline.datamanager, "train_pixel_sampler", None)
@@ -102,8 +110,10 @@ class Lifecycle:
         kept = occupancy_from_logits(logits) >= KEPT_ABOVE
         agreement = decisions_agree(self.decisions, kept)
         self.decisions = kept
-        if self._heal(step, logits, kept, last) or not schedule.freeze:
+        if not schedule.freeze or self._heal(step, logits, kept, last):
             return
+        if not last and float(kept.float().mean()) > 0.95:
+            return  # it agrees with itself only because it has not yet found anything empty
         if converged(step, agreement, schedule):
             CONSOLE.log(
                 f"\\[leco] step {step}: {agreement:.1%} of {len(kept)} decisions are those of "
@@ -131,7 +141,7 @@ class Lifecycle:
         return logits
 
     def _heal(self, step: int, logits: Tensor, kept: Tensor, last: bool) -> bool:
-        """Resets a gate that is found collapsed in two looks running; returns whether it did.
+        """Heals a gate found collapsed in two looks running; returns whether it starts anew.
 
         Raises:
             RuntimeError: the gate has collapsed more often than it may.
@@ -150,14 +160,19 @@ class Lifecycle:
                 "scene's bounds in the log above, and the weights under --pipeline.model.gate-loss"
             )
         self.recoveries += 1
+        self.suspected = False
+        head = self.model.gate.head
+        if collapse.one_expert:
+            spread_scene_experts(head, int(shares[1:].argmax()) + 1)
+            remedy = "its points are shared out anew"
+        else:
+            reset_gate_head(head)
+            remedy = "its last layer starts anew, on dense samples"
+            more = self.schedule.learn_steps // 2
+            self.schedule = replace(self.schedule, learn_steps=step + 1 + more)
+            self.decisions = torch.zeros(0, dtype=torch.bool)
         CONSOLE.log(
-            f"\\[leco] step {step}: {collapse.cause}; its last layer starts anew, on dense samples "
+            f"\\[leco] step {step}: {collapse.cause}; {remedy} "
             f"(recovery {self.recoveries} of {MOST_RECOVERIES})"
         )
-        reset_gate_head(self.model.gate.head)
-        self.schedule = replace(
-            self.schedule, learn_steps=step + 1 + self.schedule.learn_steps // 2
-        )
-        self.decisions = torch.zeros(0, dtype=torch.bool)
-        self.suspected = False
-        return True
+        return not collapse.one_expert

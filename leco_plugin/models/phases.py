@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import torch
@@ -65,6 +66,8 @@ class Collapse:
     """A gate that has stopped deciding, and why it is thought so."""
 
     cause: str
+    one_expert: bool = False
+    """Whether it still knows what is empty, and only sends everything else to one expert."""
 
 
 def find_collapse(kept_fraction: float, shares: Tensor, at_the_end: bool) -> Collapse | None:
@@ -82,7 +85,7 @@ def find_collapse(kept_fraction: float, shares: Tensor, at_the_end: bool) -> Col
         return Collapse("the gate calls all space occupied")
     scene = shares[1:]
     if len(scene) > 1 and float(scene.sum()) > 0.01 and float(scene.max() / scene.sum()) > 0.999:
-        return Collapse(f"scene expert {int(scene.argmax()) + 1} takes all points")
+        return Collapse(f"scene expert {int(scene.argmax()) + 1} takes all points", True)
     return None
 
 
@@ -91,3 +94,18 @@ def reset_gate_head(head: torch.nn.Linear) -> None:
     """Gives a collapsed gate an undecided last layer; what its hidden layers know stays."""
     torch.nn.init.normal_(head.weight, std=0.05)
     torch.nn.init.zeros_(head.bias)
+
+
+@torch.no_grad()
+def spread_scene_experts(head: torch.nn.Linear, dominant: int) -> None:
+    """Shares the points of one scene expert out among all; o(x) stays as it was.
+
+    n equal logits have the log-sum-exp of one that is log n higher.
+
+    Args:
+        head: last layer of the gate, [1 + n, width].
+        dominant: the expert that takes all points, in [1, n].
+    """
+    num_scene = head.out_features - 1
+    head.weight[1:] = head.weight[dominant] + 0.05 * torch.randn_like(head.weight[1:])
+    head.bias[1:] = head.bias[dominant] - math.log(num_scene)

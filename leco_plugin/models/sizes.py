@@ -20,9 +20,9 @@ class Sizes:
     """The radiance field with its experts."""
     learn_candidates: int = 64
     """Candidates along a ray while the occupancy is learned."""
-    guided_batch: float = 2.0
-    """Rays of a batch once the occupancy guides, as a multiple of those before: most of their
-    samples are skipped."""
+    guided_batch: float = 3.0
+    """Most rays of a guided batch, as a multiple of those before: their samples are mostly skipped,
+    and the batch grows until it shades as many as before."""
     candidates: int = 128
     """Candidates along a ray once the occupancy guides, and in every rendering."""
 

@@ -1,4 +1,4 @@
-"""Where a scene lies, found from its cameras and sparse points: the space mapping and each ray's range.
+"""Where a scene lies, found from cameras and sparse points: its mapping and the rays' range.
 
 A scene photographed from above is bounded: its rays are cut at a plane above and one below all
 points, as Mega-NeRF cuts them by altitude, and space is not contracted. Everything else is
@@ -32,7 +32,7 @@ class SceneBounds:
     far: float
     """Where rays end."""
     aabb: Tensor
-    """[6] min and max corner of the box in which rays are marched; +-FAR_AWAY where there is no wall."""
+    """[6] corners of the box in which rays are marched; +-FAR_AWAY where there is no wall."""
     reason: str
     """One line for the log: what was seen in the data."""
 

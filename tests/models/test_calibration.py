@@ -40,7 +40,9 @@ class Chunk:
         self.greys = torch.rand(len(weights), 3, generator=generator)
         near = weights > 0.01
         intervals = Intervals(self.ray_indices, starts, starts + 1.0)
-        self.reference = Reference(intervals, weights, occupancies, near, self.render(weights))
+        self.reference = Reference(
+            intervals, weights, occupancies, near, self.render(weights), torch.zeros_like(near)
+        )
         self.truth = self.reference.rgb + 0.05 * torch.randn(RAYS, 3, generator=generator)
 
     def render(self, weights: Tensor) -> Tensor:

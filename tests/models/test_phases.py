@@ -7,6 +7,8 @@ from itertools import pairwise
 import pytest
 import torch
 
+from leco_plugin.models.gate import occupancy_from_logits
+from leco_plugin.models.losses import expert_shares
 from leco_plugin.models.phases import (
     ScheduleConfig,
     converged,
@@ -14,6 +16,7 @@ from leco_plugin.models.phases import (
     find_collapse,
     ramp,
     reset_gate_head,
+    spread_scene_experts,
 )
 
 SCHEDULE = ScheduleConfig(learn_steps=1000, earliest=0.5, ramp_from=0.2, ramp_to=0.6)
@@ -83,3 +86,17 @@ def test_a_reset_gate_is_undecided_again() -> None:
     assert not bool(head.bias.any())
     assert float(probabilities.mean(dim=0).min()) > 0.05
     assert head.weight.requires_grad
+
+
+def test_sharing_out_one_experts_points_leaves_the_occupancy_as_it_was() -> None:
+    torch.manual_seed(0)
+    head = torch.nn.Linear(16, 5)
+    with torch.no_grad():
+        head.bias[3] = head.bias[0] = 20.0
+    features = torch.randn(500, 16)
+    before = occupancy_from_logits(head(features))
+    spread_scene_experts(head, 3)
+    after = head(features)
+    assert (occupancy_from_logits(after) - before).abs().mean() < 0.03
+    shares = expert_shares(after[:, 1:].argmax(dim=-1), 4)
+    assert float(shares.max()) < 0.8

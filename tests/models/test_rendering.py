@@ -15,9 +15,11 @@ from leco_plugin.models.rendering import (
     Rays,
     Routing,
     Shaded,
+    backdrop_of,
     gate_values_and_routes,
     per_ray_pictures,
     shade,
+    with_backdrop,
 )
 from leco_plugin.samplers.marching import march
 from leco_plugin.space import Space
@@ -133,3 +135,34 @@ def test_the_papers_factor_is_the_probability_of_the_chosen_expert() -> None:
     values, routes = gate_values_and_routes(logits, ROUTINGS["paper"])
     assert torch.equal(routes, logits.argmax(dim=-1))
     assert torch.equal(values, logits.softmax(dim=-1).amax(dim=-1))
+
+
+def test_every_ray_ends_in_a_backdrop_that_absorbs_what_is_left() -> None:
+    scene, rays = Scene(), some_rays(7)
+    no_samples = Intervals(torch.zeros(0, dtype=torch.int64), torch.zeros(0), torch.zeros(0))
+    for intervals in (intervals_of(rays), no_samples):
+        ended = with_backdrop(intervals, rays, 0.05, 0.0)
+        is_backdrop = backdrop_of(ended, rays)
+        assert torch.equal(ended.ray_indices[is_backdrop], torch.arange(7))
+        assert bool((ended.ray_indices.diff() >= 0).all())
+        on_one_ray = ended.ray_indices.diff() == 0
+        assert bool((ended.t_starts.diff()[on_one_ray] >= 0).all())
+        shaded = scene.shade(rays, ended, ROUTINGS["threshold"])
+        torch.testing.assert_close(shaded.accumulation, torch.ones(7))
+
+
+def test_the_backdrop_is_the_same_whatever_was_skipped_before_it() -> None:
+    rays = some_rays(5)
+    ends = []
+    for occupied in (None, lambda positions: positions[:, 0] > 0.0):
+        ended = with_backdrop(intervals_of(rays, occupied), rays, 0.05, 0.02)
+        mask = backdrop_of(ended, rays)
+        ends.append(torch.stack([ended.t_starts[mask], ended.t_ends[mask]]))
+    assert torch.equal(*ends)
+
+
+def test_a_ray_that_misses_the_scene_stays_transparent() -> None:
+    rays = some_rays(2)
+    rays = rays._replace(t_maxs=torch.tensor([0.05, 3.0]))
+    ended = with_backdrop(intervals_of(rays), rays, 0.05, 0.0)
+    assert ended.ray_indices[backdrop_of(ended, rays)].tolist() == [1]
