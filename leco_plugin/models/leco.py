@@ -91,6 +91,8 @@ class LecoModelConfig(ModelConfig):
     """What skipping may cost."""
     distortion: float = 0.05
     """Weight of the distortion loss, which clears haze (mip-NeRF 360, eq. 15)."""
+    distortion_after: float = 0.04
+    """Share of the distortion loss that stays when the first phase is over and detail is wanted."""
     homogeneous: bool = False
     """A mixture of scene experts only, for comparison: no empty-space expert, nothing to freeze."""
     near: float | None = None
@@ -281,6 +283,8 @@ class LecoModel(Model):
         truth = self.renderer_rgb.blend_background(image)
         losses = {"rgb_loss": torch.nn.functional.mse_loss(shaded.rgb, truth)}
         weight = self.config.distortion * self.ramped
+        if not self.is_learning():
+            weight *= self.config.distortion_after
         if weight > 0.0:
             near, far = self.march_range[:2]
             starts, ends = ((t - near) / (far - near) for t in outputs["intervals"][1:])
