@@ -18,7 +18,7 @@ from safetensors.torch import save
 from torch import Tensor, nn
 
 from leco_plugin.models.gate import Gate, GateConfig
-from leco_plugin.space import Space
+from leco_plugin.space import NO_WALL, Space
 
 FORMAT = "leco-occupancy"
 VERSION = 1
@@ -37,9 +37,12 @@ class Occupancy(nn.Module):
         precision: the type of matrix products it was trained and calibrated in; queries keep to it,
             because the same weights decide otherwise in another one (DESIGN, section 3).
         report: what was measured when it was calibrated, JSON values only.
+        walls: [6] min and max corner of the box in which the gate was taught; what lies outside was
+            never on a ray, the gate knows nothing of it, and it is empty. None is no walls.
     """
 
     threshold_value: Tensor
+    walls: Tensor
 
     def __init__(
         self,
@@ -48,6 +51,7 @@ class Occupancy(nn.Module):
         threshold: float,
         precision: Precision = "float32",
         report: dict[str, Any] | None = None,
+        walls: Tensor | None = None,
     ) -> None:
         super().__init__()
         self.gate = gate
@@ -55,6 +59,8 @@ class Occupancy(nn.Module):
         self.precision: Precision = precision
         self.report = dict(report or {})
         self.register_buffer("threshold_value", torch.tensor(float(threshold)))
+        everywhere = torch.tensor([-NO_WALL] * 3 + [NO_WALL] * 3)
+        self.register_buffer("walls", everywhere if walls is None else walls.detach().clone())
         self.requires_grad_(False)
 
     @property
@@ -69,10 +75,12 @@ class Occupancy(nn.Module):
         Args:
             positions: [N, 3] float, scene units, on the module's device.
         Returns:
-            [N] float32 in [0, 1]; 0 outside a bounded space and where a position is not finite.
+            [N] float32 in [0, 1]; 0 outside a bounded space or the walls, and where a position is
+            not finite.
         """
         mapped = self.space.map(positions)
         inside = (mapped.abs() <= 1.0).all(dim=-1)  # false for NaN
+        inside &= ((positions >= self.walls[:3]) & (positions <= self.walls[3:])).all(dim=-1)
         with gate_precision(mapped.device.type, self.precision):
             values = self.gate.occupancy(torch.where(inside[:, None], mapped, 0.0))
         return torch.where(inside, values, 0.0)

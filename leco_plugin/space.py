@@ -13,6 +13,10 @@ from torch import Tensor, nn
 
 SpaceKind = Literal["box", "contraction"]
 
+NO_WALL = 1e6
+"""Stands for "no wall" in the corners of a box, scene units; infinity would meet zero in a slab test
+and is no finite number in a file."""
+
 
 def contract(positions: Tensor) -> Tensor:
     """Maps R^3 into the cube of half-width 2, leaving the cube of half-width 1 as it is.

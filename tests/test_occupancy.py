@@ -225,3 +225,14 @@ def test_a_threshold_outside_0_to_1_is_refused(threshold: float, tmp_path: Path)
     wrong.save(tmp_path / "o.safetensors")
     with pytest.raises(ValueError, match="threshold"):
         Occupancy.load(tmp_path / "o.safetensors")
+
+
+def test_what_lies_outside_the_walls_is_empty_also_after_a_round_trip(tmp_path: Path) -> None:
+    torch.manual_seed(0)
+    walls = torch.tensor([-1e6, -1e6, -0.2, 1e6, 1e6, 0.3])
+    occupancy = Occupancy(Gate(GateConfig()), Space(), 1e-6, walls=walls)
+    occupancy.save(tmp_path / "occupancy.safetensors")
+    positions = torch.rand(2000, 3) * 2 - 1
+    kept = Occupancy.load(tmp_path / "occupancy.safetensors").occupied(positions)
+    between = (positions[:, 2] >= -0.2) & (positions[:, 2] <= 0.3)
+    assert torch.equal(kept, between)

@@ -215,7 +215,12 @@ class LecoModel(Model):
     def occupancy(self) -> Occupancy:
         """The gate as an `Occupancy`; it shares this model's parameters."""
         return Occupancy(
-            self.gate, self.space, float(self.threshold), self.precision, self.report
+            self.gate,
+            self.space,
+            float(self.threshold),
+            self.precision,
+            self.report,
+            self.aabb,
         ).to(self.device)
 
     def intervals_of(self, rays: Rays, guided: bool, learning: bool) -> Intervals:

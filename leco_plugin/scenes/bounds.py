@@ -12,11 +12,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from leco_plugin.space import SpaceKind
-
-FAR_AWAY = 1e6
-"""Stands for "no wall" in a box, scene units; infinity would meet zero in the slab test."""
-
+from leco_plugin.space import NO_WALL, SpaceKind
 
 @dataclass(frozen=True)
 class SceneBounds:
@@ -32,7 +28,7 @@ class SceneBounds:
     far: float
     """Where rays end."""
     aabb: Tensor
-    """[6] corners of the box in which rays are marched; +-FAR_AWAY where there is no wall."""
+    """[6] corners of the box in which rays are marched; +-NO_WALL where there is no wall."""
     reason: str
     """One line for the log: what was seen in the data."""
 
@@ -82,7 +78,7 @@ def _slab(
     sides = torch.stack([hits.amin(dim=0), hits.amax(dim=0)])
     center = torch.tensor([*sides.mean(dim=0).tolist(), (ground + top) / 2])
     half = 1.02 * max(float((sides[1] - sides[0]).max()), top - ground) / 2
-    wall = FAR_AWAY
+    wall = NO_WALL
     return SceneBounds(
         "box",
         center,
@@ -105,7 +101,7 @@ def _without_points(poses: Tensor) -> SceneBounds:
 
 
 def _no_walls() -> Tensor:
-    return torch.tensor([-FAR_AWAY] * 3 + [FAR_AWAY] * 3)
+    return torch.tensor([-NO_WALL] * 3 + [NO_WALL] * 3)
 
 
 def _quantiles(values: Tensor, share: float) -> Tensor:
