@@ -1,0 +1,47 @@
+"""Real photographs are learned from without a flag: bounds, orientation and sizes come from them."""
+
+from __future__ import annotations
+
+import copy
+from pathlib import Path
+
+import pytest
+import torch
+
+from leco_plugin.evaluation.timed_run import psnr_on_rays, run_training
+from leco_plugin.method_configs import leco_occupancy
+from leco_plugin.models.calibration import CalibrationConfig
+from leco_plugin.models.freezing import FILE_NAME
+from leco_plugin.occupancy import Occupancy
+
+KINDS = {"brighton_beach": "box", "caliterra": "box", "banana": "box", "fox": "contraction"}
+
+
+# nerfstudio leaves the images open whose size it has read
+@pytest.mark.filterwarnings("ignore:unclosed file:ResourceWarning")
+@pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
+@pytest.mark.scenes
+@pytest.mark.slow
+@pytest.mark.parametrize("name", KINDS)
+def test_a_scene_trains_freezes_and_renders_without_a_flag(
+    name: str, scenes: Path, tmp_path: Path
+) -> None:
+    config = copy.deepcopy(leco_occupancy.config)
+    config.pipeline.datamanager.data = scenes / name
+    config.pipeline.datamanager.train_num_rays_per_batch = 128
+    config.pipeline.model.calibration = CalibrationConfig(rays=64)
+    config.output_dir, config.vis, config.max_num_iterations = tmp_path, "tensorboard", 24
+    config.steps_per_eval_image = 0
+    config.logging.local_writer.enable = False
+    config.set_timestamp()
+    trainer = config.setup(local_rank=0, world_size=1)
+    trainer.setup()
+    run_training(trainer)
+    model = trainer.pipeline.model
+    assert bool(model.frozen)
+    assert model.space.kind == KINDS[name]
+    assert psnr_on_rays(trainer, 200) > 7.0
+    occupancy = Occupancy.load(trainer.base_dir / FILE_NAME)
+    assert occupancy.report["held_out"]
+    values = occupancy.query(torch.rand(100, 3) - 0.5)
+    assert bool(((values >= 0) & (values <= 1)).all())
