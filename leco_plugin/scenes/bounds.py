@@ -14,6 +14,7 @@ from torch import Tensor
 
 from leco_plugin.space import NO_WALL, SpaceKind
 
+
 @dataclass(frozen=True)
 class SceneBounds:
     """The space mapping of a scene and the range in which rays are marched; scene units."""
