@@ -14,8 +14,8 @@ from torch import Tensor, nn
 SpaceKind = Literal["box", "contraction"]
 
 NO_WALL = 1e6
-"""Stands for "no wall" in the corners of a box, scene units; infinity would meet zero in a slab test
-and is no finite number in a file."""
+"""Stands for "no wall" in the corners of a box, scene units; infinity would meet zero in a slab
+test and is no finite number in a file."""
 
 
 def contract(positions: Tensor) -> Tensor:

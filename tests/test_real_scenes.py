@@ -1,4 +1,4 @@
-"""Real photographs are learned from without a flag: bounds, orientation and sizes come from them."""
+"""Real photographs need no flag: bounds, orientation and sizes come from them."""
 
 from __future__ import annotations
 
