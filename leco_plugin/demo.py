@@ -18,7 +18,7 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, Ti
 
 from leco_plugin.evaluation.charts import psnr_against_seconds
 from leco_plugin.evaluation.inspection import ViewBox
-from leco_plugin.evaluation.json_file import write_json
+from leco_plugin.evaluation.json_file import finite_or_null, write_json
 from leco_plugin.evaluation.machine import describe_machine
 from leco_plugin.evaluation.occupancy_picture import draw_slice
 from leco_plugin.evaluation.occupancy_truth import compare_with_truth
@@ -157,7 +157,7 @@ def _frozen_occupancy(
         **{name: report[name] for name in (*names, "image_price_db")},
         **measured,
     }
-    return occupancy, _strict(facts), truth
+    return occupancy, finite_or_null(facts), truth
 
 
 @torch.no_grad()
@@ -213,14 +213,6 @@ def _bar(what: str) -> Iterator[Callable[[float], None]]:
     with Progress(*columns, TimeRemainingColumn(), console=CONSOLE, transient=True) as progress:
         task = progress.add_task(what, total=1.0)
         yield lambda share: progress.update(task, completed=share)
-
-
-def _strict(values: dict[str, Any]) -> dict[str, Any]:
-    """NaN and infinity are no JSON: null in their place."""
-    return {
-        name: None if isinstance(value, float) and not math.isfinite(value) else value
-        for name, value in values.items()
-    }
 
 
 def summary(report: dict[str, Any]) -> list[str]:

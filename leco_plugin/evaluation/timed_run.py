@@ -20,6 +20,7 @@ from nerfstudio.engine.trainer import Trainer, TrainerConfig
 from nerfstudio.utils import writer
 from torch import Tensor
 
+from leco_plugin.evaluation.json_file import finite_or_null
 from leco_plugin.evaluation.metrics import image_metrics
 
 CURVE_RAYS = 4096
@@ -54,10 +55,7 @@ class TimedRun:
         for name in ("train_seconds", "psnr", "ssim", "samples_per_ray", "field_queries_per_ray"):
             values[name] = round(values[name], 4)
         values["curve"] = [[round(seconds, 2), round(psnr, 3)] for seconds, psnr in self.curve]
-        return {
-            name: None if isinstance(value, float) and not math.isfinite(value) else value
-            for name, value in values.items()
-        }
+        return finite_or_null(values)
 
 
 class Clock:

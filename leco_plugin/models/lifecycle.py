@@ -29,6 +29,7 @@ from leco_plugin.models.phases import (
     spread_scene_experts,
 )
 from leco_plugin.models.statistics import KEPT_ABOVE
+from leco_plugin.occupancy import gate_precision
 from leco_plugin.scenes.survey import survey
 
 if TYPE_CHECKING:
@@ -134,9 +135,7 @@ class Lifecycle:
         distance = torch.lerp(rays.t_mins[which], rays.t_maxs[which], along)
         positions = rays.origins[which] + rays.directions[which] * distance[:, None]
         mapped = model.space.map(positions).clamp(-1.0, 1.0)
-        with torch.autocast(
-            model.device.type, torch.bfloat16, enabled=model.precision == "bfloat16"
-        ):
+        with gate_precision(model.device.type, model.precision):
             logits: Tensor = model.gate(mapped)
         return logits
 

@@ -172,10 +172,11 @@ def shade(
         gate_values, routes = gate_values_and_routes(logits, routing)
     sigmas, features = field.density(mapped, routes, gate_values)
     packed_info = pack_info(ray_indices, num_rays)
-    sigmas = torch.where(backdrop_of(intervals, rays), sigmas + OPAQUE, sigmas)
+    # for the weights only: what the field says of the place stays the field's
+    absorbing = torch.where(backdrop_of(intervals, rays), sigmas + OPAQUE, sigmas)
     scale = space.half_extent
     weights, _, _ = render_weight_from_density(
-        t_starts / scale, t_ends / scale, sigmas, packed_info=packed_info
+        t_starts / scale, t_ends / scale, absorbing, packed_info=packed_info
     )
     visible = (weights.detach() > VISIBLE).nonzero()[:, 0]
     rays_seen = ray_indices[visible]

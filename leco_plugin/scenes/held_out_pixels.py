@@ -6,6 +6,8 @@ is the same on every process and after every resume.
 
 from __future__ import annotations
 
+import functools
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -23,6 +25,25 @@ def is_held_out(indices: Tensor) -> Tensor:
     return ((indices[:, 1] % PERIOD == _OFFSET) & (indices[:, 2] % PERIOD == _OFFSET)).bool()
 
 
+def _stepping_aside(sample: Callable[..., Tensor]) -> Callable[..., Tensor]:
+    """One of nerfstudio's ways to draw pixels, with held-out pixels giving way to others."""
+
+    @functools.wraps(sample)
+    def sample_others(
+        self: HeldOutPixelSampler,
+        batch_size: int,
+        num_images: int,
+        image_height: int,
+        image_width: int,
+        mask: Tensor | None = None,
+        device: torch.device | str = "cpu",
+    ) -> Tensor:
+        indices = sample(self, batch_size, num_images, image_height, image_width, mask, device)
+        return self._step_aside(indices, image_width, mask)
+
+    return sample_others
+
+
 @dataclass
 class HeldOutPixelSamplerConfig(PixelSamplerConfig):
     """Samples pixels uniformly, except for a lattice that calibration keeps to itself."""
@@ -34,50 +55,9 @@ class HeldOutPixelSamplerConfig(PixelSamplerConfig):
 class HeldOutPixelSampler(PixelSampler):
     """nerfstudio's sampler with a lattice of pixels left out of training."""
 
-    def sample_method(
-        self,
-        batch_size: int,
-        num_images: int,
-        image_height: int,
-        image_width: int,
-        mask: Tensor | None = None,
-        device: torch.device | str = "cpu",
-    ) -> Tensor:
-        """[batch_size, 3] of (image, row, column); a held-out pixel gives way to its neighbour."""
-        indices = super().sample_method(
-            batch_size, num_images, image_height, image_width, mask, device
-        )
-        return self._step_aside(indices, image_width, mask)
-
-    def sample_method_equirectangular(
-        self,
-        batch_size: int,
-        num_images: int,
-        image_height: int,
-        image_width: int,
-        mask: Tensor | None = None,
-        device: torch.device | str = "cpu",
-    ) -> Tensor:
-        """The same for panoramas."""
-        indices = super().sample_method_equirectangular(
-            batch_size, num_images, image_height, image_width, mask, device
-        )
-        return self._step_aside(indices, image_width, mask)
-
-    def sample_method_fisheye(
-        self,
-        batch_size: int,
-        num_images: int,
-        image_height: int,
-        image_width: int,
-        mask: Tensor | None = None,
-        device: torch.device | str = "cpu",
-    ) -> Tensor:
-        """The same for the disc of a fisheye image."""
-        indices = super().sample_method_fisheye(
-            batch_size, num_images, image_height, image_width, mask, device
-        )
-        return self._step_aside(indices, image_width, mask)
+    sample_method = _stepping_aside(PixelSampler.sample_method)
+    sample_method_equirectangular = _stepping_aside(PixelSampler.sample_method_equirectangular)
+    sample_method_fisheye = _stepping_aside(PixelSampler.sample_method_fisheye)
 
     def _step_aside(self, indices: Tensor, image_width: int, mask: Tensor | None) -> Tensor:
         """Moves held-out pixels [N, 3] to their neighbours, or to others where those are masked."""

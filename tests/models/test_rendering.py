@@ -166,3 +166,11 @@ def test_a_ray_that_misses_the_scene_stays_transparent() -> None:
     rays = rays._replace(t_maxs=torch.tensor([0.05, 3.0]))
     ended = with_backdrop(intervals_of(rays), rays, 0.05, 0.0)
     assert ended.ray_indices[backdrop_of(ended, rays)].tolist() == [1]
+
+
+def test_the_backdrop_absorbs_without_changing_what_the_field_says() -> None:
+    scene, rays = Scene(), some_rays(6)
+    ended = with_backdrop(intervals_of(rays), rays, 0.05, 0.0)
+    shaded = scene.shade(rays, ended, ROUTINGS["threshold"])
+    assert bool(backdrop_of(ended, rays).any())
+    assert float(shaded.sigmas.detach().max()) < 1e3
