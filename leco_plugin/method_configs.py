@@ -18,7 +18,7 @@ from leco_plugin.models.leco import LecoModelConfig
 from leco_plugin.models.optimizers import FusedAdamConfig
 from leco_plugin.models.phases import ScheduleConfig
 from leco_plugin.models.sizes import PAPER, sizes_for
-from leco_plugin.scenes.held_out_pixels import HeldOutPixelSamplerConfig
+from leco_plugin.scenes.known_distances import KnownDistancePixelSamplerConfig
 from leco_plugin.scenes.photographs import LecoPhotographsDataParserConfig
 
 
@@ -54,17 +54,17 @@ _leco_occupancy = TrainerConfig(
     pipeline=VanillaPipelineConfig(
         datamanager=VanillaDataManagerConfig(
             dataparser=LecoPhotographsDataParserConfig(),
-            train_num_rays_per_batch=4096 if ON_GPU else 512,
+            train_num_rays_per_batch=4096 if ON_GPU else 1024,
             eval_num_rays_per_batch=1024,
-            pixel_sampler=HeldOutPixelSamplerConfig(),
+            pixel_sampler=KnownDistancePixelSamplerConfig(),
         ),
         model=LecoModelConfig(
             sizes=sizes_for(best_device()),
-            schedule=ScheduleConfig(learn_steps=2_000 if ON_GPU else 300),
+            schedule=ScheduleConfig(learn_steps=2_000 if ON_GPU else 200),
             eval_num_rays_per_chunk=1 << 15 if ON_GPU else 1 << 12,
         ),
     ),
-    optimizers=_optimizers(STEPS, 1e-2, 5e-3, 5e-3),
+    optimizers=_optimizers(STEPS, 2e-2, 1e-2, 5e-3),
     viewer=ViewerConfig(num_rays_per_chunk=1 << 12, quit_on_train_completion=True),
     vis="viewer+tensorboard",
 )

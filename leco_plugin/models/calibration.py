@@ -27,7 +27,7 @@ SURFACE_STEPS = 2.0
 class CalibrationConfig:
     """What skipping may cost."""
 
-    lost_surface_mass: float = 8e-4
+    lost_surface_mass: float = 3e-4
     """Largest share of the weight near surfaces that may fall on skipped samples."""
     image_price_db: float = 0.04
     """Largest loss of PSNR on the calibration rays, in dB."""

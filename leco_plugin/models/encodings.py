@@ -58,7 +58,7 @@ class FrequencyEncoding(nn.Module):
 
 
 class _InterpolateTable(torch.autograd.Function):
-    """Weighted sum of 8 table rows per point and level; the backward is a histogram.
+    """Weighted sum of 4 table rows per point and level; the backward is a histogram.
 
     `embedding_bag` is the fastest forward that plain torch has on a CPU, but its backward sorts
     the indices; a weighted `bincount` per feature is 9 times faster there. On CUDA `index_add_` is
@@ -97,7 +97,11 @@ class _InterpolateTable(torch.autograd.Function):
 
 
 class HashEncoding(nn.Module):
-    """Multi-resolution hash grid (Instant-NGP, eq. 3 and 4). Positions receive no gradient."""
+    """Multi-resolution hash grid (Instant-NGP, eq. 3 and 4). Positions receive no gradient.
+
+    Features are interpolated linearly over tetrahedra: 4 rows a level, where the trilinear
+    interpolation of the paper looks up 8, and half of its time on a CPU.
+    """
 
     resolutions: Tensor
     offsets: Tensor
@@ -126,28 +130,36 @@ class HashEncoding(nn.Module):
         self.table = nn.Parameter(torch.empty(levels << log2_table, features).uniform_(-1e-4, 1e-4))
 
     def rows_and_weights(self, mapped: Tensor) -> tuple[Tensor, Tensor]:
-        """The 8 table rows of every point and level, and their trilinear weights.
+        """The 4 table rows of every point and level, and their weights.
+
+        A cell is cut into six tetrahedra by the order of the three coordinates in it. From the
+        lowest corner a walk adds the axis of the largest coordinate, the middle one, the smallest.
 
         Args:
             mapped: [N, 3] in [-1, 1].
         Returns:
-            rows [N * levels, 8] int32, weights [N * levels, 8] float32, which sum to one.
+            rows [N * levels, 4] int32, weights [N * levels, 4] float32, which sum to one.
         """
-        cells = (mapped.detach().float() * 0.5 + 0.5).t()[
-            :, :, None
-        ] * self.resolutions  # [3, N, levels]
+        unit = (mapped.detach().float() * 0.5 + 0.5).t()
+        cells = unit[:, :, None] * self.resolutions  # [3, N, levels]
         corner = cells.floor()
-        upper = cells - corner
-        low = corner.to(torch.int32) * self.primes[:, None, None]
-        hashes = torch.stack([low, low + self.primes[:, None, None]], dim=-1)  # [3, N, levels, 2]
-        sides = torch.stack([1.0 - upper, upper], dim=-1)
-        plane = (hashes[0, ..., :, None] ^ hashes[1, ..., None, :]).flatten(-2)
-        rows = ((plane[..., :, None] ^ hashes[2, ..., None, :]) & self.mask) + self.offsets[
-            :, None, None
-        ]
-        plane_weights = (sides[0, ..., :, None] * sides[1, ..., None, :]).flatten(-2)
-        weights = plane_weights[..., :, None] * sides[2, ..., None, :]
-        return rows.reshape(-1, 8), weights.reshape(-1, 8)
+        x, y, z = cells.sub_(corner).unbind(0)
+        low = corner.to(torch.int32).mul_(self.primes[:, None, None])
+        # what an exclusive or with the row's hash does to go one step along each axis
+        along_x, along_y, along_z = (low ^ (low + self.primes[:, None, None])).unbind(0)
+        first = low[0] ^ low[1] ^ low[2]
+        x_over_y, y_over_z, x_over_z = x >= y, y >= z, x >= z
+        largest = torch.where(x_over_y & x_over_z, along_x, torch.where(y_over_z, along_y, along_z))
+        smallest = torch.where(
+            x_over_z & y_over_z, along_z, torch.where(x_over_y, along_y, along_x)
+        )
+        last = first ^ along_x ^ along_y ^ along_z
+        rows = torch.stack([first, first ^ largest, last ^ smallest, last], dim=-1)
+        rows.bitwise_and_(self.mask).add_(self.offsets[:, None])
+        most, least = torch.maximum(torch.maximum(x, y), z), torch.minimum(torch.minimum(x, y), z)
+        middle = x + y + z - most - least
+        weights = torch.stack([1.0 - most, most - middle, middle - least, least], dim=-1)
+        return rows.view(-1, 4), weights.view(-1, 4)
 
     def forward(self, mapped: Tensor) -> Tensor:
         """[N, 3] in [-1, 1] to [N, levels * features] float32."""

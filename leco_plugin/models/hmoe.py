@@ -6,12 +6,13 @@ Dispatch is top-1 and dropless: every point goes through the expert it is routed
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Literal
 
 import torch
 from torch import Tensor, nn
 
 from leco_plugin.models.gate import EMPTY
+from leco_plugin.models.rows import permute_rows
 
 
 @dataclass(frozen=True)
@@ -64,19 +65,6 @@ class Expert(nn.Module):
         return features + hidden if self.residual else hidden
 
 
-class _Permute(torch.autograd.Function):
-    """Rows in another order; backward is the inverse order, where autograd would add up rows."""
-
-    @staticmethod
-    def forward(ctx: Any, rows: Tensor, order: Tensor, inverse: Tensor) -> Tensor:
-        ctx.inverse = inverse
-        return rows.index_select(0, order)
-
-    @staticmethod
-    def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor, None, None]:
-        return gradient.index_select(0, ctx.inverse), None, None
-
-
 class HMoE(nn.Module):
     """h(x) = G_i*(x) E_i*(x): each point through the one expert it is routed to."""
 
@@ -109,7 +97,7 @@ class HMoE(nn.Module):
             0, order, torch.arange(len(order), device=order.device)
         )
         counts = torch.bincount(routes, minlength=len(self.experts)).tolist()  # one synchronisation
-        ordered = _Permute.apply(features, order, inverse)
+        ordered = permute_rows(features, order, inverse)
         parts = [
             expert(part) if len(part) else part
             for expert, part in zip(self.experts, ordered.split(counts))
@@ -118,7 +106,7 @@ class HMoE(nn.Module):
             parts[EMPTY] = torch.zeros_like(parts[EMPTY])
         dtype = next((p.dtype for p in parts[1:] if len(p)), features.dtype)
         hidden = torch.cat([part.to(dtype) for part in parts])
-        return _Permute.apply(hidden, inverse, order) * gate_values[:, None].to(dtype)
+        return permute_rows(hidden, inverse, order) * gate_values[:, None].to(dtype)
 
 
 def dense_hmoe(hmoe: HMoE, features: Tensor, routes: Tensor, gate_values: Tensor) -> Tensor:

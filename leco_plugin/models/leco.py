@@ -17,13 +17,15 @@ from leco_plugin.compat.checkpoints import allow_checkpoint_globals
 from leco_plugin.evaluation.metrics import image_metrics
 from leco_plugin.models.calibration import CalibrationConfig
 from leco_plugin.models.field import HMoEField
-from leco_plugin.models.gate import Gate
+from leco_plugin.models.gate import Gate, occupancy_from_logits
 from leco_plugin.models.losses import (
+    agreement_loss,
     balance_loss,
     contribution_loss,
     density_loss,
     distortion_loss,
     imbalanced_gate_loss,
+    termination_loss,
     widen,
 )
 from leco_plugin.models.phases import ScheduleConfig
@@ -44,6 +46,7 @@ from leco_plugin.samplers.estimator import LearnedOccupancyEstimator
 from leco_plugin.samplers.marching import march
 from leco_plugin.samplers.rays import intersect_box
 from leco_plugin.scenes.bounds import SceneBounds
+from leco_plugin.scenes.known_distances import DISTANCE
 from leco_plugin.space import Space
 
 
@@ -55,12 +58,14 @@ class GateLossConfig:
     """Contribution in logit form, or imbalanced gate loss and density loss as in the paper."""
     contribution: float = 0.02
     """Weight of the contribution loss (logit form)."""
-    weight_at_full: float = 0.05
+    weight_at_full: float = 0.15
     """w_0: rendering weight that makes a sample fully occupied (logit form)."""
-    emphasis: float = 4.0
+    emphasis: float = 8.0
     """k: how much dearer a lost contribution is than a needless sample (logit form)."""
     empty_below: float = 0.2
     """o(x) below which a point goes to the empty-space expert (logit form; the paper: argmax)."""
+    agreement: float = 0.1
+    """Weight of the field giving up what the gate calls empty (logit form)."""
     balance: float = 5e-3
     """Weight of the balance among scene experts (logit form, and the homogeneous mixture)."""
     imbalance: float = 5e-3
@@ -91,6 +96,15 @@ class LecoModelConfig(ModelConfig):
     """What skipping may cost."""
     distortion: float = 0.05
     """Weight of the distortion loss, which clears haze (mip-NeRF 360, eq. 15)."""
+    termination: float = 0.03
+    """Weight, while the occupancy is learned, of ending rays at the sparse points they lead to."""
+    nearness: float = 0.03
+    """Weight, while the occupancy is learned, of taking the farther of two explanations of a ray:
+    a dark sky is no dark cloud before the camera. Comes in with the distortion loss."""
+    look_everywhere: float = 0.125
+    """Share of rays that shade all candidates while the others follow the gate being learned."""
+    likely_above: float = 0.05
+    """o(x) from which those others shade a candidate."""
     distortion_after: float = 0.04
     """Share of the distortion loss that stays when the first phase is over and detail is wanted."""
     homogeneous: bool = False
@@ -238,7 +252,30 @@ class LecoModel(Model):
             occupied=self.estimator.occupied if guided else None,
             near_occupied=self.estimator.questions()[1] if guided else None,
         )
-        return with_backdrop(Intervals(*samples), rays, size, angle)
+        intervals = Intervals(*samples)
+        if learning and self.ramped > 0.0 and self.config.look_everywhere < 1.0:
+            intervals = self._likely(intervals, rays)
+        return with_backdrop(intervals, rays, size, angle)
+
+    @torch.no_grad()
+    def _likely(self, intervals: Intervals, rays: Rays) -> Intervals:
+        """Leaves out what the gate, as far as it has learned, calls empty; some rays keep all."""
+        ray_indices, t_starts, t_ends = intervals
+        positions = torch.addcmul(
+            rays.origins.index_select(0, ray_indices),
+            rays.directions.index_select(0, ray_indices),
+            (0.5 * (t_starts + t_ends))[:, None],
+        )
+        mapped = self.space.map(positions).clamp(-1.0, 1.0)
+        with gate_precision(self.device.type, self.precision):
+            likely = self.gate.occupancy(mapped) >= self.config.likely_above
+        dense = torch.rand_like(rays.t_mins) < self.config.look_everywhere
+        kept = (likely | dense.index_select(0, ray_indices)).nonzero()[:, 0]
+        self.learning_kept = 0.9 * self.learning_kept + 0.1 * len(kept) / max(len(likely), 1)
+        return Intervals(*(part.index_select(0, kept) for part in intervals))
+
+    learning_kept = 1.0
+    """Share of candidates that are shaded while learning, a running mean."""
 
     def shade(self, rays: Rays, intervals: Intervals) -> Shaded:
         """Renders intervals in this device's fastest precision."""
@@ -296,6 +333,14 @@ class LecoModel(Model):
             losses["distortion_loss"] = weight * distortion_loss(
                 shaded.weights, starts, ends, shaded.packed_info
             )
+        if self.is_learning() and self.config.termination > 0.0 and DISTANCE in batch:
+            losses["termination_loss"] = self.config.termination * termination_loss(
+                shaded.weights, outputs["intervals"], batch[DISTANCE].to(self.device)
+            )
+        if self.is_learning() and self.config.nearness > 0.0:
+            near, far = self.march_range[:2]
+            nearness = ((far - shaded.depth) / (far - near)).mean()
+            losses["nearness_loss"] = self.config.nearness * self.ramped * nearness
         if not bool(self.frozen):
             losses |= self._gate_losses(shaded, outputs["intervals"], outputs["rays"])
         for name, value in losses.items():
@@ -324,7 +369,13 @@ class LecoModel(Model):
             contribution = contribution_loss(
                 logits.index_select(0, before), weights, config.weight_at_full, config.emphasis
             )
+            agreement = agreement_loss(
+                shaded.weights.index_select(0, before),
+                occupancy_from_logits(logits.index_select(0, before)),
+                config.empty_below,
+            ) / len(rays.origins)
             return {
+                "agreement_loss": config.agreement * self.ramped * agreement,
                 "contribution_loss": config.contribution * contribution,
                 "balance_loss": balance,
             }

@@ -30,6 +30,9 @@ from leco_plugin.models.phases import (
 )
 from leco_plugin.models.statistics import KEPT_ABOVE
 from leco_plugin.occupancy import gate_precision
+from leco_plugin.scenes.known_distances import KnownDistancePixelSampler
+from leco_plugin.scenes.photographs import POINTS
+from leco_plugin.scenes.sparse_pixels import sparse_pixels
 from leco_plugin.scenes.survey import survey
 
 if TYPE_CHECKING:
@@ -57,6 +60,9 @@ class Lifecycle:
         if not bool(model.bounds_known):
             model.set_bounds(self.survey.bounds, self.survey.median_length)
             CONSOLE.log(f"\\[leco] {self.survey.describe()}")
+        dataset = self.pipeline.datamanager.train_dataset
+        points = dataset.metadata.get(POINTS)
+        self.sparse = sparse_pixels(dataset.cameras, points) if points is not None else None
         self.rays_per_batch = int(self.pipeline.datamanager.get_train_rays_per_batch())
         self.decisions = torch.zeros(0, dtype=torch.bool)
         self.recoveries = 0
@@ -81,7 +87,12 @@ class Lifecycle:
         model.ramped = ramp(step, self.schedule)
         model.learned = not self.schedule.freeze and step >= self.schedule.learn_steps
         past_learning = bool(model.frozen) or model.learned
-        self._set_rays(self._guided_batch() if bool(model.frozen) else 1.0)
+        self._set_known_distances(not past_learning)
+        most = model.config.sizes.guided_batch
+        factor = (
+            self._guided_batch() if bool(model.frozen) else min(most, 1.0 / model.learning_kept)
+        )
+        self._set_rays(factor)
         if not past_learning:
             self.step_started = time.monotonic()
 
@@ -91,6 +102,11 @@ class Lifecycle:
         kept = 1.0 - float(self.model.report.get("empty_fraction", 0.0))
         same_samples = sizes.learn_candidates / max(1.0, kept * sizes.candidates)
         return min(sizes.guided_batch, max(0.5, same_samples))
+
+    def _set_known_distances(self, wanted: bool) -> None:
+        sampler = getattr(self.pipeline.datamanager, "train_pixel_sampler", None)
+        if isinstance(sampler, KnownDistancePixelSampler):
+            sampler.sparse = self.sparse if wanted and self.model.config.termination > 0.0 else None
 
     def _set_rays(self, factor: float) -> None:
         sampler = getattr(self.pipeline.datamanager, "train_pixel_sampler", None)

@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from leco_plugin.models.gate import EMPTY, occupancy_logit
+from leco_plugin.models.rendering import Intervals
 from leco_plugin.samplers.packed import exclusive_sum
 
 
@@ -97,6 +98,44 @@ def contribution_loss(
         emphasis * target * torch.nn.functional.softplus(-occupied)
         + (1.0 - target) * torch.nn.functional.softplus(occupied)
     ).mean()
+
+
+def agreement_loss(weights: Tensor, occupancies: Tensor, empty_below: float) -> Tensor:
+    """Rendering weight at places that the gate calls empty: sum of w max(0, 1 - o / empty_below).
+
+    The gate, being smooth, does not follow single specks of density that explain single pixels; the
+    field gives them up. Only the field is taught.
+
+    Args:
+        weights: [N] rendering weights.
+        occupancies: [N] o(x).
+        empty_below: o(x) from which the gate has no doubt left.
+    """
+    doubt = (1.0 - occupancies.detach() / empty_below).clamp(min=0.0)
+    return (weights * doubt).sum()
+
+
+def termination_loss(
+    weights: Tensor, intervals: Intervals, distances: Tensor, floor: float = 0.03
+) -> Tensor:
+    """Rays with a known distance end there: mean of -log(weight within one step of it + floor).
+
+    After the ray termination loss of DS-NeRF (Deng et al. 2022, eq. 6). The floor lets go of rays
+    that plainly end before: some points are seen through what hides them.
+
+    Args:
+        weights: [M] rendering weights.
+        intervals: [M] packed, scene units.
+        distances: [R] of each ray, scene units; 0 where it is not known.
+    Returns:
+        Scalar; zero when no distance is known.
+    """
+    known = distances.index_select(0, intervals.ray_indices)
+    middles = 0.5 * (intervals.t_starts + intervals.t_ends)
+    near = (middles - known).abs() <= intervals.t_ends - intervals.t_starts
+    there = torch.zeros_like(distances).index_add_(0, intervals.ray_indices, weights * near)
+    likelihoods = -torch.log(there.clamp(min=0.0) + floor)
+    return (likelihoods * (distances > 0)).sum() / (distances > 0).sum().clamp(min=1)
 
 
 def distortion_loss(

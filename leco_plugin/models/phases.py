@@ -18,7 +18,7 @@ class ScheduleConfig:
 
     freeze: bool = True
     """Whether the gate is ever frozen; False is the plain HMoE, for comparison."""
-    learn_steps: int = 300
+    learn_steps: int = 200
     """Steps after which the gate is frozen even if its decisions still change."""
     earliest: float = 0.85
     """Share of `learn_steps` before which it is never frozen."""

@@ -9,6 +9,7 @@ from torch import Tensor
 
 from leco_plugin.models.field import HMoEField
 from leco_plugin.models.gate import Gate, occupancy_from_logits, route
+from leco_plugin.models.rows import select_rows
 from leco_plugin.samplers.packed import (
     accumulate_along_rays,
     pack_info,
@@ -179,10 +180,9 @@ def shade(
         t_starts / scale, t_ends / scale, absorbing, packed_info=packed_info
     )
     visible = (weights.detach() > VISIBLE).nonzero()[:, 0]
-    rays_seen = ray_indices[visible]
-    images = rays.images[rays_seen] if rays.images is not None else None
-    colors = field.color(features[visible], rays.directions[rays_seen], images)
-    rgb = accumulate_along_rays(weights[visible], colors, rays_seen, num_rays)
+    rays_seen = ray_indices.index_select(0, visible)
+    colors = field.color(select_rows(features, visible), rays_seen, rays.directions, rays.images)
+    rgb = accumulate_along_rays(select_rows(weights, visible), colors, rays_seen, num_rays)
     sums = accumulate_along_rays(
         weights, torch.stack([torch.ones_like(middles), middles], dim=-1), ray_indices, num_rays
     )

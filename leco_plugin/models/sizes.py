@@ -18,7 +18,7 @@ class Sizes:
     """The gating network."""
     field: FieldConfig = field(default_factory=FieldConfig)
     """The radiance field with its experts."""
-    learn_candidates: int = 64
+    learn_candidates: int = 32
     """Candidates along a ray while the occupancy is learned."""
     guided_batch: float = 3.0
     """Most rays of a guided batch, as a multiple of those before: their samples are mostly skipped,
@@ -38,7 +38,7 @@ LARGE = Sizes(
         appearance_dim=32,
         color_width=128,
     ),
-    learn_candidates=128,
+    learn_candidates=96,
     candidates=512,
 )
 """One GPU."""

@@ -57,7 +57,7 @@ def find_bounds(camera_to_worlds: Tensor, directions: Tensor, points: Tensor | N
     directions = directions.detach().float().cpu()
     low, high = _quantiles(points, 0.001), _quantiles(points, 0.999)
     depths = _depths(poses, directions, points)
-    near, far = 0.5 * float(_quantiles(depths, 0.01)), 1.25 * float(_quantiles(depths, 0.999))
+    near, far = 0.75 * float(_quantiles(depths, 0.01)), 1.25 * float(_quantiles(depths, 0.999))
     if _seen_from_above(poses, directions, points):
         return _slab(poses, directions, float(low[2]), float(high[2]), near, far)
     half = float((high - low).max()) / 2

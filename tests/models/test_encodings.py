@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 import math
 
 import torch
@@ -20,18 +19,21 @@ def slow_frequency(x: list[float], octaves: int) -> list[float]:
 
 
 def slow_hash(encoding: HashEncoding, x: list[float], table: Tensor) -> Tensor:
-    """Instant-NGP, section 3, for one point in [-1, 1]^3."""
+    """Instant-NGP, section 3, interpolated over a tetrahedron, for one point in [-1, 1]^3."""
     size, parts = encoding.mask + 1, []
     for level, resolution in enumerate(encoding.resolutions.tolist()):
         cell = [(value * 0.5 + 0.5) * resolution for value in x]
-        total = torch.zeros(table.shape[1], dtype=table.dtype)
-        for corner in itertools.product((0, 1), repeat=3):
-            number, weight = 0, 1.0
-            for value, up, prime in zip(cell, corner, PRIMES):
-                base = math.floor(value)
-                number ^= (base + up) * prime
-                weight *= value - base if up else 1.0 - (value - base)
+        base = [math.floor(value) for value in cell]
+        inside = [value - low for value, low in zip(cell, base)]
+        walk = sorted(range(3), key=lambda axis: -inside[axis])
+        heights = [1.0, *(inside[axis] for axis in walk), 0.0]
+        corner, total = list(base), torch.zeros(table.shape[1], dtype=table.dtype)
+        for step in range(4):
+            number = corner[0] * PRIMES[0] ^ corner[1] * PRIMES[1] ^ corner[2] * PRIMES[2]
+            weight = heights[step] - heights[step + 1]
             total = total + weight * table[level * size + number % size]
+            if step < 3:
+                corner[walk[step]] += 1
         parts.append(total)
     return torch.cat(parts)
 
@@ -68,7 +70,7 @@ def test_hash_gradients_are_those_of_the_definition() -> None:
     torch.testing.assert_close(encoding.table.grad, table.grad, rtol=0, atol=1e-5)
 
 
-def test_trilinear_weights_sum_to_one() -> None:
+def test_interpolation_weights_sum_to_one() -> None:
     _, weights = hash_encoding().rows_and_weights(torch.rand(100, 3) * 2 - 1)
     torch.testing.assert_close(weights.sum(dim=-1), torch.ones_like(weights[:, 0]))
 
@@ -78,7 +80,7 @@ def test_rows_stay_in_the_table_of_their_level() -> None:
     rows, _ = encoding.rows_and_weights(torch.rand(100, 3) * 2 - 1)
     size = encoding.mask + 1
     assert torch.equal(
-        rows.view(100, 3, 8) // size, torch.arange(3).view(1, 3, 1).expand(100, 3, 8)
+        rows.view(100, 3, 4) // size, torch.arange(3).view(1, 3, 1).expand(100, 3, 4)
     )
 
 
