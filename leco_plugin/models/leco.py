@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field
-from typing import Any, Literal
+from typing import Any
 
 import torch
 from nerfstudio.cameras.rays import RayBundle
@@ -17,17 +17,9 @@ from leco_plugin.compat.checkpoints import allow_checkpoint_globals
 from leco_plugin.evaluation.metrics import image_metrics
 from leco_plugin.models.calibration import CalibrationConfig
 from leco_plugin.models.field import HMoEField
-from leco_plugin.models.gate import Gate, occupancy_from_logits
-from leco_plugin.models.losses import (
-    agreement_loss,
-    balance_loss,
-    contribution_loss,
-    density_loss,
-    distortion_loss,
-    imbalanced_gate_loss,
-    termination_loss,
-    widen,
-)
+from leco_plugin.models.gate import Gate
+from leco_plugin.models.losses import distortion_loss, termination_loss
+from leco_plugin.models.objective import GateLossConfig, gate_losses
 from leco_plugin.models.phases import ScheduleConfig
 from leco_plugin.models.precision import fast_precision, keep_freed_memory
 from leco_plugin.models.rendering import (
@@ -35,7 +27,6 @@ from leco_plugin.models.rendering import (
     Rays,
     Routing,
     Shaded,
-    backdrop_of,
     per_ray_pictures,
     shade,
     with_backdrop,
@@ -48,32 +39,6 @@ from leco_plugin.samplers.rays import intersect_box
 from leco_plugin.scenes.bounds import SceneBounds
 from leco_plugin.scenes.known_distances import DISTANCE
 from leco_plugin.space import Space
-
-
-@dataclass
-class GateLossConfig:
-    """What teaches the gate."""
-
-    form: Literal["logit", "paper"] = "logit"
-    """Contribution in logit form, or imbalanced gate loss and density loss as in the paper."""
-    contribution: float = 0.02
-    """Weight of the contribution loss (logit form)."""
-    weight_at_full: float = 0.15
-    """w_0: rendering weight that makes a sample fully occupied (logit form)."""
-    emphasis: float = 8.0
-    """k: how much dearer a lost contribution is than a needless sample (logit form)."""
-    empty_below: float = 0.2
-    """o(x) below which a point goes to the empty-space expert (logit form; the paper: argmax)."""
-    agreement: float = 0.1
-    """Weight of the field giving up what the gate calls empty (logit form)."""
-    balance: float = 5e-3
-    """Weight of the balance among scene experts (logit form, and the homogeneous mixture)."""
-    imbalance: float = 5e-3
-    """lambda_g, weight of the imbalanced gate loss (paper form)."""
-    empty_ratio: float = 0.9
-    """rho, the target empty ratio (paper form)."""
-    density: float = 1.0
-    """lambda_d, weight of the density loss (paper form)."""
 
 
 @dataclass
@@ -253,7 +218,8 @@ class LecoModel(Model):
             near_occupied=self.estimator.questions()[1] if guided else None,
         )
         intervals = Intervals(*samples)
-        if learning and self.ramped > 0.0 and self.config.look_everywhere < 1.0:
+        # a homogeneous gate is taught nothing about emptiness
+        if learning and self.ramped > 0.0 and not self.config.homogeneous:
             intervals = self._likely(intervals, rays)
         return with_backdrop(intervals, rays, size, angle)
 
@@ -342,51 +308,21 @@ class LecoModel(Model):
             nearness = ((far - shaded.depth) / (far - near)).mean()
             losses["nearness_loss"] = self.config.nearness * self.ramped * nearness
         if not bool(self.frozen):
-            losses |= self._gate_losses(shaded, outputs["intervals"], outputs["rays"])
+            losses |= gate_losses(
+                self.config.gate_loss,
+                shaded,
+                outputs["intervals"],
+                outputs["rays"],
+                homogeneous=self.config.homogeneous,
+                ramped=self.ramped,
+                half_extent=self.space.half_extent,
+            )
         for name, value in losses.items():
             if not math.isfinite(float(value.detach())):
                 from leco_plugin.models.failures import explain_non_finite
 
                 raise FloatingPointError(explain_non_finite(name, self, outputs, image))
         return losses
-
-    def _gate_losses(self, shaded: Shaded, intervals: Intervals, rays: Rays) -> dict[str, Tensor]:
-        config, logits, routes = self.config.gate_loss, shaded.logits, shaded.routes
-        on_scene = (routes > 0).nonzero()[:, 0]
-        balance = logits.new_zeros(())
-        if len(on_scene) > 0 and logits.shape[-1] > 2:
-            probabilities = logits[on_scene, 1:].softmax(dim=-1)
-            balance = config.balance * balance_loss(probabilities, routes[on_scene] - 1)
-        if self.config.homogeneous:
-            return {"balance_loss": balance}
-        if config.form == "logit":
-            # the backdrop is kept anyway, and says nothing about where a ray happens to end
-            before = (~backdrop_of(intervals, rays)).nonzero()[:, 0]
-            weights = widen(
-                shaded.weights.detach().index_select(0, before),
-                intervals.ray_indices.index_select(0, before),
-            )
-            contribution = contribution_loss(
-                logits.index_select(0, before), weights, config.weight_at_full, config.emphasis
-            )
-            agreement = agreement_loss(
-                shaded.weights.index_select(0, before),
-                occupancy_from_logits(logits.index_select(0, before)),
-                config.empty_below,
-            ) / len(rays.origins)
-            return {
-                "agreement_loss": config.agreement * self.ramped * agreement,
-                "contribution_loss": config.contribution * contribution,
-                "balance_loss": balance,
-            }
-        probabilities = logits.softmax(dim=-1)
-        lengths = (intervals.t_ends - intervals.t_starts) / self.space.half_extent
-        alphas = 1.0 - torch.exp(-shaded.sigmas * lengths)
-        return {
-            "gate_loss": config.imbalance
-            * imbalanced_gate_loss(probabilities, routes, config.empty_ratio),
-            "density_loss": config.density * density_loss(probabilities[:, 0], alphas),
-        }
 
     @torch.no_grad()
     def get_metrics_dict(

@@ -60,7 +60,7 @@ class Lifecycle:
         if not bool(model.bounds_known):
             model.set_bounds(self.survey.bounds, self.survey.median_length)
             CONSOLE.log(f"\\[leco] {self.survey.describe()}")
-        dataset = self.pipeline.datamanager.train_dataset
+        dataset: Any = self.pipeline.datamanager.train_dataset
         points = dataset.metadata.get(POINTS)
         self.sparse = sparse_pixels(dataset.cameras, points) if points is not None else None
         self.rays_per_batch = int(self.pipeline.datamanager.get_train_rays_per_batch())

@@ -2,19 +2,24 @@
 
 from __future__ import annotations
 
+import math
+
 import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from leco_plugin.models.losses import (
+    agreement_loss,
     balance_loss,
     contribution_loss,
     density_loss,
     distortion_loss,
     expert_shares,
     imbalanced_gate_loss,
+    termination_loss,
 )
+from leco_plugin.models.rendering import Intervals
 from leco_plugin.samplers.packed import pack_info
 
 
@@ -125,3 +130,46 @@ def test_distortion_of_nothing_is_zero() -> None:
     for rays in (0, 3):
         info = pack_info(torch.zeros(0, dtype=torch.int64), rays)
         assert float(distortion_loss(nothing, nothing, nothing, info)) == 0.0
+
+
+def two_rays() -> Intervals:
+    """Two rays of four samples one unit long."""
+    starts = torch.arange(4.0).repeat(2)
+    return Intervals(torch.arange(2).repeat_interleave(4), starts, starts + 1.0)
+
+
+def test_termination_is_least_where_all_weight_lies_at_the_known_distance() -> None:
+    distances = torch.tensor([2.5, 0.0])
+    there = torch.tensor([0.0, 0.0, 1.0, 0.0, 1.0, 0.0, 0.0, 0.0])
+    elsewhere = there.roll(2)
+    best = termination_loss(there, two_rays(), distances)
+    torch.testing.assert_close(best, torch.tensor(-math.log(1.03)))
+    assert termination_loss(elsewhere, two_rays(), distances) > best + 3.0
+
+
+def test_termination_lets_go_of_a_ray_that_plainly_ends_before() -> None:
+    def pull(weight_there: float) -> float:
+        weights = torch.tensor([0.0, 0.0, 0.0, weight_there, 0.0, 0.0, 0.0, 0.0])
+        weights.requires_grad_()
+        termination_loss(weights, two_rays(), torch.tensor([3.5, 0.0])).backward()
+        assert weights.grad is not None
+        return weight_there * float(weights.grad[3].abs())
+
+    assert pull(1e-3) < 0.05 < 0.7 < pull(0.1)
+
+
+def test_termination_without_known_distances_is_zero() -> None:
+    weights = torch.rand(8, requires_grad=True)
+    loss = termination_loss(weights, two_rays(), torch.zeros(2))
+    loss.backward()
+    assert float(loss.detach()) == 0.0 and weights.grad is not None and not bool(weights.grad.any())
+
+
+def test_agreement_teaches_the_field_alone_and_only_where_the_gate_says_empty() -> None:
+    weights = torch.full((3,), 0.5, requires_grad=True)
+    occupancies = torch.tensor([0.0, 0.1, 0.9], requires_grad=True)
+    loss = agreement_loss(weights, occupancies, 0.2)
+    loss.backward()
+    torch.testing.assert_close(weights.grad, torch.tensor([1.0, 0.5, 0.0]))
+    assert occupancies.grad is None
+    torch.testing.assert_close(loss.detach(), torch.tensor(0.75))

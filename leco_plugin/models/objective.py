@@ -1,0 +1,101 @@
+"""What teaches the gate, put together: which losses, with which weights, on which samples."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+import torch
+from torch import Tensor
+
+from leco_plugin.models.gate import occupancy_from_logits
+from leco_plugin.models.losses import (
+    agreement_loss,
+    balance_loss,
+    contribution_loss,
+    density_loss,
+    imbalanced_gate_loss,
+    widen,
+)
+from leco_plugin.models.rendering import Intervals, Rays, Shaded, backdrop_of
+
+
+@dataclass
+class GateLossConfig:
+    """What teaches the gate."""
+
+    form: Literal["logit", "paper"] = "logit"
+    """Contribution in logit form, or imbalanced gate loss and density loss as in the paper."""
+    contribution: float = 0.02
+    """Weight of the contribution loss (logit form)."""
+    weight_at_full: float = 0.15
+    """w_0: rendering weight that makes a sample fully occupied (logit form)."""
+    emphasis: float = 8.0
+    """k: how much dearer a lost contribution is than a needless sample (logit form)."""
+    empty_below: float = 0.2
+    """o(x) below which a point goes to the empty-space expert (logit form; the paper: argmax)."""
+    agreement: float = 0.1
+    """Weight of the field giving up what the gate calls empty (logit form)."""
+    balance: float = 5e-3
+    """Weight of the balance among scene experts (logit form, and the homogeneous mixture)."""
+    imbalance: float = 5e-3
+    """lambda_g, weight of the imbalanced gate loss (paper form)."""
+    empty_ratio: float = 0.9
+    """rho, the target empty ratio (paper form)."""
+    density: float = 1.0
+    """lambda_d, weight of the density loss (paper form)."""
+
+
+def gate_losses(
+    config: GateLossConfig,
+    shaded: Shaded,
+    intervals: Intervals,
+    rays: Rays,
+    *,
+    homogeneous: bool,
+    ramped: float,
+    half_extent: Tensor,
+) -> dict[str, Tensor]:
+    """Weighted losses of one batch, by name.
+
+    Args:
+        homogeneous: only the balance among the scene experts.
+        ramped: how far the distortion loss has come in, in [0, 1]; agreement comes in with it.
+        half_extent: scalar, scene units in the unit of density.
+    """
+    logits, routes = shaded.logits, shaded.routes
+    on_scene = (routes > 0).nonzero()[:, 0]
+    balance = logits.new_zeros(())
+    if len(on_scene) > 0 and logits.shape[-1] > 2:
+        probabilities = logits[on_scene, 1:].softmax(dim=-1)
+        balance = config.balance * balance_loss(probabilities, routes[on_scene] - 1)
+    if homogeneous:
+        return {"balance_loss": balance}
+    if config.form == "logit":
+        # the backdrop is kept anyway, and says nothing about where a ray happens to end
+        before = (~backdrop_of(intervals, rays)).nonzero()[:, 0]
+        weights = widen(
+            shaded.weights.detach().index_select(0, before),
+            intervals.ray_indices.index_select(0, before),
+        )
+        contribution = contribution_loss(
+            logits.index_select(0, before), weights, config.weight_at_full, config.emphasis
+        )
+        agreement = agreement_loss(
+            shaded.weights.index_select(0, before),
+            occupancy_from_logits(logits.index_select(0, before)),
+            config.empty_below,
+        ) / len(rays.origins)
+        return {
+            "agreement_loss": config.agreement * ramped * agreement,
+            "contribution_loss": config.contribution * contribution,
+            "balance_loss": balance,
+        }
+    probabilities = logits.softmax(dim=-1)
+    lengths = (intervals.t_ends - intervals.t_starts) / half_extent
+    alphas = 1.0 - torch.exp(-shaded.sigmas * lengths)
+    return {
+        "gate_loss": config.imbalance
+        * imbalanced_gate_loss(probabilities, routes, config.empty_ratio),
+        "density_loss": config.density * density_loss(probabilities[:, 0], alphas),
+    }

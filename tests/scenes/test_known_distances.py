@@ -1,0 +1,68 @@
+"""A batch says which of its rays have a known distance, and says it of the right ones."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+import torch
+
+from leco_plugin.scenes.known_distances import (
+    DISTANCE,
+    KnownDistancePixelSampler,
+    KnownDistancePixelSamplerConfig,
+)
+from leco_plugin.scenes.sparse_pixels import SparsePixels
+
+
+def images() -> dict[str, Any]:
+    """Three images whose colours are their pixels' places; their own numbers are 7, 8, 9."""
+    places = torch.meshgrid(torch.arange(3), torch.arange(20), torch.arange(30), indexing="ij")
+    return {"image": torch.stack(places, dim=-1).float(), "image_idx": torch.tensor([7, 8, 9])}
+
+
+def known() -> SparsePixels:
+    """Pixels of the images 6 to 9, whose distances tell them apart; image 6 is not loaded."""
+    numbers = torch.arange(40)
+    indices = torch.stack([6 + numbers % 4, numbers % 20, numbers % 30], dim=-1)
+    return SparsePixels(indices, 1.0 + numbers.float())
+
+
+def sampler() -> KnownDistancePixelSampler:
+    made = KnownDistancePixelSamplerConfig(num_rays_per_batch=400).setup()
+    assert isinstance(made, KnownDistancePixelSampler)
+    return made
+
+
+def test_nothing_is_added_as_long_as_no_point_is_known() -> None:
+    assert DISTANCE not in sampler().sample(images())
+
+
+@pytest.mark.parametrize("kind", ["tensor", "list"])
+def test_known_rays_have_the_colour_the_place_and_the_distance_of_their_pixel(kind: str) -> None:
+    torch.manual_seed(0)
+    made, batch = sampler(), images()
+    made.sparse = known()
+    if kind == "list":
+        batch["image"] = list(batch["image"])
+    pixels = made.sample(batch)
+    found = pixels[DISTANCE]
+    assert found.shape == (400,) and 50 < int((found > 0).sum()) <= 100
+    for row in (found > 0).nonzero()[:, 0].tolist():
+        number = round(float(found[row])) - 1
+        expected = known().indices[number]
+        assert expected[0] > 6
+        assert torch.equal(pixels["indices"][row], expected)
+        colour = torch.tensor([int(expected[0]) - 7, *expected[1:].tolist()]).float()
+        assert torch.equal(pixels["image"][row].float(), colour)
+
+
+def test_masked_pixels_are_left_out() -> None:
+    torch.manual_seed(0)
+    made, batch = sampler(), images()
+    made.sparse = known()
+    batch["mask"] = torch.ones(3, 20, 30, 1, dtype=torch.bool)
+    batch["mask"][1] = False
+    pixels = made.sample(batch)
+    assert int((pixels[DISTANCE] > 0).sum()) > 20
+    assert 8 not in pixels["indices"][:, 0].tolist()
