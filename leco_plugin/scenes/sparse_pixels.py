@@ -21,6 +21,10 @@ NEARER = 0.9
 POINTS_PER_CELL = 2.0
 """Points that share a cell of the coarse depth map, on average."""
 FEWEST_POINTS = 32
+MOST_POINTS = 50_000
+"""Of a larger cloud so many points are drawn: 5 ms for each image."""
+MOST_PIXELS = 4_000_000
+"""Of all images together: about 110 MB."""
 
 
 class SparsePixels(NamedTuple):
@@ -40,7 +44,8 @@ def sparse_pixels(cameras: Cameras, points: Tensor) -> SparsePixels:
         points: [P, 3] in the same coordinates.
     """
     cameras = cameras.to("cpu")
-    points = points.detach().float().cpu()
+    points = _at_most(MOST_POINTS, points.detach().float().cpu())
+    for_each_image = MOST_PIXELS // max(len(cameras), 1)
     indices, distances = [torch.zeros(0, 3, dtype=torch.long)], [torch.zeros(0)]
     for number in range(len(cameras) if len(points) >= FEWEST_POINTS else 0):
         if int(cameras.camera_type[number]) != CameraType.PERSPECTIVE.value:
@@ -53,9 +58,17 @@ def sparse_pixels(cameras: Cameras, points: Tensor) -> SparsePixels:
         seen = ~hidden(pixels, lengths, height, width)
         found = torch.cat([torch.full((len(pixels), 1), number), pixels], dim=-1)
         seen &= ~is_held_out(found)
-        indices.append(found[seen])
-        distances.append(lengths[seen])
+        chosen = _at_most(for_each_image, seen.nonzero()[:, 0])
+        indices.append(found[chosen])
+        distances.append(lengths[chosen])
     return SparsePixels(torch.cat(indices), torch.cat(distances))
+
+
+def _at_most(most: int, rows: Tensor) -> Tensor:
+    """The rows, or so many of them, drawn evenly and always the same."""
+    if len(rows) <= most:
+        return rows
+    return rows[torch.randperm(len(rows), generator=torch.Generator().manual_seed(0))[:most]]
 
 
 def project(cameras: Cameras, number: int, points: Tensor) -> tuple[Tensor, Tensor]:

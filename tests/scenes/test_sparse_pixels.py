@@ -75,3 +75,13 @@ def test_only_plainly_nearer_neighbours_hide_a_point() -> None:
     lengths[0], lengths[2] = 1.0, 1.05
     assert hidden(pixels, lengths, HEIGHT, WIDTH).tolist()[:4] == [False, True, False, False]
     assert not bool(hidden(pixels, lengths, HEIGHT, WIDTH)[4:].any())
+
+
+def test_large_clouds_are_thinned_the_same_way_each_time(monkeypatch) -> None:
+    from leco_plugin.scenes import sparse_pixels as module
+
+    monkeypatch.setattr(module, "MOST_POINTS", 200)
+    monkeypatch.setattr(module, "MOST_PIXELS", 60)
+    first, second = sparse_pixels(cameras(), ground()), sparse_pixels(cameras(), ground())
+    assert len(first.distances) == 60
+    assert torch.equal(first.indices, second.indices)
