@@ -85,34 +85,32 @@ def sampling_table(report: dict[str, Any]) -> str:
     return "\n".join(rows)
 
 
+def section(
+    title: str, command: str, report: dict[str, Any], table: str, note: str = ""
+) -> list[str]:
+    """Title, the command and the machine that made the table, and the table."""
+    return [f"## {title}\n", f"`{command}`; {machine_line(report)}.{note}\n", f"{table}\n"]
+
+
 def page() -> str:
     """The whole of `docs/results.md`."""
     parts = [HEAD]
     demo = RESULTS / "demo.json"
     if demo.exists():
         report = json.loads(demo.read_text())
-        parts += [
-            "## The demo: procedural city, one seed\n",
-            f"`leco demo`; {machine_line(report)}.\n",
-            demo_table(report) + "\n",
-        ]
+        title = "The demo: procedural city, one seed"
+        parts += section(title, "leco demo", report, demo_table(report))
     for path in sorted(RESULTS.glob("equal-time-*.json")):
         report = json.loads(path.read_text())
         scene, seconds = report["scene"]["name"], report["seconds"]
         command = f"python benchmarks/equal_time.py --data {scene} --seconds {seconds:g}"
-        parts += [
-            f"## Equal time: `{scene}`, {seconds:g} s of training\n",
-            f"`{command}`; {machine_line(report)}.\n",
-            equal_time_table(report) + "\n",
-        ]
+        title = f"Equal time: `{scene}`, {seconds:g} s of training"
+        parts += section(title, command, report, equal_time_table(report))
     sampling = RESULTS / "sampling.json"
     if sampling.exists():
         report = json.loads(sampling.read_text())
-        parts += [
-            "## Sampling\n",
-            f"`python benchmarks/sampling.py`; {machine_line(report)}. Ratios within one run.\n",
-            sampling_table(report) + "\n",
-        ]
+        command, note = "python benchmarks/sampling.py", " Ratios within one run."
+        parts += section("Sampling", command, report, sampling_table(report), note)
     return "\n".join(parts)
 
 

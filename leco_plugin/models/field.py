@@ -57,6 +57,8 @@ class _TruncatedExponential(torch.autograd.Function):
 class HMoEField(nn.Module):
     """Density and colour of mapped positions, each computed by the expert that the gate chose."""
 
+    opponent: Tensor
+
     def __init__(self, config: FieldConfig, num_images: int) -> None:
         super().__init__()
         self.config = config
@@ -76,6 +78,7 @@ class HMoEField(nn.Module):
         self.color_in = nn.Linear(width, config.color_width)
         self.color_of_ray = nn.Linear(of_ray, config.color_width, bias=False)
         self.color_out = nn.Linear(config.color_width, 3)
+        self.register_buffer("opponent", OPPONENT.clone(), persistent=False)
 
     def density(self, mapped: Tensor, routes: Tensor, gate_values: Tensor) -> tuple[Tensor, Tensor]:
         """Density and the features that colour is made of.
@@ -124,4 +127,4 @@ class HMoEField(nn.Module):
             features.dtype
         ).index_select(0, ray_indices)
         opponent = self.color_out(torch.relu(hidden)).float()
-        return torch.sigmoid(opponent @ OPPONENT.to(opponent.device))
+        return torch.sigmoid(opponent @ self.opponent)

@@ -27,6 +27,7 @@ from leco_plugin.models.rendering import (
     Rays,
     Routing,
     Shaded,
+    mapped_middles,
     per_ray_pictures,
     shade,
     with_backdrop,
@@ -226,17 +227,11 @@ class LecoModel(Model):
     @torch.no_grad()
     def _likely(self, intervals: Intervals, rays: Rays) -> Intervals:
         """Leaves out what the gate, as far as it has learned, calls empty; some rays keep all."""
-        ray_indices, t_starts, t_ends = intervals
-        positions = torch.addcmul(
-            rays.origins.index_select(0, ray_indices),
-            rays.directions.index_select(0, ray_indices),
-            (0.5 * (t_starts + t_ends))[:, None],
-        )
-        mapped = self.space.map(positions).clamp(-1.0, 1.0)
+        mapped = mapped_middles(self.space, rays, intervals)
         with gate_precision(self.device.type, self.precision):
             likely = self.gate.occupancy(mapped) >= self.config.likely_above
         dense = torch.rand_like(rays.t_mins) < self.config.look_everywhere
-        kept = (likely | dense.index_select(0, ray_indices)).nonzero()[:, 0]
+        kept = (likely | dense.index_select(0, intervals.ray_indices)).nonzero()[:, 0]
         self.learning_kept = 0.9 * self.learning_kept + 0.1 * len(kept) / max(len(likely), 1)
         return Intervals(*(part.index_select(0, kept) for part in intervals))
 
@@ -290,21 +285,21 @@ class LecoModel(Model):
         image = batch["image"].to(self.device)
         truth = self.renderer_rgb.blend_background(image)
         losses = {"rgb_loss": torch.nn.functional.mse_loss(shaded.rgb, truth)}
+        near, far = self.march_range[:2]
+        learning = self.is_learning()
         weight = self.config.distortion * self.ramped
-        if not self.is_learning():
+        if not learning:
             weight *= self.config.distortion_after
         if weight > 0.0:
-            near, far = self.march_range[:2]
             starts, ends = ((t - near) / (far - near) for t in outputs["intervals"][1:])
             losses["distortion_loss"] = weight * distortion_loss(
                 shaded.weights, starts, ends, shaded.packed_info
             )
-        if self.is_learning() and self.config.termination > 0.0 and DISTANCE in batch:
+        if learning and self.config.termination > 0.0 and DISTANCE in batch:
             losses["termination_loss"] = self.config.termination * termination_loss(
                 shaded.weights, outputs["intervals"], batch[DISTANCE].to(self.device)
             )
-        if self.is_learning() and self.config.nearness > 0.0:
-            near, far = self.march_range[:2]
+        if learning and self.config.nearness > 0.0:
             nearness = ((far - shaded.depth) / (far - near)).mean()
             losses["nearness_loss"] = self.config.nearness * self.ramped * nearness
         if not bool(self.frozen):

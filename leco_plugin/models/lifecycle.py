@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from dataclasses import replace
+from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -32,7 +33,7 @@ from leco_plugin.models.statistics import KEPT_ABOVE
 from leco_plugin.occupancy import gate_precision
 from leco_plugin.scenes.known_distances import KnownDistancePixelSampler
 from leco_plugin.scenes.photographs import POINTS
-from leco_plugin.scenes.sparse_pixels import sparse_pixels
+from leco_plugin.scenes.sparse_pixels import SparsePixels, sparse_pixels
 from leco_plugin.scenes.survey import survey
 
 if TYPE_CHECKING:
@@ -60,9 +61,6 @@ class Lifecycle:
         if not bool(model.bounds_known):
             model.set_bounds(self.survey.bounds, self.survey.median_length)
             CONSOLE.log(f"\\[leco] {self.survey.describe()}")
-        dataset: Any = self.pipeline.datamanager.train_dataset
-        points = dataset.metadata.get(POINTS)
-        self.sparse = sparse_pixels(dataset.cameras, points) if points is not None else None
         self.rays_per_batch = int(self.pipeline.datamanager.get_train_rays_per_batch())
         self.decisions = torch.zeros(0, dtype=torch.bool)
         self.recoveries = 0
@@ -102,6 +100,13 @@ class Lifecycle:
         kept = 1.0 - float(self.model.report.get("empty_fraction", 0.0))
         same_samples = sizes.learn_candidates / max(1.0, kept * sizes.candidates)
         return min(sizes.guided_batch, max(0.5, same_samples))
+
+    @cached_property
+    def sparse(self) -> SparsePixels | None:
+        """Where sparse points are seen; projected only once learning asks for it."""
+        dataset: Any = self.pipeline.datamanager.train_dataset
+        points = dataset.metadata.get(POINTS)
+        return sparse_pixels(dataset.cameras, points) if points is not None else None
 
     def _set_known_distances(self, wanted: bool) -> None:
         sampler = getattr(self.pipeline.datamanager, "train_pixel_sampler", None)

@@ -145,6 +145,17 @@ def backdrop_of(intervals: Intervals, rays: Rays) -> Tensor:
     return intervals.t_ends >= ends.index_select(0, intervals.ray_indices)
 
 
+def mapped_middles(space: Space, rays: Rays, intervals: Intervals) -> Tensor:
+    """Middles of packed intervals as gate and field take them: [M, 3] in [-1, 1]."""
+    ray_indices, t_starts, t_ends = intervals
+    positions = torch.addcmul(
+        rays.origins.index_select(0, ray_indices),
+        rays.directions.index_select(0, ray_indices),
+        (0.5 * (t_starts + t_ends))[:, None],
+    )
+    return space.map(positions).clamp(-1.0, 1.0)
+
+
 def shade(
     field: HMoEField,
     gate: Gate,
@@ -162,12 +173,7 @@ def shade(
     num_rays = len(rays.origins)
     ray_indices, t_starts, t_ends = intervals
     middles = 0.5 * (t_starts + t_ends)
-    positions = torch.addcmul(
-        rays.origins.index_select(0, ray_indices),
-        rays.directions.index_select(0, ray_indices),
-        middles[:, None],
-    )
-    mapped = space.map(positions).clamp(-1.0, 1.0)
+    mapped = mapped_middles(space, rays, intervals)
     with torch.set_grad_enabled(torch.is_grad_enabled() and not freeze_gate):
         logits = gate(mapped)
         gate_values, routes = gate_values_and_routes(logits, routing)

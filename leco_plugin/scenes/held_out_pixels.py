@@ -25,6 +25,20 @@ def is_held_out(indices: Tensor) -> Tensor:
     return ((indices[:, 1] % PERIOD == _OFFSET) & (indices[:, 2] % PERIOD == _OFFSET)).bool()
 
 
+def look_up(source: Any, which: Tensor, places: Tensor) -> Tensor:
+    """Values of pixels: [K, ...].
+
+    Args:
+        source: images [P, H, W, ...], or a list of [H, W, ...].
+        which: [K] int64, number of the image in `source`.
+        places: [K, 2] int64, row and column.
+    """
+    rows, columns = places.unbind(dim=-1)
+    if isinstance(source, Tensor):
+        return source[which.to(source.device), rows.to(source.device), columns.to(source.device)]
+    return torch.stack([source[i][r, c] for i, r, c in zip(which, rows, columns)])
+
+
 def _stepping_aside(sample: Callable[..., Tensor]) -> Callable[..., Tensor]:
     """One of nerfstudio's ways to draw pixels, with held-out pixels giving way to others."""
 
@@ -89,16 +103,10 @@ class HeldOutPixelSampler(PixelSampler):
         sizes = torch.tensor([picture.shape[:2] for picture in pictures])[which]
         cells = ((sizes - _OFFSET - 1) // PERIOD + 1).clamp(min=1)
         places = (torch.rand(count, 2, generator=generator) * cells).long() * PERIOD + _OFFSET
-        rows, columns = torch.minimum(places, sizes - 1).unbind(dim=-1)
+        places = torch.minimum(places, sizes - 1)
         if "mask" in images:
-            masks = images["mask"]
-            seen = torch.tensor(
-                [bool(masks[i][r, c].all()) for i, r, c in zip(which, rows, columns)]
-            )
-            which, rows, columns = which[seen], rows[seen], columns[seen]
-        if isinstance(pictures, Tensor):
-            colors = pictures[which, rows, columns]
-        else:
-            colors = torch.stack([pictures[i][r, c] for i, r, c in zip(which, rows, columns)])
+            seen = look_up(images["mask"], which, places).flatten(1).all(dim=1).cpu()
+            which, places = which[seen], places[seen]
+        colors = look_up(pictures, which, places)
         numbers = torch.as_tensor(images["image_idx"]).cpu()[which]
-        return {"image": colors, "indices": torch.stack([numbers, rows, columns], dim=-1)}
+        return {"image": colors, "indices": torch.cat([numbers[:, None], places], dim=-1)}

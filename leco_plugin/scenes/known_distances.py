@@ -6,9 +6,12 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import torch
-from torch import Tensor
 
-from leco_plugin.scenes.held_out_pixels import HeldOutPixelSampler, HeldOutPixelSamplerConfig
+from leco_plugin.scenes.held_out_pixels import (
+    HeldOutPixelSampler,
+    HeldOutPixelSamplerConfig,
+    look_up,
+)
 from leco_plugin.scenes.sparse_pixels import SparsePixels
 
 DISTANCE = "known_distance"
@@ -53,20 +56,16 @@ class KnownDistancePixelSampler(HeldOutPixelSampler):
         places = place_of[pixels[:, 0]]
         loaded = places >= 0
         if "mask" in images:
-            loaded &= _look_up(images["mask"], places.clamp(min=0), pixels).flatten(1).all(dim=1)
+            loaded &= (
+                look_up(images["mask"], places.clamp(min=0), pixels[:, 1:]).flatten(1).all(dim=1)
+            )
         drawn, pixels, places = drawn[loaded], pixels[loaded], places[loaded]
         known = batch["image"].new_zeros(len(batch["indices"]), dtype=torch.float32)
         known[: len(drawn)] = sparse.distances[drawn].to(known.device)
         for key, source in images.items():
             if key in batch and key not in ("image_idx", "indices"):
-                batch[key][: len(drawn)] = _look_up(source, places, pixels).to(batch[key].device)
+                batch[key][: len(drawn)] = look_up(source, places, pixels[:, 1:]).to(
+                    batch[key].device
+                )
         batch["indices"][: len(drawn)] = pixels.to(batch["indices"].device)
         batch[DISTANCE] = known
-
-
-def _look_up(source: Any, places: Tensor, pixels: Tensor) -> Tensor:
-    """Values of pixels [K, 3] in images [P, H, W, ...] or a list of [H, W, ...]: [K, ...]."""
-    _, rows, columns = pixels.unbind(dim=-1)
-    if isinstance(source, Tensor):
-        return source[places.to(source.device), rows.to(source.device), columns.to(source.device)]
-    return torch.stack([source[i][r, c] for i, r, c in zip(places, rows, columns)])
