@@ -29,14 +29,15 @@ def look_up(source: Any, which: Tensor, places: Tensor) -> Tensor:
     """Values of pixels: [K, ...].
 
     Args:
-        source: images [P, H, W, ...], or a list of [H, W, ...].
+        source: images [P, H, W, ...], or a list of one or more [H, W, ...].
         which: [K] int64, number of the image in `source`.
         places: [K, 2] int64, row and column.
     """
     rows, columns = places.unbind(dim=-1)
     if isinstance(source, Tensor):
         return source[which.to(source.device), rows.to(source.device), columns.to(source.device)]
-    return torch.stack([source[i][r, c] for i, r, c in zip(which, rows, columns)])
+    values = [source[i][r, c] for i, r, c in zip(which, rows, columns)]
+    return torch.stack(values) if values else source[0].new_zeros(0, *source[0].shape[2:])
 
 
 def _stepping_aside(sample: Callable[..., Tensor]) -> Callable[..., Tensor]:

@@ -55,11 +55,10 @@ class KnownDistancePixelSampler(HeldOutPixelSampler):
         place_of[numbers] = torch.arange(len(numbers))
         places = place_of[pixels[:, 0]]
         loaded = places >= 0
-        if "mask" in images:
-            loaded &= (
-                look_up(images["mask"], places.clamp(min=0), pixels[:, 1:]).flatten(1).all(dim=1)
-            )
         drawn, pixels, places = drawn[loaded], pixels[loaded], places[loaded]
+        if "mask" in images:
+            seen = look_up(images["mask"], places, pixels[:, 1:]).flatten(1).all(dim=1).cpu()
+            drawn, pixels, places = drawn[seen], pixels[seen], places[seen]
         known = batch["image"].new_zeros(len(batch["indices"]), dtype=torch.float32)
         known[: len(drawn)] = sparse.distances[drawn].to(known.device)
         for key, source in images.items():

@@ -10,6 +10,7 @@ from leco_plugin.scenes.held_out_pixels import (
     HeldOutPixelSampler,
     HeldOutPixelSamplerConfig,
     is_held_out,
+    look_up,
 )
 
 
@@ -80,6 +81,23 @@ def test_images_of_many_sizes_are_sampled_as_a_list() -> None:
     assert bool(is_held_out(samples["indices"]).all())
     for color, (image, row, column) in zip(samples["image"], samples["indices"].tolist()):
         assert torch.equal(color, pictures[image][row, column])
+
+
+@pytest.mark.parametrize("kind", ["tensor", "list"])
+def test_no_pixels_have_no_values_of_the_right_shape_and_type(kind: str) -> None:
+    images = torch.zeros(2, 20, 30, 3, dtype=torch.uint8)
+    source = images if kind == "tensor" else list(images)
+    none = torch.zeros(0, dtype=torch.int64)
+    values = look_up(source, none, none.view(0, 2))
+    assert values.shape == (0, 3) and values.dtype == torch.uint8
+
+
+def test_images_of_many_sizes_that_are_masked_throughout_hold_no_held_out_pixel() -> None:
+    pictures = [torch.rand(20, 30, 3), torch.rand(50, 12, 3)]
+    masks = [torch.zeros(*picture.shape[:2], 1, dtype=torch.bool) for picture in pictures]
+    batch = {"image": pictures, "mask": masks, "image_idx": torch.tensor([0, 1])}
+    samples = sampler().sample_held_out(batch, 50, seed=0)
+    assert samples["image"].shape == (0, 3) and samples["indices"].shape == (0, 3)
 
 
 def test_one_pixel_in_a_period_squared_is_held_out() -> None:

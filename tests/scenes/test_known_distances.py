@@ -28,8 +28,8 @@ def known() -> SparsePixels:
     return SparsePixels(indices, 1.0 + numbers.float())
 
 
-def sampler() -> KnownDistancePixelSampler:
-    made = KnownDistancePixelSamplerConfig(num_rays_per_batch=400).setup()
+def sampler(**options: Any) -> KnownDistancePixelSampler:
+    made = KnownDistancePixelSamplerConfig(num_rays_per_batch=400, **options).setup()
     assert isinstance(made, KnownDistancePixelSampler)
     return made
 
@@ -66,3 +66,27 @@ def test_masked_pixels_are_left_out() -> None:
     pixels = made.sample(batch)
     assert int((pixels[DISTANCE] > 0).sum()) > 20
     assert 8 not in pixels["indices"][:, 0].tolist()
+
+
+def of_many_sizes() -> dict[str, Any]:
+    """The images 7 and 8; 7 is narrower."""
+    pictures = [torch.zeros(20, 12, 3), torch.zeros(20, 30, 3)]
+    return {"image": pictures, "image_idx": torch.tensor([7, 8])}
+
+
+def test_a_batch_of_many_sizes_may_hold_no_known_pixel() -> None:
+    made, batch = sampler(), of_many_sizes()
+    made.sparse = SparsePixels(torch.tensor([[6, 15, 25], [9, 15, 25]]), torch.ones(2))
+    pixels = made.sample(batch)
+    assert not bool(pixels[DISTANCE].any()) and pixels["image"].shape == (400, 3)
+
+
+def test_a_pixel_is_looked_up_in_the_mask_of_its_own_image() -> None:
+    torch.manual_seed(0)
+    # nerfstudio's rejection sampling takes no masks of many sizes
+    made, batch = sampler(rejection_sample_mask=False), of_many_sizes()
+    batch["mask"] = [torch.ones(*picture.shape[:2], 1).bool() for picture in batch["image"]]
+    # one pixel of an image that is not in the batch, and outside the first that is
+    made.sparse = SparsePixels(torch.tensor([[6, 15, 25], [8, 15, 25]]), torch.tensor([1.0, 2.0]))
+    pixels = made.sample(batch)
+    assert set(pixels[DISTANCE].tolist()) == {0.0, 2.0}
