@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import TYPE_CHECKING, Any
 
 import torch
@@ -9,6 +10,12 @@ from torch import Tensor
 
 if TYPE_CHECKING:
     from leco_plugin.models.leco import LecoModel
+
+
+def first_non_finite(losses: dict[str, Tensor]) -> str | None:
+    """Name of the first scalar loss that is not finite, or None; waits for the device once."""
+    values = torch.stack([loss.detach().float() for loss in losses.values()]).tolist()
+    return next((name for name, value in zip(losses, values) if not math.isfinite(value)), None)
 
 
 def explain_non_finite(name: str, model: LecoModel, outputs: dict[str, Any], image: Tensor) -> str:

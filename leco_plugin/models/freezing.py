@@ -72,10 +72,15 @@ def freeze(
             "--pipeline.model.schedule.learn-steps usually help"
         )
     if folder is not None:
-        folder.mkdir(parents=True, exist_ok=True)
-        model.occupancy().save(folder / FILE_NAME)
-        CONSOLE.log(f"\\[leco] wrote {folder / FILE_NAME}")
+        write_occupancy(model, folder)
     return measured
+
+
+def write_occupancy(model: LecoModel, folder: Path) -> None:
+    """Leaves the frozen gate as `occupancy.safetensors` in a folder, made where it is missing."""
+    folder.mkdir(parents=True, exist_ok=True)
+    model.occupancy().save(folder / FILE_NAME)
+    CONSOLE.log(f"\\[leco] wrote {folder / FILE_NAME}")
 
 
 def held_out_sampler(datamanager: Any) -> HeldOutPixelSampler | None:

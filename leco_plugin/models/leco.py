@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -16,12 +15,14 @@ from torch import Tensor, nn
 from leco_plugin.compat.checkpoints import allow_checkpoint_globals
 from leco_plugin.evaluation.metrics import image_metrics
 from leco_plugin.models.calibration import CalibrationConfig
+from leco_plugin.models.failures import explain_non_finite, first_non_finite
 from leco_plugin.models.field import HMoEField
 from leco_plugin.models.gate import Gate
 from leco_plugin.models.losses import distortion_loss, termination_loss
 from leco_plugin.models.objective import GateLossConfig, gate_losses
 from leco_plugin.models.phases import ScheduleConfig
 from leco_plugin.models.precision import fast_precision, keep_freed_memory
+from leco_plugin.models.progress import Progress
 from leco_plugin.models.rendering import (
     Intervals,
     Rays,
@@ -116,6 +117,7 @@ class LecoModel(Model):
         # held in a tuple: the estimator shares the gate, which must not be registered twice
         self._estimator: tuple[LearnedOccupancyEstimator, ...] = ()
         self.report: dict[str, Any] = {}
+        self.progress = Progress()
 
     def _routing(self) -> Routing:
         losses = self.config.gate_loss
@@ -184,12 +186,13 @@ class LecoModel(Model):
         return self._estimator[0]
 
     def get_extra_state(self) -> dict[str, Any]:
-        """The calibration report travels with a checkpoint, as plain values."""
-        return {"report": self.report}
+        """Calibration report and learning progress travel with a checkpoint, as plain values."""
+        return {"report": self.report, "progress": self.progress.to_dict()}
 
     def set_extra_state(self, state: dict[str, Any]) -> None:
         """Restores what `get_extra_state` gave."""
         self.report = dict(state.get("report", {}))
+        self.progress = Progress(**state.get("progress", {}))
         self._estimator = ()
 
     def occupancy(self) -> Occupancy:
@@ -312,11 +315,9 @@ class LecoModel(Model):
                 ramped=self.ramped,
                 half_extent=self.space.half_extent,
             )
-        for name, value in losses.items():
-            if not math.isfinite(float(value.detach())):
-                from leco_plugin.models.failures import explain_non_finite
-
-                raise FloatingPointError(explain_non_finite(name, self, outputs, image))
+        name = first_non_finite(losses)
+        if name is not None:
+            raise FloatingPointError(explain_non_finite(name, self, outputs, image))
         return losses
 
     @torch.no_grad()

@@ -17,11 +17,12 @@ from nerfstudio.engine.callbacks import (
 from nerfstudio.utils.rich_utils import CONSOLE
 from torch import Tensor
 
-from leco_plugin.models.freezing import freeze
+from leco_plugin.models.freezing import freeze, write_occupancy
 from leco_plugin.models.gate import occupancy_from_logits, route
 from leco_plugin.models.losses import expert_shares
 from leco_plugin.models.phases import (
     PROBES,
+    ScheduleConfig,
     converged,
     decisions_agree,
     find_collapse,
@@ -29,6 +30,7 @@ from leco_plugin.models.phases import (
     reset_gate_head,
     spread_scene_experts,
 )
+from leco_plugin.models.progress import Progress
 from leco_plugin.models.statistics import KEPT_ABOVE
 from leco_plugin.occupancy import gate_precision
 from leco_plugin.scenes.known_distances import KnownDistancePixelSampler
@@ -52,21 +54,35 @@ class Lifecycle:
         self.model = model
         self.pipeline: Any = attributes.pipeline
         self.trainer: Any = attributes.trainer
-        self.schedule = model.config.schedule
+        most = configured = model.config.schedule.learn_steps
         if self.trainer is not None:
             # a short run still passes through both phases
             most = max(2, int(0.5 * self.trainer.config.max_num_iterations))
-            self.schedule = replace(self.schedule, learn_steps=min(self.schedule.learn_steps, most))
+        # nerfstudio makes callbacks after it has loaded a checkpoint
+        self.progress.begin(configured, most)
         self.survey = survey(self.pipeline.datamanager)
         if not bool(model.bounds_known):
             model.set_bounds(self.survey.bounds, self.survey.median_length)
             CONSOLE.log(f"\\[leco] {self.survey.describe()}")
         self.rays_per_batch = int(self.pipeline.datamanager.get_train_rays_per_batch())
-        self.decisions = torch.zeros(0, dtype=torch.bool)
-        self.recoveries = 0
-        self.suspected = False
-        self.learn_seconds = 0.0
         self.step_started = 0.0
+        if bool(model.frozen) and self.folder is not None:
+            write_occupancy(model, self.folder)  # a resumed run may have a folder of its own
+
+    @property
+    def progress(self) -> Progress:
+        """Of the model, because that is what a checkpoint restores."""
+        return self.model.progress
+
+    @property
+    def schedule(self) -> ScheduleConfig:
+        """The config's, with the learning steps of this run."""
+        return replace(self.model.config.schedule, learn_steps=self.progress.learn_steps)
+
+    @property
+    def folder(self) -> Path | None:
+        """The run's folder."""
+        return Path(self.trainer.base_dir) if self.trainer is not None else None
 
     def callbacks(self) -> list[TrainingCallback]:
         """What nerfstudio's trainer calls before and after each step."""
@@ -121,17 +137,17 @@ class Lifecycle:
 
     def after_step(self, step: int) -> None:
         """Looks at the gate now and then, and freezes it when its decisions have settled."""
-        model, schedule = self.model, self.schedule
+        model, schedule, progress = self.model, self.schedule, self.progress
         if bool(model.frozen) or model.learned or model.config.homogeneous:
             return
-        self.learn_seconds += time.monotonic() - self.step_started
+        progress.learn_seconds += time.monotonic() - self.step_started
         last = step + 1 >= schedule.learn_steps
         if (step + 1) % schedule.steps_per_check and not last:
             return
         logits = self._probe()
         kept = occupancy_from_logits(logits) >= KEPT_ABOVE
-        agreement = decisions_agree(self.decisions, kept)
-        self.decisions = kept
+        agreement = decisions_agree(progress.decisions.to(kept.device), kept)
+        progress.decisions = kept
         if not schedule.freeze or self._heal(step, logits, kept, last):
             return
         if not last and float(kept.float().mean()) > 0.95:
@@ -141,12 +157,14 @@ class Lifecycle:
                 f"\\[leco] step {step}: {agreement:.1%} of {len(kept)} decisions are those of "
                 f"{schedule.steps_per_check} steps ago; freezing the gate"
             )
-            folder = Path(self.trainer.base_dir) if self.trainer is not None else None
-            freeze(model, self.pipeline.datamanager, self.survey, folder, step, self.learn_seconds)
+            data, seconds = self.pipeline.datamanager, progress.learn_seconds
+            freeze(model, data, self.survey, self.folder, step, seconds)
+            if self.trainer is not None and self.trainer.config.steps_per_save > 0:
+                self.trainer.save_checkpoint(step)  # a run killed from now on stays frozen
 
-    @torch.no_grad()
-    def _probe(self) -> Tensor:
-        """The gate's logits [P, 1 + n] at candidates of a fixed set of training rays."""
+    @cached_property
+    def probe_positions(self) -> Tensor:
+        """Mapped candidates of a fixed set of training rays: [P, 3] in [-1, 1]."""
         model = self.model
         rays = self.survey.probe_rays(model.device, model.aabb, model.march_range)
         generator = torch.Generator().manual_seed(0)
@@ -155,9 +173,13 @@ class Lifecycle:
         which = which.to(model.device)
         distance = torch.lerp(rays.t_mins[which], rays.t_maxs[which], along)
         positions = rays.origins[which] + rays.directions[which] * distance[:, None]
-        mapped = model.space.map(positions).clamp(-1.0, 1.0)
-        with gate_precision(model.device.type, model.precision):
-            logits: Tensor = model.gate(mapped)
+        return model.space.map(positions).clamp(-1.0, 1.0)
+
+    @torch.no_grad()
+    def _probe(self) -> Tensor:
+        """The gate's logits [P, 1 + n] at the probe positions."""
+        with gate_precision(self.model.device.type, self.model.precision):
+            logits: Tensor = self.model.gate(self.probe_positions)
         return logits
 
     def _heal(self, step: int, logits: Tensor, kept: Tensor, last: bool) -> bool:
@@ -171,16 +193,17 @@ class Lifecycle:
         routes = route(logits, self.model.routing.empty_below)
         shares = expert_shares(routes, logits.shape[-1])
         collapse = find_collapse(float(kept.float().mean()), shares, last)
-        if collapse is None or not (last or self.suspected):
-            self.suspected = collapse is not None
+        progress = self.progress
+        if collapse is None or not (last or progress.suspected):
+            progress.suspected = collapse is not None
             return False
-        if self.recoveries == MOST_RECOVERIES:
+        if progress.recoveries == MOST_RECOVERIES:
             raise RuntimeError(
                 f"step {step}: {collapse.cause}, after {MOST_RECOVERIES} recoveries. Check the "
                 "scene's bounds in the log above, and the weights under --pipeline.model.gate-loss"
             )
-        self.recoveries += 1
-        self.suspected = False
+        progress.recoveries += 1
+        progress.suspected = False
         head = self.model.gate.head
         if collapse.one_expert:
             spread_scene_experts(head, int(shares[1:].argmax()) + 1)
@@ -188,11 +211,10 @@ class Lifecycle:
         else:
             reset_gate_head(head)
             remedy = "its last layer starts anew, on dense samples"
-            more = self.schedule.learn_steps // 2
-            self.schedule = replace(self.schedule, learn_steps=step + 1 + more)
-            self.decisions = torch.zeros(0, dtype=torch.bool)
+            progress.learn_steps = step + 1 + progress.learn_steps // 2
+            progress.decisions = torch.zeros(0, dtype=torch.bool)
         CONSOLE.log(
             f"\\[leco] step {step}: {collapse.cause}; {remedy} "
-            f"(recovery {self.recoveries} of {MOST_RECOVERIES})"
+            f"(recovery {progress.recoveries} of {MOST_RECOVERIES})"
         )
         return not collapse.one_expert

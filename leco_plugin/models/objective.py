@@ -71,9 +71,9 @@ def gate_losses(
         balance = config.balance * balance_loss(probabilities, routes[on_scene] - 1)
     if homogeneous:
         return {"balance_loss": balance}
+    # the backdrop is kept anyway, and says nothing about where a ray happens to end
+    before = (~backdrop_of(intervals, rays)).nonzero()[:, 0]
     if config.form == "logit":
-        # the backdrop is kept anyway, and says nothing about where a ray happens to end
-        before = (~backdrop_of(intervals, rays)).nonzero()[:, 0]
         weights = widen(
             shaded.weights.detach().index_select(0, before),
             intervals.ray_indices.index_select(0, before),
@@ -91,9 +91,10 @@ def gate_losses(
             "contribution_loss": config.contribution * contribution,
             "balance_loss": balance,
         }
-    probabilities = logits.softmax(dim=-1)
+    probabilities = logits.index_select(0, before).softmax(dim=-1)
+    routes = routes.index_select(0, before)
     lengths = (intervals.t_ends - intervals.t_starts) / half_extent
-    alphas = 1.0 - torch.exp(-shaded.sigmas * lengths)
+    alphas = (1.0 - torch.exp(-shaded.sigmas * lengths)).index_select(0, before)
     return {
         "gate_loss": config.imbalance
         * imbalanced_gate_loss(probabilities, routes, config.empty_ratio),

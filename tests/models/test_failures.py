@@ -8,8 +8,9 @@ from typing import Any
 
 import pytest
 import torch
+from torch.utils._python_dispatch import TorchDispatchMode
 
-from leco_plugin.models.failures import explain_non_finite
+from leco_plugin.models.failures import explain_non_finite, first_non_finite
 
 
 def sound() -> tuple[torch.nn.Module, dict[str, Any], torch.Tensor]:
@@ -60,3 +61,35 @@ def test_the_first_cause_on_the_way_is_named() -> None:
     image.fill_(torch.nan)
     outputs["shaded"].rgb.fill_(torch.nan)
     assert "training image" in explain_non_finite("rgb_loss", model, outputs, image)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("bad", [torch.nan, torch.inf, -torch.inf])
+def test_the_first_loss_that_is_not_finite_is_named(bad: float) -> None:
+    names = ("rgb_loss", "distortion_loss", "nearness_loss", "contribution_loss")
+    losses = {name: torch.tensor(1.0, requires_grad=True) for name in names}
+    assert first_non_finite(losses) is None
+    losses["contribution_loss"] = torch.tensor(bad)
+    assert first_non_finite(losses) == "contribution_loss"
+    losses["distortion_loss"] = torch.tensor(bad, dtype=torch.bfloat16)
+    assert first_non_finite(losses) == "distortion_loss"
+
+
+class CountsWaits(TorchDispatchMode):
+    """Counts the reads of single numbers, each of which waits for the device."""
+
+    waits = 0
+
+    def __torch_dispatch__(self, operation, types, arguments=(), options=None):  # type: ignore[no-untyped-def]
+        self.waits += operation is torch.ops.aten._local_scalar_dense.default
+        return operation(*arguments, **(options or {}))
+
+
+def test_all_losses_are_waited_for_at_once() -> None:
+    losses = {str(number): torch.tensor(float(number)) for number in range(5)}
+    with CountsWaits() as counted:
+        for loss in losses.values():
+            float(loss)
+    assert counted.waits == 5
+    with CountsWaits() as counted:
+        first_non_finite(losses)
+    assert counted.waits <= 1

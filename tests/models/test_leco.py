@@ -1,0 +1,105 @@
+"""Claims about the model itself: what it refuses to learn from, and what a checkpoint restores."""
+
+from __future__ import annotations
+
+import io
+from typing import Any
+
+import pytest
+import torch
+from nerfstudio.cameras.rays import RayBundle
+from nerfstudio.data.scene_box import SceneBox
+
+from leco_plugin.models.encodings import EncodingConfig
+from leco_plugin.models.field import FieldConfig
+from leco_plugin.models.gate import GateConfig
+from leco_plugin.models.leco import LecoModel, LecoModelConfig
+from leco_plugin.models.sizes import Sizes
+
+NUM_RAYS = 12
+
+TINY = Sizes(
+    gate=GateConfig(EncodingConfig(octaves=1), width=8, layers=1, scene_experts=2),
+    field=FieldConfig(EncodingConfig(kind="hash", log2_table=8)),
+    learn_candidates=8,
+    candidates=16,
+)
+
+
+@pytest.fixture
+def model() -> LecoModel:
+    torch.manual_seed(0)
+    box = SceneBox(torch.tensor([[-1.0] * 3, [1.0] * 3]))
+    made = LecoModelConfig(sizes=TINY).setup(scene_box=box, num_train_data=3)
+    assert isinstance(made, LecoModel)
+    made.ramped = 0.5  # every loss takes part
+    return made.train()
+
+
+def step(model: LecoModel) -> tuple[dict[str, Any], dict[str, torch.Tensor]]:
+    """Outputs of a training batch, and the batch."""
+    directions = torch.nn.functional.normalize(torch.randn(NUM_RAYS, 3), dim=-1)
+    bundle = RayBundle(
+        origins=-0.5 * directions,
+        directions=directions,
+        pixel_area=torch.ones(NUM_RAYS, 1),
+        camera_indices=torch.zeros(NUM_RAYS, 1, dtype=torch.int64),
+    )
+    return model.get_outputs(bundle), {"image": torch.rand(NUM_RAYS, 3)}
+
+
+def spoil(outputs: dict[str, Any], name: str) -> dict[str, Any]:
+    """The outputs with one tensor of the rendering not finite."""
+    shaded = outputs["shaded"]
+    return outputs | {
+        "shaded": shaded._replace(**{name: torch.full_like(getattr(shaded, name), torch.nan)})
+    }
+
+
+def test_a_sound_batch_has_finite_losses(model: LecoModel) -> None:
+    losses = model.get_loss_dict(*step(model))
+    assert len(losses) >= 5
+    assert all(bool(torch.isfinite(loss)) for loss in losses.values())
+
+
+@pytest.mark.parametrize(
+    ("spoiled", "loss", "cause"),
+    [
+        ("rgb", "rgb_loss", "a colour overflowed"),
+        ("weights", "distortion_loss", "all inputs and parameters are finite"),
+        ("depth", "nearness_loss", "all inputs and parameters are finite"),
+        ("logits", "agreement_loss", "the gate's logits overflowed"),
+    ],
+)
+def test_the_first_loss_that_is_not_finite_stops_the_step(
+    model: LecoModel, spoiled: str, loss: str, cause: str
+) -> None:
+    outputs, batch = step(model)
+    with pytest.raises(FloatingPointError, match=f"^{loss} is not finite: {cause}"):
+        model.get_loss_dict(spoil(outputs, spoiled), batch)
+
+
+def test_a_checkpoint_restores_report_and_progress(model: LecoModel) -> None:
+    model.report = {"step": 7, "threshold": 0.25}
+    model.progress.begin(200, most=150)
+    model.progress.recoveries, model.progress.learn_seconds = 2, 3.5
+    model.progress.decisions = torch.tensor([True, False, True])
+    buffer = io.BytesIO()
+    torch.save(model.state_dict(), buffer)
+    model.report, model.progress.recoveries = {}, 0
+    buffer.seek(0)
+    restored = LecoModelConfig(sizes=TINY).setup(scene_box=model.scene_box, num_train_data=3)
+    restored.load_state_dict(torch.load(buffer, weights_only=True))
+    assert restored.report == {"step": 7, "threshold": 0.25}
+    progress = restored.progress
+    assert (progress.learn_steps, progress.configured) == (150, 200)
+    assert (progress.recoveries, progress.learn_seconds) == (2, 3.5)
+    assert progress.decisions.tolist() == [True, False, True]
+
+
+def test_a_checkpoint_from_before_there_was_progress_is_read(model: LecoModel) -> None:
+    state = model.state_dict()
+    state["_extra_state"] = {"report": {"step": 7}}
+    model.progress.recoveries = 2
+    model.load_state_dict(state)
+    assert model.report == {"step": 7} and model.progress.recoveries == 0

@@ -1,0 +1,69 @@
+"""Claims about looking at the gate while it learns."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+
+import pytest
+import torch
+
+from leco_plugin.models import lifecycle
+from leco_plugin.models.encodings import EncodingConfig
+from leco_plugin.models.gate import Gate, GateConfig
+from leco_plugin.models.lifecycle import Lifecycle
+from leco_plugin.models.rendering import Rays
+from leco_plugin.space import Space
+
+PROBES = 500
+
+
+class CountingSurvey:
+    """Rays along x from the origin, which says how often it was asked for them."""
+
+    asked = 0
+
+    def probe_rays(self, *arguments: object) -> Rays:
+        self.asked += 1
+        directions = torch.tensor([[1.0, 0.0, 0.0]]).expand(9, 3)
+        origins = torch.stack([torch.zeros(9), torch.arange(9.0), torch.zeros(9)], dim=-1)
+        return Rays(origins, directions, torch.full((9,), 0.5), torch.full((9,), 2.0), None)
+
+
+@pytest.fixture
+def looking(monkeypatch: pytest.MonkeyPatch) -> Lifecycle:
+    """A lifecycle that has just what looking at the gate touches."""
+    monkeypatch.setattr(lifecycle, "PROBES", PROBES)
+    space = Space()
+    space.set("contraction", torch.zeros(3), 4.0)
+    made = object.__new__(Lifecycle)
+    made.survey = CountingSurvey()  # type: ignore[assignment]
+    made.model = SimpleNamespace(  # type: ignore[assignment]
+        device=torch.device("cpu"),
+        precision="float32",
+        aabb=torch.zeros(6),
+        march_range=torch.zeros(6),
+        space=space,
+        gate=Gate(GateConfig(EncodingConfig(octaves=1), width=8, layers=1, scene_experts=2)),
+    )
+    return made
+
+
+def test_the_probe_positions_lie_on_their_rays_within_the_bounds(looking: Lifecycle) -> None:
+    positions = looking.model.space.unmap(looking.probe_positions)
+    assert positions.shape == (PROBES, 3)
+    assert float(positions[:, 0].min()) >= 0.499 and float(positions[:, 0].max()) <= 2.001
+    assert set(positions[:, 1].round(decimals=3).tolist()) == {float(ray) for ray in range(9)}
+
+
+def test_every_look_is_at_the_same_positions_found_once(looking: Lifecycle) -> None:
+    first, again = looking._probe(), looking._probe()
+    assert torch.equal(first, again) and first.shape == (PROBES, 3)
+    assert looking.survey.asked == 1  # type: ignore[attr-defined]
+    assert not first.requires_grad
+
+
+def test_a_look_sees_what_the_gate_has_learned_since(looking: Lifecycle) -> None:
+    before = looking._probe()
+    with torch.no_grad():
+        looking.model.gate.head.bias += 1.0
+    torch.testing.assert_close(looking._probe(), before + 1.0)

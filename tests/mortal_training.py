@@ -1,0 +1,128 @@
+"""`ns-train` in a process that kills itself with SIGKILL at an exact moment.
+
+Meant for the forkserver of `multiprocessing`: nerfstudio is imported once, and each run is a fork.
+"""
+
+from __future__ import annotations
+
+import os
+import signal
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import torch
+from nerfstudio.engine.trainer import Trainer
+from nerfstudio.scripts import train as ns_train
+
+from leco_plugin.compat.atomic_trainer import AtomicTrainer
+from leco_plugin.models import lifecycle
+from leco_plugin.models.freezing import FILE_NAME
+from leco_plugin.models.phases import Collapse
+from leco_plugin.occupancy import Occupancy
+from leco_plugin.samplers import estimator
+
+FREEZES_AT = 11
+"""The step at which the runs of the tests freeze their gate."""
+
+HEALED_FREEZES_AT = 17
+"""The same after `collapse_once`: the first phase is half as long again."""
+
+MOMENTS: dict[str, tuple[type, str, Callable[..., bool]]] = {
+    "while it learns": (AtomicTrainer, "train_iteration", lambda _, step: step == 8),
+    "with half of the occupancy's file written": (
+        type(Path()),
+        "write_bytes",
+        lambda path, _: FILE_NAME in path.name,
+    ),
+    "with the occupancy's file written": (Occupancy, "save", lambda *_: True),
+    "with the frozen checkpoint not yet in its place": (
+        Trainer,
+        "save_checkpoint",
+        lambda _, step: step == FREEZES_AT,
+    ),
+    "with the frozen checkpoint written": (
+        AtomicTrainer,
+        "save_checkpoint",
+        lambda _, step: step == FREEZES_AT,
+    ),
+    "while it is guided": (AtomicTrainer, "train_iteration", lambda _, step: step == 17),
+    "after it has been healed": (AtomicTrainer, "train_iteration", lambda _, step: step == 14),
+}
+"""Owner and name of a function, and the arguments of the call that it does not survive: the process
+dies when that call has returned."""
+
+
+def die_after(owner: type, name: str, fatal: Callable[..., bool]) -> None:
+    """Makes a function kill its process."""
+    function = getattr(owner, name)
+
+    def dies(*arguments: Any) -> Any:
+        result = function(*arguments)
+        if fatal(*arguments):
+            os.kill(os.getpid(), signal.SIGKILL)
+        return result
+
+    setattr(owner, name, dies)
+
+
+def collapse_once() -> None:
+    """Has the gate found collapsed at the end of the first phase, once."""
+    found = [Collapse("the gate calls all space empty")]
+
+    def find_collapse(kept: float, shares: torch.Tensor, at_the_end: bool) -> Collapse | None:
+        return found.pop() if at_the_end and found else None
+
+    lifecycle.FEWEST_STEPS = 0
+    lifecycle.find_collapse = find_collapse
+
+
+def leave_out_the_cache() -> None:
+    """Has the gate asked directly: building its cell cache would take most of so short a run."""
+
+    def refuse(*arguments: Any, **options: Any) -> None:
+        raise ValueError("a test is short")
+
+    estimator.build_cache = refuse
+
+
+def show_what_was_loaded(path: Path) -> None:
+    """Has a run save what it begins its first step with."""
+    train = Trainer.train
+
+    def saves_and_trains(self: Trainer) -> None:
+        optimizers = {k: v.state_dict() for k, v in self.optimizers.optimizers.items()}
+        torch.save({"pipeline": self.pipeline.state_dict(), "optimizers": optimizers}, path)
+        train(self)
+
+    Trainer.train = saves_and_trains
+
+
+def run(
+    arguments: list[str],
+    log: Path,
+    moment: str | None = None,
+    loaded: Path | None = None,
+    collapses: bool = False,
+) -> None:
+    """`ns-train` with these arguments; the target of a process.
+
+    Args:
+        log: file for what it prints.
+        moment: of `MOMENTS`, when it dies; None is never.
+        loaded: file for what it begins its first step with.
+        collapses: whether the gate is found collapsed once.
+    """
+    with log.open("wb") as printed:
+        os.dup2(printed.fileno(), sys.stdout.fileno())
+        os.dup2(printed.fileno(), sys.stderr.fileno())
+    leave_out_the_cache()
+    if moment is not None:
+        die_after(*MOMENTS[moment])
+    if loaded is not None:
+        show_what_was_loaded(loaded)
+    if collapses:
+        collapse_once()
+    sys.argv = ["ns-train", *arguments]
+    ns_train.entrypoint()
