@@ -77,6 +77,29 @@ def inspect(
     _write_json(json, facts)
 
 
+def swap(
+    method: Annotated[str, tyro.conf.Positional],
+    occupancy: Path,
+    arguments: Annotated[tuple[str, ...], tyro.conf.Positional] = (),
+    json: Path | None = None,
+) -> None:
+    """Train any registered nerfstudio method with its sampler swapped for a learned occupancy.
+
+    The run folder opens with every ns-* command as it is.
+
+    Args:
+        method: As ns-train knows it: instant-ngp, nerfacto, or of another plugin.
+        occupancy: An occupancy.safetensors, or the folder of a run that left one.
+        arguments: After --, what ns-train would be given for this method: -- --data DIR ...
+        json: File for the folder of the run, as JSON.
+    """
+    from leco_plugin.swap import swap as train_swapped
+
+    folder = train_swapped(method, occupancy, arguments)
+    print(f"{method}, guided: {folder}")
+    _write_json(json, {"format": 1, "method": method, "folder": str(folder)})
+
+
 def demo(out: Path = Path("runs/demo"), seconds: float = 110.0, json: Path | None = None) -> None:
     """Learn the occupancy of a small city, go on guided, and compare with never freezing.
 
@@ -100,7 +123,12 @@ def demo(out: Path = Path("runs/demo"), seconds: float = 110.0, json: Path | Non
     _write_json(json, report)
 
 
-COMMANDS: dict[str, Callable[..., None]] = {"city": city, "inspect": inspect, "demo": demo}
+COMMANDS: dict[str, Callable[..., None]] = {
+    "city": city,
+    "inspect": inspect,
+    "swap": swap,
+    "demo": demo,
+}
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

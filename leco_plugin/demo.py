@@ -5,16 +5,12 @@ from __future__ import annotations
 import copy
 import math
 import shutil
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import torch
 from nerfstudio.engine.trainer import Trainer, TrainerConfig
-from nerfstudio.utils.rich_utils import CONSOLE
-from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
 from leco_plugin.evaluation.charts import psnr_against_seconds
 from leco_plugin.evaluation.inspection import ViewBox
@@ -26,6 +22,7 @@ from leco_plugin.evaluation.timed_run import timed_run, true_image
 from leco_plugin.method_configs import leco_occupancy
 from leco_plugin.models.freezing import FILE_NAME
 from leco_plugin.occupancy import Occupancy
+from leco_plugin.progress_bar import bar
 from leco_plugin.scenes.city import CityConfig
 from leco_plugin.scenes.city_folder import CaptureConfig, write_city
 from leco_plugin.scenes.city_truth import CityTruth
@@ -68,7 +65,7 @@ def run_demo(
     folder = write_city(city, out / "city", capture)
 
     guided = _config(folder, out, seconds)
-    with _bar("Guided: learns, freezes, goes on") as show:
+    with bar("Guided: learns, freezes, goes on") as show:
         guided_run, trainer = timed_run(
             guided, seconds, sampler="learned-occupancy", on_progress=show
         )
@@ -76,7 +73,7 @@ def run_demo(
     _draw_picture(trainer, occupancy, truth, out / "picture.png")
     del trainer
 
-    with _bar("The same, never frozen") as show:
+    with bar("The same, never frozen") as show:
         other_run, trainer = timed_run(
             never_frozen(guided), seconds, sampler="dense", on_progress=show
         )
@@ -206,15 +203,6 @@ def _draw_city_slice(axes: Any, occupancy: Occupancy, truth: CityTruth) -> None:
     height = float(truth.to_model(ground)[2])
     draw_slice(axes, occupancy, ViewBox(low, high), 2, height, solid=truth.occupied)
     axes.set_title(f"occupancy {SLICE_HEIGHT:.0f} m up, true walls white")
-
-
-@contextmanager
-def _bar(what: str) -> Iterator[Callable[[float], None]]:
-    """A progress bar under nerfstudio's log; yields what takes the share that is done."""
-    columns = (TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn())
-    with Progress(*columns, TimeRemainingColumn(), console=CONSOLE, transient=True) as progress:
-        task = progress.add_task(what, total=1.0)
-        yield lambda share: progress.update(task, completed=share)
 
 
 def summary(report: dict[str, Any]) -> list[str]:

@@ -15,7 +15,7 @@ from nerfstudio.plugins.types import MethodSpecification
 
 from leco_plugin.compat.atomic_trainer import AtomicTrainer
 from leco_plugin.models.leco import LecoModelConfig
-from leco_plugin.models.optimizers import FusedAdamConfig
+from leco_plugin.models.optimizers import RATES, FusedAdamConfig
 from leco_plugin.models.phases import ScheduleConfig
 from leco_plugin.models.sizes import PAPER, sizes_for
 from leco_plugin.scenes.known_distances import KnownDistancePixelSamplerConfig
@@ -27,19 +27,26 @@ def best_device() -> Literal["cpu", "cuda"]:
     return "cuda" if torch.cuda.is_available() else "cpu"
 
 
-def _optimizers(steps: int, table_lr: float, lr: float, gate_lr: float) -> dict[str, object]:
+def _optimizers(steps: int, rates: dict[str, float]) -> dict[str, object]:
     """Adam for each parameter group, decayed to a tenth over the run."""
     return {
         name: {
             "optimizer": FusedAdamConfig(lr=rate),
             "scheduler": ExponentialDecaySchedulerConfig(lr_final=rate / 10.0, max_steps=steps),
         }
-        for name, rate in (("encoding", table_lr), ("field", lr), ("gate", gate_lr))
+        for name, rate in rates.items()
     }
 
 
 ON_GPU = best_device() == "cuda"
 STEPS = 30_000 if ON_GPU else 4_000
+
+LEARNING = LecoModelConfig(
+    sizes=sizes_for(best_device()),
+    schedule=ScheduleConfig(learn_steps=2_000 if ON_GPU else 200),
+    eval_num_rays_per_chunk=1 << 15 if ON_GPU else 1 << 12,
+)
+"""The HMoE in the sizes of this device."""
 
 _leco_occupancy = TrainerConfig(
     _target=AtomicTrainer,
@@ -58,13 +65,9 @@ _leco_occupancy = TrainerConfig(
             eval_num_rays_per_batch=1024,
             pixel_sampler=KnownDistancePixelSamplerConfig(),
         ),
-        model=LecoModelConfig(
-            sizes=sizes_for(best_device()),
-            schedule=ScheduleConfig(learn_steps=2_000 if ON_GPU else 200),
-            eval_num_rays_per_chunk=1 << 15 if ON_GPU else 1 << 12,
-        ),
+        model=LEARNING,
     ),
-    optimizers=_optimizers(STEPS, 2e-2, 1e-2, 5e-3),
+    optimizers=_optimizers(STEPS, RATES),
     viewer=ViewerConfig(num_rays_per_chunk=1 << 12, quit_on_train_completion=True),
     vis="viewer+tensorboard",
 )
@@ -91,7 +94,7 @@ leco_occupancy_paper = MethodSpecification(
                 schedule=ScheduleConfig(learn_steps=40_000, steps_per_check=500),
             ),
         ),
-        optimizers=_optimizers(540_000, 5e-4, 5e-4, 5e-4),
+        optimizers=_optimizers(540_000, dict.fromkeys(RATES, 5e-4)),
     ),
     description="The same with the sizes of the paper: 8 experts of 7 x 256, 257 samples.",
 )

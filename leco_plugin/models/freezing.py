@@ -17,6 +17,7 @@ from leco_plugin.models.calibration import (
 )
 from leco_plugin.models.gate import occupancy_from_logits
 from leco_plugin.models.rendering import Intervals, Rays, backdrop_of
+from leco_plugin.scenes.frames import frame_of
 from leco_plugin.scenes.held_out_pixels import HeldOutPixelSampler
 from leco_plugin.scenes.survey import Survey
 
@@ -59,6 +60,7 @@ def freeze(
         "cone_angle": float(model.march_range[4]),
         "aabb": model.aabb.tolist(),
         "cameras": survey.positions.tolist(),
+        "frame": frame_of(datamanager),
     }
     CONSOLE.log(
         f"\\[leco] occupancy learned in {learn_seconds:.0f} s: threshold {measured.threshold:.4f} "

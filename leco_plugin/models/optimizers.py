@@ -6,6 +6,9 @@ from dataclasses import dataclass
 
 from nerfstudio.engine.optimizers import AdamOptimizerConfig
 
+RATES = {"encoding": 2e-2, "field": 1e-2, "gate": 5e-3}
+"""Learning rates of `leco-occupancy` for each of its parameter groups."""
+
 
 @dataclass
 class FusedAdamConfig(AdamOptimizerConfig):

@@ -34,6 +34,8 @@ class LearnedOccupancySampler(Sampler):
         initial_sampler: lays the candidates; None is nerfstudio's default for proposal hosts.
         single_jitter: shift all samples of a ray by the same random share.
         cache_bytes: budget of the cell cache; 0 asks the gate about every candidate.
+        frame: takes positions of the host to those of the occupancy, [3, 4]; None where they are
+            the same.
     """
 
     def __init__(
@@ -44,8 +46,10 @@ class LearnedOccupancySampler(Sampler):
         initial_sampler: Sampler | None = None,
         single_jitter: bool = False,
         cache_bytes: int = 1 << 20,
+        frame: Tensor | None = None,
     ) -> None:
         super().__init__()
+        self.frame = frame
         self.estimator = LearnedOccupancyEstimator(occupancy, cache_bytes=cache_bytes)
         self.num_samples = num_samples
         self.num_candidates = num_candidates
@@ -100,6 +104,8 @@ class LearnedOccupancySampler(Sampler):
         The cache decides first, so that the gate is asked only where it lets something through.
         """
         flat = positions.reshape(-1, 3)
+        if self.frame is not None:
+            flat = flat @ self.frame[:, :3].T + self.frame[:, 3]
         kept = self.estimator.occupied(flat).nonzero()[:, 0]
         worth = flat.new_zeros(len(flat))
         if kept.numel():

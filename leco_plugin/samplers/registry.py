@@ -7,13 +7,13 @@ installed knows them, and modules are imported when a sampler is built, not when
 from __future__ import annotations
 
 import importlib
-import warnings
 from collections.abc import Callable
 from dataclasses import dataclass
-from importlib.metadata import entry_points
 from typing import Any
 
 from torch import nn
+
+from leco_plugin.entries import foreign_entries
 
 GROUP = "leco_plugin.samplers"
 
@@ -56,15 +56,7 @@ OURS = {
 
 def samplers() -> dict[str, SamplerSpec]:
     """All samplers by name. A broken entry point of another package is left out with a warning."""
-    found: dict[str, SamplerSpec] = {}
-    for entry in entry_points(group=GROUP):
-        if entry.name in OURS:
-            continue
-        try:
-            found[entry.name] = entry.load()
-        except Exception as error:  # noqa: BLE001 (whatever a foreign module raises)
-            warnings.warn(f"sampler {entry.name!r} ({entry.value}): {error!r}", stacklevel=2)
-    return {**OURS, **found}
+    return {**foreign_entries(GROUP, frozenset(OURS)), **OURS}
 
 
 def build_estimator(name: str, **options: Any) -> nn.Module:

@@ -1,0 +1,123 @@
+"""Guided hosts as methods of `ns-train`, each with sizes that fit the device."""
+
+from __future__ import annotations
+
+from nerfstudio.cameras.camera_optimizers import CameraOptimizerConfig
+from nerfstudio.configs.base_config import MachineConfig, ViewerConfig
+from nerfstudio.data.datamanagers.base_datamanager import VanillaDataManagerConfig
+from nerfstudio.engine.schedulers import ExponentialDecaySchedulerConfig
+from nerfstudio.engine.trainer import TrainerConfig
+from nerfstudio.models.base_model import ModelConfig
+from nerfstudio.models.instant_ngp import InstantNGPModelConfig
+from nerfstudio.models.nerfacto import NerfactoModelConfig
+from nerfstudio.pipelines.base_pipeline import VanillaPipelineConfig
+from nerfstudio.plugins.types import MethodSpecification
+
+from leco_plugin.compat.atomic_trainer import AtomicTrainer
+from leco_plugin.compat.dynamic_batch import ClampedDynamicBatchPipelineConfig
+from leco_plugin.method_configs import LEARNING, ON_GPU, STEPS, best_device
+from leco_plugin.models.guided import GuidedModelConfig
+from leco_plugin.models.guided_start import OccupancyConfig
+from leco_plugin.models.optimizers import FusedAdamConfig
+from leco_plugin.scenes.known_distances import KnownDistancePixelSamplerConfig
+from leco_plugin.scenes.photographs import LecoPhotographsDataParserConfig
+
+
+def guided(host: ModelConfig) -> GuidedModelConfig:
+    """The host, guided by an occupancy from a file or learned first."""
+    return GuidedModelConfig(
+        host=host,
+        occupancy=OccupancyConfig(learning=LEARNING, rays=4096 if ON_GPU else 1024),
+    )
+
+
+def photographs(rays: int) -> VanillaDataManagerConfig:
+    """The reader of `leco-occupancy`, whose coordinates the occupancy is in."""
+    return VanillaDataManagerConfig(
+        dataparser=LecoPhotographsDataParserConfig(),
+        train_num_rays_per_batch=rays,
+        eval_num_rays_per_batch=1024,
+        pixel_sampler=KnownDistancePixelSamplerConfig(),
+    )
+
+
+def trainer(name: str, pipeline: VanillaPipelineConfig, rates: dict[str, float]) -> TrainerConfig:
+    """A method: Adam at these rates, decayed to a tenth over the run."""
+    return TrainerConfig(
+        _target=AtomicTrainer,
+        method_name=name,
+        machine=MachineConfig(device_type=best_device()),
+        max_num_iterations=STEPS,
+        steps_per_save=500,
+        steps_per_eval_batch=0,
+        steps_per_eval_image=500,
+        steps_per_eval_all_images=0,
+        mixed_precision=ON_GPU,
+        pipeline=pipeline,
+        optimizers={
+            group: {
+                "optimizer": FusedAdamConfig(lr=rate),
+                "scheduler": ExponentialDecaySchedulerConfig(lr_final=rate / 10.0, max_steps=STEPS),
+            }
+            for group, rate in rates.items()
+        },
+        viewer=ViewerConfig(num_rays_per_chunk=1 << 12, quit_on_train_completion=True),
+        vis="viewer+tensorboard",
+    )
+
+
+def ngp_host() -> InstantNGPModelConfig:
+    """Instant-NGP as nerfstudio has it; on a CPU with a smaller table and longer steps."""
+    if ON_GPU:
+        return InstantNGPModelConfig(eval_num_rays_per_chunk=8192)
+    return InstantNGPModelConfig(
+        eval_num_rays_per_chunk=2048,
+        log2_hashmap_size=16,
+        max_res=1024,
+        cone_angle=1 / 64,
+        grid_resolution=64,
+    )
+
+
+def nerfacto_host() -> NerfactoModelConfig:
+    """Nerfacto as nerfstudio has it; on a CPU with a smaller table and fewer samples."""
+    if ON_GPU:
+        return NerfactoModelConfig(eval_num_rays_per_chunk=1 << 15, average_init_density=0.01)
+    return NerfactoModelConfig(
+        eval_num_rays_per_chunk=2048,
+        average_init_density=0.01,
+        implementation="torch",
+        num_levels=8,
+        max_res=1024,
+        log2_hashmap_size=16,
+        num_proposal_samples_per_ray=(128, 64),
+        num_nerf_samples_per_ray=32,
+        camera_optimizer=CameraOptimizerConfig(mode="off"),
+    )
+
+
+leco_ngp = MethodSpecification(
+    config=trainer(
+        "leco-ngp",
+        ClampedDynamicBatchPipelineConfig(
+            datamanager=photographs(4096 if ON_GPU else 512),
+            model=guided(ngp_host()),
+            target_num_samples=1 << 18 if ON_GPU else 1 << 14,
+            max_num_samples_per_ray=1024 if ON_GPU else 32,
+        ),
+        {"fields": 1e-2},
+    ),
+    description="Instant-NGP, guided by learned occupancy instead of its occupancy grid.",
+)
+
+leco_nerfacto = MethodSpecification(
+    config=trainer(
+        "leco-nerfacto",
+        VanillaPipelineConfig(
+            datamanager=photographs(4096 if ON_GPU else 512),
+            model=guided(nerfacto_host()),
+        ),
+        {"fields": 1e-2, "proposal_networks": 1e-2, "camera_opt": 1e-3},
+    ),
+    description="Nerfacto, guided by learned occupancy instead of its proposal networks.",
+)

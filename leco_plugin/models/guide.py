@@ -1,0 +1,193 @@
+"""What guides a host: an occupancy, and the samplers that are made from it when they are asked.
+
+A host keeps stand-ins where it had its own samplers. They are made before there is an occupancy: it
+may still have to be learned, or to come with a checkpoint whose gate has a shape of its own.
+"""
+
+from __future__ import annotations
+
+import functools
+from typing import Any
+
+import torch
+from nerfstudio.model_components.ray_samplers import Sampler
+from torch import Tensor, nn
+
+from leco_plugin.models.gate import Gate, GateConfig
+from leco_plugin.occupancy import Occupancy
+from leco_plugin.samplers.base import Estimator
+from leco_plugin.samplers.registry import build_estimator, build_proposal, samplers
+from leco_plugin.space import Space
+
+
+class Guide(nn.Module):
+    """The occupancy of a host, with its place in the host's checkpoints.
+
+    Args:
+        sampler: name in the registry of samplers.
+
+    Attributes:
+        occupancy: None until there is one.
+        frame: [3, 4] takes positions of the host to those of the occupancy: a rotation times a
+            scale, and a translation.
+    """
+
+    frame: Tensor
+
+    def __init__(self, sampler: str = "learned-occupancy") -> None:
+        super().__init__()
+        self.sampler = sampler
+        self.occupancy: Occupancy | None = None
+        self.version = 0
+        self.register_buffer("frame", torch.eye(3, 4))
+        self.register_load_state_dict_post_hook(lambda guide, _: guide.changed())
+
+    @property
+    def needs_occupancy(self) -> bool:
+        """Whether the sampler asks a gate at all; a grid does not.
+
+        Raises:
+            ValueError: there is no such sampler.
+        """
+        known = samplers()
+        if self.sampler not in known:
+            raise ValueError(
+                f"there is no sampler {self.sampler!r}; there are {', '.join(sorted(known))}"
+            )
+        return known[self.sampler].needs_occupancy
+
+    def changed(self) -> None:
+        """Samplers that were made are made anew when they are next asked."""
+        self.version += 1
+
+    def set_occupancy(self, occupancy: Occupancy, frame: Tensor | None = None) -> None:
+        """Guides by this occupancy from now on; `frame` as the attribute, None for no change."""
+        self.occupancy = occupancy.to(self.frame.device).eval()
+        self.occupancy.requires_grad_(False)
+        if frame is not None:
+            self.frame.copy_(frame)
+        self.changed()
+
+    def the_occupancy(self) -> Occupancy:
+        """The occupancy.
+
+        Raises:
+            RuntimeError: there is none yet.
+        """
+        if self.occupancy is None:
+            raise RuntimeError(
+                "this model has no occupancy yet: train it, load a checkpoint, or give a file with "
+                "--pipeline.model.occupancy.path"
+            )
+        return self.occupancy
+
+    def same_frame(self) -> bool:
+        """Whether host and occupancy share their coordinates."""
+        return torch.equal(self.frame, torch.eye(3, 4, device=self.frame.device))
+
+    def estimator(self, aabb: Tensor) -> nn.Module:
+        """What goes where a packed host has its estimator; `aabb` is the box of that one, [6]."""
+        if self.needs_occupancy:
+            return GuidedEstimator(self, aabb)
+        return build_estimator(self.sampler, aabb=aabb)
+
+    def proposal(self, **options: Any) -> Sampler:
+        """What goes where a proposal host has its sampler; options as for the registry."""
+        return GuidedProposal(self, options)
+
+    def get_extra_state(self) -> dict[str, Any]:
+        """What a checkpoint must say before the gate's weights can be read."""
+        if self.occupancy is None:
+            return {}
+        return {
+            "gate": self.occupancy.gate.config.to_dict(),
+            "precision": self.occupancy.precision,
+            "report": self.occupancy.report,
+        }
+
+    def set_extra_state(self, state: dict[str, Any]) -> None:
+        """Makes an occupancy of the checkpoint's shape; torch then reads its weights."""
+        if state:
+            gate = Gate(GateConfig.from_dict(state["gate"]))
+            occupancy = Occupancy(gate, Space(), 0.0, state["precision"], state["report"])
+            self.set_occupancy(occupancy)
+
+
+class _StandIn(nn.Module):
+    """Builds the real sampler when it is first asked, and again when the occupancy has changed."""
+
+    def __init__(self, guide: Guide) -> None:
+        super().__init__()
+        # in tuples: neither the guide nor the sampler is a part of this module's state
+        self._guide = (guide,)
+        self._built: tuple[Any, tuple[nn.Module, ...]] = (None, ())
+
+    def _build(self, guide: Guide) -> nn.Module:
+        raise NotImplementedError
+
+    @property
+    def sampler(self) -> nn.Module:
+        """The sampler behind this; its mode follows the host's."""
+        (guide,) = self._guide
+        key = (guide.version, guide.frame.device)
+        if self._built[0] != key:
+            self._built = (key, (self._build(guide).to(guide.frame.device),))
+        return self._built[1][0].train(self.training)
+
+
+class GuidedEstimator(_StandIn):
+    """A packed sampler of the registry, in the host's coordinates."""
+
+    def __init__(self, guide: Guide, aabb: Tensor) -> None:
+        super().__init__(guide)
+        self._aabb = aabb.detach().cpu()
+
+    def _build(self, guide: Guide) -> nn.Module:
+        return build_estimator(guide.sampler, aabb=self._aabb, occupancy=guide.the_occupancy())
+
+    @functools.wraps(Estimator.sampling)
+    def sampling(self, rays_o: Tensor, rays_d: Tensor, *args: Any, **kwargs: Any) -> Any:
+        (guide,) = self._guide
+        estimator: Any = self.sampler
+        if not guide.same_frame():
+            # a direction carries the scale, so that distances along the ray stay the host's
+            turn = guide.frame[:, :3].T.to(rays_o)
+            rays_o, rays_d = rays_o @ turn + guide.frame[:, 3].to(rays_o), rays_d @ turn
+        return estimator.sampling(rays_o, rays_d, *args, **kwargs)
+
+    def update_every_n_steps(self, *args: Any, **kwargs: Any) -> None:
+        """Called by hosts before each training step; a frozen gate has nothing to update."""
+        estimator: Any = self.sampler
+        estimator.update_every_n_steps(*args, **kwargs)
+
+    def __getattr__(self, name: str) -> Any:
+        if name in ("aabbs", "binaries", "occs", "resolution", "device"):
+            return getattr(self.sampler, name)
+        return super().__getattr__(name)
+
+
+class GuidedProposal(_StandIn, Sampler):
+    """A proposal sampler of the registry, in the host's coordinates."""
+
+    def __init__(self, guide: Guide, options: dict[str, Any]) -> None:
+        super().__init__(guide)
+        self._options = options
+
+    def _build(self, guide: Guide) -> nn.Module:
+        options = dict(self._options)
+        if not guide.same_frame():
+            options["frame"] = guide.frame
+        return build_proposal(guide.sampler, occupancy=guide.the_occupancy(), **options)
+
+    def forward(self, *args: Any, **kwargs: Any) -> Any:
+        return self.sampler(*args, **kwargs)
+
+    def generate_ray_samples(self, *args: Any, **kwargs: Any) -> Any:
+        """As of the sampler behind this."""
+        return self.sampler(*args, **kwargs)
+
+    def set_anneal(self, anneal: float) -> None:
+        """Called by hosts for proposal networks, of which there are none."""
+
+    def step_cb(self, step: int) -> None:
+        """Called by hosts after a training step; nothing is scheduled here."""

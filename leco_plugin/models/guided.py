@@ -1,0 +1,99 @@
+"""A guided host: any nerfstudio model with its sampler swapped for a learned occupancy.
+
+A composition: the host keeps its own class, outputs, losses and optimizers. It comes out of
+`GuidedModelConfig.setup` as it would come out of its own config, but for where it samples.
+"""
+
+from __future__ import annotations
+
+import copy
+import functools
+from dataclasses import dataclass, field
+from typing import Any
+
+import torch
+from nerfstudio.engine.callbacks import (
+    TrainingCallback,
+    TrainingCallbackAttributes,
+    TrainingCallbackLocation,
+)
+from nerfstudio.models.base_model import Model, ModelConfig
+
+from leco_plugin.compat.checkpoints import allow_checkpoint_globals
+from leco_plugin.compat.host_lpips import setup_with_lazy_lpips
+from leco_plugin.models.guide import Guide
+from leco_plugin.models.guided_start import (
+    OWN_SAMPLER,
+    GuidedStart,
+    OccupancyConfig,
+    occupancy_file,
+)
+from leco_plugin.models.precision import keep_freed_memory
+from leco_plugin.models.seams import swap_sampler
+from leco_plugin.occupancy import Occupancy
+
+
+@dataclass
+class GuidedModelConfig(ModelConfig):
+    """A host with its sampler swapped"""
+
+    _target: type = field(default_factory=lambda: set_up_guided)  # type: ignore[assignment, return-value]
+    """what builds the host"""
+    host: ModelConfig = field(default_factory=ModelConfig)
+    """The host, as its own method has it."""
+    occupancy: OccupancyConfig = field(default_factory=OccupancyConfig)
+    """What guides it."""
+    eval_num_rays_per_chunk: int | None = None  # type: ignore[assignment]
+    """Rays rendered at a time; None is the host's own."""
+
+
+def set_up_guided(config: GuidedModelConfig, **arguments: Any) -> Model:
+    """Builds the host, swaps its sampler, and returns the host.
+
+    Args:
+        config: host and occupancy.
+        arguments: what nerfstudio gives a model (scene_box, num_train_data, metadata, device, ...).
+    Raises:
+        InputError: the host has no seam that is known, or there is no such sampler.
+        ValueError, OSError: the file is there, and is no occupancy.
+    """
+    allow_checkpoint_globals()
+    if torch.device(arguments.get("device", "cpu")).type == "cpu":
+        keep_freed_memory()
+    host_config = copy.deepcopy(config.host)
+    if config.eval_num_rays_per_chunk is not None:
+        host_config.eval_num_rays_per_chunk = config.eval_num_rays_per_chunk
+    if config.occupancy.sampler == OWN_SAMPLER:
+        return _as_it_is(host_config, arguments)
+    guide = Guide(config.occupancy.sampler)
+    file = occupancy_file(config.occupancy.path)
+    if guide.needs_occupancy and file is not None and file.exists():
+        guide.set_occupancy(Occupancy.load(file))
+    host = setup_with_lazy_lpips(host_config, **arguments)
+    host.guide = guide
+    swap_sampler(host, guide)
+    _begin_with_occupancy(host, guide, config.occupancy)
+    return host
+
+
+def _as_it_is(host_config: ModelConfig, arguments: dict[str, Any]) -> Model:
+    """The host with its own sampler, for comparison, on any device and without a network."""
+    from leco_plugin.samplers import nerfacc_cpu
+
+    nerfacc_cpu.install()
+    return setup_with_lazy_lpips(host_config, **arguments)
+
+
+def _begin_with_occupancy(host: Model, guide: Guide, config: OccupancyConfig) -> None:
+    """Before the host's first step there is an occupancy, in its coordinates, and in its folder."""
+    own_callbacks = host.get_training_callbacks
+
+    @functools.wraps(own_callbacks)
+    def get_training_callbacks(attributes: TrainingCallbackAttributes) -> list[TrainingCallback]:
+        if not guide.needs_occupancy:
+            return own_callbacks(attributes)
+        start = GuidedStart(guide, config, attributes.pipeline, attributes.trainer)
+        where = [TrainingCallbackLocation.BEFORE_TRAIN_ITERATION]
+        return [TrainingCallback(where, start.before_step), *own_callbacks(attributes)]
+
+    host.get_training_callbacks = get_training_callbacks  # type: ignore[assignment, method-assign]

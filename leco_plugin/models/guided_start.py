@@ -1,0 +1,147 @@
+"""Where a guided host gets its occupancy: from a file, or learned first; in its own coordinates."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import torch
+from nerfstudio.utils.rich_utils import CONSOLE
+from torch import distributed
+
+from leco_plugin.models.freezing import FILE_NAME
+from leco_plugin.models.guide import Guide
+from leco_plugin.models.leco import LecoModelConfig
+from leco_plugin.occupancy import Occupancy
+from leco_plugin.samplers.rays import intersect_box
+from leco_plugin.scenes.frames import between, frame_of
+from leco_plugin.scenes.input_error import InputError
+from leco_plugin.scenes.survey import covering_rays
+
+PLACES = 128
+"""Positions on each ray at which a file is asked whether it fits the cameras."""
+
+OWN_SAMPLER = "own"
+"""Name of no sampler: the host keeps its own."""
+
+
+@dataclass
+class OccupancyConfig:
+    """What guides the host."""
+
+    path: Path | None = None
+    """An occupancy.safetensors, or the folder of a run that left one. None learns the occupancy
+    first, in this run."""
+    sampler: str = "learned-occupancy"
+    """Name in the registry of samplers. For comparison: `dense`, `occupancy-grid`, and `own`, which
+    leaves the host as it is."""
+    seconds: float | None = None
+    """Without a path: about how long learning may take; None is until it has settled."""
+    rays: int = 1024
+    """Without a path: rays of a batch while learning."""
+    learning: LecoModelConfig = field(default_factory=LecoModelConfig)
+    """Without a path: the HMoE that learns."""
+
+
+def occupancy_file(path: Path | None) -> Path | None:
+    """The file that `path` means: itself, or the newest occupancy in the folder of a run.
+
+    Without an error where there is none: a checkpoint brings its own.
+    """
+    if path is None or not path.is_dir():
+        return path
+    found = sorted(path.rglob(FILE_NAME), key=lambda file: file.stat().st_mtime)
+    return found[-1] if found else path / FILE_NAME
+
+
+class GuidedStart:
+    """The start of one training run of a guided host.
+
+    Args:
+        guide: of the host; it has an occupancy already where a file or a checkpoint gave one.
+        config: where else to get one.
+        pipeline, trainer: nerfstudio's; without a trainer no file is left.
+    Raises:
+        InputError: the file is not there, or its occupancy keeps nothing that the cameras see.
+    """
+
+    def __init__(
+        self, guide: Guide, config: OccupancyConfig, pipeline: Any, trainer: Any = None
+    ) -> None:
+        self.guide, self.config = guide, config
+        self.pipeline, self.trainer = pipeline, trainer
+        self.begun = False
+        if guide.occupancy is not None:
+            self._fit(guide.occupancy)
+        elif config.path is not None:
+            raise InputError(
+                f"there is no occupancy {config.path}: train leco-occupancy on this scene and give "
+                "its run folder, or give no path to learn it first"
+            )
+
+    def before_step(self, step: int) -> None:
+        """Learns the occupancy if there is none yet; leaves its file in the run's folder."""
+        if self.begun:
+            return
+        self.begun = True
+        if self.guide.occupancy is None:
+            from leco_plugin.models.learn_first import learn_occupancy
+
+            config = self.config
+            occupancy = learn_occupancy(config.learning, self.pipeline, config.rays, config.seconds)
+            _share_among_ranks(occupancy)
+            self.guide.set_occupancy(occupancy)
+        if self.trainer is not None and getattr(self.trainer, "local_rank", 0) == 0:
+            folder = Path(self.trainer.base_dir)
+            folder.mkdir(parents=True, exist_ok=True)
+            self.guide.the_occupancy().save(folder / FILE_NAME)
+
+    def _fit(self, occupancy: Occupancy) -> None:
+        """Finds how the occupancy's coordinates lie in the host's, and whether they are of one
+        scene."""
+        manager = self.pipeline.datamanager
+        learned_in, host = occupancy.report.get("frame"), frame_of(manager)
+        if learned_in is not None and host is not None:
+            self.guide.frame.copy_(between(host, learned_in))
+            self.guide.changed()
+        share = kept_on_rays(self.guide, manager.train_dataset.cameras)
+        if share == 0.0:
+            raise InputError(
+                "the occupancy keeps nothing on the rays of these cameras: it was learned on "
+                "another scene, or the scene has been moved since"
+            )
+        CONSOLE.log(f"\\[leco] guided by an occupancy that keeps {share:.1%} along these rays")
+
+
+@torch.no_grad()
+def kept_on_rays(guide: Guide, cameras: Any) -> float:
+    """Share of the positions on rays through the occupancy's box that it keeps, in [0, 1]."""
+    occupancy = guide.the_occupancy()
+    frame = guide.frame
+    origins, directions = (part.reshape(-1, 3).to(frame) for part in covering_rays(cameras))
+    origins, directions = origins @ frame[:, :3].T + frame[:, 3], directions @ frame[:, :3].T
+    center, half = occupancy.space.center, occupancy.space.half_extent
+    # a contraction goes on beyond its inner cube: most of what is seen lies within some of those
+    reach = half if occupancy.space.kind == "box" else 8.0 * half
+    box = torch.cat([center - reach, center + reach])
+    enters, leaves = intersect_box(origins, directions, box)
+    along = (torch.arange(PLACES, device=frame.device) + 0.5) / PLACES
+    hits = (leaves > enters.clamp(min=0.0)).nonzero()[:, 0]
+    starts, ends = enters[hits].clamp(min=0.0)[:, None], leaves[hits][:, None]
+    t = starts + (ends - starts) * along
+    positions = origins[hits][:, None] + directions[hits][:, None] * t[..., None]
+    parts = positions.reshape(-1, 3).split(1 << 18)
+    kept = sum(float(occupancy.occupied(part).sum()) for part in parts)
+    return kept / max(t.numel(), 1)
+
+
+def _share_among_ranks(occupancy: Occupancy) -> None:
+    """Every process of a data-parallel run is guided by what the first one learned."""
+    if not (distributed.is_available() and distributed.is_initialized()):
+        return
+    for value in occupancy.state_dict().values():
+        distributed.broadcast(value, src=0)
+    report = [occupancy.report]
+    distributed.broadcast_object_list(report, src=0)
+    occupancy.report = report[0]

@@ -1,0 +1,97 @@
+"""Learns an occupancy inside the run of another method, before that method's own first step."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import replace
+from typing import Any
+
+import torch
+from nerfstudio.engine.callbacks import TrainingCallbackAttributes
+
+from leco_plugin.models.leco import LecoModel, LecoModelConfig
+from leco_plugin.models.lifecycle import Lifecycle
+from leco_plugin.models.optimizers import RATES, FusedAdamConfig
+from leco_plugin.occupancy import Occupancy
+from leco_plugin.progress_bar import bar
+
+TIMED_STEPS = 10
+"""Steps after which their time is known well enough to keep to a budget."""
+FEWEST_STEPS = 20
+
+
+def learn_occupancy(
+    config: LecoModelConfig, pipeline: Any, rays: int, seconds: float | None = None
+) -> Occupancy:
+    """Trains an HMoE on the pipeline's data until its gate is frozen and calibrated.
+
+    Args:
+        config: of the HMoE.
+        pipeline: a nerfstudio pipeline; only its data manager and device are used, and its batches
+            are as long as before when this returns.
+        rays: of a batch.
+        seconds: how long this may take, about; None takes the config's learning steps.
+    Returns:
+        The occupancy, in the coordinates of the pipeline's model.
+    Raises:
+        ValueError: the budget is no positive number of seconds.
+        FloatingPointError, RuntimeError: learning failed; one line says where and why.
+    """
+    if seconds is not None and not seconds > 0.0:
+        raise ValueError(f"an occupancy is learned in a positive number of seconds, not {seconds}")
+    manager = pipeline.datamanager
+    dataset = manager.train_dataset
+    model: Any = config.setup(
+        scene_box=dataset.scene_box,
+        num_train_data=len(dataset),
+        metadata=dataset.metadata,
+        device=pipeline.device,
+    ).to(pipeline.device)
+    model.train()
+    sampler = getattr(manager, "train_pixel_sampler", None)
+    before = sampler.num_rays_per_batch if sampler is not None else 0
+    if sampler is not None:
+        sampler.set_num_rays_per_batch(rays)
+    lifecycle = Lifecycle(model, TrainingCallbackAttributes(None, None, pipeline, None))
+    lifecycle.rays_per_batch = rays
+    groups = model.get_param_groups()
+    optimizers = [replace(_adam(name), lr=RATES[name]).setup(p) for name, p in groups.items()]
+    try:
+        with bar("Learning the occupancy") as show:
+            _train(model, lifecycle, optimizers, manager, seconds, show)
+    finally:
+        if sampler is not None:
+            sampler.set_num_rays_per_batch(before)
+    occupancy: Occupancy = model.occupancy()
+    return occupancy.eval()
+
+
+def _adam(name: str) -> FusedAdamConfig:
+    return FusedAdamConfig(lr=RATES[name])
+
+
+def _train(
+    model: LecoModel,
+    lifecycle: Lifecycle,
+    optimizers: list[Any],
+    manager: Any,
+    seconds: float | None,
+    show: Any,
+) -> None:
+    started = time.monotonic()
+    step = 0
+    while not bool(model.frozen):
+        lifecycle.before_step(step)
+        bundle, batch = manager.next_train(step)
+        losses = model.get_loss_dict(model(bundle), batch)
+        for optimizer in optimizers:
+            optimizer.zero_grad(set_to_none=True)
+        torch.stack(list(losses.values())).sum().backward()
+        for optimizer in optimizers:
+            optimizer.step()
+        lifecycle.after_step(step)
+        step += 1
+        if seconds is not None and step == TIMED_STEPS:
+            a_step = (time.monotonic() - started) / step
+            lifecycle.progress.learn_steps = max(FEWEST_STEPS, int(seconds / a_step))
+        show(min(1.0, step / lifecycle.progress.learn_steps))

@@ -1,0 +1,186 @@
+"""Where a host asks for samples, and how that is replaced (entry-point group `leco_plugin.hosts`).
+
+A seam is found by its type, wherever the host keeps it and whatever it calls it. A host that
+samples in another way brings a `HostAdapter`.
+"""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+from torch import nn
+
+from leco_plugin.entries import foreign_entries
+from leco_plugin.models.guide import Guide
+from leco_plugin.samplers.base import Estimator
+from leco_plugin.scenes.input_error import InputError
+
+if TYPE_CHECKING:
+    from nerfstudio.models.base_model import Model
+
+GROUP = "leco_plugin.hosts"
+
+
+@dataclass(frozen=True)
+class HostAdapter:
+    """How the sampler of a kind of host is replaced."""
+
+    description: str
+    """What it looks for, for the error that nothing was found."""
+    fits: Callable[[Model], bool]
+    """Whether a model is such a host."""
+    swap: Callable[[Model, Guide], None]
+    """Puts `guide.estimator(...)` or `guide.proposal(...)` in the place of the host's own sampling,
+    and takes away what that makes superfluous."""
+
+
+def adapters() -> dict[str, HostAdapter]:
+    """All adapters by name, those of other packages first."""
+    return {**foreign_entries(GROUP), "packed": PACKED, "proposal": PROPOSAL}
+
+
+def swap_sampler(host: Model, guide: Guide) -> str:
+    """Replaces the host's sampling by the guide's; returns the name of the adapter that did.
+
+    Raises:
+        InputError: the host has no seam that any adapter knows.
+    """
+    known = adapters()
+    for name, adapter in known.items():
+        if adapter.fits(host):
+            adapter.swap(host, guide)
+            _leave_out_empty_groups(host)
+            return name
+    looked_for = "; ".join(f"{name}: {adapter.description}" for name, adapter in known.items())
+    raise InputError(
+        f"{type(host).__name__} has no sampler that could be swapped. Looked for: {looked_for}. "
+        f"A package can bring a HostAdapter (leco_plugin.models.seams) in the entry-point group "
+        f"{GROUP}"
+    )
+
+
+def _replace(host: nn.Module, old: nn.Module, new: nn.Module) -> None:
+    """Puts `new` wherever the host or a module in it holds `old`."""
+    for parent in list(host.modules()):
+        for name, child in list(parent._modules.items()):
+            if child is old:
+                setattr(parent, name, new)
+
+
+def _estimators(host: nn.Module) -> list[nn.Module]:
+    from nerfacc.estimators.base import AbstractEstimator
+    from nerfacc.estimators.prop_net import PropNetEstimator
+
+    return [
+        module
+        for module in host.modules()
+        if isinstance(module, AbstractEstimator | Estimator)
+        and not isinstance(module, PropNetEstimator)
+    ]
+
+
+def _swap_packed(host: Model, guide: Guide) -> None:
+    from leco_plugin.samplers import nerfacc_cpu
+
+    nerfacc_cpu.install()
+    for old in _estimators(host):
+        boxes: Any = old.aabbs
+        _replace(host, old, guide.estimator(boxes[0].detach()))
+
+
+PACKED = HostAdapter(
+    "an estimator of nerfacc (OccGridEstimator) that a volumetric sampler asks",
+    lambda host: bool(_estimators(host)),
+    _swap_packed,
+)
+
+
+def _proposal_samplers(host: nn.Module) -> list[Any]:
+    from nerfstudio.model_components.ray_samplers import ProposalNetworkSampler
+
+    return [module for module in host.modules() if isinstance(module, ProposalNetworkSampler)]
+
+
+def _swap_proposal(host: Model, guide: Guide) -> None:
+    if not guide.needs_occupancy:
+        raise InputError(f"the sampler {guide.sampler!r} has nothing for a proposal host")
+    for old in _proposal_samplers(host):
+        initial = old.initial_sampler
+        _replace(
+            host,
+            old,
+            guide.proposal(
+                num_samples=old.num_nerf_samples_per_ray,
+                initial_sampler=initial,
+                single_jitter=bool(getattr(initial, "single_jitter", False)),
+            ),
+        )
+    _remove_density_networks(host)
+    _leave_out_proposal_loss(host)
+
+
+PROPOSAL = HostAdapter(
+    "a ProposalNetworkSampler of nerfstudio",
+    lambda host: bool(_proposal_samplers(host)),
+    _swap_proposal,
+)
+
+
+def no_density(*_: Any, **__: Any) -> None:
+    """Stands in a host's list of proposal densities: their number is asked for, not they.
+
+    Raises:
+        RuntimeError: it is called after all.
+    """
+    raise RuntimeError("a guided host has no proposal networks to ask for a density")
+
+
+def _density_lists(host: nn.Module) -> Iterator[tuple[str, list[Any]]]:
+    """Lists of bound methods of modules, as proposal hosts hand to their sampler."""
+    for name, value in vars(host).items():
+        if isinstance(value, list) and value:
+            owners = [getattr(item, "__self__", None) for item in value]
+            if all(isinstance(owner, nn.Module) for owner in owners):
+                yield name, value
+
+
+def _remove_density_networks(host: nn.Module) -> None:
+    """Drops the proposal networks from memory, state dict and parameter groups."""
+    field = getattr(host, "field", None)
+    for name, densities in list(_density_lists(host)):
+        networks = {id(density.__self__) for density in densities} - {id(field)}
+        for parent in list(host.modules()):
+            if isinstance(parent, nn.ModuleList) and any(id(n) in networks for n in parent):
+                _replace(host, parent, nn.ModuleList(n for n in parent if id(n) not in networks))
+        for attribute, child in list(host._modules.items()):
+            if id(child) in networks:
+                del host._modules[attribute]
+        setattr(host, name, [no_density] * len(densities))
+
+
+def _leave_out_proposal_loss(host: Model) -> None:
+    """A loss that reaches no parameter, as the one of proposal networks now, is left out."""
+    with_all = host.get_loss_dict
+
+    @functools.wraps(with_all)
+    def get_loss_dict(*args: Any, **kwargs: Any) -> dict[str, Any]:
+        losses = with_all(*args, **kwargs)
+        if not host.training:
+            return losses
+        return {name: loss for name, loss in losses.items() if loss.requires_grad}
+
+    host.get_loss_dict = get_loss_dict  # type: ignore[method-assign]
+
+
+def _leave_out_empty_groups(host: Model) -> None:
+    """An optimizer takes no empty list: groups whose parameters are gone are not handed out."""
+    with_all = host.get_param_groups
+
+    @functools.wraps(with_all)
+    def get_param_groups() -> dict[str, list[nn.Parameter]]:
+        return {name: group for name, group in with_all().items() if group}
+
+    host.get_param_groups = get_param_groups  # type: ignore[method-assign]
