@@ -65,10 +65,9 @@ def test_a_gate_that_no_file_could_hold_is_refused_before_it_is_built() -> None:
         LecoModel(LecoModelConfig(sizes=sizes), scene_box=None, num_train_data=2)  # type: ignore[arg-type]
 
 
-def pipeline_of(kind: Kind, scene: Path, folder: Path) -> tuple[Any, Any]:
+def pipeline_of(kind: Kind, scene: Path) -> tuple[Any, Any]:
     """A pipeline on a scene, and what its trainer would call around each step."""
     config = copy.deepcopy(leco_occupancy.config)
-    config.data, config.output_dir = scene, folder
     manager = config.pipeline.datamanager
     manager.data, manager.train_num_rays_per_batch = scene, 128
     manager.dataparser.downscale_factor = 1  # else nerfstudio leaves an image open to look at it
@@ -77,9 +76,7 @@ def pipeline_of(kind: Kind, scene: Path, folder: Path) -> tuple[Any, Any]:
     model.schedule = ScheduleConfig(learn_steps=LEARN_STEPS, steps_per_check=4)
     model.calibration = CalibrationConfig(rays=128)
     pipeline = config.pipeline.setup(device="cpu", test_mode="val")
-    trainer = type("Trainer", (), {"config": config, "base_dir": folder})
-    config.max_num_iterations = 4 * LEARN_STEPS
-    attributes = TrainingCallbackAttributes(None, None, pipeline, trainer)  # type: ignore[arg-type]
+    attributes = TrainingCallbackAttributes(None, None, pipeline, None)  # type: ignore[arg-type]
     return pipeline, pipeline.get_training_callbacks(attributes)
 
 
@@ -90,7 +87,7 @@ def test_a_gate_on_any_features_is_learned_frozen_and_saved(
     torch.manual_seed(0)
     without_cache = partial(LearnedOccupancyEstimator, cache_bytes=0)  # seconds to build
     monkeypatch.setattr("leco_plugin.models.leco.LearnedOccupancyEstimator", without_cache)
-    pipeline, callbacks = pipeline_of(kind, tiny_scene, tmp_path)
+    pipeline, callbacks = pipeline_of(kind, tiny_scene)
     model = pipeline.model.train()
     groups = model.get_param_groups()
     optimizer = torch.optim.Adam([{"params": group} for group in groups.values()], lr=1e-2)
@@ -112,6 +109,7 @@ def test_a_gate_on_any_features_is_learned_frozen_and_saved(
             assert bool(model.frozen)
             at_freezing = [table.detach().clone() for table in tables]
     assert all(torch.equal(table, before) for table, before in zip(tables, at_freezing))
+    model.occupancy().save(tmp_path / FILE_NAME)
     occupancy = Occupancy.load(tmp_path / FILE_NAME)
     estimator = build_estimator(f"learned-occupancy-{kind}", occupancy=occupancy, cache_bytes=0)
     positions = torch.rand(1000, 3) - 0.5
