@@ -17,7 +17,7 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import save
 from torch import Tensor, nn
 
-from leco_plugin.models.gate import Gate, GateConfig
+from leco_plugin.models.gate import Gate, GateConfig, check_sizes
 from leco_plugin.space import NO_WALL, Space
 
 FORMAT = "leco-occupancy"
@@ -211,13 +211,7 @@ def _digest(header: dict[str, str], tensors: dict[str, Tensor]) -> str:
 
 def _expected_shapes(config: GateConfig) -> dict[str, tuple[tuple[int, ...], torch.dtype]]:
     """Names, shapes and types that a file with this gate must hold, found without allocating it."""
-    encoding = config.encoding
-    counts = (config.width, config.layers, config.scene_experts, encoding.octaves, encoding.levels)
-    sizes = (*counts, encoding.features, encoding.log2_table, encoding.coarsest, encoding.finest)
-    if not all(type(size) is int and 0 < size < 2**20 for size in sizes) or max(counts[1:]) > 64:
-        raise ValueError(f"sizes out of range {sizes}")
-    if encoding.kind not in ("frequency", "hash") or encoding.log2_table > 24:
-        raise ValueError("an unknown encoding, or a table out of range")
+    check_sizes(config)
     with torch.device("meta"):
         module = Occupancy(Gate(config), Space(), 0.0)
     return {name: (tuple(value.shape), value.dtype) for name, value in module.state_dict().items()}

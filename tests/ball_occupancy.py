@@ -1,4 +1,4 @@
-"""An occupancy that is known: a ball, whose gate was fitted to it in a second."""
+"""An occupancy that is known: a ball, whose gate was fitted to it in a second or two."""
 
 from __future__ import annotations
 
@@ -14,11 +14,23 @@ from leco_plugin.space import Space
 CENTRE, RADIUS, HALF = (1.0, 2.0, 0.5), 1.0, 2.0
 
 
+ENCODINGS = {
+    "frequency": EncodingConfig("frequency", octaves=2),
+    "hash": EncodingConfig("hash", levels=3, log2_table=13, coarsest=8, finest=32),
+    "vm": EncodingConfig("vm", components=4, plane_cells=32),
+    "k-planes": EncodingConfig("k-planes", levels=3, coarsest=8, plane_cells=32),
+}
+
+
 @functools.cache
-def ball() -> Occupancy:
-    """Kept within `RADIUS` of `CENTRE`, to some hundredths; its report names walls and cameras."""
+def ball(kind: str = "frequency") -> Occupancy:
+    """Kept within `RADIUS` of `CENTRE`, to some hundredths; its report names walls and cameras.
+
+    Args:
+        kind: of the features that its gate is on.
+    """
     torch.manual_seed(0)
-    gate = Gate(GateConfig(EncodingConfig(kind="frequency", octaves=2), 32, 2, 2))
+    gate = Gate(GateConfig(ENCODINGS[kind], 32, 2, 2))
     optimizer = torch.optim.Adam(gate.parameters(), 1e-2)
     for _ in range(200):
         mapped = 2.0 * torch.rand(1024, 3) - 1.0

@@ -15,13 +15,17 @@ from safetensors.torch import save
 from torch import Tensor
 
 from leco_plugin.models.encodings import EncodingConfig
-from leco_plugin.models.gate import Gate, GateConfig
+from leco_plugin.models.gate import LARGEST_SIZES, Gate, GateConfig
 from leco_plugin.occupancy import LARGEST_FILE, Occupancy
 from leco_plugin.space import Space
 
 GATES = {
     "frequency": GateConfig(EncodingConfig(octaves=2), width=8, layers=1, scene_experts=2),
     "hash": GateConfig(EncodingConfig("hash", levels=2, log2_table=5), width=8, layers=1),
+    "vm": GateConfig(EncodingConfig("vm", components=2, plane_cells=3), width=8, layers=1),
+    "k-planes": GateConfig(
+        EncodingConfig("k-planes", levels=2, coarsest=2, plane_cells=3), width=8, layers=1
+    ),
 }
 
 
@@ -34,8 +38,12 @@ def occupancy(kind: str = "frequency", **options) -> Occupancy:
 
 @pytest.fixture(scope="module")
 def sound(tmp_path_factory: pytest.TempPathFactory) -> bytes:
-    path = tmp_path_factory.mktemp("sound") / "occupancy.safetensors"
-    occupancy().save(path)
+    return content_of(occupancy(), tmp_path_factory.mktemp("sound"))
+
+
+def content_of(occupancy: Occupancy, folder: Path) -> bytes:
+    path = folder / "occupancy.safetensors"
+    occupancy.save(path)
     return path.read_bytes()
 
 
@@ -124,13 +132,13 @@ def is_refused_or_the_same(path: Path, state: dict[str, Tensor]) -> bool:
     return False
 
 
-def test_damaged_files_are_refused_or_load_to_the_same_tensors(sound, tmp_path: Path) -> None:
-    state, path = occupancy().state_dict(), tmp_path / "o.safetensors"
-    refused = 0
-    for content in damaged(sound, 400):
+@pytest.mark.parametrize("kind", GATES)
+def test_damaged_files_are_refused_or_load_to_the_same_tensors(kind, tmp_path: Path) -> None:
+    saved, path, refused = occupancy(kind), tmp_path / "o.safetensors", 0
+    for content in damaged(content_of(saved, tmp_path), 200):
         path.write_bytes(content)
-        refused += is_refused_or_the_same(path, state)
-    assert refused > 380
+        refused += is_refused_or_the_same(path, saved.state_dict())
+    assert refused > 190
 
 
 FOREIGN = {
@@ -174,8 +182,8 @@ HEADERS = {
         '{"encoding": {"kind": "frequency"}, "a\\nb": 1}',
         *(
             json.dumps({"encoding": {"kind": kind, name: size}})
-            for kind in ("frequency", "hash")
-            for name in ("octaves", "levels", "features", "log2_table", "finest")
+            for kind in GATES
+            for name in LARGEST_SIZES.keys() - {"width", "layers", "scene_experts"}
             for size in (0, -1, 10**6, 10**400, 1.5, "a\nb", None, True)
         ),
         *(
@@ -198,6 +206,26 @@ def test_a_header_of_nonsense_is_refused_in_one_line(key: str, sound, tmp_path: 
         assert is_refused_or_the_same(path, tensors), value
     path.write_bytes(save(tensors, metadata={k: v for k, v in header.items() if k != key}))
     assert is_refused_or_the_same(path, tensors)
+
+
+@pytest.mark.parametrize("kind", GATES)
+def test_a_header_that_claims_another_gate_is_refused(kind: str, tmp_path: Path) -> None:
+    saved = occupancy(kind)
+    header, tensors = parts(content_of(saved, tmp_path), tmp_path)
+    gate, path = saved.gate.config.to_dict(), tmp_path / "o.safetensors"
+    used = {
+        "frequency": {"octaves"},
+        "hash": {"levels", "features", "log2_table"},
+        "vm": {"components", "plane_cells"},
+        "k-planes": {"levels", "features", "coarsest", "plane_cells"},
+    }[kind]
+    claims = [{"kind": other} for other in GATES if other != kind]
+    claims += [{name: size} for name in used for size in (1, 7, LARGEST_SIZES[name])]
+    claims += [{name: LARGEST_SIZES[name] for name in used}]
+    for claim in claims:
+        claimed = gate | {"encoding": gate["encoding"] | claim}
+        path.write_bytes(save(tensors, metadata=header | {"gate": json.dumps(claimed)}))
+        assert is_refused_or_the_same(path, saved.state_dict()), claim
 
 
 def test_tensors_that_do_not_fit_the_header_are_refused(sound: bytes, tmp_path: Path) -> None:

@@ -9,25 +9,34 @@ from typing import Any, Literal, Protocol
 import torch
 from torch import Tensor, nn
 
+from leco_plugin.models.planes import KPlanesEncoding, VectorMatrixEncoding
+
+Kind = Literal["frequency", "hash", "vm", "k-planes"]
+
 
 @dataclass(frozen=True)
 class EncodingConfig:
     """Which encoding, and its size. Serialisable: it is written into `occupancy.safetensors`."""
 
-    kind: Literal["frequency", "hash"] = "frequency"
-    """Sines and cosines (NeRF, eq. 4), or a multi-resolution hash grid (Instant-NGP, section 3)."""
+    kind: Kind = "frequency"
+    """Sines and cosines (NeRF, eq. 4), a multi-resolution hash grid (Instant-NGP, section 3),
+    vector-matrix products (TensoRF, eq. 3), or products of planes (K-planes, eq. 1)."""
     octaves: int = 6
     """Frequency: number of octaves, the lowest with a period of twice the cube."""
     levels: int = 8
-    """Hash: number of resolutions."""
+    """Hash, K-planes: number of resolutions."""
     features: int = 2
-    """Hash: features per level."""
+    """Hash, K-planes: features per level."""
+    components: int = 8
+    """VM: products of a plane and a line for each of the three pairs."""
     log2_table: int = 16
     """Hash: binary logarithm of the entries per level."""
     coarsest: int = 16
-    """Hash: cells along the cube at the coarsest level."""
+    """Hash, K-planes: cells along the cube at the coarsest level."""
     finest: int = 1024
     """Hash: cells along the cube at the finest level."""
+    plane_cells: int = 128
+    """VM, and the finest level of K-planes: cells along the cube; memory grows with the square."""
 
     def to_dict(self) -> dict[str, int | str]:
         return asdict(self)
@@ -170,10 +179,15 @@ class HashEncoding(nn.Module):
             )
 
 
-def build_encoding(config: EncodingConfig) -> FrequencyEncoding | HashEncoding:
+def build_encoding(
+    config: EncodingConfig,
+) -> FrequencyEncoding | HashEncoding | VectorMatrixEncoding | KPlanesEncoding:
     """The module that `config` describes."""
-    if config.kind == "frequency":
-        return FrequencyEncoding(config.octaves)
-    return HashEncoding(
-        config.levels, config.features, config.log2_table, config.coarsest, config.finest
-    )
+    levels, features, coarsest = config.levels, config.features, config.coarsest
+    if config.kind == "hash":
+        return HashEncoding(levels, features, config.log2_table, coarsest, config.finest)
+    if config.kind == "vm":
+        return VectorMatrixEncoding(config.components, config.plane_cells)
+    if config.kind == "k-planes":
+        return KPlanesEncoding(levels, features, coarsest, config.plane_cells)
+    return FrequencyEncoding(config.octaves)

@@ -7,11 +7,12 @@ from __future__ import annotations
 
 from dataclasses import asdict, dataclass, field
 from itertools import pairwise
+from typing import get_args
 
 import torch
 from torch import Tensor, nn
 
-from leco_plugin.models.encodings import EncodingConfig, build_encoding
+from leco_plugin.models.encodings import EncodingConfig, Kind, build_encoding
 
 EMPTY = 0
 """Index of the empty-space expert in logits, probabilities and routes."""
@@ -44,6 +45,45 @@ class GateConfig:
         if not isinstance(encoding, dict):
             raise TypeError(f"the gate's encoding must be a mapping, got {type(encoding).__name__}")
         return GateConfig(**{**values, "encoding": EncodingConfig(**encoding)})  # type: ignore[arg-type]
+
+
+MOST_VALUES = 15 * 2**20
+"""Learned values of the largest gate: 60 MiB, which `occupancy.LARGEST_FILE` has room for."""
+LARGEST_SIZES = {
+    "width": 2**12,
+    "layers": 64,
+    "scene_experts": 64,
+    "octaves": 64,
+    "levels": 64,
+    "features": 64,
+    "components": 64,
+    "log2_table": 24,
+    "coarsest": 2**20,
+    "finest": 2**20,
+    "plane_cells": 2**12,
+}
+
+
+def check_sizes(config: GateConfig) -> None:
+    """Refuses a gate that cannot be built or saved, before anything of it is allocated.
+
+    Raises:
+        ValueError: an unknown kind of encoding, a size that is no whole number or out of range, or
+            more than `MOST_VALUES` learned values. One line.
+    """
+    if config.encoding.kind not in get_args(Kind):
+        raise ValueError(f"the gate's encoding is of an unknown kind {config.encoding.kind!r}")
+    sizes = {**vars(config), **vars(config.encoding)}
+    for name, largest in LARGEST_SIZES.items():
+        if type(sizes[name]) is not int or not 0 < sizes[name] <= largest:
+            raise ValueError(f"the gate's {name} is {sizes[name]!r}, not in 1 to {largest}")
+    with torch.device("meta"):
+        values = sum(parameter.numel() for parameter in Gate(config).parameters())
+    if values > MOST_VALUES:
+        raise ValueError(
+            f"a gate on {config.encoding.kind} features of these sizes holds {values} values; "
+            f"at most {MOST_VALUES} fit its file"
+        )
 
 
 class Gate(nn.Module):

@@ -17,7 +17,7 @@ from leco_plugin.evaluation.metrics import image_metrics
 from leco_plugin.models.calibration import CalibrationConfig
 from leco_plugin.models.failures import explain_non_finite, first_non_finite
 from leco_plugin.models.field import HMoEField
-from leco_plugin.models.gate import Gate
+from leco_plugin.models.gate import Gate, check_sizes
 from leco_plugin.models.losses import distortion_loss, termination_loss
 from leco_plugin.models.objective import GateLossConfig, gate_losses
 from leco_plugin.models.phases import ScheduleConfig
@@ -101,6 +101,7 @@ class LecoModel(Model):
             keep_freed_memory()
         self.precision = fast_precision(device)
         sizes = self.config.sizes
+        check_sizes(sizes.gate)
         self.gate = Gate(sizes.gate)
         self.field = HMoEField(sizes.field, self.num_train_data)
         self.space = Space()
@@ -126,13 +127,15 @@ class LecoModel(Model):
         )
 
     def get_param_groups(self) -> dict[str, list[nn.Parameter]]:
-        """`encoding` (tables, if any), `field` (everything else that shades) and `gate`."""
-        tables = list(self.field.encoding.parameters())
+        """`encoding` (tables of both, if any), and what else there is in `field` and `gate`."""
+        tables = [*self.field.encoding.parameters(), *self.gate.encoding.parameters()]
         known = {id(parameter) for parameter in tables}
-        rest = [p for p in self.field.parameters() if id(p) not in known]
+        groups = {
+            name: [p for p in module.parameters() if id(p) not in known]
+            for name, module in (("field", self.field), ("gate", self.gate))
+        }
         # a frequency encoding has no parameters, and an optimizer needs one
-        tables = tables or [self.device_indicator_param]
-        return {"encoding": tables, "field": rest, "gate": list(self.gate.parameters())}
+        return groups | {"encoding": tables or [self.device_indicator_param]}
 
     def get_training_callbacks(
         self, training_callback_attributes: TrainingCallbackAttributes

@@ -8,7 +8,12 @@ from __future__ import annotations
 
 import importlib
 from collections.abc import Callable
+<<<<<<< HEAD
 from dataclasses import dataclass
+=======
+from dataclasses import dataclass, replace
+from importlib.metadata import entry_points
+>>>>>>> h-kinds
 from typing import Any
 
 from torch import nn
@@ -31,6 +36,8 @@ class SamplerSpec:
     """Builds what a proposal host calls (`proposal.LearnedOccupancySampler`), likewise."""
     needs_occupancy: bool = False
     """Whether it asks a frozen gate."""
+    gate_encoding: str | None = None
+    """The kind of features that this gate must be on; None is any."""
 
 
 DENSE = SamplerSpec(
@@ -47,10 +54,23 @@ LEARNED_OCCUPANCY = SamplerSpec(
     proposal="leco_plugin.samplers.registry:build_learned_proposal",
     needs_occupancy=True,
 )
+
+
+def _on(features: str, kind: str) -> SamplerSpec:
+    description = f"learned occupancy whose gate is on {features}, for comparison"
+    return replace(LEARNED_OCCUPANCY, description=description, gate_encoding=kind)
+
+
+LEARNED_OCCUPANCY_HASH = _on("hash-grid features", "hash")
+LEARNED_OCCUPANCY_VM = _on("TensoRF's vector-matrix features", "vm")
+LEARNED_OCCUPANCY_K_PLANES = _on("K-planes features", "k-planes")
 OURS = {
     "dense": DENSE,
     "occupancy-grid": OCCUPANCY_GRID,
     "learned-occupancy": LEARNED_OCCUPANCY,
+    "learned-occupancy-hash": LEARNED_OCCUPANCY_HASH,
+    "learned-occupancy-vm": LEARNED_OCCUPANCY_VM,
+    "learned-occupancy-k-planes": LEARNED_OCCUPANCY_K_PLANES,
 }
 
 
@@ -64,7 +84,7 @@ def build_estimator(name: str, **options: Any) -> nn.Module:
 
     Raises:
         ValueError: there is no such sampler, it does not serve packed hosts, or it needs an
-            occupancy and none is given.
+            occupancy and none is given, or one whose gate is on other features.
     """
     return _build(name, "estimator", options)
 
@@ -84,11 +104,24 @@ def _build(name: str, kind: str, options: dict[str, Any]) -> nn.Module:
         raise ValueError(f"sampler {name!r} has nothing for hosts that call a {kind}")
     if spec.needs_occupancy and options.get("occupancy") is None:
         raise ValueError(f"sampler {name!r} needs an occupancy")
+    if spec.gate_encoding is not None:
+        _check_gate(name, spec.gate_encoding, options.get("occupancy"))
     if isinstance(builder, str):
         module, _, attribute = builder.partition(":")
         builder = getattr(importlib.import_module(module), attribute)
     estimator: nn.Module = builder(**options)
     return estimator
+
+
+def _check_gate(name: str, wanted: str, occupancy: Any) -> None:
+    config = getattr(getattr(occupancy, "gate", None), "config", None)
+    found = config.encoding.kind if config is not None else "no"
+    if found != wanted:
+        raise ValueError(
+            f"sampler {name!r} asks a gate on {wanted} features, and this occupancy's is on "
+            f"{found} features; learn one with `ns-train leco-occupancy "
+            f"--pipeline.model.sizes.gate.encoding.kind {wanted} --data SCENE`"
+        )
 
 
 def build_dense(aabb: Any = None, occupancy: Any = None) -> nn.Module:

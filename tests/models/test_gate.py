@@ -2,20 +2,27 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import pytest
 import torch
+from ball_occupancy import CENTRE, ENCODINGS, HALF, RADIUS, ball
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from leco_plugin.models.encodings import EncodingConfig
 from leco_plugin.models.gate import (
     EMPTY,
+    LARGEST_SIZES,
+    MOST_VALUES,
     Gate,
     GateConfig,
+    check_sizes,
     occupancy_from_logits,
     occupancy_logit,
     route,
 )
+from leco_plugin.occupancy import LARGEST_FILE
 
 
 def random_logits(seed: int, experts: int) -> torch.Tensor:
@@ -54,9 +61,9 @@ def test_with_a_threshold_exactly_the_points_below_it_are_empty(seed: int, below
     assert torch.equal(routes[on_scene], logits[on_scene, 1:].argmax(dim=-1) + 1)
 
 
-@pytest.mark.parametrize("kind", ["frequency", "hash"])
+@pytest.mark.parametrize("kind", ENCODINGS)
 def test_a_gate_answers_for_every_point_also_for_none(kind) -> None:
-    gate = Gate(GateConfig(EncodingConfig(kind, levels=2, log2_table=5), width=8, scene_experts=3))
+    gate = Gate(GateConfig(ENCODINGS[kind], width=8, scene_experts=3))
     assert gate(torch.rand(5, 3)).shape == (5, 4)
     assert gate.occupancy(torch.zeros(0, 3)).shape == (0,)
 
@@ -69,3 +76,49 @@ def test_logits_are_float32_under_autocast() -> None:
 def test_a_configuration_survives_its_dictionary() -> None:
     config = GateConfig(EncodingConfig("hash", levels=3), width=17, scene_experts=5)
     assert GateConfig.from_dict(config.to_dict()) == config
+
+
+def test_a_dictionary_from_before_there_were_planes_is_read() -> None:
+    config = GateConfig(EncodingConfig("hash", levels=3))
+    values = config.to_dict()
+    for name in ("components", "plane_cells"):
+        del values["encoding"][name]  # type: ignore[attr-defined]
+    assert GateConfig.from_dict(values) == config
+
+
+@pytest.mark.parametrize("kind", ENCODINGS)
+def test_a_gate_on_any_features_learns_a_ball(kind) -> None:
+    """To half a percent of the cube, and not beyond a twentieth of its half extent."""
+    generator = torch.Generator().manual_seed(1)
+    offsets = HALF * (torch.rand(1 << 16, 3, generator=generator) * 2 - 1)
+    distances = offsets.norm(dim=-1)
+    wrong = ball(kind).occupied(offsets + torch.tensor(CENTRE)) != (distances < RADIUS)
+    assert float(wrong.float().mean()) < 5e-3
+    assert not bool(wrong[(distances - RADIUS).abs() > 0.05 * HALF].any())
+
+
+@pytest.mark.parametrize("name", LARGEST_SIZES)
+def test_a_size_out_of_range_is_refused_in_one_line(name) -> None:
+    for size in (0, -1, 1.5, "a\nb", None, True, LARGEST_SIZES[name] + 1, 10**400):
+        config = GateConfig()
+        if hasattr(config, name):
+            config = replace(config, **{name: size})
+        else:
+            config = replace(config, encoding=replace(config.encoding, **{name: size}))
+        with pytest.raises(ValueError, match=f"the gate's {name} is") as error:
+            check_sizes(config)
+        assert "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize("kind", ENCODINGS)
+def test_the_largest_sizes_are_refused_before_they_are_allocated(kind) -> None:
+    sizes = {name: size for name, size in LARGEST_SIZES.items() if hasattr(EncodingConfig, name)}
+    wide = 2**12 if kind == "frequency" else 64
+    with pytest.raises(ValueError, match=r"on .* features of these sizes holds \d+ values"):
+        check_sizes(GateConfig(EncodingConfig(kind, **sizes), width=wide))
+    assert 4 * MOST_VALUES < LARGEST_FILE
+
+
+@pytest.mark.parametrize("kind", ENCODINGS)
+def test_usual_sizes_are_accepted(kind) -> None:
+    check_sizes(GateConfig(EncodingConfig(kind)))

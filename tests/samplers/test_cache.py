@@ -4,10 +4,16 @@ from __future__ import annotations
 
 import pytest
 import torch
+from ball_occupancy import CENTRE, HALF, ball
 from samplers.analytic_occupancy import Balls
 
+from leco_plugin.models.encodings import EncodingConfig
+from leco_plugin.models.gate import Gate, GateConfig
+from leco_plugin.occupancy import Occupancy
 from leco_plugin.samplers.cache import CellCache
 from leco_plugin.samplers.cache_build import build_cache
+from leco_plugin.samplers.estimator import LearnedOccupancyEstimator
+from leco_plugin.space import Space
 
 BUDGET = 1 << 17
 
@@ -97,6 +103,36 @@ def test_a_constant_gate_needs_no_bricks(constant):
     decided, left_open = cache.decide(torch.rand(1000, 3) - 0.5)
     assert len(cache.fine) == len(left_open) == 0
     assert decided.float().mean() == constant
+
+
+@pytest.mark.parametrize("kind", ["hash", "vm", "k-planes"])
+def test_a_gate_on_any_features_can_be_held(kind):
+    occupancy = ball(kind)
+    cache = build_cache(occupancy, budget=BUDGET, check_points=1 << 17, tolerance=2e-4)
+    assert cache.report.bytes <= BUDGET
+    assert cache.report.asked < 0.02
+    generator = torch.Generator().manual_seed(7)
+    mapped = torch.rand(1 << 17, 3, generator=generator) * 2.0 - 1.0
+    positions = mapped * HALF + torch.tensor(CENTRE)
+    assert cache.report.differing <= cache.report.differing_bound <= 2e-4
+    differing = decide(cache, occupancy, positions) != occupancy.occupied(positions)
+    assert float(differing.float().mean()) <= 2e-4
+
+
+@pytest.mark.parametrize("kind", ["hash", "vm", "k-planes"])
+def test_an_untaught_gate_on_any_features_is_asked_without_a_cache(kind, caplog):
+    torch.manual_seed(0)
+    gate = Gate(GateConfig(EncodingConfig(kind, plane_cells=64), width=8, layers=1))
+    for table in gate.encoding.parameters():
+        torch.nn.init.normal_(table)
+    positions = torch.rand(2000, 3) * 2.0 - 1.0
+    occupancy = Occupancy(gate, Space(), 0.5)
+    occupancy.threshold_value.copy_(occupancy.query(positions).median())
+    estimator = LearnedOccupancyEstimator(occupancy)
+    assert estimator.cache is None
+    (record,) = caplog.records
+    assert "no cell cache" in record.message and "\n" not in record.message
+    assert torch.equal(estimator.occupied(positions), occupancy.occupied(positions))
 
 
 def test_a_gate_that_no_cells_can_hold_is_refused():

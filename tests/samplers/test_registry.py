@@ -2,16 +2,20 @@
 
 from __future__ import annotations
 
+import re
 from importlib.metadata import EntryPoint
+from pathlib import Path
 
 import pytest
 import torch
+from ball_occupancy import ball
 from samplers.analytic_occupancy import Balls, camera_rays
 
 from leco_plugin.samplers import registry
 from leco_plugin.samplers.base import Estimator
 from leco_plugin.samplers.registry import SamplerSpec, build_estimator, build_proposal, samplers
 
+KINDS = ["hash", "vm", "k-planes"]
 BOX = torch.tensor([-1.0] * 3 + [1.0] * 3)
 FOREIGN = SamplerSpec("another package's", estimator=lambda aabb, occupancy: torch.nn.Identity())
 
@@ -37,6 +41,38 @@ def test_a_proposal_host_gets_a_sampler():
     assert sampler.num_samples == 8
 
 
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_learned_occupancy_of_one_kind_asks_a_gate_of_that_kind(kind):
+    name, occupancy = f"learned-occupancy-{kind}", ball(kind)
+    estimator = build_estimator(name, aabb=BOX, occupancy=occupancy, cache_bytes=0)
+    positions = torch.rand(500, 3) * 4.0 - torch.tensor([1.0, 0.0, 1.5])
+    assert torch.equal(estimator.occupied(positions), occupancy.occupied(positions))
+    assert 0 < int(estimator.occupied(positions).sum()) < 500
+    for other in [ball(), *(ball(other) for other in KINDS if other != kind), Balls()]:
+        remedy = f"ns-train leco-occupancy --pipeline.model.sizes.gate.encoding.kind {kind} "
+        with pytest.raises(ValueError, match=f"'{name}' asks a gate on {kind} .*{remedy}") as error:
+            build_estimator(name, aabb=BOX, occupancy=other)
+        assert "\n" not in str(error.value)
+    with pytest.raises(ValueError, match=f"'{name}' needs an occupancy"):
+        build_estimator(name, aabb=BOX)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_proposal_host_gets_a_gate_of_one_kind(kind):
+    pytest.importorskip("nerfstudio")
+    options = {"num_samples": 8, "cache_bytes": 0}
+    assert build_proposal(f"learned-occupancy-{kind}", occupancy=ball(kind), **options)
+    with pytest.raises(ValueError, match=f"asks a gate on {kind} features"):
+        build_proposal(f"learned-occupancy-{kind}", occupancy=ball(), **options)
+
+
+def test_every_sampler_of_ours_is_an_entry_point_too():
+    pyproject = Path(__file__).parents[2] / "pyproject.toml"
+    section = pyproject.read_text().split(f'entry-points."{registry.GROUP}"]')[1].split("[")[0]
+    found = dict(re.findall(r'^([\w-]+) = "leco_plugin.samplers.registry:(\w+)"$', section, re.M))
+    assert {name: getattr(registry, value) for name, value in found.items()} == registry.OURS
+
+
 def test_mistakes_are_named():
     with pytest.raises(ValueError, match="no sampler 'grid'; there are dense, learned-occ"):
         build_estimator("grid")
@@ -57,7 +93,8 @@ def test_entry_points_of_other_packages_are_found_and_broken_ones_left_out(monke
     monkeypatch.setattr(registry, "FOREIGN", FOREIGN, raising=False)
     with pytest.warns(UserWarning, match="sampler 'broken'"):
         found = samplers()
-    assert set(found) == {"dense", "occupancy-grid", "learned-occupancy", "foreign"}
+    assert set(found) == {*registry.OURS, "foreign"}
+    assert found["dense"] is registry.DENSE
     with pytest.warns(UserWarning, match="broken"):
         assert isinstance(build_estimator("foreign", aabb=BOX, occupancy=None), torch.nn.Identity)
 
