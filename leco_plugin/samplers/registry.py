@@ -8,12 +8,7 @@ from __future__ import annotations
 
 import importlib
 from collections.abc import Callable
-<<<<<<< HEAD
-from dataclasses import dataclass
-=======
 from dataclasses import dataclass, replace
-from importlib.metadata import entry_points
->>>>>>> h-kinds
 from typing import Any
 
 from torch import nn
