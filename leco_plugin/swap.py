@@ -47,13 +47,15 @@ def registered(method: str) -> TrainerConfig:
     """A copy of the config of a registered method.
 
     Raises:
-        InputError: there is no such method.
+        InputError: there is no such method, or its package is not installed.
     """
     from nerfstudio.configs.method_configs import all_methods
 
     if method not in all_methods:
         raise InputError(f"there is no method {method!r}; there are {', '.join(all_methods)}")
-    config: TrainerConfig = copy.deepcopy(all_methods[method])
+    config = copy.deepcopy(all_methods[method])
+    if not isinstance(config, TrainerConfig):
+        raise InputError(f"{method!r} is known by name only: its package is not installed")
     return config
 
 
