@@ -123,11 +123,70 @@ def demo(out: Path = Path("runs/demo"), seconds: float = 110.0, json: Path | Non
     _write_json(json, report)
 
 
+def chart(
+    data: Path,
+    out: Path,
+    methods: tuple[str, ...] = (),
+    samplers: tuple[str, ...] = (),
+    suite: str | None = None,
+    seconds: float | None = None,
+    steps: int | None = None,
+    seeds: tuple[int, ...] = (0, 1, 2),
+    learn_seconds: float | None = None,
+    images: int = 2,
+    json: Path | None = None,
+) -> None:
+    """Train methods on a scene for the same time, and draw accuracy against what it costs.
+
+    Writes chart.png, chart-dark.png, chart.html, table.md and results.json. What is finished is
+    kept whenever this is stopped; the same command goes on with what is missing.
+
+    Args:
+        data: A scene in nerfstudio's format.
+        out: Folder of the chart. More methods and seeds may be added to it later.
+        methods: As ns-train knows them, or leco-occupancy-never-frozen, -retrained, -homogeneous.
+        samplers: Of the registry, occupancy-grid-N for N cells along an axis, or own. By default
+            learned-occupancy and own where the method can have both.
+        suite: A named comparison instead of methods and samplers: empty-expert, losses, freeze,
+            representations, enough-time, grid-resolution.
+        seconds: Training time of each run.
+        steps: Training steps of each run; with both, a run ends with the first.
+        seeds: Seeds.
+        learn_seconds: Most of a run, about, that learning its occupancy may take. By default 0.4 of
+            seconds.
+        images: Whole test images that each run renders at its end.
+        json: Another file for the results.
+    """
+    from leco_plugin.chart.command import make_chart
+
+    results = make_chart(
+        data=data,
+        out=out,
+        methods=methods,
+        samplers=samplers,
+        suite=suite,
+        seconds=seconds,
+        steps=steps,
+        seeds=seeds,
+        learn_seconds=learn_seconds,
+        images=images,
+    )
+    print(f"see chart.png, chart.html, table.md and results.json in {out}")
+    _write_json(json, results)
+    failures = results["failures"]
+    if failures:
+        raise RuntimeError(
+            f"{len(failures)} of {len(failures) + len(results['runs'])} runs failed, the first "
+            f"({failures[0]['name']}, seed {failures[0]['seed']}) with: {failures[0]['reason']}"
+        )
+
+
 COMMANDS: dict[str, Callable[..., None]] = {
     "city": city,
     "inspect": inspect,
     "swap": swap,
     "demo": demo,
+    "chart": chart,
 }
 
 

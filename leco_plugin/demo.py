@@ -13,12 +13,14 @@ import torch
 from nerfstudio.engine.trainer import Trainer, TrainerConfig
 
 from leco_plugin.evaluation.charts import psnr_against_seconds
+from leco_plugin.evaluation.clock import Budget
+from leco_plugin.evaluation.held_out_images import true_image
 from leco_plugin.evaluation.inspection import ViewBox
-from leco_plugin.evaluation.json_file import finite_or_null, write_json
+from leco_plugin.evaluation.json_file import write_json
 from leco_plugin.evaluation.machine import describe_machine
+from leco_plugin.evaluation.occupancy_facts import occupancy_facts, truth_of
 from leco_plugin.evaluation.occupancy_picture import draw_slice
-from leco_plugin.evaluation.occupancy_truth import compare_with_truth
-from leco_plugin.evaluation.timed_run import timed_run, true_image
+from leco_plugin.evaluation.timed_run import timed_run
 from leco_plugin.method_configs import leco_occupancy
 from leco_plugin.models.freezing import FILE_NAME
 from leco_plugin.occupancy import Occupancy
@@ -67,7 +69,7 @@ def run_demo(
     guided = _config(folder, out, seconds)
     with bar("Guided: learns, freezes, goes on") as show:
         guided_run, trainer = timed_run(
-            guided, seconds, sampler="learned-occupancy", on_progress=show
+            guided, Budget(seconds), sampler="learned-occupancy", on_progress=show
         )
     occupancy, facts, truth = _frozen_occupancy(trainer, folder, out)
     _draw_picture(trainer, occupancy, truth, out / "picture.png")
@@ -75,7 +77,7 @@ def run_demo(
 
     with bar("The same, never frozen") as show:
         other_run, trainer = timed_run(
-            never_frozen(guided), seconds, sampler="dense", on_progress=show
+            never_frozen(guided), Budget(seconds), sampler="dense", on_progress=show
         )
     manager: Any = trainer.pipeline.datamanager
     report = {
@@ -144,19 +146,10 @@ def _frozen_occupancy(
     kept_file = out / FILE_NAME
     shutil.copyfile(written, kept_file)
     occupancy = Occupancy.load(kept_file, model.device)
-    manager: Any = trainer.pipeline.datamanager
-    truth = CityTruth.from_dataparser(folder, manager.train_dataparser_outputs)
-    highest = float(manager.train_dataset.cameras.camera_to_worlds[:, 2, 3].max())
-    report = occupancy.report
-    measured = compare_with_truth(occupancy, truth, model.aabb, report["step_size"], highest)
-    names = ("train_seconds", "empty_fraction", "lost_mass", "threshold", "lost_surface_mass")
-    facts = {
-        "params": occupancy.num_params,
-        "bytes": kept_file.stat().st_size,
-        **{name: report[name] for name in (*names, "image_price_db")},
-        **measured,
-    }
-    return occupancy, finite_or_null(facts), truth
+    manager = trainer.pipeline.datamanager
+    truth = truth_of(folder, manager)
+    assert truth is not None
+    return occupancy, occupancy_facts(occupancy, kept_file, manager, truth), truth
 
 
 @torch.no_grad()

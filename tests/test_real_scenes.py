@@ -8,7 +8,8 @@ from pathlib import Path
 import pytest
 import torch
 
-from leco_plugin.evaluation.timed_run import psnr_on_rays, run_training
+from leco_plugin.evaluation.held_out_images import psnr_on_rays
+from leco_plugin.evaluation.timed_run import run_training
 from leco_plugin.method_configs import leco_occupancy
 from leco_plugin.models.calibration import CalibrationConfig
 from leco_plugin.models.freezing import FILE_NAME

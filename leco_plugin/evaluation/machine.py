@@ -23,6 +23,23 @@ def describe_machine() -> dict[str, Any]:
     }
 
 
+def describe_code() -> dict[str, Any]:
+    """Version of this package, and the commit if it is run from a checkout."""
+    import subprocess
+
+    from leco_plugin import __version__
+
+    here = Path(__file__).resolve().parent
+    command = ["git", "-C", str(here), "rev-parse", "--short=12", "HEAD"]
+    try:
+        asked = subprocess.run(command, capture_output=True, text=True, check=False)
+        # an installed package may lie inside another project's checkout
+        commit = asked.stdout.strip() if (here.parents[1] / ".git").exists() else ""
+    except OSError:
+        commit = ""
+    return {"version": __version__, "commit": commit or None}
+
+
 def usable_cores() -> int:
     """Cores that this process may run on, which in a container can be fewer than there are."""
     if hasattr(os, "sched_getaffinity"):

@@ -1,30 +1,32 @@
-"""One training run for a fixed wall-clock time through nerfstudio's own trainer.
+"""One training run for a fixed time or number of steps through nerfstudio's own trainer.
 
-Evaluation is off the clock.
+Evaluation is off the clock; learning an occupancy is on it, and told apart.
 """
 
 from __future__ import annotations
 
 import copy
-import math
-import resource
-import sys
-import time
+import random
+import statistics
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any
 
+import numpy as np
 import torch
 from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackLocation
 from nerfstudio.engine.trainer import Trainer, TrainerConfig
 from nerfstudio.utils import writer
-from torch import Tensor
 
+from leco_plugin.evaluation.clock import Budget, Clock, timed, warm_up
+from leco_plugin.evaluation.field_queries import FieldQueries, counted
+from leco_plugin.evaluation.held_out_images import evaluate_images, psnr_on_rays
 from leco_plugin.evaluation.json_file import finite_or_null
-from leco_plugin.evaluation.metrics import image_metrics
+from leco_plugin.evaluation.peak_memory import peak_allocator_bytes, peak_process_bytes
+from leco_plugin.models.learn_first import TIMED_STEPS, steps_within
 
-CURVE_RAYS = 4096
-"""Test pixels behind each point of a curve."""
+CURVE_RAYS = 8192
+"""Test pixels behind each point of a curve, its end included."""
 
 ENDLESS = 10_000_000
 """Steps that no timed run reaches; the clock ends it."""
@@ -39,76 +41,91 @@ class TimedRun:
     seed: int
     steps: int = 0
     train_seconds: float = 0.0
+    step_seconds: float | None = None
+    """Median of a step once there is an occupancy, if there is ever one."""
+    learn_seconds: float | None = None
+    """Of the training time: until there was an occupancy, or all updates of a grid."""
+    freeze_seconds: float | None = None
+    """When there was an occupancy."""
     psnr: float = 0.0
     ssim: float = 0.0
     lpips: float | None = None
     samples_per_ray: float = 0.0
     field_queries_per_ray: float = 0.0
+    """In rendering; those for pruning samples are counted too."""
+    proposal_queries_per_ray: float = 0.0
+    train_queries: FieldQueries = field(default_factory=FieldQueries)
+    """In all of the training."""
     render_seconds_per_image: float = 0.0
     peak_memory_bytes: int = 0
-    freeze_seconds: float | None = None
+    """Of the allocator on CUDA, of the process elsewhere."""
+    peak_process_bytes: int = 0
+    peak_allocator_bytes: int | None = None
     curve: list[tuple[float, float]] = field(default_factory=list)
+    """Seconds of training, and PSNR on test pixels."""
 
     def to_dict(self) -> dict[str, Any]:
         """JSON values, rounded to what the measurement means; None where there is no number."""
-        values = dict(vars(self))
-        for name in ("train_seconds", "psnr", "ssim", "samples_per_ray", "field_queries_per_ray"):
-            values[name] = round(values[name], 4)
+        values = {
+            name: round(value, 4) if isinstance(value, float) else value
+            for name, value in vars(self).items()
+        }
+        values["train_queries"] = dict(vars(self.train_queries))
         values["curve"] = [[round(seconds, 2), round(psnr, 3)] for seconds, psnr in self.curve]
         return finite_or_null(values)
 
 
-class Clock:
-    """Training time: runs between a step's start and its end, and stands still while evaluating."""
-
-    def __init__(self) -> None:
-        self.seconds = 0.0
-        self._started = 0.0
-
-    def start(self) -> None:
-        synchronize()
-        self._started = time.perf_counter()
-
-    def stop(self) -> None:
-        synchronize()
-        self.seconds += time.perf_counter() - self._started
-
-
-def synchronize() -> None:
-    """Waits for the device, so that a time belongs to what was timed."""
-    if torch.cuda.is_available():
-        torch.cuda.synchronize()
-
-
 def timed_run(
     config: TrainerConfig,
-    seconds: float,
+    budget: Budget,
     *,
     sampler: str,
     seed: int = 0,
-    curve_points: int = 8,
+    curve_points: int = 6,
     images: int = 2,
     on_progress: Callable[[float], None] | None = None,
+    on_frozen: Callable[[Trainer], None] | None = None,
 ) -> tuple[TimedRun, Trainer]:
-    """Trains for `seconds` and evaluates on the test images.
+    """Trains until the budget is used and evaluates on the test images.
 
-    The learning rates of all groups decay to a tenth over the time, whatever the number of steps;
+    The learning rates of all groups decay to a tenth over the budget, whatever the number of steps;
     nerfstudio's own schedulers count steps, and a slow method would end with a high rate.
 
     Args:
         config: a method with its data; it is copied, not changed.
-        seconds: training time.
+        budget: when the run is over.
         sampler: what to call the sampler in the record.
-        curve_points: evaluations along the way, evenly spaced in time.
+        curve_points: evaluations, evenly spaced over the budget, the last at its end.
         images: whole test images rendered at the end, for SSIM, LPIPS and the rendering time.
-        on_progress: called with the share of the time that has passed.
+        on_progress: called with the share of the budget that is used, after each step.
+        on_frozen: called off the clock when a model that learns its occupancy itself has frozen it.
     Returns:
         The record, and the trainer with its model.
     """
-    torch.manual_seed(seed)
+    trainer = _set_up(config, budget, seed)
+    run = TimedRun(config.method_name or "", sampler, seed)
+    model = trainer.pipeline.model
+    with counted(model) as queries:
+        course = _Course(trainer, budget, run, queries, curve_points, on_progress, on_frozen)
+        run_training(trainer)
+        course.end()
+        run.curve.append((run.train_seconds, psnr_on_rays(trainer, CURVE_RAYS)))
+        run.psnr = run.curve[-1][1]
+        figures = evaluate_images(trainer, images, queries)
+    run.ssim, run.lpips = figures["ssim"], figures.get("lpips")
+    for name in ("samples", "field_queries", "proposal_queries"):
+        setattr(run, f"{name}_per_ray", figures[f"{name}_per_ray"])
+    run.render_seconds_per_image = figures["render_seconds_per_image"]
+    return run, trainer
+
+
+def _set_up(config: TrainerConfig, budget: Budget, seed: int) -> Trainer:
+    """A trainer that logs, saves and evaluates nothing by itself."""
+    for sow in (random.seed, np.random.seed, torch.manual_seed):
+        sow(seed)
     config = copy.deepcopy(config)
     config.machine.seed = seed
-    config.max_num_iterations = ENDLESS
+    config.max_num_iterations = budget.steps or ENDLESS
     config.vis = "tensorboard"
     config.steps_per_save = config.steps_per_eval_image = config.steps_per_eval_batch = 0
     config.steps_per_eval_all_images = 0
@@ -120,125 +137,117 @@ def timed_run(
     writer.EVENT_WRITERS.clear()
     trainer: Trainer = config.setup(local_rank=0, world_size=1)
     trainer.setup()
-    run = TimedRun(config.method_name or "", sampler, seed)
-    clock = Clock()
-    rates = {
-        name: [group["lr"] for group in optimizer.param_groups]
-        for name, optimizer in trainer.optimizers.optimizers.items()
-    }
-    marks = [seconds * (i + 1) / curve_points for i in range(curve_points - 1)]
+    warm_up(trainer.device)
+    return trainer
 
-    def before(step: int) -> None:
-        share = min(1.0, clock.seconds / seconds)
-        for name, optimizer in trainer.optimizers.optimizers.items():
-            for group, rate in zip(optimizer.param_groups, rates[name]):
-                group["lr"] = rate * 0.1**share
-        clock.start()
 
-    def after(step: int) -> None:
-        clock.stop()
+class _Course:
+    """Stands around every step of a run: clock, learning rates, evaluation, the end."""
+
+    def __init__(
+        self,
+        trainer: Trainer,
+        budget: Budget,
+        run: TimedRun,
+        queries: FieldQueries,
+        curve_points: int,
+        on_progress: Callable[[float], None] | None,
+        on_frozen: Callable[[Trainer], None] | None,
+    ) -> None:
+        self.trainer, self.budget, self.run, self.queries = trainer, budget, run, queries
+        self.on_progress, self.on_frozen = on_progress, on_frozen
+        self.clock, self.grid_clock = Clock(), Clock()
+        self.marks = [(i + 1) / curve_points for i in range(curve_points - 1)]
+        self.step_times: list[float] = []
+        self.before_step = queries.copy()
+        self.rates = [
+            (group, group["lr"])
+            for optimizer in trainer.optimizers.optimizers.values()
+            for group in optimizer.param_groups
+        ]
+        self.has_grid = _time_updates(trainer.pipeline.model, self.grid_clock)
+        where = TrainingCallbackLocation
+        trainer.callbacks.insert(0, TrainingCallback([where.BEFORE_TRAIN_ITERATION], self.before))
+        trainer.callbacks.append(TrainingCallback([where.BEFORE_TRAIN_ITERATION], self.begun))
+        trainer.callbacks.append(TrainingCallback([where.AFTER_TRAIN_ITERATION], self.after))
+
+    def before(self, step: int) -> None:
+        """Before everything else that happens before a step."""
+        share = self.budget.share(self.clock.seconds, step)
+        for group, rate in self.rates:
+            group["lr"] = rate * 0.1**share
+        self.before_step = self.queries.copy()
+        self.clock.start()
+
+    def begun(self, step: int) -> None:
+        """Before a step, after everything else: a host that learns its occupancy first has it."""
+        self._look_for_occupancy()
+
+    def after(self, step: int) -> None:
+        """After everything else that happens after a step."""
+        run, clock = self.run, self.clock
+        frozen_now = self._look_for_occupancy()
+        seconds = clock.stop()
+        asked = self.queries.since(self.before_step)
+        for name, count in vars(asked).items():
+            setattr(run.train_queries, name, getattr(run.train_queries, name) + count)
+        if frozen_now:
+            self.step_times.clear()
+            if self.on_frozen is not None:
+                self.on_frozen(self.trainer)
+        else:
+            self.step_times.append(seconds)
         run.steps = step + 1
-        if run.freeze_seconds is None and bool(getattr(trainer.pipeline.model, "frozen", False)):
-            run.freeze_seconds = round(clock.seconds, 2)
-        if on_progress is not None:
-            on_progress(min(1.0, clock.seconds / seconds))
-        if clock.seconds >= seconds:
-            trainer.stop_training = True
-        elif marks and clock.seconds >= marks[0]:
-            while marks and clock.seconds >= marks[0]:
-                marks.pop(0)
-            run.curve.append((clock.seconds, psnr_on_rays(trainer, CURVE_RAYS)))
+        if run.steps == TIMED_STEPS:
+            self._keep_to_learning_time()
+        share = self.budget.share(clock.seconds, run.steps)
+        if self.on_progress is not None:
+            self.on_progress(share)
+        if share >= 1.0:
+            self.trainer.stop_training = True
+        elif self.marks and share >= self.marks[0]:
+            self.marks = [mark for mark in self.marks if mark > share]
+            run.curve.append((clock.seconds, psnr_on_rays(self.trainer, CURVE_RAYS)))
 
-    where = TrainingCallbackLocation
-    trainer.callbacks.insert(0, TrainingCallback([where.BEFORE_TRAIN_ITERATION], before))
-    trainer.callbacks.append(TrainingCallback([where.AFTER_TRAIN_ITERATION], after))
-    run_training(trainer)
-    run.train_seconds = clock.seconds
-    run.peak_memory_bytes = peak_memory_bytes()
-    figures = evaluate_images(trainer, images)
-    run.ssim, run.lpips = figures["ssim"], figures.get("lpips")
-    run.psnr = psnr_on_rays(trainer, 4 * CURVE_RAYS)
-    run.samples_per_ray = figures["samples_per_ray"]
-    run.field_queries_per_ray = run.samples_per_ray
-    run.render_seconds_per_image = figures["render_seconds_per_image"]
-    run.curve.append((clock.seconds, psnr_on_rays(trainer, CURVE_RAYS)))
-    return run, trainer
+    def end(self) -> None:
+        """Writes down what is known when the training is over."""
+        run = self.run
+        run.train_seconds = self.clock.seconds
+        run.step_seconds = statistics.median(self.step_times) if self.step_times else None
+        if self.has_grid:
+            run.learn_seconds = self.grid_clock.seconds
+        run.peak_process_bytes = peak_process_bytes()
+        run.peak_allocator_bytes = peak_allocator_bytes()
+        run.peak_memory_bytes = run.peak_allocator_bytes or run.peak_process_bytes
+
+    def _look_for_occupancy(self) -> bool:
+        """Notes when there is an occupancy; returns whether there is one since the last look."""
+        model: Any = self.trainer.pipeline.model
+        guide = getattr(model, "guide", None)
+        there = bool(getattr(model, "frozen", False)) or getattr(guide, "occupancy", None)
+        if self.run.freeze_seconds is not None or not there:
+            return False
+        self.run.freeze_seconds = self.run.learn_seconds = self.clock.now()
+        return True
+
+    def _keep_to_learning_time(self) -> None:
+        """As a host that learns first does: a model that learns itself freezes in time."""
+        progress = getattr(self.trainer.pipeline.model, "progress", None)
+        if progress is not None and self.budget.learn_seconds is not None:
+            a_step = self.clock.seconds / self.run.steps
+            most = progress.learn_steps
+            progress.learn_steps = steps_within(self.budget.learn_seconds, a_step, most)
+
+
+def _time_updates(model: torch.nn.Module, clock: Clock) -> bool:
+    """Counts the time in which occupancy grids are updated; returns whether there is one."""
+    grids: list[Any] = [module for module in model.modules() if "occs" in module._buffers]
+    for grid in grids:
+        grid.update_every_n_steps = timed(grid.update_every_n_steps, clock)
+    return bool(grids)
 
 
 def run_training(trainer: Trainer) -> None:
     """nerfstudio's training loop, without the last checkpoint and its banner."""
     trainer._after_train = lambda: None  # type: ignore[method-assign]
     trainer.train()
-
-
-@torch.no_grad()
-def psnr_on_rays(trainer: Trainer, rays: int, seed: int = 0) -> float:
-    """PSNR over pixels spread over all test images: the same pixels at every call.
-
-    A full image of an unguided method takes minutes on a CPU; some thousand pixels say as much.
-    """
-    pipeline = trainer.pipeline
-    pipeline.eval()
-    dataset: Any = pipeline.datamanager.eval_dataset
-    generator = torch.Generator().manual_seed(seed)
-    per_image = -(-rays // len(dataset))
-    squared_error, count = 0.0, 0
-    for number in range(len(dataset)):
-        image = dataset.get_data(number)["image"]
-        rows = torch.randint(image.shape[0], (per_image,), generator=generator)
-        columns = torch.randint(image.shape[1], (per_image,), generator=generator)
-        coords = torch.stack([rows, columns], dim=-1) + 0.5
-        camera = dataset.cameras.to("cpu")
-        bundle = camera.generate_rays(camera_indices=number, coords=coords).to(pipeline.device)
-        rgb = pipeline.model(bundle)["rgb"].clamp(0.0, 1.0)
-        truth = true_image(pipeline.model, image[rows, columns], rgb)
-        squared_error += float(((rgb - truth) ** 2).sum(dtype=torch.float64))
-        count += truth.numel()
-    pipeline.train()
-    return -10.0 * math.log10(max(squared_error / count, 1e-12))
-
-
-@torch.no_grad()
-def evaluate_images(trainer: Trainer, most_images: int) -> dict[str, float]:
-    """Mean figures over whole test images, evenly chosen; rendering alone is timed."""
-    pipeline = trainer.pipeline
-    pipeline.eval()
-    dataset: Any = pipeline.datamanager.eval_dataset
-    count = min(most_images, len(dataset))
-    chosen = torch.linspace(0, len(dataset) - 1, count).round().long().tolist()
-    sums: dict[str, float] = {}
-    times = []
-    for number in chosen:
-        camera = dataset.cameras[number : number + 1].to(pipeline.device)
-        clock = Clock()
-        clock.start()
-        outputs = pipeline.model.get_outputs_for_camera(camera)
-        clock.stop()
-        times.append(clock.seconds)
-        predicted = outputs["rgb"].clamp(0.0, 1.0)
-        truth = true_image(pipeline.model, dataset.get_data(number)["image"], predicted)
-        figures = image_metrics(predicted, truth)
-        for name in ("samples_per_ray", "num_samples_per_ray"):
-            if name in outputs:
-                figures["samples_per_ray"] = float(outputs[name].float().mean())
-        for name, value in figures.items():
-            sums[name] = sums.get(name, 0.0) + value / count
-    pipeline.train()
-    sums.setdefault("samples_per_ray", float("nan"))
-    sums["render_seconds_per_image"] = sorted(times)[len(times) // 2]
-    return sums
-
-
-def true_image(model: Any, image: Tensor, like: Tensor) -> Tensor:
-    """The truth [H, W, 3] behind the method's own background."""
-    image = image.to(like.device)
-    renderer = getattr(model, "renderer_rgb", None)
-    return renderer.blend_background(image) if renderer is not None else image[..., :3]
-
-
-def peak_memory_bytes() -> int:
-    """Highest memory of this process so far, or on CUDA of the allocator."""
-    if torch.cuda.is_available():
-        return int(torch.cuda.max_memory_allocated())
-    unit = 1 if sys.platform == "darwin" else 1024
-    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * unit

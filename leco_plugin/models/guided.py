@@ -65,7 +65,7 @@ def set_up_guided(config: GuidedModelConfig, **arguments: Any) -> Model:
         host_config.eval_num_rays_per_chunk = config.eval_num_rays_per_chunk
     if config.occupancy.sampler == OWN_SAMPLER:
         return _as_it_is(host_config, arguments)
-    guide = Guide(config.occupancy.sampler)
+    guide = Guide(config.occupancy.sampler, config.occupancy.options)
     file = occupancy_file(config.occupancy.path)
     if guide.needs_occupancy and file is not None and file.exists():
         guide.set_occupancy(Occupancy.load(file))

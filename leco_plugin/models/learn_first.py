@@ -30,7 +30,7 @@ def learn_occupancy(
         pipeline: a nerfstudio pipeline; only its data manager and device are used, and its batches
             are as long as before when this returns.
         rays: of a batch.
-        seconds: how long this may take, about; None takes the config's learning steps.
+        seconds: how long this may take at most, about; None takes the config's learning steps.
     Returns:
         The occupancy, in the coordinates of the pipeline's model.
     Raises:
@@ -66,6 +66,11 @@ def learn_occupancy(
     return occupancy.eval()
 
 
+def steps_within(seconds: float, a_step: float, most: int) -> int:
+    """Learning steps of a length in seconds that fit into a time, of those that are wanted."""
+    return min(most, max(FEWEST_STEPS, int(seconds / a_step)))
+
+
 def _adam(name: str) -> FusedAdamConfig:
     return FusedAdamConfig(lr=RATES[name])
 
@@ -92,6 +97,6 @@ def _train(
         lifecycle.after_step(step)
         step += 1
         if seconds is not None and step == TIMED_STEPS:
-            a_step = (time.monotonic() - started) / step
-            lifecycle.progress.learn_steps = max(FEWEST_STEPS, int(seconds / a_step))
+            a_step, most = (time.monotonic() - started) / step, lifecycle.progress.learn_steps
+            lifecycle.progress.learn_steps = steps_within(seconds, a_step, most)
         show(min(1.0, step / lifecycle.progress.learn_steps))

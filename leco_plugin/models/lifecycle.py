@@ -17,6 +17,7 @@ from nerfstudio.engine.callbacks import (
 from nerfstudio.utils.rich_utils import CONSOLE
 from torch import Tensor
 
+from leco_plugin.models.field import HMoEField
 from leco_plugin.models.freezing import freeze, write_occupancy
 from leco_plugin.models.gate import occupancy_from_logits, route
 from leco_plugin.models.losses import expert_shares
@@ -159,8 +160,20 @@ class Lifecycle:
             )
             data, seconds = self.pipeline.datamanager, progress.learn_seconds
             freeze(model, data, self.survey, self.folder, step, seconds)
+            if schedule.restart:
+                self._restart_field()
             if self.trainer is not None and self.trainer.config.steps_per_save > 0:
                 self.trainer.save_checkpoint(step)  # a run killed from now on stays frozen
+
+    def _restart_field(self) -> None:
+        """Gives the field the weights of a new one, and its optimizers nothing to remember."""
+        field = self.model.field
+        fresh = HMoEField(field.config, self.model.num_train_data)
+        field.load_state_dict(fresh.state_dict())
+        if self.trainer is not None:
+            for optimizer in self.trainer.optimizers.optimizers.values():
+                optimizer.state.clear()
+        CONSOLE.log("\\[leco] the field starts anew, guided from its first step")
 
     @cached_property
     def probe_positions(self) -> Tensor:

@@ -18,6 +18,9 @@ class ScheduleConfig:
 
     freeze: bool = True
     """Whether the gate is ever frozen; False is the plain HMoE, for comparison."""
+    restart: bool = False
+    """Whether the field starts anew when the gate is frozen, for comparison; else it goes on from
+    what it has learned."""
     learn_steps: int = 200
     """Steps after which the gate is frozen even if its decisions still change."""
     earliest: float = 0.85

@@ -101,6 +101,11 @@ class OccupancyGridEstimator(Estimator):
         """
         return lookup(self.binaries, self.aabbs[0], positions)
 
+    def values(self, positions: Tensor) -> Tensor:
+        """The running occupancy of the cell that holds a position, 0 outside; [N, 3] to [N]."""
+        index, inside = cells_of(self.binaries.shape, self.aabbs[0], positions)
+        return self.occs.index_select(0, index) * inside
+
     def update_every_n_steps(
         self,
         step: int,
@@ -175,7 +180,22 @@ def lookup(binaries: Tensor, innermost: Tensor, positions: Tensor) -> Tensor:
     Returns:
         bool [N], False outside the outermost box.
     """
-    levels, *sizes = binaries.shape
+    index, inside = cells_of(binaries.shape, innermost, positions)
+    return binaries.view(-1).index_select(0, index).logical_and_(inside)
+
+
+def cells_of(shape: Sequence[int], innermost: Tensor, positions: Tensor) -> tuple[Tensor, Tensor]:
+    """The cells of nested grids that hold positions.
+
+    Args:
+        shape: (levels, nx, ny, nz).
+        innermost: box of level 0, [6] of (min, max).
+        positions: [N, 3].
+
+    Returns:
+        int32 [N] into the flattened grids, and bool [N] whether there is such a cell.
+    """
+    levels, *sizes = shape
     low, high = innermost.to(positions).view(2, 3, 1)
     # Within +-0.5 in the innermost box; each level is half as large in these units.
     units = torch.addcmul(-0.5 * (low + high) / (high - low), positions.T, 1.0 / (high - low))
@@ -187,10 +207,9 @@ def lookup(binaries: Tensor, innermost: Tensor, positions: Tensor) -> Tensor:
         for inner in range(levels - 1):
             level += widest > 0.5 * 2**inner
         units *= torch.exp2(-level)
-    shape = positions.new_tensor(sizes)[:, None]
-    cells = torch.addcmul(0.5 * shape, units, shape).nan_to_num_(nan=-1.0)
+    ends = positions.new_tensor(sizes)[:, None]
+    cells = torch.addcmul(0.5 * ends, units, ends).nan_to_num_(nan=-1.0)
     # Inside by the comparison above, yet on the last face or a rounding away from one.
-    cells = torch.minimum(cells.clamp_(min=0.0), shape - 1.0).to(torch.int32)
+    cells = torch.minimum(cells.clamp_(min=0.0), ends - 1.0).to(torch.int32)
     index = cells[0] if level is None else cells[0] + level.to(torch.int32) * sizes[0]
-    index = (index * sizes[1] + cells[1]) * sizes[2] + cells[2]
-    return binaries.view(-1).index_select(0, index).logical_and_(inside)
+    return (index * sizes[1] + cells[1]) * sizes[2] + cells[2], inside

@@ -1,0 +1,65 @@
+"""What is compared, as plain data: a method with a sampler and a few settings changed."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, field, replace
+from typing import Any
+
+
+@dataclass(frozen=True)
+class Contender:
+    """One line of a chart."""
+
+    name: str
+    """A few words, on the chart and in the table: of the method, then of the sampler."""
+    method: str
+    """As `ns-train` knows it."""
+    sampler: str
+    """As the registry of samplers knows it, or `own`."""
+    changes: Mapping[str, Any] = field(default_factory=dict)
+    """Settings under `--pipeline.model.`, by their path."""
+    budget: float = 1.0
+    """Multiple of the chart's time and steps that it is given."""
+    grids: tuple[int, ...] = ()
+    """Cells along each axis of occupancy grids that are made from its field when it freezes, and
+    compared with its gate."""
+
+    @property
+    def key(self) -> str:
+        """The same for what would run alike, whatever it is called: file name and identity."""
+        what = {name: value for name, value in asdict(self).items() if name != "name"}
+        digest = hashlib.sha256(json.dumps(what, sort_keys=True).encode()).hexdigest()
+        return f"{self.method}-{self.sampler}-{digest[:8]}"
+
+    @staticmethod
+    def from_dict(values: Mapping[str, Any]) -> Contender:
+        """Inverse of `dataclasses.asdict`, also after JSON."""
+        return Contender(**{**values, "grids": tuple(values["grids"])})
+
+
+def changed(config: Any, path: str, value: Any) -> Any:
+    """A config with one setting of it changed; the config given is left as it is.
+
+    Args:
+        config: a dataclass of dataclasses.
+        path: names of fields with dots between them.
+    Raises:
+        ValueError: there is no such field.
+    """
+    name, _, rest = path.partition(".")
+    if name not in getattr(config, "__dataclass_fields__", {}):
+        raise ValueError(f"{type(config).__name__} has no setting {name!r}")
+    return replace(config, **{name: changed(getattr(config, name), rest, value) if rest else value})
+
+
+def short_names(names: Sequence[str]) -> list[str]:
+    """The names without the method where it is the same for all."""
+    parts = [re.fullmatch(r"(.*?)(?: \+ |, )(.*)", name) for name in names]
+    found = [part.groups() for part in parts if part is not None]
+    if len(found) < 2 or len(found) < len(names) or len({method for method, _ in found}) > 1:
+        return list(names)
+    return [rest for _, rest in found]

@@ -1,0 +1,90 @@
+"""How long every run of a chart trains, and how it is looked at: the same for all of them."""
+
+from __future__ import annotations
+
+import hashlib
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+from leco_plugin.evaluation.clock import Budget
+
+LEARN_SHARE = 0.4
+"""Of the training time, at most, for learning an occupancy; short runs need most of that."""
+
+
+@dataclass(frozen=True)
+class Protocol:
+    """Time or steps, and what is evaluated."""
+
+    seconds: float | None = None
+    """Training time of a run."""
+    steps: int | None = None
+    """Training steps of a run; the run ends with the first of the two."""
+    learn_seconds: float | None = None
+    """Most of it that learning an occupancy may take, about; None is a share of `seconds`."""
+    images: int = 2
+    """Whole test images that are rendered at the end."""
+    curve_points: int = 6
+    """Looks at the test images while training, off the clock."""
+
+    def __post_init__(self) -> None:
+        self.budget()
+        for name, count in {"images": self.images, "curve points": self.curve_points}.items():
+            if count < 1:
+                raise ValueError(f"at least one of the {name} is needed, not {count}")
+
+    def budget(self, times: float = 1.0) -> Budget:
+        """Of a run that is given a multiple of the time and the steps; learning is not prolonged.
+
+        Raises:
+            ValueError: a time or a number of steps is missing or not positive.
+        """
+        learning = self.learn_seconds
+        if learning is None and self.seconds is not None:
+            learning = LEARN_SHARE * self.seconds
+        return Budget(
+            None if self.seconds is None else times * self.seconds,
+            None if self.steps is None else round(times * self.steps),
+            learning,
+        )
+
+    def describe(self) -> str:
+        """In a few words."""
+        parts = []
+        if self.seconds is not None:
+            parts.append(f"{self.seconds:g} s")
+        if self.steps is not None:
+            parts.append(f"{self.steps} steps")
+        return " or ".join(parts)
+
+
+def describe_scene(data: Path) -> dict[str, Any]:
+    """Name, number of images, and what tells the scene from another: JSON values.
+
+    Raises:
+        InputError: it is no scene that can be read.
+    """
+    from leco_plugin.scenes.photographs import check_scene, folder_of
+
+    meta = check_scene(data)
+    description = data if data.suffix == ".json" else data / "transforms.json"
+    digest = hashlib.sha256(description.read_bytes()).hexdigest()
+    name = folder_of(data).resolve().name
+    return {"name": name, "images": len(meta["frames"]), "digest": digest[:16]}
+
+
+def settings_of(
+    scene: dict[str, Any], protocol: Protocol, suite: str | None, machine: dict[str, Any]
+) -> dict[str, Any]:
+    """What the runs of one chart share; runs with other settings are not comparable."""
+    from leco_plugin import __version__
+
+    return {
+        "format": 1,
+        "scene": scene,
+        "suite": suite,
+        **asdict(protocol),
+        "machine": machine,
+        "version": __version__,
+    }

@@ -1,0 +1,139 @@
+"""The comparisons that the paper's reviewers asked for, each by name and as data."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+from leco_plugin.chart.contender import Contender
+from leco_plugin.chart.methods import GRID, LEARNED, NEVER_FROZEN, VARIANTS, contenders
+from leco_plugin.method_configs import LEARNING, ON_GPU
+from leco_plugin.models.guided_start import OWN_SAMPLER
+from leco_plugin.scenes.input_error import InputError
+
+SCENE_LAYERS = LEARNING.sizes.field.experts.layers
+SCENE_EXPERTS = LEARNING.sizes.gate.scene_experts
+GRIDS = (128, 256, 512) if ON_GPU else (64, 128, 256)
+"""A grid of 256^3 cells in four levels takes a minute of two CPU cores each time it is updated."""
+MADE_GRIDS = GRIDS if ON_GPU else GRIDS[:2]
+"""Made anew within one run, all at once."""
+
+
+@dataclass(frozen=True)
+class Suite:
+    """A named comparison."""
+
+    question: str
+    """What it answers, and who asked."""
+    contenders: tuple[Contender, ...]
+    seconds: float = 60.0
+    """Training time of a run without `--seconds`: three seeds then take under 45 minutes on two CPU
+    cores."""
+    representations: bool = False
+    """Whether what an occupancy costs and keeps is the point, rather than the pictures."""
+
+
+def _leco(name: str, **changes: object) -> Contender:
+    """`leco-occupancy` with settings changed; `__` stands for the dots of their paths."""
+    paths = {path.replace("__", "."): value for path, value in changes.items()}
+    return Contender(name, "leco-occupancy", LEARNED, paths)
+
+
+def _empty_mlp(name: str, layers: int) -> Contender:
+    return _leco(
+        name,
+        sizes__field__experts__empty_expert="mlp",
+        sizes__field__experts__empty_layers=layers,
+    )
+
+
+def _paper(name: str, **changes: object) -> Contender:
+    return _leco(name, gate_loss__form="paper", **changes)
+
+
+def _with_time(contender: Contender, times: float) -> Contender:
+    return replace(contender, name=f"{contender.name}, {times:g} x time", budget=times)
+
+
+OURS = _leco("learn, freeze, go on")
+HOSTS = contenders(["leco-ngp"], [LEARNED, OWN_SAMPLER])
+
+SUITES = {
+    "empty-expert": Suite(
+        "How small must the empty-space expert be, and what if there is none? (reviews 3 and 6)",
+        (
+            _leco("identity (ours)"),
+            _empty_mlp("MLP of one layer", 1),
+            _empty_mlp("MLP as large as a scene expert", SCENE_LAYERS),
+            _empty_mlp("MLP twice as deep", 2 * SCENE_LAYERS),
+            _leco("none: density is zero", sizes__field__experts__empty_expert="none"),
+        ),
+    ),
+    "losses": Suite(
+        "What do the losses of the gate do?",
+        (
+            _leco("contribution (ours)"),
+            _leco("ours without agreement", gate_loss__agreement=0.0),
+            _paper("paper: imbalance and density"),
+            _paper("paper without density loss", gate_loss__density=0.0),
+            _paper(
+                "balanced as in Switch-NeRF",
+                gate_loss__density=0.0,
+                gate_loss__empty_ratio=1.0 / (1 + SCENE_EXPERTS),
+            ),
+        ),
+    ),
+    "freeze": Suite(
+        "Why freeze and train again, instead of going on with the same network? (review 4)",
+        (
+            OURS,
+            replace(VARIANTS["leco-occupancy-retrained"], name="learn, freeze, from scratch"),
+            replace(NEVER_FROZEN, name="never frozen"),
+            replace(VARIANTS["leco-occupancy-homogeneous"], name="equal experts, no gate"),
+        ),
+    ),
+    "representations": Suite(
+        "Is a small MLP the best place for an occupancy? (reviews 1 and 2)",
+        (
+            replace(_leco("MLP on frequencies (ours)"), grids=MADE_GRIDS),
+            *(
+                Contender(
+                    name, "leco-occupancy", f"{LEARNED}-{kind}", {"sizes.gate.encoding.kind": kind}
+                )
+                for kind, name in (
+                    ("hash", "hash grid"),
+                    ("vm", "TensoRF planes"),
+                    ("k-planes", "K-planes"),
+                )
+            ),
+        ),
+        representations=True,
+    ),
+    "enough-time": Suite(
+        "Does it still pay with enough training time? (review 5)",
+        tuple(
+            _with_time(contender, times)
+            for times in (1.0, 4.0)
+            for contender in (
+                *HOSTS,
+                replace(OURS, name="LeCO + learned occupancy"),
+                VARIANTS["leco-occupancy-homogeneous"],
+            )
+        ),
+        seconds=20.0,
+    ),
+    "grid-resolution": Suite(
+        "Is a finer occupancy grid as good? (review 1)",
+        (HOSTS[0], *contenders(["leco-ngp"], [f"{GRID}-{cells}" for cells in GRIDS])),
+    ),
+}
+
+
+def suite(name: str) -> Suite:
+    """The suite of a name.
+
+    Raises:
+        InputError: there is none.
+    """
+    if name not in SUITES:
+        raise InputError(f"there is no suite {name!r}; there are {', '.join(SUITES)}")
+    return SUITES[name]

@@ -1,0 +1,153 @@
+"""`table.md`: every contender, every failure, and every occupancy in figures."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from leco_plugin.chart.summary import (
+    COSTS,
+    LEARNING,
+    Cost,
+    Line,
+    circumstances,
+    common_psnr,
+    front,
+    headline,
+    lines_of,
+    representations_of,
+    verdict,
+)
+
+STEPS = Cost("steps", "steps", "")
+STEP_SECONDS = Cost("step_seconds", "a step", "ms", 1e3)
+TRAIN_QUERIES = Cost("train_queries.field", "field queries in training", "M", 1e-6)
+LEARN_QUERIES = Cost("train_queries.learning", "", "M", 1e-6)
+PROPOSALS = Cost("proposal_queries_per_ray", "proposal queries a ray", "")
+
+
+def write_table(results: Mapping[str, Any], path: Path) -> Path:
+    """Writes the table; results without any run give a table without rows."""
+    path.write_text(table(results))
+    return path
+
+
+def table(results: Mapping[str, Any]) -> str:
+    """The whole of `table.md`."""
+    made = results["made"]
+    parts = [
+        f"# {results['scene']['name']}" + (f": {results['suite']}" if results["suite"] else ""),
+        *([results["question"]] if results["question"] else []),
+    ]
+    lines = lines_of(results) if results["runs"] else []
+    if lines:
+        parts += [f"{headline(results)}. {circumstances(results)}.", runs_table(lines)]
+    if results["failures"]:
+        parts.append(failures_table(results["failures"]))
+    if any(run.get("occupancy") for line in lines for run in line.runs):
+        parts.append(occupancy_table(lines))
+    held = representations_of(lines)
+    if len(held) > 1:
+        rows = [[r.name, _number(r.size), _number(r.learn_seconds), f"{r.kept:.1f}"] for r in held]
+        header = ["representation", "kB", "learned in, s", "volume kept at equal loss, %"]
+        parts += [_rows(header, rows), f"{verdict(held)}."]
+    commit = f" at {made['commit']}" if made["commit"] else ""
+    parts.append(f"`{made['command']}`, {made['date']}, leco_plugin {made['version']}{commit}.")
+    return "\n\n".join(parts) + "\n"
+
+
+def runs_table(lines: Sequence[Line]) -> str:
+    """Means of quality and medians of cost over seeds; bold is on the front of its column."""
+    level = common_psnr(lines)
+    header = [
+        *("method", "seeds", "PSNR, dB", "SSIM", "LPIPS", f"s to {level:.1f} dB", "steps"),
+        "ms a step",
+        "of which learning, s",
+        *(f"{cost.title}{f', {cost.unit}' if cost.unit else ''}" for cost in COSTS),
+        *("proposal queries a ray", "field queries in training, M"),
+    ]
+    bold = {cost.key: _on_front(lines, cost) for cost in COSTS}
+    rows = []
+    for line in lines:
+        ssim, lpips, reached = line.mean("ssim"), line.mean("lpips"), line.seconds_to(level)
+        costs = []
+        for cost in COSTS:
+            shown = _number(line.median(cost))
+            costs.append(f"**{shown}**" if line.name in bold[cost.key] else shown)
+        asked = [line.median(TRAIN_QUERIES), line.median(LEARN_QUERIES)]
+        rows.append(
+            [
+                line.name,
+                str(len(line.runs)),
+                _psnr(line),
+                "-" if ssim is None else f"{ssim:.3f}",
+                "-" if lpips is None else f"{lpips:.3f}",
+                _number(reached),
+                _number(line.median(STEPS)),
+                _number(line.median(STEP_SECONDS)),
+                _number(line.median(LEARNING)),
+                *costs,
+                _number(line.median(PROPOSALS)),
+                _number(sum(value or 0.0 for value in asked)),
+            ]
+        )
+    return _rows(header, rows)
+
+
+def failures_table(failures: Sequence[Mapping[str, Any]]) -> str:
+    """Runs that ended without a result."""
+    rows = [[f["name"], str(f["seed"]), f"failed: {_cell(f['reason'])}"] for f in failures]
+    return _rows(["method", "seed", "reason"], rows)
+
+
+def occupancy_table(lines: Sequence[Line]) -> str:
+    """What was learned, and what it costs: medians over seeds."""
+    columns = (
+        Cost("occupancy.params", "parameters", ""),
+        Cost("occupancy.bytes", "kB", "", 1e-3),
+        Cost("occupancy.learn_seconds", "learned in, s", ""),
+        Cost("occupancy.empty_fraction", "candidates skipped, %", "", 100.0),
+        Cost("occupancy.image_price_db", "price, dB", ""),
+        Cost("occupancy.lost_surface_mass", "lost surface mass", ""),
+        Cost("occupancy.at_equal_loss.kept_volume", "volume kept at 1e-3, %", "", 100.0),
+        Cost("occupancy.kept_surface_recall", "true surface kept, %", "", 100.0),
+        Cost("occupancy.free_space_skipped", "free space skipped, %", "", 100.0),
+    )
+    rows = [
+        [line.name, *(_number(line.median(column)) for column in columns)]
+        for line in lines
+        if all(run.get("occupancy") for run in line.runs)
+    ]
+    return _rows(["occupancy of", *(column.title for column in columns)], rows)
+
+
+def _on_front(lines: Sequence[Line], cost: Cost) -> set[str]:
+    known = [(line, line.median(cost)) for line in lines]
+    points = [(line, value) for line, value in known if value is not None]
+    members = front([(value, line.psnr) for line, value in points])
+    return {points[i][0].name for i in members}
+
+
+def _psnr(line: Line) -> str:
+    if len(line.runs) == 1:
+        return f"{line.psnr:.2f}"
+    return f"{line.psnr:.2f} ({min(line.psnrs):.2f} to {max(line.psnrs):.2f})"
+
+
+def _number(value: float | None) -> str:
+    """Three digits, or a dash where there is no number."""
+    if value is None:
+        return "-"
+    if abs(value) >= 100.0 or value == int(value):
+        return f"{value:.0f}"
+    return f"{value:.3g}"
+
+
+def _cell(text: str) -> str:
+    return text.replace("|", "\\|")
+
+
+def _rows(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
+    lines = [header, ["---"] * len(header), *rows]
+    return "\n".join(f"| {' | '.join(cells)} |" for cells in lines)

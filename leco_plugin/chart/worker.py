@@ -1,0 +1,147 @@
+"""One run in a process of its own: `python -m leco_plugin.chart.worker FOLDER`.
+
+The folder holds `job.json`; the run leaves `result.json` in it, or `failure.json` with its reason.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import sys
+import threading
+import traceback
+from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from nerfstudio.engine.trainer import Trainer
+
+    from leco_plugin.chart.contender import Contender
+    from leco_plugin.chart.protocol import Protocol
+
+JOB, RESULT, FAILURE, PROGRESS = "job.json", "result.json", "failure.json", "progress"
+
+
+def die_with_parent() -> None:
+    """Ends this process when the one that started it is gone: its end of our input is then closed.
+
+    A run that nobody waits for would slow the ones that are timed.
+    """
+
+    def wait() -> None:
+        while os.read(sys.stdin.fileno(), 1):
+            pass
+        os._exit(1)
+
+    threading.Thread(target=wait, daemon=True).start()
+
+
+def run_job(
+    contender: Contender,
+    seed: int,
+    data: Path,
+    protocol: Protocol,
+    folder: Path,
+    on_progress: Callable[[float], None] | None = None,
+) -> dict[str, Any]:
+    """Trains, evaluates and measures; the record as JSON values.
+
+    Args:
+        contender, seed: what.
+        data: the scene.
+        protocol: how long, and how it is evaluated.
+        folder: for the occupancy, if there is one, and for nerfstudio's own files.
+        on_progress: called with the share that is done.
+    Returns:
+        A run of `results.json`, with an `occupancy` of its own.
+    """
+    from leco_plugin.chart.configs import config_of
+    from leco_plugin.evaluation.equal_loss import at_equal_loss
+    from leco_plugin.evaluation.timed_run import timed_run
+    from leco_plugin.models.leco import LecoModel
+
+    config = config_of(contender, data, folder / "nerfstudio", protocol.learn_seconds)
+    at_loss: dict[str, Any] = {}
+
+    def when_frozen(trainer: Trainer) -> None:
+        model: Any = trainer.pipeline.model
+        if isinstance(model, LecoModel) and not model.config.schedule.restart:
+            manager = trainer.pipeline.datamanager
+            at_loss.update(at_equal_loss(model, manager, contender.grids))
+
+    run, trainer = timed_run(
+        config,
+        protocol.budget(contender.budget),
+        sampler=contender.sampler,
+        seed=seed,
+        curve_points=protocol.curve_points,
+        images=protocol.images,
+        on_progress=on_progress,
+        on_frozen=when_frozen,
+    )
+    facts = _occupancy_of(trainer, data, folder)
+    if facts is not None:
+        facts["at_equal_loss"] = at_loss or None
+        facts["learn_seconds"] = run.learn_seconds
+    return {**run.to_dict(), "name": contender.name, "occupancy": facts}
+
+
+def _occupancy_of(trainer: Trainer, data: Path, folder: Path) -> dict[str, Any] | None:
+    """What is known of the occupancy that a run has left, if any; its file is kept."""
+    from leco_plugin.evaluation.occupancy_facts import occupancy_facts, truth_of
+    from leco_plugin.models.freezing import FILE_NAME
+    from leco_plugin.occupancy import Occupancy
+    from leco_plugin.scenes.photographs import folder_of
+
+    file = trainer.base_dir / FILE_NAME
+    if not file.exists():
+        return None
+    manager = trainer.pipeline.datamanager
+    shutil.copyfile(file, folder / FILE_NAME)
+    occupancy = Occupancy.load(file, trainer.pipeline.device)
+    return occupancy_facts(occupancy, file, manager, truth_of(folder_of(data), manager))
+
+
+def reason_of(error: BaseException) -> str:
+    """An error in one line."""
+    said = " ".join(str(error).split())
+    return said if isinstance(error, ValueError) and said else f"{type(error).__name__}: {said}"
+
+
+def main(folder: Path) -> int:
+    """Makes the run that a folder describes; 0, or 1 and a reason beside it."""
+    from leco_plugin.chart.contender import Contender
+    from leco_plugin.chart.protocol import Protocol
+    from leco_plugin.evaluation.json_file import write_json
+
+    die_with_parent()
+    job = json.loads((folder / JOB).read_text())
+    shown = [0.0]
+
+    def show(share: float) -> None:
+        if share - shown[0] >= 0.01:
+            shown[0] = share
+            (folder / PROGRESS).write_text(f"{share:.3f}")
+
+    try:
+        result = run_job(
+            Contender.from_dict(job["contender"]),
+            job["seed"],
+            Path(job["data"]),
+            Protocol(**job["protocol"]),
+            folder,
+            show,
+        )
+        write_json(folder / RESULT, result)
+    # whatever a method raises is a row of the table, and the others go on
+    except BaseException as error:  # noqa: BLE001
+        traceback.print_exc()
+        write_json(folder / FAILURE, {"reason": reason_of(error)})
+        return 1
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main(Path(sys.argv[1])))

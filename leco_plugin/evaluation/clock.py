@@ -1,0 +1,95 @@
+"""Training time: a clock that stands still while a run is evaluated, and when a run is over."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import torch
+
+
+class Clock:
+    """Counts from a step's start to its end, the device waited for at both."""
+
+    def __init__(self) -> None:
+        self.seconds = 0.0
+        self._started: float | None = None
+
+    def start(self) -> None:
+        synchronize()
+        self._started = time.perf_counter()
+
+    def stop(self) -> float:
+        """Stands still from here; returns the seconds since the start."""
+        passed = self.now() - self.seconds
+        self.seconds += passed
+        self._started = None
+        return passed
+
+    def now(self) -> float:
+        """Seconds so far, the step under way included."""
+        if self._started is None:
+            return self.seconds
+        synchronize()
+        return self.seconds + time.perf_counter() - self._started
+
+
+def synchronize() -> None:
+    """Waits for the device, so that a time belongs to what was timed."""
+    if torch.cuda.is_available():
+        torch.cuda.synchronize()
+
+
+def warm_up(device: torch.device | str, seconds: float = 0.2) -> None:
+    """Has the device work for a moment, so that no first step pays for threads and handles."""
+    weights = torch.zeros(64, 64, device=device, requires_grad=True)
+    end = time.perf_counter() + seconds
+    while time.perf_counter() < end:
+        product = torch.ones(4096, 64, device=device) @ weights
+        product.relu().sum().backward()
+        synchronize()
+
+
+@dataclass(frozen=True)
+class Budget:
+    """When a run is over: after so much time or so many steps, whichever comes first."""
+
+    seconds: float | None = None
+    """Training time."""
+    steps: int | None = None
+    """Training steps."""
+    learn_seconds: float | None = None
+    """Most of that time, about, that learning an occupancy may take; None leaves it to the method.
+    """
+
+    def __post_init__(self) -> None:
+        if self.seconds is None and self.steps is None:
+            raise ValueError("a run needs an end: give --seconds or --steps")
+        limits = {"seconds": self.seconds, "steps": self.steps, "learn seconds": self.learn_seconds}
+        for name, limit in limits.items():
+            if limit is not None and not 0.0 < limit < math.inf:
+                raise ValueError(f"the training {name} are a positive number, not {limit}")
+
+    def share(self, seconds: float, steps: int) -> float:
+        """How much of the budget is used, in [0, 1]; at 1 the run is over."""
+        used = 0.0
+        if self.seconds is not None:
+            used = seconds / self.seconds
+        if self.steps is not None:
+            used = max(used, steps / self.steps)
+        return min(1.0, used)
+
+
+def timed(function: Callable[..., object], clock: Clock) -> Callable[..., object]:
+    """The same function, its time counted by a clock of its own."""
+
+    def run(*args: object, **kwargs: object) -> object:
+        clock.start()
+        try:
+            return function(*args, **kwargs)
+        finally:
+            clock.stop()
+
+    return run
