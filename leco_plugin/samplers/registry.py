@@ -89,11 +89,20 @@ def build_proposal(name: str, **options: Any) -> nn.Module:
     return _build(name, "proposal", options)
 
 
-def _build(name: str, kind: str, options: dict[str, Any]) -> nn.Module:
+def sampler_spec(name: str) -> SamplerSpec:
+    """The sampler of that name.
+
+    Raises:
+        ValueError: there is none.
+    """
     known = samplers()
     if name not in known:
         raise ValueError(f"there is no sampler {name!r}; there are {', '.join(sorted(known))}")
-    spec = known[name]
+    return known[name]
+
+
+def _build(name: str, kind: str, options: dict[str, Any]) -> nn.Module:
+    spec = sampler_spec(name)
     builder = getattr(spec, kind)
     if builder is None:
         raise ValueError(f"sampler {name!r} has nothing for hosts that call a {kind}")
