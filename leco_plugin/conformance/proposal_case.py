@@ -29,11 +29,9 @@ class ProposalCase(SamplerCase):
     def teach(self, sampler: Any, scene: Slab) -> None:
         """Nothing: it asks the host for densities whenever it samples."""
 
-    def answer(
-        self, sampler: Any, rays: Rays, scene: Slab = SLAB, levels: int = LEVELS
-    ) -> tuple[Any, Any, Any]:
+    def answer(self, sampler: Any, rays: Rays, scene: Slab = SLAB) -> tuple[Any, Any, Any]:
         """ray_samples, weights_list and ray_samples_list, as a host gets them."""
-        answer = sampler(ray_bundle(rays), density_fns=[scene.density] * levels)
+        answer = sampler(ray_bundle(rays), density_fns=[scene.density] * LEVELS)
         are_three = isinstance(answer, (tuple, list)) and len(answer) == 3
         require(
             are_three,

@@ -27,6 +27,8 @@ CHORD = 0.8
 """World units that a ray spends in the slab at least, for what is asked of its samples."""
 INSIDE = 0.9
 """Share of a ray's samples that must lie in or near what is kept."""
+UNREACHED = 0.1
+"""Share of a ray, in the host's spacing, that may be left out at either end."""
 UNEVEN = 1.5
 """In units of their mean, how far places may be from evenly spaced when everything is kept."""
 
@@ -50,17 +52,16 @@ def shapes_types_devices(case: ProposalCase) -> None:
     """As many samples on each ray; weights for the samples of each level that the host has."""
     for device in devices():
         sampler, rays = case.shared(SLAB).to(device), crossing().to(device)
-        for levels in (1, LEVELS):
-            ray_samples, weights, candidates = case.answer(sampler, rays, levels=levels)
-            require(
-                len(weights) == len(candidates) == levels,
-                f"{levels} density_fns got {len(weights)} weights and {len(candidates)} samples",
-            )
-            _check_tensors("ray_samples", rays, *_edges(ray_samples))
-            for level in range(levels):
-                starts, ends = _edges(candidates[level])
-                _check_tensors(f"level {level}", rays, starts, ends, weights[level])
-                require(bool((weights[level] >= 0.0).all()), f"level {level} has weights below 0")
+        ray_samples, weights, candidates = case.answer(sampler, rays)
+        require(
+            len(weights) == len(candidates) == LEVELS,
+            f"{LEVELS} density_fns got {len(weights)} weights and {len(candidates)} samples",
+        )
+        _check_tensors("ray_samples", rays, *_edges(ray_samples))
+        for level in range(LEVELS):
+            starts, ends = _edges(candidates[level])
+            _check_tensors(f"level {level}", rays, starts, ends, weights[level])
+            require(bool((weights[level] >= 0.0).all()), f"level {level} has weights below 0")
         sampler.to("cpu")
 
 
@@ -126,11 +127,18 @@ def _chords(rays: Rays) -> tuple[Tensor, Tensor]:
 
 
 def all_kept_equals_dense(case: ProposalCase) -> None:
-    """Where everything is occupied, samples are even in the spacing that the host counts in."""
+    """Where everything is occupied, a ray is sampled from end to end; evenly, if a gate decides."""
     rays = cut_short()  # which lie within the box: outside it nothing is occupied
     ray_samples, _, _ = case.answer(case.shared(EVERYTHING), rays, EVERYTHING)
     starts, ends = ray_samples.spacing_starts, ray_samples.spacing_ends
     require(starts is not None and ends is not None, "ray_samples have no spacing_starts and ends")
+    reaches = float(starts.amin(dim=1).max()), float(ends.amax(dim=1).min())
+    require(
+        reaches[0] <= UNREACHED and reaches[1] >= 1.0 - UNREACHED,
+        f"a ray is sampled from {reaches[0]:.0%} to {reaches[1]:.0%} of it only",
+    )
+    if not case.needs_occupancy:
+        return  # weights of a density depend on what lies in front
     places = ((starts + ends) / 2.0).view(len(rays.origins), -1)
     n_samples = places.shape[1]
     even = (torch.arange(n_samples) + 0.5) / n_samples

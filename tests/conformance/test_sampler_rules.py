@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+import nerfacc
 import pytest
+from nerfstudio.model_components.ray_samplers import ProposalNetworkSampler
 
 from leco_plugin.conformance.checking import pairs, sampler_cases
 from leco_plugin.conformance.rule import apply
 from leco_plugin.conformance.sampler_rules import SAMPLER_RULES
+from leco_plugin.samplers import nerfacc_cpu, registry
+from leco_plugin.samplers.registry import SamplerSpec
 
 
 @pytest.mark.slow  # `learned-occupancy` builds cell caches, also in two processes
@@ -26,6 +30,31 @@ def test_the_baselines_keep_every_rule(name):
     assert {verdict.seam for verdict in verdicts} == {"estimator"}
 
 
+def nerfaccs_grid(aabb, occupancy):
+    nerfacc_cpu.install()
+    return nerfacc.OccGridEstimator(aabb, resolution=64)
+
+
+def nerfstudios_proposals(aabb, occupancy):
+    return ProposalNetworkSampler((256, 96), num_nerf_samples_per_ray=48)
+
+
+@pytest.mark.parametrize(
+    "spec",
+    [
+        SamplerSpec("nerfacc's", estimator=nerfaccs_grid),
+        SamplerSpec("nerfstudio's", proposal=nerfstudios_proposals),
+    ],
+    ids=["nerfacc", "nerfstudio"],
+)
+def test_those_whose_places_are_taken_keep_the_rules_too(spec, monkeypatch):
+    monkeypatch.setitem(registry.OURS, "stock", spec)
+    rules = tuple(rule for rule in SAMPLER_RULES if rule.name != "two-processes")
+    verdicts = [apply(rule, case) for rule, case in pairs(sampler_cases("stock"), rules)]
+    nerfacc_cpu.uninstall()
+    assert [verdict.line() for verdict in verdicts if not verdict.passed] == []
+
+
 def test_rules_have_names_of_their_own_and_say_why_and_what_to_do():
     assert len({rule.name for rule in SAMPLER_RULES}) == len(SAMPLER_RULES)
     for rule in SAMPLER_RULES:
@@ -34,9 +63,7 @@ def test_rules_have_names_of_their_own_and_say_why_and_what_to_do():
 
 
 def test_a_sampler_that_serves_no_seam_is_refused(monkeypatch):
-    from leco_plugin.samplers import registry
-
-    monkeypatch.setitem(registry.OURS, "hollow", registry.SamplerSpec("nothing"))
+    monkeypatch.setitem(registry.OURS, "hollow", SamplerSpec("nothing"))
     with pytest.raises(ValueError, match="builds neither an estimator nor a proposal"):
         sampler_cases("hollow")
     with pytest.raises(ValueError, match="no sampler 'hollov'"):
