@@ -10,7 +10,7 @@ from torch import Tensor
 from leco_plugin.conformance.estimator_case import EstimatorCase
 from leco_plugin.conformance.intervals import among, covered, dense, in_order, same
 from leco_plugin.conformance.rule import Broken, require
-from leco_plugin.conformance.scene import EVERYTHING, MARGIN, SLAB, STEP, Rays, crossing
+from leco_plugin.conformance.scene import EVERYTHING, MARGIN, SLAB, STEP, Rays, crossing, stretched
 from leco_plugin.samplers.marching import Samples
 from leco_plugin.samplers.packed import render_transmittance_from_density
 
@@ -22,17 +22,21 @@ SLACK = 1e-3
 
 def skips_only_what_it_may(case: EstimatorCase) -> None:
     """What is plainly kept is sampled; what is plainly skipped is not, where the gate decides."""
-    rays = crossing()
-    samples = case.sample(case.shared(SLAB), rays)
-    if case.needs_occupancy:
-        positions = rays.at(samples[0], (samples[1] + samples[2]) / 2.0)
-        outside = SLAB.depth(positions) < -MARGIN
-        require(
-            not bool(outside.any()),
-            f"{int(outside.sum())} of {len(outside)} samples lie where the occupancy is empty"
-            + _first(positions[outside]),
-        )
-    check_kept_is_sampled(rays, samples)
+    for rays in (crossing(), stretched()):
+        samples = case.sample(case.shared(SLAB), rays)
+        if case.needs_occupancy:
+            _check_skipped_is_not(rays, samples)
+        check_kept_is_sampled(rays, samples)
+
+
+def _check_skipped_is_not(rays: Rays, samples: Samples) -> None:
+    positions = rays.at(samples[0], (samples[1] + samples[2]) / 2.0)
+    outside = SLAB.depth(positions) < -MARGIN
+    require(
+        not bool(outside.any()),
+        f"{int(outside.sum())} of {len(outside)} samples lie where the occupancy is empty"
+        + _first(positions[outside]),
+    )
 
 
 def check_kept_is_sampled(rays: Rays, samples: Samples) -> None:

@@ -7,15 +7,15 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from leco_plugin.conformance.rule import require
+from leco_plugin.conformance.rule import Broken, require
 from leco_plugin.conformance.sampler_case import SamplerCase
-from leco_plugin.conformance.scene import BACKGROUND, SLAB, Field, Rays, Slab, box
+from leco_plugin.conformance.scene import BACKGROUND, SLAB, Field, Rays, Slab
 from leco_plugin.occupancy import Occupancy
 from leco_plugin.samplers.marching import Samples
 from leco_plugin.samplers.registry import build_proposal
 
-LEVELS = 2
-"""Proposal levels of the host, nerfacto's default."""
+LEVELS, NUM_SAMPLES = 2, 48
+"""Proposal levels and samples a ray of the host, nerfacto's defaults."""
 
 
 class ProposalCase(SamplerCase):
@@ -24,14 +24,29 @@ class ProposalCase(SamplerCase):
     seam = "proposal"
 
     def build(self, occupancy: Occupancy | None) -> Any:
-        return build_proposal(self.name, aabb=box(), occupancy=occupancy)
+        from nerfstudio.model_components.ray_samplers import UniformLinDispPiecewiseSampler
+
+        return build_proposal(
+            self.name,
+            occupancy=occupancy,
+            num_samples=NUM_SAMPLES,
+            initial_sampler=UniformLinDispPiecewiseSampler(),
+            single_jitter=False,
+        )
 
     def teach(self, sampler: Any, scene: Slab) -> None:
         """Nothing: it asks the host for densities whenever it samples."""
 
-    def answer(self, sampler: Any, rays: Rays, scene: Slab = SLAB) -> tuple[Any, Any, Any]:
-        """ray_samples, weights_list and ray_samples_list, as a host gets them."""
-        answer = sampler(ray_bundle(rays), density_fns=[scene.density] * LEVELS)
+    def answer(
+        self, sampler: Any, rays: Rays, scene: Slab = SLAB, density: Any = None
+    ) -> tuple[Any, Any, Any]:
+        """ray_samples, weights_list and ray_samples_list, as a host gets them.
+
+        Args:
+            density: what each of the host's density_fns is; None is the density of the scene.
+        """
+        density_fns = [scene.density if density is None else density] * LEVELS
+        answer = sampler(ray_bundle(rays), density_fns=density_fns)
         are_three = isinstance(answer, (tuple, list)) and len(answer) == 3
         require(
             are_three,
@@ -53,6 +68,15 @@ class ProposalCase(SamplerCase):
         weights = ray_samples.get_weights(field.density(positions)[..., None])
         colours = (weights * field.colours(positions)).sum(dim=-2)
         return colours + (1.0 - weights.sum(dim=-2)) * colours.new_tensor(BACKGROUND)
+
+
+def no_density(*_: Any, **__: Any) -> None:
+    """What a guided host has in the place of its proposal networks.
+
+    Raises:
+        Broken: always.
+    """
+    raise Broken("density_fns are called, and a guided host has no proposal networks to answer")
 
 
 def ray_bundle(rays: Rays) -> Any:

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor, nn
 
 from leco_plugin.conformance.intervals import ROUNDING, check_intervals, check_order, same
-from leco_plugin.conformance.proposal_case import LEVELS, ProposalCase, packed
+from leco_plugin.conformance.proposal_case import LEVELS, ProposalCase, no_density, packed
 from leco_plugin.conformance.rule import require
 from leco_plugin.conformance.sampler_case import devices
 from leco_plugin.conformance.scene import (
@@ -39,7 +39,8 @@ def signature(case: ProposalCase) -> None:
     require(isinstance(sampler, nn.Module), f"it is a {type(sampler).__name__}, no torch module")
     for callback in ("set_anneal", "step_cb"):
         require(callable(getattr(sampler, callback, None)), f"it has no method {callback}")
-    ray_samples, weights, candidates = case.answer(sampler, crossing())
+    density = no_density if case.needs_occupancy else None
+    ray_samples, weights, candidates = case.answer(sampler, crossing(), density=density)
     require(
         hasattr(ray_samples, "frustums"),
         f"the first of three is {type(ray_samples).__name__}, not RaySamples",

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from typing import Any, ClassVar
+from typing import Any, ClassVar, cast
 
 import torch
 from torch import Tensor
 
 from leco_plugin.conformance.scene import SLAB, Field, Rays, Slab
+from leco_plugin.models.encodings import Kind
 from leco_plugin.occupancy import Occupancy
 from leco_plugin.samplers.marching import Samples
 from leco_plugin.samplers.registry import sampler_spec
@@ -31,7 +32,9 @@ class SamplerCase(ABC):
 
     def __init__(self, name: str) -> None:
         self.name = name
-        self.needs_occupancy = sampler_spec(name).needs_occupancy
+        spec = sampler_spec(name)
+        self.needs_occupancy = spec.needs_occupancy
+        self.gate_encoding = cast(Kind, spec.gate_encoding or "frequency")
         self._shared: dict[Slab, tuple[Any, Occupancy]] = {}
 
     def forget(self) -> None:
@@ -48,7 +51,7 @@ class SamplerCase(ABC):
 
     def _built(self, scene: Slab) -> tuple[Any, Occupancy]:
         if scene not in self._shared:
-            occupancy = scene.occupancy()
+            occupancy = scene.occupancy(self.gate_encoding)
             sampler = self.build(occupancy if self.needs_occupancy else None)
             if not self.needs_occupancy:
                 self.teach(sampler, scene)

@@ -54,7 +54,7 @@ def state_dict_round_trip(case: SamplerCase) -> None:
     torch.save(source.state_dict(), file)
     file.seek(0)
     state = torch.load(file, weights_only=True)
-    restored = case.build(OTHER.occupancy() if case.needs_occupancy else None)
+    restored = case.build(OTHER.occupancy(case.gate_encoding) if case.needs_occupancy else None)
     restored.load_state_dict(state)
     samples = case.sample(restored.eval(), rays, EVERYTHING)
     require(

@@ -19,7 +19,8 @@ SAMPLER_RULES = (
         name="signature",
         reason="hosts pass these arguments by name and by position, and know nothing else.",
         remedy="take the arguments of nerfacc's OccGridEstimator in its order with its defaults "
-        "(estimator), or subclass nerfstudio's Sampler with set_anneal and step_cb (proposal).",
+        "(estimator); subclass nerfstudio's Sampler, with set_anneal and step_cb, and count "
+        "density_fns but call none where an occupancy decides (proposal).",
         checks={ESTIMATOR: estimator_form.signature, PROPOSAL: proposal_checks.signature},
     ),
     Rule(
@@ -74,8 +75,8 @@ SAMPLER_RULES = (
         name="skips-only-what-it-may",
         reason="what is skipped though it is occupied is a hole in the image, and what is kept "
         "though it is empty is time lost.",
-        remedy="decide by Occupancy.occupied at the middle of each candidate, in world positions "
-        "(the occupancy maps them itself); check the direction of the comparison.",
+        remedy="decide by Occupancy.occupied at the middle of each candidate, origin + t direction "
+        "whatever the direction's length (the occupancy maps positions itself).",
         checks={
             ESTIMATOR: estimator_choices.skips_only_what_it_may,
             PROPOSAL: proposal_checks.skips_only_what_it_may,

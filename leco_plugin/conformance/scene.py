@@ -1,7 +1,7 @@
 """A scene in which everything is known: a box, rays through and past it, a slab, and a field.
 
-The slab's occupancy is a real gate whose weights are written down instead of learned: it decides
-exactly, costs nothing, and is saved and loaded like any other.
+The slab's occupancy is a real one: it decides exactly, costs nothing, and is saved and loaded like
+any other.
 """
 
 from __future__ import annotations
@@ -13,8 +13,8 @@ from typing import NamedTuple
 import torch
 from torch import Tensor, nn
 
-from leco_plugin.models.encodings import EncodingConfig
-from leco_plugin.models.gate import Gate, GateConfig
+from leco_plugin.conformance.known_gate import slab_gate
+from leco_plugin.models.encodings import Kind
 from leco_plugin.occupancy import Occupancy
 from leco_plugin.samplers.marching import Samples
 from leco_plugin.samplers.packed import accumulate_along_rays, render_weight_from_density
@@ -73,6 +73,12 @@ def cut_short() -> Rays:
     return rays._replace(t_min=DISTANCE - 0.8 + spread, t_max=DISTANCE + 0.8 - spread)
 
 
+def stretched() -> Rays:
+    """The rays of `crossing` with directions of length 2, as a host in other units has them."""
+    rays = crossing()
+    return Rays(rays.origins, 2.0 * rays.directions, rays.t_min / 2.0, rays.t_max / 2.0)
+
+
 def without_samples() -> dict[str, Rays]:
     """Rays on which there is nothing to sample, by why."""
     rays = crossing()
@@ -105,25 +111,9 @@ class Slab:
         """1 inside and 0 outside: [..., 3] to [..., 1], as hosts answer."""
         return (self.depth(positions) >= 0.0).to(positions.dtype)[..., None]
 
-    @torch.no_grad()
-    def occupancy(self) -> Occupancy:
-        """A frozen gate that says just this.
-
-        Two hidden layers make u = relu(|n.x| - w) and v = relu(w - |n.x|), small enough that the
-        LayerNorm is nearly linear between them; the logit of o is proportional to v - u.
-        """
-        gate = Gate(GateConfig(EncodingConfig(octaves=1), width=2, layers=2, scene_experts=1))
-        for parameter in gate.parameters():
-            parameter.zero_()
-        small, steepness = 2e-3, 50.0
-        first, second = gate.hidden
-        assert isinstance(first, nn.Linear) and isinstance(second, nn.Linear)
-        signs = torch.tensor([1.0, -1.0])
-        first.weight[:, :3] = signs[:, None] * torch.tensor(self.normal)
-        second.weight.copy_((small * signs)[:, None].expand(2, 2))
-        second.bias.copy_(-small * self.half_width * signs)
-        gate.norm.weight.fill_(1.0)
-        gate.head.weight[1] = -steepness * signs
+    def occupancy(self, kind: Kind = "frequency") -> Occupancy:
+        """A frozen gate on features of a kind that says just this."""
+        gate = slab_gate(torch.tensor(self.normal), self.half_width, kind)
         return Occupancy(gate, Space("box", CENTRE, HALF), threshold=0.5).eval()
 
 

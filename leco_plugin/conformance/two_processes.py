@@ -19,8 +19,8 @@ from leco_plugin.conformance.scene import SLAB, Field, Rays, crossing
 from leco_plugin.samplers.marching import Samples
 
 PATIENCE, PATIENCE_OF_A_RANK = 280.0, 120.0
-"""Seconds in all, and seconds that a rank waits for the other: a busy machine takes a minute for what
-an idle one does in five seconds."""
+"""Seconds in all, and seconds that a rank waits for the other: a busy machine takes a minute for
+what an idle one does in five seconds."""
 
 
 def on_two_ranks(case: SamplerCase) -> list[Samples]:

@@ -28,7 +28,9 @@ class SamplerSpec:
     """Builds what a packed host calls (`base.Estimator`), or "module:attribute" of such. Called
     with `aabb` (the host's box, [6]), `occupancy` (None when there is none) and options."""
     proposal: Callable[..., nn.Module] | str | None = None
-    """Builds what a proposal host calls (`proposal.LearnedOccupancySampler`), likewise."""
+    """Builds what a proposal host calls (`proposal.LearnedOccupancySampler`), likewise. Called with
+    `occupancy`, with the host's `num_samples`, `initial_sampler` and `single_jitter`, and with
+    `frame` where the host's coordinates are not those of the occupancy."""
     needs_occupancy: bool = False
     """Whether it asks a frozen gate."""
     gate_encoding: str | None = None

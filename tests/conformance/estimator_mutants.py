@@ -164,6 +164,14 @@ class KeepsTooLittle(Sound):
         return self.occupancy.query(positions) >= 0.999
 
 
+class Normalises(Sound):
+    """Takes directions for unit vectors, which those of a host in other units are not."""
+
+    def sampling(self, rays_o: Tensor, rays_d: Tensor, *args: Any, **options: Any) -> Samples:
+        directions = torch.nn.functional.normalize(rays_d, dim=-1)
+        return super().sampling(rays_o, directions, *args, **options)
+
+
 class DropsTheFirst(Answers):
     """A cell that a ray is just entering is forgotten."""
 
@@ -274,7 +282,7 @@ MUTANTS: dict[str, tuple[type, ...]] = {
     "packing-consistent": (ShortIndices, RaysInPieces),
     "deterministic-in-eval": (AlwaysShaking,),
     "stratified-in-training": (NeverStratified, ShakenOutOfBounds),
-    "skips-only-what-it-may": (KeepsAll, KeepsTooLittle),
+    "skips-only-what-it-may": (KeepsAll, KeepsTooLittle, Normalises),
     "all-kept-equals-dense": (DropsTheFirst,),
     "no-gradient-to-the-gate": (GateThaws, GradientsSwitchedOff),
     "zero-samples-well-formed": (StandInSample, FloatWhenEmpty),

@@ -16,8 +16,8 @@ from leco_plugin.samplers.registry import SamplerSpec
 class SoundProposal(LearnedOccupancySampler):
     """What all others are but for one thing."""
 
-    def __init__(self, aabb: Tensor, occupancy: Occupancy) -> None:
-        super().__init__(occupancy, num_samples=24, cache_bytes=0)
+    def __init__(self, occupancy: Occupancy, **options: Any) -> None:
+        super().__init__(occupancy, cache_bytes=0, **options)
 
 
 class NoCallbacks(SoundProposal):
@@ -32,6 +32,14 @@ class TuplesForLists(SoundProposal):
     def generate_ray_samples(self, ray_bundle: Any = None, density_fns: Any = None) -> Any:
         samples, weights, candidates = super().generate_ray_samples(ray_bundle, density_fns)
         return samples, tuple(weights), tuple(candidates)
+
+
+class AsksProposalNetworks(SoundProposal):
+    """Which a guided host no longer has."""
+
+    def generate_ray_samples(self, ray_bundle: Any = None, density_fns: Any = None) -> Any:
+        density_fns[0](ray_bundle.origins)
+        return super().generate_ray_samples(ray_bundle, density_fns)
 
 
 class OneLevelOnly(SoundProposal):
@@ -100,8 +108,8 @@ class PrefersTheFront(SoundProposal):
 
 
 class ProposalThaws(SoundProposal):
-    def __init__(self, aabb: Tensor, occupancy: Occupancy) -> None:
-        super().__init__(aabb, occupancy)
+    def __init__(self, occupancy: Occupancy, **options: Any) -> None:
+        super().__init__(occupancy, **options)
         occupancy.gate.requires_grad_(True)
 
 
@@ -126,8 +134,8 @@ class Anneals(SoundProposal):
 
 
 class ProposalOutsideTheStateDict(SoundProposal):
-    def __init__(self, aabb: Tensor, occupancy: Occupancy) -> None:
-        super().__init__(aabb, occupancy)
+    def __init__(self, occupancy: Occupancy, **options: Any) -> None:
+        super().__init__(occupancy, **options)
         estimator = self.estimator
         del self.estimator
         self.__dict__["estimator"] = estimator
@@ -139,7 +147,7 @@ class SamplesByRank(Shifted):
 
 
 PROPOSAL_MUTANTS: dict[str, tuple[type, ...]] = {
-    "signature": (NoCallbacks, TuplesForLists),
+    "signature": (NoCallbacks, TuplesForLists, AsksProposalNetworks),
     "shapes-types-devices": (OneLevelOnly, FlatWeights),
     "sorted-disjoint-inside": (LastFirst,),
     "deterministic-in-eval": (Shaking,),

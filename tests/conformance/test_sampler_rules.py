@@ -30,12 +30,19 @@ def test_the_baselines_keep_every_rule(name):
     assert {verdict.seam for verdict in verdicts} == {"estimator"}
 
 
+@pytest.mark.parametrize("features", ["hash", "vm", "k-planes"])
+def test_a_gate_on_other_features_is_known_too(features):
+    (case, _) = sampler_cases(f"learned-occupancy-{features}")
+    rules = [rule for rule in SAMPLER_RULES if rule.name == "skips-only-what-it-may"]
+    assert [apply(rule, case).problem for rule in rules] == [""]
+
+
 def nerfaccs_grid(aabb, occupancy):
     nerfacc_cpu.install()
     return nerfacc.OccGridEstimator(aabb, resolution=64)
 
 
-def nerfstudios_proposals(aabb, occupancy):
+def nerfstudios_proposals(**_):
     return ProposalNetworkSampler((256, 96), num_nerf_samples_per_ray=48)
 
 

@@ -2,24 +2,28 @@
 
 from __future__ import annotations
 
+from typing import get_args
+
 import pytest
 import torch
 
 from leco_plugin.conformance import scene
+from leco_plugin.models.encodings import Kind
 from leco_plugin.occupancy import Occupancy
 
 SLABS = [scene.SLAB, scene.OTHER, scene.EVERYTHING]
 
 
+@pytest.mark.parametrize("kind", get_args(Kind))
 @pytest.mark.parametrize("slab", SLABS)
-def test_the_gate_decides_as_the_slab_is_defined(slab):
+def test_the_gate_decides_as_the_slab_is_defined(slab, kind):
     offsets = (torch.rand(100_000, 3) - 0.5) * 2.4 * scene.HALF
     positions = torch.tensor(scene.CENTRE) + offsets
     from_plane = (offsets @ torch.tensor(slab.normal)).abs()
     expected = (offsets.abs().amax(dim=-1) <= scene.HALF) & (
         from_plane <= slab.half_width * scene.HALF
     )
-    occupancy = slab.occupancy()
+    occupancy = slab.occupancy(kind)
     clear = slab.depth(positions).abs() > 1e-4  # nearer than that a rounding decides
     assert clear.float().mean() > 0.99
     assert occupancy.occupied(positions)[clear].equal(expected[clear])
@@ -32,11 +36,12 @@ def test_everything_is_all_of_the_box():
     assert scene.EVERYTHING.occupancy().occupied(positions).all()
 
 
-def test_the_gate_is_saved_and_loaded_like_a_learned_one(tmp_path):
-    scene.SLAB.occupancy().save(tmp_path / "slab.safetensors")
+@pytest.mark.parametrize("kind", get_args(Kind))
+def test_the_gate_is_saved_and_loaded_like_a_learned_one(kind, tmp_path):
+    scene.SLAB.occupancy(kind).save(tmp_path / "slab.safetensors")
     loaded = Occupancy.load(tmp_path / "slab.safetensors")
     positions = torch.tensor(scene.CENTRE) + torch.randn(1000, 3)
-    assert loaded.query(positions).equal(scene.SLAB.occupancy().query(positions))
+    assert loaded.query(positions).equal(scene.SLAB.occupancy(kind).query(positions))
 
 
 def test_rays_cross_the_slab_or_have_nothing_to_sample():
