@@ -18,6 +18,8 @@ from leco_plugin.models.leco import LecoModelConfig
 from leco_plugin.models.optimizers import FusedAdamConfig
 from leco_plugin.models.phases import ScheduleConfig
 from leco_plugin.models.sizes import PAPER, sizes_for
+from leco_plugin.models.switch_nerf import SwitchNerfModelConfig
+from leco_plugin.models.switch_sizes import switch_sizes_for
 from leco_plugin.scenes.known_distances import KnownDistancePixelSamplerConfig
 from leco_plugin.scenes.photographs import LecoPhotographsDataParserConfig
 
@@ -27,14 +29,14 @@ def best_device() -> Literal["cpu", "cuda"]:
     return "cuda" if torch.cuda.is_available() else "cpu"
 
 
-def _optimizers(steps: int, table_lr: float, lr: float, gate_lr: float) -> dict[str, object]:
+def _optimizers(rates: dict[str, float], steps: int) -> dict[str, object]:
     """Adam for each parameter group, decayed to a tenth over the run."""
     return {
         name: {
             "optimizer": FusedAdamConfig(lr=rate),
             "scheduler": ExponentialDecaySchedulerConfig(lr_final=rate / 10.0, max_steps=steps),
         }
-        for name, rate in (("encoding", table_lr), ("field", lr), ("gate", gate_lr))
+        for name, rate in rates.items()
     }
 
 
@@ -64,7 +66,7 @@ _leco_occupancy = TrainerConfig(
             eval_num_rays_per_chunk=1 << 15 if ON_GPU else 1 << 12,
         ),
     ),
-    optimizers=_optimizers(STEPS, 2e-2, 1e-2, 5e-3),
+    optimizers=_optimizers({"encoding": 2e-2, "field": 1e-2, "gate": 5e-3}, STEPS),
     viewer=ViewerConfig(num_rays_per_chunk=1 << 12, quit_on_train_completion=True),
     vis="viewer+tensorboard",
 )
@@ -91,7 +93,26 @@ leco_occupancy_paper = MethodSpecification(
                 schedule=ScheduleConfig(learn_steps=40_000, steps_per_check=500),
             ),
         ),
-        optimizers=_optimizers(540_000, 5e-4, 5e-4, 5e-4),
+        optimizers=_optimizers(dict.fromkeys(("encoding", "field", "gate"), 5e-4), 540_000),
     ),
     description="The same with the sizes of the paper: 8 experts of 7 x 256, 257 samples.",
+)
+
+switch_nerf = MethodSpecification(
+    config=replace(
+        _leco_occupancy,
+        method_name="switch-nerf",
+        max_num_iterations=500_000 if ON_GPU else 4_000,
+        pipeline=replace(
+            _leco_occupancy.pipeline,
+            datamanager=VanillaDataManagerConfig(
+                dataparser=LecoPhotographsDataParserConfig(),
+                train_num_rays_per_batch=1024 if ON_GPU else 512,
+                eval_num_rays_per_batch=512,
+            ),
+            model=SwitchNerfModelConfig(sizes=switch_sizes_for(best_device())),
+        ),
+        optimizers=_optimizers({"fields": 5e-4 if ON_GPU else 5e-3}, 500_000 if ON_GPU else 4_000),
+    ),
+    description="Switch-NeRF, unguided: coarse and fine samples, a gate among equal experts.",
 )
