@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
-from leco_plugin.samplers.registry import build_estimator
+from leco_plugin.samplers.grid import OccupancyGridEstimator
 from leco_plugin.space import Space
 
 
-def scene_grid(space: Space, aabb: Tensor, resolution: int, levels: int) -> nn.Module:
+def scene_grid(space: Space, aabb: Tensor, resolution: int, levels: int) -> OccupancyGridEstimator:
     """An empty grid, whose innermost box is what the space maps without contraction.
 
     Args:
@@ -20,5 +20,4 @@ def scene_grid(space: Space, aabb: Tensor, resolution: int, levels: int) -> nn.M
     low, high = aabb.view(2, 3)
     low = low.maximum(space.center - space.half_extent)
     high = high.minimum(space.center + space.half_extent)
-    box = torch.cat([low, high])
-    return build_estimator("occupancy-grid", aabb=box, resolution=resolution, levels=levels)
+    return OccupancyGridEstimator(torch.cat([low, high]), resolution, levels)

@@ -36,7 +36,6 @@ from leco_plugin.models.switch_objective import switch_losses, switch_statistics
 from leco_plugin.models.switch_rendering import coarse_and_fine, kept_by, leading_expert, render
 from leco_plugin.models.switch_sizes import SMALL, SwitchSizes
 from leco_plugin.occupancy import gate_precision
-from leco_plugin.samplers.base import Estimator
 from leco_plugin.samplers.grid import OccupancyGridEstimator
 from leco_plugin.scenes.bounds import SceneBounds
 from leco_plugin.scenes.input_error import InputError
@@ -67,10 +66,9 @@ class SwitchNerfModelConfig(ModelConfig):
     """Weight of the balanced gate loss."""
     sigma_noise: float = 1.0
     """Standard deviation of the noise on density, before its activation, while training."""
-    early_stop_eps: float = 1e-4
-    """Packed samples: transmittance below which a sample is not shaded; 0 turns that off."""
-    alpha_thre: float = 0.0
-    """Packed samples: opacity below which a sample is not shaded in training; 0 turns it off."""
+    early_stop_eps: float = 0.0
+    """Packed samples, in training: transmittance below which a sample is not shaded. That asks for
+    all densities first, which pays where surfaces are opaque; 0 does not."""
     grid_levels: int = 4
     """Nested levels of the occupancy grid around an unbounded scene; a bounded one has one."""
     near: float | None = None
@@ -121,16 +119,9 @@ class SwitchNerfModel(Model):
             self._sample_with_grid(levels=1)
 
     def sample_with(self, estimator: nn.Module | None) -> None:
-        """Replaces the sampling; None is coarse and fine.
-
-        Args:
-            estimator: with nerfacc's `sampling` and `update_every_n_steps`; one of this package is
-                also told the density, so that renderings ask nothing behind opaque surfaces.
-        """
+        """Replaces the sampling by an estimator's; None is coarse and fine."""
         if estimator is not None:
             estimator.to(self.aabb.device).train(self.training)
-        if isinstance(estimator, Estimator):
-            estimator.density_fn = self.density_fn
         self.occupancy_grid = estimator
 
     def _sample_with_grid(self, levels: int) -> None:
@@ -222,16 +213,15 @@ class SwitchNerfModel(Model):
         step, cone_angle = self.march_range[2:].tolist()
         config, sizes = self.config, self.config.sizes
         if self.occupancy_grid is not None:
-            pruning = self.training and (config.early_stop_eps > 0.0 or config.alpha_thre > 0.0)
+            prune_below = config.early_stop_eps if self.training else 0.0
             packed = kept_by(
                 self.occupancy_grid,
                 rays,
                 step,
                 cone_angle,
-                self.density_fn if pruning else None,
-                config.early_stop_eps,
-                config.alpha_thre,
-                jittered=self.training,
+                self.training,
+                self.density_fn,
+                prune_below,
             )
             intervals = with_backdrop(packed, rays, step, cone_angle)
             answers = self._ask(mapped_middles(self.space, rays, intervals))

@@ -96,20 +96,21 @@ def kept_by(
     rays: Rays,
     step_size: float,
     cone_angle: float,
-    density_fn: Callable[[Tensor], Tensor] | None,
-    early_stop_eps: float,
-    alpha_thre: float,
     jittered: bool,
+    density_fn: Callable[[Tensor], Tensor],
+    prune_below: float,
 ) -> Intervals:
     """What an estimator keeps of the candidates along rays.
 
     Args:
         estimator: anything with nerfacc's `sampling`.
-        density_fn: scene positions [N, 3] to [N, 1]; samples that cannot be seen are then left out.
-        Others as for `samplers.base.Estimator.sampling`.
+        step_size, cone_angle: of the march.
+        jittered: stratified sampling.
+        density_fn: scene positions [N, 3] to densities per scene unit [N, 1].
+        prune_below: transmittance below which a sample is left out; 0 asks no densities.
     """
     sigma_fn = None
-    if density_fn is not None:
+    if prune_below > 0.0:
         sigma_fn = densities_of_samples(density_fn, rays.origins, rays.directions)
     return Intervals(
         *estimator.sampling(
@@ -119,8 +120,7 @@ def kept_by(
             t_min=rays.t_mins,
             t_max=rays.t_maxs,
             render_step_size=step_size,
-            early_stop_eps=early_stop_eps,
-            alpha_thre=alpha_thre,
+            early_stop_eps=prune_below,
             stratified=jittered,
             cone_angle=cone_angle,
         )
