@@ -117,6 +117,21 @@ def test_evaluation_is_deterministic_and_training_is_stratified_and_noisy(sampli
         assert torch.equal(first[name], second[name])
 
 
+@pytest.mark.parametrize("sampling", SAMPLINGS)
+def test_in_half_precision_losses_and_pixels_stay_float32(sampling) -> None:
+    full = updated(new_model(sampling=sampling)).eval()
+    half = copy.deepcopy(full)
+    full.precision, half.precision = "float32", "bfloat16"
+    torch.testing.assert_close(half(bundle())["rgb"], full(bundle())["rgb"], atol=0.05, rtol=0)
+    outputs = half.train()(bundle())
+    losses = half.get_loss_dict(outputs, {"image": torch.rand(10, 3)})
+    assert outputs["rgb"].dtype == torch.float32
+    assert all(loss.dtype == torch.float32 for loss in losses.values())
+    sum(losses.values()).backward()
+    gradients = [p.grad for p in half.field.parameters() if p.grad is not None]
+    assert all(bool(gradient.isfinite().all()) for gradient in gradients)
+
+
 @pytest.mark.parametrize("training", [False, True])
 def test_noise_and_limited_places_are_for_training(training: bool) -> None:
     model = new_model(capacity_factor=1.0, sigma_noise=0.7).train(training)
