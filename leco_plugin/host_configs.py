@@ -43,8 +43,14 @@ def photographs(rays: int) -> VanillaDataManagerConfig:
     )
 
 
-def trainer(name: str, pipeline: VanillaPipelineConfig, rates: dict[str, float]) -> TrainerConfig:
-    """A method: Adam at these rates, decayed to a tenth over the run."""
+def trainer(
+    name: str,
+    pipeline: VanillaPipelineConfig,
+    rates: dict[str, float],
+    steps: int = STEPS,
+    mixed_precision: bool = ON_GPU,
+) -> TrainerConfig:
+    """A method: Adam at these rates, decayed to a tenth over its steps."""
     return TrainerConfig(
         _target=AtomicTrainer,
         method_name=name,

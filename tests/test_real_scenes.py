@@ -9,7 +9,8 @@ import pytest
 import torch
 
 from leco_plugin.evaluation.timed_run import psnr_on_rays, run_training
-from leco_plugin.method_configs import leco_occupancy, switch_nerf
+from leco_plugin.host_configs import switch_nerf
+from leco_plugin.method_configs import leco_occupancy
 from leco_plugin.models.calibration import CalibrationConfig
 from leco_plugin.models.freezing import FILE_NAME
 from leco_plugin.occupancy import Occupancy

@@ -15,7 +15,7 @@ from nerfstudio.data.scene_box import SceneBox
 from nerfstudio.engine.callbacks import TrainingCallbackAttributes
 from torch import Tensor
 
-from leco_plugin.method_configs import switch_nerf
+from leco_plugin.host_configs import switch_nerf
 from leco_plugin.models.switch_field import SwitchFieldConfig
 from leco_plugin.models.switch_nerf import SwitchNerfModel, SwitchNerfModelConfig
 from leco_plugin.models.switch_sizes import SwitchSizes
