@@ -15,6 +15,7 @@ from leco_plugin.chart.contender import Contender
 from leco_plugin.models.guided import GuidedModelConfig
 from leco_plugin.models.guided_start import OWN_SAMPLER
 from leco_plugin.models.leco import LecoModelConfig
+from leco_plugin.models.switch_nerf import SwitchNerfModelConfig
 from leco_plugin.samplers.registry import samplers as registered_samplers
 from leco_plugin.scenes.input_error import InputError
 from leco_plugin.swap import registered
@@ -135,28 +136,52 @@ def _learning(method: str, sampler: str) -> Contender | None:
 
 def _hosting(method: str, sampler: str, host: Any) -> Contender | None:
     """A host, which takes any sampler of its kind."""
-    resolution = getattr(host, "grid_resolution", None)
-    cells = resolution if isinstance(resolution, int) else 128
     proposes = hasattr(host, "num_proposal_samples_per_ray")
     called = METHOD_NAMES.get(method, method)
     if sampler == OWN_SAMPLER:
-        own = "own sampling"
-        if resolution is not None:
-            own = f"own grid {cells}³"
-        elif proposes:
-            own = "proposal networks"
-        return Contender(f"{called} + {own}", method, sampler, {"occupancy.sampler": OWN_SAMPLER})
+        name = f"{called} + {_own_sampling(host)}"
+        return Contender(name, method, sampler, {"occupancy.sampler": OWN_SAMPLER})
     sized = SIZED_GRID.fullmatch(sampler)
     spec = registered_samplers()[GRID if sized else sampler]
     if (spec.proposal if proposes else spec.estimator) is None:
         return None
-    changes: dict[str, Any] = {"occupancy.sampler": GRID if sized else sampler}
-    name = SAMPLER_NAMES.get(sampler, sampler)
-    if changes["occupancy.sampler"] == GRID:
-        cells = int(sized[1]) if sized else cells
-        levels = getattr(host, "grid_levels", 1)
-        changes["occupancy.options"] = {"resolution": cells, "levels": levels}
-        name = f"grid {cells}³"
+    if sized or sampler == GRID:
+        cells = int(sized[1]) if sized else _own_cells(host) or 128
+        return Contender(f"{called} + grid {cells}³", method, sampler, _grid(host, cells))
+    changes = {"occupancy.sampler": sampler}
     if spec.gate_encoding is not None:
         changes["occupancy.learning.sizes.gate.encoding.kind"] = spec.gate_encoding
-    return Contender(f"{called} + {name}", method, sampler, changes)
+    name = f"{called} + {SAMPLER_NAMES.get(sampler, sampler)}"
+    return Contender(name, method, sampler, changes)
+
+
+def _own_sampling(host: Any) -> str:
+    """What a host does when it is left as it is, in words."""
+    if isinstance(host, SwitchNerfModelConfig) and host.sampling == "coarse-fine":
+        return "coarse and fine samples"
+    if hasattr(host, "num_proposal_samples_per_ray"):
+        return "proposal networks"
+    cells = _own_cells(host)
+    return "own sampling" if cells is None else f"own grid {cells}³"
+
+
+def _own_cells(host: Any) -> int | None:
+    """Cells along each axis of the grid that a host has by itself."""
+    owner = host.sizes if isinstance(host, SwitchNerfModelConfig) else host
+    cells = getattr(owner, "grid_resolution", None)
+    return cells if isinstance(cells, int) else None
+
+
+def _grid(host: Any, cells: int) -> dict[str, Any]:
+    """Changes that have a host ask an occupancy grid of so many cells along each axis."""
+    if isinstance(host, SwitchNerfModelConfig):  # its grid follows the bounds that it finds
+        return {
+            "occupancy.sampler": OWN_SAMPLER,
+            "host.sampling": "occupancy-grid",
+            "host.sizes.grid_resolution": cells,
+        }
+    levels = getattr(host, "grid_levels", 1)
+    return {
+        "occupancy.sampler": GRID,
+        "occupancy.options": {"resolution": cells, "levels": levels},
+    }

@@ -298,7 +298,7 @@ def _draw_representations(
     panels[0].set_ylabel("volume kept, %")
     points = [(line, line.median(RENDERING)) for line in lines]
     _draw_costs(panels[2], RENDERING, points, theme, first=False)
-    panels[2].set_title("PSNR, dB, by rendering an image, s", fontsize=11.5, loc="left")
+    panels[2].set_title("rendering an image, s: PSNR", fontsize=11.5, loc="left")
 
 
 def _name_point(axes: Any, name: str, place: tuple[float, float]) -> None:

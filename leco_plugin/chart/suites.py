@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 from leco_plugin.chart.contender import Contender
-from leco_plugin.chart.methods import GRID, LEARNED, NEVER_FROZEN, VARIANTS, contenders
+from leco_plugin.chart.methods import GRID, LEARNED, NEVER_FROZEN, VARIANTS
 from leco_plugin.method_configs import LEARNING, ON_GPU
 from leco_plugin.models.guided_start import OWN_SAMPLER
 from leco_plugin.scenes.input_error import InputError
@@ -54,8 +54,21 @@ def _with_time(contender: Contender, times: float) -> Contender:
     return replace(contender, name=f"{contender.name}, {times:g} x time", budget=times)
 
 
+def _ngp_grid(cells: int) -> Contender:
+    options = {"resolution": cells, "levels": NGP_LEVELS}
+    changes = {"occupancy.sampler": GRID, "occupancy.options": options}
+    return Contender(f"Instant-NGP + grid {cells}³", "leco-ngp", f"{GRID}-{cells}", changes)
+
+
 OURS = _leco("learn, freeze, go on")
-HOSTS = contenders(["leco-ngp"], [LEARNED, OWN_SAMPLER])
+NGP_LEARNED = Contender(
+    "Instant-NGP + learned occupancy", "leco-ngp", LEARNED, {"occupancy.sampler": LEARNED}
+)
+NGP_OWN = Contender(
+    "Instant-NGP + own grid", "leco-ngp", OWN_SAMPLER, {"occupancy.sampler": OWN_SAMPLER}
+)
+NGP_LEVELS = 4
+"""Nested grids, as many as Instant-NGP has around a scene without bounds."""
 
 SUITES = {
     "empty-expert": Suite(
@@ -114,7 +127,8 @@ SUITES = {
             _with_time(contender, times)
             for times in (1.0, 4.0)
             for contender in (
-                *HOSTS,
+                NGP_LEARNED,
+                NGP_OWN,
                 replace(OURS, name="LeCO + learned occupancy"),
                 VARIANTS["leco-occupancy-homogeneous"],
             )
@@ -123,7 +137,7 @@ SUITES = {
     ),
     "grid-resolution": Suite(
         "Is a finer occupancy grid as good? (review 1)",
-        (HOSTS[0], *contenders(["leco-ngp"], [f"{GRID}-{cells}" for cells in GRIDS])),
+        (NGP_LEARNED, *(_ngp_grid(cells) for cells in GRIDS)),
     ),
 }
 

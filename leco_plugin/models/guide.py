@@ -17,7 +17,7 @@ from torch import Tensor, nn
 from leco_plugin.models.gate import Gate, GateConfig
 from leco_plugin.occupancy import Occupancy
 from leco_plugin.samplers.base import Estimator
-from leco_plugin.samplers.registry import build_estimator, build_proposal, samplers
+from leco_plugin.samplers.registry import build_estimator, build_proposal, sampler_spec
 from leco_plugin.space import Space
 
 
@@ -54,12 +54,7 @@ class Guide(nn.Module):
         Raises:
             ValueError: there is no such sampler.
         """
-        known = samplers()
-        if self.sampler not in known:
-            raise ValueError(
-                f"there is no sampler {self.sampler!r}; there are {', '.join(sorted(known))}"
-            )
-        return known[self.sampler].needs_occupancy
+        return sampler_spec(self.sampler).needs_occupancy
 
     def changed(self) -> None:
         """Samplers that were made are made anew when they are next asked."""

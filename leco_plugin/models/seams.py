@@ -39,7 +39,12 @@ class HostAdapter:
 
 def adapters() -> dict[str, HostAdapter]:
     """All adapters by name, those of other packages first."""
-    return {**foreign_entries(GROUP), "packed": PACKED, "proposal": PROPOSAL}
+    return {
+        **foreign_entries(GROUP),
+        "sample-with": SAMPLE_WITH,
+        "packed": PACKED,
+        "proposal": PROPOSAL,
+    }
 
 
 def swap_sampler(host: Model, guide: Guide) -> str:
@@ -60,6 +65,17 @@ def swap_sampler(host: Model, guide: Guide) -> str:
         f"A package can bring a HostAdapter (leco_plugin.models.seams) in the entry-point group "
         f"{GROUP}"
     )
+
+
+def _sample_with(host: Any, guide: Guide) -> None:
+    host.sample_with(guide.estimator(host.aabb))
+
+
+SAMPLE_WITH = HostAdapter(
+    "a method sample_with(estimator) and a box aabb, as switch-nerf has",
+    lambda host: callable(getattr(host, "sample_with", None)),
+    _sample_with,
+)
 
 
 def _replace(host: nn.Module, old: nn.Module, new: nn.Module) -> None:

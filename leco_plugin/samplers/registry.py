@@ -28,7 +28,9 @@ class SamplerSpec:
     """Builds what a packed host calls (`base.Estimator`), or "module:attribute" of such. Called
     with `aabb` (the host's box, [6]), `occupancy` (None when there is none) and options."""
     proposal: Callable[..., nn.Module] | str | None = None
-    """Builds what a proposal host calls (`proposal.LearnedOccupancySampler`), likewise."""
+    """Builds what a proposal host calls (`proposal.LearnedOccupancySampler`), likewise. Called with
+    `occupancy`, with the host's `num_samples`, `initial_sampler` and `single_jitter`, and with
+    `frame` where the host's coordinates are not those of the occupancy."""
     needs_occupancy: bool = False
     """Whether it asks a frozen gate."""
     gate_encoding: str | None = None
@@ -89,11 +91,20 @@ def build_proposal(name: str, **options: Any) -> nn.Module:
     return _build(name, "proposal", options)
 
 
-def _build(name: str, kind: str, options: dict[str, Any]) -> nn.Module:
+def sampler_spec(name: str) -> SamplerSpec:
+    """The sampler of that name.
+
+    Raises:
+        ValueError: there is none.
+    """
     known = samplers()
     if name not in known:
         raise ValueError(f"there is no sampler {name!r}; there are {', '.join(sorted(known))}")
-    spec = known[name]
+    return known[name]
+
+
+def _build(name: str, kind: str, options: dict[str, Any]) -> nn.Module:
+    spec = sampler_spec(name)
     builder = getattr(spec, kind)
     if builder is None:
         raise ValueError(f"sampler {name!r} has nothing for hosts that call a {kind}")
