@@ -7,7 +7,6 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from leco_plugin.chart.picture import LIGHT
 from leco_plugin.chart.summary import (
     COSTS,
     LEARNING,
@@ -20,6 +19,7 @@ from leco_plugin.chart.summary import (
     representations_of,
     verdict,
 )
+from leco_plugin.chart.theme import LIGHT
 
 SYMBOLS = ("circle", "square", "diamond", "triangle-up", "triangle-down", "cross", "x", "star")
 FRONT = {"color": "rgba(120,120,120,0.45)", "width": 5, "shape": "hv"}

@@ -150,7 +150,8 @@ class Chart:
         Nothing is drawn when no run has succeeded.
         """
         from leco_plugin.chart.page import write_page
-        from leco_plugin.chart.picture import DARK, LIGHT, draw
+        from leco_plugin.chart.picture import draw
+        from leco_plugin.chart.theme import DARK, LIGHT
 
         results = self.write()
         if results["runs"]:

@@ -62,7 +62,8 @@ def run_job(
     from leco_plugin.evaluation.timed_run import timed_run
     from leco_plugin.models.leco import LecoModel
 
-    config = config_of(contender, data, folder / "nerfstudio", protocol.learn_seconds)
+    budget = protocol.budget(contender.budget)
+    config = config_of(contender, data, folder / "nerfstudio", budget.learn_seconds)
     at_loss: dict[str, Any] = {}
 
     def when_frozen(trainer: Trainer) -> None:
@@ -73,7 +74,7 @@ def run_job(
 
     run, trainer = timed_run(
         config,
-        protocol.budget(contender.budget),
+        budget,
         sampler=contender.sampler,
         seed=seed,
         curve_points=protocol.curve_points,

@@ -132,3 +132,12 @@ def test_the_state_of_a_host_holds_the_gate_once(guide: Guide):
     host.grid.sampling(*rays(), **MARCH)
     assert all(name.startswith("guide.") for name in host.state_dict())
     assert not any(parameter.requires_grad for parameter in host.parameters())
+
+
+def test_the_options_of_a_sampler_reach_it(guide: Guide):
+    grid = Guide("occupancy-grid", {"resolution": 7, "levels": 2}).estimator(BOX)
+    assert grid.binaries.shape == (2, 7, 7, 7)
+    own = Guide(options={"cache_bytes": 0})
+    own.set_occupancy(ball())
+    assert own.estimator(BOX).sampler.cache_bytes == 0
+    assert own.proposal(num_samples=3).sampler.estimator.cache_bytes == 0

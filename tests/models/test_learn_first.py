@@ -10,7 +10,7 @@ from nerfstudio.data.datamanagers.base_datamanager import VanillaDataManagerConf
 from nerfstudio.pipelines.base_pipeline import VanillaPipelineConfig
 
 from leco_plugin.models.guided_start import OccupancyConfig
-from leco_plugin.models.learn_first import FEWEST_STEPS, learn_occupancy
+from leco_plugin.models.learn_first import FEWEST_STEPS, learn_occupancy, steps_within
 from leco_plugin.models.leco import LecoModelConfig
 from leco_plugin.models.phases import ScheduleConfig
 from leco_plugin.occupancy import Occupancy
@@ -62,3 +62,10 @@ def test_each_method_has_learning_sizes_of_its_own():
     one, other = OccupancyConfig(), OccupancyConfig()
     one.learning.schedule = replace(one.learning.schedule, learn_steps=3)
     assert other.learning.schedule.learn_steps != 3
+
+
+@pytest.mark.parametrize(
+    ("seconds", "a_step", "steps"), [(10.0, 0.1, 100), (0.1, 0.1, FEWEST_STEPS), (90.0, 0.1, 200)]
+)
+def test_learning_takes_the_steps_that_fit_but_never_more_than_are_wanted(seconds, a_step, steps):
+    assert steps_within(seconds, a_step, most=200) == steps

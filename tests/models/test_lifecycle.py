@@ -9,6 +9,7 @@ import torch
 
 from leco_plugin.models import lifecycle
 from leco_plugin.models.encodings import EncodingConfig
+from leco_plugin.models.field import FieldConfig, HMoEField
 from leco_plugin.models.gate import Gate, GateConfig
 from leco_plugin.models.lifecycle import Lifecycle
 from leco_plugin.models.rendering import Rays
@@ -67,3 +68,22 @@ def test_a_look_sees_what_the_gate_has_learned_since(looking: Lifecycle) -> None
     with torch.no_grad():
         looking.model.gate.head.bias += 1.0
     torch.testing.assert_close(looking._probe(), before + 1.0)
+
+
+def test_a_field_that_starts_anew_keeps_its_parameters_and_forgets_what_they_were() -> None:
+    config = FieldConfig(EncodingConfig("hash", levels=1, log2_table=4), appearance_dim=2)
+    field = HMoEField(config, 3)
+    optimizer = torch.optim.Adam(field.parameters(), lr=1.0)
+    sum(parameter.sum() for parameter in field.parameters()).backward()
+    optimizer.step()
+    made = object.__new__(Lifecycle)
+    made.model = SimpleNamespace(field=field, num_train_data=3)  # type: ignore[assignment]
+    made.trainer = SimpleNamespace(optimizers=SimpleNamespace(optimizers={"field": optimizer}))
+    before = list(field.parameters())
+    learned = [parameter.detach().clone() for parameter in before]
+    made._restart_field()
+    assert all(one is other for one, other in zip(field.parameters(), before, strict=True))
+    assert not any(torch.equal(one, other) for one, other in zip(field.parameters(), learned))
+    assert not optimizer.state
+    sum(parameter.sum() for parameter in field.parameters()).backward()
+    optimizer.step()

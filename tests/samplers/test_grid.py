@@ -105,3 +105,14 @@ def test_impossible_grids_are_refused():
         OccupancyGridEstimator(BOX, resolution=0)
     with pytest.raises(ValueError, match="positive sizes"):
         OccupancyGridEstimator(BOX, levels=0)
+
+
+@settings(deadline=None, max_examples=30)
+@given(seed=st.integers(0, 2**16), levels=st.integers(1, 3))
+def test_the_value_at_a_position_is_that_of_the_cell_that_answers(seed, levels):
+    torch.manual_seed(seed)
+    grid = OccupancyGridEstimator(BOX, resolution=[4, 5, 6], levels=levels)
+    grid.occs.copy_(torch.rand(levels * 120))
+    grid.binaries.copy_(grid.occs.view_as(grid.binaries) > 0.5)
+    positions = torch.randn(60, 3) * 2.0
+    assert torch.equal(grid.values(positions) > 0.5, grid.occupied(positions))

@@ -1,0 +1,31 @@
+"""Claims about the interactive page of a chart."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import pytest
+from chart_results import occupancy, results, run
+
+from leco_plugin.chart.page import write_page
+
+
+@pytest.fixture(scope="module")
+def page(tmp_path_factory: pytest.TempPathFactory) -> str:
+    held = [run("A <b>", occupancy=occupancy(50_000, 0.1)), run("B", occupancy=occupancy(90, 0.2))]
+    return write_page(results(*held), tmp_path_factory.mktemp("page") / "chart.html").read_text()
+
+
+def test_the_page_asks_no_other_machine_for_anything(page: str) -> None:
+    assert not re.search(r"<(script|link|img|iframe)[^>]*\s(src|href)=", page)
+
+
+def test_every_contender_is_in_it_with_its_curve(page: str) -> None:
+    assert page.count('"name":"B"') >= 4  # a curve and a point for each cost
+    assert "seconds of training" in page and "volume kept at equal loss" in page
+
+
+def test_a_chart_without_occupancies_has_no_row_for_them(tmp_path: Path) -> None:
+    text = write_page(results(run("A"), run("B")), tmp_path / "chart.html").read_text()
+    assert "volume kept at equal loss" not in text

@@ -1,0 +1,48 @@
+"""Claims about the named comparisons."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from leco_plugin.chart.configs import config_of
+from leco_plugin.chart.suites import SUITES, suite
+from leco_plugin.scenes.input_error import InputError
+
+NAMES = {
+    "empty-expert",
+    "losses",
+    "freeze",
+    "representations",
+    "enough-time",
+    "grid-resolution",
+}
+OVERHEAD_SECONDS = 40.0
+"""Start, evaluation and rendering of a run on two cores."""
+
+
+def test_there_is_a_suite_for_every_question() -> None:
+    assert set(SUITES) == NAMES
+
+
+@pytest.mark.parametrize("name", sorted(NAMES))
+def test_the_contenders_of_a_suite_differ_and_can_be_configured(name: str) -> None:
+    compared = SUITES[name].contenders
+    assert len(compared) >= 4
+    assert len({one.key for one in compared}) == len({one.name for one in compared})
+    assert len({one.key for one in compared}) == len(compared)
+    for one in compared:
+        assert config_of(one, Path("scene"), Path("runs")).method_name == one.method
+
+
+@pytest.mark.parametrize("name", sorted(NAMES))
+def test_three_seeds_of_a_suite_take_less_than_45_minutes(name: str) -> None:
+    found = SUITES[name]
+    run = [one.budget * found.seconds + OVERHEAD_SECONDS for one in found.contenders]
+    assert 3 * sum(run) < 45 * 60
+
+
+def test_an_unknown_suite_is_named_beside_those_there_are() -> None:
+    with pytest.raises(InputError, match=r"'no-such'.*empty-expert"):
+        suite("no-such")

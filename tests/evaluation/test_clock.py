@@ -1,0 +1,86 @@
+"""Claims about the clock of a run and about when a run is over."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+
+from leco_plugin.evaluation import clock as clock_module
+from leco_plugin.evaluation.clock import Budget, Clock, timed, warm_up
+
+
+class Time:
+    """Stands for `time.perf_counter`."""
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        self.now = 100.0
+        monkeypatch.setattr(clock_module.time, "perf_counter", lambda: self.now)
+
+
+@pytest.fixture
+def time(monkeypatch: pytest.MonkeyPatch) -> Time:
+    return Time(monkeypatch)
+
+
+def test_the_clock_stands_still_between_steps(time: Time) -> None:
+    clock = Clock()
+    for step in (2.0, 3.0):
+        clock.start()
+        time.now += step
+        assert clock.stop() == step
+        time.now += 50.0
+    assert clock.seconds == clock.now() == 5.0
+
+
+def test_a_look_at_a_running_clock_does_not_stop_it(time: Time) -> None:
+    clock = Clock()
+    clock.start()
+    time.now += 2.0
+    assert clock.now() == 2.0 and clock.seconds == 0.0
+    time.now += 2.0
+    clock.stop()
+    assert clock.seconds == 4.0
+
+
+def test_a_timed_function_is_counted_also_when_it_fails(time: Time) -> None:
+    clock = Clock()
+
+    def fail(seconds: float) -> None:
+        time.now += seconds
+        raise RuntimeError
+
+    with pytest.raises(RuntimeError):
+        timed(fail, clock)(3.0)
+    assert clock.seconds == 3.0
+    assert timed(lambda value: value, clock)(7) == 7
+
+
+@pytest.mark.parametrize(
+    ("budget", "seconds", "steps", "share"),
+    [
+        (Budget(10.0), 5.0, 999, 0.5),
+        (Budget(None, 100), 1e9, 25, 0.25),
+        (Budget(10.0, 100), 2.0, 50, 0.5),
+        (Budget(10.0, 100), 9.0, 50, 0.9),
+        (Budget(10.0, 100), 20.0, 0, 1.0),
+    ],
+)
+def test_a_run_is_over_with_the_first_of_time_and_steps(
+    budget: Budget, seconds: float, steps: int, share: float
+) -> None:
+    assert budget.share(seconds, steps) == share
+
+
+@pytest.mark.parametrize("wrong", [0.0, -1.0, math.nan, math.inf])
+def test_what_is_no_time_is_refused(wrong: float) -> None:
+    with pytest.raises(ValueError, match="positive number"):
+        Budget(wrong)
+    with pytest.raises(ValueError, match="learn seconds"):
+        Budget(1.0, learn_seconds=wrong)
+    with pytest.raises(ValueError, match="--seconds or --steps"):
+        Budget()
+
+
+def test_warming_up_ends() -> None:
+    warm_up("cpu", seconds=0.001)

@@ -1,0 +1,133 @@
+"""Claims about counting what fields are asked."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+import torch
+from nerfstudio.cameras.rays import Frustums, RaySamples
+from nerfstudio.fields.base_field import Field
+from nerfstudio.fields.density_fields import HashMLPDensityField
+from torch import Tensor, nn
+
+from leco_plugin.evaluation.field_queries import counted
+from leco_plugin.models.encodings import EncodingConfig
+from leco_plugin.models.field import FieldConfig, HMoEField
+
+
+class Fog(Field):
+    """The same density everywhere."""
+
+    def get_density(self, ray_samples: RaySamples) -> tuple[Tensor, Tensor]:
+        density = torch.ones(*ray_samples.frustums.shape, 1)
+        return density, density
+
+    def get_outputs(self, ray_samples: RaySamples, density_embedding: Any = None) -> dict[Any, Any]:
+        return {}
+
+
+class ThickFog(Fog):
+    """Asks the field that it is made from."""
+
+    def get_density(self, ray_samples: RaySamples) -> tuple[Tensor, Tensor]:
+        density, features = super().get_density(ray_samples)
+        return 2.0 * density, features
+
+
+class Plain(nn.Module):
+    """A field that is simply called."""
+
+    def forward(self, positions: Tensor, noise: float = 0.0) -> Tensor:
+        return positions[..., 0] + noise
+
+
+class Host(nn.Module):
+    def __init__(self, field: nn.Module, proposals: int = 0) -> None:
+        super().__init__()
+        self.field = field
+        self.proposal_networks = nn.ModuleList(
+            HashMLPDensityField(
+                torch.tensor([[-1.0] * 3, [1.0] * 3]),
+                num_levels=1,
+                log2_hashmap_size=4,
+                implementation="torch",
+            )
+            for _ in range(proposals)
+        )
+        self.density_fns = [network.density_fn for network in self.proposal_networks]
+
+
+def samples(rays: int, each: int) -> RaySamples:
+    ones = torch.ones(rays, each, 3)
+    return RaySamples(frustums=Frustums(ones, ones, ones[..., :1], ones[..., :1], ones[..., :1]))
+
+
+def hmoe() -> HMoEField:
+    encoding = EncodingConfig("hash", levels=1, log2_table=4)
+    return HMoEField(FieldConfig(encoding, appearance_dim=0), num_images=1)
+
+
+def ask(field: HMoEField, count: int) -> None:
+    field.density(torch.zeros(count, 3), torch.ones(count).long(), torch.ones(count))
+
+
+def test_shading_pruning_and_updating_are_all_counted() -> None:
+    host = Host(Fog())
+    with counted(host) as queries:
+        host.field(samples(5, 7))
+        host.field.density_fn(torch.zeros(11, 3))
+        host.field.get_density(samples(2, 3))
+    assert vars(queries) == {"field": 35 + 11 + 6, "proposal": 0, "learning": 0}
+
+
+def test_proposal_networks_are_counted_apart() -> None:
+    host = Host(Fog(), proposals=2)
+    with counted(host) as queries:
+        host.field(samples(5, 7))
+        for density_fn in host.density_fns:
+            density_fn(torch.zeros(4, 6, 3))
+    assert vars(queries) == {"field": 35, "proposal": 48, "learning": 0}
+
+
+def test_a_field_that_asks_its_parent_class_is_asked_once() -> None:
+    host = Host(ThickFog())
+    host.other = Fog()  # type: ignore[assignment]
+    with counted(host) as queries:
+        host.field.density_fn(torch.zeros(9, 3))
+    assert queries.field == 9
+
+
+def test_a_field_that_is_called_is_counted() -> None:
+    host = Host(Plain())
+    with counted(host) as queries:
+        host.field(torch.zeros(13, 3), noise=1.0)
+    assert queries.field == 13
+
+
+def test_a_field_that_learns_for_a_host_is_counted_apart() -> None:
+    own = hmoe()
+    with counted(Host(own)) as queries:
+        ask(own, 3)
+        ask(hmoe(), 4)
+    assert vars(queries) == {"field": 3, "proposal": 0, "learning": 4}
+
+
+def test_what_was_asked_since_a_moment() -> None:
+    host = Host(Plain())
+    with counted(host) as queries:
+        host.field(torch.zeros(2, 3))
+        before = queries.copy()
+        host.field(torch.zeros(5, 3))
+    assert queries.since(before).field == 5 and before.field == 2
+
+
+def test_afterwards_nothing_is_counted_and_the_classes_are_as_they_were() -> None:
+    own = {owner: dict(vars(owner)) for owner in (Fog, ThickFog, Plain, HMoEField)}
+    host = Host(ThickFog())
+    with pytest.raises(RuntimeError), counted(host) as queries:
+        raise RuntimeError
+    host.field(samples(5, 7))
+    ask(hmoe(), 4)
+    assert vars(queries) == {"field": 0, "proposal": 0, "learning": 0}
+    assert all(dict(vars(owner)) == before for owner, before in own.items())
