@@ -80,8 +80,12 @@ class Guide(nn.Module):
         """Whether host and occupancy share their coordinates."""
         return torch.equal(self.frame, torch.eye(3, 4, device=self.frame.device))
 
-    def estimator(self, aabb: Tensor) -> nn.Module:
-        """What goes where a packed host has its estimator; `aabb` is the box of that one, [6]."""
+    def estimator(self, aabb: Tensor | None) -> nn.Module:
+        """What goes where a packed host has its estimator.
+
+        Args:
+            aabb: box of that estimator, [6]; None where the host cuts its rays itself.
+        """
         if self.needs_occupancy:
             return GuidedEstimator(self, aabb)
         return build_estimator(self.sampler, aabb=aabb)
@@ -133,9 +137,9 @@ class _StandIn(nn.Module):
 class GuidedEstimator(_StandIn):
     """A packed sampler of the registry, in the host's coordinates."""
 
-    def __init__(self, guide: Guide, aabb: Tensor) -> None:
+    def __init__(self, guide: Guide, aabb: Tensor | None) -> None:
         super().__init__(guide)
-        self._aabb = aabb.detach().cpu()
+        self._aabb = None if aabb is None else aabb.detach().cpu()
 
     def _build(self, guide: Guide) -> nn.Module:
         return build_estimator(guide.sampler, aabb=self._aabb, occupancy=guide.the_occupancy())
