@@ -112,6 +112,17 @@ class Guide(nn.Module):
             self.set_occupancy(occupancy)
 
 
+def turned(directions: Tensor, frame: Tensor) -> Tensor:
+    """Directions [N, 3] by turn and scale of a frame [3, 4], in whatever precision a host is."""
+    with torch.autocast(directions.device.type, enabled=False):
+        return directions @ frame[:, :3].T
+
+
+def moved(positions: Tensor, frame: Tensor) -> Tensor:
+    """Positions [N, 3] taken to another frame [3, 4]."""
+    return turned(positions, frame) + frame[:, 3]
+
+
 class _StandIn(nn.Module):
     """Builds the real sampler when it is first asked, and again when the occupancy has changed."""
 
@@ -150,8 +161,8 @@ class GuidedEstimator(_StandIn):
         estimator: Any = self.sampler
         if not guide.same_frame():
             # a direction carries the scale, so that distances along the ray stay the host's
-            turn = guide.frame[:, :3].T.to(rays_o)
-            rays_o, rays_d = rays_o @ turn + guide.frame[:, 3].to(rays_o), rays_d @ turn
+            frame = guide.frame.to(rays_o)
+            rays_o, rays_d = moved(rays_o, frame), turned(rays_d, frame)
         return estimator.sampling(rays_o, rays_d, *args, **kwargs)
 
     def update_every_n_steps(self, *args: Any, **kwargs: Any) -> None:

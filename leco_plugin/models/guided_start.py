@@ -15,6 +15,7 @@ from leco_plugin.models.guide import Guide
 from leco_plugin.models.leco import LecoModelConfig
 from leco_plugin.occupancy import Occupancy
 from leco_plugin.samplers.rays import intersect_box
+from leco_plugin.samplers.registry import sampler_spec
 from leco_plugin.scenes.frames import between, frame_of
 from leco_plugin.scenes.input_error import InputError
 from leco_plugin.scenes.survey import covering_rays
@@ -79,6 +80,15 @@ class GuidedStart:
                 f"there is no occupancy {config.path}: train leco-occupancy on this scene and give "
                 "its run folder, or give no path to learn it first"
             )
+        else:
+            kind = config.learning.sizes.gate.encoding.kind
+            wanted = sampler_spec(guide.sampler).gate_encoding
+            if wanted not in (None, kind):
+                raise InputError(
+                    f"the sampler {guide.sampler!r} asks a gate on {wanted} features, and one on "
+                    f"{kind} features would be learned: add --pipeline.model.occupancy.learning."
+                    f"sizes.gate.encoding.kind {wanted}"
+                )
 
     def before_step(self, step: int) -> None:
         """Learns the occupancy if there is none yet; leaves its file in the run's folder."""

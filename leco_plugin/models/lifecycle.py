@@ -99,7 +99,8 @@ class Lifecycle:
         """Sets what follows from the step alone, so that a resumed run is where it was."""
         model = self.model
         model.ramped = ramp(step, self.schedule)
-        model.learned = not self.schedule.freeze and step >= self.schedule.learn_steps
+        never_frozen = model.config.homogeneous or not self.schedule.freeze
+        model.learned = never_frozen and step >= self.schedule.learn_steps
         past_learning = bool(model.frozen) or model.learned
         self._set_known_distances(not past_learning)
         most = model.config.sizes.guided_batch

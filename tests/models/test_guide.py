@@ -132,3 +132,13 @@ def test_the_state_of_a_host_holds_the_gate_once(guide: Guide):
     host.grid.sampling(*rays(), **MARCH)
     assert all(name.startswith("guide.") for name in host.state_dict())
     assert not any(parameter.requires_grad for parameter in host.parameters())
+
+
+def test_a_host_in_half_precision_moves_its_rays_in_full(guide: Guide):
+    turn = torch.linalg.qr(torch.randn(3, 3))[0]
+    guide.set_occupancy(ball(), torch.cat([turn * torch.det(turn), torch.ones(3, 1)], dim=1))
+    origins, directions = rays()
+    expected = guide.estimator(BOX).sampling(origins, directions, **MARCH)
+    with torch.autocast("cpu", torch.bfloat16):
+        found = guide.estimator(BOX).sampling(origins, directions, **MARCH)
+    assert torch.equal(found[1], expected[1])

@@ -114,8 +114,6 @@ def test_a_host_without_a_seam_is_told_what_was_looked_for(guide: Guide):
 class SamplesWith(Host):
     """A host that cuts its rays itself and takes any estimator."""
 
-    estimator: nn.Module | None = None
-
     def sample_with(self, estimator: nn.Module | None) -> None:
         self.estimator = estimator
 
