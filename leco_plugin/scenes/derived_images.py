@@ -14,6 +14,9 @@ from PIL import Image
 from leco_plugin.scenes.input_error import InputError
 from leco_plugin.scenes.whole_files import write_whole
 
+_FORMATS = ("JPEG", "PNG")
+"""By content, whatever the name: Pillow hands some other kinds of files to other programs."""
+
 
 class DerivedImages:
     """A folder of PNG files that are made when they are first asked for.
@@ -53,7 +56,7 @@ class DerivedImages:
 def open_image(path: Path) -> Image.Image:
     """A decoded picture. InputError, in one line, if it is none."""
     try:
-        with Image.open(path) as image:
+        with Image.open(path, formats=_FORMATS) as image:
             image.load()
             return image
     # Damaged pictures raise whatever their decoders meet.
@@ -64,7 +67,7 @@ def open_image(path: Path) -> Image.Image:
 def image_header(path: Path) -> tuple[tuple[int, int], str]:
     """Width and height of a picture, and its mode. InputError as of `open_image`."""
     try:
-        with Image.open(path) as image:
+        with Image.open(path, formats=_FORMATS) as image:
             return image.size, image.mode
     except Exception as error:  # noqa: BLE001 (as above)
         raise _unreadable(path, error) from None

@@ -49,3 +49,11 @@ def test_a_source_that_is_no_picture_leaves_nothing(source: Path, tmp_path: Path
 def test_a_place_that_cannot_be_written_is_named_with_the_remedy(source: Path) -> None:
     with pytest.raises(InputError, match=r"cannot be written .*--cache"):
         DerivedImages(source / "cache").get(source, "copy", lambda: open_image(source))
+
+
+def test_the_jpeg_of_a_drone_with_its_preview_is_a_picture(tmp_path: Path) -> None:
+    path = tmp_path / "DJI_0001.JPG"
+    small = Image.new("RGB", (4, 3))
+    Image.new("RGB", (40, 30)).save(path, format="MPO", save_all=True, append_images=[small])
+    assert image_header(path) == ((40, 30), "RGB")
+    assert open_image(path).size == (40, 30)

@@ -62,7 +62,7 @@ def test_other_kinds_of_pixels_become_colours(
 ) -> None:
     whole = Image.fromarray(mega_nerf_scene.image(2))
     for mode, channels in (("P", 3), ("LA", 4), ("CMYK", 3)):
-        path = tmp_path / f"{mode}.{'tif' if mode == 'CMYK' else 'png'}"
+        path = tmp_path / f"{mode}.{'jpg' if mode == 'CMYK' else 'png'}"
         whole.convert(mode).save(path)
         other = dataclasses.replace(frame, image=path, mode=mode)
         assert pixels(picture_of(other, 1, False, derived)).shape == (16, 24, channels)
