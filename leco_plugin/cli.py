@@ -5,38 +5,57 @@ from __future__ import annotations
 import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 import tyro
 
 BAD_INPUT, FAILURE = 2, 1
 
 
-def city(out: Path, blocks: int = 3, seed: int = 0, json: Path | None = None) -> None:
-    """Write the procedural city as a nerfstudio scene, with its exact geometry.
+def city(
+    out: Path,
+    blocks: int = 3,
+    seed: int = 0,
+    block_size: float = 40.0,
+    width: int = 160,
+    height: int = 120,
+    format: Literal["nerfstudio", "mega-nerf"] = "nerfstudio",
+    json: Path | None = None,
+) -> None:
+    """Write the procedural city as a scene to train on, with its exact geometry.
+
+    A run that was killed goes on where it ended when the same is asked for again.
 
     Args:
         out: Folder to write. If it holds just this city, nothing is done.
-        blocks: The city covers blocks x blocks blocks.
+        blocks: The city covers blocks x blocks blocks; above 8, with an irregular outline.
         seed: Another seed, another city.
+        block_size: Metres from one street's middle to the next, 32 to 200.
+        width: Width of the pictures in pixels.
+        height: Height of the pictures in pixels.
+        format: Of the scene: nerfstudio's, or Mega-NeRF's, for the data parser mega-nerf.
         json: File for what was written, as JSON.
     """
     from leco_plugin.scenes.city import CityConfig
-    from leco_plugin.scenes.city_folder import read_transforms, write_city
+    from leco_plugin.scenes.city_folder import CaptureConfig, count_pictures, write_city
 
-    folder = write_city(CityConfig(blocks, seed), out)
-    transforms = read_transforms(folder)
+    config, capture = CityConfig(blocks, seed, block_size), CaptureConfig(width, height)
+    folder = write_city(config, out, capture, layout=format)
+    images, test_images = count_pictures(folder)
     facts = {
         "format": 1,
+        "layout": format,
         "blocks": blocks,
+        "block_size": block_size,
         "seed": seed,
-        "images": len(transforms["frames"]),
-        "test_images": len(transforms["test_filenames"]),
-        "width": transforms["w"],
-        "height": transforms["h"],
+        "images": images,
+        "test_images": test_images,
+        "width": width,
+        "height": height,
     }
-    print(f"{folder}: {facts['images']} pictures, {facts['test_images']} of them for testing")
-    print(f"train on it with: ns-train leco-occupancy --data {folder}")
+    reader = "mega-nerf " if format == "mega-nerf" else ""
+    print(f"{folder}: {images} pictures, {test_images} of them for testing")
+    print(f"train on it with: ns-train leco-occupancy {reader}--data {folder}")
     _write_json(json, facts)
 
 

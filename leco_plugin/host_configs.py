@@ -6,14 +6,13 @@ from nerfstudio.cameras.camera_optimizers import CameraOptimizerConfig
 from nerfstudio.configs.base_config import MachineConfig, ViewerConfig
 from nerfstudio.data.datamanagers.base_datamanager import VanillaDataManagerConfig
 from nerfstudio.engine.schedulers import ExponentialDecaySchedulerConfig
-from nerfstudio.engine.trainer import TrainerConfig
 from nerfstudio.models.base_model import ModelConfig
 from nerfstudio.models.instant_ngp import InstantNGPModelConfig
 from nerfstudio.models.nerfacto import NerfactoModelConfig
 from nerfstudio.pipelines.base_pipeline import VanillaPipelineConfig
 from nerfstudio.plugins.types import MethodSpecification
 
-from leco_plugin.compat.atomic_trainer import AtomicTrainer
+from leco_plugin.compat.data_parallel import DataParallelTrainerConfig
 from leco_plugin.compat.dynamic_batch import ClampedDynamicBatchPipelineConfig
 from leco_plugin.method_configs import LEARNING, ON_GPU, STEPS, best_device
 from leco_plugin.models.guided import GuidedModelConfig
@@ -49,10 +48,9 @@ def trainer(
     rates: dict[str, float],
     steps: int = STEPS,
     mixed_precision: bool = ON_GPU,
-) -> TrainerConfig:
+) -> DataParallelTrainerConfig:
     """A method: Adam at these rates, decayed to a tenth over its steps."""
-    return TrainerConfig(
-        _target=AtomicTrainer,
+    return DataParallelTrainerConfig(
         method_name=name,
         machine=MachineConfig(device_type=best_device()),
         max_num_iterations=steps,
@@ -131,7 +129,7 @@ leco_nerfacto = MethodSpecification(
 )
 
 
-def _switch_nerf(name: str, model: ModelConfig) -> TrainerConfig:
+def _switch_nerf(name: str, model: ModelConfig) -> DataParallelTrainerConfig:
     """Switch-NeRF's batches, rates and steps; it chooses its precision itself."""
     return trainer(
         name,

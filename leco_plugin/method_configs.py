@@ -9,11 +9,10 @@ import torch
 from nerfstudio.configs.base_config import MachineConfig, ViewerConfig
 from nerfstudio.data.datamanagers.base_datamanager import VanillaDataManagerConfig
 from nerfstudio.engine.schedulers import ExponentialDecaySchedulerConfig
-from nerfstudio.engine.trainer import TrainerConfig
 from nerfstudio.pipelines.base_pipeline import VanillaPipelineConfig
 from nerfstudio.plugins.types import MethodSpecification
 
-from leco_plugin.compat.atomic_trainer import AtomicTrainer
+from leco_plugin.compat.data_parallel import DataParallelTrainerConfig
 from leco_plugin.models.leco import LecoModelConfig
 from leco_plugin.models.optimizers import RATES, FusedAdamConfig
 from leco_plugin.models.phases import ScheduleConfig
@@ -48,8 +47,7 @@ LEARNING = LecoModelConfig(
 )
 """The HMoE in the sizes of this device."""
 
-_leco_occupancy = TrainerConfig(
-    _target=AtomicTrainer,
+_leco_occupancy = DataParallelTrainerConfig(
     method_name="leco-occupancy",
     machine=MachineConfig(device_type=best_device()),
     max_num_iterations=STEPS,

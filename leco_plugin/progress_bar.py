@@ -8,11 +8,15 @@ from contextlib import contextmanager
 from nerfstudio.utils.rich_utils import CONSOLE
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
+from leco_plugin.models.ranks import is_first
+
 
 @contextmanager
 def bar(what: str) -> Iterator[Callable[[float], None]]:
-    """Shows a bar while it lasts; yields what takes the share that is done."""
+    """Shows a bar while it lasts, once for all processes; yields what takes the share done."""
     columns = (TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn())
-    with Progress(*columns, TimeRemainingColumn(), console=CONSOLE, transient=True) as progress:
+    with Progress(
+        *columns, TimeRemainingColumn(), console=CONSOLE, transient=True, disable=not is_first()
+    ) as progress:
         task = progress.add_task(what, total=1.0)
         yield lambda share: progress.update(task, completed=share)

@@ -12,6 +12,7 @@ import tyro
 from nerfstudio.engine.trainer import Trainer, TrainerConfig
 
 from leco_plugin.compat.atomic_trainer import AtomicTrainer
+from leco_plugin.compat.data_parallel import DataParallelTrainerConfig
 from leco_plugin.compat.dynamic_batch import ClampedDynamicBatchPipelineConfig
 from leco_plugin.models.guided import GuidedModelConfig
 from leco_plugin.models.guided_start import OccupancyConfig, occupancy_file
@@ -74,10 +75,11 @@ def with_sampler_swapped(config: TrainerConfig, file: Path) -> TrainerConfig:
             f"{config.method_name} finds its occupancy itself; swap another method's sampler"
         )
     pipeline.model = GuidedModelConfig(host=host, occupancy=OccupancyConfig(path=file.resolve()))
-    changes: dict[str, Any] = {"pipeline": clamped(pipeline)}
-    if config._target is Trainer:
-        changes["_target"] = AtomicTrainer
-    return replace(config, **changes)
+    if type(config) is TrainerConfig:
+        values = {f.name: getattr(config, f.name) for f in fields(config)}
+        config = DataParallelTrainerConfig(**values)
+    trainer = AtomicTrainer if config._target is Trainer else config._target
+    return replace(config, pipeline=clamped(pipeline), _target=trainer)
 
 
 def clamped(pipeline: Any) -> Any:

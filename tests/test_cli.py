@@ -92,6 +92,17 @@ def test_check_ends_with_status_1_when_a_rule_is_broken(
     assert not json.loads((tmp_path / "verdicts.json").read_text())["verdicts"][0]["passed"]
 
 
+def test_city_writes_mega_nerfs_format(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    out, report = tmp_path / "city", tmp_path / "city.json"
+    small = ["--width", 40, "--height", 32, "--block-size", 50]
+    arguments = ["city", "--blocks", 1, "--out", out, *small, "--format", "mega-nerf"]
+    assert run(*arguments, "--json", report) == 0
+    assert f"ns-train leco-occupancy mega-nerf --data {out}" in capsys.readouterr().out
+    facts = json.loads(report.read_text())
+    assert facts["layout"] == "mega-nerf" and facts["block_size"] == 50
+    assert facts["test_images"] == len(list((out / "val/rgbs").iterdir())) > 0
+
+
 def bad_inputs(folder: Path, file: Path) -> dict[str, list[object]]:
     """Arguments that a user may well give, by what is wrong with them."""
     (folder / "text.safetensors").write_text("not an occupancy")
@@ -106,6 +117,8 @@ def bad_inputs(folder: Path, file: Path) -> dict[str, list[object]]:
         "an unknown kind of picture": ["inspect", file, "--picture", folder / "picture.xyz"],
         "json where a folder is": ["inspect", file, "--json", folder / "taken"],
         "no blocks": ["city", "--blocks", 0, "--out", folder / "city"],
+        "a block too small": ["city", "--block-size", 3, "--out", folder / "city"],
+        "no width": ["city", "--width", 0, "--out", folder / "city"],
         "a folder of other things": ["city", "--out", folder / "taken"],
         "an unknown sampler": ["check", "grit"],
         "no time": ["demo", "--seconds", 0, "--out", folder / "demo"],

@@ -13,8 +13,12 @@ import torch
 from nerfstudio.pipelines.dynamic_batch import DynamicBatchPipeline, DynamicBatchPipelineConfig
 from torch import Tensor
 
-MOST_CHANGE = 2.0
-"""Factor by which a batch may grow or shrink from one step to the next."""
+from leco_plugin.models.ranks import mean
+
+MOST_GROWTH = 2.0
+"""Factor by which a batch may grow from one step to the next; it shrinks as far as it must."""
+NOTHING_KEPT = 1
+"""Samples of a batch that has none."""
 
 
 @dataclass
@@ -26,11 +30,12 @@ class ClampedDynamicBatchPipelineConfig(DynamicBatchPipelineConfig):
     fewest_rays: int = 64
     """Rays of the smallest batch."""
     most_rays: int = 1 << 16
-    """Rays of the largest batch: a batch in which nothing is kept says nothing about the next."""
+    """Rays of the largest batch."""
 
 
 class ClampedDynamicBatchPipeline(DynamicBatchPipeline):
-    """The number of rays changes by steps, stays within bounds, and travels with a checkpoint."""
+    """The number of rays stays within bounds, travels with a checkpoint, and is that of all
+    processes of a data-parallel run."""
 
     config: ClampedDynamicBatchPipelineConfig
     rays_per_batch: Tensor
@@ -39,17 +44,21 @@ class ClampedDynamicBatchPipeline(DynamicBatchPipeline):
         super().__init__(*args, **kwargs)
         self.register_buffer("rays_per_batch", torch.tensor(self.dynamic_num_rays_per_batch))
         self.register_load_state_dict_post_hook(lambda pipeline, _: pipeline.restore())
+        self.restore()
 
     def _update_dynamic_num_rays_per_batch(self, num_samples_per_batch: int) -> None:
-        factor = self.config.target_num_samples / max(num_samples_per_batch, 1)
-        factor = min(MOST_CHANGE, max(1.0 / MOST_CHANGE, factor))
-        wanted = round(self.dynamic_num_rays_per_batch * factor)
-        self.dynamic_num_rays_per_batch = min(
-            self.config.most_rays, max(self.config.fewest_rays, wanted)
-        )
-        self.rays_per_batch.fill_(self.dynamic_num_rays_per_batch)
+        samples = mean(float(num_samples_per_batch), self.device)
+        if samples <= NOTHING_KEPT:
+            return  # it says nothing about a batch in which something is kept
+        factor = min(MOST_GROWTH, self.config.target_num_samples / samples)
+        self._set_rays(round(self.dynamic_num_rays_per_batch * factor))
 
     def restore(self) -> None:
-        """Goes on with the batch of the checkpoint."""
-        self.dynamic_num_rays_per_batch = int(self.rays_per_batch)
+        """Goes on with `rays_per_batch`, of a checkpoint too, within the bounds of this run."""
+        self._set_rays(int(self.rays_per_batch))
         self._update_pixel_samplers()
+
+    def _set_rays(self, wanted: int) -> None:
+        most, fewest = self.config.most_rays, self.config.fewest_rays
+        self.dynamic_num_rays_per_batch = min(most, max(fewest, wanted))
+        self.rays_per_batch.fill_(self.dynamic_num_rays_per_batch)

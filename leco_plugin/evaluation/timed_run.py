@@ -23,7 +23,7 @@ from leco_plugin.evaluation.field_queries import FieldQueries, counted
 from leco_plugin.evaluation.held_out_images import evaluate_images, psnr_on_rays
 from leco_plugin.evaluation.json_file import finite_or_null
 from leco_plugin.evaluation.peak_memory import peak_allocator_bytes, peak_process_bytes
-from leco_plugin.models.learn_first import TIMED_STEPS, steps_within
+from leco_plugin.models.learn_first import FIRST_TIMED, TIMED_STEPS, steps_within
 
 CURVE_RAYS = 8192
 """Test pixels behind each point of a curve, its end included."""
@@ -233,10 +233,11 @@ class _Course:
     def _keep_to_learning_time(self) -> None:
         """As a host that learns first does: a model that learns itself freezes in time."""
         progress = getattr(self.trainer.pipeline.model, "progress", None)
-        if progress is not None and self.budget.learn_seconds is not None:
-            a_step = self.clock.seconds / self.run.steps
-            most = progress.learn_steps
-            progress.learn_steps = steps_within(self.budget.learn_seconds, a_step, most)
+        if progress is None or self.budget.learn_seconds is None:
+            return
+        a_step = statistics.fmean(self.step_times[FIRST_TIMED:])
+        more = (self.budget.learn_seconds - self.clock.seconds) / a_step
+        progress.learn_steps = steps_within(more, self.run.steps, progress.learn_steps)
 
 
 def _time_updates(model: torch.nn.Module, clock: Clock) -> bool:

@@ -6,7 +6,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import torch
-from nerfstudio.utils.rich_utils import CONSOLE
 from torch import Tensor
 
 from leco_plugin.models.calibration import (
@@ -16,6 +15,7 @@ from leco_plugin.models.calibration import (
     near_median_depth,
 )
 from leco_plugin.models.gate import occupancy_from_logits
+from leco_plugin.models.ranks import from_first, say, share
 from leco_plugin.models.rendering import Intervals, Rays, backdrop_of
 from leco_plugin.scenes.frames import frame_of
 from leco_plugin.scenes.held_out_pixels import HeldOutPixelSampler
@@ -36,13 +36,41 @@ def freeze(
     step: int,
     learn_seconds: float,
 ) -> Measured:
-    """Calibrates the gate, freezes it, and leaves `occupancy.safetensors` in the run's folder."""
-    rays, truth = calibration_rays(model, datamanager)
-    measured = calibrate_on(model, rays, truth)
+    """Calibrates the gate, freezes it, and leaves `occupancy.safetensors` in the run's folder.
+
+    In every process of a data-parallel run the gate is that of the first one, and so is its price.
+    """
+    share(model.gate.state_dict().values())
+    measured, report = from_first(
+        lambda: _priced(model, datamanager, survey, step, learn_seconds), model.device
+    )
     model.threshold.fill_(measured.threshold)
     model.frozen.fill_(True)
     model.gate.requires_grad_(False)
-    model.report = {
+    model.report = report
+    say(
+        f"occupancy learned in {learn_seconds:.0f} s: threshold {measured.threshold:.4f} "
+        f"skips {measured.empty_fraction:.1%} of all candidates for {measured.image_price_db:+.3f} "
+        f"dB and {measured.lost_surface_mass:.2e} of the surface mass "
+        f"({measured.lost_mass:.2e} of all)"
+    )
+    if measured.threshold == 0.0:
+        say(
+            "no threshold keeps the price within its bounds, so nothing is skipped; more "
+            "--pipeline.model.schedule.learn-steps usually help"
+        )
+    if folder is not None:
+        write_occupancy(model, folder)
+    return measured
+
+
+def _priced(
+    model: LecoModel, datamanager: Any, survey: Survey, step: int, learn_seconds: float
+) -> tuple[Measured, dict[str, Any]]:
+    """The threshold with what it costs, and the report that the occupancy carries."""
+    rays, truth = calibration_rays(model, datamanager)
+    measured = calibrate_on(model, rays, truth)
+    return measured, {
         "step": step,
         "train_seconds": round(learn_seconds, 2),
         "params": sum(p.numel() for p in model.gate.parameters()),
@@ -62,27 +90,13 @@ def freeze(
         "cameras": survey.positions.tolist(),
         "frame": frame_of(datamanager),
     }
-    CONSOLE.log(
-        f"\\[leco] occupancy learned in {learn_seconds:.0f} s: threshold {measured.threshold:.4f} "
-        f"skips {measured.empty_fraction:.1%} of all candidates for {measured.image_price_db:+.3f} "
-        f"dB and {measured.lost_surface_mass:.2e} of the surface mass "
-        f"({measured.lost_mass:.2e} of all)"
-    )
-    if measured.threshold == 0.0:
-        CONSOLE.log(
-            "\\[leco] no threshold keeps the price within its bounds, so nothing is skipped; more "
-            "--pipeline.model.schedule.learn-steps usually help"
-        )
-    if folder is not None:
-        write_occupancy(model, folder)
-    return measured
 
 
 def write_occupancy(model: LecoModel, folder: Path) -> None:
     """Leaves the frozen gate as `occupancy.safetensors` in a folder, made where it is missing."""
     folder.mkdir(parents=True, exist_ok=True)
     model.occupancy().save(folder / FILE_NAME)
-    CONSOLE.log(f"\\[leco] wrote {folder / FILE_NAME}")
+    say(f"wrote {folder / FILE_NAME}")
 
 
 def held_out_sampler(datamanager: Any) -> HeldOutPixelSampler | None:

@@ -85,8 +85,12 @@ class Guide(nn.Module):
         """Whether host and occupancy share their coordinates."""
         return torch.equal(self.frame, torch.eye(3, 4, device=self.frame.device))
 
-    def estimator(self, aabb: Tensor) -> nn.Module:
-        """What goes where a packed host has its estimator; `aabb` is the box of that one, [6]."""
+    def estimator(self, aabb: Tensor | None) -> nn.Module:
+        """What goes where a packed host has its estimator.
+
+        Args:
+            aabb: box of that estimator, [6]; None where the host cuts its rays itself.
+        """
         if self.needs_occupancy:
             return GuidedEstimator(self, aabb)
         return build_estimator(self.sampler, aabb=aabb, **self.options)
@@ -111,6 +115,17 @@ class Guide(nn.Module):
             gate = Gate(GateConfig.from_dict(state["gate"]))
             occupancy = Occupancy(gate, Space(), 0.0, state["precision"], state["report"])
             self.set_occupancy(occupancy)
+
+
+def turned(directions: Tensor, frame: Tensor) -> Tensor:
+    """Directions [N, 3] by turn and scale of a frame [3, 4], in whatever precision a host is."""
+    with torch.autocast(directions.device.type, enabled=False):
+        return directions @ frame[:, :3].T
+
+
+def moved(positions: Tensor, frame: Tensor) -> Tensor:
+    """Positions [N, 3] taken to another frame [3, 4]."""
+    return turned(positions, frame) + frame[:, 3]
 
 
 class _StandIn(nn.Module):
@@ -138,9 +153,9 @@ class _StandIn(nn.Module):
 class GuidedEstimator(_StandIn):
     """A packed sampler of the registry, in the host's coordinates."""
 
-    def __init__(self, guide: Guide, aabb: Tensor) -> None:
+    def __init__(self, guide: Guide, aabb: Tensor | None) -> None:
         super().__init__(guide)
-        self._aabb = aabb.detach().cpu()
+        self._aabb = None if aabb is None else aabb.detach().cpu()
 
     def _build(self, guide: Guide) -> nn.Module:
         return build_estimator(
@@ -153,8 +168,8 @@ class GuidedEstimator(_StandIn):
         estimator: Any = self.sampler
         if not guide.same_frame():
             # a direction carries the scale, so that distances along the ray stay the host's
-            turn = guide.frame[:, :3].T.to(rays_o)
-            rays_o, rays_d = rays_o @ turn + guide.frame[:, 3].to(rays_o), rays_d @ turn
+            frame = guide.frame.to(rays_o)
+            rays_o, rays_d = moved(rays_o, frame), turned(rays_d, frame)
         return estimator.sampling(rays_o, rays_d, *args, **kwargs)
 
     def update_every_n_steps(self, *args: Any, **kwargs: Any) -> None:

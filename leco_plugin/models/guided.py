@@ -12,6 +12,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import torch
+import tyro
 from nerfstudio.engine.callbacks import (
     TrainingCallback,
     TrainingCallbackAttributes,
@@ -45,6 +46,11 @@ class GuidedModelConfig(ModelConfig):
     """What guides it."""
     eval_num_rays_per_chunk: int | None = None  # type: ignore[assignment]
     """Rays rendered at a time; None is the host's own."""
+    # every model config has these, and of a guided one the host's own count: they are no options
+    enable_collider: tyro.conf.Suppress[bool] = True
+    collider_params: tyro.conf.Suppress[dict[str, float] | None] = None
+    loss_coefficients: tyro.conf.Suppress[dict[str, float]] = field(default_factory=dict)
+    prompt: tyro.conf.Suppress[str | None] = None
 
 
 def set_up_guided(config: GuidedModelConfig, **arguments: Any) -> Model:

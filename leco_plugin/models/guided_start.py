@@ -7,14 +7,14 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from nerfstudio.utils.rich_utils import CONSOLE
-from torch import distributed
 
 from leco_plugin.models.freezing import FILE_NAME
 from leco_plugin.models.guide import Guide
 from leco_plugin.models.leco import LecoModelConfig
+from leco_plugin.models.ranks import is_first, say
 from leco_plugin.occupancy import Occupancy
 from leco_plugin.samplers.rays import intersect_box
+from leco_plugin.samplers.registry import sampler_spec
 from leco_plugin.scenes.frames import between, frame_of
 from leco_plugin.scenes.input_error import InputError
 from leco_plugin.scenes.survey import covering_rays
@@ -81,6 +81,15 @@ class GuidedStart:
                 f"there is no occupancy {config.path}: train leco-occupancy on this scene and give "
                 "its run folder, or give no path to learn it first"
             )
+        else:
+            kind = config.learning.sizes.gate.encoding.kind
+            wanted = sampler_spec(guide.sampler).gate_encoding
+            if wanted not in (None, kind):
+                raise InputError(
+                    f"the sampler {guide.sampler!r} asks a gate on {wanted} features, and one on "
+                    f"{kind} features would be learned: add --pipeline.model.occupancy.learning."
+                    f"sizes.gate.encoding.kind {wanted}"
+                )
 
     def before_step(self, step: int) -> None:
         """Learns the occupancy if there is none yet; leaves its file in the run's folder."""
@@ -92,9 +101,8 @@ class GuidedStart:
 
             config = self.config
             occupancy = learn_occupancy(config.learning, self.pipeline, config.rays, config.seconds)
-            _share_among_ranks(occupancy)
             self.guide.set_occupancy(occupancy)
-        if self.trainer is not None and getattr(self.trainer, "local_rank", 0) == 0:
+        if self.trainer is not None and is_first():
             folder = Path(self.trainer.base_dir)
             folder.mkdir(parents=True, exist_ok=True)
             self.guide.the_occupancy().save(folder / FILE_NAME)
@@ -113,7 +121,7 @@ class GuidedStart:
                 "the occupancy keeps nothing on the rays of these cameras: it was learned on "
                 "another scene, or the scene has been moved since"
             )
-        CONSOLE.log(f"\\[leco] guided by an occupancy that keeps {share:.1%} along these rays")
+        say(f"guided by an occupancy that keeps {share:.1%} along these rays")
 
 
 @torch.no_grad()
@@ -136,14 +144,3 @@ def kept_on_rays(guide: Guide, cameras: Any) -> float:
     parts = positions.reshape(-1, 3).split(1 << 18)
     kept = sum(float(occupancy.occupied(part).sum()) for part in parts)
     return kept / max(t.numel(), 1)
-
-
-def _share_among_ranks(occupancy: Occupancy) -> None:
-    """Every process of a data-parallel run is guided by what the first one learned."""
-    if not (distributed.is_available() and distributed.is_initialized()):
-        return
-    for value in occupancy.state_dict().values():
-        distributed.broadcast(value, src=0)
-    report = [occupancy.report]
-    distributed.broadcast_object_list(report, src=0)
-    occupancy.report = report[0]

@@ -8,15 +8,17 @@ from typing import Any
 
 import torch
 from nerfstudio.engine.callbacks import TrainingCallbackAttributes
+from torch import nn
 
-from leco_plugin.models.leco import LecoModel, LecoModelConfig
+from leco_plugin.models.leco import LecoModelConfig
 from leco_plugin.models.lifecycle import Lifecycle
 from leco_plugin.models.optimizers import RATES, FusedAdamConfig
+from leco_plugin.models.ranks import averaging, mean
 from leco_plugin.occupancy import Occupancy
 from leco_plugin.progress_bar import bar
 
-TIMED_STEPS = 10
-"""Steps after which their time is known well enough to keep to a budget."""
+FIRST_TIMED, TIMED_STEPS = 5, 15
+"""Steps between which a step is timed, to keep to a budget; the first ones are slow."""
 FEWEST_STEPS = 20
 
 
@@ -24,6 +26,8 @@ def learn_occupancy(
     config: LecoModelConfig, pipeline: Any, rays: int, seconds: float | None = None
 ) -> Occupancy:
     """Trains an HMoE on the pipeline's data until its gate is frozen and calibrated.
+
+    All processes of a data-parallel run learn it together, and have the same at the end.
 
     Args:
         config: of the HMoE.
@@ -48,6 +52,7 @@ def learn_occupancy(
         device=pipeline.device,
     ).to(pipeline.device)
     model.train()
+    trained = averaging(model, model.device)
     sampler = getattr(manager, "train_pixel_sampler", None)
     before = sampler.num_rays_per_batch if sampler is not None else 0
     if sampler is not None:
@@ -58,7 +63,7 @@ def learn_occupancy(
     optimizers = [replace(_adam(name), lr=RATES[name]).setup(p) for name, p in groups.items()]
     try:
         with bar("Learning the occupancy") as show:
-            _train(model, lifecycle, optimizers, manager, seconds, show)
+            _train(trained, lifecycle, optimizers, manager, seconds, show)
     finally:
         if sampler is not None:
             sampler.set_num_rays_per_batch(before)
@@ -66,9 +71,13 @@ def learn_occupancy(
     return occupancy.eval()
 
 
-def steps_within(seconds: float, a_step: float, most: int) -> int:
-    """Learning steps of a length in seconds that fit into a time, of those that are wanted."""
-    return min(most, max(FEWEST_STEPS, int(seconds / a_step)))
+def steps_within(more: float, done: int, most: int) -> int:
+    """Learning steps in all when so many more fit into the time that is left.
+
+    Args:
+        most: that are wanted.
+    """
+    return min(most, max(FEWEST_STEPS, done + int(more)))
 
 
 def _adam(name: str) -> FusedAdamConfig:
@@ -76,19 +85,20 @@ def _adam(name: str) -> FusedAdamConfig:
 
 
 def _train(
-    model: LecoModel,
+    trained: nn.Module,
     lifecycle: Lifecycle,
     optimizers: list[Any],
     manager: Any,
     seconds: float | None,
     show: Any,
 ) -> None:
+    model = lifecycle.model
     started = time.monotonic()
-    step = 0
+    step, timed_from = 0, started
     while not bool(model.frozen):
         lifecycle.before_step(step)
         bundle, batch = manager.next_train(step)
-        losses = model.get_loss_dict(model(bundle), batch)
+        losses = model.get_loss_dict(trained(bundle), batch)
         for optimizer in optimizers:
             optimizer.zero_grad(set_to_none=True)
         torch.stack(list(losses.values())).sum().backward()
@@ -96,7 +106,12 @@ def _train(
             optimizer.step()
         lifecycle.after_step(step)
         step += 1
+        if step == FIRST_TIMED:
+            timed_from = time.monotonic()
         if seconds is not None and step == TIMED_STEPS:
-            a_step, most = (time.monotonic() - started) / step, lifecycle.progress.learn_steps
-            lifecycle.progress.learn_steps = steps_within(seconds, a_step, most)
+            now = time.monotonic()
+            a_step = (now - timed_from) / (TIMED_STEPS - FIRST_TIMED)
+            more = mean((seconds - (now - started)) / a_step, model.device)
+            progress = lifecycle.progress
+            progress.learn_steps = steps_within(more, step, progress.learn_steps)
         show(min(1.0, step / lifecycle.progress.learn_steps))

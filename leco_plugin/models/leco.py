@@ -179,12 +179,18 @@ class LecoModel(Model):
 
     def get_extra_state(self) -> dict[str, Any]:
         """Calibration report and learning progress travel with a checkpoint, as plain values."""
-        return {"report": self.report, "progress": self.progress.to_dict()}
+        return {
+            "report": self.report,
+            "progress": self.progress.to_dict(),
+            "precision": self.precision,
+        }
 
     def set_extra_state(self, state: dict[str, Any]) -> None:
         """Restores what `get_extra_state` gave."""
         self.report = dict(state.get("report", {}))
         self.progress = Progress(**state.get("progress", {}))
+        # a gate decides otherwise in another precision than the one it was taught in
+        self.precision = state.get("precision", self.precision)
         self._estimator = ()
 
     def occupancy(self) -> Occupancy:

@@ -14,7 +14,6 @@ from nerfstudio.engine.callbacks import (
     TrainingCallbackAttributes,
     TrainingCallbackLocation,
 )
-from nerfstudio.utils.rich_utils import CONSOLE
 from torch import Tensor
 
 from leco_plugin.models.field import HMoEField
@@ -32,6 +31,7 @@ from leco_plugin.models.phases import (
     spread_scene_experts,
 )
 from leco_plugin.models.progress import Progress
+from leco_plugin.models.ranks import is_first, mean, say, share
 from leco_plugin.models.statistics import KEPT_ABOVE
 from leco_plugin.occupancy import gate_precision
 from leco_plugin.scenes.known_distances import KnownDistancePixelSampler
@@ -64,7 +64,7 @@ class Lifecycle:
         self.survey = survey(self.pipeline.datamanager)
         if not bool(model.bounds_known):
             model.set_bounds(self.survey.bounds, self.survey.median_length)
-            CONSOLE.log(f"\\[leco] {self.survey.describe()}")
+            say(self.survey.describe())
         self.rays_per_batch = int(self.pipeline.datamanager.get_train_rays_per_batch())
         self.step_started = 0.0
         if bool(model.frozen) and self.folder is not None:
@@ -82,8 +82,8 @@ class Lifecycle:
 
     @property
     def folder(self) -> Path | None:
-        """The run's folder."""
-        return Path(self.trainer.base_dir) if self.trainer is not None else None
+        """The run's folder; None where no file is to be left, as by all processes but the first."""
+        return Path(self.trainer.base_dir) if self.trainer is not None and is_first() else None
 
     def callbacks(self) -> list[TrainingCallback]:
         """What nerfstudio's trainer calls before and after each step."""
@@ -100,16 +100,22 @@ class Lifecycle:
         """Sets what follows from the step alone, so that a resumed run is where it was."""
         model = self.model
         model.ramped = ramp(step, self.schedule)
-        model.learned = not self.schedule.freeze and step >= self.schedule.learn_steps
+        never_frozen = model.config.homogeneous or not self.schedule.freeze
+        model.learned = never_frozen and step >= self.schedule.learn_steps
         past_learning = bool(model.frozen) or model.learned
         self._set_known_distances(not past_learning)
-        most = model.config.sizes.guided_batch
-        factor = (
-            self._guided_batch() if bool(model.frozen) else min(most, 1.0 / model.learning_kept)
-        )
-        self._set_rays(factor)
+        self._set_rays(self._guided_batch() if bool(model.frozen) else self._learning_batch())
         if not past_learning:
             self.step_started = time.monotonic()
+
+    def _learning_batch(self) -> float:
+        """Rays of a batch as a multiple, while the gate being learned is followed already.
+
+        The same in every process: the mean of their gradients is then that of one large batch.
+        """
+        model = self.model
+        model.learning_kept = mean(model.learning_kept, model.device)
+        return min(model.config.sizes.guided_batch, 1.0 / model.learning_kept)
 
     def _guided_batch(self) -> float:
         """Rays of a guided batch as a multiple: about as many samples are shaded as before."""
@@ -154,8 +160,8 @@ class Lifecycle:
         if not last and float(kept.float().mean()) > 0.95:
             return  # it agrees with itself only because it has not yet found anything empty
         if converged(step, agreement, schedule):
-            CONSOLE.log(
-                f"\\[leco] step {step}: {agreement:.1%} of {len(kept)} decisions are those of "
+            say(
+                f"step {step}: {agreement:.1%} of {len(kept)} decisions are those of "
                 f"{schedule.steps_per_check} steps ago; freezing the gate"
             )
             data, seconds = self.pipeline.datamanager, progress.learn_seconds
@@ -190,9 +196,10 @@ class Lifecycle:
 
     @torch.no_grad()
     def _probe(self) -> Tensor:
-        """The gate's logits [P, 1 + n] at the probe positions."""
+        """The gate's logits [P, 1 + n] at the probe positions, the same ones in every process."""
         with gate_precision(self.model.device.type, self.model.precision):
             logits: Tensor = self.model.gate(self.probe_positions)
+        share([logits])
         return logits
 
     def _heal(self, step: int, logits: Tensor, kept: Tensor, last: bool) -> bool:
@@ -226,8 +233,9 @@ class Lifecycle:
             remedy = "its last layer starts anew, on dense samples"
             progress.learn_steps = step + 1 + progress.learn_steps // 2
             progress.decisions = torch.zeros(0, dtype=torch.bool)
-        CONSOLE.log(
-            f"\\[leco] step {step}: {collapse.cause}; {remedy} "
+        share(head.parameters())  # the remedy is drawn at random
+        say(
+            f"step {step}: {collapse.cause}; {remedy} "
             f"(recovery {progress.recoveries} of {MOST_RECOVERIES})"
         )
         return not collapse.one_expert

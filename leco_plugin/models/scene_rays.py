@@ -25,8 +25,9 @@ def cut_to_bounds(
     return Rays(
         bundle.origins,
         bundle.directions,
-        enters.clamp(min=near),
-        leaves.clamp(max=far),
+        # finite also for a ray that runs along a wall outside, so that its backdrop has a place
+        enters.clamp(min=near).clamp(max=far),
+        leaves.clamp(min=0.0).clamp(max=far),
         images[:, 0] if images is not None else None,
     )
 

@@ -68,11 +68,17 @@ def swap_sampler(host: Model, guide: Guide) -> str:
 
 
 def _sample_with(host: Any, guide: Guide) -> None:
-    host.sample_with(guide.estimator(host.aabb))
+    """Such a host cuts its rays itself, at bounds that it may not know yet: it needs no box."""
+    if guide.sampler == "occupancy-grid":
+        raise InputError(
+            f"{type(host).__name__} makes a grid that fits its bounds itself: with "
+            "--pipeline.model.sampling occupancy-grid of the method that is not guided"
+        )
+    host.sample_with(guide.estimator(None))
 
 
 SAMPLE_WITH = HostAdapter(
-    "a method sample_with(estimator) and a box aabb, as switch-nerf has",
+    "a method sample_with(estimator), as switch-nerf has",
     lambda host: callable(getattr(host, "sample_with", None)),
     _sample_with,
 )

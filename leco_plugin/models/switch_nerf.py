@@ -14,13 +14,13 @@ from nerfstudio.engine.callbacks import (
 )
 from nerfstudio.model_components.renderers import RGBRenderer
 from nerfstudio.models.base_model import Model, ModelConfig
-from nerfstudio.utils.rich_utils import CONSOLE
 from torch import Tensor, nn
 
 from leco_plugin.compat.checkpoints import allow_checkpoint_globals
 from leco_plugin.models.failures import require_finite
 from leco_plugin.models.image_figures import image_figures
 from leco_plugin.models.precision import fast_precision, keep_freed_memory
+from leco_plugin.models.ranks import say
 from leco_plugin.models.rendering import (
     Intervals,
     Rays,
@@ -147,7 +147,7 @@ class SwitchNerfModel(Model):
         if not bool(self.bounds_known):
             seen = survey(training_callback_attributes.pipeline.datamanager)
             self.set_bounds(seen.bounds, seen.median_length)
-            CONSOLE.log(f"\\[leco] {seen.describe()}")
+            say(seen.describe())
         before = TrainingCallbackLocation.BEFORE_TRAIN_ITERATION
         return [TrainingCallback([before], self.update_estimator)]
 

@@ -66,9 +66,10 @@ class LearnedOccupancyEstimator(Estimator):
         self.cache = None
         if self.cache_bytes > 0:
             try:
-                self.cache = build_cache(
-                    self.occupancy, budget=self.cache_bytes, tolerance=self.tolerance
-                )
+                with torch.autocast(self.device.type, enabled=False):  # whatever the host is in
+                    self.cache = build_cache(
+                        self.occupancy, budget=self.cache_bytes, tolerance=self.tolerance
+                    )
             except ValueError as reason:
                 _log.warning("no cell cache, sampling will be slower: %s", reason)
 

@@ -105,7 +105,8 @@ class LearnedOccupancySampler(Sampler):
         """
         flat = positions.reshape(-1, 3)
         if self.frame is not None:
-            flat = flat @ self.frame[:, :3].T + self.frame[:, 3]
+            with torch.autocast(flat.device.type, enabled=False):  # a host may be in half precision
+                flat = flat @ self.frame[:, :3].T + self.frame[:, 3]
         kept = self.estimator.occupied(flat).nonzero()[:, 0]
         worth = flat.new_zeros(len(flat))
         if kept.numel():

@@ -17,16 +17,23 @@ from leco_plugin.scenes.city_canvas import Canvas
 from leco_plugin.scenes.city_palette import CARS, Material, Palette
 from leco_plugin.scenes.city_shapes import Array, Shapes, add_prism, add_wire
 
+LARGE = 9
+"""From so many blocks a side on, the city's outline wanders."""
 POLE_LINE = 0.8
 """Distance of poles and wires from the lot's edge, metres."""
 _EDGE_PARTS = 3
 
 
 def choose_blocks(blocks: int, seed: int) -> NDArray[np.bool_]:
-    """Which cells of the [blocks, blocks] square are built; the rim of larger ones has gaps."""
+    """Which cells of the [blocks, blocks] square are built.
+
+    The rim of a city has gaps; from `LARGE` on its outline has bays and headlands instead.
+    """
     built = np.ones((blocks, blocks), bool)
     if blocks < 3:
         return built
+    if blocks >= LARGE:
+        return _wandering(blocks, seed)
     random = np.random.default_rng([seed, blocks, 1])
     rim = np.ones_like(built)
     rim[1:-1, 1:-1] = False
@@ -38,6 +45,35 @@ def choose_blocks(blocks: int, seed: int) -> NDArray[np.bool_]:
         # A corner without a neighbour would be an island.
         built[i, j] &= built[i, 1 if j == 0 else -2] or built[1 if i == 0 else -2, j]
     return built
+
+
+def _wandering(blocks: int, seed: int) -> NDArray[np.bool_]:
+    """A connected city with bays and headlands, about 4/5 of its square."""
+    random = np.random.default_rng([seed, blocks, 6])
+    x, y = np.moveaxis((np.indices((blocks, blocks)) + 0.5) / blocks * 2 - 1, 0, 0)
+    turn = np.arctan2(y, x)
+    reach = np.full(turn.shape, 1.1)
+    for waves, depth in ((3, 0.08), (5, 0.06), (9, 0.05)):
+        reach -= depth * (1 + np.sin(waves * turn + random.uniform(0, 2 * np.pi)))
+    # between a circle and a square
+    inside: NDArray[np.bool_] = (x**6 + y**6) ** (1 / 6) <= reach
+    return _around_the_middle(inside)
+
+
+def _around_the_middle(cells: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """The cells that are connected, side by side, with the middle one."""
+    found = np.zeros_like(cells)
+    found[len(cells) // 2, len(cells) // 2] = True
+    while True:
+        wider = found.copy()
+        wider[1:] |= found[:-1]
+        wider[:-1] |= found[1:]
+        wider[:, 1:] |= found[:, :-1]
+        wider[:, :-1] |= found[:, 1:]
+        wider &= cells
+        if np.array_equal(wider, found):
+            return found
+        found = wider
 
 
 def centres(built: NDArray[np.bool_], size: float) -> Array:

@@ -17,6 +17,7 @@ from torch import Tensor
 
 from leco_plugin.scenes.city import City, read_description
 from leco_plugin.scenes.city_folder import CaptureConfig, read_transforms
+from leco_plugin.scenes.mega_nerf_axes import TO_DRB
 
 
 @dataclass
@@ -39,6 +40,9 @@ class CityTruth:
         """
         folder = Path(folder)
         transform = outputs.dataparser_transform.double().cpu()
+        if read_description(folder).get("layout") == "mega-nerf":
+            turn = torch.from_numpy(TO_DRB)  # that reader begins at (down, right, back)
+            transform = torch.cat([transform[:, :3] @ turn, transform[:, 3:]], dim=1)
         return cls(City.from_folder(folder), folder, transform, float(outputs.dataparser_scale))
 
     def to_metres(self, positions: Tensor) -> NDArray[np.float64]:

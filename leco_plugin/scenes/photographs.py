@@ -19,6 +19,7 @@ from nerfstudio.plugins.registry_dataparser import DataParserSpecification
 from torch import Tensor
 
 from leco_plugin.scenes.input_error import InputError
+from leco_plugin.scenes.rotations import distance_from_rotations
 
 POINTS = "leco_sparse_points"
 """Key of the dataset's metadata with the sparse points [P, 3] in model coordinates."""
@@ -94,9 +95,7 @@ def check_scene(data: Path) -> dict[str, Any]:
         raise InputError(f"{description} has no cameras: its list of frames is empty")
     if poses.shape[1:] not in ((4, 4), (3, 4)) or not np.isfinite(poses).all():
         raise InputError(f"{description} holds a transform_matrix that is no finite 4 x 4 matrix")
-    rotations = poses[:, :3, :3]
-    distortions = np.abs(rotations @ rotations.swapaxes(1, 2) - np.eye(3)).max(axis=(1, 2))
-    distortions = np.maximum(distortions, np.abs(np.linalg.det(rotations) - 1.0))
+    distortions = distance_from_rotations(poses[:, :3, :3])
     if distortions.max() > 0.05:
         worst = paths[int(distortions.argmax())]
         raise InputError(f"{description}: the transform_matrix of {worst} is no rotation")

@@ -141,3 +141,13 @@ def test_the_options_of_a_sampler_reach_it(guide: Guide):
     own.set_occupancy(ball())
     assert own.estimator(BOX).sampler.cache_bytes == 0
     assert own.proposal(num_samples=3).sampler.estimator.cache_bytes == 0
+
+
+def test_a_host_in_half_precision_moves_its_rays_in_full(guide: Guide):
+    turn = torch.linalg.qr(torch.randn(3, 3))[0]
+    guide.set_occupancy(ball(), torch.cat([turn * torch.det(turn), torch.ones(3, 1)], dim=1))
+    origins, directions = rays()
+    expected = guide.estimator(BOX).sampling(origins, directions, **MARCH)
+    with torch.autocast("cpu", torch.bfloat16):
+        found = guide.estimator(BOX).sampling(origins, directions, **MARCH)
+    assert torch.equal(found[1], expected[1])

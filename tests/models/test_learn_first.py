@@ -64,8 +64,6 @@ def test_each_method_has_learning_sizes_of_its_own():
     assert other.learning.schedule.learn_steps != 3
 
 
-@pytest.mark.parametrize(
-    ("seconds", "a_step", "steps"), [(10.0, 0.1, 100), (0.1, 0.1, FEWEST_STEPS), (90.0, 0.1, 200)]
-)
-def test_learning_takes_the_steps_that_fit_but_never_more_than_are_wanted(seconds, a_step, steps):
-    assert steps_within(seconds, a_step, most=200) == steps
+@pytest.mark.parametrize(("more", "steps"), [(90.7, 100), (0.0, FEWEST_STEPS), (900.0, 200)])
+def test_learning_takes_the_steps_that_fit_but_never_more_than_are_wanted(more, steps):
+    assert steps_within(more, done=10, most=200) == steps

@@ -46,3 +46,16 @@ def test_a_median_ray_has_the_wanted_number_of_candidates(kind) -> None:
     ray_indices, _, _ = march(*one, *ends, step_size=step_size, cone_angle=cone_angle)
     assert abs(len(ray_indices) - 64) <= 1
     assert (cone_angle > 0.0) == (kind == "contraction")
+
+
+def test_a_ray_along_a_wall_that_misses_the_box_stays_finite():
+    aabb = torch.tensor([-1.0, -1.0, -0.5, 1.0, 1.0, 0.5])
+    bundle = RayBundle(
+        origins=torch.tensor([[0.0, 0.0, 2.0]]),
+        directions=torch.tensor([[1.0, 0.0, 0.0]]),
+        pixel_area=torch.ones(1, 1),
+    )
+    rays = cut_to_bounds(bundle, aabb, torch.tensor(0.1), torch.tensor(3.0), with_images=False)
+    assert bool(rays.t_mins.isfinite())
+    assert bool(rays.t_maxs.isfinite())
+    assert bool(rays.t_maxs <= rays.t_mins)

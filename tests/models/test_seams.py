@@ -109,3 +109,26 @@ def test_a_grid_has_nothing_for_a_proposal_host():
 def test_a_host_without_a_seam_is_told_what_was_looked_for(guide: Guide):
     with pytest.raises(ValueError, match=r"OccGridEstimator.*ProposalNetworkSampler.*HostAdapter"):
         swap_sampler(Host(), guide)
+
+
+class SamplesWith(Host):
+    """A host that cuts its rays itself and takes any estimator."""
+
+    def sample_with(self, estimator: nn.Module | None) -> None:
+        self.estimator = estimator
+
+
+def test_a_host_that_takes_any_estimator_is_given_one_without_a_box(guide: Guide):
+    host = SamplesWith()
+    assert swap_sampler(host, guide) == "sample-with"
+    assert isinstance(host.estimator, GuidedEstimator)
+    dense = SamplesWith()
+    swap_sampler(dense, Guide("dense"))
+    far = torch.tensor([[50.0, 0.0, 0.0]])
+    samples = dense.estimator.sampling(far, torch.eye(3)[:1], far_plane=1.0, render_step_size=0.1)
+    assert len(samples[0]) == 10
+
+
+def test_such_a_host_has_a_grid_of_its_own():
+    with pytest.raises(ValueError, match="sampling occupancy-grid"):
+        swap_sampler(SamplesWith(), Guide("occupancy-grid"))

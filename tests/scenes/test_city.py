@@ -84,7 +84,7 @@ def test_the_middles_of_walls_poles_and_wires_are_matter(city: City) -> None:
     assert city.occupied(np.array([[x, y, -1.0], [x + 20, y + 20, -0.01]])).all()
 
 
-@pytest.mark.parametrize("blocks", [3, 4, 7, 16])
+@pytest.mark.parametrize("blocks", [3, 4, 7, 8])
 @pytest.mark.parametrize("seed", [0, 1, 2])
 def test_the_rim_has_gaps_and_the_rest_hangs_together(blocks: int, seed: int) -> None:
     built = choose_blocks(blocks, seed)
@@ -94,6 +94,23 @@ def test_the_rim_has_gaps_and_the_rest_hangs_together(blocks: int, seed: int) ->
     padded = np.pad(built, 1)
     neighbours = padded[:-2, 1:-1] | padded[2:, 1:-1] | padded[1:-1, :-2] | padded[1:-1, 2:]
     assert neighbours[built].all()
+
+
+@pytest.mark.parametrize("blocks", [9, 16, 64])
+@pytest.mark.parametrize("seed", [0, 1, 2])
+def test_the_outline_of_a_large_city_wanders(blocks: int, seed: int) -> None:
+    built = choose_blocks(blocks, seed)
+    assert 0.7 < built.mean() < 0.9
+    widths = {int(np.ptp(np.flatnonzero(row))) for row in built if row.any()}
+    assert len(widths) >= blocks // 4
+    reached = np.zeros_like(built)
+    todo = [tuple(np.argwhere(built)[0])]
+    while todo:
+        i, j = todo.pop()
+        if 0 <= i < blocks and 0 <= j < blocks and built[i, j] and not reached[i, j]:
+            reached[i, j] = True
+            todo += [(i + 1, j), (i - 1, j), (i, j + 1), (i, j - 1)]
+    assert np.array_equal(reached, built)
 
 
 def test_the_outline_is_irregular(city: City) -> None:

@@ -1,8 +1,17 @@
 """A folder is written whole or not at all, never twice, and never over something else."""
 
+from __future__ import annotations
+
 import dataclasses
 import json
+import shutil
+import signal
+import subprocess
+import sys
+import weakref
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -10,7 +19,8 @@ import trimesh
 from PIL import Image
 
 from leco_plugin.scenes.city import City, CityConfig
-from leco_plugin.scenes.city_folder import CaptureConfig, write_city
+from leco_plugin.scenes.city_folder import CaptureConfig, count_pictures, write_city
+from leco_plugin.scenes.city_layouts import LayoutName
 from leco_plugin.scenes.city_render import Tracer
 
 CITY = CityConfig(blocks=1, seed=3, sky=True)
@@ -98,7 +108,59 @@ def test_a_damaged_folder_gets_one_line(copy: Path, damage: str) -> None:
         write_city(CITY, copy, CAPTURE)
 
 
-def test_an_interrupted_write_leaves_nothing_behind(
+KILLED = """
+import os, signal, sys
+from leco_plugin.scenes.city import CityConfig
+from leco_plugin.scenes.city_folder import CaptureConfig, write_city
+from leco_plugin.scenes.city_render import Tracer
+from leco_plugin.scenes import whole_files
+
+photograph, taken = Tracer.photograph, []
+
+def until_killed(self, *arguments):
+    taken.append(1)
+    if len(taken) == 4:  # in the middle of a file
+        open(sys.argv[1] + "/" + os.listdir(sys.argv[1])[0] + "/.a.png.1-1.part", "w")
+        os.kill(os.getpid(), signal.SIGKILL)
+    return photograph(self, *arguments)
+
+Tracer.photograph = until_killed
+capture = CaptureConfig(40, 30, aerial_per_block=6, street_per_block=3, test_every=3)
+config = CityConfig(blocks=1, seed=3, sky=True)
+write_city(config, sys.argv[1] + "/city", capture, False, sys.argv[2])
+"""
+
+
+@pytest.mark.parametrize("layout", ["nerfstudio", "mega-nerf"])
+def test_a_killed_run_is_taken_up_where_it_ended(
+    layout: LayoutName, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    killed = subprocess.run(
+        [sys.executable, "-W", "ignore", "-c", KILLED, str(tmp_path), layout], timeout=200
+    )
+    assert killed.returncode == -signal.SIGKILL
+    assert not (tmp_path / "city").exists()
+    taken = []
+    photograph = Tracer.photograph
+
+    def count(self: Tracer, *arguments: Any) -> Any:
+        taken.append(1)
+        return photograph(self, *arguments)
+
+    monkeypatch.setattr(Tracer, "photograph", count)
+    resumed = write_city(CITY, tmp_path / "city", CAPTURE, progress=False, layout=layout)
+    assert len(taken) == 9 - 3
+    whole = write_city(CITY, tmp_path / "other", CAPTURE, progress=False, layout=layout)
+    assert [path.name for path in tmp_path.iterdir() if path.name.startswith(".")] == []
+    assert contents(resumed) == contents(whole)
+
+
+def contents(folder: Path) -> dict[str, bytes]:
+    files = [path for path in folder.rglob("*") if path.is_file()]
+    return {str(path.relative_to(folder)): path.read_bytes() for path in files}
+
+
+def test_an_interrupted_write_keeps_what_it_has_out_of_sight(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def interrupt(*_: object) -> None:
@@ -107,24 +169,61 @@ def test_an_interrupted_write_leaves_nothing_behind(
     monkeypatch.setattr(Tracer, "photograph", interrupt)
     with pytest.raises(KeyboardInterrupt):
         write_city(CITY, tmp_path / "city", CAPTURE, progress=False)
-    assert list(tmp_path.iterdir()) == []
+    assert all(path.name.startswith(".city-unfinished-") for path in tmp_path.iterdir())
+
+
+def test_two_processes_that_write_one_city_help_each_other(tmp_path: Path) -> None:
+    with ThreadPoolExecutor(2) as pool:
+        runs = [
+            pool.submit(write_city, CITY, tmp_path / "city", CAPTURE, progress=False)
+            for _ in range(2)
+        ]
+        folders = [run.result() for run in runs]
+    assert folders == 2 * [tmp_path / "city"]
+    assert [path.name for path in tmp_path.iterdir()] == ["city"]
+
+
+def test_no_picture_stays_in_memory(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    class Depth(np.ndarray):
+        """An array whose life can be watched."""
+
+    alive: list[weakref.ref[Depth]] = []
+    most = []
+    photograph = Tracer.photograph
+
+    def watch(self: Tracer, *arguments: Any) -> Any:
+        most.append(sum(one() is not None for one in alive))
+        image, depth = photograph(self, *arguments)
+        watched = depth.view(Depth)
+        alive.append(weakref.ref(watched))
+        return image, watched
+
+    monkeypatch.setattr(Tracer, "photograph", watch)
+    write_city(CITY, tmp_path / "city", CAPTURE, progress=False)
+    assert len(most) == 9 and max(most) <= 1
+
+
+def test_a_city_in_another_format_is_refused(folder: Path, tmp_path: Path) -> None:
+    with pytest.raises(FileExistsError, match="layout is nerfstudio there, not mega-nerf"):
+        write_city(CITY, folder, CAPTURE, layout="mega-nerf")
+    description = json.loads((folder / "city.json").read_text())
+    del description["layout"]  # as earlier versions wrote it
+    copied = shutil.copytree(folder, tmp_path / "old")
+    (copied / "city.json").write_text(json.dumps(description))
+    assert write_city(CITY, copied, CAPTURE) == copied
+
+
+@pytest.mark.parametrize(
+    "lost", ["mappings.txt", "train/rgbs/000000.png", "val/metadata/000001.pt"]
+)
+def test_a_damaged_city_in_mega_nerfs_format_is_named(lost: str, tmp_path: Path) -> None:
+    folder = write_city(CITY, tmp_path / "city", CAPTURE, progress=False, layout="mega-nerf")
+    assert count_pictures(folder) == (9, 3)
+    (folder / lost).unlink()
+    with pytest.raises(ValueError, match=f"is damaged: .*{Path(lost).name} is missing"):
+        write_city(CITY, folder, CAPTURE, layout="mega-nerf")
 
 
 def test_no_city_at_all_is_said_in_one_line(tmp_path: Path) -> None:
     with pytest.raises(FileNotFoundError, match=r"^[^\n]*holds no city[^\n]*$"):
         City.from_folder(tmp_path)
-
-
-@pytest.mark.parametrize(
-    "bad",
-    [
-        {"width": 0},
-        {"field_of_view": 180.0},
-        {"aerial_per_block": -1.0},
-        {"aerial_per_block": 0.0, "street_per_block": 0.0},
-        {"test_every": 1},
-    ],
-)
-def test_pictures_that_cannot_be_taken_are_refused_in_one_line(bad: dict) -> None:
-    with pytest.raises(ValueError, match=r"^[^\n]+$"):
-        CaptureConfig(**bad)

@@ -1,0 +1,95 @@
+"""`--machine.num-devices N` with `--machine.device-type cpu`: N processes that speak gloo.
+
+nerfstudio 1.1.5 takes the backend from the device type, and then wants CUDA devices all the same:
+in each process that it starts, and where a pipeline tells torch the number of a model's GPU.
+"""
+
+from __future__ import annotations
+
+import sys
+from dataclasses import dataclass, field
+from types import SimpleNamespace
+from typing import Any
+
+import torch
+from nerfstudio.engine.trainer import TrainerConfig
+from torch import distributed, nn
+from torch.nn.parallel import DistributedDataParallel
+
+from leco_plugin.compat.atomic_trainer import AtomicTrainer
+
+
+@dataclass
+class DataParallelTrainerConfig(TrainerConfig):
+    """nerfstudio's, with checkpoints that are whole, and with several processes also on a CPU"""
+
+    _target: type = field(default_factory=lambda: AtomicTrainer)
+    """target class to instantiate"""
+
+    def set_timestamp(self) -> None:
+        """Prepares the launcher too: of a config, nothing else is called before processes start."""
+        super().set_timestamp()
+        machine = self.machine
+        if machine.device_type == "cpu" and machine.num_devices * machine.num_machines > 1:
+            launch_on_cpu()
+
+
+def launch_on_cpu() -> None:
+    """Has nerfstudio's launcher, where it is loaded, start `process` and not its own function."""
+    for name in ("nerfstudio.scripts.train", "__main__"):
+        launcher: Any = sys.modules.get(name)
+        if hasattr(launcher, "_distributed_worker"):
+            launcher._distributed_worker = process
+
+
+def process(local_rank: int, *arguments: Any) -> None:
+    """One of the processes of a run, from its first line to its last.
+
+    Args:
+        local_rank: number of the process on this machine.
+        arguments: as nerfstudio's launcher gives them to its own function.
+    """
+    train, world_size, here, machine_rank, address, config, timeout, device_type = arguments
+    if device_type != "cpu":
+        from nerfstudio.scripts.train import _distributed_worker
+
+        _distributed_worker(local_rank, *arguments)
+        return
+    # each would else take all cores for itself
+    torch.set_num_threads(max(1, torch.get_num_threads() // here))
+    rank = machine_rank * here + local_rank
+    distributed.init_process_group(
+        "gloo", init_method=address, world_size=world_size, rank=rank, timeout=timeout
+    )
+    _name_machines(world_size, here, machine_rank)
+    _wrap_models_without_devices()
+    train(local_rank, world_size, config, rank)
+    distributed.barrier()
+    distributed.destroy_process_group()
+
+
+def _name_machines(world_size: int, here: int, machine_rank: int) -> None:
+    """The group of processes on this machine, for which nerfstudio asks."""
+    from nerfstudio.utils import comms
+
+    for machine in range(world_size // here):
+        group = distributed.new_group(list(range(machine * here, (machine + 1) * here)))
+        if machine == machine_rank:
+            comms.LOCAL_PROCESS_GROUP = group  # type: ignore[assignment]
+
+
+class WithoutDevices(DistributedDataParallel):
+    """torch's, for a caller that names a device although the module is on a CPU."""
+
+    def __init__(self, module: nn.Module, device_ids: Any = None, **options: Any) -> None:
+        super().__init__(module, **options)
+
+
+def _wrap_models_without_devices() -> None:
+    """For all pipelines of this process, which was started for one run on a CPU."""
+    from nerfstudio.pipelines import base_pipeline
+
+    base_pipeline.DDP = WithoutDevices  # type: ignore[assignment, misc]
+    base_pipeline.dist = SimpleNamespace(  # type: ignore[assignment]
+        barrier=lambda **_: distributed.barrier()
+    )

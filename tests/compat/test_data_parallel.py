@@ -1,0 +1,128 @@
+"""Claims about who is started as a process of a data-parallel run; `tests/test_data_parallel.py`
+runs them.
+"""
+
+from __future__ import annotations
+
+import copy
+import sys
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+import yaml
+from ball_occupancy import ball
+from nerfstudio.engine.trainer import TrainerConfig
+from nerfstudio.scripts import train as ns_train
+from torch import nn
+
+from leco_plugin import host_configs, method_configs
+from leco_plugin.compat.atomic_trainer import AtomicTrainer
+from leco_plugin.compat.data_parallel import DataParallelTrainerConfig, WithoutDevices, process
+from leco_plugin.swap import registered, swapped_config, with_sampler_swapped
+
+
+@pytest.fixture(autouse=True)
+def own(monkeypatch: pytest.MonkeyPatch) -> list[Any]:
+    """Puts something else where nerfstudio has its own function; what that is called with."""
+    calls: list[Any] = []
+    monkeypatch.setattr(ns_train, "_distributed_worker", lambda *given: calls.append(given))
+    return calls
+
+
+def config(device: str, devices: int) -> DataParallelTrainerConfig:
+    made = copy.deepcopy(method_configs.leco_occupancy.config)
+    assert isinstance(made, DataParallelTrainerConfig)
+    made.machine.device_type, made.machine.num_devices = device, devices  # type: ignore[assignment]
+    return made
+
+
+def test_several_processes_on_a_cpu_are_ours() -> None:
+    made = config("cpu", 2)
+    assert ns_train._distributed_worker is not process
+    made.set_timestamp()
+    assert ns_train._distributed_worker is process
+    assert made.timestamp != "{timestamp}"
+
+
+def test_so_are_those_of_several_machines() -> None:
+    made = config("cpu", 1)
+    made.machine.num_machines = 2
+    made.set_timestamp()
+    assert ns_train._distributed_worker is process
+
+
+@pytest.mark.parametrize(("device", "devices"), [("cpu", 1), ("cuda", 1), ("cuda", 2)])
+def test_all_others_are_left_to_nerfstudio(device: str, devices: int) -> None:
+    config(device, devices).set_timestamp()
+    assert ns_train._distributed_worker is not process
+
+
+def test_a_launcher_that_is_run_as_a_script_is_found(monkeypatch: pytest.MonkeyPatch) -> None:
+    script = SimpleNamespace(_distributed_worker=None)
+    monkeypatch.setitem(sys.modules, "__main__", script)
+    config("cpu", 2).set_timestamp()
+    assert script._distributed_worker is process
+
+
+def test_a_later_run_on_cuda_is_nerfstudios_again(own: list[Any]) -> None:
+    given = (1, print, 2, 2, 0, "tcp://127.0.0.1:1", None, None, "cuda")
+    process(*given)
+    assert own == [given]
+
+
+def test_a_caller_may_name_a_device_for_a_module_on_a_cpu(monkeypatch: pytest.MonkeyPatch) -> None:
+    given: dict[str, Any] = {}
+    monkeypatch.setattr(
+        nn.parallel.DistributedDataParallel,
+        "__init__",
+        lambda self, module, **options: given.update(module=module, **options),
+    )
+    model = nn.Linear(1, 1)
+    WithoutDevices(model, device_ids=[1], find_unused_parameters=True)
+    assert given == {"module": model, "find_unused_parameters": True}
+
+
+def test_every_method_of_ours_can() -> None:
+    configs = [
+        value.config
+        for module in (method_configs, host_configs)
+        for name, value in vars(module).items()
+        if hasattr(value, "config") and hasattr(value, "description")
+    ]
+    assert len(configs) >= 6
+    assert all(type(made) is DataParallelTrainerConfig for made in configs)
+    assert all(made._target is AtomicTrainer for made in configs)
+
+
+def test_a_config_file_gives_it_back() -> None:
+    made = yaml.load(yaml.dump(config("cpu", 2)), Loader=yaml.Loader)
+    assert type(made) is DataParallelTrainerConfig
+    assert made.machine.num_devices == 2
+
+
+@pytest.fixture
+def file(tmp_path: Path) -> Path:
+    ball().save(tmp_path / "ball.safetensors")
+    return tmp_path / "ball.safetensors"
+
+
+def test_a_swapped_method_can(file: Path) -> None:
+    made = swapped_config("instant-ngp-bounded", file, ["--machine.num-devices", "2"])
+    assert type(made) is DataParallelTrainerConfig
+    assert made._target is AtomicTrainer
+    assert made.machine.num_devices == 2
+    assert made.optimizers == registered("instant-ngp-bounded").optimizers
+
+
+class OthersConfig(TrainerConfig):
+    """Of a package that has a config of its own."""
+
+
+def test_a_config_of_another_kind_stays_what_it_is(file: Path) -> None:
+    found = registered("nerfacto")
+    other = OthersConfig(**vars(found))
+    made = with_sampler_swapped(other, file)
+    assert type(made) is OthersConfig
+    assert made._target is AtomicTrainer

@@ -1,0 +1,161 @@
+"""Claims about `leco_plugin.compat.dynamic_batch`, on the host that uses it."""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from nerfstudio.pipelines.dynamic_batch import DynamicBatchPipeline
+from nerfstudio.utils import writer
+
+from leco_plugin.compat.dynamic_batch import ClampedDynamicBatchPipeline
+from leco_plugin.host_configs import leco_ngp
+from leco_plugin.models.encodings import EncodingConfig
+from leco_plugin.models.gate import Gate, GateConfig
+from leco_plugin.occupancy import Occupancy
+from leco_plugin.space import Space
+
+pytestmark = [  # nerfstudio leaves an image open
+    pytest.mark.filterwarnings("ignore:unclosed file:ResourceWarning"),
+    pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning"),
+]
+
+TARGET, MOST_PER_RAY = 2048, 32
+FIRST = TARGET // MOST_PER_RAY
+
+
+@pytest.fixture(autouse=True)
+def _alone(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    """Without a cell cache, which takes seconds, and without what other trainers have to write."""
+
+    def refuse(*_: object, **__: object) -> None:
+        raise ValueError("no cache in this test")
+
+    monkeypatch.setattr("leco_plugin.samplers.estimator.build_cache", refuse)
+    monkeypatch.setattr(writer, "GLOBAL_BUFFER", {})
+    monkeypatch.setattr(writer, "EVENT_WRITERS", [])
+    yield
+
+
+def occupancy(threshold: float) -> Occupancy:
+    """Of a gate that has learned nothing: o(x) is about two thirds everywhere."""
+    torch.manual_seed(0)
+    gate = Gate(GateConfig(EncodingConfig(octaves=1), width=8, layers=1, scene_experts=2))
+    return Occupancy(gate, Space("contraction", (0.0, 0.0, 0.0), 1.0), threshold)
+
+
+def config(scene: Path, folder: Path, threshold: float = 0.0, **bounds: int) -> Any:
+    """`leco-ngp` in sizes for a test, guided by a file."""
+    made: Any = copy.deepcopy(leco_ngp.config)
+    file = folder / "occupancy.safetensors"
+    occupancy(threshold).save(file)
+    made.output_dir, made.timestamp, made.vis = folder, "run", "tensorboard"
+    made.logging.local_writer.enable = False
+    made.steps_per_eval_image = made.steps_per_save = 0
+    made.pipeline.datamanager.data = scene
+    made.pipeline.model.occupancy.path = file
+    host = made.pipeline.model.host
+    host.log2_hashmap_size, host.max_res, host.cone_angle = 8, 32, 1 / 8
+    made.pipeline = replace(
+        made.pipeline, target_num_samples=TARGET, max_num_samples_per_ray=MOST_PER_RAY, **bounds
+    )
+    return made
+
+
+def pipeline_of(made: Any) -> ClampedDynamicBatchPipeline:
+    pipeline = made.pipeline.setup(device="cpu", test_mode="val")
+    assert isinstance(pipeline, ClampedDynamicBatchPipeline)
+    return pipeline
+
+
+@pytest.fixture(scope="module")
+def pipeline(
+    tiny_scene: Path, tmp_path_factory: pytest.TempPathFactory
+) -> ClampedDynamicBatchPipeline:
+    made = config(tiny_scene, tmp_path_factory.mktemp("run"), fewest_rays=16, most_rays=512)
+    return pipeline_of(made)
+
+
+def rays_after(pipeline: ClampedDynamicBatchPipeline, rays: int, samples: int) -> int:
+    """Rays of the batch that follows one of so many rays with so many samples."""
+    pipeline._set_rays(rays)
+    pipeline._update_dynamic_num_rays_per_batch(samples)
+    assert int(pipeline.rays_per_batch) == pipeline.dynamic_num_rays_per_batch
+    return pipeline.dynamic_num_rays_per_batch
+
+
+def test_the_batch_follows_the_samples_that_rays_have(
+    pipeline: ClampedDynamicBatchPipeline,
+) -> None:
+    assert rays_after(pipeline, 100, TARGET) == 100
+    assert rays_after(pipeline, 100, 4 * TARGET) == 25
+    assert rays_after(pipeline, 100, round(TARGET / 1.5)) == 150
+
+
+def test_it_never_more_than_doubles(pipeline: ClampedDynamicBatchPipeline) -> None:
+    assert rays_after(pipeline, 100, 2) == 200
+    assert rays_after(pipeline, 100, TARGET // 3) == 200
+
+
+def test_it_stays_within_its_bounds(pipeline: ClampedDynamicBatchPipeline) -> None:
+    assert rays_after(pipeline, 400, 2) == 512
+    assert rays_after(pipeline, 100, 100 * TARGET) == 16
+
+
+@pytest.mark.parametrize("samples", [0, 1])
+def test_a_batch_without_samples_changes_nothing(
+    pipeline: ClampedDynamicBatchPipeline, samples: int
+) -> None:
+    assert rays_after(pipeline, 100, samples) == 100
+
+
+def test_a_first_batch_beyond_the_bounds_is_brought_within(
+    tiny_scene: Path, tmp_path: Path
+) -> None:
+    pipeline = pipeline_of(config(tiny_scene, tmp_path, fewest_rays=2 * FIRST))
+    assert pipeline.dynamic_num_rays_per_batch == 2 * FIRST
+    assert len(pipeline.datamanager.next_train(0)[0]) == 2 * FIRST
+
+
+def test_the_fake_sample_of_an_empty_batch_is_not_taken_for_one(
+    tiny_scene: Path, tmp_path: Path
+) -> None:
+    pipeline = pipeline_of(config(tiny_scene, tmp_path, threshold=1.0))
+    _, _, metrics = pipeline.get_train_loss_dict(0)
+    assert int(metrics["num_samples_per_batch"]) == 1  # VolumetricSampler invents it
+    assert metrics["num_rays_per_batch"] == FIRST
+    assert len(pipeline.datamanager.next_train(1)[0]) == FIRST
+    DynamicBatchPipeline._update_dynamic_num_rays_per_batch(pipeline, 1)
+    assert pipeline.dynamic_num_rays_per_batch == FIRST * TARGET
+
+
+def test_a_resumed_run_goes_on_with_its_batch(tiny_scene: Path, tmp_path: Path) -> None:
+    made = config(tiny_scene, tmp_path, fewest_rays=8)
+    made.max_num_iterations = 4
+    trainer = made.setup()
+    trainer.setup()
+    trainer.train()
+    rays = trainer.pipeline.dynamic_num_rays_per_batch
+    assert rays != FIRST
+
+    resumed = replace(made, load_dir=made.get_checkpoint_dir(), timestamp="resumed").setup()
+    resumed.setup()
+    assert resumed.pipeline.dynamic_num_rays_per_batch == rays
+    assert len(resumed.pipeline.datamanager.next_train(4)[0]) == rays
+
+    (checkpoint,) = made.get_checkpoint_dir().iterdir()
+    state = torch.load(checkpoint)["pipeline"]
+    narrow = pipeline_of(replace(made, pipeline=replace(made.pipeline, most_rays=rays - 1)))
+    narrow.load_pipeline(state, 3)
+    assert narrow.dynamic_num_rays_per_batch == rays - 1
+    evaluated = made.pipeline.setup(device="cpu", test_mode="inference")
+    evaluated.load_pipeline(state, 3)  # there is no sampler to tell
+    assert int(evaluated.rays_per_batch) == rays
+    del state["rays_per_batch"]  # as of nerfstudio's own pipeline
+    narrow.load_pipeline(state, 3)
+    assert narrow.dynamic_num_rays_per_batch == rays - 1

@@ -1,0 +1,59 @@
+"""A scene in Mega-NeRF's format without a renderer: coloured noise seen from a drone."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from leco_plugin.scenes.city_cameras import look_at
+from leco_plugin.scenes.mega_nerf_axes import Coordinates
+from leco_plugin.scenes.mega_nerf_writer import (
+    write_coordinates,
+    write_mappings,
+    write_mask,
+    write_view,
+)
+
+WIDTH, HEIGHT = 24, 16
+COORDINATES = Coordinates(np.array([-90.0, 12.0, -300.0]), 40.0)
+INTRINSICS = (20.0, 21.0, 12.5, 7.5)
+VALIDATION = (2, 5)
+"""Numbers of the pictures that are held out."""
+
+
+def poses(count: int = 7) -> np.ndarray:
+    """[count, 3, 4] metres, (right, forward, up): cameras at 100 m and more that look down."""
+    random = np.random.default_rng(3)
+    middle = np.array([12.0, 300.0, 90.0])
+    places = middle + np.column_stack(
+        [random.uniform(-35, 35, (count, 2)), random.uniform(10, 30, count)]
+    )
+    targets = places * [1, 1, 0] + np.column_stack(
+        [random.uniform(-40, 40, (count, 2)), np.zeros(count)]
+    )
+    return np.stack([look_at(place, target) for place, target in zip(places, targets)])
+
+
+def image(number: int, channels: int = 3) -> np.ndarray:
+    """[HEIGHT, WIDTH, channels] noise."""
+    random = np.random.default_rng(number)
+    return random.integers(0, 256, (HEIGHT, WIDTH, channels), dtype=np.uint8)
+
+
+def write(folder: Path, masks: bool = False) -> Path:
+    """Writes seven pictures, two of them for validation; returns `folder`."""
+    write_coordinates(folder, COORDINATES)
+    for number, pose in enumerate(COORDINATES.to_file(poses())):
+        split = "val" if number in VALIDATION else "train"
+        write_view(folder, split, f"{number:06d}", image(number), pose, INTRINSICS)
+        if masks:
+            write_mask(folder / "masks", f"{number:06d}", mask(number))
+    write_mappings(folder, {f"DJI_{n}.JPG": f"{n:06d}" for n in range(7)})
+    return folder
+
+
+def mask(number: int) -> np.ndarray:
+    """bool [HEIGHT, WIDTH]; that of picture 4 keeps nothing."""
+    keep = np.random.default_rng(number).random((HEIGHT, WIDTH)) < 0.7
+    return keep & (number != 4)

@@ -1,0 +1,38 @@
+"""One process has nothing to agree on with others; `tests/test_data_parallel.py` has two."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from torch import nn
+
+from leco_plugin.models import ranks
+
+CPU = torch.device("cpu")
+
+
+def test_one_process_decides_alone() -> None:
+    assert not ranks.several() and ranks.is_first()
+    assert ranks.mean(1.5, CPU) == 1.5
+    assert ranks.from_first(lambda: {"rays": 3}, CPU) == {"rays": 3}
+
+
+def test_its_tensors_stay_as_they_are() -> None:
+    value = torch.rand(3)
+    before = value.clone()
+    ranks.share([value])
+    assert torch.equal(value, before)
+
+
+def test_its_model_is_trained_as_it_is() -> None:
+    model = nn.Linear(1, 1)
+    assert ranks.averaging(model, CPU) is model
+
+
+@pytest.mark.parametrize("first", [True, False])
+def test_only_the_first_speaks(
+    first: bool, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(ranks, "is_first", lambda: first)
+    ranks.say("hear, hear")
+    assert ("[leco] hear, hear" in capsys.readouterr().out) == first

@@ -1,0 +1,37 @@
+"""A file under its name is whole, whatever happens to the process that writes it."""
+
+from pathlib import Path
+from typing import BinaryIO
+
+import pytest
+
+from leco_plugin.scenes.whole_files import PART, remove_parts, write_whole
+
+
+def test_a_file_replaces_the_old_one_and_makes_its_folder(tmp_path: Path) -> None:
+    path = tmp_path / "new" / "file"
+    for text in (b"one", b"two"):
+        write_whole(path, lambda file, text=text: file.write(text))
+        assert path.read_bytes() == text
+    assert [p.name for p in path.parent.iterdir()] == ["file"]
+
+
+def test_a_failure_leaves_the_old_file_and_no_part(tmp_path: Path) -> None:
+    path = tmp_path / "file"
+    path.write_bytes(b"old")
+
+    def fail(file: BinaryIO) -> None:
+        file.write(b"half")
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        write_whole(path, fail)
+    assert [(p.name, p.read_bytes()) for p in tmp_path.iterdir()] == [("file", b"old")]
+
+
+def test_parts_of_killed_processes_are_found_at_any_depth(tmp_path: Path) -> None:
+    (tmp_path / "a").mkdir()
+    (tmp_path / "a" / f".picture.png.12-34{PART}").write_bytes(b"")
+    (tmp_path / "a" / "picture.png").write_bytes(b"")
+    remove_parts(tmp_path)
+    assert [p.name for p in tmp_path.rglob("*") if p.is_file()] == ["picture.png"]
