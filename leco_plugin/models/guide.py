@@ -7,6 +7,7 @@ may still have to be learned, or to come with a checkpoint whose gate has a shap
 from __future__ import annotations
 
 import functools
+from collections.abc import Mapping
 from typing import Any
 
 import torch
@@ -25,6 +26,7 @@ class Guide(nn.Module):
 
     Args:
         sampler: name in the registry of samplers.
+        options: of that sampler.
 
     Attributes:
         occupancy: None until there is one.
@@ -34,9 +36,12 @@ class Guide(nn.Module):
 
     frame: Tensor
 
-    def __init__(self, sampler: str = "learned-occupancy") -> None:
+    def __init__(
+        self, sampler: str = "learned-occupancy", options: Mapping[str, Any] | None = None
+    ) -> None:
         super().__init__()
         self.sampler = sampler
+        self.options = dict(options or {})
         self.occupancy: Occupancy | None = None
         self.version = 0
         self.register_buffer("frame", torch.eye(3, 4))
@@ -88,11 +93,11 @@ class Guide(nn.Module):
         """
         if self.needs_occupancy:
             return GuidedEstimator(self, aabb)
-        return build_estimator(self.sampler, aabb=aabb)
+        return build_estimator(self.sampler, aabb=aabb, **self.options)
 
     def proposal(self, **options: Any) -> Sampler:
         """What goes where a proposal host has its sampler; options as for the registry."""
-        return GuidedProposal(self, options)
+        return GuidedProposal(self, {**options, **self.options})
 
     def get_extra_state(self) -> dict[str, Any]:
         """What a checkpoint must say before the gate's weights can be read."""
@@ -153,7 +158,9 @@ class GuidedEstimator(_StandIn):
         self._aabb = None if aabb is None else aabb.detach().cpu()
 
     def _build(self, guide: Guide) -> nn.Module:
-        return build_estimator(guide.sampler, aabb=self._aabb, occupancy=guide.the_occupancy())
+        return build_estimator(
+            guide.sampler, aabb=self._aabb, occupancy=guide.the_occupancy(), **guide.options
+        )
 
     @functools.wraps(Estimator.sampling)
     def sampling(self, rays_o: Tensor, rays_d: Tensor, *args: Any, **kwargs: Any) -> Any:

@@ -36,6 +36,8 @@ class OccupancyConfig:
     sampler: str = "learned-occupancy"
     """Name in the registry of samplers. For comparison: `dense`, `occupancy-grid`, and `own`, which
     leaves the host as it is."""
+    options: dict[str, int | float] = field(default_factory=dict)
+    """Of that sampler, as its entry in the registry says: resolution 256 levels 4."""
     seconds: float | None = None
     """Without a path: about how long learning may take; None is until it has settled."""
     rays: int = 1024
