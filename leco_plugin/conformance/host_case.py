@@ -145,11 +145,18 @@ def loss_of(
 
 @contextmanager
 def quietly() -> Iterator[None]:
-    """While this lasts, nerfstudio prints nothing: verdicts are what is to be read."""
+    """While this lasts, nerfstudio prints nothing: verdicts are what is to be read.
+
+    Raises:
+        RuntimeError: nerfstudio ends the process; what it printed last.
+    """
     from nerfstudio.utils.rich_utils import CONSOLE
 
-    before, CONSOLE.quiet = CONSOLE.quiet, True
+    printed = CONSOLE.capture()
     try:
-        yield
-    finally:
-        CONSOLE.quiet = before
+        with printed:
+            yield
+    except SystemExit as end:
+        if isinstance(end, InputError):
+            raise
+        raise RuntimeError(" ".join(printed.get().split()) or f"it ends with {end}") from end

@@ -82,7 +82,7 @@ class Run:
         for scheduler in self.optimizers.schedulers.values():
             scheduler.step()
         self._call(step, Location.AFTER_TRAIN_ITERATION)
-        return float(loss)
+        return float(loss.detach())
 
     def _call(self, step: int, location: TrainingCallbackLocation) -> None:
         for callback in self.callbacks:

@@ -48,6 +48,22 @@ HOST_RULES = (
         checks={HOST: host_training.nothing_superfluous_is_left},
     ),
     Rule(
+        name="shades-only-what-is-kept",
+        reason="what is shaded where all is empty is time lost, and a ray that is not shaded where "
+        "something is has a hole; both happen when host and occupancy differ in coordinates.",
+        remedy="ask the field about the samples that the sampler returns and no others, in the "
+        "coordinates of the rays that the sampler was given.",
+        checks={HOST: host_images.shades_only_what_is_kept},
+    ),
+    Rule(
+        name="state-and-yaml-round-trip",
+        reason="ns-eval, ns-render and the viewer open a run by its config.yml and checkpoint; the "
+        "occupancy's file may be gone by then.",
+        remedy="keep in the config what YAML can say (no lambdas and no open objects), and in "
+        "parameters or buffers all that decides how the model renders.",
+        checks={HOST: host_life.state_and_yaml_round_trip},
+    ),
+    Rule(
         name="empty-rays-show-background",
         reason="an occupancy leaves rays into the sky without samples, and sometimes a whole "
         "batch: that must neither end the run nor leave light or NaN in images and weights.",
@@ -57,28 +73,12 @@ HOST_RULES = (
         checks={HOST: host_images.empty_rays_show_background},
     ),
     Rule(
-        name="shades-only-what-is-kept",
-        reason="what is shaded where all is empty is time lost, and a ray that is not shaded where "
-        "something is has a hole; both happen when host and occupancy differ in coordinates.",
-        remedy="ask the field about the samples that the sampler returns and no others, in the "
-        "coordinates of the rays that the sampler was given.",
-        checks={HOST: host_images.shades_only_what_is_kept},
-    ),
-    Rule(
         name="guided-by-everything-is-dense",
         reason="guidance that changes more than what is skipped changes the image, and no "
         "calibration has measured that.",
         remedy="let the sampler leave candidates out and move none, hand out all that it keeps, "
         "and cover each ray from its near to its far end where everything is occupied.",
         checks={HOST: host_images.guided_by_everything_is_dense},
-    ),
-    Rule(
-        name="state-and-yaml-round-trip",
-        reason="ns-eval, ns-render and the viewer open a run by its config.yml and checkpoint; the "
-        "occupancy's file may be gone by then.",
-        remedy="keep in the config what YAML can say (no lambdas and no open objects), and in "
-        "parameters or buffers all that decides how the model renders.",
-        checks={HOST: host_life.state_and_yaml_round_trip},
     ),
     Rule(
         name="resumes-where-it-stopped",

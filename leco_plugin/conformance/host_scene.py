@@ -19,22 +19,22 @@ if TYPE_CHECKING:
     from nerfstudio.cameras.cameras import Cameras
     from nerfstudio.cameras.rays import RayBundle
 
-CAMERAS, SIDE = 4, 4
-"""Cameras around the box, and pixels along each side of their images."""
+FROM = ((1.0, 0.4, 0.5), (0.3, 1.0, 0.6), (-0.8, -0.9, -0.1), (-0.4, -0.6, -1.0))
+"""Directions in which cameras lie from the centre of the box, to both sides of the slab."""
+CAMERAS, SIDE = len(FROM), 4
+"""Cameras, and pixels along each side of their images."""
 SEEN = 0.8
-"""World units to each side of the box's centre that an image shows: all rays meet the slab."""
+"""World units to each side of the box's centre that an image shows: all rays cross the slab."""
 
 NOTHING = Slab((0.0, 0.0, 1.0), -1.0)
 """A scene in which all is empty."""
 
 
 def cameras() -> Cameras:
-    """Around the box, each of which looks at its centre."""
+    """Around the box, looking at its centre."""
     from nerfstudio.cameras.cameras import Cameras
 
-    angles = torch.arange(CAMERAS) * (2.0 * torch.pi / CAMERAS) + 0.3
-    heights = torch.linspace(-0.5, 0.7, CAMERAS)
-    backward = normalize(torch.stack([angles.cos(), angles.sin(), heights], dim=-1), dim=-1)
+    backward = normalize(torch.tensor(FROM), dim=-1)
     upward = torch.tensor([0.0, 0.0, 1.0]).expand_as(backward)
     right = normalize(torch.linalg.cross(upward, backward), dim=-1)
     position = torch.tensor(CENTRE) + DISTANCE * backward

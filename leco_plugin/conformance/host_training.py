@@ -10,7 +10,7 @@ from torch import Tensor
 from leco_plugin.conformance.host_case import HostCase, loss_of
 from leco_plugin.conformance.host_scene import batch, bundle
 from leco_plugin.conformance.rule import require
-from leco_plugin.conformance.watching import shaded
+from leco_plugin.conformance.watching import densely, shaded
 
 if TYPE_CHECKING:
     from nerfstudio.models.base_model import Model
@@ -71,7 +71,9 @@ def nothing_superfluous_is_left(case: HostCase) -> None:
     for adapter in (PACKED, PROPOSAL):
         require(not adapter.fits(model), f"the host still holds {adapter.description}")
     now = dict(model.named_parameters())
-    idle = gradients_of_a_step(own).keys() & now.keys() - gradients_of_a_step(model).keys()
+    with densely(own):  # a grid that nobody has updated keeps nothing
+        before = gradients_of_a_step(own)
+    idle = before.keys() & now.keys() - gradients_of_a_step(model).keys()
     require(
         not idle,
         f"{_some(sorted(idle))} are trained with the host's own sampler, and get no gradient now",

@@ -35,18 +35,8 @@ def on_two_ranks(work: Callable[[int], Any], imports: Sequence[str] = ("torch",)
     Raises:
         Broken: a rank failed, or the two wait for each other.
     """
-    methods = torch.multiprocessing.get_all_start_methods()
-    if SERVER in methods:
-        torch.multiprocessing.set_forkserver_preload(list(imports))
     with tempfile.TemporaryDirectory() as folder:
-        ranks = torch.multiprocessing.start_processes(
-            _rank,
-            args=(work, folder),
-            nprocs=2,
-            join=False,
-            start_method=SERVER if SERVER in methods else "spawn",
-        )
-        require(ranks is not None, "no processes could be started")
+        ranks = _started(work, imports, folder)
         deadline = time.monotonic() + PATIENCE
         try:
             while not ranks.join(timeout=1.0):
@@ -57,6 +47,27 @@ def on_two_ranks(work: Callable[[int], Any], imports: Sequence[str] = ("torch",)
             for process in ranks.processes:
                 process.kill()
         return [torch.load(_left_by(rank, folder), weights_only=True) for rank in range(2)]
+
+
+def _started(work: Callable[[int], Any], imports: Sequence[str], folder: str) -> Any:
+    """Both processes, at their work."""
+    methods = torch.multiprocessing.get_all_start_methods()
+    if SERVER in methods:
+        torch.multiprocessing.set_forkserver_preload(list(imports))
+    before = os.environ.get("PYTHONWARNINGS")
+    os.environ["PYTHONWARNINGS"] = "ignore"  # what they import has said its own in this process
+    try:
+        return torch.multiprocessing.start_processes(
+            _rank,
+            args=(work, folder),
+            nprocs=2,
+            join=False,
+            start_method=SERVER if SERVER in methods else "spawn",
+        )
+    finally:
+        del os.environ["PYTHONWARNINGS"]
+        if before is not None:
+            os.environ["PYTHONWARNINGS"] = before
 
 
 def _left_by(rank: int, folder: str) -> Path:

@@ -11,6 +11,7 @@ from torch import Tensor, nn
 
 from leco_plugin.conformance.scene import box
 from leco_plugin.models.guide import GuidedEstimator, GuidedProposal
+from leco_plugin.samplers.base import Estimator
 from leco_plugin.samplers.grid import DenseEstimator
 from leco_plugin.samplers.marching import Samples
 
@@ -84,10 +85,15 @@ def _answers_noted(seam: GuidedEstimator | GuidedProposal, sampled: list[Tensor]
 
 @contextmanager
 def densely(model: Model) -> Iterator[None]:
-    """While this lasts, the host is not guided: it samples all of the box, or all of each ray."""
+    """While this lasts, a guided host samples all of the box, or all of each ray.
+
+    So does a packed host with its own estimator.
+    """
+    from nerfacc.estimators.base import AbstractEstimator
+
     with ExitStack() as stack:
         for module in model.modules():
-            if isinstance(module, GuidedEstimator):
+            if isinstance(module, GuidedEstimator | AbstractEstimator | Estimator):
                 stack.enter_context(_instead(module, "sampling", DenseEstimator(box()).sampling))
             elif isinstance(module, GuidedProposal):
                 stack.enter_context(_instead(module, "forward", _all_of_each_ray))
