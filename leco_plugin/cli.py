@@ -201,16 +201,22 @@ def chart(
 
 
 def check(name: Annotated[str, tyro.conf.Positional], json: Path | None = None) -> None:
-    """Hold a sampler to the rules that hosts rely on, one line a rule.
+    """Hold a sampler, or a guided method, to the rules that others rely on: one line a rule.
+
+    A method that is not guided is checked with its sampler swapped, as leco swap does it.
 
     Args:
-        name: A registered sampler, of this package or of another.
+        name: A registered sampler or nerfstudio method, of this package or of another.
         json: File for the verdicts as JSON.
     """
-    from leco_plugin.conformance.checking import check_sampler
+    import warnings
+
+    # what nerfstudio and torch think of each other is nothing that a user can act on
+    warnings.filterwarnings("ignore", module=r"nerfstudio|torch")
+    from leco_plugin.conformance.checking import check as verdicts_on
 
     verdicts = []
-    for verdict in check_sampler(name):
+    for verdict in verdicts_on(name):
         print(verdict.line(), flush=True)
         verdicts.append(verdict)
     rows = [verdict.to_dict() for verdict in verdicts]

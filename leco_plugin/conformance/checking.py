@@ -5,10 +5,15 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 from leco_plugin.conformance.estimator_case import EstimatorCase
+from leco_plugin.conformance.host_case import HostCase
+from leco_plugin.conformance.host_rules import HOST_RULES
 from leco_plugin.conformance.proposal_case import ProposalCase
 from leco_plugin.conformance.rule import Case, Rule, Verdict, apply
 from leco_plugin.conformance.sampler_rules import SAMPLER_RULES
-from leco_plugin.samplers.registry import sampler_spec
+from leco_plugin.samplers.registry import sampler_spec, samplers
+from leco_plugin.scenes.input_error import InputError
+
+RULES = SAMPLER_RULES + HOST_RULES
 
 
 def sampler_cases(name: str) -> list[Case]:
@@ -28,16 +33,52 @@ def sampler_cases(name: str) -> list[Case]:
     return cases
 
 
-def pairs(cases: list[Case], rules: tuple[Rule, ...]) -> list[tuple[Rule, Case]]:
+def host_cases(name: str) -> list[Case]:
+    """A registered method, which can be built on the scene of the kit.
+
+    Raises:
+        InputError: there is no such method, or it cannot be built, or not be guided.
+    """
+    case = HostCase(name)
+    try:
+        case.shared()
+    except InputError:
+        raise
+    except Exception as error:
+        said = f"{type(error).__name__}: {error}"
+        raise InputError(f"{name} cannot be built on the scene of the kit: {said}") from error
+    return [case]
+
+
+def cases_of(name: str) -> list[Case]:
+    """A sampler or a method; of a name that is both, the sampler.
+
+    Raises:
+        ValueError: as `sampler_cases` and `host_cases`, or the name is neither.
+    """
+    known = samplers()
+    if name in known:
+        return sampler_cases(name)
+    from nerfstudio.configs.method_configs import all_methods
+
+    if name not in all_methods:
+        raise ValueError(
+            f"there is no sampler or method {name!r}; there are the samplers "
+            f"{', '.join(sorted(known))} and the methods {', '.join(all_methods)}"
+        )
+    return host_cases(name)
+
+
+def pairs(cases: list[Case], rules: tuple[Rule, ...] = RULES) -> list[tuple[Rule, Case]]:
     """Each rule with each case at whose seam it has something to check."""
     return [(rule, case) for case in cases for rule in rules if case.seam in rule.checks]
 
 
-def check_sampler(name: str) -> Iterator[Verdict]:
-    """Applies the rules for samplers one after another.
+def check(name: str) -> Iterator[Verdict]:
+    """Applies the rules for a sampler or a method one after another.
 
     Raises:
-        ValueError: at once, as `sampler_cases`.
+        ValueError: at once, as `cases_of`.
     """
-    found = pairs(sampler_cases(name), SAMPLER_RULES)
+    found = pairs(cases_of(name))
     return (apply(rule, case) for rule, case in found)

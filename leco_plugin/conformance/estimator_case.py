@@ -24,7 +24,7 @@ class EstimatorCase(SamplerCase):
     seam = "estimator"
 
     def build(self, occupancy: Occupancy | None) -> Any:
-        return build_estimator(self.name, aabb=box(), occupancy=occupancy)
+        return build_estimator(self.name, aabb=box(), occupancy=occupancy, **self.options)
 
     def teach(self, sampler: Any, scene: Slab) -> None:
         sampler.train()

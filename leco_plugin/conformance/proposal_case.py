@@ -22,6 +22,7 @@ class ProposalCase(SamplerCase):
     """A sampler called as (ray_bundle, density_fns=...) -> (ray_samples, weights, samples)."""
 
     seam = "proposal"
+    imports = ("torch", "nerfstudio.model_components.ray_samplers")
 
     def build(self, occupancy: Occupancy | None) -> Any:
         from nerfstudio.model_components.ray_samplers import UniformLinDispPiecewiseSampler
@@ -32,6 +33,7 @@ class ProposalCase(SamplerCase):
             num_samples=NUM_SAMPLES,
             initial_sampler=UniformLinDispPiecewiseSampler(),
             single_jitter=False,
+            **self.options,
         )
 
     def teach(self, sampler: Any, scene: Slab) -> None:

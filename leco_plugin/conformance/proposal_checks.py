@@ -98,7 +98,7 @@ def sorted_disjoint_inside(case: ProposalCase) -> None:
 def skips_only_what_it_may(case: ProposalCase) -> None:
     """Samples gather in what is kept, from where a ray enters it to where it leaves."""
     rays = crossing()
-    enters, leaves = _chords(rays)
+    enters, leaves = chords(rays)
     long = leaves - enters >= CHORD
     ray_indices, t_starts, t_ends = case.sample(case.shared(SLAB), rays)
     middles = (t_starts + t_ends) / 2.0
@@ -117,7 +117,7 @@ def skips_only_what_it_may(case: ProposalCase) -> None:
         require(bare == 0, f"{bare} rays have no sample in the {half} half of what is kept")
 
 
-def _chords(rays: Rays) -> tuple[Tensor, Tensor]:
+def chords(rays: Rays) -> tuple[Tensor, Tensor]:
     """Where each ray enters and leaves the slab, [n_rays] each, to a hundredth; 0 if never."""
     t = torch.arange(0.0, 8.0, 0.01)
     positions = rays.origins[:, None] + rays.directions[:, None] * t[:, None]

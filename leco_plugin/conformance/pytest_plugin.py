@@ -9,10 +9,13 @@ import pytest
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:
-    parser.getgroup("leco", "conformance of leco_plugin").addoption(
-        "--leco-sampler",
-        action="append",
-        default=[],
-        metavar="NAME",
-        help="sampler to hold to the rules, with --pyargs leco_plugin.conformance; may be repeated",
-    )
+    group = parser.getgroup("leco", "conformance of leco_plugin")
+    for option, what in (("--leco-sampler", "sampler"), ("--leco-method", "nerfstudio method")):
+        group.addoption(
+            option,
+            action="append",
+            default=[],
+            metavar="NAME",
+            help=f"{what} to hold to the rules, with --pyargs leco_plugin.conformance; may be "
+            "repeated",
+        )

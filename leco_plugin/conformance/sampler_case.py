@@ -29,11 +29,14 @@ class SamplerCase(ABC):
     """
 
     seam: ClassVar[str]
+    imports: ClassVar[tuple[str, ...]] = ("torch",)
+    """Modules behind the samplers at this seam that take time to import."""
 
     def __init__(self, name: str) -> None:
         self.name = name
         spec = sampler_spec(name)
         self.needs_occupancy = spec.needs_occupancy
+        self.options = dict(spec.check_options)
         self.gate_encoding = cast(Kind, spec.gate_encoding or "frequency")
         self._shared: dict[Slab, tuple[Any, Occupancy]] = {}
 

@@ -2,15 +2,26 @@
 
 from __future__ import annotations
 
+import functools
 import io
 
 import torch
+from torch import nn
 
 from leco_plugin.conformance.intervals import PARTS, check_inside, same
 from leco_plugin.conformance.rule import require
 from leco_plugin.conformance.sampler_case import SamplerCase
-from leco_plugin.conformance.scene import EVERYTHING, OTHER, SLAB, Field, crossing, cut_short
+from leco_plugin.conformance.scene import (
+    EVERYTHING,
+    OTHER,
+    SLAB,
+    Field,
+    Rays,
+    crossing,
+    cut_short,
+)
 from leco_plugin.conformance.two_processes import on_two_ranks
+from leco_plugin.samplers.marching import Samples
 
 
 def deterministic_in_eval(case: SamplerCase) -> None:
@@ -65,5 +76,25 @@ def state_dict_round_trip(case: SamplerCase) -> None:
 
 def two_processes(case: SamplerCase) -> None:
     """Two ranks that train side by side sample alike."""
-    one, other = on_two_ranks(case)
+    work = functools.partial(samples_after_a_step, type(case), case.name)
+    one, other = on_two_ranks(work, case.imports)
     require(same(one, other), "two ranks with the same buffers sample the same rays differently")
+
+
+def samples_after_a_step(kind: type[SamplerCase], name: str, rank: int) -> Samples:
+    """Samples in evaluation after a training step on the rank's own rays, of a sampler that each
+    process finds by its name."""
+    case, rays = kind(name), crossing()
+    sampler = case.shared(SLAB).train()
+    own = Rays(*(tensor[rank::2] for tensor in rays))
+    case.colours(sampler, own, Field()).sum().backward()
+    _share(sampler)
+    return case.sample(sampler.eval(), rays, seed=rank)
+
+
+def _share(sampler: nn.Module) -> None:
+    """What data-parallel training does before each step: all ranks take what rank 0 holds."""
+    for tensor in (*sampler.parameters(), *sampler.buffers()):
+        held = tensor.detach().clone(memory_format=torch.contiguous_format)
+        torch.distributed.broadcast(held, src=0)
+        tensor.detach().copy_(held)

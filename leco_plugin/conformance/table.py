@@ -5,7 +5,7 @@ from __future__ import annotations
 import sys
 from pathlib import Path
 
-from leco_plugin.conformance.sampler_rules import SAMPLER_RULES
+from leco_plugin.conformance.checking import RULES
 
 BEGIN, END = "<!-- rules: generated -->", "<!-- end of the rules -->"
 
@@ -15,7 +15,7 @@ def rules_table() -> str:
     rows = ["| rule | seams | why it matters | remedy |", "|---|---|---|---|"]
     rows += [
         f"| `{rule.name}` | {', '.join(rule.checks)} | {rule.reason} | {rule.remedy} |"
-        for rule in SAMPLER_RULES
+        for rule in RULES
     ]
     return "\n".join(rows)
 

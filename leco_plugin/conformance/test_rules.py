@@ -1,4 +1,7 @@
-"""One test a rule and seam: pytest --pyargs leco_plugin.conformance --leco-sampler NAME."""
+"""One test a rule and seam: pytest --pyargs leco_plugin.conformance --leco-sampler NAME.
+
+Of a guided host, --leco-method NAME.
+"""
 
 from __future__ import annotations
 
@@ -6,22 +9,24 @@ import warnings
 
 import pytest
 
-from leco_plugin.conformance.checking import pairs, sampler_cases
+from leco_plugin.conformance.checking import host_cases, pairs, sampler_cases
 from leco_plugin.conformance.rule import Broken, Case, Rule, apply
-from leco_plugin.conformance.sampler_rules import SAMPLER_RULES
 
 
 def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:
-    names: list[str] = metafunc.config.getoption("--leco-sampler")
-    if not names:
-        raise pytest.Collector.CollectError("name what to check: --leco-sampler NAME")
+    samplers: list[str] = metafunc.config.getoption("--leco-sampler")
+    methods: list[str] = metafunc.config.getoption("--leco-method")
+    if not samplers and not methods:
+        wanted = "--leco-sampler NAME or --leco-method NAME"
+        raise pytest.Collector.CollectError(f"name what to check: {wanted}")
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("default")  # no import of theirs is an error, whoever runs this
-            cases = [case for name in names for case in sampler_cases(name)]
+            cases = [case for name in samplers for case in sampler_cases(name)]
+            cases += [case for name in methods for case in host_cases(name)]
     except ValueError as error:
         raise pytest.Collector.CollectError(str(error)) from None
-    found = pairs(cases, SAMPLER_RULES)
+    found = pairs(cases)
     labels = [f"{case.name}-{case.seam}-{rule.name}" for rule, case in found]
     metafunc.parametrize(("rule", "case"), found, ids=labels)
 

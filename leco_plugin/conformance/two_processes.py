@@ -6,36 +6,37 @@ import os
 import socket
 import tempfile
 import time
+from collections.abc import Callable, Sequence
 from datetime import timedelta
 from pathlib import Path
+from typing import Any
 
 import torch
 import torch.multiprocessing
-from torch import nn
 
 from leco_plugin.conformance.rule import Broken, require
-from leco_plugin.conformance.sampler_case import SamplerCase
-from leco_plugin.conformance.scene import SLAB, Field, Rays, crossing
-from leco_plugin.samplers.marching import Samples
 
 PATIENCE, PATIENCE_OF_A_RANK = 280.0, 120.0
 """Seconds in all, and seconds that a rank waits for the other: a busy machine takes a minute for
 what an idle one does in five seconds."""
 
+SERVER = "forkserver"
+"""Starts processes that share what it has imported, and so takes those seconds only once."""
 
-def on_two_ranks(case: SamplerCase) -> list[Samples]:
-    """Samples of the same rays in evaluation, of each rank, after a training step.
 
-    Each process finds the sampler anew by its name.
+def on_two_ranks(work: Callable[[int], Any], imports: Sequence[str] = ("torch",)) -> list[Any]:
+    """What a function returns on each of two ranks, which a process group connects meanwhile.
+
+    Args:
+        work: takes the rank; can be pickled, and returns what `torch.load` reads without unpickling
+            foreign types.
+        imports: modules that it needs and that take time to import.
 
     Raises:
         Broken: a rank failed, or the two wait for each other.
     """
     with tempfile.TemporaryDirectory() as folder:
-        ranks = torch.multiprocessing.spawn(
-            _rank, args=(type(case), case.name, folder), nprocs=2, join=False
-        )
-        require(ranks is not None, "no processes could be started")
+        ranks = _started(work, imports, folder)
         deadline = time.monotonic() + PATIENCE
         try:
             while not ranks.join(timeout=1.0):
@@ -48,12 +49,33 @@ def on_two_ranks(case: SamplerCase) -> list[Samples]:
         return [torch.load(_left_by(rank, folder), weights_only=True) for rank in range(2)]
 
 
+def _started(work: Callable[[int], Any], imports: Sequence[str], folder: str) -> Any:
+    """Both processes, at their work."""
+    methods = torch.multiprocessing.get_all_start_methods()
+    if SERVER in methods:
+        torch.multiprocessing.set_forkserver_preload(list(imports))
+    before = os.environ.get("PYTHONWARNINGS")
+    os.environ["PYTHONWARNINGS"] = "ignore"  # what they import has said its own in this process
+    try:
+        return torch.multiprocessing.start_processes(
+            _rank,
+            args=(work, folder),
+            nprocs=2,
+            join=False,
+            start_method=SERVER if SERVER in methods else "spawn",
+        )
+    finally:
+        del os.environ["PYTHONWARNINGS"]
+        if before is not None:
+            os.environ["PYTHONWARNINGS"] = before
+
+
 def _left_by(rank: int, folder: str) -> Path:
     return Path(folder) / f"rank-{rank}.pt"
 
 
-def _rank(rank: int, kind: type[SamplerCase], name: str, folder: str) -> None:
-    """What each process does: one step on its own rays with its own random numbers."""
+def _rank(rank: int, work: Callable[[int], Any], folder: str) -> None:
+    """What each process does, with its own random numbers."""
     torch.set_num_threads(1)
     torch.manual_seed(rank)
     loopback = {"lo", "lo0"} & {interface for _, interface in socket.if_nameindex()}
@@ -66,19 +88,5 @@ def _rank(rank: int, kind: type[SamplerCase], name: str, folder: str) -> None:
         world_size=2,
         timeout=timedelta(seconds=PATIENCE_OF_A_RANK),
     )
-    case, rays = kind(name), crossing()
-    sampler = case.shared(SLAB).train()
-    own = Rays(*(tensor[rank::2] for tensor in rays))
-    case.colours(sampler, own, Field()).sum().backward()
-    _share(sampler)
-    samples = case.sample(sampler.eval(), rays, seed=rank)
-    torch.save(samples, _left_by(rank, folder))
+    torch.save(work(rank), _left_by(rank, folder))
     torch.distributed.destroy_process_group()
-
-
-def _share(sampler: nn.Module) -> None:
-    """What data-parallel training does before each step: all ranks take what rank 0 holds."""
-    for tensor in (*sampler.parameters(), *sampler.buffers()):
-        held = tensor.detach().clone(memory_format=torch.contiguous_format)
-        torch.distributed.broadcast(held, src=0)
-        tensor.detach().copy_(held)

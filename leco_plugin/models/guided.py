@@ -22,6 +22,7 @@ from nerfstudio.models.base_model import Model, ModelConfig
 
 from leco_plugin.compat.checkpoints import allow_checkpoint_globals
 from leco_plugin.compat.host_lpips import setup_with_lazy_lpips
+from leco_plugin.compat.host_outputs import with_counts_as_floats
 from leco_plugin.models.guide import Guide
 from leco_plugin.models.guided_start import (
     OWN_SAMPLER,
@@ -75,7 +76,7 @@ def set_up_guided(config: GuidedModelConfig, **arguments: Any) -> Model:
     file = occupancy_file(config.occupancy.path)
     if guide.needs_occupancy and file is not None and file.exists():
         guide.set_occupancy(Occupancy.load(file))
-    host = setup_with_lazy_lpips(host_config, **arguments)
+    host = with_counts_as_floats(setup_with_lazy_lpips(host_config, **arguments))
     host.guide = guide
     swap_sampler(host, guide)
     _begin_with_occupancy(host, guide, config.occupancy)
@@ -87,7 +88,7 @@ def _as_it_is(host_config: ModelConfig, arguments: dict[str, Any]) -> Model:
     from leco_plugin.samplers import nerfacc_cpu
 
     nerfacc_cpu.install()
-    return setup_with_lazy_lpips(host_config, **arguments)
+    return with_counts_as_floats(setup_with_lazy_lpips(host_config, **arguments))
 
 
 def _begin_with_occupancy(host: Model, guide: Guide, config: OccupancyConfig) -> None:

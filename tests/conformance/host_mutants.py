@@ -1,0 +1,316 @@
+"""Guided methods that are broken in one way each, and the rule that must say so.
+
+They stand in a distribution of their own (`mutant_plugin.py`), as methods, samplers and adapters of
+another package would.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import torch
+from conformance.estimator_mutants import Answers, rank
+from conformance.proposal_mutants import SoundProposal
+from nerfstudio.cameras.rays import RayBundle, RaySamples
+from nerfstudio.engine.optimizers import AdamOptimizerConfig
+from nerfstudio.engine.schedulers import ExponentialDecaySchedulerConfig
+from nerfstudio.engine.trainer import TrainerConfig
+from nerfstudio.models.base_model import Model, ModelConfig
+from nerfstudio.models.instant_ngp import InstantNGPModelConfig, NGPModel
+from nerfstudio.models.nerfacto import NerfactoModel, NerfactoModelConfig
+from nerfstudio.pipelines.base_pipeline import VanillaPipelineConfig
+from nerfstudio.plugins.types import MethodSpecification
+from torch import Tensor, nn
+
+from leco_plugin.models.guide import Guide
+from leco_plugin.models.guided import GuidedModelConfig
+from leco_plugin.models.guided_start import OccupancyConfig
+from leco_plugin.models.seams import HostAdapter
+from leco_plugin.samplers import nerfacc_cpu
+from leco_plugin.samplers.marching import Samples
+from leco_plugin.samplers.registry import SamplerSpec
+
+PACKED = InstantNGPModelConfig(
+    log2_hashmap_size=8,
+    max_res=64,
+    grid_resolution=8,
+    grid_levels=1,
+    render_step_size=0.05,
+    cone_angle=0.0,
+    background_color="white",
+)
+SCOUT = {"hidden_dim": 8, "log2_hashmap_size": 8, "num_levels": 2, "max_res": 32}
+PROPOSAL = NerfactoModelConfig(
+    implementation="torch",
+    num_levels=2,
+    max_res=64,
+    log2_hashmap_size=8,
+    hidden_dim=16,
+    hidden_dim_color=16,
+    proposal_net_args_list=[SCOUT, SCOUT],
+    num_proposal_samples_per_ray=(24, 16),
+    num_nerf_samples_per_ray=32,
+)
+
+
+def packed(
+    model: type = NGPModel, sampler: str = "Sound", config: ModelConfig = PACKED
+) -> GuidedModelConfig:
+    """A small packed host, guided."""
+    host = replace(config, _target=model)
+    return GuidedModelConfig(host=host, occupancy=OccupancyConfig(sampler=sampler))
+
+
+def proposal(model: type = NerfactoModel, sampler: str = "SoundProposal") -> GuidedModelConfig:
+    """A small proposal host, guided."""
+    host = replace(PROPOSAL, _target=model)
+    return GuidedModelConfig(host=host, occupancy=OccupancyConfig(sampler=sampler))
+
+
+class FlatAccumulation(NGPModel):
+    def get_outputs(self, ray_bundle: RayBundle) -> dict[str, Any]:
+        outputs = super().get_outputs(ray_bundle)
+        return outputs | ({} if self.training else {"accumulation": outputs["accumulation"][:, 0]})
+
+
+class TwoChannels(NGPModel):
+    """Of which no picture can be made."""
+
+    def get_outputs(self, ray_bundle: RayBundle) -> dict[str, Any]:
+        outputs = super().get_outputs(ray_bundle)
+        return outputs | {"flow": outputs["rgb"][:, :2]}
+
+
+class CountsInImages(NGPModel):
+    """Renders in a way of its own, and integers among the rest."""
+
+    def get_outputs_for_camera(self, camera: Any, obb_box: Any = None) -> dict[str, Any]:
+        images = super().get_outputs_for_camera(camera, obb_box)
+        return images | {"counts": images["num_samples_per_ray"].long()}
+
+
+class Grainy(NerfactoModel):
+    def get_outputs(self, ray_bundle: RayBundle) -> dict[str, Any]:
+        outputs = super().get_outputs(ray_bundle)
+        grain = 1e-4 * torch.rand_like(outputs["rgb"]) * (not self.training)
+        return outputs | {"rgb": outputs["rgb"] + grain}
+
+
+class NeverShaken(NGPModel):
+    """Keeps its sampler in evaluation, say to save the first pass over the densities."""
+
+    def get_outputs(self, ray_bundle: RayBundle) -> dict[str, Any]:
+        self.sampler.eval()
+        return super().get_outputs(ray_bundle)
+
+
+class LearnsNothing(NGPModel):
+    def get_loss_dict(self, *args: Any, **options: Any) -> dict[str, Tensor]:
+        return {name: 0.0 * loss for name, loss in super().get_loss_dict(*args, **options).items()}
+
+
+class Thaws(NerfactoModel):
+    """Has everything trained that it holds."""
+
+    def get_param_groups(self) -> dict[str, list[nn.Parameter]]:
+        self.requires_grad_(True)
+        return super().get_param_groups()
+
+
+class KeepsScouts(NerfactoModel):
+    """Comes with an adapter that forgets the proposal networks."""
+
+
+class KeepsGrid(NGPModel):
+    """Comes with an adapter that exchanges the grid in one of its two places."""
+
+
+class GuidedTwice(NGPModel):
+    """Comes with an adapter that has the gate in the checkpoint twice."""
+
+
+class FillsUp(NGPModel):
+    """Shades a whole ray in each batch, lest the field forget what free space is."""
+
+    def get_outputs(self, ray_bundle: RayBundle) -> dict[str, Any]:
+        edges = torch.linspace(0.1, 6.0, 20)[None, :, None]
+        whole: RaySamples = ray_bundle[:1].get_ray_samples(edges[:, :-1], edges[:, 1:])
+        self.field(whole)
+        return super().get_outputs(ray_bundle)
+
+
+class SamplesElsewhere(NGPModel):
+    """Has the sampler look at a scene that was moved."""
+
+    def get_outputs(self, ray_bundle: RayBundle) -> dict[str, Any]:
+        ray_bundle.origins = ray_bundle.origins - torch.tensor([0.5, -1.0, 2.0])
+        return super().get_outputs(ray_bundle)
+
+
+class DividesByOpacity(NGPModel):
+    def get_outputs(self, ray_bundle: RayBundle) -> dict[str, Any]:
+        outputs = super().get_outputs(ray_bundle)
+        return outputs | {"depth": outputs["depth"] / outputs["accumulation"]}
+
+
+class ForgetsBackground(NGPModel):
+    def get_outputs(self, ray_bundle: RayBundle) -> dict[str, Any]:
+        outputs = super().get_outputs(ray_bundle)
+        return outputs | {"rgb": outputs["rgb"] * (outputs["accumulation"] > 0.0)}
+
+
+class EverySecond(Answers):
+    """Takes what lies between two samples for sampled."""
+
+    def change(self, ray_indices: Tensor, t_starts: Tensor, t_ends: Tensor) -> Samples:
+        return ray_indices[::2], t_starts[::2], t_ends[::2]
+
+
+class NearHalf(SoundProposal):
+    """Draws from the nearer half of the places that are worth something."""
+
+    def worth(self, positions: Tensor) -> Tensor:
+        worth = super().worth(positions)
+        return worth * (worth.cumsum(dim=-2) <= 0.5 * worth.sum(dim=-2, keepdim=True))
+
+
+class Measures(NGPModel):
+    """In a unit that it makes up when it is built."""
+
+    def populate_modules(self) -> None:
+        super().populate_modules()
+        self.unit = float(1.0 + torch.rand(()))
+
+    def get_outputs(self, ray_bundle: RayBundle) -> dict[str, Any]:
+        outputs = super().get_outputs(ray_bundle)
+        return outputs | {"depth": self.unit * outputs["depth"]}
+
+
+@dataclass
+class WithFunction(InstantNGPModelConfig):
+    """A config that no file can hold"""
+
+    activation: Callable[[Any], Any] = field(default_factory=lambda: lambda value: value)
+
+
+class CountsSteps(NerfactoModel):
+    """Weighs its losses by a number that no checkpoint has."""
+
+    steps = 0
+
+    def get_loss_dict(self, *args: Any, **options: Any) -> dict[str, Tensor]:
+        self.steps += 1
+        losses = super().get_loss_dict(*args, **options)
+        return {name: self.steps * loss for name, loss in losses.items()}
+
+
+class LearnsOnFirstRank(NGPModel):
+    def get_loss_dict(self, *args: Any, **options: Any) -> dict[str, Tensor]:
+        losses = super().get_loss_dict(*args, **options)
+        return {name: (rank() == 0) * loss for name, loss in losses.items()}
+
+
+SOUND = {"SoundHost": packed(), "SoundProposalHost": proposal()}
+"""What all others are but for one thing."""
+HOST_MUTANTS: dict[str, dict[str, GuidedModelConfig]] = {
+    "outputs-can-be-drawn": {
+        "FlatAccumulation": packed(FlatAccumulation),
+        "TwoChannels": packed(TwoChannels),
+        "CountsInImages": packed(CountsInImages),
+    },
+    "same-image-in-eval": {"Grainy": proposal(Grainy)},
+    "samples-shift-in-training": {"NeverShakenHost": packed(NeverShaken)},
+    "teaches-the-host-alone": {
+        "LearnsNothing": packed(LearnsNothing),
+        "Thaws": proposal(Thaws),
+    },
+    "nothing-superfluous-is-left": {
+        "KeepsScouts": proposal(KeepsScouts),
+        "KeepsGrid": packed(KeepsGrid),
+        "GuidedTwice": packed(GuidedTwice),
+    },
+    "shades-only-what-is-kept": {
+        "FillsUp": packed(FillsUp),
+        "SamplesElsewhere": packed(SamplesElsewhere),
+        "UniformHost": proposal(sampler="Uniform"),
+    },
+    "state-and-yaml-round-trip": {
+        "Measures": packed(Measures),
+        "WithFunction": packed(config=WithFunction(**vars(PACKED))),
+    },
+    "empty-rays-show-background": {
+        "DividesByOpacity": packed(DividesByOpacity),
+        "ForgetsBackground": packed(ForgetsBackground),
+    },
+    "guided-by-everything-is-dense": {
+        "EverySecondHost": packed(sampler="EverySecond"),
+        "NearHalfHost": proposal(sampler="NearHalf"),
+    },
+    "resumes-where-it-stopped": {"CountsSteps": proposal(CountsSteps)},
+    "two-processes-step-alike": {"LearnsOnFirstRank": packed(LearnsOnFirstRank)},
+}
+"""By the rule that must fail, methods by name."""
+METHODS = {
+    **SOUND,
+    "Unguided": PACKED,
+    **{name: model for family in HOST_MUTANTS.values() for name, model in family.items()},
+}
+SAMPLERS = {
+    "EverySecond": SamplerSpec("", estimator=EverySecond, needs_occupancy=True),
+    "NearHalf": SamplerSpec("", proposal=NearHalf, needs_occupancy=True),
+}
+
+
+def _exchange_sampler_only(host: Any, guide: Guide) -> None:
+    old = host.proposal_sampler
+    host.proposal_sampler = guide.proposal(
+        num_samples=old.num_nerf_samples_per_ray, initial_sampler=old.initial_sampler
+    )
+
+
+def _exchange_once(host: Any, guide: Guide) -> None:
+    nerfacc_cpu.install()
+    host.sampler.occupancy_grid = guide.estimator(host.scene_aabb.detach())
+
+
+def _exchange_and_hold(host: Any, guide: Guide) -> None:
+    _exchange_once(host, guide)
+    host.occupancy_grid = host.sampler.occupancy_grid
+    host.my_guide = guide
+
+
+def _adapter(kind: type[Model], swap: Callable[[Any, Guide], None]) -> HostAdapter:
+    return HostAdapter(kind.__name__, lambda host: isinstance(host, kind), swap)
+
+
+ADAPTERS = {
+    "forgets_scouts": _adapter(KeepsScouts, _exchange_sampler_only),
+    "forgets_grid": _adapter(KeepsGrid, _exchange_once),
+    "guides_twice": _adapter(GuidedTwice, _exchange_and_hold),
+}
+
+
+def _method(name: str, model: ModelConfig) -> MethodSpecification:
+    rate = {
+        "optimizer": AdamOptimizerConfig(lr=1e-2),
+        "scheduler": ExponentialDecaySchedulerConfig(lr_final=1e-3, max_steps=100),
+    }
+    config = TrainerConfig(
+        method_name=name,
+        pipeline=VanillaPipelineConfig(model=model),
+        optimizers={group: rate for group in ("fields", "proposal_networks", "camera_opt")},
+    )
+    return MethodSpecification(config, name)
+
+
+def __getattr__(name: str) -> Any:
+    """Entry points name what they mean in lower case, adapters as they are called."""
+    for title, model in METHODS.items():
+        if title.lower() == name:
+            return _method(title, model)
+    found = {**{title.lower(): spec for title, spec in SAMPLERS.items()}, **ADAPTERS}
+    if name not in found:
+        raise AttributeError(name)
+    return found[name]
