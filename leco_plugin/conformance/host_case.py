@@ -129,9 +129,7 @@ def callbacks(model: Model, optimizers: Any = None) -> list[TrainingCallback]:
         return model.get_training_callbacks(attributes)
 
 
-def loss_of(
-    model: Model, rays: RayBundle, batch: dict[str, Tensor], forward: Any = None
-) -> Tensor:
+def loss_of(model: Model, rays: RayBundle, batch: dict[str, Tensor], forward: Any = None) -> Tensor:
     """The loss of a batch, as nerfstudio's pipeline and trainer compute it.
 
     Args:

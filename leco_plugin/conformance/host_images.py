@@ -78,9 +78,7 @@ def same_image_in_eval(case: HostCase) -> None:
     model = case.shared()
     one, other = (rendered(model, bundle(), seed) for seed in (1, 2))
     for name, value in one.items():
-        require(
-            value.equal(other[name]), f"two evaluations of the same rays differ in {name!r}"
-        )
+        require(value.equal(other[name]), f"two evaluations of the same rays differ in {name!r}")
 
 
 @torch.no_grad()

@@ -179,7 +179,7 @@ class Lifecycle:
         if self.trainer is not None:
             for optimizer in self.trainer.optimizers.optimizers.values():
                 optimizer.state.clear()
-        CONSOLE.log("\\[leco] the field starts anew, guided from its first step")
+        say("the field starts anew, guided from its first step")
 
     @cached_property
     def probe_positions(self) -> Tensor:
