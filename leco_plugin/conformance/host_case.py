@@ -103,7 +103,8 @@ def guided(name: str, file: Path) -> tuple[TrainerConfig, Kind]:
         )
     if not isinstance(model, GuidedModelConfig):
         config = with_sampler_swapped(config, file)
-    occupancy: Any = config.pipeline.model.occupancy
+    guided: Any = config.pipeline.model
+    occupancy = guided.occupancy
     spec = None if occupancy.sampler == "own" else sampler_spec(occupancy.sampler)
     if spec is None or not spec.needs_occupancy:
         raise InputError(f"{name} is guided by no occupancy: its sampler is {occupancy.sampler!r}")

@@ -30,14 +30,14 @@ if TYPE_CHECKING:
 CHANNELS = {"rgb": 3, "depth": 1, "accumulation": 1}
 """Outputs that nerfstudio's commands rely on."""
 TOLERANCE = {True: 1e-3, False: 0.25}
-"""Of a packed host, and of one with a fixed number of samples, which are few: the largest difference
-between guided by everything and dense, as a share of the largest value."""
+"""Of a packed host, and of one with a fixed number of samples, which are few: the largest
+difference between guided by everything and dense, as a share of the largest value."""
 OPAQUE = 1e-4
 """Accumulation up to which a ray has met nothing."""
 
 
 def outputs_can_be_drawn(case: HostCase) -> None:
-    """Colour, depth and accumulation have their channels, and every output can be made a picture."""
+    """Colour, depth and accumulation have their channels; every output can be made a picture."""
     for device in devices():
         model = case.shared().to(device)
         rays = bundle().to(device)

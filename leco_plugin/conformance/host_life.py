@@ -1,4 +1,4 @@
-"""Checks of a guided host beyond one process: config, checkpoint, resuming, data-parallel training."""
+"""Checks of a guided host beyond one process: config, checkpoint, resuming, data parallel."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ ROUNDING = 1e-3
 
 def state_and_yaml_round_trip(case: HostCase) -> None:
     """A run folder is all that it takes: its config.yml, its checkpoint, and no other file."""
-    import yaml
+    import yaml  # type: ignore[import-untyped]
 
     model = case.shared()
     expected = rendered(model, bundle())

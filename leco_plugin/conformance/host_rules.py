@@ -43,7 +43,7 @@ HOST_RULES = (
         name="nothing-superfluous-is-left",
         reason="grids and proposal networks that nobody asks any more take memory, make "
         "checkpoints large, and slow down each step of an optimizer and of data-parallel training.",
-        remedy="have the HostAdapter remove what the guide stands for from the host's modules; hold "
+        remedy="have the HostAdapter remove what the guide stands for from the host; hold "
         "proposal densities in a list of bound methods, which the built-in adapter finds.",
         checks={HOST: host_training.nothing_superfluous_is_left},
     ),
@@ -83,7 +83,7 @@ HOST_RULES = (
     Rule(
         name="resumes-where-it-stopped",
         reason="long runs are interrupted, and go on from a checkpoint with what it holds alone.",
-        remedy="keep what a step depends on in parameters, buffers or the extra state, or derive it "
+        remedy="keep what a step depends on in parameters, buffers or extra state, or derive it "
         "in update_to_step, which nerfstudio calls before it loads the state.",
         checks={HOST: host_life.resumes_where_it_stopped},
     ),
@@ -91,7 +91,7 @@ HOST_RULES = (
         name="two-processes-step-alike",
         reason="data-parallel training averages the ranks' gradients: a host that does something "
         "else on one of them learns another scene with --machine.num-devices 2, or hangs.",
-        remedy="make the loss a mean over rays, let nothing depend on the rank, and hold no buffers "
+        remedy="make the loss a mean over rays, let nothing depend on the rank, hold no buffers "
         "of types that ranks cannot send (int16).",
         checks={HOST: host_life.two_processes_step_alike},
     ),

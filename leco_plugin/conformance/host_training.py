@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import torch
 from torch import Tensor
@@ -37,7 +37,7 @@ def _places(model: Model, seed: int) -> Tensor:
 
 def teaches_the_host_alone(case: HostCase) -> None:
     """A step moves the host's parameters, and never the frozen gate."""
-    model = case.shared()
+    model: Any = case.shared()
     groups = model.get_param_groups()
     handed_out = {id(parameter) for group in groups.values() for parameter in group}
     gradients = gradients_of_a_step(model)

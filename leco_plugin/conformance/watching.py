@@ -70,7 +70,7 @@ def _answers_noted(seam: GuidedEstimator | GuidedProposal, sampled: list[Tensor]
         with note:
             yield
         return
-    original = seam.sampling
+    original: Any = seam.sampling
 
     def sampling(rays_o: Tensor, rays_d: Tensor, *args: Any, **kwargs: Any) -> Samples:
         samples: Samples = original(rays_o, rays_d, *args, **kwargs)

@@ -1,4 +1,4 @@
-"""A distribution that holds the mutants, as another package's samplers and methods would be installed."""
+"""A distribution that holds the mutants, installed as another package's would be."""
 
 from __future__ import annotations
 
