@@ -16,7 +16,14 @@ from torch import Tensor, nn
 from leco_plugin.models.gate import Gate, GateConfig
 from leco_plugin.occupancy import Occupancy
 from leco_plugin.samplers.base import Estimator
-from leco_plugin.samplers.registry import build_estimator, build_proposal, samplers
+from leco_plugin.samplers.registry import (
+    SamplerSpec,
+    build_estimator,
+    build_proposal,
+    sampler_spec,
+)
+from leco_plugin.scenes.frames import box_around
+from leco_plugin.scenes.input_error import InputError
 from leco_plugin.space import Space
 
 
@@ -47,14 +54,21 @@ class Guide(nn.Module):
         """Whether the sampler asks a gate at all; a grid does not.
 
         Raises:
-            ValueError: there is no such sampler.
+            InputError: there is no such sampler.
         """
-        known = samplers()
-        if self.sampler not in known:
-            raise ValueError(
-                f"there is no sampler {self.sampler!r}; there are {', '.join(sorted(known))}"
+        return self._spec().needs_occupancy
+
+    def _spec(self, kind: str | None = None) -> SamplerSpec:
+        """What is registered under the sampler's name, and serves this kind of hosts."""
+        try:
+            spec = sampler_spec(self.sampler)
+        except ValueError as error:
+            raise InputError(str(error)) from None
+        if kind is not None and getattr(spec, kind) is None:
+            raise InputError(
+                f"the sampler {self.sampler!r} cannot go into this host: it has no {kind}"
             )
-        return known[self.sampler].needs_occupancy
+        return spec
 
     def changed(self) -> None:
         """Samplers that were made are made anew when they are next asked."""
@@ -86,13 +100,22 @@ class Guide(nn.Module):
         return torch.equal(self.frame, torch.eye(3, 4, device=self.frame.device))
 
     def estimator(self, aabb: Tensor) -> nn.Module:
-        """What goes where a packed host has its estimator; `aabb` is the box of that one, [6]."""
-        if self.needs_occupancy:
+        """What goes where a packed host has its estimator; `aabb` is the box of that one, [6].
+
+        Raises:
+            InputError: the sampler has no estimator.
+        """
+        if self._spec("estimator").needs_occupancy:
             return GuidedEstimator(self, aabb)
         return build_estimator(self.sampler, aabb=aabb)
 
     def proposal(self, **options: Any) -> Sampler:
-        """What goes where a proposal host has its sampler; options as for the registry."""
+        """What goes where a proposal host has its sampler; options as for the registry.
+
+        Raises:
+            InputError: the sampler has nothing for proposal hosts.
+        """
+        self._spec("proposal")
         return GuidedProposal(self, options)
 
     def get_extra_state(self) -> dict[str, Any]:
@@ -143,7 +166,8 @@ class GuidedEstimator(_StandIn):
         self._aabb = aabb.detach().cpu()
 
     def _build(self, guide: Guide) -> nn.Module:
-        return build_estimator(guide.sampler, aabb=self._aabb, occupancy=guide.the_occupancy())
+        aabb = self._aabb if guide.same_frame() else box_around(self._aabb, guide.frame.cpu())
+        return build_estimator(guide.sampler, aabb=aabb, occupancy=guide.the_occupancy())
 
     @functools.wraps(Estimator.sampling)
     def sampling(self, rays_o: Tensor, rays_d: Tensor, *args: Any, **kwargs: Any) -> Any:
@@ -175,9 +199,11 @@ class GuidedProposal(_StandIn, Sampler):
 
     def _build(self, guide: Guide) -> nn.Module:
         options = dict(self._options)
-        if not guide.same_frame():
-            options["frame"] = guide.frame
-        return build_proposal(guide.sampler, occupancy=guide.the_occupancy(), **options)
+        if guide.needs_occupancy:
+            options["occupancy"] = guide.the_occupancy()
+            if not guide.same_frame():
+                options["frame"] = guide.frame
+        return build_proposal(guide.sampler, **options)
 
     def forward(self, *args: Any, **kwargs: Any) -> Any:
         return self.sampler(*args, **kwargs)

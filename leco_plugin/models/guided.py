@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import copy
 import functools
+from contextlib import suppress
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -21,16 +22,17 @@ from nerfstudio.models.base_model import Model, ModelConfig
 
 from leco_plugin.compat.checkpoints import allow_checkpoint_globals
 from leco_plugin.compat.host_lpips import setup_with_lazy_lpips
+from leco_plugin.compat.host_outputs import with_counts_as_floats
 from leco_plugin.models.guide import Guide
 from leco_plugin.models.guided_start import (
     OWN_SAMPLER,
     GuidedStart,
     OccupancyConfig,
-    occupancy_file,
+    load_occupancy,
 )
 from leco_plugin.models.precision import keep_freed_memory
 from leco_plugin.models.seams import swap_sampler
-from leco_plugin.occupancy import Occupancy
+from leco_plugin.scenes.input_error import InputError
 
 
 @dataclass
@@ -54,8 +56,7 @@ def set_up_guided(config: GuidedModelConfig, **arguments: Any) -> Model:
         config: host and occupancy.
         arguments: what nerfstudio gives a model (scene_box, num_train_data, metadata, device, ...).
     Raises:
-        InputError: the host has no seam that is known, or there is no such sampler.
-        ValueError, OSError: the file is there, and is no occupancy.
+        InputError: the host has no seam that is known, or there is no such sampler for it.
     """
     allow_checkpoint_globals()
     if torch.device(arguments.get("device", "cpu")).type == "cpu":
@@ -66,10 +67,10 @@ def set_up_guided(config: GuidedModelConfig, **arguments: Any) -> Model:
     if config.occupancy.sampler == OWN_SAMPLER:
         return _as_it_is(host_config, arguments)
     guide = Guide(config.occupancy.sampler)
-    file = occupancy_file(config.occupancy.path)
-    if guide.needs_occupancy and file is not None and file.exists():
-        guide.set_occupancy(Occupancy.load(file))
-    host = setup_with_lazy_lpips(host_config, **arguments)
+    if guide.needs_occupancy and config.occupancy.path is not None:
+        with suppress(InputError):  # a checkpoint brings its own; without one, training says it
+            guide.set_occupancy(load_occupancy(config.occupancy.path))
+    host = with_counts_as_floats(setup_with_lazy_lpips(host_config, **arguments))
     host.guide = guide
     swap_sampler(host, guide)
     _begin_with_occupancy(host, guide, config.occupancy)
@@ -81,7 +82,7 @@ def _as_it_is(host_config: ModelConfig, arguments: dict[str, Any]) -> Model:
     from leco_plugin.samplers import nerfacc_cpu
 
     nerfacc_cpu.install()
-    return setup_with_lazy_lpips(host_config, **arguments)
+    return with_counts_as_floats(setup_with_lazy_lpips(host_config, **arguments))
 
 
 def _begin_with_occupancy(host: Model, guide: Guide, config: OccupancyConfig) -> None:

@@ -28,7 +28,9 @@ class SamplerSpec:
     """Builds what a packed host calls (`base.Estimator`), or "module:attribute" of such. Called
     with `aabb` (the host's box, [6]), `occupancy` (None when there is none) and options."""
     proposal: Callable[..., nn.Module] | str | None = None
-    """Builds what a proposal host calls (`proposal.LearnedOccupancySampler`), likewise."""
+    """Builds what a proposal host calls (`proposal.LearnedOccupancySampler`), likewise. Called with
+    `occupancy`, `num_samples`, `initial_sampler`, `single_jitter`, and `frame` where the host's
+    coordinates are not those of the occupancy."""
     needs_occupancy: bool = False
     """Whether it asks a frozen gate."""
     gate_encoding: str | None = None
@@ -89,18 +91,27 @@ def build_proposal(name: str, **options: Any) -> nn.Module:
     return _build(name, "proposal", options)
 
 
-def _build(name: str, kind: str, options: dict[str, Any]) -> nn.Module:
+def sampler_spec(name: str) -> SamplerSpec:
+    """The sampler of that name.
+
+    Raises:
+        ValueError: there is none.
+    """
     known = samplers()
     if name not in known:
         raise ValueError(f"there is no sampler {name!r}; there are {', '.join(sorted(known))}")
-    spec = known[name]
+    return known[name]
+
+
+def _build(name: str, kind: str, options: dict[str, Any]) -> nn.Module:
+    spec = sampler_spec(name)
     builder = getattr(spec, kind)
     if builder is None:
         raise ValueError(f"sampler {name!r} has nothing for hosts that call a {kind}")
     if spec.needs_occupancy and options.get("occupancy") is None:
         raise ValueError(f"sampler {name!r} needs an occupancy")
-    if spec.gate_encoding is not None:
-        _check_gate(name, spec.gate_encoding, options.get("occupancy"))
+    if spec.needs_occupancy:
+        check_gate(name, getattr(getattr(options["occupancy"], "gate", None), "config", None))
     if isinstance(builder, str):
         module, _, attribute = builder.partition(":")
         builder = getattr(importlib.import_module(module), attribute)
@@ -108,10 +119,15 @@ def _build(name: str, kind: str, options: dict[str, Any]) -> nn.Module:
     return estimator
 
 
-def _check_gate(name: str, wanted: str, occupancy: Any) -> None:
-    config = getattr(getattr(occupancy, "gate", None), "config", None)
+def check_gate(name: str, config: Any) -> None:
+    """Whether a sampler can ask gates of this config (`GateConfig`; None is no gate).
+
+    Raises:
+        ValueError: there is no such sampler, or it asks gates on other features.
+    """
+    wanted = sampler_spec(name).gate_encoding
     found = config.encoding.kind if config is not None else "no"
-    if found != wanted:
+    if wanted not in (None, found):
         raise ValueError(
             f"sampler {name!r} asks a gate on {wanted} features, and this occupancy's is on "
             f"{found} features; learn one with `ns-train leco-occupancy "
