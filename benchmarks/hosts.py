@@ -20,7 +20,7 @@ from nerfstudio.engine.trainer import TrainerConfig
 from leco_plugin.evaluation.json_file import write_json
 from leco_plugin.evaluation.machine import describe_machine
 from leco_plugin.evaluation.timed_run import timed_run
-from leco_plugin.host_configs import leco_nerfacto, leco_ngp
+from leco_plugin.host_configs import leco_nerfacto, leco_ngp, leco_switch_nerf
 from leco_plugin.models.guided_start import OWN_SAMPLER
 
 GUIDED = "learned-occupancy"
@@ -29,6 +29,9 @@ METHODS: dict[str, tuple[TrainerConfig, str, str]] = {
     "instant-ngp": (leco_ngp.config, OWN_SAMPLER, "occupancy-grid"),
     "leco-nerfacto": (leco_nerfacto.config, GUIDED, GUIDED),
     "nerfacto": (leco_nerfacto.config, OWN_SAMPLER, "proposal-networks"),
+    "leco-switch-nerf": (leco_switch_nerf.config, GUIDED, GUIDED),
+    "switch-nerf": (leco_switch_nerf.config, OWN_SAMPLER, "coarse-fine"),
+    "switch-nerf-grid": (leco_switch_nerf.config, OWN_SAMPLER, "occupancy-grid"),
 }
 
 
@@ -36,7 +39,7 @@ def main(
     data: Path,
     out: Path,
     seconds: float = 60.0,
-    learn_seconds: float = 25.0,
+    learn_seconds: float | None = None,
     seeds: tuple[int, ...] = (0, 1, 2),
     methods: tuple[str, ...] = tuple(METHODS),
 ) -> None:
@@ -46,7 +49,8 @@ def main(
         data: A scene in nerfstudio's format.
         out: JSON file of the results; existing runs in it are kept.
         seconds: Training time of each run.
-        learn_seconds: Of which the guided ones learn their occupancy for about this long.
+        learn_seconds: Of which the guided ones learn their occupancy for about this long; None is
+            as many steps as leco-occupancy.
         seeds: Seeds.
         methods: Which of them.
     """
@@ -71,6 +75,8 @@ def main(
             config.pipeline.datamanager.data = data
             model: Any = config.pipeline.model
             model.occupancy.sampler, model.occupancy.seconds = sampler, learn_seconds
+            if method == "switch-nerf-grid":
+                model.host.sampling = "occupancy-grid"
             run, trainer = timed_run(config, seconds, sampler=called, seed=seed, images=1)
             guide = getattr(trainer.pipeline.model, "guide", None)
             if guide is not None:

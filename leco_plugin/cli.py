@@ -128,11 +128,33 @@ def demo(out: Path = Path("runs/demo"), seconds: float = 110.0, json: Path | Non
     _write_json(json, report)
 
 
+def check(name: Annotated[str, tyro.conf.Positional], json: Path | None = None) -> None:
+    """Hold a sampler to the rules that hosts rely on, one line a rule.
+
+    Args:
+        name: A registered sampler, of this package or of another.
+        json: File for the verdicts as JSON.
+    """
+    from leco_plugin.conformance.checking import check_sampler
+
+    verdicts = []
+    for verdict in check_sampler(name):
+        print(verdict.line(), flush=True)
+        verdicts.append(verdict)
+    rows = [verdict.to_dict() for verdict in verdicts]
+    _write_json(json, {"format": 1, "name": name, "verdicts": rows})
+    failed = sum(not verdict.passed for verdict in verdicts)
+    if failed:
+        raise RuntimeError(f"{name} breaks {failed} of {len(verdicts)} rules")
+    print(f"{name} keeps all {len(verdicts)} rules")
+
+
 COMMANDS: dict[str, Callable[..., None]] = {
     "city": city,
     "inspect": inspect,
     "swap": swap,
     "demo": demo,
+    "check": check,
 }
 
 

@@ -19,6 +19,8 @@ from leco_plugin.method_configs import LEARNING, ON_GPU, STEPS, best_device
 from leco_plugin.models.guided import GuidedModelConfig
 from leco_plugin.models.guided_start import OccupancyConfig
 from leco_plugin.models.optimizers import FusedAdamConfig
+from leco_plugin.models.switch_nerf import SwitchNerfModelConfig
+from leco_plugin.models.switch_sizes import switch_sizes_for
 from leco_plugin.scenes.known_distances import KnownDistancePixelSamplerConfig
 from leco_plugin.scenes.photographs import LecoPhotographsDataParserConfig
 
@@ -41,23 +43,29 @@ def photographs(rays: int) -> VanillaDataManagerConfig:
     )
 
 
-def trainer(name: str, pipeline: VanillaPipelineConfig, rates: dict[str, float]) -> TrainerConfig:
-    """A method: Adam at these rates, decayed to a tenth over the run."""
+def trainer(
+    name: str,
+    pipeline: VanillaPipelineConfig,
+    rates: dict[str, float],
+    steps: int = STEPS,
+    mixed_precision: bool = ON_GPU,
+) -> TrainerConfig:
+    """A method: Adam at these rates, decayed to a tenth over its steps."""
     return TrainerConfig(
         _target=AtomicTrainer,
         method_name=name,
         machine=MachineConfig(device_type=best_device()),
-        max_num_iterations=STEPS,
+        max_num_iterations=steps,
         steps_per_save=500,
         steps_per_eval_batch=0,
         steps_per_eval_image=500,
         steps_per_eval_all_images=0,
-        mixed_precision=ON_GPU,
+        mixed_precision=mixed_precision,
         pipeline=pipeline,
         optimizers={
             group: {
                 "optimizer": FusedAdamConfig(lr=rate),
-                "scheduler": ExponentialDecaySchedulerConfig(lr_final=rate / 10.0, max_steps=STEPS),
+                "scheduler": ExponentialDecaySchedulerConfig(lr_final=rate / 10.0, max_steps=steps),
             }
             for group, rate in rates.items()
         },
@@ -120,4 +128,28 @@ leco_nerfacto = MethodSpecification(
         {"fields": 1e-2, "proposal_networks": 1e-2, "camera_opt": 1e-3},
     ),
     description="Nerfacto, guided by learned occupancy instead of its proposal networks.",
+)
+
+
+def _switch_nerf(name: str, model: ModelConfig) -> TrainerConfig:
+    """Switch-NeRF's batches, rates and steps; it chooses its precision itself."""
+    return trainer(
+        name,
+        VanillaPipelineConfig(datamanager=photographs(1024 if ON_GPU else 512), model=model),
+        {"fields": 5e-4 if ON_GPU else 5e-3},
+        steps=500_000 if ON_GPU else STEPS,
+        mixed_precision=False,
+    )
+
+
+switch_nerf_host = SwitchNerfModelConfig(sizes=switch_sizes_for(best_device()))
+
+switch_nerf = MethodSpecification(
+    config=_switch_nerf("switch-nerf", switch_nerf_host),
+    description="Switch-NeRF, unguided: coarse and fine samples, a gate among equal experts.",
+)
+
+leco_switch_nerf = MethodSpecification(
+    config=_switch_nerf("leco-switch-nerf", guided(switch_nerf_host)),
+    description="Switch-NeRF, guided by learned occupancy instead of coarse and fine samples.",
 )

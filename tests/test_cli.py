@@ -56,6 +56,42 @@ def test_city_writes_a_scene_and_says_so(tmp_path: Path) -> None:
     assert 0 < facts["test_images"] < facts["images"]
 
 
+@pytest.fixture
+def few_rules(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of the rules, those that take no time."""
+    from leco_plugin.conformance import checking
+
+    monkeypatch.setattr(checking, "SAMPLER_RULES", checking.SAMPLER_RULES[:3])
+
+
+def test_check_prints_a_line_for_each_rule(
+    few_rules: None, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert run("check", "dense", "--json", tmp_path / "verdicts.json") == 0
+    said = capsys.readouterr().out.splitlines()
+    assert said[0] == "pass  estimator  signature" and said[-1] == "dense keeps all 3 rules"
+    facts = json.loads((tmp_path / "verdicts.json").read_text())
+    assert facts["format"] == 1 and facts["name"] == "dense"
+    assert [verdict["passed"] for verdict in facts["verdicts"]] == [True] * 3
+
+
+def test_check_ends_with_status_1_when_a_rule_is_broken(
+    few_rules: None,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    from leco_plugin.samplers import registry
+
+    spec = registry.SamplerSpec("no sampler at all", estimator=lambda aabb, occupancy: object())
+    monkeypatch.setitem(registry.OURS, "object", spec)
+    assert run("check", "object", "--json", tmp_path / "verdicts.json") == 1
+    said = capsys.readouterr()
+    assert said.out.count("\n") == 3 and said.out.count("Remedy: ") == 3
+    assert said.err == "leco: object breaks 3 of 3 rules\n"
+    assert not json.loads((tmp_path / "verdicts.json").read_text())["verdicts"][0]["passed"]
+
+
 def bad_inputs(folder: Path, file: Path) -> dict[str, list[object]]:
     """Arguments that a user may well give, by what is wrong with them."""
     (folder / "text.safetensors").write_text("not an occupancy")
@@ -71,6 +107,7 @@ def bad_inputs(folder: Path, file: Path) -> dict[str, list[object]]:
         "json where a folder is": ["inspect", file, "--json", folder / "taken"],
         "no blocks": ["city", "--blocks", 0, "--out", folder / "city"],
         "a folder of other things": ["city", "--out", folder / "taken"],
+        "an unknown sampler": ["check", "grit"],
         "no time": ["demo", "--seconds", 0, "--out", folder / "demo"],
         "no number of seconds": ["demo", "--seconds", "nan", "--out", folder / "demo"],
     }

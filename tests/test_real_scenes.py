@@ -9,6 +9,7 @@ import pytest
 import torch
 
 from leco_plugin.evaluation.timed_run import psnr_on_rays, run_training
+from leco_plugin.host_configs import switch_nerf
 from leco_plugin.method_configs import leco_occupancy
 from leco_plugin.models.calibration import CalibrationConfig
 from leco_plugin.models.freezing import FILE_NAME
@@ -45,3 +46,27 @@ def test_a_scene_trains_freezes_and_renders_without_a_flag(
     assert occupancy.report["held_out"]
     values = occupancy.query(torch.rand(100, 3) - 0.5)
     assert bool(((values >= 0) & (values <= 1)).all())
+
+
+@pytest.mark.filterwarnings("ignore:unclosed file:ResourceWarning")
+@pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
+@pytest.mark.scenes
+@pytest.mark.slow
+@pytest.mark.parametrize("sampling", ["coarse-fine", "occupancy-grid"])
+@pytest.mark.parametrize("name", KINDS)
+def test_switch_nerf_trains_and_renders_without_a_flag(
+    name: str, sampling: str, scenes: Path, tmp_path: Path
+) -> None:
+    config = copy.deepcopy(switch_nerf.config)
+    config.pipeline.datamanager.data = scenes / name
+    config.pipeline.datamanager.train_num_rays_per_batch = 128
+    config.pipeline.model.sampling = sampling
+    config.output_dir, config.vis, config.max_num_iterations = tmp_path, "tensorboard", 20
+    config.steps_per_eval_image = 0
+    config.logging.local_writer.enable = False
+    config.set_timestamp()
+    trainer = config.setup(local_rank=0, world_size=1)
+    trainer.setup()
+    run_training(trainer)
+    assert trainer.pipeline.model.space.kind == KINDS[name]
+    assert psnr_on_rays(trainer, 200) > 7.0

@@ -3,13 +3,10 @@
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import torch
-from torch import Tensor
-
-if TYPE_CHECKING:
-    from leco_plugin.models.leco import LecoModel
+from torch import Tensor, nn
 
 
 def first_non_finite(losses: dict[str, Tensor]) -> str | None:
@@ -18,7 +15,23 @@ def first_non_finite(losses: dict[str, Tensor]) -> str | None:
     return next((name for name, value in zip(losses, values) if not math.isfinite(value)), None)
 
 
-def explain_non_finite(name: str, model: LecoModel, outputs: dict[str, Any], image: Tensor) -> str:
+def require_finite(
+    losses: dict[str, Tensor], model: nn.Module, outputs: dict[str, Any], image: Tensor
+) -> None:
+    """Refuses losses that are not finite, before a step is taken with them.
+
+    Args:
+        outputs: with `rays` and `shaded` of the batch.
+        image: what the batch was compared with.
+    Raises:
+        FloatingPointError: says which loss, and the likely cause.
+    """
+    name = first_non_finite(losses)
+    if name is not None:
+        raise FloatingPointError(explain_non_finite(name, model, outputs, image))
+
+
+def explain_non_finite(name: str, model: nn.Module, outputs: dict[str, Any], image: Tensor) -> str:
     """One line: which loss, and the first thing on its way that was not finite."""
     suspects: list[tuple[str, Tensor]] = [
         ("the training image holds values that are not finite", image),

@@ -8,20 +8,9 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from leco_plugin.models.encodings import EncodingConfig, FrequencyEncoding, build_encoding
+from leco_plugin.models.color_head import ColorHead
+from leco_plugin.models.encodings import EncodingConfig, build_encoding
 from leco_plugin.models.hmoe import HMoE, HMoEConfig
-
-OPPONENT = torch.tensor(
-    [[1 / 3**0.5] * 3, [1 / 2**0.5, 0.0, -1 / 2**0.5], [1 / 6**0.5, -2 / 6**0.5, 1 / 6**0.5]]
-)
-"""Rows: brightness and two hues, orthonormal, in red, green and blue. The colour head answers in
-these, so that the errors in brightness, which are the larger ones, leave the weights of the hues
-alone; in red, green and blue they pull all three rows of its last layer to one grey."""
-
-
-APPEARANCE_SCALE = 0.1
-"""Adam moves a code as fast as a weight, however little there is to learn from one image; scaled
-down, codes follow slowly, and the mean code of a rendering is one that the field has met."""
 
 
 @dataclass(frozen=True)
@@ -57,8 +46,6 @@ class _TruncatedExponential(torch.autograd.Function):
 class HMoEField(nn.Module):
     """Density and colour of mapped positions, each computed by the expert that the gate chose."""
 
-    opponent: Tensor
-
     def __init__(self, config: FieldConfig, num_images: int) -> None:
         super().__init__()
         self.config = config
@@ -67,18 +54,13 @@ class HMoEField(nn.Module):
         self.projection = nn.Linear(self.encoding.out_dim, width)
         self.experts = HMoE(config.experts)
         self.density_head = nn.Linear(width, 1)
-        self.direction_encoding = FrequencyEncoding(config.direction_octaves)
-        self.appearance = (
-            nn.Embedding(num_images, config.appearance_dim) if config.appearance_dim else None
+        self.color = ColorHead(
+            width,
+            config.color_width,
+            config.direction_octaves,
+            config.appearance_dim,
+            num_images,
         )
-        if self.appearance is not None:
-            # alike at first: what differs between images is learned, not drawn
-            nn.init.zeros_(self.appearance.weight)
-        of_ray = self.direction_encoding.out_dim + config.appearance_dim
-        self.color_in = nn.Linear(width, config.color_width)
-        self.color_of_ray = nn.Linear(of_ray, config.color_width, bias=False)
-        self.color_out = nn.Linear(config.color_width, 3)
-        self.register_buffer("opponent", OPPONENT.clone(), persistent=False)
 
     def density(self, mapped: Tensor, routes: Tensor, gate_values: Tensor) -> tuple[Tensor, Tensor]:
         """Density and the features that colour is made of.
@@ -96,35 +78,3 @@ class HMoEField(nn.Module):
         if self.config.experts.empty_expert == "none":
             sigmas = sigmas * (routes > 0)
         return sigmas, hidden
-
-    def color(
-        self,
-        features: Tensor,
-        ray_indices: Tensor,
-        directions: Tensor,
-        image_indices: Tensor | None,
-    ) -> Tensor:
-        """Colour of samples, seen along their rays.
-
-        Args:
-            features: [M, width] of `density`.
-            ray_indices: [M] int64, the ray of each sample.
-            directions: [R, 3] unit vectors.
-            image_indices: [R] int64 of the training image, or None for the mean appearance.
-        Returns:
-            [M, 3] float32 in [0, 1].
-        """
-        of_rays = [self.direction_encoding(directions)]
-        if self.appearance is not None:
-            code = (
-                self.appearance(image_indices)
-                if image_indices is not None
-                else self.appearance.weight.mean(dim=0).expand(len(directions), -1)
-            )
-            of_rays.append(APPEARANCE_SCALE * code)
-        # the first layer of a concatenation is the sum of two, one of which is the same all along
-        hidden = self.color_in(features) + self.color_of_ray(torch.cat(of_rays, dim=-1)).to(
-            features.dtype
-        ).index_select(0, ray_indices)
-        opponent = self.color_out(torch.relu(hidden)).float()
-        return torch.sigmoid(opponent @ self.opponent)

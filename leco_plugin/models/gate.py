@@ -103,14 +103,21 @@ class Gate(nn.Module):
         features = self.encoding(mapped)
         for layer in self.hidden:
             features = torch.relu(layer(features))
-        # a decision at a threshold needs more digits than bf16 has, so the last step is in float32
-        with torch.autocast(mapped.device.type, enabled=False):
-            features = self.norm(features.float())
-            return nn.functional.linear(features, self.head.weight.float(), self.head.bias.float())
+        return logits_of(features, self.norm, self.head)
 
     def occupancy(self, mapped: Tensor) -> Tensor:
         """o(x) = 1 - G_0(x): mapped positions [N, 3] to [N] float32 in [0, 1]."""
         return occupancy_from_logits(self(mapped))
+
+
+def logits_of(features: Tensor, norm: nn.LayerNorm, head: nn.Linear) -> Tensor:
+    """Normed features [N, width] through the last layer, to float32 whatever the precision is.
+
+    A decision at a threshold, or between two experts, needs more digits than bf16 has.
+    """
+    with torch.autocast(features.device.type, enabled=False):
+        normed = norm(features.float())
+        return nn.functional.linear(normed, head.weight.float(), head.bias.float())
 
 
 def occupancy_from_logits(logits: Tensor) -> Tensor:

@@ -11,8 +11,7 @@ from typing import Literal
 import torch
 from torch import Tensor, nn
 
-from leco_plugin.models.gate import EMPTY
-from leco_plugin.models.rows import permute_rows
+from leco_plugin.models.dispatch import dispatch
 
 
 @dataclass(frozen=True)
@@ -92,21 +91,10 @@ class HMoE(nn.Module):
         Returns:
             [N, width] in the dtype of the experts' output.
         """
-        order = routes.argsort(stable=True)
-        inverse = torch.empty_like(order).scatter_(
-            0, order, torch.arange(len(order), device=order.device)
-        )
-        counts = torch.bincount(routes, minlength=len(self.experts)).tolist()  # one synchronisation
-        ordered = permute_rows(features, order, inverse)
-        parts = [
-            expert(part) if len(part) else part
-            for expert, part in zip(self.experts, ordered.split(counts))
-        ]
-        if self.config.empty_expert == "none":
-            parts[EMPTY] = torch.zeros_like(parts[EMPTY])
-        dtype = next((p.dtype for p in parts[1:] if len(p)), features.dtype)
-        hidden = torch.cat([part.to(dtype) for part in parts])
-        return permute_rows(hidden, inverse, order) * gate_values[:, None].to(dtype)
+        empty, *scene = self.experts
+        experts = [None if self.config.empty_expert == "none" else empty, *scene]
+        hidden = dispatch(features, routes, experts)
+        return hidden * gate_values[:, None].to(hidden.dtype)
 
 
 def dense_hmoe(hmoe: HMoE, features: Tensor, routes: Tensor, gate_values: Tensor) -> Tensor:

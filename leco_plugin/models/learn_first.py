@@ -15,8 +15,8 @@ from leco_plugin.models.optimizers import RATES, FusedAdamConfig
 from leco_plugin.occupancy import Occupancy
 from leco_plugin.progress_bar import bar
 
-TIMED_STEPS = 10
-"""Steps after which their time is known well enough to keep to a budget."""
+FIRST_TIMED, TIMED_STEPS = 5, 15
+"""Steps between which a step is timed, to keep to a budget; the first ones are slow."""
 FEWEST_STEPS = 20
 
 
@@ -79,7 +79,7 @@ def _train(
     show: Any,
 ) -> None:
     started = time.monotonic()
-    step = 0
+    step, timed_from = 0, started
     while not bool(model.frozen):
         lifecycle.before_step(step)
         bundle, batch = manager.next_train(step)
@@ -91,7 +91,11 @@ def _train(
             optimizer.step()
         lifecycle.after_step(step)
         step += 1
+        if step == FIRST_TIMED:
+            timed_from = time.monotonic()
         if seconds is not None and step == TIMED_STEPS:
-            a_step = (time.monotonic() - started) / step
-            lifecycle.progress.learn_steps = max(FEWEST_STEPS, int(seconds / a_step))
+            now = time.monotonic()
+            a_step = (now - timed_from) / (TIMED_STEPS - FIRST_TIMED)
+            more = int((seconds - (now - started)) / a_step)
+            lifecycle.progress.learn_steps = max(FEWEST_STEPS, step + more)
         show(min(1.0, step / lifecycle.progress.learn_steps))

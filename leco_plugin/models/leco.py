@@ -13,11 +13,11 @@ from nerfstudio.models.base_model import Model, ModelConfig
 from torch import Tensor, nn
 
 from leco_plugin.compat.checkpoints import allow_checkpoint_globals
-from leco_plugin.evaluation.metrics import image_metrics
 from leco_plugin.models.calibration import CalibrationConfig
-from leco_plugin.models.failures import explain_non_finite, first_non_finite
+from leco_plugin.models.failures import require_finite
 from leco_plugin.models.field import HMoEField
 from leco_plugin.models.gate import Gate, check_sizes
+from leco_plugin.models.image_figures import image_figures
 from leco_plugin.models.losses import distortion_loss, termination_loss
 from leco_plugin.models.objective import GateLossConfig, gate_losses
 from leco_plugin.models.phases import ScheduleConfig
@@ -33,11 +33,11 @@ from leco_plugin.models.rendering import (
     shade,
     with_backdrop,
 )
+from leco_plugin.models.scene_rays import cut_to_bounds, marching_rule
 from leco_plugin.models.sizes import SMALL, Sizes
 from leco_plugin.occupancy import Occupancy, gate_precision
 from leco_plugin.samplers.estimator import LearnedOccupancyEstimator
 from leco_plugin.samplers.marching import march
-from leco_plugin.samplers.rays import intersect_box
 from leco_plugin.scenes.bounds import SceneBounds
 from leco_plugin.scenes.known_distances import DISTANCE
 from leco_plugin.space import Space
@@ -157,27 +157,16 @@ class LecoModel(Model):
         far = self.config.far if self.config.far is not None else bounds.far
         self.space.set(bounds.kind, bounds.center, bounds.half_extent)
         self.aabb.copy_(bounds.aabb)
-        steps, cones = [], []
-        for candidates in (self.config.sizes.candidates, self.config.sizes.learn_candidates):
-            # a box is marched evenly; an unbounded scene in steps that grow with distance
-            cone = 0.0 if bounds.kind == "box" else (far / near) ** (1.0 / candidates) - 1.0
-            steps.append(near * cone if cone else median_length / candidates)
-            cones.append(cone)
-        self.march_range.copy_(torch.tensor([near, far, *steps, *cones]))
+        sizes, kind = self.config.sizes, bounds.kind
+        step, cone = marching_rule(kind, near, far, sizes.candidates, median_length)
+        learning = marching_rule(kind, near, far, sizes.learn_candidates, median_length)
+        self.march_range.copy_(torch.tensor([near, far, step, learning[0], cone, learning[1]]))
         self.bounds_known.fill_(True)
 
     def rays_of(self, bundle: RayBundle) -> Rays:
         """The bundle's rays, cut to the scene's bounds."""
         near, far = self.march_range[:2]
-        enters, leaves = intersect_box(bundle.origins, bundle.directions, self.aabb)
-        images = bundle.camera_indices
-        return Rays(
-            bundle.origins,
-            bundle.directions,
-            enters.clamp(min=near),
-            leaves.clamp(max=far),
-            images[:, 0] if images is not None and self.training else None,
-        )
+        return cut_to_bounds(bundle, self.aabb, near, far, with_images=self.training)
 
     @property
     def estimator(self) -> LearnedOccupancyEstimator:
@@ -318,9 +307,7 @@ class LecoModel(Model):
                 ramped=self.ramped,
                 half_extent=self.space.half_extent,
             )
-        name = first_non_finite(losses)
-        if name is not None:
-            raise FloatingPointError(explain_non_finite(name, self, outputs, image))
+        require_finite(losses, self, outputs, image)
         return losses
 
     @torch.no_grad()
@@ -341,15 +328,5 @@ class LecoModel(Model):
         self, outputs: dict[str, Tensor], batch: dict[str, Tensor]
     ) -> tuple[dict[str, float], dict[str, Tensor]]:
         """Figures of one image, and pictures for the log."""
-        from nerfstudio.utils import colormaps
-
         truth = self.renderer_rgb.blend_background(batch["image"].to(outputs["rgb"].device))
-        predicted = outputs["rgb"].clamp(0.0, 1.0)
-        pictures = {
-            "img": torch.cat([truth, predicted], dim=1),
-            "accumulation": colormaps.apply_colormap(outputs["accumulation"]),
-            "depth": colormaps.apply_depth_colormap(
-                outputs["depth"], accumulation=outputs["accumulation"]
-            ),
-        }
-        return image_metrics(predicted, truth), pictures
+        return image_figures(outputs, truth)

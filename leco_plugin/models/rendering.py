@@ -7,6 +7,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from leco_plugin.models.color_head import ColorHead
 from leco_plugin.models.field import HMoEField
 from leco_plugin.models.gate import Gate, occupancy_from_logits, route
 from leco_plugin.models.rows import select_rows
@@ -118,7 +119,7 @@ def with_backdrop(
         [M' + R] packed.
     """
     num_rays = len(rays.origins)
-    starts = rays.t_maxs - (rays.t_maxs * cone_angle).clamp(min=step_size)
+    starts = backdrop_starts(rays, step_size, cone_angle)
     middles = 0.5 * (intervals.t_starts + intervals.t_ends)
     inside = (middles < starts.index_select(0, intervals.ray_indices)).nonzero()[:, 0]
     ray_indices, t_starts, t_ends = (part.index_select(0, inside) for part in intervals)
@@ -137,6 +138,11 @@ def with_backdrop(
         together[slots], together[last_slots] = of_samples, of_rays.to(of_samples.dtype)
         merged.append(together)
     return Intervals(*merged)
+
+
+def backdrop_starts(rays: Rays, step_size: float, cone_angle: float) -> Tensor:
+    """Where the backdrop of each ray begins [R]: the march's last step before the ray's end."""
+    return rays.t_maxs - (rays.t_maxs * cone_angle).clamp(min=step_size)
 
 
 def backdrop_of(intervals: Intervals, rays: Rays) -> Tensor:
@@ -170,31 +176,69 @@ def shade(
     Args:
         freeze_gate: no gradient reaches the gate.
     """
-    num_rays = len(rays.origins)
-    ray_indices, t_starts, t_ends = intervals
-    middles = 0.5 * (t_starts + t_ends)
     mapped = mapped_middles(space, rays, intervals)
     with torch.set_grad_enabled(torch.is_grad_enabled() and not freeze_gate):
         logits = gate(mapped)
         gate_values, routes = gate_values_and_routes(logits, routing)
     sigmas, features = field.density(mapped, routes, gate_values)
-    packed_info = pack_info(ray_indices, num_rays)
-    # for the weights only: what the field says of the place stays the field's
-    absorbing = torch.where(backdrop_of(intervals, rays), sigmas + OPAQUE, sigmas)
-    scale = space.half_extent
-    weights, _, _ = render_weight_from_density(
-        t_starts / scale, t_ends / scale, absorbing, packed_info=packed_info
+    weights, packed_info = weigh(
+        sigmas, backdrop_of(intervals, rays), intervals, space.half_extent, len(rays.origins)
     )
+    rgb = composite(field.color, features, weights, rays, intervals)
+    accumulation, depth = sum_up(weights, rays, intervals)
+    return Shaded(rgb, accumulation, depth, weights, sigmas, logits, routes, packed_info)
+
+
+def weigh(
+    sigmas: Tensor,
+    is_backdrop: Tensor,
+    intervals: Intervals,
+    half_extent: Tensor,
+    num_rays: int,
+) -> tuple[Tensor, Tensor]:
+    """Rendering weights of packed intervals [M] and where each ray has them [R, 2].
+
+    Args:
+        sigmas: [M] per half extent.
+        is_backdrop: bool [M], which intervals are opaque whatever their density is.
+        half_extent: scalar, scene units.
+    """
+    packed_info = pack_info(intervals.ray_indices, num_rays)
+    # for the weights only: what the field says of the place stays the field's
+    absorbing = torch.where(is_backdrop, sigmas + OPAQUE, sigmas)
+    weights, _, _ = render_weight_from_density(
+        intervals.t_starts / half_extent,
+        intervals.t_ends / half_extent,
+        absorbing,
+        packed_info=packed_info,
+    )
+    return weights, packed_info
+
+
+def composite(
+    color: ColorHead, features: Tensor, weights: Tensor, rays: Rays, intervals: Intervals
+) -> Tensor:
+    """Colours of rays [R, 3], without background; only visible samples are coloured."""
     visible = (weights.detach() > VISIBLE).nonzero()[:, 0]
-    rays_seen = ray_indices.index_select(0, visible)
-    colors = field.color(select_rows(features, visible), rays_seen, rays.directions, rays.images)
-    rgb = accumulate_along_rays(select_rows(weights, visible), colors, rays_seen, num_rays)
+    rays_seen = intervals.ray_indices.index_select(0, visible)
+    colors = color(select_rows(features, visible), rays_seen, rays.directions, rays.images)
+    return accumulate_along_rays(
+        select_rows(weights, visible), colors, rays_seen, len(rays.origins)
+    )
+
+
+def sum_up(weights: Tensor, rays: Rays, intervals: Intervals) -> tuple[Tensor, Tensor]:
+    """Accumulation and expected depth of rays, both [R]; one that meets nothing has its end."""
+    middles = 0.5 * (intervals.t_starts + intervals.t_ends)
     sums = accumulate_along_rays(
-        weights, torch.stack([torch.ones_like(middles), middles], dim=-1), ray_indices, num_rays
+        weights,
+        torch.stack([torch.ones_like(middles), middles], dim=-1),
+        intervals.ray_indices,
+        len(rays.origins),
     )
     accumulation = sums[:, 0]
     depth = torch.where(accumulation > 1e-6, sums[:, 1] / accumulation.clamp(min=1e-6), rays.t_maxs)
-    return Shaded(rgb, accumulation, depth, weights, sigmas, logits, routes, packed_info)
+    return accumulation, depth
 
 
 def per_ray_pictures(shaded: Shaded, ray_indices: Tensor, num_rays: int) -> dict[str, Tensor]:

@@ -40,7 +40,7 @@ class HostAdapter:
 
 def adapters() -> dict[str, HostAdapter]:
     """All adapters by name, those of other packages first."""
-    ours = {"packed": PACKED, "proposal": PROPOSAL}
+    ours = {"sample-with": SAMPLE_WITH, "packed": PACKED, "proposal": PROPOSAL}
     return {**foreign_entries(GROUP, frozenset(ours)), **ours}
 
 
@@ -74,6 +74,17 @@ def _fits(name: str, adapter: HostAdapter, host: Model) -> bool:
     except Exception as error:  # noqa: BLE001 (whatever a foreign adapter raises)
         warnings.warn(f"{GROUP} {name!r} is left out: {error!r}", stacklevel=3)
         return False
+
+
+def _sample_with(host: Any, guide: Guide) -> None:
+    host.sample_with(guide.estimator(host.aabb))
+
+
+SAMPLE_WITH = HostAdapter(
+    "a method sample_with(estimator) and a box aabb, as switch-nerf has",
+    lambda host: callable(getattr(host, "sample_with", None)),
+    _sample_with,
+)
 
 
 def _replace(host: nn.Module, old: nn.Module, new: nn.Module) -> None:

@@ -138,14 +138,27 @@ class CellCache(nn.Module):
             shift = shift - space.center.detach().cpu() * scale
         else:
             self._map = space.map
-        for name, table in tables._asdict().items():
-            self.register_buffer(name, table, persistent=False)
-        self.register_buffer("scale", scale.float().view(1, 1), persistent=False)
-        self.register_buffer("shift", shift.float().view(3, 1), persistent=False)
         center, half_extent = space.center.detach().clone(), space.half_extent.detach().clone()
-        self.register_buffer("center", center.view(3, 1), persistent=False)
-        self.register_buffer("half_extent", half_extent, persistent=False)
+        derived = {
+            **tables._asdict(),
+            "scale": scale.float().view(1, 1),
+            "shift": shift.float().view(3, 1),
+            "center": center.view(3, 1),
+            "half_extent": half_extent,
+        }
+        # No buffers: data-parallel training sends every buffer to all ranks before each step, and
+        # its back ends know no int16. Each rank derives the same from the gate.
+        self._derived = tuple(derived)
+        for name, tensor in derived.items():
+            setattr(self, name, tensor)
         self.to(tables.coarse.device)
+
+    def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> CellCache:
+        """What moving a module does to its tensors (`to`, `cpu`, `cuda`)."""
+        super()._apply(fn, recurse)  # type: ignore[no-untyped-call]
+        for name in self._derived:
+            setattr(self, name, fn(getattr(self, name)))
+        return self
 
     def tables(self) -> Tables:
         """The tables, where they are now."""

@@ -48,15 +48,27 @@ class LearnedOccupancyEstimator(Estimator):
     ) -> None:
         super().__init__()
         self.occupancy = occupancy
+        self.cache_bytes, self.tolerance = cache_bytes, tolerance
         self.to(occupancy.space.center.device)
+        self._box_is_given = aabb is not None
         box = torch.empty(0, 6) if aabb is None else torch.as_tensor(aabb).detach().reshape(1, 6)
-        if aabb is None and occupancy.space.kind == "box":
-            box = self._uncontracted_box()
         self.register_buffer("_box", box.float().to(self.device), persistent=False)
         self.cache: CellCache | None = None
-        if cache_bytes > 0:
+        self._derive()
+        self.register_load_state_dict_post_hook(_derive_anew)
+
+    def _derive(self) -> None:
+        """Builds what follows from the occupancy: its box and the cells."""
+        self._derived_from = _decisive(self.occupancy)
+        if not self._box_is_given:
+            bounded = self.occupancy.space.kind == "box"
+            self._box = self._uncontracted_box() if bounded else self._box[:0]
+        self.cache = None
+        if self.cache_bytes > 0:
             try:
-                self.cache = build_cache(occupancy, budget=cache_bytes, tolerance=tolerance)
+                self.cache = build_cache(
+                    self.occupancy, budget=self.cache_bytes, tolerance=self.tolerance
+                )
             except ValueError as reason:
                 _log.warning("no cell cache, sampling will be slower: %s", reason)
 
@@ -110,3 +122,17 @@ class LearnedOccupancyEstimator(Estimator):
         """Decisions at the cell centres of `aabbs`, bool [1, n, n, n]."""
         occupied = self.occs >= self.occupancy.threshold
         return occupied.view(1, *[ANSWER_RESOLUTION] * 3)
+
+
+def _decisive(occupancy: OccupancyLike) -> list[Tensor]:
+    """Copies of what an occupancy's decisions depend on, as far as a state dict can change it."""
+    if not isinstance(occupancy, torch.nn.Module):
+        return []
+    return [value.detach().cpu().clone() for value in occupancy.state_dict().values()]
+
+
+def _derive_anew(estimator: LearnedOccupancyEstimator, _: object) -> None:
+    """A checkpoint may hold another gate than the file that the estimator was built from."""
+    found = _decisive(estimator.occupancy)
+    if not all(map(torch.equal, found, estimator._derived_from)):
+        estimator._derive()

@@ -29,8 +29,8 @@ class SamplerSpec:
     with `aabb` (the host's box, [6]), `occupancy` (None when there is none) and options."""
     proposal: Callable[..., nn.Module] | str | None = None
     """Builds what a proposal host calls (`proposal.LearnedOccupancySampler`), likewise. Called with
-    `occupancy`, `num_samples`, `initial_sampler`, `single_jitter`, and `frame` where the host's
-    coordinates are not those of the occupancy."""
+    `occupancy`, with the host's `num_samples`, `initial_sampler` and `single_jitter`, and with
+    `frame` where the host's coordinates are not those of the occupancy."""
     needs_occupancy: bool = False
     """Whether it asks a frozen gate."""
     gate_encoding: str | None = None

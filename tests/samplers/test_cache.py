@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import copy
+
 import pytest
 import torch
 from ball_occupancy import CENTRE, HALF, ball
@@ -46,6 +48,14 @@ def test_the_report_says_what_is_held_and_what_was_measured(cache):
     assert cache.tables().bytes == report.bytes <= BUDGET
     assert report.differing <= report.differing_bound <= 1e-4
     assert report.checked == 1 << 18
+
+
+def test_its_tables_move_with_a_module_and_are_sent_to_nobody(cache):
+    host = torch.nn.ModuleDict({"cache": copy.deepcopy(cache)})
+    assert not list(host.buffers()) and not host.state_dict()
+    host.to("meta")
+    assert {table.device.type for table in host["cache"].tables()} == {"meta"}
+    assert host["cache"].scale.is_meta and not cache.scale.is_meta
 
 
 def test_few_positions_are_left_to_the_gate(cache, balls):

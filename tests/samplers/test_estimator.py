@@ -10,7 +10,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from samplers.analytic_occupancy import Balls, camera_rays, slow_march
 
+from leco_plugin.conformance.scene import OTHER, SLAB, box, crossing
+from leco_plugin.samplers import estimator as module
 from leco_plugin.samplers import packed
+from leco_plugin.samplers.cache_build import build_cache as really_build_cache
 from leco_plugin.samplers.estimator import LearnedOccupancyEstimator
 from leco_plugin.samplers.grid import DenseEstimator, OccupancyGridEstimator
 
@@ -155,6 +158,29 @@ def test_no_box_is_needed_and_one_may_be_given():
     assert 0 < len(part[0]) < len(everything[0])
     positions = origins[part[0]] + directions[part[0]] * ((part[1] + part[2]) / 2)[:, None]
     assert positions[:, 0].min() > -0.1 - 1e-4
+
+
+@pytest.mark.parametrize("aabb", [None, [-0.1, -1.0, -1.0, 1.0, 1.0, 1.0]])
+def test_a_checkpoint_of_another_gate_decides_from_then_on(aabb, monkeypatch):
+    built = []
+
+    def build_cache(*args, **kwargs):
+        built.append(kwargs)
+        return really_build_cache(*args, **kwargs)
+
+    monkeypatch.setattr(module, "build_cache", build_cache)
+    rays = crossing()
+    saved = LearnedOccupancyEstimator(SLAB.occupancy(), aabb, cache_bytes=BUDGET)
+    moved = OTHER.occupancy()
+    moved.space.set("box", moved.space.center + 0.3, 1.0)
+    host = torch.nn.ModuleDict({"grid": LearnedOccupancyEstimator(moved, aabb, cache_bytes=BUDGET)})
+    host.load_state_dict({f"grid.{name}": value for name, value in saved.state_dict().items()})
+    samples = saved.sampling(*rays[:2], render_step_size=0.05)
+    assert all(map(torch.equal, host["grid"].sampling(*rays[:2], render_step_size=0.05), samples))
+    assert host["grid"].aabbs.equal(box()[None] if aabb is None else torch.tensor([aabb]))
+    assert len(built) == 3
+    host.load_state_dict(host.state_dict())
+    assert len(built) == 3  # the same gate asks for no other cells
 
 
 def test_an_impossible_cache_is_done_without_and_said(caplog):

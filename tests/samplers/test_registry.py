@@ -89,9 +89,9 @@ def test_entry_points_of_other_packages_are_found_and_broken_ones_left_out(monke
         EntryPoint("broken", "no_such_module:spec", registry.GROUP),
         EntryPoint("dense", "no_such_module:spec", registry.GROUP),  # ours stay ours
     ]
-    monkeypatch.setattr(registry, "entry_points", lambda group: entries)
+    monkeypatch.setattr("leco_plugin.entries.entry_points", lambda group: entries)
     monkeypatch.setattr(registry, "FOREIGN", FOREIGN, raising=False)
-    with pytest.warns(UserWarning, match="sampler 'broken'"):
+    with pytest.warns(UserWarning, match="leco_plugin.samplers 'broken'"):
         found = samplers()
     assert set(found) == {*registry.OURS, "foreign"}
     assert found["dense"] is registry.DENSE

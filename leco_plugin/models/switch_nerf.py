@@ -1,0 +1,296 @@
+"""`switch-nerf` as a nerfstudio model: a host whose own sampling an estimator can replace."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any, Literal
+
+import torch
+from nerfstudio.cameras.rays import RayBundle
+from nerfstudio.engine.callbacks import (
+    TrainingCallback,
+    TrainingCallbackAttributes,
+    TrainingCallbackLocation,
+)
+from nerfstudio.model_components.renderers import RGBRenderer
+from nerfstudio.models.base_model import Model, ModelConfig
+from nerfstudio.utils.rich_utils import CONSOLE
+from torch import Tensor, nn
+
+from leco_plugin.compat.checkpoints import allow_checkpoint_globals
+from leco_plugin.models.failures import require_finite
+from leco_plugin.models.image_figures import image_figures
+from leco_plugin.models.precision import fast_precision, keep_freed_memory
+from leco_plugin.models.rendering import (
+    Intervals,
+    Rays,
+    Shaded,
+    backdrop_starts,
+    mapped_middles,
+    with_backdrop,
+)
+from leco_plugin.models.scene_grid import scene_grid
+from leco_plugin.models.scene_rays import cut_to_bounds, marching_rule, with_ends_for_all
+from leco_plugin.models.switch_field import Answers, SwitchField
+from leco_plugin.models.switch_objective import switch_losses, switch_statistics
+from leco_plugin.models.switch_rendering import coarse_and_fine, kept_by, leading_expert, render
+from leco_plugin.models.switch_sizes import SMALL, SwitchSizes
+from leco_plugin.occupancy import gate_precision
+from leco_plugin.samplers.grid import OccupancyGridEstimator
+from leco_plugin.scenes.bounds import SceneBounds
+from leco_plugin.scenes.input_error import InputError
+from leco_plugin.scenes.survey import survey
+from leco_plugin.space import Space
+
+
+@dataclass
+class SwitchNerfModelConfig(ModelConfig):
+    """Switch-NeRF: equal experts, a gate that learns to share the scene among them"""
+
+    _target: type = field(default_factory=lambda: SwitchNerfModel)
+    """target class to instantiate"""
+    enable_collider: bool = False
+    """Rays are cut at the scene's own bounds instead."""
+    eval_num_rays_per_chunk: int = 2048
+    """Rays rendered at a time."""
+    sizes: SwitchSizes = field(default_factory=lambda: SMALL)
+    """Sizes of field and sampling."""
+    sampling: Literal["coarse-fine", "occupancy-grid"] = "coarse-fine"
+    """Samples of the method's own, coarse and fine; or packed ones where an occupancy grid, updated
+    while training, has something."""
+    capacity_factor: float | None = None
+    """In training, places of each expert as a multiple of an equal share of the points (1.0 in the
+    paper). Points beyond skip their expert: zero features, a hole for this step. None is dropless;
+    renderings always are."""
+    balance: float = 5e-4
+    """Weight of the balanced gate loss."""
+    sigma_noise: float = 1.0
+    """Standard deviation of the noise on density, before its activation, while training."""
+    early_stop_eps: float = 0.0
+    """Packed samples, in training: transmittance below which a sample is not shaded. That asks for
+    all densities first, which pays where surfaces are opaque; 0 does not."""
+    grid_levels: int = 4
+    """Nested levels of the occupancy grid around an unbounded scene; a bounded one has one."""
+    near: float | None = None
+    """Where rays begin, scene units; None is found from the data."""
+    far: float | None = None
+    """Where rays end, scene units; None is found from the data."""
+
+
+class SwitchNerfModel(Model):
+    """A packed host with its own way of sampling beside.
+
+    The seam is `occupancy_grid`: None is coarse and fine sampling, and anything with nerfacc's two
+    verbs, `sampling` and `update_every_n_steps`, takes its place. `sample_with` sets it, on a new
+    model or on one that has been trained; nothing else has to be known or changed. The estimator is
+    a submodule like any other: it follows the model to its device, into evaluation and into the
+    state dict, and is in no parameter group.
+    """
+
+    config: SwitchNerfModelConfig
+    bounds_known: Tensor
+    march_range: Tensor
+    aabb: Tensor
+    occupancy_grid: nn.Module | None
+
+    def populate_modules(self) -> None:
+        """Builds the field, the sampler and the buffers that a checkpoint restores."""
+        super().populate_modules()
+        if self.config.capacity_factor is not None and not self.config.capacity_factor > 0.0:
+            raise InputError(
+                f"capacity_factor must be positive, got {self.config.capacity_factor}; "
+                "leave it out for dropless routing"
+            )
+        allow_checkpoint_globals()
+        device = self.kwargs.get("device", "cpu")
+        if torch.device(device).type == "cpu":
+            keep_freed_memory()
+        self.precision = fast_precision(device)
+        self.field = SwitchField(self.config.sizes.field, self.num_train_data)
+        self.space = Space()
+        # buffers, because nerfstudio tells a model its step before it restores its state
+        self.register_buffer("bounds_known", torch.tensor(False))
+        # near, far, step and cone angle
+        self.register_buffer("march_range", torch.tensor([0.05, 4.0, 0.03, 0.0]))
+        self.register_buffer("aabb", torch.tensor([-1.0] * 3 + [1.0] * 3))
+        self.renderer_rgb = RGBRenderer(background_color="random")
+        self.occupancy_grid = None
+        if self.config.sampling == "occupancy-grid":
+            self._sample_with_grid(levels=1)
+
+    def sample_with(self, estimator: nn.Module | None) -> None:
+        """Replaces the sampling by an estimator's; None is coarse and fine."""
+        if estimator is not None:
+            estimator.to(self.aabb.device).train(self.training)
+        self.occupancy_grid = estimator
+
+    def _sample_with_grid(self, levels: int) -> None:
+        resolution = self.config.sizes.grid_resolution
+        self.sample_with(scene_grid(self.space, self.aabb, resolution, levels))
+
+    def _load_from_state_dict(self, state_dict: dict[str, Any], prefix: str, *rest: Any) -> None:
+        """A grid has as many levels as it was trained with, which depend on the scene."""
+        saved = state_dict.get(f"{prefix}occupancy_grid.aabbs")
+        if isinstance(self.occupancy_grid, OccupancyGridEstimator) and saved is not None:
+            self._sample_with_grid(len(saved))
+        super()._load_from_state_dict(state_dict, prefix, *rest)
+
+    def get_param_groups(self) -> dict[str, list[nn.Parameter]]:
+        """`fields`: everything that is trained."""
+        return {"fields": list(self.field.parameters())}
+
+    def get_training_callbacks(
+        self, training_callback_attributes: TrainingCallbackAttributes
+    ) -> list[TrainingCallback]:
+        """Finds the scene's bounds now, and returns what updates the estimator before each step."""
+        assert training_callback_attributes.pipeline is not None
+        if not bool(self.bounds_known):
+            seen = survey(training_callback_attributes.pipeline.datamanager)
+            self.set_bounds(seen.bounds, seen.median_length)
+            CONSOLE.log(f"\\[leco] {seen.describe()}")
+        before = TrainingCallbackLocation.BEFORE_TRAIN_ITERATION
+        return [TrainingCallback([before], self.update_estimator)]
+
+    @torch.no_grad()
+    def set_bounds(self, bounds: SceneBounds, median_length: float) -> None:
+        """Fixes the space mapping, the marching rule and the grid's box.
+
+        Args:
+            bounds: of the scene.
+            median_length: median length of rays inside the bounds, scene units.
+        Raises:
+            InputError: the configured range is empty or begins at the camera.
+        """
+        near = self.config.near if self.config.near is not None else bounds.near
+        far = self.config.far if self.config.far is not None else bounds.far
+        if not 0.0 < near < far:
+            raise InputError(f"rays need 0 < near < far, got near {near:g} and far {far:g}")
+        self.space.set(bounds.kind, bounds.center, bounds.half_extent)
+        self.aabb.copy_(bounds.aabb)
+        rule = marching_rule(bounds.kind, near, far, self.config.sizes.candidates, median_length)
+        self.march_range.copy_(torch.tensor([near, far, *rule]))
+        self.bounds_known.fill_(True)
+        if isinstance(self.occupancy_grid, OccupancyGridEstimator):
+            self._sample_with_grid(1 if bounds.kind == "box" else self.config.grid_levels)
+
+    def update_estimator(self, step: int) -> None:
+        """Lets the estimator ask the field, as packed hosts do before each training step."""
+        if self.occupancy_grid is not None:
+            update: Any = self.occupancy_grid.update_every_n_steps
+            update(step=step, occ_eval_fn=self.opacity_of_a_step)
+
+    @torch.no_grad()
+    def opacity_of_a_step(self, positions: Tensor) -> Tensor:
+        """Density times the length of a step: scene positions [N, 3] to [N, 1].
+
+        Steps that grow with distance are taken to be those at one half extent.
+        """
+        _, _, step, cone_angle = self.march_range
+        return self.density_fn(positions) * step.maximum(cone_angle * self.space.half_extent)
+
+    def density_fn(self, positions: Tensor) -> Tensor:
+        """Density per scene unit, without noise: scene positions [N, 3] to [N, 1]."""
+        with gate_precision(self.device.type, self.precision):
+            answers = self.field(self.space.map(positions).clamp(-1.0, 1.0))
+        densities: Tensor = answers.sigmas[:, None] / self.space.half_extent
+        return densities
+
+    def _ask(self, mapped: Tensor) -> Answers:
+        """The field, with noise and limited places while training."""
+        noise = self.config.sigma_noise if self.training else 0.0
+        capacity = self.config.capacity_factor if self.training else None
+        answers: Answers = self.field(mapped, noise, capacity)
+        return answers
+
+    def rays_of(self, bundle: RayBundle) -> Rays:
+        """The bundle's rays, cut to the scene's bounds; those that miss end where all do."""
+        near, far, step, cone_angle = self.march_range
+        rays = cut_to_bounds(bundle, self.aabb, near, far, with_images=self.training)
+        return with_ends_for_all(rays, far, step.maximum(far * cone_angle))
+
+    def _shade(self, rays: Rays) -> tuple[Intervals, Shaded]:
+        """Samples along rays in whichever way, shaded."""
+        step, cone_angle = self.march_range[2:].tolist()
+        config, sizes = self.config, self.config.sizes
+        if self.occupancy_grid is not None:
+            prune_below = config.early_stop_eps if self.training else 0.0
+            packed = kept_by(
+                self.occupancy_grid,
+                rays,
+                step,
+                cone_angle,
+                self.training,
+                self.density_fn,
+                prune_below,
+            )
+            intervals = with_backdrop(packed, rays, step, cone_angle)
+            answers = self._ask(mapped_middles(self.space, rays, intervals))
+        else:
+            stops = backdrop_starts(rays, step, cone_angle).maximum(rays.t_mins)
+            intervals, answers = coarse_and_fine(
+                self._ask,
+                self.space,
+                rays,
+                stops,
+                (sizes.coarse, sizes.fine),
+                growing=self.space.kind == "contraction",
+                jittered=self.training,
+            )
+        shaded = render(self.field.color, answers, rays, intervals, self.space.half_extent)
+        return intervals, shaded
+
+    def get_outputs(self, ray_bundle: RayBundle) -> dict[str, Any]:  # type: ignore[override]
+        """Pixels of rays, and what the losses need (`shaded`, `rays`).
+
+        `samples_per_ray` counts the points at which the field was asked, as a float because
+        nerfstudio cannot show integers. `expert`, in evaluation, is the number from 1 of the one
+        with the greatest weight along the ray.
+        """
+        rays = self.rays_of(ray_bundle)
+        with gate_precision(self.device.type, self.precision):
+            intervals, shaded = self._shade(rays)
+        outputs: dict[str, Any] = {
+            "rgb": shaded.rgb,
+            "depth": shaded.depth[:, None],
+            "accumulation": shaded.accumulation[:, None],
+            "samples_per_ray": shaded.packed_info[:, 1:].float(),
+            "shaded": shaded,
+            "rays": rays,
+        }
+        if not self.training:
+            experts = self.config.sizes.field.experts
+            outputs["expert"] = leading_expert(shaded, intervals.ray_indices, experts)
+        return outputs
+
+    def get_rgba_image(self, outputs: dict[str, Tensor], output_name: str = "rgb") -> Tensor:
+        """Colours with what was met before the backdrop as their alpha, [..., 4]."""
+        accumulation = outputs[output_name.replace("rgb", "accumulation")]
+        return torch.cat([outputs[output_name], accumulation], dim=-1)
+
+    def get_loss_dict(
+        self, outputs: dict[str, Any], batch: dict[str, Tensor], metrics_dict: Any = None
+    ) -> dict[str, Tensor]:
+        """Colour loss and balanced gate loss.
+
+        Raises:
+            FloatingPointError: a loss is not finite; the step was not taken.
+        """
+        image = batch["image"].to(self.device)
+        truth = self.renderer_rgb.blend_background(image)
+        losses = switch_losses(outputs["shaded"], truth, self.config.balance)
+        require_finite(losses, self, outputs, image)
+        return losses
+
+    def get_metrics_dict(
+        self, outputs: dict[str, Any], batch: dict[str, Tensor]
+    ) -> dict[str, Tensor]:
+        """PSNR of the batch, its number of samples, and the share of each expert."""
+        truth = self.renderer_rgb.blend_background(batch["image"].to(self.device))
+        return switch_statistics(outputs["shaded"], truth)
+
+    def get_image_metrics_and_images(
+        self, outputs: dict[str, Tensor], batch: dict[str, Tensor]
+    ) -> tuple[dict[str, float], dict[str, Tensor]]:
+        """Figures of one image, and pictures for the log."""
+        truth = self.renderer_rgb.blend_background(batch["image"].to(outputs["rgb"].device))
+        return image_figures(outputs, truth)

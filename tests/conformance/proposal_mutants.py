@@ -1,0 +1,178 @@
+"""Samplers for proposal hosts that are broken in one way each, and the rule that must say so."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+from conformance.estimator_mutants import rank
+from torch import Tensor
+
+from leco_plugin.occupancy import Occupancy
+from leco_plugin.samplers.proposal import LearnedOccupancySampler
+from leco_plugin.samplers.registry import SamplerSpec
+
+
+class SoundProposal(LearnedOccupancySampler):
+    """What all others are but for one thing."""
+
+    def __init__(self, occupancy: Occupancy, **options: Any) -> None:
+        super().__init__(occupancy, cache_bytes=0, **options)
+
+
+class NoCallbacks(SoundProposal):
+    """A host's training callbacks find nothing to call."""
+
+    @property
+    def set_anneal(self) -> Any:
+        raise AttributeError("set_anneal")
+
+
+class TuplesForLists(SoundProposal):
+    def generate_ray_samples(self, ray_bundle: Any = None, density_fns: Any = None) -> Any:
+        samples, weights, candidates = super().generate_ray_samples(ray_bundle, density_fns)
+        return samples, tuple(weights), tuple(candidates)
+
+
+class AsksProposalNetworks(SoundProposal):
+    """Which a guided host no longer has."""
+
+    def generate_ray_samples(self, ray_bundle: Any = None, density_fns: Any = None) -> Any:
+        density_fns[0](ray_bundle.origins)
+        return super().generate_ray_samples(ray_bundle, density_fns)
+
+
+class OneLevelOnly(SoundProposal):
+    def generate_ray_samples(self, ray_bundle: Any = None, density_fns: Any = None) -> Any:
+        return super().generate_ray_samples(ray_bundle, None)
+
+
+class FlatWeights(SoundProposal):
+    def generate_ray_samples(self, ray_bundle: Any = None, density_fns: Any = None) -> Any:
+        samples, weights, candidates = super().generate_ray_samples(ray_bundle, density_fns)
+        return samples, [level[..., 0] for level in weights], candidates
+
+
+class Shifted(SoundProposal):
+    """Changes the samples' edges [n_rays, n, 1]."""
+
+    def generate_ray_samples(self, ray_bundle: Any = None, density_fns: Any = None) -> Any:
+        samples, weights, candidates = super().generate_ray_samples(ray_bundle, density_fns)
+        starts, ends = samples.frustums.starts, samples.frustums.ends
+        samples.frustums.starts, samples.frustums.ends = self.change(starts, ends)
+        return samples, weights, candidates
+
+    def change(self, starts: Tensor, ends: Tensor) -> tuple[Tensor, Tensor]:
+        raise NotImplementedError
+
+
+class LastFirst(Shifted):
+    def change(self, starts: Tensor, ends: Tensor) -> tuple[Tensor, Tensor]:
+        return starts.flip(1), ends.flip(1)
+
+
+class Shaking(Shifted):
+    def change(self, starts: Tensor, ends: Tensor) -> tuple[Tensor, Tensor]:
+        shift = 1e-5 * torch.rand(()) * (not self.training)
+        return starts + shift, ends + shift
+
+
+class NeverShaken(SoundProposal):
+    def generate_ray_samples(self, ray_bundle: Any = None, density_fns: Any = None) -> Any:
+        self.initial_sampler.train_stratified = self.pdf_sampler.train_stratified = False
+        return super().generate_ray_samples(ray_bundle, density_fns)
+
+
+class Uniform(SoundProposal):
+    """Everything is worth the same."""
+
+    def worth(self, positions: Tensor) -> Tensor:
+        return torch.ones_like(positions[..., :1])
+
+
+class FrontOnly(SoundProposal):
+    """Only what a ray meets first is sampled."""
+
+    def worth(self, positions: Tensor) -> Tensor:
+        worth = super().worth(positions)
+        if bool((worth > 0.0).float().mean() > 0.9):
+            return worth
+        return worth * (worth.cumsum(dim=-2) < 0.3 * worth.sum(dim=-2, keepdim=True))
+
+
+class PrefersTheFront(SoundProposal):
+    """Worth falls with distance, also where everything is occupied."""
+
+    def worth(self, positions: Tensor) -> Tensor:
+        return super().worth(positions) * torch.linspace(2.0, 0.8, positions.shape[-2])[:, None]
+
+
+class ProposalThaws(SoundProposal):
+    def __init__(self, occupancy: Occupancy, **options: Any) -> None:
+        super().__init__(occupancy, **options)
+        occupancy.gate.requires_grad_(True)
+
+
+class NothingPerNothing(SoundProposal):
+    """Weights of a ray that meets nothing are 0/0."""
+
+    def generate_ray_samples(self, ray_bundle: Any = None, density_fns: Any = None) -> Any:
+        samples, weights, candidates = super().generate_ray_samples(ray_bundle, density_fns)
+        return samples, [level / level.sum(dim=-2, keepdim=True) for level in weights], candidates
+
+
+class Anneals(SoundProposal):
+    """Blurs what is settled as if it were a proposal network that learns."""
+
+    anneal = 0.5
+
+    def set_anneal(self, anneal: float) -> None:
+        self.anneal = anneal
+
+    def worth(self, positions: Tensor) -> Tensor:
+        return super().worth(positions) ** self.anneal
+
+
+class ProposalOutsideTheStateDict(SoundProposal):
+    def __init__(self, occupancy: Occupancy, **options: Any) -> None:
+        super().__init__(occupancy, **options)
+        estimator = self.estimator
+        del self.estimator
+        self.__dict__["estimator"] = estimator
+
+
+class SamplesByRank(Shifted):
+    def change(self, starts: Tensor, ends: Tensor) -> tuple[Tensor, Tensor]:
+        return starts + 1e-5 * rank(), ends + 1e-5 * rank()
+
+
+PROPOSAL_MUTANTS: dict[str, tuple[type, ...]] = {
+    "signature": (NoCallbacks, TuplesForLists, AsksProposalNetworks),
+    "shapes-types-devices": (OneLevelOnly, FlatWeights),
+    "sorted-disjoint-inside": (LastFirst,),
+    "deterministic-in-eval": (Shaking,),
+    "stratified-in-training": (NeverShaken,),
+    "skips-only-what-it-may": (Uniform, FrontOnly),
+    "all-kept-equals-dense": (PrefersTheFront,),
+    "no-gradient-to-the-gate": (ProposalThaws,),
+    "zero-samples-well-formed": (NothingPerNothing,),
+    "update-while-frozen-is-harmless": (Anneals,),
+    "state-dict-round-trip": (ProposalOutsideTheStateDict,),
+    "two-processes": (SamplesByRank,),
+}
+"""By the rule that must fail."""
+
+ALSO: dict[type, set[str]] = {
+    NoCallbacks: {"update-while-frozen-is-harmless"},
+    FlatWeights: {"zero-samples-well-formed"},
+    LastFirst: {"zero-samples-well-formed"},
+}
+"""What else cannot hold for a mutant."""
+
+
+def __getattr__(name: str) -> SamplerSpec:
+    """Entry points name a class in lower case: its specification."""
+    for mutant in (SoundProposal, *(m for family in PROPOSAL_MUTANTS.values() for m in family)):
+        if mutant.__name__.lower() == name:
+            return SamplerSpec(mutant.__name__, proposal=mutant, needs_occupancy=True)
+    raise AttributeError(name)

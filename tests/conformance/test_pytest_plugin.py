@@ -1,0 +1,79 @@
+"""`pytest --pyargs leco_plugin.conformance --leco-sampler NAME`, run as third parties run it."""
+
+from __future__ import annotations
+
+import os
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from conformance.mutant_plugin import write_distribution
+
+ROOT = Path(__file__).resolve().parents[2]
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory) -> Path:
+    """Where the mutants are installed, and the entry point for pytest as pyproject.toml has it."""
+    project = (ROOT / "pyproject.toml").read_text()
+    declared = re.search(r'\[project\.entry-points\.pytest11\]\n"?([\w.]+)"? = "([\w.]+)"', project)
+    assert declared is not None
+    section = f"[pytest11]\n{declared[1]} = {declared[2]}"
+    return write_distribution(tmp_path_factory.mktemp("installed"), section)
+
+
+def run(folder: Path, work: Path, *arguments: str) -> tuple[int, str]:
+    """Exit status and output of pytest in a folder of its own, where warnings are errors."""
+    path = os.pathsep.join([str(folder), str(ROOT / "tests"), str(ROOT)])
+    strict = ["-W", "error", "-p", "no:dash", "-p", "no:cacheprovider", "-v"]
+    done = subprocess.run(
+        [sys.executable, "-m", "pytest", *strict, *arguments],
+        cwd=work,
+        env={**os.environ, "PYTHONPATH": path, "OMP_NUM_THREADS": "1"},
+        capture_output=True,
+        text=True,
+    )
+    return done.returncode, done.stdout + done.stderr
+
+
+PYARGS = ("--pyargs", "leco_plugin.conformance")
+
+
+def test_one_test_a_rule_and_seam(folder, tmp_path):
+    names = ("--leco-sampler", "SoundProposal", "--leco-sampler", "KeepsAll")
+    status, said = run(folder, tmp_path, *PYARGS, *names, "-k", "signature or skips")
+    assert status == 1
+    assert "test_rule[SoundProposal-proposal-signature] PASSED" in said
+    assert "test_rule[SoundProposal-proposal-skips-only-what-it-may] PASSED" in said
+    assert "test_rule[KeepsAll-estimator-signature] PASSED" in said
+    assert "test_rule[KeepsAll-estimator-skips-only-what-it-may] FAILED" in said
+    assert "Remedy: decide by Occupancy.occupied" in said
+    assert "1 failed, 3 passed" in said
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ((), "name what to check: --leco-sampler NAME"),
+        (("--leco-sampler", "grit"), "there is no sampler 'grit'; there are"),
+    ],
+)
+def test_what_cannot_be_checked_is_an_error_in_one_line(folder, tmp_path, options, message):
+    status, said = run(folder, tmp_path, *PYARGS, *options)
+    assert status == 2
+    assert message in said and "Traceback" not in said
+
+
+def test_other_runs_of_pytest_are_left_alone(folder, tmp_path):
+    (tmp_path / "test_another.py").write_text(
+        "import sys\n\ndef test_no_more_than_the_options_was_loaded(pytestconfig):\n"
+        "    assert pytestconfig.getoption('leco_sampler') == []\n"
+        "    ours = {name for name in sys.modules if name.startswith('leco_plugin')}\n"
+        "    assert ours == {'leco_plugin', 'leco_plugin.conformance',\n"
+        "                    'leco_plugin.conformance.pytest_plugin'}\n"
+        "    assert not {'torch', 'nerfstudio'} & set(sys.modules)\n"
+    )
+    status, said = run(folder, tmp_path)
+    assert status == 0 and "1 passed" in said, said

@@ -1,0 +1,70 @@
+"""Applying a rule: what counts as broken, and that nothing of it is left behind."""
+
+from __future__ import annotations
+
+import json
+
+import pytest
+import torch
+
+from leco_plugin.conformance.rule import Rule, apply, require
+
+
+class Case:
+    """One thing to check."""
+
+    name, seam = "it", "somewhere"
+
+    def __init__(self) -> None:
+        self.forgot = 0
+
+    def forget(self) -> None:
+        self.forgot += 1
+
+
+def rule(check) -> Rule:
+    return Rule("a-rule", "things break.", "mend it.", {"somewhere": check})
+
+
+def test_a_rule_that_holds_passes_and_keeps_what_was_built():
+    case = Case()
+    verdict = apply(rule(lambda case: require(True, "")), case)
+    assert verdict.passed and verdict.problem == "" and case.forgot == 0
+    assert verdict.line() == "pass  somewhere  a-rule"
+
+
+def fails(case):
+    require(False, "two of\nthree are wrong")
+
+
+def raises(case):
+    raise KeyError("t_min")
+
+
+@pytest.mark.parametrize(
+    ("check", "problem"), [(fails, "two of three are wrong"), (raises, "KeyError: 't_min'")]
+)
+def test_what_is_found_or_raised_is_told_in_one_line(check, problem):
+    case = Case()
+    verdict = apply(rule(check), case)
+    assert not verdict.passed and case.forgot == 1
+    assert verdict.line() == (
+        f"FAIL  somewhere  a-rule: {problem}. Why it matters: things break. Remedy: mend it."
+    )
+    assert json.loads(json.dumps(verdict.to_dict()))["problem"] == problem
+
+
+def test_random_numbers_and_gradients_are_as_before():
+    def meddles(case):
+        torch.manual_seed(5)
+        torch.set_grad_enabled(False)
+
+    torch.manual_seed(1)
+    expected = torch.rand(3)
+    torch.manual_seed(1)
+    apply(rule(meddles), Case())
+    assert torch.is_grad_enabled()
+    assert torch.rand(3).equal(expected)
+    with torch.no_grad():
+        apply(rule(meddles), Case())
+        assert not torch.is_grad_enabled()

@@ -1,0 +1,77 @@
+"""Our samplers keep the rules that we ask of others'."""
+
+from __future__ import annotations
+
+import nerfacc
+import pytest
+from nerfstudio.model_components.ray_samplers import ProposalNetworkSampler
+
+from leco_plugin.conformance.checking import pairs, sampler_cases
+from leco_plugin.conformance.rule import apply
+from leco_plugin.conformance.sampler_rules import SAMPLER_RULES
+from leco_plugin.samplers import nerfacc_cpu, registry
+from leco_plugin.samplers.registry import SamplerSpec
+
+
+@pytest.mark.slow  # `learned-occupancy` builds cell caches, also in two processes
+@pytest.mark.parametrize("seam", ["estimator", "proposal"])
+def test_the_learned_occupancy_keeps_every_rule(seam):
+    cases = [case for case in sampler_cases("learned-occupancy") if case.seam == seam]
+    verdicts = [apply(rule, case) for rule, case in pairs(cases, SAMPLER_RULES)]
+    assert [verdict.line() for verdict in verdicts if not verdict.passed] == []
+    assert len(verdicts) == {"estimator": 14, "proposal": 12}[seam]
+
+
+@pytest.mark.parametrize("name", ["dense", "occupancy-grid"])
+def test_the_baselines_keep_every_rule(name):
+    found = pairs(sampler_cases(name), SAMPLER_RULES)
+    verdicts = [apply(rule, case) for rule, case in found]
+    assert [verdict.line() for verdict in verdicts if not verdict.passed] == []
+    assert {verdict.seam for verdict in verdicts} == {"estimator"}
+
+
+@pytest.mark.parametrize("features", ["hash", "vm", "k-planes"])
+def test_a_gate_on_other_features_is_known_too(features):
+    (case, _) = sampler_cases(f"learned-occupancy-{features}")
+    rules = [rule for rule in SAMPLER_RULES if rule.name == "skips-only-what-it-may"]
+    assert [apply(rule, case).problem for rule in rules] == [""]
+
+
+def nerfaccs_grid(aabb, occupancy):
+    nerfacc_cpu.install()
+    return nerfacc.OccGridEstimator(aabb, resolution=64)
+
+
+def nerfstudios_proposals(**_):
+    return ProposalNetworkSampler((256, 96), num_nerf_samples_per_ray=48)
+
+
+@pytest.mark.parametrize(
+    "spec",
+    [
+        SamplerSpec("nerfacc's", estimator=nerfaccs_grid),
+        SamplerSpec("nerfstudio's", proposal=nerfstudios_proposals),
+    ],
+    ids=["nerfacc", "nerfstudio"],
+)
+def test_those_whose_places_are_taken_keep_the_rules_too(spec, monkeypatch):
+    monkeypatch.setitem(registry.OURS, "stock", spec)
+    rules = tuple(rule for rule in SAMPLER_RULES if rule.name != "two-processes")
+    verdicts = [apply(rule, case) for rule, case in pairs(sampler_cases("stock"), rules)]
+    nerfacc_cpu.uninstall()
+    assert [verdict.line() for verdict in verdicts if not verdict.passed] == []
+
+
+def test_rules_have_names_of_their_own_and_say_why_and_what_to_do():
+    assert len({rule.name for rule in SAMPLER_RULES}) == len(SAMPLER_RULES)
+    for rule in SAMPLER_RULES:
+        assert rule.reason.endswith(".") and rule.remedy.endswith(".")
+        assert rule.checks
+
+
+def test_a_sampler_that_serves_no_seam_is_refused(monkeypatch):
+    monkeypatch.setitem(registry.OURS, "hollow", SamplerSpec("nothing"))
+    with pytest.raises(ValueError, match="builds neither an estimator nor a proposal"):
+        sampler_cases("hollow")
+    with pytest.raises(ValueError, match="no sampler 'hollov'"):
+        sampler_cases("hollov")

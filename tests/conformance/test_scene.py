@@ -1,0 +1,56 @@
+"""The scene of the kit is known exactly, and its gate is a gate like any other."""
+
+from __future__ import annotations
+
+from typing import get_args
+
+import pytest
+import torch
+
+from leco_plugin.conformance import scene
+from leco_plugin.models.encodings import Kind
+from leco_plugin.occupancy import Occupancy
+
+SLABS = [scene.SLAB, scene.OTHER, scene.EVERYTHING]
+
+
+@pytest.mark.parametrize("kind", get_args(Kind))
+@pytest.mark.parametrize("slab", SLABS)
+def test_the_gate_decides_as_the_slab_is_defined(slab, kind):
+    offsets = (torch.rand(100_000, 3) - 0.5) * 2.4 * scene.HALF
+    positions = torch.tensor(scene.CENTRE) + offsets
+    from_plane = (offsets @ torch.tensor(slab.normal)).abs()
+    expected = (offsets.abs().amax(dim=-1) <= scene.HALF) & (
+        from_plane <= slab.half_width * scene.HALF
+    )
+    occupancy = slab.occupancy(kind)
+    clear = slab.depth(positions).abs() > 1e-4  # nearer than that a rounding decides
+    assert clear.float().mean() > 0.99
+    assert occupancy.occupied(positions)[clear].equal(expected[clear])
+    assert (slab.depth(positions)[clear] > 0.0).equal(expected[clear])
+    assert slab.density(positions).shape == (100_000, 1)
+
+
+def test_everything_is_all_of_the_box():
+    positions = torch.tensor(scene.CENTRE) + (torch.rand(1000, 3) - 0.5) * 1.99 * scene.HALF
+    assert scene.EVERYTHING.occupancy().occupied(positions).all()
+
+
+@pytest.mark.parametrize("kind", get_args(Kind))
+def test_the_gate_is_saved_and_loaded_like_a_learned_one(kind, tmp_path):
+    scene.SLAB.occupancy(kind).save(tmp_path / "slab.safetensors")
+    loaded = Occupancy.load(tmp_path / "slab.safetensors")
+    positions = torch.tensor(scene.CENTRE) + torch.randn(1000, 3)
+    assert loaded.query(positions).equal(scene.SLAB.occupancy(kind).query(positions))
+
+
+def test_rays_cross_the_slab_or_have_nothing_to_sample():
+    rays = scene.crossing()
+    t = torch.linspace(0.0, 2.0 * scene.DISTANCE, 600)
+    depths = scene.SLAB.depth(rays.origins[:, None] + rays.directions[:, None] * t[:, None])
+    assert (depths.amax(dim=1) > scene.MARGIN).all()
+    missing = scene.without_samples()["rays that miss the box"]
+    depths = scene.EVERYTHING.depth(
+        missing.origins[:, None] + missing.directions[:, None] * t[:, None]
+    )
+    assert (depths < 0.0).all()

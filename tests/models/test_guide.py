@@ -1,0 +1,134 @@
+"""The occupancy of a host: its samplers, its checkpoints, its coordinates."""
+
+from __future__ import annotations
+
+import inspect
+
+import pytest
+import torch
+from ball_occupancy import CENTRE, ball
+from nerfstudio.cameras.rays import RayBundle
+
+from leco_plugin.models.guide import Guide
+from leco_plugin.samplers.base import Estimator
+from leco_plugin.samplers.estimator import LearnedOccupancyEstimator
+
+BOX = torch.tensor([-1.0, -1.0, -1.0, 3.0, 4.0, 2.0])
+MARCH = {"render_step_size": 0.05, "near_plane": 0.0, "far_plane": 8.0}
+
+
+@pytest.fixture(autouse=True)
+def without_cache(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A cell cache takes seconds to build, and is tested where it lives."""
+
+    def refuse(*_: object, **__: object) -> None:
+        raise ValueError("no cache in this test")
+
+    monkeypatch.setattr("leco_plugin.samplers.estimator.build_cache", refuse)
+
+
+@pytest.fixture
+def guide() -> Guide:
+    made = Guide()
+    made.set_occupancy(ball())
+    return made
+
+
+def rays(count: int = 30) -> tuple[torch.Tensor, torch.Tensor]:
+    """Rays towards the ball and beside it, from outside its space."""
+    generator = torch.Generator().manual_seed(0)
+    origins = torch.tensor(CENTRE) + torch.tensor([0.0, 0.0, 4.0])
+    aims = torch.tensor(CENTRE) + 1.5 * torch.randn(count, 3, generator=generator)
+    directions = torch.nn.functional.normalize(aims - origins, dim=-1)
+    return origins.expand(count, 3).contiguous(), directions
+
+
+def test_a_host_samples_as_with_the_estimator_itself(guide: Guide):
+    own = LearnedOccupancyEstimator(ball()).eval()
+    origins, directions = rays()
+    expected = own.sampling(origins, directions, **MARCH)
+    found = guide.estimator(BOX).eval().sampling(origins, directions, **MARCH)
+    assert len(expected[0]) > 0
+    for a, b in zip(found, expected):
+        assert torch.equal(a, b)
+
+
+def test_the_signature_is_that_of_estimators(guide: Guide):
+    stand_in = inspect.signature(type(guide.estimator(BOX)).sampling)
+    assert stand_in == inspect.signature(Estimator.sampling)
+
+
+def test_a_host_in_other_coordinates_gets_the_same_samples(guide: Guide):
+    turn, scale = torch.linalg.qr(torch.randn(3, 3))[0], 2.5
+    turn = turn * torch.det(turn)
+    shift = torch.tensor([0.3, -1.0, 0.2])
+    origins, directions = rays()
+    expected = guide.estimator(BOX).eval().sampling(origins, directions, **MARCH)
+    # where the host sees what the occupancy sees at p: (p - shift) turned back and shrunk
+    host_origins, host_directions = (origins - shift) @ turn / scale, directions @ turn
+    guide.set_occupancy(ball(), torch.cat([scale * turn, shift[:, None]], dim=1))
+    shorter = {name: value / scale for name, value in MARCH.items()}
+    found = guide.estimator(BOX).eval().sampling(host_origins, host_directions, **shorter)
+    assert abs(len(found[0]) - len(expected[0])) <= 2  # rounding at the ball's edge
+    both = min(len(found[0]), len(expected[0]))
+    torch.testing.assert_close(
+        found[1][:both].sort()[0] * scale, expected[1][:both].sort()[0], atol=0.06, rtol=0.0
+    )
+
+
+def test_a_proposal_host_in_other_coordinates_samples_the_ball(guide: Guide):
+    turn = torch.tensor([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
+    origins, directions = rays(3)
+    directions = torch.nn.functional.normalize(torch.tensor(CENTRE) - origins, dim=-1)
+    guide.set_occupancy(ball(), torch.cat([turn, torch.zeros(3, 1)], dim=1))
+    bundle = RayBundle(
+        origins=origins @ turn,
+        directions=directions @ turn,
+        pixel_area=torch.ones(3, 1),
+        nears=torch.zeros(3, 1),
+        fars=torch.full((3, 1), 8.0),
+    )
+    samples, _, _ = guide.proposal(num_samples=16).eval()(bundle)
+    inside = (samples.frustums.get_positions() @ turn.T - torch.tensor(CENTRE)).norm(dim=-1)
+    assert (inside < 1.3).float().mean() > 0.9
+
+
+def test_without_an_occupancy_one_line_says_how_to_get_one():
+    with pytest.raises(RuntimeError, match=r"occupancy\.path"):
+        Guide().estimator(BOX).sampling(*rays(), **MARCH)
+
+
+def test_an_unknown_sampler_is_named():
+    with pytest.raises(ValueError, match="no-such"):
+        _ = Guide("no-such").needs_occupancy
+
+
+def test_a_sampler_without_a_gate_is_built_in_the_hosts_box():
+    grid = Guide("occupancy-grid").estimator(BOX)
+    torch.testing.assert_close(grid.aabbs[0], BOX)
+
+
+@pytest.mark.parametrize("already", [False, True], ids=["empty", "with another gate"])
+def test_a_checkpoint_brings_its_own_occupancy(guide: Guide, already: bool):
+    guide.frame.copy_(2.0 * torch.eye(3, 4))
+    fresh = Guide()
+    if already:
+        fresh.set_occupancy(ball("vm"))
+        stand_in = fresh.estimator(BOX)
+        stand_in.sampling(*rays(), **MARCH)  # built on the gate that gives way
+    fresh.load_state_dict(guide.state_dict())
+    probe = torch.rand(500, 3) * 3.0
+    assert torch.equal(fresh.the_occupancy().query(probe), ball().query(probe))
+    assert torch.equal(fresh.frame, guide.frame)
+    assert fresh.the_occupancy().report == ball().report
+    if already:
+        expected = guide.estimator(BOX).sampling(*rays(), **MARCH)
+        assert torch.equal(stand_in.sampling(*rays(), **MARCH)[1], expected[1])
+
+
+def test_the_state_of_a_host_holds_the_gate_once(guide: Guide):
+    host = torch.nn.Module()
+    host.guide, host.grid = guide, guide.estimator(BOX)
+    host.grid.sampling(*rays(), **MARCH)
+    assert all(name.startswith("guide.") for name in host.state_dict())
+    assert not any(parameter.requires_grad for parameter in host.parameters())

@@ -1,0 +1,64 @@
+"""An occupancy learned inside another method's run."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+import tiny_scene
+from nerfstudio.data.datamanagers.base_datamanager import VanillaDataManagerConfig
+from nerfstudio.pipelines.base_pipeline import VanillaPipelineConfig
+
+from leco_plugin.models.guided_start import OccupancyConfig
+from leco_plugin.models.learn_first import FEWEST_STEPS, learn_occupancy
+from leco_plugin.models.leco import LecoModelConfig
+from leco_plugin.models.phases import ScheduleConfig
+from leco_plugin.occupancy import Occupancy
+from leco_plugin.scenes.photographs import LecoPhotographsDataParserConfig
+
+pytestmark = [  # nerfstudio leaves an image open
+    pytest.mark.filterwarnings("ignore:unclosed file:ResourceWarning"),
+    pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning"),
+]
+
+
+@pytest.fixture(scope="module")
+def pipeline(tmp_path_factory: pytest.TempPathFactory):
+    folder = tiny_scene.write(tmp_path_factory.mktemp("scene"))
+    data = VanillaDataManagerConfig(
+        dataparser=LecoPhotographsDataParserConfig(data=folder), train_num_rays_per_batch=77
+    )
+    return VanillaPipelineConfig(datamanager=data, model=LecoModelConfig()).setup(device="cpu")
+
+
+def config(steps: int) -> LecoModelConfig:
+    return LecoModelConfig(schedule=ScheduleConfig(learn_steps=steps))
+
+
+def test_it_is_frozen_and_calibrated_and_the_batch_is_as_before(pipeline):
+    occupancy = learn_occupancy(config(8), pipeline, rays=64)
+    assert isinstance(occupancy, Occupancy)
+    assert occupancy.report["step"] == 7
+    assert occupancy.report["frame"] is not None
+    assert pipeline.datamanager.train_pixel_sampler.num_rays_per_batch == 77
+    assert not any(p.requires_grad for p in occupancy.parameters())
+
+
+def test_a_budget_sets_the_number_of_steps(pipeline, monkeypatch: pytest.MonkeyPatch):
+    clock = iter(range(10_000))
+    monkeypatch.setattr("leco_plugin.models.learn_first.time.monotonic", lambda: next(clock))
+    # the lifecycle asks the same clock twice a step, and the training once in front of the steps
+    occupancy = learn_occupancy(config(5000), pipeline, rays=32, seconds=1.0)
+    assert occupancy.report["step"] == FEWEST_STEPS - 1
+
+
+@pytest.mark.parametrize("seconds", [0.0, -3.0, float("nan")])
+def test_no_time_is_refused(pipeline, seconds: float):
+    with pytest.raises(ValueError, match="positive number of seconds"):
+        learn_occupancy(config(8), pipeline, rays=32, seconds=seconds)
+
+
+def test_each_method_has_learning_sizes_of_its_own():
+    one, other = OccupancyConfig(), OccupancyConfig()
+    one.learning.schedule = replace(one.learning.schedule, learn_steps=3)
+    assert other.learning.schedule.learn_steps != 3

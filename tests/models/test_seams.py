@@ -1,0 +1,110 @@
+"""Where hosts keep their samplers, and what is taken away when those are swapped."""
+
+from __future__ import annotations
+
+import nerfacc
+import pytest
+import torch
+from ball_occupancy import ball
+from nerfstudio.model_components.ray_samplers import (
+    ProposalNetworkSampler,
+    UniformSampler,
+    VolumetricSampler,
+)
+from torch import nn
+
+from leco_plugin.models.guide import Guide, GuidedEstimator, GuidedProposal
+from leco_plugin.models.seams import no_density, swap_sampler
+
+
+class Host(nn.Module):
+    """What a seam is sought in."""
+
+    def get_param_groups(self) -> dict[str, list[nn.Parameter]]:
+        return {}
+
+    def get_loss_dict(self, *_: object) -> dict[str, torch.Tensor]:
+        return {}
+
+
+class Packed(Host):
+    def __init__(self) -> None:
+        super().__init__()
+        self.gatekeeper = nerfacc.OccGridEstimator(torch.tensor([-1.0] * 3 + [1.0] * 3), 8, 1)
+        self.walker = VolumetricSampler(self.gatekeeper)
+
+
+class Network(nn.Module):
+    def __init__(self) -> None:
+        super().__init__()
+        self.layer = nn.Linear(3, 1)
+
+    def density_fn(self, positions: torch.Tensor) -> torch.Tensor:
+        return self.layer(positions)
+
+
+class Proposal(Host):
+    def __init__(self) -> None:
+        super().__init__()
+        self.field = Network()
+        self.scouts = nn.ModuleList([Network(), Network()])
+        self.alone = Network()
+        self.opinions = [net.density_fn for net in (*self.scouts, self.alone)]
+        self.chooser = ProposalNetworkSampler(
+            num_nerf_samples_per_ray=21, initial_sampler=UniformSampler(single_jitter=True)
+        )
+
+    def get_param_groups(self) -> dict[str, list[nn.Parameter]]:
+        return {
+            "scouts": list(self.scouts.parameters()),
+            "fields": list(self.field.parameters()),
+        }
+
+    def get_loss_dict(self, *_: object) -> dict[str, torch.Tensor]:
+        constant = torch.tensor(0.5)
+        return {"rgb": self.field.layer.weight.sum(), "scouting": constant}
+
+
+@pytest.fixture
+def guide() -> Guide:
+    made = Guide()
+    made.set_occupancy(ball())
+    return made
+
+
+def test_a_packed_host_is_found_under_any_name(guide: Guide):
+    host = Packed()
+    assert swap_sampler(host, guide) == "packed"
+    assert isinstance(host.gatekeeper, GuidedEstimator)
+    assert host.walker.occupancy_grid is host.gatekeeper
+    assert not any("occs" in name for name in host.state_dict())
+
+
+def test_a_proposal_host_keeps_nothing_of_its_networks(guide: Guide):
+    host = Proposal()
+    assert swap_sampler(host, guide) == "proposal"
+    assert isinstance(host.chooser, GuidedProposal)
+    assert host.chooser._options["num_samples"] == 21
+    assert host.chooser._options["single_jitter"] is True
+    assert isinstance(host.chooser._options["initial_sampler"], UniformSampler)
+    assert not [*host.scouts.parameters(), *host.alone.parameters()]
+    assert host.opinions == [no_density] * 3
+    assert set(host.get_param_groups()) == {"fields"}
+    assert {name.split(".")[0] for name in host.state_dict()} == {"field"}
+
+
+def test_a_loss_that_reaches_nothing_is_left_out_in_training_only(guide: Guide):
+    host = Proposal()
+    swap_sampler(host, guide)
+    assert set(host.train().get_loss_dict()) == {"rgb"}
+    assert set(host.eval().get_loss_dict()) == {"rgb", "scouting"}
+
+
+def test_a_grid_has_nothing_for_a_proposal_host():
+    with pytest.raises(ValueError, match="occupancy-grid"):
+        swap_sampler(Proposal(), Guide("occupancy-grid"))
+
+
+def test_a_host_without_a_seam_is_told_what_was_looked_for(guide: Guide):
+    with pytest.raises(ValueError, match=r"OccGridEstimator.*ProposalNetworkSampler.*HostAdapter"):
+        swap_sampler(Host(), guide)

@@ -1,0 +1,49 @@
+"""What was learned in the coordinates of one reader is asked in those of another."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+
+import torch
+
+from leco_plugin.scenes.frames import between, frame_of
+
+
+def rotation(seed: int) -> torch.Tensor:
+    generator = torch.Generator().manual_seed(seed)
+    turn = torch.linalg.qr(torch.randn(3, 3, dtype=torch.float64, generator=generator))[0]
+    return turn * torch.det(turn)
+
+
+def reader(seed: int, scale: float) -> SimpleNamespace:
+    """A data manager whose reader turned, moved and scaled the scene."""
+    transform = torch.cat([rotation(seed), torch.full((3, 1), 0.1 * seed)], dim=1)
+    return SimpleNamespace(
+        train_dataparser_outputs=SimpleNamespace(
+            dataparser_transform=transform.float(), dataparser_scale=scale
+        )
+    )
+
+
+def in_model(manager: SimpleNamespace, points: torch.Tensor) -> torch.Tensor:
+    """As nerfstudio's readers do it with poses: turn and move, then scale."""
+    outputs = manager.train_dataparser_outputs
+    transform = outputs.dataparser_transform.double()
+    return outputs.dataparser_scale * (points @ transform[:, :3].T + transform[:, 3])
+
+
+def test_points_of_one_reader_are_taken_to_those_of_another():
+    points = torch.randn(50, 3, dtype=torch.float64)
+    host, other = reader(1, 0.3), reader(2, 2.5)
+    frame = between(frame_of(host), frame_of(other)).double()
+    moved = in_model(host, points) @ frame[:, :3].T + frame[:, 3]
+    torch.testing.assert_close(moved, in_model(other, points), rtol=1e-4, atol=1e-4)
+
+
+def test_the_same_reader_is_exactly_the_identity():
+    frame = frame_of(reader(3, 0.7))
+    assert torch.equal(between(frame, frame), torch.eye(3, 4))
+
+
+def test_a_data_manager_without_a_reader_has_no_known_frame():
+    assert frame_of(SimpleNamespace()) is None
