@@ -42,6 +42,7 @@ class ForkedCommands:
             cwd=folder,
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
+            stderr=subprocess.DEVNULL,  # of the imports; each command has a log
             text=True,
         )
 
@@ -51,6 +52,7 @@ class ForkedCommands:
     def __exit__(self, *_: object) -> None:
         _pipe(self.server.stdin).close()
         self.server.wait(timeout=60)
+        _pipe(self.server.stdout).close()
 
     def __call__(self, name: str, *arguments: object, status: int = 0) -> str:
         """Runs a command to its end, which must be of this status; returns what it printed."""

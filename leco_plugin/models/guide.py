@@ -7,6 +7,7 @@ may still have to be learned, or to come with a checkpoint whose gate has a shap
 from __future__ import annotations
 
 import functools
+import inspect
 from typing import Any
 
 import torch
@@ -16,6 +17,7 @@ from torch import Tensor, nn
 from leco_plugin.models.gate import Gate, GateConfig
 from leco_plugin.occupancy import Occupancy
 from leco_plugin.samplers.base import Estimator
+from leco_plugin.samplers.rays import intersect_box
 from leco_plugin.samplers.registry import (
     SamplerSpec,
     build_estimator,
@@ -99,14 +101,17 @@ class Guide(nn.Module):
         """Whether host and occupancy share their coordinates."""
         return torch.equal(self.frame, torch.eye(3, 4, device=self.frame.device))
 
-    def estimator(self, aabb: Tensor) -> nn.Module:
-        """What goes where a packed host has its estimator; `aabb` is the box of that one, [6].
+    def estimator(self, aabb: Tensor, outermost: Tensor | None = None) -> nn.Module:
+        """What goes where a packed host has its estimator.
 
+        Args:
+            aabb: the box of the host's own, [6].
+            outermost: the box in which the host's own samples at all, [6]; None is no such box.
         Raises:
             InputError: the sampler has no estimator.
         """
         if self._spec("estimator").needs_occupancy:
-            return GuidedEstimator(self, aabb)
+            return GuidedEstimator(self, aabb, outermost)
         return build_estimator(self.sampler, aabb=aabb)
 
     def proposal(self, **options: Any) -> Sampler:
@@ -158,12 +163,16 @@ class _StandIn(nn.Module):
         return self._built[1][0].train(self.training)
 
 
+_SAMPLING = inspect.signature(Estimator.sampling)
+
+
 class GuidedEstimator(_StandIn):
     """A packed sampler of the registry, in the host's coordinates."""
 
-    def __init__(self, guide: Guide, aabb: Tensor) -> None:
+    def __init__(self, guide: Guide, aabb: Tensor, outermost: Tensor | None = None) -> None:
         super().__init__(guide)
         self._aabb = aabb.detach().cpu()
+        self._outermost = None if outermost is None else outermost.detach().cpu()
 
     def _build(self, guide: Guide) -> nn.Module:
         aabb = self._aabb if guide.same_frame() else box_around(self._aabb, guide.frame.cpu())
@@ -173,11 +182,27 @@ class GuidedEstimator(_StandIn):
     def sampling(self, rays_o: Tensor, rays_d: Tensor, *args: Any, **kwargs: Any) -> Any:
         (guide,) = self._guide
         estimator: Any = self.sampler
+        options = self._with_an_end(_SAMPLING.bind(self, rays_o, rays_d, *args, **kwargs).arguments)
         if not guide.same_frame():
             # a direction carries the scale, so that distances along the ray stay the host's
             turn = guide.frame[:, :3].T.to(rays_o)
             rays_o, rays_d = rays_o @ turn + guide.frame[:, 3].to(rays_o), rays_d @ turn
-        return estimator.sampling(rays_o, rays_d, *args, **kwargs)
+        return estimator.sampling(rays_o, rays_d, **options)
+
+    def _with_an_end(self, arguments: dict[str, Any]) -> dict[str, Any]:
+        """The options of `sampling`; rays that would go on for ever end at the host's box.
+
+        A host whose steps do not grow relies on the box of its own estimator, and an unbounded
+        occupancy has none.
+        """
+        (guide,) = self._guide
+        _, rays_o, rays_d = (arguments.pop(name) for name in ("self", "rays_o", "rays_d"))
+        endless = guide.the_occupancy().space.kind == "contraction"
+        if endless and self._outermost is not None and not arguments.get("cone_angle"):
+            _, leaves = intersect_box(rays_o, rays_d, self._outermost.to(rays_o))
+            t_max = arguments.get("t_max")
+            arguments["t_max"] = leaves if t_max is None else leaves.minimum(t_max)
+        return arguments
 
     def update_every_n_steps(self, *args: Any, **kwargs: Any) -> None:
         """Called by hosts before each training step; a frozen gate has nothing to update."""

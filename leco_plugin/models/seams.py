@@ -110,7 +110,8 @@ def _estimators(host: nn.Module) -> list[nn.Module]:
 def _swap_packed(host: Model, guide: Guide) -> None:
     for old in _estimators(host):
         boxes: Any = old.aabbs
-        _replace(host, old, guide.estimator(boxes[0].detach()))
+        # of nested boxes the first is the scene's, and nothing is sampled outside the last
+        _replace(host, old, guide.estimator(boxes[0].detach(), boxes[-1].detach()))
 
 
 PACKED = HostAdapter(

@@ -19,6 +19,7 @@ from nerfstudio.models.base_model import Model
 from small_hosts import SMALL, pipeline_of, small, unswapped
 from torch import Tensor
 
+from leco_plugin.models.guide import GuidedEstimator
 from leco_plugin.models.guided import GuidedModelConfig
 from leco_plugin.samplers import estimator
 from leco_plugin.swap import with_sampler_swapped
@@ -185,19 +186,35 @@ def test_a_batch_that_meets_nothing_is_trained_on(pair: Pair) -> None:
     assert all(bool(grad.isfinite().all()) for grad in grads)
 
 
-def test_no_sample_lies_where_the_occupancy_keeps_nothing(pair: Pair) -> None:
-    model = pair.guided.model
-    if not hasattr(model, "walker"):
-        pytest.skip("a proposal host shades as many samples on every ray")
-    model.eval()
-    rays = bundle_of(pair.guided).flatten()
+def kept_share(pipeline: Any, occupancy: Any) -> float:
+    """Share of the samples shaded for one camera that lie where the occupancy keeps something."""
+    shaded: list[Tensor] = []
+    field = getattr(pipeline.model, "field", None) or pipeline.model.matter
+    get_density = field.get_density
+
+    def watched(samples: Any) -> Any:
+        shaded.append(samples.frustums.get_positions().reshape(-1, 3))
+        return get_density(samples)
+
+    field.get_density = watched
+    pipeline.eval()
     with torch.no_grad():
-        samples, _ = model.walker(ray_bundle=rays, render_step_size=0.05)
-    positions = samples.frustums.get_positions()
-    frame = model.guide.frame
-    assert len(positions) > 100
-    assert bool(model.guide.occupancy.occupied(positions @ frame[:, :3].T + frame[:, 3]).all())
-    model.train()
+        pipeline.model(bundle_of(pipeline).flatten())
+    pipeline.train()
+    del field.get_density
+    return float(occupancy(torch.cat(shaded)).float().mean())
+
+
+def test_it_shades_where_the_occupancy_keeps_something(pair: Pair) -> None:
+    guide = pair.guided.model.guide
+    turn, shift = guide.frame.split([3, 1], dim=1)
+
+    def occupied(positions: Tensor) -> Tensor:
+        return guide.the_occupancy().occupied(positions @ turn.T + shift[:, 0])
+
+    found, before = kept_share(pair.guided, occupied), kept_share(pair.own, occupied)
+    packed = any(isinstance(module, GuidedEstimator) for module in pair.guided.model.modules())
+    assert found == 1.0 if packed else found > 1.5 * before > 0.0
 
 
 def test_a_config_says_everything_in_yaml(pair: Pair, tmp_path: Path) -> None:
