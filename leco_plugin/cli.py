@@ -100,6 +100,7 @@ def swap(
     method: Annotated[str, tyro.conf.Positional],
     occupancy: Path,
     arguments: Annotated[tuple[str, ...], tyro.conf.Positional] = (),
+    sampler: str = "learned-occupancy",
     json: Path | None = None,
 ) -> None:
     """Train any registered nerfstudio method with its sampler swapped for a learned occupancy.
@@ -110,13 +111,16 @@ def swap(
         method: As ns-train knows it: instant-ngp, nerfacto, or of another plugin.
         occupancy: An occupancy.safetensors, or the folder of a run that left one.
         arguments: After --, what ns-train would be given for this method: -- --data DIR ...
+        sampler: Of this package or of another, in place of the method's own.
         json: File for the folder of the run, as JSON.
     """
     from leco_plugin.swap import swap as train_swapped
 
-    folder = train_swapped(method, occupancy, arguments)
+    _check_json(json)
+    folder = train_swapped(method, occupancy, arguments, sampler)
     print(f"{method}, guided: {folder}")
-    _write_json(json, {"format": 1, "method": method, "folder": str(folder)})
+    facts = {"format": 1, "method": method, "sampler": sampler, "folder": str(folder)}
+    _write_json(json, facts)
 
 
 def demo(out: Path = Path("runs/demo"), seconds: float = 110.0, json: Path | None = None) -> None:
@@ -136,6 +140,7 @@ def demo(out: Path = Path("runs/demo"), seconds: float = 110.0, json: Path | Non
     warnings.filterwarnings("ignore", module=r"nerfstudio|torch")
     from leco_plugin.demo import run_demo, summary
 
+    _check_json(json)
     report = run_demo(out, seconds)
     print("\n".join(summary(report)))
     print(f"see report.json, chart.png and picture.png in {out}")
@@ -263,6 +268,12 @@ def _complain(error: BaseException, status: int) -> int:
 
 def _listed(values: Sequence[float]) -> str:
     return "(" + ", ".join(f"{value:.4g}" for value in values) + ")"
+
+
+def _check_json(path: Path | None) -> None:
+    """Before work that takes minutes, whether its report has a place."""
+    if path is not None and path.is_dir():
+        raise ValueError(f"--json {path} is a folder; give a file")
 
 
 def _write_json(path: Path | None, value: Any) -> None:

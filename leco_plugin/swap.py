@@ -14,38 +14,61 @@ from nerfstudio.engine.trainer import Trainer, TrainerConfig
 from leco_plugin.compat.atomic_trainer import AtomicTrainer
 from leco_plugin.compat.data_parallel import DataParallelTrainerConfig
 from leco_plugin.compat.dynamic_batch import ClampedDynamicBatchPipelineConfig
+from leco_plugin.method_configs import best_device
 from leco_plugin.models.guided import GuidedModelConfig
-from leco_plugin.models.guided_start import OccupancyConfig, occupancy_file
-from leco_plugin.occupancy import Occupancy
+from leco_plugin.models.guided_start import OccupancyConfig, load_occupancy, occupancy_file
+from leco_plugin.samplers.registry import check_gate
 from leco_plugin.scenes.input_error import InputError
 
+LEARNED = "learned-occupancy"
+"""Name of the sampler that goes into a host unless another one is asked for."""
 
-def swapped_config(method: str, file: Path, arguments: Sequence[str] = ()) -> TrainerConfig:
+
+def swapped_config(
+    method: str, file: Path, arguments: Sequence[str] = (), sampler: str = LEARNED
+) -> TrainerConfig:
     """The config of a registered method with its sampler swapped.
 
     Args:
         method: name, as `ns-train` knows it.
         file: an occupancy, or the folder of a run that left one.
         arguments: what `ns-train METHOD` would be given.
+        sampler: name in the registry of samplers.
     Raises:
-        InputError: there is no such method, or it is guided or learns occupancy itself.
-        ValueError, OSError: there is no such file, or it is no occupancy.
+        InputError: there is no such method, or it is guided or learns occupancy itself; there is no
+            such sampler, or it asks another kind of gate; there is no such file, or it is no
+            occupancy; the arguments name a config that would replace this one.
         SystemExit: the arguments are none of the method's; tyro has said why.
     """
-    found = occupancy_file(file)
-    assert found is not None
-    Occupancy.load(found)
+    check_gate_of(file, sampler)
     config = tyro.cli(
         tyro.conf.SuppressFixed[tyro.conf.FlagConversionOff[TrainerConfig]],
         default=registered(method),
         args=list(arguments),
         prog=f"leco swap {method} --occupancy {file} --",
     )
-    return with_sampler_swapped(config, found)
+    if config.load_config is not None:
+        raise InputError(
+            "--load-config would train what that file says, without a swap; a run that was swapped "
+            "is trained again with ns-train and its config"
+        )
+    return with_sampler_swapped(config, file, sampler)
+
+
+def check_gate_of(file: Path, sampler: str) -> None:
+    """Whether there is an occupancy, and a sampler that asks gates of its kind.
+
+    Raises:
+        InputError: there is not.
+    """
+    try:
+        check_gate(sampler, load_occupancy(file).gate.config)
+    except ValueError as error:
+        raise InputError(str(error)) from None
 
 
 def registered(method: str) -> TrainerConfig:
-    """A copy of the config of a registered method.
+    """A copy of the config of a registered method, for the device that is there.
 
     Raises:
         InputError: there is no such method, or its package is not installed.
@@ -57,10 +80,14 @@ def registered(method: str) -> TrainerConfig:
     config = copy.deepcopy(all_methods[method])
     if not isinstance(config, TrainerConfig):
         raise InputError(f"{method!r} is known by name only: its package is not installed")
+    if config.machine.device_type == "cuda":
+        config.machine.device_type = best_device()  # what nerfstudio's methods take for granted
     return config
 
 
-def with_sampler_swapped(config: TrainerConfig, file: Path) -> TrainerConfig:
+def with_sampler_swapped(
+    config: TrainerConfig, file: Path, sampler: str = LEARNED
+) -> TrainerConfig:
     """The same training with its model guided by an occupancy; the config given is not changed.
 
     Raises:
@@ -74,7 +101,9 @@ def with_sampler_swapped(config: TrainerConfig, file: Path) -> TrainerConfig:
         raise InputError(
             f"{config.method_name} finds its occupancy itself; swap another method's sampler"
         )
-    pipeline.model = GuidedModelConfig(host=host, occupancy=OccupancyConfig(path=file.resolve()))
+    path = occupancy_file(file.resolve())
+    occupancy = OccupancyConfig(path=path, sampler=sampler)
+    pipeline.model = GuidedModelConfig(host=host, occupancy=occupancy)
     if type(config) is TrainerConfig:
         values = {f.name: getattr(config, f.name) for f in fields(config)}
         config = DataParallelTrainerConfig(**values)
@@ -92,10 +121,10 @@ def clamped(pipeline: Any) -> Any:
     return ClampedDynamicBatchPipelineConfig(**values)
 
 
-def swap(method: str, file: Path, arguments: Sequence[str] = ()) -> Path:
+def swap(method: str, file: Path, arguments: Sequence[str] = (), sampler: str = LEARNED) -> Path:
     """Trains, and returns the folder of the run. Arguments and errors as for `swapped_config`."""
     from nerfstudio.scripts.train import main as train
 
-    config = swapped_config(method, file, arguments)
+    config = swapped_config(method, file, arguments, sampler)
     train(config)
     return config.get_base_dir()

@@ -5,6 +5,7 @@ from __future__ import annotations
 import functools
 
 import torch
+from tiny_scene import BALL_CENTRE, BALL_RADIUS
 
 from leco_plugin.models.encodings import EncodingConfig
 from leco_plugin.models.gate import Gate, GateConfig, occupancy_logit
@@ -47,3 +48,19 @@ def ball(kind: str = "frequency") -> Occupancy:
         "empty_fraction": 0.9,
     }
     return Occupancy(gate, Space("box", CENTRE, HALF), 0.5, report=report).eval()
+
+
+SCENE_FRAME = torch.eye(3, 4).tolist()
+
+
+def ball_of_the_tiny_scene(frame: list[list[float]] = SCENE_FRAME) -> Occupancy:
+    """The ball of `tiny_scene`, as if it had been learned in the coordinates of `frame`.
+
+    Args:
+        frame: [3, 4], a rotation times a scale, and a translation, from the scene's coordinates.
+    """
+    turn, shift = torch.tensor(frame).split([3, 1], dim=1)
+    x, y, z = (turn @ torch.tensor(BALL_CENTRE).float() + shift[:, 0]).tolist()
+    half = BALL_RADIUS / (RADIUS / HALF) * float(turn.norm()) / 3.0**0.5
+    space = Space("box", (x, y, z), half)
+    return Occupancy(ball().gate, space, 0.5, report={"frame": frame}).eval()

@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import os
+import shutil
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -27,6 +30,21 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 def tiny_scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Folder of a scene of nine 32 x 32 images in nerfstudio's format."""
     return tiny_scene_writer.write(tmp_path_factory.mktemp("tiny_scene") / "ball")
+
+
+@pytest.fixture(scope="session")
+def elsewhere(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Folder in which the package of `tests/elsewhere` is installed, entry points and all."""
+    folder = tmp_path_factory.mktemp("elsewhere")
+    source, site = folder / "source", folder / "site"
+    shutil.copytree(Path(__file__).parent / "elsewhere", source)  # setuptools builds in place
+    arguments = ["--no-deps", "--no-build-isolation", "--no-index", "--target", str(site)]
+    command = [sys.executable, "-m", "pip", "install", "--disable-pip-version-check", "--quiet"]
+    done = subprocess.run(
+        [*command, *arguments, str(source)], capture_output=True, text=True, timeout=120
+    )
+    assert done.returncode == 0, done.stderr
+    return site
 
 
 @pytest.fixture(scope="session")

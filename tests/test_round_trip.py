@@ -7,9 +7,7 @@ been set up. Each takes some six seconds to import nerfstudio.
 from __future__ import annotations
 
 import json
-import os
 import re
-import shutil
 import socket
 import subprocess
 import sys
@@ -22,6 +20,7 @@ import numpy as np
 import pytest
 import torch
 import trimesh
+from bare_machine import variables
 from PIL import Image
 
 from leco_plugin.occupancy import Occupancy
@@ -54,25 +53,7 @@ Runner = Callable[..., str]
 @pytest.fixture(scope="module")
 def environment(tmp_path_factory: pytest.TempPathFactory) -> dict[str, str]:
     """Of a process without network, without downloaded weights, on one core."""
-    folder = tmp_path_factory.mktemp("environment")
-    closed = "http://127.0.0.1:9"
-    variables = os.environ | {
-        "http_proxy": closed,
-        "https_proxy": closed,
-        "no_proxy": "",
-        "TORCH_HOME": str(folder / "torch"),
-        "OMP_NUM_THREADS": "1",
-        "PYTHONUNBUFFERED": "1",
-        "PYTHONWARNINGS": "default",
-    }
-    if shutil.which("ffmpeg") is None:
-        # ns-render looks for ffmpeg even where it writes images, which do not need it.
-        stand_in = folder / "bin" / "ffmpeg"
-        stand_in.parent.mkdir()
-        stand_in.write_text("#!/bin/sh\nexit 1\n")
-        stand_in.chmod(0o755)
-        variables["PATH"] = f"{stand_in.parent}{os.pathsep}{variables['PATH']}"
-    return variables
+    return variables(tmp_path_factory.mktemp("environment"))
 
 
 def command(name: str) -> str:

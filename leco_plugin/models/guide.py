@@ -7,6 +7,7 @@ may still have to be learned, or to come with a checkpoint whose gate has a shap
 from __future__ import annotations
 
 import functools
+import inspect
 from collections.abc import Mapping
 from typing import Any
 
@@ -17,7 +18,15 @@ from torch import Tensor, nn
 from leco_plugin.models.gate import Gate, GateConfig
 from leco_plugin.occupancy import Occupancy
 from leco_plugin.samplers.base import Estimator
-from leco_plugin.samplers.registry import build_estimator, build_proposal, sampler_spec
+from leco_plugin.samplers.rays import intersect_box
+from leco_plugin.samplers.registry import (
+    SamplerSpec,
+    build_estimator,
+    build_proposal,
+    sampler_spec,
+)
+from leco_plugin.scenes.frames import box_around
+from leco_plugin.scenes.input_error import InputError
 from leco_plugin.space import Space
 
 
@@ -52,9 +61,21 @@ class Guide(nn.Module):
         """Whether the sampler asks a gate at all; a grid does not.
 
         Raises:
-            ValueError: there is no such sampler.
+            InputError: there is no such sampler.
         """
-        return sampler_spec(self.sampler).needs_occupancy
+        return self._spec().needs_occupancy
+
+    def _spec(self, kind: str | None = None) -> SamplerSpec:
+        """What is registered under the sampler's name, and serves this kind of hosts."""
+        try:
+            spec = sampler_spec(self.sampler)
+        except ValueError as error:
+            raise InputError(str(error)) from None
+        if kind is not None and getattr(spec, kind) is None:
+            raise InputError(
+                f"the sampler {self.sampler!r} cannot go into this host: it has no {kind}"
+            )
+        return spec
 
     def changed(self) -> None:
         """Samplers that were made are made anew when they are next asked."""
@@ -85,18 +106,26 @@ class Guide(nn.Module):
         """Whether host and occupancy share their coordinates."""
         return torch.equal(self.frame, torch.eye(3, 4, device=self.frame.device))
 
-    def estimator(self, aabb: Tensor | None) -> nn.Module:
+    def estimator(self, aabb: Tensor | None, outermost: Tensor | None = None) -> nn.Module:
         """What goes where a packed host has its estimator.
 
         Args:
             aabb: box of that estimator, [6]; None where the host cuts its rays itself.
+            outermost: the box in which the host's own samples at all, [6]; None is no such box.
+        Raises:
+            InputError: the sampler has no estimator.
         """
-        if self.needs_occupancy:
-            return GuidedEstimator(self, aabb)
+        if self._spec("estimator").needs_occupancy:
+            return GuidedEstimator(self, aabb, outermost)
         return build_estimator(self.sampler, aabb=aabb, **self.options)
 
     def proposal(self, **options: Any) -> Sampler:
-        """What goes where a proposal host has its sampler; options as for the registry."""
+        """What goes where a proposal host has its sampler; options as for the registry.
+
+        Raises:
+            InputError: the sampler has nothing for proposal hosts.
+        """
+        self._spec("proposal")
         return GuidedProposal(self, {**options, **self.options})
 
     def get_extra_state(self) -> dict[str, Any]:
@@ -150,27 +179,50 @@ class _StandIn(nn.Module):
         return self._built[1][0].train(self.training)
 
 
+_SAMPLING = inspect.signature(Estimator.sampling)
+
+
 class GuidedEstimator(_StandIn):
     """A packed sampler of the registry, in the host's coordinates."""
 
-    def __init__(self, guide: Guide, aabb: Tensor | None) -> None:
+    def __init__(self, guide: Guide, aabb: Tensor | None, outermost: Tensor | None = None) -> None:
         super().__init__(guide)
         self._aabb = None if aabb is None else aabb.detach().cpu()
+        self._outermost = None if outermost is None else outermost.detach().cpu()
 
     def _build(self, guide: Guide) -> nn.Module:
+        aabb = self._aabb
+        if aabb is not None and not guide.same_frame():
+            aabb = box_around(aabb, guide.frame.cpu())
         return build_estimator(
-            guide.sampler, aabb=self._aabb, occupancy=guide.the_occupancy(), **guide.options
+            guide.sampler, aabb=aabb, occupancy=guide.the_occupancy(), **guide.options
         )
 
     @functools.wraps(Estimator.sampling)
     def sampling(self, rays_o: Tensor, rays_d: Tensor, *args: Any, **kwargs: Any) -> Any:
         (guide,) = self._guide
         estimator: Any = self.sampler
+        options = self._with_an_end(_SAMPLING.bind(self, rays_o, rays_d, *args, **kwargs).arguments)
         if not guide.same_frame():
             # a direction carries the scale, so that distances along the ray stay the host's
             frame = guide.frame.to(rays_o)
             rays_o, rays_d = moved(rays_o, frame), turned(rays_d, frame)
-        return estimator.sampling(rays_o, rays_d, *args, **kwargs)
+        return estimator.sampling(rays_o, rays_d, **options)
+
+    def _with_an_end(self, arguments: dict[str, Any]) -> dict[str, Any]:
+        """The options of `sampling`; rays that would go on for ever end at the host's box.
+
+        A host whose steps do not grow relies on the box of its own estimator, and an unbounded
+        occupancy has none.
+        """
+        (guide,) = self._guide
+        _, rays_o, rays_d = (arguments.pop(name) for name in ("self", "rays_o", "rays_d"))
+        endless = guide.the_occupancy().space.kind == "contraction"
+        if endless and self._outermost is not None and not arguments.get("cone_angle"):
+            _, leaves = intersect_box(rays_o, rays_d, self._outermost.to(rays_o))
+            t_max = arguments.get("t_max")
+            arguments["t_max"] = leaves if t_max is None else leaves.minimum(t_max)
+        return arguments
 
     def update_every_n_steps(self, *args: Any, **kwargs: Any) -> None:
         """Called by hosts before each training step; a frozen gate has nothing to update."""
@@ -192,9 +244,11 @@ class GuidedProposal(_StandIn, Sampler):
 
     def _build(self, guide: Guide) -> nn.Module:
         options = dict(self._options)
-        if not guide.same_frame():
-            options["frame"] = guide.frame
-        return build_proposal(guide.sampler, occupancy=guide.the_occupancy(), **options)
+        if guide.needs_occupancy:
+            options["occupancy"] = guide.the_occupancy()
+            if not guide.same_frame():
+                options["frame"] = guide.frame
+        return build_proposal(guide.sampler, **options)
 
     def forward(self, *args: Any, **kwargs: Any) -> Any:
         return self.sampler(*args, **kwargs)

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import copy
 import functools
+from contextlib import suppress
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -28,11 +29,11 @@ from leco_plugin.models.guided_start import (
     OWN_SAMPLER,
     GuidedStart,
     OccupancyConfig,
-    occupancy_file,
+    load_occupancy,
 )
 from leco_plugin.models.precision import keep_freed_memory
 from leco_plugin.models.seams import swap_sampler
-from leco_plugin.occupancy import Occupancy
+from leco_plugin.scenes.input_error import InputError
 
 
 @dataclass
@@ -61,8 +62,7 @@ def set_up_guided(config: GuidedModelConfig, **arguments: Any) -> Model:
         config: host and occupancy.
         arguments: what nerfstudio gives a model (scene_box, num_train_data, metadata, device, ...).
     Raises:
-        InputError: the host has no seam that is known, or there is no such sampler.
-        ValueError, OSError: the file is there, and is no occupancy.
+        InputError: the host has no seam that is known, or there is no such sampler for it.
     """
     allow_checkpoint_globals()
     if torch.device(arguments.get("device", "cpu")).type == "cpu":
@@ -73,9 +73,9 @@ def set_up_guided(config: GuidedModelConfig, **arguments: Any) -> Model:
     if config.occupancy.sampler == OWN_SAMPLER:
         return _as_it_is(host_config, arguments)
     guide = Guide(config.occupancy.sampler, config.occupancy.options)
-    file = occupancy_file(config.occupancy.path)
-    if guide.needs_occupancy and file is not None and file.exists():
-        guide.set_occupancy(Occupancy.load(file))
+    if guide.needs_occupancy and config.occupancy.path is not None:
+        with suppress(InputError):  # a checkpoint brings its own; without one, training says it
+            guide.set_occupancy(load_occupancy(config.occupancy.path))
     host = with_counts_as_floats(setup_with_lazy_lpips(host_config, **arguments))
     host.guide = guide
     swap_sampler(host, guide)

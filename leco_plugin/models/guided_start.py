@@ -14,7 +14,7 @@ from leco_plugin.models.leco import LecoModelConfig
 from leco_plugin.models.ranks import is_first, say
 from leco_plugin.occupancy import Occupancy
 from leco_plugin.samplers.rays import intersect_box
-from leco_plugin.samplers.registry import sampler_spec
+from leco_plugin.samplers.registry import check_gate
 from leco_plugin.scenes.frames import between, frame_of
 from leco_plugin.scenes.input_error import InputError
 from leco_plugin.scenes.survey import covering_rays
@@ -57,6 +57,25 @@ def occupancy_file(path: Path | None) -> Path | None:
     return found[-1] if found else path / FILE_NAME
 
 
+def load_occupancy(path: Path) -> Occupancy:
+    """The occupancy that `path` means.
+
+    Raises:
+        InputError: there is none, or it cannot be read.
+    """
+    file = occupancy_file(path)
+    assert file is not None
+    try:
+        return Occupancy.load(file)
+    except FileNotFoundError:
+        raise InputError(
+            f"there is no occupancy {file}: train leco-occupancy on this scene and give its run "
+            "folder, or give no path to learn it first"
+        ) from None
+    except (OSError, ValueError) as error:
+        raise InputError(f"no occupancy can be read: {error}") from None
+
+
 class GuidedStart:
     """The start of one training run of a guided host.
 
@@ -65,7 +84,8 @@ class GuidedStart:
         config: where else to get one.
         pipeline, trainer: nerfstudio's; without a trainer no file is left.
     Raises:
-        InputError: the file is not there, or its occupancy keeps nothing that the cameras see.
+        InputError: the file is not there or cannot be read, its occupancy keeps nothing that the
+            cameras see, or its gate is none that the sampler asks.
     """
 
     def __init__(
@@ -74,22 +94,15 @@ class GuidedStart:
         self.guide, self.config = guide, config
         self.pipeline, self.trainer = pipeline, trainer
         self.begun = False
+        if guide.occupancy is None and config.path is not None:
+            guide.set_occupancy(load_occupancy(config.path))  # says why it could not be before
+        learned = guide.occupancy.gate.config if guide.occupancy is not None else None
+        try:
+            check_gate(guide.sampler, learned or config.learning.sizes.gate)
+        except ValueError as error:
+            raise InputError(str(error)) from None
         if guide.occupancy is not None:
             self._fit(guide.occupancy)
-        elif config.path is not None:
-            raise InputError(
-                f"there is no occupancy {config.path}: train leco-occupancy on this scene and give "
-                "its run folder, or give no path to learn it first"
-            )
-        else:
-            kind = config.learning.sizes.gate.encoding.kind
-            wanted = sampler_spec(guide.sampler).gate_encoding
-            if wanted not in (None, kind):
-                raise InputError(
-                    f"the sampler {guide.sampler!r} asks a gate on {wanted} features, and one on "
-                    f"{kind} features would be learned: add --pipeline.model.occupancy.learning."
-                    f"sizes.gate.encoding.kind {wanted}"
-                )
 
     def before_step(self, step: int) -> None:
         """Learns the occupancy if there is none yet; leaves its file in the run's folder."""

@@ -7,6 +7,7 @@ samples in another way brings a `HostAdapter`.
 from __future__ import annotations
 
 import functools
+import warnings
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
@@ -39,12 +40,8 @@ class HostAdapter:
 
 def adapters() -> dict[str, HostAdapter]:
     """All adapters by name, those of other packages first."""
-    return {
-        **foreign_entries(GROUP),
-        "sample-with": SAMPLE_WITH,
-        "packed": PACKED,
-        "proposal": PROPOSAL,
-    }
+    ours = {"sample-with": SAMPLE_WITH, "packed": PACKED, "proposal": PROPOSAL}
+    return {**foreign_entries(GROUP, frozenset(ours)), **ours}
 
 
 def swap_sampler(host: Model, guide: Guide) -> str:
@@ -53,11 +50,14 @@ def swap_sampler(host: Model, guide: Guide) -> str:
     Raises:
         InputError: the host has no seam that any adapter knows.
     """
+    from leco_plugin.samplers import nerfacc_cpu
+
+    nerfacc_cpu.install()
     known = adapters()
     for name, adapter in known.items():
-        if adapter.fits(host):
+        if _fits(name, adapter, host):
             adapter.swap(host, guide)
-            _leave_out_empty_groups(host)
+            _leave_out_what_is_not_trained(host, guide)
             return name
     looked_for = "; ".join(f"{name}: {adapter.description}" for name, adapter in known.items())
     raise InputError(
@@ -65,6 +65,15 @@ def swap_sampler(host: Model, guide: Guide) -> str:
         f"A package can bring a HostAdapter (leco_plugin.models.seams) in the entry-point group "
         f"{GROUP}"
     )
+
+
+def _fits(name: str, adapter: HostAdapter, host: Model) -> bool:
+    """Whether an adapter takes this host; one that cannot tell does not keep others from it."""
+    try:
+        return adapter.fits(host)
+    except Exception as error:  # noqa: BLE001 (whatever a foreign adapter raises)
+        warnings.warn(f"{GROUP} {name!r} is left out: {error!r}", stacklevel=3)
+        return False
 
 
 def _sample_with(host: Any, guide: Guide) -> None:
@@ -105,12 +114,10 @@ def _estimators(host: nn.Module) -> list[nn.Module]:
 
 
 def _swap_packed(host: Model, guide: Guide) -> None:
-    from leco_plugin.samplers import nerfacc_cpu
-
-    nerfacc_cpu.install()
     for old in _estimators(host):
         boxes: Any = old.aabbs
-        _replace(host, old, guide.estimator(boxes[0].detach()))
+        # of nested boxes the first is the scene's, and nothing is sampled outside the last
+        _replace(host, old, guide.estimator(boxes[0].detach(), boxes[-1].detach()))
 
 
 PACKED = HostAdapter(
@@ -127,8 +134,6 @@ def _proposal_samplers(host: nn.Module) -> list[Any]:
 
 
 def _swap_proposal(host: Model, guide: Guide) -> None:
-    if not guide.needs_occupancy:
-        raise InputError(f"the sampler {guide.sampler!r} has nothing for a proposal host")
     for old in _proposal_samplers(host):
         initial = old.initial_sampler
         _replace(
@@ -160,27 +165,25 @@ def no_density(*_: Any, **__: Any) -> None:
     raise RuntimeError("a guided host has no proposal networks to ask for a density")
 
 
-def _density_lists(host: nn.Module) -> Iterator[tuple[str, list[Any]]]:
+def _density_lists(host: nn.Module) -> Iterator[tuple[str, list[Any] | tuple[Any, ...]]]:
     """Lists of bound methods of modules, as proposal hosts hand to their sampler."""
     for name, value in vars(host).items():
-        if isinstance(value, list) and value:
+        if isinstance(value, list | tuple) and value:
             owners = [getattr(item, "__self__", None) for item in value]
             if all(isinstance(owner, nn.Module) for owner in owners):
                 yield name, value
 
 
 def _remove_density_networks(host: nn.Module) -> None:
-    """Drops the proposal networks from memory, state dict and parameter groups."""
+    """Drops the proposal networks from memory, state dict and parameter groups.
+
+    An empty module takes their places: a host may go on listing their parameters.
+    """
     field = getattr(host, "field", None)
     for name, densities in list(_density_lists(host)):
-        networks = {id(density.__self__) for density in densities} - {id(field)}
-        for parent in list(host.modules()):
-            if isinstance(parent, nn.ModuleList) and any(id(n) in networks for n in parent):
-                _replace(host, parent, nn.ModuleList(n for n in parent if id(n) not in networks))
-        for attribute, child in list(host._modules.items()):
-            if id(child) in networks:
-                del host._modules[attribute]
-        setattr(host, name, [no_density] * len(densities))
+        for network in {density.__self__ for density in densities} - {field}:
+            _replace(host, network, nn.Module())
+        setattr(host, name, type(densities)([no_density] * len(densities)))
 
 
 def _leave_out_proposal_loss(host: Model) -> None:
@@ -197,12 +200,21 @@ def _leave_out_proposal_loss(host: Model) -> None:
     host.get_loss_dict = get_loss_dict  # type: ignore[method-assign]
 
 
-def _leave_out_empty_groups(host: Model) -> None:
-    """An optimizer takes no empty list: groups whose parameters are gone are not handed out."""
+def _leave_out_what_is_not_trained(host: Model, guide: Guide) -> None:
+    """Groups of parameters are handed out without the gate, and not at all when they are empty.
+
+    An optimizer takes no empty list. A gate among its parameters would be one more of them in a run
+    that was given a file than in the same run resumed without.
+    """
     with_all = host.get_param_groups
 
     @functools.wraps(with_all)
     def get_param_groups() -> dict[str, list[nn.Parameter]]:
-        return {name: group for name, group in with_all().items() if group}
+        frozen = {id(parameter) for parameter in guide.parameters()}
+        groups = {
+            name: [parameter for parameter in group if id(parameter) not in frozen]
+            for name, group in with_all().items()
+        }
+        return {name: group for name, group in groups.items() if group}
 
     host.get_param_groups = get_param_groups  # type: ignore[method-assign]

@@ -113,8 +113,8 @@ def _build(name: str, kind: str, options: dict[str, Any]) -> nn.Module:
         raise ValueError(f"sampler {name!r} has nothing for hosts that call a {kind}")
     if spec.needs_occupancy and options.get("occupancy") is None:
         raise ValueError(f"sampler {name!r} needs an occupancy")
-    if spec.gate_encoding is not None:
-        _check_gate(name, spec.gate_encoding, options.get("occupancy"))
+    if spec.needs_occupancy:
+        check_gate(name, getattr(getattr(options["occupancy"], "gate", None), "config", None))
     if isinstance(builder, str):
         module, _, attribute = builder.partition(":")
         builder = getattr(importlib.import_module(module), attribute)
@@ -122,10 +122,15 @@ def _build(name: str, kind: str, options: dict[str, Any]) -> nn.Module:
     return estimator
 
 
-def _check_gate(name: str, wanted: str, occupancy: Any) -> None:
-    config = getattr(getattr(occupancy, "gate", None), "config", None)
+def check_gate(name: str, config: Any) -> None:
+    """Whether a sampler can ask gates of this config (`GateConfig`; None is no gate).
+
+    Raises:
+        ValueError: there is no such sampler, or it asks gates on other features.
+    """
+    wanted = sampler_spec(name).gate_encoding
     found = config.encoding.kind if config is not None else "no"
-    if found != wanted:
+    if wanted not in (None, found):
         raise ValueError(
             f"sampler {name!r} asks a gate on {wanted} features, and this occupancy's is on "
             f"{found} features; learn one with `ns-train leco-occupancy "

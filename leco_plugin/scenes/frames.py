@@ -35,3 +35,10 @@ def between(host: list[list[float]], other: list[list[float]]) -> Tensor:
     frame = torch.cat([turn, (b[:, 3] - turn @ a[:, 3])[:, None]], dim=1).float()
     same = torch.eye(3, 4)
     return same if torch.allclose(frame, same, atol=1e-6) else frame
+
+
+def box_around(box: Tensor, frame: Tensor) -> Tensor:
+    """The smallest box along the axes of a frame that holds a box of the host: [6] from [6]."""
+    corners = torch.cartesian_prod(*box.view(2, 3).T)
+    turned = corners @ frame[:, :3].T + frame[:, 3]
+    return torch.cat([turned.amin(dim=0), turned.amax(dim=0)])

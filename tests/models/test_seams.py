@@ -87,8 +87,7 @@ def test_a_proposal_host_keeps_nothing_of_its_networks(guide: Guide):
     assert host.chooser._options["num_samples"] == 21
     assert host.chooser._options["single_jitter"] is True
     assert isinstance(host.chooser._options["initial_sampler"], UniformSampler)
-    assert len(host.scouts) == 0
-    assert not hasattr(host, "alone")
+    assert not [*host.scouts.parameters(), *host.alone.parameters()]
     assert host.opinions == [no_density] * 3
     assert set(host.get_param_groups()) == {"fields"}
     assert {name.split(".")[0] for name in host.state_dict()} == {"field"}

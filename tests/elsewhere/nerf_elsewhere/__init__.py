@@ -1,0 +1,1 @@
+"""Hosts and a sampler of another package."""

@@ -1,0 +1,114 @@
+"""Commands of nerfstudio and of this package, in forks of one process that imported them once.
+
+A command alone takes some six seconds to import nerfstudio; what it then computes on a scene for
+tests takes one.
+"""
+
+from __future__ import annotations
+
+import importlib
+import json
+import os
+import subprocess
+import sys
+import traceback
+from pathlib import Path
+from typing import IO
+
+ENTRY_POINTS = {
+    "ns-train": "nerfstudio.scripts.train:entrypoint",
+    "ns-eval": "nerfstudio.scripts.eval:entrypoint",
+    "ns-render": "nerfstudio.scripts.render:entrypoint",
+    "leco": "leco_plugin.cli:main",
+}
+
+
+class ForkedCommands:
+    """Runs commands one after the other; a context manager.
+
+    Args:
+        environment: variables of the commands' processes.
+        folder: their working directory, and where their output is kept.
+    """
+
+    def __init__(self, environment: dict[str, str], folder: Path) -> None:
+        self.folder = folder
+        self.count = 0
+        here = str(Path(__file__).parent)
+        paths = [here, *filter(None, [environment.get("PYTHONPATH")])]
+        self.server = subprocess.Popen(
+            [sys.executable, __file__],
+            env=environment | {"PYTHONPATH": os.pathsep.join(paths)},
+            cwd=folder,
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.DEVNULL,  # of the imports; each command has a log
+            text=True,
+        )
+
+    def __enter__(self) -> ForkedCommands:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        _pipe(self.server.stdin).close()
+        self.server.wait(timeout=60)
+        _pipe(self.server.stdout).close()
+
+    def __call__(self, name: str, *arguments: object, status: int = 0) -> str:
+        """Runs a command to its end, which must be of this status; returns what it printed."""
+        self.count += 1
+        log = self.folder / f"{self.count:03d}-{name}.log"
+        line = json.dumps({"command": [name, *map(str, arguments)], "log": str(log)})
+        stdin = _pipe(self.server.stdin)
+        stdin.write(line + "\n")
+        stdin.flush()
+        found = int(_pipe(self.server.stdout).readline())
+        printed = log.read_text()
+        assert found == status, f"{name} ended with {found}:\n{printed[-4000:]}"
+        return printed
+
+
+def _pipe(pipe: IO[str] | None) -> IO[str]:
+    assert pipe is not None
+    return pipe
+
+
+def _run(command: list[str], log: str) -> int:
+    """One command in this process, which ends with it; returns its exit status."""
+    with open(log, "wb") as printed:
+        os.dup2(printed.fileno(), sys.stdout.fileno())
+        os.dup2(printed.fileno(), sys.stderr.fileno())
+    sys.argv = command
+    module, _, function = ENTRY_POINTS[command[0]].partition(":")
+    try:
+        ended = getattr(sys.modules[module], function)()
+    except SystemExit as end:
+        ended = end.code
+    except BaseException:  # noqa: BLE001  as Python itself ends
+        traceback.print_exc()
+        ended = 1
+    if isinstance(ended, str):
+        print(ended, file=sys.stderr)
+        ended = 1
+    sys.stdout.flush()
+    sys.stderr.flush()
+    return int(ended or 0)
+
+
+def _serve() -> None:
+    from mortal_training import leave_out_the_cache
+
+    for entry in ENTRY_POINTS.values():
+        importlib.import_module(entry.partition(":")[0])
+    importlib.import_module("leco_plugin.swap")
+    leave_out_the_cache()
+    for line in sys.stdin:
+        child = os.fork()
+        if child == 0:
+            sys.exit(_run(**json.loads(line)))  # and what runs at exit, for processes of its own
+        _, status = os.waitpid(child, 0)
+        print(os.waitstatus_to_exitcode(status), flush=True)
+
+
+if __name__ == "__main__":
+    _serve()
