@@ -61,7 +61,7 @@ def few_rules(monkeypatch: pytest.MonkeyPatch) -> None:
     """Of the rules, those that take no time."""
     from leco_plugin.conformance import checking
 
-    monkeypatch.setattr(checking, "SAMPLER_RULES", checking.SAMPLER_RULES[:3])
+    monkeypatch.setattr(checking, "RULES", checking.SAMPLER_RULES[:3])
 
 
 def test_check_prints_a_line_for_each_rule(

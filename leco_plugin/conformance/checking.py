@@ -80,5 +80,5 @@ def check(name: str) -> Iterator[Verdict]:
     Raises:
         ValueError: at once, as `cases_of`.
     """
-    found = pairs(cases_of(name))
+    found = pairs(cases_of(name), RULES)
     return (apply(rule, case) for rule, case in found)

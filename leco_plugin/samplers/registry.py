@@ -100,6 +100,8 @@ def sampler_spec(name: str) -> SamplerSpec:
     Raises:
         ValueError: there is none.
     """
+    if name in OURS:  # to look for others is to read what every installed package says of itself
+        return OURS[name]
     known = samplers()
     if name not in known:
         raise ValueError(f"there is no sampler {name!r}; there are {', '.join(sorted(known))}")

@@ -8,7 +8,7 @@ from conformance.estimator_mutants import MUTANTS
 from conformance.mutant_plugin import write_distribution
 from conformance.proposal_mutants import PROPOSAL_MUTANTS
 
-from leco_plugin.conformance.checking import check_sampler, pairs, sampler_cases
+from leco_plugin.conformance.checking import check, pairs, sampler_cases
 from leco_plugin.conformance.rule import apply
 from leco_plugin.conformance.sampler_rules import SAMPLER_RULES
 
@@ -62,7 +62,7 @@ def test_every_rule_has_a_mutant_at_every_seam():
 
 
 def test_a_verdict_says_what_was_found_why_it_matters_and_what_to_do():
-    verdict = next(v for v in check_sampler("KeepsAll") if not v.passed)
+    verdict = next(v for v in check("KeepsAll") if not v.passed)
     line = verdict.line()
     assert line.startswith("FAIL  estimator  skips-only-what-it-may: ")
     assert "samples lie where the occupancy is empty, the first at [" in line
