@@ -176,10 +176,11 @@ class Lifecycle:
         field = self.model.field
         fresh = HMoEField(field.config, self.model.num_train_data)
         field.load_state_dict(fresh.state_dict())
+        share(field.parameters())
         if self.trainer is not None:
             for optimizer in self.trainer.optimizers.optimizers.values():
                 optimizer.state.clear()
-        CONSOLE.log("\\[leco] the field starts anew, guided from its first step")
+        say("the field starts anew, guided from its first step")
 
     @cached_property
     def probe_positions(self) -> Tensor:
