@@ -176,6 +176,7 @@ class Lifecycle:
         field = self.model.field
         fresh = HMoEField(field.config, self.model.num_train_data)
         field.load_state_dict(fresh.state_dict())
+        share(field.parameters())
         if self.trainer is not None:
             for optimizer in self.trainer.optimizers.optimizers.values():
                 optimizer.state.clear()
