@@ -56,7 +56,8 @@ def run(local_rank: int, world_size: int, config: Any, global_rank: int = 0) -> 
 
 
 def look_elsewhere() -> None:
-    """Has this process look at its gate where no other does."""
+    """Has this process look at its gate where no other does, and find fewer places kept."""
+    LecoModel.learning_kept = 0.5
     lifecycle.Lifecycle.probe_positions = property(  # type: ignore[assignment]
         lambda self: torch.rand(lifecycle.PROBES, 3)
     )
