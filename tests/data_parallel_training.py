@@ -40,7 +40,12 @@ def run(local_rank: int, world_size: int, config: Any, global_rank: int = 0) -> 
     if global_rank > 0:
         look_elsewhere()
         drift_before_freezing()
-    seen: dict[str, Any] = {"steps": [], "saved": [], "threads": torch.get_num_threads()}
+    seen: dict[str, Any] = {
+        "steps": [],
+        "looks": [],
+        "saved": [],
+        "threads": torch.get_num_threads(),
+    }
     record(seen)
     ns_train.train_loop(local_rank, world_size, config, global_rank)
     trainer = seen.pop("trainer")
@@ -51,7 +56,8 @@ def run(local_rank: int, world_size: int, config: Any, global_rank: int = 0) -> 
 
 
 def look_elsewhere() -> None:
-    """Has this process look at its gate where no other does."""
+    """Has this process look at its gate where no other does, and find fewer places kept."""
+    LecoModel.learning_kept = 0.5
     lifecycle.Lifecycle.probe_positions = property(  # type: ignore[assignment]
         lambda self: torch.rand(lifecycle.PROBES, 3)
     )
@@ -70,7 +76,7 @@ def drift_before_freezing() -> None:
 
 
 def record(seen: dict[str, Any]) -> None:
-    """Notes every step of a trainer with its weights and loss, and every occupancy's file."""
+    """Notes every step with its weights and loss, every look at the gate, every file written."""
     own_step, own_save = Trainer.train_iteration, Occupancy.save
 
     def train_iteration(self: Trainer, step: int) -> Any:
@@ -89,6 +95,14 @@ def record(seen: dict[str, Any]) -> None:
         seen["saved"].append(str(path))
         own_save(self, path)
 
+    own_look = lifecycle.Lifecycle._probe
+
+    def look(self: lifecycle.Lifecycle) -> Tensor:
+        logits = own_look(self)
+        seen["looks"].append(logits.clone())
+        return logits
+
+    lifecycle.Lifecycle._probe = look  # type: ignore[method-assign]
     Trainer.train_iteration = train_iteration  # type: ignore[method-assign]
     Occupancy.save = save  # type: ignore[method-assign, assignment]
 
