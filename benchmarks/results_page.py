@@ -103,9 +103,12 @@ def page() -> str:
     for path in sorted(RESULTS.glob("equal-time-*.json")):
         report = json.loads(path.read_text())
         scene, seconds = report["scene"]["name"], report["seconds"]
-        command = f"python benchmarks/equal_time.py --data {scene} --seconds {seconds:g}"
+        # stored before leco chart; benchmarks/equal_time.py of commit 0327a07 made them
+        methods = "leco-occupancy{,-never-frozen,-homogeneous}"
+        command = f"leco chart --data {scene} --methods {methods} --seconds {seconds:g} --out DIR"
         title = f"Equal time: `{scene}`, {seconds:g} s of training"
-        parts += section(title, command, report, equal_time_table(report))
+        note = " Made by what leco chart has replaced since."
+        parts += section(title, command, report, equal_time_table(report), note)
     sampling = RESULTS / "sampling.json"
     if sampling.exists():
         report = json.loads(sampling.read_text())
