@@ -9,6 +9,7 @@ from __future__ import annotations
 import dataclasses
 import hashlib
 import json
+import shutil
 from pathlib import Path
 from typing import Any
 
@@ -72,6 +73,7 @@ def write_city(
         # Somebody else may have finished the same city in the meantime.
         if not _holds(out_dir, json.loads(text)):
             raise
+        shutil.rmtree(unfinished, ignore_errors=True)
     return out_dir
 
 
