@@ -73,11 +73,12 @@ class Occupancy(nn.Module):
         """o(x) of scene positions.
 
         Args:
-            positions: [N, 3] float, scene units, on the module's device.
+            positions: [N, 3] of any floating type, scene units, on the module's device.
         Returns:
             [N] float32 in [0, 1]; 0 outside a bounded space or the walls, and where a position is
             not finite.
         """
+        positions = positions.to(self.space.center.dtype)
         mapped = self.space.map(positions)
         inside = (mapped.abs() <= 1.0).all(dim=-1)  # false for NaN
         inside &= ((positions >= self.walls[:3]) & (positions <= self.walls[3:])).all(dim=-1)

@@ -8,8 +8,8 @@ from __future__ import annotations
 
 import functools
 import inspect
-from collections.abc import Mapping
-from typing import Any
+from collections.abc import Callable, Mapping
+from typing import Any, cast
 
 import torch
 from nerfstudio.model_components.ray_samplers import Sampler
@@ -18,6 +18,7 @@ from torch import Tensor, nn
 from leco_plugin.models.gate import Gate, GateConfig
 from leco_plugin.occupancy import Occupancy
 from leco_plugin.samplers.base import Estimator
+from leco_plugin.samplers.estimator import cell_centers
 from leco_plugin.samplers.rays import intersect_box
 from leco_plugin.samplers.registry import (
     SamplerSpec,
@@ -25,9 +26,12 @@ from leco_plugin.samplers.registry import (
     build_proposal,
     sampler_spec,
 )
-from leco_plugin.scenes.frames import box_around
+from leco_plugin.scenes.frames import box_around, inverse
 from leco_plugin.scenes.input_error import InputError
 from leco_plugin.space import Space
+
+DensityFn = Callable[[Tensor], Tensor]
+"""Positions [N, 3] to densities [N] or [N, 1]."""
 
 
 class Guide(nn.Module):
@@ -36,6 +40,7 @@ class Guide(nn.Module):
     Args:
         sampler: name in the registry of samplers.
         options: of that sampler.
+        front_to_back: whether packed hosts render so, see `Estimator.density_fn`.
 
     Attributes:
         occupancy: None until there is one.
@@ -46,10 +51,13 @@ class Guide(nn.Module):
     frame: Tensor
 
     def __init__(
-        self, sampler: str = "learned-occupancy", options: Mapping[str, Any] | None = None
+        self,
+        sampler: str = "learned-occupancy",
+        options: Mapping[str, Any] | None = None,
+        front_to_back: bool = False,
     ) -> None:
         super().__init__()
-        self.sampler = sampler
+        self.sampler, self.front_to_back = sampler, front_to_back
         self.options = dict(options or {})
         self.occupancy: Occupancy | None = None
         self.version = 0
@@ -106,18 +114,27 @@ class Guide(nn.Module):
         """Whether host and occupancy share their coordinates."""
         return torch.equal(self.frame, torch.eye(3, 4, device=self.frame.device))
 
-    def estimator(self, aabb: Tensor | None, outermost: Tensor | None = None) -> nn.Module:
+    def estimator(
+        self,
+        aabb: Tensor | None,
+        outermost: Tensor | None = None,
+        density_fn: DensityFn | None = None,
+    ) -> nn.Module:
         """What goes where a packed host has its estimator.
 
         Args:
             aabb: box of that estimator, [6]; None where the host cuts its rays itself.
             outermost: the box in which the host's own samples at all, [6]; None is no such box.
+            density_fn: the host's density at positions [N, 3], for rendering front to back.
         Raises:
             InputError: the sampler has no estimator.
         """
         if self._spec("estimator").needs_occupancy:
-            return GuidedEstimator(self, aabb, outermost)
-        return build_estimator(self.sampler, aabb=aabb, **self.options)
+            return GuidedEstimator(self, aabb, outermost, density_fn)
+        estimator = build_estimator(self.sampler, aabb=aabb, **self.options)
+        if self.front_to_back and isinstance(estimator, Estimator):
+            estimator.density_fn = density_fn
+        return estimator
 
     def proposal(self, **options: Any) -> Sampler:
         """What goes where a proposal host has its sampler; options as for the registry.
@@ -185,8 +202,15 @@ _SAMPLING = inspect.signature(Estimator.sampling)
 class GuidedEstimator(_StandIn):
     """A packed sampler of the registry, in the host's coordinates."""
 
-    def __init__(self, guide: Guide, aabb: Tensor | None, outermost: Tensor | None = None) -> None:
+    def __init__(
+        self,
+        guide: Guide,
+        aabb: Tensor | None,
+        outermost: Tensor | None = None,
+        density_fn: DensityFn | None = None,
+    ) -> None:
         super().__init__(guide)
+        self._density_fn = density_fn
         self._aabb = None if aabb is None else aabb.detach().cpu()
         self._outermost = None if outermost is None else outermost.detach().cpu()
 
@@ -194,9 +218,20 @@ class GuidedEstimator(_StandIn):
         aabb = self._aabb
         if aabb is not None and not guide.same_frame():
             aabb = box_around(aabb, guide.frame.cpu())
-        return build_estimator(
+        estimator = build_estimator(
             guide.sampler, aabb=aabb, occupancy=guide.the_occupancy(), **guide.options
         )
+        if guide.front_to_back and isinstance(estimator, Estimator):
+            estimator.density_fn = self._density_of(guide)
+        return estimator
+
+    def _density_of(self, guide: Guide) -> DensityFn | None:
+        """The host's density, asked at positions of the occupancy."""
+        ask = self._density_fn
+        if ask is None or guide.same_frame():
+            return ask
+        back = inverse(guide.frame)
+        return lambda positions: ask(moved(positions, back))
 
     @functools.wraps(Estimator.sampling)
     def sampling(self, rays_o: Tensor, rays_d: Tensor, *args: Any, **kwargs: Any) -> Any:
@@ -229,8 +264,39 @@ class GuidedEstimator(_StandIn):
         estimator: Any = self.sampler
         estimator.update_every_n_steps(*args, **kwargs)
 
+    @property
+    def aabbs(self) -> Tensor:
+        """Boxes of the sampler behind this, in the host's coordinates, [n_boxes, 6]."""
+        (guide,) = self._guide
+        boxes: Tensor = cast(Any, self.sampler).aabbs
+        if guide.same_frame():
+            return boxes
+        back = inverse(guide.frame)
+        return torch.stack([box_around(box, back) for box in boxes])
+
+    @property
+    def occs(self) -> Tensor:
+        """o at the centres of the cells of `aabbs`, [n_boxes * cells]."""
+        (guide,) = self._guide
+        sampler: Any = self.sampler
+        if guide.same_frame():
+            return cast(Tensor, sampler.occs)
+        cells = cell_centers(self.aabbs, sampler.resolution)
+        with torch.no_grad():
+            return guide.the_occupancy().query(moved(cells, guide.frame))
+
+    @property
+    def binaries(self) -> Tensor:
+        """Decisions at the centres of the cells of `aabbs`, bool [n_boxes, n, n, n]."""
+        (guide,) = self._guide
+        sampler: Any = self.sampler
+        if guide.same_frame():
+            return cast(Tensor, sampler.binaries)
+        occupied = self.occs >= guide.the_occupancy().threshold
+        return occupied.view(-1, *sampler.resolution.tolist())
+
     def __getattr__(self, name: str) -> Any:
-        if name in ("aabbs", "binaries", "occs", "resolution", "device"):
+        if name in ("resolution", "device"):
             return getattr(self.sampler, name)
         return super().__getattr__(name)
 

@@ -72,7 +72,9 @@ def set_up_guided(config: GuidedModelConfig, **arguments: Any) -> Model:
         host_config.eval_num_rays_per_chunk = config.eval_num_rays_per_chunk
     if config.occupancy.sampler == OWN_SAMPLER:
         return _as_it_is(host_config, arguments)
-    guide = Guide(config.occupancy.sampler, config.occupancy.options)
+    guide = Guide(
+        config.occupancy.sampler, config.occupancy.options, config.occupancy.front_to_back
+    )
     if guide.needs_occupancy and config.occupancy.path is not None:
         with suppress(InputError):  # a checkpoint brings its own; without one, training says it
             guide.set_occupancy(load_occupancy(config.occupancy.path))

@@ -38,6 +38,10 @@ class OccupancyConfig:
     leaves the host as it is."""
     options: dict[str, int | float] = field(default_factory=dict)
     """Of that sampler, as its entry in the registry says: resolution 256 levels 4."""
+    front_to_back: bool = False
+    """Packed hosts, when they render: ask densities front to back, and shade nothing behind an
+    opaque surface. The image is the same to a thousandth; it pays where shading costs much more
+    than a density."""
     seconds: float | None = None
     """Without a path: about how long learning may take at most; None is until it has settled."""
     rays: int = 1024

@@ -280,10 +280,13 @@ class LecoModel(Model):
         """Colour loss, distortion loss, and before the gate is frozen what teaches it.
 
         Raises:
+            ValueError: the batch holds no rays.
             FloatingPointError: a loss is not finite; the step was not taken.
         """
         shaded: Shaded = outputs["shaded"]
         image = batch["image"].to(self.device)
+        if len(image) == 0:
+            raise ValueError("a training batch holds no rays: are all pixels masked?")
         truth = self.renderer_rgb.blend_background(image)
         losses = {"rgb_loss": torch.nn.functional.mse_loss(shaded.rgb, truth)}
         near, far = self.march_range[:2]

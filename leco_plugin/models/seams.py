@@ -10,12 +10,12 @@ import functools
 import warnings
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, cast
 
 from torch import nn
 
 from leco_plugin.entries import foreign_entries
-from leco_plugin.models.guide import Guide
+from leco_plugin.models.guide import DensityFn, Guide
 from leco_plugin.samplers.base import Estimator
 from leco_plugin.scenes.input_error import InputError
 
@@ -83,7 +83,7 @@ def _sample_with(host: Any, guide: Guide) -> None:
             f"{type(host).__name__} makes a grid that fits its bounds itself: with "
             "--pipeline.model.sampling occupancy-grid of the method that is not guided"
         )
-    host.sample_with(guide.estimator(None))
+    host.sample_with(guide.estimator(None, density_fn=getattr(host, "density_fn", None)))
 
 
 SAMPLE_WITH = HostAdapter(
@@ -113,11 +113,22 @@ def _estimators(host: nn.Module) -> list[nn.Module]:
     ]
 
 
+def _density_beside(host: nn.Module, estimator: nn.Module) -> DensityFn | None:
+    """The host's density, as the sampler that holds the estimator has it."""
+    for module in host.modules():
+        if estimator in module._modules.values():
+            density_fn = getattr(module, "density_fn", None)
+            if callable(density_fn):
+                return cast(DensityFn, density_fn)
+    return None
+
+
 def _swap_packed(host: Model, guide: Guide) -> None:
     for old in _estimators(host):
         boxes: Any = old.aabbs
         # of nested boxes the first is the scene's, and nothing is sampled outside the last
-        _replace(host, old, guide.estimator(boxes[0].detach(), boxes[-1].detach()))
+        new = guide.estimator(boxes[0].detach(), boxes[-1].detach(), _density_beside(host, old))
+        _replace(host, old, new)
 
 
 PACKED = HostAdapter(

@@ -213,15 +213,14 @@ class SwitchNerfModel(Model):
         step, cone_angle = self.march_range[2:].tolist()
         config, sizes = self.config, self.config.sizes
         if self.occupancy_grid is not None:
-            prune_below = config.early_stop_eps if self.training else 0.0
             packed = kept_by(
                 self.occupancy_grid,
                 rays,
                 step,
                 cone_angle,
                 self.training,
-                self.density_fn,
-                prune_below,
+                self.density_fn if self.training else None,
+                config.early_stop_eps,
             )
             intervals = with_backdrop(packed, rays, step, cone_angle)
             answers = self._ask(mapped_middles(self.space, rays, intervals))

@@ -97,8 +97,8 @@ def kept_by(
     step_size: float,
     cone_angle: float,
     jittered: bool,
-    density_fn: Callable[[Tensor], Tensor],
-    prune_below: float,
+    density_fn: Callable[[Tensor], Tensor] | None,
+    early_stop_eps: float,
 ) -> Intervals:
     """What an estimator keeps of the candidates along rays.
 
@@ -106,11 +106,11 @@ def kept_by(
         estimator: anything with nerfacc's `sampling`.
         step_size, cone_angle: of the march.
         jittered: stratified sampling.
-        density_fn: scene positions [N, 3] to densities per scene unit [N, 1].
-        prune_below: transmittance below which a sample is left out; 0 asks no densities.
+        density_fn: scene positions [N, 3] to densities per scene unit [N, 1]; None asks none.
+        early_stop_eps: transmittance below which a sample is left out.
     """
     sigma_fn = None
-    if prune_below > 0.0:
+    if density_fn is not None:
         sigma_fn = densities_of_samples(density_fn, rays.origins, rays.directions)
     return Intervals(
         *estimator.sampling(
@@ -120,7 +120,7 @@ def kept_by(
             t_min=rays.t_mins,
             t_max=rays.t_maxs,
             render_step_size=step_size,
-            early_stop_eps=prune_below,
+            early_stop_eps=early_stop_eps,
             stratified=jittered,
             cone_angle=cone_angle,
         )

@@ -98,6 +98,9 @@ class Estimator(nn.Module):
         Raises:
             ValueError: rays do not fit each other or this estimator's device, or have no end.
         """
+        for name, rays in (("rays_o", rays_o), ("rays_d", rays_d)):
+            if rays.dim() != 2 or rays.shape[-1] != 3:
+                raise ValueError(f"{name} must be [n_rays, 3], got {list(rays.shape)}")
         if rays_o.device != self.device:
             raise ValueError(f"rays are on {rays_o.device}, the estimator on {self.device}")
         t_mins = torch.full_like(rays_o[..., 0], near_plane)
@@ -110,7 +113,7 @@ class Estimator(nn.Module):
         jitter = torch.rand_like(t_mins) if stratified else None
         t_enters = None
         bounds = self.bounds()
-        if bounds is not None and rays_o.dim() == 2 and rays_o.shape == rays_d.shape:
+        if bounds is not None and rays_o.shape == rays_d.shape:
             t_enters, t_leaves = intersect_box(rays_o, rays_d, bounds.to(rays_o))
             t_maxs = t_maxs.minimum(t_leaves)
 

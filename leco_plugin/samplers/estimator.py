@@ -112,17 +112,26 @@ class LearnedOccupancyEstimator(Estimator):
     @property
     def occs(self) -> Tensor:
         """o at the cell centres of `aabbs`, [resolution^3]; asked anew at each call."""
-        axis = (torch.arange(ANSWER_RESOLUTION, device=self.device) + 0.5) / ANSWER_RESOLUTION
-        units = torch.stack(torch.meshgrid(axis, axis, axis, indexing="ij"), dim=-1).view(-1, 3)
-        low, high = self.aabbs[0].view(2, 3)
         with torch.no_grad():
-            return self.occupancy.query(low + units * (high - low))
+            return self.occupancy.query(cell_centers(self.aabbs, self.resolution))
 
     @property
     def binaries(self) -> Tensor:
         """Decisions at the cell centres of `aabbs`, bool [1, n, n, n]."""
         occupied = self.occs >= self.occupancy.threshold
         return occupied.view(1, *[ANSWER_RESOLUTION] * 3)
+
+
+def cell_centers(aabbs: Tensor, resolution: Tensor) -> Tensor:
+    """Centres of the cells of boxes [n_boxes, 6], z fastest: [n_boxes * cells, 3].
+
+    Args:
+        resolution: cells along each axis, int [3].
+    """
+    axes = [(torch.arange(cells, device=aabbs.device) + 0.5) / cells for cells in resolution]
+    units = torch.cartesian_prod(*axes)
+    low, high = aabbs[:, None, :3], aabbs[:, None, 3:]
+    return (low + units * (high - low)).view(-1, 3)
 
 
 def _decisive(occupancy: OccupancyLike) -> list[Tensor]:

@@ -162,17 +162,22 @@ def plan(
     if jitter is not None:
         t_mins = t_mins + jitter * step_size
     usable = usable_rays(origins, directions, t_mins, t_maxs)
+    if t_enters is not None:
+        usable &= t_enters < t_maxs
     t_mins, t_maxs = t_mins.masked_fill(~usable, 0.0), t_maxs.masked_fill(~usable, 0.0)
     counts = candidate_counts(t_mins, t_maxs, step_size, cone_angle)
-    first = torch.zeros_like(counts)
+    first, last = torch.zeros_like(counts), counts
     if t_enters is not None:
         first = candidate_counts(t_mins, t_enters.minimum(t_maxs), step_size, cone_angle)
         counts = counts - first
-    shortest, longest = torch.stack(counts.aminmax()).long().tolist() if len(counts) else (0, 0)
-    if longest > MAX_CANDIDATES_PER_RAY:
+    shortest = longest = highest = 0
+    if len(counts):
+        sizes = torch.stack([*counts.aminmax(), last.amax()])
+        shortest, longest, highest = sizes.long().tolist()
+    if highest > MAX_CANDIDATES_PER_RAY:
         raise ValueError(
             f"the longest of {len(counts)} rays has over 2^24 steps of {step_size:g}: give a far "
-            "plane, t_max or a box, a longer step or a cone angle"
+            "plane, t_max or a box, begin nearer to it, or take a longer step or a cone angle"
         )
     coordinates = torch.stack([origins.T, directions.T])
     return Candidates(coordinates, t_mins, first, counts, step_size, cone_angle), shortest, longest

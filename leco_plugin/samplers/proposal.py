@@ -8,6 +8,7 @@ are drawn from that distribution. There is no proposal network to train.
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
 import torch
@@ -90,6 +91,8 @@ class LearnedOccupancySampler(Sampler):
         """
         if ray_bundle is None or ray_bundle.nears is None or ray_bundle.fars is None:
             raise ValueError("samples need a ray bundle with nears and fars (set by a collider)")
+        # a ray that ends before it begins has samples without length, all where it begins
+        ray_bundle = replace(ray_bundle, fars=ray_bundle.fars.maximum(ray_bundle.nears))
         candidates = self.initial_sampler(ray_bundle, num_samples=self.num_candidates)
         worth = self.worth(candidates.frustums.get_positions())
         weights = worth / worth.sum(dim=-2, keepdim=True).clamp(min=1e-12)
@@ -103,12 +106,12 @@ class LearnedOccupancySampler(Sampler):
 
         The cache decides first, so that the gate is asked only where it lets something through.
         """
-        flat = positions.reshape(-1, 3)
+        flat = positions.reshape(-1, 3).float()  # a host may be in half or double precision
         if self.frame is not None:
-            with torch.autocast(flat.device.type, enabled=False):  # a host may be in half precision
+            with torch.autocast(flat.device.type, enabled=False):
                 flat = flat @ self.frame[:, :3].T + self.frame[:, 3]
         kept = self.estimator.occupied(flat).nonzero()[:, 0]
-        worth = flat.new_zeros(len(flat))
+        worth = positions.new_zeros(len(flat))
         if kept.numel():
             values = self.estimator.occupancy.query(flat.index_select(0, kept))
             worth.index_put_((kept,), values.to(worth.dtype))

@@ -37,6 +37,12 @@ def between(host: list[list[float]], other: list[list[float]]) -> Tensor:
     return same if torch.allclose(frame, same, atol=1e-6) else frame
 
 
+def inverse(frame: Tensor) -> Tensor:
+    """The frame [3, 4] that takes positions back."""
+    turn = torch.linalg.inv(frame[:, :3].double())
+    return torch.cat([turn, -turn @ frame[:, 3:].double()], dim=1).to(frame)
+
+
 def box_around(box: Tensor, frame: Tensor) -> Tensor:
     """The smallest box along the axes of a frame that holds a box of the host: [6] from [6]."""
     corners = torch.cartesian_prod(*box.view(2, 3).T)

@@ -76,6 +76,44 @@ def test_a_host_in_other_coordinates_gets_the_same_samples(guide: Guide):
     )
 
 
+def test_boxes_and_cells_are_answered_in_the_hosts_coordinates(guide: Guide):
+    shift = torch.tensor([0.3, -1.0, 0.2])
+    here = guide.estimator(BOX)
+    boxes, opacities, decisions = here.aabbs, here.occs, here.binaries
+    guide.set_occupancy(ball(), torch.cat([2.0 * torch.eye(3), shift[:, None]], dim=1))
+    there = guide.estimator(BOX)
+    torch.testing.assert_close(there.aabbs, (boxes - shift.repeat(2)) / 2.0)
+    torch.testing.assert_close(there.occs, opacities, atol=0.02, rtol=0.0)
+    assert (there.binaries != decisions).float().mean() < 1e-3
+    assert 0.01 < decisions.float().mean() < 0.5
+
+
+def wall_behind(x: float):
+    """A host's density: opaque beyond the plane z < x of the occupancy's coordinates."""
+    return lambda positions: 1e3 * (positions[:, 2:] < x).float()
+
+
+@pytest.mark.parametrize("scale", [1.0, 2.0], ids=["same frame", "another"])
+@pytest.mark.parametrize("sampler", ["learned-occupancy", "dense"])
+def test_rendering_front_to_back_hands_out_nothing_behind_a_wall(scale: float, sampler: str):
+    made = Guide(sampler, front_to_back=True)
+    made.set_occupancy(ball(), torch.cat([scale * torch.eye(3), torch.zeros(3, 1)], dim=1))
+    middle = CENTRE[2] / scale
+    estimator = made.estimator(BOX / scale, density_fn=wall_behind(middle)).eval()
+    origins, _ = rays(1)
+    march = {name: value / scale for name, value in MARCH.items()}
+
+    def depths() -> torch.Tensor:
+        down = torch.tensor([[0.0, 0.0, -1.0]])
+        _, starts, ends = estimator.sampling(origins / scale, down, **march)
+        return origins[0, 2] / scale - 0.5 * (starts + ends)
+
+    step = march["render_step_size"]
+    assert middle - 2 * step < depths().min() < middle
+    estimator.train()
+    assert depths().min() < middle - 0.5 / scale
+
+
 def test_a_proposal_host_in_other_coordinates_samples_the_ball(guide: Guide):
     turn = torch.tensor([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
     origins, directions = rays(3)

@@ -14,6 +14,7 @@ from leco_plugin.models.encodings import EncodingConfig
 from leco_plugin.models.field import FieldConfig
 from leco_plugin.models.gate import GateConfig
 from leco_plugin.models.leco import LecoModel, LecoModelConfig
+from leco_plugin.models.rendering import Intervals, Rays
 from leco_plugin.models.sizes import Sizes
 
 NUM_RAYS = 12
@@ -77,6 +78,57 @@ def test_the_first_loss_that_is_not_finite_stops_the_step(
     outputs, batch = step(model)
     with pytest.raises(FloatingPointError, match=f"^{loss} is not finite: {cause}"):
         model.get_loss_dict(spoil(outputs, spoiled), batch)
+
+
+def test_a_batch_without_rays_says_so(model: LecoModel) -> None:
+    outputs, batch = step(model)
+    with pytest.raises(ValueError, match="no rays"):
+        model.get_loss_dict(outputs, {"image": batch["image"][:0]})
+
+
+def test_the_nearness_loss_is_its_weight_at_near_and_nothing_at_far(model: LecoModel) -> None:
+    outputs, batch = step(model)
+    for place, expected in ((0, model.config.nearness * model.ramped), (1, 0.0)):
+        at = model.march_range[place].expand(NUM_RAYS)
+        placed = outputs | {"shaded": outputs["shaded"]._replace(depth=at)}
+        loss = model.get_loss_dict(placed, batch)["nearness_loss"]
+        assert float(loss) == pytest.approx(expected, abs=1e-6)
+
+
+@pytest.mark.parametrize(("everywhere", "shaded"), [(0.0, 0.0), (1.0, 1.0), (0.25, 0.25)])
+def test_what_the_gate_calls_empty_is_looked_at_on_some_rays_all_the_same(
+    model: LecoModel, everywhere: float, shaded: float
+) -> None:
+    with torch.no_grad():
+        model.gate.head.bias[0] += 1e3  # empty everywhere
+    model.config.look_everywhere = everywhere
+    rays = 4000
+    directions = torch.nn.functional.normalize(torch.randn(rays, 3), dim=-1)
+    starts, ends = torch.full((rays,), 0.1), torch.full((rays,), 0.2)
+    bundle = Rays(-0.5 * directions, directions, starts, ends, None)
+    kept = model._likely(Intervals(torch.arange(rays), starts, ends), bundle)
+    assert len(kept.ray_indices) / rays == pytest.approx(shaded, abs=0.03)
+
+
+def test_the_colours_of_an_image_are_learned_and_their_mean_is_rendered(model: LecoModel) -> None:
+    torch.nn.init.normal_(model.field.color.appearance.weight, std=10.0)
+    for parameter in model.field.parameters():
+        parameter.data += 0.1 * torch.randn_like(parameter)
+
+    def colours(image: int) -> torch.Tensor:
+        torch.manual_seed(1)
+        directions = torch.nn.functional.normalize(torch.randn(NUM_RAYS, 3), dim=-1)
+        bundle = RayBundle(
+            origins=-0.5 * directions,
+            directions=directions,
+            pixel_area=torch.ones(NUM_RAYS, 1),
+            camera_indices=torch.full((NUM_RAYS, 1), image),
+        )
+        return model.get_outputs(bundle)["rgb"].detach()
+
+    assert (colours(0) - colours(1)).abs().max() > 1e-3
+    model.eval()
+    assert torch.equal(colours(0), colours(1))
 
 
 def test_a_checkpoint_restores_report_and_progress(model: LecoModel) -> None:

@@ -70,6 +70,18 @@ def test_a_look_sees_what_the_gate_has_learned_since(looking: Lifecycle) -> None
     torch.testing.assert_close(looking._probe(), before + 1.0)
 
 
+@pytest.mark.parametrize(
+    ("empty_fraction", "factor"), [(0.0, 0.5), (0.75, 2.0), (0.875, 4.0), (0.999, 4.0)]
+)
+def test_a_guided_batch_has_the_samples_of_a_learning_one_within_limits(
+    looking: Lifecycle, empty_fraction: float, factor: float
+) -> None:
+    sizes = SimpleNamespace(learn_candidates=32, candidates=64, guided_batch=4.0)
+    looking.model.config = SimpleNamespace(sizes=sizes)  # type: ignore[assignment]
+    looking.model.report = {"empty_fraction": empty_fraction}
+    assert looking._guided_batch() == pytest.approx(factor)
+
+
 def test_a_field_that_starts_anew_keeps_its_parameters_and_forgets_what_they_were() -> None:
     config = FieldConfig(EncodingConfig("hash", levels=1, log2_table=4), appearance_dim=2)
     field = HMoEField(config, 3)

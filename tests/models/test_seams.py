@@ -80,6 +80,15 @@ def test_a_packed_host_is_found_under_any_name(guide: Guide):
     assert not any("occs" in name for name in host.state_dict())
 
 
+def test_a_packed_host_lends_its_density_for_rendering_front_to_back():
+    host, network = Packed(), Network()
+    host.walker.density_fn = network.density_fn
+    made = Guide(front_to_back=True)
+    made.set_occupancy(ball())
+    swap_sampler(host, made)
+    assert host.gatekeeper.sampler.density_fn == network.density_fn
+
+
 def test_a_proposal_host_keeps_nothing_of_its_networks(guide: Guide):
     host = Proposal()
     assert swap_sampler(host, guide) == "proposal"

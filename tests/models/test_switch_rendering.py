@@ -31,10 +31,6 @@ def some_rays(count: int = 6) -> Rays:
     return Rays(origins, directions, torch.full((count,), 1.0), torch.full((count,), 8.0), None)
 
 
-def no_density(positions: Tensor) -> Tensor:
-    raise AssertionError("no density is wanted")
-
-
 @pytest.mark.parametrize("jittered", [False, True])
 @pytest.mark.parametrize("growing", [False, True])
 def test_samples_are_disjoint_cover_the_ray_and_are_answered_in_place(growing, jittered) -> None:
@@ -86,7 +82,7 @@ def test_the_backdrop_gives_its_colour_and_is_nothing_met() -> None:
 
 def test_packed_samples_of_all_candidates_render_what_coarse_and_fine_do() -> None:
     color, rays = ColorHead(3, 8, 1, 0, 1), some_rays()
-    packed = kept_by(DenseEstimator(), rays, 0.02, 0.0, False, no_density, 0.0)
+    packed = kept_by(DenseEstimator(), rays, 0.02, 0.0, False, None, 1e-4)
     intervals = with_backdrop(packed, rays, 0.02, 0.0)
     places = rays.origins[intervals.ray_indices] + rays.directions[intervals.ray_indices] * (
         0.5 * (intervals.t_starts + intervals.t_ends)
@@ -104,7 +100,7 @@ def test_pruning_leaves_out_what_lies_behind_an_opaque_place() -> None:
     def density_fn(positions: Tensor) -> Tensor:
         return ball(positions / 10.0).sigmas[:, None] / 10.0
 
-    everything = kept_by(DenseEstimator(), rays, 0.05, 0.0, False, no_density, 0.0)
+    everything = kept_by(DenseEstimator(), rays, 0.05, 0.0, False, None, 1e-4)
     seen = kept_by(DenseEstimator(), rays, 0.05, 0.0, False, density_fn, 1e-4)
     assert 3.0 < float(seen.t_ends.max()) < 5.0 < float(everything.t_ends.max())
 

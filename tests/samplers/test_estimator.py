@@ -6,6 +6,7 @@ import inspect
 
 import pytest
 import torch
+from ball_occupancy import CENTRE, RADIUS, ball
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from samplers.analytic_occupancy import Balls, camera_rays, slow_march
@@ -226,5 +227,18 @@ def test_rays_that_do_not_fit_are_named(bare):
         bare.sampling(origins.to("meta"), directions.to("meta"))
     with pytest.raises(ValueError, match=r"directions must be \[3, 3\]"):
         bare.sampling(origins, directions[:2])
+    for shape in ((3,), (1, 3, 3), (3, 2), ()):
+        with pytest.raises(ValueError, match=r"rays_o must be \[n_rays, 3\], got \["):
+            bare.sampling(torch.zeros(shape), directions)
     with pytest.raises(ValueError, match="give a far plane"):
         DenseEstimator().sampling(origins, directions)
+
+
+def test_rays_may_be_in_double_precision():
+    learned = LearnedOccupancyEstimator(ball(), cache_bytes=BUDGET)
+    origins = torch.tensor(CENTRE).double() + torch.tensor([[0.0, 0.0, 4.0]]).double()
+    downwards = torch.tensor([[0.0, 0.0, -1.0]]).double()
+    _, t_starts, t_ends = learned.sampling(origins, downwards, render_step_size=0.1, far_plane=8.0)
+    assert t_starts.dtype == torch.float64
+    middles = 0.5 * (t_starts + t_ends)
+    assert len(middles) > 15 and (middles - 4.0).abs().max() < RADIUS + 0.1

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import pytest
 import torch
+from ball_occupancy import ball
 from samplers.analytic_occupancy import Balls, camera_rays
 
 pytest.importorskip("nerfstudio")
@@ -120,3 +121,25 @@ def test_no_rays_is_no_samples(sampler):
     samples, weights, _ = sampler(bundle(0))
     assert samples.frustums.starts.shape == (0, 32, 1)
     assert weights[0].shape == (0, 128, 1)
+
+
+def test_a_ray_that_ends_before_it_begins_has_samples_without_length(sampler):
+    rays = bundle(4)
+    rays.nears[0], rays.fars[0] = FAR, NEAR
+    frustums = sampler(rays)[0].frustums
+    assert torch.equal(frustums.starts[0], torch.full_like(frustums.starts[0], FAR))
+    assert torch.equal(frustums.ends[0], frustums.starts[0])
+    assert (frustums.ends[1:] > frustums.starts[1:]).all()
+
+
+@pytest.mark.parametrize("dtype", [torch.float64, torch.float16])
+def test_a_host_may_be_in_another_precision(dtype):
+    rays = bundle(4)
+    for name in ("origins", "directions", "pixel_area", "nears", "fars"):
+        setattr(rays, name, getattr(rays, name).to(dtype))
+    turned = LearnedOccupancySampler(
+        ball(), num_samples=8, num_candidates=32, cache_bytes=0, frame=torch.eye(3, 4)
+    )
+    samples, weights, _ = turned(rays)
+    assert samples.frustums.starts.isfinite().all()
+    assert weights[0].isfinite().all() and weights[0].shape == (4, 32, 1)

@@ -6,7 +6,7 @@ from types import SimpleNamespace
 
 import torch
 
-from leco_plugin.scenes.frames import between, frame_of
+from leco_plugin.scenes.frames import between, frame_of, inverse
 
 
 def rotation(seed: int) -> torch.Tensor:
@@ -47,3 +47,10 @@ def test_the_same_reader_is_exactly_the_identity():
 
 def test_a_data_manager_without_a_reader_has_no_known_frame():
     assert frame_of(SimpleNamespace()) is None
+
+
+def test_an_inverse_takes_positions_back():
+    frame = torch.cat([1.7 * torch.linalg.qr(torch.randn(3, 3))[0], torch.randn(3, 1)], dim=1)
+    back, points = inverse(frame), torch.randn(10, 3)
+    there = points @ frame[:, :3].T + frame[:, 3]
+    torch.testing.assert_close(there @ back[:, :3].T + back[:, 3], points)
