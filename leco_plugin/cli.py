@@ -62,6 +62,7 @@ def city(
 def inspect(
     file: Annotated[Path, tyro.conf.Positional],
     picture: Path | None = None,
+    history: Path | None = None,
     json: Path | None = None,
 ) -> None:
     """Say what an occupancy is: sizes, threshold, price and gain; and draw it.
@@ -69,6 +70,8 @@ def inspect(
     Args:
         file: An occupancy.safetensors, as a run of leco-occupancy leaves it in its folder.
         picture: File for a picture: slices of o(x) with the cameras, and the kept points.
+        history: File for how it was learned: a .gif that moves, or a still picture. For runs with
+            --pipeline.model.schedule.steps-per-look 10, say.
         json: File for the same as JSON.
     """
     from leco_plugin.evaluation.inspection import describe
@@ -93,6 +96,11 @@ def inspect(
 
         picture.parent.mkdir(parents=True, exist_ok=True)
         print(f"drew {draw(occupancy, picture)}")
+    if history is not None:
+        from leco_plugin.evaluation.history_picture import draw_history
+
+        history.parent.mkdir(parents=True, exist_ok=True)
+        print(f"drew {draw_history(occupancy, file.parent, history)}")
     _write_json(json, facts)
 
 

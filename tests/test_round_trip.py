@@ -23,6 +23,7 @@ import trimesh
 from bare_machine import variables
 from PIL import Image
 
+from leco_plugin.models.history import GateHistory
 from leco_plugin.occupancy import Occupancy
 
 pytestmark = [pytest.mark.slow, pytest.mark.xdist_group("round_trip")]
@@ -37,6 +38,7 @@ TINY = [
     "--pipeline.datamanager.train-num-rays-per-batch=256",
     "--pipeline.datamanager.eval-num-rays-per-batch=256",
     "--pipeline.model.calibration.rays=512",
+    "--pipeline.model.schedule.steps-per-look=5",
     "--pipeline.model.sizes.candidates=64",
     "--pipeline.model.sizes.learn-candidates=32",
     "--pipeline.model.sizes.field.encoding.log2-table=12",
@@ -111,6 +113,10 @@ def test_training_leaves_a_config_a_checkpoint_and_the_occupancy(trained: Path) 
     occupancy = Occupancy.load(trained / "occupancy.safetensors")
     asked = occupancy.query(torch.rand(10, 3) - 0.5)
     assert ((asked >= 0) & (asked <= 1)).all()
+    history = GateHistory.load(trained / "occupancy_history.safetensors", occupancy.gate)
+    assert history.steps[0] == 0 and len(history) >= 3
+    for name, value in occupancy.gate.state_dict().items():
+        assert torch.equal(history.weights[-1][name], value)
 
 
 def test_resuming_goes_on_at_the_next_step(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import statistics
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -19,6 +20,7 @@ from leco_plugin.chart.summary import (
     representations_of,
     verdict,
 )
+from leco_plugin.chart.versus import Versus, rivals
 
 STEPS = Cost("steps", "steps", "")
 STEP_SECONDS = Cost("step_seconds", "a step", "ms", 1e3)
@@ -43,6 +45,9 @@ def table(results: Mapping[str, Any]) -> str:
     lines = lines_of(results) if results["runs"] else []
     if lines:
         parts += [f"{headline(results)}. {circumstances(results)}.", runs_table(lines)]
+    duels = rivals(lines)
+    if duels:
+        parts.append(versus_table(duels))
     if results["failures"]:
         parts.append(failures_table(results["failures"]))
     if any(run.get("occupancy") for line in lines for run in line.runs):
@@ -95,6 +100,26 @@ def runs_table(lines: Sequence[Line]) -> str:
     return _rows(header, rows)
 
 
+def versus_table(duels: Sequence[Versus]) -> str:
+    """What learned occupancies gain: medians over seeds, and the least and the most."""
+    header = [
+        *("against", "seeds", "PSNR, dB", "passes its last PSNR after, s"),
+        *("sooner by, x", "renders faster by, x"),
+    ]
+    rows = [
+        [
+            f"{duel.ours} against {duel.theirs}",
+            str(len(duel.gains)),
+            _spread(duel.gains, "+.2f"),
+            _spread(duel.passed, ".0f"),
+            _spread(duel.sooner, ".2f"),
+            _spread(duel.faster, ".1f"),
+        ]
+        for duel in duels
+    ]
+    return _rows(header, rows)
+
+
 def failures_table(failures: Sequence[Mapping[str, Any]]) -> str:
     """Runs that ended without a result."""
     rows = [[f["name"], str(f["seed"]), f"failed: {_cell(f['reason'])}"] for f in failures]
@@ -133,6 +158,17 @@ def _psnr(line: Line) -> str:
     if len(line.runs) == 1:
         return f"{line.psnr:.2f}"
     return f"{line.psnr:.2f} ({min(line.psnrs):.2f} to {max(line.psnrs):.2f})"
+
+
+def _spread(values: Sequence[float | None], form: str) -> str:
+    """Median, and where there are several, least and most; a dash where a seed has none."""
+    known = [value for value in values if value is not None]
+    if len(known) < len(values) or not known:
+        return "-"
+    middle = format(statistics.median(known), form)
+    if len(known) == 1:
+        return middle
+    return f"{middle} ({min(known):{form}} to {max(known):{form}})"
 
 
 def _number(value: float | None) -> str:

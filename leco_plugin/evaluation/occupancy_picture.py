@@ -79,6 +79,7 @@ def draw_slice(
     at: float,
     cameras: Tensor | None = None,
     solid: Callable[[Tensor], Tensor] | None = None,
+    pixels: int = PIXELS,
 ) -> Any:
     """One slice of o(x) with the contour of the threshold; returns what a colour bar needs.
 
@@ -88,10 +89,11 @@ def draw_slice(
         at: its position along that axis, scene units.
         cameras: [C, 3] centres to mark.
         solid: the truth, if known: positions [N, 3] to bool [N], drawn as a white outline.
+        pixels: along the longer side.
     """
     across, up = (a for a in range(3) if a != normal)
     sides = (box.high - box.low)[[across, up]]
-    counts = (sides / sides.max() * PIXELS).round().clamp(min=2).int().tolist()
+    counts = (sides / sides.max() * pixels).round().clamp(min=2).int().tolist()
     u, v = box.axis(across, counts[0]), box.axis(up, counts[1])
     positions = torch.empty(len(v), len(u), 3)
     positions[..., normal], positions[..., across] = at, u

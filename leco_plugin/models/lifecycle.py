@@ -19,6 +19,7 @@ from torch import Tensor
 from leco_plugin.models.field import HMoEField
 from leco_plugin.models.freezing import freeze, write_occupancy
 from leco_plugin.models.gate import occupancy_from_logits, route
+from leco_plugin.models.history import GateHistory
 from leco_plugin.models.losses import expert_shares
 from leco_plugin.models.phases import (
     PROBES,
@@ -32,6 +33,7 @@ from leco_plugin.models.phases import (
 )
 from leco_plugin.models.progress import Progress
 from leco_plugin.models.ranks import is_first, mean, say, share
+from leco_plugin.models.rendering import gate_values_and_routes
 from leco_plugin.models.statistics import KEPT_ABOVE
 from leco_plugin.occupancy import gate_precision
 from leco_plugin.scenes.known_distances import KnownDistancePixelSampler
@@ -67,6 +69,7 @@ class Lifecycle:
             say(self.survey.describe())
         self.rays_per_batch = int(self.pipeline.datamanager.get_train_rays_per_batch())
         self.step_started = 0.0
+        self.history = GateHistory()
         if bool(model.frozen) and self.folder is not None:
             write_occupancy(model, self.folder)  # a resumed run may have a folder of its own
 
@@ -148,6 +151,8 @@ class Lifecycle:
         if bool(model.frozen) or model.learned or model.config.homogeneous:
             return
         progress.learn_seconds += time.monotonic() - self.step_started
+        if schedule.steps_per_look > 0 and step % schedule.steps_per_look == 0:
+            self._look(step)
         last = step + 1 >= schedule.learn_steps
         if (step + 1) % schedule.steps_per_check and not last:
             return
@@ -166,10 +171,24 @@ class Lifecycle:
             )
             data, seconds = self.pipeline.datamanager, progress.learn_seconds
             freeze(model, data, self.survey, self.folder, step, seconds)
+            if schedule.steps_per_look > 0:
+                self._look(step)
             if schedule.restart:
                 self._restart_field()
             if self.trainer is not None and self.trainer.config.steps_per_save > 0:
                 self.trainer.save_checkpoint(step)  # a run killed from now on stays frozen
+
+    @torch.no_grad()
+    def _look(self, step: int) -> None:
+        """One more entry in the history of the gate, which is written each time."""
+        if self.folder is None:
+            return
+        model, positions = self.model, self.probe_positions
+        with gate_precision(model.device.type, model.precision):
+            gate_values, routes = gate_values_and_routes(model.gate(positions), model.routing)
+            sigmas, _ = model.field.density(positions, routes, gate_values)
+        self.history.look(step, self.progress.learn_seconds, model.gate, routes, sigmas)
+        self.history.save(self.folder)
 
     def _restart_field(self) -> None:
         """Gives the field the weights of a new one, and its optimizers nothing to remember."""

@@ -1,0 +1,113 @@
+"""How a gate came to be: its weights and what its experts do, as they were while it learned."""
+
+from __future__ import annotations
+
+import os
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import torch
+from safetensors import SafetensorError, safe_open
+from safetensors.torch import save
+from torch import Tensor
+
+from leco_plugin.models.gate import Gate
+from leco_plugin.models.losses import expert_shares
+
+FILE_NAME = "occupancy_history.safetensors"
+FORMAT = "leco_plugin.history"
+
+
+@dataclass
+class GateHistory:
+    """Looks at a gate, one after the other."""
+
+    steps: list[int] = field(default_factory=list)
+    seconds: list[float] = field(default_factory=list)
+    """Seconds of learning until each look."""
+    shares: list[Tensor] = field(default_factory=list)
+    """[1 + n] share of the probe positions that each expert gets; 0 is the empty-space expert."""
+    densities: list[Tensor] = field(default_factory=list)
+    """[1 + n] mean density of those, per half extent of the scene; 0 where an expert gets none."""
+    weights: list[dict[str, Tensor]] = field(default_factory=list)
+    """State dicts of the gate."""
+
+    def __len__(self) -> int:
+        return len(self.steps)
+
+    def look(self, step: int, seconds: float, gate: Gate, routes: Tensor, sigmas: Tensor) -> None:
+        """Remembers the gate after a step.
+
+        Args:
+            routes: [P] int64, the expert of each probe position.
+            sigmas: [P] densities there, per half extent of the scene.
+        """
+        experts = 1 + gate.config.scene_experts
+        shares = expert_shares(routes, experts)
+        sums = torch.zeros_like(shares).index_add_(0, routes, sigmas.float())
+        self.steps.append(step)
+        self.seconds.append(seconds)
+        self.shares.append(shares.cpu())
+        self.densities.append((sums / (shares * len(routes)).clamp(min=1.0)).cpu())
+        state = gate.state_dict()
+        self.weights.append({name: value.detach().cpu().clone() for name, value in state.items()})
+
+    def save(self, folder: Path) -> Path:
+        """Writes `occupancy_history.safetensors` in a folder, whole or not at all.
+
+        Raises:
+            ValueError: there was no look yet.
+            OSError: the folder cannot be written to.
+        """
+        if not self.steps:
+            raise ValueError("a history without a single look cannot be written")
+        tensors = {
+            "steps": torch.tensor(self.steps),
+            "seconds": torch.tensor(self.seconds, dtype=torch.float64),
+            "shares": torch.stack(self.shares),
+            "densities": torch.stack(self.densities),
+        }
+        for name in self.weights[0]:
+            tensors[f"gate.{name}"] = torch.stack([state[name] for state in self.weights])
+        folder.mkdir(parents=True, exist_ok=True)
+        path = folder / FILE_NAME
+        unfinished = path.with_name(f".{path.name}.{os.getpid()}.unfinished")
+        try:
+            unfinished.write_bytes(save(tensors, metadata={"format": FORMAT}))
+            unfinished.replace(path)
+        finally:
+            unfinished.unlink(missing_ok=True)
+        return path
+
+    @classmethod
+    def load(cls, path: Path, gate: Gate) -> GateHistory:
+        """Reads what `save` wrote.
+
+        Args:
+            gate: as it became; its weights say which shapes are expected.
+        Raises:
+            OSError: there is no such file.
+            ValueError: it is no history, or the history of a gate of another shape.
+        """
+        try:
+            with safe_open(path, framework="pt", device="cpu") as file:
+                header = file.metadata() or {}
+                tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
+        except SafetensorError as error:
+            raise ValueError(f"{path} is not a whole safetensors file: {error}") from None
+        if header.get("format") != FORMAT:
+            raise ValueError(f"{path} is not a history of leco_plugin")
+        state = gate.state_dict()
+        looks, experts = len(tensors.get("steps", ())), 1 + gate.config.scene_experts
+        expected: dict[str, tuple[int, ...]] = {name: (looks,) for name in ("steps", "seconds")}
+        expected |= {name: (looks, experts) for name in ("shares", "densities")}
+        expected |= {f"gate.{name}": (looks, *value.shape) for name, value in state.items()}
+        if {name: tuple(tensor.shape) for name, tensor in tensors.items()} != expected or not looks:
+            raise ValueError(f"{path} is the history of another gate than that of the occupancy")
+        return cls(
+            tensors["steps"].tolist(),
+            tensors["seconds"].tolist(),
+            list(tensors["shares"]),
+            list(tensors["densities"]),
+            [{name: tensors[f"gate.{name}"][look] for name in state} for look in range(looks)],
+        )

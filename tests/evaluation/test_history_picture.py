@@ -1,0 +1,58 @@
+"""How an occupancy was learned is drawn, still and moving."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+import torch
+from ball_occupancy import ball
+from PIL import Image
+
+from leco_plugin.cli import main
+from leco_plugin.evaluation import history_picture
+from leco_plugin.models.history import GateHistory
+
+
+@pytest.fixture
+def run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """The folder of a run whose gate grew into the ball."""
+    for name, value in {"PIXELS": 24, "HELD": 2, "DPI": 20}.items():
+        monkeypatch.setattr(history_picture, name, value)
+    history, gate = GateHistory(), ball().gate
+    learned = {name: value.clone() for name, value in gate.state_dict().items()}
+    for look in range(3):
+        share = (look + 1) / 3
+        gate.load_state_dict({name: share * value for name, value in learned.items()})
+        history.look(10 * look, float(look), gate, torch.tensor([0, 1]), torch.tensor([0.1, 9.0]))
+    gate.load_state_dict(learned)
+    history.save(tmp_path)
+    ball().save(tmp_path / "occupancy.safetensors")
+    return tmp_path
+
+
+def test_a_gif_has_a_frame_for_each_look_and_rests_on_the_last(run: Path) -> None:
+    path = run / "learned.gif"
+    assert main(["inspect", str(run / "occupancy.safetensors"), "--history", str(path)]) == 0
+    with Image.open(path) as film:
+        # frames that are alike are one that stays longer
+        assert film.n_frames in (3, 5)
+        film.seek(0)
+        first = film.convert("RGB").tobytes()
+        film.seek(2)
+        assert film.convert("RGB").tobytes() != first
+
+
+def test_a_still_picture_is_drawn_too(run: Path) -> None:
+    path = history_picture.draw_history(ball(), run, run / "learned.png")
+    with Image.open(path) as picture:
+        assert picture.width > 100
+
+
+def test_a_run_without_a_history_is_told_how_to_get_one(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    file = tmp_path / "occupancy.safetensors"
+    ball().save(file)
+    assert main(["inspect", str(file), "--history", str(tmp_path / "a.gif")]) == 2
+    assert "steps-per-look" in capsys.readouterr().err.splitlines()[-1]
