@@ -131,7 +131,7 @@ def swap(
     _write_json(json, facts)
 
 
-def demo(out: Path = Path("runs/demo"), seconds: float = 110.0, json: Path | None = None) -> None:
+def demo(out: Path = Path("runs/demo"), seconds: float = 130.0, json: Path | None = None) -> None:
     """Learn the occupancy of a small city, go on guided, and compare with never freezing.
 
     Writes report.json, chart.png, picture.png and occupancy.safetensors. Under six minutes on two
