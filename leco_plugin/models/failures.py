@@ -1,4 +1,4 @@
-"""Names the likely cause when a loss is not finite."""
+"""What ends a training run before its time, and the likely cause of a loss that is not finite."""
 
 from __future__ import annotations
 
@@ -7,6 +7,16 @@ from typing import Any
 
 import torch
 from torch import Tensor, nn
+
+
+class TrainingStopped(SystemExit, RuntimeError):
+    """A run cannot go on; the message says at which step, why, and what is left of it.
+
+    As a `SystemExit` it ends any `ns-*` command with its one line and status 1.
+    """
+
+    def __str__(self) -> str:
+        return str(self.code)
 
 
 def first_non_finite(losses: dict[str, Tensor]) -> str | None:
@@ -53,4 +63,4 @@ def explain_non_finite(name: str, model: nn.Module, outputs: dict[str, Any], ima
         (text for text, value in suspects if not bool(torch.isfinite(value).all())),
         "all inputs and parameters are finite; the loss itself overflowed",
     )
-    return f"{name} is not finite: {cause}. The step was not taken; the last checkpoint is good."
+    return f"{name} is not finite: {cause}."

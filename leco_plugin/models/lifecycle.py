@@ -16,6 +16,7 @@ from nerfstudio.engine.callbacks import (
 )
 from torch import Tensor
 
+from leco_plugin.models.failures import TrainingStopped
 from leco_plugin.models.field import HMoEField
 from leco_plugin.models.freezing import freeze, write_occupancy
 from leco_plugin.models.gate import occupancy_from_logits, route
@@ -219,7 +220,7 @@ class Lifecycle:
             progress.suspected = collapse is not None
             return False
         if progress.recoveries == MOST_RECOVERIES:
-            raise RuntimeError(
+            raise TrainingStopped(
                 f"step {step}: {collapse.cause}, after {MOST_RECOVERIES} recoveries. Check the "
                 "scene's bounds in the log above, and the weights under --pipeline.model.gate-loss"
             )

@@ -1,4 +1,4 @@
-"""Masks of photographs: what would end a run at its first batch is said before anything is loaded."""
+"""Masks of photographs: what would end a run at its first batch is said before it is loaded."""
 
 from __future__ import annotations
 
