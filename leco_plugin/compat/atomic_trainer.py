@@ -14,7 +14,7 @@ from nerfstudio.engine.trainer import Trainer
 from nerfstudio.utils.decorators import check_main_thread
 
 from leco_plugin.compat.whole_checkpoints import first_not_finite, newest_whole, previous_of
-from leco_plugin.models.failures import TrainingStopped
+from leco_plugin.models.failures import GateCollapsed, TrainingStopped
 from leco_plugin.models.ranks import say
 
 SECONDS_BETWEEN_SAVES = 60.0
@@ -52,13 +52,16 @@ class AtomicTrainer(Trainer):
         """Trains to the last step.
 
         Raises:
-            TrainingStopped: a loss is not finite; the step was not taken.
+            TrainingStopped: a loss is not finite, and the step was not taken; or the gate has
+                collapsed more often than it may.
         """
         try:
             super().train()
         except FloatingPointError as error:
             line = f"step {self.step}: {error} The step was not taken; {self._what_is_left()}"
             raise TrainingStopped(line) from None
+        except GateCollapsed as error:
+            raise TrainingStopped(f"{error} Kept: {self._what_is_left()}") from None
 
     def _what_is_left(self) -> str:
         """For the last line of a run that ends before its time."""
@@ -99,7 +102,7 @@ class AtomicTrainer(Trainer):
             TrainingStopped: so it was with the last checkpoint of a run.
         """
         bad = first_not_finite(self.pipeline)
-        reason = f"{bad} is not finite" if bad is not None else None
+        reason = f"{bad} is not finite" if bad is not None else self._doubts()
         started = time.monotonic()
         if reason is None:
             try:
@@ -114,6 +117,13 @@ class AtomicTrainer(Trainer):
         if self.training_state == "completed":
             raise TrainingStopped(line)
         say(line)
+
+    def _doubts(self) -> str | None:
+        """Why the model should not replace the last good checkpoint; None where it may."""
+        if self.training_state == "completed":
+            return None  # the one before stays beside it
+        progress = getattr(getattr(self.pipeline, "model", None), "progress", None)
+        return "the gate looks collapsed" if getattr(progress, "suspected_since", -1) >= 0 else None
 
     def _save_whole(self, step: int) -> None:
         """Beside, because nerfstudio reads a step out of every file name in its folder.
