@@ -1,7 +1,7 @@
 """What is done about a collapsed gate, as a stated rule.
 
 A gate that is found collapsed at every look for `SUSPECTED_STEPS` steps, or at the look that ends
-the first phase, is healed, `MOST_RECOVERIES` times at most. Its last layer starts anew, and learning
+the first phase, is healed, `MOST_RECOVERIES` times at most. Its last layer starts anew; learning
 goes on for half as long again: first on dense samples, while what teaches the gate comes in again
 from nothing and the field finds its surfaces without it; then as before, with the force that led to
 the collapse `EASED` times weaker. Where one scene expert took all points, they are shared out anew,
