@@ -35,7 +35,7 @@ def require_finite(
     """Refuses losses that are not finite, before a step is taken with them.
 
     Args:
-        outputs: with `rays` and `shaded` of the batch.
+        outputs: of the batch; where they hold `rays` and `shaded`, these are suspects too.
         image: what the batch was compared with.
     Raises:
         FloatingPointError: says which loss, and the likely cause.
@@ -47,22 +47,24 @@ def require_finite(
 
 def explain_non_finite(name: str, model: nn.Module, outputs: dict[str, Any], image: Tensor) -> str:
     """One line: which loss, and the first thing on its way that was not finite."""
-    suspects: list[tuple[str, Tensor]] = [
-        ("the training image holds values that are not finite", image),
-        ("a ray is not finite: check the camera poses", outputs["rays"].directions),
-        ("a ray is not finite: check the camera poses", outputs["rays"].origins),
-    ]
+    rays, shaded = outputs.get("rays"), outputs.get("shaded")
+    suspects = [("the training image holds values that are not finite", image)]
+    if rays is not None:
+        suspects += [
+            ("a ray is not finite: check the camera poses", rays.directions),
+            ("a ray is not finite: check the camera poses", rays.origins),
+        ]
     suspects += [
         (f"parameter {key} is not finite: the learning rate is probably too high", value)
         for key, value in model.named_parameters()
         if value.numel()
     ]
-    shaded = outputs["shaded"]
-    suspects += [
-        ("the gate's logits overflowed", shaded.logits),
-        ("a density overflowed: the learning rate is probably too high", shaded.sigmas),
-        ("a colour overflowed", shaded.rgb),
-    ]
+    if shaded is not None:
+        suspects += [
+            ("the gate's logits overflowed", shaded.logits),
+            ("a density overflowed: the learning rate is probably too high", shaded.sigmas),
+            ("a colour overflowed", shaded.rgb),
+        ]
     cause = next(
         (text for text, value in suspects if not bool(torch.isfinite(value).all())),
         "all inputs and parameters are finite; the loss itself overflowed",
