@@ -71,7 +71,7 @@ def inspect(
         file: An occupancy.safetensors, as a run of leco-occupancy leaves it in its folder.
         picture: File for a picture: slices of o(x) with the cameras, and the kept points.
         history: File for how it was learned: a .gif that moves, or a still picture. For runs with
-            --pipeline.model.schedule.steps-per-look 10, say.
+            --pipeline.model.schedule.steps-per-record 10, say.
         json: File for the same as JSON.
     """
     from leco_plugin.evaluation.inspection import describe

@@ -99,7 +99,8 @@ class Occupancy(nn.Module):
         """Writes the file whole or not at all.
 
         Raises:
-            OSError: the folder cannot be written to.
+            OSError: the folder cannot be written to, or the disk is full.
+            ValueError: this is nothing that `load` would take; no file is written.
         """
         path = Path(path)
         header = {
@@ -111,6 +112,7 @@ class Occupancy(nn.Module):
         }
         state = self.state_dict()
         tensors = {name: value.detach().cpu().contiguous() for name, value in state.items()}
+        _check_values(path, tensors)
         header["sha256"] = _digest(header, tensors)
         unfinished = path.with_name(f".{path.name}.{os.getpid()}.unfinished")
         try:
@@ -130,6 +132,8 @@ class Occupancy(nn.Module):
                 tensors that are missing, misshapen or not finite. One line each.
         """
         path = Path(path)
+        if path.is_dir():
+            raise IsADirectoryError(f"{path} is a folder; an occupancy is a file")
         size = path.stat().st_size
         if size > LARGEST_FILE:
             raise ValueError(f"{path} has {size} bytes; an occupancy has at most {LARGEST_FILE}")
@@ -137,6 +141,8 @@ class Occupancy(nn.Module):
             with safe_open(path, framework="pt", device="cpu") as file:
                 header = file.metadata() or {}
                 tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
+        except OSError as error:
+            raise OSError(f"{path} cannot be read: {_line(error)}") from None
         except _UNREADABLE as error:
             raise ValueError(f"{path} is not a whole safetensors file: {_line(error)}") from None
         return cls._checked(path, header, tensors).to(device)
@@ -164,20 +170,32 @@ class Occupancy(nn.Module):
                     f"{path}: tensor {name!r} is {found.get(name)}, "
                     f"the header asks for {expected.get(name)}"
                 )
-        for name, tensor in tensors.items():
-            if tensor.is_floating_point() and not bool(tensor.isfinite().all()):
-                raise ValueError(f"{path}: tensor {name} holds values that are not finite")
-        threshold = float(tensors["threshold_value"])
-        if not 0.0 <= threshold <= 1.0:
-            raise ValueError(f"{path}: the threshold {threshold} is not in [0, 1]")
-        if not float(tensors["space.half_extent"]) > 0.0:
-            raise ValueError(f"{path}: the half extent of its space is not positive")
+        _check_values(path, tensors)
         if header.get("sha256") != _digest(header, tensors):
             raise ValueError(f"{path} is damaged: its contents do not match its checksum")
         report = report if isinstance(report, dict) else {}
         occupancy = cls(Gate(config), Space(), 0.0, cast(Precision, precision), report)
         occupancy.load_state_dict(tensors)
         return occupancy.eval()
+
+
+def _check_values(path: Path, tensors: dict[str, Tensor]) -> None:
+    """Whether the numbers of an occupancy can be decided with.
+
+    Raises:
+        ValueError: one line, with the path of the file.
+    """
+    for name, tensor in tensors.items():
+        if tensor.is_floating_point() and not bool(tensor.isfinite().all()):
+            raise ValueError(f"{path}: tensor {name} holds values that are not finite")
+    threshold = float(tensors["threshold_value"])
+    if not 0.0 <= threshold <= 1.0:
+        raise ValueError(f"{path}: the threshold {threshold} is not in [0, 1]")
+    if not float(tensors["space.half_extent"]) > 0.0:
+        raise ValueError(f"{path}: the half extent of its space is not positive")
+    low, high = tensors["walls"].view(2, 3)
+    if bool((low > high).any()):
+        raise ValueError(f"{path}: its walls end before they begin")
 
 
 _UNREADABLE = (

@@ -24,7 +24,7 @@ def contract(positions: Tensor) -> Tensor:
     Args:
         positions: [..., 3] float.
     Returns:
-        [..., 3], every coordinate in [-2, 2]; infinitely far points land on its faces.
+        [..., 3], every coordinate in [-2, 2]. Infinitely far points have no place: they give NaN.
     """
     magnitude = positions.abs().amax(dim=-1, keepdim=True)
     outside = magnitude.clamp(min=1.0)  # the clamp keeps the untaken branch finite

@@ -17,7 +17,7 @@ from nerfstudio.engine.trainer import Trainer
 from nerfstudio.scripts import train as ns_train
 
 from leco_plugin.compat.atomic_trainer import AtomicTrainer
-from leco_plugin.models import lifecycle
+from leco_plugin.models import healing
 from leco_plugin.models.freezing import FILE_NAME
 from leco_plugin.models.phases import Collapse
 from leco_plugin.occupancy import Occupancy
@@ -74,8 +74,8 @@ def collapse_once() -> None:
     def find_collapse(kept: float, shares: torch.Tensor, at_the_end: bool) -> Collapse | None:
         return found.pop() if at_the_end and found else None
 
-    lifecycle.FEWEST_STEPS = 0
-    lifecycle.find_collapse = find_collapse
+    healing.FEWEST_STEPS = 0
+    healing.find_collapse = find_collapse
 
 
 def leave_out_the_cache() -> None:

@@ -78,3 +78,8 @@ def test_a_space_travels_with_a_state_dict() -> None:
 def test_a_half_extent_that_is_not_positive_and_finite_is_refused(half_extent: float) -> None:
     with pytest.raises(ValueError, match="half extent"):
         Space("box", half_extent=half_extent)
+
+
+def test_infinitely_far_points_have_no_place() -> None:
+    far = contract(torch.tensor([[1e30, 0.0, 0.0], [torch.inf, 0.0, 0.0]]))
+    assert far[0, 0] == 2.0 and bool(far[1, 0].isnan())

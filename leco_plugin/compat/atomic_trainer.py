@@ -1,41 +1,160 @@
-"""nerfstudio's trainer, with checkpoints that are whole or absent whenever it is killed."""
+"""nerfstudio's trainer, of which nothing that was saved is lost, however it ends."""
 
 from __future__ import annotations
 
 import os
 import shutil
+import time
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
 
+from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackLocation
 from nerfstudio.engine.trainer import Trainer
 from nerfstudio.utils.decorators import check_main_thread
+
+from leco_plugin.compat.whole_checkpoints import first_not_finite, newest_whole, previous_of
+from leco_plugin.models.failures import GateCollapsed, TrainingStopped
+from leco_plugin.models.ranks import say
+
+SECONDS_BETWEEN_SAVES = 60.0
+"""A run that saves at all is saved this often, however few its steps are..."""
+SAVES_COST = 100.0
+"""...unless a save takes longer than a hundredth of that."""
 
 
 class AtomicTrainer(Trainer):
     """Set as `_target` of a `TrainerConfig`.
 
-    nerfstudio writes a checkpoint in place, and resuming takes the file with the highest step: one
-    that was cut off half-way ends every attempt to go on, even with a whole one beside it.
+    nerfstudio writes a checkpoint in place and deletes the one before, and resuming takes the file
+    with the highest step: one that was cut off half-way ends every attempt to go on.
     """
+
+    saved_at = 0.0
+    """When the last checkpoint was saved, or training began."""
+    save_seconds = 0.0
+    """What it took."""
+
+    def setup(self, *arguments: Any, **options: Any) -> None:
+        """As nerfstudio's; then checkpoints are also saved by the clock."""
+        super().setup(*arguments, **options)
+        self.saved_at = time.monotonic()
+        where = [TrainingCallbackLocation.AFTER_TRAIN_ITERATION]
+        self.callbacks.append(TrainingCallback(where, self.save_by_the_clock))
+
+    def save_by_the_clock(self, step: int) -> None:
+        """Saves if the last time is long ago; nothing where a run is to save nothing."""
+        wait = max(SECONDS_BETWEEN_SAVES, SAVES_COST * self.save_seconds)
+        if self.config.steps_per_save > 0 and time.monotonic() - self.saved_at > wait:
+            self.save_checkpoint(step)
+
+    def train(self) -> None:
+        """Trains to the last step.
+
+        Raises:
+            TrainingStopped: a loss is not finite, and the step was not taken; or the gate has
+                collapsed more often than it may.
+        """
+        try:
+            super().train()
+        except FloatingPointError as error:
+            line = f"step {self.step}: {error} The step was not taken; {self._what_is_left()}"
+            raise TrainingStopped(line) from None
+        except GateCollapsed as error:
+            raise TrainingStopped(f"{error} Kept: {self._what_is_left()}") from None
+
+    def _what_is_left(self) -> str:
+        """For the last line of a run that ends before its time."""
+        saved = sorted(self.checkpoint_dir.glob("*.ckpt"))
+        return (
+            f"the last good checkpoint is {saved[-1]}" if saved else "no checkpoint was saved yet"
+        )
+
+    def _load_checkpoint(self) -> None:
+        """As nerfstudio's, from the newest checkpoint of a folder that is whole.
+
+        Raises:
+            InputError: there is none.
+        """
+        config, folder = self.config, self.config.load_dir
+        if folder is None or config.load_step is not None:
+            super()._load_checkpoint()
+            return
+        path, damaged = newest_whole(folder)
+        for line in damaged:
+            say(line)
+        if damaged:
+            say(f"going on from {path}, the newest that is whole")
+        self.config = replace(config, load_dir=None, load_checkpoint=path)
+        try:
+            super()._load_checkpoint()
+        finally:
+            self.config = config
 
     @check_main_thread
     def save_checkpoint(self, step: int) -> None:
         """Writes the checkpoint of `step` beside the folder of checkpoints, then moves it in.
 
-        Beside, because nerfstudio reads a step out of every file name in that folder.
+        The one before stays in a folder of its own. A disk that is full costs this checkpoint, and
+        a state that is not finite is not saved; training goes on.
+
+        Raises:
+            TrainingStopped: so it was with the last checkpoint of a run.
+        """
+        bad = first_not_finite(self.pipeline)
+        reason = f"{bad} is not finite" if bad is not None else self._doubts()
+        started = time.monotonic()
+        if reason is None:
+            try:
+                self._save_whole(step)
+            except (OSError, RuntimeError) as error:  # as which torch reports a disk that is full
+                reason = next(iter(str(error).splitlines()), type(error).__name__)
+        self.saved_at = time.monotonic()
+        self.save_seconds = self.saved_at - started
+        if reason is None:
+            return
+        line = f"step {step}: no checkpoint could be saved ({reason}); {self._what_is_left()}"
+        if self.training_state == "completed":
+            raise TrainingStopped(line)
+        say(line)
+
+    def _doubts(self) -> str | None:
+        """Why the model should not replace the last good checkpoint; None where it may."""
+        if self.training_state == "completed":
+            return None  # the one before stays beside it
+        progress = getattr(getattr(self.pipeline, "model", None), "progress", None)
+        return "the gate looks collapsed" if getattr(progress, "suspected_since", -1) >= 0 else None
+
+    def _save_whole(self, step: int) -> None:
+        """Beside, because nerfstudio reads a step out of every file name in its folder.
+
+        Raises:
+            OSError, RuntimeError: it cannot be written; what was there before is there.
         """
         checkpoints = self.checkpoint_dir
         beside = checkpoints.with_name(f"{checkpoints.name}.unfinished")
         self.checkpoint_dir = beside
         try:
             super().save_checkpoint(step)
+            unfinished = beside / f"step-{step:09d}.ckpt"
+            with unfinished.open("rb") as file:
+                os.fsync(file.fileno())
+            checkpoints.mkdir(parents=True, exist_ok=True)
+            finished = unfinished.replace(checkpoints / unfinished.name)
         finally:
             self.checkpoint_dir = checkpoints
-        unfinished = beside / f"step-{step:09d}.ckpt"
-        with unfinished.open("rb") as file:
-            os.fsync(file.fileno())
-        checkpoints.mkdir(parents=True, exist_ok=True)
-        finished = unfinished.replace(checkpoints / unfinished.name)
-        shutil.rmtree(beside)  # with whatever a killed process has left there
+            shutil.rmtree(beside, ignore_errors=True)  # also what a killed process has left there
         if self.config.save_only_latest_checkpoint:
-            for older in checkpoints.glob("*.ckpt"):
-                if older != finished:
-                    older.unlink()
+            self._put_aside([path for path in checkpoints.glob("*.ckpt") if path != finished])
+
+    def _put_aside(self, older: list[Path]) -> None:
+        """Keeps the newest of these as the one before the newest of the run, and no other."""
+        if not older:
+            return
+        aside = previous_of(self.checkpoint_dir)
+        aside.mkdir(exist_ok=True)
+        *others, newest = sorted(older)
+        kept = newest.replace(aside / newest.name)
+        for path in [*others, *aside.glob("*.ckpt")]:
+            if path != kept:
+                path.unlink()

@@ -6,6 +6,7 @@ in each process that it starts, and where a pipeline tells torch the number of a
 
 from __future__ import annotations
 
+import functools
 import sys
 from dataclasses import dataclass, field
 from types import SimpleNamespace
@@ -14,9 +15,17 @@ from typing import Any
 import torch
 from nerfstudio.engine.trainer import TrainerConfig
 from torch import distributed, nn
+from torch.multiprocessing import ProcessExitedException, ProcessRaisedException
 from torch.nn.parallel import DistributedDataParallel
 
 from leco_plugin.compat.atomic_trainer import AtomicTrainer
+from leco_plugin.compat.run_folder import claim
+from leco_plugin.models.failures import TrainingStopped
+from leco_plugin.models.ranks import say
+from leco_plugin.scenes.input_error import InputError
+
+LOST = ("Connection closed by peer", "Connection reset by peer", "NCCL communicator was aborted")
+"""What gloo and NCCL say of a process that is gone."""
 
 
 @dataclass
@@ -30,8 +39,21 @@ class DataParallelTrainerConfig(TrainerConfig):
         """Prepares the launcher too: of a config, nothing else is called before processes start."""
         super().set_timestamp()
         machine = self.machine
+        if machine.num_devices * machine.num_machines > 1:
+            name_the_lost()
         if machine.device_type == "cpu" and machine.num_devices * machine.num_machines > 1:
             launch_on_cpu()
+
+    def save_config(self) -> None:
+        """Takes the run's folder; one that another run has, or has left, gives way to a new one."""
+        wanted, reasons = self.timestamp, []
+        load_from = self.load_checkpoint or self.load_dir
+        while reason := claim(self.get_base_dir(), self.get_checkpoint_dir(), load_from):
+            reasons.append(reason)
+            self.timestamp = f"{wanted}-{len(reasons) + 1}"
+        if reasons:
+            say(f"{reasons[0]}; this run goes to {self.get_base_dir()}")
+        super().save_config()
 
 
 def launch_on_cpu() -> None:
@@ -40,6 +62,47 @@ def launch_on_cpu() -> None:
         launcher: Any = sys.modules.get(name)
         if hasattr(launcher, "_distributed_worker"):
             launcher._distributed_worker = process
+
+
+def name_the_lost() -> None:
+    """Has nerfstudio's launcher, where it is loaded, end in one line when a process is lost."""
+    for name in ("nerfstudio.scripts.train", "__main__"):
+        launcher: Any = sys.modules.get(name)
+        if not hasattr(launcher, "launch") or hasattr(launcher.launch, "__wrapped__"):
+            continue
+        launcher.launch = _with_one_line(launcher.launch)
+
+
+def _with_one_line(launch: Any) -> Any:
+    @functools.wraps(launch)
+    def launching(*arguments: Any, **options: Any) -> Any:
+        try:
+            return launch(*arguments, **options)
+        except ProcessExitedException as error:
+            exit_code = f"exit code {error.exit_code}"
+            _stop(f"number {error.error_index}", error.signal_name or exit_code, options["config"])
+        except ProcessRaisedException as error:
+            name, _, line = str(error).strip().splitlines()[-1].partition(": ")
+            if name.endswith((TrainingStopped.__name__, InputError.__name__)):
+                raise TrainingStopped(line) from None
+            if not any(sign in line for sign in LOST):
+                raise
+            _stop("one", "its connection broke", options["config"])
+
+    return launching
+
+
+def _stop(which: str, how: str, config: Any) -> None:
+    """Ends the launcher because a process is gone.
+
+    Raises:
+        TrainingStopped: always; the message says what is left.
+    """
+    raise TrainingStopped(
+        f"{which} of {config.machine.num_devices} processes was lost ({how}), and the others have "
+        "stopped; nothing that was saved is lost: go on with --load-dir "
+        f"{config.get_checkpoint_dir()}"
+    ) from None
 
 
 def process(local_rank: int, *arguments: Any) -> None:

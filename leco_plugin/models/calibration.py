@@ -35,6 +35,10 @@ class CalibrationConfig:
     """Held-out training rays to measure with."""
     rays_at_once: int = 1024
     """Rays rendered at a time."""
+    recheck_rays: int = 512
+    """Other held-out rays on which prices are measured again in guided training; 0 is never."""
+    steps_per_recheck: int = 100
+    """Fewest steps between two such measurements; more where they take over 1% of the time."""
 
 
 class Measured(NamedTuple):
@@ -137,18 +141,47 @@ def measure(
     )
 
 
+def excesses(
+    references: list[Reference],
+    truths: list[Tensor],
+    render_kept: Callable[[int, Tensor], Tensor],
+    threshold: float,
+    config: CalibrationConfig,
+) -> tuple[Tensor, Tensor]:
+    """By how much single rays are beyond the bounds: a mean above 0 is a price that is too high.
+
+    Arguments as for `measure`.
+
+    Returns:
+        Lost weight near surfaces less the share of it that may be lost, and squared error of the
+        gated image less what the bound on the price makes of the dense one's; both [R].
+    """
+    surface, image = [], []
+    worse = 10.0 ** (0.1 * config.image_price_db)
+    for i, (reference, truth) in enumerate(zip(references, truths)):
+        gone = (reference.occupancies < threshold) & ~reference.always_kept
+        on_surface = reference.weights * reference.near_surface
+        beyond = on_surface * gone - config.lost_surface_mass * on_surface
+        per_ray = beyond.new_zeros(len(truth))
+        surface.append(per_ray.index_add_(0, reference.intervals.ray_indices, beyond))
+        gated = ((render_kept(i, ~gone) - truth) ** 2).sum(dim=-1)
+        image.append(gated - worse * ((reference.rgb - truth) ** 2).sum(dim=-1))
+    return torch.cat(surface), torch.cat(image)
+
+
 def calibrate(
     references: list[Reference],
     truths: list[Tensor],
     render_kept: Callable[[int, Tensor], Tensor],
     config: CalibrationConfig,
+    below: float = 1.0,
 ) -> Measured:
     """The largest threshold of `THRESHOLDS` within the bounds, with what it costs.
 
-    Arguments as for `measure`. When none is within them, the threshold is 0: everything is kept,
-    which is slow and never wrong.
+    Arguments as for `measure`; only thresholds below `below` are tried. When none is within the
+    bounds, the threshold is 0: everything is kept, which is slow and never wrong.
     """
-    for threshold in THRESHOLDS:
+    for threshold in (tried for tried in THRESHOLDS if tried < below):
         cheap = measure(references, truths, render_kept, threshold, with_image=False)
         if cheap.lost_surface_mass > config.lost_surface_mass:
             continue

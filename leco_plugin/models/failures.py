@@ -1,4 +1,4 @@
-"""Names the likely cause when a loss is not finite."""
+"""What ends a training run before its time, and the likely cause of a loss that is not finite."""
 
 from __future__ import annotations
 
@@ -7,6 +7,20 @@ from typing import Any
 
 import torch
 from torch import Tensor, nn
+
+
+class GateCollapsed(RuntimeError):
+    """A gate has collapsed more often than it may be healed."""
+
+
+class TrainingStopped(SystemExit, RuntimeError):
+    """A run cannot go on; the message says at which step, why, and what is left of it.
+
+    As a `SystemExit` it ends any `ns-*` command with its one line and status 1.
+    """
+
+    def __str__(self) -> str:
+        return str(self.code)
 
 
 def first_non_finite(losses: dict[str, Tensor]) -> str | None:
@@ -21,7 +35,7 @@ def require_finite(
     """Refuses losses that are not finite, before a step is taken with them.
 
     Args:
-        outputs: with `rays` and `shaded` of the batch.
+        outputs: of the batch; where they hold `rays` and `shaded`, these are suspects too.
         image: what the batch was compared with.
     Raises:
         FloatingPointError: says which loss, and the likely cause.
@@ -33,24 +47,26 @@ def require_finite(
 
 def explain_non_finite(name: str, model: nn.Module, outputs: dict[str, Any], image: Tensor) -> str:
     """One line: which loss, and the first thing on its way that was not finite."""
-    suspects: list[tuple[str, Tensor]] = [
-        ("the training image holds values that are not finite", image),
-        ("a ray is not finite: check the camera poses", outputs["rays"].directions),
-        ("a ray is not finite: check the camera poses", outputs["rays"].origins),
-    ]
+    rays, shaded = outputs.get("rays"), outputs.get("shaded")
+    suspects = [("the training image holds values that are not finite", image)]
+    if rays is not None:
+        suspects += [
+            ("a ray is not finite: check the camera poses", rays.directions),
+            ("a ray is not finite: check the camera poses", rays.origins),
+        ]
     suspects += [
         (f"parameter {key} is not finite: the learning rate is probably too high", value)
         for key, value in model.named_parameters()
         if value.numel()
     ]
-    shaded = outputs["shaded"]
-    suspects += [
-        ("the gate's logits overflowed", shaded.logits),
-        ("a density overflowed: the learning rate is probably too high", shaded.sigmas),
-        ("a colour overflowed", shaded.rgb),
-    ]
+    if shaded is not None:
+        suspects += [
+            ("the gate's logits overflowed", shaded.logits),
+            ("a density overflowed: the learning rate is probably too high", shaded.sigmas),
+            ("a colour overflowed", shaded.rgb),
+        ]
     cause = next(
         (text for text, value in suspects if not bool(torch.isfinite(value).all())),
         "all inputs and parameters are finite; the loss itself overflowed",
     )
-    return f"{name} is not finite: {cause}. The step was not taken; the last checkpoint is good."
+    return f"{name} is not finite: {cause}."

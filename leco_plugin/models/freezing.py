@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import torch
+from nerfstudio.cameras.rays import RayBundle
 from torch import Tensor
 
 from leco_plugin.models.calibration import (
@@ -93,9 +95,16 @@ def _priced(
 
 
 def write_occupancy(model: LecoModel, folder: Path) -> None:
-    """Leaves the frozen gate as `occupancy.safetensors` in a folder, made where it is missing."""
-    folder.mkdir(parents=True, exist_ok=True)
-    model.occupancy().save(folder / FILE_NAME)
+    """Leaves the frozen gate as `occupancy.safetensors` in a folder, made where it is missing.
+
+    A disk that is full is said in one line: the checkpoint holds the gate too.
+    """
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        model.occupancy().save(folder / FILE_NAME)
+    except OSError as error:
+        say(f"{folder / FILE_NAME} could not be written ({error}); a resumed run writes it anew")
+        return
     say(f"wrote {folder / FILE_NAME}")
 
 
@@ -105,29 +114,77 @@ def held_out_sampler(datamanager: Any) -> HeldOutPixelSampler | None:
     return sampler if isinstance(sampler, HeldOutPixelSampler) else None
 
 
-def calibration_rays(model: LecoModel, datamanager: Any) -> tuple[Rays, Tensor]:
-    """Rays of held-out training pixels, cut to the bounds, and their true colours [R, 3 or 4].
+def held_out_bundle(
+    datamanager: Any, calibrated: int, count: int, seed: int
+) -> tuple[RayBundle, Tensor]:
+    """Rays of training pixels that are never trained on, and their true colours [R, 3 or 4].
 
     A data manager without held-out pixels gives ordinary training rays; the report says so.
+
+    Args:
+        calibrated: rays that the threshold was first calibrated with, which are those of seed 0.
+        count: rays wanted; fewer come back where masks leave fewer.
+        seed: of the draw; any but 0 avoids the pixels of seed 0, unless there are no others.
     """
     sampler = held_out_sampler(datamanager)
-    count = model.config.calibration.rays
-    if sampler is not None:
-        images = next(datamanager.iter_train_image_dataloader)
-        batch = sampler.sample_held_out(images, count, seed=0)
-        bundle = datamanager.train_ray_generator(batch["indices"])
-    else:
+    if sampler is None:
         bundle, batch = datamanager.next_train(0)
-    rays = model.rays_of(bundle.to(model.device))
-    return rays, batch["image"].to(model.device).float()
+        return bundle[:count], batch["image"][:count]
+    images = next(datamanager.iter_train_image_dataloader)
+    batch = sampler.sample_held_out(images, count, seed)
+    if seed != 0:
+        used = sampler.sample_held_out(images, calibrated, 0)["indices"]
+        new = ~torch.isin(_numbers(batch["indices"]), _numbers(used))
+        if bool(new.any()):
+            batch = {name: values[new.to(values.device)] for name, values in batch.items()}
+    return datamanager.train_ray_generator(batch["indices"]), batch["image"]
+
+
+def _numbers(indices: Tensor) -> Tensor:
+    """One number for each pixel (image, row, column) [N, 3]."""
+    return (indices[:, 0] << 40) + (indices[:, 1] << 20) + indices[:, 2]
+
+
+def calibration_rays(
+    model: LecoModel, datamanager: Any, count: int | None = None, seed: int = 0
+) -> tuple[Rays, Tensor]:
+    """Held-out rays, cut to the model's bounds, and their true colours [R, 3 or 4].
+
+    Args:
+        count: None is what a calibration takes.
+        seed: see `held_out_bundle`.
+    """
+    calibrated = model.config.calibration.rays
+    bundle, truth = held_out_bundle(datamanager, calibrated, count or calibrated, seed)
+    return model.rays_of(bundle.to(model.device)), truth.to(model.device).float()
+
+
+class DenseRendering(NamedTuple):
+    """What `calibration.measure` and its kin take: see there."""
+
+    references: list[Reference]
+    truths: list[Tensor]
+    render_kept: Callable[[int, Tensor], Tensor]
 
 
 @torch.no_grad()
-def calibrate_on(model: LecoModel, rays: Rays, truth: Tensor) -> Measured:
-    """Finds the threshold of a model's gate on given rays; the model is left as it was."""
-    config = model.config.calibration
+def calibrate_on(model: LecoModel, rays: Rays, truth: Tensor, below: float = 1.0) -> Measured:
+    """Finds the threshold of a model's gate on given rays; the model is left as it was.
+
+    Args:
+        below: only thresholds below this are tried.
+    """
     was_training = model.training
     model.eval()
+    measured = calibrate(*dense_rendering(model, rays, truth), model.config.calibration, below)
+    model.train(was_training)
+    return measured
+
+
+@torch.no_grad()
+def dense_rendering(model: LecoModel, rays: Rays, truth: Tensor) -> DenseRendering:
+    """All candidates of given rays rendered, in chunks, in the model's present mode."""
+    config = model.config.calibration
     chunks = [
         Rays._make(None if part is None else part[i : i + config.rays_at_once] for part in rays)
         for i in range(0, len(truth), config.rays_at_once)
@@ -139,9 +196,7 @@ def calibrate_on(model: LecoModel, rays: Rays, truth: Tensor) -> Measured:
         return model.shade(chunks[number], kept).rgb
 
     truths = list(model.renderer_rgb.blend_background(truth).split(config.rays_at_once))
-    measured = calibrate(references, truths, render_kept, config)
-    model.train(was_training)
-    return measured
+    return DenseRendering(references, truths, render_kept)
 
 
 def dense_reference(model: LecoModel, rays: Rays) -> Reference:

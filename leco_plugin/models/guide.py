@@ -44,6 +44,9 @@ class Guide(nn.Module):
 
     Attributes:
         occupancy: None until there is one.
+        dense: whether packed samplers keep every candidate for the moment, as a reference.
+        kept: samples that a packed sampler kept when it was last asked in training.
+        watched: what was found of the price of skipping; travels with a checkpoint.
         frame: [3, 4] takes positions of the host to those of the occupancy: a rotation times a
             scale, and a translation.
     """
@@ -61,6 +64,9 @@ class Guide(nn.Module):
         self.options = dict(options or {})
         self.occupancy: Occupancy | None = None
         self.version = 0
+        self.dense = False
+        self.kept: int | None = None
+        self.watched: dict[str, Any] = {}
         self.register_buffer("frame", torch.eye(3, 4))
         self.register_load_state_dict_post_hook(lambda guide, _: guide.changed())
 
@@ -110,6 +116,10 @@ class Guide(nn.Module):
             )
         return self.occupancy
 
+    def the_occupancy_skips(self) -> bool:
+        """Whether it skips anything; at threshold 0 it does not, and need not be asked."""
+        return not self.needs_occupancy or self.the_occupancy().threshold > 0.0
+
     def same_frame(self) -> bool:
         """Whether host and occupancy share their coordinates."""
         return torch.equal(self.frame, torch.eye(3, 4, device=self.frame.device))
@@ -153,11 +163,13 @@ class Guide(nn.Module):
             "gate": self.occupancy.gate.config.to_dict(),
             "precision": self.occupancy.precision,
             "report": self.occupancy.report,
+            "watched": self.watched,
         }
 
     def set_extra_state(self, state: dict[str, Any]) -> None:
         """Makes an occupancy of the checkpoint's shape; torch then reads its weights."""
         if state:
+            self.watched = dict(state.get("watched", {}))
             gate = Gate(GateConfig.from_dict(state["gate"]))
             occupancy = Occupancy(gate, Space(), 0.0, state["precision"], state["report"])
             self.set_occupancy(occupancy)
@@ -236,13 +248,27 @@ class GuidedEstimator(_StandIn):
     @functools.wraps(Estimator.sampling)
     def sampling(self, rays_o: Tensor, rays_d: Tensor, *args: Any, **kwargs: Any) -> Any:
         (guide,) = self._guide
-        estimator: Any = self.sampler
+        skips = not guide.dense and guide.the_occupancy_skips()
+        estimator: Any = self.sampler if skips else self.dense
         options = self._with_an_end(_SAMPLING.bind(self, rays_o, rays_d, *args, **kwargs).arguments)
         if not guide.same_frame():
             # a direction carries the scale, so that distances along the ray stay the host's
             frame = guide.frame.to(rays_o)
             rays_o, rays_d = moved(rays_o, frame), turned(rays_d, frame)
-        return estimator.sampling(rays_o, rays_d, **options)
+        samples = estimator.sampling(rays_o, rays_d, **options)
+        if self.training:
+            guide.kept = len(samples[0])
+        return samples
+
+    @property
+    def dense(self) -> nn.Module:
+        """Keeps every candidate, in the box in which the host samples at all."""
+        (guide,) = self._guide
+        box = self._aabb if self._outermost is None else self._outermost
+        if box is not None and not guide.same_frame():
+            box = box_around(box, guide.frame.cpu())
+        made = build_estimator("dense", aabb=box).to(guide.frame.device)
+        return made.train(self.training)
 
     def _with_an_end(self, arguments: dict[str, Any]) -> dict[str, Any]:
         """The options of `sampling`; rays that would go on for ever end at the host's box.

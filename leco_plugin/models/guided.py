@@ -24,6 +24,7 @@ from nerfstudio.models.base_model import Model, ModelConfig
 from leco_plugin.compat.checkpoints import allow_checkpoint_globals
 from leco_plugin.compat.host_lpips import setup_with_lazy_lpips
 from leco_plugin.compat.host_outputs import with_counts_as_floats
+from leco_plugin.models.failures import require_finite
 from leco_plugin.models.guide import Guide
 from leco_plugin.models.guided_start import (
     OWN_SAMPLER,
@@ -31,6 +32,7 @@ from leco_plugin.models.guided_start import (
     OccupancyConfig,
     load_occupancy,
 )
+from leco_plugin.models.host_watch import HostWatch
 from leco_plugin.models.precision import keep_freed_memory
 from leco_plugin.models.seams import swap_sampler
 from leco_plugin.scenes.input_error import InputError
@@ -81,6 +83,7 @@ def set_up_guided(config: GuidedModelConfig, **arguments: Any) -> Model:
     host = with_counts_as_floats(setup_with_lazy_lpips(host_config, **arguments))
     host.guide = guide
     swap_sampler(host, guide)
+    _refuse_what_is_not_finite(host)
     _begin_with_occupancy(host, guide, config.occupancy)
     return host
 
@@ -93,6 +96,20 @@ def _as_it_is(host_config: ModelConfig, arguments: dict[str, Any]) -> Model:
     return with_counts_as_floats(setup_with_lazy_lpips(host_config, **arguments))
 
 
+def _refuse_what_is_not_finite(host: Model) -> None:
+    """No step is taken with a loss that is not finite."""
+    own_losses = host.get_loss_dict
+
+    @functools.wraps(own_losses)
+    def get_loss_dict(outputs: Any, batch: Any, *args: Any, **kwargs: Any) -> dict[str, Any]:
+        losses = own_losses(outputs, batch, *args, **kwargs)
+        if host.training and losses:
+            require_finite(losses, host, outputs, batch["image"])
+        return losses
+
+    host.get_loss_dict = get_loss_dict  # type: ignore[method-assign]
+
+
 def _begin_with_occupancy(host: Model, guide: Guide, config: OccupancyConfig) -> None:
     """Before the host's first step there is an occupancy, in its coordinates, and in its folder."""
     own_callbacks = host.get_training_callbacks
@@ -102,7 +119,16 @@ def _begin_with_occupancy(host: Model, guide: Guide, config: OccupancyConfig) ->
         if not guide.needs_occupancy:
             return own_callbacks(attributes)
         start = GuidedStart(guide, config, attributes.pipeline, attributes.trainer)
-        where = [TrainingCallbackLocation.BEFORE_TRAIN_ITERATION]
-        return [TrainingCallback(where, start.before_step), *own_callbacks(attributes)]
+        watch = HostWatch(
+            host, guide, config.learning.calibration, attributes.pipeline, attributes.trainer
+        )
+        before = [TrainingCallbackLocation.BEFORE_TRAIN_ITERATION]
+        after = [TrainingCallbackLocation.AFTER_TRAIN_ITERATION]
+        return [
+            TrainingCallback(before, start.before_step),
+            *own_callbacks(attributes),
+            TrainingCallback(before, watch.before_step),
+            TrainingCallback(after, watch.after_step),
+        ]
 
     host.get_training_callbacks = get_training_callbacks  # type: ignore[assignment, method-assign]

@@ -17,6 +17,7 @@ from leco_plugin.models.calibration import CalibrationConfig
 from leco_plugin.models.failures import require_finite
 from leco_plugin.models.field import HMoEField
 from leco_plugin.models.gate import Gate, check_sizes
+from leco_plugin.models.healing import annealed, is_dense
 from leco_plugin.models.image_figures import image_figures
 from leco_plugin.models.losses import distortion_loss, termination_loss
 from leco_plugin.models.objective import GateLossConfig, gate_losses
@@ -114,6 +115,7 @@ class LecoModel(Model):
         self.register_buffer("aabb", torch.tensor([-1.0] * 3 + [1.0] * 3))
         self.renderer_rgb = RGBRenderer(background_color="random")
         self.ramped = 0.0
+        self.step = 0
         self.routing = self._routing()
         # held in a tuple: the estimator shares the gate, which must not be registered twice
         self._estimator: tuple[LearnedOccupancyEstimator, ...] = ()
@@ -188,9 +190,20 @@ class LecoModel(Model):
     def set_extra_state(self, state: dict[str, Any]) -> None:
         """Restores what `get_extra_state` gave."""
         self.report = dict(state.get("report", {}))
-        self.progress = Progress(**state.get("progress", {}))
+        self.progress = Progress.from_dict(state.get("progress", {}))
         # a gate decides otherwise in another precision than the one it was taught in
         self.precision = state.get("precision", self.precision)
+        self.forget_estimator()
+
+    def reopen(self) -> None:
+        """Has a frozen gate learn again."""
+        self.frozen.fill_(False)
+        self.threshold.fill_(0.0)
+        self.gate.requires_grad_(True)
+        self.forget_estimator()
+
+    def forget_estimator(self) -> None:
+        """Has it built anew when it is next asked, for another gate or another threshold."""
         self._estimator = ()
 
     def occupancy(self) -> Occupancy:
@@ -221,7 +234,8 @@ class LecoModel(Model):
         )
         intervals = Intervals(*samples)
         # a homogeneous gate is taught nothing about emptiness
-        if learning and self.ramped > 0.0 and not self.config.homogeneous:
+        followed = self.ramped > 0.0 and not is_dense(self.progress, self.step)
+        if learning and followed and not self.config.homogeneous:
             intervals = self._likely(intervals, rays)
         return with_backdrop(intervals, rays, size, angle)
 
@@ -236,6 +250,8 @@ class LecoModel(Model):
         self.learning_kept = 0.9 * self.learning_kept + 0.1 * len(kept) / max(len(likely), 1)
         return Intervals(*(part.index_select(0, kept) for part in intervals))
 
+    guided_kept = 1.0
+    """Samples a ray that the frozen gate kept of the last batch, backdrops left out."""
     learning_kept = 1.0
     """Share of candidates that are shaded while learning, a running mean."""
 
@@ -255,8 +271,10 @@ class LecoModel(Model):
     def get_outputs(self, ray_bundle: RayBundle) -> dict[str, Any]:  # type: ignore[override]
         """Pixels of rays; in training also what the losses need (`shaded`, `intervals`, `rays`)."""
         rays = self.rays_of(ray_bundle)
-        guided = bool(self.frozen)
+        guided = bool(self.frozen) and float(self.threshold) > 0.0  # at 0 nothing is skipped
         intervals = self.intervals_of(rays, guided, learning=self.training and self.is_learning())
+        if self.training and guided:
+            self.guided_kept = len(intervals.t_starts) / max(len(rays.origins), 1) - 1.0
         shaded = self.shade(rays, intervals)
         outputs: dict[str, Any] = {
             "rgb": shaded.rgb,
@@ -308,7 +326,7 @@ class LecoModel(Model):
             losses["nearness_loss"] = self.config.nearness * self.ramped * nearness
         if not bool(self.frozen):
             losses |= gate_losses(
-                self.config.gate_loss,
+                annealed(self.config.gate_loss, self.progress, self.step),
                 shaded,
                 outputs["intervals"],
                 outputs["rays"],

@@ -16,9 +16,12 @@ from nerfstudio.engine.callbacks import (
 )
 from torch import Tensor
 
+from leco_plugin.models.failures import GateCollapsed
 from leco_plugin.models.field import HMoEField
 from leco_plugin.models.freezing import freeze, write_occupancy
 from leco_plugin.models.gate import occupancy_from_logits, route
+from leco_plugin.models.guided_watch import GuidedWatch
+from leco_plugin.models.healing import MOST_RECOVERIES, STEPS_PER_LOOK, heal, is_collapsed
 from leco_plugin.models.history import GateHistory
 from leco_plugin.models.losses import expert_shares
 from leco_plugin.models.phases import (
@@ -26,12 +29,9 @@ from leco_plugin.models.phases import (
     ScheduleConfig,
     converged,
     decisions_agree,
-    find_collapse,
     ramp,
-    reset_gate_head,
-    spread_scene_experts,
 )
-from leco_plugin.models.progress import Progress
+from leco_plugin.models.progress import NO_EVIDENCE, Progress
 from leco_plugin.models.ranks import is_first, mean, say, share
 from leco_plugin.models.rendering import gate_values_and_routes
 from leco_plugin.models.statistics import KEPT_ABOVE
@@ -43,10 +43,6 @@ from leco_plugin.scenes.survey import survey
 
 if TYPE_CHECKING:
     from leco_plugin.models.leco import LecoModel
-
-MOST_RECOVERIES = 3
-FEWEST_STEPS = 100
-"""A gate is not called collapsed before it has had this many steps."""
 
 
 class Lifecycle:
@@ -70,6 +66,7 @@ class Lifecycle:
         self.rays_per_batch = int(self.pipeline.datamanager.get_train_rays_per_batch())
         self.step_started = 0.0
         self.history = GateHistory()
+        self.guided = GuidedWatch(self)
         if bool(model.frozen) and self.folder is not None:
             write_occupancy(model, self.folder)  # a resumed run may have a folder of its own
 
@@ -102,14 +99,14 @@ class Lifecycle:
     def before_step(self, step: int) -> None:
         """Sets what follows from the step alone, so that a resumed run is where it was."""
         model = self.model
+        model.step = step
         model.ramped = ramp(step, self.schedule)
         never_frozen = model.config.homogeneous or not self.schedule.freeze
         model.learned = never_frozen and step >= self.schedule.learn_steps
         past_learning = bool(model.frozen) or model.learned
         self._set_known_distances(not past_learning)
         self._set_rays(self._guided_batch() if bool(model.frozen) else self._learning_batch())
-        if not past_learning:
-            self.step_started = time.monotonic()
+        self.step_started = time.monotonic()
 
     def _learning_batch(self) -> float:
         """Rays of a batch as a multiple, while the gate being learned is followed already.
@@ -146,21 +143,31 @@ class Lifecycle:
             sampler.set_num_rays_per_batch(wanted)
 
     def after_step(self, step: int) -> None:
-        """Looks at the gate now and then, and freezes it when its decisions have settled."""
+        """Looks at the gate now and then, and freezes it when its decisions have settled; then at
+        what skipping costs."""
         model, schedule, progress = self.model, self.schedule, self.progress
-        if bool(model.frozen) or model.learned or model.config.homogeneous:
+        if model.learned or model.config.homogeneous:
             return
-        progress.learn_seconds += time.monotonic() - self.step_started
-        if schedule.steps_per_look > 0 and step % schedule.steps_per_look == 0:
-            self._look(step)
+        seconds = time.monotonic() - self.step_started
+        if bool(model.frozen):
+            self.guided.after_step(step, seconds)
+            return
+        progress.learn_seconds += seconds
+        if schedule.steps_per_record > 0 and step % schedule.steps_per_record == 0:
+            self._record(step)
         last = step + 1 >= schedule.learn_steps
-        if (step + 1) % schedule.steps_per_check and not last:
+        checks = (step + 1) % schedule.steps_per_check == 0 or last
+        if not checks and (step + 1) % STEPS_PER_LOOK:
             return
         logits = self._probe()
         kept = occupancy_from_logits(logits) >= KEPT_ABOVE
+        if schedule.freeze and self._healed(step, logits, kept, last):
+            return
+        if not checks:
+            return
         agreement = decisions_agree(progress.decisions.to(kept.device), kept)
         progress.decisions = kept
-        if not schedule.freeze or self._heal(step, logits, kept, last):
+        if not schedule.freeze or (progress.suspected_since >= 0 and not last):
             return
         if not last and float(kept.float().mean()) > 0.95:
             return  # it agrees with itself only because it has not yet found anything empty
@@ -171,15 +178,20 @@ class Lifecycle:
             )
             data, seconds = self.pipeline.datamanager, progress.learn_seconds
             freeze(model, data, self.survey, self.folder, step, seconds)
-            if schedule.steps_per_look > 0:
-                self._look(step)
+            progress.recheck_due, progress.surface, progress.image = 0, NO_EVIDENCE, NO_EVIDENCE
+            if schedule.steps_per_record > 0:
+                self._record(step)
             if schedule.restart:
                 self._restart_field()
-            if self.trainer is not None and self.trainer.config.steps_per_save > 0:
-                self.trainer.save_checkpoint(step)  # a run killed from now on stays frozen
+            self.save(step)  # a run killed from now on stays frozen
+
+    def save(self, step: int) -> None:
+        """A checkpoint, where the run saves any."""
+        if self.trainer is not None and self.trainer.config.steps_per_save > 0:
+            self.trainer.save_checkpoint(step)
 
     @torch.no_grad()
-    def _look(self, step: int) -> None:
+    def _record(self, step: int) -> None:
         """One more entry in the history of the gate, which is written each time."""
         if self.folder is None:
             return
@@ -222,40 +234,33 @@ class Lifecycle:
         share([logits])
         return logits
 
-    def _heal(self, step: int, logits: Tensor, kept: Tensor, last: bool) -> bool:
-        """Heals a gate found collapsed in two looks running; returns whether it starts anew.
+    def _healed(self, step: int, logits: Tensor, kept: Tensor, last: bool) -> bool:
+        """Heals a gate that has collapsed for a while; returns whether it starts anew.
 
         Raises:
-            RuntimeError: the gate has collapsed more often than it may.
+            GateCollapsed: more often than it may.
         """
-        if self.model.ramped < 1.0 or step + 1 < FEWEST_STEPS:
-            return False
-        routes = route(logits, self.model.routing.empty_below)
-        shares = expert_shares(routes, logits.shape[-1])
-        collapse = find_collapse(float(kept.float().mean()), shares, last)
-        progress = self.progress
-        if collapse is None or not (last or progress.suspected):
-            progress.suspected = collapse is not None
+        model, progress = self.model, self.progress
+        shares = expert_shares(route(logits, model.routing.empty_below), logits.shape[-1])
+        share_kept = float(kept.float().mean())
+        collapse = is_collapsed(progress, step, share_kept, shares, last)
+        if collapse is None:
             return False
         if progress.recoveries == MOST_RECOVERIES:
-            raise RuntimeError(
+            if (
+                collapse.kind == "occupied"
+            ):  # slow, and never wrong: what can be skipped is measured
+                say(f"step {step}: {collapse.cause}, after {MOST_RECOVERIES} recoveries; so be it")
+                return False
+            raise GateCollapsed(
                 f"step {step}: {collapse.cause}, after {MOST_RECOVERIES} recoveries. Check the "
-                "scene's bounds in the log above, and the weights under --pipeline.model.gate-loss"
+                "scene's bounds in the log above, and the weights under --pipeline.model.gate-loss;"
+                " --pipeline.model.schedule.freeze False trains without skipping."
             )
-        progress.recoveries += 1
-        progress.suspected = False
-        head = self.model.gate.head
-        if collapse.one_expert:
-            spread_scene_experts(head, int(shares[1:].argmax()) + 1)
-            remedy = "its points are shared out anew"
-        else:
-            reset_gate_head(head)
-            remedy = "its last layer starts anew, on dense samples"
-            progress.learn_steps = step + 1 + progress.learn_steps // 2
-            progress.decisions = torch.zeros(0, dtype=torch.bool)
-        share(head.parameters())  # the remedy is drawn at random
+        done = heal(model.gate.head, progress, collapse, shares, step)
+        share(model.gate.head.parameters())  # the remedy is drawn at random
         say(
-            f"step {step}: {collapse.cause}; {remedy} "
+            f"step {step}: {collapse.cause}; {done} "
             f"(recovery {progress.recoveries} of {MOST_RECOVERIES})"
         )
-        return not collapse.one_expert
+        return collapse.kind != "one expert"

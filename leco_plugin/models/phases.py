@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import Literal
 
 import torch
 from torch import Tensor
@@ -29,7 +30,7 @@ class ScheduleConfig:
     """Share of `learn_steps` at which the distortion loss begins to come in."""
     ramp_to: float = 0.7
     """Share of `learn_steps` from which it has its full weight."""
-    steps_per_look: int = 0
+    steps_per_record: int = 0
     """Steps between two entries of `occupancy_history.safetensors` in the run's folder, from which
     `leco inspect` draws how the occupancy was learned; 0 writes none."""
     steps_per_check: int = 25
@@ -72,8 +73,9 @@ class Collapse:
     """A gate that has stopped deciding, and why it is thought so."""
 
     cause: str
-    one_expert: bool = False
-    """Whether it still knows what is empty, and only sends everything else to one expert."""
+    kind: Literal["empty", "occupied", "one expert"] = "empty"
+    """What it calls everything; `one expert`: it still knows what is empty, and only sends
+    everything else to one expert."""
 
 
 def find_collapse(kept_fraction: float, shares: Tensor, at_the_end: bool) -> Collapse | None:
@@ -88,10 +90,10 @@ def find_collapse(kept_fraction: float, shares: Tensor, at_the_end: bool) -> Col
     if kept_fraction < 2e-4:
         return Collapse("the gate calls all space empty")
     if kept_fraction > 0.9995 and at_the_end:
-        return Collapse("the gate calls all space occupied")
+        return Collapse("the gate calls all space occupied", "occupied")
     scene = shares[1:]
     if len(scene) > 1 and float(scene.sum()) > 0.01 and float(scene.max() / scene.sum()) > 0.999:
-        return Collapse(f"scene expert {int(scene.argmax()) + 1} takes all points", True)
+        return Collapse(f"scene expert {int(scene.argmax()) + 1} takes all points", "one expert")
     return None
 
 

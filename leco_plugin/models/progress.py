@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from typing import Any
 
 import torch
 from torch import Tensor
+
+NO_EVIDENCE = (0.0, 0.0, 0.0)
 
 
 @dataclass
@@ -22,10 +24,27 @@ class Progress:
     """Time spent in the first phase."""
     recoveries: int = 0
     """How often a collapsed gate has been healed."""
-    suspected: bool = False
-    """Whether the gate looked collapsed at the last check."""
+    suspected_since: int = -1
+    """Step since which the gate looks collapsed; -1 where it does not."""
+    healed_at: int = -1
+    """Step of the last recovery that began on dense samples; -1 is none."""
+    dense_until: int = 0
+    """Step before which a healed gate is not followed."""
+    pull: float = 1.0
+    """Factor, after recoveries, of what pulls the gate towards empty space."""
+    balance: float = 1.0
+    """Factor, after recoveries, of the balance among scene experts."""
     decisions: Tensor = field(default_factory=lambda: torch.zeros(0, dtype=torch.bool))
     """[P] bool, what the gate decided of the probe positions at the last check."""
+
+    rechecks: int = 0
+    """How often the price of skipping was measured again since the gate was frozen."""
+    recheck_due: int = 0
+    """Step after which that is done next; 0 is not known yet."""
+    surface: tuple[float, ...] = NO_EVIDENCE
+    """What was found of lost surface mass since the threshold was last changed: `Evidence`."""
+    image: tuple[float, ...] = NO_EVIDENCE
+    """The same of the image price."""
 
     def begin(self, configured: int, most: int) -> None:
         """Sets `learn_steps`, unless a checkpoint did so under the same config.
@@ -36,6 +55,12 @@ class Progress:
         """
         if configured != self.configured:
             self.learn_steps, self.configured = min(configured, most), configured
+
+    @classmethod
+    def from_dict(cls, state: dict[str, Any]) -> Progress:
+        """What `to_dict` gave, also of an older release, whose other values are left out."""
+        known = {field.name for field in fields(cls)}
+        return cls(**{name: value for name, value in state.items() if name in known})
 
     def to_dict(self) -> dict[str, Any]:
         """What a checkpoint holds."""

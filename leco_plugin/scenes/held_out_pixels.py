@@ -15,6 +15,8 @@ import torch
 from nerfstudio.data.pixel_samplers import PixelSampler, PixelSamplerConfig
 from torch import Tensor
 
+from leco_plugin.scenes.input_error import InputError
+
 PERIOD = 11
 """Of 121 pixels one is held out."""
 _OFFSET = 5
@@ -73,6 +75,32 @@ class HeldOutPixelSampler(PixelSampler):
     sample_method = _stepping_aside(PixelSampler.sample_method)
     sample_method_equirectangular = _stepping_aside(PixelSampler.sample_method_equirectangular)
     sample_method_fisheye = _stepping_aside(PixelSampler.sample_method_fisheye)
+
+    def rejection_sample_mask(
+        self,
+        mask: Tensor,
+        num_samples: int,
+        num_images: int,
+        image_height: int,
+        image_width: int,
+        device: torch.device | str,
+    ) -> Tensor:
+        """Pixels [N, 3] int64 of a mask [P, H, W, 1]; nerfstudio's own cannot sample one image.
+
+        Raises:
+            InputError: the mask leaves no pixel.
+        """
+        seen = mask.reshape(num_images, image_height, image_width).bool()
+        sizes = torch.tensor([num_images, image_height, image_width], device=device)
+        indices = (torch.rand((num_samples, 3), device=device) * sizes).long()
+        image, row, column = indices.to(seen.device).unbind(dim=-1)
+        hidden = ~seen[image, row, column].to(device)
+        if bool(hidden.any()):
+            others = seen.nonzero().to(device)
+            if len(others) == 0:
+                raise InputError("the masks leave no pixel of the training images")
+            indices[hidden] = others[torch.randint(len(others), (int(hidden.sum()),))]
+        return indices
 
     def _step_aside(self, indices: Tensor, image_width: int, mask: Tensor | None) -> Tensor:
         """Moves held-out pixels [N, 3] to their neighbours, or to others where those are masked."""

@@ -19,6 +19,7 @@ from nerfstudio.plugins.registry_dataparser import DataParserSpecification
 from torch import Tensor
 
 from leco_plugin.scenes.input_error import InputError
+from leco_plugin.scenes.photograph_masks import check_masks
 from leco_plugin.scenes.rotations import distance_from_rotations
 
 POINTS = "leco_sparse_points"
@@ -71,8 +72,8 @@ def check_scene(data: Path) -> dict[str, Any]:
     """Reads the description of a scene and says what is wrong with it, if anything is.
 
     Raises:
-        InputError: one line: no such folder, no cameras, missing images, images that disagree with
-            the intrinsics, poses that are not poses.
+        InputError: one line: no such folder, no cameras or a single place, missing images, images
+            that disagree with the intrinsics, masks that hide everything, poses that are not poses.
     """
     if not data.exists():
         raise InputError(f"there is no folder {data}; give one with --data")
@@ -99,7 +100,12 @@ def check_scene(data: Path) -> dict[str, Any]:
     if distortions.max() > 0.05:
         worst = paths[int(distortions.argmax())]
         raise InputError(f"{description}: the transform_matrix of {worst} is no rotation")
-    _check_images(meta, frames, folder_of(data))
+    if np.ptp(poses[:, :3, 3], axis=0).max() == 0.0:
+        number = "one image" if len(frames) == 1 else f"{len(frames)} images from one place"
+        raise InputError(f"{description} has {number}; a scene is seen from two places at least")
+    folder = folder_of(data)
+    _check_images(meta, frames, folder)
+    check_masks(frames, folder)
     return dict(meta)
 
 
@@ -114,7 +120,8 @@ def _check_images(meta: dict[str, Any], frames: list[dict[str, Any]], folder: Pa
             f"the first is {folder / missing[0]}"
         )
     for frame in frames:
-        width, height = frame.get("w", meta.get("w")), frame.get("h", meta.get("h"))
+        # the scene's own size goes before that of a frame, as in nerfstudio
+        width, height = meta.get("w", frame.get("w")), meta.get("h", frame.get("h"))
         path = folder / frame["file_path"]
         try:
             with Image.open(path) as image:

@@ -55,4 +55,4 @@ def test_a_run_without_a_history_is_told_how_to_get_one(
     file = tmp_path / "occupancy.safetensors"
     ball().save(file)
     assert main(["inspect", str(file), "--history", str(tmp_path / "a.gif")]) == 2
-    assert "steps-per-look" in capsys.readouterr().err.splitlines()[-1]
+    assert "steps-per-record" in capsys.readouterr().err.splitlines()[-1]

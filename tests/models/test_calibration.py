@@ -16,6 +16,7 @@ from leco_plugin.models.calibration import (
     CalibrationConfig,
     Reference,
     calibrate,
+    excesses,
     measure,
     near_median_depth,
 )
@@ -23,6 +24,7 @@ from leco_plugin.models.rendering import Intervals, Shaded
 from leco_plugin.samplers.packed import accumulate_along_rays, pack_info
 
 RAYS, SAMPLES = 20, 30
+CONFIG = CalibrationConfig()
 
 
 class Chunk:
@@ -163,3 +165,28 @@ def test_no_samples_have_no_median() -> None:
     none, no_rays = torch.zeros(0), torch.zeros(0, dtype=torch.int64)
     shaded = Shaded(none, torch.zeros(3), none, none, none, none, none, pack_info(no_rays, 3))
     assert near_median_depth(shaded, Intervals(no_rays, none, none)).shape == (0,)
+
+
+@settings(deadline=None, max_examples=30)
+@given(seed=st.integers(0, 1000), which=st.integers(0, len(THRESHOLDS) - 1))
+def test_rays_exceed_the_bounds_on_average_where_the_price_does(seed: int, which: int) -> None:
+    problem, threshold = Problem(seed), THRESHOLDS[which]
+    parts = problem.references, problem.truths, problem.render_kept
+    measured = measure(*parts, threshold)
+    surface, image = excesses(*parts, threshold, CONFIG)
+    assert surface.shape == image.shape == (2 * RAYS,)
+    for excess, price, bound in (
+        (surface, measured.lost_surface_mass, CONFIG.lost_surface_mass),
+        (image, measured.image_price_db, CONFIG.image_price_db),
+    ):
+        if abs(price - bound) > 1e-4:
+            assert (float(excess.mean()) > 0.0) == (price > bound)
+
+
+def test_only_lower_thresholds_are_tried_where_that_is_asked() -> None:
+    problem = Problem(0)
+    parts = problem.references, problem.truths, problem.render_kept
+    free = CalibrationConfig(lost_surface_mass=1.0, image_price_db=99.0)
+    assert calibrate(*parts, free).threshold == THRESHOLDS[0]
+    assert calibrate(*parts, free, below=THRESHOLDS[3]).threshold == THRESHOLDS[4]
+    assert calibrate(*parts, free, below=THRESHOLDS[-1]).threshold == 0.0

@@ -32,10 +32,20 @@ def test_a_run_resumed_with_another_schedule_takes_that_one() -> None:
 
 
 def test_progress_is_read_back_without_unsafe_loading() -> None:
-    progress = Progress(300, 200, 12.5, 2, True, torch.tensor([True, False]))
+    progress = Progress(
+        *(300, 200, 12.5, 2),
+        decisions=torch.tensor([True, False]),
+        suspected_since=7,
+        surface=(1.0, 2.0, 3.0),
+    )
     buffer = io.BytesIO()
     torch.save(progress.to_dict(), buffer)
     buffer.seek(0)
     found = Progress(**torch.load(buffer, weights_only=True))
     assert torch.equal(found.decisions, progress.decisions)
     assert {**found.to_dict(), "decisions": None} == {**progress.to_dict(), "decisions": None}
+
+
+def test_progress_of_an_older_release_is_read() -> None:
+    state = Progress(learn_steps=300).to_dict() | {"suspected": True}
+    assert Progress.from_dict(state).learn_steps == 300

@@ -12,6 +12,7 @@ from leco_plugin.scenes.held_out_pixels import (
     is_held_out,
     look_up,
 )
+from leco_plugin.scenes.input_error import InputError
 
 
 def images(masked: bool = False) -> dict[str, torch.Tensor]:
@@ -103,3 +104,29 @@ def test_images_of_many_sizes_that_are_masked_throughout_hold_no_held_out_pixel(
 def test_one_pixel_in_a_period_squared_is_held_out() -> None:
     places = torch.cartesian_prod(torch.zeros(1).long(), *[torch.arange(5 * PERIOD)] * 2)
     assert int(is_held_out(places).sum()) == 25
+
+
+def test_masked_images_of_many_sizes_are_sampled_where_they_are_seen() -> None:
+    pictures = [torch.rand(20, 30, 3), torch.rand(50, 12, 3)]
+    masks = [torch.zeros(*picture.shape[:2], 1, dtype=torch.bool) for picture in pictures]
+    masks[0][3:9, 5:20], masks[1][40:, :4] = True, True
+    batch = {"image": pictures, "mask": masks, "image_idx": torch.tensor([0, 1])}
+    samples = sampler().sample(batch)
+    assert len(samples["indices"]) == 5000
+    assert not bool(is_held_out(samples["indices"]).any())
+    for image, row, column in samples["indices"].tolist():
+        assert bool(masks[image][row, column])
+
+
+def test_a_mask_is_sampled_evenly() -> None:
+    torch.manual_seed(0)
+    mask = torch.zeros(1, 10, 20, 1, dtype=torch.bool)
+    mask[0, 2, :4] = True
+    found = sampler().rejection_sample_mask(mask, 4000, 1, 10, 20, "cpu")
+    assert bool(mask[tuple(found.unbind(dim=-1))].all())
+    assert (found[:, 2].bincount() - 1000).abs().max() < 150
+
+
+def test_a_mask_without_a_pixel_is_an_input_error() -> None:
+    with pytest.raises(InputError, match="leave no pixel"):
+        sampler().rejection_sample_mask(torch.zeros(1, 4, 4, 1), 3, 1, 4, 4, "cpu")

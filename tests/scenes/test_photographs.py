@@ -54,6 +54,34 @@ def set_pose(value: Any) -> Callable[[dict[str, Any]], None]:
     return lambda meta: meta["frames"][1].update(transform_matrix=value)
 
 
+def stand_still(meta: dict[str, Any]) -> None:
+    for frame in meta["frames"]:
+        for row in frame["transform_matrix"][:3]:
+            row[3] = 0.5
+
+
+def add_masks(scene: Path, values: list[int]) -> None:
+    """Gives each image a mask of one value, of its size."""
+    (scene / "masks").mkdir()
+    meta = json.loads((scene / "transforms.json").read_text())
+    for number, (frame, value) in enumerate(zip(meta["frames"], values)):
+        with Image.open(scene / frame["file_path"]) as image:
+            Image.new("L", image.size, value).save(scene / "masks" / f"{number}.png")
+        frame["mask_path"] = f"masks/{number}.png"
+    (scene / "transforms.json").write_text(json.dumps(meta))
+
+
+def shrink(scene: Path, name: str) -> None:
+    """Halves an image, and gives each frame intrinsics of its own."""
+    Image.new("RGB", (16, 16)).save(scene / "images" / name)
+    meta = json.loads((scene / "transforms.json").read_text())
+    own = {key: meta.pop(key) for key in ("w", "h", "fl_x", "fl_y", "cx", "cy")}
+    for frame in meta["frames"]:
+        half = 2 if frame["file_path"].endswith(name) else 1
+        frame |= {key: value // half for key, value in own.items()}
+    (scene / "transforms.json").write_text(json.dumps(meta))
+
+
 BAD_MEASURES: dict[str, tuple[Callable[[Path], object], str]] = {
     "no such folder": (shutil.rmtree, "there is no folder"),
     "no transforms.json": (lambda s: (s / "transforms.json").unlink(), "holds no transforms.json"),
@@ -99,6 +127,35 @@ BAD_MEASURES: dict[str, tuple[Callable[[Path], object], str]] = {
         "no finite 4 x 4 matrix",
     ),
     "a pose of another shape": (lambda s: change(s, set_pose([[1.0]])), "transforms.json"),
+    "one image": (
+        lambda s: change(s, lambda m: m.update(frames=m["frames"][:1])),
+        "has one image; a scene is seen from two places",
+    ),
+    "a panorama": (lambda s: change(s, stand_still), "has 9 images from one place"),
+    "masks that hide everything": (
+        lambda s: add_masks(s, [0] * 9),
+        "the masks leave no pixel of 9 images",
+    ),
+    "masks for some images": (
+        lambda s: (add_masks(s, [255] * 9), change(s, lambda m: m["frames"][0].pop("mask_path"))),
+        "8 of 9 images have a mask_path",
+    ),
+    "a mask of another size": (
+        lambda s: (add_masks(s, [255] * 9), Image.new("L", (8, 8)).save(s / "masks" / "3.png")),
+        "3.png has 8 x 8 pixels, its image 32 x 32",
+    ),
+    "a missing mask": (
+        lambda s: (add_masks(s, [255] * 9), (s / "masks" / "3.png").unlink()),
+        "3.png is not there",
+    ),
+    "a mask that is none": (
+        lambda s: (add_masks(s, [255] * 9), (s / "masks" / "3.png").write_bytes(b"nothing")),
+        "3.png cannot be read as an image",
+    ),
+    "an empty mask among images of many sizes": (
+        lambda s: (shrink(s, "000.png"), add_masks(s, [255] * 8 + [0])),
+        "the mask of images/008.png leaves no pixel",
+    ),
     "poses of words": (lambda s: change(s, set_pose("north")), "not a scene in nerfstudio"),
 }
 
@@ -110,6 +167,11 @@ def test_bad_input_gets_one_line(name: str, scene: Path) -> None:
     with pytest.raises(InputError, match=message) as caught:
         check_scene(scene)
     assert "\n" not in str(caught.value)
+
+
+def test_one_empty_mask_among_images_of_one_size_is_no_error(scene: Path) -> None:
+    add_masks(scene, [255] * 8 + [0])
+    check_scene(scene)
 
 
 def test_an_input_error_ends_a_command_and_is_a_value_error() -> None:

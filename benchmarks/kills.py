@@ -1,0 +1,201 @@
+"""Runs of `leco-occupancy` that are killed with SIGKILL at random moments and resumed.
+
+    python benchmarks/kills.py --kills 100
+
+Each kill must lose nothing that had been saved, and each run must end as runs that nobody kills.
+The result is written after every run, and a later call goes on with it.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import multiprocessing
+import os
+import random
+import shutil
+import signal
+import statistics
+import sys
+import tempfile
+import time
+from pathlib import Path
+from typing import Any
+
+from leco_plugin.compat.checkpoints import allow_checkpoint_globals
+from leco_plugin.compat.whole_checkpoints import newest_whole, previous_of, step_of
+from leco_plugin.evaluation.json_file import write_json
+from leco_plugin.evaluation.machine import describe_machine
+from leco_plugin.occupancy import Occupancy
+from leco_plugin.scenes.input_error import InputError
+
+ROOT = Path(__file__).resolve().parents[1]
+STEPS, LEARN_STEPS = 60, 24
+UNDISTURBED = 4
+"""Runs with other seeds that nobody kills, which say how much the end of a run varies."""
+ARGUMENTS = [
+    "--steps-per-save=4",
+    "--steps-per-eval-image=0",
+    "--vis=tensorboard",
+    "--logging.local-writer.enable=False",
+    "--pipeline.datamanager.train-num-rays-per-batch=256",
+    f"--pipeline.model.schedule.learn-steps={LEARN_STEPS}",
+    "--pipeline.model.calibration.rays=256",
+    "--pipeline.model.calibration.recheck-rays=64",
+    "--pipeline.model.calibration.steps-per-recheck=10",
+    "--pipeline.model.sizes.candidates=32",
+    "--pipeline.model.sizes.learn-candidates=16",
+    "--pipeline.model.sizes.field.encoding.log2-table=12",
+    "--pipeline.model.sizes.gate.encoding.octaves=1",
+    "--pipeline.model.sizes.gate.layers=1",
+    "--pipeline.model.sizes.gate.width=8",
+]
+
+
+def train(arguments: list[str], log: Path, end: Path) -> None:
+    """`ns-train` as the target of a process; leaves what its end is like as a JSON file."""
+    with log.open("ab") as printed:
+        os.dup2(printed.fileno(), sys.stdout.fileno())
+        os.dup2(printed.fileno(), sys.stderr.fileno())
+    from nerfstudio.engine.trainer import Trainer
+    from nerfstudio.scripts import train as ns_train
+
+    from leco_plugin.evaluation.held_out_images import psnr_on_rays
+
+    after = Trainer._after_train
+
+    def after_train(trainer: Trainer) -> None:
+        after(trainer)
+        model: Any = trainer.pipeline.model
+        figures = {
+            "step": trainer.step,
+            "psnr": round(psnr_on_rays(trainer, 2048), 3),
+            "frozen": bool(model.frozen),
+        }
+        write_json(end, figures)
+
+    Trainer._after_train = after_train  # type: ignore[method-assign]
+    sys.argv = ["ns-train", *arguments]
+    ns_train.entrypoint()
+
+
+class Runs:
+    """Runs of one scene, each in a folder of its own."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder, self.scene = folder, folder / "scene"
+        shutil.rmtree(folder, ignore_errors=True)
+        sys.path.insert(0, str(ROOT / "tests"))
+        import tiny_scene
+
+        tiny_scene.write(self.scene)
+        self.forks = multiprocessing.get_context("forkserver")
+        self.forks.set_forkserver_preload(["nerfstudio.scripts.train"])
+
+    def base(self, name: str) -> Path:
+        return self.folder / "tiny" / "leco-occupancy" / name
+
+    def start(self, name: str, seed: int, done: int) -> Any:
+        """A process that trains a run from its newest checkpoint on, after so many steps."""
+        checkpoints = self.base(name) / "nerfstudio_models"
+        arguments = [
+            *("leco-occupancy", "--data", str(self.scene), *ARGUMENTS),
+            *("--output-dir", str(self.folder), "--experiment-name", "tiny", "--timestamp", name),
+            f"--max-num-iterations={STEPS - done}",
+            f"--machine.seed={seed}",
+            *([f"--load-dir={checkpoints}"] if done else []),
+        ]
+        log, end = self.folder / f"{name}.log", self.folder / f"{name}.json"
+        process = self.forks.Process(target=train, args=(arguments, log, end))
+        process.start()
+        return process
+
+    def newest(self, name: str) -> int:
+        """Step of the newest whole checkpoint; -1 where there is none, an error at a damaged."""
+        folder = self.base(name) / "nerfstudio_models"
+        if not any(folder.glob("*.ckpt")) and not any(previous_of(folder).glob("*.ckpt")):
+            return -1
+        path, damaged = newest_whole(folder)
+        if damaged:
+            raise InputError("; ".join(damaged))
+        return step_of(path)
+
+    def end(self, name: str) -> dict[str, Any]:
+        """How a run ended; its occupancy loads."""
+        figures: dict[str, Any] = json.loads((self.folder / f"{name}.json").read_text())
+        occupancy = Occupancy.load(self.base(name) / "occupancy.safetensors")
+        figures["threshold"] = round(occupancy.threshold, 4)
+        return figures
+
+
+def undisturbed(runs: Runs, seed: int) -> dict[str, Any]:
+    """A run that nobody kills."""
+    name, started = f"undisturbed-{seed}", time.monotonic()
+    process = runs.start(name, seed, 0)
+    process.join()
+    if process.exitcode != 0:
+        raise RuntimeError((runs.folder / f"{name}.log").read_text()[-3000:])
+    return runs.end(name) | {"seconds": round(time.monotonic() - started, 2)}
+
+
+def killed(runs: Runs, number: int, kills: int, seconds: float, dice: random.Random) -> Any:
+    """A run that is killed up to so often, until it ends by itself.
+
+    Returns:
+        Its end, with `kills`: for each, the step that was saved before, after, and in how many
+        seconds it came.
+    """
+    name, found = f"killed-{number}", []
+    while True:
+        done = runs.newest(name) + 1
+        if done == STEPS:  # killed between its last checkpoint and its end
+            return {"step": STEPS - 1, "kills": found}
+        process = runs.start(name, number, done)
+        moment = dice.uniform(0.2, 1.1) * seconds * (1.0 - 0.7 * done / STEPS)
+        process.join(moment if len(found) < kills else None)
+        if process.exitcode is None:
+            before = runs.newest(name)
+            os.kill(process.pid, signal.SIGKILL)
+            process.join()
+            after = runs.newest(name)
+            found.append({"seconds": round(moment, 2), "before": before, "after": after})
+            if after < before:
+                raise RuntimeError(f"{name}: step {before} was saved, and {after} is left")
+        elif process.exitcode == 0:
+            return runs.end(name) | {"kills": found}
+        else:
+            raise RuntimeError((runs.folder / f"{name}.log").read_text()[-3000:])
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--kills", type=int, default=100)
+    parser.add_argument("--out", type=Path, default=ROOT / "benchmarks" / "results" / "kills.json")
+    arguments = parser.parse_args()
+    allow_checkpoint_globals()
+    os.environ["OMP_NUM_THREADS"] = "1"
+    result = {"format": 1, "steps": STEPS, "undisturbed": [], "killed": []}
+    if arguments.out.exists():
+        result = json.loads(arguments.out.read_text())
+    result["machine"] = describe_machine()
+    with tempfile.TemporaryDirectory() as folder:
+        runs = Runs(Path(folder) / "runs")
+        while len(result["undisturbed"]) < UNDISTURBED:
+            result["undisturbed"].append(undisturbed(runs, len(result["undisturbed"])))
+            write_json(arguments.out, result)
+        seconds = statistics.median(run["seconds"] for run in result["undisturbed"])
+        while (left := arguments.kills - total(result)) > 0:
+            number = len(result["killed"])
+            dice = random.Random(number)
+            result["killed"].append(killed(runs, number, min(3, left), seconds, dice))
+            write_json(arguments.out, result | {"kills": total(result)})
+            print(f"{total(result)} of {arguments.kills} kills", flush=True)
+
+
+def total(result: dict[str, Any]) -> int:
+    """Kills so far."""
+    return sum(len(run["kills"]) for run in result["killed"])
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,66 @@
+"""One run in a folder at a time, and none over another's checkpoints.
+
+A new run deletes whatever checkpoints it finds in its folder as soon as it saves one of its own.
+"""
+
+from __future__ import annotations
+
+import fcntl
+import os
+from pathlib import Path
+
+from leco_plugin.compat.whole_checkpoints import step_of
+
+LOCK = ".running"
+"""File that a run holds locked; the system lets go of it however the run ends."""
+
+_held: dict[Path, int] = {}
+"""Descriptors of this process's locks, by folder."""
+
+
+def claim(folder: Path, checkpoints: Path, load_from: Path | None) -> str | None:
+    """Takes a folder for the run of this process until it ends; returns why it cannot be had.
+
+    Args:
+        folder: of the run; made where it is missing.
+        checkpoints: where the run saves.
+        load_from: folder or file that the run resumes from; None is a new run.
+    """
+    place = folder.resolve()
+    if place not in _held:
+        folder.mkdir(parents=True, exist_ok=True)
+        held = _lock(folder)
+        if held is None:
+            return f"another run is going on in {folder}"
+        _held[place] = held
+    theirs = [path for path in checkpoints.glob("*.ckpt") if step_of(path) >= 0]
+    if theirs and (load_from is None or not _goes_on(load_from, checkpoints)):
+        release(folder)
+        return f"{folder} holds an earlier run, with which this one does not go on"
+    return None
+
+
+def release(folder: Path) -> None:
+    """Lets go of a folder before the process ends."""
+    held = _held.pop(folder.resolve(), None)
+    if held is not None:
+        os.close(held)
+
+
+def _lock(folder: Path) -> int | None:
+    """An open file that is locked; None where another process has locked it."""
+    held = os.open(folder / LOCK, os.O_CREAT | os.O_RDWR, 0o644)
+    try:
+        fcntl.flock(held, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        os.close(held)
+        return None
+    except OSError:
+        return held  # a file system without locks
+    return held
+
+
+def _goes_on(load_from: Path, checkpoints: Path) -> bool:
+    """Whether what a run resumes from is the folder in which it saves, or lies there."""
+    source = load_from.resolve()
+    return checkpoints.resolve() in (source, source.parent)

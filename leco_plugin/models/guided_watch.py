@@ -1,0 +1,105 @@
+"""Stands beside guided training: skips less where skipping costs too much, and re-opens a gate that
+keeps nothing of what the cameras see."""
+
+from __future__ import annotations
+
+import time
+from typing import TYPE_CHECKING
+
+import torch
+
+from leco_plugin.models.failures import GateCollapsed
+from leco_plugin.models.freezing import write_occupancy
+from leco_plugin.models.healing import MOST_RECOVERIES, SUSPECTED_STEPS, heal
+from leco_plugin.models.phases import Collapse
+from leco_plugin.models.ranks import from_first, mean, say, share
+from leco_plugin.models.recheck import beyond_bounds, measure_again, skip_less, steps_until_next
+
+if TYPE_CHECKING:
+    from leco_plugin.models.lifecycle import Lifecycle
+
+FEWEST_KEPT = 0.5
+"""Samples a ray from which, by its calibration, an occupancy keeps something in every batch: fewer
+are right where there is nothing."""
+
+
+class GuidedWatch:
+    """The part of a `Lifecycle` that begins when the gate is frozen."""
+
+    def __init__(self, lifecycle: Lifecycle) -> None:
+        self.lifecycle = lifecycle
+        self.steps, self.seconds = 0, 0.0
+        self.recheck_seconds = 0.0
+
+    def after_step(self, step: int, seconds: float) -> None:
+        """Looks at the batch of a step, and measures again when that is due.
+
+        Args:
+            seconds: that the step took.
+        Raises:
+            GateCollapsed: the gate has been re-opened as often as it may.
+        """
+        self.steps, self.seconds = self.steps + 1, self.seconds + seconds
+        lifecycle = self.lifecycle
+        progress, config = lifecycle.progress, lifecycle.model.config.calibration
+        if self._collapsed(step):
+            self._reopen(step)
+            return
+        if config.recheck_rays == 0:
+            return
+        if progress.recheck_due == 0:
+            progress.recheck_due = step + config.steps_per_recheck
+        if step >= progress.recheck_due:
+            self._recheck(step)
+
+    def _recheck(self, step: int) -> None:
+        lifecycle = self.lifecycle
+        model, progress = lifecycle.model, lifecycle.progress
+        config, data = model.config.calibration, lifecycle.pipeline.datamanager
+        if float(model.threshold) == 0.0:  # nothing is skipped, and nothing is lost
+            progress.recheck_due = step + config.steps_per_recheck
+            return
+        started = time.monotonic()
+        measure_again(model, data)
+        seconds, a_step = time.monotonic() - started, self.seconds / self.steps
+        self.recheck_seconds += seconds
+        wait = from_first(lambda: steps_until_next(config, seconds, a_step), model.device)
+        progress.recheck_due = step + wait
+        why = beyond_bounds(progress)
+        if why is not None:
+            skip_less(model, data, step, why)
+            if lifecycle.folder is not None:
+                write_occupancy(model, lifecycle.folder)
+            lifecycle.save(step)
+
+    def _collapsed(self, step: int) -> bool:
+        """Whether batches have held no kept sample at all for `SUSPECTED_STEPS` steps."""
+        model, progress = self.lifecycle.model, self.lifecycle.progress
+        wanted = (1.0 - model.report["empty_fraction"]) * model.config.sizes.candidates
+        kept = mean(model.guided_kept, model.device)
+        if kept > 0.0 or wanted < FEWEST_KEPT:
+            progress.suspected_since = -1
+            return False
+        if progress.suspected_since < 0:
+            progress.suspected_since = step
+        return step - progress.suspected_since >= SUSPECTED_STEPS
+
+    def _reopen(self, step: int) -> None:
+        """The gate learns once more, on dense samples first.
+
+        Raises:
+            GateCollapsed: it has done so as often as it may.
+        """
+        lifecycle = self.lifecycle
+        model, progress = lifecycle.model, lifecycle.progress
+        cause = "the frozen gate keeps nothing of what the cameras see"
+        if progress.recoveries == MOST_RECOVERIES:
+            raise GateCollapsed(f"step {step}: {cause}, after {MOST_RECOVERIES} recoveries.")
+        shares = torch.zeros(model.gate.head.out_features)
+        done = heal(model.gate.head, progress, Collapse(cause), shares, step)
+        share(model.gate.head.parameters())
+        model.reopen()
+        say(
+            f"step {step}: {cause}; the gate is opened again, {done} "
+            f"(recovery {progress.recoveries} of {MOST_RECOVERIES})"
+        )

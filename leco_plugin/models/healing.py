@@ -1,0 +1,106 @@
+"""What is done about a collapsed gate, as a stated rule.
+
+A gate that is found collapsed at every look for `SUSPECTED_STEPS` steps, or at the look that ends
+the first phase, is healed, `MOST_RECOVERIES` times at most. Its last layer starts anew; learning
+goes on for half as long again: first on dense samples, while what teaches the gate comes in again
+from nothing and the field finds its surfaces without it; then as before, with the force that led to
+the collapse `EASED` times weaker. Where one scene expert took all points, they are shared out anew,
+and their balance counts `EASED` times as much.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import torch
+from torch import Tensor, nn
+
+from leco_plugin.models.objective import GateLossConfig
+from leco_plugin.models.phases import (
+    Collapse,
+    find_collapse,
+    reset_gate_head,
+    spread_scene_experts,
+)
+from leco_plugin.models.progress import Progress
+
+MOST_RECOVERIES = 3
+FEWEST_STEPS = 100
+"""A gate is not called collapsed before it has had this many steps."""
+SUSPECTED_STEPS = 100
+"""Steps for which a gate looks collapsed before it is healed."""
+STEPS_PER_LOOK = 50
+"""Most steps between two looks: with the above, a collapse is found within 150 steps."""
+EASED = 4.0
+"""How much weaker the force towards a collapse is after it."""
+
+
+def is_collapsed(
+    progress: Progress, step: int, kept: float, shares: Tensor, last: bool
+) -> Collapse | None:
+    """The collapse of a gate, if it has lasted; `progress` notes since when one is suspected.
+
+    Args:
+        kept: share of probe positions whose o(x) is at least 0.1.
+        shares: [1 + n] share of them at each expert.
+        last: whether this look ends the first phase.
+    """
+    if step + 1 < FEWEST_STEPS:
+        return None
+    collapse = find_collapse(kept, shares, last)
+    if collapse is None:
+        progress.suspected_since = -1
+        return None
+    if progress.suspected_since < 0:
+        progress.suspected_since = step
+    lasted = step - progress.suspected_since >= SUSPECTED_STEPS
+    return collapse if lasted or last else None
+
+
+def heal(head: nn.Linear, progress: Progress, collapse: Collapse, shares: Tensor, step: int) -> str:
+    """Heals the gate whose last layer this is; returns what was done, in words.
+
+    Args:
+        shares: [1 + n] share of points at each expert.
+    """
+    progress.recoveries += 1
+    progress.suspected_since = -1
+    if collapse.kind == "one expert":
+        spread_scene_experts(head, int(shares[1:].argmax()) + 1)
+        progress.balance *= EASED
+        return "its points are shared out anew"
+    reset_gate_head(head)
+    progress.pull *= 1.0 / EASED if collapse.kind == "empty" else EASED
+    progress.healed_at = step
+    progress.dense_until = step + 1 + progress.learn_steps // 4
+    progress.learn_steps = step + 1 + progress.learn_steps // 2
+    progress.decisions = torch.zeros(0, dtype=torch.bool)
+    return (
+        f"its last layer starts anew, on dense samples to step {progress.dense_until}, then with "
+        f"{EASED:.0f} times less pressure"
+    )
+
+
+def is_dense(progress: Progress, step: int) -> bool:
+    """Whether a healed gate is not followed yet."""
+    return step < progress.dense_until
+
+
+def annealed(config: GateLossConfig, progress: Progress, step: int) -> GateLossConfig:
+    """What teaches the gate at a step, after the recoveries so far.
+
+    While samples are dense all of it comes in again from nothing. The pull towards empty space is
+    lambda_g in the paper's form, and 1 / k in logit form.
+    """
+    weight = 1.0
+    if is_dense(progress, step):
+        weight = (step - progress.healed_at) / (progress.dense_until - progress.healed_at)
+    return replace(
+        config,
+        contribution=config.contribution * weight,
+        agreement=config.agreement * weight,
+        imbalance=config.imbalance * weight * progress.pull,
+        density=config.density * weight,
+        emphasis=config.emphasis / progress.pull,
+        balance=config.balance * progress.balance,
+    )

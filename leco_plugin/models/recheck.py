@@ -1,0 +1,133 @@
+"""The price of skipping, measured again in guided training: a frozen gate meets a better field.
+
+Calibration bounds the price for the field of that moment. Every so many steps it is measured anew
+on a few held-out rays that the calibration did not use. Where it is found to be beyond its bounds,
+the threshold is calibrated again among lower ones; where none of these is within them, nothing is
+skipped any more.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import torch
+from torch import Tensor
+
+from leco_plugin.models.calibration import CalibrationConfig, Measured, excesses
+from leco_plugin.models.freezing import calibrate_on, calibration_rays, dense_rendering
+from leco_plugin.models.progress import NO_EVIDENCE, Progress
+from leco_plugin.models.ranks import from_first, say
+
+if TYPE_CHECKING:
+    from leco_plugin.models.leco import LecoModel
+
+REMEMBERED = 0.8
+"""How much the rays of a measurement count beside those of the next: the field goes on learning."""
+SURE = 2.0
+"""Standard errors by which a price must be beyond its bound. Without, a long run of measurements
+would lower the threshold of a sound gate step by step to nothing."""
+SHARE_OF_TIME = 0.01
+"""Of guided training, the largest share that measuring again may take."""
+
+
+class Evidence(NamedTuple):
+    """How far rays are beyond a bound on average, from sums in which older rays count less."""
+
+    count: float
+    total: float
+    squares: float
+
+    def with_rays(self, values: Tensor) -> Evidence:
+        """With the rays of one more measurement.
+
+        Args:
+            values: [R], of `calibration.excesses`.
+        """
+        values = values.double()
+        new = (float(len(values)), float(values.sum()), float(values.square().sum()))
+        return Evidence(*(REMEMBERED * old + more for old, more in zip(self, new)))
+
+    def exceeds(self) -> bool:
+        """Whether the mean is above 0 by more than `SURE` standard errors."""
+        if self.count <= 1.0:
+            return False
+        mean = self.total / self.count
+        variance = max(0.0, self.squares / self.count - mean * mean)
+        return mean > 0.0 and mean > SURE * math.sqrt(variance / self.count)
+
+
+def steps_until_next(config: CalibrationConfig, seconds: float, a_step: float) -> int:
+    """Steps between two measurements.
+
+    Args:
+        seconds: that the last one took.
+        a_step: seconds of a training step.
+    """
+    within_share = math.ceil(seconds / (SHARE_OF_TIME * max(a_step, 1e-9)))
+    return max(config.steps_per_recheck, within_share)
+
+
+@torch.no_grad()
+def measure_again(model: LecoModel, datamanager: Any) -> None:
+    """Adds one measurement to the evidence in the model's progress; the model is left as it was."""
+    config, progress = model.config.calibration, model.progress
+    threshold = float(model.threshold)
+
+    def evidence() -> tuple[tuple[float, ...], tuple[float, ...]]:
+        seed = progress.rechecks + 1
+        rays, truth = calibration_rays(model, datamanager, config.recheck_rays, seed)
+        was_training = model.training
+        model.eval()
+        found = excesses(*dense_rendering(model, rays, truth), threshold, config)
+        model.train(was_training)
+        before = (Evidence(*progress.surface), Evidence(*progress.image))
+        surface, image = (old.with_rays(new) for old, new in zip(before, found))
+        return tuple(surface), tuple(image)
+
+    progress.surface, progress.image = from_first(evidence, model.device)
+    progress.rechecks += 1
+
+
+def beyond_bounds(progress: Progress) -> str | None:
+    """Which price is found to be beyond its bound, in words; None is neither."""
+    named = {"lost surface mass": progress.surface, "the image price": progress.image}
+    found = [name for name, evidence in named.items() if Evidence(*evidence).exceeds()]
+    return " and ".join(found) or None
+
+
+@torch.no_grad()
+def skip_less(model: LecoModel, datamanager: Any, step: int, why: str) -> Measured:
+    """Lowers the threshold until the prices are within their bounds; 0 where none is low enough.
+
+    Args:
+        why: see `beyond_bounds`.
+    """
+    progress, before = model.progress, float(model.threshold)
+
+    def again() -> Measured:
+        rays, truth = calibration_rays(model, datamanager, seed=progress.rechecks)
+        return calibrate_on(model, rays, truth, below=before)
+
+    measured = from_first(again, model.device)
+    model.threshold.fill_(measured.threshold)
+    # a new report: whoever was given the old one keeps what it said
+    model.report = model.report | {
+        "threshold": measured.threshold,
+        "lost_surface_mass": measured.lost_surface_mass,
+        "lost_mass": measured.lost_mass,
+        "image_price_db": measured.image_price_db,
+        "empty_fraction": measured.empty_fraction,
+        "lowered": [*model.report.get("lowered", []), [step, measured.threshold]],
+    }
+    model.forget_estimator()
+    progress.surface = progress.image = NO_EVIDENCE
+    now = (
+        f"threshold {before:.4f} lowered to {measured.threshold:.4f}, which skips "
+        f"{measured.empty_fraction:.1%} for {measured.image_price_db:+.3f} dB and "
+        f"{measured.lost_surface_mass:.2e} of the surface mass"
+        if measured.threshold > 0.0
+        else "no threshold is low enough: from now on nothing is skipped"
+    )
+    say(f"step {step}: {why} of skipping is beyond its bound for the field as it is now; {now}")
+    return measured

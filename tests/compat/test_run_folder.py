@@ -1,0 +1,78 @@
+"""Two runs never share a folder, and a new one never takes an old one's."""
+
+from __future__ import annotations
+
+import copy
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from leco_plugin.compat.run_folder import claim, release
+from leco_plugin.method_configs import leco_occupancy
+
+HOLD = """
+import sys
+from pathlib import Path
+from leco_plugin.compat.run_folder import claim
+folder = Path(sys.argv[1])
+print(claim(folder, folder / "checkpoints", None), flush=True)
+sys.stdin.read()
+"""
+"""Claims a folder, says what came of it, and keeps it until it dies."""
+
+
+@pytest.fixture
+def folder(tmp_path: Path):
+    yield tmp_path / "run"
+    release(tmp_path / "run")
+
+
+def test_a_folder_in_which_a_run_goes_on_is_refused_until_that_run_is_dead(folder: Path) -> None:
+    other = subprocess.Popen(
+        [sys.executable, "-c", HOLD, str(folder)],
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        text=True,
+    )
+    with other:
+        assert other.stdout is not None and other.stdout.readline() == "None\n"
+        assert "another run is going on" in (claim(folder, folder / "checkpoints", None) or "")
+        other.kill()  # SIGKILL: the system lets go of the lock
+    assert claim(folder, folder / "checkpoints", None) is None
+    assert claim(folder, folder / "checkpoints", None) is None  # this run's already
+
+
+def test_a_new_run_does_not_take_a_folder_with_checkpoints(folder: Path) -> None:
+    checkpoints = folder / "checkpoints"
+    checkpoints.mkdir(parents=True)
+    assert claim(folder, checkpoints, None) is None
+    left = checkpoints / "step-000000010.ckpt"
+    left.touch()
+    assert "holds an earlier run" in (claim(folder, checkpoints, None) or "")
+    assert "holds an earlier run" in (claim(folder, checkpoints, folder / "others") or "")
+    assert claim(folder, checkpoints, checkpoints) is None
+    assert claim(folder, checkpoints, left) is None
+
+
+def test_a_config_goes_to_a_folder_of_its_own_and_says_so(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def config():
+        made = copy.deepcopy(leco_occupancy.config)
+        made.output_dir, made.experiment_name, made.timestamp = tmp_path, "tiny", "run"
+        made.save_config()
+        return made
+
+    first = config()
+    assert first.timestamp == "run"
+    first.get_checkpoint_dir().mkdir()
+    (first.get_checkpoint_dir() / "step-000000003.ckpt").touch()
+    before = (first.get_base_dir() / "config.yml").read_text()
+    second = config()
+    assert second.timestamp == "run-2" and (second.get_base_dir() / "config.yml").exists()
+    assert (first.get_base_dir() / "config.yml").read_text() == before
+    assert "this run goes to" in " ".join(capsys.readouterr().out.split())
+    for made in (first, second):
+        release(made.get_base_dir())

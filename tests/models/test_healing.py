@@ -1,0 +1,172 @@
+"""A collapse is found within 200 steps, healed by the stated rule, three times at most."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+
+import pytest
+import torch
+
+from leco_plugin.models import lifecycle
+from leco_plugin.models.encodings import EncodingConfig
+from leco_plugin.models.failures import GateCollapsed
+from leco_plugin.models.gate import Gate, GateConfig
+from leco_plugin.models.healing import EASED, annealed, heal, is_collapsed, is_dense
+from leco_plugin.models.lifecycle import Lifecycle
+from leco_plugin.models.objective import GateLossConfig
+from leco_plugin.models.phases import Collapse, ScheduleConfig
+from leco_plugin.models.progress import Progress
+
+SPREAD = torch.tensor([0.5, 0.25, 0.25])
+ONE = torch.tensor([0.5, 0.5, 0.0])
+
+
+@pytest.mark.parametrize("per_check", [25, 500])
+@pytest.mark.parametrize("starts", [130, 149, 1000, 1399])
+@pytest.mark.parametrize(
+    ("logits", "cause"),
+    [([20.0, 0.0, 0.0], "calls all space empty"), ([0.0, 20.0, 0.0], "scene expert 1 takes all")],
+)
+def test_a_collapse_is_found_within_200_steps_of_its_start(
+    logits: list[float], cause: str, starts: int, per_check: int, healthy_run, capsys
+) -> None:
+    run = healthy_run(ScheduleConfig(learn_steps=2000, steps_per_check=per_check))
+    for step in range(2000):
+        if step == starts:
+            run.looks = torch.tensor([logits]).expand(100, 3)
+        run.lifecycle.before_step(step)
+        run.lifecycle.after_step(step)
+        if run.lifecycle.progress.recoveries:
+            break
+    assert starts + 95 <= step < starts + 200
+    said = " ".join(capsys.readouterr().out.split())
+    assert f"step {step}: " in said and cause in said and "(recovery" in said
+
+
+def test_a_gate_that_recovers_by_itself_is_left_alone(healthy_run) -> None:
+    run = healthy_run(ScheduleConfig(learn_steps=2000))
+    for step in range(1000):
+        gone = 300 <= step < 380
+        run.looks = run.empty if gone else run.sound
+        run.lifecycle.before_step(step)
+        run.lifecycle.after_step(step)
+        assert (run.lifecycle.progress.suspected_since >= 0) == (324 <= step < 399)
+    assert run.lifecycle.progress.recoveries == 0
+
+
+def test_a_gate_that_collapses_again_and_again_ends_the_run_in_one_line(healthy_run) -> None:
+    run = healthy_run(ScheduleConfig(learn_steps=400))
+    run.looks = run.empty
+    with pytest.raises(GateCollapsed, match=r"step \d+: the gate calls .* 3 recoveries") as caught:
+        for step in range(10_000):
+            run.lifecycle.before_step(step)
+            run.lifecycle.after_step(step)
+    assert "\n" not in str(caught.value)
+    assert run.lifecycle.progress.recoveries == 3
+
+
+def test_a_gate_that_keeps_everything_after_three_recoveries_is_frozen_all_the_same(
+    healthy_run, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    frozen: list[int] = []
+    monkeypatch.setattr(lifecycle, "freeze", lambda *arguments: frozen.append(arguments[4]))
+    run = healthy_run(ScheduleConfig(learn_steps=200))
+    run.looks = torch.tensor([[0.0, 20.0, 20.0 - 1e-3]]).expand(100, 3)
+    for step in range(10_000):
+        run.lifecycle.before_step(step)
+        run.lifecycle.after_step(step)
+        if frozen:
+            break
+    assert run.lifecycle.progress.recoveries == 3
+
+
+@pytest.fixture
+def healthy_run(monkeypatch: pytest.MonkeyPatch):
+    """A lifecycle that looks at given logits, and nothing else of a run."""
+
+    def make(schedule: ScheduleConfig) -> SimpleNamespace:
+        gate = Gate(GateConfig(EncodingConfig(octaves=1), width=8, layers=1, scene_experts=2))
+        sound = torch.tensor([[20.0, 0.0, 0.0], [0.0, 20.0, 0.0], [0.0, 0.0, 20.0]]).repeat(33, 1)
+        run = SimpleNamespace(
+            sound=sound, empty=torch.tensor([[20.0, 0.0, 0.0]]).expand(100, 3), looks=sound
+        )
+        run.lifecycle = object.__new__(Lifecycle)
+        run.lifecycle.trainer, run.lifecycle.survey = None, None
+        run.lifecycle.rays_per_batch = 8
+        run.lifecycle.pipeline = SimpleNamespace(datamanager=SimpleNamespace(train_dataset=None))
+        run.lifecycle.model = SimpleNamespace(
+            config=SimpleNamespace(
+                schedule=schedule,
+                homogeneous=False,
+                termination=0.0,
+                sizes=SimpleNamespace(guided_batch=1.0),
+            ),
+            device=torch.device("cpu"),
+            frozen=torch.tensor(False),
+            learning_kept=1.0,
+            gate=gate,
+            routing=SimpleNamespace(empty_below=0.2),
+            progress=Progress(learn_steps=schedule.learn_steps, configured=schedule.learn_steps),
+        )
+        return run
+
+    def look(self: Lifecycle) -> torch.Tensor:
+        return current[-1].looks
+
+    current: list[SimpleNamespace] = []
+
+    def making(schedule: ScheduleConfig) -> SimpleNamespace:
+        current.append(make(schedule))
+        return current[-1]
+
+    monkeypatch.setattr(Lifecycle, "_probe", look)
+    return making
+
+
+def head_of(bias: list[float]) -> torch.nn.Linear:
+    head = torch.nn.Linear(4, 3)
+    with torch.no_grad():
+        head.bias.copy_(torch.tensor(bias))
+    return head
+
+
+def test_a_collapse_must_last_unless_the_first_phase_is_over() -> None:
+    progress = Progress()
+    assert is_collapsed(progress, 98, 0.0, SPREAD, last=True) is None  # too early to tell
+    assert is_collapsed(progress, 199, 0.0, SPREAD, last=False) is None
+    assert is_collapsed(progress, 298, 0.0, SPREAD, last=False) is None
+    assert is_collapsed(progress, 299, 0.0, SPREAD, last=False) is not None
+    assert is_collapsed(Progress(), 299, 1.0, SPREAD, last=True) is not None
+    assert is_collapsed(progress, 324, 0.3, SPREAD, last=False) is None
+    assert progress.suspected_since == -1
+
+
+@pytest.mark.parametrize(("kind", "pull"), [("empty", 1.0 / EASED), ("occupied", EASED)])
+def test_a_healed_gate_learns_on_dense_samples_first_and_under_less_pressure(kind, pull) -> None:
+    progress = Progress(learn_steps=200, configured=200, suspected_since=90)
+    head, losses = head_of([30.0, 0.0, 0.0]), GateLossConfig()
+    said = heal(head, progress, Collapse("a cause", kind), SPREAD, step=199)
+    assert not bool(head.bias.any()) and "dense samples to step 250" in said
+    assert (progress.recoveries, progress.suspected_since) == (1, -1)
+    assert (progress.learn_steps, progress.dense_until) == (300, 250)
+    assert is_dense(progress, 249) and not is_dense(progress, 250)
+
+    begins, half, ends = (annealed(losses, progress, step) for step in (199, 224, 250))
+    assert begins.contribution == begins.imbalance == begins.density == begins.agreement == 0.0
+    assert half.contribution == pytest.approx(25 / 51 * losses.contribution)
+    assert ends.contribution == losses.contribution and ends.density == losses.density
+    assert ends.imbalance == pytest.approx(pull * losses.imbalance)
+    assert ends.emphasis == pytest.approx(losses.emphasis / pull)
+    assert ends.balance == losses.balance
+
+
+def test_points_of_one_expert_are_shared_out_and_the_balance_counts_more() -> None:
+    progress, head = Progress(learn_steps=200), head_of([0.0, 30.0, 0.0])
+    heal(head, progress, Collapse("a cause", "one expert"), ONE, step=150)
+    assert (head.bias[1] - head.bias[2]).abs() < 1e-6
+    assert progress.learn_steps == 200 and not is_dense(progress, 151)
+    assert annealed(GateLossConfig(), progress, 151).balance == EASED * GateLossConfig().balance
+
+
+def test_a_run_that_was_never_healed_is_taught_as_configured() -> None:
+    assert annealed(GateLossConfig(), Progress(), 0) == GateLossConfig()

@@ -1,0 +1,160 @@
+"""A guided host skips less where skipping has come to cost it too much."""
+
+from __future__ import annotations
+
+import copy
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+import torch
+from ball_occupancy import CENTRE, ball
+
+from leco_plugin.models import host_watch
+from leco_plugin.models.calibration import CalibrationConfig
+from leco_plugin.models.guide import Guide
+from leco_plugin.models.guided import _refuse_what_is_not_finite
+from leco_plugin.models.host_watch import HostWatch
+from leco_plugin.occupancy import Occupancy
+from leco_plugin.samplers import estimator
+
+BOX = torch.tensor([-4.0, -4.0, -4.0, 4.0, 4.0, 4.0])
+RAYS = 64
+
+
+class Host:
+    """A host whose pixels are off by `price` where something is skipped."""
+
+    device = torch.device("cpu")
+
+    def __init__(self, guide: Guide) -> None:
+        self.guide, self.price, self.training = guide, 0.0, True
+
+    def eval(self) -> None:
+        self.training = False
+
+    def train(self, mode: bool = True) -> None:
+        self.training = mode
+
+    def __call__(self, truth: torch.Tensor) -> dict[str, torch.Tensor]:
+        assert not self.training
+        self.guide.kept = 0  # as if it sampled
+        off = 0.1 + (0.0 if self.guide.dense else self.price)
+        return {"rgb": truth + off}
+
+
+class Watched(SimpleNamespace):
+    def go(self, first: int, last: int) -> None:
+        for step in range(first, last):
+            self.watch.before_step(step)
+            self.now[0] += 0.1
+            self.guide.kept = self.kept
+            self.watch.after_step(step)
+
+
+@pytest.fixture
+def watched(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Watched:
+    guide, now, asked = Guide(), [0.0], []
+    guide.set_occupancy(copy.deepcopy(ball()))
+    host = Host(guide)
+    monkeypatch.setattr(host_watch.time, "monotonic", lambda: now[0])
+
+    def held_out_bundle(_: Any, calibrated: int, count: int, seed: int) -> Any:
+        asked.append(seed)
+        truth = torch.rand(RAYS, 3)
+        return truth, truth
+
+    monkeypatch.setattr(host_watch, "held_out_bundle", held_out_bundle)
+    watch = HostWatch(
+        host,
+        guide,
+        CalibrationConfig(),
+        SimpleNamespace(datamanager=None),
+        SimpleNamespace(base_dir=tmp_path),
+    )
+    return Watched(guide=guide, host=host, watch=watch, now=now, asked=asked, kept=9, out=tmp_path)
+
+
+def test_a_price_beyond_its_bound_lowers_the_threshold_until_it_is_not(watched: Watched) -> None:
+    before, version = watched.guide.the_occupancy().threshold, watched.guide.version
+    watched.go(0, 250)
+    assert watched.asked == [1, 2] and watched.guide.the_occupancy().threshold == before
+    watched.host.price = 0.05
+    watched.go(250, 301)
+    after = watched.guide.the_occupancy()
+    assert after.threshold == pytest.approx(0.5 * before)
+    assert watched.guide.version > version and not watched.guide.dense
+    assert watched.host.training and watched.guide.kept == 9
+    left = Occupancy.load(watched.out / "occupancy.safetensors")
+    assert left.threshold == after.threshold and left.report["lowered"] == [[300, after.threshold]]
+    watched.go(301, 3000)
+    assert watched.guide.the_occupancy().threshold == 0.0
+    measured = len(watched.asked)
+    watched.go(3000, 3500)
+    assert len(watched.asked) == measured  # nothing is skipped, nothing is lost
+
+
+def test_an_occupancy_that_keeps_nothing_is_not_followed(watched: Watched, capsys: Any) -> None:
+    watched.kept = 0
+    watched.go(0, 60)
+    watched.kept = 3
+    watched.go(60, 70)
+    watched.kept = 0
+    watched.go(70, 170)
+    assert watched.guide.the_occupancy().threshold > 0.0
+    watched.go(170, 171)
+    assert watched.guide.the_occupancy().threshold == 0.0
+    said = " ".join(capsys.readouterr().out.split())
+    assert "step 170: the occupancy kept nothing for 100 steps" in said
+
+
+def test_what_was_found_travels_with_a_checkpoint(watched: Watched) -> None:
+    watched.go(0, 150)
+    fresh = Guide()
+    fresh.load_state_dict(watched.guide.state_dict())
+    assert fresh.watched == watched.guide.watched and fresh.watched["rechecks"] == 1
+
+
+@pytest.mark.parametrize("how", ["for the moment", "for good"])
+def test_a_guide_that_skips_nothing_keeps_every_candidate(
+    how: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def refuse(*_: object, **__: object) -> None:
+        raise ValueError("no cache in this test")
+
+    monkeypatch.setattr(estimator, "build_cache", refuse)
+    guide = Guide()
+    guide.set_occupancy(copy.deepcopy(ball()))
+    origins = (torch.tensor(CENTRE) + torch.tensor([0.0, 0.0, 3.0])).expand(4, 3)
+    directions = torch.tensor([[0.0, 0.0, -1.0]]).expand(4, 3)
+    march = {"render_step_size": 0.05, "near_plane": 0.0, "far_plane": 4.0}
+    stand_in = guide.estimator(BOX).train()
+    some = stand_in.sampling(origins, directions, **march)[0]
+    assert guide.kept == len(some)
+    guide.dense = how == "for the moment"
+    if how == "for good":
+        guide.the_occupancy().threshold_value.fill_(0.0)
+    every = stand_in.sampling(origins, directions, **march)[0]
+    assert 0 < len(some) < 4 * 80 - 8 and abs(len(every) - 4 * 80) <= 4
+    guide.dense = False
+
+
+@pytest.mark.parametrize("where", ["image", "loss", "weight"])
+def test_a_host_takes_no_step_with_a_loss_that_is_not_finite(where: str) -> None:
+    host: Any = torch.nn.Linear(2, 2)
+    loss = torch.ones(())
+    host.get_loss_dict = lambda outputs, batch, metrics=None: {"rgb_loss": loss}
+    _refuse_what_is_not_finite(host)
+    batch = {"image": torch.zeros(3)}
+    assert host.get_loss_dict({}, batch) == {"rgb_loss": loss}
+    loss.fill_(torch.nan)
+    if where == "image":
+        batch["image"][0] = torch.nan
+    if where == "weight":
+        host.weight.data[0] = torch.inf
+    cause = {"image": "training image", "loss": "the loss itself", "weight": "parameter weight"}
+    with pytest.raises(FloatingPointError, match=f"rgb_loss is not finite: .*{cause[where]}"):
+        host.get_loss_dict({}, batch)
+    host.eval()
+    host.get_loss_dict({}, batch)

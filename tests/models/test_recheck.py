@@ -1,0 +1,190 @@
+"""Skipping is never more than calibration allows, also for the field that the gate meets later."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+import torch
+
+from leco_plugin.models import guided_watch, recheck
+from leco_plugin.models.calibration import CalibrationConfig, Measured
+from leco_plugin.models.failures import GateCollapsed
+from leco_plugin.models.guided_watch import GuidedWatch
+from leco_plugin.models.progress import NO_EVIDENCE, Progress
+from leco_plugin.models.recheck import (
+    SHARE_OF_TIME,
+    Evidence,
+    beyond_bounds,
+    skip_less,
+    steps_until_next,
+)
+
+CONFIG = CalibrationConfig()
+
+
+def evidence_after(mean: float, measurements: int = 8, seed: int = 0) -> Evidence:
+    generator = torch.Generator().manual_seed(seed)
+    evidence = Evidence(*NO_EVIDENCE)
+    for _ in range(measurements):
+        evidence = evidence.with_rays(mean + torch.randn(512, generator=generator))
+    return evidence
+
+
+def test_the_evidence_is_a_mean_in_which_older_rays_count_less() -> None:
+    evidence = Evidence(*NO_EVIDENCE)
+    for value in (1.0, 2.0):
+        evidence = evidence.with_rays(torch.full((10,), value))
+    assert evidence.total / evidence.count == pytest.approx((0.8 * 1.0 + 2.0) / 1.8)
+
+
+def test_a_price_well_beyond_its_bound_is_found_at_once() -> None:
+    assert evidence_after(0.3, measurements=1).exceeds()
+
+
+def test_a_price_a_little_beyond_its_bound_is_found_by_more_rays() -> None:
+    found = [evidence_after(0.07, measurements=8, seed=seed).exceeds() for seed in range(20)]
+    assert sum(found) >= 18
+
+
+def test_a_price_at_its_bound_is_rarely_taken_for_more() -> None:
+    found = [evidence_after(0.0, seed=seed).exceeds() for seed in range(200)]
+    assert sum(found) <= 10
+    assert not Evidence(*NO_EVIDENCE).exceeds()
+    assert not evidence_after(-0.5).exceeds()
+
+
+def test_measuring_again_keeps_to_its_share_of_the_time() -> None:
+    for seconds, a_step in ((0.3, 0.1), (20.0, 0.1), (1e-3, 1.0), (1.0, 0.0)):
+        steps = steps_until_next(CONFIG, seconds, a_step)
+        assert steps >= CONFIG.steps_per_recheck
+        assert seconds <= SHARE_OF_TIME * steps * max(a_step, 1e-9) * 1.0001
+
+
+class Model(SimpleNamespace):
+    """Of a frozen model, what watching touches."""
+
+    def __init__(self, threshold: float = 0.4) -> None:
+        super().__init__(
+            config=SimpleNamespace(calibration=CONFIG, sizes=SimpleNamespace(candidates=64)),
+            threshold=torch.tensor(threshold),
+            device=torch.device("cpu"),
+            progress=Progress(learn_steps=200, configured=200),
+            report={"threshold": threshold, "empty_fraction": 0.7, "params": 5},
+            gate=SimpleNamespace(head=torch.nn.Linear(4, 3)),
+            guided_kept=3.0,
+            forgotten=0,
+            reopened=0,
+        )
+
+    def forget_estimator(self) -> None:
+        self.forgotten += 1
+
+    def reopen(self) -> None:
+        self.reopened += 1
+
+
+@pytest.mark.parametrize("found", [0.2, 0.0])
+def test_the_threshold_is_lowered_to_one_within_the_bounds_or_to_none(
+    found: float, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    asked: list[Any] = []
+
+    def calibrate_on(model: Any, rays: Any, truth: Any, below: float) -> Measured:
+        asked.append((rays, below))
+        return Measured(found, 1e-4, 2e-3, 0.01, 0.5 if found else 0.0)
+
+    monkeypatch.setattr(recheck, "calibration_rays", lambda *_, seed: (f"rays {seed}", None))
+    monkeypatch.setattr(recheck, "calibrate_on", calibrate_on)
+    model = Model()
+    model.progress.rechecks, model.progress.surface = 3, (9.0, 9.0, 9.0)
+    before = model.report
+    skip_less(model, None, 700, "lost surface mass")  # type: ignore[arg-type]
+    assert asked == [("rays 3", pytest.approx(0.4))]
+    assert float(model.threshold) == pytest.approx(found) and model.forgotten == 1
+    assert model.report["threshold"] == found and model.report["params"] == 5
+    assert model.report["lowered"] == [[700, found]] and "lowered" not in before
+    assert model.progress.surface == NO_EVIDENCE
+    said = " ".join(capsys.readouterr().out.split())
+    assert "step 700: lost surface mass of skipping" in said
+    assert ("from now on nothing is skipped" in said) == (found == 0.0)
+
+
+@pytest.fixture
+def watched(monkeypatch: pytest.MonkeyPatch) -> SimpleNamespace:
+    """A watch over a model whose price is `price` more than allowed."""
+    made = SimpleNamespace(price=-1.0, written=0, saved=[], measured=[], lowered=[])
+    lifecycle = SimpleNamespace(
+        model=Model(),
+        pipeline=SimpleNamespace(datamanager=None),
+        folder="folder",
+        save=made.saved.append,
+    )
+    lifecycle.progress = lifecycle.model.progress
+    made.model, made.watch = lifecycle.model, GuidedWatch(lifecycle)  # type: ignore[arg-type]
+
+    def measure_again(model: Any, _: Any) -> None:
+        made.measured.append(made.step)
+        rays = made.price + 0.1 * torch.randn(50)
+        model.progress.surface = tuple(Evidence(*model.progress.surface).with_rays(rays))
+
+    def lower(model: Any, _: Any, step: int, why: str) -> None:
+        made.lowered.append((step, why))
+        model.threshold.mul_(0.5)
+        model.progress.surface = NO_EVIDENCE
+
+    def write(*_: Any) -> None:
+        made.written += 1
+
+    monkeypatch.setattr(guided_watch, "measure_again", measure_again)
+    monkeypatch.setattr(guided_watch, "skip_less", lower)
+    monkeypatch.setattr(guided_watch, "write_occupancy", write)
+
+    def go(first: int, last: int) -> None:
+        for made.step in range(first, last):
+            made.watch.after_step(made.step, 1.0)
+
+    made.go = go
+    return made
+
+
+def test_a_gate_whose_field_gets_better_skips_less_and_leaves_a_new_file(watched: Any) -> None:
+    torch.manual_seed(0)
+    watched.go(200, 650)
+    assert watched.measured == [300, 400, 500, 600] and not watched.lowered
+    watched.price = 5.0
+    watched.go(650, 750)
+    assert watched.lowered == [(700, "lost surface mass")]
+    assert watched.saved == [700] and watched.written == 1
+    watched.price = -1.0
+    watched.go(750, 1200)
+    assert len(watched.lowered) == 1
+
+
+def test_where_nothing_is_skipped_nothing_is_measured(watched: Any) -> None:
+    watched.model.threshold.fill_(0.0)
+    watched.go(0, 500)
+    assert not watched.measured
+
+
+def test_a_frozen_gate_that_keeps_nothing_is_opened_again_and_then_given_up(watched: Any) -> None:
+    watched.model.guided_kept = 0.0
+    with pytest.raises(GateCollapsed, match=r"step \d+: the frozen gate keeps nothing"):
+        watched.go(200, 2000)
+    assert watched.model.reopened == watched.model.progress.recoveries == 3
+    assert watched.step == 200 + 4 * 101 - 1
+
+
+def test_an_occupancy_of_an_empty_scene_may_keep_nothing(watched: Any) -> None:
+    watched.model.guided_kept = 0.0
+    watched.model.report["empty_fraction"] = 1.0
+    watched.go(200, 900)
+    assert watched.model.reopened == 0
+
+
+def test_what_was_found_travels_with_a_checkpoint() -> None:
+    progress = Progress(rechecks=4, recheck_due=800, surface=tuple(evidence_after(0.3)))
+    found = Progress.from_dict(progress.to_dict())
+    assert beyond_bounds(found) == "lost surface mass"
+    assert (found.rechecks, found.recheck_due) == (4, 800)
