@@ -38,7 +38,7 @@ from leco_plugin.models.sizes import SMALL, Sizes
 from leco_plugin.occupancy import Occupancy, gate_precision
 from leco_plugin.samplers.estimator import LearnedOccupancyEstimator
 from leco_plugin.samplers.marching import march
-from leco_plugin.scenes.bounds import SceneBounds
+from leco_plugin.scenes.bounds import BoundsConfig, SceneBounds
 from leco_plugin.scenes.known_distances import DISTANCE
 from leco_plugin.space import Space
 
@@ -80,6 +80,8 @@ class LecoModelConfig(ModelConfig):
     """Where rays begin, scene units; None is found from the data."""
     far: float | None = None
     """Where rays end, scene units; None is found from the data."""
+    bounds: BoundsConfig = field(default_factory=BoundsConfig)
+    """Where the scene lies, where the data do not say it right."""
 
 
 class LecoModel(Model):

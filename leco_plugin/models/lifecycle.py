@@ -35,9 +35,8 @@ from leco_plugin.models.ranks import is_first, mean, say, share
 from leco_plugin.models.statistics import KEPT_ABOVE
 from leco_plugin.occupancy import gate_precision
 from leco_plugin.scenes.known_distances import KnownDistancePixelSampler
-from leco_plugin.scenes.photographs import POINTS
 from leco_plugin.scenes.sparse_pixels import SparsePixels, sparse_pixels
-from leco_plugin.scenes.survey import survey
+from leco_plugin.scenes.survey import announce, sparse_points, survey
 
 if TYPE_CHECKING:
     from leco_plugin.models.leco import LecoModel
@@ -61,10 +60,11 @@ class Lifecycle:
             most = max(2, int(0.5 * self.trainer.config.max_num_iterations))
         # nerfstudio makes callbacks after it has loaded a checkpoint
         self.progress.begin(configured, most)
-        self.survey = survey(self.pipeline.datamanager)
+        config = model.config
+        self.survey = survey(self.pipeline.datamanager, config.bounds, config.near, config.far)
         if not bool(model.bounds_known):
             model.set_bounds(self.survey.bounds, self.survey.median_length)
-            say(self.survey.describe())
+            announce(self.survey)
         self.rays_per_batch = int(self.pipeline.datamanager.get_train_rays_per_batch())
         self.step_started = 0.0
         if bool(model.frozen) and self.folder is not None:
@@ -128,7 +128,7 @@ class Lifecycle:
     def sparse(self) -> SparsePixels | None:
         """Where sparse points are seen; projected only once learning asks for it."""
         dataset: Any = self.pipeline.datamanager.train_dataset
-        points = dataset.metadata.get(POINTS)
+        points = sparse_points(dataset)
         return sparse_pixels(dataset.cameras, points) if points is not None else None
 
     def _set_known_distances(self, wanted: bool) -> None:
