@@ -22,6 +22,7 @@ from leco_plugin.models.losses import distortion_loss, termination_loss
 from leco_plugin.models.objective import GateLossConfig, gate_losses
 from leco_plugin.models.phases import ScheduleConfig
 from leco_plugin.models.precision import fast_precision, keep_freed_memory
+from leco_plugin.models.prior import PriorConfig
 from leco_plugin.models.progress import Progress
 from leco_plugin.models.rendering import (
     Intervals,
@@ -59,6 +60,8 @@ class LecoModelConfig(ModelConfig):
     """When the gate is frozen."""
     gate_loss: GateLossConfig = field(default_factory=GateLossConfig)
     """What teaches the gate."""
+    prior: PriorConfig = field(default_factory=PriorConfig)
+    """What sparse points teach the gate before the first step; off by default."""
     calibration: CalibrationConfig = field(default_factory=CalibrationConfig)
     """What skipping may cost."""
     distortion: float = 0.05

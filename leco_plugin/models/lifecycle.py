@@ -30,12 +30,13 @@ from leco_plugin.models.phases import (
     reset_gate_head,
     spread_scene_experts,
 )
+from leco_plugin.models.prior import warm_start
 from leco_plugin.models.progress import Progress
 from leco_plugin.models.ranks import is_first, mean, say, share
 from leco_plugin.models.statistics import KEPT_ABOVE
 from leco_plugin.occupancy import gate_precision
 from leco_plugin.scenes.known_distances import KnownDistancePixelSampler
-from leco_plugin.scenes.sparse_pixels import SparsePixels, sparse_pixels
+from leco_plugin.scenes.sparse_pixels import FEWEST_POINTS, SparsePixels, sparse_pixels
 from leco_plugin.scenes.survey import announce, sparse_points, survey
 
 if TYPE_CHECKING:
@@ -65,10 +66,30 @@ class Lifecycle:
         if not bool(model.bounds_known):
             model.set_bounds(self.survey.bounds, self.survey.median_length)
             announce(self.survey)
+            self._begin_with_points()
         self.rays_per_batch = int(self.pipeline.datamanager.get_train_rays_per_batch())
         self.step_started = 0.0
         if bool(model.frozen) and self.folder is not None:
             write_occupancy(model, self.folder)  # a resumed run may have a folder of its own
+
+    def _begin_with_points(self) -> None:
+        """Shows the gate the sparse points, where that is asked for; it counts as learning time."""
+        model, prior = self.model, self.model.config.prior
+        if prior.steps == 0 or model.config.homogeneous or bool(model.frozen):
+            return
+        dataset: Any = self.pipeline.datamanager.train_dataset
+        points, sparse = sparse_points(dataset), self.sparse
+        if points is None or sparse is None or len(points) < FEWEST_POINTS:
+            say("no prior: the scene has no sparse points")
+            return
+        started = time.monotonic()
+        loss = warm_start(model, dataset.cameras, points, sparse)
+        seconds = time.monotonic() - started
+        self.progress.learn_seconds += seconds
+        say(
+            f"{len(points)} sparse points and {len(sparse.distances)} lines of sight to them have "
+            f"taught the gate in {seconds:.1f} s (loss {loss:.3f})"
+        )
 
     @property
     def progress(self) -> Progress:
