@@ -47,9 +47,9 @@ class Options:
     """Steps between two looks at a gate."""
     prior_steps: int = 60
     """Steps of the prior."""
-    kept: float = 0.5
-    """Share of the reference's samples that each gate may keep."""
-    lost: float = 1e-2
+    kept: tuple[float, ...] = (0.5, 0.3, 0.2)
+    """Shares of the reference's samples that each gate may keep."""
+    lost: float = 1e-3
     """Lost surface mass up to which seconds are counted."""
     rays: int = 2048
     """Held-out rays of the reference."""
@@ -64,9 +64,9 @@ def lost_when_keeping(weights: torch.Tensor, scores: torch.Tensor, kept: float) 
     return float(weights[order[first_lost:]].sum() / weights.sum().clamp(min=1e-12))
 
 
-def seconds_until(curve: list[list[float]], lost: float) -> float | None:
-    """Seconds after which a curve of (seconds, lost) stays at or below `lost`; None is never."""
-    above = [i for i, (_, value) in enumerate(curve) if value > lost]
+def seconds_until(curve: list[list[float]], lost: float, column: int = 1) -> float | None:
+    """Seconds (column 0) after which a column stays at or below `lost`; None is never."""
+    above = [i for i, row in enumerate(curve) if row[column] > lost]
     first = above[-1] + 1 if above else 0
     return curve[first][0] if first < len(curve) else None
 
@@ -79,7 +79,7 @@ def run(
     Args:
         references: rays and dense renderings by another field; None for that field itself.
     Returns:
-        The model, and (seconds, lost surface mass) at each look.
+        The model, and at each look seconds, then the lost surface mass for each share kept.
     """
     torch.manual_seed(seed)
     config = copy.deepcopy(leco_occupancy.config.pipeline.model)
@@ -93,10 +93,10 @@ def run(
     model.train()
     started = time.process_time()
     lifecycle = Lifecycle(model, TrainingCallbackAttributes(None, None, pipeline, None))
-    spent = time.process_time() - started if prior else 0.0
+    spent = time.process_time() - started
     groups = model.get_param_groups()
     optimizers = [FusedAdamConfig(lr=RATES[name]).setup(group) for name, group in groups.items()]
-    curve = [[spent, look(model, references, options.kept)]] if references else []
+    curve = [[round(spent, 2), *look(model, references, options.kept)]] if references else []
     for step in range(options.steps):
         started = time.process_time()
         lifecycle.before_step(step)
@@ -109,13 +109,15 @@ def run(
             optimizer.step()
         spent += time.process_time() - started
         if references and (step + 1) % options.steps_per_look == 0:
-            curve.append([round(spent, 2), look(model, references, options.kept)])
+            curve.append([round(spent, 2), *look(model, references, options.kept)])
     return model, curve
 
 
 @torch.no_grad()
-def look(model: LecoModel, references: list[tuple[Rays, Reference]], kept: float) -> float:
-    """Lost surface mass of a model's gate on a reference."""
+def look(
+    model: LecoModel, references: list[tuple[Rays, Reference]], kept: tuple[float, ...]
+) -> list[float]:
+    """Lost surface mass of a model's gate on a reference, for each share kept."""
     weights, scores = [], []
     for rays, reference in references:
         mapped = mapped_middles(model.space, rays, reference.intervals)
@@ -124,7 +126,8 @@ def look(model: LecoModel, references: list[tuple[Rays, Reference]], kept: float
         counted = ~reference.always_kept
         weights.append((reference.weights * reference.near_surface)[counted])
         scores.append(score[counted])
-    return round(lost_when_keeping(torch.cat(weights), torch.cat(scores), kept), 6)
+    together = torch.cat(weights), torch.cat(scores)
+    return [round(lost_when_keeping(*together, share), 6) for share in kept]
 
 
 @torch.no_grad()
@@ -154,8 +157,10 @@ def compare(data: Path, options: Options) -> list[dict[str, Any]]:
                 "scene": data.name,
                 "seed": seed,
                 "prior_steps": prior,
-                "seconds": seconds_until(curve, options.lost),
-                "lost_at_end": curve[-1][1],
+                "seconds": [
+                    seconds_until(curve, options.lost, column + 1)
+                    for column in range(len(options.kept))
+                ],
                 "curve": curve,
             }
             print(json.dumps(row), flush=True)

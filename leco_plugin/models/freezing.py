@@ -18,7 +18,7 @@ from leco_plugin.models.gate import occupancy_from_logits
 from leco_plugin.models.ranks import from_first, say, share
 from leco_plugin.models.rendering import Intervals, Rays, backdrop_of
 from leco_plugin.scenes.frames import frame_of
-from leco_plugin.scenes.held_out_pixels import HeldOutPixelSampler
+from leco_plugin.scenes.held_out_pixels import HeldOutPixelSampler, some_images
 from leco_plugin.scenes.survey import Survey
 
 if TYPE_CHECKING:
@@ -113,13 +113,24 @@ def calibration_rays(model: LecoModel, datamanager: Any) -> tuple[Rays, Tensor]:
     sampler = held_out_sampler(datamanager)
     count = model.config.calibration.rays
     if sampler is not None:
-        images = next(datamanager.iter_train_image_dataloader)
-        batch = sampler.sample_held_out(images, count, seed=0)
-        bundle = datamanager.train_ray_generator(batch["indices"])
+        batch = sampler.sample_held_out(_images(datamanager), count, seed=0)
+        pixels = batch["indices"]
+        bundle = datamanager.train_dataset.cameras.to("cpu").generate_rays(
+            camera_indices=pixels[:, :1], coords=pixels[:, 1:].float() + 0.5
+        )
     else:
         bundle, batch = datamanager.next_train(0)
     rays = model.rays_of(bundle.to(model.device))
     return rays, batch["image"].to(model.device).float()
+
+
+def _images(datamanager: Any) -> dict[str, Any]:
+    """Images to take held-out pixels from: those that are loaded, or some where none are here."""
+    loader = getattr(datamanager, "iter_train_image_dataloader", None)
+    if loader is None:
+        return some_images(datamanager.train_dataset)
+    loaded: dict[str, Any] = next(loader)
+    return loaded
 
 
 @torch.no_grad()

@@ -35,7 +35,7 @@ from leco_plugin.models.progress import Progress
 from leco_plugin.models.ranks import is_first, mean, say, share
 from leco_plugin.models.statistics import KEPT_ABOVE
 from leco_plugin.occupancy import gate_precision
-from leco_plugin.scenes.known_distances import KnownDistancePixelSampler
+from leco_plugin.scenes.known_distances import KnownDistancePixelSampler, sampler_here
 from leco_plugin.scenes.sparse_pixels import FEWEST_POINTS, SparsePixels, sparse_pixels
 from leco_plugin.scenes.survey import announce, sparse_points, survey
 
@@ -66,6 +66,8 @@ class Lifecycle:
         if not bool(model.bounds_known):
             model.set_bounds(self.survey.bounds, self.survey.median_length)
             announce(self.survey)
+            if sampler_here(self.pipeline.datamanager) is None:
+                say("batches come from elsewhere: they keep their size, and no pixel's distance")
             self._begin_with_points()
         self.rays_per_batch = int(self.pipeline.datamanager.get_train_rays_per_batch())
         self.step_started = 0.0
@@ -153,12 +155,12 @@ class Lifecycle:
         return sparse_pixels(dataset.cameras, points) if points is not None else None
 
     def _set_known_distances(self, wanted: bool) -> None:
-        sampler = getattr(self.pipeline.datamanager, "train_pixel_sampler", None)
+        sampler = sampler_here(self.pipeline.datamanager)
         if isinstance(sampler, KnownDistancePixelSampler):
             sampler.sparse = self.sparse if wanted and self.model.config.termination > 0.0 else None
 
     def _set_rays(self, factor: float) -> None:
-        sampler = getattr(self.pipeline.datamanager, "train_pixel_sampler", None)
+        sampler = sampler_here(self.pipeline.datamanager)
         wanted = round(self.rays_per_batch * factor)
         if sampler is not None and sampler.num_rays_per_batch != wanted:
             sampler.set_num_rays_per_batch(wanted)

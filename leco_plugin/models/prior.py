@@ -117,6 +117,7 @@ def warm_start(model: LecoModel, cameras: Cameras, points: Tensor, sparse: Spars
     near = near_points(model.space.map(points).clamp(-1.0, 1.0))
     low, high = model.space.map(model.aabb.view(2, 3)).clamp(-1.0, 1.0)
     sight = [part.to(device) for part in lines_of_sight(cameras, sparse)]
+    near_plane = float(model.march_range[0])
     optimizer = FusedAdamConfig(lr=RATES["gate"]).setup(list(model.gate.parameters()))
     emphasis = model.config.gate_loss.emphasis
     loss = torch.zeros((), device=device)
@@ -124,9 +125,8 @@ def warm_start(model: LecoModel, cameras: Cameras, points: Tensor, sparse: Spars
         drawn = points[torch.randint(len(points), (config.positions,), device=device)]
         there = model.space.map(drawn + spread * torch.randn_like(drawn))
         lines = torch.randint(len(sight[0]), (min(config.positions, len(sight[0])),), device=device)
-        free = before_points(
-            *(part[lines] for part in sight), clear=3.0 * spread, near=float(model.march_range[0])
-        )
+        origins, directions, distances = (part[lines] for part in sight)
+        free = before_points(origins, directions, distances, 3.0 * spread, near_plane)
         parts = [
             (there, emphasis, True),
             (model.space.map(free), 1.0, False),

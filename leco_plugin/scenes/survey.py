@@ -108,6 +108,11 @@ def survey(
         InputError: no cameras, no ray meets the scene, or what is configured is no range.
     """
     config = config or BoundsConfig()
+    if hasattr(datamanager, "train_unseen_cameras"):
+        raise InputError(
+            f"{type(datamanager).__name__} hands out whole images, and this method trains on rays; "
+            "leave the method its own data manager, and see its option `images` to save memory"
+        )
     dataset = datamanager.train_dataset
     cameras: Cameras = dataset.cameras
     if len(cameras) == 0:
