@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from nerfstudio.cameras.camera_optimizers import CameraOptimizerConfig
 from nerfstudio.configs.base_config import MachineConfig, ViewerConfig
-from nerfstudio.data.datamanagers.base_datamanager import VanillaDataManagerConfig
 from nerfstudio.engine.schedulers import ExponentialDecaySchedulerConfig
 from nerfstudio.models.base_model import ModelConfig
 from nerfstudio.models.instant_ngp import InstantNGPModelConfig
@@ -20,6 +19,7 @@ from leco_plugin.models.guided_start import OccupancyConfig
 from leco_plugin.models.optimizers import FusedAdamConfig
 from leco_plugin.models.switch_nerf import SwitchNerfModelConfig
 from leco_plugin.models.switch_sizes import switch_sizes_for
+from leco_plugin.scenes.data_manager import LecoDataManagerConfig
 from leco_plugin.scenes.known_distances import KnownDistancePixelSamplerConfig
 from leco_plugin.scenes.photographs import LecoPhotographsDataParserConfig
 
@@ -32,9 +32,9 @@ def guided(host: ModelConfig) -> GuidedModelConfig:
     )
 
 
-def photographs(rays: int) -> VanillaDataManagerConfig:
+def photographs(rays: int) -> LecoDataManagerConfig:
     """The reader of `leco-occupancy`, whose coordinates the occupancy is in."""
-    return VanillaDataManagerConfig(
+    return LecoDataManagerConfig(
         dataparser=LecoPhotographsDataParserConfig(),
         train_num_rays_per_batch=rays,
         eval_num_rays_per_batch=1024,

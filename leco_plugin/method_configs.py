@@ -7,7 +7,6 @@ from typing import Literal, cast
 
 import torch
 from nerfstudio.configs.base_config import MachineConfig, ViewerConfig
-from nerfstudio.data.datamanagers.base_datamanager import VanillaDataManagerConfig
 from nerfstudio.engine.schedulers import ExponentialDecaySchedulerConfig
 from nerfstudio.pipelines.base_pipeline import VanillaPipelineConfig
 from nerfstudio.plugins.types import MethodSpecification
@@ -17,6 +16,7 @@ from leco_plugin.models.leco import LecoModelConfig
 from leco_plugin.models.optimizers import RATES, FusedAdamConfig
 from leco_plugin.models.phases import ScheduleConfig
 from leco_plugin.models.sizes import PAPER, sizes_for
+from leco_plugin.scenes.data_manager import LecoDataManagerConfig
 from leco_plugin.scenes.known_distances import KnownDistancePixelSamplerConfig
 from leco_plugin.scenes.photographs import LecoPhotographsDataParserConfig
 
@@ -57,7 +57,7 @@ _leco_occupancy = DataParallelTrainerConfig(
     steps_per_eval_all_images=0,
     mixed_precision=False,  # the model chooses its precision itself, on CPU and CUDA alike
     pipeline=VanillaPipelineConfig(
-        datamanager=VanillaDataManagerConfig(
+        datamanager=LecoDataManagerConfig(
             dataparser=LecoPhotographsDataParserConfig(),
             train_num_rays_per_batch=4096 if ON_GPU else 1024,
             eval_num_rays_per_batch=1024,
@@ -83,7 +83,7 @@ leco_occupancy_paper = MethodSpecification(
         pipeline=replace(
             _leco_occupancy.pipeline,
             datamanager=replace(
-                cast(VanillaDataManagerConfig, _leco_occupancy.pipeline.datamanager),
+                cast(LecoDataManagerConfig, _leco_occupancy.pipeline.datamanager),
                 train_num_rays_per_batch=1024,
             ),
             model=replace(

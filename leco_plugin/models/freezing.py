@@ -20,7 +20,7 @@ from leco_plugin.models.gate import occupancy_from_logits
 from leco_plugin.models.ranks import from_first, say, share
 from leco_plugin.models.rendering import Intervals, Rays, backdrop_of
 from leco_plugin.scenes.frames import frame_of
-from leco_plugin.scenes.held_out_pixels import HeldOutPixelSampler
+from leco_plugin.scenes.held_out_pixels import HeldOutPixelSampler, some_images
 from leco_plugin.scenes.survey import Survey
 
 if TYPE_CHECKING:
@@ -130,14 +130,18 @@ def held_out_bundle(
     if sampler is None:
         bundle, batch = datamanager.next_train(0)
         return bundle[:count], batch["image"][:count]
-    images = next(datamanager.iter_train_image_dataloader)
+    images = _images(datamanager)
     batch = sampler.sample_held_out(images, count, seed)
     if seed != 0:
         used = sampler.sample_held_out(images, calibrated, 0)["indices"]
         new = ~torch.isin(_numbers(batch["indices"]), _numbers(used))
         if bool(new.any()):
             batch = {name: values[new.to(values.device)] for name, values in batch.items()}
-    return datamanager.train_ray_generator(batch["indices"]), batch["image"]
+    pixels = batch["indices"]
+    bundle = datamanager.train_dataset.cameras.to("cpu").generate_rays(
+        camera_indices=pixels[:, :1], coords=pixels[:, 1:].float() + 0.5
+    )
+    return bundle, batch["image"]
 
 
 def _numbers(indices: Tensor) -> Tensor:
@@ -165,6 +169,15 @@ class DenseRendering(NamedTuple):
     references: list[Reference]
     truths: list[Tensor]
     render_kept: Callable[[int, Tensor], Tensor]
+
+
+def _images(datamanager: Any) -> dict[str, Any]:
+    """Images to take held-out pixels from: those that are loaded, or some where none are here."""
+    loader = getattr(datamanager, "iter_train_image_dataloader", None)
+    if loader is None:
+        return some_images(datamanager.train_dataset)
+    loaded: dict[str, Any] = next(loader)
+    return loaded
 
 
 @torch.no_grad()

@@ -17,7 +17,7 @@ from leco_plugin.samplers.rays import intersect_box
 from leco_plugin.samplers.registry import check_gate
 from leco_plugin.scenes.frames import between, frame_of
 from leco_plugin.scenes.input_error import InputError
-from leco_plugin.scenes.survey import covering_rays
+from leco_plugin.scenes.survey import announce, covering_rays, survey
 
 PLACES = 128
 """Positions on each ray at which a file is asked whether it fits the cameras."""
@@ -138,6 +138,8 @@ class GuidedStart:
                 "the occupancy keeps nothing on the rays of these cameras: it was learned on "
                 "another scene, or the scene has been moved since"
             )
+        learning = self.config.learning
+        announce(survey(manager, learning.bounds, learning.near, learning.far))
         say(f"guided by an occupancy that keeps {share:.1%} along these rays")
 
 

@@ -16,6 +16,7 @@ from leco_plugin.models.optimizers import RATES, FusedAdamConfig
 from leco_plugin.models.ranks import averaging, mean
 from leco_plugin.occupancy import Occupancy
 from leco_plugin.progress_bar import bar
+from leco_plugin.scenes.known_distances import sampler_here
 
 FIRST_TIMED, TIMED_STEPS = 5, 15
 """Steps between which a step is timed, to keep to a budget; the first ones are slow."""
@@ -53,7 +54,7 @@ def learn_occupancy(
     ).to(pipeline.device)
     model.train()
     trained = averaging(model, model.device)
-    sampler = getattr(manager, "train_pixel_sampler", None)
+    sampler = sampler_here(manager)
     before = sampler.num_rays_per_batch if sampler is not None else 0
     if sampler is not None:
         sampler.set_num_rays_per_batch(rays)

@@ -23,6 +23,7 @@ from leco_plugin.models.losses import distortion_loss, termination_loss
 from leco_plugin.models.objective import GateLossConfig, gate_losses
 from leco_plugin.models.phases import ScheduleConfig
 from leco_plugin.models.precision import fast_precision, keep_freed_memory
+from leco_plugin.models.prior import PriorConfig
 from leco_plugin.models.progress import Progress
 from leco_plugin.models.rendering import (
     Intervals,
@@ -39,7 +40,7 @@ from leco_plugin.models.sizes import SMALL, Sizes
 from leco_plugin.occupancy import Occupancy, gate_precision
 from leco_plugin.samplers.estimator import LearnedOccupancyEstimator
 from leco_plugin.samplers.marching import march
-from leco_plugin.scenes.bounds import SceneBounds
+from leco_plugin.scenes.bounds import BoundsConfig, SceneBounds
 from leco_plugin.scenes.known_distances import DISTANCE
 from leco_plugin.space import Space
 
@@ -60,6 +61,8 @@ class LecoModelConfig(ModelConfig):
     """When the gate is frozen."""
     gate_loss: GateLossConfig = field(default_factory=GateLossConfig)
     """What teaches the gate."""
+    prior: PriorConfig = field(default_factory=PriorConfig)
+    """What sparse points teach the gate before the first step; off by default."""
     calibration: CalibrationConfig = field(default_factory=CalibrationConfig)
     """What skipping may cost."""
     distortion: float = 0.05
@@ -81,6 +84,8 @@ class LecoModelConfig(ModelConfig):
     """Where rays begin, scene units; None is found from the data."""
     far: float | None = None
     """Where rays end, scene units; None is found from the data."""
+    bounds: BoundsConfig = field(default_factory=BoundsConfig)
+    """Where the scene lies, where the data do not say it right."""
 
 
 class LecoModel(Model):

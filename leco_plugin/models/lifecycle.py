@@ -31,15 +31,15 @@ from leco_plugin.models.phases import (
     decisions_agree,
     ramp,
 )
+from leco_plugin.models.prior import warm_start
 from leco_plugin.models.progress import NO_EVIDENCE, Progress
 from leco_plugin.models.ranks import is_first, mean, say, share
 from leco_plugin.models.rendering import gate_values_and_routes
 from leco_plugin.models.statistics import KEPT_ABOVE
 from leco_plugin.occupancy import gate_precision
-from leco_plugin.scenes.known_distances import KnownDistancePixelSampler
-from leco_plugin.scenes.photographs import POINTS
-from leco_plugin.scenes.sparse_pixels import SparsePixels, sparse_pixels
-from leco_plugin.scenes.survey import survey
+from leco_plugin.scenes.known_distances import KnownDistancePixelSampler, sampler_here
+from leco_plugin.scenes.sparse_pixels import FEWEST_POINTS, SparsePixels, sparse_pixels
+from leco_plugin.scenes.survey import announce, sparse_points, survey
 
 if TYPE_CHECKING:
     from leco_plugin.models.leco import LecoModel
@@ -59,16 +59,39 @@ class Lifecycle:
             most = max(2, int(0.5 * self.trainer.config.max_num_iterations))
         # nerfstudio makes callbacks after it has loaded a checkpoint
         self.progress.begin(configured, most)
-        self.survey = survey(self.pipeline.datamanager)
+        config = model.config
+        self.survey = survey(self.pipeline.datamanager, config.bounds, config.near, config.far)
         if not bool(model.bounds_known):
             model.set_bounds(self.survey.bounds, self.survey.median_length)
-            say(self.survey.describe())
+            announce(self.survey)
+            if sampler_here(self.pipeline.datamanager) is None:
+                say("batches come from elsewhere: they keep their size, and no pixel's distance")
+            self._begin_with_points()
         self.rays_per_batch = int(self.pipeline.datamanager.get_train_rays_per_batch())
         self.step_started = 0.0
         self.history = GateHistory()
         self.guided = GuidedWatch(self)
         if bool(model.frozen) and self.folder is not None:
             write_occupancy(model, self.folder)  # a resumed run may have a folder of its own
+
+    def _begin_with_points(self) -> None:
+        """Shows the gate the sparse points, where that is asked for; it counts as learning time."""
+        model, prior = self.model, self.model.config.prior
+        if prior.steps == 0 or model.config.homogeneous or bool(model.frozen):
+            return
+        dataset: Any = self.pipeline.datamanager.train_dataset
+        points, sparse = sparse_points(dataset), self.sparse
+        if points is None or sparse is None or len(points) < FEWEST_POINTS:
+            say("no prior: the scene has no sparse points")
+            return
+        started = time.monotonic()
+        loss = warm_start(model, dataset.cameras, points, sparse)
+        seconds = time.monotonic() - started
+        self.progress.learn_seconds += seconds
+        say(
+            f"{len(points)} sparse points and {len(sparse.distances)} lines of sight to them have "
+            f"taught the gate in {seconds:.1f} s (loss {loss:.3f})"
+        )
 
     @property
     def progress(self) -> Progress:
@@ -128,16 +151,16 @@ class Lifecycle:
     def sparse(self) -> SparsePixels | None:
         """Where sparse points are seen; projected only once learning asks for it."""
         dataset: Any = self.pipeline.datamanager.train_dataset
-        points = dataset.metadata.get(POINTS)
+        points = sparse_points(dataset)
         return sparse_pixels(dataset.cameras, points) if points is not None else None
 
     def _set_known_distances(self, wanted: bool) -> None:
-        sampler = getattr(self.pipeline.datamanager, "train_pixel_sampler", None)
+        sampler = sampler_here(self.pipeline.datamanager)
         if isinstance(sampler, KnownDistancePixelSampler):
             sampler.sparse = self.sparse if wanted and self.model.config.termination > 0.0 else None
 
     def _set_rays(self, factor: float) -> None:
-        sampler = getattr(self.pipeline.datamanager, "train_pixel_sampler", None)
+        sampler = sampler_here(self.pipeline.datamanager)
         wanted = round(self.rays_per_batch * factor)
         if sampler is not None and sampler.num_rays_per_batch != wanted:
             sampler.set_num_rays_per_batch(wanted)

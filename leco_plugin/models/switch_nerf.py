@@ -20,7 +20,6 @@ from leco_plugin.compat.checkpoints import allow_checkpoint_globals
 from leco_plugin.models.failures import require_finite
 from leco_plugin.models.image_figures import image_figures
 from leco_plugin.models.precision import fast_precision, keep_freed_memory
-from leco_plugin.models.ranks import say
 from leco_plugin.models.rendering import (
     Intervals,
     Rays,
@@ -37,9 +36,9 @@ from leco_plugin.models.switch_rendering import coarse_and_fine, kept_by, leadin
 from leco_plugin.models.switch_sizes import SMALL, SwitchSizes
 from leco_plugin.occupancy import gate_precision
 from leco_plugin.samplers.grid import OccupancyGridEstimator
-from leco_plugin.scenes.bounds import SceneBounds
+from leco_plugin.scenes.bounds import BoundsConfig, SceneBounds
 from leco_plugin.scenes.input_error import InputError
-from leco_plugin.scenes.survey import survey
+from leco_plugin.scenes.survey import announce, survey
 from leco_plugin.space import Space
 
 
@@ -75,6 +74,8 @@ class SwitchNerfModelConfig(ModelConfig):
     """Where rays begin, scene units; None is found from the data."""
     far: float | None = None
     """Where rays end, scene units; None is found from the data."""
+    bounds: BoundsConfig = field(default_factory=BoundsConfig)
+    """Where the scene lies, where the data do not say it right."""
 
 
 class SwitchNerfModel(Model):
@@ -145,9 +146,10 @@ class SwitchNerfModel(Model):
         """Finds the scene's bounds now, and returns what updates the estimator before each step."""
         assert training_callback_attributes.pipeline is not None
         if not bool(self.bounds_known):
-            seen = survey(training_callback_attributes.pipeline.datamanager)
+            manager, config = training_callback_attributes.pipeline.datamanager, self.config
+            seen = survey(manager, config.bounds, config.near, config.far)
             self.set_bounds(seen.bounds, seen.median_length)
-            say(seen.describe())
+            announce(seen)
         before = TrainingCallbackLocation.BEFORE_TRAIN_ITERATION
         return [TrainingCallback([before], self.update_estimator)]
 

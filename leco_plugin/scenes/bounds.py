@@ -2,17 +2,36 @@
 
 A scene photographed from above is bounded: its rays are cut at a plane above and one below all
 points, as Mega-NeRF cuts them by altitude, and space is not contracted. Everything else is
-contracted, with the points in the uncontracted cube.
+contracted, with the points in the uncontracted cube. Either choice can be made by hand.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import math
+from dataclasses import dataclass, replace
+from typing import Literal
 
 import torch
 from torch import Tensor
 
 from leco_plugin.space import NO_WALL, SpaceKind
+
+
+@dataclass
+class BoundsConfig:
+    """Where the scene lies, in scene units, where the data do not say it right"""
+
+    space: Literal["auto", "box", "contraction"] = "auto"
+    """box: bounded, nothing is contracted, as for a survey from the air. contraction: goes on into
+    the distance, as in the street. auto: chosen from cameras and sparse points."""
+    altitudes: tuple[float, float] | None = None
+    """z below and above everything; rays are cut there. None is found from the sparse points."""
+    metres_per_unit: float | None = None
+    """Metres in a unit of the dataset's own poses, for the log: 1 for OpenDroneMap. None takes what
+    the dataparser knows."""
+
+
+FROM_ABOVE = "photographed from above"
 
 
 @dataclass(frozen=True)
@@ -34,17 +53,25 @@ class SceneBounds:
     """One line for the log: what was seen in the data."""
 
 
-def find_bounds(camera_to_worlds: Tensor, directions: Tensor, points: Tensor | None) -> SceneBounds:
+def find_bounds(
+    camera_to_worlds: Tensor,
+    directions: Tensor,
+    points: Tensor | None,
+    config: BoundsConfig | None = None,
+) -> SceneBounds:
     """Bounds from camera poses, some of the cameras' rays, and sparse points.
 
     Args:
         camera_to_worlds: [C, 3, 4] OpenGL poses, scene units.
         directions: [C, K, 3] unit directions of rays that cover each image, its corners included.
         points: [P, 3] sparse scene points, or None; fewer than 32 count as none.
+        config: what is not to be found.
     Raises:
-        ValueError: there are no cameras, a pose is not finite, or no camera sees a point.
+        ValueError: there are no cameras, a pose is not finite, no camera sees a point, or the
+            configured altitudes are no range that rays go down to.
     """
-    poses = camera_to_worlds.detach().float().cpu()
+    config = config or BoundsConfig()
+    poses, directions = (part.detach().float().cpu() for part in (camera_to_worlds, directions))
     if len(poses) == 0:
         raise ValueError("the scene has no cameras")
     if not bool(poses.isfinite().all()):
@@ -52,26 +79,85 @@ def find_bounds(camera_to_worlds: Tensor, directions: Tensor, points: Tensor | N
     if points is not None:
         points = points.detach().float().cpu()
         points = points[points.isfinite().all(dim=-1)]
-    if points is None or len(points) < 32:
-        return _without_points(poses)
-    directions = directions.detach().float().cpu()
+        points = points if len(points) >= 32 else None
+    if config.altitudes is not None and config.space != "contraction":
+        return _between(config.altitudes, poses, directions, points)
+    if points is None:
+        if config.space == "box":
+            raise ValueError(
+                "a bounded scene without sparse points needs its altitudes: give bounds.altitudes "
+                "with the z of its ground and of its top"
+            )
+        return _without_points(poses, directions)
     low, high = _quantiles(points, 0.001), _quantiles(points, 0.999)
-    depths = _depths(poses, directions, points)
-    near, far = 0.75 * float(_quantiles(depths, 0.01)), 1.25 * float(_quantiles(depths, 0.999))
-    if _seen_from_above(poses, directions, points):
-        return _slab(poses, directions, float(low[2]), float(high[2]), near, far)
+    near, far = _range(_depths(poses, directions, points))
+    from_above, seen = _seen_from_above(poses, directions, points)
+    if from_above and config.space != "contraction":
+        relief = max(float(high[2] - low[2]), 0.02 * far)
+        # far below, so that a flat picture on the lower plane is plainly wrong from two places
+        ground = float(low[2]) - max(0.5 * relief, 0.2 * far)
+        top = float(high[2]) + 0.3 * relief
+        return _slab(poses, directions, ground, top, near, far, f"{FROM_ABOVE} ({seen}): bounded")
+    if config.space == "box":
+        return _room(poses, low, high, near, far)
     half = float((high - low).max()) / 2
-    reason = f"contracted outside {half:.3f} around {len(points)} sparse points"
+    why = "as configured" if config.space == "contraction" else f"not from above ({seen})"
+    reason = f"{why}: contracted outside {half:.3f} around {len(points)} sparse points"
     return SceneBounds("contraction", (low + high) / 2, half, near, far, _no_walls(), reason)
 
 
-def _slab(
-    poses: Tensor, directions: Tensor, low: float, high: float, near: float, far: float
+def with_range(bounds: SceneBounds, near: float | None, far: float | None) -> SceneBounds:
+    """The bounds with near and far set by hand; None leaves what was found.
+
+    Raises:
+        ValueError: the range is empty or begins at the camera.
+    """
+    near, far = bounds.near if near is None else near, bounds.far if far is None else far
+    if not 0.0 < near < far < math.inf:
+        raise ValueError(f"rays need 0 < near < far, got near {near:g} and far {far:g}")
+    return replace(bounds, near=near, far=far)
+
+
+def _range(depths: Tensor) -> tuple[float, float]:
+    """Near and far of distances [D] to what is seen, with margins."""
+    return 0.75 * float(_quantiles(depths, 0.01)), 1.25 * float(_quantiles(depths, 0.999))
+
+
+def _between(
+    altitudes: tuple[float, float], poses: Tensor, directions: Tensor, points: Tensor | None
 ) -> SceneBounds:
-    """A bounded scene between two levels; points may miss a cellar or a mast, hence the margins."""
-    relief = max(high - low, 0.02 * far)
-    # far below, so that a flat picture on the lower plane, seen from two places, is plainly wrong
-    ground, top = low - max(0.5 * relief, 0.2 * far), high + 0.3 * relief
+    """A bounded scene between two levels that somebody knows, with points or without."""
+    ground, top = altitudes
+    if not -math.inf < ground < top < math.inf:
+        raise ValueError(f"bounds.altitudes are ground < top, got {ground:g} and {top:g}")
+    heights = poses[:, None, 2, 3]
+    down = (directions[..., 2] < -0.05) & (heights > ground)
+    if not bool(down.any()):
+        raise ValueError(
+            f"no ray of any camera goes down to the ground at z = {ground:g}: bounds.altitudes are "
+            "in scene units, +z up"
+        )
+    if points is not None:
+        near, far = _range(_depths(poses, directions, points))
+    else:
+        reaches, begins = (
+            ((level - heights) / directions[..., 2])[down].clamp(min=0.0) for level in altitudes
+        )
+        far = 1.05 * float(_quantiles(reaches, 0.999))
+        near = max(0.75 * float(_quantiles(begins, 0.01)), 1e-3 * far)
+    return _slab(poses, directions, ground, top, near, far, "altitudes as configured: bounded")
+
+
+def _slab(
+    poses: Tensor,
+    directions: Tensor,
+    ground: float,
+    top: float,
+    near: float,
+    far: float,
+    why: str,
+) -> SceneBounds:
+    """A bounded scene between two levels, as wide as the rays reach in it."""
     down = directions[..., 2] < -0.05
     reach = ((ground - poses[:, None, 2, 3]) / directions[..., 2]).clamp(0.0, far)[down]
     origins = poses[:, None, :, 3].expand_as(directions)[down]
@@ -87,16 +173,29 @@ def _slab(
         near,
         far,
         torch.tensor([-wall, -wall, ground, wall, wall, top]),
-        f"photographed from above: bounded, rays cut at z = {ground:.3f} and {top:.3f}",
+        f"{why}, rays cut at z = {ground:.3f} and {top:.3f}",
     )
 
 
-def _without_points(poses: Tensor) -> SceneBounds:
+def _room(poses: Tensor, low: Tensor, high: Tensor, near: float, far: float) -> SceneBounds:
+    """A bounded scene with walls around its points and its cameras, an eighth beyond them."""
+    places = poses[:, :, 3]
+    low, high = torch.minimum(low, places.amin(dim=0)), torch.maximum(high, places.amax(dim=0))
+    margin = 0.125 * float((high - low).max())
+    low, high = low - margin, high + margin
+    half = float((high - low).max()) / 2
+    reason = "as configured: bounded, rays cut at walls around points and cameras"
+    return SceneBounds("box", (low + high) / 2, half, near, far, torch.cat([low, high]), reason)
+
+
+def _without_points(poses: Tensor, directions: Tensor) -> SceneBounds:
     """The scene is taken to be as large as the cameras' path; a contraction holds the rest."""
     positions = poses[:, :3, 3]
     low, high = positions.amin(dim=0), positions.amax(dim=0)
     half = max(float((high - low).max()) / 2, 1e-3)
     reason = f"no sparse points: contracted outside {half:.3f} around the cameras"
+    if float((directions[..., 2] < -0.05).float().mean()) >= MOSTLY_DOWN:
+        reason += "; all look down: give bounds.altitudes with the z of ground and top"
     center = (low + high) / 2
     return SceneBounds("contraction", center, half, 0.05 * half, 100 * half, _no_walls(), reason)
 
@@ -126,8 +225,15 @@ def _depths(poses: Tensor, directions: Tensor, points: Tensor) -> Tensor:
     return depths
 
 
-def _seen_from_above(poses: Tensor, directions: Tensor, points: Tensor) -> bool:
-    """Whether nearly all rays go down, from cameras of which most are above nearly all points."""
-    above = poses[:, 2, 3] > _quantiles(points[:, 2], 0.95)
-    downwards = directions[..., 2] < -0.05
-    return bool(above.float().mean() >= 0.75 and downwards.float().mean() >= 0.9)
+MOSTLY_ABOVE, MOSTLY_DOWN = 0.75, 0.9
+"""Share of cameras above nearly all points, and of rays that go down, of a survey from the air."""
+
+
+def _seen_from_above(poses: Tensor, directions: Tensor, points: Tensor) -> tuple[bool, str]:
+    """Whether nearly all rays go down, from cameras of which most are above nearly all points;
+    and the two shares in words.
+    """
+    above = float((poses[:, 2, 3] > _quantiles(points[:, 2], 0.95)).float().mean())
+    down = float((directions[..., 2] < -0.05).float().mean())
+    words = f"{down:.0%} of rays go down, {above:.0%} of cameras are above the points"
+    return above >= MOSTLY_ABOVE and down >= MOSTLY_DOWN, words

@@ -7,7 +7,9 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
+from nerfstudio.data.dataparsers.base_dataparser import DataparserOutputs
 from nerfstudio.data.dataparsers.nerfstudio_dataparser import Nerfstudio, NerfstudioDataParserConfig
 from nerfstudio.plugins.registry_dataparser import DataParserSpecification
 
@@ -47,7 +49,7 @@ class LecoCityDataParserConfig(NerfstudioDataParserConfig):
 
 
 class LecoCity(Nerfstudio):
-    """Writes the city if it is not there, then reads it as any nerfstudio scene."""
+    """Writes the city if it is not there, then reads it as any scene, with its sparse points."""
 
     config: LecoCityDataParserConfig
 
@@ -61,6 +63,20 @@ class LecoCity(Nerfstudio):
         )
         capture = CaptureConfig(config.width, config.height)
         self.config.data = write_city(city, config.folder(), capture)
+
+    def _generate_dataparser_outputs(
+        self, split: str = "train", **kwargs: Any
+    ) -> DataparserOutputs:
+        from leco_plugin.scenes.city_layouts import POINTS as FILE
+        from leco_plugin.scenes.dataset_units import METRES_PER_UNIT
+        from leco_plugin.scenes.photographs import POINTS, read_ply
+
+        outputs: DataparserOutputs = super()._generate_dataparser_outputs(split)
+        transform, scale = outputs.dataparser_transform, outputs.dataparser_scale
+        points = read_ply(self.config.data / FILE)
+        outputs.metadata[POINTS] = scale * (points @ transform[:, :3].T + transform[:, 3])
+        outputs.metadata[METRES_PER_UNIT] = 1.0
+        return outputs
 
 
 leco_city_dataparser = DataParserSpecification(

@@ -101,6 +101,7 @@ class NerfstudioLayout(Layout):
             "cy": lens.height / 2,
             "orientation_override": "none",
             "ply_file_path": POINTS,
+            "metres_per_unit": 1.0,
             "frames": frames,
             "train_filenames": paths,
             "val_filenames": held_out,

@@ -16,10 +16,13 @@ from nerfstudio.data.pixel_samplers import PixelSampler, PixelSamplerConfig
 from torch import Tensor
 
 from leco_plugin.scenes.input_error import InputError
+from leco_plugin.scenes.stored_pictures import StoredPictures
 
 PERIOD = 11
 """Of 121 pixels one is held out."""
 _OFFSET = 5
+TRIES = 100
+"""Draws of a pixel that no mask hides: one in three fails where 1% of the pixels are seen."""
 
 
 def is_held_out(indices: Tensor) -> Tensor:
@@ -31,15 +34,38 @@ def look_up(source: Any, which: Tensor, places: Tensor) -> Tensor:
     """Values of pixels: [K, ...].
 
     Args:
-        source: images [P, H, W, ...], or a list of one or more [H, W, ...].
+        source: images [P, H, W, ...], a list of one or more [H, W, ...], or stored ones.
         which: [K] int64, number of the image in `source`.
         places: [K, 2] int64, row and column.
     """
+    if isinstance(source, StoredPictures):
+        return source.read(which, places)
     rows, columns = places.unbind(dim=-1)
     if isinstance(source, Tensor):
         return source[which.to(source.device), rows.to(source.device), columns.to(source.device)]
     values = [source[i][r, c] for i, r, c in zip(which, rows, columns)]
     return torch.stack(values) if values else source[0].new_zeros(0, *source[0].shape[2:])
+
+
+def _aside(pictures: StoredPictures, count: int) -> Tensor:
+    """Pixels [count, 3] of stored pictures; held-out ones give way to their neighbours."""
+    indices = pictures.draw(count)
+    columns, widths = indices[:, 2], pictures.sizes[indices[:, 0], 1]
+    aside = torch.where(columns + 1 < widths, columns + 1, columns - 1)
+    indices[:, 2] = torch.where(is_held_out(indices), aside, columns)
+    return indices
+
+
+def some_images(dataset: Any, most: int = 16) -> dict[str, Any]:
+    """A batch of up to so many images, spread evenly, decoded for the occasion.
+
+    Args:
+        dataset: nerfstudio's `InputDataset`.
+    """
+    chosen = torch.linspace(0, len(dataset) - 1, min(most, len(dataset))).long().unique()
+    read = [dataset.get_data(number) for number in chosen.tolist()]
+    images = {key: [data[key] for data in read] for key in ("image", "mask") if key in read[0]}
+    return images | {"image_idx": chosen}
 
 
 def _stepping_aside(sample: Callable[..., Tensor]) -> Callable[..., Tensor]:
@@ -102,6 +128,28 @@ class HeldOutPixelSampler(PixelSampler):
             indices[hidden] = others[torch.randint(len(others), (int(hidden.sum()),))]
         return indices
 
+    def sample(self, image_batch: dict[str, Any]) -> dict[str, Any]:
+        """A batch as nerfstudio makes it, also of stored pictures."""
+        pictures = image_batch["image"]
+        if isinstance(pictures, StoredPictures):
+            return self._sample_stored(pictures, image_batch.get("mask"))
+        batch: dict[str, Any] = super().sample(image_batch)
+        return batch
+
+    def _sample_stored(
+        self, pictures: StoredPictures, masks: StoredPictures | None
+    ) -> dict[str, Any]:
+        """A batch of pixels that are neither held out nor, as far as there are others, masked."""
+        indices = _aside(pictures, self.num_rays_per_batch)
+        for _ in range(TRIES if masks is not None and not self.config.ignore_mask else 0):
+            assert masks is not None
+            seen = masks.read(indices[:, 0], indices[:, 1:])[:, 0] > 0
+            if bool(seen.all()):
+                break
+            fresh = _aside(pictures, int((~seen).sum()))
+            indices[~seen] = fresh
+        return {"image": pictures.read(indices[:, 0], indices[:, 1:]), "indices": indices}
+
     def _step_aside(self, indices: Tensor, image_width: int, mask: Tensor | None) -> Tensor:
         """Moves held-out pixels [N, 3] to their neighbours, or to others where those are masked."""
         held_out, columns = is_held_out(indices), indices[:, 2]
@@ -129,7 +177,10 @@ class HeldOutPixelSampler(PixelSampler):
         generator = torch.Generator().manual_seed(seed)
         pictures = images["image"]
         which = torch.randint(len(pictures), (count,), generator=generator)
-        sizes = torch.tensor([picture.shape[:2] for picture in pictures])[which]
+        if isinstance(pictures, StoredPictures):
+            sizes = pictures.sizes[which]
+        else:
+            sizes = torch.tensor([picture.shape[:2] for picture in pictures])[which]
         cells = ((sizes - _OFFSET - 1) // PERIOD + 1).clamp(min=1)
         places = (torch.rand(count, 2, generator=generator) * cells).long() * PERIOD + _OFFSET
         places = torch.minimum(places, sizes - 1)

@@ -28,6 +28,16 @@ class KnownDistancePixelSamplerConfig(HeldOutPixelSamplerConfig):
     """Share of a batch with known distances, as long as the model asks for them."""
 
 
+def sampler_here(datamanager: Any) -> Any:
+    """The sampler that training batches are drawn with, if that happens in this process.
+
+    nerfstudio's parallel data manager draws in others, which hold copies of it.
+    """
+    if hasattr(datamanager, "data_procs"):
+        return None
+    return getattr(datamanager, "train_pixel_sampler", None)
+
+
 class KnownDistancePixelSampler(HeldOutPixelSampler):
     """The sampler of held-out pixels, which can be told of sparse points."""
 

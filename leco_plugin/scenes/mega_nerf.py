@@ -24,6 +24,7 @@ from nerfstudio.data.dataparsers.base_dataparser import (
     DataparserOutputs,
 )
 from nerfstudio.plugins.registry_dataparser import DataParserSpecification
+from torch import Tensor
 
 if TYPE_CHECKING:
     from leco_plugin.scenes.derived_images import DerivedImages
@@ -50,6 +51,9 @@ class MegaNerfDataParserConfig(DataParserConfig):
     cache: Path | None = None
     """Folder for resized pictures, right halves and unpacked masks; by default
     DATA/leco-cache."""
+    points: Path | None = None
+    """A .ply of sparse points in metres (down, right, back), which say where the ground is; by
+    default DATA/points.ply where there is one."""
     check_axes: bool = True
     """Whether to refuse a scene whose cameras show that its first axis does not point down."""
 
@@ -77,13 +81,21 @@ class MegaNerf(DataParser):
         else:
             images = self._scored_files(frames, factor)
         cameras = _cameras(scene, frames, factor, right_half=half and not training)
+        from leco_plugin.scenes.dataset_units import METRES_PER_UNIT
+        from leco_plugin.scenes.photographs import POINTS
+
         coordinates = scene.coordinates
+        transform = torch.from_numpy(coordinates.transform()).float()
+        metadata: dict[str, Any] = {METRES_PER_UNIT: 1.0}  # the poses, scaled back, are in metres
+        points = self._points()
+        if points is not None:
+            metadata[POINTS] = (points @ transform[:, :3].T + transform[:, 3]) / coordinates.metres
         return DataparserOutputs(
             image_filenames=images,
             cameras=cameras,
             mask_filenames=masks,
-            metadata={},
-            dataparser_transform=torch.from_numpy(coordinates.transform()).float(),
+            metadata=metadata,
+            dataparser_transform=transform,
             dataparser_scale=1.0 / coordinates.metres,
         )
 
@@ -98,6 +110,18 @@ class MegaNerf(DataParser):
                 self._scene = read_scene(self.config.data, self.config.check_axes, progress)
             CONSOLE.log(self._scene.describe())
         return self._scene
+
+    def _points(self) -> Tensor | None:
+        """Sparse points [P, 3] as the file has them, if there is one."""
+        from leco_plugin.scenes.input_error import InputError
+        from leco_plugin.scenes.photographs import read_ply
+
+        path = self.config.points or self.config.data / "points.ply"
+        if path.is_file():
+            return read_ply(path)
+        if self.config.points is not None:
+            raise InputError(f"there is no file {path} with sparse points")
+        return None
 
     def _derived(self) -> DerivedImages:
         from leco_plugin.scenes.derived_images import DerivedImages

@@ -18,6 +18,7 @@ from nerfstudio.data.dataparsers.nerfstudio_dataparser import Nerfstudio, Nerfst
 from nerfstudio.plugins.registry_dataparser import DataParserSpecification
 from torch import Tensor
 
+from leco_plugin.scenes.dataset_units import METRES_PER_UNIT
 from leco_plugin.scenes.input_error import InputError
 from leco_plugin.scenes.photograph_masks import check_masks
 from leco_plugin.scenes.rotations import distance_from_rotations
@@ -55,7 +56,17 @@ class LecoPhotographs(Nerfstudio):
         if points is not None:
             transform, scale = outputs.dataparser_transform, outputs.dataparser_scale
             outputs.metadata[POINTS] = scale * (points @ transform[:, :3].T + transform[:, 3])
+        if "metres_per_unit" in meta:
+            outputs.metadata[METRES_PER_UNIT] = _metres(meta, self.config.data)
         return outputs
+
+
+def _metres(meta: dict[str, Any], data: Path) -> float:
+    """What a scene says of its units: metres in one."""
+    metres = meta["metres_per_unit"]
+    if not isinstance(metres, int | float) or not 0.0 < metres < float("inf"):
+        raise InputError(f"{data}: metres_per_unit is {metres!r}, not a positive number")
+    return float(metres)
 
 
 def folder_of(data: Path) -> Path:
@@ -146,13 +157,22 @@ def read_points(meta: dict[str, Any], folder: Path) -> Tensor | None:
     name = meta.get("ply_file_path")
     if name is None or not (folder / name).exists():
         return None
+    return read_ply(folder / name)
+
+
+def read_ply(path: Path) -> Tensor:
+    """The vertices [P, 3] float32 of a file.
+
+    Raises:
+        InputError: it cannot be read as points.
+    """
     import trimesh
 
     try:
-        loaded: Any = trimesh.load(folder / name)
+        loaded: Any = trimesh.load(path)
         vertices = np.asarray(loaded.vertices, dtype=np.float32)
     except Exception as error:  # noqa: BLE001  trimesh raises whatever its parsers meet
-        raise InputError(f"{folder / name} cannot be read as sparse points: {error}") from None
+        raise InputError(f"{path} cannot be read as sparse points: {error}") from None
     return torch.from_numpy(vertices.reshape(-1, 3).copy())
 
 

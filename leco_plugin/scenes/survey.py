@@ -9,9 +9,11 @@ import torch
 from nerfstudio.cameras.cameras import Cameras
 from torch import Tensor
 
+from leco_plugin.models.ranks import say
 from leco_plugin.models.rendering import Rays
 from leco_plugin.samplers.rays import intersect_box
-from leco_plugin.scenes.bounds import SceneBounds, find_bounds
+from leco_plugin.scenes.bounds import BoundsConfig, SceneBounds, find_bounds, with_range
+from leco_plugin.scenes.dataset_units import DatasetUnits, units_of
 from leco_plugin.scenes.input_error import InputError
 from leco_plugin.scenes.photographs import POINTS
 
@@ -35,13 +37,40 @@ class Survey:
     """Median length of those rays inside the bounds, scene units."""
     positions: Tensor
     """[C, 3] of up to `MOST_CAMERAS` cameras."""
+    rays: int = 0
+    """How many rays were looked at."""
+    units: DatasetUnits | None = None
+    """Those of the dataset, if its dataparser says what it did to them."""
 
-    def describe(self) -> str:
-        """One line for the log."""
-        return (
-            f"{self.bounds.reason}; rays from {self.bounds.near:.3f} to {self.bounds.far:.3f}; "
-            f"{self.meeting:.0%} of all rays meet the scene"
+    def lines(self) -> list[str]:
+        """For the log: what was chosen and why, the range in scene units and beside it in metres,
+        and how many rays meet it."""
+        bounds, heights = self.bounds, self.positions[:, 2]
+        rows = [("near", bounds.near, False), ("far", bounds.far, False)]
+        if bounds.kind == "box":
+            ground, top = float(bounds.aabb[2]), float(bounds.aabb[5])
+            rows += [("ground, z", ground, True), ("top, z", top, True)]
+            lowest, highest = float(heights.min()), float(heights.max())
+            rows += [("lowest camera, z", lowest, True), ("highest camera, z", highest, True)]
+        else:
+            rows.append(("inner cube, half", bounds.half_extent, False))
+        units = self.units
+        head = f"{'':18}{'scene units':>12}" + (f"{units.name:>12}" if units else "")
+        table = [head] + [
+            f"{name:18}{value:12.3f}" + (f"{_in(units, value, level):12.2f}" if units else "")
+            for name, value, level in rows
+        ]
+        if units is not None and not units.metric:
+            table.append(
+                "data units are those of the poses; bounds.metres-per-unit says the metres"
+            )
+        length = f"{self.median_length:.3f}"
+        if units is not None and units.metric:
+            length += f" ({_in(units, self.median_length, False):.1f} m)"
+        meeting = (
+            f"{self.meeting:.1%} of {self.rays} rays meet the scene, half of them for {length}"
         )
+        return [bounds.reason, *table, meeting]
 
     def probe_rays(self, device: torch.device, aabb: Tensor, march_range: Tensor) -> Rays:
         """The rays of the survey, cut to a model's bounds; rays that miss are left out."""
@@ -52,21 +81,48 @@ class Survey:
         return Rays(origins[hits], directions[hits], t_mins[hits], t_maxs[hits], None)
 
 
-def survey(datamanager: Any) -> Survey:
+def _in(units: DatasetUnits, value: float, level: bool) -> float:
+    """A length or, as a level, an altitude in the dataset's units."""
+    return units.altitude(value) if level else units.per_scene_unit * value
+
+
+def sparse_points(dataset: Any) -> Tensor | None:
+    """Sparse points [P, 3] in model coordinates from the metadata of any reader, or None."""
+    metadata = getattr(dataset, "metadata", {}) or {}
+    points = metadata.get(POINTS, metadata.get("points3D_xyz"))
+    return None if points is None else torch.as_tensor(points)
+
+
+def survey(
+    datamanager: Any,
+    config: BoundsConfig | None = None,
+    near: float | None = None,
+    far: float | None = None,
+) -> Survey:
     """Looks at the training cameras of any nerfstudio data manager.
 
+    Args:
+        config: what is not to be found from the data.
+        near, far: where rays begin and end, scene units; None is found from the data.
     Raises:
-        InputError: no cameras, or no ray meets the scene.
+        InputError: no cameras, no ray meets the scene, or what is configured is no range.
     """
+    config = config or BoundsConfig()
+    if hasattr(datamanager, "train_unseen_cameras"):
+        raise InputError(
+            f"{type(datamanager).__name__} hands out whole images, and this method trains on rays; "
+            "leave the method its own data manager, and see its option `images` to save memory"
+        )
     dataset = datamanager.train_dataset
     cameras: Cameras = dataset.cameras
     if len(cameras) == 0:
         raise InputError("the scene has no training cameras")
-    metadata = getattr(dataset, "metadata", {}) or {}
-    points = metadata.get(POINTS, metadata.get("points3D_xyz"))
     origins, directions = covering_rays(cameras)
+    poses = cameras.camera_to_worlds[_chosen(len(cameras))]
     try:
-        bounds = find_bounds(cameras.camera_to_worlds, directions, points)
+        found = find_bounds(poses, directions, sparse_points(dataset), config)
+        bounds = with_range(found, near, far)
+        units = units_of(datamanager, config.metres_per_unit)
     except ValueError as error:
         raise InputError(str(error)) from None
     flat_origins, flat_directions = origins.reshape(-1, 3), directions.reshape(-1, 3)
@@ -74,10 +130,13 @@ def survey(datamanager: Any) -> Survey:
     lengths = leaves.clamp(max=bounds.far) - enters.clamp(min=bounds.near)
     hits = lengths > 0.0
     if not bool(hits.any()):
-        raise InputError(
-            "no ray of any camera meets the scene: the sparse points and the camera poses are "
-            "probably in different coordinates"
+        set_by_hand = near is not None or far is not None or config.altitudes is not None
+        cause = (
+            "near, far and altitudes are in scene units; leave them out to have them found"
+            if set_by_hand
+            else "the sparse points and the camera poses are probably in different coordinates"
         )
+        raise InputError(f"0% of the rays meet the scene ({bounds.reason}): {cause}")
     return Survey(
         bounds,
         flat_origins[hits],
@@ -85,7 +144,20 @@ def survey(datamanager: Any) -> Survey:
         float(hits.float().mean()),
         float(lengths[hits].median()),
         origins[:, 0],
+        len(hits),
+        units,
     )
+
+
+def announce(found: Survey) -> None:
+    """Says in the log where the scene lies."""
+    for line in found.lines():
+        say(line)
+
+
+def _chosen(count: int) -> Tensor:
+    """Numbers of up to `MOST_CAMERAS` of so many cameras, spread evenly."""
+    return torch.linspace(0, count - 1, min(count, MOST_CAMERAS)).long().unique()
 
 
 def covering_rays(cameras: Cameras) -> tuple[Tensor, Tensor]:
@@ -95,9 +167,8 @@ def covering_rays(cameras: Cameras) -> tuple[Tensor, Tensor]:
         origins and unit directions, [C, SIDE * SIDE, 3] float32 on the CPU.
     """
     cameras = cameras.to("cpu")
-    chosen = torch.linspace(0, len(cameras) - 1, min(len(cameras), MOST_CAMERAS)).long().unique()
     origins, directions = [], []
-    for number in chosen.tolist():
+    for number in _chosen(len(cameras)).tolist():
         height, width = float(cameras.height[number]), float(cameras.width[number])
         rows = torch.linspace(0.5, height - 0.5, SIDE)
         columns = torch.linspace(0.5, width - 0.5, SIDE)

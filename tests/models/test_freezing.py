@@ -22,11 +22,21 @@ class Manager:
             HeldOutPixelSamplerConfig().setup(num_rays_per_batch=8) if keeps_pixels_back else None
         )
         self.iter_train_image_dataloader = iter([self.images])
-        self.train_ray_generator = Bundle
+        self.train_dataset = SimpleNamespace(cameras=Cameras())
 
     def next_train(self, step: int) -> tuple[Bundle, dict[str, torch.Tensor]]:
         indices = torch.zeros(COUNT, 3, dtype=torch.int64)
         return Bundle(indices), {"image": torch.zeros(COUNT, 3), "indices": indices}
+
+
+class Cameras:
+    """All of them at once, whose rays are pixels."""
+
+    def to(self, device: str) -> Cameras:
+        return self
+
+    def generate_rays(self, camera_indices: torch.Tensor, coords: torch.Tensor) -> Bundle:
+        return Bundle(torch.cat([camera_indices, (coords - 0.5).long()], dim=1))
 
 
 class Bundle:
@@ -34,6 +44,9 @@ class Bundle:
 
     def __init__(self, indices: torch.Tensor) -> None:
         self.indices = indices
+
+    def __getitem__(self, which: slice) -> Bundle:
+        return Bundle(self.indices[which])
 
     def to(self, device: torch.device) -> torch.Tensor:
         return self.indices

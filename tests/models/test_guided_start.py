@@ -364,3 +364,26 @@ def test_a_host_that_asks_no_gate_needs_no_occupancy(tiny_scene: Path) -> None:
     attributes = TrainingCallbackAttributes(None, None, pipeline, None)  # type: ignore[arg-type]
     pipeline.get_training_callbacks(attributes)
     assert pipeline.model.guide.occupancy is None
+
+
+def test_where_the_scene_lies_is_said_before_the_first_step(
+    readers: dict[str, Data], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    said: list[str] = []
+    monkeypatch.setattr("leco_plugin.scenes.survey.say", said.append)
+    started(lopsided(readers["as it is"]), readers["as it is"])
+    assert any(line.startswith("near") for line in said)
+    assert "rays meet the scene" in said[-1]
+
+
+def test_a_range_that_no_ray_meets_is_refused_before_the_first_step(
+    readers: dict[str, Data],
+) -> None:
+    data = readers["as it is"]
+    config = OccupancyConfig()
+    config.learning.bounds.altitudes = (-9.0, -8.0)
+    config.learning.near, config.learning.far = 1e-3, 2e-3
+    guide = Guide("learned-occupancy")
+    guide.set_occupancy(lopsided(data))
+    with pytest.raises(InputError, match=r"^0% of the rays meet the scene"):
+        GuidedStart(guide, config, Pipe(data))

@@ -8,7 +8,7 @@ from tiny_scene import camera_to_world
 from torch import Tensor
 
 from leco_plugin.samplers.rays import intersect_box
-from leco_plugin.scenes.bounds import SceneBounds, find_bounds
+from leco_plugin.scenes.bounds import BoundsConfig, SceneBounds, find_bounds, with_range
 
 
 def image_rays(poses: Tensor) -> Tensor:
@@ -121,3 +121,68 @@ def test_points_that_no_camera_sees_are_refused() -> None:
 def test_the_reason_is_one_line() -> None:
     for scene in (from_above, around):
         assert "\n" not in find_bounds(*scene()).reason
+
+
+def test_what_is_chosen_can_be_chosen_by_hand() -> None:
+    street = find_bounds(*around(), BoundsConfig(space="box"))
+    assert street.kind == "box" and "as configured" in street.reason
+    poses, directions, points = from_above()
+    sky = find_bounds(poses, directions, points, BoundsConfig(space="contraction"))
+    assert sky.kind == "contraction" and "as configured" in sky.reason
+
+
+def test_walls_by_hand_hold_cameras_and_points() -> None:
+    poses, directions, points = around()
+    low, high = find_bounds(poses, directions, points, BoundsConfig(space="box")).aabb.view(2, 3)
+    for places in (poses[:, :, 3], points):
+        assert bool((places >= low).all()) and bool((places <= high).all())
+
+
+@pytest.mark.parametrize("with_points", [True, False])
+def test_altitudes_by_hand_cut_the_rays_with_points_and_without(with_points: bool) -> None:
+    poses, directions, points = from_above()
+    config = BoundsConfig(altitudes=(-0.5, 2.0))
+    bounds = find_bounds(poses, directions, points if with_points else None, config)
+    assert bounds.kind == "box"
+    assert bounds.aabb[[2, 5]].tolist() == [-0.5, 2.0]
+    begins, ends = ranges(bounds, poses, directions)
+    assert bool((ends > begins).all())
+    # cameras are 10 above the ground: 8 above the top, seen through 53 degrees
+    assert 0.5 * 8.0 < bounds.near <= 8.0
+    assert 10.5 * 1.2 < bounds.far < 10.5 * 2.0
+
+
+@pytest.mark.parametrize(
+    ("config", "message"),
+    [
+        (BoundsConfig(altitudes=(1.0, 1.0)), "ground < top"),
+        (BoundsConfig(altitudes=(float("nan"), 1.0)), "ground < top"),
+        (BoundsConfig(altitudes=(20.0, 30.0)), "no ray of any camera goes down"),
+    ],
+)
+def test_altitudes_that_are_no_range_of_these_cameras_are_refused(
+    config: BoundsConfig, message: str
+) -> None:
+    with pytest.raises(ValueError, match=message) as caught:
+        find_bounds(*from_above(), config)
+    assert "\n" not in str(caught.value)
+
+
+def test_a_box_without_points_asks_for_its_altitudes() -> None:
+    poses, directions, _ = from_above()
+    with pytest.raises(ValueError, match=r"give bounds\.altitudes"):
+        find_bounds(poses, directions, None, BoundsConfig(space="box"))
+    assert "give bounds.altitudes" in find_bounds(poses, directions, None).reason
+
+
+def test_a_range_by_hand_replaces_what_was_found() -> None:
+    bounds = find_bounds(*from_above())
+    assert with_range(bounds, None, None) == bounds
+    assert with_range(bounds, 1.5, None).near == 1.5
+    assert with_range(bounds, None, 99.0).far == 99.0
+
+
+@pytest.mark.parametrize(("near", "far"), [(0.0, 1.0), (2.0, 2.0), (1.0, float("inf"))])
+def test_a_range_by_hand_that_is_none_is_refused(near: float, far: float) -> None:
+    with pytest.raises(ValueError, match="0 < near < far"):
+        with_range(find_bounds(*from_above()), near, far)

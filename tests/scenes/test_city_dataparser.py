@@ -11,6 +11,8 @@ from nerfstudio.plugins.registry_dataparser import DataParserSpecification
 
 from leco_plugin.scenes.city_dataparser import LecoCityDataParserConfig, leco_city_dataparser
 from leco_plugin.scenes.city_truth import CityTruth
+from leco_plugin.scenes.dataset_units import METRES_PER_UNIT
+from leco_plugin.scenes.photographs import POINTS
 
 
 @pytest.fixture(scope="module")
@@ -37,6 +39,12 @@ def test_the_city_is_written_and_loaded(
     assert all(path.is_file() for path in outputs.image_filenames)
     assert int(outputs.cameras.width[0]) == 40
     assert len(outputs.metadata["depth_filenames"]) == len(outputs.image_filenames)
+
+
+def test_its_sparse_points_and_its_metres_come_along(outputs: DataparserOutputs) -> None:
+    assert outputs.metadata[METRES_PER_UNIT] == 1.0
+    points = outputs.metadata[POINTS]
+    assert points.shape[1] == 3 and len(points) > 500
 
 
 def test_by_default_each_kind_of_city_has_its_folder(

@@ -16,9 +16,11 @@ from nerfstudio.data.datamanagers.base_datamanager import VanillaDataManagerConf
 from nerfstudio.data.datasets.base_dataset import InputDataset
 from nerfstudio.plugins.registry_dataparser import DataParserSpecification
 
+from leco_plugin.scenes.dataset_units import METRES_PER_UNIT
 from leco_plugin.scenes.frames import between, frame_of
 from leco_plugin.scenes.input_error import InputError
 from leco_plugin.scenes.mega_nerf import MegaNerfDataParserConfig, mega_nerf_dataparser
+from leco_plugin.scenes.photographs import POINTS
 
 # nerfstudio leaves images open that it has read
 pytestmark = [
@@ -194,3 +196,28 @@ def test_the_entry_point_is_light_to_import() -> None:
     )
     assert loaded.stdout.split() == ["leco_plugin.scenes", "leco_plugin.scenes.mega_nerf"]
     assert isinstance(mega_nerf_dataparser, DataParserSpecification)
+
+
+def test_sparse_points_in_metres_arrive_where_the_cameras_are(tmp_path: Path) -> None:
+    """Points 100 m below two cameras, in the files' axes: (down, right, back)."""
+    folder = mega_nerf_scene.write(tmp_path / "scene")
+    places = mega_nerf_scene.poses()[:2, :, 3]
+    below = np.stack([[-up + 100.0, right, -forward] for right, forward, up in places])
+    rows = "".join(" ".join(f"{value:.5f}" for value in row) + "\n" for row in below)
+    axes = "".join(f"property float {axis}\n" for axis in "xyz")
+    text = f"ply\nformat ascii 1.0\nelement vertex 2\n{axes}end_header\n{rows}"
+    (folder / "points.ply").write_text(text)
+    outputs = MegaNerfDataParserConfig(data=folder).setup().get_dataparser_outputs("train")
+    metres = mega_nerf_scene.COORDINATES.metres
+    frame = outputs.dataparser_transform
+    drb = torch.tensor([[-up, right, -forward] for right, forward, up in places]).float()
+    expected = (drb @ frame[:, :3].T + frame[:, 3]) / metres - torch.tensor([0, 0, 100.0 / metres])
+    torch.testing.assert_close(outputs.metadata[POINTS], expected, atol=1e-4, rtol=0)
+    assert outputs.metadata[METRES_PER_UNIT] == 1.0
+
+
+def test_a_file_of_points_that_is_not_there_is_named(tmp_path: Path) -> None:
+    folder = mega_nerf_scene.write(tmp_path / "scene")
+    config = MegaNerfDataParserConfig(data=folder, points=tmp_path / "none.ply")
+    with pytest.raises(InputError, match=r"none\.ply"):
+        config.setup().get_dataparser_outputs("train")

@@ -14,6 +14,7 @@ import torch
 import trimesh
 from PIL import Image
 
+from leco_plugin.scenes.dataset_units import METRES_PER_UNIT
 from leco_plugin.scenes.input_error import InputError
 from leco_plugin.scenes.photographs import (
     POINTS,
@@ -217,3 +218,20 @@ def test_only_cameras_that_look_down_are_above() -> None:
     across[:, :3, :3] = [[1, 0, 0], [0, 0, -1], [0, 1, 0]]
     assert taken_from_above(down)
     assert not taken_from_above(across)
+
+
+@pytest.mark.filterwarnings("ignore:unclosed file:ResourceWarning")
+@pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
+def test_a_scene_may_say_how_many_metres_a_unit_of_its_poses_is(scene: Path) -> None:
+    def metadata() -> dict[str, Any]:
+        outputs = LecoPhotographsDataParserConfig(data=scene).setup().get_dataparser_outputs()
+        return outputs.metadata
+
+    assert METRES_PER_UNIT not in metadata()
+    change(scene, lambda meta: meta.update(metres_per_unit=2))
+    assert metadata()[METRES_PER_UNIT] == 2.0
+    for wrong in (0, -1.0, "one", None):
+        change(scene, lambda meta, wrong=wrong: meta.update(metres_per_unit=wrong))
+        with pytest.raises(InputError, match="metres_per_unit") as caught:
+            metadata()
+        assert "\n" not in str(caught.value)

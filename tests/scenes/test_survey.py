@@ -9,9 +9,21 @@ import torch
 from nerfstudio.cameras.cameras import Cameras
 from tiny_scene import camera_to_world
 
+from leco_plugin.scenes.bounds import BoundsConfig
+from leco_plugin.scenes.city import CityConfig
+from leco_plugin.scenes.city_capture import CaptureConfig
+from leco_plugin.scenes.city_folder import write_city
 from leco_plugin.scenes.input_error import InputError
-from leco_plugin.scenes.photographs import POINTS
-from leco_plugin.scenes.survey import SIDE, covering_rays, survey
+from leco_plugin.scenes.mega_nerf import MegaNerfDataParserConfig
+from leco_plugin.scenes.photographs import POINTS, LecoPhotographsDataParserConfig
+from leco_plugin.scenes.survey import (
+    MOST_CAMERAS,
+    SIDE,
+    announce,
+    covering_rays,
+    sparse_points,
+    survey,
+)
 
 
 def ring(count: int = 8) -> Cameras:
@@ -35,7 +47,7 @@ def test_a_ring_of_cameras_sees_its_scene() -> None:
     points = torch.rand(200, 3, generator=torch.Generator().manual_seed(0)) * 0.6 - 0.3
     found = survey(datamanager(ring(), points))
     assert found.meeting > 0.5 and found.median_length > 0.0
-    assert "\n" not in found.describe()
+    assert not any("\n" in line for line in found.lines())
     span = torch.tensor([found.bounds.near, found.bounds.far])
     rays = found.probe_rays(torch.device("cpu"), found.bounds.aabb, span)
     assert len(rays.origins) > 0 and bool((rays.t_maxs > rays.t_mins).all())
@@ -54,3 +66,133 @@ def test_rays_that_never_meet_the_scene_are_refused_in_one_line() -> None:
     with pytest.raises(InputError, match=r"no (camera sees|ray of any camera)") as caught:
         survey(datamanager(ring(), behind))
     assert "\n" not in str(caught.value)
+
+
+def drone(count: int = 12) -> Cameras:
+    """Cameras 10 above the origin that look straight down."""
+    poses = torch.eye(4)[:3].repeat(count, 1, 1)
+    poses[:, :, 3] = torch.tensor([0.0, 0.0, 10.0])
+    poses[:, 0, 3] = torch.linspace(-5.0, 5.0, count)
+    return Cameras(poses, 32.0, 32.0, 16.0, 16.0, 32, 32)
+
+
+def ground(low: float = 0.0, high: float = 1.0) -> torch.Tensor:
+    points = torch.rand(300, 3, generator=torch.Generator().manual_seed(0))
+    return points * torch.tensor([8.0, 8.0, high - low]) + torch.tensor([-4.0, -4.0, low])
+
+
+def colmap_like(cameras: Cameras, points: torch.Tensor, scale: float = 0.1) -> SimpleNamespace:
+    """What nerfstudio's reader of COLMAP gives: points under its own key, and what it did."""
+    metadata = {"points3D_xyz": points, "points3D_rgb": torch.zeros(len(points), 3)}
+    transform = torch.eye(3, 4)
+    transform[2, 3] = -30.0
+    outputs = SimpleNamespace(
+        dataparser_scale=scale, dataparser_transform=transform, metadata=metadata
+    )
+    dataset = SimpleNamespace(cameras=cameras, metadata=metadata)
+    return SimpleNamespace(train_dataset=dataset, train_dataparser_outputs=outputs)
+
+
+def columns(lines: list[str], name: str) -> list[float]:
+    """The numbers of a row of the log."""
+    (row,) = [line for line in lines if line.startswith(name)]
+    return [float(word) for word in row.removeprefix(name).replace(",", " ").split() if word != "z"]
+
+
+def test_points_of_colmap_bound_the_scene_and_both_units_stand_side_by_side() -> None:
+    data = colmap_like(drone(), ground())
+    lines = survey(data, BoundsConfig(metres_per_unit=1.0)).lines()
+    assert any("scene units" in line and "metres" in line for line in lines)
+    scene, metres = columns(lines, "near")
+    assert metres == pytest.approx(10.0 * scene, abs=0.02)
+    scene, metres = columns(lines, "highest camera")
+    assert scene == pytest.approx(10.0, abs=1e-3) and metres == pytest.approx(130.0, abs=0.01)
+    assert "data units" in "".join(survey(data).lines())
+    assert "100.0% of 768 rays meet the scene" in lines[-1]
+
+
+def test_it_says_which_space_was_chosen_and_why() -> None:
+    assert (
+        "photographed from above (100% of rays go down"
+        in survey(colmap_like(drone(), ground())).lines()[0]
+    )
+    points = torch.rand(200, 3, generator=torch.Generator().manual_seed(0)) * 0.6 - 0.3
+    assert "not from above" in survey(datamanager(ring(), points)).lines()[0]
+
+
+def test_more_cameras_than_are_looked_at_still_have_bounds() -> None:
+    found = survey(datamanager(drone(MOST_CAMERAS + 44), ground()))
+    assert found.bounds.kind == "box" and len(found.positions) == MOST_CAMERAS
+
+
+def test_a_range_by_hand_is_what_rays_are_counted_in() -> None:
+    data = datamanager(drone(), ground())
+    assert survey(data, near=1.0, far=12.0).bounds.far == 12.0
+    with pytest.raises(
+        InputError, match=r"^0% of the rays meet the scene .*leave them out"
+    ) as caught:
+        survey(data, near=0.5, far=2.0)
+    assert "\n" not in str(caught.value)
+    with pytest.raises(InputError, match="0 < near < far"):
+        survey(data, near=3.0, far=2.0)
+
+
+def test_rays_that_miss_are_counted() -> None:
+    """They enter between 8.7 and 10.7 from the camera."""
+    data = datamanager(drone(), ground())
+    shares = [survey(data, far=far).meeting for far in (9.0, 9.8, 20.0)]
+    assert 0.0 < shares[0] < shares[1] < shares[2] == 1.0
+
+
+def test_points_of_no_kind_are_none() -> None:
+    assert sparse_points(SimpleNamespace(metadata=None)) is None
+    assert sparse_points(SimpleNamespace(metadata={"points3D_rgb": torch.zeros(1, 3)})) is None
+
+
+@pytest.fixture(scope="module")
+def cities(tmp_path_factory: pytest.TempPathFactory) -> dict[str, SimpleNamespace]:
+    """One city in both formats, each through its own reader; sparse points for both."""
+    folder = tmp_path_factory.mktemp("cities")
+    capture = CaptureConfig(24, 18, aerial_per_block=6.0, street_per_block=0.0)
+    city = CityConfig(blocks=2)
+    plain = write_city(city, folder / "plain", capture, progress=False)
+    mega = write_city(city, folder / "mega", capture, progress=False, layout="mega-nerf")
+    upright = LecoPhotographsDataParserConfig(data=plain).setup().get_dataparser_outputs("train")
+    transform, scale = upright.dataparser_transform, upright.dataparser_scale
+    in_metres = (upright.metadata[POINTS] / scale - transform[:, 3]) @ transform[:, :3]
+    drb = torch.stack([-in_metres[:, 2], in_metres[:, 0], -in_metres[:, 1]], dim=-1)
+    rows = "".join(" ".join(f"{value:.4f}" for value in point) + "\n" for point in drb.tolist())
+    head = "ply\nformat ascii 1.0\nelement vertex {}\n{}end_header\n"
+    axes = "".join(f"property float {axis}\n" for axis in "xyz")
+    (mega / "points.ply").write_text(head.format(len(drb), axes) + rows)
+    config = MegaNerfDataParserConfig(data=mega, val_scale_factor=1, protocol="full")
+    outputs = {"plain": upright, "mega": config.setup().get_dataparser_outputs("train")}
+    return {
+        name: SimpleNamespace(
+            train_dataparser_outputs=out,
+            train_dataset=SimpleNamespace(cameras=out.cameras, metadata=out.metadata),
+        )
+        for name, out in outputs.items()
+    }
+
+
+@pytest.mark.filterwarnings("ignore:unclosed file:ResourceWarning")
+@pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
+def test_one_city_in_two_formats_has_the_same_bounds_in_metres(
+    cities: dict[str, SimpleNamespace],
+) -> None:
+    found = {name: survey(data) for name, data in cities.items()}
+    assert {seen.bounds.kind for seen in found.values()} == {"box"}
+    for row in ("near", "far", "ground", "top", "lowest camera", "highest camera"):
+        plain, mega = (columns(found[name].lines(), row)[1] for name in ("plain", "mega"))
+        assert plain == pytest.approx(mega, abs=0.05), row
+    lines = found["mega"].lines()
+    assert columns(lines, "lowest camera")[1] > columns(lines, "ground")[1] + 30.0
+
+
+def test_every_line_reaches_the_log(monkeypatch: pytest.MonkeyPatch) -> None:
+    said: list[str] = []
+    monkeypatch.setattr("leco_plugin.scenes.survey.say", said.append)
+    found = survey(datamanager(drone(), ground()))
+    announce(found)
+    assert said == found.lines()

@@ -1,0 +1,135 @@
+"""nerfstudio's data manager for rays, with photographs that stay on disk where they are many."""
+
+from __future__ import annotations
+
+import itertools
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Literal
+
+from nerfstudio.data.datamanagers.base_datamanager import (
+    VanillaDataManager,
+    VanillaDataManagerConfig,
+)
+from nerfstudio.data.utils.dataloaders import (
+    FixedIndicesEvalDataloader,
+    RandIndicesEvalDataloader,
+)
+from nerfstudio.model_components.ray_generators import RayGenerator
+
+from leco_plugin.models.ranks import say
+from leco_plugin.scenes.held_out_pixels import HeldOutPixelSampler
+from leco_plugin.scenes.input_error import InputError
+from leco_plugin.scenes.stored_pictures import store_pictures
+
+MOST_OF_MEMORY = 0.4
+"""Share of the memory that is free which photographs in memory may take."""
+
+
+@dataclass
+class LecoDataManagerConfig(VanillaDataManagerConfig):
+    """Rays of photographs, in memory or on disk"""
+
+    _target: type = field(default_factory=lambda: LecoDataManager)
+    """target class to instantiate"""
+    images: Literal["auto", "memory", "disk"] = "auto"
+    """memory: all photographs decoded in memory, as nerfstudio has them. disk: decoded once, one by
+    one, into files, of which pixels are read. auto: on disk where they would take more than 40% of
+    the memory that is free."""
+    pixels: Path | None = None
+    """Folder of those files; by default leco-cache/pixels beside the data."""
+
+
+class LecoDataManager(VanillaDataManager):  # type: ignore[type-arg]
+    """As nerfstudio's, but for where the photographs are."""
+
+    config: LecoDataManagerConfig
+
+    def on_disk(self) -> bool:
+        """Whether pixels are read from files.
+
+        Raises:
+            InputError: they are to be, and cannot.
+        """
+        config = self.config
+        if config.images == "memory" or config.train_num_images_to_sample_from != -1:
+            return False
+        obstacle = self._obstacle()
+        if config.images == "disk":
+            if obstacle is not None:
+                raise InputError(f"photographs on disk: {obstacle}")
+            return True
+        needed = decoded_bytes(self.train_dataset) + decoded_bytes(self.eval_dataset)
+        free = free_memory()
+        return obstacle is None and free is not None and needed > MOST_OF_MEMORY * free
+
+    def _obstacle(self) -> str | None:
+        """Why pixels cannot be read from files, if they cannot."""
+        if not issubclass(self.config.pixel_sampler._target, HeldOutPixelSampler):
+            return "the pixel sampler draws from images in memory only; use leco's own"
+        if self.train_dataset.mask_color:
+            return "the scene's mask_color is painted over images in memory only"
+        return None
+
+    def _store(self, dataset: Any, what: str) -> Any:
+        """An endless iterator over the one batch of images that there is."""
+        data = Path(self.config.dataparser.data)
+        beside = data if data.is_dir() else data.parent
+        folder = self.config.pixels or beside / "leco-cache" / "pixels"
+        return itertools.repeat(store_pictures(dataset, folder, what))
+
+    def setup_train(self) -> None:
+        """Sets up what training rays are drawn from."""
+        if not self.on_disk():
+            super().setup_train()
+            return
+        gigabytes = decoded_bytes(self.train_dataset) / 1e9
+        say(f"{len(self.train_dataset)} photographs, {gigabytes:.1f} GB decoded, stay on disk")
+        self.iter_train_image_dataloader = self._store(self.train_dataset, "photographs")
+        self.train_pixel_sampler = self._get_pixel_sampler(
+            self.train_dataset, self.config.train_num_rays_per_batch
+        )
+        self.train_ray_generator = RayGenerator(self.train_dataset.cameras.to(self.device))
+
+    def setup_eval(self) -> None:
+        """Sets up what evaluation draws from; whole images are decoded when they are asked for."""
+        if not self.on_disk():
+            super().setup_eval()
+            return
+        self.iter_eval_image_dataloader = self._store(self.eval_dataset, "test photographs")
+        self.eval_pixel_sampler = self._get_pixel_sampler(
+            self.eval_dataset, self.config.eval_num_rays_per_batch
+        )
+        self.eval_ray_generator = RayGenerator(self.eval_dataset.cameras.to(self.device))
+        self.fixed_indices_eval_dataloader = FixedIndicesEvalDataloader(
+            input_dataset=self.eval_dataset, device=self.device
+        )
+        self.eval_dataloader = RandIndicesEvalDataloader(
+            input_dataset=self.eval_dataset, device=self.device
+        )
+
+
+def decoded_bytes(dataset: Any) -> int:
+    """What all photographs of a dataset take in memory as nerfstudio decodes them, float32."""
+    cameras = dataset.cameras
+    pixels = int((cameras.height.long() * cameras.width.long()).sum())
+    return 12 * pixels
+
+
+def free_memory(
+    meminfo: Path = Path("/proc/meminfo"), group: Path = Path("/sys/fs/cgroup")
+) -> int | None:
+    """Bytes that this process may still take, a container's limit included; None if unknown."""
+    limits = []
+    try:
+        fields = (line.split() for line in meminfo.read_text().splitlines())
+        limits += [int(field[1]) * 1024 for field in fields if field[:1] == ["MemAvailable:"]]
+    except OSError:
+        pass
+    try:
+        most = (group / "memory.max").read_text().strip()
+        if most != "max":
+            limits.append(int(most) - int((group / "memory.current").read_text()))
+    except (OSError, ValueError):
+        pass
+    return min(limits) if limits else None

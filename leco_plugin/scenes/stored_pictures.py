@@ -1,0 +1,155 @@
+"""Photographs decoded once, one by one, into files of bare bytes, of which single pixels are read.
+
+A batch asks for a few thousand pixels of thousands of photographs. Here that takes the memory of
+the batch; the files may lie in the system's cache, which gives way to whatever needs memory.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import os
+from collections.abc import Iterable
+from functools import partial
+from pathlib import Path
+from typing import Any, BinaryIO
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from leco_plugin.progress_bar import bar
+from leco_plugin.scenes.input_error import InputError
+from leco_plugin.scenes.whole_files import write_whole
+
+
+class StoredPictures:
+    """Pictures of equal or different sizes as files of bytes, [H, W, C] each.
+
+    Args:
+        files: one for each picture.
+        sizes: [P, 2] int64 height and width.
+        channels: bytes of a pixel.
+    """
+
+    def __init__(self, files: list[Path], sizes: Tensor, channels: int) -> None:
+        self.files, self.sizes, self.channels = files, sizes, channels
+        self._pixels_until = sizes.prod(dim=-1).cumsum(0)
+
+    def __len__(self) -> int:
+        return len(self.files)
+
+    def draw(self, count: int) -> Tensor:
+        """Pixels, each of all pictures as likely as any other: [count, 3] picture, row, column."""
+        total = int(self._pixels_until[-1])
+        drawn = torch.randint(total, (count,))
+        which = torch.searchsorted(self._pixels_until, drawn, right=True)
+        within = drawn - (self._pixels_until[which] - self.sizes[which].prod(dim=-1))
+        width = self.sizes[which, 1]
+        return torch.stack([which, within // width, within % width], dim=-1)
+
+    def read(self, which: Tensor, places: Tensor) -> Tensor:
+        """Values of pixels: [K, C] float32 in [0, 1].
+
+        Args:
+            which: [K] int64 pictures.
+            places: [K, 2] int64 rows and columns.
+        """
+        offsets = (places[:, 0] * self.sizes[which, 1] + places[:, 1]) * self.channels
+        found = np.empty((len(which), self.channels), dtype=np.uint8)
+        order = which.argsort(stable=True).tolist()
+        numbers, at = which.tolist(), offsets.tolist()
+        open_number, handle = -1, -1
+        try:
+            for row in order:
+                if numbers[row] != open_number:
+                    if handle >= 0:
+                        os.close(handle)
+                    open_number, handle = (
+                        numbers[row],
+                        os.open(self.files[numbers[row]], os.O_RDONLY),
+                    )
+                found[row] = np.frombuffer(os.pread(handle, self.channels, at[row]), np.uint8)
+        finally:
+            if handle >= 0:
+                os.close(handle)
+        return torch.from_numpy(found).float() / 255.0
+
+
+def store_pictures(dataset: Any, folder: Path, what: str = "photographs") -> dict[str, Any]:
+    """Decodes what a dataset has not yet decoded into `folder`.
+
+    Args:
+        dataset: nerfstudio's `InputDataset`.
+        folder: made if it is missing; pictures that are there already are not decoded again.
+    Returns:
+        As a batch of nerfstudio's image loader: `image` and, if there are masks, `mask`, both
+        `StoredPictures`, and `image_idx` [P].
+    Raises:
+        InputError: nothing can be written there, or the pictures have no common form.
+    """
+    sizes = torch.stack(
+        [dataset.cameras.height.flatten(), dataset.cameras.width.flatten()], dim=-1
+    ).long()
+    masked = dataset._dataparser_outputs.mask_filenames is not None
+    names = [_name(dataset, number) for number in range(len(dataset))]
+    files = {"image": [folder / f"{name}.pixels" for name in names]}
+    if masked:
+        files["mask"] = [folder / f"{name}.mask" for name in names]
+    with bar(f"Decoding the {what}") as progress:
+        for number in range(len(dataset)):
+            if not all(made[number].is_file() for made in files.values()):
+                _decode(dataset, number, sizes[number].tolist(), files)
+            progress((number + 1) / len(dataset))
+    pixels = sizes.prod(dim=-1).tolist()
+    stored: dict[str, Any] = {
+        kind: StoredPictures(made, sizes, _channels(made, pixels)) for kind, made in files.items()
+    }
+    return stored | {"image_idx": torch.arange(len(dataset))}
+
+
+def _name(dataset: Any, number: int) -> str:
+    """Another picture, or the same one read otherwise, has another name."""
+    outputs = dataset._dataparser_outputs
+    paths: Iterable[Path] = [outputs.image_filenames[number]]
+    if outputs.mask_filenames is not None:
+        paths = [*paths, outputs.mask_filenames[number]]
+    of_files = [(str(path), os.stat(path).st_mtime_ns, os.stat(path).st_size) for path in paths]
+    alpha = None if outputs.alpha_color is None else torch.as_tensor(outputs.alpha_color).tolist()
+    text = repr((of_files, dataset.scale_factor, alpha))
+    return hashlib.blake2b(text.encode(), digest_size=12).hexdigest()
+
+
+def _decode(dataset: Any, number: int, size: list[int], files: dict[str, list[Path]]) -> None:
+    source = dataset.image_filenames[number]
+    data = dataset.get_data(number, image_type="uint8")
+    if list(data["image"].shape[:2]) != size:
+        height, width = data["image"].shape[:2]
+        raise InputError(
+            f"{source} has {width} x {height} pixels, its camera {size[1]} x {size[0]}"
+        )
+    for kind, made in files.items():
+        values = data[kind].numpy()
+        bytes_of = (values > 0).astype(np.uint8) * 255 if kind == "mask" else values
+        raw = np.ascontiguousarray(bytes_of).tobytes()
+        try:
+            write_whole(made[number], partial(_write, raw))
+        except OSError as error:
+            raise InputError(
+                f"decoded photographs cannot be written to {made[number].parent} "
+                f"({error.strerror}); give another folder with --pipeline.datamanager.pixels"
+            ) from None
+
+
+def _write(raw: bytes, file: BinaryIO) -> None:
+    file.write(raw)
+
+
+def _channels(files: list[Path], pixels: list[int]) -> int:
+    """Bytes of a pixel, the same in all files."""
+    sizes = {path.stat().st_size / count for path, count in zip(files, pixels)}
+    if len(sizes) != 1 or (channels := sizes.pop()) not in (1, 3, 4):
+        raise InputError(
+            "some photographs have transparency and some have not, or decoded ones are damaged: "
+            f"make them alike, or remove {files[0].parent} to decode them again"
+        )
+    return int(channels)

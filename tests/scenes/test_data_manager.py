@@ -1,0 +1,161 @@
+"""Methods train on photographs wherever they are: in memory, on disk, in other processes."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+import torch
+from nerfstudio.data.datamanagers.base_datamanager import VanillaDataManagerConfig
+from nerfstudio.data.datamanagers.full_images_datamanager import FullImageDatamanagerConfig
+from nerfstudio.data.datamanagers.parallel_datamanager import ParallelDataManagerConfig
+from nerfstudio.data.pixel_samplers import PixelSamplerConfig
+from nerfstudio.pipelines.base_pipeline import VanillaPipelineConfig
+
+from leco_plugin.models.calibration import CalibrationConfig
+from leco_plugin.models.learn_first import learn_occupancy
+from leco_plugin.models.leco import LecoModelConfig
+from leco_plugin.models.phases import ScheduleConfig
+from leco_plugin.scenes import data_manager
+from leco_plugin.scenes.data_manager import (
+    LecoDataManager,
+    LecoDataManagerConfig,
+    decoded_bytes,
+    free_memory,
+)
+from leco_plugin.scenes.input_error import InputError
+from leco_plugin.scenes.known_distances import KnownDistancePixelSamplerConfig, sampler_here
+from leco_plugin.scenes.photographs import LecoPhotographsDataParserConfig
+from leco_plugin.scenes.stored_pictures import StoredPictures
+from leco_plugin.scenes.survey import survey
+
+# nerfstudio leaves images open that it has read
+pytestmark = [
+    pytest.mark.filterwarnings("ignore:unclosed file:ResourceWarning"),
+    pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning"),
+]
+
+
+def options(scene: Path) -> dict[str, Any]:
+    return {
+        "dataparser": LecoPhotographsDataParserConfig(data=scene),
+        "train_num_rays_per_batch": 64,
+        "eval_num_rays_per_batch": 64,
+        "pixel_sampler": KnownDistancePixelSamplerConfig(),
+    }
+
+
+def on_disk(scene: Path, folder: Path, **more: Any) -> LecoDataManagerConfig:
+    return LecoDataManagerConfig(images="disk", pixels=folder, **(options(scene) | more))
+
+
+def learned(config: VanillaDataManagerConfig) -> Any:
+    """The report of an occupancy learned on this data manager for a few steps, and the manager."""
+    small = LecoModelConfig(
+        schedule=ScheduleConfig(learn_steps=6), calibration=CalibrationConfig(rays=64)
+    )
+    pipeline: Any = VanillaPipelineConfig(datamanager=config, model=LecoModelConfig()).setup(
+        device="cpu"
+    )
+    return learn_occupancy(small, pipeline, rays=64).report, pipeline.datamanager
+
+
+def test_a_manager_on_disk_gives_rays_and_pixels_of_the_same_places(
+    tiny_scene: Path, tmp_path: Path
+) -> None:
+    stored: Any = on_disk(tiny_scene, tmp_path).setup(device="cpu")
+    memory: Any = VanillaDataManagerConfig(**options(tiny_scene)).setup(device="cpu")
+    assert isinstance(next(stored.iter_train_image_dataloader)["image"], StoredPictures)
+    for bundle, batch, generator, images in (
+        (*stored.next_train(0), memory.train_ray_generator, memory.train_dataset),
+        (*stored.next_eval(0), memory.eval_ray_generator, memory.eval_dataset),
+    ):
+        expected = generator(batch["indices"])
+        torch.testing.assert_close(bundle.origins, expected.origins)
+        torch.testing.assert_close(bundle.directions, expected.directions)
+        pictures = [images.get_data(number)["image"] for number in range(len(images))]
+        colours = torch.stack([pictures[i][r, c] for i, r, c in batch["indices"].tolist()])
+        torch.testing.assert_close(batch["image"], colours, atol=1e-6, rtol=0)
+    camera, picture = stored.next_eval_image(0)
+    assert camera.shape == (1,) and picture["image"].shape == (32, 32, 3)
+
+
+def test_an_occupancy_is_learned_and_calibrated_from_files(
+    tiny_scene: Path, tmp_path: Path
+) -> None:
+    report, _ = learned(on_disk(tiny_scene, tmp_path))
+    assert report["held_out"] and report["calibration_rays"] > 0
+
+
+@pytest.mark.parametrize("some", [{}, {"train_num_images_to_sample_from": 3}])
+def test_few_photographs_stay_in_memory(tiny_scene: Path, some: dict[str, int]) -> None:
+    manager: Any = LecoDataManagerConfig(**options(tiny_scene), **some).setup(device="cpu")
+    assert not manager.on_disk()
+    assert isinstance(next(manager.iter_train_image_dataloader)["image"], torch.Tensor)
+
+
+def test_photographs_that_do_not_fit_go_to_disk(
+    tiny_scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    decoded = 9 * 32 * 32 * 12
+    free = decoded / data_manager.MOST_OF_MEMORY
+    for memory, expected in ((1.01 * free, False), (0.99 * free, True), (None, False)):
+        monkeypatch.setattr(data_manager, "free_memory", lambda memory=memory: memory)
+        config = LecoDataManagerConfig(pixels=tmp_path, **options(tiny_scene))
+        manager = config.setup(device="cpu")
+        assert isinstance(manager, LecoDataManager) and manager.on_disk() is expected
+        assert decoded_bytes(manager.train_dataset) == 7 * 32 * 32 * 12
+
+
+def test_a_sampler_that_needs_images_in_memory_is_named(tiny_scene: Path, tmp_path: Path) -> None:
+    config = on_disk(tiny_scene, tmp_path, pixel_sampler=PixelSamplerConfig())
+    with pytest.raises(InputError, match="pixel sampler") as caught:
+        config.setup(device="cpu")
+    assert "\n" not in str(caught.value)
+
+
+def test_free_memory_is_the_smaller_of_machine_and_container(tmp_path: Path) -> None:
+    machine = tmp_path / "meminfo"
+    machine.write_text("MemTotal: 900 kB\nMemAvailable: 500 kB\n")
+    assert free_memory(machine, tmp_path) == 500 * 1024
+    (tmp_path / "memory.max").write_text("100000\n")
+    (tmp_path / "memory.current").write_text("40000\n")
+    assert free_memory(machine, tmp_path) == 60000
+    (tmp_path / "memory.max").write_text("max\n")
+    assert free_memory(machine, tmp_path) == 500 * 1024
+    assert free_memory(tmp_path / "none", tmp_path / "none") is None
+
+
+def test_whole_images_are_refused_before_the_first_step(tiny_scene: Path) -> None:
+    config = FullImageDatamanagerConfig(
+        dataparser=LecoPhotographsDataParserConfig(data=tiny_scene), cache_images="cpu"
+    )
+    with pytest.raises(InputError, match="hands out whole images") as caught:
+        survey(config.setup(device="cpu"))
+    assert "\n" not in str(caught.value)
+
+
+def test_a_sampler_in_another_process_is_not_here() -> None:
+    here = SimpleNamespace(train_pixel_sampler="sampler")
+    assert sampler_here(here) == "sampler"
+    assert sampler_here(SimpleNamespace(train_pixel_sampler="copy", data_procs=[])) is None
+    assert sampler_here(SimpleNamespace()) is None
+
+
+@pytest.mark.slow
+def test_an_occupancy_is_learned_from_batches_of_other_processes(tiny_scene: Path) -> None:
+    report, manager = learned(ParallelDataManagerConfig(**options(tiny_scene)))
+    assert report["held_out"] and report["calibration_rays"] > 0
+    assert report["step"] == 5
+    for process in manager.data_procs:
+        process.terminate()
+        process.join()
+
+
+@pytest.mark.slow
+def test_an_occupancy_is_learned_from_some_images_at_a_time(tiny_scene: Path) -> None:
+    some = {"train_num_images_to_sample_from": 2, "train_num_times_to_repeat_images": 2}
+    report, _ = learned(VanillaDataManagerConfig(**options(tiny_scene), **some))
+    assert report["held_out"] and report["calibration_rays"] > 0
