@@ -96,6 +96,42 @@ def inspect(
     _write_json(json, facts)
 
 
+def export(
+    file: Annotated[Path, tyro.conf.Positional],
+    format: Literal["ply", "nerfacc-grid"],
+    out: Path,
+    resolution: int = 128,
+    levels: int | None = None,
+    json: Path | None = None,
+) -> None:
+    """Write an occupancy for other programs: kept points, or an occupancy grid of nerfacc.
+
+    Args:
+        file: An occupancy.safetensors.
+        format: ply is the surface of what is kept, coloured by o(x); nerfacc-grid is what
+            OccGridEstimator.load_state_dict takes, a cell marked where any of 27 points in it is
+            kept. A host that goes on updating such a grid replaces it by its own.
+        out: File to write.
+        resolution: Cells along the longest side of the space, or along each axis of a grid.
+        levels: Nested boxes of a grid, each twice as wide as the one inside it. By default one, or
+            as many as the rays of an unbounded scene reach.
+        json: File for what was written, as JSON.
+    """
+    from leco_plugin.export.command import export as write
+
+    _check_json(json)
+    facts = write(file, format, out, resolution, levels)
+    if format == "ply":
+        print(f"{out}: {facts['points']} points")
+    else:
+        print(
+            f"{out}: {facts['levels']} x {resolution}^3 cells, {facts['kept_share_of_cells']:.2%} "
+            "of them kept"
+        )
+        print(f"for OccGridEstimator({facts['aabbs'][0]}, {resolution}, {facts['levels']})")
+    _write_json(json, facts)
+
+
 def swap(
     method: Annotated[str, tyro.conf.Positional],
     occupancy: Path,
@@ -235,6 +271,7 @@ def check(name: Annotated[str, tyro.conf.Positional], json: Path | None = None) 
 COMMANDS: dict[str, Callable[..., None]] = {
     "city": city,
     "inspect": inspect,
+    "export": export,
     "swap": swap,
     "demo": demo,
     "chart": chart,
