@@ -132,6 +132,57 @@ def export(
     _write_json(json, facts)
 
 
+def shrink(
+    file: Annotated[Path, tyro.conf.Positional],
+    data: Path,
+    out: Path,
+    lost_surface_mass: float = 1e-3,
+    image_price: float = 0.05,
+    picture: Path | None = None,
+    json: Path | None = None,
+) -> None:
+    """Find the smallest gate that decides as a frozen one does, at a price measured on unseen rays.
+
+    Smaller gates are taught, from small to large, until one holds. Where the file lies in the folder
+    of its run, the run's trained model says what a dropped candidate was worth; without one the
+    loss is measured against what the original keeps.
+
+    Args:
+        file: An occupancy.safetensors, best where its run left it.
+        data: The scene that it was learned on.
+        out: File for the smaller occupancy.
+        lost_surface_mass: Most of the weight near surfaces that it may declare lost, the original's
+            share included.
+        image_price: Most dB that it may declare, the original's share included.
+        picture: File for a picture of the gates that were tried.
+        json: File for the gates that were tried and the one that was chosen, as JSON.
+    """
+    import warnings
+
+    # what nerfstudio and torch think of each other is nothing that a user can act on
+    warnings.filterwarnings("ignore", module=r"nerfstudio|torch")
+    from leco_plugin.shrink.command import shrink as find_smaller
+    from leco_plugin.shrink.search import Bounds
+
+    _check_json(json)
+    results = find_smaller(file, data, out, Bounds(lost_surface_mass, image_price))
+    before, after = results["from"], results["to"]
+    if "shrunk_from_params" not in after:
+        print("no smaller gate holds these bounds: this is the same gate, stored shorter")
+    print(
+        f"{out}: {before['bytes'] / 1000:.1f} kB before, {after['bytes'] / 1000:.1f} kB now; asked "
+        f"{results['query_speedup']:.1f} times faster; loses {after['lost_surface_mass']:.2e} of "
+        "the surface mass at most"
+    )
+    if "loss_measured_against" in after:
+        print(f"measured against {after['loss_measured_against']}")
+    if picture is not None:
+        from leco_plugin.shrink.picture import draw
+
+        print(f"drew {draw(results, picture)}")
+    _write_json(json, results)
+
+
 def swap(
     method: Annotated[str, tyro.conf.Positional],
     occupancy: Path,
@@ -272,6 +323,7 @@ COMMANDS: dict[str, Callable[..., None]] = {
     "city": city,
     "inspect": inspect,
     "export": export,
+    "shrink": shrink,
     "swap": swap,
     "demo": demo,
     "chart": chart,
