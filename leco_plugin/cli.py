@@ -5,9 +5,13 @@ from __future__ import annotations
 import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
 import tyro
+
+from leco_plugin.cli_capacity import capacity, export, shrink
+from leco_plugin.cli_reports import check_json as _check_json
+from leco_plugin.cli_reports import write_json as _write_json
 
 BAD_INPUT, FAILURE = 2, 1
 
@@ -94,93 +98,6 @@ def inspect(
         picture.parent.mkdir(parents=True, exist_ok=True)
         print(f"drew {draw(occupancy, picture)}")
     _write_json(json, facts)
-
-
-def export(
-    file: Annotated[Path, tyro.conf.Positional],
-    format: Literal["ply", "nerfacc-grid"],
-    out: Path,
-    resolution: int = 128,
-    levels: int | None = None,
-    json: Path | None = None,
-) -> None:
-    """Write an occupancy for other programs: kept points, or an occupancy grid of nerfacc.
-
-    Args:
-        file: An occupancy.safetensors.
-        format: ply is the surface of what is kept, coloured by o(x); nerfacc-grid is what
-            OccGridEstimator.load_state_dict takes, a cell marked where any of 27 points in it is
-            kept. A host that goes on updating such a grid replaces it by its own.
-        out: File to write.
-        resolution: Cells along the longest side of the space, or along each axis of a grid.
-        levels: Nested boxes of a grid, each twice as wide as the one inside it. By default one, or
-            as many as the rays of an unbounded scene reach.
-        json: File for what was written, as JSON.
-    """
-    from leco_plugin.export.command import export as write
-
-    _check_json(json)
-    facts = write(file, format, out, resolution, levels)
-    if format == "ply":
-        print(f"{out}: {facts['points']} points")
-    else:
-        print(
-            f"{out}: {facts['levels']} x {resolution}^3 cells, {facts['kept_share_of_cells']:.2%} "
-            "of them kept"
-        )
-        print(f"for OccGridEstimator({facts['aabbs'][0]}, {resolution}, {facts['levels']})")
-    _write_json(json, facts)
-
-
-def shrink(
-    file: Annotated[Path, tyro.conf.Positional],
-    data: Path,
-    out: Path,
-    lost_surface_mass: float = 1e-3,
-    image_price: float = 0.05,
-    picture: Path | None = None,
-    json: Path | None = None,
-) -> None:
-    """Find the smallest gate that decides as a frozen one does, at a price measured on unseen rays.
-
-    Smaller gates are taught, from small to large, until one holds. Where the file lies in the folder
-    of its run, the run's trained model says what a dropped candidate was worth; without one the
-    loss is measured against what the original keeps.
-
-    Args:
-        file: An occupancy.safetensors, best where its run left it.
-        data: The scene that it was learned on.
-        out: File for the smaller occupancy.
-        lost_surface_mass: Most of the weight near surfaces that it may declare lost, the original's
-            share included.
-        image_price: Most dB that it may declare, the original's share included.
-        picture: File for a picture of the gates that were tried.
-        json: File for the gates that were tried and the one that was chosen, as JSON.
-    """
-    import warnings
-
-    # what nerfstudio and torch think of each other is nothing that a user can act on
-    warnings.filterwarnings("ignore", module=r"nerfstudio|torch")
-    from leco_plugin.shrink.command import shrink as find_smaller
-    from leco_plugin.shrink.search import Bounds
-
-    _check_json(json)
-    results = find_smaller(file, data, out, Bounds(lost_surface_mass, image_price))
-    before, after = results["from"], results["to"]
-    if "shrunk_from_params" not in after:
-        print("no smaller gate holds these bounds: this is the same gate, stored shorter")
-    print(
-        f"{out}: {before['bytes'] / 1000:.1f} kB before, {after['bytes'] / 1000:.1f} kB now; asked "
-        f"{results['query_speedup']:.1f} times faster; loses {after['lost_surface_mass']:.2e} of "
-        "the surface mass at most"
-    )
-    if "loss_measured_against" in after:
-        print(f"measured against {after['loss_measured_against']}")
-    if picture is not None:
-        from leco_plugin.shrink.picture import draw
-
-        print(f"drew {draw(results, picture)}")
-    _write_json(json, results)
 
 
 def swap(
@@ -324,6 +241,7 @@ COMMANDS: dict[str, Callable[..., None]] = {
     "inspect": inspect,
     "export": export,
     "shrink": shrink,
+    "capacity": capacity,
     "swap": swap,
     "demo": demo,
     "chart": chart,
@@ -357,16 +275,3 @@ def _complain(error: BaseException, status: int) -> int:
 
 def _listed(values: Sequence[float]) -> str:
     return "(" + ", ".join(f"{value:.4g}" for value in values) + ")"
-
-
-def _check_json(path: Path | None) -> None:
-    """Before work that takes minutes, whether its report has a place."""
-    if path is not None and path.is_dir():
-        raise ValueError(f"--json {path} is a folder; give a file")
-
-
-def _write_json(path: Path | None, value: Any) -> None:
-    if path is not None:
-        from leco_plugin.evaluation.json_file import write_json
-
-        write_json(path, value)

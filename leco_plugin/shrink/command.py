@@ -178,3 +178,22 @@ def line_of(rung: Rung) -> str:
         f"{rung.lost_surface_mass:.1e}  {price} dB  keeps {rung.kept_volume:>6.1%} of the "
         f"original's volume  {rung.verdict}"
     )
+
+
+def summary(results: dict[str, Any], out: Path) -> list[str]:
+    """The outcome in a few lines, for the terminal."""
+    before, after = results["from"], results["to"]
+    lines = []
+    if "shrunk_from_params" not in after:
+        lines.append("no smaller gate holds these bounds: this is the same gate, stored shorter")
+    lines.append(
+        f"{out}: {before['bytes'] / 1000:.1f} kB before, {after['bytes'] / 1000:.1f} kB now; asked "
+        f"{results['query_speedup']:.1f} times faster"
+    )
+    lost, price = after.get("lost_surface_mass"), after.get("image_price_db")
+    if lost is not None:
+        cost = "" if price is None else f" and {price:+.3f} dB"
+        lines.append(f"declares {lost:.2e} of the surface mass{cost}, the original's included")
+    if "loss_measured_against" in after:
+        lines.append(f"measured against {after['loss_measured_against']}")
+    return lines

@@ -56,13 +56,20 @@ class Rendered(NamedTuple):
 
 
 @torch.no_grad()
-def gather(source: Source, occupancy: Occupancy, seen: Seen) -> tuple[Evidence, list[Rendered]]:
-    """The candidates of some rays with their worth; no renderings where there is no model."""
+def gather(
+    source: Source, occupancy: Occupancy | None, seen: Seen
+) -> tuple[Evidence, list[Rendered]]:
+    """The candidates of some rays with their worth; no renderings where there is no model.
+
+    Args:
+        occupancy: the original; None keeps every candidate, for a model that was trained on all.
+    """
     pieces, rendered = [], []
     for first in range(0, len(seen.truth), RAYS_AT_ONCE):
         part = slice(first, first + RAYS_AT_ONCE)
         rays = Rays._make(None if value is None else value[part] for value in seen.rays)
         if source.model is None:
+            assert occupancy is not None
             piece = _by_decisions(occupancy, rays)
         else:
             truth = source.model.renderer_rgb.blend_background(seen.truth[part])
@@ -81,12 +88,14 @@ def middles(rays: Rays, intervals: Intervals) -> Tensor:
 
 
 def _by_rendering(
-    model: LecoModel, occupancy: Occupancy, rays: Rays, truth: Tensor
+    model: LecoModel, occupancy: Occupancy | None, rays: Rays, truth: Tensor
 ) -> tuple[Evidence, Rendered]:
     intervals = model.intervals_of(rays, guided=False, learning=False)
     positions = middles(rays, intervals)
     is_backdrop = backdrop_of(intervals, rays)
-    kept = occupancy.occupied(positions) & ~is_backdrop
+    kept = ~is_backdrop
+    if occupancy is not None:
+        kept &= occupancy.occupied(positions)
     guided = Intervals(*(part[kept | is_backdrop] for part in intervals))
     shaded = model.shade(rays, guided)
     weights = torch.zeros_like(intervals.t_starts)

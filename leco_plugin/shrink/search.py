@@ -151,8 +151,8 @@ def room_beyond(original: Occupancy, bounds: Bounds) -> Bounds:
     lost, price = (float(value) if isinstance(value, int | float) else 0.0 for value in declared)
     if lost >= bounds.lost_surface_mass:
         raise ValueError(
-            f"the occupancy itself declares a lost surface mass of {lost:.2e}, which leaves nothing "
-            f"of {bounds.lost_surface_mass:.2e}: raise --lost-surface-mass"
+            f"the occupancy itself declares a lost surface mass of {lost:.2e}, which leaves "
+            f"nothing of {bounds.lost_surface_mass:.2e}: raise --lost-surface-mass"
         )
     if price >= bounds.image_price_db:
         raise ValueError(

@@ -63,7 +63,10 @@ def _of_run(folder: Path, data: Path) -> Source | None:
     from nerfstudio.utils.eval_utils import eval_load_checkpoint
 
     # as ns-eval reads it
-    config = yaml.load((folder / CONFIG).read_text(), Loader=yaml.Loader)
+    try:
+        config = yaml.load((folder / CONFIG).read_text(), Loader=yaml.Loader)
+    except (yaml.YAMLError, ImportError, AttributeError) as error:
+        raise InputError(f"{folder / CONFIG} cannot be read: {_line(error)}") from None
     if not issubclass(config.pipeline.model._target, LecoModel):
         return None
     config.load_dir = folder / CHECKPOINTS
@@ -73,9 +76,14 @@ def _of_run(folder: Path, data: Path) -> Source | None:
         pipeline = config.pipeline.setup(device=_device(), test_mode="test")
         eval_load_checkpoint(config, pipeline)
     except (RuntimeError, KeyError) as error:
-        line = " ".join(str(error).split())[:200]
-        raise InputError(f"the model of the run in {folder} cannot be loaded: {line}") from None
+        raise InputError(
+            f"the model of the run in {folder} cannot be loaded: {_line(error)}"
+        ) from None
     return Source(pipeline.datamanager, pipeline.model.eval())
+
+
+def _line(error: BaseException) -> str:
+    return " ".join(str(error).split())[:200]
 
 
 def _photographs(data: Path) -> Any:
