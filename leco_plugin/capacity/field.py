@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, NamedTuple
@@ -52,7 +53,7 @@ def prepare(data: Path, folder: Path, learn_steps: int) -> Ground:
     torch.manual_seed(0)
     config: Any = copy.deepcopy(leco_occupancy.config.pipeline)
     config.datamanager.data = data
-    config.model.schedule.learn_steps = learn_steps
+    config.model.schedule = replace(config.model.schedule, learn_steps=learn_steps)
     device = best_device()
     manager = config.datamanager.setup(device=device, test_mode="val")
     stored = folder / FIELD

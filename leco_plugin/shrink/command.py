@@ -134,6 +134,7 @@ def report_of(original: Occupancy, ground: Ground, found: Found) -> dict[str, An
         "shrunk_from_params": original.num_params,
         "loss_measured_against": reference,
         "lost_beyond_the_original": measured["lost_surface_mass"],
+        "kept_candidates_dropped": measured["kept_candidates_dropped"],
         "kept_volume_of_the_original": found.rungs[-1].kept_volume,
     }
 

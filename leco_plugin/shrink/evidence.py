@@ -76,8 +76,15 @@ def gather(
             piece, again = _by_rendering(source.model, occupancy, rays, truth)
             rendered.append(again)
         pieces.append(piece._replace(ray_indices=piece.ray_indices + first))
-    *columns, counts = zip(*pieces)
-    return Evidence(*(torch.cat(column) for column in columns), sum(counts)), rendered
+    joined = Evidence(
+        torch.cat([piece.positions for piece in pieces]),
+        torch.cat([piece.ray_indices for piece in pieces]),
+        torch.cat([piece.kept for piece in pieces]),
+        torch.cat([piece.weights for piece in pieces]),
+        torch.cat([piece.worth for piece in pieces]),
+        sum(piece.rays for piece in pieces),
+    )
+    return joined, rendered
 
 
 def middles(rays: Rays, intervals: Intervals) -> Tensor:

@@ -25,6 +25,7 @@ def draw(results: Mapping[str, Any], path: Path, theme: Theme = LIGHT) -> Path:
     from matplotlib import rc_context
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
+    from matplotlib.ticker import NullFormatter, StrMethodFormatter
 
     rungs = results["rungs"]
     parts = ("text.color", "axes.labelcolor", "axes.edgecolor", "xtick.color", "ytick.color")
@@ -52,11 +53,21 @@ def draw(results: Mapping[str, Any], path: Path, theme: Theme = LIGHT) -> Path:
                 textcoords="offset points",
                 fontsize=9.5,
             )
-        axes.axhline(
-            results["bounds"]["lost_surface_mass"], color=theme.ink, linestyle="--", linewidth=1
+        allowed = results["bounds"]["lost_surface_mass"]
+        axes.axhline(allowed, color=theme.ink, linestyle="--", linewidth=1)
+        axes.annotate(
+            "allowed",
+            (1.0, allowed),
+            xycoords=("axes fraction", "data"),
+            xytext=(-4, 4),
+            textcoords="offset points",
+            ha="right",
         )
         axes.set(xscale="log", yscale="log", xlabel="kB of weights", ylabel="lost surface mass")
         axes.set_xlim(0.7 * min(sizes), 3.5 * max(sizes))
+        axes.margins(y=0.12)
+        axes.xaxis.set_major_formatter(StrMethodFormatter("{x:g}"))
+        axes.xaxis.set_minor_formatter(NullFormatter())
         plain(axes, theme)
         axes.set_title(headline(results), loc="left", fontsize=13, fontweight="bold")
         path.parent.mkdir(parents=True, exist_ok=True)

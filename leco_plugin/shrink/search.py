@@ -222,6 +222,9 @@ def _verified(ground: Ground, smaller: Occupancy, room: Bounds, rung: Rung) -> b
         "lost_mass": unseen.lost_mass,
         "image_price_db": price,
         "empty_fraction": float(skipped.double().mean()),
+        "kept_candidates_dropped": float(
+            (skipped & ground.verify.kept).sum() / ground.verify.kept.sum().clamp(min=1)
+        ),
     }
     return unseen.bound <= room.lost_surface_mass and (price or 0.0) <= room.image_price_db
 
