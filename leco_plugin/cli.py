@@ -5,9 +5,13 @@ from __future__ import annotations
 import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
 import tyro
+
+from leco_plugin.cli_capacity import capacity, export, shrink
+from leco_plugin.cli_reports import check_json as _check_json
+from leco_plugin.cli_reports import write_json as _write_json
 
 BAD_INPUT, FAILURE = 2, 1
 
@@ -243,6 +247,9 @@ def check(name: Annotated[str, tyro.conf.Positional], json: Path | None = None) 
 COMMANDS: dict[str, Callable[..., None]] = {
     "city": city,
     "inspect": inspect,
+    "export": export,
+    "shrink": shrink,
+    "capacity": capacity,
     "swap": swap,
     "demo": demo,
     "chart": chart,
@@ -276,16 +283,3 @@ def _complain(error: BaseException, status: int) -> int:
 
 def _listed(values: Sequence[float]) -> str:
     return "(" + ", ".join(f"{value:.4g}" for value in values) + ")"
-
-
-def _check_json(path: Path | None) -> None:
-    """Before work that takes minutes, whether its report has a place."""
-    if path is not None and path.is_dir():
-        raise ValueError(f"--json {path} is a folder; give a file")
-
-
-def _write_json(path: Path | None, value: Any) -> None:
-    if path is not None:
-        from leco_plugin.evaluation.json_file import write_json
-
-        write_json(path, value)

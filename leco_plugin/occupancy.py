@@ -98,6 +98,9 @@ class Occupancy(nn.Module):
     def save(self, path: str | Path) -> None:
         """Writes the file whole or not at all.
 
+        Tensors of the gate whose values bfloat16 holds exactly are stored in it, so that a gate
+        that was rounded to it (`leco shrink`) takes half the bytes and nothing changes in any.
+
         Raises:
             OSError: the folder cannot be written to, or the disk is full.
             ValueError: this is nothing that `load` would take; no file is written.
@@ -111,7 +114,7 @@ class Occupancy(nn.Module):
             "report": json.dumps(self.report),
         }
         state = self.state_dict()
-        tensors = {name: value.detach().cpu().contiguous() for name, value in state.items()}
+        tensors = {name: _packed(name, value) for name, value in state.items()}
         _check_values(path, tensors)
         header["sha256"] = _digest(header, tensors)
         unfinished = path.with_name(f".{path.name}.{os.getpid()}.unfinished")
@@ -165,7 +168,7 @@ class Occupancy(nn.Module):
             raise ValueError(f"{path} has a damaged header: {_line(error)}") from None
         found = {name: (tuple(tensor.shape), tensor.dtype) for name, tensor in tensors.items()}
         for name in sorted(expected.keys() | found.keys()):
-            if expected.get(name) != found.get(name):
+            if not _fits(name, expected.get(name), found.get(name)):
                 raise ValueError(
                     f"{path}: tensor {name!r} is {found.get(name)}, "
                     f"the header asks for {expected.get(name)}"
@@ -228,7 +231,29 @@ def _digest(header: dict[str, str], tensors: dict[str, Tensor]) -> str:
     return digest.hexdigest()
 
 
-def _expected_shapes(config: GateConfig) -> dict[str, tuple[tuple[int, ...], torch.dtype]]:
+_Described = tuple[tuple[int, ...], torch.dtype]
+OF_GATE = "gate."
+"""How the names of the gate's tensors begin."""
+
+
+def _packed(name: str, value: Tensor) -> Tensor:
+    """A tensor as it is stored: of the gate's, those that lose nothing by it in bfloat16."""
+    value = value.detach().cpu().contiguous()
+    if name.startswith(OF_GATE) and value.dtype == torch.float32:
+        short = value.bfloat16()
+        if torch.equal(short.float(), value):
+            return short
+    return value
+
+
+def _fits(name: str, wanted: _Described | None, found: _Described | None) -> bool:
+    """Whether a stored tensor is the one that is wanted."""
+    if wanted is None or found is None or not name.startswith(OF_GATE):
+        return wanted == found
+    return wanted[0] == found[0] and found[1] in (wanted[1], torch.bfloat16)
+
+
+def _expected_shapes(config: GateConfig) -> dict[str, _Described]:
     """Names, shapes and types that a file with this gate must hold, found without allocating it."""
     check_sizes(config)
     with torch.device("meta"):

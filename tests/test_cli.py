@@ -48,6 +48,18 @@ def test_inspect_says_draws_and_writes(
     assert facts["report"]["empty_fraction"] == 0.9
 
 
+@pytest.mark.parametrize("format", ["ply", "nerfacc-grid"])
+def test_export_writes_a_file_and_says_what_is_in_it(
+    format: str, file: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out, report = tmp_path / "new" / "exported", tmp_path / "exported.json"
+    arguments = ["--format", format, "--resolution", 16, "--out", out, "--json", report]
+    assert run("export", file, *arguments) == 0
+    facts = json.loads(report.read_text())
+    assert facts["written"] == format and facts["bytes"] == out.stat().st_size > 1000
+    assert ("points" if format == "ply" else "16^3") in capsys.readouterr().out
+
+
 def test_city_writes_a_scene_and_says_so(tmp_path: Path) -> None:
     out, report = tmp_path / "city", tmp_path / "city.json"
     assert run("city", "--blocks", 1, "--out", out, "--json", report) == 0
@@ -116,6 +128,20 @@ def bad_inputs(folder: Path, file: Path) -> dict[str, list[object]]:
         "a truncated file": ["inspect", folder / "cut.safetensors"],
         "an unknown kind of picture": ["inspect", file, "--picture", folder / "picture.xyz"],
         "json where a folder is": ["inspect", file, "--json", folder / "taken"],
+        "points with levels": [
+            *("export", file, "--format", "ply", "--levels", 2, "--out", folder / "kept.ply")
+        ],
+        "no cells": [
+            *("export", file, "--format", "nerfacc-grid", "--resolution", 0),
+            *("--out", folder / "grid.pt"),
+        ],
+        "an export where a folder is": [
+            *("export", file, "--format", "ply", "--out", folder / "taken")
+        ],
+        "an export of a foreign file": [
+            *("export", folder / "text.safetensors", "--format", "ply"),
+            *("--out", folder / "kept.ply"),
+        ],
         "no blocks": ["city", "--blocks", 0, "--out", folder / "city"],
         "a block too small": ["city", "--block-size", 3, "--out", folder / "city"],
         "no width": ["city", "--width", 0, "--out", folder / "city"],

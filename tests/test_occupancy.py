@@ -74,6 +74,21 @@ def test_a_loaded_occupancy_decides_as_the_saved_one(kind, precision, tmp_path: 
     assert not any(parameter.requires_grad for parameter in loaded.parameters())
 
 
+@pytest.mark.parametrize("kind", GATES)
+def test_a_gate_that_bfloat16_holds_exactly_takes_half_the_bytes(kind, tmp_path: Path) -> None:
+    full, rounded = occupancy(kind), occupancy(kind)
+    for parameter in rounded.gate.parameters():
+        parameter.data = parameter.data.bfloat16().float()
+    long, short = content_of(full, tmp_path), content_of(rounded, tmp_path)
+    assert len(long) - len(short) > 1.9 * (full.num_params - 3 * 8)  # but for the norm of ones
+    loaded = Occupancy.load(tmp_path / "occupancy.safetensors")
+    positions = torch.randn(2000, 3) * 3
+    assert torch.equal(loaded.query(positions), rounded.query(positions))
+    assert all(parameter.dtype == torch.float32 for parameter in loaded.gate.parameters())
+    loaded.save(tmp_path / "again.safetensors")
+    assert (tmp_path / "again.safetensors").stat().st_size == len(short)
+
+
 def test_outside_a_box_and_where_a_position_is_not_finite_space_is_empty() -> None:
     boxed = Occupancy(Gate(GATES["frequency"]), Space("box"), 0.0)
     nowhere = torch.tensor([[1.01, 0.0, 0.0], [float("nan"), 0.0, 0.0], [0.0, float("inf"), 0.0]])

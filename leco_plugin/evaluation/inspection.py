@@ -98,3 +98,19 @@ def query(occupancy: Occupancy, positions: Tensor) -> Tensor:
         occupancy.query(part.to(device)).cpu() for part in positions.reshape(-1, 3).split(1 << 16)
     ]
     return torch.cat(parts).reshape(positions.shape[:-1])
+
+
+def exposed(kept: Tensor, beyond: bool = False) -> Tensor:
+    """Kept cells of which one of the six neighbours is not; bool [X, Y, Z], and of that shape.
+
+    Args:
+        beyond: whether what lies beyond the cells counts as kept.
+    """
+    skipped = torch.nn.functional.pad(~kept, (1, 1) * 3, value=not beyond)
+    found = torch.zeros_like(kept)
+    for axis in range(3):
+        for side in (0, 2):
+            window = [slice(1, -1)] * 3
+            window[axis] = slice(side, side - 2 or None)
+            found |= skipped[tuple(window)]
+    return kept & found

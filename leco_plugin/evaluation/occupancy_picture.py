@@ -9,7 +9,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from leco_plugin.evaluation.inspection import ViewBox, cameras_of, query, whole_box
+from leco_plugin.evaluation.inspection import ViewBox, cameras_of, exposed, query, whole_box
 from leco_plugin.occupancy import Occupancy
 
 SEARCH_CELLS = 64
@@ -152,15 +152,8 @@ def heights_seen_from_above(occupancy: Occupancy, box: ViewBox) -> tuple[float, 
 def surface_points(occupancy: Occupancy, box: ViewBox, lowest: float) -> tuple[Tensor, Tensor]:
     """Kept positions next to skipped ones, and the directions [P, 3] in which o(x) falls there."""
     values, positions, kept = _kept_cells(occupancy, box, CELLS)
-    skipped = torch.nn.functional.pad(~kept, (1, 1) * 3)
-    exposed = torch.zeros_like(kept)
-    for axis in range(3):
-        for side in (0, 2):
-            window = [slice(1, -1)] * 3
-            window[axis] = slice(side, side - 2 or None)
-            exposed |= skipped[tuple(window)]
     margin = 2.0 * float((box.high - box.low).max()) / CELLS
-    chosen = (kept & exposed & (positions[..., 2] > lowest - margin)).nonzero()
+    chosen = (exposed(kept, beyond=True) & (positions[..., 2] > lowest - margin)).nonzero()
     order = torch.randperm(len(chosen), generator=torch.Generator().manual_seed(0))
     chosen = chosen[order[:MOST_POINTS]]
     falls = -torch.stack(torch.gradient(values), dim=-1)

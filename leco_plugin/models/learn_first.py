@@ -10,7 +10,7 @@ import torch
 from nerfstudio.engine.callbacks import TrainingCallbackAttributes
 from torch import nn
 
-from leco_plugin.models.leco import LecoModelConfig
+from leco_plugin.models.leco import LecoModel, LecoModelConfig
 from leco_plugin.models.lifecycle import Lifecycle
 from leco_plugin.models.optimizers import RATES, FusedAdamConfig
 from leco_plugin.models.ranks import averaging, mean
@@ -28,6 +28,20 @@ def learn_occupancy(
 ) -> Occupancy:
     """Trains an HMoE on the pipeline's data until its gate is frozen and calibrated.
 
+    Arguments and errors as for `learn_model`.
+
+    Returns:
+        The occupancy, in the coordinates of the pipeline's model.
+    """
+    occupancy: Occupancy = learn_model(config, pipeline, rays, seconds).occupancy()
+    return occupancy.eval()
+
+
+def learn_model(
+    config: LecoModelConfig, pipeline: Any, rays: int, seconds: float | None = None
+) -> LecoModel:
+    """Trains an HMoE on the pipeline's data until its gate is frozen, field and all.
+
     All processes of a data-parallel run learn it together, and have the same at the end.
 
     Args:
@@ -37,7 +51,7 @@ def learn_occupancy(
         rays: of a batch.
         seconds: how long this may take at most, about; None takes the config's learning steps.
     Returns:
-        The occupancy, in the coordinates of the pipeline's model.
+        The model as it is at the moment of freezing.
     Raises:
         ValueError: the budget is no positive number of seconds.
         FloatingPointError, RuntimeError: learning failed; one line says where and why.
@@ -68,8 +82,8 @@ def learn_occupancy(
     finally:
         if sampler is not None:
             sampler.set_num_rays_per_batch(before)
-    occupancy: Occupancy = model.occupancy()
-    return occupancy.eval()
+    learned: LecoModel = model
+    return learned
 
 
 def steps_within(more: float, done: int, most: int) -> int:

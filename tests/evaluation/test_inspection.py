@@ -11,7 +11,7 @@ import torch
 from ball_occupancy import CENTRE, HALF, RADIUS, ball
 from PIL import Image
 
-from leco_plugin.evaluation.inspection import cameras_of, describe, whole_box
+from leco_plugin.evaluation.inspection import cameras_of, describe, exposed, whole_box
 from leco_plugin.evaluation.occupancy_picture import draw, interesting_box, surface_points
 from leco_plugin.occupancy import Occupancy
 
@@ -72,3 +72,15 @@ def test_a_picture_is_made_whatever_is_kept(tmp_path: Path, threshold: float) ->
     occupancy = Occupancy(known.gate, known.space, threshold, report=known.report)
     image = np.asarray(Image.open(draw(occupancy, tmp_path / "picture.png")).convert("L"))
     assert min(image.shape) > 600 and image.std() > 30
+
+
+def test_exposed_cells_are_those_with_a_skipped_neighbour() -> None:
+    kept = torch.rand(5, 6, 7, generator=torch.Generator().manual_seed(0)) < 0.8
+    found, open_ended = exposed(kept), exposed(kept, beyond=True)
+    for x, y, z in np.ndindex(*kept.shape):
+        beside = [(x + d, y, z) for d in (-1, 1)]
+        beside += [(x, y + d, z) for d in (-1, 1)] + [(x, y, z + d) for d in (-1, 1)]
+        inside = [p for p in beside if all(0 <= a < n for a, n in zip(p, kept.shape))]
+        free = not all(bool(kept[p]) for p in inside)
+        assert bool(open_ended[x, y, z]) == (bool(kept[x, y, z]) and free)
+        assert bool(found[x, y, z]) == (bool(kept[x, y, z]) and (free or len(inside) < 6))

@@ -52,6 +52,18 @@ def test_frequencies_are_those_of_the_definition() -> None:
     torch.testing.assert_close(encoding(x), expected, rtol=0, atol=1e-5)  # scales are float32
 
 
+def test_doubled_octaves_are_as_exact_as_their_angles() -> None:
+    x = torch.rand(5000, 3) * 2 - 1
+    encoding = build_encoding(EncodingConfig(octaves=12))
+    angles = (x[:, None, :] * encoding.scales[:, None]).flatten(1)
+    direct = torch.cat([x, angles.sin(), angles.cos()], dim=-1)
+    exact = build_encoding(EncodingConfig(octaves=12)).double()
+    exact.scales.copy_(math.pi * 2.0 ** torch.arange(12, dtype=torch.float64))
+    truth = exact(x.double())
+    error, bound = (encoding(x) - truth).abs().max(), (direct - truth).abs().max()
+    assert float(error) < 1.5 * float(bound) < 1e-3
+
+
 def test_hash_features_are_those_of_the_definition() -> None:
     encoding, x = hash_encoding(), torch.rand(40, 3) * 2 - 1
     x = torch.cat([x, torch.tensor([[-1.0] * 3, [1.0] * 3, [0.0] * 3])])

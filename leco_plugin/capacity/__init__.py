@@ -1,0 +1,1 @@
+"""`leco capacity`: how much does this scene need?"""

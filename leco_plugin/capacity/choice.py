@@ -1,0 +1,68 @@
+"""Which representation a scene needs, and the sentence that says so."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from leco_plugin.capacity.measuring import VOLUMES
+
+TOLERANCE = 1.05
+"""Kept volume that counts as no more than another's."""
+NAMES = {
+    "frequency": "gate on frequencies",
+    "hash": "gate on a hash grid",
+    "vm": "gate on TensoRF's products",
+    "k-planes": "gate on K-planes",
+    "grid": "occupancy grid",
+}
+
+
+def choose(rows: Sequence[Mapping[str, Any]]) -> Mapping[str, Any]:
+    """Of those that keep next to the least volume at the same loss, the one of fewest bytes."""
+    least = min(row["kept_volume"] for row in rows)
+    enough = [row for row in rows if row["kept_volume"] <= TOLERANCE * least]
+    return min(enough, key=lambda row: row["bytes"])
+
+
+def smallest_grid(
+    rows: Sequence[Mapping[str, Any]], chosen: Mapping[str, Any]
+) -> Mapping[str, Any] | None:
+    """The smallest grid that keeps no more than what was chosen; None where none does."""
+    limit = TOLERANCE * chosen["kept_volume"]
+    enough = [row for row in rows if row["family"] == "grid" and row["kept_volume"] <= limit]
+    return min(enough, key=lambda row: row["bytes"], default=None)
+
+
+def verdict(rows: Sequence[Mapping[str, Any]]) -> str:
+    """What the scene needs, in a sentence or two."""
+    chosen = choose(rows)
+    kept = f"keeps {chosen['kept_volume']:.1%} of the volume"
+    if chosen["family"] == "grid":
+        return (
+            f"A grid suffices: {chosen['size']}^3 cells, {kilobytes(chosen)}, {kept}; no gate that "
+            "keeps as little is smaller."
+        )
+    said = f"A {NAMES[chosen['family']]} of {kilobytes(chosen)} {kept}."
+    if not any(row["family"] == "grid" for row in rows):
+        return said
+    grid = smallest_grid(rows, chosen)
+    if grid is None:
+        finest = max((int(row["size"]) for row in rows if row["family"] == "grid"), default=0)
+        return f"{said} No grid up to {finest}^3 keeps as little."
+    return (
+        f"{said} A grid that keeps as little takes {grid['size']}^3 cells, "
+        f"{grid['bytes'] / chosen['bytes']:.0f} times as many bytes."
+    )
+
+
+def common_volume(rows: Sequence[Mapping[str, Any]]) -> int:
+    """Number of the volume of `VOLUMES` at which losses are compared: what the chosen one keeps."""
+    kept = choose(rows)["kept_volume"]
+    return min(range(len(VOLUMES)), key=lambda i: abs(VOLUMES[i] / kept - 1.0))
+
+
+def kilobytes(row: Mapping[str, Any]) -> str:
+    """Bytes as they are read."""
+    size = row["bytes"]
+    return f"{size / 1000:.1f} kB" if size < 1e6 else f"{size / 1e6:.1f} MB"

@@ -1,0 +1,140 @@
+"""`leco capacity`: from the words on the command line to the picture."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from nerfstudio.utils.rich_utils import CONSOLE
+
+from leco_plugin.capacity.choice import choose, kilobytes, verdict
+from leco_plugin.capacity.field import prepare
+from leco_plugin.capacity.grids import fits_memory
+from leco_plugin.capacity.measuring import Candidate, gates, grids, of_gate, of_grids
+from leco_plugin.capacity.picture import draw
+from leco_plugin.chart.theme import DARK, LIGHT
+from leco_plugin.evaluation.json_file import write_json
+from leco_plugin.evaluation.machine import describe_machine
+from leco_plugin.progress_bar import bar
+from leco_plugin.scenes.input_error import InputError
+
+SETTINGS, POINTS = "settings.json", "points"
+
+
+def capacity(
+    data: Path,
+    out: Path,
+    resolutions: Sequence[int] = (32, 64, 128, 256, 512),
+    lost_surface_mass: float = 1e-3,
+    learn_steps: int = 200,
+    gate_candidates: Sequence[Candidate] | None = None,
+) -> dict[str, Any]:
+    """Teaches and measures what is missing in a folder, and draws all of it.
+
+    Args:
+        data: the scene in nerfstudio's format.
+        out: the folder; what is finished stays there whenever this is stopped.
+        resolutions: of grids; those that do not fit the memory are left out.
+        lost_surface_mass: at which kept volumes are compared.
+        learn_steps: of the field.
+        gate_candidates: `gates()` by default.
+    Returns:
+        The results, as in `results.json`.
+    Raises:
+        ValueError, OSError: a folder or a size is wrong; nothing was started.
+    """
+    if not 0.0 < lost_surface_mass < 0.5:
+        raise ValueError(f"a lost surface mass lies between 0 and 0.5, not at {lost_surface_mass}")
+    if learn_steps < 1 or any(n < 2 for n in resolutions):
+        raise ValueError("a field is learned in one step or more, a grid has 2 cells or more")
+    if not data.is_dir():
+        raise InputError(f"--data {data}: there is no such folder")
+    _settle(
+        out,
+        {
+            "data": data.resolve().name,
+            "lost_surface_mass": lost_surface_mass,
+            "learn_steps": learn_steps,
+        },
+    )
+    wanted = list(gates() if gate_candidates is None else gate_candidates)
+    fitting = [n for n in resolutions if fits_memory(n)]
+    for n in sorted(set(resolutions) - set(fitting)):
+        CONSOLE.print(f"a grid of {n}^3 cells does not fit the free memory; it is left out")
+    of_cells = grids(tuple(fitting))
+    ground = prepare(data, out, learn_steps)
+    rows: list[dict[str, Any]] = []
+    with bar("Teaching representations") as show:
+        for number, candidate in enumerate(wanted):
+            row = _stored(out, candidate)
+            rows.append(
+                row or _store(out, candidate, of_gate(ground, candidate, lost_surface_mass))
+            )
+            show((number + 1) / (len(wanted) + len(of_cells)))
+        stored = [_stored(out, candidate) for candidate in of_cells]
+        if all(row is not None for row in stored):
+            rows += [row for row in stored if row is not None]
+        else:  # each grid is refined from the one before
+            filling = of_grids(ground, of_cells, lost_surface_mass)
+            for number, (candidate, row) in enumerate(filling):
+                rows.append(_store(out, candidate, row))
+                show((len(wanted) + number + 1) / (len(wanted) + len(of_cells)))
+    manager_images = int(ground.model.num_train_data)
+    results = {
+        "format": 1,
+        "machine": describe_machine(),
+        "scene": {"name": data.resolve().name, "train_images": manager_images},
+        "lost_surface_mass": lost_surface_mass,
+        "learn_steps": learn_steps,
+        "rays": ground.held_out.rays,
+        "representations": rows,
+        "chosen": dict(choose(rows)),
+        "verdict": verdict(rows),
+    }
+    write_json(out / "results.json", results)
+    draw(results, out / "capacity.png", LIGHT)
+    draw(results, out / "capacity-dark.png", DARK)
+    return results
+
+
+def _settle(out: Path, settings: dict[str, Any]) -> None:
+    """Whether a folder may hold points of these settings.
+
+    Raises:
+        InputError: it holds something else, or points of other settings.
+    """
+    file = out / SETTINGS
+    if file.exists():
+        found = json.loads(file.read_text())
+        names = [name for name, value in settings.items() if found.get(name) != value]
+        if names:
+            raise InputError(
+                f"{out} holds points with another {names[0].replace('_', ' ')} "
+                f"({found.get(names[0])}, not {settings[names[0]]}); name a new folder with --out"
+            )
+    elif out.exists() and (not out.is_dir() or any(out.iterdir())):
+        raise InputError(f"{out} holds something else; name a new folder with --out")
+    else:
+        write_json(file, settings)
+
+
+def _stored(out: Path, candidate: Candidate) -> dict[str, Any] | None:
+    file = out / POINTS / f"{candidate.key}.json"
+    row: dict[str, Any] | None = json.loads(file.read_text()) if file.exists() else None
+    return row
+
+
+def _store(out: Path, candidate: Candidate, row: dict[str, Any]) -> dict[str, Any]:
+    write_json(out / POINTS / f"{candidate.key}.json", row)
+    CONSOLE.print(line_of(row), markup=False, highlight=False)
+    return row
+
+
+def line_of(row: dict[str, Any]) -> str:
+    """A representation as a line of the table."""
+    return (
+        f"{row['family']:<10} {row['size']:<10} {kilobytes(row):>10}  keeps "
+        f"{row['kept_volume']:>6.2%} of the volume"
+    )

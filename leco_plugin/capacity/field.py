@@ -1,0 +1,108 @@
+"""The one trained field that teaches all representations, and what they are measured on."""
+
+from __future__ import annotations
+
+import copy
+from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any, NamedTuple
+
+import torch
+from torch import Tensor
+
+from leco_plugin.evaluation.inspection import ViewBox, whole_box
+from leco_plugin.models.leco import LecoModel
+from leco_plugin.models.losses import widen
+from leco_plugin.models.objective import GateLossConfig
+from leco_plugin.scenes.input_error import InputError
+from leco_plugin.scenes.whole_files import write_whole
+from leco_plugin.shrink.evidence import Evidence, gather
+from leco_plugin.shrink.sources import Source, held_out, trained_on
+from leco_plugin.shrink.teaching import Lesson
+
+FIELD = "field.pt"
+RAYS, TAUGHT_RAYS = 8192, 6144
+VOLUME_POINTS = 1 << 17
+
+
+class Ground(NamedTuple):
+    """What every representation is taught and measured on."""
+
+    model: LecoModel
+    lesson: Lesson
+    held_out: Evidence
+    """Dense candidates of pixels that nothing was trained on."""
+    mapped: Tensor
+    """[M, 3] of those candidates, in [-1, 1]."""
+    volume: Tensor
+    """[P, 3] mapped, spread evenly over the scene's box."""
+
+
+def prepare(data: Path, folder: Path, learn_steps: int) -> Ground:
+    """Learns the field, or loads the one that an earlier call left, and renders rays with it.
+
+    Raises:
+        InputError: `data` is no folder.
+    """
+    if not data.is_dir():
+        raise InputError(f"--data {data}: there is no such folder")
+    from leco_plugin.method_configs import best_device, leco_occupancy
+    from leco_plugin.models.learn_first import learn_model
+
+    torch.manual_seed(0)
+    config: Any = copy.deepcopy(leco_occupancy.config.pipeline)
+    config.datamanager.data = data
+    config.model.schedule = replace(config.model.schedule, learn_steps=learn_steps)
+    device = best_device()
+    manager = config.datamanager.setup(device=device, test_mode="val")
+    stored = folder / FIELD
+    if stored.exists():
+        dataset = manager.train_dataset
+        model: LecoModel = config.model.setup(
+            scene_box=dataset.scene_box,
+            num_train_data=len(dataset),
+            metadata=dataset.metadata,
+            device=device,
+        ).to(device)
+        model.load_state_dict(torch.load(stored, map_location=device, weights_only=True))
+    else:
+        pipeline = SimpleNamespace(datamanager=manager, device=torch.device(device))
+        rays = config.datamanager.train_num_rays_per_batch
+        model = learn_model(config.model, pipeline, rays)
+        write_whole(stored, lambda file: torch.save(model.state_dict(), file))
+    return _ground(Source(manager, model.eval()))
+
+
+def _ground(source: Source) -> Ground:
+    model = source.model
+    assert model is not None
+    occupancy = model.occupancy().eval()
+    taught, _ = gather(source, None, trained_on(source, occupancy, TAUGHT_RAYS))
+    measured, _ = gather(source, None, held_out(source, occupancy, RAYS, parts=1)[0])
+    box = whole_box(occupancy)
+    unit = torch.rand(VOLUME_POINTS, 3, generator=torch.Generator().manual_seed(5))
+    positions = torch.lerp(box.low, box.high, unit).to(model.device)
+
+    def mapped(places: Tensor) -> Tensor:
+        return model.space.map(places).clamp(-1.0, 1.0)
+
+    lesson = lesson_of(mapped(taught.positions), taught, model.config.gate_loss)
+    return Ground(model, lesson, measured, mapped(measured.positions), mapped(positions))
+
+
+def lesson_of(mapped: Tensor, taught: Evidence, losses: GateLossConfig) -> Lesson:
+    """The contribution loss with the field's weights, as `leco-occupancy` teaches its gate."""
+    wide = widen(taught.weights, taught.ray_indices)
+    target = (wide / losses.weight_at_full).clamp(max=1.0)
+    return Lesson(mapped, losses.emphasis * target, 1.0 - target)
+
+
+def mapped_box(model: LecoModel) -> ViewBox:
+    """The scene's box in mapped coordinates; an unbounded scene fills the cube."""
+    if model.space.kind != "box":
+        return ViewBox(-torch.ones(3), torch.ones(3))
+    box = whole_box(model.occupancy())
+    corners = torch.stack([box.low, box.high]).to(model.device)
+    low, high = model.space.map(corners).clamp(-1.0, 1.0).cpu()
+    return ViewBox(low, high)

@@ -1,0 +1,71 @@
+"""Occupancy grids of growing resolution from a field's density, each refined from the one before.
+
+A cell is asked only where the coarser grid, or a neighbour of its cell, has not ruled it out; so
+512^3 cells take as long as their surface asks for.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable
+
+import torch
+from torch import Tensor
+from torch.nn.functional import max_pool3d
+
+from leco_plugin.evaluation.inspection import ViewBox
+from leco_plugin.samplers.grid import cells_of
+
+PROBES = 4
+"""Densities asked in each cell, at random places; the largest is the cell's score."""
+CELLS_AT_ONCE = 1 << 18
+BYTES_A_CELL = 16
+"""Of memory while a grid is filled, about."""
+
+
+def filled(
+    density: Callable[[Tensor], Tensor],
+    box: ViewBox,
+    resolution: int,
+    coarser: Tensor | None = None,
+    floor: float = 0.0,
+    seed: int = 0,
+) -> Tensor:
+    """Scores of the cells of a grid: [n, n, n].
+
+    Args:
+        density: mapped positions [N, 3] to [N].
+        box: in mapped coordinates.
+        resolution: n, twice that of `coarser`.
+        coarser: [n/2, n/2, n/2] scores; without it every cell is asked.
+        floor: score of the coarser grid below which a cell and all around it are taken for empty.
+    """
+    device = box.low.device
+    if coarser is None:
+        asked = torch.ones([resolution] * 3, dtype=torch.bool, device=device)
+    else:
+        near = max_pool3d(coarser[None, None], 3, stride=1, padding=1)[0, 0] >= floor
+        asked = near.repeat_interleave(2, 0).repeat_interleave(2, 1).repeat_interleave(2, 2)
+    scores = torch.zeros([resolution] * 3, device=device)
+    generator = torch.Generator(device).manual_seed(seed)
+    for cells in asked.nonzero().split(CELLS_AT_ONCE):
+        best = torch.zeros(len(cells), device=device)
+        for _ in range(PROBES):
+            units = cells + torch.rand(len(cells), 3, device=device, generator=generator)
+            places = torch.lerp(box.low, box.high, units / resolution)
+            best = torch.maximum(best, density(places).float())
+        scores[tuple(cells.T)] = best
+    return scores
+
+
+def looked_up(scores: Tensor, box: ViewBox, mapped: Tensor) -> Tensor:
+    """Scores of the cells that hold mapped positions [N, 3]; zero outside: [N]."""
+    corners = torch.cat([box.low, box.high])
+    index, inside = cells_of((1, *scores.shape), corners, mapped)
+    return scores.view(-1).index_select(0, index) * inside
+
+
+def fits_memory(resolution: int) -> bool:
+    """Whether a grid can be filled in half of the memory that is free."""
+    free = os.sysconf("SC_AVPHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
+    return BYTES_A_CELL * resolution**3 < free / 2

@@ -1,0 +1,190 @@
+"""Representations, and what each keeps and loses: on the same rays, at the same loss or volume."""
+
+from __future__ import annotations
+
+import math
+import time
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from leco_plugin.capacity.field import Ground, mapped_box
+from leco_plugin.capacity.grids import filled, looked_up
+from leco_plugin.evaluation.equal_loss import threshold_losing
+from leco_plugin.models.encodings import EncodingConfig
+from leco_plugin.models.gate import GateConfig, occupancy_logit
+from leco_plugin.models.leco import LecoModel
+from leco_plugin.models.rendering import gate_values_and_routes
+from leco_plugin.occupancy import gate_precision
+from leco_plugin.shrink.evidence import Evidence
+from leco_plugin.shrink.ladder import values_of
+from leco_plugin.shrink.search import threshold_keeping
+from leco_plugin.shrink.teaching import round_weights, teach
+
+STEPS = 300
+"""With which each gate is taught; 200 are enough for most."""
+VOLUMES = (0.01, 0.015, 0.02, 0.03, 0.04, 0.06, 0.08, 0.11, 0.15, 0.2, 0.3, 0.45)
+"""Kept volumes at which the loss is noted."""
+POINTS_AT_ONCE = 1 << 16
+FAMILIES = ("frequency", "hash", "vm", "k-planes", "grid")
+
+
+@dataclass(frozen=True)
+class Candidate:
+    """A representation of one size."""
+
+    family: str
+    size: str
+    gate: GateConfig | None = None
+    resolution: int | None = None
+
+    @property
+    def key(self) -> str:
+        """Of its file."""
+        return f"{self.family}-{self.size}".replace(" ", "-")
+
+    @property
+    def bytes(self) -> int:
+        """A gate's numbers in bfloat16, a grid's cells in bits."""
+        if self.gate is not None:
+            return 2 * values_of(self.gate)
+        assert self.resolution is not None
+        return math.ceil(self.resolution**3 / 8)
+
+
+def gates() -> list[Candidate]:
+    """Gates of growing size of each kind."""
+    found = [
+        Candidate("frequency", f"{o}-{w}-{n}", GateConfig(EncodingConfig(octaves=o), w, n, 1))
+        for o, w, n in ((3, 8, 1), (4, 16, 1), (5, 16, 2), (6, 32, 2), (6, 64, 3), (8, 128, 4))
+    ]
+    found += [
+        Candidate(
+            "hash",
+            f"{n}-{t}",
+            GateConfig(EncodingConfig("hash", levels=n, log2_table=t, finest=finest), 16, 1, 1),
+        )
+        for n, t, finest in ((4, 8, 64), (4, 10, 128), (6, 12, 256), (8, 14, 512), (8, 16, 1024))
+    ]
+    for cells, features in ((16, 2), (32, 4), (64, 8), (128, 8)):
+        found.append(
+            Candidate(
+                "vm",
+                f"{cells}-{features}",
+                GateConfig(EncodingConfig("vm", components=features, plane_cells=cells), 16, 1, 1),
+            )
+        )
+    for cells, features, levels in ((16, 2, 1), (32, 4, 1), (64, 4, 2), (128, 2, 4)):
+        found.append(
+            Candidate(
+                "k-planes",
+                f"{cells}-{features}-{levels}",
+                GateConfig(
+                    EncodingConfig(
+                        "k-planes",
+                        levels=levels,
+                        features=features,
+                        coarsest=16 if levels > 1 else cells,
+                        plane_cells=cells,
+                    ),
+                    *(16, 1, 1),
+                ),
+            )
+        )
+    return found
+
+
+def grids(resolutions: tuple[int, ...]) -> list[Candidate]:
+    """Grids by their cells along an axis."""
+    return [Candidate("grid", str(n), resolution=n) for n in sorted(resolutions)]
+
+
+def measured(evidence: Evidence, scores: Tensor, of_volume: Tensor, lost: float) -> dict[str, Any]:
+    """What a representation keeps when it loses a given share, and loses when it keeps a given one.
+
+    Args:
+        evidence: dense candidates.
+        scores: [M] of those candidates.
+        of_volume: [P] of places spread evenly over the scene's box.
+        lost: share of the weight near surfaces.
+    """
+    threshold = threshold_losing(evidence.worth, scores, lost)
+    total = float(evidence.worth.double().sum())
+    losses = [
+        float(evidence.worth[scores < threshold_keeping(of_volume, share)].double().sum()) / total
+        for share in VOLUMES
+    ]
+    return {
+        "kept_volume": float((of_volume >= threshold).double().mean()),
+        "kept_candidates": float((scores >= threshold).double().mean()),
+        "lost_at_volumes": losses,
+    }
+
+
+def of_gate(ground: Ground, candidate: Candidate, lost: float) -> dict[str, Any]:
+    """Teaches a gate and measures it, as it would be stored and asked."""
+    assert candidate.gate is not None
+    started = time.monotonic()
+    precision = ground.model.precision
+    gate = round_weights(teach(candidate.gate, ground.lesson, STEPS, precision))
+
+    @torch.no_grad()
+    def score(mapped: Tensor) -> Tensor:
+        with gate_precision(mapped.device.type, precision):
+            return occupancy_logit(gate(mapped))
+
+    scores, of_volume = in_parts(score, ground.mapped), in_parts(score, ground.volume)
+    return _row(candidate, started, measured(ground.held_out, scores, of_volume, lost))
+
+
+def of_grids(ground: Ground, candidates: list[Candidate], lost: float) -> Any:
+    """Fills grids from the field's density, each from the one before; yields a row for each."""
+    box = mapped_box(ground.model)
+    scores: Tensor | None = None
+    floor = 0.0
+    for candidate in candidates:
+        started = time.monotonic()
+        assert candidate.resolution is not None
+        refined = scores is not None and candidate.resolution == 2 * len(scores)
+        scores = filled(
+            lambda mapped: density_of(ground.model, mapped),
+            box,
+            candidate.resolution,
+            scores if refined else None,
+            floor,
+        )
+        of_rays = looked_up(scores, box, ground.mapped)
+        found = measured(ground.held_out, of_rays, looked_up(scores, box, ground.volume), lost)
+        # cells that a tenth of the loss can spare are empty in finer grids too
+        floor = threshold_losing(ground.held_out.worth, of_rays, 0.1 * lost)
+        yield candidate, _row(candidate, started, found)
+
+
+@torch.no_grad()
+def density_of(model: LecoModel, mapped: Tensor) -> Tensor:
+    """Density of a model's field at mapped positions [N, 3], per half extent: [N]."""
+
+    def part_of(part: Tensor) -> Tensor:
+        with gate_precision(model.device.type, model.precision):
+            values, routes = gate_values_and_routes(model.gate(part), model.routing)
+            sigmas: Tensor = model.field.density(part, routes, values)[0]
+        return sigmas
+
+    return in_parts(part_of, mapped)
+
+
+def in_parts(function: Any, mapped: Tensor) -> Tensor:
+    """A function of positions [N, 3], some at a time: [N]."""
+    return torch.cat([function(part) for part in mapped.split(POINTS_AT_ONCE)])
+
+
+def _row(candidate: Candidate, started: float, found: dict[str, Any]) -> dict[str, Any]:
+    return {
+        "family": candidate.family,
+        "size": candidate.size,
+        "bytes": candidate.bytes,
+        "seconds": round(time.monotonic() - started, 2),
+        **found,
+    }

@@ -1,0 +1,123 @@
+"""Subcommands of `leco` about how much a scene needs, and about other formats of an occupancy."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Literal
+
+import tyro
+
+from leco_plugin.cli_reports import check_json, write_json
+
+
+def export(
+    file: Annotated[Path, tyro.conf.Positional],
+    format: Literal["ply", "nerfacc-grid"],
+    out: Path,
+    resolution: int = 128,
+    levels: int | None = None,
+    json: Path | None = None,
+) -> None:
+    """Write an occupancy for other programs: kept points, or an occupancy grid of nerfacc.
+
+    Args:
+        file: An occupancy.safetensors.
+        format: ply is the surface of what is kept, coloured by o(x); nerfacc-grid is what
+            OccGridEstimator.load_state_dict takes, a cell marked where any of 27 points in it is
+            kept. A host that goes on updating such a grid replaces it by its own.
+        out: File to write.
+        resolution: Cells along the longest side of the space, or along each axis of a grid.
+        levels: Nested boxes of a grid, each twice as wide as the one inside it. By default one, or
+            as many as the rays of an unbounded scene reach.
+        json: File for what was written, as JSON.
+    """
+    from leco_plugin.export.command import export as write
+
+    check_json(json)
+    facts = write(file, format, out, resolution, levels)
+    if format == "ply":
+        print(f"{out}: {facts['points']} points")
+    else:
+        print(
+            f"{out}: {facts['levels']} x {resolution}^3 cells, {facts['kept_share_of_cells']:.2%} "
+            "of them kept"
+        )
+        print(f"for OccGridEstimator({facts['aabbs'][0]}, {resolution}, {facts['levels']})")
+    write_json(json, facts)
+
+
+def shrink(
+    file: Annotated[Path, tyro.conf.Positional],
+    data: Path,
+    out: Path,
+    lost_surface_mass: float = 1e-3,
+    image_price: float = 0.05,
+    picture: Path | None = None,
+    json: Path | None = None,
+) -> None:
+    """Find the smallest gate that decides as a frozen one does; measured on rays it never saw.
+
+    Smaller gates are taught, from small to large, until one holds. Where the file lies in the
+    folder of its run, the run's trained model says what a dropped candidate was worth; without one
+    the loss is measured against what the original keeps.
+
+    Args:
+        file: An occupancy.safetensors, best where its run left it.
+        data: The scene that it was learned on.
+        out: File for the smaller occupancy.
+        lost_surface_mass: Most of the weight near surfaces that it may declare lost, the original's
+            share included.
+        image_price: Most dB that it may declare, the original's share included.
+        picture: File for a picture of the gates that were tried.
+        json: File for the gates that were tried and the one that was chosen, as JSON.
+    """
+    import warnings
+
+    # what nerfstudio and torch think of each other is nothing that a user can act on
+    warnings.filterwarnings("ignore", module=r"nerfstudio|torch")
+    from leco_plugin.shrink.command import shrink as find_smaller
+    from leco_plugin.shrink.command import summary
+    from leco_plugin.shrink.search import Bounds
+
+    check_json(json)
+    results = find_smaller(file, data, out, Bounds(lost_surface_mass, image_price))
+    print("\n".join(summary(results, out)))
+    if picture is not None:
+        from leco_plugin.shrink.picture import draw
+
+        print(f"drew {draw(results, picture)}")
+    write_json(json, results)
+
+
+def capacity(
+    data: Path,
+    out: Path,
+    grids: tuple[int, ...] = (32, 64, 128, 256, 512),
+    lost_surface_mass: float = 1e-3,
+    learn_steps: int = 200,
+    json: Path | None = None,
+) -> None:
+    """Answer how much a scene needs: gates and grids of growing size, and which of them suffices.
+
+    One field is learned, and teaches them all. Writes capacity.png, capacity-dark.png and
+    results.json. What is finished is kept whenever this is stopped.
+
+    Args:
+        data: A scene in nerfstudio's format.
+        out: Folder of the picture.
+        grids: Cells along an axis of the occupancy grids.
+        lost_surface_mass: Share of the weight near surfaces that each may lose.
+        learn_steps: Steps in which the field is learned, at most.
+        json: Another file for the results.
+    """
+    import warnings
+
+    # what nerfstudio and torch think of each other is nothing that a user can act on
+    warnings.filterwarnings("ignore", module=r"nerfstudio|torch")
+    from leco_plugin.capacity.command import capacity as measure
+
+    check_json(json)
+    results = measure(data, out, grids, lost_surface_mass, learn_steps)
+    print(results["verdict"])
+    print(f"see capacity.png and results.json in {out}")
+    write_json(json, results)

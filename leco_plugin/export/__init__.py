@@ -1,0 +1,1 @@
+"""`leco export`: an occupancy in the formats of other programs."""

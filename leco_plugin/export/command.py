@@ -1,0 +1,59 @@
+"""`leco export`: from the words on the command line to a file."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any, Literal
+
+from leco_plugin.occupancy import Occupancy
+from leco_plugin.progress_bar import bar
+
+Format = Literal["ply", "nerfacc-grid"]
+
+
+def export(
+    file: Path, format: Format, out: Path, resolution: int = 128, levels: int | None = None
+) -> dict[str, Any]:
+    """Writes an occupancy in another format.
+
+    Args:
+        file: an occupancy.
+        format: `ply` or `nerfacc-grid`.
+        out: of what is written.
+        resolution: cells along the longest side, or along each axis of a grid.
+        levels: of a grid.
+    Returns:
+        What was written, as JSON values.
+    Raises:
+        ValueError, OSError: the file is no occupancy, a size is out of range, there is nothing to
+            export, or it cannot be written there.
+    """
+    if format == "ply" and levels is not None:
+        raise ValueError("points have no levels: --levels goes with --format nerfacc-grid")
+    if out.is_dir():
+        raise ValueError(f"--out {out} is a folder; give a file")
+    occupancy = Occupancy.load(file)
+    if format == "ply":
+        from leco_plugin.export.points import kept_surface, write_ply
+
+        surface = kept_surface(occupancy, resolution)
+        write_ply(surface, out)
+        facts: dict[str, Any] = {"points": len(surface.positions)}
+    else:
+        from leco_plugin.export.nerfacc_grid import grid_buffers, write_grid
+
+        with bar(f"Asking the gate about {resolution}^3 cells a level") as show:
+            buffers = grid_buffers(occupancy, resolution, levels, show)
+        write_grid(buffers, out)
+        facts = {
+            "levels": len(buffers["aabbs"]),
+            "aabbs": buffers["aabbs"].tolist(),
+            "kept_share_of_cells": float(buffers["binaries"].double().mean()),
+        }
+    return {
+        "format": 1,
+        "written": format,
+        "resolution": resolution,
+        **facts,
+        "bytes": out.stat().st_size,
+    }

@@ -1,0 +1,1 @@
+"""`leco shrink`: the smallest gate that decides as a frozen one does."""

@@ -1,0 +1,200 @@
+"""`leco shrink`: from the words on the command line to a smaller file."""
+
+from __future__ import annotations
+
+import statistics
+import time
+from pathlib import Path
+from typing import Any
+
+import torch
+from nerfstudio.utils.rich_utils import CONSOLE
+
+from leco_plugin.evaluation.inspection import whole_box
+from leco_plugin.evaluation.machine import describe_machine
+from leco_plugin.occupancy import Occupancy
+from leco_plugin.progress_bar import bar
+from leco_plugin.shrink.evidence import gather
+from leco_plugin.shrink.search import Bounds, Found, Ground, Rung, room_beyond, search
+from leco_plugin.shrink.sources import Source, find_source, held_out, trained_on
+
+RAYS = 4096
+TAUGHT_RAYS = 6144
+TIMED_POSITIONS, ROUNDS = 1 << 16, 15
+COPIED = (
+    *("step", "train_seconds", "bounds", "near", "far", "step_size", "cone_angle", "aabb"),
+    *("frame", "cameras"),
+)
+"""What a smaller occupancy's report takes over from the original's."""
+BY_RENDERING = "the run's field, rendered as the original guides it"
+BY_DECISIONS = "the original's keep decisions, weighed by o(x): no rendering weights were at hand"
+
+
+def shrink(file: Path, data: Path, out: Path, bounds: Bounds, seed: int = 0) -> dict[str, Any]:
+    """Finds the smallest gate that decides as a frozen one does, and writes it.
+
+    Args:
+        file: an occupancy, in the folder of its run if its trained model is to be the reference.
+        data: the scene in nerfstudio's format.
+        out: of the smaller occupancy.
+        bounds: what it may declare.
+        seed: of rays that were trained on.
+    Returns:
+        The frontier that was walked, and what was written: JSON values.
+    Raises:
+        ValueError, OSError: a file, a folder or a bound is wrong; nothing was written.
+    """
+    if out.is_dir():
+        raise ValueError(f"--out {out} is a folder; give a file")
+    original = Occupancy.load(file)
+    room_beyond(original, bounds)
+    missing = [name for name in ("near", "far", "step_size") if name not in original.report]
+    if missing:
+        raise ValueError(f"{file} does not say how its rays are marched: no {missing[0]}")
+    torch.manual_seed(seed)
+    source = find_source(file, data)
+    original = original.to(source.model.device) if source.model is not None else original
+    ground = _ground(source, original)
+    with bar("Teaching smaller gates") as show:
+        found = search(ground, bounds, on_rung=_say, on_progress=show)
+    smaller = found.occupancy
+    if smaller is None:
+        smaller = _rounded_as_it_is(original)
+    smaller.report = report_of(original, ground, found)
+    out.parent.mkdir(parents=True, exist_ok=True)
+    smaller.save(out)
+    speedup, times = compare_queries(original, smaller)
+    reported = {name: value for name, value in smaller.report.items() if name not in COPIED}
+    return {
+        "format": 1,
+        "machine": describe_machine(),
+        "from": {"params": original.num_params, "bytes": file.stat().st_size},
+        "to": {"params": smaller.num_params, "bytes": out.stat().st_size, **reported},
+        "bounds": {**vars(bounds)},
+        "query_speedup": speedup,
+        "query_milliseconds": times,
+        "queried_positions": TIMED_POSITIONS,
+        "rungs": [rung.to_dict() for rung in found.rungs],
+    }
+
+
+def _ground(source: Source, original: Occupancy) -> Ground:
+    """Rays to teach by, to search on, and to verify on, with what they are worth."""
+    searched, verified = held_out(source, original, RAYS)
+    taught, _ = gather(source, original, trained_on(source, original, TAUGHT_RAYS))
+    on_search, search_rendered = gather(source, original, searched)
+    on_verify, verify_rendered = gather(source, original, verified)
+    if not bool(on_search.kept.any()) or not bool(on_verify.kept.any()):
+        raise ValueError(
+            "the occupancy keeps nothing on the rays of these photographs: they are of another "
+            "scene, or it has been moved since"
+        )
+    return Ground(
+        original, source.model, taught, on_search, search_rendered, on_verify, verify_rendered
+    )
+
+
+def _rounded_as_it_is(original: Occupancy) -> Occupancy:
+    """The original itself, its products' weights in bfloat16 where they are asked in it anyway.
+
+    Not a decision changes: autocast rounds them so whenever the gate is asked.
+    """
+    if original.precision == "bfloat16":
+        for layer in original.gate.hidden:
+            for parameter in layer.parameters():
+                parameter.copy_(parameter.bfloat16().float())
+    return original
+
+
+def report_of(original: Occupancy, ground: Ground, found: Found) -> dict[str, Any]:
+    """What the smaller occupancy declares: the original's loss and, on top, its own."""
+    report = {name: original.report[name] for name in COPIED if name in original.report}
+    if "cameras" in report:
+        report["cameras"] = [[round(float(x), 4) for x in row] for row in report["cameras"]]
+    if found.occupancy is None:
+        return {**original.report, **report}
+    measured = found.rungs[-1].verified
+    reference = BY_RENDERING if ground.model is not None else BY_DECISIONS
+
+    def declared(name: str, beyond: float | None) -> float | None:
+        before = original.report.get(name)
+        if beyond is None or not isinstance(before, int | float):
+            return beyond
+        return max(float(before), 0.0) + beyond
+
+    return report | {
+        "params": found.rungs[-1].params,
+        "threshold": found.occupancy.threshold,
+        "lost_surface_mass": declared("lost_surface_mass", measured["lost_surface_mass_bound"]),
+        "lost_mass": declared("lost_mass", measured["lost_mass"]),
+        "image_price_db": declared("image_price_db", measured["image_price_db"]),
+        "empty_fraction": measured["empty_fraction"],
+        "calibration_rays": ground.verify.rays,
+        "held_out": bool(original.report.get("held_out", False)),
+        "shrunk_from_params": original.num_params,
+        "loss_measured_against": reference,
+        "lost_beyond_the_original": measured["lost_surface_mass"],
+        "kept_candidates_dropped": measured["kept_candidates_dropped"],
+        "kept_volume_of_the_original": found.rungs[-1].kept_volume,
+    }
+
+
+def compare_queries(original: Occupancy, smaller: Occupancy) -> tuple[float, list[float]]:
+    """How many times faster the smaller gate answers: median of interleaved pairs.
+
+    Returns:
+        the median of the pairs' ratios, and the median milliseconds of each.
+    """
+    box = whole_box(original)
+    unit = torch.rand(TIMED_POSITIONS, 3, generator=torch.Generator().manual_seed(0))
+    device = original.threshold_value.device
+    positions = torch.lerp(box.low, box.high, unit).to(device)
+    pairs = [
+        tuple(_seconds(occupancy, positions) for occupancy in (original, smaller))
+        for _ in range(ROUNDS)
+    ][2:]
+    ratio = statistics.median(before / after for before, after in pairs)
+    return round(ratio, 2), [round(1e3 * statistics.median(times), 3) for times in zip(*pairs)]
+
+
+def _seconds(occupancy: Occupancy, positions: torch.Tensor) -> float:
+    from leco_plugin.evaluation.clock import synchronize
+
+    synchronize()
+    started = time.perf_counter()
+    occupancy.occupied(positions)
+    synchronize()
+    return time.perf_counter() - started
+
+
+def _say(rung: Rung) -> None:
+    CONSOLE.print(line_of(rung), markup=False, highlight=False)
+
+
+def line_of(rung: Rung) -> str:
+    """A rung as a line of the table."""
+    price = "     -" if rung.image_price_db is None else f"{rung.image_price_db:+6.3f}"
+    return (
+        f"{rung.name:<28}{rung.params:>8} values {rung.bytes / 1000:>7.1f} kB  loses "
+        f"{rung.lost_surface_mass:.1e}  {price} dB  keeps {rung.kept_volume:>6.1%} of the "
+        f"original's volume  {rung.verdict}"
+    )
+
+
+def summary(results: dict[str, Any], out: Path) -> list[str]:
+    """The outcome in a few lines, for the terminal."""
+    before, after = results["from"], results["to"]
+    lines = []
+    if "shrunk_from_params" not in after:
+        lines.append("no smaller gate holds these bounds: this is the same gate, stored shorter")
+    lines.append(
+        f"{out}: {before['bytes'] / 1000:.1f} kB before, {after['bytes'] / 1000:.1f} kB now; asked "
+        f"{results['query_speedup']:.1f} times faster"
+    )
+    lost, price = after.get("lost_surface_mass"), after.get("image_price_db")
+    if lost is not None:
+        cost = "" if price is None else f" and {price:+.3f} dB"
+        lines.append(f"declares {lost:.2e} of the surface mass{cost}, the original's included")
+    if "loss_measured_against" in after:
+        lines.append(f"measured against {after['loss_measured_against']}")
+    return lines

@@ -1,0 +1,242 @@
+"""From small to large: teach, find a threshold, measure; the first gate that holds is the answer.
+
+The threshold gives each gate the kept volume of the original, so that what differs is the loss. It
+is found on rays of its own; what is declared is measured on others.
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass, field
+from typing import Any, NamedTuple
+
+import torch
+from torch import Tensor
+
+from leco_plugin.evaluation.inspection import whole_box
+from leco_plugin.models.gate import GateConfig
+from leco_plugin.models.leco import LecoModel
+from leco_plugin.occupancy import Occupancy
+from leco_plugin.shrink.evidence import (
+    Evidence,
+    Rendered,
+    image_price,
+    loss,
+    query_in_parts,
+)
+from leco_plugin.shrink.ladder import ladder, name_of, values_of
+from leco_plugin.shrink.teaching import Lesson, round_weights, teach
+
+STEPS = 400
+EMPHASIS, WEIGHT_AT_FULL = 8.0, 0.05
+"""How much dearer a candidate is that carries rendering weight, and from which weight on fully."""
+MARGIN = 0.5
+"""Share of the allowed loss that a gate may use on the rays of the search, so that others hold."""
+VOLUME_POINTS = 1 << 17
+TAUGHT_POINTS = 1 << 18
+VOLUMES = (1.0, 1.05)
+"""Kept volumes that are tried, as shares of the original's."""
+
+
+@dataclass(frozen=True)
+class Bounds:
+    """What the smaller occupancy may declare in all, the original's share included."""
+
+    lost_surface_mass: float = 1e-3
+    image_price_db: float = 0.05
+
+
+@dataclass
+class Rung:
+    """One gate that was tried. Losses are beyond the original's."""
+
+    name: str
+    params: int
+    bytes: int
+    """Of its weights in bfloat16."""
+    kept_volume: float
+    """Share of the original's."""
+    lost_surface_mass: float
+    image_price_db: float | None
+    verdict: str
+    seconds: float
+    verified: dict[str, float | None] = field(default_factory=dict)
+
+    def to_dict(self) -> dict[str, Any]:
+        return asdict(self)
+
+
+class Ground(NamedTuple):
+    """What gates are taught and measured on."""
+
+    original: Occupancy
+    model: LecoModel | None
+    taught: Evidence
+    search: Evidence
+    search_rendered: Sequence[Rendered]
+    verify: Evidence
+    verify_rendered: Sequence[Rendered]
+
+
+class Found(NamedTuple):
+    """The outcome: None is that nothing smaller holds."""
+
+    occupancy: Occupancy | None
+    rungs: list[Rung]
+
+
+def search(
+    ground: Ground,
+    bounds: Bounds,
+    gates: Sequence[GateConfig] | None = None,
+    on_rung: Callable[[Rung], None] | None = None,
+    on_progress: Callable[[float], None] | None = None,
+) -> Found:
+    """Walks up the ladder and stops at the first gate whose price, on unseen rays, is in bounds.
+
+    Args:
+        gates: by size; those smaller than the original by default.
+        on_rung: called with each gate that was tried.
+        on_progress: called with the share of the ladder that is done.
+    Raises:
+        ValueError: what the original declares already leaves nothing to lose.
+    """
+    room = room_beyond(ground.original, bounds)
+    gates = ladder(values_of(ground.original.gate.config)) if gates is None else gates
+    volume = _volume(ground.original, VOLUME_POINTS, seed=5)
+    kept = query_in_parts(ground.original, volume) >= ground.original.threshold
+    lesson = lesson_of(ground.original, ground.taught)
+    rungs: list[Rung] = []
+    for number, config in enumerate(gates):
+
+        def show(share: float, done: int = number) -> None:
+            if on_progress is not None:
+                on_progress((done + share) / len(gates))
+
+        started = time.monotonic()
+        gate = round_weights(
+            teach(config, lesson, STEPS, ground.original.precision, 0, on_progress=show)
+        )
+        smaller, rung = _measured(
+            ground,
+            Occupancy(
+                gate,
+                ground.original.space,
+                0.5,
+                ground.original.precision,
+                walls=ground.original.walls,
+            ).eval(),
+            room,
+            volume,
+            kept,
+        )
+        rung.seconds = round(time.monotonic() - started, 2)
+        rungs.append(rung)
+        if on_rung is not None:
+            on_rung(rung)
+        if rung.verdict == "chosen":
+            return Found(smaller, rungs)
+    return Found(None, rungs)
+
+
+def room_beyond(original: Occupancy, bounds: Bounds) -> Bounds:
+    """What is left to lose after what the original declares.
+
+    Raises:
+        ValueError: nothing is.
+    """
+    declared = [original.report.get(name) for name in ("lost_surface_mass", "image_price_db")]
+    lost, price = (float(value) if isinstance(value, int | float) else 0.0 for value in declared)
+    if lost >= bounds.lost_surface_mass:
+        raise ValueError(
+            f"the occupancy itself declares a lost surface mass of {lost:.2e}, which leaves "
+            f"nothing of {bounds.lost_surface_mass:.2e}: raise --lost-surface-mass"
+        )
+    if price >= bounds.image_price_db:
+        raise ValueError(
+            f"the occupancy itself declares an image price of {price:.3f} dB, which leaves nothing "
+            f"of {bounds.image_price_db:.3f} dB: raise --image-price"
+        )
+    # that the original gains something is no licence to lose it
+    return Bounds(
+        bounds.lost_surface_mass - max(lost, 0.0), bounds.image_price_db - max(price, 0.0)
+    )
+
+
+def lesson_of(original: Occupancy, taught: Evidence) -> Lesson:
+    """The original's decisions on candidates of rays, and as many places anywhere in its box."""
+    anywhere = _volume(original, TAUGHT_POINTS, seed=6)
+    decided = query_in_parts(original, anywhere) >= original.threshold
+    kept = torch.cat([taught.kept, decided]).float()
+    full = (taught.weights / WEIGHT_AT_FULL).clamp(max=1.0)
+    emphasis = torch.cat([full, torch.zeros_like(decided, dtype=full.dtype)])
+    mapped = original.space.map(torch.cat([taught.positions, anywhere])).clamp(-1.0, 1.0)
+    return Lesson(mapped, kept * (1.0 + EMPHASIS * emphasis), 1.0 - kept)
+
+
+def _measured(
+    ground: Ground, smaller: Occupancy, room: Bounds, volume: Tensor, kept: Tensor
+) -> tuple[Occupancy, Rung]:
+    """The gate with the threshold that suits it, and what was found."""
+    scores = query_in_parts(smaller, ground.search.positions)
+    of_volume = query_in_parts(smaller, volume)
+    allowed = MARGIN * room.lost_surface_mass
+    lost, ratio = math.inf, 0.0
+    for share in VOLUMES:
+        threshold = threshold_keeping(of_volume, share * float(kept.double().mean()))
+        lost = loss(ground.search, scores < threshold).share
+        ratio = float((of_volume >= threshold).double().mean() / kept.double().mean())
+        if lost <= allowed:
+            break
+    smaller.threshold_value.fill_(threshold)
+    config = smaller.gate.config
+    params = values_of(config)
+    rung = Rung(name_of(config), params, 2 * params, round(ratio, 4), lost, None, "", 0.0)
+    if lost > allowed:
+        rung.verdict = "loses too much"
+        return smaller, rung
+    if ratio > VOLUMES[-1] + 0.005:
+        rung.verdict = "keeps too much"
+        return smaller, rung
+    if ground.model is not None:
+        rung.image_price_db = image_price(ground.model, ground.search_rendered, smaller)
+        if rung.image_price_db > room.image_price_db:
+            rung.verdict = "costs too much of the image"
+            return smaller, rung
+    rung.verdict = "chosen" if _verified(ground, smaller, room, rung) else "fails on unseen rays"
+    return smaller, rung
+
+
+def _verified(ground: Ground, smaller: Occupancy, room: Bounds, rung: Rung) -> bool:
+    """Whether the bounds hold on rays that the search did not see; measures what to declare."""
+    skipped = query_in_parts(smaller, ground.verify.positions) < smaller.threshold
+    unseen = loss(ground.verify, skipped)
+    price = None
+    if ground.model is not None:
+        price = image_price(ground.model, ground.verify_rendered, smaller)
+    rung.verified = {
+        "lost_surface_mass": unseen.share,
+        "lost_surface_mass_bound": unseen.bound,
+        "lost_mass": unseen.lost_mass,
+        "image_price_db": price,
+        "empty_fraction": float(skipped.double().mean()),
+        "kept_candidates_dropped": float(
+            (skipped & ground.verify.kept).sum() / ground.verify.kept.sum().clamp(min=1)
+        ),
+    }
+    return unseen.bound <= room.lost_surface_mass and (price or 0.0) <= room.image_price_db
+
+
+def threshold_keeping(scores: Tensor, share: float) -> float:
+    """The threshold at which a share of places, with scores [M], is kept."""
+    ordered = scores.double().sort(descending=True).values
+    return float(ordered[min(max(round(share * len(ordered)) - 1, 0), len(ordered) - 1)])
+
+
+def _volume(occupancy: Occupancy, count: int, seed: int) -> Tensor:
+    """Positions [count, 3] spread evenly over the occupancy's box."""
+    box = whole_box(occupancy)
+    unit = torch.rand(count, 3, generator=torch.Generator().manual_seed(seed))
+    return torch.lerp(box.low, box.high, unit).to(occupancy.threshold_value.device)

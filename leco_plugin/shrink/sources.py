@@ -1,0 +1,158 @@
+"""Where the rays come from that a smaller gate is measured on, and what renders them.
+
+An occupancy lies in the folder of the run that learned it. The run's trained model is the natural
+reference: its rendering weights say what a dropped candidate was worth. Without one there are rays.
+"""
+
+from __future__ import annotations
+
+import copy
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import torch
+from torch import Tensor
+
+from leco_plugin.models.freezing import held_out_sampler
+from leco_plugin.models.leco import LecoModel
+from leco_plugin.models.rendering import Rays
+from leco_plugin.models.scene_rays import cut_to_bounds
+from leco_plugin.occupancy import Occupancy
+from leco_plugin.scenes.frames import between, frame_of
+from leco_plugin.scenes.input_error import InputError
+
+CONFIG, CHECKPOINTS = "config.yml", "nerfstudio_models"
+
+
+class Source(NamedTuple):
+    """Photographs, and the model that was trained on them if there is one."""
+
+    manager: Any
+    """nerfstudio's data manager."""
+    model: LecoModel | None
+    """In evaluation mode."""
+
+
+class Seen(NamedTuple):
+    """Rays in the occupancy's coordinates, and what the photographs show there."""
+
+    rays: Rays
+    truth: Tensor
+    """[R, 3 or 4] pixels."""
+
+
+def find_source(file: Path, data: Path) -> Source:
+    """The photographs in `data`, with the model of the run that the occupancy lies in.
+
+    Raises:
+        InputError: `data` is no folder, or the run's model cannot be loaded.
+    """
+    if not data.is_dir():
+        raise InputError(f"--data {data}: there is no such folder")
+    folder = file.resolve().parent
+    if (folder / CONFIG).is_file() and any((folder / CHECKPOINTS).glob("step-*.ckpt")):
+        source = _of_run(folder, data.resolve())
+        if source is not None:
+            return source
+    return Source(_photographs(data), None)
+
+
+def _of_run(folder: Path, data: Path) -> Source | None:
+    """The run's photographs and model; None where the model is a host's, with another field."""
+    import yaml
+    from nerfstudio.utils.eval_utils import eval_load_checkpoint
+
+    # as ns-eval reads it
+    try:
+        config = yaml.load((folder / CONFIG).read_text(), Loader=yaml.Loader)
+    except (yaml.YAMLError, ImportError, AttributeError) as error:
+        raise InputError(f"{folder / CONFIG} cannot be read: {_line(error)}") from None
+    if not issubclass(config.pipeline.model._target, LecoModel):
+        return None
+    config.load_dir = folder / CHECKPOINTS
+    config.load_step = None
+    config.data = config.pipeline.datamanager.data = data
+    try:
+        pipeline = config.pipeline.setup(device=_device(), test_mode="test")
+        eval_load_checkpoint(config, pipeline)
+    except (RuntimeError, KeyError) as error:
+        raise InputError(
+            f"the model of the run in {folder} cannot be loaded: {_line(error)}"
+        ) from None
+    return Source(pipeline.datamanager, pipeline.model.eval())
+
+
+def _line(error: BaseException) -> str:
+    return " ".join(str(error).split())[:200]
+
+
+def _photographs(data: Path) -> Any:
+    """A data manager of `leco-occupancy` on some photographs."""
+    from leco_plugin.method_configs import leco_occupancy
+
+    config: Any = copy.deepcopy(leco_occupancy.config.pipeline)
+    config.datamanager.data = data
+    return config.datamanager.setup(device=_device(), test_mode="test")
+
+
+def _device() -> str:
+    from leco_plugin.method_configs import best_device
+
+    return best_device()
+
+
+def held_out(source: Source, occupancy: Occupancy, count: int, parts: int = 2) -> list[Seen]:
+    """Rays of pixels that nothing was trained on, in disjoint parts of up to `count` rays each.
+
+    A data manager that holds none back gives ordinary training rays.
+    """
+    sampler = held_out_sampler(source.manager)
+    if sampler is None:
+        return [trained_on(source, occupancy, count) for _ in range(parts)]
+    images = next(source.manager.iter_train_image_dataloader)
+    batch = sampler.sample_held_out(images, 2 * parts * count, seed=1)
+    # the same pixel twice would let one part know of the other
+    numbers, groups = batch["indices"].unique(dim=0, return_inverse=True)
+    first = torch.full((len(numbers),), len(groups)).scatter_reduce(
+        0, groups, torch.arange(len(groups)), "amin"
+    )
+    each = min(count, len(first) // parts)
+    order = torch.randperm(len(first), generator=torch.Generator().manual_seed(2))
+    chosen = first[order[: each * parts]].split(max(each, 1))
+    return [
+        _seen(
+            source,
+            occupancy,
+            source.manager.train_ray_generator(batch["indices"][part]),
+            batch["image"][part],
+        )
+        for part in chosen
+    ]
+
+
+def trained_on(source: Source, occupancy: Occupancy, count: int) -> Seen:
+    """Rays of training pixels."""
+    sampler = source.manager.train_pixel_sampler
+    before = sampler.num_rays_per_batch
+    sampler.set_num_rays_per_batch(count)
+    bundle, batch = source.manager.next_train(0)
+    sampler.set_num_rays_per_batch(before)
+    return _seen(source, occupancy, bundle, batch["image"])
+
+
+def _seen(source: Source, occupancy: Occupancy, bundle: Any, truth: Tensor) -> Seen:
+    model = source.model
+    if model is not None:
+        model.train()  # rays know their training image, and so its appearance
+        rays = model.rays_of(bundle.to(model.device))
+        model.eval()
+        return Seen(rays, truth.to(model.device).float())
+    learned_in, here = occupancy.report.get("frame"), frame_of(source.manager)
+    if learned_in is not None and here is not None:
+        frame = between(here, learned_in)
+        turned = bundle.directions @ frame[:, :3].T
+        bundle.origins = bundle.origins @ frame[:, :3].T + frame[:, 3]
+        bundle.directions = turned / turned.norm(dim=-1, keepdim=True)
+    near, far = (torch.tensor(float(occupancy.report[name])) for name in ("near", "far"))
+    rays = cut_to_bounds(bundle, occupancy.walls, near, far, with_images=False)
+    return Seen(rays, truth.float())

@@ -1,0 +1,124 @@
+"""Claims about `leco capacity`: it goes on where it was stopped, draws, and refuses in one line."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+from PIL import Image
+
+from leco_plugin import cli
+from leco_plugin.capacity import command
+from leco_plugin.capacity.measuring import VOLUMES, Candidate
+
+pytestmark = [  # nerfstudio leaves an image open
+    pytest.mark.filterwarnings("ignore:unclosed file:ResourceWarning"),
+    pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning"),
+]
+
+
+def run(*arguments: object) -> int:
+    return cli.main([str(argument) for argument in arguments])
+
+
+def row_of(candidate: Candidate) -> dict[str, Any]:
+    return {
+        "family": candidate.family,
+        "size": candidate.size,
+        "bytes": candidate.bytes,
+        "seconds": 0.1,
+        "kept_volume": 0.05 + 50.0 / (candidate.bytes + 1000),
+        "kept_candidates": 0.2,
+        "lost_at_volumes": [0.03 / (1 + i) ** 2 for i in range(len(VOLUMES))],
+    }
+
+
+@pytest.fixture
+def taught(monkeypatch: pytest.MonkeyPatch) -> list[str]:
+    """Nothing is learned; the keys of what would have been."""
+    done: list[str] = []
+
+    def of_gate(ground: Any, candidate: Candidate, lost: float) -> dict[str, Any]:
+        if len(done) == 5:
+            raise KeyboardInterrupt
+        done.append(candidate.key)
+        return row_of(candidate)
+
+    def of_grids(ground: Any, candidates: list[Candidate], lost: float) -> Any:
+        for candidate in candidates:
+            done.append(candidate.key)
+            yield candidate, row_of(candidate)
+
+    model = SimpleNamespace(num_train_data=7)
+    ground = SimpleNamespace(model=model, held_out=SimpleNamespace(rays=99))
+    monkeypatch.setattr(command, "prepare", lambda *arguments: ground)
+    monkeypatch.setattr(command, "of_gate", of_gate)
+    monkeypatch.setattr(command, "of_grids", of_grids)
+    return done
+
+
+def test_what_was_finished_is_kept(
+    taught: list[str], tiny_scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "capacity"
+    arguments = ["capacity", "--data", tiny_scene, "--out", out, "--grids", 16, 32]
+    assert run(*arguments) == 130  # stopped at the sixth
+    assert len(list((out / "points").iterdir())) == len(taught) == 5
+    taught.append("so that it is not stopped again")
+    assert run(*arguments) == 0
+    assert len(set(taught)) == len(taught)
+    results = json.loads((out / "results.json").read_text())
+    assert len(results["representations"]) == len(taught) - 1
+    assert results["verdict"] in capsys.readouterr().out
+    for name in ("capacity.png", "capacity-dark.png"):
+        with Image.open(out / name) as image:
+            assert image.size[0] > 1000
+    before = len(taught)
+    assert run(*arguments) == 0 and len(taught) == before
+
+
+def test_other_settings_and_bad_input_are_refused_in_one_line(
+    taught: list[str], tiny_scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "capacity"
+    taught += [""] * 6
+    assert run("capacity", "--data", tiny_scene, "--out", out, "--grids", 16) == 0
+    capsys.readouterr()
+    (tmp_path / "taken").mkdir()
+    (tmp_path / "taken" / "thesis.txt").write_text("")
+    new = ["--out", tmp_path / "new"]
+    cases: dict[str, list[object]] = {
+        "another learn steps": ["--data", tiny_scene, "--out", out, "--learn-steps", 7],
+        "holds something else": ["--data", tiny_scene, "--out", tmp_path / "taken"],
+        "no such folder": ["--data", tmp_path / "none", *new],
+        "between 0 and 0.5": ["--data", tiny_scene, *new, "--lost-surface-mass", 0],
+        "2 cells or more": ["--data", tiny_scene, *new, "--grids", 1],
+    }
+    for cause, arguments in cases.items():
+        assert run("capacity", *arguments) == 2, cause
+        said = capsys.readouterr().err
+        assert said.startswith("leco: ") and said.count("\n") == 1 and cause in said, said
+
+
+@pytest.mark.slow
+def test_one_field_teaches_gates_and_grids(
+    tiny_scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from leco_plugin.capacity import field, measuring
+
+    monkeypatch.setattr(field, "RAYS", 256)
+    monkeypatch.setattr(field, "TAUGHT_RAYS", 256)
+    monkeypatch.setattr(field, "VOLUME_POINTS", 2048)
+    monkeypatch.setattr(measuring, "STEPS", 20)
+    monkeypatch.setattr("leco_plugin.shrink.teaching.BATCH", 512)
+    some = [candidate for candidate in measuring.gates() if candidate.bytes < 5000]
+    out = tmp_path / "out"
+    for _ in range(2):  # the second time from the stored field
+        results = command.capacity(tiny_scene, out, (8, 16), 0.01, 4, some)
+        assert len(results["representations"]) == len(some) + 2
+        for file in (out / "points").glob("grid*"):
+            file.unlink()
+    assert all(0.0 < row["kept_volume"] <= 1.0 for row in results["representations"])

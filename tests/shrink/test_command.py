@@ -1,0 +1,192 @@
+"""Claims about `leco shrink` from its arguments to its file."""
+
+from __future__ import annotations
+
+import copy
+import json
+import shutil
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from ball_occupancy import ball_of_the_tiny_scene
+from PIL import Image
+
+from leco_plugin import cli
+from leco_plugin.evaluation.inspection import describe
+from leco_plugin.models.encodings import EncodingConfig
+from leco_plugin.models.gate import GateConfig
+from leco_plugin.occupancy import Occupancy
+from leco_plugin.shrink import command, search, sources
+from leco_plugin.shrink.command import compare_queries
+from leco_plugin.shrink.picture import draw
+
+pytestmark = [  # nerfstudio leaves an image open
+    pytest.mark.filterwarnings("ignore:unclosed file:ResourceWarning"),
+    pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning"),
+]
+
+MARCH = {"near": 0.05, "far": 2.0, "step_size": 0.02, "cone_angle": 0.0}
+
+
+@pytest.fixture(autouse=True)
+def quick(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(search, "STEPS", 150)
+    monkeypatch.setattr(search, "VOLUME_POINTS", 1 << 14)
+    monkeypatch.setattr(search, "TAUGHT_POINTS", 1 << 14)
+    monkeypatch.setattr(command, "RAYS", 512)
+    monkeypatch.setattr(command, "TAUGHT_RAYS", 512)
+    monkeypatch.setattr(command, "TIMED_POSITIONS", 512)
+    monkeypatch.setattr("leco_plugin.shrink.teaching.BATCH", 4096)
+
+
+@pytest.fixture
+def file(tmp_path: Path) -> Path:
+    """The ball, and how its rays are marched; no run lies beside it."""
+    occupancy = ball_of_the_tiny_scene()
+    occupancy.report |= MARCH | {"lost_surface_mass": 1e-4, "cameras": [[0.123456, 0.0, 1.0]]}
+    occupancy.save(tmp_path / "ball.safetensors")
+    return tmp_path / "ball.safetensors"
+
+
+def run(*arguments: object) -> int:
+    return cli.main([str(argument) for argument in arguments])
+
+
+def test_without_a_run_it_keeps_to_the_decisions_and_says_so(
+    file: Path,
+    tiny_scene: Path,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    smallest = [GateConfig(EncodingConfig(octaves=2), width, 1, 1) for width in (1, 12, 24)]
+    monkeypatch.setattr(search, "ladder", lambda most: smallest)
+    out, report, picture = (tmp_path / "new" / name for name in ("small", "small.json", "a.png"))
+    options = ["--lost-surface-mass", 0.03, "--json", report, "--picture", picture]
+    assert run("shrink", file, "--data", tiny_scene, "--out", out, *options) == 0
+    said = capsys.readouterr().out
+    assert "the original's keep decisions, weighed by o(x)" in " ".join(said.split())
+    results = json.loads(report.read_text())
+    smaller = Occupancy.load(out)
+    assert out.stat().st_size == results["to"]["bytes"] < file.stat().st_size
+    assert [rung["verdict"] for rung in results["rungs"]][-1] == "chosen"
+    assert smaller.report["cameras"] == [[0.1235, 0.0, 1.0]]
+    beyond = results["rungs"][-1]["verified"]["lost_surface_mass_bound"]
+    assert smaller.report["lost_surface_mass"] == pytest.approx(1e-4 + beyond)
+    assert describe(smaller)["kept_share_of_box"] == pytest.approx(
+        describe(Occupancy.load(file))["kept_share_of_box"], rel=0.1
+    )
+    with Image.open(picture) as image:
+        assert image.size[0] > 500
+    assert draw(results, tmp_path / "again.png").exists()
+
+
+def test_where_nothing_smaller_holds_the_same_gate_is_stored(
+    file: Path,
+    tiny_scene: Path,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    original = Occupancy.load(file)
+    original.precision = "bfloat16"
+    original.save(file)
+    out = tmp_path / "same.safetensors"
+    monkeypatch.setattr(search, "ladder", lambda most: [])
+    assert run("shrink", file, "--data", tiny_scene, "--out", out) == 0
+    assert "the same gate, stored shorter" in capsys.readouterr().out
+    same = Occupancy.load(out)
+    positions = torch.rand(5000, 3) - 0.5
+    assert torch.equal(same.query(positions), original.query(positions))
+    assert out.stat().st_size < 0.8 * file.stat().st_size
+    assert same.report["lost_surface_mass"] == 1e-4
+
+
+def test_bad_input_ends_with_one_line_and_status_2(
+    file: Path, tiny_scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    silent = ball_of_the_tiny_scene()
+    silent.save(tmp_path / "silent.safetensors")
+    out = ["--out", tmp_path / "out.safetensors"]
+    cases: dict[str, list[object]] = {
+        "there is no such folder": [file, "--data", tmp_path / "none", *out],
+        "raise --lost-surface-mass": [file, "--data", tiny_scene, *out, "--lost-surface-mass", 0],
+        "how its rays are marched": [tmp_path / "silent.safetensors", "--data", tiny_scene, *out],
+        "is a folder": [file, "--data", tiny_scene, "--out", tmp_path],
+        "No such file": [tmp_path / "none.safetensors", "--data", tiny_scene, *out],
+    }
+    for cause, arguments in cases.items():
+        assert run("shrink", *arguments) == 2, cause
+        said = capsys.readouterr().err
+        assert said.startswith("leco: ") and said.count("\n") == 1 and cause in said, said
+    assert not (tmp_path / "out.safetensors").exists()
+
+
+def test_the_speed_is_that_of_interleaved_pairs() -> None:
+    one = ball_of_the_tiny_scene()
+    ratio, times = compare_queries(one, one)
+    assert 0.3 < ratio < 3.0 and len(times) == 2 and min(times) > 0.0
+
+
+@pytest.fixture(scope="module")
+def trained(tiny_scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Folder of a finished run of `leco-occupancy`, in sizes for a test."""
+    from leco_plugin.method_configs import leco_occupancy
+
+    config: Any = copy.deepcopy(leco_occupancy.config)
+    config.output_dir = tmp_path_factory.mktemp("outputs")
+    config.experiment_name, config.timestamp, config.vis = "tiny", "run", "tensorboard"
+    config.logging.local_writer.enable = False
+    config.max_num_iterations = 120
+    config.steps_per_eval_image = config.steps_per_eval_batch = 0
+    config.data = config.pipeline.datamanager.data = tiny_scene
+    config.pipeline.datamanager.train_num_rays_per_batch = 512
+    sizes = config.pipeline.model.sizes
+    gate = GateConfig(EncodingConfig(octaves=3), 32, 2, 2)
+    field = replace(sizes.field, encoding=replace(sizes.field.encoding, log2_table=12))
+    config.pipeline.model.sizes = replace(sizes, gate=gate, field=field, candidates=64)
+    config.save_config()
+    trainer = config.setup(local_rank=0, world_size=1)
+    trainer.setup()
+    trainer.train()
+    return Path(trainer.base_dir)
+
+
+@pytest.mark.slow
+def test_the_model_of_the_run_says_what_is_lost(
+    trained: Path, tiny_scene: Path, tmp_path: Path
+) -> None:
+    out, report = tmp_path / "small.safetensors", tmp_path / "small.json"
+    bounds = ["--lost-surface-mass", 0.05, "--image-price", 0.5, "--json", report]
+    original = Occupancy.load(trained / "occupancy.safetensors")
+    assert original.threshold > 0.0
+    file = trained / "occupancy.safetensors"
+    assert run("shrink", file, "--data", tiny_scene, "--out", out, *bounds) == 0
+    results, smaller = json.loads(report.read_text()), Occupancy.load(out)
+    assert results["to"]["loss_measured_against"] == command.BY_RENDERING
+    assert smaller.num_params < original.num_params
+    assert isinstance(smaller.report["image_price_db"], float)
+    source = sources.find_source(file, tiny_scene)
+    assert source.model is not None
+    unseen = command._ground(source, original)  # the same rays again, by the same seeds
+    skipped = ~smaller.occupied(unseen.verify.positions)
+    lost = float((unseen.verify.worth * skipped).sum() / unseen.verify.worth.sum())
+    assert lost <= smaller.report["lost_surface_mass"]
+
+
+@pytest.mark.slow
+def test_a_run_whose_model_does_not_fit_is_refused_in_one_line(
+    trained: Path, tiny_scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    broken = tmp_path / "run"
+    shutil.copytree(trained, broken)
+    config = (broken / "config.yml").read_text()
+    assert "log2_table: 12" in config
+    (broken / "config.yml").write_text(config.replace("log2_table: 12", "log2_table: 11"))
+    arguments = ["--data", tiny_scene, "--out", tmp_path / "out"]
+    assert run("shrink", broken / "occupancy.safetensors", *arguments) == 2
+    said = capsys.readouterr().err
+    assert said.count("\n") == 1 and "cannot be loaded" in said

@@ -1,0 +1,77 @@
+"""Claims about what a dropped candidate is worth, from definitions and on known rays."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from ball_occupancy import CENTRE, ball
+
+from leco_plugin.models.rendering import Rays
+from leco_plugin.occupancy import Occupancy
+from leco_plugin.shrink.evidence import Evidence, gather, loss
+from leco_plugin.shrink.sources import Seen, Source
+
+
+def evidence(rays: int = 50, each: int = 20) -> Evidence:
+    torch.manual_seed(0)
+    count = rays * each
+    weights = torch.rand(count)
+    worth = weights * (torch.rand(count) < 0.3)
+    indices = torch.arange(rays).repeat_interleave(each)
+    return Evidence(torch.rand(count, 3), indices, weights > 0.1, weights, worth, rays)
+
+
+def test_the_loss_is_the_skipped_share_of_the_worth() -> None:
+    known = evidence()
+    skipped = torch.rand(len(known.worth)) < 0.1
+    found = loss(known, skipped)
+    worth = known.worth.double()
+    assert found.share == pytest.approx(float(worth[skipped].sum() / worth.sum()))
+    assert found.lost_mass == pytest.approx(
+        float(known.weights[skipped].sum() / known.weights.sum()), rel=1e-5
+    )
+    assert found.bound > found.share
+    assert loss(known, torch.zeros_like(skipped)) == (0.0, 0.0, 0.0)
+
+
+def test_the_bound_holds_on_other_rays_of_the_same_kind() -> None:
+    """The declared bound of one half is kept by the other half, at about the promised rate."""
+    torch.manual_seed(1)
+    broken = 0
+    for _ in range(200):
+        whole = torch.rand(2000)
+        lost = whole * (torch.rand(2000) < 0.05) * torch.rand(2000)
+        halves = []
+        for part in (slice(0, 1000), slice(1000, 2000)):
+            worth = torch.stack([lost[part], (whole - lost)[part]], dim=1).reshape(-1)
+            skipped = torch.tensor([True, False]).repeat(1000)
+            indices = torch.arange(1000).repeat_interleave(2)
+            halves.append(
+                loss(Evidence(torch.zeros(2000, 3), indices, skipped, worth, worth, 1000), skipped)
+            )
+        broken += halves[1].share > halves[0].bound
+    # both halves are noisy, so a bound at 2.33 errors of one is one at 1.65 of the difference
+    assert broken <= 0.1 * 200
+
+
+def rays_down(count: int) -> Rays:
+    origins = torch.tensor(CENTRE) + torch.cat(
+        [torch.linspace(-1.5, 1.5, count)[:, None], torch.zeros(count, 1), torch.ones(count, 1)], 1
+    )
+    directions = torch.tensor([[0.0, 0.0, -1.0]]).expand(count, 3)
+    return Rays(origins, directions, torch.zeros(count), torch.full((count,), 2.0), None)
+
+
+def test_without_a_field_what_is_kept_is_worth_its_occupancy() -> None:
+    known = ball()
+    report = {"near": 0.0, "far": 2.0, "step_size": 0.05}
+    original = Occupancy(known.gate, known.space, known.threshold, report=report).eval()
+    seen = Seen(rays_down(1500), torch.rand(1500, 3))  # more than are asked about at once
+    found, rendered = gather(Source(None, None), original, seen)
+    assert not rendered and found.rays == 1500
+    assert int(found.ray_indices.max()) == 1499
+    values = original.query(found.positions)
+    assert torch.equal(found.kept, values >= original.threshold)
+    torch.testing.assert_close(found.worth, values * found.kept)
+    outside = loss(found, found.kept & (found.positions[:, 2] > CENTRE[2]))
+    assert outside.share == pytest.approx(0.5, abs=0.05)  # the upper half of the ball

@@ -1,0 +1,117 @@
+"""Claims about the search: it stops at the first gate that holds, and declares what was unseen."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+import torch
+from ball_occupancy import CENTRE, HALF, ball
+
+from leco_plugin.evaluation.inspection import whole_box
+from leco_plugin.models.encodings import EncodingConfig
+from leco_plugin.models.gate import GateConfig
+from leco_plugin.occupancy import Occupancy
+from leco_plugin.shrink import search as searching
+from leco_plugin.shrink.evidence import Evidence, query_in_parts
+from leco_plugin.shrink.search import Bounds, Found, Ground, Rung, search, threshold_keeping
+
+TOO_SMALL = GateConfig(EncodingConfig(octaves=1), 1, 1, 1)
+ENOUGH = GateConfig(EncodingConfig(octaves=2), 16, 2, 1)
+
+
+@pytest.fixture(autouse=True)
+def quick(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(searching, "STEPS", 200)
+    monkeypatch.setattr(searching, "VOLUME_POINTS", 1 << 14)
+    monkeypatch.setattr(searching, "TAUGHT_POINTS", 1 << 14)
+    monkeypatch.setattr("leco_plugin.shrink.teaching.BATCH", 4096)
+
+
+def original(**report: object) -> Occupancy:
+    known = ball()
+    return Occupancy(known.gate, known.space, known.threshold, report=report).eval()
+
+
+def known_worth(occupancy: Occupancy, seed: int) -> Evidence:
+    """Places in the ball's box; the deeper inside it, the more they are worth."""
+    generator = torch.Generator().manual_seed(seed)
+    positions = torch.tensor(CENTRE) + HALF * (2.0 * torch.rand(20_000, 3, generator=generator) - 1)
+    kept = occupancy.occupied(positions)
+    depth = (1.0 - (positions - torch.tensor(CENTRE)).norm(dim=-1)).clamp(min=0.0)
+    worth = depth * kept
+    return Evidence(positions, torch.arange(20_000) // 10, kept, worth, worth, 2000)
+
+
+def ground(occupancy: Occupancy, verify: Evidence | None = None) -> Ground:
+    taught, searched, unseen = (known_worth(occupancy, seed) for seed in range(3))
+    return Ground(occupancy, None, taught, searched, [], verify or unseen, [])
+
+
+def walk(occupancy: Occupancy, gates: list[GateConfig], **options: object) -> Found:
+    return search(ground(occupancy), Bounds(**options), gates)
+
+
+def test_it_stops_at_the_first_gate_that_holds() -> None:
+    seen: list[Rung] = []
+    shares: list[float] = []
+    found = search(
+        ground(original()),
+        Bounds(2e-3),
+        [TOO_SMALL, ENOUGH, replace(ENOUGH, width=32)],
+        seen.append,
+        shares.append,
+    )
+    verdicts = [rung.verdict for rung in found.rungs]
+    assert len(verdicts) == 2 and verdicts[0] != "chosen" and verdicts[1] == "chosen"
+    assert seen == found.rungs and shares[-1] == pytest.approx(2 / 3)
+    assert found.occupancy is not None and found.occupancy.gate.config == ENOUGH
+
+
+def test_the_chosen_gate_keeps_about_as_much_and_loses_what_it_says() -> None:
+    known = original()
+    found = walk(known, [ENOUGH], lost_surface_mass=2e-3)
+    assert found.occupancy is not None
+    rung = found.rungs[-1]
+    assert 0.95 <= rung.kept_volume <= 1.055
+    fresh = known_worth(known, 77)
+    lost = fresh.worth[~found.occupancy.occupied(fresh.positions)].sum() / fresh.worth.sum()
+    assert float(lost) <= rung.verified["lost_surface_mass_bound"] <= 2e-3
+    for parameter in found.occupancy.gate.parameters():
+        assert torch.equal(parameter, parameter.bfloat16().float())
+
+
+def test_what_fails_on_unseen_rays_is_not_chosen() -> None:
+    known = original()
+    unseen = known_worth(known, 2)
+    # everything that is worth something lies where no gate of the original's volume keeps it
+    far = (unseen.positions - torch.tensor(CENTRE)).norm(dim=-1) > 1.3
+    found = search(ground(known, unseen._replace(worth=far.float())), Bounds(2e-3), [ENOUGH])
+    assert found.occupancy is None
+    assert [rung.verdict for rung in found.rungs] == ["fails on unseen rays"]
+
+
+def test_nothing_is_lost_beyond_what_the_original_leaves() -> None:
+    with pytest.raises(ValueError, match="raise --lost-surface-mass"):
+        walk(original(lost_surface_mass=2e-3), [ENOUGH], lost_surface_mass=1e-3)
+    with pytest.raises(ValueError, match="raise --image-price"):
+        walk(original(image_price_db=0.06), [ENOUGH])
+    room = searching.room_beyond(original(lost_surface_mass=4e-4, image_price_db=-0.1), Bounds())
+    assert room.lost_surface_mass == pytest.approx(6e-4) and room.image_price_db == 0.05
+
+
+def test_a_threshold_that_keeps_a_share_keeps_it() -> None:
+    scores = torch.randperm(1000).float()
+    for share in (0.001, 0.1, 0.5, 1.0):
+        assert float((scores >= threshold_keeping(scores, share)).float().mean()) == pytest.approx(
+            share
+        )
+
+
+def test_places_anywhere_are_taught_too() -> None:
+    known = original()
+    lesson = searching.lesson_of(known, known_worth(known, 0))
+    assert len(lesson.mapped) == 20_000 + (1 << 14)
+    inside = query_in_parts(known, known.space.unmap(lesson.mapped)) >= known.threshold
+    assert float((inside == (lesson.keep > 0)).float().mean()) > 0.999
+    assert float(lesson.keep.max()) > 1.5 and whole_box(known).low.tolist() == [-1.0, 0.0, -1.5]
