@@ -86,6 +86,48 @@ def _loaded(matrices, ROWS: tl.constexpr, COLUMNS: tl.constexpr):
 
 
 @triton.jit
+def _halves(features, ROWS: tl.constexpr, COLUMNS: tl.constexpr):
+    """The first and the second half of the columns."""
+    halves = tl.reshape(features, (ROWS, 2, COLUMNS // 2))
+    return tl.split(tl.permute(halves, (0, 2, 1)))
+
+
+@triton.jit
+def _layer(
+    features,
+    matrices,
+    sums,
+    ROWS: tl.constexpr,
+    IN: tl.constexpr,
+    OUT: tl.constexpr,
+    HALF: tl.constexpr,
+):
+    """sums + features [ROWS, IN] times a matrix [IN, OUT], 64 rows of which are held at a time."""
+    if IN == 256:
+        low, high = _halves(features, ROWS, IN)
+        sums = _half_layer(low, matrices, sums, ROWS, IN // 2, OUT, HALF)
+        return _half_layer(high, matrices + IN // 2 * OUT, sums, ROWS, IN // 2, OUT, HALF)
+    return _half_layer(features, matrices, sums, ROWS, IN, OUT, HALF)
+
+
+@triton.jit
+def _half_layer(
+    features,
+    matrices,
+    sums,
+    ROWS: tl.constexpr,
+    IN: tl.constexpr,
+    OUT: tl.constexpr,
+    HALF: tl.constexpr,
+):
+    if IN == 128:
+        low, high = _halves(features, ROWS, IN)
+        sums = _multiplied(low, _loaded(matrices, IN // 2, OUT), sums, HALF)
+        return _multiplied(high, _loaded(matrices + IN // 2 * OUT, IN // 2, OUT), sums, HALF)
+    return _multiplied(features, _loaded(matrices, IN, OUT), sums, HALF)
+
+
+@triton.jit
 def _activated(sums, biases, WIDTH: tl.constexpr, HALF: tl.constexpr):
     """Bias and ReLU; rounded where the twin's layer answers in bfloat16."""
     hidden = tl.maximum(sums + tl.load(biases + tl.arange(0, WIDTH))[None, :], 0.0)
@@ -127,15 +169,15 @@ def gate_keeps(
     features = tl.where(turning[None, :], sines, coordinates)
 
     sums = tl.zeros((ROWS, PADDED), tl.float32)
-    sums = _multiplied(features, _loaded(matrices, COLUMNS, PADDED), sums, HALF)
+    sums = _layer(features, matrices, sums, ROWS, COLUMNS, PADDED, HALF)
     matrices += COLUMNS * PADDED
-    sums = _multiplied(cosines, _loaded(matrices, COLUMNS, PADDED), sums, HALF)
+    sums = _layer(cosines, matrices, sums, ROWS, COLUMNS, PADDED, HALF)
     matrices += COLUMNS * PADDED
     hidden = _activated(sums, vectors, PADDED, HALF)
     vectors += PADDED
     for _ in tl.static_range(LAYERS - 1):
         sums = tl.zeros((ROWS, PADDED), tl.float32)
-        sums = _multiplied(hidden, _loaded(matrices, PADDED, PADDED), sums, HALF)
+        sums = _layer(hidden, matrices, sums, ROWS, PADDED, PADDED, HALF)
         matrices += PADDED * PADDED
         hidden = _activated(sums, vectors, PADDED, HALF)
         vectors += PADDED
@@ -146,10 +188,10 @@ def gate_keeps(
     spread = tl.rsqrt(tl.sum(centred * centred, axis=1) / WIDTH + epsilon)
 
     sums = tl.zeros((ROWS, PADDED_LOGITS), tl.float32)
-    sums = _multiplied(hidden, _loaded(matrices, PADDED, PADDED_LOGITS), sums, HALF)
+    sums = _layer(hidden, matrices, sums, ROWS, PADDED, PADDED_LOGITS, HALF)
     if HALF:
         matrices += PADDED * PADDED_LOGITS
-        sums = _multiplied(hidden, _loaded(matrices, PADDED, PADDED_LOGITS), sums, HALF)
+        sums = _layer(hidden, matrices, sums, ROWS, PADDED, PADDED_LOGITS, HALF)
     number = tl.arange(0, PADDED_LOGITS)
     totals = tl.load(vectors + number)[None, :]
     constants = tl.load(vectors + PADDED_LOGITS + number)[None, :]
