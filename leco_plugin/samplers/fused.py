@@ -15,11 +15,24 @@ from weakref import WeakKeyDictionary
 import torch
 from torch import Tensor, nn
 
-from leco_plugin.samplers.gate_weights import GateWeights, gate_weights, why_not
+from leco_plugin.samplers.cache import CellCache
+from leco_plugin.samplers.gate_weights import (
+    MOST_WIDTH,
+    MOST_WIDTH_BUT_HOPPER,
+    GateWeights,
+    gate_weights,
+    why_not,
+)
+from leco_plugin.samplers.growth import MOST_POWERS, powers_needed
+from leco_plugin.samplers.marching import Candidates, Samples, TooManyCandidates
 
 _log = logging.getLogger(__name__)
 
+WIDEST_MARCH = 128
+"""Compiled, a march around a wider gate spills its registers; the twin asks the fused gate then."""
+
 Answer = TypeVar("Answer")
+PlanFn = Callable[[], Candidates]
 
 
 class _Switch:
@@ -68,11 +81,50 @@ def decisions(occupancy: nn.Module, positions: Tensor) -> Tensor | None:
     return tried("gate", ask)
 
 
+def march(
+    occupancy: nn.Module, cache: CellCache | None, device: torch.device, plan: PlanFn
+) -> Samples | None:
+    """The fused march of an estimator's rays; None: ask the torch twin.
+
+    Without cells every candidate would ask the gate in both launches: the twin asks it once.
+
+    Args:
+        occupancy: an `Occupancy`, or anything else that an estimator asks.
+        cache: the cells of its decisions.
+        device: where the rays are.
+        plan: numbers the candidates of the rays, without waiting for the device.
+
+    Raises:
+        ValueError: as `marching.march`.
+    """
+    if cache is None or not ready(device) or not isinstance(occupancy, nn.Module):
+        return None
+    weights = weights_of(occupancy)
+    if weights is None or weights.padded_width > WIDEST_MARCH:
+        return None
+    candidates = plan()
+    if candidates.counts.dtype != torch.float32 or not growth_fits(candidates):
+        return None
+
+    def ask() -> Samples:
+        from leco_plugin.samplers.march_kernel import march_kept
+
+        return march_kept(cache, weights, candidates)
+
+    return tried("march", ask)
+
+
+def growth_fits(candidates: Candidates) -> bool:
+    """Whether the powers of a growing step fit their table."""
+    step_size, cone_angle = candidates.step_size, candidates.cone_angle
+    return cone_angle <= 0.0 or powers_needed(step_size, cone_angle) <= MOST_POWERS
+
+
 def tried(name: str, kernel: Callable[[], Answer]) -> Answer | None:
     """What a kernel answers, or None after it failed, which the log says once."""
     try:
         return kernel()
-    except torch.cuda.OutOfMemoryError:
+    except (torch.cuda.OutOfMemoryError, TooManyCandidates):
         raise
     except Exception as error:  # noqa: BLE001 - a compiler and its driver raise what they like
         _switch.off = True
@@ -87,12 +139,18 @@ def weights_of(occupancy: nn.Module) -> GateWeights | None:
     now = tuple((value.data_ptr(), _version(value)) for value in state)
     found = _packed.get(occupancy)
     if found is None or found[0] != now:
-        reason = why_not(occupancy)
-        if reason is not None and found is None:
+        reason = why_not(occupancy, _most_width(state[0].device))
+        if reason is not None and found is None:  # else it has been said
             _log.info("no fused gate: %s", reason)
         found = now, gate_weights(occupancy) if reason is None else None
         _packed[occupancy] = found
     return found[1]
+
+
+def _most_width(device: torch.device) -> int:
+    if device.type == "cuda" and torch.cuda.get_device_capability(device)[0] != 9:
+        return MOST_WIDTH_BUT_HOPPER
+    return MOST_WIDTH
 
 
 def _version(value: Any) -> int:

@@ -14,6 +14,9 @@ from torch import Tensor
 MOST_COLUMNS = 128
 """Widest padded encoding; 20 octaves fit."""
 MOST_WIDTH = 256
+MOST_WIDTH_BUT_HOPPER = 128
+"""Compiled for compute capability 8, a wider gate spills its registers by tens of kilobytes; 9 was
+looked at, later ones were not."""
 MOST_LAYERS = 8
 MOST_LOGITS = 64
 
@@ -47,11 +50,12 @@ class GateWeights(NamedTuple):
     """Of the layer norm."""
 
 
-def why_not(occupancy: Any) -> str | None:
+def why_not(occupancy: Any, most_width: int = MOST_WIDTH) -> str | None:
     """Why the kernel cannot hold this occupancy's gate, or None if it can.
 
     Args:
         occupancy: anything that answers `cache.OccupancyLike`.
+        most_width: widest gate on the device.
     """
     config = getattr(getattr(occupancy, "gate", None), "config", None)
     if config is None or not hasattr(occupancy, "precision"):
@@ -60,7 +64,7 @@ def why_not(occupancy: Any) -> str | None:
         return f"its gate is on {config.encoding.kind} features"
     for name, size, most in (
         ("octaves", config.encoding.octaves, (MOST_COLUMNS - 3) // 6),
-        ("width", config.width, MOST_WIDTH),
+        ("width", config.width, most_width),
         ("layers", config.layers, MOST_LAYERS),
         ("logits", 1 + config.scene_experts, MOST_LOGITS),
     ):

@@ -10,11 +10,7 @@ from leco_plugin.occupancy import Occupancy
 from leco_plugin.samplers.fused import twins_only
 from leco_plugin.samplers.gate_weights import gate_weights
 
-pytestmark = [
-    *ON_KERNELS,
-    # numpy says so of the interpreter's arithmetic on places that no scene has
-    pytest.mark.filterwarnings("ignore:(overflow|invalid value) encountered:RuntimeWarning"),
-]
+pytestmark = ON_KERNELS
 
 
 def fused(asked: Occupancy, places: torch.Tensor) -> torch.Tensor:

@@ -15,7 +15,7 @@ import pytest
 HERE = Path(__file__).parent
 
 
-@pytest.mark.parametrize("name", ["test_gate_kernel.py"])
+@pytest.mark.parametrize("name", ["test_gate_kernel.py", "test_march_kernel.py"])
 def test_kernels_agree_with_their_twins(name: str) -> None:
     pytest.importorskip("triton")
     finished = subprocess.run(
