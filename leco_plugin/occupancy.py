@@ -18,6 +18,7 @@ from safetensors.torch import save
 from torch import Tensor, nn
 
 from leco_plugin.models.gate import Gate, GateConfig, check_sizes
+from leco_plugin.samplers import fused
 from leco_plugin.space import NO_WALL, Space
 
 FORMAT = "leco-occupancy"
@@ -87,8 +88,12 @@ class Occupancy(nn.Module):
         return torch.where(inside, values, 0.0)
 
     def occupied(self, positions: Tensor) -> Tensor:
-        """Whether scene positions [N, 3] are kept: bool [N]."""
-        return self.query(positions) >= self.threshold_value
+        """Whether scene positions [N, 3] are kept: bool [N].
+
+        On CUDA by the fused kernel where it runs, which may differ close to the threshold.
+        """
+        decided = fused.decisions(self, positions)
+        return self.query(positions) >= self.threshold_value if decided is None else decided
 
     @property
     def num_params(self) -> int:

@@ -117,9 +117,9 @@ class Estimator(nn.Module):
             t_enters, t_leaves = intersect_box(rays_o, rays_d, bounds.to(rays_o))
             t_maxs = t_maxs.minimum(t_leaves)
 
-        occupied, near_occupied = self.questions()
         asked = sigma_fn is not None or alpha_fn is not None
         if self.density_fn is not None and not (self.training or asked) and early_stop_eps > 0.0:
+            occupied, near_occupied = self.questions()
             candidates, _, longest = plan(
                 rays_o, rays_d, t_mins, t_maxs, render_step_size, cone_angle, jitter, t_enters
             )
@@ -131,18 +131,8 @@ class Estimator(nn.Module):
                 sigma_fn=densities_of_samples(self.density_fn, rays_o, rays_d),
                 early_stop_eps=early_stop_eps,
             )
-        samples = march(
-            rays_o,
-            rays_d,
-            t_mins,
-            t_maxs,
-            step_size=render_step_size,
-            cone_angle=cone_angle,
-            jitter=jitter,
-            occupied=occupied,
-            near_occupied=near_occupied,
-            t_enters=t_enters,
-            chunk_size=self.chunk_size,
+        samples = self.kept(
+            rays_o, rays_d, t_mins, t_maxs, render_step_size, cone_angle, jitter, t_enters
         )
         if not asked or (early_stop_eps <= 0.0 and alpha_thre <= 0.0):
             return samples
@@ -154,6 +144,33 @@ class Estimator(nn.Module):
             early_stop_eps=early_stop_eps,
             alpha_thre=alpha_thre,
             alpha_cap=self.alpha_cap,
+        )
+
+    def kept(
+        self,
+        rays_o: Tensor,
+        rays_d: Tensor,
+        t_mins: Tensor,
+        t_maxs: Tensor,
+        step_size: float,
+        cone_angle: float,
+        jitter: Tensor | None,
+        t_enters: Tensor | None,
+    ) -> Samples:
+        """Candidates that this estimator's questions leave; arguments as for `march`."""
+        occupied, near_occupied = self.questions()
+        return march(
+            rays_o,
+            rays_d,
+            t_mins,
+            t_maxs,
+            step_size=step_size,
+            cone_angle=cone_angle,
+            jitter=jitter,
+            occupied=occupied,
+            near_occupied=near_occupied,
+            t_enters=t_enters,
+            chunk_size=self.chunk_size,
         )
 
 

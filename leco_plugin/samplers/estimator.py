@@ -13,10 +13,11 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from leco_plugin.samplers import fused
 from leco_plugin.samplers.base import Estimator
 from leco_plugin.samplers.cache import CellCache, OccupancyLike
 from leco_plugin.samplers.cache_build import build_cache
-from leco_plugin.samplers.marching import NearFn, OccupiedFn
+from leco_plugin.samplers.marching import NearFn, OccupiedFn, Samples, number
 
 _log = logging.getLogger(__name__)
 
@@ -81,6 +82,22 @@ class LearnedOccupancyEstimator(Estimator):
 
     def questions(self) -> tuple[OccupiedFn | None, NearFn | None]:
         return self.occupied, None if self.cache is None else self.cache.near
+
+    def kept(
+        self,
+        rays_o: Tensor,
+        rays_d: Tensor,
+        t_mins: Tensor,
+        t_maxs: Tensor,
+        step_size: float,
+        cone_angle: float,
+        jitter: Tensor | None,
+        t_enters: Tensor | None,
+    ) -> Samples:
+        """As any estimator's, by the fused march where it runs."""
+        rays = rays_o, rays_d, t_mins, t_maxs, step_size, cone_angle, jitter, t_enters
+        samples = fused.march(self.occupancy, self.cache, rays_o.device, lambda: number(*rays))
+        return super().kept(*rays) if samples is None else samples
 
     def bounds(self) -> Tensor | None:
         return self._box[0] if len(self._box) else None

@@ -40,6 +40,10 @@ RUN = 16
 """Candidates of a run: long enough to work on at once, short enough to waste little."""
 
 
+class TooManyCandidates(ValueError):
+    """A ray has more candidates than a float32 can number."""
+
+
 class Candidates(NamedTuple):
     """The candidates of a batch of rays, of which only the numbers are held."""
 
@@ -154,6 +158,29 @@ def plan(
     Returns:
         the candidates, and the least and most of any ray (the one wait for the device).
     """
+    candidates = number(
+        origins, directions, t_mins, t_maxs, step_size, cone_angle, jitter, t_enters
+    )
+    counts, shortest, longest = candidates.counts, 0, 0
+    if len(counts):
+        last = (candidates.first + counts).amax()
+        sizes = torch.stack([*counts.aminmax(), last])
+        shortest, longest, highest = sizes.long().tolist()
+        check_longest(highest, len(counts), step_size)
+    return candidates, shortest, longest
+
+
+def number(
+    origins: Tensor,
+    directions: Tensor,
+    t_mins: Tensor,
+    t_maxs: Tensor,
+    step_size: float,
+    cone_angle: float = 0.0,
+    jitter: Tensor | None = None,
+    t_enters: Tensor | None = None,
+) -> Candidates:
+    """As `plan`, without the wait: how many candidates the longest ray has is not checked."""
     check_rays(origins, directions, t_mins, t_maxs, jitter, t_enters)
     if not (step_size > 0.0 and math.isfinite(step_size)):
         raise ValueError(f"step_size must be positive and finite, got {step_size}")
@@ -166,21 +193,27 @@ def plan(
         usable &= t_enters < t_maxs
     t_mins, t_maxs = t_mins.masked_fill(~usable, 0.0), t_maxs.masked_fill(~usable, 0.0)
     counts = candidate_counts(t_mins, t_maxs, step_size, cone_angle)
-    first, last = torch.zeros_like(counts), counts
+    first = torch.zeros_like(counts)
     if t_enters is not None:
         first = candidate_counts(t_mins, t_enters.minimum(t_maxs), step_size, cone_angle)
         counts = counts - first
-    shortest = longest = highest = 0
-    if len(counts):
-        sizes = torch.stack([*counts.aminmax(), last.amax()])
-        shortest, longest, highest = sizes.long().tolist()
+    coordinates = torch.stack([origins.T, directions.T])
+    return Candidates(coordinates, t_mins, first, counts, step_size, cone_angle)
+
+
+def check_longest(highest: int, n_rays: int, step_size: float) -> None:
+    """Raise where a ray has more steps than a float32 can number.
+
+    Args:
+        highest: steps of a ray from its t_min to its last candidate, the most of any.
+    Raises:
+        TooManyCandidates: those are more than 2^24.
+    """
     if highest > MAX_CANDIDATES_PER_RAY:
-        raise ValueError(
-            f"the longest of {len(counts)} rays has over 2^24 steps of {step_size:g}: give a far "
+        raise TooManyCandidates(
+            f"the longest of {n_rays} rays has over 2^24 steps of {step_size:g}: give a far "
             "plane, t_max or a box, begin nearer to it, or take a longer step or a cone angle"
         )
-    coordinates = torch.stack([origins.T, directions.T])
-    return Candidates(coordinates, t_mins, first, counts, step_size, cone_angle), shortest, longest
 
 
 def keep(
@@ -271,7 +304,7 @@ def candidate_edges(t_mins: Tensor, steps: Tensor, step_size: float, cone_angle:
     linear = torch.add(t_mins, steps, alpha=step_size)
     if cone_angle <= 0.0:
         return linear
-    n_linear, t_switch = _switch(t_mins, step_size, cone_angle)
+    n_linear, t_switch = switch(t_mins, step_size, cone_angle)
     growth = torch.exp((steps - n_linear).clamp_(min=0.0) * math.log1p(cone_angle))
     return torch.where(steps <= n_linear, linear, t_switch * growth)
 
@@ -288,7 +321,7 @@ def candidate_counts(t_mins: Tensor, t_maxs: Tensor, step_size: float, cone_angl
     """
     counts = ((t_maxs - t_mins) / step_size - 0.5).ceil()
     if cone_angle > 0.0:
-        n_linear, t_switch = _switch(t_mins, step_size, cone_angle)
+        n_linear, t_switch = switch(t_mins, step_size, cone_angle)
         ratio = t_maxs / (t_switch * (1.0 + 0.5 * cone_angle))
         geometric = n_linear + (ratio.clamp(min=1e-12).log() / math.log1p(cone_angle)).ceil()
         counts = torch.where(counts > n_linear, geometric.maximum(n_linear), counts)
@@ -306,7 +339,7 @@ def _midpoint(t_mins: Tensor, steps: Tensor, step_size: float, cone_angle: float
     return (starts + candidate_edges(t_mins, steps + 1.0, step_size, cone_angle)) * 0.5
 
 
-def _switch(t_mins: Tensor, step_size: float, cone_angle: float) -> tuple[Tensor, Tensor]:
+def switch(t_mins: Tensor, step_size: float, cone_angle: float) -> tuple[Tensor, Tensor]:
     """First edge with t cone_angle >= step_size, from which the step grows, and its t."""
     n_linear = ((step_size / cone_angle - t_mins) / step_size).ceil().clamp(min=0.0)
     return n_linear, torch.add(t_mins, n_linear, alpha=step_size)

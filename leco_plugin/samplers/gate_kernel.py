@@ -1,0 +1,308 @@
+"""The fused gate: positions to keep or skip in one Triton kernel.
+
+Its torch twin is `occupancy.Occupancy.occupied`. Imported by `fused.py` only where a kernel can
+run: on CUDA, or in Triton's interpreter. Between positions and bits nothing reaches memory.
+
+Sines and cosines of 2^k pi x come from 2^k x, reduced to a quarter turn without rounding, and a
+polynomial; the twin rounds its angles, by up to 2^(k - 23), and that is how far they differ.
+"""
+
+from __future__ import annotations
+
+import os
+
+import torch
+import triton
+import triton.language as tl
+from torch import Tensor
+
+from leco_plugin.samplers.gate_weights import GateWeights
+
+INTERPRETED = os.environ.get("TRITON_INTERPRET") == "1"
+"""Whether kernels run in Triton's interpreter; decided when Triton was imported."""
+
+_INTERPRETED = tl.constexpr(INTERPRETED)
+
+
+@triton.jit
+def mapped_of(x, y, z, facts, CONTRACTED: tl.constexpr):
+    """`Space.map` of positions, and whether they lie in the cube and the walls."""
+    half_extent = tl.load(facts + 3)
+    u = tl.div_rn(x - tl.load(facts), half_extent)
+    v = tl.div_rn(y - tl.load(facts + 1), half_extent)
+    w = tl.div_rn(z - tl.load(facts + 2), half_extent)
+    if CONTRACTED:
+        outside = tl.maximum(largest_of(u, v, w), 1.0)
+        factor = 2.0 - tl.div_rn(1.0, outside)
+        u = tl.div_rn(u * factor, outside) * 0.5
+        v = tl.div_rn(v * factor, outside) * 0.5
+        w = tl.div_rn(w * factor, outside) * 0.5
+    # each comparison is false for NaN, which the largest of the three need not be
+    inside = (tl.abs(u) <= 1.0) & (tl.abs(v) <= 1.0) & (tl.abs(w) <= 1.0)
+    inside &= (x >= tl.load(facts + 4)) & (x <= tl.load(facts + 7))
+    inside &= (y >= tl.load(facts + 5)) & (y <= tl.load(facts + 8))
+    inside &= (z >= tl.load(facts + 6)) & (z <= tl.load(facts + 9))
+    return u, v, w, inside
+
+
+@triton.jit
+def largest_of(u, v, w):
+    """Maximum norm."""
+    return tl.maximum(tl.maximum(tl.abs(u), tl.abs(v)), tl.abs(w))
+
+
+@triton.jit
+def _turned(half_turns):
+    """sin(pi y) and cos(pi y), to 1e-7."""
+    whole = tl.floor(half_turns + 0.5)
+    part = half_turns - whole
+    sign = 1.0 - 2.0 * (whole - 2.0 * tl.floor(whole * 0.5))
+    square = part * part
+    sine = tl.fma(square, 0.07765766030370826, -0.5982912856197324)
+    sine = tl.fma(square, sine, 2.5500775232145423)
+    sine = tl.fma(square, sine, -5.167710083507896)
+    sine = tl.fma(square, sine, 3.1415926401307073)
+    cosine = tl.fma(square, 0.2196896110974905, -1.331876568080807)
+    cosine = tl.fma(square, cosine, 4.058411352862603)
+    cosine = tl.fma(square, cosine, -4.934792830619646)
+    cosine = tl.fma(square, cosine, 0.9999999532476083)
+    return sign * part * sine, sign * cosine
+
+
+@triton.jit
+def _multiplied(features, matrix, sums, HALF: tl.constexpr):
+    """sums + features matrix, with the features rounded to the type of the matrix."""
+    if HALF:
+        features = features.to(tl.bfloat16)
+        if _INTERPRETED:  # the interpreter of Triton 3.9 would multiply the bits of bfloat16
+            features, matrix = features.to(tl.float32), matrix.to(tl.float32)
+    return tl.dot(features, matrix, sums, input_precision="ieee")
+
+
+@triton.jit
+def _loaded(matrices, ROWS: tl.constexpr, COLUMNS: tl.constexpr):
+    rows, columns = tl.arange(0, ROWS), tl.arange(0, COLUMNS)
+    return tl.load(matrices + rows[:, None] * COLUMNS + columns[None, :])
+
+
+@triton.jit
+def _halves(features, ROWS: tl.constexpr, COLUMNS: tl.constexpr):
+    """The first and the second half of the columns."""
+    halves = tl.reshape(features, (ROWS, 2, COLUMNS // 2))
+    return tl.split(tl.permute(halves, (0, 2, 1)))
+
+
+@triton.jit
+def _layer(
+    features,
+    matrices,
+    sums,
+    ROWS: tl.constexpr,
+    IN: tl.constexpr,
+    OUT: tl.constexpr,
+    HALF: tl.constexpr,
+):
+    """sums + features [ROWS, IN] times a matrix [IN, OUT], 64 rows of which are held at a time."""
+    if IN == 256:
+        low, high = _halves(features, ROWS, IN)
+        sums = _half_layer(low, matrices, sums, ROWS, IN // 2, OUT, HALF)
+        return _half_layer(high, matrices + IN // 2 * OUT, sums, ROWS, IN // 2, OUT, HALF)
+    return _half_layer(features, matrices, sums, ROWS, IN, OUT, HALF)
+
+
+@triton.jit
+def _half_layer(
+    features,
+    matrices,
+    sums,
+    ROWS: tl.constexpr,
+    IN: tl.constexpr,
+    OUT: tl.constexpr,
+    HALF: tl.constexpr,
+):
+    if IN == 128:
+        low, high = _halves(features, ROWS, IN)
+        sums = _multiplied(low, _loaded(matrices, IN // 2, OUT), sums, HALF)
+        return _multiplied(high, _loaded(matrices + IN // 2 * OUT, IN // 2, OUT), sums, HALF)
+    return _multiplied(features, _loaded(matrices, IN, OUT), sums, HALF)
+
+
+@triton.jit
+def _activated(sums, biases, WIDTH: tl.constexpr, HALF: tl.constexpr):
+    """Bias and ReLU; rounded where the twin's layer answers in bfloat16."""
+    hidden = tl.maximum(sums + tl.load(biases + tl.arange(0, WIDTH))[None, :], 0.0)
+    return hidden.to(tl.bfloat16).to(tl.float32) if HALF else hidden
+
+
+@triton.jit
+def gate_keeps(
+    x,
+    y,
+    z,
+    facts,
+    matrices,
+    vectors,
+    epsilon,
+    ROWS: tl.constexpr,
+    OCTAVES: tl.constexpr,
+    COLUMNS: tl.constexpr,
+    WIDTH: tl.constexpr,
+    PADDED: tl.constexpr,
+    LAYERS: tl.constexpr,
+    LOGITS: tl.constexpr,
+    PADDED_LOGITS: tl.constexpr,
+    CONTRACTED: tl.constexpr,
+    HALF: tl.constexpr,
+):
+    """The gate's decisions about positions [ROWS]."""
+    u, v, w, inside = mapped_of(x, y, z, facts, CONTRACTED)
+    u, v, w = tl.where(inside, u, 0.0), tl.where(inside, v, 0.0), tl.where(inside, w, 0.0)
+
+    column = tl.arange(0, COLUMNS)
+    turning = column < 3 * OCTAVES
+    axis = (column % 3)[None, :]
+    scale = (1 << tl.where(turning, column // 3, 0)).to(tl.float32)[None, :]
+    coordinates = tl.where(
+        axis == 0, u[:, None], tl.where(axis == 1, v[:, None], w[:, None])
+    )  # [ROWS, COLUMNS]
+    sines, cosines = _turned(coordinates * scale)
+    features = tl.where(turning[None, :], sines, coordinates)
+
+    sums = tl.zeros((ROWS, PADDED), tl.float32)
+    sums = _layer(features, matrices, sums, ROWS, COLUMNS, PADDED, HALF)
+    matrices += COLUMNS * PADDED
+    sums = _layer(cosines, matrices, sums, ROWS, COLUMNS, PADDED, HALF)
+    matrices += COLUMNS * PADDED
+    hidden = _activated(sums, vectors, PADDED, HALF)
+    vectors += PADDED
+    for _ in tl.static_range(LAYERS - 1):
+        sums = tl.zeros((ROWS, PADDED), tl.float32)
+        sums = _layer(hidden, matrices, sums, ROWS, PADDED, PADDED, HALF)
+        matrices += PADDED * PADDED
+        hidden = _activated(sums, vectors, PADDED, HALF)
+        vectors += PADDED
+
+    mean = tl.sum(hidden, axis=1) / WIDTH
+    real = (tl.arange(0, PADDED) < WIDTH)[None, :]
+    centred = tl.where(real, hidden - mean[:, None], 0.0)
+    spread = tl.rsqrt(tl.sum(centred * centred, axis=1) / WIDTH + epsilon)
+
+    sums = tl.zeros((ROWS, PADDED_LOGITS), tl.float32)
+    sums = _layer(hidden, matrices, sums, ROWS, PADDED, PADDED_LOGITS, HALF)
+    if HALF:
+        matrices += PADDED * PADDED_LOGITS
+        sums = _layer(hidden, matrices, sums, ROWS, PADDED, PADDED_LOGITS, HALF)
+    number = tl.arange(0, PADDED_LOGITS)
+    totals = tl.load(vectors + number)[None, :]
+    constants = tl.load(vectors + PADDED_LOGITS + number)[None, :]
+    logits = (sums - mean[:, None] * totals) * spread[:, None] + constants
+    occupancy = tl.where(inside, _occupancy(logits, number[None, :], LOGITS), 0.0)
+    return occupancy >= tl.load(facts + 10)
+
+
+@triton.jit
+def _occupancy(logits, number, LOGITS: tl.constexpr):
+    """`gate.occupancy_from_logits`; no exponential overflows."""
+    scene = tl.where((number > 0) & (number < LOGITS), logits, float("-inf"))
+    highest = tl.max(scene, axis=1)
+    total = tl.sum(tl.exp(scene - highest[:, None]), axis=1)
+    empty = tl.sum(tl.where(number == 0, logits, 0.0), axis=1)
+    logit = tl.log(total) + highest - empty
+    small = tl.exp(-tl.abs(logit))
+    return tl.where(logit >= 0.0, 1.0, small) / (1.0 + small)
+
+
+@triton.jit
+def _gate_kernel(
+    positions,
+    kept,
+    count,
+    row_stride,
+    column_stride,
+    facts,
+    matrices,
+    vectors,
+    epsilon,
+    ROWS: tl.constexpr,
+    OCTAVES: tl.constexpr,
+    COLUMNS: tl.constexpr,
+    WIDTH: tl.constexpr,
+    PADDED: tl.constexpr,
+    LAYERS: tl.constexpr,
+    LOGITS: tl.constexpr,
+    PADDED_LOGITS: tl.constexpr,
+    CONTRACTED: tl.constexpr,
+    HALF: tl.constexpr,
+):
+    rows = tl.program_id(0).to(tl.int64) * ROWS + tl.arange(0, ROWS)
+    there = rows < count
+    at = positions + rows * row_stride
+    x = tl.load(at, mask=there, other=0.0)
+    y = tl.load(at + column_stride, mask=there, other=0.0)
+    z = tl.load(at + 2 * column_stride, mask=there, other=0.0)
+    keep = gate_keeps(
+        x,
+        y,
+        z,
+        facts,
+        matrices,
+        vectors,
+        epsilon,
+        ROWS,
+        OCTAVES,
+        COLUMNS,
+        WIDTH,
+        PADDED,
+        LAYERS,
+        LOGITS,
+        PADDED_LOGITS,
+        CONTRACTED,
+        HALF,
+    )
+    tl.store(kept + rows, keep.to(tl.uint8), mask=there)
+
+
+def sizes_of(weights: GateWeights) -> dict[str, int | bool]:
+    """The constants that a kernel with this gate is compiled for."""
+    return {
+        "OCTAVES": weights.octaves,
+        "COLUMNS": weights.columns,
+        "WIDTH": weights.width,
+        "PADDED": weights.padded_width,
+        "LAYERS": weights.layers,
+        "LOGITS": weights.logits,
+        "PADDED_LOGITS": weights.padded_logits,
+        "CONTRACTED": weights.contracted,
+        "HALF": weights.half,
+    }
+
+
+def gate_decisions(weights: GateWeights, positions: Tensor) -> Tensor:
+    """Which positions the gate keeps, in one launch.
+
+    Args:
+        weights: as `gate_weights` packs them.
+        positions: float32 [N, 3] of any strides, scene units, on the device of the weights.
+
+    Returns:
+        bool [N], as `Occupancy.occupied` answers but for positions near the threshold.
+    """
+    kept = torch.empty(len(positions), dtype=torch.uint8, device=positions.device)
+    if len(positions):
+        wide = weights.padded_width > 64
+        rows = 64 if wide else 128
+        _gate_kernel[(triton.cdiv(len(positions), rows),)](
+            positions,
+            kept,
+            len(positions),
+            *positions.stride(),
+            weights.facts,
+            weights.matrices,
+            weights.vectors,
+            weights.epsilon,
+            ROWS=rows,
+            **sizes_of(weights),
+            num_warps=8 if weights.padded_width > 128 else 4,
+            enable_fp_fusion=False,
+        )
+    return kept.view(torch.bool)

@@ -1,0 +1,133 @@
+"""A gate's weights as its fused kernel reads them: three flat tensors and a few sizes.
+
+Torch only. The layer norm's scale and shift are folded into the last layer, so that the kernel
+multiplies the raw features and corrects for their mean and spread afterwards.
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import torch
+from torch import Tensor
+
+MOST_COLUMNS = 128
+"""Widest padded encoding; 20 octaves fit."""
+MOST_WIDTH = 256
+MOST_WIDTH_BUT_HOPPER = 128
+"""Compiled for compute capability 8, a wider gate spills its registers by tens of kilobytes; 9 was
+looked at, later ones were not."""
+MOST_LAYERS = 8
+MOST_LOGITS = 64
+
+
+class GateWeights(NamedTuple):
+    """What the kernel is given beside positions.
+
+    A matrix [in, out] stands row by row, padded with zeros to powers of two of at least 16.
+    """
+
+    facts: Tensor
+    """float32 [11]: centre, half extent, walls (min, max), threshold."""
+    matrices: Tensor
+    """bfloat16 or float32, flat: the first layer for sines and coordinates, the same for cosines,
+    the other hidden layers, the last layer, and in bfloat16 what its rounding left over."""
+    vectors: Tensor
+    """float32, flat: the bias of each hidden layer, then the column sums and the bias of the last
+    layer with the norm folded in."""
+    octaves: int
+    columns: int
+    """Columns of the padded encoding, once for sines and once for cosines."""
+    width: int
+    padded_width: int
+    layers: int
+    logits: int
+    padded_logits: int
+    contracted: bool
+    half: bool
+    """Whether it multiplies in bfloat16."""
+    epsilon: float
+    """Of the layer norm."""
+
+
+def why_not(occupancy: Any, most_width: int = MOST_WIDTH) -> str | None:
+    """Why the kernel cannot hold this occupancy's gate, or None if it can.
+
+    Args:
+        occupancy: anything that answers `cache.OccupancyLike`.
+        most_width: widest gate on the device.
+    """
+    config = getattr(getattr(occupancy, "gate", None), "config", None)
+    if config is None or not hasattr(occupancy, "precision"):
+        return "it has no gate of this package"
+    if config.encoding.kind != "frequency":
+        return f"its gate is on {config.encoding.kind} features"
+    for name, size, most in (
+        ("octaves", config.encoding.octaves, (MOST_COLUMNS - 3) // 6),
+        ("width", config.width, most_width),
+        ("layers", config.layers, MOST_LAYERS),
+        ("logits", 1 + config.scene_experts, MOST_LOGITS),
+    ):
+        if size > most:
+            return f"its gate has {name} {size}; the kernel holds {most}"
+    return None
+
+
+@torch.no_grad()
+def gate_weights(occupancy: Any) -> GateWeights:
+    """The weights of an occupancy for which `why_not` finds nothing, on its device."""
+    gate, space = occupancy.gate, occupancy.space
+    config, half = gate.config, occupancy.precision == "bfloat16"
+    octaves, width, logits = config.encoding.octaves, config.width, 1 + config.scene_experts
+    columns = power_of_two(3 * octaves + 3)
+    padded, padded_logits = power_of_two(width), power_of_two(logits)
+    first, *others = (layer.weight.float().T for layer in gate.hidden)
+    coordinates, sines, cosines = first.split([3, 3 * octaves, 3 * octaves])
+    last = (gate.head.weight.float() * gate.norm.weight.float()).T
+    matrices = [
+        _padded(torch.cat([sines, coordinates]), columns, padded),
+        _padded(cosines, columns, padded),
+        *(_padded(matrix, padded, padded) for matrix in others),
+    ]
+    last = _padded(last, padded, padded_logits)
+    rounded = last.to(torch.bfloat16).float()
+    # a bfloat16 feature times a float32 weight, as two exact products of bfloat16
+    matrices += [rounded, last - rounded] if half else [last]
+    biases = [layer.bias.float() for layer in gate.hidden]
+    biases = [bias.to(torch.bfloat16).float() if half else bias for bias in biases]
+    constant = gate.head.weight.float() @ gate.norm.bias.float() + gate.head.bias.float()
+    vectors = [
+        *(_padded(bias[None], 1, padded) for bias in biases),
+        last.sum(dim=0),
+        _padded(constant[None], 1, padded_logits),
+    ]
+    facts = [space.center, space.half_extent, occupancy.walls, occupancy.threshold_value]
+    return GateWeights(
+        facts=torch.cat([fact.reshape(-1).float() for fact in facts]),
+        matrices=_flat(matrices).to(torch.bfloat16 if half else torch.float32),
+        vectors=_flat(vectors),
+        octaves=octaves,
+        columns=columns,
+        width=width,
+        padded_width=padded,
+        layers=config.layers,
+        logits=logits,
+        padded_logits=padded_logits,
+        contracted=space.kind == "contraction",
+        half=half,
+        epsilon=gate.norm.eps,
+    )
+
+
+def power_of_two(size: int) -> int:
+    """The least power of two that is no less than `size` and 16, the least a tile may have."""
+    return max(16, 1 << (size - 1).bit_length())
+
+
+def _padded(matrix: Tensor, rows: int, columns: int) -> Tensor:
+    height, width = matrix.shape
+    return torch.nn.functional.pad(matrix, (0, columns - width, 0, rows - height))
+
+
+def _flat(parts: list[Tensor]) -> Tensor:
+    return torch.cat([part.reshape(-1) for part in parts])

@@ -1,0 +1,141 @@
+"""Kernels are chosen where they can run, and one that fails is replaced by its twin, once said."""
+
+from __future__ import annotations
+
+import logging
+import subprocess
+import sys
+
+import pytest
+import torch
+from ball_occupancy import ENCODINGS
+
+from leco_plugin.models.encodings import EncodingConfig
+from leco_plugin.models.gate import Gate, GateConfig
+from leco_plugin.occupancy import Occupancy
+from leco_plugin.samplers import fused
+from leco_plugin.samplers.gate_weights import GateWeights, gate_weights, why_not
+from leco_plugin.samplers.growth import growth_table, powers_needed
+from leco_plugin.samplers.marching import TooManyCandidates, candidate_counts, switch
+from leco_plugin.space import Space
+
+
+@pytest.fixture(autouse=True)
+def switched_on(monkeypatch) -> None:
+    monkeypatch.setattr(fused, "_switch", fused._Switch())
+
+
+def test_without_cuda_triton_is_never_imported() -> None:
+    code = (
+        "import sys, torch; from leco_plugin.samplers.estimator import LearnedOccupancyEstimator;"
+        "from leco_plugin.occupancy import Occupancy; from leco_plugin.models.gate import *;"
+        "from leco_plugin.space import Space;"
+        "made = LearnedOccupancyEstimator(Occupancy(Gate(GateConfig()), Space(), 0.5), "
+        "cache_bytes=0); made.sampling(torch.zeros(2, 3), torch.ones(2, 3), render_step_size=0.1);"
+        "assert not torch.cuda.is_available(); assert 'triton' not in sys.modules"
+    )
+    if torch.cuda.is_available():
+        pytest.skip("there is CUDA")
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+
+
+def test_a_failing_kernel_is_said_once_and_its_twin_answers(monkeypatch, caplog) -> None:
+    asked = Occupancy(Gate(GateConfig()), Space(), 0.5)
+    monkeypatch.setattr(fused, "ready", lambda device: not fused._switch.off)
+
+    monkeypatch.setitem(sys.modules, "leco_plugin.samplers.gate_kernel", None)
+    places = torch.randn(50, 3)
+    with caplog.at_level(logging.WARNING):
+        first, second = asked.occupied(places), asked.occupied(places)
+    assert torch.equal(first, asked.query(places) >= asked.threshold_value)
+    assert torch.equal(first, second)
+    said = [record.getMessage() for record in caplog.records]
+    assert len(said) == 1 and "the fused gate does not run, torch answers" in said[0]
+    assert "\n" not in said[0]
+
+
+def test_rays_without_an_end_are_no_failure_of_a_kernel() -> None:
+    def endless() -> None:
+        raise TooManyCandidates("over 2^24 steps")
+
+    with pytest.raises(ValueError, match="over 2"):
+        fused.tried("march", endless)
+    assert not fused._switch.off
+
+
+def test_twins_only_is_over_afterwards() -> None:
+    with fused.twins_only():
+        assert fused._switch.off
+    assert not fused._switch.off
+
+
+@pytest.mark.parametrize("kind", ["hash", "vm", "k-planes"])
+def test_gates_on_tables_stay_with_torch(kind: str) -> None:
+    occupancy = Occupancy(Gate(GateConfig(ENCODINGS[kind])), Space(), 0.5)
+    assert why_not(occupancy) == f"its gate is on {kind} features"
+
+
+@pytest.mark.parametrize(
+    ("sizes", "reason"),
+    [
+        ({"width": 512}, "width 512; the kernel holds 256"),
+        ({"layers": 9}, "layers 9; the kernel holds 8"),
+        ({"encoding": EncodingConfig(octaves=21)}, "octaves 21; the kernel holds 20"),
+        ({"scene_experts": 64}, "logits 65; the kernel holds 64"),
+    ],
+)
+def test_gates_that_do_not_fit_are_named(sizes, reason: str) -> None:
+    occupancy = Occupancy(Gate(GateConfig(**sizes)), Space(), 0.5)
+    found = why_not(occupancy)
+    assert found is not None and reason in found
+
+
+def test_what_is_no_occupancy_of_ours_stays_with_torch() -> None:
+    assert why_not(object()) == "it has no gate of this package"
+
+
+def test_weights_are_packed_anew_only_when_the_gate_changes() -> None:
+    occupancy = Occupancy(Gate(GateConfig()), Space(), 0.5)
+    packed = fused.weights_of(occupancy)
+    assert fused.weights_of(occupancy) is packed
+    occupancy.threshold_value.fill_(0.25)
+    renewed = fused.weights_of(occupancy)
+    assert renewed is not None and float(renewed.facts[10]) == 0.25
+    with torch.no_grad():
+        occupancy.gate.head.bias.add_(1.0)
+    assert fused.weights_of(occupancy) is not renewed
+
+
+def logits_by_hand(weights: GateWeights, features: torch.Tensor) -> torch.Tensor:
+    """What the kernel computes behind the hidden layers, from its last matrix and vectors."""
+    size = weights.padded_width * weights.padded_logits
+    last = weights.matrices.float()[-size * (1 + weights.half) :].view(-1, weights.padded_logits)
+    last = last.view(1 + weights.half, -1, weights.padded_logits).sum(dim=0)
+    totals, constants = weights.vectors[-2 * weights.padded_logits :].view(2, -1)
+    mean = features.mean(dim=1, keepdim=True)
+    spread = (features.var(dim=1, unbiased=False, keepdim=True) + weights.epsilon).rsqrt()
+    padded = torch.nn.functional.pad(features, (0, weights.padded_width - weights.width))
+    return ((padded @ last - mean * totals) * spread + constants)[:, : weights.logits]
+
+
+@pytest.mark.parametrize("precision", ["float32", "bfloat16"])
+def test_the_norm_folds_into_the_last_layer(precision) -> None:
+    gate = Gate(GateConfig(width=40))
+    torch.nn.init.normal_(gate.norm.weight)
+    torch.nn.init.normal_(gate.norm.bias)
+    weights = gate_weights(Occupancy(gate, Space(), 0.5, precision))
+    features = torch.rand(30, 40)
+    expected = gate.head(gate.norm(features))
+    torch.testing.assert_close(logits_by_hand(weights, features), expected, rtol=1e-4, atol=1e-4)
+
+
+@pytest.mark.parametrize("cone_angle", [1e-3, 1.0 / 256.0, 0.5])
+def test_the_powers_reach_as_far_as_a_float_can(cone_angle: float) -> None:
+    t_mins, t_maxs = torch.tensor([0.0, 3.0]), torch.full((2,), 1e30)
+    counts = candidate_counts(t_mins, t_maxs, 0.01, cone_angle)
+    n_linear, _ = switch(t_mins, 0.01, cone_angle)
+    assert float((counts + 1.0 - n_linear).max()) < powers_needed(0.01, cone_angle)
+    table = growth_table(0.01, cone_angle, torch.device("cpu"))
+    assert len(table) == powers_needed(0.01, cone_angle)
+    assert float(table[0]) == 1.0

@@ -1,0 +1,150 @@
+"""The fused march hands out the intervals of `march`, bit for bit where decisions agree."""
+
+from __future__ import annotations
+
+import functools
+
+import pytest
+import torch
+from samplers.analytic_occupancy import camera_rays
+from samplers.kernel_cases import DEVICE, NEAR_THRESHOLD, ON_KERNELS, occupancy
+
+from leco_plugin.samplers.cache_build import build_cache
+from leco_plugin.samplers.estimator import LearnedOccupancyEstimator
+from leco_plugin.samplers.gate_weights import gate_weights
+from leco_plugin.samplers.marching import Samples, march, number
+
+pytestmark = ON_KERNELS
+
+STEP = 1.0 / 16.0
+"""A power of two: then a CPU, which may round a product before it adds, has the same edges."""
+
+
+@functools.cache
+def estimator(kind: str, precision: str = "float32", octaves: int = 2) -> LearnedOccupancyEstimator:
+    asked = occupancy(kind, precision, octaves=octaves, width=16)
+    made = LearnedOccupancyEstimator(asked, cache_bytes=0)
+    made.cache = build_cache(asked, budget=1 << 18, tolerance=1e-2, check_points=1 << 14)
+    return made
+
+
+def rays(count: int) -> list[torch.Tensor]:
+    origins, directions = camera_rays(count)
+    return [origins.to(DEVICE), directions.to(DEVICE)]
+
+
+def fused(made: LearnedOccupancyEstimator, *arguments, **options) -> Samples:
+    from leco_plugin.samplers.march_kernel import march_kept
+
+    assert made.cache is not None
+    return march_kept(made.cache, gate_weights(made.occupancy), number(*arguments, **options))
+
+
+def twin(made: LearnedOccupancyEstimator, *arguments, **options) -> Samples:
+    occupied, near_occupied = made.questions()
+    return march(*arguments, occupied=occupied, near_occupied=near_occupied, **options)
+
+
+def as_set(samples: Samples) -> set[tuple[float, float, float]]:
+    return set(zip(*(tensor.tolist() for tensor in samples), strict=True))
+
+
+def assert_same(made: LearnedOccupancyEstimator, *arguments, **options) -> int:
+    """The two agree, but for candidates close to the threshold; how many are kept."""
+    ours, torchs = fused(made, *arguments, **options), twin(made, *arguments, **options)
+    for one, other in zip(ours, torchs, strict=True):
+        assert one.dtype == other.dtype and one.device == other.device
+    order = ours[0].double() * 1e6 + ours[1].double()
+    assert bool((order[1:] > order[:-1]).all())  # by ray, then t
+    differing = sorted(as_set(ours) ^ as_set(torchs))
+    assert len(differing) <= 2 + 0.005 * len(torchs[0])
+    if differing:
+        found = torch.tensor(differing, device=DEVICE)
+        middles = (found[:, 1] + found[:, 2])[:, None] / 2.0
+        which = found[:, 0].long()
+        values = made.occupancy.query(arguments[0][which] + arguments[1][which] * middles)
+        far = (values - made.occupancy.threshold_value).abs()
+        # a plane of a cell decides within its own error of the threshold
+        assert far.max() < NEAR_THRESHOLD["bfloat16"] + 0.05
+    return len(torchs[0])
+
+
+@pytest.mark.parametrize(
+    ("kind", "precision", "cone_angle"),
+    [
+        ("box", "float32", 0.0),
+        ("box", "bfloat16", 1.0 / 16.0),
+        ("contraction", "float32", 1.0 / 16.0),
+        ("contraction", "bfloat16", 0.0),
+    ],
+)
+def test_intervals_are_those_of_the_twin(kind: str, precision: str, cone_angle: float) -> None:
+    count = 6
+    near, far = torch.full((count,), 0.5), torch.linspace(0.4, 5.0, count)
+    kept = assert_same(
+        estimator(kind, precision),
+        *rays(count),
+        near.to(DEVICE),
+        far.to(DEVICE),
+        step_size=STEP,
+        cone_angle=cone_angle,
+    )
+    assert kept > 20
+
+
+def test_a_box_and_a_jitter_are_honoured() -> None:
+    count = 3
+    generator = torch.Generator().manual_seed(2)
+    jitter = (torch.rand(count, generator=generator) * 8.0).floor() / 8.0
+    assert_same(
+        estimator("box"),
+        *rays(count),
+        torch.zeros(count, device=DEVICE),
+        torch.full((count,), 3.0, device=DEVICE),
+        step_size=STEP,
+        jitter=jitter.to(DEVICE),
+        t_enters=torch.linspace(0.0, 3.5, count, device=DEVICE),
+    )
+
+
+def test_any_step_has_the_edges_of_the_twin_but_for_a_rounding() -> None:
+    made, count = estimator("box"), 2
+    arguments = (
+        *rays(count),
+        torch.zeros(count, device=DEVICE),
+        torch.full((count,), 4.0).to(DEVICE),
+    )
+    ours = fused(made, *arguments, step_size=0.07)
+    torchs = twin(made, *arguments, step_size=0.07)
+    assert abs(len(ours[0]) - len(torchs[0])) <= 2
+    if len(ours[0]) == len(torchs[0]):
+        torch.testing.assert_close(ours[1], torchs[1], atol=1e-6, rtol=0.0)
+
+
+@pytest.mark.parametrize("count", [0, 1])
+def test_few_rays_and_rays_without_candidates(count: int) -> None:
+    made = estimator("box")
+    origins, directions = rays(count)
+    nowhere = torch.zeros(count, device=DEVICE), torch.zeros(count, device=DEVICE)
+    samples = fused(made, origins, directions, *nowhere, step_size=STEP)
+    assert [len(tensor) for tensor in samples] == [0, 0, 0]
+    assert samples[0].dtype == torch.int64 and samples[1].dtype == torch.float32
+
+
+def test_rays_that_are_no_rays_keep_nothing_and_harm_no_other() -> None:
+    made = estimator("contraction")
+    origins, directions = rays(5)
+    origins[0], origins[1, 2] = torch.nan, torch.inf
+    directions[2], origins[3] = 0.0, 1e20
+    limits = torch.zeros(5, device=DEVICE), torch.full((5,), 3.0, device=DEVICE)
+    limits[1][3] = -1.0
+    samples = fused(made, origins, directions, *limits, step_size=STEP)
+    assert not torch.isin(samples[0], torch.tensor([0, 1, 2, 3], device=DEVICE)).any()
+    assert as_set(samples) == as_set(twin(made, origins, directions, *limits, step_size=STEP))
+
+
+def test_a_ray_without_an_end_is_named() -> None:
+    origins, directions = rays(2)
+    limits = torch.zeros(2, device=DEVICE), torch.tensor([1.0, 1e10], device=DEVICE)
+    with pytest.raises(ValueError, match="give a far plane"):
+        fused(estimator("box"), origins, directions, *limits, step_size=STEP)
