@@ -81,8 +81,8 @@ def shots_of(capture: Capture) -> list[Shot]:
     """All pictures of a capture, always the same."""
     random = np.random.default_rng([capture.seed, 21])
     poses = [_pose(capture, random, number) for number in range(capture.views + capture.test_views)]
-    every = max(2, round(len(poses) / capture.test_views))
-    held_out = set(range(every // 2, len(poses), every)[: capture.test_views])
+    places = (np.arange(capture.test_views) + 0.5) * len(poses) / capture.test_views
+    held_out = set(places.astype(int).tolist())
     noise = np.random.default_rng([capture.seed, 22])
     shots: list[Shot] = []
     for number, pose in enumerate(poses):
