@@ -45,7 +45,7 @@ def entries_of(
     the references that they are held against."""
     entries = []
     for case in cases:
-        wanted = {one.name for one in samplers if not case.only or one.name in case.only}
+        wanted = {one.name for one in samplers if case.is_about(one.name)}
         wanted |= {one.reference for one in samplers if one.name in wanted and one.reference}
         for sampler in samplers:
             if sampler.name in wanted:

@@ -43,11 +43,6 @@ class Sizes:
         }
 
     @property
-    def share_of_full(self) -> float:
-        """Work of a run as a share of one in full size, about."""
-        return self.steps * self.rays / (FULL.steps * FULL.rays)
-
-    @property
     def nerfacto(self) -> dict[str, Any]:
         """Nerfacto in the same sizes."""
         return {
@@ -66,7 +61,7 @@ class Sizes:
         }
 
 
-FULL = Sizes(steps=300, rays=256, learn_rays=512, learn_steps=200)
+FULL = Sizes(steps=208, rays=256, learn_rays=512, learn_steps=200)
 QUICK = Sizes(
     steps=40, rays=64, learn_rays=64, learn_steps=20, picture=0.5, views=0.4, dense_samples=48
 )

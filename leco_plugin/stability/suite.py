@@ -109,8 +109,8 @@ class Suite:
 
     def estimate(self) -> str:
         """How long what is missing takes, in words."""
-        todo, share = self.missing(), self.sizes.share_of_full
-        seconds = core_seconds(todo, list(self.stored().values()), share) / self.workers
+        todo, stored = self.missing(), list(self.stored().values())
+        seconds = core_seconds(todo, stored, self.sizes) / self.workers
         return (
             f"{len(todo)} of {len(runs_of(self.entries))} runs are to be made, {self.workers} at a "
             f"time: about {in_words(seconds)}"

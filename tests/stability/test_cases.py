@@ -52,7 +52,7 @@ def test_settings_arrive_where_they_belong() -> None:
     assert config("fp16", "learned").pipeline.model.occupancy.learning.precision == "float16"
     assert config("far-terrain", "grid-256").pipeline.model.occupancy.options == {
         "resolution": 256,
-        "levels": 4,
+        "levels": 2,
     }
     homogeneous = config("homogeneous", "learned").pipeline.model.occupancy.learning
     assert homogeneous.sizes.field.experts.empty_layers == homogeneous.sizes.field.experts.layers

@@ -78,7 +78,7 @@ def test_the_time_it_takes_is_said_before_and_from_its_own_runs_later(tmp_path: 
     assert made.estimate().startswith("3 of 3 runs are to be made, 1 at a time: about ")
     make(made, Runs())
     more = suite(tmp_path, ("yard",), SAMPLERS, (0, 1))
-    assert more.estimate() == "3 of 6 runs are to be made, 1 at a time: about 66 s"
+    assert more.estimate() == "3 of 6 runs are to be made, 1 at a time: about 30 s"
 
 
 def test_failures_are_drawn_beside_what_is_there(tmp_path: Path) -> None:
