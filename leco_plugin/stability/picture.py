@@ -14,16 +14,16 @@ from typing import Any
 from leco_plugin.chart.theme import LIGHT, Theme
 from leco_plugin.stability.table import figures, headline
 
-ROW, HEAD, FOOT = 0.36, 1.35, 0.75
+ROW, HEAD, FOOT = 0.36, 1.0, 0.7
 """Heights in inches."""
 NAMES, COLUMN = 2.75, 1.72
 """Widths in inches."""
 GAP = 0.03
-SIGNS = {"pass": "✓", "degraded": "~", "fail": "✗", "no reference": "·"}
+SIGNS = {"pass": "✓", "degraded": "~", "fail": "✗", "no reference": "-"}
 HOW_TO_READ = (
     "Each cell: PSNR against the dense run of the same host; samples kept, surfaces lost.  "
     "✓ within 0.2 dB and no bad seed   ~ degraded   ✗ fails   "
-    "· nothing to compare with: the dense run does not train"
+    "- nothing to compare with: the dense run does not train"
 )
 
 
@@ -109,12 +109,14 @@ def _draw_cell(axes: Any, cell: Mapping[str, Any], left: float, top: float, them
         )
     )
     ink = tints.inks[verdict]
-    first, second = figures(cell)
+    first, second, worst = figures(cell)
     if cell["psnr"] is None and cell["reason"]:
-        first, second = ("ended without a result" if verdict == "fail" else cell["reason"]), ""
+        first = "no result" if verdict == "fail" else cell["reason"]
     middle = top + ROW / 2
     offset = 0.065 if second else 0.0
     axes.text(left + 0.17, middle, SIGNS[verdict], ha="center", va="center", fontsize=12, color=ink)
     axes.text(left + 0.33, middle - offset, first, va="center", fontsize=9.5, color=ink)
+    right = left + COLUMN - 0.08
+    axes.text(right, middle - offset, worst, ha="right", va="center", fontsize=7, color=ink)
     if second:
-        axes.text(left + 0.33, middle + 0.085, second, va="center", fontsize=6.8, color=ink)
+        axes.text(left + 0.33, middle + 0.085, second, va="center", fontsize=7, color=ink)

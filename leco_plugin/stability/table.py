@@ -70,24 +70,24 @@ def blind(results: Mapping[str, Any]) -> list[str]:
     ]
 
 
-def figures(cell: Mapping[str, Any]) -> tuple[str, str]:
-    """The figures of a cell in two short lines: its PSNR, and what it skips."""
+def figures(cell: Mapping[str, Any]) -> tuple[str, str, str]:
+    """The figures of a cell in short words: its PSNR, what it skips, and its worst seed."""
     if cell["psnr"] is None:
-        return "-", ""
+        return "-", "", ""
     first = f"{cell['psnr']:.1f} dB" if cell["gap"] is None else f"{cell['gap']:+.2f} dB"
     parts = [] if cell["gap"] is None else [f"kept {cell['kept_fraction']:.0%}"]
     if cell["gap"] is not None and cell["lost_mass"] is not None:
         parts.append(f"lost {cell['lost_mass']:.1%}")
-    if cell["seeds"] > 1:
-        parts.append(f"worst {cell['worst']:+.2f}")
-    return first, ", ".join(parts)
+    worst = f"worst {cell['worst']:+.2f}" if cell["seeds"] > 1 else ""
+    return first, ", ".join(parts), worst
 
 
 def _cell(cell: Mapping[str, Any] | None) -> str:
     if cell is None:
         return ""
-    first, second = figures(cell)
-    return f"{SIGNS[cell['verdict']]}: {first}" + (f" ({second})" if second else "")
+    first, *rest = figures(cell)
+    more = ", ".join(part for part in rest if part)
+    return f"{SIGNS[cell['verdict']]}: {first}" + (f" ({more})" if more else "")
 
 
 def _rows(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
