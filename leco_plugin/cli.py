@@ -217,6 +217,46 @@ def chart(
         )
 
 
+def stability(
+    out: Path,
+    cases: tuple[str, ...] = (),
+    samplers: tuple[str, ...] = (),
+    seeds: tuple[int, ...] = (0,),
+    quick: bool = False,
+    json: Path | None = None,
+) -> None:
+    """Run samplers through scenes and disturbances in which they fail: a table of who passes.
+
+    Writes stability.json, table.md, stability.png, stability-dark.png, and for each failure a
+    picture in failures. What is finished is kept whenever this is stopped; the same command goes on
+    with what is missing. Exit 0 says that all was run, whatever the verdicts are; 1, that the case
+    that must fail was passed, so that no verdict can be believed.
+
+    Args:
+        out: Folder of the table. More cases, samplers and seeds may be added to it later.
+        cases: Names of cases, by default all; an unknown one is answered with all there are.
+        samplers: learned, grid-128, grid-256, proposal-networks, dense, dense-proposal; by default
+            all. The dense reference of a sampler's host joins by itself.
+        seeds: Seeds of each cell; the case ten-seeds has ten.
+        quick: Tiny pictures and few steps, to see whether everything works; no verdicts.
+        json: Another file for the results.
+    """
+    import warnings
+
+    # what nerfstudio and torch think of each other is nothing that a user can act on
+    warnings.filterwarnings("ignore", module=r"nerfstudio|torch")
+    from leco_plugin.stability.command import make_table
+    from leco_plugin.stability.table import blind, headline
+
+    _check_json(json)
+    results = make_table(out, cases, samplers, seeds, quick)
+    print(headline(results))
+    print(f"see stability.png, table.md, stability.json and failures in {out}")
+    _write_json(json, results)
+    if blind(results) and not quick:
+        raise RuntimeError(f"the case {blind(results)[0]} must fail and was passed")
+
+
 def check(name: Annotated[str, tyro.conf.Positional], json: Path | None = None) -> None:
     """Hold a sampler, or a guided method, to the rules that others rely on: one line a rule.
 
@@ -253,6 +293,7 @@ COMMANDS: dict[str, Callable[..., None]] = {
     "swap": swap,
     "demo": demo,
     "chart": chart,
+    "stability": stability,
     "check": check,
 }
 

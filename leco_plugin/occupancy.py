@@ -10,7 +10,7 @@ import hashlib
 import json
 import os
 from pathlib import Path
-from typing import Any, Literal, cast
+from typing import Any, Literal, cast, get_args
 
 import torch
 from safetensors import SafetensorError, safe_open
@@ -26,7 +26,7 @@ VERSION = 1
 LARGEST_FILE = 64 * 2**20
 """Bytes; a thousand times a usual gate. A larger file is another thing by mistake."""
 
-Precision = Literal["float32", "bfloat16"]
+Precision = Literal["float32", "bfloat16", "float16"]
 
 
 class Occupancy(nn.Module):
@@ -163,7 +163,7 @@ class Occupancy(nn.Module):
             version = header.get("version")
             raise ValueError(f"{path} has format version {version!r}; this reads {VERSION}")
         precision = header.get("precision")
-        if precision not in ("float32", "bfloat16"):
+        if precision not in get_args(Precision):
             raise ValueError(f"{path} names an unknown precision {precision!r}")
         try:
             config = GateConfig.from_dict(json.loads(header["gate"]))
@@ -268,4 +268,5 @@ def _expected_shapes(config: GateConfig) -> dict[str, _Described]:
 
 def gate_precision(device_type: str, precision: Precision) -> torch.autocast:
     """The context in which a gate of this precision is asked."""
-    return torch.autocast(device_type, dtype=torch.bfloat16, enabled=precision == "bfloat16")
+    half = torch.float16 if precision == "float16" else torch.bfloat16
+    return torch.autocast(device_type, dtype=half, enabled=precision != "float32")

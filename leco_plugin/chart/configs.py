@@ -51,4 +51,7 @@ def config_of(
     for path, value in contender.changes.items():
         model = changed(model, path, value)
     pipeline.model = model
-    return replace(config, pipeline=pipeline)
+    config = replace(config, pipeline=pipeline)
+    for path, value in contender.settings.items():
+        config = changed(config, path, value)
+    return config

@@ -22,6 +22,8 @@ class Contender:
     """As the registry of samplers knows it, or `own`."""
     changes: Mapping[str, Any] = field(default_factory=dict)
     """Settings under `--pipeline.model.`, by their path."""
+    settings: Mapping[str, Any] = field(default_factory=dict)
+    """Settings of the whole method, by their path; keys of dictionaries are steps of it too."""
     budget: float = 1.0
     """Multiple of the chart's time and steps that it is given."""
     grids: tuple[int, ...] = ()
@@ -32,6 +34,8 @@ class Contender:
     def key(self) -> str:
         """The same for what would run alike, whatever it is called: file name and identity."""
         what = {name: value for name, value in asdict(self).items() if name != "name"}
+        if not self.settings:
+            del what["settings"]  # charts that are stored were made before there were any
         digest = hashlib.sha256(json.dumps(what, sort_keys=True).encode()).hexdigest()
         return f"{self.method}-{self.sampler}-{digest[:8]}"
 
@@ -45,12 +49,16 @@ def changed(config: Any, path: str, value: Any) -> Any:
     """A config with one setting of it changed; the config given is left as it is.
 
     Args:
-        config: a dataclass of dataclasses.
-        path: names of fields with dots between them.
+        config: a dataclass of dataclasses and dictionaries.
+        path: names of fields, and keys, with dots between them.
     Raises:
-        ValueError: there is no such field.
+        ValueError: there is no such field or key.
     """
     name, _, rest = path.partition(".")
+    if isinstance(config, dict):
+        if name not in config:
+            raise ValueError(f"there is no setting {name!r}; there are {', '.join(config)}")
+        return {**config, name: changed(config[name], rest, value) if rest else value}
     if name not in getattr(config, "__dataclass_fields__", {}):
         raise ValueError(f"{type(config).__name__} has no setting {name!r}")
     return replace(config, **{name: changed(getattr(config, name), rest, value) if rest else value})

@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import json
+import os
 import shutil
 import signal
 import subprocess
 import sys
 import tempfile
+import threading
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -19,7 +21,8 @@ from leco_plugin.chart.protocol import Protocol
 from leco_plugin.chart.worker import FAILURE, JOB, PROGRESS, RESULT
 from leco_plugin.evaluation.json_file import write_json
 
-OCCUPANCY = "occupancy.safetensors"
+KEPT = ("occupancy.safetensors", "view.png")
+"""What a run may leave in its folder to be kept beside its record, by its ending."""
 POLL_SECONDS = 0.25
 WORKER = (sys.executable, "-W", "ignore", "-m", "leco_plugin.chart.worker")
 
@@ -36,6 +39,8 @@ class ProcessRunner:
         protocol: how long, and how they are evaluated.
         folder: of the chart; a failed run leaves its log there.
         command: what is started, with the folder of the job behind it.
+        environment: variables of that process that differ from those of this one.
+        stop: when it is set, a run under way is ended.
     """
 
     def __init__(
@@ -44,9 +49,13 @@ class ProcessRunner:
         protocol: Protocol,
         folder: ChartFolder,
         command: Sequence[str] = WORKER,
+        environment: Mapping[str, str] | None = None,
+        stop: threading.Event | None = None,
     ) -> None:
         self.data, self.protocol, self.folder = data.resolve(), protocol, folder
         self.command = list(command)
+        self.environment = {**os.environ, **(environment or {})}
+        self.stop = stop or threading.Event()
 
     def __call__(self, job: Job, show: Callable[[float], None]) -> dict[str, Any]:
         """The run's record. Its occupancy is left beside the stored runs.
@@ -55,6 +64,7 @@ class ProcessRunner:
             show: called with the share that is done.
         Raises:
             RunFailed: the process has failed or was killed.
+            KeyboardInterrupt: it was ended because all is to stop.
         """
         place = self.folder.path
         work = Path(tempfile.mkdtemp(prefix=f"{job.name}-", dir=place / UNFINISHED))
@@ -72,8 +82,10 @@ class ProcessRunner:
         if not (work / RESULT).exists():
             raise RunFailed(_reason(work, status, log))
         result: dict[str, Any] = json.loads((work / RESULT).read_text())
-        if (work / OCCUPANCY).exists():
-            (work / OCCUPANCY).replace(place / RUNS / f"{job.name}.safetensors")
+        for name in KEPT:
+            if (work / name).exists():
+                kept = (place / RUNS / job.name).as_posix() + Path(name).suffix
+                (work / name).replace(kept)
         shutil.rmtree(work)
         log.unlink()
         return result
@@ -86,10 +98,13 @@ class ProcessRunner:
                 stdin=subprocess.PIPE,
                 stdout=printed,
                 stderr=subprocess.STDOUT,
+                env=self.environment,
             )
             try:
                 while child.poll() is None:
                     time.sleep(POLL_SECONDS)
+                    if self.stop.is_set():
+                        raise KeyboardInterrupt
                     if (work / PROGRESS).exists():
                         show(float((work / PROGRESS).read_text() or 0.0))
             finally:

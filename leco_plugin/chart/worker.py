@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from nerfstudio.engine.trainer import Trainer
+    from nerfstudio.engine.trainer import Trainer, TrainerConfig
 
     from leco_plugin.chart.contender import Contender
     from leco_plugin.chart.protocol import Protocol
@@ -46,24 +46,41 @@ def run_job(
     folder: Path,
     on_progress: Callable[[float], None] | None = None,
 ) -> dict[str, Any]:
-    """Trains, evaluates and measures; the record as JSON values.
+    """Trains, evaluates and measures; the record as JSON values. Arguments as of `train_job`."""
+    from leco_plugin.chart.configs import config_of
+
+    budget = protocol.budget(contender.budget)
+    config = config_of(contender, data, folder / "nerfstudio", budget.learn_seconds)
+    return train_job(config, contender, seed, data, protocol, folder, on_progress)[0]
+
+
+def train_job(
+    config: TrainerConfig,
+    contender: Contender,
+    seed: int,
+    data: Path,
+    protocol: Protocol,
+    folder: Path,
+    on_progress: Callable[[float], None] | None = None,
+) -> tuple[dict[str, Any], Trainer]:
+    """Trains, evaluates and measures.
 
     Args:
+        config: of the contender.
         contender, seed: what.
         data: the scene.
         protocol: how long, and how it is evaluated.
         folder: for the occupancy, if there is one, and for nerfstudio's own files.
         on_progress: called with the share that is done.
     Returns:
-        A run of `results.json`, with an `occupancy` of its own.
+        A run of `results.json`, with an `occupancy` of its own, as JSON values; and the trainer
+        with its model.
     """
-    from leco_plugin.chart.configs import config_of
     from leco_plugin.evaluation.equal_loss import at_equal_loss
     from leco_plugin.evaluation.timed_run import timed_run
     from leco_plugin.models.leco import LecoModel
 
     budget = protocol.budget(contender.budget)
-    config = config_of(contender, data, folder / "nerfstudio", budget.learn_seconds)
     at_loss: dict[str, Any] = {}
 
     def when_frozen(trainer: Trainer) -> None:
@@ -86,7 +103,7 @@ def run_job(
     if facts is not None:
         facts["at_equal_loss"] = at_loss or None
         facts["learn_seconds"] = run.learn_seconds
-    return {**run.to_dict(), "name": contender.name, "occupancy": facts}
+    return {**run.to_dict(), "name": contender.name, "occupancy": facts}, trainer
 
 
 def _occupancy_of(trainer: Trainer, data: Path, folder: Path) -> dict[str, Any] | None:
@@ -111,8 +128,12 @@ def reason_of(error: BaseException) -> str:
     return said if isinstance(error, ValueError) and said else f"{type(error).__name__}: {said}"
 
 
-def main(folder: Path) -> int:
-    """Makes the run that a folder describes; 0, or 1 and a reason beside it."""
+def main(folder: Path, run: Callable[..., dict[str, Any]] = run_job) -> int:
+    """Makes the run that a folder describes; 0, or 1 and a reason beside it.
+
+    Args:
+        run: makes it; arguments as of `run_job`.
+    """
     from leco_plugin.chart.contender import Contender
     from leco_plugin.chart.protocol import Protocol
     from leco_plugin.evaluation.json_file import write_json
@@ -127,7 +148,7 @@ def main(folder: Path) -> int:
             (folder / PROGRESS).write_text(f"{share:.3f}")
 
     try:
-        result = run_job(
+        result = run(
             Contender.from_dict(job["contender"]),
             job["seed"],
             Path(job["data"]),

@@ -46,6 +46,8 @@ class OccupancyConfig:
     """Without a path: about how long learning may take at most; None is until it has settled."""
     rays: int = 1024
     """Without a path: rays of a batch while learning."""
+    rate: float = 1.0
+    """Without a path: multiple of the learning rates while learning."""
     learning: LecoModelConfig = field(default_factory=LecoModelConfig)
     """Without a path: the HMoE that learns."""
 
@@ -117,7 +119,9 @@ class GuidedStart:
             from leco_plugin.models.learn_first import learn_occupancy
 
             config = self.config
-            occupancy = learn_occupancy(config.learning, self.pipeline, config.rays, config.seconds)
+            occupancy = learn_occupancy(
+                config.learning, self.pipeline, config.rays, config.seconds, config.rate
+            )
             self.guide.set_occupancy(occupancy)
         if self.trainer is not None and is_first():
             folder = Path(self.trainer.base_dir)

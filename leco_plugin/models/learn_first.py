@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import time
-from dataclasses import replace
 from typing import Any
 
 import torch
@@ -24,7 +23,11 @@ FEWEST_STEPS = 20
 
 
 def learn_occupancy(
-    config: LecoModelConfig, pipeline: Any, rays: int, seconds: float | None = None
+    config: LecoModelConfig,
+    pipeline: Any,
+    rays: int,
+    seconds: float | None = None,
+    rate: float = 1.0,
 ) -> Occupancy:
     """Trains an HMoE on the pipeline's data until its gate is frozen and calibrated.
 
@@ -50,6 +53,7 @@ def learn_model(
             are as long as before when this returns.
         rays: of a batch.
         seconds: how long this may take at most, about; None takes the config's learning steps.
+        rate: multiple of the learning rates.
     Returns:
         The model as it is at the moment of freezing.
     Raises:
@@ -75,7 +79,7 @@ def learn_model(
     lifecycle = Lifecycle(model, TrainingCallbackAttributes(None, None, pipeline, None))
     lifecycle.rays_per_batch = rays
     groups = model.get_param_groups()
-    optimizers = [replace(_adam(name), lr=RATES[name]).setup(p) for name, p in groups.items()]
+    optimizers = [FusedAdamConfig(lr=rate * RATES[name]).setup(p) for name, p in groups.items()]
     try:
         with bar("Learning the occupancy") as show:
             _train(trained, lifecycle, optimizers, manager, seconds, show)
@@ -93,10 +97,6 @@ def steps_within(more: float, done: int, most: int) -> int:
         most: that are wanted.
     """
     return min(most, max(FEWEST_STEPS, done + int(more)))
-
-
-def _adam(name: str) -> FusedAdamConfig:
-    return FusedAdamConfig(lr=RATES[name])
 
 
 def _train(

@@ -37,7 +37,7 @@ from leco_plugin.models.rendering import (
 )
 from leco_plugin.models.scene_rays import cut_to_bounds, marching_rule
 from leco_plugin.models.sizes import SMALL, Sizes
-from leco_plugin.occupancy import Occupancy, gate_precision
+from leco_plugin.occupancy import Occupancy, Precision, gate_precision
 from leco_plugin.samplers.estimator import LearnedOccupancyEstimator
 from leco_plugin.samplers.marching import march
 from leco_plugin.scenes.bounds import BoundsConfig, SceneBounds
@@ -80,6 +80,9 @@ class LecoModelConfig(ModelConfig):
     """Share of the distortion loss that stays when the first phase is over and detail is wanted."""
     homogeneous: bool = False
     """A mixture of scene experts only, for comparison: no empty-space expert, nothing to freeze."""
+    precision: Precision | None = None
+    """Of matrix products, while learning and wherever the gate is asked; None is what the device is
+    fastest in."""
     near: float | None = None
     """Where rays begin, scene units; None is found from the data."""
     far: float | None = None
@@ -105,7 +108,7 @@ class LecoModel(Model):
         device = self.kwargs.get("device", "cpu")
         if torch.device(device).type == "cpu":
             keep_freed_memory()
-        self.precision = fast_precision(device)
+        self.precision = self.config.precision or fast_precision(device)
         sizes = self.config.sizes
         check_sizes(sizes.gate)
         self.gate = Gate(sizes.gate)

@@ -20,6 +20,19 @@ CELLS_AT_ONCE = 1 << 20
 """Cells evaluated in one call of the host's density; nerfacc asks 2 million at once."""
 
 
+def nested_boxes(box: Sequence[float] | Tensor, levels: int) -> list[Tensor]:
+    """A box [6] of (min, max), and around it others, each twice as wide as the one before.
+
+    Raises:
+        ValueError: there is not even one level.
+    """
+    if levels < 1:
+        raise ValueError(f"there is at least one box, not {levels}")
+    inner = torch.as_tensor(box).float()
+    center, half = (inner[:3] + inner[3:]) / 2, (inner[3:] - inner[:3]) / 2
+    return [torch.cat([center - half * 2**i, center + half * 2**i]) for i in range(levels)]
+
+
 class DenseEstimator(Estimator):
     """Keeps every candidate: the reference that skipping is measured against.
 
@@ -74,8 +87,7 @@ class OccupancyGridEstimator(Estimator):
             raise ValueError(f"a grid needs positive sizes, got {sizes} and {levels} levels")
         if box.shape != (6,) or not bool((box[:3] < box[3:]).all()) or not box.isfinite().all():
             raise ValueError(f"roi_aabb must be a finite box (min, max), got {box.tolist()}")
-        center, half = (box[:3] + box[3:]) / 2, (box[3:] - box[:3]) / 2
-        boxes = [torch.cat([center - half * 2**i, center + half * 2**i]) for i in range(levels)]
+        boxes = nested_boxes(box, levels)
         self.levels = levels
         self.cells_per_lvl = sizes[0] * sizes[1] * sizes[2]
         self.sizes = sizes

@@ -24,6 +24,24 @@ from leco_plugin.samplers.cache import OccupancyLike
 from leco_plugin.samplers.estimator import LearnedOccupancyEstimator
 
 
+def with_ends(ray_bundle: RayBundle | None) -> RayBundle:
+    """The rays, if they can be sampled.
+
+    A ray that ends before it begins has samples without length, all where it begins.
+
+    Raises:
+        ValueError: there are no rays, or they have no nears and fars.
+    """
+    if ray_bundle is None or ray_bundle.nears is None or ray_bundle.fars is None:
+        raise ValueError("samples need a ray bundle with nears and fars (set by a collider)")
+    return replace(ray_bundle, fars=ray_bundle.fars.maximum(ray_bundle.nears))
+
+
+def levels_of(density_fns: list[Callable[..., Any]] | None) -> int:
+    """How many levels of weights a host's losses and depth outputs expect."""
+    return 1 if density_fns is None else len(density_fns)
+
+
 class LearnedOccupancySampler(Sampler):
     """Draws samples from the gate's distribution along each ray.
 
@@ -89,15 +107,12 @@ class LearnedOccupancySampler(Sampler):
         Raises:
             ValueError: there are no rays to sample, or they have no nears and fars.
         """
-        if ray_bundle is None or ray_bundle.nears is None or ray_bundle.fars is None:
-            raise ValueError("samples need a ray bundle with nears and fars (set by a collider)")
-        # a ray that ends before it begins has samples without length, all where it begins
-        ray_bundle = replace(ray_bundle, fars=ray_bundle.fars.maximum(ray_bundle.nears))
+        ray_bundle = with_ends(ray_bundle)
         candidates = self.initial_sampler(ray_bundle, num_samples=self.num_candidates)
         worth = self.worth(candidates.frustums.get_positions())
         weights = worth / worth.sum(dim=-2, keepdim=True).clamp(min=1e-12)
         samples = self.pdf_sampler(ray_bundle, candidates, weights, num_samples=self.num_samples)
-        levels = 1 if density_fns is None else len(density_fns)
+        levels = levels_of(density_fns)
         return samples, [weights] * levels, [candidates] * levels
 
     @torch.no_grad()
@@ -116,3 +131,38 @@ class LearnedOccupancySampler(Sampler):
             values = self.estimator.occupancy.query(flat.index_select(0, kept))
             worth.index_put_((kept,), values.to(worth.dtype))
         return worth.view(*positions.shape[:-1], 1)
+
+
+class DenseSampler(Sampler):
+    """As many samples as are asked for, laid along every ray as the host lays its first ones.
+
+    Args:
+        num_samples: of the host, after its proposals; not looked at.
+        samples: samples of each ray.
+        initial_sampler, single_jitter: as of `LearnedOccupancySampler`.
+    """
+
+    def __init__(
+        self,
+        num_samples: int = 48,
+        samples: int = 256,
+        initial_sampler: Sampler | None = None,
+        single_jitter: bool = False,
+    ) -> None:
+        super().__init__()
+        self.samples = samples
+        self.initial_sampler = initial_sampler or UniformLinDispPiecewiseSampler(
+            single_jitter=single_jitter
+        )
+
+    def generate_ray_samples(
+        self,
+        ray_bundle: RayBundle | None = None,
+        density_fns: list[Callable[..., Any]] | None = None,
+    ) -> tuple[RaySamples, list[Tensor], list[RaySamples]]:
+        """Samples for a host; equal weights where it expects those of its proposals."""
+        candidates = self.initial_sampler(with_ends(ray_bundle), num_samples=self.samples)
+        shape = candidates.frustums.starts.shape
+        weights = candidates.frustums.starts.new_full(shape, 1.0 / self.samples)
+        levels = levels_of(density_fns)
+        return candidates, [weights] * levels, [candidates] * levels

@@ -40,8 +40,12 @@ class SamplerSpec:
 
 
 DENSE = SamplerSpec(
-    description="every candidate is kept: the reference",
+    description="every candidate is kept: the reference; option levels doubles the box",
     estimator="leco_plugin.samplers.registry:build_dense",
+)
+DENSE_PROPOSAL = SamplerSpec(
+    description="samples spread as a host spreads its first ones: the reference; option samples",
+    proposal="leco_plugin.samplers.registry:build_dense_proposal",
 )
 OCCUPANCY_GRID = SamplerSpec(
     description="Instant-NGP's occupancy grid as in nerfacc; options resolution, levels",
@@ -66,6 +70,7 @@ LEARNED_OCCUPANCY_VM = _on("TensoRF's vector-matrix features", "vm")
 LEARNED_OCCUPANCY_K_PLANES = _on("K-planes features", "k-planes")
 OURS = {
     "dense": DENSE,
+    "dense-proposal": DENSE_PROPOSAL,
     "occupancy-grid": OCCUPANCY_GRID,
     "learned-occupancy": LEARNED_OCCUPANCY,
     "learned-occupancy-hash": LEARNED_OCCUPANCY_HASH,
@@ -140,11 +145,20 @@ def check_gate(name: str, config: Any) -> None:
         )
 
 
-def build_dense(aabb: Any = None, occupancy: Any = None) -> nn.Module:
-    """`grid.DenseEstimator` in the host's box."""
-    from leco_plugin.samplers.grid import DenseEstimator
+def build_dense(aabb: Any = None, occupancy: Any = None, levels: int = 1) -> nn.Module:
+    """`grid.DenseEstimator` in the host's box, or in the outermost of so many nested ones."""
+    from leco_plugin.samplers.grid import DenseEstimator, nested_boxes
 
-    return DenseEstimator(aabb)
+    return DenseEstimator(aabb if aabb is None else nested_boxes(aabb, levels)[-1])
+
+
+def build_dense_proposal(**options: Any) -> nn.Module:
+    """`proposal.DenseSampler`; it asks no occupancy."""
+    from leco_plugin.samplers.proposal import DenseSampler
+
+    options.pop("occupancy", None)
+    options.pop("frame", None)
+    return DenseSampler(**options)
 
 
 def build_grid(aabb: Any, occupancy: Any = None, **options: Any) -> nn.Module:

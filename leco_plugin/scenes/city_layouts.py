@@ -76,7 +76,7 @@ class NerfstudioLayout(Layout):
         write_whole(folder / depths, lambda f: np.save(f, self.lens.axial(depth)))
 
     def finish(self, folder: Path) -> None:
-        _write_points(folder / POINTS, self._points(folder))
+        write_points(folder / POINTS, self._points(folder))
         transforms = json.dumps(self._transforms(), indent=1) + "\n"
         write_whole(folder / TRANSFORMS, lambda f: f.write(transforms.encode()))
 
@@ -168,7 +168,7 @@ class MegaNerfLayout(Layout):
         return f"{view.number:06d}"
 
 
-def _write_points(path: Path, rows: NDArray[Any]) -> None:
+def write_points(path: Path, rows: NDArray[Any]) -> None:
     """Writes rows of `xyz` (metres) and `rgb` as a binary PLY file."""
     fields = [f"property float {axis}" for axis in "xyz"]
     fields += [f"property uchar {name}" for name in ("red", "green", "blue")]

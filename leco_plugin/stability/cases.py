@@ -1,0 +1,263 @@
+"""The cases: each a scene or a disturbance, with a reason to exist. All of them are data."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+from leco_plugin.scenes.input_error import InputError
+from leco_plugin.stability.capture import Capture
+from leco_plugin.stability.contenders import DENSE, GRID, LEARNED
+
+LEARN = "occupancy.learning."
+FINE = 256
+"""Cells along an axis of the finer occupancy grid."""
+
+
+@dataclass(frozen=True)
+class Case:
+    """One row of the table."""
+
+    name: str
+    title: str
+    """In the table."""
+    why: str
+    """What it is for, in a sentence."""
+    stage: str = "yard"
+    """What is there, by its name in `stages`."""
+    capture: Capture = field(default_factory=Capture)
+    """How it is photographed."""
+    changes: Mapping[str, Any] = field(default_factory=dict)
+    """Settings of the model; those of the occupancy count for what learns one."""
+    settings: Mapping[str, Any] = field(default_factory=dict)
+    """Settings of the whole method."""
+    grid_levels: int = 1
+    """Nested boxes of occupancy grids: as many as somebody who knows the scene would take."""
+    fine_grid: bool = False
+    """Whether size and place of cells are the question, so that finer ones are tried too: to keep
+    256^3 cells up to date takes a core of a CPU minutes."""
+    only: tuple[str, ...] = ()
+    """Samplers that it has something to say about; none is all. References join by themselves."""
+    seeds: int = 1
+    """Fewest seeds."""
+    must_fail: bool = False
+    """Whether it shows that the suite can tell a failure: learned occupancy has to fail in it."""
+    fixed_views: bool = False
+    """Whether the number of pictures is the point."""
+
+    def is_about(self, sampler: str) -> bool:
+        """Whether it has something to say about a sampler."""
+        fine = sampler == f"{GRID}-{FINE}"
+        return (not self.only or sampler in self.only) and (self.fine_grid or not fine)
+
+    @property
+    def scene(self) -> str:
+        """Name of its scene's folder: cases with equal pictures share one."""
+        plain = self.capture == Capture(stand=self.capture.stand)
+        return self.stage if plain else self.name
+
+
+def _learning(name: str, title: str, why: str, **changes: Any) -> Case:
+    """A case that changes how the occupancy is learned, and nothing else."""
+    paths = {LEARN + path.replace("__", "."): value for path, value in changes.items()}
+    return Case(name, title, why, changes=paths, only=(LEARNED,))
+
+
+def _paper(name: str, title: str, why: str, **changes: Any) -> Case:
+    """The same with the losses in the paper's form, whose weights have these names."""
+    return _learning(name, title, why, gate_loss__form="paper", **changes)
+
+
+CASES = {
+    case.name: case
+    for case in (
+        Case(
+            "yard",
+            "a yard",
+            "nothing is difficult: who fails here fails everywhere",
+            fine_grid=True,
+        ),
+        Case(
+            "poles-and-wires",
+            "poles and wires",
+            "a wire is thinner than a cell, and costs no PSNR when it disappears",
+            "poles-and-wires",
+            fine_grid=True,
+        ),
+        Case(
+            "glass", "glass", "low density that matters, before surfaces", "glass", fine_grid=True
+        ),
+        Case(
+            "fog",
+            "fog",
+            "low density everywhere: nothing is empty, nothing is solid",
+            "fog",
+            fine_grid=True,
+        ),
+        Case(
+            "all-empty",
+            "nothing but sky",
+            "a gate may call all of it empty, and must not collapse over it",
+            "all-empty",
+            Capture(stand="low"),
+        ),
+        Case("all-full", "matter everywhere", "nothing may be skipped", "all-full"),
+        Case(
+            "far-terrain",
+            "sky and far terrain",
+            "half of every picture lies outside any box that fits the scene",
+            "far-terrain",
+            Capture(stand="low"),
+            grid_levels=2,
+            fine_grid=True,
+        ),
+        Case(
+            "outline",
+            "irregular outline",
+            "no box fits the scene, and one camera stands far outside",
+            "outline",
+            Capture(stray=1),
+            fine_grid=True,
+        ),
+        Case(
+            "indoors",
+            "inside a building",
+            "cameras inside the matter that they see: what is empty is around them",
+            "indoors",
+            Capture(stand="inside"),
+            fine_grid=True,
+        ),
+        Case(
+            "bounds-too-small",
+            "bounds 4 x too small",
+            "bounds are guessed, and most of the scene lies outside them",
+            settings={"pipeline.datamanager.dataparser.scene_scale": 0.25},
+            fine_grid=True,
+        ),
+        Case(
+            "bounds-too-large",
+            "bounds 4 x too large",
+            "bounds are guessed, and cells are four times as coarse",
+            settings={"pipeline.datamanager.dataparser.scene_scale": 4.0},
+            fine_grid=True,
+        ),
+        Case(
+            "six-views",
+            "six views only",
+            "most places are seen once or never: haze explains the pictures as well as surfaces",
+            capture=Capture(views=6),
+            fixed_views=True,
+        ),
+        Case(
+            "exposure",
+            "changing exposure",
+            "no density explains what differs between pictures, and haze tries",
+            capture=Capture(exposure=0.35),
+        ),
+        Case(
+            "pose-noise",
+            "noisy poses",
+            "surfaces do not meet, and a sharp occupancy cuts off the half that is elsewhere",
+            capture=Capture(shift=0.03, turn=0.3),
+        ),
+        Case(
+            "moving",
+            "moving objects",
+            "what is there in a third of the pictures only must not take the floor along",
+            capture=Capture(moving=True),
+        ),
+        Case(
+            "resolutions",
+            "three resolutions",
+            "batches mix pictures of different sizes",
+            capture=Capture(sizes=(1.0, 0.5, 1.5)),
+        ),
+        Case(
+            "far-origin",
+            "origin 10 km away",
+            "metric coordinates leave float32 a millimetre",
+            capture=Capture(origin=(10_000.0, -14_000.0, 300.0)),
+        ),
+        _paper(
+            "ratio-too-low",
+            "empty ratio 5 x too low",
+            "the target that the paper has one guess, guessed wrong",
+            gate_loss__empty_ratio=0.9 / 5,
+        ),
+        _paper(
+            "ratio-too-high",
+            "occupied ratio 5 x too low",
+            "the same in the other direction: the gate is pressed to call surfaces empty",
+            gate_loss__empty_ratio=1.0 - 0.1 / 5,
+        ),
+        *(
+            _paper(
+                f"lambda-{letter}-{word}",
+                f"λ_{letter} {sign} 10",
+                f"the weight of the {loss} loss is ten times too {size}",
+                **{f"gate_loss__{key}": weight * times},
+            )
+            for letter, key, loss, weight in (
+                ("g", "imbalance", "imbalanced gate", 5e-3),
+                ("d", "density", "density", 1.0),
+            )
+            for word, sign, size, times in (
+                ("high", "x", "large", 10.0),
+                ("low", "/", "small", 0.1),
+            )
+        ),
+        Case(
+            "learning-rate",
+            "learning rate x 10",
+            "steps that overshoot, of host and gate alike",
+            changes={"occupancy.rate": 10.0},
+            settings={"optimizers.fields.optimizer.lr": 1e-1},
+        ),
+        Case(
+            "few-rays",
+            "32 rays a batch",
+            "gradients of few rays, and statistics of few samples",
+            changes={"occupancy.rays": 32},
+            settings={"pipeline.datamanager.train_num_rays_per_batch": 32},
+        ),
+        _learning(
+            "bf16", "bfloat16", "eight bits of mantissa decide what is kept", precision="bfloat16"
+        ),
+        _learning(
+            "fp16", "float16", "small gradients vanish, large ones overflow", precision="float16"
+        ),
+        replace(
+            Case("ten-seeds", "ten seeds", "one seed in ten goes bad, and nobody looks"),
+            only=(LEARNED, f"{GRID}-128", DENSE),
+            seeds=10,
+        ),
+        replace(
+            _paper(
+                "homogeneous",
+                "equal experts (must fail)",
+                "an occupancy from a mixture of equal experts, balanced and not calibrated, skips "
+                "surfaces: a suite that passes it is blind",
+                gate_loss__density=0.0,
+                gate_loss__empty_ratio=0.2,
+                sizes__field__experts__empty_expert="mlp",
+                sizes__field__experts__empty_layers=2,
+                calibration__lost_surface_mass=1.0,
+                calibration__image_price_db=1e3,
+            ),
+            must_fail=True,
+        ),
+    )
+}
+
+
+def cases_named(names: tuple[str, ...]) -> list[Case]:
+    """The cases of these names, in the table's order; without names, all.
+
+    Raises:
+        InputError: there is no case of a name.
+    """
+    unknown = [name for name in names if name not in CASES]
+    if unknown:
+        raise InputError(f"there is no case {unknown[0]!r}; there are {', '.join(CASES)}")
+    return [case for case in CASES.values() if not names or case.name in names]

@@ -1,0 +1,57 @@
+"""`leco stability`: from the words on the command line to a table that is made and drawn."""
+
+from __future__ import annotations
+
+import functools
+import shlex
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+from nerfstudio.utils.rich_utils import CONSOLE
+
+from leco_plugin.progress_bar import bar
+from leco_plugin.stability.cases import cases_named
+from leco_plugin.stability.contenders import samplers_named
+from leco_plugin.stability.sizes import FULL, QUICK
+from leco_plugin.stability.suite import Runner, Suite
+
+
+def make_table(
+    out: Path,
+    cases: Sequence[str] = (),
+    samplers: Sequence[str] = (),
+    seeds: Sequence[int] = (0,),
+    quick: bool = False,
+    runner_for: Callable[[str], Runner] | None = None,
+) -> dict[str, Any]:
+    """Makes what is missing of a table and draws it.
+
+    Args:
+        out: the table's folder.
+        cases, samplers: their names; none is all.
+        seeds: of each cell; cases that are about seeds have more.
+        quick: tiny sizes, for a look at whether everything works.
+        runner_for: gives what makes the runs of a scene.
+    Returns:
+        The results, as in `stability.json`.
+    Raises:
+        ValueError, OSError: a name or the folder is wrong; nothing was started.
+    """
+    chosen, compared = cases_named(tuple(cases)), samplers_named(tuple(samplers))
+    say = functools.partial(CONSOLE.print, markup=False, highlight=False)
+    command = command_line(quick, {"cases": cases, "samplers": samplers, "seeds": seeds})
+    suite = Suite(out, chosen, compared, seeds, QUICK if quick else FULL, command)
+    say(suite.estimate())
+    with bar(f"{len(chosen)} cases") as show:
+        suite.make(say, show, runner_for)
+    return suite.draw()
+
+
+def command_line(quick: bool, named: dict[str, Sequence[object]]) -> str:
+    """What to type for the same table elsewhere: without this machine's paths."""
+    words: list[object] = ["leco", "stability", "--out", "DIR"]
+    for name, values in named.items():
+        if values:
+            words += [f"--{name}", *values]
+    return shlex.join(map(str, [*words, *(["--quick"] if quick else [])]))

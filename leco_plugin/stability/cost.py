@@ -1,0 +1,76 @@
+"""How long a table takes: before its first run from stored figures, then from its own runs.
+
+The figures are seconds of one core of a server's CPU, with one thread.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from leco_plugin.stability.contenders import (
+    DENSE,
+    DENSE_PROPOSAL,
+    GRID,
+    LEARNED,
+    PROPOSALS,
+)
+from leco_plugin.stability.plan import Run
+from leco_plugin.stability.sizes import Sizes
+
+START_SECONDS = 15.0
+"""For a process to start, to read the scene, to build the host, and to look at the result."""
+RAY_SECONDS: Mapping[str, float] = {
+    LEARNED: 4e-4,
+    GRID: 4e-4,
+    PROPOSALS: 5e-4,
+    DENSE: 8e-4,
+    DENSE_PROPOSAL: 10e-4,
+}
+"""Of training, a ray of a step."""
+LEARNED_RAY_SECONDS = 3e-4
+"""A ray of a step of learning."""
+FREEZE_SECONDS = 15.0
+"""To calibrate a gate and to build its cell cache."""
+CELL_SECONDS = 1.8e-6
+"""To ask the field about a cell of an occupancy grid."""
+STEPS_PER_UPDATE = 16
+"""Of an occupancy grid; until step 256 it asks about every cell."""
+
+
+def core_seconds(runs: Sequence[Run], stored: Sequence[Mapping[str, Any]], sizes: Sizes) -> float:
+    """What some runs take of one core, seconds.
+
+    Args:
+        runs: to be made.
+        stored: records of runs that were made; what they took replaces the stored figures.
+    """
+    measured: dict[str, list[float]] = {}
+    for record in stored:
+        measured.setdefault(record["sampler"], []).append(float(record["processor_seconds"]))
+    means = {name: sum(seconds) / len(seconds) for name, seconds in measured.items()}
+    return sum(means.get(run.job.contender.sampler) or expected_seconds(run, sizes) for run in runs)
+
+
+def expected_seconds(run: Run, sizes: Sizes) -> float:
+    """What a run takes before any like it was made."""
+    contender = run.job.contender
+    rays = contender.settings["pipeline.datamanager.train_num_rays_per_batch"]
+    kind = GRID if contender.sampler.startswith(f"{GRID}-") else contender.sampler
+    seconds = START_SECONDS + sizes.steps * rays * RAY_SECONDS[kind]
+    if kind == LEARNED:
+        learning = contender.changes["occupancy.rays"] * sizes.learn_steps
+        seconds += FREEZE_SECONDS + learning * LEARNED_RAY_SECONDS
+    if kind == GRID:
+        options = contender.changes["occupancy.options"]
+        cells = options["levels"] * options["resolution"] ** 3
+        seconds += -(-sizes.steps // STEPS_PER_UPDATE) * cells * CELL_SECONDS
+    return float(seconds)
+
+
+def in_words(seconds: float) -> str:
+    """A time for people."""
+    minutes = seconds / 60.0
+    if minutes < 2.0:
+        return f"{seconds:.0f} s"
+    return f"{minutes:.0f} minutes" if minutes < 120.0 else f"{minutes / 60.0:.1f} hours"

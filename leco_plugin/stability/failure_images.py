@@ -1,0 +1,68 @@
+"""For each failure a picture: what is there, what the reference shows, what the sampler shows."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from PIL import Image
+
+if TYPE_CHECKING:
+    from leco_plugin.stability.suite import Suite
+
+FAILURES = "failures"
+_WIDTH = 3.4
+"""Of one picture, inches."""
+
+
+def draw_failures(suite: Suite, results: Mapping[str, Any]) -> list[Path]:
+    """Draws all cells that fail or are degraded and have pictures; those of earlier calls go."""
+    folder = suite.out / FAILURES
+    folder.mkdir(exist_ok=True)
+    for old in folder.glob("*.png"):
+        old.unlink()
+    rows = {row["name"]: row["cells"] for row in results["cases"]}
+    drawn = []
+    for entry in suite.entries:
+        cell = rows[entry.case.name][entry.sampler.name]
+        if cell["verdict"] not in ("fail", "degraded") or entry.sampler.reference is None:
+            continue
+        worst = cell["worst_seed"]
+        shown = suite.view_of(entry, worst)
+        reference = suite.view_of(suite.reference_of(entry), worst)
+        if shown is not None:
+            path = folder / f"{entry.case.name}--{entry.sampler.name}.png"
+            pictures = {"what is there": suite.true_view(entry.case), "dense": reference}
+            pictures[f"{entry.sampler.title}, seed {worst}"] = shown
+            title = f"{entry.case.title}: {cell['reason']}"
+            drawn.append(side_by_side(pictures, title, path))
+    return drawn
+
+
+def side_by_side(pictures: Mapping[str, Path | None], title: str, path: Path) -> Path:
+    """Pictures under their names in a row; those that are None are left out."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    there = {name: picture for name, picture in pictures.items() if picture is not None}
+    figure = Figure(figsize=(_WIDTH * len(there), 0.75 * _WIDTH + 0.75), facecolor="white")
+    FigureCanvasAgg(figure)
+    figure.text(0.01, 0.985, title, va="top", fontsize=11, fontweight="bold")
+    for number, (name, picture) in enumerate(there.items()):
+        left = number / len(there)
+        axes = figure.add_axes((left + 0.008, 0.02, 1 / len(there) - 0.016, 0.78))
+        axes.imshow(on_white(picture), interpolation="nearest")
+        axes.set_title(name, fontsize=10, loc="left", pad=4)
+        axes.axis("off")
+    figure.savefig(path, dpi=110)
+    return path
+
+
+def on_white(picture: Path) -> Any:
+    """A picture [h, w, 3] in 0..1, white where it is transparent."""
+    with Image.open(picture) as image:
+        pixels = np.asarray(image.convert("RGBA"), dtype=float) / 255.0
+    alpha = pixels[..., 3:]
+    return pixels[..., :3] * alpha + 1.0 - alpha

@@ -1,0 +1,164 @@
+"""What a trained host skips of a scene that is known exactly, and what its pictures show of it.
+
+In the exact scene all weight of a ray lies on the first surface that it meets. Whatever a sampler
+is, it loses a ray when none of its samples comes near that surface.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from nerfstudio.cameras.rays import RayBundle
+from nerfstudio.engine.trainer import Trainer
+from numpy.typing import NDArray
+from torch import Tensor
+
+from leco_plugin.evaluation.held_out_images import true_image
+from leco_plugin.stability.scene_folder import TRUTH
+
+NEAR = 0.03
+"""A sample whose middle is within this share of the surface's distance is near it: the references
+step by about as much."""
+RAYS_AT_ONCE = 1024
+
+
+@dataclass(frozen=True)
+class Measured:
+    """Of all held-out pictures together."""
+
+    lost_mass: float | None
+    """Share of the rays that meet a surface and have no sample near it; None without surfaces."""
+    kept_fraction: float
+    """Samples as a share of the candidates of the dense reference."""
+    detail_psnr: float | None
+    """PSNR on the pixels that show what the case is about; None where it is about no such thing."""
+    trivial_psnr: float
+    """PSNR of the held-out pictures against their mean colour: of a method that saw nothing."""
+    black_share: float
+    """Share of the rays without any sample."""
+
+
+@torch.no_grad()
+def measure(trainer: Trainer, data: Path, dense_samples: int) -> tuple[Measured, NDArray[np.uint8]]:
+    """Renders the held-out pictures of a case's scene.
+
+    Args:
+        trainer: with a trained host.
+        data: folder of the scene, with its truth.
+        dense_samples: candidates of a ray of a proposal host's reference.
+    Returns:
+        The figures, and the first picture [h, w, 3] as the host renders it.
+    """
+    pipeline: Any = trainer.pipeline
+    pipeline.eval()
+    dataset: Any = pipeline.datamanager.eval_dataset
+    scale = float(pipeline.datamanager.train_dataparser_outputs.dataparser_scale)
+    lost = met = samples = candidates = rays = without = 0
+    errors: list[Tensor] = []
+    details: list[Tensor] = []
+    colours: list[Tensor] = []
+    shown = None
+    for number, file in enumerate(dataset.image_filenames):
+        truth = np.load(data / TRUTH / f"{Path(file).stem}.npz")
+        depth = torch.from_numpy(truth["depth"]).flatten() * scale
+        bundle = dataset.cameras.to("cpu").generate_rays(camera_indices=number).to(pipeline.device)
+        height, width = bundle.shape
+        flat = bundle.flatten()
+        nearest, counts, most = [], [], 0
+        for first in range(0, len(flat), RAYS_AT_ONCE):
+            part = flat[first : first + RAYS_AT_ONCE]
+            near, count, all_of_them = sampled(
+                pipeline.model, part, depth[first : first + RAYS_AT_ONCE], dense_samples
+            )
+            nearest.append(near)
+            counts.append(count)
+            most += all_of_them
+        surface = depth.isfinite()
+        away = torch.cat(nearest)[surface]
+        lost += int((away > NEAR * depth[surface]).sum())
+        met += int(surface.sum())
+        count = torch.cat(counts)
+        samples, candidates = samples + int(count.sum()), candidates + most
+        rays, without = rays + len(count), without + int((count == 0).sum())
+        rgb = render(pipeline.model, flat)
+        image = dataset.get_data(number)["image"].reshape(len(flat), -1)
+        wanted = true_image(pipeline.model, image, rgb).float().cpu()
+        errors.append((rgb.cpu() - wanted).square())
+        colours.append(wanted)
+        details.append(torch.from_numpy(truth["detail"]).flatten())
+        if shown is None:
+            shown = (255 * rgb.cpu().view(height, width, 3)).round().byte().numpy()
+    pipeline.train()
+    error, colour, detail = torch.cat(errors), torch.cat(colours), torch.cat(details)
+    assert shown is not None
+    return (
+        Measured(
+            lost / met if met else None,
+            samples / max(candidates, 1),
+            psnr(error[detail]) if bool(detail.any()) else None,
+            psnr((colour - colour.mean(dim=0)).square()),
+            without / max(rays, 1),
+        ),
+        shown,
+    )
+
+
+def psnr(squared_errors: Tensor) -> float:
+    """Of any number of squared errors, dB."""
+    return -10.0 * math.log10(max(float(squared_errors.double().mean()), 1e-12))
+
+
+def render(model: Any, bundle: RayBundle) -> Tensor:
+    """Colours [N, 3] of rays, in [0, 1]."""
+    parts = [bundle[i : i + RAYS_AT_ONCE] for i in range(0, len(bundle), RAYS_AT_ONCE)]
+    rendered: Tensor = torch.cat([model(part)["rgb"] for part in parts])
+    return rendered.clamp(0.0, 1.0)
+
+
+def sampled(
+    model: Any, bundle: RayBundle, depth: Tensor, dense_samples: int
+) -> tuple[Tensor, Tensor, int]:
+    """Where a host would ask its field along some rays.
+
+    Args:
+        model: a packed host or a proposal host.
+        bundle: rays [N].
+        depth: [N] distance of each ray's surface, scene units; inf for none.
+        dense_samples: candidates of a ray of a proposal host's reference.
+    Returns:
+        [N] distance of the surface from the middle of the nearest sample, inf without one; [N]
+        number of samples; and how many all candidates of all rays are.
+    """
+    if hasattr(model, "proposal_sampler"):
+        bundle = model.collider(bundle) if model.collider is not None else bundle
+        samples, _, _ = model.proposal_sampler(bundle, density_fns=model.density_fns)
+        middles = ((samples.frustums.starts + samples.frustums.ends) / 2)[..., 0].cpu()
+        away = (middles - depth[:, None]).abs().amin(dim=1)
+        count = torch.full((len(bundle),), middles.shape[1])
+        return away, count, dense_samples * len(bundle)
+    from leco_plugin.samplers.registry import build_estimator
+    from leco_plugin.stability.contenders import DENSE_LEVELS
+
+    config = model.config
+    options = {
+        "near_plane": config.near_plane,
+        "far_plane": config.far_plane,
+        "render_step_size": config.render_step_size,
+        "cone_angle": config.cone_angle,
+    }
+    rays = bundle.origins, bundle.directions
+    ray_indices, starts, ends = model.occupancy_grid.sampling(*rays, **options)
+    dense: Any = build_estimator("dense", aabb=model.scene_aabb, levels=DENSE_LEVELS).to(
+        model.device
+    )
+    most = len(dense.sampling(*rays, **options)[0])
+    ray_indices, middles = ray_indices.cpu(), ((starts + ends) / 2).cpu()
+    away = (middles - depth[ray_indices]).abs()
+    nearest = torch.full((len(bundle),), math.inf)
+    nearest = nearest.scatter_reduce(0, ray_indices, away, "amin")
+    return nearest, torch.bincount(ray_indices, minlength=len(bundle)), most

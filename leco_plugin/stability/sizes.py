@@ -1,0 +1,68 @@
+"""How large everything is: small enough that all cases take two cores less than two hours."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+
+@dataclass(frozen=True)
+class Sizes:
+    """Of pictures, hosts and runs."""
+
+    steps: int
+    """Training steps of each host; what learns its occupancy first does that before them."""
+    rays: int
+    """Of a batch."""
+    learn_rays: int
+    """Of a batch while the occupancy is learned."""
+    learn_steps: int
+    """Most steps of learning."""
+    picture: float = 1.0
+    """Multiple of the pictures' width and height."""
+    views: float = 1.0
+    """Multiple of the number of training pictures, where a case does not fix it."""
+    dense_samples: int = 192
+    """Of a ray of the dense reference of proposal hosts."""
+    table: int = 15
+    """Binary logarithm of the entries of the hosts' hash tables."""
+    host: Mapping[str, Any] = field(default_factory=dict)
+    """Settings of Instant-NGP that differ besides."""
+
+    @property
+    def ngp(self) -> dict[str, Any]:
+        """Instant-NGP: rays end well beyond the scene, with steps that grow with the distance."""
+        return {
+            "host.log2_hashmap_size": self.table,
+            "host.max_res": 512,
+            "host.grid_levels": 1,
+            "host.cone_angle": 1 / 32,
+            "host.far_plane": 20.0,
+            **self.host,
+        }
+
+    @property
+    def nerfacto(self) -> dict[str, Any]:
+        """Nerfacto in the same sizes."""
+        return {
+            "host.log2_hashmap_size": self.table,
+            "host.max_res": 512,
+            "host.far_plane": 20.0,
+            "host.use_appearance_embedding": False,
+        }
+
+    @property
+    def learning(self) -> dict[str, Any]:
+        """What learns the occupancy."""
+        return {
+            "occupancy.rays": self.learn_rays,
+            "occupancy.learning.schedule.learn_steps": self.learn_steps,
+        }
+
+
+FULL = Sizes(steps=208, rays=256, learn_rays=512, learn_steps=200)
+QUICK = Sizes(
+    steps=40, rays=64, learn_rays=64, learn_steps=20, picture=0.5, views=0.4, dense_samples=48
+)
+"""For a look at whether everything works; its verdicts mean little."""

@@ -1,0 +1,98 @@
+"""`table.md`: the verdicts with their figures, and what every failure is."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from leco_plugin.stability.contenders import OURS
+
+SIGNS = {"pass": "pass", "degraded": "degraded", "fail": "**fail**", "no reference": "-"}
+
+
+def table(results: Mapping[str, Any]) -> str:
+    """The whole of `table.md`."""
+    samplers, made = results["samplers"], results["made"]
+    header = ["case", *(one["title"] for one in samplers)]
+    rows = [
+        [row["title"], *(_cell(row["cells"].get(one["name"])) for one in samplers)]
+        for row in results["cases"]
+    ]
+    parts = ["# Stability", f"{headline(results)}", _rows(header, rows)]
+    broken = [
+        [row["title"], one["title"], row["cells"][one["name"]]["reason"]]
+        for row in results["cases"]
+        for one in samplers
+        if row["cells"].get(one["name"], {}).get("verdict") in ("fail", "degraded")
+    ]
+    if broken:
+        parts.append(_rows(["case", "sampler", "what failed"], broken))
+    parts.append(
+        _rows(["case", "why it is there"], [[r["title"], r["why"]] for r in results["cases"]])
+    )
+    commit = f" at {made['commit']}" if made["commit"] else ""
+    parts.append(f"`{made['command']}`, {made['date']}, leco_plugin {made['version']}{commit}.")
+    return "\n\n".join(parts) + "\n"
+
+
+def headline(results: Mapping[str, Any]) -> str:
+    """What the table shows, in a sentence or two."""
+    said = []
+    for one in results["samplers"]:
+        if one["reference"] is None:
+            continue
+        verdicts = verdicts_of(results, one["name"])
+        held = [verdict for verdict in verdicts if verdict != "no reference"]
+        if held:
+            said.append((one, held.count("pass"), len(held)))
+    if not said:
+        return "nothing has been run yet"
+    said.sort(key=lambda part: part[0]["name"] != OURS)
+    first, *others = [f"{one['title']} passes {n} of {many}" for one, n, many in said]
+    return f"{first} cases" + "".join(f"; {other}" for other in others)
+
+
+def verdicts_of(results: Mapping[str, Any], sampler: str) -> list[str]:
+    """Verdicts of a sampler on all cases but those that must fail."""
+    return [
+        row["cells"][sampler]["verdict"]
+        for row in results["cases"]
+        if not row["must_fail"] and sampler in row["cells"]
+    ]
+
+
+def blind(results: Mapping[str, Any]) -> list[str]:
+    """Cases that must fail and were passed: the suite cannot be believed then."""
+    return [
+        row["name"]
+        for row in results["cases"]
+        if row["must_fail"] and row["cells"].get(OURS, {}).get("verdict") == "pass"
+    ]
+
+
+def figures(cell: Mapping[str, Any]) -> tuple[str, str, str]:
+    """The figures of a cell in short words: its PSNR, what it skips, and its worst seed."""
+    if cell["psnr"] is None:
+        return "-", "", ""
+    first = f"{cell['psnr']:.1f} dB" if cell["gap"] is None else f"{cell['gap']:+.2f} dB"
+    parts = [] if cell["gap"] is None else [f"kept {cell['kept_fraction']:.0%}"]
+    if cell["gap"] is not None and cell["lost_mass"] is not None:
+        parts.append(f"lost {cell['lost_mass']:.1%}")
+    worst = f"worst {cell['worst']:+.2f}" if cell["seeds"] > 1 else ""
+    return first, ", ".join(parts), worst
+
+
+def _cell(cell: Mapping[str, Any] | None) -> str:
+    if cell is None:
+        return ""
+    first, *rest = figures(cell)
+    more = ", ".join(part for part in rest if part)
+    return f"{SIGNS[cell['verdict']]}: {first}" + (f" ({more})" if more else "")
+
+
+def _rows(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
+    lines = [header, ["---"] * len(header), *rows]
+    return "\n".join(
+        f"| {' | '.join(str(cell).replace('|', chr(92) + '|') for cell in cells)} |"
+        for cells in lines
+    )

@@ -1,0 +1,96 @@
+"""Claims about the cases: data that can be configured, and reasons."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from leco_plugin.chart.configs import config_of
+from leco_plugin.scenes.input_error import InputError
+from leco_plugin.stability.cases import CASES, cases_named
+from leco_plugin.stability.contenders import SAMPLERS, samplers_named
+from leco_plugin.stability.plan import capture_of, entries_of, runs_of, scenes_of
+from leco_plugin.stability.sizes import FULL, QUICK
+from leco_plugin.stability.worker import with_fixed_batches
+
+WANTED = {
+    *("poles-and-wires", "glass", "fog", "all-empty", "all-full", "far-terrain", "outline"),
+    *("indoors", "bounds-too-small", "bounds-too-large", "six-views", "exposure", "pose-noise"),
+    *("moving", "resolutions", "far-origin", "ratio-too-low", "ratio-too-high"),
+    *("lambda-g-x", "lambda-g-low", "lambda-d-x", "lambda-d-low"),
+    *("learning-rate", "few-rays", "bf16", "fp16", "ten-seeds", "homogeneous"),
+}
+ALL = entries_of(list(CASES.values()), list(SAMPLERS.values()), (0,), FULL)
+
+
+def test_every_case_that_was_asked_for_is_there_with_a_reason() -> None:
+    assert {name.replace("-high", "-x") for name in CASES} >= {
+        name.replace("ratio-too-high", "ratio-too-x") for name in WANTED
+    }
+    assert all(len(case.why) > 20 and len(case.title) < 30 for case in CASES.values())
+    assert len({case.title for case in CASES.values()}) == len(CASES)
+
+
+@pytest.mark.parametrize("name", sorted(CASES))
+def test_every_run_of_a_case_can_be_configured(name: str) -> None:
+    for entry in ALL:
+        if entry.case.name == name:
+            config = with_fixed_batches(config_of(entry.contender, Path("scene"), Path("runs")))
+            assert type(config.pipeline).__name__ == "VanillaPipelineConfig"
+
+
+def test_settings_arrive_where_they_belong() -> None:
+    def config(case: str, sampler: str):  # type: ignore[no-untyped-def]
+        (entry,) = [e for e in ALL if (e.case.name, e.sampler.name) == (case, sampler)]
+        return with_fixed_batches(config_of(entry.contender, Path("scene"), Path("runs")))
+
+    assert config("few-rays", "dense").pipeline.datamanager.train_num_rays_per_batch == 32
+    assert config("few-rays", "learned").pipeline.model.occupancy.rays == 32
+    assert config("learning-rate", "grid-128").optimizers["fields"]["optimizer"].lr == 0.1
+    assert config("bounds-too-small", "dense").pipeline.datamanager.dataparser.scene_scale == 0.25
+    assert config("fp16", "learned").pipeline.model.occupancy.learning.precision == "float16"
+    assert config("far-terrain", "grid-256").pipeline.model.occupancy.options == {
+        "resolution": 256,
+        "levels": 2,
+    }
+    homogeneous = config("homogeneous", "learned").pipeline.model.occupancy.learning
+    assert homogeneous.sizes.field.experts.empty_layers == homogeneous.sizes.field.experts.layers
+
+
+def test_what_a_case_does_not_touch_is_run_once() -> None:
+    runs = runs_of(ALL)
+    keys = [(run.scene, run.job.name) for run in runs]
+    assert len(set(keys)) == len(keys)
+    dense = [key for key in keys if key[0] == "yard" and "-dense-" in key[1]]
+    changed = ("bounds-too-small", "bounds-too-large", "learning-rate", "few-rays")
+    hosts = 2
+    assert len(dense) == hosts * (1 + len(changed)) + 9  # and nine more of the ten seeds
+
+
+def test_all_cells_get_their_first_seed_before_any_gets_its_second() -> None:
+    entries = entries_of(
+        cases_named(("glass", "fog")), samplers_named(("grid-128",)), (7, 3), QUICK
+    )
+    seeds = [run.job.seed for run in runs_of(entries)]
+    assert seeds == [7] * 4 + [3] * 4
+
+
+def test_references_join_by_themselves() -> None:
+    assert [one.name for one in samplers_named(("grid-128",))] == ["grid-128", "dense"]
+    assert [one.name for one in samplers_named(())] == list(SAMPLERS)
+
+
+def test_an_unknown_name_is_answered_with_all_there_are() -> None:
+    with pytest.raises(InputError, match=r"no case 'fogg'; there are yard, .*fog"):
+        cases_named(("fogg",))
+    with pytest.raises(InputError, match=r"no sampler 'grid'; there are learned, grid-128"):
+        samplers_named(("grid",))
+
+
+def test_cases_with_the_same_pictures_share_them() -> None:
+    scenes = scenes_of(list(CASES.values()), FULL)
+    for case in CASES.values():
+        assert scenes[case.scene][1] == capture_of(case, FULL)
+    assert capture_of(CASES["six-views"], QUICK).views == 6
+    assert capture_of(CASES["yard"], QUICK).views < capture_of(CASES["yard"], FULL).views

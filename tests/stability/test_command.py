@@ -1,0 +1,71 @@
+"""Claims about `leco stability` from the command line."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+from stability_runs import Runs
+
+from leco_plugin import cli
+from leco_plugin.stability import command
+
+
+@pytest.fixture
+def runs(monkeypatch: pytest.MonkeyPatch) -> Runs:
+    """What stands in for the processes of all runs."""
+    made = Runs()
+    with_processes = command.make_table
+
+    def make_table(*args: Any, **kwargs: Any) -> dict[str, Any]:
+        return with_processes(*args, **kwargs, runner_for=made)
+
+    monkeypatch.setattr(command, "make_table", make_table)
+    return made
+
+
+def stability(out: Path, *words: str) -> int:
+    return cli.main(["stability", "--out", str(out), "--quick", *words])
+
+
+def test_all_was_run_is_success_whatever_the_verdicts_are(tmp_path: Path, runs: Runs) -> None:
+    runs.psnrs = {"learned": 13.0}
+    report = tmp_path / "report.json"
+    words = ("--cases", "yard", "--samplers", "learned", "--json", str(report))
+    assert stability(tmp_path / "out", *words) == 0
+    assert '"verdict": "fail"' in report.read_text()
+    assert len(runs.made) == 2
+
+
+@pytest.mark.parametrize("psnr", [25.0, 20.0])
+def test_a_suite_that_is_blind_says_so(
+    tmp_path: Path, runs: Runs, capsys: pytest.CaptureFixture[str], psnr: float
+) -> None:
+    runs.psnrs = {"learned": psnr}
+    words = ["stability", "--out", str(tmp_path / "out"), "--cases", "homogeneous"]
+    assert cli.main(words) == (1 if psnr == 25.0 else 0)
+    assert ("must fail and was passed" in capsys.readouterr().err) == (psnr == 25.0)
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (("--cases", "foog"), "no case 'foog'; there are yard, poles-and-wires"),
+        (("--samplers", "grid"), "no sampler 'grid'; there are learned, grid-128"),
+    ],
+)
+def test_an_unknown_name_is_one_line_and_starts_nothing(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], words: tuple[str, ...], said: str
+) -> None:
+    assert stability(tmp_path / "out", *words) == 2
+    error = capsys.readouterr().err
+    assert said in error and error.count("\n") == 1
+    assert not (tmp_path / "out").exists()
+
+
+def test_the_command_of_the_results_has_no_paths(tmp_path: Path, runs: Runs) -> None:
+    stability(tmp_path / "out", "--cases", "yard", "--samplers", "grid-128", "--seeds", "0", "2")
+    text = (tmp_path / "out" / "stability.json").read_text()
+    words = "leco stability --out DIR --cases yard --samplers grid-128 --seeds 0 2 --quick"
+    assert words in text and str(tmp_path) not in text

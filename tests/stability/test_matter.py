@@ -1,0 +1,82 @@
+"""Claims about shapes that rays meet, against points walked along the rays."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from leco_plugin.stability.matter import Ball, Box, Paint, Rod, Shape
+
+PAINT = Paint((0.5, 0.6, 0.7))
+SHAPES: dict[str, Shape] = {
+    "box": Box((-0.7, -0.4, 0.1), (0.5, 0.9, 1.2), PAINT),
+    "ball": Ball((0.2, -0.1, 0.4), 0.8, PAINT),
+    "rod": Rod((-0.6, 0.1, -0.5), (0.7, 0.3, 0.9), 0.35, PAINT),
+}
+WALK = 2e-3
+
+
+def inside(shape: Shape, points: np.ndarray) -> np.ndarray:
+    """Whether points [..., 3] lie in the shape, from its definition."""
+    if isinstance(shape, Box):
+        return ((points >= shape.low) & (points <= shape.high)).all(axis=-1)
+    if isinstance(shape, Ball):
+        return np.linalg.norm(points - np.array(shape.centre), axis=-1) <= shape.radius
+    assert isinstance(shape, Rod)
+    start, axis = np.array(shape.start), np.array(shape.end) - np.array(shape.start)
+    along = (points - start) @ axis / (axis @ axis)
+    beside = np.linalg.norm(points - start - along[..., None] * axis, axis=-1)
+    return (along >= 0) & (along <= 1) & (beside <= shape.radius)
+
+
+def rays(count: int = 300) -> tuple[np.ndarray, np.ndarray]:
+    random = np.random.default_rng(3)
+    origins = random.uniform(-2.5, 2.5, (count, 3))
+    directions = random.uniform(-0.6, 0.6, (count, 3)) - origins
+    return origins, directions / np.linalg.norm(directions, axis=1, keepdims=True)
+
+
+def walked_to(shape: Shape, origins: np.ndarray, directions: np.ndarray) -> np.ndarray:
+    """[N] where walking along a ray first goes into the shape or out of it; inf for nowhere."""
+    steps = np.arange(0.0, 8.0, WALK)
+    states = inside(shape, origins[:, None] + directions[:, None] * steps[:, None])
+    changes = states[:, 1:] != states[:, :-1]
+    return np.where(changes.any(1), steps[changes.argmax(1)], np.inf)
+
+
+@pytest.mark.parametrize("name", ["box", "ball"])
+def test_a_ray_meets_a_solid_where_walking_along_it_does(name: str) -> None:
+    origins, directions = rays()
+    t, normals = SHAPES[name].meet(origins, directions)
+    walked, met = walked_to(SHAPES[name], origins, directions), np.isfinite(t)
+    assert (np.isfinite(walked) == met).mean() > 0.99  # a grazing ray can be stepped over
+    both = met & np.isfinite(walked)
+    assert both.mean() > 0.3 and np.abs(walked[both] - t[both]).max() < 2 * WALK
+    assert np.allclose(np.linalg.norm(normals[met], axis=1), 1.0)
+
+
+def test_a_ray_meets_the_side_of_a_rod_where_walking_along_it_does() -> None:
+    rod = SHAPES["rod"]
+    assert isinstance(rod, Rod)
+    origins, directions = rays(600)
+    t, normals = rod.meet(origins, directions)
+    walked = walked_to(rod, origins, directions)
+    found = np.flatnonzero(np.isfinite(walked))
+    places = origins[found] + walked[found, None] * directions[found]
+    axis = np.array(rod.end) - np.array(rod.start)
+    along = (places - np.array(rod.start)) @ axis / (axis @ axis)
+    sides = found[(along > 0.02) & (along < 0.98)]  # the ends are open
+    assert len(sides) > 60 and np.abs(walked[sides] - t[sides]).max() < 3 * WALK
+    met = np.isfinite(t)
+    assert np.allclose(normals[met] @ axis, 0.0) and not met[np.isinf(walked)].any()
+
+
+def test_a_room_is_met_from_within() -> None:
+    t, normals = SHAPES["box"].meet(np.array([[0.0, 0.0, 0.5]]), np.array([[1.0, 0.0, 0.0]]))
+    assert t == pytest.approx([0.5]) and normals.tolist() == [[-1.0, 0.0, 0.0]]
+
+
+def test_a_pattern_stays_where_it_is_and_within_range() -> None:
+    points = np.random.default_rng(0).uniform(-3, 3, (200, 3))
+    colours = Paint((0.9, 0.5, 0.2), contrast=0.9).at(points)
+    assert colours.min() >= 0.0 and colours.max() <= 1.0 and colours[:, 1].std() > 0.05

@@ -1,0 +1,94 @@
+"""Claims about what a sampler keeps and loses of a scene that is known."""
+
+from __future__ import annotations
+
+import math
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+import torch
+from nerfstudio.cameras.rays import RayBundle
+from nerfstudio.model_components.ray_samplers import UniformSampler
+from torch import Tensor
+
+from leco_plugin.samplers.base import Estimator
+from leco_plugin.samplers.proposal import DenseSampler
+from leco_plugin.stability.measure import NEAR, psnr, sampled
+
+RADIUS = 0.5
+"""Of the ball around the origin that the rays meet."""
+FAR = 2.0
+"""From the origin to where the rays begin."""
+AABB = torch.tensor([-1.0, -1.0, -1.0, 1.0, 1.0, 1.0])
+
+
+def bundle(count: int = 64) -> tuple[RayBundle, Tensor]:
+    """Rays towards the origin, and how far they go to the ball."""
+    generator = torch.Generator().manual_seed(0)
+    outward = torch.nn.functional.normalize(torch.randn(count, 3, generator=generator), dim=-1)
+    ends = torch.zeros(count, 1), torch.full((count, 1), 2 * FAR)
+    rays = RayBundle(FAR * outward, -outward, torch.ones(count, 1), None, *ends)
+    return rays, torch.full((count,), FAR - RADIUS)
+
+
+class Shell(Estimator):
+    """Keeps what is as far from the origin as the ball is wide, give or take."""
+
+    def __init__(self, radius: float, width: float) -> None:
+        super().__init__()
+        self.radius, self.width = radius, width
+
+    def questions(self) -> Any:
+        return lambda x: (x.norm(dim=-1) - self.radius).abs() < self.width, None
+
+    def bounds(self) -> None:
+        return None
+
+
+def packed(estimator: Estimator) -> Any:
+    config = SimpleNamespace(near_plane=0.05, far_plane=20.0, render_step_size=0.02, cone_angle=0.0)
+    return SimpleNamespace(
+        config=config, occupancy_grid=estimator, scene_aabb=AABB, device=torch.device("cpu")
+    )
+
+
+def lost(model: Any) -> tuple[float, float]:
+    """Share of the rays whose surface is lost, and of the candidates that are kept."""
+    rays, depth = bundle()
+    nearest, count, most = sampled(model, rays, depth, 64)
+    return float((nearest > NEAR * depth).float().mean()), int(count.sum()) / most
+
+
+def test_who_keeps_the_surface_loses_nothing_however_much_else_is_skipped() -> None:
+    share, kept = lost(packed(Shell(RADIUS, 0.03)))
+    assert share == 0.0 and 0.0 < kept < 0.1
+
+
+def test_who_keeps_another_place_loses_every_surface() -> None:
+    share, kept = lost(packed(Shell(0.9, 0.1)))
+    assert share == 1.0 and kept > 0.0
+
+
+def test_a_ray_without_samples_is_lost() -> None:
+    rays, depth = bundle()
+    nearest, count, _ = sampled(packed(Shell(50.0, 0.1)), rays, depth, 64)
+    assert nearest.isinf().all() and not count.any()
+
+
+def test_a_ray_that_meets_nothing_is_not_asked_about() -> None:
+    rays, _ = bundle(4)
+    nowhere = torch.full((4,), math.inf)
+    nearest, _, _ = sampled(packed(Shell(RADIUS, 0.1)), rays, nowhere, 64)
+    assert not (nearest <= 1e9).any()
+
+
+@pytest.mark.parametrize(("samples", "share"), [(256, 0.0), (3, 1.0)])
+def test_a_proposal_host_loses_what_its_samples_are_far_from(samples: int, share: float) -> None:
+    sampler = DenseSampler(samples=samples, initial_sampler=UniformSampler())
+    model = SimpleNamespace(proposal_sampler=sampler.eval(), density_fns=[], collider=None)
+    assert lost(model) == (share, pytest.approx(samples / 64))
+
+
+def test_psnr_of_known_errors() -> None:
+    assert psnr(torch.full((5, 3), 0.01)) == pytest.approx(20.0)

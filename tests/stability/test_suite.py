@@ -1,0 +1,92 @@
+"""Claims about making a table, with a stand-in for what makes a run."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+from stability_runs import TINY, Runs, make, suite
+
+from leco_plugin.stability import suite as suite_module
+from leco_plugin.stability.cases import cases_named
+from leco_plugin.stability.contenders import samplers_named
+
+SAMPLERS = ("grid-128", "learned")
+
+
+@pytest.fixture(autouse=True)
+def one_at_a_time(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(suite_module, "usable_cores", lambda: 1)
+
+
+def test_a_table_holds_every_cell_with_its_figures(tmp_path: Path) -> None:
+    results = make(suite(tmp_path, ("glass",), SAMPLERS), Runs({"grid-128": 23.0}))
+    (row,) = results["cases"]
+    assert row["name"] == "glass" and row["why"]
+    assert {name: cell["verdict"] for name, cell in row["cells"].items()} == {
+        "learned": "pass",
+        "grid-128": "fail",
+        "dense": "pass",
+    }
+    assert row["cells"]["grid-128"]["gap"] == -2.0
+    assert row["cells"]["learned"]["runs"][0]["kept_fraction"] == 0.25
+    assert json.loads((tmp_path / "stability.json").read_text()) == results
+
+
+@pytest.mark.parametrize("stops_at", [0, 2, 5])
+def test_after_a_kill_only_what_is_missing_is_made(tmp_path: Path, stops_at: int) -> None:
+    cases, seeds = ("yard", "outline"), (0,)
+    first, second = Runs(stops_at=stops_at), Runs()
+    with pytest.raises(KeyboardInterrupt):
+        make(suite(tmp_path, cases, SAMPLERS, seeds), first)
+    results = make(suite(tmp_path, cases, SAMPLERS, seeds), second)
+    assert len(first.made) + len(second.made) == 6
+    assert not set(first.made) & set(second.made)
+    whole = make(suite(tmp_path / "whole", cases, SAMPLERS, seeds), Runs())
+    assert results["cases"] == whole["cases"]
+
+
+def test_cases_and_seeds_may_join_later(tmp_path: Path) -> None:
+    make(suite(tmp_path, ("yard",), ("grid-128",)), Runs())
+    later = Runs()
+    results = make(suite(tmp_path, ("yard", "few-rays"), ("grid-128",), (0, 1)), later)
+    assert len(later.made) == 6 and ("yard", "dense", 0) in later.made  # of few rays
+    assert [row["cells"]["dense"]["seeds"] for row in results["cases"]] == [2, 2]
+
+
+def test_a_run_that_ends_without_a_result_fails_its_cell_and_no_other(tmp_path: Path) -> None:
+    made = suite(tmp_path, ("yard",), SAMPLERS)
+    cells = make(made, Runs(broken="learned"))["cases"][0]["cells"]
+    assert cells["learned"]["verdict"] == "fail" and "is broken" in cells["learned"]["reason"]
+    assert cells["grid-128"]["verdict"] == "pass"
+    again = Runs()
+    make(suite(tmp_path, ("yard",), SAMPLERS), again)
+    assert again.made == [("yard", "learned", 0)]
+
+
+def test_a_folder_of_other_sizes_is_refused(tmp_path: Path) -> None:
+    make(suite(tmp_path, ("yard",), ("grid-128",)), Runs())
+    with pytest.raises(ValueError, match="another steps"):
+        longer = replace(TINY, steps=41)
+        suite_module.Suite(tmp_path, cases_named(("yard",)), samplers_named(()), (0,), longer)
+
+
+def test_the_time_it_takes_is_said_before_and_from_its_own_runs_later(tmp_path: Path) -> None:
+    made = suite(tmp_path, ("yard",), SAMPLERS)
+    assert made.estimate().startswith("3 of 3 runs are to be made, 1 at a time: about ")
+    make(made, Runs())
+    more = suite(tmp_path, ("yard",), SAMPLERS, (0, 1))
+    assert more.estimate() == "3 of 6 runs are to be made, 1 at a time: about 30 s"
+
+
+def test_failures_are_drawn_beside_what_is_there(tmp_path: Path) -> None:
+    made = suite(tmp_path, ("yard", "outline"), ("grid-128",))
+    make(made, Runs({"grid-128": 20.0}, pictures=tmp_path))
+    made.draw()
+    drawn = sorted(path.name for path in (tmp_path / "failures").iterdir())
+    assert drawn == ["outline--grid-128.png", "yard--grid-128.png"]
+    assert (tmp_path / "stability.png").stat().st_size > 10_000
+    assert (tmp_path / "stability-dark.png").exists()
+    assert "**fail**" in (tmp_path / "table.md").read_text()

@@ -1,0 +1,69 @@
+"""Claims about the words of a table."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from leco_plugin.stability.table import blind, headline, table, verdicts_of
+
+SAMPLERS = [
+    {"name": "learned", "title": "learned occupancy", "reference": "dense"},
+    {"name": "grid-128", "title": "grid 128³", "reference": "dense"},
+    {"name": "dense", "title": "dense", "reference": None},
+]
+MADE = {"date": "2024-02-29", "command": "leco stability --out DIR", "version": "0", "commit": None}
+
+
+def cell(verdict: str, gap: float | None = -0.05, **values: Any) -> dict[str, Any]:
+    figures = {"psnr": 24.0, "gap": gap, "seeds": 1, "worst": 0.0, "reason": f"why {verdict}"}
+    return figures | {"verdict": verdict, "kept_fraction": 0.2, "lost_mass": 0.004} | values
+
+
+def results(*rows: tuple[str, bool, dict[str, dict[str, Any]]]) -> dict[str, Any]:
+    cases = [
+        {"name": name, "title": name, "why": f"{name}?", "must_fail": must_fail, "cells": cells}
+        for name, must_fail, cells in rows
+    ]
+    return {"samplers": SAMPLERS, "cases": cases, "made": MADE}
+
+
+def both(ours: str, theirs: str) -> dict[str, dict[str, Any]]:
+    return {"learned": cell(ours), "grid-128": cell(theirs), "dense": cell("pass", None)}
+
+
+TWO = results(
+    ("yard", False, both("pass", "fail")),
+    ("fog", False, both("degraded", "no reference")),
+    ("equal experts", True, {"learned": cell("fail")}),
+)
+
+
+def test_the_headline_counts_what_was_passed_where_there_is_a_reference() -> None:
+    said = headline(TWO)
+    assert said == "learned occupancy passes 1 of 2 cases; grid 128³ passes 0 of 1"
+    assert verdicts_of(TWO, "learned") == ["pass", "degraded"]
+    assert headline(results()) == "nothing has been run yet"
+
+
+def test_a_suite_that_passes_what_must_fail_is_blind() -> None:
+    assert blind(TWO) == []
+    assert blind(results(("equal", True, {"learned": cell("pass")}))) == ["equal"]
+
+
+def test_every_failure_says_why() -> None:
+    text = table(TWO)
+    assert "| yard | pass: -0.05 dB (kept 20%, lost 0.4%) | **fail**: -0.05 dB" in text
+    assert "| yard | grid 128³ | why fail |" in text
+    assert "| fog | learned occupancy | why degraded |" in text
+    assert "| fog | fog? |" in text
+
+
+def test_a_cell_that_was_not_run_or_does_not_exist_is_shown_as_such() -> None:
+    unknown = cell("no reference", None, psnr=None)
+    text = table(results(("yard", False, {"learned": unknown})))
+    assert "| yard | -: - |  |  |" in text
+
+
+def test_several_seeds_show_their_worst() -> None:
+    text = table(results(("yard", False, {"learned": cell("pass", seeds=3, worst=-0.4)})))
+    assert "worst -0.40" in text

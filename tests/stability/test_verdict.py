@@ -1,0 +1,83 @@
+"""Claims about what runs say of a sampler."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+
+from leco_plugin.stability.verdict import judge
+
+
+def run(seed: int = 0, psnr: float = 25.0, **measured: Any) -> dict[str, Any]:
+    figures = {"lost_mass": 0.0, "kept_fraction": 0.2, "detail_psnr": None}
+    figures |= {"trivial_psnr": 12.0, "black_share": 0.0}
+    return {"seed": seed, "psnr": psnr, "measured": figures | measured}
+
+
+def runs(*psnrs: float, **measured: Any) -> list[dict[str, Any]]:
+    return [run(seed, psnr, **measured) for seed, psnr in enumerate(psnrs)]
+
+
+DENSE = runs(25.0, 25.1, 24.9)
+
+
+@pytest.mark.parametrize(
+    ("psnrs", "verdict"),
+    [
+        ((24.81, 24.85, 24.9), "pass"),
+        ((26.0, 26.0, 26.0), "pass"),
+        ((24.79, 24.7, 24.9), "degraded"),
+        ((23.9, 23.9, 23.9), "fail"),
+        ((25.0, 25.0, 24.45), "degraded"),
+        ((25.0, 25.0, 23.4), "fail"),
+    ],
+)
+def test_the_median_and_the_worst_seed_are_held_to_the_bars(
+    psnrs: tuple[float, ...], verdict: str
+) -> None:
+    cell = judge(runs(*psnrs), DENSE)
+    assert cell.verdict == verdict and bool(cell.reason) == (verdict != "pass")
+
+
+def test_the_worst_seed_is_named() -> None:
+    cell = judge(runs(25.0, 20.0, 25.0), DENSE)
+    assert (cell.worst_seed, cell.worst) == (1, -5.0) and "seed 1 is 5.00 dB" in cell.reason
+
+
+def test_a_surface_that_is_lost_is_a_failure_whatever_the_pictures_say() -> None:
+    assert judge(runs(25.0, lost_mass=0.008), DENSE).verdict == "pass"
+    assert judge(runs(25.0, lost_mass=0.03), DENSE).verdict == "degraded"
+    assert judge(runs(25.0, lost_mass=0.08), DENSE).verdict == "fail"
+    excused = runs(25.0, lost_mass=0.05)
+    assert judge(runs(25.0, lost_mass=0.055), excused).verdict == "pass"
+
+
+def test_a_wire_that_disappears_is_a_failure_though_it_costs_no_psnr() -> None:
+    dense = runs(25.0, detail_psnr=20.0)
+    assert judge(runs(25.0, detail_psnr=19.7), dense).verdict == "pass"
+    cell = judge(runs(25.0, detail_psnr=16.0), dense)
+    assert cell.verdict == "fail" and "where it matters" in cell.reason
+
+
+def test_nobody_is_held_to_a_reference_that_does_not_train() -> None:
+    black = runs(12.3, 12.2, 12.4)
+    assert judge(runs(5.0), black).verdict == "no reference"
+    assert judge(black, None).verdict == "fail"
+    assert judge(runs(31.0, trivial_psnr=30.5), None).verdict == "pass"  # a sky is one colour
+
+
+def test_a_run_that_ended_without_a_result_is_a_failure() -> None:
+    cell = judge(runs(25.0), DENSE, ["out of memory"])
+    assert cell.verdict == "fail" and cell.reason == "1 of 2 runs ended: out of memory"
+    assert cell.psnr is None
+
+
+def test_what_has_not_been_run_has_no_verdict() -> None:
+    assert judge([], DENSE).verdict == "no reference"
+    assert judge(runs(25.0), []).verdict == "no reference"
+
+
+def test_a_reference_is_held_to_having_trained_only() -> None:
+    cell = judge(DENSE, None)
+    assert (cell.verdict, cell.gap, cell.psnr) == ("pass", None, 25.0)
