@@ -19,6 +19,7 @@ from leco_plugin.evaluation.occupancy_picture import (
 )
 from leco_plugin.models.history import FILE_NAME, GateHistory
 from leco_plugin.occupancy import Occupancy
+from leco_plugin.progress_bar import bar
 from leco_plugin.scenes.input_error import InputError
 
 PIXELS = 300
@@ -48,13 +49,13 @@ def draw_history(occupancy: Occupancy, folder: Path, path: Path) -> Path:
         film.still(looks).savefig(path, dpi=DPI)
         return path
     from matplotlib.animation import FuncAnimation, PillowWriter
-    from tqdm import tqdm
 
     figure, show = film.moving()
     looks = [*range(len(history)), *[len(history) - 1] * HELD]
-    frames = tqdm(looks, desc="drawing", leave=False)
-    animation = FuncAnimation(figure, show, frames, init_func=list)
-    animation.save(path, writer=PillowWriter(FRAMES_PER_SECOND), dpi=DPI)
+    animation = FuncAnimation(figure, show, looks, init_func=list)
+    writer = PillowWriter(FRAMES_PER_SECOND)
+    with bar("Drawing how it was learned") as progress:
+        animation.save(path, writer, dpi=DPI, progress_callback=lambda i, n: progress((i + 1) / n))
     return path
 
 
@@ -113,7 +114,7 @@ class _Film:
                 axes.clear()
             for row, axes in enumerate(left):
                 self._slice(axes, row, look)
-            self._lines(*right, look)
+            self._lines(right[0], right[1], look)
             step, seconds = self.history.steps[look], self.history.seconds[look]
             figure.suptitle(f"learning what is empty: step {step}, {seconds:.0f} s")
             return []

@@ -36,12 +36,16 @@ def learn_occupancy(
     Returns:
         The occupancy, in the coordinates of the pipeline's model.
     """
-    occupancy: Occupancy = learn_model(config, pipeline, rays, seconds).occupancy()
+    occupancy: Occupancy = learn_model(config, pipeline, rays, seconds, rate).occupancy()
     return occupancy.eval()
 
 
 def learn_model(
-    config: LecoModelConfig, pipeline: Any, rays: int, seconds: float | None = None
+    config: LecoModelConfig,
+    pipeline: Any,
+    rays: int,
+    seconds: float | None = None,
+    rate: float = 1.0,
 ) -> LecoModel:
     """Trains an HMoE on the pipeline's data until its gate is frozen, field and all.
 
