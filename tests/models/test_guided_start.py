@@ -187,7 +187,7 @@ def test_steps_that_do_not_grow_end_at_the_hosts_box() -> None:
     """An unbounded occupancy has no end of its own, and nerfstudio's sampler gives none."""
     guide = Guide()
     space = Space("contraction", (0.0, 0.0, 0.0), 1.0)
-    guide.set_occupancy(Occupancy(ball().gate, space, 0.0))
+    guide.set_occupancy(Occupancy(ball().gate, space, 1e-9))
     inner, outer = torch.tensor([-1.0] * 3 + [1.0] * 3), torch.tensor([-2.0] * 3 + [2.0] * 3)
     origins = torch.tensor([[-3.0, 0.0, 0.0], [0.0, 1.5, 0.0], [0.0, 3.0, 0.0]])
     directions = torch.tensor([[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [1.0, 0.0, 0.0]])
