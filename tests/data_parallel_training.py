@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from mortal_training import collapse_once, leave_out_the_cache
+from mortal_training import collapse_once, die_after, leave_out_the_cache
 from nerfstudio.engine.trainer import Trainer
 from nerfstudio.scripts import train as ns_train
 from torch import Tensor, distributed
@@ -53,6 +53,18 @@ def run(local_rank: int, world_size: int, config: Any, global_rank: int = 0) -> 
     seen["state"] = trainer.pipeline.model.state_dict()
     seen["gradients"] = gradients(trainer.pipeline.model)
     torch.save(seen, folder / f"process-{global_rank}.pt")
+
+
+def lose_one(local_rank: int, world_size: int, config: Any, global_rank: int = 0) -> None:
+    """Trains, in the second process up to its tenth step only."""
+    folder = config.get_base_dir()
+    with (folder / f"process-{global_rank}.log").open("wb") as printed:
+        os.dup2(printed.fileno(), sys.stdout.fileno())
+        os.dup2(printed.fileno(), sys.stderr.fileno())
+    leave_out_the_cache()
+    if global_rank == 1:
+        die_after(Trainer, "train_iteration", lambda _, step: step == 9)
+    ns_train.train_loop(local_rank, world_size, config, global_rank)
 
 
 def look_elsewhere() -> None:

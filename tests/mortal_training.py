@@ -19,6 +19,7 @@ from nerfstudio.scripts import train as ns_train
 from leco_plugin.compat.atomic_trainer import AtomicTrainer
 from leco_plugin.models import healing
 from leco_plugin.models.freezing import FILE_NAME
+from leco_plugin.models.leco import LecoModel
 from leco_plugin.models.phases import Collapse
 from leco_plugin.occupancy import Occupancy
 from leco_plugin.samplers import estimator
@@ -99,12 +100,25 @@ def show_what_was_loaded(path: Path) -> None:
     Trainer.train = saves_and_trains
 
 
+def spoil_a_batch(step: int) -> None:
+    """Has one pixel of one batch be no number."""
+    losses = LecoModel.get_loss_dict
+
+    def spoiled(self: LecoModel, outputs: Any, batch: Any, *rest: Any) -> Any:
+        if self.step == step:
+            batch["image"][3, 1] = torch.nan
+        return losses(self, outputs, batch, *rest)
+
+    LecoModel.get_loss_dict = spoiled  # type: ignore[method-assign]
+
+
 def run(
     arguments: list[str],
     log: Path,
     moment: str | None = None,
     loaded: Path | None = None,
     collapses: bool = False,
+    spoiled: int | None = None,
 ) -> None:
     """`ns-train` with these arguments; the target of a process.
 
@@ -113,6 +127,7 @@ def run(
         moment: of `MOMENTS`, when it dies; None is never.
         loaded: file for what it begins its first step with.
         collapses: whether the gate is found collapsed once.
+        spoiled: step whose batch holds a value that is not finite.
     """
     with log.open("wb") as printed:
         os.dup2(printed.fileno(), sys.stdout.fileno())
@@ -124,5 +139,7 @@ def run(
         show_what_was_loaded(loaded)
     if collapses:
         collapse_once()
+    if spoiled is not None:
+        spoil_a_batch(spoiled)
     sys.argv = ["ns-train", *arguments]
     ns_train.entrypoint()

@@ -19,9 +19,11 @@ from torch import Tensor
 
 from leco_plugin.compat.checkpoints import allow_checkpoint_globals
 from leco_plugin.compat.data_parallel import DataParallelTrainerConfig
+from leco_plugin.compat.whole_checkpoints import newest_whole, step_of
 from leco_plugin.host_configs import leco_ngp
 from leco_plugin.method_configs import leco_occupancy
 from leco_plugin.models.encodings import EncodingConfig
+from leco_plugin.models.failures import TrainingStopped
 from leco_plugin.models.field import FieldConfig
 from leco_plugin.models.gate import Gate, GateConfig
 from leco_plugin.models.leco import LecoModelConfig
@@ -236,6 +238,18 @@ def test_dynamic_batches_have_as_many_rays_in_every_process(guided: Any) -> None
     first, second = guided[1]
     assert phases(first) == phases(second)
     assert len({rays for _, rays, *_ in first["steps"]}) > 1
+
+
+def test_a_process_that_is_lost_ends_the_run_in_one_line_and_nothing_saved_is_lost(
+    launch: Launch, tiny_scene: Path, folder: Path
+) -> None:
+    config = config_of(leco_occupancy, tiny_scene, folder, "lost")
+    config.steps_per_save = 4
+    with pytest.raises(TrainingStopped, match=r"of 2 processes was lost .*--load-dir") as caught:
+        launch(processes.lose_one, config)
+    assert "\n" not in str(caught.value)
+    path, damaged = newest_whole(config.get_checkpoint_dir())
+    assert step_of(path) == 8 and not damaged
 
 
 def refuse(*_: object, **__: object) -> None:

@@ -248,8 +248,7 @@ class GuidedEstimator(_StandIn):
     @functools.wraps(Estimator.sampling)
     def sampling(self, rays_o: Tensor, rays_d: Tensor, *args: Any, **kwargs: Any) -> Any:
         (guide,) = self._guide
-        skips = not guide.dense and guide.the_occupancy_skips()
-        estimator: Any = self.sampler if skips else self.dense
+        estimator: Any = self.dense if guide.dense else self.sampler
         options = self._with_an_end(_SAMPLING.bind(self, rays_o, rays_d, *args, **kwargs).arguments)
         if not guide.same_frame():
             # a direction carries the scale, so that distances along the ray stay the host's
@@ -262,13 +261,10 @@ class GuidedEstimator(_StandIn):
 
     @property
     def dense(self) -> nn.Module:
-        """Keeps every candidate, in the box in which the host samples at all."""
+        """Keeps every candidate that the sampler behind this asks about."""
         (guide,) = self._guide
-        box = self._aabb if self._outermost is None else self._outermost
-        if box is not None and not guide.same_frame():
-            box = box_around(box, guide.frame.cpu())
-        made = build_estimator("dense", aabb=box).to(guide.frame.device)
-        return made.train(self.training)
+        box = self.sampler.bounds() if isinstance(self.sampler, Estimator) else None
+        return build_estimator("dense", aabb=box).to(guide.frame.device).train(self.training)
 
     def _with_an_end(self, arguments: dict[str, Any]) -> dict[str, Any]:
         """The options of `sampling`; rays that would go on for ever end at the host's box.

@@ -34,7 +34,7 @@ SHARE_OF_TIME = 0.01
 class Evidence(NamedTuple):
     """How far rays are beyond a bound on average, from sums in which older rays count less."""
 
-    count: float
+    rays: float
     total: float
     squares: float
 
@@ -50,11 +50,11 @@ class Evidence(NamedTuple):
 
     def exceeds(self) -> bool:
         """Whether the mean is above 0 by more than `SURE` standard errors."""
-        if self.count <= 1.0:
+        if self.rays <= 1.0:
             return False
-        mean = self.total / self.count
-        variance = max(0.0, self.squares / self.count - mean * mean)
-        return mean > 0.0 and mean > SURE * math.sqrt(variance / self.count)
+        mean = self.total / self.rays
+        variance = max(0.0, self.squares / self.rays - mean * mean)
+        return mean > 0.0 and mean > SURE * math.sqrt(variance / self.rays)
 
 
 def steps_until_next(config: CalibrationConfig, seconds: float, a_step: float) -> int:

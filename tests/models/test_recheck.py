@@ -36,7 +36,7 @@ def test_the_evidence_is_a_mean_in_which_older_rays_count_less() -> None:
     evidence = Evidence(*NO_EVIDENCE)
     for value in (1.0, 2.0):
         evidence = evidence.with_rays(torch.full((10,), value))
-    assert evidence.total / evidence.count == pytest.approx((0.8 * 1.0 + 2.0) / 1.8)
+    assert evidence.total / evidence.rays == pytest.approx((0.8 * 1.0 + 2.0) / 1.8)
 
 
 def test_a_price_well_beyond_its_bound_is_found_at_once() -> None:

@@ -1,0 +1,56 @@
+"""A data-parallel run that loses a process ends in one line."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+from torch.multiprocessing import ProcessExitedException, ProcessRaisedException
+
+from leco_plugin.compat.data_parallel import _with_one_line
+from leco_plugin.models.failures import TrainingStopped
+
+CONFIG = SimpleNamespace(
+    machine=SimpleNamespace(num_devices=2), get_checkpoint_dir=lambda: Path("run/checkpoints")
+)
+
+
+def launching(error: Exception) -> Any:
+    def launch(config: Any) -> None:
+        raise error
+
+    return _with_one_line(launch)
+
+
+def raised(line: str) -> ProcessRaisedException:
+    return ProcessRaisedException(f"\n\nTraceback (most recent call last):\n{line}\n", 0, 7)
+
+
+@pytest.mark.parametrize(
+    ("error", "message"),
+    [
+        (
+            ProcessExitedException("it died", 1, 7, -9, "SIGKILL"),
+            r"number 1 of .* lost \(SIGKILL\)",
+        ),
+        (ProcessExitedException("it died", 0, 7, 3), r"number 0 of 2 .* lost \(exit code 3\)"),
+        (raised("RuntimeError: [..] Connection closed by peer [::1]:7"), "one of 2 processes"),
+    ],
+)
+def test_a_lost_process_is_named_with_what_is_left(error: Exception, message: str) -> None:
+    with pytest.raises(TrainingStopped, match=f"{message}.*--load-dir run/checkpoints") as caught:
+        launching(error)(config=CONFIG)
+    assert "\n" not in str(caught.value)
+
+
+def test_the_line_of_a_process_that_stopped_itself_is_the_line_of_the_run() -> None:
+    error = raised("leco_plugin.models.failures.TrainingStopped: step 3: a reason: another")
+    with pytest.raises(TrainingStopped, match=r"^step 3: a reason: another$"):
+        launching(error)(config=CONFIG)
+
+
+def test_an_error_of_another_kind_stays_what_it_is() -> None:
+    with pytest.raises(ProcessRaisedException):
+        launching(raised("KeyError: 3"))(config=CONFIG)
