@@ -9,7 +9,7 @@ import pytest
 
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent / "benchmarks"))
 
-from bounds import verdict  # noqa: E402
+from bounds import verdict
 
 
 @pytest.mark.parametrize(("automatic", "reached"), [(20.0, True), (19.8, False), (19.91, True)])
