@@ -46,7 +46,9 @@ def threshold_losing(weights: Tensor, scores: Tensor, lost: float) -> float:
 
 
 @torch.no_grad()
-def at_equal_loss(model: LecoModel, datamanager: Any, grids: Sequence[int] = ()) -> dict[str, Any]:
+def at_equal_loss(
+    model: LecoModel, datamanager: Any, grids: Sequence[int | tuple[int, int, int]] = ()
+) -> dict[str, Any]:
     """What the model's gate keeps at `LOST_SURFACE_MASS`, and grids made from the same field.
 
     Meant for the moment of freezing: what a gate skips is not trained from then on.
@@ -54,7 +56,7 @@ def at_equal_loss(model: LecoModel, datamanager: Any, grids: Sequence[int] = ())
     Args:
         model: whose gate has just been frozen; it is left as it was.
         datamanager: with held-out training pixels.
-        grids: cells along each axis of the grids.
+        grids: cells along each axis of the grids, one number for all three or one for each.
     Returns:
         `lost_surface_mass`; `kept_volume` and `kept_candidates`, shares of the scene's box and of
         the candidates between near and far; and `grids`, the same for each with its `resolution`,
@@ -85,7 +87,7 @@ def _grid_row(
     chunks: Sequence[Rays],
     references: Sequence[Reference],
     volume: Tensor,
-    resolution: int,
+    resolution: int | tuple[int, int, int],
 ) -> dict[str, Any]:
     clock = Clock()
     clock.start()
@@ -97,13 +99,15 @@ def _grid_row(
     ]
     return {
         "resolution": resolution,
-        "bytes": math.ceil(resolution**3 / 8),
+        "bytes": math.ceil(grid.cells_per_lvl / 8),
         "update_seconds": round(seconds, 3),
         **_kept(references, scores, grid.values(volume)),
     }
 
 
-def grid_of_field(model: LecoModel, resolution: int) -> OccupancyGridEstimator:
+def grid_of_field(
+    model: LecoModel, resolution: int | tuple[int, int, int]
+) -> OccupancyGridEstimator:
     """An occupancy grid in mapped coordinates, filled from the density of a model's field."""
     low, high = _mapped_box(model)
     grid = OccupancyGridEstimator(torch.cat([low, high]), resolution).to(model.device).train()

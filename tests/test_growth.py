@@ -1,0 +1,59 @@
+"""The benchmark of growth: its arithmetic, and that it passes from city to picture and goes on."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parent.parent
+sys.path.insert(0, str(ROOT / "benchmarks"))
+
+from growth import bytes_for, gate_of, slope  # noqa: E402
+
+from leco_plugin.models.gate import GateConfig  # noqa: E402
+
+
+def test_an_exponent_is_that_of_a_power_and_missing_values_are_left_out() -> None:
+    assert slope([1.0, 2.0, 8.0], [3.0, 6.0 * 2.0**0.5, None]) == pytest.approx(1.5)
+    assert slope([1.0, 2.0, 8.0], [5.0] * 3) == pytest.approx(0.0)
+    assert slope([1.0, 2.0], [3.0, None]) is None
+    assert slope([], []) is None
+
+
+def test_the_grid_that_keeps_a_volume_lies_between_those_measured() -> None:
+    rows = [{"bytes": 10**k, "kept_volume": 0.8 / 2**k} for k in range(4)]
+    assert bytes_for(0.2, rows) == pytest.approx(100.0)
+    assert bytes_for(0.2 * 2**0.5, rows) == pytest.approx(10**1.5)
+    assert bytes_for(0.9, rows) == 1.0
+    assert bytes_for(0.01, rows) is None
+    level = [{"bytes": 8, "kept_volume": 0.5}, {"bytes": 64, "kept_volume": 0.5}]
+    assert bytes_for(0.5, level) == 8.0
+
+
+def test_a_gate_has_an_octave_more_when_the_side_doubles() -> None:
+    octaves = [gate_of(GateConfig(), blocks, 1).encoding.octaves for blocks in (2, 4, 8, 16)]
+    first = GateConfig().encoding.octaves
+    assert octaves == [first, first, first + 1, first + 2]
+
+
+@pytest.mark.slow
+def test_a_dry_run_passes_and_is_not_done_twice(tmp_path: Path) -> None:
+    out = tmp_path / "growth.json"
+    command = [sys.executable, "-W", "ignore", str(ROOT / "benchmarks" / "growth.py"), "--dry-run"]
+    command += ["--out", str(out), "--cities", str(tmp_path / "cities")]
+    environment = os.environ | {"PYTHONPATH": str(ROOT)}
+    done = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    report = json.loads(out.read_text())
+    assert [row["blocks"] for row in report["rows"]] == [1, 2]
+    for row in report["rows"]:
+        assert len(row["grids"]) == 2 and row["gate_bytes"] > 0
+        assert 0.0 < row["kept_volume"] <= 1.0
+    assert out.with_suffix(".png").stat().st_size > 5000
+    again = subprocess.run(command, env=environment, capture_output=True, text=True, check=True)
+    assert again.stdout.count("stored already") == 2
