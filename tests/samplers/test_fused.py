@@ -130,6 +130,14 @@ def test_the_norm_folds_into_the_last_layer(precision) -> None:
     torch.testing.assert_close(logits_by_hand(weights, features), expected, rtol=1e-4, atol=1e-4)
 
 
+def test_packing_within_a_hosts_autocast_rounds_nothing() -> None:
+    occupancy = Occupancy(Gate(GateConfig()), Space(), 0.5)
+    with torch.autocast("cpu", dtype=torch.bfloat16):
+        within = gate_weights(occupancy)
+    for one, other in zip(within[:3], gate_weights(occupancy)[:3]):
+        assert torch.equal(one, other)
+
+
 @pytest.mark.parametrize("cone_angle", [1e-3, 1.0 / 256.0, 0.5])
 def test_the_powers_reach_as_far_as_a_float_can(cone_angle: float) -> None:
     t_mins, t_maxs = torch.tensor([0.0, 3.0]), torch.full((2,), 1e30)
