@@ -83,7 +83,7 @@ def decisions(occupancy: nn.Module, positions: Tensor) -> Tensor | None:
 
 
 def march(
-    occupancy: nn.Module, cache: CellCache | None, device: torch.device, plan: PlanFn
+    occupancy: object, cache: CellCache | None, device: torch.device, plan: PlanFn
 ) -> Samples | None:
     """The fused march of an estimator's rays; None: ask the torch twin.
 
@@ -140,7 +140,8 @@ def weights_of(occupancy: nn.Module) -> GateWeights | None:
     now = tuple((value.data_ptr(), _version(value)) for value in state)
     found = _packed.get(occupancy)
     if found is None or found[0] != now:
-        reason = why_not(occupancy, _most_width(occupancy, state[0].device))
+        device = state[0].device if state else torch.device("cpu")
+        reason = why_not(occupancy, _most_width(occupancy, device))
         if reason is not None and found is None:  # else it has been said
             _log.info("no fused gate: %s", reason)
         found = now, gate_weights(occupancy) if reason is None else None

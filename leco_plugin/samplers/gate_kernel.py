@@ -212,7 +212,7 @@ def _occupancy(logits, number, LOGITS: tl.constexpr):
     return tl.where(logit >= 0.0, 1.0, small) / (1.0 + small)
 
 
-@triton.jit
+@triton.jit(do_not_specialize=["count", "column_stride"])  # else a compilation for every kind
 def _gate_kernel(
     positions,
     kept,

@@ -18,7 +18,7 @@ MOST_WIDTH_BUT_HOPPER = 128
 """Compiled for compute capability 8, a wider gate spills its registers by tens of kilobytes; 9 was
 looked at, later ones were not."""
 MOST_WIDTH_FLOAT32 = 64
-"""Products in float32 are no matrix instructions: compiled, a wider gate takes minutes and spills."""
+"""Float32 products are no matrix instructions: compiled, a wider gate takes minutes and spills."""
 MOST_LAYERS = 8
 MOST_LOGITS = 64
 

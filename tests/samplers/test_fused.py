@@ -93,6 +93,7 @@ def test_gates_that_do_not_fit_are_named(sizes, reason: str) -> None:
 
 def test_what_is_no_occupancy_of_ours_stays_with_torch() -> None:
     assert why_not(object()) == "it has no gate of this package"
+    assert fused.weights_of(torch.nn.Module()) is None
 
 
 def test_weights_are_packed_anew_only_when_the_gate_changes() -> None:
