@@ -1,4 +1,4 @@
-"""The GPU suite: `python benchmarks/gpu.py`, at most ten minutes, on a machine with a CUDA device.
+"""The GPU suite: `PYTHONPATH=. python benchmarks/gpu.py`, at most ten minutes, with a CUDA device.
 
 Correctness first, then times with device events, and the card's own ceilings in the same run. A
 part that is in the results file already is not run again, so that a run that was cut off goes on.
@@ -19,9 +19,6 @@ from pathlib import Path
 from typing import Any
 
 import torch
-
-sys.path[:0] = [str(Path(__file__).resolve().parent), str(Path(__file__).resolve().parents[1])]
-
 from gpu_parts import PARTS, Scale
 
 from leco_plugin.evaluation.json_file import write_json

@@ -107,6 +107,19 @@ def sampling_table(report: dict[str, Any]) -> str:
     return "\n".join(rows)
 
 
+def gpu_table(results: dict[str, Any]) -> str:
+    """The bars of the GPU suite, with the milliseconds behind them, floors among them."""
+    rows = ["| figure | measured | bar | reached | milliseconds |", "|---|---|---|---|---|"]
+    for figure in (f for part in results["parts"].values() for f in part.get("figures", [])):
+        sign = "<=" if figure["at_most"] else ">="
+        times = ", ".join(f"{name} {time:.3g}" for name, time in figure["milliseconds"].items())
+        rows.append(
+            f"| {figure['name']} | {figure['value']:.3g} | {sign} {figure['bar']:g} "
+            f"| {'yes' if figure['reached'] else '**no**'} | {times} |"
+        )
+    return "\n".join(rows)
+
+
 def section(
     title: str, command: str, report: dict[str, Any], table: str, note: str = ""
 ) -> list[str]:
@@ -129,6 +142,10 @@ def page() -> str:
         report = json.loads(sampling.read_text())
         command, note = "python benchmarks/sampling.py", " Ratios within one run."
         parts += section("Sampling", command, report, sampling_table(report), note)
+    for path in sorted(RESULTS.glob("gpu-*.json")):
+        report = json.loads(path.read_text())
+        title, command = f"On a GPU: {report['machine']['device']}", "python benchmarks/gpu.py"
+        parts += section(title, command, report, gpu_table(report))
     return "\n".join(parts)
 
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Sequence
-from typing import Protocol
+from typing import Protocol, cast
 
 import torch
 from torch import Tensor, nn
@@ -49,8 +49,9 @@ def grouped_dispatch(features: Tensor, routes: Tensor, experts: Sequence[Layered
     for i in range(len(first.layers)):
         if i == first.skip:
             hidden = torch.cat([points, hidden], dim=-1)
-        weights = torch.stack([expert.layers[i].weight for expert in experts]).to(points.dtype)
-        biases = torch.stack([expert.layers[i].bias for expert in experts]).to(points.dtype)
+        layers = [cast(nn.Linear, expert.layers[i]) for expert in experts]
+        weights = torch.stack([layer.weight for layer in layers]).to(points.dtype)
+        biases = torch.stack([layer.bias for layer in layers]).to(points.dtype)
         hidden = nn.functional.grouped_mm(hidden, weights.mT, offs=ends)
         # rows beyond the last group hold anything, and so do their gradients
         hidden = torch.where(taken, hidden + biases.index_select(0, groups), 0.0)

@@ -19,6 +19,7 @@ from leco_plugin.samplers.cache import CellCache
 from leco_plugin.samplers.gate_weights import (
     MOST_WIDTH,
     MOST_WIDTH_BUT_HOPPER,
+    MOST_WIDTH_FLOAT32,
     GateWeights,
     gate_weights,
     why_not,
@@ -82,7 +83,7 @@ def decisions(occupancy: nn.Module, positions: Tensor) -> Tensor | None:
 
 
 def march(
-    occupancy: nn.Module, cache: CellCache | None, device: torch.device, plan: PlanFn
+    occupancy: object, cache: CellCache | None, device: torch.device, plan: PlanFn
 ) -> Samples | None:
     """The fused march of an estimator's rays; None: ask the torch twin.
 
@@ -139,7 +140,8 @@ def weights_of(occupancy: nn.Module) -> GateWeights | None:
     now = tuple((value.data_ptr(), _version(value)) for value in state)
     found = _packed.get(occupancy)
     if found is None or found[0] != now:
-        reason = why_not(occupancy, _most_width(state[0].device))
+        device = state[0].device if state else torch.device("cpu")
+        reason = why_not(occupancy, _most_width(occupancy, device))
         if reason is not None and found is None:  # else it has been said
             _log.info("no fused gate: %s", reason)
         found = now, gate_weights(occupancy) if reason is None else None
@@ -147,10 +149,12 @@ def weights_of(occupancy: nn.Module) -> GateWeights | None:
     return found[1]
 
 
-def _most_width(device: torch.device) -> int:
-    if device.type == "cuda" and torch.cuda.get_device_capability(device)[0] != 9:
-        return MOST_WIDTH_BUT_HOPPER
-    return MOST_WIDTH
+def _most_width(occupancy: Any, device: torch.device) -> int:
+    if device.type != "cuda":
+        return MOST_WIDTH
+    if getattr(occupancy, "precision", None) == "float32":
+        return MOST_WIDTH_FLOAT32
+    return MOST_WIDTH if torch.cuda.get_device_capability(device)[0] == 9 else MOST_WIDTH_BUT_HOPPER
 
 
 def _version(value: Any) -> int:

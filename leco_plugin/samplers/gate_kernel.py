@@ -212,7 +212,7 @@ def _occupancy(logits, number, LOGITS: tl.constexpr):
     return tl.where(logit >= 0.0, 1.0, small) / (1.0 + small)
 
 
-@triton.jit
+@triton.jit(do_not_specialize=["count", "column_stride"])  # else a compilation for every kind
 def _gate_kernel(
     positions,
     kept,
@@ -289,8 +289,8 @@ def gate_decisions(weights: GateWeights, positions: Tensor) -> Tensor:
     """
     kept = torch.empty(len(positions), dtype=torch.uint8, device=positions.device)
     if len(positions):
-        wide = weights.padded_width > 64
-        rows = 64 if wide else 128
+        rows = 32 if not weights.half else 64 if weights.padded_width > 64 else 128
+        many_warps = weights.padded_width > 128 or not weights.half
         _gate_kernel[(triton.cdiv(len(positions), rows),)](
             positions,
             kept,
@@ -302,7 +302,7 @@ def gate_decisions(weights: GateWeights, positions: Tensor) -> Tensor:
             weights.epsilon,
             ROWS=rows,
             **sizes_of(weights),
-            num_warps=8 if weights.padded_width > 128 else 4,
+            num_warps=8 if many_warps else 4,
             enable_fp_fusion=False,
         )
     return kept.view(torch.bool)

@@ -17,6 +17,8 @@ MOST_WIDTH = 256
 MOST_WIDTH_BUT_HOPPER = 128
 """Compiled for compute capability 8, a wider gate spills its registers by tens of kilobytes; 9 was
 looked at, later ones were not."""
+MOST_WIDTH_FLOAT32 = 64
+"""Float32 products are no matrix instructions: compiled, a wider gate takes minutes and spills."""
 MOST_LAYERS = 8
 MOST_LOGITS = 64
 
@@ -76,6 +78,11 @@ def why_not(occupancy: Any, most_width: int = MOST_WIDTH) -> str | None:
 @torch.no_grad()
 def gate_weights(occupancy: Any) -> GateWeights:
     """The weights of an occupancy for which `why_not` finds nothing, on its device."""
+    with torch.autocast(occupancy.threshold_value.device.type, enabled=False):  # the host may be
+        return _packed(occupancy)
+
+
+def _packed(occupancy: Any) -> GateWeights:
     gate, space = occupancy.gate, occupancy.space
     config, half = gate.config, occupancy.precision == "bfloat16"
     octaves, width, logits = config.encoding.octaves, config.width, 1 + config.scene_experts

@@ -14,14 +14,9 @@ import triton
 import triton.language as tl
 from torch import Tensor
 
-from leco_plugin.samplers.cache import (
-    BRICK,
-    COARSE_OCCUPIED,
-    FINE_EMPTY,
-    FINE_OCCUPIED,
-    CellCache,
-)
-from leco_plugin.samplers.gate_kernel import gate_keeps, largest_of, mapped_of, sizes_of
+from leco_plugin.samplers.cache import CellCache
+from leco_plugin.samplers.cache_kernel import cells_decide, cells_near
+from leco_plugin.samplers.gate_kernel import gate_keeps, sizes_of
 from leco_plugin.samplers.gate_weights import GateWeights
 from leco_plugin.samplers.growth import growth_table
 from leco_plugin.samplers.marching import (
@@ -33,13 +28,9 @@ from leco_plugin.samplers.marching import (
 )
 
 STEPS = 32
-"""Candidates that a program works on at once: a stretch costs one coarse question, and one of 16
-products of matrices for the gate if any of it is open."""
+"""Candidates that a program works on at once: one coarse question for all of them, and the gate's
+products for all of them if one is left open."""
 
-_BRICK = tl.constexpr(BRICK)
-_COARSE_OCCUPIED = tl.constexpr(COARSE_OCCUPIED)
-_FINE_EMPTY = tl.constexpr(FINE_EMPTY)
-_FINE_OCCUPIED = tl.constexpr(FINE_OCCUPIED)
 _MOST = tl.constexpr(MAX_CANDIDATES_PER_RAY)
 
 
@@ -53,106 +44,7 @@ def _edge(step, t_min, step_size, n_linear, t_switch, growth, CONED: tl.constexp
     return linear
 
 
-@triton.jit
-def _cells(x, y, z, facts, frame, RESOLUTION: tl.constexpr, CONTRACTED: tl.constexpr):
-    """`CellCache._cells`: coordinates in coarse cells, the border included."""
-    if CONTRACTED:
-        x, y, z, _ = mapped_of(x, y, z, facts, True)
-    scale = tl.load(frame)
-    return (
-        _clamped(tl.fma(x, scale, tl.load(frame + 1)), RESOLUTION),
-        _clamped(tl.fma(y, scale, tl.load(frame + 2)), RESOLUTION),
-        _clamped(tl.fma(z, scale, tl.load(frame + 3)), RESOLUTION),
-    )
-
-
-@triton.jit
-def _clamped(cell, RESOLUTION: tl.constexpr):
-    cell = tl.where(cell == cell, cell, 0.0)
-    return tl.minimum(tl.maximum(cell, 0.0), RESOLUTION + 1.5)
-
-
-@triton.jit
-def _near(
-    x,
-    y,
-    z,
-    radius,
-    facts,
-    frame,
-    clearance,
-    RESOLUTION: tl.constexpr,
-    CONTRACTED: tl.constexpr,
-):
-    """`CellCache.near` of one ball."""
-    u, v, w = _cells(x, y, z, facts, frame, RESOLUTION, CONTRACTED)
-    u = tl.floor((u - 1.0) * 2.0)
-    v = tl.floor((v - 1.0) * 2.0)
-    w = tl.floor((w - 1.0) * 2.0)
-    width: tl.constexpr = 2 * RESOLUTION
-    lowest = tl.minimum(tl.minimum(u, v), w)
-    outside = (lowest < 0.0) | (tl.maximum(tl.maximum(u, v), w) >= width)
-    last = width - 1.0
-    u = tl.minimum(tl.maximum(u, 0.0), last).to(tl.int32)
-    v = tl.minimum(tl.maximum(v, 0.0), last).to(tl.int32)
-    w = tl.minimum(tl.maximum(w, 0.0), last).to(tl.int32)
-    index = (u * width + v) * width + w
-    pair = tl.load(clearance + (index >> 1)).to(tl.int32)
-    clear = (pair >> ((index & 1) * 4)) & 15
-    stretch = tl.load(frame)
-    if CONTRACTED:
-        half_extent = tl.load(facts + 3)
-        distance = largest_of(x - tl.load(facts), y - tl.load(facts + 1), z - tl.load(facts + 2))
-        inner = tl.maximum((distance - radius) / half_extent, 1.5)
-        stretch = stretch * (0.5 / half_extent) * (4.0 * inner - 3.0) / (inner * inner)
-    return (radius * stretch * 2.0 >= clear) | outside
-
-
-@triton.jit
-def _decided(
-    x,
-    y,
-    z,
-    wanted,
-    facts,
-    frame,
-    coarse,
-    fine,
-    first_plane,
-    planes,
-    n_planes,
-    RESOLUTION: tl.constexpr,
-    CONTRACTED: tl.constexpr,
-):
-    """`CellCache.decide`: which of the wanted positions are occupied, and which are left open."""
-    u, v, w = _cells(x, y, z, facts, frame, RESOLUTION, CONTRACTED)
-    i, j, k = tl.floor(u), tl.floor(v), tl.floor(w)
-    width: tl.constexpr = RESOLUTION + 2
-    at = (i.to(tl.int32) * width + j.to(tl.int32)) * width + k.to(tl.int32)
-    brick = tl.load(coarse + at, mask=wanted, other=-1).to(tl.int32)
-    occupied = brick == _COARSE_OCCUPIED
-
-    u, v, w = (u - i) * _BRICK, (v - j) * _BRICK, (w - k) * _BRICK
-    i, j, k = tl.floor(u), tl.floor(v), tl.floor(w)
-    at = (i.to(tl.int32) * _BRICK + j.to(tl.int32)) * _BRICK + k.to(tl.int32)
-    at += brick * (_BRICK * _BRICK * _BRICK)
-    known = tl.load(fine + at, mask=brick >= 0, other=_FINE_EMPTY).to(tl.int32)
-    occupied = occupied | (known == _FINE_OCCUPIED)
-
-    held = known < _FINE_EMPTY
-    plane = planes + tl.load(first_plane + brick, mask=held, other=0) + known
-    height = tl.load(plane, mask=held, other=0).to(tl.float32)
-    for axis in tl.static_range(3):
-        plane += n_planes
-        slope = tl.load(plane, mask=held, other=0).to(tl.float32)
-        along = u - i if axis == 0 else (v - j if axis == 1 else w - k)
-        height = tl.fma(slope, along * 2.0 - 1.0, height)
-    error = tl.load(plane + n_planes, mask=held, other=0).to(tl.float32)
-    occupied = occupied | (height > 0.0)
-    return occupied, tl.where(held, tl.abs(height) <= error, held)
-
-
-@triton.jit
+@triton.jit(do_not_specialize=["n_rays", "n_planes"])
 def _march_kernel(
     rays,
     n_rays,
@@ -218,7 +110,7 @@ def _march_kernel(
         finish = begin + size.to(tl.float32)
         t_finish = _edge(finish, t_min, step_size, n_linear, t_switch, growth, CONED)
         middle = (t_begin + t_finish) * 0.5
-        near = _near(
+        near = cells_near(
             tl.fma(dx, middle, ox),
             tl.fma(dy, middle, oy),
             tl.fma(dz, middle, oz),
@@ -238,7 +130,7 @@ def _march_kernel(
             t_end = _edge(numbered + 1.0, t_min, step_size, n_linear, t_switch, growth, CONED)
             middles = (t_start + t_end) * 0.5
             x, y, z = tl.fma(dx, middles, ox), tl.fma(dy, middles, oy), tl.fma(dz, middles, oz)
-            kept, left_open = _decided(
+            kept, left_open = cells_decide(
                 x,
                 y,
                 z,

@@ -93,6 +93,7 @@ def test_gates_that_do_not_fit_are_named(sizes, reason: str) -> None:
 
 def test_what_is_no_occupancy_of_ours_stays_with_torch() -> None:
     assert why_not(object()) == "it has no gate of this package"
+    assert fused.weights_of(torch.nn.Module()) is None
 
 
 def test_weights_are_packed_anew_only_when_the_gate_changes() -> None:
@@ -128,6 +129,14 @@ def test_the_norm_folds_into_the_last_layer(precision) -> None:
     features = torch.rand(30, 40)
     expected = gate.head(gate.norm(features))
     torch.testing.assert_close(logits_by_hand(weights, features), expected, rtol=1e-4, atol=1e-4)
+
+
+def test_packing_within_a_hosts_autocast_rounds_nothing() -> None:
+    occupancy = Occupancy(Gate(GateConfig()), Space(), 0.5)
+    with torch.autocast("cpu", dtype=torch.bfloat16):
+        within = gate_weights(occupancy)
+    for one, other in zip(within[:3], gate_weights(occupancy)[:3]):
+        assert torch.equal(one, other)
 
 
 @pytest.mark.parametrize("cone_angle", [1e-3, 1.0 / 256.0, 0.5])

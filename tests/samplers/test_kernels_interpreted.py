@@ -24,7 +24,7 @@ def test_kernels_agree_with_their_twins(name: str) -> None:
         cwd=HERE.parent.parent,
         capture_output=True,
         text=True,
-        timeout=200,
+        timeout=280,
     )
     assert finished.returncode == 0, finished.stdout[-4000:] + finished.stderr[-1000:]
     assert " passed" in finished.stdout and "skipped" not in finished.stdout
