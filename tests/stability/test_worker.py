@@ -57,7 +57,7 @@ def run(contender: Contender, scene: Path, folder: Path) -> dict[str, Any]:
 def on_small_host(sampler: str, options: dict[str, int]) -> Contender:
     changes = {**SMALL, "occupancy.sampler": sampler, "occupancy.options": options}
     settings = {"pipeline.datamanager.train_num_rays_per_batch": MICRO.rays}
-    return Contender(sampler, "leco-ngp", sampler, changes, settings)
+    return Contender(sampler, "leco-ngp", sampler, changes, settings=settings)
 
 
 @pytest.mark.slow
