@@ -22,13 +22,13 @@ class Contender:
     """As the registry of samplers knows it, or `own`."""
     changes: Mapping[str, Any] = field(default_factory=dict)
     """Settings under `--pipeline.model.`, by their path."""
-    settings: Mapping[str, Any] = field(default_factory=dict)
-    """Settings of the whole method, by their path; keys of dictionaries are steps of it too."""
     budget: float = 1.0
     """Multiple of the chart's time and steps that it is given."""
     grids: tuple[int, ...] = ()
     """Cells along each axis of occupancy grids that are made from its field when it freezes, and
     compared with its gate."""
+    settings: Mapping[str, Any] = field(default_factory=dict)
+    """Settings of the whole method, by their path; keys of dictionaries are steps of it too."""
 
     @property
     def key(self) -> str:

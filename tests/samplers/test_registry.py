@@ -74,7 +74,9 @@ def test_every_sampler_of_ours_is_an_entry_point_too():
 
 
 def test_mistakes_are_named():
-    with pytest.raises(ValueError, match="no sampler 'grid'; there are dense, learned-occ"):
+    with pytest.raises(
+        ValueError, match="no sampler 'grid'; there are dense, dense-proposal, learned-occ"
+    ):
         build_estimator("grid")
     with pytest.raises(ValueError, match="'learned-occupancy' needs an occupancy"):
         build_estimator("learned-occupancy", aabb=BOX)
