@@ -22,7 +22,7 @@ from leco_plugin.shrink.sources import Source, held_out, trained_on
 from leco_plugin.shrink.teaching import Lesson
 
 FIELD = "field.pt"
-RAYS, TAUGHT_RAYS = 8192, 6144
+RAYS, TAUGHT_RAYS = 8192, 1 << 15
 VOLUME_POINTS = 1 << 17
 
 

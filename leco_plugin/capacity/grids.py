@@ -16,8 +16,9 @@ from torch.nn.functional import max_pool3d
 from leco_plugin.evaluation.inspection import ViewBox
 from leco_plugin.samplers.grid import cells_of
 
-PROBES = 4
-"""Densities asked in each cell, at random places; the largest is the cell's score."""
+FEWEST_PROBES, PROBES_ALONG = 8, 2048
+"""Densities asked in each cell, at random places; the largest is the cell's score. More in coarse
+cells, of which a surface may fill a corner."""
 CELLS_AT_ONCE = 1 << 18
 BYTES_A_CELL = 16
 """Of memory while a grid is filled, about."""
@@ -50,7 +51,7 @@ def filled(
     generator = torch.Generator(device).manual_seed(seed)
     for cells in asked.nonzero().split(CELLS_AT_ONCE):
         best = torch.zeros(len(cells), device=device)
-        for _ in range(PROBES):
+        for _ in range(max(FEWEST_PROBES, PROBES_ALONG // resolution)):
             units = cells + torch.rand(len(cells), 3, device=device, generator=generator)
             places = torch.lerp(box.low, box.high, units / resolution)
             best = torch.maximum(best, density(places).float())

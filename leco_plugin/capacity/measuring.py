@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import math
 import time
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import torch
@@ -13,6 +15,7 @@ from torch import Tensor
 from leco_plugin.capacity.field import Ground, mapped_box
 from leco_plugin.capacity.grids import filled, looked_up
 from leco_plugin.evaluation.equal_loss import threshold_losing
+from leco_plugin.evaluation.inspection import ViewBox
 from leco_plugin.models.encodings import EncodingConfig
 from leco_plugin.models.gate import GateConfig, occupancy_logit
 from leco_plugin.models.leco import LecoModel
@@ -28,6 +31,8 @@ STEPS = 300
 VOLUMES = (0.01, 0.015, 0.02, 0.03, 0.04, 0.06, 0.08, 0.11, 0.15, 0.2, 0.3, 0.45)
 """Kept volumes at which the loss is noted."""
 POINTS_AT_ONCE = 1 << 16
+ASK_ALL = 64
+"""Cells along an axis up to which a grid may be filled without a coarser one."""
 FAMILIES = ("frequency", "hash", "vm", "k-planes", "grid")
 
 
@@ -139,27 +144,44 @@ def of_gate(ground: Ground, candidate: Candidate, lost: float) -> dict[str, Any]
     return _row(candidate, started, measured(ground.held_out, scores, of_volume, lost))
 
 
-def of_grids(ground: Ground, candidates: list[Candidate], lost: float) -> Any:
-    """Fills grids from the field's density, each from the one before; yields a row for each."""
+def of_grids(
+    ground: Ground, candidates: Sequence[Candidate], lost: float
+) -> Iterator[tuple[Candidate, dict[str, Any]]]:
+    """Fills grids from the field's density, each from one half as fine; yields a row for each.
+
+    Args:
+        candidates: by resolution.
+        lost: share of the weight near surfaces.
+    """
     box = mapped_box(ground.model)
+    box = ViewBox(box.low.to(ground.mapped), box.high.to(ground.mapped))
     scores: Tensor | None = None
     floor = 0.0
     for candidate in candidates:
         started = time.monotonic()
         assert candidate.resolution is not None
-        refined = scores is not None and candidate.resolution == 2 * len(scores)
-        scores = filled(
-            lambda mapped: density_of(ground.model, mapped),
-            box,
-            candidate.resolution,
-            scores if refined else None,
-            floor,
-        )
-        of_rays = looked_up(scores, box, ground.mapped)
-        found = measured(ground.held_out, of_rays, looked_up(scores, box, ground.volume), lost)
-        # cells that a tenth of the loss can spare are empty in finer grids too
-        floor = threshold_losing(ground.held_out.worth, of_rays, 0.1 * lost)
+        for resolution in halvings(candidate.resolution, 0 if scores is None else len(scores)):
+            coarser = scores if scores is not None and resolution == 2 * len(scores) else None
+            scores = filled(partial(density_of, ground.model), box, resolution, coarser, floor)
+            of_rays = looked_up(scores, box, ground.mapped)
+            # cells that a tenth of the loss can spare are empty in finer grids too
+            floor = threshold_losing(ground.held_out.worth, of_rays, 0.1 * lost)
+        assert scores is not None
+        of_volume = looked_up(scores, box, ground.volume)
+        found = measured(ground.held_out, of_rays, of_volume, lost)
         yield candidate, _row(candidate, started, found)
+
+
+def halvings(resolution: int, known: int) -> list[int]:
+    """Resolutions to fill on the way to one, from coarse to fine.
+
+    Args:
+        known: cells along an axis of the grid that there is already.
+    """
+    steps = [resolution]
+    while steps[0] > ASK_ALL and steps[0] % 2 == 0 and steps[0] != 2 * known:
+        steps.insert(0, steps[0] // 2)
+    return steps
 
 
 @torch.no_grad()

@@ -51,14 +51,14 @@ def draw(results: Mapping[str, Any], path: Path, theme: Theme = LIGHT) -> Path:
             panel.set_title(heading, fontsize=12, loc="left")
         handles, labels = panels[0].get_legend_handles_labels()
         figure.legend(
-            *(handles, labels), loc="lower center", ncols=len(labels), frameon=False, fontsize=11
+            *(handles, labels), loc="lower center", ncols=len(labels), frameon=False, fontsize=10
         )
         figure.savefig(path, dpi=150)
     return path
 
 
 def _draw_panel(panel: Any, rows: Any, values: list[float], theme: Theme) -> None:
-    from matplotlib.ticker import NullFormatter, StrMethodFormatter
+    from matplotlib.ticker import LogLocator, NullFormatter, StrMethodFormatter
 
     chosen = choose(rows)
     for number, family in enumerate(FAMILIES):
@@ -102,6 +102,7 @@ def _draw_panel(panel: Any, rows: Any, values: list[float], theme: Theme) -> Non
     panel.xaxis.set_minor_formatter(NullFormatter())
     if min(values) > 2 * LEAST and max(values) > 1.0:
         panel.yaxis.set_major_formatter(StrMethodFormatter("{x:g}"))
+        panel.yaxis.set_minor_locator(LogLocator(subs=(2.0, 5.0)))
         panel.yaxis.set_minor_formatter(StrMethodFormatter("{x:g}"))
         panel.tick_params(axis="y", which="minor", labelsize=9)
     panel.margins(y=0.16)

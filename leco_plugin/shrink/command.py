@@ -186,7 +186,7 @@ def summary(results: dict[str, Any], out: Path) -> list[str]:
     before, after = results["from"], results["to"]
     lines = []
     if "shrunk_from_params" not in after:
-        lines.append("no smaller gate holds these bounds: this is the same gate, stored shorter")
+        lines.append("no smaller gate holds these bounds: this is the same gate")
     lines.append(
         f"{out}: {before['bytes'] / 1000:.1f} kB before, {after['bytes'] / 1000:.1f} kB now; asked "
         f"{results['query_speedup']:.1f} times faster"

@@ -145,8 +145,13 @@ def room_beyond(original: Occupancy, bounds: Bounds) -> Bounds:
     """What is left to lose after what the original declares.
 
     Raises:
-        ValueError: nothing is.
+        ValueError: nothing is, or a bound is out of range.
     """
+    if not 0.0 <= bounds.lost_surface_mass < 1.0 or not math.isfinite(bounds.image_price_db):
+        raise ValueError(
+            "bounds are a lost surface mass from 0 to 1 and a number of dB, not "
+            f"{bounds.lost_surface_mass} and {bounds.image_price_db}"
+        )
     declared = [original.report.get(name) for name in ("lost_surface_mass", "image_price_db")]
     lost, price = (float(value) if isinstance(value, int | float) else 0.0 for value in declared)
     if lost >= bounds.lost_surface_mass:

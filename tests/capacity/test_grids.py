@@ -49,7 +49,7 @@ def test_refining_finds_what_asking_every_cell_finds_with_fewer_questions() -> N
     )
     inside = ball(torch.lerp(BOX.low, BOX.high, middles).view(-1, 3)).view(32, 32, 32) > 0
     assert float(refined[inside].mean()) > 0.97
-    assert asked[0] < 0.5 * 4 * 32**3
+    assert asked[0] < 0.5 * 64 * 32**3
 
 
 def test_memory_is_looked_at_before_a_grid_is_filled() -> None:

@@ -97,7 +97,7 @@ def test_where_nothing_smaller_holds_the_same_gate_is_stored(
     out = tmp_path / "same.safetensors"
     monkeypatch.setattr(search, "ladder", lambda most: [])
     assert run("shrink", file, "--data", tiny_scene, "--out", out) == 0
-    assert "the same gate, stored shorter" in capsys.readouterr().out
+    assert "this is the same gate" in capsys.readouterr().out
     same = Occupancy.load(out)
     positions = torch.rand(5000, 3) - 0.5
     assert torch.equal(same.query(positions), original.query(positions))
@@ -115,6 +115,7 @@ def test_bad_input_ends_with_one_line_and_status_2(
         "there is no such folder": [file, "--data", tmp_path / "none", *out],
         "raise --lost-surface-mass": [file, "--data", tiny_scene, *out, "--lost-surface-mass", 0],
         "how its rays are marched": [tmp_path / "silent.safetensors", "--data", tiny_scene, *out],
+        "not nan": [file, "--data", tiny_scene, *out, "--lost-surface-mass", "nan"],
         "is a folder": [file, "--data", tiny_scene, "--out", tmp_path],
         "No such file": [tmp_path / "none.safetensors", "--data", tiny_scene, *out],
     }
