@@ -294,6 +294,7 @@ def test_the_method_learns_saves_and_is_evaluated(sampling, tiny_scene: Path, tm
     config.output_dir, config.vis = tmp_path, "tensorboard"
     config.logging.local_writer.enable = False
     config.set_timestamp()
+    config.save_config()
     trainer = config.setup(local_rank=0, world_size=1)
     trainer.setup()
     attributes = TrainingCallbackAttributes(
@@ -311,7 +312,6 @@ def test_the_method_learns_saves_and_is_evaluated(sampling, tiny_scene: Path, tm
         losses.append(float(trainer.train_iteration(step)[0].detach()))
     assert sum(losses[-5:]) < 0.75 * sum(losses[:5])
     trainer.save_checkpoint(24)
-    config.save_config()
     stored = yaml.load((config.get_base_dir() / "config.yml").read_text(), Loader=yaml.Loader)
     pipeline = stored.pipeline.setup(device="cpu", test_mode="test")
     checkpoint = torch.load(stored.get_checkpoint_dir() / "step-000000024.ckpt")
