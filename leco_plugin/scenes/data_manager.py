@@ -63,6 +63,7 @@ class LecoDataManager(VanillaDataManager):  # type: ignore[type-arg]
             return True
         needed = decoded_bytes(self.train_dataset) + decoded_bytes(self.eval_dataset)
         free = free_memory()
+        needed *= max(1, self.world_size)  # each process decodes its own
         return obstacle is None and free is not None and needed > MOST_OF_MEMORY * free
 
     def _obstacle(self) -> str | None:
