@@ -43,9 +43,13 @@ class AtomicTrainer(Trainer):
         self.callbacks.append(TrainingCallback(where, self.save_by_the_clock))
 
     def save_by_the_clock(self, step: int) -> None:
-        """Saves if the last time is long ago; nothing where a run is to save nothing."""
+        """Saves if the last time is long ago; nothing where a run is to save nothing, or keeps all
+        that it saves: then their number is the user's choice."""
+        config = self.config
+        if config.steps_per_save <= 0 or not config.save_only_latest_checkpoint:
+            return
         wait = max(SECONDS_BETWEEN_SAVES, SAVES_COST * self.save_seconds)
-        if self.config.steps_per_save > 0 and time.monotonic() - self.saved_at > wait:
+        if time.monotonic() - self.saved_at > wait:
             self.save_checkpoint(step)
 
     def train(self) -> None:
@@ -137,7 +141,7 @@ class AtomicTrainer(Trainer):
         try:
             super().save_checkpoint(step)
             unfinished = beside / f"step-{step:09d}.ckpt"
-            with unfinished.open("rb") as file:
+            with unfinished.open("r+b") as file:  # Windows syncs no file that is only read
                 os.fsync(file.fileno())
             checkpoints.mkdir(parents=True, exist_ok=True)
             finished = unfinished.replace(checkpoints / unfinished.name)

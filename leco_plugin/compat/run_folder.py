@@ -5,11 +5,18 @@ A new run deletes whatever checkpoints it finds in its folder as soon as it save
 
 from __future__ import annotations
 
-import fcntl
 import os
 from pathlib import Path
+from typing import Any
 
 from leco_plugin.compat.whole_checkpoints import step_of
+
+try:
+    import fcntl as _fcntl
+
+    fcntl: Any = _fcntl
+except ImportError:  # Windows has no such locks: there only checkpoints are looked for
+    fcntl = None
 
 LOCK = ".running"
 """File that a run holds locked; the system lets go of it however the run ends."""
@@ -50,6 +57,8 @@ def release(folder: Path) -> None:
 def _lock(folder: Path) -> int | None:
     """An open file that is locked; None where another process has locked it."""
     held = os.open(folder / LOCK, os.O_CREAT | os.O_RDWR, 0o644)
+    if fcntl is None:
+        return held
     try:
         fcntl.flock(held, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except BlockingIOError:

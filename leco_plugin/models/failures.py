@@ -24,8 +24,14 @@ class TrainingStopped(SystemExit, RuntimeError):
 
 
 def first_non_finite(losses: dict[str, Tensor]) -> str | None:
-    """Name of the first scalar loss that is not finite, or None; waits for the device once."""
-    values = torch.stack([loss.detach().float() for loss in losses.values()]).tolist()
+    """Name of the first loss that is not finite, or None; waits for the device once.
+
+    Args:
+        losses: of any shapes; hosts also give plain numbers.
+    """
+    tensors = [torch.as_tensor(loss).detach() for loss in losses.values()]
+    device = next((loss.device for loss in tensors if loss.device.type != "cpu"), "cpu")
+    values = torch.stack([loss.float().sum().to(device) for loss in tensors]).tolist()
     return next((name for name, value in zip(losses, values) if not math.isfinite(value)), None)
 
 

@@ -19,6 +19,7 @@ from leco_plugin.models.calibration import (
 from leco_plugin.models.gate import occupancy_from_logits
 from leco_plugin.models.ranks import from_first, say, share
 from leco_plugin.models.rendering import Intervals, Rays, backdrop_of
+from leco_plugin.occupancy import Occupancy
 from leco_plugin.scenes.frames import frame_of
 from leco_plugin.scenes.held_out_pixels import HeldOutPixelSampler, some_images
 from leco_plugin.scenes.survey import Survey
@@ -95,13 +96,18 @@ def _priced(
 
 
 def write_occupancy(model: LecoModel, folder: Path) -> None:
-    """Leaves the frozen gate as `occupancy.safetensors` in a folder, made where it is missing.
+    """Leaves the frozen gate as `occupancy.safetensors` in a folder."""
+    leave_file(model.occupancy(), folder)
+
+
+def leave_file(occupancy: Occupancy, folder: Path) -> None:
+    """Leaves an occupancy as `occupancy.safetensors` in a folder, made where it is missing.
 
     A disk that is full is said in one line: the checkpoint holds the gate too.
     """
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        model.occupancy().save(folder / FILE_NAME)
+        occupancy.save(folder / FILE_NAME)
     except OSError as error:
         say(f"{folder / FILE_NAME} could not be written ({error}); a resumed run writes it anew")
         return

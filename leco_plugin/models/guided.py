@@ -104,7 +104,7 @@ def _refuse_what_is_not_finite(host: Model) -> None:
     def get_loss_dict(outputs: Any, batch: Any, *args: Any, **kwargs: Any) -> dict[str, Any]:
         losses = own_losses(outputs, batch, *args, **kwargs)
         if host.training and losses:
-            require_finite(losses, host, outputs, batch["image"])
+            require_finite(losses, host, outputs, batch.get("image", torch.zeros(())))
         return losses
 
     host.get_loss_dict = get_loss_dict  # type: ignore[method-assign]

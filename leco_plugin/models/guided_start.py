@@ -8,7 +8,7 @@ from typing import Any
 
 import torch
 
-from leco_plugin.models.freezing import FILE_NAME
+from leco_plugin.models.freezing import FILE_NAME, leave_file
 from leco_plugin.models.guide import Guide
 from leco_plugin.models.leco import LecoModelConfig
 from leco_plugin.models.ranks import is_first, say
@@ -124,9 +124,7 @@ class GuidedStart:
             )
             self.guide.set_occupancy(occupancy)
         if self.trainer is not None and is_first():
-            folder = Path(self.trainer.base_dir)
-            folder.mkdir(parents=True, exist_ok=True)
-            self.guide.the_occupancy().save(folder / FILE_NAME)
+            leave_file(self.guide.the_occupancy(), Path(self.trainer.base_dir))
 
     def _fit(self, occupancy: Occupancy) -> None:
         """Finds how the occupancy's coordinates lie in the host's, and whether they are of one

@@ -15,11 +15,11 @@ import torch
 from torch import Tensor
 
 from leco_plugin.models.calibration import THRESHOLDS, CalibrationConfig
-from leco_plugin.models.freezing import FILE_NAME, held_out_bundle
+from leco_plugin.models.freezing import held_out_bundle, leave_file
 from leco_plugin.models.guide import Guide
 from leco_plugin.models.healing import SUSPECTED_STEPS
 from leco_plugin.models.progress import NO_EVIDENCE
-from leco_plugin.models.ranks import from_first, is_first, say
+from leco_plugin.models.ranks import from_first, is_first, mean, say
 from leco_plugin.models.recheck import Evidence, steps_until_next
 
 LOWERED_TO = 0.5
@@ -51,16 +51,19 @@ class HostWatch:
         """Measures again where that is due; skips less where it has come to cost too much."""
         self.steps, self.seconds = self.steps + 1, self.seconds + time.monotonic() - self.started
         guide, config = self.guide, self.config
-        if guide.kept is None or config.recheck_rays == 0 or not guide.the_occupancy_skips():
+        if guide.kept is None or config.recheck_rays == 0:
             return
-        if self._keeps_nothing(step):
+        device, watched = guide.frame.device, guide.watched
+        nothing = self._keeps_nothing(step, device)
+        if not nothing and step < watched.setdefault("due", step + config.steps_per_recheck):
+            return
+        if not guide.the_occupancy_skips():
+            watched["due"] = step + config.steps_per_recheck
+            return
+        if nothing:
             self._lower(step, 0.0, f"the occupancy kept nothing for {SUSPECTED_STEPS} steps")
             return
-        watched = guide.watched
-        if step < watched.setdefault("due", step + config.steps_per_recheck):
-            return
         began = time.monotonic()
-        device = guide.frame.device
         watched["image"] = from_first(self._measured, device)
         watched["rechecks"] = watched.get("rechecks", 0) + 1
         seconds, a_step = time.monotonic() - began, self.seconds / self.steps
@@ -71,8 +74,9 @@ class HostWatch:
             why = "the image price of skipping is beyond its bound"
             self._lower(step, lower if lower >= THRESHOLDS[-1] else 0.0, why)
 
-    def _keeps_nothing(self, step: int) -> bool:
-        if self.guide.kept:
+    def _keeps_nothing(self, step: int, device: torch.device) -> bool:
+        """Whether no process has kept a sample for `SUSPECTED_STEPS` steps; all say the same."""
+        if mean(float(self.guide.kept or 0), device) > 0.0:
             self.nothing_since = None
             return False
         if self.nothing_since is None:
@@ -117,8 +121,4 @@ class HostWatch:
         nothing = "0: from now on nothing is skipped"
         say(f"step {step}: {why}; the threshold is {now if threshold > 0.0 else nothing}")
         if self.trainer is not None and is_first():
-            folder = Path(self.trainer.base_dir)
-            try:
-                occupancy.save(folder / FILE_NAME)
-            except OSError as error:
-                say(f"{folder / FILE_NAME} could not be written ({error})")
+            leave_file(occupancy, Path(self.trainer.base_dir))

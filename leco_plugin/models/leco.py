@@ -13,6 +13,7 @@ from nerfstudio.models.base_model import Model, ModelConfig
 from torch import Tensor, nn
 
 from leco_plugin.compat.checkpoints import allow_checkpoint_globals
+from leco_plugin.compat.earlier_configs import GrowingConfig
 from leco_plugin.models.calibration import CalibrationConfig
 from leco_plugin.models.failures import require_finite
 from leco_plugin.models.field import HMoEField
@@ -46,7 +47,7 @@ from leco_plugin.space import Space
 
 
 @dataclass
-class LecoModelConfig(ModelConfig):
+class LecoModelConfig(GrowingConfig, ModelConfig):
     """Learned occupancy: learn, freeze and calibrate, go on guided"""
 
     _target: type = field(default_factory=lambda: LecoModel)
@@ -281,8 +282,9 @@ class LecoModel(Model):
         rays = self.rays_of(ray_bundle)
         guided = bool(self.frozen) and float(self.threshold) > 0.0  # at 0 nothing is skipped
         intervals = self.intervals_of(rays, guided, learning=self.training and self.is_learning())
-        if self.training and guided:
-            self.guided_kept = len(intervals.t_starts) / max(len(rays.origins), 1) - 1.0
+        if self.training:
+            kept = len(intervals.t_starts) / max(len(rays.origins), 1) - 1.0
+            self.guided_kept = kept if guided else 1.0
         shaded = self.shade(rays, intervals)
         outputs: dict[str, Any] = {
             "rgb": shaded.rgb,

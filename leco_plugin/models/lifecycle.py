@@ -202,6 +202,7 @@ class Lifecycle:
             data, seconds = self.pipeline.datamanager, progress.learn_seconds
             freeze(model, data, self.survey, self.folder, step, seconds)
             progress.recheck_due, progress.surface, progress.image = 0, NO_EVIDENCE, NO_EVIDENCE
+            progress.suspected_since = -1  # of the gate as it is now
             if schedule.steps_per_record > 0:
                 self._record(step)
             if schedule.restart:
@@ -223,7 +224,10 @@ class Lifecycle:
             gate_values, routes = gate_values_and_routes(model.gate(positions), model.routing)
             sigmas, _ = model.field.density(positions, routes, gate_values)
         self.history.look(step, self.progress.learn_seconds, model.gate, routes, sigmas)
-        self.history.save(self.folder)
+        try:
+            self.history.save(self.folder)
+        except OSError as error:
+            say(f"the history of the gate could not be written ({error})")
 
     def _restart_field(self) -> None:
         """Gives the field the weights of a new one, and its optimizers nothing to remember."""

@@ -17,6 +17,7 @@ from nerfstudio.models.base_model import Model, ModelConfig
 from torch import Tensor, nn
 
 from leco_plugin.compat.checkpoints import allow_checkpoint_globals
+from leco_plugin.compat.earlier_configs import GrowingConfig
 from leco_plugin.models.failures import require_finite
 from leco_plugin.models.image_figures import image_figures
 from leco_plugin.models.precision import fast_precision, keep_freed_memory
@@ -43,7 +44,7 @@ from leco_plugin.space import Space
 
 
 @dataclass
-class SwitchNerfModelConfig(ModelConfig):
+class SwitchNerfModelConfig(GrowingConfig, ModelConfig):
     """Switch-NeRF: equal experts, a gate that learns to share the scene among them"""
 
     _target: type = field(default_factory=lambda: SwitchNerfModel)

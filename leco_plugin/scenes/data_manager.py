@@ -52,15 +52,18 @@ class LecoDataManager(VanillaDataManager):  # type: ignore[type-arg]
             InputError: they are to be, and cannot.
         """
         config = self.config
-        if config.images == "memory" or config.train_num_images_to_sample_from != -1:
+        # nerfstudio sets this class as the target of configs that an earlier release stored
+        wanted = getattr(config, "images", "auto")
+        if wanted == "memory" or config.train_num_images_to_sample_from != -1:
             return False
         obstacle = self._obstacle()
-        if config.images == "disk":
+        if wanted == "disk":
             if obstacle is not None:
                 raise InputError(f"photographs on disk: {obstacle}")
             return True
         needed = decoded_bytes(self.train_dataset) + decoded_bytes(self.eval_dataset)
         free = free_memory()
+        needed *= max(1, self.world_size)  # each process decodes its own
         return obstacle is None and free is not None and needed > MOST_OF_MEMORY * free
 
     def _obstacle(self) -> str | None:
@@ -75,7 +78,7 @@ class LecoDataManager(VanillaDataManager):  # type: ignore[type-arg]
         """An endless iterator over the one batch of images that there is."""
         data = Path(self.config.dataparser.data)
         beside = data if data.is_dir() else data.parent
-        folder = self.config.pixels or beside / "leco-cache" / "pixels"
+        folder = getattr(self.config, "pixels", None) or beside / "leco-cache" / "pixels"
         return itertools.repeat(store_pictures(dataset, folder, what))
 
     def setup_train(self) -> None:

@@ -158,10 +158,12 @@ def test_checkpoints_are_saved_by_the_clock(
         now[0] += 1.0
         trainer.save_by_the_clock(step)
     assert saved == [60, 121, 182]
-    trainer.config.steps_per_save = 0
-    now[0] += 1e6
-    trainer.save_by_the_clock(200)
-    assert len(saved) == 3
+    for steps_per_save, only_latest in ((0, True), (500, False)):
+        trainer.config.steps_per_save = steps_per_save
+        trainer.config.save_only_latest_checkpoint = only_latest
+        now[0] += 1e6
+        trainer.save_by_the_clock(200)
+    assert len(saved) == 3  # none are wanted, or all are kept, as many as the user asked for
 
 
 def test_slow_saves_are_rare(trainer: AtomicTrainer, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -93,3 +93,10 @@ def test_all_losses_are_waited_for_at_once() -> None:
     with CountsWaits() as counted:
         first_non_finite(losses)
     assert counted.waits <= 1
+
+
+def test_losses_of_hosts_have_any_shape_and_may_be_plain_numbers() -> None:
+    losses: dict[str, Any] = {"rgb_loss": torch.ones(1), "none": 0.0, "per_ray": torch.ones(3, 2)}
+    assert first_non_finite(losses) is None
+    losses["per_ray"][1, 1] = torch.nan
+    assert first_non_finite(losses) == "per_ray"

@@ -387,3 +387,24 @@ def test_a_range_that_no_ray_meets_is_refused_before_the_first_step(
     guide.set_occupancy(lopsided(data))
     with pytest.raises(InputError, match=r"^0% of the rays meet the scene"):
         GuidedStart(guide, config, Pipe(data))
+
+
+def test_a_full_disk_does_not_end_a_run_that_has_its_occupancy(
+    readers: dict[str, Data],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    class Trainer:
+        base_dir, local_rank = tmp_path / "run", 0
+
+    def full(*_: object) -> None:
+        raise OSError(28, "No space left on device")
+
+    guide = Guide()
+    guide.set_occupancy(ball_of_the_tiny_scene())
+    start = GuidedStart(guide, OccupancyConfig(), Pipe(readers["as it is"]), Trainer())
+    monkeypatch.setattr(Occupancy, "save", full)
+    start.before_step(0)
+    said = " ".join(capsys.readouterr().out.split())
+    assert "could not be written" in said and "No space left on device" in said

@@ -157,3 +157,13 @@ def test_a_host_takes_no_step_with_a_loss_that_is_not_finite(where: str) -> None
         host.get_loss_dict({}, batch)
     host.eval()
     host.get_loss_dict({}, batch)
+
+
+def test_all_processes_lower_the_threshold_or_none(
+    watched: Watched, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    kept_elsewhere = 7.0
+    monkeypatch.setattr(host_watch, "mean", lambda here, _: 0.5 * (here + kept_elsewhere))
+    watched.kept = 0
+    watched.go(0, 300)
+    assert watched.guide.the_occupancy().threshold > 0.0

@@ -155,3 +155,18 @@ def test_a_checkpoint_from_before_there_was_progress_is_read(model: LecoModel) -
     model.progress.recoveries = 2
     model.load_state_dict(state)
     assert model.report == {"step": 7} and model.progress.recoveries == 0
+
+
+def test_a_gate_that_skips_nothing_is_not_taken_for_one_that_keeps_nothing(
+    model: LecoModel,
+) -> None:
+    with torch.no_grad():
+        model.gate.head.bias[0] += 1e3  # empty everywhere
+    model.frozen.fill_(True)
+    model.threshold.fill_(0.5)
+    step(model)
+    assert model.guided_kept == 0.0
+    model.threshold.fill_(0.0)  # as measuring again does with such a gate
+    model.forget_estimator()
+    step(model)
+    assert model.guided_kept > 0.0

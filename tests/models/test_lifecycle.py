@@ -11,8 +11,10 @@ from leco_plugin.models import lifecycle
 from leco_plugin.models.encodings import EncodingConfig
 from leco_plugin.models.field import FieldConfig, HMoEField
 from leco_plugin.models.gate import Gate, GateConfig
+from leco_plugin.models.history import GateHistory
 from leco_plugin.models.lifecycle import Lifecycle
-from leco_plugin.models.rendering import Rays
+from leco_plugin.models.progress import Progress
+from leco_plugin.models.rendering import Rays, Routing
 from leco_plugin.space import Space
 
 PROBES = 500
@@ -99,3 +101,21 @@ def test_a_field_that_starts_anew_keeps_its_parameters_and_forgets_what_they_wer
     assert not optimizer.state
     sum(parameter.sum() for parameter in field.parameters()).backward()
     optimizer.step()
+
+
+def test_a_full_disk_costs_the_history_and_not_the_run(
+    looking: Lifecycle, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def full(*_: object) -> None:
+        raise OSError(28, "No space left on device")
+
+    config = FieldConfig(EncodingConfig(kind="hash", log2_table=8))
+    looking.model.field = HMoEField(config, num_images=2)
+    looking.model.routing = Routing(None, False)
+    looking.model.progress = Progress()
+    looking.history = GateHistory()
+    looking.trainer = SimpleNamespace(base_dir="run")
+    monkeypatch.setattr(GateHistory, "save", full)
+    looking._record(3)
+    assert looking.history.steps == [3]
+    assert "could not be written" in " ".join(capsys.readouterr().out.split())

@@ -107,6 +107,11 @@ def test_photographs_that_do_not_fit_go_to_disk(
         manager = config.setup(device="cpu")
         assert isinstance(manager, LecoDataManager) and manager.on_disk() is expected
         assert decoded_bytes(manager.train_dataset) == 7 * 32 * 32 * 12
+    monkeypatch.setattr(data_manager, "free_memory", lambda: 3.0 * free)
+    manager = LecoDataManagerConfig(pixels=tmp_path, **options(tiny_scene)).setup(
+        device="cpu", world_size=4
+    )
+    assert isinstance(manager, LecoDataManager) and manager.on_disk()
 
 
 def test_a_sampler_that_needs_images_in_memory_is_named(tiny_scene: Path, tmp_path: Path) -> None:
