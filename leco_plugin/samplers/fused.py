@@ -33,8 +33,8 @@ WIDEST_MARCH = 128
 """Compiled, a march around a wider gate spills its registers; the twin asks the fused gate then."""
 
 CHECKED, MOST_OTHERWISE = 4096, 20
-"""Positions that a gate's kernel is tried on before it is trusted, and about how many of them it may
-decide otherwise than the twin; a steep gate turns single roundings into decisions."""
+"""Positions that a gate's kernel is tried on before it is trusted, and of how many it may decide
+otherwise than the twin; a steep gate turns single roundings into decisions."""
 NEAR_THRESHOLD = {True: 0.02, False: 2e-4}
 """Distance of o(x) from the threshold within which a decision is not counted; by whether products
 are bfloat16."""
