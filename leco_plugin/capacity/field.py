@@ -24,6 +24,8 @@ from leco_plugin.shrink.teaching import Lesson
 FIELD = "field.pt"
 RAYS, TAUGHT_RAYS = 8192, 1 << 15
 VOLUME_POINTS = 1 << 17
+CELLS = 64
+"""Along an axis of the mapped cube: cells without a taught candidate are no part of the volume."""
 
 
 class Ground(NamedTuple):
@@ -36,7 +38,8 @@ class Ground(NamedTuple):
     mapped: Tensor
     """[M, 3] of those candidates, in [-1, 1]."""
     volume: Tensor
-    """[P, 3] mapped, spread evenly over the scene's box."""
+    """[P, 3] mapped, spread evenly over what rays of photographs reach of the scene's box: what a
+    representation says of other places is nobody's teaching."""
 
 
 def prepare(data: Path, folder: Path, learn_steps: int) -> Ground:
@@ -88,7 +91,21 @@ def _ground(source: Source) -> Ground:
         return model.space.map(places).clamp(-1.0, 1.0)
 
     lesson = lesson_of(mapped(taught.positions), taught, model.config.gate_loss)
-    return Ground(model, lesson, measured, mapped(measured.positions), mapped(positions))
+    volume = mapped(positions)
+    volume = volume[reached(lesson.mapped, volume)]
+    return Ground(model, lesson, measured, mapped(measured.positions), volume)
+
+
+def reached(taught: Tensor, mapped: Tensor) -> Tensor:
+    """Which mapped positions [P, 3] share a cell with one of those taught [M, 3]: bool [P]."""
+
+    def cells(places: Tensor) -> Tensor:
+        i, j, k = ((places + 1.0) * (CELLS / 2)).long().clamp(0, CELLS - 1).unbind(dim=-1)
+        return (i * CELLS + j) * CELLS + k
+
+    found = torch.zeros(CELLS**3, dtype=torch.bool, device=taught.device)
+    found[cells(taught)] = True
+    return found[cells(mapped)]
 
 
 def lesson_of(mapped: Tensor, taught: Evidence, losses: GateLossConfig) -> Lesson:

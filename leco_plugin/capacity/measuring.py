@@ -112,7 +112,7 @@ def measured(evidence: Evidence, scores: Tensor, of_volume: Tensor, lost: float)
     Args:
         evidence: dense candidates.
         scores: [M] of those candidates.
-        of_volume: [P] of places spread evenly over the scene's box.
+        of_volume: [P] of places spread evenly over what rays reach of the scene's box.
         lost: share of the weight near surfaces.
     """
     threshold = threshold_losing(evidence.worth, scores, lost)
@@ -149,12 +149,16 @@ def of_grids(
 ) -> Iterator[tuple[Candidate, dict[str, Any]]]:
     """Fills grids from the field's density, each from one half as fine; yields a row for each.
 
+    They hear of the places that gates are taught by, and of random ones.
+
     Args:
         candidates: by resolution.
         lost: share of the weight near surfaces.
     """
     box = mapped_box(ground.model)
     box = ViewBox(box.low.to(ground.mapped), box.high.to(ground.mapped))
+    places = ground.lesson.mapped
+    known = places, density_of(ground.model, places)
     scores: Tensor | None = None
     floor = 0.0
     for candidate in candidates:
@@ -162,7 +166,8 @@ def of_grids(
         assert candidate.resolution is not None
         for resolution in halvings(candidate.resolution, 0 if scores is None else len(scores)):
             coarser = scores if scores is not None and resolution == 2 * len(scores) else None
-            scores = filled(partial(density_of, ground.model), box, resolution, coarser, floor)
+            density = partial(density_of, ground.model)
+            scores = filled(density, box, resolution, coarser, floor, known=known)
             of_rays = looked_up(scores, box, ground.mapped)
             # cells that a tenth of the loss can spare are empty in finer grids too
             floor = threshold_losing(ground.held_out.worth, of_rays, 0.1 * lost)

@@ -1,15 +1,15 @@
 """Whether a fused kernel answers instead of its torch twin; the one place that imports kernels.
 
-They run where Triton and CUDA are. A kernel that is missing or fails is said once, in one line of
-the log, and the twin answers from then on.
+They run where Triton and CUDA are. A kernel that is missing, fails, or decides otherwise than its
+twin is said once, in one line of the log, and the twin answers from then on.
 """
 
 from __future__ import annotations
 
 import logging
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
-from typing import Any, TypeVar
+from contextlib import AbstractContextManager, contextmanager, nullcontext
+from typing import Any, NamedTuple, TypeVar
 from weakref import WeakKeyDictionary
 
 import torch
@@ -32,6 +32,13 @@ _log = logging.getLogger(__name__)
 WIDEST_MARCH = 128
 """Compiled, a march around a wider gate spills its registers; the twin asks the fused gate then."""
 
+CHECKED, MOST_OTHERWISE = 4096, 20
+"""Positions that a gate's kernel is tried on before it is trusted, and of how many it may decide
+otherwise than the twin; a steep gate turns single roundings into decisions."""
+NEAR_THRESHOLD = {True: 0.02, False: 2e-4}
+"""Distance of o(x) from the threshold within which a decision is not counted; by whether products
+are bfloat16."""
+
 Answer = TypeVar("Answer")
 PlanFn = Callable[[], Candidates]
 
@@ -43,8 +50,19 @@ class _Switch:
         self.off = False
 
 
+class _Packed(NamedTuple):
+    """The weights of an occupancy, and what they were packed from."""
+
+    state: tuple[Tensor, ...]
+    """Held, so that nothing else comes to lie at the same address."""
+    now: tuple[tuple[int, int], ...]
+    """Address and version of each."""
+    weights: GateWeights | None
+
+
 _switch = _Switch()
-_packed: WeakKeyDictionary[nn.Module, tuple[object, GateWeights | None]] = WeakKeyDictionary()
+_packed: WeakKeyDictionary[nn.Module, _Packed] = WeakKeyDictionary()
+_checked: WeakKeyDictionary[nn.Module, GateWeights] = WeakKeyDictionary()
 
 
 @contextmanager
@@ -71,7 +89,7 @@ def decisions(occupancy: nn.Module, positions: Tensor) -> Tensor | None:
     if not ready(positions.device) or positions.dtype != torch.float32:
         return None
     weights = weights_of(occupancy)
-    if weights is None:
+    if weights is None or not trusted(occupancy, weights):
         return None
 
     def ask() -> Tensor:
@@ -79,7 +97,35 @@ def decisions(occupancy: nn.Module, positions: Tensor) -> Tensor | None:
 
         return gate_decisions(weights, positions)
 
-    return tried("gate", ask)
+    return tried("gate", ask, positions.device)
+
+
+def trusted(occupancy: nn.Module, weights: GateWeights) -> bool:
+    """Whether the kernel decides as the twin with these weights; tried once, on random positions.
+
+    A kernel that does not is switched off, and the log says so.
+    """
+    if _checked.get(occupancy) is weights:
+        return True
+
+    def compare() -> bool:
+        from leco_plugin.samplers.gate_kernel import gate_decisions
+
+        centre, half_extent = weights.facts[:3], weights.facts[3]
+        unit = torch.rand(CHECKED, 3, generator=torch.Generator().manual_seed(0)) * 2.4 - 1.2
+        positions = centre + half_extent * unit.to(centre)
+        o, threshold = occupancy.query(positions), weights.facts[10]  # type: ignore[operator]
+        kept = gate_decisions(weights, positions)
+        far = (o - threshold).abs() > NEAR_THRESHOLD[weights.half]
+        wrong = int((far & (kept != (o >= threshold))).sum())
+        if wrong > MOST_OTHERWISE:
+            raise ValueError(f"it decides otherwise about {wrong} of {CHECKED} positions")
+        return True
+
+    if tried("gate", compare, weights.facts.device) is None:
+        return False
+    _checked[occupancy] = weights
+    return True
 
 
 def march(
@@ -101,7 +147,7 @@ def march(
     if cache is None or not ready(device) or not isinstance(occupancy, nn.Module):
         return None
     weights = weights_of(occupancy)
-    if weights is None or weights.padded_width > WIDEST_MARCH:
+    if weights is None or weights.padded_width > WIDEST_MARCH or not trusted(occupancy, weights):
         return None
     candidates = plan()
     if candidates.counts.dtype != torch.float32 or not growth_fits(candidates):
@@ -112,7 +158,7 @@ def march(
 
         return march_kept(cache, weights, candidates)
 
-    return tried("march", ask)
+    return tried("march", ask, device)
 
 
 def growth_fits(candidates: Candidates) -> bool:
@@ -121,10 +167,11 @@ def growth_fits(candidates: Candidates) -> bool:
     return cone_angle <= 0.0 or powers_needed(step_size, cone_angle) <= MOST_POWERS
 
 
-def tried(name: str, kernel: Callable[[], Answer]) -> Answer | None:
+def tried(name: str, kernel: Callable[[], Answer], device: torch.device) -> Answer | None:
     """What a kernel answers, or None after it failed, which the log says once."""
     try:
-        return kernel()
+        with on(device):
+            return kernel()
     except (torch.cuda.OutOfMemoryError, TooManyCandidates):
         raise
     except Exception as error:  # noqa: BLE001 - a compiler and its driver raise what they like
@@ -134,19 +181,25 @@ def tried(name: str, kernel: Callable[[], Answer]) -> Answer | None:
         return None
 
 
+def on(device: torch.device) -> AbstractContextManager[object]:
+    """Triton launches on the current device, wherever the tensors are."""
+    return torch.cuda.device(device) if device.type == "cuda" else nullcontext()
+
+
 def weights_of(occupancy: nn.Module) -> GateWeights | None:
     """The packed weights of an occupancy, packed anew when it has changed; None if none fit."""
     state = (*occupancy.parameters(), *occupancy.buffers())
     now = tuple((value.data_ptr(), _version(value)) for value in state)
     found = _packed.get(occupancy)
-    if found is None or found[0] != now:
+    if found is None or found.now != now:
         device = state[0].device if state else torch.device("cpu")
         reason = why_not(occupancy, _most_width(occupancy, device))
         if reason is not None and found is None:  # else it has been said
             _log.info("no fused gate: %s", reason)
-        found = now, gate_weights(occupancy) if reason is None else None
+        held = tuple(value.detach() for value in state)
+        found = _Packed(held, now, gate_weights(occupancy) if reason is None else None)
         _packed[occupancy] = found
-    return found[1]
+    return found.weights
 
 
 def _most_width(occupancy: Any, device: torch.device) -> int:

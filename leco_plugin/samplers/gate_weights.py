@@ -62,6 +62,8 @@ def why_not(occupancy: Any, most_width: int = MOST_WIDTH) -> str | None:
     config = getattr(getattr(occupancy, "gate", None), "config", None)
     if config is None or not hasattr(occupancy, "precision"):
         return "it has no gate of this package"
+    if occupancy.precision not in ("bfloat16", "float32"):
+        return f"its gate is asked in {occupancy.precision}"
     if config.encoding.kind != "frequency":
         return f"its gate is on {config.encoding.kind} features"
     for name, size, most in (

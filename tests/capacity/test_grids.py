@@ -52,5 +52,17 @@ def test_refining_finds_what_asking_every_cell_finds_with_fewer_questions() -> N
     assert asked[0] < 0.5 * 64 * 32**3
 
 
+def test_a_known_surface_is_never_missed_by_a_coarse_cell() -> None:
+    def film(mapped: Tensor) -> Tensor:
+        return ((mapped[:, 2] - 0.061).abs() < 1e-6).float()
+
+    seen = torch.tensor([[0.3, 0.3, 0.061], [0.3, 0.3, 0.7]])  # the second lies outside
+    known = seen, torch.tensor([1.0, 5.0])
+    scores = filled(film, BOX, 8, known=known)
+    assert float(looked_up(scores, BOX, seen[:1])) == 1.0
+    assert float(scores.sum()) == 1.0
+    assert float(filled(film, BOX, 8).sum()) == 0.0
+
+
 def test_memory_is_looked_at_before_a_grid_is_filled() -> None:
     assert fits_memory(8) and not fits_memory(1 << 15)

@@ -52,6 +52,35 @@ def test_without_points_there_are_no_answers() -> None:
     assert none.shape == (0, 8)
 
 
+@pytest.mark.parametrize("fault", ["odd sizes", "no rows"])
+def test_a_device_on_which_grouped_products_are_wrong_is_found_out(fault: str, monkeypatch) -> None:
+    right = torch.nn.functional.grouped_mm
+
+    class Wrong(torch.autograd.Function):
+        """Gradients of matrices without rows are whatever was in memory."""
+
+        @staticmethod
+        def forward(ctx, matrices):
+            return matrices.clone()
+
+        @staticmethod
+        def backward(ctx, gradients):
+            empty = (gradients == 0.0).all(dim=-1).all(dim=-1)
+            return torch.where(empty[:, None, None], 7.0, gradients)
+
+    def grouped_mm(rows, matrices, *, offs):
+        if fault == "no rows":
+            return right(rows, Wrong.apply(matrices), offs=offs)
+        return right(rows, matrices, offs=(offs + 7) // 8 * 8)
+
+    works_on.cache_clear()
+    assert works_on(torch.device("cpu"))
+    works_on.cache_clear()
+    monkeypatch.setattr(torch.nn.functional, "grouped_mm", grouped_mm)
+    assert not works_on(torch.device("cpu"))
+    works_on.cache_clear()
+
+
 def test_it_serves_bfloat16_on_cuda_only() -> None:
     assert works_on(torch.device("cpu"))
     assert not may_group(torch.zeros(2, 8, dtype=torch.bfloat16), 8)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 import subprocess
 import sys
+from types import SimpleNamespace
 
 import pytest
 import torch
@@ -55,12 +56,48 @@ def test_a_failing_kernel_is_said_once_and_its_twin_answers(monkeypatch, caplog)
     assert "\n" not in said[0]
 
 
+def test_a_kernel_that_decides_otherwise_is_never_believed(monkeypatch, caplog) -> None:
+    asked = Occupancy(Gate(GateConfig()), Space(), 0.0)
+    wrong = SimpleNamespace(gate_decisions=lambda weights, x: torch.zeros(len(x), dtype=bool))
+    monkeypatch.setattr(fused, "ready", lambda device: not fused._switch.off)
+    monkeypatch.setitem(sys.modules, "leco_plugin.samplers.gate_kernel", wrong)
+    with caplog.at_level(logging.WARNING):
+        assert asked.occupied(torch.rand(50, 3)).all()
+        assert asked.occupied(torch.rand(50, 3)).all()
+    said = [record.getMessage() for record in caplog.records]
+    assert len(said) == 1 and "decides otherwise about" in said[0]
+
+
+def test_a_kernel_is_compared_with_its_twin_once_for_each_gate(monkeypatch) -> None:
+    asked = Occupancy(Gate(GateConfig()), Space(), 0.5)
+    sizes: list[int] = []
+
+    def answer(weights: GateWeights, positions: torch.Tensor) -> torch.Tensor:
+        sizes.append(len(positions))
+        return asked.query(positions) >= asked.threshold_value
+
+    monkeypatch.setattr(fused, "ready", lambda device: not fused._switch.off)
+    kernel = SimpleNamespace(gate_decisions=answer)
+    monkeypatch.setitem(sys.modules, "leco_plugin.samplers.gate_kernel", kernel)
+    for _ in range(2):
+        asked.occupied(torch.rand(50, 3))
+    assert sizes == [fused.CHECKED, 50, 50]
+    asked.threshold_value.fill_(0.25)
+    asked.occupied(torch.rand(50, 3))
+    assert sizes[3:] == [fused.CHECKED, 50]
+
+
+def test_kernels_are_launched_where_their_tensors_are() -> None:
+    there = fused.on(torch.device("cuda", 1))
+    assert isinstance(there, torch.cuda.device) and there.idx == 1
+
+
 def test_rays_without_an_end_are_no_failure_of_a_kernel() -> None:
     def endless() -> None:
         raise TooManyCandidates("over 2^24 steps")
 
     with pytest.raises(ValueError, match="over 2"):
-        fused.tried("march", endless)
+        fused.tried("march", endless, torch.device("cpu"))
     assert not fused._switch.off
 
 
@@ -91,6 +128,11 @@ def test_gates_that_do_not_fit_are_named(sizes, reason: str) -> None:
     assert found is not None and reason in found
 
 
+def test_a_gate_in_float16_stays_with_torch() -> None:
+    occupancy = Occupancy(Gate(GateConfig()), Space(), 0.5, "float16")
+    assert why_not(occupancy) == "its gate is asked in float16"
+
+
 def test_what_is_no_occupancy_of_ours_stays_with_torch() -> None:
     assert why_not(object()) == "it has no gate of this package"
     assert fused.weights_of(torch.nn.Module()) is None
@@ -106,6 +148,15 @@ def test_weights_are_packed_anew_only_when_the_gate_changes() -> None:
     with torch.no_grad():
         occupancy.gate.head.bias.add_(1.0)
     assert fused.weights_of(occupancy) is not renewed
+
+
+def test_a_new_threshold_at_the_address_of_the_old_one_is_noticed() -> None:
+    occupancy = Occupancy(Gate(GateConfig()), Space(), 0.5)
+    for value in (0.125, 0.25, 0.375, 0.75):
+        del occupancy.threshold_value
+        occupancy.register_buffer("threshold_value", torch.tensor(value))
+        packed = fused.weights_of(occupancy)
+        assert packed is not None and float(packed.facts[10]) == value
 
 
 def logits_by_hand(weights: GateWeights, features: torch.Tensor) -> torch.Tensor:

@@ -1,13 +1,13 @@
-"""The suite on a real host: it trains, it is measured, and who skips a surface is found out."""
+"""One run of a case on real hosts, and who skips a surface in it."""
 
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import pytest
-import torch
 
 from leco_plugin.chart.contender import Contender
 from leco_plugin.chart.protocol import Protocol
@@ -28,8 +28,10 @@ pytestmark = [
     pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning"),
 ]
 
-MICRO = Sizes(steps=60, rays=128, learn_rays=64, learn_steps=20, dense_samples=24, table=11)
-SMALL = {**MICRO.ngp, "host.cone_angle": 1 / 12, "host.max_res": 64, "host.far_plane": 8.0}
+# where a host samples does not depend on what its field has learned
+MICRO = Sizes(steps=3, rays=64, learn_rays=64, learn_steps=20, dense_samples=24, table=8)
+# steps short enough that no surface lies between two middles and near neither
+SMALL = {**MICRO.ngp, "host.cone_angle": 1 / 20, "host.max_res": 32, "host.far_plane": 8.0}
 
 
 class SkipsHalf(DenseEstimator):
@@ -41,7 +43,7 @@ class SkipsHalf(DenseEstimator):
 
 @pytest.fixture(scope="module")
 def scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    capture = Capture(views=12, test_views=2, width=16, height=12)
+    capture = Capture(views=6, test_views=2, width=16, height=12)
     return write_scene(YARD, capture, tmp_path_factory.mktemp("stability") / "yard")
 
 
@@ -50,39 +52,47 @@ def run(contender: Contender, scene: Path, folder: Path) -> dict[str, Any]:
     protocol = Protocol(steps=MICRO.steps, images=1, curve_points=1)
     record = run_cell(contender, 0, scene, protocol, folder)
     assert (folder / "view.png").exists()
+    assert record["steps"] == MICRO.steps
     assert all(math.isfinite(value) for value in record["measured"].values() if value is not None)
     return record
 
 
-def on_small_host(sampler: str, options: dict[str, int]) -> Contender:
-    changes = {**SMALL, "occupancy.sampler": sampler, "occupancy.options": options}
-    settings = {"pipeline.datamanager.train_num_rays_per_batch": MICRO.rays}
-    return Contender(sampler, "leco-ngp", sampler, changes, settings=settings)
+def on_small_host(sampler: str) -> Contender:
+    base = contender_of(SAMPLERS["dense"], MICRO, {}, {})
+    return replace(base, sampler=sampler, changes={**base.changes, **SMALL, **sampled_by(sampler)})
 
 
-@pytest.mark.slow
-def test_who_skips_a_surface_is_found_out(
+def sampled_by(sampler: str) -> dict[str, Any]:
+    return {"occupancy.sampler": sampler, "occupancy.options": {"levels": DENSE_LEVELS}}
+
+
+def test_the_dense_reference_of_a_packed_host_loses_no_surface(scene: Path, tmp_path: Path) -> None:
+    measured = run(on_small_host("dense"), scene, tmp_path / "run")["measured"]
+    assert measured["kept_fraction"] == 1.0
+    assert measured["lost_mass"] < 0.01
+
+
+def test_a_packed_host_that_skips_half_of_the_scene_loses_its_surfaces(
     scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    spec = SamplerSpec("half", lambda aabb, occupancy=None, levels=1: SkipsHalf(box(aabb, levels)))
+    spec = SamplerSpec(
+        "half", lambda aabb, occupancy=None, levels=1: SkipsHalf(nested_boxes(aabb, levels)[-1])
+    )
     monkeypatch.setitem(registry.OURS, "skips-half", spec)
-    dense = run(on_small_host("dense", {"levels": DENSE_LEVELS}), scene, tmp_path / "dense")
-    blind = run(on_small_host("skips-half", {"levels": DENSE_LEVELS}), scene, tmp_path / "blind")
-    assert judge([dense], None).verdict == "pass"
-    assert dense["measured"]["kept_fraction"] == 1.0
-    # steps of a twelfth of the distance leave some surfaces between two middles
-    assert blind["measured"]["lost_mass"] > dense["measured"]["lost_mass"] + 0.15
-    assert judge([blind], [dense]).verdict == "fail"
+    measured = run(on_small_host("skips-half"), scene, tmp_path / "run")["measured"]
+    assert 0.1 < measured["kept_fraction"] < 0.9
+    assert measured["lost_mass"] > 0.2
+    # found out even where its pictures are as good as the reference's
+    blind = {"psnr": 25.0, "seed": 0, "measured": {**measured, "trivial_psnr": 12.0}}
+    dense = {**blind, "measured": {**blind["measured"], "lost_mass": 0.0, "detail_psnr": None}}
     assert judge([dense], [dense]).verdict == "pass"
-    assert blind["steps"] == dense["steps"] == MICRO.steps
+    assert judge([blind], [dense]).verdict == "fail"
 
 
-def box(aabb: torch.Tensor, levels: int) -> torch.Tensor:
-    return nested_boxes(aabb, levels)[-1]
-
-
-def test_the_dense_reference_of_a_proposal_host_trains(scene: Path, tmp_path: Path) -> None:
+def test_the_dense_reference_of_a_proposal_host_samples_everywhere(
+    scene: Path, tmp_path: Path
+) -> None:
     contender = contender_of(SAMPLERS["dense-proposal"], MICRO, {}, {})
     record = run(contender, scene, tmp_path / "run")
     assert record["measured"]["kept_fraction"] == 1.0
-    assert record["steps"] == MICRO.steps and record["train_queries"]["proposal"] == 0
+    assert record["train_queries"]["proposal"] == 0
