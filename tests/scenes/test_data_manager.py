@@ -128,6 +128,8 @@ def test_free_memory_is_the_smaller_of_machine_and_container(tmp_path: Path) -> 
     (tmp_path / "memory.max").write_text("100000\n")
     (tmp_path / "memory.current").write_text("40000\n")
     assert free_memory(machine, tmp_path) == 60000
+    (tmp_path / "memory.stat").write_text("anon 9\nactive_file 5000\ninactive_file 20000\n")
+    assert free_memory(machine, tmp_path) == 85000  # of the cache, the system makes room
     (tmp_path / "memory.max").write_text("max\n")
     assert free_memory(machine, tmp_path) == 500 * 1024
     assert free_memory(tmp_path / "none", tmp_path / "none") is None
