@@ -29,6 +29,7 @@ from leco_plugin.models.phases import (
     ScheduleConfig,
     converged,
     decisions_agree,
+    is_unsettled,
     ramp,
 )
 from leco_plugin.models.prior import warm_start
@@ -194,6 +195,9 @@ class Lifecycle:
             return
         if not last and float(kept.float().mean()) > 0.95:
             return  # it agrees with itself only because it has not yet found anything empty
+        if last and is_unsettled(step, agreement, schedule, progress.extensions):
+            self._learn_on(step, agreement)
+            return
         if converged(step, agreement, schedule):
             say(
                 f"step {step}: {agreement:.1%} of {len(kept)} decisions are those of "
@@ -208,6 +212,15 @@ class Lifecycle:
             if schedule.restart:
                 self._restart_field()
             self.save(step)  # a run killed from now on stays frozen
+
+    def _learn_on(self, step: int, agreement: float) -> None:
+        progress = self.progress
+        progress.extensions += 1
+        progress.learn_steps = step + 1 + max(1, progress.configured // 4)
+        say(
+            f"step {step}: only {agreement:.1%} of the gate's decisions are those of the last "
+            f"check; it learns on until step {progress.learn_steps}"
+        )
 
     def save(self, step: int) -> None:
         """A checkpoint, where the run saves any."""

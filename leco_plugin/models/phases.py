@@ -23,7 +23,10 @@ class ScheduleConfig:
     """Whether the field starts anew when the gate is frozen, for comparison; else it goes on from
     what it has learned."""
     learn_steps: int = 200
-    """Steps after which the gate is frozen even if its decisions still change."""
+    """Steps after which the gate is frozen even if a few of its decisions still change."""
+    settled: float = 0.92
+    """Share of probe positions whose decision must be the same in the last two checks; else the
+    gate learns on for a quarter of `learn_steps`, at most twice."""
     earliest: float = 0.85
     """Share of `learn_steps` before which it is never frozen."""
     ramp_from: float = 0.3
@@ -59,6 +62,21 @@ def converged(step: int, agreement: float, config: ScheduleConfig) -> bool:
     if step + 1 >= config.learn_steps:
         return True
     return step + 1 >= config.earliest * config.learn_steps and agreement >= config.agreement
+
+
+MOST_EXTENSIONS = 2
+
+
+def is_unsettled(step: int, agreement: float, config: ScheduleConfig, extensions: int) -> bool:
+    """Whether a gate at its step limit should learn on.
+
+    Args:
+        step: training step.
+        agreement: share of probe decisions equal to those of the check before.
+        extensions: how often it has learned on already.
+    """
+    looked_often = step + 1 >= 4 * config.steps_per_check
+    return looked_often and agreement < config.settled and extensions < MOST_EXTENSIONS
 
 
 def decisions_agree(before: Tensor, now: Tensor) -> float:

@@ -17,11 +17,13 @@ class Progress:
 
     learn_steps: int = 0
     """Steps after which the gate is frozen: those of the config, shortened for a short run and
-    lengthened by recoveries."""
+    lengthened by recoveries and extensions."""
     configured: int = 0
     """`ScheduleConfig.learn_steps` that they were made from; 0 before the first step."""
     learn_seconds: float = 0.0
     """Time spent in the first phase."""
+    extensions: int = 0
+    """How often a gate that had not settled has been given more steps."""
     recoveries: int = 0
     """How often a collapsed gate has been healed."""
     suspected_since: int = -1

@@ -119,3 +119,13 @@ def test_a_full_disk_costs_the_history_and_not_the_run(
     looking._record(3)
     assert looking.history.steps == [3]
     assert "could not be written" in " ".join(capsys.readouterr().out.split())
+
+
+def test_learning_on_takes_a_quarter_more_and_is_said(
+    looking: Lifecycle, capsys: pytest.CaptureFixture[str]
+) -> None:
+    looking.model.progress = Progress(learn_steps=173, configured=200)  # type: ignore[assignment]
+    looking._learn_on(172, 0.86)
+    assert looking.progress.learn_steps == 223 and looking.progress.extensions == 1
+    said = capsys.readouterr().out
+    assert "it learns" in said and "until step 223" in said

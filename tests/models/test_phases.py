@@ -14,6 +14,7 @@ from leco_plugin.models.phases import (
     converged,
     decisions_agree,
     find_collapse,
+    is_unsettled,
     ramp,
     reset_gate_head,
     spread_scene_experts,
@@ -42,6 +43,15 @@ def test_a_gate_is_frozen_when_its_decisions_have_settled_but_not_too_early() ->
 
 def test_a_gate_is_frozen_at_the_step_limit_whatever_it_decides() -> None:
     assert converged(999, 0.0, SCHEDULE)
+
+
+def test_a_gate_that_changes_its_mind_at_the_step_limit_learns_on_twice() -> None:
+    below = SCHEDULE.settled - 1e-3
+    assert [is_unsettled(999, below, SCHEDULE, times) for times in range(4)] == [
+        *(True, True, False, False)
+    ]
+    assert not is_unsettled(999, SCHEDULE.settled, SCHEDULE, 0)
+    assert not is_unsettled(4 * SCHEDULE.steps_per_check - 2, below, SCHEDULE, 0)  # a short run
 
 
 def test_agreement_is_the_share_of_equal_decisions() -> None:

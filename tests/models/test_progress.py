@@ -33,7 +33,7 @@ def test_a_run_resumed_with_another_schedule_takes_that_one() -> None:
 
 def test_progress_is_read_back_without_unsafe_loading() -> None:
     progress = Progress(
-        *(300, 200, 12.5, 2),
+        *(300, 200, 12.5, 1, 2),
         decisions=torch.tensor([True, False]),
         suspected_since=7,
         surface=(1.0, 2.0, 3.0),
