@@ -26,7 +26,10 @@ COPIED = (
     *("frame", "cameras"),
 )
 """What a smaller occupancy's report takes over from the original's."""
-BY_RENDERING = "the run's field, rendered as the original guides it"
+BY_RENDERING = (
+    "the run's field as it is now, rendered as the original guides it; of the field at the moment "
+    "of freezing it may lose more"
+)
 BY_DECISIONS = "the original's keep decisions, weighed by o(x): no rendering weights were at hand"
 
 
@@ -88,6 +91,11 @@ def _ground(source: Source, original: Occupancy) -> Ground:
         raise ValueError(
             "the occupancy keeps nothing on the rays of these photographs: they are of another "
             "scene, or it has been moved since"
+        )
+    if not bool(on_search.worth.any()) or not bool(on_verify.worth.any()):
+        raise ValueError(
+            "the run's field renders nothing where the occupancy keeps something, so that no loss "
+            "can be measured: it is of another run, or was hardly trained"
         )
     return Ground(
         original, source.model, taught, on_search, search_rendered, on_verify, verify_rendered

@@ -19,6 +19,7 @@ from leco_plugin.evaluation.inspection import describe
 from leco_plugin.models.encodings import EncodingConfig
 from leco_plugin.models.gate import GateConfig
 from leco_plugin.occupancy import Occupancy
+from leco_plugin.scenes.frames import frame_of
 from leco_plugin.shrink import command, search, sources
 from leco_plugin.shrink.command import compare_queries
 from leco_plugin.shrink.picture import draw
@@ -133,38 +134,48 @@ def test_the_speed_is_that_of_interleaved_pairs() -> None:
 
 
 @pytest.fixture(scope="module")
-def trained(tiny_scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Folder of a finished run of `leco-occupancy`, in sizes for a test."""
+def known_run(tiny_scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Folder of a run of `leco-occupancy`: its frozen gate is the ball, its field is opaque."""
     from leco_plugin.method_configs import leco_occupancy
 
     config: Any = copy.deepcopy(leco_occupancy.config)
     config.output_dir = tmp_path_factory.mktemp("outputs")
     config.experiment_name, config.timestamp, config.vis = "tiny", "run", "tensorboard"
     config.logging.local_writer.enable = False
-    config.max_num_iterations = 120
-    config.steps_per_eval_image = config.steps_per_eval_batch = 0
     config.data = config.pipeline.datamanager.data = tiny_scene
-    config.pipeline.datamanager.train_num_rays_per_batch = 512
+    config.pipeline.datamanager.train_num_rays_per_batch = 64
     sizes = config.pipeline.model.sizes
-    gate = GateConfig(EncodingConfig(octaves=3), 32, 2, 2)
-    field = replace(sizes.field, encoding=replace(sizes.field.encoding, log2_table=12))
+    gate = ball_of_the_tiny_scene().gate.config
+    field = replace(sizes.field, encoding=replace(sizes.field.encoding, log2_table=8))
     config.pipeline.model.sizes = replace(sizes, gate=gate, field=field, candidates=64)
     config.save_config()
     trainer = config.setup(local_rank=0, world_size=1)
     trainer.setup()
-    trainer.train()
+    model, frame = trainer.pipeline.model, frame_of(trainer.pipeline.datamanager)
+    assert frame is not None
+    known = ball_of_the_tiny_scene(frame)
+    model.gate.load_state_dict(known.gate.state_dict())
+    model.space.load_state_dict(known.space.state_dict())
+    model.threshold.fill_(known.threshold)
+    model.frozen.fill_(True)
+    with torch.no_grad():
+        model.field.density_head.bias.fill_(6.0)
+    near, far, step_size, cone_angle = MARCH.values()
+    model.march_range.copy_(torch.tensor([near, far, step_size, step_size, cone_angle, cone_angle]))
+    model.report = MARCH | {"lost_surface_mass": 1e-4}
+    model.occupancy().save(trainer.base_dir / "occupancy.safetensors")
+    trainer.save_checkpoint(0)
     return Path(trainer.base_dir)
 
 
-@pytest.mark.slow
 def test_the_model_of_the_run_says_what_is_lost(
-    trained: Path, tiny_scene: Path, tmp_path: Path
+    known_run: Path, tiny_scene: Path, tmp_path: Path
 ) -> None:
     out, report = tmp_path / "small.safetensors", tmp_path / "small.json"
     bounds = ["--lost-surface-mass", 0.05, "--image-price", 0.5, "--json", report]
-    original = Occupancy.load(trained / "occupancy.safetensors")
+    original = Occupancy.load(known_run / "occupancy.safetensors")
     assert original.threshold > 0.0
-    file = trained / "occupancy.safetensors"
+    file = known_run / "occupancy.safetensors"
     assert run("shrink", file, "--data", tiny_scene, "--out", out, *bounds) == 0
     results, smaller = json.loads(report.read_text()), Occupancy.load(out)
     assert results["to"]["loss_measured_against"] == command.BY_RENDERING
@@ -178,15 +189,24 @@ def test_the_model_of_the_run_says_what_is_lost(
     assert lost <= smaller.report["lost_surface_mass"]
 
 
-@pytest.mark.slow
+def test_a_field_that_renders_nothing_is_no_reference(known_run: Path, tiny_scene: Path) -> None:
+    file = known_run / "occupancy.safetensors"
+    source = sources.find_source(file, tiny_scene)
+    assert source.model is not None
+    with torch.no_grad():
+        source.model.field.density_head.bias.fill_(-50.0)
+    with pytest.raises(ValueError, match="renders nothing"):
+        command._ground(source, Occupancy.load(file))
+
+
 def test_a_run_whose_model_does_not_fit_is_refused_in_one_line(
-    trained: Path, tiny_scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    known_run: Path, tiny_scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     broken = tmp_path / "run"
-    shutil.copytree(trained, broken)
+    shutil.copytree(known_run, broken)
     config = (broken / "config.yml").read_text()
-    assert "log2_table: 12" in config
-    (broken / "config.yml").write_text(config.replace("log2_table: 12", "log2_table: 11"))
+    assert "log2_table: 8" in config
+    (broken / "config.yml").write_text(config.replace("log2_table: 8", "log2_table: 7"))
     arguments = ["--data", tiny_scene, "--out", tmp_path / "out"]
     assert run("shrink", broken / "occupancy.safetensors", *arguments) == 2
     said = capsys.readouterr().err
