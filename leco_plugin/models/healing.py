@@ -72,8 +72,10 @@ def heal(head: nn.Linear, progress: Progress, collapse: Collapse, shares: Tensor
     reset_gate_head(head)
     progress.pull *= 1.0 / EASED if collapse.kind == "empty" else EASED
     progress.healed_at = step
-    progress.dense_until = step + 1 + progress.learn_steps // 4
-    progress.learn_steps = step + 1 + progress.learn_steps // 2
+    # of a gate that was re-opened late, the steps are counted from the run's first
+    phase = min(progress.learn_steps, progress.configured or progress.learn_steps)
+    progress.dense_until = step + 1 + phase // 4
+    progress.learn_steps = step + 1 + phase // 2
     progress.decisions = torch.zeros(0, dtype=torch.bool)
     return (
         f"its last layer starts anew, on dense samples to step {progress.dense_until}, then with "

@@ -170,3 +170,9 @@ def test_points_of_one_expert_are_shared_out_and_the_balance_counts_more() -> No
 
 def test_a_run_that_was_never_healed_is_taught_as_configured() -> None:
     assert annealed(GateLossConfig(), Progress(), 0) == GateLossConfig()
+
+
+def test_a_gate_that_was_opened_again_late_is_healed_as_quickly_as_an_early_one() -> None:
+    progress, head = Progress(learn_steps=20_000, configured=200), head_of([0.0, 0.0, 0.0])
+    heal(head, progress, Collapse("the gate calls all space empty"), torch.ones(3) / 3, 19_000)
+    assert (progress.learn_steps, progress.dense_until) == (19_101, 19_051)
