@@ -57,6 +57,7 @@ def model(monkeypatch: pytest.MonkeyPatch) -> LecoModel:
         candidates=64,
     )
     config = LecoModelConfig(sizes=sizes, calibration=CalibrationConfig(rays_at_once=32))
+    torch.manual_seed(0)
     made = LecoModel(config, scene_box=None, num_train_data=1)  # type: ignore[arg-type]
     made.set_bounds(BOUNDS, 1.0)
 
