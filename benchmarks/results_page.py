@@ -137,11 +137,11 @@ def page() -> str:
         parts += section(title, "leco demo", report, demo_table(report))
     for name in titles():
         parts += chart_section(RESULTS / "charts" / f"{name}.json")
-    sampling = RESULTS / "sampling.json"
-    if sampling.exists():
+    for sampling in sorted(RESULTS.glob("sampling*.json")):
         report = json.loads(sampling.read_text())
         command, note = "python benchmarks/sampling.py", " Ratios within one run."
-        parts += section("Sampling", command, report, sampling_table(report), note)
+        title = f"Sampling: {report['machine']['processor']}"
+        parts += section(title, command, report, sampling_table(report), note)
     for path in sorted(RESULTS.glob("gpu-*.json")):
         report = json.loads(path.read_text())
         title, command = f"On a GPU: {report['machine']['device']}", "python benchmarks/gpu.py"

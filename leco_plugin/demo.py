@@ -185,7 +185,7 @@ def _draw_picture(trainer: Trainer, occupancy: Occupancy, truth: CityTruth, path
     _draw_city_slice(axes[3], occupancy, truth)
     for panel in axes:
         panel.set(xticks=[], yticks=[], xlabel="", ylabel="")
-    figure.savefig(path, dpi=110)
+    figure.savefig(path, dpi=110, bbox_inches="tight")
 
 
 def _draw_city_slice(axes: Any, occupancy: Occupancy, truth: CityTruth) -> None:
