@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import json
 import math
-import os
 from pathlib import Path
 from typing import Any
+
+from leco_plugin.scenes.whole_files import write_whole
 
 
 def write_json(path: Path, value: Any) -> None:
@@ -17,13 +18,7 @@ def write_json(path: Path, value: Any) -> None:
         OSError: nothing can be written there.
     """
     text = json.dumps(value, indent=2, allow_nan=False) + "\n"
-    path.parent.mkdir(parents=True, exist_ok=True)
-    unfinished = path.with_name(f".{path.name}.{os.getpid()}.unfinished")
-    try:
-        unfinished.write_text(text)
-        unfinished.replace(path)
-    finally:
-        unfinished.unlink(missing_ok=True)
+    write_whole(path, lambda file: file.write(text.encode()))
 
 
 def finite_or_null(values: dict[str, Any]) -> dict[str, Any]:

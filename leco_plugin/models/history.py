@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -13,6 +12,7 @@ from torch import Tensor
 
 from leco_plugin.models.gate import Gate
 from leco_plugin.models.losses import expert_shares
+from leco_plugin.scenes.whole_files import write_whole
 
 FILE_NAME = "occupancy_history.safetensors"
 FORMAT = "leco_plugin.history"
@@ -69,14 +69,9 @@ class GateHistory:
         }
         for name in self.weights[0]:
             tensors[f"gate.{name}"] = torch.stack([state[name] for state in self.weights])
-        folder.mkdir(parents=True, exist_ok=True)
         path = folder / FILE_NAME
-        unfinished = path.with_name(f".{path.name}.{os.getpid()}.unfinished")
-        try:
-            unfinished.write_bytes(save(tensors, metadata={"format": FORMAT}))
-            unfinished.replace(path)
-        finally:
-            unfinished.unlink(missing_ok=True)
+        content = save(tensors, metadata={"format": FORMAT})
+        write_whole(path, lambda file: file.write(content))
         return path
 
     @classmethod
