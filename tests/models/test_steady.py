@@ -1,4 +1,4 @@
-"""Under autocast on a CPU numbers of rows come from a short list, and answers stay what they are."""
+"""Under autocast on a CPU numbers of rows are few, and answers stay what they are."""
 
 from __future__ import annotations
 
