@@ -26,6 +26,9 @@ BRICK = 4
 COARSE_EMPTY, COARSE_OCCUPIED = -1, -2
 """Values of the coarse table beside the numbers of bricks, which are >= 0."""
 
+UNIFORM = 2
+"""Bricks that stand for such a coarse cell when fine cells are looked up, in the order of its value."""
+
 FINE_EMPTY, FINE_OCCUPIED = 64, 65
 """Values of the fine table beside the numbers of planes within a brick, 0 to 63."""
 
@@ -93,8 +96,8 @@ class Tables(NamedTuple):
     """Plane a + b.u over a fine cell, u in [-1, 1]^3, and the height |a + b.u| up to which it does
     not decide, in one unit; int8 [5, n_planes], a column contiguous because each is read alone."""
     clearance: Tensor
-    """Whole empty half coarse cells around each half coarse cell (maximum norm), up to 15; two to
-    a byte, uint8 [4 resolution^3], flat."""
+    """How many half coarse cells are empty from each one on in every direction (maximum norm), itself
+    included, up to 15; two to a byte, uint8 [4 resolution^3], flat."""
 
     @property
     def bytes(self) -> int:
@@ -116,7 +119,7 @@ class CellCache(nn.Module):
     """
 
     coarse: Tensor
-    fine: Tensor
+    judged: Tensor
     first_plane: Tensor
     planes: Tensor
     clearance: Tensor
@@ -139,8 +142,14 @@ class CellCache(nn.Module):
         else:
             self._map = space.map
         center, half_extent = space.center.detach().clone(), space.half_extent.detach().clone()
+        uniform = torch.tensor([[FINE_OCCUPIED], [FINE_EMPTY]], dtype=torch.uint8)
+        uniform = uniform.to(tables.fine.device).expand(UNIFORM, BRICK**3)
         derived = {
-            **tables._asdict(),
+            "coarse": tables.coarse,
+            "judged": torch.cat([uniform, tables.fine]),
+            "first_plane": tables.first_plane,
+            "planes": tables.planes,
+            "clearance": tables.clearance,
             "scale": scale.float().view(1, 1),
             "shift": shift.float().view(3, 1),
             "center": center.view(3, 1),
@@ -162,7 +171,9 @@ class CellCache(nn.Module):
 
     def tables(self) -> Tables:
         """The tables, where they are now."""
-        return Tables(self.coarse, self.fine, self.first_plane, self.planes, self.clearance)
+        return Tables(
+            self.coarse, self.judged[UNIFORM:], self.first_plane, self.planes, self.clearance
+        )
 
     def decide(self, positions: Tensor) -> tuple[Tensor, Tensor]:
         """Decisions as far as cells know them.
@@ -174,53 +185,47 @@ class CellCache(nn.Module):
             occupied bool [N], False where open; and the indices of positions that are left open,
             int64 [n_open]: the gate's to answer.
         """
-        cells = self._cells(positions)
-        corners = cells.floor()
-        known = self.coarse.index_select(0, _flat(corners, self.resolution + 2))
-        occupied = known == COARSE_OCCUPIED
-        refer = (known >= 0).nonzero()[:, 0]
-        if refer.numel() == 0:
-            return occupied, refer
-
-        brick = known.index_select(0, refer).to(torch.int32)
-        within = cells.index_select(1, refer).sub_(corners.index_select(1, refer)).mul_(BRICK)
-        corners = within.floor()
-        at = torch.add(_flat(corners, BRICK), brick, alpha=BRICK**3)
-        known = self.fine.view(-1).index_select(0, at)
-        occupied.index_put_((refer,), known == FINE_OCCUPIED)
+        cells = self._cells(positions).mul_(BRICK)
+        corners = cells.to(torch.int32)
+        coarse = _flat(corners >> 2, self.resolution + 2)
+        brick = self.coarse.index_select(0, coarse).to(torch.int32)
+        at = torch.add(_flat(corners.bitwise_and_(3), BRICK), brick, alpha=BRICK**3)
+        known = self.judged.view(-1).index_select(0, at.add_(UNIFORM * BRICK**3))
+        occupied = known == FINE_OCCUPIED
         chosen = (known < FINE_EMPTY).nonzero()[:, 0]
         if chosen.numel() == 0:
             return occupied, chosen
 
-        refer, brick = refer.index_select(0, chosen), brick.index_select(0, chosen)
-        within = within.index_select(1, chosen).sub_(corners.index_select(1, chosen))
-        plane = self.first_plane.index_select(0, brick).add_(known.index_select(0, chosen))
-        offset, *slopes, error = (row.index_select(0, plane).float() for row in self.planes)
-        for slope, along in zip(slopes, within.mul_(2.0).sub_(1.0), strict=True):
+        plane = self.first_plane.index_select(0, brick.index_select(0, chosen))
+        plane = self.planes.index_select(1, plane.add_(known.index_select(0, chosen))).float()
+        offset, *slopes, error = plane
+        within = cells.index_select(1, chosen).frac_().mul_(2.0).sub_(1.0)
+        for slope, along in zip(slopes, within, strict=True):
             offset.addcmul_(slope, along)
-        occupied.index_put_((refer,), offset > 0.0)
-        return occupied, refer.index_select(0, (offset.abs_() <= error).nonzero()[:, 0])
+        occupied.index_put_((chosen,), offset > 0.0)
+        return occupied, chosen.index_select(0, (offset.abs_() <= error).nonzero()[:, 0])
 
     def near(self, positions: Tensor, radii: Tensor) -> Tensor:
         """Whether anything within `radii` of `positions` may be occupied (the coarse question).
 
         Args:
             positions: world units, [N, 3].
-            radii: world units, [N].
+            radii: half widths of cubes around them, world units, [N].
 
         Returns:
             bool [N]; False is certain as far as the cells are.
         """
-        halves = self._cells(positions).sub_(1.0).mul_(2.0).floor_()
+        halves = self._cells(positions).sub_(1.0).mul_(2.0)
         width = 2 * self.resolution
-        inside = ((halves >= 0.0) & (halves < width)).all(dim=0)
-        index = _flat(halves.clamp_(0.0, width - 1.0), width)
+        inner = halves.clamp(0.0, width - 1.0).floor_()
+        index = _flat(inner, width).to(torch.int32)
+        # From the middle of the cell that answers, in cells: over 1/2 outside the cube.
+        aside = halves.sub_(inner).sub_(0.5).abs_().amax(dim=0)
         pair = self.clearance.index_select(0, index >> 1)
-        clear = (pair >> ((index & 1) << 2).to(torch.uint8)) & 15
-        # The ball's centre lies anywhere in its cell, so it reaches past `clear` whole cells only
-        # when it is wider than they are.
-        reach = radii * self._stretch(positions, radii) * 2.0
-        return (reach >= clear).logical_or_(inside.logical_not_())
+        clear = pair.bitwise_right_shift_((index & 1).mul_(4).to(torch.uint8)).bitwise_and_(15)
+        # The cell itself is the first of the empty ones that are counted.
+        reach = (radii * self._stretch(positions, radii)).mul_(2.0)
+        return reach.add_(aside).add_(0.5) >= clear
 
     def _stretch(self, positions: Tensor, radii: Tensor) -> Tensor:
         """Bound on cells per world unit (maximum norm) within the balls.
@@ -245,4 +250,4 @@ class CellCache(nn.Module):
 def _flat(corners: Tensor, width: int) -> Tensor:
     """Index of cells [3, N] in a flat table; whole floats are exact up to a width of 256."""
     index = torch.add(corners[1], corners[0], alpha=width)
-    return torch.add(corners[2], index, alpha=width).to(torch.int32)
+    return torch.add(corners[2], index, alpha=width)

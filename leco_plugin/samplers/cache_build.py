@@ -37,12 +37,12 @@ from leco_plugin.samplers.cache_cells import (
     judge_fine,
 )
 
-RESOLUTIONS = range(8, 65, 2)
+RESOLUTIONS = range(8, 65)
 """Coarse cells along the cube that are considered."""
 PROBE = 16
 """Coarse cells along the cube at which the gate is looked at first."""
 MARGINS = (0.1, 0.5, 2.0)
-CAUTIONS = (0.8, 1.0, 1.2, 1.4, 1.7, 2.0, 2.5, 3.0, 5.0, math.inf)
+CAUTIONS = (*(0.6 * 1.1**step for step in range(20)), 5.0, math.inf)
 """What is tried, in this order; see `CacheReport`."""
 ROUGH = 0.6
 """Share of the probe's cells that the gate's boundary may cross: beyond, cells know too little."""

@@ -1,7 +1,8 @@
 """How cells are judged by a frozen gate: from its logits at their corners, centres and within.
 
 A cell is called empty or occupied when all logits seen in it lie on one side of the threshold by
-a margin proportional to their spread. A fine cell that is neither gets a plane.
+a margin proportional to their spread; fine ones that are close to it are looked at in more places.
+A fine cell that is neither gets a plane.
 """
 
 from __future__ import annotations
@@ -23,6 +24,8 @@ POINTS_AT_ONCE = 1 << 17
 """Positions that the gate is asked about in one call."""
 TRIALS = 24
 """Random points of a cell to which its plane is fitted, and which show where it errs."""
+CLOSE = 0.5
+"""Margin within which a fine cell that seems empty or occupied is tried at such points as well."""
 
 
 def judge_coarse(occupancy: OccupancyLike, resolution: int, margin: float) -> tuple[Tensor, Tensor]:
@@ -84,9 +87,26 @@ def judge_fine(
     eight = corners.unfold(0, 2, 1).unfold(1, 2, 1).unfold(2, 2, 1)
     x, y, z = (cells[:, None, :] * BRICK + within).unbind(-1)
     values = torch.cat([eight[x, y, z].flatten(2), centres], dim=-1)
-    states = _judge(values.amin(dim=-1), values.amax(dim=-1), margin)
+    low, high = values.amin(dim=-1), values.amax(dim=-1)
+    states = _judge(low, high, margin)
+    close = (states != MIXED) & (_judge(low, high, max(margin, CLOSE)) == MIXED)
+    tried = logits_above(occupancy, _random_points(places[close], size)[0])
+    differs = (tried.view(-1, TRIALS) >= 0.0) != (states[close] == OCCUPIED)[:, None]
+    states[close] = states[close].masked_fill(differs.any(dim=1), MIXED)
     mixed = states == MIXED
     return states, values[mixed], places[mixed]
+
+
+def _random_points(places: Tensor, size: float) -> tuple[Tensor, Tensor]:
+    """Random points of cells with these lowest corners [m, 3], the same ones for the same m.
+
+    Returns:
+        mapped positions [m TRIALS, 3], and where in their cells they lie, in [0, 1), of that shape
+        but for [m, TRIALS, 3].
+    """
+    generator = torch.Generator(places.device).manual_seed(len(places))
+    random = torch.rand(len(places), TRIALS, 3, device=places.device, generator=generator)
+    return (places[:, None, :] + random * size).view(-1, 3), random
 
 
 def fit_planes(
@@ -101,13 +121,10 @@ def fit_planes(
 
     Returns:
         planes (a, b) in units of which the largest is 127, [m, 4], and doubts in these units [m]:
-        the height at which points of the cell show an error, and half the spread of residuals.
-        Few cells bend sharply; only there the two differ much.
+        the largest residual in the cell, where those far from the threshold count for less.
     """
     device = values.device
-    generator = torch.Generator(device).manual_seed(len(values))
-    random = torch.rand(len(values), TRIALS, 3, device=device, generator=generator)
-    mapped = (places[:, None, :] + random * size).reshape(-1, 3)
+    mapped, random = _random_points(places, size)
     values = torch.cat([values, logits_above(occupancy, mapped).view(len(values), TRIALS)], dim=1)
     nine = torch.cat([_lattice(1, device), torch.zeros(1, 3, device=device)])
     units = torch.cat([nine.expand(len(values), 9, 3), random * 2.0 - 1.0], dim=1)
@@ -122,10 +139,8 @@ def fit_planes(
     unit = planes.abs().amax(dim=1, keepdim=True).clamp(min=1e-6) / 127.0
     planes = (planes / unit).round()
 
-    heights = (design @ planes[:, :, None])[..., 0]
-    spread = (heights - values / unit).square().mean(dim=1).sqrt()
-    wrong = (heights > 0.0) != (values >= 0.0)
-    return planes, (heights.abs() * wrong).amax(dim=1) + 0.5 * spread
+    residuals = (design @ planes[:, :, None])[..., 0] - values / unit
+    return planes, (weights * residuals.abs()).amax(dim=1)
 
 
 def clearance_of(states: Tensor, mixed: Tensor, fine_states: Tensor) -> Tensor:

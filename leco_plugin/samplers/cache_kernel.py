@@ -45,19 +45,16 @@ def cells_near(
     RESOLUTION: tl.constexpr,
     CONTRACTED: tl.constexpr,
 ):
-    """`CellCache.near` of one ball."""
+    """`CellCache.near` of one cube."""
     u, v, w = _cells(x, y, z, facts, frame, RESOLUTION, CONTRACTED)
-    u = tl.floor((u - 1.0) * 2.0)
-    v = tl.floor((v - 1.0) * 2.0)
-    w = tl.floor((w - 1.0) * 2.0)
+    u, v, w = (u - 1.0) * 2.0, (v - 1.0) * 2.0, (w - 1.0) * 2.0
     width: tl.constexpr = 2 * RESOLUTION
-    lowest = tl.minimum(tl.minimum(u, v), w)
-    outside = (lowest < 0.0) | (tl.maximum(tl.maximum(u, v), w) >= width)
     last = width - 1.0
-    u = tl.minimum(tl.maximum(u, 0.0), last).to(tl.int32)
-    v = tl.minimum(tl.maximum(v, 0.0), last).to(tl.int32)
-    w = tl.minimum(tl.maximum(w, 0.0), last).to(tl.int32)
-    index = (u * width + v) * width + w
+    i = tl.floor(tl.minimum(tl.maximum(u, 0.0), last))
+    j = tl.floor(tl.minimum(tl.maximum(v, 0.0), last))
+    k = tl.floor(tl.minimum(tl.maximum(w, 0.0), last))
+    aside = largest_of(u - i - 0.5, v - j - 0.5, w - k - 0.5)
+    index = (i.to(tl.int32) * width + j.to(tl.int32)) * width + k.to(tl.int32)
     pair = tl.load(clearance + (index >> 1)).to(tl.int32)
     clear = (pair >> ((index & 1) * 4)) & 15
     stretch = tl.load(frame)
@@ -66,7 +63,7 @@ def cells_near(
         distance = largest_of(x - tl.load(facts), y - tl.load(facts + 1), z - tl.load(facts + 2))
         inner = tl.maximum((distance - radius) / half_extent, 1.5)
         stretch = stretch * (0.5 / half_extent) * (4.0 * inner - 3.0) / (inner * inner)
-    return (radius * stretch * 2.0 >= clear) | outside
+    return radius * stretch * 2.0 + (aside + 0.5) >= clear
 
 
 @triton.jit

@@ -1,7 +1,7 @@
 """The powers by which a step grows with distance, once for all rays.
 
 Behind its linear part, edge k of a ray is `t_switch` times a power that depends on a whole number
-only. A kernel that reads these powers has the edges of `marching.candidate_edges` to the last bit,
+only. A kernel that reads these powers has the edges of `edges.candidate_edges` to the last bit,
 whatever its own exponential would answer.
 """
 

@@ -16,16 +16,11 @@ from torch import Tensor
 
 from leco_plugin.samplers.cache import CellCache
 from leco_plugin.samplers.cache_kernel import cells_decide, cells_near
+from leco_plugin.samplers.edges import MAX_CANDIDATES_PER_RAY, switch
 from leco_plugin.samplers.gate_kernel import gate_keeps, sizes_of
 from leco_plugin.samplers.gate_weights import GateWeights
 from leco_plugin.samplers.growth import growth_table
-from leco_plugin.samplers.marching import (
-    MAX_CANDIDATES_PER_RAY,
-    Candidates,
-    Samples,
-    check_longest,
-    switch,
-)
+from leco_plugin.samplers.marching import Candidates, Samples, check_longest
 
 STEPS = 32
 """Candidates that a program works on at once: one coarse question for all of them, and the gate's
@@ -36,7 +31,7 @@ _MOST = tl.constexpr(MAX_CANDIDATES_PER_RAY)
 
 @triton.jit
 def _edge(step, t_min, step_size, n_linear, t_switch, growth, CONED: tl.constexpr):
-    """`marching.candidate_edges`, with the powers of the growing step from a table."""
+    """`edges.candidate_edges`, with the powers of the growing step from a table."""
     linear = tl.fma(step, step_size, t_min)
     if CONED:
         power = tl.load(growth + tl.maximum(step - n_linear, 0.0).to(tl.int32))

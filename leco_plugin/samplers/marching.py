@@ -2,39 +2,37 @@
 
 The rule is that of nerfacc's `traverse_grids`: intervals of length dt(t) = max(t cone_angle,
 step_size) follow one another from t_min, and an interval is a candidate while its midpoint lies in
-front of t_max; its midpoint is the position that is asked. Edge k has a closed form (linear while
-the step is constant, geometric after), so no candidate depends on the decision for another, none
-needs to be stored, and neighbours share their edge exactly.
+front of t_max; its midpoint is the position that is asked. Edge k has a closed form (`edges.py`).
+Steps are the rows and rays the columns of everything here: what is broadcast, a ray's origin or a
+step's number, is then read in long rows, which a CPU does five times faster than in short ones.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
+from leco_plugin.samplers.edges import MAX_CANDIDATES_PER_RAY, candidate_counts, candidate_edges
 from leco_plugin.samplers.rays import check_rays, usable_rays
 
 OccupiedFn = Callable[[Tensor], Tensor]
 """Positions [N, 3] to bool [N]."""
 
 NearFn = Callable[[Tensor, Tensor], Tensor]
-"""Positions [N, 3] and radii [N] to bool [N]: may anything within the radius be occupied?"""
+"""Positions [N, 3] and radii [N] to bool [N]: may anything within the radius (maximum norm, a cube
+around the position) be occupied?"""
 
 Samples = tuple[Tensor, Tensor, Tensor]
 """ray_indices int64 [n_samples], t_starts [n_samples], t_ends [n_samples]."""
 
-MAX_CANDIDATES_PER_RAY = 1 << 24
-"""Above this a float32 cannot number the candidates of a ray; nobody means to march so far."""
-
 CPU_CHUNK = 1 << 19
 DEVICE_CHUNK = 1 << 22
-"""Candidates worked on at once: what fits the cache of a CPU core; elsewhere a training batch,
-because each chunk there waits for the device once."""
-
+"""Positions asked at once: what fits the cache of a CPU core; elsewhere a training batch, because
+each chunk there waits for the device once."""
 
 RUN = 16
 """Candidates of a run: long enough to work on at once, short enough to waste little."""
@@ -77,10 +75,17 @@ class Candidates(NamedTuple):
         return self._replace(first=self.first + first_step, counts=counts)
 
     def edges(self, n_steps: int) -> Tensor:
-        """t of the first `n_steps` + 1 edges of each ray, [n_rays, n_steps + 1]."""
-        steps = torch.arange(n_steps + 1, dtype=self.t_mins.dtype, device=self.t_mins.device)
-        steps = self.first[:, None] + steps
-        return candidate_edges(self.t_mins[:, None], steps, self.step_size, self.cone_angle)
+        """t of the first `n_steps` + 1 edges of each ray, [n_steps + 1, n_rays]."""
+        return self.edges_at(self.numbers(n_steps + 1))
+
+    def edges_at(self, numbers: Tensor) -> Tensor:
+        """t of the edges of these numbers [n], counted from the first candidate; [n, n_rays]."""
+        steps = self.first + numbers[:, None]
+        return candidate_edges(self.t_mins, steps, self.step_size, self.cone_angle)
+
+    def numbers(self, end: int, step: int = 1) -> Tensor:
+        """0, `step`, 2 `step` and so on, below `end`, of the type of t."""
+        return torch.arange(0, end, step, dtype=self.t_mins.dtype, device=self.t_mins.device)
 
 
 @torch.no_grad()
@@ -114,7 +119,7 @@ def march(
             answers False, `occupied` would deny them all. It changes the time, not the result.
         t_enters: leave out candidates whose midpoint lies in front of this, [n_rays]: where a ray
             enters a box, without moving the candidates inside it.
-        chunk_size: most candidates held at once (a run of 16 at least).
+        chunk_size: most positions asked at once (a run of 16 at least).
 
     Returns:
         ray_indices int64 [n_samples], t_starts [n_samples], t_ends [n_samples], sorted by ray,
@@ -129,17 +134,20 @@ def march(
     )
     if chunk_size is None:
         chunk_size = CPU_CHUNK if origins.device.type == "cpu" else DEVICE_CHUNK
-    rays_at_once = max(1, chunk_size // max(RUN, -(-longest // RUN) * RUN))  # in whole runs
-    steps_at_once = min(longest, max(RUN, chunk_size // RUN * RUN))
+    in_runs = near_occupied is not None or shortest < longest
+    runs_at_once = max(1, chunk_size // RUN)
     kept: list[Samples] = []
-    for first_ray in range(0, len(origins) if longest else 0, rays_at_once):
-        rays = candidates.of_rays(slice(first_ray, first_ray + rays_at_once))
-        for first_step in range(0, longest, steps_at_once):
-            n_steps = min(steps_at_once, longest - first_step)
-            tile = rays.window(first_step, n_steps) if n_steps < longest else rays
-            uniform = shortest >= first_step + n_steps
-            ray_indices, t_starts, t_ends = keep(tile, n_steps, uniform, occupied, near_occupied)
-            kept.append((ray_indices + first_ray, t_starts, t_ends))
+    for first_ray, tile, n_steps in tiles(candidates, longest, chunk_size * (RUN if in_runs else 1)):
+        if not in_runs:
+            parts = [keep_steps(tile, n_steps, None, occupied)]
+        else:
+            rays, runs = cut(tile, n_steps, near_occupied)
+            parts = [
+                keep_steps(runs.of_rays(part), RUN, rays[part], occupied)
+                for first_run in range(0, len(rays), runs_at_once)
+                for part in [slice(first_run, first_run + runs_at_once)]
+            ]
+        kept += [(rays + first_ray, t_starts, t_ends) for rays, t_starts, t_ends in parts]
     return join(kept, origins)
 
 
@@ -216,42 +224,68 @@ def check_longest(highest: int, n_rays: int, step_size: float) -> None:
         )
 
 
+def tiles(
+    candidates: Candidates, longest: int, at_once: int
+) -> Iterator[tuple[int, Candidates, int]]:
+    """Cut a batch into tiles of rays x steps, in the order of rays, then steps.
+
+    Args:
+        longest: most candidates of any ray.
+        at_once: most candidates of a tile, in whole runs.
+
+    Yields:
+        the first ray of a tile, its candidates, and the most of any of its rays.
+    """
+    rays_at_once = max(1, at_once // max(RUN, -(-longest // RUN) * RUN))
+    steps_at_once = min(longest, max(RUN, at_once // RUN * RUN))
+    for first_ray in range(0, len(candidates.counts) if longest else 0, rays_at_once):
+        rays = candidates.of_rays(slice(first_ray, first_ray + rays_at_once))
+        for first_step in range(0, longest, steps_at_once):
+            n_steps = min(steps_at_once, longest - first_step)
+            tile = rays.window(first_step, n_steps) if n_steps < longest else rays
+            yield first_ray, tile, n_steps
+
+
 def keep(
     candidates: Candidates,
     n_steps: int,
-    uniform: bool,
     occupied: OccupiedFn | None,
     near_occupied: NearFn | None = None,
 ) -> Samples:
-    """Pack those candidates that are occupied.
+    """Pack those candidates that are occupied; `n_steps` is the most of any ray."""
+    rays, runs = cut(candidates, n_steps, near_occupied)
+    return keep_steps(runs, RUN, rays, occupied)
+
+
+def keep_steps(
+    candidates: Candidates, n_steps: int, rays: Tensor | None, occupied: OccupiedFn | None
+) -> Samples:
+    """Pack those of the first `n_steps` candidates of each ray that are occupied.
 
     Args:
-        n_steps: most candidates of any ray.
-        uniform: all rays have that many. Otherwise, and for the coarse question, rays are cut into
-            runs of equal length, and `occupied` is also asked about the few steps by which a
-            ray's last run is too long: their answers are not used.
+        rays: what to call each ray, int64 [n_rays], where they are runs of rays. A ray's last run
+            can be too long by a few steps, about which `occupied` is asked too: their answers are
+            not used. None: each goes by its place, and all have `n_steps` candidates.
     """
-    runs, rays = candidates, None
-    if not uniform or near_occupied is not None:
-        rays, runs = cut(candidates, n_steps, near_occupied)
-        n_steps = RUN
-    edges = runs.edges(n_steps)
+    edges = candidates.edges(n_steps)
+    n_rays = edges.shape[1]
+    if rays is None and occupied is None:
+        every = torch.arange(n_rays, device=edges.device)[:, None].expand(n_rays, n_steps)
+        return every.reshape(-1), edges[:-1].T.reshape(-1), edges[1:].T.reshape(-1)
     wanted = None
     if rays is not None:
-        wanted = torch.arange(n_steps, device=edges.device) < runs.counts[:, None]
+        wanted = candidates.numbers(n_steps)[:, None] < candidates.counts
     if occupied is not None:
-        midpoints = (edges[:, :-1] + edges[:, 1:]).mul_(0.5)
-        origins, directions = runs.coordinates[..., None]
+        midpoints = (edges[:-1] + edges[1:]).mul_(0.5)
+        origins, directions = candidates.coordinates[:, :, None]
         answers = occupied(torch.addcmul(origins, directions, midpoints).view(3, -1).T)
-        wanted = answers if wanted is None else wanted.view(-1).logical_and_(answers)
-    if wanted is None:
-        wanted = edges.new_ones(len(edges) * n_steps, dtype=torch.bool)
-    chosen = wanted.view(-1).nonzero()[:, 0]
-    run_indices = chosen.div(n_steps, rounding_mode="floor")
-    at = chosen + run_indices  # a row of edges is one longer than a row of candidates
+        answers = answers.view(n_steps, n_rays)
+        wanted = answers if wanted is None else wanted.bitwise_and_(answers)
+    columns, steps = _by_column(wanted)
+    at = steps * n_rays + columns
     edges = edges.view(-1)
-    ray_indices = run_indices if rays is None else rays.index_select(0, run_indices)
-    return ray_indices, edges.index_select(0, at), edges.index_select(0, at + 1)
+    ray_indices = columns if rays is None else rays.index_select(0, columns)
+    return ray_indices, edges.index_select(0, at), edges.index_select(0, at + n_rays)
 
 
 def cut(
@@ -262,22 +296,27 @@ def cut(
     Returns:
         ray of each run, int64 [n_runs], and the runs as if each were a ray.
     """
-    t_mins, device = candidates.t_mins, candidates.t_mins.device
-    numbers = torch.arange(0, n_steps + RUN, RUN, dtype=t_mins.dtype, device=device)
-    wanted = numbers[:-1] < candidates.counts[:, None]
+    numbers = candidates.numbers(n_steps + RUN, RUN)
+    wanted = numbers[:-1, None] < candidates.counts
     if near_occupied is not None:
-        steps = candidates.first[:, None] + numbers
-        edges = candidate_edges(t_mins[:, None], steps, candidates.step_size, candidates.cone_angle)
-        starts, ends = edges[:, :-1], edges[:, 1:]
-        origins, directions = candidates.coordinates[..., None]
+        edges = candidates.edges_at(numbers)
+        starts, ends = edges[:-1], edges[1:]
+        origins, directions = candidates.coordinates[:, :, None]
         centers = torch.addcmul(origins, directions, (starts + ends) * 0.5).view(3, -1)
-        speeds = directions.square().sum(dim=0).sqrt()
+        speeds = candidates.coordinates[1].abs().amax(dim=0)
         near = near_occupied(centers.T, ((ends - starts) * (0.5 * speeds)).view(-1))
-        wanted = wanted.view(-1).logical_and_(near)
-    chosen = wanted.view(-1).nonzero()[:, 0]
-    rays = chosen.div(len(numbers) - 1, rounding_mode="floor")
-    first = (chosen - rays * (len(numbers) - 1)) * RUN
+        wanted.bitwise_and_(near.view_as(wanted))
+    rays, runs = _by_column(wanted)
+    first = (runs * RUN).to(numbers.dtype)
     return rays, candidates.of_rays(rays).window(first, RUN)
+
+
+def _by_column(wanted: Tensor) -> tuple[Tensor, Tensor]:
+    """Columns and rows of what is true in bool [n, m], by column; the one wait for the device."""
+    n = len(wanted)
+    chosen = wanted.T.contiguous().view(-1).nonzero()[:, 0]
+    columns = chosen.div(n, rounding_mode="floor")
+    return columns, chosen - columns * n
 
 
 def join(parts: list[Samples], like: Tensor) -> Samples:
@@ -289,57 +328,3 @@ def join(parts: list[Samples], like: Tensor) -> Samples:
         return parts[0]
     ray_indices, t_starts, t_ends = zip(*parts, strict=True)
     return torch.cat(ray_indices), torch.cat(t_starts), torch.cat(t_ends)
-
-
-def candidate_edges(t_mins: Tensor, steps: Tensor, step_size: float, cone_angle: float) -> Tensor:
-    """t of edge k of a ray: the solution of t_{k+1} = t_k + max(t_k cone_angle, step_size).
-
-    Args:
-        t_mins: t of edge 0.
-        steps: k, whole but floating, >= 0, of a shape that broadcasts with `t_mins`.
-
-    Returns:
-        t of the edges in the broadcast shape; rounding errors do not add up along a ray.
-    """
-    linear = torch.add(t_mins, steps, alpha=step_size)
-    if cone_angle <= 0.0:
-        return linear
-    n_linear, t_switch = switch(t_mins, step_size, cone_angle)
-    growth = torch.exp((steps - n_linear).clamp_(min=0.0) * math.log1p(cone_angle))
-    return torch.where(steps <= n_linear, linear, t_switch * growth)
-
-
-def candidate_counts(t_mins: Tensor, t_maxs: Tensor, step_size: float, cone_angle: float) -> Tensor:
-    """Number of candidates of each ray, that is, of midpoints in front of t_max.
-
-    Args:
-        t_mins: finite [n_rays].
-        t_maxs: [n_rays], may be infinite.
-
-    Returns:
-        [n_rays], whole but floating; exact below 2^24, capped near 2^25.
-    """
-    counts = ((t_maxs - t_mins) / step_size - 0.5).ceil()
-    if cone_angle > 0.0:
-        n_linear, t_switch = switch(t_mins, step_size, cone_angle)
-        ratio = t_maxs / (t_switch * (1.0 + 0.5 * cone_angle))
-        geometric = n_linear + (ratio.clamp(min=1e-12).log() / math.log1p(cone_angle)).ceil()
-        counts = torch.where(counts > n_linear, geometric.maximum(n_linear), counts)
-    counts = counts.nan_to_num(nan=0.0).clamp(0, 2 * MAX_CANDIDATES_PER_RAY)
-    # The estimate can be one off by rounding; the rule is the comparison with the midpoint itself.
-    for _ in range(2):
-        counts = counts + (_midpoint(t_mins, counts, step_size, cone_angle) < t_maxs)
-        late = _midpoint(t_mins, counts - 1.0, step_size, cone_angle) >= t_maxs
-        counts = counts - (late & (counts > 0)).to(counts.dtype)
-    return counts
-
-
-def _midpoint(t_mins: Tensor, steps: Tensor, step_size: float, cone_angle: float) -> Tensor:
-    starts = candidate_edges(t_mins, steps, step_size, cone_angle)
-    return (starts + candidate_edges(t_mins, steps + 1.0, step_size, cone_angle)) * 0.5
-
-
-def switch(t_mins: Tensor, step_size: float, cone_angle: float) -> tuple[Tensor, Tensor]:
-    """First edge with t cone_angle >= step_size, from which the step grows, and its t."""
-    n_linear = ((step_size / cone_angle - t_mins) / step_size).ceil().clamp(min=0.0)
-    return n_linear, torch.add(t_mins, n_linear, alpha=step_size)

@@ -165,7 +165,7 @@ def _front_to_back(
         if alive.numel() == 0:
             break
         part = candidates.of_rays(alive).window(first_step, slab)
-        ray_indices, t_starts, t_ends = keep(part, slab, False, occupied, near_occupied)
+        ray_indices, t_starts, t_ends = keep(part, slab, occupied, near_occupied)
         if ray_indices.numel() == 0:
             continue
         ray_indices = alive.index_select(0, ray_indices)

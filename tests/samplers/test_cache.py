@@ -7,7 +7,7 @@ import copy
 import pytest
 import torch
 from ball_occupancy import CENTRE, HALF, ball
-from samplers.analytic_occupancy import Balls
+from samplers.analytic_occupancy import Balls, camera_rays
 
 from leco_plugin.models.encodings import EncodingConfig
 from leco_plugin.models.gate import Gate, GateConfig
@@ -15,6 +15,7 @@ from leco_plugin.occupancy import Occupancy
 from leco_plugin.samplers.cache import CellCache
 from leco_plugin.samplers.cache_build import build_cache
 from leco_plugin.samplers.estimator import LearnedOccupancyEstimator
+from leco_plugin.samplers.marching import march
 from leco_plugin.space import Space
 
 BUDGET = 1 << 17
@@ -80,18 +81,38 @@ def test_positions_outside_a_box_or_nowhere_are_empty(balls, cache):
     assert cache.near(positions, torch.zeros(3)).shape == (3,)
 
 
-@pytest.mark.parametrize("radius", [0.0, 0.01, 0.1, 0.5])
-def test_nothing_is_occupied_within_a_radius_that_is_called_clear(cache, balls, radius):
+@pytest.mark.parametrize("half_cells", [0.0, 0.1, 0.5, 0.9, 1.5, 4.0])
+def test_nothing_is_occupied_in_a_cube_that_is_called_clear(cache, balls, half_cells):
     generator = torch.Generator().manual_seed(3)
-    centers = torch.randn(4000, 3, generator=generator) * 1.5
+    radius = half_cells * float(balls.space.half_extent) / cache.resolution
+    outwards = torch.nn.functional.normalize(torch.randn(4000, 3, generator=generator), dim=-1)
+    heights = 0.25 + torch.rand(4000, 1, generator=generator) * (3.0 * radius + 0.2)
+    centers = balls.centers[0] + outwards * heights
     near = cache.near(centers, torch.full((4000,), radius))
-    offsets = torch.nn.functional.normalize(torch.randn(4000, 16, 3, generator=generator), dim=-1)
+    offsets = torch.rand(4000, 30, 3, generator=generator) * 2.0 - 1.0
+    offsets = torch.cat([offsets, offsets[:, :15].sign()], dim=1)
     around = centers[:, None] + offsets * radius
-    occupied = balls.occupied(around.reshape(-1, 3)).view(4000, 16).any(dim=-1)
+    occupied = balls.occupied(around.reshape(-1, 3)).view(4000, 45).any(dim=-1)
     assert near[occupied].all()
-    if radius <= 0.1:
-        inside = (balls.space.map(centers).abs() <= 1.0).all(dim=-1)
-        assert near[inside].float().mean() < 0.7
+
+
+def test_cubes_far_from_everything_are_clear(cache, balls):
+    centers = torch.rand(4000, 3, generator=torch.Generator().manual_seed(3)) * 2.0 - 1.0
+    near = cache.near(centers, torch.full((4000,), 0.05))
+    assert near.float().mean() < 0.3
+
+
+@pytest.mark.parametrize("step_size", [0.004, 0.01, 0.03])
+def test_asking_for_clear_runs_first_drops_no_sample(cache, balls, step_size):
+    origins, directions = camera_rays(400)
+    rays = origins, directions, torch.zeros(400), torch.full((400,), 4.0)
+
+    def occupied(positions):
+        return decide(cache, balls, positions)
+
+    one = march(*rays, step_size=step_size, occupied=occupied)
+    other = march(*rays, step_size=step_size, occupied=occupied, near_occupied=cache.near)
+    assert all(a.equal(b) for a, b in zip(one, other, strict=True))
 
 
 def test_the_stretch_bounds_the_mapping_everywhere(cache, balls):
@@ -111,7 +132,7 @@ def test_a_constant_gate_needs_no_bricks(constant):
     balls.query = lambda positions: torch.full((len(positions),), constant)
     cache = build_cache(balls, budget=BUDGET, check_points=1 << 14, tolerance=1e-2)
     decided, left_open = cache.decide(torch.rand(1000, 3) - 0.5)
-    assert len(cache.fine) == len(left_open) == 0
+    assert len(cache.tables().fine) == len(left_open) == 0
     assert decided.float().mean() == constant
 
 

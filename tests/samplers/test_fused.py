@@ -15,9 +15,10 @@ from leco_plugin.models.encodings import EncodingConfig
 from leco_plugin.models.gate import Gate, GateConfig
 from leco_plugin.occupancy import Occupancy
 from leco_plugin.samplers import fused
+from leco_plugin.samplers.edges import candidate_counts, switch
 from leco_plugin.samplers.gate_weights import GateWeights, gate_weights, why_not
 from leco_plugin.samplers.growth import growth_table, powers_needed
-from leco_plugin.samplers.marching import TooManyCandidates, candidate_counts, switch
+from leco_plugin.samplers.marching import TooManyCandidates
 from leco_plugin.space import Space
 
 
