@@ -30,18 +30,25 @@ from leco_plugin.samplers.cache import (
     Tables,
 )
 from leco_plugin.samplers.cache_cells import (
+    LEAST_MARGIN,
     POINTS_AT_ONCE,
+    Look,
     clearance_of,
     fit_planes,
     judge_coarse,
     judge_fine,
+    look,
 )
 
 RESOLUTIONS = range(8, 65)
 """Coarse cells along the cube that are considered."""
 PROBE = 16
 """Coarse cells along the cube at which the gate is looked at first."""
-MARGINS = (0.1, 0.5, 2.0)
+SCOUT = 24
+"""Coarse cells along the cube from which the size of finer tables is foretold."""
+AIM = 0.95
+"""Of the budget, by what is foretold: a look at cells that turn out too small takes a second."""
+MARGINS = (LEAST_MARGIN, 0.5, 2.0)
 CAUTIONS = (*(0.6 * 1.1**step for step in range(20)), 5.0, math.inf)
 """What is tried, in this order; see `CacheReport`."""
 ROUGH = 0.6
@@ -62,7 +69,7 @@ def build_cache(
 ) -> CellCache:
     """The finest cache of a frozen occupancy that fits a budget and keeps its decisions.
 
-    Asks the gate about 6 million positions for the default budget.
+    Asks the gate about 5 million positions for the default budget, most of them near its boundary.
 
     Args:
         occupancy: the frozen gate with its space and threshold.
@@ -86,7 +93,7 @@ def build_cache(
             cpu, budget=budget, tolerance=tolerance, check_points=check_points, seed=seed
         )
         return CellCache(cache.tables().to(device), occupancy.space, cache.report)
-    probe = judge_coarse(occupancy, PROBE, MARGINS[0])[0]
+    probe, seen = look(occupancy, PROBE)
     mixed = int((probe == MIXED).sum())
     if mixed > ROUGH * PROBE**3:
         raise ValueError(
@@ -100,7 +107,9 @@ def build_cache(
     positions, by_gate = _decisions(occupancy, probe != EMPTY, check_points, seed)
     report = None
     for margin in MARGINS:
-        built = _largest_tables(occupancy, budget, surface, enough, margin)
+        # what a look at the probe's cells missed, a look everywhere finds
+        relied_on = seen if margin == LEAST_MARGIN else None
+        built = _largest_tables(occupancy, budget, enough, margin, relied_on)
         if built is None:
             break
         resolution, tables, doubts = built
@@ -125,34 +134,45 @@ def build_cache(
 
 
 def _largest_tables(
-    occupancy: OccupancyLike, budget: int, surface: float, enough: float, margin: float
+    occupancy: OccupancyLike,
+    budget: int,
+    enough: float,
+    margin: float,
+    seen: Look | None,
 ) -> tuple[int, Tables, Tensor] | None:
     """The finest tables within the budget that are of use.
 
     Args:
-        surface: the gate's boundary is a surface: at resolution n it crosses about this times n^2
-            cells, and BRICK^2 times as many fine ones.
         enough: resolution beyond which cells are not worth their time.
+        seen: as for `judge_coarse`.
 
     Returns:
         the resolution, the tables, and the doubts about the planes.
     """
+    states, corners = judge_coarse(occupancy, SCOUT, margin, seen)
+    mixed, planes = _counts(occupancy, states, corners, margin)
     for resolution in reversed(RESOLUTIONS):
-        expected = surface * resolution**2
-        too_large = _bytes(resolution, expected, expected * BRICK**2) > 1.05 * budget
+        finer = (resolution / SCOUT) ** 2  # the boundary is a surface
+        too_large = _bytes(resolution, finer * mixed, finer * planes) > AIM * budget
         if resolution > RESOLUTIONS[0] and (too_large or resolution - RESOLUTIONS.step >= enough):
             continue
-        states, corners = judge_coarse(occupancy, resolution, margin)
-        mixed = (states == MIXED).nonzero()
-        sample = mixed[:: max(1, len(mixed) // BRICKS_AT_ONCE)]
-        planes = int((judge_fine(occupancy, corners, sample, margin)[0] == MIXED).sum())
-        planes_in_all = planes * len(mixed) / max(1, len(sample))
-        if _bytes(resolution, len(mixed), planes_in_all) > budget:
+        states, corners = judge_coarse(occupancy, resolution, margin, seen)
+        if _bytes(resolution, *_counts(occupancy, states, corners, margin)) > budget:
             continue
         tables, doubts = _tables(occupancy, states, corners, margin)
         if tables.bytes <= budget:
             return resolution, tables, doubts
     return None
+
+
+def _counts(
+    occupancy: OccupancyLike, states: Tensor, corners: Tensor, margin: float
+) -> tuple[int, float]:
+    """How many coarse cells are mixed, and about how many fine ones: some bricks are looked at."""
+    mixed = (states == MIXED).nonzero()
+    sample = mixed[:: max(1, len(mixed) // BRICKS_AT_ONCE)]
+    planes = int((judge_fine(occupancy, corners, sample, margin)[0] == MIXED).sum())
+    return len(mixed), planes * len(mixed) / max(1, len(sample))
 
 
 def _bytes(resolution: int, bricks: float, planes: float) -> float:

@@ -7,9 +7,11 @@ A fine cell that is neither gets a plane.
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import torch
 from torch import Tensor
-from torch.nn.functional import max_pool3d, pad
+from torch.nn.functional import interpolate, max_pool3d, pad
 
 from leco_plugin.samplers.cache import (
     BRICK,
@@ -24,21 +26,62 @@ POINTS_AT_ONCE = 1 << 17
 """Positions that the gate is asked about in one call."""
 TRIALS = 24
 """Random points of a cell to which its plane is fitted, and which show where it errs."""
+LEAST_MARGIN = 0.1
+"""Of a cell's spread of logits: how far from the threshold it must stay to be called empty."""
+PLAIN_MARGIN = 0.5
+"""Margin of cells that a finer look does not ask about again."""
 CLOSE = 0.5
 """Margin within which a fine cell that seems empty or occupied is tried at such points as well."""
 
 
-def judge_coarse(occupancy: OccupancyLike, resolution: int, margin: float) -> tuple[Tensor, Tensor]:
+class Look(NamedTuple):
+    """What a look at the whole cube shows, and where a finer one has to ask the gate again."""
+
+    corners: Tensor
+    """Logits above the threshold's at the points of a lattice, [m + 1]^3."""
+    open: Tensor
+    """Which of n^3 cells are not plainly on one side, or lie beside one of those: bool."""
+
+
+def look(occupancy: OccupancyLike, resolution: int) -> tuple[Tensor, Look]:
+    """States of coarse cells, judged with the smallest margin, and what finer looks may rely on."""
+    states, corners = judge_coarse(occupancy, resolution, LEAST_MARGIN)
+    low, high = _extremes(corners)
+    unsure = (_judge(low, high, PLAIN_MARGIN) == MIXED).float()[None, None]
+    return states, Look(corners, max_pool3d(unsure, 3, stride=1, padding=1)[0, 0] > 0.0)
+
+
+def judge_coarse(
+    occupancy: OccupancyLike, resolution: int, margin: float, seen: Look | None = None
+) -> tuple[Tensor, Tensor]:
     """States of the coarse cells [n, n, n], and logits at the corners of the fine ones, [4n + 1]^3.
 
     A coarse cell is judged by the 5^3 corners of its fine ones.
+
+    Args:
+        seen: a coarser look; outside its open cells its logits are interpolated. None asks the gate
+            everywhere.
     """
-    intervals = BRICK * resolution
-    points = _lattice(intervals, occupancy.space.center.device)
-    corners = logits_above(occupancy, points).view(1, 1, *[intervals + 1] * 3)
-    high = max_pool3d(corners, BRICK + 1, BRICK)
-    low = -max_pool3d(-corners, BRICK + 1, BRICK)
-    return _judge(low, high, margin)[0, 0], corners[0, 0]
+    size, device = BRICK * resolution + 1, occupancy.space.center.device
+    if seen is None:
+        corners = logits_above(occupancy, _lattice(size - 1, device)).view(size, size, size)
+    else:
+        whole = seen.corners[None, None]
+        corners = interpolate(whole, (size,) * 3, mode="trilinear", align_corners=True)[0, 0]
+        # a lattice point between two cells lies in the upper one; open cells have a margin
+        cell = (torch.arange(size, device=device) * len(seen.open) // (size - 1)).clamp(
+            max=len(seen.open) - 1
+        )
+        asked = seen.open[cell][:, cell][:, :, cell].nonzero()
+        corners[tuple(asked.T)] = logits_above(occupancy, asked * (2.0 / (size - 1)) - 1.0)
+    return _judge(*_extremes(corners), margin), corners
+
+
+def _extremes(corners: Tensor) -> tuple[Tensor, Tensor]:
+    """Lowest and highest value in each coarse cell [n, n, n] of a lattice of corners [4n + 1]^3."""
+    whole = corners[None, None]
+    high = max_pool3d(whole, BRICK + 1, BRICK)[0, 0]
+    return -max_pool3d(-whole, BRICK + 1, BRICK)[0, 0], high
 
 
 def _lattice(intervals: int, device: torch.device) -> Tensor:

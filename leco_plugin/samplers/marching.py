@@ -137,7 +137,9 @@ def march(
     in_runs = near_occupied is not None or shortest < longest
     runs_at_once = max(1, chunk_size // RUN)
     kept: list[Samples] = []
-    for first_ray, tile, n_steps in tiles(candidates, longest, chunk_size * (RUN if in_runs else 1)):
+    for first_ray, tile, n_steps in tiles(
+        candidates, longest, chunk_size * (RUN if in_runs else 1)
+    ):
         if not in_runs:
             parts = [keep_steps(tile, n_steps, None, occupied)]
         else:
