@@ -6,6 +6,7 @@ import torch
 from torch import Tensor, nn
 
 from leco_plugin.models.encodings import FrequencyEncoding
+from leco_plugin.models.steady import steadied
 
 OPPONENT = torch.tensor(
     [[1 / 3**0.5] * 3, [1 / 2**0.5, 0.0, -1 / 2**0.5], [1 / 6**0.5, -2 / 6**0.5, 1 / 6**0.5]]
@@ -75,8 +76,10 @@ class ColorHead(nn.Module):
             )
             of_rays.append(APPEARANCE_SCALE * code)
         # the first layer of a concatenation is the sum of two, one of which is the same all along
-        hidden = self.of_features(features) + self.of_ray(torch.cat(of_rays, dim=-1)).to(
-            features.dtype
-        ).index_select(0, ray_indices)
-        opponent = self.out(torch.relu(hidden)).float()
+        count = len(features)
+        of_ray = self.of_ray(torch.cat(of_rays, dim=-1)).to(features.dtype)
+        hidden = self.of_features(steadied(features)) + of_ray.index_select(
+            0, steadied(ray_indices)
+        )
+        opponent = self.out(torch.relu(hidden))[:count].float()
         return torch.sigmoid(opponent @ self.opponent)

@@ -3,14 +3,71 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from typing import Any
 
 import torch
 from torch import Tensor
 
 from leco_plugin.models.rows import permute_rows
+from leco_plugin.models.steady import steady_size
 
 Expert = Callable[[Tensor], Tensor]
 """Features [M, width] to [M, width]."""
+
+
+class Places:
+    """Where rows go that are sorted by a key, each key's rows up to a steady size.
+
+    Args:
+        keys: [N] int64 in [0, num_keys).
+        num_keys: how many keys there are.
+    """
+
+    sizes: list[int]
+    """Rows of each key, filling included; they sum up to P."""
+    counts: list[int]
+    """Rows of each key without."""
+
+    def __init__(self, keys: Tensor, num_keys: int) -> None:
+        device = keys.device
+        sources = keys.argsort(stable=True)
+        self.counts = torch.bincount(keys, minlength=num_keys).tolist()  # one synchronisation
+        self.sizes = [steady_size(count, device.type) for count in self.counts]
+        numbers = torch.arange(len(keys), device=device)
+        self.filling: list[slice] = []
+        if self.sizes == self.counts:
+            self.sources, slots = sources, numbers
+        else:
+            filled = [size - count for size, count in zip(self.sizes, self.counts)]
+            ends = torch.tensor(self.sizes).cumsum(0).tolist()
+            self.filling = [slice(end - rows, end) for end, rows in zip(ends, filled) if rows]
+            before = (torch.tensor(filled).cumsum(0) - torch.tensor(filled)).to(device)
+            slots = numbers + before.index_select(0, keys.index_select(0, sources))
+            self.sources = sources.new_zeros(ends[-1]).scatter_(0, slots, sources)
+        self.slots = torch.empty_like(sources).scatter_(0, sources, slots)
+
+    def gather(self, rows: Tensor) -> Sequence[Tensor]:
+        """Rows [N, D] as one [size, D] for each key; filling holds copies of any row."""
+        return permute_rows(rows, self.sources, self.slots).split(self.sizes)
+
+    def put_back(self, rows: Tensor) -> Tensor:
+        """Placed rows [P, D] as [N, D], in the order of the keys; filling is left out."""
+        back: Tensor = _PutBack.apply(rows, self)
+        return back
+
+
+class _PutBack(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: Any, rows: Tensor, places: Places) -> Tensor:
+        ctx.places = places
+        return rows.index_select(0, places.slots)
+
+    @staticmethod
+    def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor, None]:
+        placed = gradient.index_select(0, ctx.places.sources)
+        for filling in ctx.places.filling:
+            placed[filling] = 0.0
+        return placed, None
 
 
 def dispatch(features: Tensor, routes: Tensor, experts: Sequence[Expert | None]) -> Tensor:
@@ -23,15 +80,10 @@ def dispatch(features: Tensor, routes: Tensor, experts: Sequence[Expert | None])
     Returns:
         [N, width] in the dtype of the last expert that has points.
     """
-    order = routes.argsort(stable=True)
-    inverse = torch.empty_like(order).scatter_(
-        0, order, torch.arange(len(order), device=order.device)
-    )
-    counts = torch.bincount(routes, minlength=len(experts)).tolist()  # one synchronisation
-    ordered = permute_rows(features, order, inverse)
+    places = Places(routes, len(experts))
     parts = []
     dtype = features.dtype
-    for expert, part in zip(experts, ordered.split(counts)):
+    for expert, part in zip(experts, places.gather(features)):
         if expert is None:
             parts.append(torch.zeros_like(part))
         elif len(part):
@@ -39,7 +91,7 @@ def dispatch(features: Tensor, routes: Tensor, experts: Sequence[Expert | None])
             dtype = parts[-1].dtype
         else:
             parts.append(part)
-    return permute_rows(torch.cat([part.to(dtype) for part in parts]), inverse, order)
+    return places.put_back(torch.cat([part.to(dtype) for part in parts]))
 
 
 @torch.no_grad()

@@ -11,6 +11,7 @@ from torch import Tensor, nn
 from leco_plugin.models.color_head import ColorHead
 from leco_plugin.models.encodings import EncodingConfig, build_encoding
 from leco_plugin.models.hmoe import HMoE, HMoEConfig
+from leco_plugin.models.steady import steadied
 
 
 @dataclass(frozen=True)
@@ -72,9 +73,11 @@ class HMoEField(nn.Module):
         Returns:
             sigmas [N] float32, per half extent of the scene; features [N, width].
         """
-        hidden = self.experts(self.projection(self.encoding(mapped)), routes, gate_values)
-        raw = self.density_head(hidden)[:, 0].float()
+        count = len(mapped)
+        projected = self.projection(self.encoding(steadied(mapped)))
+        hidden = self.experts(projected, steadied(routes), steadied(gate_values))
+        raw = self.density_head(hidden)[:count, 0].float()
         sigmas = _TruncatedExponential.apply(raw - 1.0)
         if self.config.experts.empty_expert == "none":
             sigmas = sigmas * (routes > 0)
-        return sigmas, hidden
+        return sigmas, hidden[:count]

@@ -13,6 +13,7 @@ import torch
 from torch import Tensor, nn
 
 from leco_plugin.models.encodings import EncodingConfig, Kind, build_encoding
+from leco_plugin.models.steady import steadied
 
 EMPTY = 0
 """Index of the empty-space expert in logits, probabilities and routes."""
@@ -100,10 +101,10 @@ class Gate(nn.Module):
 
     def forward(self, mapped: Tensor) -> Tensor:
         """Mapped positions [N, 3] in [-1, 1] to logits [N, 1 + n] float32; 0 is emptiness."""
-        features = self.encoding(mapped)
+        features = self.encoding(steadied(mapped))
         for layer in self.hidden:
             features = torch.relu(layer(features))
-        return logits_of(features, self.norm, self.head)
+        return logits_of(features, self.norm, self.head)[: len(mapped)]
 
     def occupancy(self, mapped: Tensor) -> Tensor:
         """o(x) = 1 - G_0(x): mapped positions [N, 3] to [N] float32 in [0, 1]."""

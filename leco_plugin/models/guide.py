@@ -47,6 +47,7 @@ class Guide(nn.Module):
         dense: whether packed samplers keep every candidate for the moment, as a reference.
         kept: samples that a packed sampler kept when it was last asked in training.
         watched: what was found of the price of skipping; travels with a checkpoint.
+        first_density: with which the host's field began, None for its own; see `opaque_start`.
         frame: [3, 4] takes positions of the host to those of the occupancy: a rotation times a
             scale, and a translation.
     """
@@ -67,6 +68,7 @@ class Guide(nn.Module):
         self.dense = False
         self.kept: int | None = None
         self.watched: dict[str, Any] = {}
+        self.first_density: float | None = None
         self.register_buffer("frame", torch.eye(3, 4))
         self.register_load_state_dict_post_hook(lambda guide, _: guide.changed())
 
@@ -164,12 +166,14 @@ class Guide(nn.Module):
             "precision": self.occupancy.precision,
             "report": self.occupancy.report,
             "watched": self.watched,
+            "first_density": self.first_density,
         }
 
     def set_extra_state(self, state: dict[str, Any]) -> None:
         """Makes an occupancy of the checkpoint's shape; torch then reads its weights."""
         if state:
             self.watched = dict(state.get("watched", {}))
+            self.first_density = state.get("first_density")
             gate = Gate(GateConfig.from_dict(state["gate"]))
             occupancy = Occupancy(gate, Space(), 0.0, state["precision"], state["report"])
             self.set_occupancy(occupancy)

@@ -33,6 +33,7 @@ from leco_plugin.models.guided_start import (
     load_occupancy,
 )
 from leco_plugin.models.host_watch import HostWatch
+from leco_plugin.models.opaque_start import set_first_density
 from leco_plugin.models.precision import keep_freed_memory
 from leco_plugin.models.seams import swap_sampler
 from leco_plugin.scenes.input_error import InputError
@@ -83,6 +84,7 @@ def set_up_guided(config: GuidedModelConfig, **arguments: Any) -> Model:
     host = with_counts_as_floats(setup_with_lazy_lpips(host_config, **arguments))
     host.guide = guide
     swap_sampler(host, guide)
+    guide.register_load_state_dict_post_hook(lambda guide, _: set_first_density(host, guide))
     _refuse_what_is_not_finite(host)
     _begin_with_occupancy(host, guide, config.occupancy)
     return host
@@ -118,7 +120,7 @@ def _begin_with_occupancy(host: Model, guide: Guide, config: OccupancyConfig) ->
     def get_training_callbacks(attributes: TrainingCallbackAttributes) -> list[TrainingCallback]:
         if not guide.needs_occupancy:
             return own_callbacks(attributes)
-        start = GuidedStart(guide, config, attributes.pipeline, attributes.trainer)
+        start = GuidedStart(host, guide, config, attributes.pipeline, attributes.trainer)
         watch = HostWatch(
             host, guide, config.learning.calibration, attributes.pipeline, attributes.trainer
         )

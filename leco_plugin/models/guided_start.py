@@ -7,10 +7,12 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from torch import Tensor, nn
 
 from leco_plugin.models.freezing import FILE_NAME, leave_file
 from leco_plugin.models.guide import Guide
 from leco_plugin.models.leco import LecoModelConfig
+from leco_plugin.models.opaque_start import begin_opaque
 from leco_plugin.models.ranks import is_first, say
 from leco_plugin.occupancy import Occupancy
 from leco_plugin.samplers.rays import intersect_box
@@ -42,6 +44,9 @@ class OccupancyConfig:
     """Packed hosts, when they render: ask densities front to back, and shade nothing behind an
     opaque surface. The image is the same to a thousandth; it pays where shading costs much more
     than a density."""
+    opaque_start: bool = True
+    """Packed hosts: begin with a density that makes what is kept of a ray opaque, where the host's
+    own would not. Before a random background a transparent start may never recover."""
     seconds: float | None = None
     """Without a path: about how long learning may take at most; None is until it has settled."""
     rays: int = 1024
@@ -86,6 +91,7 @@ class GuidedStart:
     """The start of one training run of a guided host.
 
     Args:
+        host: what is guided.
         guide: of the host; it has an occupancy already where a file or a checkpoint gave one.
         config: where else to get one.
         pipeline, trainer: nerfstudio's; without a trainer no file is left.
@@ -95,9 +101,14 @@ class GuidedStart:
     """
 
     def __init__(
-        self, guide: Guide, config: OccupancyConfig, pipeline: Any, trainer: Any = None
+        self,
+        host: nn.Module,
+        guide: Guide,
+        config: OccupancyConfig,
+        pipeline: Any,
+        trainer: Any = None,
     ) -> None:
-        self.guide, self.config = guide, config
+        self.host, self.guide, self.config = host, guide, config
         self.pipeline, self.trainer = pipeline, trainer
         self.begun = False
         if guide.occupancy is None and config.path is not None:
@@ -123,6 +134,9 @@ class GuidedStart:
                 config.learning, self.pipeline, config.rays, config.seconds, config.rate
             )
             self.guide.set_occupancy(occupancy)
+        if step == 0 and self.config.opaque_start:
+            cameras = self.pipeline.datamanager.train_dataset.cameras
+            begin_opaque(self.host, self.guide, kept_of_rays(self.guide, cameras)[0])
         if self.trainer is not None and is_first():
             leave_file(self.guide.the_occupancy(), Path(self.trainer.base_dir))
 
@@ -134,7 +148,8 @@ class GuidedStart:
         if learned_in is not None and host is not None:
             self.guide.frame.copy_(between(host, learned_in))
             self.guide.changed()
-        share = kept_on_rays(self.guide, manager.train_dataset.cameras)
+        kept, met = kept_of_rays(self.guide, manager.train_dataset.cameras)
+        share = float(kept.sum() / met.sum().clamp(min=1e-12))
         if share == 0.0:
             raise InputError(
                 "the occupancy keeps nothing on the rays of these cameras: it was learned on "
@@ -146,8 +161,12 @@ class GuidedStart:
 
 
 @torch.no_grad()
-def kept_on_rays(guide: Guide, cameras: Any) -> float:
-    """Share of the positions on rays through the occupancy's box that it keeps, in [0, 1]."""
+def kept_of_rays(guide: Guide, cameras: Any) -> tuple[Tensor, Tensor]:
+    """How much the occupancy keeps of rays through its box, and how much of them lies in it.
+
+    Returns:
+        Lengths [R] and [R], scene units of the host.
+    """
     occupancy = guide.the_occupancy()
     frame = guide.frame
     origins, directions = (part.reshape(-1, 3).to(frame) for part in covering_rays(cameras))
@@ -163,5 +182,6 @@ def kept_on_rays(guide: Guide, cameras: Any) -> float:
     t = starts + (ends - starts) * along
     positions = origins[hits][:, None] + directions[hits][:, None] * t[..., None]
     parts = positions.reshape(-1, 3).split(1 << 18)
-    kept = sum(float(occupancy.occupied(part).sum()) for part in parts)
-    return kept / max(t.numel(), 1)
+    kept = torch.cat([occupancy.occupied(part) for part in parts]).view(t.shape)
+    lengths = (ends - starts)[:, 0]
+    return kept.float().mean(dim=-1) * lengths, lengths

@@ -139,7 +139,8 @@ class Lifecycle:
         """
         model = self.model
         model.learning_kept = mean(model.learning_kept, model.device)
-        return min(model.config.sizes.guided_batch, 1.0 / model.learning_kept)
+        wanted = min(model.config.sizes.guided_batch, 1.0 / model.learning_kept)
+        return round(8 * wanted) / 8  # of few sizes; see `steady`
 
     def _guided_batch(self) -> float:
         """Rays of a guided batch as a multiple: about as many samples are shaded as before."""

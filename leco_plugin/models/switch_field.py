@@ -17,6 +17,7 @@ from leco_plugin.models.dispatch import dispatch, within_capacity
 from leco_plugin.models.encodings import FrequencyEncoding
 from leco_plugin.models.gate import logits_of
 from leco_plugin.models.hmoe import Expert
+from leco_plugin.models.steady import steadied
 
 
 @dataclass(frozen=True)
@@ -106,11 +107,12 @@ class SwitchField(nn.Module):
             capacity_factor: places of each expert, as a multiple of an equal share of the points;
                 a point without a place has zero features. None is dropless.
         """
-        projected = self.projection(self.encoding(mapped))
-        logits = self.gate(projected)
+        count = len(mapped)
+        projected = self.projection(self.encoding(steadied(mapped)))
+        logits = self.gate(projected)[:count]
         gate_values, routes = logits.softmax(dim=-1).max(dim=-1)
-        features = self._mixture(projected, routes, gate_values, capacity_factor)
-        raw = self.density_head(features)[:, 0].float()
+        features = self._mixture(projected[:count], routes, gate_values, capacity_factor)
+        raw = self.density_head(steadied(features))[:count, 0].float()
         if noise > 0.0:
             raw = raw + noise * torch.randn_like(raw)
         return Answers(nn.functional.softplus(raw - 1.0), features, logits, routes)

@@ -7,7 +7,7 @@ import math
 import pytest
 import torch
 
-from leco_plugin.models.dispatch import dispatch, within_capacity
+from leco_plugin.models.dispatch import Places, dispatch, within_capacity
 
 
 def test_each_point_goes_through_its_expert_and_comes_back_in_its_place() -> None:
@@ -50,3 +50,22 @@ def test_a_place_for_every_point_drops_none() -> None:
     routes = torch.zeros(40, dtype=torch.int64)
     assert bool(within_capacity(routes, torch.rand(40), 4, 4.0).all())
     assert int(within_capacity(routes, torch.rand(40), 4, 1.0).sum()) == 10
+
+
+def test_filled_places_answer_and_teach_as_one_point_at_a_time() -> None:
+    routes = torch.randint(3, (1001,))
+    experts = [torch.nn.Linear(4, 4), None, torch.nn.Linear(4, 4)]
+    features = torch.randn(1001, 4, requires_grad=True)
+    weights = torch.randn(1001, 4)
+    with torch.autocast("cpu", dtype=torch.bfloat16):
+        assert Places(routes, 3).filling, "autocast on a CPU fills up"
+        mine = (dispatch(features, routes, experts).float() * weights).sum()
+    plain = sum(
+        (expert(features[routes == i]) * weights[routes == i]).sum()
+        for i, expert in enumerate(experts)
+        if expert is not None
+    )
+    wanted = [features, *experts[0].parameters(), *experts[2].parameters()]
+    for ours, theirs in zip(torch.autograd.grad(mine, wanted), torch.autograd.grad(plain, wanted)):
+        scale = float(theirs.abs().max())
+        assert torch.allclose(ours, theirs, rtol=2e-2, atol=2e-2 * scale)

@@ -17,7 +17,7 @@ from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataPars
 from nerfstudio.engine.callbacks import TrainingCallbackAttributes
 from nerfstudio.model_components.ray_samplers import UniformSampler
 from nerfstudio.pipelines.base_pipeline import VanillaPipelineConfig
-from torch import Tensor
+from torch import Tensor, nn
 
 from leco_plugin.host_configs import leco_ngp
 from leco_plugin.models.encodings import EncodingConfig
@@ -26,7 +26,7 @@ from leco_plugin.models.guide import Guide
 from leco_plugin.models.guided_start import (
     GuidedStart,
     OccupancyConfig,
-    kept_on_rays,
+    kept_of_rays,
     load_occupancy,
     occupancy_file,
 )
@@ -115,7 +115,7 @@ def started(occupancy: Occupancy, data: Data, sampler: str = "learned-occupancy"
     """A guide in the coordinates of a host that reads with `data`."""
     guide = Guide(sampler)
     guide.set_occupancy(occupancy)
-    GuidedStart(guide, OccupancyConfig(sampler=sampler), Pipe(data))
+    GuidedStart(nn.Module(), guide, OccupancyConfig(sampler=sampler), Pipe(data))
     return guide.eval()
 
 
@@ -251,7 +251,8 @@ def test_the_ball_is_found_whatever_it_was_learned_in(readers: dict[str, Data]) 
         frame = frame_of(learned)
         assert frame is not None
         guide = started(ball_of_the_tiny_scene(frame), readers["turned up"])
-        shares.append(kept_on_rays(guide, readers["turned up"].train_dataset.cameras))
+        kept, met = kept_of_rays(guide, readers["turned up"].train_dataset.cameras)
+        shares.append(float(kept.sum() / met.sum()))
     assert shares == pytest.approx([shares[0]] * len(shares), rel=0.05)
     assert 0.05 < shares[0] < 0.6
 
@@ -307,13 +308,15 @@ def test_bad_paths_are_named_in_a_line(tmp_path: Path) -> None:
 def test_training_says_what_was_wrong_with_a_path(readers: dict[str, Data], tmp_path: Path) -> None:
     for path, message in bad_paths(tmp_path).values():
         with pytest.raises(InputError, match=message):
-            GuidedStart(Guide(), OccupancyConfig(path), Pipe(readers["as it is"]))
+            GuidedStart(nn.Module(), Guide(), OccupancyConfig(path), Pipe(readers["as it is"]))
 
 
 def test_a_checkpoint_needs_no_file(readers: dict[str, Data]) -> None:
     guide = Guide()
     guide.set_occupancy(ball_of_the_tiny_scene())
-    GuidedStart(guide, OccupancyConfig(Path("deleted") / NAME), Pipe(readers["as it is"]))
+    GuidedStart(
+        nn.Module(), guide, OccupancyConfig(Path("deleted") / NAME), Pipe(readers["as it is"])
+    )
     assert guide.occupancy is not None
 
 
@@ -324,7 +327,7 @@ def test_a_sampler_and_a_gate_that_do_not_fit_are_refused_before_learning(
     with pytest.raises(InputError, match=f"{name}.* asks a gate on hash features"):
         started(ball_of_the_tiny_scene(), data, name)
     with pytest.raises(InputError, match=f"{name}.* asks a gate on hash features"):
-        GuidedStart(Guide(name), OccupancyConfig(sampler=name), Pipe(data))
+        GuidedStart(nn.Module(), Guide(name), OccupancyConfig(sampler=name), Pipe(data))
 
 
 def test_an_unknown_sampler_is_refused_in_a_line(tiny_scene: Path) -> None:
@@ -345,7 +348,7 @@ def test_the_first_step_leaves_the_file_in_the_runs_folder(
 
     guide = Guide()
     guide.set_occupancy(ball_of_the_tiny_scene())
-    start = GuidedStart(guide, OccupancyConfig(), Pipe(readers["as it is"]), Trainer())
+    start = GuidedStart(nn.Module(), guide, OccupancyConfig(), Pipe(readers["as it is"]), Trainer())
     assert not Trainer.base_dir.exists()
     start.before_step(0)
     left = Occupancy.load(Trainer.base_dir / NAME)
@@ -386,7 +389,7 @@ def test_a_range_that_no_ray_meets_is_refused_before_the_first_step(
     guide = Guide("learned-occupancy")
     guide.set_occupancy(lopsided(data))
     with pytest.raises(InputError, match=r"^0% of the rays meet the scene"):
-        GuidedStart(guide, config, Pipe(data))
+        GuidedStart(nn.Module(), guide, config, Pipe(data))
 
 
 def test_a_full_disk_does_not_end_a_run_that_has_its_occupancy(
@@ -403,7 +406,7 @@ def test_a_full_disk_does_not_end_a_run_that_has_its_occupancy(
 
     guide = Guide()
     guide.set_occupancy(ball_of_the_tiny_scene())
-    start = GuidedStart(guide, OccupancyConfig(), Pipe(readers["as it is"]), Trainer())
+    start = GuidedStart(nn.Module(), guide, OccupancyConfig(), Pipe(readers["as it is"]), Trainer())
     monkeypatch.setattr(Occupancy, "save", full)
     start.before_step(0)
     said = " ".join(capsys.readouterr().out.split())
