@@ -16,6 +16,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from leco_plugin.samplers.columns import RUN, by_column, by_column_in_runs
 from leco_plugin.samplers.edges import MAX_CANDIDATES_PER_RAY, candidate_counts, candidate_edges
 from leco_plugin.samplers.rays import check_rays, usable_rays
 
@@ -33,9 +34,6 @@ CPU_CHUNK = 1 << 19
 DEVICE_CHUNK = 1 << 22
 """Positions asked at once: what fits the cache of a CPU core; elsewhere a training batch, because
 each chunk there waits for the device once."""
-
-RUN = 16
-"""Candidates of a run: long enough to work on at once, short enough to waste little."""
 
 
 class TooManyCandidates(ValueError):
@@ -63,7 +61,7 @@ class Candidates(NamedTuple):
             return tensor[..., rays] if isinstance(rays, slice) else tensor.index_select(-1, rays)
 
         return self._replace(
-            coordinates=pick(self.coordinates),
+            coordinates=pick(self.coordinates.flatten(0, 1)).unflatten(0, (2, 3)),
             t_mins=pick(self.t_mins),
             first=pick(self.first),
             counts=pick(self.counts),
@@ -135,21 +133,19 @@ def march(
     if chunk_size is None:
         chunk_size = CPU_CHUNK if origins.device.type == "cpu" else DEVICE_CHUNK
     in_runs = near_occupied is not None or shortest < longest
+    at_once = chunk_size * RUN if in_runs else chunk_size  # a run is one coarse question
     runs_at_once = max(1, chunk_size // RUN)
     kept: list[Samples] = []
-    for first_ray, tile, n_steps in tiles(
-        candidates, longest, chunk_size * (RUN if in_runs else 1)
-    ):
+    for first_ray, tile, n_steps in tiles(candidates, longest, at_once):
         if not in_runs:
-            parts = [keep_steps(tile, n_steps, None, occupied)]
-        else:
-            rays, runs = cut(tile, n_steps, near_occupied)
-            parts = [
-                keep_steps(runs.of_rays(part), RUN, rays[part], occupied)
-                for first_run in range(0, len(rays), runs_at_once)
-                for part in [slice(first_run, first_run + runs_at_once)]
-            ]
-        kept += [(rays + first_ray, t_starts, t_ends) for rays, t_starts, t_ends in parts]
+            rays, t_starts, t_ends = keep_steps(tile, n_steps, None, occupied)
+            kept.append((rays + first_ray, t_starts, t_ends))
+            continue
+        rays, runs = cut(tile, n_steps, near_occupied)
+        rays += first_ray
+        for first_run in range(0, len(rays), runs_at_once):
+            part = slice(first_run, first_run + runs_at_once)
+            kept.append(keep_steps(runs.of_rays(part), RUN, rays[part], occupied))
     return join(kept, origins)
 
 
@@ -264,27 +260,34 @@ def keep_steps(
 ) -> Samples:
     """Pack those of the first `n_steps` candidates of each ray that are occupied.
 
+    `occupied` is asked in whole runs, also about the few steps by which a ray's last run is too
+    long: those answers are not used.
+
     Args:
-        rays: what to call each ray, int64 [n_rays], where they are runs of rays. A ray's last run
-            can be too long by a few steps, about which `occupied` is asked too: their answers are
-            not used. None: each goes by its place, and all have `n_steps` candidates.
+        rays: what to call each ray, int64 [n_rays], where they are runs of rays and some are too
+            long. None: each goes by its place, and all have `n_steps` candidates.
     """
-    edges = candidates.edges(n_steps)
+    n_rows = -(-n_steps // RUN) * RUN
+    edges = candidates.edges(n_rows)
     n_rays = edges.shape[1]
     if rays is None and occupied is None:
         every = torch.arange(n_rays, device=edges.device)[:, None].expand(n_rays, n_steps)
-        return every.reshape(-1), edges[:-1].T.reshape(-1), edges[1:].T.reshape(-1)
-    wanted = None
-    if rays is not None:
-        wanted = candidates.numbers(n_steps)[:, None] < candidates.counts
+        starts, ends = edges[:n_steps], edges[1 : n_steps + 1]
+        return every.reshape(-1), starts.T.reshape(-1), ends.T.reshape(-1)
+    steps = torch.arange(n_rows, device=edges.device)[:, None]
+    if rays is None:
+        wanted = steps < n_steps
+    else:
+        wanted = torch.empty(n_rows, n_rays, dtype=torch.uint8, device=edges.device)
+        torch.lt(steps.to(torch.uint8), candidates.counts.to(torch.uint8), out=wanted)
+        wanted = wanted.view(torch.bool)
     if occupied is not None:
-        midpoints = (edges[:-1] + edges[1:]).mul_(0.5)
         origins, directions = candidates.coordinates[:, :, None]
-        answers = occupied(torch.addcmul(origins, directions, midpoints).view(3, -1).T)
-        answers = answers.view(n_steps, n_rays)
-        wanted = answers if wanted is None else wanted.bitwise_and_(answers)
-    columns, steps = _by_column(wanted)
-    at = steps * n_rays + columns
+        twice = edges[:-1] + edges[1:]  # it is exact to halve the directions instead, and less work
+        places = torch.addcmul(origins, directions * 0.5, twice).view(3, -1).T
+        wanted = wanted & occupied(places).reshape(n_rows, n_rays)
+    columns, steps = by_column_in_runs(wanted)
+    at = torch.add(columns, steps, alpha=n_rays)
     edges = edges.view(-1)
     ray_indices = columns if rays is None else rays.index_select(0, columns)
     return ray_indices, edges.index_select(0, at), edges.index_select(0, at + n_rays)
@@ -308,17 +311,9 @@ def cut(
         speeds = candidates.coordinates[1].abs().amax(dim=0)
         near = near_occupied(centers.T, ((ends - starts) * (0.5 * speeds)).view(-1))
         wanted.bitwise_and_(near.view_as(wanted))
-    rays, runs = _by_column(wanted)
+    rays, runs = by_column(wanted)
     first = (runs * RUN).to(numbers.dtype)
     return rays, candidates.of_rays(rays).window(first, RUN)
-
-
-def _by_column(wanted: Tensor) -> tuple[Tensor, Tensor]:
-    """Columns and rows of what is true in bool [n, m], by column; the one wait for the device."""
-    n = len(wanted)
-    chosen = wanted.T.contiguous().view(-1).nonzero()[:, 0]
-    columns = chosen.div(n, rounding_mode="floor")
-    return columns, chosen - columns * n
 
 
 def join(parts: list[Samples], like: Tensor) -> Samples:

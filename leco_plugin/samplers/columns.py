@@ -1,0 +1,43 @@
+"""Where a matrix of answers is true, column by column: how the march packs what it keeps.
+
+Rays are columns and candidates rows, so packed samples are the true entries in the order of
+columns. What is kept of a ray lies together: on a CPU, where finding true entries takes longer than
+anything else of the march, most runs of rows are passed over at once. Elsewhere each search would
+wait for the device, so there is only one.
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+RUN = 16
+"""Rows of a run: long enough to work on at once, short enough to waste little."""
+
+
+def by_column(wanted: Tensor) -> tuple[Tensor, Tensor]:
+    """Columns and rows of what is true in bool [n, m], int64, by column, then row."""
+    n = len(wanted)
+    chosen = _true(wanted)
+    columns = chosen.div(n, rounding_mode="floor")
+    return columns, chosen - columns * n
+
+
+def by_column_in_runs(wanted: Tensor) -> tuple[Tensor, Tensor]:
+    """The same where n is a multiple of `RUN`, faster on a CPU if few runs are not all false."""
+    if wanted.device.type != "cpu":
+        return by_column(wanted)
+    m = wanted.shape[1]
+    some = wanted.view(torch.uint8).unflatten(0, (-1, RUN)).amax(dim=1)
+    columns, runs = by_column(some)
+    rows = torch.arange(RUN)[:, None] * m
+    places = torch.add(columns, runs, alpha=RUN * m) + rows
+    chosen = _true(wanted.view(-1).index_select(0, places.view(-1)).view(RUN, -1))
+    run = chosen >> 4
+    rows = torch.add(chosen.bitwise_and_(RUN - 1), runs.index_select(0, run), alpha=RUN)
+    return columns.index_select(0, run), rows
+
+
+def _true(wanted: Tensor) -> Tensor:
+    """Indices of what is true in the transposed matrix; waits for the device."""
+    return wanted.T.contiguous().view(-1).nonzero()[:, 0]

@@ -1,0 +1,30 @@
+"""What is true is found in the order of columns, in runs and without."""
+
+from __future__ import annotations
+
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from leco_plugin.samplers.columns import RUN, by_column, by_column_in_runs
+
+
+def slow_by_column(wanted) -> list[tuple[int, int]]:
+    n, m = wanted.shape
+    return [(column, row) for column in range(m) for row in range(n) if wanted[row, column]]
+
+
+@settings(deadline=None, max_examples=40)
+@given(
+    runs=st.integers(1, 3),
+    m=st.integers(0, 9),
+    share=st.sampled_from([0.0, 0.05, 0.5, 1.0]),
+    seed=st.integers(0, 2**16),
+)
+def test_true_entries_come_by_column_then_row(runs, m, share, seed):
+    wanted = torch.rand(runs * RUN, m, generator=torch.Generator().manual_seed(seed)) < share
+    expected = slow_by_column(wanted)
+    for function in (by_column, by_column_in_runs):
+        columns, rows = function(wanted)
+        assert columns.dtype == rows.dtype == torch.int64
+        assert list(zip(columns.tolist(), rows.tolist(), strict=True)) == expected
