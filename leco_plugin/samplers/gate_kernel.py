@@ -236,6 +236,7 @@ def _gate_kernel(
 ):
     rows = tl.program_id(0).to(tl.int64) * ROWS + tl.arange(0, ROWS)
     there = rows < count
+    column_stride = column_stride.to(tl.int64)  # twice it is a billion positions' worth
     at = positions + rows * row_stride
     x = tl.load(at, mask=there, other=0.0)
     y = tl.load(at + column_stride, mask=there, other=0.0)

@@ -82,6 +82,7 @@ def _march_kernel(
     HALF: tl.constexpr,
 ):
     ray = tl.program_id(0)
+    n_rays = n_rays.to(tl.int64)  # six rows of them are read
     ox, oy, oz = (
         tl.load(rays + ray),
         tl.load(rays + n_rays + ray),
@@ -203,6 +204,7 @@ def march_kept(cache: CellCache, weights: GateWeights, candidates: Candidates) -
     tables = cache.tables()
     frame = torch.cat([cache.scale.view(-1), cache.shift.view(-1)])
     found = torch.zeros(n_rays, dtype=torch.int64, device=device)
+    nowhere = torch.zeros_like(found)
 
     def launch(starts: Tensor, ends: Tensor, samples: Samples) -> None:
         _march_kernel[(n_rays,)](
@@ -234,7 +236,7 @@ def march_kept(cache: CellCache, weights: GateWeights, candidates: Candidates) -
             enable_fp_fusion=False,
         )
 
-    launch(found, found, _room(1, device))
+    launch(nowhere, nowhere, _room(1, device))  # counts, and has no room to write
     ends = found.cumsum(0)
     last = (first + counts).max().long()
     total, highest = torch.stack([ends[-1], last]).tolist()  # the one wait

@@ -14,6 +14,7 @@ import torch
 from leco_plugin.models.encodings import EncodingConfig
 from leco_plugin.models.gate import Gate, GateConfig
 from leco_plugin.occupancy import Occupancy
+from leco_plugin.samplers.fused import _why_not
 from leco_plugin.space import Space
 
 INTERPRETED = os.environ.get("TRITON_INTERPRET") == "1"
@@ -57,6 +58,11 @@ def occupancy(
     values = made.query(positions(2000))
     made.threshold_value.copy_(values[values > 0.0].median())
     return made
+
+
+def left_to_torch(asked: Occupancy) -> str | None:
+    """Why this device gets no kernel for a gate; the interpreter takes them all."""
+    return None if INTERPRETED else _why_not(asked, torch.device(DEVICE))
 
 
 def positions(count: int, spread: float = 1.5, seed: int = 1) -> torch.Tensor:

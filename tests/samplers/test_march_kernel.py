@@ -8,9 +8,11 @@ import pytest
 import torch
 from samplers.analytic_occupancy import camera_rays
 from samplers.kernel_cases import DEVICE, NEAR_THRESHOLD, ON_KERNELS, occupancy
+from waits import Waits
 
 from leco_plugin.samplers.cache_build import build_cache
 from leco_plugin.samplers.estimator import LearnedOccupancyEstimator
+from leco_plugin.samplers.fused import twins_only
 from leco_plugin.samplers.gate_weights import gate_weights
 from leco_plugin.samplers.marching import Samples, march, number
 
@@ -42,7 +44,8 @@ def fused(made: LearnedOccupancyEstimator, *arguments, **options) -> Samples:
 
 def twin(made: LearnedOccupancyEstimator, *arguments, **options) -> Samples:
     occupied, near_occupied = made.questions()
-    return march(*arguments, occupied=occupied, near_occupied=near_occupied, **options)
+    with twins_only():
+        return march(*arguments, occupied=occupied, near_occupied=near_occupied, **options)
 
 
 def as_set(samples: Samples) -> set[tuple[float, float, float]]:
@@ -141,6 +144,30 @@ def test_rays_that_are_no_rays_keep_nothing_and_harm_no_other() -> None:
     samples = fused(made, origins, directions, *limits, step_size=STEP)
     assert not torch.isin(samples[0], torch.tensor([0, 1, 2, 3], device=DEVICE)).any()
     assert as_set(samples) == as_set(twin(made, origins, directions, *limits, step_size=STEP))
+
+
+def test_rays_wait_once_for_the_device(monkeypatch) -> None:
+    from leco_plugin.samplers import march_kernel
+
+    made, count = estimator("contraction"), 4
+    weights = gate_weights(made.occupancy)
+    launches = []
+
+    class Kernel:
+        def __getitem__(self, grid):
+            def launch(*arguments, **_):
+                launches.append(grid)
+                arguments[7].fill_(3)  # found
+
+            return launch
+
+    monkeypatch.setattr(march_kernel, "_march_kernel", Kernel())
+    limits = torch.zeros(count, device=DEVICE), torch.full((count,), 3.0, device=DEVICE)
+    with Waits() as waits:
+        candidates = number(*rays(count), *limits, STEP, 1.0 / 64.0)
+        samples = march_kernel.march_kept(made.cache, weights, candidates)
+    assert waits.seen == ["tolist"] and launches == [(count,)] * 2
+    assert [len(part) for part in samples] == [3 * count] * 3
 
 
 def test_a_ray_without_an_end_is_named() -> None:
