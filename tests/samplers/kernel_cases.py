@@ -39,15 +39,19 @@ def occupancy(
     layers: int = 2,
     octaves: int = 4,
     experts: int = 4,
+    encoding: EncodingConfig | None = None,
     seed: int = 0,
     walls: list[float] | None = None,
 ) -> Occupancy:
     """A gate of random weights, twice the usual size, whose threshold halves what is inside."""
     torch.manual_seed(seed)
-    gate = Gate(GateConfig(EncodingConfig(octaves=octaves), width, layers, experts))
+    encoding = encoding or EncodingConfig(octaves=octaves)
+    gate = Gate(GateConfig(encoding, width, layers, experts))
     with torch.no_grad():
         for parameter in gate.parameters():
             parameter.mul_(2.0)
+        for table in gate.encoding.parameters():
+            table.normal_()
         gate.norm.weight.add_(torch.randn(width) * 0.3)
         gate.norm.bias.add_(torch.randn(width) * 0.3)
     space = Space(kind, (0.1, 0.2, -0.3), 1.5)

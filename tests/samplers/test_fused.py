@@ -219,10 +219,10 @@ def test_sampling_waits_once_for_the_device() -> None:
     assert len(said) == 1
 
 
-@pytest.mark.parametrize("kind", ["hash", "vm", "k-planes"])
-def test_gates_on_tables_stay_with_torch(kind: str) -> None:
+@pytest.mark.parametrize("kind", ENCODINGS)
+def test_gates_on_all_features_have_a_kernel(kind: str) -> None:
     occupancy = Occupancy(Gate(GateConfig(ENCODINGS[kind])), Space(), 0.5)
-    assert why_not(occupancy) == f"its gate is on {kind} features"
+    assert why_not(occupancy) is None and fused.weights_of(occupancy) is not None
 
 
 @pytest.mark.parametrize(
@@ -230,7 +230,8 @@ def test_gates_on_tables_stay_with_torch(kind: str) -> None:
     [
         ({"width": 512}, "width 512; the kernel holds 256"),
         ({"layers": 9}, "layers 9; the kernel holds 8"),
-        ({"encoding": EncodingConfig(octaves=21)}, "octaves 21; the kernel holds 20"),
+        ({"encoding": EncodingConfig(octaves=21)}, "frequency features 66; the kernel holds 64"),
+        ({"encoding": EncodingConfig("vm", components=22)}, "vm features 66; the kernel holds 64"),
         ({"scene_experts": 64}, "logits 65; the kernel holds 64"),
     ],
 )
