@@ -15,18 +15,42 @@ import shutil
 import subprocess
 import sys
 import time
+from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
-from gpu_parts import PARTS, Scale
+from gpu_parts import correctness, experts, gate_throughput
+from gpu_sampling import sampling
+from gpu_scale import Scale
+from gpu_training import dense, learned
 
 from leco_plugin.evaluation.json_file import write_json
 from leco_plugin.evaluation.machine import describe_code, describe_machine
 
 RESULTS = Path(__file__).resolve().parent / "results"
 LIMIT = 600.0
-"""Seconds after which no further part is begun."""
+"""Seconds that a run may take."""
+
+
+class Part(NamedTuple):
+    """One thing that the suite measures."""
+
+    measure: Callable[[Scale, dict[str, Any]], dict[str, Any]]
+    """From the scale and the parts before it to JSON values."""
+    seconds: float
+    """What it may take; it is not begun with less time left."""
+
+
+PARTS = {
+    "correctness": Part(correctness, 120.0),
+    "gate": Part(gate_throughput, 40.0),
+    "sampling": Part(sampling, 70.0),
+    "experts": Part(experts, 20.0),
+    "learned": Part(learned, 170.0),
+    "dense": Part(dense, 170.0),
+}
+"""In the order in which they run."""
 
 
 def driver() -> str | None:
@@ -44,26 +68,43 @@ def results_path() -> Path:
     return RESULTS / f"gpu-{name}-{datetime.date.today():%Y%m%d}.json"
 
 
-def run(scale: Scale, out: Path | None) -> dict[str, Any]:
+def run(scale: Scale, out: Path | None, dry: bool) -> dict[str, Any]:
     """All parts that `out` does not hold yet; it is renewed after each."""
-    stored = json.loads(out.read_text()) if out is not None and out.exists() else {"parts": {}}
     about = {**describe_machine(), "driver": driver(), "cuda": torch.version.cuda}
-    results = {"format": 1, "machine": about, "code": describe_code(), "parts": stored["parts"]}
+    results = {"format": 1, "dry": dry, "machine": about, "code": describe_code(), "parts": {}}
+    results["parts"] = stored_parts(out, results)
     started = time.perf_counter()
     for name, part in PARTS.items():
         if name in results["parts"]:
             continue
-        if time.perf_counter() - started > LIMIT:
-            print(f"{name} is left for the next run: ten minutes are over", file=sys.stderr)
+        if time.perf_counter() - started > LIMIT - part.seconds:
+            print(f"{name} is left for the next run: the ten minutes are over", file=sys.stderr)
             break
-        results["parts"][name] = part(scale)
-        for figure in results["parts"][name].get("figures", []):
+        results["parts"][name] = measured = part.measure(scale, results["parts"])
+        for figure in measured.get("figures", []):
             sign = "<=" if figure["at_most"] else ">="
             verdict = "reached" if figure["reached"] else "NOT REACHED"
             print(f"{figure['name']}: {figure['value']:.3g} ({sign} {figure['bar']}) {verdict}")
+        missing = [kernel for kernel, runs in measured.get("running", {}).items() if not runs]
+        if missing and not dry:
+            print(f"{name}: torch answered in place of the fused {' and '.join(missing)}")
         if out is not None:
             write_json(out, results)
     return results
+
+
+def stored_parts(out: Path | None, results: dict[str, Any]) -> dict[str, Any]:
+    """Parts of an earlier run that was cut off, if it ran the same code on the same machine."""
+    if out is None or not out.exists():
+        return {}
+    try:
+        stored = json.loads(out.read_text())
+        if all(stored[name] == results[name] for name in ("format", "dry", "machine", "code")):
+            return dict(stored["parts"])
+        print(f"{out.name} is of another machine or other code: everything is measured anew")
+    except (ValueError, KeyError, TypeError):
+        print(f"{out.name} holds no results: everything is measured anew")
+    return {}
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -74,14 +115,16 @@ def main(arguments: list[str] | None = None) -> int:
     options = parser.parse_args(arguments)
     if options.dry_run:
         device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
-        run(Scale(device).dry(), options.out)
+        if options.out is not None and options.out.resolve().parent == RESULTS:
+            parser.error("a dry run leaves nothing among the results: give another --out")
+        run(Scale(device).dry(), options.out, dry=True)
         print("dry run: every part ran; its figures mean nothing")
         return 0
     if not torch.cuda.is_available():
         print("no CUDA device here: nothing is measured; try --dry-run", file=sys.stderr)
         return 2
-    run(Scale(torch.device("cuda")), options.out or results_path())
-    return 0
+    run(Scale(torch.device("cuda")), options.out or results_path(), dry=False)  # CUDA only
+    return 0  # CUDA only
 
 
 if __name__ == "__main__":

@@ -51,17 +51,22 @@ def seconds(function: Callable[[], Any], device: torch.device, rounds: int) -> f
     times = []
     for _ in range(rounds):
         if device.type == "cuda":
-            begin, end = (torch.cuda.Event(enable_timing=True) for _ in range(2))
-            begin.record()
-            function()
-            end.record()
-            end.synchronize()
-            times.append(begin.elapsed_time(end) / 1e3)
+            times.append(by_events(function))  # CUDA only
         else:
             started = time.perf_counter()
             function()
             times.append(time.perf_counter() - started)
     return statistics.median(times)
+
+
+def by_events(function: Callable[[], Any]) -> float:
+    """Seconds between two events of the device around a call."""
+    begin, end = (torch.cuda.Event(enable_timing=True) for _ in range(2))  # CUDA only
+    begin.record()  # CUDA only
+    function()  # CUDA only
+    end.record()  # CUDA only
+    end.synchronize()  # CUDA only
+    return begin.elapsed_time(end) / 1e3  # CUDA only
 
 
 def measure_ceilings(device: torch.device, size: int, rounds: int) -> Ceilings:

@@ -1,65 +1,34 @@
-"""What the GPU suite measures, part by part; each returns JSON values."""
+"""Parts of the GPU suite: correctness of the kernels, the gate against its floor, the experts."""
 
 from __future__ import annotations
 
-import importlib.util
-from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any
 
 import torch
 from gpu_floor import floor_seconds, measure_ceilings, seconds
+from gpu_scale import Scale, figure
+from gpu_training import peak_of
 from sampling_scene import fit_occupancy, rays_into
 from torch import Tensor
 
+from leco_plugin.models import grouped_trial
+from leco_plugin.models.dispatch import dispatch
 from leco_plugin.models.encodings import EncodingConfig
-from leco_plugin.models.field import HMoEField
 from leco_plugin.models.gate import Gate, GateConfig
-from leco_plugin.models.rendering import Intervals, Rays, Routing, shade
-from leco_plugin.models.sizes import LARGE, PAPER, SMALL, Sizes
-from leco_plugin.occupancy import Occupancy, gate_precision
+from leco_plugin.models.grouped import grouped_dispatch
+from leco_plugin.models.hmoe import Expert
+from leco_plugin.models.sizes import LARGE, PAPER, SMALL
+from leco_plugin.occupancy import Occupancy
 from leco_plugin.samplers import fused
 from leco_plugin.samplers.estimator import LearnedOccupancyEstimator
-from leco_plugin.samplers.grid import DenseEstimator, OccupancyGridEstimator
 from leco_plugin.space import Space
 
 NEAR_THRESHOLD = 2e-2
 """How far from the threshold o may lie where the fused gate decides otherwise than its twin."""
-
-
-@dataclass(frozen=True)
-class Scale:
-    """How much is measured."""
-
-    device: torch.device
-    positions: int = 1 << 22
-    rays: int = 4096
-    grid: int = 128
-    matrix: int = 8192
-    rounds: int = 30
-    fit_steps: int = 300
-    cache_bytes: int = 1 << 20
-    sizes: Sizes = PAPER
-
-    def dry(self) -> Scale:
-        """The smallest of everything."""
-        tiny = replace(SMALL, candidates=16)
-        small = replace(self, positions=512, rays=32, grid=16, matrix=64, rounds=2)
-        return replace(small, fit_steps=20, cache_bytes=0, sizes=tiny)
-
-
-def figure(name: str, value: float, bar: float, at_most: bool, **parts: float) -> dict[str, Any]:
-    """A ratio with the bar it must reach and the milliseconds behind it."""
-    reached = value <= bar if at_most else value >= bar
-    milliseconds = {part: round(time * 1e3, 5) for part, time in parts.items()}
-    return {
-        "name": name,
-        "value": value,
-        "bar": bar,
-        "at_most": at_most,
-        "reached": reached,
-        "milliseconds": milliseconds,
-    }
+MOST_OTHERWISE = 5e-3
+"""Share of the kept candidates of which the fused march may keep others than its twin: cells add
+planes, whose own errors lie around the threshold, to the roundings of the gate."""
 
 
 def random_occupancy(config: GateConfig, device: torch.device) -> Occupancy:
@@ -79,28 +48,66 @@ def gates() -> dict[str, GateConfig]:
     return {"small": small, "large": LARGE.gate, "paper": PAPER.gate, **others, **deep}
 
 
-def correctness(scale: Scale) -> dict[str, Any]:
+def correctness(scale: Scale, before: dict[str, Any]) -> dict[str, Any]:
     """Decisions and intervals against the torch twins.
 
     Raises:
-        RuntimeError: they differ farther from the threshold than is stated.
+        RuntimeError: they differ farther from the threshold, or more often, than is stated.
     """
-    found = {}
-    for name, config in gates().items():
-        occupancy = random_occupancy(config, scale.device)
-        places = torch.randn(min(scale.positions, 1 << 18), 3, device=scale.device) * 2.0
-        ours = occupancy.occupied(places)
-        with fused.twins_only():
-            differing = ours != occupancy.occupied(places)
-        distances = (occupancy.query(places) - occupancy.threshold_value).abs()[differing]
-        farthest = float(distances.max()) if len(distances) else 0.0
-        found[name] = {"differing": float(differing.float().mean()), "farthest": farthest}
-        if farthest > NEAR_THRESHOLD:
-            raise RuntimeError(f"the fused gate is wrong ({name}): {farthest} from the threshold")
-    return {"gates": found, "kernels": fused.ready(scale.device)}
+    found = {name: decisions_differ(config, scale) for name, config in gates().items()}
+    for name, differing in found.items():
+        if differing["farthest"] > NEAR_THRESHOLD:
+            raise RuntimeError(
+                f"the fused gate is wrong ({name}): {differing['farthest']} from the threshold"
+            )
+    occupancy = fit_occupancy(str(scale.device), steps=scale.fit_steps)
+    learned = LearnedOccupancyEstimator(occupancy, cache_bytes=scale.cache_bytes, tolerance=1.0)
+    differing = {
+        f"cone angle {angle}": intervals_differ(learned, angle, scale) for angle in (0.0, 0.01)
+    }
+    for name, share in differing.items():
+        if share > MOST_OTHERWISE:
+            raise RuntimeError(f"the fused march is wrong ({name}): {share:.2%} of what it keeps")
+    return {"gates": found, "march": differing, "running": running(scale.device)}
 
 
-def gate_throughput(scale: Scale) -> dict[str, Any]:
+def running(device: torch.device) -> dict[str, bool]:
+    """Which kernels answer on this device; where one does not, figures are those of its twin."""
+    return {name: fused.ready(device, name) for name in ("gate", "march")}
+
+
+def decisions_differ(config: GateConfig, scale: Scale) -> dict[str, float]:
+    """Share of positions about which kernel and twin differ, and how far off the threshold."""
+    occupancy = random_occupancy(config, scale.device)
+    places = torch.randn(min(scale.positions, 1 << 18), 3, device=scale.device) * 2.0
+    ours = occupancy.occupied(places)
+    with fused.twins_only():
+        differing = ours != occupancy.occupied(places)
+    distances = (occupancy.query(places) - occupancy.threshold_value).abs()
+    return {
+        "differing": float(differing.float().mean()),
+        "farthest": float((distances * differing).max()),
+    }
+
+
+def intervals_differ(learned: LearnedOccupancyEstimator, angle: float, scale: Scale) -> float:
+    """Share of the kept intervals that only one of the march's kernel and its twin keeps."""
+    rays = rays_into(learned.occupancy.space, scale.rays)
+    options: dict[str, Any] = {"render_step_size": 0.01, "far_plane": 8.0, "cone_angle": angle}
+    ours = numbers_of(learned.sampling(*rays, **options))
+    with fused.twins_only():
+        theirs = numbers_of(learned.sampling(*rays, **options))
+    single = (~torch.isin(ours, theirs)).sum() + (~torch.isin(theirs, ours)).sum()
+    return float(single) / max(len(theirs), 1)
+
+
+def numbers_of(samples: tuple[Tensor, Tensor, Tensor]) -> Tensor:
+    """One number for each interval, which a rounding of its ends leaves alone; [N] int64."""
+    ray_indices, t_starts, t_ends = samples
+    return (ray_indices << 32) + ((t_starts + t_ends) * 1e3).round().long()
+
+
+def gate_throughput(scale: Scale, before: dict[str, Any]) -> dict[str, Any]:
     """The fused gate against its floor and against the eager twin in bf16."""
     ceilings = measure_ceilings(scale.device, scale.matrix, scale.rounds)
     figures = []
@@ -119,110 +126,33 @@ def gate_throughput(scale: Scale) -> dict[str, Any]:
             ),
             figure(f"{title}: eager twin / fused", twin / ours, 5.0, False, fused=ours, twin=twin),
         ]
-    return {"ceilings": vars(ceilings), "figures": figures}
+    return {"ceilings": vars(ceilings), "running": running(scale.device), "figures": figures}
 
 
-def sampling(scale: Scale) -> dict[str, Any]:
-    """Sampling rays by the gate with its cells, by its torch twin, and by grids of the same set."""
-    occupancy = fit_occupancy(str(scale.device), steps=scale.fit_steps)
-    learned = LearnedOccupancyEstimator(occupancy, cache_bytes=scale.cache_bytes)
-    origins, directions = rays_into(occupancy.space, scale.rays)
-    options: dict[str, Any] = {"render_step_size": float(occupancy.space.half_extent) / 200.0}
-    sample = lambda e: e.sampling(origins, directions, **options)  # noqa: E731
-    ours = seconds(lambda: sample(learned), scale.device, scale.rounds)
-    kept = {"learned": len(sample(learned)[0])}
-    with fused.twins_only():
-        twin = seconds(lambda: sample(learned), scale.device, scale.rounds)
-        kept["twin"] = len(sample(learned)[0])
-    figures = [
-        figure("sampling: torch twin / fused", twin / ours, 1.0, False, ours=ours, twin=twin)
-    ]
-    for name, grid in grids(occupancy, scale).items():
-        theirs = seconds(lambda g=grid: sample(g), scale.device, scale.rounds)
-        kept[name] = len(sample(grid)[0])
-        title = f"sampling {scale.rays} rays: learned / {name}"
-        figures.append(figure(title, ours / theirs, 1.0, True, learned=ours, grid=theirs))
-    cells = None if learned.cache is None else vars(learned.cache.report)
-    return {"kept": kept, "cache": cells, "figures": figures}
+def experts(scale: Scale, before: dict[str, Any]) -> dict[str, Any]:
+    """Points through the scene experts, forward and backward: grouped, and one expert by one."""
+    config, device = scale.sizes.field.experts, scale.device
+    n, count = config.scene_experts, scale.batch * scale.sizes.candidates
+    made = [Expert(config.width, config.layers, config.skip, config.residual) for _ in range(n)]
+    scene = torch.nn.ModuleList(made).to(device)
+    points = torch.randn(count, config.width, device=device).bfloat16().requires_grad_()
+    routes = torch.randint(1 + n, (count,), device=device)
 
+    def through(grouped: bool) -> None:
+        if grouped:
+            answers = grouped_dispatch(points, routes, made)
+        else:
+            with torch.autocast(device.type, dtype=torch.bfloat16):
+                answers = dispatch(points, routes, [None, *made])
+        torch.autograd.grad(answers.float().sum(), [points, *scene.parameters()])
 
-def grids(occupancy: Occupancy, scale: Scale) -> dict[str, Any]:
-    """Our torch grid and, where its kernels build, nerfacc's, filled from the occupancy."""
-    space = occupancy.space
-    box = torch.cat([space.center - space.half_extent, space.center + space.half_extent])
-    classes: dict[str, Callable[..., Any]] = {"torch grid": OccupancyGridEstimator}
-    if scale.device.type == "cuda" and importlib.util.find_spec("nerfacc"):
-        import nerfacc
-
-        classes["nerfacc grid"] = nerfacc.OccGridEstimator
-    made = {}
-    for name, build in classes.items():
-        for levels in (1, 4):
-            grid = build(box.cpu(), resolution=scale.grid, levels=levels).to(scale.device).train()
-            grid.update_every_n_steps(0, lambda x: occupancy.occupied(x).float())
-            made[f"{name} {scale.grid}^3 x {levels}"] = grid
-    return made
-
-
-def training(scale: Scale) -> dict[str, Any]:
-    """A training step of the HMoE on all candidates, and guided, with their peak memory."""
-    occupancy = fit_occupancy(str(scale.device), steps=scale.fit_steps)
-    space, device = occupancy.space, scale.device
-    origins, directions = rays_into(space, scale.rays // 4)
-    zeros = torch.zeros_like(origins[:, 0])
-    reach = 4.0 * float(space.half_extent)
-    rays = Rays(origins, directions, zeros, zeros + reach, None)
-    image = torch.rand(len(origins), 3, device=device)
-    options = {"render_step_size": reach / scale.sizes.candidates, "far_plane": reach}
-    box = torch.cat([space.center - space.half_extent, space.center + space.half_extent])
-    samplers = {
-        "dense": DenseEstimator(box).to(device),
-        "guided": LearnedOccupancyEstimator(occupancy, cache_bytes=scale.cache_bytes),
-    }
-    times, peaks = {}, {}
-    for name, sampler in samplers.items():
-        torch.manual_seed(0)
-        field = HMoEField(scale.sizes.field, num_images=1).to(device)
-        optimizer = torch.optim.Adam(field.parameters(), lr=1e-3)
-
-        def step(s: Any = sampler, f: HMoEField = field, o: Any = optimizer) -> None:
-            intervals = Intervals(*s.sampling(origins, directions, stratified=True, **options))
-            loss = loss_of(f, occupancy, rays, intervals, image)
-            o.zero_grad()
-            loss.backward()
-            o.step()
-
-        if device.type == "cuda":
-            torch.cuda.reset_peak_memory_stats()
-        times[name] = seconds(step, device, max(2, scale.rounds // 3))
-        peaks[name] = torch.cuda.max_memory_allocated() if device.type == "cuda" else 0
-    figures = [
-        figure(
-            "training step: dense / guided", times["dense"] / times["guided"], 2.5, False, **times
-        )
-    ]
-    if peaks["dense"]:
-        ratio = peaks["guided"] / peaks["dense"]
-        figures.append(figure("peak memory: guided / dense", ratio, 0.5, True))
-    return {"peak_bytes": peaks, "figures": figures}
-
-
-def loss_of(
-    field: HMoEField, occupancy: Occupancy, rays: Rays, intervals: Intervals, image: Tensor
-) -> Tensor:
-    """Photometric loss of a mixture of experts on packed intervals; every point meets an expert."""
-    routing = Routing(None, homogeneous=True)
-    with gate_precision(image.device.type, "bfloat16"):
-        shaded = shade(
-            field, occupancy.gate, occupancy.space, rays, intervals, routing, freeze_gate=True
-        )
-    return (shaded.rgb.float() - image).square().mean()
-
-
-PARTS: dict[str, Callable[[Scale], dict[str, Any]]] = {
-    "correctness": correctness,
-    "gate": gate_throughput,
-    "sampling": sampling,
-    "training": training,
-}
-"""In the order in which they run."""
+    taken, peaks = {}, {}
+    for name, grouped in (("grouped", True), ("one by one", False)):
+        peak = peak_of(device)
+        taken[name] = seconds(lambda g=grouped: through(g), device, max(2, scale.rounds // 3))
+        peaks[name] = peak()
+    title = f"{n} experts of {config.layers} x {config.width}, {count} points"
+    ratio = taken["one by one"] / taken["grouped"]
+    figures = [figure(f"{title}: one by one / grouped", ratio, 1.0, False, **taken)]
+    chosen = grouped_trial.serves(device, n, config.width)
+    return {"peak_bytes": peaks, "grouped is chosen": chosen, "figures": figures}

@@ -120,6 +120,17 @@ def gpu_table(results: dict[str, Any]) -> str:
     return "\n".join(rows)
 
 
+def check_gpu(results: dict[str, Any]) -> None:
+    """Refuses figures that no card has given.
+
+    Raises:
+        ValueError: of a dry run, or without a card and its driver.
+    """
+    machine = results["machine"]
+    if results["dry"] or machine["device"] == "cpu" or machine["driver"] is None:
+        raise ValueError(f"results of a GPU that nobody ran on are not shown: {machine}")
+
+
 def section(
     title: str, command: str, report: dict[str, Any], table: str, note: str = ""
 ) -> list[str]:
@@ -144,6 +155,7 @@ def page() -> str:
         parts += section(title, command, report, sampling_table(report), note)
     for path in sorted(RESULTS.glob("gpu-*.json")):
         report = json.loads(path.read_text())
+        check_gpu(report)
         title, command = f"On a GPU: {report['machine']['device']}", "python benchmarks/gpu.py"
         parts += section(title, command, report, gpu_table(report))
     return "\n".join(parts)

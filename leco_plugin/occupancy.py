@@ -13,8 +13,6 @@ from pathlib import Path
 from typing import Any, Literal, cast, get_args
 
 import torch
-from safetensors import SafetensorError, safe_open
-from safetensors.torch import save
 from torch import Tensor, nn
 
 from leco_plugin.models.gate import Gate, GateConfig, check_sizes
@@ -124,6 +122,8 @@ class Occupancy(nn.Module):
         header["sha256"] = _digest(header, tensors)
         unfinished = path.with_name(f".{path.name}.{os.getpid()}.unfinished")
         try:
+            from safetensors.torch import save  # a gate in memory needs torch only
+
             # not save_file: that leaves a file which only its owner can read
             unfinished.write_bytes(save(tensors, metadata=header))
             unfinished.replace(path)
@@ -139,6 +139,8 @@ class Occupancy(nn.Module):
             ValueError: the file is truncated, oversized, foreign, of another version, or holds
                 tensors that are missing, misshapen or not finite. One line each.
         """
+        from safetensors import SafetensorError, safe_open
+
         path = Path(path)
         if path.is_dir():
             raise IsADirectoryError(f"{path} is a folder; an occupancy is a file")
@@ -151,7 +153,7 @@ class Occupancy(nn.Module):
                 tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
         except OSError as error:
             raise OSError(f"{path} cannot be read: {_line(error)}") from None
-        except _UNREADABLE as error:
+        except (SafetensorError, *_UNREADABLE) as error:
             raise ValueError(f"{path} is not a whole safetensors file: {_line(error)}") from None
         return cls._checked(path, header, tensors).to(device)
 
@@ -207,7 +209,6 @@ def _check_values(path: Path, tensors: dict[str, Tensor]) -> None:
 
 
 _UNREADABLE = (
-    SafetensorError,
     AttributeError,
     KeyError,
     MemoryError,
@@ -216,7 +217,7 @@ _UNREADABLE = (
     TypeError,
     ValueError,
 )
-"""What safetensors, json and torch raise when they meet nonsense."""
+"""What json and torch raise when they meet nonsense."""
 
 
 def _line(error: BaseException) -> str:

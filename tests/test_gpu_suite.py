@@ -1,53 +1,131 @@
-"""The GPU suite runs to its end without a GPU, resumes, and then measures nothing."""
+"""The GPU suite: every line runs without a GPU, on a bare machine, and from where it was killed."""
 
 from __future__ import annotations
 
-import importlib.util
+import importlib
 import json
 import os
+import signal
 import subprocess
 import sys
+import time
 from pathlib import Path
+from types import ModuleType
 
 import pytest
 import torch
+from torch.utils.flop_counter import FlopCounterMode
 
 from leco_plugin.models.encodings import EncodingConfig
+from leco_plugin.models.field import HMoEField
 from leco_plugin.models.gate import GateConfig
 
-BENCHMARKS = Path(__file__).resolve().parent.parent / "benchmarks"
+HERE = Path(__file__).resolve().parent
+BENCHMARKS = HERE.parent / "benchmarks"
+PARTS = ["correctness", "gate", "sampling", "experts", "learned", "dense"]
+
+ON_A_BARE_MACHINE = """
+import importlib.abc, runpy, sys
+ABSENT = {
+    "nerfstudio", "nerfacc", "torchmetrics", "torchvision", "tyro", "safetensors", "matplotlib",
+    "plotly", "trimesh", "rich", "PIL", "scipy", "triton", "viser", "open3d", "gsplat", "embreex",
+}
+class Absent(importlib.abc.MetaPathFinder):
+    def find_spec(self, name, path=None, target=None):
+        if name.split(".")[0] in ABSENT:
+            raise ModuleNotFoundError(f"No module named {name!r}", name=name)
+sys.meta_path.insert(0, Absent())
+sys.argv = ["gpu.py", "--dry-run", "--out", sys.argv[2]]
+runpy.run_path("gpu.py", run_name="__main__")
+"""
+"""Torch and numpy are there, and of what this package wants nothing else is."""
 
 
-def suite(*arguments: str) -> subprocess.CompletedProcess[str]:
-    command = [sys.executable, str(BENCHMARKS / "gpu.py"), *arguments]
-    environment = {**os.environ, "PYTHONPATH": str(BENCHMARKS.parent)}
-    return subprocess.run(command, capture_output=True, text=True, timeout=280, env=environment)
+@pytest.fixture
+def benchmarks(monkeypatch) -> None:
+    monkeypatch.syspath_prepend(str(BENCHMARKS))
 
 
-def test_the_dry_run_does_every_part_and_a_second_one_none(tmp_path: Path) -> None:
+def load(name: str) -> ModuleType:
+    return importlib.import_module(name)
+
+
+def environment() -> dict[str, str]:
+    return {**os.environ, "PYTHONPATH": str(BENCHMARKS.parent), "OMP_NUM_THREADS": "1"}
+
+
+def test_every_line_is_exercised_without_a_gpu() -> None:
+    command = [sys.executable, str(HERE / "gpu_suite_traced.py")]
+    done = subprocess.run(
+        command, capture_output=True, text=True, timeout=280, env=environment(), cwd=HERE.parent
+    )
+    assert done.returncode == 0, done.stdout[-4000:] + done.stderr[-2000:]
+
+
+def test_a_killed_run_on_a_bare_machine_goes_on_where_it_stopped(tmp_path: Path) -> None:
     out = tmp_path / "gpu.json"
-    done = suite("--dry-run", "--out", str(out))
-    assert done.returncode == 0, done.stderr
-    results = json.loads(out.read_text())
-    assert list(results["parts"]) == ["correctness", "gate", "sampling", "training"]
-    assert results["machine"]["torch"] == torch.__version__ and "driver" in results["machine"]
-    again = suite("--dry-run", "--out", str(out))
-    assert again.returncode == 0 and "floor / fused" not in again.stdout
-    assert json.loads(out.read_text())["parts"] == results["parts"]
+    command = [sys.executable, "-c", ON_A_BARE_MACHINE, "--", str(out)]
+
+    def begin() -> subprocess.Popen[str]:
+        return subprocess.Popen(
+            command, cwd=BENCHMARKS, env=environment(), text=True, stderr=subprocess.PIPE
+        )
+
+    first = begin()
+    while not (out.exists() and "gate" in json.loads(out.read_text())["parts"]):
+        assert first.poll() is None, first.communicate()[1]
+        time.sleep(0.05)
+    first.send_signal(signal.SIGKILL)
+    first.communicate()
+    before = json.loads(out.read_text())["parts"]
+    assert len(before) < len(PARTS)
+    second = begin()
+    _, error = second.communicate(timeout=280)
+    assert second.returncode == 0, error
+    after = json.loads(out.read_text())["parts"]
+    assert list(after) == PARTS and {name: after[name] for name in before} == before
 
 
-@pytest.mark.skipif(torch.cuda.is_available(), reason="there is a GPU to be measured")
-def test_without_a_gpu_nothing_is_measured() -> None:
-    done = suite()
-    assert done.returncode == 2 and "no CUDA device here" in done.stderr
+def test_operations_on_paper_are_those_of_the_products(benchmarks) -> None:
+    paper, sizes = load("gpu_paper"), load("gpu_scale").PAPER
+    with FlopCounterMode(display=False) as counted, torch.device("meta"):
+        field = HMoEField(sizes.field, 1)
+        features = field.projection(torch.empty(10, field.encoding.out_dim))
+        field.density_head(field.experts.experts[1](features))
+    assert counted.get_total_flops() == 10 * paper.field_operations(sizes)
+    dense = paper.step_of(sizes, 10, 0, guided=False)
+    assert dense.operations == 30 * (
+        paper.field_operations(sizes) + paper.operations_per_position(sizes.gate)
+    )
 
 
-def test_the_floor_is_the_larger_of_bytes_and_operations(monkeypatch) -> None:
-    spec = importlib.util.spec_from_file_location("gpu_floor", BENCHMARKS / "gpu_floor.py")
-    assert spec is not None and spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    monkeypatch.setitem(sys.modules, "gpu_floor", module)
-    spec.loader.exec_module(module)
+def test_stored_results_are_of_cards_that_somebody_ran_on(benchmarks) -> None:
+    page = load("results_page")
+    for path in page.RESULTS.glob("gpu-*.json"):
+        page.check_gpu(json.loads(path.read_text()))
+    measured = {"dry": False, "machine": {"device": "NVIDIA H100", "driver": "570.86"}}
+    page.check_gpu(measured)
+    for fault in (
+        {"dry": True},
+        {"machine": {"device": "cpu", "driver": "570.86"}},
+        {"machine": {"device": "NVIDIA H100", "driver": None}},
+    ):
+        with pytest.raises(ValueError, match="nobody ran on"):
+            page.check_gpu({**measured, **fault})
+
+
+def test_a_figure_is_shown_with_its_floor_beside_it(benchmarks) -> None:
+    figure = load("gpu_scale").figure(
+        "gate: floor / fused", 0.6, 0.5, False, fused=2e-3, floor=1e-3
+    )
+    row = (
+        load("results_page").gpu_table({"parts": {"gate": {"figures": [figure]}}}).splitlines()[-1]
+    )
+    assert row == "| gate: floor / fused | 0.6 | >= 0.5 | yes | fused 2, floor 1 |"
+
+
+def test_the_floor_is_the_larger_of_bytes_and_operations(benchmarks) -> None:
+    module = load("gpu_floor")
     config = GateConfig(EncodingConfig(octaves=6), width=64, layers=3, scene_experts=4)
     assert module.operations_per_position(config) == 2 * (39 * 64 + 2 * 64 * 64 + 64 * 5)
     slow_memory = module.floor_seconds(config, 10, module.Ceilings(13.0, 1e12))

@@ -6,13 +6,13 @@ Nothing waits for the device: where an expert's points begin and end stays there
 
 from __future__ import annotations
 
-import functools
 from collections.abc import Sequence
 from typing import Protocol, cast
 
 import torch
 from torch import Tensor, nn
 
+from leco_plugin.models.grouped_trial import grouped_product, serves
 from leco_plugin.models.rows import permute_rows
 
 
@@ -52,7 +52,7 @@ def grouped_dispatch(features: Tensor, routes: Tensor, experts: Sequence[Layered
         layers = [cast(nn.Linear, expert.layers[i]) for expert in experts]
         weights = torch.stack([layer.weight for layer in layers]).to(points.dtype)
         biases = torch.stack([layer.bias for layer in layers]).to(points.dtype)
-        hidden = nn.functional.grouped_mm(hidden, weights.mT, offs=ends)
+        hidden = grouped_product(hidden, weights, ends)
         # rows beyond the last group hold anything, and so do their gradients
         hidden = torch.where(taken, hidden + biases.index_select(0, groups), 0.0)
         if i < last or not first.residual:
@@ -61,56 +61,22 @@ def grouped_dispatch(features: Tensor, routes: Tensor, experts: Sequence[Layered
     return permute_rows(hidden, inverse, order)
 
 
-def may_group(features: Tensor, width: int) -> bool:
-    """Whether `grouped_dispatch` serves: bfloat16 on a CUDA device on which a small trial agrees.
+def may_group(features: Tensor, n: int, width: int) -> bool:
+    """Whether `grouped_dispatch` serves: bfloat16 on CUDA where a trial finds it right and faster.
 
-    Rows must be multiples of 16 bytes.
+    Rows must be multiples of 16 bytes, and there must be some.
+
+    Args:
+        features: [N, width].
+        n: number of experts.
+        width: of their layers.
     """
     device = features.device.type
-    if device != "cuda" or width % 8 or not hasattr(nn.functional, "grouped_mm"):
+    if device != "cuda" or width % 8 or not len(features):
         return False
     return (
-        torch.get_autocast_dtype(device) == torch.bfloat16
+        hasattr(nn.functional, "grouped_mm")
+        and torch.get_autocast_dtype(device) == torch.bfloat16
         and (features.dtype == torch.bfloat16 or torch.is_autocast_enabled(device))
-        and works_on(features.device)
+        and serves(features.device, n, width)
     )
-
-
-@functools.cache
-def works_on(device: torch.device, dtype: torch.dtype = torch.bfloat16) -> bool:
-    """Whether grouped products, forward and backward, are right on this device; tried once.
-
-    The trial has what routes have: a group of an odd size, one without rows, and rows in no group.
-    """
-    sizes, width, beyond = [5, 0, 27], 16, 3
-    with (
-        torch.inference_mode(False),
-        torch.enable_grad(),
-        torch.autocast(device.type, enabled=False),
-    ):
-        count, n = sum(sizes) + beyond, len(sizes)
-        rows = torch.linspace(-1.0, 1.0, count * width, device=device).view(count, width)
-        matrices = torch.linspace(1.0, -1.0, n * width**2, device=device).view(n, width, width)
-        given = rows.to(dtype), matrices.to(dtype)
-        ends = torch.tensor(sizes, device=device).cumsum(0).to(torch.int32)
-
-        def answers(grouped: bool) -> list[Tensor]:
-            points, weights = (value.clone().requires_grad_() for value in given)
-            if grouped:
-                product = nn.functional.grouped_mm(points, weights.mT, offs=ends)[:-beyond]
-            else:
-                parts = points[:-beyond].split(sizes)
-                product = torch.cat([part @ one.mT for part, one in zip(parts, weights)])
-            of_points, of_weights = torch.autograd.grad(
-                product, [points, weights], given[0][:-beyond]
-            )
-            return [product, of_points[:-beyond], of_weights]
-
-        try:
-            found, wanted = answers(True), answers(False)
-            return all(
-                torch.allclose(one, other, rtol=0.05, atol=0.05)
-                for one, other in zip(found, wanted, strict=True)
-            )
-        except (RuntimeError, TypeError, ValueError):
-            return False

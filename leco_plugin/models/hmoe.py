@@ -93,7 +93,7 @@ class HMoE(nn.Module):
             [N, width] in the dtype of the experts' output.
         """
         empty, *scene = self.experts
-        if may_group(features, self.config.width):
+        if may_group(features, len(scene), self.config.width):
             hidden = self._grouped(features, routes)
             return hidden * gate_values[:, None].to(hidden.dtype)
         experts = [None if self.config.empty_expert == "none" else empty, *scene]

@@ -230,17 +230,12 @@ class LecoModel(Model):
         """Candidates along the rays; guided, only those that the occupancy keeps."""
         _, _, step, learn_step, cone, learn_cone = self.march_range.tolist()
         size, angle = (learn_step, learn_cone) if learning else (step, cone)
-        samples = march(
-            rays.origins,
-            rays.directions,
-            rays.t_mins,
-            rays.t_maxs,
-            step_size=size,
-            cone_angle=angle,
-            jitter=torch.rand_like(rays.t_mins) if self.training else None,
-            occupied=self.estimator.occupied if guided else None,
-            near_occupied=self.estimator.questions()[1] if guided else None,
-        )
+        jitter = torch.rand_like(rays.t_mins) if self.training else None
+        along = rays.origins, rays.directions, rays.t_mins, rays.t_maxs
+        if guided:
+            samples = self.estimator.kept(*along, size, angle, jitter, t_enters=None)
+        else:
+            samples = march(*along, step_size=size, cone_angle=angle, jitter=jitter)
         intervals = Intervals(*samples)
         # a homogeneous gate is taught nothing about emptiness
         followed = self.ramped > 0.0 and not is_dense(self.progress, self.step)

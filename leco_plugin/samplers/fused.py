@@ -32,22 +32,17 @@ _log = logging.getLogger(__name__)
 WIDEST_MARCH = 128
 """Compiled, a march around a wider gate spills its registers; the twin asks the fused gate then."""
 
-CHECKED, MOST_OTHERWISE = 4096, 20
-"""Positions that a gate's kernel is tried on before it is trusted, and of how many it may decide
-otherwise than the twin; a steep gate turns single roundings into decisions."""
-NEAR_THRESHOLD = {True: 0.02, False: 2e-4}
-"""Distance of o(x) from the threshold within which a decision is not counted; by whether products
-are bfloat16."""
+ALL = frozenset({"gate", "march"})
 
 Answer = TypeVar("Answer")
 PlanFn = Callable[[], Candidates]
 
 
 class _Switch:
-    """Whether kernels are used in this process; off for good once one has failed."""
+    """The kernels that are not used in this process; for good once one has failed."""
 
     def __init__(self) -> None:
-        self.off = False
+        self.off: frozenset[str] = frozenset()
 
 
 class _Packed(NamedTuple):
@@ -62,22 +57,25 @@ class _Packed(NamedTuple):
 
 _switch = _Switch()
 _packed: WeakKeyDictionary[nn.Module, _Packed] = WeakKeyDictionary()
-_checked: WeakKeyDictionary[nn.Module, GateWeights] = WeakKeyDictionary()
+_passed: dict[str, WeakKeyDictionary[nn.Module, GateWeights]] = {
+    name: WeakKeyDictionary() for name in ("gate", "march", "march with growing steps")
+}
+"""The weights with which each kernel passed its trial: of an occupancy, or of its cells."""
 
 
 @contextmanager
 def twins_only() -> Iterator[None]:
     """Within it torch answers everything: what kernels are compared with."""
-    before, _switch.off = _switch.off, True
+    before, _switch.off = _switch.off, ALL
     try:
         yield
     finally:
         _switch.off = before
 
 
-def ready(device: torch.device) -> bool:
-    """Whether kernels may be tried on this device."""
-    return device.type == "cuda" and torch.version.cuda is not None and not _switch.off
+def ready(device: torch.device, name: str = "gate") -> bool:
+    """Whether a kernel, `gate` or `march`, may be tried on this device."""
+    return device.type == "cuda" and torch.version.cuda is not None and name not in _switch.off
 
 
 def decisions(occupancy: nn.Module, positions: Tensor) -> Tensor | None:
@@ -101,30 +99,29 @@ def decisions(occupancy: nn.Module, positions: Tensor) -> Tensor | None:
 
 
 def trusted(occupancy: nn.Module, weights: GateWeights) -> bool:
-    """Whether the kernel decides as the twin with these weights; tried once, on random positions.
+    """Whether the gate's kernel decides as the twin with these weights; tried once.
 
     A kernel that does not is switched off, and the log says so.
     """
-    if _checked.get(occupancy) is weights:
+    from leco_plugin.samplers.trials import try_gate
+
+    return _passes("gate", "gate", occupancy, weights, lambda: try_gate(occupancy, weights))
+
+
+def _passes(
+    name: str, kind: str, owner: nn.Module, weights: GateWeights, trial: Callable[[], None]
+) -> bool:
+    """Whether a kernel has passed a trial with these weights, now or before."""
+    if _passed[kind].get(owner) is weights:
         return True
 
-    def compare() -> bool:
-        from leco_plugin.samplers.gate_kernel import gate_decisions
-
-        centre, half_extent = weights.facts[:3], weights.facts[3]
-        unit = torch.rand(CHECKED, 3, generator=torch.Generator().manual_seed(0)) * 2.4 - 1.2
-        positions = centre + half_extent * unit.to(centre)
-        o, threshold = occupancy.query(positions), weights.facts[10]  # type: ignore[operator]
-        kept = gate_decisions(weights, positions)
-        far = (o - threshold).abs() > NEAR_THRESHOLD[weights.half]
-        wrong = int((far & (kept != (o >= threshold))).sum())
-        if wrong > MOST_OTHERWISE:
-            raise ValueError(f"it decides otherwise about {wrong} of {CHECKED} positions")
+    def passes() -> bool:
+        trial()
         return True
 
-    if tried("gate", compare, weights.facts.device) is None:
+    if tried(name, passes, weights.facts.device) is None:
         return False
-    _checked[occupancy] = weights
+    _passed[kind][owner] = weights
     return True
 
 
@@ -144,13 +141,26 @@ def march(
     Raises:
         ValueError: as `marching.march`.
     """
-    if cache is None or not ready(device) or not isinstance(occupancy, nn.Module):
+    if cache is None or not isinstance(occupancy, nn.Module):
+        return None
+    if not (ready(device) and ready(device, "march")):
         return None
     weights = weights_of(occupancy)
     if weights is None or weights.padded_width > WIDEST_MARCH or not trusted(occupancy, weights):
         return None
     candidates = plan()
     if candidates.counts.dtype != torch.float32 or not growth_fits(candidates):
+        return None
+
+    coned = candidates.cone_angle > 0.0
+    kind = "march with growing steps" if coned else "march"
+
+    def trial() -> None:
+        from leco_plugin.samplers.trials import try_march
+
+        try_march(occupancy, cache, weights, coned)
+
+    if not _passes("march", kind, cache, weights, trial):
         return None
 
     def ask() -> Samples:
@@ -168,14 +178,17 @@ def growth_fits(candidates: Candidates) -> bool:
 
 
 def tried(name: str, kernel: Callable[[], Answer], device: torch.device) -> Answer | None:
-    """What a kernel answers, or None after it failed, which the log says once."""
+    """What a kernel answers, or None after it failed, which the log says once.
+
+    Where the gate fails the march, which holds it, is not tried; not the other way round.
+    """
     try:
         with on(device):
             return kernel()
     except (torch.cuda.OutOfMemoryError, TooManyCandidates):
         raise
     except Exception as error:  # noqa: BLE001 - a compiler and its driver raise what they like
-        _switch.off = True
+        _switch.off |= {name, "march"}
         reason = next(iter(str(error).splitlines()), "") or type(error).__name__
         _log.warning("the fused %s does not run, torch answers in its place: %s", name, reason)
         return None
@@ -193,7 +206,7 @@ def weights_of(occupancy: nn.Module) -> GateWeights | None:
     found = _packed.get(occupancy)
     if found is None or found.now != now:
         device = state[0].device if state else torch.device("cpu")
-        reason = why_not(occupancy, _most_width(occupancy, device))
+        reason = _why_not(occupancy, device)
         if reason is not None and found is None:  # else it has been said
             _log.info("no fused gate: %s", reason)
         held = tuple(value.detach() for value in state)
@@ -202,12 +215,16 @@ def weights_of(occupancy: nn.Module) -> GateWeights | None:
     return found.weights
 
 
-def _most_width(occupancy: Any, device: torch.device) -> int:
+def _why_not(occupancy: Any, device: torch.device) -> str | None:
+    """Why a device gets no kernel for this occupancy's gate, or None if it does."""
     if device.type != "cuda":
-        return MOST_WIDTH
+        return why_not(occupancy)
+    capability = torch.cuda.get_device_capability(device)
+    if capability < (8, 0):
+        return f"compute capability {capability[0]}.{capability[1]} is below 8.0"
     if getattr(occupancy, "precision", None) == "float32":
-        return MOST_WIDTH_FLOAT32
-    return MOST_WIDTH if torch.cuda.get_device_capability(device)[0] == 9 else MOST_WIDTH_BUT_HOPPER
+        return why_not(occupancy, MOST_WIDTH_FLOAT32)
+    return why_not(occupancy, MOST_WIDTH if capability[0] == 9 else MOST_WIDTH_BUT_HOPPER)
 
 
 def _version(value: Any) -> int:

@@ -2,9 +2,6 @@
 
 Its torch twin is `occupancy.Occupancy.occupied`. Imported by `fused.py` only where a kernel can
 run: on CUDA, or in Triton's interpreter. Between positions and bits nothing reaches memory.
-
-Sines and cosines of 2^k pi x come from 2^k x, reduced to a quarter turn without rounding, and a
-polynomial; the twin rounds its angles, by up to 2^(k - 23), and that is how far they differ.
 """
 
 from __future__ import annotations
@@ -16,12 +13,13 @@ import triton
 import triton.language as tl
 from torch import Tensor
 
-from leco_plugin.samplers.gate_weights import GateWeights
+from leco_plugin.samplers.encoding_kernel import frequencies, looked_up
+from leco_plugin.samplers.gate_weights import FREQUENCY, GateWeights
 
 INTERPRETED = os.environ.get("TRITON_INTERPRET") == "1"
 """Whether kernels run in Triton's interpreter; decided when Triton was imported."""
 
-_INTERPRETED = tl.constexpr(INTERPRETED)
+_INTERPRETED, _FREQUENCY = tl.constexpr(INTERPRETED), tl.constexpr(FREQUENCY)
 
 
 @triton.jit
@@ -49,24 +47,6 @@ def mapped_of(x, y, z, facts, CONTRACTED: tl.constexpr):
 def largest_of(u, v, w):
     """Maximum norm."""
     return tl.maximum(tl.maximum(tl.abs(u), tl.abs(v)), tl.abs(w))
-
-
-@triton.jit
-def _turned(half_turns):
-    """sin(pi y) and cos(pi y), to 1e-7."""
-    whole = tl.floor(half_turns + 0.5)
-    part = half_turns - whole
-    sign = 1.0 - 2.0 * (whole - 2.0 * tl.floor(whole * 0.5))
-    square = part * part
-    sine = tl.fma(square, 0.07765766030370826, -0.5982912856197324)
-    sine = tl.fma(square, sine, 2.5500775232145423)
-    sine = tl.fma(square, sine, -5.167710083507896)
-    sine = tl.fma(square, sine, 3.1415926401307073)
-    cosine = tl.fma(square, 0.2196896110974905, -1.331876568080807)
-    cosine = tl.fma(square, cosine, 4.058411352862603)
-    cosine = tl.fma(square, cosine, -4.934792830619646)
-    cosine = tl.fma(square, cosine, 0.9999999532476083)
-    return sign * part * sine, sign * cosine
 
 
 @triton.jit
@@ -142,9 +122,15 @@ def gate_keeps(
     facts,
     matrices,
     vectors,
+    tables,
+    grids,
     epsilon,
     ROWS: tl.constexpr,
+    KIND: tl.constexpr,
     OCTAVES: tl.constexpr,
+    LEVELS: tl.constexpr,
+    FEATURES: tl.constexpr,
+    MASK: tl.constexpr,
     COLUMNS: tl.constexpr,
     WIDTH: tl.constexpr,
     PADDED: tl.constexpr,
@@ -158,20 +144,14 @@ def gate_keeps(
     u, v, w, inside = mapped_of(x, y, z, facts, CONTRACTED)
     u, v, w = tl.where(inside, u, 0.0), tl.where(inside, v, 0.0), tl.where(inside, w, 0.0)
 
-    column = tl.arange(0, COLUMNS)
-    turning = column < 3 * OCTAVES
-    axis = (column % 3)[None, :]
-    scale = (1 << tl.where(turning, column // 3, 0)).to(tl.float32)[None, :]
-    coordinates = tl.where(
-        axis == 0, u[:, None], tl.where(axis == 1, v[:, None], w[:, None])
-    )  # [ROWS, COLUMNS]
-    sines, cosines = _turned(coordinates * scale)
-    features = tl.where(turning[None, :], sines, coordinates)
-
     sums = tl.zeros((ROWS, PADDED), tl.float32)
+    if KIND == _FREQUENCY:
+        features, cosines = frequencies(u, v, w, OCTAVES, COLUMNS)
+        sums = _layer(cosines, matrices, sums, ROWS, COLUMNS, PADDED, HALF)
+        matrices += COLUMNS * PADDED
+    else:
+        features = looked_up(u, v, w, tables, grids, COLUMNS, KIND, LEVELS, FEATURES, MASK)
     sums = _layer(features, matrices, sums, ROWS, COLUMNS, PADDED, HALF)
-    matrices += COLUMNS * PADDED
-    sums = _layer(cosines, matrices, sums, ROWS, COLUMNS, PADDED, HALF)
     matrices += COLUMNS * PADDED
     hidden = _activated(sums, vectors, PADDED, HALF)
     vectors += PADDED
@@ -222,9 +202,15 @@ def _gate_kernel(
     facts,
     matrices,
     vectors,
+    tables,
+    grids,
     epsilon,
     ROWS: tl.constexpr,
+    KIND: tl.constexpr,
     OCTAVES: tl.constexpr,
+    LEVELS: tl.constexpr,
+    FEATURES: tl.constexpr,
+    MASK: tl.constexpr,
     COLUMNS: tl.constexpr,
     WIDTH: tl.constexpr,
     PADDED: tl.constexpr,
@@ -236,6 +222,7 @@ def _gate_kernel(
 ):
     rows = tl.program_id(0).to(tl.int64) * ROWS + tl.arange(0, ROWS)
     there = rows < count
+    column_stride = column_stride.to(tl.int64)  # twice it is a billion positions' worth
     at = positions + rows * row_stride
     x = tl.load(at, mask=there, other=0.0)
     y = tl.load(at + column_stride, mask=there, other=0.0)
@@ -247,9 +234,15 @@ def _gate_kernel(
         facts,
         matrices,
         vectors,
+        tables,
+        grids,
         epsilon,
         ROWS,
+        KIND,
         OCTAVES,
+        LEVELS,
+        FEATURES,
+        MASK,
         COLUMNS,
         WIDTH,
         PADDED,
@@ -265,7 +258,11 @@ def _gate_kernel(
 def sizes_of(weights: GateWeights) -> dict[str, int | bool]:
     """The constants that a kernel with this gate is compiled for."""
     return {
+        "KIND": weights.kind,
         "OCTAVES": weights.octaves,
+        "LEVELS": weights.levels,
+        "FEATURES": weights.features,
+        "MASK": weights.mask,
         "COLUMNS": weights.columns,
         "WIDTH": weights.width,
         "PADDED": weights.padded_width,
@@ -299,6 +296,8 @@ def gate_decisions(weights: GateWeights, positions: Tensor) -> Tensor:
             weights.facts,
             weights.matrices,
             weights.vectors,
+            weights.tables,
+            weights.grids,
             weights.epsilon,
             ROWS=rows,
             **sizes_of(weights),

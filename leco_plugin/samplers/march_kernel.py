@@ -62,11 +62,17 @@ def _march_kernel(
     facts,
     matrices,
     vectors,
+    tables,
+    grids,
     epsilon,
     STEPS: tl.constexpr,
     CONED: tl.constexpr,
     RESOLUTION: tl.constexpr,
+    KIND: tl.constexpr,
     OCTAVES: tl.constexpr,
+    LEVELS: tl.constexpr,
+    FEATURES: tl.constexpr,
+    MASK: tl.constexpr,
     COLUMNS: tl.constexpr,
     WIDTH: tl.constexpr,
     PADDED: tl.constexpr,
@@ -77,6 +83,7 @@ def _march_kernel(
     HALF: tl.constexpr,
 ):
     ray = tl.program_id(0)
+    n_rays = n_rays.to(tl.int64)  # six rows of them are read
     ox, oy, oz = (
         tl.load(rays + ray),
         tl.load(rays + n_rays + ray),
@@ -149,9 +156,15 @@ def _march_kernel(
                     facts,
                     matrices,
                     vectors,
+                    tables,
+                    grids,
                     epsilon,
                     STEPS,
+                    KIND,
                     OCTAVES,
+                    LEVELS,
+                    FEATURES,
+                    MASK,
                     COLUMNS,
                     WIDTH,
                     PADDED,
@@ -198,6 +211,7 @@ def march_kept(cache: CellCache, weights: GateWeights, candidates: Candidates) -
     tables = cache.tables()
     frame = torch.cat([cache.scale.view(-1), cache.shift.view(-1)])
     found = torch.zeros(n_rays, dtype=torch.int64, device=device)
+    nowhere = torch.zeros_like(found)
 
     def launch(starts: Tensor, ends: Tensor, samples: Samples) -> None:
         _march_kernel[(n_rays,)](
@@ -220,6 +234,8 @@ def march_kept(cache: CellCache, weights: GateWeights, candidates: Candidates) -
             weights.facts,
             weights.matrices,
             weights.vectors,
+            weights.tables,
+            weights.grids,
             weights.epsilon,
             STEPS=STEPS,
             CONED=coned,
@@ -229,7 +245,7 @@ def march_kept(cache: CellCache, weights: GateWeights, candidates: Candidates) -
             enable_fp_fusion=False,
         )
 
-    launch(found, found, _room(1, device))
+    launch(nowhere, nowhere, _room(1, device))  # counts, and has no room to write
     ends = found.cumsum(0)
     last = (first + counts).max().long()
     total, highest = torch.stack([ends[-1], last]).tolist()  # the one wait

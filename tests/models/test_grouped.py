@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import pytest
 import torch
+from waits import Waits
 
-from leco_plugin.models.grouped import grouped_dispatch, may_group, works_on
+from leco_plugin.models.grouped import grouped_dispatch, may_group
 from leco_plugin.models.hmoe import Expert, HMoE, HMoEConfig, dense_hmoe
 
 pytestmark = pytest.mark.skipif(
@@ -52,38 +53,19 @@ def test_without_points_there_are_no_answers() -> None:
     assert none.shape == (0, 8)
 
 
-@pytest.mark.parametrize("fault", ["odd sizes", "no rows"])
-def test_a_device_on_which_grouped_products_are_wrong_is_found_out(fault: str, monkeypatch) -> None:
-    right = torch.nn.functional.grouped_mm
-
-    class Wrong(torch.autograd.Function):
-        """Gradients of matrices without rows are whatever was in memory."""
-
-        @staticmethod
-        def forward(ctx, matrices):
-            return matrices.clone()
-
-        @staticmethod
-        def backward(ctx, gradients):
-            empty = (gradients == 0.0).all(dim=-1).all(dim=-1)
-            return torch.where(empty[:, None, None], 7.0, gradients)
-
-    def grouped_mm(rows, matrices, *, offs):
-        if fault == "no rows":
-            return right(rows, Wrong.apply(matrices), offs=offs)
-        return right(rows, matrices, offs=(offs + 7) // 8 * 8)
-
-    works_on.cache_clear()
-    assert works_on(torch.device("cpu"))
-    works_on.cache_clear()
-    monkeypatch.setattr(torch.nn.functional, "grouped_mm", grouped_mm)
-    assert not works_on(torch.device("cpu"))
-    works_on.cache_clear()
-
-
 def test_it_serves_bfloat16_on_cuda_only() -> None:
-    assert works_on(torch.device("cpu"))
-    assert not may_group(torch.zeros(2, 8, dtype=torch.bfloat16), 8)
+    assert not may_group(torch.zeros(2, 8, dtype=torch.bfloat16), 4, 8)
+
+
+def test_nothing_waits_for_the_sizes_of_groups() -> None:
+    hmoe = HMoE(HMoEConfig(4, 8, 3, None, False))
+    features = torch.randn(100, 8, requires_grad=True)
+    routes = torch.randint(5, (100,))
+    with Waits() as grouped:
+        hmoe._grouped(features, routes, torch.float32).sum().backward()
+    with Waits() as plain:
+        hmoe(features, routes, torch.ones(100))
+    assert grouped.seen == [] and plain.seen == ["tolist"]
 
 
 @pytest.mark.gpu
@@ -92,7 +74,7 @@ def test_it_never_waits_for_the_device() -> None:
     features = torch.randn(1000, 64, device="cuda")
     routes, values = torch.randint(5, (1000,), device="cuda"), torch.rand(1000, device="cuda")
     with torch.autocast("cuda", dtype=torch.bfloat16):
-        if not may_group(features, 64):
+        if not may_group(features, 4, 64):
             pytest.skip("this device has no grouped products")
         torch.cuda.set_sync_debug_mode("error")
         try:

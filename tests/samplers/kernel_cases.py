@@ -14,6 +14,7 @@ import torch
 from leco_plugin.models.encodings import EncodingConfig
 from leco_plugin.models.gate import Gate, GateConfig
 from leco_plugin.occupancy import Occupancy
+from leco_plugin.samplers.fused import _why_not
 from leco_plugin.space import Space
 
 INTERPRETED = os.environ.get("TRITON_INTERPRET") == "1"
@@ -38,15 +39,19 @@ def occupancy(
     layers: int = 2,
     octaves: int = 4,
     experts: int = 4,
+    encoding: EncodingConfig | None = None,
     seed: int = 0,
     walls: list[float] | None = None,
 ) -> Occupancy:
     """A gate of random weights, twice the usual size, whose threshold halves what is inside."""
     torch.manual_seed(seed)
-    gate = Gate(GateConfig(EncodingConfig(octaves=octaves), width, layers, experts))
+    encoding = encoding or EncodingConfig(octaves=octaves)
+    gate = Gate(GateConfig(encoding, width, layers, experts))
     with torch.no_grad():
         for parameter in gate.parameters():
             parameter.mul_(2.0)
+        for table in gate.encoding.parameters():
+            table.normal_()
         gate.norm.weight.add_(torch.randn(width) * 0.3)
         gate.norm.bias.add_(torch.randn(width) * 0.3)
     space = Space(kind, (0.1, 0.2, -0.3), 1.5)
@@ -57,6 +62,11 @@ def occupancy(
     values = made.query(positions(2000))
     made.threshold_value.copy_(values[values > 0.0].median())
     return made
+
+
+def left_to_torch(asked: Occupancy) -> str | None:
+    """Why this device gets no kernel for a gate; the interpreter takes them all."""
+    return None if INTERPRETED else _why_not(asked, torch.device(DEVICE))
 
 
 def positions(count: int, spread: float = 1.5, seed: int = 1) -> torch.Tensor:

@@ -2,29 +2,39 @@
 
 from __future__ import annotations
 
+import copy
 import logging
 import subprocess
 import sys
 from types import SimpleNamespace
+from weakref import WeakKeyDictionary
 
 import pytest
 import torch
-from ball_occupancy import ENCODINGS
+from ball_occupancy import ENCODINGS, ball
 
 from leco_plugin.models.encodings import EncodingConfig
 from leco_plugin.models.gate import Gate, GateConfig
 from leco_plugin.occupancy import Occupancy
-from leco_plugin.samplers import fused
+from leco_plugin.samplers import fused, trials
+from leco_plugin.samplers.cache import CellCache
 from leco_plugin.samplers.edges import candidate_counts, switch
+from leco_plugin.samplers.estimator import LearnedOccupancyEstimator
 from leco_plugin.samplers.gate_weights import GateWeights, gate_weights, why_not
 from leco_plugin.samplers.growth import growth_table, powers_needed
-from leco_plugin.samplers.marching import TooManyCandidates
+from leco_plugin.samplers.marching import (
+    Candidates,
+    Samples,
+    TooManyCandidates,
+    keep,
+)
 from leco_plugin.space import Space
 
 
 @pytest.fixture(autouse=True)
 def switched_on(monkeypatch) -> None:
     monkeypatch.setattr(fused, "_switch", fused._Switch())
+    monkeypatch.setattr(fused, "_passed", {kind: WeakKeyDictionary() for kind in fused._passed})
 
 
 def test_without_cuda_triton_is_never_imported() -> None:
@@ -57,6 +67,90 @@ def test_a_failing_kernel_is_said_once_and_its_twin_answers(monkeypatch, caplog)
     assert "\n" not in said[0]
 
 
+def test_a_missing_triton_is_said_once_and_torch_answers(steep, monkeypatch, caplog) -> None:
+    monkeypatch.setattr(fused, "ready", lambda device, name="gate": name not in fused._switch.off)
+    monkeypatch.setitem(sys.modules, "triton", None)
+    for name in ("gate_kernel", "march_kernel"):
+        monkeypatch.delitem(sys.modules, f"leco_plugin.samplers.{name}", raising=False)
+    rays = torch.rand(9, 3), torch.randn(9, 3)
+    with caplog.at_level(logging.WARNING):
+        samples = [steep.sampling(*rays, render_step_size=0.1) for _ in range(2)]
+        steep.occupancy.occupied(torch.rand(50, 3))
+    with fused.twins_only():
+        wanted = steep.sampling(*rays, render_step_size=0.1)
+    assert all(map(torch.equal, samples[0], wanted)) and all(map(torch.equal, samples[1], wanted))
+    said = [record.getMessage() for record in caplog.records]
+    assert len(said) == 1 and "triton" in said[0] and "torch answers in its place" in said[0]
+
+
+class MarchKernel:
+    """Stands where the march's kernel is, and answers as the twin with a fault of its own."""
+
+    def __init__(self, made: LearnedOccupancyEstimator, fault: str) -> None:
+        self.made, self.fault, self.calls = made, fault, 0
+
+    def march_kept(self, cache: CellCache, weights: GateWeights, candidates: Candidates) -> Samples:
+        self.calls += 1
+        longest = int(candidates.counts.max())
+        with fused.twins_only():
+            samples = keep(candidates, longest, self.made.occupied, cache.near)
+        if self.fault == "keeps all":
+            return keep(candidates, longest, None)
+        if self.fault == "skips some":
+            return tuple(part[100:] for part in samples)
+        if self.fault == "other order":
+            return tuple(part.flip(0) for part in samples)
+        if self.fault == "raises":
+            raise RuntimeError("out of resource: shared memory\nand more")
+        return samples
+
+
+@pytest.fixture(scope="module")
+def steep() -> LearnedOccupancyEstimator:
+    """Cells of a ball with a sharp border."""
+    return LearnedOccupancyEstimator(ball(), cache_bytes=1 << 16, tolerance=0.02)
+
+
+@pytest.mark.parametrize("cone_angle", [0.0, 0.01])
+@pytest.mark.parametrize("fault", ["keeps all", "skips some", "other order", "raises"])
+def test_a_march_that_keeps_otherwise_is_never_believed(
+    fault: str, cone_angle: float, steep, monkeypatch, caplog
+) -> None:
+    kernel = MarchKernel(steep, fault)
+    gate = SimpleNamespace(gate_decisions=lambda w, x: steep.occupancy.query(x) >= w.facts[10])
+    monkeypatch.setattr(fused, "ready", lambda device, name="gate": name not in fused._switch.off)
+    monkeypatch.setitem(sys.modules, "leco_plugin.samplers.march_kernel", kernel)
+    monkeypatch.setitem(sys.modules, "leco_plugin.samplers.gate_kernel", gate)
+    rays = torch.rand(9, 3), torch.randn(9, 3)
+    options = {"render_step_size": 0.05, "cone_angle": cone_angle, "far_plane": 4.0}
+    with caplog.at_level(logging.WARNING):
+        samples = [steep.sampling(*rays, **options) for _ in range(2)]
+    assert kernel.calls == 1 and fused._switch.off == {"march"}  # the gate goes on
+    with fused.twins_only():
+        wanted = steep.sampling(*rays, **options)
+    assert all(map(torch.equal, samples[0], wanted)) and all(map(torch.equal, samples[1], wanted))
+    said = [record.getMessage() for record in caplog.records]
+    assert len(said) == 1 and "the fused march does not run" in said[0] and "\n" not in said[0]
+
+
+def test_a_march_is_compared_with_its_twin_once_for_each_kind_of_step(steep, monkeypatch) -> None:
+    kernel = MarchKernel(steep, "none")
+    gate = SimpleNamespace(gate_decisions=lambda w, x: steep.occupancy.query(x) >= w.facts[10])
+    monkeypatch.setattr(fused, "ready", lambda device, name="gate": name not in fused._switch.off)
+    monkeypatch.setitem(sys.modules, "leco_plugin.samplers.march_kernel", kernel)
+    monkeypatch.setitem(sys.modules, "leco_plugin.samplers.gate_kernel", gate)
+    calls = []
+    for cone_angle in (0.0, 0.0, 0.01, 0.0, 0.01):
+        steep.sampling(
+            *(torch.rand(9, 3), torch.randn(9, 3)),
+            render_step_size=0.05,
+            cone_angle=cone_angle,
+            far_plane=4.0,
+        )
+        calls.append(kernel.calls)
+    assert calls == [2, 3, 5, 6, 7] and not fused._switch.off
+
+
 def test_a_kernel_that_decides_otherwise_is_never_believed(monkeypatch, caplog) -> None:
     asked = Occupancy(Gate(GateConfig()), Space(), 0.0)
     wrong = SimpleNamespace(gate_decisions=lambda weights, x: torch.zeros(len(x), dtype=bool))
@@ -82,10 +176,10 @@ def test_a_kernel_is_compared_with_its_twin_once_for_each_gate(monkeypatch) -> N
     monkeypatch.setitem(sys.modules, "leco_plugin.samplers.gate_kernel", kernel)
     for _ in range(2):
         asked.occupied(torch.rand(50, 3))
-    assert sizes == [fused.CHECKED, 50, 50]
+    assert sizes == [trials.CHECKED, 50, 50]
     asked.threshold_value.fill_(0.25)
     asked.occupied(torch.rand(50, 3))
-    assert sizes[3:] == [fused.CHECKED, 50]
+    assert sizes[3:] == [trials.CHECKED, 50]
 
 
 def test_kernels_are_launched_where_their_tensors_are() -> None:
@@ -108,10 +202,26 @@ def test_twins_only_is_over_afterwards() -> None:
     assert not fused._switch.off
 
 
-@pytest.mark.parametrize("kind", ["hash", "vm", "k-planes"])
-def test_gates_on_tables_stay_with_torch(kind: str) -> None:
+@pytest.mark.gpu
+def test_sampling_waits_once_for_the_device() -> None:
+    made = LearnedOccupancyEstimator(copy.deepcopy(ball()).cuda(), tolerance=0.02)
+    rays = torch.rand(64, 3, device="cuda"), torch.randn(64, 3, device="cuda")
+    options = {"render_step_size": 0.05, "far_plane": 4.0}
+    made.sampling(*rays, **options)  # compiled, and tried
+    assert fused.ready(made.device, "march")
+    torch.cuda.set_sync_debug_mode("warn")
+    try:
+        with pytest.warns(UserWarning, match="synchronizing") as said:
+            made.sampling(*rays, **options)
+    finally:
+        torch.cuda.set_sync_debug_mode("default")
+    assert len(said) == 1
+
+
+@pytest.mark.parametrize("kind", ENCODINGS)
+def test_gates_on_all_features_have_a_kernel(kind: str) -> None:
     occupancy = Occupancy(Gate(GateConfig(ENCODINGS[kind])), Space(), 0.5)
-    assert why_not(occupancy) == f"its gate is on {kind} features"
+    assert why_not(occupancy) is None and fused.weights_of(occupancy) is not None
 
 
 @pytest.mark.parametrize(
@@ -119,7 +229,8 @@ def test_gates_on_tables_stay_with_torch(kind: str) -> None:
     [
         ({"width": 512}, "width 512; the kernel holds 256"),
         ({"layers": 9}, "layers 9; the kernel holds 8"),
-        ({"encoding": EncodingConfig(octaves=21)}, "octaves 21; the kernel holds 20"),
+        ({"encoding": EncodingConfig(octaves=21)}, "frequency features 66; the kernel holds 64"),
+        ({"encoding": EncodingConfig("vm", components=22)}, "vm features 66; the kernel holds 64"),
         ({"scene_experts": 64}, "logits 65; the kernel holds 64"),
     ],
 )
@@ -127,6 +238,20 @@ def test_gates_that_do_not_fit_are_named(sizes, reason: str) -> None:
     occupancy = Occupancy(Gate(GateConfig(**sizes)), Space(), 0.5)
     found = why_not(occupancy)
     assert found is not None and reason in found
+
+
+def test_each_card_gets_the_widths_that_were_compiled_for_it(monkeypatch) -> None:
+    def left_to_torch(capability: tuple[int, int], width: int, precision: str) -> bool:
+        monkeypatch.setattr(torch.cuda, "get_device_capability", lambda *_: capability)
+        asked = Occupancy(Gate(GateConfig(width=width)), Space(), 0.5, precision)
+        return fused._why_not(asked, torch.device("cuda")) is not None
+
+    assert not left_to_torch((9, 0), 256, "bfloat16")
+    for capability in ((8, 0), (8, 9), (10, 0)):
+        assert left_to_torch(capability, 256, "bfloat16")
+        assert not left_to_torch(capability, 128, "bfloat16")
+    assert left_to_torch((9, 0), 128, "float32") and not left_to_torch((9, 0), 64, "float32")
+    assert left_to_torch((7, 5), 16, "bfloat16")
 
 
 def test_a_gate_in_float16_stays_with_torch() -> None:

@@ -1,0 +1,259 @@
+"""Learning, freezing and guided training on the procedural city, against a dense host.
+
+The fields, losses and calibration of `leco-occupancy-paper` without nerfstudio's trainer. The dense
+host is the same mixture without an empty-space expert, as in Switch-NeRF: every candidate goes
+through a scene expert, and nothing is ever skipped.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from typing import Any
+
+import torch
+from gpu_city import Photographed, Pixels, photographed
+from gpu_floor import seconds
+from gpu_scale import Scale, figure
+from torch import Tensor
+
+from leco_plugin.evaluation.peak_memory import peak_process_bytes
+from leco_plugin.models.calibration import (
+    CalibrationConfig,
+    Measured,
+    Reference,
+    calibrate,
+    near_median_depth,
+)
+from leco_plugin.models.field import HMoEField
+from leco_plugin.models.gate import Gate, occupancy_from_logits
+from leco_plugin.models.losses import distortion_loss
+from leco_plugin.models.objective import GateLossConfig, gate_losses
+from leco_plugin.models.phases import ScheduleConfig, ramp
+from leco_plugin.models.rendering import (
+    Intervals,
+    Rays,
+    Routing,
+    Shaded,
+    backdrop_of,
+    shade,
+    with_backdrop,
+)
+from leco_plugin.occupancy import Occupancy, gate_precision
+from leco_plugin.samplers.estimator import LearnedOccupancyEstimator
+from leco_plugin.samplers.marching import march
+from leco_plugin.samplers.rays import intersect_box
+from leco_plugin.space import Space
+
+RATE, DISTORTION, DISTORTION_AFTER = 5e-4, 0.05, 0.002
+"""Learning rate of `leco-occupancy-paper`; weights of the distortion loss, learning and guided."""
+RAYS_AT_ONCE, STEPS_PER_LOOK = 1024, 10
+"""Rays rendered at a time, and steps between two looks at the clock, each of which waits."""
+
+
+class Run:
+    """One field and its gate on one city."""
+
+    def __init__(self, scene: Photographed, scale: Scale, homogeneous: bool) -> None:
+        torch.manual_seed(0)
+        self.scene, self.scale, self.device = scene, scale, scale.device
+        sizes, low, high = scale.sizes, *scene.box.view(2, 3)
+        half_extent = float((high - low).max()) / 2.0
+        self.space = Space("box", tuple(((low + high) / 2.0).tolist()), half_extent)
+        self.space.to(self.device)
+        self.gate = Gate(sizes.gate).to(self.device)
+        self.field = HMoEField(sizes.field, scene.num_images).to(self.device)
+        self.losses = GateLossConfig()
+        self.routing = Routing(None if homogeneous else self.losses.empty_below, homogeneous)
+        parameters = [*self.gate.parameters(), *self.field.parameters()]
+        self.optimizer = torch.optim.Adam(parameters, RATE, eps=1e-15, fused=True)
+        self.estimator: LearnedOccupancyEstimator | None = None
+        self.ramped = 0.0
+        self.steps = 0
+
+    def rays_of(self, pixels: Pixels) -> Rays:
+        """Rays of pixels, cut to the box of the city."""
+        enters, leaves = intersect_box(pixels.origins, pixels.directions, self.scene.box)
+        enters = enters.clamp(min=0.0)
+        return Rays(pixels.origins, pixels.directions, enters, leaves.maximum(enters), None)
+
+    def intervals_of(self, rays: Rays, candidates: int, jittered: bool) -> Intervals:
+        """Candidates along rays; once guided, those that the occupancy keeps."""
+        step_size = self.scene.length / candidates
+        jitter = torch.rand_like(rays.t_mins) if jittered else None
+        along = rays.origins, rays.directions, rays.t_mins, rays.t_maxs
+        if self.estimator is None:
+            samples = march(*along, step_size=step_size, jitter=jitter)
+        else:
+            samples = self.estimator.kept(*along, step_size, 0.0, jitter, None)
+        return with_backdrop(Intervals(*samples), rays, step_size, 0.0)
+
+    def shaded(self, rays: Rays, intervals: Intervals) -> Shaded:
+        """Renders intervals in bfloat16."""
+        frozen = self.estimator is not None
+        with gate_precision(self.device.type, "bfloat16"):
+            return shade(self.field, self.gate, self.space, rays, intervals, self.routing, frozen)
+
+    def step(self, candidates: int) -> None:
+        """One training step on random pixels."""
+        pixels = self.scene.train
+        chosen = torch.randint(len(pixels.images), (self.scale.batch,), device=self.device)
+        pixels = pixels.some(chosen)
+        rays = self.rays_of(pixels)._replace(images=pixels.images)
+        intervals = self.intervals_of(rays, candidates, jittered=True)
+        shaded = self.shaded(rays, intervals)
+        learning = self.estimator is None
+        reach = 2.0 * self.space.half_extent
+        starts, ends = intervals.t_starts / reach, intervals.t_ends / reach
+        weight = DISTORTION * self.ramped if learning else DISTORTION_AFTER
+        distortion = distortion_loss(shaded.weights, starts, ends, shaded.packed_info)
+        loss = (shaded.rgb - pixels.colors).square().mean() + weight * distortion
+        if learning:
+            of_gate = gate_losses(
+                self.losses,
+                shaded,
+                intervals,
+                rays,
+                homogeneous=self.routing.homogeneous,
+                ramped=self.ramped,
+                half_extent=self.space.half_extent,
+            )
+            loss = loss + torch.stack(list(of_gate.values())).sum()
+        self.optimizer.zero_grad()
+        loss.backward()
+        self.optimizer.step()
+        self.steps += 1
+
+    def train(self, duration: float, candidates: int) -> float:
+        """Steps for so many seconds; the seconds it took."""
+        started, passed = time.perf_counter(), 0.0
+        while passed < duration:
+            # the distortion loss comes in with the time that has passed, as in `phases.ramp`
+            self.ramped = ramp(int(1000 * passed / duration), ScheduleConfig(learn_steps=1000))
+            for _ in range(STEPS_PER_LOOK):
+                self.step(candidates)
+            wait(self.device)
+            passed = time.perf_counter() - started
+        return passed
+
+    @torch.no_grad()
+    def freeze(self) -> Measured:
+        """Finds the threshold on pixels that are never trained on; from now on it guides."""
+        pixels = self.scene.calibration
+        chunks = [
+            Pixels(*parts)
+            for parts in zip(
+                *(part[: self.scale.calibration].split(RAYS_AT_ONCE) for part in pixels)
+            )
+        ]
+        rays = [self.rays_of(chunk) for chunk in chunks]
+        references = [self.reference(of_chunk) for of_chunk in rays]
+
+        def render_kept(number: int, mask: Tensor) -> Tensor:
+            kept = Intervals(*(part[mask] for part in references[number].intervals))
+            return self.shaded(rays[number], kept).rgb
+
+        truths = [chunk.colors for chunk in chunks]
+        measured = calibrate(references, truths, render_kept, CalibrationConfig())
+        box = self.scene.box
+        occupancy = Occupancy(self.gate, self.space, measured.threshold, "bfloat16", walls=box)
+        self.estimator = LearnedOccupancyEstimator(
+            occupancy.to(self.device),
+            box,
+            cache_bytes=self.scale.cache_bytes,
+            tolerance=self.scale.tolerance,
+        )
+        return measured
+
+    def reference(self, rays: Rays) -> Reference:
+        """All candidates of rays, rendered."""
+        intervals = self.intervals_of(rays, self.scale.sizes.candidates, jittered=False)
+        shaded = self.shaded(rays, intervals)
+        return Reference(
+            intervals,
+            shaded.weights,
+            occupancy_from_logits(shaded.logits),
+            near_median_depth(shaded, intervals),
+            shaded.rgb,
+            backdrop_of(intervals, rays),
+        )
+
+    @torch.no_grad()
+    def psnr(self) -> float:
+        """Of pixels of held-out pictures, dB."""
+        pixels, generator = self.scene.test, torch.Generator().manual_seed(0)
+        order = torch.randperm(len(pixels.images), generator=generator)[: self.scale.test]
+        errors = []
+        for chosen in order.to(self.device).split(RAYS_AT_ONCE):
+            some = pixels.some(chosen)
+            rays = self.rays_of(some)
+            intervals = self.intervals_of(rays, self.scale.sizes.candidates, jittered=False)
+            errors.append((self.shaded(rays, intervals).rgb - some.colors).square())
+        return float(-10.0 * torch.cat(errors).mean().log10())
+
+
+def learned(scale: Scale, before: dict[str, Any]) -> dict[str, Any]:
+    """Learns the occupancy, freezes it, and goes on guided by it."""
+    scene = photographed(scale.city, scale.capture, scale.device)
+    run, sizes = Run(scene, scale, homogeneous=False), scale.sizes
+    learning = run.train(scale.learning, sizes.learn_candidates)
+    learn_steps, learn_step = run.steps, timed(run, sizes.learn_candidates)
+    started = time.perf_counter()
+    measured = run.freeze()
+    wait(scale.device)
+    freezing = time.perf_counter() - started
+    guided = run.train(scale.guided, sizes.candidates)
+    psnr, step = run.psnr(), timed(run, sizes.candidates)
+    return {
+        "seconds": {"learning": learning, "freezing": freezing, "guided": guided},
+        "steps": {"learning": learn_steps, "all": run.steps},
+        "learning_step": learn_step,
+        "guided_step": step,
+        "occupancy": measured._asdict(),
+        "psnr": psnr,
+    }
+
+
+def dense(scale: Scale, before: dict[str, Any]) -> dict[str, Any]:
+    """The dense host for as long as the guided run took, learning included, beside that run."""
+    guided = before["learned"]
+    scene = photographed(scale.city, scale.capture, scale.device)
+    run = Run(scene, scale, homogeneous=True)
+    took = run.train(sum(guided["seconds"].values()), scale.sizes.candidates)
+    psnr, steps = run.psnr(), run.steps
+    step = timed(run, scale.sizes.candidates)
+    ours = guided["guided_step"]
+    times = {"dense": step["seconds"], "guided": ours["seconds"]}
+    figures = [
+        figure(
+            "steps per second: guided / dense",
+            times["dense"] / times["guided"],
+            2.5,
+            False,
+            **times,
+        ),
+        figure("peak memory: guided / dense", ours["peak_bytes"] / step["peak_bytes"], 0.5, True),
+        figure("PSNR at equal time: guided - dense, dB", guided["psnr"] - psnr, 0.0, False),
+    ]
+    return {"seconds": took, "steps": steps, "step": step, "psnr": psnr, "figures": figures}
+
+
+def timed(run: Run, candidates: int) -> dict[str, float]:
+    """A step's median seconds and steps per second, and the most memory that it took."""
+    memory = peak_of(run.device)
+    took = seconds(lambda: run.step(candidates), run.device, max(2, run.scale.rounds // 3))
+    return {"seconds": took, "steps_per_second": 1.0 / took, "peak_bytes": memory()}
+
+
+def peak_of(device: torch.device) -> Callable[[], int]:
+    """Answers with the most bytes that tensors have held since; on a CPU the whole process ever."""
+    if device.type != "cuda":
+        return peak_process_bytes
+    torch.cuda.reset_peak_memory_stats()  # CUDA only
+    return torch.cuda.max_memory_allocated  # CUDA only
+
+
+def wait(device: torch.device) -> None:
+    """Until the device has done everything."""
+    if device.type == "cuda":
+        torch.cuda.synchronize()  # CUDA only

@@ -1,0 +1,198 @@
+"""What the GPU suite does without a GPU; run by `test_gpu_suite.py`, which counts its lines."""
+
+from __future__ import annotations
+
+import json
+import runpy
+import shutil
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from types import SimpleNamespace
+
+import gpu
+import gpu_parts
+import gpu_sampling
+import gpu_training
+import pytest
+import torch
+from gpu_scale import Scale
+
+from leco_plugin.samplers import fused, nerfacc_cpu
+
+CPU = torch.device("cpu")
+DRY = Scale(CPU).dry()
+
+
+@pytest.fixture(scope="module")
+def stored(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
+    """The results of one dry run."""
+    out = tmp_path_factory.mktemp("dry") / "gpu.json"
+    assert gpu.main(["--dry-run", "--out", str(out)]) == 0
+    yield out
+    nerfacc_cpu.uninstall()
+
+
+@pytest.fixture
+def quick(monkeypatch) -> list[str]:
+    """A suite of two parts that take no time; the names of those that ran."""
+    ran: list[str] = []
+
+    def part(name: str, figures: list[dict[str, object]]) -> gpu.Part:
+        def measure(scale: Scale, before: dict[str, object]) -> dict[str, object]:
+            ran.append(name)
+            return {"figures": figures, "running": {"gate": False, "march": True}}
+
+        return gpu.Part(measure, 10.0)
+
+    reached = {"name": "speed", "value": 3.0, "bar": 2.5, "at_most": False, "reached": True}
+    missed = {"name": "memory", "value": 0.7, "bar": 0.5, "at_most": True, "reached": False}
+    monkeypatch.setattr(
+        gpu, "PARTS", {"one": part("one", [reached, missed]), "two": part("two", [])}
+    )
+    return ran
+
+
+def test_a_dry_run_does_every_part(stored: Path) -> None:
+    results = json.loads(stored.read_text())
+    assert list(results["parts"]) == list(gpu.PARTS) and results["dry"]
+    assert results["machine"]["torch"] == torch.__version__
+    assert {"driver", "cuda", "device"} <= set(results["machine"])
+    assert set(results["code"]) == {"version", "commit"}
+    parts = results["parts"]
+    for name in ("gate", "sampling", "experts", "dense"):
+        assert parts[name]["figures"], name
+    learned, dense = parts["learned"], parts["dense"]
+    assert learned["guided_step"]["peak_bytes"] > 0 and learned["psnr"] > 0.0
+    assert dense["seconds"] >= sum(learned["seconds"].values())  # equal time
+    names = [figure["name"] for figure in dense["figures"]]
+    assert "steps per second: guided / dense" in names and "peak memory: guided / dense" in names
+
+
+def test_a_grid_keeps_as_much_as_the_gate(stored: Path) -> None:
+    kept = json.loads(stored.read_text())["parts"]["sampling"]["kept"]
+    for space in ("box", "unbounded"):
+        wanted = kept[f"learned, {space}"]
+        for name, count in kept.items():
+            if name.endswith(space) and "torch grid" in name:
+                assert abs(count - wanted) <= 0.25 * wanted  # cells of the dry run are coarse
+
+
+def test_nothing_is_measured_twice(stored: Path, capsys) -> None:
+    before = stored.read_text()
+    assert gpu.main(["--dry-run", "--out", str(stored)]) == 0
+    assert json.loads(stored.read_text()) == json.loads(before)
+    assert "floor / fused" not in capsys.readouterr().out
+
+
+def test_results_of_other_code_or_of_another_machine_are_not_gone_on_with(
+    quick: list[str], tmp_path: Path, capsys
+) -> None:
+    out = tmp_path / "gpu.json"
+    gpu.run(DRY, out, dry=True)
+    for name in ("code", "machine", "dry"):
+        out.write_text(json.dumps({**json.loads(out.read_text()), name: "other"}))
+        quick.clear()
+        gpu.run(DRY, out, dry=True)
+        assert quick == ["one", "two"]
+    assert capsys.readouterr().out.count("everything is measured anew") == 3
+    out.write_text("{")
+    gpu.run(DRY, out, dry=True)
+    assert "holds no results" in capsys.readouterr().out
+
+
+def test_no_part_begins_that_would_pass_the_ten_minutes(
+    quick: list[str], monkeypatch, capsys
+) -> None:
+    monkeypatch.setattr(gpu, "LIMIT", 5.0)
+    gpu.run(DRY, None, dry=True)
+    assert quick == [] and "is left for the next run" in capsys.readouterr().err
+
+
+def test_all_parts_fit_into_ten_minutes() -> None:
+    assert sum(part.seconds for part in gpu.PARTS.values()) <= gpu.LIMIT == 600.0
+
+
+def test_figures_of_a_twin_are_said_to_be_its_own(quick: list[str], capsys) -> None:
+    gpu.run(DRY, None, dry=False)
+    said = capsys.readouterr().out
+    assert "torch answered in place of the fused gate" in said
+    assert "speed: 3 (>= 2.5) reached" in said and "memory: 0.7 (<= 0.5) NOT REACHED" in said
+
+
+@pytest.mark.skipif(torch.cuda.is_available(), reason="there is a GPU to be measured")
+def test_without_a_gpu_nothing_is_measured_and_nothing_written(quick: list[str], capsys) -> None:
+    before = sorted(gpu.RESULTS.rglob("*"))
+    assert gpu.main([]) == 2 and "no CUDA device here" in capsys.readouterr().err
+    assert quick == [] and sorted(gpu.RESULTS.rglob("*")) == before
+
+
+def test_a_dry_run_leaves_nothing_among_the_results(quick: list[str]) -> None:
+    with pytest.raises(SystemExit):
+        gpu.main(["--dry-run", "--out", str(gpu.RESULTS / "gpu-card-20260101.json")])
+    assert quick == []
+
+
+def test_a_file_is_named_after_the_card_and_the_day(monkeypatch) -> None:
+    monkeypatch.setattr(torch.cuda, "get_device_name", lambda: "NVIDIA H100 80GB HBM3")
+    assert gpu.results_path().name.startswith("gpu-nvidia-h100-80gb-hbm3-2")
+
+
+def test_the_driver_is_what_its_tool_says(monkeypatch) -> None:
+    monkeypatch.setattr(shutil, "which", lambda name: None)
+    assert gpu.driver() is None
+    monkeypatch.setattr(shutil, "which", lambda name: name)
+    answer = SimpleNamespace(stdout="570.86.15\n570.86.15\n")
+    monkeypatch.setattr(subprocess, "run", lambda *_, **__: answer)
+    assert gpu.driver() == "570.86.15"
+
+
+def test_a_wrong_gate_ends_the_run(monkeypatch) -> None:
+    def wrong(occupancy: object, positions: torch.Tensor) -> torch.Tensor | None:
+        return None if fused._switch.off else torch.ones(len(positions), dtype=torch.bool)
+
+    monkeypatch.setattr(fused, "decisions", wrong)
+    with pytest.raises(RuntimeError, match="the fused gate is wrong"):
+        gpu_parts.correctness(DRY, {})
+
+
+def test_a_wrong_march_ends_the_run(monkeypatch) -> None:
+    def wrong(*_: object) -> tuple[torch.Tensor, ...] | None:
+        return None if fused._switch.off else (torch.tensor([0]), torch.zeros(1), torch.ones(1))
+
+    monkeypatch.setattr(fused, "march", wrong)
+    with pytest.raises(RuntimeError, match="the fused march is wrong"):
+        gpu_parts.correctness(DRY, {})
+
+
+def test_without_nerfacc_the_torch_grid_is_compared(monkeypatch, capsys) -> None:
+    monkeypatch.setitem(sys.modules, "nerfacc", None)
+    figures = gpu_sampling.sampling(DRY, {})["figures"]
+    assert "no comparison with nerfacc" in capsys.readouterr().out
+    assert not any("nerfacc" in figure["name"] for figure in figures)
+
+
+def test_a_guided_run_skips(stored: Path) -> None:
+    scene = gpu_training.photographed(DRY.city, DRY.capture, CPU)
+    run = gpu_training.Run(scene, DRY, homogeneous=False)
+    rays = run.rays_of(scene.test)
+    everything = run.intervals_of(rays, 16, jittered=False)
+    run.freeze()
+    assert run.estimator is not None
+    run.estimator.occupancy.threshold_value.fill_(1.0)
+    run.estimator.cache = None
+    kept = run.intervals_of(rays, 16, jittered=False)
+    assert len(kept.t_starts) == len(rays.origins) < len(everything.t_starts)  # backdrops only
+
+
+def test_the_floors_on_paper_are_printed(capsys) -> None:
+    runpy.run_path(str(gpu.RESULTS.parent / "gpu_paper.py"), run_name="__main__")
+    assert "| paper | 305,152 | H100 SXM |" in capsys.readouterr().out
+
+
+def test_the_suite_is_a_command(monkeypatch, quick: list[str]) -> None:
+    monkeypatch.setattr(sys, "argv", ["gpu.py", "--help"])
+    with pytest.raises(SystemExit) as ended:
+        runpy.run_path(str(gpu.RESULTS.parent / "gpu.py"), run_name="__main__")
+    assert ended.value.code == 0

@@ -1,0 +1,51 @@
+"""What docs/gpu.md says can be run, and is what is counted."""
+
+from __future__ import annotations
+
+import importlib
+import re
+import shlex
+from pathlib import Path
+
+import pytest
+import tyro
+from nerfstudio.configs.base_config import MachineConfig
+
+ROOT = Path(__file__).resolve().parent.parent
+PAGE = (ROOT / "docs" / "gpu.md").read_text()
+
+
+def test_the_floors_on_paper_are_those_that_are_counted(monkeypatch) -> None:
+    monkeypatch.syspath_prepend(str(ROOT / "benchmarks"))
+    paper = importlib.import_module("gpu_paper")
+    assert paper.gate_table() in PAGE
+    assert paper.training_table() in PAGE
+
+
+def test_the_page_says_of_every_part_how_long_it_may_take(monkeypatch) -> None:
+    monkeypatch.syspath_prepend(str(ROOT / "benchmarks"))
+    parts = importlib.import_module("gpu").PARTS
+    rows = re.findall(r"^\| (\w+) \| .* \| (\d+) \|$", PAGE, re.MULTILINE)
+    assert {name: float(seconds) for name, seconds in rows} == {
+        name: part.seconds for name, part in parts.items()
+    }
+
+
+def test_the_commands_for_several_gpus_are_nerfstudios() -> None:
+    commands = re.findall(r"^    (ns-train leco-occupancy .*)$", PAGE, re.MULTILINE)
+    given = []
+    for command in commands:
+        words = shlex.split(command)[2:]
+        assert words[-2:] == ["--data", "SCENE"]
+        options = [word.removeprefix("--machine.") for word in words[:-2]]
+        flags = [f"--{word}" if i % 2 == 0 else word for i, word in enumerate(options)]
+        given.append(tyro.cli(MachineConfig, args=flags))
+    assert [machine.num_devices for machine in given] == [4, 4, 4]
+    assert [machine.num_machines for machine in given] == [1, 2, 2]
+    assert [machine.machine_rank for machine in given] == [0, 0, 1]
+    assert given[1].dist_url == given[2].dist_url == "tcp://HOST:PORT"
+
+
+@pytest.mark.parametrize("name", re.findall(r"`((?:samplers|models)/\w+\.py)`", PAGE))
+def test_files_that_it_names_are_there(name: str) -> None:
+    assert (ROOT / "leco_plugin" / name).is_file()
