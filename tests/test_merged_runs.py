@@ -37,7 +37,7 @@ def trainer_of(scene: Path, folder: Path, load_from: Path | None = None) -> Atom
     model.sizes = replace(model.sizes, field=field, candidates=32)
     model.schedule = replace(model.schedule, learn_steps=4)
     model.calibration = replace(model.calibration, rays=64, recheck_rays=0)
-    model.merging = MergingConfig(1e3)  # whatever it costs
+    model.merging = MergingConfig(1e3, rays=64)  # whatever it costs
     config.load_dir = load_from
     config.max_num_iterations = 100
     torch.manual_seed(0)

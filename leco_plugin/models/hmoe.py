@@ -112,14 +112,21 @@ class HMoE(nn.Module):
         return self.left if any(expert is None for expert in self.experts) else None
 
     def _load_from_state_dict(self, state_dict: dict[str, Any], prefix: str, *rest: Any) -> None:
-        """Called by torch, before it reads the experts' values: takes on those that there are."""
-        left = state_dict.setdefault(f"{prefix}left", torch.ones_like(self.left))  # added later
+        """Called by torch, before it reads the experts' values: takes on those that there are.
+
+        nerfstudio reads a checkpoint twice, the second time without the model's part.
+        """
+        if any(name.startswith(f"{prefix}experts.") for name in state_dict):
+            earlier = torch.ones_like(self.left)  # experts could not be dropped
+            self._take_on(state_dict.setdefault(f"{prefix}left", earlier))
+        super()._load_from_state_dict(state_dict, prefix, *rest)
+
+    def _take_on(self, left: Tensor) -> None:
         for number, is_left in enumerate(left.tolist()[: len(self.left)], 1):
             if not is_left and self.experts[number] is not None:
                 self.drop(number)
             elif is_left and self.experts[number] is None:
                 self.put_back(number, self._scene_expert().to(self.left.device))
-        super()._load_from_state_dict(state_dict, prefix, *rest)
 
     def forward(self, features: Tensor, routes: Tensor, gate_values: Tensor) -> Tensor:
         """Dispatches, applies the experts, and brings the points back in order.

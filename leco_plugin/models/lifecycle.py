@@ -214,7 +214,7 @@ class Lifecycle:
             if self.folder is not None:
                 leave_field(model, self.folder)
             if self.trainer is not None and not schedule.restart:
-                merge(model, lambda: calibration_rays(model, data))
+                merge(model, lambda count: calibration_rays(model, data, count))
                 forget_the_gone(self.trainer.optimizers, model.get_param_groups())
             progress.recheck_due, progress.surface, progress.image = 0, NO_EVIDENCE, NO_EVIDENCE
             progress.suspected_since = -1  # of the gate as it is now

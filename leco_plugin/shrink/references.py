@@ -1,10 +1,10 @@
-"""The fields that say what a dropped candidate was worth, each on rays of its own.
+"""The fields that say what a dropped candidate was worth.
 
-What a smaller gate declares holds against every one of them:
+What a smaller gate declares holds against each of them, along rays of held-out pixels and rays from
+between the cameras, which nobody has photographed:
 - the field at the moment of freezing, every candidate rendered: the gate's loss, absolutely;
-- the same along rays from between the cameras, which nobody has photographed;
 - the run's field as it is now, rendered as the original guides it: the loss beyond the original's.
-Without a run, the original's own decisions stand in for the last one.
+Without a run, the original's own decisions stand in, along rays of held-out pixels.
 """
 
 from __future__ import annotations
@@ -14,17 +14,21 @@ from typing import NamedTuple
 
 from leco_plugin.models.leco import LecoModel
 from leco_plugin.occupancy import Occupancy
-from leco_plugin.shrink.evidence import Evidence, Rendered, gather
+from leco_plugin.shrink.evidence import Evidence, Rendered, gather, join
 from leco_plugin.shrink.sources import Seen, Source, from_between_cameras
 
 NOW = "the run's field as it is now, beyond what the original declares"
 AT_FREEZING = "the field at the moment of freezing, all of it"
-BETWEEN = "the same from between the cameras"
 BY_DECISIONS = "the original's keep decisions, weighed by o(x): no rendering weights were at hand"
 
 
 DECLARED = ("lost_surface_mass", "lost_mass", "image_price_db")
 """What a report says of the original's own losses."""
+
+
+MOVED = 3
+"""Rays from between the cameras for each ray of a held-out pixel: what is lost lies on few rays, so
+that many have to be looked at, and held-out pixels are few."""
 
 
 class Part(NamedTuple):
@@ -56,21 +60,27 @@ def references(
     """All there are; what the original declares comes first where only the rest is measured."""
     # that the original gains something is no licence to lose it
     lost, mass, price = (max(declared(original, name), 0.0) for name in DECLARED)
-    name = NOW if source.model is not None else BY_DECISIONS
-    sides = [Part(*gather(source, original, seen)) for seen in (searched, verified)]
-    found = [Reference(name, source.model, lost, mass, price, *sides)]
-    if source.frozen is None:
-        return found
-    at_freezing = source._replace(model=source.frozen)
-    sides = [Part(*gather(at_freezing, None, seen)) for seen in (searched, verified)]
-    found.append(Reference(AT_FREEZING, source.frozen, 0.0, 0.0, 0.0, *sides))
-    moved = [
-        from_between_cameras(at_freezing, seen, seed)
-        for seed, seen in enumerate((searched, verified))
-    ]
-    sides = [Part(gather(at_freezing, None, seen)[0]) for seen in moved]
-    found.append(Reference(BETWEEN, source.frozen, 0.0, 0.0, 0.0, *sides))
+    sides = searched, verified
+    if source.model is None:
+        parts = [Part(*gather(source, original, seen)) for seen in sides]
+        return [Reference(BY_DECISIONS, None, lost, mass, price, *parts)]
+    parts = [_rendered(source, original, seen, seed) for seed, seen in enumerate(sides)]
+    found = [Reference(NOW, source.model, lost, mass, price, *parts)]
+    if source.frozen is not None:
+        before = source._replace(model=source.frozen)
+        parts = [_rendered(before, None, seen, seed) for seed, seen in enumerate(sides)]
+        found.append(Reference(AT_FREEZING, source.frozen, 0.0, 0.0, 0.0, *parts))
     return found
+
+
+def _rendered(source: Source, occupancy: Occupancy | None, seen: Seen, side: int) -> Part:
+    """Held-out pixels with their renderings, and rays from between the cameras without."""
+    evidence, rendered = gather(source, occupancy, seen)
+    pieces = [evidence]
+    for number in range(MOVED):
+        moved = from_between_cameras(source, seen, seed=side * MOVED + number)
+        pieces.append(gather(source, occupancy, moved)[0])
+    return Part(join(pieces), rendered)
 
 
 def declared(original: Occupancy, name: str) -> float:

@@ -138,6 +138,9 @@ def test_who_loads_a_state_dict_has_the_experts_that_are_left_in_it() -> None:
         assert target.left.tolist() == source.left.tolist()
         assert list(target.state_dict()) == list(source.state_dict())
         assert torch.equal(target(features, fewer, values), source(features, fewer, values))
+    full.drop(2)
+    full.load_state_dict({}, strict=False)  # as nerfstudio does after it has loaded a model
+    assert full.left.tolist() == [True, False, True]
     earlier = mixture(scene_experts=3).state_dict()
     del earlier["left"]  # as checkpoints were before experts could be dropped
     full.load_state_dict(earlier)

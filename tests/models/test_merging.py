@@ -15,7 +15,7 @@ from leco_plugin.models.field import FieldConfig
 from leco_plugin.models.gate import GateConfig
 from leco_plugin.models.hmoe import HMoEConfig
 from leco_plugin.models.leco import LecoModel, LecoModelConfig
-from leco_plugin.models.merging import find_unneeded, line_of, merge
+from leco_plugin.models.merging import MergingConfig, find_unneeded, line_of, merge
 from leco_plugin.models.rendering import Rays
 from leco_plugin.models.sizes import Sizes
 
@@ -127,10 +127,10 @@ def test_the_price_is_that_of_all_that_have_gone(model: LecoModel) -> None:
 def test_what_is_empty_and_what_is_skipped_stays_so(
     model: LecoModel, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    model.config.merging = model.config.merging.__class__(1e3)
+    model.config.merging = MergingConfig(1e3, rays=200)
     before = occupancies(model)
     params = sum(parameter.numel() for parameter in model.field.parameters())
-    merge(model, lambda: (some_rays(), torch.rand(200, 3)))
+    merge(model, lambda count: (some_rays(count), torch.rand(count, 3)))
     assert torch.equal(occupancies(model), before)
     assert int(model.field.experts.left.sum()) == 1
     each = 16 * 16 + 16
@@ -151,12 +151,12 @@ def test_a_checkpoint_of_a_field_without_some_experts_renders_the_same(model: Le
 
 
 def test_where_nothing_may_go_nothing_is_tried(model: LecoModel) -> None:
-    def draw() -> tuple[Rays, torch.Tensor]:
+    def draw(count: int) -> tuple[Rays, torch.Tensor]:
         raise AssertionError("rays were asked for")
 
-    model.config.merging = model.config.merging.__class__(None)
+    model.config.merging = MergingConfig(None)
     merge(model, draw)
-    model.config.merging = model.config.merging.__class__(BOUND)
+    model.config.merging = MergingConfig(BOUND)
     model.config.homogeneous = True
     merge(model, draw)
     model.config.homogeneous = False

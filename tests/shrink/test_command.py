@@ -201,6 +201,8 @@ def test_what_is_declared_holds_against_the_field_at_the_moment_of_freezing(
 ) -> None:
     """That field has matter where the original skips: haze that is densest about the ball."""
     monkeypatch.setattr(search, "MARGIN", 1.0)
+    gates = [GateConfig(EncodingConfig(octaves=3), 16, 2, 1)]
+    monkeypatch.setattr(search, "ladder", lambda most: gates)
     folder = tmp_path / "run"
     shutil.copytree(known_run, folder)
     file, out, report = folder / "occupancy.safetensors", tmp_path / "small", tmp_path / "a.json"
@@ -218,14 +220,14 @@ def test_what_is_declared_holds_against_the_field_at_the_moment_of_freezing(
     assert [one["reference"] for one in against] == [
         references.NOW,
         references.AT_FREEZING,
-        references.BETWEEN,
     ]
     ground = command._ground(sources.find_source(file, tiny_scene), Occupancy.load(file))
     lost = lost_on_unseen_rays(ground, smaller)
     assert lost[1] > lost[0] + 0.01  # what the original skips counts
     assert max(lost) <= smaller.report["lost_surface_mass"] == max(x["bound"] for x in against)
-    between, seen = (ground.references[i].verify.evidence for i in (2, 1))
-    assert between.rays == seen.rays and len(between.positions) != len(seen.positions)
+    part = ground.references[1].verify
+    pixels = sum(len(one.truth) for one in part.rendered)
+    assert part.evidence.rays == (1 + references.MOVED) * pixels
 
 
 def test_rays_from_between_the_cameras_begin_there(known_run: Path, tiny_scene: Path) -> None:
