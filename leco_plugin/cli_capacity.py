@@ -58,8 +58,9 @@ def shrink(
     """Find the smallest gate that decides as a frozen one does; measured on rays it never saw.
 
     Smaller gates are taught, from small to large, until one holds. Where the file lies in the
-    folder of its run, the run's trained model says what a dropped candidate was worth; without one
-    the loss is measured against what the original keeps.
+    folder of its run, the run's field, as it was at the moment of freezing and as it is now, says
+    what a dropped candidate was worth; without one the loss is measured against what the original
+    keeps.
 
     Args:
         file: An occupancy.safetensors, best where its run left it.

@@ -195,7 +195,8 @@ def density_of(model: LecoModel, mapped: Tensor) -> Tensor:
 
     def part_of(part: Tensor) -> Tensor:
         with gate_precision(model.device.type, model.precision):
-            values, routes = gate_values_and_routes(model.gate(part), model.routing)
+            left = model.field.experts.those_left()
+            values, routes = gate_values_and_routes(model.gate(part), model.routing, left)
             sigmas: Tensor = model.field.density(part, routes, values)[0]
         return sigmas
 

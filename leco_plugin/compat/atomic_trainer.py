@@ -10,9 +10,11 @@ from pathlib import Path
 from typing import Any
 
 from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackLocation
+from nerfstudio.engine.optimizers import Optimizers
 from nerfstudio.engine.trainer import Trainer
 from nerfstudio.utils.decorators import check_main_thread
 
+from leco_plugin.compat.optimizers import OptimizersOfThePresent
 from leco_plugin.compat.whole_checkpoints import first_not_finite, newest_whole, previous_of
 from leco_plugin.models.failures import GateCollapsed, TrainingStopped
 from leco_plugin.models.ranks import say
@@ -41,6 +43,10 @@ class AtomicTrainer(Trainer):
         self.saved_at = time.monotonic()
         where = [TrainingCallbackLocation.AFTER_TRAIN_ITERATION]
         self.callbacks.append(TrainingCallback(where, self.save_by_the_clock))
+
+    def setup_optimizers(self) -> Optimizers:
+        """nerfstudio's, which resume with the parameters that a checkpoint has left the model."""
+        return OptimizersOfThePresent(self.config.optimizers.copy(), self.pipeline)
 
     def save_by_the_clock(self, step: int) -> None:
         """Saves if the last time is long ago; nothing where a run is to save nothing, or keeps all

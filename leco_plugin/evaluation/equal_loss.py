@@ -122,7 +122,8 @@ def grid_of_field(
 
 def _sigmas(model: LecoModel, mapped: Tensor) -> Tensor:
     with gate_precision(model.device.type, model.precision):
-        values, routes = gate_values_and_routes(model.gate(mapped), model.routing)
+        left = model.field.experts.those_left()
+        values, routes = gate_values_and_routes(model.gate(mapped), model.routing, left)
         sigmas: Tensor = model.field.density(mapped, routes, values)[0]
     return sigmas
 

@@ -6,7 +6,7 @@ Dispatch is top-1 and dropless: every point goes through the expert it is routed
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal
+from typing import Any, Literal
 
 import torch
 from torch import Tensor, nn
@@ -66,7 +66,14 @@ class Expert(nn.Module):
 
 
 class HMoE(nn.Module):
-    """h(x) = G_i*(x) E_i*(x): each point through the one expert it is routed to."""
+    """h(x) = G_i*(x) E_i*(x): each point through the one expert it is routed to.
+
+    Attributes:
+        left: bool [n], which scene experts have not been dropped; a state dict says so too, and
+            whoever loads it has the same ones afterwards.
+    """
+
+    left: Tensor
 
     def __init__(self, config: HMoEConfig) -> None:
         super().__init__()
@@ -74,11 +81,52 @@ class HMoE(nn.Module):
         empty: nn.Module = nn.Identity()
         if config.empty_expert == "mlp":
             empty = Expert(config.width, config.empty_layers)
-        scene = (
-            Expert(config.width, config.layers, config.skip, config.residual)
-            for _ in range(config.scene_experts)
-        )
+        scene = (self._scene_expert() for _ in range(config.scene_experts))
         self.experts = nn.ModuleList([empty, *scene])
+        self.register_buffer("left", torch.ones(config.scene_experts, dtype=torch.bool))
+
+    def _scene_expert(self) -> Expert:
+        config = self.config
+        return Expert(config.width, config.layers, config.skip, config.residual)
+
+    def drop(self, number: int) -> nn.Module:
+        """Takes a scene expert out, parameters and all; the others keep their numbers.
+
+        Args:
+            number: in [1, n], of an expert that is left.
+        Returns:
+            The expert, for `put_back`.
+        """
+        expert = self.experts[number]
+        self.experts[number] = None  # type: ignore[assignment]
+        self.left[number - 1] = False
+        return expert
+
+    def put_back(self, number: int, expert: nn.Module) -> None:
+        """Undoes `drop`."""
+        self.experts[number] = expert
+        self.left[number - 1] = True
+
+    def those_left(self) -> Tensor | None:
+        """`left`, or None while no expert has been dropped; nothing waits for the device."""
+        return self.left if any(expert is None for expert in self.experts) else None
+
+    def _load_from_state_dict(self, state_dict: dict[str, Any], prefix: str, *rest: Any) -> None:
+        """Called by torch, before it reads the experts' values: takes on those that there are.
+
+        nerfstudio reads a checkpoint twice, the second time without the model's part.
+        """
+        if any(name.startswith(f"{prefix}experts.") for name in state_dict):
+            earlier = torch.ones_like(self.left)  # experts could not be dropped
+            self._take_on(state_dict.setdefault(f"{prefix}left", earlier))
+        super()._load_from_state_dict(state_dict, prefix, *rest)
+
+    def _take_on(self, left: Tensor) -> None:
+        for number, is_left in enumerate(left.tolist()[: len(self.left)], 1):
+            if not is_left and self.experts[number] is not None:
+                self.drop(number)
+            elif is_left and self.experts[number] is None:
+                self.put_back(number, self._scene_expert().to(self.left.device))
 
     def forward(self, features: Tensor, routes: Tensor, gate_values: Tensor) -> Tensor:
         """Dispatches, applies the experts, and brings the points back in order.
@@ -87,7 +135,7 @@ class HMoE(nn.Module):
 
         Args:
             features: [N, width] A gamma(x).
-            routes: [N] int64 in [0, n].
+            routes: [N] int64 in [0, n], of experts that are left.
             gate_values: [N] G_i*(x), in the precision of the gate.
         Returns:
             [N, width] in the dtype of the experts' output.
@@ -104,7 +152,10 @@ class HMoE(nn.Module):
         self, features: Tensor, routes: Tensor, dtype: torch.dtype | None = None
     ) -> Tensor:
         """As `dispatch`, without a wait for the device; the empty-space expert sees all points."""
-        empty, *scene = self.experts
+        empty, *scene = (expert for expert in self.experts if expert is not None)
+        if len(scene) < len(self.left):
+            numbers = torch.cat([self.left.new_zeros(1), self.left]).cumsum(0)
+            routes = numbers.index_select(0, routes)
         features = features.to(torch.bfloat16 if dtype is None else dtype)
         with torch.autocast(features.device.type, enabled=False):
             hidden = grouped_dispatch(features, routes, scene)  # type: ignore[arg-type]
@@ -115,7 +166,12 @@ class HMoE(nn.Module):
 
 def dense_hmoe(hmoe: HMoE, features: Tensor, routes: Tensor, gate_values: Tensor) -> Tensor:
     """The slow twin of `HMoE.forward`: every expert on every point, selected by a one-hot mask."""
-    outputs = torch.stack([expert(features) for expert in hmoe.experts])
+    outputs = torch.stack(
+        [
+            torch.zeros_like(features) if expert is None else expert(features)
+            for expert in hmoe.experts
+        ]
+    )
     if hmoe.config.empty_expert == "none":
         outputs = torch.cat([torch.zeros_like(outputs[:1]), outputs[1:]])
     chosen = torch.nn.functional.one_hot(routes, len(hmoe.experts)).t()[..., None]

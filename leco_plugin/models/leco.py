@@ -17,10 +17,12 @@ from leco_plugin.compat.earlier_configs import GrowingConfig
 from leco_plugin.models.calibration import CalibrationConfig
 from leco_plugin.models.failures import require_finite
 from leco_plugin.models.field import HMoEField
+from leco_plugin.models.front_to_back import shade_front_to_back
 from leco_plugin.models.gate import Gate, check_sizes
 from leco_plugin.models.healing import annealed, is_dense
 from leco_plugin.models.image_figures import image_figures
 from leco_plugin.models.losses import distortion_loss, termination_loss
+from leco_plugin.models.merging import MergingConfig
 from leco_plugin.models.objective import GateLossConfig, gate_losses
 from leco_plugin.models.phases import ScheduleConfig
 from leco_plugin.models.precision import fast_precision, keep_freed_memory
@@ -66,6 +68,8 @@ class LecoModelConfig(GrowingConfig, ModelConfig):
     """What sparse points teach the gate before the first step; off by default."""
     calibration: CalibrationConfig = field(default_factory=CalibrationConfig)
     """What skipping may cost."""
+    merging: MergingConfig = field(default_factory=MergingConfig)
+    """Which scene experts are left when the gate is frozen."""
     distortion: float = 0.05
     """Weight of the distortion loss, which clears haze (mip-NeRF 360, eq. 15)."""
     termination: float = 0.03
@@ -272,6 +276,13 @@ class LecoModel(Model):
                 freeze_gate=bool(self.frozen),
             )
 
+    def shade_what_is_seen(self, rays: Rays, intervals: Intervals) -> tuple[Shaded, Intervals]:
+        """As `shade`, without gradients and without what lies behind opaque surfaces."""
+        with gate_precision(self.device.type, self.precision):
+            return shade_front_to_back(
+                self.field, self.gate, self.space, rays, intervals, self.routing
+            )
+
     def get_outputs(self, ray_bundle: RayBundle) -> dict[str, Any]:  # type: ignore[override]
         """Pixels of rays; in training also what the losses need (`shaded`, `intervals`, `rays`)."""
         rays = self.rays_of(ray_bundle)
@@ -280,7 +291,10 @@ class LecoModel(Model):
         if self.training:
             kept = len(intervals.t_starts) / max(len(rays.origins), 1) - 1.0
             self.guided_kept = kept if guided else 1.0
-        shaded = self.shade(rays, intervals)
+        if self.training:
+            shaded = self.shade(rays, intervals)
+        else:
+            shaded, intervals = self.shade_what_is_seen(rays, intervals)
         outputs: dict[str, Any] = {
             "rgb": shaded.rgb,
             "depth": shaded.depth[:, None],

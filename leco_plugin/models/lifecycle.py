@@ -16,14 +16,17 @@ from nerfstudio.engine.callbacks import (
 )
 from torch import Tensor
 
+from leco_plugin.compat.optimizers import forget_the_gone
 from leco_plugin.models.failures import GateCollapsed
 from leco_plugin.models.field import HMoEField
-from leco_plugin.models.freezing import freeze, write_occupancy
+from leco_plugin.models.field_at_freezing import carry_over, leave_field
+from leco_plugin.models.freezing import calibration_rays, freeze, write_occupancy
 from leco_plugin.models.gate import occupancy_from_logits, route
 from leco_plugin.models.guided_watch import GuidedWatch
 from leco_plugin.models.healing import MOST_RECOVERIES, STEPS_PER_LOOK, heal, is_collapsed
 from leco_plugin.models.history import GateHistory
 from leco_plugin.models.losses import expert_shares
+from leco_plugin.models.merging import merge
 from leco_plugin.models.phases import (
     PROBES,
     ScheduleConfig,
@@ -72,8 +75,11 @@ class Lifecycle:
         self.step_started = 0.0
         self.history = GateHistory()
         self.guided = GuidedWatch(self)
-        if bool(model.frozen) and self.folder is not None:
+        if bool(model.frozen) and self.trainer is not None and self.folder is not None:
             write_occupancy(model, self.folder)  # a resumed run may have a folder of its own
+            resumed = self.trainer.config.load_checkpoint or self.trainer.config.load_dir
+            if resumed is not None:
+                carry_over(resumed, self.folder)
 
     def _begin_with_points(self) -> None:
         """Shows the gate the sparse points, where that is asked for; it counts as learning time."""
@@ -206,6 +212,11 @@ class Lifecycle:
             )
             data, seconds = self.pipeline.datamanager, progress.learn_seconds
             freeze(model, data, self.survey, self.folder, step, seconds)
+            if self.folder is not None:
+                leave_field(model, self.folder)
+            if self.trainer is not None and not schedule.restart:
+                merge(model, lambda count: calibration_rays(model, data, count))
+                forget_the_gone(self.trainer.optimizers, model.get_param_groups())
             progress.recheck_due, progress.surface, progress.image = 0, NO_EVIDENCE, NO_EVIDENCE
             progress.suspected_since = -1  # of the gate as it is now
             if schedule.steps_per_record > 0:
@@ -235,7 +246,9 @@ class Lifecycle:
             return
         model, positions = self.model, self.probe_positions
         with gate_precision(model.device.type, model.precision):
-            gate_values, routes = gate_values_and_routes(model.gate(positions), model.routing)
+            gate_values, routes = gate_values_and_routes(
+                model.gate(positions), model.routing, model.field.experts.those_left()
+            )
             sigmas, _ = model.field.density(positions, routes, gate_values)
         self.history.look(step, self.progress.learn_seconds, model.gate, routes, sigmas)
         try:

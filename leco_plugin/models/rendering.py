@@ -9,7 +9,7 @@ from torch import Tensor
 
 from leco_plugin.models.color_head import ColorHead
 from leco_plugin.models.field import HMoEField
-from leco_plugin.models.gate import Gate, occupancy_from_logits, route
+from leco_plugin.models.gate import EMPTY, Gate, occupancy_from_logits, route
 from leco_plugin.models.rows import select_rows
 from leco_plugin.samplers.packed import (
     accumulate_along_rays,
@@ -83,8 +83,28 @@ class Routing(NamedTuple):
     """No empty-space expert at all: the gate chooses among the scene experts."""
 
 
-def gate_values_and_routes(logits: Tensor, routing: Routing) -> tuple[Tensor, Tensor]:
+def gate_values_and_routes(
+    logits: Tensor, routing: Routing, left: Tensor | None = None
+) -> tuple[Tensor, Tensor]:
     """The factor of each sample's features [M] float32, and its expert [M] int64.
+
+    Points of a scene expert that was dropped go to the best of those that are left, with the factor
+    that they had; which points are empty, and all other points, stay as they are.
+
+    Args:
+        logits: [M, 1 + n].
+        left: bool [n], scene experts that were not dropped; None is all of them.
+    """
+    gate_values, routes = _of_all_experts(logits, routing)
+    if left is not None:
+        scene = logits[:, 1:]
+        best = scene.masked_fill(~left[: scene.shape[-1]], -torch.inf).argmax(dim=-1) + 1
+        routes = torch.where(routes == EMPTY, EMPTY, best)
+    return gate_values, routes
+
+
+def _of_all_experts(logits: Tensor, routing: Routing) -> tuple[Tensor, Tensor]:
+    """As above, while no expert has been dropped.
 
     The paper's factor is G_i*(x), which jumps when a sample changes from an expert to another. With
     a threshold rule the factor is one, and only its gradient is that of the scene expert's share
@@ -176,11 +196,46 @@ def shade(
     Args:
         freeze_gate: no gradient reaches the gate.
     """
+    answers = ask(field, gate, space, rays, intervals, routing, freeze_gate)
+    return render(field, space, rays, intervals, answers)
+
+
+class Answers(NamedTuple):
+    """What gate and field say of packed samples."""
+
+    sigmas: Tensor
+    """[M] densities per half extent."""
+    features: Tensor
+    """[M, width] of which colour is made."""
+    logits: Tensor
+    """[M, 1 + n] of the gate."""
+    routes: Tensor
+    """[M] int64, the expert of each sample."""
+
+
+def ask(
+    field: HMoEField,
+    gate: Gate,
+    space: Space,
+    rays: Rays,
+    intervals: Intervals,
+    routing: Routing,
+    freeze_gate: bool,
+) -> Answers:
+    """Asks gate and field at the middles of intervals; arguments as for `shade`."""
     mapped = mapped_middles(space, rays, intervals)
     with torch.set_grad_enabled(torch.is_grad_enabled() and not freeze_gate):
         logits = gate(mapped)
-        gate_values, routes = gate_values_and_routes(logits, routing)
+        gate_values, routes = gate_values_and_routes(logits, routing, field.experts.those_left())
     sigmas, features = field.density(mapped, routes, gate_values)
+    return Answers(sigmas, features, logits, routes)
+
+
+def render(
+    field: HMoEField, space: Space, rays: Rays, intervals: Intervals, answers: Answers
+) -> Shaded:
+    """Pixels from what was said of packed intervals."""
+    sigmas, features, logits, routes = answers
     weights, packed_info = weigh(
         sigmas, backdrop_of(intervals, rays), intervals, space.half_extent, len(rays.origins)
     )

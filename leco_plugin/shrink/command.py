@@ -14,8 +14,9 @@ from leco_plugin.evaluation.inspection import whole_box
 from leco_plugin.evaluation.machine import describe_machine
 from leco_plugin.occupancy import Occupancy
 from leco_plugin.progress_bar import bar
-from leco_plugin.shrink.evidence import gather
-from leco_plugin.shrink.search import Bounds, Found, Ground, Rung, room_beyond, search
+from leco_plugin.shrink.evidence import Evidence, gather
+from leco_plugin.shrink.references import names_of, references
+from leco_plugin.shrink.search import Bounds, Found, Ground, Rung, check_room, search
 from leco_plugin.shrink.sources import Source, find_source, held_out, trained_on
 
 RAYS = 4096
@@ -26,11 +27,6 @@ COPIED = (
     *("frame", "cameras"),
 )
 """What a smaller occupancy's report takes over from the original's."""
-BY_RENDERING = (
-    "the run's field as it is now, rendered as the original guides it; of the field at the moment "
-    "of freezing it may lose more"
-)
-BY_DECISIONS = "the original's keep decisions, weighed by o(x): no rendering weights were at hand"
 
 
 def shrink(file: Path, data: Path, out: Path, bounds: Bounds, seed: int = 0) -> dict[str, Any]:
@@ -50,7 +46,7 @@ def shrink(file: Path, data: Path, out: Path, bounds: Bounds, seed: int = 0) -> 
     if out.is_dir():
         raise ValueError(f"--out {out} is a folder; give a file")
     original = Occupancy.load(file)
-    room_beyond(original, bounds)
+    check_room(original, bounds)
     missing = [name for name in ("near", "far", "step_size") if name not in original.report]
     if missing:
         raise ValueError(f"{file} does not say how its rays are marched: no {missing[0]}")
@@ -84,22 +80,29 @@ def shrink(file: Path, data: Path, out: Path, bounds: Bounds, seed: int = 0) -> 
 def _ground(source: Source, original: Occupancy) -> Ground:
     """Rays to teach by, to search on, and to verify on, with what they are worth."""
     searched, verified = held_out(source, original, RAYS)
-    taught, _ = gather(source, original, trained_on(source, original, TAUGHT_RAYS))
-    on_search, search_rendered = gather(source, original, searched)
-    on_verify, verify_rendered = gather(source, original, verified)
-    if not bool(on_search.kept.any()) or not bool(on_verify.kept.any()):
+    found = references(source, original, searched, verified)
+    parts = [part.evidence for one in found for part in (one.search, one.verify)]
+    if not all(bool(part.kept.any()) for part in parts[:2]):
         raise ValueError(
             "the occupancy keeps nothing on the rays of these photographs: they are of another "
             "scene, or it has been moved since"
         )
-    if not bool(on_search.worth.any()) or not bool(on_verify.worth.any()):
+    if not all(bool(part.worth.any()) for part in parts):
         raise ValueError(
             "the run's field renders nothing where the occupancy keeps something, so that no loss "
             "can be measured: it is of another run, or was hardly trained"
         )
-    return Ground(
-        original, source.model, taught, on_search, search_rendered, on_verify, verify_rendered
-    )
+    return Ground(original, _taught(source, original), found)
+
+
+def _taught(source: Source, original: Occupancy) -> Evidence:
+    """Rays to teach by; a candidate weighs what it weighs in any of the fields."""
+    seen = trained_on(source, original, TAUGHT_RAYS)
+    taught, _ = gather(source, original, seen)
+    if source.frozen is None:
+        return taught
+    before, _ = gather(source._replace(model=source.frozen), None, seen)
+    return taught._replace(weights=taught.weights.maximum(before.weights))
 
 
 def _rounded_as_it_is(original: Occupancy) -> Occupancy:
@@ -121,30 +124,23 @@ def report_of(original: Occupancy, ground: Ground, found: Found) -> dict[str, An
         report["cameras"] = [[round(float(x), 4) for x in row] for row in report["cameras"]]
     if found.occupancy is None:
         return {**original.report, **report}
-    measured = found.rungs[-1].verified
-    reference = BY_RENDERING if ground.model is not None else BY_DECISIONS
-
-    def declared(name: str, beyond: float | None) -> float | None:
-        before = original.report.get(name)
-        if beyond is None or not isinstance(before, int | float):
-            return beyond
-        return max(float(before), 0.0) + beyond
-
-    return report | {
-        "params": found.rungs[-1].params,
-        "threshold": found.occupancy.threshold,
-        "lost_surface_mass": declared("lost_surface_mass", measured["lost_surface_mass_bound"]),
-        "lost_mass": declared("lost_mass", measured["lost_mass"]),
-        "image_price_db": declared("image_price_db", measured["image_price_db"]),
-        "empty_fraction": measured["empty_fraction"],
-        "calibration_rays": ground.verify.rays,
-        "held_out": bool(original.report.get("held_out", False)),
-        "shrunk_from_params": original.num_params,
-        "loss_measured_against": reference,
-        "lost_beyond_the_original": measured["lost_surface_mass"],
-        "kept_candidates_dropped": measured["kept_candidates_dropped"],
-        "kept_volume_of_the_original": found.rungs[-1].kept_volume,
-    }
+    rung = found.rungs[-1]
+    measured = rung.verified
+    unchanged = ("lost_mass", "image_price_db", "empty_fraction", "kept_candidates_dropped")
+    return (
+        report
+        | {name: measured[name] for name in unchanged}
+        | {
+            "params": rung.params,
+            "threshold": found.occupancy.threshold,
+            "lost_surface_mass": measured["lost_surface_mass_bound"],
+            "calibration_rays": ground.references[0].verify.evidence.rays,
+            "held_out": bool(original.report.get("held_out", False)),
+            "shrunk_from_params": original.num_params,
+            "loss_measured_against": names_of(ground.references),
+            "kept_volume_of_the_original": rung.kept_volume,
+        }
+    )
 
 
 def compare_queries(original: Occupancy, smaller: Occupancy) -> tuple[float, list[float]]:

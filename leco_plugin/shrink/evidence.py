@@ -75,16 +75,24 @@ def gather(
             truth = source.model.renderer_rgb.blend_background(seen.truth[part])
             piece, again = _by_rendering(source.model, occupancy, rays, truth)
             rendered.append(again)
-        pieces.append(piece._replace(ray_indices=piece.ray_indices + first))
-    joined = Evidence(
+        pieces.append(piece)
+    return join(pieces), rendered
+
+
+def join(pieces: Sequence[Evidence]) -> Evidence:
+    """Evidence of several batches of rays, numbered through."""
+    before, ray_indices = 0, []
+    for piece in pieces:
+        ray_indices.append(piece.ray_indices + before)
+        before += piece.rays
+    return Evidence(
         torch.cat([piece.positions for piece in pieces]),
-        torch.cat([piece.ray_indices for piece in pieces]),
+        torch.cat(ray_indices),
         torch.cat([piece.kept for piece in pieces]),
         torch.cat([piece.weights for piece in pieces]),
         torch.cat([piece.worth for piece in pieces]),
-        sum(piece.rays for piece in pieces),
+        before,
     )
-    return joined, rendered
 
 
 def middles(rays: Rays, intervals: Intervals) -> Tensor:
@@ -166,6 +174,9 @@ CONFIDENCE = 2.33
 def loss(evidence: Evidence, skipped: Tensor) -> Loss:
     """The share of the worth that is skipped, with the error of a ratio of sums over rays.
 
+    The error is reckoned as if one more ray of average worth were lost: a loss that no ray has seen
+    yet has no spread.
+
     Args:
         skipped: bool [M].
     """
@@ -178,7 +189,8 @@ def loss(evidence: Evidence, skipped: Tensor) -> Loss:
     )
     total = max(float(worth.sum()), 1e-12)
     share = float(lost.sum()) / total
-    error = float((lost - share * worth).square().sum().sqrt()) / total
+    one_more = (total / max(evidence.rays, 1)) ** 2
+    error = math.sqrt(float((lost - share * worth).square().sum()) + one_more) / total
     return Loss(share, share + CONFIDENCE * error, lost_all / max(all_weight, 1e-12))
 
 

@@ -17,16 +17,10 @@ from torch import Tensor
 
 from leco_plugin.evaluation.inspection import whole_box
 from leco_plugin.models.gate import GateConfig
-from leco_plugin.models.leco import LecoModel
 from leco_plugin.occupancy import Occupancy
-from leco_plugin.shrink.evidence import (
-    Evidence,
-    Rendered,
-    image_price,
-    loss,
-    query_in_parts,
-)
+from leco_plugin.shrink.evidence import Evidence, Loss, image_price, loss, query_in_parts
 from leco_plugin.shrink.ladder import ladder, name_of, values_of
+from leco_plugin.shrink.references import Part, Reference, declared
 from leco_plugin.shrink.teaching import Lesson, round_weights, teach
 
 STEPS = 400
@@ -50,7 +44,7 @@ class Bounds:
 
 @dataclass
 class Rung:
-    """One gate that was tried. Losses are beyond the original's."""
+    """One gate that was tried. Losses are the worst of any reference, the original's included."""
 
     name: str
     params: int
@@ -63,6 +57,8 @@ class Rung:
     verdict: str
     seconds: float
     verified: dict[str, float | None] = field(default_factory=dict)
+    verified_against: list[dict[str, str | float]] = field(default_factory=list)
+    """The share that each reference has lost on rays of its own, and its bound."""
 
     def to_dict(self) -> dict[str, Any]:
         return asdict(self)
@@ -72,12 +68,8 @@ class Ground(NamedTuple):
     """What gates are taught and measured on."""
 
     original: Occupancy
-    model: LecoModel | None
     taught: Evidence
-    search: Evidence
-    search_rendered: Sequence[Rendered]
-    verify: Evidence
-    verify_rendered: Sequence[Rendered]
+    references: Sequence[Reference]
 
 
 class Found(NamedTuple):
@@ -103,7 +95,7 @@ def search(
     Raises:
         ValueError: what the original declares already leaves nothing to lose.
     """
-    room = room_beyond(ground.original, bounds)
+    check_room(ground.original, bounds)
     gates = ladder(values_of(ground.original.gate.config)) if gates is None else gates
     volume = _volume(ground.original, VOLUME_POINTS, seed=5)
     kept = query_in_parts(ground.original, volume) >= ground.original.threshold
@@ -128,7 +120,7 @@ def search(
                 ground.original.precision,
                 walls=ground.original.walls,
             ).eval(),
-            room,
+            bounds,
             volume,
             kept,
         )
@@ -141,8 +133,8 @@ def search(
     return Found(None, rungs)
 
 
-def room_beyond(original: Occupancy, bounds: Bounds) -> Bounds:
-    """What is left to lose after what the original declares.
+def check_room(original: Occupancy, bounds: Bounds) -> None:
+    """Whether anything is left to lose after what the original declares.
 
     Raises:
         ValueError: nothing is, or a bound is out of range.
@@ -152,8 +144,7 @@ def room_beyond(original: Occupancy, bounds: Bounds) -> Bounds:
             "bounds are a lost surface mass from 0 to 1 and a number of dB, not "
             f"{bounds.lost_surface_mass} and {bounds.image_price_db}"
         )
-    declared = [original.report.get(name) for name in ("lost_surface_mass", "image_price_db")]
-    lost, price = (float(value) if isinstance(value, int | float) else 0.0 for value in declared)
+    lost, price = declared(original, "lost_surface_mass"), declared(original, "image_price_db")
     if lost >= bounds.lost_surface_mass:
         raise ValueError(
             f"the occupancy itself declares a lost surface mass of {lost:.2e}, which leaves "
@@ -164,10 +155,6 @@ def room_beyond(original: Occupancy, bounds: Bounds) -> Bounds:
             f"the occupancy itself declares an image price of {price:.3f} dB, which leaves nothing "
             f"of {bounds.image_price_db:.3f} dB: raise --image-price"
         )
-    # that the original gains something is no licence to lose it
-    return Bounds(
-        bounds.lost_surface_mass - max(lost, 0.0), bounds.image_price_db - max(price, 0.0)
-    )
 
 
 def lesson_of(original: Occupancy, taught: Evidence) -> Lesson:
@@ -182,56 +169,103 @@ def lesson_of(original: Occupancy, taught: Evidence) -> Lesson:
 
 
 def _measured(
-    ground: Ground, smaller: Occupancy, room: Bounds, volume: Tensor, kept: Tensor
+    ground: Ground, smaller: Occupancy, bounds: Bounds, volume: Tensor, kept: Tensor
 ) -> tuple[Occupancy, Rung]:
     """The gate with the threshold that suits it, and what was found."""
-    scores = query_in_parts(smaller, ground.search.positions)
+    scores = [
+        query_in_parts(smaller, reference.search.evidence.positions)
+        for reference in ground.references
+    ]
     of_volume = query_in_parts(smaller, volume)
-    allowed = MARGIN * room.lost_surface_mass
-    lost, ratio = math.inf, 0.0
+    losses: list[float] = []
+    holds, ratio = False, 0.0
     for share in VOLUMES:
         threshold = threshold_keeping(of_volume, share * float(kept.double().mean()))
-        lost = loss(ground.search, scores < threshold).share
+        losses = [
+            reference.lost_before + loss(reference.search.evidence, found < threshold).share
+            for reference, found in zip(ground.references, scores)
+        ]
         ratio = float((of_volume >= threshold).double().mean() / kept.double().mean())
-        if lost <= allowed:
+        holds = all(
+            lost <= MARGIN * bounds.lost_surface_mass + (1.0 - MARGIN) * reference.lost_before
+            for reference, lost in zip(ground.references, losses)
+        )
+        if holds:
             break
     smaller.threshold_value.fill_(threshold)
     config = smaller.gate.config
     params = values_of(config)
-    rung = Rung(name_of(config), params, 2 * params, round(ratio, 4), lost, None, "", 0.0)
-    if lost > allowed:
+    rung = Rung(name_of(config), params, 2 * params, round(ratio, 4), max(losses), None, "", 0.0)
+    if not holds:
         rung.verdict = "loses too much"
         return smaller, rung
     if ratio > VOLUMES[-1] + 0.005:
         rung.verdict = "keeps too much"
         return smaller, rung
-    if ground.model is not None:
-        rung.image_price_db = image_price(ground.model, ground.search_rendered, smaller)
-        if rung.image_price_db > room.image_price_db:
-            rung.verdict = "costs too much of the image"
-            return smaller, rung
-    rung.verdict = "chosen" if _verified(ground, smaller, room, rung) else "fails on unseen rays"
+    prices = [price_of(reference, reference.search, smaller) for reference in ground.references]
+    rung.image_price_db = worst(prices)
+    if (rung.image_price_db or 0.0) > bounds.image_price_db:
+        rung.verdict = "costs too much of the image"
+        return smaller, rung
+    rung.verdict = "chosen" if _verified(ground, smaller, bounds, rung) else "fails on unseen rays"
     return smaller, rung
 
 
-def _verified(ground: Ground, smaller: Occupancy, room: Bounds, rung: Rung) -> bool:
-    """Whether the bounds hold on rays that the search did not see; measures what to declare."""
-    skipped = query_in_parts(smaller, ground.verify.positions) < smaller.threshold
-    unseen = loss(ground.verify, skipped)
-    price = None
-    if ground.model is not None:
-        price = image_price(ground.model, ground.verify_rendered, smaller)
+def price_of(reference: Reference, part: Part, smaller: Occupancy) -> float | None:
+    """The image price of skipping what a gate skips, dB; None where nothing is rendered."""
+    if reference.model is None or not part.rendered:
+        return None
+    return reference.price_before + image_price(reference.model, part.rendered, smaller)
+
+
+def worst(values: Sequence[float | None]) -> float | None:
+    """The largest of what was measured; None where nothing was."""
+    return max((value for value in values if value is not None), default=None)
+
+
+def _verified(ground: Ground, smaller: Occupancy, bounds: Bounds, rung: Rung) -> bool:
+    """Whether the bounds hold on rays that the search did not see; measures what to declare.
+
+    What the rays of the search have lost counts as well, where it is more: most of a loss lies on
+    few rays, and they may all be among those.
+    """
+    found: list[Loss] = []
+    prices: list[float | None] = []
+    for reference in ground.references:
+        parts = reference.search, reference.verify
+        searched, unseen = (loss(part.evidence, _skipped(smaller, part)) for part in parts)
+        before = reference.lost_before
+        found.append(
+            Loss(
+                before + unseen.share,
+                before + max(searched.bound, unseen.bound),
+                reference.mass_before + unseen.lost_mass,
+            )
+        )
+        prices += [price_of(reference, part, smaller) for part in parts]
+    first = ground.references[0].verify
+    kept, skipped = first.evidence.kept, _skipped(smaller, first)
     rung.verified = {
-        "lost_surface_mass": unseen.share,
-        "lost_surface_mass_bound": unseen.bound,
-        "lost_mass": unseen.lost_mass,
-        "image_price_db": price,
+        "lost_surface_mass": max(one.share for one in found),
+        "lost_surface_mass_bound": max(one.bound for one in found),
+        "lost_mass": max(one.lost_mass for one in found),
+        "image_price_db": worst(prices),
         "empty_fraction": float(skipped.double().mean()),
-        "kept_candidates_dropped": float(
-            (skipped & ground.verify.kept).sum() / ground.verify.kept.sum().clamp(min=1)
-        ),
+        "kept_candidates_dropped": float((skipped & kept).sum() / kept.sum().clamp(min=1)),
     }
-    return unseen.bound <= room.lost_surface_mass and (price or 0.0) <= room.image_price_db
+    rung.verified_against = [
+        {"reference": reference.name, "lost_surface_mass": one.share, "bound": one.bound}
+        for reference, one in zip(ground.references, found)
+    ]
+    price = rung.verified["image_price_db"] or 0.0
+    return (
+        max(one.bound for one in found) <= bounds.lost_surface_mass
+        and price <= bounds.image_price_db
+    )
+
+
+def _skipped(smaller: Occupancy, part: Part) -> Tensor:
+    return query_in_parts(smaller, part.evidence.positions) < smaller.threshold
 
 
 def threshold_keeping(scores: Tensor, share: float) -> float:

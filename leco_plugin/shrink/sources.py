@@ -11,8 +11,10 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import torch
+from nerfstudio.cameras.rays import RayBundle
 from torch import Tensor
 
+from leco_plugin.models.field_at_freezing import field_at_freezing
 from leco_plugin.models.freezing import held_out_sampler
 from leco_plugin.models.leco import LecoModel
 from leco_plugin.models.rendering import Rays
@@ -31,6 +33,8 @@ class Source(NamedTuple):
     """nerfstudio's data manager."""
     model: LecoModel | None
     """In evaluation mode."""
+    frozen: LecoModel | None = None
+    """The same model as it was when its gate was frozen."""
 
 
 class Seen(NamedTuple):
@@ -79,7 +83,8 @@ def _of_run(folder: Path, data: Path) -> Source | None:
         raise InputError(
             f"the model of the run in {folder} cannot be loaded: {_line(error)}"
         ) from None
-    return Source(pipeline.datamanager, pipeline.model.eval())
+    model = pipeline.model.eval()
+    return Source(pipeline.datamanager, model, field_at_freezing(model, folder))
 
 
 def _line(error: BaseException) -> str:
@@ -140,13 +145,37 @@ def trained_on(source: Source, occupancy: Occupancy, count: int) -> Seen:
     return _seen(source, occupancy, bundle, batch["image"])
 
 
-def _seen(source: Source, occupancy: Occupancy, bundle: Any, truth: Tensor) -> Seen:
+def from_between_cameras(source: Source, seen: Seen, seed: int) -> Seen:
+    """Rays that begin somewhere on the way from their camera to the nearest other one.
+
+    Args:
+        seen: rays of training images; their colours are not those of the rays that come back.
+    """
+    model, rays = source.model, seen.rays
+    assert model is not None and rays.images is not None
+    images = rays.images.cpu()
+    positions = source.manager.train_dataset.cameras.camera_to_worlds[:, :3, 3].cpu().float()
+    others = torch.cdist(positions, positions).fill_diagonal_(torch.inf).argmin(dim=1)
+    generator = torch.Generator().manual_seed(seed)
+    along = torch.rand(len(images), 1, generator=generator)
+    moved = (along * (positions[others] - positions)[images]).to(rays.origins)
+    bundle = RayBundle(
+        origins=rays.origins + moved,
+        directions=rays.directions,
+        pixel_area=torch.ones_like(rays.t_mins)[:, None],
+        camera_indices=rays.images[:, None],
+    )
+    return _seen(source, None, bundle, seen.truth)
+
+
+def _seen(source: Source, occupancy: Occupancy | None, bundle: Any, truth: Tensor) -> Seen:
     model = source.model
     if model is not None:
         model.train()  # rays know their training image, and so its appearance
         rays = model.rays_of(bundle.to(model.device))
         model.eval()
         return Seen(rays, truth.to(model.device).float())
+    assert occupancy is not None
     learned_in, here = occupancy.report.get("frame"), frame_of(source.manager)
     if learned_in is not None and here is not None:
         frame = between(here, learned_in)

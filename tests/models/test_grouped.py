@@ -48,6 +48,19 @@ def test_grouped_is_the_dense_mixture(routing: str, residual: bool, empty_expert
         torch.testing.assert_close(ours, dense, rtol=1e-4, atol=1e-4)
 
 
+@pytest.mark.parametrize("empty_expert", ["identity", "none"])
+def test_grouped_is_the_dense_mixture_of_those_left(empty_expert) -> None:
+    torch.manual_seed(0)
+    hmoe = HMoE(HMoEConfig(4, 8, 2, empty_expert=empty_expert))
+    for parameter in hmoe.parameters():
+        torch.nn.init.normal_(parameter, std=0.5)
+    hmoe.drop(1)
+    hmoe.drop(3)
+    routes = torch.tensor([0, 2, 4])[torch.randint(3, (41,))]
+    for ours, dense in zip(results(hmoe, True, routes), results(hmoe, False, routes), strict=True):
+        torch.testing.assert_close(ours, dense, rtol=1e-4, atol=1e-4)
+
+
 def test_without_points_there_are_no_answers() -> None:
     none = grouped_dispatch(torch.zeros(0, 8), torch.zeros(0, dtype=torch.int64), [Expert(8, 2)])
     assert none.shape == (0, 8)

@@ -101,3 +101,47 @@ def test_dispatch_is_three_times_faster_than_the_dense_mixture_for_eight_experts
     finally:
         torch.set_num_threads(threads)
     assert statistics.median(dense[1:]) >= 3.0 * statistics.median(ours[1:])
+
+
+@pytest.mark.parametrize("empty_expert", ["identity", "mlp", "none"])
+def test_those_that_are_left_dispatch_as_before(empty_expert) -> None:
+    hmoe = mixture(scene_experts=4, empty_expert=empty_expert)
+    routes = torch.tensor([0, 1, 3, 3, 0, 1, 1])
+    before = hmoe(torch.ones(7, 8).double(), routes, torch.ones(7))
+    hmoe.drop(2)
+    hmoe.drop(4)
+    assert hmoe.left.tolist() == [True, False, True, False]
+    assert torch.equal(hmoe(torch.ones(7, 8).double(), routes, torch.ones(7)), before)
+    assert_dispatch_is_dense(hmoe, routes)
+
+
+def test_a_dropped_expert_takes_its_parameters_along() -> None:
+    hmoe = mixture(scene_experts=4)
+    each = sum(parameter.numel() for parameter in hmoe.experts[1].parameters())
+    before = sum(parameter.numel() for parameter in hmoe.parameters())
+    assert hmoe.those_left() is None
+    gone = hmoe.drop(3)
+    assert sum(parameter.numel() for parameter in hmoe.parameters()) == before - each
+    assert not any(name.startswith("experts.3.") for name in hmoe.state_dict())
+    hmoe.put_back(3, gone)
+    assert sum(parameter.numel() for parameter in hmoe.parameters()) == before
+    assert hmoe.those_left() is None and bool(hmoe.left.all())
+
+
+def test_who_loads_a_state_dict_has_the_experts_that_are_left_in_it() -> None:
+    full, reduced = mixture(scene_experts=3), mixture(scene_experts=3)
+    reduced.drop(1)
+    features, values = torch.randn(30, 8).double(), torch.ones(30)
+    fewer = torch.tensor([0, 2, 3])[torch.randint(3, (30,))]
+    for source, target in ((reduced, full), (mixture(scene_experts=3), reduced)):
+        target.load_state_dict(source.state_dict())
+        assert target.left.tolist() == source.left.tolist()
+        assert list(target.state_dict()) == list(source.state_dict())
+        assert torch.equal(target(features, fewer, values), source(features, fewer, values))
+    full.drop(2)
+    full.load_state_dict({}, strict=False)  # as nerfstudio does after it has loaded a model
+    assert full.left.tolist() == [True, False, True]
+    earlier = mixture(scene_experts=3).state_dict()
+    del earlier["left"]  # as checkpoints were before experts could be dropped
+    full.load_state_dict(earlier)
+    assert bool(full.left.all()) and "left" not in earlier

@@ -130,6 +130,23 @@ def test_routes_are_experts_and_factors_teach_the_gate(routing: Routing) -> None
     assert logits.grad is not None and bool(logits.grad[routes > 0].any(dim=-1).all())
 
 
+@pytest.mark.parametrize("name", ["threshold", "paper"])
+def test_points_of_a_dropped_expert_go_to_the_next_best_and_no_other_point_changes(
+    name: str,
+) -> None:
+    torch.manual_seed(0)
+    logits = torch.randn(500, 4)
+    values, routes = gate_values_and_routes(logits, ROUTINGS[name])
+    left = torch.tensor([True, False, True])
+    values_left, routes_left = gate_values_and_routes(logits, ROUTINGS[name], left)
+    assert torch.equal(values_left, values)
+    moved = routes == 2
+    assert torch.equal(routes_left[~moved], routes[~moved])
+    assert bool(moved.any()) and 0 in routes
+    for one, route in zip(logits[moved].tolist(), routes_left[moved].tolist(), strict=True):
+        assert route == (1 if one[1] >= one[3] else 3)
+
+
 def test_the_papers_factor_is_the_probability_of_the_chosen_expert() -> None:
     logits = torch.randn(200, 4)
     values, routes = gate_values_and_routes(logits, ROUTINGS["paper"])

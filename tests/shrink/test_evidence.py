@@ -8,7 +8,7 @@ from ball_occupancy import CENTRE, ball
 
 from leco_plugin.models.rendering import Rays
 from leco_plugin.occupancy import Occupancy
-from leco_plugin.shrink.evidence import Evidence, gather, loss
+from leco_plugin.shrink.evidence import CONFIDENCE, Evidence, gather, join, loss
 from leco_plugin.shrink.sources import Seen, Source
 
 
@@ -31,7 +31,23 @@ def test_the_loss_is_the_skipped_share_of_the_worth() -> None:
         float(known.weights[skipped].sum() / known.weights.sum()), rel=1e-5
     )
     assert found.bound > found.share
-    assert loss(known, torch.zeros_like(skipped)) == (0.0, 0.0, 0.0)
+
+
+def test_a_loss_that_nobody_has_seen_is_bounded_by_the_number_of_rays() -> None:
+    for rays in (50, 500):
+        known = evidence(rays)
+        share, bound, mass = loss(known, torch.zeros_like(known.kept))
+        assert share == mass == 0.0 and bound == pytest.approx(CONFIDENCE / rays)
+
+
+def test_evidence_is_joined_ray_by_ray() -> None:
+    first, second = evidence(5, 4), evidence(7, 3)
+    both = join([first, second])
+    assert both.rays == 12 and torch.equal(both.ray_indices.unique(), torch.arange(12))
+    assert torch.equal(both.worth, torch.cat([first.worth, second.worth]))
+    per_ray = torch.zeros(12).index_add_(0, both.ray_indices, both.worth)
+    expected = torch.cat([part.worth.view(part.rays, -1).sum(dim=1) for part in (first, second)])
+    torch.testing.assert_close(per_ray, expected)
 
 
 def test_the_bound_holds_on_other_rays_of_the_same_kind() -> None:

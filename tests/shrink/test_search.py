@@ -14,6 +14,7 @@ from leco_plugin.models.gate import GateConfig
 from leco_plugin.occupancy import Occupancy
 from leco_plugin.shrink import search as searching
 from leco_plugin.shrink.evidence import Evidence, query_in_parts
+from leco_plugin.shrink.references import Part, Reference, declared
 from leco_plugin.shrink.search import Bounds, Found, Ground, Rung, search, threshold_keeping
 
 TOO_SMALL = GateConfig(EncodingConfig(octaves=1), 1, 1, 1)
@@ -45,7 +46,9 @@ def known_worth(occupancy: Occupancy, seed: int) -> Evidence:
 
 def ground(occupancy: Occupancy, verify: Evidence | None = None) -> Ground:
     taught, searched, unseen = (known_worth(occupancy, seed) for seed in range(3))
-    return Ground(occupancy, None, taught, searched, [], verify or unseen, [])
+    lost, price = (declared(occupancy, name) for name in ("lost_surface_mass", "image_price_db"))
+    sides = Part(searched), Part(verify or unseen)
+    return Ground(occupancy, taught, [Reference("known", None, lost, 0.0, max(price, 0.0), *sides)])
 
 
 def walk(occupancy: Occupancy, gates: list[GateConfig], **options: object) -> Found:
@@ -91,13 +94,56 @@ def test_what_fails_on_unseen_rays_is_not_chosen() -> None:
     assert [rung.verdict for rung in found.rungs] == ["fails on unseen rays"]
 
 
+def test_a_loss_that_the_search_has_seen_is_declared_too() -> None:
+    known = original()
+    here = ground(known)
+    (reference,) = here.references
+    nothing = reference.verify.evidence
+    inside = (nothing.positions - torch.tensor(CENTRE)).norm(dim=-1) < 0.5  # no gate loses these
+    harmless = reference._replace(verify=Part(nothing._replace(worth=inside.float())))
+    (found,) = search(here._replace(references=[harmless]), Bounds(4e-3), [ENOUGH]).rungs
+    assert found.verified["lost_surface_mass"] == 0.0
+    assert float(found.verified["lost_surface_mass_bound"] or 0.0) > found.lost_surface_mass > 0.0
+
+
 def test_nothing_is_lost_beyond_what_the_original_leaves() -> None:
     with pytest.raises(ValueError, match="raise --lost-surface-mass"):
         walk(original(lost_surface_mass=2e-3), [ENOUGH], lost_surface_mass=1e-3)
     with pytest.raises(ValueError, match="raise --image-price"):
         walk(original(image_price_db=0.06), [ENOUGH])
-    room = searching.room_beyond(original(lost_surface_mass=4e-4, image_price_db=-0.1), Bounds())
-    assert room.lost_surface_mass == pytest.approx(6e-4) and room.image_price_db == 0.05
+    searching.check_room(original(lost_surface_mass=4e-4, image_price_db=-0.1), Bounds())
+
+
+def test_what_the_original_has_lost_is_declared_too() -> None:
+    first, second = (
+        walk(original(lost_surface_mass=lost), [ENOUGH], lost_surface_mass=4e-3).rungs[-1]
+        for lost in (0.0, 2e-4)
+    )
+    for name in ("lost_surface_mass", "lost_surface_mass_bound"):
+        more = float(second.verified[name] or 0.0) - float(first.verified[name] or 0.0)
+        assert more == pytest.approx(2e-4, rel=1e-3)
+    assert second.lost_surface_mass == pytest.approx(first.lost_surface_mass + 2e-4)
+
+
+def test_the_worst_reference_decides_and_is_declared() -> None:
+    """The second one values a place that no gate of the original's volume keeps."""
+    known = original()
+    here = ground(known)
+    kind = here.references[0]
+    unseen = kind.verify.evidence
+    far = (unseen.positions - torch.tensor(CENTRE)).norm(dim=-1) > 1.3
+    strict = kind._replace(
+        name="strict", verify=Part(unseen._replace(worth=unseen.worth + 1e-5 * far.float()))
+    )
+    both = here._replace(references=[kind, strict])
+    (lenient,), (found,) = (search(one, Bounds(4e-3), [ENOUGH]).rungs for one in (here, both))
+    assert [one["reference"] for one in found.verified_against] == ["known", "strict"]
+    bounds = [float(one["bound"]) for one in found.verified_against]
+    assert bounds[1] > bounds[0] == pytest.approx(lenient.verified["lost_surface_mass_bound"])
+    assert found.verified["lost_surface_mass_bound"] == bounds[1]
+    all_of_it = strict._replace(verify=Part(unseen._replace(worth=far.float())))
+    refused = search(here._replace(references=[kind, all_of_it]), Bounds(4e-3), [ENOUGH])
+    assert [rung.verdict for rung in refused.rungs] == ["fails on unseen rays"]
 
 
 def test_a_threshold_that_keeps_a_share_keeps_it() -> None:

@@ -1,0 +1,94 @@
+"""The fields that say what a dropped candidate was worth.
+
+What a smaller gate declares holds against each of them, along rays of held-out pixels and rays from
+between the cameras, which nobody has photographed:
+- the field at the moment of freezing, every candidate rendered: the gate's loss, absolutely;
+- the run's field as it is now, rendered as the original guides it: the loss beyond the original's.
+Without a run, the original's own decisions stand in, along rays of held-out pixels.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from typing import NamedTuple
+
+from leco_plugin.models.leco import LecoModel
+from leco_plugin.occupancy import Occupancy
+from leco_plugin.shrink.evidence import Evidence, Rendered, gather, join
+from leco_plugin.shrink.sources import Seen, Source, from_between_cameras
+
+NOW = "the run's field as it is now, beyond what the original declares"
+AT_FREEZING = "the field at the moment of freezing, all of it"
+BY_DECISIONS = "the original's keep decisions, weighed by o(x): no rendering weights were at hand"
+
+
+DECLARED = ("lost_surface_mass", "lost_mass", "image_price_db")
+"""What a report says of the original's own losses."""
+
+
+MOVED = 3
+"""Rays from between the cameras for each ray of a held-out pixel: what is lost lies on few rays, so
+that many have to be looked at, and held-out pixels are few."""
+
+
+class Part(NamedTuple):
+    """Some rays, as a reference sees them."""
+
+    evidence: Evidence
+    rendered: Sequence[Rendered] = ()
+    """Empty where no image price can be measured."""
+
+
+class Reference(NamedTuple):
+    """A field with rays to search on, and others to verify on."""
+
+    name: str
+    model: LecoModel | None
+    lost_before: float
+    """Share of the surface mass that the original has lost before anything is measured here."""
+    mass_before: float
+    """The same of all rendering weight."""
+    price_before: float
+    """The same of the image price, dB."""
+    search: Part
+    verify: Part
+
+
+def references(
+    source: Source, original: Occupancy, searched: Seen, verified: Seen
+) -> list[Reference]:
+    """All there are; what the original declares comes first where only the rest is measured."""
+    # that the original gains something is no licence to lose it
+    lost, mass, price = (max(declared(original, name), 0.0) for name in DECLARED)
+    sides = searched, verified
+    if source.model is None:
+        parts = [Part(*gather(source, original, seen)) for seen in sides]
+        return [Reference(BY_DECISIONS, None, lost, mass, price, *parts)]
+    parts = [_rendered(source, original, seen, seed) for seed, seen in enumerate(sides)]
+    found = [Reference(NOW, source.model, lost, mass, price, *parts)]
+    if source.frozen is not None:
+        before = source._replace(model=source.frozen)
+        parts = [_rendered(before, None, seen, seed) for seed, seen in enumerate(sides)]
+        found.append(Reference(AT_FREEZING, source.frozen, 0.0, 0.0, 0.0, *parts))
+    return found
+
+
+def _rendered(source: Source, occupancy: Occupancy | None, seen: Seen, side: int) -> Part:
+    """Held-out pixels with their renderings, and rays from between the cameras without."""
+    evidence, rendered = gather(source, occupancy, seen)
+    pieces = [evidence]
+    for number in range(MOVED):
+        moved = from_between_cameras(source, seen, seed=side * MOVED + number)
+        pieces.append(gather(source, occupancy, moved)[0])
+    return Part(join(pieces), rendered)
+
+
+def declared(original: Occupancy, name: str) -> float:
+    """A figure of an occupancy's report; 0 where it has none."""
+    value = original.report.get(name)
+    return float(value) if isinstance(value, int | float) else 0.0
+
+
+def names_of(found: Iterable[Reference]) -> str:
+    """What the loss was measured against, in a line."""
+    return "; ".join(reference.name for reference in found)

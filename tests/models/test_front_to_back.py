@@ -1,0 +1,110 @@
+"""Front to back, pixels are those of asking about everything, for fewer questions."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+
+from leco_plugin.models.encodings import EncodingConfig
+from leco_plugin.models.field import FieldConfig, HMoEField
+from leco_plugin.models.front_to_back import (
+    FEWEST_AT_ONCE,
+    LEAST_LIGHT,
+    samples_of,
+    shade_front_to_back,
+)
+from leco_plugin.models.gate import Gate, GateConfig
+from leco_plugin.models.hmoe import HMoEConfig
+from leco_plugin.models.rendering import Intervals, Rays, Routing, shade, with_backdrop
+from leco_plugin.samplers.marching import march
+from leco_plugin.samplers.packed import render_transmittance_from_density
+from leco_plugin.space import Space
+
+ROUTING = Routing(0.2, False)
+STEP = 0.05
+
+
+class Scene:
+    """A gate and a field; `density` is about how dense it is everywhere, per half extent."""
+
+    def __init__(self, density: float) -> None:
+        torch.manual_seed(0)
+        encoding = EncodingConfig("hash", levels=2, log2_table=6, coarsest=4, finest=16)
+        config = FieldConfig(encoding, HMoEConfig(scene_experts=3, width=16), appearance_dim=4)
+        self.field = HMoEField(config, num_images=3)
+        torch.nn.init.normal_(self.field.encoding.table, std=2.0)
+        with torch.no_grad():
+            self.field.density_head.bias.fill_(1.0 + torch.tensor(density).log())
+        self.gate = Gate(GateConfig(EncodingConfig(octaves=2), width=8, scene_experts=3))
+        self.space = Space("contraction", half_extent=0.5)
+
+    def parts(self) -> tuple[HMoEField, Gate, Space]:
+        return self.field, self.gate, self.space
+
+
+def some_rays(count: int) -> Rays:
+    torch.manual_seed(count)
+    directions = torch.nn.functional.normalize(torch.randn(count, 3), dim=-1)
+    starts, ends = torch.full((count,), 0.1), 0.3 + 2.0 * torch.rand(count)
+    ends[::7] = 0.05  # these miss the scene
+    return Rays(torch.rand(count, 3) - 0.5, directions, starts, ends, None)
+
+
+def kept_along(rays: Rays) -> Intervals:
+    def occupied(positions: torch.Tensor) -> torch.Tensor:
+        return (7.0 * positions).sin().sum(dim=-1) > -0.3
+
+    samples = march(*rays[:4], step_size=STEP, occupied=occupied)
+    return with_backdrop(Intervals(*samples), rays, STEP, 0.0)
+
+
+@pytest.mark.parametrize("density", [0.01, 1.0, 30.0, 3000.0])
+@pytest.mark.parametrize("count", [0, 1, 150])
+def test_it_renders_what_asking_about_everything_renders(count: int, density: float) -> None:
+    scene, rays = Scene(density), some_rays(count)
+    everything = kept_along(rays)
+    with torch.no_grad():
+        whole = shade(*scene.parts(), rays, everything, ROUTING, freeze_gate=True)
+    seen, asked = shade_front_to_back(*scene.parts(), rays, everything, ROUTING)
+    assert len(asked.t_starts) == len(seen.weights) == len(seen.logits) == len(seen.routes)
+    torch.testing.assert_close(seen.rgb, whole.rgb, atol=1.2 * LEAST_LIGHT, rtol=0.0)
+    torch.testing.assert_close(
+        seen.accumulation, whole.accumulation, atol=1.2 * LEAST_LIGHT, rtol=0.0
+    )
+    torch.testing.assert_close(seen.depth, whole.depth, atol=3.0 * LEAST_LIGHT, rtol=0.0)
+
+
+@pytest.mark.parametrize("density", [0.01, 30.0, 3000.0])
+def test_it_asks_from_the_front_and_hardly_further_than_light_goes(density: float) -> None:
+    scene, rays = Scene(density), some_rays(150)
+    everything = kept_along(rays)
+    with torch.no_grad():
+        whole = shade(*scene.parts(), rays, everything, ROUTING, freeze_gate=True)
+    trans, _ = render_transmittance_from_density(
+        everything.t_starts / 0.5,
+        everything.t_ends / 0.5,
+        whole.sigmas,
+        packed_info=whole.packed_info,
+    )
+    _, asked = shade_front_to_back(*scene.parts(), rays, everything, ROUTING)
+    at = {
+        (int(ray), float(start)): number
+        for number, (ray, start) in enumerate(zip(everything.ray_indices, everything.t_starts))
+    }
+    found = [at[int(ray), float(start)] for ray, start in zip(asked.ray_indices, asked.t_starts)]
+    assert found == sorted(set(found))
+    was_asked = torch.zeros(len(trans), dtype=torch.bool)
+    was_asked[found] = True
+    assert bool(was_asked[trans > 1.01 * LEAST_LIGHT].all())
+    hidden = (trans < 0.99 * LEAST_LIGHT) & was_asked
+    of_ray = torch.bincount(everything.ray_indices[hidden], minlength=150)
+    assert int(of_ray.max()) < FEWEST_AT_ONCE
+    if density == 3000.0:
+        assert float(was_asked.float().mean()) < 0.5
+    if density == 0.01:
+        assert bool(was_asked.all())
+
+
+def test_samples_of_some_rays_are_counted_out() -> None:
+    found = samples_of(torch.tensor([3, 10, 20]), torch.tensor([2, 0, 3]), 4)
+    assert found.tolist() == [3, 4, 20, 21, 22]
