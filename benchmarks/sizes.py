@@ -1,8 +1,8 @@
 """Automatic sizes against a sweep: `python benchmarks/sizes.py [SCENE ...]`.
 
-`leco-occupancy` trains for the same number of steps in the sizes that it chooses for a scene, in
-those of the device, and with smaller and larger tables and fewer and more experts than chosen; on
-cities of 1 and 3 blocks a side and on scenes that are named. Steps and not seconds: it may run
+`leco-occupancy` trains for the same number of steps, on drone surveys of cities of 1 and 3 blocks a
+side and on scenes that are named: in the sizes that it chooses, in those of the device, and with
+smaller and larger tables and fewer and more experts than chosen. Steps and not seconds: it may run
 beside other work. Each run is stored when it is done; a benchmark that was stopped goes on there.
 """
 
@@ -185,7 +185,9 @@ def verdict(rows: Sequence[dict[str, Any]]) -> dict[str, dict[str, Any]]:
 
 def main(options: Options) -> None:
     options = dry(options) if options.dry_run else options
-    capture = CaptureConfig(24, 18, aerial_per_block=6.0) if options.dry_run else CaptureConfig()
+    capture = CaptureConfig(street_per_block=0.0)
+    if options.dry_run:
+        capture = replace(capture, width=24, height=18, aerial_per_block=6.0)
     folders = {
         blocks: write_city(
             CityConfig(blocks), options.folder / f"city-{blocks}", capture, layout="nerfstudio"

@@ -16,7 +16,7 @@ import torch
 from leco_plugin.models.encodings import EncodingConfig
 from leco_plugin.models.gate import GateConfig
 from leco_plugin.models.ranks import say
-from leco_plugin.models.size_limits import check, memory_of, state_bytes, values_of
+from leco_plugin.models.size_limits import check, check_memory, memory_of, state_bytes, values_of
 from leco_plugin.models.sizes import Sizes, left_open, size_at, sizes_for, with_size
 from leco_plugin.scenes.bounds import BoundsConfig
 from leco_plugin.scenes.detail import CAMERAS, SceneDetail, detail_of
@@ -93,9 +93,17 @@ def choose(
     Raises:
         ValueError: sizes that cannot be together, or do not fit the device. One line.
     """
-    if not left_open(wanted):
-        check(wanted, images, memory)
-        return Choice(wanted, ())
+    sizes = _filled(wanted, most, detail)
+    check(sizes)
+    if memory is not None:
+        if not wanted.field.encoding.log2_table:
+            sizes = within(sizes, images, SHARE_OF_MEMORY * memory)
+        check_memory(sizes, images, memory)
+    lines = explain(wanted, most, sizes, detail, images) if left_open(wanted) else ()
+    return Choice(sizes, lines)
+
+
+def _filled(wanted: Sizes, most: Sizes, detail: SceneDetail | None) -> Sizes:
     texels = detail.texels if detail is not None else math.inf
     across = detail.across if detail is not None else math.inf
     # a number that is 0 is automatic: whatever stands before `or` has been set by hand
@@ -119,13 +127,9 @@ def choose(
         width=gate.width or gate_width(octaves, most.gate),
         scene_experts=gate.scene_experts or number,
     )
-    sizes = replace(
+    return replace(
         wanted, gate=gate, field=replace(wanted.field, encoding=encoding, experts=experts)
     )
-    if not wanted.field.encoding.log2_table and memory is not None:
-        sizes = within(sizes, images, SHARE_OF_MEMORY * memory)
-    check(sizes, images, memory)
-    return Choice(sizes, explain(wanted, most, sizes, detail, images))
 
 
 def finest_cells(across: float, most: EncodingConfig) -> int:
@@ -199,36 +203,40 @@ def explain(
     if detail is not None:
         head = (
             f"sizes for a surface of {detail.texels:,.0f} texels in {detail.pixels:,} pixels of "
-            f"{detail.images} photographs; {detail.across:,.0f} texels along the cube:"
+            f"{detail.images} photographs, in a cube of {detail.across:,.0f} texels a side:"
         )
 
     def row(name: str, at: str, reason: str, power: bool = False) -> str:
         by_hand, top, size = (size_at(each, at) for each in (wanted, most, sizes))
-        why = reason if size < top else f"{reason}; no more on this device"
+        why = reason if size < top else f"the most on this device; {reason}"
         text = f"2^{size}" if power else str(size)
         return f"  {name:15}{text:>6}  {'set by hand' if by_hand else why}"
 
     return (
         head,
-        row("finest cells", "field.encoding.finest", "along the cube, none larger than a texel"),
-        row("levels", "field.encoding.levels", "up to these from the coarsest"),
+        row(
+            "finest cells",
+            "field.encoding.finest",
+            "a power of two above the texels a side",
+        ),
+        row("levels", "field.encoding.levels", "up to the finest cells"),
         row(
             "hash table",
             "field.encoding.log2_table",
-            f"entries a level, one for at most {TEXELS_PER_ENTRY:g} texels",
+            f"entries a level, one for {TEXELS_PER_ENTRY:g} texels",
             power=True,
         ),
         row(
             "scene experts",
             "field.experts.scene_experts",
-            f"one for at most {TEXELS_PER_EXPERT:,} texels",
+            f"one for {TEXELS_PER_EXPERT:,} texels",
         ),
         row("expert width", "field.experts.width", "narrower where one is too many"),
         row(
             "gate octaves",
             "gate.encoding.octaves",
-            f"down to periods of {CELLS_PER_PERIOD} of the finest cells",
+            f"down to a period of {CELLS_PER_PERIOD} of the finest cells",
         ),
-        row("gate width", "gate.width", f"{UNITS_PER_FEATURE:g} units for each of its features"),
+        row("gate width", "gate.width", f"{UNITS_PER_FEATURE:g} units for each feature"),
         f"  {values_of(sizes, images):,} parameters of gate and field",
     )

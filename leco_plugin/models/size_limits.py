@@ -34,12 +34,9 @@ def state_bytes(sizes: Sizes, images: int) -> int:
     return BYTES_PER_VALUE * values_of(sizes, images)
 
 
-def check(sizes: Sizes, images: int, memory: int | None = None) -> None:
-    """Refuses what cannot be built or trained, before anything of it is allocated.
+def check(sizes: Sizes) -> None:
+    """Refuses what cannot be built, before anything of it is allocated.
 
-    Args:
-        images: training photographs.
-        memory: bytes of the device; None where it is not known.
     Raises:
         ValueError: in one line, what does not go together and what to change.
     """
@@ -54,7 +51,19 @@ def check(sizes: Sizes, images: int, memory: int | None = None) -> None:
             f"{sizes.field.experts.scene_experts}: set {CLI}.gate.scene-experts and "
             f"{CLI}.field.experts.scene-experts alike, or only one of them"
         )
-    if memory is not None and (needed := state_bytes(sizes, images)) > memory:
+
+
+def check_memory(sizes: Sizes, images: int, memory: int) -> None:
+    """Refuses what cannot be trained, before anything of it is allocated.
+
+    Args:
+        images: training photographs.
+        memory: bytes of the device.
+    Raises:
+        ValueError: in one line, what is needed and what there is.
+    """
+    needed = state_bytes(sizes, images)
+    if needed > memory:
         raise ValueError(
             f"training gate and field of these sizes takes {needed / 1e9:.1f} GB for weights and "
             f"optimizer alone, and the device has {memory / 1e9:.1f}: lower "

@@ -40,7 +40,7 @@ def config_of(scene: Path, folder: Path, name: str, **changes: Any) -> Any:
     model = config.pipeline.model
     config.pipeline.model = replace(
         model,
-        sizes=replace(model.sizes, candidates=16, learn_candidates=8),
+        sizes=replace(model.sizes, candidates=64, learn_candidates=32),
         schedule=ScheduleConfig(learn_steps=1000, freeze=False),
         calibration=CalibrationConfig(rays=32),
     )

@@ -34,7 +34,7 @@ def ground(side: float, scale: float = 1.0) -> Tensor:
     return scale * unit * torch.tensor([side, side, 0.02])
 
 
-@pytest.mark.parametrize("side", [4.0, 12.0])
+@pytest.mark.parametrize("side", [4.0, 9.0])
 def test_texels_are_the_ground_over_the_footprint_of_a_pixel(side: float) -> None:
     found = detail_of(survey(side), ground(side))
     assert found.pixels == found.images * SIDE**2
@@ -42,15 +42,15 @@ def test_texels_are_the_ground_over_the_footprint_of_a_pixel(side: float) -> Non
 
 
 def test_walls_count_as_the_ground_does() -> None:
-    flat = ground(8.0)
+    flat = ground(6.0)
     wall = flat[:, [0, 2, 1]] * torch.tensor([1.0, 1.0, 0.1])  # a tenth as high as it is long
-    cameras, both = survey(8.0), torch.cat([flat, wall[:300]])
+    cameras, both = survey(6.0), torch.cat([flat, wall[:300]])
     more = detail_of(cameras, both).texels / detail_of(cameras, flat).texels
     assert 1.02 < more < 1.3
 
 
 def test_more_photographs_of_the_same_ground_show_no_more() -> None:
-    once, often = (detail_of(survey(8.0, spacing), ground(8.0)) for spacing in (1.0, 0.5))
+    once, often = (detail_of(survey(4.0, spacing), ground(4.0)) for spacing in (1.0, 0.5))
     assert often.pixels == 4 * once.pixels
     assert often.texels == pytest.approx(once.texels, rel=0.1)
 
@@ -71,9 +71,9 @@ def test_of_distances_the_nearest_counts() -> None:
 
 
 def test_there_are_no_more_texels_than_pixels() -> None:
-    found = detail_of(survey(1.0), ground(4.0))
-    assert found.images == 1
-    assert found.texels == found.pixels == SIDE**2  # cells at the rim lie half outside
+    solid = ground(4.0) * torch.tensor([1.0, 1.0, 50.0])  # surfaces everywhere up to half way
+    found = detail_of(survey(4.0), solid)
+    assert found.texels == found.pixels == found.images * SIDE**2
 
 
 def test_the_unit_of_length_does_not_count() -> None:
@@ -84,17 +84,17 @@ def test_the_unit_of_length_does_not_count() -> None:
 
 
 def test_it_is_the_same_each_time_and_for_many_photographs_by_a_sample_of_them() -> None:
-    cameras, points = survey(20.0), ground(20.0)
-    assert len(cameras) == 400  # more than are looked at
+    cameras, points = survey(17.0), ground(17.0)
+    assert len(cameras) == 289  # more than are looked at
     found = detail_of(cameras, points)
     assert found == detail_of(cameras, points)
-    assert found.texels == pytest.approx(20.0**2 * 16**2, rel=0.2)
+    assert found.texels == pytest.approx(17.0**2 * 16**2, rel=0.2)
 
 
 def test_without_points_the_places_that_rays_reach_stand_for_them() -> None:
     config = BoundsConfig(altitudes=(0.0, 0.5))
-    known, found = (detail_of(survey(8.0), p, config) for p in (ground(8.0), None))
-    assert found.texels == pytest.approx(known.texels, rel=0.3)
+    # the outermost images reach half a side beyond the survey
+    assert detail_of(survey(8.0), None, config).texels == pytest.approx(9.0**2 * 16**2, rel=0.2)
     assert detail_of(survey(8.0), None).texels > 0.0  # contracted around the cameras
 
 
