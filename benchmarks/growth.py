@@ -33,6 +33,7 @@ from leco_plugin.models.gate import GateConfig
 from leco_plugin.models.lifecycle import Lifecycle
 from leco_plugin.models.optimizers import RATES, FusedAdamConfig
 from leco_plugin.models.phases import ScheduleConfig
+from leco_plugin.models.sizes import sizes_for
 from leco_plugin.scenes.city import City, CityConfig
 from leco_plugin.scenes.city_capture import CaptureConfig
 from leco_plugin.scenes.city_folder import write_city
@@ -132,8 +133,9 @@ def learn(blocks: int, options: Options) -> dict[str, Any]:
     steps = max(2, options.steps_per_side * blocks)
     model_config.schedule = ScheduleConfig(freeze=False, learn_steps=steps)
     model_config.calibration = CalibrationConfig(rays=options.rays)
-    gate = gate_of(model_config.sizes.gate, blocks, options.octaves_per_doubling)
-    model_config.sizes = replace(model_config.sizes, gate=gate)
+    sizes = sizes_for(leco_occupancy.config.machine.device_type)
+    gate = gate_of(sizes.gate, blocks, options.octaves_per_doubling)
+    model_config.sizes = replace(sizes, gate=gate)
     torch.manual_seed(options.seed)
     pipeline: Any = config.setup(device=leco_occupancy.config.machine.device_type)
     manager, model = pipeline.datamanager, pipeline.model

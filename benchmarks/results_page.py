@@ -131,6 +131,44 @@ def check_gpu(results: dict[str, Any]) -> None:
         raise ValueError(f"results of a GPU that nobody ran on are not shown: {machine}")
 
 
+def sizes_table(report: dict[str, Any]) -> str:
+    """Sizes that were chosen, and beside them the sweep, one row a point."""
+    lines = [
+        "| scene | photographs | texels | table | experts | parameters | of the device's |",
+        "|---|---|---|---|---|---|---|",
+    ]
+    for scene in report["scenes"]:
+        sizes, share = scene["sizes"], scene["parameters"] / scene["device_parameters"]
+        lines.append(
+            f"| {scene['scene']} | {scene['images']} | {scene['texels']:,} "
+            f"| {sizes['field.encoding.levels']} x 2^{sizes['field.encoding.log2_table']} "
+            f"| {sizes['field.experts.scene_experts']} | {scene['parameters']:,} | {share:.0%} |"
+        )
+    lines += [
+        "",
+        "| scene | sizes | parameters | PSNR, mean (least to most) |",
+        "|---|---|---|---|",
+    ]
+    points: dict[tuple[str, str], list[dict[str, Any]]] = {}
+    for row in report["runs"]:
+        if row["point"] is not None:
+            points.setdefault((row["scene"], row["point"]), []).append(row)
+    for (scene, point), runs in sorted(points.items(), key=lambda item: item[0][0]):
+        values = [run["psnr"] for run in runs]
+        lines.append(
+            f"| {scene} | {point} | {runs[0]['parameters']:,} | {sum(values) / len(values):.2f} dB "
+            f"({min(values):.2f} to {max(values):.2f}) |"
+        )
+    lines += ["", "| scene | automatic | best of the sweep | within bounds |", "|---|---|---|---|"]
+    for scene, found in report["verdict"].items():
+        lines.append(
+            f"| {scene} | {found['psnr']:.2f} dB, {found['parameters']:,} "
+            f"| {found['best']}: {found['best_psnr']:.2f} dB, {found['best_parameters']:,} "
+            f"| {'yes' if found['reached'] else '**no**'} |"
+        )
+    return "\n".join(lines)
+
+
 def section(
     title: str, command: str, report: dict[str, Any], table: str, note: str = ""
 ) -> list[str]:
@@ -148,6 +186,12 @@ def page() -> str:
         parts += section(title, "leco demo", report, demo_table(report))
     for name in titles():
         parts += chart_section(RESULTS / "charts" / f"{name}.json")
+    if (sizes := RESULTS / "sizes.json").exists():
+        report = json.loads(sizes.read_text())
+        steps, learn = report["settings"]["steps"], report["settings"]["learn_steps"]
+        note = f" {steps} steps each, {learn} of them learning; PSNR of test pixels."
+        command, title = "python benchmarks/sizes.py", "Automatic sizes, and a sweep around them"
+        parts += section(title, command, report, sizes_table(report), note)
     for sampling in sorted(RESULTS.glob("sampling*.json")):
         report = json.loads(sampling.read_text())
         command, note = "python benchmarks/sampling.py", " Ratios within one run."

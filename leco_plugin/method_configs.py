@@ -15,7 +15,7 @@ from leco_plugin.compat.data_parallel import DataParallelTrainerConfig
 from leco_plugin.models.leco import LecoModelConfig
 from leco_plugin.models.optimizers import RATES, FusedAdamConfig
 from leco_plugin.models.phases import ScheduleConfig
-from leco_plugin.models.sizes import PAPER, sizes_for
+from leco_plugin.models.sizes import PAPER, automatic, sizes_for
 from leco_plugin.scenes.data_manager import LecoDataManagerConfig
 from leco_plugin.scenes.known_distances import KnownDistancePixelSamplerConfig
 from leco_plugin.scenes.photographs import LecoPhotographsDataParserConfig
@@ -41,11 +41,11 @@ ON_GPU = best_device() == "cuda"
 STEPS = 30_000 if ON_GPU else 4_000
 
 LEARNING = LecoModelConfig(
-    sizes=sizes_for(best_device()),
+    sizes=automatic(sizes_for(best_device())),
     schedule=ScheduleConfig(learn_steps=2_000 if ON_GPU else 200),
     eval_num_rays_per_chunk=1 << 15 if ON_GPU else 1 << 12,
 )
-"""The HMoE in the sizes of this device."""
+"""The HMoE in sizes of this device, smaller where the scene is."""
 
 _leco_occupancy = DataParallelTrainerConfig(
     method_name="leco-occupancy",

@@ -15,6 +15,12 @@ from nerfstudio.engine.trainer import Trainer
 from nerfstudio.utils.decorators import check_main_thread
 
 from leco_plugin.compat.optimizers import OptimizersOfThePresent
+from leco_plugin.compat.run_sizes import (
+    check_photographs,
+    checkpoint_of,
+    keep_sizes,
+    with_sizes_of,
+)
 from leco_plugin.compat.whole_checkpoints import first_not_finite, newest_whole, previous_of
 from leco_plugin.models.failures import GateCollapsed, TrainingStopped
 from leco_plugin.models.ranks import say
@@ -38,8 +44,17 @@ class AtomicTrainer(Trainer):
     """What it took."""
 
     def setup(self, *arguments: Any, **options: Any) -> None:
-        """As nerfstudio's; then checkpoints are also saved by the clock."""
+        """As nerfstudio's, in the sizes of the run that is gone on with; then checkpoints are also
+        saved by the clock.
+
+        Raises:
+            InputError: there is no whole checkpoint to go on from, its sizes are not those that are
+                set by hand, or the scene has other photographs now.
+        """
+        self.config = with_sizes_of(self.config, checkpoint_of(self.config))
         super().setup(*arguments, **options)
+        check_photographs(self.pipeline)
+        self.config = keep_sizes(self.config, self.pipeline.model)
         self.saved_at = time.monotonic()
         where = [TrainingCallbackLocation.AFTER_TRAIN_ITERATION]
         self.callbacks.append(TrainingCallback(where, self.save_by_the_clock))

@@ -15,6 +15,7 @@ from leco_plugin.models.optimizers import RATES, FusedAdamConfig
 from leco_plugin.models.ranks import averaging, mean
 from leco_plugin.occupancy import Occupancy
 from leco_plugin.progress_bar import bar
+from leco_plugin.scenes.detail import CAMERAS
 from leco_plugin.scenes.known_distances import sampler_here
 
 FIRST_TIMED, TIMED_STEPS = 5, 15
@@ -71,7 +72,7 @@ def learn_model(
     model: Any = config.setup(
         scene_box=dataset.scene_box,
         num_train_data=len(dataset),
-        metadata=dataset.metadata,
+        metadata={**(dataset.metadata or {}), CAMERAS: dataset.cameras},
         device=pipeline.device,
     ).to(pipeline.device)
     model.train()

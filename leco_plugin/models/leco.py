@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import torch
@@ -18,7 +18,7 @@ from leco_plugin.models.calibration import CalibrationConfig
 from leco_plugin.models.failures import require_finite
 from leco_plugin.models.field import HMoEField
 from leco_plugin.models.front_to_back import shade_front_to_back
-from leco_plugin.models.gate import Gate, check_sizes
+from leco_plugin.models.gate import Gate
 from leco_plugin.models.healing import annealed, is_dense
 from leco_plugin.models.image_figures import image_figures
 from leco_plugin.models.losses import distortion_loss, termination_loss
@@ -39,7 +39,9 @@ from leco_plugin.models.rendering import (
     with_backdrop,
 )
 from leco_plugin.models.scene_rays import cut_to_bounds, marching_rule
+from leco_plugin.models.scene_sizes import complete
 from leco_plugin.models.sizes import SMALL, Sizes
+from leco_plugin.models.stored_sizes import SIZES, stored_in, to_store
 from leco_plugin.occupancy import Occupancy, Precision, gate_precision
 from leco_plugin.samplers.estimator import LearnedOccupancyEstimator
 from leco_plugin.samplers.marching import march
@@ -59,7 +61,7 @@ class LecoModelConfig(GrowingConfig, ModelConfig):
     eval_num_rays_per_chunk: int = 4096
     """Rays rendered at a time."""
     sizes: Sizes = field(default_factory=lambda: SMALL)
-    """Sizes of gate, field and batches."""
+    """Sizes of gate, field and batches. Those that are 0 are chosen from scene and device."""
     schedule: ScheduleConfig = field(default_factory=ScheduleConfig)
     """When the gate is frozen."""
     gate_loss: GateLossConfig = field(default_factory=GateLossConfig)
@@ -114,10 +116,10 @@ class LecoModel(Model):
         if torch.device(device).type == "cpu":
             keep_freed_memory()
         self.precision = self.config.precision or fast_precision(device)
-        sizes = self.config.sizes
-        check_sizes(sizes.gate)
-        self.gate = Gate(sizes.gate)
-        self.field = HMoEField(sizes.field, self.num_train_data)
+        metadata = self.kwargs.get("metadata") or {}
+        self._build(
+            complete(self.config.sizes, self.config.bounds, metadata, self.num_train_data, device)
+        )
         self.space = Space()
         # buffers, because nerfstudio tells a model its step before it restores its state
         self.register_buffer("frozen", torch.tensor(False))
@@ -134,6 +136,12 @@ class LecoModel(Model):
         self._estimator: tuple[LearnedOccupancyEstimator, ...] = ()
         self.report: dict[str, Any] = {}
         self.progress = Progress()
+
+    def _build(self, sizes: Sizes) -> None:
+        """Gate and field; from here on the config says their sizes."""
+        self.config = replace(self.config, sizes=sizes)
+        self.gate = Gate(sizes.gate)
+        self.field = HMoEField(sizes.field, self.num_train_data)
 
     def _routing(self) -> Routing:
         losses = self.config.gate_loss
@@ -198,7 +206,21 @@ class LecoModel(Model):
             "report": self.report,
             "progress": self.progress.to_dict(),
             "precision": self.precision,
+            SIZES: to_store(self.config.sizes, self.num_train_data),
         }
+
+    def _load_from_state_dict(
+        self, state_dict: dict[str, Any], prefix: str, *arguments: Any
+    ) -> None:
+        """Gate and field are first built as they were stored, whatever the scene is now."""
+        now = self.config.sizes, self.num_train_data
+        stored = stored_in(state_dict.get(f"{prefix}_extra_state"), now)
+        if stored != now:
+            sizes, self.num_train_data = stored
+            self._build(sizes)
+            self.to(self.device)
+            self.forget_estimator()
+        super()._load_from_state_dict(state_dict, prefix, *arguments)
 
     def set_extra_state(self, state: dict[str, Any]) -> None:
         """Restores what `get_extra_state` gave."""

@@ -1,8 +1,9 @@
-"""Sizes that fit the device: what `leco-occupancy` builds where the user has not said otherwise."""
+"""Sizes of gate, field and batches: the most that each device is given, and those of the paper."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
+from typing import Any
 
 from leco_plugin.models.encodings import EncodingConfig
 from leco_plugin.models.field import FieldConfig
@@ -60,5 +61,46 @@ PAPER = Sizes(
 
 
 def sizes_for(device_type: str) -> Sizes:
-    """The default sizes of a device: `cpu`, `cuda` or `mps`."""
+    """The largest automatic sizes of a device: `cpu`, `cuda` or `mps`."""
     return LARGE if device_type == "cuda" else SMALL
+
+
+AUTOMATIC = 0
+"""In place of a size: it is chosen from the scene and the device before training."""
+
+CHOSEN = (
+    "field.encoding.finest",
+    "field.encoding.levels",
+    "field.encoding.log2_table",
+    "field.experts.scene_experts",
+    "field.experts.width",
+    "gate.encoding.octaves",
+    "gate.scene_experts",
+    "gate.width",
+)
+"""The sizes that `scene_sizes.choose` can choose."""
+
+
+def size_at(sizes: Any, path: str) -> Any:
+    """The value at a dotted path."""
+    for name in path.split("."):
+        sizes = getattr(sizes, name)
+    return sizes
+
+
+def with_size(sizes: Any, path: str, value: int) -> Any:
+    """The same sizes with another value at a dotted path."""
+    name, _, rest = path.partition(".")
+    return replace(sizes, **{name: with_size(getattr(sizes, name), rest, value) if rest else value})
+
+
+def automatic(sizes: Sizes) -> Sizes:
+    """The same with everything left open that can be chosen."""
+    for path in CHOSEN:
+        sizes = with_size(sizes, path, AUTOMATIC)
+    return sizes
+
+
+def left_open(sizes: Sizes) -> list[str]:
+    """Paths of the sizes that are automatic."""
+    return [path for path in CHOSEN if size_at(sizes, path) == AUTOMATIC]

@@ -18,6 +18,7 @@ from nerfstudio.data.utils.dataloaders import (
 from nerfstudio.model_components.ray_generators import RayGenerator
 
 from leco_plugin.models.ranks import say
+from leco_plugin.scenes.detail import CAMERAS
 from leco_plugin.scenes.held_out_pixels import HeldOutPixelSampler
 from leco_plugin.scenes.input_error import InputError
 from leco_plugin.scenes.stored_pictures import store_pictures
@@ -44,6 +45,12 @@ class LecoDataManager(VanillaDataManager):  # type: ignore[type-arg]
     """As nerfstudio's, but for where the photographs are."""
 
     config: LecoDataManagerConfig
+
+    def create_train_dataset(self) -> Any:
+        """The training photographs; the model is told of their cameras, for its sizes."""
+        dataset = super().create_train_dataset()
+        dataset.metadata[CAMERAS] = dataset.cameras
+        return dataset
 
     def on_disk(self) -> bool:
         """Whether pixels are read from files.

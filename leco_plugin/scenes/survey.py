@@ -87,8 +87,12 @@ def _in(units: DatasetUnits, value: float, level: bool) -> float:
 
 
 def sparse_points(dataset: Any) -> Tensor | None:
-    """Sparse points [P, 3] in model coordinates from the metadata of any reader, or None."""
-    metadata = getattr(dataset, "metadata", {}) or {}
+    """Sparse points [P, 3] in model coordinates of a dataset of any reader, or None."""
+    return points_in(getattr(dataset, "metadata", {}) or {})
+
+
+def points_in(metadata: dict[str, Any]) -> Tensor | None:
+    """Sparse points [P, 3] in model coordinates in what a reader says of a dataset, or None."""
     points = metadata.get(POINTS, metadata.get("points3D_xyz"))
     return None if points is None else torch.as_tensor(points)
 
@@ -118,7 +122,7 @@ def survey(
     if len(cameras) == 0:
         raise InputError("the scene has no training cameras")
     origins, directions = covering_rays(cameras)
-    poses = cameras.camera_to_worlds[_chosen(len(cameras))]
+    poses = cameras.camera_to_worlds[chosen_cameras(len(cameras))]
     try:
         found = find_bounds(poses, directions, sparse_points(dataset), config)
         bounds = with_range(found, near, far)
@@ -155,7 +159,7 @@ def announce(found: Survey) -> None:
         say(line)
 
 
-def _chosen(count: int) -> Tensor:
+def chosen_cameras(count: int) -> Tensor:
     """Numbers of up to `MOST_CAMERAS` of so many cameras, spread evenly."""
     return torch.linspace(0, count - 1, min(count, MOST_CAMERAS)).long().unique()
 
@@ -168,7 +172,7 @@ def covering_rays(cameras: Cameras) -> tuple[Tensor, Tensor]:
     """
     cameras = cameras.to("cpu")
     origins, directions = [], []
-    for number in _chosen(len(cameras)).tolist():
+    for number in chosen_cameras(len(cameras)).tolist():
         height, width = float(cameras.height[number]), float(cameras.width[number])
         rows = torch.linspace(0.5, height - 0.5, SIDE)
         columns = torch.linspace(0.5, width - 0.5, SIDE)

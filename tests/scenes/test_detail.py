@@ -1,0 +1,113 @@
+"""The size of a scene in footprints of a pixel: against surveys whose size is known."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from nerfstudio.cameras.cameras import Cameras, CameraType
+from torch import Tensor
+
+from leco_plugin.scenes.bounds import BoundsConfig
+from leco_plugin.scenes.detail import detail_of
+from leco_plugin.scenes.input_error import InputError
+
+HEIGHT, SIDE, FOCAL = 2.0, 32, 32.0
+"""Of the survey: a pixel's footprint is 1/16, an image's 2 x 2."""
+
+
+def survey(side: float, spacing: float = 1.0, size: int = SIDE, scale: float = 1.0) -> Cameras:
+    """Cameras on a grid above a square of that side, looking straight down."""
+    count = round(side / spacing)
+    places = (torch.arange(count) + 0.5) * spacing - side / 2
+    x, y = torch.meshgrid(places, places, indexing="ij")
+    poses = torch.eye(4)[:3].repeat(count**2, 1, 1)
+    poses[:, :, 3] = scale * torch.stack(
+        [x.flatten(), y.flatten(), torch.full((count**2,), HEIGHT)], dim=-1
+    )
+    focal = FOCAL * size / SIDE
+    return Cameras(poses, focal, focal, size / 2, size / 2, size, size)
+
+
+def ground(side: float, scale: float = 1.0) -> Tensor:
+    """Sparse points [P, 3] evenly on the ground, a little uneven."""
+    unit = torch.rand(3000, 3, generator=torch.Generator().manual_seed(1)) - 0.5
+    return scale * unit * torch.tensor([side, side, 0.02])
+
+
+@pytest.mark.parametrize("side", [4.0, 9.0])
+def test_texels_are_the_ground_over_the_footprint_of_a_pixel(side: float) -> None:
+    found = detail_of(survey(side), ground(side))
+    assert found.pixels == found.images * SIDE**2
+    assert found.texels == pytest.approx(side**2 * 16**2, rel=0.2)
+
+
+def test_walls_count_as_the_ground_does() -> None:
+    flat = ground(6.0)
+    wall = flat[:, [0, 2, 1]] * torch.tensor([1.0, 1.0, 0.1])  # a tenth as high as it is long
+    cameras, both = survey(6.0), torch.cat([flat, wall[:300]])
+    more = detail_of(cameras, both).texels / detail_of(cameras, flat).texels
+    assert 1.02 < more < 1.3
+
+
+def test_more_photographs_of_the_same_ground_show_no_more() -> None:
+    once, often = (detail_of(survey(4.0, spacing), ground(4.0)) for spacing in (1.0, 0.5))
+    assert often.pixels == 4 * once.pixels
+    assert often.texels == pytest.approx(once.texels, rel=0.1)
+
+
+def test_finer_photographs_show_more() -> None:
+    coarse, fine = (detail_of(survey(6.0, size=size), ground(6.0)) for size in (SIDE, 2 * SIDE))
+    assert fine.texels == pytest.approx(4.0 * coarse.texels, rel=0.05)
+    assert fine.across == pytest.approx(2.0 * coarse.across, rel=0.05)
+
+
+def test_of_distances_the_nearest_counts() -> None:
+    near = survey(6.0)
+    poses = near.camera_to_worlds.clone()
+    poses[::2, 2, 3] = 10.0 * HEIGHT
+    mixed = Cameras(poses, FOCAL, FOCAL, SIDE / 2, SIDE / 2, SIDE, SIDE)
+    found = detail_of(mixed, ground(6.0))
+    assert found.texels == pytest.approx(detail_of(near, ground(6.0)).texels, rel=0.2)
+
+
+def test_there_are_no_more_texels_than_pixels() -> None:
+    solid = ground(4.0) * torch.tensor([1.0, 1.0, 50.0])  # surfaces everywhere up to half way
+    found = detail_of(survey(4.0), solid)
+    assert found.texels == found.pixels == found.images * SIDE**2
+
+
+def test_the_unit_of_length_does_not_count() -> None:
+    found = detail_of(survey(6.0), ground(6.0))
+    scaled = detail_of(survey(6.0, scale=37.0), ground(6.0, 37.0))
+    assert scaled.texels == pytest.approx(found.texels, rel=1e-3)
+    assert scaled.across == pytest.approx(found.across, rel=1e-3)
+
+
+def test_it_is_the_same_each_time_and_for_many_photographs_by_a_sample_of_them() -> None:
+    cameras, points = survey(17.0), ground(17.0)
+    assert len(cameras) == 289  # more than are looked at
+    found = detail_of(cameras, points)
+    assert found == detail_of(cameras, points)
+    assert found.texels == pytest.approx(17.0**2 * 16**2, rel=0.2)
+
+
+def test_without_points_the_places_that_rays_reach_stand_for_them() -> None:
+    config = BoundsConfig(altitudes=(0.0, 0.5))
+    # the outermost images reach half a side beyond the survey
+    assert detail_of(survey(8.0), None, config).texels == pytest.approx(9.0**2 * 16**2, rel=0.2)
+    assert detail_of(survey(8.0), None).texels > 0.0  # contracted around the cameras
+
+
+def test_a_fisheye_is_looked_through_too() -> None:
+    cameras = survey(6.0)
+    cameras.camera_type.fill_(CameraType.FISHEYE.value)
+    assert detail_of(cameras, ground(6.0)).texels > 0.0
+
+
+def test_what_nobody_sees_has_no_size() -> None:
+    with pytest.raises(InputError, match="no training cameras"):
+        detail_of(survey(2.0)[torch.zeros(4, dtype=torch.bool)])
+    behind = ground(2.0) + torch.tensor([0.0, 0.0, 10.0])
+    with pytest.raises(InputError, match="no camera sees") as caught:
+        detail_of(survey(2.0), behind)
+    assert "\n" not in str(caught.value)
