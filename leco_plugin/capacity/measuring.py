@@ -163,6 +163,7 @@ def of_grids(
         started = time.monotonic()
         assert candidate.resolution is not None
         scores = grids.fill((candidate.resolution,) * 3)
+        assert scores is not None
         of_rays, of_volume = (
             looked_up(scores, box, mapped) for mapped in (ground.mapped, ground.volume)
         )

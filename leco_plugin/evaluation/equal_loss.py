@@ -38,6 +38,8 @@ LOST_SURFACE_MASS = 1e-3
 VOLUME_POINTS = 1 << 17
 """In the whole box, those that no ray reaches among them."""
 TAUGHT_RAYS = 1 << 15
+MOST_ON_CPU = 2e8
+"""Densities asked for one grid: about three minutes of two cores."""
 SPARED = 0.1
 """Of the allowed loss: cells of a coarse grid that can be had for it are empty in finer ones."""
 
@@ -84,13 +86,13 @@ def at_equal_loss(
     Args:
         model: whose gate is frozen; it is left as it was.
         datamanager: with held-out training pixels.
-        grids: cells along each axis of the grids, one number for all three or one for each; those
-            that do not fit the free memory are left out.
+        grids: cells along each axis of the grids, one number for all three or one for each.
     Returns:
         `lost_surface_mass`; `reached_volume`, the share of the scene's box that rays reach;
         `kept_reached_volume` and `kept_candidates`, shares of that and of the candidates between
-        near and far; and `grids`, the same for each with its `resolution`, its `bytes` at one bit a
-        cell and the `update_seconds` that it took beyond the field, coarser grids included.
+        near and far; `grids`, the same for each with its `resolution`, its `bytes` at one bit a
+        cell and the `update_seconds` that it took beyond the field, coarser grids included; and
+        `left_out`, resolutions that would not fit the free memory, or take minutes of a CPU.
     Raises:
         ValueError: held-out rays see no surface.
     """
@@ -104,7 +106,7 @@ def at_equal_loss(
     kept = kept_shares(
         weights, occupancies, in_parts(partial(_occupancy, model), volume), LOST_SURFACE_MASS
     )
-    rows = []
+    rows, left_out = [], []
     if grids:
         box = mapped_box(model)
 
@@ -113,12 +115,14 @@ def at_equal_loss(
             return threshold_losing(weights, of_rays, SPARED * LOST_SURFACE_MASS)
 
         known = taught, density_of(model, taught)
-        filling = FieldGrids(partial(density_of, model), box, known, floor_of)
+        most = MOST_ON_CPU if model.device.type == "cpu" else math.inf
+        filling = FieldGrids(partial(density_of, model), box, known, floor_of, most)
         for resolution in grids:
             sizes = (resolution,) * 3 if isinstance(resolution, int) else resolution
-            if not fits_memory(math.prod(sizes)):
+            scores = filling.fill(sizes) if fits_memory(math.prod(sizes)) else None
+            if scores is None:
+                left_out.append(resolution)
                 continue
-            scores = filling.fill(sizes)
             of_rays, of_volume = (looked_up(scores, box, places) for places in (mapped, volume))
             row: dict[str, Any] = {
                 "resolution": resolution,
@@ -132,6 +136,7 @@ def at_equal_loss(
         "reached_volume": round(len(volume) / VOLUME_POINTS, 5),
         **_shares(kept),
         "grids": rows,
+        "left_out": left_out,
     }
 
 

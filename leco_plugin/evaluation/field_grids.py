@@ -6,6 +6,7 @@ A cell is asked only where the coarser grid, or a neighbour of its cell, has not
 
 from __future__ import annotations
 
+import math
 import os
 from collections.abc import Callable, Sequence
 
@@ -44,6 +45,7 @@ class FieldGrids:
             surface that fills a thousandth of a cell is missed by hundreds of random places.
         floor_of: the score below which a cell of a grid [nx, ny, nz], and all around it, are empty
             in finer grids too.
+        most: densities that may be asked for one grid.
     """
 
     def __init__(
@@ -52,32 +54,35 @@ class FieldGrids:
         box: ViewBox,
         known: tuple[Tensor, Tensor] | None,
         floor_of: Callable[[Tensor], float],
+        most: float = math.inf,
     ) -> None:
         self.density, self.box, self.known, self.floor_of = density, box, known, floor_of
+        self.most = most
         self.scores: Tensor | None = None
         self.floor = 0.0
         self.clock = Clock()
         """Counts what the last grid took, those that it was refined from included."""
 
-    def fill(self, sizes: Sequence[int]) -> Tensor:
-        """Scores of the cells of a grid; those of the grid before serve if it is half as fine.
+    def fill(self, sizes: Sequence[int]) -> Tensor | None:
+        """Scores [nx, ny, nz] of the cells of a grid; None where it asks more than it may.
+
+        Those of the grid before serve if it is half as fine.
 
         Args:
             sizes: cells along each axis.
-        Returns:
-            sizes
         """
         steps = halvings(sizes, () if self.scores is None else self.scores.shape)
         if self.scores is None or tuple(2 * n for n in self.scores.shape) != steps[0]:
             self.scores, self.floor, self.clock = None, 0.0, Clock()
         self.clock.start()
         for step in steps:
-            self.scores = filled(
-                self.density, self.box, step, self.scores, self.floor, known=self.known
-            )
+            asked = cells_to_ask(step, self.scores, self.floor, self.box.low.device)
+            if int(asked.sum()) * probes_in_a_cell(step) > self.most:
+                self.clock.stop()
+                return None
+            self.scores = filled(self.density, self.box, asked, known=self.known)
             self.floor = self.floor_of(self.scores)
         self.clock.stop()
-        assert self.scores is not None
         return self.scores
 
 
@@ -97,37 +102,52 @@ def halvings(sizes: Sequence[int], known: Sequence[int]) -> list[tuple[int, ...]
     return steps
 
 
-def filled(
-    density: Density,
-    box: ViewBox,
+def cells_to_ask(
     sizes: Sequence[int],
     coarser: Tensor | None = None,
     floor: float = 0.0,
+    device: torch.device | str = "cpu",
+) -> Tensor:
+    """Cells of a grid whose density is not known yet: bool [nx, ny, nz].
+
+    Args:
+        sizes: cells along each axis, twice those of `coarser`.
+        coarser: scores of a grid half as fine; without it every cell is asked.
+        floor: score of the coarser grid below which a cell and all around it are taken for empty.
+    """
+    if coarser is None:
+        return torch.ones(*sizes, dtype=torch.bool, device=device)
+    near = max_pool3d(coarser[None, None], 3, stride=1, padding=1)[0, 0] >= floor
+    return near.repeat_interleave(2, 0).repeat_interleave(2, 1).repeat_interleave(2, 2)
+
+
+def probes_in_a_cell(sizes: Sequence[int]) -> int:
+    """Random places at which a cell is asked, of a grid with so many cells along each axis."""
+    return max(FEWEST_PROBES, PROBES_ALONG // max(sizes))
+
+
+def filled(
+    density: Density,
+    box: ViewBox,
+    asked: Tensor,
     seed: int = 0,
     known: tuple[Tensor, Tensor] | None = None,
 ) -> Tensor:
-    """Scores of the cells of a grid: [nx, ny, nz].
+    """Scores of the cells of a grid: [nx, ny, nz]; zero where they are neither asked nor known.
 
     Args:
         density: of the field.
         box: in mapped coordinates.
-        sizes: cells along each axis, twice those of `coarser`.
-        coarser: scores of a grid half as fine; without it every cell is asked.
-        floor: score of the coarser grid below which a cell and all around it are taken for empty.
+        asked: bool [nx, ny, nz].
         known: mapped positions [M, 3] and densities [M] that count beside those that are asked.
     """
     device = box.low.device
-    if coarser is None:
-        asked = torch.ones(*sizes, dtype=torch.bool, device=device)
-    else:
-        near = max_pool3d(coarser[None, None], 3, stride=1, padding=1)[0, 0] >= floor
-        asked = near.repeat_interleave(2, 0).repeat_interleave(2, 1).repeat_interleave(2, 2)
-    scores = torch.zeros(*sizes, device=device)
-    counts = torch.tensor(sizes, device=device)
+    scores = torch.zeros(asked.shape, device=device)
+    counts = torch.tensor(asked.shape, device=device)
     generator = torch.Generator(device).manual_seed(seed)
     for cells in asked.nonzero().split(CELLS_AT_ONCE):
         best = torch.zeros(len(cells), device=device)
-        for _ in range(max(FEWEST_PROBES, PROBES_ALONG // max(sizes))):
+        for _ in range(probes_in_a_cell(asked.shape)):
             units = cells + torch.rand(len(cells), 3, device=device, generator=generator)
             places = torch.lerp(box.low, box.high, units / counts)
             best = torch.maximum(best, density(places).float())

@@ -175,6 +175,7 @@ def test_rays_without_any_surface_are_refused_in_a_line(
 def test_a_grid_that_does_not_fit_the_memory_is_left_out(model: LecoModel) -> None:
     found = at_equal_loss(model, None, grids=(4, 1 << 15))
     assert [row["resolution"] for row in found["grids"]] == [4]
+    assert found["left_out"] == [1 << 15]
 
 
 def test_training_draws_the_same_random_numbers_afterwards(model: LecoModel) -> None:

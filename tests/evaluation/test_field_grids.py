@@ -9,7 +9,14 @@ import pytest
 import torch
 from torch import Tensor
 
-from leco_plugin.evaluation.field_grids import FieldGrids, filled, fits_memory, halvings, looked_up
+from leco_plugin.evaluation.field_grids import (
+    FieldGrids,
+    cells_to_ask,
+    filled,
+    fits_memory,
+    halvings,
+    looked_up,
+)
 from leco_plugin.evaluation.inspection import ViewBox
 
 BOX = ViewBox(torch.tensor([-1.0, -1.0, -0.5]), torch.tensor([1.0, 1.0, 0.5]))
@@ -21,7 +28,7 @@ def ball(mapped: Tensor) -> Tensor:
 
 
 def test_a_cell_has_the_density_of_the_place() -> None:
-    scores = filled(ball, BOX, CUBE)
+    scores = filled(ball, BOX, cells_to_ask(CUBE))
     mapped = torch.lerp(BOX.low, BOX.high, torch.rand(5000, 3))
     found = looked_up(scores, BOX, mapped)
     distances = mapped.norm(dim=-1)
@@ -45,9 +52,9 @@ def test_refining_finds_what_asking_every_cell_finds_with_fewer_questions() -> N
         asked[0] += len(mapped)
         return ball(mapped)
 
-    coarse = filled(ball, BOX, CUBE)
-    refined = filled(counted, BOX, FINE, coarse, floor=0.5)
-    whole = filled(ball, BOX, FINE)
+    coarse = filled(ball, BOX, cells_to_ask(CUBE))
+    refined = filled(counted, BOX, cells_to_ask(FINE, coarse, floor=0.5))
+    whole = filled(ball, BOX, cells_to_ask(FINE))
     assert float((refined == whole).float().mean()) > 0.98  # other places in the cells were asked
     middles = torch.stack(
         torch.meshgrid(*[(torch.arange(32) + 0.5) / 32] * 3, indexing="ij"), dim=-1
@@ -63,10 +70,10 @@ def test_a_known_surface_is_never_missed_by_a_coarse_cell() -> None:
 
     seen = torch.tensor([[0.3, 0.3, 0.061], [0.3, 0.3, 0.7]])  # the second lies outside
     known = seen, torch.tensor([1.0, 5.0])
-    scores = filled(film, BOX, (8, 8, 8), known=known)
+    scores = filled(film, BOX, cells_to_ask((8, 8, 8)), known=known)
     assert float(looked_up(scores, BOX, seen[:1])) == 1.0
     assert float(scores.sum()) == 1.0
-    assert float(filled(film, BOX, (8, 8, 8)).sum()) == 0.0
+    assert float(filled(film, BOX, cells_to_ask((8, 8, 8))).sum()) == 0.0
 
 
 def test_memory_is_looked_at_before_a_grid_is_filled() -> None:
@@ -90,7 +97,7 @@ def test_a_cell_is_asked_where_the_coarser_grid_has_not_ruled_it_out(seed: int) 
     sizes = (12, 16, 8)
     cells = torch.rand(sizes, generator=generator)  # the same density anywhere in a cell
     coarse = torch.rand(6, 8, 4, generator=generator)
-    found = filled(partial(looked_up, cells, BOX), BOX, sizes, coarse, floor=0.98)
+    found = filled(partial(looked_up, cells, BOX), BOX, cells_to_ask(sizes, coarse, floor=0.98))
     assert 0 < int((found > 0).sum()) < found.numel()
     torch.testing.assert_close(found, slow_refined(coarse, 0.98, cells))
 
@@ -100,7 +107,7 @@ def test_known_places_count_like_a_loop_over_them() -> None:
     places = torch.rand(200, 3, generator=generator) * 2.4 - 1.2
     densities = torch.rand(200, generator=generator)
     found = filled(
-        lambda mapped: torch.zeros(len(mapped)), BOX, (4, 3, 2), known=(places, densities)
+        lambda mapped: torch.zeros(len(mapped)), BOX, cells_to_ask((4, 3, 2)), known=(places, densities)
     )
     expected = torch.zeros(4, 3, 2)
     for place, density in zip(places, densities):
@@ -136,3 +143,10 @@ def test_a_grid_serves_the_next_one_only_if_that_is_twice_as_fine() -> None:
         return sum(asked) - before
 
     assert questions(16, 32) < questions(32) == questions(12, 32)
+
+
+def test_a_grid_that_asks_more_than_it_may_is_filled_only_from_a_coarser_one() -> None:
+    most = 32**3 * 64 - 1
+    assert FieldGrids(ball, BOX, None, lambda scores: 0.5, most).fill(FINE) is None
+    grids = FieldGrids(ball, BOX, None, lambda scores: 0.5, most)
+    assert grids.fill(CUBE) is not None and grids.fill(FINE) is not None
