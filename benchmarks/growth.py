@@ -105,14 +105,14 @@ def bytes_for(volume: float, grids: Sequence[dict[str, Any]]) -> float | None:
     grid keeps so little; the smallest grid's bytes where all do.
     """
     rows = sorted(grids, key=lambda row: row["bytes"])
-    enough = next((i for i, row in enumerate(rows) if row["kept_volume"] <= volume), None)
+    enough = next((i for i, row in enumerate(rows) if row["kept_reached_volume"] <= volume), None)
     if enough is None:
         return None
     if enough == 0:
         return float(rows[0]["bytes"])
     less, more = rows[enough - 1], rows[enough]
-    span = math.log(less["kept_volume"] / max(more["kept_volume"], 1e-9))
-    along = math.log(less["kept_volume"] / max(volume, 1e-9)) / span if span > 0 else 1.0
+    span = math.log(less["kept_reached_volume"] / max(more["kept_reached_volume"], 1e-9))
+    along = math.log(less["kept_reached_volume"] / max(volume, 1e-9)) / span if span > 0 else 1.0
     low, high = math.log(less["bytes"]), math.log(more["bytes"])
     return math.exp(low + min(1.0, max(0.0, along)) * (high - low))
 
@@ -169,7 +169,7 @@ def learn(blocks: int, options: Options) -> dict[str, Any]:
         "steps": step,
         "seconds": round(clock.seconds, 2) if learned else None,
         "gate_bytes": size,
-        "grid_bytes": bytes_for(found["kept_volume"], found["grids"]),
+        "grid_bytes": bytes_for(found["kept_reached_volume"], found["grids"]),
         "looks": looks,
         **found,
     }

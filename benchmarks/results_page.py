@@ -1,4 +1,5 @@
-"""Writes `docs/results.md` and the README's table from stored results; `--check` compares.
+"""Writes `docs/results.md` and the README's table and chart from stored results, or with `--check`
+says which of them are of other results.
 
 python benchmarks/results_page.py
 """
@@ -10,14 +11,19 @@ import sys
 from pathlib import Path
 from typing import Any
 
+from PIL import Image
+
 from leco_plugin.chart.picture import draw
 from leco_plugin.chart.table import table
+from leco_plugin.chart.theme import DARK, LIGHT
+from leco_plugin.evaluation.charts import SOURCE, fingerprint
 
 ROOT = Path(__file__).resolve().parent.parent
 RESULTS = ROOT / "benchmarks" / "results"
 PAGE = ROOT / "docs" / "results.md"
 README = ROOT / "README.md"
 CHARTS = ROOT / "docs" / "images" / "charts"
+DEMO_CHART = ROOT / "docs" / "images" / "demo-chart.png"
 BEGIN, END = "<!-- demo table: generated -->", "<!-- end of the demo table -->"
 
 HEAD = """# Results
@@ -75,7 +81,12 @@ def chart_section(path: Path) -> list[str]:
     """What `leco chart` stored: its picture and its tables, and the paper's where there are any."""
     results = json.loads(path.read_text())
     _, body = table(results).split("\n", 1)
-    parts = [f"## {titles()[path.stem]}\n", f"![{path.stem}](images/charts/{path.stem}.png)"]
+    image = f"images/charts/{path.stem}"
+    parts = [
+        f"## {titles()[path.stem]}\n",
+        f'<picture><source media="(prefers-color-scheme: dark)" srcset="{image}-dark.png">'
+        f'<img alt="{path.stem}" src="{image}.png"></picture>',
+    ]
     parts += [body, f"{machine_line(results)}.\n"]
     if path.stem in PAPER_ROWS:
         parts.append(PAPER_ROWS[path.stem])
@@ -88,11 +99,35 @@ def titles() -> dict[str, str]:
     return found
 
 
-def draw_charts() -> None:
-    """The pictures of the stored charts."""
-    CHARTS.mkdir(parents=True, exist_ok=True)
+def pictures() -> dict[Path, Any]:
+    """Every picture that is drawn from stored results, and those results."""
+    found: dict[Path, Any] = {}
+    if (RESULTS / "demo.json").exists():
+        found[DEMO_CHART] = json.loads((RESULTS / "demo.json").read_text())["runs"]
     for name in titles():
-        draw(json.loads((RESULTS / "charts" / f"{name}.json").read_text()), CHARTS / f"{name}.png")
+        results = json.loads((RESULTS / "charts" / f"{name}.json").read_text())
+        found |= {CHARTS / f"{name}.png": results, CHARTS / f"{name}-dark.png": results}
+    return found
+
+
+def draw_pictures() -> None:
+    """All of `pictures`."""
+    from leco_plugin.demo import draw_chart
+
+    CHARTS.mkdir(parents=True, exist_ok=True)
+    for path, results in pictures().items():
+        if path == DEMO_CHART:
+            draw_chart(json.loads((RESULTS / "demo.json").read_text()), path)
+        else:
+            draw(results, path, DARK if path.stem.endswith("-dark") else LIGHT)
+
+
+def is_stale(path: Path, results: Any) -> bool:
+    """Whether a picture is missing, or of other results."""
+    if not path.exists():
+        return True
+    with Image.open(path) as image:
+        return image.info.get(SOURCE) != fingerprint(results)
 
 
 def sampling_table(report: dict[str, Any]) -> str:
@@ -218,12 +253,13 @@ def main() -> int:
     wanted = {PAGE: page(), README: readme(README.read_text())}
     if "--check" in sys.argv[1:]:
         stale = [path.name for path, text in wanted.items() if path.read_text() != text]
+        stale += [path.name for path, results in pictures().items() if is_stale(path, results)]
         if stale:
             print(f"{', '.join(stale)}: run python benchmarks/results_page.py", file=sys.stderr)
         return 1 if stale else 0
     for path, text in wanted.items():
         path.write_text(text)
-    draw_charts()
+    draw_pictures()
     return 0
 
 

@@ -45,7 +45,12 @@ def occupancy(size: int, kept: float, grids: list[dict[str, Any]] | None = None)
         "lost_surface_mass": 1e-4,
         "kept_surface_recall": None,
         "free_space_skipped": None,
-        "at_equal_loss": {"kept_volume": kept, "kept_candidates": kept, "grids": grids or []},
+        "at_equal_loss": {
+            "kept_reached_volume": kept,
+            "kept_candidates": kept,
+            "grids": grids or [],
+            "left_out": [],
+        },
     }
 
 

@@ -26,12 +26,12 @@ def test_an_exponent_is_that_of_a_power_and_missing_values_are_left_out() -> Non
 
 
 def test_the_grid_that_keeps_a_volume_lies_between_those_measured() -> None:
-    rows = [{"bytes": 10**k, "kept_volume": 0.8 / 2**k} for k in range(4)]
+    rows = [{"bytes": 10**k, "kept_reached_volume": 0.8 / 2**k} for k in range(4)]
     assert bytes_for(0.2, rows) == pytest.approx(100.0)
     assert bytes_for(0.2 * 2**0.5, rows) == pytest.approx(10**1.5)
     assert bytes_for(0.9, rows) == 1.0
     assert bytes_for(0.01, rows) is None
-    level = [{"bytes": 8, "kept_volume": 0.5}, {"bytes": 64, "kept_volume": 0.5}]
+    level = [{"bytes": 8, "kept_reached_volume": 0.5}, {"bytes": 64, "kept_reached_volume": 0.5}]
     assert bytes_for(0.5, level) == 8.0
 
 
@@ -53,7 +53,7 @@ def test_a_dry_run_passes_and_is_not_done_twice(tmp_path: Path) -> None:
     assert [row["blocks"] for row in report["rows"]] == [1, 2]
     for row in report["rows"]:
         assert len(row["grids"]) == 2 and row["gate_bytes"] > 0
-        assert 0.0 < row["kept_volume"] <= 1.0
+        assert 0.0 < row["kept_reached_volume"] <= 1.0
     assert out.with_suffix(".png").stat().st_size > 5000
     again = subprocess.run(command, env=environment, capture_output=True, text=True, check=True)
     assert again.stdout.count("stored already") == 2

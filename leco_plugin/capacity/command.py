@@ -11,10 +11,10 @@ from nerfstudio.utils.rich_utils import CONSOLE
 
 from leco_plugin.capacity.choice import choose, kilobytes, verdict
 from leco_plugin.capacity.field import prepare
-from leco_plugin.capacity.grids import fits_memory
 from leco_plugin.capacity.measuring import Candidate, gates, grids, of_gate, of_grids
 from leco_plugin.capacity.picture import draw
 from leco_plugin.chart.theme import DARK, LIGHT
+from leco_plugin.evaluation.field_grids import fits_memory
 from leco_plugin.evaluation.json_file import write_json
 from leco_plugin.evaluation.machine import describe_machine
 from leco_plugin.progress_bar import bar
@@ -60,7 +60,7 @@ def capacity(
         },
     )
     wanted = list(gates() if gate_candidates is None else gate_candidates)
-    fitting = [n for n in resolutions if fits_memory(n)]
+    fitting = [n for n in resolutions if fits_memory(n**3)]
     for n in sorted(set(resolutions) - set(fitting)):
         CONSOLE.print(f"a grid of {n}^3 cells does not fit the free memory; it is left out")
     of_cells = grids(tuple(fitting))

@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from leco_plugin.evaluation.inspection import ViewBox, whole_box
+from leco_plugin.evaluation.reached_volume import reached_volume
 from leco_plugin.models.leco import LecoModel
 from leco_plugin.models.losses import widen
 from leco_plugin.models.objective import GateLossConfig
@@ -24,8 +24,6 @@ from leco_plugin.shrink.teaching import Lesson
 FIELD = "field.pt"
 RAYS, TAUGHT_RAYS = 8192, 1 << 15
 VOLUME_POINTS = 1 << 17
-CELLS = 64
-"""Along an axis of the mapped cube: cells without a taught candidate are no part of the volume."""
 
 
 class Ground(NamedTuple):
@@ -83,29 +81,13 @@ def _ground(source: Source) -> Ground:
     occupancy = model.occupancy().eval()
     taught, _ = gather(source, None, trained_on(source, occupancy, TAUGHT_RAYS))
     measured, _ = gather(source, None, held_out(source, occupancy, RAYS, parts=1)[0])
-    box = whole_box(occupancy)
-    unit = torch.rand(VOLUME_POINTS, 3, generator=torch.Generator().manual_seed(5))
-    positions = torch.lerp(box.low, box.high, unit).to(model.device)
 
     def mapped(places: Tensor) -> Tensor:
         return model.space.map(places).clamp(-1.0, 1.0)
 
     lesson = lesson_of(mapped(taught.positions), taught, model.config.gate_loss)
-    volume = mapped(positions)
-    volume = volume[reached(lesson.mapped, volume)]
+    volume = reached_volume(model, lesson.mapped, VOLUME_POINTS, seed=5)
     return Ground(model, lesson, measured, mapped(measured.positions), volume)
-
-
-def reached(taught: Tensor, mapped: Tensor) -> Tensor:
-    """Which mapped positions [P, 3] share a cell with one of those taught [M, 3]: bool [P]."""
-
-    def cells(places: Tensor) -> Tensor:
-        i, j, k = ((places + 1.0) * (CELLS / 2)).long().clamp(0, CELLS - 1).unbind(dim=-1)
-        return (i * CELLS + j) * CELLS + k
-
-    found = torch.zeros(CELLS**3, dtype=torch.bool, device=taught.device)
-    found[cells(taught)] = True
-    return found[cells(mapped)]
 
 
 def lesson_of(mapped: Tensor, taught: Evidence, losses: GateLossConfig) -> Lesson:
@@ -113,13 +95,3 @@ def lesson_of(mapped: Tensor, taught: Evidence, losses: GateLossConfig) -> Lesso
     wide = widen(taught.weights, taught.ray_indices)
     target = (wide / losses.weight_at_full).clamp(max=1.0)
     return Lesson(mapped, losses.emphasis * target, 1.0 - target)
-
-
-def mapped_box(model: LecoModel) -> ViewBox:
-    """The scene's box in mapped coordinates; an unbounded scene fills the cube."""
-    if model.space.kind != "box":
-        return ViewBox(-torch.ones(3), torch.ones(3))
-    box = whole_box(model.occupancy())
-    corners = torch.stack([box.low, box.high]).to(model.device)
-    low, high = model.space.map(corners).clamp(-1.0, 1.0).cpu()
-    return ViewBox(low, high)

@@ -12,14 +12,12 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from leco_plugin.capacity.field import Ground, mapped_box
-from leco_plugin.capacity.grids import filled, looked_up
-from leco_plugin.evaluation.equal_loss import threshold_losing
-from leco_plugin.evaluation.inspection import ViewBox
+from leco_plugin.capacity.field import Ground
+from leco_plugin.evaluation.equal_loss import SPARED, kept_shares, threshold_losing
+from leco_plugin.evaluation.field_grids import FieldGrids, density_of, in_parts, looked_up
+from leco_plugin.evaluation.reached_volume import mapped_box
 from leco_plugin.models.encodings import EncodingConfig
 from leco_plugin.models.gate import GateConfig, occupancy_logit
-from leco_plugin.models.leco import LecoModel
-from leco_plugin.models.rendering import gate_values_and_routes
 from leco_plugin.occupancy import gate_precision
 from leco_plugin.shrink.evidence import Evidence
 from leco_plugin.shrink.ladder import values_of
@@ -30,9 +28,6 @@ STEPS = 300
 """With which each gate is taught; 200 are enough for most."""
 VOLUMES = (0.01, 0.015, 0.02, 0.03, 0.04, 0.06, 0.08, 0.11, 0.15, 0.2, 0.3, 0.45)
 """Kept volumes at which the loss is noted."""
-POINTS_AT_ONCE = 1 << 16
-ASK_ALL = 64
-"""Cells along an axis up to which a grid may be filled without a coarser one."""
 FAMILIES = ("frequency", "hash", "vm", "k-planes", "grid")
 
 
@@ -115,15 +110,15 @@ def measured(evidence: Evidence, scores: Tensor, of_volume: Tensor, lost: float)
         of_volume: [P] of places spread evenly over what rays reach of the scene's box.
         lost: share of the weight near surfaces.
     """
-    threshold = threshold_losing(evidence.worth, scores, lost)
+    volume, candidates = kept_shares(evidence.worth, scores, of_volume, lost)
     total = float(evidence.worth.double().sum())
     losses = [
         float(evidence.worth[scores < threshold_keeping(of_volume, share)].double().sum()) / total
         for share in VOLUMES
     ]
     return {
-        "kept_volume": float((of_volume >= threshold).double().mean()),
-        "kept_candidates": float((scores >= threshold).double().mean()),
+        "kept_volume": volume,
+        "kept_candidates": candidates,
         "lost_at_volumes": losses,
     }
 
@@ -155,57 +150,25 @@ def of_grids(
         candidates: by resolution.
         lost: share of the weight near surfaces.
     """
+    density = partial(density_of, ground.model)
     box = mapped_box(ground.model)
-    box = ViewBox(box.low.to(ground.mapped), box.high.to(ground.mapped))
     places = ground.lesson.mapped
-    known = places, density_of(ground.model, places)
-    scores: Tensor | None = None
-    floor = 0.0
+
+    def floor_of(scores: Tensor) -> float:
+        of_rays = looked_up(scores, box, ground.mapped)
+        return threshold_losing(ground.held_out.worth, of_rays, SPARED * lost)
+
+    grids = FieldGrids(density, box, (places, density(places)), floor_of)
     for candidate in candidates:
         started = time.monotonic()
         assert candidate.resolution is not None
-        for resolution in halvings(candidate.resolution, 0 if scores is None else len(scores)):
-            coarser = scores if scores is not None and resolution == 2 * len(scores) else None
-            density = partial(density_of, ground.model)
-            scores = filled(density, box, resolution, coarser, floor, known=known)
-            of_rays = looked_up(scores, box, ground.mapped)
-            # cells that a tenth of the loss can spare are empty in finer grids too
-            floor = threshold_losing(ground.held_out.worth, of_rays, 0.1 * lost)
+        scores = grids.fill((candidate.resolution,) * 3)
         assert scores is not None
-        of_volume = looked_up(scores, box, ground.volume)
+        of_rays, of_volume = (
+            looked_up(scores, box, mapped) for mapped in (ground.mapped, ground.volume)
+        )
         found = measured(ground.held_out, of_rays, of_volume, lost)
         yield candidate, _row(candidate, started, found)
-
-
-def halvings(resolution: int, known: int) -> list[int]:
-    """Resolutions to fill on the way to one, from coarse to fine.
-
-    Args:
-        known: cells along an axis of the grid that there is already.
-    """
-    steps = [resolution]
-    while steps[0] > ASK_ALL and steps[0] % 2 == 0 and steps[0] != 2 * known:
-        steps.insert(0, steps[0] // 2)
-    return steps
-
-
-@torch.no_grad()
-def density_of(model: LecoModel, mapped: Tensor) -> Tensor:
-    """Density of a model's field at mapped positions [N, 3], per half extent: [N]."""
-
-    def part_of(part: Tensor) -> Tensor:
-        with gate_precision(model.device.type, model.precision):
-            left = model.field.experts.those_left()
-            values, routes = gate_values_and_routes(model.gate(part), model.routing, left)
-            sigmas: Tensor = model.field.density(part, routes, values)[0]
-        return sigmas
-
-    return in_parts(part_of, mapped)
-
-
-def in_parts(function: Any, mapped: Tensor) -> Tensor:
-    """A function of positions [N, 3], some at a time: [N]."""
-    return torch.cat([function(part) for part in mapped.split(POINTS_AT_ONCE)])
 
 
 def _row(candidate: Candidate, started: float, found: dict[str, Any]) -> dict[str, Any]:

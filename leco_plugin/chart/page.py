@@ -17,6 +17,7 @@ from leco_plugin.chart.summary import (
     headline,
     lines_of,
     representations_of,
+    sentence,
     verdict,
 )
 from leco_plugin.chart.theme import LIGHT
@@ -32,7 +33,7 @@ def write_page(results: Mapping[str, Any], path: Path) -> Path:
     """
     lines = lines_of(results)
     held = representations_of(lines)
-    title = html.escape(verdict(held) if len(held) > 1 else headline(results))
+    title = html.escape(sentence(verdict(held) if len(held) > 1 else headline(results)))
     figure = _figure(lines)
     if len(held) > 1:
         _add_representations(figure, held)

@@ -1,4 +1,4 @@
-"""The lower panels of `chart.png`: accuracy, or kept volume, against one cost each."""
+"""Panels of `chart.png`: accuracy, or kept volume, against one cost each."""
 
 from __future__ import annotations
 
@@ -6,9 +6,7 @@ from collections.abc import Sequence
 from typing import Any
 
 from leco_plugin.chart.summary import (
-    BYTES,
     COSTS,
-    LEARNING,
     RENDERING,
     Cost,
     Line,
@@ -19,6 +17,8 @@ from leco_plugin.chart.theme import Theme, plain, style
 
 WIDE_RANGE = 8.0
 """Ratio of costs from which their axis is logarithmic."""
+NAME_WIDTH = 0.0118
+"""Of a letter beside a point of the large panel, of the panel's."""
 
 
 def draw_all_costs(panels: Sequence[Any], lines: Sequence[Line], theme: Theme) -> None:
@@ -89,44 +89,74 @@ def _cost_axis(axes: Any, title: str, unit: str, values: Sequence[float], theme:
     axes.set_title(f"{title}, {unit}" if unit else title, fontsize=11.5, loc="left")
 
 
-def draw_representations(
-    panels: Sequence[Any],
+def draw_kept(
+    axes: Any,
+    cost: Cost,
+    values: Sequence[float],
     held: Sequence[Representation],
     lines: Sequence[Line],
     theme: Theme,
+) -> list[tuple[float, float]]:
+    """What each occupancy keeps of the scene against one cost of it, less of both up and left.
+
+    Args:
+        values: of the cost, in the unit shown, for each of `held`.
+    Returns:
+        The places of the points.
+    """
+    places = [(value, one.kept) for value, one in zip(values, held)]
+    _cost_axis(axes, cost.title, cost.unit, values, theme)
+    names = [line.name for line in lines]
+    for place, one in zip(places, held):
+        look = style(names.index(one.name), theme) if one.name in names else {"marker": "x"}
+        size = 15 if one.ours else 11
+        axes.plot(*place, markersize=size, zorder=3, **{"color": theme.ink, **look})
+    axes.invert_yaxis()
+    _draw_front(axes, places, theme, sign=-1.0)
+    return places
+
+
+def name_points(
+    axes: Any, places: Sequence[tuple[float, float]], names: Sequence[str], colours: Sequence[str]
 ) -> None:
-    """What an occupancy keeps of the scene against its size and its learning time."""
-    for panel, cost, values in (
-        (panels[0], BYTES, [one.size for one in held]),
-        (panels[1], LEARNING, [one.learn_seconds for one in held]),
-    ):
-        places = [(value, one.kept) for value, one in zip(values, held)]
-        _cost_axis(panel, cost.title, cost.unit, values, theme)
-        names = [line.name for line in lines]
-        for place, one in zip(places, held):
-            known = one.name in names
-            look = style(names.index(one.name), theme) if known else {"marker": "x"}
-            panel.plot(*place, markersize=11, **{"color": theme.ink, **look})
-            if not known:
-                _name_point(panel, one.name, place)
-        panel.invert_yaxis()
-        _draw_front(panel, places, theme, sign=-1.0)
-    panels[0].set_ylabel("volume kept, %")
-    points = [(line, line.median(RENDERING)) for line in lines]
-    _draw_costs(panels[2], RENDERING, points, theme, first=False)
-    panels[2].set_title("rendering an image, s: PSNR", fontsize=11.5, loc="left")
+    """Names beside points, each where it covers neither another name nor a point."""
+    spots = axes.transAxes.inverted().transform(axes.transData.transform(places)).tolist()
+    taken = [(x - 0.012, y - 0.03, x + 0.012, y + 0.03) for x, y in spots]
+    for (x, y), name, colour in zip(spots, names, colours):
+        width = NAME_WIDTH * len(name)
+        corners = [
+            (x + across if across > 0 else x + across - width, y + up)
+            for up in (0.06, -0.06, 0.0, 0.13, -0.13)
+            for across in (0.022, -0.022)
+        ]
+        inside = [corner for corner in corners if _is_free(corner, width, ())] or corners
+        free = [corner for corner in inside if _is_free(corner, width, taken)]
+        left, middle = (free or inside)[0]
+        taken.append((left, middle - 0.035, left + width, middle + 0.035))
+        axes.text(
+            *(left, middle, name),
+            transform=axes.transAxes,
+            va="center",
+            color=colour,
+            fontweight="bold",
+        )
 
 
-def _name_point(axes: Any, name: str, place: tuple[float, float]) -> None:
-    """A name beside a point, on the side where the panel has room."""
-    x, _ = axes.transAxes.inverted().transform(axes.transData.transform(place))
-    side, align = (8, "left") if x < 0.6 else (-8, "right")
-    axes.annotate(
-        name,
-        place,
-        xytext=(side, 0),
-        textcoords="offset points",
-        va="center",
-        ha=align,
-        fontsize=10,
+def _is_free(
+    corner: tuple[float, float], width: float, taken: Sequence[tuple[float, float, float, float]]
+) -> bool:
+    """Whether a name that begins there lies in the panel and on nothing else."""
+    left, middle = corner
+    low, high, right = middle - 0.035, middle + 0.035, left + width
+    inside = left >= 0.0 and right <= 1.0 and low >= 0.0 and high <= 1.0
+    return inside and not any(
+        left < b_right and right > b_left and low < b_high and high > b_low
+        for b_left, b_low, b_right, b_high in taken
     )
+
+
+def draw_rendering(axes: Any, lines: Sequence[Line], theme: Theme) -> None:
+    """PSNR against the time to render an image, in a panel beside others."""
+    points = [(line, line.median(RENDERING)) for line in lines]
+    _draw_costs(axes, RENDERING, points, theme, first=False)
+    axes.set_title("PSNR by seconds to render an image", fontsize=11.5, loc="left")

@@ -11,18 +11,22 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from leco_plugin.chart.panels import draw_all_costs, draw_representations
+from leco_plugin.chart.panels import draw_all_costs, draw_kept, draw_rendering, name_points
 from leco_plugin.chart.summary import (
+    BYTES,
     LEARNING,
     LOST_SURFACE_MASS,
     Line,
+    Representation,
     circumstances,
     headline,
     lines_of,
     representations_of,
+    sentence,
     verdict,
 )
 from leco_plugin.chart.theme import LIGHT, Theme, plain, style
+from leco_plugin.evaluation.charts import SOURCE, fingerprint
 
 CLOSE = 0.056
 """Least distance of two names at the ends of curves, of the panel's height."""
@@ -32,7 +36,11 @@ TITLE_WIDTH = 66
 CHARACTER = 0.0098
 """Width of a letter of the names, of the figure's."""
 HOW_TO_READ = "What it costs: up and left is better; nothing beats the grey front in both."
-EQUAL_LOSS = f" All lose {LOST_SURFACE_MASS:.1%} of the surface."
+KEPT_AGAINST_SIZE = (
+    f"space that must be sampled where each loses {LOST_SURFACE_MASS:.1%} of the surface, against "
+    "size in kB: up and left is better"
+)
+WHAT_ELSE = "The same against learning time, and what the runs came to: up and left is better."
 
 
 def draw(results: Mapping[str, Any], path: Path, theme: Theme = LIGHT) -> Path:
@@ -52,49 +60,83 @@ def draw(results: Mapping[str, Any], path: Path, theme: Theme = LIGHT) -> Path:
     parts = ("text.color", "axes.labelcolor", "axes.edgecolor", "xtick.color", "ytick.color")
     settings: dict[Any, Any] = {"font.size": 12, "axes.facecolor": theme.page}
     settings |= dict.fromkeys(parts, theme.ink)
-    sentence = verdict(held) if len(held) > 1 else headline(results)
+    compared = len(held) > 1
     with rc_context(settings):
         figure = Figure(figsize=(10, 8.4), facecolor=theme.page)
         FigureCanvasAgg(figure)
-        title = textwrap.fill(sentence, TITLE_WIDTH)
+        title = balanced(sentence(verdict(held) if compared else headline(results)))
         figure.text(0.015, 0.985, title, va="top", fontsize=17, fontweight="bold")
         figure.text(0.015, 0.895, circumstances(results), va="top", fontsize=11.5)
-        widest = max(len(line.name) for line in lines)
-        right = 0.93 - CHARACTER * min(widest + 6, 40)
-        _draw_curves(figure.add_axes((0.075, 0.43, right - 0.075, 0.42)), lines, theme)
-        explained = HOW_TO_READ + (EQUAL_LOSS if len(held) > 1 else "")
-        figure.text(0.015, 0.335, explained, va="top", fontsize=11.5)
         below = [figure.add_axes((0.075 + 0.325 * i, 0.065, 0.255, 0.2)) for i in range(3)]
-        if len(held) > 1:
-            draw_representations(below, held, lines, theme)
+        if compared:
+            figure.text(0.015, 0.335, WHAT_ELSE, va="top", fontsize=11.5)
+            _draw_compared(figure.add_axes((0.075, 0.43, 0.895, 0.39)), below, held, lines, theme)
         else:
+            figure.text(0.015, 0.335, HOW_TO_READ, va="top", fontsize=11.5)
+            widest = max(len(line.name) for line in lines)
+            right = 0.93 - CHARACTER * min(widest + 6, 40)
+            main = figure.add_axes((0.075, 0.43, right - 0.075, 0.42))
+            _draw_curves(main, lines, theme)
+            _draw_learning(main, lines, theme)
+            _name_ends(main, lines, theme)
             draw_all_costs(below, lines, theme)
-        figure.savefig(path, dpi=160)
+        figure.savefig(path, dpi=160, metadata={SOURCE: fingerprint(results)})
     return path
 
 
-def _draw_curves(axes: Any, lines: Sequence[Line], theme: Theme) -> None:
+def balanced(text: str, width: int = TITLE_WIDTH) -> str:
+    """A text in as few lines as `width` letters allow, all about as long."""
+    lines = len(textwrap.wrap(text, width))
+    narrowest = next(n for n in range(1, width + 1) if len(textwrap.wrap(text, n)) <= lines)
+    return textwrap.fill(text, narrowest)
+
+
+def _draw_compared(
+    main: Any,
+    below: Sequence[Any],
+    held: Sequence[Representation],
+    lines: Sequence[Line],
+    theme: Theme,
+) -> None:
+    """What each occupancy keeps against its size; below, against learning time, and the runs."""
+    places = draw_kept(main, BYTES, [one.size for one in held], held, lines, theme)
+    main.set_title(KEPT_AGAINST_SIZE, fontsize=11.5, loc="left")
+    main.set_ylabel("space kept, %")
+    looks = {line.name: style(i, theme)["color"] for i, line in enumerate(lines)}
+    colours = [looks.get(one.name, theme.ink) for one in held]
+    name_points(main, places, [one.name for one in held], colours)
+    draw_kept(below[0], LEARNING, [one.learn_seconds for one in held], held, lines, theme)
+    below[0].set_title("space kept by seconds of learning it", fontsize=11.5, loc="left")
+    _draw_curves(below[1], lines, theme, small=True)
+    draw_rendering(below[2], lines, theme)
+
+
+def _draw_curves(axes: Any, lines: Sequence[Line], theme: Theme, small: bool = False) -> None:
     longest = max(run["train_seconds"] for line in lines for run in line.runs)
-    ends = []
     for i, line in enumerate(lines):
         look = style(i, theme)
         seconds, mean, low, high = line.curve()
         dashes = "-" if line.learned else (0, (5, 2))
-        axes.plot(seconds, mean, linestyle=dashes, linewidth=2.6, color=look["color"])
+        width, size = (1.6, 6) if small else (2.6, 9)
+        axes.plot(seconds, mean, linestyle=dashes, linewidth=width, color=look["color"])
         axes.fill_between(seconds, low, high, color=look["color"], alpha=0.16, linewidth=0)
-        axes.plot(seconds[-1], mean[-1], markersize=9, **look)
-        ends.append((float(seconds[-1]), float(mean[-1]), f"{line.name}  {mean[-1]:.1f}"))
+        axes.plot(seconds[-1], mean[-1], markersize=size, **look)
     plain(axes, theme)
     axes.set_xlim(0.0, 1.02 * longest)
     axes.margins(y=0.05)
-    _draw_learning(axes, lines, theme)
-    axes.set_ylabel("PSNR on test images, dB")
-    axes.set_xlabel("seconds of training")
-    _name_ends(axes, ends, theme)
+    if small:
+        axes.set_title("PSNR by seconds of training", fontsize=11.5, loc="left")
+    else:
+        axes.set_ylabel("test PSNR, dB (more is better)")
+        axes.set_xlabel("seconds of training")
 
 
-def _name_ends(axes: Any, ends: Sequence[tuple[float, float, str]], theme: Theme) -> None:
+def _name_ends(axes: Any, lines: Sequence[Line], theme: Theme) -> None:
     """Names to the right of the panel, each as near to the end of its curve as there is room."""
+    ends = []
+    for line in lines:
+        times, mean, _, _ = line.curve()
+        ends.append((float(times[-1]), float(mean[-1]), f"{line.name}  {mean[-1]:.1f}"))
     low, high = axes.get_ylim()
     wanted = [(value - low) / (high - low) for _, value, _ in ends]
     for i, place in enumerate(spread(wanted, CLOSE)):

@@ -3,14 +3,21 @@
 from __future__ import annotations
 
 import hashlib
+from collections.abc import Iterable
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
+from leco_plugin.chart.contender import Contender
 from leco_plugin.evaluation.clock import Budget
 
 LEARN_SHARE = 0.4
 """Of the training time, at most, for learning an occupancy; short runs need most of that."""
+
+OVERHEAD_SECONDS = 45.0
+"""Start, evaluation and rendering of a run on two CPU cores, about: 25 to 70 were measured."""
+GRIDS_SECONDS = 120.0
+"""Making grids from the field of a run, those of 512^3 cells among them, about."""
 
 
 @dataclass(frozen=True)
@@ -48,6 +55,19 @@ class Protocol:
             None if self.steps is None else round(times * self.steps),
             learning,
         )
+
+    def minutes(self, contenders: Iterable[Contender]) -> float | None:
+        """About how long runs take on two CPU cores, one of each contender that is given.
+
+        None where only steps end them, whose time is not known.
+        """
+        if self.seconds is None:
+            return None
+        runs = [
+            one.budget * self.seconds + OVERHEAD_SECONDS + (GRIDS_SECONDS if one.grids else 0.0)
+            for one in contenders
+        ]
+        return sum(runs) / 60.0
 
     def describe(self) -> str:
         """In a few words."""

@@ -79,6 +79,8 @@ class Chart:
             show: called with the share of all runs that is done.
         """
         todo = self.missing()
+        if todo:
+            say(self.forecast(todo))
         self.write()
         for number, job in enumerate(todo):
             done = len(self.jobs) - len(todo) + number
@@ -100,6 +102,16 @@ class Chart:
                     f"{run['render_seconds_per_image']:.2f} s an image"
                 )
             self.write()
+
+    def forecast(self, todo: Sequence[Job]) -> str:
+        """How many runs are to be made, and about how long that takes."""
+        minutes = self.protocol.minutes(job.contender for job in todo)
+        runs = f"{len(todo)} run{'s' if len(todo) > 1 else ''}"
+        stored = len(self.jobs) - len(todo)
+        there = f" ({stored} more are there already)" if stored else ""
+        if minutes is None:
+            return f"{runs} of {self.protocol.describe()}{there}"
+        return f"{runs}, about {max(minutes, 1.0):.0f} minutes on two CPU cores{there}"
 
     def _fail(self, job: Job, reason: str) -> None:
         contender = job.contender

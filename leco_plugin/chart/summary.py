@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import statistics
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -14,6 +14,8 @@ from leco_plugin.chart.contender import short_names
 
 LOST_SURFACE_MASS = 1e-3
 """Of the weight near surfaces, at which `evaluation.equal_loss` compares representations."""
+OURS = "learned-occupancy"
+"""The sampler whose gate is the one that this package takes by default."""
 CURVE_TIMES = 60
 """Common times at which the curves of several seeds are read."""
 
@@ -42,7 +44,7 @@ MEMORY = Cost("peak_memory_bytes", "peak memory in training", "GB", 1e-9)
 QUERIES = Cost("field_queries_per_ray", "field queries a ray", "")
 LEARNING = Cost("learn_seconds", "learning the occupancy", "s")
 BYTES = Cost("occupancy.bytes", "size of the occupancy", "kB", 1e-3)
-KEPT = Cost("occupancy.at_equal_loss.kept_volume", "volume kept at equal loss", "%", 100.0)
+KEPT = Cost("occupancy.at_equal_loss.kept_reached_volume", "volume kept at equal loss", "%", 100.0)
 COSTS = (RENDERING, MEMORY, QUERIES)
 
 
@@ -131,29 +133,62 @@ class Representation:
     learn_seconds: float
     """Until it is there; for a grid, of the field it was made from, and its own updates."""
     kept: float
-    """Percent of the scene's volume that it keeps when all lose equally much."""
+    """Percent of the volume that rays reach which it keeps when all lose equally much."""
+    ours: bool = False
+    """Whether it is the gate that this package takes by default."""
+
+    def beats(self, other: Representation, cost: Callable[[Representation], float]) -> bool:
+        """Whether it keeps no more at no more cost, and is better in one of the two."""
+        mine, theirs = (cost(self), self.kept), (cost(other), other.kept)
+        return mine != theirs and all(a <= b for a, b in zip(mine, theirs))
+
+
+FRONTS: dict[str, Callable[[Representation], float]] = {
+    "size": lambda one: one.size,
+    "learning time": lambda one: one.learn_seconds,
+}
+"""The costs on whose fronts representations are."""
 
 
 def representations_of(lines: Sequence[Line]) -> list[Representation]:
-    """Learned occupancies, and grids made from the same field, where they were measured."""
-    found = []
+    """Learned occupancies, and grids made from the same field, where they were measured.
+
+    None where all are gates of one kind: then something else is compared.
+    """
+    found: list[Representation] = []
+    kinds: set[str] = set()
     for line in lines:
         size, seconds, kept = (line.median(cost) for cost in (BYTES, LEARNING, KEPT))
         if size is None or seconds is None or kept is None:
             continue
-        found.append(Representation(line.name, size, seconds, kept))
-        rows = [run["occupancy"]["at_equal_loss"]["grids"] for run in line.runs]
-        for grids in zip(*rows):
+        found.append(Representation(line.name, size, seconds, kept, line.sampler == OURS))
+        kinds.add(line.sampler)
+        of_runs = [
+            {str(grid["resolution"]): grid for grid in run["occupancy"]["at_equal_loss"]["grids"]}
+            for run in line.runs
+        ]
+        for resolution in of_runs[0]:
+            grids = [grids[resolution] for grids in of_runs if resolution in grids]
+            kinds.add("grid")
             updates = statistics.median(grid["update_seconds"] for grid in grids)
             found.append(
                 Representation(
-                    f"grid {grids[0]['resolution']}³",
+                    f"grid {resolution}³",
                     grids[0]["bytes"] / 1e3,
                     seconds + updates,
-                    100.0 * statistics.median(grid["kept_volume"] for grid in grids),
+                    100.0 * statistics.median(grid["kept_reached_volume"] for grid in grids),
                 )
             )
-    return found
+    return found if len(kinds) > 1 else []
+
+
+def fronts_of(one: Representation, all_of_them: Sequence[Representation]) -> list[str]:
+    """The names of the `FRONTS` on which a representation is."""
+    return [
+        name
+        for name, cost in FRONTS.items()
+        if not any(other.beats(one, cost) for other in all_of_them)
+    ]
 
 
 def headline(results: Mapping[str, Any]) -> str:
@@ -187,13 +222,20 @@ def circumstances(results: Mapping[str, Any]) -> str:
 
 
 def verdict(representations: Sequence[Representation]) -> str:
-    """Whether the first representation, ours, is on both fronts."""
-    ours = representations[0]
-    fronts = {
-        "size": front([(r.size, -r.kept) for r in representations]),
-        "learning time": front([(r.learn_seconds, -r.kept) for r in representations]),
-    }
-    off = [name for name, members in fronts.items() if 0 not in members]
-    if not off:
-        return f"{ours.name} is on both fronts: nothing keeps less space for its size or time"
-    return f"{ours.name} is not on the front of {' nor of '.join(off)}"
+    """Whether ours is on both fronts, and what beats it where it is not."""
+    ours = next((one for one in representations if one.ours), None)
+    if ours is None:
+        return "our own gate has no figures here"
+    beaten = []
+    for name, cost in FRONTS.items():
+        better = [one for one in representations if one.beats(ours, cost)]
+        if better:
+            beaten.append(f"in {name} by {min(better, key=lambda one: one.kept).name}")
+    if not beaten:
+        return f"nothing as small, and nothing learned as soon, keeps less space than {ours.name}"
+    return f"{ours.name} is not on the front: it is beaten {' and '.join(beaten)}"
+
+
+def sentence(text: str) -> str:
+    """The text as it begins a line."""
+    return text[:1].upper() + text[1:]

@@ -9,15 +9,19 @@ from typing import Any
 
 from leco_plugin.chart.summary import (
     COSTS,
+    KEPT,
     LEARNING,
     Cost,
     Line,
+    Representation,
     circumstances,
     common_psnr,
     front,
+    fronts_of,
     headline,
     lines_of,
     representations_of,
+    sentence,
     verdict,
 )
 from leco_plugin.chart.versus import Versus, rivals
@@ -44,7 +48,7 @@ def table(results: Mapping[str, Any]) -> str:
     ]
     lines = lines_of(results) if results["runs"] else []
     if lines:
-        parts += [f"{headline(results)}. {circumstances(results)}.", runs_table(lines)]
+        parts += [f"{sentence(headline(results))}. {circumstances(results)}.", runs_table(lines)]
     duels = rivals(lines)
     if duels:
         parts.append(versus_table(duels))
@@ -54,9 +58,7 @@ def table(results: Mapping[str, Any]) -> str:
         parts.append(occupancy_table(lines))
     held = representations_of(lines)
     if len(held) > 1:
-        rows = [[r.name, _number(r.size), _number(r.learn_seconds), f"{r.kept:.1f}"] for r in held]
-        header = ["representation", "kB", "learned in, s", "volume kept at equal loss, %"]
-        parts += [_rows(header, rows), f"{verdict(held)}."]
+        parts += [representations_table(held), f"{sentence(verdict(held))}.{left_out(lines)}"]
     commit = f" at {made['commit']}" if made["commit"] else ""
     parts.append(f"`{made['command']}`, {made['date']}, leco_plugin {made['version']}{commit}.")
     return "\n\n".join(parts) + "\n"
@@ -135,7 +137,7 @@ def occupancy_table(lines: Sequence[Line]) -> str:
         Cost("occupancy.empty_fraction", "candidates skipped, %", "", 100.0),
         Cost("occupancy.image_price_db", "price, dB", ""),
         Cost("occupancy.lost_surface_mass", "lost surface mass", ""),
-        Cost("occupancy.at_equal_loss.kept_volume", "volume kept at 1e-3, %", "", 100.0),
+        Cost(KEPT.key, "volume kept at 1e-3, %", "", 100.0),
         Cost("occupancy.kept_surface_recall", "true surface kept, %", "", 100.0),
         Cost("occupancy.free_space_skipped", "free space skipped, %", "", 100.0),
     )
@@ -145,6 +147,36 @@ def occupancy_table(lines: Sequence[Line]) -> str:
         if all(run.get("occupancy") for run in line.runs)
     ]
     return _rows(["occupancy of", *(column.title for column in columns)], rows)
+
+
+def representations_table(held: Sequence[Representation]) -> str:
+    """What each keeps for its size and its learning time, and where nothing else beats it."""
+    header = ["representation", "kB", "learned in, s", "volume kept at equal loss, %"]
+    rows = [
+        [
+            one.name,
+            _number(one.size),
+            _number(one.learn_seconds),
+            f"{one.kept:.1f}",
+            ", ".join(fronts_of(one, held)) or "-",
+        ]
+        for one in held
+    ]
+    return _rows([*header, "on the front of"], rows)
+
+
+def left_out(lines: Sequence[Line]) -> str:
+    """Grids that were to be made from a field and were not, in a sentence after another."""
+    sizes = {
+        str(size)
+        for line in lines
+        for run in line.runs
+        for size in ((run.get("occupancy") or {}).get("at_equal_loss") or {}).get("left_out", [])
+    }
+    if not sizes:
+        return ""
+    listed = ", ".join(f"{size}³" for size in sorted(sizes, key=int))
+    return f" Not in every run, for want of memory or time: grid {listed}."
 
 
 def _on_front(lines: Sequence[Line], cost: Cost) -> set[str]:

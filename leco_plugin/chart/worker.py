@@ -5,6 +5,7 @@ The folder holds `job.json`; the run leaves `result.json` in it, or `failure.jso
 
 from __future__ import annotations
 
+import copy
 import json
 import os
 import shutil
@@ -20,6 +21,7 @@ if TYPE_CHECKING:
 
     from leco_plugin.chart.contender import Contender
     from leco_plugin.chart.protocol import Protocol
+    from leco_plugin.models.leco import LecoModel
 
 JOB, RESULT, FAILURE, PROGRESS = "job.json", "result.json", "failure.json", "progress"
 
@@ -76,18 +78,16 @@ def train_job(
         A run of `results.json`, with an `occupancy` of its own, as JSON values; and the trainer
         with its model.
     """
-    from leco_plugin.evaluation.equal_loss import at_equal_loss
     from leco_plugin.evaluation.timed_run import timed_run
     from leco_plugin.models.leco import LecoModel
 
     budget = protocol.budget(contender.budget)
-    at_loss: dict[str, Any] = {}
+    frozen: dict[str, Any] = {}
 
     def when_frozen(trainer: Trainer) -> None:
         model: Any = trainer.pipeline.model
         if isinstance(model, LecoModel) and not model.config.schedule.restart:
-            manager = trainer.pipeline.datamanager
-            at_loss.update(at_equal_loss(model, manager, contender.grids))
+            frozen.update(_weights_of(model))
 
     run, trainer = timed_run(
         config,
@@ -101,9 +101,38 @@ def train_job(
     )
     facts = _occupancy_of(trainer, data, folder)
     if facts is not None:
-        facts["at_equal_loss"] = at_loss or None
+        facts["at_equal_loss"] = _at_freezing(trainer, frozen, contender.grids)
         facts["learn_seconds"] = run.learn_seconds
     return {**run.to_dict(), "name": contender.name, "occupancy": facts}, trainer
+
+
+def _weights_of(model: LecoModel) -> dict[str, Any]:
+    return {name: copy.deepcopy(getattr(model, name).state_dict()) for name in ("gate", "field")}
+
+
+def _at_freezing(
+    trainer: Trainer, frozen: dict[str, Any], grids: tuple[int, ...]
+) -> dict[str, Any] | None:
+    """What the gate and grids keep of the field as it was when the gate was frozen, if it ever was.
+
+    After the run, so that neither its memory nor its random numbers know of it.
+    """
+    from leco_plugin.evaluation.equal_loss import at_equal_loss
+
+    if not frozen:
+        return None
+    model: Any = trainer.pipeline.model
+    now = _weights_of(model)
+    for name, weights in frozen.items():
+        getattr(model, name).load_state_dict(weights)
+    found: dict[str, Any] | None = None
+    try:
+        found = at_equal_loss(model, trainer.pipeline.datamanager, grids)
+    except ValueError as error:  # the run itself is whole
+        print(error)
+    for name, weights in now.items():
+        getattr(model, name).load_state_dict(weights)
+    return found
 
 
 def _occupancy_of(trainer: Trainer, data: Path, folder: Path) -> dict[str, Any] | None:

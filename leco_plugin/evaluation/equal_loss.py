@@ -1,35 +1,47 @@
 """How much space an occupancy keeps when all lose equally much: representations side by side.
 
-Each representation has a score of its own, o(x) of a gate or the running occupancy of a grid's
-cell; its threshold is set so that exactly the same share of the weight near surfaces is lost.
+Each representation has a score of its own, o(x) of a gate or the largest density in a grid's cell;
+its threshold is set so that exactly the same share of the weight near surfaces is lost.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from functools import partial
 from typing import Any
 
 import torch
 from torch import Tensor
 
-from leco_plugin.evaluation.clock import Clock
-from leco_plugin.evaluation.inspection import whole_box
-from leco_plugin.models.calibration import Reference
+from leco_plugin.evaluation.field_grids import (
+    FieldGrids,
+    density_of,
+    fits_memory,
+    in_parts,
+    looked_up,
+)
+from leco_plugin.evaluation.reached_volume import (
+    candidates_of,
+    mapped_box,
+    rays_of_photographs,
+    reached_volume,
+)
 from leco_plugin.models.freezing import calibration_rays, dense_reference
 from leco_plugin.models.gate import occupancy_from_logits
 from leco_plugin.models.leco import LecoModel
-from leco_plugin.models.rendering import Rays, gate_values_and_routes, mapped_middles
+from leco_plugin.models.rendering import Rays, mapped_middles
 from leco_plugin.occupancy import gate_precision
-from leco_plugin.samplers.grid import OccupancyGridEstimator
 
 LOST_SURFACE_MASS = 1e-3
 """Of the weight near surfaces."""
-VOLUME_POINTS = 1 << 16
-GRID_UPDATES = 4
-"""Times that a grid asks the density of all its cells, each time somewhere else in them. nerfacc's
-asks 16 times before it begins to ask fewer; thin things in large cells want several."""
-POINTS_AT_ONCE = 1 << 16
+VOLUME_POINTS = 1 << 17
+"""In the whole box, those that no ray reaches among them."""
+TAUGHT_RAYS = 1 << 15
+MOST_ON_CPU = 2e8
+"""Densities asked for one grid: about three minutes of two cores."""
+SPARED = 0.1
+"""Of the allowed loss: cells of a coarse grid that can be had for it are empty in finer ones."""
 
 
 def threshold_losing(weights: Tensor, scores: Tensor, lost: float) -> float:
@@ -45,127 +57,111 @@ def threshold_losing(weights: Tensor, scores: Tensor, lost: float) -> float:
     return float(ordered[min(first_too_many, len(ordered) - 1)])
 
 
+def kept_shares(
+    weights: Tensor, scores: Tensor, of_volume: Tensor, lost: float
+) -> tuple[float, float]:
+    """Shares of the volume and of the candidates that are kept where a share of weight is lost.
+
+    Args:
+        weights: [M] of candidates, near surfaces.
+        scores: [M] of the candidates.
+        of_volume: [P] scores of places spread evenly over what rays reach of the scene's box.
+        lost: share of the weight.
+    """
+    threshold = threshold_losing(weights, scores, lost)
+    volume, candidates = ((some >= threshold).double().mean() for some in (of_volume, scores))
+    return float(volume), float(candidates)
+
+
 @torch.no_grad()
 def at_equal_loss(
     model: LecoModel, datamanager: Any, grids: Sequence[int | tuple[int, int, int]] = ()
 ) -> dict[str, Any]:
     """What the model's gate keeps at `LOST_SURFACE_MASS`, and grids made from the same field.
 
-    Meant for the moment of freezing: what a gate skips is not trained from then on.
+    Meant for the model as it was at the moment of freezing: what a gate skips is not trained from
+    then on. Only places that rays of photographs reach count as volume. Grids hear of the densities
+    along those rays, as a gate does while it learns, beside random places in their cells.
 
     Args:
-        model: whose gate has just been frozen; it is left as it was.
+        model: whose gate is frozen; it is left as it was.
         datamanager: with held-out training pixels.
         grids: cells along each axis of the grids, one number for all three or one for each.
     Returns:
-        `lost_surface_mass`; `kept_volume` and `kept_candidates`, shares of the scene's box and of
-        the candidates between near and far; and `grids`, the same for each with its `resolution`,
-        its `bytes` at one bit a cell and the `update_seconds` that it took beyond the field.
+        `lost_surface_mass`; `reached_volume`, the share of the scene's box that rays reach;
+        `kept_reached_volume` and `kept_candidates`, shares of that and of the candidates between
+        near and far; `grids`, the same for each with its `resolution`, its `bytes` at one bit a
+        cell and the `update_seconds` that it took beyond the field, coarser grids included; and
+        `left_out`, resolutions that would not fit the free memory, or take minutes of a CPU.
+    Raises:
+        ValueError: held-out rays see no surface.
     """
     was_training = model.training
     model.eval()
-    rays, _ = calibration_rays(model, datamanager)
-    most = model.config.calibration.rays_at_once
-    chunks = [
-        Rays._make(None if part is None else part[i : i + most] for part in rays)
-        for i in range(0, len(rays.origins), most)
-    ]
-    references = [dense_reference(model, chunk) for chunk in chunks]
-    volume = _points_of_box(model)
-    gate = _kept(
-        references,
-        [reference.occupancies for reference in references],
-        _in_parts(lambda mapped: _occupancy(model, mapped), volume),
+    mapped, weights, occupancies = _measured(model, datamanager)
+    if not bool((weights > 0.0).any()):
+        raise ValueError("no surface is seen by the held-out rays, so that none can be lost")
+    taught = candidates_of(model, rays_of_photographs(datamanager, TAUGHT_RAYS))
+    volume = reached_volume(model, taught, VOLUME_POINTS)
+    kept = kept_shares(
+        weights, occupancies, in_parts(partial(_occupancy, model), volume), LOST_SURFACE_MASS
     )
-    rows = [_grid_row(model, chunks, references, volume, size) for size in grids]
+    rows, left_out = [], []
+    if grids:
+        box = mapped_box(model)
+
+        def floor_of(scores: Tensor) -> float:
+            of_rays = looked_up(scores, box, mapped)
+            return threshold_losing(weights, of_rays, SPARED * LOST_SURFACE_MASS)
+
+        known = taught, density_of(model, taught)
+        most = MOST_ON_CPU if model.device.type == "cpu" else math.inf
+        filling = FieldGrids(partial(density_of, model), box, known, floor_of, most)
+        for resolution in grids:
+            sizes = (resolution,) * 3 if isinstance(resolution, int) else resolution
+            scores = filling.fill(sizes) if fits_memory(math.prod(sizes)) else None
+            if scores is None:
+                left_out.append(resolution)
+                continue
+            of_rays, of_volume = (looked_up(scores, box, places) for places in (mapped, volume))
+            row: dict[str, Any] = {
+                "resolution": resolution,
+                "bytes": math.ceil(math.prod(sizes) / 8),
+                "update_seconds": round(filling.clock.seconds, 3),
+            }
+            rows.append(row | _shares(kept_shares(weights, of_rays, of_volume, LOST_SURFACE_MASS)))
     model.train(was_training)
-    return {"lost_surface_mass": LOST_SURFACE_MASS, **gate, "grids": rows}
-
-
-def _grid_row(
-    model: LecoModel,
-    chunks: Sequence[Rays],
-    references: Sequence[Reference],
-    volume: Tensor,
-    resolution: int | tuple[int, int, int],
-) -> dict[str, Any]:
-    clock = Clock()
-    clock.start()
-    grid = grid_of_field(model, resolution)
-    seconds = clock.stop()
-    scores = [
-        grid.values(mapped_middles(model.space, rays, reference.intervals))
-        for rays, reference in zip(chunks, references)
-    ]
     return {
-        "resolution": resolution,
-        "bytes": math.ceil(grid.cells_per_lvl / 8),
-        "update_seconds": round(seconds, 3),
-        **_kept(references, scores, grid.values(volume)),
+        "lost_surface_mass": LOST_SURFACE_MASS,
+        "reached_volume": round(len(volume) / VOLUME_POINTS, 5),
+        **_shares(kept),
+        "grids": rows,
+        "left_out": left_out,
     }
 
 
-def grid_of_field(
-    model: LecoModel, resolution: int | tuple[int, int, int]
-) -> OccupancyGridEstimator:
-    """An occupancy grid in mapped coordinates, filled from the density of a model's field."""
-    low, high = _mapped_box(model)
-    grid = OccupancyGridEstimator(torch.cat([low, high]), resolution).to(model.device).train()
-
-    def density(mapped: Tensor) -> Tensor:
-        return _in_parts(lambda part: _sigmas(model, part), mapped)
-
-    for _ in range(GRID_UPDATES):
-        grid.update_every_n_steps(step=0, occ_eval_fn=density)
-    return grid
+def _shares(kept: tuple[float, float]) -> dict[str, float]:
+    return {"kept_reached_volume": round(kept[0], 5), "kept_candidates": round(kept[1], 5)}
 
 
-def _sigmas(model: LecoModel, mapped: Tensor) -> Tensor:
-    with gate_precision(model.device.type, model.precision):
-        left = model.field.experts.those_left()
-        values, routes = gate_values_and_routes(model.gate(mapped), model.routing, left)
-        sigmas: Tensor = model.field.density(mapped, routes, values)[0]
-    return sigmas
+def _measured(model: LecoModel, datamanager: Any) -> tuple[Tensor, Tensor, Tensor]:
+    """Candidates of held-out rays before the backdrop: mapped [M, 3], weights near surfaces [M],
+    and o(x) [M]."""
+    rays, _ = calibration_rays(model, datamanager)
+    most = model.config.calibration.rays_at_once
+    pieces = []
+    for first in range(0, len(rays.origins), most):
+        part = slice(first, first + most)
+        some = Rays._make(None if value is None else value[part] for value in rays)
+        found = dense_reference(model, some)
+        before = ~found.always_kept
+        places = mapped_middles(model.space, some, found.intervals)
+        weights = found.weights * found.near_surface
+        pieces.append((places[before], weights[before], found.occupancies[before]))
+    places, weights, occupancies = (torch.cat(parts) for parts in zip(*pieces))
+    return places, weights, occupancies
 
 
 def _occupancy(model: LecoModel, mapped: Tensor) -> Tensor:
     with gate_precision(model.device.type, model.precision):
         return occupancy_from_logits(model.gate(mapped))
-
-
-def _in_parts(function: Any, mapped: Tensor) -> Tensor:
-    return torch.cat([function(part) for part in mapped.split(POINTS_AT_ONCE)])
-
-
-def _mapped_box(model: LecoModel) -> tuple[Tensor, Tensor]:
-    """Corners of the scene's box in mapped coordinates; an unbounded scene fills the cube."""
-    device = model.device
-    if model.space.kind != "box":
-        return -torch.ones(3, device=device), torch.ones(3, device=device)
-    box = whole_box(model.occupancy())
-    corners = torch.stack([box.low, box.high]).to(device)
-    low, high = model.space.map(corners).clamp(-1.0, 1.0)
-    return low, high
-
-
-def _points_of_box(model: LecoModel) -> Tensor:
-    """Mapped positions [P, 3] spread evenly over the volume of the scene's box."""
-    box = whole_box(model.occupancy())
-    unit = torch.rand(VOLUME_POINTS, 3, generator=torch.Generator().manual_seed(0))
-    positions = torch.lerp(box.low, box.high, unit).to(model.device)
-    return model.space.map(positions).clamp(-1.0, 1.0)
-
-
-def _kept(
-    references: Sequence[Reference], scores: Sequence[Tensor], volume_scores: Tensor
-) -> dict[str, float]:
-    """Shares kept at the threshold that loses `LOST_SURFACE_MASS`; the backdrop is left out."""
-    counted = [~reference.always_kept for reference in references]
-    weights = torch.cat([r.weights * r.near_surface for r in references])
-    all_scores, before_backdrop = torch.cat(list(scores)), torch.cat(counted)
-    weights, all_scores = weights[before_backdrop], all_scores[before_backdrop]
-    threshold = threshold_losing(weights, all_scores, LOST_SURFACE_MASS)
-    return {
-        "kept_volume": round(float((volume_scores >= threshold).double().mean()), 5),
-        "kept_candidates": round(float((all_scores >= threshold).double().mean()), 5),
-    }

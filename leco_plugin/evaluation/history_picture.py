@@ -29,6 +29,8 @@ STILL = 4
 FRAMES_PER_SECOND, HELD = 5, 10
 """Of a picture that moves; it rests on its last frame for so many."""
 DPI = 80
+OPAQUE = 1e4
+"""Density, per half extent, beyond which nothing is told apart: opaque within a ten-thousandth."""
 
 
 def draw_history(occupancy: Occupancy, folder: Path, path: Path) -> Path:
@@ -86,7 +88,7 @@ class _Film:
         self.places = ((2, low + HORIZONTAL[0] * (high - low)), (1, float(middle[1])))
         """The normal of each slice and its position along that."""
         self.shares = torch.stack(history.shares).numpy()
-        self.densities = torch.stack(history.densities).numpy()
+        self.densities = torch.stack(history.densities).clamp(max=OPAQUE).numpy()
 
     def still(self, looks: list[int]) -> Any:
         """A figure with a column for each of some looks, over the lines of all."""
@@ -115,8 +117,7 @@ class _Film:
             for row, axes in enumerate(left):
                 self._slice(axes, row, look)
             self._lines(right[0], right[1], look)
-            step, seconds = self.history.steps[look], self.history.seconds[look]
-            figure.suptitle(f"learning what is empty: step {step}, {seconds:.0f} s")
+            figure.suptitle(f"learning what is empty: step {self.history.steps[look]}")
             return []
 
         return figure, show
@@ -137,7 +138,7 @@ class _Film:
             below.plot(steps[:upto], self.densities[:upto, expert], **style)
         above.set_ylabel("share of points, %")
         above.set_ylim(0, 100)
-        below.set_ylabel("mean density, per half extent")
+        below.set_ylabel("mean density, per half extent\n(10⁴: opaque)")
         below.set_yscale("symlog", linthresh=1.0)
         below.set_ylim(0, 1.5 * max(1.0, float(self.densities.max())))
         for axes in (above, below):

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 import torch
 
-from leco_plugin.capacity.measuring import FAMILIES, VOLUMES, gates, grids, halvings, measured
+from leco_plugin.capacity.measuring import FAMILIES, VOLUMES, gates, grids, measured
 from leco_plugin.models.gate import check_sizes
 from leco_plugin.shrink.evidence import Evidence
 
@@ -47,10 +47,3 @@ def test_every_family_grows() -> None:
     for candidate in gates():
         assert candidate.gate is not None
         check_sizes(candidate.gate)
-
-
-def test_a_fine_grid_is_reached_by_halves() -> None:
-    assert halvings(32, 0) == [32] and halvings(64, 32) == [64]
-    assert halvings(512, 0) == [64, 128, 256, 512]
-    assert halvings(512, 128) == [256, 512]
-    assert halvings(100, 0) == [50, 100] and halvings(75, 32) == [75]

@@ -13,7 +13,10 @@ from leco_plugin.chart.page import write_page
 
 @pytest.fixture(scope="module")
 def page(tmp_path_factory: pytest.TempPathFactory) -> str:
-    held = [run("A <b>", occupancy=occupancy(50_000, 0.1)), run("B", occupancy=occupancy(90, 0.2))]
+    held = [
+        run("A <b>", occupancy=occupancy(50_000, 0.1)),
+        run("B", sampler="learned-occupancy-hash", occupancy=occupancy(90, 0.2)),
+    ]
     return write_page(results(*held), tmp_path_factory.mktemp("page") / "chart.html").read_text()
 
 

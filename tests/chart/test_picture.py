@@ -9,10 +9,13 @@ import pytest
 from chart_results import occupancy, results, run
 from hypothesis import given
 from hypothesis import strategies as st
+from matplotlib.figure import Figure
 from PIL import Image
 
-from leco_plugin.chart.picture import CLOSE, draw, spread
+from leco_plugin.chart.panels import NAME_WIDTH, name_points
+from leco_plugin.chart.picture import CLOSE, balanced, draw, spread
 from leco_plugin.chart.theme import DARK, LIGHT, Theme
+from leco_plugin.evaluation.charts import SOURCE, fingerprint
 
 RUNS = [
     run(name, seed, psnr + seed) for name, psnr in (("A", 20.0), ("B", 23.0)) for seed in (0, 1)
@@ -75,8 +78,47 @@ def test_one_run_with_one_point_is_drawn(tmp_path: Path) -> None:
 
 
 def test_representations_and_grids_are_drawn(tmp_path: Path) -> None:
-    grids = [{"resolution": 64, "bytes": 32768, "update_seconds": 2.0, "kept_volume": 0.3}]
+    grids = [{"resolution": 64, "bytes": 32768, "update_seconds": 2.0, "kept_reached_volume": 0.3}]
     ours = run("MLP", occupancy=occupancy(50_000, 0.1, grids))
-    other = run("hash grid", occupancy=occupancy(4_000_000, 0.2))
+    other = run("hash grid", sampler="learned-occupancy-hash", occupancy=occupancy(4_000_000, 0.2))
     path = draw(results(ours, other), tmp_path / "chart.png")
-    assert share_of(LIGHT.colours[0], path) > 1e-3
+    assert all(share_of(colour, path) > 1e-3 for colour in LIGHT.colours[:2])
+
+
+def test_a_picture_remembers_of_which_results_it_is(tmp_path: Path) -> None:
+    with Image.open(draw(results(*RUNS), tmp_path / "chart.png")) as image:
+        assert image.info[SOURCE] == fingerprint(results(*RUNS))
+        assert image.info[SOURCE] != fingerprint(results(*RUNS[1:]))
+
+
+def test_a_title_has_as_few_lines_as_it_can_and_no_short_one() -> None:
+    text = "learned occupancy is ahead: 21.8 dB, 1.3 more than equal experts, no gate"
+    first, second = balanced(text).split("\n")
+    assert f"{first} {second}" == text and abs(len(first) - len(second)) < 12
+    assert balanced("short") == "short"
+
+
+@given(st.lists(st.tuples(*[st.floats(0.05, 0.95)] * 2), min_size=2, max_size=6, unique=True))
+def test_names_of_points_lie_in_the_panel(
+    places: list[tuple[float, float]],
+) -> None:
+    figure = Figure()
+    axes = figure.add_axes((0.0, 0.0, 1.0, 1.0))
+    axes.set(xlim=(0.0, 1.0), ylim=(0.0, 1.0))
+    names = [f"name {i}" for i in range(len(places))]
+    name_points(axes, places, names, ["black"] * len(places))
+    boxes = [(*text.get_position(), text.get_text()) for text in axes.texts]
+    assert [name for _, _, name in boxes] == names
+    width = NAME_WIDTH * len(names[0])
+    assert all(-1e-9 <= x <= 1.0 - width + 1e-9 and 0.0 <= y <= 1.0 for x, y, _ in boxes)
+
+
+def test_names_of_neighbours_do_not_cover_one_another() -> None:
+    figure = Figure()
+    axes = figure.add_axes((0.0, 0.0, 1.0, 1.0))
+    axes.set(xlim=(0.0, 1.0), ylim=(0.0, 1.0))
+    name_points(axes, [(0.5, 0.5), (0.52, 0.5), (0.51, 0.52)], ["one", "two", "six"], ["red"] * 3)
+    spots = [text.get_position() for text in axes.texts]
+    for i, (x, y) in enumerate(spots):
+        for other_x, other_y in spots[:i]:
+            assert abs(x - other_x) >= 3 * NAME_WIDTH or abs(y - other_y) >= 0.07

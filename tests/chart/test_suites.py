@@ -6,7 +6,9 @@ from pathlib import Path
 
 import pytest
 
+from leco_plugin import cli
 from leco_plugin.chart.configs import config_of
+from leco_plugin.chart.protocol import OVERHEAD_SECONDS, Protocol
 from leco_plugin.chart.suites import SUITES, suite
 from leco_plugin.scenes.input_error import InputError
 
@@ -18,8 +20,6 @@ NAMES = {
     "enough-time",
     "grid-resolution",
 }
-OVERHEAD_SECONDS = 40.0
-"""Start, evaluation and rendering of a run on two cores."""
 
 
 def test_there_is_a_suite_for_every_question() -> None:
@@ -39,8 +39,22 @@ def test_the_contenders_of_a_suite_differ_and_can_be_configured(name: str) -> No
 @pytest.mark.parametrize("name", sorted(NAMES))
 def test_three_seeds_of_a_suite_take_less_than_45_minutes(name: str) -> None:
     found = SUITES[name]
-    run = [one.budget * found.seconds + OVERHEAD_SECONDS for one in found.contenders]
-    assert 3 * sum(run) < 45 * 60
+    runs = [one.budget * found.seconds + OVERHEAD_SECONDS for one in found.contenders]
+    assert 3 * sum(runs) / 60 <= found.minutes() < 45
+    assert found.minutes(1) == pytest.approx(found.minutes() / 3)
+
+
+def test_all_suites_take_less_than_four_hours_and_the_help_says_how_long_each_takes() -> None:
+    assert sum(one.minutes() for one in SUITES.values()) < 4 * 60
+    said = " ".join(str(cli.chart.__doc__).split())
+    for name, found in SUITES.items():
+        assert f"{name} {found.minutes():.0f}" in said
+
+
+def test_a_run_of_a_suite_leaves_time_to_learn_an_occupancy() -> None:
+    for found in SUITES.values():
+        assert Protocol(found.seconds).budget().learn_seconds == pytest.approx(0.4 * found.seconds)
+        assert 0.4 * found.seconds >= 30.0
 
 
 def test_an_unknown_suite_is_named_beside_those_there_are() -> None:

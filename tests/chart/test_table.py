@@ -60,3 +60,27 @@ def test_occupancies_have_a_table_of_their_own() -> None:
 def test_the_command_and_the_question_are_there() -> None:
     text = table(results(run("A"), suite="losses", question="What do they do?"))
     assert "What do they do?" in text and "`leco chart --data city`, 2024-02-29" in text
+
+
+def test_representations_say_on_which_front_they_are_and_whether_ours_is() -> None:
+    ours = run("MLP (ours)", occupancy=occupancy(51_000, 0.125), learn_seconds=9.0)
+    other = run(
+        "hash grid",
+        sampler="learned-occupancy-hash",
+        occupancy=occupancy(4_000_000, 0.1),
+        learn_seconds=8.0,
+    )
+    text = table(results(ours, other))
+    assert rows(text, "MLP (ours)")[-1] == ["MLP (ours)", "51", "9", "12.5", "size"]
+    assert rows(text, "hash grid")[-1][-1] == "size, learning time"
+    assert "MLP (ours) is not on the front: it is beaten in learning time by hash grid." in text
+
+
+def test_grids_that_could_not_be_made_are_named() -> None:
+    ours = run("MLP (ours)", occupancy=occupancy(51_000, 0.125))
+    other = run("planes", sampler="learned-occupancy-vm", occupancy=occupancy(4_000_000, 0.1))
+    assert "for want of" not in table(results(ours, other))
+    ours["occupancy"]["at_equal_loss"]["left_out"] = [512, 1024]
+    assert "Not in every run, for want of memory or time: grid 512³, 1024³." in table(
+        results(ours, other)
+    )

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from torch import Tensor
 
 from leco_plugin.evaluation import equal_loss
-from leco_plugin.evaluation.equal_loss import at_equal_loss, grid_of_field, threshold_losing
+from leco_plugin.evaluation.equal_loss import at_equal_loss, kept_shares, threshold_losing
 from leco_plugin.models.calibration import CalibrationConfig
 from leco_plugin.models.encodings import EncodingConfig
 from leco_plugin.models.field import FieldConfig
@@ -39,6 +39,19 @@ def test_the_threshold_is_the_largest_within_the_loss(seed: int, lost: float, le
     scores = torch.randint(levels, (40,), generator=generator).float()  # with ties
     expected = slow_threshold(weights, scores, lost)
     assert threshold_losing(weights, scores, lost) == expected
+
+
+@given(st.integers(0, 10_000), st.sampled_from([0.0, 1e-2, 0.3]))
+def test_shares_are_counted_one_by_one_at_that_threshold(seed: int, lost: float) -> None:
+    generator = torch.Generator().manual_seed(seed)
+    weights = torch.rand(30, generator=generator)
+    scores = torch.randint(6, (30,), generator=generator).float()
+    of_volume = torch.randint(6, (50,), generator=generator).float()
+    threshold = slow_threshold(weights, scores, lost)
+    expected = tuple(
+        sum(float(score) >= threshold for score in some) / len(some) for some in (of_volume, scores)
+    )
+    assert kept_shares(weights, scores, of_volume, lost) == pytest.approx(expected)
 
 
 BOUNDS = SceneBounds(
@@ -71,37 +84,101 @@ def model(monkeypatch: pytest.MonkeyPatch) -> LecoModel:
     monkeypatch.setattr(made.gate, "forward", gate)
     monkeypatch.setattr(made.field, "density", density)
     made.report = {"aabb": BOUNDS.aabb.tolist()}
-    origins = torch.tensor([[-2.0, 0.0, 0.0]]).expand(50, 3)
-    aims = torch.stack([torch.full((50,), 2.0), *(0.1 * torch.randn(2, 50))], dim=-1)
-    directions = torch.nn.functional.normalize(aims, dim=-1)
-    rays = Rays(origins, directions, torch.full((50,), 1.5), torch.full((50,), 2.5), None)
+    rays = rays_along_x(50)
     monkeypatch.setattr(equal_loss, "calibration_rays", lambda *_: (rays, torch.zeros(50, 3)))
+    monkeypatch.setattr(equal_loss, "rays_of_photographs", lambda *_: None)
+    taught = torch.rand(200_000, 3, generator=torch.Generator().manual_seed(1))
+    box = BOUNDS.aabb.view(2, 3)
+    monkeypatch.setattr(equal_loss, "candidates_of", lambda *_: torch.lerp(box[0], box[1], taught))
     return made
+
+
+def rays_along_x(count: int) -> Rays:
+    """From the empty half of the box into the dense one."""
+    origins = torch.tensor([[-2.0, 0.0, 0.0]]).expand(count, 3)
+    generator = torch.Generator().manual_seed(2)
+    sideways = 0.05 * torch.randn(count, 2, generator=generator)
+    aims = torch.cat([torch.full((count, 1), 2.0), sideways], dim=-1)
+    directions = torch.nn.functional.normalize(aims, dim=-1)
+    near, far = torch.full((count,), 1.5), torch.full((count,), 2.5)
+    return Rays(origins, directions, near, far, None)
 
 
 def test_a_perfect_gate_keeps_the_occupied_half_of_the_box(model: LecoModel) -> None:
     found = at_equal_loss(model.train(), None)
     assert found["lost_surface_mass"] == 1e-3 and found["grids"] == []
-    assert found["kept_volume"] == pytest.approx(0.5, abs=0.01)
+    assert found["kept_reached_volume"] == pytest.approx(0.5, abs=0.01)
     assert 0.3 < found["kept_candidates"] < 0.6
+    assert found["reached_volume"] > 0.9
     assert model.training
 
 
-def test_a_grid_made_from_the_field_keeps_its_cells(model: LecoModel) -> None:
-    grid = grid_of_field(model, 5)
-    torch.testing.assert_close(grid.aabbs[0], BOUNDS.aabb)  # the walls, not the whole cube
-    kept = grid.values(torch.tensor([[0.3, 0.0, 0.0], [-0.3, 0.0, 0.0], [0.7, 0.0, 0.0]])) > 0
-    assert kept.tolist() == [True, False, False]
-
-
-def test_grids_are_measured_like_the_gate(
-    model: LecoModel, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(equal_loss, "GRID_UPDATES", 20)  # enough to see both halves of a cell
+def test_grids_are_measured_like_the_gate(model: LecoModel) -> None:
     even, odd = at_equal_loss(model, None, grids=(4, 5))["grids"]
     assert (even["resolution"], even["bytes"]) == (4, 8)
     assert (odd["resolution"], odd["bytes"]) == (5, 16)
-    assert even["kept_volume"] == pytest.approx(0.5, abs=0.01)
+    assert even["kept_reached_volume"] == pytest.approx(0.5, abs=0.01)
     # the cells in the middle hold both, and a surface in them
-    assert odd["kept_volume"] == pytest.approx(0.6, abs=0.01)
+    assert odd["kept_reached_volume"] == pytest.approx(0.6, abs=0.01)
     assert even["update_seconds"] > 0.0
+
+
+def test_a_grid_of_another_size_along_each_axis_is_measured_too(model: LecoModel) -> None:
+    (row,) = at_equal_loss(model, None, grids=((4, 3, 2),))["grids"]
+    assert row["bytes"] == 3 and row["kept_reached_volume"] == pytest.approx(0.5, abs=0.01)
+
+
+def test_a_coarse_grid_hears_of_a_surface_that_random_places_miss(
+    model: LecoModel, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def film(mapped: Tensor, *_: Tensor) -> tuple[Tensor, Tensor]:
+        on_film = (mapped[:, 0] - 0.2).abs() < 1e-4
+        return 1e5 * on_film, torch.zeros(len(mapped), 4)
+
+    places = torch.tensor([0.2, 0.0, 0.0]).repeat(64, 1)
+    places[:, 1:] = torch.cartesian_prod(*[torch.linspace(-0.45, 0.45, 8)] * 2)
+    everywhere = equal_loss.candidates_of(model, None)
+    monkeypatch.setattr(model.field, "density", film)
+    monkeypatch.setattr(equal_loss, "candidates_of", lambda *_: torch.cat([places, everywhere]))
+    held_out = torch.tensor([[0.2, 0.07, 0.07], [-0.3, 0.1, 0.1]])
+    weights = torch.tensor([1.0, 0.0])
+    monkeypatch.setattr(
+        equal_loss, "_measured", lambda *_: (held_out, weights, torch.tensor([0.9, 0.1]))
+    )
+    (row,) = at_equal_loss(model, None, grids=(8,))["grids"]
+    assert row["kept_reached_volume"] < 0.2  # a slab of one cell, not the whole box
+
+
+def test_space_that_no_ray_reaches_is_nobodys_volume(
+    model: LecoModel, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    everywhere = equal_loss.candidates_of(model, None)
+    middles = (everywhere[:, 0] > -6 / 32) & (everywhere[:, 0] < 3 / 32)  # nine layers of cells
+    seen = everywhere[middles]
+    monkeypatch.setattr(equal_loss, "candidates_of", lambda *_: seen)
+    found = at_equal_loss(model, None, grids=(4,))
+    assert found["reached_volume"] == pytest.approx(9 / 32, abs=0.01)
+    # a third of what is reached is dense, of the box half is
+    assert found["kept_reached_volume"] == pytest.approx(1 / 3, abs=0.01)
+    assert found["grids"][0]["kept_reached_volume"] == pytest.approx(1 / 3, abs=0.01)
+
+
+def test_rays_without_any_surface_are_refused_in_a_line(
+    model: LecoModel, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    nothing = torch.zeros(0, 3), torch.zeros(0), torch.zeros(0)
+    monkeypatch.setattr(equal_loss, "_measured", lambda *_: nothing)
+    with pytest.raises(ValueError, match="no surface"):
+        at_equal_loss(model, None)
+
+
+def test_a_grid_that_does_not_fit_the_memory_is_left_out(model: LecoModel) -> None:
+    found = at_equal_loss(model, None, grids=(4, 1 << 15))
+    assert [row["resolution"] for row in found["grids"]] == [4]
+    assert found["left_out"] == [1 << 15]
+
+
+def test_training_draws_the_same_random_numbers_afterwards(model: LecoModel) -> None:
+    state = torch.random.get_rng_state()
+    at_equal_loss(model, None, grids=(4,))
+    assert torch.equal(torch.random.get_rng_state(), state)

@@ -1,0 +1,194 @@
+"""Occupancy grids of a trained field, each refined from one half as fine.
+
+A cell is asked only where the coarser grid, or a neighbour of its cell, has not ruled it out; so
+512^3 cells take as long as their surface asks for.
+"""
+
+from __future__ import annotations
+
+import math
+import os
+from collections.abc import Callable, Sequence
+
+import torch
+from torch import Tensor
+from torch.nn.functional import max_pool3d
+
+from leco_plugin.evaluation.clock import Clock
+from leco_plugin.evaluation.inspection import ViewBox
+from leco_plugin.models.leco import LecoModel
+from leco_plugin.models.rendering import gate_values_and_routes
+from leco_plugin.occupancy import gate_precision
+from leco_plugin.samplers.grid import cells_of
+
+FEWEST_PROBES, PROBES_ALONG = 8, 2048
+"""Densities asked in each cell, at random places; the largest is the cell's score. More in coarse
+cells, of which a surface may fill a corner."""
+CELLS_AT_ONCE = 1 << 18
+POINTS_AT_ONCE = 1 << 16
+BYTES_A_CELL = 16
+"""Of memory while a grid is filled, about."""
+ASK_ALL = 64
+"""Cells along an axis up to which a grid may be filled without a coarser one."""
+
+Density = Callable[[Tensor], Tensor]
+"""Of mapped positions [N, 3]: [N]."""
+
+
+class FieldGrids:
+    """Grids of one field, from coarse to fine.
+
+    Args:
+        density: of the field.
+        box: in mapped coordinates.
+        known: mapped positions [M, 3] and densities [M] that count beside those that are asked: a
+            surface that fills a thousandth of a cell is missed by hundreds of random places.
+        floor_of: the score below which a cell of a grid [nx, ny, nz], and all around it, are empty
+            in finer grids too.
+        most: densities that may be asked for one grid.
+    """
+
+    def __init__(
+        self,
+        density: Density,
+        box: ViewBox,
+        known: tuple[Tensor, Tensor] | None,
+        floor_of: Callable[[Tensor], float],
+        most: float = math.inf,
+    ) -> None:
+        self.density, self.box, self.known, self.floor_of = density, box, known, floor_of
+        self.most = most
+        self.scores: Tensor | None = None
+        self.floor = 0.0
+        self.clock = Clock()
+        """Counts what the last grid took, those that it was refined from included."""
+
+    def fill(self, sizes: Sequence[int]) -> Tensor | None:
+        """Scores [nx, ny, nz] of the cells of a grid; None where it asks more than it may.
+
+        Those of the grid before serve if it is half as fine.
+
+        Args:
+            sizes: cells along each axis.
+        """
+        steps = halvings(sizes, () if self.scores is None else self.scores.shape)
+        if self.scores is None or tuple(2 * n for n in self.scores.shape) != steps[0]:
+            self.scores, self.floor, self.clock = None, 0.0, Clock()
+        self.clock.start()
+        for step in steps:
+            asked = cells_to_ask(step, self.scores, self.floor, self.box.low.device)
+            if int(asked.sum()) * probes_in_a_cell(step) > self.most:
+                self.clock.stop()
+                return None
+            self.scores = filled(self.density, self.box, asked, known=self.known)
+            self.floor = self.floor_of(self.scores)
+        self.clock.stop()
+        return self.scores
+
+
+def halvings(sizes: Sequence[int], known: Sequence[int]) -> list[tuple[int, ...]]:
+    """Sizes of the grids to fill on the way to one, from coarse to fine.
+
+    Args:
+        known: cells along each axis of the grid that there is already.
+    """
+    steps = [tuple(sizes)]
+    while (
+        max(steps[0]) > ASK_ALL
+        and all(n % 2 == 0 for n in steps[0])
+        and steps[0] != tuple(2 * n for n in known)
+    ):
+        steps.insert(0, tuple(n // 2 for n in steps[0]))
+    return steps
+
+
+def cells_to_ask(
+    sizes: Sequence[int],
+    coarser: Tensor | None = None,
+    floor: float = 0.0,
+    device: torch.device | str = "cpu",
+) -> Tensor:
+    """Cells of a grid whose density is not known yet: bool [nx, ny, nz].
+
+    Args:
+        sizes: cells along each axis, twice those of `coarser`.
+        coarser: scores of a grid half as fine; without it every cell is asked.
+        floor: score of the coarser grid below which a cell and all around it are taken for empty.
+    """
+    if coarser is None:
+        return torch.ones(*sizes, dtype=torch.bool, device=device)
+    near = max_pool3d(coarser[None, None], 3, stride=1, padding=1)[0, 0] >= floor
+    return near.repeat_interleave(2, 0).repeat_interleave(2, 1).repeat_interleave(2, 2)
+
+
+def probes_in_a_cell(sizes: Sequence[int]) -> int:
+    """Random places at which a cell is asked, of a grid with so many cells along each axis."""
+    return max(FEWEST_PROBES, PROBES_ALONG // max(sizes))
+
+
+def filled(
+    density: Density,
+    box: ViewBox,
+    asked: Tensor,
+    seed: int = 0,
+    known: tuple[Tensor, Tensor] | None = None,
+) -> Tensor:
+    """Scores of the cells of a grid: [nx, ny, nz]; zero where they are neither asked nor known.
+
+    Args:
+        density: of the field.
+        box: in mapped coordinates.
+        asked: bool [nx, ny, nz].
+        known: mapped positions [M, 3] and densities [M] that count beside those that are asked.
+    """
+    device = box.low.device
+    scores = torch.zeros(asked.shape, device=device)
+    counts = torch.tensor(asked.shape, device=device)
+    generator = torch.Generator(device).manual_seed(seed)
+    for cells in asked.nonzero().split(CELLS_AT_ONCE):
+        best = torch.zeros(len(cells), device=device)
+        for _ in range(probes_in_a_cell(asked.shape)):
+            units = cells + torch.rand(len(cells), 3, device=device, generator=generator)
+            places = torch.lerp(box.low, box.high, units / counts)
+            best = torch.maximum(best, density(places).float())
+        scores[tuple(cells.T)] = best
+    if known is not None:
+        index, inside = _cells(scores, box, known[0])
+        scores.view(-1).scatter_reduce_(0, index.long(), known[1].float() * inside, "amax")
+    return scores
+
+
+def looked_up(scores: Tensor, box: ViewBox, mapped: Tensor) -> Tensor:
+    """Scores of the cells that hold mapped positions [N, 3]; zero outside: [N]."""
+    index, inside = _cells(scores, box, mapped)
+    return scores.view(-1).index_select(0, index) * inside
+
+
+def _cells(scores: Tensor, box: ViewBox, mapped: Tensor) -> tuple[Tensor, Tensor]:
+    return cells_of((1, *scores.shape), torch.cat([box.low, box.high]), mapped)
+
+
+def fits_memory(cells: int) -> bool:
+    """Whether a grid of so many cells can be filled in half of the memory that is free."""
+    free = os.sysconf("SC_AVPHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
+    return BYTES_A_CELL * cells < free / 2
+
+
+@torch.no_grad()
+def density_of(model: LecoModel, mapped: Tensor) -> Tensor:
+    """Density of a model's field at mapped positions [N, 3], per half extent: [N]."""
+
+    def part_of(part: Tensor) -> Tensor:
+        with gate_precision(model.device.type, model.precision):
+            values, routes = gate_values_and_routes(
+                model.gate(part), model.routing, model.field.experts.those_left()
+            )
+            sigmas: Tensor = model.field.density(part, routes, values)[0]
+        return sigmas
+
+    return in_parts(part_of, mapped)
+
+
+def in_parts(function: Density, mapped: Tensor) -> Tensor:
+    """A function of positions [N, 3], some at a time: [N]."""
+    return torch.cat([function(part) for part in mapped.split(POINTS_AT_ONCE)])

@@ -1,0 +1,133 @@
+"""Claims about `leco chart`: bad input is one line before anything is started, a crash is a row."""
+
+from __future__ import annotations
+
+import functools
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import chart_results
+import pytest
+
+from leco_plugin import cli
+from leco_plugin.chart import command
+from leco_plugin.chart.folder import Job
+from leco_plugin.chart.processes import RunFailed
+from leco_plugin.chart.suites import SUITES
+
+METHODS = ["--methods", "leco-occupancy", "leco-occupancy-never-frozen"]
+TIME = ["--seconds", 3]
+Started = list[tuple[str, int]]
+
+
+@pytest.fixture
+def started(monkeypatch: pytest.MonkeyPatch) -> Started:
+    """Nothing is trained; names and seeds of the runs that would have been. Dense ones crash."""
+    runs: Started = []
+
+    def runner_for(*arguments: Any) -> Callable[[Job, Callable[[float], None]], dict[str, Any]]:
+        def make(job: Job, show: Callable[[float], None]) -> dict[str, Any]:
+            runs.append((job.contender.name, job.seed))
+            show(0.5)
+            if job.contender.sampler == "dense":
+                raise RunFailed("half-way there was no memory left")
+            return chart_results.run(job.contender.name, job.seed)
+
+        return make
+
+    made = functools.partial(command.make_chart, runner_for=runner_for)
+    monkeypatch.setattr(command, "make_chart", made)
+    return runs
+
+
+def run(*arguments: object) -> int:
+    return cli.main(["chart", *(str(argument) for argument in arguments)])
+
+
+def test_a_crash_half_way_is_a_row_the_others_finish_and_the_status_is_one(
+    started: Started, tiny_scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "chart"
+    arguments = ["--data", tiny_scene, "--out", out, *METHODS, *TIME, "--seeds", 0, 1]
+    assert run(*arguments) == 1
+    assert len(started) == 4
+    row = "| LeCO, never frozen | 1 | failed: half-way there was no memory left |"
+    assert row in (out / "table.md").read_text()
+    assert len(json.loads((out / "results.json").read_text())["runs"]) == 2
+    for name in ("chart.png", "chart-dark.png", "chart.html"):
+        assert (out / name).stat().st_size > 10_000
+    said = capsys.readouterr()
+    assert "2 of 4 runs failed" in said.err and said.err.count("\n") == 1
+    assert run(*arguments) == 1 and len(started) == 6  # only what crashed is made again
+
+
+def test_how_long_it_takes_is_said_before_it_is_started(
+    started: Started, tiny_scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = ["--data", tiny_scene, "--out", tmp_path / "chart", "--methods", "leco-occupancy"]
+    assert run(*out, "--seconds", 75, "--seeds", 0, 1) == 0
+    assert "2 runs, about 4 minutes on two CPU cores" in capsys.readouterr().out
+    assert run(*out, "--seconds", 75, "--seeds", 0, 1, 2) == 0
+    assert "1 run, about 2 minutes on two CPU cores (2 more are there" in capsys.readouterr().out
+    steps = ["--data", tiny_scene, "--out", tmp_path / "steps", "--methods", "leco-occupancy"]
+    assert run(*steps, "--steps", 9, "--seeds", 0) == 0
+    assert "1 run of 9 steps" in capsys.readouterr().out
+
+
+BAD = {
+    "'no-such'": ["--methods", "no-such", *TIME],
+    "no sampler 'no-such'": ["--methods", "leco-ngp", "--samplers", "no-such", *TIME],
+    "no suite 'no-such'": ["--suite", "no-such"],
+    "give --suite or --methods": ["--suite", "losses", *METHODS],
+    "nothing to chart": [*TIME],
+    "give --seconds or --steps": METHODS,
+    "a positive number, not 0": [*METHODS, "--seconds", 0],
+    "a positive number, not -1": [*METHODS, "--steps", -1],
+    "a positive number, not nan": [*METHODS, "--seconds", "nan"],
+    "at least one of the images": [*METHODS, *TIME, "--images", 0],
+}
+
+
+@pytest.mark.parametrize("cause", BAD)
+def test_bad_input_is_one_line_and_nothing_is_started(
+    cause: str,
+    started: Started,
+    tiny_scene: Path,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    out = tmp_path / "chart"
+    assert run("--data", tiny_scene, "--out", out, *BAD[cause]) == 2
+    said = capsys.readouterr().err
+    assert said.startswith("leco: ") and said.count("\n") == 1 and cause in said, said
+    assert not started and not out.exists()
+
+
+def test_folders_and_scenes_that_do_not_fit_are_one_line_too(
+    started: Started, tiny_scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    good, taken = tmp_path / "good", tmp_path / "taken"
+    assert run("--data", tiny_scene, "--out", good, "--suite", "losses", "--seeds", 0) == 0
+    begun = len(started)
+    assert begun == len(SUITES["losses"].contenders)
+    taken.mkdir()
+    (taken / "thesis.txt").write_text("")
+    before = sorted(str(path) for path in good.rglob("*"))
+    capsys.readouterr()
+    scene, new = ["--data", tiny_scene], ["--out", tmp_path / "new"]
+    cases: dict[str, list[object]] = {
+        "another suite": [*scene, "--out", good, *METHODS, *TIME],
+        "another seconds": [*scene, "--out", good, "--suite", "losses", "--seconds", 7],
+        "holds something else": [*scene, "--out", taken, *METHODS, *TIME],
+        "thesis.txt": [*scene, "--out", taken / "thesis.txt", *METHODS, *TIME],
+        "nowhere": ["--data", tmp_path / "nowhere", *new, *METHODS, *TIME],
+    }
+    for cause, arguments in cases.items():
+        assert run(*arguments) == 2, cause
+        said = capsys.readouterr().err
+        assert said.startswith("leco: ") and said.count("\n") == 1 and cause in said, said
+    assert len(started) == begun and not (tmp_path / "new").exists()
+    assert sorted(str(path) for path in good.rglob("*")) == before
+    assert [path.name for path in taken.iterdir()] == ["thesis.txt"]

@@ -1,0 +1,150 @@
+"""Claims about one run of a chart: what it leaves, and what a crash half-way leaves."""
+
+from __future__ import annotations
+
+import io
+import json
+from collections.abc import Callable
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+
+from leco_plugin.chart import worker
+from leco_plugin.chart.contender import Contender
+from leco_plugin.chart.protocol import Protocol
+from leco_plugin.chart.worker import FAILURE, JOB, PROGRESS, RESULT, main, run_job, train_job
+from leco_plugin.evaluation import timed_run
+
+pytestmark = [  # nerfstudio leaves an image open
+    pytest.mark.filterwarnings("ignore:unclosed file:ResourceWarning"),
+    pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning"),
+]
+
+SMALL = {
+    "sizes.field.encoding.levels": 2,
+    "sizes.field.encoding.log2_table": 8,
+    "sizes.candidates": 32,
+    "calibration.rays": 64,
+    "schedule.learn_steps": 3,
+}
+ONE = Contender("LeCO", "leco-occupancy", "learned-occupancy", SMALL)
+SHORT = Protocol(steps=6, images=1, curve_points=2)
+
+
+@pytest.fixture(autouse=True)
+def short(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Nothing reads the standard input; few rays are evaluated."""
+    monkeypatch.setattr(worker, "die_with_parent", lambda: None)
+    monkeypatch.setattr(timed_run, "CURVE_RAYS", 64)
+    monkeypatch.setattr("leco_plugin.evaluation.equal_loss.TAUGHT_RAYS", 256)
+    monkeypatch.setattr("leco_plugin.evaluation.equal_loss.VOLUME_POINTS", 4096)
+
+
+def job(folder: Path, scene: Path, contender: Contender = ONE) -> Path:
+    values = {"contender": asdict(contender), "seed": 3, "data": str(scene)}
+    (folder / JOB).write_text(json.dumps({**values, "protocol": asdict(SHORT)}))
+    return folder
+
+
+def test_a_job_comes_to_the_run_as_it_was_written(tiny_scene: Path, tmp_path: Path) -> None:
+    def run(contender: Contender, seed: int, data: Path, protocol: Protocol, *rest: Any) -> Any:
+        show: Callable[[float], None] = rest[1]
+        show(0.5)
+        return {"same": contender == ONE and protocol == SHORT, "seed": seed, "data": str(data)}
+
+    assert main(job(tmp_path, tiny_scene), run) == 0
+    found = json.loads((tmp_path / RESULT).read_text())
+    assert found == {"same": True, "seed": 3, "data": str(tiny_scene)}
+    assert (tmp_path / PROGRESS).read_text() == "0.500"
+
+
+@pytest.mark.parametrize(
+    ("error", "reason"),
+    [
+        (ValueError("the gate calls\n all space empty"), "the gate calls all space empty"),
+        (ZeroDivisionError("division by zero"), "ZeroDivisionError: division by zero"),
+        (SystemExit(3), "SystemExit: 3"),
+        (MemoryError(), "MemoryError: "),
+    ],
+)
+def test_whatever_a_method_raises_is_a_reason_in_a_line(
+    tiny_scene: Path,
+    tmp_path: Path,
+    error: BaseException,
+    reason: str,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    def run(*arguments: Any) -> Any:
+        raise error
+
+    assert main(job(tmp_path, tiny_scene), run) == 1
+    assert json.loads((tmp_path / FAILURE).read_text()) == {"reason": reason}
+    assert not (tmp_path / RESULT).exists() and "Traceback" in capsys.readouterr().err
+
+
+def test_a_method_that_crashes_half_way_has_its_own_reason(
+    tiny_scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from leco_plugin.models.leco import LecoModel
+
+    steps: list[int] = []
+    losses = LecoModel.get_loss_dict
+
+    def get_loss_dict(self: LecoModel, *arguments: Any) -> Any:
+        steps.append(1)
+        if len(steps) == 3:
+            raise RuntimeError("the third step\nwas one too many")
+        return losses(self, *arguments)
+
+    monkeypatch.setattr(LecoModel, "get_loss_dict", get_loss_dict)
+    monkeypatch.setattr("sys.stderr", io.StringIO())
+    assert main(job(tmp_path, tiny_scene)) == 1
+    reason = json.loads((tmp_path / FAILURE).read_text())["reason"]
+    assert reason == "RuntimeError: the third step was one too many"
+
+
+def test_gate_and_grids_are_measured_on_the_field_of_the_moment_of_freezing(
+    tiny_scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from leco_plugin.chart.configs import config_of
+    from leco_plugin.evaluation import equal_loss
+
+    asked: list[dict[str, torch.Tensor]] = []
+
+    def at_equal_loss(model: Any, manager: Any, grids: tuple[int, ...]) -> dict[str, Any]:
+        asked.append(
+            {k: v.clone() for k, v in model.field.state_dict().items() if "extra" not in k}
+        )
+        return {"grids": list(grids)}
+
+    monkeypatch.setattr(equal_loss, "at_equal_loss", at_equal_loss)
+    one = Contender("LeCO", "leco-occupancy", "learned-occupancy", SMALL, grids=(8, 16))
+    config = config_of(one, tiny_scene, tmp_path / "nerfstudio")
+    result, trainer = train_job(config, one, 3, tiny_scene, SHORT, tmp_path)
+    assert result["occupancy"]["at_equal_loss"] == {"grids": [8, 16]}
+    trained = trainer.pipeline.model.field.state_dict()
+    (then,) = asked
+    assert any(not torch.equal(value, trained[name]) for name, value in then.items())
+    assert result["steps"] == 6 and (tmp_path / "occupancy.safetensors").exists()
+
+
+def test_a_whole_run_has_its_figures(tiny_scene: Path, tmp_path: Path) -> None:
+    shares: list[float] = []
+    one = Contender("LeCO", "leco-occupancy", "learned-occupancy", SMALL, grids=(8,))
+    found = run_job(one, 0, tiny_scene, SHORT, tmp_path, shares.append)
+    assert json.loads(json.dumps(found)) == found and shares[-1] == 1.0
+    kept = found["occupancy"]["at_equal_loss"]
+    assert 0.0 < kept["kept_reached_volume"] <= 1.0 and 0.0 < kept["reached_volume"] <= 1.0
+    assert kept["grids"][0]["bytes"] == 64
+
+
+def test_a_run_that_starts_anew_when_frozen_has_no_field_to_measure(
+    tiny_scene: Path, tmp_path: Path
+) -> None:
+    changes = {**SMALL, "schedule.restart": True}
+    one = Contender("LeCO", "leco-occupancy", "learned-occupancy", changes)
+    found = run_job(one, 0, tiny_scene, SHORT, tmp_path)
+    assert found["occupancy"]["at_equal_loss"] is None and found["steps"] == 6

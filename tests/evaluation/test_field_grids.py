@@ -1,0 +1,155 @@
+"""Claims about grids that are refined from coarser ones."""
+
+from __future__ import annotations
+
+import itertools
+from functools import partial
+
+import pytest
+import torch
+from torch import Tensor
+
+from leco_plugin.evaluation.field_grids import (
+    FieldGrids,
+    cells_to_ask,
+    filled,
+    fits_memory,
+    halvings,
+    looked_up,
+)
+from leco_plugin.evaluation.inspection import ViewBox
+
+BOX = ViewBox(torch.tensor([-1.0, -1.0, -0.5]), torch.tensor([1.0, 1.0, 0.5]))
+CUBE, FINE = (16, 16, 16), (32, 32, 32)
+
+
+def ball(mapped: Tensor) -> Tensor:
+    return (mapped.norm(dim=-1) < 0.4).float()
+
+
+def test_a_cell_has_the_density_of_the_place() -> None:
+    scores = filled(ball, BOX, cells_to_ask(CUBE))
+    mapped = torch.lerp(BOX.low, BOX.high, torch.rand(5000, 3))
+    found = looked_up(scores, BOX, mapped)
+    distances = mapped.norm(dim=-1)
+    diagonal = ((BOX.high - BOX.low) / 16).norm()
+    assert bool((found[distances < 0.4 - diagonal] == 1.0).all())
+    assert bool((found[distances > 0.4 + diagonal] == 0.0).all())
+
+
+def test_outside_the_box_there_is_nothing() -> None:
+    scores = torch.ones(4, 4, 4)
+    assert looked_up(scores, BOX, torch.tensor([[0.0, 0.0, 0.6], [0.0, 0.0, 0.4]])).tolist() == [
+        0,
+        1,
+    ]
+
+
+def test_refining_finds_what_asking_every_cell_finds_with_fewer_questions() -> None:
+    asked = [0]
+
+    def counted(mapped: Tensor) -> Tensor:
+        asked[0] += len(mapped)
+        return ball(mapped)
+
+    coarse = filled(ball, BOX, cells_to_ask(CUBE))
+    refined = filled(counted, BOX, cells_to_ask(FINE, coarse, floor=0.5))
+    whole = filled(ball, BOX, cells_to_ask(FINE))
+    assert float((refined == whole).float().mean()) > 0.98  # other places in the cells were asked
+    middles = torch.stack(
+        torch.meshgrid(*[(torch.arange(32) + 0.5) / 32] * 3, indexing="ij"), dim=-1
+    )
+    inside = ball(torch.lerp(BOX.low, BOX.high, middles).view(-1, 3)).view(32, 32, 32) > 0
+    assert float(refined[inside].mean()) > 0.97
+    assert asked[0] < 0.5 * 64 * 32**3
+
+
+def test_a_known_surface_is_never_missed_by_a_coarse_cell() -> None:
+    def film(mapped: Tensor) -> Tensor:
+        return ((mapped[:, 2] - 0.061).abs() < 1e-6).float()
+
+    seen = torch.tensor([[0.3, 0.3, 0.061], [0.3, 0.3, 0.7]])  # the second lies outside
+    known = seen, torch.tensor([1.0, 5.0])
+    scores = filled(film, BOX, cells_to_ask((8, 8, 8)), known=known)
+    assert float(looked_up(scores, BOX, seen[:1])) == 1.0
+    assert float(scores.sum()) == 1.0
+    assert float(filled(film, BOX, cells_to_ask((8, 8, 8))).sum()) == 0.0
+
+
+def test_memory_is_looked_at_before_a_grid_is_filled() -> None:
+    assert fits_memory(8**3) and not fits_memory(1 << 45)
+
+
+def slow_refined(coarse: Tensor, floor: float, density: Tensor) -> Tensor:
+    """Cell by cell: the density of a fine cell if its coarse one or a neighbour may hold some."""
+    found = torch.zeros_like(density)
+    for cell in itertools.product(*(range(n) for n in density.shape)):
+        parent = [i // 2 for i in cell]
+        around = [range(max(0, i - 1), min(n, i + 2)) for i, n in zip(parent, coarse.shape)]
+        if any(float(coarse[near]) >= floor for near in itertools.product(*around)):
+            found[cell] = density[cell]
+    return found
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_a_cell_is_asked_where_the_coarser_grid_has_not_ruled_it_out(seed: int) -> None:
+    generator = torch.Generator().manual_seed(seed)
+    sizes = (12, 16, 8)
+    cells = torch.rand(sizes, generator=generator)  # the same density anywhere in a cell
+    coarse = torch.rand(6, 8, 4, generator=generator)
+    found = filled(partial(looked_up, cells, BOX), BOX, cells_to_ask(sizes, coarse, floor=0.98))
+    assert 0 < int((found > 0).sum()) < found.numel()
+    torch.testing.assert_close(found, slow_refined(coarse, 0.98, cells))
+
+
+def test_known_places_count_like_a_loop_over_them() -> None:
+    generator = torch.Generator().manual_seed(4)
+    places = torch.rand(200, 3, generator=generator) * 2.4 - 1.2
+    densities = torch.rand(200, generator=generator)
+    found = filled(
+        lambda mapped: torch.zeros(len(mapped)),
+        BOX,
+        cells_to_ask((4, 3, 2)),
+        known=(places, densities),
+    )
+    expected = torch.zeros(4, 3, 2)
+    for place, density in zip(places, densities):
+        shares = (place - BOX.low) / (BOX.high - BOX.low)
+        if bool(((shares >= 0.0) & (shares <= 1.0)).all()):
+            cell = tuple((shares * torch.tensor([4, 3, 2])).long().tolist())
+            expected[cell] = max(float(expected[cell]), float(density))
+    torch.testing.assert_close(found, expected)
+
+
+def test_a_fine_grid_is_reached_by_halves() -> None:
+    assert halvings((32,) * 3, ()) == [(32,) * 3]
+    assert halvings((64,) * 3, (32,) * 3) == [(64,) * 3]
+    assert halvings((512,) * 3, ()) == [(n,) * 3 for n in (64, 128, 256, 512)]
+    assert halvings((512,) * 3, (128,) * 3) == [(256,) * 3, (512,) * 3]
+    assert halvings((100, 100, 40), ()) == [(50, 50, 20), (100, 100, 40)]
+    assert halvings((100, 75, 40), (50, 50, 20)) == [(100, 75, 40)]
+
+
+def test_a_grid_serves_the_next_one_only_if_that_is_twice_as_fine() -> None:
+    asked: list[int] = []
+
+    def counted(mapped: Tensor) -> Tensor:
+        asked.append(len(mapped))
+        return ball(mapped)
+
+    def questions(*resolutions: int) -> int:
+        grids = FieldGrids(counted, BOX, None, lambda scores: 0.5)
+        for n in resolutions:
+            before = sum(asked)
+            scores = grids.fill((n,) * 3)
+        assert scores.shape == (n,) * 3 and grids.clock.seconds > 0.0
+        return sum(asked) - before
+
+    assert questions(16, 32) < questions(32) == questions(12, 32)
+
+
+def test_a_grid_that_asks_more_than_it_may_is_filled_only_from_a_coarser_one() -> None:
+    most = 32**3 * 64 - 1
+    assert FieldGrids(ball, BOX, None, lambda scores: 0.5, most).fill(FINE) is None
+    grids = FieldGrids(ball, BOX, None, lambda scores: 0.5, most)
+    assert grids.fill(CUBE) is not None and grids.fill(FINE) is not None
