@@ -244,6 +244,7 @@ def test_a_checkpoint_brings_back_the_same_pixels(sampling, bounds, tmp_path: Pa
 def test_a_density_is_that_of_the_scenes_units() -> None:
     model = new_model(SceneBounds("box", torch.zeros(3), 4.0, 0.1, 4.0, NO_WALLS, ""))
     positions = torch.rand(6, 3) * 8 - 4
+    model.precision = "float32"
     asked = model.field(positions / 4.0).sigmas[:, None] / 4.0
     torch.testing.assert_close(model.density_fn(positions), asked)
     step = float(model.march_range[2])
