@@ -21,9 +21,8 @@ from leco_plugin.models.front_to_back import shade_front_to_back
 from leco_plugin.models.gate import Gate
 from leco_plugin.models.healing import annealed, is_dense
 from leco_plugin.models.image_figures import image_figures
-from leco_plugin.models.losses import distortion_loss, termination_loss
 from leco_plugin.models.merging import MergingConfig
-from leco_plugin.models.objective import GateLossConfig, gate_losses
+from leco_plugin.models.objective import GateLossConfig, field_losses, gate_losses
 from leco_plugin.models.phases import ScheduleConfig
 from leco_plugin.models.precision import fast_precision, keep_freed_memory
 from leco_plugin.models.prior import PriorConfig
@@ -347,24 +346,17 @@ class LecoModel(Model):
         if len(image) == 0:
             raise ValueError("a training batch holds no rays: are all pixels masked?")
         truth = self.renderer_rgb.blend_background(image)
-        losses = {"rgb_loss": torch.nn.functional.mse_loss(shaded.rgb, truth)}
-        near, far = self.march_range[:2]
-        learning = self.is_learning()
-        weight = self.config.distortion * self.ramped
-        if not learning:
-            weight *= self.config.distortion_after
-        if weight > 0.0:
-            starts, ends = ((t - near) / (far - near) for t in outputs["intervals"][1:])
-            losses["distortion_loss"] = weight * distortion_loss(
-                shaded.weights, starts, ends, shaded.packed_info
-            )
-        if learning and self.config.termination > 0.0 and DISTANCE in batch:
-            losses["termination_loss"] = self.config.termination * termination_loss(
-                shaded.weights, outputs["intervals"], batch[DISTANCE].to(self.device)
-            )
-        if learning and self.config.nearness > 0.0:
-            nearness = ((far - shaded.depth) / (far - near)).mean()
-            losses["nearness_loss"] = self.config.nearness * self.ramped * nearness
+        known = batch.get(DISTANCE)
+        losses = field_losses(
+            self.config,
+            shaded,
+            outputs["intervals"],
+            truth,
+            None if known is None else known.to(self.device),
+            span=self.march_range[:2],
+            learning=self.is_learning(),
+            ramped=self.ramped,
+        )
         if not bool(self.frozen):
             losses |= gate_losses(
                 annealed(self.config.gate_loss, self.progress, self.step),

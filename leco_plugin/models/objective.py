@@ -1,9 +1,9 @@
-"""What teaches the gate, put together: which losses, with which weights, on which samples."""
+"""What teaches field and gate, put together: which losses, which weights, on which samples."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal
+from typing import Literal, Protocol
 
 import torch
 from torch import Tensor
@@ -14,7 +14,9 @@ from leco_plugin.models.losses import (
     balance_loss,
     contribution_loss,
     density_loss,
+    distortion_loss,
     imbalanced_gate_loss,
+    termination_loss,
     widen,
 )
 from leco_plugin.models.rendering import Intervals, Rays, Shaded, backdrop_of
@@ -44,6 +46,53 @@ class GateLossConfig:
     """rho, the target empty ratio (paper form)."""
     density: float = 1.0
     """lambda_d, weight of the density loss (paper form)."""
+
+
+class FieldLossWeights(Protocol):
+    """Weights of what teaches the field beside colours; see `LecoModelConfig`."""
+
+    distortion: float
+    distortion_after: float
+    termination: float
+    nearness: float
+
+
+def field_losses(
+    weights: FieldLossWeights,
+    shaded: Shaded,
+    intervals: Intervals,
+    truth: Tensor,
+    distances: Tensor | None,
+    *,
+    span: Tensor,
+    learning: bool,
+    ramped: float,
+) -> dict[str, Tensor]:
+    """Weighted losses of one batch that the field answers for, by name.
+
+    Args:
+        truth: [R, 3] colours.
+        distances: [R] to sparse points, scene units, 0 where none is known; None is no such points.
+        span: [2] near and far, scene units.
+        learning: whether this is the first phase.
+        ramped: how far the distortion loss has come in, in [0, 1]; nearness comes in with it.
+    """
+    losses = {"rgb_loss": torch.nn.functional.mse_loss(shaded.rgb, truth)}
+    near, far = span
+    distortion = weights.distortion * ramped * (1.0 if learning else weights.distortion_after)
+    if distortion > 0.0:
+        starts, ends = ((t - near) / (far - near) for t in intervals[1:])
+        losses["distortion_loss"] = distortion * distortion_loss(
+            shaded.weights, starts, ends, shaded.packed_info
+        )
+    if learning and weights.termination > 0.0 and distances is not None:
+        losses["termination_loss"] = weights.termination * termination_loss(
+            shaded.weights, intervals, distances
+        )
+    if learning and weights.nearness > 0.0:
+        nearness = ((far - shaded.depth) / (far - near)).mean()
+        losses["nearness_loss"] = weights.nearness * ramped * nearness
+    return losses
 
 
 def gate_losses(
