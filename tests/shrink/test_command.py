@@ -67,7 +67,7 @@ def test_without_a_run_it_keeps_to_the_decisions_and_says_so(
     smallest = [GateConfig(EncodingConfig(octaves=2), width, 1, 1) for width in (1, 12, 24)]
     monkeypatch.setattr(search, "ladder", lambda most: smallest)
     out, report, picture = (tmp_path / "new" / name for name in ("small", "small.json", "a.png"))
-    options = ["--lost-surface-mass", 0.03, "--json", report, "--picture", picture]
+    options = ["--lost-surface-mass", 0.2, "--json", report, "--picture", picture]
     assert run("shrink", file, "--data", tiny_scene, "--out", out, *options) == 0
     said = capsys.readouterr().out
     assert "the original's keep decisions, weighed by o(x)" in " ".join(said.split())

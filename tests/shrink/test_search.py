@@ -41,7 +41,7 @@ def known_worth(occupancy: Occupancy, seed: int) -> Evidence:
     kept = occupancy.occupied(positions)
     depth = (1.0 - (positions - torch.tensor(CENTRE)).norm(dim=-1)).clamp(min=0.0)
     worth = depth * kept
-    return Evidence(positions, torch.arange(20_000) // 10, kept, worth, worth, 2000)
+    return Evidence(positions, torch.arange(20_000) // 4, kept, worth, worth, 5000)
 
 
 def ground(occupancy: Occupancy, verify: Evidence | None = None) -> Ground:
