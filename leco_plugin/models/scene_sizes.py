@@ -227,13 +227,9 @@ def explain(
         row("finest cells", "field.encoding.finest", "a power of two above the texels a side"),
         row("levels", "field.encoding.levels", "up to the finest cells"),
         row("hash table", "field.encoding.log2_table", table_reason, power=True),
-        row(
-            "scene experts", "field.experts.scene_experts", f"one for {TEXELS_PER_EXPERT:,} texels"
-        ),
+        row("scene experts", "field.experts.scene_experts", an_expert),
         row("expert width", "field.experts.width", "narrower where one is too many"),
-        row(
-            "gate octaves", "gate.encoding.octaves", f"a period of {CELLS_PER_PERIOD} finest cells"
-        ),
+        row("gate octaves", "gate.encoding.octaves", a_period),
         row("gate width", "gate.width", f"{UNITS_PER_FEATURE:g} units for each feature"),
     )
     return head, *rows, f"  {values_of(sizes, images):,} parameters of gate and field"
