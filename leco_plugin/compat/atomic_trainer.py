@@ -51,10 +51,11 @@ class AtomicTrainer(Trainer):
             InputError: there is no whole checkpoint to go on from, its sizes are not those that are
                 set by hand, or the scene has other photographs now.
         """
+        asked = self.config.pipeline.model
         self.config = with_sizes_of(self.config, checkpoint_of(self.config))
         super().setup(*arguments, **options)
         check_photographs(self.pipeline)
-        self.config = keep_sizes(self.config, self.pipeline.model)
+        self.config = keep_sizes(self.config, self.pipeline.model, asked)
         self.saved_at = time.monotonic()
         where = [TrainingCallbackLocation.AFTER_TRAIN_ITERATION]
         self.callbacks.append(TrainingCallback(where, self.save_by_the_clock))

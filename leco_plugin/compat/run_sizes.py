@@ -56,11 +56,15 @@ def with_sizes_of(config: Any, checkpoint: Path | None) -> Any:
     return _with_model(config, replace(model, sizes=going_on(model.sizes, stored)))
 
 
-def keep_sizes(config: Any, model: Any) -> Any:
-    """A trainer's config with the sizes that its model has, also in the run's `config.yml`."""
+def keep_sizes(config: Any, model: Any, asked: Any) -> Any:
+    """A trainer's config with the sizes that its model has, also in the run's `config.yml`.
+
+    Args:
+        asked: the model's config as the command gave it, which is what is stored so far.
+    """
     from leco_plugin.models.leco import LecoModel
 
-    if not isinstance(model, LecoModel) or config.pipeline.model.sizes == model.config.sizes:
+    if not isinstance(model, LecoModel) or asked.sizes == model.config.sizes:
         return config
     config = _with_model(config, model.config)
     path = config.get_base_dir() / CONFIG

@@ -138,7 +138,8 @@ class LecoModel(Model):
 
     def _build(self, sizes: Sizes) -> None:
         """Gate and field; from here on the config says their sizes."""
-        self.config = replace(self.config, sizes=sizes)
+        if sizes != self.config.sizes:  # others may share the config, and have other scenes
+            self.config = replace(self.config, sizes=sizes)
         self.gate = Gate(sizes.gate)
         self.field = HMoEField(sizes.field, self.num_train_data)
 

@@ -95,11 +95,14 @@ def choose(
     """
     sizes = _filled(wanted, most, detail)
     check(sizes)
+    reason = f"entries a level, one for {TEXELS_PER_ENTRY:g} texels"
     if memory is not None:
         if not wanted.field.encoding.log2_table:
-            sizes = within(sizes, images, SHARE_OF_MEMORY * memory)
+            fitting = within(sizes, images, SHARE_OF_MEMORY * memory)
+            if fitting != sizes:
+                sizes, reason = fitting, "entries a level, what an eighth of the memory holds"
         check_memory(sizes, images, memory)
-    lines = explain(wanted, most, sizes, detail, images) if left_open(wanted) else ()
+    lines = explain(wanted, most, sizes, detail, images, reason) if left_open(wanted) else ()
     return Choice(sizes, lines)
 
 
@@ -188,7 +191,12 @@ def within(sizes: Sizes, images: int, memory: float) -> Sizes:
 
 
 def explain(
-    wanted: Sizes, most: Sizes, sizes: Sizes, detail: SceneDetail | None, images: int
+    wanted: Sizes,
+    most: Sizes,
+    sizes: Sizes,
+    detail: SceneDetail | None,
+    images: int,
+    table_reason: str,
 ) -> tuple[str, ...]:
     """For the log: what was counted, and each size that could be chosen with its reason.
 
@@ -198,6 +206,7 @@ def explain(
         sizes: as they are now.
         detail: of the scene, if anything is known of it.
         images: training photographs.
+        table_reason: for the size of the hash table.
     """
     head = "sizes of the device; nothing is known of the scene:"
     if detail is not None:
@@ -212,31 +221,15 @@ def explain(
         text = f"2^{size}" if power else str(size)
         return f"  {name:15}{text:>6}  {'set by hand' if by_hand else why}"
 
-    return (
-        head,
-        row(
-            "finest cells",
-            "field.encoding.finest",
-            "a power of two above the texels a side",
-        ),
+    an_expert = f"one for {TEXELS_PER_EXPERT:,} texels"
+    a_period = f"a period of {CELLS_PER_PERIOD} finest cells"
+    rows = (
+        row("finest cells", "field.encoding.finest", "a power of two above the texels a side"),
         row("levels", "field.encoding.levels", "up to the finest cells"),
-        row(
-            "hash table",
-            "field.encoding.log2_table",
-            f"entries a level, one for {TEXELS_PER_ENTRY:g} texels",
-            power=True,
-        ),
-        row(
-            "scene experts",
-            "field.experts.scene_experts",
-            f"one for {TEXELS_PER_EXPERT:,} texels",
-        ),
+        row("hash table", "field.encoding.log2_table", table_reason, power=True),
+        row("scene experts", "field.experts.scene_experts", an_expert),
         row("expert width", "field.experts.width", "narrower where one is too many"),
-        row(
-            "gate octaves",
-            "gate.encoding.octaves",
-            f"down to a period of {CELLS_PER_PERIOD} of the finest cells",
-        ),
+        row("gate octaves", "gate.encoding.octaves", a_period),
         row("gate width", "gate.width", f"{UNITS_PER_FEATURE:g} units for each feature"),
-        f"  {values_of(sizes, images):,} parameters of gate and field",
     )
+    return head, *rows, f"  {values_of(sizes, images):,} parameters of gate and field"

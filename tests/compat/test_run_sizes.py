@@ -140,11 +140,14 @@ def test_a_resumed_run_has_the_sizes_it_was_begun_with(
         raise AssertionError("sizes are chosen anew")
 
     monkeypatch.setattr("leco_plugin.models.scene_sizes.detail_of", lost)
-    config = replace(resumed(begun, scene, "resumed"), max_num_iterations=STEPS + 2)
-    trainer = run(config)
+    trainer = run(resumed(begun, scene, "resumed"))
     assert trainer.pipeline.model.config.sizes == begun.pipeline.model.config.sizes
-    assert trainer.step == STEPS + 1
+    assert trainer.step == 2 * STEPS - 1
     assert "texels" not in capsys.readouterr().out
+    stored = yaml.load(
+        (trainer.config.get_base_dir() / "config.yml").read_text(), Loader=yaml.Loader
+    )
+    assert stored.pipeline.model.sizes == begun.pipeline.model.config.sizes
     # what is trained is what is rendered
     trained = {id(p) for o in trainer.optimizers.optimizers.values() for p in groups_of(o)}
     assert {id(p) for p in trainer.pipeline.model.field.parameters()} <= trained

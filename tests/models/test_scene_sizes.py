@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -25,8 +26,13 @@ from leco_plugin.models.sizes import (
     with_size,
 )
 from leco_plugin.scenes.bounds import BoundsConfig
-from leco_plugin.scenes.detail import CAMERAS, SceneDetail
+from leco_plugin.scenes.city import CityConfig
+from leco_plugin.scenes.city_capture import CaptureConfig
+from leco_plugin.scenes.city_folder import write_city
+from leco_plugin.scenes.detail import CAMERAS, SceneDetail, detail_of
 from leco_plugin.scenes.input_error import InputError
+from leco_plugin.scenes.photographs import LecoPhotographsDataParserConfig
+from leco_plugin.scenes.survey import points_in
 
 IMAGES = 20
 TABLE = "field.encoding.log2_table"
@@ -160,6 +166,13 @@ def test_a_chosen_table_leaves_the_memory_to_others(memory: int, texels: float) 
         assert sizes == free
 
 
+def test_a_table_that_memory_made_smaller_says_so() -> None:
+    made = choose(automatic(LARGE), LARGE, scene(1e9, 1e5), IMAGES, memory=1 << 30)
+    assert size_at(made.sizes, TABLE) < size_at(LARGE, TABLE)
+    (line,) = (line for line in made.lines if "hash table" in line)
+    assert "memory" in line and "texels" not in line
+
+
 def changed(path: str, value: int) -> Sizes:
     return with_size(automatic(SMALL), path, value)
 
@@ -212,6 +225,28 @@ def test_a_model_asks_its_scene_only_where_a_size_is_open(
 def test_a_wrong_size_ends_a_command_with_one_line() -> None:
     with pytest.raises(InputError, match="the gate's width is -3"):
         complete(changed("gate.width", -3), BoundsConfig(), {}, IMAGES, "cpu")
+
+
+def city(folder: Path, blocks: int) -> tuple[SceneDetail, int]:
+    """Detail of a drone survey of a city, and its number of photographs."""
+    capture = CaptureConfig(24, 18, street_per_block=0.0)
+    write_city(CityConfig(blocks), folder, capture, progress=False)
+    parser = LecoPhotographsDataParserConfig(data=folder, downscale_factor=1)
+    outputs = parser.setup().get_dataparser_outputs("train")
+    outputs.cameras.rescale_output_resolution(160 / 24)  # the poses are the same at every size
+    found = detail_of(outputs.cameras, points_in(outputs.metadata))
+    return found, len(outputs.image_filenames)
+
+
+@pytest.mark.slow
+def test_a_block_has_a_quarter_of_the_parameters_of_eight_by_eight(tmp_path: Path) -> None:
+    values = {}
+    for blocks in (1, 3, 8):
+        found, images = city(tmp_path / str(blocks), blocks)
+        sizes = choose(automatic(SMALL), SMALL, found, images).sizes
+        values[blocks] = values_of(sizes, images)
+        assert sizes == SMALL or blocks == 1
+    assert values[1] <= values[8] / 4
 
 
 def test_zero_stands_for_automatic() -> None:

@@ -71,8 +71,8 @@ def test_of_distances_the_nearest_counts() -> None:
 
 
 def test_there_are_no_more_texels_than_pixels() -> None:
-    solid = ground(4.0) * torch.tensor([1.0, 1.0, 50.0])  # surfaces everywhere up to half way
-    found = detail_of(survey(4.0), solid)
+    solid = ground(4.0) * torch.tensor([1.0, 1.0, 100.0])  # surfaces everywhere up to half way
+    found = detail_of(survey(1.0), solid)
     assert found.texels == found.pixels == found.images * SIDE**2
 
 
