@@ -106,7 +106,7 @@ def test_no_part_begins_that_would_pass_the_ten_minutes(
     quick: list[str], monkeypatch, capsys
 ) -> None:
     monkeypatch.setattr(gpu, "LIMIT", 5.0)
-    gpu.run(DRY, None, dry=True)
+    gpu.run(DRY, None, dry=False)
     assert quick == [] and "is left for the next run" in capsys.readouterr().err
 
 

@@ -5,10 +5,11 @@ from __future__ import annotations
 import importlib
 import json
 import os
-import signal
 import subprocess
 import sys
 import time
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from types import ModuleType
 
@@ -62,25 +63,29 @@ def test_every_line_is_exercised_without_a_gpu() -> None:
     assert done.returncode == 0, done.stdout[-4000:] + done.stderr[-2000:]
 
 
+@contextmanager
+def on_a_bare_machine(out: Path) -> Iterator[subprocess.Popen[str]]:
+    """A dry run in a process of its own, which ends with the block at the latest."""
+    command = [sys.executable, "-c", ON_A_BARE_MACHINE, "--", str(out)]
+    with subprocess.Popen(
+        command, cwd=BENCHMARKS, env=environment(), text=True, stderr=subprocess.PIPE
+    ) as process:
+        try:
+            yield process
+        finally:
+            process.kill()
+
+
 def test_a_killed_run_on_a_bare_machine_goes_on_where_it_stopped(tmp_path: Path) -> None:
     out = tmp_path / "gpu.json"
-    command = [sys.executable, "-c", ON_A_BARE_MACHINE, "--", str(out)]
-
-    def begin() -> subprocess.Popen[str]:
-        return subprocess.Popen(
-            command, cwd=BENCHMARKS, env=environment(), text=True, stderr=subprocess.PIPE
-        )
-
-    first = begin()
-    while not (out.exists() and "gate" in json.loads(out.read_text())["parts"]):
-        assert first.poll() is None, first.communicate()[1]
-        time.sleep(0.05)
-    first.send_signal(signal.SIGKILL)
-    first.communicate()
+    with on_a_bare_machine(out) as first:
+        while not (out.exists() and "gate" in json.loads(out.read_text())["parts"]):
+            assert first.poll() is None, first.communicate()[1]
+            time.sleep(0.05)
     before = json.loads(out.read_text())["parts"]
     assert len(before) < len(PARTS)
-    second = begin()
-    _, error = second.communicate(timeout=280)
+    with on_a_bare_machine(out) as second:
+        _, error = second.communicate()
     assert second.returncode == 0, error
     after = json.loads(out.read_text())["parts"]
     assert list(after) == PARTS and {name: after[name] for name in before} == before

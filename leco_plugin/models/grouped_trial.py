@@ -97,7 +97,8 @@ def race(device: torch.device, n: int, width: int) -> tuple[float, float]:
         _wait(device)
         return time.perf_counter() - started
 
-    grouped, plain = [], []
+    grouped: list[float] = []
+    plain: list[float] = []
     for _ in range(ROUNDS + 1):
         grouped.append(seconds(lambda points, weights: grouped_product(points, weights, ends)))
         plain.append(seconds(lambda points, weights: one_by_one(points, weights, sizes)))
