@@ -28,7 +28,7 @@ PIXELS = 300
 """Along the longer side of a slice."""
 STILL = 4
 """Looks in a picture that does not move."""
-MOST_FRAMES, FRAME_COLOURS = 16, 48
+MOST_FRAMES, FRAME_COLOURS = 12, 24
 """Of a picture that moves, so that a page may hold it."""
 FRAME, LAST_FRAME = 250, 3000
 """Milliseconds for which one is seen."""
@@ -126,7 +126,7 @@ class _Film:
 
     def moving(self) -> tuple[Any, Any]:
         """A figure, and what draws one look into it."""
-        figure = _figure((9.6, 5.4))
+        figure = _figure((8.0, 4.5))
         columns = figure.add_gridspec(1, 2)
         slices = columns[0].subgridspec(2, 1, height_ratios=(3, 1))
         curves = columns[1].subgridspec(2, 1)
@@ -157,7 +157,8 @@ class _Film:
             above.plot(steps[:upto], 100.0 * self.shares[:upto, expert], label=label, **style)
             below.plot(steps[:upto], self.densities[:upto, expert], **style)
         above.set_ylabel("share of points, %")
-        above.set_ylim(0, 100)
+        above.set_ylim(0, 140)  # with room for the names
+        above.set_yticks(range(0, 101, 20))
         below.set_ylabel("mean density, per half extent\n(10⁴: opaque)")
         below.set_yscale("symlog", linthresh=1.0)
         below.set_ylim(0, 1.5 * max(1.0, float(self.densities.max())))
