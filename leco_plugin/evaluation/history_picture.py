@@ -6,7 +6,9 @@ import copy
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
+from PIL import Image
 
 from leco_plugin.evaluation.charts import COLOURS
 from leco_plugin.evaluation.inspection import cameras_of
@@ -26,8 +28,10 @@ PIXELS = 300
 """Along the longer side of a slice."""
 STILL = 4
 """Looks in a picture that does not move."""
-FRAMES_PER_SECOND, HELD = 5, 10
-"""Of a picture that moves; it rests on its last frame for so many."""
+MOST_FRAMES, FRAME_COLOURS = 12, 24
+"""Of a picture that moves, so that a page may hold it."""
+FRAME, LAST_FRAME = 250, 3000
+"""Milliseconds for which one is seen."""
 DPI = 80
 OPAQUE = 1e4
 """Density, per half extent, beyond which nothing is told apart: opaque within a ten-thousandth."""
@@ -47,18 +51,34 @@ def draw_history(occupancy: Occupancy, folder: Path, path: Path) -> Path:
     history = _read(occupancy, folder)
     film = _Film(occupancy, history)
     if path.suffix.lower() != ".gif":
-        looks = torch.linspace(0, len(history) - 1, STILL).round().int().unique().tolist()
+        looks = spread_evenly(len(history), STILL)
         film.still(looks).savefig(path, dpi=DPI)
         return path
-    from matplotlib.animation import FuncAnimation, PillowWriter
-
+    frames = []
     figure, show = film.moving()
-    looks = [*range(len(history)), *[len(history) - 1] * HELD]
-    animation = FuncAnimation(figure, show, looks, init_func=list)
-    writer = PillowWriter(FRAMES_PER_SECOND)
+    shown = spread_evenly(len(history), MOST_FRAMES)
     with bar("Drawing how it was learned") as progress:
-        animation.save(path, writer, dpi=DPI, progress_callback=lambda i, n: progress((i + 1) / n))
+        for number, look in enumerate(shown):
+            show(look)
+            frames.append(_frame(figure))
+            progress((number + 1) / len(shown))
+    durations = [FRAME] * (len(frames) - 1) + [LAST_FRAME]
+    frames[0].save(path, save_all=True, append_images=frames[1:], duration=durations, loop=0)
     return path
+
+
+def spread_evenly(count: int, most: int) -> list[int]:
+    """Up to `most` of the numbers below `count`, the first and the last among them."""
+    places = torch.linspace(0, count - 1, min(count, most))
+    numbers: list[int] = places.round().int().unique().tolist()
+    return numbers
+
+
+def _frame(figure: Any) -> Image.Image:
+    """A figure as an image of few colours, without the noise that GIF cannot compress."""
+    figure.canvas.draw()
+    pixels = np.asarray(figure.canvas.buffer_rgba())[..., :3]
+    return Image.fromarray(pixels).quantize(FRAME_COLOURS, dither=Image.Dither.NONE)
 
 
 def _read(occupancy: Occupancy, folder: Path) -> GateHistory:
@@ -106,19 +126,19 @@ class _Film:
 
     def moving(self) -> tuple[Any, Any]:
         """A figure, and what draws one look into it."""
-        figure = _figure((12, 7))
-        grid = figure.add_gridspec(2, 2, width_ratios=(1.2, 1.0))
-        left = [figure.add_subplot(grid[row, 0]) for row in range(2)]
-        right = [figure.add_subplot(grid[row, 1]) for row in range(2)]
+        figure = _figure((8.0, 4.5))
+        columns = figure.add_gridspec(1, 2)
+        slices = columns[0].subgridspec(2, 1, height_ratios=(3, 1))
+        curves = columns[1].subgridspec(2, 1)
+        left, right = ([figure.add_subplot(grid[i]) for i in range(2)] for grid in (slices, curves))
 
-        def show(look: int) -> list[Any]:
+        def show(look: int) -> None:
             for axes in (*left, *right):
                 axes.clear()
             for row, axes in enumerate(left):
                 self._slice(axes, row, look)
             self._lines(right[0], right[1], look)
             figure.suptitle(f"learning what is empty: step {self.history.steps[look]}")
-            return []
 
         return figure, show
 
@@ -137,7 +157,8 @@ class _Film:
             above.plot(steps[:upto], 100.0 * self.shares[:upto, expert], label=label, **style)
             below.plot(steps[:upto], self.densities[:upto, expert], **style)
         above.set_ylabel("share of points, %")
-        above.set_ylim(0, 100)
+        above.set_ylim(0, 140)  # with room for the names
+        above.set_yticks(range(0, 101, 20))
         below.set_ylabel("mean density, per half extent\n(10⁴: opaque)")
         below.set_yscale("symlog", linthresh=1.0)
         below.set_ylim(0, 1.5 * max(1.0, float(self.densities.max())))
@@ -153,6 +174,6 @@ def _figure(size: tuple[float, float]) -> Any:
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
-    figure = Figure(figsize=size, layout="constrained", facecolor="white")
+    figure = Figure(figsize=size, dpi=DPI, layout="constrained", facecolor="white")
     FigureCanvasAgg(figure)
     return figure

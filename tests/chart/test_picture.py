@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from chart_results import occupancy, results, run
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from matplotlib.figure import Figure
 from PIL import Image
@@ -98,6 +98,7 @@ def test_a_title_has_as_few_lines_as_it_can_and_no_short_one() -> None:
     assert balanced("short") == "short"
 
 
+@settings(deadline=None, max_examples=30)
 @given(st.lists(st.tuples(*[st.floats(0.05, 0.95)] * 2), min_size=2, max_size=6, unique=True))
 def test_names_of_points_lie_in_the_panel(
     places: list[tuple[float, float]],

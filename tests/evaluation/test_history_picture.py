@@ -11,13 +11,14 @@ from PIL import Image
 
 from leco_plugin.cli import main
 from leco_plugin.evaluation import history_picture
+from leco_plugin.evaluation.history_picture import spread_evenly
 from leco_plugin.models.history import GateHistory
 
 
 @pytest.fixture
 def run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """The folder of a run whose gate grew into the ball."""
-    for name, value in {"PIXELS": 24, "HELD": 2, "DPI": 20}.items():
+    for name, value in {"PIXELS": 24, "DPI": 20}.items():
         monkeypatch.setattr(history_picture, name, value)
     history, gate = GateHistory(), ball().gate
     learned = {name: value.clone() for name, value in gate.state_dict().items()}
@@ -35,12 +36,24 @@ def test_a_gif_has_a_frame_for_each_look_and_rests_on_the_last(run: Path) -> Non
     path = run / "learned.gif"
     assert main(["inspect", str(run / "occupancy.safetensors"), "--history", str(path)]) == 0
     with Image.open(path) as film:
-        # frames that are alike are one that stays longer
-        assert film.n_frames in (3, 5)
+        assert film.n_frames == 3
         film.seek(0)
-        first = film.convert("RGB").tobytes()
+        first, seen = film.convert("RGB").tobytes(), film.info["duration"]
         film.seek(2)
-        assert film.convert("RGB").tobytes() != first
+        assert film.convert("RGB").tobytes() != first and film.info["duration"] > 4 * seen
+
+
+def test_a_long_history_is_shown_from_its_first_look_to_its_last(
+    run: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    assert spread_evenly(3, 16) == [0, 1, 2] and spread_evenly(1, 16) == [0]
+    shown = spread_evenly(200, 16)
+    assert (shown[0], shown[-1], len(shown)) == (0, 199, 16)
+    steps = [b - a for a, b in zip(shown, shown[1:])]
+    assert max(steps) - min(steps) <= 1
+    monkeypatch.setattr(history_picture, "MOST_FRAMES", 2)
+    with Image.open(history_picture.draw_history(ball(), run, run / "short.gif")) as film:
+        assert film.n_frames == 2
 
 
 def test_a_still_picture_is_drawn_too(run: Path) -> None:
