@@ -84,8 +84,8 @@ class LecoModelConfig(GrowingConfig, ModelConfig):
     distortion_after: float = 0.04
     """Share of the distortion loss that stays when the first phase is over and detail is wanted."""
     front_to_back: bool = False
-    """Whether rendering goes from the front and shades nothing behind opaque surfaces: fewer samples
-    for the same image, and more steps to get there."""
+    """Whether rendering shades from the front and nothing behind opaque surfaces: fewer samples for
+    the same image, and more steps to get there."""
     homogeneous: bool = False
     """A mixture of scene experts only, for comparison: no empty-space expert, nothing to freeze."""
     precision: Precision | None = None
