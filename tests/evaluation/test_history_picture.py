@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
 from pathlib import Path
 
 import pytest
@@ -49,7 +50,7 @@ def test_a_long_history_is_shown_from_its_first_look_to_its_last(
     assert spread_evenly(3, 16) == [0, 1, 2] and spread_evenly(1, 16) == [0]
     shown = spread_evenly(200, 16)
     assert (shown[0], shown[-1], len(shown)) == (0, 199, 16)
-    steps = [b - a for a, b in zip(shown, shown[1:])]
+    steps = [b - a for a, b in pairwise(shown)]
     assert max(steps) - min(steps) <= 1
     monkeypatch.setattr(history_picture, "MOST_FRAMES", 2)
     with Image.open(history_picture.draw_history(ball(), run, run / "short.gif")) as film:
