@@ -33,6 +33,10 @@ they differ. Times are seconds of training, evaluation left out. Nothing here is
 what is called so. To make a chart again, add `--out FOLDER` to its command; `city` is the one that
 `leco demo` leaves in `runs/demo/city`, `caliterra` 75 drone photographs of a building site, from
 OpenDroneMap's `odm_data_caliterra` (CC0), at 480 x 360 with poses from COLMAP.
+
+*Never frozen* is the same model, whose gate goes on learning: it renders without skipping. *Equal
+experts, no gate* has as many scene experts and none for empty space, as Switch-NeRF, and never skips.
+*Price* is what skipping costs on held-out pixels at the moment of freezing.
 """
 
 PAPER_ROWS = {
