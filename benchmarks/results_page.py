@@ -35,7 +35,7 @@ what is called so. To make a chart again, add `--out FOLDER` to its command; `ci
 OpenDroneMap's `odm_data_caliterra` (CC0), at 480 x 360 with poses from COLMAP.
 
 *Never frozen* is the same model, whose gate goes on learning: it renders without skipping. *Equal
-experts, no gate* has as many scene experts and none for empty space, as Switch-NeRF, and never skips.
+experts, no gate* has as many scene experts, none for empty space, as Switch-NeRF, and never skips.
 *Price* is what skipping costs on held-out pixels at the moment of freezing.
 """
 
