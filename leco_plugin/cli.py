@@ -11,6 +11,7 @@ import tyro
 
 from leco_plugin.cli_capacity import capacity, export, shrink
 from leco_plugin.cli_reports import check_json as _check_json
+from leco_plugin.cli_reports import occupancy_of
 from leco_plugin.cli_reports import write_json as _write_json
 
 BAD_INPUT, FAILURE = 2, 1
@@ -72,7 +73,7 @@ def inspect(
     """Say what an occupancy is: sizes, threshold, price and gain; and draw it.
 
     Args:
-        file: An occupancy.safetensors, as a run of leco-occupancy leaves it in its folder.
+        file: An occupancy.safetensors, or a folder of runs: the newest in it.
         picture: File for a picture: slices of o(x) with the cameras, and the kept points.
         history: File for how it was learned: a .gif that moves, or a still picture. For runs with
             --pipeline.model.schedule.steps-per-record 10, say.
@@ -81,6 +82,7 @@ def inspect(
     from leco_plugin.evaluation.inspection import describe
     from leco_plugin.occupancy import Occupancy
 
+    file = occupancy_of(file)
     occupancy = Occupancy.load(file)
     facts = {**describe(occupancy), "bytes": file.stat().st_size}
     space = facts["space"]

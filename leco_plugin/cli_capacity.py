@@ -7,7 +7,7 @@ from typing import Annotated, Literal
 
 import tyro
 
-from leco_plugin.cli_reports import check_json, write_json
+from leco_plugin.cli_reports import check_json, occupancy_of, write_json
 
 
 def export(
@@ -21,7 +21,7 @@ def export(
     """Write an occupancy for other programs: kept points, or an occupancy grid of nerfacc.
 
     Args:
-        file: An occupancy.safetensors.
+        file: An occupancy.safetensors, or a folder of runs: the newest in it.
         format: ply is the surface of what is kept, coloured by o(x); nerfacc-grid is what
             OccGridEstimator.load_state_dict takes, a cell marked where any of 27 points in it is
             kept. A host that goes on updating such a grid replaces it by its own.
@@ -34,7 +34,7 @@ def export(
     from leco_plugin.export.command import export as write
 
     check_json(json)
-    facts = write(file, format, out, resolution, levels)
+    facts = write(occupancy_of(file), format, out, resolution, levels)
     if format == "ply":
         print(f"{out}: {facts['points']} points")
     else:
@@ -63,7 +63,7 @@ def shrink(
     keeps.
 
     Args:
-        file: An occupancy.safetensors, best where its run left it.
+        file: An occupancy.safetensors, best where its run left it, or a folder of runs: the newest.
         data: The scene that it was learned on.
         out: File for the smaller occupancy.
         lost_surface_mass: Most of the weight near surfaces that it may declare lost, the original's
@@ -81,7 +81,7 @@ def shrink(
     from leco_plugin.shrink.search import Bounds
 
     check_json(json)
-    results = find_smaller(file, data, out, Bounds(lost_surface_mass, image_price))
+    results = find_smaller(occupancy_of(file), data, out, Bounds(lost_surface_mass, image_price))
     print("\n".join(summary(results, out)))
     if picture is not None:
         from leco_plugin.shrink.picture import draw

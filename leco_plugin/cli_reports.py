@@ -1,9 +1,25 @@
-"""`--json` of every subcommand of `leco`."""
+"""What the subcommands of `leco` share: the file that is meant, and `--json`."""
 
 from __future__ import annotations
 
 from pathlib import Path
 from typing import Any
+
+
+def occupancy_of(path: Path) -> Path:
+    """The file that is meant: itself, or the newest occupancy in a folder of runs.
+
+    Raises:
+        ValueError: there is none in the folder.
+    """
+    if not path.is_dir():
+        return path
+    from leco_plugin.models.guided_start import occupancy_file
+
+    file = occupancy_file(path)
+    if file is None or not file.exists():
+        raise ValueError(f"there is no occupancy.safetensors in {path}: no run has frozen its gate")
+    return file
 
 
 def check_json(path: Path | None) -> None:

@@ -11,6 +11,7 @@ from typing import Any
 
 import torch
 from nerfstudio.engine.trainer import Trainer, TrainerConfig
+from torch import Tensor
 
 from leco_plugin.evaluation.charts import psnr_against_seconds
 from leco_plugin.evaluation.clock import Budget
@@ -154,10 +155,7 @@ def _frozen_occupancy(
 
 @torch.no_grad()
 def _draw_picture(trainer: Trainer, occupancy: Occupancy, truth: CityTruth, path: Path) -> None:
-    """Photograph, guided rendering, its depth, and a slice of the occupancy with the true walls."""
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
-
+    """A test image as it is photographed and as the guided model renders it, and the occupancy."""
     pipeline: Any = trainer.pipeline
     model = pipeline.model
     dataset = pipeline.datamanager.eval_dataset
@@ -169,23 +167,47 @@ def _draw_picture(trainer: Trainer, occupancy: Occupancy, truth: CityTruth, path
     rgb = outputs["rgb"].clamp(0.0, 1.0)
     photograph = true_image(model, dataset.get_data(number)["image"], rgb)
     depth = (outputs["depth"][..., 0] / truth.scale).cpu()
-    seen = torch.quantile(depth, torch.tensor([0.01, 0.95])).tolist()
-
-    figure = Figure(figsize=(16, 3.7), layout="constrained", facecolor="white")
-    FigureCanvasAgg(figure)
-    axes = figure.subplots(1, 4, gridspec_kw={"width_ratios": [4, 4, 4.3, 3.1]})
-    axes[0].imshow(photograph.cpu())
-    axes[0].set_title("photograph (held out)")
-    axes[1].imshow(rgb.cpu())
     samples = float(outputs["samples_per_ray"].mean())
-    axes[1].set_title(f"guided rendering, {samples:.0f} samples a ray")
+    draw_panels(photograph.cpu(), rgb.cpu(), samples, depth, occupancy, truth, path)
+
+
+def draw_panels(
+    photograph: Tensor,
+    rgb: Tensor,
+    samples: float,
+    depth: Tensor,
+    occupancy: Occupancy,
+    truth: CityTruth,
+    path: Path,
+) -> None:
+    """Photograph, guided rendering, its depth, and a slice of the occupancy with the true walls.
+
+    Args:
+        photograph, rgb: [H, W, 3] in [0, 1].
+        samples: a ray, mean over the image.
+        depth: [H, W] in metres.
+        occupancy, truth: in the same coordinates.
+        path: of the picture.
+    """
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    seen = torch.quantile(depth, torch.tensor([0.01, 0.95])).tolist()
+    # letters of this size can still be read where a page shows the picture half as wide
+    figure = Figure(figsize=(11, 2.9), layout="constrained", facecolor="white")
+    FigureCanvasAgg(figure)
+    axes = figure.subplots(1, 4, gridspec_kw={"width_ratios": [4, 4, 4.5, 2.6]})
+    axes[0].imshow(photograph)
+    axes[0].set_title("photograph\n(held out)")
+    axes[1].imshow(rgb)
+    axes[1].set_title(f"guided rendering\n({samples:.0f} samples a ray)")
     shown = axes[2].imshow(depth, cmap="turbo_r", vmin=seen[0], vmax=seen[1])
-    axes[2].set_title("its depth")
-    figure.colorbar(shown, ax=axes[2], label="metres", shrink=0.8, pad=0.01)
+    axes[2].set_title("its depth\n(metres)")
+    figure.colorbar(shown, ax=axes[2], shrink=0.8, pad=0.01)
     _draw_city_slice(axes[3], occupancy, truth)
     for panel in axes:
         panel.set(xticks=[], yticks=[], xlabel="", ylabel="")
-    figure.savefig(path, dpi=110, bbox_inches="tight")
+    figure.savefig(path, dpi=160, bbox_inches="tight")
 
 
 def _draw_city_slice(axes: Any, occupancy: Occupancy, truth: CityTruth) -> None:
@@ -195,7 +217,7 @@ def _draw_city_slice(axes: Any, occupancy: Occupancy, truth: CityTruth) -> None:
     ground[2] = SLICE_HEIGHT
     height = float(truth.to_model(ground)[2])
     draw_slice(axes, occupancy, ViewBox(low, high), 2, height, solid=truth.occupied)
-    axes.set_title(f"occupancy {SLICE_HEIGHT:.0f} m up, true walls white")
+    axes.set_title(f"occupancy {SLICE_HEIGHT:.0f} m up\n(true walls white)", fontsize=12)
 
 
 def summary(report: dict[str, Any]) -> list[str]:

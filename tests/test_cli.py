@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import subprocess
 import sys
 from pathlib import Path
@@ -46,6 +47,21 @@ def test_inspect_says_draws_and_writes(
     assert facts["format"] == 1 and facts["bytes"] == file.stat().st_size
     assert facts["params"] == ball().num_params
     assert facts["report"]["empty_fraction"] == 0.9
+
+
+def test_a_folder_of_runs_means_its_newest_occupancy(
+    file: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for age, name in enumerate(["newest", "older", "oldest"]):
+        run_file = tmp_path / "runs" / name / "occupancy.safetensors"
+        run_file.parent.mkdir(parents=True)
+        run_file.write_bytes(file.read_bytes())
+        os.utime(run_file, (1e9 - age, 1e9 - age))
+    assert run("inspect", tmp_path / "runs") == 0
+    assert f"{tmp_path / 'runs' / 'newest' / 'occupancy.safetensors'}: " in capsys.readouterr().out
+    out = tmp_path / "kept.ply"
+    assert run("export", tmp_path / "runs", "--format", "ply", "--out", out) == 0
+    assert out.exists()
 
 
 @pytest.mark.parametrize("format", ["ply", "nerfacc-grid"])

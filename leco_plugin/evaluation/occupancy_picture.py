@@ -88,7 +88,7 @@ def draw_slice(
         normal: 0, 1 or 2, the axis that the slice is perpendicular to.
         at: its position along that axis, scene units.
         cameras: [C, 3] centres to mark.
-        solid: the truth, if known: positions [N, 3] to bool [N], drawn as a white outline.
+        solid: the truth, if known: positions [N, 3] to bool [N], as white lines edged in black.
         pixels: along the longer side.
     """
     across, up = (a for a in range(3) if a != normal)
@@ -110,7 +110,8 @@ def draw_slice(
     if solid is not None:
         inside = solid(positions.reshape(-1, 3)).cpu().reshape(values.shape).float()
         if inside.min() < inside.max():
-            axes.contour(u, v, inside, levels=[0.5], colors=TRUTH, linewidths=0.8)
+            for colour, width in (("black", 1.8), (TRUTH, 0.8)):  # seen on light and on dark
+                axes.contour(u, v, inside, levels=[0.5], colors=colour, linewidths=width)
     if cameras is not None and len(cameras):
         x, y = cameras[:, across], cameras[:, up]
         axes.scatter(x, y, s=9, c=CAMERA, edgecolors="black", linewidths=0.3, label="cameras")
