@@ -16,7 +16,6 @@ from nerfstudio.utils.decorators import check_main_thread
 
 from leco_plugin.compat.optimizers import OptimizersOfThePresent
 from leco_plugin.compat.run_sizes import (
-    check_photographs,
     checkpoint_of,
     keep_sizes,
     with_sizes_of,
@@ -54,7 +53,6 @@ class AtomicTrainer(Trainer):
         asked = self.config.pipeline.model
         self.config = with_sizes_of(self.config, checkpoint_of(self.config))
         super().setup(*arguments, **options)
-        check_photographs(self.pipeline)
         self.config = keep_sizes(self.config, self.pipeline.model, asked)
         self.saved_at = time.monotonic()
         where = [TrainingCallbackLocation.AFTER_TRAIN_ITERATION]

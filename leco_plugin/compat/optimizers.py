@@ -7,6 +7,8 @@ from typing import Any
 from nerfstudio.engine.optimizers import Optimizers
 from torch.nn import Parameter
 
+from leco_plugin.compat.run_sizes import check_photographs
+
 
 class OptimizersOfThePresent(Optimizers):
     """They are made before a checkpoint is loaded, and loaded after the model.
@@ -21,7 +23,12 @@ class OptimizersOfThePresent(Optimizers):
         self.pipeline = pipeline
 
     def load_optimizers(self, loaded_state: dict[str, Any]) -> None:
-        """As nerfstudio's, for the parameters that the model has now."""
+        """As nerfstudio's, for the parameters that the model has now.
+
+        Raises:
+            InputError: the model came back with other photographs than the scene has.
+        """
+        check_photographs(self.pipeline)
         forget_the_gone(self, self.pipeline.get_param_groups())
         super().load_optimizers(loaded_state)
 

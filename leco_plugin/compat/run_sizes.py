@@ -82,8 +82,11 @@ def check_photographs(pipeline: Any) -> None:
     """
     from leco_plugin.models.leco import LecoModel
 
-    model, now = pipeline.model, len(pipeline.datamanager.train_dataset)
-    if isinstance(model, LecoModel) and model.num_train_data != now:
+    model = getattr(pipeline, "model", None)
+    if not isinstance(model, LecoModel):
+        return
+    now = len(pipeline.datamanager.train_dataset)
+    if model.num_train_data != now:
         raise InputError(
             f"the run was begun with {model.num_train_data} training photographs, and the scene "
             f"has {now}: put the same ones there, or begin a new run"

@@ -173,7 +173,7 @@ def test_the_model_of_the_run_says_what_is_lost(
     known_run: Path, tiny_scene: Path, tmp_path: Path
 ) -> None:
     out, report = tmp_path / "small.safetensors", tmp_path / "small.json"
-    bounds = ["--lost-surface-mass", 0.05, "--image-price", 0.5, "--json", report]
+    bounds = ["--lost-surface-mass", 0.25, "--image-price", 0.5, "--json", report]
     original = Occupancy.load(known_run / "occupancy.safetensors")
     assert original.threshold > 0.0
     file = known_run / "occupancy.safetensors"
@@ -262,9 +262,10 @@ def test_a_run_whose_model_does_not_fit_is_refused_in_one_line(
 ) -> None:
     broken = tmp_path / "run"
     shutil.copytree(known_run, broken)
-    config = (broken / "config.yml").read_text()
-    assert "log2_table: 8" in config
-    (broken / "config.yml").write_text(config.replace("log2_table: 8", "log2_table: 7"))
+    for path in (broken / "nerfstudio_models").glob("*.ckpt"):
+        state = torch.load(path, weights_only=True)
+        state["pipeline"]["_model.field.density_head.weight"] = torch.zeros(1, 3)
+        torch.save(state, path)
     arguments = ["--data", tiny_scene, "--out", tmp_path / "out"]
     assert run("shrink", broken / "occupancy.safetensors", *arguments) == 2
     said = capsys.readouterr().err
