@@ -263,7 +263,7 @@ def test_an_occupancy_of_another_scene_is_refused(readers: dict[str, Data]) -> N
 
 
 def test_training_says_what_was_wrong_with_a_path(readers: dict[str, Data], tmp_path: Path) -> None:
-    with pytest.raises(InputError, match="there is no occupancy .*none: train leco-occupancy"):
+    with pytest.raises(InputError, match=r"there is no occupancy .*none: train leco-occupancy"):
         config = OccupancyConfig(tmp_path / "none")
         GuidedStart(nn.Module(), Guide(), config, Pipe(readers["as it is"]))
 
