@@ -15,7 +15,7 @@ LEARN_SHARE = 0.4
 """Of the training time, at most, for learning an occupancy; short runs need most of that."""
 
 OVERHEAD_SECONDS = 45.0
-"""Start, evaluation and rendering of a run on two CPU cores, about: 25 to 70 were measured."""
+"""Start, evaluation and rendering of a run on two CPU cores, about: 30 to 80 were measured."""
 GRIDS_SECONDS = 120.0
 """Making grids from the field of a run, those of 512^3 cells among them, about."""
 

@@ -28,7 +28,7 @@ PIXELS = 300
 """Along the longer side of a slice."""
 STILL = 4
 """Looks in a picture that does not move."""
-MOST_FRAMES, FRAME_COLOURS = 12, 24
+MOST_FRAMES, FRAME_COLOURS = 12, 48
 """Of a picture that moves, so that a page may hold it."""
 FRAME, LAST_FRAME = 250, 3000
 """Milliseconds for which one is seen."""
@@ -126,7 +126,7 @@ class _Film:
 
     def moving(self) -> tuple[Any, Any]:
         """A figure, and what draws one look into it."""
-        figure = _figure((8.0, 4.5))
+        figure = _figure((9.6, 5.4))
         columns = figure.add_gridspec(1, 2)
         slices = columns[0].subgridspec(2, 1, height_ratios=(3, 1))
         curves = columns[1].subgridspec(2, 1)

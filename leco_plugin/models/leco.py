@@ -84,6 +84,9 @@ class LecoModelConfig(GrowingConfig, ModelConfig):
     """o(x) from which those others shade a candidate."""
     distortion_after: float = 0.04
     """Share of the distortion loss that stays when the first phase is over and detail is wanted."""
+    front_to_back: bool = False
+    """Whether rendering shades from the front and nothing behind opaque surfaces: fewer samples for
+    the same image, and more steps to get there."""
     homogeneous: bool = False
     """A mixture of scene experts only, for comparison: no empty-space expert, nothing to freeze."""
     precision: Precision | None = None
@@ -313,10 +316,10 @@ class LecoModel(Model):
         if self.training:
             kept = len(intervals.t_starts) / max(len(rays.origins), 1) - 1.0
             self.guided_kept = kept if guided else 1.0
-        if self.training:
-            shaded = self.shade(rays, intervals)
-        else:
+        if self.config.front_to_back and not self.training:
             shaded, intervals = self.shade_what_is_seen(rays, intervals)
+        else:
+            shaded = self.shade(rays, intervals)
         outputs: dict[str, Any] = {
             "rgb": shaded.rgb,
             "depth": shaded.depth[:, None],

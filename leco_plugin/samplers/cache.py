@@ -20,7 +20,8 @@ from torch import Tensor, nn
 
 EMPTY, OCCUPIED, MIXED = 0, 1, 2
 
-BRICK = 4
+BRICK_BITS = 2
+BRICK = 1 << BRICK_BITS
 """Fine cells along a coarse one."""
 
 COARSE_EMPTY, COARSE_OCCUPIED = -1, -2
@@ -187,9 +188,9 @@ class CellCache(nn.Module):
         """
         cells = self._cells(positions).mul_(BRICK)
         corners = cells.to(torch.int32)
-        coarse = _flat(corners >> 2, self.resolution + 2)
+        coarse = _flat(corners >> BRICK_BITS, self.resolution + 2)
         brick = self.coarse.index_select(0, coarse).to(torch.int32)
-        at = torch.add(_flat(corners.bitwise_and_(3), BRICK), brick, alpha=BRICK**3)
+        at = torch.add(_flat(corners.bitwise_and_(BRICK - 1), BRICK), brick, alpha=BRICK**3)
         known = self.judged.view(-1).index_select(0, at.add_(UNIFORM * BRICK**3))
         # An answer in the type of what is compared is found ten times faster on a CPU than a bool.
         occupied = torch.eq(known, FINE_OCCUPIED, out=torch.empty_like(known)).view(torch.bool)

@@ -11,7 +11,8 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-RUN = 16
+RUN_BITS = 4
+RUN = 1 << RUN_BITS
 """Rows of a run: long enough to work on at once, short enough to waste little."""
 
 
@@ -33,7 +34,7 @@ def by_column_in_runs(wanted: Tensor) -> tuple[Tensor, Tensor]:
     rows = torch.arange(RUN)[:, None] * m
     places = torch.add(columns, runs, alpha=RUN * m) + rows
     chosen = _true(wanted.view(-1).index_select(0, places.view(-1)).view(RUN, -1))
-    run = chosen >> 4
+    run = chosen >> RUN_BITS
     rows = torch.add(chosen.bitwise_and_(RUN - 1), runs.index_select(0, run), alpha=RUN)
     return columns.index_select(0, run), rows
 

@@ -170,3 +170,18 @@ def test_a_gate_that_skips_nothing_is_not_taken_for_one_that_keeps_nothing(
     model.forget_estimator()
     step(model)
     assert model.guided_kept > 0.0
+
+
+def test_front_to_back_renders_the_same_pixels_from_fewer_samples(model: LecoModel) -> None:
+    with torch.no_grad():
+        model.field.density_head.bias.fill_(9.0)  # opaque everywhere
+    model.eval()
+    rendered = []
+    for model.config.front_to_back in (False, True):
+        torch.manual_seed(0)
+        rendered.append({name: value.detach() for name, value in step(model)[0].items()})
+    whole, seen = rendered
+    torch.testing.assert_close(seen["rgb"], whole["rgb"], atol=2e-4, rtol=0.0)
+    torch.testing.assert_close(seen["depth"], whole["depth"], atol=1e-3, rtol=1e-3)
+    fewer, all_of_them = (float(one["samples_per_ray"].mean()) for one in (seen, whole))
+    assert fewer < 0.5 * all_of_them
