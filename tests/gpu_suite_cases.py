@@ -19,6 +19,7 @@ import pytest
 import torch
 from gpu_scale import Scale
 
+from leco_plugin.occupancy import Occupancy
 from leco_plugin.samplers import fused, nerfacc_cpu
 
 CPU = torch.device("cpu")
@@ -59,8 +60,10 @@ def test_a_dry_run_does_every_part(stored: Path) -> None:
     assert list(results["parts"]) == list(gpu.PARTS) and results["dry"]
     assert results["machine"]["torch"] == torch.__version__
     assert {"driver", "cuda", "device"} <= set(results["machine"])
-    assert set(results["code"]) == {"version", "commit"}
+    assert set(results["code"]) == {"version", "commit", "sources"}
     parts = results["parts"]
+    assert parts["gate"]["running"].keys() == {"small gate", "large gate", "paper gate"}
+    assert parts["sampling"]["running"].keys() == {"march, box", "march, unbounded"}
     for name in ("gate", "sampling", "experts", "dense"):
         assert parts[name]["figures"], name
     learned, dense = parts["learned"], parts["dense"]
@@ -128,10 +131,22 @@ def test_without_a_gpu_nothing_is_measured_and_nothing_written(quick: list[str],
     assert quick == [] and sorted(gpu.RESULTS.rglob("*")) == before
 
 
-def test_a_dry_run_leaves_nothing_among_the_results(quick: list[str]) -> None:
+@pytest.mark.parametrize("name", ["gpu-card-20260101.json", "charts/gpu.json", "../results/a"])
+def test_a_dry_run_leaves_nothing_among_the_results(name: str, quick: list[str]) -> None:
     with pytest.raises(SystemExit):
-        gpu.main(["--dry-run", "--out", str(gpu.RESULTS / "gpu-card-20260101.json")])
+        gpu.main(["--dry-run", "--out", str(gpu.RESULTS / name)])
     assert quick == []
+
+
+def test_a_kernel_that_was_changed_is_other_code(tmp_path: Path, monkeypatch) -> None:
+    monkeypatch.setattr(gpu, "ROOT", tmp_path)
+    kernel = tmp_path / "leco_plugin" / "samplers" / "gate_kernel.py"
+    kernel.parent.mkdir(parents=True)
+    found = []
+    for text in ("one", "two", "one"):
+        kernel.write_text(text)
+        found.append(gpu.code())
+    assert found[0] == found[2] != found[1]
 
 
 def test_a_file_is_named_after_the_card_and_the_day(monkeypatch) -> None:
@@ -171,6 +186,16 @@ def test_without_nerfacc_the_torch_grid_is_compared(monkeypatch, capsys) -> None
     figures = gpu_sampling.sampling(DRY, {})["figures"]
     assert "no comparison with nerfacc" in capsys.readouterr().out
     assert not any("nerfacc" in figure["name"] for figure in figures)
+
+
+def test_a_gate_that_no_kernel_takes_is_said_to_be_answered_by_torch(monkeypatch) -> None:
+    def decided(occupancy: Occupancy, positions: torch.Tensor) -> torch.Tensor | None:
+        fits = occupancy.gate.config.width <= 128 and not fused._switch.off
+        return occupancy.query(positions) >= occupancy.threshold_value if fits else None
+
+    monkeypatch.setattr(fused, "decisions", decided)
+    running = gpu_parts.gate_throughput(DRY, {})["running"]
+    assert running == {"small gate": True, "large gate": True, "paper gate": False}
 
 
 def test_a_guided_run_skips(stored: Path) -> None:
