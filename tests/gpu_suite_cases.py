@@ -8,19 +8,25 @@ import shutil
 import subprocess
 import sys
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 
 import gpu
+import gpu_counts
 import gpu_parts
 import gpu_sampling
+import gpu_scale
 import gpu_training
 import pytest
 import torch
 from gpu_scale import Scale
+from sampling_scene import rays_into
 
 from leco_plugin.occupancy import Occupancy
 from leco_plugin.samplers import fused, nerfacc_cpu
+from leco_plugin.samplers.estimator import LearnedOccupancyEstimator
+from leco_plugin.samplers.marching import march, number
 
 CPU = torch.device("cpu")
 DRY = Scale(CPU).dry()
@@ -214,6 +220,43 @@ def test_a_guided_run_skips(stored: Path) -> None:
 def test_the_floors_on_paper_are_printed(capsys) -> None:
     runpy.run_path(str(gpu.RESULTS.parent / "gpu_paper.py"), run_name="__main__")
     assert "| paper | 305,152 | H100 SXM |" in capsys.readouterr().out
+
+
+def test_the_counts_on_paper_are_printed(monkeypatch, capsys) -> None:
+    small = replace(DRY, cache_bytes=1 << 20)
+    monkeypatch.setattr(gpu_scale, "Scale", lambda device: small)
+    runpy.run_path(str(gpu.RESULTS.parent / "gpu_counts.py"), run_name="__main__")
+    assert capsys.readouterr().out.startswith(f"Counted(rays={DRY.rays}, candidates=")
+
+
+@pytest.mark.parametrize("cone_angle", [0.0, 0.01])
+def test_stretches_are_those_in_which_the_twin_leaves_candidates_open(cone_angle: float) -> None:
+    *_, (_, occupancy, _) = gpu_sampling.scenes(DRY)
+    cache = LearnedOccupancyEstimator(occupancy, tolerance=1.0).cache
+    assert cache is not None
+    origins, directions = rays_into(occupancy.space, 20)
+    rays = origins, directions, torch.zeros(20), torch.linspace(0.0, 4.0, 20)
+    ray_indices, t_starts, t_ends = march(*rays, step_size=0.02, cone_angle=cone_angle)
+    middles = ((t_starts + t_ends) * 0.5)[:, None]
+    _, left_open = cache.decide(origins[ray_indices] + directions[ray_indices] * middles)
+    before = (
+        torch.bincount(ray_indices, minlength=20)
+        .cumsum(0)
+        .roll(1)
+        .index_fill_(0, torch.tensor([0]), 0)
+    )
+    numbers = torch.arange(len(ray_indices)) - before[ray_indices]
+    stretches = ray_indices * 1000 + numbers.div(gpu_counts.STEPS, rounding_mode="floor")
+    begun, near, asked = gpu_counts.stretches(cache, number(*rays, 0.02, cone_angle))
+    assert begun == len(stretches.unique()) >= near >= asked > 0
+    assert asked == len(stretches[left_open].unique())
+
+
+def test_stretches_are_as_long_as_the_kernels() -> None:
+    pytest.importorskip("triton")
+    from leco_plugin.samplers.march_kernel import STEPS
+
+    assert gpu_counts.STEPS == STEPS
 
 
 def test_the_suite_is_a_command(monkeypatch, quick: list[str]) -> None:
