@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import argparse
 import datetime
+import hashlib
 import json
 import re
 import shutil
@@ -28,7 +29,8 @@ from gpu_training import dense, learned
 from leco_plugin.evaluation.json_file import write_json
 from leco_plugin.evaluation.machine import describe_code, describe_machine
 
-RESULTS = Path(__file__).resolve().parent / "results"
+ROOT = Path(__file__).resolve().parent.parent
+RESULTS = ROOT / "benchmarks" / "results"
 LIMIT = 600.0
 """Seconds that a run may take."""
 
@@ -62,6 +64,15 @@ def driver() -> str | None:
     return next(iter(answered.stdout.split()), None)
 
 
+def code() -> dict[str, Any]:
+    """What was measured: a commit does not tell of a kernel that was changed since."""
+    digest = hashlib.sha256()
+    for folder in ("benchmarks", "leco_plugin"):
+        for path in sorted((ROOT / folder).rglob("*.py")):
+            digest.update(path.read_bytes())
+    return {**describe_code(), "sources": digest.hexdigest()[:12]}
+
+
 def results_path() -> Path:
     """Where this card's results of today belong."""
     name = re.sub(r"[^a-z0-9]+", "-", torch.cuda.get_device_name().lower()).strip("-")
@@ -71,7 +82,7 @@ def results_path() -> Path:
 def run(scale: Scale, out: Path | None, dry: bool) -> dict[str, Any]:
     """All parts that `out` does not hold yet; it is renewed after each."""
     about = {**describe_machine(), "driver": driver(), "cuda": torch.version.cuda}
-    results = {"format": 1, "dry": dry, "machine": about, "code": describe_code(), "parts": {}}
+    results = {"format": 1, "dry": dry, "machine": about, "code": code(), "parts": {}}
     results["parts"] = stored_parts(out, results)
     started = time.perf_counter()
     for name, part in PARTS.items():
@@ -87,7 +98,7 @@ def run(scale: Scale, out: Path | None, dry: bool) -> dict[str, Any]:
             print(f"{figure['name']}: {figure['value']:.3g} ({sign} {figure['bar']}) {verdict}")
         missing = [kernel for kernel, runs in measured.get("running", {}).items() if not runs]
         if missing and not dry:
-            print(f"{name}: torch answered in place of the fused {' and '.join(missing)}")
+            print(f"{name}: torch answered in place of the fused {', '.join(missing)}")
         if out is not None:
             write_json(out, results)
     return results
@@ -115,7 +126,7 @@ def main(arguments: list[str] | None = None) -> int:
     options = parser.parse_args(arguments)
     if options.dry_run:
         device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
-        if options.out is not None and options.out.resolve().parent == RESULTS:
+        if options.out is not None and options.out.resolve().is_relative_to(RESULTS):
             parser.error("a dry run leaves nothing among the results: give another --out")
         run(Scale(device).dry(), options.out, dry=True)
         print("dry run: every part ran; its figures mean nothing")

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
+from gpu_counts import STEPS, Counted
 from gpu_floor import Ceilings, floor_seconds, operations_per_position
 
 from leco_plugin.models.field import HMoEField
@@ -17,6 +18,22 @@ CARDS = {"H100 SXM": Ceilings(3.35e12, 989e12), "A100 SXM": Ceilings(2.04e12, 31
 """Data sheets: memory bandwidth, and dense bf16 products."""
 KEPT = (0.1, 0.25, 0.4)
 """Shares of the candidates that a guided step shades."""
+COUNTED = Counted(
+    rays=4096,
+    candidates=2_928_640,
+    stretches=94_208,
+    near=70_524,
+    asked=16_203,
+    kept=577_402,
+    cell_bytes=960_834,
+)
+"""What `gpu_counts.py` prints."""
+LAUNCHES = 2
+BYTES_OF_RAY, BYTES_KEPT = 4 * (6 + 5) + 8 * 3, 8 + 4 + 4
+"""In each launch: coordinates, numbers, where its samples begin and end, how many they are. Of a
+sample: its ray, its start, its end."""
+GRID_BYTES = 4 * 128**3
+"""One for each cell of four levels, if all are read."""
 PAIR, ROUND_TRIP = 2, 3
 """Operations of a multiplication with an addition; products of a step for one of its forward."""
 
@@ -110,5 +127,27 @@ def training_table(sizes: Sizes = PAPER, rays: int = 1024) -> str:
     return "\n".join(lines)
 
 
+def sampling_table(work: Counted = COUNTED, sizes: Sizes = SMALL) -> str:
+    """The suite's rays through unbounded space, with the gate and cells and with a grid."""
+    operations = LAUNCHES * work.asked * STEPS * operations_per_position(sizes.gate)
+    written = BYTES_KEPT * work.kept
+    moved = LAUNCHES * BYTES_OF_RAY * work.rays + written + work.cell_bytes
+    lines = [
+        "| card | by operations | by bytes | floor | grid 128^3 x 4, by bytes |",
+        "|---|---|---|---|---|",
+    ]
+    for card, ceilings in CARDS.items():
+        ours, bytes_moved, grid = (
+            1e6 * operations / ceilings.operations_per_second,
+            1e6 * moved / ceilings.bytes_per_second,
+            1e6 * (written + GRID_BYTES) / ceilings.bytes_per_second,
+        )
+        floor = max(ours, bytes_moved)
+        lines.append(
+            f"| {card} | {ours:.1f} us | {bytes_moved:.1f} us | {floor:.1f} us | {grid:.1f} us |"
+        )
+    return "\n".join(lines)
+
+
 if __name__ == "__main__":
-    print(gate_table(), training_table(), sep="\n\n")
+    print(gate_table(), training_table(), sampling_table(), sep="\n\n")

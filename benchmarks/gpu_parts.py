@@ -7,6 +7,7 @@ from typing import Any
 
 import torch
 from gpu_floor import floor_seconds, measure_ceilings, seconds
+from gpu_sampling import march_answers
 from gpu_scale import Scale, figure
 from gpu_training import peak_of
 from sampling_scene import fit_occupancy, rays_into
@@ -68,12 +69,12 @@ def correctness(scale: Scale, before: dict[str, Any]) -> dict[str, Any]:
     for name, share in differing.items():
         if share > MOST_OTHERWISE:
             raise RuntimeError(f"the fused march is wrong ({name}): {share:.2%} of what it keeps")
-    return {"gates": found, "march": differing, "running": running(scale.device)}
+    return {"gates": found, "march": differing, "running": {"march": march_answers(learned)}}
 
 
-def running(device: torch.device) -> dict[str, bool]:
-    """Which kernels answer on this device; where one does not, figures are those of its twin."""
-    return {name: fused.ready(device, name) for name in ("gate", "march")}
+def gate_answers(occupancy: Occupancy, device: torch.device) -> bool:
+    """Whether the fused gate answers for an occupancy; if not, figures are those of its twin."""
+    return fused.decisions(occupancy, torch.zeros(1, 3, device=device)) is not None
 
 
 def decisions_differ(config: GateConfig, scale: Scale) -> dict[str, float]:
@@ -110,11 +111,12 @@ def numbers_of(samples: tuple[Tensor, Tensor, Tensor]) -> Tensor:
 def gate_throughput(scale: Scale, before: dict[str, Any]) -> dict[str, Any]:
     """The fused gate against its floor and against the eager twin in bf16."""
     ceilings = measure_ceilings(scale.device, scale.matrix, scale.rounds)
-    figures = []
+    figures, running = [], {}
     for name in ("small", "large", "paper"):
         config = gates()[name]
         occupancy = random_occupancy(config, scale.device)
         places = torch.randn(scale.positions, 3, device=scale.device)
+        running[f"{name} gate"] = gate_answers(occupancy, scale.device)
         ours = seconds(lambda o=occupancy, p=places: o.occupied(p), scale.device, scale.rounds)
         with fused.twins_only():
             twin = seconds(lambda o=occupancy, p=places: o.occupied(p), scale.device, scale.rounds)
@@ -126,7 +128,7 @@ def gate_throughput(scale: Scale, before: dict[str, Any]) -> dict[str, Any]:
             ),
             figure(f"{title}: eager twin / fused", twin / ours, 5.0, False, fused=ours, twin=twin),
         ]
-    return {"ceilings": vars(ceilings), "running": running(scale.device), "figures": figures}
+    return {"ceilings": vars(ceilings), "running": running, "figures": figures}
 
 
 def experts(scale: Scale, before: dict[str, Any]) -> dict[str, Any]:

@@ -20,6 +20,7 @@ from leco_plugin.occupancy import Occupancy
 from leco_plugin.samplers import fused
 from leco_plugin.samplers.estimator import LearnedOccupancyEstimator, cell_centers
 from leco_plugin.samplers.grid import OccupancyGridEstimator
+from leco_plugin.samplers.marching import number
 from leco_plugin.space import Space
 
 POINTS, AT_ONCE, HALVINGS = 4, 1 << 20, 12
@@ -29,7 +30,7 @@ a cell is marked is halved in on."""
 
 def sampling(scale: Scale, before: dict[str, Any]) -> dict[str, Any]:
     """The fused march against its twin and against grids of one and of four levels."""
-    figures, kept, cells = [], {}, {}
+    figures, kept, cells, running = [], {}, {}, {}
     for levels, occupancy, options in scenes(scale):
         learned = LearnedOccupancyEstimator(
             occupancy, cache_bytes=scale.cache_bytes, tolerance=scale.tolerance
@@ -45,6 +46,7 @@ def sampling(scale: Scale, before: dict[str, Any]) -> dict[str, Any]:
         space = "box" if levels == 1 else "unbounded"
         kept[f"learned, {space}"] = len(sample(learned)[0])
         cells[space] = None if learned.cache is None else vars(learned.cache.report)
+        running[f"march, {space}"] = march_answers(learned)
         ours = time(learned)
         with fused.twins_only():
             twin = time(learned)
@@ -57,7 +59,16 @@ def sampling(scale: Scale, before: dict[str, Any]) -> dict[str, Any]:
             kept[f"{name}, {space}"] = len(sample(grid)[0])
             title = f"sampling {scale.rays} rays, {space}: learned / {name}"
             figures.append(figure(title, ours / theirs, 1.0, True, learned=ours, grid=theirs))
-    return {"kept": kept, "cells": cells, "figures": figures}
+    return {"kept": kept, "cells": cells, "running": running, "figures": figures}
+
+
+def march_answers(learned: LearnedOccupancyEstimator) -> bool:
+    """Whether the fused march answers for an estimator, and not its twin."""
+    points = torch.zeros(1, 3, device=learned.device), torch.ones(1, 3, device=learned.device)
+    limits = torch.zeros(1, device=learned.device), torch.ones(1, device=learned.device)
+    occupancy, cache = learned.occupancy, learned.cache
+    rays = *points, *limits
+    return fused.march(occupancy, cache, learned.device, lambda: number(*rays, 0.5)) is not None
 
 
 def scenes(scale: Scale) -> Iterator[tuple[int, Occupancy, dict[str, Any]]]:

@@ -158,6 +158,9 @@ def gpu_table(results: dict[str, Any]) -> str:
             f"| {figure['name']} | {figure['value']:.3g} | {sign} {figure['bar']:g} "
             f"| {'yes' if figure['reached'] else '**no**'} | {times} |"
         )
+    for name, part in results["parts"].items():
+        if missing := [kernel for kernel, runs in part.get("running", {}).items() if not runs]:
+            rows += ["", f"Part {name}: torch answered in place of the fused {', '.join(missing)}."]
     return "\n".join(rows)
 
 

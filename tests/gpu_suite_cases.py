@@ -8,18 +8,25 @@ import shutil
 import subprocess
 import sys
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 
 import gpu
+import gpu_counts
 import gpu_parts
 import gpu_sampling
+import gpu_scale
 import gpu_training
 import pytest
 import torch
 from gpu_scale import Scale
+from sampling_scene import rays_into
 
+from leco_plugin.occupancy import Occupancy
 from leco_plugin.samplers import fused, nerfacc_cpu
+from leco_plugin.samplers.estimator import LearnedOccupancyEstimator
+from leco_plugin.samplers.marching import march, number
 
 CPU = torch.device("cpu")
 DRY = Scale(CPU).dry()
@@ -59,8 +66,10 @@ def test_a_dry_run_does_every_part(stored: Path) -> None:
     assert list(results["parts"]) == list(gpu.PARTS) and results["dry"]
     assert results["machine"]["torch"] == torch.__version__
     assert {"driver", "cuda", "device"} <= set(results["machine"])
-    assert set(results["code"]) == {"version", "commit"}
+    assert set(results["code"]) == {"version", "commit", "sources"}
     parts = results["parts"]
+    assert parts["gate"]["running"].keys() == {"small gate", "large gate", "paper gate"}
+    assert parts["sampling"]["running"].keys() == {"march, box", "march, unbounded"}
     for name in ("gate", "sampling", "experts", "dense"):
         assert parts[name]["figures"], name
     learned, dense = parts["learned"], parts["dense"]
@@ -128,10 +137,22 @@ def test_without_a_gpu_nothing_is_measured_and_nothing_written(quick: list[str],
     assert quick == [] and sorted(gpu.RESULTS.rglob("*")) == before
 
 
-def test_a_dry_run_leaves_nothing_among_the_results(quick: list[str]) -> None:
+@pytest.mark.parametrize("name", ["gpu-card-20260101.json", "charts/gpu.json", "../results/a"])
+def test_a_dry_run_leaves_nothing_among_the_results(name: str, quick: list[str]) -> None:
     with pytest.raises(SystemExit):
-        gpu.main(["--dry-run", "--out", str(gpu.RESULTS / "gpu-card-20260101.json")])
+        gpu.main(["--dry-run", "--out", str(gpu.RESULTS / name)])
     assert quick == []
+
+
+def test_a_kernel_that_was_changed_is_other_code(tmp_path: Path, monkeypatch) -> None:
+    monkeypatch.setattr(gpu, "ROOT", tmp_path)
+    kernel = tmp_path / "leco_plugin" / "samplers" / "gate_kernel.py"
+    kernel.parent.mkdir(parents=True)
+    found = []
+    for text in ("one", "two", "one"):
+        kernel.write_text(text)
+        found.append(gpu.code())
+    assert found[0] == found[2] != found[1]
 
 
 def test_a_file_is_named_after_the_card_and_the_day(monkeypatch) -> None:
@@ -173,6 +194,16 @@ def test_without_nerfacc_the_torch_grid_is_compared(monkeypatch, capsys) -> None
     assert not any("nerfacc" in figure["name"] for figure in figures)
 
 
+def test_a_gate_that_no_kernel_takes_is_said_to_be_answered_by_torch(monkeypatch) -> None:
+    def decided(occupancy: Occupancy, positions: torch.Tensor) -> torch.Tensor | None:
+        fits = occupancy.gate.config.width <= 128 and not fused._switch.off
+        return occupancy.query(positions) >= occupancy.threshold_value if fits else None
+
+    monkeypatch.setattr(fused, "decisions", decided)
+    running = gpu_parts.gate_throughput(DRY, {})["running"]
+    assert running == {"small gate": True, "large gate": True, "paper gate": False}
+
+
 def test_a_guided_run_skips(stored: Path) -> None:
     scene = gpu_training.photographed(DRY.city, DRY.capture, CPU)
     run = gpu_training.Run(scene, DRY, homogeneous=False)
@@ -189,6 +220,43 @@ def test_a_guided_run_skips(stored: Path) -> None:
 def test_the_floors_on_paper_are_printed(capsys) -> None:
     runpy.run_path(str(gpu.RESULTS.parent / "gpu_paper.py"), run_name="__main__")
     assert "| paper | 305,152 | H100 SXM |" in capsys.readouterr().out
+
+
+def test_the_counts_on_paper_are_printed(monkeypatch, capsys) -> None:
+    small = replace(DRY, cache_bytes=1 << 20)
+    monkeypatch.setattr(gpu_scale, "Scale", lambda device: small)
+    runpy.run_path(str(gpu.RESULTS.parent / "gpu_counts.py"), run_name="__main__")
+    assert capsys.readouterr().out.startswith(f"Counted(rays={DRY.rays}, candidates=")
+
+
+@pytest.mark.parametrize("cone_angle", [0.0, 0.01])
+def test_stretches_are_those_in_which_the_twin_leaves_candidates_open(cone_angle: float) -> None:
+    *_, (_, occupancy, _) = gpu_sampling.scenes(DRY)
+    cache = LearnedOccupancyEstimator(occupancy, tolerance=1.0).cache
+    assert cache is not None
+    origins, directions = rays_into(occupancy.space, 20)
+    rays = origins, directions, torch.zeros(20), torch.linspace(0.0, 4.0, 20)
+    ray_indices, t_starts, t_ends = march(*rays, step_size=0.02, cone_angle=cone_angle)
+    middles = ((t_starts + t_ends) * 0.5)[:, None]
+    _, left_open = cache.decide(origins[ray_indices] + directions[ray_indices] * middles)
+    before = (
+        torch.bincount(ray_indices, minlength=20)
+        .cumsum(0)
+        .roll(1)
+        .index_fill_(0, torch.tensor([0]), 0)
+    )
+    numbers = torch.arange(len(ray_indices)) - before[ray_indices]
+    stretches = ray_indices * 1000 + numbers.div(gpu_counts.STEPS, rounding_mode="floor")
+    begun, near, asked = gpu_counts.stretches(cache, number(*rays, 0.02, cone_angle))
+    assert begun == len(stretches.unique()) >= near >= asked > 0
+    assert asked == len(stretches[left_open].unique())
+
+
+def test_stretches_are_as_long_as_the_kernels() -> None:
+    pytest.importorskip("triton")
+    from leco_plugin.samplers.march_kernel import STEPS
+
+    assert gpu_counts.STEPS == STEPS
 
 
 def test_the_suite_is_a_command(monkeypatch, quick: list[str]) -> None:

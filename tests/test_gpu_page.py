@@ -20,6 +20,7 @@ def test_the_floors_on_paper_are_those_that_are_counted(monkeypatch) -> None:
     paper = importlib.import_module("gpu_paper")
     assert paper.gate_table() in PAGE
     assert paper.training_table() in PAGE
+    assert paper.sampling_table() in PAGE
 
 
 def test_the_page_says_of_every_part_how_long_it_may_take(monkeypatch) -> None:

@@ -129,6 +129,12 @@ def test_a_figure_is_shown_with_its_floor_beside_it(benchmarks) -> None:
     assert row == "| gate: floor / fused | 0.6 | >= 0.5 | yes | fused 2, floor 1 |"
 
 
+def test_figures_of_a_twin_are_shown_as_its_own(benchmarks) -> None:
+    parts = {"gate": {"running": {"gate": True, "march": False}, "figures": []}}
+    table = load("results_page").gpu_table({"parts": parts})
+    assert table.endswith("Part gate: torch answered in place of the fused march.")
+
+
 def test_the_floor_is_the_larger_of_bytes_and_operations(benchmarks) -> None:
     module = load("gpu_floor")
     config = GateConfig(EncodingConfig(octaves=6), width=64, layers=3, scene_experts=4)

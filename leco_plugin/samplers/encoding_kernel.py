@@ -18,6 +18,9 @@ from leco_plugin.samplers.gate_weights import HASH, VM
 
 _HASH, _VM = tl.constexpr(HASH), tl.constexpr(VM)
 _PRIME_Y, _PRIME_Z = tl.constexpr(2654435761 - 2**32), tl.constexpr(805459861)
+_ROUNDING = tl.constexpr(1.5 * 2**23)
+"""Added to a number below 2^22 it leaves the nearest whole one, whose last bit says whether it is
+odd; rounding instructions run at an eighth of the rate of additions."""
 
 
 @triton.jit
@@ -37,9 +40,9 @@ def frequencies(u, v, w, OCTAVES: tl.constexpr, COLUMNS: tl.constexpr):
 @triton.jit
 def _turned(half_turns):
     """sin(pi y) and cos(pi y), to 1e-7."""
-    whole = tl.floor(half_turns + 0.5)
-    part = half_turns - whole
-    sign = 1.0 - 2.0 * (whole - 2.0 * tl.floor(whole * 0.5))
+    shifted = half_turns + _ROUNDING
+    part = half_turns - (shifted - _ROUNDING)
+    odd = shifted.to(tl.int32, bitcast=True) << 31
     square = part * part
     sine = tl.fma(square, 0.07765766030370826, -0.5982912856197324)
     sine = tl.fma(square, sine, 2.5500775232145423)
@@ -49,7 +52,12 @@ def _turned(half_turns):
     cosine = tl.fma(square, cosine, 4.058411352862603)
     cosine = tl.fma(square, cosine, -4.934792830619646)
     cosine = tl.fma(square, cosine, 0.9999999532476083)
-    return sign * part * sine, sign * cosine
+    return _signed(part * sine, odd), _signed(cosine, odd)
+
+
+@triton.jit
+def _signed(values, sign_bits):
+    return (values.to(tl.int32, bitcast=True) ^ sign_bits).to(tl.float32, bitcast=True)
 
 
 @triton.jit

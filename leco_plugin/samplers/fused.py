@@ -87,7 +87,9 @@ def decisions(occupancy: nn.Module, positions: Tensor) -> Tensor | None:
     if not ready(positions.device) or positions.dtype != torch.float32:
         return None
     weights = weights_of(occupancy)
-    if weights is None or not trusted(occupancy, weights):
+    if weights is None or weights.facts.device != positions.device:  # torch names the mismatch
+        return None
+    if not trusted(occupancy, weights):
         return None
 
     def ask() -> Tensor:
@@ -146,7 +148,9 @@ def march(
     if not (ready(device) and ready(device, "march")):
         return None
     weights = weights_of(occupancy)
-    if weights is None or weights.padded_width > WIDEST_MARCH or not trusted(occupancy, weights):
+    if weights is None or weights.facts.device != device or weights.padded_width > WIDEST_MARCH:
+        return None
+    if not trusted(occupancy, weights):
         return None
     candidates = plan()
     if candidates.counts.dtype != torch.float32 or not growth_fits(candidates):

@@ -50,6 +50,17 @@ def largest_of(u, v, w):
 
 
 @triton.jit
+def _once(values):
+    """The same, of which the compiler does not know that it could compute them again: every thread
+    that needs a position would map it for itself, with seven divisions."""
+    if _INTERPRETED:
+        return values
+    return tl.inline_asm_elementwise(
+        "mov.b32 $0, $1;", "=r,r", [values], dtype=tl.float32, is_pure=False, pack=1
+    )
+
+
+@triton.jit
 def _multiplied(features, matrix, sums, HALF: tl.constexpr):
     """sums + features matrix, with the features rounded to the type of the matrix."""
     if HALF:
@@ -143,6 +154,7 @@ def gate_keeps(
     """The gate's decisions about positions [ROWS]."""
     u, v, w, inside = mapped_of(x, y, z, facts, CONTRACTED)
     u, v, w = tl.where(inside, u, 0.0), tl.where(inside, v, 0.0), tl.where(inside, w, 0.0)
+    u, v, w = _once(u), _once(v), _once(w)
 
     sums = tl.zeros((ROWS, PADDED), tl.float32)
     if KIND == _FREQUENCY:

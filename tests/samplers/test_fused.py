@@ -187,6 +187,18 @@ def test_kernels_are_launched_where_their_tensors_are() -> None:
     assert isinstance(there, torch.cuda.device) and there.idx == 1
 
 
+def test_positions_on_another_device_are_no_failure_of_a_kernel(steep, monkeypatch) -> None:
+    monkeypatch.setattr(fused, "ready", lambda device, name="gate": name not in fused._switch.off)
+    elsewhere = torch.device("meta")
+    assert fused.decisions(steep.occupancy, torch.empty(9, 3, device=elsewhere)) is None
+
+    def plan() -> Candidates:
+        raise AssertionError("nothing is planned")
+
+    assert fused.march(steep.occupancy, steep.cache, elsewhere, plan) is None
+    assert not fused._switch.off
+
+
 def test_rays_without_an_end_are_no_failure_of_a_kernel() -> None:
     def endless() -> None:
         raise TooManyCandidates("over 2^24 steps")
