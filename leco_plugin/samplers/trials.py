@@ -13,9 +13,11 @@ from leco_plugin.samplers.cache import CellCache
 from leco_plugin.samplers.gate_weights import GateWeights
 from leco_plugin.samplers.marching import Samples, march, number
 
-CHECKED, MOST_OTHERWISE = 4096, 20
-"""Positions that a gate's kernel is tried on, and of how many a kernel may decide otherwise than
-the twin; a steep gate turns single roundings into decisions."""
+CHECKED = 4096
+"""Positions that a gate's kernel is tried on."""
+OTHERWISE = 0.02
+"""How much of what the twin keeps a kernel may decide otherwise; a steep gate turns single
+roundings into decisions."""
 NEAR_THRESHOLD = {True: 0.02, False: 2e-4}
 """Distance of o(x) from the threshold within which a decision is not counted; by whether products
 are bfloat16."""
@@ -34,8 +36,9 @@ def try_gate(occupancy: nn.Module, weights: GateWeights) -> None:
     positions = _places(weights, CHECKED)
     kept = gate_decisions(weights, positions)
     o = occupancy.query(positions)  # type: ignore[operator]
-    wrong = int((_far(o, weights) & (kept != (o >= weights.facts[10]))).sum())
-    if wrong > MOST_OTHERWISE:
+    by_twin = o >= weights.facts[10]
+    wrong = int((_far(o, weights) & (kept != by_twin)).sum())
+    if wrong > _most_otherwise(int(by_twin.sum())):
         raise ValueError(f"it decides otherwise about {wrong} of {CHECKED} positions")
 
 
@@ -94,7 +97,12 @@ def _kept_otherwise(
     middles = ((t_starts + t_ends) * 0.5).float()[:, None]
     o = occupancy.query(origins[which] + directions[which] * middles)  # type: ignore[operator]
     wrong = int(_far(o, weights).sum())
-    return wrong if wrong > MOST_OTHERWISE else 0
+    return wrong if wrong > _most_otherwise(len(others)) else 0
+
+
+def _most_otherwise(kept: int) -> int:
+    """Decisions that may differ where the twin keeps so many."""
+    return max(2, int(OTHERWISE * kept))
 
 
 def _numbers(samples: Samples, step_size: float) -> Tensor:
