@@ -74,9 +74,20 @@ def code() -> dict[str, Any]:
 
 
 def results_path() -> Path:
-    """Where this card's results of today belong."""
+    """Where this card's results belong: beside those of today, or where a run was cut off."""
     name = re.sub(r"[^a-z0-9]+", "-", torch.cuda.get_device_name().lower()).strip("-")
-    return RESULTS / f"gpu-{name}-{datetime.date.today():%Y%m%d}.json"
+    earlier = [path for path in RESULTS.glob(f"gpu-{name}-*.json") if is_unfinished(path)]
+    today = RESULTS / f"gpu-{name}-{datetime.date.today():%Y%m%d}.json"
+    return max(earlier, default=today)
+
+
+def is_unfinished(path: Path) -> bool:
+    """Whether a file holds some parts only, of the code that is here."""
+    try:
+        stored = json.loads(path.read_text())
+        return stored["code"] == code() and set(stored["parts"]) < set(PARTS)
+    except (ValueError, KeyError, TypeError):
+        return False
 
 
 def run(scale: Scale, out: Path | None, dry: bool) -> dict[str, Any]:

@@ -66,7 +66,7 @@ class Scale:
             matrix=64,
             rounds=2,
             fit_steps=20,
-            cache_bytes=1 << 16,
+            cache_bytes=1 << 18,
             tolerance=1.0,
             sizes=TINY,
             learning=1.0,

@@ -264,3 +264,21 @@ def test_the_suite_is_a_command(monkeypatch, quick: list[str]) -> None:
     with pytest.raises(SystemExit) as ended:
         runpy.run_path(str(gpu.RESULTS.parent / "gpu.py"), run_name="__main__")
     assert ended.value.code == 0
+
+
+def test_a_run_that_was_cut_off_at_midnight_goes_on_in_its_own_file(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(gpu, "RESULTS", tmp_path)
+    monkeypatch.setattr(torch.cuda, "get_device_name", lambda: "NVIDIA Some Card")
+    today = gpu.results_path()
+    assert today.name.startswith("gpu-nvidia-some-card-")
+    yesterdays = tmp_path / "gpu-nvidia-some-card-20010101.json"
+    contents = {"code": gpu.code(), "parts": {next(iter(gpu.PARTS)): {}}}
+    yesterdays.write_text(json.dumps(contents))
+    assert gpu.results_path() == yesterdays
+    for other in ({"code": {}}, {"parts": dict.fromkeys(gpu.PARTS)}):
+        yesterdays.write_text(json.dumps(contents | other))
+        assert gpu.results_path() == today
+    yesterdays.write_text("cut")
+    assert gpu.results_path() == today
