@@ -1,7 +1,7 @@
 """What teaches the gate: the paper's two losses and the same two forces in logit form.
 
 Beside them stands the distortion loss of the field. All of them run in float32 and are means
-over the points given, so that their weights do not depend on the batch.
+over the points given, so that their weights do not depend on the batch; of no points they are zero.
 """
 
 from __future__ import annotations
@@ -41,7 +41,8 @@ def imbalanced_gate_loss(probabilities: Tensor, routes: Tensor, empty_ratio: flo
         (num_experts,), (num_experts - 1) / (1.0 - empty_ratio), device=probabilities.device
     )
     weights[EMPTY] = 1.0 / empty_ratio
-    return (weights * expert_shares(routes, num_experts) * probabilities.mean(dim=0)).sum()
+    means = probabilities.sum(dim=0) / max(len(probabilities), 1)
+    return (weights * expert_shares(routes, num_experts) * means).sum()
 
 
 def balance_loss(probabilities: Tensor, routes: Tensor) -> Tensor:
@@ -75,7 +76,7 @@ def density_loss(empty_probability: Tensor, alphas: Tensor) -> Tensor:
         empty_probability: [N] G_0(x).
         alphas: [N] opacity 1 - exp(-sigma delta) of each sample.
     """
-    return (empty_probability * alphas.detach()).mean()
+    return (empty_probability * alphas.detach()).sum() / max(len(alphas), 1)
 
 
 def contribution_loss(
@@ -94,10 +95,9 @@ def contribution_loss(
     """
     target = (weights.detach() / weight_at_full).clamp(max=1.0)
     occupied = occupancy_logit(logits)
-    return (
-        emphasis * target * torch.nn.functional.softplus(-occupied)
-        + (1.0 - target) * torch.nn.functional.softplus(occupied)
-    ).mean()
+    losses = emphasis * target * torch.nn.functional.softplus(-occupied)
+    losses = losses + (1.0 - target) * torch.nn.functional.softplus(occupied)
+    return losses.sum() / max(len(losses), 1)
 
 
 def agreement_loss(weights: Tensor, occupancies: Tensor, empty_below: float) -> Tensor:

@@ -173,3 +173,16 @@ def test_agreement_teaches_the_field_alone_and_only_where_the_gate_says_empty() 
     torch.testing.assert_close(weights.grad, torch.tensor([1.0, 0.5, 0.0]))
     assert occupancies.grad is None
     torch.testing.assert_close(loss.detach(), torch.tensor(0.75))
+
+
+def test_a_batch_without_points_teaches_nothing() -> None:
+    logits, none = torch.zeros(0, 3, requires_grad=True), torch.zeros(0)
+    routes = torch.zeros(0, dtype=torch.int64)
+    losses = [
+        contribution_loss(logits, none),
+        density_loss(logits.softmax(dim=-1)[:, 0], none),
+        imbalanced_gate_loss(logits.softmax(dim=-1), routes, 0.9),
+    ]
+    for loss in losses:
+        assert loss.item() == 0.0
+        loss.backward()
