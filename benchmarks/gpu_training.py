@@ -23,10 +23,10 @@ from leco_plugin.models.calibration import (
     Measured,
     Reference,
     calibrate,
-    near_median_depth,
+    reference_of,
 )
 from leco_plugin.models.field import HMoEField
-from leco_plugin.models.gate import Gate, occupancy_from_logits
+from leco_plugin.models.gate import Gate
 from leco_plugin.models.losses import distortion_loss
 from leco_plugin.models.objective import GateLossConfig, gate_losses
 from leco_plugin.models.phases import ScheduleConfig, ramp
@@ -35,7 +35,6 @@ from leco_plugin.models.rendering import (
     Rays,
     Routing,
     Shaded,
-    backdrop_of,
     shade,
     with_backdrop,
 )
@@ -169,14 +168,7 @@ class Run:
         """All candidates of rays, rendered."""
         intervals = self.intervals_of(rays, self.scale.sizes.candidates, jittered=False)
         shaded = self.shaded(rays, intervals)
-        return Reference(
-            intervals,
-            shaded.weights,
-            occupancy_from_logits(shaded.logits),
-            near_median_depth(shaded, intervals),
-            shaded.rgb,
-            backdrop_of(intervals, rays),
-        )
+        return reference_of(shaded, intervals, rays)
 
     @torch.no_grad()
     def psnr(self) -> float:

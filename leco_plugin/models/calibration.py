@@ -13,7 +13,8 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from leco_plugin.models.rendering import Intervals, Shaded
+from leco_plugin.models.gate import occupancy_from_logits
+from leco_plugin.models.rendering import Intervals, Rays, Shaded, backdrop_of
 from leco_plugin.samplers.packed import accumulate_along_rays, inclusive_sum
 
 THRESHOLDS = tuple(0.75 * 0.8**i for i in range(32))
@@ -73,6 +74,18 @@ class Reference(NamedTuple):
     """[R, 3] rendered."""
     always_kept: Tensor
     """[M] bool: the backdrop, which no threshold skips."""
+
+
+def reference_of(shaded: Shaded, intervals: Intervals, rays: Rays) -> Reference:
+    """The reference that a rendering of all candidates is."""
+    return Reference(
+        intervals,
+        shaded.weights,
+        occupancy_from_logits(shaded.logits),
+        near_median_depth(shaded, intervals),
+        shaded.rgb,
+        backdrop_of(intervals, rays),
+    )
 
 
 def near_median_depth(shaded: Shaded, intervals: Intervals) -> Tensor:

@@ -25,20 +25,18 @@ class Places:
 
     sizes: list[int]
     """Rows of each key, filling included; they sum up to P."""
-    counts: list[int]
-    """Rows of each key without."""
 
     def __init__(self, keys: Tensor, num_keys: int) -> None:
         device = keys.device
         sources = keys.argsort(stable=True)
-        self.counts = torch.bincount(keys, minlength=num_keys).tolist()  # one synchronisation
-        self.sizes = [steady_size(count, device.type) for count in self.counts]
+        counts = torch.bincount(keys, minlength=num_keys).tolist()  # one synchronisation
+        self.sizes = [steady_size(count, device.type) for count in counts]
         numbers = torch.arange(len(keys), device=device)
         self.filling: list[slice] = []
-        if self.sizes == self.counts:
+        if self.sizes == counts:
             self.sources, slots = sources, numbers
         else:
-            filled = [size - count for size, count in zip(self.sizes, self.counts)]
+            filled = [size - count for size, count in zip(self.sizes, counts)]
             ends = torch.tensor(self.sizes).cumsum(0).tolist()
             self.filling = [slice(end - rows, end) for end, rows in zip(ends, filled) if rows]
             before = (torch.tensor(filled).cumsum(0) - torch.tensor(filled)).to(device)

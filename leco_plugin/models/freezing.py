@@ -14,11 +14,10 @@ from leco_plugin.models.calibration import (
     Measured,
     Reference,
     calibrate,
-    near_median_depth,
+    reference_of,
 )
-from leco_plugin.models.gate import occupancy_from_logits
 from leco_plugin.models.ranks import from_first, say, share
-from leco_plugin.models.rendering import Intervals, Rays, backdrop_of
+from leco_plugin.models.rendering import Intervals, Rays
 from leco_plugin.occupancy import Occupancy
 from leco_plugin.scenes.frames import frame_of
 from leco_plugin.scenes.held_out_pixels import HeldOutPixelSampler, some_images
@@ -222,11 +221,4 @@ def dense_reference(model: LecoModel, rays: Rays) -> Reference:
     """All candidates of some rays rendered, as the reference that skipping is measured against."""
     intervals = model.intervals_of(rays, guided=False, learning=False)
     shaded = model.shade(rays, intervals)
-    return Reference(
-        intervals,
-        shaded.weights,
-        occupancy_from_logits(shaded.logits),
-        near_median_depth(shaded, intervals),
-        shaded.rgb,
-        backdrop_of(intervals, rays),
-    )
+    return reference_of(shaded, intervals, rays)

@@ -118,8 +118,7 @@ class GuidedStart:
             check_gate(guide.sampler, learned or config.learning.sizes.gate)
         except ValueError as error:
             raise InputError(str(error)) from None
-        if guide.occupancy is not None:
-            self._fit(guide.occupancy)
+        self.kept = None if guide.occupancy is None else self._fit(guide.occupancy)
 
     def before_step(self, step: int) -> None:
         """Learns the occupancy if there is none yet; leaves its file in the run's folder."""
@@ -135,14 +134,16 @@ class GuidedStart:
             )
             self.guide.set_occupancy(occupancy)
         if step == 0 and self.config.opaque_start:
-            cameras = self.pipeline.datamanager.train_dataset.cameras
-            begin_opaque(self.host, self.guide, kept_of_rays(self.guide, cameras)[0])
+            kept = self.kept
+            if kept is None:
+                kept, _ = kept_of_rays(self.guide, self.pipeline.datamanager.train_dataset.cameras)
+            begin_opaque(self.host, self.guide, kept)
         if self.trainer is not None and is_first():
             leave_file(self.guide.the_occupancy(), Path(self.trainer.base_dir))
 
-    def _fit(self, occupancy: Occupancy) -> None:
+    def _fit(self, occupancy: Occupancy) -> Tensor:
         """Finds how the occupancy's coordinates lie in the host's, and whether they are of one
-        scene."""
+        scene; returns how much it keeps of rays, as `kept_of_rays` does."""
         manager = self.pipeline.datamanager
         learned_in, host = occupancy.report.get("frame"), frame_of(manager)
         if learned_in is not None and host is not None:
@@ -158,6 +159,7 @@ class GuidedStart:
         learning = self.config.learning
         announce(survey(manager, learning.bounds, learning.near, learning.far))
         say(f"guided by an occupancy that keeps {share:.1%} along these rays")
+        return kept
 
 
 @torch.no_grad()
