@@ -88,7 +88,7 @@ def measure(way: str, folder: Path, steps: int) -> dict[str, Any]:
 
     from leco_plugin.evaluation.peak_memory import peak_process_bytes
     from leco_plugin.models.learn_first import learn_occupancy
-    from leco_plugin.models.leco import LecoModelConfig
+    from leco_plugin.models.leco_config import LecoModelConfig
     from leco_plugin.models.phases import ScheduleConfig
     from leco_plugin.scenes.data_manager import LecoDataManagerConfig, decoded_bytes
     from leco_plugin.scenes.known_distances import KnownDistancePixelSamplerConfig

@@ -12,7 +12,7 @@ from nerfstudio.pipelines.base_pipeline import VanillaPipelineConfig
 from nerfstudio.plugins.types import MethodSpecification
 
 from leco_plugin.compat.data_parallel import DataParallelTrainerConfig
-from leco_plugin.models.leco import LecoModelConfig
+from leco_plugin.models.leco_config import LecoModelConfig
 from leco_plugin.models.optimizers import RATES, FusedAdamConfig
 from leco_plugin.models.phases import ScheduleConfig
 from leco_plugin.models.sizes import PAPER, automatic, sizes_for

@@ -93,7 +93,7 @@ def with_sampler_swapped(
     Raises:
         InputError: the model learns or has an occupancy already.
     """
-    from leco_plugin.models.leco import LecoModelConfig
+    from leco_plugin.models.leco_config import LecoModelConfig
 
     pipeline: Any = copy.deepcopy(config.pipeline)
     host = pipeline.model

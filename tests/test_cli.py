@@ -82,6 +82,10 @@ def test_city_writes_a_scene_and_says_so(tmp_path: Path) -> None:
     facts = json.loads(report.read_text())
     assert facts["images"] == len(list((out / "images").iterdir()))
     assert 0 < facts["test_images"] < facts["images"]
+    aerial = tmp_path / "aerial"
+    assert run("city", "--blocks", 1, "--out", aerial, "--aerial-only", "--json", report) == 0
+    assert json.loads(report.read_text())["images"] < facts["images"]
+    assert json.loads((aerial / "city.json").read_text())["capture"]["street_per_block"] == 0.0
 
 
 @pytest.fixture

@@ -63,6 +63,7 @@ def make_chart(
     protocol = Protocol(seconds, steps, learn_seconds, images)
     named = {"methods": methods, "samplers": samplers, "seeds": seeds}
     chosen = {"suite": suite, "seconds": seconds, "steps": steps, "learn-seconds": learn_seconds}
+    chosen["images"] = images
     command = command_line(data, chosen, named)
     chart = Chart(data, out, compared, seeds, protocol, about, command)
     say = functools.partial(CONSOLE.print, markup=False, highlight=False)

@@ -44,7 +44,7 @@ def with_sizes_of(config: Any, checkpoint: Path | None) -> Any:
     Raises:
         InputError: a size has been set by hand, and the run has another one.
     """
-    from leco_plugin.models.leco import LecoModelConfig
+    from leco_plugin.models.leco_config import LecoModelConfig
 
     model = config.pipeline.model
     if checkpoint is None or not isinstance(model, LecoModelConfig) or not checkpoint.exists():

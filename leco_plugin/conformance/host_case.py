@@ -91,7 +91,7 @@ def guided(name: str, file: Path) -> tuple[TrainerConfig, Kind]:
         InputError: as `HostCase`.
     """
     from leco_plugin.models.guided import GuidedModelConfig
-    from leco_plugin.models.leco import LecoModelConfig
+    from leco_plugin.models.leco_config import LecoModelConfig
     from leco_plugin.swap import registered, with_sampler_swapped
 
     config = registered(name)

@@ -7,9 +7,9 @@ A cell is asked only where the coarser grid, or a neighbour of its cell, has not
 from __future__ import annotations
 
 import math
-import os
 from collections.abc import Callable, Sequence
 
+import psutil
 import torch
 from torch import Tensor
 from torch.nn.functional import max_pool3d
@@ -170,8 +170,7 @@ def _cells(scores: Tensor, box: ViewBox, mapped: Tensor) -> tuple[Tensor, Tensor
 
 def fits_memory(cells: int) -> bool:
     """Whether a grid of so many cells can be filled in half of the memory that is free."""
-    free = os.sysconf("SC_AVPHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
-    return BYTES_A_CELL * cells < free / 2
+    return BYTES_A_CELL * cells < psutil.virtual_memory().available / 2
 
 
 @torch.no_grad()

@@ -11,7 +11,7 @@ from torch import Tensor, nn
 
 from leco_plugin.models.freezing import FILE_NAME, leave_file
 from leco_plugin.models.guide import Guide
-from leco_plugin.models.leco import LecoModelConfig
+from leco_plugin.models.leco_config import LecoModelConfig
 from leco_plugin.models.opaque_start import begin_opaque
 from leco_plugin.models.ranks import is_first, say
 from leco_plugin.occupancy import Occupancy

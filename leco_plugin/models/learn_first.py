@@ -9,7 +9,8 @@ import torch
 from nerfstudio.engine.callbacks import TrainingCallbackAttributes
 from torch import nn
 
-from leco_plugin.models.leco import LecoModel, LecoModelConfig
+from leco_plugin.models.leco import LecoModel
+from leco_plugin.models.leco_config import LecoModelConfig
 from leco_plugin.models.lifecycle import Lifecycle
 from leco_plugin.models.optimizers import RATES, FusedAdamConfig
 from leco_plugin.models.ranks import averaging, mean
@@ -82,7 +83,7 @@ def learn_model(
     if sampler is not None:
         sampler.set_num_rays_per_batch(rays)
     lifecycle = Lifecycle(model, TrainingCallbackAttributes(None, None, pipeline, None))
-    lifecycle.rays_per_batch = rays
+    lifecycle.batches.rays_per_batch = rays
     groups = model.get_param_groups()
     optimizers = [FusedAdamConfig(lr=rate * RATES[name]).setup(p) for name, p in groups.items()]
     try:

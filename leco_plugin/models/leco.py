@@ -2,30 +2,26 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from typing import Any
 
 import torch
 from nerfstudio.cameras.rays import RayBundle
 from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackAttributes
 from nerfstudio.model_components.renderers import RGBRenderer
-from nerfstudio.models.base_model import Model, ModelConfig
+from nerfstudio.models.base_model import Model
 from torch import Tensor, nn
 
 from leco_plugin.compat.checkpoints import allow_checkpoint_globals
-from leco_plugin.compat.earlier_configs import GrowingConfig
-from leco_plugin.models.calibration import CalibrationConfig
 from leco_plugin.models.failures import require_finite
 from leco_plugin.models.field import HMoEField
 from leco_plugin.models.front_to_back import shade_front_to_back
 from leco_plugin.models.gate import Gate
 from leco_plugin.models.healing import annealed, is_dense
 from leco_plugin.models.image_figures import image_figures
-from leco_plugin.models.merging import MergingConfig
-from leco_plugin.models.objective import GateLossConfig, field_losses, gate_losses
-from leco_plugin.models.phases import ScheduleConfig
+from leco_plugin.models.leco_config import LecoModelConfig
+from leco_plugin.models.objective import field_losses, gate_losses
 from leco_plugin.models.precision import fast_precision, keep_freed_memory
-from leco_plugin.models.prior import PriorConfig
 from leco_plugin.models.progress import Progress
 from leco_plugin.models.rendering import (
     Intervals,
@@ -39,65 +35,14 @@ from leco_plugin.models.rendering import (
 )
 from leco_plugin.models.scene_rays import cut_to_bounds, marching_rule
 from leco_plugin.models.scene_sizes import complete
-from leco_plugin.models.sizes import SMALL, Sizes
+from leco_plugin.models.sizes import Sizes
 from leco_plugin.models.stored_sizes import SIZES, stored_in, to_store
-from leco_plugin.occupancy import Occupancy, Precision, gate_precision
+from leco_plugin.occupancy import Occupancy, gate_precision
 from leco_plugin.samplers.estimator import LearnedOccupancyEstimator
 from leco_plugin.samplers.marching import march
-from leco_plugin.scenes.bounds import BoundsConfig, SceneBounds
+from leco_plugin.scenes.bounds import SceneBounds
 from leco_plugin.scenes.known_distances import DISTANCE
 from leco_plugin.space import Space
-
-
-@dataclass
-class LecoModelConfig(GrowingConfig, ModelConfig):
-    """Learned occupancy: learn, freeze and calibrate, go on guided"""
-
-    _target: type = field(default_factory=lambda: LecoModel)
-    """target class to instantiate"""
-    enable_collider: bool = False
-    """Rays are cut at the scene's own bounds instead."""
-    eval_num_rays_per_chunk: int = 4096
-    """Rays rendered at a time."""
-    sizes: Sizes = field(default_factory=lambda: SMALL)
-    """Sizes of gate, field and batches. Those that are 0 are chosen from scene and device."""
-    schedule: ScheduleConfig = field(default_factory=ScheduleConfig)
-    """When the gate is frozen."""
-    gate_loss: GateLossConfig = field(default_factory=GateLossConfig)
-    """What teaches the gate."""
-    prior: PriorConfig = field(default_factory=PriorConfig)
-    """What sparse points teach the gate before the first step; off by default."""
-    calibration: CalibrationConfig = field(default_factory=CalibrationConfig)
-    """What skipping may cost."""
-    merging: MergingConfig = field(default_factory=MergingConfig)
-    """Which scene experts are left when the gate is frozen."""
-    distortion: float = 0.05
-    """Weight of the distortion loss, which clears haze (mip-NeRF 360, eq. 15)."""
-    termination: float = 0.03
-    """Weight, while the occupancy is learned, of ending rays at the sparse points they lead to."""
-    nearness: float = 0.03
-    """Weight, while the occupancy is learned, of taking the farther of two explanations of a ray:
-    a dark sky is no dark cloud before the camera. Comes in with the distortion loss."""
-    look_everywhere: float = 0.125
-    """Share of rays that shade all candidates while the others follow the gate being learned."""
-    likely_above: float = 0.05
-    """o(x) from which those others shade a candidate."""
-    distortion_after: float = 0.04
-    """Share of the distortion loss that stays when the first phase is over and detail is wanted."""
-    front_to_back: bool = False
-    """Whether rendering shades from the front and nothing behind opaque surfaces: fewer samples for
-    the same image, and more steps to get there."""
-    homogeneous: bool = False
-    """A mixture of scene experts only, for comparison: no empty-space expert, nothing to freeze."""
-    precision: Precision | None = None
-    """Of matrix products, while learning and wherever the gate is asked; None is what the device is
-    fastest in."""
-    near: float | None = None
-    """Where rays begin, scene units; None is found from the data."""
-    far: float | None = None
-    """Where rays end, scene units; None is found from the data."""
-    bounds: BoundsConfig = field(default_factory=BoundsConfig)
-    """Where the scene lies, where the data do not say it right."""
 
 
 class LecoModel(Model):

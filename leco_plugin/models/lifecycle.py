@@ -17,6 +17,7 @@ from nerfstudio.engine.callbacks import (
 from torch import Tensor
 
 from leco_plugin.compat.optimizers import forget_the_gone
+from leco_plugin.models.batches import Batches
 from leco_plugin.models.failures import GateCollapsed
 from leco_plugin.models.field import HMoEField
 from leco_plugin.models.field_at_freezing import carry_over, leave_field
@@ -37,12 +38,12 @@ from leco_plugin.models.phases import (
 )
 from leco_plugin.models.prior import warm_start
 from leco_plugin.models.progress import NO_EVIDENCE, Progress
-from leco_plugin.models.ranks import is_first, mean, say, share
+from leco_plugin.models.ranks import is_first, say, share
 from leco_plugin.models.rendering import gate_values_and_routes
 from leco_plugin.models.statistics import KEPT_ABOVE
 from leco_plugin.occupancy import gate_precision
-from leco_plugin.scenes.known_distances import KnownDistancePixelSampler, sampler_here
-from leco_plugin.scenes.sparse_pixels import FEWEST_POINTS, SparsePixels, sparse_pixels
+from leco_plugin.scenes.known_distances import sampler_here
+from leco_plugin.scenes.sparse_pixels import FEWEST_POINTS
 from leco_plugin.scenes.survey import announce, sparse_points, survey
 
 if TYPE_CHECKING:
@@ -63,6 +64,7 @@ class Lifecycle:
             most = max(2, int(0.5 * self.trainer.config.max_num_iterations))
         # nerfstudio makes callbacks after it has loaded a checkpoint
         self.progress.begin(configured, most)
+        self.batches = Batches(model, self.pipeline.datamanager)
         config = model.config
         self.survey = survey(self.pipeline.datamanager, config.bounds, config.near, config.far)
         if not bool(model.bounds_known):
@@ -71,7 +73,6 @@ class Lifecycle:
             if sampler_here(self.pipeline.datamanager) is None:
                 say("batches come from elsewhere: they keep their size, and no pixel's distance")
             self._begin_with_points()
-        self.rays_per_batch = int(self.pipeline.datamanager.get_train_rays_per_batch())
         self.step_started = 0.0
         self.history = GateHistory()
         self.guided = GuidedWatch(self)
@@ -87,7 +88,7 @@ class Lifecycle:
         if prior.steps == 0 or model.config.homogeneous or bool(model.frozen):
             return
         dataset: Any = self.pipeline.datamanager.train_dataset
-        points, sparse = sparse_points(dataset), self.sparse
+        points, sparse = sparse_points(dataset), self.batches.sparse
         if points is None or sparse is None or len(points) < FEWEST_POINTS:
             say("no prior: the scene has no sparse points")
             return
@@ -134,56 +135,33 @@ class Lifecycle:
         never_frozen = model.config.homogeneous or not self.schedule.freeze
         model.learned = never_frozen and step >= self.schedule.learn_steps
         past_learning = bool(model.frozen) or model.learned
-        self._set_known_distances(not past_learning)
-        self._set_rays(self._guided_batch() if bool(model.frozen) else self._learning_batch())
+        self.batches.prepare(learning=not past_learning)
         self.step_started = time.monotonic()
-
-    def _learning_batch(self) -> float:
-        """Rays of a batch as a multiple, while the gate being learned is followed already.
-
-        The same in every process: the mean of their gradients is then that of one large batch.
-        """
-        model = self.model
-        model.learning_kept = mean(model.learning_kept, model.device)
-        wanted = min(model.config.sizes.guided_batch, 1.0 / model.learning_kept)
-        return round(8 * wanted) / 8  # of few sizes; see `steady`
-
-    def _guided_batch(self) -> float:
-        """Rays of a guided batch as a multiple: about as many samples are shaded as before."""
-        sizes = self.model.config.sizes
-        kept = 1.0 - float(self.model.report.get("empty_fraction", 0.0))
-        same_samples = sizes.learn_candidates / max(1.0, kept * sizes.candidates)
-        return min(sizes.guided_batch, max(0.5, same_samples))
-
-    @cached_property
-    def sparse(self) -> SparsePixels | None:
-        """Where sparse points are seen; projected only once learning asks for it."""
-        dataset: Any = self.pipeline.datamanager.train_dataset
-        points = sparse_points(dataset)
-        return sparse_pixels(dataset.cameras, points) if points is not None else None
-
-    def _set_known_distances(self, wanted: bool) -> None:
-        sampler = sampler_here(self.pipeline.datamanager)
-        if isinstance(sampler, KnownDistancePixelSampler):
-            sampler.sparse = self.sparse if wanted and self.model.config.termination > 0.0 else None
-
-    def _set_rays(self, factor: float) -> None:
-        sampler = sampler_here(self.pipeline.datamanager)
-        wanted = round(self.rays_per_batch * factor)
-        if sampler is not None and sampler.num_rays_per_batch != wanted:
-            sampler.set_num_rays_per_batch(wanted)
 
     def after_step(self, step: int) -> None:
         """Looks at the gate now and then, and freezes it when its decisions have settled; then at
         what skipping costs."""
-        model, schedule, progress = self.model, self.schedule, self.progress
+        model = self.model
         if model.learned or model.config.homogeneous:
             return
         seconds = time.monotonic() - self.step_started
         if bool(model.frozen):
             self.guided.after_step(step, seconds)
             return
-        progress.learn_seconds += seconds
+        self.progress.learn_seconds += seconds
+        self._after_learning_step(step)
+        if self.schedule.freeze and not bool(model.frozen) and self._ends_after(step):
+            say(
+                f"step {step}: the run ends while its occupancy is still learned, and nothing is "
+                f"frozen; go on from its checkpoint (--load-dir) with --max-num-iterations well "
+                f"above {self.progress.learn_steps}"
+            )
+
+    def _ends_after(self, step: int) -> bool:
+        return self.trainer is not None and step + 1 >= self.trainer.config.max_num_iterations
+
+    def _after_learning_step(self, step: int) -> None:
+        model, schedule, progress = self.model, self.schedule, self.progress
         if schedule.steps_per_record > 0 and step % schedule.steps_per_record == 0:
             self._record(step)
         last = step + 1 >= schedule.learn_steps

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-import os
 from pathlib import Path
 
+import psutil
 import torch
 
 from leco_plugin.models.field import HMoEField
@@ -101,10 +101,7 @@ def memory_of(device: torch.device | str, group: Path = Path("/sys/fs/cgroup")) 
         return int(torch.cuda.get_device_properties(device).total_memory)
     if device.type != "cpu":
         return None
-    try:
-        memory = os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
-    except (AttributeError, ValueError, OSError):  # not on Windows
-        return None
+    memory = int(psutil.virtual_memory().total)
     try:
         return min(memory, int((group / "memory.max").read_text()))
     except (OSError, ValueError):  # no container, or one without a limit

@@ -10,6 +10,7 @@ import hashlib
 import os
 from collections.abc import Iterable
 from functools import partial
+from itertools import groupby
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -53,25 +54,19 @@ class StoredPictures:
         Args:
             which: [K] int64 pictures.
             places: [K, 2] int64 rows and columns.
+        Raises:
+            InputError: a file is shorter than its picture.
         """
         offsets = (places[:, 0] * self.sizes[which, 1] + places[:, 1]) * self.channels
         found = np.empty((len(which), self.channels), dtype=np.uint8)
         order = which.argsort(stable=True).tolist()
         numbers, at = which.tolist(), offsets.tolist()
-        open_number, handle = -1, -1
-        try:
-            for row in order:
-                if numbers[row] != open_number:
-                    if handle >= 0:
-                        os.close(handle)
-                    open_number, handle = (
-                        numbers[row],
-                        os.open(self.files[numbers[row]], os.O_RDONLY),
-                    )
-                found[row] = np.frombuffer(os.pread(handle, self.channels, at[row]), np.uint8)
-        finally:
-            if handle >= 0:
-                os.close(handle)
+        for number, rows in groupby(order, numbers.__getitem__):
+            with self.files[number].open("rb", buffering=0) as file:
+                for row in rows:
+                    file.seek(at[row])
+                    if file.readinto(found[row]) != self.channels:
+                        raise InputError(f"{self.files[number]} is cut off: delete it and go on")
         return torch.from_numpy(found).float() / 255.0
 
 

@@ -76,6 +76,22 @@ def test_how_long_it_takes_is_said_before_it_is_started(
     assert "1 run of 9 steps" in capsys.readouterr().out
 
 
+def test_the_stored_command_makes_the_same_runs(
+    started: Started, tiny_scene: Path, tmp_path: Path
+) -> None:
+    chosen = [*METHODS, *TIME, "--seeds", 4, 5, "--images", 1, "--learn-seconds", 2]
+    assert run("--data", tiny_scene, "--out", tmp_path / "first", *chosen) == 1
+    stored = json.loads((tmp_path / "first" / "results.json").read_text())["made"]["command"]
+    words = stored.split()
+    assert words[:4] == ["leco", "chart", "--data", tiny_scene.name]
+    assert run("--data", tiny_scene, "--out", tmp_path / "again", *words[4:]) == 1
+    assert started[:4] == started[4:] and len(started) == 8
+    settings = [
+        json.loads((tmp_path / name / "settings.json").read_text()) for name in ("first", "again")
+    ]
+    assert settings[0] == settings[1]
+
+
 BAD = {
     "'no-such'": ["--methods", "no-such", *TIME],
     "no sampler 'no-such'": ["--methods", "leco-ngp", "--samplers", "no-such", *TIME],

@@ -12,7 +12,7 @@ import yaml
 from nerfstudio.data.datamanagers.base_datamanager import VanillaDataManagerConfig
 
 from leco_plugin.method_configs import leco_occupancy
-from leco_plugin.models.leco import LecoModelConfig
+from leco_plugin.models.leco_config import LecoModelConfig
 from leco_plugin.models.prior import PriorConfig
 from leco_plugin.models.switch_nerf import SwitchNerfModelConfig
 from leco_plugin.scenes.bounds import BoundsConfig

@@ -15,7 +15,8 @@ from leco_plugin.models.encodings import EncodingConfig
 from leco_plugin.models.field import FieldConfig
 from leco_plugin.models.gate import GateConfig
 from leco_plugin.models.hmoe import HMoEConfig
-from leco_plugin.models.leco import LecoModel, LecoModelConfig
+from leco_plugin.models.leco import LecoModel
+from leco_plugin.models.leco_config import LecoModelConfig
 from leco_plugin.models.rendering import Rays
 from leco_plugin.models.sizes import Sizes
 from leco_plugin.scenes.bounds import SceneBounds

@@ -92,7 +92,7 @@ def healthy_run(monkeypatch: pytest.MonkeyPatch):
         )
         run.lifecycle = object.__new__(Lifecycle)
         run.lifecycle.trainer, run.lifecycle.survey = None, None
-        run.lifecycle.rays_per_batch = 8
+        run.lifecycle.batches = SimpleNamespace(prepare=lambda learning: None)
         run.lifecycle.pipeline = SimpleNamespace(datamanager=SimpleNamespace(train_dataset=None))
         run.lifecycle.model = SimpleNamespace(
             config=SimpleNamespace(

@@ -11,7 +11,7 @@ from nerfstudio.pipelines.base_pipeline import VanillaPipelineConfig
 
 from leco_plugin.models.guided_start import OccupancyConfig
 from leco_plugin.models.learn_first import FEWEST_STEPS, learn_occupancy, steps_within
-from leco_plugin.models.leco import LecoModelConfig
+from leco_plugin.models.leco_config import LecoModelConfig
 from leco_plugin.models.phases import ScheduleConfig
 from leco_plugin.occupancy import Occupancy
 from leco_plugin.scenes.photographs import LecoPhotographsDataParserConfig

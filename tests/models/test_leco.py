@@ -13,7 +13,8 @@ from nerfstudio.data.scene_box import SceneBox
 from leco_plugin.models.encodings import EncodingConfig
 from leco_plugin.models.field import FieldConfig
 from leco_plugin.models.gate import GateConfig
-from leco_plugin.models.leco import LecoModel, LecoModelConfig
+from leco_plugin.models.leco import LecoModel
+from leco_plugin.models.leco_config import LecoModelConfig
 from leco_plugin.models.rendering import Intervals, Rays
 from leco_plugin.models.sizes import Sizes
 

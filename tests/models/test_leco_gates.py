@@ -19,7 +19,8 @@ from leco_plugin.models.field import FieldConfig
 from leco_plugin.models.freezing import FILE_NAME
 from leco_plugin.models.gate import GateConfig
 from leco_plugin.models.hmoe import HMoEConfig
-from leco_plugin.models.leco import LecoModel, LecoModelConfig
+from leco_plugin.models.leco import LecoModel
+from leco_plugin.models.leco_config import LecoModelConfig
 from leco_plugin.models.phases import ScheduleConfig
 from leco_plugin.models.sizes import Sizes
 from leco_plugin.occupancy import Occupancy

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from types import SimpleNamespace
+from typing import Any
 
 import pytest
 import torch
@@ -13,6 +14,7 @@ from leco_plugin.models.field import FieldConfig, HMoEField
 from leco_plugin.models.gate import Gate, GateConfig
 from leco_plugin.models.history import GateHistory
 from leco_plugin.models.lifecycle import Lifecycle
+from leco_plugin.models.phases import ScheduleConfig
 from leco_plugin.models.progress import Progress
 from leco_plugin.models.rendering import Rays, Routing
 from leco_plugin.space import Space
@@ -72,18 +74,6 @@ def test_a_look_sees_what_the_gate_has_learned_since(looking: Lifecycle) -> None
     torch.testing.assert_close(looking._probe(), before + 1.0)
 
 
-@pytest.mark.parametrize(
-    ("empty_fraction", "factor"), [(0.0, 0.5), (0.75, 2.0), (0.875, 4.0), (0.999, 4.0)]
-)
-def test_a_guided_batch_has_the_samples_of_a_learning_one_within_limits(
-    looking: Lifecycle, empty_fraction: float, factor: float
-) -> None:
-    sizes = SimpleNamespace(learn_candidates=32, candidates=64, guided_batch=4.0)
-    looking.model.config = SimpleNamespace(sizes=sizes)  # type: ignore[assignment]
-    looking.model.report = {"empty_fraction": empty_fraction}
-    assert looking._guided_batch() == pytest.approx(factor)
-
-
 def test_a_field_that_starts_anew_keeps_its_parameters_and_forgets_what_they_were() -> None:
     config = FieldConfig(EncodingConfig("hash", levels=1, log2_table=4), appearance_dim=2)
     field = HMoEField(config, 3)
@@ -129,3 +119,28 @@ def test_learning_on_takes_a_quarter_more_and_is_said(
     assert looking.progress.learn_steps == 223 and looking.progress.extensions == 1
     said = capsys.readouterr().out
     assert "it learns" in said and "until step 223" in said
+
+
+@pytest.mark.parametrize(
+    ("last", "freezes", "said"), [(9, True, True), (9, False, False), (8, True, False)]
+)
+def test_a_run_that_ends_before_it_has_frozen_anything_says_so(
+    looking: Lifecycle,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    last: int,
+    freezes: bool,
+    said: bool,
+) -> None:
+    model: Any = looking.model
+    model.config = SimpleNamespace(schedule=ScheduleConfig(freeze=freezes), homogeneous=False)
+    model.progress, model.frozen, model.learned = (
+        Progress(learn_steps=30),
+        torch.tensor(False),
+        False,
+    )
+    looking.trainer = SimpleNamespace(config=SimpleNamespace(max_num_iterations=10))
+    looking.step_started = 0.0
+    looking.after_step(last)
+    line = " ".join(capsys.readouterr().out.split())
+    assert ("nothing is frozen" in line and "well above 30" in line) == said

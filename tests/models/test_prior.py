@@ -11,10 +11,12 @@ from nerfstudio.cameras.cameras import Cameras
 from nerfstudio.data.scene_box import SceneBox
 
 from leco_plugin.models import lifecycle
+from leco_plugin.models.batches import Batches
 from leco_plugin.models.encodings import EncodingConfig
 from leco_plugin.models.field import FieldConfig
 from leco_plugin.models.gate import GateConfig
-from leco_plugin.models.leco import LecoModel, LecoModelConfig
+from leco_plugin.models.leco import LecoModel
+from leco_plugin.models.leco_config import LecoModelConfig
 from leco_plugin.models.lifecycle import Lifecycle
 from leco_plugin.models.prior import (
     CELLS,
@@ -128,13 +130,15 @@ def test_no_points_are_no_prior_and_a_frozen_gate_is_left_alone(
     run = object.__new__(Lifecycle)
     run.model = model
     dataset = SimpleNamespace(cameras=drone(), metadata={})
-    run.pipeline = SimpleNamespace(datamanager=SimpleNamespace(train_dataset=dataset))
+    manager = SimpleNamespace(train_dataset=dataset, get_train_rays_per_batch=lambda: 8)
+    run.pipeline = SimpleNamespace(datamanager=manager)
+    run.batches = Batches(model, manager)
     before = [parameter.clone() for parameter in model.gate.parameters()]
     run._begin_with_points()
     assert all(torch.equal(a, b) for a, b in zip(before, model.gate.parameters()))
     assert said == ([] if frozen else ["no prior: the scene has no sparse points"])
     dataset.metadata["points3D_xyz"] = hills()
-    run.__dict__.pop("sparse", None)
+    run.batches = Batches(model, manager)
     run._begin_with_points()
     changed = any(not torch.equal(a, b) for a, b in zip(before, model.gate.parameters()))
     assert changed is not frozen

@@ -15,7 +15,8 @@ from leco_plugin.models.encodings import EncodingConfig
 from leco_plugin.models.field import FieldConfig
 from leco_plugin.models.gate import GateConfig
 from leco_plugin.models.hmoe import HMoEConfig
-from leco_plugin.models.leco import LecoModel, LecoModelConfig
+from leco_plugin.models.leco import LecoModel
+from leco_plugin.models.leco_config import LecoModelConfig
 from leco_plugin.models.sizes import LARGE, PAPER, SMALL, Sizes, automatic, with_size
 from leco_plugin.models.stored_sizes import from_stored, going_on, sizes_in, stored_in, to_store
 from leco_plugin.scenes.input_error import InputError

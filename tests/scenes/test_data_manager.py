@@ -16,7 +16,7 @@ from nerfstudio.pipelines.base_pipeline import VanillaPipelineConfig
 
 from leco_plugin.models.calibration import CalibrationConfig
 from leco_plugin.models.learn_first import learn_occupancy
-from leco_plugin.models.leco import LecoModelConfig
+from leco_plugin.models.leco_config import LecoModelConfig
 from leco_plugin.models.phases import ScheduleConfig
 from leco_plugin.scenes import data_manager
 from leco_plugin.scenes.data_manager import (

@@ -130,3 +130,22 @@ def test_a_damaged_file_is_noticed(tmp_path: Path) -> None:
     stored.files[0].write_bytes(b"short")
     with pytest.raises(InputError, match="damaged"):
         store_pictures(dataset, tmp_path / "pixels")
+
+
+def test_a_file_cut_off_while_a_run_goes_on_is_one_line(tmp_path: Path) -> None:
+    stored = store_pictures(write(tmp_path), tmp_path / "pixels")["image"]
+    stored.files[1].write_bytes(stored.files[1].read_bytes()[:-2])
+    last = torch.tensor([[23, 35]])
+    assert stored.read(torch.tensor([0]), torch.tensor([[29, 39]])).shape == (1, 3)
+    with pytest.raises(InputError, match="is cut off"):
+        stored.read(torch.tensor([1]), last)
+
+
+def test_many_pixels_in_any_order_are_read_in_that_order(tmp_path: Path) -> None:
+    dataset = write(tmp_path)
+    stored = store_pictures(dataset, tmp_path / "pixels")["image"]
+    drawn = stored.draw(500)
+    found = stored.read(drawn[:, 0], drawn[:, 1:])
+    images = [dataset.get_image_float32(number) for number in range(len(SIZES))]
+    wanted = torch.stack([images[n][row, column] for n, row, column in drawn.tolist()])
+    torch.testing.assert_close(found, wanted)

@@ -1,0 +1,74 @@
+"""Settings of `leco-occupancy`'s model."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+from nerfstudio.models.base_model import ModelConfig
+
+from leco_plugin.compat.earlier_configs import GrowingConfig
+from leco_plugin.models.calibration import CalibrationConfig
+from leco_plugin.models.merging import MergingConfig
+from leco_plugin.models.objective import GateLossConfig
+from leco_plugin.models.phases import ScheduleConfig
+from leco_plugin.models.prior import PriorConfig
+from leco_plugin.models.sizes import SMALL, Sizes
+from leco_plugin.occupancy import Precision
+from leco_plugin.scenes.bounds import BoundsConfig
+
+
+def _model() -> type:
+    from leco_plugin.models.leco import LecoModel
+
+    return LecoModel
+
+
+@dataclass
+class LecoModelConfig(GrowingConfig, ModelConfig):
+    """Learned occupancy: learn, freeze and calibrate, go on guided"""
+
+    _target: type = field(default_factory=_model)
+    """target class to instantiate"""
+    enable_collider: bool = False
+    """Rays are cut at the scene's own bounds instead."""
+    eval_num_rays_per_chunk: int = 4096
+    """Rays rendered at a time."""
+    sizes: Sizes = field(default_factory=lambda: SMALL)
+    """Sizes of gate, field and batches. Those that are 0 are chosen from scene and device."""
+    schedule: ScheduleConfig = field(default_factory=ScheduleConfig)
+    """When the gate is frozen."""
+    gate_loss: GateLossConfig = field(default_factory=GateLossConfig)
+    """What teaches the gate."""
+    prior: PriorConfig = field(default_factory=PriorConfig)
+    """What sparse points teach the gate before the first step; off by default."""
+    calibration: CalibrationConfig = field(default_factory=CalibrationConfig)
+    """What skipping may cost."""
+    merging: MergingConfig = field(default_factory=MergingConfig)
+    """Which scene experts are left when the gate is frozen."""
+    distortion: float = 0.05
+    """Weight of the distortion loss, which clears haze (mip-NeRF 360, eq. 15)."""
+    termination: float = 0.03
+    """Weight, while the occupancy is learned, of ending rays at the sparse points they lead to."""
+    nearness: float = 0.03
+    """Weight, while the occupancy is learned, of taking the farther of two explanations of a ray:
+    a dark sky is no dark cloud before the camera. Comes in with the distortion loss."""
+    look_everywhere: float = 0.125
+    """Share of rays that shade all candidates while the others follow the gate being learned."""
+    likely_above: float = 0.05
+    """o(x) from which those others shade a candidate."""
+    distortion_after: float = 0.04
+    """Share of the distortion loss that stays when the first phase is over and detail is wanted."""
+    front_to_back: bool = False
+    """Whether rendering shades from the front and nothing behind opaque surfaces: fewer samples for
+    the same image, and more steps to get there."""
+    homogeneous: bool = False
+    """A mixture of scene experts only, for comparison: no empty-space expert, nothing to freeze."""
+    precision: Precision | None = None
+    """Of matrix products, while learning and wherever the gate is asked; None is what the device is
+    fastest in."""
+    near: float | None = None
+    """Where rays begin, scene units; None is found from the data."""
+    far: float | None = None
+    """Where rays end, scene units; None is found from the data."""
+    bounds: BoundsConfig = field(default_factory=BoundsConfig)
+    """Where the scene lies, where the data do not say it right."""
