@@ -5,8 +5,8 @@ from __future__ import annotations
 import os
 
 VARIABLE = "LECO_KERNELS_OFF"
-"""The environment variable that names them; unlike an option it reaches every process of a run, and
-loops that know no options of ours."""
+"""The environment variable that names them; unlike an option it reaches every process that a
+command starts, and loops that know no options of ours."""
 NAMES = frozenset({"gate", "march", "experts"})
 """What it may name. The march holds the gate, and is off with it."""
 

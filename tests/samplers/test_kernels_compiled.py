@@ -1,5 +1,5 @@
-"""Every kernel is compiled for A100 and H100 without one, and those of the automatic sizes for cards
-at home: what interprets may still not compile."""
+"""Every kernel is compiled for A100 and H100 without one, those of the automatic sizes for cards at
+home too: what interprets may still not compile."""
 
 from __future__ import annotations
 
