@@ -1,4 +1,4 @@
-"""The GPU suite: `PYTHONPATH=. python benchmarks/gpu.py`, at most ten minutes, with a CUDA device.
+"""The GPU suite: `python benchmarks/gpu.py`, at most ten minutes, with a CUDA device.
 
 Correctness first, then times with device events, and the card's own ceilings in the same run. A
 part that is in the results file already is not run again, so that a run that was cut off goes on.
@@ -10,7 +10,9 @@ from __future__ import annotations
 import argparse
 import datetime
 import hashlib
+import importlib.metadata
 import json
+import logging
 import re
 import shutil
 import subprocess
@@ -20,8 +22,9 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import checkout  # noqa: F401
 import torch
-from gpu_parts import correctness, experts, gate_throughput
+from gpu_parts import Disagreement, correctness, experts, gate_throughput
 from gpu_sampling import sampling
 from gpu_scale import Scale
 from gpu_training import dense, learned
@@ -61,7 +64,18 @@ def driver() -> str | None:
         return None
     command = ["nvidia-smi", "--query-gpu=driver_version", "--format=csv,noheader"]
     answered = subprocess.run(command, capture_output=True, text=True, check=False)
-    return next(iter(answered.stdout.split()), None)
+    found = answered.stdout.split() if answered.returncode == 0 else []
+    return next(iter(found), None)
+
+
+def machine() -> dict[str, Any]:
+    """What figures depend on: the computer, its card and driver, and what compiles for the card."""
+    found = {**describe_machine(), "driver": driver(), "cuda": torch.version.cuda}
+    try:
+        found["triton"] = importlib.metadata.version("triton")
+    except importlib.metadata.PackageNotFoundError:
+        found["triton"] = None
+    return found
 
 
 def code() -> dict[str, Any]:
@@ -91,28 +105,59 @@ def is_unfinished(path: Path) -> bool:
 
 
 def run(scale: Scale, out: Path | None, dry: bool) -> dict[str, Any]:
-    """All parts that `out` does not hold yet; it is renewed after each."""
-    about = {**describe_machine(), "driver": driver(), "cuda": torch.version.cuda}
-    results = {"format": 1, "dry": dry, "machine": about, "code": code(), "parts": {}}
-    results["parts"] = stored_parts(out, results)
+    """All parts that `out` does not hold yet; it is renewed after each.
+
+    Raises:
+        Disagreement: a kernel answers otherwise than its twin.
+    """
+    results: dict[str, Any] = {"format": 1, "dry": dry, "date": f"{datetime.date.today()}"}
+    results |= {"machine": machine(), "code": code(), "parts": {}}
+    parts = results["parts"] = stored_parts(out, results)
     started = time.perf_counter()
     for name, part in PARTS.items():
-        if name in results["parts"]:
+        if name in parts:
+            print(f"{name}: measured before")
             continue
         if not dry and time.perf_counter() - started > LIMIT - part.seconds:
-            print(f"{name} is left for the next run: the ten minutes are over", file=sys.stderr)
+            print(
+                f"{name} is left for the next run, for the ten minutes are over: "
+                "the same command goes on from here",
+                file=sys.stderr,
+            )
             break
-        results["parts"][name] = measured = part.measure(scale, results["parts"])
-        for figure in measured.get("figures", []):
-            sign = "<=" if figure["at_most"] else ">="
-            verdict = "reached" if figure["reached"] else "NOT REACHED"
-            print(f"{figure['name']}: {figure['value']:.3g} ({sign} {figure['bar']}) {verdict}")
-        missing = [kernel for kernel, runs in measured.get("running", {}).items() if not runs]
-        if missing and not dry:
-            print(f"{name}: torch answered in place of the fused {', '.join(missing)}")
+        print(f"{name} ...", flush=True)
+        begun = time.perf_counter()
+        parts[name] = measured = measure(part, scale, parts)
+        measured["wall_seconds"] = round(time.perf_counter() - begun, 1)
+        tell(name, measured, dry)
         if out is not None:
             write_json(out, results)
     return results
+
+
+def measure(part: Part, scale: Scale, before: dict[str, Any]) -> dict[str, Any]:
+    """What a part finds, or that the card has too little memory for it."""
+    try:
+        return part.measure(scale, before)
+    except torch.cuda.OutOfMemoryError as error:
+        return {"left_out": next(iter(str(error).splitlines()), "out of memory")}
+
+
+def tell(name: str, measured: dict[str, Any], dry: bool) -> None:
+    """Prints what a part has found; of a dry run only that it ran."""
+    if reason := measured.get("left_out"):
+        print(f"{name}: LEFT OUT, {reason}")
+        return
+    print(f"{name}: {measured['wall_seconds']} s")
+    if dry:
+        return
+    for figure in measured.get("figures", []):
+        sign = "<=" if figure["at_most"] else ">="
+        verdict = "reached" if figure["reached"] else "NOT REACHED"
+        print(f"  {figure['name']}: {figure['value']:.3g} ({sign} {figure['bar']}) {verdict}")
+    missing = [kernel for kernel, runs in measured.get("running", {}).items() if not runs]
+    if missing:
+        print(f"  torch answered in place of the fused {'; '.join(missing)}")
 
 
 def stored_parts(out: Path | None, results: dict[str, Any]) -> dict[str, Any]:
@@ -130,23 +175,50 @@ def stored_parts(out: Path | None, results: dict[str, Any]) -> dict[str, Any]:
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """The command; exits 2 where there is no CUDA device."""
+    """The command; exits 1 where a kernel is wrong, 2 where nothing can be measured."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--dry-run", action="store_true", help="tiny sizes, any machine")
-    parser.add_argument("--out", type=Path, help="results file")
+    parser.add_argument(
+        "--out", type=Path, help="results file; without it one of this card in benchmarks/results"
+    )
     options = parser.parse_args(arguments)
+    logging.basicConfig(format="  %(message)s")
+    logging.getLogger("leco_plugin").setLevel(logging.INFO)  # why torch answers is among it
     if options.dry_run:
         device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
         if options.out is not None and options.out.resolve().is_relative_to(RESULTS):
             parser.error("a dry run leaves nothing among the results: give another --out")
-        run(Scale(device).dry(), options.out, dry=True)
-        print("dry run: every part ran; its figures mean nothing")
-        return 0
+        return finished(Scale(device).dry(), options.out, dry=True)
     if not torch.cuda.is_available():
-        print("no CUDA device here: nothing is measured; try --dry-run", file=sys.stderr)
+        print(
+            f"no CUDA device here for torch {torch.__version__}: nothing is measured; --dry-run "
+            "runs on any machine",
+            file=sys.stderr,
+        )
         return 2
-    run(Scale(torch.device("cuda")), options.out or results_path(), dry=False)  # CUDA only
-    return 0  # CUDA only
+    if options.out is None and driver() is None:
+        print(
+            "nvidia-smi does not tell the driver's version, without which results are not shown: "
+            "nothing is measured; put it on the PATH, or measure for yourself with --out FILE",
+            file=sys.stderr,
+        )
+        return 2
+    return finished(Scale(torch.device("cuda")), options.out or results_path(), dry=False)
+
+
+def finished(scale: Scale, out: Path | None, dry: bool) -> int:
+    """Runs the suite, and says where its results are and what becomes of them."""
+    try:
+        results = run(scale, out, dry)
+    except Disagreement as error:
+        print(f"{error}: figures of a wrong kernel are not measured", file=sys.stderr)
+        return 1
+    where = "" if out is None else f"; they are in {out}"
+    if dry:
+        print(f"dry run: every part ran; its figures mean nothing{where}")
+    elif len(results["parts"]) == len(PARTS):
+        print(f"all parts are measured{where}; docs/gpu.md says how to add them to the results")
+    return 0
 
 
 if __name__ == "__main__":

@@ -1,11 +1,12 @@
 """What the fused march has to do for the rays of the GPU suite, counted with its torch twins:
-`PYTHONPATH=. python benchmarks/gpu_counts.py`, on any machine. `gpu_paper.py` holds what it prints.
+`python benchmarks/gpu_counts.py`, on any machine. `gpu_paper.py` holds what it prints.
 """
 
 from __future__ import annotations
 
 from typing import Any, NamedTuple
 
+import checkout  # noqa: F401
 import torch
 from gpu_sampling import scenes
 from gpu_scale import Scale

@@ -1,4 +1,4 @@
-"""What the GPU suite's bars are on paper: `PYTHONPATH=. python benchmarks/gpu_paper.py`.
+"""What the GPU suite's bars are on paper: `python benchmarks/gpu_paper.py`.
 
 Bytes and operations against the data sheets of two cards; nothing here is measured on a card.
 docs/gpu.md holds the tables that this prints, and a test compares them.
@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
+import checkout  # noqa: F401
 from gpu_counts import STEPS, Counted
 from gpu_floor import Ceilings, floor_seconds, operations_per_position
 

@@ -209,6 +209,8 @@ def learned(scale: Scale, before: dict[str, Any]) -> dict[str, Any]:
 def dense(scale: Scale, before: dict[str, Any]) -> dict[str, Any]:
     """The dense host for as long as the guided run took, learning included, beside that run."""
     guided = before["learned"]
+    if "guided_step" not in guided:
+        return {"left_out": "there is no guided run to compare with"}
     scene = photographed(scale.city, scale.capture, scale.device)
     run = Run(scene, scale, homogeneous=True)
     took = run.train(sum(guided["seconds"].values()), scale.sizes.candidates)

@@ -1,5 +1,6 @@
 """Writes `docs/results.md` and the README's table and chart from stored results, or with `--check`
-says which of them are of other results.
+says which of them are of other results. Charts are drawn where their results have changed; with
+`--redraw`, all of them.
 
 python benchmarks/results_page.py
 """
@@ -11,6 +12,7 @@ import sys
 from pathlib import Path
 from typing import Any
 
+import checkout  # noqa: F401
 from PIL import Image
 
 from leco_plugin.chart.picture import draw
@@ -117,12 +119,14 @@ def pictures() -> dict[Path, Any]:
     return found
 
 
-def draw_pictures() -> None:
-    """All of `pictures`."""
+def draw_pictures(redraw: bool) -> None:
+    """All of `pictures`, or those that are of other results."""
     from leco_plugin.demo import draw_chart
 
     CHARTS.mkdir(parents=True, exist_ok=True)
     for path, results in pictures().items():
+        if not (redraw or is_stale(path, results)):
+            continue
         if path == DEMO_CHART:
             draw_chart(json.loads((RESULTS / "demo.json").read_text()), path)
         else:
@@ -161,8 +165,31 @@ def gpu_table(results: dict[str, Any]) -> str:
         )
     for name, part in results["parts"].items():
         if missing := [kernel for kernel, runs in part.get("running", {}).items() if not runs]:
-            rows += ["", f"Part {name}: torch answered in place of the fused {', '.join(missing)}."]
-    return "\n".join(rows)
+            rows += ["", f"Part {name}: torch answered in place of the fused {'; '.join(missing)}."]
+        if reason := part.get("left_out"):
+            rows += ["", f"Part {name} was left out: {reason}"]
+    return "\n".join(rows + trained_lines(results["parts"]))
+
+
+def trained_lines(parts: dict[str, Any]) -> list[str]:
+    """Steps, memory and PSNR of the guided run of the GPU suite and of the dense one beside it."""
+    learned, dense = parts.get("learned", {}), parts.get("dense", {})
+    if "psnr" not in learned or "psnr" not in dense:
+        return []
+    rows = ["", "| run | seconds | steps | ms a step | peak memory, GiB | PSNR, dB |"]
+    rows.append("|---|---|---|---|---|---|")
+    seconds, steps = learned["seconds"], learned["steps"]
+    after = steps["all"] - steps["learning"]
+    for name, took, count, step, psnr in (
+        ("learning", seconds["learning"], steps["learning"], learned["learning_step"], "-"),
+        ("guided", seconds["guided"], after, learned["guided_step"], f"{learned['psnr']:.2f}"),
+        ("dense", dense["seconds"], dense["steps"], dense["step"], f"{dense['psnr']:.2f}"),
+    ):
+        milliseconds, gibibytes = 1e3 * step["seconds"], step["peak_bytes"] / 2**30
+        rows.append(
+            f"| {name} | {took:.0f} | {count} | {milliseconds:.1f} | {gibibytes:.2f} | {psnr} |"
+        )
+    return rows
 
 
 def check_gpu(results: dict[str, Any]) -> None:
@@ -245,8 +272,10 @@ def page() -> str:
     for path in sorted(RESULTS.glob("gpu-*.json")):
         report = json.loads(path.read_text())
         check_gpu(report)
-        title, command = f"On a GPU: {report['machine']['device']}", "python benchmarks/gpu.py"
-        parts += section(title, command, report, gpu_table(report))
+        title = f"On a GPU: {report['machine']['device']}, {report['date']}"
+        version, commit = report["code"]["version"], report["code"]["commit"] or "no commit"
+        note = f" leco_plugin {version} at {commit}, sources {report['code']['sources']}."
+        parts += section(title, "python benchmarks/gpu.py", report, gpu_table(report), note)
     return "\n".join(parts)
 
 
@@ -269,7 +298,7 @@ def main() -> int:
         return 1 if stale else 0
     for path, text in wanted.items():
         path.write_text(text)
-    draw_pictures()
+    draw_pictures("--redraw" in sys.argv[1:])
     return 0
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib.metadata
 import json
 import runpy
 import shutil
@@ -68,6 +69,7 @@ def test_a_dry_run_does_every_part(stored: Path) -> None:
     assert {"driver", "cuda", "device"} <= set(results["machine"])
     assert set(results["code"]) == {"version", "commit", "sources"}
     parts = results["parts"]
+    assert "small gate" in parts["correctness"]["running"]
     assert parts["gate"]["running"].keys() == {"small gate", "large gate", "paper gate"}
     assert parts["sampling"]["running"].keys() == {"march, box", "march, unbounded"}
     for name in ("gate", "sampling", "experts", "dense"):
@@ -92,7 +94,8 @@ def test_nothing_is_measured_twice(stored: Path, capsys) -> None:
     before = stored.read_text()
     assert gpu.main(["--dry-run", "--out", str(stored)]) == 0
     assert json.loads(stored.read_text()) == json.loads(before)
-    assert "floor / fused" not in capsys.readouterr().out
+    said = capsys.readouterr().out
+    assert said.count("measured before") == len(gpu.PARTS) and str(stored) in said
 
 
 def test_results_of_other_code_or_of_another_machine_are_not_gone_on_with(
@@ -123,6 +126,47 @@ def test_all_parts_fit_into_ten_minutes() -> None:
     assert sum(part.seconds for part in gpu.PARTS.values()) <= gpu.LIMIT == 600.0
 
 
+def test_a_dry_run_gives_no_verdicts(quick: list[str], capsys) -> None:
+    assert gpu.main(["--dry-run"]) == 0
+    said = capsys.readouterr().out
+    assert "one ..." in said and "two: " in said and "mean nothing" in said
+    assert "reached" not in said.lower() and "torch answered" not in said
+
+
+def test_the_end_says_where_the_results_are(quick: list[str], tmp_path: Path, capsys) -> None:
+    out = tmp_path / "gpu.json"
+    assert gpu.finished(DRY, out, dry=False) == 0
+    assert f"all parts are measured; they are in {out}" in capsys.readouterr().out
+    stored = json.loads(out.read_text())
+    assert set(stored["parts"]["one"]) == {"figures", "running", "wall_seconds"}
+    assert len(stored["date"]) == len("2026-01-01")
+
+
+def full(*_: object) -> None:
+    raise torch.cuda.OutOfMemoryError("CUDA out of memory. Tried to allocate 2 GiB.\nmore")
+
+
+def test_a_part_that_does_not_fit_a_card_is_left_out(
+    quick: list[str], monkeypatch, tmp_path: Path, capsys
+) -> None:
+    monkeypatch.setitem(gpu.PARTS, "one", gpu.Part(full, 10.0))
+    results = gpu.run(DRY, tmp_path / "gpu.json", dry=False)
+    assert quick == ["two"]
+    assert results["parts"]["one"]["left_out"] == "CUDA out of memory. Tried to allocate 2 GiB."
+    assert "one: LEFT OUT, CUDA out of memory" in capsys.readouterr().out
+    assert "left_out" in gpu_training.dense(DRY, {"learned": results["parts"]["one"]})
+
+
+def test_a_small_card_decides_about_fewer_positions(monkeypatch) -> None:
+    occupancy = gpu_parts.random_occupancy(gpu_parts.gates()["small"], CPU)
+    monkeypatch.setattr(gpu_parts, "FEWEST", 100)
+    monkeypatch.setattr(Occupancy, "query", lambda _, places: full() if len(places) > 200 else None)
+    assert len(gpu_parts.places_that_fit(occupancy, DRY)) == 128
+    monkeypatch.setattr(Occupancy, "query", full)
+    with pytest.raises(torch.cuda.OutOfMemoryError):
+        gpu_parts.places_that_fit(occupancy, DRY)
+
+
 def test_figures_of_a_twin_are_said_to_be_its_own(quick: list[str], capsys) -> None:
     gpu.run(DRY, None, dry=False)
     said = capsys.readouterr().out
@@ -135,6 +179,34 @@ def test_without_a_gpu_nothing_is_measured_and_nothing_written(quick: list[str],
     before = sorted(gpu.RESULTS.rglob("*"))
     assert gpu.main([]) == 2 and "no CUDA device here" in capsys.readouterr().err
     assert quick == [] and sorted(gpu.RESULTS.rglob("*")) == before
+
+
+def test_without_the_drivers_version_nothing_is_measured(
+    quick: list[str], monkeypatch, tmp_path: Path, capsys
+) -> None:
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
+    monkeypatch.setattr(gpu, "driver", lambda: None)
+    monkeypatch.setattr(gpu, "machine", dict)
+    assert gpu.main([]) == 2 and quick == []
+    assert "put it on the PATH" in capsys.readouterr().err
+    assert gpu.main(["--out", str(tmp_path / "gpu.json")]) == 0 and quick == ["one", "two"]
+
+
+def test_a_wrong_kernel_ends_the_run_in_one_line(monkeypatch, capsys) -> None:
+    def wrong(*_: object) -> None:
+        raise gpu_parts.Disagreement("the fused gate is wrong")
+
+    monkeypatch.setattr(gpu, "PARTS", {"correctness": gpu.Part(wrong, 10.0)})
+    assert gpu.main(["--dry-run"]) == 1
+    assert capsys.readouterr().err.startswith("the fused gate is wrong: figures of")
+
+
+def test_a_machine_without_triton_says_so(monkeypatch) -> None:
+    def absent(name: str) -> str:
+        raise importlib.metadata.PackageNotFoundError(name)
+
+    monkeypatch.setattr(importlib.metadata, "version", absent)
+    assert gpu.machine()["triton"] is None
 
 
 @pytest.mark.parametrize("name", ["gpu-card-20260101.json", "charts/gpu.json", "../results/a"])
@@ -164,9 +236,11 @@ def test_the_driver_is_what_its_tool_says(monkeypatch) -> None:
     monkeypatch.setattr(shutil, "which", lambda name: None)
     assert gpu.driver() is None
     monkeypatch.setattr(shutil, "which", lambda name: name)
-    answer = SimpleNamespace(stdout="570.86.15\n570.86.15\n")
+    answer = SimpleNamespace(stdout="570.86.15\n570.86.15\n", returncode=0)
     monkeypatch.setattr(subprocess, "run", lambda *_, **__: answer)
     assert gpu.driver() == "570.86.15"
+    answer.stdout, answer.returncode = "NVIDIA-SMI has failed", 9
+    assert gpu.driver() is None
 
 
 def test_a_wrong_gate_ends_the_run(monkeypatch) -> None:
@@ -174,7 +248,7 @@ def test_a_wrong_gate_ends_the_run(monkeypatch) -> None:
         return None if fused._switch.off else torch.ones(len(positions), dtype=torch.bool)
 
     monkeypatch.setattr(fused, "decisions", wrong)
-    with pytest.raises(RuntimeError, match="the fused gate is wrong"):
+    with pytest.raises(gpu_parts.Disagreement, match="the fused gate is wrong"):
         gpu_parts.correctness(DRY, {})
 
 
@@ -183,7 +257,7 @@ def test_a_wrong_march_ends_the_run(monkeypatch) -> None:
         return None if fused._switch.off else (torch.tensor([0]), torch.zeros(1), torch.ones(1))
 
     monkeypatch.setattr(fused, "march", wrong)
-    with pytest.raises(RuntimeError, match="the fused march is wrong"):
+    with pytest.raises(gpu_parts.Disagreement, match="the fused march is wrong"):
         gpu_parts.correctness(DRY, {})
 
 

@@ -11,6 +11,8 @@ import pytest
 import tyro
 from nerfstudio.configs.base_config import MachineConfig
 
+from leco_plugin.samplers.kernels_off import NAMES, VARIABLE
+
 ROOT = Path(__file__).resolve().parent.parent
 PAGE = (ROOT / "docs" / "gpu.md").read_text()
 
@@ -50,3 +52,36 @@ def test_the_commands_for_several_gpus_are_nerfstudios() -> None:
 @pytest.mark.parametrize("name", re.findall(r"`((?:samplers|models)/\w+\.py)`", PAGE))
 def test_files_that_it_names_are_there(name: str) -> None:
     assert (ROOT / "leco_plugin" / name).is_file()
+
+
+def test_kernels_that_can_be_turned_off_are_named() -> None:
+    (paragraph,) = re.findall(r"\*\*Off\.\*\*.*?\n\n", PAGE, re.DOTALL)
+    assert f"`{VARIABLE}=march`" in paragraph
+    assert all(f"`{name}`" in paragraph for name in NAMES)
+
+
+@pytest.mark.parametrize(
+    ("file", "line"),
+    [
+        ("samplers/fused.py", "the fused {} answers on "),
+        ("samplers/fused.py", "no fused gate: "),
+        ("samplers/fused.py", "the fused {} does not run, torch answers in its place: "),
+        ("samplers/fused.py", "compute capability {} is below 8.0"),
+        ("samplers/trials.py", "it decides otherwise about {} of {} positions"),
+        ("samplers/gate_weights.py", "the kernel holds "),
+        ("samplers/estimator.py", "no cell cache, sampling will be slower: "),
+        ("models/grouped_trial.py", "no grouped products, "),
+        ("models/grouped_trial.py", "ms a layer grouped, "),
+    ],
+)
+def test_lines_of_the_log_are_those_that_are_logged(file: str, line: str) -> None:
+    values = re.escape(line).replace(r"\{\}", r"(%s|\{[^`]*?\}|[\w.]+)")
+    assert re.search(values, (ROOT / "leco_plugin" / file).read_text())
+    (table,) = re.findall(r"\| line \| .*?\n\n", PAGE, re.DOTALL)
+    assert re.search(values, table)
+
+
+def test_its_own_sections_are_found() -> None:
+    titles = re.findall(r"^## (.*)$", PAGE, re.MULTILINE)
+    anchors = {re.sub(r"[^\w -]", "", title).lower().replace(" ", "-") for title in titles}
+    assert set(re.findall(r"\]\(#([\w-]+)\)", PAGE)) <= anchors

@@ -135,6 +135,43 @@ def test_figures_of_a_twin_are_shown_as_its_own(benchmarks) -> None:
     assert table.endswith("Part gate: torch answered in place of the fused march.")
 
 
+def test_the_trained_runs_are_shown_side_by_side(benchmarks) -> None:
+    step = {"seconds": 0.01, "peak_bytes": 1 << 30}
+    parts = {
+        "learned": {
+            "seconds": {"learning": 60.2, "freezing": 2.0, "guided": 60.1},
+            "steps": {"learning": 100, "all": 350},
+            "learning_step": step,
+            "guided_step": step,
+            "psnr": 21.5,
+        },
+        "dense": {"seconds": 122.0, "steps": 70, "step": step, "psnr": 20.25},
+    }
+    page = load("results_page")
+    assert page.gpu_table({"parts": parts}).splitlines()[-3:] == [
+        "| learning | 60 | 100 | 10.0 | 1.00 | - |",
+        "| guided | 60 | 250 | 10.0 | 1.00 | 21.50 |",
+        "| dense | 122 | 70 | 10.0 | 1.00 | 20.25 |",
+    ]
+    parts["dense"] = {"left_out": "out of memory"}
+    assert page.gpu_table({"parts": parts}).endswith("Part dense was left out: out of memory")
+
+
+def test_the_checkout_is_measured_and_not_what_is_installed(tmp_path: Path) -> None:
+    (tmp_path / "leco_plugin").mkdir()
+    (tmp_path / "leco_plugin" / "__init__.py").touch()
+    command = [sys.executable, "-c", "import checkout, leco_plugin; print(leco_plugin.__file__)"]
+    done = subprocess.run(
+        command,
+        cwd=BENCHMARKS,
+        env={**os.environ, "PYTHONPATH": str(tmp_path)},
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    assert Path(done.stdout.strip()).parent == BENCHMARKS.parent / "leco_plugin"
+
+
 def test_the_floor_is_the_larger_of_bytes_and_operations(benchmarks) -> None:
     module = load("gpu_floor")
     config = GateConfig(EncodingConfig(octaves=6), width=64, layers=3, scene_experts=4)

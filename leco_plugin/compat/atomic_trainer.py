@@ -22,7 +22,9 @@ from leco_plugin.compat.run_sizes import (
 )
 from leco_plugin.compat.whole_checkpoints import first_not_finite, newest_whole, previous_of
 from leco_plugin.models.failures import GateCollapsed, TrainingStopped
-from leco_plugin.models.ranks import say
+from leco_plugin.models.ranks import say, say_what_is_logged
+from leco_plugin.samplers.kernels_off import VARIABLE, kernels_off
+from leco_plugin.scenes.input_error import InputError
 
 SECONDS_BETWEEN_SAVES = 60.0
 """A run that saves at all is saved this often, however few its steps are..."""
@@ -48,8 +50,11 @@ class AtomicTrainer(Trainer):
 
         Raises:
             InputError: there is no whole checkpoint to go on from, its sizes are not those that are
-                set by hand, or the scene has other photographs now.
+                set by hand, the scene has other photographs now, or there is no kernel of a name
+                that is to be off.
         """
+        say_what_is_logged()
+        _say_which_kernels_are_off()
         asked = self.config.pipeline.model
         self.config = with_sizes_of(self.config, checkpoint_of(self.config))
         super().setup(*arguments, **options)
@@ -182,3 +187,12 @@ class AtomicTrainer(Trainer):
         for path in [*others, *aside.glob("*.ckpt")]:
             if path != kept:
                 path.unlink()
+
+
+def _say_which_kernels_are_off() -> None:
+    try:
+        off = ", ".join(sorted(kernels_off()))
+    except ValueError as error:
+        raise InputError(str(error)) from None
+    if off:
+        say(f"{VARIABLE}: torch answers in place of {off}")

@@ -13,6 +13,7 @@ from types import SimpleNamespace
 from typing import Any
 
 import torch
+from nerfstudio.configs.base_config import MachineConfig
 from nerfstudio.engine.trainer import TrainerConfig
 from torch import distributed, nn
 from torch.multiprocessing import ProcessExitedException, ProcessRaisedException
@@ -36,9 +37,14 @@ class DataParallelTrainerConfig(TrainerConfig):
     """target class to instantiate"""
 
     def set_timestamp(self) -> None:
-        """Prepares the launcher too: of a config, nothing else is called before processes start."""
+        """Prepares the launcher too: of a config, nothing else is called before processes start.
+
+        Raises:
+            InputError: the processes that are asked for cannot be started, or find each other.
+        """
         super().set_timestamp()
         machine = self.machine
+        require_startable(machine)
         if machine.num_devices * machine.num_machines > 1:
             name_the_lost()
         if machine.device_type == "cpu" and machine.num_devices * machine.num_machines > 1:
@@ -54,6 +60,33 @@ class DataParallelTrainerConfig(TrainerConfig):
         if reasons:
             say(f"{reasons[0]}; this run goes to {self.get_base_dir()}")
         super().save_config()
+
+
+def require_startable(machine: MachineConfig) -> None:
+    """Refuses what nerfstudio would refuse in a process that it has started.
+
+    Raises:
+        InputError: there are fewer GPUs than processes here, or several machines do not know of
+            each other.
+    """
+    devices, machines = machine.num_devices, machine.num_machines
+    if machine.device_type == "cuda" and devices > 1:
+        there = torch.cuda.device_count()
+        if devices > there:
+            raise InputError(
+                f"--machine.num-devices is {devices}, and torch sees {there} CUDA devices here; "
+                "it counts those of one machine"
+            )
+    if machines > 1 and machine.dist_url == "auto":
+        raise InputError(
+            f"--machine.num-machines is {machines}: give each --machine.dist-url tcp://HOST:PORT, "
+            "the name or address of the machine with rank 0 and a port that is free there"
+        )
+    if not 0 <= machine.machine_rank < machines:
+        raise InputError(
+            f"--machine.machine-rank is {machine.machine_rank}; of {machines} machines the ranks "
+            f"are 0 to {machines - 1}"
+        )
 
 
 def launch_on_cpu() -> None:
@@ -99,8 +132,8 @@ def _stop(which: str, how: str, config: Any) -> None:
         TrainingStopped: always; the message says what is left.
     """
     raise TrainingStopped(
-        f"{which} of {config.machine.num_devices} processes was lost ({how}), and the others have "
-        "stopped; nothing that was saved is lost: go on with --load-dir "
+        f"{which} of {config.machine.num_devices} processes here was lost ({how}), and the others "
+        "have stopped; nothing that was saved is lost: go on with --load-dir "
         f"{config.get_checkpoint_dir()}"
     ) from None
 

@@ -14,6 +14,7 @@ from torch import Tensor, nn
 
 from leco_plugin.models.grouped_trial import grouped_product, serves
 from leco_plugin.models.rows import permute_rows
+from leco_plugin.samplers.kernels_off import kernels_off
 
 
 class Layered(Protocol):
@@ -76,6 +77,7 @@ def may_group(features: Tensor, n: int, width: int) -> bool:
         return False
     return (
         hasattr(nn.functional, "grouped_mm")
+        and "experts" not in kernels_off()
         and torch.get_autocast_dtype(device) == torch.bfloat16
         and (features.dtype == torch.bfloat16 or torch.is_autocast_enabled(device))
         and serves(features.device, n, width)

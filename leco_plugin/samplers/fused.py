@@ -25,6 +25,7 @@ from leco_plugin.samplers.gate_weights import (
     why_not,
 )
 from leco_plugin.samplers.growth import MOST_POWERS, powers_needed
+from leco_plugin.samplers.kernels_off import kernels_off
 from leco_plugin.samplers.marching import Candidates, Samples, TooManyCandidates
 
 _log = logging.getLogger(__name__)
@@ -75,7 +76,9 @@ def twins_only() -> Iterator[None]:
 
 def ready(device: torch.device, name: str = "gate") -> bool:
     """Whether a kernel, `gate` or `march`, may be tried on this device."""
-    return device.type == "cuda" and torch.version.cuda is not None and name not in _switch.off
+    if device.type != "cuda" or torch.version.cuda is None:
+        return False
+    return name not in _switch.off and name not in kernels_off()
 
 
 def decisions(occupancy: nn.Module, positions: Tensor) -> Tensor | None:
@@ -123,6 +126,8 @@ def _passes(
 
     if tried(name, passes, weights.facts.device) is None:
         return False
+    if not _passed[kind]:
+        _log.info("the fused %s answers on %s", kind, weights.facts.device)
     _passed[kind][owner] = weights
     return True
 

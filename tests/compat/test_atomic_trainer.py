@@ -16,9 +16,10 @@ import torch
 from nerfstudio.engine.trainer import Trainer
 
 from leco_plugin.compat import atomic_trainer
-from leco_plugin.compat.atomic_trainer import AtomicTrainer
+from leco_plugin.compat.atomic_trainer import AtomicTrainer, _say_which_kernels_are_off
 from leco_plugin.compat.whole_checkpoints import damage_of
 from leco_plugin.models.failures import TrainingStopped
+from leco_plugin.samplers.kernels_off import VARIABLE
 from leco_plugin.scenes.input_error import InputError
 
 
@@ -247,3 +248,18 @@ def test_an_empty_folder_has_no_checkpoint(trainer: AtomicTrainer, tmp_path: Pat
     trainer.config = Loading(tmp_path)
     with pytest.raises(InputError, match="there is no checkpoint in"):
         trainer._load_checkpoint()
+
+
+def test_kernels_that_are_off_are_said_before_training(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setenv(VARIABLE, "march, gate")
+    _say_which_kernels_are_off()
+    said = " ".join(capsys.readouterr().out.split())
+    assert "[leco] LECO_KERNELS_OFF: torch answers in place of gate, march" in said
+    monkeypatch.setenv(VARIABLE, "marsh")
+    with pytest.raises(InputError, match="LECO_KERNELS_OFF names marsh"):
+        _say_which_kernels_are_off()
+    monkeypatch.delenv(VARIABLE)
+    _say_which_kernels_are_off()
+    assert capsys.readouterr().out == ""

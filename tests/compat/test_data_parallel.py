@@ -11,6 +11,7 @@ from types import SimpleNamespace
 from typing import Any
 
 import pytest
+import torch
 import yaml
 from ball_occupancy import ball
 from nerfstudio.engine.trainer import TrainerConfig
@@ -20,6 +21,7 @@ from torch import nn
 from leco_plugin import host_configs, method_configs
 from leco_plugin.compat.atomic_trainer import AtomicTrainer
 from leco_plugin.compat.data_parallel import DataParallelTrainerConfig, WithoutDevices, process
+from leco_plugin.scenes.input_error import InputError
 from leco_plugin.swap import registered, swapped_config, with_sampler_swapped
 
 
@@ -48,13 +50,16 @@ def test_several_processes_on_a_cpu_are_ours() -> None:
 
 def test_so_are_those_of_several_machines() -> None:
     made = config("cpu", 1)
-    made.machine.num_machines = 2
+    made.machine.num_machines, made.machine.dist_url = 2, "tcp://host:1"
     made.set_timestamp()
     assert ns_train._distributed_worker is process
 
 
 @pytest.mark.parametrize(("device", "devices"), [("cpu", 1), ("cuda", 1), ("cuda", 2)])
-def test_all_others_are_left_to_nerfstudio(device: str, devices: int) -> None:
+def test_all_others_are_left_to_nerfstudio(
+    device: str, devices: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(torch.cuda, "device_count", lambda: 2)
     config(device, devices).set_timestamp()
     assert ns_train._distributed_worker is not process
 
@@ -114,6 +119,25 @@ def test_a_swapped_method_can(file: Path) -> None:
     assert made._target is AtomicTrainer
     assert made.machine.num_devices == 2
     assert made.optimizers == registered("instant-ngp-bounded").optimizers
+
+
+@pytest.mark.parametrize(
+    ("asked", "message"),
+    [
+        ({"num_devices": 4}, r"num-devices is 4, and torch sees 1 CUDA devices"),
+        ({"num_machines": 2}, r"num-machines is 2: give each --machine.dist-url tcp://HOST:PORT"),
+        ({"machine_rank": 1}, r"machine-rank is 1; of 1 machines the ranks are 0 to 0"),
+    ],
+)
+def test_what_cannot_be_started_is_refused_in_one_line(
+    asked: dict[str, int], message: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(torch.cuda, "device_count", lambda: 1)
+    made = config("cuda", 1)
+    vars(made.machine).update(asked)
+    with pytest.raises(InputError, match=message) as refused:
+        made.set_timestamp()
+    assert "\n" not in str(refused.value)
 
 
 class OthersConfig(TrainerConfig):

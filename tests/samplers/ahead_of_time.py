@@ -17,7 +17,9 @@ from typing import Any, NamedTuple
 
 CAPABILITIES = (80, 90)
 """A100 and H100."""
-SHARED = {80: 163 << 10, 90: 227 << 10}
+AT_HOME = (86, 89, 120)
+"""RTX 30, 40 and 50."""
+SHARED = {80: 163 << 10, 90: 227 << 10} | dict.fromkeys(AT_HOME, 99 << 10)
 """Bytes of shared memory that one program may have."""
 
 

@@ -1,4 +1,5 @@
-"""Every kernel is compiled for A100 and H100 without one: what interprets may still not compile."""
+"""Every kernel is compiled for A100 and H100 without one, those of the automatic sizes for cards at
+home too: what interprets may still not compile."""
 
 from __future__ import annotations
 
@@ -8,7 +9,7 @@ from typing import Any
 
 import pytest
 import torch
-from samplers.ahead_of_time import CAPABILITIES, SHARED, Compiled, compiling
+from samplers.ahead_of_time import AT_HOME, CAPABILITIES, SHARED, Compiled, compiling
 
 from leco_plugin.models.encodings import EncodingConfig
 from leco_plugin.models.gate import Gate, GateConfig
@@ -128,11 +129,15 @@ def cells(space: Space, dtype: torch.dtype, resolution: int = 32) -> CellCache:
     ("name", "capability"), on_each_card(MARCHES, {("small", 80), ("large", 90)})
 )
 def test_the_march_compiles(name: str, capability: int, folder: Path, monkeypatch) -> None:
+    weights = weights_of(MARCHES[name][0], capability, monkeypatch)
+    assert weights.padded_width <= fused.WIDEST_MARCH
+    compile_march(name, weights, capability, folder)
+
+
+def compile_march(name: str, weights: GateWeights, capability: int, folder: Path) -> None:
     from leco_plugin.samplers import march_kernel
 
     gate, cone_angle, dtype = MARCHES[name]
-    weights = weights_of(gate, capability, monkeypatch)
-    assert weights.padded_width <= fused.WIDEST_MARCH
     cache = cells(Space(GATES[gate][1]), dtype)
     limits = torch.zeros(5), torch.ones(5)
     candidates = number(torch.zeros(5, 3), torch.ones(5, 3), *limits, 0.1, cone_angle)
@@ -140,3 +145,17 @@ def test_the_march_compiles(name: str, capability: int, folder: Path, monkeypatc
         march_kernel.march_kept(cache, weights, candidates)
     assert len(compiled) == 1  # nothing ran, nothing was counted, nothing is written
     assert_it_fits(compiled[0], capability)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("capability", AT_HOME)
+def test_the_automatic_sizes_compile_for_cards_at_home(
+    capability: int, folder: Path, monkeypatch
+) -> None:
+    from leco_plugin.samplers import gate_kernel
+
+    weights = weights_of("large", capability, monkeypatch)
+    with compiling(gate_kernel, "_gate_kernel", capability, folder) as compiled:
+        gate_kernel.gate_decisions(weights, torch.zeros(300, 3))
+    assert_it_fits(compiled[0], capability)
+    compile_march("large", weights, capability, folder)
