@@ -10,10 +10,11 @@ from typing import Any
 
 import tyro
 from nerfstudio.engine.trainer import Trainer, TrainerConfig
+from nerfstudio.models.base_model import ModelConfig
 
 from leco_plugin.compat.atomic_trainer import AtomicTrainer
 from leco_plugin.compat.data_parallel import DataParallelTrainerConfig
-from leco_plugin.compat.dynamic_batch import ClampedDynamicBatchPipelineConfig
+from leco_plugin.compat.dynamic_batch import clamped
 from leco_plugin.method_configs import best_device
 from leco_plugin.models.guided import GuidedModelConfig
 from leco_plugin.models.guided_start import OccupancyConfig, load_occupancy, occupancy_file
@@ -91,15 +92,24 @@ def with_sampler_swapped(
     """The same training with its model guided by an occupancy; the config given is not changed.
 
     Raises:
-        InputError: the model learns or has an occupancy already.
+        InputError: the model learns or has an occupancy already, or there is no model.
     """
     from leco_plugin.models.leco_config import LecoModelConfig
 
     pipeline: Any = copy.deepcopy(config.pipeline)
-    host = pipeline.model
-    if isinstance(host, GuidedModelConfig | LecoModelConfig):
+    host = getattr(pipeline, "model", None)
+    if isinstance(host, GuidedModelConfig):
         raise InputError(
-            f"{config.method_name} finds its occupancy itself; swap another method's sampler"
+            f"{config.method_name} is guided already: ns-train {config.method_name} "
+            f"--pipeline.model.occupancy.path {file} guides it by this occupancy"
+        )
+    if isinstance(host, LecoModelConfig):
+        raise InputError(
+            f"{config.method_name} is no host: it learns the occupancy that guides other methods"
+        )
+    if not isinstance(host, ModelConfig):
+        raise InputError(
+            f"{config.method_name} has a pipeline without a model that could be guided"
         )
     path = occupancy_file(file.resolve())
     occupancy = OccupancyConfig(path=path, sampler=sampler)
@@ -109,16 +119,6 @@ def with_sampler_swapped(
         config = DataParallelTrainerConfig(**values)
     trainer = AtomicTrainer if config._target is Trainer else config._target
     return replace(config, pipeline=clamped(pipeline), _target=trainer)
-
-
-def clamped(pipeline: Any) -> Any:
-    """A pipeline of dynamic batches as one that keeps within bounds; any other as it is."""
-    from nerfstudio.pipelines.dynamic_batch import DynamicBatchPipelineConfig
-
-    if type(pipeline) is not DynamicBatchPipelineConfig:
-        return pipeline
-    values = {f.name: getattr(pipeline, f.name) for f in fields(pipeline) if f.name != "_target"}
-    return ClampedDynamicBatchPipelineConfig(**values)
 
 
 def swap(method: str, file: Path, arguments: Sequence[str] = (), sampler: str = LEARNED) -> Path:

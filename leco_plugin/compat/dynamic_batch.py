@@ -6,7 +6,7 @@ behind one fake sample, and the next batch then has 262,144 times as many rays.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields, replace
 from typing import Any
 
 import torch
@@ -19,6 +19,8 @@ MOST_GROWTH = 2.0
 """Factor by which a batch may grow from one step to the next; it shrinks as far as it must."""
 NOTHING_KEPT = 1
 """Samples of a batch that has none."""
+FEWEST_RAYS, MOST_RAYS = 64, 1 << 16
+"""Rays of the smallest and of the largest batch."""
 
 
 @dataclass
@@ -27,9 +29,9 @@ class ClampedDynamicBatchPipelineConfig(DynamicBatchPipelineConfig):
 
     _target: type = field(default_factory=lambda: ClampedDynamicBatchPipeline)
     """target class to instantiate"""
-    fewest_rays: int = 64
+    fewest_rays: int = FEWEST_RAYS
     """Rays of the smallest batch."""
-    most_rays: int = 1 << 16
+    most_rays: int = MOST_RAYS
     """Rays of the largest batch."""
 
 
@@ -37,7 +39,6 @@ class ClampedDynamicBatchPipeline(DynamicBatchPipeline):
     """The number of rays stays within bounds, travels with a checkpoint, and is that of all
     processes of a data-parallel run."""
 
-    config: ClampedDynamicBatchPipelineConfig
     rays_per_batch: Tensor
 
     def __init__(self, *args: Any, **kwargs: Any) -> None:
@@ -59,6 +60,37 @@ class ClampedDynamicBatchPipeline(DynamicBatchPipeline):
         self._update_pixel_samplers()
 
     def _set_rays(self, wanted: int) -> None:
-        most, fewest = self.config.most_rays, self.config.fewest_rays
+        fewest = getattr(self.config, "fewest_rays", FEWEST_RAYS)
+        most = getattr(self.config, "most_rays", MOST_RAYS)
         self.dynamic_num_rays_per_batch = min(most, max(fewest, wanted))
         self.rays_per_batch.fill_(self.dynamic_num_rays_per_batch)
+
+
+@dataclass(frozen=True)
+class Clamping:
+    """Set as `_target` of the config of another package's dynamic batches: they are clamped too."""
+
+    pipeline: type[DynamicBatchPipeline]
+    """The class of that package."""
+
+    def __call__(self, config: Any, **arguments: Any) -> DynamicBatchPipeline:
+        """The pipeline, of a class that is both."""
+        both = (ClampedDynamicBatchPipeline, self.pipeline)
+        made: DynamicBatchPipeline = type(f"Clamped{self.pipeline.__name__}", both, {})(
+            config, **arguments
+        )
+        return made
+
+
+def clamped(pipeline: Any) -> Any:
+    """The config of a pipeline of dynamic batches as one that keeps within bounds; any other as it
+    is."""
+    target = getattr(pipeline, "_target", None)
+    dynamic = isinstance(target, type) and issubclass(target, DynamicBatchPipeline)
+    if not dynamic or issubclass(target, ClampedDynamicBatchPipeline):
+        return pipeline
+    if type(pipeline) is DynamicBatchPipelineConfig and target is DynamicBatchPipeline:
+        values = {f.name: getattr(pipeline, f.name) for f in fields(pipeline)}
+        values.pop("_target")
+        return ClampedDynamicBatchPipelineConfig(**values)
+    return replace(pipeline, _target=Clamping(target))

@@ -23,7 +23,7 @@ from leco_plugin.evaluation.field_queries import FieldQueries, counted
 from leco_plugin.evaluation.held_out_images import evaluate_images, psnr_on_rays
 from leco_plugin.evaluation.json_file import finite_or_null
 from leco_plugin.evaluation.peak_memory import peak_allocator_bytes, peak_process_bytes
-from leco_plugin.models.learn_first import FIRST_TIMED, TIMED_STEPS, steps_within
+from leco_plugin.models.learn_first import FIRST_TIMED, TIMED_STEPS, keep_within
 
 CURVE_RAYS = 8192
 """Test pixels behind each point of a curve, its end included."""
@@ -237,7 +237,7 @@ class _Course:
             return
         a_step = statistics.fmean(self.step_times[FIRST_TIMED:])
         more = (self.budget.learn_seconds - self.clock.seconds) / a_step
-        progress.learn_steps = steps_within(more, self.run.steps, progress.learn_steps)
+        keep_within(progress, more, self.run.steps)
 
 
 def _time_updates(model: torch.nn.Module, clock: Clock) -> bool:

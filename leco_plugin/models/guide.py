@@ -13,6 +13,7 @@ from typing import Any, cast
 
 import torch
 from nerfstudio.model_components.ray_samplers import Sampler
+from nerfstudio.viewer_legacy.server.viewer_utils import IOChangeException
 from torch import Tensor, nn
 
 from leco_plugin.models.gate import Gate, GateConfig
@@ -32,6 +33,14 @@ from leco_plugin.space import Space
 
 DensityFn = Callable[[Tensor], Tensor]
 """Positions [N, 3] to densities [N] or [N, 1]."""
+
+
+class NoOccupancyYet(RuntimeError, IOChangeException):
+    """A guided host was asked before it had an occupancy.
+
+    As an `IOChangeException` it tells nerfstudio's viewer, which may have a client before the first
+    step, that there is no picture for now; any other exception would end its rendering for good.
+    """
 
 
 class Guide(nn.Module):
@@ -109,10 +118,10 @@ class Guide(nn.Module):
         """The occupancy.
 
         Raises:
-            RuntimeError: there is none yet.
+            NoOccupancyYet: there is none yet.
         """
         if self.occupancy is None:
-            raise RuntimeError(
+            raise NoOccupancyYet(
                 "this model has no occupancy yet: train it, load a checkpoint, or give a file with "
                 "--pipeline.model.occupancy.path"
             )
@@ -201,6 +210,12 @@ class _StandIn(nn.Module):
 
     def _build(self, guide: Guide) -> nn.Module:
         raise NotImplementedError
+
+    def __dir__(self) -> list[str]:
+        """Without properties: nerfstudio's viewer takes the value of every name that it finds here,
+        and these build a sampler, for which there may be no occupancy yet, and ask it at length."""
+        found = {name: getattr(type(self), name, None) for name in super().__dir__()}
+        return [name for name, value in found.items() if not isinstance(value, property)]
 
     @property
     def sampler(self) -> nn.Module:

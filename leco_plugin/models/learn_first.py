@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 from typing import Any
 
@@ -13,10 +14,13 @@ from leco_plugin.models.leco import LecoModel
 from leco_plugin.models.leco_config import LecoModelConfig
 from leco_plugin.models.lifecycle import Lifecycle
 from leco_plugin.models.optimizers import RATES, FusedAdamConfig
+from leco_plugin.models.phases import MOST_EXTENSIONS, steps_of_an_extension
+from leco_plugin.models.progress import Progress
 from leco_plugin.models.ranks import averaging, mean
 from leco_plugin.occupancy import Occupancy
 from leco_plugin.progress_bar import bar
 from leco_plugin.scenes.detail import CAMERAS
+from leco_plugin.scenes.input_error import InputError
 from leco_plugin.scenes.known_distances import sampler_here
 
 FIRST_TIMED, TIMED_STEPS = 5, 15
@@ -63,11 +67,10 @@ def learn_model(
     Returns:
         The model as it is at the moment of freezing.
     Raises:
-        ValueError: the budget is no positive number of seconds.
+        InputError: see `check_budget`.
         FloatingPointError, RuntimeError: learning failed; one line says where and why.
     """
-    if seconds is not None and not seconds > 0.0:
-        raise ValueError(f"an occupancy is learned in a positive number of seconds, not {seconds}")
+    check_budget(rays, seconds, rate)
     manager = pipeline.datamanager
     dataset = manager.train_dataset
     model: Any = config.setup(
@@ -96,13 +99,29 @@ def learn_model(
     return learned
 
 
-def steps_within(more: float, done: int, most: int) -> int:
-    """Learning steps in all when so many more fit into the time that is left.
+def check_budget(rays: int, seconds: float | None, rate: float) -> None:
+    """Whether something can be learned so; arguments as for `learn_model`.
 
-    Args:
-        most: that are wanted.
+    Raises:
+        InputError: not so.
     """
-    return min(most, max(FEWEST_STEPS, done + int(more)))
+    if seconds is not None and not 0.0 < seconds < math.inf:
+        raise InputError(f"an occupancy is learned in a positive number of seconds, not {seconds}")
+    if rays < 1:
+        raise InputError(f"an occupancy is learned on at least one ray a batch, not {rays}")
+    if not 0.0 < rate < math.inf:
+        raise InputError(f"the multiple of the learning rates must be positive, not {rate}")
+
+
+def keep_within(progress: Progress, more: float, done: int) -> None:
+    """Shortens learning to so many more steps, which fit into the time that is left.
+
+    What does not fit of the further steps that a gate gets when it has not settled, it has had.
+    """
+    fit = max(FEWEST_STEPS, done + int(more))
+    progress.learn_steps = min(progress.learn_steps, fit)
+    extensions = (fit - progress.learn_steps) // steps_of_an_extension(progress.configured)
+    progress.extensions = max(0, MOST_EXTENSIONS - extensions)
 
 
 def _train(
@@ -125,14 +144,15 @@ def _train(
         torch.stack(list(losses.values())).sum().backward()
         for optimizer in optimizers:
             optimizer.step()
-        lifecycle.after_step(step)
         step += 1
         if step == FIRST_TIMED:
             timed_from = time.monotonic()
-        if seconds is not None and step == TIMED_STEPS:
-            now = time.monotonic()
-            a_step = (now - timed_from) / (TIMED_STEPS - FIRST_TIMED)
-            more = mean((seconds - (now - started)) / a_step, model.device)
-            progress = lifecycle.progress
-            progress.learn_steps = steps_within(more, step, progress.learn_steps)
+        if seconds is not None and step >= TIMED_STEPS and lifecycle.progress.recoveries == 0:
+            left = mean(seconds - (time.monotonic() - started), model.device)
+            if step == TIMED_STEPS:
+                a_step = mean(time.monotonic() - timed_from, model.device) / (step - FIRST_TIMED)
+                keep_within(lifecycle.progress, left / a_step, step)
+            elif left <= 0.0:  # steps have become slower
+                keep_within(lifecycle.progress, 0.0, step)
+        lifecycle.after_step(step - 1)
         show(min(1.0, step / lifecycle.progress.learn_steps))

@@ -35,6 +35,7 @@ from leco_plugin.models.phases import (
     decisions_agree,
     is_unsettled,
     ramp,
+    steps_of_an_extension,
 )
 from leco_plugin.models.prior import warm_start
 from leco_plugin.models.progress import NO_EVIDENCE, Progress
@@ -206,7 +207,7 @@ class Lifecycle:
     def _learn_on(self, step: int, agreement: float) -> None:
         progress = self.progress
         progress.extensions += 1
-        progress.learn_steps = step + 1 + max(1, progress.configured // 4)
+        progress.learn_steps = step + 1 + steps_of_an_extension(progress.configured)
         say(
             f"step {step}: only {agreement:.1%} of the gate's decisions are those of the last "
             f"check; it learns on until step {progress.learn_steps}"

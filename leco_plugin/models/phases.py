@@ -67,6 +67,11 @@ def converged(step: int, agreement: float, config: ScheduleConfig) -> bool:
 MOST_EXTENSIONS = 2
 
 
+def steps_of_an_extension(learn_steps: int) -> int:
+    """Steps that a gate gets beyond those of its config, each time that it has not settled."""
+    return max(1, learn_steps // 4)
+
+
 def is_unsettled(step: int, agreement: float, config: ScheduleConfig, extensions: int) -> bool:
     """Whether a gate at its step limit should learn on.
 

@@ -4,16 +4,23 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Iterator
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 import pytest
 import torch
-from nerfstudio.pipelines.dynamic_batch import DynamicBatchPipeline
+import yaml
+from nerfstudio.pipelines.base_pipeline import VanillaPipelineConfig
+from nerfstudio.pipelines.dynamic_batch import DynamicBatchPipeline, DynamicBatchPipelineConfig
 from nerfstudio.utils import writer
 
-from leco_plugin.compat.dynamic_batch import ClampedDynamicBatchPipeline
+from leco_plugin.compat.dynamic_batch import (
+    MOST_RAYS,
+    ClampedDynamicBatchPipeline,
+    ClampedDynamicBatchPipelineConfig,
+    clamped,
+)
 from leco_plugin.host_configs import leco_ngp
 from leco_plugin.models.encodings import EncodingConfig
 from leco_plugin.models.gate import Gate, GateConfig
@@ -159,3 +166,47 @@ def test_a_resumed_run_goes_on_with_its_batch(tiny_scene: Path, tmp_path: Path) 
     del state["rays_per_batch"]  # as of nerfstudio's own pipeline
     narrow.load_pipeline(state, 3)
     assert narrow.dynamic_num_rays_per_batch == rays - 1
+
+
+class TheirPipeline(DynamicBatchPipeline):
+    """Of another package."""
+
+    def __init__(self, config: Any, *args: Any, **kwargs: Any) -> None:
+        super().__init__(config, *args, **kwargs)
+        self.theirs = config.theirs
+
+
+@dataclass
+class TheirPipelineConfig(DynamicBatchPipelineConfig):
+    """Dynamic batches of another package"""
+
+    _target: type = field(default_factory=lambda: TheirPipeline)
+    theirs: int = 7
+
+
+def test_a_pipeline_of_another_package_keeps_its_class_and_is_clamped_too(
+    tiny_scene: Path, tmp_path: Path
+) -> None:
+    made = config(tiny_scene, tmp_path).pipeline
+    theirs = clamped(
+        TheirPipelineConfig(
+            datamanager=made.datamanager,
+            model=made.model,
+            target_num_samples=TARGET,
+            max_num_samples_per_ray=MOST_PER_RAY,
+        )
+    )
+    again = yaml.load(yaml.dump(theirs), Loader=yaml.Loader)
+    assert again == theirs == clamped(again)
+    pipeline = again.setup(device="cpu", test_mode="val")
+    assert isinstance(pipeline, TheirPipeline) and pipeline.theirs == 7
+    assert rays_after(pipeline, 100, 1) == 100
+    assert rays_after(pipeline, MOST_RAYS, 2) == MOST_RAYS
+    assert "rays_per_batch" in pipeline.state_dict()
+
+
+def test_only_dynamic_batches_are_clamped() -> None:
+    plain, ours = VanillaPipelineConfig(), ClampedDynamicBatchPipelineConfig(fewest_rays=3)
+    assert clamped(plain) is plain and clamped(ours) is ours
+    stock = clamped(DynamicBatchPipelineConfig(target_num_samples=5))
+    assert type(stock) is ClampedDynamicBatchPipelineConfig and stock.target_num_samples == 5

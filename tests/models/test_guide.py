@@ -8,6 +8,9 @@ import pytest
 import torch
 from ball_occupancy import CENTRE, ball
 from nerfstudio.cameras.rays import RayBundle
+from nerfstudio.viewer.utils import parse_object
+from nerfstudio.viewer.viewer_elements import ViewerElement
+from nerfstudio.viewer_legacy.server.viewer_utils import IOChangeException
 
 from leco_plugin.models.guide import Guide
 from leco_plugin.samplers.base import Estimator
@@ -134,6 +137,25 @@ def test_a_proposal_host_in_other_coordinates_samples_the_ball(guide: Guide):
 def test_without_an_occupancy_one_line_says_how_to_get_one():
     with pytest.raises(RuntimeError, match=r"occupancy\.path"):
         Guide().estimator(BOX).sampling(*rays(), **MARCH)
+
+
+def test_the_viewer_looks_for_its_elements_before_there_is_an_occupancy():
+    host = torch.nn.Module()
+    host.guide = Guide()
+    host.grid, host.chooser = host.guide.estimator(BOX), host.guide.proposal(num_samples=3)
+    assert parse_object(host, ViewerElement, "Custom Elements") == []
+
+
+def test_the_viewer_does_not_ask_a_gate_when_it_looks_for_its_elements(guide: Guide):
+    host = torch.nn.Module()
+    host.guide, host.grid = guide, guide.estimator(BOX)
+    parse_object(host, ViewerElement, "Custom Elements")
+    assert host.grid._built[0] is None
+
+
+def test_before_there_is_an_occupancy_the_viewer_has_no_picture_and_goes_on():
+    with pytest.raises(IOChangeException):
+        Guide().proposal(num_samples=3)(None)
 
 
 def test_an_unknown_sampler_is_named():

@@ -10,10 +10,12 @@ from nerfstudio.data.datamanagers.base_datamanager import VanillaDataManagerConf
 from nerfstudio.pipelines.base_pipeline import VanillaPipelineConfig
 
 from leco_plugin.models.guided_start import OccupancyConfig
-from leco_plugin.models.learn_first import FEWEST_STEPS, learn_occupancy, steps_within
+from leco_plugin.models.learn_first import FEWEST_STEPS, keep_within, learn_occupancy
 from leco_plugin.models.leco_config import LecoModelConfig
-from leco_plugin.models.phases import ScheduleConfig
+from leco_plugin.models.phases import MOST_EXTENSIONS, ScheduleConfig
+from leco_plugin.models.progress import Progress
 from leco_plugin.occupancy import Occupancy
+from leco_plugin.scenes.input_error import InputError
 from leco_plugin.scenes.photographs import LecoPhotographsDataParserConfig
 
 pytestmark = [  # nerfstudio leaves an image open
@@ -52,10 +54,35 @@ def test_a_budget_sets_the_number_of_steps(pipeline, monkeypatch: pytest.MonkeyP
     assert occupancy.report["step"] == FEWEST_STEPS - 1
 
 
-@pytest.mark.parametrize("seconds", [0.0, -3.0, float("nan")])
-def test_no_time_is_refused(pipeline, seconds: float):
-    with pytest.raises(ValueError, match="positive number of seconds"):
-        learn_occupancy(config(8), pipeline, rays=32, seconds=seconds)
+def test_steps_that_become_slower_do_not_outlast_the_budget(
+    pipeline, monkeypatch: pytest.MonkeyPatch
+):
+    taken = 0
+
+    def clock() -> float:
+        """A step of the first thirty takes a second, one of the later ones ten."""
+        return float(min(taken, 30) + 10 * max(0, taken - 30))
+
+    def next_train(self, step: int):
+        nonlocal taken
+        taken = step + 1
+        return give(step)
+
+    give = pipeline.datamanager.next_train
+    monkeypatch.setattr(type(pipeline.datamanager), "next_train", next_train)
+    monkeypatch.setattr("leco_plugin.models.learn_first.time.monotonic", clock)
+    occupancy = learn_occupancy(config(5000), pipeline, rays=32, seconds=75.0)
+    assert occupancy.report["step"] == 34  # the 35th ends at 80 s
+
+
+BUDGETS = {"seconds": [0.0, -3.0, float("nan"), float("inf")], "rays": [0, -1], "rate": [0.0, -1.0]}
+
+
+@pytest.mark.parametrize(("name", "value"), [(n, v) for n, vs in BUDGETS.items() for v in vs])
+def test_nothing_to_learn_with_is_refused_in_a_line(pipeline, name: str, value: float):
+    with pytest.raises(InputError, match=r"an occupancy is learned|must be positive") as error:
+        learn_occupancy(config(8), pipeline, **{"rays": 32, name: value})
+    assert "\n" not in str(error.value)
 
 
 def test_each_method_has_learning_sizes_of_its_own():
@@ -64,6 +91,12 @@ def test_each_method_has_learning_sizes_of_its_own():
     assert other.learning.schedule.learn_steps != 3
 
 
-@pytest.mark.parametrize(("more", "steps"), [(90.7, 100), (0.0, FEWEST_STEPS), (900.0, 200)])
-def test_learning_takes_the_steps_that_fit_but_never_more_than_are_wanted(more, steps):
-    assert steps_within(more, done=10, most=200) == steps
+@pytest.mark.parametrize(
+    ("more", "steps", "further"),
+    [(90.7, 100, 0), (0.0, FEWEST_STEPS, 0), (190.0, 200, 0), (240.0, 200, 1), (900.0, 200, 2)],
+)
+def test_learning_takes_the_steps_that_fit_but_never_more_than_are_wanted(more, steps, further):
+    progress = Progress(learn_steps=200, configured=200)
+    keep_within(progress, more, done=10)
+    assert progress.learn_steps == steps
+    assert progress.extensions == MOST_EXTENSIONS - further
