@@ -11,6 +11,8 @@ import sys
 from pathlib import Path
 from typing import Any
 
+from growth_picture import draw as draw_growth
+from large_scene_tables import LARGE_SCENES
 from PIL import Image
 
 from leco_plugin.chart.picture import draw
@@ -23,6 +25,7 @@ RESULTS = ROOT / "benchmarks" / "results"
 PAGE = ROOT / "docs" / "results.md"
 README = ROOT / "README.md"
 CHARTS = ROOT / "docs" / "images" / "charts"
+GROWTH = CHARTS / "growth.png"
 DEMO_CHART = ROOT / "docs" / "images" / "demo-chart.png"
 BEGIN, END = "<!-- demo table: generated -->", "<!-- end of the demo table -->"
 
@@ -87,16 +90,20 @@ def chart_section(path: Path) -> list[str]:
     """What `leco chart` stored: its picture and its tables, and the paper's where there are any."""
     results = json.loads(path.read_text())
     _, body = table(results).split("\n", 1)
-    image = f"images/charts/{path.stem}"
-    parts = [
-        f"## {titles()[path.stem]}\n",
-        f'<picture><source media="(prefers-color-scheme: dark)" srcset="{image}-dark.png">'
-        f'<img alt="{path.stem}" src="{image}.png"></picture>',
-    ]
+    parts = [f"## {titles()[path.stem]}\n", picture(path.stem)]
     parts += [body, f"{machine_line(results)}.\n"]
     if path.stem in PAPER_ROWS:
         parts.append(PAPER_ROWS[path.stem])
     return parts
+
+
+def picture(name: str) -> str:
+    """A picture in the page, in the page's colours."""
+    image = f"images/charts/{name}"
+    return (
+        f'<picture><source media="(prefers-color-scheme: dark)" srcset="{image}-dark.png">'
+        f'<img alt="{name}" src="{image}.png"></picture>'
+    )
 
 
 def titles() -> dict[str, str]:
@@ -113,6 +120,9 @@ def pictures() -> dict[Path, Any]:
     for name in titles():
         results = json.loads((RESULTS / "charts" / f"{name}.json").read_text())
         found |= {CHARTS / f"{name}.png": results, CHARTS / f"{name}-dark.png": results}
+    if (growth := RESULTS / "growth.json").exists():
+        report = json.loads(growth.read_text())
+        found |= {GROWTH: report, GROWTH.with_stem("growth-dark"): report}
     return found
 
 
@@ -124,6 +134,8 @@ def draw_pictures() -> None:
     for path, results in pictures().items():
         if path == DEMO_CHART:
             draw_chart(json.loads((RESULTS / "demo.json").read_text()), path)
+        elif path.stem.removesuffix("-dark") == GROWTH.stem:
+            draw_growth(path, results, DARK if path.stem.endswith("-dark") else LIGHT)
         else:
             draw(results, path, DARK if path.stem.endswith("-dark") else LIGHT)
 
@@ -213,6 +225,18 @@ def sizes_table(report: dict[str, Any]) -> str:
     return "\n".join(lines)
 
 
+def large_scene_sections() -> list[str]:
+    """Of growth, bounds, prior and photographs, those that are stored."""
+    parts = []
+    for name, (title, command, rows, note) in LARGE_SCENES.items():
+        if not (path := RESULTS / f"{name}.json").exists():
+            continue
+        report = json.loads(path.read_text())
+        head, *rest = section(title, command, report, rows(report), note(report))
+        parts += [head, f"{picture(name)}\n", *rest] if name == GROWTH.stem else [head, *rest]
+    return parts
+
+
 def section(
     title: str, command: str, report: dict[str, Any], table: str, note: str = ""
 ) -> list[str]:
@@ -236,6 +260,7 @@ def page() -> str:
         note = f" {steps} steps each, {learn} of them learning; PSNR of test pixels."
         command, title = "python benchmarks/sizes.py", "Automatic sizes, and a sweep around them"
         parts += section(title, command, report, sizes_table(report), note)
+    parts += large_scene_sections()
     for sampling in sorted(RESULTS.glob("sampling*.json")):
         report = json.loads(sampling.read_text())
         command, note = "python benchmarks/sampling.py", " Ratios within one run."
