@@ -43,7 +43,7 @@ def draw(path: Path, report: dict[str, Any], theme: Theme = LIGHT) -> Path:
             axes.set_ylabel(label)
             plain(axes, theme)
             if axes.get_legend_handles_labels()[1]:
-                axes.legend(frameon=False)
+                axes.legend(frameon=False, loc="lower left", bbox_to_anchor=(0.0, 1.0))
         figure.savefig(path, dpi=140, metadata={SOURCE: fingerprint(report)})
     return path
 
