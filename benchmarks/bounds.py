@@ -25,6 +25,7 @@ from leco_plugin.evaluation.json_file import write_json
 from leco_plugin.evaluation.machine import describe_machine
 from leco_plugin.evaluation.timed_run import timed_run
 from leco_plugin.method_configs import leco_occupancy
+from leco_plugin.models.failures import GateCollapsed, TrainingStopped
 from leco_plugin.scenes.bounds import BoundsConfig
 
 Pair = tuple[float, float]
@@ -62,10 +63,8 @@ def verdict(rows: Sequence[dict[str, Any]]) -> dict[str, dict[str, float | bool 
         Without planes and with them, as far as there are runs: see `ways_of`.
     """
     automatic = _by_seed(row for row in rows if row["range"] is None)["null"]
-    return {
-        name: _against(automatic, _by_seed(row for row in hand if row["seed"] in automatic))
-        for name, hand in ways_of(rows).items()
-    }
+    ways = {name: _by_seed(some) for name, some in ways_of(rows).items()}
+    return {name: _against(automatic, by_hand) for name, by_hand in ways.items() if by_hand}
 
 
 def ways_of(rows: Sequence[dict[str, Any]]) -> dict[str, list[dict[str, Any]]]:
@@ -77,10 +76,15 @@ def ways_of(rows: Sequence[dict[str, Any]]) -> dict[str, list[dict[str, Any]]]:
 
 
 def _by_seed(rows: Iterable[dict[str, Any]]) -> dict[str, dict[int, float]]:
+    """PSNR by range and seed; a range with which a run has failed is left out."""
     found: dict[str, dict[int, float]] = {}
+    failed = set()
     for row in rows:
-        found.setdefault(json.dumps(row["range"]), {})[row["seed"]] = row["psnr"]
-    return found
+        name = json.dumps(row["range"])
+        found.setdefault(name, {})[row["seed"]] = row["psnr"]
+        if row["psnr"] is None:
+            failed.add(name)
+    return {name: values for name, values in found.items() if name not in failed}
 
 
 def _against(
@@ -116,11 +120,17 @@ def run(options: Options, pair: Pair | None, planes: bool, seed: int) -> dict[st
     if not planes:
         config.pipeline.model.bounds = BoundsConfig(space="contraction")
     budget = Budget(options.seconds, 6 if options.dry_run else None)
-    record, trainer = timed_run(
-        config, budget, sampler="learned-occupancy", seed=seed, curve_points=2, images=1
-    )
+    facts: dict[str, Any] = {"range": pair, "planes": planes, "seed": seed}
+    try:
+        record, trainer = timed_run(
+            config, budget, sampler="learned-occupancy", seed=seed, curve_points=2, images=1
+        )
+    except (GateCollapsed, TrainingStopped) as error:  # as a badly chosen range may
+        if pair is None:
+            raise
+        return facts | {"range": list(pair), "psnr": None, "failed": str(error)}
     march_range = trainer.pipeline.model.march_range.tolist()[:2]
-    facts = {"range": pair, "planes": planes, "marched": march_range, **record.to_dict()}
+    facts |= {"marched": march_range, **record.to_dict()}
     plain: dict[str, Any] = json.loads(json.dumps(facts))
     return plain
 
@@ -158,7 +168,7 @@ def main(options: Options) -> None:
         }
         write_json(options.out, report)
         name = f"{pair or 'automatic'}, planes {'on' if planes else 'off'}, seed {seed}"
-        print(f"{name}: {rows[-1]['psnr']:.2f} dB", flush=True)
+        print(f"{name}: {rows[-1]['psnr']} dB", flush=True)
     print(json.dumps(verdict(rows), indent=2))
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import statistics
 from collections.abc import Callable
+from dataclasses import dataclass
 from typing import Any
 
 Report = dict[str, Any]
@@ -48,14 +49,16 @@ def growth_table(report: Report) -> str:
 def bounds_table(report: Report) -> str:
     """A row for each way to set near and far, and the verdict."""
     lines = ["| near and far | rays cut at planes | PSNR, mean (each seed) |", "|---|---|---|"]
-    groups: dict[tuple[str, bool], list[float]] = {}
+    groups: dict[tuple[str, bool], list[Any]] = {}
     for run in report["runs"]:
         name = "automatic" if run["range"] is None else "{:g} to {:g}".format(*run["range"])
         groups.setdefault((name, run["planes"]), []).append(run["psnr"])
     for (name, planes), values in groups.items():
-        each = ", ".join(f"{value:.2f}" for value in values)
-        cut = "yes" if planes else "no"
-        lines.append(f"| {name} | {cut} | {statistics.fmean(values):.2f} dB ({each}) |")
+        figures = "failed"
+        if None not in values:
+            each = ", ".join(f"{value:.2f}" for value in values)
+            figures = f"{statistics.fmean(values):.2f} dB ({each})"
+        lines.append(f"| {name} | {'yes' if planes else 'no'} | {figures} |")
     lines += [
         "",
         "| by hand | best | automatic | reached: at most 0.1 dB below "
@@ -136,33 +139,43 @@ def _memory_note(report: Report) -> str:
     )
 
 
-LARGE_SCENES: dict[str, tuple[str, str, Callable[[Report], str], Callable[[Report], str]]] = {
-    "growth": (
+@dataclass(frozen=True)
+class Shown:
+    """How one stored result is shown."""
+
+    title: str
+    command: Callable[[Report], str]
+    table: Callable[[Report], str]
+    note: Callable[[Report], str]
+    """What the reader of the table must know."""
+
+
+def _prior_command(report: Report) -> str:
+    scenes = " ".join(dict.fromkeys(run["scene"] for run in report["runs"]))
+    return f"python benchmarks/prior.py --data {scenes} --steps {report['steps']}"
+
+
+def _memory_command(report: Report) -> str:
+    return f"python benchmarks/image_memory.py --ways {' '.join(r['way'] for r in report['runs'])}"
+
+
+LARGE_SCENES = {
+    "growth": Shown(
         "How occupancy grows with a city",
-        "python benchmarks/growth.py",
+        lambda report: "python benchmarks/growth.py",
         growth_table,
         _growth_note,
     ),
-    "bounds": (
+    "bounds": Shown(
         "Automatic bounds against near and far set by hand",
-        "python benchmarks/bounds.py SCENE",
+        lambda report: f"python benchmarks/bounds.py {report['settings']['scene']}",
         bounds_table,
         _bounds_note,
     ),
-    "prior": (
-        "A prior from sparse points",
-        "python benchmarks/prior.py --data SCENES --steps 70",
-        prior_table,
-        _prior_note,
-    ),
-    "image-memory": (
-        "Photographs on disk",
-        "python benchmarks/image_memory.py",
-        memory_table,
-        _memory_note,
-    ),
+    "prior": Shown("A prior from sparse points", _prior_command, prior_table, _prior_note),
+    "image-memory": Shown("Photographs on disk", _memory_command, memory_table, _memory_note),
 }
-"""Of each stored result: title, command, table, and what the reader must know."""
+"""By the names of the stored results, in the order of the page."""
 
 
 def _kb(size: float) -> str:

@@ -228,11 +228,12 @@ def sizes_table(report: dict[str, Any]) -> str:
 def large_scene_sections() -> list[str]:
     """Of growth, bounds, prior and photographs, those that are stored."""
     parts = []
-    for name, (title, command, rows, note) in LARGE_SCENES.items():
+    for name, shown in LARGE_SCENES.items():
         if not (path := RESULTS / f"{name}.json").exists():
             continue
         report = json.loads(path.read_text())
-        head, *rest = section(title, command, report, rows(report), note(report))
+        texts = (part(report) for part in (shown.table, shown.note))
+        head, *rest = section(shown.title, shown.command(report), report, *texts)
         parts += [head, f"{picture(name)}\n", *rest] if name == GROWTH.stem else [head, *rest]
     return parts
 

@@ -61,6 +61,15 @@ def test_pairs_with_planes_and_without_are_told_apart() -> None:
     assert f"| {WITH_PLANES} | 21.00 dB | 20.00 dB | **no** | -1.00 dB |" in table
 
 
+def test_a_pair_with_which_a_run_failed_is_not_the_best() -> None:
+    rows = rows_of(20.0, {(0.1, 2.0): 25.0, (0.1, 9.0): 20.0})
+    lost = next(row for row in rows if row["range"] == [0.1, 2.0])
+    lost |= {"psnr": None, "failed": "step 75: the gate calls all space empty"}
+    found = verdict(rows)
+    assert found[ALONE]["best_by_hand"] == pytest.approx(20.0)
+    assert "| 0.1 to 2 | no | failed |" in bounds_table({"runs": rows, "verdict": found})
+
+
 def test_a_verdict_is_there_after_the_first_run() -> None:
     assert verdict(rows_of(20.0, {})[:1]) == {}
 
