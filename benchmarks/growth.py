@@ -1,10 +1,12 @@
 """How the cost of occupancy grows with a scene: `python benchmarks/growth.py`.
 
-Cities of 2, 4, 8 and, if asked for, 16 blocks a side. A gate learns until, at 1e-3 of the weight
-near surfaces lost, it keeps no more than a given share of the candidates; looks are off the clock.
-Beside it stands the occupancy grid, filled from the same field, that loses as much and keeps the
-same volume. Every city's row is stored when it is done, and a benchmark that was stopped is taken
-up there. `--dry-run` passes through everything in seconds and means nothing.
+Cities of 2, 4, 8 and 16 blocks a side. A gate learns until, at 1e-3 of the weight near surfaces
+lost, it keeps no more than a given share of the candidates; looks are off the clock. It is given
+the shortest of several schedules in which it gets there, starting with that of the next smaller
+city; the seconds are those of that schedule alone. Beside it stands the occupancy grid, filled from
+the same field, that loses as much and keeps the same volume. Every city's row is stored when it is
+done, and a benchmark that was stopped is taken up there. `--dry-run` passes through everything in
+seconds and means nothing. `python benchmarks/results_page.py` draws what is stored.
 """
 
 from __future__ import annotations
@@ -19,7 +21,7 @@ from typing import Any
 
 import torch
 import tyro
-from growth_picture import draw
+from growth_figures import bytes_for, exponents, grid_for
 from nerfstudio.engine.callbacks import TrainingCallbackAttributes
 
 from leco_plugin.evaluation.clock import Clock, warm_up
@@ -29,6 +31,7 @@ from leco_plugin.evaluation.json_file import write_json
 from leco_plugin.evaluation.machine import describe_machine
 from leco_plugin.method_configs import leco_occupancy
 from leco_plugin.models.calibration import CalibrationConfig
+from leco_plugin.models.freezing import calibration_rays, dense_rendering
 from leco_plugin.models.gate import GateConfig
 from leco_plugin.models.lifecycle import Lifecycle
 from leco_plugin.models.optimizers import RATES, FusedAdamConfig
@@ -45,16 +48,14 @@ RESULTS = Path(__file__).parent / "results"
 class Options:
     """Settings of the benchmark."""
 
-    blocks: tuple[int, ...] = (2, 4, 8)
-    """Blocks a side of the cities; add 16 for the largest."""
+    blocks: tuple[int, ...] = (2, 4, 8, 16)
+    """Blocks a side of the cities, from small to large."""
     seed: int = 0
     """Of cities and gates."""
-    steps_per_side: int = 100
-    """Learning steps for each block a side; looks begin when they are over."""
-    most: float = 4.0
-    """Times those steps after which a gate is given up."""
-    steps_per_look: int = 25
-    """Steps between two looks."""
+    schedules: tuple[int, ...] = (100, 200, 400, 800, 1600)
+    """Learning steps that are tried, from few to many."""
+    looks: int = 4
+    """Looks at a gate in the second half of its learning steps."""
     kept: float = 0.35
     """Share of the candidates that a gate may keep when it counts as learned."""
     octaves_per_doubling: int = 1
@@ -78,43 +79,12 @@ def dry(options: Options) -> Options:
     return replace(
         options,
         blocks=(1, 2),
-        steps_per_side=4,
-        most=1.5,
-        steps_per_look=2,
+        schedules=(4, 8),
+        looks=2,
         grids=(4, 8),
         rays=128,
         capture=CaptureConfig(24, 18, aerial_per_block=6.0, street_per_block=0.0),
     )
-
-
-def slope(sizes: Sequence[float], values: Sequence[float | None]) -> float | None:
-    """The exponent p of values ~ sizes^p by least squares in logarithms; None from one value."""
-    pairs = [(math.log(s), math.log(v)) for s, v in zip(sizes, values) if v is not None and v > 0]
-    if len({size for size, _ in pairs}) < 2:
-        return None
-    middle_x = sum(x for x, _ in pairs) / len(pairs)
-    middle_y = sum(y for _, y in pairs) / len(pairs)
-    across = sum((x - middle_x) * (y - middle_y) for x, y in pairs)
-    return across / sum((x - middle_x) ** 2 for x, _ in pairs)
-
-
-def bytes_for(volume: float, grids: Sequence[dict[str, Any]]) -> float | None:
-    """Bytes of the grid that keeps this share of the volume, between those measured.
-
-    Interpolated in logarithms between the largest grid that keeps more and the next. None where no
-    grid keeps so little; the smallest grid's bytes where all do.
-    """
-    rows = sorted(grids, key=lambda row: row["bytes"])
-    enough = next((i for i, row in enumerate(rows) if row["kept_reached_volume"] <= volume), None)
-    if enough is None:
-        return None
-    if enough == 0:
-        return float(rows[0]["bytes"])
-    less, more = rows[enough - 1], rows[enough]
-    span = math.log(less["kept_reached_volume"] / max(more["kept_reached_volume"], 1e-9))
-    along = math.log(less["kept_reached_volume"] / max(volume, 1e-9)) / span if span > 0 else 1.0
-    low, high = math.log(less["bytes"]), math.log(more["bytes"])
-    return math.exp(low + min(1.0, max(0.0, along)) * (high - low))
 
 
 def gate_of(gate: GateConfig, blocks: int, per_doubling: int) -> GateConfig:
@@ -123,56 +93,112 @@ def gate_of(gate: GateConfig, blocks: int, per_doubling: int) -> GateConfig:
     return replace(gate, encoding=replace(gate.encoding, octaves=gate.encoding.octaves + more))
 
 
-def learn(blocks: int, options: Options) -> dict[str, Any]:
-    """One city: the row of figures that is stored."""
+def learn(blocks: int, options: Options, first: int = 0) -> dict[str, Any]:
+    """One city: the row of figures that is stored.
+
+    Args:
+        first: number of the schedule that is tried first.
+    """
     city = CityConfig(blocks, options.seed)
     folder = write_city(city, options.cities / f"{blocks}-blocks", options.capture)
-    config: Any = copy.deepcopy(leco_occupancy.config.pipeline)
-    config.datamanager.data = folder
-    model_config = config.model
-    steps = max(2, options.steps_per_side * blocks)
-    model_config.schedule = ScheduleConfig(freeze=False, learn_steps=steps)
-    model_config.calibration = CalibrationConfig(rays=options.rays)
-    sizes = sizes_for(leco_occupancy.config.machine.device_type)
-    gate = gate_of(sizes.gate, blocks, options.octaves_per_doubling)
-    model_config.sizes = replace(sizes, gate=gate)
-    torch.manual_seed(options.seed)
-    pipeline: Any = config.setup(device=leco_occupancy.config.machine.device_type)
-    manager, model = pipeline.datamanager, pipeline.model
-    model.train()
-    warm_up(model.device)
-    clock = Clock()
-    clock.start()
-    lifecycle = Lifecycle(model, TrainingCallbackAttributes(None, None, pipeline, None))
-    clock.stop()
-    groups = model.get_param_groups()
-    optimizers = [FusedAdamConfig(lr=RATES[name]).setup(group) for name, group in groups.items()]
-    learned, looks, step = False, [], 0
-    while not learned and step < options.most * steps:
-        _step(model, lifecycle, manager, optimizers, step, clock)
-        step += 1
-        if step >= steps and (step - steps) % options.steps_per_look == 0:
-            found = at_equal_loss(model, manager)
-            looks.append([step, round(clock.seconds, 2), found["kept_candidates"]])
-            learned = found["kept_candidates"] <= options.kept
+    for steps in options.schedules[first:]:
+        attempt = learned_in(steps, folder, blocks, options)
+        if attempt.learned:
+            break
+        print(f"{blocks} blocks: not in {steps} steps")
+    model, manager = attempt.model, attempt.manager
     cells = [whole_box(model.occupancy()).cells(longest) for longest in options.grids]
-    found = at_equal_loss(model, manager, cells)
-    built = City(city).built
-    size = sum(value.numel() * value.element_size() for value in model.gate.state_dict().values())
+    found = at_equal_loss(model, manager, cells, until_as_little=True)
+    seen = City(city)
+    area = float(seen.built.sum()) * city.block_size**2
+    enough = grid_for(found["kept_reached_volume"], found["grids"])
     return {
         "blocks": blocks,
-        "built_blocks": int(built.sum()),
-        "area_square_metres": float(built.sum()) * city.block_size**2,
+        "built_blocks": int(seen.built.sum()),
+        "area_square_metres": area,
+        "volume_cubic_metres": round(area * seen.roof),
         "photographs": len(manager.train_dataset),
-        "octaves": gate.encoding.octaves,
-        "learned": learned,
-        "steps": step,
-        "seconds": round(clock.seconds, 2) if learned else None,
-        "gate_bytes": size,
+        "octaves": model.gate.config.encoding.octaves,
+        "learned": attempt.learned,
+        "schedule": steps,
+        "steps": attempt.step,
+        "seconds": round(attempt.seconds, 2) if attempt.learned else None,
+        "psnr_held_out": round(held_out_psnr(model, manager), 2),
+        "gate_bytes": bytes_of(model.gate),
+        "field_bytes": bytes_of(model.field),
         "grid_bytes": bytes_for(found["kept_reached_volume"], found["grids"]),
-        "looks": looks,
+        "grid_seconds": enough["update_seconds"] if enough is not None else None,
+        "looks": attempt.looks,
         **found,
     }
+
+
+@dataclass
+class Attempt:
+    """A gate, and what it took."""
+
+    model: Any
+    manager: Any
+    learned: bool = False
+    step: int = 0
+    seconds: float = 0.0
+    looks: list[list[float]] = field(default_factory=list)
+    """Step, seconds and kept share of the candidates, of each look."""
+
+
+def learned_in(steps: int, folder: Path, blocks: int, options: Options) -> Attempt:
+    """A gate that learns by a schedule of so many steps, until it keeps little enough."""
+    config: Any = copy.deepcopy(leco_occupancy.config.pipeline)
+    config.datamanager.data = folder
+    config.model.schedule = ScheduleConfig(freeze=False, learn_steps=steps)
+    config.model.calibration = CalibrationConfig(rays=options.rays)
+    device = leco_occupancy.config.machine.device_type
+    sizes = sizes_for(device)
+    gate = gate_of(sizes.gate, blocks, options.octaves_per_doubling)
+    config.model.sizes = replace(sizes, gate=gate)
+    torch.manual_seed(options.seed)
+    pipeline: Any = config.setup(device=device)
+    attempt = Attempt(pipeline.model, pipeline.datamanager)
+    attempt.model.train()
+    warm_up(attempt.model.device)
+    clock = Clock()
+    clock.start()
+    lifecycle = Lifecycle(attempt.model, TrainingCallbackAttributes(None, None, pipeline, None))
+    clock.stop()
+    groups = attempt.model.get_param_groups()
+    optimizers = [FusedAdamConfig(lr=RATES[name]).setup(group) for name, group in groups.items()]
+    looks = look_steps(steps, options.looks)
+    while not attempt.learned and attempt.step < steps:
+        _step(attempt.model, lifecycle, attempt.manager, optimizers, attempt.step, clock)
+        attempt.step, attempt.seconds = attempt.step + 1, clock.seconds
+        if attempt.step in looks:
+            kept = at_equal_loss(attempt.model, attempt.manager)["kept_candidates"]
+            attempt.looks.append([attempt.step, round(clock.seconds, 2), kept])
+            attempt.learned = kept <= options.kept
+    return attempt
+
+
+def look_steps(steps: int, looks: int) -> set[int]:
+    """After which steps a gate is looked at: evenly in the second half, the last at the end."""
+    return {steps - number * (steps // 2) // looks for number in range(looks)}
+
+
+@torch.no_grad()
+def held_out_psnr(model: Any, manager: Any) -> float:
+    """Of held-out training pixels, rendered without skipping: what the field is worth by then."""
+    model.eval()
+    rendering = dense_rendering(model, *calibration_rays(model, manager))
+    squares = [
+        (reference.rgb - truth).square()
+        for reference, truth in zip(rendering.references, rendering.truths)
+    ]
+    model.train()
+    return -10.0 * math.log10(float(torch.cat(squares).mean()))
+
+
+def bytes_of(module: torch.nn.Module) -> int:
+    """Of all that a checkpoint would hold of it."""
+    return sum(value.numel() * value.element_size() for value in module.state_dict().values())
 
 
 def _step(
@@ -190,11 +216,10 @@ def _step(
     clock.stop()
 
 
-def exponents(rows: Sequence[dict[str, Any]]) -> dict[str, float | None]:
-    """Growth of each figure with the built area."""
-    areas = [row["area_square_metres"] for row in rows]
-    names = ("gate_bytes", "grid_bytes", "seconds")
-    return {name: slope(areas, [row[name] for row in rows]) for name in names}
+def first_schedule(rows: Sequence[dict[str, Any]], blocks: int, options: Options) -> int:
+    """Number of the schedule by which the next smaller city has learned, or was given up."""
+    smaller = [row for row in rows if row["blocks"] < blocks]
+    return options.schedules.index(smaller[-1]["schedule"]) if smaller else 0
 
 
 def settings_of(options: Options) -> dict[str, Any]:
@@ -223,18 +248,19 @@ def main(options: Options) -> None:
         if any(row["blocks"] == blocks for row in rows):
             print(f"{blocks} blocks: stored already")
             continue
-        rows = sorted([*rows, learn(blocks, options)], key=lambda row: row["blocks"])
+        row = learn(blocks, options, first_schedule(rows, blocks, options))
+        rows = sorted([*rows, row], key=lambda row: row["blocks"])
         report = {
             "format": 1,
             "machine": describe_machine(),
             "lost_surface_mass": LOST_SURFACE_MASS,
             "settings": settings,
-            "exponents_with_area": exponents(rows),
+            "exponents_with_area": exponents(rows, "area_square_metres"),
+            "exponents_with_volume": exponents(rows, "volume_cubic_metres"),
             "rows": rows,
         }
         write_json(options.out, report)
-        draw(options.out.with_suffix(".png"), report)
-        print(f"{blocks} blocks: {exponents(rows)}")
+        print(f"{blocks} blocks: {report['exponents_with_area']}")
 
 
 if __name__ == "__main__":

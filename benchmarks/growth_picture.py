@@ -5,40 +5,56 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-from leco_plugin.chart.theme import LIGHT, plain, style
+from leco_plugin.chart.theme import LIGHT, Theme, plain, style
+from leco_plugin.evaluation.charts import SOURCE, fingerprint
+
+PANELS = (
+    ("bytes of the occupancy", (("gate_bytes", "gate"), ("grid_bytes", "grid, a bit a cell"))),
+    (
+        "seconds",
+        (("seconds", "learning the gate"), ("grid_seconds", "filling the grid from that field")),
+    ),
+)
 
 
-def draw(path: Path, report: dict[str, Any]) -> Path:
-    """Two panels with logarithmic axes; a figure that is not there is left out."""
+def draw(path: Path, report: dict[str, Any], theme: Theme = LIGHT) -> Path:
+    """Two panels with logarithmic axes; a figure that is not there is left out.
+
+    Args:
+        path: of the picture.
+        report: as in `growth.json`.
+        theme: of the page it is meant for.
+    """
+    from matplotlib import rc_context
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
-    figure = Figure(figsize=(10.0, 4.2), facecolor=LIGHT.page, layout="constrained")
-    FigureCanvasAgg(figure)
-    memory, time = figure.subplots(1, 2)
-    panels = [
-        (memory, "bytes of the occupancy", [("gate_bytes", "gate"), ("grid_bytes", "grid")]),
-        (time, "seconds to learn", [("seconds", "gate")]),
-    ]
-    for axes, label, lines in panels:
-        for number, (name, what) in enumerate(lines):
-            _line(axes, report, name, what, number)
-        axes.set_xscale("log")
-        axes.set_yscale("log")
-        axes.set_xlabel("built area, square metres", color=LIGHT.ink)
-        axes.set_ylabel(label, color=LIGHT.ink)
-        plain(axes, LIGHT)
-        if axes.get_legend_handles_labels()[1]:
-            axes.legend(frameon=False)
-    figure.savefig(path, dpi=120)
+    parts = ("text.color", "axes.labelcolor", "axes.edgecolor", "xtick.color", "ytick.color")
+    settings: dict[Any, Any] = {"font.size": 11.5, "axes.facecolor": theme.page}
+    with rc_context(settings | dict.fromkeys(parts, theme.ink)):
+        figure = Figure(figsize=(10.0, 4.4), facecolor=theme.page, layout="constrained")
+        FigureCanvasAgg(figure)
+        for axes, (label, lines) in zip(figure.subplots(1, 2), PANELS):
+            for number, (name, what) in enumerate(lines):
+                _line(axes, report, name, what, number, theme)
+            axes.set_xscale("log")
+            axes.set_yscale("log")
+            axes.set_xlabel("built area, square metres")
+            axes.set_ylabel(label)
+            plain(axes, theme)
+            if axes.get_legend_handles_labels()[1]:
+                axes.legend(frameon=False, loc="lower left", bbox_to_anchor=(0.0, 1.0))
+        figure.savefig(path, dpi=140, metadata={SOURCE: fingerprint(report)})
     return path
 
 
-def _line(axes: Any, report: dict[str, Any], name: str, what: str, number: int) -> None:
+def _line(
+    axes: Any, report: dict[str, Any], name: str, what: str, number: int, theme: Theme
+) -> None:
     rows = [row for row in report["rows"] if row[name]]
     if not rows:
         return
     exponent = report["exponents_with_area"][name]
-    label = what if exponent is None else f"{what}: grows as area to the {exponent:.2f}"
+    label = what if exponent is None else f"{what}: as area to the {exponent:.2f}"
     areas = [row["area_square_metres"] for row in rows]
-    axes.plot(areas, [row[name] for row in rows], label=label, **style(number, LIGHT))
+    axes.plot(areas, [row[name] for row in rows], label=label, **style(number, theme))

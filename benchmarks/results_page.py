@@ -13,6 +13,8 @@ from pathlib import Path
 from typing import Any
 
 import checkout  # noqa: F401
+from growth_picture import draw as draw_growth
+from large_scene_tables import LARGE_SCENES
 from PIL import Image
 
 from leco_plugin.chart.picture import draw
@@ -25,6 +27,7 @@ RESULTS = ROOT / "benchmarks" / "results"
 PAGE = ROOT / "docs" / "results.md"
 README = ROOT / "README.md"
 CHARTS = ROOT / "docs" / "images" / "charts"
+GROWTH = CHARTS / "growth.png"
 DEMO_CHART = ROOT / "docs" / "images" / "demo-chart.png"
 BEGIN, END = "<!-- demo table: generated -->", "<!-- end of the demo table -->"
 
@@ -90,16 +93,20 @@ def chart_section(path: Path) -> list[str]:
     """What `leco chart` stored: its picture and its tables, and the paper's where there are any."""
     results = json.loads(path.read_text())
     _, body = table(results).split("\n", 1)
-    image = f"images/charts/{path.stem}"
-    parts = [
-        f"## {titles()[path.stem]}\n",
-        f'<picture><source media="(prefers-color-scheme: dark)" srcset="{image}-dark.png">'
-        f'<img alt="{path.stem}" src="{image}.png"></picture>',
-    ]
+    parts = [f"## {titles()[path.stem]}\n", picture(path.stem)]
     parts += [body, f"{machine_line(results)}.\n"]
     if path.stem in PAPER_ROWS:
         parts.append(PAPER_ROWS[path.stem])
     return parts
+
+
+def picture(name: str) -> str:
+    """A picture in the page, in the page's colours."""
+    image = f"images/charts/{name}"
+    return (
+        f'<picture><source media="(prefers-color-scheme: dark)" srcset="{image}-dark.png">'
+        f'<img alt="{name}" src="{image}.png"></picture>'
+    )
 
 
 def titles() -> dict[str, str]:
@@ -116,6 +123,9 @@ def pictures() -> dict[Path, Any]:
     for name in titles():
         results = json.loads((RESULTS / "charts" / f"{name}.json").read_text())
         found |= {CHARTS / f"{name}.png": results, CHARTS / f"{name}-dark.png": results}
+    if (growth := RESULTS / "growth.json").exists():
+        report = json.loads(growth.read_text())
+        found |= {GROWTH: report, GROWTH.with_stem("growth-dark"): report}
     return found
 
 
@@ -129,6 +139,8 @@ def draw_pictures(redraw: bool) -> None:
             continue
         if path == DEMO_CHART:
             draw_chart(json.loads((RESULTS / "demo.json").read_text()), path)
+        elif path.stem.removesuffix("-dark") == GROWTH.stem:
+            draw_growth(path, results, DARK if path.stem.endswith("-dark") else LIGHT)
         else:
             draw(results, path, DARK if path.stem.endswith("-dark") else LIGHT)
 
@@ -241,6 +253,19 @@ def sizes_table(report: dict[str, Any]) -> str:
     return "\n".join(lines)
 
 
+def large_scene_sections() -> list[str]:
+    """Of growth, bounds, prior and photographs, those that are stored."""
+    parts = []
+    for name, shown in LARGE_SCENES.items():
+        if not (path := RESULTS / f"{name}.json").exists():
+            continue
+        report = json.loads(path.read_text())
+        texts = (part(report) for part in (shown.table, shown.note))
+        head, *rest = section(shown.title, shown.command(report), report, *texts)
+        parts += [head, f"{picture(name)}\n", *rest] if name == GROWTH.stem else [head, *rest]
+    return parts
+
+
 def section(
     title: str, command: str, report: dict[str, Any], table: str, note: str = ""
 ) -> list[str]:
@@ -264,6 +289,7 @@ def page() -> str:
         note = f" {steps} steps each, {learn} of them learning; PSNR of test pixels."
         command, title = "python benchmarks/sizes.py", "Automatic sizes, and a sweep around them"
         parts += section(title, command, report, sizes_table(report), note)
+    parts += large_scene_sections()
     for sampling in sorted(RESULTS.glob("sampling*.json")):
         report = json.loads(sampling.read_text())
         command, note = "python benchmarks/sampling.py", " Ratios within one run."

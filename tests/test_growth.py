@@ -13,7 +13,9 @@ import pytest
 ROOT = Path(__file__).resolve().parent.parent
 sys.path.insert(0, str(ROOT / "benchmarks"))
 
-from growth import bytes_for, gate_of, slope  # noqa: E402
+from growth import Options, first_schedule, gate_of, look_steps  # noqa: E402
+from growth_figures import bytes_for, exponents, grid_for, slope  # noqa: E402
+from large_scene_tables import growth_table  # noqa: E402
 
 from leco_plugin.models.gate import GateConfig  # noqa: E402
 
@@ -30,7 +32,8 @@ def test_the_grid_that_keeps_a_volume_lies_between_those_measured() -> None:
     assert bytes_for(0.2, rows) == pytest.approx(100.0)
     assert bytes_for(0.2 * 2**0.5, rows) == pytest.approx(10**1.5)
     assert bytes_for(0.9, rows) == 1.0
-    assert bytes_for(0.01, rows) is None
+    assert bytes_for(0.01, rows) is None and grid_for(0.01, rows) is None
+    assert grid_for(0.3, rows) == rows[2]
     level = [{"bytes": 8, "kept_reached_volume": 0.5}, {"bytes": 64, "kept_reached_volume": 0.5}]
     assert bytes_for(0.5, level) == 8.0
 
@@ -39,6 +42,29 @@ def test_a_gate_has_an_octave_more_when_the_side_doubles() -> None:
     octaves = [gate_of(GateConfig(), blocks, 1).encoding.octaves for blocks in (2, 4, 8, 16)]
     first = GateConfig().encoding.octaves
     assert octaves == [first, first, first + 1, first + 2]
+
+
+def test_growth_is_told_with_area_and_with_volume() -> None:
+    rows = [
+        {"area": n**2, "volume": n**4, "gate_bytes": 7, "grid_bytes": n**4, "seconds": None}
+        for n in (1, 2, 4)
+    ]
+    rows = [row | {"grid_seconds": 1.0} for row in rows]
+    assert exponents(rows, "area")["grid_bytes"] == pytest.approx(2.0)
+    found = exponents(rows, "volume")
+    assert found["grid_bytes"] == pytest.approx(1.0) and found["gate_bytes"] == pytest.approx(0.0)
+    assert found["seconds"] is None
+
+
+def test_a_city_begins_with_the_schedule_of_the_next_smaller_one() -> None:
+    options = Options(schedules=(10, 20, 40))
+    rows = [{"blocks": 2, "schedule": 10}, {"blocks": 4, "schedule": 20}]
+    assert [first_schedule(rows, blocks, options) for blocks in (1, 3, 8)] == [0, 0, 1]
+
+
+def test_looks_lie_in_the_second_half_and_the_last_at_the_end() -> None:
+    assert look_steps(100, 4) == {63, 75, 88, 100}
+    assert look_steps(5, 2) == {4, 5}
 
 
 @pytest.mark.slow
@@ -53,7 +79,8 @@ def test_a_dry_run_passes_and_is_not_done_twice(tmp_path: Path) -> None:
     assert [row["blocks"] for row in report["rows"]] == [1, 2]
     for row in report["rows"]:
         assert len(row["grids"]) == 2 and row["gate_bytes"] > 0
-        assert 0.0 < row["kept_reached_volume"] <= 1.0
-    assert out.with_suffix(".png").stat().st_size > 5000
+        assert 0.0 < row["kept_reached_volume"] <= 1.0 and row["psnr_held_out"] > 3.0
+        assert row["schedule"] == 8 and not row["learned"]
+    assert "Not learned in any schedule: 1, 2" in growth_table(report)
     again = subprocess.run(command, env=environment, capture_output=True, text=True, check=True)
     assert again.stdout.count("stored already") == 2

@@ -75,7 +75,10 @@ def kept_shares(
 
 @torch.no_grad()
 def at_equal_loss(
-    model: LecoModel, datamanager: Any, grids: Sequence[int | tuple[int, int, int]] = ()
+    model: LecoModel,
+    datamanager: Any,
+    grids: Sequence[int | tuple[int, int, int]] = (),
+    until_as_little: bool = False,
 ) -> dict[str, Any]:
     """What the model's gate keeps at `LOST_SURFACE_MASS`, and grids made from the same field.
 
@@ -87,6 +90,7 @@ def at_equal_loss(
         model: whose gate is frozen; it is left as it was.
         datamanager: with held-out training pixels.
         grids: cells along each axis of the grids, one number for all three or one for each.
+        until_as_little: whether the first grid that keeps as little as the gate is the last.
     Returns:
         `lost_surface_mass`; `reached_volume`, the share of the scene's box that rays reach;
         `kept_reached_volume` and `kept_candidates`, shares of that and of the candidates between
@@ -130,6 +134,8 @@ def at_equal_loss(
                 "update_seconds": round(filling.clock.seconds, 3),
             }
             rows.append(row | _shares(kept_shares(weights, of_rays, of_volume, LOST_SURFACE_MASS)))
+            if until_as_little and rows[-1]["kept_reached_volume"] <= round(kept[0], 5):
+                break
     model.train(was_training)
     return {
         "lost_surface_mass": LOST_SURFACE_MASS,

@@ -1,0 +1,186 @@
+"""Tables of what was measured for large scenes: growth, bounds, prior and photographs on disk."""
+
+from __future__ import annotations
+
+import statistics
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+Report = dict[str, Any]
+
+
+def growth_table(report: Report) -> str:
+    """A row a city; the exponents of growth below, and whether the gate's is below that of area."""
+    lines = [
+        "| blocks a side | built, m2 | photographs | gate, kB | grid, kB | volume kept, % "
+        "| learned in, s | steps | grid filled in, s | held-out PSNR |",
+        "|" + "---|" * 10,
+    ]
+    for row in report["rows"]:
+        largest = max((grid["bytes"] for grid in row["grids"]), default=0)
+        grid = f"over {largest / 1000:.0f}" if row["grid_bytes"] is None else _kb(row["grid_bytes"])
+        lines.append(
+            f"| {row['blocks']} | {row['area_square_metres']:,.0f} | {row['photographs']} "
+            f"| {_kb(row['gate_bytes'])} | {grid} | {100 * row['kept_reached_volume']:.1f} "
+            f"| {_or_dash(row['seconds'], '.0f')} | {row['steps']} of {row['schedule']} "
+            f"| {_or_dash(row['grid_seconds'], '.1f')} | {row['psnr_held_out']:.1f} dB |"
+        )
+    lines += [
+        "",
+        "| grows as a power of | gate's bytes | grid's bytes | learning the gate, s "
+        "| filling the grid, s |",
+        "|" + "---|" * 5,
+    ]
+    for what in ("area", "volume"):
+        found = report[f"exponents_with_{what}"]
+        cells = (_or_dash(value, ".2f") for value in found.values())
+        lines.append(f"| {what} | {' | '.join(cells)} |")
+    gate = report["exponents_with_area"]["gate_bytes"]
+    unlearned = [str(row["blocks"]) for row in report["rows"] if not row["learned"]]
+    if gate is not None:
+        slower = "yes" if gate < 1.0 and not unlearned else "**no**"
+        lines += ["", f"The gate's memory grows more slowly than the area: {slower}."]
+    if unlearned:
+        lines += ["", f"Not learned in any schedule: {', '.join(unlearned)} blocks a side."]
+    return "\n".join(lines)
+
+
+def bounds_table(report: Report) -> str:
+    """A row for each way to set near and far, and the verdict."""
+    lines = ["| near and far | rays cut at planes | PSNR, mean (each seed) |", "|---|---|---|"]
+    groups: dict[tuple[str, bool], list[Any]] = {}
+    for run in report["runs"]:
+        name = "automatic" if run["range"] is None else "{:g} to {:g}".format(*run["range"])
+        groups.setdefault((name, run["planes"]), []).append(run["psnr"])
+    for (name, planes), values in groups.items():
+        figures = "failed"
+        if None not in values:
+            each = ", ".join(f"{value:.2f}" for value in values)
+            figures = f"{statistics.fmean(values):.2f} dB ({each})"
+        lines.append(f"| {name} | {'yes' if planes else 'no'} | {figures} |")
+    lines += [
+        "",
+        "| by hand | best | automatic | reached: at most 0.1 dB below "
+        "| against the pair that was best on the other seeds |",
+        "|---|---|---|---|---|",
+    ]
+    for name, found in (report["verdict"] or {}).items():
+        lines.append(
+            f"| {name} | {found['best_by_hand']:.2f} dB | {found['automatic']:.2f} dB "
+            f"| {'yes' if found['reached'] else '**no**'} "
+            f"| {_or_dash(found['against_best_elsewhere'], '+.2f')} dB |"
+        )
+    return "\n".join(lines)
+
+
+def prior_table(report: Report) -> str:
+    """Seconds until no more than the allowed mass is lost for good, without and with the prior."""
+    lines = [
+        "| scene | seed | samples kept | without the prior, s | with it, s |",
+        "|---|---|---|---|---|",
+    ]
+    pairs: dict[tuple[str, int], list[Report]] = {}
+    for run in report["runs"]:
+        pairs.setdefault((run["scene"], run["seed"]), []).append(run)
+    for (scene, seed), runs in pairs.items():
+        without, with_it = sorted(runs, key=lambda run: run["prior_steps"])
+        for share, first, second in zip(report["kept"], without["seconds"], with_it["seconds"]):
+            cells = f"{_or_dash(first, '.1f')} | {_or_dash(second, '.1f')}"
+            lines.append(f"| {scene} | {seed} | {share:.0%} | {cells} |")
+    return "\n".join(lines)
+
+
+def memory_table(report: Report) -> str:
+    """What photographs take in memory, for each way to hold them."""
+    lines = [
+        "| way | photographs take, MB | decoded as bytes, MB | decoded as floats, MB "
+        "| process at its peak, MB |",
+        "|---|---|---|---|---|",
+    ]
+    names = ("photographs_bytes", "decoded_bytes", "decoded_float_bytes", "peak_bytes")
+    for run in report["runs"]:
+        cells = " | ".join(f"{run[name] / 1e6:,.0f}" for name in names)
+        lines.append(f"| {run['way']} | {cells} |")
+    return "\n".join(lines)
+
+
+def _growth_note(report: Report) -> str:
+    return (
+        f" Learned: {report['settings']['kept']:.0%} of the candidates or fewer are kept where "
+        f"{report['lost_surface_mass']:.1%} of the weight near surfaces is lost. The grid is filled"
+        " from the same field, loses as much and keeps the same share of the volume that rays "
+        "reach; its bytes are interpolated between grids."
+    )
+
+
+def _bounds_note(report: Report) -> str:
+    settings = report["settings"]
+    return (
+        f" {settings['scene']}, {settings['seconds']:g} s of training each. By hand: `near` and "
+        "`far`, and space contracted, as without a look at the data; and the same with space and "
+        "planes found from the data."
+    )
+
+
+def _prior_note(report: Report) -> str:
+    return (
+        f" Processor seconds until a gate that keeps so many of a reference's samples loses no more"
+        f" than {report['lost_surface_mass']:.1%} of its weight near surfaces for good, in "
+        f"{report['steps']} learning steps; a dash: not in these. It is off by default."
+    )
+
+
+def _memory_note(report: Report) -> str:
+    images, width, height = report["photographs"]
+    return (
+        f" {images} photographs of {width} x {height}; what the same run takes with a tenth of the "
+        "size is taken off."
+    )
+
+
+@dataclass(frozen=True)
+class Shown:
+    """How one stored result is shown."""
+
+    title: str
+    command: Callable[[Report], str]
+    table: Callable[[Report], str]
+    note: Callable[[Report], str]
+    """What the reader of the table must know."""
+
+
+def _prior_command(report: Report) -> str:
+    scenes = " ".join(dict.fromkeys(run["scene"] for run in report["runs"]))
+    return f"python benchmarks/prior.py --data {scenes} --steps {report['steps']}"
+
+
+def _memory_command(report: Report) -> str:
+    return f"python benchmarks/image_memory.py --ways {' '.join(r['way'] for r in report['runs'])}"
+
+
+LARGE_SCENES = {
+    "growth": Shown(
+        "How occupancy grows with a city",
+        lambda report: "python benchmarks/growth.py",
+        growth_table,
+        _growth_note,
+    ),
+    "bounds": Shown(
+        "Automatic bounds against near and far set by hand",
+        lambda report: f"python benchmarks/bounds.py {report['settings']['scene']}",
+        bounds_table,
+        _bounds_note,
+    ),
+    "prior": Shown("A prior from sparse points", _prior_command, prior_table, _prior_note),
+    "image-memory": Shown("Photographs on disk", _memory_command, memory_table, _memory_note),
+}
+"""By the names of the stored results, in the order of the page."""
+
+
+def _kb(size: float) -> str:
+    return f"{size / 1000:.0f}" if size >= 10_000 else f"{size / 1000:.1f}"
+
+
+def _or_dash(value: float | None, form: str) -> str:
+    return "-" if value is None else format(value, form)
