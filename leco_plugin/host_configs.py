@@ -17,7 +17,7 @@ from leco_plugin.method_configs import LEARNING, ON_GPU, STEPS, best_device
 from leco_plugin.models.guided import GuidedModelConfig
 from leco_plugin.models.guided_start import OccupancyConfig
 from leco_plugin.models.optimizers import FusedAdamConfig
-from leco_plugin.models.switch_nerf import SwitchNerfModelConfig
+from leco_plugin.models.switch_config import SwitchNerfModelConfig
 from leco_plugin.models.switch_sizes import switch_sizes_for
 from leco_plugin.scenes.data_manager import LecoDataManagerConfig
 from leco_plugin.scenes.known_distances import KnownDistancePixelSamplerConfig

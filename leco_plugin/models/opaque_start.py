@@ -18,14 +18,14 @@ from leco_plugin.models.ranks import say
 OPACITY = 0.9
 """Of half of the rays, what is kept hides at least so much at first."""
 SCALE = "average_init_density"
-"""nerfstudio's name for the factor of a field's density."""
+"""nerfstudio's name for the density with which a field begins."""
 
 
 def begin_opaque(host: nn.Module, guide: Guide, kept_lengths: Tensor) -> None:
     """Raises the density with which a packed host's field begins, where its kept stretches need it.
 
     Args:
-        host: before its first step; one whose fields have no such factor stays as it is.
+        host: before its first step; one that has no such density to set stays as it is.
         guide: remembers the density for checkpoints.
         kept_lengths: [R] kept of each ray, scene units of the host; those of 0 are left out.
     """
@@ -52,7 +52,7 @@ def set_first_density(host: nn.Module, guide: Guide) -> None:
 
 
 def _scaled(host: nn.Module) -> list[nn.Module]:
-    """Fields whose density has a factor, of a host whose samples are packed."""
+    """What has that density to set in a host whose samples are packed: its fields, or itself."""
     if not any(isinstance(module, GuidedEstimator) for module in host.modules()):
         return []
     return [module for module in host.modules() if hasattr(module, SCALE)]

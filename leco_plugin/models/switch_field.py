@@ -6,6 +6,7 @@ another linear layer; the two are one here.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -18,6 +19,11 @@ from leco_plugin.models.encodings import FrequencyEncoding
 from leco_plugin.models.gate import logits_of
 from leco_plugin.models.hmoe import Expert
 from leco_plugin.models.steady import steadied
+
+SHIFT = -1.0
+"""Added to the density head's answer before its softplus."""
+NEW_DENSITY = math.log1p(math.exp(SHIFT))
+"""Density of a field that has learned nothing, per half extent and unit of its scale."""
 
 
 @dataclass(frozen=True)
@@ -76,11 +82,16 @@ class SwitchGate(nn.Module):
 
 
 class SwitchField(nn.Module):
-    """Density and colour of mapped positions, each from the expert that the gate chose."""
+    """Density and colour of mapped positions, each from the expert that the gate chose.
+
+    Attributes:
+        density_scale: factor of the density, 1 in the paper; see `opaque_start`.
+    """
 
     def __init__(self, config: SwitchFieldConfig, num_images: int) -> None:
         super().__init__()
         self.config = config
+        self.density_scale = 1.0
         self.encoding = FrequencyEncoding(config.octaves)
         self.projection = nn.Linear(self.encoding.out_dim, config.width)
         self.gate = SwitchGate(config.width, config.gate_layers, config.experts)
@@ -115,7 +126,8 @@ class SwitchField(nn.Module):
         raw = self.density_head(steadied(features))[:count, 0].float()
         if noise > 0.0:
             raw = raw + noise * torch.randn_like(raw)
-        return Answers(nn.functional.softplus(raw - 1.0), features, logits, routes)
+        sigmas = self.density_scale * nn.functional.softplus(raw + SHIFT)
+        return Answers(sigmas, features, logits, routes)
 
     def _mixture(
         self, projected: Tensor, routes: Tensor, gate_values: Tensor, capacity_factor: float | None

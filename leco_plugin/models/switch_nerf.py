@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
-from typing import Any, Literal
+from typing import Any
 
 import torch
 from nerfstudio.cameras.rays import RayBundle
@@ -13,11 +12,10 @@ from nerfstudio.engine.callbacks import (
     TrainingCallbackLocation,
 )
 from nerfstudio.model_components.renderers import RGBRenderer
-from nerfstudio.models.base_model import Model, ModelConfig
+from nerfstudio.models.base_model import Model
 from torch import Tensor, nn
 
 from leco_plugin.compat.checkpoints import allow_checkpoint_globals
-from leco_plugin.compat.earlier_configs import GrowingConfig
 from leco_plugin.models.failures import require_finite
 from leco_plugin.models.image_figures import image_figures
 from leco_plugin.models.precision import fast_precision, keep_freed_memory
@@ -31,52 +29,16 @@ from leco_plugin.models.rendering import (
 )
 from leco_plugin.models.scene_grid import scene_grid
 from leco_plugin.models.scene_rays import cut_to_bounds, marching_rule, with_ends_for_all
-from leco_plugin.models.switch_field import Answers, SwitchField
+from leco_plugin.models.switch_config import SwitchNerfModelConfig
+from leco_plugin.models.switch_field import NEW_DENSITY, Answers, SwitchField
 from leco_plugin.models.switch_objective import switch_losses, switch_statistics
 from leco_plugin.models.switch_rendering import coarse_and_fine, kept_by, leading_expert, render
-from leco_plugin.models.switch_sizes import SMALL, SwitchSizes
 from leco_plugin.occupancy import gate_precision
 from leco_plugin.samplers.grid import OccupancyGridEstimator
-from leco_plugin.scenes.bounds import BoundsConfig, SceneBounds
+from leco_plugin.scenes.bounds import SceneBounds
 from leco_plugin.scenes.input_error import InputError
 from leco_plugin.scenes.survey import announce, survey
 from leco_plugin.space import Space
-
-
-@dataclass
-class SwitchNerfModelConfig(GrowingConfig, ModelConfig):
-    """Switch-NeRF: equal experts, a gate that learns to share the scene among them"""
-
-    _target: type = field(default_factory=lambda: SwitchNerfModel)
-    """target class to instantiate"""
-    enable_collider: bool = False
-    """Rays are cut at the scene's own bounds instead."""
-    eval_num_rays_per_chunk: int = 2048
-    """Rays rendered at a time."""
-    sizes: SwitchSizes = field(default_factory=lambda: SMALL)
-    """Sizes of field and sampling."""
-    sampling: Literal["coarse-fine", "occupancy-grid"] = "coarse-fine"
-    """Samples of the method's own, coarse and fine; or packed ones where an occupancy grid, updated
-    while training, has something."""
-    capacity_factor: float | None = None
-    """In training, places of each expert as a multiple of an equal share of the points (1.0 in the
-    paper). Points beyond skip their expert: zero features, a hole for this step. None is dropless;
-    renderings always are."""
-    balance: float = 5e-4
-    """Weight of the balanced gate loss."""
-    sigma_noise: float = 1.0
-    """Standard deviation of the noise on density, before its activation, while training."""
-    early_stop_eps: float = 0.0
-    """Packed samples, in training: transmittance below which a sample is not shaded. That asks for
-    all densities first, which pays where surfaces are opaque; 0 does not."""
-    grid_levels: int = 4
-    """Nested levels of the occupancy grid around an unbounded scene; a bounded one has one."""
-    near: float | None = None
-    """Where rays begin, scene units; None is found from the data."""
-    far: float | None = None
-    """Where rays end, scene units; None is found from the data."""
-    bounds: BoundsConfig = field(default_factory=BoundsConfig)
-    """Where the scene lies, where the data do not say it right."""
 
 
 class SwitchNerfModel(Model):
@@ -197,6 +159,15 @@ class SwitchNerfModel(Model):
             answers = self.field(self.space.map(positions).clamp(-1.0, 1.0))
         densities: Tensor = answers.sigmas[:, None] / self.space.half_extent
         return densities
+
+    @property
+    def average_init_density(self) -> float:
+        """Density of a new field, per scene unit, under the name that nerfstudio's fields have."""
+        return self.field.density_scale * NEW_DENSITY / float(self.space.half_extent)
+
+    @average_init_density.setter
+    def average_init_density(self, density: float) -> None:
+        self.field.density_scale = density * float(self.space.half_extent) / NEW_DENSITY
 
     def _ask(self, mapped: Tensor) -> Answers:
         """The field, with noise and limited places while training."""

@@ -9,13 +9,17 @@ from typing import Any
 import pytest
 import torch
 from ball_occupancy import ball_of_the_tiny_scene
+from nerfstudio.data.scene_box import SceneBox
 from nerfstudio.engine.callbacks import TrainingCallbackAttributes, TrainingCallbackLocation
 from small_hosts import pipeline_of, small
 from torch import nn
 
 from leco_plugin.models.guide import Guide, GuidedEstimator
 from leco_plugin.models.opaque_start import begin_opaque
+from leco_plugin.models.switch_config import SwitchNerfModelConfig
+from leco_plugin.models.switch_sizes import SMALL
 from leco_plugin.samplers import estimator
+from leco_plugin.scenes.bounds import SceneBounds
 from leco_plugin.swap import with_sampler_swapped
 
 pytestmark = [
@@ -62,6 +66,26 @@ def test_without_rays_or_without_a_factor_nothing_is_done(host: nn.Module) -> No
     guide = Guide()
     begin_opaque(host, guide, torch.zeros(3) if isinstance(host, Host) else LENGTHS)
     assert guide.first_density is None
+
+
+def test_switch_nerf_begins_opaque_too_whatever_its_scene_measures() -> None:
+    torch.manual_seed(0)
+    box = torch.tensor([-2.0] * 3 + [2.0] * 3)
+    model = SwitchNerfModelConfig(sizes=SMALL).setup(
+        scene_box=SceneBox(box.view(2, 3)), num_train_data=2
+    )
+    model.set_bounds(SceneBounds("box", torch.zeros(3), 2.0, 0.1, 4.0, box, ""), 2.0)
+    positions = torch.rand(200, 3)
+    before, own = model.density_fn(positions), model.average_init_density
+    assert own == pytest.approx(math.log1p(math.exp(-1.0)) / 2.0)
+    guide = Guide()
+    begin_opaque(model, guide, LENGTHS)
+    assert guide.first_density is None  # its own samples go from end to end
+    model.sample_with(GuidedEstimator(guide, None))
+    begin_opaque(model, guide, LENGTHS)
+    assert guide.first_density is not None and guide.first_density > own
+    assert model.average_init_density == pytest.approx(guide.first_density)
+    torch.testing.assert_close(model.density_fn(positions), before * guide.first_density / own)
 
 
 def test_a_checkpoint_brings_the_density_back(
