@@ -81,7 +81,7 @@ def load_occupancy(path: Path) -> Occupancy:
     except FileNotFoundError:
         raise InputError(
             f"there is no occupancy {file}: train leco-occupancy on this scene and give its run "
-            "folder, or give no path to learn it first"
+            "folder (guided methods like leco-ngp learn it first where no path is given)"
         ) from None
     except (OSError, ValueError) as error:
         raise InputError(f"no occupancy can be read: {error}") from None
