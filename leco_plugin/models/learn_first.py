@@ -16,6 +16,7 @@ from leco_plugin.models.ranks import averaging, mean
 from leco_plugin.occupancy import Occupancy
 from leco_plugin.progress_bar import bar
 from leco_plugin.scenes.detail import CAMERAS
+from leco_plugin.scenes.input_error import InputError
 from leco_plugin.scenes.known_distances import sampler_here
 
 FIRST_TIMED, TIMED_STEPS = 5, 15
@@ -62,11 +63,16 @@ def learn_model(
     Returns:
         The model as it is at the moment of freezing.
     Raises:
-        ValueError: the budget is no positive number of seconds.
+        ValueError: the budget is no positive number of seconds, or the gate would never be frozen.
         FloatingPointError, RuntimeError: learning failed; one line says where and why.
     """
     if seconds is not None and not seconds > 0.0:
         raise ValueError(f"an occupancy is learned in a positive number of seconds, not {seconds}")
+    if config.homogeneous or not config.schedule.freeze:
+        raise InputError(
+            "this run would learn an occupancy for ever: with homogeneous, or schedule.freeze "
+            "False, none is frozen. Those are for leco-occupancy, which guides no other method"
+        )
     manager = pipeline.datamanager
     dataset = manager.train_dataset
     model: Any = config.setup(

@@ -57,13 +57,8 @@ class Lifecycle:
         self.model = model
         self.pipeline: Any = attributes.pipeline
         self.trainer: Any = attributes.trainer
-        most = configured = model.config.schedule.learn_steps
-        if self.trainer is not None:
-            # a short run still passes through both phases
-            most = max(2, int(0.5 * self.trainer.config.max_num_iterations))
-        # nerfstudio makes callbacks after it has loaded a checkpoint
-        self.progress.begin(configured, most)
         config = model.config
+        self._begin_learning(config.schedule.learn_steps)
         self.survey = survey(self.pipeline.datamanager, config.bounds, config.near, config.far)
         if not bool(model.bounds_known):
             model.set_bounds(self.survey.bounds, self.survey.median_length)
@@ -80,6 +75,20 @@ class Lifecycle:
             resumed = self.trainer.config.load_checkpoint or self.trainer.config.load_dir
             if resumed is not None:
                 carry_over(resumed, self.folder)
+
+    def _begin_learning(self, configured: int) -> None:
+        """Says after how many steps the gate is frozen; nerfstudio makes callbacks, and so this,
+        after it has loaded a checkpoint."""
+        if self.trainer is None:
+            self.progress.begin(configured, configured)
+            return
+        steps = self.trainer.config.max_num_iterations
+        half = max(2, int(0.5 * steps))  # a short run still passes through both phases
+        if self.progress.begin(configured, half):
+            say(
+                f"a run of {steps} steps learns the occupancy in its first half: {half} steps, not "
+                f"the {configured} of schedule.learn-steps"
+            )
 
     def _begin_with_points(self) -> None:
         """Shows the gate the sparse points, where that is asked for; it counts as learning time."""
@@ -308,8 +317,8 @@ class Lifecycle:
                 return False
             raise GateCollapsed(
                 f"step {step}: {collapse.cause}, after {MOST_RECOVERIES} recoveries. Check the "
-                "scene's bounds in the log above, and the weights under --pipeline.model.gate-loss;"
-                " --pipeline.model.schedule.freeze False trains without skipping."
+                "scene's bounds in the log above, and the weights under gate-loss; leco-occupancy "
+                "trains without skipping with --pipeline.model.schedule.freeze False."
             )
         done = heal(model.gate.head, progress, collapse, shares, step)
         share(model.gate.head.parameters())  # the remedy is drawn at random

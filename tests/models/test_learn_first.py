@@ -14,6 +14,7 @@ from leco_plugin.models.learn_first import FEWEST_STEPS, learn_occupancy, steps_
 from leco_plugin.models.leco import LecoModelConfig
 from leco_plugin.models.phases import ScheduleConfig
 from leco_plugin.occupancy import Occupancy
+from leco_plugin.scenes.input_error import InputError
 from leco_plugin.scenes.photographs import LecoPhotographsDataParserConfig
 
 pytestmark = [  # nerfstudio leaves an image open
@@ -56,6 +57,14 @@ def test_a_budget_sets_the_number_of_steps(pipeline, monkeypatch: pytest.MonkeyP
 def test_no_time_is_refused(pipeline, seconds: float):
     with pytest.raises(ValueError, match="positive number of seconds"):
         learn_occupancy(config(8), pipeline, rays=32, seconds=seconds)
+
+
+@pytest.mark.parametrize(
+    "never", [{"schedule": ScheduleConfig(freeze=False)}, {"homogeneous": True}], ids=str
+)
+def test_what_would_learn_for_ever_is_refused(pipeline, never):
+    with pytest.raises(InputError, match=r"for ever.*leco-occupancy"):
+        learn_occupancy(replace(config(8), **never), pipeline, rays=32)
 
 
 def test_each_method_has_learning_sizes_of_its_own():
