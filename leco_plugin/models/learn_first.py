@@ -63,18 +63,19 @@ def learn_model(
     Returns:
         The model as it is at the moment of freezing.
     Raises:
-        ValueError: the budget is no positive number of seconds, or the gate would never be frozen.
+        ValueError: the budget is no positive number of seconds.
         FloatingPointError, RuntimeError: learning failed; one line says where and why.
+        InputError: the gate would never be frozen.
     """
     if seconds is not None and not seconds > 0.0:
         raise ValueError(f"an occupancy is learned in a positive number of seconds, not {seconds}")
+    manager = pipeline.datamanager
+    dataset = manager.train_dataset
     if config.homogeneous or not config.schedule.freeze:
         raise InputError(
             "this run would learn an occupancy for ever: with homogeneous, or schedule.freeze "
             "False, none is frozen. Those are for leco-occupancy, which guides no other method"
         )
-    manager = pipeline.datamanager
-    dataset = manager.train_dataset
     model: Any = config.setup(
         scene_box=dataset.scene_box,
         num_train_data=len(dataset),

@@ -57,8 +57,14 @@ class Lifecycle:
         self.model = model
         self.pipeline: Any = attributes.pipeline
         self.trainer: Any = attributes.trainer
+        most = configured = model.config.schedule.learn_steps
+        if self.trainer is not None:
+            # a short run still passes through both phases
+            most = max(2, int(0.5 * self.trainer.config.max_num_iterations))
+            self._say_if_short(configured, most)
+        # nerfstudio makes callbacks after it has loaded a checkpoint
+        self.progress.begin(configured, most)
         config = model.config
-        self._begin_learning(config.schedule.learn_steps)
         self.survey = survey(self.pipeline.datamanager, config.bounds, config.near, config.far)
         if not bool(model.bounds_known):
             model.set_bounds(self.survey.bounds, self.survey.median_length)
@@ -76,18 +82,12 @@ class Lifecycle:
             if resumed is not None:
                 carry_over(resumed, self.folder)
 
-    def _begin_learning(self, configured: int) -> None:
-        """Says after how many steps the gate is frozen; nerfstudio makes callbacks, and so this,
-        after it has loaded a checkpoint."""
-        if self.trainer is None:
-            self.progress.begin(configured, configured)
-            return
-        steps = self.trainer.config.max_num_iterations
-        half = max(2, int(0.5 * steps))  # a short run still passes through both phases
-        if self.progress.begin(configured, half):
+    def _say_if_short(self, configured: int, most: int) -> None:
+        """Says so before a run that learns for fewer steps than are configured."""
+        if most < configured != self.progress.configured:
             say(
-                f"a run of {steps} steps learns the occupancy in its first half: {half} steps, not "
-                f"the {configured} of schedule.learn-steps"
+                f"a run of {self.trainer.config.max_num_iterations} steps learns the occupancy in "
+                f"its first half: {most} steps, not the {configured} of schedule.learn-steps"
             )
 
     def _begin_with_points(self) -> None:

@@ -48,18 +48,15 @@ class Progress:
     image: tuple[float, ...] = NO_EVIDENCE
     """The same of the image price."""
 
-    def begin(self, configured: int, most: int) -> bool:
-        """Sets `learn_steps`, unless a checkpoint did so under the same config; returns whether
-        they were set, and to fewer than that config has.
+    def begin(self, configured: int, most: int) -> None:
+        """Sets `learn_steps`, unless a checkpoint did so under the same config.
 
         Args:
             configured: of the config; a resumed run may have been given another one.
             most: steps that this process leaves for the first phase.
         """
-        if configured == self.configured:
-            return False
-        self.learn_steps, self.configured = min(configured, most), configured
-        return most < configured
+        if configured != self.configured:
+            self.learn_steps, self.configured = min(configured, most), configured
 
     @classmethod
     def from_dict(cls, state: dict[str, Any]) -> Progress:

@@ -121,26 +121,18 @@ def test_a_full_disk_costs_the_history_and_not_the_run(
     assert "could not be written" in " ".join(capsys.readouterr().out.split())
 
 
-def test_a_short_run_says_that_half_of_it_is_for_learning(
+def test_a_short_run_says_once_that_half_of_it_is_for_learning(
     looking: Lifecycle, capsys: pytest.CaptureFixture[str]
 ) -> None:
     looking.trainer = SimpleNamespace(config=SimpleNamespace(max_num_iterations=125))
     looking.model.progress = Progress()  # type: ignore[assignment]
-    looking._begin_learning(200)
+    looking._say_if_short(200, 62)
     said = " ".join(capsys.readouterr().out.split())
-    assert looking.progress.learn_steps == 62
     assert "a run of 125 steps" in said and "62 steps, not the 200 of" in said
-
-
-@pytest.mark.parametrize("trainer", [None, 4000])
-def test_nothing_is_said_where_all_learning_steps_fit(
-    looking: Lifecycle, capsys: pytest.CaptureFixture[str], trainer: int | None
-) -> None:
-    steps = SimpleNamespace(max_num_iterations=trainer)
-    looking.trainer = None if trainer is None else SimpleNamespace(config=steps)
-    looking.model.progress = Progress()  # type: ignore[assignment]
-    looking._begin_learning(200)
-    assert looking.progress.learn_steps == 200 and capsys.readouterr().out == ""
+    looking._say_if_short(50, 62)  # all of them fit
+    looking.model.progress.begin(200, 62)
+    looking._say_if_short(200, 62)  # resumed
+    assert capsys.readouterr().out == ""
 
 
 def test_learning_on_takes_a_quarter_more_and_is_said(
