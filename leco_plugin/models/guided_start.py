@@ -158,7 +158,10 @@ class GuidedStart:
             )
         learning = self.config.learning
         announce(survey(manager, learning.bounds, learning.near, learning.far))
-        say(f"guided by an occupancy that keeps {share:.1%} along these rays")
+        say(
+            f"guided by an occupancy that keeps {share:.1%} along these rays; the bounds above are "
+            "those for learning one, and do not change it"
+        )
         return kept
 
 
