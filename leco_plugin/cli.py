@@ -16,6 +16,10 @@ from leco_plugin.cli_reports import occupancy_of
 from leco_plugin.cli_reports import write_json as _write_json
 
 BAD_INPUT, FAILURE = 2, 1
+SEPARATE = (
+    "leco: what ns-train would be given stands behind --, as in "
+    "`leco swap METHOD --occupancy FILE -- --data SCENE`"
+)
 
 
 def city(
@@ -99,9 +103,7 @@ def inspect(
     print(f"kept share of its box: {facts['kept_share_of_box']:.2%}")
     for name, value in facts["report"].items():
         if isinstance(value, (int, float, str)) and name not in ("params", "threshold"):
-            print(
-                f"{name.replace('_', ' ')}: {value if isinstance(value, str) else f'{value:.4g}'}"
-            )
+            print(f"{name.replace('_', ' ')}: {_said(value)}")
     if picture is not None:
         from leco_plugin.evaluation.occupancy_picture import draw
 
@@ -308,15 +310,20 @@ COMMANDS: dict[str, Callable[..., None]] = {
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Runs `leco`: 0, or one line on stderr and 2 for bad input, 1 for a failure."""
+    given = list(sys.argv[1:] if arguments is None else arguments)
     try:
         tyro.extras.subcommand_cli_from_dict(
             COMMANDS,
             prog="leco",
             description="Learned occupancy for nerfstudio: what is empty is skipped.",
-            args=arguments,
+            args=given,
         )
     except (ValueError, OSError) as error:  # InputError is both a ValueError and a SystemExit
         return _complain(error, BAD_INPUT)
+    except SystemExit as end:
+        if end.code == BAD_INPUT and given[:1] == ["swap"] and "--" not in given:
+            print(SEPARATE, file=sys.stderr)
+        raise
     except (RuntimeError, FloatingPointError, ImportError) as error:
         return _complain(error, FAILURE)
     except KeyboardInterrupt:
@@ -328,6 +335,12 @@ def _complain(error: BaseException, status: int) -> int:
     message = " ".join(str(error).split()) or type(error).__name__
     print(f"leco: {message}", file=sys.stderr)
     return status
+
+
+def _said(value: bool | float | str) -> str:
+    if isinstance(value, bool):
+        return "yes" if value else "no"
+    return value if isinstance(value, str) else f"{value:.4g}"
 
 
 def _listed(values: Sequence[float]) -> str:

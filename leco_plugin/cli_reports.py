@@ -10,8 +10,13 @@ def occupancy_of(path: Path) -> Path:
     """The file that is meant: itself, or the newest occupancy in a folder of runs.
 
     Raises:
-        ValueError: there is none in the folder.
+        ValueError: there is neither, or none in the folder.
     """
+    if not path.exists():
+        raise ValueError(
+            f"there is no {path}: give an occupancy.safetensors, or a folder with a run that left "
+            "one, as outputs/SCENE/leco-occupancy"
+        )
     if not path.is_dir():
         return path
     from leco_plugin.models.guided_start import occupancy_file

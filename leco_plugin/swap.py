@@ -38,7 +38,7 @@ def swapped_config(
     Raises:
         InputError: there is no such method, or it is guided or learns occupancy itself; there is no
             such sampler, or it asks another kind of gate; there is no such file, or it is no
-            occupancy; the arguments name a config that would replace this one.
+            occupancy; the arguments name a config that would replace this one, or no scene.
         SystemExit: the arguments are none of the method's; tyro has said why.
     """
     check_gate_of(file, sampler)
@@ -53,6 +53,8 @@ def swapped_config(
             "--load-config would train what that file says, without a swap; a run that was swapped "
             "is trained again with ns-train and its config"
         )
+    if config.data is not None and not config.data.exists():
+        raise InputError(f"there is no scene {config.data} (--data)")
     return with_sampler_swapped(config, file, sampler)
 
 

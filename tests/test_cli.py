@@ -188,6 +188,16 @@ def test_a_wrong_command_line_is_bad_input_too(arguments: list[str]) -> None:
     assert end.value.code == 2
 
 
+def test_a_swap_whose_arguments_are_not_set_apart_says_how(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    with pytest.raises(SystemExit) as end:
+        run("swap", "nerfacto", "--occupancy", "FILE", "--data", "SCENE")
+    assert end.value.code == 2
+    last = capsys.readouterr().err.splitlines()[-1]
+    assert last.startswith("leco: ") and "--occupancy FILE -- --data SCENE" in last
+
+
 def test_a_failure_ends_with_one_line_and_status_1(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -4,13 +4,18 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
+import torch
+
 from leco_plugin.conformance.estimator_case import EstimatorCase
 from leco_plugin.conformance.host_case import HostCase
 from leco_plugin.conformance.host_rules import HOST_RULES
 from leco_plugin.conformance.proposal_case import ProposalCase
 from leco_plugin.conformance.rule import Case, Rule, Verdict, apply
+from leco_plugin.conformance.sampler_case import SamplerCase
 from leco_plugin.conformance.sampler_rules import SAMPLER_RULES
-from leco_plugin.samplers.registry import sampler_spec, samplers
+from leco_plugin.conformance.scene import SLAB
+from leco_plugin.entries import why_left_out
+from leco_plugin.samplers.registry import GROUP, SamplerSpec, sampler_spec, samplers
 from leco_plugin.scenes.input_error import InputError
 
 RULES = SAMPLER_RULES + HOST_RULES
@@ -20,17 +25,32 @@ def sampler_cases(name: str) -> list[Case]:
     """A registered sampler at each seam that it serves.
 
     Raises:
-        ValueError: there is no such sampler, or it serves no seam.
+        ValueError: there is no such sampler, it serves no seam, or it cannot be built.
     """
     spec = sampler_spec(name)
-    cases: list[Case] = []
+    cases: list[SamplerCase] = []
     if spec.estimator is not None:
         cases.append(EstimatorCase(name))
     if spec.proposal is not None:
         cases.append(ProposalCase(name))
     if not cases:
         raise ValueError(f"sampler {name!r} builds neither an estimator nor a proposal sampler")
-    return cases
+    for case in cases:
+        _refuse_what_cannot_be_built(case)
+    return [*cases]
+
+
+def _refuse_what_cannot_be_built(case: SamplerCase) -> None:
+    """One line about a builder, instead of one a rule with remedies for something else."""
+    occupancy = case.occupancy_of(SLAB) if case.needs_occupancy else None
+    try:
+        with torch.random.fork_rng(devices=[]), torch.enable_grad():
+            case.build(occupancy)
+    except Exception as error:
+        raise ValueError(
+            f"the {case.seam} of sampler {case.name!r} cannot be built: {type(error).__name__}: "
+            f"{error} (SamplerSpec says what its builder is called with)"
+        ) from error
 
 
 def host_cases(name: str) -> list[Case]:
@@ -57,7 +77,7 @@ def cases_of(name: str) -> list[Case]:
         ValueError: as `sampler_cases` and `host_cases`, or the name is neither.
     """
     known = samplers()
-    if name in known:
+    if name in known or why_left_out(GROUP, SamplerSpec, name) is not None:
         return sampler_cases(name)
     from nerfstudio.configs.method_configs import all_methods
 

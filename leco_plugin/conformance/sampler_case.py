@@ -52,9 +52,13 @@ class SamplerCase(ABC):
         """The occupancy that `shared(scene)` was given, if it was given one."""
         return self._built(scene)[1]
 
+    def occupancy_of(self, scene: Slab) -> Occupancy:
+        """The occupancy of a scene, its gate on the features that this sampler asks."""
+        return scene.occupancy(self.gate_encoding)
+
     def _built(self, scene: Slab) -> tuple[Any, Occupancy]:
         if scene not in self._shared:
-            occupancy = scene.occupancy(self.gate_encoding)
+            occupancy = self.occupancy_of(scene)
             sampler = self.build(occupancy if self.needs_occupancy else None)
             if not self.needs_occupancy:
                 self.teach(sampler, scene)

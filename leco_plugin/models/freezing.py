@@ -27,6 +27,8 @@ if TYPE_CHECKING:
     from leco_plugin.models.leco import LecoModel
 
 FILE_NAME = "occupancy.safetensors"
+HARDLY_ANYTHING = 0.05
+"""Share of all candidates below which a run that skips no more is given advice."""
 
 
 @torch.no_grad()
@@ -56,14 +58,25 @@ def freeze(
         f"dB and {measured.lost_surface_mass:.2e} of the surface mass "
         f"({measured.lost_mass:.2e} of all)"
     )
-    if measured.threshold == 0.0:
-        say(
-            "no threshold keeps the price within its bounds, so nothing is skipped; more "
-            "--pipeline.model.schedule.learn-steps usually help"
-        )
+    advice = advice_on(measured)
+    if advice is not None:
+        say(advice)
     if folder is not None:
         write_occupancy(model, folder)
     return measured
+
+
+def advice_on(measured: Measured) -> str | None:
+    """What to do about an occupancy that skips next to nothing; None for one that skips."""
+    longer = (
+        "more learning steps usually help: schedule.learn-steps, at --pipeline.model of "
+        "leco-occupancy and at --pipeline.model.occupancy.learning of guided methods"
+    )
+    if measured.threshold == 0.0:
+        return f"no threshold keeps the price within its bounds, so nothing is skipped; {longer}"
+    if measured.empty_fraction < HARDLY_ANYTHING:
+        return f"hardly anything is skipped, which is right for a scene full of fog; else {longer}"
+    return None
 
 
 def _priced(

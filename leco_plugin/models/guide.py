@@ -152,7 +152,7 @@ class Guide(nn.Module):
         """
         if self._spec("estimator").needs_occupancy:
             return GuidedEstimator(self, aabb, outermost, density_fn)
-        estimator = build_estimator(self.sampler, aabb=aabb, **self.options)
+        estimator = build_estimator(self.sampler, aabb=aabb, occupancy=None, **self.options)
         if self.front_to_back and isinstance(estimator, Estimator):
             estimator.density_fn = density_fn
         return estimator
@@ -350,7 +350,7 @@ class GuidedProposal(_StandIn, Sampler):
         self._options = options
 
     def _build(self, guide: Guide) -> nn.Module:
-        options = dict(self._options)
+        options = {**self._options, "occupancy": None}
         if guide.needs_occupancy:
             options["occupancy"] = guide.the_occupancy()
             if not guide.same_frame():

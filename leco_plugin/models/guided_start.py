@@ -81,7 +81,7 @@ def load_occupancy(path: Path) -> Occupancy:
     except FileNotFoundError:
         raise InputError(
             f"there is no occupancy {file}: train leco-occupancy on this scene and give its run "
-            "folder, or give no path to learn it first"
+            "folder (guided methods like leco-ngp learn it first where no path is given)"
         ) from None
     except (OSError, ValueError) as error:
         raise InputError(f"no occupancy can be read: {error}") from None
@@ -158,7 +158,10 @@ class GuidedStart:
             )
         learning = self.config.learning
         announce(survey(manager, learning.bounds, learning.near, learning.far))
-        say(f"guided by an occupancy that keeps {share:.1%} along these rays")
+        say(
+            f"guided by an occupancy that keeps {share:.1%} along these rays; the bounds above are "
+            "those for learning one, and do not change it"
+        )
         return kept
 
 

@@ -69,10 +69,16 @@ def learn_model(
     Raises:
         InputError: see `check_budget`.
         FloatingPointError, RuntimeError: learning failed; one line says where and why.
+        InputError: the gate would never be frozen.
     """
     check_budget(rays, seconds, rate)
     manager = pipeline.datamanager
     dataset = manager.train_dataset
+    if config.homogeneous or not config.schedule.freeze:
+        raise InputError(
+            "this run would learn an occupancy for ever: with homogeneous, or schedule.freeze "
+            "False, none is frozen. Those are for leco-occupancy, which guides no other method"
+        )
     model: Any = config.setup(
         scene_box=dataset.scene_box,
         num_train_data=len(dataset),

@@ -63,6 +63,7 @@ class Lifecycle:
         if self.trainer is not None:
             # a short run still passes through both phases
             most = max(2, int(0.5 * self.trainer.config.max_num_iterations))
+            self._say_if_short(configured, most)
         # nerfstudio makes callbacks after it has loaded a checkpoint
         self.progress.begin(configured, most)
         self.batches = Batches(model, self.pipeline.datamanager)
@@ -82,6 +83,14 @@ class Lifecycle:
             resumed = self.trainer.config.load_checkpoint or self.trainer.config.load_dir
             if resumed is not None:
                 carry_over(resumed, self.folder)
+
+    def _say_if_short(self, configured: int, most: int) -> None:
+        """Says so before a run that learns for fewer steps than are configured."""
+        if most < configured != self.progress.configured:
+            say(
+                f"a run of {self.trainer.config.max_num_iterations} steps learns the occupancy in "
+                f"its first half: {most} steps, not the {configured} of schedule.learn-steps"
+            )
 
     def _begin_with_points(self) -> None:
         """Shows the gate the sparse points, where that is asked for; it counts as learning time."""
@@ -287,8 +296,8 @@ class Lifecycle:
                 return False
             raise GateCollapsed(
                 f"step {step}: {collapse.cause}, after {MOST_RECOVERIES} recoveries. Check the "
-                "scene's bounds in the log above, and the weights under --pipeline.model.gate-loss;"
-                " --pipeline.model.schedule.freeze False trains without skipping."
+                "scene's bounds in the log above, and the weights under gate-loss; leco-occupancy "
+                "trains without skipping with --pipeline.model.schedule.freeze False."
             )
         done = heal(model.gate.head, progress, collapse, shares, step)
         share(model.gate.head.parameters())  # the remedy is drawn at random

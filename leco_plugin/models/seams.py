@@ -41,7 +41,7 @@ class HostAdapter:
 def adapters() -> dict[str, HostAdapter]:
     """All adapters by name, those of other packages first."""
     ours = {"sample-with": SAMPLE_WITH, "packed": PACKED, "proposal": PROPOSAL}
-    return {**foreign_entries(GROUP, frozenset(ours)), **ours}
+    return {**foreign_entries(GROUP, HostAdapter, frozenset(ours)), **ours}
 
 
 def swap_sampler(host: Model, guide: Guide) -> str:

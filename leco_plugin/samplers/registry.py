@@ -13,7 +13,7 @@ from typing import Any
 
 from torch import nn
 
-from leco_plugin.entries import foreign_entries
+from leco_plugin.entries import foreign_entries, why_left_out
 
 GROUP = "leco_plugin.samplers"
 
@@ -29,8 +29,9 @@ class SamplerSpec:
     with `aabb` (the host's box, [6]), `occupancy` (None when there is none) and options."""
     proposal: Callable[..., nn.Module] | str | None = None
     """Builds what a proposal host calls (`proposal.LearnedOccupancySampler`), likewise. Called with
-    `occupancy`, with the host's `num_samples`, `initial_sampler` and `single_jitter`, and with
-    `frame` where the host's coordinates are not those of the occupancy."""
+    `occupancy`, with the host's `num_samples`, `initial_sampler` and `single_jitter`, and where
+    the host's coordinates are not those of the occupancy with `frame`, [3, 4], which takes them
+    there."""
     needs_occupancy: bool = False
     """Whether it asks a frozen gate."""
     gate_encoding: str | None = None
@@ -81,7 +82,7 @@ OURS = {
 
 def samplers() -> dict[str, SamplerSpec]:
     """All samplers by name. A broken entry point of another package is left out with a warning."""
-    return {**foreign_entries(GROUP, frozenset(OURS)), **OURS}
+    return {**foreign_entries(GROUP, SamplerSpec, frozenset(OURS)), **OURS}
 
 
 def build_estimator(name: str, **options: Any) -> nn.Module:
@@ -103,12 +104,15 @@ def sampler_spec(name: str) -> SamplerSpec:
     """The sampler of that name.
 
     Raises:
-        ValueError: there is none.
+        ValueError: there is none, or what is registered under it is of no use.
     """
     if name in OURS:  # to look for others is to read what every installed package says of itself
         return OURS[name]
     known = samplers()
     if name not in known:
+        why = why_left_out(GROUP, SamplerSpec, name)
+        if why is not None:
+            raise ValueError(f"the sampler {name!r} is registered, but {why}")
         raise ValueError(f"there is no sampler {name!r}; there are {', '.join(sorted(known))}")
     return known[name]
 

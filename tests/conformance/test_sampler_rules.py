@@ -6,11 +6,11 @@ import nerfacc
 import pytest
 from nerfstudio.model_components.ray_samplers import ProposalNetworkSampler
 
-from leco_plugin.conformance.checking import pairs, sampler_cases
+from leco_plugin.conformance.checking import cases_of, pairs, sampler_cases
 from leco_plugin.conformance.rule import apply
 from leco_plugin.conformance.sampler_rules import SAMPLER_RULES
 from leco_plugin.samplers import nerfacc_cpu, registry
-from leco_plugin.samplers.registry import SamplerSpec
+from leco_plugin.samplers.registry import SamplerSpec, build_learned_proposal
 
 
 @pytest.mark.slow  # `learned-occupancy` builds cell caches, also in two processes
@@ -67,6 +67,30 @@ def test_rules_have_names_of_their_own_and_say_why_and_what_to_do():
     for rule in SAMPLER_RULES:
         assert rule.reason.endswith(".") and rule.remedy.endswith(".")
         assert rule.checks
+
+
+def without_a_frame(occupancy, num_samples, initial_sampler, single_jitter):
+    return build_learned_proposal(occupancy, num_samples=num_samples)
+
+
+@pytest.mark.parametrize(
+    ("spec", "said"),
+    [
+        (
+            SamplerSpec("typo", estimator="leco_plugin.samplers.registry:build_dens"),
+            "the estimator of sampler 'crooked' cannot be built: AttributeError: .*build_dens",
+        ),
+        (
+            SamplerSpec("no frame", proposal=without_a_frame, needs_occupancy=True),
+            "the proposal of sampler 'crooked' cannot be built: TypeError: .*'frame'",
+        ),
+    ],
+    ids=["typo", "no frame"],
+)
+def test_what_cannot_be_built_is_said_once_and_not_rule_by_rule(spec, said, monkeypatch):
+    monkeypatch.setitem(registry.OURS, "crooked", spec)
+    with pytest.raises(ValueError, match=said):
+        cases_of("crooked")
 
 
 def test_a_sampler_that_serves_no_seam_is_refused(monkeypatch):

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 from types import SimpleNamespace
 
+import pytest
 import torch
 
-from leco_plugin.models.freezing import calibration_rays
+from leco_plugin.models.calibration import Measured
+from leco_plugin.models.freezing import advice_on, calibration_rays
 from leco_plugin.scenes.held_out_pixels import HeldOutPixelSampler, HeldOutPixelSamplerConfig
 
 COUNT = 50
@@ -76,3 +78,16 @@ def test_without_held_out_pixels_it_is_measured_on_training_rays() -> None:
     pixels, colours = calibration_rays(a_model(), Manager(keeps_pixels_back=False))
     assert len(pixels) == len(colours) == COUNT
     assert not colours.any()
+
+
+@pytest.mark.parametrize(
+    ("threshold", "skipped", "said"),
+    [(0.0, 0.0, "no threshold"), (0.04, 0.004, "hardly anything"), (0.3, 0.8, None)],
+)
+def test_what_skips_next_to_nothing_comes_with_advice(threshold, skipped, said) -> None:
+    advice = advice_on(Measured(threshold, 1e-4, 1e-3, 0.01, skipped))
+    assert (advice is None) == (said is None)
+    if advice is not None:  # where that option is differs between methods
+        assert advice.startswith(said)
+        assert "--pipeline.model of leco-occupancy" in advice
+        assert "--pipeline.model.occupancy.learning of guided methods" in advice

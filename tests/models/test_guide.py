@@ -13,8 +13,10 @@ from nerfstudio.viewer.viewer_elements import ViewerElement
 from nerfstudio.viewer_legacy.server.viewer_utils import IOChangeException
 
 from leco_plugin.models.guide import Guide
+from leco_plugin.samplers import registry
 from leco_plugin.samplers.base import Estimator
 from leco_plugin.samplers.estimator import LearnedOccupancyEstimator
+from leco_plugin.samplers.registry import SamplerSpec
 
 BOX = torch.tensor([-1.0, -1.0, -1.0, 3.0, 4.0, 2.0])
 MARCH = {"render_step_size": 0.05, "near_plane": 0.0, "far_plane": 8.0}
@@ -166,6 +168,20 @@ def test_an_unknown_sampler_is_named():
 def test_a_sampler_without_a_gate_is_built_in_the_hosts_box():
     grid = Guide("occupancy-grid").estimator(BOX)
     torch.testing.assert_close(grid.aabbs[0], BOX)
+
+
+def test_a_builder_that_asks_no_gate_is_told_so(monkeypatch: pytest.MonkeyPatch):
+    def estimator(aabb: torch.Tensor, occupancy: None) -> torch.nn.Module:
+        return torch.nn.Identity()
+
+    def proposal(occupancy: None, **options: object) -> torch.nn.Module:
+        return torch.nn.Identity()
+
+    spec = SamplerSpec("as documented", estimator=estimator, proposal=proposal)
+    monkeypatch.setitem(registry.OURS, "documented", spec)
+    guide = Guide("documented")
+    assert isinstance(guide.estimator(BOX), torch.nn.Identity)
+    assert guide.proposal(num_samples=4)(5) == 5
 
 
 @pytest.mark.parametrize("already", [False, True], ids=["empty", "with another gate"])

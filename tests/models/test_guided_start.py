@@ -330,10 +330,12 @@ def test_where_the_scene_lies_is_said_before_the_first_step(
     readers: dict[str, Data], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     said: list[str] = []
-    monkeypatch.setattr("leco_plugin.scenes.survey.say", said.append)
+    for module in ("scenes.survey", "models.guided_start"):
+        monkeypatch.setattr(f"leco_plugin.{module}.say", said.append)
     started(lopsided(readers["as it is"]), readers["as it is"])
     assert any(line.startswith("near") for line in said)
-    assert "rays meet the scene" in said[-1]
+    assert "rays meet the scene" in said[-2]
+    assert "those for learning one, and do not change it" in said[-1]
 
 
 def test_a_range_that_no_ray_meets_is_refused_before_the_first_step(

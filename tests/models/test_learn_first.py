@@ -85,6 +85,14 @@ def test_nothing_to_learn_with_is_refused_in_a_line(pipeline, name: str, value: 
     assert "\n" not in str(error.value)
 
 
+@pytest.mark.parametrize(
+    "never", [{"schedule": ScheduleConfig(freeze=False)}, {"homogeneous": True}], ids=str
+)
+def test_what_would_learn_for_ever_is_refused(pipeline, never):
+    with pytest.raises(InputError, match=r"for ever.*leco-occupancy"):
+        learn_occupancy(replace(config(8), **never), pipeline, rays=32)
+
+
 def test_each_method_has_learning_sizes_of_its_own():
     one, other = OccupancyConfig(), OccupancyConfig()
     one.learning.schedule = replace(one.learning.schedule, learn_steps=3)

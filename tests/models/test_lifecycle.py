@@ -111,6 +111,20 @@ def test_a_full_disk_costs_the_history_and_not_the_run(
     assert "could not be written" in " ".join(capsys.readouterr().out.split())
 
 
+def test_a_short_run_says_once_that_half_of_it_is_for_learning(
+    looking: Lifecycle, capsys: pytest.CaptureFixture[str]
+) -> None:
+    looking.trainer = SimpleNamespace(config=SimpleNamespace(max_num_iterations=125))
+    looking.model.progress = Progress()  # type: ignore[assignment]
+    looking._say_if_short(200, 62)
+    said = " ".join(capsys.readouterr().out.split())
+    assert "a run of 125 steps" in said and "62 steps, not the 200 of" in said
+    looking._say_if_short(50, 62)  # all of them fit
+    looking.model.progress.begin(200, 62)
+    looking._say_if_short(200, 62)  # resumed
+    assert capsys.readouterr().out == ""
+
+
 def test_learning_on_takes_a_quarter_more_and_is_said(
     looking: Lifecycle, capsys: pytest.CaptureFixture[str]
 ) -> None:

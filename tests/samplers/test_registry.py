@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import warnings
 from importlib.metadata import EntryPoint
 from pathlib import Path
 
@@ -89,16 +90,22 @@ def test_entry_points_of_other_packages_are_found_and_broken_ones_left_out(monke
     entries = [
         EntryPoint("foreign", f"{here}:FOREIGN", registry.GROUP),
         EntryPoint("broken", "no_such_module:spec", registry.GROUP),
+        EntryPoint("builder", f"{here}:build_dense", registry.GROUP),  # no SamplerSpec
         EntryPoint("dense", "no_such_module:spec", registry.GROUP),  # ours stay ours
     ]
     monkeypatch.setattr("leco_plugin.entries.entry_points", lambda group: entries)
     monkeypatch.setattr(registry, "FOREIGN", FOREIGN, raising=False)
-    with pytest.warns(UserWarning, match="leco_plugin.samplers 'broken'"):
+    with pytest.warns(UserWarning, match="leco_plugin.samplers '(broken|builder)' is left out"):
         found = samplers()
     assert set(found) == {*registry.OURS, "foreign"}
     assert found["dense"] is registry.DENSE
-    with pytest.warns(UserWarning, match="broken"):
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
         assert isinstance(build_estimator("foreign", aabb=BOX, occupancy=None), torch.nn.Identity)
+        with pytest.raises(ValueError, match="'broken' is registered, but no_such_module:spec can"):
+            build_estimator("broken", aabb=BOX)
+        with pytest.raises(ValueError, match="of type function, where a SamplerSpec is expected"):
+            build_estimator("builder", aabb=BOX)
 
 
 def test_the_torch_core_imports_nothing_of_nerfstudio_or_nerfacc():
