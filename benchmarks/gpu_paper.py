@@ -11,12 +11,16 @@ from typing import NamedTuple
 import checkout  # noqa: F401
 from gpu_counts import STEPS, Counted
 from gpu_floor import Ceilings, floor_seconds, operations_per_position
+from gpu_twin import bytes_of_twin
 
 from leco_plugin.models.field import HMoEField
 from leco_plugin.models.sizes import LARGE, PAPER, SMALL, Sizes
 
 CARDS = {"H100 SXM": Ceilings(3.35e12, 989e12), "A100 SXM": Ceilings(2.04e12, 312e12)}
 """Data sheets: memory bandwidth, and dense bf16 products."""
+GATES = {"small": SMALL.gate, "large": LARGE.gate, "paper": PAPER.gate}
+TWIN_BAR = 5.0
+"""Times that the fused gate must be faster than its eager twin."""
 KEPT = (0.1, 0.25, 0.4)
 """Shares of the candidates that a guided step shades."""
 COUNTED = Counted(
@@ -45,14 +49,26 @@ def gate_table() -> str:
         "| gate | operations | card | by operations | by bytes | floor |",
         "|---|---|---|---|---|---|",
     ]
-    for name, sizes in (("small", SMALL), ("large", LARGE), ("paper", PAPER)):
+    for name, gate in GATES.items():
         for card, ceilings in CARDS.items():
-            terms = {k: 1e12 * v for k, v in floor_seconds(sizes.gate, 1, ceilings).items()}
+            terms = {k: 1e12 * v for k, v in floor_seconds(gate, 1, ceilings).items()}
             lines.append(
-                f"| {name} | {operations_per_position(sizes.gate):,} | {card} "
+                f"| {name} | {operations_per_position(gate):,} | {card} "
                 f"| {terms['operations']:.1f} ps | {terms['bytes']:.1f} ps "
                 f"| {terms['floor']:.1f} ps: {1e3 / terms['floor']:.1f} billion a second |"
             )
+    return "\n".join(lines)
+
+
+def twin_table() -> str:
+    """What each gate's eager twin takes at least, and what the second bar leaves the kernel."""
+    head = "| gate | bytes of its twin | " + " | ".join(f"{card}: twin, bar" for card in CARDS)
+    lines = [head + " |", "|---" * (2 + len(CARDS)) + "|"]
+    for name, gate in GATES.items():
+        moved = bytes_of_twin(gate)
+        taken = [1e12 * moved / ceilings.bytes_per_second for ceilings in CARDS.values()]
+        cells = " | ".join(f"{time:.0f} ps, {time / TWIN_BAR:.0f} ps" for time in taken)
+        lines.append(f"| {name} | {moved:,.0f} | {cells} |")
     return "\n".join(lines)
 
 
@@ -151,4 +167,4 @@ def sampling_table(work: Counted = COUNTED, sizes: Sizes = SMALL) -> str:
 
 
 if __name__ == "__main__":
-    print(gate_table(), training_table(), sampling_table(), sep="\n\n")
+    print(gate_table(), twin_table(), training_table(), sampling_table(), sep="\n\n")

@@ -180,13 +180,29 @@ def experts(scale: Scale, before: dict[str, Any]) -> dict[str, Any]:
                 answers = dispatch(points, routes, [None, *made])
         torch.autograd.grad(answers.float().sum(), [points, *scene.parameters()])
 
+    ways = {"one by one": False} | ({"grouped": True} if grouped_is_right(device) else {})
     taken, peaks = {}, {}
-    for name, grouped in (("grouped", True), ("one by one", False)):
+    for name, grouped in ways.items():
         peak = peak_of(device)
         taken[name] = seconds(lambda g=grouped: through(g), device, max(2, scale.rounds // 3))
         peaks[name] = peak()
+    measured = {"seconds": taken, "peak_bytes": peaks}
+    if "grouped" not in ways:
+        return {**measured, "grouped is chosen": False, "figures": []}
     title = f"{n} experts of {config.layers} x {config.width}, {count} points"
     ratio = taken["one by one"] / taken["grouped"]
     figures = [figure(f"{title}: one by one / grouped", ratio, 1.0, False, **taken)]
     chosen = grouped_trial.serves(device, n, config.width)
-    return {"peak_bytes": peaks, "grouped is chosen": chosen, "figures": figures}
+    return {**measured, "grouped is chosen": chosen, "figures": figures}
+
+
+def grouped_is_right(device: torch.device) -> bool:
+    """Whether torch has grouped products for this device, and they are right."""
+    try:
+        if grouped_trial.is_right(device):
+            return True
+        reason = "they are wrong"
+    except (AttributeError, RuntimeError) as error:  # an older torch, or a card without a kernel
+        reason = next(iter(str(error).splitlines()), type(error).__name__)
+    print(f"no grouped products: {reason}")
+    return False

@@ -12,6 +12,7 @@ from typing import Any
 
 import torch
 from gpu_floor import seconds
+from gpu_nerfacc import nerfacc_grid
 from gpu_scale import Scale, figure
 from sampling_scene import fit_occupancy, rays_into
 from torch import Tensor
@@ -101,29 +102,6 @@ def grids(
     theirs = nerfacc_grid(ours, sample)
     if theirs is not None:
         yield f"nerfacc {scale.grid}^3 x {levels}", theirs
-
-
-def nerfacc_grid(ours: OccupancyGridEstimator, sample: Callable[[Any], Any]) -> Any:
-    """nerfacc's grid with the same cells marked, or None where it does not sample.
-
-    On a CPU it samples by this package's functions in place of its kernels.
-    """
-    try:
-        import nerfacc
-
-        from leco_plugin.samplers import nerfacc_cpu
-
-        nerfacc_cpu.install()
-        box, resolution = ours.aabbs[0].cpu(), ours.sizes[0]
-        grid = nerfacc.OccGridEstimator(box, resolution=resolution, levels=ours.levels)
-        grid = grid.to(ours.device).eval()
-        grid.binaries.copy_(ours.binaries)
-        sample(grid)
-    except Exception as error:  # noqa: BLE001 - the build of somebody else's kernels raises anything
-        reason = next(iter(str(error).splitlines()), type(error).__name__)
-        print(f"no comparison with nerfacc: {reason}")
-        return None
-    return grid
 
 
 @torch.no_grad()

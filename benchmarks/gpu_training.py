@@ -1,19 +1,22 @@
 """Learning, freezing and guided training on the procedural city, against a dense host.
 
-The fields, losses and calibration of `leco-occupancy-paper` without nerfstudio's trainer. The dense
-host is the same mixture without an empty-space expert, as in Switch-NeRF: every candidate goes
-through a scene expert, and nothing is ever skipped.
+The fields, losses and calibration of `leco-occupancy-paper` without nerfstudio's trainer; while it
+learns, every ray shades all of its candidates, and no experts are merged. The dense host is the
+same mixture without an empty-space expert, as in Switch-NeRF: every candidate goes through a scene
+expert, and nothing is ever skipped.
 """
 
 from __future__ import annotations
 
+import gc
 import time
 from collections.abc import Callable
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 from gpu_city import Photographed, Pixels, photographed
 from gpu_floor import seconds
+from gpu_sampling import march_answers
 from gpu_scale import Scale, figure
 from torch import Tensor
 
@@ -27,8 +30,7 @@ from leco_plugin.models.calibration import (
 )
 from leco_plugin.models.field import HMoEField
 from leco_plugin.models.gate import Gate
-from leco_plugin.models.losses import distortion_loss
-from leco_plugin.models.objective import GateLossConfig, gate_losses
+from leco_plugin.models.objective import GateLossConfig, field_losses, gate_losses
 from leco_plugin.models.phases import ScheduleConfig, ramp
 from leco_plugin.models.rendering import (
     Intervals,
@@ -39,13 +41,24 @@ from leco_plugin.models.rendering import (
     with_backdrop,
 )
 from leco_plugin.occupancy import Occupancy, gate_precision
+from leco_plugin.samplers import fused
 from leco_plugin.samplers.estimator import LearnedOccupancyEstimator
 from leco_plugin.samplers.marching import march
 from leco_plugin.samplers.rays import intersect_box
 from leco_plugin.space import Space
 
-RATE, DISTORTION, DISTORTION_AFTER = 5e-4, 0.05, 0.002
-"""Learning rate of `leco-occupancy-paper`; weights of the distortion loss, learning and guided."""
+
+class Weights(NamedTuple):
+    """Of the field's losses in `leco-occupancy-paper`, whose configuration needs nerfstudio."""
+
+    distortion: float = 0.05
+    distortion_after: float = 0.04
+    termination: float = 0.03
+    nearness: float = 0.03
+
+
+RATE = 5e-4
+"""Learning rate of `leco-occupancy-paper`."""
 RAYS_AT_ONCE, STEPS_PER_LOOK = 1024, 10
 """Rays rendered at a time, and steps between two looks at the clock, each of which waits."""
 
@@ -62,12 +75,13 @@ class Run:
         self.space.to(self.device)
         self.gate = Gate(sizes.gate).to(self.device)
         self.field = HMoEField(sizes.field, scene.num_images).to(self.device)
+        self.span = torch.tensor([0.0, 2.0 * half_extent], device=self.device)
         self.losses = GateLossConfig()
         self.routing = Routing(None if homogeneous else self.losses.empty_below, homogeneous)
         parameters = [*self.gate.parameters(), *self.field.parameters()]
         self.optimizer = torch.optim.Adam(parameters, RATE, eps=1e-15, fused=True)
         self.estimator: LearnedOccupancyEstimator | None = None
-        self.ramped = 0.0
+        self.learning, self.ramped = True, 0.0
         self.steps = 0
 
     def rays_of(self, pixels: Pixels) -> Rays:
@@ -101,14 +115,18 @@ class Run:
         rays = self.rays_of(pixels)._replace(images=pixels.images)
         intervals = self.intervals_of(rays, candidates, jittered=True)
         shaded = self.shaded(rays, intervals)
-        learning = self.estimator is None
-        reach = 2.0 * self.space.half_extent
-        starts, ends = intervals.t_starts / reach, intervals.t_ends / reach
-        weight = DISTORTION * self.ramped if learning else DISTORTION_AFTER
-        distortion = distortion_loss(shaded.weights, starts, ends, shaded.packed_info)
-        loss = (shaded.rgb - pixels.colors).square().mean() + weight * distortion
-        if learning:
-            of_gate = gate_losses(
+        losses = field_losses(
+            Weights(),
+            shaded,
+            intervals,
+            pixels.colors,
+            None,
+            span=self.span,
+            learning=self.learning,
+            ramped=self.ramped,
+        )
+        if self.estimator is None:
+            losses |= gate_losses(
                 self.losses,
                 shaded,
                 intervals,
@@ -117,7 +135,7 @@ class Run:
                 ramped=self.ramped,
                 half_extent=self.space.half_extent,
             )
-            loss = loss + torch.stack(list(of_gate.values())).sum()
+        loss = torch.stack(list(losses.values())).sum()
         self.optimizer.zero_grad()
         loss.backward()
         self.optimizer.step()
@@ -127,13 +145,17 @@ class Run:
         """Steps for so many seconds; the seconds it took."""
         started, passed = time.perf_counter(), 0.0
         while passed < duration:
-            # the distortion loss comes in with the time that has passed, as in `phases.ramp`
-            self.ramped = ramp(int(1000 * passed / duration), ScheduleConfig(learn_steps=1000))
+            if self.learning:  # the distortion loss comes in with time, as in `phases.ramp`
+                self.ramped = ramp(int(1000 * passed / duration), ScheduleConfig(learn_steps=1000))
             for _ in range(STEPS_PER_LOOK):
                 self.step(candidates)
             wait(self.device)
             passed = time.perf_counter() - started
         return passed
+
+    def end_learning(self) -> None:
+        """Detail is wanted from now on: little is left of the distortion loss."""
+        self.learning, self.ramped = False, 1.0
 
     @torch.no_grad()
     def freeze(self) -> Measured:
@@ -154,6 +176,7 @@ class Run:
 
         truths = [chunk.colors for chunk in chunks]
         measured = calibrate(references, truths, render_kept, CalibrationConfig())
+        self.end_learning()
         box = self.scene.box
         occupancy = Occupancy(self.gate, self.space, measured.threshold, "bfloat16", walls=box)
         self.estimator = LearnedOccupancyEstimator(
@@ -188,14 +211,22 @@ def learned(scale: Scale, before: dict[str, Any]) -> dict[str, Any]:
     """Learns the occupancy, freezes it, and goes on guided by it."""
     scene = photographed(scale.city, scale.capture, scale.device)
     run, sizes = Run(scene, scale, homogeneous=False), scale.sizes
-    learning = run.train(scale.learning, sizes.learn_candidates)
+    started = time.perf_counter()
+    run.train(scale.learning, sizes.learn_candidates)
     learn_steps, learn_step = run.steps, timed(run, sizes.learn_candidates)
+    learning = time.perf_counter() - started  # steps that are timed teach, too
     started = time.perf_counter()
     measured = run.freeze()
     wait(scale.device)
     freezing = time.perf_counter() - started
     guided = run.train(scale.guided, sizes.candidates)
     psnr, step = run.psnr(), timed(run, sizes.candidates)
+    assert run.estimator is not None
+    place = torch.zeros(1, 3, device=scale.device)
+    running = {
+        "gate": fused.decisions(run.estimator.occupancy, place) is not None,
+        "march": march_answers(run.estimator),
+    }
     return {
         "seconds": {"learning": learning, "freezing": freezing, "guided": guided},
         "steps": {"learning": learn_steps, "all": run.steps},
@@ -203,6 +234,7 @@ def learned(scale: Scale, before: dict[str, Any]) -> dict[str, Any]:
         "guided_step": step,
         "occupancy": measured._asdict(),
         "psnr": psnr,
+        "running": running,
     }
 
 
@@ -213,7 +245,10 @@ def dense(scale: Scale, before: dict[str, Any]) -> dict[str, Any]:
         return {"left_out": "there is no guided run to compare with"}
     scene = photographed(scale.city, scale.capture, scale.device)
     run = Run(scene, scale, homogeneous=True)
-    took = run.train(sum(guided["seconds"].values()), scale.sizes.candidates)
+    first = guided["seconds"]["learning"]
+    took = run.train(first, scale.sizes.candidates)
+    run.end_learning()  # its losses change when those of the guided run did
+    took += run.train(sum(guided["seconds"].values()) - first, scale.sizes.candidates)
     psnr, steps = run.psnr(), run.steps
     step = timed(run, scale.sizes.candidates)
     ours = guided["guided_step"]
@@ -241,6 +276,7 @@ def timed(run: Run, candidates: int) -> dict[str, float]:
 
 def peak_of(device: torch.device) -> Callable[[], int]:
     """Answers with the most bytes that tensors have held since; on a CPU the whole process ever."""
+    gc.collect()  # a run that is over holds nothing
     if device.type != "cuda":
         return peak_process_bytes
     torch.cuda.reset_peak_memory_stats()  # CUDA only

@@ -1,4 +1,4 @@
-"""Runs `gpu_suite_cases.py` and prints the lines of the GPU suite that none of its cases reached.
+"""Runs `gpu_suite*_cases.py` and prints the lines of the GPU suite that none of its cases reached.
 
 A line that needs a card says so at its end: `# CUDA only`.
 """
@@ -40,7 +40,7 @@ def main() -> int:
     sys.path.insert(0, str(HERE.parent / "benchmarks"))
     sys.settrace(trace)
     options = ["-q", "-p", "no:cacheprovider", "-o", "timeout=0"]  # whoever starts this has one
-    failed = int(pytest.main([*options, str(HERE / "gpu_suite_cases.py")]))
+    failed = int(pytest.main([*options, *map(str, sorted(HERE.glob("gpu_suite*_cases.py")))]))
     sys.settrace(None)
     for path in SUITE:
         text = path.read_text()

@@ -21,6 +21,7 @@ def test_the_floors_on_paper_are_those_that_are_counted(monkeypatch) -> None:
     monkeypatch.syspath_prepend(str(ROOT / "benchmarks"))
     paper = importlib.import_module("gpu_paper")
     assert paper.gate_table() in PAGE
+    assert paper.twin_table() in PAGE
     assert paper.training_table() in PAGE
     assert paper.sampling_table() in PAGE
 

@@ -199,6 +199,30 @@ def test_positions_on_another_device_are_no_failure_of_a_kernel(steep, monkeypat
     assert not fused._switch.off
 
 
+@pytest.mark.parametrize("dtype", [torch.float64, torch.float16])
+def test_positions_that_are_not_in_float32_are_left_to_torch(dtype, steep, monkeypatch) -> None:
+    monkeypatch.setattr(fused, "ready", lambda device, name="gate": name not in fused._switch.off)
+    monkeypatch.setitem(sys.modules, "leco_plugin.samplers.gate_kernel", None)
+    places, occupancy = torch.rand(50, 3, dtype=dtype), steep.occupancy
+    assert torch.equal(occupancy.occupied(places), occupancy.query(places) >= occupancy.threshold)
+    assert not fused._switch.off
+
+
+@pytest.mark.parametrize("cone_angle", [0.0, 0.01])
+def test_rays_in_double_are_left_to_torch(cone_angle: float, steep, monkeypatch) -> None:
+    gate = SimpleNamespace(gate_decisions=lambda w, x: steep.occupancy.query(x) >= w.facts[10])
+    monkeypatch.setattr(fused, "ready", lambda device, name="gate": name not in fused._switch.off)
+    monkeypatch.setitem(sys.modules, "leco_plugin.samplers.gate_kernel", gate)
+    monkeypatch.setitem(sys.modules, "leco_plugin.samplers.march_kernel", None)
+    rays = torch.rand(9, 3).double(), torch.randn(9, 3).double()
+    options = {"render_step_size": 0.05, "cone_angle": cone_angle, "far_plane": 4.0}
+    samples = steep.sampling(*rays, **options)
+    with fused.twins_only():
+        wanted = steep.sampling(*rays, **options)
+    assert len(samples[0]) > 0 and samples[1].dtype == torch.float64
+    assert all(map(torch.equal, samples, wanted)) and not fused._switch.off
+
+
 def test_rays_without_an_end_are_no_failure_of_a_kernel() -> None:
     def endless() -> None:
         raise TooManyCandidates("over 2^24 steps")
