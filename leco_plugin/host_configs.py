@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 from nerfstudio.cameras.camera_optimizers import CameraOptimizerConfig
 from nerfstudio.configs.base_config import MachineConfig, ViewerConfig
@@ -16,7 +17,7 @@ from nerfstudio.plugins.types import MethodSpecification
 
 from leco_plugin.compat.data_parallel import DataParallelTrainerConfig
 from leco_plugin.compat.dynamic_batch import ClampedDynamicBatchPipelineConfig
-from leco_plugin.method_configs import LEARNING, LEARNING_RAYS, ON_GPU, STEPS, best_device
+from leco_plugin.method_configs import LEARNING, ON_GPU, STEPS, best_device
 from leco_plugin.models.guided import GuidedModelConfig
 from leco_plugin.models.guided_start import OccupancyConfig
 from leco_plugin.models.optimizers import FusedAdamConfig
@@ -32,7 +33,7 @@ def guided(host: ModelConfig) -> GuidedModelConfig:
     """The host, guided by an occupancy from a file or learned first."""
     return GuidedModelConfig(
         host=host,
-        occupancy=OccupancyConfig(learning=LEARNING, rays=LEARNING_RAYS),
+        occupancy=OccupancyConfig(learning=LEARNING, rays=4096 if ON_GPU else 1024),
     )
 
 
@@ -44,6 +45,8 @@ def learning_first(config: TrainerConfig, name: str) -> TrainerConfig:
         InputError: its model learns or has an occupancy already.
     """
     made = with_sampler_swapped(config, None)
+    pipeline: Any = made.pipeline
+    pipeline.model = guided(pipeline.model.host)
     machine = replace(made.machine, device_type=best_device())
     return replace(made, method_name=name, machine=machine)
 

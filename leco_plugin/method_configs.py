@@ -46,8 +46,6 @@ LEARNING = LecoModelConfig(
     eval_num_rays_per_chunk=1 << 15 if ON_GPU else 1 << 12,
 )
 """The HMoE in sizes of this device, smaller where the scene is."""
-LEARNING_RAYS = 4096 if ON_GPU else 1024
-"""Rays of a batch while it learns."""
 
 _leco_occupancy = DataParallelTrainerConfig(
     method_name="leco-occupancy",

@@ -14,7 +14,7 @@ from nerfstudio.engine.trainer import Trainer, TrainerConfig
 from leco_plugin.compat.atomic_trainer import AtomicTrainer
 from leco_plugin.compat.data_parallel import DataParallelTrainerConfig
 from leco_plugin.compat.dynamic_batch import ClampedDynamicBatchPipelineConfig
-from leco_plugin.method_configs import LEARNING, LEARNING_RAYS, best_device
+from leco_plugin.method_configs import best_device
 from leco_plugin.models.guided import GuidedModelConfig
 from leco_plugin.models.guided_start import OccupancyConfig, load_occupancy, occupancy_file
 from leco_plugin.samplers.registry import check_gate
@@ -105,8 +105,7 @@ def with_sampler_swapped(
             f"{config.method_name} finds its occupancy itself; swap another method's sampler"
         )
     path = None if file is None else occupancy_file(file.resolve())
-    learning = copy.deepcopy(LEARNING)
-    occupancy = OccupancyConfig(path=path, sampler=sampler, learning=learning, rays=LEARNING_RAYS)
+    occupancy = OccupancyConfig(path=path, sampler=sampler)
     pipeline.model = GuidedModelConfig(host=host, occupancy=occupancy)
     if type(config) is TrainerConfig:
         values = {f.name: getattr(config, f.name) for f in fields(config)}
