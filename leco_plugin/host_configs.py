@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+from typing import Any
+
 from nerfstudio.cameras.camera_optimizers import CameraOptimizerConfig
 from nerfstudio.configs.base_config import MachineConfig, ViewerConfig
 from nerfstudio.engine.schedulers import ExponentialDecaySchedulerConfig
+from nerfstudio.engine.trainer import TrainerConfig
 from nerfstudio.models.base_model import ModelConfig
 from nerfstudio.models.instant_ngp import InstantNGPModelConfig
 from nerfstudio.models.nerfacto import NerfactoModelConfig
@@ -22,6 +26,7 @@ from leco_plugin.models.switch_sizes import switch_sizes_for
 from leco_plugin.scenes.data_manager import LecoDataManagerConfig
 from leco_plugin.scenes.known_distances import KnownDistancePixelSamplerConfig
 from leco_plugin.scenes.photographs import LecoPhotographsDataParserConfig
+from leco_plugin.swap import with_sampler_swapped
 
 
 def guided(host: ModelConfig) -> GuidedModelConfig:
@@ -30,6 +35,20 @@ def guided(host: ModelConfig) -> GuidedModelConfig:
         host=host,
         occupancy=OccupancyConfig(learning=LEARNING, rays=4096 if ON_GPU else 1024),
     )
+
+
+def learning_first(config: TrainerConfig, name: str) -> TrainerConfig:
+    """Another method like `leco-ngp`, on the device that is here: its model guided by an occupancy
+    that a run learns first, or by `--pipeline.model.occupancy.path`. `config` is not changed.
+
+    Raises:
+        InputError: its model learns or has an occupancy already.
+    """
+    made = with_sampler_swapped(config, None)
+    pipeline: Any = made.pipeline
+    pipeline.model = guided(pipeline.model.host)
+    machine = replace(made.machine, device_type=best_device())
+    return replace(made, method_name=name, machine=machine)
 
 
 def photographs(rays: int) -> LecoDataManagerConfig:

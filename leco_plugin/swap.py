@@ -89,9 +89,10 @@ def registered(method: str) -> TrainerConfig:
 
 
 def with_sampler_swapped(
-    config: TrainerConfig, file: Path, sampler: str = LEARNED
+    config: TrainerConfig, file: Path | None, sampler: str = LEARNED
 ) -> TrainerConfig:
-    """The same training with its model guided by an occupancy; the config given is not changed.
+    """The same training with its model guided by an occupancy, learned first where there is no
+    file; the config given is not changed.
 
     Raises:
         InputError: the model learns or has an occupancy already, or there is no model.
@@ -113,7 +114,7 @@ def with_sampler_swapped(
         raise InputError(
             f"{config.method_name} has a pipeline without a model that could be guided"
         )
-    path = occupancy_file(file.resolve())
+    path = None if file is None else occupancy_file(file.resolve())
     occupancy = OccupancyConfig(path=path, sampler=sampler)
     pipeline.model = GuidedModelConfig(host=host, occupancy=occupancy)
     if type(config) is TrainerConfig:

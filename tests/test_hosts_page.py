@@ -18,6 +18,7 @@ from nerfstudio.model_components.ray_samplers import UniformSampler
 from nerfstudio.plugins.types import MethodSpecification
 from torch import nn
 
+from leco_plugin.method_configs import best_device
 from leco_plugin.models import seams
 from leco_plugin.models.guide import Guide
 from leco_plugin.models.guided import GuidedModelConfig
@@ -69,7 +70,9 @@ def test_a_method_that_is_registered_as_the_page_says_learns_first(
     assert isinstance(config.pipeline.model, GuidedModelConfig)
     assert config.pipeline.model.occupancy.path is None
     assert config.pipeline.model.host == mine.pipeline.model  # which is as it was
-    assert mine.method_name == "my-method"
+    assert mine.method_name == "my-method" and mine.machine.device_type == "cuda"
+    assert config.machine.device_type == best_device()
+    assert config.pipeline.datamanager != mine.pipeline.datamanager
 
 
 def test_the_adapter_of_the_page_samples_where_the_occupancy_is(
