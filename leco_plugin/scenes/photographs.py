@@ -167,17 +167,17 @@ def _check_images(meta: dict[str, Any], frames: list[dict[str, Any]], folder: Pa
             f"the first is {folder / missing[0]}"
         )
     for frame in frames:
-        width, height = meta.get("w", frame.get("w")), meta.get("h", frame.get("h"))
+        width, height = (int(meta.get(name, frame.get(name))) for name in ("w", "h"))
         path = folder / frame["file_path"]
         try:
             with Image.open(path) as image:
                 size = image.size
         except (OSError, UnidentifiedImageError, Image.DecompressionBombError):
             raise InputError(f"{path} cannot be read as an image") from None
-        if size != (int(width), int(height)):
+        if size != (width, height):
             raise InputError(
                 f"{path} has {size[0]} x {size[1]} pixels, "
-                f"its intrinsics are for {int(width)} x {int(height)}"
+                f"its intrinsics are for {width} x {height}"
             )
 
 

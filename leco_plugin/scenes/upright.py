@@ -99,7 +99,8 @@ def _fly_over(poses: Tensor, points: Tensor | None, up: Tensor) -> bool:
     heights, ground = poses[:, :, 3] @ up, points @ up
     above = float((heights > ground.quantile(0.95)).double().mean()) >= ABOVE
     clearance = float(heights.median() - ground.median())
-    return above and (not alike or _spreads(poses[:, :, 3])[0][1] >= WIDE * clearance)
+    spread = float(_spreads(poses[:, :, 3])[0][1])
+    return above and (not alike or spread >= WIDE * clearance)
 
 
 def _without_strays(points: Tensor) -> Tensor | None:

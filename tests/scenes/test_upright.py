@@ -18,7 +18,7 @@ from torch import Tensor
 
 from leco_plugin.scenes.city_cameras import look_at
 from leco_plugin.scenes.data_manager import LecoDataManagerConfig, upright_outputs
-from leco_plugin.scenes.photographs import LecoPhotographsDataParserConfig
+from leco_plugin.scenes.photographs import LecoPhotographsDataParserConfig, read_ply
 from leco_plugin.scenes.survey import survey
 from leco_plugin.scenes.upright import turn_to_upright
 
@@ -114,6 +114,19 @@ def test_photographs_of_other_things_stay_as_they_are() -> None:
     for poses, points in (at_eye_level, (few_steps, wall[1]), street):
         assert turn_to_upright(poses, points) is None
     assert turn_to_upright(SIDEWAYS @ flight(3, 2)[:3], None) is None
+
+
+@pytest.mark.scenes
+@pytest.mark.parametrize("name", ["brighton_beach", "caliterra", "banana", "fox"])
+def test_real_surveys_are_set_upright_and_a_statue_is_not(name: str, scenes: Path) -> None:
+    meta = json.loads((scenes / name / "transforms.json").read_text())
+    poses = torch.tensor([frame["transform_matrix"] for frame in meta["frames"]])[:, :3]
+    points = read_ply(scenes / name / meta["ply_file_path"])
+    assert turn_to_upright(poses, points) is None
+    for turn in TURNS.values():
+        found = turn_to_upright(turn @ poses, points @ turn.T)
+        assert (found is None) == (name == "fox")
+        assert found is None or float((found @ turn @ UP)[2]) > np.cos(np.deg2rad(5))
 
 
 @pytest.fixture
