@@ -48,7 +48,7 @@ def city(
         format: Of the scene: nerfstudio's, or Mega-NeRF's, for the data parser mega-nerf.
         json: File for what was written, as JSON.
     """
-    from leco_plugin.scenes.city import CityConfig
+    from leco_plugin.scenes.city import City, CityConfig
     from leco_plugin.scenes.city_folder import CaptureConfig, count_pictures, write_city
 
     config, capture = CityConfig(blocks, seed, block_size), CaptureConfig(width, height)
@@ -67,9 +67,13 @@ def city(
         "width": width,
         "height": height,
     }
-    reader = "mega-nerf " if format == "mega-nerf" else ""
     print(f"{folder}: {images} pictures, {test_images} of them for testing")
-    print(f"train on it with: ns-train leco-occupancy {reader}--data {folder}")
+    command = f"ns-train leco-occupancy --data {folder}"
+    if format == "mega-nerf":  # which has no sparse points to say where the ground is
+        roof = City(config).roof
+        levels = f"--ray-altitude-range {-1.3 * roof:.0f} {0.5 * roof:.0f}"
+        command = f"ns-train leco-occupancy mega-nerf --data {folder} {levels}"
+    print(f"train on it with: {command}")
     _write_json(json, facts)
 
 

@@ -129,7 +129,8 @@ def test_city_writes_mega_nerfs_format(tmp_path: Path, capsys: pytest.CaptureFix
     small = ["--width", 40, "--height", 32, "--block-size", 50]
     arguments = ["city", "--blocks", 1, "--out", out, *small, "--format", "mega-nerf"]
     assert run(*arguments, "--json", report) == 0
-    assert f"ns-train leco-occupancy mega-nerf --data {out}" in capsys.readouterr().out
+    said = capsys.readouterr().out
+    assert f"ns-train leco-occupancy mega-nerf --data {out} --ray-altitude-range -" in said
     facts = json.loads(report.read_text())
     assert facts["layout"] == "mega-nerf" and facts["block_size"] == 50
     assert facts["test_images"] == len(list((out / "val/rgbs").iterdir())) > 0

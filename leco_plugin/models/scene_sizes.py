@@ -21,7 +21,7 @@ from leco_plugin.models.sizes import Sizes, left_open, size_at, sizes_for, with_
 from leco_plugin.scenes.bounds import BoundsConfig
 from leco_plugin.scenes.detail import CAMERAS, SceneDetail, detail_of
 from leco_plugin.scenes.input_error import InputError
-from leco_plugin.scenes.survey import points_in
+from leco_plugin.scenes.survey import points_in, with_known_altitudes
 
 TEXELS_PER_ENTRY = 4.0
 """Texels for each entry of a level of the hash table."""
@@ -68,6 +68,7 @@ def complete(
     """
     detail = None
     if left_open(wanted) and CAMERAS in metadata:
+        bounds = with_known_altitudes(bounds, metadata)
         detail = detail_of(metadata[CAMERAS], points_in(metadata), bounds)
     most = sizes_for(torch.device(device).type)
     try:

@@ -68,14 +68,14 @@ class LecoCity(Nerfstudio):
         self, split: str = "train", **kwargs: Any
     ) -> DataparserOutputs:
         from leco_plugin.scenes.city_layouts import POINTS as FILE
-        from leco_plugin.scenes.dataset_units import METRES_PER_UNIT
+        from leco_plugin.scenes.dataset_units import METRES_PER_UNIT, UP_IS_KNOWN
         from leco_plugin.scenes.photographs import POINTS, read_ply
 
         outputs: DataparserOutputs = super()._generate_dataparser_outputs(split)
         transform, scale = outputs.dataparser_transform, outputs.dataparser_scale
         points = read_ply(self.config.data / FILE)
         outputs.metadata[POINTS] = scale * (points @ transform[:, :3].T + transform[:, 3])
-        outputs.metadata[METRES_PER_UNIT] = 1.0
+        outputs.metadata |= {METRES_PER_UNIT: 1.0, UP_IS_KNOWN: True}
         return outputs
 
 

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import itertools
+import math
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
@@ -11,17 +13,21 @@ from nerfstudio.data.datamanagers.base_datamanager import (
     VanillaDataManager,
     VanillaDataManagerConfig,
 )
+from nerfstudio.data.dataparsers.base_dataparser import DataparserOutputs
 from nerfstudio.data.utils.dataloaders import (
     FixedIndicesEvalDataloader,
     RandIndicesEvalDataloader,
 )
 from nerfstudio.model_components.ray_generators import RayGenerator
+from torch import Tensor
 
 from leco_plugin.models.ranks import say
+from leco_plugin.scenes.dataset_units import UP_IS_KNOWN
 from leco_plugin.scenes.detail import CAMERAS
 from leco_plugin.scenes.held_out_pixels import HeldOutPixelSampler
 from leco_plugin.scenes.input_error import InputError
 from leco_plugin.scenes.stored_pictures import store_pictures
+from leco_plugin.scenes.upright import points_of, turn_to_upright, turned
 
 MOST_OF_MEMORY = 0.4
 """Share of the memory that is free which photographs in memory may take."""
@@ -39,12 +45,30 @@ class LecoDataManagerConfig(VanillaDataManagerConfig):
     the memory that is free."""
     pixels: Path | None = None
     """Folder of those files; by default leco-cache/pixels beside the data."""
+    upright: bool = True
+    """Whether a survey from the air that its reader leaves on its side is set upright."""
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        """Called by yaml: a run that was begun before there was a choice stays as it lies."""
+        self.__dict__.update({"upright": False} | state)
 
 
 class LecoDataManager(VanillaDataManager):  # type: ignore[type-arg]
-    """As nerfstudio's, but for where the photographs are."""
+    """As nerfstudio's, but for where the photographs are, and what is up."""
 
     config: LecoDataManagerConfig
+
+    @property
+    def dataparser(self) -> Any:
+        """The scene's reader, whichever it is; nerfstudio's commands ask it for splits."""
+        return self._dataparser
+
+    @dataparser.setter
+    def dataparser(self, parser: Any) -> None:
+        self._dataparser = parser
+        # nerfstudio sets this class as the target of configs that an earlier release stored
+        if getattr(self.config, "upright", False):
+            parser.get_dataparser_outputs = upright_outputs(parser.get_dataparser_outputs)
 
     def create_train_dataset(self) -> Any:
         """The training photographs; the model is told of their cameras, for its sizes."""
@@ -59,7 +83,6 @@ class LecoDataManager(VanillaDataManager):  # type: ignore[type-arg]
             InputError: they are to be, and cannot.
         """
         config = self.config
-        # nerfstudio sets this class as the target of configs that an earlier release stored
         wanted = getattr(config, "images", "auto")
         if wanted == "memory" or config.train_num_images_to_sample_from != -1:
             return False
@@ -117,6 +140,35 @@ class LecoDataManager(VanillaDataManager):  # type: ignore[type-arg]
         self.eval_dataloader = RandIndicesEvalDataloader(
             input_dataset=self.eval_dataset, device=self.device
         )
+
+
+def upright_outputs(read: Callable[..., DataparserOutputs]) -> Callable[..., DataparserOutputs]:
+    """A reader of splits, all of them turned by what the training cameras show to be up."""
+    known: list[Tensor | None] = []
+
+    def outputs_of(split: str = "train", **kwargs: Any) -> DataparserOutputs:
+        outputs = read(split=split, **kwargs)
+        if not known:
+            training = outputs if split == "train" else read(split="train", **kwargs)
+            known.append(_turn_of(training))
+        turn = known[0]
+        return outputs if turn is None else turned(outputs, turn)
+
+    return outputs_of
+
+
+def _turn_of(outputs: DataparserOutputs) -> Tensor | None:
+    """What sets a scene upright, said in the log; None where nothing is to be done."""
+    if UP_IS_KNOWN in outputs.metadata:
+        return None
+    turn = turn_to_upright(outputs.cameras.camera_to_worlds, points_of(outputs))
+    if turn is not None:
+        degrees = math.degrees(math.acos(max(-1.0, min(1.0, float(turn[2, 2])))))
+        say(
+            f"the survey lies on its side and is set upright, by {degrees:.0f} degrees; "
+            "--pipeline.datamanager.upright False leaves it as it is"
+        )
+    return turn
 
 
 def decoded_bytes(dataset: Any) -> int:

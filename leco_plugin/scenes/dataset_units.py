@@ -13,6 +13,10 @@ import torch
 
 METRES_PER_UNIT = "leco_metres_per_unit"
 """Key of a dataparser's metadata: metres in a unit of the dataset's own poses, float."""
+ALTITUDES = "leco_altitudes"
+"""Key of a dataparser's metadata: z of the ground and of the top, scene units, two floats."""
+UP_IS_KNOWN = "leco_up_is_known"
+"""Key of a dataparser's metadata: there where z is up in the dataset already."""
 
 
 @dataclass(frozen=True)

@@ -11,6 +11,7 @@ that any model is scored in this way.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -54,6 +55,9 @@ class MegaNerfDataParserConfig(DataParserConfig):
     points: Path | None = None
     """A .ply of sparse points in metres (down, right, back), which say where the ground is; by
     default DATA/points.ply where there is one."""
+    ray_altitude_range: tuple[float, float] | None = None
+    """Metres along the down axis at which rays are cut, top and ground, as in Mega-NeRF's own
+    configurations: less is higher."""
     check_axes: bool = True
     """Whether to refuse a scene whose cameras show that its first axis does not point down."""
 
@@ -81,12 +85,16 @@ class MegaNerf(DataParser):
         else:
             images = self._scored_files(frames, factor)
         cameras = _cameras(scene, frames, factor, right_half=half and not training)
-        from leco_plugin.scenes.dataset_units import METRES_PER_UNIT
+        from leco_plugin.scenes.dataset_units import ALTITUDES, METRES_PER_UNIT, UP_IS_KNOWN
         from leco_plugin.scenes.photographs import POINTS
 
         coordinates = scene.coordinates
         transform = torch.from_numpy(coordinates.transform()).float()
-        metadata: dict[str, Any] = {METRES_PER_UNIT: 1.0}  # the poses, scaled back, are in metres
+        # the poses, scaled back, are in metres
+        metadata: dict[str, Any] = {METRES_PER_UNIT: 1.0, UP_IS_KNOWN: True}
+        if config.ray_altitude_range is not None:
+            top, ground = config.ray_altitude_range
+            metadata[ALTITUDES] = coordinates.height_of(ground), coordinates.height_of(top)
         points = self._points()
         if points is not None:
             metadata[POINTS] = (points @ transform[:, :3].T + transform[:, 3]) / coordinates.metres
@@ -181,6 +189,13 @@ def _check(config: MegaNerfDataParserConfig) -> None:
 
     if min(config.train_scale_factor, config.val_scale_factor) < 1:
         raise InputError("train_scale_factor and val_scale_factor are whole numbers from 1 on")
+    if config.ray_altitude_range is not None:
+        top, ground = config.ray_altitude_range
+        if not -math.inf < top < ground < math.inf:
+            raise InputError(
+                f"ray_altitude_range is the top and then the ground, in metres along the down axis,"
+                f" so that the first is less: not {top:g} and {ground:g}"
+            )
     if config.masks is not None and not config.masks.is_dir():
         raise InputError(f"there is no folder {config.masks} with masks")
 

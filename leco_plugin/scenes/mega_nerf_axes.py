@@ -51,6 +51,10 @@ class Coordinates:
         """Metres above the datum, up is positive, of poses [C, 3, 4] of the files: [C]."""
         return -(poses[:, 0, 3] * self.metres + self.origin_drb[0])
 
+    def height_of(self, down: float) -> float:
+        """The model's z of a level that lies so many metres down from the datum."""
+        return float(self.origin_drb[0] - down) / self.metres
+
     def transform(self) -> Array:
         """[3, 4] from metres (down, right, back) to the model's axes, before scaling."""
         return np.column_stack([TO_DRB.T, -TO_DRB.T @ self.origin_drb])

@@ -19,13 +19,14 @@ def check_masks(frames: list[dict[str, Any]], folder: Path) -> None:
         return
     if len(masked) < len(frames):
         raise InputError(
-            f"{len(masked)} of {len(frames)} images have a mask_path; give one to all or to none"
+            f"{folder}: {len(masked)} of {len(frames)} images have a mask_path; "
+            "give one to all or to none"
         )
     shown = [_shows_something(folder, frame) for frame in frames]
     if not any(seen for seen, _ in shown):
         raise InputError(
-            f"the masks leave no pixel of {len(frames)} images: a mask is black where its image is "
-            "not to be used"
+            f"{folder}: the masks leave no pixel of {len(frames)} images: a mask is black where "
+            "its image is not to be used"
         )
     hidden = [frame["file_path"] for frame, (seen, _) in zip(frames, shown) if not seen]
     if hidden and len({size for _, size in shown}) > 1:
@@ -43,13 +44,13 @@ def _shows_something(folder: Path, frame: dict[str, Any]) -> tuple[bool, tuple[i
     """
     from PIL import Image, UnidentifiedImageError
 
-    path = folder / frame["mask_path"]
+    path = folder / str(frame["mask_path"])
     try:
         with Image.open(path) as mask, Image.open(folder / frame["file_path"]) as image:
             size, wanted, seen = mask.size, image.size, mask.getbbox() is not None
     except FileNotFoundError:
         raise InputError(f"the mask {path} is not there") from None
-    except (OSError, UnidentifiedImageError):
+    except (OSError, ValueError, UnidentifiedImageError, Image.DecompressionBombError):
         raise InputError(f"the mask {path} cannot be read as an image") from None
     if size != wanted:
         raise InputError(

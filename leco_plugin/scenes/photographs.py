@@ -18,7 +18,7 @@ from nerfstudio.data.dataparsers.nerfstudio_dataparser import Nerfstudio, Nerfst
 from nerfstudio.plugins.registry_dataparser import DataParserSpecification
 from torch import Tensor
 
-from leco_plugin.scenes.dataset_units import METRES_PER_UNIT
+from leco_plugin.scenes.dataset_units import METRES_PER_UNIT, UP_IS_KNOWN
 from leco_plugin.scenes.input_error import InputError
 from leco_plugin.scenes.photograph_masks import check_masks
 from leco_plugin.scenes.rotations import distance_from_rotations
@@ -44,21 +44,32 @@ class LecoPhotographs(Nerfstudio):
         self, split: str = "train", **kwargs: Any
     ) -> DataparserOutputs:
         meta = check_scene(self.config.data)
-        if "orientation_override" not in meta and self.config.orientation_method == "up":
-            poses = np.array([frame["transform_matrix"] for frame in meta["frames"]], dtype=float)
-            if taken_from_above(poses):
-                # nerfstudio's "up" would take the photographs' top edges for up, and tip the scene
-                self.config.orientation_method = "none"
-        outputs: DataparserOutputs = super()._generate_dataparser_outputs(split)
+        up_is_known = self._knows_up(meta)
+        if up_is_known and "orientation_override" not in meta:
+            # nerfstudio's "up" would take the photographs' top edges for up, and tip the scene
+            self.config.orientation_method = "none"
+        try:
+            outputs: DataparserOutputs = super()._generate_dataparser_outputs(split)
+        except (AssertionError, RuntimeError) as error:  # what nerfstudio finds wrong with it
+            raise InputError(f"{self.config.data}: {_one_line(error)}") from error
         if len(outputs.image_filenames) == 0:
             raise InputError(f"{self.config.data}: no image is left for the split {split!r}")
         points = read_points(meta, folder_of(self.config.data))
         if points is not None:
             transform, scale = outputs.dataparser_transform, outputs.dataparser_scale
             outputs.metadata[POINTS] = scale * (points @ transform[:, :3].T + transform[:, 3])
+        if up_is_known:
+            outputs.metadata[UP_IS_KNOWN] = True
         if "metres_per_unit" in meta:
             outputs.metadata[METRES_PER_UNIT] = _metres(meta, self.config.data)
         return outputs
+
+    def _knows_up(self, meta: dict[str, Any]) -> bool:
+        """Whether z is up in the file already: it says so, or its cameras look down along it."""
+        if "orientation_override" in meta:
+            return bool(meta["orientation_override"] == "none")
+        poses = np.array([frame["transform_matrix"] for frame in meta["frames"]], dtype=float)
+        return self.config.orientation_method in ("up", "none") and taken_from_above(poses)
 
 
 def _metres(meta: dict[str, Any], data: Path) -> float:
@@ -97,9 +108,11 @@ def check_scene(data: Path) -> dict[str, Any]:
         meta = json.loads(description.read_text())
         frames = meta["frames"]
         paths = [frame["file_path"] for frame in frames]
+        if not all(type(path) is str and "\0" not in path for path in paths):
+            raise ValueError("a file_path is no path")
         poses = np.array([frame["transform_matrix"] for frame in frames], dtype=float)
-    except (OSError, ValueError, KeyError, TypeError) as error:
-        reason = f"{type(error).__name__}: {str(error).splitlines()[0] if str(error) else ''}"
+    except (OSError, ValueError, KeyError, TypeError, OverflowError, RecursionError) as error:
+        reason = f"{type(error).__name__}: {_one_line(error)}"
         raise InputError(
             f"{description} is not a scene in nerfstudio's format ({reason})"
         ) from None
@@ -115,9 +128,32 @@ def check_scene(data: Path) -> dict[str, Any]:
         number = "one image" if len(frames) == 1 else f"{len(frames)} images from one place"
         raise InputError(f"{description} has {number}; a scene is seen from two places at least")
     folder = folder_of(data)
+    _check_intrinsics(meta, frames, description)
     _check_images(meta, frames, folder)
     check_masks(frames, folder)
     return dict(meta)
+
+
+def _one_line(error: Exception) -> str:
+    return " ".join(str(error).split())[:120]
+
+
+def _check_intrinsics(
+    meta: dict[str, Any], frames: list[dict[str, Any]], description: Path
+) -> None:
+    """The size of the images and their intrinsics are numbers, for the scene or for each frame."""
+    for name in ("w", "h", "fl_x", "fl_y", "cx", "cy"):
+        for frame in frames:
+            # the scene's own goes before that of a frame, as in nerfstudio
+            value = meta.get(name, frame.get(name))
+            if value is None:
+                raise InputError(f"{description}: {frame['file_path']} has no {name}")
+            sound = type(value) in (int, float) and abs(value) < 1e9
+            if not sound or (name[0] != "c" and not value >= 1e-3):
+                raise InputError(
+                    f"{description}: {name} of {frame['file_path']} is {str(value)[:40]!r}, and "
+                    "not what a camera has"
+                )
 
 
 def _check_images(meta: dict[str, Any], frames: list[dict[str, Any]], folder: Path) -> None:
@@ -131,20 +167,17 @@ def _check_images(meta: dict[str, Any], frames: list[dict[str, Any]], folder: Pa
             f"the first is {folder / missing[0]}"
         )
     for frame in frames:
-        # the scene's own size goes before that of a frame, as in nerfstudio
-        width, height = meta.get("w", frame.get("w")), meta.get("h", frame.get("h"))
+        width, height = (int(meta.get(name, frame.get(name))) for name in ("w", "h"))
         path = folder / frame["file_path"]
         try:
             with Image.open(path) as image:
                 size = image.size
-        except (OSError, UnidentifiedImageError):
+        except (OSError, UnidentifiedImageError, Image.DecompressionBombError):
             raise InputError(f"{path} cannot be read as an image") from None
-        if width is None or height is None:
-            raise InputError(f"the size (w, h) of {frame['file_path']} is not in transforms.json")
-        if size != (int(width), int(height)):
+        if size != (width, height):
             raise InputError(
                 f"{path} has {size[0]} x {size[1]} pixels, "
-                f"its intrinsics are for {int(width)} x {int(height)}"
+                f"its intrinsics are for {width} x {height}"
             )
 
 
@@ -155,9 +188,9 @@ def read_points(meta: dict[str, Any], folder: Path) -> Tensor | None:
         InputError: a file is named, but cannot be read as points.
     """
     name = meta.get("ply_file_path")
-    if name is None or not (folder / name).exists():
+    if name is None or not (folder / str(name)).is_file():
         return None
-    return read_ply(folder / name)
+    return read_ply(folder / str(name))
 
 
 def read_ply(path: Path) -> Tensor:
@@ -169,11 +202,13 @@ def read_ply(path: Path) -> Tensor:
     import trimesh
 
     try:
-        loaded: Any = trimesh.load(path)
-        vertices = np.asarray(loaded.vertices, dtype=np.float32)
+        # as a file and not by its name: nothing else is read that it may point to
+        with path.open("rb") as file:
+            loaded: Any = trimesh.load(file, file_type="ply")
+        vertices = np.asarray(loaded.vertices, dtype=np.float32).reshape(-1, 3)
     except Exception as error:  # noqa: BLE001  trimesh raises whatever its parsers meet
-        raise InputError(f"{path} cannot be read as sparse points: {error}") from None
-    return torch.from_numpy(vertices.reshape(-1, 3).copy())
+        raise InputError(f"{path} cannot be read as sparse points: {_one_line(error)}") from None
+    return torch.from_numpy(vertices[np.isfinite(vertices).all(axis=1)].copy())
 
 
 leco_photographs_dataparser = DataParserSpecification(

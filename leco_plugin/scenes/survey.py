@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import torch
@@ -13,7 +13,7 @@ from leco_plugin.models.ranks import say
 from leco_plugin.models.rendering import Rays
 from leco_plugin.samplers.rays import intersect_box
 from leco_plugin.scenes.bounds import BoundsConfig, SceneBounds, find_bounds, with_range
-from leco_plugin.scenes.dataset_units import DatasetUnits, units_of
+from leco_plugin.scenes.dataset_units import ALTITUDES, DatasetUnits, units_of
 from leco_plugin.scenes.input_error import InputError
 from leco_plugin.scenes.photographs import POINTS
 
@@ -97,6 +97,13 @@ def points_in(metadata: dict[str, Any]) -> Tensor | None:
     return None if points is None else torch.as_tensor(points)
 
 
+def with_known_altitudes(config: BoundsConfig | None, metadata: dict[str, Any]) -> BoundsConfig:
+    """What is configured, with the altitudes that a reader knows where none are set by hand."""
+    config = config or BoundsConfig()
+    known = metadata.get(ALTITUDES)
+    return config if config.altitudes or known is None else replace(config, altitudes=known)
+
+
 def survey(
     datamanager: Any,
     config: BoundsConfig | None = None,
@@ -111,13 +118,13 @@ def survey(
     Raises:
         InputError: no cameras, no ray meets the scene, or what is configured is no range.
     """
-    config = config or BoundsConfig()
     if hasattr(datamanager, "train_unseen_cameras"):
         raise InputError(
             f"{type(datamanager).__name__} hands out whole images, and this method trains on rays; "
             "leave the method its own data manager, and see its option `images` to save memory"
         )
     dataset = datamanager.train_dataset
+    config = with_known_altitudes(config, getattr(dataset, "metadata", {}) or {})
     cameras: Cameras = dataset.cameras
     if len(cameras) == 0:
         raise InputError("the scene has no training cameras")

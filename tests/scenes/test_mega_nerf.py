@@ -12,15 +12,19 @@ import mega_nerf_scene
 import numpy as np
 import pytest
 import torch
+import tyro
 from nerfstudio.data.datamanagers.base_datamanager import VanillaDataManagerConfig
 from nerfstudio.data.datasets.base_dataset import InputDataset
 from nerfstudio.plugins.registry_dataparser import DataParserSpecification
 
-from leco_plugin.scenes.dataset_units import METRES_PER_UNIT
+from leco_plugin.scenes.bounds import BoundsConfig
+from leco_plugin.scenes.data_manager import LecoDataManagerConfig
+from leco_plugin.scenes.dataset_units import ALTITUDES, METRES_PER_UNIT
 from leco_plugin.scenes.frames import between, frame_of
 from leco_plugin.scenes.input_error import InputError
 from leco_plugin.scenes.mega_nerf import MegaNerfDataParserConfig, mega_nerf_dataparser
 from leco_plugin.scenes.photographs import POINTS
+from leco_plugin.scenes.survey import survey
 
 # nerfstudio leaves images open that it has read
 pytestmark = [
@@ -221,3 +225,29 @@ def test_a_file_of_points_that_is_not_there_is_named(tmp_path: Path) -> None:
     config = MegaNerfDataParserConfig(data=folder, points=tmp_path / "none.ply")
     with pytest.raises(InputError, match=r"none\.ply"):
         config.setup().get_dataparser_outputs("train")
+
+
+def test_altitudes_of_mega_nerfs_configurations_cut_the_rays(scene: Path) -> None:
+    """Its datum is 90 m above the origin, a unit 40 m: z is (-90 - metres down) / 40."""
+    parser = MegaNerfDataParserConfig(data=scene, ray_altitude_range=(-30.0, 10.0))
+    manager = LecoDataManagerConfig(dataparser=parser).setup(device="cpu")
+    assert manager.train_dataset.metadata[ALTITUDES] == (-2.5, -1.5)
+    found = survey(manager)
+    assert found.bounds.kind == "box" and found.bounds.aabb[[2, 5]].tolist() == [-2.5, -1.5]
+    rows = {line[:9]: line.split() for line in found.lines()}
+    assert rows["ground, z"][-1] == "-10.00" and rows["top, z   "][-1] == "30.00"  # metres, up
+    by_hand = survey(manager, BoundsConfig(altitudes=(-2.0, -1.75)))
+    assert by_hand.bounds.aabb[[2, 5]].tolist() == [-2.0, -1.75]
+
+
+def test_altitudes_above_the_datum_are_negative_on_the_command_line() -> None:
+    arguments = ["--ray-altitude-range", "-38", "15.5"]
+    parsed = tyro.cli(MegaNerfDataParserConfig, args=arguments)
+    assert parsed.ray_altitude_range == (-38.0, 15.5)
+
+
+@pytest.mark.parametrize("levels", [(10.0, -30.0), (1.0, 1.0), (0.0, float("inf"))])
+def test_altitudes_in_another_order_are_refused(levels: tuple[float, float], scene: Path) -> None:
+    with pytest.raises(InputError, match="the top and then the ground") as caught:
+        parse(scene, ray_altitude_range=levels)
+    assert "\n" not in str(caught.value)

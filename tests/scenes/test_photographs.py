@@ -116,7 +116,13 @@ BAD_MEASURES: dict[str, tuple[Callable[[Path], object], str]] = {
         lambda s: Image.new("RGB", (16, 31)).save(s / "images" / "003.png"),
         "003.png has 16 x 31 pixels, its intrinsics are for 32 x 32",
     ),
-    "no image size": (lambda s: change(s, lambda m: m.pop("w")), r"size \(w, h\)"),
+    "no image size": (lambda s: change(s, lambda m: m.pop("w")), "000.png has no w"),
+    "no principal point": (lambda s: change(s, lambda m: m.pop("cx")), "000.png has no cx"),
+    "no focal length": (
+        lambda s: change(s, lambda m: m.update(fl_y=0)),
+        "fl_y of .*000.png is '0'",
+    ),
+    "a size of words": (lambda s: change(s, lambda m: m.update(w="wide")), "w of .* is 'wide'"),
     "a scaled pose": (lambda s: change(s, scale_pose), "001.png is no rotation"),
     "a sheared pose": (lambda s: change(s, shear_pose), "001.png is no rotation"),
     "a mirrored pose": (

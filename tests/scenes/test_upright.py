@@ -1,0 +1,208 @@
+"""Surveys are set upright in whatever coordinates they come; nothing else is touched."""
+
+from __future__ import annotations
+
+import copy
+import json
+import shutil
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+import trimesh
+import yaml
+from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataParserConfig
+from torch import Tensor
+
+from leco_plugin.scenes.city_cameras import look_at
+from leco_plugin.scenes.data_manager import LecoDataManagerConfig, upright_outputs
+from leco_plugin.scenes.photographs import LecoPhotographsDataParserConfig, read_ply
+from leco_plugin.scenes.survey import survey
+from leco_plugin.scenes.upright import turn_to_upright
+
+UP = torch.tensor([0.0, 0.0, 1.0])
+
+
+def flight(tilt: float, headings: int, rows: int = 5) -> Tensor:
+    """[C, 3, 4] poses over a square of side 2 at a height of about 1.
+
+    Args:
+        tilt: of the cameras, degrees off straight down.
+        headings: directions in which they fly, in turn.
+    """
+    random = np.random.default_rng(5)
+    poses = []
+    for number, (x, y) in enumerate(np.ndindex(rows, rows)):
+        place = np.array([x, y, 0]) * 2 / (rows - 1) - [1, 1, 0] + random.normal(0, 0.03, 3)
+        place[2] += 1.0
+        angle = 2 * np.pi * (number % headings) / headings + 0.3
+        reach = np.tan(np.deg2rad(tilt)) + 0.01
+        ahead = reach * np.array([np.cos(angle), np.sin(angle), 0.0])
+        poses.append(look_at(place, place + ahead - [0, 0, 1]))
+    return torch.tensor(np.stack(poses)).float()
+
+
+def ground(relief: float = 0.05) -> Tensor:
+    """[2000, 3] points around z = 0, and a few strays far below them."""
+    random = torch.Generator().manual_seed(2)
+    points = torch.rand(2000, 3, generator=random) * 4 - 2
+    points[:, 2] = relief * torch.randn(2000, generator=random)
+    points[:20, 2] -= 50.0
+    return points
+
+
+def around(count: int, height: float, radius: float = 1.0) -> Tensor:
+    """[count, 3, 4] cameras on a ring that look at its middle on the ground."""
+    angles = np.arange(count) * 2 * np.pi / count
+    x, y = radius * np.cos(angles), radius * np.sin(angles)
+    places = np.column_stack([x, y, np.full(count, height)])
+    return torch.tensor(np.stack([look_at(place, np.zeros(3)) for place in places]))
+
+
+def any_rotation(seed: int) -> Tensor:
+    values = torch.randn(3, 3, generator=torch.Generator().manual_seed(seed))
+    rotation, _ = torch.linalg.qr(values)
+    return rotation * torch.linalg.det(rotation).sign()
+
+
+# of the first camera of a survey, structure from motion makes (right, down, ahead); nerfstudio then
+# has z where the tops of the photographs are
+SIDEWAYS = torch.tensor([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
+TURNS = {"sideways": SIDEWAYS, "upside down": torch.diag(torch.tensor([1.0, -1.0, -1.0]))}
+TURNS |= {f"anyhow {seed}": any_rotation(seed) for seed in range(3)}
+
+
+@pytest.mark.parametrize("turn", TURNS)
+@pytest.mark.parametrize(("tilt", "headings"), [(0, 1), (3, 2), (10, 4), (40, 4), (40, 2)])
+def test_a_survey_is_set_upright_from_any_side(tilt: float, headings: int, turn: str) -> None:
+    poses, points = TURNS[turn] @ flight(tilt, headings), ground() @ TURNS[turn].T
+    found = turn_to_upright(poses, points)
+    assert found is not None
+    torch.testing.assert_close(found @ found.T, torch.eye(3), atol=1e-5, rtol=0)
+    up = found @ TURNS[turn] @ UP
+    assert float(up[2]) > np.cos(np.deg2rad(3))
+
+
+def test_without_points_cameras_of_several_headings_show_what_is_up() -> None:
+    found = turn_to_upright(SIDEWAYS @ flight(10, 4), None)
+    assert found is not None and float((found @ SIDEWAYS @ UP)[2]) > np.cos(np.deg2rad(3))
+
+
+def test_without_points_cameras_that_are_held_alike_may_stand_before_a_wall() -> None:
+    assert turn_to_upright(SIDEWAYS @ flight(0, 1), None) is None
+
+
+def test_a_survey_that_is_upright_stays_as_it_is() -> None:
+    for tilt, headings in ((0, 1), (10, 2), (45, 4)):
+        assert turn_to_upright(flight(tilt, headings), ground()) is None
+    slope = torch.tensor([[0.94, 0.0, 0.34], [0.0, 1.0, 0.0], [-0.34, 0.0, 0.94]])
+    assert turn_to_upright(flight(0, 2), ground() @ slope.T) is None
+
+
+def test_photographs_of_other_things_stay_as_they_are() -> None:
+    at_eye_level = around(24, 0.05), ground(0.4)
+    wall = SIDEWAYS @ flight(3, 1), ground() @ SIDEWAYS.T
+    few_steps = wall[0].clone()
+    few_steps[:, :, 3] -= (
+        0.8
+        * (few_steps[:, :, 3] - few_steps[:, :, 3].mean(dim=0))
+        * (torch.tensor([1.0, 0.0, 1.0]))
+    )
+    street = torch.stack([flight(89, 8)[n] for n in range(25)]), ground(0.02)
+    for poses, points in (at_eye_level, (few_steps, wall[1]), street):
+        assert turn_to_upright(poses, points) is None
+    assert turn_to_upright(SIDEWAYS @ flight(3, 2)[:3], None) is None
+
+
+@pytest.mark.scenes
+@pytest.mark.parametrize("name", ["brighton_beach", "caliterra", "banana", "fox"])
+def test_real_surveys_are_set_upright_and_a_statue_is_not(name: str, scenes: Path) -> None:
+    meta = json.loads((scenes / name / "transforms.json").read_text())
+    poses = torch.tensor([frame["transform_matrix"] for frame in meta["frames"]])[:, :3]
+    points = read_ply(scenes / name / meta["ply_file_path"])
+    assert turn_to_upright(poses, points) is None
+    for turn in TURNS.values():
+        found = turn_to_upright(turn @ poses, points @ turn.T)
+        assert (found is None) == (name == "fox")
+        assert found is None or float((found @ turn @ UP)[2]) > np.cos(np.deg2rad(5))
+
+
+@pytest.fixture
+def colmap_scene(tiny_scene: Path, tmp_path: Path) -> Path:
+    """A survey in the coordinates that structure from motion and nerfstudio leave it in."""
+    scene = shutil.copytree(tiny_scene, tmp_path / "scene")
+    meta = json.loads((scene / "transforms.json").read_text())
+    poses = SIDEWAYS @ flight(3, 2, rows=3)
+    for frame, pose in zip(meta["frames"], poses):
+        frame["transform_matrix"] = [*pose.tolist(), [0.0, 0.0, 0.0, 1.0]]
+    meta.pop("orientation_override", None)
+    meta["ply_file_path"] = "points.ply"
+    trimesh.PointCloud((ground() @ SIDEWAYS.T).numpy()).export(scene / "points.ply")
+    (scene / "transforms.json").write_text(json.dumps(meta))
+    return scene
+
+
+READERS: dict[str, Any] = {
+    "leco-photographs": LecoPhotographsDataParserConfig,
+    "nerfstudio-data": NerfstudioDataParserConfig,
+}
+
+
+@pytest.mark.filterwarnings("ignore:unclosed file:ResourceWarning")
+@pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
+@pytest.mark.parametrize("reader", READERS)
+def test_a_survey_from_structure_from_motion_is_bounded_whatever_reads_it(
+    reader: str, colmap_scene: Path
+) -> None:
+    config = LecoDataManagerConfig(dataparser=READERS[reader](data=colmap_scene))
+    manager: Any = config.setup(device="cpu")
+    for dataset in (manager.train_dataset, manager.eval_dataset):
+        assert bool((dataset.cameras.camera_to_worlds[:, 2, 2] > 0.9).all())
+    split = manager.dataparser.get_dataparser_outputs("test")  # as ns-render does
+    assert bool((split.cameras.camera_to_worlds[:, 2, 2] > 0.9).all())
+    if reader == "leco-photographs":  # nerfstudio's own leaves the points out
+        found = survey(manager).bounds
+        assert found.kind == "box" and "photographed from above" in found.reason
+    _leads_back(manager.train_dataparser_outputs, colmap_scene)
+
+
+def _leads_back(outputs: Any, scene: Path) -> None:
+    """What the outputs say they did takes the file's cameras to the model's."""
+    meta = json.loads((scene / "transforms.json").read_text())
+    frames = {frame["file_path"]: frame["transform_matrix"] for frame in meta["frames"]}
+    transform, scale = outputs.dataparser_transform.double(), outputs.dataparser_scale
+    for path, camera in zip(outputs.image_filenames, outputs.cameras.camera_to_worlds):
+        pose = torch.tensor(frames[f"images/{path.name}"], dtype=torch.float64)
+        place = scale * (transform[:, :3] @ pose[:3, 3] + transform[:, 3])
+        torch.testing.assert_close(place.float(), camera[:, 3], atol=1e-5, rtol=0)
+        turned = (transform[:, :3] @ pose[:3, :3]).float()
+        torch.testing.assert_close(turned, camera[:, :3], atol=1e-5, rtol=0)
+
+
+@pytest.mark.filterwarnings("ignore:unclosed file:ResourceWarning")
+@pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
+def test_it_is_left_on_its_side_where_that_is_asked_for(colmap_scene: Path) -> None:
+    parser = LecoPhotographsDataParserConfig(data=colmap_scene)
+    manager: Any = LecoDataManagerConfig(dataparser=parser, upright=False).setup(device="cpu")
+    assert not bool((manager.train_dataset.cameras.camera_to_worlds[:, 2, 2] > 0.9).any())
+
+
+def test_a_run_that_was_begun_before_stays_as_it_lies() -> None:
+    config = LecoDataManagerConfig()
+    assert copy.deepcopy(config).upright and yaml.load(yaml.dump(config), yaml.Loader).upright
+    stored = {name: value for name, value in vars(config).items() if name != "upright"}
+    earlier = LecoDataManagerConfig.__new__(LecoDataManagerConfig)
+    earlier.__setstate__(stored)
+    assert not earlier.upright and earlier.images == "auto"
+
+
+@pytest.mark.filterwarnings("ignore:unclosed file:ResourceWarning")
+@pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
+def test_all_splits_are_turned_by_the_training_cameras(colmap_scene: Path) -> None:
+    parser = LecoPhotographsDataParserConfig(data=colmap_scene).setup()
+    read = upright_outputs(parser.get_dataparser_outputs)
+    held_out = read("test")  # two cameras, of which nobody could tell what is up
+    assert len(held_out.cameras) == 2
+    assert bool((held_out.cameras.camera_to_worlds[:, 2, 2] > 0.9).all())
