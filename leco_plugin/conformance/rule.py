@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+import traceback
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any, Protocol
 
 import torch
+
+HERE = Path(__file__).resolve().parents[1]
 
 
 class Broken(AssertionError):
@@ -65,7 +69,9 @@ class Verdict:
         if self.error is None:
             return ""
         said = " ".join(str(self.error).split())
-        return said if isinstance(self.error, Broken) else f"{type(self.error).__name__}: {said}"
+        if isinstance(self.error, Broken):
+            return said
+        return f"{type(self.error).__name__}: {said}{_place(self.error)}"
 
     @property
     def advice(self) -> str:
@@ -87,6 +93,19 @@ class Verdict:
             "reason": self.rule.reason,
             "remedy": self.rule.remedy,
         }
+
+
+OTHERS = {"torch", "nerfstudio", "nerfacc"}
+"""Packages in which errors come up that are not theirs."""
+
+
+def _place(error: Exception) -> str:
+    """Where in the code that is checked an error came up; empty where it did not."""
+    for frame in reversed(traceback.extract_tb(error.__traceback__)):
+        path = Path(frame.filename)
+        if HERE not in path.parents and not OTHERS & set(path.parts):
+            return f" ({path.name}, line {frame.lineno})"
+    return ""
 
 
 def apply(rule: Rule, case: Case) -> Verdict:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from pathlib import Path
 
 import pytest
 import torch
@@ -42,7 +43,11 @@ def raises(case):
 
 
 @pytest.mark.parametrize(
-    ("check", "problem"), [(fails, "two of three are wrong"), (raises, "KeyError: 't_min'")]
+    ("check", "problem"),
+    [
+        (fails, "two of three are wrong"),
+        (raises, f"KeyError: 't_min' (test_rule.py, line {raises.__code__.co_firstlineno + 1})"),
+    ],
 )
 def test_what_is_found_or_raised_is_told_in_one_line(check, problem):
     case = Case()
@@ -52,6 +57,17 @@ def test_what_is_found_or_raised_is_told_in_one_line(check, problem):
         f"FAIL  somewhere  a-rule: {problem}. Why it matters: things break. Remedy: mend it."
     )
     assert json.loads(json.dumps(verdict.to_dict()))["problem"] == problem
+
+
+def test_an_error_of_a_library_is_told_where_the_code_that_is_checked_asked_for_it():
+    verdict = apply(rule(lambda case: torch.nn.Linear(3, 1)(torch.ones(2))), Case())
+    assert verdict.problem.endswith(f"(test_rule.py, line {line_of('Linear(3, 1)')})")
+    assert apply(rule(lambda: None), Case()).problem.endswith("given")  # nothing of theirs ran
+
+
+def line_of(text: str) -> int:
+    lines = Path(__file__).read_text().splitlines()
+    return 1 + next(number for number, line in enumerate(lines) if text in line)
 
 
 def test_random_numbers_and_gradients_are_as_before():
