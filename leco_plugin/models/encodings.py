@@ -59,26 +59,25 @@ class FrequencyEncoding(nn.Module):
     """x, sin(2^k pi x), cos(2^k pi x) for k < octaves (NeRF, eq. 4)."""
 
     scales: Tensor
+    start: Tensor
 
     def __init__(self, octaves: int) -> None:
         super().__init__()
         self.out_dim = 3 + 6 * octaves
         self.register_buffer("scales", math.pi * 2.0 ** torch.arange(octaves), persistent=False)
+        self.register_buffer("start", torch.tensor([0.0, -1.0]).view(2, 1, 1), persistent=False)
 
     def forward(self, mapped: Tensor) -> Tensor:
         """[N, 3] in [-1, 1] to [N, 3 + 6 octaves] float32."""
         x = mapped.t().contiguous()
-        sines: list[Tensor] = []
-        cosines: list[Tensor] = []
+        waves: list[Tensor] = []  # sines and cosines of each octave, [2, 3, N]
         for octave, scale in enumerate(self.scales):
             if octave % FRESH == 0:
                 angles = x * scale
-                sines.append(angles.sin())
-                cosines.append(angles.cos())
-            else:  # sin 2a = 2 sin a cos a, cos 2a = 1 - 2 sin^2 a
-                sine = sines[-1]
-                sines.append(2.0 * sine * cosines[-1])
-                cosines.append(1.0 - 2.0 * sine * sine)
+                waves.append(torch.stack([angles.sin(), angles.cos()]))
+            else:  # sin 2a = 2 sin a cos a, cos 2a = 2 cos a cos a - 1
+                waves.append(torch.addcmul(self.start, waves[-1], waves[-1][1], value=2.0))
+        sines, cosines = zip(*waves, strict=True)
         return torch.cat([x, *sines, *cosines]).t()
 
 
