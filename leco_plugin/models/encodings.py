@@ -70,15 +70,21 @@ class FrequencyEncoding(nn.Module):
     def forward(self, mapped: Tensor) -> Tensor:
         """[N, 3] in [-1, 1] to [N, 3 + 6 octaves] float32."""
         x = mapped.t().contiguous()
-        waves: list[Tensor] = []  # sines and cosines of each octave, [2, 3, N]
+        if x.requires_grad:  # as it is defined, which torch can differentiate
+            angles = (self.scales[:, None, None] * x).flatten(0, 1)
+            return torch.cat([x, angles.sin(), angles.cos()]).t()
+        features = x.new_empty(self.out_dim, x.shape[1])
+        features[:3] = x
+        waves = features[3:].view(2, len(self.scales), *x.shape)  # sines, cosines
         for octave, scale in enumerate(self.scales):
             if octave % FRESH == 0:
                 angles = x * scale
-                waves.append(torch.stack([angles.sin(), angles.cos()]))
+                torch.sin(angles, out=waves[0, octave])
+                torch.cos(angles, out=waves[1, octave])
             else:  # sin 2a = 2 sin a cos a, cos 2a = 2 cos a cos a - 1
-                waves.append(torch.addcmul(self.start, waves[-1], waves[-1][1], value=2.0))
-        sines, cosines = zip(*waves, strict=True)
-        return torch.cat([x, *sines, *cosines]).t()
+                last = waves[:, octave - 1]
+                torch.addcmul(self.start, last, last[1], value=2.0, out=waves[:, octave])
+        return features.t()
 
 
 class _InterpolateTable(torch.autograd.Function):

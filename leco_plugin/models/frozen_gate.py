@@ -23,6 +23,10 @@ from leco_plugin.models.steady import filled_size
 LARGEST_LOGIT = 80.0
 """Sums of exponentials of up to this stay finite; o is 1 in float32 long before."""
 
+BLOCKS = 32
+"""Of rows that the last layer multiplies apart, where their number has such a divisor: a product of
+few columns is twice as fast when its rows lie in the cache."""
+
 LayerFn = Callable[[Tensor, Tensor, Tensor], Tensor]
 """Rows [N, inputs], weight [width, inputs] and bias [width] to relu(W x + b), [N, width]."""
 
@@ -66,20 +70,22 @@ def occupancy_of(gate: Gate, mapped: Tensor, dtype: torch.dtype) -> Tensor:
 
 def _layer(features: Tensor, weight: Tensor, bias: Tensor) -> Tensor:
     one_pass = _one_pass(features.dtype)
-    if one_pass is None or not features.is_contiguous():  # which it would be made first
+    if one_pass is None or not features.is_contiguous():  # columns would be made rows first
         return torch.addmm(bias, features, weight.T).relu_()
     return one_pass(features, weight, bias)
 
 
 def _occupancy(frozen: FrozenGate, features: Tensor, epsilon: float) -> Tensor:
     """Norm, last layer and 1 - softmax: features [N, width] float32 to [N]."""
-    sums = frozen.head @ features.T
-    above, mean = sums[:-1], sums[-1]
-    square = torch.linalg.vector_norm(features, dim=1).square_()
-    square = square.addcmul_(mean, mean, value=-1.0).clamp_(min=0.0)
-    square = square.add_(features.shape[1] * epsilon)
-    logits = torch.addcmul(frozen.shift, above, square.rsqrt_())
-    odds = logits.clamp_(max=LARGEST_LOGIT).exp_().sum(dim=0)
+    count, width = features.shape
+    blocks = math.gcd(count, BLOCKS)
+    columns = features.view(blocks, count // blocks, width).transpose(1, 2)
+    sums = torch.bmm(frozen.head.expand(blocks, -1, -1), columns)
+    above, mean = sums[:, :-1], sums[:, -1]
+    square = torch.linalg.vector_norm(features, dim=1).square_().view_as(mean)
+    square = square.addcmul_(mean, mean, value=-1.0).clamp_(min=0.0).add_(width * epsilon)
+    logits = torch.addcmul(frozen.shift, above, square.rsqrt_()[:, None])
+    odds = logits.clamp_(max=LARGEST_LOGIT).exp_().sum(dim=1).view(-1)
     return odds / (odds + 1.0)
 
 

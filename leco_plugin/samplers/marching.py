@@ -112,7 +112,8 @@ def march(
         rays += first_ray
         for first_run in range(0, len(rays), runs_at_once):
             part = slice(first_run, first_run + runs_at_once)
-            kept.append(keep_steps(runs.of_rays(part), RUN, rays[part], occupied))
+            dense = near_occupied is not None
+            kept.append(keep_steps(runs.of_rays(part), RUN, rays[part], occupied, dense))
     return join(kept, origins)
 
 
@@ -146,11 +147,15 @@ def keep(
 ) -> Samples:
     """Pack those candidates that are occupied; `n_steps` is the most of any ray."""
     rays, runs = cut(candidates, n_steps, near_occupied)
-    return keep_steps(runs, RUN, rays, occupied)
+    return keep_steps(runs, RUN, rays, occupied, near_occupied is not None)
 
 
 def keep_steps(
-    candidates: Candidates, n_steps: int, rays: Tensor | None, occupied: OccupiedFn | None
+    candidates: Candidates,
+    n_steps: int,
+    rays: Tensor | None,
+    occupied: OccupiedFn | None,
+    dense: bool = False,
 ) -> Samples:
     """Pack those of the first `n_steps` candidates of each ray that are occupied.
 
@@ -160,6 +165,8 @@ def keep_steps(
     Args:
         rays: what to call each ray, int64 [n_rays], where they are runs of rays and some are too
             long. None: each goes by its place, and all have `n_steps` candidates.
+        dense: whether much is kept, as where a coarse question has been asked: to look for runs in
+            which anything is kept would then take longer than it saves.
     """
     edges = candidates.edges(n_steps)
     n_rays = edges.shape[1]
@@ -175,7 +182,7 @@ def keep_steps(
     else:
         every = torch.arange(n_rays, device=edges.device)[:, None].expand(n_rays, n_steps)
         return every.reshape(-1), edges[:-1].T.reshape(-1), edges[1:].T.reshape(-1)
-    columns, steps = by_column_in_runs(wanted)
+    columns, steps = by_column(wanted) if dense else by_column_in_runs(wanted)
     at = torch.add(columns, steps, alpha=n_rays)
     edges = edges.view(-1)
     ray_indices = columns if rays is None else rays.index_select(0, columns)
