@@ -59,27 +59,32 @@ class FrequencyEncoding(nn.Module):
     """x, sin(2^k pi x), cos(2^k pi x) for k < octaves (NeRF, eq. 4)."""
 
     scales: Tensor
+    start: Tensor
 
     def __init__(self, octaves: int) -> None:
         super().__init__()
         self.out_dim = 3 + 6 * octaves
         self.register_buffer("scales", math.pi * 2.0 ** torch.arange(octaves), persistent=False)
+        self.register_buffer("start", torch.tensor([0.0, -1.0]).view(2, 1, 1), persistent=False)
 
     def forward(self, mapped: Tensor) -> Tensor:
         """[N, 3] in [-1, 1] to [N, 3 + 6 octaves] float32."""
         x = mapped.t().contiguous()
-        sines: list[Tensor] = []
-        cosines: list[Tensor] = []
+        if x.requires_grad:  # as it is defined, which torch can differentiate
+            angles = (self.scales[:, None, None] * x).flatten(0, 1)
+            return torch.cat([x, angles.sin(), angles.cos()]).t()
+        features = x.new_empty(self.out_dim, x.shape[1])
+        features[:3] = x
+        waves = features[3:].view(2, len(self.scales), *x.shape)  # sines, cosines
         for octave, scale in enumerate(self.scales):
             if octave % FRESH == 0:
                 angles = x * scale
-                sines.append(angles.sin())
-                cosines.append(angles.cos())
-            else:  # sin 2a = 2 sin a cos a, cos 2a = 1 - 2 sin^2 a
-                sine = sines[-1]
-                sines.append(2.0 * sine * cosines[-1])
-                cosines.append(1.0 - 2.0 * sine * sine)
-        return torch.cat([x, *sines, *cosines]).t()
+                torch.sin(angles, out=waves[0, octave])
+                torch.cos(angles, out=waves[1, octave])
+            else:  # sin 2a = 2 sin a cos a, cos 2a = 2 cos a cos a - 1
+                last = waves[:, octave - 1]
+                torch.addcmul(self.start, last, last[1], value=2.0, out=waves[:, octave])
+        return features.t()
 
 
 class _InterpolateTable(torch.autograd.Function):

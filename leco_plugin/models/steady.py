@@ -17,6 +17,11 @@ def steady_size(count: int, device_type: str) -> int:
     """How many rows to compute for `count` of them: a few more where that saves compiling."""
     if device_type != "cpu" or not torch.is_autocast_enabled("cpu"):
         return count
+    return filled_size(count)
+
+
+def filled_size(count: int) -> int:
+    """The least of the few sizes that is no less than `count`."""
     step = max(1, 2 ** max(count - 1, 0).bit_length() // (2 * SIZES_PER_OCTAVE))
     return -(-count // step) * step
 

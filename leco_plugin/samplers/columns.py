@@ -25,15 +25,17 @@ def by_column(wanted: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def by_column_in_runs(wanted: Tensor) -> tuple[Tensor, Tensor]:
-    """The same where n is a multiple of `RUN`, faster on a CPU if few runs are not all false."""
+    """The same, faster on a CPU if few runs of rows are not all false."""
     if wanted.device.type != "cpu":
         return by_column(wanted)
-    m = wanted.shape[1]
+    n, m = wanted.shape
+    if n % RUN:
+        wanted = torch.nn.functional.pad(wanted, (0, 0, 0, -n % RUN))
     some = wanted.view(torch.uint8).unflatten(0, (-1, RUN)).amax(dim=1)
     columns, runs = by_column(some)
-    rows = torch.arange(RUN)[:, None] * m
-    places = torch.add(columns, runs, alpha=RUN * m) + rows
-    chosen = _true(wanted.view(-1).index_select(0, places.view(-1)).view(RUN, -1))
+    first = torch.add(columns, runs, alpha=RUN * m)
+    places = first[:, None] + torch.arange(RUN) * m
+    chosen = wanted.view(-1).index_select(0, places.view(-1)).nonzero()[:, 0]
     run = chosen >> RUN_BITS
     rows = torch.add(chosen.bitwise_and_(RUN - 1), runs.index_select(0, run), alpha=RUN)
     return columns.index_select(0, run), rows

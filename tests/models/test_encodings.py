@@ -102,3 +102,10 @@ def test_no_points_give_no_features_and_a_zero_gradient() -> None:
     features.sum().backward()
     assert features.shape == (0, encoding.out_dim)
     assert encoding.table.grad is not None and not bool(encoding.table.grad.any())
+
+
+def test_frequencies_have_the_gradient_of_the_definition() -> None:
+    encoding = build_encoding(EncodingConfig(octaves=3)).double()
+    x = (torch.rand(10, 3) * 2 - 1).double().requires_grad_()
+    assert torch.autograd.gradcheck(encoding, x)
+    torch.testing.assert_close(encoding(x), encoding(x.detach()), rtol=0, atol=1e-12)

@@ -1,0 +1,138 @@
+"""A gate asked on a CPU without gradients: the answers of `Gate` in fewer passes over memory.
+
+More work lies between a gate's products than in them: types change, biases are added, negative
+units cut off, rows normed. Here weights change their type once, a layer is one pass where oneDNN
+has it, and the norm is folded into the last layer, which is asked for no more than decides: how far
+each scene expert's logit lies above that of emptiness.
+"""
+
+from __future__ import annotations
+
+import functools
+import math
+from collections.abc import Callable
+from typing import NamedTuple
+from weakref import WeakKeyDictionary
+
+import torch
+from torch import Tensor
+
+from leco_plugin.models.gate import EMPTY, Gate
+from leco_plugin.models.steady import filled_size
+
+LARGEST_LOGIT = 80.0
+"""Sums of exponentials of up to this stay finite; o is 1 in float32 long before."""
+
+BLOCKS = 32
+"""Of rows that the last layer multiplies apart, where their number has such a divisor: a product of
+few columns is twice as fast when its rows lie in the cache."""
+
+LayerFn = Callable[[Tensor, Tensor, Tensor], Tensor]
+"""Rows [N, inputs], weight [width, inputs] and bias [width] to relu(W x + b), [N, width]."""
+
+
+class FrozenGate(NamedTuple):
+    """A gate's weights as they are asked."""
+
+    sources: tuple[Tensor, ...]
+    """What they were made from; held, so that nothing else comes to lie at the same address."""
+    state: tuple[tuple[int, int], ...]
+    """Address and version of each source."""
+    layers: list[tuple[Tensor, Tensor]]
+    """Weight and bias of each hidden layer, in the type of the products."""
+    head: Tensor
+    """float32 [n + 1, width]: scene logits above the empty one, of features less their mean and
+    over the length of what is left; in the last row the mean, as a part of the features' length."""
+    shift: Tensor
+    """float32 [n, 1]: what is added to those logits."""
+
+
+def occupancy_of(gate: Gate, mapped: Tensor, dtype: torch.dtype) -> Tensor:
+    """o(x) = 1 - G_0(x), as `Gate.occupancy` has it under autocast to `dtype`.
+
+    Args:
+        mapped: [N, 3] in [-1, 1] on a CPU; cheapest with strides (1, N).
+        dtype: type of the hidden layers' products.
+    Returns:
+        [N] float32 in [0, 1].
+    """
+    count = len(mapped)
+    filling = filled_size(count) - count
+    if filling:
+        mapped = torch.nn.functional.pad(mapped.T, (0, filling)).T
+    with torch.no_grad(), torch.autocast("cpu", enabled=False):
+        frozen = frozen_gate(gate, dtype)
+        features = gate.encoding(mapped).to(dtype)
+        for weight, bias in frozen.layers:
+            features = _layer(features, weight, bias)
+        return _occupancy(frozen, features.float(), gate.norm.eps)[:count]
+
+
+def _layer(features: Tensor, weight: Tensor, bias: Tensor) -> Tensor:
+    one_pass = _one_pass(features.dtype)
+    if one_pass is None or not features.is_contiguous():  # columns would be made rows first
+        return torch.addmm(bias, features, weight.T).relu_()
+    return one_pass(features, weight, bias)
+
+
+def _occupancy(frozen: FrozenGate, features: Tensor, epsilon: float) -> Tensor:
+    """Norm, last layer and 1 - softmax: features [N, width] float32 to [N]."""
+    count, width = features.shape
+    blocks = math.gcd(count, BLOCKS)
+    columns = features.view(blocks, count // blocks, width).transpose(1, 2)
+    sums = torch.bmm(frozen.head.expand(blocks, -1, -1), columns)
+    above, mean = sums[:, :-1], sums[:, -1]
+    square = torch.linalg.vector_norm(features, dim=1).square_().view_as(mean)
+    square = square.addcmul_(mean, mean, value=-1.0).clamp_(min=0.0).add_(width * epsilon)
+    logits = torch.addcmul(frozen.shift, above, square.rsqrt_()[:, None])
+    odds = logits.clamp_(max=LARGEST_LOGIT).exp_().sum(dim=1).view(-1)
+    return odds / (odds + 1.0)
+
+
+_found: WeakKeyDictionary[Gate, dict[torch.dtype, FrozenGate]] = WeakKeyDictionary()
+
+
+def frozen_gate(gate: Gate, dtype: torch.dtype) -> FrozenGate:
+    """The weights of a gate as they are now, made anew only where one has changed."""
+    modules = [*gate.hidden, gate.norm, gate.head]
+    sources = tuple(value for module in modules for value in (module.weight, module.bias))
+    state = tuple((value.data_ptr(), _version(value)) for value in sources)
+    found = _found.setdefault(gate, {})
+    if dtype not in found or found[dtype].state != state:
+        hidden = [(layer.weight.to(dtype), layer.bias.to(dtype)) for layer in gate.hidden]
+        weight = gate.head.weight.float()
+        constant = weight @ gate.norm.bias.float() + gate.head.bias.float()
+        head = _above_empty(weight * gate.norm.weight.float())
+        length = math.sqrt(head.shape[1])
+        head = (head - head.mean(dim=1, keepdim=True)) * length
+        head = torch.cat([head, torch.full_like(head[:1], 1.0 / length)])
+        held = tuple(value.detach() for value in sources)
+        found[dtype] = FrozenGate(held, state, hidden, head, _above_empty(constant[:, None]))
+    return found[dtype]
+
+
+def _above_empty(rows: Tensor) -> Tensor:
+    """What a row of each expert [1 + n, ...] has more than that of emptiness, [n, ...]."""
+    return rows[EMPTY + 1 :] - rows[EMPTY]
+
+
+def _version(value: Tensor) -> int:
+    return 0 if value.is_inference() else value._version
+
+
+@functools.cache
+def _one_pass(dtype: torch.dtype) -> LayerFn | None:
+    """oneDNN's layer, which torch keeps private; None where it is missing or errs."""
+    rows, weight = torch.linspace(-1.0, 1.0, 32 * 48).view(48, 32).to(dtype).split([32, 16])
+    bias = weight[:, 0].contiguous()
+
+    def layer(rows: Tensor, weight: Tensor, bias: Tensor) -> Tensor:
+        answer: Tensor = torch.ops.mkldnn._linear_pointwise(rows, weight, bias, "relu", [], "")
+        return answer
+
+    try:
+        answer = layer(rows, weight, bias)
+    except (AttributeError, NotImplementedError, RuntimeError):
+        return None
+    expected = (rows.double() @ weight.double().T + bias.double()).relu()
+    return layer if torch.allclose(answer.double(), expected, rtol=0.02, atol=0.02) else None
