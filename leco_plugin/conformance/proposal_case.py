@@ -24,7 +24,7 @@ class ProposalCase(SamplerCase):
     seam = "proposal"
     imports = ("torch", "nerfstudio.model_components.ray_samplers")
 
-    def build(self, occupancy: Occupancy | None) -> Any:
+    def build(self, occupancy: Occupancy | None, **more: Any) -> Any:
         from nerfstudio.model_components.ray_samplers import UniformLinDispPiecewiseSampler
 
         return build_proposal(
@@ -34,6 +34,7 @@ class ProposalCase(SamplerCase):
             initial_sampler=UniformLinDispPiecewiseSampler(),
             single_jitter=False,
             **self.options,
+            **more,
         )
 
     def teach(self, sampler: Any, scene: Slab) -> None:
