@@ -44,7 +44,7 @@ from leco_plugin.scenes.input_error import InputError
 class GuidedModelConfig(GrowingConfig, ModelConfig):
     """A host with its sampler swapped"""
 
-    _target: type = field(default_factory=lambda: set_up_guided)  # type: ignore[assignment, return-value]
+    _target: Any = field(default_factory=lambda: set_up_guided)
     """what builds the host"""
     host: ModelConfig = field(default_factory=ModelConfig)
     """The host, as its own method has it."""
