@@ -1,4 +1,4 @@
-"""Hosts in sizes for tests: two of nerfstudio, three of the package in `tests/elsewhere`."""
+"""Hosts in sizes for tests: ours, two of nerfstudio, three of the package in `tests/elsewhere`."""
 
 from __future__ import annotations
 
@@ -41,6 +41,19 @@ NERFACTO = [
     "num-proposal-samples-per-ray 24 16",
 ]
 
+SWITCH_NERF = [
+    "sizes.field.octaves=4",
+    "sizes.field.experts=2",
+    "sizes.field.width=16",
+    "sizes.field.layers=2",
+    "sizes.field.skip=1",
+    "sizes.field.color-width=16",
+    "sizes.field.appearance-dim=4",
+    "sizes.candidates=24",
+    "sizes.coarse=12",
+    "sizes.fine=12",
+]
+
 
 def sizes(of_model: list[str], where: str = "pipeline.model") -> list[str]:
     """Flags of a model that is at `where` in the config."""
@@ -54,6 +67,7 @@ SMALL: dict[str, list[str]] = {
         "--pipeline.max-num-samples-per-ray=16",
     ],
     "nerfacto": [*sizes(NERFACTO), *RAYS],
+    "switch-nerf": [*sizes(SWITCH_NERF), *RAYS],
     "elsewhere-packed": [],
     "elsewhere-proposal": [],
     "elsewhere-places": [],

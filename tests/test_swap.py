@@ -1,19 +1,89 @@
-"""What `leco swap` refuses before anything is read or trained."""
+"""What becomes of a method's config when its sampler is swapped, and what is refused."""
 
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import pytest
 from ball_occupancy import ball
+from nerfstudio.configs.method_configs import all_methods
 
-from leco_plugin.swap import swapped_config
+from leco_plugin.compat.dynamic_batch import ClampedDynamicBatchPipelineConfig
+from leco_plugin.models.guided import GuidedModelConfig
+from leco_plugin.scenes.input_error import InputError
+from leco_plugin.swap import registered, swapped_config
 
 
-def test_a_scene_that_is_not_there_is_said_before_the_run_has_a_folder(tmp_path: Path) -> None:
-    file, scene = tmp_path / "occupancy.safetensors", tmp_path / "nowhere"
-    ball().save(file)
-    with pytest.raises(ValueError, match=f"there is no scene {scene}"):
+@pytest.fixture(scope="module")
+def file(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("occupancy") / "occupancy.safetensors"
+    ball().save(path)
+    return path
+
+
+def test_only_sampler_batches_and_trainer_are_others(file: Path) -> None:
+    before = registered("instant-ngp")
+    made: Any = swapped_config("instant-ngp", file, ["--max-num-iterations", "7"])
+    assert made.method_name == "instant-ngp" and made.max_num_iterations == 7
+    assert made.optimizers == before.optimizers
+    assert isinstance(made.pipeline, ClampedDynamicBatchPipelineConfig)
+    guided = made.pipeline.model
+    assert isinstance(guided, GuidedModelConfig)
+    assert guided.host == before.pipeline.model  # type: ignore[attr-defined]
+    assert guided.occupancy.path == file and guided.occupancy.sampler == "learned-occupancy"
+
+
+def test_what_is_registered_stays_as_it_is(file: Path) -> None:
+    swapped_config("nerfacto", file, ["--pipeline.model.near-plane", "0.3"])
+    host: Any = all_methods["nerfacto"].pipeline.model
+    assert not isinstance(host, GuidedModelConfig) and host.near_plane != 0.3
+
+
+def test_a_relative_file_is_stored_as_an_absolute_one(
+    file: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(file.parent)
+    for given in (Path(file.name), Path(".")):
+        made: Any = swapped_config("nerfacto", given)
+        assert made.pipeline.model.occupancy.path == file
+
+
+REFUSED: dict[str, tuple[str, list[str], str, str]] = {
+    "an unknown method": ("nerfato", [], "learned-occupancy", "no method 'nerfato'; there are"),
+    "a method without its package": ("kplanes", [], "learned-occupancy", "not installed"),
+    "a guided method": (
+        *("leco-ngp", [], "learned-occupancy"),
+        "ns-train leco-ngp --pipeline.model.occupancy.path .*occupancy.safetensors",
+    ),
+    "the method that learns": ("leco-occupancy", [], "learned-occupancy", "is no host"),
+    "an unknown sampler": ("nerfacto", [], "learnt", "no sampler 'learnt'; there are"),
+    "another kind of gate": ("nerfacto", [], "learned-occupancy-hash", "asks a gate on hash"),
+    "another run's config": (
+        *("nerfacto", ["--load-config", "config.yml"], "learned-occupancy"),
+        "--load-config would train what that file says",
+    ),
+}
+
+
+@pytest.mark.parametrize("what", REFUSED)
+def test_what_cannot_be_swapped_is_said_in_a_line(what: str, file: Path) -> None:
+    method, arguments, sampler, message = REFUSED[what]
+    with pytest.raises(InputError, match=message) as error:
+        swapped_config(method, file, arguments, sampler)
+    assert "\n" not in str(error.value)
+
+
+def test_a_file_that_is_not_there_is_said_before_anything_is_read(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="there is no occupancy"):
+        swapped_config("nerfacto", tmp_path / "none.safetensors")
+
+
+def test_a_scene_that_is_not_there_is_said_before_the_run_has_a_folder(
+    file: Path, tmp_path: Path
+) -> None:
+    scene = tmp_path / "nowhere"
+    with pytest.raises(InputError, match=f"there is no scene {scene}"):
         swapped_config("nerfacto", file, ["--data", str(scene)])
     scene.mkdir()
     assert swapped_config("nerfacto", file, ["--data", str(scene)]).data == scene

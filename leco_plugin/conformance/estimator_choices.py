@@ -16,17 +16,20 @@ from leco_plugin.samplers.packed import render_transmittance_from_density
 
 ALLOWED_DIFFERENCE = 0.005
 """Share of all samples that a rounding at the sides of the box may add or take away."""
+CONE_ANGLE = 0.02
+"""Growth of the steps with distance, which makes them half as long again at the far end."""
 SLACK = 1e-3
 """Relative distance from a threshold at which a rounding does not decide."""
 
 
 def skips_only_what_it_may(case: EstimatorCase) -> None:
     """What is plainly kept is sampled; what is plainly skipped is not, where the gate decides."""
-    for rays in (crossing(), stretched()):
-        samples = case.sample(case.shared(SLAB), rays)
-        if case.needs_occupancy:
-            _check_skipped_is_not(rays, samples)
-        check_kept_is_sampled(rays, samples)
+    for training in (False, True):
+        for rays in (crossing(), stretched()):
+            samples = case.sample(case.shared(SLAB).train(training), rays)
+            if case.needs_occupancy:
+                _check_skipped_is_not(rays, samples)
+            check_kept_is_sampled(rays, samples)
 
 
 def _check_skipped_is_not(rays: Rays, samples: Samples) -> None:
@@ -59,15 +62,17 @@ def _first(positions: Tensor) -> str:
 
 def all_kept_equals_dense(case: EstimatorCase) -> None:
     """Where everything is occupied, samples are those of the ray-marching rule without skipping."""
-    rays = crossing()
-    samples, expected = case.sample(case.shared(EVERYTHING), rays), dense(rays)
-    missing = int((~among(expected, samples)).sum())
-    extra = int((~among(samples, expected)).sum())
-    require(
-        missing + extra <= ALLOWED_DIFFERENCE * len(expected[0]),
-        f"of {len(expected[0])} candidates of a constant step {missing} are missing, "
-        f"{extra} samples are none of them",
-    )
+    rays, sampler = crossing(), case.shared(EVERYTHING)
+    for cone_angle in (0.0, CONE_ANGLE):
+        samples = case.sample(sampler, rays, cone_angle=cone_angle)
+        expected = dense(rays, cone_angle)
+        missing = int((~among(expected, samples)).sum())
+        extra = int((~among(samples, expected)).sum())
+        require(
+            missing + extra <= ALLOWED_DIFFERENCE * len(expected[0]),
+            f"with cone_angle {cone_angle:g} {missing} of {len(expected[0])} candidates are "
+            f"missing, {extra} samples are none of them",
+        )
 
 
 def visibility_pruning(case: EstimatorCase) -> None:

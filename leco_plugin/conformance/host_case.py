@@ -17,7 +17,7 @@ import torch
 from torch import Tensor
 
 from leco_plugin.conformance.host_scene import model_arguments, pipeline_of
-from leco_plugin.conformance.scene import SLAB, Slab
+from leco_plugin.conformance.scene import HERE, MOVED, SLAB, Slab
 from leco_plugin.models.encodings import Kind
 from leco_plugin.occupancy import Occupancy
 from leco_plugin.samplers.registry import sampler_spec
@@ -55,24 +55,29 @@ class HostCase:
         self.config, self._kind = guided(name, self.file)
         self.occupancy(SLAB).save(self.file)
         self._model: Model | None = None
-        self._scene = SLAB
+        self._guided_by = (SLAB, False)
 
     def forget(self) -> None:
         """Builds the model anew from now on."""
         self._model = None
 
-    def occupancy(self, scene: Slab) -> Occupancy:
+    def occupancy(self, scene: Slab, frame: Tensor = HERE) -> Occupancy:
         """The occupancy of a scene, its gate on the features that the method's sampler asks."""
-        return scene.occupancy(self._kind)
+        return scene.occupancy(self._kind, frame)
 
-    def shared(self, scene: Slab = SLAB) -> Model:
-        """The model as a run has it before its first step, guided in a scene, in evaluation."""
+    def shared(self, scene: Slab = SLAB, moved: bool = False) -> Model:
+        """The model as a run has it before its first step, guided in a scene, in evaluation.
+
+        Args:
+            moved: whether its occupancy has other coordinates than the host.
+        """
         if self._model is None:
-            self._model, self._scene = build(self.config.pipeline.model), SLAB
+            self._model, self._guided_by = build(self.config.pipeline.model), (SLAB, False)
             callbacks(self._model)
-        if scene != self._scene:
-            cast(Any, self._model).guide.set_occupancy(self.occupancy(scene))
-            self._scene = scene
+        if (scene, moved) != self._guided_by:
+            frame = MOVED if moved else HERE
+            cast(Any, self._model).guide.set_occupancy(self.occupancy(scene, frame), frame)
+            self._guided_by = scene, moved
         return self._model.eval()
 
     def unguided(self) -> Model:

@@ -140,12 +140,11 @@ def _listed(colour: Tensor) -> list[float]:
 
 def shades_only_what_is_kept(case: HostCase) -> None:
     """The field is asked where the occupancy keeps something, on every ray, and nowhere else."""
-    model = case.shared(SLAB)
     rays = as_rays(bundle())
     enters, leaves = chords(rays)
     require(bool((leaves - enters > CHORD).all()), "the kit's rays do not all cross its slab")
-    for training in (False, True):
-        model.train(training)
+    for training, moved in ((False, False), (True, False), (False, True)):
+        model = case.shared(SLAB, moved).train(training)
         with torch.no_grad(), shaded(model) as places:
             model(bundle())
         require(bool(places), "the field is asked about no sample at all")

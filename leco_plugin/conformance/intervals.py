@@ -17,10 +17,15 @@ ROUNDING = 1e-4
 """World units that two ways to compute an edge may differ by."""
 
 
-def dense(rays: Rays) -> Samples:
+def dense(rays: Rays, cone_angle: float = 0.0) -> Samples:
     """Every candidate in the box, by the one ray-marching rule."""
     return DenseEstimator(box()).sampling(
-        rays.origins, rays.directions, t_min=rays.t_min, t_max=rays.t_max, render_step_size=STEP
+        rays.origins,
+        rays.directions,
+        t_min=rays.t_min,
+        t_max=rays.t_max,
+        render_step_size=STEP,
+        cone_angle=cone_angle,
     )
 
 

@@ -24,7 +24,7 @@ class ProposalCase(SamplerCase):
     seam = "proposal"
     imports = ("torch", "nerfstudio.model_components.ray_samplers")
 
-    def build(self, occupancy: Occupancy | None) -> Any:
+    def build(self, occupancy: Occupancy | None, **more: Any) -> Any:
         from nerfstudio.model_components.ray_samplers import UniformLinDispPiecewiseSampler
 
         return build_proposal(
@@ -35,6 +35,7 @@ class ProposalCase(SamplerCase):
             single_jitter=False,
             **({} if occupancy is None else {"frame": torch.eye(3, 4)}),  # as a guide passes one
             **self.options,
+            **more,
         )
 
     def teach(self, sampler: Any, scene: Slab) -> None:

@@ -9,10 +9,11 @@ from torch import Tensor, nn
 
 from leco_plugin.conformance.intervals import ROUNDING, check_intervals, check_order, same
 from leco_plugin.conformance.proposal_case import LEVELS, ProposalCase, no_density, packed
-from leco_plugin.conformance.rule import require
+from leco_plugin.conformance.rule import Broken, require
 from leco_plugin.conformance.sampler_case import devices
 from leco_plugin.conformance.scene import (
     EVERYTHING,
+    MOVED,
     SLAB,
     Field,
     Rays,
@@ -97,10 +98,25 @@ def sorted_disjoint_inside(case: ProposalCase) -> None:
 
 def skips_only_what_it_may(case: ProposalCase) -> None:
     """Samples gather in what is kept, from where a ray enters it to where it leaves."""
+    for training in (False, True):
+        _check_gathered(case, case.shared(SLAB).train(training))
+    if case.needs_occupancy:
+        _check_gathered(case, _in_other_coordinates(case).eval())
+
+
+def _in_other_coordinates(case: ProposalCase) -> Any:
+    """The sampler for a host whose coordinates are not those of the occupancy."""
+    try:
+        return case.build(SLAB.occupancy(case.gate_encoding, MOVED), frame=MOVED)
+    except TypeError as error:
+        raise Broken(f"no host in other coordinates can have it (frame=): {error}") from error
+
+
+def _check_gathered(case: ProposalCase, sampler: Any) -> None:
     rays = crossing()
     enters, leaves = chords(rays)
     long = leaves - enters >= CHORD
-    ray_indices, t_starts, t_ends = case.sample(case.shared(SLAB), rays)
+    ray_indices, t_starts, t_ends = case.sample(sampler, rays)
     middles = (t_starts + t_ends) / 2.0
     depths = SLAB.depth(rays.at(ray_indices, middles)).view(len(rays.origins), -1)[long]
     middles = middles.view(len(rays.origins), -1)[long]

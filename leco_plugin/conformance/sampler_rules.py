@@ -76,7 +76,8 @@ SAMPLER_RULES = (
         reason="what is skipped though it is occupied is a hole in the image, and what is kept "
         "though it is empty is time lost.",
         remedy="decide by Occupancy.occupied at the middle of each candidate, origin + t direction "
-        "whatever the direction's length (the occupancy maps positions itself).",
+        "whatever the direction's length (the occupancy maps positions itself), in training as in "
+        "evaluation; take frame=, and ask at positions that it has moved (proposal).",
         checks={
             ESTIMATOR: estimator_choices.skips_only_what_it_may,
             PROPOSAL: proposal_checks.skips_only_what_it_may,
@@ -86,8 +87,9 @@ SAMPLER_RULES = (
         name="all-kept-equals-dense",
         reason="a sampler that changes more than what is skipped cannot be compared with the "
         "one that it replaces.",
-        remedy="march from t_min in steps of render_step_size, leave candidates out and move none "
-        "(estimator); draw from a histogram without preferring one end of the ray (proposal).",
+        remedy="march from t_min in steps of render_step_size, or of cone_angle times the distance "
+        "where that is longer, leave candidates out and move none (estimator); draw from a "
+        "histogram without preferring one end of the ray (proposal).",
         checks={
             ESTIMATOR: estimator_choices.all_kept_equals_dense,
             PROPOSAL: proposal_checks.all_kept_equals_dense,

@@ -29,6 +29,10 @@ MARGIN = 0.08
 """World units. Deeper than this inside what is kept is plainly inside, farther off is plainly
 outside: wider than a cell of a grid of 128, and than what a rounding decides."""
 BACKGROUND = (0.2, 0.5, 0.8)
+HERE = torch.eye(3, 4)
+MOVED = torch.tensor([[0.0, -2.0, 0.0, 1.0], [2.0, 0.0, 0.0, -0.5], [0.0, 0.0, 2.0, 0.25]])
+"""Frames [3, 4], which take a host's coordinates to those of an occupancy: the same ones; and
+others, turned by a right angle, twice as large and shifted."""
 
 
 def box() -> Tensor:
@@ -111,10 +115,13 @@ class Slab:
         """1 inside and 0 outside: [..., 3] to [..., 1], as hosts answer."""
         return (self.depth(positions) >= 0.0).to(positions.dtype)[..., None]
 
-    def occupancy(self, kind: Kind = "frequency") -> Occupancy:
-        """A frozen gate on features of a kind that says just this."""
-        gate = slab_gate(torch.tensor(self.normal), self.half_width, kind)
-        return Occupancy(gate, Space("box", CENTRE, HALF), threshold=0.5).eval()
+    def occupancy(self, kind: Kind = "frequency", frame: Tensor = HERE) -> Occupancy:
+        """A frozen gate on features of a kind that says just this, in a frame's coordinates."""
+        turn, shift = frame[:, :3], frame[:, 3]
+        scale = float(turn.abs().max())  # turns are by right angles
+        gate = slab_gate(turn @ torch.tensor(self.normal) / scale, self.half_width, kind)
+        x, y, z = (turn @ torch.tensor(CENTRE) + shift).tolist()
+        return Occupancy(gate, Space("box", (x, y, z), scale * HALF), threshold=0.5).eval()
 
 
 SLAB = Slab((0.6, 0.64, 0.48), 0.4)

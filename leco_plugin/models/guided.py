@@ -22,6 +22,7 @@ from nerfstudio.engine.callbacks import (
 from nerfstudio.models.base_model import Model, ModelConfig
 
 from leco_plugin.compat.checkpoints import allow_checkpoint_globals
+from leco_plugin.compat.earlier_configs import GrowingConfig
 from leco_plugin.compat.host_lpips import setup_with_lazy_lpips
 from leco_plugin.compat.host_outputs import with_counts_as_floats
 from leco_plugin.models.failures import require_finite
@@ -40,10 +41,10 @@ from leco_plugin.scenes.input_error import InputError
 
 
 @dataclass
-class GuidedModelConfig(ModelConfig):
+class GuidedModelConfig(GrowingConfig, ModelConfig):
     """A host with its sampler swapped"""
 
-    _target: type = field(default_factory=lambda: set_up_guided)  # type: ignore[assignment, return-value]
+    _target: Any = field(default_factory=lambda: set_up_guided)
     """what builds the host"""
     host: ModelConfig = field(default_factory=ModelConfig)
     """The host, as its own method has it."""

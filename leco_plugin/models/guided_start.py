@@ -9,6 +9,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
+from leco_plugin.compat.earlier_configs import GrowingConfig
 from leco_plugin.models.freezing import FILE_NAME, leave_file
 from leco_plugin.models.guide import Guide
 from leco_plugin.models.leco_config import LecoModelConfig
@@ -29,7 +30,7 @@ OWN_SAMPLER = "own"
 
 
 @dataclass
-class OccupancyConfig:
+class OccupancyConfig(GrowingConfig):
     """What guides the host."""
 
     path: Path | None = None
@@ -97,7 +98,8 @@ class GuidedStart:
         pipeline, trainer: nerfstudio's; without a trainer no file is left.
     Raises:
         InputError: the file is not there or cannot be read, its occupancy keeps nothing that the
-            cameras see, or its gate is none that the sampler asks.
+            cameras see, its gate is none that the sampler asks, or nothing can be learned in the
+            time or with the rays that are given.
     """
 
     def __init__(
@@ -113,6 +115,10 @@ class GuidedStart:
         self.begun = False
         if guide.occupancy is None and config.path is not None:
             guide.set_occupancy(load_occupancy(config.path))  # says why it could not be before
+        if guide.occupancy is None:
+            from leco_plugin.models.learn_first import check_budget
+
+            check_budget(config.rays, config.seconds, config.rate)
         learned = guide.occupancy.gate.config if guide.occupancy is not None else None
         try:
             check_gate(guide.sampler, learned or config.learning.sizes.gate)

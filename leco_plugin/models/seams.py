@@ -27,7 +27,21 @@ GROUP = "leco_plugin.hosts"
 
 @dataclass(frozen=True)
 class HostAdapter:
-    """How the sampler of a kind of host is replaced."""
+    """How the sampler of a kind of host is replaced.
+
+    Of a model with the attributes `my_sampler` and `my_grid`:
+
+        def swap(host, guide):
+            host.my_sampler = guide.estimator(host.scene_box.aabb.flatten())
+            del host.my_grid
+
+        ADAPTER = HostAdapter("my grid", lambda host: isinstance(host, MyModel), swap)
+
+    and in that package's `pyproject.toml`:
+
+        [project.entry-points."leco_plugin.hosts"]
+        my-method = "my_package.adapting:ADAPTER"
+    """
 
     description: str
     """What it looks for, for the error that nothing was found."""
@@ -62,8 +76,8 @@ def swap_sampler(host: Model, guide: Guide) -> str:
     looked_for = "; ".join(f"{name}: {adapter.description}" for name, adapter in known.items())
     raise InputError(
         f"{type(host).__name__} has no sampler that could be swapped. Looked for: {looked_for}. "
-        f"A package can bring a HostAdapter (leco_plugin.models.seams) in the entry-point group "
-        f"{GROUP}"
+        f"A package can bring a HostAdapter in the entry-point group {GROUP}: "
+        "see help(leco_plugin.models.seams.HostAdapter)"
     )
 
 

@@ -12,6 +12,8 @@ import yaml
 from nerfstudio.data.datamanagers.base_datamanager import VanillaDataManagerConfig
 
 from leco_plugin.method_configs import leco_occupancy
+from leco_plugin.models.guided import GuidedModelConfig
+from leco_plugin.models.guided_start import OccupancyConfig
 from leco_plugin.models.leco_config import LecoModelConfig
 from leco_plugin.models.prior import PriorConfig
 from leco_plugin.models.switch_config import SwitchNerfModelConfig
@@ -34,6 +36,14 @@ def test_a_stored_config_without_later_fields_has_their_defaults(kind: Any) -> N
     found = yaml.load(yaml.dump(config), Loader=yaml.Loader)
     assert found.bounds == BoundsConfig() and found.near == 0.25
     assert found == kind(near=0.25) and repr(found)
+
+
+def test_a_guided_run_of_an_earlier_release_has_no_options() -> None:
+    config = GuidedModelConfig(occupancy=OccupancyConfig(Path("some.safetensors"), seconds=7.0))
+    del config.occupancy.__dict__["options"]
+    found = yaml.load(yaml.dump(config), Loader=yaml.Loader)
+    expected = OccupancyConfig(Path("some.safetensors"), seconds=7.0)
+    assert found == GuidedModelConfig(occupancy=expected)
 
 
 def test_what_is_stored_goes_before_defaults() -> None:

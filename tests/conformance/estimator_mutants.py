@@ -164,6 +164,14 @@ class KeepsTooLittle(Sound):
         return self.occupancy.query(positions) >= 0.999
 
 
+class KeepsAllInTraining(Sound):
+    """And shows in evaluation, where a user looks, what it should have done."""
+
+    def occupied(self, positions: Tensor) -> Tensor:
+        decided = super().occupied(positions)
+        return decided | self.training
+
+
 class Normalises(Sound):
     """Takes directions for unit vectors, which those of a host in other units are not."""
 
@@ -179,6 +187,14 @@ class DropsTheFirst(Answers):
         kept = torch.ones_like(ray_indices, dtype=torch.bool)
         kept[1:] = ray_indices[1:] == ray_indices[:-1]
         return ray_indices[kept], t_starts[kept], t_ends[kept]
+
+
+class StepsOfOneLength(Sound):
+    """Deaf to a host whose steps grow with distance."""
+
+    def sampling(self, rays_o: Tensor, rays_d: Tensor, *args: Any, **options: Any) -> Samples:
+        options["cone_angle"] = 0.0
+        return super().sampling(rays_o, rays_d, *args, **options)
 
 
 class GateThaws(Sound):
@@ -282,8 +298,8 @@ MUTANTS: dict[str, tuple[type, ...]] = {
     "packing-consistent": (ShortIndices, RaysInPieces),
     "deterministic-in-eval": (AlwaysShaking,),
     "stratified-in-training": (NeverStratified, ShakenOutOfBounds),
-    "skips-only-what-it-may": (KeepsAll, KeepsTooLittle, Normalises),
-    "all-kept-equals-dense": (DropsTheFirst,),
+    "skips-only-what-it-may": (KeepsAll, KeepsTooLittle, KeepsAllInTraining, Normalises),
+    "all-kept-equals-dense": (DropsTheFirst, StepsOfOneLength),
     "no-gradient-to-the-gate": (GateThaws, GradientsSwitchedOff),
     "zero-samples-well-formed": (StandInSample, FloatWhenEmpty),
     "visibility-pruning": (StopsEarly, DeafToDensities),
@@ -295,6 +311,7 @@ MUTANTS: dict[str, tuple[type, ...]] = {
 
 ALSO: dict[type, set[str]] = {
     Overlapping: {"all-kept-equals-dense", "stratified-in-training", "visibility-pruning"},
+    ShakenOutOfBounds: {"skips-only-what-it-may"},
     DropsTheFirst: {"visibility-pruning"},
 }
 """What else cannot hold for a mutant."""

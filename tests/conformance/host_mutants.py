@@ -24,7 +24,7 @@ from nerfstudio.pipelines.base_pipeline import VanillaPipelineConfig
 from nerfstudio.plugins.types import MethodSpecification
 from torch import Tensor, nn
 
-from leco_plugin.models.guide import Guide
+from leco_plugin.models.guide import Guide, GuidedEstimator
 from leco_plugin.models.guided import GuidedModelConfig
 from leco_plugin.models.guided_start import OccupancyConfig
 from leco_plugin.models.seams import HostAdapter
@@ -141,6 +141,10 @@ class FillsUp(NGPModel):
         return super().get_outputs(ray_bundle)
 
 
+class AsksAsItIs(NGPModel):
+    """Comes with an adapter that asks the gate in the host's coordinates, whatever its own are."""
+
+
 class SamplesElsewhere(NGPModel):
     """Has the sampler look at a scene that was moved."""
 
@@ -234,6 +238,7 @@ HOST_MUTANTS: dict[str, dict[str, GuidedModelConfig]] = {
     "shades-only-what-is-kept": {
         "FillsUp": packed(FillsUp),
         "SamplesElsewhere": packed(SamplesElsewhere),
+        "AsksAsItIs": packed(AsksAsItIs),
         "UniformHost": proposal(sampler="Uniform"),
     },
     "state-and-yaml-round-trip": {
@@ -275,6 +280,17 @@ def _exchange_once(host: Any, guide: Guide) -> None:
     host.sampler.occupancy_grid = guide.estimator(host.scene_aabb.detach())
 
 
+class WithoutFrame(GuidedEstimator):
+    def sampling(self, rays_o: Tensor, rays_d: Tensor, *args: Any, **options: Any) -> Samples:
+        sampler: Any = self.sampler
+        return sampler.sampling(rays_o, rays_d, *args, **options)
+
+
+def _exchange_without_frame(host: Any, guide: Guide) -> None:
+    nerfacc_cpu.install()
+    host.occupancy_grid = host.sampler.occupancy_grid = WithoutFrame(guide, None)
+
+
 def _exchange_and_hold(host: Any, guide: Guide) -> None:
     _exchange_once(host, guide)
     host.occupancy_grid = host.sampler.occupancy_grid
@@ -289,6 +305,7 @@ ADAPTERS = {
     "forgets_scouts": _adapter(KeepsScouts, _exchange_sampler_only),
     "forgets_grid": _adapter(KeepsGrid, _exchange_once),
     "guides_twice": _adapter(GuidedTwice, _exchange_and_hold),
+    "asks_as_it_is": _adapter(AsksAsItIs, _exchange_without_frame),
 }
 
 

@@ -100,6 +100,28 @@ class FrontOnly(SoundProposal):
         return worth * (worth.cumsum(dim=-2) < 0.3 * worth.sum(dim=-2, keepdim=True))
 
 
+class UniformInTraining(SoundProposal):
+    def worth(self, positions: Tensor) -> Tensor:
+        return torch.ones_like(positions[..., :1]) if self.training else super().worth(positions)
+
+
+class ForgetsTheFrame(SoundProposal):
+    """Asks where the host is, whatever coordinates the occupancy was learned in."""
+
+    def __init__(self, occupancy: Occupancy, frame: Tensor | None = None, **options: Any) -> None:
+        super().__init__(occupancy, **options)
+
+
+class KnowsNoFrame(SoundProposal):
+    """Cannot be built for a host in other coordinates."""
+
+    def __init__(
+        self, occupancy: Occupancy, num_samples: int, initial_sampler: Any, single_jitter: bool
+    ) -> None:
+        options = {"initial_sampler": initial_sampler, "single_jitter": single_jitter}
+        super().__init__(occupancy, num_samples=num_samples, **options)
+
+
 class PrefersTheFront(SoundProposal):
     """Worth falls with distance, also where everything is occupied."""
 
@@ -152,7 +174,13 @@ PROPOSAL_MUTANTS: dict[str, tuple[type, ...]] = {
     "sorted-disjoint-inside": (LastFirst,),
     "deterministic-in-eval": (Shaking,),
     "stratified-in-training": (NeverShaken,),
-    "skips-only-what-it-may": (Uniform, FrontOnly),
+    "skips-only-what-it-may": (
+        Uniform,
+        FrontOnly,
+        UniformInTraining,
+        ForgetsTheFrame,
+        KnowsNoFrame,
+    ),
     "all-kept-equals-dense": (PrefersTheFront,),
     "no-gradient-to-the-gate": (ProposalThaws,),
     "zero-samples-well-formed": (NothingPerNothing,),

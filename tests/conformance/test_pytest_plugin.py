@@ -53,11 +53,22 @@ def test_one_test_a_rule_and_seam(folder, tmp_path):
     assert "1 failed, 3 passed" in said
 
 
+def test_one_test_a_rule_of_a_method(folder, tmp_path):
+    names = ("--leco-method", "SoundHost", "--leco-method", "FlatAccumulation")
+    status, said = run(folder, tmp_path, *PYARGS, *names, "-k", "drawn")
+    assert status == 1, said
+    assert "test_rule[SoundHost-host-outputs-can-be-drawn] PASSED" in said
+    assert "test_rule[FlatAccumulation-host-outputs-can-be-drawn] FAILED" in said
+    assert "Remedy: return rgb [n_rays, 3]" in said
+    assert "1 failed, 1 passed" in said
+
+
 @pytest.mark.parametrize(
     ("options", "message"),
     [
         ((), "name what to check: --leco-sampler NAME"),
         (("--leco-sampler", "grit"), "there is no sampler 'grit'; there are"),
+        (("--leco-method", "ngp"), "there is no method 'ngp'; there are"),
     ],
 )
 def test_what_cannot_be_checked_is_an_error_in_one_line(folder, tmp_path, options, message):

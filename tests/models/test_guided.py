@@ -33,6 +33,7 @@ pytestmark = [
 SUPERFLUOUS = {
     "instant-ngp": ("occupancy_grid.", "sampler.occupancy_grid."),
     "nerfacto": ("proposal_networks.",),
+    "switch-nerf": (),
     "elsewhere-packed": ("gatekeeper.", "walker.occupancy_grid."),
     "elsewhere-proposal": ("far_scout.", "near_scout."),
     "elsewhere-places": (),
@@ -54,7 +55,7 @@ class Pair:
 
     def steps(self) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
         """The losses of one training step of each."""
-        return tuple(p.get_train_loss_dict(0)[2] for p in (self.own, self.guided))  # type: ignore[return-value]
+        return tuple(p.get_train_loss_dict(0)[1] for p in (self.own, self.guided))  # type: ignore[return-value]
 
 
 @pytest.fixture(scope="module")
@@ -206,6 +207,8 @@ def kept_share(pipeline: Any, occupancy: Any) -> float:
 
 
 def test_it_shades_where_the_occupancy_keeps_something(pair: Pair) -> None:
+    if pair.name == "switch-nerf":
+        pytest.skip("its backdrops are shaded whatever an occupancy says: see test_switch_nerf")
     guide = pair.guided.model.guide
     turn, shift = guide.frame.split([3, 1], dim=1)
 

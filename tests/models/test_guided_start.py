@@ -287,6 +287,14 @@ def test_a_sampler_and_a_gate_that_do_not_fit_are_refused_before_learning(
         GuidedStart(nn.Module(), Guide(name), OccupancyConfig(sampler=name), Pipe(data))
 
 
+def test_a_budget_in_which_nothing_can_be_learned_is_refused_before_the_first_step(
+    readers: dict[str, Data],
+) -> None:
+    for config in (OccupancyConfig(seconds=0.0), OccupancyConfig(rays=0)):
+        with pytest.raises(InputError, match="an occupancy is learned"):
+            GuidedStart(nn.Module(), Guide(), config, Pipe(readers["as it is"]))
+
+
 def test_an_unknown_sampler_is_refused_in_a_line(tiny_scene: Path) -> None:
     config: Any = leco_ngp.config.pipeline
     data = VanillaDataManagerConfig(dataparser=NerfstudioDataParserConfig(data=tiny_scene))
