@@ -167,7 +167,7 @@ def _check_images(meta: dict[str, Any], frames: list[dict[str, Any]], folder: Pa
             f"the first is {folder / missing[0]}"
         )
     for frame in frames:
-        width, height = (int(meta.get(name, frame.get(name))) for name in ("w", "h"))
+        width, height = (int(meta[name] if name in meta else frame[name]) for name in ("w", "h"))
         path = folder / frame["file_path"]
         try:
             with Image.open(path) as image:
