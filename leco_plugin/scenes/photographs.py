@@ -108,7 +108,7 @@ def check_scene(data: Path) -> dict[str, Any]:
         meta = json.loads(description.read_text())
         frames = meta["frames"]
         paths = [frame["file_path"] for frame in frames]
-        if not all(type(path) is str and "\0" not in path for path in paths):
+        if not all(type(path) is str and all(ord(c) >= 32 for c in path) for path in paths):
             raise ValueError("a file_path is no path")
         poses = np.array([frame["transform_matrix"] for frame in frames], dtype=float)
     except (OSError, ValueError, KeyError, TypeError, OverflowError, RecursionError) as error:
@@ -167,7 +167,7 @@ def _check_images(meta: dict[str, Any], frames: list[dict[str, Any]], folder: Pa
             f"the first is {folder / missing[0]}"
         )
     for frame in frames:
-        width, height = (int(meta[name] if name in meta else frame[name]) for name in ("w", "h"))
+        width, height = (int(meta[n] if n in meta else frame[n]) for n in ("w", "h"))
         path = folder / frame["file_path"]
         try:
             with Image.open(path) as image:
