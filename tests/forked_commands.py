@@ -20,7 +20,10 @@ ENTRY_POINTS = {
     "ns-eval": "nerfstudio.scripts.eval:entrypoint",
     "ns-render": "nerfstudio.scripts.render:entrypoint",
     "leco": "leco_plugin.cli:main",
+    "ns-export": "nerfstudio.scripts.exporter:entrypoint",
 }
+NOT_EVERYWHERE = ("ns-export",)
+"""Imported only when they are run: not all machines have open3d, which this one needs."""
 
 
 class ForkedCommands:
@@ -81,7 +84,7 @@ def _run(command: list[str], log: str) -> int:
     sys.argv = command
     module, _, function = ENTRY_POINTS[command[0]].partition(":")
     try:
-        ended = getattr(sys.modules[module], function)()
+        ended = getattr(importlib.import_module(module), function)()
     except SystemExit as end:
         ended = end.code
     except BaseException:  # noqa: BLE001  as Python itself ends
@@ -98,8 +101,9 @@ def _run(command: list[str], log: str) -> int:
 def _serve() -> None:
     from mortal_training import leave_out_the_cache
 
-    for entry in ENTRY_POINTS.values():
-        importlib.import_module(entry.partition(":")[0])
+    for name, entry in ENTRY_POINTS.items():
+        if name not in NOT_EVERYWHERE:
+            importlib.import_module(entry.partition(":")[0])
     importlib.import_module("leco_plugin.swap")
     leave_out_the_cache()
     for line in sys.stdin:
