@@ -162,13 +162,16 @@ class Lifecycle:
         self._after_learning_step(step)
         if self.schedule.freeze and not bool(model.frozen) and self._ends_after(step):
             say(
-                f"step {step}: the run ends while its occupancy is still learned, and nothing is "
-                f"frozen; go on from its checkpoint (--load-dir) with --max-num-iterations well "
-                f"above {self.progress.learn_steps}"
+                f"step {step}: the run ends while its occupancy is still learned, to step "
+                f"{self.progress.learn_steps}, and nothing is frozen; go on from its checkpoint "
+                "with --load-dir"
             )
 
     def _ends_after(self, step: int) -> bool:
-        return self.trainer is not None and step + 1 >= self.trainer.config.max_num_iterations
+        if self.trainer is None:
+            return False
+        # nerfstudio counts its iterations from the step that is gone on from
+        return step + 1 >= self.trainer._start_step + int(self.trainer.config.max_num_iterations)
 
     def _after_learning_step(self, step: int) -> None:
         model, schedule, progress = self.model, self.schedule, self.progress
