@@ -11,7 +11,7 @@ from __future__ import annotations
 import functools
 import math
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 from weakref import WeakKeyDictionary
 
 import torch
@@ -94,12 +94,12 @@ _found: WeakKeyDictionary[Gate, dict[torch.dtype, FrozenGate]] = WeakKeyDictiona
 
 def frozen_gate(gate: Gate, dtype: torch.dtype) -> FrozenGate:
     """The weights of a gate as they are now, made anew only where one has changed."""
-    modules = [*gate.hidden, gate.norm, gate.head]
+    modules: list[Any] = [*gate.hidden, gate.norm, gate.head]
     sources = tuple(value for module in modules for value in (module.weight, module.bias))
     state = tuple((value.data_ptr(), _version(value)) for value in sources)
     found = _found.setdefault(gate, {})
     if dtype not in found or found[dtype].state != state:
-        hidden = [(layer.weight.to(dtype), layer.bias.to(dtype)) for layer in gate.hidden]
+        hidden = [(layer.weight.to(dtype), layer.bias.to(dtype)) for layer in modules[:-2]]
         weight = gate.head.weight.float()
         constant = weight @ gate.norm.bias.float() + gate.head.bias.float()
         head = _above_empty(weight * gate.norm.weight.float())
