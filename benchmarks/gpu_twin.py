@@ -5,12 +5,14 @@ while it runs on a CPU. On a card each is a kernel, which begins and ends in mem
 from __future__ import annotations
 
 from typing import Any
+from unittest.mock import patch
 
 import torch
 from torch import Tensor
 from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils._pytree import tree_leaves
 
+from leco_plugin import occupancy
 from leco_plugin.models.gate import Gate, GateConfig
 from leco_plugin.occupancy import Occupancy
 from leco_plugin.space import Space
@@ -35,13 +37,19 @@ class Traffic(TorchDispatchMode):
         return given
 
 
+def as_on_a_card(gate: Gate, mapped: Tensor, dtype: torch.dtype) -> Tensor:
+    """What `Occupancy.query` asks on a card; a CPU is asked in fewer passes."""
+    with torch.autocast("cpu", dtype):
+        return gate.occupancy(mapped)
+
+
 def bytes_of_twin(config: GateConfig) -> float:
     """Bytes a position that `Occupancy.occupied` moves in bfloat16 through unbounded space."""
     asked = Occupancy(Gate(config), Space("contraction"), 0.5, "bfloat16")
     counted = []
     for positions in (POSITIONS, 2 * POSITIONS):
         places = torch.zeros(positions, 3)
-        with Traffic() as traffic:
+        with patch.object(occupancy, "occupancy_of", as_on_a_card), Traffic() as traffic:
             asked.occupied(places)
         counted.append(traffic.bytes)
     return (counted[1] - counted[0]) / POSITIONS  # without the weights

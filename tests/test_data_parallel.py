@@ -245,7 +245,9 @@ def test_a_process_that_is_lost_ends_the_run_in_one_line_and_nothing_saved_is_lo
 ) -> None:
     config = config_of(leco_occupancy, tiny_scene, folder, "lost")
     config.steps_per_save = 4
-    with pytest.raises(TrainingStopped, match=r"of 2 processes was lost .*--load-dir") as caught:
+    with pytest.raises(
+        TrainingStopped, match=r"of 2 processes here was lost .*--load-dir"
+    ) as caught:
         launch(processes.lose_one, config)
     assert "\n" not in str(caught.value)
     path, damaged = newest_whole(config.get_checkpoint_dir())

@@ -78,7 +78,8 @@ def test_a_dry_run_passes_and_is_not_done_twice(tmp_path: Path) -> None:
     report = json.loads(out.read_text())
     assert [row["blocks"] for row in report["rows"]] == [1, 2]
     for row in report["rows"]:
-        assert len(row["grids"]) == 2 and row["gate_bytes"] > 0
+        assert 1 <= len(row["grids"]) <= 2  # none behind one that keeps as little as the gate
+        assert row["gate_bytes"] > 0
         assert 0.0 < row["kept_reached_volume"] <= 1.0 and row["psnr_held_out"] > 3.0
         assert row["schedule"] == 8 and not row["learned"]
     assert "Not learned in any schedule: 1, 2" in growth_table(report)

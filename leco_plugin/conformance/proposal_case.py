@@ -33,7 +33,6 @@ class ProposalCase(SamplerCase):
             num_samples=NUM_SAMPLES,
             initial_sampler=UniformLinDispPiecewiseSampler(),
             single_jitter=False,
-            **({} if occupancy is None else {"frame": torch.eye(3, 4)}),  # as a guide passes one
             **self.options,
             **more,
         )

@@ -39,6 +39,10 @@ def say(line: str) -> None:
         CONSOLE.log(f"\\[leco] {line}", _stack_offset=2)
 
 
+OF_A_DEVICE = ("leco_plugin.samplers.fused", "leco_plugin.models.grouped_trial")
+"""Whose warnings are of the device of one process; all others have the same everywhere."""
+
+
 class _Says(logging.Handler):
     """Says what is logged by samplers and experts, which know nothing of nerfstudio."""
 
@@ -46,7 +50,7 @@ class _Says(logging.Handler):
         line = escape(record.getMessage())
         if is_first():
             say(line)
-        elif record.levelno >= logging.WARNING:  # of the device of this process
+        elif record.levelno >= logging.WARNING and record.name in OF_A_DEVICE:
             CONSOLE.log(f"\\[leco] process {distributed.get_rank()}: {line}")
 
 

@@ -69,7 +69,7 @@ def test_rules_have_names_of_their_own_and_say_why_and_what_to_do():
         assert rule.checks
 
 
-def without_a_frame(occupancy, num_samples, initial_sampler, single_jitter):
+def without_jitter(occupancy, num_samples, initial_sampler, frame=None):
     return build_learned_proposal(occupancy, num_samples=num_samples)
 
 
@@ -81,11 +81,11 @@ def without_a_frame(occupancy, num_samples, initial_sampler, single_jitter):
             "the estimator of sampler 'crooked' cannot be built: AttributeError: .*build_dens",
         ),
         (
-            SamplerSpec("no frame", proposal=without_a_frame, needs_occupancy=True),
-            "the proposal of sampler 'crooked' cannot be built: TypeError: .*'frame'",
+            SamplerSpec("no jitter", proposal=without_jitter, needs_occupancy=True),
+            "the proposal of sampler 'crooked' cannot be built: TypeError: .*'single_jitter'",
         ),
     ],
-    ids=["typo", "no frame"],
+    ids=["typo", "no jitter"],
 )
 def test_what_cannot_be_built_is_said_once_and_not_rule_by_rule(spec, said, monkeypatch):
     monkeypatch.setitem(registry.OURS, "crooked", spec)

@@ -210,6 +210,7 @@ def test_positions_that_are_not_in_float32_are_left_to_torch(dtype, steep, monke
 
 @pytest.mark.parametrize("cone_angle", [0.0, 0.01])
 def test_rays_in_double_are_left_to_torch(cone_angle: float, steep, monkeypatch) -> None:
+    torch.manual_seed(0)
     gate = SimpleNamespace(gate_decisions=lambda w, x: steep.occupancy.query(x) >= w.facts[10])
     monkeypatch.setattr(fused, "ready", lambda device, name="gate": name not in fused._switch.off)
     monkeypatch.setitem(sys.modules, "leco_plugin.samplers.gate_kernel", gate)

@@ -34,14 +34,19 @@ def twin(asked: Occupancy, places: torch.Tensor) -> torch.Tensor:
         return asked.occupied(places)
 
 
-def assert_agreement(asked: Occupancy, places: torch.Tensor) -> None:
-    ours, torchs = fused(asked, places), twin(asked, places)
+def differing(asked: Occupancy, places: torch.Tensor) -> torch.Tensor:
+    """Where the kernel decides otherwise than its twin; nowhere but near the threshold."""
+    ours = fused(asked, places)
     assert ours.dtype == torch.bool and ours.shape == (len(places),)
-    differing = ours != torchs
-    distances = (asked.query(places) - asked.threshold_value).abs()[differing]
+    found = ours != twin(asked, places)
+    distances = (asked.query(places) - asked.threshold_value).abs()[found]
     assert (distances <= NEAR_THRESHOLD[asked.precision]).all(), distances.max()
-    assert differing.float().mean() < 0.02
-    assert 0.02 < torchs.float().mean() < 0.98
+    return found
+
+
+def assert_agreement(asked: Occupancy, places: torch.Tensor) -> None:
+    assert differing(asked, places).float().mean() < 0.02
+    assert 0.02 < twin(asked, places).float().mean() < 0.98
 
 
 @pytest.mark.parametrize("precision", ["float32", "bfloat16"])
@@ -98,7 +103,7 @@ def test_every_number_of_experts(experts: int) -> None:
 def test_ends_are_ragged(count: int) -> None:
     asked = occupancy(precision="float32")
     places = positions(count)
-    assert torch.equal(fused(asked, places), twin(asked, places))
+    assert int(differing(asked, places).sum()) <= 1
 
 
 @pytest.mark.parametrize("kind", ["box", "contraction"])

@@ -119,7 +119,12 @@ def test_bad_input_ends_with_one_line_and_status_2(
         "how its rays are marched": [tmp_path / "silent.safetensors", "--data", tiny_scene, *out],
         "not nan": [file, "--data", tiny_scene, *out, "--lost-surface-mass", "nan"],
         "is a folder": [file, "--data", tiny_scene, "--out", tmp_path],
-        "No such file": [tmp_path / "none.safetensors", "--data", tiny_scene, *out],
+        "give an occupancy.safetensors": [
+            tmp_path / "none.safetensors",
+            "--data",
+            tiny_scene,
+            *out,
+        ],
     }
     for cause, arguments in cases.items():
         assert run("shrink", *arguments) == 2, cause
