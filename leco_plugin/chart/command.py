@@ -62,8 +62,13 @@ def make_chart(
         compared = contenders(methods, samplers)
     protocol = Protocol(seconds, steps, learn_seconds, images)
     named = {"methods": methods, "samplers": samplers, "seeds": seeds}
-    chosen = {"suite": suite, "seconds": seconds, "steps": steps, "learn-seconds": learn_seconds}
-    chosen["images"] = images
+    chosen = {
+        "suite": suite,
+        "seconds": seconds,
+        "steps": steps,
+        "learn-seconds": learn_seconds,
+        "images": images,
+    }
     command = command_line(data, chosen, named)
     chart = Chart(data, out, compared, seeds, protocol, about, command)
     say = functools.partial(CONSOLE.print, markup=False, highlight=False)

@@ -22,7 +22,7 @@ import mega_nerf_scene
 import numpy as np
 import pytest
 import torch
-from numpy.random import Generator
+from damaged_bytes import cut, flip, splice
 from PIL import Image
 
 from leco_plugin.scenes.derived_images import DerivedImages
@@ -95,24 +95,6 @@ def reader(scene: Path, tmp_path: Path) -> Iterator[Reader]:
 def peak_megabytes() -> float:
     unit = 1 if sys.platform == "darwin" else 1024
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * unit / 1e6
-
-
-def flip(data: bytes, random: Generator) -> bytes:
-    changed = np.frombuffer(data, np.uint8).copy()
-    places = random.integers(len(changed), size=random.integers(1, 9))
-    changed[places] ^= (1 << random.integers(8, size=len(places))).astype(np.uint8)
-    return changed.tobytes()
-
-
-def cut(data: bytes, random: Generator) -> bytes:
-    return data[: random.integers(len(data))]
-
-
-def splice(data: bytes, random: Generator) -> bytes:
-    """A part of it is missing, doubled, or of another value."""
-    start, stop = sorted(random.integers(len(data), size=2))
-    middle = (b"", 2 * data[start:stop], bytes([random.integers(256)]) * (stop - start))
-    return data[:start] + middle[random.integers(3)] + data[stop:]
 
 
 @pytest.mark.parametrize("kind", ["coordinates", "metadata", "mask", "picture"])

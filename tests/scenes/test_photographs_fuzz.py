@@ -12,29 +12,12 @@ from typing import Any
 
 import numpy as np
 import pytest
-from numpy.random import Generator
+from damaged_bytes import cut, flip, splice
 
 from leco_plugin.scenes.input_error import InputError
 from leco_plugin.scenes.photographs import check_scene, read_ply
 
 SECONDS = 2.0
-
-
-def flip(data: bytes, random: Generator) -> bytes:
-    changed = np.frombuffer(data, np.uint8).copy()
-    places = random.integers(len(changed), size=random.integers(1, 9))
-    changed[places] ^= (1 << random.integers(8, size=len(places))).astype(np.uint8)
-    return changed.tobytes()
-
-
-def cut(data: bytes, random: Generator) -> bytes:
-    return data[: random.integers(len(data))]
-
-
-def splice(data: bytes, random: Generator) -> bytes:
-    start, stop = sorted(random.integers(len(data), size=2))
-    middle = (b"", 2 * data[start:stop], bytes([random.integers(256)]) * (stop - start))
-    return data[:start] + middle[random.integers(3)] + data[stop:]
 
 
 def read(path: Path, data: bytes, reader: Callable[[Path], Any]) -> bool:
