@@ -27,7 +27,8 @@ from leco_plugin.scenes.detail import CAMERAS
 from leco_plugin.scenes.held_out_pixels import HeldOutPixelSampler
 from leco_plugin.scenes.input_error import InputError
 from leco_plugin.scenes.stored_pictures import store_pictures
-from leco_plugin.scenes.upright import points_of, turn_to_upright, turned
+from leco_plugin.scenes.survey import points_in
+from leco_plugin.scenes.upright import turn_to_upright, turned
 
 MOST_OF_MEMORY = 0.4
 """Share of the memory that is free which photographs in memory may take."""
@@ -161,7 +162,7 @@ def _turn_of(outputs: DataparserOutputs) -> Tensor | None:
     """What sets a scene upright, said in the log; None where nothing is to be done."""
     if UP_IS_KNOWN in outputs.metadata:
         return None
-    turn = turn_to_upright(outputs.cameras.camera_to_worlds, points_of(outputs))
+    turn = turn_to_upright(outputs.cameras.camera_to_worlds, points_in(outputs.metadata))
     if turn is not None:
         degrees = math.degrees(math.acos(max(-1.0, min(1.0, float(turn[2, 2])))))
         say(

@@ -25,6 +25,8 @@ from leco_plugin.scenes.rotations import distance_from_rotations
 
 POINTS = "leco_sparse_points"
 """Key of the dataset's metadata with the sparse points [P, 3] in model coordinates."""
+POINT_KEYS = (POINTS, "points3D_xyz")
+"""Ours, and that of nerfstudio's own readers."""
 
 
 @dataclass

@@ -15,7 +15,7 @@ from leco_plugin.samplers.rays import intersect_box
 from leco_plugin.scenes.bounds import BoundsConfig, SceneBounds, find_bounds, with_range
 from leco_plugin.scenes.dataset_units import ALTITUDES, DatasetUnits, units_of
 from leco_plugin.scenes.input_error import InputError
-from leco_plugin.scenes.photographs import POINTS
+from leco_plugin.scenes.photographs import POINT_KEYS
 
 SIDE = 8
 """A grid of this many rays a side covers each image, its corners included."""
@@ -93,7 +93,8 @@ def sparse_points(dataset: Any) -> Tensor | None:
 
 def points_in(metadata: dict[str, Any]) -> Tensor | None:
     """Sparse points [P, 3] in model coordinates in what a reader says of a dataset, or None."""
-    points = metadata.get(POINTS, metadata.get("points3D_xyz"))
+    found = (metadata.get(key) for key in POINT_KEYS)
+    points = next((points for points in found if points is not None), None)
     return None if points is None else torch.as_tensor(points)
 
 

@@ -11,9 +11,8 @@ from nerfstudio.cameras.camera_utils import rotation_matrix_between
 from nerfstudio.data.dataparsers.base_dataparser import DataparserOutputs
 from torch import Tensor
 
-from leco_plugin.scenes.photographs import POINTS
+from leco_plugin.scenes.photographs import POINT_KEYS
 
-POINT_KEYS = (POINTS, "points3D_xyz")
 FEWEST_CAMERAS, FEWEST_POINTS = 4, 32
 UPRIGHT = 0.94
 """Cosine of 20 degrees: what is nearer to z may be the slope of a hill."""
@@ -78,13 +77,6 @@ def turned(outputs: DataparserOutputs, turn: Tensor) -> DataparserOutputs:
             points = torch.as_tensor(outputs.metadata[key])
             outputs.metadata[key] = points @ turn.to(points).T
     return outputs
-
-
-def points_of(outputs: DataparserOutputs) -> Tensor | None:
-    """Sparse points [P, 3] of a dataparser's outputs, if there are any."""
-    found = (outputs.metadata.get(key) for key in POINT_KEYS)
-    points = next((points for points in found if points is not None), None)
-    return None if points is None else torch.as_tensor(points)
 
 
 def _look_down(looks: Tensor, up: Tensor) -> bool:
