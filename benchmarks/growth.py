@@ -12,6 +12,7 @@ seconds and means nothing. `python benchmarks/results_page.py` draws what is sto
 from __future__ import annotations
 
 import copy
+import itertools
 import json
 import math
 from collections.abc import Sequence
@@ -50,7 +51,7 @@ class Options:
 
     blocks: tuple[int, ...] = (2, 4, 8, 16)
     """Blocks a side of the cities, from small to large."""
-    seed: int = 0
+    seeds: tuple[int, ...] = (0, 1, 2)
     """Of cities and gates."""
     schedules: tuple[int, ...] = (100, 200, 400, 800, 1600)
     """Learning steps that are tried, from few to many."""
@@ -79,6 +80,7 @@ def dry(options: Options) -> Options:
     return replace(
         options,
         blocks=(1, 2),
+        seeds=(0,),
         schedules=(4, 8),
         looks=2,
         grids=(4, 8),
@@ -93,16 +95,16 @@ def gate_of(gate: GateConfig, blocks: int, per_doubling: int) -> GateConfig:
     return replace(gate, encoding=replace(gate.encoding, octaves=gate.encoding.octaves + more))
 
 
-def learn(blocks: int, options: Options, first: int = 0) -> dict[str, Any]:
+def learn(blocks: int, seed: int, options: Options, first: int = 0) -> dict[str, Any]:
     """One city: the row of figures that is stored.
 
     Args:
         first: number of the schedule that is tried first.
     """
-    city = CityConfig(blocks, options.seed)
-    folder = write_city(city, options.cities / f"{blocks}-blocks", options.capture)
+    city = CityConfig(blocks, seed)
+    folder = write_city(city, options.cities / f"{blocks}-blocks-{seed}", options.capture)
     for steps in options.schedules[first:]:
-        attempt = learned_in(steps, folder, blocks, options)
+        attempt = learned_in(steps, folder, blocks, seed, options)
         if attempt.learned:
             break
         print(f"{blocks} blocks: not in {steps} steps")
@@ -114,6 +116,7 @@ def learn(blocks: int, options: Options, first: int = 0) -> dict[str, Any]:
     enough = grid_for(found["kept_reached_volume"], found["grids"])
     return {
         "blocks": blocks,
+        "seed": seed,
         "built_blocks": int(seen.built.sum()),
         "area_square_metres": area,
         "volume_cubic_metres": round(area * seen.roof),
@@ -146,7 +149,7 @@ class Attempt:
     """Step, seconds and kept share of the candidates, of each look."""
 
 
-def learned_in(steps: int, folder: Path, blocks: int, options: Options) -> Attempt:
+def learned_in(steps: int, folder: Path, blocks: int, seed: int, options: Options) -> Attempt:
     """A gate that learns by a schedule of so many steps, until it keeps little enough."""
     config: Any = copy.deepcopy(leco_occupancy.config.pipeline)
     config.datamanager.data = folder
@@ -156,7 +159,7 @@ def learned_in(steps: int, folder: Path, blocks: int, options: Options) -> Attem
     sizes = sizes_for(device)
     gate = gate_of(sizes.gate, blocks, options.octaves_per_doubling)
     config.model.sizes = replace(sizes, gate=gate)
-    torch.manual_seed(options.seed)
+    torch.manual_seed(seed)
     pipeline: Any = config.setup(device=device)
     attempt = Attempt(pipeline.model, pipeline.datamanager)
     attempt.model.train()
@@ -216,15 +219,15 @@ def _step(
     clock.stop()
 
 
-def first_schedule(rows: Sequence[dict[str, Any]], blocks: int, options: Options) -> int:
+def first_schedule(rows: Sequence[dict[str, Any]], blocks: int, seed: int, options: Options) -> int:
     """Number of the schedule by which the next smaller city has learned, or was given up."""
-    smaller = [row for row in rows if row["blocks"] < blocks]
+    smaller = [row for row in rows if row["blocks"] < blocks and row["seed"] == seed]
     return options.schedules.index(smaller[-1]["schedule"]) if smaller else 0
 
 
 def settings_of(options: Options) -> dict[str, Any]:
     """What a stored row depends on, besides its number of blocks, as JSON values."""
-    left_out = ("blocks", "out", "cities")
+    left_out = ("blocks", "seeds", "out", "cities")
     values = {name: value for name, value in vars(options).items() if name not in left_out}
     values["capture"] = vars(options.capture)
     settings: dict[str, Any] = json.loads(json.dumps(values))
@@ -244,12 +247,12 @@ def main(options: Options) -> None:
     options = dry(options) if options.dry_run else options
     settings = settings_of(options)
     rows = stored_rows(options.out, settings)
-    for blocks in options.blocks:
-        if any(row["blocks"] == blocks for row in rows):
-            print(f"{blocks} blocks: stored already")
+    for seed, blocks in itertools.product(options.seeds, options.blocks):
+        if any((row["blocks"], row["seed"]) == (blocks, seed) for row in rows):
+            print(f"{blocks} blocks, seed {seed}: stored already")
             continue
-        row = learn(blocks, options, first_schedule(rows, blocks, options))
-        rows = sorted([*rows, row], key=lambda row: row["blocks"])
+        row = learn(blocks, seed, options, first_schedule(rows, blocks, seed, options))
+        rows = sorted([*rows, row], key=lambda row: (row["blocks"], row["seed"]))
         report = {
             "format": 1,
             "machine": describe_machine(),
@@ -260,7 +263,7 @@ def main(options: Options) -> None:
             "rows": rows,
         }
         write_json(options.out, report)
-        print(f"{blocks} blocks: {report['exponents_with_area']}")
+        print(f"{blocks} blocks, seed {seed}: {report['exponents_with_area']}")
 
 
 if __name__ == "__main__":

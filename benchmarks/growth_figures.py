@@ -29,8 +29,9 @@ def grid_for(volume: float, grids: Sequence[dict[str, Any]]) -> dict[str, Any] |
 def bytes_for(volume: float, grids: Sequence[dict[str, Any]]) -> float | None:
     """Bytes of the grid that keeps this share of the volume, between those measured.
 
-    Interpolated in logarithms between the largest grid that keeps more and the next. None where no
-    grid keeps so little; the smallest grid's bytes where all do.
+    Interpolated in logarithms between the next grid and, of those with fewer bytes, the one that
+    keeps least: a single cell that must not be lost can make a grid in between keep nearly all.
+    None where no grid keeps so little; the smallest grid's bytes where all do.
     """
     more = grid_for(volume, grids)
     if more is None:
@@ -38,14 +39,24 @@ def bytes_for(volume: float, grids: Sequence[dict[str, Any]]) -> float | None:
     coarser = [row for row in grids if row["bytes"] < more["bytes"]]
     if not coarser:
         return float(more["bytes"])
-    less = max(coarser, key=lambda row: row["bytes"])
+    less = min(coarser, key=lambda row: row["kept_reached_volume"])
     span = math.log(less["kept_reached_volume"] / max(more["kept_reached_volume"], 1e-9))
     along = math.log(less["kept_reached_volume"] / max(volume, 1e-9)) / span
     low, high = math.log(less["bytes"]), math.log(more["bytes"])
     return math.exp(low + along * (high - low))
 
 
-def exponents(rows: Sequence[dict[str, Any]], with_what: str) -> dict[str, float | None]:
-    """Growth of each figure with a column of the rows."""
-    sizes = [row[with_what] for row in rows]
-    return {name: slope(sizes, [row[name] for row in rows]) for name in GROWING}
+def exponents(
+    rows: Sequence[dict[str, Any]], with_what: str
+) -> dict[str, dict[str, float | list[float] | None]]:
+    """Growth of each figure with a column of the rows: over all of them, and for each seed."""
+
+    def of(some: Sequence[dict[str, Any]], name: str) -> float | None:
+        return slope([row[with_what] for row in some], [row[name] for row in some])
+
+    seeds = sorted({row["seed"] for row in rows})
+    found: dict[str, dict[str, float | list[float] | None]] = {}
+    for name in GROWING:
+        each = [of([row for row in rows if row["seed"] == seed], name) for seed in seeds]
+        found[name] = {"all": of(rows, name), "each": [one for one in each if one is not None]}
+    return found

@@ -54,7 +54,9 @@ def _line(
     rows = [row for row in report["rows"] if row[name]]
     if not rows:
         return
-    exponent = report["exponents_with_area"][name]
-    label = what if exponent is None else f"{what}: as area to the {exponent:.2f}"
-    areas = [row["area_square_metres"] for row in rows]
-    axes.plot(areas, [row[name] for row in rows], label=label, **style(number, theme))
+    exponent = report["exponents_with_area"][name]["all"]
+    label: str | None = what if exponent is None else f"{what}: as area to the {exponent:.2f}"
+    for seed in sorted({row["seed"] for row in rows}):
+        points = [(row["area_square_metres"], row[name]) for row in rows if row["seed"] == seed]
+        axes.plot(*zip(*points), label=label, **style(number, theme))
+        label = None

@@ -13,7 +13,7 @@ Report = dict[str, Any]
 def growth_table(report: Report) -> str:
     """A row a city; the exponents of growth below, and whether the gate's is below that of area."""
     lines = [
-        "| blocks a side | built, m2 | photographs | gate, kB | grid, kB | volume kept, % "
+        "| blocks a side (seed) | built, m2 | photographs | gate, kB | grid, kB | volume kept, % "
         "| learned in, s | steps | grid filled in, s | held-out PSNR |",
         "|" + "---|" * 10,
     ]
@@ -21,29 +21,35 @@ def growth_table(report: Report) -> str:
         largest = max((grid["bytes"] for grid in row["grids"]), default=0)
         grid = f"over {largest / 1000:.0f}" if row["grid_bytes"] is None else _kb(row["grid_bytes"])
         lines.append(
-            f"| {row['blocks']} | {row['area_square_metres']:,.0f} | {row['photographs']} "
-            f"| {_kb(row['gate_bytes'])} | {grid} | {100 * row['kept_reached_volume']:.1f} "
+            f"| {row['blocks']} ({row['seed']}) | {row['area_square_metres']:,.0f} "
+            f"| {row['photographs']} | {_kb(row['gate_bytes'])} | {grid} "
+            f"| {100 * row['kept_reached_volume']:.1f} "
             f"| {_or_dash(row['seconds'], '.0f')} | {row['steps']} of {row['schedule']} "
             f"| {_or_dash(row['grid_seconds'], '.1f')} | {row['psnr_held_out']:.1f} dB |"
         )
     lines += [
         "",
-        "| grows as a power of | gate's bytes | grid's bytes | learning the gate, s "
+        "| grows as a power of (each seed) | gate's bytes | grid's bytes | learning the gate, s "
         "| filling the grid, s |",
         "|" + "---|" * 5,
     ]
     for what in ("area", "volume"):
         found = report[f"exponents_with_{what}"]
-        cells = (_or_dash(value, ".2f") for value in found.values())
+        cells = (_exponent(value) for value in found.values())
         lines.append(f"| {what} | {' | '.join(cells)} |")
-    gate = report["exponents_with_area"]["gate_bytes"]
-    unlearned = [str(row["blocks"]) for row in report["rows"] if not row["learned"]]
+    gate = report["exponents_with_area"]["gate_bytes"]["all"]
+    unlearned = [f"{row['blocks']} ({row['seed']})" for row in report["rows"] if not row["learned"]]
     if gate is not None:
         slower = "yes" if gate < 1.0 and not unlearned else "**no**"
         lines += ["", f"The gate's memory grows more slowly than the area: {slower}."]
     if unlearned:
         lines += ["", f"Not learned in any schedule: {', '.join(unlearned)} blocks a side."]
     return "\n".join(lines)
+
+
+def _exponent(found: dict[str, Any]) -> str:
+    each = ", ".join(f"{one:.2f}" for one in found["each"])
+    return f"{found['all']:.2f} ({each})" if found["all"] is not None else "-"
 
 
 def bounds_table(report: Report) -> str:

@@ -34,6 +34,8 @@ def test_the_grid_that_keeps_a_volume_lies_between_those_measured() -> None:
     assert bytes_for(0.9, rows) == 1.0
     assert bytes_for(0.01, rows) is None and grid_for(0.01, rows) is None
     assert grid_for(0.3, rows) == rows[2]
+    stumbling = [*rows[:2], {"bytes": 30, "kept_reached_volume": 0.99}, *rows[2:]]
+    assert bytes_for(0.2 * 2**0.5, stumbling) == pytest.approx(10**1.5)
     level = [{"bytes": 8, "kept_reached_volume": 0.5}, {"bytes": 64, "kept_reached_volume": 0.5}]
     assert bytes_for(0.5, level) == 8.0
 
@@ -49,17 +51,22 @@ def test_growth_is_told_with_area_and_with_volume() -> None:
         {"area": n**2, "volume": n**4, "gate_bytes": 7, "grid_bytes": n**4, "seconds": None}
         for n in (1, 2, 4)
     ]
-    rows = [row | {"grid_seconds": 1.0} for row in rows]
-    assert exponents(rows, "area")["grid_bytes"] == pytest.approx(2.0)
-    found = exponents(rows, "volume")
-    assert found["grid_bytes"] == pytest.approx(1.0) and found["gate_bytes"] == pytest.approx(0.0)
-    assert found["seconds"] is None
+    first = [row | {"grid_seconds": 1.0, "seed": 0} for row in rows]
+    second = [row | {"seed": 1, "grid_bytes": row["area"]} for row in first]
+    grids = exponents([*first, *second], "area")["grid_bytes"]
+    assert grids["all"] == pytest.approx(1.5) and grids["each"] == pytest.approx([2.0, 1.0])
+    found = exponents(first, "volume")
+    assert found["grid_bytes"]["all"] == pytest.approx(1.0)
+    assert found["gate_bytes"]["all"] == pytest.approx(0.0)
+    assert found["seconds"] == {"all": None, "each": []}
 
 
 def test_a_city_begins_with_the_schedule_of_the_next_smaller_one() -> None:
     options = Options(schedules=(10, 20, 40))
     rows = [{"blocks": 2, "schedule": 10}, {"blocks": 4, "schedule": 20}]
-    assert [first_schedule(rows, blocks, options) for blocks in (1, 3, 8)] == [0, 0, 1]
+    rows = [row | {"seed": 0} for row in rows] + [{"blocks": 4, "schedule": 40, "seed": 1}]
+    assert [first_schedule(rows, blocks, 0, options) for blocks in (1, 3, 8)] == [0, 0, 1]
+    assert [first_schedule(rows, blocks, 1, options) for blocks in (4, 8)] == [0, 2]
 
 
 def test_looks_lie_in_the_second_half_and_the_last_at_the_end() -> None:
@@ -82,6 +89,6 @@ def test_a_dry_run_passes_and_is_not_done_twice(tmp_path: Path) -> None:
         assert row["gate_bytes"] > 0
         assert 0.0 < row["kept_reached_volume"] <= 1.0 and row["psnr_held_out"] > 3.0
         assert row["schedule"] == 8 and not row["learned"]
-    assert "Not learned in any schedule: 1, 2" in growth_table(report)
+    assert "Not learned in any schedule: 1 (0), 2 (0)" in growth_table(report)
     again = subprocess.run(command, env=environment, capture_output=True, text=True, check=True)
     assert again.stdout.count("stored already") == 2

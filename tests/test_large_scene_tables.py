@@ -20,6 +20,7 @@ from leco_plugin.evaluation.charts import SOURCE, fingerprint
 def growth_report(grid_bytes: float | None = 4e6, learned: bool = True) -> dict[str, Any]:
     row = {
         "blocks": 2,
+        "seed": 0,
         "area_square_metres": 6400.0,
         "photographs": 34,
         "gate_bytes": 51_000,
@@ -41,7 +42,11 @@ def growth_report(grid_bytes: float | None = 4e6, learned: bool = True) -> dict[
         "learned": learned,
         "seconds": 100.0 if learned else None,
     }
-    both = {"gate_bytes": 0.05, "grid_bytes": 1.04, "seconds": None, "grid_seconds": 0.9}
+    figures = {"gate_bytes": 0.05, "grid_bytes": 1.04, "seconds": None, "grid_seconds": 0.9}
+    both = {
+        name: {"all": one, "each": [] if one is None else [one, one + 0.1]}
+        for name, one in figures.items()
+    }
     return {
         "exponents_with_area": both,
         "exponents_with_volume": both,
@@ -51,19 +56,19 @@ def growth_report(grid_bytes: float | None = 4e6, learned: bool = True) -> dict[
 
 def test_growth_says_each_city_and_whether_the_gate_grows_more_slowly_than_the_area() -> None:
     table = growth_table(growth_report())
-    assert "| 2 | 6,400 | 34 | 51 | 9.4 | 8.1 | 11 | 75 of 100 | 1.3 | 19.1 dB |" in table
-    assert "| area | 0.05 | 1.04 | - | 0.90 |" in table
+    assert "| 2 (0) | 6,400 | 34 | 51 | 9.4 | 8.1 | 11 | 75 of 100 | 1.3 | 19.1 dB |" in table
+    assert "| area | 0.05 (0.05, 0.15) | 1.04 (1.04, 1.14) | - | 0.90 (0.90, 1.00) |" in table
     assert "more slowly than the area: yes." in table
 
 
 def test_growth_without_a_grid_that_does_says_how_large_one_did_not() -> None:
-    assert "| 16 | 409,600 | 34 | 51 | over 4 | 8.1 |" in growth_table(growth_report(None))
+    assert "| 16 (0) | 409,600 | 34 | 51 | over 4 | 8.1 |" in growth_table(growth_report(None))
 
 
 def test_a_gate_that_has_not_learned_does_not_count_as_growing_slowly() -> None:
     table = growth_table(growth_report(learned=False))
     assert "more slowly than the area: **no**." in table
-    assert "Not learned in any schedule: 16 blocks a side." in table
+    assert "Not learned in any schedule: 16 (0) blocks a side." in table
 
 
 def test_growth_is_drawn_with_what_it_was_drawn_from(tmp_path: Path) -> None:
