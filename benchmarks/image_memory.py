@@ -1,14 +1,17 @@
 """Peak memory of learning an occupancy on many photographs: `python benchmarks/image_memory.py`.
 
-Photographs are generated; each way to hold them is measured in a process of its own, as the highest
-resident memory beyond what the process holds when everything is imported. The same on photographs
-of a tenth of the size, taken off, leaves what the photographs take. Nothing is learned in so few
-steps; all that a run does with photographs happens in them.
+Photographs are generated, more than fit the allowance once they are decoded; each way to hold them
+is measured in a process of its own, as the highest resident memory beyond what the process holds
+when everything is imported. The kernel refuses what goes beyond the allowance. The same on
+photographs of a tenth of the width and height tells what is not due to the photographs. Nothing is
+learned in so few steps; all that a run does with photographs happens in them.
 """
 
 from __future__ import annotations
 
 import json
+import os
+import signal
 import subprocess
 import sys
 import tempfile
@@ -20,14 +23,18 @@ import numpy as np
 import tyro
 from PIL import Image
 
-WAYS = ("disk", "some", "parallel", "memory")
+Way = Literal["disk", "some", "parallel", "memory"]
+OVER = ("can't allocate memory", "Cannot allocate memory", "MemoryError", "bad_alloc")
+"""How a refused allocation ends in what a process says, by who has asked for it."""
+HANGS = 300.0
+"""Seconds after which a process waits for one that has died: nerfstudio's own for photographs."""
 
 
 @dataclass
 class Options:
     """Settings of the benchmark."""
 
-    images: int = 60
+    images: int = 240
     """Photographs."""
     width: int = 2000
     """Of each, pixels."""
@@ -35,14 +42,17 @@ class Options:
     """Of each, pixels."""
     steps: int = 8
     """Learning steps, then the gate is calibrated and frozen."""
-    ways: tuple[Literal["disk", "some", "parallel", "memory"], ...] = ("disk", "some")
+    ways: tuple[Way, ...] = ("disk", "some", "parallel", "memory")
     """disk: decoded once into files of which pixels are read. some: nerfstudio's own eight images
-    at a time. parallel: its parallel data manager. memory: all images decoded, its default."""
+    at a time. parallel: its parallel data manager, which decodes all in a process of its own.
+    memory: all images decoded, its default."""
+    allowance: int = 2_000_000_000
+    """Bytes that each process may take beyond what it holds when everything is imported."""
     folder: Path | None = None
     """Where the photographs go; by default a folder that is removed afterwards."""
     out: Path = Path(__file__).parent / "results" / "image-memory.json"
     """Where the figures go."""
-    measure: Literal["disk", "some", "parallel", "memory"] | None = None
+    measure: Way | None = None
     """Measures one way in this process and prints it; what the benchmark starts."""
 
 
@@ -81,7 +91,19 @@ def write_photographs(folder: Path, options: Options) -> Path:
     return folder
 
 
-def measure(way: str, folder: Path, steps: int) -> dict[str, Any]:
+def allow(more: int) -> None:
+    """Lets the kernel refuse this process, and those it starts, so many bytes more than it has.
+
+    Files that are mapped for reading do not count: the kernel drops their pages when it needs them.
+    """
+    import resource
+
+    status = Path("/proc/self/status").read_text().splitlines()
+    held = 1024 * int(next(line for line in status if line.startswith("VmData:")).split()[1])
+    resource.setrlimit(resource.RLIMIT_DATA, (held + more, held + more))
+
+
+def measure(way: Way, folder: Path, options: Options) -> dict[str, Any]:
     """Learns for some steps with photographs held in one way: peak and baseline, bytes."""
     from nerfstudio.data.datamanagers.parallel_datamanager import ParallelDataManagerConfig
     from nerfstudio.pipelines.base_pipeline import VanillaPipelineConfig
@@ -107,8 +129,9 @@ def measure(way: str, folder: Path, steps: int) -> dict[str, Any]:
         config = LecoDataManagerConfig(images="memory", **some, **common)
     else:
         config = LecoDataManagerConfig(images=way, pixels=folder / "pixels", **common)
-    model = LecoModelConfig(schedule=ScheduleConfig(learn_steps=steps))
+    model = LecoModelConfig(schedule=ScheduleConfig(learn_steps=options.steps))
     before = peak_process_bytes()
+    allow(options.allowance)
     pipeline: Any = VanillaPipelineConfig(datamanager=config, model=model).setup(device="cpu")
     learn_occupancy(model, pipeline, rays=512)
     dataset = pipeline.datamanager.train_dataset
@@ -129,19 +152,43 @@ def measure(way: str, folder: Path, steps: int) -> dict[str, Any]:
     }
 
 
-def in_its_own_process(way: str, folder: Path, steps: int) -> dict[str, Any]:
-    """What `measure` says in a new process."""
+def in_its_own_process(way: Way, folder: Path, options: Options) -> dict[str, Any] | None:
+    """What `measure` says in a new process; None where the allowance was not enough."""
     command = [sys.executable, "-W", "ignore", __file__, "--measure", way]
-    command += ["--folder", str(folder), "--steps", str(steps)]
-    done = subprocess.run(command, stdout=subprocess.PIPE, text=True, check=True)
-    measured: dict[str, Any] = json.loads(done.stdout.splitlines()[-1])
-    return measured
+    command += ["--folder", str(folder), "--steps", str(options.steps)]
+    command += ["--allowance", str(options.allowance)]
+    with subprocess.Popen(
+        command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, start_new_session=True
+    ) as process:
+        try:
+            said, complaint = process.communicate(timeout=HANGS)
+        except subprocess.TimeoutExpired:
+            os.killpg(process.pid, signal.SIGKILL)
+            said, complaint = process.communicate()
+    if process.returncode == 0:
+        measured: dict[str, Any] = json.loads(said.splitlines()[-1])
+        return measured
+    if any(words in complaint for words in OVER):
+        return None
+    raise RuntimeError(f"photographs {way}:\n{complaint}")
+
+
+def compared(way: Way, folder: Path, small: Path, options: Options) -> dict[str, Any]:
+    """A row of the results: what a way takes, and how much of it is the photographs."""
+    row = in_its_own_process(way, folder, options)
+    if row is None:
+        return {"way": way, "within_allowance": False}
+    without = in_its_own_process(way, small, options)
+    assert without is not None, "a tenth of the size takes more than the whole"
+    row["within_allowance"] = True
+    row["added_on_a_tenth_bytes"] = without["added_bytes"]
+    return row
 
 
 def main(options: Options) -> None:
     if options.measure is not None:
         assert options.folder is not None
-        print(json.dumps(measure(options.measure, options.folder, options.steps)))
+        print(json.dumps(measure(options.measure, options.folder, options)))
         return
     from leco_plugin.evaluation.machine import describe_machine
 
@@ -151,16 +198,15 @@ def main(options: Options) -> None:
         tenth = replace(options, width=options.width // 10, height=options.height // 10)
         small = write_photographs(Path(temporary) / "tenth", tenth)
         for way in options.ways:
-            row, without = (in_its_own_process(way, of, options.steps) for of in (folder, small))
-            row["added_on_a_tenth_bytes"] = without["added_bytes"]
-            row["photographs_bytes"] = row["added_bytes"] - without["added_bytes"]
-            share = row["photographs_bytes"] / row["decoded_bytes"]
-            print(f"{way}: {row['photographs_bytes'] / 1e6:.0f} MB, {share:.2f} of decoded bytes")
+            row = compared(way, folder, small, options)
+            taken = f"{row['added_bytes'] / 1e6:.0f} MB" if row["within_allowance"] else "over"
+            print(f"{way}: {taken}", flush=True)
             rows.append(row)
     results = {
         "format": 1,
         "machine": describe_machine(),
         "photographs": [options.images, options.width, options.height],
+        "allowance_bytes": options.allowance,
         "runs": rows,
     }
     options.out.parent.mkdir(parents=True, exist_ok=True)

@@ -91,9 +91,15 @@ def test_a_prior_that_does_not_get_there_has_a_dash() -> None:
 def test_memory_is_told_in_megabytes() -> None:
     run = {
         "way": "disk",
-        "photographs_bytes": 62_300_000,
+        "added_bytes": 562_300_000,
+        "added_on_a_tenth_bytes": 501_000_000,
         "decoded_bytes": 531_000_000,
         "decoded_float_bytes": 2_124_000_000,
-        "peak_bytes": 1_361_000_000,
+        "within_allowance": True,
     }
-    assert memory_table({"runs": [run]}).endswith("| disk | 62 | 531 | 2,124 | 1,361 |")
+    over = {"way": "memory", "within_allowance": False}
+    lines = memory_table({"runs": [run, over]}).splitlines()
+    assert lines[-2:] == [
+        "| disk | 562 | 501 | 531 | 2,124 |",
+        "| memory | **over the allowance** | | | |",
+    ]
