@@ -18,7 +18,7 @@ from leco_plugin.models.ranks import is_first, say
 from leco_plugin.occupancy import Occupancy
 from leco_plugin.samplers.rays import intersect_box
 from leco_plugin.samplers.registry import check_gate
-from leco_plugin.scenes.frames import between, frame_of
+from leco_plugin.scenes.frames import between, frame_of, moved, turned
 from leco_plugin.scenes.input_error import InputError
 from leco_plugin.scenes.survey import announce, covering_rays, survey
 
@@ -181,7 +181,7 @@ def kept_of_rays(guide: Guide, cameras: Any) -> tuple[Tensor, Tensor]:
     occupancy = guide.the_occupancy()
     frame = guide.frame
     origins, directions = (part.reshape(-1, 3).to(frame) for part in covering_rays(cameras))
-    origins, directions = origins @ frame[:, :3].T + frame[:, 3], directions @ frame[:, :3].T
+    origins, directions = moved(origins, frame), turned(directions, frame)
     center, half = occupancy.space.center, occupancy.space.half_extent
     # a contraction goes on beyond its inner cube: most of what is seen lies within some of those
     reach = half if occupancy.space.kind == "box" else 8.0 * half

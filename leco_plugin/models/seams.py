@@ -15,8 +15,8 @@ from typing import TYPE_CHECKING, Any, cast
 from torch import nn
 
 from leco_plugin.entries import foreign_entries
-from leco_plugin.models.guide import DensityFn, Guide
-from leco_plugin.samplers.base import Estimator
+from leco_plugin.models.guide import Guide
+from leco_plugin.samplers.base import DensityFn, Estimator
 from leco_plugin.scenes.input_error import InputError
 
 if TYPE_CHECKING:

@@ -19,8 +19,8 @@ from nerfstudio.models.base_model import Model
 from small_hosts import SMALL, pipeline_of, small, unswapped
 from torch import Tensor
 
-from leco_plugin.models.guide import GuidedEstimator
 from leco_plugin.models.guided import GuidedModelConfig
+from leco_plugin.models.stand_ins import GuidedEstimator
 from leco_plugin.samplers import estimator
 from leco_plugin.swap import with_sampler_swapped
 

@@ -13,8 +13,9 @@ from nerfstudio.model_components.ray_samplers import (
 )
 from torch import nn
 
-from leco_plugin.models.guide import Guide, GuidedEstimator, GuidedProposal
+from leco_plugin.models.guide import Guide
 from leco_plugin.models.seams import no_density, swap_sampler
+from leco_plugin.models.stand_ins import GuidedEstimator, GuidedProposal
 
 
 class Host(nn.Module):
