@@ -83,7 +83,7 @@ def set_up_guided(config: GuidedModelConfig, **arguments: Any) -> Model:
         with suppress(InputError):  # a checkpoint brings its own; without one, training says it
             guide.set_occupancy(load_occupancy(config.occupancy.path))
     host = with_counts_as_floats(setup_with_lazy_lpips(host_config, **arguments))
-    host.guide = guide
+    host.leco_guide = guide  # by no name that the host may have given something of its own
     swap_sampler(host, guide)
     guide.register_load_state_dict_post_hook(lambda guide, _: set_first_density(host, guide))
     _refuse_what_is_not_finite(host)

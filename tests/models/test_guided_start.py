@@ -291,7 +291,7 @@ def test_a_host_that_asks_no_gate_needs_no_occupancy(tiny_scene: Path) -> None:
     pipeline: Any = VanillaPipelineConfig(datamanager=data, model=model).setup(device="cpu")
     attributes = TrainingCallbackAttributes(None, None, pipeline, None)  # type: ignore[arg-type]
     pipeline.get_training_callbacks(attributes)
-    assert pipeline.model.guide.occupancy is None
+    assert pipeline.model.leco_guide.occupancy is None
 
 
 def test_where_the_scene_lies_is_said_before_the_first_step(

@@ -98,7 +98,7 @@ def test_a_checkpoint_brings_the_density_back(
     for callback in begun.get_training_callbacks(attributes):
         callback.run_callback_at_location(0, TrainingCallbackLocation.BEFORE_TRAIN_ITERATION)
     model: Any = begun.model
-    assert model.guide.first_density == model.field.average_init_density > 1.0
+    assert model.leco_guide.first_density == model.field.average_init_density > 1.0
     assert reader.model.field.average_init_density == 1.0
     reader.model.load_state_dict(model.state_dict())
     assert reader.model.field.average_init_density == model.field.average_init_density
