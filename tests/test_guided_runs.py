@@ -144,6 +144,7 @@ def swapped(
     assert facts == {
         "method": request.param,
         "sampler": "learned-occupancy",
+        "options": {},
         "folder": str(folder),
     }
     file.unlink()

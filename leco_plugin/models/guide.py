@@ -19,7 +19,12 @@ from leco_plugin.models.gate import Gate, GateConfig
 from leco_plugin.models.stand_ins import GuidedEstimator, GuidedProposal
 from leco_plugin.occupancy import Occupancy
 from leco_plugin.samplers.base import DensityFn, Estimator
-from leco_plugin.samplers.registry import SamplerSpec, build_estimator, sampler_spec
+from leco_plugin.samplers.registry import (
+    SamplerSpec,
+    build_estimator,
+    refuse_unknown_options,
+    sampler_spec,
+)
 from leco_plugin.scenes.input_error import InputError
 from leco_plugin.space import Space
 
@@ -83,12 +88,14 @@ class Guide(nn.Module):
         """What is registered under the sampler's name, and serves this kind of hosts."""
         try:
             spec = sampler_spec(self.sampler)
+            if kind is not None:
+                if getattr(spec, kind) is None:
+                    raise ValueError(
+                        f"the sampler {self.sampler!r} cannot go into this host: it has no {kind}"
+                    )
+                refuse_unknown_options(self.sampler, self.options, (kind,))
         except ValueError as error:
             raise InputError(str(error)) from None
-        if kind is not None and getattr(spec, kind) is None:
-            raise InputError(
-                f"the sampler {self.sampler!r} cannot go into this host: it has no {kind}"
-            )
         return spec
 
     def changed(self) -> None:
@@ -137,7 +144,7 @@ class Guide(nn.Module):
             outermost: the box in which the host's own samples at all, [6]; None is no such box.
             density_fn: the host's density at positions [N, 3], for rendering front to back.
         Raises:
-            InputError: the sampler has no estimator.
+            InputError: the sampler has no estimator, or not all of its options.
         """
         if self._spec("estimator").needs_occupancy:
             return GuidedEstimator(self, aabb, outermost, density_fn)
@@ -150,7 +157,7 @@ class Guide(nn.Module):
         """What goes where a proposal host has its sampler; options as for the registry.
 
         Raises:
-            InputError: the sampler has nothing for proposal hosts.
+            InputError: the sampler has nothing for proposal hosts, or not all of its options.
         """
         self._spec("proposal")
         return GuidedProposal(self, {**options, **self.options})

@@ -10,6 +10,7 @@ from nerfstudio.viewer_legacy.server.viewer_utils import IOChangeException
 from leco_plugin.models.guide import Guide
 from leco_plugin.samplers import registry
 from leco_plugin.samplers.registry import SamplerSpec
+from leco_plugin.scenes.input_error import InputError
 
 pytestmark = pytest.mark.usefixtures("without_cache")
 
@@ -88,3 +89,12 @@ def test_the_options_of_a_sampler_reach_it(guide: Guide):
     own.set_occupancy(ball())
     assert own.estimator(BOX).sampler.cache_bytes == 0
     assert own.proposal(num_samples=3).sampler.estimator.cache_bytes == 0
+
+
+def test_options_that_a_host_of_its_kind_cannot_use_are_named():
+    packed, proposal = Guide(options={"tolerance": 1e-3}), Guide(options={"num_candidates": 9})
+    packed.estimator(BOX), proposal.proposal(num_samples=3)
+    with pytest.raises(InputError, match="'tolerance' in proposal hosts; there are cache_bytes, "):
+        packed.proposal(num_samples=3)
+    with pytest.raises(InputError, match="'num_candidates' in packed hosts; there are cache_"):
+        proposal.estimator(BOX)
