@@ -243,7 +243,8 @@ def test_a_sampler_and_a_gate_that_do_not_fit_are_refused_before_learning(
     data, name = readers["as it is"], "learned-occupancy-hash"
     with pytest.raises(InputError, match=f"{name}.* asks a gate on hash features"):
         started(ball_of_the_tiny_scene(), data, name)
-    with pytest.raises(InputError, match=f"{name}.* asks a gate on hash features"):
+    learning = "--pipeline.model.occupancy.learning"
+    with pytest.raises(InputError, match=f"{name}.* asks a gate on hash features.*{learning}$"):
         GuidedStart(nn.Module(), Guide(name), OccupancyConfig(sampler=name), Pipe(data))
 
 
@@ -281,6 +282,23 @@ def test_the_first_step_leaves_the_file_in_the_runs_folder(
     (Trainer.base_dir / NAME).unlink()
     start.before_step(1)
     assert not (Trainer.base_dir / NAME).exists()
+
+
+def test_before_learning_a_run_says_that_it_starts_over_where_it_is_stopped(
+    readers: dict[str, Data], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    said: list[str] = []
+
+    def learn(*_: object) -> Occupancy:
+        said.append("learned")
+        return ball_of_the_tiny_scene()
+
+    monkeypatch.setattr("leco_plugin.models.guided_start.say", said.append)
+    monkeypatch.setattr("leco_plugin.models.learn_first.learn_occupancy", learn)
+    guide = Guide()
+    GuidedStart(nn.Module(), guide, OccupancyConfig(), Pipe(readers["as it is"])).before_step(0)
+    assert "in no checkpoint until then" in said[0] and said[1] == "learned"
+    assert guide.occupancy is not None
 
 
 def test_a_host_that_asks_no_gate_needs_no_occupancy(tiny_scene: Path) -> None:
