@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
+from types import MappingProxyType
 from typing import Annotated, Literal
 
 import tyro
@@ -88,8 +89,8 @@ def inspect(
     Args:
         file: An occupancy.safetensors, or a folder of runs: the newest in it.
         picture: File for a picture: slices of o(x) with the cameras, and the kept points.
-        history: File for how it was learned: a .gif that moves, or a still picture. For runs with
-            --pipeline.model.schedule.steps-per-record 10, say.
+        history: File for how it was learned: a .gif that moves, or a still picture. For runs of
+            leco-occupancy with --pipeline.model.schedule.steps-per-record 10, say.
         json: File for the same as JSON.
     """
     from leco_plugin.evaluation.inspection import describe
@@ -126,6 +127,7 @@ def swap(
     occupancy: Path,
     arguments: Annotated[tuple[str, ...], tyro.conf.Positional] = (),
     sampler: str = "learned-occupancy",
+    options: Mapping[str, int | float] = MappingProxyType({}),
     json: Path | None = None,
 ) -> None:
     """Train any registered nerfstudio method with its sampler swapped for a learned occupancy.
@@ -137,15 +139,16 @@ def swap(
         occupancy: An occupancy.safetensors, or the folder of a run that left one.
         arguments: After --, what ns-train would be given for this method: -- --data DIR ...
         sampler: Of this package or of another, in place of the method's own.
+        options: Of that sampler, by name: --options num_candidates 512 cache_bytes 4194304.
         json: File for the folder of the run, as JSON.
     """
     from leco_plugin.swap import swap as train_swapped
 
     _check_json(json)
-    folder = train_swapped(method, occupancy, arguments, sampler)
+    folder = train_swapped(method, occupancy, arguments, sampler, options)
     print(f"{method}, guided: {folder}")
-    facts = {"format": 1, "method": method, "sampler": sampler, "folder": str(folder)}
-    _write_json(json, facts)
+    facts = {"method": method, "sampler": sampler, "options": dict(options), "folder": str(folder)}
+    _write_json(json, {"format": 1, **facts})
 
 
 def demo(out: Path = Path("runs/demo"), seconds: float = 130.0, json: Path | None = None) -> None:

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import fields, replace
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 import tyro
@@ -18,15 +19,20 @@ from leco_plugin.compat.dynamic_batch import clamped
 from leco_plugin.method_configs import best_device
 from leco_plugin.models.guided import GuidedModelConfig
 from leco_plugin.models.guided_start import OccupancyConfig, load_occupancy, occupancy_file
-from leco_plugin.samplers.registry import check_gate
+from leco_plugin.samplers.registry import check_gate, refuse_unknown_options
 from leco_plugin.scenes.input_error import InputError
 
 LEARNED = "learned-occupancy"
 """Name of the sampler that goes into a host unless another one is asked for."""
+NO_OPTIONS: Mapping[str, int | float] = MappingProxyType({})
 
 
 def swapped_config(
-    method: str, file: Path, arguments: Sequence[str] = (), sampler: str = LEARNED
+    method: str,
+    file: Path,
+    arguments: Sequence[str] = (),
+    sampler: str = LEARNED,
+    options: Mapping[str, int | float] = NO_OPTIONS,
 ) -> TrainerConfig:
     """The config of a registered method with its sampler swapped.
 
@@ -35,13 +41,15 @@ def swapped_config(
         file: an occupancy, or the folder of a run that left one.
         arguments: what `ns-train METHOD` would be given.
         sampler: name in the registry of samplers.
+        options: of that sampler, by name.
     Raises:
         InputError: there is no such method, or it is guided or learns occupancy itself; there is no
-            such sampler, or it asks another kind of gate; there is no such file, or it is no
-            occupancy; the arguments name a config that would replace this one, or no scene.
+            such sampler, or it asks another kind of gate, or has no such option; there is no such
+            file, or it is no occupancy; the arguments name a config that would replace this one,
+            or no scene.
         SystemExit: the arguments are none of the method's; tyro has said why.
     """
-    check_gate_of(file, sampler)
+    check_sampler(file, sampler, options)
     config = tyro.cli(
         tyro.conf.SuppressFixed[tyro.conf.FlagConversionOff[TrainerConfig]],
         default=registered(method),
@@ -55,17 +63,18 @@ def swapped_config(
         )
     if config.data is not None and not config.data.exists():
         raise InputError(f"there is no scene {config.data} (--data)")
-    return with_sampler_swapped(config, file, sampler)
+    return with_sampler_swapped(config, file, sampler, options)
 
 
-def check_gate_of(file: Path, sampler: str) -> None:
-    """Whether there is an occupancy, and a sampler that asks gates of its kind.
+def check_sampler(file: Path, sampler: str, options: Mapping[str, int | float]) -> None:
+    """Whether there is an occupancy, and a sampler with these options that asks gates of its kind.
 
     Raises:
         InputError: there is not.
     """
     try:
         check_gate(sampler, load_occupancy(file).gate.config)
+        refuse_unknown_options(sampler, options)
     except ValueError as error:
         raise InputError(str(error)) from None
 
@@ -89,7 +98,10 @@ def registered(method: str) -> TrainerConfig:
 
 
 def with_sampler_swapped(
-    config: TrainerConfig, file: Path | None, sampler: str = LEARNED
+    config: TrainerConfig,
+    file: Path | None,
+    sampler: str = LEARNED,
+    options: Mapping[str, int | float] = NO_OPTIONS,
 ) -> TrainerConfig:
     """The same training with its model guided by an occupancy, learned first where there is no
     file; the config given is not changed.
@@ -115,7 +127,7 @@ def with_sampler_swapped(
             f"{config.method_name} has a pipeline without a model that could be guided"
         )
     path = None if file is None else occupancy_file(file.resolve())
-    occupancy = OccupancyConfig(path=path, sampler=sampler)
+    occupancy = OccupancyConfig(path=path, sampler=sampler, options=dict(options))
     pipeline.model = GuidedModelConfig(host=host, occupancy=occupancy)
     if type(config) is TrainerConfig:
         values = {f.name: getattr(config, f.name) for f in fields(config)}
@@ -124,10 +136,16 @@ def with_sampler_swapped(
     return replace(config, pipeline=clamped(pipeline), _target=trainer)
 
 
-def swap(method: str, file: Path, arguments: Sequence[str] = (), sampler: str = LEARNED) -> Path:
+def swap(
+    method: str,
+    file: Path,
+    arguments: Sequence[str] = (),
+    sampler: str = LEARNED,
+    options: Mapping[str, int | float] = NO_OPTIONS,
+) -> Path:
     """Trains, and returns the folder of the run. Arguments and errors as for `swapped_config`."""
     from nerfstudio.scripts.train import main as train
 
-    config = swapped_config(method, file, arguments, sampler)
+    config = swapped_config(method, file, arguments, sampler, options)
     train(config)
     return config.get_base_dir()

@@ -13,6 +13,10 @@ from leco_plugin.occupancy import Occupancy
 from leco_plugin.space import Space
 
 CENTRE, RADIUS, HALF = (1.0, 2.0, 0.5), 1.0, 2.0
+BOX = torch.tensor([-1.0, -1.0, -1.0, 3.0, 4.0, 2.0])
+"""Of a host, around much of the ball's space."""
+MARCH = {"render_step_size": 0.05, "near_plane": 0.0, "far_plane": 8.0}
+"""Of `rays`, through and past the ball."""
 
 
 ENCODINGS = {
@@ -64,3 +68,12 @@ def ball_of_the_tiny_scene(frame: list[list[float]] = SCENE_FRAME) -> Occupancy:
     half = BALL_RADIUS / (RADIUS / HALF) * float(turn.norm()) / 3.0**0.5
     space = Space("box", (x, y, z), half)
     return Occupancy(ball().gate, space, 0.5, report={"frame": frame}).eval()
+
+
+def rays(count: int = 30) -> tuple[torch.Tensor, torch.Tensor]:
+    """Origins and directions [count, 3] of rays from outside towards the ball and beside it."""
+    generator = torch.Generator().manual_seed(0)
+    origins = torch.tensor(CENTRE) + torch.tensor([0.0, 0.0, 4.0])
+    aims = torch.tensor(CENTRE) + 1.5 * torch.randn(count, 3, generator=generator)
+    directions = torch.nn.functional.normalize(aims - origins, dim=-1)
+    return origins.expand(count, 3).contiguous(), directions

@@ -47,6 +47,16 @@ def elsewhere(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return site
 
 
+@pytest.fixture
+def without_cache(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A cell cache takes seconds to build, and is tested where it lives."""
+
+    def refuse(*_: object, **__: object) -> None:
+        raise ValueError("no cache in this test")
+
+    monkeypatch.setattr("leco_plugin.samplers.estimator.build_cache", refuse)
+
+
 @pytest.fixture(scope="session")
 def scenes() -> Path:
     """Folder of real scenes; for tests marked `scenes`."""

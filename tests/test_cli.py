@@ -168,6 +168,10 @@ def bad_inputs(folder: Path, file: Path) -> dict[str, list[object]]:
         "no width": ["city", "--width", 0, "--out", folder / "city"],
         "a folder of other things": ["city", "--out", folder / "taken"],
         "an unknown sampler": ["check", "grit"],
+        "an unknown option": [
+            *("swap", "nerfacto", "--occupancy", file),
+            *("--options", "cells", 64, "--", "--data", folder),
+        ],
         "no time": ["demo", "--seconds", 0, "--out", folder / "demo"],
         "no number of seconds": ["demo", "--seconds", "nan", "--out", folder / "demo"],
     }
@@ -197,6 +201,27 @@ def test_a_swap_whose_arguments_are_not_set_apart_says_how(
     assert end.value.code == 2
     last = capsys.readouterr().err.splitlines()[-1]
     assert last.startswith("leco: ") and "--occupancy FILE -- --data SCENE" in last
+
+
+def test_a_swap_hands_options_of_the_sampler_on(
+    file: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from leco_plugin import swap
+
+    given: list[object] = []
+
+    def train(*arguments: object) -> Path:
+        given.extend(arguments)
+        return tmp_path
+
+    monkeypatch.setattr(swap, "swap", train)
+    options = ["--options", "num_candidates", 512, "tolerance", 1e-3]
+    report = tmp_path / "swap.json"
+    arguments = ["--json", report, "--", "--data", "SCENE"]
+    assert run("swap", "nerfacto", "--occupancy", file, *options, *arguments) == 0
+    expected = {"num_candidates": 512, "tolerance": 1e-3}
+    assert given == ["nerfacto", file, ("--data", "SCENE"), "learned-occupancy", expected]
+    assert json.loads(report.read_text())["options"] == expected
 
 
 def test_a_failure_ends_with_one_line_and_status_1(

@@ -226,8 +226,8 @@ def test_an_occupancy_is_learned_together_before_a_host_is_trained(guided: Any) 
     occupancy = Occupancy.load(config.get_base_dir() / "occupancy.safetensors")
     for process in (first, second):
         state = process["state"]
-        assert state["guide._extra_state"]["report"] == occupancy.report
-        found = {f"guide.occupancy.{name}": v for name, v in occupancy.state_dict().items()}
+        assert state["leco_guide._extra_state"]["report"] == occupancy.report
+        found = {f"leco_guide.occupancy.{name}": v for name, v in occupancy.state_dict().items()}
         found = processes.digest(found)
         assert found.items() <= processes.digest(state).items()
     assert losses(first) != losses(second)

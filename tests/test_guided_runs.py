@@ -114,7 +114,7 @@ def checkpoint(folder: Path) -> dict[str, Any]:
 
 def gate_of(folder: Path) -> dict[str, torch.Tensor]:
     """The frozen occupancy in a run's checkpoint."""
-    prefix = "_model.guide.occupancy."
+    prefix = "_model.leco_guide.occupancy."
     state = checkpoint(folder)["pipeline"]
     return {name.removeprefix(prefix): state[name] for name in state if name.startswith(prefix)}
 
@@ -144,6 +144,7 @@ def swapped(
     assert facts == {
         "method": request.param,
         "sampler": "learned-occupancy",
+        "options": {},
         "folder": str(folder),
     }
     file.unlink()
@@ -158,7 +159,8 @@ def test_swapping_leaves_a_run_that_is_guided(swapped: Path) -> None:
     left = Occupancy.load(swapped / NAME)
     assert_same(dict(left.state_dict()), dict(ball_of_the_tiny_scene().state_dict()))
     assert_same(gate_of(swapped), dict(left.state_dict()))
-    assert checkpoint(swapped)["pipeline"]["_model.guide._extra_state"]["report"] == left.report
+    stored = checkpoint(swapped)["pipeline"]["_model.leco_guide._extra_state"]
+    assert stored["report"] == left.report
 
 
 def test_ns_eval_opens_it(swapped: Path, runs: Runs) -> None:
@@ -237,7 +239,7 @@ def test_what_leco_occupancy_leaves_guides_a_host_in_other_coordinates(runs: Run
     arguments = [*runs.arguments("smaller"), "nerfstudio-data", "--scale-factor", "0.5"]
     runs.command("leco", "swap", "elsewhere-packed", "--occupancy", learned, "--", *arguments)
     folder = runs.folder("elsewhere-packed", "smaller")
-    frame = checkpoint(folder)["pipeline"]["_model.guide.frame"]
+    frame = checkpoint(folder)["pipeline"]["_model.leco_guide.frame"]
     torch.testing.assert_close(frame, 2.0 * torch.eye(3, 4))
     assert runs.evaluate(folder)["psnr"] > 3.0
 

@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+import yaml
 from ball_occupancy import ball
 from nerfstudio.configs.method_configs import all_methods
 
@@ -32,6 +33,20 @@ def test_only_sampler_batches_and_trainer_are_others(file: Path) -> None:
     assert isinstance(guided, GuidedModelConfig)
     assert guided.host == before.pipeline.model  # type: ignore[attr-defined]
     assert guided.occupancy.path == file and guided.occupancy.sampler == "learned-occupancy"
+
+
+def test_options_of_the_sampler_are_in_the_config(file: Path) -> None:
+    options = {"cache_bytes": 0, "num_candidates": 64}
+    made: Any = swapped_config("nerfacto", file, options=options)
+    assert made.pipeline.model.occupancy.options == options
+    assert yaml.load(yaml.dump(made), Loader=yaml.Loader) == made
+
+
+def test_an_option_that_the_sampler_does_not_have_is_said_in_a_line(file: Path) -> None:
+    message = "'occupancy-grid' has no option 'cells'; there are levels, resolution"
+    with pytest.raises(InputError, match=message) as error:
+        swapped_config("instant-ngp", file, [], "occupancy-grid", {"levels": 2, "cells": 64})
+    assert "\n" not in str(error.value)
 
 
 def test_what_is_registered_stays_as_it_is(file: Path) -> None:

@@ -76,7 +76,7 @@ class HostCase:
             callbacks(self._model)
         if (scene, moved) != self._guided_by:
             frame = MOVED if moved else HERE
-            cast(Any, self._model).guide.set_occupancy(self.occupancy(scene, frame), frame)
+            cast(Any, self._model).leco_guide.set_occupancy(self.occupancy(scene, frame), frame)
             self._guided_by = scene, moved
         return self._model.eval()
 

@@ -36,7 +36,7 @@ HOST_RULES = (
         reason="a host whose field gets no gradient learns nothing; a gate that gets one, or that "
         "an optimizer decays, no longer is the occupancy whose price was measured.",
         remedy="sample under torch.no_grad as a context, shade outside of it, and leave "
-        "self.guide out of get_param_groups and of requires_grad_.",
+        "self.leco_guide out of get_param_groups and of requires_grad_.",
         checks={HOST: host_training.teaches_the_host_alone},
     ),
     Rule(

@@ -15,6 +15,9 @@ from leco_plugin.conformance.watching import densely, shaded
 if TYPE_CHECKING:
     from nerfstudio.models.base_model import Model
 
+GUIDE = "leco_guide."
+"""How the names of what belongs to the guide of a host begin."""
+
 
 def samples_shift_in_training(case: HostCase) -> None:
     """The field is asked at other places in each step."""
@@ -45,10 +48,10 @@ def teaches_the_host_alone(case: HostCase) -> None:
     require(bool(reached), "no parameter of the host gets a gradient")
     for name, gradient in gradients.items():
         require(bool(gradient.isfinite().all()), f"the gradient of {name} is not finite")
-    for name, parameter in model.guide.named_parameters():
+    for name, parameter in model.leco_guide.named_parameters():
         require(not parameter.requires_grad, f"{name} of the guide is no longer frozen")
         require(id(parameter) not in handed_out, f"{name} of the guide is handed to an optimizer")
-    touched = [name for name in gradients if name.startswith("guide.")]
+    touched = [name for name in gradients if name.startswith(GUIDE)]
     require(not touched, f"{_some(touched)} of the guide get a gradient")
 
 
@@ -79,7 +82,8 @@ def nothing_superfluous_is_left(case: HostCase) -> None:
         f"{_some(sorted(idle))} are trained with the host's own sampler, and get no gradient now",
     )
     state = model.state_dict().keys()
-    more = sorted(name for name in state - own.state_dict().keys() if name[:6] != "guide.")
+    gained = state - own.state_dict().keys()
+    more = sorted(name for name in gained if not name.startswith(GUIDE))
     require(not more, f"the state dict has gained {_some(more)} beside the guide")
     held = {id(parameter) for parameter in now.values()}
     for name, group in model.get_param_groups().items():

@@ -87,7 +87,7 @@ def _read(occupancy: Occupancy, folder: Path) -> GateHistory:
         return GateHistory.load(file, occupancy.gate)
     except FileNotFoundError:
         raise InputError(
-            f"there is no {file}: a run leaves one with "
+            f"there is no {file}: a run of leco-occupancy leaves one with "
             "--pipeline.model.schedule.steps-per-record 10"
         ) from None
     except ValueError as error:

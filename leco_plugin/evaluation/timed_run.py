@@ -223,7 +223,7 @@ class _Course:
     def _look_for_occupancy(self) -> bool:
         """Notes when there is an occupancy; returns whether there is one since the last look."""
         model: Any = self.trainer.pipeline.model
-        guide = getattr(model, "guide", None)
+        guide = getattr(model, "leco_guide", None)
         there = bool(getattr(model, "frozen", False)) or getattr(guide, "occupancy", None)
         if self.run.freeze_seconds is not None or not there:
             return False

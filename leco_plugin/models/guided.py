@@ -23,6 +23,7 @@ from nerfstudio.models.base_model import Model, ModelConfig
 
 from leco_plugin.compat.checkpoints import allow_checkpoint_globals
 from leco_plugin.compat.earlier_configs import GrowingConfig
+from leco_plugin.compat.earlier_guides import read_earlier_guide
 from leco_plugin.compat.host_lpips import setup_with_lazy_lpips
 from leco_plugin.compat.host_outputs import with_counts_as_floats
 from leco_plugin.models.failures import require_finite
@@ -66,7 +67,8 @@ def set_up_guided(config: GuidedModelConfig, **arguments: Any) -> Model:
         config: host and occupancy.
         arguments: what nerfstudio gives a model (scene_box, num_train_data, metadata, device, ...).
     Raises:
-        InputError: the host has no seam that is known, or there is no such sampler for it.
+        InputError: the host has no seam that is known, or there is no such sampler for it, or none
+            with these options.
     """
     allow_checkpoint_globals()
     if torch.device(arguments.get("device", "cpu")).type == "cpu":
@@ -83,7 +85,8 @@ def set_up_guided(config: GuidedModelConfig, **arguments: Any) -> Model:
         with suppress(InputError):  # a checkpoint brings its own; without one, training says it
             guide.set_occupancy(load_occupancy(config.occupancy.path))
     host = with_counts_as_floats(setup_with_lazy_lpips(host_config, **arguments))
-    host.guide = guide
+    host.leco_guide = guide  # by no name that the host may have given something of its own
+    read_earlier_guide(host)
     swap_sampler(host, guide)
     guide.register_load_state_dict_post_hook(lambda guide, _: set_first_density(host, guide))
     _refuse_what_is_not_finite(host)
@@ -118,7 +121,10 @@ def _begin_with_occupancy(host: Model, guide: Guide, config: OccupancyConfig) ->
     own_callbacks = host.get_training_callbacks
 
     @functools.wraps(own_callbacks)
-    def get_training_callbacks(attributes: TrainingCallbackAttributes) -> list[TrainingCallback]:
+    def get_training_callbacks(
+        training_callback_attributes: TrainingCallbackAttributes,
+    ) -> list[TrainingCallback]:
+        attributes = training_callback_attributes  # by which name a pipeline may hand them over
         if not guide.needs_occupancy:
             return own_callbacks(attributes)
         start = GuidedStart(host, guide, config, attributes.pipeline, attributes.trainer)

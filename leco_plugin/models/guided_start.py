@@ -18,12 +18,18 @@ from leco_plugin.models.ranks import is_first, say
 from leco_plugin.occupancy import Occupancy
 from leco_plugin.samplers.rays import intersect_box
 from leco_plugin.samplers.registry import check_gate
-from leco_plugin.scenes.frames import between, frame_of
+from leco_plugin.scenes.frames import between, frame_of, moved, turned
 from leco_plugin.scenes.input_error import InputError
 from leco_plugin.scenes.survey import announce, covering_rays, survey
 
 PLACES = 128
 """Positions on each ray at which a file is asked whether it fits the cameras."""
+
+LEARNING = (
+    "the occupancy is learned first, and is in no checkpoint until then: a run that is stopped "
+    "before starts over. A run of leco-occupancy can be gone on with, and its folder be given here "
+    "with --pipeline.model.occupancy.path"
+)
 
 OWN_SAMPLER = "own"
 """Name of no sampler: the host keeps its own."""
@@ -40,7 +46,7 @@ class OccupancyConfig(GrowingConfig):
     """Name in the registry of samplers. For comparison: `dense`, `occupancy-grid`, and `own`, which
     leaves the host as it is."""
     options: dict[str, int | float] = field(default_factory=dict)
-    """Of that sampler, as its entry in the registry says: resolution 256 levels 4."""
+    """Of that sampler, by name: resolution 256 levels 4."""
     front_to_back: bool = False
     """Packed hosts, when they render: ask densities front to back, and shade nothing behind an
     opaque surface. The image is the same to a thousandth; it pays where shading costs much more
@@ -123,7 +129,8 @@ class GuidedStart:
         try:
             check_gate(guide.sampler, learned or config.learning.sizes.gate)
         except ValueError as error:
-            raise InputError(str(error)) from None
+            here = "; or here, with that option at --pipeline.model.occupancy.learning"
+            raise InputError(f"{error}{'' if learned else here}") from None
         self.kept = None if guide.occupancy is None else self._fit(guide.occupancy)
 
     def before_step(self, step: int) -> None:
@@ -134,6 +141,7 @@ class GuidedStart:
         if self.guide.occupancy is None:
             from leco_plugin.models.learn_first import learn_occupancy
 
+            say(LEARNING)
             config = self.config
             occupancy = learn_occupancy(
                 config.learning, self.pipeline, config.rays, config.seconds, config.rate
@@ -181,7 +189,7 @@ def kept_of_rays(guide: Guide, cameras: Any) -> tuple[Tensor, Tensor]:
     occupancy = guide.the_occupancy()
     frame = guide.frame
     origins, directions = (part.reshape(-1, 3).to(frame) for part in covering_rays(cameras))
-    origins, directions = origins @ frame[:, :3].T + frame[:, 3], directions @ frame[:, :3].T
+    origins, directions = moved(origins, frame), turned(directions, frame)
     center, half = occupancy.space.center, occupancy.space.half_extent
     # a contraction goes on beyond its inner cube: most of what is seen lies within some of those
     reach = half if occupancy.space.kind == "box" else 8.0 * half

@@ -26,6 +26,8 @@ from leco_plugin.scenes.known_distances import sampler_here
 FIRST_TIMED, TIMED_STEPS = 5, 15
 """Steps between which a step is timed, to keep to a budget; the first ones are slow."""
 FEWEST_STEPS = 20
+OF_LEARNER, OF_HOST = "--pipeline.model.", "--pipeline.model.occupancy.learning."
+"""Where the options of what learns are, in `leco-occupancy` and in a guided host."""
 
 
 def learn_occupancy(
@@ -37,12 +39,16 @@ def learn_occupancy(
 ) -> Occupancy:
     """Trains an HMoE on the pipeline's data until its gate is frozen and calibrated.
 
-    Arguments and errors as for `learn_model`.
+    Arguments and errors as for `learn_model`, with options named as they are given to a host.
 
     Returns:
         The occupancy, in the coordinates of the pipeline's model.
     """
-    occupancy: Occupancy = learn_model(config, pipeline, rays, seconds, rate).occupancy()
+    try:
+        model = learn_model(config, pipeline, rays, seconds, rate)
+    except InputError as error:
+        raise InputError(str(error).replace(OF_LEARNER, OF_HOST)) from None
+    occupancy: Occupancy = model.occupancy()
     return occupancy.eval()
 
 
@@ -67,9 +73,8 @@ def learn_model(
     Returns:
         The model as it is at the moment of freezing.
     Raises:
-        InputError: see `check_budget`.
+        InputError: as `check_budget`; the gate would never be frozen; or its sizes cannot be.
         FloatingPointError, RuntimeError: learning failed; one line says where and why.
-        InputError: the gate would never be frozen.
     """
     check_budget(rays, seconds, rate)
     manager = pipeline.datamanager

@@ -12,8 +12,9 @@ import math
 
 from torch import Tensor, nn
 
-from leco_plugin.models.guide import Guide, GuidedEstimator
+from leco_plugin.models.guide import Guide
 from leco_plugin.models.ranks import say
+from leco_plugin.models.stand_ins import GuidedEstimator
 
 OPACITY = 0.9
 """Of half of the rays, what is kept hides at least so much at first."""

@@ -34,8 +34,8 @@ class ScheduleConfig:
     ramp_to: float = 0.7
     """Share of `learn_steps` from which it has its full weight."""
     steps_per_record: int = 0
-    """Steps between two entries of `occupancy_history.safetensors` in the run's folder, from which
-    `leco inspect` draws how the occupancy was learned; 0 writes none."""
+    """Of leco-occupancy: steps between two entries of `occupancy_history.safetensors` in the run's
+    folder, from which `leco inspect` draws how the occupancy was learned; 0 writes none."""
     steps_per_check: int = 25
     """Steps between two looks at the gate."""
     agreement: float = 0.99

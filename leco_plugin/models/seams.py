@@ -15,8 +15,8 @@ from typing import TYPE_CHECKING, Any, cast
 from torch import nn
 
 from leco_plugin.entries import foreign_entries
-from leco_plugin.models.guide import DensityFn, Guide
-from leco_plugin.samplers.base import Estimator
+from leco_plugin.models.guide import Guide
+from leco_plugin.samplers.base import DensityFn, Estimator
 from leco_plugin.scenes.input_error import InputError
 
 if TYPE_CHECKING:
@@ -116,6 +116,7 @@ def _replace(host: nn.Module, old: nn.Module, new: nn.Module) -> None:
 
 
 def _estimators(host: nn.Module) -> list[nn.Module]:
+    """What marches rays through boxes in a host."""
     from nerfacc.estimators.base import AbstractEstimator
     from nerfacc.estimators.prop_net import PropNetEstimator
 
@@ -124,6 +125,7 @@ def _estimators(host: nn.Module) -> list[nn.Module]:
         for module in host.modules()
         if isinstance(module, AbstractEstimator | Estimator)
         and not isinstance(module, PropNetEstimator)
+        and len(getattr(module, "aabbs", ())) > 0
     ]
 
 
@@ -191,11 +193,12 @@ def no_density(*_: Any, **__: Any) -> None:
 
 
 def _density_lists(host: nn.Module) -> Iterator[tuple[str, list[Any] | tuple[Any, ...]]]:
-    """Lists of bound methods of modules, as proposal hosts hand to their sampler."""
+    """Lists of methods of modules in the host, as proposal hosts hand to their sampler; those of
+    its own methods are for something else."""
     for name, value in vars(host).items():
         if isinstance(value, list | tuple) and value:
             owners = [getattr(item, "__self__", None) for item in value]
-            if all(isinstance(owner, nn.Module) for owner in owners):
+            if all(isinstance(owner, nn.Module) and owner is not host for owner in owners):
                 yield name, value
 
 

@@ -18,13 +18,16 @@ from leco_plugin.samplers.marching import NearFn, OccupiedFn, Samples, march, pl
 from leco_plugin.samplers.rays import intersect_box
 from leco_plugin.samplers.visibility import SampleFn, front_to_back, prune
 
+DensityFn = Callable[[Tensor], Tensor]
+"""Positions [N, 3] to densities [N] or [N, 1]."""
+
 
 class Estimator(nn.Module):
     """Marches rays and keeps what a subclass calls occupied.
 
     Attributes:
-        density_fn: density of a position, [N, 3] to [N] or [N, 1]. When a host sets it, evaluation
-            goes front to back and hands out no sample behind an opaque surface.
+        density_fn: density of a position. When a host sets it, evaluation goes front to back and
+            hands out no sample behind an opaque surface.
         chunk_size: most candidates worked on at once; None chooses by device.
     """
 
@@ -33,7 +36,7 @@ class Estimator(nn.Module):
     def __init__(self) -> None:
         super().__init__()
         self.register_buffer("_place", torch.empty(0), persistent=False)
-        self.density_fn: Callable[[Tensor], Tensor] | None = None
+        self.density_fn: DensityFn | None = None
         self.chunk_size: int | None = None
 
     @property
@@ -174,9 +177,7 @@ class Estimator(nn.Module):
         )
 
 
-def densities_of_samples(
-    density_fn: Callable[[Tensor], Tensor], rays_o: Tensor, rays_d: Tensor
-) -> SampleFn:
+def densities_of_samples(density_fn: DensityFn, rays_o: Tensor, rays_d: Tensor) -> SampleFn:
     """Density of samples from the density of positions, asked at the midpoints."""
 
     def sigma_fn(t_starts: Tensor, t_ends: Tensor, ray_indices: Tensor) -> Tensor:

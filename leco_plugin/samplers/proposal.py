@@ -140,6 +140,7 @@ class DenseSampler(Sampler):
         num_samples: of the host, after its proposals; not looked at.
         samples: samples of each ray.
         initial_sampler, single_jitter: as of `LearnedOccupancySampler`.
+        occupancy, frame: likewise; not looked at.
     """
 
     def __init__(
@@ -148,6 +149,8 @@ class DenseSampler(Sampler):
         samples: int = 256,
         initial_sampler: Sampler | None = None,
         single_jitter: bool = False,
+        occupancy: OccupancyLike | None = None,
+        frame: Tensor | None = None,
     ) -> None:
         super().__init__()
         self.samples = samples

@@ -7,7 +7,8 @@ installed knows them, and modules are imported when a sampler is built, not when
 from __future__ import annotations
 
 import importlib
-from collections.abc import Callable, Mapping
+import inspect
+from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -16,6 +17,10 @@ from torch import nn
 from leco_plugin.entries import foreign_entries, why_left_out
 
 GROUP = "leco_plugin.samplers"
+GIVEN = {"aabb", "occupancy", "num_samples", "initial_sampler", "single_jitter", "frame"}
+"""What hosts give a builder; whatever else it takes is an option."""
+HOSTS = {"estimator": "packed", "proposal": "proposal"}
+"""The hosts that call each of the two kinds of samplers."""
 
 
 @dataclass(frozen=True)
@@ -26,7 +31,8 @@ class SamplerSpec:
     """One line for lists and help."""
     estimator: Callable[..., nn.Module] | str | None = None
     """Builds what a packed host calls (`base.Estimator`), or "module:attribute" of such. Called
-    with `aabb` (the host's box, [6]), `occupancy` (None when there is none) and options."""
+    with `aabb` (the host's box, [6]), `occupancy` (None when there is none) and options, which are
+    its other parameters."""
     proposal: Callable[..., nn.Module] | str | None = None
     """Builds what a proposal host calls (`proposal.LearnedOccupancySampler`), likewise. Called with
     `occupancy`, with the host's `num_samples`, `initial_sampler` and `single_jitter`, and where
@@ -46,16 +52,17 @@ DENSE = SamplerSpec(
 )
 DENSE_PROPOSAL = SamplerSpec(
     description="samples spread as a host spreads its first ones: the reference; option samples",
-    proposal="leco_plugin.samplers.registry:build_dense_proposal",
+    proposal="leco_plugin.samplers.proposal:DenseSampler",
 )
 OCCUPANCY_GRID = SamplerSpec(
     description="Instant-NGP's occupancy grid as in nerfacc; options resolution, levels",
     estimator="leco_plugin.samplers.registry:build_grid",
 )
 LEARNED_OCCUPANCY = SamplerSpec(
-    description="a frozen gate with a cell cache; options cache_bytes, tolerance",
+    description="a frozen gate with a cell cache; options cache_bytes, for packed hosts tolerance, "
+    "for proposal hosts num_candidates",
     estimator="leco_plugin.samplers.registry:build_learned",
-    proposal="leco_plugin.samplers.registry:build_learned_proposal",
+    proposal="leco_plugin.samplers.proposal:LearnedOccupancySampler",
     needs_occupancy=True,
     check_options={"cache_bytes": 1 << 16},
 )
@@ -126,11 +133,46 @@ def _build(name: str, kind: str, options: dict[str, Any]) -> nn.Module:
         raise ValueError(f"sampler {name!r} needs an occupancy")
     if spec.needs_occupancy:
         check_gate(name, getattr(getattr(options["occupancy"], "gate", None), "config", None))
-    if isinstance(builder, str):
-        module, _, attribute = builder.partition(":")
-        builder = getattr(importlib.import_module(module), attribute)
-    estimator: nn.Module = builder(**options)
+    estimator: nn.Module = _loaded(builder)(**options)
     return estimator
+
+
+def _loaded(builder: Callable[..., nn.Module] | str) -> Callable[..., nn.Module]:
+    """A builder, imported where a spec says where it is."""
+    if not isinstance(builder, str):
+        return builder
+    module, _, attribute = builder.partition(":")
+    made: Callable[..., nn.Module] = getattr(importlib.import_module(module), attribute)
+    return made
+
+
+def refuse_unknown_options(
+    name: str, options: Collection[str], kinds: tuple[str, ...] = tuple(HOSTS)
+) -> None:
+    """Whether a sampler takes options of these names, in hosts that call one of these kinds.
+
+    Of a builder that takes any (`**options`) nothing is known, and nothing refused.
+
+    Raises:
+        ValueError: there is no such sampler, or it does not take one of them.
+    """
+    spec = sampler_spec(name)
+    if not options:
+        return
+    known: set[str] = set()
+    for builder in (getattr(spec, kind) for kind in kinds):
+        if builder is not None:
+            parameters = inspect.signature(_loaded(builder)).parameters
+            if any(each.kind is each.VAR_KEYWORD for each in parameters.values()):
+                return
+            known |= parameters.keys() - GIVEN
+    unknown = next((option for option in options if option not in known), None)
+    if unknown is not None:
+        here = f" in {HOSTS[kinds[0]]} hosts" if len(kinds) == 1 else ""
+        there_are = ", ".join(sorted(known)) or "none"
+        raise ValueError(
+            f"the sampler {name!r} has no option {unknown!r}{here}; there are {there_are}"
+        )
 
 
 def check_gate(name: str, config: Any) -> None:
@@ -156,31 +198,19 @@ def build_dense(aabb: Any = None, occupancy: Any = None, levels: int = 1) -> nn.
     return DenseEstimator(aabb if aabb is None else nested_boxes(aabb, levels)[-1])
 
 
-def build_dense_proposal(**options: Any) -> nn.Module:
-    """`proposal.DenseSampler`; it asks no occupancy."""
-    from leco_plugin.samplers.proposal import DenseSampler
-
-    options.pop("occupancy", None)
-    options.pop("frame", None)
-    return DenseSampler(**options)
-
-
-def build_grid(aabb: Any, occupancy: Any = None, **options: Any) -> nn.Module:
+def build_grid(
+    aabb: Any, occupancy: Any = None, resolution: int = 128, levels: int = 1
+) -> nn.Module:
     """`grid.OccupancyGridEstimator` whose innermost level is the host's box."""
     from leco_plugin.samplers.grid import OccupancyGridEstimator
 
-    return OccupancyGridEstimator(aabb, **options)
+    return OccupancyGridEstimator(aabb, resolution, levels)
 
 
-def build_learned(occupancy: Any, aabb: Any = None, **options: Any) -> nn.Module:
+def build_learned(
+    occupancy: Any, aabb: Any = None, cache_bytes: int = 1 << 20, tolerance: float = 1e-4
+) -> nn.Module:
     """`estimator.LearnedOccupancyEstimator`; it needs no box, so the host's is left aside."""
     from leco_plugin.samplers.estimator import LearnedOccupancyEstimator
 
-    return LearnedOccupancyEstimator(occupancy, **options)
-
-
-def build_learned_proposal(occupancy: Any, aabb: Any = None, **options: Any) -> nn.Module:
-    """`proposal.LearnedOccupancySampler`."""
-    from leco_plugin.samplers.proposal import LearnedOccupancySampler
-
-    return LearnedOccupancySampler(occupancy, **options)
+    return LearnedOccupancyEstimator(occupancy, cache_bytes=cache_bytes, tolerance=tolerance)

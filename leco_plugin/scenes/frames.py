@@ -43,8 +43,18 @@ def inverse(frame: Tensor) -> Tensor:
     return torch.cat([turn, -turn @ frame[:, 3:].double()], dim=1).to(frame)
 
 
+def turned(directions: Tensor, frame: Tensor) -> Tensor:
+    """Directions [N, 3] by turn and scale of a frame [3, 4], in whatever precision a host is."""
+    with torch.autocast(directions.device.type, enabled=False):
+        return directions @ frame[:, :3].T
+
+
+def moved(positions: Tensor, frame: Tensor) -> Tensor:
+    """Positions [N, 3] taken to another frame [3, 4]."""
+    return turned(positions, frame) + frame[:, 3]
+
+
 def box_around(box: Tensor, frame: Tensor) -> Tensor:
     """The smallest box along the axes of a frame that holds a box of the host: [6] from [6]."""
-    corners = torch.cartesian_prod(*box.view(2, 3).T)
-    turned = corners @ frame[:, :3].T + frame[:, 3]
-    return torch.cat([turned.amin(dim=0), turned.amax(dim=0)])
+    corners = moved(torch.cartesian_prod(*box.view(2, 3).T), frame)
+    return torch.cat([corners.amin(dim=0), corners.amax(dim=0)])

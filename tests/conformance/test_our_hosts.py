@@ -32,5 +32,5 @@ def test_a_case_goes_back_to_its_own_coordinates() -> None:
     (case,) = host_cases("leco-switch-nerf")
     (rule,) = (rule for rule in HOST_RULES if rule.name == "shades-only-what-is-kept")
     assert apply(rule, case).problem == ""
-    assert not case.shared(moved=True).guide.same_frame()
-    assert case.shared().guide.same_frame()
+    assert not case.shared(moved=True).leco_guide.same_frame()
+    assert case.shared().leco_guide.same_frame()

@@ -10,7 +10,8 @@ from leco_plugin.conformance.checking import cases_of, pairs, sampler_cases
 from leco_plugin.conformance.rule import apply
 from leco_plugin.conformance.sampler_rules import SAMPLER_RULES
 from leco_plugin.samplers import nerfacc_cpu, registry
-from leco_plugin.samplers.registry import SamplerSpec, build_learned_proposal
+from leco_plugin.samplers.proposal import LearnedOccupancySampler
+from leco_plugin.samplers.registry import SamplerSpec
 
 
 @pytest.mark.slow  # `learned-occupancy` builds cell caches, also in two processes
@@ -70,7 +71,7 @@ def test_rules_have_names_of_their_own_and_say_why_and_what_to_do():
 
 
 def without_jitter(occupancy, num_samples, initial_sampler, frame=None):
-    return build_learned_proposal(occupancy, num_samples=num_samples)
+    return LearnedOccupancySampler(occupancy, num_samples)
 
 
 @pytest.mark.parametrize(

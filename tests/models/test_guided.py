@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -16,11 +16,14 @@ from nerfstudio.engine.callbacks import TrainingCallbackAttributes, TrainingCall
 from nerfstudio.fields.density_fields import HashMLPDensityField
 from nerfstudio.model_components.ray_samplers import ProposalNetworkSampler
 from nerfstudio.models.base_model import Model
+from nerfstudio.models.instant_ngp import NGPModel
 from small_hosts import SMALL, pipeline_of, small, unswapped
-from torch import Tensor
+from torch import Tensor, nn
 
-from leco_plugin.models.guide import GuidedEstimator
+from leco_plugin.conformance.host_scene import model_arguments
+from leco_plugin.models.guide import Guide
 from leco_plugin.models.guided import GuidedModelConfig
+from leco_plugin.models.stand_ins import GuidedEstimator
 from leco_plugin.samplers import estimator
 from leco_plugin.swap import with_sampler_swapped
 
@@ -96,6 +99,22 @@ def pair(
         yield Pair(name, own, guided)
 
 
+class HasAGuide(NGPModel):
+    """Calls something of its own a guide."""
+
+    def populate_modules(self) -> None:
+        super().populate_modules()
+        self.guide = nn.Linear(2, 2)
+
+
+def test_what_guides_a_host_takes_the_place_of_nothing_that_it_has() -> None:
+    config: Any = with_sampler_swapped(small("instant-ngp"), Path("none")).pipeline
+    host = replace(config.model.host, _target=HasAGuide)
+    model = replace(config.model, host=host).setup(**model_arguments())
+    assert isinstance(model.guide, nn.Linear)
+    assert isinstance(model.leco_guide, Guide)
+
+
 def bundle_of(pipeline: Any) -> Any:
     """Rays of a whole camera, [H, W]."""
     cameras = pipeline.datamanager.train_dataset.cameras
@@ -136,7 +155,7 @@ def test_what_the_gate_makes_superfluous_is_gone(pair: Pair) -> None:
     superfluous = {name for name in before if name.startswith(SUPERFLUOUS[pair.name] or "-")}
     assert bool(superfluous) == bool(SUPERFLUOUS[pair.name])
     assert before - after == superfluous
-    assert all(name.startswith("guide.") for name in after - before)
+    assert all(name.startswith("leco_guide.") for name in after - before)
     parts = (OccGridEstimator, ProposalNetworkSampler, HashMLPDensityField)
     assert not any(isinstance(module, parts) for module in guided.modules())
     trained = {name for name, p in own.named_parameters() if p.requires_grad}
@@ -149,7 +168,7 @@ def test_what_is_trained_is_the_host_without_its_sampling(pair: Pair) -> None:
     groups = guided.get_param_groups()
     assert groups.keys() == own.get_param_groups().keys() - PROPOSAL_GROUP.get(pair.name, set())
     assert all(groups.values())
-    gate = {id(parameter) for parameter in guided.guide.parameters()}
+    gate = {id(parameter) for parameter in guided.leco_guide.parameters()}
     assert gate
     handed_out = [id(parameter) for group in groups.values() for parameter in group]
     assert not gate & set(handed_out)
@@ -159,7 +178,7 @@ def test_what_is_trained_is_the_host_without_its_sampling(pair: Pair) -> None:
 
 
 def test_a_step_teaches_the_host_and_not_the_gate(pair: Pair) -> None:
-    before = {n: p.clone() for n, p in pair.guided.model.guide.named_parameters()}
+    before = {n: p.clone() for n, p in pair.guided.model.leco_guide.named_parameters()}
     own, guided = pair.steps()
     assert guided.keys() == own.keys() - PROPOSAL_LOSS.get(pair.name, set())
     assert all(bool(loss.isfinite()) for loss in guided.values())
@@ -168,8 +187,8 @@ def test_a_step_teaches_the_host_and_not_the_gate(pair: Pair) -> None:
     grads = {n: p.grad for n, p in pair.guided.model.named_parameters() if p.grad is not None}
     assert grads and all(bool(grad.isfinite().all()) for grad in grads.values())
     assert any(bool(grad.any()) for grad in grads.values())
-    assert not any(name.startswith("guide.") for name in grads)
-    after = dict(pair.guided.model.guide.named_parameters())
+    assert not any(name.startswith("leco_guide.") for name in grads)
+    after = dict(pair.guided.model.leco_guide.named_parameters())
     assert before.keys() == after.keys()
     assert all(torch.equal(before[name], after[name]) for name in before)
 
@@ -209,7 +228,7 @@ def kept_share(pipeline: Any, occupancy: Any) -> float:
 def test_it_shades_where_the_occupancy_keeps_something(pair: Pair) -> None:
     if pair.name == "switch-nerf":
         pytest.skip("its backdrops are shaded whatever an occupancy says: see test_switch_nerf")
-    guide = pair.guided.model.guide
+    guide = pair.guided.model.leco_guide
     turn, shift = guide.frame.split([3, 1], dim=1)
 
     def occupied(positions: Tensor) -> Tensor:
@@ -237,10 +256,10 @@ def test_a_state_brings_its_own_gate(pair: Pair, tiny_scene: Path) -> None:
     empty.load_state_dict(pair.guided.state_dict())
     positions = torch.rand(500, 3) - 0.5
     assert torch.equal(
-        model.guide.the_occupancy().query(positions),
-        pair.guided.model.guide.the_occupancy().query(positions),
+        model.leco_guide.the_occupancy().query(positions),
+        pair.guided.model.leco_guide.the_occupancy().query(positions),
     )
-    assert torch.equal(model.guide.frame, pair.guided.model.guide.frame)
+    assert torch.equal(model.leco_guide.frame, pair.guided.model.leco_guide.frame)
     assert model.get_param_groups().keys() == pair.guided.model.get_param_groups().keys()
     assert all(
         len(group) == len(pair.guided.model.get_param_groups()[name])

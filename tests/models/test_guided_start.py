@@ -9,7 +9,7 @@ from typing import Any
 
 import pytest
 import torch
-from ball_occupancy import ball, ball_of_the_tiny_scene
+from ball_occupancy import ball_of_the_tiny_scene
 from nerfstudio.cameras.rays import RayBundle
 from nerfstudio.data.datamanagers.base_datamanager import VanillaDataManagerConfig
 from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataParserConfig
@@ -28,12 +28,13 @@ from leco_plugin.models.guided_start import (
     kept_of_rays,
 )
 from leco_plugin.occupancy import Occupancy
-from leco_plugin.samplers import estimator
 from leco_plugin.scenes.frames import box_around, frame_of
 from leco_plugin.scenes.input_error import InputError
 from leco_plugin.space import Space
 
-pytestmark = [  # nerfstudio leaves the images open whose size it has read
+pytestmark = [
+    pytest.mark.usefixtures("without_cache"),
+    # nerfstudio leaves the images open whose size it has read
     pytest.mark.filterwarnings("ignore:unclosed file:ResourceWarning"),
     pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning"),
 ]
@@ -84,14 +85,6 @@ def readers(tilted: Path) -> dict[str, Data]:
         name: Data(NerfstudioDataParserConfig(data=tilted, **values))
         for name, values in options.items()
     }
-
-
-@pytest.fixture(autouse=True)
-def without_cache(monkeypatch: pytest.MonkeyPatch) -> None:
-    def refuse(*_: object, **__: object) -> None:
-        raise ValueError("no cache in this test")
-
-    monkeypatch.setattr(estimator, "build_cache", refuse)
 
 
 def lopsided(data: Data) -> Occupancy:
@@ -180,26 +173,6 @@ def test_a_proposal_host_asks_in_the_coordinates_of_the_occupancy(
     assert torch.equal(weights.flatten()[clear] > 0.0, expected[clear])
 
 
-def test_steps_that_do_not_grow_end_at_the_hosts_box() -> None:
-    """An unbounded occupancy has no end of its own, and nerfstudio's sampler gives none."""
-    guide = Guide()
-    space = Space("contraction", (0.0, 0.0, 0.0), 1.0)
-    guide.set_occupancy(Occupancy(ball().gate, space, 1e-9))
-    inner, outer = torch.tensor([-1.0] * 3 + [1.0] * 3), torch.tensor([-2.0] * 3 + [2.0] * 3)
-    origins = torch.tensor([[-3.0, 0.0, 0.0], [0.0, 1.5, 0.0], [0.0, 3.0, 0.0]])
-    directions = torch.tensor([[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [1.0, 0.0, 0.0]])
-    guided: Any = guide.estimator(inner, outer).eval()
-    march: dict[str, Any] = {"render_step_size": 0.125, "far_plane": 1e10}
-    rays, _, t_ends = guided.sampling(origins, directions, **march)
-    assert [float(t_ends[rays == ray].max()) for ray in (0, 1)] == pytest.approx([5.0, 0.5])
-    assert not bool((rays == 2).any())
-    sooner = torch.tensor([1.0, 9.0, 9.0])
-    rays, _, t_ends = guided.sampling(origins, directions, t_max=sooner, **march)
-    assert [float(t_ends[rays == ray].max()) for ray in (0, 1)] == pytest.approx([1.0, 0.5])
-    rays, _, t_ends = guided.sampling(origins, directions, cone_angle=0.5, far_plane=50.0)
-    assert float(t_ends.max()) > 40.0
-
-
 def test_readers_that_agree_need_no_frame(readers: dict[str, Data]) -> None:
     assert started(lopsided(readers["turned up"]), readers["turned up"]).same_frame()
 
@@ -208,19 +181,6 @@ def test_an_occupancy_that_does_not_say_is_asked_as_it_is(readers: dict[str, Dat
     occupancy = lopsided(readers["as it is"])
     occupancy.report = {}
     assert started(occupancy, readers["as it is"]).same_frame()
-
-
-def test_a_turned_box_holds_the_box_and_no_more() -> None:
-    box = torch.tensor([-1.0, -2.0, 0.0, 1.0, 3.0, 0.5])
-    turn = torch.linalg.qr(torch.randn(3, 3, generator=torch.Generator().manual_seed(1)))[0]
-    frame = torch.cat([1.7 * turn, torch.tensor([[0.3], [-2.0], [1.0]])], dim=1)
-    around = box_around(box, frame)
-    inside = torch.lerp(box[:3], box[3:], torch.rand(2000, 3)) @ frame[:, :3].T + frame[:, 3]
-    assert bool(((inside >= around[:3] - 1e-5) & (inside <= around[3:] + 1e-5)).all())
-    x, y, z = (box[[i, i + 3]] for i in range(3))
-    corners = torch.stack([g.flatten() for g in torch.meshgrid(x, y, z, indexing="ij")], dim=-1)
-    corners = corners @ frame[:, :3].T + frame[:, 3]
-    torch.testing.assert_close(around, torch.cat([corners.amin(0), corners.amax(0)]))
 
 
 def test_a_sampler_with_a_box_gets_the_hosts_in_the_coordinates_that_it_is_asked_in(
@@ -232,7 +192,7 @@ def test_a_sampler_with_a_box_gets_the_hosts_in_the_coordinates_that_it_is_asked
         seen.update(options)
         return torch.nn.Identity()
 
-    monkeypatch.setattr("leco_plugin.models.guide.build_estimator", build)
+    monkeypatch.setattr("leco_plugin.models.stand_ins.build_estimator", build)
     guide = started(lopsided(readers["as it is"]), readers["turned by pca"])
     box = torch.tensor([-1.0, -1.0, -1.0, 1.0, 1.0, 1.0])
     _ = guide.estimator(box).sampler
@@ -283,7 +243,8 @@ def test_a_sampler_and_a_gate_that_do_not_fit_are_refused_before_learning(
     data, name = readers["as it is"], "learned-occupancy-hash"
     with pytest.raises(InputError, match=f"{name}.* asks a gate on hash features"):
         started(ball_of_the_tiny_scene(), data, name)
-    with pytest.raises(InputError, match=f"{name}.* asks a gate on hash features"):
+    learning = "--pipeline.model.occupancy.learning"
+    with pytest.raises(InputError, match=f"{name}.* asks a gate on hash features.*{learning}$"):
         GuidedStart(nn.Module(), Guide(name), OccupancyConfig(sampler=name), Pipe(data))
 
 
@@ -323,6 +284,23 @@ def test_the_first_step_leaves_the_file_in_the_runs_folder(
     assert not (Trainer.base_dir / NAME).exists()
 
 
+def test_before_learning_a_run_says_that_it_starts_over_where_it_is_stopped(
+    readers: dict[str, Data], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    said: list[str] = []
+
+    def learn(*_: object) -> Occupancy:
+        said.append("learned")
+        return ball_of_the_tiny_scene()
+
+    monkeypatch.setattr("leco_plugin.models.guided_start.say", said.append)
+    monkeypatch.setattr("leco_plugin.models.learn_first.learn_occupancy", learn)
+    guide = Guide()
+    GuidedStart(nn.Module(), guide, OccupancyConfig(), Pipe(readers["as it is"])).before_step(0)
+    assert "in no checkpoint until then" in said[0] and said[1] == "learned"
+    assert guide.occupancy is not None
+
+
 def test_a_host_that_asks_no_gate_needs_no_occupancy(tiny_scene: Path) -> None:
     config: Any = leco_ngp.config.pipeline
     data = VanillaDataManagerConfig(dataparser=NerfstudioDataParserConfig(data=tiny_scene))
@@ -331,7 +309,7 @@ def test_a_host_that_asks_no_gate_needs_no_occupancy(tiny_scene: Path) -> None:
     pipeline: Any = VanillaPipelineConfig(datamanager=data, model=model).setup(device="cpu")
     attributes = TrainingCallbackAttributes(None, None, pipeline, None)  # type: ignore[arg-type]
     pipeline.get_training_callbacks(attributes)
-    assert pipeline.model.guide.occupancy is None
+    assert pipeline.model.leco_guide.occupancy is None
 
 
 def test_where_the_scene_lies_is_said_before_the_first_step(

@@ -9,7 +9,7 @@ from typing import Any
 
 import pytest
 import torch
-from ball_occupancy import CENTRE, ball
+from ball_occupancy import ball
 
 from leco_plugin.models import host_watch
 from leco_plugin.models.calibration import CalibrationConfig
@@ -17,7 +17,6 @@ from leco_plugin.models.guide import Guide
 from leco_plugin.models.guided import _refuse_what_is_not_finite
 from leco_plugin.models.host_watch import HostWatch
 from leco_plugin.occupancy import Occupancy
-from leco_plugin.samplers import estimator
 
 BOX = torch.tensor([-4.0, -4.0, -4.0, 4.0, 4.0, 4.0])
 RAYS = 64
@@ -114,29 +113,6 @@ def test_what_was_found_travels_with_a_checkpoint(watched: Watched) -> None:
     fresh = Guide()
     fresh.load_state_dict(watched.guide.state_dict())
     assert fresh.watched == watched.guide.watched and fresh.watched["rechecks"] == 1
-
-
-def test_a_guide_that_is_dense_for_the_moment_keeps_every_candidate(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    def refuse(*_: object, **__: object) -> None:
-        raise ValueError("no cache in this test")
-
-    monkeypatch.setattr(estimator, "build_cache", refuse)
-    guide = Guide()
-    guide.set_occupancy(copy.deepcopy(ball()))
-    origins = (torch.tensor(CENTRE) + torch.tensor([0.0, 0.0, 3.0])).expand(4, 3)
-    directions = torch.tensor([[0.0, 0.0, -1.0]]).expand(4, 3)
-    march = {"render_step_size": 0.05, "near_plane": 0.0, "far_plane": 4.0}
-    stand_in = guide.estimator(BOX).train()
-    some = stand_in.sampling(origins, directions, **march)[0]
-    assert guide.kept == len(some)
-    guide.dense = True
-    every = stand_in.sampling(origins, directions, **march)[0]
-    guide.dense = False
-    guide.the_occupancy().threshold_value.fill_(0.0)
-    inside = stand_in.sampling(origins, directions, **march)[0]
-    assert 0 < len(some) < len(every) and abs(len(every) - len(inside)) <= 8
 
 
 @pytest.mark.parametrize("where", ["image", "loss", "weight"])

@@ -14,6 +14,7 @@ from leco_plugin.models.learn_first import FEWEST_STEPS, keep_within, learn_occu
 from leco_plugin.models.leco_config import LecoModelConfig
 from leco_plugin.models.phases import MOST_EXTENSIONS, ScheduleConfig
 from leco_plugin.models.progress import Progress
+from leco_plugin.models.sizes import SMALL
 from leco_plugin.occupancy import Occupancy
 from leco_plugin.scenes.input_error import InputError
 from leco_plugin.scenes.photographs import LecoPhotographsDataParserConfig
@@ -91,6 +92,13 @@ def test_nothing_to_learn_with_is_refused_in_a_line(pipeline, name: str, value: 
 def test_what_would_learn_for_ever_is_refused(pipeline, never):
     with pytest.raises(InputError, match=r"for ever.*leco-occupancy"):
         learn_occupancy(replace(config(8), **never), pipeline, rays=32)
+
+
+def test_sizes_that_cannot_be_are_named_as_options_of_the_host(pipeline):
+    impossible = replace(config(8), sizes=replace(SMALL, candidates=0))
+    option = "--pipeline.model.occupancy.learning.sizes.candidates is 0"
+    with pytest.raises(InputError, match=f"^{option}, below 1$"):
+        learn_occupancy(impossible, pipeline, rays=32)
 
 
 def test_each_method_has_learning_sizes_of_its_own():

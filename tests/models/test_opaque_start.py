@@ -14,11 +14,11 @@ from nerfstudio.engine.callbacks import TrainingCallbackAttributes, TrainingCall
 from small_hosts import pipeline_of, small
 from torch import nn
 
-from leco_plugin.models.guide import Guide, GuidedEstimator
+from leco_plugin.models.guide import Guide
 from leco_plugin.models.opaque_start import begin_opaque
+from leco_plugin.models.stand_ins import GuidedEstimator
 from leco_plugin.models.switch_config import SwitchNerfModelConfig
 from leco_plugin.models.switch_sizes import SMALL
-from leco_plugin.samplers import estimator
 from leco_plugin.scenes.bounds import SceneBounds
 from leco_plugin.swap import with_sampler_swapped
 
@@ -89,12 +89,8 @@ def test_switch_nerf_begins_opaque_too_whatever_its_scene_measures() -> None:
 
 
 def test_a_checkpoint_brings_the_density_back(
-    tiny_scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    tiny_scene: Path, tmp_path: Path, without_cache: None
 ) -> None:
-    def refuse(*arguments: object, **options: object) -> None:
-        raise ValueError("a test is short")
-
-    monkeypatch.setattr(estimator, "build_cache", refuse)
     ball_of_the_tiny_scene().save(tmp_path / "occupancy.safetensors")
     config = with_sampler_swapped(small("instant-ngp"), tmp_path / "occupancy.safetensors")
     begun, reader = (pipeline_of(config, tiny_scene) for _ in range(2))
@@ -102,7 +98,7 @@ def test_a_checkpoint_brings_the_density_back(
     for callback in begun.get_training_callbacks(attributes):
         callback.run_callback_at_location(0, TrainingCallbackLocation.BEFORE_TRAIN_ITERATION)
     model: Any = begun.model
-    assert model.guide.first_density == model.field.average_init_density > 1.0
+    assert model.leco_guide.first_density == model.field.average_init_density > 1.0
     assert reader.model.field.average_init_density == 1.0
     reader.model.load_state_dict(model.state_dict())
     assert reader.model.field.average_init_density == model.field.average_init_density

@@ -13,8 +13,9 @@ from nerfstudio.model_components.ray_samplers import (
 )
 from torch import nn
 
-from leco_plugin.models.guide import Guide, GuidedEstimator, GuidedProposal
+from leco_plugin.models.guide import Guide
 from leco_plugin.models.seams import no_density, swap_sampler
+from leco_plugin.models.stand_ins import GuidedEstimator, GuidedProposal
 
 
 class Host(nn.Module):
@@ -100,6 +101,37 @@ def test_a_proposal_host_keeps_nothing_of_its_networks(guide: Guide):
     assert host.opinions == [no_density] * 3
     assert set(host.get_param_groups()) == {"fields"}
     assert {name.split(".")[0] for name in host.state_dict()} == {"field"}
+
+
+class WithStages(Proposal):
+    """Holds its own methods in a list, too."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.stages = [self.get_loss_dict, self.get_param_groups]
+
+
+def test_a_list_of_the_hosts_own_methods_is_none_of_proposal_densities(guide: Guide):
+    host = WithStages()
+    before = list(host.stages)
+    swap_sampler(host, guide)
+    assert host.stages == before
+    assert host.opinions == [no_density] * 3
+
+
+class Boxless(nerfacc.OccGridEstimator):
+    """An estimator whose boxes are called otherwise."""
+
+    def __init__(self) -> None:
+        super().__init__(torch.tensor([-1.0] * 3 + [1.0] * 3), 8, 1)
+        del self.aabbs
+
+
+def test_an_estimator_without_boxes_needs_an_adapter(guide: Guide):
+    host = Packed()
+    host.gatekeeper = host.walker.occupancy_grid = Boxless()
+    with pytest.raises(ValueError, match="has no sampler that could be swapped"):
+        swap_sampler(host, guide)
 
 
 def test_a_loss_that_reaches_nothing_is_left_out_in_training_only(guide: Guide):

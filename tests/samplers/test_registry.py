@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 import re
 import warnings
 from importlib.metadata import EntryPoint
@@ -14,7 +15,15 @@ from samplers.analytic_occupancy import Balls, camera_rays
 
 from leco_plugin.samplers import registry
 from leco_plugin.samplers.base import Estimator
-from leco_plugin.samplers.registry import SamplerSpec, build_estimator, build_proposal, samplers
+from leco_plugin.samplers.estimator import LearnedOccupancyEstimator
+from leco_plugin.samplers.grid import OccupancyGridEstimator
+from leco_plugin.samplers.registry import (
+    SamplerSpec,
+    build_estimator,
+    build_proposal,
+    refuse_unknown_options,
+    samplers,
+)
 
 KINDS = ["hash", "vm", "k-planes"]
 BOX = torch.tensor([-1.0] * 3 + [1.0] * 3)
@@ -34,6 +43,41 @@ def test_options_reach_the_sampler():
     assert grid.binaries.shape == (2, 16, 16, 16)
     learned = build_estimator("learned-occupancy", occupancy=Balls(), cache_bytes=0)
     assert learned.cache is None
+
+
+@pytest.mark.parametrize(
+    ("builder", "made"),
+    [
+        (registry.build_grid, OccupancyGridEstimator),
+        (registry.build_learned, LearnedOccupancyEstimator),
+    ],
+)
+def test_an_option_left_out_is_what_it_is_without_the_registry(builder, made):
+    own = inspect.signature(made).parameters
+    options = {
+        name: each.default
+        for name, each in inspect.signature(builder).parameters.items()
+        if name not in registry.GIVEN
+    }
+    assert options == {name: own[name].default for name in options}
+    assert options.keys() == own.keys() - registry.GIVEN - {"roi_aabb"}
+
+
+def test_options_that_a_sampler_does_not_have_are_named():
+    refuse_unknown_options("learned-occupancy", ["cache_bytes", "tolerance", "num_candidates"])
+    refuse_unknown_options("dense", ["levels"], ("estimator",))
+    with pytest.raises(ValueError, match=r"'dense' has no option 'aabb'; there are levels$"):
+        refuse_unknown_options("dense", ["levels", "aabb"])
+    with pytest.raises(ValueError, match=r"'dense' has no option 'levels' .* there are none$"):
+        refuse_unknown_options("dense", ["levels"], ("proposal",))
+    with pytest.raises(ValueError, match="no sampler 'dens'"):
+        refuse_unknown_options("dens", [])
+
+
+def test_a_builder_that_takes_anything_is_not_asked_what(monkeypatch):
+    spec = SamplerSpec("takes all", estimator=lambda aabb, **options: torch.nn.Identity())
+    monkeypatch.setitem(registry.OURS, "takes-all", spec)
+    refuse_unknown_options("takes-all", ["whatever"])
 
 
 def test_a_proposal_host_gets_a_sampler():

@@ -6,7 +6,7 @@ from types import SimpleNamespace
 
 import torch
 
-from leco_plugin.scenes.frames import between, frame_of, inverse
+from leco_plugin.scenes.frames import between, box_around, frame_of, inverse, moved
 
 
 def rotation(seed: int) -> torch.Tensor:
@@ -36,8 +36,8 @@ def test_points_of_one_reader_are_taken_to_those_of_another():
     points = torch.randn(50, 3, dtype=torch.float64)
     host, other = reader(1, 0.3), reader(2, 2.5)
     frame = between(frame_of(host), frame_of(other)).double()
-    moved = in_model(host, points) @ frame[:, :3].T + frame[:, 3]
-    torch.testing.assert_close(moved, in_model(other, points), rtol=1e-4, atol=1e-4)
+    found = moved(in_model(host, points), frame)
+    torch.testing.assert_close(found, in_model(other, points), rtol=1e-4, atol=1e-4)
 
 
 def test_the_same_reader_is_exactly_the_identity():
@@ -52,5 +52,19 @@ def test_a_data_manager_without_a_reader_has_no_known_frame():
 def test_an_inverse_takes_positions_back():
     frame = torch.cat([1.7 * torch.linalg.qr(torch.randn(3, 3))[0], torch.randn(3, 1)], dim=1)
     back, points = inverse(frame), torch.randn(10, 3)
-    there = points @ frame[:, :3].T + frame[:, 3]
-    torch.testing.assert_close(there @ back[:, :3].T + back[:, 3], points)
+    there = moved(points, frame)
+    torch.testing.assert_close(there, points @ frame[:, :3].T + frame[:, 3])
+    torch.testing.assert_close(moved(there, back), points)
+
+
+def test_a_turned_box_holds_the_box_and_no_more():
+    box = torch.tensor([-1.0, -2.0, 0.0, 1.0, 3.0, 0.5])
+    turn = torch.linalg.qr(torch.randn(3, 3, generator=torch.Generator().manual_seed(1)))[0]
+    frame = torch.cat([1.7 * turn, torch.tensor([[0.3], [-2.0], [1.0]])], dim=1)
+    around = box_around(box, frame)
+    inside = torch.lerp(box[:3], box[3:], torch.rand(2000, 3)) @ frame[:, :3].T + frame[:, 3]
+    assert bool(((inside >= around[:3] - 1e-5) & (inside <= around[3:] + 1e-5)).all())
+    x, y, z = (box[[i, i + 3]] for i in range(3))
+    corners = torch.stack([g.flatten() for g in torch.meshgrid(x, y, z, indexing="ij")], dim=-1)
+    corners = corners @ frame[:, :3].T + frame[:, 3]
+    torch.testing.assert_close(around, torch.cat([corners.amin(0), corners.amax(0)]))

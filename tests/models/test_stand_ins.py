@@ -1,0 +1,177 @@
+"""A host's stand-ins ask samplers in the occupancy's coordinates, and answer in the host's."""
+
+from __future__ import annotations
+
+import copy
+import inspect
+from typing import Any
+
+import pytest
+import torch
+from ball_occupancy import BOX, CENTRE, MARCH, ball, rays
+from nerfstudio.cameras.rays import RayBundle
+from nerfstudio.viewer.utils import parse_object
+from nerfstudio.viewer.viewer_elements import ViewerElement
+
+from leco_plugin.models.guide import Guide
+from leco_plugin.occupancy import Occupancy
+from leco_plugin.samplers.base import Estimator
+from leco_plugin.samplers.estimator import LearnedOccupancyEstimator
+from leco_plugin.space import Space
+
+pytestmark = pytest.mark.usefixtures("without_cache")
+
+
+@pytest.fixture
+def guide() -> Guide:
+    made = Guide()
+    made.set_occupancy(ball())
+    return made
+
+
+def test_a_host_samples_as_with_the_estimator_itself(guide: Guide):
+    own = LearnedOccupancyEstimator(ball()).eval()
+    origins, directions = rays()
+    expected = own.sampling(origins, directions, **MARCH)
+    found = guide.estimator(BOX).eval().sampling(origins, directions, **MARCH)
+    assert len(expected[0]) > 0
+    for a, b in zip(found, expected):
+        assert torch.equal(a, b)
+
+
+def test_the_signature_is_that_of_estimators(guide: Guide):
+    stand_in = inspect.signature(type(guide.estimator(BOX)).sampling)
+    assert stand_in == inspect.signature(Estimator.sampling)
+
+
+def test_a_host_in_other_coordinates_gets_the_same_samples(guide: Guide):
+    turn, scale = torch.linalg.qr(torch.randn(3, 3))[0], 2.5
+    turn = turn * torch.det(turn)
+    shift = torch.tensor([0.3, -1.0, 0.2])
+    origins, directions = rays()
+    expected = guide.estimator(BOX).eval().sampling(origins, directions, **MARCH)
+    # where the host sees what the occupancy sees at p: (p - shift) turned back and shrunk
+    host_origins, host_directions = (origins - shift) @ turn / scale, directions @ turn
+    guide.set_occupancy(ball(), torch.cat([scale * turn, shift[:, None]], dim=1))
+    shorter = {name: value / scale for name, value in MARCH.items()}
+    found = guide.estimator(BOX).eval().sampling(host_origins, host_directions, **shorter)
+    assert abs(len(found[0]) - len(expected[0])) <= 2  # rounding at the ball's edge
+    both = min(len(found[0]), len(expected[0]))
+    torch.testing.assert_close(
+        found[1][:both].sort()[0] * scale, expected[1][:both].sort()[0], atol=0.06, rtol=0.0
+    )
+
+
+def test_boxes_and_cells_are_answered_in_the_hosts_coordinates(guide: Guide):
+    shift = torch.tensor([0.3, -1.0, 0.2])
+    here = guide.estimator(BOX)
+    boxes, opacities, decisions = here.aabbs, here.occs, here.binaries
+    guide.set_occupancy(ball(), torch.cat([2.0 * torch.eye(3), shift[:, None]], dim=1))
+    there = guide.estimator(BOX)
+    torch.testing.assert_close(there.aabbs, (boxes - shift.repeat(2)) / 2.0)
+    torch.testing.assert_close(there.occs, opacities, atol=0.02, rtol=0.0)
+    assert (there.binaries != decisions).float().mean() < 1e-3
+    assert 0.01 < decisions.float().mean() < 0.5
+
+
+def test_steps_that_do_not_grow_end_at_the_hosts_box():
+    """An unbounded occupancy has no end of its own, and nerfstudio's sampler gives none."""
+    guide = Guide()
+    space = Space("contraction", (0.0, 0.0, 0.0), 1.0)
+    guide.set_occupancy(Occupancy(ball().gate, space, 1e-9))
+    inner, outer = torch.tensor([-1.0] * 3 + [1.0] * 3), torch.tensor([-2.0] * 3 + [2.0] * 3)
+    origins = torch.tensor([[-3.0, 0.0, 0.0], [0.0, 1.5, 0.0], [0.0, 3.0, 0.0]])
+    directions = torch.tensor([[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [1.0, 0.0, 0.0]])
+    guided: Any = guide.estimator(inner, outer).eval()
+    march: dict[str, Any] = {"render_step_size": 0.125, "far_plane": 1e10}
+    indices, _, t_ends = guided.sampling(origins, directions, **march)
+    assert [float(t_ends[indices == ray].max()) for ray in (0, 1)] == pytest.approx([5.0, 0.5])
+    assert not bool((indices == 2).any())
+    sooner = torch.tensor([1.0, 9.0, 9.0])
+    indices, _, t_ends = guided.sampling(origins, directions, t_max=sooner, **march)
+    assert [float(t_ends[indices == ray].max()) for ray in (0, 1)] == pytest.approx([1.0, 0.5])
+    _, _, t_ends = guided.sampling(origins, directions, cone_angle=0.5, far_plane=50.0)
+    assert float(t_ends.max()) > 40.0
+
+
+def wall_behind(x: float):
+    """A host's density: opaque beyond the plane z < x of the occupancy's coordinates."""
+    return lambda positions: 1e3 * (positions[:, 2:] < x).float()
+
+
+@pytest.mark.parametrize("scale", [1.0, 2.0], ids=["same frame", "another"])
+@pytest.mark.parametrize("sampler", ["learned-occupancy", "dense"])
+def test_rendering_front_to_back_hands_out_nothing_behind_a_wall(scale: float, sampler: str):
+    made = Guide(sampler, front_to_back=True)
+    made.set_occupancy(ball(), torch.cat([scale * torch.eye(3), torch.zeros(3, 1)], dim=1))
+    middle = CENTRE[2] / scale
+    estimator = made.estimator(BOX / scale, density_fn=wall_behind(middle)).eval()
+    origins, _ = rays(1)
+    march = {name: value / scale for name, value in MARCH.items()}
+
+    def depths() -> torch.Tensor:
+        down = torch.tensor([[0.0, 0.0, -1.0]])
+        _, starts, ends = estimator.sampling(origins / scale, down, **march)
+        return origins[0, 2] / scale - 0.5 * (starts + ends)
+
+    step = march["render_step_size"]
+    assert middle - 2 * step < depths().min() < middle
+    estimator.train()
+    assert depths().min() < middle - 0.5 / scale
+
+
+def test_a_proposal_host_in_other_coordinates_samples_the_ball(guide: Guide):
+    turn = torch.tensor([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
+    origins, directions = rays(3)
+    directions = torch.nn.functional.normalize(torch.tensor(CENTRE) - origins, dim=-1)
+    guide.set_occupancy(ball(), torch.cat([turn, torch.zeros(3, 1)], dim=1))
+    bundle = RayBundle(
+        origins=origins @ turn,
+        directions=directions @ turn,
+        pixel_area=torch.ones(3, 1),
+        nears=torch.zeros(3, 1),
+        fars=torch.full((3, 1), 8.0),
+    )
+    samples, _, _ = guide.proposal(num_samples=16).eval()(bundle)
+    inside = (samples.frustums.get_positions() @ turn.T - torch.tensor(CENTRE)).norm(dim=-1)
+    assert (inside < 1.3).float().mean() > 0.9
+
+
+def test_a_host_in_half_precision_moves_its_rays_in_full(guide: Guide):
+    turn = torch.linalg.qr(torch.randn(3, 3))[0]
+    guide.set_occupancy(ball(), torch.cat([turn * torch.det(turn), torch.ones(3, 1)], dim=1))
+    origins, directions = rays()
+    expected = guide.estimator(BOX).sampling(origins, directions, **MARCH)
+    with torch.autocast("cpu", torch.bfloat16):
+        found = guide.estimator(BOX).sampling(origins, directions, **MARCH)
+    assert torch.equal(found[1], expected[1])
+
+
+def test_a_guide_that_is_dense_for_the_moment_keeps_every_candidate(guide: Guide):
+    guide.set_occupancy(copy.deepcopy(ball()))
+    origins = (torch.tensor(CENTRE) + torch.tensor([0.0, 0.0, 3.0])).expand(4, 3)
+    directions = torch.tensor([[0.0, 0.0, -1.0]]).expand(4, 3)
+    march = MARCH | {"far_plane": 4.0}
+    stand_in = guide.estimator(BOX).train()
+    some = stand_in.sampling(origins, directions, **march)[0]
+    assert guide.kept == len(some)
+    guide.dense = True
+    every = stand_in.sampling(origins, directions, **march)[0]
+    guide.dense = False
+    guide.the_occupancy().threshold_value.fill_(0.0)
+    inside = stand_in.sampling(origins, directions, **march)[0]
+    assert 0 < len(some) < len(every) and abs(len(every) - len(inside)) <= 8
+
+
+def test_the_viewer_looks_for_its_elements_before_there_is_an_occupancy():
+    host = torch.nn.Module()
+    host.guide = Guide()
+    host.grid, host.chooser = host.guide.estimator(BOX), host.guide.proposal(num_samples=3)
+    assert parse_object(host, ViewerElement, "Custom Elements") == []
+
+
+def test_the_viewer_does_not_ask_a_gate_when_it_looks_for_its_elements(guide: Guide):
+    host = torch.nn.Module()
+    host.guide, host.grid = guide, guide.estimator(BOX)
+    parse_object(host, ViewerElement, "Custom Elements")
+    assert host.grid._built[0] is None
