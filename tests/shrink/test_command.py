@@ -201,6 +201,52 @@ def lost_on_unseen_rays(ground: search.Ground, smaller: Occupancy) -> list[float
     ]
 
 
+def test_search_verification_and_teaching_have_no_pixel_in_common(
+    known_run: Path, tiny_scene: Path
+) -> None:
+    file = known_run / "occupancy.safetensors"
+    source, original = sources.find_source(file, tiny_scene), Occupancy.load(file)
+    seen = [*sources.held_out(source, original, 512), sources.trained_on(source, original, 512)]
+    pixels = [
+        {(int(image), *map(float, ray)) for image, ray in zip(one.rays.images, one.rays.directions)}
+        for one in seen
+        if one.rays.images is not None
+    ]
+    searched, verified, taught = pixels
+    assert min(len(searched), len(verified)) > 50
+    assert not searched & verified and not (searched | verified) & taught
+
+
+def test_the_file_declares_what_rays_have_lost_that_the_search_did_not_see(
+    known_run: Path, tiny_scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """To them, places where the original hardly keeps anything are worth most."""
+    grounds: list[search.Ground] = []
+    prepare = command._ground
+
+    def harder(source: sources.Source, original: Occupancy) -> search.Ground:
+        ground = prepare(source, original)
+        (reference,) = ground.references
+        evidence = reference.verify.evidence
+        doubtful = original.query(evidence.positions) < 1.05 * original.threshold
+        worth = evidence.worth * (1.0 + 50.0 * doubtful)
+        verify = reference.verify._replace(evidence=evidence._replace(worth=worth))
+        grounds.append(ground._replace(references=[reference._replace(verify=verify)]))
+        return grounds[-1]
+
+    monkeypatch.setattr(command, "_ground", harder)
+    monkeypatch.setattr(search, "MARGIN", 1.0)
+    smaller_ones = [GateConfig(EncodingConfig(octaves=3), 16, 2, 1)]
+    monkeypatch.setattr(search, "ladder", lambda most: smaller_ones)
+    file, out, report = known_run / "occupancy.safetensors", tmp_path / "small", tmp_path / "a.json"
+    bounds = ["--lost-surface-mass", 0.99, "--image-price", 50, "--json", report]
+    assert run("shrink", file, "--data", tiny_scene, "--out", out, *bounds) == 0
+    smaller, rung = Occupancy.load(out), json.loads(report.read_text())["rungs"][-1]
+    (lost,) = lost_on_unseen_rays(grounds[0], smaller)
+    assert rung["verified"]["lost_surface_mass"] == pytest.approx(lost + 1e-4, rel=1e-3)
+    assert smaller.report["lost_surface_mass"] > lost > 2.0 * rung["lost_surface_mass"] > 0.0
+
+
 def test_what_is_declared_holds_against_the_field_at_the_moment_of_freezing(
     known_run: Path, tiny_scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
