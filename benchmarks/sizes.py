@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import copy
 import json
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -145,7 +145,7 @@ def train(data: Path, sizes: Sizes, seed: int, options: Options) -> dict[str, An
     """One training run."""
     config: Any = copy.deepcopy(leco_occupancy.config)
     config.pipeline.datamanager.data = data
-    config.output_dir = options.folder / "runs"
+    config.output_dir = options.folder / "sweep"
     model = config.pipeline.model
     schedule = replace(model.schedule, learn_steps=options.learn_steps)
     config.pipeline.model = replace(model, sizes=sizes, schedule=schedule)
@@ -185,6 +185,26 @@ def cities_of(options: Options) -> dict[int, Path]:
     return {n: write_city(CityConfig(n), options.folder / f"city-{n}", capture) for n in blocks}
 
 
+def wanted_runs(
+    scenes: Mapping[Path, dict[str, Any]], cities: Mapping[int, Path], options: Options
+) -> list[tuple[Path, str, Sizes, int]]:
+    """Scene, point, sizes and seed of each run, seed after seed.
+
+    Args:
+        scenes: as `look` describes them.
+        cities: by their blocks a side.
+    """
+    ways = {cities[n]: larger for n in options.beside_larger}
+    ways |= {data: sweep for data in (*(cities[n] for n in options.cities), *options.data)}
+    most = sizes_for(best_device())
+    return [
+        (data, name, sizes, seed)
+        for seed in options.seeds
+        for data, way in ways.items()
+        for name, sizes in way(sizes_of(scenes[data]), most, options).items()
+    ]
+
+
 def main(options: Options) -> None:
     """Trains what is not stored yet, and stores each run.
 
@@ -195,24 +215,16 @@ def main(options: Options) -> None:
     settings = {"steps": options.steps, "learn_steps": options.learn_steps}
     rows = stored_rows(options.out, settings)
     cities = cities_of(options)
-    swept = [*(cities[n] for n in options.cities), *options.data]
-    trained = [*swept, *(cities[n] for n in options.beside_larger)]
     blocks = {folder: n for n, folder in cities.items()}
-    scenes = [
-        described(data, blocks.get(data)) for data in dict.fromkeys([*trained, *cities.values()])
-    ]
-    most = sizes_for(best_device())
-    wanted = [
-        (data, name, sizes, seed)
-        for seed in options.seeds
-        for data, facts in zip(trained, scenes)
-        for name, sizes in (sweep if data in swept else larger)(
-            sizes_of(facts), most, options
-        ).items()
-    ]
+    scenes = {
+        data: described(data, blocks.get(data))
+        for data in dict.fromkeys([*options.data, *cities.values()])
+    }
+    wanted = wanted_runs(scenes, cities, options)
     left = sum(find(rows, data.name, sizes, seed) is None for data, _, sizes, seed in wanted)
     print(f"{left} of {len(wanted)} runs to do", flush=True)
     done: list[dict[str, Any]] = []
+    report: dict[str, Any] = {"verdict": {}, "bars": []}
     for data, name, sizes, seed in wanted:
         row = find(rows, data.name, sizes, seed)
         if row is None:
@@ -225,13 +237,13 @@ def main(options: Options) -> None:
             "machine": describe_machine(),
             "code": describe_code(),
             "settings": settings,
-            "scenes": scenes,
+            "scenes": list(scenes.values()),
             "verdict": verdict(done),
-            "bars": bars(scenes, done),
+            "bars": bars(list(scenes.values()), done),
             "runs": [*done, *({**row, "point": None} for row in rows if not _among(row, done))],
         }
         write_json(options.out, report)
-    print(json.dumps([verdict(done), bars(scenes, done)], indent=1))
+    print(json.dumps([report["verdict"], report["bars"]], indent=1))
 
 
 def find(

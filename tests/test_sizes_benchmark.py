@@ -14,6 +14,7 @@ import pytest
 ROOT = Path(__file__).resolve().parent.parent
 sys.path.insert(0, str(ROOT / "benchmarks"))
 
+import sizes_sections  # noqa: E402
 from sizes import Options, dry, larger, stored_rows, sweep  # noqa: E402
 from sizes_figures import ahead, bars, points_of, verdict  # noqa: E402
 from sizes_tables import (  # noqa: E402
@@ -167,6 +168,22 @@ def test_the_fine_grid_stands_beside_the_best_gate_of_a_hundredth_of_its_bytes()
     report = {"scene": {"train_images": 53}, "representations": rows, "chosen": rows[0]}
     line = capacity_table({"city-3": report}).splitlines()[-1]
     assert line == "| city-3 | 53 | hash 8 | 30.0 | 2.00 | none | 6.00 | 5.00 (vm, 20.0 kB) | yes |"
+
+
+def test_what_is_stored_is_shown_city_after_city(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(sizes_sections, "RESULTS", tmp_path)
+    assert sizes_sections.sizes_sections() == []
+    (tmp_path / "shrink").mkdir()
+    for name in ("fox", "city-16", "brighton_beach", "city-3"):
+        report = shrunk() | {"machine": {"cores": 2}}
+        (tmp_path / "shrink" / f"{name}.json").write_text(json.dumps(report))
+    in_order = ["city-3", "city-16", "brighton_beach", "fox"]
+    assert list(sizes_sections.scene_results("shrink")) == in_order
+    title, command, table = sizes_sections.sizes_sections()
+    assert title.startswith("## ") and "leco shrink" in command and "cores: 2" in command
+    assert [line.split(" | ")[0] for line in table.splitlines()[2:]] == [f"| {n}" for n in in_order]
 
 
 @pytest.mark.slow

