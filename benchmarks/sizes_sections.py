@@ -22,14 +22,18 @@ def sizes_sections() -> list[str]:
             f" {steps} steps each, {learn} of them learning; PSNR of test pixels, differences in "
             "pairs of one seed."
         )
-        command, title = "python benchmarks/sizes.py", "Automatic sizes, and a sweep around them"
+        named = [scene["scene"] for scene in report["scenes"] if "blocks" not in scene]
+        command = " ".join(["python benchmarks/sizes.py", *named])
+        title = "Automatic sizes, and a sweep around them"
         parts += section(title, command, report, sizes_table(report), note)
     if shrunk := scene_results("shrink"):
         note = (
             " In bold: a bar is missed, 32 kB, a declared loss of 1e-3, three times faster queries "
             "(65536 positions, interleaved), or a declaration below what unseen rays have lost."
         )
-        command = "leco shrink RUN --data SCENE --out FILE --json benchmarks/results/shrink"
+        command = (
+            "leco shrink RUN --data SCENE --out FILE --json benchmarks/results/shrink/SCENE.json"
+        )
         title = "Gates shrunk to what decides alike"
         parts += section(title, command, next(iter(shrunk.values())), shrink_table(shrunk), note)
     if measured := scene_results("capacity"):
@@ -39,7 +43,7 @@ def sizes_sections() -> list[str]:
             "share of the volume that rays reach. The last column: whether such a gate keeps no "
             "more than the grid."
         )
-        command = "leco capacity --data SCENE --out DIR --json benchmarks/results/capacity"
+        command = "leco capacity --data SCENE --out DIR --json results/capacity/SCENE.json"
         title = "How much a scene needs: gates and grids at equal loss"
         head, *rest = section(title, command, first, capacity_table(measured), note)
         parts += [head, *(f"{picture(CAPACITY + name)}\n" for name in measured), *rest]

@@ -124,7 +124,16 @@ def capacity_table(reports: Mapping[str, Report]) -> str:
             *_beside(grid, gate),
         )
         lines.append(f"| {scene} | {' | '.join(cells)} |")
-    return "\n".join(lines)
+    return "\n".join([*lines, "", where_it_pays(reports)])
+
+
+def where_it_pays(reports: Mapping[str, Report]) -> str:
+    """For which scenes a grid suffices, and for which a gate is smaller."""
+    groups: dict[bool, list[str]] = {True: [], False: []}
+    for scene, report in reports.items():
+        groups[report["chosen"]["family"] == "grid"].append(scene)
+    grid, gate = (", ".join(groups[suffices]) or "none" for suffices in (True, False))
+    return f"A grid suffices for: {grid}. A gate that keeps as little is smaller for: {gate}."
 
 
 def beside_fine_grid(rows: Sequence[Report]) -> tuple[Report | None, Report | None]:

@@ -166,8 +166,10 @@ def test_the_fine_grid_stands_beside_the_best_gate_of_a_hundredth_of_its_bytes()
     assert grid is rows[3] and gate is rows[1]
     assert beside_fine_grid(rows[:3]) == (None, None)
     report = {"scene": {"train_images": 53}, "representations": rows, "chosen": rows[0]}
-    line = capacity_table({"city-3": report}).splitlines()[-1]
+    of_object = report | {"chosen": rows[3]}
+    *_, line, _, _, said = capacity_table({"city-3": report, "fox": of_object}).splitlines()
     assert line == "| city-3 | 53 | hash 8 | 30.0 | 2.00 | none | 6.00 | 5.00 (vm, 20.0 kB) | yes |"
+    assert said.startswith("A grid suffices for: fox.") and said.endswith("smaller for: city-3.")
 
 
 def test_what_is_stored_is_shown_city_after_city(
