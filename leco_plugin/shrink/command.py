@@ -119,9 +119,7 @@ def _rounded_as_it_is(original: Occupancy) -> Occupancy:
     return original
 
 
-def report_of(
-    original: Occupancy, ground: Ground, found: Found, held_out: bool = True
-) -> dict[str, Any]:
+def report_of(original: Occupancy, ground: Ground, found: Found, held_out: bool) -> dict[str, Any]:
     """What the smaller occupancy declares: the original's loss and, on top, its own.
 
     Args:
