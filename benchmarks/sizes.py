@@ -194,8 +194,9 @@ def wanted_runs(
         scenes: as `look` describes them.
         cities: by their blocks a side.
     """
-    ways = {cities[n]: larger for n in options.beside_larger}
-    ways |= {data: sweep for data in (*(cities[n] for n in options.cities), *options.data)}
+    ways = {data: sweep for data in (*(cities[n] for n in options.cities), *options.data)}
+    for n in options.beside_larger:
+        ways.setdefault(cities[n], larger)
     most = sizes_for(best_device())
     return [
         (data, name, sizes, seed)
