@@ -15,15 +15,16 @@ from typing import Any
 import checkout  # noqa: F401
 from growth_picture import draw as draw_growth
 from large_scene_tables import LARGE_SCENES
+from page_parts import RESULTS, ROOT, machine_line, picture, section
 from PIL import Image
+from sizes_sections import CAPACITY, scene_results, sizes_sections
 
+from leco_plugin.capacity.picture import draw as draw_capacity
 from leco_plugin.chart.picture import draw
 from leco_plugin.chart.table import table
 from leco_plugin.chart.theme import DARK, LIGHT
 from leco_plugin.evaluation.charts import SOURCE, fingerprint
 
-ROOT = Path(__file__).resolve().parent.parent
-RESULTS = ROOT / "benchmarks" / "results"
 PAGE = ROOT / "docs" / "results.md"
 README = ROOT / "README.md"
 CHARTS = ROOT / "docs" / "images" / "charts"
@@ -84,11 +85,6 @@ def demo_table(report: dict[str, Any]) -> str:
     return "\n".join(lines)
 
 
-def machine_line(report: dict[str, Any]) -> str:
-    """What it ran on, in one line."""
-    return ", ".join(f"{name}: {value}" for name, value in report["machine"].items())
-
-
 def chart_section(path: Path) -> list[str]:
     """What `leco chart` stored: its picture and its tables, and the paper's where there are any."""
     results = json.loads(path.read_text())
@@ -98,15 +94,6 @@ def chart_section(path: Path) -> list[str]:
     if path.stem in PAPER_ROWS:
         parts.append(PAPER_ROWS[path.stem])
     return parts
-
-
-def picture(name: str) -> str:
-    """A picture in the page, in the page's colours."""
-    image = f"images/charts/{name}"
-    return (
-        f'<picture><source media="(prefers-color-scheme: dark)" srcset="{image}-dark.png">'
-        f'<img alt="{name}" src="{image}.png"></picture>'
-    )
 
 
 def titles() -> dict[str, str]:
@@ -126,6 +113,9 @@ def pictures() -> dict[Path, Any]:
     if (growth := RESULTS / "growth.json").exists():
         report = json.loads(growth.read_text())
         found |= {GROWTH: report, GROWTH.with_stem("growth-dark"): report}
+    for name, results in scene_results("capacity").items():
+        path = CHARTS / f"{CAPACITY}{name}.png"
+        found |= {path: results, path.with_stem(f"{path.stem}-dark"): results}
     return found
 
 
@@ -137,12 +127,15 @@ def draw_pictures(redraw: bool) -> None:
     for path, results in pictures().items():
         if not (redraw or is_stale(path, results)):
             continue
+        theme = DARK if path.stem.endswith("-dark") else LIGHT
         if path == DEMO_CHART:
             draw_chart(json.loads((RESULTS / "demo.json").read_text()), path)
         elif path.stem.removesuffix("-dark") == GROWTH.stem:
-            draw_growth(path, results, DARK if path.stem.endswith("-dark") else LIGHT)
+            draw_growth(path, results, theme)
+        elif path.stem.startswith(CAPACITY):
+            draw_capacity(results, path, theme)
         else:
-            draw(results, path, DARK if path.stem.endswith("-dark") else LIGHT)
+            draw(results, path, theme)
 
 
 def is_stale(path: Path, results: Any) -> bool:
@@ -215,44 +208,6 @@ def check_gpu(results: dict[str, Any]) -> None:
         raise ValueError(f"results of a GPU that nobody ran on are not shown: {machine}")
 
 
-def sizes_table(report: dict[str, Any]) -> str:
-    """Sizes that were chosen, and beside them the sweep, one row a point."""
-    lines = [
-        "| scene | photographs | texels | table | experts | parameters | of the device's |",
-        "|---|---|---|---|---|---|---|",
-    ]
-    for scene in report["scenes"]:
-        sizes, share = scene["sizes"], scene["parameters"] / scene["device_parameters"]
-        lines.append(
-            f"| {scene['scene']} | {scene['images']} | {scene['texels']:,} "
-            f"| {sizes['field.encoding.levels']} x 2^{sizes['field.encoding.log2_table']} "
-            f"| {sizes['field.experts.scene_experts']} | {scene['parameters']:,} | {share:.0%} |"
-        )
-    lines += [
-        "",
-        "| scene | sizes | parameters | PSNR, mean (least to most) |",
-        "|---|---|---|---|",
-    ]
-    points: dict[tuple[str, str], list[dict[str, Any]]] = {}
-    for row in report["runs"]:
-        if row["point"] is not None:
-            points.setdefault((row["scene"], row["point"]), []).append(row)
-    for (scene, point), runs in sorted(points.items(), key=lambda item: item[0][0]):
-        values = [run["psnr"] for run in runs]
-        lines.append(
-            f"| {scene} | {point} | {runs[0]['parameters']:,} | {sum(values) / len(values):.2f} dB "
-            f"({min(values):.2f} to {max(values):.2f}) |"
-        )
-    lines += ["", "| scene | automatic | best of the sweep | within bounds |", "|---|---|---|---|"]
-    for scene, found in report["verdict"].items():
-        lines.append(
-            f"| {scene} | {found['psnr']:.2f} dB, {found['parameters']:,} "
-            f"| {found['best']}: {found['best_psnr']:.2f} dB, {found['best_parameters']:,} "
-            f"| {'yes' if found['reached'] else '**no**'} |"
-        )
-    return "\n".join(lines)
-
-
 def large_scene_sections() -> list[str]:
     """Of growth, bounds, prior and photographs, those that are stored."""
     parts = []
@@ -266,13 +221,6 @@ def large_scene_sections() -> list[str]:
     return parts
 
 
-def section(
-    title: str, command: str, report: dict[str, Any], table: str, note: str = ""
-) -> list[str]:
-    """Title, the command and the machine that made the table, and the table."""
-    return [f"## {title}\n", f"`{command}`; {machine_line(report)}.{note}\n", f"{table}\n"]
-
-
 def page() -> str:
     """The whole of `docs/results.md`."""
     parts = [HEAD]
@@ -283,12 +231,7 @@ def page() -> str:
         parts += section(title, "leco demo", report, demo_table(report))
     for name in titles():
         parts += chart_section(RESULTS / "charts" / f"{name}.json")
-    if (sizes := RESULTS / "sizes.json").exists():
-        report = json.loads(sizes.read_text())
-        steps, learn = report["settings"]["steps"], report["settings"]["learn_steps"]
-        note = f" {steps} steps each, {learn} of them learning; PSNR of test pixels."
-        command, title = "python benchmarks/sizes.py", "Automatic sizes, and a sweep around them"
-        parts += section(title, command, report, sizes_table(report), note)
+    parts += sizes_sections()
     parts += large_scene_sections()
     for sampling in sorted(RESULTS.glob("sampling*.json")):
         report = json.loads(sampling.read_text())

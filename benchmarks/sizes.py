@@ -1,22 +1,24 @@
 """Automatic sizes against a sweep: `python benchmarks/sizes.py [SCENE ...]`.
 
-`leco-occupancy` trains for the same number of steps, on drone surveys of cities of 1 and 3 blocks a
-side and on scenes that are named: in the sizes that it chooses, in those of the device, and with
-smaller and larger tables and fewer and more experts than chosen. Steps and not seconds: it may run
-beside other work. Each run is stored when it is done; a benchmark that was stopped goes on there.
+`leco-occupancy` trains for the same number of steps, on drone surveys of cities and on scenes that
+are named: in the sizes that it chooses, in those of the device, and with smaller and larger tables
+than chosen; on the largest city in automatic sizes and larger ones only. Steps and not seconds: it
+may run beside other work. A run is stored when it is done; a benchmark that was stopped goes on
+there. `--dry-run` passes through everything in seconds and means nothing.
 """
 
 from __future__ import annotations
 
 import copy
 import json
-import statistics
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+import checkout  # noqa: F401
 import tyro
+from sizes_figures import AUTOMATIC, bars, verdict
 
 from leco_plugin.evaluation.clock import Budget
 from leco_plugin.evaluation.json_file import write_json
@@ -33,10 +35,7 @@ from leco_plugin.scenes.city_folder import write_city
 from leco_plugin.scenes.detail import CAMERAS, detail_of
 from leco_plugin.scenes.survey import points_in
 
-MAY_LOSE, MAY_HAVE, SMALL_AGAINST_LARGE = 0.1, 1.25, 0.25
-"""dB below the best of the sweep, its parameters times this, and parameters of the smallest city
-against those of the largest: the bars."""
-AUTOMATIC, DEVICE = "automatic", "the device's"
+DEVICE = "the device's"
 TABLE, EXPERTS = "field.encoding.log2_table", "scene_experts"
 
 
@@ -47,30 +46,53 @@ class Options:
     data: tyro.conf.Positional[tuple[Path, ...]] = ()
     """Scenes in nerfstudio's format, say caliterra."""
     cities: tuple[int, ...] = (1, 3)
-    """Blocks a side of the cities that are trained on."""
-    sized: tuple[int, ...] = (8,)
+    """Blocks a side of the cities with a sweep."""
+    beside_larger: tuple[int, ...] = (8,)
+    """Blocks a side of cities that are trained in automatic sizes and in larger ones only."""
+    sized: tuple[int, ...] = (16,)
     """Blocks a side of cities for which sizes are chosen only."""
-    steps: int = 300
+    steps: int = 400
     """Training steps of a run."""
     learn_steps: int = 150
     """Of them, until the gate is frozen."""
-    seeds: tuple[int, ...] = (0, 1)
-    """Of the runs."""
+    seeds: tuple[int, ...] = (0, 1, 2)
+    """Of the runs, one after the other: what is there is whole whenever this is stopped."""
     tables: tuple[int, ...] = (-2, 2)
     """Added to the binary logarithm of the table that is chosen."""
-    experts: tuple[float, ...] = (0.5, 2.0)
+    experts: tuple[float, ...] = ()
     """Times the scene experts that are chosen."""
     folder: Path = Path("data/sizes")
     """Where the cities are, or will be."""
     out: Path = Path(__file__).parent / "results" / "sizes.json"
     """Where the figures go."""
     dry_run: bool = False
-    """A tiny city and a few steps: to see that everything passes."""
+    """Tiny cities and a few steps: to see that everything passes."""
 
 
 def dry(options: Options) -> Options:
-    """Sizes that take seconds."""
-    return replace(options, cities=(1,), sized=(2,), steps=8, learn_steps=4, seeds=(0,))
+    """Sizes that take seconds, in a folder and a file of their own."""
+    return replace(
+        options,
+        cities=(1,),
+        beside_larger=(2,),
+        sized=(),
+        steps=8,
+        learn_steps=4,
+        seeds=(0,),
+        folder=options.folder / "dry",
+        out=options.folder / "dry" / "sizes.json",
+    )
+
+
+def larger(chosen: Sizes, most: Sizes, options: Options) -> dict[str, Sizes]:
+    """Of a sweep, the chosen sizes and those with more parameters."""
+    points = sweep(chosen, most, options)
+    few = values_of(chosen, images=0)
+    return {
+        name: sizes
+        for name, sizes in points.items()
+        if name == AUTOMATIC or values_of(sizes, images=0) > few
+    }
 
 
 def sweep(chosen: Sizes, most: Sizes, options: Options) -> dict[str, Sizes]:
@@ -123,6 +145,7 @@ def train(data: Path, sizes: Sizes, seed: int, options: Options) -> dict[str, An
     """One training run."""
     config: Any = copy.deepcopy(leco_occupancy.config)
     config.pipeline.datamanager.data = data
+    config.output_dir = options.folder / "sweep"
     model = config.pipeline.model
     schedule = replace(model.schedule, learn_steps=options.learn_steps)
     config.pipeline.model = replace(model, sizes=sizes, schedule=schedule)
@@ -148,64 +171,61 @@ def train(data: Path, sizes: Sizes, seed: int, options: Options) -> dict[str, An
     return plain
 
 
-def verdict(rows: Sequence[dict[str, Any]]) -> dict[str, dict[str, Any]]:
-    """Of each scene: automatic beside the best of the sweep; only points with all their seeds.
-
-    Args:
-        rows: runs, whose `point` is None where they belong to no point of this sweep.
-    """
-    found = {}
-    for scene in dict.fromkeys(row["scene"] for row in rows):
-        points: dict[str, list[dict[str, Any]]] = {}
-        for row in rows:
-            if row["scene"] == scene and row["point"] is not None:
-                points.setdefault(row["point"], []).append(row)
-        most = max(len(runs) for runs in points.values())
-        means = {
-            name: statistics.fmean(run["psnr"] for run in runs)
-            for name, runs in points.items()
-            if len(runs) == most
-        }
-        if AUTOMATIC not in means:
-            continue
-        best = max(means, key=lambda name: means[name])
-        ours, its = (points[name][0]["parameters"] for name in (AUTOMATIC, best))
-        psnrs = [run["psnr"] for run in points[AUTOMATIC]]
-        found[scene] = {
-            "psnr": means[AUTOMATIC],
-            "spread": max(psnrs) - min(psnrs),
-            "best": best,
-            "best_psnr": means[best],
-            "parameters": ours,
-            "best_parameters": its,
-            "reached": means[AUTOMATIC] >= means[best] - MAY_LOSE and ours <= MAY_HAVE * its,
-        }
-    return found
+def described(data: Path, blocks: int | None) -> dict[str, Any]:
+    """`look`, and of a city how many blocks it has a side."""
+    return look(data) | ({} if blocks is None else {"blocks": blocks})
 
 
-def main(options: Options) -> None:
-    options = dry(options) if options.dry_run else options
+def cities_of(options: Options) -> dict[int, Path]:
+    """The folder of each city by its blocks a side, written where it is missing."""
     capture = CaptureConfig(street_per_block=0.0)
     if options.dry_run:
         capture = replace(capture, width=24, height=18, aerial_per_block=6.0)
-    folders = {
-        blocks: write_city(
-            CityConfig(blocks), options.folder / f"city-{blocks}", capture, layout="nerfstudio"
-        )
-        for blocks in dict.fromkeys([*options.cities, *options.sized])
-    }
-    trained = [*(folders[blocks] for blocks in options.cities), *options.data]
-    scenes = [look(data) for data in dict.fromkeys([*trained, *folders.values()])]
-    settings = {"steps": options.steps, "learn_steps": options.learn_steps}
-    rows = stored_rows(options.out, settings)
+    blocks = dict.fromkeys([*options.cities, *options.beside_larger, *options.sized])
+    return {n: write_city(CityConfig(n), options.folder / f"city-{n}", capture) for n in blocks}
+
+
+def wanted_runs(
+    scenes: Mapping[Path, dict[str, Any]], cities: Mapping[int, Path], options: Options
+) -> list[tuple[Path, str, Sizes, int]]:
+    """Scene, point, sizes and seed of each run, seed after seed.
+
+    Args:
+        scenes: as `look` describes them.
+        cities: by their blocks a side.
+    """
+    ways = {data: sweep for data in (*(cities[n] for n in options.cities), *options.data)}
+    for n in options.beside_larger:
+        ways.setdefault(cities[n], larger)
     most = sizes_for(best_device())
-    wanted = [
+    return [
         (data, name, sizes, seed)
         for seed in options.seeds
-        for data, facts in zip(trained, scenes)
-        for name, sizes in sweep(sizes_of(facts), most, options).items()
+        for data, way in ways.items()
+        for name, sizes in way(sizes_of(scenes[data]), most, options).items()
     ]
+
+
+def main(options: Options) -> None:
+    """Trains what is not stored yet, and stores each run.
+
+    Raises:
+        SystemExit: the file holds runs of other settings.
+    """
+    options = dry(options) if options.dry_run else options
+    settings = {"steps": options.steps, "learn_steps": options.learn_steps}
+    rows = stored_rows(options.out, settings)
+    cities = cities_of(options)
+    blocks = {folder: n for n, folder in cities.items()}
+    scenes = {
+        data: described(data, blocks.get(data))
+        for data in dict.fromkeys([*options.data, *cities.values()])
+    }
+    wanted = wanted_runs(scenes, cities, options)
+    left = sum(find(rows, data.name, sizes, seed) is None for data, _, sizes, seed in wanted)
+    print(f"{left} of {len(wanted)} runs to do", flush=True)
     done: list[dict[str, Any]] = []
+    report: dict[str, Any] = {"verdict": {}, "bars": []}
     for data, name, sizes, seed in wanted:
         row = find(rows, data.name, sizes, seed)
         if row is None:
@@ -218,12 +238,13 @@ def main(options: Options) -> None:
             "machine": describe_machine(),
             "code": describe_code(),
             "settings": settings,
-            "scenes": scenes,
+            "scenes": list(scenes.values()),
             "verdict": verdict(done),
+            "bars": bars(list(scenes.values()), done),
             "runs": [*done, *({**row, "point": None} for row in rows if not _among(row, done))],
         }
         write_json(options.out, report)
-    print(json.dumps(verdict(done), indent=1))
+    print(json.dumps([report["verdict"], report["bars"]], indent=1))
 
 
 def find(
@@ -241,11 +262,19 @@ def _among(row: dict[str, Any], rows: Sequence[dict[str, Any]]) -> bool:
 
 
 def stored_rows(out: Path, settings: dict[str, Any]) -> list[dict[str, Any]]:
-    """Rows that an earlier run of the same settings has left."""
+    """Rows that an earlier run of the same settings has left.
+
+    Raises:
+        SystemExit: they are of other settings.
+    """
     if not out.is_file():
         return []
     stored = json.loads(out.read_text())
-    rows: list[dict[str, Any]] = stored["runs"] if stored["settings"] == settings else []
+    if stored["settings"] != settings:
+        raise SystemExit(
+            f"{out} holds runs of {stored['settings']}, not of {settings}; name another --out"
+        )
+    rows: list[dict[str, Any]] = stored["runs"]
     return rows
 
 

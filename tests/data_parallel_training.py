@@ -19,7 +19,7 @@ from nerfstudio.engine.trainer import Trainer
 from nerfstudio.scripts import train as ns_train
 from torch import Tensor, distributed
 
-from leco_plugin.models import lifecycle
+from leco_plugin.models import lifecycle, merging
 from leco_plugin.models.leco import LecoModel
 from leco_plugin.models.ranks import from_first, is_first, mean, share
 from leco_plugin.occupancy import Occupancy
@@ -40,6 +40,7 @@ def run(local_rank: int, world_size: int, config: Any, global_rank: int = 0) -> 
     if global_rank > 0:
         look_elsewhere()
         drift_before_freezing()
+        need_every_expert()
     seen: dict[str, Any] = {
         "steps": [],
         "looks": [],
@@ -85,6 +86,11 @@ def drift_before_freezing() -> None:
         return freeze(model, *arguments)
 
     lifecycle.freeze = drifted
+
+
+def need_every_expert() -> None:
+    """Has this process find that no scene expert may leave, if it is asked."""
+    merging.find_unneeded = lambda *_: merging.Merging([], None)  # type: ignore[assignment]
 
 
 def record(seen: dict[str, Any]) -> None:

@@ -102,6 +102,8 @@ def config_of(method: Any, scene: Path, folder: Path, name: str) -> Any:
     learning.sizes = SIZES
     learning.schedule = replace(learning.schedule, learn_steps=LEARN)
     learning.calibration = replace(learning.calibration, rays=128)
+    # whatever it costs the image: one scene expert is left
+    learning.merging = replace(learning.merging, image_price_db=1e3, rays=64)
     if learning is not model:
         model.occupancy.rays = 64
         model.host.log2_hashmap_size, model.host.max_res, model.host.cone_angle = 8, 32, 1 / 8
@@ -187,6 +189,17 @@ def test_the_same_gate_is_frozen_and_stays_as_it_was_frozen(learned: Any) -> Non
             for name, gradient in process["gradients"].items()
             if name.startswith(("gate.", "field.density_head"))
         )
+
+
+def test_all_processes_drop_the_experts_that_the_first_one_does_not_need(learned: Any) -> None:
+    config, seen = learned
+    first, second = (process["state"]["field.experts.left"] for process in seen)
+    assert torch.equal(first, second) and first.tolist().count(True) == 1
+    gone = [f"experts.{number}." for number, left in enumerate(first.tolist(), 1) if not left]
+    for process in seen:
+        names = [*process["state"], *process["gradients"]]
+        assert not any(part in name for name in names for part in gone)
+    assert "scene experts: 1 left" in (config.get_base_dir() / "process-0.log").read_text()
 
 
 @pytest.mark.parametrize("method", ["learned", "guided"])

@@ -58,7 +58,15 @@ def gates() -> list[Candidate]:
     """Gates of growing size of each kind."""
     found = [
         Candidate("frequency", f"{o}-{w}-{n}", GateConfig(EncodingConfig(octaves=o), w, n, 1))
-        for o, w, n in ((3, 8, 1), (4, 16, 1), (5, 16, 2), (6, 32, 2), (6, 64, 3), (8, 128, 4))
+        for o, w, n in (
+            (3, 8, 1),
+            (4, 16, 1),
+            (5, 16, 2),
+            (6, 32, 2),
+            (8, 64, 2),
+            (6, 64, 3),
+            (8, 128, 4),
+        )
     ]
     found += [
         Candidate(
@@ -76,7 +84,7 @@ def gates() -> list[Candidate]:
                 GateConfig(EncodingConfig("vm", components=features, plane_cells=cells), 16, 1, 1),
             )
         )
-    for cells, features, levels in ((16, 2, 1), (32, 4, 1), (64, 4, 2), (128, 2, 4)):
+    for cells, features, levels in ((16, 2, 1), (32, 2, 1), (32, 4, 1), (64, 4, 2), (128, 2, 4)):
         found.append(
             Candidate(
                 "k-planes",

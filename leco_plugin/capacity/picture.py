@@ -10,6 +10,7 @@ from typing import Any
 from leco_plugin.capacity.choice import NAMES, choose, common_volume, verdict
 from leco_plugin.capacity.measuring import FAMILIES, VOLUMES
 from leco_plugin.chart.theme import LIGHT, Theme, plain, style
+from leco_plugin.evaluation.charts import SOURCE, fingerprint
 
 LEAST = 1e-5
 """Lost surface mass that is drawn for less, and for none at all."""
@@ -53,7 +54,7 @@ def draw(results: Mapping[str, Any], path: Path, theme: Theme = LIGHT) -> Path:
         figure.legend(
             *(handles, labels), loc="lower center", ncols=len(labels), frameon=False, fontsize=10
         )
-        figure.savefig(path, dpi=150)
+        figure.savefig(path, dpi=150, metadata={SOURCE: fingerprint(results)})
     return path
 
 

@@ -30,8 +30,22 @@ LEAST_LIGHT = 1e-4
 """Transmittance below which a ray is given up: what lies behind changes a pixel by less than a
 thirtieth of a step of an 8-bit image."""
 
-FEWEST_AT_ONCE, MOST_LOOKS = 4, 16
+FEWEST_AT_ONCE, MOST_LOOKS = 8, 16
 """Samples of a ray between two looks at its transmittance, and looks at the longest ray."""
+
+MANY_RAYS = 2048
+"""In a batch from which on a CPU is no slower for looking; see `docs/decisions.md`."""
+
+
+def is_no_slower(num_rays: int, guided: bool, device: torch.device) -> bool:
+    """Whether shading from the front was measured to take no longer than shading everything.
+
+    Args:
+        num_rays: in the batch.
+        guided: whether only what an occupancy keeps is shaded.
+        device: of the model.
+    """
+    return guided and device.type == "cpu" and num_rays >= MANY_RAYS
 
 
 @torch.no_grad()

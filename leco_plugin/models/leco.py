@@ -15,7 +15,7 @@ from torch import Tensor, nn
 from leco_plugin.compat.checkpoints import allow_checkpoint_globals
 from leco_plugin.models.failures import require_finite
 from leco_plugin.models.field import HMoEField
-from leco_plugin.models.front_to_back import shade_front_to_back
+from leco_plugin.models.front_to_back import is_no_slower, shade_front_to_back
 from leco_plugin.models.gate import Gate
 from leco_plugin.models.healing import annealed, is_dense
 from leco_plugin.models.image_figures import image_figures
@@ -261,7 +261,10 @@ class LecoModel(Model):
         if self.training:
             kept = len(intervals.t_starts) / max(len(rays.origins), 1) - 1.0
             self.guided_kept = kept if guided else 1.0
-        if self.config.front_to_back and not self.training:
+        from_the_front = self.config.front_to_back
+        if from_the_front is None:
+            from_the_front = is_no_slower(len(rays.origins), guided, self.device)
+        if from_the_front and not self.training:
             shaded, intervals = self.shade_what_is_seen(rays, intervals)
         else:
             shaded = self.shade(rays, intervals)

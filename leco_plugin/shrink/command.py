@@ -12,6 +12,7 @@ from nerfstudio.utils.rich_utils import CONSOLE
 
 from leco_plugin.evaluation.inspection import whole_box
 from leco_plugin.evaluation.machine import describe_machine
+from leco_plugin.models.freezing import held_out_sampler
 from leco_plugin.occupancy import Occupancy
 from leco_plugin.progress_bar import bar
 from leco_plugin.shrink.evidence import Evidence, gather
@@ -59,7 +60,8 @@ def shrink(file: Path, data: Path, out: Path, bounds: Bounds, seed: int = 0) -> 
     smaller = found.occupancy
     if smaller is None:
         smaller = _rounded_as_it_is(original)
-    smaller.report = report_of(original, ground, found)
+    held_out = held_out_sampler(source.manager) is not None
+    smaller.report = report_of(original, ground, found, held_out)
     out.parent.mkdir(parents=True, exist_ok=True)
     smaller.save(out)
     speedup, times = compare_queries(original, smaller)
@@ -117,8 +119,12 @@ def _rounded_as_it_is(original: Occupancy) -> Occupancy:
     return original
 
 
-def report_of(original: Occupancy, ground: Ground, found: Found) -> dict[str, Any]:
-    """What the smaller occupancy declares: the original's loss and, on top, its own."""
+def report_of(original: Occupancy, ground: Ground, found: Found, held_out: bool) -> dict[str, Any]:
+    """What the smaller occupancy declares: the original's loss and, on top, its own.
+
+    Args:
+        held_out: whether nothing was trained on the pixels of the ground's rays.
+    """
     report = {name: original.report[name] for name in COPIED if name in original.report}
     if "cameras" in report:
         report["cameras"] = [[round(float(x), 4) for x in row] for row in report["cameras"]]
@@ -135,7 +141,7 @@ def report_of(original: Occupancy, ground: Ground, found: Found) -> dict[str, An
             "threshold": found.occupancy.threshold,
             "lost_surface_mass": measured["lost_surface_mass_bound"],
             "calibration_rays": ground.references[0].verify.evidence.rays,
-            "held_out": bool(original.report.get("held_out", False)),
+            "held_out": held_out and bool(original.report.get("held_out", False)),
             "shrunk_from_params": original.num_params,
             "loss_measured_against": names_of(ground.references),
             "kept_volume_of_the_original": rung.kept_volume,

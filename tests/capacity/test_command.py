@@ -13,6 +13,7 @@ from PIL import Image
 from leco_plugin import cli
 from leco_plugin.capacity import command
 from leco_plugin.capacity.measuring import VOLUMES, Candidate
+from leco_plugin.evaluation.charts import SOURCE, fingerprint
 
 pytestmark = [  # nerfstudio leaves an image open
     pytest.mark.filterwarnings("ignore:unclosed file:ResourceWarning"),
@@ -76,6 +77,7 @@ def test_what_was_finished_is_kept(
     for name in ("capacity.png", "capacity-dark.png"):
         with Image.open(out / name) as image:
             assert image.size[0] > 1000
+            assert image.info[SOURCE] == fingerprint(results)
     before = len(taught)
     assert run(*arguments) == 0 and len(taught) == before
 

@@ -10,6 +10,8 @@ from leco_plugin.models.field import FieldConfig, HMoEField
 from leco_plugin.models.front_to_back import (
     FEWEST_AT_ONCE,
     LEAST_LIGHT,
+    MANY_RAYS,
+    is_no_slower,
     samples_of,
     shade_front_to_back,
 )
@@ -21,7 +23,7 @@ from leco_plugin.samplers.packed import render_transmittance_from_density
 from leco_plugin.space import Space
 
 ROUTING = Routing(0.2, False)
-STEP = 0.05
+STEP = 0.02
 
 
 class Scene:
@@ -108,3 +110,11 @@ def test_it_asks_from_the_front_and_hardly_further_than_light_goes(density: floa
 def test_samples_of_some_rays_are_counted_out() -> None:
     found = samples_of(torch.tensor([3, 10, 20]), torch.tensor([2, 0, 3]), 4)
     assert found.tolist() == [3, 4, 20, 21, 22]
+
+
+def test_where_it_was_not_measured_to_be_no_slower_everything_is_shaded() -> None:
+    cpu = torch.device("cpu")
+    assert is_no_slower(MANY_RAYS, True, cpu)
+    assert not is_no_slower(MANY_RAYS - 1, True, cpu)
+    assert not is_no_slower(MANY_RAYS, False, cpu)
+    assert not is_no_slower(MANY_RAYS, True, torch.device("cuda"))

@@ -10,6 +10,7 @@ import torch
 from nerfstudio.cameras.rays import RayBundle
 from nerfstudio.data.scene_box import SceneBox
 
+from leco_plugin.models import front_to_back
 from leco_plugin.models.encodings import EncodingConfig
 from leco_plugin.models.field import FieldConfig
 from leco_plugin.models.gate import GateConfig
@@ -186,3 +187,23 @@ def test_front_to_back_renders_the_same_pixels_from_fewer_samples(model: LecoMod
     torch.testing.assert_close(seen["depth"], whole["depth"], atol=1e-3, rtol=1e-3)
     fewer, all_of_them = (float(one["samples_per_ray"].mean()) for one in (seen, whole))
     assert fewer < 0.5 * all_of_them
+
+
+def test_guided_batches_of_many_rays_are_rendered_from_the_front_by_default(
+    model: LecoModel, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with torch.no_grad():
+        model.field.density_head.bias.fill_(9.0)  # opaque everywhere
+    model.threshold.fill_(1e-3)
+    model.eval()
+
+    def samples() -> float:
+        torch.manual_seed(0)
+        return float(step(model)[0]["samples_per_ray"].mean())
+
+    monkeypatch.setattr(front_to_back, "MANY_RAYS", NUM_RAYS)
+    dense = samples()
+    model.frozen.fill_(True)
+    assert samples() < 0.5 * dense
+    monkeypatch.setattr(front_to_back, "MANY_RAYS", NUM_RAYS + 1)
+    assert samples() == dense  # the gate keeps all

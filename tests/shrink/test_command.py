@@ -23,6 +23,7 @@ from leco_plugin.occupancy import Occupancy
 from leco_plugin.scenes.frames import frame_of
 from leco_plugin.shrink import command, references, search, sources
 from leco_plugin.shrink.command import compare_queries
+from leco_plugin.shrink.evidence import loss
 from leco_plugin.shrink.picture import draw
 
 pytestmark = [  # nerfstudio leaves an image open
@@ -199,6 +200,63 @@ def lost_on_unseen_rays(ground: search.Ground, smaller: Occupancy) -> list[float
         float((part.worth * ~smaller.occupied(part.positions)).sum() / part.worth.sum())
         for part in parts
     ]
+
+
+def test_search_verification_and_teaching_have_no_pixel_in_common(
+    known_run: Path, tiny_scene: Path
+) -> None:
+    file = known_run / "occupancy.safetensors"
+    source, original = sources.find_source(file, tiny_scene), Occupancy.load(file)
+    seen = [*sources.held_out(source, original, 512), sources.trained_on(source, original, 512)]
+    pixels = [
+        {(int(image), *map(float, ray)) for image, ray in zip(one.rays.images, one.rays.directions)}
+        for one in seen
+        if one.rays.images is not None
+    ]
+    searched, verified, taught = pixels
+    assert min(len(searched), len(verified)) > 20
+    assert not searched & verified and not (searched | verified) & taught
+
+
+def test_the_file_declares_what_rays_have_lost_that_the_search_did_not_see(
+    known_run: Path, tiny_scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """On the rays of the search only the safest places are worth anything, on others all kept."""
+    grounds: list[search.Ground] = []
+    prepare = command._ground
+
+    def uneven(source: sources.Source, original: Occupancy) -> search.Ground:
+        ground = prepare(source, original)
+        (reference,) = ground.references
+        searched, unseen = reference.search, reference.verify
+        values = original.query(searched.evidence.positions)
+        safest = (values >= values.quantile(0.99)).float()
+        known = reference._replace(
+            search=searched._replace(evidence=searched.evidence._replace(worth=safest)),
+            verify=unseen._replace(
+                evidence=unseen.evidence._replace(worth=unseen.evidence.kept.float())
+            ),
+        )
+        grounds.append(ground._replace(references=[known]))
+        return grounds[-1]
+
+    monkeypatch.setattr(command, "_ground", uneven)
+    smaller_ones = [GateConfig(EncodingConfig(octaves=3), 16, 2, 1)]
+    monkeypatch.setattr(search, "ladder", lambda most: smaller_ones)
+    file, out, report = known_run / "occupancy.safetensors", tmp_path / "small", tmp_path / "a.json"
+    bounds = ["--lost-surface-mass", 0.99, "--image-price", 50, "--json", report]
+    assert run("shrink", file, "--data", tiny_scene, "--out", out, *bounds) == 0
+    smaller, rung = Occupancy.load(out), json.loads(report.read_text())["rungs"][-1]
+    (lost,) = lost_on_unseen_rays(grounds[0], smaller)
+    assert lost > 0.0 and rung["lost_surface_mass"] == pytest.approx(1e-4)  # of the original
+    assert rung["verified"]["lost_surface_mass"] == pytest.approx(lost + 1e-4, rel=1e-3)
+    (known,) = grounds[0].references
+    seen, unseen = (
+        loss(part.evidence, ~smaller.occupied(part.evidence.positions)).bound
+        for part in (known.search, known.verify)
+    )
+    assert smaller.report["lost_surface_mass"] == pytest.approx(unseen + 1e-4, rel=1e-3)
+    assert unseen > seen
 
 
 def test_what_is_declared_holds_against_the_field_at_the_moment_of_freezing(

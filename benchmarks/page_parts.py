@@ -1,0 +1,30 @@
+"""What all sections of docs/results.md are made of."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+ROOT = Path(__file__).resolve().parent.parent
+RESULTS = ROOT / "benchmarks" / "results"
+
+
+def machine_line(report: dict[str, Any]) -> str:
+    """What it ran on, in one line."""
+    return ", ".join(f"{name}: {value}" for name, value in report["machine"].items())
+
+
+def picture(name: str) -> str:
+    """A picture in the page, in the page's colours."""
+    image = f"images/charts/{name}"
+    return (
+        f'<picture><source media="(prefers-color-scheme: dark)" srcset="{image}-dark.png">'
+        f'<img alt="{name}" src="{image}.png"></picture>'
+    )
+
+
+def section(
+    title: str, command: str, report: dict[str, Any], table: str, note: str = ""
+) -> list[str]:
+    """Title, the command and the machine that made the table, and the table."""
+    return [f"## {title}\n", f"`{command}`; {machine_line(report)}.{note}\n", f"{table}\n"]

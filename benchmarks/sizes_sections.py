@@ -1,0 +1,62 @@
+"""What docs/results.md says of how much a scene needs, from what is stored."""
+
+from __future__ import annotations
+
+import json
+from typing import Any
+
+from page_parts import RESULTS, picture, section
+from sizes_tables import capacity_table, shrink_table, sizes_table
+
+CAPACITY = "capacity-"
+"""How the names of pictures of `leco capacity` begin."""
+
+
+def sizes_sections() -> list[str]:
+    """Of automatic sizes, shrunk gates and capacity, those that are stored."""
+    parts = []
+    if (sizes := RESULTS / "sizes.json").exists():
+        report = json.loads(sizes.read_text())
+        steps, learn = report["settings"]["steps"], report["settings"]["learn_steps"]
+        note = (
+            f" {steps} steps each, {learn} of them learning; PSNR of test pixels, differences in "
+            "pairs of one seed."
+        )
+        named = [scene["scene"] for scene in report["scenes"] if "blocks" not in scene]
+        command = " ".join(["python benchmarks/sizes.py", *named])
+        title = "Automatic sizes, and a sweep around them"
+        parts += section(title, command, report, sizes_table(report), note)
+    if shrunk := scene_results("shrink"):
+        note = (
+            " In bold: a bar is missed, 32 kB, a declared loss of 1e-3, three times faster queries "
+            "(65536 positions, interleaved), or a declaration below what unseen rays have lost."
+        )
+        command = (
+            "leco shrink RUN --data SCENE --out FILE --json benchmarks/results/shrink/SCENE.json"
+        )
+        title = "Gates shrunk to what decides alike"
+        parts += section(title, command, next(iter(shrunk.values())), shrink_table(shrunk), note)
+    if measured := scene_results("capacity"):
+        first = next(iter(measured.values()))
+        note = (
+            f" Each loses {first['lost_surface_mass']:.1%} of the weight near surfaces; kept is a "
+            "share of the volume that rays reach. The last column: whether such a gate keeps no "
+            "more than the grid."
+        )
+        command = "leco capacity --data SCENE --out DIR --json results/capacity/SCENE.json"
+        title = "How much a scene needs: gates and grids at equal loss"
+        head, *rest = section(title, command, first, capacity_table(measured), note)
+        parts += [head, *(f"{picture(CAPACITY + name)}\n" for name in measured), *rest]
+    return parts
+
+
+def scene_results(folder: str) -> dict[str, Any]:
+    """Stored results of a command, by the name of their scene; cities by their blocks first."""
+    paths = sorted((RESULTS / folder).glob("*.json"), key=lambda path: _in_order(path.stem))
+    return {path.stem: json.loads(path.read_text()) for path in paths}
+
+
+def _in_order(name: str) -> tuple[int, int, str]:
+    kind, _, blocks = name.partition("-")
+    city = kind == "city" and blocks.isdigit()
+    return (0, int(blocks), "") if city else (1, 0, name)

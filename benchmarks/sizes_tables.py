@@ -1,0 +1,177 @@
+"""Tables of what shows how much a scene needs: automatic sizes, shrunk gates, capacity."""
+
+from __future__ import annotations
+
+import statistics
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+Report = Mapping[str, Any]
+
+SHRUNK_BYTES, SHRUNK_LOSS, SHRUNK_SPEEDUP = 32_000, 1e-3, 3.0
+"""Bars of a shrunk gate: bytes of its file and declared loss at most, queries at least so much
+faster."""
+FINE_GRID, SHARE_OF_ITS_BYTES = "256", 1 / 100
+"""The grid beside which gates are put, and how many of its bytes they may take."""
+
+
+def sizes_table(report: Report) -> str:
+    """Sizes that were chosen, the sweep, automatic beside its best, and the bars of two cities."""
+    lines = [
+        "| scene | photographs | texels | table | experts | parameters | of the device's |",
+        "|---|---|---|---|---|---|---|",
+    ]
+    for scene in report["scenes"]:
+        sizes, share = scene["sizes"], scene["parameters"] / scene["device_parameters"]
+        lines.append(
+            f"| {scene['scene']} | {scene['images']} | {scene['texels']:,} "
+            f"| {sizes['field.encoding.levels']} x 2^{sizes['field.encoding.log2_table']} "
+            f"| {sizes['field.experts.scene_experts']} | {scene['parameters']:,} | {share:.0%} |"
+        )
+    lines += [
+        "",
+        "| scene | sizes | parameters | PSNR, mean (least to most) |",
+        "|---|---|---|---|",
+    ]
+    points: dict[tuple[str, str], list[Report]] = {}
+    for row in report["runs"]:
+        if row["point"] is not None:
+            points.setdefault((row["scene"], row["point"]), []).append(row)
+    for (scene, point), runs in sorted(points.items(), key=lambda item: item[0][0]):
+        values = [run["psnr"] for run in runs]
+        lines.append(
+            f"| {scene} | {point} | {runs[0]['parameters']:,} | {statistics.fmean(values):.2f} dB "
+            f"({min(values):.2f} to {max(values):.2f}) |"
+        )
+    lines += [
+        "",
+        "| scene | automatic | best of the sweep | behind it by (standard error) | within bounds |",
+        "|---|---|---|---|---|",
+    ]
+    for scene, found in report["verdict"].items():
+        lines.append(
+            f"| {scene} | {found['psnr']:.2f} dB, {found['parameters']:,} "
+            f"| {found['best']}: {found['best_psnr']:.2f} dB, {found['best_parameters']:,} "
+            f"| {_with_error(found['behind'], found['error'])} dB | {_yes(found['reached'])} |"
+        )
+    if report["bars"]:
+        lines += ["", "| figure | measured (standard error) | at most | reached |"]
+        lines.append("|---|---|---|---|")
+    for bar in report["bars"]:
+        value = _with_error(bar["value"], bar["error"])
+        lines.append(f"| {bar['name']} | {value} | {bar['bar']:g} | {_yes(bar['reached'])} |")
+    return "\n".join(lines)
+
+
+def shrink_table(reports: Mapping[str, Report]) -> str:
+    """A row a scene: what a gate was shrunk to, what it declares, and how fast it answers.
+
+    Args:
+        reports: as `leco shrink --json` writes them, by the name of the scene.
+    """
+    lines = [
+        "| scene | values | file, kB | declared lost surface mass | lost on unseen rays "
+        "| image price, dB | gates tried | queries faster by |",
+        "|" + "---|" * 8,
+    ]
+    for scene, report in reports.items():
+        before, after = report["from"], report["to"]
+        declared = after["lost_surface_mass"]
+        lost = _unseen_loss(report)
+        size, speed = after["bytes"], report["query_speedup"]
+        now = _flagged(f"{size / 1000:.1f}", size <= SHRUNK_BYTES)
+        price = after.get("image_price_db")
+        cells = (
+            f"{before['params']} to {after['params']}",
+            f"{before['bytes'] / 1000:.1f} to {now}",
+            _flagged(f"{declared:.2e}", declared <= SHRUNK_LOSS),
+            "-" if lost is None else _flagged(f"{lost:.2e}", lost <= declared),
+            "-" if price is None else f"{price:+.3f}",
+            f"{len(report['rungs'])}",
+            _flagged(f"{speed:.2f} x", speed >= SHRUNK_SPEEDUP),
+        )
+        lines.append(f"| {scene} | {' | '.join(cells)} |")
+    return "\n".join(lines)
+
+
+def _unseen_loss(report: Report) -> float | None:
+    """What the chosen gate has lost on rays that the search did not see; None where none was."""
+    chosen = [rung for rung in report["rungs"] if rung["verdict"] == "chosen"]
+    return float(chosen[-1]["verified"]["lost_surface_mass"]) if chosen else None
+
+
+def capacity_table(reports: Mapping[str, Report]) -> str:
+    """A row a scene: what was chosen, and the fine grid beside the best gate of few bytes.
+
+    Args:
+        reports: as `leco capacity` writes them, by the name of the scene.
+    """
+    lines = [
+        "| scene | photographs | chosen | kB | keeps, % | smallest grid that keeps as little "
+        f"| grid {FINE_GRID}^3 keeps, % | gate of 1/100 of its bytes keeps, % | no more |",
+        "|" + "---|" * 9,
+    ]
+    for scene, report in reports.items():
+        rows = report["representations"]
+        chosen = report["chosen"]
+        grid, gate = beside_fine_grid(rows)
+        cells = (
+            f"{report['scene']['train_images']}",
+            f"{chosen['family']} {chosen['size']}",
+            f"{chosen['bytes'] / 1000:.1f}",
+            f"{100 * chosen['kept_volume']:.2f}",
+            _smallest_grid(rows, chosen),
+            *_beside(grid, gate),
+        )
+        lines.append(f"| {scene} | {' | '.join(cells)} |")
+    return "\n".join([*lines, "", where_it_pays(reports)])
+
+
+def where_it_pays(reports: Mapping[str, Report]) -> str:
+    """For which scenes a grid suffices, and for which a gate is smaller."""
+    groups: dict[bool, list[str]] = {True: [], False: []}
+    for scene, report in reports.items():
+        groups[report["chosen"]["family"] == "grid"].append(scene)
+    grid, gate = (", ".join(groups[suffices]) or "none" for suffices in (True, False))
+    return f"A grid suffices for: {grid}. A gate that keeps as little is smaller for: {gate}."
+
+
+def beside_fine_grid(rows: Sequence[Report]) -> tuple[Report | None, Report | None]:
+    """The fine grid, and of the gates that take a hundredth of its bytes the one that keeps least.
+
+    Each is None where it was not measured.
+    """
+    grids = [row for row in rows if row["family"] == "grid" and row["size"] == FINE_GRID]
+    if not grids:
+        return None, None
+    most = SHARE_OF_ITS_BYTES * grids[0]["bytes"]
+    gates = [row for row in rows if row["family"] != "grid" and row["bytes"] <= most]
+    return grids[0], min(gates, key=lambda row: row["kept_volume"], default=None)
+
+
+def _beside(grid: Report | None, gate: Report | None) -> tuple[str, str, str]:
+    if grid is None or gate is None:
+        return ("-",) * 3
+    fine, few = (f"{100 * row['kept_volume']:.2f}" for row in (grid, gate))
+    no_more = gate["kept_volume"] <= grid["kept_volume"]
+    return fine, f"{few} ({gate['family']}, {gate['bytes'] / 1000:.1f} kB)", _yes(no_more)
+
+
+def _smallest_grid(rows: Sequence[Report], chosen: Report) -> str:
+    from leco_plugin.capacity.choice import kilobytes, smallest_grid
+
+    grid = smallest_grid(rows, chosen)
+    return "none" if grid is None else f"{grid['size']}^3, {kilobytes(grid)}"
+
+
+def _with_error(value: float, error: float | None) -> str:
+    return f"{value:.2f}" if error is None else f"{value:.2f} ({error:.2f})"
+
+
+def _yes(reached: bool) -> str:
+    return "yes" if reached else "**no**"
+
+
+def _flagged(value: str, reached: bool) -> str:
+    """A figure with a bar; those that miss it stand out."""
+    return value if reached else f"**{value}**"

@@ -1,0 +1,206 @@
+"""The benchmark of automatic sizes: its arithmetic, its tables, and that it passes and goes on."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+ROOT = Path(__file__).resolve().parent.parent
+sys.path.insert(0, str(ROOT / "benchmarks"))
+
+import sizes_sections  # noqa: E402
+from sizes import Options, dry, larger, stored_rows, sweep  # noqa: E402
+from sizes_figures import ahead, bars, points_of, verdict  # noqa: E402
+from sizes_tables import (  # noqa: E402
+    beside_fine_grid,
+    capacity_table,
+    shrink_table,
+    sizes_table,
+)
+
+from leco_plugin.models.sizes import SMALL, with_size  # noqa: E402
+
+MEASURED = {"automatic": [20.0, 20.2], "table x 4": [20.1, 20.2], "table x 0.25": [19.0, 19.4]}
+PARAMETERS = {"automatic": 200, "table x 4": 800, "table x 0.25": 90}
+
+
+def runs(scene: str, measured: dict[str, list[float]] = MEASURED) -> list[dict[str, Any]]:
+    return [
+        {
+            "scene": scene,
+            "point": point,
+            "seed": seed,
+            "psnr": psnr,
+            "parameters": PARAMETERS[point],
+        }
+        for point, values in measured.items()
+        for seed, psnr in enumerate(values)
+    ]
+
+
+def test_the_gain_is_that_of_pairs_of_one_seed() -> None:
+    points = points_of(runs("a"), "a")
+    gain, error = ahead(points["table x 4"], points["automatic"])
+    assert gain == pytest.approx(0.05) and error == pytest.approx(0.05)
+    (alone,) = points_of(runs("a", {"automatic": [20.0]}), "a").values()
+    assert ahead(alone, alone) == (0.0, None)
+
+
+def test_automatic_must_be_near_the_best_and_hardly_larger() -> None:
+    found = verdict(runs("a"))["a"]
+    assert found["best"] == "table x 4" and found["behind"] == pytest.approx(0.05)
+    assert found["reached"] and (found["parameters"], found["best_parameters"]) == (200, 800)
+    better = MEASURED | {"table x 4": [20.3, 20.4]}
+    assert not verdict(runs("a", better))["a"]["reached"]
+    smaller = MEASURED | {"table x 0.25": [20.3, 20.3]}
+    assert not verdict(runs("a", smaller))["a"]["reached"]  # 200 are more than 1.25 times 90
+
+
+def test_points_without_all_their_seeds_are_not_counted() -> None:
+    rows = runs("a", MEASURED | {"table x 4": [25.0]})
+    assert verdict(rows)["a"]["best"] == "automatic"
+    assert verdict(runs("a", {"automatic": [20.0]})) == {}
+    assert verdict([row | {"point": None} for row in runs("a")]) == {}
+
+
+def test_the_smallest_city_is_put_beside_the_largest_and_each_beside_larger_models() -> None:
+    scenes = [
+        {"scene": "city-1", "blocks": 1, "parameters": 200},
+        {"scene": "city-8", "blocks": 8, "parameters": 1000},
+        {"scene": "city-16", "blocks": 16, "parameters": 1000},  # is not trained
+        {"scene": "fox", "parameters": 500},
+    ]
+    few, one = bars(scenes, runs("city-1") + runs("city-8")[:4])[:2]
+    assert few["value"] == 0.2 and few["reached"]
+    assert one["value"] == pytest.approx(0.05) and one["reached"]
+    assert bars(scenes, runs("city-1")) == []
+    worse = bars(scenes, runs("city-1", MEASURED | {"table x 4": [20.5, 20.5]}) + runs("city-8"))
+    assert not worse[1]["reached"]
+
+
+def test_a_sweep_has_no_sizes_twice_and_beside_larger_ones_none_that_is_smaller() -> None:
+    chosen = with_size(SMALL, "field.encoding.log2_table", 14)
+    options = Options(experts=(0.5, 1.0))
+    points = sweep(chosen, SMALL, options)
+    assert list(points) == ["automatic", "the device's", "table x 0.25", "experts x 0.5"]
+    assert len(set(points.values())) == len(points)
+    assert list(larger(chosen, SMALL, options)) == ["automatic", "the device's"]
+
+
+def test_runs_of_other_settings_are_not_written_over(tmp_path: Path) -> None:
+    out = tmp_path / "sizes.json"
+    assert stored_rows(out, {"steps": 1}) == []
+    out.write_text(json.dumps({"settings": {"steps": 2}, "runs": [{}]}))
+    assert stored_rows(out, {"steps": 2}) == [{}]
+    with pytest.raises(SystemExit, match="name another --out"):
+        stored_rows(out, {"steps": 1})
+    options = Options(out=out, folder=tmp_path)
+    assert dry(options).out != out
+
+
+def test_the_table_has_a_row_for_each_scene_point_and_bar() -> None:
+    scene = {
+        "scene": "city-1",
+        "images": 9,
+        "texels": 57486,
+        "sizes": {
+            "field.encoding.levels": 7,
+            "field.encoding.log2_table": 14,
+            "field.experts.scene_experts": 1,
+        },
+        "parameters": 250,
+        "device_parameters": 1000,
+    }
+    bar = {"name": "parameters", "value": 0.3, "error": None, "bar": 0.25, "reached": False}
+    report = {
+        "scenes": [scene],
+        "runs": runs("city-1"),
+        "verdict": verdict(runs("city-1")),
+        "bars": [bar],
+    }
+    rows = sizes_table(report).splitlines()
+    assert "| city-1 | 9 | 57,486 | 7 x 2^14 | 1 | 250 | 25% |" in rows
+    assert "| city-1 | automatic | 200 | 20.10 dB (20.00 to 20.20) |" in rows
+    assert "| city-1 | 20.10 dB, 200 | table x 4: 20.15 dB, 800 | 0.05 (0.05) dB | yes |" in rows
+    assert rows[-1] == "| parameters | 0.30 | 0.25 | **no** |"
+
+
+def shrunk(**after: Any) -> dict[str, Any]:
+    verified = {"lost_surface_mass": 2e-4}
+    return {
+        "from": {"params": 11333, "bytes": 51200},
+        "to": {"params": 978, "bytes": 5900, "lost_surface_mass": 5.6e-4, "image_price_db": 0.01}
+        | after,
+        "query_speedup": 3.2,
+        "rungs": [{"verdict": "loses too much"}, {"verdict": "chosen", "verified": verified}],
+    }
+
+
+def test_a_shrunk_gate_that_misses_a_bar_stands_out() -> None:
+    row = shrink_table({"city-3": shrunk()}).splitlines()[-1]
+    cells = "11333 to 978 | 51.2 to 5.9 | 5.60e-04 | 2.00e-04 | +0.010 | 2 | 3.20 x"
+    assert row == f"| city-3 | {cells} |"
+    row = shrink_table({"city-3": shrunk(bytes=40_000, lost_surface_mass=1e-4)}).splitlines()[-1]
+    assert "**40.0**" in row and "**2.00e-04**" in row
+    unchanged = shrunk() | {"rungs": []}
+    assert "| - |" in shrink_table({"city-3": unchanged}).splitlines()[-1]
+
+
+def test_the_fine_grid_stands_beside_the_best_gate_of_a_hundredth_of_its_bytes() -> None:
+    kinds = (
+        ("hash", "8", 30_000, 0.02),
+        ("vm", "4", 20_000, 0.05),
+        ("frequency", "2", 5_000, 0.07),
+    )
+    rows = [
+        {"family": family, "size": size, "bytes": count, "kept_volume": kept}
+        for family, size, count, kept in (*kinds, ("grid", "256", 256**3 // 8, 0.06))
+    ]
+    grid, gate = beside_fine_grid(rows)
+    assert grid is rows[3] and gate is rows[1]
+    assert beside_fine_grid(rows[:3]) == (None, None)
+    report = {"scene": {"train_images": 53}, "representations": rows, "chosen": rows[0]}
+    of_object = report | {"chosen": rows[3]}
+    *_, line, _, _, said = capacity_table({"city-3": report, "fox": of_object}).splitlines()
+    assert line == "| city-3 | 53 | hash 8 | 30.0 | 2.00 | none | 6.00 | 5.00 (vm, 20.0 kB) | yes |"
+    assert said.startswith("A grid suffices for: fox.") and said.endswith("smaller for: city-3.")
+
+
+def test_what_is_stored_is_shown_city_after_city(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(sizes_sections, "RESULTS", tmp_path)
+    assert sizes_sections.sizes_sections() == []
+    (tmp_path / "shrink").mkdir()
+    for name in ("fox", "city-16", "brighton_beach", "city-3"):
+        report = shrunk() | {"machine": {"cores": 2}}
+        (tmp_path / "shrink" / f"{name}.json").write_text(json.dumps(report))
+    in_order = ["city-3", "city-16", "brighton_beach", "fox"]
+    assert list(sizes_sections.scene_results("shrink")) == in_order
+    title, command, table = sizes_sections.sizes_sections()
+    assert title.startswith("## ") and "leco shrink" in command and "cores: 2" in command
+    assert [line.split(" | ")[0] for line in table.splitlines()[2:]] == [f"| {n}" for n in in_order]
+
+
+@pytest.mark.slow
+def test_a_dry_run_passes_and_is_not_done_twice(tmp_path: Path) -> None:
+    command = [sys.executable, "-W", "ignore", str(ROOT / "benchmarks" / "sizes.py"), "--dry-run"]
+    command += ["--folder", str(tmp_path)]
+    environment = os.environ | {"PYTHONPATH": str(ROOT)}
+    done = subprocess.run(
+        command, env=environment, cwd=tmp_path, capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 0, done.stderr
+    report = json.loads((tmp_path / "dry" / "sizes.json").read_text())
+    assert {row["scene"] for row in report["runs"]} == {"city-1", "city-2"}
+    assert len(report["bars"]) == 3 and "parameters of city-1" in sizes_table(report)
+    again = subprocess.run(
+        command, env=environment, cwd=tmp_path, capture_output=True, text=True, check=True
+    )
+    assert f"0 of {len(report['runs'])} runs to do" in again.stdout
