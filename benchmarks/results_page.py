@@ -1,6 +1,6 @@
-"""Writes `docs/results.md` and the README's table and chart from stored results, or with `--check`
-says which of them are of other results. Charts are drawn where their results have changed; with
-`--redraw`, all of them.
+"""Writes `docs/results.md`, the tables of `docs/stability.md` and the README's table and chart from
+stored results, or with `--check` says which of them are of other results. Charts are drawn where
+their results have changed; with `--redraw`, all of them.
 
 python benchmarks/results_page.py
 """
@@ -16,11 +16,15 @@ import checkout  # noqa: F401
 from growth_picture import draw as draw_growth
 from large_scene_tables import LARGE_SCENES
 from PIL import Image
+from stability_page import PAGE as STABILITY_PAGE
+from stability_page import PICTURE as STABILITY
+from stability_page import page as stability_page
 
 from leco_plugin.chart.picture import draw
 from leco_plugin.chart.table import table
 from leco_plugin.chart.theme import DARK, LIGHT
 from leco_plugin.evaluation.charts import SOURCE, fingerprint
+from leco_plugin.stability.picture import draw as draw_stability
 
 ROOT = Path(__file__).resolve().parent.parent
 RESULTS = ROOT / "benchmarks" / "results"
@@ -126,6 +130,9 @@ def pictures() -> dict[Path, Any]:
     if (growth := RESULTS / "growth.json").exists():
         report = json.loads(growth.read_text())
         found |= {GROWTH: report, GROWTH.with_stem("growth-dark"): report}
+    if (stability := RESULTS / "stability.json").exists():
+        report = json.loads(stability.read_text())
+        found |= {STABILITY: report, STABILITY.with_stem("stability-dark"): report}
     return found
 
 
@@ -139,10 +146,14 @@ def draw_pictures(redraw: bool) -> None:
             continue
         if path == DEMO_CHART:
             draw_chart(json.loads((RESULTS / "demo.json").read_text()), path)
-        elif path.stem.removesuffix("-dark") == GROWTH.stem:
-            draw_growth(path, results, DARK if path.stem.endswith("-dark") else LIGHT)
+            continue
+        theme = DARK if path.stem.endswith("-dark") else LIGHT
+        if path.stem.removesuffix("-dark") == GROWTH.stem:
+            draw_growth(path, results, theme)
+        elif path.stem.removesuffix("-dark") == STABILITY.stem:
+            draw_stability(results, path, theme)
         else:
-            draw(results, path, DARK if path.stem.endswith("-dark") else LIGHT)
+            draw(results, path, theme)
 
 
 def is_stale(path: Path, results: Any) -> bool:
@@ -316,6 +327,7 @@ def readme(text: str) -> str:
 def main() -> int:
     """Writes both, or with --check says whether they are as they should be."""
     wanted = {PAGE: page(), README: readme(README.read_text())}
+    wanted[STABILITY_PAGE] = stability_page(STABILITY_PAGE.read_text(), RESULTS)
     if "--check" in sys.argv[1:]:
         stale = [path.name for path, text in wanted.items() if path.read_text() != text]
         stale += [path.name for path, results in pictures().items() if is_stale(path, results)]

@@ -80,7 +80,7 @@ def measure(trainer: Trainer, data: Path, dense_samples: int) -> tuple[Measured,
             most += all_of_them
         surface = depth.isfinite()
         away = torch.cat(nearest)[surface]
-        lost += int((away > NEAR * depth[surface]).sum())
+        lost += int((~(away <= NEAR * depth[surface])).sum())  # also where a sample is nowhere
         met += int(surface.sum())
         count = torch.cat(counts)
         samples, candidates = samples + int(count.sum()), candidates + most

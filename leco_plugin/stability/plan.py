@@ -22,6 +22,11 @@ class Run:
     scene: str
     job: Job
 
+    @property
+    def key(self) -> tuple[str, str]:
+        """The same for what is run once however many cells share it."""
+        return self.scene, self.job.name
+
 
 @dataclass(frozen=True)
 class Entry:
@@ -72,7 +77,7 @@ def runs_of(entries: Sequence[Entry]) -> list[Run]:
     for number in range(most):
         for entry in entries:
             for run in entry.runs[number : number + 1]:
-                found.setdefault((run.scene, run.job.name), run)
+                found.setdefault(run.key, run)
     return list(found.values())
 
 
