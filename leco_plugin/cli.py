@@ -236,6 +236,7 @@ def stability(
     cases: tuple[str, ...] = (),
     samplers: tuple[str, ...] = (),
     seeds: tuple[int, ...] = (0,),
+    seeds_beside: tuple[int, ...] = (),
     minutes: float | None = None,
     quick: bool = False,
     json: Path | None = None,
@@ -253,6 +254,8 @@ def stability(
         samplers: learned, grid-128, grid-256, proposal-networks, dense, dense-proposal; by default
             all. The dense reference of a sampler's host joins by itself.
         seeds: Seeds of each cell; the case ten-seeds has ten.
+        seeds_beside: Seeds of the samplers that learned occupancy is compared with, by default as
+            many.
         minutes: How long this may take; the same command then goes on with what is missing.
         quick: Tiny pictures and few steps, to see whether everything works; no verdicts.
         json: Another file for the results.
@@ -265,7 +268,7 @@ def stability(
     from leco_plugin.stability.table import blind, headline
 
     _check_json(json)
-    results = make_table(out, cases, samplers, seeds, quick, minutes)
+    results = make_table(out, cases, samplers, seeds, seeds_beside, quick, minutes)
     print(headline(results))
     print(f"see stability.png, table.md, stability.json and failures in {out}")
     _write_json(json, results)

@@ -24,6 +24,7 @@ def make_table(
     cases: Sequence[str] = (),
     samplers: Sequence[str] = (),
     seeds: Sequence[int] = (0,),
+    seeds_beside: Sequence[int] = (),
     quick: bool = False,
     minutes: float | None = None,
     runner_for: Callable[[str], Runner] | None = None,
@@ -35,6 +36,7 @@ def make_table(
         out: the table's folder.
         cases, samplers: their names; none is all.
         seeds: of each cell; cases that are about seeds have more.
+        seeds_beside: of the samplers that learned occupancy is compared with; none is the same.
         quick: tiny sizes, for a look at whether everything works.
         minutes: that this may take, about; None is as many as it takes.
         runner_for: gives what makes the runs of a scene.
@@ -48,8 +50,9 @@ def make_table(
         raise InputError(f"a table is made in a positive number of minutes, not {minutes}")
     chosen, compared = cases_named(tuple(cases)), samplers_named(tuple(samplers))
     say = functools.partial(CONSOLE.print, markup=False, highlight=False)
-    command = command_line(quick, {"cases": cases, "samplers": samplers, "seeds": seeds})
-    suite = Suite(out, chosen, compared, seeds, QUICK if quick else FULL, command)
+    named = {"cases": cases, "samplers": samplers, "seeds": seeds, "seeds-beside": seeds_beside}
+    command, sizes = command_line(quick, named), QUICK if quick else FULL
+    suite = Suite(out, chosen, compared, seeds, sizes, command, seeds_beside)
     if earlier is not None:
         say(f"{suite.take_over(earlier)} runs of earlier results are taken over")
     say(suite.estimate())

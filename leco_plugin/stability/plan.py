@@ -9,7 +9,7 @@ from leco_plugin.chart.contender import Contender
 from leco_plugin.chart.folder import Job
 from leco_plugin.stability.capture import Capture
 from leco_plugin.stability.cases import Case
-from leco_plugin.stability.contenders import Sampler, contender_of
+from leco_plugin.stability.contenders import OURS, SAMPLERS, Sampler, contender_of
 from leco_plugin.stability.sizes import Sizes
 from leco_plugin.stability.stage import Stage
 from leco_plugin.stability.stages import STAGES
@@ -44,10 +44,19 @@ class Entry:
 
 
 def entries_of(
-    cases: Sequence[Case], samplers: Sequence[Sampler], seeds: Sequence[int], sizes: Sizes
+    cases: Sequence[Case],
+    samplers: Sequence[Sampler],
+    seeds: Sequence[int],
+    sizes: Sizes,
+    beside: Sequence[int] = (),
 ) -> list[Entry]:
     """All cells, case by case; a case that is about some samplers only has cells for those, and for
-    the references that they are held against."""
+    the references that they are held against.
+
+    Args:
+        beside: seeds of the samplers that learned occupancy is compared with; none is `seeds`.
+    """
+    ours = (OURS, SAMPLERS[OURS].reference)
     entries = []
     for case in cases:
         wanted = {one.name for one in samplers if case.is_about(one.name)}
@@ -57,7 +66,8 @@ def entries_of(
                 contender = contender_of(
                     sampler, sizes, case.changes, case.settings, case.grid_levels
                 )
-                entries.append(Entry(case, sampler, contender, seeds_of(case, seeds)))
+                asked = seeds if sampler.name in ours or not beside else beside
+                entries.append(Entry(case, sampler, contender, seeds_of(case, asked)))
     return entries
 
 

@@ -44,6 +44,7 @@ class Suite:
         cases, samplers, seeds: what is compared.
         sizes: of everything.
         command: what made it, for the results.
+        beside: seeds of the samplers that learned occupancy is compared with; none is `seeds`.
 
     Raises:
         ValueError, OSError: nothing to run, or a folder with runs of other sizes or versions.
@@ -57,6 +58,7 @@ class Suite:
         seeds: Sequence[int],
         sizes: Sizes,
         command: str = "leco stability",
+        beside: Sequence[int] = (),
     ) -> None:
         if not cases or not samplers or not seeds:
             raise ValueError("a table needs at least one case, one sampler and one seed")
@@ -64,7 +66,7 @@ class Suite:
         self.machine = describe_machine()
         code = describe_code()
         self.made = {"cpu": self.machine["cpu"], **code, "date": datetime.date.today().isoformat()}
-        self.entries = entries_of(cases, samplers, seeds, sizes)
+        self.entries = entries_of(cases, samplers, seeds, sizes, beside)
         shown = {entry.sampler.name for entry in self.entries}
         self.samplers = [one for one in samplers if one.name in shown]
         self.protocol = Protocol(steps=sizes.steps, images=1, curve_points=1)

@@ -76,6 +76,15 @@ def test_all_cells_get_their_first_seed_before_any_gets_its_second() -> None:
     assert seeds == [7] * 4 + [3] * 4
 
 
+def test_samplers_that_stand_beside_may_have_fewer_seeds() -> None:
+    chosen = cases_named(("glass", "ten-seeds"))
+    entries = entries_of(chosen, samplers_named(()), (0, 1, 2), QUICK, beside=(0,))
+    seeds = {(one.case.name, one.sampler.name): len(one.seeds) for one in entries}
+    assert seeds["glass", "learned"] == seeds["glass", "dense"] == 3
+    assert seeds["glass", "grid-128"] == seeds["glass", "dense-proposal"] == 1
+    assert {count for (case, _), count in seeds.items() if case == "ten-seeds"} == {10}
+
+
 def test_references_join_by_themselves() -> None:
     assert [one.name for one in samplers_named(("grid-128",))] == ["grid-128", "dense"]
     assert [one.name for one in samplers_named(())] == list(SAMPLERS)
