@@ -38,7 +38,7 @@ def of_table(results: dict[str, Any]) -> str:
     seconds = sum(run["processor_seconds"] for run in runs.values())
     made: dict[str, list[str]] = {
         name: sorted({str(run["made"][name]) for run in runs.values()})
-        for name in ("cpu", "version", "commit", "date")
+        for name in ("cpu", "version", "commit")
     }
     picture = (
         '<picture><source media="(prefers-color-scheme: dark)" srcset="images/stability-dark.png">'
@@ -47,7 +47,7 @@ def of_table(results: dict[str, Any]) -> str:
     circumstances = (
         f"`python benchmarks/stability.py`: {len(runs)} runs, {seconds / 3600:.1f} hours of one "
         f"core; {', '.join(made['cpu'])}; leco_plugin {', '.join(made['version'])} at "
-        f"{', '.join(made['commit'])}; {', '.join(made['date'])}."
+        f"{', '.join(made['commit'])}; {results['made']['date']}."
     )
     parts = [f"{sentence(headline(results))}", picture, verdicts(results), failures(results)]
     return "\n\n".join(part for part in [*parts, circumstances] if part)

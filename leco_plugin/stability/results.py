@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import datetime
 from collections.abc import Mapping
 from dataclasses import asdict
 from typing import TYPE_CHECKING, Any
@@ -33,7 +34,11 @@ def results_of(suite: Suite) -> dict[str, Any]:
         "format": 1,
         "machine": suite.machine,
         "sizes": asdict(suite.sizes),
-        "made": {**suite.made, "command": suite.command},
+        "made": {
+            "date": datetime.date.today().isoformat(),
+            "command": suite.command,
+            **suite.made,
+        },
         "samplers": [
             {"name": one.name, "title": one.title, "reference": one.reference}
             for one in suite.samplers

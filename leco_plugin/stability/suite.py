@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import datetime
 import json
 import math
 import sys
@@ -64,8 +63,7 @@ class Suite:
             raise ValueError("a table needs at least one case, one sampler and one seed")
         self.out, self.cases, self.sizes, self.command = out, list(cases), sizes, command
         self.machine = describe_machine()
-        code = describe_code()
-        self.made = {"cpu": self.machine["cpu"], **code, "date": datetime.date.today().isoformat()}
+        self.made = {"cpu": self.machine["cpu"], **describe_code()}
         self.entries = entries_of(cases, samplers, seeds, sizes, beside)
         shown = {entry.sampler.name for entry in self.entries}
         self.samplers = [one for one in samplers if one.name in shown]
