@@ -50,10 +50,12 @@ def test_settings_arrive_where_they_belong() -> None:
     assert config("learning-rate", "grid-128").optimizers["fields"]["optimizer"].lr == 0.1
     assert config("bounds-too-small", "dense").pipeline.datamanager.dataparser.scene_scale == 0.25
     assert config("fp16", "learned").pipeline.model.occupancy.learning.precision == "float16"
-    assert config("far-terrain", "grid-256").pipeline.model.occupancy.options == {
-        "resolution": 256,
-        "levels": 2,
-    }
+    for case, sampler, resolution, levels in (
+        ("far-terrain", "grid-128", 128, 2),
+        ("poles-and-wires", "grid-256", 256, 1),
+    ):
+        options = config(case, sampler).pipeline.model.occupancy.options
+        assert options == {"resolution": resolution, "levels": levels}
     homogeneous = config("homogeneous", "learned").pipeline.model.occupancy.learning
     assert homogeneous.sizes.field.experts.empty_layers == homogeneous.sizes.field.experts.layers
 

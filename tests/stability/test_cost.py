@@ -27,11 +27,11 @@ def test_finer_cells_and_more_levels_take_longer() -> None:
     )
     (far,) = [
         run
-        for run in runs(("far-terrain",), ("grid-256",))
-        if run.job.contender.sampler == "grid-256"
+        for run in runs(("far-terrain",), ("grid-128",))
+        if run.job.contender.sampler == "grid-128"
     ]
-    times = [expected_seconds(run, FULL) for run in (coarse, fine, far)]
-    assert times == sorted(times) and times[1] > 3 * times[0]
+    times = [expected_seconds(run, FULL) for run in (coarse, far, fine)]
+    assert times == sorted(times) and times[2] > 3 * times[0]
 
 
 def test_what_runs_took_replaces_what_they_were_thought_to_take() -> None:
