@@ -36,7 +36,7 @@ def make_table(
         out: the table's folder.
         cases, samplers: their names; none is all.
         seeds: of each cell; cases that are about seeds have more.
-        seeds_beside: of the samplers that learned occupancy is compared with; none is the same.
+        seeds_beside: of the samplers that learned occupancy is compared with, see `entries_of`.
         quick: tiny sizes, for a look at whether everything works.
         minutes: that this may take, about; None is as many as it takes.
         runner_for: gives what makes the runs of a scene.

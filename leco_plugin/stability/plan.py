@@ -54,7 +54,8 @@ def entries_of(
     the references that they are held against.
 
     Args:
-        beside: seeds of the samplers that learned occupancy is compared with; none is `seeds`.
+        beside: seeds of the samplers that learned occupancy is compared with, also where a case
+            is about seeds; none is as for learned occupancy.
     """
     ours = (OURS, SAMPLERS[OURS].reference)
     entries = []
@@ -66,8 +67,9 @@ def entries_of(
                 contender = contender_of(
                     sampler, sizes, case.changes, case.settings, case.grid_levels
                 )
-                asked = seeds if sampler.name in ours or not beside else beside
-                entries.append(Entry(case, sampler, contender, seeds_of(case, asked)))
+                fewer = beside and sampler.name not in ours
+                chosen = tuple(dict.fromkeys(beside)) if fewer else seeds_of(case, seeds)
+                entries.append(Entry(case, sampler, contender, chosen))
     return entries
 
 

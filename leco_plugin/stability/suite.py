@@ -43,7 +43,7 @@ class Suite:
         cases, samplers, seeds: what is compared.
         sizes: of everything.
         command: what made it, for the results.
-        beside: seeds of the samplers that learned occupancy is compared with; none is `seeds`.
+        beside: seeds of the samplers that learned occupancy is compared with, see `entries_of`.
 
     Raises:
         ValueError, OSError: nothing to run, or a folder with runs of other sizes or versions.
