@@ -64,11 +64,11 @@ def of_kills(results: dict[str, Any]) -> str:
     lost = sum(kill["after"] < kill["before"] for kill in kills)
     ends = [run for run in results["killed"] if run["kills"] and "psnr" in run]
     whole = results["undisturbed"]
-    unfinished = sum(run["step"] != results["steps"] - 1 or not run["frozen"] for run in ends)
+    finished = sum(run["step"] == results["steps"] - 1 and run["frozen"] for run in ends)
     return (
-        f"`python benchmarks/kills.py`: {len(kills)} kills with SIGKILL at random moments of "
-        f"{len(ends)} runs of {results['steps']} steps; {lost} of them lost something that had "
-        f"been saved. All but {unfinished} of the runs went on to their last step with a frozen "
+        f"`python benchmarks/kills.py`: {len(kills)} kills with SIGKILL at random moments of runs "
+        f"of {results['steps']} steps; {lost or 'none'} of them lost something that had been saved. "
+        f"{finished} of {len(ends)} runs that were killed went on to their last step with a frozen "
         f"gate and an occupancy that loads, at {spread(ends)} on test pixels; {len(whole)} runs "
         f"that nobody killed end at {spread(whole)}. {results['machine']['cpu']}."
     )
