@@ -67,7 +67,7 @@ def of_kills(results: dict[str, Any]) -> str:
     finished = sum(run["step"] == results["steps"] - 1 and run["frozen"] for run in ends)
     return (
         f"`python benchmarks/kills.py`: {len(kills)} kills with SIGKILL at random moments of runs "
-        f"of {results['steps']} steps; {lost or 'none'} of them lost something that had been saved. "
+        f"of {results['steps']} steps; {lost or 'none'} of them lost something that was saved. "
         f"{finished} of {len(ends)} runs that were killed went on to their last step with a frozen "
         f"gate and an occupancy that loads, at {spread(ends)} on test pixels; {len(whole)} runs "
         f"that nobody killed end at {spread(whole)}. {results['machine']['cpu']}."
