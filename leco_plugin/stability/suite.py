@@ -191,7 +191,8 @@ class Suite:
             return f"{title}: failed: {error}"
         folder.store(run.job, record | {"made": self.made})
         failure.unlink(missing_ok=True)
-        return f"{title}: {record['psnr']:.2f} dB after {record['processor_seconds']:.0f} s"
+        psnr = "no PSNR" if record["psnr"] is None else f"{record['psnr']:.2f} dB"
+        return f"{title}: {psnr} after {record['processor_seconds']:.0f} s"
 
     def take_over(self, results: Mapping[str, Any]) -> int:
         """Keeps the runs of another table that would be made here just so; returns how many."""

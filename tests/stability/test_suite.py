@@ -105,6 +105,12 @@ def _another(what: str, results: dict[str, Any]) -> dict[str, Any]:
     return changed
 
 
+def test_a_run_that_renders_no_number_fails_and_the_others_go_on(tmp_path: Path) -> None:
+    cells = make(suite(tmp_path, ("yard",), SAMPLERS), Runs({"learned": None}))["cases"][0]["cells"]
+    assert cells["learned"]["reason"] == "seed 0 renders what is no number"
+    assert cells["grid-128"]["verdict"] == "pass"
+
+
 def test_a_folder_of_other_sizes_is_refused(tmp_path: Path) -> None:
     make(suite(tmp_path, ("yard",), ("grid-128",)), Runs())
     with pytest.raises(ValueError, match="another steps"):
