@@ -1,15 +1,18 @@
 """Runs of `leco-occupancy` that are killed with SIGKILL at random moments and resumed.
 
-    python benchmarks/kills.py --kills 100
+    python benchmarks/kills.py --kills 100 --minutes 10
 
 Each kill must lose nothing that had been saved, and each run must end as runs that nobody kills.
-The result is written after every run, and a later call goes on with it.
+The result is written after every run, and a later call goes on with it. Runs are as small as still
+pass through every phase, and ask their gate directly: building its cell cache would take most of
+the time, and nothing of it is ever saved.
 """
 
 from __future__ import annotations
 
 import argparse
 import json
+import math
 import multiprocessing
 import os
 import random
@@ -31,7 +34,17 @@ from leco_plugin.scenes.input_error import InputError
 ROOT = Path(__file__).resolve().parents[1]
 STEPS, LEARN_STEPS = 60, 24
 UNDISTURBED = 4
-"""Runs with other seeds that nobody kills, which say how much the end of a run varies."""
+"""Runs with other seeds that nobody kills, which say how much the end of a run varies; one more for
+each later call says how long a run takes now."""
+KILLS_A_RUN = 5
+"""At most: what comes between the last of them and the end of a run shows no kill."""
+PRELOADED = [
+    "nerfstudio.scripts.train",
+    "leco_plugin.compat.atomic_trainer",
+    "leco_plugin.models.lifecycle",
+    "leco_plugin.evaluation.held_out_images",
+]
+"""Imported once for all runs."""
 ARGUMENTS = [
     "--steps-per-save=4",
     "--steps-per-eval-image=0",
@@ -56,11 +69,13 @@ def train(arguments: list[str], log: Path, end: Path) -> None:
     with log.open("ab") as printed:
         os.dup2(printed.fileno(), sys.stdout.fileno())
         os.dup2(printed.fileno(), sys.stderr.fileno())
+    from mortal_training import leave_out_the_cache
     from nerfstudio.engine.trainer import Trainer
     from nerfstudio.scripts import train as ns_train
 
     from leco_plugin.evaluation.held_out_images import psnr_on_rays
 
+    leave_out_the_cache()
     after = Trainer._after_train
 
     def after_train(trainer: Trainer) -> None:
@@ -89,7 +104,10 @@ class Runs:
 
         tiny_scene.write(self.scene)
         self.forks = multiprocessing.get_context("forkserver")
-        self.forks.set_forkserver_preload(["nerfstudio.scripts.train"])
+        self.forks.set_forkserver_preload(PRELOADED)
+        first = self.forks.Process(target=int)  # waits for the imports, which no run is to pay for
+        first.start()
+        first.join()
 
     def base(self, name: str) -> Path:
         return self.folder / "tiny" / "leco-occupancy" / name
@@ -149,13 +167,14 @@ def killed(runs: Runs, number: int, kills: int, seconds: float, dice: random.Ran
         done = runs.newest(name) + 1
         if done == STEPS:  # killed between its last checkpoint and its end
             return {"step": STEPS - 1, "kills": found}
-        process = runs.start(name, number, done)
+        process, before = runs.start(name, number, done), done - 1
         moment = dice.uniform(0.2, 1.1) * seconds * (1.0 - 0.7 * done / STEPS)
         process.join(moment if len(found) < kills else None)
         if process.exitcode is None:
             before = runs.newest(name)
             os.kill(process.pid, signal.SIGKILL)
             process.join()
+        if process.exitcode == -signal.SIGKILL:
             after = runs.newest(name)
             found.append({"seconds": round(moment, 2), "before": before, "after": after})
             if after < before:
@@ -169,8 +188,10 @@ def killed(runs: Runs, number: int, kills: int, seconds: float, dice: random.Ran
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--kills", type=int, default=100)
+    parser.add_argument("--minutes", type=float, default=math.inf, help="that this may take, about")
     parser.add_argument("--out", type=Path, default=ROOT / "benchmarks" / "results" / "kills.json")
     arguments = parser.parse_args()
+    ends = time.monotonic() + 60.0 * arguments.minutes
     allow_checkpoint_globals()
     os.environ["OMP_NUM_THREADS"] = "1"
     result = {"format": 1, "steps": STEPS, "undisturbed": [], "killed": []}
@@ -179,14 +200,15 @@ def main() -> None:
     result["machine"] = describe_machine()
     with tempfile.TemporaryDirectory() as folder:
         runs = Runs(Path(folder) / "runs")
-        while len(result["undisturbed"]) < UNDISTURBED:
+        for _ in range(max(1, UNDISTURBED - len(result["undisturbed"]))):
             result["undisturbed"].append(undisturbed(runs, len(result["undisturbed"])))
             write_json(arguments.out, result)
-        seconds = min(run["seconds"] for run in result["undisturbed"])  # of a machine at rest
-        while (left := arguments.kills - total(result)) > 0:
+        seconds = result["undisturbed"][-1]["seconds"]
+        while (left := arguments.kills - total(result)) > 0 and time.monotonic() < ends:
             number = len(result["killed"])
             dice = random.Random(number)
-            result["killed"].append(killed(runs, number, min(3, left), seconds, dice))
+            run = killed(runs, number, min(KILLS_A_RUN, left), seconds, dice)
+            result["killed"].append(run)
             write_json(arguments.out, result | {"kills": total(result)})
             print(f"{total(result)} of {arguments.kills} kills", flush=True)
 

@@ -1,6 +1,6 @@
-"""Writes `docs/results.md` and the README's table and chart from stored results, or with `--check`
-says which of them are of other results. Charts are drawn where their results have changed; with
-`--redraw`, all of them.
+"""Writes `docs/results.md`, the tables of `docs/stability.md` and the README's table and chart from
+stored results, or with `--check` says which of them are of other results. Charts are drawn where
+their results have changed; with `--redraw`, all of them.
 
 python benchmarks/results_page.py
 """
@@ -18,12 +18,16 @@ from large_scene_tables import LARGE_SCENES
 from page_parts import RESULTS, ROOT, machine_line, picture, section
 from PIL import Image
 from sizes_sections import CAPACITY, scene_results, sizes_sections
+from stability_page import PAGE as STABILITY_PAGE
+from stability_page import PICTURE as STABILITY
+from stability_page import page as stability_page
 
 from leco_plugin.capacity.picture import draw as draw_capacity
 from leco_plugin.chart.picture import draw
 from leco_plugin.chart.table import table
 from leco_plugin.chart.theme import DARK, LIGHT
 from leco_plugin.evaluation.charts import SOURCE, fingerprint
+from leco_plugin.stability.picture import draw as draw_stability
 
 PAGE = ROOT / "docs" / "results.md"
 README = ROOT / "README.md"
@@ -116,6 +120,9 @@ def pictures() -> dict[Path, Any]:
     for name, results in scene_results("capacity").items():
         path = CHARTS / f"{CAPACITY}{name}.png"
         found |= {path: results, path.with_stem(f"{path.stem}-dark"): results}
+    if (stability := RESULTS / "stability.json").exists():
+        report = json.loads(stability.read_text())
+        found |= {STABILITY: report, STABILITY.with_stem("stability-dark"): report}
     return found
 
 
@@ -132,6 +139,8 @@ def draw_pictures(redraw: bool) -> None:
             draw_chart(json.loads((RESULTS / "demo.json").read_text()), path)
         elif path.stem.removesuffix("-dark") == GROWTH.stem:
             draw_growth(path, results, theme)
+        elif path.stem.removesuffix("-dark") == STABILITY.stem:
+            draw_stability(results, path, theme)
         elif path.stem.startswith(CAPACITY):
             draw_capacity(results, path, theme)
         else:
@@ -259,6 +268,7 @@ def readme(text: str) -> str:
 def main() -> int:
     """Writes both, or with --check says whether they are as they should be."""
     wanted = {PAGE: page(), README: readme(README.read_text())}
+    wanted[STABILITY_PAGE] = stability_page(STABILITY_PAGE.read_text(), RESULTS)
     if "--check" in sys.argv[1:]:
         stale = [path.name for path, text in wanted.items() if path.read_text() != text]
         stale += [path.name for path, results in pictures().items() if is_stale(path, results)]

@@ -36,14 +36,14 @@ class Runs:
     """Makes runs at once, and remembers them.
 
     Args:
-        psnrs: by name of the sampler; 25 dB for others.
+        psnrs: by name of the sampler, None for no number; 25 dB for others.
         broken: name of a sampler whose runs end without a result.
         stops_at: number of the run at which somebody presses Ctrl-C.
     """
 
     def __init__(
         self,
-        psnrs: dict[str, float] | None = None,
+        psnrs: dict[str, float | None] | None = None,
         broken: str | None = None,
         stops_at: int | None = None,
         pictures: Path | None = None,

@@ -57,7 +57,10 @@ def newest_whole(checkpoints: Path) -> tuple[Path, list[str]]:
             damaged.append(f"{path} is damaged ({damage})")
     if not damaged:
         raise InputError(f"there is no checkpoint in {checkpoints}")
-    raise InputError(f"no checkpoint can be gone on with: {'; '.join(damaged)}")
+    raise InputError(
+        f"no checkpoint can be gone on with: {'; '.join(damaged)}; put a copy of one of them back, "
+        "or train again"
+    )
 
 
 def first_not_finite(module: nn.Module) -> str | None:

@@ -24,6 +24,7 @@ from nerfstudio.models.base_model import Model, ModelConfig
 from leco_plugin.compat.checkpoints import allow_checkpoint_globals
 from leco_plugin.compat.earlier_configs import GrowingConfig
 from leco_plugin.compat.earlier_guides import read_earlier_guide
+from leco_plugin.compat.evaluated_runs import evaluate_whole_checkpoints
 from leco_plugin.compat.host_lpips import setup_with_lazy_lpips
 from leco_plugin.compat.host_outputs import with_counts_as_floats
 from leco_plugin.models.failures import require_finite
@@ -71,6 +72,7 @@ def set_up_guided(config: GuidedModelConfig, **arguments: Any) -> Model:
             with these options.
     """
     allow_checkpoint_globals()
+    evaluate_whole_checkpoints()
     if torch.device(arguments.get("device", "cpu")).type == "cpu":
         keep_freed_memory()
     host_config = copy.deepcopy(config.host)

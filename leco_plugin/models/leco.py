@@ -13,6 +13,7 @@ from nerfstudio.models.base_model import Model
 from torch import Tensor, nn
 
 from leco_plugin.compat.checkpoints import allow_checkpoint_globals
+from leco_plugin.compat.evaluated_runs import evaluate_whole_checkpoints
 from leco_plugin.models.failures import require_finite
 from leco_plugin.models.field import HMoEField
 from leco_plugin.models.front_to_back import is_no_slower, shade_front_to_back
@@ -59,6 +60,7 @@ class LecoModel(Model):
         """Builds gate, field and the buffers that a checkpoint restores."""
         super().populate_modules()
         allow_checkpoint_globals()
+        evaluate_whole_checkpoints()
         device = self.kwargs.get("device", "cpu")
         if torch.device(device).type == "cpu":
             keep_freed_memory()

@@ -16,6 +16,7 @@ from nerfstudio.models.base_model import Model
 from torch import Tensor, nn
 
 from leco_plugin.compat.checkpoints import allow_checkpoint_globals
+from leco_plugin.compat.evaluated_runs import evaluate_whole_checkpoints
 from leco_plugin.models.failures import require_finite
 from leco_plugin.models.image_figures import image_figures
 from leco_plugin.models.precision import fast_precision, keep_freed_memory
@@ -66,6 +67,7 @@ class SwitchNerfModel(Model):
                 "leave it out for dropless routing"
             )
         allow_checkpoint_globals()
+        evaluate_whole_checkpoints()
         device = self.kwargs.get("device", "cpu")
         if torch.device(device).type == "cpu":
             keep_freed_memory()

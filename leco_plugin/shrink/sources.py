@@ -14,6 +14,8 @@ import torch
 from nerfstudio.cameras.rays import RayBundle
 from torch import Tensor
 
+from leco_plugin.compat.evaluated_runs import whole_of
+from leco_plugin.compat.whole_checkpoints import step_of
 from leco_plugin.models.field_at_freezing import field_at_freezing
 from leco_plugin.models.freezing import held_out_sampler
 from leco_plugin.models.leco import LecoModel
@@ -73,8 +75,8 @@ def _of_run(folder: Path, data: Path) -> Source | None:
         raise InputError(f"{folder / CONFIG} cannot be read: {_line(error)}") from None
     if not issubclass(config.pipeline.model._target, LecoModel):
         return None
-    config.load_dir = folder / CHECKPOINTS
-    config.load_step = None
+    path = whole_of(folder / CHECKPOINTS)
+    config.load_dir, config.load_step = path.parent, step_of(path)
     config.data = config.pipeline.datamanager.data = data
     try:
         pipeline = config.pipeline.setup(device=_device(), test_mode="test")

@@ -26,7 +26,7 @@ class Capture:
 
     views: int = 40
     """Training pictures."""
-    test_views: int = 6
+    test_views: int = 4
     """Held-out pictures."""
     width: int = 64
     """Of a picture, pixels."""

@@ -35,8 +35,8 @@ class Case:
     grid_levels: int = 1
     """Nested boxes of occupancy grids: as many as somebody who knows the scene would take."""
     fine_grid: bool = False
-    """Whether size and place of cells are the question, so that finer ones are tried too: to keep
-    256^3 cells up to date takes a core of a CPU minutes."""
+    """Whether the size of cells is the question, so that finer ones are tried too: to keep 256^3
+    cells up to date takes a core of a CPU minutes."""
     only: tuple[str, ...] = ()
     """Samplers that it has something to say about; none is all. References join by themselves."""
     seeds: int = 1
@@ -85,15 +85,12 @@ CASES = {
             "poles-and-wires",
             fine_grid=True,
         ),
-        Case(
-            "glass", "glass", "low density that matters, before surfaces", "glass", fine_grid=True
-        ),
+        Case("glass", "glass", "low density that matters, before surfaces", "glass"),
         Case(
             "fog",
             "fog",
             "low density everywhere: nothing is empty, nothing is solid",
             "fog",
-            fine_grid=True,
         ),
         Case(
             "all-empty",
@@ -110,7 +107,6 @@ CASES = {
             "far-terrain",
             Capture(stand="low"),
             grid_levels=2,
-            fine_grid=True,
         ),
         Case(
             "outline",
@@ -118,7 +114,6 @@ CASES = {
             "no box fits the scene, and one camera stands far outside",
             "outline",
             Capture(stray=1),
-            fine_grid=True,
         ),
         Case(
             "indoors",
@@ -126,14 +121,12 @@ CASES = {
             "cameras inside the matter that they see: what is empty is around them",
             "indoors",
             Capture(stand="inside"),
-            fine_grid=True,
         ),
         Case(
             "bounds-too-small",
             "bounds 4 x too small",
             "bounds are guessed, and most of the scene lies outside them",
             settings={"pipeline.datamanager.dataparser.scene_scale": 0.25},
-            fine_grid=True,
         ),
         Case(
             "bounds-too-large",

@@ -18,22 +18,28 @@ from leco_plugin.stability.contenders import (
 from leco_plugin.stability.plan import Run
 from leco_plugin.stability.sizes import Sizes
 
-START_SECONDS = 15.0
-"""For a process to start, to read the scene, to build the host, and to look at the result."""
+START_SECONDS = 7.0
+"""For a process to start, to read the scene and to build the host."""
 RAY_SECONDS: Mapping[str, float] = {
-    LEARNED: 4e-4,
-    GRID: 4e-4,
+    LEARNED: 5e-4,
+    GRID: 5e-4,
     PROPOSALS: 5e-4,
-    DENSE: 8e-4,
+    DENSE: 11e-4,
     DENSE_PROPOSAL: 10e-4,
 }
 """Of training, a ray of a step."""
+RENDERED = 25_000
+"""Rays that are looked at when a run in full sizes has ended..."""
+RENDERING = 0.45
+"""...each for this share of what it takes to train on it."""
 LEARNED_RAY_SECONDS = 3e-4
 """A ray of a step of learning."""
-FREEZE_SECONDS = 15.0
+FREEZE_SECONDS = 10.0
 """To calibrate a gate and to build its cell cache."""
+FIRST_CELL_SECONDS = 6e-6
+"""To ask the field about a cell of an occupancy grid for the first time, with memory to fetch..."""
 CELL_SECONDS = 1.8e-6
-"""To ask the field about a cell of an occupancy grid."""
+"""...and later."""
 STEPS_PER_UPDATE = 16
 """Of an occupancy grid; until step 256 it asks about every cell."""
 
@@ -57,14 +63,16 @@ def expected_seconds(run: Run, sizes: Sizes) -> float:
     contender = run.job.contender
     rays = contender.settings["pipeline.datamanager.train_num_rays_per_batch"]
     kind = GRID if contender.sampler.startswith(f"{GRID}-") else contender.sampler
-    seconds = START_SECONDS + sizes.steps * rays * RAY_SECONDS[kind]
+    rendered = RENDERED * sizes.picture**2 * RENDERING
+    seconds = START_SECONDS + (sizes.steps * rays + rendered) * RAY_SECONDS[kind]
     if kind == LEARNED:
         learning = contender.changes["occupancy.rays"] * sizes.learn_steps
         seconds += FREEZE_SECONDS + learning * LEARNED_RAY_SECONDS
     if kind == GRID:
         options = contender.changes["occupancy.options"]
         cells = options["levels"] * options["resolution"] ** 3
-        seconds += -(-sizes.steps // STEPS_PER_UPDATE) * cells * CELL_SECONDS
+        later = -(-sizes.steps // STEPS_PER_UPDATE) - 1
+        seconds += cells * (FIRST_CELL_SECONDS + later * CELL_SECONDS)
     return float(seconds)
 
 

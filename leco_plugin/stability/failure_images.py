@@ -35,7 +35,8 @@ def draw_failures(suite: Suite, results: Mapping[str, Any]) -> list[Path]:
         if shown is not None:
             path = folder / f"{entry.case.name}--{entry.sampler.name}.png"
             pictures = {"what is there": suite.true_view(entry.case), "dense": reference}
-            pictures[f"{entry.sampler.title}, seed {worst}"] = shown
+            name = entry.sampler.title if worst is None else f"{entry.sampler.title}, seed {worst}"
+            pictures[name] = shown
             title = f"{entry.case.title}: {cell['reason']}"
             drawn.append(side_by_side(pictures, title, path))
     return drawn

@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from leco_plugin.chart.theme import LIGHT, Theme
+from leco_plugin.evaluation.charts import SOURCE, fingerprint
 from leco_plugin.stability.table import figures, headline
 
 ROW, HEAD, FOOT = 0.36, 1.0, 0.7
@@ -89,7 +90,7 @@ def draw(results: Mapping[str, Any], path: Path, theme: Theme = LIGHT) -> Path:
                 _draw_cell(axes, cell, NAMES + COLUMN * column, top, theme)
     explained = textwrap.fill(HOW_TO_READ, int(width * 13))
     axes.text(0.15, height - FOOT + 0.12, explained, va="top", fontsize=9, color=theme.ink)
-    figure.savefig(path, dpi=140)
+    figure.savefig(path, dpi=140, metadata={SOURCE: fingerprint(results)})
     return path
 
 

@@ -9,7 +9,7 @@ from leco_plugin.chart.contender import Contender
 from leco_plugin.chart.folder import Job
 from leco_plugin.stability.capture import Capture
 from leco_plugin.stability.cases import Case
-from leco_plugin.stability.contenders import Sampler, contender_of
+from leco_plugin.stability.contenders import OURS, SAMPLERS, Sampler, contender_of
 from leco_plugin.stability.sizes import Sizes
 from leco_plugin.stability.stage import Stage
 from leco_plugin.stability.stages import STAGES
@@ -21,6 +21,11 @@ class Run:
 
     scene: str
     job: Job
+
+    @property
+    def key(self) -> tuple[str, str]:
+        """The same for what is run once however many cells share it."""
+        return self.scene, self.job.name
 
 
 @dataclass(frozen=True)
@@ -39,10 +44,20 @@ class Entry:
 
 
 def entries_of(
-    cases: Sequence[Case], samplers: Sequence[Sampler], seeds: Sequence[int], sizes: Sizes
+    cases: Sequence[Case],
+    samplers: Sequence[Sampler],
+    seeds: Sequence[int],
+    sizes: Sizes,
+    beside: Sequence[int] = (),
 ) -> list[Entry]:
     """All cells, case by case; a case that is about some samplers only has cells for those, and for
-    the references that they are held against."""
+    the references that they are held against.
+
+    Args:
+        beside: seeds of the samplers that learned occupancy is compared with, also where a case
+            is about seeds; none is as for learned occupancy.
+    """
+    ours = (OURS, SAMPLERS[OURS].reference)
     entries = []
     for case in cases:
         wanted = {one.name for one in samplers if case.is_about(one.name)}
@@ -52,7 +67,9 @@ def entries_of(
                 contender = contender_of(
                     sampler, sizes, case.changes, case.settings, case.grid_levels
                 )
-                entries.append(Entry(case, sampler, contender, seeds_of(case, seeds)))
+                fewer = beside and sampler.name not in ours
+                chosen = tuple(dict.fromkeys(beside)) if fewer else seeds_of(case, seeds)
+                entries.append(Entry(case, sampler, contender, chosen))
     return entries
 
 
@@ -72,7 +89,7 @@ def runs_of(entries: Sequence[Entry]) -> list[Run]:
     for number in range(most):
         for entry in entries:
             for run in entry.runs[number : number + 1]:
-                found.setdefault((run.scene, run.job.name), run)
+                found.setdefault(run.key, run)
     return list(found.values())
 
 

@@ -1,4 +1,4 @@
-"""How large everything is: small enough that all cases take two cores less than two hours."""
+"""How large everything is: so that the stored table is to take two cores less than two hours."""
 
 from __future__ import annotations
 
@@ -61,7 +61,7 @@ class Sizes:
         }
 
 
-FULL = Sizes(steps=208, rays=256, learn_rays=512, learn_steps=200)
+FULL = Sizes(steps=176, rays=192, learn_rays=384, learn_steps=200)
 QUICK = Sizes(
     steps=40, rays=64, learn_rays=64, learn_steps=20, picture=0.5, views=0.4, dense_samples=48
 )

@@ -2,17 +2,18 @@
 
 from __future__ import annotations
 
-import datetime
 import json
+import math
 import sys
 import threading
-from collections.abc import Callable, Sequence
+import time
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-from leco_plugin.chart.folder import RUNS, ChartFolder, Job
+from leco_plugin.chart.folder import LOGS, RUNS, ChartFolder, Job
 from leco_plugin.chart.processes import ProcessRunner, RunFailed
 from leco_plugin.chart.protocol import Protocol, describe_scene, settings_of
 from leco_plugin.evaluation.json_file import write_json
@@ -22,12 +23,14 @@ from leco_plugin.stability.cases import Case
 from leco_plugin.stability.contenders import Sampler
 from leco_plugin.stability.cost import core_seconds, in_words
 from leco_plugin.stability.plan import Entry, Run, entries_of, runs_of, scenes_of
-from leco_plugin.stability.scene_folder import write_scene
+from leco_plugin.stability.results import results_of, runs_in
+from leco_plugin.stability.scene_folder import digest_of, write_scene
 from leco_plugin.stability.sizes import Sizes
-from leco_plugin.stability.verdict import judge
 
 WORKER = (sys.executable, "-W", "ignore", "-m", "leco_plugin.stability.worker")
 RESULTS = "stability.json"
+FAILED = ".failed"
+"""Ending of the file, beside its log, with the reason why a run has no result."""
 Runner = Callable[[Job, Callable[[float], None]], dict[str, Any]]
 Say = Callable[[str], None]
 
@@ -40,6 +43,7 @@ class Suite:
         cases, samplers, seeds: what is compared.
         sizes: of everything.
         command: what made it, for the results.
+        beside: seeds of the samplers that learned occupancy is compared with, see `entries_of`.
 
     Raises:
         ValueError, OSError: nothing to run, or a folder with runs of other sizes or versions.
@@ -53,21 +57,23 @@ class Suite:
         seeds: Sequence[int],
         sizes: Sizes,
         command: str = "leco stability",
+        beside: Sequence[int] = (),
     ) -> None:
         if not cases or not samplers or not seeds:
             raise ValueError("a table needs at least one case, one sampler and one seed")
         self.out, self.cases, self.sizes, self.command = out, list(cases), sizes, command
         self.machine = describe_machine()
-        self.entries = entries_of(cases, samplers, seeds, sizes)
+        self.made = {"cpu": self.machine["cpu"], **describe_code()}
+        self.entries = entries_of(cases, samplers, seeds, sizes, beside)
         shown = {entry.sampler.name for entry in self.entries}
         self.samplers = [one for one in samplers if one.name in shown]
         self.protocol = Protocol(steps=sizes.steps, images=1, curve_points=1)
-        self.failures: dict[tuple[str, str], str] = {}
         self.stop = threading.Event()
-        self._writing = threading.Lock()
+        scenes = scenes_of(cases, sizes)
+        self.digests = {name: digest_of(*scene) for name, scene in scenes.items()}
         self.data = {
-            name: write_scene(stage, capture, _made(out / "scenes") / name)
-            for name, (stage, capture) in scenes_of(cases, sizes).items()
+            name: write_scene(*scene, _made(out / "scenes") / name)
+            for name, scene in scenes.items()
         }
         self.folders = {name: self._folder(name) for name in self.data}
 
@@ -102,10 +108,19 @@ class Suite:
             for name, record in folder.stored().items()
         }
 
+    def failures(self) -> dict[tuple[str, str], str]:
+        """Why runs have ended without a result, likewise: until they are made with one."""
+        return {
+            (scene, file.stem): file.read_text()
+            for scene, folder in self.folders.items()
+            for file in (folder.path / LOGS).glob(f"*{FAILED}")
+        }
+
     def missing(self) -> list[Run]:
-        """Runs that are not stored. One that failed is missing."""
-        stored = self.stored()
-        return [run for run in runs_of(self.entries) if (run.scene, run.job.name) not in stored]
+        """Runs that are not stored: those that nobody tried, then those that have failed."""
+        stored, failures = self.stored(), self.failures()
+        runs = [run for run in runs_of(self.entries) if run.key not in stored]
+        return sorted(runs, key=lambda run: run.key in failures)
 
     def estimate(self) -> str:
         """How long what is missing takes, in words."""
@@ -121,6 +136,7 @@ class Suite:
         say: Say,
         show: Callable[[float], None],
         runner_for: Callable[[str], Runner] | None = None,
+        seconds: float = math.inf,
     ) -> None:
         """Makes what is missing; whenever this is stopped, what was finished is kept.
 
@@ -128,85 +144,67 @@ class Suite:
             say: called with a line for each run.
             show: called with the share of all runs that is done.
             runner_for: gives what makes the runs of a scene, instead of processes.
+            seconds: after which no run is to go on; but for the first ones, what would take longer
+                is left for another time.
         """
-        todo, total = self.missing(), len(runs_of(self.entries))
-        make_one = runner_for or self.runner
+        todo, total, stored = self.missing(), len(runs_of(self.entries)), self.stored()
+        expected = [core_seconds([run], list(stored.values()), self.sizes) for run in todo]
+        make_one, ends = runner_for or self.runner, time.monotonic() + seconds
+        done = total - len(todo)
         self.write()
         with ThreadPoolExecutor(self.workers) as pool:
             under_way: set[Future[str]] = set()
             try:
                 for number, run in enumerate(todo):
-                    show((total - len(todo) + number - len(under_way)) / total)
+                    late = time.monotonic() + expected[number] > ends
+                    if late and number >= self.workers:
+                        continue
                     under_way.add(pool.submit(self._run, run, make_one(run.scene)))
                     if len(under_way) >= self.workers:
-                        under_way = self._collect(under_way, say)
+                        done += self._collect(under_way, say)
+                        show(done / total)
                 while under_way:
-                    show((total - len(under_way)) / total)
-                    under_way = self._collect(under_way, say)
+                    done += self._collect(under_way, say)
+                    show(done / total)
             except BaseException:
                 self.stop.set()
                 raise
-        show(1.0)
 
-    def _collect(self, under_way: set[Future[str]], say: Say) -> set[Future[str]]:
-        """Waits for one run; returns those that go on."""
+    def _collect(self, under_way: set[Future[str]], say: Say) -> int:
+        """Waits for one run, or more that end together, and takes them out; returns how many."""
         done, rest = wait(under_way, return_when=FIRST_COMPLETED)
         for future in done:
             say(future.result())
         self.write()
-        return rest
+        under_way &= rest
+        return len(done)
 
     def _run(self, run: Run, runner: Runner) -> str:
         """Makes a run and keeps it; returns a line about it."""
         title = f"{run.scene}, {run.job.contender.name}, seed {run.job.seed}"
+        folder = self.folders[run.scene]
+        failure = folder.path / LOGS / f"{run.job.name}{FAILED}"
         try:
             record = runner(run.job, lambda share: None)
-        except RunFailed as failure:
-            with self._writing:
-                self.failures[run.scene, run.job.name] = str(failure)
-            return f"{title}: failed: {failure}"
-        self.folders[run.scene].store(run.job, record)
-        return f"{title}: {record['psnr']:.2f} dB after {record['processor_seconds']:.0f} s"
+        except RunFailed as error:
+            failure.write_text(str(error))
+            return f"{title}: failed: {error}"
+        folder.store(run.job, record | {"made": self.made})
+        failure.unlink(missing_ok=True)
+        psnr = "no PSNR" if record["psnr"] is None else f"{record['psnr']:.2f} dB"
+        return f"{title}: {psnr} after {record['processor_seconds']:.0f} s"
+
+    def take_over(self, results: Mapping[str, Any]) -> int:
+        """Keeps the runs of another table that would be made here just so; returns how many."""
+        taken, stored = runs_in(results, self), self.stored()
+        runs = [run for run in runs_of(self.entries) if run.key in taken.keys() - stored.keys()]
+        for run in runs:
+            self.folders[run.scene].store(run.job, taken[run.key])
+        return len(runs)
 
     def results(self) -> dict[str, Any]:
         """The table, as in `stability.json`."""
-        stored = self.stored()
-        rows = []
-        for case in self.cases:
-            cells = {
-                entry.sampler.name: self._cell(entry, stored)
-                for entry in self.entries
-                if entry.case is case
-            }
-            facts = {"name": case.name, "title": case.title, "why": case.why}
-            rows.append({**facts, "must_fail": case.must_fail, "cells": cells})
-        return {
-            "format": 1,
-            "machine": self.machine,
-            "sizes": asdict(self.sizes),
-            "made": {
-                "date": datetime.date.today().isoformat(),
-                "command": self.command,
-                **describe_code(),
-            },
-            "samplers": [
-                {"name": one.name, "title": one.title, "reference": one.reference}
-                for one in self.samplers
-            ],
-            "cases": rows,
-        }
-
-    def _cell(self, entry: Entry, stored: dict[tuple[str, str], dict[str, Any]]) -> dict[str, Any]:
-        runs, failures = self._runs(entry, stored)
-        reference = None
-        if entry.sampler.reference is not None:
-            reference = self._runs(self.reference_of(entry), stored)[0]
-        cell = judge(runs, reference, failures)
-        figures = [
-            {"seed": run["seed"], "psnr": run["psnr"], **run["measured"], **_learned(run)}
-            for run in runs
-        ]
-        return {**cell.to_dict(), "runs": figures}
+        return results_of(self)
 
     def reference_of(self, entry: Entry) -> Entry:
         """The cell that a cell is held against."""
@@ -230,14 +228,6 @@ class Suite:
         data = self.data[case.scene]
         names = json.loads((data / TRANSFORMS).read_text())["test_filenames"]
         return data / str(names[0])
-
-    def _runs(
-        self, entry: Entry, stored: dict[tuple[str, str], dict[str, Any]]
-    ) -> tuple[list[dict[str, Any]], list[str]]:
-        """Finished runs of a cell, and why others ended."""
-        keys = [(run.scene, run.job.name) for run in entry.runs]
-        failed = [self.failures[key] for key in keys if key in self.failures]
-        return [stored[key] for key in keys if key in stored], failed
 
     def write(self) -> dict[str, Any]:
         """`stability.json` and `table.md`, as far as there are runs."""
@@ -264,12 +254,3 @@ class Suite:
 def _made(folder: Path) -> Path:
     folder.mkdir(parents=True, exist_ok=True)
     return folder
-
-
-def _learned(run: dict[str, Any]) -> dict[str, Any]:
-    """What the calibration of a learned occupancy says, of a run that has one."""
-    facts = run.get("occupancy")
-    if not facts:
-        return {}
-    names = ("threshold", "lost_surface_mass", "image_price_db", "empty_fraction")
-    return {"occupancy": {name: facts.get(name) for name in names}}

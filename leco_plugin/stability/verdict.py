@@ -6,6 +6,7 @@ many rays; where that does not train, nobody can be held to anything.
 
 from __future__ import annotations
 
+import math
 import statistics
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
@@ -44,6 +45,8 @@ class Cell:
     reason: str
     """In a few words; empty for a pass."""
     seeds: int
+    missing: int = 0
+    """Seeds that were asked for and not run yet."""
     psnr: float | None = None
     """Median over seeds, dB."""
     gap: float | None = None
@@ -72,6 +75,7 @@ def judge(
     runs: Sequence[Mapping[str, Any]],
     reference: Sequence[Mapping[str, Any]] | None,
     failures: Sequence[str] = (),
+    missing: int = 0,
 ) -> Cell:
     """The cell of a sampler in a case.
 
@@ -79,13 +83,17 @@ def judge(
         runs: its finished runs.
         reference: those of its dense reference; None where it is one itself.
         failures: reasons of its runs that have ended without a result.
+        missing: its runs that have not been made.
     """
     if failures:
         many = len(failures) + len(runs)
-        return Cell("fail", f"{len(failures)} of {many} runs ended: {failures[0]}", many)
+        return Cell("fail", f"{len(failures)} of {many} runs ended: {failures[0]}", many, missing)
     if not runs:
-        return Cell("no reference", "not run", 0)
-    cell = _figures(runs, reference)
+        return Cell("no reference", "not run", 0, missing)
+    blind = _unmeasured(runs, reference or ())
+    if blind:
+        return Cell("fail", blind, len(runs), missing)
+    cell = _figures(runs, reference, missing)
     held_to = runs if reference is None else reference
     if not _trained(held_to):
         reason = "does not train" if reference is None else "the reference does not train"
@@ -114,15 +122,31 @@ def _broken(cell: Cell, bars: Bars, lost: float | None, most_lost: float) -> str
     return ""
 
 
+def _unmeasured(runs: Sequence[Mapping[str, Any]], reference: Sequence[Mapping[str, Any]]) -> str:
+    """The first figure that is no number although there should be one, in words: what nobody has
+    seen is not passed."""
+    wanted = ["kept_fraction", "trivial_psnr"]
+    wanted += [name for name in ("lost_mass", "detail_psnr") if _values(reference, name)]
+    for run in runs:
+        if run["psnr"] is None:
+            return f"seed {run['seed']} renders what is no number"
+        for name in wanted:
+            if run["measured"].get(name) is None:
+                return f"seed {run['seed']} has no {name.replace('_', ' ')}"
+    return ""
+
+
 def _figures(
-    runs: Sequence[Mapping[str, Any]], reference: Sequence[Mapping[str, Any]] | None
+    runs: Sequence[Mapping[str, Any]],
+    reference: Sequence[Mapping[str, Any]] | None,
+    missing: int,
 ) -> Cell:
     psnrs = [float(run["psnr"]) for run in runs]
     middle = statistics.median(psnrs)
     at = min(range(len(runs)), key=psnrs.__getitem__)
     gap = detail_gap = None
-    if reference:
-        gap = middle - statistics.median(float(run["psnr"]) for run in reference)
+    if reference and math.isfinite(_psnr(reference)):
+        gap = middle - _psnr(reference)
         ours, theirs = _median(runs, "detail_psnr"), _median(reference, "detail_psnr")
         if ours is not None and theirs is not None:
             detail_gap = ours - theirs
@@ -130,6 +154,7 @@ def _figures(
         "pass",
         "",
         len(runs),
+        missing,
         middle,
         gap,
         psnrs[at] - middle,
@@ -144,9 +169,13 @@ def _figures(
 def _trained(runs: Sequence[Mapping[str, Any]]) -> bool:
     if not runs:
         return False
-    psnr = statistics.median(float(run["psnr"]) for run in runs)
-    trivial = statistics.median(float(run["measured"]["trivial_psnr"]) for run in runs)
-    return psnr > min(trivial + TRAINED_ABOVE, GOOD_ANYWAY)
+    trivial = _median(runs, "trivial_psnr")
+    return trivial is not None and _psnr(runs) > min(trivial + TRAINED_ABOVE, GOOD_ANYWAY)
+
+
+def _psnr(runs: Sequence[Mapping[str, Any]]) -> float:
+    """Median over seeds, dB; what is no number is worse than any."""
+    return statistics.median(-math.inf if r["psnr"] is None else float(r["psnr"]) for r in runs)
 
 
 def _values(runs: Sequence[Mapping[str, Any]], name: str) -> list[float]:

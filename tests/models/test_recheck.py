@@ -8,9 +8,10 @@ from typing import Any
 import pytest
 import torch
 
-from leco_plugin.models import guided_watch, recheck
-from leco_plugin.models.calibration import CalibrationConfig, Measured
+from leco_plugin.models import freezing, guided_watch, recheck
+from leco_plugin.models.calibration import CalibrationConfig, Measured, Reference
 from leco_plugin.models.failures import GateCollapsed
+from leco_plugin.models.freezing import DenseRendering
 from leco_plugin.models.guided_watch import GuidedWatch
 from leco_plugin.models.progress import NO_EVIDENCE, Progress
 from leco_plugin.models.recheck import (
@@ -20,6 +21,7 @@ from leco_plugin.models.recheck import (
     skip_less,
     steps_until_next,
 )
+from leco_plugin.models.rendering import Intervals
 
 CONFIG = CalibrationConfig()
 
@@ -83,6 +85,14 @@ class Model(SimpleNamespace):
 
     def reopen(self) -> None:
         self.reopened += 1
+
+    training = True
+
+    def eval(self) -> None:
+        self.training = False
+
+    def train(self, mode: bool) -> None:
+        self.training = mode
 
 
 @pytest.mark.parametrize("found", [0.2, 0.0])
@@ -188,3 +198,80 @@ def test_what_was_found_travels_with_a_checkpoint() -> None:
     found = Progress.from_dict(progress.to_dict())
     assert beyond_bounds(found) == "lost surface mass"
     assert (found.rechecks, found.recheck_due) == (4, 800)
+
+
+WALL, WIRE, SAMPLES = 15, 6, 20
+"""Places along a ray: what the gate keeps at any threshold, and what it takes for hardly there."""
+
+
+class Street:
+    """Rays that end at a white wall; in a tenth of them a black wire is before it."""
+
+    wires_are_learned = False
+
+    def rays(self, model: Any, data: Any, count: int | None = None, seed: int = 0) -> Any:
+        generator = torch.Generator().manual_seed(seed)
+        there = torch.rand(count or CONFIG.rays, generator=generator) < 0.1
+        noise = 0.05 * torch.randn(len(there), 3, generator=generator)
+        return there, torch.where(there, 0.1, 1.0)[:, None] + noise
+
+    def rendering(self, model: Any, there: torch.Tensor, truth: torch.Tensor) -> DenseRendering:
+        assert not model.training
+        shown = there & self.wires_are_learned
+        weights = torch.zeros(len(there), SAMPLES)
+        weights[:, WIRE] = 0.9 * shown
+        weights[:, WALL] = 1.0 - weights[:, WIRE]
+        occupancies = torch.full_like(weights, 0.05)
+        occupancies[:, WIRE], occupancies[:, WALL] = 0.2, 0.95
+        median = torch.where(shown, WIRE, WALL)[:, None]
+        near = (torch.arange(SAMPLES) - median).abs() <= 2
+        ray_indices = torch.arange(len(there)).repeat_interleave(SAMPLES)
+        starts = torch.arange(SAMPLES).float().repeat(len(there))
+        intervals = Intervals(ray_indices, starts, starts + 1.0)
+        never = torch.zeros(weights.numel(), dtype=torch.bool)
+        flat = weights.flatten(), occupancies.flatten(), near.flatten()
+
+        def render_kept(_: int, mask: torch.Tensor) -> torch.Tensor:
+            kept = weights * mask.view_as(weights)
+            if not bool(mask.view_as(weights)[:, WIRE].all()):  # light goes on to the wall
+                kept = kept.clone()
+                kept[:, WALL] = 1.0
+            return kept[:, WALL, None].expand(-1, 3)
+
+        rgb = render_kept(0, ~never)
+        return DenseRendering([Reference(intervals, *flat, rgb, never)], [truth], render_kept)
+
+
+def test_a_field_that_learns_a_wire_lowers_the_threshold_until_the_wire_is_kept(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    street, model, left, saved = Street(), Model(), [], []
+    for module in (recheck, freezing):
+        monkeypatch.setattr(module, "calibration_rays", street.rays)
+        monkeypatch.setattr(module, "dense_rendering", street.rendering)
+    monkeypatch.setattr(guided_watch, "write_occupancy", lambda m, _: left.append(m.report))
+    lifecycle: Any = SimpleNamespace(
+        model=model,
+        progress=model.progress,
+        pipeline=SimpleNamespace(datamanager=None),
+        folder="folder",
+        save=saved.append,
+    )
+    watch = GuidedWatch(lifecycle)
+
+    def go(first: int, last: int) -> None:
+        for step in range(first, last):
+            watch.after_step(step, 100.0)
+
+    go(200, 901)
+    assert float(model.threshold) == pytest.approx(0.4) and not saved  # nobody sees the wires yet
+    street.wires_are_learned = True
+    go(901, 1001)
+    assert model.progress.rechecks == 8 and saved == [1000]
+    assert 0.15 < float(model.threshold) < 0.2
+    (report,) = left
+    assert report["threshold"] == pytest.approx(float(model.threshold))
+    assert report["lost_surface_mass"] <= CONFIG.lost_surface_mass
+    assert report["image_price_db"] <= CONFIG.image_price_db and report["empty_fraction"] > 0.8
+    go(1001, 3000)
+    assert saved == [1000] and model.training

@@ -50,10 +50,12 @@ def test_settings_arrive_where_they_belong() -> None:
     assert config("learning-rate", "grid-128").optimizers["fields"]["optimizer"].lr == 0.1
     assert config("bounds-too-small", "dense").pipeline.datamanager.dataparser.scene_scale == 0.25
     assert config("fp16", "learned").pipeline.model.occupancy.learning.precision == "float16"
-    assert config("far-terrain", "grid-256").pipeline.model.occupancy.options == {
-        "resolution": 256,
-        "levels": 2,
-    }
+    for case, sampler, resolution, levels in (
+        ("far-terrain", "grid-128", 128, 2),
+        ("poles-and-wires", "grid-256", 256, 1),
+    ):
+        options = config(case, sampler).pipeline.model.occupancy.options
+        assert options == {"resolution": resolution, "levels": levels}
     homogeneous = config("homogeneous", "learned").pipeline.model.occupancy.learning
     assert homogeneous.sizes.field.experts.empty_layers == homogeneous.sizes.field.experts.layers
 
@@ -74,6 +76,16 @@ def test_all_cells_get_their_first_seed_before_any_gets_its_second() -> None:
     )
     seeds = [run.job.seed for run in runs_of(entries)]
     assert seeds == [7] * 4 + [3] * 4
+
+
+def test_samplers_that_stand_beside_may_have_fewer_seeds() -> None:
+    chosen = cases_named(("glass", "ten-seeds"))
+    entries = entries_of(chosen, samplers_named(()), (0, 1, 2), QUICK, beside=(0,))
+    seeds = {(one.case.name, one.sampler.name): len(one.seeds) for one in entries}
+    assert seeds["glass", "learned"] == seeds["glass", "dense"] == 3
+    assert seeds["glass", "grid-128"] == seeds["glass", "dense-proposal"] == 1
+    assert seeds["ten-seeds", "learned"] == seeds["ten-seeds", "dense"] == 10
+    assert seeds["ten-seeds", "grid-128"] == 1
 
 
 def test_references_join_by_themselves() -> None:

@@ -9,7 +9,7 @@ import pytest
 from stability_runs import Runs
 
 from leco_plugin import cli
-from leco_plugin.stability import command
+from leco_plugin.stability import command, suite
 
 
 @pytest.fixture
@@ -38,14 +38,29 @@ def test_all_was_run_is_success_whatever_the_verdicts_are(tmp_path: Path, runs: 
     assert len(runs.made) == 2
 
 
-@pytest.mark.parametrize("psnr", [25.0, 20.0])
+@pytest.mark.parametrize("psnr", [25.0, 24.5, 20.0])
 def test_a_suite_that_is_blind_says_so(
     tmp_path: Path, runs: Runs, capsys: pytest.CaptureFixture[str], psnr: float
 ) -> None:
     runs.psnrs = {"learned": psnr}
     words = ["stability", "--out", str(tmp_path / "out"), "--cases", "homogeneous"]
-    assert cli.main(words) == (1 if psnr == 25.0 else 0)
-    assert ("must fail and was passed" in capsys.readouterr().err) == (psnr == 25.0)
+    assert cli.main(words) == (0 if psnr == 20.0 else 1)
+    assert ("homogeneous must fail" in capsys.readouterr().err) == (psnr != 20.0)
+
+
+def test_a_portion_is_made_and_the_same_command_goes_on(
+    tmp_path: Path, runs: Runs, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(suite, "usable_cores", lambda: 1)
+    words = ("--cases", "yard", "--samplers", "grid-128", "learned", "--minutes", "0.001")
+    for left in (2, 1):
+        assert stability(tmp_path / "out", *words) == 0
+        said = " ".join(capsys.readouterr().out.split())
+        assert f"{left} runs are left or have failed; the same command goes on with them" in said
+    assert stability(tmp_path / "out", *words) == 0
+    assert "runs are left" not in capsys.readouterr().out
+    assert sorted(name for _, name, _ in runs.made) == ["dense", "grid-128", "learned"]
+    assert stability(tmp_path / "out", "--minutes", "0") == 2
 
 
 @pytest.mark.parametrize(

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import copy
 import json
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import pytest
 from stability_runs import TINY, Runs, make, suite
@@ -31,7 +33,7 @@ def test_a_table_holds_every_cell_with_its_figures(tmp_path: Path) -> None:
         "dense": "pass",
     }
     assert row["cells"]["grid-128"]["gap"] == -2.0
-    assert row["cells"]["learned"]["runs"][0]["kept_fraction"] == 0.25
+    assert row["cells"]["learned"]["runs"][0]["measured"]["kept_fraction"] == 0.25
     assert json.loads((tmp_path / "stability.json").read_text()) == results
 
 
@@ -64,6 +66,49 @@ def test_a_run_that_ends_without_a_result_fails_its_cell_and_no_other(tmp_path: 
     again = Runs()
     make(suite(tmp_path, ("yard",), SAMPLERS), again)
     assert again.made == [("yard", "learned", 0)]
+
+
+def test_a_failure_stands_until_the_run_is_made(tmp_path: Path) -> None:
+    make(suite(tmp_path, ("yard",), SAMPLERS, (0, 1)), Runs(broken="grid-128"))
+    later = suite(tmp_path, ("yard",), SAMPLERS, (0, 1))
+    cell = later.results()["cases"][0]["cells"]["grid-128"]
+    assert cell["verdict"] == "fail" and "2 of 2 runs ended: grid-128 is broken" in cell["reason"]
+    longer = suite(tmp_path, ("yard",), SAMPLERS, (0, 1, 2))
+    tried = {run.job.contender.sampler for run in longer.missing()[-2:]}
+    assert tried == {"grid-128"} and len(longer.missing()) == 5  # what has failed comes last
+    cells = make(later, Runs())["cases"][0]["cells"]
+    assert cells["grid-128"]["verdict"] == "pass" and not later.failures()
+
+
+def test_runs_of_another_table_are_taken_over_where_they_are_of_the_same_settings(
+    tmp_path: Path,
+) -> None:
+    there = make(suite(tmp_path / "there", ("yard", "glass"), SAMPLERS), Runs({"dense": 25.2}))
+    here = suite(tmp_path / "here", ("yard", "glass", "fog"), SAMPLERS)
+    assert here.take_over(there) == 6 and here.take_over(there) == 0
+    later = Runs()
+    whole = make(here, later)
+    assert {scene for scene, _, _ in later.made} == {"fog"}
+    assert whole["cases"][:2] == there["cases"]
+
+    assert suite(tmp_path / "other", ("yard",), SAMPLERS).take_over(_another("sizes", there)) == 0
+    assert suite(tmp_path / "other", ("yard",), SAMPLERS).take_over(_another("scene", there)) == 0
+
+
+def _another(what: str, results: dict[str, Any]) -> dict[str, Any]:
+    """The same results, of other sizes or scenes."""
+    changed = copy.deepcopy(results)
+    if what == "sizes":
+        changed["sizes"]["steps"] += 1
+    for row in changed["cases"] if what == "scene" else ():
+        row["scene"]["digest"] = "another"
+    return changed
+
+
+def test_a_run_that_renders_no_number_fails_and_the_others_go_on(tmp_path: Path) -> None:
+    cells = make(suite(tmp_path, ("yard",), SAMPLERS), Runs({"learned": None}))["cases"][0]["cells"]
+    assert cells["learned"]["reason"] == "seed 0 renders what is no number"
+    assert cells["grid-128"]["verdict"] == "pass"
 
 
 def test_a_folder_of_other_sizes_is_refused(tmp_path: Path) -> None:

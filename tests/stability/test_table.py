@@ -4,7 +4,9 @@ from __future__ import annotations
 
 from typing import Any
 
-from leco_plugin.stability.table import blind, headline, table, verdicts_of
+import pytest
+
+from leco_plugin.stability.table import blind, headline, table, unproven, verdicts_of
 
 SAMPLERS = [
     {"name": "learned", "title": "learned occupancy", "reference": "dense"},
@@ -15,7 +17,14 @@ MADE = {"date": "2024-02-29", "command": "leco stability --out DIR", "version": 
 
 
 def cell(verdict: str, gap: float | None = -0.05, **values: Any) -> dict[str, Any]:
-    figures = {"psnr": 24.0, "gap": gap, "seeds": 1, "worst": 0.0, "reason": f"why {verdict}"}
+    figures = {
+        "psnr": 24.0,
+        "gap": gap,
+        "seeds": 1,
+        "missing": 0,
+        "worst": 0.0,
+        "reason": f"why {verdict}",
+    }
     return figures | {"verdict": verdict, "kept_fraction": 0.2, "lost_mass": 0.004} | values
 
 
@@ -45,9 +54,35 @@ def test_the_headline_counts_what_was_passed_where_there_is_a_reference() -> Non
     assert headline(results()) == "nothing has been run yet"
 
 
-def test_a_suite_that_passes_what_must_fail_is_blind() -> None:
-    assert blind(TWO) == []
-    assert blind(results(("equal", True, {"learned": cell("pass")}))) == ["equal"]
+@pytest.mark.parametrize(
+    ("ours", "why"),
+    [
+        (cell("pass"), "the case equal must fail, and its verdict is pass"),
+        (cell("degraded"), "the case equal must fail, and its verdict is degraded"),
+        (
+            cell("fail", None, psnr=None, reason="1 of 1 runs ended: out of memory"),
+            "the case equal must fail by its figures; 1 of 1 runs ended: out of memory",
+        ),
+    ],
+)
+def test_a_suite_in_which_what_must_fail_does_not_is_blind(ours: dict[str, Any], why: str) -> None:
+    shown = results(("yard", False, both("pass", "pass")), ("equal", True, {"learned": ours}))
+    assert blind(shown) == [why] and unproven(shown)
+    assert headline(shown).endswith("; unproven: the case that must fail has not failed")
+    assert blind(TWO) == [] and not unproven(TWO)
+
+
+def test_a_suite_whose_failing_case_says_nothing_is_unproven_though_not_blind() -> None:
+    for silent in (cell("no reference"), cell("no reference", None, psnr=None, seeds=0)):
+        shown = results(("yard", False, both("pass", "pass")), ("equal", True, {"learned": silent}))
+        assert blind(shown) == [] and unproven(shown)
+    assert not unproven(results(("yard", False, both("pass", "pass"))))
+
+
+def test_what_is_missing_is_said() -> None:
+    shown = results(("yard", False, {"learned": cell("pass", seeds=1, missing=2)}))
+    assert headline(shown).endswith("; 2 seeds of cells are missing")
+    assert "1 of 3 seeds" in table(shown)
 
 
 def test_every_failure_says_why() -> None:

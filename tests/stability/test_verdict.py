@@ -9,13 +9,13 @@ import pytest
 from leco_plugin.stability.verdict import judge
 
 
-def run(seed: int = 0, psnr: float = 25.0, **measured: Any) -> dict[str, Any]:
+def run(seed: int = 0, psnr: float | None = 25.0, **measured: Any) -> dict[str, Any]:
     figures = {"lost_mass": 0.0, "kept_fraction": 0.2, "detail_psnr": None}
     figures |= {"trivial_psnr": 12.0, "black_share": 0.0}
     return {"seed": seed, "psnr": psnr, "measured": figures | measured}
 
 
-def runs(*psnrs: float, **measured: Any) -> list[dict[str, Any]]:
+def runs(*psnrs: float | None, **measured: Any) -> list[dict[str, Any]]:
     return [run(seed, psnr, **measured) for seed, psnr in enumerate(psnrs)]
 
 
@@ -81,3 +81,41 @@ def test_what_has_not_been_run_has_no_verdict() -> None:
 def test_a_reference_is_held_to_having_trained_only() -> None:
     cell = judge(DENSE, None)
     assert (cell.verdict, cell.gap, cell.psnr) == ("pass", None, 25.0)
+
+
+@pytest.mark.parametrize(
+    ("psnr", "measured", "reason"),
+    [
+        (None, {}, "seed 1 renders what is no number"),
+        (25.0, {"lost_mass": None}, "seed 1 has no lost mass"),
+        (25.0, {"detail_psnr": None}, "seed 1 has no detail psnr"),
+        (25.0, {"kept_fraction": None}, "seed 1 has no kept fraction"),
+    ],
+)
+def test_what_nobody_has_seen_is_not_passed(
+    psnr: float | None, measured: dict[str, Any], reason: str
+) -> None:
+    dense = runs(25.0, 25.1, 24.9, detail_psnr=20.0)
+    whole, other = (run(seed, detail_psnr=20.0) for seed in (0, 2))
+    assert judge([whole, other], dense).verdict == "pass"
+    blind = run(1, psnr, **{"detail_psnr": 20.0} | measured)
+    cell = judge([whole, blind, other], dense)
+    assert (cell.verdict, cell.reason, cell.seeds) == ("fail", reason, 3)
+
+
+def test_where_no_surface_is_met_none_is_asked_for() -> None:
+    nowhere = {"lost_mass": None}
+    assert judge(runs(25.0, **nowhere), runs(25.0, **nowhere)).verdict == "pass"
+
+
+def test_a_reference_that_renders_no_number_has_not_trained() -> None:
+    assert judge(runs(25.0), runs(25.0, None, 25.2)).verdict == "pass"
+    cell = judge(runs(25.0), runs(25.0, None, None))
+    assert (cell.verdict, cell.gap) == ("no reference", None)
+    assert judge(runs(25.0, None), None).verdict == "fail"
+
+
+def test_seeds_that_are_missing_are_counted() -> None:
+    assert judge(runs(25.0), DENSE, missing=2).missing == 2
+    assert judge([], DENSE, missing=3).missing == 3
+    assert judge([], DENSE, ["out of memory"], missing=2).missing == 2

@@ -1,0 +1,80 @@
+"""What docs/stability.md shows of the stored results: the table, and runs that were killed."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import checkout  # noqa: F401
+
+from leco_plugin.stability.table import failures, headline, verdicts
+
+ROOT = Path(__file__).resolve().parent.parent
+PAGE = ROOT / "docs" / "stability.md"
+PICTURE = ROOT / "docs" / "images" / "stability.png"
+TABLE = "<!-- results: generated -->", "<!-- end of the results -->"
+KILLS = "<!-- kills: generated -->", "<!-- end of the kills -->"
+
+
+def page(text: str, results: Path) -> str:
+    """The page with its generated parts renewed; a part whose results are not stored says so."""
+    for (begin, end), name, shown in ((TABLE, "stability", of_table), (KILLS, "kills", of_kills)):
+        stored = results / f"{name}.json"
+        body = shown(json.loads(stored.read_text())) if stored.exists() else "Not run yet."
+        before, rest = text.split(begin)
+        text = f"{before}{begin}\n{body}\n{end}{rest.split(end)[1]}"
+    return text
+
+
+def of_table(results: dict[str, Any]) -> str:
+    """Picture, verdicts, what failed, and where the runs come from."""
+    runs = {
+        (row["scene"]["name"], run["name"]): run
+        for row in results["cases"]
+        for cell in row["cells"].values()
+        for run in cell["runs"]
+    }
+    seconds = sum(run["processor_seconds"] for run in runs.values())
+    made: dict[str, list[str]] = {
+        name: sorted({str(run["made"][name]) for run in runs.values()})
+        for name in ("cpu", "version", "commit")
+    }
+    picture = (
+        '<picture><source media="(prefers-color-scheme: dark)" srcset="images/stability-dark.png">'
+        '<img alt="cases by samplers" src="images/stability.png"></picture>'
+    )
+    circumstances = (
+        f"`python benchmarks/stability.py`: {len(runs)} runs, {seconds / 3600:.1f} hours of one "
+        f"core; {', '.join(made['cpu'])}; leco_plugin {', '.join(made['version'])} at "
+        f"{', '.join(made['commit'])}; {results['made']['date']}."
+    )
+    parts = [f"{sentence(headline(results))}", picture, verdicts(results), failures(results)]
+    return "\n\n".join(part for part in [*parts, circumstances] if part)
+
+
+def sentence(text: str) -> str:
+    """With a capital at its beginning and a full stop."""
+    return f"{text[:1].upper()}{text[1:]}."
+
+
+def of_kills(results: dict[str, Any]) -> str:
+    """How often runs were killed, what that lost, and how they ended beside the others."""
+    kills = [kill for run in results["killed"] for kill in run["kills"]]
+    lost = sum(kill["after"] < kill["before"] for kill in kills)
+    ends = [run for run in results["killed"] if run["kills"] and "psnr" in run]
+    whole = results["undisturbed"]
+    finished = sum(run["step"] == results["steps"] - 1 and run["frozen"] for run in ends)
+    return (
+        f"`python benchmarks/kills.py`: {len(kills)} kills with SIGKILL at random moments of runs "
+        f"of {results['steps']} steps; {lost or 'none'} of them lost something that was saved. "
+        f"{finished} of {len(ends)} runs that were killed went on to their last step with a frozen "
+        f"gate and an occupancy that loads, at {spread(ends)} on test pixels; {len(whole)} runs "
+        f"that nobody killed end at {spread(whole)}. {results['machine']['cpu']}."
+    )
+
+
+def spread(runs: list[dict[str, Any]]) -> str:
+    """From the least PSNR to the most."""
+    values = [run["psnr"] for run in runs]
+    return f"{min(values):.2f} to {max(values):.2f} dB" if values else "no PSNR yet"
