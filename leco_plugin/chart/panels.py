@@ -7,7 +7,6 @@ from typing import Any
 
 from leco_plugin.chart.summary import (
     COSTS,
-    RENDERING,
     Cost,
     Line,
     Representation,
@@ -17,7 +16,7 @@ from leco_plugin.chart.theme import Theme, plain, style
 
 WIDE_RANGE = 8.0
 """Ratio of costs from which their axis is logarithmic."""
-NAME_WIDTH = 0.0118
+NAME_WIDTH = 0.019
 """Of a letter beside a point of the large panel, of the panel's."""
 
 
@@ -155,8 +154,7 @@ def _is_free(
     )
 
 
-def draw_rendering(axes: Any, lines: Sequence[Line], theme: Theme) -> None:
-    """PSNR against the time to render an image, in a panel beside others."""
-    points = [(line, line.median(RENDERING)) for line in lines]
-    _draw_costs(axes, RENDERING, points, theme, first=False)
-    axes.set_title("PSNR by seconds to render an image", fontsize=11.5, loc="left")
+def draw_cost(axes: Any, cost: Cost, lines: Sequence[Line], theme: Theme) -> None:
+    """PSNR against one cost, in a panel beside others."""
+    _draw_costs(axes, cost, [(line, line.median(cost)) for line in lines], theme, first=False)
+    axes.set_title(f"PSNR by {cost.title}, {cost.unit}", fontsize=11.5, loc="left")
