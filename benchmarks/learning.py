@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import argparse
 import datetime
+import math
 import statistics
 from pathlib import Path
 from typing import Any
@@ -52,6 +53,14 @@ def together(shares: list[list[float]], values: list[list[float]]) -> list[float
     ]
 
 
+def without_none(report: dict[str, Any]) -> list[list[float]]:
+    """The densities, not a number where an expert gets no point."""
+    return [
+        [density if share else math.nan for share, density in zip(*rows)]
+        for rows in zip(report["shares"], report["densities"])
+    ]
+
+
 def late_means(report: dict[str, Any]) -> tuple[float, float, float]:
     """Share of points at the empty-space expert, and the median densities, per half extent, of
     what it and what the scene experts get, over the later looks."""
@@ -68,8 +77,8 @@ def sentence(report: dict[str, Any]) -> str:
     """What the picture shows."""
     share, empty, scene = late_means(report)
     return (
-        f"The empty-space expert takes {share:.0%} of the points: "
-        f"about {float(f'{scene / empty:.1g}'):,.0f} times less dense than the others"
+        f"The empty-space expert takes {share:.0%} of the points, "
+        f"about {float(f'{scene / empty:.1g}'):,.0f} times less dense than the rest"
     )
 
 
@@ -90,12 +99,13 @@ def draw(path: Path, report: dict[str, Any], theme: Theme = LIGHT) -> Path:
     with rc_context(settings | dict.fromkeys(parts, theme.ink)):
         figure = Figure(figsize=(10.0, 4.4), facecolor=theme.page, layout="constrained")
         FigureCanvasAgg(figure)
-        figure.suptitle(sentence(report), fontsize=14, fontweight="bold", x=0.01, ha="left")
+        figure.suptitle(sentence(report), fontsize=13, fontweight="bold", x=0.01, ha="left")
         shares, densities = figure.subplots(1, 2)
         steps = report["steps"]
+        known = {"shares": report["shares"], "densities": without_none(report)}
         for axes, name, factor in ((shares, "shares", 100.0), (densities, "densities", 1.0)):
             for expert in range(1, len(report["shares"][0])):
-                each = [factor * row[expert] or None for row in report[name]]
+                each = [factor * row[expert] for row in known[name]]
                 label = "each scene expert" if expert == 1 else None
                 axes.plot(steps, each, color=theme.colours[1], alpha=0.35, label=label)
             look = {"linewidth": 3.0, "color": theme.colours[1], "label": "all scene experts"}
@@ -104,7 +114,7 @@ def draw(path: Path, report: dict[str, Any], theme: Theme = LIGHT) -> Path:
                 whole = [factor * sum(row[1:]) for row in report["shares"]]
             axes.plot(steps, whole, **look)
             look |= {"color": theme.colours[0], "label": "empty-space expert"}
-            axes.plot(steps, [factor * row[0] or None for row in report[name]], **look)
+            axes.plot(steps, [factor * row[0] for row in known[name]], **look)
         shares.set_title("share of the points, %", fontsize=11.5, loc="left")
         shares.set_ylim(0.0, 100.0)
         densities.set_title("mean density of their points (10⁴: opaque)", fontsize=11.5, loc="left")

@@ -39,9 +39,14 @@ def test_the_sentence_is_of_the_later_looks_and_opaque_is_opaque(learning: Modul
     assert share == pytest.approx(0.625) and empty == pytest.approx(3.0)
     assert scene == pytest.approx((200.0 + learning.OPAQUE) / 2)
     assert learning.sentence(report) == (
-        "The empty-space expert takes 62% of the points: about 2,000 times less dense than the "
-        "others"
+        "The empty-space expert takes 62% of the points, about 2,000 times less dense than the rest"
     )
+
+
+def test_an_expert_without_points_has_no_density(learning: ModuleType) -> None:
+    report = learning.report_of(history(), "city", "2024-02-29")
+    known = torch.tensor(learning.without_none(report)).isfinite().tolist()
+    assert known == [[share > 0.0 for share in row] for row in report["shares"]]
 
 
 def test_the_picture_remembers_of_which_figures_it_is(learning: ModuleType, tmp_path: Path) -> None:

@@ -11,6 +11,9 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+from numpy.typing import NDArray
+
 from leco_plugin.chart.panels import draw_all_costs, draw_cost, draw_kept, name_points
 from leco_plugin.chart.summary import (
     BYTES,
@@ -44,7 +47,7 @@ KEPT_SPACE = (
     f"Space that must be sampled where each loses {LOST_SURFACE_MASS:.1%} of the surface. "
     "Up and left is better:"
 )
-WHAT_ELSE = "What the runs came to: up and left is better."
+WHAT_ELSE = "PSNR on unseen photographs, dB, against what it costs. Up and left is better:"
 
 
 def draw(results: Mapping[str, Any], path: Path, theme: Theme = LIGHT) -> Path:
@@ -111,6 +114,7 @@ def _draw_compared(
 ) -> None:
     """What each occupancy keeps against its size and its learning time; below, the runs."""
     by_size, by_time = beside
+    below[0].set_ylabel("PSNR, dB")
     places = draw_kept(by_size, BYTES, [one.size for one in held], held, lines, theme)
     by_size.set_ylabel("space kept, %")
     looks = {line.name: style(i, theme)["color"] for i, line in enumerate(lines)}
@@ -118,7 +122,7 @@ def _draw_compared(
     name_points(by_size, places, [one.name for one in held], colours)
     seconds = [one.learn_seconds for one in held]
     draw_kept(by_time, LEARNING, seconds, held, lines, theme)
-    by_time.set_xlim(0.94 * min(seconds), 1.04 * max(seconds))
+    by_time.set_xlim(0.9 * min(seconds), 1.04 * max(seconds))
     _draw_curves(below[0], lines, theme, small=True)
     for panel, cost in zip(below[1:], (RENDERING, MEMORY)):
         draw_cost(panel, cost, lines, theme)
@@ -134,14 +138,26 @@ def _draw_curves(axes: Any, lines: Sequence[Line], theme: Theme, small: bool = F
         axes.plot(seconds, mean, linestyle=dashes, linewidth=width, color=look["color"])
         axes.fill_between(seconds, low, high, color=look["color"], alpha=0.16, linewidth=0)
         axes.plot(seconds[-1], mean[-1], markersize=size, **look)
+    if not small:
+        times, best = best_so_far(lines)
+        axes.plot(times, best, color=theme.ink, alpha=0.25, linewidth=9, zorder=1)
     plain(axes, theme)
     axes.set_xlim(0.0, 1.02 * longest)
     axes.margins(y=0.05)
     if small:
-        axes.set_title("PSNR by seconds of training", fontsize=11.5, loc="left")
+        axes.set_title("training, s", fontsize=11.5, loc="left")
     else:
         axes.set_title("PSNR on unseen photographs, dB: more is better", fontsize=11.5, loc="left")
         axes.set_xlabel("seconds of training")
+
+
+def best_so_far(lines: Sequence[Line]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """The front of accuracy against training time: seconds [T], and the highest mean PSNR that any
+    contender has reached by then [T]."""
+    curves = [line.curve()[:2] for line in lines]
+    times = np.unique(np.concatenate([seconds for seconds, _ in curves]))
+    reached = [np.interp(times, *curve, left=-np.inf) for curve in curves]
+    return times, np.maximum.accumulate(np.max(reached, axis=0))
 
 
 def _name_ends(axes: Any, lines: Sequence[Line], theme: Theme) -> None:
