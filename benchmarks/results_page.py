@@ -9,31 +9,20 @@ from __future__ import annotations
 
 import json
 import sys
-from pathlib import Path
 from typing import Any
 
 import checkout  # noqa: F401
-from growth_picture import draw as draw_growth
+from chart_sections import chart_sections
 from large_scene_tables import LARGE_SCENES
+from learning import sentence as learning_sentence
 from page_parts import RESULTS, ROOT, machine_line, picture, section
-from PIL import Image
-from sizes_sections import CAPACITY, scene_results, sizes_sections
+from page_pictures import GROWTH, LEARNING, draw_pictures, is_stale, pictures
+from sizes_sections import sizes_sections
 from stability_page import PAGE as STABILITY_PAGE
-from stability_page import PICTURE as STABILITY
 from stability_page import page as stability_page
-
-from leco_plugin.capacity.picture import draw as draw_capacity
-from leco_plugin.chart.picture import draw
-from leco_plugin.chart.table import table
-from leco_plugin.chart.theme import DARK, LIGHT
-from leco_plugin.evaluation.charts import SOURCE, fingerprint
-from leco_plugin.stability.picture import draw as draw_stability
 
 PAGE = ROOT / "docs" / "results.md"
 README = ROOT / "README.md"
-CHARTS = ROOT / "docs" / "images" / "charts"
-GROWTH = CHARTS / "growth.png"
-DEMO_CHART = ROOT / "docs" / "images" / "demo-chart.png"
 BEGIN, END = "<!-- demo table: generated -->", "<!-- end of the demo table -->"
 
 HEAD = """# Results
@@ -43,26 +32,13 @@ they differ. Times are seconds of training, evaluation left out. Nothing here is
 what is called so. To make a chart again, add `--out FOLDER` to its command; `city` is the one that
 `leco demo` leaves in `runs/demo/city`, `city-4` that of `leco city --blocks 4 --aerial-only`,
 `caliterra` 75 drone photographs of a building site, from OpenDroneMap's `odm_data_caliterra` (CC0),
-at 480 x 360 with poses from COLMAP.
+at 480 x 360 with poses from COLMAP, and `fox` the 50 photographs of that name that come with
+NVIDIA's instant-ngp.
 
 *Never frozen* is the same model, whose gate goes on learning: it renders without skipping. *Equal
 experts, no gate* has as many scene experts, none for empty space, as Switch-NeRF, and never skips.
 *Price* is what skipping costs on held-out pixels at the moment of freezing.
 """
-
-PAPER_ROWS = {
-    "city-4-switch": """The paper's three columns, on its own scenes and by its own protocol (500k
-steps; the rebuttal's table of enough training time, 41.5 and 43.4 h). Figures of the two protocols
-cannot be compared; who is ahead can.
-
-| paper | Switch-NeRF | + occupancy grid | + learned occupancy |
-|---|---|---|---|
-| Rubble: PSNR, SSIM, LPIPS | 24.31, 0.562, 0.496 | 23.94, 0.538, 0.526 | 24.52, 0.581, 0.477 |
-| Residence: PSNR, SSIM, LPIPS | 22.57, 0.654, 0.457 | 22.48, 0.645, 0.474 | 22.88, 0.658, 0.454 |
-| speed-up of guided training | | | 2.5 x |
-""",
-}
-"""What the paper says beside a chart of ours."""
 
 
 def demo_table(report: dict[str, Any]) -> str:
@@ -87,72 +63,6 @@ def demo_table(report: dict[str, Any]) -> str:
         f"{facts['free_space_skipped']:.1%} of free space skipped.",
     ]
     return "\n".join(lines)
-
-
-def chart_section(path: Path) -> list[str]:
-    """What `leco chart` stored: its picture and its tables, and the paper's where there are any."""
-    results = json.loads(path.read_text())
-    _, body = table(results).split("\n", 1)
-    parts = [f"## {titles()[path.stem]}\n", picture(path.stem)]
-    parts += [body, f"{machine_line(results)}.\n"]
-    if path.stem in PAPER_ROWS:
-        parts.append(PAPER_ROWS[path.stem])
-    return parts
-
-
-def titles() -> dict[str, str]:
-    """The title of each stored chart, from `charts.json`: file names to sentences, in order."""
-    found: dict[str, str] = json.loads((RESULTS / "charts.json").read_text())
-    return found
-
-
-def pictures() -> dict[Path, Any]:
-    """Every picture that is drawn from stored results, and those results."""
-    found: dict[Path, Any] = {}
-    if (RESULTS / "demo.json").exists():
-        found[DEMO_CHART] = json.loads((RESULTS / "demo.json").read_text())["runs"]
-    for name in titles():
-        results = json.loads((RESULTS / "charts" / f"{name}.json").read_text())
-        found |= {CHARTS / f"{name}.png": results, CHARTS / f"{name}-dark.png": results}
-    if (growth := RESULTS / "growth.json").exists():
-        report = json.loads(growth.read_text())
-        found |= {GROWTH: report, GROWTH.with_stem("growth-dark"): report}
-    for name, results in scene_results("capacity").items():
-        path = CHARTS / f"{CAPACITY}{name}.png"
-        found |= {path: results, path.with_stem(f"{path.stem}-dark"): results}
-    if (stability := RESULTS / "stability.json").exists():
-        report = json.loads(stability.read_text())
-        found |= {STABILITY: report, STABILITY.with_stem("stability-dark"): report}
-    return found
-
-
-def draw_pictures(redraw: bool) -> None:
-    """All of `pictures`, or those that are of other results."""
-    from leco_plugin.demo import draw_chart
-
-    CHARTS.mkdir(parents=True, exist_ok=True)
-    for path, results in pictures().items():
-        if not (redraw or is_stale(path, results)):
-            continue
-        theme = DARK if path.stem.endswith("-dark") else LIGHT
-        if path == DEMO_CHART:
-            draw_chart(json.loads((RESULTS / "demo.json").read_text()), path)
-        elif path.stem.removesuffix("-dark") == GROWTH.stem:
-            draw_growth(path, results, theme)
-        elif path.stem.removesuffix("-dark") == STABILITY.stem:
-            draw_stability(results, path, theme)
-        elif path.stem.startswith(CAPACITY):
-            draw_capacity(results, path, theme)
-        else:
-            draw(results, path, theme)
-
-
-def is_stale(path: Path, results: Any) -> bool:
-    """Whether a picture is missing, or of other results."""
-    if not path.exists():
-        return True
-    with Image.open(path) as image:
-        return image.info.get(SOURCE) != fingerprint(results)
 
 
 def sampling_table(report: dict[str, Any]) -> str:
@@ -238,8 +148,9 @@ def page() -> str:
         report = json.loads(demo.read_text())
         title = "The demo: procedural city, one seed"
         parts += section(title, "leco demo", report, demo_table(report))
-    for name in titles():
-        parts += chart_section(RESULTS / "charts" / f"{name}.json")
+    parts += chart_sections()
+    if (learning := RESULTS / "learning.json").exists():
+        parts += learning_section(json.loads(learning.read_text()))
     parts += sizes_sections()
     parts += large_scene_sections()
     for sampling in sorted(RESULTS.glob("sampling*.json")):
@@ -255,6 +166,24 @@ def page() -> str:
         note = f" leco_plugin {version} at {commit}, sources {report['code']['sources']}."
         parts += section(title, "python benchmarks/gpu.py", report, gpu_table(report), note)
     return "\n".join(parts)
+
+
+def learning_section(report: dict[str, Any]) -> list[str]:
+    """What each expert gets while an occupancy is learned, and how its slices change."""
+    recorded = "--pipeline.model.schedule.steps-per-record 8"
+    return [
+        "## While an occupancy is learned\n",
+        f"{picture(LEARNING.stem)}\n",
+        f"{learning_sentence(report)}, in the later half of learning. Points are spread over the "
+        "scene's box; a mean density is of those that an expert gets, per half extent. Which scene "
+        "expert takes what changes to the end; what is empty does not.\n",
+        "![Slices of the occupancy from above and from the side, step by step]"
+        "(images/learning.gif)\n",
+        f"`ns-train leco-occupancy --data {report['scene']} {recorded}` and `python "
+        f"benchmarks/learning.py outputs/{report['scene']}/leco-occupancy`, {report['date']}; "
+        f"{machine_line(report)}. The slices: `leco inspect outputs/{report['scene']}/"
+        "leco-occupancy --history learned.gif`, of the same kind of run.\n",
+    ]
 
 
 def readme(text: str) -> str:

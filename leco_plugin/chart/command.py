@@ -31,6 +31,7 @@ def make_chart(
     seeds: Sequence[int] = (0, 1, 2),
     learn_seconds: float | None = None,
     images: int = 2,
+    reuse: Sequence[Path] = (),
     runner_for: Callable[[Path, Protocol, ChartFolder], Runner] = ProcessRunner,
 ) -> dict[str, Any]:
     """Makes what is missing of a chart and draws it.
@@ -44,6 +45,7 @@ def make_chart(
         seeds: of each.
         learn_seconds: most of it for learning an occupancy.
         images: whole test images for each run.
+        reuse: folders of other charts on this scene, whose runs need not be made again.
         runner_for: gives what makes a run.
     Returns:
         The results, as in `results.json`.
@@ -58,6 +60,8 @@ def make_chart(
         compared, about = list(comparison.contenders), (suite, comparison.question)
         if seconds is None and steps is None:
             seconds = comparison.seconds
+            if learn_seconds is None:
+                learn_seconds = comparison.learn_seconds
     else:
         compared = contenders(methods, samplers)
     protocol = Protocol(seconds, steps, learn_seconds, images)
@@ -70,7 +74,7 @@ def make_chart(
         "images": images,
     }
     command = command_line(data, chosen, named)
-    chart = Chart(data, out, compared, seeds, protocol, about, command)
+    chart = Chart(data, out, compared, seeds, protocol, about, command, reuse)
     say = functools.partial(CONSOLE.print, markup=False, highlight=False)
     with bar(f"{chart.scene['name']}, {protocol.describe()} a run") as show:
         chart.make(runner_for(data, protocol, chart.folder), say, show)

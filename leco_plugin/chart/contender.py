@@ -39,6 +39,10 @@ class Contender:
         digest = hashlib.sha256(json.dumps(what, sort_keys=True).encode()).hexdigest()
         return f"{self.method}-{self.sampler}-{digest[:8]}"
 
+    def without_grids(self) -> Contender:
+        """The same training: grids are made after it."""
+        return replace(self, grids=())
+
     @staticmethod
     def from_dict(values: Mapping[str, Any]) -> Contender:
         """Inverse of `dataclasses.asdict`, also after JSON."""
@@ -66,8 +70,17 @@ def changed(config: Any, path: str, value: Any) -> Any:
 
 def short_names(names: Sequence[str]) -> list[str]:
     """The names without the method where it is the same for all."""
-    parts = [re.fullmatch(r"(.*?)(?: \+ |, )(.*)", name) for name in names]
-    found = [part.groups() for part in parts if part is not None]
-    if len(found) < 2 or len(found) < len(names) or len({method for method, _ in found}) > 1:
-        return list(names)
-    return [rest for _, rest in found]
+    method = shared_method(names)
+    return [_split(name)[1] if method else name for name in names]
+
+
+def shared_method(names: Sequence[str]) -> str | None:
+    """The method with which all of several names begin; None where there is no such."""
+    methods = {_split(name)[0] for name in names}
+    return methods.pop() if len(names) > 1 and len(methods) == 1 else None
+
+
+def _split(name: str) -> tuple[str | None, str]:
+    """Method and the rest of a name, where it has both."""
+    parts = re.fullmatch(r"(.*?)(?: \+ |, )(.*)", name)
+    return (None, name) if parts is None else (parts[1], parts[2])

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import shutil
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -13,7 +13,8 @@ from leco_plugin.chart.contender import Contender
 from leco_plugin.evaluation.json_file import write_json
 from leco_plugin.scenes.input_error import InputError
 
-SETTINGS, RUNS, UNFINISHED, LOGS = "settings.json", "runs", "unfinished", "logs"
+SETTINGS, RESULTS = "settings.json", "results.json"
+RUNS, UNFINISHED, LOGS = "runs", "unfinished", "logs"
 
 
 @dataclass(frozen=True)
@@ -45,39 +46,113 @@ class ChartFolder:
 
     def __init__(self, path: Path, settings: Mapping[str, Any]) -> None:
         self.path = path
-        file = path / SETTINGS
-        wanted = json.loads(json.dumps(settings))
-        if file.exists():
-            _refuse_others(path, json.loads(file.read_text()), wanted)
-        elif path.exists() and any(path.iterdir()):
+        found = read_settings(path)
+        if found is not None and (other := difference(found, settings)):
+            raise InputError(
+                f"{path} holds a chart with another {other}; name a new folder with --out"
+            )
+        if found is None and path.exists() and any(path.iterdir()):
             raise InputError(f"{path} holds something else; name a new folder with --out")
-        else:
-            write_json(file, wanted)
+        if found is None:
+            write_json(path / SETTINGS, dict(settings))
         shutil.rmtree(path / UNFINISHED, ignore_errors=True)  # of a process that was killed
         for name in (RUNS, UNFINISHED, LOGS):
             (path / name).mkdir(exist_ok=True)
 
     def stored(self) -> dict[str, dict[str, Any]]:
-        """Finished runs by the name of their job; each has `contender` and `run`."""
-        found = {}
-        for file in sorted((self.path / RUNS).glob("*.json")):
-            found[file.stem] = json.loads(file.read_text())
-        return found
+        """Finished runs by the name of their job; each has `contender`, `run`, and `made`, unless
+        it is from before charts noted that."""
+        return stored_in(self.path)
 
-    def store(self, job: Job, run: Mapping[str, Any]) -> None:
-        """Keeps a finished run: whole, or not at all."""
-        record = {"contender": asdict(job.contender), "run": dict(run)}
+    def store(
+        self,
+        job: Job,
+        run: Mapping[str, Any],
+        made: Mapping[str, Any] | None = None,
+        reused: bool = False,
+    ) -> None:
+        """Keeps a finished run: whole, or not at all.
+
+        Args:
+            made: when, by which command and by which code.
+            reused: whether it was made for another chart.
+        """
+        record: dict[str, Any] = {
+            "contender": asdict(job.contender),
+            "run": {**run, "reused": True} if reused else dict(run),
+        }
+        if made is not None:
+            record["made"] = dict(made)
         write_json(self.path / RUNS / f"{job.name}.json", record)
+        (self.path / LOGS / f"{job.name}.json").unlink(missing_ok=True)
 
-
-def _refuse_others(path: Path, found: Mapping[str, Any], wanted: Mapping[str, Any]) -> None:
-    names = [name for name in wanted if found.get(name) != wanted[name]]
-    if names:
-        name = names[0]
-        raise InputError(
-            f"{path} holds a chart with another {name.replace('_', ' ')} "
-            f"({_short(found.get(name))}, not {_short(wanted[name])}); name a new folder with --out"
+    def fail(self, job: Job, reason: str) -> None:
+        """Notes that a run has ended without a result, until it is made again."""
+        one = job.contender
+        failure = {"name": one.name, "method": one.method, "sampler": one.sampler}
+        write_json(
+            self.path / LOGS / f"{job.name}.json", failure | {"seed": job.seed, "reason": reason}
         )
+
+    def failures(self) -> list[dict[str, Any]]:
+        """Runs that ended without a result, by seed: `name`, `method`, `sampler`, `seed` and
+        `reason`."""
+        found = [read_object(file) for file in sorted((self.path / LOGS).glob("*.json"))]
+        return sorted(found, key=lambda failure: (failure["seed"], failure["name"]))
+
+    def keep(self, job: Job, files: Iterable[Path]) -> None:
+        """Copies files that a run has left beside its record, under the name of its job."""
+        for file in files:
+            shutil.copyfile(file, self.path / RUNS / f"{job.name}{file.suffix}")
+
+
+def stored_in(path: Path) -> dict[str, dict[str, Any]]:
+    """The records in the folder of a chart, by the names of their jobs.
+
+    Raises:
+        InputError: one is damaged.
+    """
+    found = {}
+    for file in sorted((path / RUNS).glob("*.json")):
+        record = read_object(file)
+        if not all(isinstance(record.get(part), dict) for part in ("contender", "run")):
+            raise InputError(f"{file} is no run of a chart; delete it to have it made again")
+        found[file.stem] = record
+    return found
+
+
+def read_settings(path: Path) -> dict[str, Any] | None:
+    """What the runs of the chart in a folder share; None where there is no chart.
+
+    Raises:
+        InputError: it cannot be read.
+    """
+    file = path / SETTINGS
+    return read_object(file) if file.is_file() else None
+
+
+def read_object(file: Path) -> dict[str, Any]:
+    """A JSON object of a chart.
+
+    Raises:
+        InputError: it is damaged.
+    """
+    try:
+        found = json.loads(file.read_text())
+    except ValueError:  # no JSON, or no text
+        found = None
+    if not isinstance(found, dict):
+        raise InputError(f"{file} is damaged, or not of a chart; delete it, or name a new folder")
+    return found
+
+
+def difference(found: Mapping[str, Any], wanted: Mapping[str, Any]) -> str | None:
+    """The first setting that is not as wanted, in words; None where all are."""
+    for name, value in json.loads(json.dumps(wanted)).items():
+        if found.get(name) != value:
+            said = f"{_short(found.get(name))}, not {_short(value)}"
+            return f"{name.replace('_', ' ')} ({said})"
+    return None
 
 
 def _short(value: Any) -> str:

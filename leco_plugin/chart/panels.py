@@ -7,7 +7,6 @@ from typing import Any
 
 from leco_plugin.chart.summary import (
     COSTS,
-    RENDERING,
     Cost,
     Line,
     Representation,
@@ -17,26 +16,23 @@ from leco_plugin.chart.theme import Theme, plain, style
 
 WIDE_RANGE = 8.0
 """Ratio of costs from which their axis is logarithmic."""
-NAME_WIDTH = 0.0118
+NAME_WIDTH = 0.019
 """Of a letter beside a point of the large panel, of the panel's."""
 
 
 def draw_all_costs(panels: Sequence[Any], lines: Sequence[Line], theme: Theme) -> None:
     """PSNR against each of `COSTS`."""
     for panel, cost in zip(panels, COSTS):
-        points = [(line, line.median(cost)) for line in lines]
-        _draw_costs(panel, cost, points, theme, first=panel is panels[0])
+        draw_cost(panel, cost, lines, theme)
+    panels[0].set_ylabel("PSNR, dB")
 
 
-def _draw_costs(
-    axes: Any,
-    cost: Cost,
-    points: Sequence[tuple[Line, float | None]],
-    theme: Theme,
-    first: bool,
-) -> None:
+def draw_cost(axes: Any, cost: Cost, lines: Sequence[Line], theme: Theme) -> None:
     """PSNR against one cost, and the front that no contender beats in both."""
-    known = [(i, line, value) for i, (line, value) in enumerate(points) if value is not None]
+    values = [line.median(cost) for line in lines]
+    known = [
+        (i, line, value) for i, (line, value) in enumerate(zip(lines, values)) if value is not None
+    ]
     places = [(value, line.psnr) for _, line, value in known]
     for i, line, value in known:
         look = style(i, theme)
@@ -44,8 +40,6 @@ def _draw_costs(
         axes.plot(value, line.psnr, markersize=11, markeredgecolor=theme.page, **look)
     _cost_axis(axes, cost.title, cost.unit, [value for value, _ in places], theme)
     _draw_front(axes, places, theme)
-    if first:
-        axes.set_ylabel("PSNR, dB")
 
 
 def _draw_front(
@@ -153,10 +147,3 @@ def _is_free(
         left < b_right and right > b_left and low < b_high and high > b_low
         for b_left, b_low, b_right, b_high in taken
     )
-
-
-def draw_rendering(axes: Any, lines: Sequence[Line], theme: Theme) -> None:
-    """PSNR against the time to render an image, in a panel beside others."""
-    points = [(line, line.median(RENDERING)) for line in lines]
-    _draw_costs(axes, RENDERING, points, theme, first=False)
-    axes.set_title("PSNR by seconds to render an image", fontsize=11.5, loc="left")

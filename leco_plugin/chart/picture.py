@@ -11,11 +11,16 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from leco_plugin.chart.panels import draw_all_costs, draw_kept, draw_rendering, name_points
+import numpy as np
+from numpy.typing import NDArray
+
+from leco_plugin.chart.panels import draw_all_costs, draw_cost, draw_kept, name_points
 from leco_plugin.chart.summary import (
     BYTES,
     LEARNING,
     LOST_SURFACE_MASS,
+    MEMORY,
+    RENDERING,
     Line,
     Representation,
     circumstances,
@@ -35,12 +40,14 @@ BAR = 0.032
 TITLE_WIDTH = 66
 CHARACTER = 0.0098
 """Width of a letter of the names, of the figure's."""
-HOW_TO_READ = "What it costs: up and left is better; nothing beats the grey front in both."
-KEPT_AGAINST_SIZE = (
-    f"space that must be sampled where each loses {LOST_SURFACE_MASS:.1%} of the surface, against "
-    "size in kB: up and left is better"
+TOP, LINE = 0.985, 0.04
+"""Of the figure: where the title begins, and the height of a line of it."""
+HOW_TO_READ = "What it costs. Up and left is better; nothing is better in both than the grey line."
+KEPT_SPACE = (
+    f"Space that must be sampled where each loses {LOST_SURFACE_MASS:.1%} of the surface. "
+    "Up and left is better:"
 )
-WHAT_ELSE = "The same against learning time, and what the runs came to: up and left is better."
+WHAT_ELSE = "PSNR on unseen photographs, dB, against what it costs. Up and left is better:"
 
 
 def draw(results: Mapping[str, Any], path: Path, theme: Theme = LIGHT) -> Path:
@@ -65,17 +72,24 @@ def draw(results: Mapping[str, Any], path: Path, theme: Theme = LIGHT) -> Path:
         figure = Figure(figsize=(10, 8.4), facecolor=theme.page)
         FigureCanvasAgg(figure)
         title = balanced(sentence(verdict(held) if compared else headline(results)))
-        figure.text(0.015, 0.985, title, va="top", fontsize=17, fontweight="bold")
-        figure.text(0.015, 0.895, circumstances(results), va="top", fontsize=11.5)
+        figure.text(0.015, TOP, title, va="top", fontsize=17, fontweight="bold")
+        below_title = TOP - 0.01 - LINE * (title.count("\n") + 1)
+        figure.text(0.015, below_title, circumstances(results), va="top", fontsize=11.5)
+        height = below_title - 0.08 - 0.43
         below = [figure.add_axes((0.075 + 0.325 * i, 0.065, 0.255, 0.2)) for i in range(3)]
         if compared:
             figure.text(0.015, 0.335, WHAT_ELSE, va="top", fontsize=11.5)
-            _draw_compared(figure.add_axes((0.075, 0.43, 0.895, 0.39)), below, held, lines, theme)
+            figure.text(0.015, below_title - 0.035, KEPT_SPACE, va="top", fontsize=11.5)
+            beside = [
+                figure.add_axes((left, 0.43, width, height - 0.03))
+                for left, width in ((0.075, 0.56), (0.70, 0.28))
+            ]
+            _draw_compared(beside, below, held, lines, theme)
         else:
             figure.text(0.015, 0.335, HOW_TO_READ, va="top", fontsize=11.5)
             widest = max(len(line.name) for line in lines)
             right = 0.93 - CHARACTER * min(widest + 6, 40)
-            main = figure.add_axes((0.075, 0.43, right - 0.075, 0.42))
+            main = figure.add_axes((0.075, 0.43, right - 0.075, height))
             _draw_curves(main, lines, theme)
             _draw_learning(main, lines, theme)
             _name_ends(main, lines, theme)
@@ -92,23 +106,26 @@ def balanced(text: str, width: int = TITLE_WIDTH) -> str:
 
 
 def _draw_compared(
-    main: Any,
+    beside: Sequence[Any],
     below: Sequence[Any],
     held: Sequence[Representation],
     lines: Sequence[Line],
     theme: Theme,
 ) -> None:
-    """What each occupancy keeps against its size; below, against learning time, and the runs."""
-    places = draw_kept(main, BYTES, [one.size for one in held], held, lines, theme)
-    main.set_title(KEPT_AGAINST_SIZE, fontsize=11.5, loc="left")
-    main.set_ylabel("space kept, %")
+    """What each occupancy keeps against its size and its learning time; below, the runs."""
+    by_size, by_time = beside
+    below[0].set_ylabel("PSNR, dB")
+    places = draw_kept(by_size, BYTES, [one.size for one in held], held, lines, theme)
+    by_size.set_ylabel("space kept, %")
     looks = {line.name: style(i, theme)["color"] for i, line in enumerate(lines)}
     colours = [looks.get(one.name, theme.ink) for one in held]
-    name_points(main, places, [one.name for one in held], colours)
-    draw_kept(below[0], LEARNING, [one.learn_seconds for one in held], held, lines, theme)
-    below[0].set_title("space kept by seconds of learning it", fontsize=11.5, loc="left")
-    _draw_curves(below[1], lines, theme, small=True)
-    draw_rendering(below[2], lines, theme)
+    name_points(by_size, places, [one.name for one in held], colours)
+    seconds = [one.learn_seconds for one in held]
+    draw_kept(by_time, LEARNING, seconds, held, lines, theme)
+    by_time.set_xlim(0.9 * min(seconds), 1.04 * max(seconds))
+    _draw_curves(below[0], lines, theme, small=True)
+    for panel, cost in zip(below[1:], (RENDERING, MEMORY)):
+        draw_cost(panel, cost, lines, theme)
 
 
 def _draw_curves(axes: Any, lines: Sequence[Line], theme: Theme, small: bool = False) -> None:
@@ -121,14 +138,26 @@ def _draw_curves(axes: Any, lines: Sequence[Line], theme: Theme, small: bool = F
         axes.plot(seconds, mean, linestyle=dashes, linewidth=width, color=look["color"])
         axes.fill_between(seconds, low, high, color=look["color"], alpha=0.16, linewidth=0)
         axes.plot(seconds[-1], mean[-1], markersize=size, **look)
+    if not small:
+        times, best = best_so_far(lines)
+        axes.plot(times, best, color=theme.ink, alpha=0.25, linewidth=9, zorder=1)
     plain(axes, theme)
     axes.set_xlim(0.0, 1.02 * longest)
     axes.margins(y=0.05)
     if small:
-        axes.set_title("PSNR by seconds of training", fontsize=11.5, loc="left")
+        axes.set_title("training, s", fontsize=11.5, loc="left")
     else:
-        axes.set_ylabel("test PSNR, dB (more is better)")
+        axes.set_title("PSNR on unseen photographs, dB: more is better", fontsize=11.5, loc="left")
         axes.set_xlabel("seconds of training")
+
+
+def best_so_far(lines: Sequence[Line]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """The front of accuracy against training time: seconds [T], and the highest mean PSNR that any
+    contender has reached by then [T]."""
+    curves = [line.curve()[:2] for line in lines]
+    times = np.unique(np.concatenate([seconds for seconds, _ in curves]))
+    reached = [np.interp(times, *curve, left=-np.inf) for curve in curves]
+    return times, np.maximum.accumulate(np.max(reached, axis=0))
 
 
 def _name_ends(axes: Any, lines: Sequence[Line], theme: Theme) -> None:

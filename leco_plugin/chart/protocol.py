@@ -14,8 +14,9 @@ from leco_plugin.evaluation.clock import Budget
 LEARN_SHARE = 0.4
 """Of the training time, at most, for learning an occupancy; short runs need most of that."""
 
-OVERHEAD_SECONDS = 45.0
-"""Start, evaluation and rendering of a run on two CPU cores, about: 30 to 80 were measured."""
+OVERHEAD_SECONDS = 40.0
+"""Start, evaluation and rendering of a run on two CPU cores, about: 26 to 40 on cities, 35 to 80 on
+a drone survey, whose images take an unguided run 17 to 24 s each."""
 GRIDS_SECONDS = 120.0
 """Making grids from the field of a run, those of 512^3 cells among them, about."""
 

@@ -3,23 +3,27 @@
 from __future__ import annotations
 
 import datetime
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
 from leco_plugin.chart.contender import Contender
-from leco_plugin.chart.folder import ChartFolder, Job
+from leco_plugin.chart.folder import RESULTS, ChartFolder, Job
 from leco_plugin.chart.processes import RunFailed
 from leco_plugin.chart.protocol import Protocol, describe_scene, settings_of
+from leco_plugin.chart.reuse import check_sources, take_over
 from leco_plugin.chart.table import write_table
 from leco_plugin.evaluation.json_file import write_json
 from leco_plugin.evaluation.machine import describe_code, describe_machine
+from leco_plugin.scenes.input_error import InputError
 
 Runner = Callable[[Job, Callable[[float], None]], dict[str, Any]]
 Say = Callable[[str], None]
 
-RESULTS, TABLE = "results.json", "table.md"
+TABLE = "table.md"
+SEEDS = 1 << 32
+"""As many as numpy takes."""
 
 
 def jobs_of(contenders: Sequence[Contender], seeds: Sequence[int]) -> list[Job]:
@@ -39,6 +43,7 @@ class Chart:
         protocol: how long, and how it is evaluated.
         suite: name and question of the comparison, if it has one.
         command: what made it, for the results.
+        reuse: folders of charts, from which runs that are missing here are taken over.
 
     Raises:
         ValueError, OSError: nothing to compare, no such scene, a folder of something else.
@@ -53,17 +58,22 @@ class Chart:
         protocol: Protocol,
         suite: tuple[str, str] | None = None,
         command: str = "leco chart",
+        reuse: Sequence[Path] = (),
     ) -> None:
         if not contenders or not seeds:
             raise ValueError("a chart needs at least one method and one seed")
+        for seed in seeds:
+            if not 0 <= seed < SEEDS:
+                raise InputError(f"a seed is a whole number from 0 to {SEEDS - 1}, not {seed}")
         self.scene, self.machine = describe_scene(data), describe_machine()
         self.protocol, self.suite, self.command = protocol, suite, command
         self.contenders = list(contenders)
         self.jobs = jobs_of(contenders, seeds)
         name = suite[0] if suite is not None else None
         settings = settings_of(self.scene, protocol, name, self.machine)
+        check_sources(reuse, settings)
         self.folder = ChartFolder(out, settings)
-        self.failures: list[dict[str, Any]] = []
+        self.reuse = list(reuse)
 
     def missing(self) -> list[Job]:
         """Runs that are not stored. One that failed is missing."""
@@ -78,6 +88,9 @@ class Chart:
             say: called with a line for each run.
             show: called with the share of all runs that is done.
         """
+        taken = take_over(self.folder, self.missing(), self.reuse)
+        if taken:
+            say(f"{_counted(len(taken), 'run')} taken over from other charts")
         todo = self.missing()
         if todo:
             say(self.forecast(todo))
@@ -93,10 +106,10 @@ class Chart:
             try:
                 run = runner(job, show_share)
             except RunFailed as failure:
-                self._fail(job, str(failure))
+                self.folder.fail(job, str(failure))
                 say(f"{title}: failed: {failure}")
             else:
-                self.folder.store(job, run)
+                self.folder.store(job, run, self._made())
                 say(
                     f"{title}: {run['psnr']:.2f} dB after {run['train_seconds']:.0f} s, "
                     f"{run['render_seconds_per_image']:.2f} s an image"
@@ -106,24 +119,12 @@ class Chart:
     def forecast(self, todo: Sequence[Job]) -> str:
         """How many runs are to be made, and about how long that takes."""
         minutes = self.protocol.minutes(job.contender for job in todo)
-        runs = f"{len(todo)} run{'s' if len(todo) > 1 else ''}"
+        runs = _counted(len(todo), "run")
         stored = len(self.jobs) - len(todo)
         there = f" ({stored} more are there already)" if stored else ""
         if minutes is None:
             return f"{runs} of {self.protocol.describe()}{there}"
         return f"{runs}, about {max(minutes, 1.0):.0f} minutes on two CPU cores{there}"
-
-    def _fail(self, job: Job, reason: str) -> None:
-        contender = job.contender
-        self.failures.append(
-            {
-                "name": contender.name,
-                "method": contender.method,
-                "sampler": contender.sampler,
-                "seed": job.seed,
-                "reason": reason,
-            }
-        )
 
     def results(self) -> dict[str, Any]:
         """All finished runs in the folder, the contenders of this call first."""
@@ -139,14 +140,29 @@ class Chart:
             "protocol": asdict(self.protocol),
             "suite": self.suite[0] if self.suite is not None else None,
             "question": self.suite[1] if self.suite is not None else None,
-            "made": {
-                "date": datetime.date.today().isoformat(),
-                "command": self.command,
-                **describe_code(),
-            },
+            "made": self._made_of(stored),
             "occupancy": occupancies[0] if occupancies else None,
             "runs": runs,
-            "failures": self.failures,
+            "failures": self.folder.failures(),
+        }
+
+    def _made(self) -> dict[str, Any]:
+        """When, how and by which code something is made now."""
+        today = datetime.date.today().isoformat()
+        return {"date": today, "command": self.command, **describe_code()}
+
+    def _made_of(self, stored: Mapping[str, Mapping[str, Any]]) -> dict[str, Any]:
+        """The same of all runs that are stored: this call's command, where it asks for all of them,
+        else those that made the others before it; and the commits at which they were made."""
+        asked = {job.name for job in self.jobs}
+        made = {name: record.get("made") or {} for name, record in stored.items()}
+        others = [of["command"] for name, of in made.items() if name not in asked and of]
+        commits = sorted({of["commit"] for of in made.values() if of.get("commit")})
+        now = self._made()
+        return {
+            **now,
+            "command": " && ".join(dict.fromkeys([*others, self.command])),
+            "commit": ", ".join(commits) or now["commit"],
         }
 
     def write(self) -> dict[str, Any]:
@@ -172,6 +188,10 @@ class Chart:
             draw(results, place / "chart-dark.png", DARK)
             write_page(results, place / "chart.html")
         return results
+
+
+def _counted(count: int, name: str) -> str:
+    return f"{count} {name}{'s' if count != 1 else ''}"
 
 
 def _place(record: dict[str, Any], order: Sequence[str]) -> tuple[int, str, int]:

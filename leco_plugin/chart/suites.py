@@ -7,14 +7,17 @@ from dataclasses import dataclass, replace
 from leco_plugin.chart.contender import Contender
 from leco_plugin.chart.methods import GRID, LEARNED, NEVER_FROZEN, VARIANTS
 from leco_plugin.chart.protocol import Protocol
-from leco_plugin.method_configs import LEARNING, ON_GPU
+from leco_plugin.method_configs import LEARNING, ON_GPU, best_device
 from leco_plugin.models.guided_start import OWN_SAMPLER
+from leco_plugin.models.switch_sizes import switch_sizes_for
 from leco_plugin.scenes.input_error import InputError
 
 SCENE_LAYERS = LEARNING.sizes.field.experts.layers
 SCENE_EXPERTS = LEARNING.sizes.gate.scene_experts
+SWITCH_CELLS = switch_sizes_for(best_device()).grid_resolution
+"""Of the grid that Switch-NeRF has by itself."""
 GRIDS = (128, 256, 512) if ON_GPU else (64, 128, 256)
-"""A grid of 256^3 cells in four levels takes a minute of two CPU cores each time it is updated."""
+"""Cells along an axis, learned beside the host; 512^3 would take two CPU cores all of a run."""
 MADE_GRIDS = (64, 128, 256, 512)
 """Made from one field, each from the one before, which costs less than training beside them."""
 
@@ -26,13 +29,15 @@ class Suite:
     question: str
     """What it answers, and who asked."""
     contenders: tuple[Contender, ...]
-    seconds: float = 80.0
-    """Training time of a run without `--seconds`: enough for 30 s of learning an occupancy, and
-    three seeds take under 45 minutes on two CPU cores."""
+    seconds: float = 60.0
+    """Training time of a run without `--seconds`: half a minute of learning and as much guided."""
+    learn_seconds: float | None = 32.0
+    """Most of that for learning an occupancy, without `--seconds`; None is the usual share. Suites
+    that agree in both can share their runs."""
 
     def minutes(self, seeds: int = 3) -> float:
         """About how long all of it takes on two CPU cores."""
-        minutes = Protocol(self.seconds).minutes(self.contenders)
+        minutes = Protocol(self.seconds, None, self.learn_seconds).minutes(self.contenders)
         assert minutes is not None
         return seeds * minutes
 
@@ -43,43 +48,64 @@ def _leco(name: str, **changes: object) -> Contender:
     return Contender(name, "leco-occupancy", LEARNED, paths)
 
 
-def _empty_mlp(name: str, layers: int) -> Contender:
-    return _leco(
-        name,
-        sizes__field__experts__empty_expert="mlp",
-        sizes__field__experts__empty_layers=layers,
-    )
-
-
 def _paper(name: str, **changes: object) -> Contender:
     return _leco(name, gate_loss__form="paper", **changes)
 
 
-def _ngp_grid(cells: int) -> Contender:
-    options = {"resolution": cells, "levels": NGP_LEVELS}
-    changes = {"occupancy.sampler": GRID, "occupancy.options": options}
-    return Contender(f"Instant-NGP + grid {cells}³", "leco-ngp", f"{GRID}-{cells}", changes)
+def _empty_mlp(layers: int) -> dict[str, object]:
+    """Changes that make the empty-space expert an MLP as wide as a scene expert."""
+    return {
+        "sizes__field__experts__empty_expert": "mlp",
+        "sizes__field__experts__empty_layers": layers,
+    }
 
 
-OURS = _leco("learn, freeze, go on")
-NGP_LEARNED = Contender(
-    "Instant-NGP + learned occupancy", "leco-ngp", LEARNED, {"occupancy.sampler": LEARNED}
-)
-NGP_OWN = Contender(
-    "Instant-NGP + own grid", "leco-ngp", OWN_SAMPLER, {"occupancy.sampler": OWN_SAMPLER}
-)
-NGP_LEVELS = 4
-"""Nested grids, as many as Instant-NGP has around a scene without bounds."""
+def _switch(sampling: str, sampler: str, **changes: object) -> Contender:
+    """`leco-switch-nerf` with a sampler, as `--methods` and `--samplers` would have it."""
+    paths = {path.replace("__", "."): value for path, value in changes.items()}
+    return Contender(f"Switch-NeRF + {sampling}", "leco-switch-nerf", sampler, paths)
+
+
+def _switch_grid(cells: int) -> Contender:
+    return _switch(
+        f"grid {cells}³",
+        f"{GRID}-{cells}",
+        occupancy__sampler=OWN_SAMPLER,
+        host__sampling="occupancy-grid",
+        host__sizes__grid_resolution=cells,
+    )
+
+
+SWITCH_LEARNED = _switch("learned occupancy", LEARNED, occupancy__sampler=LEARNED)
+SWITCH_OWN = _switch("coarse and fine samples", OWN_SAMPLER, occupancy__sampler=OWN_SAMPLER)
+SCENE_SIZED = _empty_mlp(SCENE_LAYERS)
 
 SUITES = {
+    "representations": Suite(
+        "Is a small MLP the best place for an occupancy? (reviews 1 and 2)",
+        (
+            replace(_leco("MLP on frequencies (ours)"), grids=MADE_GRIDS),
+            *(
+                Contender(
+                    name, "leco-occupancy", f"{LEARNED}-{kind}", {"sizes.gate.encoding.kind": kind}
+                )
+                for kind, name in (
+                    ("hash", "hash grid"),
+                    ("vm", "TensoRF planes"),
+                    ("k-planes", "K-planes"),
+                )
+            ),
+        ),
+    ),
     "empty-expert": Suite(
         "How small must the empty-space expert be, and what if there is none? (reviews 3 and 6)",
         (
             _leco("identity (ours)"),
-            _empty_mlp("MLP of one layer", 1),
-            _empty_mlp("MLP as large as a scene expert", SCENE_LAYERS),
-            _empty_mlp("MLP twice as deep", 2 * SCENE_LAYERS),
+            _leco("MLP of one layer", **_empty_mlp(1)),
+            _leco("as large as a scene expert", **SCENE_SIZED),
             _leco("none: density is zero", sizes__field__experts__empty_expert="none"),
+            _paper("imbalance loss alone, identity", gate_loss__density=0.0),
+            _paper("imbalance loss alone, large", gate_loss__density=0.0, **SCENE_SIZED),
         ),
     ),
     "losses": Suite(
@@ -99,43 +125,28 @@ SUITES = {
     "freeze": Suite(
         "Why freeze and train again, instead of going on with the same network? (review 4)",
         (
-            OURS,
+            _leco("learn, freeze, go on"),
             replace(VARIANTS["leco-occupancy-retrained"], name="learn, freeze, from scratch"),
             replace(NEVER_FROZEN, name="never frozen"),
             replace(VARIANTS["leco-occupancy-homogeneous"], name="equal experts, no gate"),
         ),
-    ),
-    "representations": Suite(
-        "Is a small MLP the best place for an occupancy? (reviews 1 and 2)",
-        (
-            replace(_leco("MLP on frequencies (ours)"), grids=MADE_GRIDS),
-            *(
-                Contender(
-                    name, "leco-occupancy", f"{LEARNED}-{kind}", {"sizes.gate.encoding.kind": kind}
-                )
-                for kind, name in (
-                    ("hash", "hash grid"),
-                    ("vm", "TensoRF planes"),
-                    ("k-planes", "K-planes"),
-                )
-            ),
-        ),
+        seconds=120.0,
+        learn_seconds=None,
     ),
     "enough-time": Suite(
         "Does it still pay with enough training time? (review 5)",
-        (
-            replace(OURS, name="LeCO + learned occupancy"),
-            VARIANTS["leco-occupancy-homogeneous"],
-            NGP_LEARNED,
-            NGP_OWN,
-        ),
-        seconds=160.0,
+        (SWITCH_LEARNED, SWITCH_OWN, _switch_grid(SWITCH_CELLS)),
+        seconds=180.0,
+        learn_seconds=None,
     ),
     "grid-resolution": Suite(
         "Is a finer occupancy grid as good? (review 1)",
-        (NGP_LEARNED, *(_ngp_grid(cells) for cells in GRIDS)),
+        (SWITCH_LEARNED, *(_switch_grid(cells) for cells in GRIDS)),
+        seconds=180.0,
+        learn_seconds=None,
     ),
 }
+"""In an order in which each can take over most from those before it."""
 
 
 def suite(name: str) -> Suite:

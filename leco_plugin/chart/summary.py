@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from leco_plugin.chart.contender import short_names
+from leco_plugin.chart.contender import shared_method, short_names
 
 LOST_SURFACE_MASS = 1e-3
 """Of the weight near surfaces, at which `evaluation.equal_loss` compares representations."""
@@ -206,7 +206,7 @@ def headline(results: Mapping[str, Any]) -> str:
 
 
 def circumstances(results: Mapping[str, Any]) -> str:
-    """Scene, machine, budget and seeds, in one line."""
+    """Method, scene, machine, budget and seeds, in one line."""
     machine, protocol = results["machine"], results["protocol"]
     where = (
         f"{machine['cores']} CPU cores" if machine["device"] == "cpu" else str(machine["device"])
@@ -217,23 +217,29 @@ def circumstances(results: Mapping[str, Any]) -> str:
     if protocol["steps"] is not None:
         parts.append(f"{protocol['steps']} steps")
     seeds = len({run["seed"] for run in results["runs"]})
-    many = "one seed" if seeds == 1 else f"mean of {seeds} seeds (bands: all)"
-    return f"{results['scene']['name']}, {' or '.join(parts)} of training on {where}, {many}"
+    many = "one seed" if seeds == 1 else f"mean of {seeds} seeds (bands: least to most)"
+    method = shared_method(list(dict.fromkeys(run["name"] for run in results["runs"])))
+    what = f"{method} on {results['scene']['name']}" if method else results["scene"]["name"]
+    return f"{what}, {' or '.join(parts)} of training on {where}, {many}"
 
 
 def verdict(representations: Sequence[Representation]) -> str:
-    """Whether ours is on both fronts, and what beats it where it is not."""
+    """On which fronts ours is, and what beats it where it is not."""
     ours = next((one for one in representations if one.ours), None)
     if ours is None:
         return "our own gate has no figures here"
-    beaten = []
+    held, beaten = fronts_of(ours, representations), []
     for name, cost in FRONTS.items():
         better = [one for one in representations if one.beats(ours, cost)]
         if better:
             beaten.append(f"in {name} by {min(better, key=lambda one: one.kept).name}")
     if not beaten:
-        return f"nothing as small, and nothing learned as soon, keeps less space than {ours.name}"
-    return f"{ours.name} is not on the front: it is beaten {' and '.join(beaten)}"
+        return (
+            f"{ours.name} is on both fronts: what keeps less space is larger and takes longer to "
+            "learn"
+        )
+    where = f"is on the front of {held[0]} only" if held else "is on neither front"
+    return f"{ours.name} {where}: it is beaten {' and '.join(beaten)}"
 
 
 def sentence(text: str) -> str:

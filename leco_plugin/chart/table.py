@@ -60,7 +60,10 @@ def table(results: Mapping[str, Any]) -> str:
     if len(held) > 1:
         parts += [representations_table(held), f"{sentence(verdict(held))}.{left_out(lines)}"]
     commit = f" at {made['commit']}" if made["commit"] else ""
-    parts.append(f"`{made['command']}`, {made['date']}, leco_plugin {made['version']}{commit}.")
+    reused = sum(bool(run.get("reused")) for run in results["runs"])
+    taken = f" {reused} of the runs were made for other charts (`--reuse`)." if reused else ""
+    said = f"`{made['command']}`, {made['date']}, leco_plugin {made['version']}{commit}."
+    parts.append(said + taken)
     return "\n\n".join(parts) + "\n"
 
 

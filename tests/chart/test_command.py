@@ -102,6 +102,8 @@ BAD = {
     "a positive number, not 0": [*METHODS, "--seconds", 0],
     "a positive number, not -1": [*METHODS, "--steps", -1],
     "a positive number, not nan": [*METHODS, "--seconds", "nan"],
+    "not -1": [*METHODS, *TIME, "--seeds", -1],
+    "there is no chart in it": [*METHODS, *TIME, "--reuse", "no-such"],
     "at least one of the images": [*METHODS, *TIME, "--images", 0],
 }
 

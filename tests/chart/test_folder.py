@@ -61,3 +61,21 @@ def test_an_empty_folder_is_taken(tmp_path: Path) -> None:
     (tmp_path / "empty").mkdir()
     ChartFolder(tmp_path / "empty", SETTINGS)
     assert json.loads((tmp_path / "empty" / "settings.json").read_text())["seconds"] == 10.0
+
+
+@pytest.mark.parametrize("text", ["{", "[]", "\\x00"])
+def test_a_damaged_folder_is_told_of_in_a_line_that_names_the_file(
+    tmp_path: Path, text: str
+) -> None:
+    folder = ChartFolder(tmp_path, SETTINGS)
+    run = folder.path / RUNS / "a.json"
+    run.write_text(text)
+    with pytest.raises(InputError, match=r"a\.json is damaged") as refused:
+        folder.stored()
+    assert "\n" not in str(refused.value)
+    run.write_text('{"contender": 3}')
+    with pytest.raises(InputError, match=r"a\.json is no run"):
+        folder.stored()
+    (tmp_path / "settings.json").write_text(text)
+    with pytest.raises(InputError, match=r"settings\.json is damaged"):
+        ChartFolder(tmp_path, SETTINGS)

@@ -13,7 +13,8 @@ from matplotlib.figure import Figure
 from PIL import Image
 
 from leco_plugin.chart.panels import NAME_WIDTH, name_points
-from leco_plugin.chart.picture import CLOSE, balanced, draw, spread
+from leco_plugin.chart.picture import CLOSE, balanced, best_so_far, draw, spread
+from leco_plugin.chart.summary import lines_of
 from leco_plugin.chart.theme import DARK, LIGHT, Theme
 from leco_plugin.evaluation.charts import SOURCE, fingerprint
 
@@ -70,6 +71,17 @@ def test_names_with_room_enough_never_leave_the_panel(wanted: list[float]) -> No
 
 def test_names_that_are_far_apart_stay_where_they_are() -> None:
     assert spread([0.9, 0.1, 0.5], 0.05) == [0.9, 0.1, 0.5]
+
+
+def test_the_front_of_the_curves_is_the_best_that_anybody_has_reached_by_then() -> None:
+    early = run("A", curve=[[2.0, 10.0], [4.0, 14.0], [8.0, 13.0]])
+    late = run("B", curve=[[4.0, 8.0], [8.0, 16.0]])
+    times, best = best_so_far(lines_of(results(early, late)))
+    at = dict(zip(times.round(6).tolist(), best.tolist()))
+    assert (times[0], times[-1]) == (2.0, 8.0)
+    assert at[2.0] == pytest.approx(10.0) and at[8.0] == pytest.approx(16.0)
+    assert np.interp(6.0, times, best) == pytest.approx(14.0, abs=0.1)  # what was reached stays
+    assert (np.diff(best) >= 0.0).all()
 
 
 def test_one_run_with_one_point_is_drawn(tmp_path: Path) -> None:

@@ -91,6 +91,15 @@ def test_a_run_that_failed_is_tried_again(tiny_scene: Path, tmp_path: Path) -> N
     assert again.made == [("b", 0), ("b", 1)] and not results["failures"]
 
 
+def test_a_crash_stays_in_the_table_while_other_seeds_are_made(
+    tiny_scene: Path, tmp_path: Path
+) -> None:
+    make(chart(tiny_scene, tmp_path, seeds=(0,)), Runner(broken="b"))
+    others = make(chart(tiny_scene, tmp_path, seeds=(1,)), Runner())
+    assert [(f["name"], f["seed"]) for f in others["failures"]] == [("b", 0)]
+    assert len(others["runs"]) == 5
+
+
 def test_methods_and_seeds_may_join_later_and_all_are_shown(
     tiny_scene: Path, tmp_path: Path
 ) -> None:
@@ -116,6 +125,27 @@ def test_results_have_the_agreed_form(tiny_scene: Path, tmp_path: Path) -> None:
     assert {"machine", "scene", "occupancy", "runs", "failures", "made"} <= results.keys()
     assert results["made"]["command"] == "leco chart --data ball"
     assert {"date", "commit", "version"} <= results["made"].keys()
+
+
+def test_the_command_is_all_commands_that_made_what_is_shown(
+    tiny_scene: Path, tmp_path: Path
+) -> None:
+    parts = {"leco chart --methods a": CONTENDERS[:1], "leco chart --methods b": CONTENDERS[1:2]}
+    for command, compared in parts.items():
+        results = make(chart(tiny_scene, tmp_path, contenders=compared, command=command), Runner())
+    assert results["made"]["command"] == " && ".join(parts)
+    whole = chart(tiny_scene, tmp_path, command="leco chart --methods a b c")
+    assert make(whole, Runner())["made"]["command"] == "leco chart --methods a b c"
+
+
+def test_the_commits_are_those_at_which_the_runs_were_made(
+    tiny_scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for commit, compared in (("1b", CONTENDERS[:1]), ("2a", CONTENDERS[1:2])):
+        code = {"version": "0.1.0", "commit": commit}
+        monkeypatch.setattr("leco_plugin.chart.run.describe_code", lambda code=code: code)
+        results = make(chart(tiny_scene, tmp_path, contenders=compared), Runner())
+    assert results["made"]["commit"] == "1b, 2a"
 
 
 def test_the_first_occupancy_stands_for_all(tiny_scene: Path, tmp_path: Path) -> None:

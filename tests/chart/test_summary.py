@@ -12,6 +12,7 @@ from leco_plugin.chart.summary import (
     MEMORY,
     RENDERING,
     Representation,
+    circumstances,
     common_psnr,
     front,
     fronts_of,
@@ -80,6 +81,15 @@ def test_the_headline_names_the_leader_and_its_lead() -> None:
     assert said == "b is ahead: 21.5 dB, 1.5 more than a"
 
 
+def test_the_method_that_all_share_is_named_once_and_with_the_scene() -> None:
+    shared = results(run("NGP + a", psnr=20.0), run("NGP + b", psnr=21.5))
+    assert circumstances(shared) == "NGP on city, 10 s of training on 2 CPU cores, one seed"
+    mixed = results(run("NGP + a"), run("LeCO, b", 1))
+    assert circumstances(mixed) == (
+        "city, 10 s of training on 2 CPU cores, mean of 2 seeds (bands: least to most)"
+    )
+
+
 def test_a_lead_within_the_spread_of_the_seeds_is_none() -> None:
     best = [run("A", seed, psnr) for seed, psnr in enumerate([20.0, 22.0])]
     other = [run("B", seed, psnr) for seed, psnr in enumerate([20.2, 20.4])]
@@ -116,7 +126,7 @@ def test_grids_stand_beside_the_gates_of_whose_field_they_were_made() -> None:
     assert [one.kept for one in held] == pytest.approx([10.0, 30.0, 20.0, 20.0])
     assert [one.ours for one in held] == [True, False, False, False]
     assert verdict(held) == (
-        "nothing as small, and nothing learned as soon, keeps less space than MLP (ours)"
+        "MLP (ours) is on both fronts: what keeps less space is larger and takes longer to learn"
     )
 
 
@@ -144,9 +154,12 @@ def test_it_is_said_where_ours_is_not_on_the_front_and_what_beats_it() -> None:
     faster = ("hash grid", "learned-occupancy-hash", 4_000_000, 3.0, 0.05)
     smaller = ("K-planes", "learned-occupancy-k-planes", 40_000, 10.0, 0.1)
     said = verdict(gates(faster, ours))  # whatever comes first
-    assert said == "MLP (ours) is not on the front: it is beaten in learning time by hash grid"
-    assert verdict(gates(ours, faster, smaller)).endswith(
-        "it is beaten in size by K-planes and in learning time by hash grid"
+    assert said == (
+        "MLP (ours) is on the front of size only: it is beaten in learning time by hash grid"
+    )
+    assert verdict(gates(ours, faster, smaller)) == (
+        "MLP (ours) is on neither front: it is beaten in size by K-planes and in learning time by "
+        "hash grid"
     )
     assert verdict(gates(faster, smaller)) == "our own gate has no figures here"
 

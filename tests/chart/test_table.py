@@ -62,6 +62,12 @@ def test_the_command_and_the_question_are_there() -> None:
     assert "What do they do?" in text and "`leco chart --data city`, 2024-02-29" in text
 
 
+def test_runs_of_other_charts_are_counted() -> None:
+    assert "other charts" not in table(results(run("A"), run("B")))
+    text = table(results(run("A"), run("B", reused=True), run("B", 1, reused=True)))
+    assert "2 of the runs were made for other charts (`--reuse`)." in text
+
+
 def test_representations_say_on_which_front_they_are_and_whether_ours_is() -> None:
     ours = run("MLP (ours)", occupancy=occupancy(51_000, 0.125), learn_seconds=9.0)
     other = run(
@@ -73,7 +79,10 @@ def test_representations_say_on_which_front_they_are_and_whether_ours_is() -> No
     text = table(results(ours, other))
     assert rows(text, "MLP (ours)")[-1] == ["MLP (ours)", "51", "9", "12.5", "size"]
     assert rows(text, "hash grid")[-1][-1] == "size, learning time"
-    assert "MLP (ours) is not on the front: it is beaten in learning time by hash grid." in text
+    assert (
+        "MLP (ours) is on the front of size only: it is beaten in learning time by hash grid."
+        in text
+    )
 
 
 def test_grids_that_could_not_be_made_are_named() -> None:

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from leco_plugin.chart.theme import DARK, LIGHT, Theme
 from leco_plugin.evaluation.charts import psnr_against_seconds
 from leco_plugin.evaluation.json_file import write_json
 from leco_plugin.evaluation.machine import describe_machine
@@ -28,13 +29,15 @@ def test_what_is_no_json_leaves_no_file(tmp_path: Path) -> None:
     assert list(tmp_path.iterdir()) == []
 
 
-def test_the_chart_marks_both_runs_and_the_freezing(tmp_path: Path) -> None:
+@pytest.mark.parametrize("theme", [LIGHT, DARK], ids=["light", "dark"])
+def test_the_chart_marks_both_runs_and_the_freezing(theme: Theme, tmp_path: Path) -> None:
     curve = [[10.0 * i, 18.0 + i] for i in range(1, 6)]
     runs = [
         {"method": "a", "train_seconds": 50.0, "curve": curve, "freeze_seconds": 12.0},
         {"method": "b", "train_seconds": 50.0, "curve": [[t, p - 1.0] for t, p in curve]},
     ]
-    path = psnr_against_seconds(runs, tmp_path / "chart.png", "A city")
+    path = psnr_against_seconds(runs, tmp_path / "chart.png", "b loses", "a city", theme=theme)
     image = np.asarray(Image.open(path).convert("RGB")).reshape(-1, 3).astype(int)
-    for colour in ((0x0B, 0x6E, 0x8F), (0xD1, 0x60, 0x2B)):
-        assert (np.abs(image - colour).max(axis=1) < 8).sum() > 500
+    for colour, fewest in {theme.page: 200_000, **dict.fromkeys(theme.colours[:2], 500)}.items():
+        wanted = [int(colour[i : i + 2], 16) for i in (1, 3, 5)]
+        assert (np.abs(image - wanted).max(axis=1) < 8).sum() > fewest

@@ -1,0 +1,55 @@
+"""Claims about the picture of what each expert gets while an occupancy is learned."""
+
+from __future__ import annotations
+
+import importlib
+from pathlib import Path
+from types import ModuleType
+
+import pytest
+import torch
+from PIL import Image
+
+from leco_plugin.evaluation.charts import SOURCE, fingerprint
+from leco_plugin.models.history import GateHistory
+
+ROOT = Path(__file__).resolve().parent.parent
+
+
+@pytest.fixture
+def learning(monkeypatch: pytest.MonkeyPatch) -> ModuleType:
+    monkeypatch.syspath_prepend(str(ROOT / "benchmarks"))
+    return importlib.import_module("learning")
+
+
+def history() -> GateHistory:
+    """Four looks; from the third on half, then three quarters, of the points are empty."""
+    shares = [[0.0, 1.0, 0.0], [0.2, 0.8, 0.0], [0.5, 0.25, 0.25], [0.75, 0.0, 0.25]]
+    densities = [[0.0, 1.0, 0.0], [1.0, 9.0, 0.0], [2.0, 100.0, 300.0], [4.0, 0.0, 1e13]]
+    looks = GateHistory([0, 10, 20, 30], [0.0, 1.0, 2.0, 3.0])
+    looks.shares, looks.densities = (
+        [torch.tensor(row) for row in rows] for rows in (shares, densities)
+    )
+    return looks
+
+
+def test_the_sentence_is_of_the_later_looks_and_opaque_is_opaque(learning: ModuleType) -> None:
+    report = learning.report_of(history(), "city", "2024-02-29")
+    share, empty, scene = learning.late_means(report)
+    assert share == pytest.approx(0.625) and empty == pytest.approx(3.0)
+    assert scene == pytest.approx((200.0 + learning.OPAQUE) / 2)
+    assert learning.sentence(report) == (
+        "The empty-space expert takes 62% of the points, about 2,000 times less dense than the rest"
+    )
+
+
+def test_an_expert_without_points_has_no_density(learning: ModuleType) -> None:
+    report = learning.report_of(history(), "city", "2024-02-29")
+    known = torch.tensor(learning.without_none(report)).isfinite().tolist()
+    assert known == [[share > 0.0 for share in row] for row in report["shares"]]
+
+
+def test_the_picture_remembers_of_which_figures_it_is(learning: ModuleType, tmp_path: Path) -> None:
+    report = learning.report_of(history(), "city", "2024-02-29")
+    with Image.open(learning.draw(tmp_path / "learning.png", report)) as image:
+        assert image.info[SOURCE] == fingerprint(report)
