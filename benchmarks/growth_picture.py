@@ -60,3 +60,20 @@ def _line(
         points = [(row["area_square_metres"], row[name]) for row in rows if row["seed"] == seed]
         axes.plot(*zip(*points), label=label, **style(number, theme))
         label = None
+    if name == "grid_bytes":
+        _without_a_grid(axes, report, number, theme)
+
+
+def _without_a_grid(axes: Any, report: dict[str, Any], number: int, theme: Theme) -> None:
+    """Arrows from the largest grid that was tried, where none keeps as little as the gate."""
+    missing = [
+        (row["area_square_metres"], max(grid["bytes"] for grid in row["grids"]))
+        for row in report["rows"]
+        if row["grid_bytes"] is None and row["grids"]
+    ]
+    colour = theme.colours[number % len(theme.colours)]
+    for place, (area, most) in enumerate(missing):
+        arrow = {"arrowstyle": "<-", "color": colour, "linewidth": 1.6}
+        axes.annotate("", (area, most), (area, 3.0 * most), arrowprops=arrow)
+        said = None if place else "no grid up to here keeps as little"
+        axes.plot([area], [most], "_", color=colour, markersize=12, label=said)

@@ -156,7 +156,7 @@ def best_so_far(lines: Sequence[Line]) -> tuple[NDArray[np.float64], NDArray[np.
     contender has reached by then [T]."""
     curves = [line.curve()[:2] for line in lines]
     times = np.unique(np.concatenate([seconds for seconds, _ in curves]))
-    reached = [np.interp(times, *curve, left=-np.inf) for curve in curves]
+    reached = [np.interp(times, seconds, psnr, left=-np.inf) for seconds, psnr in curves]
     return times, np.maximum.accumulate(np.max(reached, axis=0))
 
 

@@ -32,10 +32,6 @@ class BoundsConfig:
 
 
 FROM_ABOVE = "photographed from above"
-BEYOND_POINTS = 1.25
-"""Far, in units of the longest line of sight to sparse points."""
-FAR_TO_GROUND = 1.05
-"""The same, drawn out to the lower plane."""
 
 
 @dataclass(frozen=True)
@@ -101,7 +97,6 @@ def find_bounds(
         # far below, so that a flat picture on the lower plane is plainly wrong from two places
         ground = float(low[2]) - max(0.5 * relief, 0.2 * far)
         top = float(high[2]) + 0.3 * relief
-        far *= max(1.0, _drawn_out(poses, float(low[2]), ground))
         return _slab(poses, directions, ground, top, near, far, f"{FROM_ABOVE} ({seen}): bounded")
     if config.space == "box":
         return _room(poses, low, high, near, far)
@@ -125,15 +120,7 @@ def with_range(bounds: SceneBounds, near: float | None, far: float | None) -> Sc
 
 def _range(depths: Tensor) -> tuple[float, float]:
     """Near and far of distances [D] to what is seen, with margins."""
-    seen = float(_quantiles(depths, 0.999))
-    return 0.75 * float(_quantiles(depths, 0.01)), BEYOND_POINTS * seen
-
-
-def _drawn_out(poses: Tensor, low: float, ground: float) -> float:
-    """By how much far is to grow, so that the longest line of sight to the lowest points goes on
-    to the lower plane: cut before it, the corners of a picture could lie flat on far."""
-    height = float(poses[:, 2, 3].median())
-    return FAR_TO_GROUND / BEYOND_POINTS * (height - ground) / max(height - low, 1e-6)
+    return 0.75 * float(_quantiles(depths, 0.01)), 1.25 * float(_quantiles(depths, 0.999))
 
 
 def _between(
