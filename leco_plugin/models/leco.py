@@ -308,6 +308,7 @@ class LecoModel(Model):
             truth,
             None if known is None else known.to(self.device),
             span=self.march_range[:2],
+            unbounded=self.space.unbounded,
             learning=self.is_learning(),
             ramped=self.ramped,
         )

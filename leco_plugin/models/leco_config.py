@@ -51,7 +51,8 @@ class LecoModelConfig(GrowingConfig, ModelConfig):
     """Weight, while the occupancy is learned, of ending rays at the sparse points they lead to."""
     nearness: float = 0.03
     """Weight, while the occupancy is learned, of taking the farther of two explanations of a ray:
-    a dark sky is no dark cloud before the camera. Comes in with the distortion loss."""
+    a dark sky is no dark cloud before the camera. Comes in with the distortion loss; in a bounded
+    scene for pixels that are nearly black."""
     look_everywhere: float = 0.125
     """Share of rays that shade all candidates while the others follow the gate being learned."""
     likely_above: float = 0.05

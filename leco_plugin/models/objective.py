@@ -21,6 +21,9 @@ from leco_plugin.models.losses import (
 )
 from leco_plugin.models.rendering import Intervals, Rays, Shaded, backdrop_of
 
+DARK = 0.1
+"""Brightness, of the largest channel, from which a pixel of a bounded scene shows something."""
+
 
 @dataclass
 class GateLossConfig:
@@ -65,6 +68,7 @@ def field_losses(
     distances: Tensor | None,
     *,
     span: Tensor,
+    unbounded: Tensor,
     learning: bool,
     ramped: float,
 ) -> dict[str, Tensor]:
@@ -74,6 +78,8 @@ def field_losses(
         truth: [R, 3] colours.
         distances: [R] to sparse points, scene units, 0 where none is known; None is no such points.
         span: [2] near and far, scene units.
+        unbounded: scalar bool, whether a ray may go on to a sky of any colour; in a box nothing but
+            darkness lies behind the scene.
         learning: whether this is the first phase.
         ramped: how far the distortion loss has come in, in [0, 1]; nearness comes in with it.
     """
@@ -90,8 +96,9 @@ def field_losses(
             shaded.weights, intervals, distances
         )
     if learning and weights.nearness > 0.0:
-        nearness = ((far - shaded.depth) / (far - near)).mean()
-        losses["nearness_loss"] = weights.nearness * ramped * nearness
+        dark = (1.0 - truth.amax(dim=-1) / DARK).clamp(min=0.0)
+        nearness = (far - shaded.depth) / (far - near) * torch.where(unbounded, 1.0, dark)
+        losses["nearness_loss"] = weights.nearness * ramped * nearness.mean()
     return losses
 
 

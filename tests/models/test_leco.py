@@ -88,9 +88,18 @@ def test_a_batch_without_rays_says_so(model: LecoModel) -> None:
         model.get_loss_dict(outputs, {"image": batch["image"][:0]})
 
 
-def test_the_nearness_loss_is_its_weight_at_near_and_nothing_at_far(model: LecoModel) -> None:
+@pytest.mark.parametrize(
+    ("unbounded", "brightness", "share"),
+    [(True, 0.5, 1.0), (False, 0.0, 1.0), (False, 0.05, 0.5), (False, 0.5, 0.0)],
+)
+def test_the_nearness_loss_is_its_weight_at_near_and_nothing_at_far(
+    model: LecoModel, unbounded: bool, brightness: float, share: float
+) -> None:
+    """In a box it is of pixels that are nearly black: the others show something for certain."""
     outputs, batch = step(model)
-    for place, expected in ((0, model.config.nearness * model.ramped), (1, 0.0)):
+    model.space.unbounded.fill_(unbounded)
+    batch = batch | {"image": torch.full_like(batch["image"], brightness)}
+    for place, expected in ((0, share * model.config.nearness * model.ramped), (1, 0.0)):
         at = model.march_range[place].expand(NUM_RAYS)
         placed = outputs | {"shaded": outputs["shaded"]._replace(depth=at)}
         loss = model.get_loss_dict(placed, batch)["nearness_loss"]
