@@ -125,8 +125,7 @@ def _bounds_note(report: Report) -> str:
     settings = report["settings"]
     return (
         f" {settings['scene']}, {settings['seconds']:g} s of training each. By hand: `near` and "
-        "`far`, and space contracted, as without a look at the data; and the same with space and "
-        "planes found from the data."
+        "`far`; without planes space is contracted, as without a look at the data."
     )
 
 
