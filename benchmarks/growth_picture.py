@@ -77,3 +77,4 @@ def _without_a_grid(axes: Any, report: dict[str, Any], number: int, theme: Theme
         axes.annotate("", (area, most), (area, 3.0 * most), arrowprops=arrow)
         said = None if place else "no grid up to here keeps as little"
         axes.plot([area], [most], "_", color=colour, markersize=12, label=said)
+        axes.plot([area], [4.0 * most], alpha=0.0)

@@ -162,6 +162,15 @@ def _prior_command(report: Report) -> str:
     return f"python benchmarks/prior.py --data {scenes} --steps {report['steps']}"
 
 
+def _bounds_command(report: Report) -> str:
+    by_hand = [run for run in report["runs"] if run["range"] is not None]
+    planes, seeds = ({str(run[name]): None for run in by_hand} for name in ("planes", "seed"))
+    return (
+        f"python benchmarks/bounds.py {report['settings']['scene']} "
+        f"--planes {' '.join(planes)} --seeds {' '.join(seeds)}"
+    )
+
+
 def _memory_command(report: Report) -> str:
     return f"python benchmarks/image_memory.py --ways {' '.join(r['way'] for r in report['runs'])}"
 
@@ -175,7 +184,7 @@ LARGE_SCENES = {
     ),
     "bounds": Shown(
         "Automatic bounds against near and far set by hand",
-        lambda report: f"python benchmarks/bounds.py {report['settings']['scene']}",
+        _bounds_command,
         bounds_table,
         _bounds_note,
     ),
