@@ -122,6 +122,7 @@ class Run:
             pixels.colors,
             None,
             span=self.span,
+            unbounded=self.space.unbounded,
             learning=self.learning,
             ramped=self.ramped,
         )

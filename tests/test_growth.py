@@ -75,6 +75,7 @@ def test_looks_lie_in_the_second_half_and_the_last_at_the_end() -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.long
 def test_a_dry_run_passes_and_is_not_done_twice(tmp_path: Path) -> None:
     out = tmp_path / "growth.json"
     command = [sys.executable, "-W", "ignore", str(ROOT / "benchmarks" / "growth.py"), "--dry-run"]

@@ -25,6 +25,7 @@ def test_the_stored_result_keeps_more_than_the_allowance_on_disk() -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.long
 def test_memory_does_not_grow_with_the_photographs_on_disk(tmp_path: Path) -> None:
     """72 pictures decode to 648 MB in bytes, 2.6 GB in floats."""
     out = tmp_path / "out.json"

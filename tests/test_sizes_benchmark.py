@@ -189,6 +189,7 @@ def test_what_is_stored_is_shown_city_after_city(
 
 
 @pytest.mark.slow
+@pytest.mark.long
 def test_a_dry_run_passes_and_is_not_done_twice(tmp_path: Path) -> None:
     command = [sys.executable, "-W", "ignore", str(ROOT / "benchmarks" / "sizes.py"), "--dry-run"]
     command += ["--folder", str(tmp_path)]
