@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-from leco_plugin.chart.theme import LIGHT, Theme, plain, style
+from leco_plugin.chart.theme import LIGHT, Theme, plain, style, themed
 from leco_plugin.evaluation.charts import SOURCE, fingerprint
 
 PANELS = (
@@ -25,13 +25,10 @@ def draw(path: Path, report: dict[str, Any], theme: Theme = LIGHT) -> Path:
         report: as in `growth.json`.
         theme: of the page it is meant for.
     """
-    from matplotlib import rc_context
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
-    parts = ("text.color", "axes.labelcolor", "axes.edgecolor", "xtick.color", "ytick.color")
-    settings: dict[Any, Any] = {"font.size": 11.5, "axes.facecolor": theme.page}
-    with rc_context(settings | dict.fromkeys(parts, theme.ink)):
+    with themed(theme, 11.5):
         figure = Figure(figsize=(10.0, 4.4), facecolor=theme.page, layout="constrained")
         FigureCanvasAgg(figure)
         for axes, (label, lines) in zip(figure.subplots(1, 2), PANELS):

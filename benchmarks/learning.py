@@ -16,7 +16,7 @@ from typing import Any
 
 import checkout  # noqa: F401
 
-from leco_plugin.chart.theme import LIGHT, Theme, plain
+from leco_plugin.chart.theme import LIGHT, Theme, plain, themed
 from leco_plugin.cli_reports import occupancy_of
 from leco_plugin.evaluation.charts import SOURCE, fingerprint
 from leco_plugin.evaluation.history_picture import OPAQUE
@@ -90,13 +90,10 @@ def draw(path: Path, report: dict[str, Any], theme: Theme = LIGHT) -> Path:
         report: as in `learning.json`.
         theme: of the page it is meant for.
     """
-    from matplotlib import rc_context
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
-    parts = ("text.color", "axes.labelcolor", "axes.edgecolor", "xtick.color", "ytick.color")
-    settings: dict[Any, Any] = {"font.size": 11.5, "axes.facecolor": theme.page}
-    with rc_context(settings | dict.fromkeys(parts, theme.ink)):
+    with themed(theme, 11.5):
         figure = Figure(figsize=(10.0, 4.4), facecolor=theme.page, layout="constrained")
         FigureCanvasAgg(figure)
         figure.suptitle(sentence(report), fontsize=13, fontweight="bold", x=0.01, ha="left")

@@ -7,6 +7,7 @@ import shutil
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
 import pytest
 import tiny_scene as tiny_scene_writer
@@ -55,6 +56,18 @@ def without_cache(monkeypatch: pytest.MonkeyPatch) -> None:
         raise ValueError("no cache in this test")
 
     monkeypatch.setattr("leco_plugin.samplers.estimator.build_cache", refuse)
+
+
+@pytest.fixture
+def guide() -> Any:
+    """A host's guide with the ball for its occupancy."""
+    from ball_occupancy import ball
+
+    from leco_plugin.models.guide import Guide  # samplers are tested without nerfstudio, too
+
+    made = Guide()
+    made.set_occupancy(ball())
+    return made
 
 
 @pytest.fixture(scope="session")

@@ -9,7 +9,7 @@ from typing import Any
 
 from leco_plugin.capacity.choice import NAMES, choose, common_volume, verdict
 from leco_plugin.capacity.measuring import FAMILIES, VOLUMES
-from leco_plugin.chart.theme import LIGHT, Theme, plain, style
+from leco_plugin.chart.theme import LIGHT, Theme, plain, style, themed
 from leco_plugin.evaluation.charts import SOURCE, fingerprint
 
 LEAST = 1e-5
@@ -24,7 +24,6 @@ def draw(results: Mapping[str, Any], path: Path, theme: Theme = LIGHT) -> Path:
         path: of the picture.
         theme: of the page that it is meant for.
     """
-    from matplotlib import rc_context
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
@@ -32,10 +31,7 @@ def draw(results: Mapping[str, Any], path: Path, theme: Theme = LIGHT) -> Path:
     volume = common_volume(rows)
     kept = [100.0 * row["kept_volume"] for row in rows]
     lost = [max(row["lost_at_volumes"][volume], LEAST) for row in rows]
-    parts = ("text.color", "axes.labelcolor", "axes.edgecolor", "xtick.color", "ytick.color")
-    settings: dict[Any, Any] = {"font.size": 12, "axes.facecolor": theme.page}
-    settings |= dict.fromkeys(parts, theme.ink)
-    with rc_context(settings):
+    with themed(theme):
         figure = Figure(figsize=(11, 5.9), facecolor=theme.page)
         FigureCanvasAgg(figure)
         title = textwrap.fill(verdict(rows), 84)

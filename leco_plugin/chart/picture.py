@@ -30,7 +30,7 @@ from leco_plugin.chart.summary import (
     sentence,
     verdict,
 )
-from leco_plugin.chart.theme import LIGHT, Theme, plain, style
+from leco_plugin.chart.theme import LIGHT, Theme, plain, style, themed
 from leco_plugin.evaluation.charts import SOURCE, fingerprint
 
 CLOSE = 0.056
@@ -58,17 +58,13 @@ def draw(results: Mapping[str, Any], path: Path, theme: Theme = LIGHT) -> Path:
         path: of the picture.
         theme: of the page it is meant for.
     """
-    from matplotlib import rc_context
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
     lines = lines_of(results)
     held = representations_of(lines)
-    parts = ("text.color", "axes.labelcolor", "axes.edgecolor", "xtick.color", "ytick.color")
-    settings: dict[Any, Any] = {"font.size": 12, "axes.facecolor": theme.page}
-    settings |= dict.fromkeys(parts, theme.ink)
     compared = len(held) > 1
-    with rc_context(settings):
+    with themed(theme):
         figure = Figure(figsize=(10, 8.4), facecolor=theme.page)
         FigureCanvasAgg(figure)
         title = balanced(sentence(verdict(held) if compared else headline(results)))

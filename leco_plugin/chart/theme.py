@@ -47,3 +47,13 @@ def plain(axes: Any, theme: Theme) -> None:
     axes.grid(color=theme.faint, linewidth=0.8)
     axes.set_axisbelow(True)
     axes.spines[["top", "right"]].set_visible(False)
+
+
+def themed(theme: Theme, size: float = 12) -> Any:
+    """A context in which matplotlib draws with a theme's ink, on its page, and in type of a size,
+    points."""
+    from matplotlib import rc_context
+
+    parts = ("text.color", "axes.labelcolor", "axes.edgecolor", "xtick.color", "ytick.color")
+    settings: dict[Any, Any] = {"font.size": size, "axes.facecolor": theme.page}
+    return rc_context(settings | dict.fromkeys(parts, theme.ink))

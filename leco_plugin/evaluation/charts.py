@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from leco_plugin.chart.theme import LIGHT, Theme, plain, style
+from leco_plugin.chart.theme import LIGHT, Theme, plain, style, themed
 
 COLOURS = ("#0b6e8f", "#d1602b", "#6b8e23", "#7d4fa3", "#555555")
 """Told apart also in grey and by colour-blind readers."""
@@ -34,13 +34,10 @@ def psnr_against_seconds(
         labels: names of the curves; the methods by default.
         theme: of the page it is meant for.
     """
-    from matplotlib import rc_context
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
-    parts = ("text.color", "axes.labelcolor", "axes.edgecolor", "xtick.color", "ytick.color")
-    settings: dict[Any, Any] = {"font.size": 12, "axes.facecolor": theme.page}
-    with rc_context(settings | dict.fromkeys(parts, theme.ink)):
+    with themed(theme):
         figure = Figure(figsize=(8, 4.4), layout="constrained", facecolor=theme.page)
         FigureCanvasAgg(figure)
         figure.suptitle(title, fontsize=14, fontweight="bold", x=0.01, ha="left")

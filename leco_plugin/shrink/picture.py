@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from leco_plugin.chart.theme import LIGHT, Theme, plain
+from leco_plugin.chart.theme import LIGHT, Theme, plain, themed
 
 LEAST = 1e-6
 """Lost surface mass that is drawn for none at all."""
@@ -22,16 +22,12 @@ def draw(results: Mapping[str, Any], path: Path, theme: Theme = LIGHT) -> Path:
     Raises:
         OSError, ValueError: it cannot be written there, or is of no known kind.
     """
-    from matplotlib import rc_context
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
     from matplotlib.ticker import NullFormatter, StrMethodFormatter
 
     rungs = results["rungs"]
-    parts = ("text.color", "axes.labelcolor", "axes.edgecolor", "xtick.color", "ytick.color")
-    settings: dict[Any, Any] = {"font.size": 12, "axes.facecolor": theme.page}
-    settings |= dict.fromkeys(parts, theme.ink)
-    with rc_context(settings):
+    with themed(theme):
         figure = Figure(figsize=(8.5, 5), facecolor=theme.page, layout="constrained")
         FigureCanvasAgg(figure)
         axes = figure.subplots()

@@ -15,13 +15,6 @@ from leco_plugin.scenes.input_error import InputError
 pytestmark = pytest.mark.usefixtures("without_cache")
 
 
-@pytest.fixture
-def guide() -> Guide:
-    made = Guide()
-    made.set_occupancy(ball())
-    return made
-
-
 def test_without_an_occupancy_one_line_says_how_to_get_one():
     with pytest.raises(RuntimeError, match=r"occupancy\.path"):
         Guide().estimator(BOX).sampling(*rays(), **MARCH)

@@ -66,13 +66,6 @@ class Proposal(Host):
         return {"rgb": self.field.layer.weight.sum(), "scouting": constant}
 
 
-@pytest.fixture
-def guide() -> Guide:
-    made = Guide()
-    made.set_occupancy(ball())
-    return made
-
-
 def test_a_packed_host_is_found_under_any_name(guide: Guide):
     host = Packed()
     assert swap_sampler(host, guide) == "packed"

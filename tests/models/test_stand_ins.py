@@ -22,13 +22,6 @@ from leco_plugin.space import Space
 pytestmark = pytest.mark.usefixtures("without_cache")
 
 
-@pytest.fixture
-def guide() -> Guide:
-    made = Guide()
-    made.set_occupancy(ball())
-    return made
-
-
 def test_a_host_samples_as_with_the_estimator_itself(guide: Guide):
     own = LearnedOccupancyEstimator(ball()).eval()
     origins, directions = rays()
