@@ -79,17 +79,18 @@ class Occupancy(nn.Module):
             not finite.
         """
         # one coordinate after the other: on a CPU rows of three numbers take five times as long
-        positions = positions.to(self.space.center.dtype).T.contiguous().T
-        mapped = self.space.map(positions)
-        inside = (mapped.abs() <= 1.0).all(dim=-1)  # false for NaN
-        inside &= ((positions >= self.walls[:3]) & (positions <= self.walls[3:])).all(dim=-1)
-        mapped = torch.where(inside[:, None], mapped, 0.0)
+        columns = torch.stack(positions.to(self.space.center.dtype).unbind(-1))
+        mapped = self.space.map(columns.T)
+        low, high = self.walls.view(2, 3, 1)
+        x, y, z = (mapped.T.abs() <= 1.0) & (columns >= low) & (columns <= high)  # no NaN is
+        inside = x & y & z
+        mapped = mapped.clamp(-1.0, 1.0).nan_to_num_()
         if mapped.device.type == "cpu":
             values = occupancy_of(self.gate, mapped, getattr(torch, self.precision))
         else:
             with gate_precision(mapped.device.type, self.precision):
                 values = self.gate.occupancy(mapped)
-        return torch.where(inside, values, 0.0)
+        return values * inside
 
     def occupied(self, positions: Tensor) -> Tensor:
         """Whether scene positions [N, 3] are kept: bool [N].

@@ -50,9 +50,10 @@ class Encoding(Protocol):
     def __call__(self, mapped: Tensor) -> Tensor: ...
 
 
-FRESH = 4
-"""Octaves that follow from one sine and cosine by doubling: two to four times as fast, and no less
-exact, because an error that doubles with each octave stays below that of the angles themselves."""
+FRESH = {torch.float32: 4, torch.float16: 6, torch.bfloat16: 8}
+"""Octaves that follow from one sine and cosine by doubling: two to four times as fast. The error
+grows with each; in float32 it stays below that of the angles themselves, in halves below a
+third of what rounding to them costs."""
 
 
 class FrequencyEncoding(nn.Module):
@@ -67,23 +68,25 @@ class FrequencyEncoding(nn.Module):
         self.register_buffer("scales", math.pi * 2.0 ** torch.arange(octaves), persistent=False)
         self.register_buffer("start", torch.tensor([0.0, -1.0]).view(2, 1, 1), persistent=False)
 
-    def forward(self, mapped: Tensor) -> Tensor:
-        """[N, 3] in [-1, 1] to [N, 3 + 6 octaves] float32."""
+    def forward(self, mapped: Tensor, dtype: torch.dtype | None = None) -> Tensor:
+        """[N, 3] in [-1, 1] to [N, 3 + 6 octaves], in the type of the positions or the one given."""
         x = mapped.t().contiguous()
+        dtype = dtype or x.dtype
         if x.requires_grad:  # as it is defined, which torch can differentiate
             angles = (self.scales[:, None, None] * x).flatten(0, 1)
-            return torch.cat([x, angles.sin(), angles.cos()]).t()
-        features = x.new_empty(self.out_dim, x.shape[1])
+            return torch.cat([x, angles.sin(), angles.cos()]).t().to(dtype)
+        features = x.new_empty(self.out_dim, x.shape[1], dtype=dtype)
         features[:3] = x
-        waves = features[3:].view(2, len(self.scales), *x.shape)  # sines, cosines
+        every = features[3:].view(2, len(self.scales), *x.shape)  # sines, cosines
+        waves = x.new_empty(2, *x.shape)
         for octave, scale in enumerate(self.scales):
-            if octave % FRESH == 0:
+            if octave % FRESH.get(dtype, 1) == 0:
                 angles = x * scale
-                torch.sin(angles, out=waves[0, octave])
-                torch.cos(angles, out=waves[1, octave])
+                torch.sin(angles, out=waves[0])
+                torch.cos(angles, out=waves[1])
             else:  # sin 2a = 2 sin a cos a, cos 2a = 2 cos a cos a - 1
-                last = waves[:, octave - 1]
-                torch.addcmul(self.start, last, last[1], value=2.0, out=waves[:, octave])
+                waves = torch.addcmul(self.start, waves, waves[1], value=2.0)
+            every[:, octave] = waves
         return features.t()
 
 

@@ -17,6 +17,7 @@ from weakref import WeakKeyDictionary
 import torch
 from torch import Tensor
 
+from leco_plugin.models.encodings import Encoding, FrequencyEncoding
 from leco_plugin.models.gate import EMPTY, Gate
 from leco_plugin.models.steady import filled_size
 
@@ -62,10 +63,16 @@ def occupancy_of(gate: Gate, mapped: Tensor, dtype: torch.dtype) -> Tensor:
         mapped = torch.nn.functional.pad(mapped.T, (0, filling)).T
     with torch.no_grad(), torch.autocast("cpu", enabled=False):
         frozen = frozen_gate(gate, dtype)
-        features = gate.encoding(mapped).to(dtype)
+        features = _encoded(gate.encoding, mapped, dtype)
         for weight, bias in frozen.layers:
             features = _layer(features, weight, bias)
         return _occupancy(frozen, features.float(), gate.norm.eps)[:count]
+
+
+def _encoded(encoding: Encoding, mapped: Tensor, dtype: torch.dtype) -> Tensor:
+    if isinstance(encoding, FrequencyEncoding):
+        return encoding(mapped, dtype)
+    return encoding(mapped).to(dtype)
 
 
 def _layer(features: Tensor, weight: Tensor, bias: Tensor) -> Tensor:
@@ -85,6 +92,8 @@ def _occupancy(frozen: FrozenGate, features: Tensor, epsilon: float) -> Tensor:
     square = torch.linalg.vector_norm(features, dim=1).square_().view_as(mean)
     square = square.addcmul_(mean, mean, value=-1.0).clamp_(min=0.0).add_(width * epsilon)
     logits = torch.addcmul(frozen.shift, above, square.rsqrt_()[:, None])
+    if len(frozen.shift) == 1:
+        return logits.view(-1).sigmoid_()
     odds = logits.clamp_(max=LARGEST_LOGIT).exp_().sum(dim=1).view(-1)
     return odds / (odds + 1.0)
 

@@ -23,7 +23,7 @@ from leco_plugin.shrink.ladder import ladder, name_of, values_of
 from leco_plugin.shrink.references import Part, Reference, declared
 from leco_plugin.shrink.teaching import Lesson, round_weights, teach
 
-STEPS = 400
+STEPS = 1200
 EMPHASIS, WEIGHT_AT_FULL = 8.0, 0.05
 """How much dearer a candidate is that carries rendering weight, and from which weight on fully."""
 MARGIN = 0.5

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 
+import pytest
 import torch
 from torch import Tensor
 
@@ -62,6 +63,16 @@ def test_doubled_octaves_are_as_exact_as_their_angles() -> None:
     truth = exact(x.double())
     error, bound = (encoding(x) - truth).abs().max(), (direct - truth).abs().max()
     assert float(error) < 1.5 * float(bound) < 1e-3
+
+
+@pytest.mark.parametrize("dtype", [torch.bfloat16, torch.float16])
+def test_octaves_in_halves_are_nearly_the_rounded_ones(dtype) -> None:
+    x = torch.rand(5000, 3) * 2 - 1
+    encoding = build_encoding(EncodingConfig(octaves=8))
+    features, exact = encoding(x, dtype), encoding(x)
+    assert features.dtype == dtype
+    error, rounding = (features - exact).abs().max(), (exact.to(dtype) - exact).abs().max()
+    assert float(error) < 1.34 * float(rounding)
 
 
 def test_hash_features_are_those_of_the_definition() -> None:
