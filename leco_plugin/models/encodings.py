@@ -69,7 +69,7 @@ class FrequencyEncoding(nn.Module):
         self.register_buffer("start", torch.tensor([0.0, -1.0]).view(2, 1, 1), persistent=False)
 
     def forward(self, mapped: Tensor, dtype: torch.dtype | None = None) -> Tensor:
-        """[N, 3] in [-1, 1] to [N, 3 + 6 octaves], in the type of the positions or the one given."""
+        """[N, 3] in [-1, 1] to [N, 3 + 6 octaves]; `dtype` is the positions' unless given."""
         x = mapped.t().contiguous()
         dtype = dtype or x.dtype
         if x.requires_grad:  # as it is defined, which torch can differentiate
