@@ -30,6 +30,7 @@ def city(
     block_size: float = 40.0,
     width: int = 160,
     height: int = 120,
+    aerial_per_block: float = 8.5,
     aerial_only: bool = False,
     format: Literal["nerfstudio", "mega-nerf"] = "nerfstudio",
     json: Path | None = None,
@@ -45,6 +46,7 @@ def city(
         block_size: Metres from one street's middle to the next, 32 to 200.
         width: Width of the pictures in pixels.
         height: Height of the pictures in pixels.
+        aerial_per_block: Pictures from the air for each block that is built.
         aerial_only: No pictures from the street, as in the city of `leco demo`.
         format: Of the scene: nerfstudio's, or Mega-NeRF's, for the data parser mega-nerf.
         json: File for what was written, as JSON.
@@ -53,6 +55,7 @@ def city(
     from leco_plugin.scenes.city_folder import CaptureConfig, count_pictures, write_city
 
     config, capture = CityConfig(blocks, seed, block_size), CaptureConfig(width, height)
+    capture = replace(capture, aerial_per_block=aerial_per_block)
     if aerial_only:
         capture = replace(capture, street_per_block=0.0)
     folder = write_city(config, out, capture, layout=format)
