@@ -37,8 +37,8 @@ from leco_plugin.scenes.survey import points_in
 
 DEVICE = "the device's"
 FEWEST = 40
-"""Photographs of a city from the air, however small it is: from eight of them of a single block, one
-for testing, PSNR scattered by 2 dB between seeds."""
+"""Photographs of a city from the air, however small it is: from the eight of a single block, one of
+them for testing, PSNR scattered by 2 dB between seeds."""
 TABLE, EXPERTS = "field.encoding.log2_table", "scene_experts"
 
 
