@@ -59,7 +59,7 @@ def test_settings_arrive_where_they_belong() -> None:
     homogeneous = config("homogeneous", "learned").pipeline.model.occupancy.learning
     experts = homogeneous.sizes.field.experts
     assert experts.empty_layers == experts.layers
-    assert homogeneous.gate_loss.empty_ratio == 1 / (1 + experts.scene_experts)  # balanced
+    assert homogeneous.gate_loss.density == 0.0
 
 
 def test_what_a_case_does_not_touch_is_run_once() -> None:
