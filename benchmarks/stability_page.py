@@ -61,13 +61,16 @@ def sentence(text: str) -> str:
 def of_kills(results: dict[str, Any]) -> str:
     """How often runs were killed, what that lost, and how they ended beside the others."""
     kills = [kill for run in results["killed"] for kill in run["kills"]]
-    lost = sum(kill["after"] < kill["before"] for kill in kills)
-    ends = [run for run in results["killed"] if run["kills"] and "psnr" in run]
+    early = sum(kill["before"] < 0 for kill in kills)
+    lost = sum(kill["after"] < kill["before"] or kill.get("damaged", 0) > 0 for kill in kills)
+    ends = [run for run in results["killed"] if run["kills"] and run.keys() & {"psnr", "failed"}]
     whole = results["undisturbed"]
-    finished = sum(run["step"] == results["steps"] - 1 and run["frozen"] for run in ends)
+    last = results["steps"] - 1
+    finished = sum(run["step"] == last and run.get("frozen", False) for run in ends)
     return (
         f"`python benchmarks/kills.py`: {len(kills)} kills with SIGKILL at random moments of runs "
-        f"of {results['steps']} steps; {lost or 'none'} of them lost something that was saved. "
+        f"of {results['steps']} steps, {early} of them before anything was saved; {lost or 'none'} "
+        f"of them lost something that was saved, or left a damaged checkpoint. "
         f"{finished} of {len(ends)} runs that were killed went on to their last step with a frozen "
         f"gate and an occupancy that loads, at {spread(ends)} on test pixels; {len(whole)} runs "
         f"that nobody killed end at {spread(whole)}. {results['machine']['cpu']}."
@@ -76,5 +79,5 @@ def of_kills(results: dict[str, Any]) -> str:
 
 def spread(runs: list[dict[str, Any]]) -> str:
     """From the least PSNR to the most."""
-    values = [run["psnr"] for run in runs]
+    values = [run["psnr"] for run in runs if "psnr" in run]
     return f"{min(values):.2f} to {max(values):.2f} dB" if values else "no PSNR yet"

@@ -36,7 +36,7 @@ def claim(folder: Path, checkpoints: Path, load_from: Path | None) -> str | None
     place = folder.resolve()
     if place not in _held:
         folder.mkdir(parents=True, exist_ok=True)
-        held = _lock(folder)
+        held = lock(folder)
         if held is None:
             return f"another run is going on in {folder}"
         _held[place] = held
@@ -54,8 +54,9 @@ def release(folder: Path) -> None:
         os.close(held)
 
 
-def _lock(folder: Path) -> int | None:
-    """An open file that is locked; None where another process has locked it."""
+def lock(folder: Path) -> int | None:
+    """An open file in a folder that is locked until it is closed, which the system does for a
+    process that ends; None where another process has locked it."""
     held = os.open(folder / LOCK, os.O_CREAT | os.O_RDWR, 0o644)
     if fcntl is None:
         return held

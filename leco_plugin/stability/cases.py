@@ -229,8 +229,8 @@ CASES = {
             _paper(
                 "homogeneous",
                 "equal experts (must fail)",
-                "an occupancy from a mixture of equal experts, balanced and not calibrated, skips "
-                "surfaces: a suite that passes it is blind",
+                "an occupancy from equal experts, of which no density keeps one empty, not "
+                "calibrated, skips surfaces: a suite that passes it is blind",
                 gate_loss__density=0.0,
                 gate_loss__empty_ratio=0.2,
                 sizes__field__experts__empty_expert="mlp",

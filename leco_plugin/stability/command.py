@@ -4,13 +4,16 @@ from __future__ import annotations
 
 import functools
 import math
+import os
 import shlex
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 from nerfstudio.utils.rich_utils import CONSOLE
 
+from leco_plugin.compat.run_folder import lock
 from leco_plugin.progress_bar import bar
 from leco_plugin.scenes.input_error import InputError
 from leco_plugin.stability.cases import cases_named
@@ -52,15 +55,36 @@ def make_table(
     say = functools.partial(CONSOLE.print, markup=False, highlight=False)
     named = {"cases": cases, "samplers": samplers, "seeds": seeds, "seeds-beside": seeds_beside}
     command, sizes = command_line(quick, named), QUICK if quick else FULL
-    suite = Suite(out, chosen, compared, seeds, sizes, command, seeds_beside)
-    if earlier is not None:
-        say(f"{suite.take_over(earlier)} runs of earlier results are taken over")
-    say(suite.estimate())
-    with bar(f"{len(chosen)} cases") as show:
-        suite.make(say, show, runner_for, math.inf if minutes is None else 60.0 * minutes)
-    if left := len(suite.missing()):
-        say(f"{left} runs are left or have failed; the same command goes on with them")
-    return suite.draw()
+    with alone_in(out):
+        suite = Suite(out, chosen, compared, seeds, sizes, command, seeds_beside)
+        if earlier is not None:
+            say(f"{suite.take_over(earlier)} runs of earlier results are taken over")
+        say(suite.estimate())
+        with bar(f"{len(chosen)} cases") as show:
+            suite.make(say, show, runner_for, math.inf if minutes is None else 60.0 * minutes)
+        if left := len(suite.missing()):
+            say(f"{left} runs are left or have failed; the same command goes on with them")
+        return suite.draw()
+
+
+@contextmanager
+def alone_in(out: Path) -> Iterator[None]:
+    """Keeps a table's folder from every other process that would make the same runs in it.
+
+    Raises:
+        InputError: one is at work there.
+    """
+    out.mkdir(parents=True, exist_ok=True)
+    held = lock(out)
+    if held is None:
+        raise InputError(
+            f"another process makes the table in {out}, with all cores; wait for it, or name "
+            "another folder with --out"
+        )
+    try:
+        yield
+    finally:
+        os.close(held)
 
 
 def command_line(quick: bool, named: dict[str, Sequence[object]]) -> str:

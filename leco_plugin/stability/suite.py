@@ -31,6 +31,8 @@ WORKER = (sys.executable, "-W", "ignore", "-m", "leco_plugin.stability.worker")
 RESULTS = "stability.json"
 FAILED = ".failed"
 """Ending of the file, beside its log, with the reason why a run has no result."""
+PER_PORTION = {"cores", "threads"}
+"""Facts of the machine that say how many runs are made at once, and change no run."""
 Runner = Callable[[Job, Callable[[float], None]], dict[str, Any]]
 Say = Callable[[str], None]
 
@@ -79,7 +81,8 @@ class Suite:
 
     def _folder(self, scene: str) -> ChartFolder:
         described = describe_scene(self.data[scene])
-        settings = settings_of(described, self.protocol, None, self.machine)
+        machine = {key: fact for key, fact in self.machine.items() if key not in PER_PORTION}
+        settings = settings_of(described, self.protocol, None, machine)
         return ChartFolder(
             _made(self.out / "runs") / scene, settings | {"sizes": asdict(self.sizes)}
         )

@@ -50,7 +50,7 @@ class Cell:
     psnr: float | None = None
     """Median over seeds, dB."""
     gap: float | None = None
-    """Median PSNR less the reference's, dB; None for a reference."""
+    """Median PSNR less the reference's over the seeds that both have, dB; None for a reference."""
     worst: float | None = None
     """Worst seed less the median one, dB."""
     worst_seed: int | None = None
@@ -81,7 +81,8 @@ def judge(
 
     Args:
         runs: its finished runs.
-        reference: those of its dense reference; None where it is one itself.
+        reference: those of its dense reference, of which the same seeds count; None where it is
+            one itself.
         failures: reasons of its runs that have ended without a result.
         missing: its runs that have not been made.
     """
@@ -90,14 +91,17 @@ def judge(
         return Cell("fail", f"{len(failures)} of {many} runs ended: {failures[0]}", many, missing)
     if not runs:
         return Cell("no reference", "not run", 0, missing)
+    reference = _of_the_same_seeds(reference, runs)
     blind = _unmeasured(runs, reference or ())
     if blind:
         return Cell("fail", blind, len(runs), missing)
     cell = _figures(runs, reference, missing)
     held_to = runs if reference is None else reference
     if not _trained(held_to):
-        reason = "does not train" if reference is None else "the reference does not train"
-        verdict: Verdict = "fail" if reference is None else "no reference"
+        reason = "the reference does not train" if held_to else "the reference has no result"
+        verdict: Verdict = "no reference"
+        if reference is None:
+            reason, verdict = "does not train", "fail"
         return Cell(**{**asdict(cell), "verdict": verdict, "reason": reason})
     lost = None
     if reference is not None and cell.lost_mass is not None:
@@ -107,6 +111,17 @@ def judge(
         if reason:
             return Cell(**{**asdict(cell), "verdict": verdict, "reason": reason})
     return cell
+
+
+def _of_the_same_seeds(
+    some: Sequence[Mapping[str, Any]] | None, others: Sequence[Mapping[str, Any]]
+) -> list[Mapping[str, Any]] | None:
+    """Those of some runs whose seeds others have too: medians of different seeds would differ by
+    more than what is compared."""
+    if some is None:
+        return None
+    seeds = {run["seed"] for run in others}
+    return [run for run in some if run["seed"] in seeds]
 
 
 def _broken(cell: Cell, bars: Bars, lost: float | None, most_lost: float) -> str:
@@ -145,9 +160,10 @@ def _figures(
     middle = statistics.median(psnrs)
     at = min(range(len(runs)), key=psnrs.__getitem__)
     gap = detail_gap = None
-    if reference and math.isfinite(_psnr(reference)):
-        gap = middle - _psnr(reference)
-        ours, theirs = _median(runs, "detail_psnr"), _median(reference, "detail_psnr")
+    paired = _of_the_same_seeds(runs, reference or ())
+    if reference and paired and math.isfinite(_psnr(reference)):
+        gap = _psnr(paired) - _psnr(reference)
+        ours, theirs = _median(paired, "detail_psnr"), _median(reference, "detail_psnr")
         if ours is not None and theirs is not None:
             detail_gap = ours - theirs
     return Cell(

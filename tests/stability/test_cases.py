@@ -57,7 +57,9 @@ def test_settings_arrive_where_they_belong() -> None:
         options = config(case, sampler).pipeline.model.occupancy.options
         assert options == {"resolution": resolution, "levels": levels}
     homogeneous = config("homogeneous", "learned").pipeline.model.occupancy.learning
-    assert homogeneous.sizes.field.experts.empty_layers == homogeneous.sizes.field.experts.layers
+    experts = homogeneous.sizes.field.experts
+    assert experts.empty_layers == experts.layers
+    assert homogeneous.gate_loss.density == 0.0
 
 
 def test_what_a_case_does_not_touch_is_run_once() -> None:

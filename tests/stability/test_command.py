@@ -63,6 +63,17 @@ def test_a_portion_is_made_and_the_same_command_goes_on(
     assert stability(tmp_path / "out", "--minutes", "0") == 2
 
 
+def test_a_second_process_in_the_same_folder_is_refused_in_one_line(
+    tmp_path: Path, runs: Runs, capsys: pytest.CaptureFixture[str]
+) -> None:
+    words = ("--cases", "yard", "--samplers", "grid-128")
+    with command.alone_in(tmp_path / "out"):
+        assert stability(tmp_path / "out", *words) == 2
+    error = capsys.readouterr().err
+    assert "another process makes the table" in error and error.count("\n") == 1
+    assert not runs.made and stability(tmp_path / "out", *words) == 0
+
+
 @pytest.mark.parametrize(
     ("words", "said"),
     [

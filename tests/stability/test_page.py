@@ -63,15 +63,22 @@ def test_the_page_counts_kills_and_what_they_lost(results: Path) -> None:
         found = [{"seconds": 1.0, "before": before, "after": after} for before, after in kills]
         return {"step": 59, "psnr": psnr, "frozen": True, "kills": found}
 
-    between = {"step": 59, "kills": [{"seconds": 1.0, "before": 59, "after": 59}]}
+    def kill(before: int, **more: int) -> dict[str, object]:
+        return {"seconds": 1.0, "before": before, "after": before, **more}
+
+    between = {"step": 59, "kills": [kill(59)]}
+    damaged = {"step": 19, "kills": [kill(19, damaged=1)]}
+    stuck = {"step": 7, "kills": [kill(-1), kill(7)], "failed": "KeyError: 'gate'"}
+    unfinished = [between, damaged, stuck]
     stored = {
         "steps": 60,
         "undisturbed": [ended(13.0), ended(13.5)],
-        "killed": [ended(13.2, (3, 3), (7, 11)), ended(13.1, (7, 3)), ended(9.0), between],
+        "killed": [ended(13.2, (3, 3), (7, 11)), ended(13.1, (7, 3)), ended(9.0), *unfinished],
         "machine": {"cpu": "Some CPU"},
     }
     (results / "kills.json").write_text(json.dumps(stored))
     shown = " ".join(stability_page.page(PAGE.read_text(), results).split())
-    assert "4 kills with SIGKILL at random moments of runs of 60 steps; 1 of them lost" in shown
-    assert "2 of 2 runs that were killed went on" in shown and "at 13.10 to 13.20 dB" in shown
+    assert "7 kills with SIGKILL at random moments of runs of 60 steps, 1 of them before" in shown
+    assert "; 2 of them lost something" in shown
+    assert "2 of 3 runs that were killed went on" in shown and "at 13.10 to 13.20 dB" in shown
     assert "end at 13.00 to 13.50 dB. Some CPU." in shown

@@ -118,6 +118,15 @@ def test_a_folder_of_other_sizes_is_refused(tmp_path: Path) -> None:
         suite_module.Suite(tmp_path, cases_named(("yard",)), samplers_named(()), (0,), longer)
 
 
+def test_a_folder_is_gone_on_with_on_fewer_cores(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    make(suite(tmp_path, ("yard",), ("grid-128",)), Runs())
+    fewer = suite_module.describe_machine() | {"cores": 1, "threads": 7}
+    monkeypatch.setattr(suite_module, "describe_machine", lambda: fewer)
+    assert not suite(tmp_path, ("yard",), ("grid-128",)).missing()
+
+
 def test_the_time_it_takes_is_said_before_and_from_its_own_runs_later(tmp_path: Path) -> None:
     made = suite(tmp_path, ("yard",), SAMPLERS)
     assert made.estimate().startswith("3 of 3 runs are to be made, 1 at a time: about ")

@@ -54,6 +54,14 @@ def test_the_headline_counts_what_was_passed_where_there_is_a_reference() -> Non
     assert headline(results()) == "nothing has been run yet"
 
 
+def test_a_case_in_which_nobody_is_held_to_anything_is_counted_apart() -> None:
+    both_ways = [("pass", 3), ("no reference", 3), ("no reference", 0)]
+    rows = [(word, False, {"learned": cell(word, seeds=n)}) for word, n in both_ways]
+    assert headline(results(*rows)) == (
+        "learned occupancy passes 1 of 1 cases; for 1 more it has no dense run that trains"
+    )
+
+
 @pytest.mark.parametrize(
     ("ours", "why"),
     [

@@ -110,9 +110,25 @@ def test_where_no_surface_is_met_none_is_asked_for() -> None:
 
 def test_a_reference_that_renders_no_number_has_not_trained() -> None:
     assert judge(runs(25.0), runs(25.0, None, 25.2)).verdict == "pass"
-    cell = judge(runs(25.0), runs(25.0, None, None))
+    cell = judge(runs(25.0, 25.0, 25.0), runs(25.0, None, None))
     assert (cell.verdict, cell.gap) == ("no reference", None)
     assert judge(runs(25.0, None), None).verdict == "fail"
+
+
+def test_only_the_same_seeds_are_compared() -> None:
+    dense = runs(25.0, 20.0, 20.0)
+    cell = judge([run(0, 24.5)], dense)
+    assert (cell.verdict, cell.gap) == ("degraded", -0.5)
+    cell = judge(runs(25.0, 24.7, 24.7), dense[:1])
+    assert (cell.verdict, cell.gap, cell.psnr) == ("pass", 0.0, 24.7)
+    assert judge([run(0, lost_mass=0.02)], [run(0), run(1, lost_mass=0.02)]).verdict == "degraded"
+
+
+def test_a_reference_without_a_result_of_these_seeds_is_said_to_be_missing() -> None:
+    for reference in ([], [run(1)]):
+        cell = judge([run(0)], reference)
+        assert (cell.verdict, cell.gap) == ("no reference", None)
+        assert cell.reason == "the reference has no result"
 
 
 def test_seeds_that_are_missing_are_counted() -> None:
