@@ -29,7 +29,8 @@ def sizes_sections() -> list[str]:
     if shrunk := scene_results("shrink"):
         note = (
             " In bold: a bar is missed, 32 kB, a declared loss of 1e-3, three times faster queries "
-            "(65536 positions, interleaved), or a declaration below what unseen rays have lost."
+            "(65536 positions, interleaved), or a declaration below what rays of test photographs "
+            "have lost, which decided nothing."
         )
         command = (
             "leco shrink RUN --data SCENE --out FILE --json benchmarks/results/shrink/SCENE.json"

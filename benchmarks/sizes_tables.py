@@ -6,6 +6,16 @@ import statistics
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+from sizes_figures import MAY_LOSE
+
+from leco_plugin.capacity.choice import (
+    USUAL_GRID,
+    choose,
+    grid_that_suffices,
+    kilobytes,
+    smallest_grid,
+)
+
 Report = Mapping[str, Any]
 
 SHRUNK_BYTES, SHRUNK_LOSS, SHRUNK_SPEEDUP = 32_000, 1e-3, 3.0
@@ -52,14 +62,16 @@ def sizes_table(report: Report) -> str:
         lines.append(
             f"| {scene} | {found['psnr']:.2f} dB, {found['parameters']:,} "
             f"| {found['best']}: {found['best_psnr']:.2f} dB, {found['best_parameters']:,} "
-            f"| {_with_error(found['behind'], found['error'])} dB | {_yes(found['reached'])} |"
+            f"| {_with_error(found['behind'], found['error'])} dB "
+            f"| {_told_apart(found['reached'], found['behind'] - MAY_LOSE, found['error'])} |"
         )
     if report["bars"]:
         lines += ["", "| figure | measured (standard error) | at most | reached |"]
         lines.append("|---|---|---|---|")
     for bar in report["bars"]:
         value = _with_error(bar["value"], bar["error"])
-        lines.append(f"| {bar['name']} | {value} | {bar['bar']:g} | {_yes(bar['reached'])} |")
+        reached = _told_apart(bar["reached"], bar["value"] - bar["bar"], bar["error"])
+        lines.append(f"| {bar['name']} | {value} | {bar['bar']:g} | {reached} |")
     return "\n".join(lines)
 
 
@@ -70,14 +82,15 @@ def shrink_table(reports: Mapping[str, Report]) -> str:
         reports: as `leco shrink --json` writes them, by the name of the scene.
     """
     lines = [
-        "| scene | values | file, kB | declared lost surface mass | lost on unseen rays "
+        "| scene | values | file, kB | declared lost surface mass | lost on test photographs "
         "| image price, dB | gates tried | queries faster by |",
         "|" + "---|" * 8,
     ]
     for scene, report in reports.items():
         before, after = report["from"], report["to"]
         declared = after["lost_surface_mass"]
-        lost = _unseen_loss(report)
+        checked = report.get("checked")
+        lost = None if checked is None else checked["lost_surface_mass"]
         size, speed = after["bytes"], report["query_speedup"]
         now = _flagged(f"{size / 1000:.1f}", size <= SHRUNK_BYTES)
         price = after.get("image_price_db")
@@ -94,12 +107,6 @@ def shrink_table(reports: Mapping[str, Report]) -> str:
     return "\n".join(lines)
 
 
-def _unseen_loss(report: Report) -> float | None:
-    """What the chosen gate has lost on rays that the search did not see; None where none was."""
-    chosen = [rung for rung in report["rungs"] if rung["verdict"] == "chosen"]
-    return float(chosen[-1]["verified"]["lost_surface_mass"]) if chosen else None
-
-
 def capacity_table(reports: Mapping[str, Report]) -> str:
     """A row a scene: what was chosen, and the fine grid beside the best gate of few bytes.
 
@@ -113,7 +120,7 @@ def capacity_table(reports: Mapping[str, Report]) -> str:
     ]
     for scene, report in reports.items():
         rows = report["representations"]
-        chosen = report["chosen"]
+        chosen = choose(rows)
         grid, gate = beside_fine_grid(rows)
         cells = (
             f"{report['scene']['train_images']}",
@@ -128,12 +135,16 @@ def capacity_table(reports: Mapping[str, Report]) -> str:
 
 
 def where_it_pays(reports: Mapping[str, Report]) -> str:
-    """For which scenes a grid suffices, and for which a gate is smaller."""
+    """For which scenes a grid suffices, and for which learned occupancy pays."""
     groups: dict[bool, list[str]] = {True: [], False: []}
     for scene, report in reports.items():
-        groups[report["chosen"]["family"] == "grid"].append(scene)
+        suffices = grid_that_suffices(report["representations"]) is not None
+        groups[suffices].append(scene)
     grid, gate = (", ".join(groups[suffices]) or "none" for suffices in (True, False))
-    return f"A grid suffices for: {grid}. A gate that keeps as little is smaller for: {gate}."
+    return (
+        f"A grid of {USUAL_GRID}^3 cells or fewer keeps as little as what is chosen, and suffices, "
+        f"for: {grid}. Learned occupancy pays for: {gate}."
+    )
 
 
 def beside_fine_grid(rows: Sequence[Report]) -> tuple[Report | None, Report | None]:
@@ -158,8 +169,6 @@ def _beside(grid: Report | None, gate: Report | None) -> tuple[str, str, str]:
 
 
 def _smallest_grid(rows: Sequence[Report], chosen: Report) -> str:
-    from leco_plugin.capacity.choice import kilobytes, smallest_grid
-
     grid = smallest_grid(rows, chosen)
     return "none" if grid is None else f"{grid['size']}^3, {kilobytes(grid)}"
 
@@ -170,6 +179,17 @@ def _with_error(value: float, error: float | None) -> str:
 
 def _yes(reached: bool) -> str:
     return "yes" if reached else "**no**"
+
+
+def _told_apart(reached: bool, beyond: float, error: float | None) -> str:
+    """Whether a bar is reached, and whether its error leaves that open.
+
+    Args:
+        beyond: how far a figure lies above its bar.
+        error: its standard error.
+    """
+    is_open = error is not None and abs(beyond) < error
+    return f"{_yes(reached)}{', within the error' if is_open else ''}"
 
 
 def _flagged(value: str, reached: bool) -> str:

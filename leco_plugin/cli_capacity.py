@@ -7,7 +7,12 @@ from typing import Annotated, Literal
 
 import tyro
 
-from leco_plugin.cli_reports import check_json, occupancy_of, write_json
+from leco_plugin.cli_reports import (
+    check_json,
+    check_picture,
+    occupancy_of,
+    write_json,
+)
 
 
 def export(
@@ -81,13 +86,14 @@ def shrink(
     from leco_plugin.shrink.search import Bounds
 
     check_json(json)
+    check_picture("--picture", picture)
     results = find_smaller(occupancy_of(file), data, out, Bounds(lost_surface_mass, image_price))
     print("\n".join(summary(results, out)))
+    write_json(json, results)
     if picture is not None:
         from leco_plugin.shrink.picture import draw
 
         print(f"drew {draw(results, picture)}")
-    write_json(json, results)
 
 
 def capacity(

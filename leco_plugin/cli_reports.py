@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 from typing import Any
 
@@ -29,8 +30,36 @@ def occupancy_of(path: Path) -> Path:
 
 def check_json(path: Path | None) -> None:
     """Before work that takes minutes, whether its report has a place."""
-    if path is not None and path.is_dir():
-        raise ValueError(f"--json {path} is a folder; give a file")
+    check_place("--json", path)
+
+
+def check_place(option: str, path: Path | None) -> None:
+    """Whether a file may be written there, its folders made.
+
+    Raises:
+        ValueError: it is a folder, or one of its folders is a file or cannot be written to.
+    """
+    if path is None:
+        return
+    if path.is_dir():
+        raise ValueError(f"{option} {path} is a folder; give a file")
+    nearest = next(folder for folder in path.absolute().parents if folder.exists())
+    if not nearest.is_dir():
+        raise ValueError(f"{option} {path}: {nearest} is a file, not a folder")
+    if not os.access(nearest, os.W_OK):
+        raise ValueError(f"{option} {path}: {nearest} cannot be written to")
+
+
+def check_picture(option: str, path: Path | None) -> None:
+    """As `check_place`, and whether a picture of this kind can be drawn."""
+    check_place(option, path)
+    if path is None:
+        return
+    from matplotlib.backend_bases import FigureCanvasBase
+
+    kinds = FigureCanvasBase.get_supported_filetypes()
+    if path.suffix[1:].lower() not in kinds:
+        raise ValueError(f"{option} {path} ends in none of {', '.join(sorted(kinds))}")
 
 
 def write_json(path: Path | None, value: Any) -> None:

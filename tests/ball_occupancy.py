@@ -55,6 +55,8 @@ def ball(kind: str = "frequency") -> Occupancy:
 
 
 SCENE_FRAME = torch.eye(3, 4).tolist()
+THEIR_MARCH = {"near": 0.05, "far": 2.0, "step_size": 0.02, "cone_angle": 0.0}
+"""How rays of the tiny scene are marched, in its coordinates."""
 
 
 def ball_of_the_tiny_scene(frame: list[list[float]] = SCENE_FRAME) -> Occupancy:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -9,6 +10,11 @@ from leco_plugin.capacity.measuring import VOLUMES
 
 TOLERANCE = 1.05
 """Kept volume that counts as no more than another's."""
+WORTH_TEN_TIMES = 2 / 3
+"""Of the kept volume: what ten times the bytes must leave at most, to be worth them. The largest
+nearly always keep a little less, and a scene would need whatever is the last to be tried."""
+USUAL_GRID = 128
+"""Cells along an axis of the grids that hosts have by default: what any of them can afford."""
 NAMES = {
     "frequency": "gate on frequencies",
     "hash": "gate on a hash grid",
@@ -19,10 +25,9 @@ NAMES = {
 
 
 def choose(rows: Sequence[Mapping[str, Any]]) -> Mapping[str, Any]:
-    """Of those that keep next to the least volume at the same loss, the one of fewest bytes."""
-    least = min(row["kept_volume"] for row in rows)
-    enough = [row for row in rows if row["kept_volume"] <= TOLERANCE * least]
-    return min(enough, key=lambda row: row["bytes"])
+    """The one beside which no other keeps so much less at the same loss that its bytes pay."""
+    power = -math.log10(WORTH_TEN_TIMES)
+    return min(rows, key=lambda row: (row["kept_volume"] * row["bytes"] ** power, row["bytes"]))
 
 
 def smallest_grid(
@@ -34,26 +39,36 @@ def smallest_grid(
     return min(enough, key=lambda row: row["bytes"], default=None)
 
 
+def grid_that_suffices(rows: Sequence[Mapping[str, Any]]) -> Mapping[str, Any] | None:
+    """A grid of a usual size that keeps no more than what was chosen; None where none does."""
+    grid = smallest_grid(rows, choose(rows))
+    return grid if grid is not None and int(grid["size"]) <= USUAL_GRID else None
+
+
 def verdict(rows: Sequence[Mapping[str, Any]]) -> str:
     """What the scene needs, in a sentence or two."""
     chosen = choose(rows)
     kept = f"keeps {chosen['kept_volume']:.1%} of the volume"
     if chosen["family"] == "grid":
-        return (
-            f"A grid suffices: {chosen['size']}^3 cells, {kilobytes(chosen)}, {kept}; no gate that "
-            "keeps as little is smaller."
-        )
-    said = f"A {NAMES[chosen['family']]} of {kilobytes(chosen)} {kept}."
+        return f"A grid suffices: {_of_cells(chosen)}, {kept}; no gate keeps as little for less."
+    gate = f"a {NAMES[chosen['family']]} {kept}"
+    said = f"This scene needs {kilobytes(chosen)}: {gate}."
     if not any(row["family"] == "grid" for row in rows):
         return said
     grid = smallest_grid(rows, chosen)
     if grid is None:
         finest = max((int(row["size"]) for row in rows if row["family"] == "grid"), default=0)
         return f"{said} No grid up to {finest}^3 keeps as little."
+    if grid_that_suffices(rows) is not None:
+        return f"A grid suffices: {_of_cells(grid)}. With {kilobytes(chosen)} {gate}, as little."
     return (
         f"{said} A grid that keeps as little takes {grid['size']}^3 cells, "
         f"{grid['bytes'] / chosen['bytes']:.0f} times as many bytes."
     )
+
+
+def _of_cells(grid: Mapping[str, Any]) -> str:
+    return f"{grid['size']}^3 cells, {kilobytes(grid)}"
 
 
 def common_volume(rows: Sequence[Mapping[str, Any]]) -> int:

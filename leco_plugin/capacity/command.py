@@ -21,6 +21,8 @@ from leco_plugin.progress_bar import bar
 from leco_plugin.scenes.input_error import InputError
 
 SETTINGS, POINTS = "settings.json", "points"
+MEASURED = {"family", "size", "kept_volume", "lost_at_volumes"}
+"""What a row must have beside its bytes."""
 
 
 def capacity(
@@ -63,7 +65,7 @@ def capacity(
     fitting = [n for n in resolutions if fits_memory(n**3)]
     for n in sorted(set(resolutions) - set(fitting)):
         CONSOLE.print(f"a grid of {n}^3 cells does not fit the free memory; it is left out")
-    of_cells = grids(tuple(fitting))
+    of_cells = grids(tuple(dict.fromkeys(fitting)))
     ground = prepare(data, out, learn_steps)
     rows: list[dict[str, Any]] = []
     with bar("Teaching representations") as show:
@@ -107,7 +109,7 @@ def _settle(out: Path, settings: dict[str, Any]) -> None:
     """
     file = out / SETTINGS
     if file.exists():
-        found = json.loads(file.read_text())
+        found = _read(file)
         names = [name for name, value in settings.items() if found.get(name) != value]
         if names:
             raise InputError(
@@ -122,8 +124,27 @@ def _settle(out: Path, settings: dict[str, Any]) -> None:
 
 def _stored(out: Path, candidate: Candidate) -> dict[str, Any] | None:
     file = out / POINTS / f"{candidate.key}.json"
-    row: dict[str, Any] | None = json.loads(file.read_text()) if file.exists() else None
+    if not file.exists():
+        return None
+    row = _read(file)
+    if row.get("bytes") != candidate.bytes or not row.keys() >= MEASURED:
+        raise InputError(f"{file} is no measured representation; delete it to measure it again")
     return row
+
+
+def _read(file: Path) -> dict[str, Any]:
+    """A JSON object that an earlier call has left.
+
+    Raises:
+        InputError: it is damaged.
+    """
+    try:
+        found = json.loads(file.read_text())
+    except ValueError:  # no JSON, or no text
+        found = None
+    if not isinstance(found, dict):
+        raise InputError(f"{file} is damaged; delete it, or name a new folder with --out")
+    return found
 
 
 def _store(out: Path, candidate: Candidate, row: dict[str, Any]) -> dict[str, Any]:

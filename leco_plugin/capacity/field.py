@@ -5,6 +5,7 @@ from __future__ import annotations
 import copy
 from dataclasses import replace
 from pathlib import Path
+from pickle import UnpicklingError
 from types import SimpleNamespace
 from typing import Any, NamedTuple
 
@@ -44,7 +45,7 @@ def prepare(data: Path, folder: Path, learn_steps: int) -> Ground:
     """Learns the field, or loads the one that an earlier call left, and renders rays with it.
 
     Raises:
-        InputError: `data` is no folder.
+        InputError: `data` is no folder, or what was left is not of it.
     """
     if not data.is_dir():
         raise InputError(f"--data {data}: there is no such folder")
@@ -66,7 +67,7 @@ def prepare(data: Path, folder: Path, learn_steps: int) -> Ground:
             metadata=dataset.metadata,
             device=device,
         ).to(device)
-        model.load_state_dict(torch.load(stored, map_location=device, weights_only=True))
+        _load(model, stored, len(dataset))
     else:
         pipeline = SimpleNamespace(datamanager=manager, device=torch.device(device))
         rays = config.datamanager.train_num_rays_per_batch
@@ -75,9 +76,31 @@ def prepare(data: Path, folder: Path, learn_steps: int) -> Ground:
     return _ground(Source(manager, model.eval()))
 
 
+def _load(model: LecoModel, stored: Path, images: int) -> None:
+    """Restores the field that an earlier call left.
+
+    Args:
+        images: training photographs of the scene.
+    Raises:
+        InputError: the file is damaged, or of another number of photographs.
+    """
+    remedy = f"name a new folder with --out, or delete {stored} and the points beside it"
+    try:
+        model.load_state_dict(torch.load(stored, map_location=model.device, weights_only=True))
+    except (OSError, RuntimeError, ValueError, KeyError, EOFError, UnpicklingError) as error:
+        line = " ".join(str(error).split())[:200]
+        raise InputError(f"{stored} cannot be used ({line}): {remedy}") from None
+    if model.num_train_data != images:
+        raise InputError(
+            f"{stored} was learned on {model.num_train_data} photographs, and this scene has "
+            f"{images}: {remedy}"
+        )
+
+
 def _ground(source: Source) -> Ground:
     model = source.model
     assert model is not None
+    torch.manual_seed(1)  # so that whoever goes on is taught by the same rays
     occupancy = model.occupancy().eval()
     taught, _ = gather(source, None, trained_on(source, occupancy, TAUGHT_RAYS))
     measured, _ = gather(source, None, held_out(source, occupancy, RAYS, parts=1)[0])

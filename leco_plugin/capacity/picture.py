@@ -74,6 +74,17 @@ def _draw_panel(panel: Any, rows: Any, values: list[float], theme: Theme) -> Non
                 linewidth=1.8,
                 label=NAMES[family],
             )
+        if points and family == "grid":
+            sizes = [int(row["size"]) for row in rows if row["family"] == family]
+            for place, size in ((points[0], min(sizes)), (points[-1], max(sizes))):
+                panel.annotate(
+                    f"{size}$^3$",
+                    place,
+                    xytext=(0, 10),
+                    textcoords="offset points",
+                    ha="center",
+                    fontsize=10,
+                )
     for row, value in zip(rows, values):
         if row is chosen:
             place = (row["bytes"] / 1000, value)

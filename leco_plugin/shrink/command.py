@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import statistics
 import time
 from pathlib import Path
@@ -10,15 +11,23 @@ from typing import Any
 import torch
 from nerfstudio.utils.rich_utils import CONSOLE
 
+from leco_plugin.cli_reports import check_place
 from leco_plugin.evaluation.inspection import whole_box
 from leco_plugin.evaluation.machine import describe_machine
 from leco_plugin.models.freezing import held_out_sampler
 from leco_plugin.occupancy import Occupancy
 from leco_plugin.progress_bar import bar
 from leco_plugin.shrink.evidence import Evidence, gather
-from leco_plugin.shrink.references import names_of, references
+from leco_plugin.shrink.references import names_of, references, shares_lost
 from leco_plugin.shrink.search import Bounds, Found, Ground, Rung, check_room, search
-from leco_plugin.shrink.sources import Source, find_source, held_out, trained_on
+from leco_plugin.shrink.sources import (
+    Source,
+    check_scene,
+    find_source,
+    held_out,
+    of_test_photographs,
+    trained_on,
+)
 
 RAYS = 4096
 TAUGHT_RAYS = 6144
@@ -44,22 +53,26 @@ def shrink(file: Path, data: Path, out: Path, bounds: Bounds, seed: int = 0) -> 
     Raises:
         ValueError, OSError: a file, a folder or a bound is wrong; nothing was written.
     """
-    if out.is_dir():
-        raise ValueError(f"--out {out} is a folder; give a file")
+    check_place("--out", out)
+    if out.exists() and out.samefile(file):
+        raise ValueError(f"--out {out} is the occupancy itself; name another file")
     original = Occupancy.load(file)
     check_room(original, bounds)
-    missing = [name for name in ("near", "far", "step_size") if name not in original.report]
-    if missing:
-        raise ValueError(f"{file} does not say how its rays are marched: no {missing[0]}")
+    check_march(original, file)
     torch.manual_seed(seed)
     source = find_source(file, data)
-    original = original.to(source.model.device) if source.model is not None else original
+    check_scene(source, original, data)
+    original = original.to(source.manager.device)
     ground = _ground(source, original)
     with bar("Teaching smaller gates") as show:
         found = search(ground, bounds, on_rung=_say, on_progress=show)
+    before = {"params": original.num_params, "bytes": file.stat().st_size}
+    checked = None
     smaller = found.occupancy
     if smaller is None:
         smaller = _rounded_as_it_is(original)
+    else:
+        checked = check(source, original, smaller)
     held_out = held_out_sampler(source.manager) is not None
     smaller.report = report_of(original, ground, found, held_out)
     out.parent.mkdir(parents=True, exist_ok=True)
@@ -69,14 +82,43 @@ def shrink(file: Path, data: Path, out: Path, bounds: Bounds, seed: int = 0) -> 
     return {
         "format": 1,
         "machine": describe_machine(),
-        "from": {"params": original.num_params, "bytes": file.stat().st_size},
+        "from": before,
         "to": {"params": smaller.num_params, "bytes": out.stat().st_size, **reported},
         "bounds": {**vars(bounds)},
         "query_speedup": speedup,
         "query_milliseconds": times,
         "queried_positions": TIMED_POSITIONS,
+        "checked": checked,
         "rungs": [rung.to_dict() for rung in found.rungs],
     }
+
+
+def check_march(original: Occupancy, file: Path) -> None:
+    """Whether an occupancy says how its rays are marched.
+
+    Raises:
+        ValueError: it does not, or not in numbers.
+    """
+    for name in ("near", "far", "step_size"):
+        value = original.report.get(name)
+        if not (isinstance(value, int | float) and 0.0 <= value < math.inf):
+            raise ValueError(
+                f"{file} does not say how its rays are marched: its {name} is {value}, no distance"
+            )
+
+
+def check(source: Source, original: Occupancy, smaller: Occupancy) -> dict[str, Any] | None:
+    """What the smaller gate loses on rays of test photographs, which decided nothing here.
+
+    Returns:
+        `rays`, the worst `lost_surface_mass` of any reference, and of each (`against`); None
+        without such photographs.
+    """
+    seen = of_test_photographs(source, original, RAYS)
+    if seen is None:
+        return None
+    shares = shares_lost(source, original, smaller, seen)
+    return {"rays": len(seen.truth), "lost_surface_mass": max(shares.values()), "against": shares}
 
 
 def _ground(source: Source, original: Occupancy) -> Ground:
@@ -193,9 +235,9 @@ def line_of(rung: Rung) -> str:
 
 def summary(results: dict[str, Any], out: Path) -> list[str]:
     """The outcome in a few lines, for the terminal."""
-    before, after = results["from"], results["to"]
+    before, after, checked = results["from"], results["to"], results["checked"]
     lines = []
-    if "shrunk_from_params" not in after:
+    if not any(rung["verdict"] == "chosen" for rung in results["rungs"]):
         lines.append("no smaller gate holds these bounds: this is the same gate")
     lines.append(
         f"{out}: {before['bytes'] / 1000:.1f} kB before, {after['bytes'] / 1000:.1f} kB now; asked "
@@ -207,4 +249,8 @@ def summary(results: dict[str, Any], out: Path) -> list[str]:
         lines.append(f"declares {lost:.2e} of the surface mass{cost}, the original's included")
     if "loss_measured_against" in after:
         lines.append(f"measured against {after['loss_measured_against']}")
+    if checked is not None:
+        found = checked["lost_surface_mass"]
+        more = ", more than it declares" if found > (lost or 0.0) else ""
+        lines.append(f"{checked['rays']} rays of test photographs lose {found:.2e}{more}")
     return lines

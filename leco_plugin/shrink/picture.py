@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from leco_plugin.chart.theme import LIGHT, Theme, plain, themed
+from leco_plugin.shrink.search import MARGIN
 
 LEAST = 1e-6
 """Lost surface mass that is drawn for none at all."""
@@ -42,26 +43,32 @@ def draw(results: Mapping[str, Any], path: Path, theme: Theme = LIGHT) -> Path:
                 markersize=18 if chosen else 8,
                 color=theme.colours[2] if chosen else theme.colours[1],
             )
+            plain_to_see = rung["verdict"] == "loses too much"
             axes.annotate(
-                f"{rung['name']}: {rung['verdict']}",
+                rung["name"] if plain_to_see else f"{rung['name']}: {rung['verdict']}",
                 (size, lost),
-                xytext=(10, 6),
+                xytext=(7, 7),
                 textcoords="offset points",
+                rotation=60,  # so that those of neighbours stand beside one another
+                rotation_mode="anchor",
                 fontsize=9.5,
             )
         allowed = results["bounds"]["lost_surface_mass"]
-        axes.axhline(allowed, color=theme.ink, linestyle="--", linewidth=1)
-        axes.annotate(
-            "allowed",
-            (1.0, allowed),
-            xycoords=("axes fraction", "data"),
-            xytext=(-4, 4),
-            textcoords="offset points",
-            ha="right",
-        )
+        for share, said in ((1.0, "may be declared"), (MARGIN, "may be lost in the search")):
+            axes.axhline(share * allowed, color=theme.ink, linestyle="--", linewidth=1)
+            axes.annotate(
+                said,
+                (1.0, share * allowed),
+                xycoords=("axes fraction", "data"),
+                xytext=(-4, 4),
+                textcoords="offset points",
+                ha="right",
+                fontsize=9.5,
+            )
+        axes.set_xlim(0.7 * min(sizes, default=1.0), 4.0 * max(sizes, default=1.0))
         axes.set(xscale="log", yscale="log", xlabel="kB of weights", ylabel="lost surface mass")
-        axes.set_xlim(0.7 * min(sizes), 3.5 * max(sizes))
-        axes.margins(y=0.12)
+        heights = [*losses, allowed]
+        axes.set_ylim(min(heights) / 3.0, 30.0 * max(heights))
         axes.xaxis.set_major_formatter(StrMethodFormatter("{x:g}"))
         axes.xaxis.set_minor_formatter(NullFormatter())
         plain(axes, theme)
@@ -74,6 +81,8 @@ def draw(results: Mapping[str, Any], path: Path, theme: Theme = LIGHT) -> Path:
 def headline(results: Mapping[str, Any]) -> str:
     """What came out, in a line."""
     before, after = results["from"], results["to"]
+    if not any(rung["verdict"] == "chosen" for rung in results["rungs"]):
+        return f"{before['bytes'] / 1000:.1f} kB, and nothing smaller holds the bounds"
     return (
         f"{before['bytes'] / 1000:.0f} kB to {after['bytes'] / 1000:.1f} kB, "
         f"{results['query_speedup']:.1f} times faster"

@@ -14,7 +14,7 @@ from typing import NamedTuple
 
 from leco_plugin.models.leco import LecoModel
 from leco_plugin.occupancy import Occupancy
-from leco_plugin.shrink.evidence import Evidence, Rendered, gather, join
+from leco_plugin.shrink.evidence import Evidence, Rendered, gather, join, loss, query_in_parts
 from leco_plugin.shrink.sources import Seen, Source, from_between_cameras
 
 NOW = "the run's field as it is now, beyond what the original declares"
@@ -70,6 +70,24 @@ def references(
         before = source._replace(model=source.frozen)
         parts = [_rendered(before, None, seen, seed) for seed, seen in enumerate(sides)]
         found.append(Reference(AT_FREEZING, source.frozen, 0.0, 0.0, 0.0, *parts))
+    return found
+
+
+def shares_lost(
+    source: Source, original: Occupancy, smaller: Occupancy, seen: Seen
+) -> dict[str, float]:
+    """What a smaller gate loses on some rays: the share of the surface mass, by reference."""
+
+    def share(part: Source, guiding: Occupancy | None) -> float:
+        evidence, _ = gather(part, guiding, seen)
+        skipped = query_in_parts(smaller, evidence.positions) < smaller.threshold
+        return loss(evidence, skipped).share
+
+    name = NOW if source.model is not None else BY_DECISIONS
+    before = max(declared(original, "lost_surface_mass"), 0.0)
+    found = {name: before + share(source, original)}
+    if source.frozen is not None:
+        found[AT_FREEZING] = share(source._replace(model=source.frozen), None)
     return found
 
 

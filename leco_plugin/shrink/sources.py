@@ -16,16 +16,20 @@ from torch import Tensor
 
 from leco_plugin.compat.evaluated_runs import whole_of
 from leco_plugin.compat.whole_checkpoints import step_of
+from leco_plugin.evaluation.inspection import cameras_of
 from leco_plugin.models.field_at_freezing import field_at_freezing
 from leco_plugin.models.freezing import held_out_sampler
 from leco_plugin.models.leco import LecoModel
 from leco_plugin.models.rendering import Rays
 from leco_plugin.models.scene_rays import cut_to_bounds
 from leco_plugin.occupancy import Occupancy
-from leco_plugin.scenes.frames import between, frame_of
+from leco_plugin.scenes.frames import between, frame_of, moved, turned
+from leco_plugin.scenes.held_out_pixels import some_images
 from leco_plugin.scenes.input_error import InputError
 
 CONFIG, CHECKPOINTS = "config.yml", "nerfstudio_models"
+SAME_PLACE = 1e-3
+"""Of the half extent: two cameras that are no further apart are one."""
 
 
 class Source(NamedTuple):
@@ -71,9 +75,10 @@ def _of_run(folder: Path, data: Path) -> Source | None:
     # as ns-eval reads it
     try:
         config = yaml.load((folder / CONFIG).read_text(), Loader=yaml.Loader)
-    except (yaml.YAMLError, ImportError, AttributeError) as error:
+        built = config.pipeline.model._target  # of a guided host it is a function
+    except (yaml.YAMLError, ImportError, AttributeError, TypeError, ValueError) as error:
         raise InputError(f"{folder / CONFIG} cannot be read: {_line(error)}") from None
-    if not issubclass(config.pipeline.model._target, LecoModel):
+    if not (isinstance(built, type) and issubclass(built, LecoModel)):
         return None
     path = whole_of(folder / CHECKPOINTS)
     config.load_dir, config.load_step = path.parent, step_of(path)
@@ -87,6 +92,33 @@ def _of_run(folder: Path, data: Path) -> Source | None:
         ) from None
     model = pipeline.model.eval()
     return Source(pipeline.datamanager, model, field_at_freezing(model, folder))
+
+
+def check_scene(source: Source, occupancy: Occupancy, data: Path) -> None:
+    """Whether the photographs are those that the occupancy was learned on, by where they are from.
+
+    Raises:
+        InputError: fewer than half of the cameras that its report names are among theirs.
+    """
+    known = cameras_of(occupancy)
+    if len(known) == 0:
+        return
+    here = source.manager.train_dataset.cameras.camera_to_worlds[:, :3, 3].cpu().float()
+    if source.model is None and (frame := _frame_to(source, occupancy)) is not None:
+        here = moved(here, frame)
+    near = SAME_PLACE * float(occupancy.space.half_extent)
+    found = torch.cdist(known, here).amin(dim=1) <= near
+    if float(found.float().mean()) < 0.5:
+        raise InputError(
+            f"--data {data}: {int(found.sum())} of the {len(known)} cameras that the occupancy "
+            "names are among its photographs; give the scene that it was learned on"
+        )
+
+
+def _frame_to(source: Source, occupancy: Occupancy) -> Tensor | None:
+    """Takes positions of these photographs to those of the occupancy; None where it is unknown."""
+    learned_in, here = occupancy.report.get("frame"), frame_of(source.manager)
+    return None if learned_in is None or here is None else between(here, learned_in)
 
 
 def _line(error: BaseException) -> str:
@@ -124,8 +156,10 @@ def held_out(source: Source, occupancy: Occupancy, count: int, parts: int = 2) -
         0, groups, torch.arange(len(groups)), "amin"
     )
     each = min(count, len(first) // parts)
+    if each == 0:
+        raise InputError("the photographs have no pixels that nothing was trained on")
     order = torch.randperm(len(first), generator=torch.Generator().manual_seed(2))
-    chosen = first[order[: each * parts]].split(max(each, 1))
+    chosen = first[order[: each * parts]].split(each)
     return [
         _seen(
             source,
@@ -160,9 +194,9 @@ def from_between_cameras(source: Source, seen: Seen, seed: int) -> Seen:
     others = torch.cdist(positions, positions).fill_diagonal_(torch.inf).argmin(dim=1)
     generator = torch.Generator().manual_seed(seed)
     along = torch.rand(len(images), 1, generator=generator)
-    moved = (along * (positions[others] - positions)[images]).to(rays.origins)
+    shifts = (along * (positions[others] - positions)[images]).to(rays.origins)
     bundle = RayBundle(
-        origins=rays.origins + moved,
+        origins=rays.origins + shifts,
         directions=rays.directions,
         pixel_area=torch.ones_like(rays.t_mins)[:, None],
         camera_indices=rays.images[:, None],
@@ -170,20 +204,47 @@ def from_between_cameras(source: Source, seen: Seen, seed: int) -> Seen:
     return _seen(source, None, bundle, seen.truth)
 
 
-def _seen(source: Source, occupancy: Occupancy | None, bundle: Any, truth: Tensor) -> Seen:
+def of_test_photographs(source: Source, occupancy: Occupancy, count: int) -> Seen | None:
+    """Rays of about so many pixels of up to 16 test photographs; None where there are none."""
+    dataset = source.manager.eval_dataset
+    if dataset is None or len(dataset) == 0:
+        return None
+    images = some_images(dataset)
+    generator = torch.Generator().manual_seed(4)
+    each = -(-count // len(images["image"]))
+    indices, truths = [], []
+    for number, image in zip(images["image_idx"].tolist(), images["image"]):
+        sizes = torch.tensor(image.shape[:2])
+        pixels = (torch.rand(each, 2, generator=generator) * sizes).long()
+        indices.append(torch.cat([torch.full((each, 1), number), pixels], dim=1))
+        truths.append(image[tuple(pixels.T)])
+    numbers, places = torch.cat(indices).split([1, 2], dim=1)
+    bundle = dataset.cameras.to("cpu").generate_rays(
+        camera_indices=numbers, coords=places.float() + 0.5
+    )
+    return _seen(source, occupancy, bundle, torch.cat(truths), of_training=False)
+
+
+def _seen(
+    source: Source,
+    occupancy: Occupancy | None,
+    bundle: Any,
+    truth: Tensor,
+    of_training: bool = True,
+) -> Seen:
     model = source.model
     if model is not None:
-        model.train()  # rays know their training image, and so its appearance
+        model.train(of_training)  # rays know their training image, and so its appearance
         rays = model.rays_of(bundle.to(model.device))
         model.eval()
         return Seen(rays, truth.to(model.device).float())
     assert occupancy is not None
-    learned_in, here = occupancy.report.get("frame"), frame_of(source.manager)
-    if learned_in is not None and here is not None:
-        frame = between(here, learned_in)
-        turned = bundle.directions @ frame[:, :3].T
-        bundle.origins = bundle.origins @ frame[:, :3].T + frame[:, 3]
-        bundle.directions = turned / turned.norm(dim=-1, keepdim=True)
-    near, far = (torch.tensor(float(occupancy.report[name])) for name in ("near", "far"))
+    bundle = bundle.to(occupancy.walls.device)
+    if (frame := _frame_to(source, occupancy)) is not None:
+        frame = frame.to(bundle.origins)
+        directions = turned(bundle.directions, frame)
+        bundle.origins = moved(bundle.origins, frame)
+        bundle.directions = directions / directions.norm(dim=-1, keepdim=True)
+    near, far = (bundle.origins.new_tensor(occupancy.report[name]) for name in ("near", "far"))
     rays = cut_to_bounds(bundle, occupancy.walls, near, far, with_images=False)
     return Seen(rays, truth.float())

@@ -6,7 +6,15 @@ from typing import Any
 
 import pytest
 
-from leco_plugin.capacity.choice import choose, common_volume, kilobytes, smallest_grid, verdict
+from leco_plugin.capacity.choice import (
+    WORTH_TEN_TIMES,
+    choose,
+    common_volume,
+    grid_that_suffices,
+    kilobytes,
+    smallest_grid,
+    verdict,
+)
 from leco_plugin.capacity.measuring import VOLUMES
 
 
@@ -21,18 +29,38 @@ SMALL_GATE = row("frequency", "5-16-2", 3_000, 0.062)
 COARSE, FINE = row("grid", "32", 4_096, 0.15), row("grid", "256", 2_097_152, 0.0625)
 
 
-def test_fewest_bytes_among_those_that_keep_as_little() -> None:
+def test_more_bytes_are_chosen_only_where_they_pay() -> None:
+    """Ten times as many must leave two thirds of the volume."""
+    pays, does_not = (
+        row("hash", "4-10", 30_000, 0.062 * WORTH_TEN_TIMES * factor) for factor in (0.99, 1.01)
+    )
+    assert choose([SMALL_GATE, pays]) is pays
+    assert choose([SMALL_GATE, does_not]) is SMALL_GATE
+    assert choose([SMALL_GATE, row("vm", "9", 3_000_000, 0.06)]) is SMALL_GATE
+
+
+def test_what_the_scene_needs_is_said_beside_the_grid_that_keeps_as_little() -> None:
     rows = [LARGE_GATE, SMALL_GATE, COARSE, FINE]
     assert choose(rows) is SMALL_GATE
-    assert smallest_grid(rows, SMALL_GATE) is FINE
+    assert smallest_grid(rows, SMALL_GATE) is FINE and grid_that_suffices(rows) is None
     said = verdict(rows)
-    assert "gate on frequencies of 3.0 kB" in said and "256^3 cells, 699 times" in said
+    assert said.startswith("This scene needs 3.0 kB: a gate on frequencies keeps 6.2%")
+    assert "256^3 cells, 699 times" in said
 
 
 def test_a_grid_that_suffices_is_named() -> None:
     enough = row("grid", "16", 512, 0.061)
-    assert choose([SMALL_GATE, LARGE_GATE, enough, FINE]) is enough
-    assert verdict([SMALL_GATE, LARGE_GATE, enough, FINE]).startswith("A grid suffices: 16^3 cells")
+    rows = [SMALL_GATE, LARGE_GATE, enough, FINE]
+    assert choose(rows) is grid_that_suffices(rows) is enough
+    assert verdict(rows).startswith("A grid suffices: 16^3 cells")
+
+
+def test_a_usual_grid_that_keeps_as_little_as_a_smaller_gate_suffices() -> None:
+    usual = row("grid", "128", 262_144, 0.064)
+    rows = [SMALL_GATE, COARSE, usual, FINE]
+    assert choose(rows) is SMALL_GATE and grid_that_suffices(rows) is usual
+    said = verdict(rows)
+    assert said.startswith("A grid suffices: 128^3 cells, 262.1 kB.") and "With 3.0 kB" in said
 
 
 def test_grids_that_never_keep_as_little_are_named() -> None:

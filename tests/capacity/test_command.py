@@ -8,12 +8,14 @@ from types import SimpleNamespace
 from typing import Any
 
 import pytest
+import tiny_scene as tiny_scene_writer
 from PIL import Image
 
 from leco_plugin import cli
 from leco_plugin.capacity import command
 from leco_plugin.capacity.measuring import VOLUMES, Candidate
 from leco_plugin.evaluation.charts import SOURCE, fingerprint
+from leco_plugin.scenes.input_error import InputError
 
 pytestmark = [  # nerfstudio leaves an image open
     pytest.mark.filterwarnings("ignore:unclosed file:ResourceWarning"),
@@ -105,6 +107,38 @@ def test_other_settings_and_bad_input_are_refused_in_one_line(
         assert said.startswith("leco: ") and said.count("\n") == 1 and cause in said, said
 
 
+@pytest.mark.parametrize("name", ["settings.json", "points/grid-16.json"])
+@pytest.mark.parametrize("text", ["{", "[]", '{"data": 1}'])
+def test_a_damaged_file_is_named(
+    taught: list[str],
+    tiny_scene: Path,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+    name: str,
+    text: str,
+) -> None:
+    monkeypatch.setattr(command, "draw", lambda *arguments: None)
+    taught += [""] * 6
+    arguments = ["capacity", "--data", tiny_scene, "--out", tmp_path / "out", "--grids", 16]
+    assert run(*arguments) == 0
+    capsys.readouterr()
+    (tmp_path / "out" / name).write_text(text)
+    assert run(*arguments) == 2
+    said = capsys.readouterr().err
+    assert said.startswith("leco: ") and said.count("\n") == 1
+
+
+def test_a_grid_that_is_asked_for_twice_is_measured_once(
+    taught: list[str], tiny_scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(command, "draw", lambda *arguments: None)
+    taught += [""] * 6
+    arguments = ["capacity", "--data", tiny_scene, "--out", tmp_path / "out"]
+    assert run(*arguments, "--grids", 16, 16) == 0
+    assert taught.count("grid-16") == 1
+
+
 @pytest.mark.slow
 def test_one_field_teaches_gates_and_grids(
     tiny_scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
@@ -123,4 +157,10 @@ def test_one_field_teaches_gates_and_grids(
         assert len(results["representations"]) == len(some) + 2
         for file in (out / "points").glob("grid*"):
             file.unlink()
+    other = tiny_scene_writer.write(tmp_path / "other" / tiny_scene.name, train=4, test=2)
+    with pytest.raises(InputError, match="learned on 7 photographs, and this scene has 4"):
+        command.capacity(other, out, (8, 16), 0.01, 4, some)
+    (out / "field.pt").write_bytes(b"no field")
+    with pytest.raises(InputError, match=r"field\.pt cannot be used"):
+        command.capacity(tiny_scene, out, (8, 16), 0.01, 4, some)
     assert all(0.0 < row["kept_volume"] <= 1.0 for row in results["representations"])

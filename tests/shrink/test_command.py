@@ -4,15 +4,15 @@ from __future__ import annotations
 
 import copy
 import json
+import math
 import shutil
-from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import pytest
 import torch
-from ball_occupancy import ball_of_the_tiny_scene
+from ball_occupancy import THEIR_MARCH, ball_of_the_tiny_scene
 from PIL import Image
+from tiny_scene import camera_to_world
 
 from leco_plugin import cli
 from leco_plugin.evaluation.inspection import describe
@@ -20,7 +20,6 @@ from leco_plugin.models.encodings import EncodingConfig
 from leco_plugin.models.field_at_freezing import leave_field
 from leco_plugin.models.gate import GateConfig
 from leco_plugin.occupancy import Occupancy
-from leco_plugin.scenes.frames import frame_of
 from leco_plugin.shrink import command, references, search, sources
 from leco_plugin.shrink.command import compare_queries
 from leco_plugin.shrink.evidence import loss
@@ -30,8 +29,6 @@ pytestmark = [  # nerfstudio leaves an image open
     pytest.mark.filterwarnings("ignore:unclosed file:ResourceWarning"),
     pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning"),
 ]
-
-MARCH = {"near": 0.05, "far": 2.0, "step_size": 0.02, "cone_angle": 0.0}
 
 
 @pytest.fixture(autouse=True)
@@ -49,7 +46,9 @@ def quick(monkeypatch: pytest.MonkeyPatch) -> None:
 def file(tmp_path: Path) -> Path:
     """The ball, and how its rays are marched; no run lies beside it."""
     occupancy = ball_of_the_tiny_scene()
-    occupancy.report |= MARCH | {"lost_surface_mass": 1e-4, "cameras": [[0.123456, 0.0, 1.0]]}
+    turns = [2 * math.pi * index / 9 for index in range(9)]
+    cameras = [camera_to_world(turn)[:3, 3].tolist() for turn in turns]
+    occupancy.report |= THEIR_MARCH | {"lost_surface_mass": 1e-4, "cameras": cameras}
     occupancy.save(tmp_path / "ball.safetensors")
     return tmp_path / "ball.safetensors"
 
@@ -73,10 +72,13 @@ def test_without_a_run_it_keeps_to_the_decisions_and_says_so(
     said = capsys.readouterr().out
     assert "the original's keep decisions, weighed by o(x)" in " ".join(said.split())
     results = json.loads(report.read_text())
+    checked = results["checked"]
+    assert checked["rays"] == 512 and checked["lost_surface_mass"] >= 1e-4  # of the original
+    assert f"test photographs lose {checked['lost_surface_mass']:.2e}" in " ".join(said.split())
     smaller = Occupancy.load(out)
     assert out.stat().st_size == results["to"]["bytes"] < file.stat().st_size
     assert [rung["verdict"] for rung in results["rungs"]][-1] == "chosen"
-    assert smaller.report["cameras"] == [[0.1235, 0.0, 1.0]]
+    assert smaller.report["cameras"][1] == [0.766, 0.6428, 0.7]
     beyond = results["rungs"][-1]["verified"]["lost_surface_mass_bound"]
     assert beyond >= 1e-4 and smaller.report["lost_surface_mass"] == pytest.approx(beyond)
     assert describe(smaller)["kept_share_of_box"] == pytest.approx(
@@ -101,7 +103,11 @@ def test_where_nothing_smaller_holds_the_same_gate_is_stored(
     monkeypatch.setattr(search, "ladder", lambda most: [])
     assert run("shrink", file, "--data", tiny_scene, "--out", out) == 0
     assert "this is the same gate" in capsys.readouterr().out
-    same = Occupancy.load(out)
+    same, report = Occupancy.load(out), tmp_path / "again.json"
+    again = ["--out", tmp_path / "again", "--json", report, "--picture", tmp_path / "again.png"]
+    assert run("shrink", out, "--data", tiny_scene, *again) == 0  # and once more
+    assert "this is the same gate" in capsys.readouterr().out and (tmp_path / "again.png").exists()
+    assert json.loads(report.read_text())["checked"] is None
     positions = torch.rand(5000, 3) - 0.5
     assert torch.equal(same.query(positions), original.query(positions))
     assert out.stat().st_size < 0.8 * file.stat().st_size
@@ -113,13 +119,25 @@ def test_bad_input_ends_with_one_line_and_status_2(
 ) -> None:
     silent = ball_of_the_tiny_scene()
     silent.save(tmp_path / "silent.safetensors")
+    aground = Occupancy.load(file)
+    aground.report["step_size"] = "small"
+    aground.save(tmp_path / "aground.safetensors")
+    elsewhere = Occupancy.load(file)
+    elsewhere.report["cameras"] = [[1.0, 0.1 * number, 0.7] for number in range(20)]
+    elsewhere.save(tmp_path / "elsewhere.safetensors")
+    before = file.read_bytes()
     out = ["--out", tmp_path / "out.safetensors"]
     cases: dict[str, list[object]] = {
         "there is no such folder": [file, "--data", tmp_path / "none", *out],
         "raise --lost-surface-mass": [file, "--data", tiny_scene, *out, "--lost-surface-mass", 0],
         "how its rays are marched": [tmp_path / "silent.safetensors", "--data", tiny_scene, *out],
         "not nan": [file, "--data", tiny_scene, *out, "--lost-surface-mass", "nan"],
+        "step_size is small": [tmp_path / "aground.safetensors", "--data", tiny_scene, *out],
+        "of the 20 cameras": [tmp_path / "elsewhere.safetensors", "--data", tiny_scene, *out],
         "is a folder": [file, "--data", tiny_scene, "--out", tmp_path],
+        "is the occupancy itself": [file, "--data", tiny_scene, "--out", file],
+        "not a folder": [file, "--data", tiny_scene, "--out", file / "new" / "small"],
+        "ends in none of": [file, "--data", tiny_scene, *out, "--picture", tmp_path / "a.doc"],
         "give an occupancy.safetensors": [
             tmp_path / "none.safetensors",
             "--data",
@@ -131,48 +149,13 @@ def test_bad_input_ends_with_one_line_and_status_2(
         assert run("shrink", *arguments) == 2, cause
         said = capsys.readouterr().err
         assert said.startswith("leco: ") and said.count("\n") == 1 and cause in said, said
-    assert not (tmp_path / "out.safetensors").exists()
+    assert not (tmp_path / "out.safetensors").exists() and file.read_bytes() == before
 
 
 def test_the_speed_is_that_of_interleaved_pairs() -> None:
     one = ball_of_the_tiny_scene()
     ratio, times = compare_queries(one, one)
     assert 0.3 < ratio < 3.0 and len(times) == 2 and min(times) > 0.0
-
-
-@pytest.fixture(scope="module")
-def known_run(tiny_scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Folder of a run of `leco-occupancy`: its frozen gate is the ball, its field is opaque."""
-    from leco_plugin.method_configs import leco_occupancy
-
-    config: Any = copy.deepcopy(leco_occupancy.config)
-    config.output_dir = tmp_path_factory.mktemp("outputs")
-    config.experiment_name, config.timestamp, config.vis = "tiny", "run", "tensorboard"
-    config.logging.local_writer.enable = False
-    config.data = config.pipeline.datamanager.data = tiny_scene
-    config.pipeline.datamanager.train_num_rays_per_batch = 64
-    sizes = config.pipeline.model.sizes
-    gate = ball_of_the_tiny_scene().gate.config
-    field = replace(sizes.field, encoding=replace(sizes.field.encoding, log2_table=8))
-    config.pipeline.model.sizes = replace(sizes, gate=gate, field=field, candidates=64)
-    config.save_config()
-    trainer = config.setup(local_rank=0, world_size=1)
-    trainer.setup()
-    model, frame = trainer.pipeline.model, frame_of(trainer.pipeline.datamanager)
-    assert frame is not None
-    known = ball_of_the_tiny_scene(frame)
-    model.gate.load_state_dict(known.gate.state_dict())
-    model.space.load_state_dict(known.space.state_dict())
-    model.threshold.fill_(known.threshold)
-    model.frozen.fill_(True)
-    with torch.no_grad():
-        model.field.density_head.bias.fill_(6.0)
-    near, far, step_size, cone_angle = MARCH.values()
-    model.march_range.copy_(torch.tensor([near, far, step_size, step_size, cone_angle, cone_angle]))
-    model.report = MARCH | {"lost_surface_mass": 1e-4}
-    model.occupancy().save(trainer.base_dir / "occupancy.safetensors")
-    trainer.save_checkpoint(0)
-    return Path(trainer.base_dir)
 
 
 def test_the_model_of_the_run_says_what_is_lost(

@@ -1,0 +1,121 @@
+"""Claims about where the rays come from on which a smaller gate is measured."""
+
+from __future__ import annotations
+
+import copy
+from pathlib import Path
+from typing import Any
+
+import pytest
+import tiny_scene as tiny_scene_writer
+import torch
+from ball_occupancy import THEIR_MARCH, ball_of_the_tiny_scene
+
+from leco_plugin.occupancy import Occupancy
+from leco_plugin.scenes.input_error import InputError
+from leco_plugin.shrink.references import AT_FREEZING, BY_DECISIONS, NOW, shares_lost
+from leco_plugin.shrink.sources import (
+    CHECKPOINTS,
+    CONFIG,
+    check_scene,
+    find_source,
+    held_out,
+    of_test_photographs,
+)
+
+pytestmark = [  # nerfstudio leaves an image open
+    pytest.mark.filterwarnings("ignore:unclosed file:ResourceWarning"),
+    pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning"),
+]
+
+
+def test_of_a_guided_hosts_run_only_the_decisions_are_asked(
+    tiny_scene: Path, tmp_path: Path
+) -> None:
+    from leco_plugin.host_configs import leco_ngp
+
+    config: Any = copy.deepcopy(leco_ngp.config)
+    config.output_dir, config.experiment_name, config.timestamp = tmp_path, "tiny", "run"
+    config.data = config.pipeline.datamanager.data = tiny_scene
+    config.save_config()
+    folder = config.get_base_dir()
+    (folder / CHECKPOINTS).mkdir()
+    (folder / CHECKPOINTS / "step-000000001.ckpt").touch()
+    source = find_source(folder / "occupancy.safetensors", tiny_scene)
+    assert source.model is None and len(source.manager.train_dataset) == 7
+
+
+@pytest.mark.parametrize("text", ["", "one: [two", "!!python/name:no.such.module", "\ud800"])
+def test_a_damaged_config_is_named(tiny_scene: Path, tmp_path: Path, text: str) -> None:
+    (tmp_path / CONFIG).write_bytes(text.encode(errors="surrogatepass"))
+    (tmp_path / CHECKPOINTS).mkdir()
+    (tmp_path / CHECKPOINTS / "step-000000001.ckpt").touch()
+    with pytest.raises(InputError, match=r"config.yml cannot be read"):
+        find_source(tmp_path / "occupancy.safetensors", tiny_scene)
+
+
+def test_another_scene_than_the_runs_is_refused(
+    known_run: Path, tiny_scene: Path, tmp_path: Path
+) -> None:
+    """Its photographs would be in the model's coordinates, but show something else there."""
+    file = known_run / "occupancy.safetensors"
+    original = Occupancy.load(file)
+    source = find_source(file, tiny_scene)
+    cameras = source.manager.train_dataset.cameras.camera_to_worlds[:, :3, 3]
+    original.report["cameras"] = cameras.tolist()
+    check_scene(source, original, tiny_scene)
+    other = tiny_scene_writer.write(tmp_path / "other", train=9, test=3)
+    with pytest.raises(InputError, match="of the 7 cameras"):
+        check_scene(find_source(file, other), original, other)
+
+
+def test_cameras_are_compared_in_the_coordinates_of_the_occupancy(
+    tiny_scene: Path, tmp_path: Path
+) -> None:
+    known = ball_of_the_tiny_scene()
+    known.report["cameras"] = [
+        tiny_scene_writer.camera_to_world(2 * torch.pi * i / 9)[:3, 3].tolist() for i in range(9)
+    ]
+    source = find_source(tmp_path / "occupancy.safetensors", tiny_scene)
+    check_scene(source, known, tiny_scene)
+    del known.report["frame"]
+    with pytest.raises(InputError, match="of the 9 cameras"):
+        check_scene(source, known, tiny_scene)
+
+
+def test_test_photographs_say_what_a_smaller_gate_loses(known_run: Path, tiny_scene: Path) -> None:
+    file = known_run / "occupancy.safetensors"
+    source, original = find_source(file, tiny_scene), Occupancy.load(file)
+    seen = of_test_photographs(source, original, 300)
+    assert seen is not None and len(seen.truth) == 300
+    cameras = source.manager.eval_dataset.cameras.camera_to_worlds[:, :3, 3]
+    apart = torch.cdist(seen.rays.origins, cameras)
+    assert float(apart.amin(dim=1).max()) < 1e-5 and len(apart.argmin(dim=1).unique()) == 2
+    dataset = source.manager.eval_dataset
+    pictures = torch.stack([dataset.get_data(number)["image"] for number in range(2)])
+    assert {tuple(pixel) for pixel in seen.truth.tolist()} <= {
+        tuple(pixel) for pixel in pictures.view(-1, 3).tolist()
+    }
+    nothing = copy.deepcopy(original)
+    nothing.threshold_value.fill_(1.1)
+    both = source._replace(frozen=source.model)
+    assert shares_lost(both, original, nothing, seen) == pytest.approx(
+        {NOW: 1.0 + 1e-4, AT_FREEZING: 1.0}
+    )
+    everything = copy.deepcopy(original)
+    everything.threshold_value.fill_(0.0)
+    lost = shares_lost(both, original, everything, seen)
+    assert lost == pytest.approx({NOW: 1e-4, AT_FREEZING: 0.0})
+    alone = source._replace(model=None)
+    original.report |= THEIR_MARCH
+    assert shares_lost(alone, original, everything, seen) == pytest.approx({BY_DECISIONS: 1e-4})
+
+
+def test_photographs_too_small_for_held_out_pixels_are_named(
+    known_run: Path, tmp_path: Path
+) -> None:
+    file = known_run / "occupancy.safetensors"
+    small = tiny_scene_writer.write(tmp_path / "small", train=1, test=1, size=4)
+    source = find_source(file, small)
+    with pytest.raises(InputError, match="nothing was trained on"):
+        held_out(source, Occupancy.load(file), 100)
