@@ -14,6 +14,7 @@ from leco_plugin.capacity.field import prepare
 from leco_plugin.capacity.measuring import Candidate, gates, grids, of_gate, of_grids
 from leco_plugin.capacity.picture import draw
 from leco_plugin.chart.theme import DARK, LIGHT
+from leco_plugin.evaluation.equal_loss import MOST_ON_CPU
 from leco_plugin.evaluation.field_grids import fits_memory
 from leco_plugin.evaluation.json_file import write_json
 from leco_plugin.evaluation.machine import describe_machine
@@ -38,7 +39,8 @@ def capacity(
     Args:
         data: the scene in nerfstudio's format.
         out: the folder; what is finished stays there whenever this is stopped.
-        resolutions: of grids; those that do not fit the memory are left out.
+        resolutions: of grids; those that do not fit the memory are left out, and on a CPU those
+            that would take long.
         lost_surface_mass: at which kept volumes are compared.
         learn_steps: of the field.
         gate_candidates: `gates()` by default.
@@ -83,6 +85,11 @@ def capacity(
             for number, (candidate, row) in enumerate(filling):
                 rows.append(_store(out, candidate, row))
                 show((len(wanted) + number + 1) / (len(wanted) + len(of_cells)))
+            for left_out in of_cells[len(rows) - len(wanted) :]:
+                CONSOLE.print(
+                    f"a grid of {left_out.size}^3 cells would ask the field at more than "
+                    f"{MOST_ON_CPU / 1e6:.0f} million places; it is left out"
+                )
     manager_images = int(ground.model.num_train_data)
     results = {
         "format": 1,

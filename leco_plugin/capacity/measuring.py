@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from leco_plugin.capacity.field import Ground
-from leco_plugin.evaluation.equal_loss import SPARED, kept_shares, threshold_losing
+from leco_plugin.evaluation.equal_loss import MOST_ON_CPU, SPARED, kept_shares, threshold_losing
 from leco_plugin.evaluation.field_grids import FieldGrids, density_of, in_parts, looked_up
 from leco_plugin.evaluation.reached_volume import mapped_box
 from leco_plugin.models.encodings import EncodingConfig
@@ -152,7 +152,8 @@ def of_grids(
 ) -> Iterator[tuple[Candidate, dict[str, Any]]]:
     """Fills grids from the field's density, each from one half as fine; yields a row for each.
 
-    They hear of the places that gates are taught by, and of random ones.
+    They hear of the places that gates are taught by, and of random ones. Ends with the first that
+    would ask the field more often than `MOST_ON_CPU` on a CPU.
 
     Args:
         candidates: by resolution.
@@ -166,12 +167,14 @@ def of_grids(
         of_rays = looked_up(scores, box, ground.mapped)
         return threshold_losing(ground.held_out.worth, of_rays, SPARED * lost)
 
-    grids = FieldGrids(density, box, (places, density(places)), floor_of)
+    most = MOST_ON_CPU if ground.model.device.type == "cpu" else math.inf
+    grids = FieldGrids(density, box, (places, density(places)), floor_of, most)
     for candidate in candidates:
         started = time.monotonic()
         assert candidate.resolution is not None
         scores = grids.fill((candidate.resolution,) * 3)
-        assert scores is not None
+        if scores is None:
+            return
         of_rays, of_volume = (
             looked_up(scores, box, mapped) for mapped in (ground.mapped, ground.volume)
         )

@@ -164,3 +164,23 @@ def test_one_field_teaches_gates_and_grids(
     with pytest.raises(InputError, match=r"field\.pt cannot be used"):
         command.capacity(tiny_scene, out, (8, 16), 0.01, 4, some)
     assert all(0.0 < row["kept_volume"] <= 1.0 for row in results["representations"])
+
+
+def test_a_grid_that_would_take_too_long_is_left_out_and_said(
+    taught: list[str],
+    tiny_scene: Path,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    all_grids = command.of_grids
+    monkeypatch.setattr(command, "draw", lambda *arguments: None)
+    monkeypatch.setattr(command, "of_grids", lambda *arguments: list(all_grids(*arguments))[:2])
+    taught += [""] * 6
+    out = tmp_path / "out"
+    assert run("capacity", "--data", tiny_scene, "--out", out, "--grids", 8, 16, 32) == 0
+    assert "32^3 cells would ask the field at more than 200 million" in " ".join(
+        capsys.readouterr().out.split()
+    )
+    rows = json.loads((out / "results.json").read_text())["representations"]
+    assert [row["size"] for row in rows if row["family"] == "grid"] == ["8", "16"]
