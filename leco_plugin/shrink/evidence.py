@@ -167,15 +167,17 @@ class Loss(NamedTuple):
     """Share of all rendering weight before the backdrop, haze included."""
 
 
-CONFIDENCE = 2.33
-"""Standard errors from a mean to what 99 of 100 stay below."""
+UNLIKELY = 0.01
+"""How often the share on other rays may lie above the bound."""
+CONFIDENCE, BEYOND = math.sqrt(2.0 * math.log(1.0 / UNLIKELY)), math.log(1.0 / UNLIKELY) / 3.0
+"""Of Bernstein's inequality: errors, and rays of average worth, that are added to the mean."""
 
 
 def loss(evidence: Evidence, skipped: Tensor) -> Loss:
-    """The share of the worth that is skipped, with the error of a ratio of sums over rays.
+    """The share of the worth that is skipped, and Bernstein's bound of a ratio of sums over rays.
 
     The error is reckoned as if one more ray of average worth were lost: a loss that no ray has seen
-    yet has no spread.
+    yet has no spread. Without any loss that makes 4.6 / n, which n rays without one do exclude.
 
     Args:
         skipped: bool [M].
@@ -191,7 +193,8 @@ def loss(evidence: Evidence, skipped: Tensor) -> Loss:
     share = float(lost.sum()) / total
     one_more = (total / max(evidence.rays, 1)) ** 2
     error = math.sqrt(float((lost - share * worth).square().sum()) + one_more) / total
-    return Loss(share, share + CONFIDENCE * error, lost_all / max(all_weight, 1e-12))
+    bound = share + CONFIDENCE * error + BEYOND / max(evidence.rays, 1)
+    return Loss(share, bound, lost_all / max(all_weight, 1e-12))
 
 
 def image_price(model: LecoModel, rendered: Sequence[Rendered], smaller: Occupancy) -> float:

@@ -119,7 +119,9 @@ def search(
                 0.5,
                 ground.original.precision,
                 walls=ground.original.walls,
-            ).eval(),
+            )
+            .to(ground.original.threshold_value.device)
+            .eval(),
             bounds,
             volume,
             kept,
@@ -144,7 +146,9 @@ def check_room(original: Occupancy, bounds: Bounds) -> None:
             "bounds are a lost surface mass from 0 to 1 and a number of dB, not "
             f"{bounds.lost_surface_mass} and {bounds.image_price_db}"
         )
-    lost, price = declared(original, "lost_surface_mass"), declared(original, "image_price_db")
+    lost, price = (
+        max(declared(original, name), 0.0) for name in ("lost_surface_mass", "image_price_db")
+    )
     if lost >= bounds.lost_surface_mass:
         raise ValueError(
             f"the occupancy itself declares a lost surface mass of {lost:.2e}, which leaves "
@@ -275,7 +279,10 @@ def threshold_keeping(scores: Tensor, share: float) -> float:
 
 
 def _volume(occupancy: Occupancy, count: int, seed: int) -> Tensor:
-    """Positions [count, 3] spread evenly over the occupancy's box."""
-    box = whole_box(occupancy)
+    """Positions [count, 3] spread evenly over the occupancy's box, or over a contracted cube."""
     unit = torch.rand(count, 3, generator=torch.Generator().manual_seed(seed))
-    return torch.lerp(box.low, box.high, unit).to(occupancy.threshold_value.device)
+    device = occupancy.threshold_value.device
+    if occupancy.space.kind == "contraction":
+        return occupancy.space.unmap(2.0 * unit.to(device) - 1.0)
+    box = whole_box(occupancy)
+    return torch.lerp(box.low, box.high, unit).to(device)

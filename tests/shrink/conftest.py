@@ -12,6 +12,7 @@ import torch
 from ball_occupancy import THEIR_MARCH, ball_of_the_tiny_scene
 
 from leco_plugin.scenes.frames import frame_of
+from leco_plugin.shrink import references
 
 
 @pytest.fixture(scope="session")
@@ -47,3 +48,9 @@ def known_run(tiny_scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Pat
     model.occupancy().save(trainer.base_dir / "occupancy.safetensors")
     trainer.save_checkpoint(0)
     return Path(trainer.base_dir)
+
+
+@pytest.fixture(autouse=True)
+def fewer_rays(monkeypatch: pytest.MonkeyPatch) -> None:
+    """As many as tiny photographs can give without being asked for again and again."""
+    monkeypatch.setattr(references, "RAYS", 1500)

@@ -60,7 +60,7 @@ def test_it_stops_at_the_first_gate_that_holds() -> None:
     shares: list[float] = []
     found = search(
         ground(original()),
-        Bounds(2e-3),
+        Bounds(3e-3),
         [TOO_SMALL, ENOUGH, replace(ENOUGH, width=32)],
         seen.append,
         shares.append,
@@ -73,13 +73,13 @@ def test_it_stops_at_the_first_gate_that_holds() -> None:
 
 def test_the_chosen_gate_keeps_about_as_much_and_loses_what_it_says() -> None:
     known = original()
-    found = walk(known, [ENOUGH], lost_surface_mass=2e-3)
+    found = walk(known, [ENOUGH], lost_surface_mass=3e-3)
     assert found.occupancy is not None
     rung = found.rungs[-1]
     assert 0.95 <= rung.kept_volume <= 1.055
     fresh = known_worth(known, 77)
     lost = fresh.worth[~found.occupancy.occupied(fresh.positions)].sum() / fresh.worth.sum()
-    assert float(lost) <= rung.verified["lost_surface_mass_bound"] <= 2e-3
+    assert float(lost) <= rung.verified["lost_surface_mass_bound"] <= 3e-3
     for parameter in found.occupancy.gate.parameters():
         assert torch.equal(parameter, parameter.bfloat16().float())
 
@@ -89,7 +89,7 @@ def test_what_fails_on_unseen_rays_is_not_chosen() -> None:
     unseen = known_worth(known, 2)
     # everything that is worth something lies where no gate of the original's volume keeps it
     far = (unseen.positions - torch.tensor(CENTRE)).norm(dim=-1) > 1.3
-    found = search(ground(known, unseen._replace(worth=far.float())), Bounds(2e-3), [ENOUGH])
+    found = search(ground(known, unseen._replace(worth=far.float())), Bounds(3e-3), [ENOUGH])
     assert found.occupancy is None
     assert [rung.verdict for rung in found.rungs] == ["fails on unseen rays"]
 
@@ -108,7 +108,7 @@ def test_a_loss_that_the_search_has_seen_is_declared_too() -> None:
 
 def test_nothing_is_lost_beyond_what_the_original_leaves() -> None:
     with pytest.raises(ValueError, match="raise --lost-surface-mass"):
-        walk(original(lost_surface_mass=2e-3), [ENOUGH], lost_surface_mass=1e-3)
+        walk(original(lost_surface_mass=3e-3), [ENOUGH], lost_surface_mass=1e-3)
     with pytest.raises(ValueError, match="raise --image-price"):
         walk(original(image_price_db=0.06), [ENOUGH])
     searching.check_room(original(lost_surface_mass=4e-4, image_price_db=-0.1), Bounds())
