@@ -7,6 +7,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from leco_plugin.chart.settling import settling
 from leco_plugin.chart.summary import (
     COSTS,
     KEPT,
@@ -52,6 +53,8 @@ def table(results: Mapping[str, Any]) -> str:
     duels = rivals(lines)
     if duels:
         parts.append(versus_table(duels))
+    if results["suite"] and lines and results["protocol"]["seconds"] is not None:
+        parts.append(settling(lines))
     if results["failures"]:
         parts.append(failures_table(results["failures"]))
     if any(run.get("occupancy") for line in lines for run in line.runs):
