@@ -16,7 +16,6 @@ from leco_plugin.models.switch_sizes import switch_sizes_for
 from leco_plugin.scenes.input_error import InputError
 
 SCENE_LAYERS = LEARNING.sizes.field.experts.layers
-SCENE_EXPERTS = LEARNING.sizes.gate.scene_experts
 SWITCH_CELLS = switch_sizes_for(best_device()).grid_resolution
 """Of the grid that Switch-NeRF has by itself."""
 GRIDS = (128, 256, 512) if ON_GPU else (64, 128, 256)
@@ -136,7 +135,7 @@ SUITES = {
             _paper(
                 "balanced as in Switch-NeRF",
                 gate_loss__density=0.0,
-                gate_loss__empty_ratio=1.0 / (1 + SCENE_EXPERTS),
+                gate_loss__empty_ratio=None,
             ),
         ),
     ),

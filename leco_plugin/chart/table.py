@@ -64,7 +64,7 @@ def table(results: Mapping[str, Any]) -> str:
         parts += [representations_table(held), f"{sentence(verdict(held))}.{left_out(lines)}"]
     commit = f" at {made['commit']}" if made["commit"] else ""
     reused = sum(bool(run.get("reused")) for run in results["runs"])
-    taken = f" {reused} of the runs were made for other charts (`--reuse`)." if reused else ""
+    taken = f" {reused} of the runs were made for other charts." if reused else ""
     said = f"`{made['command']}`, {made['date']}, leco_plugin {made['version']}{commit}."
     parts.append(said + taken)
     return "\n\n".join(parts) + "\n"

@@ -67,8 +67,13 @@ def test_a_crash_half_way_is_a_row_the_others_finish_and_the_status_is_one(
 
 
 def test_how_long_it_takes_is_said_before_it_is_started(
-    started: Started, tiny_scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    started: Started,
+    tiny_scene: Path,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
+    monkeypatch.setattr(Chart, "draw", Chart.write)
     out = ["--data", tiny_scene, "--out", tmp_path / "chart", "--methods", "leco-occupancy"]
     assert run(*out, "--seconds", 75, "--seeds", 0, 1) == 0
     assert "2 runs of 75 s, about 4 minutes on two CPU cores" in capsys.readouterr().out
