@@ -26,6 +26,8 @@ SMALL: dict[str, Any] = {
     "schedule.learn_steps": 3,
 }
 CONTENDERS = {one.without_grids().key: one for found in SUITES.values() for one in found.contenders}
+BY_DEFAULT = {one.without_grids().key for one in SUITES["losses"].contenders}
+"""The others take a minute of one core, and run only when long tests are asked for."""
 
 
 def smaller(one: Contender) -> Contender:
@@ -39,7 +41,13 @@ def smaller(one: Contender) -> Contender:
     return replace(one, changes=changes, grids=(8,) if one.grids else ())
 
 
-@pytest.mark.parametrize("one", CONTENDERS.values(), ids=lambda one: one.name)
+@pytest.mark.parametrize(
+    "one",
+    [
+        pytest.param(one, id=one.name, marks=() if key in BY_DEFAULT else pytest.mark.long)
+        for key, one in CONTENDERS.items()
+    ],
+)
 def test_every_contender_of_every_suite_can_be_trained(
     one: Contender, tiny_scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
