@@ -183,12 +183,13 @@ def chart(
     out: Path,
     methods: tuple[str, ...] = (),
     samplers: tuple[str, ...] = (),
-    suite: str | None = None,
+    suite: tuple[str, ...] = (),
     seconds: float | None = None,
     steps: int | None = None,
     seeds: tuple[int, ...] = (0, 1, 2),
     learn_seconds: float | None = None,
     images: int = 2,
+    at_once: int | None = None,
     reuse: tuple[Path, ...] = (),
     json: Path | None = None,
 ) -> None:
@@ -204,41 +205,36 @@ def chart(
         samplers: Of the registry, occupancy-grid-N for N cells along an axis, or own. By default
             learned-occupancy and own where the method can have both.
         suite: A named comparison instead of methods and samplers. Minutes that it takes on two CPU
-            cores with three seeds, about: representations 26, empty-expert 30, losses 25, freeze
-            32, enough-time 33, grid-resolution 44; with --reuse all of them two and a half hours.
+            cores with three seeds, about: representations 12, empty-expert 14, losses 9, freeze 13,
+            enough-time 12, grid-resolution 15. Several of them, or all, have a folder each in that
+            of --out and share their runs: all take 60 minutes.
         seconds: Training time of each run.
         steps: Training steps of each run; with both, a run ends with the first.
         seeds: Seeds.
         learn_seconds: Most of a run, about, that learning its occupancy may take. By default 0.4 of
             seconds.
         images: Whole test images that each run renders at its end.
+        at_once: Runs beside each other, which share the threads of the CPU. By default 1; suites
+            have 2 where there is no GPU.
         reuse: Folders of other charts on this scene: runs of theirs that this one lacks are taken
             over where time, evaluation, machine and version are the same.
         json: Another file for the results.
     """
     _check_json(json)
-    from leco_plugin.chart.command import make_chart
+    from leco_plugin.chart.command import Asked, make_charts
 
-    results = make_chart(
-        data=data,
-        out=out,
-        methods=methods,
-        samplers=samplers,
-        suite=suite,
-        seconds=seconds,
-        steps=steps,
-        seeds=seeds,
-        learn_seconds=learn_seconds,
-        images=images,
-        reuse=reuse,
-    )
-    drawn = "chart.png, chart.html, " if results["runs"] else ""
-    print(f"see {drawn}table.md and results.json in {out}")
-    _write_json(json, results)
-    failures = results["failures"]
+    asked = Asked(seconds, steps, learn_seconds, seeds, images, at_once, reuse)
+    made = make_charts(data, out, methods, samplers, suite, asked)
+    for folder, results in made.items():
+        drawn = "chart.png, chart.html, " if results["runs"] else ""
+        print(f"see {drawn}table.md and results.json in {folder}")
+    charts = {folder.name: results for folder, results in made.items()}
+    _write_json(json, {"format": 1, "charts": charts} if len(made) > 1 else made[out])
+    failures = [failure for results in made.values() for failure in results["failures"]]
     if failures:
+        count = len(failures) + sum(len(results["runs"]) for results in made.values())
         raise RuntimeError(
-            f"{len(failures)} of {len(failures) + len(results['runs'])} runs failed, the first "
+            f"{len(failures)} of {count} runs failed, the first "
             f"({failures[0]['name']}, seed {failures[0]['seed']}) with: {failures[0]['reason']}"
         )
 

@@ -8,12 +8,19 @@ from pathlib import Path
 
 import pytest
 
+from leco_plugin.chart.protocol import Protocol
+from leco_plugin.chart.suites import SUITES, minutes_together
+from leco_plugin.method_configs import ON_GPU
+
 DOCS = Path(__file__).resolve().parent.parent / "docs"
 PAGE = (DOCS / "method.md").read_text()
 
 PLACE = re.compile(r"`((?:\w+/)*\w+)\.py: ([\w.]+)`")
 LINK = re.compile(r"\]\(decisions\.md#([\w-]+)\)")
 NUMBER = re.compile(r"(?<![\w.])\d+(?:\.\d+)?(?:e-\d+)?%?(?![\w.]*\w)")
+SUITE_ROW = re.compile(
+    r"^\| `([\w-]+)` \| (\d+) \| ([\d-]*) ?\| ([^|]*?) ?\| (\d+) \|$", re.MULTILINE
+)
 
 PLACES = sorted(set(PLACE.findall(PAGE)))
 REASONS = [
@@ -51,3 +58,28 @@ def test_each_figure_stands_in_an_entry_that_is_linked_beside_it(reason: str) ->
     recorded = set(NUMBER.findall(" ".join(entries()[slug] for slug in linked)))
     recorded |= {figure.rstrip("%") for figure in recorded}
     assert {figure.rstrip("%") for figure in figures} <= recorded
+
+
+def test_the_table_of_suites_says_how_many_runs_they_have_and_how_long_they_take() -> None:
+    rows = {name: cells for name, *cells in re.findall(SUITE_ROW, PAGE)}
+    assert list(rows) == [*SUITES, "all"]
+    made: set[tuple[str, Protocol]] = set()
+    for name, one in SUITES.items():
+        wanted = {(contender.without_grids().key, one.protocol) for contender in one.contenders}
+        count, shared, _, minutes = rows[name]
+        assert int(count) == len(wanted) and int(shared.replace("-", "0")) == len(wanted & made)
+        assert int(minutes) == round(one.minutes())
+        made |= wanted
+    assert int(rows["all"][0]) == len(made)
+    assert int(rows["all"][3]) == round(minutes_together(list(SUITES)))
+
+
+@pytest.mark.parametrize("name", SUITES)
+def test_the_table_of_suites_says_when_their_runs_end(name: str) -> None:
+    (ends,) = (row[3] for row in re.findall(SUITE_ROW, PAGE) if row[0] == name)
+    budget = SUITES[name].protocol.budget()
+    if budget.seconds is None:
+        assert ON_GPU or ends == f"{budget.steps} steps"
+    else:
+        learning = budget.learn_seconds
+        assert ends == f"{budget.seconds:g} s, of which at most {learning:g} learn"

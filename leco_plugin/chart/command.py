@@ -1,84 +1,161 @@
-"""`leco chart`: from the words on the command line to a chart that is made and drawn."""
+"""`leco chart`: from the words on the command line to charts that are made and drawn."""
 
 from __future__ import annotations
 
 import functools
 import shlex
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from nerfstudio.utils.rich_utils import CONSOLE
 
-from leco_plugin.chart.folder import ChartFolder
 from leco_plugin.chart.methods import contenders
 from leco_plugin.chart.processes import ProcessRunner
 from leco_plugin.chart.protocol import Protocol
+from leco_plugin.chart.reuse import fitting
 from leco_plugin.chart.run import Chart, Runner
+from leco_plugin.chart.suites import SUITES, in_order
 from leco_plugin.chart.suites import suite as suite_of
 from leco_plugin.progress_bar import bar
 from leco_plugin.scenes.input_error import InputError
 
 
-def make_chart(
+@dataclass(frozen=True)
+class Asked:
+    """What is asked for beside what is compared; None where a suite has its own."""
+
+    seconds: float | None = None
+    """Of each run."""
+    steps: int | None = None
+    """Of each run."""
+    learn_seconds: float | None = None
+    """Most of that for learning an occupancy."""
+    seeds: Sequence[int] = (0, 1, 2)
+    """Of each."""
+    images: int = 2
+    """Whole test images for each run."""
+    at_once: int | None = None
+    """Runs beside each other; one, or as a suite has it."""
+    reuse: Sequence[Path] = ()
+    """Folders of other charts on this scene, whose runs need not be made again."""
+
+
+def processes(chart: Chart) -> Runner:
+    """Makes the runs of a chart in processes of their own."""
+    threads = {"OMP_NUM_THREADS": str(chart.machine["threads"])}
+    return ProcessRunner(
+        chart.data,
+        chart.protocol,
+        chart.folder,
+        environment=threads if chart.protocol.at_once > 1 else None,
+        stop=chart.stop,
+    )
+
+
+def make_charts(
     data: Path,
     out: Path,
     methods: Sequence[str] = (),
     samplers: Sequence[str] = (),
-    suite: str | None = None,
-    seconds: float | None = None,
-    steps: int | None = None,
-    seeds: Sequence[int] = (0, 1, 2),
-    learn_seconds: float | None = None,
-    images: int = 2,
-    reuse: Sequence[Path] = (),
-    runner_for: Callable[[Path, Protocol, ChartFolder], Runner] = ProcessRunner,
-) -> dict[str, Any]:
-    """Makes what is missing of a chart and draws it.
+    suites: Sequence[str] = (),
+    asked: Asked = Asked(),
+    runner_for: Callable[[Chart], Runner] = processes,
+) -> dict[Path, dict[str, Any]]:
+    """Makes what is missing of one chart, or of those of several suites, and draws it.
 
     Args:
         data: a scene in nerfstudio's format.
-        out: the chart's folder.
+        out: the chart's folder; of several suites each has one of its own in it, and takes over
+            what the others there have made.
         methods, samplers: what is compared, or
-        suite: the name of a comparison.
-        seconds, steps: of each run; a suite has a time of its own.
-        seeds: of each.
-        learn_seconds: most of it for learning an occupancy.
-        images: whole test images for each run.
-        reuse: folders of other charts on this scene, whose runs need not be made again.
-        runner_for: gives what makes a run.
+        suites: names of comparisons, or `all`.
+        asked: how long and how often.
+        runner_for: gives what makes the runs of a chart.
     Returns:
-        The results, as in `results.json`.
+        The results by folder, as in `results.json`.
     Raises:
-        ValueError, OSError: a name, a time, the scene or the folder is wrong; nothing was started.
+        ValueError, OSError: a name, a time, the scene or a folder is wrong; nothing was started.
     """
-    about = None
-    if suite is not None:
-        if methods or samplers:
-            raise InputError("a suite has methods of its own: give --suite or --methods, not both")
-        comparison = suite_of(suite)
-        compared, about = list(comparison.contenders), (suite, comparison.question)
-        if seconds is None and steps is None:
-            seconds = comparison.seconds
-            if learn_seconds is None:
-                learn_seconds = comparison.learn_seconds
+    if suites and (methods or samplers):
+        raise InputError("a suite has methods of its own: give --suite or --methods, not both")
+    names = in_order(suites)
+    if len(names) > 1:
+        if asked.reuse:
+            raise InputError("several suites share their runs by themselves: --reuse is for one")
+        charts = [_chart_of_suite(data, out / name, name, asked, out) for name in names]
+    elif names:
+        charts = [_chart_of_suite(data, out, names[0], asked)]
     else:
-        compared = contenders(methods, samplers)
-    protocol = Protocol(seconds, steps, learn_seconds, images)
-    named = {"methods": methods, "samplers": samplers, "seeds": seeds}
+        charts = [_chart_of_methods(data, out, methods, samplers, asked)]
+    return {chart.folder.path: _made(chart, runner_for) for chart in charts}
+
+
+def _chart_of_suite(
+    data: Path, out: Path, name: str, asked: Asked, beside: Path | None = None
+) -> Chart:
+    """The chart of a suite; `beside` is where the folders of other suites may be."""
+    suite, own = suite_of(name), suite_of(name).protocol
+    by_itself = asked.seconds is None and asked.steps is None
+    protocol = Protocol(
+        own.seconds if by_itself else asked.seconds,
+        own.steps if by_itself else asked.steps,
+        own.learn_seconds if by_itself and asked.learn_seconds is None else asked.learn_seconds,
+        asked.images,
+        at_once=own.at_once if asked.at_once is None else asked.at_once,
+    )
+    chart = Chart(
+        *(data, out, suite.contenders, asked.seeds, protocol, (name, suite.question)),
+        _command(data, protocol, asked, suite=name),
+        asked.reuse,
+    )
+    if beside is not None:
+        others = [beside / other for other in SUITES if other != name]
+        chart.reuse = fitting(others, chart.settings)
+    return chart
+
+
+def _chart_of_methods(
+    data: Path, out: Path, methods: Sequence[str], samplers: Sequence[str], asked: Asked
+) -> Chart:
+    compared = contenders(methods, samplers)
+    protocol = Protocol(
+        *(asked.seconds, asked.steps, asked.learn_seconds, asked.images),
+        at_once=1 if asked.at_once is None else asked.at_once,
+    )
+    command = _command(data, protocol, asked, methods=methods, samplers=samplers)
+    return Chart(data, out, compared, asked.seeds, protocol, None, command, asked.reuse)
+
+
+def _made(chart: Chart, runner_for: Callable[[Chart], Runner]) -> dict[str, Any]:
+    """What is missing of a chart is made, and all of it drawn."""
+    say = functools.partial(CONSOLE.print, markup=False, highlight=False)
+    suite = f"{chart.suite[0]}, " if chart.suite is not None else ""
+    with bar(f"{chart.scene['name']}, {suite}{chart.protocol.describe()} a run") as show:
+        chart.make(runner_for(chart), say, show)
+    return chart.draw()
+
+
+def _command(
+    data: Path,
+    protocol: Protocol,
+    asked: Asked,
+    suite: str | None = None,
+    methods: Sequence[str] = (),
+    samplers: Sequence[str] = (),
+) -> str:
     chosen = {
         "suite": suite,
-        "seconds": seconds,
-        "steps": steps,
-        "learn-seconds": learn_seconds,
-        "images": images,
+        "seconds": protocol.seconds,
+        "steps": protocol.steps,
+        "learn-seconds": protocol.learn_seconds,
+        "images": protocol.images,
+        "at-once": protocol.at_once if protocol.at_once > 1 or suite is not None else None,
     }
-    command = command_line(data, chosen, named)
-    chart = Chart(data, out, compared, seeds, protocol, about, command, reuse)
-    say = functools.partial(CONSOLE.print, markup=False, highlight=False)
-    with bar(f"{chart.scene['name']}, {protocol.describe()} a run") as show:
-        chart.make(runner_for(data, protocol, chart.folder), say, show)
-    return chart.draw()
+    return command_line(
+        data, chosen, {"methods": methods, "samplers": samplers, "seeds": asked.seeds}
+    )
 
 
 def command_line(

@@ -128,7 +128,8 @@ def read_settings(path: Path) -> dict[str, Any] | None:
         InputError: it cannot be read.
     """
     file = path / SETTINGS
-    return read_object(file) if file.is_file() else None
+    # runs came one after the other before charts noted how many there are at once
+    return {"at_once": 1, **read_object(file)} if file.is_file() else None
 
 
 def read_object(file: Path) -> dict[str, Any]:

@@ -3,22 +3,14 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Iterable
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-from leco_plugin.chart.contender import Contender
 from leco_plugin.evaluation.clock import Budget
 
 LEARN_SHARE = 0.4
 """Of the training time, at most, for learning an occupancy; short runs need most of that."""
-
-OVERHEAD_SECONDS = 40.0
-"""Start, evaluation and rendering of a run on two CPU cores, about: 26 to 40 on cities, 35 to 80 on
-a drone survey, whose images take an unguided run 17 to 24 s each."""
-GRIDS_SECONDS = 120.0
-"""Making grids from the field of a run, those of 512^3 cells among them, about."""
 
 
 @dataclass(frozen=True)
@@ -35,10 +27,17 @@ class Protocol:
     """Whole test images that are rendered at the end."""
     curve_points: int = 6
     """Looks at the test images while training, off the clock."""
+    at_once: int = 1
+    """Runs beside each other, which share the threads of the machine."""
 
     def __post_init__(self) -> None:
         self.budget()
-        for name, count in {"images": self.images, "curve points": self.curve_points}.items():
+        counts = {
+            "images": self.images,
+            "curve points": self.curve_points,
+            "runs at once": self.at_once,
+        }
+        for name, count in counts.items():
             if count < 1:
                 raise ValueError(f"at least one of the {name} is needed, not {count}")
 
@@ -57,18 +56,9 @@ class Protocol:
             learning,
         )
 
-    def minutes(self, contenders: Iterable[Contender]) -> float | None:
-        """About how long runs take on two CPU cores, one of each contender that is given.
-
-        None where only steps end them, whose time is not known.
-        """
-        if self.seconds is None:
-            return None
-        runs = [
-            one.budget * self.seconds + OVERHEAD_SECONDS + (GRIDS_SECONDS if one.grids else 0.0)
-            for one in contenders
-        ]
-        return sum(runs) / 60.0
+    def threads(self, of_machine: int) -> int:
+        """Of each run."""
+        return max(1, of_machine // self.at_once)
 
     def describe(self) -> str:
         """In a few words."""

@@ -28,13 +28,27 @@ def check_sources(sources: Sequence[Path], settings: Mapping[str, Any]) -> None:
         InputError: a folder holds no chart, or its runs are of another scene, time, evaluation,
             machine or version. What they were made for, a suite or none, is all that may differ.
     """
-    wanted = {name: value for name, value in settings.items() if name != "suite"}
     for source in sources:
         found = read_settings(source)
         if found is None:
             raise InputError(f"--reuse {source}: there is no chart in it")
-        if other := difference(found, wanted):
+        if other := difference(found, _shared(settings)):
             raise InputError(f"--reuse {source}: its runs have another {other}")
+
+
+def fitting(sources: Sequence[Path], settings: Mapping[str, Any]) -> list[Path]:
+    """Those of several folders that hold charts whose runs may stand beside those of one with
+    these settings."""
+    charts = [(source, read_settings(source)) for source in sources]
+    return [
+        source
+        for source, found in charts
+        if found is not None and difference(found, _shared(settings)) is None
+    ]
+
+
+def _shared(settings: Mapping[str, Any]) -> dict[str, Any]:
+    return {name: value for name, value in settings.items() if name != "suite"}
 
 
 def take_over(folder: ChartFolder, jobs: Sequence[Job], sources: Sequence[Path]) -> list[Job]:

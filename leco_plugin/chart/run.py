@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import datetime
+import threading
 from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
+from leco_plugin.chart import forecast
 from leco_plugin.chart.contender import Contender
 from leco_plugin.chart.folder import RESULTS, ChartFolder, Job
 from leco_plugin.chart.processes import RunFailed
@@ -65,14 +68,16 @@ class Chart:
         for seed in seeds:
             if not 0 <= seed < SEEDS:
                 raise InputError(f"a seed is a whole number from 0 to {SEEDS - 1}, not {seed}")
-        self.scene, self.machine = describe_scene(data), describe_machine()
+        self.data, self.scene, self.machine = data, describe_scene(data), describe_machine()
+        self.machine["threads"] = protocol.threads(self.machine["threads"])
         self.protocol, self.suite, self.command = protocol, suite, command
+        self.stop = threading.Event()
         self.contenders = list(contenders)
         self.jobs = jobs_of(contenders, seeds)
         name = suite[0] if suite is not None else None
-        settings = settings_of(self.scene, protocol, name, self.machine)
-        check_sources(reuse, settings)
-        self.folder = ChartFolder(out, settings)
+        self.settings = settings_of(self.scene, protocol, name, self.machine)
+        check_sources(reuse, self.settings)
+        self.folder = ChartFolder(out, self.settings)
         self.reuse = list(reuse)
 
     def missing(self) -> list[Job]:
@@ -84,7 +89,8 @@ class Chart:
         """Makes what is missing; whenever it is stopped, what was finished is kept.
 
         Args:
-            runner: makes one run, or raises `RunFailed`.
+            runner: makes one run, or raises `RunFailed`; asked in several threads where there are
+                several runs at once. It ends what is under way when `stop` is set.
             say: called with a line for each run.
             show: called with the share of all runs that is done.
         """
@@ -95,36 +101,64 @@ class Chart:
         if todo:
             say(self.forecast(todo))
         self.write()
-        for number, job in enumerate(todo):
-            done = len(self.jobs) - len(todo) + number
+        shares = {job.name: float(job not in todo) for job in self.jobs}
 
-            def show_share(share: float, done: int = done) -> None:
-                show((done + share) / len(self.jobs))
+        def make_one(job: Job) -> str:
+            def show_share(share: float) -> None:
+                shares[job.name] = share
+                show(sum(shares.values()) / len(shares))
 
             show_share(0.0)
-            title = f"seed {job.seed}, {job.contender.name}"
+            said = self._make_one(job, runner, show_share)
+            shares[job.name] = 1.0
+            return said
+
+        with ThreadPoolExecutor(self.protocol.at_once) as pool:
+            under_way: set[Future[str]] = set()
             try:
-                run = runner(job, show_share)
-            except RunFailed as failure:
-                self.folder.fail(job, str(failure))
-                say(f"{title}: failed: {failure}")
-            else:
-                self.folder.store(job, run, self._made())
-                say(
-                    f"{title}: {run['psnr']:.2f} dB after {run['train_seconds']:.0f} s, "
-                    f"{run['render_seconds_per_image']:.2f} s an image"
-                )
-            self.write()
+                for job in todo:
+                    under_way.add(pool.submit(make_one, job))
+                    if len(under_way) == self.protocol.at_once:
+                        self._collect(under_way, say)
+                while under_way:
+                    self._collect(under_way, say)
+            except BaseException:
+                self.stop.set()
+                raise
+
+    def _make_one(self, job: Job, runner: Runner, show: Callable[[float], None]) -> str:
+        """Makes a run and keeps it, or why there is none; returns a line about it."""
+        title = f"seed {job.seed}, {job.contender.name}"
+        try:
+            run = runner(job, show)
+        except RunFailed as failure:
+            if self.stop.is_set():  # its process was told to end when we were
+                raise KeyboardInterrupt from None
+            self.folder.fail(job, str(failure))
+            return f"{title}: failed: {failure}"
+        self.folder.store(job, run, self._made())
+        return (
+            f"{title}: {run['psnr']:.2f} dB after {run['train_seconds']:.0f} s, "
+            f"{run['render_seconds_per_image']:.2f} s an image"
+        )
+
+    def _collect(self, under_way: set[Future[str]], say: Say) -> None:
+        """Waits for one run, or more that end together, and takes them out."""
+        done, rest = wait(under_way, return_when=FIRST_COMPLETED)
+        under_way &= rest
+        for future in done:
+            say(future.result())
+        self.write()
 
     def forecast(self, todo: Sequence[Job]) -> str:
         """How many runs are to be made, and about how long that takes."""
-        minutes = self.protocol.minutes(job.contender for job in todo)
-        runs = _counted(len(todo), "run")
+        minutes = forecast.minutes((job.contender for job in todo), self.protocol)
+        runs = f"{_counted(len(todo), 'run')} of {self.protocol.describe()}"
+        beside = f", {self.protocol.at_once} at a time" if self.protocol.at_once > 1 else ""
         stored = len(self.jobs) - len(todo)
         there = f" ({stored} more are there already)" if stored else ""
-        if minutes is None:
-            return f"{runs} of {self.protocol.describe()}{there}"
-        return f"{runs}, about {max(minutes, 1.0):.0f} minutes on two CPU cores{there}"
+        about = _counted(max(1, round(minutes)), "minute")
+        return f"{runs}{beside}, about {about} on two CPU cores{there}"
 
     def results(self) -> dict[str, Any]:
         """All finished runs in the folder, the contenders of this call first."""

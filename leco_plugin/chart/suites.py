@@ -2,24 +2,34 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
+from leco_plugin.chart import forecast
 from leco_plugin.chart.contender import Contender
 from leco_plugin.chart.methods import GRID, LEARNED, NEVER_FROZEN, VARIANTS
 from leco_plugin.chart.protocol import Protocol
+from leco_plugin.evaluation.machine import usable_cores
 from leco_plugin.method_configs import LEARNING, ON_GPU, best_device
 from leco_plugin.models.guided_start import OWN_SAMPLER
 from leco_plugin.models.switch_sizes import switch_sizes_for
 from leco_plugin.scenes.input_error import InputError
 
 SCENE_LAYERS = LEARNING.sizes.field.experts.layers
-SCENE_EXPERTS = LEARNING.sizes.gate.scene_experts
 SWITCH_CELLS = switch_sizes_for(best_device()).grid_resolution
 """Of the grid that Switch-NeRF has by itself."""
 GRIDS = (128, 256, 512) if ON_GPU else (64, 128, 256)
 """Cells along an axis, learned beside the host; 512^3 would take two CPU cores all of a run."""
 MADE_GRIDS = (64, 128, 256, 512)
 """Made from one field, each from the one before, which costs less than training beside them."""
+STEPS = 2 * LEARNING.schedule.learn_steps
+"""Where the question is what was learned: learning has its half, and half of that again where a
+gate has not settled."""
+STEPS_SECONDS = 60.0
+"""That many on two CPU cores that do not share a run: 200 that learn, 37 s, and 200 guided ones."""
+AT_ONCE = 1 if ON_GPU else min(2, usable_cores())
+"""Runs beside each other: small tensors gain more by another run than by another thread."""
+ALL = "all"
 
 
 @dataclass(frozen=True)
@@ -29,17 +39,25 @@ class Suite:
     question: str
     """What it answers, and who asked."""
     contenders: tuple[Contender, ...]
-    seconds: float = 60.0
-    """Training time of a run without `--seconds`: half a minute of learning and as much guided."""
-    learn_seconds: float | None = 32.0
-    """Most of that for learning an occupancy, without `--seconds`; None is the usual share. Suites
-    that agree in both can share their runs."""
+    seconds: float | None = None
+    """Training time of a run, without `--seconds` and `--steps`."""
+    learn_seconds: float | None = None
+    """Most of that for learning an occupancy; None is the usual share."""
+
+    @property
+    def protocol(self) -> Protocol:
+        """Of its runs where nothing else is asked for. Suites that agree in it share runs."""
+        steps = STEPS if self.seconds is None else None
+        return Protocol(self.seconds, steps, self.learn_seconds, at_once=AT_ONCE)
+
+    @property
+    def on_two_cores(self) -> Protocol:
+        """The same for a forecast, whatever machine this is."""
+        return Protocol(self.seconds or STEPS_SECONDS, None, self.learn_seconds, at_once=2)
 
     def minutes(self, seeds: int = 3) -> float:
         """About how long all of it takes on two CPU cores."""
-        minutes = Protocol(self.seconds, None, self.learn_seconds).minutes(self.contenders)
-        assert minutes is not None
-        return seeds * minutes
+        return seeds * forecast.minutes(self.contenders, self.on_two_cores)
 
 
 def _leco(name: str, **changes: object) -> Contender:
@@ -112,13 +130,12 @@ SUITES = {
         "What do the losses of the gate do?",
         (
             _leco("contribution (ours)"),
-            _leco("ours without agreement", gate_loss__agreement=0.0),
             _paper("paper: imbalance and density"),
             _paper("paper without density loss", gate_loss__density=0.0),
             _paper(
                 "balanced as in Switch-NeRF",
                 gate_loss__density=0.0,
-                gate_loss__empty_ratio=1.0 / (1 + SCENE_EXPERTS),
+                gate_loss__empty_ratio=None,
             ),
         ),
     ),
@@ -130,20 +147,18 @@ SUITES = {
             replace(NEVER_FROZEN, name="never frozen"),
             replace(VARIANTS["leco-occupancy-homogeneous"], name="equal experts, no gate"),
         ),
-        seconds=120.0,
-        learn_seconds=None,
+        seconds=90.0,
+        learn_seconds=45.0,
     ),
     "enough-time": Suite(
         "Does it still pay with enough training time? (review 5)",
         (SWITCH_LEARNED, SWITCH_OWN, _switch_grid(SWITCH_CELLS)),
-        seconds=180.0,
-        learn_seconds=None,
+        seconds=120.0,
     ),
     "grid-resolution": Suite(
         "Is a finer occupancy grid as good? (review 1)",
         (SWITCH_LEARNED, *(_switch_grid(cells) for cells in GRIDS)),
-        seconds=180.0,
-        learn_seconds=None,
+        seconds=120.0,
     ),
 }
 """In an order in which each can take over most from those before it."""
@@ -156,5 +171,28 @@ def suite(name: str) -> Suite:
         InputError: there is none.
     """
     if name not in SUITES:
-        raise InputError(f"there is no suite {name!r}; there are {', '.join(SUITES)}")
+        raise InputError(f"there is no suite {name!r}; there are {', '.join(SUITES)}, and {ALL}")
     return SUITES[name]
+
+
+def in_order(names: Sequence[str]) -> list[str]:
+    """Names of suites, `all` among them or not, in the order of `SUITES`.
+
+    Raises:
+        InputError: there is no such suite.
+    """
+    for name in names:
+        if name != ALL:
+            suite(name)
+    return [name for name in SUITES if name in names or ALL in names]
+
+
+def minutes_together(names: Sequence[str], seeds: int = 3) -> float:
+    """About how long suites take on two CPU cores when each takes over what others have made."""
+    made: set[tuple[str, Protocol]] = set()
+    minutes = 0.0
+    for one in (SUITES[name] for name in names):
+        new = [c for c in one.contenders if (c.without_grids().key, one.protocol) not in made]
+        made |= {(contender.without_grids().key, one.protocol) for contender in new}
+        minutes += seeds * forecast.minutes(new, one.on_two_cores)
+    return minutes

@@ -216,6 +216,8 @@ def circumstances(results: Mapping[str, Any]) -> str:
         parts.append(f"{protocol['seconds']:g} s")
     if protocol["steps"] is not None:
         parts.append(f"{protocol['steps']} steps")
+    if (at_once := protocol.get("at_once", 1)) > 1:
+        where += f", {at_once} runs at a time"
     seeds = len({run["seed"] for run in results["runs"]})
     many = "one seed" if seeds == 1 else f"mean of {seeds} seeds (bands: least to most)"
     method = shared_method(list(dict.fromkeys(run["name"] for run in results["runs"])))

@@ -7,6 +7,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from leco_plugin.chart.settling import settling
 from leco_plugin.chart.summary import (
     COSTS,
     KEPT,
@@ -52,6 +53,8 @@ def table(results: Mapping[str, Any]) -> str:
     duels = rivals(lines)
     if duels:
         parts.append(versus_table(duels))
+    if results["suite"] and lines and results["protocol"]["seconds"] is not None:
+        parts.append(settling(lines))
     if results["failures"]:
         parts.append(failures_table(results["failures"]))
     if any(run.get("occupancy") for line in lines for run in line.runs):
@@ -61,7 +64,7 @@ def table(results: Mapping[str, Any]) -> str:
         parts += [representations_table(held), f"{sentence(verdict(held))}.{left_out(lines)}"]
     commit = f" at {made['commit']}" if made["commit"] else ""
     reused = sum(bool(run.get("reused")) for run in results["runs"])
-    taken = f" {reused} of the runs were made for other charts (`--reuse`)." if reused else ""
+    taken = f" {reused} of the runs were made for other charts." if reused else ""
     said = f"`{made['command']}`, {made['date']}, leco_plugin {made['version']}{commit}."
     parts.append(said + taken)
     return "\n\n".join(parts) + "\n"

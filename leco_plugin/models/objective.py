@@ -45,8 +45,9 @@ class GateLossConfig:
     """Weight of the balance among scene experts (logit form, and the homogeneous mixture)."""
     imbalance: float = 5e-3
     """lambda_g, weight of the imbalanced gate loss (paper form)."""
-    empty_ratio: float = 0.9
-    """rho, the target empty ratio (paper form)."""
+    empty_ratio: float | None = 0.9
+    """rho, the target empty ratio (paper form); None asks for equally many points at every expert,
+    as Switch-NeRF does."""
     density: float = 1.0
     """lambda_d, weight of the density loss (paper form)."""
 
@@ -151,8 +152,9 @@ def gate_losses(
     routes = routes.index_select(0, before)
     lengths = (intervals.t_ends - intervals.t_starts) / half_extent
     alphas = (1.0 - torch.exp(-shaded.sigmas * lengths)).index_select(0, before)
+    equal_shares = 1.0 / probabilities.shape[-1]
+    empty_ratio = equal_shares if config.empty_ratio is None else config.empty_ratio
     return {
-        "gate_loss": config.imbalance
-        * imbalanced_gate_loss(probabilities, routes, config.empty_ratio),
+        "gate_loss": config.imbalance * imbalanced_gate_loss(probabilities, routes, empty_ratio),
         "density_loss": config.density * density_loss(probabilities[:, 0], alphas),
     }

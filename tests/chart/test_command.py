@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 import json
+import os
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -14,8 +15,10 @@ import pytest
 from leco_plugin import cli
 from leco_plugin.chart import command
 from leco_plugin.chart.folder import Job
-from leco_plugin.chart.processes import RunFailed
-from leco_plugin.chart.suites import SUITES
+from leco_plugin.chart.processes import ProcessRunner, RunFailed
+from leco_plugin.chart.protocol import Protocol
+from leco_plugin.chart.run import Chart
+from leco_plugin.chart.suites import AT_ONCE, SUITES
 
 METHODS = ["--methods", "leco-occupancy", "leco-occupancy-never-frozen"]
 TIME = ["--seconds", 3]
@@ -37,8 +40,8 @@ def started(monkeypatch: pytest.MonkeyPatch) -> Started:
 
         return make
 
-    made = functools.partial(command.make_chart, runner_for=runner_for)
-    monkeypatch.setattr(command, "make_chart", made)
+    made = functools.partial(command.make_charts, runner_for=runner_for)
+    monkeypatch.setattr(command, "make_charts", made)
     return runs
 
 
@@ -64,16 +67,75 @@ def test_a_crash_half_way_is_a_row_the_others_finish_and_the_status_is_one(
 
 
 def test_how_long_it_takes_is_said_before_it_is_started(
-    started: Started, tiny_scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    started: Started,
+    tiny_scene: Path,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
+    monkeypatch.setattr(Chart, "draw", Chart.write)
     out = ["--data", tiny_scene, "--out", tmp_path / "chart", "--methods", "leco-occupancy"]
     assert run(*out, "--seconds", 75, "--seeds", 0, 1) == 0
-    assert "2 runs, about 4 minutes on two CPU cores" in capsys.readouterr().out
+    assert "2 runs of 75 s, about 4 minutes on two CPU cores" in capsys.readouterr().out
     assert run(*out, "--seconds", 75, "--seeds", 0, 1, 2) == 0
-    assert "1 run, about 2 minutes on two CPU cores (2 more are there" in capsys.readouterr().out
+    said = capsys.readouterr().out
+    assert "1 run of 75 s, about 2 minutes on two CPU cores (2 more are there" in said
     steps = ["--data", tiny_scene, "--out", tmp_path / "steps", "--methods", "leco-occupancy"]
     assert run(*steps, "--steps", 9, "--seeds", 0) == 0
-    assert "1 run of 9 steps" in capsys.readouterr().out
+    assert "1 run of 9 steps, about 1 minute on" in capsys.readouterr().out
+    beside = ["--data", tiny_scene, "--out", tmp_path / "beside", "--methods", "leco-occupancy"]
+    assert run(*beside, "--seconds", 75, "--at-once", 2) == 0
+    assert "3 runs of 75 s, 2 at a time, about 3 minutes on" in capsys.readouterr().out
+
+
+def test_several_suites_have_a_folder_each_and_none_makes_what_another_has_made(
+    started: Started, tiny_scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(Chart, "draw", Chart.write)
+    out = tmp_path / "charts"
+    arguments = ["--data", tiny_scene, "--out", out, "--seeds", 0]
+    names = ["losses", "empty-expert", "representations"]
+    assert run(*arguments, "--suite", *names, "--json", tmp_path / "all.json") == 0
+    shown = {name: {one.name for one in SUITES[name].contenders} for name in names}
+    stored = json.loads((tmp_path / "all.json").read_text())["charts"]
+    for name in names:
+        assert {one["name"] for one in stored[name]["runs"]} == shown[name]
+        assert stored[name] == json.loads((out / name / "results.json").read_text())
+        words = stored[name]["made"]["command"]
+        assert f"--suite {name} --steps" in words and f"--at-once {AT_ONCE}" in words
+    keys = {one.without_grids().key for name in names for one in SUITES[name].contenders}
+    assert len(started) == len(keys)
+    assert run(*arguments, "--suite", *names) == 0 and len(started) == len(keys)
+    assert run(*arguments, "--suite", "freeze", "losses", "--seconds", 7) == 2  # losses had steps
+    assert len(started) == len(keys)
+
+
+def test_all_suites_are_every_suite(
+    started: Started, tiny_scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(Chart, "draw", Chart.write)
+    out = tmp_path / "charts"
+    assert run("--data", tiny_scene, "--out", out, "--suite", "all", "--seeds", 0) == 1
+    assert {path.name for path in out.iterdir()} == set(SUITES)
+    crashing = {("never frozen", 0), ("equal experts, no gate", 0)}  # as this stand-in has it
+    assert crashing <= set(started) and len(started) == len(set(started))
+
+
+def test_runs_beside_each_other_share_the_threads_of_the_machine(
+    tiny_scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    machine = {"cpu": "x", "cores": 8, "threads": 8, "device": "cpu"}
+    monkeypatch.setattr("leco_plugin.chart.run.describe_machine", lambda: dict(machine))
+    threads = {}
+    for at_once in (1, 2, 16):
+        protocol = Protocol(1.0, at_once=at_once)
+        one = SUITES["losses"].contenders[0]
+        made = Chart(tiny_scene, tmp_path / str(at_once), [one], (0,), protocol)
+        runner = command.processes(made)
+        assert isinstance(runner, ProcessRunner) and runner.stop is made.stop
+        threads[at_once] = made.machine["threads"], runner.environment.get("OMP_NUM_THREADS")
+    assert threads[2] == (4, "4") and threads[16] == (1, "1")
+    assert threads[1] == (8, os.environ.get("OMP_NUM_THREADS"))
 
 
 def test_the_stored_command_makes_the_same_runs(
@@ -105,6 +167,8 @@ BAD = {
     "not -1": [*METHODS, *TIME, "--seeds", -1],
     "there is no chart in it": [*METHODS, *TIME, "--reuse", "no-such"],
     "at least one of the images": [*METHODS, *TIME, "--images", 0],
+    "at least one of the runs at once": [*METHODS, *TIME, "--at-once", 0],
+    "share their runs by themselves": ["--suite", "losses", "freeze", "--reuse", "no-such"],
 }
 
 

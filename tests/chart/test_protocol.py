@@ -33,6 +33,7 @@ def test_without_a_time_learning_is_left_to_the_method() -> None:
         {"seconds": 1.0, "learn_seconds": 0.0},
         {"seconds": 1.0, "images": 0},
         {"seconds": 1.0, "curve_points": 0},
+        {"seconds": 1.0, "at_once": 0},
     ],
 )
 def test_no_time_is_refused_in_a_line(values: dict[str, float]) -> None:
@@ -57,3 +58,9 @@ def test_settings_hold_what_makes_runs_comparable() -> None:
     settings = settings_of({"name": "city"}, Protocol(10.0), "losses", {"cores": 2})
     assert {"scene", "seconds", "steps", "images", "suite", "machine"} <= settings.keys()
     assert "seeds" not in settings and "methods" not in settings
+
+
+def test_runs_beside_each_other_have_equally_many_threads_and_at_least_one() -> None:
+    assert Protocol(1.0).threads(6) == 6
+    assert Protocol(1.0, at_once=4).threads(6) == 1
+    assert Protocol(1.0, at_once=9).threads(6) == 1

@@ -14,6 +14,7 @@ import pytest
 from leco_plugin.chart.contender import Contender
 from leco_plugin.chart.folder import RUNS, Job
 from leco_plugin.chart.protocol import Protocol
+from leco_plugin.chart.reuse import fitting
 from leco_plugin.chart.run import Chart
 from leco_plugin.scenes.input_error import InputError
 
@@ -129,3 +130,30 @@ def test_a_chart_with_other_settings_gives_no_runs(tiny_scene: Path, tmp_path: P
     with pytest.raises(InputError, match="there is no chart"):
         made(tiny_scene, tmp_path / "b", PLAIN, reuse=[tmp_path])
     assert not (tmp_path / "b").exists()
+
+
+def test_charts_that_fit_are_found_among_folders_that_may_hold_none(
+    tiny_scene: Path, tmp_path: Path
+) -> None:
+    made(tiny_scene, tmp_path / "a", PLAIN, seeds=(0,))
+    made(tiny_scene, tmp_path / "long", PLAIN, seeds=(0,), protocol=Protocol(11.0))
+    made(tiny_scene, tmp_path / "beside", PLAIN, seeds=(0,), protocol=Protocol(10.0, at_once=2))
+    suite = Chart(
+        tiny_scene, tmp_path / "b", [PLAIN], (0,), Protocol(10.0), suite=("losses", "What?")
+    )
+    folders = [tmp_path / name for name in ("long", "no-such", "a", "beside")]
+    assert fitting(folders, suite.settings) == [tmp_path / "a"]
+
+
+def test_charts_from_before_runs_could_be_beside_each_other_had_one_at_a_time(
+    tiny_scene: Path, tmp_path: Path
+) -> None:
+    made(tiny_scene, tmp_path / "a", PLAIN, seeds=(0,))
+    file = tmp_path / "a" / "settings.json"
+    settings = json.loads(file.read_text())
+    assert settings.pop("at_once") == 1
+    file.write_text(json.dumps(settings))
+    _, runner, _ = made(tiny_scene, tmp_path / "b", PLAIN, seeds=(0,), reuse=[tmp_path / "a"])
+    assert not runner.made
+    with pytest.raises(InputError, match="another at once"):
+        made(tiny_scene, tmp_path / "a", PLAIN, protocol=Protocol(10.0, at_once=2))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import threading
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -52,6 +53,42 @@ def test_contenders_take_turns_within_a_seed(tiny_scene: Path, tmp_path: Path) -
     runner = Runner()
     make(chart(tiny_scene, tmp_path), runner)
     assert runner.made == [(name, seed) for seed in SEEDS for name in "abc"]
+
+
+def test_runs_at_once_are_under_way_beside_each_other(tiny_scene: Path, tmp_path: Path) -> None:
+    meet = threading.Barrier(2, timeout=30)
+    runner, shares = Runner(), []
+
+    def two_at_a_time(job: Job, show: Callable[[float], None]) -> dict[str, Any]:
+        meet.wait()
+        show(0.5)
+        return runner(job, show)
+
+    made = chart(tiny_scene, tmp_path, protocol=Protocol(10.0, at_once=2))
+    said: list[str] = []
+    made.make(two_at_a_time, say=said.append, show=shares.append)
+    assert sorted(runner.made) == sorted((name, seed) for seed in SEEDS for name in "abc")
+    assert [(run["name"], run["seed"]) for run in made.results()["runs"]] == [
+        (name, seed) for name in "abc" for seed in SEEDS
+    ]
+    assert "6 runs of 10 s, 2 at a time, about 3 minutes" in said[0] and len(said) == 7
+    assert min(shares) >= 0.0 and 0.8 < max(shares) <= 1.0
+
+
+def test_stopping_ends_the_runs_beside_and_none_of_them_is_a_failure(
+    tiny_scene: Path, tmp_path: Path
+) -> None:
+    made = chart(tiny_scene, tmp_path, protocol=Protocol(10.0, at_once=2))
+
+    def stopped(job: Job, show: Callable[[float], None]) -> dict[str, Any]:
+        if job.contender.name == "a":
+            raise KeyboardInterrupt
+        assert made.stop.wait(30)
+        raise RunFailed("the process was ended by SIGINT")
+
+    with pytest.raises(KeyboardInterrupt):
+        made.make(stopped, say=lambda line: None, show=lambda share: None)
+    assert not made.folder.failures() and len(made.missing()) == 6
 
 
 @pytest.mark.parametrize("stops_at", range(6))

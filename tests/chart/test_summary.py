@@ -84,6 +84,10 @@ def test_the_headline_names_the_leader_and_its_lead() -> None:
 def test_the_method_that_all_share_is_named_once_and_with_the_scene() -> None:
     shared = results(run("NGP + a", psnr=20.0), run("NGP + b", psnr=21.5))
     assert circumstances(shared) == "NGP on city, 10 s of training on 2 CPU cores, one seed"
+    beside = shared | {"protocol": {"seconds": None, "steps": 400, "at_once": 2}}
+    assert circumstances(beside) == (
+        "NGP on city, 400 steps of training on 2 CPU cores, 2 runs at a time, one seed"
+    )
     mixed = results(run("NGP + a"), run("LeCO, b", 1))
     assert circumstances(mixed) == (
         "city, 10 s of training on 2 CPU cores, mean of 2 seeds (bands: least to most)"

@@ -65,7 +65,7 @@ def test_the_command_and_the_question_are_there() -> None:
 def test_runs_of_other_charts_are_counted() -> None:
     assert "other charts" not in table(results(run("A"), run("B")))
     text = table(results(run("A"), run("B", reused=True), run("B", 1, reused=True)))
-    assert "2 of the runs were made for other charts (`--reuse`)." in text
+    assert "2 of the runs were made for other charts." in text
 
 
 def test_representations_say_on_which_front_they_are_and_whether_ours_is() -> None:

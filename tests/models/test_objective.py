@@ -65,6 +65,15 @@ def test_the_papers_form_is_its_two_losses_of_all_samples_before_the_backdrop() 
         torch.testing.assert_close(found[name], expected[name])
 
 
+def test_without_a_target_ratio_all_experts_are_to_get_equally_many_points() -> None:
+    shaded, intervals = batch()
+    open_ratio, equal = (
+        losses_of(GateLossConfig(form="paper", empty_ratio=ratio), shaded, intervals)
+        for ratio in (None, 1.0 / shaded.logits.shape[-1])
+    )
+    torch.testing.assert_close(open_ratio, equal)
+
+
 @pytest.mark.parametrize("form", ["logit", "paper"])
 def test_each_weight_scales_its_own_loss(form: str) -> None:
     shaded, intervals = batch()
