@@ -35,7 +35,7 @@ UNITS_PER_FEATURE = 1.5
 FEWEST_CELLS, FEWEST_ENTRIES, FEWEST_OCTAVES = 64, 10, 2
 """Least finest cells, binary logarithm of the table's entries, and octaves of the gate."""
 GRANULE = 16
-"""Widths are multiples of this."""
+"""Widths and finest cells are multiples of this."""
 SHARE_OF_MEMORY = 1 / 8
 """Most of the device's memory that automatic sizes take for weights and what trains them."""
 
@@ -137,8 +137,8 @@ def _filled(wanted: Sizes, most: Sizes, detail: SceneDetail | None) -> Sizes:
 
 
 def finest_cells(across: float, most: EncodingConfig) -> int:
-    """Cells no larger than a footprint, a power of two of them along the cube."""
-    wanted = 1 << math.ceil(math.log2(max(1.0, min(across, most.finest))))
+    """Cells no larger than a footprint, in sixteens."""
+    wanted = GRANULE * math.ceil(min(across, most.finest) / GRANULE)
     return max(FEWEST_CELLS, min(wanted, most.finest))
 
 
@@ -225,7 +225,7 @@ def explain(
     an_expert = f"one for {TEXELS_PER_EXPERT:,} texels"
     a_period = f"a period of {CELLS_PER_PERIOD} finest cells"
     rows = (
-        row("finest cells", "field.encoding.finest", "a power of two above the texels a side"),
+        row("finest cells", "field.encoding.finest", "no larger than a texel"),
         row("levels", "field.encoding.levels", "up to the finest cells"),
         row("hash table", "field.encoding.log2_table", table_reason, power=True),
         row("scene experts", "field.experts.scene_experts", an_expert),
