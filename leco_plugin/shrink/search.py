@@ -10,6 +10,7 @@ import math
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, field
+from itertools import pairwise
 from typing import Any, NamedTuple
 
 import torch
@@ -23,7 +24,9 @@ from leco_plugin.shrink.ladder import ladder, name_of, values_of
 from leco_plugin.shrink.references import Part, Reference, declared
 from leco_plugin.shrink.teaching import Lesson, round_weights, teach
 
-STEPS = 1200
+STEPS, LONGER, NEARLY = 1200, 3, 3.0
+"""Of teaching; how many times as many a gate gets that nearly holds, and what that means: a loss of
+so many times what the search allows."""
 EMPHASIS, WEIGHT_AT_FULL = 8.0, 0.05
 """How much dearer a candidate is that carries rendering weight, and from which weight on fully."""
 MARGIN = 0.5
@@ -101,38 +104,42 @@ def search(
     kept = query_in_parts(ground.original, volume) >= ground.original.threshold
     lesson = lesson_of(ground.original, ground.taught)
     rungs: list[Rung] = []
+    show = on_progress or (lambda share: None)
     for number, config in enumerate(gates):
-
-        def show(share: float, done: int = number) -> None:
-            if on_progress is not None:
-                on_progress((done + share) / len(gates))
-
         started = time.monotonic()
-        gate = round_weights(
-            teach(config, lesson, STEPS, ground.original.precision, 0, on_progress=show)
-        )
-        smaller, rung = _measured(
-            ground,
-            Occupancy(
-                gate,
-                ground.original.space,
-                0.5,
-                ground.original.precision,
-                walls=ground.original.walls,
-            )
-            .to(ground.original.threshold_value.device)
-            .eval(),
-            bounds,
-            volume,
-            kept,
-        )
+        parts = [(number + done) / len(gates) for done in (0.0, 1.0 / (1 + LONGER), 1.0)]
+        for times, part in zip((1, LONGER), pairwise(parts)):
+            gate = _taught(config, lesson, times * STEPS, ground.original, part_of(show, *part))
+            rung = _measured(ground, gate, bounds, volume, kept)
+            nearly = rung.lost_surface_mass <= NEARLY * MARGIN * bounds.lost_surface_mass
+            if rung.verdict == "chosen" or not nearly:
+                break
+        show(parts[-1])
         rung.seconds = round(time.monotonic() - started, 2)
         rungs.append(rung)
         if on_rung is not None:
             on_rung(rung)
         if rung.verdict == "chosen":
-            return Found(smaller, rungs)
+            return Found(gate, rungs)
     return Found(None, rungs)
+
+
+def part_of(show: Callable[[float], None], first: float, last: float) -> Callable[[float], None]:
+    """Shows the progress of a part that goes from `first` to `last` of all."""
+    return lambda share: show(first + share * (last - first))
+
+
+def _taught(
+    config: GateConfig,
+    lesson: Lesson,
+    steps: int,
+    original: Occupancy,
+    on_progress: Callable[[float], None],
+) -> Occupancy:
+    """A gate in the original's place, without a threshold of its own yet."""
+    gate = round_weights(teach(config, lesson, steps, original.precision, on_progress=on_progress))
+    smaller = Occupancy(gate, original.space, 0.5, original.precision, walls=original.walls)
+    return smaller.to(original.threshold_value.device).eval()
 
 
 def check_room(original: Occupancy, bounds: Bounds) -> None:
@@ -174,8 +181,8 @@ def lesson_of(original: Occupancy, taught: Evidence) -> Lesson:
 
 def _measured(
     ground: Ground, smaller: Occupancy, bounds: Bounds, volume: Tensor, kept: Tensor
-) -> tuple[Occupancy, Rung]:
-    """The gate with the threshold that suits it, and what was found."""
+) -> Rung:
+    """Gives the gate the threshold that suits it; what was found."""
     scores = [
         query_in_parts(smaller, reference.search.evidence.positions)
         for reference in ground.references
@@ -202,17 +209,17 @@ def _measured(
     rung = Rung(name_of(config), params, 2 * params, round(ratio, 4), max(losses), None, "", 0.0)
     if not holds:
         rung.verdict = "loses too much"
-        return smaller, rung
+        return rung
     if ratio > VOLUMES[-1] + 0.005:
         rung.verdict = "keeps too much"
-        return smaller, rung
+        return rung
     prices = [price_of(reference, reference.search, smaller) for reference in ground.references]
     rung.image_price_db = worst(prices)
     if (rung.image_price_db or 0.0) > bounds.image_price_db:
         rung.verdict = "costs too much of the image"
-        return smaller, rung
+        return rung
     rung.verdict = "chosen" if _verified(ground, smaller, bounds, rung) else "fails on unseen rays"
-    return smaller, rung
+    return rung
 
 
 def price_of(reference: Reference, part: Part, smaller: Occupancy) -> float | None:

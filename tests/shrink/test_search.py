@@ -161,3 +161,30 @@ def test_places_anywhere_are_taught_too() -> None:
     inside = query_in_parts(known, known.space.unmap(lesson.mapped)) >= known.threshold
     assert float((inside == (lesson.keep > 0)).float().mean()) > 0.999
     assert float(lesson.keep.max()) > 1.5 and whole_box(known).low.tolist() == [-1.0, 0.0, -1.5]
+
+
+def test_a_gate_that_nearly_holds_is_taught_for_longer(monkeypatch: pytest.MonkeyPatch) -> None:
+    """And one that is far from it is not, which is most of the time of a search."""
+    taught: list[tuple[int, int]] = []
+    real = searching.teach
+
+    def teach(config: GateConfig, lesson: object, steps: int, *rest: object, **named: object):
+        taught.append((config.width, steps))
+        return real(config, lesson, 20 if config.width == ENOUGH.width else steps, *rest, **named)
+
+    monkeypatch.setattr(searching, "teach", teach)
+    loss_of = {TOO_SMALL.width: 0.5, ENOUGH.width: 1e-3}
+    measured = searching._measured
+
+    def known_loss(known: Ground, gate: Occupancy, *rest: object) -> Rung:
+        rung = measured(known, gate, *rest)
+        lost = loss_of[gate.gate.config.width]
+        return replace(rung, lost_surface_mass=lost, verdict="loses too much")
+
+    monkeypatch.setattr(searching, "_measured", known_loss)
+    shares: list[float] = []
+    search(ground(original()), Bounds(1e-3), [TOO_SMALL, ENOUGH], on_progress=shares.append)
+    steps = searching.STEPS
+    once, longer = (ENOUGH.width, steps), (ENOUGH.width, searching.LONGER * steps)
+    assert taught == [(TOO_SMALL.width, steps), once, longer]
+    assert shares == sorted(shares) and shares[-1] == 1.0
