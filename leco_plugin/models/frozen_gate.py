@@ -43,7 +43,8 @@ class FrozenGate(NamedTuple):
     """Weight and bias of each hidden layer, in the type of the products."""
     head: Tensor
     """float32 [n + 1, width]: scene logits above the empty one, of features less their mean and
-    over the length of what is left; in the last row the mean, as a part of the features' length."""
+    over the length of what is left; in the last row the mean, as a part of the features' length,
+    unless the gate has no norm."""
     shift: Tensor
     """float32 [n, 1]: what is added to those logits."""
 
@@ -66,7 +67,7 @@ def occupancy_of(gate: Gate, mapped: Tensor, dtype: torch.dtype) -> Tensor:
         features = _encoded(gate.encoding, mapped, dtype)
         for weight, bias in frozen.layers:
             features = _layer(features, weight, bias)
-        return _occupancy(frozen, features.float(), gate.norm.eps)[:count]
+        return _occupancy(_logits(frozen, features.float(), gate))[:count]
 
 
 def _encoded(encoding: Encoding, mapped: Tensor, dtype: torch.dtype) -> Tensor:
@@ -82,17 +83,24 @@ def _layer(features: Tensor, weight: Tensor, bias: Tensor) -> Tensor:
     return one_pass(features, weight, bias)
 
 
-def _occupancy(frozen: FrozenGate, features: Tensor, epsilon: float) -> Tensor:
-    """Norm, last layer and 1 - softmax: features [N, width] float32 to [N]."""
+def _logits(frozen: FrozenGate, features: Tensor, gate: Gate) -> Tensor:
+    """How far scene experts lie above emptiness: features [N, width] float32 to [B, n, N / B]."""
     count, width = features.shape
     blocks = math.gcd(count, BLOCKS)
     columns = features.view(blocks, count // blocks, width).transpose(1, 2)
-    sums = torch.bmm(frozen.head.expand(blocks, -1, -1), columns)
+    head = frozen.head.expand(blocks, -1, -1)
+    if not gate.config.normed:
+        return torch.baddbmm(frozen.shift, head, columns)
+    sums = torch.bmm(head, columns)
     above, mean = sums[:, :-1], sums[:, -1]
     square = torch.linalg.vector_norm(features, dim=1).square_().view_as(mean)
-    square = square.addcmul_(mean, mean, value=-1.0).clamp_(min=0.0).add_(width * epsilon)
-    logits = torch.addcmul(frozen.shift, above, square.rsqrt_()[:, None])
-    if len(frozen.shift) == 1:
+    square.addcmul_(mean, mean, value=-1.0).clamp_(min=0.0).add_(width * gate.norm.eps)
+    return torch.addcmul(frozen.shift, above, square.rsqrt_()[:, None])
+
+
+def _occupancy(logits: Tensor) -> Tensor:
+    """1 - softmax of what `_logits` returns, [N]."""
+    if logits.shape[1] == 1:
         return logits.view(-1).sigmoid_()
     odds = logits.clamp_(max=LARGEST_LOGIT).exp_().sum(dim=1).view(-1)
     return odds / (odds + 1.0)
@@ -113,9 +121,12 @@ def frozen_gate(gate: Gate, dtype: torch.dtype) -> FrozenGate:
         weight = gate.head.weight.float()
         constant = weight @ gate.norm.bias.float() + gate.head.bias.float()
         head = _above_empty(weight * gate.norm.weight.float())
+        head = head - head.mean(dim=1, keepdim=True)
         length = math.sqrt(head.shape[1])
-        head = (head - head.mean(dim=1, keepdim=True)) * length
-        head = torch.cat([head, torch.full_like(head[:1], 1.0 / length)])
+        if gate.config.normed:
+            head = torch.cat([head * length, torch.full_like(head[:1], 1.0 / length)])
+        else:
+            head = head / math.sqrt(gate.norm.eps)
         held = tuple(value.detach() for value in sources)
         found[dtype] = FrozenGate(held, state, hidden, head, _above_empty(constant[:, None]))
     return found[dtype]

@@ -5,6 +5,7 @@ Torch only, so that a frozen gate can be used without nerfstudio.
 
 from __future__ import annotations
 
+import math
 from dataclasses import asdict, dataclass, field
 from itertools import pairwise
 from typing import get_args
@@ -31,6 +32,9 @@ class GateConfig:
     """Hidden layers."""
     scene_experts: int = 4
     """n: logits beside the one of the empty-space expert."""
+    normed: bool = True
+    """Whether the last layer sees features of one length. Where it does not, their mean is still
+    taken off; that is cheaper to ask on a CPU."""
 
     def to_dict(self) -> dict[str, object]:
         return asdict(self)
@@ -47,6 +51,11 @@ class GateConfig:
             raise TypeError(f"the gate's encoding must be a mapping, got {type(encoding).__name__}")
         return GateConfig(**{**values, "encoding": EncodingConfig(**encoding)})  # type: ignore[arg-type]
 
+
+NO_LENGTH = 2.0**26
+"""Epsilon of a norm that leaves lengths as they are: the features' variance is nothing beside it,
+and its root, by which the norm's scale begins, is exact. Whoever computes the norm as it is defined
+has the same logits."""
 
 MOST_VALUES = 15 * 2**20
 """Learned values of the largest gate: 60 MiB, which `occupancy.LARGEST_FILE` has room for."""
@@ -69,11 +78,13 @@ def check_sizes(config: GateConfig) -> None:
     """Refuses a gate that cannot be built or saved, before anything of it is allocated.
 
     Raises:
-        ValueError: an unknown kind of encoding, a size that is no whole number or out of range, or
-            more than `MOST_VALUES` learned values. One line.
+        ValueError: an unknown kind of encoding, a size that is no whole number or out of range, a
+            norm that is neither there nor not, or more than `MOST_VALUES` learned values. One line.
     """
     if config.encoding.kind not in get_args(Kind):
         raise ValueError(f"the gate's encoding is of an unknown kind {config.encoding.kind!r}")
+    if type(config.normed) is not bool:
+        raise ValueError(f"the gate's normed is {config.normed!r}, neither true nor false")
     sizes = {**vars(config), **vars(config.encoding)}
     for name, largest in LARGEST_SIZES.items():
         if type(sizes[name]) is not int or not 0 < sizes[name] <= largest:
@@ -96,7 +107,9 @@ class Gate(nn.Module):
         self.encoding = build_encoding(config.encoding)
         widths = [self.encoding.out_dim] + [config.width] * config.layers
         self.hidden = nn.ModuleList(nn.Linear(a, b) for a, b in pairwise(widths))
-        self.norm = nn.LayerNorm(widths[-1])
+        self.norm = nn.LayerNorm(widths[-1], eps=1e-5 if config.normed else NO_LENGTH)
+        if not config.normed:
+            nn.init.constant_(self.norm.weight, math.sqrt(NO_LENGTH))
         self.head = nn.Linear(widths[-1], 1 + config.scene_experts)
 
     def forward(self, mapped: Tensor) -> Tensor:

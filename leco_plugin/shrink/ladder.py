@@ -18,7 +18,8 @@ PLANES = ((16, 2), (32, 2), (64, 2), (64, 4), (128, 4))
 
 def ladder(most_values: int) -> list[GateConfig]:
     """Gates with fewer values than given, by their number; one scene expert, for o(x) is all that
-    is asked of an occupancy."""
+    is asked of an occupancy. Of each size first the one without a norm, which answers sooner, but
+    is no match for the other where there are few octaves."""
     gates = [
         GateConfig(EncodingConfig(octaves=octaves), width, layers, 1)
         for octaves, width, layers in FREQUENCY
@@ -30,7 +31,8 @@ def ladder(most_values: int) -> list[GateConfig]:
             GateConfig(replace(planes, kind="vm", components=features), 16, 1, 1),
         ]
     counted = sorted((values_of(gate), i) for i, gate in enumerate(gates))
-    return [gates[i] for values, i in counted if values < most_values]
+    chosen = [gates[i] for values, i in counted if values < most_values]
+    return [replace(gate, normed=normed) for gate in chosen for normed in (False, True)]
 
 
 def values_of(config: GateConfig) -> int:
@@ -50,4 +52,5 @@ def name_of(config: GateConfig) -> str:
         "vm": f"VM {encoding.components} x {encoding.plane_cells}",
         "k-planes": f"K-planes {encoding.levels} x {encoding.features} x {encoding.plane_cells}",
     }
-    return f"{sizes[encoding.kind]}, {config.layers} x {config.width}"
+    norm = ", normed" if config.normed else ""
+    return f"{sizes[encoding.kind]}, {config.layers} x {config.width}{norm}"

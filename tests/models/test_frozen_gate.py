@@ -16,9 +16,11 @@ STATED = {"float32": 1e-5, "bfloat16": 1e-2}
 """How far o may lie from the gate's: products of another order round a unit to its neighbour."""
 
 
-def gate_of(kind: str = "frequency", scale: float = 1.0, experts: int = 3) -> Gate:
+def gate_of(
+    kind: str = "frequency", scale: float = 1.0, experts: int = 3, normed: bool = True
+) -> Gate:
     torch.manual_seed(0)
-    gate = Gate(GateConfig(ENCODINGS[kind], width=24, layers=3, scene_experts=experts))
+    gate = Gate(GateConfig(ENCODINGS[kind], 24, 3, experts, normed))
     with torch.no_grad():
         for parameter in gate.parameters():
             parameter += 0.2 * torch.randn_like(parameter)
@@ -40,10 +42,10 @@ def slow_occupancy(gate: Gate, mapped: Tensor) -> Tensor:
 
 
 @pytest.mark.parametrize("kind", ENCODINGS)
-@pytest.mark.parametrize("experts", [1, 3])
+@pytest.mark.parametrize(("experts", "normed"), [(1, True), (3, True), (1, False), (3, False)])
 @pytest.mark.parametrize("count", [0, 1, 1003])
-def test_answers_are_those_of_the_definition(kind, experts, count) -> None:
-    gate, mapped = gate_of(kind, experts=experts), torch.rand(count, 3) * 2 - 1
+def test_answers_are_those_of_the_definition(kind, experts, normed, count) -> None:
+    gate, mapped = gate_of(kind, experts=experts, normed=normed), torch.rand(count, 3) * 2 - 1
     expected = slow_occupancy(gate, mapped).float()
     values = occupancy_of(gate, mapped, torch.float32)
     torch.testing.assert_close(values, expected, rtol=0, atol=STATED["float32"])
@@ -63,9 +65,9 @@ def test_answers_are_the_gates_in_its_precision(kind, precision, alone, monkeypa
     torch.testing.assert_close(values, expected, rtol=0, atol=STATED[precision])
 
 
-@pytest.mark.parametrize("experts", [1, 3])
-def test_a_gate_that_is_sure_of_emptiness_keeps_its_digits(experts) -> None:
-    gate, mapped = gate_of(experts=experts), torch.rand(1000, 3) * 2 - 1
+@pytest.mark.parametrize(("experts", "normed"), [(1, True), (3, True), (3, False)])
+def test_a_gate_that_is_sure_of_emptiness_keeps_its_digits(experts, normed) -> None:
+    gate, mapped = gate_of(experts=experts, normed=normed), torch.rand(1000, 3) * 2 - 1
     with torch.no_grad():
         gate.head.bias[0] += 40.0
     values, expected = occupancy_of(gate, mapped, torch.float32), slow_occupancy(gate, mapped)

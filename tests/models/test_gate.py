@@ -61,6 +61,11 @@ def test_with_a_threshold_exactly_the_points_below_it_are_empty(seed: int, below
     assert torch.equal(routes[on_scene], logits[on_scene, 1:].argmax(dim=-1) + 1)
 
 
+def test_a_norm_that_is_neither_there_nor_not_is_refused() -> None:
+    with pytest.raises(ValueError, match="neither true nor false"):
+        check_sizes(replace(GateConfig(), normed="no"))  # type: ignore[arg-type]
+
+
 @pytest.mark.parametrize("kind", ENCODINGS)
 def test_a_gate_answers_for_every_point_also_for_none(kind) -> None:
     gate = Gate(GateConfig(ENCODINGS[kind], width=8, scene_experts=3))
@@ -73,16 +78,28 @@ def test_logits_are_float32_under_autocast() -> None:
         assert Gate(GateConfig(width=8))(torch.rand(5, 3)).dtype == torch.float32
 
 
+def test_without_a_norm_features_keep_their_lengths() -> None:
+    torch.manual_seed(0)
+    gate, mapped = Gate(GateConfig(width=16, normed=False)), torch.rand(100, 3) * 2 - 1
+    features = gate.encoding(mapped)
+    for layer in gate.hidden:
+        features = torch.relu(layer(features))
+    centred = features - features.mean(dim=1, keepdim=True)
+    expected = centred @ gate.head.weight.T + gate.head.bias
+    torch.testing.assert_close(gate(mapped), expected, rtol=1e-5, atol=1e-6)
+
+
 def test_a_configuration_survives_its_dictionary() -> None:
     config = GateConfig(EncodingConfig("hash", levels=3), width=17, scene_experts=5)
     assert GateConfig.from_dict(config.to_dict()) == config
 
 
-def test_a_dictionary_from_before_there_were_planes_is_read() -> None:
+def test_a_dictionary_from_before_there_were_planes_and_a_choice_of_norms_is_read() -> None:
     config = GateConfig(EncodingConfig("hash", levels=3))
     values = config.to_dict()
     for name in ("components", "plane_cells"):
         del values["encoding"][name]  # type: ignore[attr-defined]
+    del values["normed"]
     assert GateConfig.from_dict(values) == config
 
 
