@@ -227,7 +227,7 @@ def line_of(rung: Rung) -> str:
     """A rung as a line of the table."""
     price = "     -" if rung.image_price_db is None else f"{rung.image_price_db:+6.3f}"
     return (
-        f"{rung.name:<36}{rung.params:>8} values {rung.bytes / 1000:>7.1f} kB  loses "
+        f"{rung.name:<28}{rung.params:>8} values {rung.bytes / 1000:>7.1f} kB  loses "
         f"{rung.lost_surface_mass:.1e}  {price} dB  keeps {rung.kept_volume:>6.1%} of the "
         f"original's volume  {rung.verdict}"
     )

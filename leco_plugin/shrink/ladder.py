@@ -12,16 +12,17 @@ FREQUENCY = (
     *((6, 32, 2), (6, 32, 3), (6, 48, 3), (6, 64, 3), (8, 64, 3), (8, 96, 3), (8, 128, 4)),
 )
 """Octaves, width and layers of gates on frequencies."""
+ENOUGH_OCTAVES = 5
+"""From so many on, a gate without a norm decides as well as one with it, and answers sooner."""
 PLANES = ((16, 2), (32, 2), (64, 2), (64, 4), (128, 4))
 """Cells, and features or components, of gates on K-planes and on vector-matrix products."""
 
 
 def ladder(most_values: int) -> list[GateConfig]:
     """Gates with fewer values than given, by their number; one scene expert, for o(x) is all that
-    is asked of an occupancy. Of each size first the one without a norm, which answers sooner, but
-    is no match for the other where there are few octaves."""
+    is asked of an occupancy."""
     gates = [
-        GateConfig(EncodingConfig(octaves=octaves), width, layers, 1)
+        GateConfig(EncodingConfig(octaves=octaves), width, layers, 1, octaves < ENOUGH_OCTAVES)
         for octaves, width, layers in FREQUENCY
     ]
     for cells, features in PLANES:
@@ -31,8 +32,7 @@ def ladder(most_values: int) -> list[GateConfig]:
             GateConfig(replace(planes, kind="vm", components=features), 16, 1, 1),
         ]
     counted = sorted((values_of(gate), i) for i, gate in enumerate(gates))
-    chosen = [gates[i] for values, i in counted if values < most_values]
-    return [replace(gate, normed=normed) for gate in chosen for normed in (False, True)]
+    return [gates[i] for values, i in counted if values < most_values]
 
 
 def values_of(config: GateConfig) -> int:
@@ -52,5 +52,4 @@ def name_of(config: GateConfig) -> str:
         "vm": f"VM {encoding.components} x {encoding.plane_cells}",
         "k-planes": f"K-planes {encoding.levels} x {encoding.features} x {encoding.plane_cells}",
     }
-    norm = ", normed" if config.normed else ""
-    return f"{sizes[encoding.kind]}, {config.layers} x {config.width}{norm}"
+    return f"{sizes[encoding.kind]}, {config.layers} x {config.width}"
