@@ -78,15 +78,19 @@ class FrequencyEncoding(nn.Module):
         features = x.new_empty(self.out_dim, x.shape[1], dtype=dtype)
         features[:3] = x
         every = features[3:].view(2, len(self.scales), *x.shape)  # sines, cosines
-        waves = x.new_empty(2, *x.shape)
+        waves = every[:, 0]
         for octave, scale in enumerate(self.scales):
+            last, waves = waves, every[:, octave]
+            if dtype != x.dtype:
+                waves = x.new_empty(2, *x.shape)
             if octave % FRESH.get(dtype, 1) == 0:
                 angles = x * scale
                 torch.sin(angles, out=waves[0])
                 torch.cos(angles, out=waves[1])
             else:  # sin 2a = 2 sin a cos a, cos 2a = 2 cos a cos a - 1
-                waves = torch.addcmul(self.start, waves, waves[1], value=2.0)
-            every[:, octave] = waves
+                torch.addcmul(self.start, last, last[1], value=2.0, out=waves)
+            if dtype != x.dtype:
+                every[:, octave] = waves
         return features.t()
 
 
