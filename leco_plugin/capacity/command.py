@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -16,12 +15,13 @@ from leco_plugin.capacity.picture import draw
 from leco_plugin.chart.theme import DARK, LIGHT
 from leco_plugin.evaluation.equal_loss import MOST_ON_CPU
 from leco_plugin.evaluation.field_grids import fits_memory
-from leco_plugin.evaluation.json_file import write_json
+from leco_plugin.evaluation.json_file import read_object, write_json
 from leco_plugin.evaluation.machine import describe_machine
 from leco_plugin.progress_bar import bar
 from leco_plugin.scenes.input_error import InputError
 
 SETTINGS, POINTS = "settings.json", "points"
+DAMAGED = "is damaged; delete it, or name a new folder with --out"
 MEASURED = {"family", "size", "kept_volume", "lost_at_volumes"}
 """What a row must have beside its bytes."""
 
@@ -116,7 +116,7 @@ def _settle(out: Path, settings: dict[str, Any]) -> None:
     """
     file = out / SETTINGS
     if file.exists():
-        found = _read(file)
+        found = read_object(file, DAMAGED)
         names = [name for name, value in settings.items() if found.get(name) != value]
         if names:
             raise InputError(
@@ -133,25 +133,10 @@ def _stored(out: Path, candidate: Candidate) -> dict[str, Any] | None:
     file = out / POINTS / f"{candidate.key}.json"
     if not file.exists():
         return None
-    row = _read(file)
+    row = read_object(file, DAMAGED)
     if row.get("bytes") != candidate.bytes or not row.keys() >= MEASURED:
         raise InputError(f"{file} is no measured representation; delete it to measure it again")
     return row
-
-
-def _read(file: Path) -> dict[str, Any]:
-    """A JSON object that an earlier call has left.
-
-    Raises:
-        InputError: it is damaged.
-    """
-    try:
-        found = json.loads(file.read_text())
-    except ValueError:  # no JSON, or no text
-        found = None
-    if not isinstance(found, dict):
-        raise InputError(f"{file} is damaged; delete it, or name a new folder with --out")
-    return found
 
 
 def _store(out: Path, candidate: Candidate, row: dict[str, Any]) -> dict[str, Any]:

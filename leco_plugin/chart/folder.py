@@ -10,11 +10,12 @@ from pathlib import Path
 from typing import Any
 
 from leco_plugin.chart.contender import Contender
-from leco_plugin.evaluation.json_file import write_json
+from leco_plugin.evaluation.json_file import read_object, write_json
 from leco_plugin.scenes.input_error import InputError
 
 SETTINGS, RESULTS = "settings.json", "results.json"
 RUNS, UNFINISHED, LOGS = "runs", "unfinished", "logs"
+DAMAGED = "is damaged, or not of a chart; delete it, or name a new folder"
 
 
 @dataclass(frozen=True)
@@ -97,7 +98,7 @@ class ChartFolder:
     def failures(self) -> list[dict[str, Any]]:
         """Runs that ended without a result, by seed: `name`, `method`, `sampler`, `seed` and
         `reason`."""
-        found = [read_object(file) for file in sorted((self.path / LOGS).glob("*.json"))]
+        found = [read_object(file, DAMAGED) for file in sorted((self.path / LOGS).glob("*.json"))]
         return sorted(found, key=lambda failure: (failure["seed"], failure["name"]))
 
     def keep(self, job: Job, files: Iterable[Path]) -> None:
@@ -114,7 +115,7 @@ def stored_in(path: Path) -> dict[str, dict[str, Any]]:
     """
     found = {}
     for file in sorted((path / RUNS).glob("*.json")):
-        record = read_object(file)
+        record = read_object(file, DAMAGED)
         if not all(isinstance(record.get(part), dict) for part in ("contender", "run")):
             raise InputError(f"{file} is no run of a chart; delete it to have it made again")
         found[file.stem] = record
@@ -129,22 +130,7 @@ def read_settings(path: Path) -> dict[str, Any] | None:
     """
     file = path / SETTINGS
     # runs came one after the other before charts noted how many there are at once
-    return {"at_once": 1, **read_object(file)} if file.is_file() else None
-
-
-def read_object(file: Path) -> dict[str, Any]:
-    """A JSON object of a chart.
-
-    Raises:
-        InputError: it is damaged.
-    """
-    try:
-        found = json.loads(file.read_text())
-    except ValueError:  # no JSON, or no text
-        found = None
-    if not isinstance(found, dict):
-        raise InputError(f"{file} is damaged, or not of a chart; delete it, or name a new folder")
-    return found
+    return {"at_once": 1, **read_object(file, DAMAGED)} if file.is_file() else None
 
 
 def difference(found: Mapping[str, Any], wanted: Mapping[str, Any]) -> str | None:

@@ -9,15 +9,16 @@ from typing import Any
 
 from leco_plugin.chart.contender import Contender
 from leco_plugin.chart.folder import (
+    DAMAGED,
     RESULTS,
     RUNS,
     ChartFolder,
     Job,
     difference,
-    read_object,
     read_settings,
     stored_in,
 )
+from leco_plugin.evaluation.json_file import read_object
 from leco_plugin.scenes.input_error import InputError
 
 
@@ -80,7 +81,7 @@ def take_over(folder: ChartFolder, jobs: Sequence[Job], sources: Sequence[Path])
 def _made_before(source: Path) -> dict[str, Any] | None:
     """What a chart from before runs noted it says of all of its runs."""
     file = source / RESULTS
-    return read_object(file).get("made") if file.exists() else None
+    return read_object(file, DAMAGED).get("made") if file.exists() else None
 
 
 def serves(record: Mapping[str, Any], job: Job) -> bool:

@@ -7,6 +7,7 @@ import math
 from pathlib import Path
 from typing import Any
 
+from leco_plugin.scenes.input_error import InputError
 from leco_plugin.scenes.whole_files import write_whole
 
 
@@ -19,6 +20,23 @@ def write_json(path: Path, value: Any) -> None:
     """
     text = json.dumps(value, indent=2, allow_nan=False) + "\n"
     write_whole(path, lambda file: file.write(text.encode()))
+
+
+def read_object(file: Path, else_say: str) -> dict[str, Any]:
+    """The JSON object in a file.
+
+    Args:
+        else_say: what is said of the file where it is damaged, and what to do.
+    Raises:
+        InputError: it is.
+    """
+    try:
+        found = json.loads(file.read_text())
+    except ValueError:  # no JSON, or no text
+        found = None
+    if not isinstance(found, dict):
+        raise InputError(f"{file} {else_say}")
+    return found
 
 
 def finite_or_null(values: dict[str, Any]) -> dict[str, Any]:

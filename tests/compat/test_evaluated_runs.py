@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import copy
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -11,6 +10,7 @@ from typing import Any
 import pytest
 import torch
 from nerfstudio.utils import eval_utils
+from tiny_run import tiny_trainer
 
 from leco_plugin.compat.evaluated_runs import evaluate_whole_checkpoints, from_whole
 from leco_plugin.compat.whole_checkpoints import previous_of
@@ -85,18 +85,9 @@ def test_it_is_done_once_and_to_nerfstudio_as_a_whole(monkeypatch: pytest.Monkey
 @pytest.fixture(scope="module")
 def run(tiny_scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A run of `leco-occupancy` that has saved twice: first with 3 in a place, then with 7."""
-    config: Any = copy.deepcopy(leco_occupancy.config)
-    config.output_dir = tmp_path_factory.mktemp("outputs")
-    config.experiment_name, config.timestamp, config.vis = "tiny", "run", "tensorboard"
-    config.logging.local_writer.enable = False
-    config.data = config.pipeline.datamanager.data = tiny_scene
-    sizes = config.pipeline.model.sizes
-    gate = replace(sizes.gate, width=8, layers=1)
-    field = replace(sizes.field, encoding=replace(sizes.field.encoding, log2_table=8))
-    config.pipeline.model.sizes = replace(sizes, gate=gate, field=field, candidates=32)
-    config.save_config()
-    trainer = config.setup(local_rank=0, world_size=1)
-    trainer.setup()
+    gate = replace(leco_occupancy.config.pipeline.model.sizes.gate, width=8, layers=1)
+    outputs = tmp_path_factory.mktemp("outputs")
+    trainer = tiny_trainer(tiny_scene, outputs, gate, candidates=32)
     bias = trainer.pipeline.model.field.density_head.bias
     for step, value in ((3, 3.0), (7, 7.0)):
         with torch.no_grad():

@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-import copy
-from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import pytest
 import torch
 from ball_occupancy import THEIR_MARCH, ball_of_the_tiny_scene
+from tiny_run import tiny_trainer
 
 from leco_plugin.scenes.frames import frame_of
 from leco_plugin.shrink import references
@@ -18,21 +16,8 @@ from leco_plugin.shrink import references
 @pytest.fixture(scope="session")
 def known_run(tiny_scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Folder of a run of `leco-occupancy`: its frozen gate is the ball, its field is opaque."""
-    from leco_plugin.method_configs import leco_occupancy
-
-    config: Any = copy.deepcopy(leco_occupancy.config)
-    config.output_dir = tmp_path_factory.mktemp("outputs")
-    config.experiment_name, config.timestamp, config.vis = "tiny", "run", "tensorboard"
-    config.logging.local_writer.enable = False
-    config.data = config.pipeline.datamanager.data = tiny_scene
-    config.pipeline.datamanager.train_num_rays_per_batch = 64
-    sizes = config.pipeline.model.sizes
-    gate = ball_of_the_tiny_scene().gate.config
-    field = replace(sizes.field, encoding=replace(sizes.field.encoding, log2_table=8))
-    config.pipeline.model.sizes = replace(sizes, gate=gate, field=field, candidates=64)
-    config.save_config()
-    trainer = config.setup(local_rank=0, world_size=1)
-    trainer.setup()
+    outputs, gate = tmp_path_factory.mktemp("outputs"), ball_of_the_tiny_scene().gate.config
+    trainer = tiny_trainer(tiny_scene, outputs, gate, candidates=64)
     model, frame = trainer.pipeline.model, frame_of(trainer.pipeline.datamanager)
     assert frame is not None
     known = ball_of_the_tiny_scene(frame)
