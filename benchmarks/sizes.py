@@ -54,7 +54,7 @@ class Options:
     """Blocks a side of cities that are trained in automatic sizes and in larger ones only."""
     sized: tuple[int, ...] = (16,)
     """Blocks a side of cities for which sizes are chosen only."""
-    steps: int = 500
+    steps: int = 1000
     """Training steps of a run."""
     learn_steps: int = 200
     """Of them, until the gate is frozen; more where it has not settled. With 150 some gates skipped

@@ -15,7 +15,7 @@ ROOT = Path(__file__).resolve().parent.parent
 sys.path.insert(0, str(ROOT / "benchmarks"))
 
 import sizes_sections  # noqa: E402
-from sizes import Options, dry, larger, stored_rows, sweep  # noqa: E402
+from sizes import TABLE, Options, dry, larger, stored_rows, sweep  # noqa: E402
 from sizes_figures import ahead, bars, points_of, verdict  # noqa: E402
 from sizes_tables import (  # noqa: E402
     beside_fine_grid,
@@ -24,7 +24,7 @@ from sizes_tables import (  # noqa: E402
     sizes_table,
 )
 
-from leco_plugin.models.sizes import SMALL, with_size  # noqa: E402
+from leco_plugin.models.sizes import SMALL, size_at, with_size  # noqa: E402
 
 MEASURED = {"automatic": [20.0, 20.2], "table x 4": [20.1, 20.2], "table x 0.25": [19.0, 19.4]}
 PARAMETERS = {"automatic": 200, "table x 4": 800, "table x 0.25": 90}
@@ -85,7 +85,7 @@ def test_the_smallest_city_is_put_beside_the_largest_and_each_beside_larger_mode
 
 
 def test_a_sweep_has_no_sizes_twice_and_beside_larger_ones_none_that_is_smaller() -> None:
-    chosen = with_size(SMALL, "field.encoding.log2_table", 14)
+    chosen = with_size(SMALL, TABLE, size_at(SMALL, TABLE) - 2)
     options = Options(experts=(0.5, 1.0))
     points = sweep(chosen, SMALL, options)
     assert list(points) == ["automatic", "the device's", "table x 0.25", "experts x 0.5"]

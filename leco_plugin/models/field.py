@@ -18,7 +18,9 @@ from leco_plugin.models.steady import steadied
 class FieldConfig:
     """The shape of the field."""
 
-    encoding: EncodingConfig = field(default_factory=lambda: EncodingConfig(kind="hash"))
+    encoding: EncodingConfig = field(
+        default_factory=lambda: EncodingConfig(kind="hash", log2_table=18)
+    )
     """Encoding of the mapped position."""
     experts: HMoEConfig = field(default_factory=HMoEConfig)
     """The mixture of experts between encoding and heads."""

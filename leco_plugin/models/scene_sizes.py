@@ -1,8 +1,8 @@
 """Sizes chosen from how much there is to see in a scene, before training: `leco-occupancy`'s own.
 
 What is counted is the footprint of a pixel at the scene's distance, a texel. A scene twice as wide
-has four times as many, and gets four times the table and the experts, until the device's sizes are
-reached. A size that is set by hand stays as it is, and what follows from it follows from that.
+has four times as many, and gets four times the experts and twice the table, up to the device's
+sizes. A size that is set by hand stays as it is, and what follows from it follows from that.
 """
 
 from __future__ import annotations
@@ -23,8 +23,8 @@ from leco_plugin.scenes.detail import CAMERAS, SceneDetail, detail_of
 from leco_plugin.scenes.input_error import InputError
 from leco_plugin.scenes.survey import points_in, with_known_altitudes
 
-TEXELS_PER_ENTRY = 4.0
-"""Texels for each entry of a level of the hash table."""
+ENTRIES_PER_SIDE = 256.0
+"""Entries of a level of the hash table for each texel along the side of a square surface."""
 TEXELS_PER_EXPERT = 1 << 16
 """Texels for each scene expert of the device's width; a scene of fewer gets a narrower one."""
 CELLS_PER_PERIOD = 32
@@ -96,7 +96,7 @@ def choose(
     """
     sizes = _filled(wanted, most, detail)
     check(sizes)
-    reason = f"entries a level, one for {TEXELS_PER_ENTRY:g} texels"
+    reason = f"entries a level, {ENTRIES_PER_SIDE:g} for each texel of the surface's side"
     if memory is not None:
         if not wanted.field.encoding.log2_table:
             fitting = within(sizes, images, SHARE_OF_MEMORY * memory)
@@ -150,9 +150,9 @@ def levels_to(finest: int, most: EncodingConfig) -> int:
 
 
 def log2_entries(texels: float, most: EncodingConfig) -> int:
-    """Binary logarithm of a level's entries, rounded up."""
-    wanted = math.log2(max(1.0, min(texels / TEXELS_PER_ENTRY, 2.0**most.log2_table)))
-    return max(FEWEST_ENTRIES, min(math.ceil(wanted), most.log2_table))
+    """Binary logarithm of a level's entries, rounded."""
+    wanted = ENTRIES_PER_SIDE * math.sqrt(min(texels, 4.0**most.log2_table))
+    return max(FEWEST_ENTRIES, min(round(math.log2(max(1.0, wanted))), most.log2_table))
 
 
 def expert_number(texels: float, most: Sizes) -> int:
