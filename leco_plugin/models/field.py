@@ -19,7 +19,7 @@ class FieldConfig:
     """The shape of the field."""
 
     encoding: EncodingConfig = field(
-        default_factory=lambda: EncodingConfig(kind="hash", log2_table=18)
+        default_factory=lambda: EncodingConfig(kind="hash", log2_table=19)
     )
     """Encoding of the mapped position."""
     experts: HMoEConfig = field(default_factory=HMoEConfig)

@@ -23,7 +23,7 @@ from leco_plugin.scenes.detail import CAMERAS, SceneDetail, detail_of
 from leco_plugin.scenes.input_error import InputError
 from leco_plugin.scenes.survey import points_in, with_known_altitudes
 
-ENTRIES_PER_SIDE = 256.0
+ENTRIES_PER_SIDE = 512.0
 """Entries of a level of the hash table for each texel along the side of a square surface."""
 TEXELS_PER_EXPERT = 1 << 16
 """Texels for each scene expert of the device's width; a scene of fewer gets a narrower one."""
