@@ -26,7 +26,7 @@ LARGEST_LOGIT = 80.0
 
 UNITS_AT_ONCE = 1 << 18
 """Units that the last layer takes to float32, multiplies and measures while they lie in the cache
-of a core: a megabyte. All at once takes twice as long."""
+of a core, for each thread: a megabyte. All at once takes twice as long."""
 
 LayerFn = Callable[[Tensor, Tensor, Tensor], Tensor]
 """Rows [N, inputs], weight [width, inputs] and bias [width] to relu(W x + b), [N, width]."""
@@ -88,7 +88,7 @@ def _logits(frozen: FrozenGate, features: Tensor, gate: Gate) -> Tensor:
     count, width = features.shape
     sums = features.new_empty(len(frozen.head), count, dtype=torch.float32)
     lengths = sums.new_empty(count if gate.config.normed else 0)
-    rows_at_once = max(1, UNITS_AT_ONCE // width)
+    rows_at_once = max(1, UNITS_AT_ONCE * torch.get_num_threads() // width)
     for first in range(0, count, rows_at_once):
         part = slice(first, first + rows_at_once)
         _last_layer(frozen, features[part].float(), sums[:, part], lengths[part])

@@ -56,7 +56,7 @@ def test_rows_that_are_not_multiplied_at_once_are_answered_as_others(
     experts, normed, monkeypatch
 ) -> None:
     gate, mapped = gate_of(experts=experts, normed=normed), torch.rand(1003, 3) * 2 - 1
-    monkeypatch.setattr(frozen_gate, "UNITS_AT_ONCE", 24 * 300)
+    monkeypatch.setattr(frozen_gate, "UNITS_AT_ONCE", 24 * 50)
     expected = slow_occupancy(gate, mapped).float()
     values = occupancy_of(gate, mapped, torch.float32)
     torch.testing.assert_close(values, expected, rtol=0, atol=STATED["float32"])
