@@ -82,10 +82,11 @@ class Occupancy(nn.Module):
         columns = torch.stack(positions.to(self.space.center.dtype).unbind(-1))
         mapped = self.space.map(columns.T)
         low, high = self.walls.view(2, 3, 1)
-        beyond_walls = (columns - 0.5 * (low + high)).abs_().sub_(0.5 * (high - low)).amax(dim=0)
-        # one comparison of distances: on a CPU it costs more than they do; of NaN it is false
-        inside = torch.maximum(mapped.T.abs().amax(dim=0) - 1.0, beyond_walls) <= 0.0
-        mapped = mapped.clamp(-1.0, 1.0).nan_to_num_()
+        beyond_walls = torch.maximum(columns - high, low - columns).amax(dim=0)
+        # one comparison of distances, to 0 or 1: on a CPU any other costs more than they do; of NaN
+        # it is 0
+        inside = torch.maximum(mapped.T.abs().amax(dim=0) - 1.0, beyond_walls).le_(0.0)
+        mapped = mapped.clamp_(-1.0, 1.0).nan_to_num_()
         if mapped.device.type == "cpu":
             values = occupancy_of(self.gate, mapped, getattr(torch, self.precision))
         else:

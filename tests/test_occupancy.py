@@ -300,3 +300,14 @@ def test_what_lies_outside_the_walls_is_empty_also_after_a_round_trip(tmp_path: 
     kept = Occupancy.load(tmp_path / "occupancy.safetensors").occupied(positions)
     between = (positions[:, 2] >= -0.2) & (positions[:, 2] <= 0.3)
     assert torch.equal(kept, between)
+
+
+def test_a_wall_is_where_it_is_said_to_be_though_there_is_none_on_the_other_side() -> None:
+    walls = torch.tensor([-1e6, -1e6, 0.1234567, 1e6, 0.3, 1e6])
+    occupancy = Occupancy(Gate(GateConfig()), Space(), 1e-6, walls=walls)
+    one = torch.zeros(5, 3) + torch.tensor([0.0, 0.0, 0.5])
+    one[0, 2] = walls[2]
+    one[1, 2] = torch.nextafter(walls[2], torch.tensor(-1.0))
+    one[2, 1] = walls[4]
+    one[3, 1] = torch.nextafter(walls[4], torch.tensor(1.0))
+    assert occupancy.occupied(one).tolist() == [True, False, True, False, True]

@@ -77,20 +77,18 @@ class FrequencyEncoding(nn.Module):
             return torch.cat([x, angles.sin(), angles.cos()]).t().to(dtype)
         features = x.new_empty(self.out_dim, x.shape[1], dtype=dtype)
         features[:3] = x
-        every = features[3:].view(2, len(self.scales), *x.shape)  # sines, cosines
-        waves = every[:, 0]
-        for octave, scale in enumerate(self.scales):
-            last, waves = waves, every[:, octave]
-            if dtype != x.dtype:
-                waves = x.new_empty(2, *x.shape)
+        octaves = features[3:].view(2, len(self.scales), *x.shape).unbind(1)  # sine and cosine each
+        wide = octaves if dtype == x.dtype else x.new_empty(2, 2, *x.shape).unbind()
+        for octave, (scale, stored) in enumerate(zip(self.scales, octaves, strict=True)):
+            waves, last = wide[octave % len(wide)], wide[(octave - 1) % len(wide)]
             if octave % FRESH.get(dtype, 1) == 0:
                 angles = x * scale
                 torch.sin(angles, out=waves[0])
                 torch.cos(angles, out=waves[1])
             else:  # sin 2a = 2 sin a cos a, cos 2a = 2 cos a cos a - 1
                 torch.addcmul(self.start, last, last[1], value=2.0, out=waves)
-            if dtype != x.dtype:
-                every[:, octave] = waves
+            if waves is not stored:
+                stored.copy_(waves)
         return features.t()
 
 

@@ -186,7 +186,7 @@ class CellCache(nn.Module):
             occupied bool [N], False where open; and the indices of positions that are left open,
             int64 [n_open]: the gate's to answer.
         """
-        cells = self._cells(positions).mul_(BRICK)
+        cells = self._cells(positions, BRICK)
         corners = cells.to(torch.int32)
         coarse = _flat(corners >> BRICK_BITS, self.resolution + 2)
         brick = self.coarse.index_select(0, coarse).to(torch.int32)
@@ -194,7 +194,8 @@ class CellCache(nn.Module):
         known = self.judged.view(-1).index_select(0, at.add_(UNIFORM * BRICK**3))
         # An answer in the type of what is compared is found ten times faster on a CPU than a bool.
         occupied = torch.eq(known, FINE_OCCUPIED, out=torch.empty_like(known)).view(torch.bool)
-        chosen = (known < FINE_EMPTY).nonzero()[:, 0]
+        mixed = torch.lt(known, FINE_EMPTY, out=torch.empty_like(known)).view(torch.bool)
+        chosen = mixed.nonzero()[:, 0]
         if chosen.numel() == 0:
             return occupied, chosen
 
@@ -204,7 +205,7 @@ class CellCache(nn.Module):
         within = cells.index_select(1, chosen).frac_().mul_(2.0).sub_(1.0)
         for slope, along in zip(slopes, within, strict=True):
             offset.addcmul_(slope, along)
-        occupied.index_put_((chosen,), offset > 0.0)
+        occupied.index_copy_(0, chosen, offset > 0.0)
         return occupied, chosen.index_select(0, (offset.abs_() <= error).nonzero()[:, 0])
 
     def near(self, positions: Tensor, radii: Tensor) -> Tensor:
@@ -217,7 +218,7 @@ class CellCache(nn.Module):
         Returns:
             bool [N]; False is certain as far as the cells are.
         """
-        halves = self._cells(positions).sub_(1.0).mul_(2.0)
+        halves = self._cells(positions, 2).sub_(2.0)
         width = 2 * self.resolution
         inner = halves.clamp(0.0, width - 1.0).floor_()
         index = _flat(inner, width).to(torch.int32)
@@ -241,12 +242,15 @@ class CellCache(nn.Module):
         inner = ((distance - radii) / self.half_extent).clamp(min=1.5)
         return (0.5 / self.half_extent) * self.scale[0] * (4.0 * inner - 3.0) / inner.square()
 
-    def _cells(self, positions: Tensor) -> Tensor:
-        """Coordinates in coarse cells, of which the border is the first and the last; [3, N]."""
+    def _cells(self, positions: Tensor, parts: int) -> Tensor:
+        """Coordinates in so many parts of coarse cells, a power of two; [3, N].
+
+        The border is the first and the last coarse cell.
+        """
         if self._map is not None:
             positions = self._map(positions)
-        cells = torch.addcmul(self.shift, positions.T, self.scale)
-        return cells.nan_to_num_(nan=0.0).clamp_(0.0, self.resolution + 1.5)
+        cells = torch.addcmul(self.shift * parts, positions.T, self.scale * parts)
+        return cells.nan_to_num_(nan=0.0).clamp_(0.0, parts * (self.resolution + 1.5))
 
 
 def _flat(corners: Tensor, width: int) -> Tensor:

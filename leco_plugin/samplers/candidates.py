@@ -27,7 +27,8 @@ class Candidates(NamedTuple):
     t_mins: Tensor
     """t of edge 0 of each ray, [n_rays]."""
     first: Tensor
-    """Number of the first step that is a candidate, whole but floating, [n_rays]."""
+    """Number of the first step that is a candidate, whole but floating, [n_rays]; or [1] where it
+    is the same for all rays, which saves computing with it for each candidate."""
     counts: Tensor
     """Number of candidates of each ray, whole but floating, [n_rays]."""
     step_size: float
@@ -42,7 +43,7 @@ class Candidates(NamedTuple):
         return self._replace(
             coordinates=pick(self.coordinates.flatten(0, 1)).unflatten(0, (2, 3)),
             t_mins=pick(self.t_mins),
-            first=pick(self.first),
+            first=self.first if len(self.first) == 1 else pick(self.first),
             counts=pick(self.counts),
         )
 
@@ -110,16 +111,19 @@ def number(
         raise ValueError(f"cone_angle must be finite and not negative, got {cone_angle}")
     if jitter is not None:
         t_mins = t_mins + jitter * step_size
-    usable = usable_rays(origins, directions, t_mins, t_maxs)
+    coordinates = torch.stack([origins.T, directions.T])
+    usable = usable_rays(coordinates, t_mins, t_maxs)
     if t_enters is not None:
         usable &= t_enters < t_maxs
-    t_mins, t_maxs = t_mins.masked_fill(~usable, 0.0), t_maxs.masked_fill(~usable, 0.0)
-    counts = candidate_counts(t_mins, t_maxs, step_size, cone_angle)
-    first = torch.zeros_like(counts)
-    if t_enters is not None:
-        first = candidate_counts(t_mins, t_enters.minimum(t_maxs), step_size, cone_angle)
-        counts = counts - first
-    coordinates = torch.stack([origins.T, directions.T])
+    skipped = ~usable
+    t_mins, t_maxs = t_mins.masked_fill(skipped, 0.0), t_maxs.masked_fill(skipped, 0.0)
+    if t_enters is None:
+        counts = candidate_counts(t_mins, t_maxs, step_size, cone_angle)
+        first = counts.new_zeros(1)
+    else:
+        limits = torch.stack([t_enters.minimum(t_maxs), t_maxs])
+        first, ends = candidate_counts(t_mins, limits, step_size, cone_angle)
+        counts = ends - first
     return Candidates(coordinates, t_mins, first, counts, step_size, cone_angle)
 
 

@@ -24,21 +24,25 @@ def by_column(wanted: Tensor) -> tuple[Tensor, Tensor]:
     return columns, chosen - columns * n
 
 
-def by_column_in_runs(wanted: Tensor) -> tuple[Tensor, Tensor]:
+def places_by_column(wanted: Tensor) -> tuple[Tensor, Tensor]:
+    """Columns of what is true in bool [n, m], and its places in the flat matrix, in that order."""
+    columns, rows = by_column(wanted)
+    return columns, torch.add(columns, rows, alpha=wanted.shape[1])
+
+
+def places_by_column_in_runs(wanted: Tensor) -> tuple[Tensor, Tensor]:
     """The same, faster on a CPU if few runs of rows are not all false."""
     if wanted.device.type != "cpu":
-        return by_column(wanted)
+        return places_by_column(wanted)
     n, m = wanted.shape
     if n % RUN:
-        wanted = torch.nn.functional.pad(wanted, (0, 0, 0, -n % RUN))
+        wanted = torch.cat([wanted, wanted.new_zeros(-n % RUN, m)])
     some = wanted.view(torch.uint8).unflatten(0, (-1, RUN)).amax(dim=1)
     columns, runs = by_column(some)
     first = torch.add(columns, runs, alpha=RUN * m)
-    places = first[:, None] + torch.arange(RUN) * m
-    chosen = wanted.view(-1).index_select(0, places.view(-1)).nonzero()[:, 0]
-    run = chosen >> RUN_BITS
-    rows = torch.add(chosen.bitwise_and_(RUN - 1), runs.index_select(0, run), alpha=RUN)
-    return columns.index_select(0, run), rows
+    places = (first[:, None] + torch.arange(RUN) * m).view(-1)
+    chosen = wanted.view(-1).index_select(0, places).nonzero()[:, 0]
+    return columns.index_select(0, chosen >> RUN_BITS), places.index_select(0, chosen)
 
 
 def _true(wanted: Tensor) -> Tensor:

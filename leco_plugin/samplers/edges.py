@@ -38,10 +38,10 @@ def candidate_counts(t_mins: Tensor, t_maxs: Tensor, step_size: float, cone_angl
 
     Args:
         t_mins: finite [n_rays].
-        t_maxs: [n_rays], may be infinite.
+        t_maxs: [..., n_rays], may be infinite.
 
     Returns:
-        [n_rays], whole but floating; exact below 2^24, capped near 2^25.
+        [..., n_rays], whole but floating; exact below 2^24, capped near 2^25.
     """
     counts = ((t_maxs - t_mins) / step_size - 0.5).ceil()
     if cone_angle > 0.0:
@@ -50,17 +50,15 @@ def candidate_counts(t_mins: Tensor, t_maxs: Tensor, step_size: float, cone_angl
         geometric = n_linear + (ratio.clamp(min=1e-12).log() / math.log1p(cone_angle)).ceil()
         counts = torch.where(counts > n_linear, geometric.maximum(n_linear), counts)
     counts = counts.nan_to_num(nan=0.0).clamp(0, 2 * MAX_CANDIDATES_PER_RAY)
-    # The estimate can be one off by rounding; the rule is the comparison with the midpoint itself.
+    # The estimate can be one off by rounding; the rule is the comparison with the midpoint itself:
+    # of the last candidate, which has to lie in front, and of the one that would follow.
+    around = torch.arange(-1, 2, dtype=counts.dtype, device=counts.device)
+    around = around.view(3, *[1] * counts.dim())
     for _ in range(2):
-        counts = counts + (_midpoint(t_mins, counts, step_size, cone_angle) < t_maxs)
-        late = _midpoint(t_mins, counts - 1.0, step_size, cone_angle) >= t_maxs
-        counts = counts - (late & (counts > 0)).to(counts.dtype)
+        edges = candidate_edges(t_mins, counts + around, step_size, cone_angle)
+        in_front = (edges[:-1] + edges[1:]) * 0.5 < t_maxs
+        counts = (counts + in_front.sum(dim=0, dtype=counts.dtype) - 1.0).clamp(min=0.0)
     return counts
-
-
-def _midpoint(t_mins: Tensor, steps: Tensor, step_size: float, cone_angle: float) -> Tensor:
-    starts = candidate_edges(t_mins, steps, step_size, cone_angle)
-    return (starts + candidate_edges(t_mins, steps + 1.0, step_size, cone_angle)) * 0.5
 
 
 def switch(t_mins: Tensor, step_size: float, cone_angle: float) -> tuple[Tensor, Tensor]:

@@ -110,7 +110,7 @@ class LearnedOccupancyEstimator(Estimator):
         decided, left_open = self.cache.decide(positions)
         if left_open.numel():
             asked = positions.T.index_select(1, left_open).T
-            decided.index_put_((left_open,), self.occupancy.occupied(asked))
+            decided.index_copy_(0, left_open, self.occupancy.occupied(asked))
         return decided
 
     def update_every_n_steps(self, *args: Any, **kwargs: Any) -> None:

@@ -206,7 +206,7 @@ def march_kept(cache: CellCache, weights: GateWeights, candidates: Candidates) -
         return _room(0, device)
     coned = cone_angle > 0.0
     switches = switch(t_mins, step_size, cone_angle) if coned else (t_mins, t_mins)
-    numbers = torch.stack([t_mins, first, counts, *switches])
+    numbers = torch.stack([t_mins, first.expand_as(counts), counts, *switches])
     growth = growth_table(step_size, cone_angle, device) if coned else numbers
     tables = cache.tables()
     frame = torch.cat([cache.scale.view(-1), cache.shift.view(-1)])

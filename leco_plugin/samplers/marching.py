@@ -21,7 +21,12 @@ from leco_plugin.samplers.candidates import (
     number,
     plan,
 )
-from leco_plugin.samplers.columns import RUN, by_column, by_column_in_runs
+from leco_plugin.samplers.columns import (
+    RUN,
+    by_column,
+    places_by_column,
+    places_by_column_in_runs,
+)
 
 __all__ = [
     "Candidates",
@@ -182,8 +187,7 @@ def keep_steps(
     else:
         every = torch.arange(n_rays, device=edges.device)[:, None].expand(n_rays, n_steps)
         return every.reshape(-1), edges[:-1].T.reshape(-1), edges[1:].T.reshape(-1)
-    columns, steps = by_column(wanted) if dense else by_column_in_runs(wanted)
-    at = torch.add(columns, steps, alpha=n_rays)
+    columns, at = places_by_column(wanted) if dense else places_by_column_in_runs(wanted)
     edges = edges.view(-1)
     ray_indices = columns if rays is None else rays.index_select(0, columns)
     return ray_indices, edges.index_select(0, at), edges.index_select(0, at + n_rays)

@@ -27,14 +27,23 @@ from leco_plugin.samplers.estimator import LearnedOccupancyEstimator
 def with_ends(ray_bundle: RayBundle | None) -> RayBundle:
     """The rays, if they can be sampled.
 
-    A ray that ends before it begins has samples without length, all where it begins.
+    A ray that ends before it begins, or nowhere, has samples without length, all where it begins,
+    and at its origin if that is nowhere either.
 
     Raises:
         ValueError: there are no rays, or they have no nears and fars.
     """
     if ray_bundle is None or ray_bundle.nears is None or ray_bundle.fars is None:
         raise ValueError("samples need a ray bundle with nears and fars (set by a collider)")
-    return replace(ray_bundle, fars=ray_bundle.fars.maximum(ray_bundle.nears))
+    nears = ray_bundle.nears.where(~ray_bundle.nears.isnan(), 0.0)
+    return replace(ray_bundle, nears=nears, fars=ray_bundle.fars.fmax(nears))
+
+
+def check_positive(**sizes: int) -> None:
+    """Raise ValueError, with the name, unless each of these is at least 1."""
+    for name, size in sizes.items():
+        if size < 1:
+            raise ValueError(f"a ray needs at least one sample, got {name} {size}")
 
 
 def levels_of(density_fns: list[Callable[..., Any]] | None) -> int:
@@ -55,6 +64,9 @@ class LearnedOccupancySampler(Sampler):
         cache_bytes: budget of the cell cache; 0 asks the gate about every candidate.
         frame: takes positions of the host to those of the occupancy, [3, 4]; None where they are
             the same.
+
+    Raises:
+        ValueError: there is not even one sample or candidate.
     """
 
     def __init__(
@@ -68,6 +80,7 @@ class LearnedOccupancySampler(Sampler):
         frame: Tensor | None = None,
     ) -> None:
         super().__init__()
+        check_positive(num_samples=num_samples, num_candidates=num_candidates)
         self.frame = frame
         self.estimator = LearnedOccupancyEstimator(occupancy, cache_bytes=cache_bytes)
         self.num_samples = num_samples
@@ -141,6 +154,9 @@ class DenseSampler(Sampler):
         samples: samples of each ray.
         initial_sampler, single_jitter: as of `LearnedOccupancySampler`.
         occupancy, frame: likewise; not looked at.
+
+    Raises:
+        ValueError: there is not even one sample.
     """
 
     def __init__(
@@ -153,6 +169,7 @@ class DenseSampler(Sampler):
         frame: Tensor | None = None,
     ) -> None:
         super().__init__()
+        check_positive(samples=samples)
         self.samples = samples
         self.initial_sampler = initial_sampler or UniformLinDispPiecewiseSampler(
             single_jitter=single_jitter

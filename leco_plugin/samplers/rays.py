@@ -46,10 +46,16 @@ def check_rays(
             )
 
 
-def usable_rays(origins: Tensor, directions: Tensor, t_mins: Tensor, t_maxs: Tensor) -> Tensor:
-    """Which rays are finite, go somewhere and begin before they end: bool [n_rays]."""
-    finite = (origins.isfinite() & directions.isfinite()).all(dim=-1) & t_mins.isfinite()
-    return finite & (directions != 0).any(dim=-1) & (t_mins < t_maxs)
+def usable_rays(coordinates: Tensor, t_mins: Tensor, t_maxs: Tensor) -> Tensor:
+    """Which rays are finite, go somewhere and begin before they end: bool [n_rays].
+
+    Args:
+        coordinates: origins and directions, [2, 3, n_rays].
+        t_mins, t_maxs: where each ray begins and ends, [n_rays].
+    """
+    origins, directions = coordinates.abs().amax(dim=1)
+    largest = torch.maximum(origins, directions).maximum(t_mins.abs())  # NaN if anything is
+    return (largest < torch.inf) & (directions > 0.0) & (t_mins < t_maxs)
 
 
 def intersect_box(origins: Tensor, directions: Tensor, aabb: Tensor) -> tuple[Tensor, Tensor]:

@@ -51,6 +51,17 @@ def test_answers_are_those_of_the_definition(kind, experts, normed, count) -> No
     torch.testing.assert_close(values, expected, rtol=0, atol=STATED["float32"])
 
 
+@pytest.mark.parametrize(("experts", "normed"), [(1, True), (3, True), (1, False), (3, False)])
+def test_rows_that_are_not_multiplied_at_once_are_answered_as_others(
+    experts, normed, monkeypatch
+) -> None:
+    gate, mapped = gate_of(experts=experts, normed=normed), torch.rand(1003, 3) * 2 - 1
+    monkeypatch.setattr(frozen_gate, "UNITS_AT_ONCE", 24 * 50)
+    expected = slow_occupancy(gate, mapped).float()
+    values = occupancy_of(gate, mapped, torch.float32)
+    torch.testing.assert_close(values, expected, rtol=0, atol=STATED["float32"])
+
+
 @pytest.mark.parametrize("kind", ENCODINGS)
 @pytest.mark.parametrize("precision", DTYPES)
 @pytest.mark.parametrize("alone", [True, False])

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import math
 
 import pytest
 import torch
@@ -12,7 +13,13 @@ from samplers.analytic_occupancy import Balls, camera_rays
 from leco_plugin.models.encodings import EncodingConfig
 from leco_plugin.models.gate import Gate, GateConfig
 from leco_plugin.occupancy import Occupancy
-from leco_plugin.samplers.cache import CellCache
+from leco_plugin.samplers.cache import (
+    BRICK,
+    COARSE_OCCUPIED,
+    FINE_EMPTY,
+    FINE_OCCUPIED,
+    CellCache,
+)
 from leco_plugin.samplers.cache_build import build_cache
 from leco_plugin.samplers.estimator import LearnedOccupancyEstimator
 from leco_plugin.samplers.marching import march
@@ -79,6 +86,43 @@ def test_positions_outside_a_box_or_nowhere_are_empty(balls, cache):
     if balls.space.kind == "box":
         assert left_open.numel() == 0
     assert cache.near(positions, torch.zeros(3)).shape == (3,)
+
+
+def slow_decide(cache: CellCache, space: Space, position: torch.Tensor) -> bool | None:
+    """What the tables say of one position, a cell within a cell; None leaves it to the gate."""
+    coarse, fine, first_plane, planes, _ = cache.tables()
+    mapped = space.map(position[None].double())[0]
+    cells = (mapped + 1.0) * (cache.resolution / 2.0) + 1.0
+    cell = [min(max(math.floor(c), 0), cache.resolution + 1) for c in cells.tolist()]
+    width = cache.resolution + 2
+    brick = int(coarse.view(width, width, width)[tuple(cell)])
+    if brick < 0:
+        return brick == COARSE_OCCUPIED
+    parts = [(c - k) * BRICK for c, k in zip(cells.tolist(), cell, strict=True)]
+    part = [min(max(math.floor(p), 0), BRICK - 1) for p in parts]
+    known = int(fine[brick].view(BRICK, BRICK, BRICK)[tuple(part)])
+    if known >= FINE_EMPTY:
+        return known == FINE_OCCUPIED
+    offset, *slopes, error = planes[:, int(first_plane[brick]) + known].tolist()
+    u = [2.0 * (p - k) - 1.0 for p, k in zip(parts, part, strict=True)]
+    height = offset + sum(slope * along for slope, along in zip(slopes, u, strict=True))
+    return None if abs(height) <= error else height > 0.0
+
+
+def test_the_tables_are_read_as_they_are_described(cache, balls):
+    generator = torch.Generator().manual_seed(5)
+    around = torch.nn.functional.normalize(torch.randn(600, 3, generator=generator), dim=-1)
+    near_a_surface = balls.centers[0] + around * (0.2 + 0.15 * torch.rand(600, 1))
+    anywhere = balls.space.unmap(torch.rand(400, 3, generator=generator) * 2.2 - 1.1)
+    positions = torch.cat([near_a_surface, anywhere])
+    decided, left_open = cache.decide(positions)
+    answers: list[bool | None] = decided.tolist()
+    for index in left_open.tolist():
+        answers[index] = None
+    expected = [slow_decide(cache, balls.space, position) for position in positions]
+    different = sum(one != other for one, other in zip(answers, expected, strict=True))
+    assert different <= 2  # a rounding from the next cell
+    assert {True, False, None} <= set(answers)
 
 
 @pytest.mark.parametrize("half_cells", [0.0, 0.1, 0.5, 0.9, 1.5, 4.0])

@@ -6,7 +6,12 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from leco_plugin.samplers.columns import RUN, by_column, by_column_in_runs
+from leco_plugin.samplers.columns import (
+    RUN,
+    by_column,
+    places_by_column,
+    places_by_column_in_runs,
+)
 
 
 def slow_by_column(wanted) -> list[tuple[int, int]]:
@@ -24,7 +29,11 @@ def slow_by_column(wanted) -> list[tuple[int, int]]:
 def test_true_entries_come_by_column_then_row(n, m, share, seed):
     wanted = torch.rand(n, m, generator=torch.Generator().manual_seed(seed)) < share
     expected = slow_by_column(wanted)
-    for function in (by_column, by_column_in_runs):
-        columns, rows = function(wanted)
-        assert columns.dtype == rows.dtype == torch.int64
-        assert list(zip(columns.tolist(), rows.tolist(), strict=True)) == expected
+    columns, rows = by_column(wanted)
+    assert columns.dtype == rows.dtype == torch.int64
+    assert list(zip(columns.tolist(), rows.tolist(), strict=True)) == expected
+    for function in (places_by_column, places_by_column_in_runs):
+        columns, places = function(wanted)
+        assert columns.dtype == places.dtype == torch.int64
+        assert columns.tolist() == [column for column, _ in expected]
+        assert places.tolist() == [row * m + column for column, row in expected]

@@ -29,3 +29,7 @@ def test_the_last_candidate_is_the_last_midpoint_in_front_of_the_end(seed, cone_
     edges = candidate_edges(t_mins[:, None], torch.arange(1003.0), 0.01, cone_angle)
     midpoints = (edges[:, :-1] + edges[:, 1:]) * 0.5
     assert counts.equal((midpoints < t_maxs[:, None]).sum(dim=-1).float())
+    ends = torch.stack([t_maxs, t_mins - 1.0])
+    assert candidate_counts(t_mins, ends, 0.01, cone_angle).equal(
+        torch.stack([counts, torch.zeros(100)])
+    )

@@ -7,7 +7,10 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from samplers.analytic_occupancy import Balls, camera_rays, slow_march
+from torch.utils._python_dispatch import TorchDispatchMode
 
+from leco_plugin.samplers import marching
+from leco_plugin.samplers.columns import places_by_column
 from leco_plugin.samplers.marching import RUN, march
 from leco_plugin.samplers.rays import intersect_box
 
@@ -174,6 +177,36 @@ def test_memory_is_bounded_by_the_chunk(length):
     bounds = torch.zeros(100), torch.linspace(0.0, length, 100)
     march(origins, directions, *bounds, step_size=0.01, occupied=occupied, chunk_size=500)
     assert largest <= 500
+
+
+class CountsSearches(TorchDispatchMode):
+    """Counts what a device is waited for: how many entries are true, and single numbers."""
+
+    waits = 0
+
+    def __torch_dispatch__(self, operation, types, arguments=(), options=None):
+        aten = torch.ops.aten
+        self.waits += operation in (aten.nonzero.default, aten._local_scalar_dense.default)
+        return operation(*arguments, **(options or {}))
+
+
+@pytest.mark.parametrize("chunk_size", [10**6, 2000])
+def test_each_chunk_is_waited_for_once(chunk_size, monkeypatch):
+    # as on all devices but a CPU
+    monkeypatch.setattr(marching, "places_by_column_in_runs", places_by_column)
+    origins, directions = camera_rays(100)
+    rays = origins, directions, torch.zeros(100), torch.ones(100)
+    chunks = 0
+
+    def occupied(positions):
+        nonlocal chunks
+        chunks += 1
+        return positions[:, 0] > 0.0
+
+    with CountsSearches() as counted:
+        march(*rays, step_size=0.01, occupied=occupied, chunk_size=chunk_size)
+    assert counted.waits == chunks
+    assert (chunks > 1) == (chunk_size < 10_000)
 
 
 @settings(deadline=None)

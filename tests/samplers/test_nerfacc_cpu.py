@@ -64,6 +64,39 @@ def test_the_stock_grid_samples_what_its_cells_say(cone_angle):
 
 
 @pytest.mark.usefixtures("installed")
+@pytest.mark.parametrize(("asked", "largest"), [("sigma_fn", 30.0), ("alpha_fn", 0.9)])
+@pytest.mark.parametrize("stratified", [False, True])
+def test_our_grid_clips_shifts_and_prunes_as_nerfaccs_own_code(asked, largest, stratified):
+    stock = stock_grid()
+    stock.occs = torch.rand_like(stock.occs) * 0.4
+    ours = OccupancyGridEstimator([-0.5] * 3 + [0.5] * 3, resolution=8, levels=2)
+    ours.binaries.copy_(stock.binaries)
+    ours.occs.copy_(stock.occs)
+
+    def field(t_starts, t_ends, ray_indices):
+        return ((t_starts + t_ends) * 40.0 + ray_indices).sin().abs() * largest
+
+    options = {
+        "near_plane": 1.2,
+        "far_plane": 3.0,
+        "t_min": torch.rand(60) + 0.7,
+        "t_max": torch.rand(60) + 2.3,
+        "render_step_size": 0.03,
+        "stratified": stratified,
+    }
+    limits = {"early_stop_eps": 0.05, "alpha_thre": 0.15}
+    found = []
+    for pruned in ({}, {asked: field, **limits}):
+        for grid in (stock, ours):
+            torch.manual_seed(3)
+            found.append(grid.sampling(*camera_rays(60), **options, **pruned))
+    for theirs, own in (found[:2], found[2:]):
+        for one, other in zip(theirs, own, strict=True):
+            assert one.equal(other)
+    assert 0 < len(found[2][0]) < len(found[0][0])
+
+
+@pytest.mark.usefixtures("installed")
 def test_intervals_share_edges_as_nerfacc_has_them():
     grid = stock_grid(levels=1)
     origins, directions = camera_rays(60)

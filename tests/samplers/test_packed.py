@@ -173,6 +173,21 @@ def test_no_samples_render_black_and_can_be_backpropagated_through():
     assert colors.equal(torch.zeros(2, 3))
 
 
+def test_rendering_and_its_gradients_wait_for_no_device():
+    # a tensor without values ends in an error whatever reads one
+    t_starts, t_ends, sigmas = (torch.rand(10, device="meta") for _ in range(3))
+    sigmas.requires_grad_()
+    rays = {"ray_indices": RAYS.to("meta"), "n_rays": N_RAYS}
+    weights, _, alphas = packed.render_weight_from_density(t_starts, t_ends, sigmas, **rays)
+    by_alpha, trans = packed.render_weight_from_alpha(alphas, **rays)
+    colors = packed.accumulate_along_rays(weights + by_alpha, torch.rand(10, 3).to("meta"), **rays)
+    sums = packed.inclusive_sum(trans, packed.pack_info(rays["ray_indices"], N_RAYS))
+    (colors.sum() + sums.sum()).backward()
+    assert sigmas.grad.shape == (10,)
+    seen = packed.render_visibility_from_density(t_starts, t_ends, sigmas, **rays, alpha_thre=0.1)
+    assert seen.shape == (10,)
+
+
 def test_shapes_that_do_not_fit_are_named():
     with pytest.raises(ValueError, match=r"\(3,\), \(3,\), \(4,\)"):
         packed.render_weight_from_density(torch.ones(3), torch.ones(3), torch.ones(4))

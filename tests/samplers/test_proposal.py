@@ -5,6 +5,8 @@ from __future__ import annotations
 import pytest
 import torch
 from ball_occupancy import ball
+from hypothesis import given, settings
+from hypothesis import strategies as st
 from samplers.analytic_occupancy import Balls, camera_rays
 
 pytest.importorskip("nerfstudio")
@@ -14,7 +16,7 @@ from nerfstudio.model_components.losses import distortion_loss, interlevel_loss
 from nerfstudio.model_components.ray_samplers import UniformSampler
 from nerfstudio.model_components.renderers import DepthRenderer
 
-from leco_plugin.samplers.proposal import LearnedOccupancySampler
+from leco_plugin.samplers.proposal import DenseSampler, LearnedOccupancySampler
 
 NEAR, FAR = 0.5, 4.0
 
@@ -74,6 +76,23 @@ def test_weights_are_the_normalised_worth_of_candidates(sampler):
     torch.testing.assert_close(weights[0], expected, rtol=1e-4, atol=1e-4)
 
 
+@pytest.mark.parametrize("training", [True, False])
+def test_samples_split_the_weight_of_a_ray_evenly(sampler, training):
+    samples, weights, candidates = sampler.train(training)(bundle(40))
+    ends, of_candidates = samples.frustums.ends[:, -1:, 0], candidates[0].frustums
+    edges = torch.cat([samples.frustums.starts[..., 0], ends], dim=1).double()
+    meets = (weights[0].sum(dim=1)[:, 0] > 0.5).nonzero()[:, 0].tolist()
+    for ray in meets:
+        pieces = (of_candidates.starts[ray], of_candidates.ends[ray], weights[0][ray])
+        in_front = torch.zeros(33, dtype=torch.float64)
+        for start, end, weight in zip(*(piece[:, 0].tolist() for piece in pieces), strict=True):
+            in_front += weight * ((edges[ray] - start) / (end - start)).clamp(0.0, 1.0)
+        middles = (torch.arange(33) + 0.5) / 33.0
+        away = 0.5 / 33.0 if training else 0.0
+        assert ((in_front - middles).abs() <= away + 1e-3).all()
+    assert len(meets) > 10
+
+
 def test_an_empty_ray_is_sampled_uniformly(sampler):
     rays = bundle(5)
     rays.directions = rays.origins / 2.0  # away from the scene
@@ -117,6 +136,21 @@ def test_rays_without_bounds_are_refused(sampler):
         sampler(rays)
 
 
+@pytest.mark.parametrize("name", ["num_samples", "num_candidates"])
+@pytest.mark.parametrize("size", [0, -1])
+def test_a_ray_without_a_sample_is_refused_in_a_line(name, size):
+    with pytest.raises(ValueError, match=f"at least one sample, got {name} {size}$"):
+        LearnedOccupancySampler(Balls(), cache_bytes=0, **{name: size})
+    with pytest.raises(ValueError, match=f"got samples {size}$"):
+        DenseSampler(samples=size)
+
+
+def test_one_sample_and_one_candidate_are_enough():
+    one = LearnedOccupancySampler(Balls(), num_samples=1, num_candidates=1, cache_bytes=0)
+    samples, weights, _ = one.eval()(bundle(3))
+    assert samples.frustums.starts.shape == weights[0].shape == (3, 1, 1)
+
+
 def test_no_rays_is_no_samples(sampler):
     samples, weights, _ = sampler(bundle(0))
     assert samples.frustums.starts.shape == (0, 32, 1)
@@ -130,6 +164,40 @@ def test_a_ray_that_ends_before_it_begins_has_samples_without_length(sampler):
     assert torch.equal(frustums.starts[0], torch.full_like(frustums.starts[0], FAR))
     assert torch.equal(frustums.ends[0], frustums.starts[0])
     assert (frustums.ends[1:] > frustums.starts[1:]).all()
+
+
+BAD = {
+    "nothing": ("origins", 1.0),
+    "NaN origin": ("origins", torch.nan),
+    "infinite origin": ("origins", torch.inf),
+    "NaN direction": ("directions", torch.nan),
+    "infinite direction": ("directions", -torch.inf),
+    "no direction": ("directions", 0.0),
+    "NaN near": ("nears", torch.nan),
+    "NaN far": ("fars", torch.nan),
+    "ends before it begins": ("fars", -1.0),
+}
+
+
+@settings(deadline=None, max_examples=40)
+@given(n_rays=st.integers(0, 4), bad=st.sampled_from(sorted(BAD)), training=st.booleans())
+def test_bad_rays_give_samples_that_can_be_rendered_and_harm_no_other(
+    sampler, n_rays, bad, training
+):
+    rays, name, value = bundle(n_rays), *BAD[bad]
+    clean = sampler.eval()(bundle(n_rays))[0].frustums.starts
+    if n_rays and bad != "nothing":
+        getattr(rays, name)[0] = value
+    samples, weights, _ = sampler.train(training)(rays)
+    starts, ends = samples.frustums.starts, samples.frustums.ends
+    assert starts.shape == ends.shape == (n_rays, 32, 1)
+    assert starts.isfinite().all() and (ends >= starts).all() and ends.isfinite().all()
+    assert weights[0].isfinite().all() and (weights[0] >= 0.0).all()
+    if not training:
+        assert starts[1:].equal(clean[1:])
+    densities = torch.rand(n_rays, 32, 1, requires_grad=True)
+    samples.get_weights(densities).sum().backward()
+    assert densities.grad.isfinite().all()
 
 
 @pytest.mark.parametrize("dtype", [torch.float64, torch.float16])

@@ -34,6 +34,21 @@ def render(samples, sigma_fn):
     return packed.accumulate_along_rays(weights, values, ray_indices, N_RAYS)
 
 
+def test_the_density_of_a_sample_is_that_of_its_middle(scene):
+    origins, directions = scene[:2]
+    ray_indices, t_starts, t_ends = march(*scene, step_size=0.5)
+    expected = []
+    for ray, start, end in zip(*(t.tolist() for t in (ray_indices, t_starts, t_ends)), strict=True):
+        middle = origins[ray] + directions[ray] * (0.5 * (start + end))
+        expected.append(float(density(middle[None])))
+    for shape in ((-1,), (-1, 1)):  # as hosts answer
+        sigma_fn = densities_of_samples(
+            lambda x, shape=shape: density(x).view(shape), origins, directions
+        )
+        sigmas = sigma_fn(t_starts, t_ends, ray_indices)
+        torch.testing.assert_close(sigmas, torch.tensor(expected), rtol=1e-3, atol=1e-3)
+
+
 @pytest.mark.parametrize("slab", [1, 7, 64, 1000])
 @pytest.mark.parametrize("cone_angle", [0.0, 0.01])
 def test_front_to_back_is_pruning_with_fewer_questions(scene, slab, cone_angle):
