@@ -262,8 +262,8 @@ class LecoModel(Model):
             )
 
     def get_outputs(self, ray_bundle: RayBundle) -> dict[str, Any]:  # type: ignore[override]
-        """Pixels of rays; in training also what the losses need (`shaded`, `intervals`, `rays`), and
-        `kept_rule`, the last three arguments of `statistics.kept_fraction`."""
+        """Pixels of rays; in training also what losses and log need: `shaded`, `intervals`, `rays`,
+        and `kept_rule`, the last three arguments of `kept_fraction`."""
         rays = self.rays_of(ray_bundle)
         frozen, threshold = bool(self.frozen), float(self.threshold)
         guided = frozen and threshold > 0.0  # at 0 nothing is skipped

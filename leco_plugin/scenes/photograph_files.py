@@ -90,19 +90,20 @@ def header_of(path: Path) -> tuple[tuple[int, int], str]:
 
 
 def names_what_it_cannot_read(dataset: Any) -> Any:
-    """A dataset of nerfstudio's which says in one line which of its images cannot be decoded."""
-    dataset.get_numpy_image = _naming(dataset.get_numpy_image, dataset.image_filenames)
+    """A dataset of nerfstudio's which says in one line which of its images, or what comes with it,
+    cannot be read."""
+    dataset.get_data = _naming(dataset.get_data, dataset.image_filenames)
     return dataset
 
 
-def _naming(read: Callable[[int], Read], paths: list[Path]) -> Callable[[int], Read]:
-    def read_or_name(image_idx: int) -> Read:
+def _naming(read: Callable[..., Read], paths: list[Path]) -> Callable[..., Read]:
+    def read_or_name(image_idx: int, *arguments: Any, **options: Any) -> Read:
         try:
-            return read(image_idx)
+            return read(image_idx, *arguments, **options)
         except (AssertionError, OSError, SyntaxError, ValueError) as error:  # of Pillow's readers
-            reason = " ".join(str(error).split())[:80] or type(error).__name__
+            reason = " ".join(str(error).split())[:200] or type(error).__name__
             raise InputError(
-                f"{paths[image_idx]} cannot be decoded ({reason}): is the file whole?"
+                f"{paths[image_idx]} cannot be read ({reason}): is the file whole?"
             ) from None
 
     return read_or_name

@@ -182,7 +182,7 @@ def test_an_image_that_is_cut_off_is_named_in_one_line(
     content = (scene / name).read_bytes()
     (scene / name).write_bytes(content[: len(content) // 2])
     config = LecoDataManagerConfig(images=way, pixels=tmp_path / "pixels", **options(scene))
-    with pytest.raises(InputError, match=f"{name} cannot be decoded") as caught:
+    with pytest.raises(InputError, match=f"{name} cannot be read") as caught:
         config.setup(device="cpu")
     assert "\n" not in str(caught.value)
 
