@@ -102,8 +102,7 @@ def _naming(read: Callable[..., Read], paths: list[Path]) -> Callable[..., Read]
             return read(image_idx, *arguments, **options)
         except (AssertionError, OSError, SyntaxError, ValueError) as error:  # of Pillow's readers
             reason = " ".join(str(error).split())[:200] or type(error).__name__
-            raise InputError(
-                f"{paths[image_idx]} cannot be read ({reason}): is the file whole?"
-            ) from None
+        # out here, because that error holds the file that nerfstudio has left open
+        raise InputError(f"{paths[image_idx]} cannot be read ({reason}): is the file whole?")
 
     return read_or_name

@@ -5,6 +5,7 @@ from __future__ import annotations
 import shutil
 from pathlib import Path
 from types import SimpleNamespace
+from typing import ClassVar
 
 import numpy as np
 import pytest
@@ -12,10 +13,32 @@ import torch
 from PIL import Image
 
 from leco_plugin.scenes.input_error import InputError
-from leco_plugin.scenes.photograph_files import check_images, check_smaller_images
+from leco_plugin.scenes.photograph_files import (
+    check_images,
+    check_smaller_images,
+    names_what_it_cannot_read,
+)
 from leco_plugin.scenes.photographs import LecoPhotographsDataParserConfig
 
 META = {"w": 8, "h": 6}
+
+
+class Dataset:
+    """Of one image, as nerfstudio's, which fails at it."""
+
+    image_filenames: ClassVar = [Path("scene/0.png")]
+
+    def get_data(self, image_idx: int, image_type: str = "float32") -> str:
+        if image_type == "uint8":
+            raise FileNotFoundError(2, "No such file or directory", "scene/masks_2/0.png")
+        return f"image {image_idx}"
+
+
+def test_what_cannot_be_read_with_an_image_is_named_beside_it() -> None:
+    dataset = names_what_it_cannot_read(Dataset())
+    assert dataset.get_data(0) == "image 0"
+    with pytest.raises(InputError, match=r"scene/0\.png cannot be read .*masks_2/0\.png"):
+        dataset.get_data(0, image_type="uint8")
 
 
 def images_of(folder: Path, *modes: str) -> list[dict[str, str]]:
