@@ -32,6 +32,8 @@ def city(
     height: int = 120,
     aerial_per_block: float = 8.5,
     aerial_only: bool = False,
+    sky: bool = False,
+    far_terrain: bool = False,
     format: Literal["nerfstudio", "mega-nerf"] = "nerfstudio",
     json: Path | None = None,
 ) -> None:
@@ -48,13 +50,16 @@ def city(
         height: Height of the pictures in pixels.
         aerial_per_block: Pictures from the air for each block that is built.
         aerial_only: No pictures from the street, as in the city of `leco demo`.
+        sky: A sky behind the city; without it, rays that miss are transparent.
+        far_terrain: A plain around the city, and hills at several times its size.
         format: Of the scene: nerfstudio's, or Mega-NeRF's, for the data parser mega-nerf.
         json: File for what was written, as JSON.
     """
     from leco_plugin.scenes.city import City, CityConfig
     from leco_plugin.scenes.city_folder import CaptureConfig, count_pictures, write_city
 
-    config, capture = CityConfig(blocks, seed, block_size), CaptureConfig(width, height)
+    config = CityConfig(blocks, seed, block_size, sky=sky, far_terrain=far_terrain)
+    capture = CaptureConfig(width, height)
     capture = replace(capture, aerial_per_block=aerial_per_block)
     if aerial_only:
         capture = replace(capture, street_per_block=0.0)
@@ -66,6 +71,8 @@ def city(
         "blocks": blocks,
         "block_size": block_size,
         "seed": seed,
+        "sky": sky,
+        "far_terrain": far_terrain,
         "images": images,
         "test_images": test_images,
         "width": width,

@@ -10,6 +10,7 @@ from pathlib import Path
 
 import pytest
 from ball_occupancy import ball
+from PIL import Image
 
 from leco_plugin import cli
 
@@ -86,6 +87,19 @@ def test_city_writes_a_scene_and_says_so(tmp_path: Path) -> None:
     assert run("city", "--blocks", 1, "--out", aerial, "--aerial-only", "--json", report) == 0
     assert json.loads(report.read_text())["images"] < facts["images"]
     assert json.loads((aerial / "city.json").read_text())["capture"]["street_per_block"] == 0.0
+
+
+def test_city_writes_a_sky_and_far_terrain_where_that_is_asked_for(tmp_path: Path) -> None:
+    small = ["--blocks", 1, "--width", 24, "--height", 20, "--aerial-only"]
+    written = {}
+    for name, more in (("plain", []), ("far", ["--sky", "--far-terrain"])):
+        out = tmp_path / name
+        assert run("city", "--out", out, *small, *more) == 0
+        described = json.loads((out / "city.json").read_text())["city"]
+        assert described["sky"] == described["far_terrain"] == bool(more)
+        with Image.open(next((out / "images").iterdir())) as image:
+            written[name] = image.mode
+    assert written == {"plain": "RGBA", "far": "RGB"}
 
 
 @pytest.fixture

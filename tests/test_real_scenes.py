@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
@@ -17,6 +18,23 @@ from leco_plugin.models.freezing import FILE_NAME
 from leco_plugin.occupancy import Occupancy
 
 KINDS = {"brighton_beach": "box", "caliterra": "box", "banana": "box", "fox": "contraction"}
+
+OUTPUTS = {"rgb", "depth", "accumulation", "occupancy", "expert", "samples_per_ray"}
+
+
+def assert_renders(trainer: Any) -> None:
+    """A test photograph, at a twelfth of its size, in every output."""
+    model, dataset = trainer.pipeline.model, trainer.pipeline.datamanager.eval_dataset
+    camera = copy.deepcopy(dataset.cameras[0:1])
+    camera.rescale_output_resolution(1 / 12)
+    shape = int(camera.height), int(camera.width)
+    model.eval()
+    outputs = model.get_outputs_for_camera(camera.to(model.device))
+    assert outputs.keys() >= OUTPUTS
+    for output in OUTPUTS:
+        assert outputs[output].shape[:2] == shape
+        assert bool(outputs[output].isfinite().all())
+    assert float(outputs["samples_per_ray"].mean()) >= 1.0
 
 
 # nerfstudio leaves the images open whose size it has read
@@ -43,6 +61,7 @@ def test_a_scene_trains_freezes_and_renders_without_a_flag(
     assert bool(model.frozen)
     assert model.space.kind == KINDS[name]
     assert psnr_on_rays(trainer, 200) > 7.0
+    assert_renders(trainer)
     occupancy = Occupancy.load(trainer.base_dir / FILE_NAME)
     assert occupancy.report["held_out"]
     values = occupancy.query(torch.rand(100, 3) - 0.5)

@@ -37,6 +37,7 @@ from leco_plugin.models.rendering import (
 from leco_plugin.models.scene_rays import cut_to_bounds, marching_rule
 from leco_plugin.models.scene_sizes import complete
 from leco_plugin.models.sizes import Sizes
+from leco_plugin.models.statistics import KEPT_ABOVE, gate_statistics, kept_fraction, prices
 from leco_plugin.models.stored_sizes import SIZES, stored_in, to_store
 from leco_plugin.occupancy import Occupancy, gate_precision
 from leco_plugin.samplers.estimator import LearnedOccupancyEstimator
@@ -184,6 +185,7 @@ class LecoModel(Model):
         """Has a frozen gate learn again."""
         self.frozen.fill_(False)
         self.threshold.fill_(0.0)
+        self.report = {}  # of the gate as it was
         self.gate.requires_grad_(True)
         self.forget_estimator()
 
@@ -202,10 +204,14 @@ class LecoModel(Model):
             self.aabb,
         ).to(self.device)
 
+    def step_and_angle(self, learning: bool) -> tuple[float, float]:
+        """Step, scene units, and cone angle of the march."""
+        _, _, step, learn_step, cone, learn_cone = self.march_range.tolist()
+        return (learn_step, learn_cone) if learning else (step, cone)
+
     def intervals_of(self, rays: Rays, guided: bool, learning: bool) -> Intervals:
         """Candidates along the rays; guided, only those that the occupancy keeps."""
-        _, _, step, learn_step, cone, learn_cone = self.march_range.tolist()
-        size, angle = (learn_step, learn_cone) if learning else (step, cone)
+        size, angle = self.step_and_angle(learning)
         jitter = torch.rand_like(rays.t_mins) if self.training else None
         along = rays.origins, rays.directions, rays.t_mins, rays.t_maxs
         if guided:
@@ -256,10 +262,13 @@ class LecoModel(Model):
             )
 
     def get_outputs(self, ray_bundle: RayBundle) -> dict[str, Any]:  # type: ignore[override]
-        """Pixels of rays; in training also what the losses need (`shaded`, `intervals`, `rays`)."""
+        """Pixels of rays; in training also what losses and log need: `shaded`, `intervals`, `rays`,
+        and `kept_rule`, the last three arguments of `kept_fraction`."""
         rays = self.rays_of(ray_bundle)
-        guided = bool(self.frozen) and float(self.threshold) > 0.0  # at 0 nothing is skipped
-        intervals = self.intervals_of(rays, guided, learning=self.training and self.is_learning())
+        frozen, threshold = bool(self.frozen), float(self.threshold)
+        guided = frozen and threshold > 0.0  # at 0 nothing is skipped
+        learning = self.training and self.is_learning()
+        intervals = self.intervals_of(rays, guided, learning)
         if self.training:
             kept = len(intervals.t_starts) / max(len(rays.origins), 1) - 1.0
             self.guided_kept = kept if guided else 1.0
@@ -276,7 +285,9 @@ class LecoModel(Model):
             "accumulation": shaded.accumulation[:, None],
         }
         if self.training:
-            return outputs | {"shaded": shaded, "intervals": intervals, "rays": rays}
+            rule = (threshold if frozen else KEPT_ABOVE, *self.step_and_angle(learning))
+            batch_of = {"shaded": shaded, "intervals": intervals, "rays": rays}
+            return outputs | batch_of | {"kept_rule": rule}
         return outputs | per_ray_pictures(shaded, intervals.ray_indices, len(rays.origins))
 
     def is_learning(self) -> bool:
@@ -329,15 +340,16 @@ class LecoModel(Model):
     def get_metrics_dict(
         self, outputs: dict[str, Any], batch: dict[str, Tensor]
     ) -> dict[str, Tensor]:
-        """PSNR of the batch; of the gate: kept fraction, share and density per expert."""
-        from leco_plugin.models.statistics import gate_statistics
-
+        """PSNR of the batch; of the gate: kept fraction, share and density per expert; once it is
+        frozen, what skipping costs."""
         truth = self.renderer_rgb.blend_background(batch["image"].to(self.device))
         error = torch.nn.functional.mse_loss(outputs["rgb"], truth)
         metrics = {"psnr": -10.0 * torch.log10(error.clamp(min=1e-12))}
         if "shaded" in outputs:
+            batch_of = outputs["shaded"], outputs["intervals"], outputs["rays"]
+            metrics["kept_fraction"] = kept_fraction(*batch_of, *outputs["kept_rule"])
             metrics |= gate_statistics(outputs["shaded"], self.config.sizes.gate.scene_experts)
-        return metrics
+        return metrics | prices(self.report)
 
     def get_image_metrics_and_images(
         self, outputs: dict[str, Tensor], batch: dict[str, Tensor]

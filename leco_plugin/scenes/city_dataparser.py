@@ -56,13 +56,17 @@ class LecoCity(Nerfstudio):
     def __init__(self, config: LecoCityDataParserConfig) -> None:
         from leco_plugin.scenes.city import CityConfig
         from leco_plugin.scenes.city_folder import CaptureConfig, write_city
+        from leco_plugin.scenes.input_error import InputError
 
         super().__init__(config)
-        city = CityConfig(
-            config.blocks, config.seed, sky=config.sky, far_terrain=config.far_terrain
-        )
-        capture = CaptureConfig(config.width, config.height)
-        self.config.data = write_city(city, config.folder(), capture)
+        try:
+            city = CityConfig(
+                config.blocks, config.seed, sky=config.sky, far_terrain=config.far_terrain
+            )
+            capture = CaptureConfig(config.width, config.height)
+            self.config.data = write_city(city, config.folder(), capture)
+        except (ValueError, OSError) as error:
+            raise InputError(f"no city could be written: {error}") from None
 
     def _generate_dataparser_outputs(
         self, split: str = "train", **kwargs: Any

@@ -26,6 +26,7 @@ from leco_plugin.scenes.dataset_units import UP_IS_KNOWN
 from leco_plugin.scenes.detail import CAMERAS
 from leco_plugin.scenes.held_out_pixels import HeldOutPixelSampler
 from leco_plugin.scenes.input_error import InputError
+from leco_plugin.scenes.photograph_files import names_what_it_cannot_read
 from leco_plugin.scenes.stored_pictures import store_pictures
 from leco_plugin.scenes.survey import points_in
 from leco_plugin.scenes.upright import turn_to_upright, turned
@@ -67,15 +68,20 @@ class LecoDataManager(VanillaDataManager):  # type: ignore[type-arg]
     @dataparser.setter
     def dataparser(self, parser: Any) -> None:
         self._dataparser = parser
+        parser.get_dataparser_outputs = in_one_line(parser.get_dataparser_outputs, parser.config)
         # nerfstudio sets this class as the target of configs that an earlier release stored
         if getattr(self.config, "upright", False):
             parser.get_dataparser_outputs = upright_outputs(parser.get_dataparser_outputs)
 
     def create_train_dataset(self) -> Any:
         """The training photographs; the model is told of their cameras, for its sizes."""
-        dataset = super().create_train_dataset()
+        dataset = names_what_it_cannot_read(super().create_train_dataset())
         dataset.metadata[CAMERAS] = dataset.cameras
         return dataset
+
+    def create_eval_dataset(self) -> Any:
+        """The test photographs."""
+        return names_what_it_cannot_read(super().create_eval_dataset())
 
     def on_disk(self) -> bool:
         """Whether pixels are read from files.
@@ -141,6 +147,23 @@ class LecoDataManager(VanillaDataManager):  # type: ignore[type-arg]
         self.eval_dataloader = RandIndicesEvalDataloader(
             input_dataset=self.eval_dataset, device=self.device
         )
+
+
+def in_one_line(read: Callable[..., DataparserOutputs], config: Any) -> Callable[..., Any]:
+    """A reader of splits which says in one line what any reader asserts of a scene, or misses.
+
+    Args:
+        config: of the reader.
+    """
+
+    def outputs_of(*arguments: Any, **options: Any) -> DataparserOutputs:
+        try:
+            return read(*arguments, **options)
+        except (AssertionError, OSError) as error:
+            reason = " ".join(str(error).split())[:200] or type(error).__name__
+            raise InputError(f"{config.data} cannot be read as a scene: {reason}") from error
+
+    return outputs_of
 
 
 def upright_outputs(read: Callable[..., DataparserOutputs]) -> Callable[..., DataparserOutputs]:

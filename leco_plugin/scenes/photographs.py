@@ -20,6 +20,8 @@ from torch import Tensor
 
 from leco_plugin.scenes.dataset_units import METRES_PER_UNIT, UP_IS_KNOWN
 from leco_plugin.scenes.input_error import InputError
+from leco_plugin.scenes.photograph_files import check_images, check_smaller_images
+from leco_plugin.scenes.photograph_intrinsics import check_intrinsics
 from leco_plugin.scenes.photograph_masks import check_masks
 from leco_plugin.scenes.rotations import distance_from_rotations
 
@@ -52,10 +54,15 @@ class LecoPhotographs(Nerfstudio):
             self.config.orientation_method = "none"
         try:
             outputs: DataparserOutputs = super()._generate_dataparser_outputs(split)
-        except (AssertionError, RuntimeError) as error:  # what nerfstudio finds wrong with it
-            raise InputError(f"{self.config.data}: {_one_line(error)}") from error
+        except InputError:
+            raise
+        except Exception as error:
+            reason = f"{type(error).__name__}: {_one_line(error)}"
+            raise InputError(f"{self.config.data} cannot be read ({reason})") from error
         if len(outputs.image_filenames) == 0:
             raise InputError(f"{self.config.data}: no image is left for the split {split!r}")
+        if self.downscale_factor != 1:
+            check_smaller_images(outputs.image_filenames, outputs.cameras)
         points = read_points(meta, folder_of(self.config.data))
         if points is not None:
             transform, scale = outputs.dataparser_transform, outputs.dataparser_scale
@@ -97,14 +104,16 @@ def check_scene(data: Path) -> dict[str, Any]:
 
     Raises:
         InputError: one line: no such folder, no cameras or a single place, missing images, images
-            that disagree with the intrinsics, masks that hide everything, poses that are not poses.
+            that disagree with the intrinsics or are of a kind that would be read wrongly, masks
+            that hide everything, poses that are not poses.
     """
     if not data.exists():
         raise InputError(f"there is no folder {data}; give one with --data")
     description = data if data.suffix == ".json" else data / "transforms.json"
     if not description.exists():
         raise InputError(
-            f"{data} holds no transforms.json; make one from photographs with ns-process-data"
+            f"{data} holds no transforms.json; give a folder with one by --data, or make one from "
+            "photographs with ns-process-data"
         )
     try:
         meta = json.loads(description.read_text())
@@ -130,57 +139,14 @@ def check_scene(data: Path) -> dict[str, Any]:
         number = "one image" if len(frames) == 1 else f"{len(frames)} images from one place"
         raise InputError(f"{description} has {number}; a scene is seen from two places at least")
     folder = folder_of(data)
-    _check_intrinsics(meta, frames, description)
-    _check_images(meta, frames, folder)
+    check_intrinsics(meta, frames, description)
+    check_images(meta, frames, folder)
     check_masks(frames, folder)
     return dict(meta)
 
 
 def _one_line(error: Exception) -> str:
     return " ".join(str(error).split())[:120]
-
-
-def _check_intrinsics(
-    meta: dict[str, Any], frames: list[dict[str, Any]], description: Path
-) -> None:
-    """The size of the images and their intrinsics are numbers, for the scene or for each frame."""
-    for name in ("w", "h", "fl_x", "fl_y", "cx", "cy"):
-        for frame in frames:
-            # the scene's own goes before that of a frame, as in nerfstudio
-            value = meta.get(name, frame.get(name))
-            if value is None:
-                raise InputError(f"{description}: {frame['file_path']} has no {name}")
-            sound = type(value) in (int, float) and abs(value) < 1e9
-            if not sound or (name[0] != "c" and not value >= 1e-3):
-                raise InputError(
-                    f"{description}: {name} of {frame['file_path']} is {str(value)[:40]!r}, and "
-                    "not what a camera has"
-                )
-
-
-def _check_images(meta: dict[str, Any], frames: list[dict[str, Any]], folder: Path) -> None:
-    """Every image is there, and has the size that its intrinsics are for."""
-    from PIL import Image, UnidentifiedImageError
-
-    missing = [f["file_path"] for f in frames if not (folder / f["file_path"]).exists()]
-    if missing:
-        raise InputError(
-            f"{len(missing)} of {len(frames)} images are not there, "
-            f"the first is {folder / missing[0]}"
-        )
-    for frame in frames:
-        width, height = (int(meta[n] if n in meta else frame[n]) for n in ("w", "h"))
-        path = folder / frame["file_path"]
-        try:
-            with Image.open(path) as image:
-                size = image.size
-        except (OSError, UnidentifiedImageError, Image.DecompressionBombError):
-            raise InputError(f"{path} cannot be read as an image") from None
-        if size != (width, height):
-            raise InputError(
-                f"{path} has {size[0]} x {size[1]} pixels, "
-                f"its intrinsics are for {width} x {height}"
-            )
 
 
 def read_points(meta: dict[str, Any], folder: Path) -> Tensor | None:

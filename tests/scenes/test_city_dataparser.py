@@ -12,6 +12,7 @@ from nerfstudio.plugins.registry_dataparser import DataParserSpecification
 from leco_plugin.scenes.city_dataparser import LecoCityDataParserConfig, leco_city_dataparser
 from leco_plugin.scenes.city_truth import CityTruth
 from leco_plugin.scenes.dataset_units import METRES_PER_UNIT
+from leco_plugin.scenes.input_error import InputError
 from leco_plugin.scenes.photographs import POINTS
 
 
@@ -103,3 +104,15 @@ def test_the_entry_point_is_light_to_import() -> None:
     )
     assert loaded.stdout.split() == ["leco_plugin.scenes.city_dataparser"]
     assert isinstance(leco_city_dataparser, DataParserSpecification)
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [({"blocks": 0}, "1 to 64 blocks"), ({"width": 0}, "no city could be written: ")],
+)
+def test_a_city_that_cannot_be_built_ends_a_command_in_one_line(
+    options: dict[str, int], message: str, tmp_path: Path
+) -> None:
+    with pytest.raises(InputError, match=message) as caught:
+        LecoCityDataParserConfig(data=tmp_path / "city", **options).setup()
+    assert "\n" not in str(caught.value) and not (tmp_path / "city").exists()

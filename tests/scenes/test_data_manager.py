@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -11,6 +12,8 @@ import torch
 from nerfstudio.data.datamanagers.base_datamanager import VanillaDataManagerConfig
 from nerfstudio.data.datamanagers.full_images_datamanager import FullImageDatamanagerConfig
 from nerfstudio.data.datamanagers.parallel_datamanager import ParallelDataManagerConfig
+from nerfstudio.data.dataparsers.blender_dataparser import BlenderDataParserConfig
+from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataParserConfig
 from nerfstudio.data.pixel_samplers import PixelSamplerConfig
 from nerfstudio.pipelines.base_pipeline import VanillaPipelineConfig
 
@@ -166,3 +169,23 @@ def test_an_occupancy_is_learned_from_some_images_at_a_time(tiny_scene: Path) ->
     some = {"train_num_images_to_sample_from": 2, "train_num_times_to_repeat_images": 2}
     report, _ = learned(VanillaDataManagerConfig(**options(tiny_scene), **some))
     assert report["held_out"] and report["calibration_rays"] > 0
+
+
+def test_an_image_that_is_cut_off_is_named_in_one_line(tiny_scene: Path, tmp_path: Path) -> None:
+    scene = Path(shutil.copytree(tiny_scene, tmp_path / "scene"))
+    manager: Any = on_disk(scene, tmp_path / "pixels").setup(device="cpu")
+    for dataset in (manager.train_dataset, manager.eval_dataset):
+        path = dataset.image_filenames[1]
+        content = path.read_bytes()
+        path.write_bytes(content[: len(content) // 2])
+        with pytest.raises(InputError, match=f"{path.name} cannot be read") as caught:
+            dataset.get_data(1)
+        assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("reader", [NerfstudioDataParserConfig, BlenderDataParserConfig])
+def test_a_folder_that_is_not_there_is_one_line_of_any_reader(reader: Any, tmp_path: Path) -> None:
+    config = LecoDataManagerConfig(dataparser=reader(data=tmp_path / "nowhere"))
+    with pytest.raises(InputError, match="nowhere cannot be read as a scene") as caught:
+        config.setup(device="cpu")
+    assert "\n" not in str(caught.value)
