@@ -21,7 +21,8 @@ THRESHOLDS = tuple(0.75 * 0.8**i for i in range(32))
 """Tried from the largest down, to 0.0007; below that a gate that fails is kept out of use (0)."""
 
 SURFACE_STEPS = 2.0
-"""Weight within this many steps of a ray's median depth counts as surface, the rest as haze."""
+"""Weight within this many steps of a ray's median depth counts as surface, the rest as haze; all of
+it where the median depth is that of the backdrop."""
 
 
 @dataclass(frozen=True)
@@ -69,7 +70,8 @@ class Reference(NamedTuple):
     occupancies: Tensor
     """[M] o(x)."""
     near_surface: Tensor
-    """[M] bool: within `SURFACE_STEPS` steps of the ray's median depth."""
+    """[M] bool: within `SURFACE_STEPS` steps of the ray's median depth, on rays that meet a
+    surface."""
     rgb: Tensor
     """[R, 3] rendered."""
     always_kept: Tensor
@@ -78,14 +80,32 @@ class Reference(NamedTuple):
 
 def reference_of(shaded: Shaded, intervals: Intervals, rays: Rays) -> Reference:
     """The reference that a rendering of all candidates is."""
+    is_backdrop = backdrop_of(intervals, rays)
     return Reference(
         intervals,
         shaded.weights,
         occupancy_from_logits(shaded.logits),
-        near_median_depth(shaded, intervals),
+        near_surface(shaded, intervals, is_backdrop),
         shaded.rgb,
-        backdrop_of(intervals, rays),
+        is_backdrop,
     )
+
+
+def near_surface(shaded: Shaded, intervals: Intervals, is_backdrop: Tensor) -> Tensor:
+    """Which samples lie within `SURFACE_STEPS` steps of their ray's surface.
+
+    A ray whose median depth lies in the backdrop meets none: what hangs before it is haze, and the
+    backdrop is there without it.
+
+    Args:
+        is_backdrop: [M] bool.
+    Returns:
+        [M] bool.
+    """
+    if len(is_backdrop) == 0:
+        return is_backdrop
+    meets = ~is_backdrop[_medians(shaded, intervals)]
+    return near_median_depth(shaded, intervals) & meets[intervals.ray_indices]
 
 
 def near_median_depth(shaded: Shaded, intervals: Intervals) -> Tensor:
@@ -94,6 +114,14 @@ def near_median_depth(shaded: Shaded, intervals: Intervals) -> Tensor:
     Returns:
         [M] bool.
     """
+    median = _medians(shaded, intervals)[intervals.ray_indices]
+    middles = 0.5 * (intervals.t_starts + intervals.t_ends)
+    steps = (intervals.t_ends - intervals.t_starts)[median]
+    return (middles - middles[median]).abs() <= SURFACE_STEPS * steps * 1.001
+
+
+def _medians(shaded: Shaded, intervals: Intervals) -> Tensor:
+    """The sample of each ray that halves its weight: [R], any for a ray without samples."""
     num_rays = len(shaded.packed_info)
     below_half = (
         inclusive_sum(shaded.weights, packed_info=shaded.packed_info)
@@ -104,10 +132,7 @@ def near_median_depth(shaded: Shaded, intervals: Intervals) -> Tensor:
     ].long()
     starts, counts = shaded.packed_info.unbind(dim=-1)
     median = starts + torch.minimum(ahead, (counts - 1).clamp(min=0))
-    median = median.clamp(max=max(len(shaded.weights) - 1, 0))[intervals.ray_indices]
-    middles = 0.5 * (intervals.t_starts + intervals.t_ends)
-    steps = (intervals.t_ends - intervals.t_starts)[median]
-    return (middles - middles[median]).abs() <= SURFACE_STEPS * steps * 1.001
+    return median.clamp(max=max(len(shaded.weights) - 1, 0))
 
 
 def measure(

@@ -13,7 +13,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from leco_plugin.models.calibration import near_median_depth
+from leco_plugin.models.calibration import near_surface
 from leco_plugin.models.leco import LecoModel
 from leco_plugin.models.rendering import Intervals, Rays, backdrop_of
 from leco_plugin.occupancy import Occupancy
@@ -115,8 +115,8 @@ def _by_rendering(
     shaded = model.shade(rays, guided)
     weights = torch.zeros_like(intervals.t_starts)
     weights[kept | is_backdrop] = shaded.weights.float()
-    near_surface = torch.zeros_like(kept)
-    near_surface[kept | is_backdrop] = near_median_depth(shaded, guided)
+    surface = torch.zeros_like(kept)
+    surface[kept | is_backdrop] = near_surface(shaded, guided, is_backdrop[kept | is_backdrop])
     before = ~is_backdrop
     weights = weights[before]
     evidence = Evidence(
@@ -124,7 +124,7 @@ def _by_rendering(
         intervals.ray_indices[before],
         kept[before],
         weights,
-        weights * near_surface[before],
+        weights * surface[before],
         len(rays.origins),
     )
     return evidence, Rendered(rays, guided, ~is_backdrop[kept | is_backdrop], shaded.rgb, truth)

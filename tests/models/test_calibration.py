@@ -19,6 +19,7 @@ from leco_plugin.models.calibration import (
     excesses,
     measure,
     near_median_depth,
+    near_surface,
 )
 from leco_plugin.models.rendering import Intervals, Shaded
 from leco_plugin.samplers.packed import accumulate_along_rays, pack_info
@@ -161,10 +162,25 @@ def test_near_the_median_depth_is_within_two_steps_of_it(seed: int) -> None:
             assert bool(near[sample]) == expected
 
 
+def test_before_a_backdrop_that_holds_the_median_there_is_no_surface() -> None:
+    ray_indices = torch.arange(3).repeat_interleave(4)
+    starts = torch.arange(4).repeat(3) * 0.5
+    intervals = Intervals(ray_indices, starts, starts + 0.5)
+    hazy, solid, thin = [0.0, 0.2, 0.2, 0.6], [0.0, 0.7, 0.1, 0.2], [0.5, 0.0, 0.0, 0.5]
+    weights, none = torch.tensor([*hazy, *solid, *thin]), torch.zeros(0)
+    packed = pack_info(ray_indices, 3)
+    shaded = Shaded(none, torch.ones(3), none, weights, none, none, none, packed)
+    near = near_surface(shaded, intervals, torch.tensor([False, False, False, True]).repeat(3))
+    assert near.view(3, 4).tolist() == [[False] * 4, [True] * 4, [True, True, True, False]]
+    everywhere = near_surface(shaded, intervals, torch.zeros(12, dtype=torch.bool))
+    assert torch.equal(everywhere, near_median_depth(shaded, intervals))
+
+
 def test_no_samples_have_no_median() -> None:
     none, no_rays = torch.zeros(0), torch.zeros(0, dtype=torch.int64)
     shaded = Shaded(none, torch.zeros(3), none, none, none, none, none, pack_info(no_rays, 3))
     assert near_median_depth(shaded, Intervals(no_rays, none, none)).shape == (0,)
+    assert near_surface(shaded, Intervals(no_rays, none, none), none.bool()).shape == (0,)
 
 
 @settings(deadline=None, max_examples=30)
