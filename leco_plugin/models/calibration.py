@@ -141,6 +141,7 @@ def measure(
     render_kept: Callable[[int, Tensor], Tensor],
     threshold: float,
     with_image: bool = True,
+    missed_only: bool = False,
 ) -> Measured:
     """What skipping below `threshold` costs and saves.
 
@@ -149,6 +150,7 @@ def measure(
         truths: their true pixels, [R, 3] each.
         render_kept: renders chunk i with only the samples of a mask [M]: returns [R, 3].
         with_image: whether to render at all; the image price is NaN otherwise.
+        missed_only: count as lost only what the photographs miss: see `is_missed`.
     """
     surface = lost_surface = total = lost = dense_error = gated_error = 0.0
     skipped = candidates = pixels = 0
@@ -156,7 +158,7 @@ def measure(
         gone = (reference.occupancies < threshold) & ~reference.always_kept
         on_surface = reference.weights * reference.near_surface
         surface += float(on_surface.sum(dtype=torch.float64))
-        lost_surface += float(on_surface[gone].sum(dtype=torch.float64))
+        lost_on_surface = on_surface * gone
         total += float(reference.weights.sum(dtype=torch.float64))
         lost += float(reference.weights[gone].sum(dtype=torch.float64))
         skipped, candidates = skipped + int(gone.sum()), candidates + len(gone)
@@ -165,6 +167,9 @@ def measure(
             dense_error += float(((reference.rgb - truth) ** 2).sum(dtype=torch.float64))
             gated_error += float(((gated - truth) ** 2).sum(dtype=torch.float64))
             pixels += truth.numel()
+            if missed_only:
+                lost_on_surface *= is_missed(reference, gated, truth)
+        lost_surface += float(lost_on_surface.sum(dtype=torch.float64))
     price = float("nan")
     if with_image and pixels:
         floor = 1e-10 * pixels  # 100 dB: below it both renderings are exact
@@ -179,6 +184,24 @@ def measure(
     )
 
 
+def is_missed(reference: Reference, gated: Tensor, truth: Tensor) -> Tensor:
+    """Which samples lie on rays whose pixel is nearer to the dense rendering than to the gated one.
+
+    Of a field that has been trained guided, the dense rendering shows what nobody has corrected
+    since the gate was frozen; only the photographs tell matter that is missed from such haze.
+
+    Args:
+        gated: [R, 3] rendered of what is kept.
+        truth: [R, 3].
+    Returns:
+        [M] bool.
+    """
+    dense_error, gated_error = (
+        (image - truth).square().sum(dim=-1) for image in (reference.rgb, gated)
+    )
+    return (gated_error > dense_error)[reference.intervals.ray_indices]
+
+
 def excesses(
     references: list[Reference],
     truths: list[Tensor],
@@ -191,19 +214,22 @@ def excesses(
     Arguments as for `measure`.
 
     Returns:
-        Lost weight near surfaces less the share of it that may be lost, and squared error of the
-        gated image less what the bound on the price makes of the dense one's; both [R].
+        Lost weight near surfaces, where it is missed, less the share that may be lost; and squared
+        error of the gated image less what the bound on the price makes of the dense one's; both
+        [R].
     """
     surface, image = [], []
     worse = 10.0 ** (0.1 * config.image_price_db)
     for i, (reference, truth) in enumerate(zip(references, truths)):
         gone = (reference.occupancies < threshold) & ~reference.always_kept
+        gated = render_kept(i, ~gone)
         on_surface = reference.weights * reference.near_surface
-        beyond = on_surface * gone - config.lost_surface_mass * on_surface
+        lost = on_surface * (gone & is_missed(reference, gated, truth))
+        beyond = lost - config.lost_surface_mass * on_surface
         per_ray = beyond.new_zeros(len(truth))
         surface.append(per_ray.index_add_(0, reference.intervals.ray_indices, beyond))
-        gated = ((render_kept(i, ~gone) - truth) ** 2).sum(dim=-1)
-        image.append(gated - worse * ((reference.rgb - truth) ** 2).sum(dim=-1))
+        dense_error = ((reference.rgb - truth) ** 2).sum(dim=-1)
+        image.append(((gated - truth) ** 2).sum(dim=-1) - worse * dense_error)
     return torch.cat(surface), torch.cat(image)
 
 
@@ -213,17 +239,19 @@ def calibrate(
     render_kept: Callable[[int, Tensor], Tensor],
     config: CalibrationConfig,
     below: float = 1.0,
+    missed_only: bool = False,
 ) -> Measured:
     """The largest threshold of `THRESHOLDS` within the bounds, with what it costs.
 
     Arguments as for `measure`; only thresholds below `below` are tried. When none is within the
     bounds, the threshold is 0: everything is kept, which is slow and never wrong.
     """
+    parts = references, truths, render_kept
     for threshold in (tried for tried in THRESHOLDS if tried < below):
-        cheap = measure(references, truths, render_kept, threshold, with_image=False)
-        if cheap.lost_surface_mass > config.lost_surface_mass:
+        cheap = measure(*parts, threshold, with_image=False)
+        if not missed_only and cheap.lost_surface_mass > config.lost_surface_mass:
             continue
-        measured = measure(references, truths, render_kept, threshold)
+        measured = measure(*parts, threshold, missed_only=missed_only)
         if measured.within(config):
             return measured
     return measure(references, truths, render_kept, 0.0)

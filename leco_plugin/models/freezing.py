@@ -199,15 +199,19 @@ def _images(datamanager: Any) -> dict[str, Any]:
 
 
 @torch.no_grad()
-def calibrate_on(model: LecoModel, rays: Rays, truth: Tensor, below: float = 1.0) -> Measured:
+def calibrate_on(
+    model: LecoModel, rays: Rays, truth: Tensor, below: float = 1.0, missed_only: bool = False
+) -> Measured:
     """Finds the threshold of a model's gate on given rays; the model is left as it was.
 
     Args:
         below: only thresholds below this are tried.
+        missed_only: see `calibration.measure`.
     """
     was_training = model.training
     model.eval()
-    measured = calibrate(*dense_rendering(model, rays, truth), model.config.calibration, below)
+    rendering, config = dense_rendering(model, rays, truth), model.config.calibration
+    measured = calibrate(*rendering, config, below, missed_only)
     model.train(was_training)
     return measured
 

@@ -1,9 +1,10 @@
 """The price of skipping, measured again in guided training: a frozen gate meets a better field.
 
 Calibration bounds the price for the field of that moment. Every so many steps it is measured anew
-on a few held-out rays that the calibration did not use. Where it is found to be beyond its bounds,
-the threshold is calibrated again among lower ones; where none of these is within them, nothing is
-skipped any more.
+on a few held-out rays that the calibration did not use. What is lost near surfaces counts where the
+photographs miss it: where the gate skips, the field is not trained any more, and shows haze. Where
+a price is found to be beyond its bounds, the threshold is calibrated again among lower ones; where
+none of these is within them, nothing is skipped any more.
 """
 
 from __future__ import annotations
@@ -107,7 +108,7 @@ def skip_less(model: LecoModel, datamanager: Any, step: int, why: str) -> Measur
 
     def again() -> Measured:
         rays, truth = calibration_rays(model, datamanager, seed=progress.rechecks)
-        return calibrate_on(model, rays, truth, below=before)
+        return calibrate_on(model, rays, truth, below=before, missed_only=True)
 
     measured = from_first(again, model.device)
     model.threshold.fill_(measured.threshold)

@@ -188,7 +188,7 @@ def test_no_samples_have_no_median() -> None:
 def test_rays_exceed_the_bounds_on_average_where_the_price_does(seed: int, which: int) -> None:
     problem, threshold = Problem(seed), THRESHOLDS[which]
     parts = problem.references, problem.truths, problem.render_kept
-    measured = measure(*parts, threshold)
+    measured = measure(*parts, threshold, missed_only=True)
     surface, image = excesses(*parts, threshold, CONFIG)
     assert surface.shape == image.shape == (2 * RAYS,)
     for excess, price, bound in (
@@ -197,6 +197,35 @@ def test_rays_exceed_the_bounds_on_average_where_the_price_does(seed: int, which
     ):
         if abs(price - bound) > 1e-4:
             assert (float(excess.mean()) > 0.0) == (price > bound)
+
+
+@settings(deadline=None, max_examples=20)
+@given(seed=st.integers(0, 1000))
+def test_what_no_photograph_misses_is_not_lost(seed: int) -> None:
+    problem, threshold = Problem(seed), 0.5
+    masks = [reference.occupancies >= threshold for reference in problem.references]
+    surface = lost = 0.0
+    for number, (reference, mask) in enumerate(zip(problem.references, masks)):
+        gated, truth = problem.render_kept(number, mask), problem.truths[number]
+        for ray in range(RAYS):
+            mine = reference.intervals.ray_indices == ray
+            weights = (reference.weights * reference.near_surface)[mine]
+            surface += float(weights.sum())
+            errors = [float((rgb[ray] - truth[ray]).norm()) for rgb in (gated, reference.rgb)]
+            lost += float(weights[~mask[mine]].sum()) if errors[0] > errors[1] else 0.0
+    found = measure(*problem.arguments(), threshold, missed_only=True)
+    assert found.lost_surface_mass == pytest.approx(lost / surface, rel=1e-4)
+    assert found.lost_surface_mass <= measure(*problem.arguments(), threshold).lost_surface_mass
+
+
+def test_a_dense_rendering_that_is_wrong_lowers_no_threshold() -> None:
+    problem = Problem(0)
+    haze = [reference.occupancies < 0.3 for reference in problem.references]
+    problem.truths[:] = [problem.render_kept(i, ~gone) for i, gone in enumerate(haze)]
+    config = CalibrationConfig(1e-6, 99.0)
+    trusting = calibrate(*problem.arguments(), config)
+    wary = calibrate(*problem.arguments(), config, missed_only=True)
+    assert trusting.threshold < 0.1 < 0.2 < wary.threshold < 0.3
 
 
 def test_only_lower_thresholds_are_tried_where_that_is_asked() -> None:

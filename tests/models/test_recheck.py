@@ -101,7 +101,10 @@ def test_the_threshold_is_lowered_to_one_within_the_bounds_or_to_none(
 ) -> None:
     asked: list[Any] = []
 
-    def calibrate_on(model: Any, rays: Any, truth: Any, below: float) -> Measured:
+    def calibrate_on(
+        model: Any, rays: Any, truth: Any, below: float, missed_only: bool
+    ) -> Measured:
+        assert missed_only
         asked.append((rays, below))
         return Measured(found, 1e-4, 2e-3, 0.01, 0.5 if found else 0.0)
 
