@@ -21,6 +21,7 @@ from leco_plugin.method_configs import LEARNING, ON_GPU, STEPS, best_device
 from leco_plugin.models.guided import GuidedModelConfig
 from leco_plugin.models.guided_start import OccupancyConfig
 from leco_plugin.models.optimizers import FusedAdamConfig
+from leco_plugin.models.sizes import learning_only
 from leco_plugin.models.switch_config import SwitchNerfModelConfig
 from leco_plugin.models.switch_sizes import switch_sizes_for
 from leco_plugin.scenes.data_manager import LecoDataManagerConfig
@@ -31,9 +32,10 @@ from leco_plugin.swap import with_sampler_swapped
 
 def guided(host: ModelConfig) -> GuidedModelConfig:
     """The host, guided by an occupancy from a file or learned first."""
+    learning = LEARNING if ON_GPU else replace(LEARNING, sizes=learning_only(LEARNING.sizes))
     return GuidedModelConfig(
         host=host,
-        occupancy=OccupancyConfig(learning=LEARNING, rays=4096 if ON_GPU else 1024),
+        occupancy=OccupancyConfig(learning=learning, rays=4096 if ON_GPU else 1024),
     )
 
 

@@ -21,8 +21,11 @@ THRESHOLDS = tuple(0.75 * 0.8**i for i in range(32))
 """Tried from the largest down, to 0.0007; below that a gate that fails is kept out of use (0)."""
 
 SURFACE_STEPS = 2.0
-"""Weight within this many steps of a ray's median depth counts as surface, the rest as haze; all of
-it where the median depth is that of the backdrop."""
+"""Weight within this many steps of a ray's median depth counts as surface, the rest as haze. Of a
+ray whose median depth lies in the backdrop, all of it is haze."""
+FEWEST_SURFACES = 0.02
+"""Share of the rays that meet a surface by that rule; with fewer, haze counts too, so that a field
+that has not found its surfaces yet does not pass for one that has nothing to lose."""
 
 
 @dataclass(frozen=True)
@@ -79,13 +82,16 @@ class Reference(NamedTuple):
 
 
 def reference_of(shaded: Shaded, intervals: Intervals, rays: Rays) -> Reference:
-    """The reference that a rendering of all candidates is."""
+    """The reference that a rendering of all candidates of some rays is."""
     is_backdrop = backdrop_of(intervals, rays)
+    near = near_surface(shaded, intervals, is_backdrop)
+    if intervals.ray_indices[near].unique().numel() < FEWEST_SURFACES * len(rays.origins):
+        near = near_median_depth(shaded, intervals)
     return Reference(
         intervals,
         shaded.weights,
         occupancy_from_logits(shaded.logits),
-        near_surface(shaded, intervals, is_backdrop),
+        near,
         shaded.rgb,
         is_backdrop,
     )
@@ -94,8 +100,8 @@ def reference_of(shaded: Shaded, intervals: Intervals, rays: Rays) -> Reference:
 def near_surface(shaded: Shaded, intervals: Intervals, is_backdrop: Tensor) -> Tensor:
     """Which samples lie within `SURFACE_STEPS` steps of their ray's surface.
 
-    A ray whose median depth lies in the backdrop meets none: what hangs before it is haze, and the
-    backdrop is there without it.
+    A ray whose median depth lies in the backdrop meets none. What is thin and before the sky has
+    less than half of its ray's weight: it is guarded by the image price alone.
 
     Args:
         is_backdrop: [M] bool.
@@ -104,8 +110,9 @@ def near_surface(shaded: Shaded, intervals: Intervals, is_backdrop: Tensor) -> T
     """
     if len(is_backdrop) == 0:
         return is_backdrop
-    meets = ~is_backdrop[_medians(shaded, intervals)]
-    return near_median_depth(shaded, intervals) & meets[intervals.ray_indices]
+    medians = _medians(shaded, intervals)
+    meets = ~is_backdrop[medians]
+    return _near(medians, intervals) & meets[intervals.ray_indices]
 
 
 def near_median_depth(shaded: Shaded, intervals: Intervals) -> Tensor:
@@ -114,7 +121,11 @@ def near_median_depth(shaded: Shaded, intervals: Intervals) -> Tensor:
     Returns:
         [M] bool.
     """
-    median = _medians(shaded, intervals)[intervals.ray_indices]
+    return _near(_medians(shaded, intervals), intervals)
+
+
+def _near(medians: Tensor, intervals: Intervals) -> Tensor:
+    median = medians[intervals.ray_indices]
     middles = 0.5 * (intervals.t_starts + intervals.t_ends)
     steps = (intervals.t_ends - intervals.t_starts)[median]
     return (middles - middles[median]).abs() <= SURFACE_STEPS * steps * 1.001
@@ -150,7 +161,7 @@ def measure(
         truths: their true pixels, [R, 3] each.
         render_kept: renders chunk i with only the samples of a mask [M]: returns [R, 3].
         with_image: whether to render at all; the image price is NaN otherwise.
-        missed_only: count as lost only what the photographs miss: see `is_missed`.
+        missed_only: count as lost only what the photographs miss, see `is_missed`; with an image.
     """
     surface = lost_surface = total = lost = dense_error = gated_error = 0.0
     skipped = candidates = pixels = 0
@@ -168,7 +179,7 @@ def measure(
             gated_error += float(((gated - truth) ** 2).sum(dtype=torch.float64))
             pixels += truth.numel()
             if missed_only:
-                lost_on_surface *= is_missed(reference, gated, truth)
+                lost_on_surface *= is_missed(reference, i, gone, gated, truth, render_kept)
         lost_surface += float(lost_on_surface.sum(dtype=torch.float64))
     price = float("nan")
     if with_image and pixels:
@@ -184,22 +195,33 @@ def measure(
     )
 
 
-def is_missed(reference: Reference, gated: Tensor, truth: Tensor) -> Tensor:
-    """Which samples lie on rays whose pixel is nearer to the dense rendering than to the gated one.
+def is_missed(
+    reference: Reference,
+    number: int,
+    gone: Tensor,
+    gated: Tensor,
+    truth: Tensor,
+    render_kept: Callable[[int, Tensor], Tensor],
+) -> Tensor:
+    """Which samples lie on rays whose pixel is better rendered with what is lost near surfaces.
 
-    Of a field that has been trained guided, the dense rendering shows what nobody has corrected
-    since the gate was frozen; only the photographs tell matter that is missed from such haze.
+    A field that has been trained guided shows haze where the gate skips, which nothing has
+    corrected since the gate was frozen; only the photographs can tell it from matter that is
+    missed. What the field has repainted on the things behind it they do not miss: a true loss is
+    found soon after freezing or not at all.
 
     Args:
-        gated: [R, 3] rendered of what is kept.
+        number: of the chunk of rays.
+        gone: [M] bool, skipped.
+        gated: [R, 3] rendered without those.
         truth: [R, 3].
+        render_kept: as of `measure`.
     Returns:
         [M] bool.
     """
-    dense_error, gated_error = (
-        (image - truth).square().sum(dim=-1) for image in (reference.rgb, gated)
-    )
-    return (gated_error > dense_error)[reference.intervals.ray_indices]
+    with_surfaces = render_kept(number, ~gone | reference.near_surface)
+    errors = [(image - truth).square().sum(dim=-1) for image in (with_surfaces, gated)]
+    return (errors[0] < errors[1])[reference.intervals.ray_indices]
 
 
 def excesses(
@@ -224,7 +246,8 @@ def excesses(
         gone = (reference.occupancies < threshold) & ~reference.always_kept
         gated = render_kept(i, ~gone)
         on_surface = reference.weights * reference.near_surface
-        lost = on_surface * (gone & is_missed(reference, gated, truth))
+        missed = is_missed(reference, i, gone, gated, truth, render_kept)
+        lost = on_surface * (gone & missed)
         beyond = lost - config.lost_surface_mass * on_surface
         per_ray = beyond.new_zeros(len(truth))
         surface.append(per_ray.index_add_(0, reference.intervals.ray_indices, beyond))
@@ -248,9 +271,10 @@ def calibrate(
     """
     parts = references, truths, render_kept
     for threshold in (tried for tried in THRESHOLDS if tried < below):
-        cheap = measure(*parts, threshold, with_image=False)
-        if not missed_only and cheap.lost_surface_mass > config.lost_surface_mass:
-            continue
+        if not missed_only:
+            cheap = measure(*parts, threshold, with_image=False)
+            if cheap.lost_surface_mass > config.lost_surface_mass:
+                continue
         measured = measure(*parts, threshold, missed_only=missed_only)
         if measured.within(config):
             return measured

@@ -15,6 +15,7 @@ from leco_plugin.models.guide import Guide
 from leco_plugin.models.leco_config import LecoModelConfig
 from leco_plugin.models.opaque_start import begin_opaque
 from leco_plugin.models.ranks import is_first, say
+from leco_plugin.models.sizes import SMALL, learning_only
 from leco_plugin.occupancy import Occupancy
 from leco_plugin.samplers.rays import intersect_box
 from leco_plugin.samplers.registry import check_gate
@@ -60,7 +61,9 @@ class OccupancyConfig(GrowingConfig):
     """Without a path: rays of a batch while learning."""
     rate: float = 1.0
     """Without a path: multiple of the learning rates while learning."""
-    learning: LecoModelConfig = field(default_factory=LecoModelConfig)
+    learning: LecoModelConfig = field(
+        default_factory=lambda: LecoModelConfig(sizes=learning_only(SMALL))
+    )
     """Without a path: the HMoE that learns."""
 
 

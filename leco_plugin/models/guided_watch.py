@@ -67,7 +67,9 @@ class GuidedWatch:
         progress.recheck_due = step + wait
         why = beyond_bounds(progress)
         if why is not None:
+            started = time.monotonic()
             skip_less(model, data, step, why)
+            self.recheck_seconds += time.monotonic() - started
             if lifecycle.folder is not None:
                 write_occupancy(model, lifecycle.folder)
             lifecycle.save(step)

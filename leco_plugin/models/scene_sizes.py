@@ -1,8 +1,9 @@
 """Sizes chosen from how much there is to see in a scene, before training: `leco-occupancy`'s own.
 
 What is counted is the footprint of a pixel at the scene's distance, a texel. A scene twice as wide
-has four times as many, and gets four times the experts and twice the table, up to the device's
-sizes. A size that is set by hand stays as it is, and what follows from it follows from that.
+has four times as many, and gets four times the experts and about twice the table, up to the sizes
+of the device. A size that is set by hand stays as it is, and what follows from it follows from
+that.
 """
 
 from __future__ import annotations
@@ -151,7 +152,9 @@ def levels_to(finest: int, most: EncodingConfig) -> int:
 
 def log2_entries(texels: float, most: EncodingConfig) -> int:
     """Binary logarithm of a level's entries, rounded."""
-    wanted = ENTRIES_PER_SIDE * math.sqrt(min(texels, 4.0**most.log2_table))
+    if math.isinf(texels):
+        return most.log2_table
+    wanted = ENTRIES_PER_SIDE * math.sqrt(texels)
     return max(FEWEST_ENTRIES, min(round(math.log2(max(1.0, wanted))), most.log2_table))
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
-from typing import Any
+from typing import Any, cast
 
 from leco_plugin.models.encodings import EncodingConfig
 from leco_plugin.models.field import FieldConfig
@@ -29,7 +29,7 @@ class Sizes:
 
 
 SMALL = Sizes()
-"""Two CPU cores: a training step of a tenth of a second."""
+"""Two CPU cores: a training step of about a tenth of a second."""
 
 LARGE = Sizes(
     gate=GateConfig(EncodingConfig(octaves=8), width=64, layers=3, scene_experts=8),
@@ -99,6 +99,16 @@ def automatic(sizes: Sizes) -> Sizes:
     for path in CHOSEN:
         sizes = with_size(sizes, path, AUTOMATIC)
     return sizes
+
+
+FIRST_TABLE = 16
+"""Binary logarithm of a level's entries where the field only learns an occupancy for a host: in the
+few hundred steps that it is there, larger tables take time and give nothing."""
+
+
+def learning_only(sizes: Sizes) -> Sizes:
+    """The same for a field that is left behind when the occupancy is learned."""
+    return cast(Sizes, with_size(sizes, "field.encoding.log2_table", FIRST_TABLE))
 
 
 def left_open(sizes: Sizes) -> list[str]:

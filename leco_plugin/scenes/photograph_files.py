@@ -100,6 +100,8 @@ def _naming(read: Callable[..., Read], paths: list[Path]) -> Callable[..., Read]
     def read_or_name(image_idx: int, *arguments: Any, **options: Any) -> Read:
         try:
             return read(image_idx, *arguments, **options)
+        except InputError:
+            raise
         except (AssertionError, OSError, SyntaxError, ValueError) as error:  # of Pillow's readers
             reason = " ".join(str(error).split())[:200] or type(error).__name__
         # out here, because that error holds the file that nerfstudio has left open

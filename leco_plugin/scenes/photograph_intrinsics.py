@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from pathlib import Path
 from typing import Any
 
@@ -38,7 +37,7 @@ def check_intrinsics(meta: dict[str, Any], frames: list[dict[str, Any]], descrip
     for owner, who in ((meta, "the scene"), *((frame, frame["file_path"]) for frame in frames)):
         for name, value in _distortions(owner):
             # nerfstudio would take what it cannot undo for no distortion at all
-            if type(value) not in (int, float) or not math.isfinite(value):
+            if type(value) not in (int, float) or not abs(value) < 1e9:
                 raise InputError(
                     f"{description}: {name} of {who} is {str(value)[:40]!r}, and not a number"
                 )

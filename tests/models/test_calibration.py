@@ -20,8 +20,9 @@ from leco_plugin.models.calibration import (
     measure,
     near_median_depth,
     near_surface,
+    reference_of,
 )
-from leco_plugin.models.rendering import Intervals, Shaded
+from leco_plugin.models.rendering import Intervals, Rays, Shaded
 from leco_plugin.samplers.packed import accumulate_along_rays, pack_info
 
 RAYS, SAMPLES = 20, 30
@@ -176,6 +177,22 @@ def test_before_a_backdrop_that_holds_the_median_there_is_no_surface() -> None:
     assert torch.equal(everywhere, near_median_depth(shaded, intervals))
 
 
+def test_a_field_without_surfaces_does_not_pass_for_one_with_nothing_to_lose() -> None:
+    rays = Rays(
+        torch.zeros(50, 3), torch.ones(50, 3), torch.zeros(50), torch.full((50,), 2.0), None
+    )
+    ray_indices = torch.arange(50).repeat_interleave(4)
+    starts = torch.arange(4).repeat(50) * 0.5
+    intervals, logits = Intervals(ray_indices, starts, starts + 0.5), torch.zeros(200, 2)
+    packed, none = pack_info(ray_indices, 50), torch.zeros(0)
+    weights = torch.tensor([0.0, 0.2, 0.2, 0.6]).repeat(50)
+    for solid in (0, 1):
+        weights[1 : 4 * solid : 4] = 0.9
+        shaded = Shaded(none, torch.ones(50), none, weights, none, logits, none, packed)
+        near = reference_of(shaded, intervals, rays).near_surface
+        assert int(near.sum()) == (4 if solid else 150)
+
+
 def test_no_samples_have_no_median() -> None:
     none, no_rays = torch.zeros(0), torch.zeros(0, dtype=torch.int64)
     shaded = Shaded(none, torch.zeros(3), none, none, none, none, none, pack_info(no_rays, 3))
@@ -211,7 +228,8 @@ def test_what_no_photograph_misses_is_not_lost(seed: int) -> None:
             mine = reference.intervals.ray_indices == ray
             weights = (reference.weights * reference.near_surface)[mine]
             surface += float(weights.sum())
-            errors = [float((rgb[ray] - truth[ray]).norm()) for rgb in (gated, reference.rgb)]
+            images = gated, problem.render_kept(number, mask | reference.near_surface)
+            errors = [float((rgb[ray] - truth[ray]).norm()) for rgb in images]
             lost += float(weights[~mask[mine]].sum()) if errors[0] > errors[1] else 0.0
     found = measure(*problem.arguments(), threshold, missed_only=True)
     assert found.lost_surface_mass == pytest.approx(lost / surface, rel=1e-4)

@@ -240,12 +240,14 @@ def city(folder: Path, blocks: int) -> tuple[SceneDetail, int]:
 
 @pytest.mark.slow
 def test_a_block_has_a_quarter_of_the_parameters_of_eight_by_eight(tmp_path: Path) -> None:
-    values = {}
+    values, tables = {}, []
     for blocks in (1, 3, 8):
         found, images = city(tmp_path / str(blocks), blocks)
         sizes = choose(automatic(SMALL), SMALL, found, images).sizes
         values[blocks] = values_of(sizes, images)
+        tables.append(size_at(sizes, TABLE))
         assert sizes == SMALL or blocks < 8
+    assert tables == [17, 18, 19]
     assert values[1] <= values[8] / 4
 
 
