@@ -104,6 +104,11 @@ def _ground(source: Source) -> Ground:
     occupancy = model.occupancy().eval()
     taught, _ = gather(source, None, trained_on(source, occupancy, TAUGHT_RAYS))
     measured, _ = gather(source, None, held_out(source, occupancy, RAYS, parts=1)[0])
+    if not bool(measured.worth.any()):
+        raise InputError(
+            "the field shows nothing along held-out rays, so that no loss can be measured: let it "
+            "learn longer (--learn-steps)"
+        )
 
     def mapped(places: Tensor) -> Tensor:
         return model.space.map(places).clamp(-1.0, 1.0)

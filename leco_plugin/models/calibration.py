@@ -84,14 +84,11 @@ class Reference(NamedTuple):
 def reference_of(shaded: Shaded, intervals: Intervals, rays: Rays) -> Reference:
     """The reference that a rendering of all candidates of some rays is."""
     is_backdrop = backdrop_of(intervals, rays)
-    near = near_surface(shaded, intervals, is_backdrop)
-    if intervals.ray_indices[near].unique().numel() < FEWEST_SURFACES * len(rays.origins):
-        near = near_median_depth(shaded, intervals)
     return Reference(
         intervals,
         shaded.weights,
         occupancy_from_logits(shaded.logits),
-        near,
+        near_surface(shaded, intervals, is_backdrop),
         shaded.rgb,
         is_backdrop,
     )
@@ -100,8 +97,9 @@ def reference_of(shaded: Shaded, intervals: Intervals, rays: Rays) -> Reference:
 def near_surface(shaded: Shaded, intervals: Intervals, is_backdrop: Tensor) -> Tensor:
     """Which samples lie within `SURFACE_STEPS` steps of their ray's surface.
 
-    A ray whose median depth lies in the backdrop meets none. What is thin and before the sky has
-    less than half of its ray's weight: it is guarded by the image price alone.
+    A ray whose median depth lies in the backdrop meets none, unless hardly any ray of them all
+    meets one. What is thin and before the sky has less than half of its ray's weight: it is guarded
+    by the image price alone.
 
     Args:
         is_backdrop: [M] bool.
@@ -111,7 +109,9 @@ def near_surface(shaded: Shaded, intervals: Intervals, is_backdrop: Tensor) -> T
     if len(is_backdrop) == 0:
         return is_backdrop
     medians = _medians(shaded, intervals)
-    meets = ~is_backdrop[medians]
+    meets = ~is_backdrop[medians] & (shaded.packed_info[:, 1] > 0)
+    if int(meets.sum()) < FEWEST_SURFACES * len(meets):
+        meets = torch.ones_like(meets)
     return _near(medians, intervals) & meets[intervals.ray_indices]
 
 
