@@ -15,6 +15,7 @@ from leco_plugin.cli_capacity import capacity, export, shrink
 from leco_plugin.cli_reports import check_json as _check_json
 from leco_plugin.cli_reports import occupancy_of
 from leco_plugin.cli_reports import write_json as _write_json
+from leco_plugin.scenes.input_error import one_line
 
 BAD_INPUT, FAILURE = 2, 1
 SEPARATE = (
@@ -356,7 +357,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _complain(error: BaseException, status: int) -> int:
-    message = " ".join(str(error).split()) or type(error).__name__
+    message = one_line(error) or type(error).__name__
     print(f"leco: {message}", file=sys.stderr)
     return status
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import copy
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -10,6 +9,7 @@ from typing import Any
 import pytest
 import torch
 from nerfstudio.engine.callbacks import TrainingCallbackLocation as Where
+from tiny_run import tiny_config
 
 from leco_plugin.compat.atomic_trainer import AtomicTrainer
 from leco_plugin.compat.optimizers import forget_the_gone
@@ -24,17 +24,8 @@ pytestmark = [  # nerfstudio leaves an image open
 
 
 def trainer_of(scene: Path, folder: Path, load_from: Path | None = None) -> AtomicTrainer:
-    from leco_plugin.method_configs import leco_occupancy
-
-    config: Any = copy.deepcopy(leco_occupancy.config)
-    config.output_dir = folder
-    config.experiment_name, config.timestamp, config.vis = "tiny", "run", "tensorboard"
-    config.logging.local_writer.enable = False
-    config.data = config.pipeline.datamanager.data = scene
-    config.pipeline.datamanager.train_num_rays_per_batch = 64
+    config = tiny_config(scene, folder, candidates=32)
     model = config.pipeline.model
-    field = replace(model.sizes.field, encoding=replace(model.sizes.field.encoding, log2_table=8))
-    model.sizes = replace(model.sizes, field=field, candidates=32)
     model.schedule = replace(model.schedule, learn_steps=4)
     model.calibration = replace(model.calibration, rays=64, recheck_rays=0)
     model.merging = MergingConfig(1e3, rays=64)  # whatever it costs

@@ -16,7 +16,7 @@ from leco_plugin.evaluation.reached_volume import reached_volume
 from leco_plugin.models.leco import LecoModel
 from leco_plugin.models.losses import widen
 from leco_plugin.models.objective import GateLossConfig
-from leco_plugin.scenes.input_error import InputError
+from leco_plugin.scenes.input_error import InputError, one_line
 from leco_plugin.scenes.whole_files import write_whole
 from leco_plugin.shrink.evidence import Evidence, gather
 from leco_plugin.shrink.sources import Source, held_out, trained_on
@@ -88,7 +88,7 @@ def _load(model: LecoModel, stored: Path, images: int) -> None:
     try:
         model.load_state_dict(torch.load(stored, map_location=model.device, weights_only=True))
     except (OSError, RuntimeError, ValueError, KeyError, EOFError, UnpicklingError) as error:
-        line = " ".join(str(error).split())[:200]
+        line = one_line(error, 200)
         raise InputError(f"{stored} cannot be used ({line}): {remedy}") from None
     if model.num_train_data != images:
         raise InputError(

@@ -16,6 +16,8 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from leco_plugin.scenes.input_error import one_line
+
 if TYPE_CHECKING:
     from nerfstudio.engine.trainer import Trainer, TrainerConfig
 
@@ -153,7 +155,7 @@ def _occupancy_of(trainer: Trainer, data: Path, folder: Path) -> dict[str, Any] 
 
 def reason_of(error: BaseException) -> str:
     """An error in one line."""
-    said = " ".join(str(error).split())
+    said = one_line(error)
     return said if isinstance(error, ValueError) and said else f"{type(error).__name__}: {said}"
 
 

@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any
 import torch
 
 from leco_plugin.models.ranks import say
+from leco_plugin.scenes.input_error import one_line
 from leco_plugin.scenes.whole_files import write_whole
 
 if TYPE_CHECKING:
@@ -69,7 +70,7 @@ def field_at_freezing(model: LecoModel, folder: Path) -> LecoModel | None:
         state: dict[str, Any] = torch.load(path, map_location=model.device, weights_only=True)
         frozen.load_state_dict(state)
     except (OSError, RuntimeError, ValueError, KeyError, EOFError, UnpicklingError) as error:
-        line = " ".join(str(error).split())[:200]
+        line = one_line(error, 200)
         raise ValueError(f"{path} cannot be used ({line}): move it away") from None
     gates = zip(frozen.gate.parameters(), model.gate.parameters(), strict=True)
     if not all(torch.equal(one, other) for one, other in gates):

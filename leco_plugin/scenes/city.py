@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from leco_plugin.scenes.city_plan import centres, choose_blocks, plan_city
 from leco_plugin.scenes.city_queries import Faces, Solids
 from leco_plugin.scenes.city_shapes import Array
+from leco_plugin.scenes.input_error import one_line
 
 DESCRIPTION = "city.json"
 
@@ -135,7 +136,5 @@ def read_description(folder: Path) -> dict[str, Any]:
             raise ValueError(f"format {description['format']} is not known")
         CityConfig(**description["city"])
     except (ValueError, TypeError, KeyError) as error:
-        raise ValueError(
-            f"{path} does not describe a city: {' '.join(str(error).split())}"
-        ) from error
+        raise ValueError(f"{path} does not describe a city: {one_line(error)}") from error
     return dict(description)

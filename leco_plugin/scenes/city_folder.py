@@ -25,6 +25,7 @@ from leco_plugin.scenes.city_layouts import (
     layout_of,
     with_alpha,
 )
+from leco_plugin.scenes.input_error import one_line
 from leco_plugin.scenes.whole_files import remove_parts, write_whole
 
 __all__ = ["CaptureConfig", "count_pictures", "read_transforms", "write_city"]
@@ -179,6 +180,6 @@ def read_transforms(folder: Path) -> dict[str, Any]:
         if not all(needed <= set(frame) for frame in transforms["frames"]):
             raise ValueError("a frame is incomplete")
     except (OSError, ValueError, KeyError, TypeError) as error:
-        message = f"{folder} is damaged: {TRANSFORMS}: {' '.join(str(error).split())}"
+        message = f"{folder} is damaged: {TRANSFORMS}: {one_line(error)}"
         raise ValueError(message) from error
     return dict(transforms)

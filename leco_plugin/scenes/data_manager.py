@@ -25,7 +25,7 @@ from leco_plugin.models.ranks import say
 from leco_plugin.scenes.dataset_units import UP_IS_KNOWN
 from leco_plugin.scenes.detail import CAMERAS
 from leco_plugin.scenes.held_out_pixels import HeldOutPixelSampler
-from leco_plugin.scenes.input_error import InputError
+from leco_plugin.scenes.input_error import InputError, one_line
 from leco_plugin.scenes.photograph_files import names_what_it_cannot_read
 from leco_plugin.scenes.stored_pictures import store_pictures
 from leco_plugin.scenes.survey import points_in
@@ -160,7 +160,7 @@ def in_one_line(read: Callable[..., DataparserOutputs], config: Any) -> Callable
         try:
             return read(*arguments, **options)
         except (AssertionError, OSError) as error:
-            reason = " ".join(str(error).split())[:200] or type(error).__name__
+            reason = one_line(error, 200) or type(error).__name__
             raise InputError(f"{config.data} cannot be read as a scene: {reason}") from error
 
     return outputs_of

@@ -11,7 +11,7 @@ from pathlib import Path
 
 from PIL import Image
 
-from leco_plugin.scenes.input_error import InputError
+from leco_plugin.scenes.input_error import InputError, one_line
 from leco_plugin.scenes.whole_files import write_whole
 
 _FORMATS = ("JPEG", "PNG")
@@ -74,5 +74,5 @@ def image_header(path: Path) -> tuple[tuple[int, int], str]:
 
 
 def _unreadable(path: Path, error: Exception) -> InputError:
-    said = " ".join(str(error).split())[:120]
+    said = one_line(error, 120)
     return InputError(f"{path} cannot be read as a picture: {said}")

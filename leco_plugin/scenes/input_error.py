@@ -12,3 +12,8 @@ class InputError(SystemExit, ValueError):
 
     def __str__(self) -> str:
         return str(self.code)
+
+
+def one_line(error: BaseException, most: int | None = None) -> str:
+    """What an error says, in one line of at most so many characters; empty if it says nothing."""
+    return " ".join(str(error).split())[:most]

@@ -11,7 +11,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from leco_plugin.scenes.input_error import InputError
+from leco_plugin.scenes.input_error import InputError, one_line
 from leco_plugin.scenes.pt_file import load, read_bytes
 
 _MORE = 1 << 16
@@ -53,7 +53,7 @@ def _unpack(path: Path, data: bytes, most: int) -> bytes:
         raise InputError(f"{path} is a zip without {path.stem}.pt, so no mask") from None
     # Damaged archives raise whatever their reader meets; nothing of it is a new fault.
     except Exception as error:  # noqa: BLE001
-        said = " ".join(str(error).split())[:120]
+        said = one_line(error, 120)
         raise InputError(f"{path} is not a zip with a mask: {said}") from None
     if len(inside) > most:
         raise InputError(f"{path} unpacks to more than {most} bytes, too many for its picture")

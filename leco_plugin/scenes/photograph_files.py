@@ -13,7 +13,7 @@ from typing import Any, TypeVar
 from nerfstudio.cameras.cameras import Cameras
 from PIL import Image, UnidentifiedImageError
 
-from leco_plugin.scenes.input_error import InputError
+from leco_plugin.scenes.input_error import InputError, one_line
 
 READ_RIGHTLY = ("L", "RGB", "RGBA")
 """Pillow's modes of images that nerfstudio reads as they are."""
@@ -103,7 +103,7 @@ def _naming(read: Callable[..., Read], paths: list[Path]) -> Callable[..., Read]
         except InputError:
             raise
         except (AssertionError, OSError, SyntaxError, ValueError) as error:  # of Pillow's readers
-            reason = " ".join(str(error).split())[:200] or type(error).__name__
+            reason = one_line(error, 200) or type(error).__name__
         # out here, because that error holds the file that nerfstudio has left open
         raise InputError(f"{paths[image_idx]} cannot be read ({reason}): is the file whole?")
 

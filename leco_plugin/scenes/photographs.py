@@ -19,7 +19,7 @@ from nerfstudio.plugins.registry_dataparser import DataParserSpecification
 from torch import Tensor
 
 from leco_plugin.scenes.dataset_units import METRES_PER_UNIT, UP_IS_KNOWN
-from leco_plugin.scenes.input_error import InputError
+from leco_plugin.scenes.input_error import InputError, one_line
 from leco_plugin.scenes.photograph_files import check_images, check_smaller_images
 from leco_plugin.scenes.photograph_intrinsics import check_intrinsics
 from leco_plugin.scenes.photograph_masks import check_masks
@@ -57,7 +57,7 @@ class LecoPhotographs(Nerfstudio):
         except InputError:
             raise
         except Exception as error:
-            reason = f"{type(error).__name__}: {_one_line(error)}"
+            reason = f"{type(error).__name__}: {one_line(error, 120)}"
             raise InputError(f"{self.config.data} cannot be read ({reason})") from error
         if len(outputs.image_filenames) == 0:
             raise InputError(f"{self.config.data}: no image is left for the split {split!r}")
@@ -123,7 +123,7 @@ def check_scene(data: Path) -> dict[str, Any]:
             raise ValueError("a file_path is no path")
         poses = np.array([frame["transform_matrix"] for frame in frames], dtype=float)
     except (OSError, ValueError, KeyError, TypeError, OverflowError, RecursionError) as error:
-        reason = f"{type(error).__name__}: {_one_line(error)}"
+        reason = f"{type(error).__name__}: {one_line(error, 120)}"
         raise InputError(
             f"{description} is not a scene in nerfstudio's format ({reason})"
         ) from None
@@ -143,10 +143,6 @@ def check_scene(data: Path) -> dict[str, Any]:
     check_images(meta, frames, folder)
     check_masks(frames, folder)
     return dict(meta)
-
-
-def _one_line(error: Exception) -> str:
-    return " ".join(str(error).split())[:120]
 
 
 def read_points(meta: dict[str, Any], folder: Path) -> Tensor | None:
@@ -175,7 +171,9 @@ def read_ply(path: Path) -> Tensor:
             loaded: Any = trimesh.load(file, file_type="ply")
         vertices = np.asarray(loaded.vertices, dtype=np.float32).reshape(-1, 3)
     except Exception as error:  # noqa: BLE001  trimesh raises whatever its parsers meet
-        raise InputError(f"{path} cannot be read as sparse points: {_one_line(error)}") from None
+        raise InputError(
+            f"{path} cannot be read as sparse points: {one_line(error, 120)}"
+        ) from None
     return torch.from_numpy(vertices[np.isfinite(vertices).all(axis=1)].copy())
 
 

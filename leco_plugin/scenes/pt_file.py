@@ -14,7 +14,7 @@ from typing import Any
 
 import torch
 
-from leco_plugin.scenes.input_error import InputError
+from leco_plugin.scenes.input_error import InputError, one_line
 from leco_plugin.scenes.pt_pickle import Look, Refused
 
 _MOST_RECORDS = 256
@@ -53,7 +53,7 @@ def load(data: bytes, name: str) -> Any:
         raise InputError(f"{name} {refusal}") from None
     # Damaged archives and pickles raise whatever their readers meet; nothing of it is a new fault.
     except Exception as error:  # noqa: BLE001
-        said = " ".join(str(error).split())[:120] or "no reason given"
+        said = one_line(error, 120) or "no reason given"
         raise InputError(f"{name} is damaged: {type(error).__name__}: {said}") from None
 
 

@@ -25,7 +25,7 @@ from leco_plugin.models.scene_rays import cut_to_bounds
 from leco_plugin.occupancy import Occupancy
 from leco_plugin.scenes.frames import between, frame_of, moved, turned
 from leco_plugin.scenes.held_out_pixels import some_images
-from leco_plugin.scenes.input_error import InputError
+from leco_plugin.scenes.input_error import InputError, one_line
 
 CONFIG, CHECKPOINTS = "config.yml", "nerfstudio_models"
 SAME_PLACE = 1e-3
@@ -77,7 +77,7 @@ def _of_run(folder: Path, data: Path) -> Source | None:
         config = yaml.load((folder / CONFIG).read_text(), Loader=yaml.Loader)
         built = config.pipeline.model._target  # of a guided host it is a function
     except (yaml.YAMLError, ImportError, AttributeError, TypeError, ValueError) as error:
-        raise InputError(f"{folder / CONFIG} cannot be read: {_line(error)}") from None
+        raise InputError(f"{folder / CONFIG} cannot be read: {one_line(error, 200)}") from None
     if not (isinstance(built, type) and issubclass(built, LecoModel)):
         return None
     path = whole_of(folder / CHECKPOINTS)
@@ -88,7 +88,7 @@ def _of_run(folder: Path, data: Path) -> Source | None:
         eval_load_checkpoint(config, pipeline)
     except (RuntimeError, KeyError) as error:
         raise InputError(
-            f"the model of the run in {folder} cannot be loaded: {_line(error)}"
+            f"the model of the run in {folder} cannot be loaded: {one_line(error, 200)}"
         ) from None
     model = pipeline.model.eval()
     return Source(pipeline.datamanager, model, field_at_freezing(model, folder))
@@ -119,10 +119,6 @@ def _frame_to(source: Source, occupancy: Occupancy) -> Tensor | None:
     """Takes positions of these photographs to those of the occupancy; None where it is unknown."""
     learned_in, here = occupancy.report.get("frame"), frame_of(source.manager)
     return None if learned_in is None or here is None else between(here, learned_in)
-
-
-def _line(error: BaseException) -> str:
-    return " ".join(str(error).split())[:200]
 
 
 def _photographs(data: Path) -> Any:
