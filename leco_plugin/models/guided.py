@@ -25,6 +25,7 @@ from leco_plugin.compat.checkpoints import allow_checkpoint_globals
 from leco_plugin.compat.earlier_configs import GrowingConfig
 from leco_plugin.compat.earlier_guides import read_earlier_guide
 from leco_plugin.compat.evaluated_runs import evaluate_whole_checkpoints
+from leco_plugin.compat.hash_encoding import speed_up_hash_encodings
 from leco_plugin.compat.host_lpips import setup_with_lazy_lpips
 from leco_plugin.compat.host_outputs import with_counts_as_floats
 from leco_plugin.models.failures import require_finite
@@ -86,7 +87,7 @@ def set_up_guided(config: GuidedModelConfig, **arguments: Any) -> Model:
     if guide.needs_occupancy and config.occupancy.path is not None:
         with suppress(InputError):  # a checkpoint brings its own; without one, training says it
             guide.set_occupancy(load_occupancy(config.occupancy.path))
-    host = with_counts_as_floats(setup_with_lazy_lpips(host_config, **arguments))
+    host = _built(host_config, arguments)
     host.leco_guide = guide  # by no name that the host may have given something of its own
     read_earlier_guide(host)
     swap_sampler(host, guide)
@@ -101,7 +102,14 @@ def _as_it_is(host_config: ModelConfig, arguments: dict[str, Any]) -> Model:
     from leco_plugin.samplers import nerfacc_cpu
 
     nerfacc_cpu.install()
-    return with_counts_as_floats(setup_with_lazy_lpips(host_config, **arguments))
+    return _built(host_config, arguments)
+
+
+def _built(host_config: ModelConfig, arguments: dict[str, Any]) -> Model:
+    """The host as nerfstudio builds it, without a network, fit for a CPU and for its commands."""
+    host = with_counts_as_floats(setup_with_lazy_lpips(host_config, **arguments))
+    speed_up_hash_encodings(host)
+    return host
 
 
 def _refuse_what_is_not_finite(host: Model) -> None:

@@ -1,0 +1,172 @@
+"""nerfstudio's hash encoding on a CPU: the same function of the same table, in fewer passes.
+
+Where tiny-cuda-nn is not installed, nerfstudio computes its hash grids in plain torch, point by
+point through all levels; that is most of a CPU's training step. Here the levels follow one another,
+so that the part of the table that is looked up fits a cache, corners are hashed in int32 and
+summed by one call, and the table's gradient is a histogram. Names of parameters, their values, and
+what comes out stay as they are, up to the order of sums.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any
+
+import torch
+from nerfstudio.field_components.encodings import HashEncoding
+from torch import Tensor
+
+if TYPE_CHECKING:
+    from torch import nn
+
+PRIMES = (1, 2654435761 - 2**32, 805459861)
+"""Of Instant-NGP's hash. Products wrap around in int32, of which the low bits are what is kept."""
+
+
+def speed_up_hash_encodings(model: nn.Module) -> None:
+    """Has every hash encoding of a model that nerfstudio computes in torch computed this way."""
+    for module in model.modules():
+        if type(module) is HashEncoding and module.tcnn_encoding is None:
+            module.__class__ = CpuHashEncoding
+
+
+class CpuHashEncoding(HashEncoding):
+    """`HashEncoding` with another way to compute it; made by `speed_up_hash_encodings`."""
+
+    def pytorch_fwd(self, in_tensor: Tensor) -> Tensor:
+        """[..., 3] positions in [0, 1] to [..., levels * features]; differentiable in both.
+
+        What is not float32 on a CPU is left to nerfstudio.
+        """
+        table = self.hash_table
+        if in_tensor.device.type != "cpu" or {in_tensor.dtype, table.dtype} != {torch.float32}:
+            return super().pytorch_fwd(in_tensor)
+        flat: Tensor = _Interpolated.apply(in_tensor.reshape(-1, 3), table, self)
+        return flat.view(*in_tensor.shape[:-1], flat.shape[-1])
+
+    def by_nerfstudio(self, in_tensor: Tensor) -> Tensor:
+        """The same as nerfstudio computes it, of which any derivative can be had."""
+        return super().pytorch_fwd(in_tensor)
+
+
+class _Interpolated(torch.autograd.Function):
+    """Features [N, levels * features] of positions [N, 3]."""
+
+    @staticmethod
+    def forward(ctx: Any, positions: Tensor, table: Tensor, encoding: CpuHashEncoding) -> Tensor:
+        low, fractions = _cells(positions, encoding.scalings)
+        rows = _rows(low, encoding)
+        weights = _weights(fractions)
+        ctx.encoding = encoding
+        ctx.save_for_backward(positions, table, rows, weights)
+        summed = torch.nn.functional.embedding_bag(
+            rows, table, per_sample_weights=weights, mode="sum"
+        )
+        return _by_point(summed, encoding)
+
+    @staticmethod
+    def backward(  # type: ignore[override]
+        ctx: Any, gradient: Tensor
+    ) -> tuple[Tensor | None, Tensor | None, None]:
+        positions, table, rows, weights = ctx.saved_tensors
+        if torch.is_grad_enabled():  # somebody wants to differentiate the gradient
+            encoded = ctx.encoding.by_nerfstudio(positions)
+            return _gradients(encoded, positions, table, gradient)
+        by_level = _by_level(gradient, ctx.encoding)
+        of_positions = of_table = None
+        if ctx.needs_input_grad[0]:
+            of_positions = _of_positions(positions, table, rows, by_level, ctx.encoding.scalings)
+        if ctx.needs_input_grad[1]:
+            of_table = _of_table(rows, weights, by_level, len(table))
+        return of_positions, of_table, None
+
+
+def _cells(positions: Tensor, scalings: Tensor) -> tuple[Tensor, Tensor]:
+    """Lower corners and places in them, both [3, levels, N], of positions [N, 3]."""
+    scaled = positions.detach().t()[:, None] * scalings.to(positions)[:, None]
+    low = scaled.floor()
+    return low, scaled.sub_(low)
+
+
+def _rows(low: Tensor, encoding: HashEncoding) -> Tensor:
+    """Rows of the table that the corners of cells [3, levels, N] hash to: [levels * N, 8] int32."""
+    primes = torch.tensor(PRIMES, dtype=torch.int32)[:, None, None]
+    lower = low.to(torch.int32).mul_(primes)
+    rows = _at_corners(lower, lower + primes, torch.bitwise_xor)
+    offsets = encoding.hash_offset.to(torch.int32)[:, None, None]
+    return rows.bitwise_and_(encoding.hash_table_size - 1).add_(offsets).view(-1, 8)
+
+
+def _weights(fractions: Tensor) -> Tensor:
+    """Trilinear weights [levels * N, 8] of places in cells [3, levels, N]."""
+    return _at_corners(1.0 - fractions, fractions, torch.mul).view(-1, 8)
+
+
+def _at_corners(
+    lower: Tensor, upper: Tensor, combine: Callable[[Tensor, Tensor], Tensor]
+) -> Tensor:
+    """What the sides [3, ...] of a cell along x, y and z make together at its corners: [..., 8],
+    whose last dimension is by sides in y, z and x, lower ones first."""
+    x, y, z = zip(lower, upper)
+    in_y_and_z = [combine(at_y, at_z) for at_y in y for at_z in z]
+    return torch.stack([combine(beside, at_x) for beside in in_y_and_z for at_x in x], dim=-1)
+
+
+def _by_point(by_level: Tensor, encoding: HashEncoding) -> Tensor:
+    """[levels * N, features] to [N, levels * features]."""
+    levels, features = encoding.num_levels, encoding.features_per_level
+    return by_level.view(levels, -1, features).transpose(0, 1).reshape(-1, levels * features)
+
+
+def _by_level(by_point: Tensor, encoding: HashEncoding) -> Tensor:
+    """[N, levels * features] to [levels * N, features]."""
+    levels, features = encoding.num_levels, encoding.features_per_level
+    return by_point.view(-1, levels, features).transpose(0, 1).reshape(-1, features)
+
+
+def _of_table(rows: Tensor, weights: Tensor, gradient: Tensor, size: int) -> Tensor:
+    """Gradient [size, features] of the table; gradient is [levels * N, features]."""
+    flat = rows.view(-1)
+    columns = [
+        torch.bincount(flat, (weights * column[:, None]).view(-1), minlength=size)
+        for column in gradient.unbind(dim=-1)
+    ]
+    return torch.stack(columns, dim=-1)
+
+
+def _of_positions(
+    positions: Tensor, table: Tensor, rows: Tensor, gradient: Tensor, scalings: Tensor
+) -> Tensor:
+    """Gradient [N, 3] of the positions; gradient is [levels * N, features]."""
+    _, (x, y, z) = _cells(positions, scalings)
+    by_y_z_x = _worth(table, rows, gradient).t().reshape(2, 2, 2, *x.shape)
+    by_x = by_y_z_x.movedim(2, 0)
+    by_y = _between(by_x, x)
+    by_z = _between(by_y, y)
+    of_x = _between(_between(by_x[1] - by_x[0], y), z)
+    of_y = _between(by_y[1] - by_y[0], z)
+    of_z = by_z[1] - by_z[0]
+    return (torch.stack([of_x, of_y, of_z]) * scalings[:, None]).sum(dim=1).t()
+
+
+def _between(sides: Tensor, places: Tensor) -> Tensor:
+    """What lies between the sides of cells [2, ...], at places in [0, 1] from the lower one."""
+    return torch.lerp(sides[0], sides[1], places)
+
+
+def _worth(table: Tensor, rows: Tensor, gradient: Tensor) -> Tensor:
+    """What the features of each corner, whole, would add to the loss: [levels * N, 8]."""
+    flat, worth = rows.view(-1), torch.zeros(rows.shape)
+    for column, of_column in zip(table.t().contiguous(), gradient.unbind(dim=-1)):
+        worth.addcmul_(column.index_select(0, flat).view_as(rows), of_column[:, None])
+    return worth
+
+
+def _gradients(
+    encoded: Tensor, positions: Tensor, table: Tensor, gradient: Tensor
+) -> tuple[Tensor | None, Tensor | None, None]:
+    """Gradients that can be differentiated again, of what requires one."""
+    wanted = [part for part in (positions, table) if part.requires_grad]
+    found = iter(torch.autograd.grad(encoded, wanted, gradient, create_graph=True))
+    of_positions = next(found) if positions.requires_grad else None
+    return of_positions, next(found) if table.requires_grad else None, None

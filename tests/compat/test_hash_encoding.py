@@ -1,0 +1,152 @@
+"""Claims about `leco_plugin.compat.hash_encoding`."""
+
+from __future__ import annotations
+
+import copy
+import time
+from unittest.mock import patch
+
+import pytest
+import torch
+from nerfstudio.data.scene_box import SceneBox
+from nerfstudio.field_components.encodings import HashEncoding
+from nerfstudio.models.base_model import ModelConfig
+from nerfstudio.models.instant_ngp import InstantNGPModelConfig
+from nerfstudio.models.nerfacto import NerfactoModelConfig
+from torch import Tensor, nn
+
+from leco_plugin.compat.hash_encoding import CpuHashEncoding, speed_up_hash_encodings
+from leco_plugin.compat.host_lpips import setup_with_lazy_lpips
+from leco_plugin.models.guided import GuidedModelConfig
+from leco_plugin.models.guided_start import OWN_SAMPLER, OccupancyConfig
+
+Sizes = dict[str, int]
+SIZES: list[Sizes] = [
+    {"num_levels": 4, "max_res": 64, "log2_hashmap_size": 8, "features_per_level": 2},
+    {"num_levels": 1, "max_res": 16, "log2_hashmap_size": 13, "features_per_level": 1},
+    {"num_levels": 3, "max_res": 2048, "log2_hashmap_size": 10, "features_per_level": 4},
+]
+
+
+def pair_of(sizes: Sizes) -> tuple[HashEncoding, HashEncoding]:
+    """nerfstudio's encoding, and the same one made fast."""
+    twin = HashEncoding(implementation="torch", hash_init_scale=1.0, **sizes)
+    module = nn.ModuleList([copy.deepcopy(twin)])
+    speed_up_hash_encodings(module)
+    fast = module[0]
+    assert isinstance(fast, CpuHashEncoding)
+    return twin, fast
+
+
+def gradients(encoding: HashEncoding, positions: Tensor, worth: Tensor) -> tuple[Tensor, ...]:
+    leaf = positions.clone().requires_grad_()
+    encoded = encoding(leaf)
+    return encoded, *torch.autograd.grad((encoded * worth).sum(), [leaf, encoding.hash_table])
+
+
+def points(shape: tuple[int, ...], seed: int = 0) -> Tensor:
+    """Off the cells' sides, where there is no one slope."""
+    return 0.001 + 0.998 * torch.rand(*shape, 3, generator=torch.Generator().manual_seed(seed))
+
+
+@pytest.mark.parametrize("sizes", SIZES)
+@pytest.mark.parametrize("shape", [(200,), (5, 7), (0,), ()])
+def test_it_is_nerfstudios_function_with_its_slopes(sizes: Sizes, shape: tuple[int, ...]) -> None:
+    twin, fast = pair_of(sizes)
+    positions = points(shape)
+    worth = torch.randn(*shape, twin.get_out_dim())
+    for ours, theirs in zip(gradients(fast, positions, worth), gradients(twin, positions, worth)):
+        largest = float(theirs.detach().abs().max()) if theirs.numel() else 0.0
+        torch.testing.assert_close(ours, theirs, rtol=0.0, atol=3e-4 * largest)
+
+
+def test_corners_sides_and_places_outside_are_looked_up_as_nerfstudio_does() -> None:
+    twin, fast = pair_of(SIZES[0])
+    sides = torch.tensor([-3.0, -0.5, 0.0, 0.25, 1.0, 1.5])
+    positions = torch.cartesian_prod(sides, sides, sides)
+    torch.testing.assert_close(fast(positions), twin(positions))
+
+
+def test_a_slope_can_be_differentiated_again() -> None:
+    positions = points((50,))
+    found = []
+    for encoding in pair_of(SIZES[0]):
+        leaf = positions.clone().requires_grad_()
+        (slope,) = torch.autograd.grad(encoding(leaf).square().sum(), leaf, create_graph=True)
+        slope.square().sum().backward()
+        assert encoding.hash_table.grad is not None
+        found.append((leaf.grad, encoding.hash_table.grad))
+    torch.testing.assert_close(found[0], found[1], rtol=1e-3, atol=1e-1)
+
+
+@pytest.mark.parametrize("frozen", ["positions", "table"])
+def test_what_needs_no_gradient_gets_none(frozen: str) -> None:
+    twin, fast = pair_of(SIZES[0])
+    positions = points((20,)).requires_grad_(frozen != "positions")
+    for encoding in (twin, fast):
+        encoding.hash_table.requires_grad_(frozen != "table")
+        encoding(positions).sum().backward()
+    assert (positions.grad is None) == (frozen == "positions")
+    assert (fast.hash_table.grad is None) == (frozen == "table")
+
+
+def test_other_types_are_left_to_nerfstudio() -> None:
+    twin, fast = pair_of(SIZES[0])
+    positions = points((10,)).double()
+    with patch.object(HashEncoding, "pytorch_fwd", return_value=torch.ones(1)) as theirs:
+        fast(positions)
+        assert theirs.call_count == 1
+        fast(positions.float())
+        assert theirs.call_count == 1
+    torch.testing.assert_close(fast(positions), twin(positions))
+
+
+def test_an_encoding_of_another_kind_stays_what_it_is() -> None:
+    class Other(HashEncoding):
+        pass
+
+    module = nn.ModuleList([Other(implementation="torch", **SIZES[0])])
+    speed_up_hash_encodings(module)
+    assert type(module[0]) is Other
+
+
+NGP = InstantNGPModelConfig(log2_hashmap_size=8)
+NERFACTO = NerfactoModelConfig(implementation="torch", log2_hashmap_size=8, num_levels=2)
+
+
+def scene() -> dict[str, object]:
+    box = SceneBox(aabb=torch.tensor([[-1.0, -1, -1], [1, 1, 1]]))
+    return {"scene_box": box, "num_train_data": 2, "metadata": {}, "device": "cpu"}
+
+
+@pytest.mark.parametrize(
+    ("host", "sampler", "encodings"),
+    [
+        (NGP, OWN_SAMPLER, 1),
+        (NGP, "dense", 1),
+        (NERFACTO, OWN_SAMPLER, 3),
+        (NERFACTO, "dense-proposal", 1),
+    ],
+)
+def test_every_encoding_of_a_host_is_sped_up_and_keeps_its_names(
+    host: ModelConfig, sampler: str, encodings: int
+) -> None:
+    config = GuidedModelConfig(host=host, occupancy=OccupancyConfig(sampler=sampler))
+    model = config.setup(**scene())
+    found = [module for module in model.modules() if isinstance(module, HashEncoding)]
+    assert [type(module) for module in found] == encodings * [CpuHashEncoding]
+    plain = setup_with_lazy_lpips(host, **scene())
+    if sampler == OWN_SAMPLER:
+        assert plain.state_dict().keys() == model.state_dict().keys()
+
+
+def test_it_is_faster() -> None:
+    sizes = {"num_levels": 16, "max_res": 1024, "log2_hashmap_size": 15, "features_per_level": 2}
+    pair, positions = pair_of(sizes), points((8192,))
+    seconds: list[list[float]] = [[], []]
+    for _ in range(5):
+        for encoding, times in zip(pair, seconds):
+            began = time.process_time()
+            encoding(positions).sum().backward()
+            times.append(time.process_time() - began)
+    assert min(seconds[1]) < 0.7 * min(seconds[0])
