@@ -54,9 +54,7 @@ class _Interpolated(torch.autograd.Function):
 
     @staticmethod
     def forward(ctx: Any, positions: Tensor, table: Tensor, encoding: CpuHashEncoding) -> Tensor:
-        low, fractions = _cells(positions, encoding.scalings)
-        rows = _rows(low, encoding)
-        weights = _weights(fractions)
+        rows, weights = _rows_and_weights(positions, encoding)
         ctx.encoding = encoding
         ctx.save_for_backward(positions, table, rows, weights)
         summed = torch.nn.functional.embedding_bag(
@@ -81,35 +79,37 @@ class _Interpolated(torch.autograd.Function):
         return of_positions, of_table, None
 
 
-def _cells(positions: Tensor, scalings: Tensor) -> tuple[Tensor, Tensor]:
-    """Lower corners and places in them, both [3, levels, N], of positions [N, 3]."""
-    scaled = positions.detach().t()[:, None] * scalings.to(positions)[:, None]
+def _rows_and_weights(positions: Tensor, encoding: HashEncoding) -> tuple[Tensor, Tensor]:
+    """Rows of the table that the corners of the cells around positions [N, 3] hash to, int32, and
+    their trilinear weights: both [levels * N, 8]."""
+    size = len(encoding.scalings), len(positions), 8
+    all_rows, all_weights = torch.empty(size, dtype=torch.int32), torch.empty(size)
+    primes = torch.tensor(PRIMES, dtype=torch.int32)[:, None]
+    levels = zip(encoding.scalings, encoding.hash_offset.tolist(), all_rows, all_weights)
+    for scaling, offset, rows, weights in levels:
+        low, fractions = _cells(positions, scaling)
+        lower = low.to(torch.int32).mul_(primes)
+        _at_corners(lower, lower + primes, torch.bitwise_xor, rows)
+        rows.bitwise_and_(encoding.hash_table_size - 1).add_(offset)
+        _at_corners(1.0 - fractions, fractions, torch.mul, weights)
+    return all_rows.view(-1, 8), all_weights.view(-1, 8)
+
+
+def _cells(positions: Tensor, scaling: Tensor) -> tuple[Tensor, Tensor]:
+    """Lower corners and places in them, both [3, N], of positions [N, 3] at one level."""
+    scaled = positions.detach().t() * scaling
     low = scaled.floor()
     return low, scaled.sub_(low)
 
 
-def _rows(low: Tensor, encoding: HashEncoding) -> Tensor:
-    """Rows of the table that the corners of cells [3, levels, N] hash to: [levels * N, 8] int32."""
-    primes = torch.tensor(PRIMES, dtype=torch.int32)[:, None, None]
-    lower = low.to(torch.int32).mul_(primes)
-    rows = _at_corners(lower, lower + primes, torch.bitwise_xor)
-    offsets = encoding.hash_offset.to(torch.int32)[:, None, None]
-    return rows.bitwise_and_(encoding.hash_table_size - 1).add_(offsets).view(-1, 8)
-
-
-def _weights(fractions: Tensor) -> Tensor:
-    """Trilinear weights [levels * N, 8] of places in cells [3, levels, N]."""
-    return _at_corners(1.0 - fractions, fractions, torch.mul).view(-1, 8)
-
-
 def _at_corners(
-    lower: Tensor, upper: Tensor, combine: Callable[[Tensor, Tensor], Tensor]
-) -> Tensor:
-    """What the sides [3, ...] of a cell along x, y and z make together at its corners: [..., 8],
-    whose last dimension is by sides in y, z and x, lower ones first."""
+    lower: Tensor, upper: Tensor, combine: Callable[[Tensor, Tensor], Tensor], out: Tensor
+) -> None:
+    """What the sides [3, N] of cells along x, y and z make together at their corners: [N, 8], whose
+    last dimension is by sides in y, z and x, lower ones first."""
     x, y, z = zip(lower, upper)
     in_y_and_z = [combine(at_y, at_z) for at_y in y for at_z in z]
-    return torch.stack([combine(beside, at_x) for beside in in_y_and_z for at_x in x], dim=-1)
+    torch.stack([combine(beside, at_x) for beside in in_y_and_z for at_x in x], dim=-1, out=out)
 
 
 def _by_point(by_level: Tensor, encoding: HashEncoding) -> Tensor:
@@ -138,15 +138,18 @@ def _of_positions(
     positions: Tensor, table: Tensor, rows: Tensor, gradient: Tensor, scalings: Tensor
 ) -> Tensor:
     """Gradient [N, 3] of the positions; gradient is [levels * N, features]."""
-    _, (x, y, z) = _cells(positions, scalings)
-    by_y_z_x = _worth(table, rows, gradient).t().reshape(2, 2, 2, *x.shape)
-    by_x = by_y_z_x.movedim(2, 0)
-    by_y = _between(by_x, x)
-    by_z = _between(by_y, y)
-    of_x = _between(_between(by_x[1] - by_x[0], y), z)
-    of_y = _between(by_y[1] - by_y[0], z)
-    of_z = by_z[1] - by_z[0]
-    return (torch.stack([of_x, of_y, of_z]) * scalings[:, None]).sum(dim=1).t()
+    columns, size = table.t().contiguous(), len(positions)
+    total = torch.zeros(3, size)
+    for scaling, *parts in zip(scalings, rows.split(size), gradient.split(size)):
+        _, (x, y, z) = _cells(positions, scaling)
+        by_x = _worth(columns, *parts).t().reshape(2, 2, 2, size).movedim(2, 0)
+        by_y = _between(by_x, x)
+        by_z = _between(by_y, y)
+        of_x = _between(_between(by_x[1] - by_x[0], y), z)
+        of_y = _between(by_y[1] - by_y[0], z)
+        of_z = by_z[1] - by_z[0]
+        total.addcmul_(torch.stack([of_x, of_y, of_z]), scaling)
+    return total.t()
 
 
 def _between(sides: Tensor, places: Tensor) -> Tensor:
@@ -154,10 +157,16 @@ def _between(sides: Tensor, places: Tensor) -> Tensor:
     return torch.lerp(sides[0], sides[1], places)
 
 
-def _worth(table: Tensor, rows: Tensor, gradient: Tensor) -> Tensor:
-    """What the features of each corner, whole, would add to the loss: [levels * N, 8]."""
+def _worth(columns: Tensor, rows: Tensor, gradient: Tensor) -> Tensor:
+    """What the features of each corner, whole, would add to the loss: [N, 8].
+
+    Args:
+        columns: [features, rows] of the table.
+        rows: [N, 8] of the corners.
+        gradient: [N, features].
+    """
     flat, worth = rows.view(-1), torch.zeros(rows.shape)
-    for column, of_column in zip(table.t().contiguous(), gradient.unbind(dim=-1)):
+    for column, of_column in zip(columns, gradient.unbind(dim=-1)):
         worth.addcmul_(column.index_select(0, flat).view_as(rows), of_column[:, None])
     return worth
 
