@@ -24,6 +24,9 @@ from leco_plugin.stability.scene_folder import TRUTH
 NEAR = 0.03
 """A sample whose middle is within this share of the surface's distance is near it: the references
 step by about as much."""
+FEWEST_VIEWS = 2
+"""Training pictures that show a surface for it to count: from one alone nobody can tell its depth,
+and what is kept there is chance."""
 RAYS_AT_ONCE = 256
 """Few: on a CPU one of 1024 took two to four times as long as one of 342, most of it for memory."""
 
@@ -33,7 +36,8 @@ class Measured:
     """Of all held-out pictures together."""
 
     lost_mass: float | None
-    """Share of the rays that meet a surface and have no sample near it; None without surfaces."""
+    """Of the rays that meet a surface which `FEWEST_VIEWS` show, the share without a sample near
+    it; None without such surfaces."""
     kept_fraction: float
     """Samples as a share of the candidates of the dense reference."""
     detail_psnr: float | None
@@ -79,7 +83,7 @@ def measure(trainer: Trainer, data: Path, dense_samples: int) -> tuple[Measured,
             nearest.append(near)
             counts.append(count)
             most += all_of_them
-        surface = depth.isfinite()
+        surface = torch.from_numpy(truth["shown_by"]).flatten() >= FEWEST_VIEWS
         away = torch.cat(nearest)[surface]
         lost += int((~(away <= NEAR * depth[surface])).sum())  # also where a sample is nowhere
         met += int(surface.sum())

@@ -1,7 +1,8 @@
 """A case's scene on disk: a scene in nerfstudio's format, and beside it what is really there.
 
 truth/NAME.npz holds, for each held-out picture, `depth` [h, w] in metres along the rays (inf for no
-surface) and `detail` [h, w], the pixels in which something is seen that the case is about.
+surface), `detail` [h, w], the pixels in which something is seen that the case is about, and
+`shown_by` [h, w], how many training pictures show the same surface.
 """
 
 from __future__ import annotations
@@ -20,6 +21,7 @@ from PIL import Image
 
 from leco_plugin.scenes.city_layouts import POINTS, TRANSFORMS, write_points
 from leco_plugin.stability.capture import Capture, Shot, shots_of
+from leco_plugin.stability.coverage import View, shown_by
 from leco_plugin.stability.matter import Array
 from leco_plugin.stability.stage import Seen, Stage, photograph
 from leco_plugin.stability.stages import moving_car
@@ -44,13 +46,16 @@ def write_scene(stage: Stage, capture: Capture, folder: Path) -> Path:
     for name in ("images", TRUTH):
         (unfinished / name).mkdir(parents=True)
     shots = shots_of(capture)
-    points: list[NDArray[Any]] = []
+    all_seen: list[Seen] = []
     for number, shot in enumerate(shots):
         with_car = stage.with_shapes(moving_car(number)) if shot.moving else stage
-        seen = photograph(with_car, shot.pose, capture.lens(shot.size))
-        _write_shot(unfinished, shot, seen)
-        points.append(_points(seen, shot, capture, number))
-    cloud = np.concatenate(points)
+        all_seen.append(photograph(with_car, shot.pose, capture.lens(shot.size)))
+        _write_image(unfinished, shot, all_seen[-1])
+    _write_truth(unfinished, capture, shots, all_seen)
+    points = (
+        _points(seen, shot, capture, n) for n, (seen, shot) in enumerate(zip(all_seen, shots))
+    )
+    cloud = np.concatenate(list(points))
     if len(cloud):
         write_points(unfinished / POINTS, cloud)
     transforms = _transforms(shots, capture, bool(len(cloud)))
@@ -65,14 +70,27 @@ def digest_of(stage: Stage, capture: Capture) -> str:
     return hashlib.sha256(repr((stage, capture)).encode()).hexdigest()[:16]
 
 
-def _write_shot(folder: Path, shot: Shot, seen: Seen) -> None:
+def _write_image(folder: Path, shot: Shot, seen: Seen) -> None:
     image = seen.image.copy()
     if shot.gain != 1.0:
         light = image[..., :3].astype(float) * shot.gain
         image[..., :3] = np.rint(light.clip(0, 255)).astype(np.uint8)
     Image.fromarray(image).save(folder / _file(shot))
-    if shot.held_out:
-        np.savez(folder / TRUTH / f"{shot.name}.npz", depth=seen.depth, detail=seen.detail)
+
+
+def _write_truth(folder: Path, capture: Capture, shots: list[Shot], all_seen: list[Seen]) -> None:
+    views = [
+        View(shot.pose, capture.lens(shot.size), seen.depth) for shot, seen in zip(shots, all_seen)
+    ]
+    trained = [view for shot, view in zip(shots, views) if not shot.held_out]
+    for shot, seen, view in zip(shots, all_seen, views):
+        if shot.held_out:
+            facts = {
+                "depth": seen.depth,
+                "detail": seen.detail,
+                "shown_by": shown_by(view, trained),
+            }
+            np.savez(folder / TRUTH / f"{shot.name}.npz", **facts)
 
 
 def _file(shot: Shot) -> str:
