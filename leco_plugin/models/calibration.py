@@ -36,8 +36,8 @@ class CalibrationConfig:
     """Largest share of the weight near surfaces that may fall on skipped samples."""
     image_price_db: float = 0.04
     """Largest loss of PSNR on the calibration rays, in dB."""
-    rays: int = 4096
-    """Held-out training rays to measure with."""
+    rays: int = 8192
+    """Held-out training rays to measure with, or as many as there are."""
     rays_at_once: int = 1024
     """Rays rendered at a time."""
     recheck_rays: int = 512

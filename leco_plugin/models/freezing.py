@@ -20,7 +20,7 @@ from leco_plugin.models.ranks import from_first, say, share
 from leco_plugin.models.rendering import Intervals, Rays
 from leco_plugin.occupancy import Occupancy
 from leco_plugin.scenes.frames import frame_of
-from leco_plugin.scenes.held_out_pixels import HeldOutPixelSampler, some_images
+from leco_plugin.scenes.held_out_pixels import HeldOutPixelSampler, Share, some_images
 from leco_plugin.scenes.survey import Survey
 
 if TYPE_CHECKING:
@@ -133,28 +133,22 @@ def held_out_sampler(datamanager: Any) -> HeldOutPixelSampler | None:
 
 
 def held_out_bundle(
-    datamanager: Any, calibrated: int, count: int, seed: int
+    datamanager: Any, count: int, seed: int = 0, share: Share = "calibration"
 ) -> tuple[RayBundle, Tensor]:
     """Rays of training pixels that are never trained on, and their true colours [R, 3 or 4].
 
     A data manager without held-out pixels gives ordinary training rays; the report says so.
 
     Args:
-        calibrated: rays that the threshold was first calibrated with, which are those of seed 0.
-        count: rays wanted; fewer come back where masks leave fewer.
-        seed: of the draw; any but 0 avoids the pixels of seed 0, unless there are no others.
+        count: rays wanted; fewer come back where there are fewer.
+        seed: of the draw.
+        share: of the held-out pixels.
     """
     sampler = held_out_sampler(datamanager)
     if sampler is None:
         bundle, batch = datamanager.next_train(0)
         return bundle[:count], batch["image"][:count]
-    images = _images(datamanager)
-    batch = sampler.sample_held_out(images, count, seed)
-    if seed != 0:
-        used = sampler.sample_held_out(images, calibrated, 0)["indices"]
-        new = ~torch.isin(_numbers(batch["indices"]), _numbers(used))
-        if bool(new.any()):
-            batch = {name: values[new.to(values.device)] for name, values in batch.items()}
+    batch = sampler.sample_held_out(_images(datamanager), count, seed, share)
     pixels = batch["indices"]
     bundle = datamanager.train_dataset.cameras.to("cpu").generate_rays(
         camera_indices=pixels[:, :1], coords=pixels[:, 1:].float() + 0.5
@@ -162,22 +156,21 @@ def held_out_bundle(
     return bundle, batch["image"]
 
 
-def _numbers(indices: Tensor) -> Tensor:
-    """One number for each pixel (image, row, column) [N, 3]."""
-    return (indices[:, 0] << 40) + (indices[:, 1] << 20) + indices[:, 2]
-
-
 def calibration_rays(
-    model: LecoModel, datamanager: Any, count: int | None = None, seed: int = 0
+    model: LecoModel,
+    datamanager: Any,
+    count: int | None = None,
+    seed: int = 0,
+    share: Share = "calibration",
 ) -> tuple[Rays, Tensor]:
     """Held-out rays, cut to the model's bounds, and their true colours [R, 3 or 4].
 
     Args:
         count: None is what a calibration takes.
-        seed: see `held_out_bundle`.
+        seed, share: see `held_out_bundle`.
     """
-    calibrated = model.config.calibration.rays
-    bundle, truth = held_out_bundle(datamanager, calibrated, count or calibrated, seed)
+    count = count or model.config.calibration.rays
+    bundle, truth = held_out_bundle(datamanager, count, seed, share)
     return model.rays_of(bundle.to(model.device)), truth.to(model.device).float()
 
 

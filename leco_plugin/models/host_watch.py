@@ -89,7 +89,7 @@ class HostWatch:
         guide, host, config = self.guide, self.host, self.config
         seed = guide.watched.get("rechecks", 0) + 1
         data = self.pipeline.datamanager
-        bundle, truth = held_out_bundle(data, config.rays, config.recheck_rays, seed)
+        bundle, truth = held_out_bundle(data, config.recheck_rays, seed, "recheck")
         bundle, truth = bundle.to(host.device), truth.to(host.device).float()
         was_training, kept = host.training, guide.kept
         host.eval()

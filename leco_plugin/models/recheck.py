@@ -77,7 +77,7 @@ def measure_again(model: LecoModel, datamanager: Any) -> None:
 
     def evidence() -> tuple[tuple[float, ...], tuple[float, ...]]:
         seed = progress.rechecks + 1
-        rays, truth = calibration_rays(model, datamanager, config.recheck_rays, seed)
+        rays, truth = calibration_rays(model, datamanager, config.recheck_rays, seed, "recheck")
         was_training = model.training
         model.eval()
         found = excesses(*dense_rendering(model, rays, truth), threshold, config)
@@ -107,7 +107,7 @@ def skip_less(model: LecoModel, datamanager: Any, step: int, why: str) -> Measur
     progress, before = model.progress, float(model.threshold)
 
     def again() -> Measured:
-        rays, truth = calibration_rays(model, datamanager, seed=progress.rechecks)
+        rays, truth = calibration_rays(model, datamanager, seed=progress.rechecks, share="all")
         return calibrate_on(model, rays, truth, below=before, missed_only=True)
 
     measured = from_first(again, model.device)

@@ -9,7 +9,7 @@ from __future__ import annotations
 import functools
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, Literal
 
 import torch
 from nerfstudio.data.pixel_samplers import PixelSampler, PixelSamplerConfig
@@ -21,6 +21,11 @@ from leco_plugin.scenes.stored_pictures import StoredPictures
 PERIOD = 11
 """Of 121 pixels one is held out."""
 _OFFSET = 5
+Share = Literal["calibration", "recheck", "all"]
+"""Which held-out pixels: those that the threshold is calibrated with, those that it is checked with
+later, a quarter of all, or either."""
+DRAWN = 8
+"""Times as many pixels as are wanted are drawn, before some are left out."""
 TRIES = 100
 """Draws of a pixel that no mask hides: one in three fails where 1% of the pixels are seen."""
 
@@ -28,6 +33,14 @@ TRIES = 100
 def is_held_out(indices: Tensor) -> Tensor:
     """Whether pixels (image, row, column) [N, 3] are held out: bool [N]."""
     return ((indices[:, 1] % PERIOD == _OFFSET) & (indices[:, 2] % PERIOD == _OFFSET)).bool()
+
+
+def is_of(indices: Tensor, share: Share) -> Tensor:
+    """Whether held-out pixels (image, row, column) [N, 3] belong to a share of them: bool [N]."""
+    if share == "all":
+        return torch.ones(len(indices), dtype=torch.bool)
+    checks = (indices[:, 1] // PERIOD + indices[:, 2] // PERIOD) % 4 == 3
+    return checks if share == "recheck" else ~checks
 
 
 def look_up(source: Any, which: Tensor, places: Tensor) -> Tensor:
@@ -164,29 +177,52 @@ class HeldOutPixelSampler(PixelSampler):
                 indices = torch.where(seen[:, None], indices, indices[others[drawn]])
         return indices
 
-    def sample_held_out(self, images: dict[str, Any], count: int, seed: int) -> dict[str, Tensor]:
+    def sample_held_out(
+        self, images: dict[str, Any], count: int, seed: int, share: Share = "all"
+    ) -> dict[str, Tensor]:
         """A batch of held-out pixels, as `sample` returns it for training; the same for a seed.
 
         Args:
             images: a batch of the image data loader: `image` [K, H, W, C] (or a list of [H, W, C]),
                 `image_idx` [K], and `mask` where there are masks.
-            count: pixels wanted; fewer come back where masks leave fewer.
+            count: pixels wanted; fewer come back where there are fewer, or masks leave fewer.
+            seed: of the draw.
+            share: of the held-out pixels; of tiny images, which have none of it, all.
         Returns:
-            `image` [N, C] and `indices` [N, 3] int64 (image, row, column).
+            `image` [N, C] and `indices` [N, 3] int64 (image, row, column), each pixel once.
         """
-        generator = torch.Generator().manual_seed(seed)
         pictures = images["image"]
-        which = torch.randint(len(pictures), (count,), generator=generator)
-        if isinstance(pictures, StoredPictures):
-            sizes = pictures.sizes[which]
-        else:
-            sizes = torch.tensor([picture.shape[:2] for picture in pictures])[which]
-        cells = ((sizes - _OFFSET - 1) // PERIOD + 1).clamp(min=1)
-        places = (torch.rand(count, 2, generator=generator) * cells).long() * PERIOD + _OFFSET
-        places = torch.minimum(places, sizes - 1)
+        places = _drawn(pictures, DRAWN * count, torch.Generator().manual_seed(seed))
+        of_share = is_of(places, share)
+        places = places[of_share] if bool(of_share.any()) else places
         if "mask" in images:
-            seen = look_up(images["mask"], which, places).flatten(1).all(dim=1).cpu()
-            which, places = which[seen], places[seen]
-        colors = look_up(pictures, which, places)
+            seen = look_up(images["mask"], places[:, 0], places[:, 1:]).flatten(1).all(dim=1)
+            places = places[seen.cpu()]
+        which, within = places[:count, 0], places[:count, 1:]
         numbers = torch.as_tensor(images["image_idx"]).cpu()[which]
-        return {"image": colors, "indices": torch.cat([numbers[:, None], places], dim=-1)}
+        return {
+            "image": look_up(pictures, which, within),
+            "indices": torch.cat([numbers[:, None], within], dim=-1),
+        }
+
+
+def _drawn(pictures: Any, count: int, generator: torch.Generator) -> Tensor:
+    """Held-out pixels [N, 3] int64 (picture, row, column) in random order, each once: up to so many
+    of some pictures."""
+    if isinstance(pictures, StoredPictures):
+        sizes = pictures.sizes
+    else:
+        sizes = torch.tensor([picture.shape[:2] for picture in pictures])
+    cells = ((sizes - _OFFSET - 1) // PERIOD + 1).clamp(min=1)
+    ends = cells.prod(dim=-1).cumsum(dim=0)
+    total = int(ends[-1])
+    if total <= count:
+        numbers = torch.randperm(total, generator=generator)
+    else:
+        numbers = torch.randint(total, (count,), generator=generator).unique()
+        numbers = numbers[torch.randperm(len(numbers), generator=generator)]
+    which = torch.searchsorted(ends, numbers, right=True)
+    numbers = numbers - (ends - cells.prod(dim=-1))[which]
+    columns = cells[which, 1]
+    places = torch.stack([numbers // columns, numbers % columns], dim=-1) * PERIOD + _OFFSET
+    return torch.cat([which[:, None], torch.minimum(places, sizes[which] - 1)], dim=-1)

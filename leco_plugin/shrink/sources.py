@@ -145,17 +145,10 @@ def held_out(source: Source, occupancy: Occupancy, count: int, parts: int = 2) -
     if sampler is None:
         return [trained_on(source, occupancy, count) for _ in range(parts)]
     images = next(source.manager.iter_train_image_dataloader)
-    batch = sampler.sample_held_out(images, 2 * parts * count, seed=1)
-    # the same pixel twice would let one part know of the other
-    numbers, groups = batch["indices"].unique(dim=0, return_inverse=True)
-    first = torch.full((len(numbers),), len(groups)).scatter_reduce(
-        0, groups, torch.arange(len(groups)), "amin"
-    )
-    each = min(count, len(first) // parts)
+    batch = sampler.sample_held_out(images, parts * count, seed=1)
+    each = min(count, len(batch["indices"]) // parts)
     if each == 0:
         raise InputError("the photographs have no pixels that nothing was trained on")
-    order = torch.randperm(len(first), generator=torch.Generator().manual_seed(2))
-    chosen = first[order[: each * parts]].split(each)
     return [
         _seen(
             source,
@@ -163,7 +156,7 @@ def held_out(source: Source, occupancy: Occupancy, count: int, parts: int = 2) -
             source.manager.train_ray_generator(batch["indices"][part]),
             batch["image"][part],
         )
-        for part in chosen
+        for part in torch.arange(each * parts).split(each)
     ]
 
 

@@ -66,7 +66,7 @@ def test_the_threshold_is_measured_on_pixels_that_training_never_sees() -> None:
     manager = Manager(keeps_pixels_back=True)
     pixels, colours = calibration_rays(a_model(), manager)
     sampler = manager.train_pixel_sampler
-    assert isinstance(sampler, HeldOutPixelSampler) and len(pixels) == COUNT
+    assert isinstance(sampler, HeldOutPixelSampler) and 5 < len(pixels) <= COUNT
     image, row, column = pixels.T
     assert torch.equal(colours, manager.images["image"][image, row, column])
     trained = sampler.sample(manager.images)["indices"]

@@ -59,7 +59,8 @@ def watched(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Watched:
     host = Host(guide)
     monkeypatch.setattr(host_watch.time, "monotonic", lambda: now[0])
 
-    def held_out_bundle(_: Any, calibrated: int, count: int, seed: int) -> Any:
+    def held_out_bundle(_: Any, count: int, seed: int, share: str) -> Any:
+        assert share == "recheck"
         asked.append(seed)
         truth = torch.rand(RAYS, 3)
         return truth, truth

@@ -108,13 +108,15 @@ def test_the_threshold_is_lowered_to_one_within_the_bounds_or_to_none(
         asked.append((rays, below))
         return Measured(found, 1e-4, 2e-3, 0.01, 0.5 if found else 0.0)
 
-    monkeypatch.setattr(recheck, "calibration_rays", lambda *_, seed: (f"rays {seed}", None))
+    monkeypatch.setattr(
+        recheck, "calibration_rays", lambda *_, seed, share: (f"{share} rays {seed}", None)
+    )
     monkeypatch.setattr(recheck, "calibrate_on", calibrate_on)
     model = Model()
     model.progress.rechecks, model.progress.surface = 3, (9.0, 9.0, 9.0)
     before = model.report
     skip_less(model, None, 700, "lost surface mass")  # type: ignore[arg-type]
-    assert asked == [("rays 3", pytest.approx(0.4))]
+    assert asked == [("all rays 3", pytest.approx(0.4))]
     assert float(model.threshold) == pytest.approx(found) and model.forgotten == 1
     assert model.report["threshold"] == found and model.report["params"] == 5
     assert model.report["lowered"] == [[700, found]] and "lowered" not in before
@@ -212,7 +214,9 @@ class Street:
 
     wires_are_learned = False
 
-    def rays(self, model: Any, data: Any, count: int | None = None, seed: int = 0) -> Any:
+    def rays(
+        self, model: Any, data: Any, count: int | None = None, seed: int = 0, share: str = ""
+    ) -> Any:
         generator = torch.Generator().manual_seed(seed)
         there = torch.rand(count or CONFIG.rays, generator=generator) < 0.1
         noise = 0.05 * torch.randn(len(there), 3, generator=generator)

@@ -9,6 +9,7 @@ from leco_plugin.scenes.held_out_pixels import (
     PERIOD,
     HeldOutPixelSampler,
     HeldOutPixelSamplerConfig,
+    Share,
     is_held_out,
     look_up,
 )
@@ -73,6 +74,43 @@ def test_held_out_sampling_only_gives_held_out_pixels(masked: bool) -> None:
 def test_held_out_samples_are_the_same_for_a_seed() -> None:
     first, again = (sampler().sample_held_out(images(), 100, seed=3)["indices"] for _ in range(2))
     assert torch.equal(first, again)
+
+
+def pixels_of(batch: dict[str, torch.Tensor], count: int, seed: int, share: Share) -> set[tuple]:
+    indices = sampler().sample_held_out(batch, count, seed, share)["indices"]
+    pixels = {tuple(pixel) for pixel in indices.tolist()}
+    assert len(pixels) == len(indices)  # none twice
+    return pixels
+
+
+@pytest.mark.parametrize("masked", [False, True])
+def test_what_calibrates_and_what_checks_share_no_pixel_and_leave_none_out(masked: bool) -> None:
+    batch = images(masked)
+    everything = pixels_of(batch, 1000, 0, "all")
+    calibrates, checks = (pixels_of(batch, 1000, 1, share) for share in ("calibration", "recheck"))
+    assert not calibrates & checks
+    assert calibrates | checks == everything
+    assert masked or len(checks) == pytest.approx(len(everything) / 4, rel=0.15)
+
+
+@pytest.mark.parametrize("share", ["calibration", "recheck"])
+def test_of_tiny_images_every_share_is_all(share: Share) -> None:
+    batch = {"image": torch.zeros(3, 12, 16, 3), "image_idx": torch.arange(3)}
+    assert pixels_of(batch, 10, 0, share) == {(0, 5, 5), (1, 5, 5), (2, 5, 5)}
+
+
+@pytest.mark.parametrize("share", ["all", "calibration", "recheck"])
+def test_of_many_held_out_pixels_other_seeds_give_others_from_everywhere(share: Share) -> None:
+    pictures = [torch.zeros(400, 300, 3), torch.zeros(800, 600, 3)]
+    batch = {"image": pictures, "image_idx": torch.tensor([0, 1])}
+    first, second = (pixels_of(batch, 50, seed, share) for seed in (0, 1))
+    assert len(first) == len(second) == 50
+    assert len(first & second) < 25
+    many = torch.tensor(sorted(pixels_of(batch, 300, 2, share))).float()
+    assert float((many[:, 0] == 1).float().mean()) == pytest.approx(0.8, abs=0.1)  # its pixels
+    larger = many[many[:, 0] == 1, 1:] / torch.tensor([800.0, 600.0])
+    assert larger.mean(dim=0).tolist() == pytest.approx([0.5, 0.5], abs=0.07)
+    assert float(larger.amax()) > 0.95 and float(larger.amin()) < 0.05
 
 
 def test_images_of_many_sizes_are_sampled_as_a_list() -> None:

@@ -96,7 +96,7 @@ def test_held_out_pixels_are_found_in_files_and_in_images_read_for_it(tmp_path: 
     for images in (store_pictures(dataset, tmp_path / "pixels"), some_images(dataset)):
         batch = sampler().sample_held_out(images, 200, seed=0)
         indices = batch["indices"]
-        assert 50 < len(indices) <= 200 and bool(is_held_out(indices).all())
+        assert 10 < len(indices) <= 200 and bool(is_held_out(indices).all())
         pictures = [dataset.get_data(number)["image"] for number in range(3)]
         expected = torch.stack([pictures[i][r, c] for i, r, c in indices.tolist()])
         torch.testing.assert_close(batch["image"], expected, atol=1e-6, rtol=0)
