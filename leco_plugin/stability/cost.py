@@ -21,24 +21,24 @@ from leco_plugin.stability.sizes import Sizes
 START_SECONDS = 7.0
 """For a process to start, to read the scene and to build the host."""
 RAY_SECONDS: Mapping[str, float] = {
-    LEARNED: 5e-4,
-    GRID: 5e-4,
-    PROPOSALS: 5e-4,
-    DENSE: 11e-4,
-    DENSE_PROPOSAL: 10e-4,
+    LEARNED: 2.1e-4,
+    GRID: 2.7e-4,
+    PROPOSALS: 4.1e-4,
+    DENSE: 7.6e-4,
+    DENSE_PROPOSAL: 7.6e-4,
 }
 """Of training, a ray of a step."""
 RENDERED = 25_000
 """Rays that are looked at when a run in full sizes has ended..."""
 RENDERING = 0.45
 """...each for this share of what it takes to train on it."""
-LEARNED_RAY_SECONDS = 3e-4
+LEARNED_RAY_SECONDS = 1.7e-4
 """A ray of a step of learning."""
-FREEZE_SECONDS = 10.0
+FREEZE_SECONDS = 3.0
 """To calibrate a gate and to build its cell cache."""
 FIRST_CELL_SECONDS = 6e-6
 """To ask the field about a cell of an occupancy grid for the first time, with memory to fetch..."""
-CELL_SECONDS = 1.8e-6
+CELL_SECONDS = 1.25e-6
 """...and later."""
 STEPS_PER_UPDATE = 16
 """Of an occupancy grid; until step 256 it asks about every cell."""
