@@ -21,6 +21,9 @@ if TYPE_CHECKING:
 
 PRIMES = (1, 2654435761 - 2**32, 805459861)
 """Of Instant-NGP's hash. Products wrap around in int32, of which the low bits are what is kept."""
+POINTS_AT_ONCE = 1 << 20
+"""A point of 16 levels takes a kilobyte for a while, and `embedding_bag` counts what it looks up in
+int32, which wraps around without a word."""
 
 
 def speed_up_hash_encodings(model: nn.Module) -> None:
@@ -41,7 +44,8 @@ class CpuHashEncoding(HashEncoding):
         table = self.hash_table
         if in_tensor.device.type != "cpu" or {in_tensor.dtype, table.dtype} != {torch.float32}:
             return super().pytorch_fwd(in_tensor)
-        flat: Tensor = _Interpolated.apply(in_tensor.reshape(-1, 3), table, self)
+        parts = in_tensor.reshape(-1, 3).split(POINTS_AT_ONCE)
+        flat = torch.cat([_Interpolated.apply(part, table, self) for part in parts])
         return flat.view(*in_tensor.shape[:-1], flat.shape[-1])
 
     def by_nerfstudio(self, in_tensor: Tensor) -> Tensor:

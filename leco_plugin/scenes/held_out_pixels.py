@@ -187,17 +187,18 @@ class HeldOutPixelSampler(PixelSampler):
                 `image_idx` [K], and `mask` where there are masks.
             count: pixels wanted; fewer come back where there are fewer, or masks leave fewer.
             seed: of the draw.
-            share: of the held-out pixels; of tiny images, which have none of it, all.
+            share: of the held-out pixels; all where images are so tiny, or masks hide so much, that
+                none of it is left.
         Returns:
             `image` [N, C] and `indices` [N, 3] int64 (image, row, column), each pixel once.
         """
         pictures = images["image"]
         places = _drawn(pictures, DRAWN * count, torch.Generator().manual_seed(seed))
-        of_share = is_of(places, share)
-        places = places[of_share] if bool(of_share.any()) else places
         if "mask" in images:
             seen = look_up(images["mask"], places[:, 0], places[:, 1:]).flatten(1).all(dim=1)
             places = places[seen.cpu()]
+        of_share = is_of(places, share)
+        places = places[of_share] if bool(of_share.any()) else places
         which, within = places[:count, 0], places[:count, 1:]
         numbers = torch.as_tensor(images["image_idx"]).cpu()[which]
         return {

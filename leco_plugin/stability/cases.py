@@ -138,7 +138,8 @@ CASES = {
         Case(
             "six-views",
             "six views only",
-            "most places are seen once or never: haze explains the pictures as well as surfaces",
+            "over a third of the places are in two pictures at most: haze explains those as well "
+            "as surfaces",
             capture=Capture(views=6),
             fixed_views=True,
         ),

@@ -83,10 +83,9 @@ def measure(trainer: Trainer, data: Path, dense_samples: int) -> tuple[Measured,
             nearest.append(near)
             counts.append(count)
             most += all_of_them
-        surface = torch.from_numpy(truth["shown_by"]).flatten() >= FEWEST_VIEWS
-        away = torch.cat(nearest)[surface]
-        lost += int((~(away <= NEAR * depth[surface])).sum())  # also where a sample is nowhere
-        met += int(surface.sum())
+        shown_by = torch.from_numpy(truth["shown_by"]).flatten()
+        lost_here, met_here = lost_of(torch.cat(nearest), depth, shown_by)
+        lost, met = lost + lost_here, met + met_here
         count = torch.cat(counts)
         samples, candidates = samples + int(count.sum()), candidates + most
         rays, without = rays + len(count), without + int((count == 0).sum())
@@ -111,6 +110,19 @@ def measure(trainer: Trainer, data: Path, dense_samples: int) -> tuple[Measured,
         ),
         shown,
     )
+
+
+def lost_of(nearest: Tensor, depth: Tensor, shown_by: Tensor) -> tuple[int, int]:
+    """How many rays lose the surface that they meet, and how many meet one that counts.
+
+    Args:
+        nearest: [N] distance of the surface from the middle of the nearest sample.
+        depth: [N] distance of the surface, in the same units.
+        shown_by: [N] training pictures that show it; 0 where there is none.
+    """
+    counts = shown_by >= FEWEST_VIEWS
+    kept = nearest[counts] <= NEAR * depth[counts]  # not where a sample is nowhere
+    return int((~kept).sum()), int(counts.sum())
 
 
 def psnr(squared_errors: Tensor) -> float:

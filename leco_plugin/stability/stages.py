@@ -1,7 +1,8 @@
 """The scenes of the cases, by name. All but the far ones lie within four metres of the middle.
 
-All of them are grey. A host learns shapes and lightness early and hue late, in some seeds hundreds
-of steps later than in others, which says nothing about where it samples.
+Whatever stands in them is grey; only the sky is blue. A host learns shapes and lightness early and
+hue late, in some seeds hundreds of steps later than in others, which says nothing about where it
+samples.
 """
 
 from __future__ import annotations

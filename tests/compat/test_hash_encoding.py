@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import pickle
 import time
 from unittest.mock import patch
 
@@ -15,6 +16,7 @@ from nerfstudio.models.instant_ngp import InstantNGPModelConfig
 from nerfstudio.models.nerfacto import NerfactoModelConfig
 from torch import Tensor, nn
 
+from leco_plugin.compat import hash_encoding
 from leco_plugin.compat.hash_encoding import CpuHashEncoding, speed_up_hash_encodings
 from leco_plugin.compat.host_lpips import setup_with_lazy_lpips
 from leco_plugin.models.guided import GuidedModelConfig
@@ -65,6 +67,30 @@ def test_corners_sides_and_places_outside_are_looked_up_as_nerfstudio_does() -> 
     sides = torch.tensor([-3.0, -0.5, 0.0, 0.25, 1.0, 1.5])
     positions = torch.cartesian_prod(sides, sides, sides)
     torch.testing.assert_close(fast(positions), twin(positions))
+
+
+def test_many_points_are_taken_in_parts(monkeypatch: pytest.MonkeyPatch) -> None:
+    own, taken = hash_encoding._rows_and_weights, []
+
+    def counted(positions: Tensor, encoding: HashEncoding) -> tuple[Tensor, Tensor]:
+        taken.append(len(positions))
+        return own(positions, encoding)
+
+    monkeypatch.setattr(hash_encoding, "_rows_and_weights", counted)
+    monkeypatch.setattr(hash_encoding, "POINTS_AT_ONCE", 16)
+    twin, fast = pair_of(SIZES[0])
+    positions, worth = points((4, 10)), torch.randn(4, 10, twin.get_out_dim())
+    for ours, theirs in zip(gradients(fast, positions, worth), gradients(twin, positions, worth)):
+        torch.testing.assert_close(ours, theirs, rtol=1e-4, atol=1e-3)
+    assert taken == [16, 16, 8]
+
+
+def test_copies_and_what_was_stored_whole_stay_fast_and_the_same() -> None:
+    _, fast = pair_of(SIZES[0])
+    positions = points((20,))
+    for other in (copy.deepcopy(fast), pickle.loads(pickle.dumps(fast))):
+        assert type(other) is CpuHashEncoding and other.hash_table is not fast.hash_table
+        assert torch.equal(other(positions), fast(positions))
 
 
 def test_a_slope_can_be_differentiated_again() -> None:

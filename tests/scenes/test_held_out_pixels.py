@@ -11,6 +11,7 @@ from leco_plugin.scenes.held_out_pixels import (
     HeldOutPixelSamplerConfig,
     Share,
     is_held_out,
+    is_of,
     look_up,
 )
 from leco_plugin.scenes.input_error import InputError
@@ -97,6 +98,16 @@ def test_what_calibrates_and_what_checks_share_no_pixel_and_leave_none_out(maske
 def test_of_tiny_images_every_share_is_all(share: Share) -> None:
     batch = {"image": torch.zeros(3, 12, 16, 3), "image_idx": torch.arange(3)}
     assert pixels_of(batch, 10, 0, share) == {(0, 5, 5), (1, 5, 5), (2, 5, 5)}
+
+
+@pytest.mark.parametrize("hidden", ["calibration", "recheck"])
+def test_where_masks_leave_nothing_of_a_share_it_is_all_that_they_leave(hidden: Share) -> None:
+    batch = images()
+    places = batch["image"].long()
+    mask = ~is_of(places.view(-1, 3), hidden).view(*places.shape[:-1], 1)
+    shares: list[Share] = ["all", "calibration", "recheck"]
+    all_of_them, *found = (pixels_of(batch | {"mask": mask}, 1000, 0, share) for share in shares)
+    assert found == [all_of_them, all_of_them] and all_of_them
 
 
 @pytest.mark.parametrize("share", ["all", "calibration", "recheck"])

@@ -14,7 +14,7 @@ from torch import Tensor
 
 from leco_plugin.samplers.base import Estimator
 from leco_plugin.samplers.proposal import DenseSampler
-from leco_plugin.stability.measure import NEAR, psnr, sampled
+from leco_plugin.stability.measure import FEWEST_VIEWS, NEAR, lost_of, psnr, sampled
 
 RADIUS = 0.5
 """Of the ball around the origin that the rays meet."""
@@ -88,6 +88,13 @@ def test_a_proposal_host_loses_what_its_samples_are_far_from(samples: int, share
     sampler = DenseSampler(samples=samples, initial_sampler=UniformSampler())
     model = SimpleNamespace(proposal_sampler=sampler.eval(), density_fns=[], collider=None)
     assert lost(model) == (share, pytest.approx(samples / 64))
+
+
+def test_only_surfaces_that_enough_training_pictures_show_can_be_lost() -> None:
+    depth = torch.tensor([2.0, 2.0, 2.0, 2.0, math.inf])
+    nearest = torch.tensor([0.01, 0.5, math.inf, 0.5, math.inf])
+    shown_by = torch.tensor([9, 9, FEWEST_VIEWS, FEWEST_VIEWS - 1, 0])
+    assert lost_of(nearest, depth, shown_by) == (2, 3)
 
 
 def test_psnr_of_known_errors() -> None:

@@ -27,6 +27,9 @@ def test_nerfstudio_can_read_it_and_the_truth_lies_beside(tmp_path: Path) -> Non
         truth = np.load(folder / TRUTH / f"{Path(name).stem}.npz")
         assert truth["depth"].shape == truth["detail"].shape == (12, 16)
         assert np.isfinite(truth["depth"]).mean() > 0.5
+        assert truth["shown_by"].shape == (12, 16)
+        assert not truth["shown_by"][np.isinf(truth["depth"])].any()
+        assert 2 <= truth["shown_by"].max() <= 4  # by training pictures alone
     assert not list(tmp_path.glob(".*"))
 
 
