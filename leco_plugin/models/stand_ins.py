@@ -14,9 +14,10 @@ import torch
 from nerfstudio.model_components.ray_samplers import Sampler
 from torch import Tensor, nn
 
+from leco_plugin.models.rendering import Intervals, Rays, with_backdrop
 from leco_plugin.samplers.base import DensityFn, Estimator
 from leco_plugin.samplers.estimator import cell_centers
-from leco_plugin.samplers.rays import intersect_box
+from leco_plugin.samplers.rays import intersect_box, usable_rays
 from leco_plugin.samplers.registry import build_estimator, build_proposal
 from leco_plugin.scenes.frames import box_around, inverse, moved, turned
 
@@ -53,6 +54,34 @@ class _StandIn(nn.Module):
 
 
 _SAMPLING = inspect.signature(Estimator.sampling)
+
+
+_FAR_PLANE = _SAMPLING.parameters["far_plane"].default
+_STEP = _SAMPLING.parameters["render_step_size"].default
+
+
+def _ending_in_a_backdrop(
+    samples: tuple[Tensor, Tensor, Tensor], rays_o: Tensor, rays_d: Tensor, options: dict[str, Any]
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Packed samples whose rays end in one interval that no gate skips.
+
+    The gate was learned before such a backdrop, and skips what that shows: a host without one would
+    have no place for the sky.
+
+    Args:
+        samples: of a sampler, in which rays may have none.
+        options: of its `sampling`.
+    """
+    ends = rays_o.new_full((len(rays_o),), float(options.get("far_plane", _FAR_PLANE)))
+    t_max = options.get("t_max")
+    ends = ends if t_max is None else ends.minimum(t_max)
+    begins = torch.full_like(ends, float(options.get("near_plane", 0.0)))
+    step, cone = options.get("render_step_size", _STEP), options.get("cone_angle", 0.0)
+    rays = Rays(rays_o, rays_d, begins, ends, None)
+    ended = with_backdrop(Intervals(*samples), rays, step, cone)
+    usable = usable_rays(torch.stack([rays_o.t(), rays_d.t()]), begins, ends)
+    kept = usable[ended.ray_indices] | (ended.t_ends < ends[ended.ray_indices])
+    return ended.ray_indices[kept], ended.t_starts[kept], ended.t_ends[kept]
 
 
 class GuidedEstimator(_StandIn):
@@ -99,6 +128,8 @@ class GuidedEstimator(_StandIn):
             frame = guide.frame.to(rays_o)
             rays_o, rays_d = moved(rays_o, frame), turned(rays_d, frame)
         samples = estimator.sampling(rays_o, rays_d, **options)
+        if self._is_endless() and not guide.dense:
+            samples = _ending_in_a_backdrop(samples, rays_o, rays_d, options)
         if self.training:
             guide.kept = len(samples[0])
         return samples
@@ -116,14 +147,17 @@ class GuidedEstimator(_StandIn):
         A host whose steps do not grow relies on the box of its own estimator, and an unbounded
         occupancy has none.
         """
-        (guide,) = self._guide
         _, rays_o, rays_d = (arguments.pop(name) for name in ("self", "rays_o", "rays_d"))
-        endless = guide.the_occupancy().space.kind == "contraction"
-        if endless and self._outermost is not None and not arguments.get("cone_angle"):
+        if self._is_endless() and self._outermost is not None and not arguments.get("cone_angle"):
             _, leaves = intersect_box(rays_o, rays_d, self._outermost.to(rays_o))
             t_max = arguments.get("t_max")
             arguments["t_max"] = leaves if t_max is None else leaves.minimum(t_max)
         return arguments
+
+    def _is_endless(self) -> bool:
+        """Whether the occupancy goes on into the distance."""
+        (guide,) = self._guide
+        return guide.needs_occupancy and guide.the_occupancy().space.kind == "contraction"
 
     def update_every_n_steps(self, *args: Any, **kwargs: Any) -> None:
         """Called by hosts before each training step; a frozen gate has nothing to update."""

@@ -87,6 +87,44 @@ def test_steps_that_do_not_grow_end_at_the_hosts_box():
     assert float(t_ends.max()) > 40.0
 
 
+def an_unbounded_guide(threshold: float) -> Guide:
+    guide = Guide()
+    space = Space("contraction", (0.0, 0.0, 0.0), 1.0)
+    guide.set_occupancy(Occupancy(ball().gate, space, threshold))
+    return guide
+
+
+def test_rays_of_an_unbounded_occupancy_end_in_a_place_for_the_sky():
+    guide = an_unbounded_guide(2.0)  # which keeps nothing
+    origins = torch.tensor([[0.0, 0.0, 0.0], [5.0, 0.0, 0.0], [0.0, torch.nan, 0.0]])
+    directions = torch.tensor([[0.0, 0.0, 1.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]])
+    march: dict[str, Any] = {"cone_angle": 0.125, "far_plane": 40.0, "render_step_size": 0.1}
+    guided: Any = guide.estimator(BOX).eval()
+    indices, t_starts, t_ends = guided.sampling(origins, directions, **march)
+    assert indices.tolist() == [0, 1]
+    assert t_starts.tolist() == [35.0, 35.0] and t_ends.tolist() == [40.0, 40.0]
+    sooner = torch.tensor([8.0, 40.0, 40.0])
+    _, t_starts, t_ends = guided.sampling(origins, directions, t_max=sooner, **march)
+    assert t_starts.tolist() == [7.0, 35.0] and t_ends.tolist() == [8.0, 40.0]
+
+
+def test_what_an_unbounded_occupancy_keeps_comes_before_the_backdrop_in_order():
+    origins, directions = rays()
+    march: dict[str, Any] = {"cone_angle": 0.05, "far_plane": 9.0, "render_step_size": 0.05}
+    guide = an_unbounded_guide(0.5)
+    own = LearnedOccupancyEstimator(guide.the_occupancy()).eval()
+    indices, t_starts, t_ends = own.sampling(origins, directions, **march)
+    before = 0.5 * (t_starts + t_ends) < 9.0 - 0.05 * 9.0
+    guided: Any = guide.estimator(BOX).eval()
+    found = guided.sampling(origins, directions, **march)
+    is_last = found[2] == 9.0
+    assert int(is_last.sum()) == len(origins)
+    assert bool((found[0].diff() >= 0).all())
+    assert bool(((found[1].diff() > 0) | (found[0].diff() > 0)).all())
+    for ours, theirs in zip(found, (indices, t_starts, t_ends)):
+        assert torch.equal(ours[~is_last], theirs[before])
+
+
 def wall_behind(x: float):
     """A host's density: opaque beyond the plane z < x of the occupancy's coordinates."""
     return lambda positions: 1e3 * (positions[:, 2:] < x).float()
