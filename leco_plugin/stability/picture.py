@@ -110,7 +110,7 @@ def _draw_cell(axes: Any, cell: Mapping[str, Any], left: float, top: float, them
         )
     )
     ink = tints.inks[verdict]
-    first, second, worst = figures(cell)
+    first, second, seeds = figures(cell)
     if cell["psnr"] is None and cell["reason"]:
         first = "no result" if verdict == "fail" else cell["reason"]
     middle = top + ROW / 2
@@ -118,6 +118,6 @@ def _draw_cell(axes: Any, cell: Mapping[str, Any], left: float, top: float, them
     axes.text(left + 0.17, middle, SIGNS[verdict], ha="center", va="center", fontsize=12, color=ink)
     axes.text(left + 0.33, middle - offset, first, va="center", fontsize=9.5, color=ink)
     right = left + COLUMN - 0.08
-    axes.text(right, middle - offset, worst, ha="right", va="center", fontsize=7, color=ink)
+    axes.text(right, middle - offset, seeds, ha="right", va="center", fontsize=7, color=ink)
     if second:
         axes.text(left + 0.33, middle + 0.085, second, va="center", fontsize=7, color=ink)
