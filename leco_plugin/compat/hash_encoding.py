@@ -16,11 +16,11 @@ import torch
 from nerfstudio.field_components.encodings import HashEncoding
 from torch import Tensor
 
+from leco_plugin.models.encodings import PRIMES, summed_by_row
+
 if TYPE_CHECKING:
     from torch import nn
 
-PRIMES = (1, 2654435761 - 2**32, 805459861)
-"""Of Instant-NGP's hash. Products wrap around in int32, of which the low bits are what is kept."""
 POINTS_AT_ONCE = 1 << 20
 """A point of 16 levels takes a kilobyte for a while, and `embedding_bag` counts what it looks up in
 int32, which wraps around without a word."""
@@ -79,7 +79,7 @@ class _Interpolated(torch.autograd.Function):
         if ctx.needs_input_grad[0]:
             of_positions = _of_positions(positions, table, rows, by_level, ctx.encoding.scalings)
         if ctx.needs_input_grad[1]:
-            of_table = _of_table(rows, weights, by_level, len(table))
+            of_table = summed_by_row(rows, weights, by_level, len(table))
         return of_positions, of_table, None
 
 
@@ -126,16 +126,6 @@ def _by_level(by_point: Tensor, encoding: HashEncoding) -> Tensor:
     """[N, levels * features] to [levels * N, features]."""
     levels, features = encoding.num_levels, encoding.features_per_level
     return by_point.view(-1, levels, features).transpose(0, 1).reshape(-1, features)
-
-
-def _of_table(rows: Tensor, weights: Tensor, gradient: Tensor, size: int) -> Tensor:
-    """Gradient [size, features] of the table; gradient is [levels * N, features]."""
-    flat = rows.view(-1)
-    columns = [
-        torch.bincount(flat, (weights * column[:, None]).view(-1), minlength=size)
-        for column in gradient.unbind(dim=-1)
-    ]
-    return torch.stack(columns, dim=-1)
 
 
 def _of_positions(

@@ -92,6 +92,27 @@ class FrequencyEncoding(nn.Module):
         return features.t()
 
 
+PRIMES = (1, 2654435761 - 2**32, 805459861)
+"""Of Instant-NGP's hash. Products wrap around in int32, of which the low bits are what is kept."""
+
+
+def summed_by_row(rows: Tensor, weights: Tensor, gradient: Tensor, size: int) -> Tensor:
+    """Gradient [size, features] of a table of which weighted rows were summed, on a CPU.
+
+    Args:
+        rows: [M, K] int32, of the table.
+        weights: [M, K].
+        gradient: [M, features], of the sums.
+        size: rows of the table.
+    """
+    flat = rows.flatten()
+    columns = [
+        torch.bincount(flat, (weights * column[:, None]).flatten(), minlength=size)
+        for column in gradient.unbind(dim=-1)
+    ]
+    return torch.stack(columns, dim=-1)
+
+
 class _InterpolateTable(torch.autograd.Function):
     """Weighted sum of 4 table rows per point and level; the backward is a histogram.
 
@@ -114,19 +135,14 @@ class _InterpolateTable(torch.autograd.Function):
     ) -> tuple[None, None, Tensor]:
         rows, weights = ctx.saved_tensors
         size, features = ctx.table_shape
-        flat = rows.flatten()
         if gradient.device.type == "cpu":
-            columns = [
-                torch.bincount(flat, (weights * gradient[:, f, None]).flatten(), minlength=size)
-                for f in range(features)
-            ]
-            return None, None, torch.stack(columns, dim=-1).to(gradient.dtype)
+            return None, None, summed_by_row(rows, weights, gradient, size).to(gradient.dtype)
         spread = (weights[..., None] * gradient[:, None, :]).reshape(-1, features)
         return (
             None,
             None,
             torch.zeros(size, features, device=gradient.device, dtype=gradient.dtype).index_add_(
-                0, flat, spread
+                0, rows.flatten(), spread
             ),
         )
 
