@@ -6,10 +6,12 @@ import importlib
 from pathlib import Path
 from typing import Any
 
+import torch
 import tyro
 from nerfstudio.configs.method_configs import all_methods
 from nerfstudio.data.datamanagers.base_datamanager import VanillaDataManagerConfig
 from nerfstudio.data.datamanagers.parallel_datamanager import ParallelDataManagerConfig
+from nerfstudio.data.scene_box import SceneBox
 from nerfstudio.engine.trainer import TrainerConfig
 from nerfstudio.pipelines.base_pipeline import VanillaPipeline
 
@@ -53,6 +55,12 @@ SWITCH_NERF = [
     "sizes.coarse=12",
     "sizes.fine=12",
 ]
+
+
+def what_a_model_gets() -> dict[str, Any]:
+    """What nerfstudio gives a model when it builds it, for two images in a cube."""
+    box = SceneBox(aabb=torch.tensor([[-1.0, -1, -1], [1, 1, 1]]))
+    return {"scene_box": box, "num_train_data": 2, "metadata": {}, "device": "cpu"}
 
 
 def sizes(of_model: list[str], where: str = "pipeline.model") -> list[str]:

@@ -9,11 +9,11 @@ from unittest.mock import patch
 
 import pytest
 import torch
-from nerfstudio.data.scene_box import SceneBox
 from nerfstudio.field_components.encodings import HashEncoding
 from nerfstudio.models.base_model import ModelConfig
 from nerfstudio.models.instant_ngp import InstantNGPModelConfig
 from nerfstudio.models.nerfacto import NerfactoModelConfig
+from small_hosts import what_a_model_gets
 from torch import Tensor, nn
 
 from leco_plugin.compat import hash_encoding
@@ -140,11 +140,6 @@ NGP = InstantNGPModelConfig(log2_hashmap_size=8)
 NERFACTO = NerfactoModelConfig(implementation="torch", log2_hashmap_size=8, num_levels=2)
 
 
-def scene() -> dict[str, object]:
-    box = SceneBox(aabb=torch.tensor([[-1.0, -1, -1], [1, 1, 1]]))
-    return {"scene_box": box, "num_train_data": 2, "metadata": {}, "device": "cpu"}
-
-
 @pytest.mark.parametrize(
     ("host", "sampler", "encodings"),
     [
@@ -158,10 +153,10 @@ def test_every_encoding_of_a_host_is_sped_up_and_keeps_its_names(
     host: ModelConfig, sampler: str, encodings: int
 ) -> None:
     config = GuidedModelConfig(host=host, occupancy=OccupancyConfig(sampler=sampler))
-    model = config.setup(**scene())
+    model = config.setup(**what_a_model_gets())
     found = [module for module in model.modules() if isinstance(module, HashEncoding)]
     assert [type(module) for module in found] == encodings * [CpuHashEncoding]
-    plain = setup_with_lazy_lpips(host, **scene())
+    plain = setup_with_lazy_lpips(host, **what_a_model_gets())
     if sampler == OWN_SAMPLER:
         assert plain.state_dict().keys() == model.state_dict().keys()
 

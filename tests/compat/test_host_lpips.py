@@ -9,10 +9,10 @@ from pathlib import Path
 
 import pytest
 import torch
-from nerfstudio.data.scene_box import SceneBox
 from nerfstudio.models.base_model import ModelConfig
 from nerfstudio.models.nerfacto import NerfactoModelConfig
 from nerfstudio.models.vanilla_nerf import NeRFModel, VanillaModelConfig
+from small_hosts import what_a_model_gets
 from torchmetrics.image.lpip import LearnedPerceptualImagePatchSimilarity
 
 from leco_plugin.compat.host_lpips import LazyLpipsNetwork, lazy_lpips, setup_with_lazy_lpips
@@ -39,21 +39,16 @@ def vanilla_nerf() -> ModelConfig:
     return VanillaModelConfig(_target=NeRFModel)
 
 
-def scene() -> dict[str, object]:
-    box = SceneBox(aabb=torch.tensor([[-1.0, -1, -1], [1, 1, 1]]))
-    return {"scene_box": box, "num_train_data": 2, "metadata": {}, "device": "cpu"}
-
-
 @pytest.mark.parametrize("host", [nerfacto, vanilla_nerf])
 def test_a_built_in_method_needs_a_network_by_itself_and_none_here(host) -> None:
     with pytest.raises(ConnectionError):
-        host().setup(**scene())
-    model = setup_with_lazy_lpips(host(), **scene())
+        host().setup(**what_a_model_gets())
+    model = setup_with_lazy_lpips(host(), **what_a_model_gets())
     assert not any("lpips" in name for name in model.state_dict())
 
 
 def test_a_host_without_lpips_weights_gives_metrics_that_are_json() -> None:
-    model = setup_with_lazy_lpips(nerfacto(), **scene())
+    model = setup_with_lazy_lpips(nerfacto(), **what_a_model_gets())
     side = 40
     outputs = {"rgb": torch.rand(side, side, 3), "accumulation": torch.rand(side, side, 1)}
     depths = ["depth", *(f"prop_depth_{level}" for level in range(2))]
