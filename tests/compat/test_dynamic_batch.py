@@ -16,6 +16,7 @@ from nerfstudio.pipelines.dynamic_batch import DynamicBatchPipeline, DynamicBatc
 from nerfstudio.utils import writer
 
 from leco_plugin.compat.dynamic_batch import (
+    MOST_GROWTH,
     MOST_RAYS,
     ClampedDynamicBatchPipeline,
     ClampedDynamicBatchPipelineConfig,
@@ -25,7 +26,7 @@ from leco_plugin.host_configs import leco_ngp
 from leco_plugin.models.encodings import EncodingConfig
 from leco_plugin.models.gate import Gate, GateConfig
 from leco_plugin.occupancy import Occupancy
-from leco_plugin.space import Space
+from leco_plugin.space import Space, SpaceKind
 
 pytestmark = [  # nerfstudio leaves an image open
     pytest.mark.filterwarnings("ignore:unclosed file:ResourceWarning"),
@@ -49,11 +50,11 @@ def _alone(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     yield
 
 
-def occupancy(threshold: float) -> Occupancy:
+def occupancy(threshold: float, kind: SpaceKind = "contraction") -> Occupancy:
     """Of a gate that has learned nothing: o(x) is about two thirds everywhere."""
     torch.manual_seed(0)
     gate = Gate(GateConfig(EncodingConfig(octaves=1), width=8, layers=1, scene_experts=2))
-    return Occupancy(gate, Space("contraction", (0.0, 0.0, 0.0), 1.0), threshold)
+    return Occupancy(gate, Space(kind, (0.0, 0.0, 0.0), 1.0), threshold)
 
 
 def config(scene: Path, folder: Path, threshold: float = 0.0, **bounds: int) -> Any:
@@ -132,13 +133,24 @@ def test_a_first_batch_beyond_the_bounds_is_brought_within(
 def test_the_fake_sample_of_an_empty_batch_is_not_taken_for_one(
     tiny_scene: Path, tmp_path: Path
 ) -> None:
-    pipeline = pipeline_of(config(tiny_scene, tmp_path, threshold=1.0))
+    made = config(tiny_scene, tmp_path)
+    occupancy(1.0, "box").save(made.pipeline.model.occupancy.path)
+    pipeline = pipeline_of(made)
     _, _, metrics = pipeline.get_train_loss_dict(0)
     assert int(metrics["num_samples_per_batch"]) == 1  # VolumetricSampler invents it
     assert metrics["num_rays_per_batch"] == FIRST
     assert len(pipeline.datamanager.next_train(1)[0]) == FIRST
     DynamicBatchPipeline._update_dynamic_num_rays_per_batch(pipeline, 1)
     assert pipeline.dynamic_num_rays_per_batch == FIRST * TARGET
+
+
+def test_a_batch_of_nothing_but_backdrops_grows_no_faster_than_any(
+    tiny_scene: Path, tmp_path: Path
+) -> None:
+    pipeline = pipeline_of(config(tiny_scene, tmp_path, threshold=1.0))
+    _, _, metrics = pipeline.get_train_loss_dict(0)
+    assert int(metrics["num_samples_per_batch"]) == FIRST  # one a ray
+    assert pipeline.dynamic_num_rays_per_batch <= MOST_GROWTH * FIRST
 
 
 def test_a_resumed_run_goes_on_with_its_batch(tiny_scene: Path, tmp_path: Path) -> None:
