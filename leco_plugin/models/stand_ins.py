@@ -56,8 +56,7 @@ class _StandIn(nn.Module):
 _SAMPLING = inspect.signature(Estimator.sampling)
 
 
-_FAR_PLANE = _SAMPLING.parameters["far_plane"].default
-_STEP = _SAMPLING.parameters["render_step_size"].default
+_DEFAULTS = {name: parameter.default for name, parameter in _SAMPLING.parameters.items()}
 
 
 def _ending_in_a_backdrop(
@@ -72,13 +71,14 @@ def _ending_in_a_backdrop(
         samples: of a sampler, in which rays may have none.
         options: of its `sampling`.
     """
-    ends = rays_o.new_full((len(rays_o),), float(options.get("far_plane", _FAR_PLANE)))
-    t_max = options.get("t_max")
-    ends = ends if t_max is None else ends.minimum(t_max)
-    begins = torch.full_like(ends, float(options.get("near_plane", 0.0)))
-    step, cone = options.get("render_step_size", _STEP), options.get("cone_angle", 0.0)
+    options = _DEFAULTS | options
+    ends = rays_o.new_full((len(rays_o),), float(options["far_plane"]))
+    ends = ends if options["t_max"] is None else ends.minimum(options["t_max"])
+    begins = torch.full_like(ends, float(options["near_plane"]))
     rays = Rays(rays_o, rays_d, begins, ends, None)
-    ended = with_backdrop(Intervals(*samples), rays, step, cone)
+    ended = with_backdrop(
+        Intervals(*samples), rays, options["render_step_size"], options["cone_angle"]
+    )
     usable = usable_rays(torch.stack([rays_o.t(), rays_d.t()]), begins, ends)
     kept = usable[ended.ray_indices] | (ended.t_ends < ends[ended.ray_indices])
     return ended.ray_indices[kept], ended.t_starts[kept], ended.t_ends[kept]
@@ -157,7 +157,7 @@ class GuidedEstimator(_StandIn):
     def _is_endless(self) -> bool:
         """Whether the occupancy goes on into the distance."""
         (guide,) = self._guide
-        return guide.needs_occupancy and guide.the_occupancy().space.kind == "contraction"
+        return guide.the_occupancy().space.kind == "contraction"
 
     def update_every_n_steps(self, *args: Any, **kwargs: Any) -> None:
         """Called by hosts before each training step; a frozen gate has nothing to update."""
