@@ -10,13 +10,14 @@ import torch
 from nerfstudio.cameras.rays import RayBundle
 from torch import Tensor
 
+from leco_plugin.models import ranks
 from leco_plugin.models.calibration import (
     Measured,
     Reference,
     calibrate,
     reference_of,
 )
-from leco_plugin.models.ranks import from_first, say, share
+from leco_plugin.models.ranks import from_first, say
 from leco_plugin.models.rendering import Intervals, Rays
 from leco_plugin.occupancy import Occupancy
 from leco_plugin.scenes.frames import frame_of
@@ -44,7 +45,7 @@ def freeze(
 
     In every process of a data-parallel run the gate is that of the first one, and so is its price.
     """
-    share(model.gate.state_dict().values())
+    ranks.share(model.gate.state_dict().values())
     measured, report = from_first(
         lambda: _priced(model, datamanager, survey, step, learn_seconds), model.device
     )
