@@ -25,6 +25,11 @@ VERSION = 1
 LARGEST_FILE = 64 * 2**20
 """Bytes; a thousand times a usual gate. A larger file is another thing by mistake."""
 
+BACKDROP_PRICE = "backdrop_price_db"
+"""In a report: what the image loses when rays do not end in a backdrop, dB."""
+NEEDS_A_BACKDROP = 0.04
+"""dB from which hosts of a bounded scene are given one."""
+
 Precision = Literal["float32", "bfloat16", "float16"]
 
 
@@ -67,6 +72,13 @@ class Occupancy(nn.Module):
     def threshold(self) -> float:
         """tau: positions with o(x) >= tau are kept."""
         return float(self.threshold_value)
+
+    def shows_a_backdrop(self) -> bool:
+        """Whether pictures show something behind all that the gate was taught about: distance or a
+        sky, in an unbounded scene always, in a bounded one where calibration found it."""
+        price = self.report.get(BACKDROP_PRICE)
+        found = isinstance(price, float | int) and price > NEEDS_A_BACKDROP
+        return self.space.kind == "contraction" or found
 
     @torch.no_grad()
     def query(self, positions: Tensor) -> Tensor:

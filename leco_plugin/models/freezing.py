@@ -14,12 +14,13 @@ from leco_plugin.models import ranks
 from leco_plugin.models.calibration import (
     Measured,
     Reference,
+    backdrop_price,
     calibrate,
     reference_of,
 )
 from leco_plugin.models.ranks import from_first, say
 from leco_plugin.models.rendering import Intervals, Rays
-from leco_plugin.occupancy import Occupancy
+from leco_plugin.occupancy import BACKDROP_PRICE, Occupancy
 from leco_plugin.scenes.frames import frame_of
 from leco_plugin.scenes.held_out_pixels import HeldOutPixelSampler, Share, some_images
 from leco_plugin.scenes.survey import Survey
@@ -85,7 +86,12 @@ def _priced(
 ) -> tuple[Measured, dict[str, Any]]:
     """The threshold with what it costs, and the report that the occupancy carries."""
     rays, truth = calibration_rays(model, datamanager)
-    measured = calibrate_on(model, rays, truth)
+    was_training = model.training
+    model.eval()
+    rendering = dense_rendering(model, rays, truth)
+    measured = calibrate(*rendering, model.config.calibration)
+    of_backdrop = backdrop_price(*rendering)
+    model.train(was_training)
     return measured, {
         "step": step,
         "train_seconds": round(learn_seconds, 2),
@@ -95,6 +101,7 @@ def _priced(
         "lost_mass": measured.lost_mass,
         "image_price_db": measured.image_price_db,
         "empty_fraction": measured.empty_fraction,
+        BACKDROP_PRICE: round(of_backdrop, 4),
         "calibration_rays": len(truth),
         "held_out": held_out_sampler(datamanager) is not None,
         "bounds": survey.bounds.reason,

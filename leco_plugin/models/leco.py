@@ -34,7 +34,7 @@ from leco_plugin.models.rendering import (
     shade,
     with_backdrop,
 )
-from leco_plugin.models.scene_rays import cut_to_bounds, marching_rule
+from leco_plugin.models.scene_rays import cut_to_bounds, marching_rule, with_ends_for_all
 from leco_plugin.models.scene_sizes import complete
 from leco_plugin.models.sizes import Sizes
 from leco_plugin.models.statistics import KEPT_ABOVE, gate_statistics, kept_fraction, prices
@@ -138,9 +138,11 @@ class LecoModel(Model):
         self.bounds_known.fill_(True)
 
     def rays_of(self, bundle: RayBundle) -> Rays:
-        """The bundle's rays, cut to the scene's bounds."""
-        near, far = self.march_range[:2]
-        return cut_to_bounds(bundle, self.aabb, near, far, with_images=self.training)
+        """The bundle's rays, cut to the scene's bounds; of one that misses them the backdrop is
+        left, far off, as its sky."""
+        near, far, step = self.march_range[:3]
+        cut = cut_to_bounds(bundle, self.aabb, near, far, with_images=self.training)
+        return with_ends_for_all(cut, far, step)
 
     @property
     def estimator(self) -> LearnedOccupancyEstimator:
@@ -316,7 +318,9 @@ class LecoModel(Model):
             self.config,
             shaded,
             outputs["intervals"],
+            outputs["rays"],
             truth,
+            image[:, 3] if image.shape[-1] == 4 else None,
             None if known is None else known.to(self.device),
             span=self.march_range[:2],
             unbounded=self.space.unbounded,

@@ -53,6 +53,8 @@ class LecoModelConfig(GrowingConfig, ModelConfig):
     """Weight, while the occupancy is learned, of taking the farther of two explanations of a ray:
     a dark sky is no dark cloud before the camera. Comes in with the distortion loss; in a bounded
     scene for pixels that are nearly black."""
+    transparency: float = 1.0
+    """Weight of leaving what is seen through transparent pixels to the backdrop."""
     look_everywhere: float = 0.125
     """Share of rays that shade all candidates while the others follow the gate being learned."""
     likely_above: float = 0.05

@@ -138,6 +138,27 @@ def termination_loss(
     return (likelihoods * (distances > 0)).sum() / (distances > 0).sum().clamp(min=1)
 
 
+def transparency_loss(
+    weights: Tensor, is_backdrop: Tensor, ray_indices: Tensor, opacities: Tensor
+) -> Tensor:
+    """What is seen through a pixel is left to the backdrop: mean of (w - (1 - a))^2 over rays.
+
+    Of weight w of the backdrop and opacity a < 1. An opaque pixel says nothing: it may show the
+    backdrop, as a sky does.
+
+    Args:
+        weights: [M] rendering weights.
+        is_backdrop: bool [M].
+        ray_indices: [M] int64.
+        opacities: [R] in [0, 1].
+    """
+    behind, meets = torch.zeros_like(opacities), torch.zeros_like(opacities)
+    behind = behind.index_add(0, ray_indices, weights * is_backdrop)
+    meets = meets.index_add(0, ray_indices, is_backdrop.to(meets.dtype))
+    wrong = (behind - (1.0 - opacities)) * (meets * (opacities < 1.0))
+    return wrong.square().sum() / max(len(opacities), 1)
+
+
 def distortion_loss(
     weights: Tensor, t_starts: Tensor, t_ends: Tensor, packed_info: Tensor
 ) -> Tensor:

@@ -17,6 +17,7 @@ from leco_plugin.models.losses import (
     distortion_loss,
     imbalanced_gate_loss,
     termination_loss,
+    transparency_loss,
     widen,
 )
 from leco_plugin.models.rendering import Intervals, Rays, Shaded, backdrop_of
@@ -59,13 +60,16 @@ class FieldLossWeights(Protocol):
     distortion_after: float
     termination: float
     nearness: float
+    transparency: float
 
 
 def field_losses(
     weights: FieldLossWeights,
     shaded: Shaded,
     intervals: Intervals,
+    rays: Rays,
     truth: Tensor,
+    opacities: Tensor | None,
     distances: Tensor | None,
     *,
     span: Tensor,
@@ -77,6 +81,7 @@ def field_losses(
 
     Args:
         truth: [R, 3] colours.
+        opacities: [R] of the pixels; None where all are opaque.
         distances: [R] to sparse points, scene units, 0 where none is known; None is no such points.
         span: [2] near and far, scene units.
         unbounded: scalar bool, whether a ray may go on to a sky of any colour; in a box nothing but
@@ -86,6 +91,10 @@ def field_losses(
     """
     losses = {"rgb_loss": torch.nn.functional.mse_loss(shaded.rgb, truth)}
     near, far = span
+    if weights.transparency > 0.0 and opacities is not None:
+        losses["transparency_loss"] = weights.transparency * transparency_loss(
+            shaded.weights, backdrop_of(intervals, rays), intervals.ray_indices, opacities
+        )
     distortion = weights.distortion * ramped * (1.0 if learning else weights.distortion_after)
     if distortion > 0.0:
         starts, ends = ((t - near) / (far - near) for t in intervals[1:])

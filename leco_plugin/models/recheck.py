@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import torch
 from torch import Tensor
 
-from leco_plugin.models.calibration import CalibrationConfig, Measured, excesses
+from leco_plugin.models.calibration import CalibrationConfig, Measured, ray_prices
 from leco_plugin.models.freezing import calibrate_on, calibration_rays, dense_rendering
 from leco_plugin.models.progress import NO_EVIDENCE, Progress
 from leco_plugin.models.ranks import from_first, say
@@ -39,14 +39,18 @@ class Evidence(NamedTuple):
     total: float
     squares: float
 
-    def with_rays(self, values: Tensor) -> Evidence:
+    def with_rays(self, values: Tensor, wanted: int) -> Evidence:
         """With the rays of one more measurement.
 
         Args:
-            values: [R], of `calibration.excesses`.
+            values: [R], of one of the excesses of `calibration.RayPrices`.
+            wanted: rays that were asked for. Fewer are all there are, the same each time: what was
+                measured on them before is no evidence besides.
         """
         values = values.double()
         new = (float(len(values)), float(values.sum()), float(values.square().sum()))
+        if len(values) < wanted:
+            return Evidence(*new)
         return Evidence(*(REMEMBERED * old + more for old, more in zip(self, new)))
 
     def exceeds(self) -> bool:
@@ -80,10 +84,13 @@ def measure_again(model: LecoModel, datamanager: Any) -> None:
         rays, truth = calibration_rays(model, datamanager, config.recheck_rays, seed, "recheck")
         was_training = model.training
         model.eval()
-        found = excesses(*dense_rendering(model, rays, truth), threshold, config)
+        prices = ray_prices(*dense_rendering(model, rays, truth), threshold, missed_only=True)
+        found = prices.surface_excess(config), prices.image_excess(config)
         model.train(was_training)
         before = (Evidence(*progress.surface), Evidence(*progress.image))
-        surface, image = (old.with_rays(new) for old, new in zip(before, found))
+        surface, image = (
+            old.with_rays(new, config.recheck_rays) for old, new in zip(before, found)
+        )
         return tuple(surface), tuple(image)
 
     progress.surface, progress.image = from_first(evidence, model.device)

@@ -60,7 +60,11 @@ _DEFAULTS = {name: parameter.default for name, parameter in _SAMPLING.parameters
 
 
 def _ending_in_a_backdrop(
-    samples: tuple[Tensor, Tensor, Tensor], rays_o: Tensor, rays_d: Tensor, options: dict[str, Any]
+    samples: tuple[Tensor, Tensor, Tensor],
+    rays_o: Tensor,
+    rays_d: Tensor,
+    options: dict[str, Any],
+    walls: Tensor,
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Packed samples whose rays end in one interval that no gate skips.
 
@@ -70,10 +74,14 @@ def _ending_in_a_backdrop(
     Args:
         samples: of a sampler, in which rays may have none.
         options: of its `sampling`.
+        walls: [6] of the occupancy: where a ray leaves them its backdrop begins; one that misses
+            them has it at its end.
     """
     options = _DEFAULTS | options
     ends = rays_o.new_full((len(rays_o),), float(options["far_plane"]))
     ends = ends if options["t_max"] is None else ends.minimum(options["t_max"])
+    enters, leaves = intersect_box(rays_o, rays_d, walls)
+    ends = torch.where(leaves > enters.clamp(min=0.0), leaves.minimum(ends), ends)
     begins = torch.full_like(ends, float(options["near_plane"]))
     rays = Rays(rays_o, rays_d, begins, ends, None)
     ended = with_backdrop(
@@ -128,8 +136,9 @@ class GuidedEstimator(_StandIn):
             frame = guide.frame.to(rays_o)
             rays_o, rays_d = moved(rays_o, frame), turned(rays_d, frame)
         samples = estimator.sampling(rays_o, rays_d, **options)
-        if self._is_endless() and not guide.dense:
-            samples = _ending_in_a_backdrop(samples, rays_o, rays_d, options)
+        occupancy = guide.the_occupancy()
+        if occupancy.shows_a_backdrop() and not guide.dense:
+            samples = _ending_in_a_backdrop(samples, rays_o, rays_d, options, occupancy.walls)
         if self.training:
             guide.kept = len(samples[0])
         return samples

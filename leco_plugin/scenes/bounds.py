@@ -31,6 +31,10 @@ class BoundsConfig:
     the dataparser knows."""
 
 
+OVER_CAMERAS = 0.06
+"""Share of the way from the ground to the highest camera by which raised bounds end above it."""
+NEAR_CAMERAS = 0.04
+"""Share of the farthest distance at which rays begin in raised bounds."""
 FROM_ABOVE = "photographed from above"
 
 
@@ -116,6 +120,32 @@ def with_range(bounds: SceneBounds, near: float | None, far: float | None) -> Sc
     if not 0.0 < near < far < math.inf:
         raise ValueError(f"rays need 0 < near < far, got near {near:g} and far {far:g}")
     return replace(bounds, near=near, far=far)
+
+
+def up_to_the_cameras(bounds: SceneBounds, heights: Tensor, seen: float) -> SceneBounds:
+    """The bounds of a scene from above with all the air up to its cameras in them.
+
+    For pictures that show something where rays miss what the sparse points bound: fog, which has no
+    points, or a sky, which a cube with walls at its sides holds before its backdrop.
+
+    Args:
+        heights: [C] z of the cameras.
+        seen: share of the rays that miss the bounds and show something.
+    """
+    ground, highest = float(bounds.aabb[2]), float(heights.max())
+    top = max(float(bounds.aabb[5]), highest + OVER_CAMERAS * (highest - ground))
+    x, y = bounds.center[:2].tolist()
+    half = max(bounds.half_extent, 1.02 * (top - ground) / 2)
+    aabb = torch.tensor([x - half, y - half, ground, x + half, y + half, top])
+    return replace(
+        bounds,
+        center=torch.tensor([x, y, (ground + top) / 2]),
+        half_extent=half,
+        near=min(bounds.near, NEAR_CAMERAS * bounds.far),
+        aabb=aabb,
+        reason=f"{bounds.reason}; raised to z = {top:.3f}, above the cameras: {seen:.1%} of the "
+        "rays go beyond and show something",
+    )
 
 
 def _range(depths: Tensor) -> tuple[float, float]:

@@ -12,14 +12,25 @@ from torch import Tensor
 from leco_plugin.models.ranks import say
 from leco_plugin.models.rendering import Rays
 from leco_plugin.samplers.rays import intersect_box
-from leco_plugin.scenes.bounds import BoundsConfig, SceneBounds, find_bounds, with_range
+from leco_plugin.scenes.bounds import (
+    FROM_ABOVE,
+    BoundsConfig,
+    SceneBounds,
+    find_bounds,
+    up_to_the_cameras,
+    with_range,
+)
 from leco_plugin.scenes.dataset_units import ALTITUDES, DatasetUnits, units_of
 from leco_plugin.scenes.input_error import InputError
 from leco_plugin.scenes.photographs import POINT_KEYS
+from leco_plugin.scenes.seen_beyond import seen_beyond
 
 SIDE = 8
 """A grid of this many rays a side covers each image, its corners included."""
 MOST_CAMERAS = 256
+WORTH_IT = 0.005
+"""Share of all rays that must go beyond a scene photographed from above and show something there
+for its bounds to be raised."""
 
 
 @dataclass(frozen=True)
@@ -130,16 +141,21 @@ def survey(
     if len(cameras) == 0:
         raise InputError("the scene has no training cameras")
     origins, directions = covering_rays(cameras)
-    poses = cameras.camera_to_worlds[chosen_cameras(len(cameras))]
+    chosen = chosen_cameras(len(cameras))
+    poses = cameras.camera_to_worlds[chosen]
     try:
         found = find_bounds(poses, directions, sparse_points(dataset), config)
+        if found.reason.startswith(FROM_ABOVE):
+            missing = lengths_inside(found, origins, directions) <= 0.0
+            seen = seen_beyond(dataset, chosen, missing.view(-1, SIDE, SIDE))
+            if seen >= WORTH_IT:
+                found = up_to_the_cameras(found, poses[:, 2, 3], seen)
         bounds = with_range(found, near, far)
         units = units_of(datamanager, config.metres_per_unit)
     except ValueError as error:
         raise InputError(str(error)) from None
     flat_origins, flat_directions = origins.reshape(-1, 3), directions.reshape(-1, 3)
-    enters, leaves = intersect_box(flat_origins, flat_directions, bounds.aabb)
-    lengths = leaves.clamp(max=bounds.far) - enters.clamp(min=bounds.near)
+    lengths = lengths_inside(bounds, flat_origins, flat_directions)
     hits = lengths > 0.0
     if not bool(hits.any()):
         set_by_hand = near is not None or far is not None or config.altitudes is not None
@@ -159,6 +175,12 @@ def survey(
         len(hits),
         units,
     )
+
+
+def lengths_inside(bounds: SceneBounds, origins: Tensor, directions: Tensor) -> Tensor:
+    """Lengths of rays [..., 3] inside bounds [N], flat; at most 0 of those that miss them."""
+    enters, leaves = intersect_box(origins.reshape(-1, 3), directions.reshape(-1, 3), bounds.aabb)
+    return leaves.clamp(max=bounds.far) - enters.clamp(min=bounds.near)
 
 
 def announce(found: Survey) -> None:

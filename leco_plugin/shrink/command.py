@@ -15,7 +15,7 @@ from leco_plugin.cli_reports import check_place
 from leco_plugin.evaluation.inspection import whole_box
 from leco_plugin.evaluation.machine import describe_machine
 from leco_plugin.models.freezing import held_out_sampler
-from leco_plugin.occupancy import Occupancy
+from leco_plugin.occupancy import BACKDROP_PRICE, Occupancy
 from leco_plugin.progress_bar import bar
 from leco_plugin.shrink.evidence import Evidence, gather
 from leco_plugin.shrink.references import names_of, references, shares_lost
@@ -34,7 +34,7 @@ TAUGHT_RAYS = 6144
 TIMED_POSITIONS, ROUNDS = 1 << 16, 15
 COPIED = (
     *("step", "train_seconds", "bounds", "near", "far", "step_size", "cone_angle", "aabb"),
-    *("frame", "cameras"),
+    *("frame", "cameras", BACKDROP_PRICE),
 )
 """What a smaller occupancy's report takes over from the original's."""
 

@@ -15,11 +15,12 @@ from leco_plugin.models.calibration import (
     THRESHOLDS,
     CalibrationConfig,
     Reference,
+    backdrop_price,
     calibrate,
-    excesses,
     measure,
     near_median_depth,
     near_surface,
+    ray_prices,
     reference_of,
 )
 from leco_plugin.models.rendering import Intervals, Rays, Shaded
@@ -88,7 +89,7 @@ def test_nothing_is_skipped_when_no_threshold_fits() -> None:
     for reference in problem.references:
         reference.occupancies.zero_()  # a gate that calls the whole scene empty
     found = calibrate(*problem.arguments(), CalibrationConfig())
-    assert found == (0.0, 0.0, 0.0, 0.0, 0.0)
+    assert found == (0.0,) * len(found)
 
 
 def test_a_perfect_gate_gets_the_largest_threshold_for_nothing() -> None:
@@ -127,6 +128,49 @@ def test_prices_are_those_of_their_definitions() -> None:
         float(10 * (errors[1] / errors[0]).log10()), abs=1e-4
     )
     assert found.empty_fraction == pytest.approx(float(gone.float().mean()))
+
+
+def test_standard_errors_are_those_of_a_bootstrap_over_rays() -> None:
+    problem, threshold = Problem(5), 0.4
+    rays = ray_prices(*problem.arguments(), threshold)
+    found = measure(*problem.arguments(), threshold)
+    drawn = torch.randint(2 * RAYS, (4000, 2 * RAYS), generator=torch.Generator().manual_seed(0))
+    masses = rays.lost_surface[drawn].sum(dim=1) / rays.surface[drawn].sum(dim=1)
+    prices = 10.0 * torch.log10(
+        rays.gated_error[drawn].sum(dim=1) / rays.dense_error[drawn].sum(dim=1)
+    )
+    assert found.surface_error == pytest.approx(float(masses.std()), rel=0.15)
+    assert found.price_error_db == pytest.approx(float(prices.std()), rel=0.15)
+
+
+def test_one_ray_of_a_few_does_not_decide_and_many_do() -> None:
+    for scene, fits in ((Problem(0), True), (Problem(1), False)):
+        for reference in scene.references:
+            reference.occupancies.fill_(1.0)
+            of_first = reference.intervals.ray_indices == 0
+            lost = of_first if fits else torch.ones_like(of_first)
+            reference.occupancies[lost & reference.near_surface] = 0.0
+        if fits:
+            scene.references[1].occupancies.fill_(1.0)
+        found = measure(*scene.arguments(), 0.5)
+        config = CalibrationConfig(lost_surface_mass=1e-3)
+        assert found.lost_surface_mass > 20 * config.lost_surface_mass
+        assert found._replace(image_price_db=0.0, price_error_db=0.0).within(config) == fits
+
+
+def test_a_backdrop_is_worth_what_the_image_loses_without_it() -> None:
+    problem = Problem(2)
+    assert backdrop_price(*problem.arguments()) == 0.0  # there is none
+    last = torch.arange(RAYS * SAMPLES) % SAMPLES == SAMPLES - 1
+    errors = torch.zeros(2)
+    for number, chunk in enumerate(problem.chunks):
+        chunk.reference.always_kept.copy_(last)
+        images = chunk.reference.rgb, problem.render_kept(number, ~last)
+        errors += torch.stack([(image - chunk.truth).square().sum() for image in images])
+    expected = float(10.0 * torch.log10(errors[1] / errors[0]))
+    assert expected > 0.0
+    assert backdrop_price(*problem.arguments()) == pytest.approx(expected, rel=1e-4)
+    assert backdrop_price([], [], problem.render_kept) == 0.0
 
 
 def test_without_an_image_there_is_no_image_price() -> None:
@@ -206,7 +250,8 @@ def test_rays_exceed_the_bounds_on_average_where_the_price_does(seed: int, which
     problem, threshold = Problem(seed), THRESHOLDS[which]
     parts = problem.references, problem.truths, problem.render_kept
     measured = measure(*parts, threshold, missed_only=True)
-    surface, image = excesses(*parts, threshold, CONFIG)
+    rays = ray_prices(*parts, threshold, missed_only=True)
+    surface, image = rays.surface_excess(CONFIG), rays.image_excess(CONFIG)
     assert surface.shape == image.shape == (2 * RAYS,)
     for excess, price, bound in (
         (surface, measured.lost_surface_mass, CONFIG.lost_surface_mass),

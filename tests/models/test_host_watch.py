@@ -15,7 +15,7 @@ from leco_plugin.models import host_watch
 from leco_plugin.models.calibration import CalibrationConfig
 from leco_plugin.models.guide import Guide
 from leco_plugin.models.guided import _refuse_what_is_not_finite
-from leco_plugin.models.host_watch import HostWatch
+from leco_plugin.models.host_watch import LOWERED_TO, HostWatch
 from leco_plugin.occupancy import Occupancy
 
 BOX = torch.tensor([-4.0, -4.0, -4.0, 4.0, 4.0, 4.0])
@@ -83,7 +83,7 @@ def test_a_price_beyond_its_bound_lowers_the_threshold_until_it_is_not(watched: 
     watched.host.price = 0.05
     watched.go(250, 301)
     after = watched.guide.the_occupancy()
-    assert after.threshold == pytest.approx(0.5 * before)
+    assert after.threshold == pytest.approx(LOWERED_TO * before)
     assert watched.guide.version > version and not watched.guide.dense
     assert watched.host.training and watched.guide.kept == 9
     left = Occupancy.load(watched.out / "occupancy.safetensors")

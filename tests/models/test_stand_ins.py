@@ -14,7 +14,7 @@ from nerfstudio.viewer.utils import parse_object
 from nerfstudio.viewer.viewer_elements import ViewerElement
 
 from leco_plugin.models.guide import Guide
-from leco_plugin.occupancy import Occupancy
+from leco_plugin.occupancy import BACKDROP_PRICE, Occupancy
 from leco_plugin.samplers.base import Estimator
 from leco_plugin.samplers.estimator import LearnedOccupancyEstimator
 from leco_plugin.space import Space
@@ -106,6 +106,21 @@ def test_rays_of_an_unbounded_occupancy_end_in_a_place_for_the_sky():
     sooner = torch.tensor([8.0, 40.0, 40.0])
     _, t_starts, t_ends = guided.sampling(origins, directions, t_max=sooner, **march)
     assert t_starts.tolist() == [7.0, 35.0] and t_ends.tolist() == [8.0, 40.0]
+
+
+def test_rays_of_a_bounded_occupancy_end_so_where_pictures_show_something_there():
+    walls = torch.tensor([-1.0, -1.0, -1.0, 1.0, 1.0, 1.0])
+    origins = torch.tensor([[0.0, 0.0, -3.0], [0.0, 5.0, -3.0]])  # one ray meets the box
+    directions = torch.tensor([[0.0, 0.0, 1.0], [0.0, 0.0, 1.0]])
+    march: dict[str, Any] = {"far_plane": 40.0, "render_step_size": 0.5}
+    for price, ends in ((0.0, []), ("?", []), (1.0, [4.0, 40.0])):
+        guide, report = Guide(), {BACKDROP_PRICE: price}
+        space = Space("box", (0.0, 0.0, 0.0), 1.0)
+        guide.set_occupancy(Occupancy(ball().gate, space, 2.0, report=report, walls=walls))
+        guided: Any = guide.estimator(None).eval()
+        indices, t_starts, t_ends = guided.sampling(origins, directions, **march)
+        assert t_ends.tolist() == ends and indices.tolist() == list(range(len(ends)))
+        assert t_starts.tolist() == [end - 0.5 for end in ends]
 
 
 def test_what_an_unbounded_occupancy_keeps_comes_before_the_backdrop_in_order():
