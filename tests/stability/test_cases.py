@@ -59,7 +59,8 @@ def test_settings_arrive_where_they_belong() -> None:
     homogeneous = config("homogeneous", "learned").pipeline.model.occupancy.learning
     experts = homogeneous.sizes.field.experts
     assert experts.empty_layers == experts.layers
-    assert homogeneous.gate_loss.density == 0.0
+    assert homogeneous.gate_loss.density == 0.0 and homogeneous.gate_loss.empty_ratio is None
+    assert homogeneous.calibration.recheck_rays == 0  # a host that is watched heals itself
 
 
 def test_what_a_case_does_not_touch_is_run_once() -> None:
