@@ -30,6 +30,8 @@ that has not found its surfaces yet does not pass for one that has nothing to lo
 
 SURE = 1.0
 """Standard errors by which a price must be beyond its bound to count as beyond it."""
+MOST = 10.0
+"""Times its bound that a price may be measured, however large its standard error is."""
 EXACT = 1e-10
 """Mean squared error, 100 dB, below which two renderings are both exact."""
 
@@ -39,9 +41,10 @@ class CalibrationConfig:
     """What skipping may cost."""
 
     lost_surface_mass: float = 3e-4
-    """Largest share of the weight near surfaces that may fall on skipped samples."""
+    """Largest share of the weight near surfaces that may fall on skipped samples, up to a standard
+    error of what is measured."""
     image_price_db: float = 0.04
-    """Largest loss of PSNR on the calibration rays, in dB."""
+    """Largest loss of PSNR on the calibration rays, in dB, likewise."""
     rays: int = 8192
     """Held-out training rays to measure with, or as many as there are."""
     rays_at_once: int = 1024
@@ -67,13 +70,17 @@ class Measured(NamedTuple):
     """Standard error of `image_price_db`."""
 
     def within(self, config: CalibrationConfig) -> bool:
-        """Whether neither price is found to be beyond its bound, by `SURE` standard errors.
+        """Whether neither price is found to be beyond its bound, by `SURE` standard errors, nor
+        beyond `MOST` times the bound at all.
 
         In a small scene one ray at the rim of a thing is worth more than the bound.
         """
-        return (
-            self.lost_surface_mass - SURE * self.surface_error <= config.lost_surface_mass
-            and self.image_price_db - SURE * self.price_error_db <= config.image_price_db
+        return all(
+            price - min(SURE * error, (MOST - 1.0) * bound) <= bound
+            for price, error, bound in (
+                (self.lost_surface_mass, self.surface_error, config.lost_surface_mass),
+                (self.image_price_db, self.price_error_db, config.image_price_db),
+            )
         )
 
 

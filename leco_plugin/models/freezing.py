@@ -101,6 +101,8 @@ def _priced(
         "lost_mass": measured.lost_mass,
         "image_price_db": measured.image_price_db,
         "empty_fraction": measured.empty_fraction,
+        "surface_error": measured.surface_error,
+        "price_error_db": measured.price_error_db,
         BACKDROP_PRICE: round(of_backdrop, 4),
         "calibration_rays": len(truth),
         "held_out": held_out_sampler(datamanager) is not None,
@@ -156,7 +158,7 @@ def held_out_bundle(
     if sampler is None:
         bundle, batch = datamanager.next_train(0)
         return bundle[:count], batch["image"][:count]
-    batch = sampler.sample_held_out(_images(datamanager), count, seed, share)
+    batch = sampler.sample_held_out(images_of(datamanager), count, seed, share)
     pixels = batch["indices"]
     bundle = datamanager.train_dataset.cameras.to("cpu").generate_rays(
         camera_indices=pixels[:, :1], coords=pixels[:, 1:].float() + 0.5
@@ -190,7 +192,7 @@ class DenseRendering(NamedTuple):
     render_kept: Callable[[int, Tensor], Tensor]
 
 
-def _images(datamanager: Any) -> dict[str, Any]:
+def images_of(datamanager: Any) -> dict[str, Any]:
     """Images to take held-out pixels from: those that are loaded, or some where none are here."""
     loader = getattr(datamanager, "iter_train_image_dataloader", None)
     if loader is None:

@@ -20,7 +20,7 @@ from leco_plugin.models.guide import Guide
 from leco_plugin.models.healing import SUSPECTED_STEPS
 from leco_plugin.models.progress import NO_EVIDENCE
 from leco_plugin.models.ranks import from_first, is_first, mean, say
-from leco_plugin.models.recheck import Evidence, steps_until_next
+from leco_plugin.models.recheck import Evidence, rays_to_check_with, steps_until_next
 
 LOWERED_TO = 0.25
 """Share of the threshold that is left when it is lowered; the next measurements say if it is low
@@ -102,7 +102,7 @@ class HostWatch:
             host.train(was_training)
         excess = gated - 10.0 ** (0.1 * config.image_price_db) * dense
         before = Evidence(*guide.watched.get("image", NO_EVIDENCE))
-        return tuple(before.with_rays(excess, config.recheck_rays))
+        return tuple(before.with_rays(excess, rays_to_check_with(data, config)))
 
     def _errors(self, bundle: Any, truth: Tensor) -> Tensor:
         """Squared error of rendered rays: [R]."""

@@ -140,9 +140,9 @@ class LecoModel(Model):
     def rays_of(self, bundle: RayBundle) -> Rays:
         """The bundle's rays, cut to the scene's bounds; of one that misses them the backdrop is
         left, far off, as its sky."""
-        near, far, step = self.march_range[:3]
+        near, far, *steps = self.march_range[:4]
         cut = cut_to_bounds(bundle, self.aabb, near, far, with_images=self.training)
-        return with_ends_for_all(cut, far, step)
+        return with_ends_for_all(cut, far, torch.minimum(*steps))
 
     @property
     def estimator(self) -> LearnedOccupancyEstimator:

@@ -16,7 +16,13 @@ import torch
 from torch import Tensor
 
 from leco_plugin.models.calibration import CalibrationConfig, Measured, ray_prices
-from leco_plugin.models.freezing import calibrate_on, calibration_rays, dense_rendering
+from leco_plugin.models.freezing import (
+    calibrate_on,
+    calibration_rays,
+    dense_rendering,
+    held_out_sampler,
+    images_of,
+)
 from leco_plugin.models.progress import NO_EVIDENCE, Progress
 from leco_plugin.models.ranks import from_first, say
 
@@ -39,19 +45,18 @@ class Evidence(NamedTuple):
     total: float
     squares: float
 
-    def with_rays(self, values: Tensor, wanted: int) -> Evidence:
+    def with_rays(self, values: Tensor, most: float) -> Evidence:
         """With the rays of one more measurement.
 
         Args:
             values: [R], of one of the excesses of `calibration.RayPrices`.
-            wanted: rays that were asked for. Fewer are all there are, the same each time: what was
-                measured on them before is no evidence besides.
+            most: rays that there are: however often they are measured, they are no more evidence.
         """
         values = values.double()
         new = (float(len(values)), float(values.sum()), float(values.square().sum()))
-        if len(values) < wanted:
-            return Evidence(*new)
-        return Evidence(*(REMEMBERED * old + more for old, more in zip(self, new)))
+        sums = [REMEMBERED * old + more for old, more in zip(self, new)]
+        share = min(1.0, most / max(sums[0], 1e-9))
+        return Evidence(*(share * total for total in sums))
 
     def exceeds(self) -> bool:
         """Whether the mean is above 0 by more than `SURE` standard errors."""
@@ -60,6 +65,16 @@ class Evidence(NamedTuple):
         mean = self.total / self.rays
         variance = max(0.0, self.squares / self.rays - mean * mean)
         return mean > 0.0 and mean > SURE * math.sqrt(variance / self.rays)
+
+
+def rays_to_check_with(datamanager: Any, config: CalibrationConfig) -> float:
+    """How many held-out rays there are to measure again with, or at least as many as are remembered
+    of a long run of measurements."""
+    sampler = held_out_sampler(datamanager)
+    if sampler is None:
+        return math.inf
+    remembered = math.ceil(config.recheck_rays / (1.0 - REMEMBERED))
+    return float(sampler.count_held_out(images_of(datamanager), remembered, "recheck"))
 
 
 def steps_until_next(config: CalibrationConfig, seconds: float, a_step: float) -> int:
@@ -88,9 +103,8 @@ def measure_again(model: LecoModel, datamanager: Any) -> None:
         found = prices.surface_excess(config), prices.image_excess(config)
         model.train(was_training)
         before = (Evidence(*progress.surface), Evidence(*progress.image))
-        surface, image = (
-            old.with_rays(new, config.recheck_rays) for old, new in zip(before, found)
-        )
+        most = rays_to_check_with(datamanager, config)
+        surface, image = (old.with_rays(new, most) for old, new in zip(before, found))
         return tuple(surface), tuple(image)
 
     progress.surface, progress.image = from_first(evidence, model.device)
@@ -126,6 +140,8 @@ def skip_less(model: LecoModel, datamanager: Any, step: int, why: str) -> Measur
         "lost_mass": measured.lost_mass,
         "image_price_db": measured.image_price_db,
         "empty_fraction": measured.empty_fraction,
+        "surface_error": measured.surface_error,
+        "price_error_db": measured.price_error_db,
         "lowered": [*model.report.get("lowered", []), [step, measured.threshold]],
     }
     model.forget_estimator()

@@ -136,11 +136,11 @@ class GuidedEstimator(_StandIn):
             frame = guide.frame.to(rays_o)
             rays_o, rays_d = moved(rays_o, frame), turned(rays_d, frame)
         samples = estimator.sampling(rays_o, rays_d, **options)
-        occupancy = guide.the_occupancy()
-        if occupancy.shows_a_backdrop() and not guide.dense:
-            samples = _ending_in_a_backdrop(samples, rays_o, rays_d, options, occupancy.walls)
         if self.training:
             guide.kept = len(samples[0])
+        occupancy = guide.the_occupancy()
+        if occupancy.shows_a_backdrop() and not (guide.dense and self._is_endless()):
+            samples = _ending_in_a_backdrop(samples, rays_o, rays_d, options, occupancy.walls)
         return samples
 
     @property

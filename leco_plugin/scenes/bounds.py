@@ -55,6 +55,8 @@ class SceneBounds:
     """[6] corners of the box in which rays are marched; +-NO_WALL where there is no wall."""
     reason: str
     """One line for the log: what was seen in the data."""
+    from_above: bool = False
+    """Whether planes were found for it because it was photographed from above."""
 
 
 def find_bounds(
@@ -101,7 +103,8 @@ def find_bounds(
         # far below, so that a flat picture on the lower plane is plainly wrong from two places
         ground = float(low[2]) - max(0.5 * relief, 0.2 * far)
         top = float(high[2]) + 0.3 * relief
-        return _slab(poses, directions, ground, top, near, far, f"{FROM_ABOVE} ({seen}): bounded")
+        found = _slab(poses, directions, ground, top, near, far, f"{FROM_ABOVE} ({seen}): bounded")
+        return replace(found, from_above=True)
     if config.space == "box":
         return _room(poses, low, high, near, far)
     half = float((high - low).max()) / 2

@@ -192,6 +192,21 @@ class HeldOutPixelSampler(PixelSampler):
         Returns:
             `image` [N, C] and `indices` [N, 3] int64 (image, row, column), each pixel once.
         """
+        which, within = self._held_out(images, count, seed, share)
+        numbers = torch.as_tensor(images["image_idx"]).cpu()[which]
+        return {
+            "image": look_up(images["image"], which, within),
+            "indices": torch.cat([numbers[:, None], within], dim=-1),
+        }
+
+    def count_held_out(self, images: dict[str, Any], most: int, share: Share) -> int:
+        """How many pixels of a share there are, up to `most`; arguments as of `sample_held_out`."""
+        return len(self._held_out(images, most, 0, share)[0])
+
+    def _held_out(
+        self, images: dict[str, Any], count: int, seed: int, share: Share
+    ) -> tuple[Tensor, Tensor]:
+        """Pictures [N] and places in them [N, 2]; arguments as of `sample_held_out`."""
         pictures = images["image"]
         places = _drawn(pictures, DRAWN * count, torch.Generator().manual_seed(seed))
         if "mask" in images:
@@ -199,12 +214,7 @@ class HeldOutPixelSampler(PixelSampler):
             places = places[seen.cpu()]
         of_share = is_of(places, share)
         places = places[of_share] if bool(of_share.any()) else places
-        which, within = places[:count, 0], places[:count, 1:]
-        numbers = torch.as_tensor(images["image_idx"]).cpu()[which]
-        return {
-            "image": look_up(pictures, which, within),
-            "indices": torch.cat([numbers[:, None], within], dim=-1),
-        }
+        return places[:count, 0], places[:count, 1:]
 
 
 def _drawn(pictures: Any, count: int, generator: torch.Generator) -> Tensor:

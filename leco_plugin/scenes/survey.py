@@ -13,7 +13,6 @@ from leco_plugin.models.ranks import say
 from leco_plugin.models.rendering import Rays
 from leco_plugin.samplers.rays import intersect_box
 from leco_plugin.scenes.bounds import (
-    FROM_ABOVE,
     BoundsConfig,
     SceneBounds,
     find_bounds,
@@ -145,7 +144,7 @@ def survey(
     poses = cameras.camera_to_worlds[chosen]
     try:
         found = find_bounds(poses, directions, sparse_points(dataset), config)
-        if found.reason.startswith(FROM_ABOVE):
+        if found.from_above:
             missing = lengths_inside(found, origins, directions) <= 0.0
             seen = seen_beyond(dataset, chosen, missing.view(-1, SIDE, SIDE))
             if seen >= WORTH_IT:

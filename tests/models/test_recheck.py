@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from types import SimpleNamespace
 from typing import Any
 
@@ -30,25 +31,25 @@ def evidence_after(mean: float, measurements: int = 8, seed: int = 0) -> Evidenc
     generator = torch.Generator().manual_seed(seed)
     evidence = Evidence(*NO_EVIDENCE)
     for _ in range(measurements):
-        evidence = evidence.with_rays(mean + torch.randn(512, generator=generator), 512)
+        evidence = evidence.with_rays(mean + torch.randn(512, generator=generator), math.inf)
     return evidence
 
 
 def test_the_evidence_is_a_mean_in_which_older_rays_count_less() -> None:
     evidence = Evidence(*NO_EVIDENCE)
     for value in (1.0, 2.0):
-        evidence = evidence.with_rays(torch.full((10,), value), 10)
+        evidence = evidence.with_rays(torch.full((10,), value), math.inf)
     assert evidence.total / evidence.rays == pytest.approx((0.8 * 1.0 + 2.0) / 1.8)
 
 
 def test_rays_that_are_all_there_are_count_once() -> None:
     few = torch.linspace(-1.0, 1.2, 40)
-    once = Evidence(*NO_EVIDENCE).with_rays(few, 512)
-    assert once.with_rays(few, 512) == once and not once.exceeds()
-    often = Evidence(*NO_EVIDENCE)
-    for _ in range(20):  # as new ones they would be taken for proof
-        often = often.with_rays(few, 40)
-    assert often.exceeds()
+    same = new = Evidence(*NO_EVIDENCE)
+    for _ in range(20):
+        same, new = same.with_rays(few, 40), new.with_rays(few, math.inf)
+    assert same.rays == pytest.approx(40.0) and not same.exceeds()
+    assert same.total / same.rays == pytest.approx(new.total / new.rays)
+    assert new.exceeds()  # as so many new ones they would be taken for proof
 
 
 def test_a_price_well_beyond_its_bound_is_found_at_once() -> None:
@@ -152,7 +153,7 @@ def watched(monkeypatch: pytest.MonkeyPatch) -> SimpleNamespace:
     def measure_again(model: Any, _: Any) -> None:
         made.measured.append(made.step)
         rays = made.price + 0.1 * torch.randn(50)
-        model.progress.surface = tuple(Evidence(*model.progress.surface).with_rays(rays, 50))
+        model.progress.surface = tuple(Evidence(*model.progress.surface).with_rays(rays, math.inf))
 
     def lower(model: Any, _: Any, step: int, why: str) -> None:
         made.lowered.append((step, why))

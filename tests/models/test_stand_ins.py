@@ -121,6 +121,11 @@ def test_rays_of_a_bounded_occupancy_end_so_where_pictures_show_something_there(
         indices, t_starts, t_ends = guided.sampling(origins, directions, **march)
         assert t_ends.tolist() == ends and indices.tolist() == list(range(len(ends)))
         assert t_starts.tolist() == [end - 0.5 for end in ends]
+        guided.train()
+        guided.sampling(origins, directions, **march)
+        assert guide.kept == 0  # a backdrop is nothing that the gate keeps
+        guide.dense = True  # what skipping is measured against has the same sky
+        assert guided.sampling(origins, directions, **march)[2].max() == max(ends, default=4.0)
 
 
 def test_what_an_unbounded_occupancy_keeps_comes_before_the_backdrop_in_order():
