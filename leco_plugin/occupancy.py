@@ -77,7 +77,7 @@ class Occupancy(nn.Module):
         """Whether pictures show something behind all that the gate was taught about: distance or a
         sky, in an unbounded scene always, in a bounded one where calibration found it."""
         price = self.report.get(BACKDROP_PRICE)
-        found = isinstance(price, float | int) and price > NEEDS_A_BACKDROP
+        found = isinstance(price, float) and NEEDS_A_BACKDROP < price < float("inf")
         return self.space.kind == "contraction" or found
 
     @torch.no_grad()

@@ -18,6 +18,7 @@ from leco_plugin.models.leco import LecoModel
 from leco_plugin.models.leco_config import LecoModelConfig
 from leco_plugin.models.rendering import Intervals, Rays
 from leco_plugin.models.sizes import Sizes
+from leco_plugin.scenes.bounds import SceneBounds
 
 NUM_RAYS = 12
 
@@ -80,6 +81,36 @@ def test_the_first_loss_that_is_not_finite_stops_the_step(
     outputs, batch = step(model)
     with pytest.raises(FloatingPointError, match=f"^{loss} is not finite: {cause}"):
         model.get_loss_dict(spoil(outputs, spoiled), batch)
+
+
+@pytest.mark.parametrize("training", [True, False])
+def test_a_ray_that_misses_a_bounded_scene_has_its_backdrop_and_a_colour(
+    model: LecoModel, training: bool
+) -> None:
+    walls = torch.tensor([-1.0, -1.0, -1.0, 1.0, 1.0, 1.0])
+    bounds = SceneBounds("box", torch.zeros(3), 1.0, 0.1, 8.0, walls, "by hand")
+    model.set_bounds(bounds, 2.0)
+    ahead = torch.tensor([[0.0, 0.0, 1.0], [0.0, 0.0, 1.0], [0.0, 0.0, -1.0]])
+    origins = torch.tensor([[0.0, 0.0, -3.0], [0.0, 5.0, -3.0], [0.0, 0.0, -3.0]])
+    bundle = RayBundle(origins, ahead, torch.ones(3, 1), torch.zeros(3, 1, dtype=torch.int64))
+    model.train(training)
+    outputs = model.get_outputs(bundle)
+    assert bool((outputs["rgb"] > 0.0).all())
+    assert outputs["accumulation"][1:].flatten().tolist() == pytest.approx([1.0, 1.0])
+    intervals = model.intervals_of(model.rays_of(bundle), guided=False, learning=training)
+    ends = [intervals.t_ends[intervals.ray_indices == ray] for ray in range(3)]
+    assert len(ends[0]) > 3 and float(ends[0].max()) == pytest.approx(4.0)
+    for missing in ends[1:]:
+        assert missing.tolist() == [8.0]
+
+
+def test_opacities_teach_only_where_there_are_any(model: LecoModel) -> None:
+    outputs, batch = step(model)
+    assert "transparency_loss" not in model.get_loss_dict(outputs, batch)
+    opaque = torch.cat([batch["image"], torch.ones(NUM_RAYS, 1)], dim=-1)
+    assert model.get_loss_dict(outputs, {"image": opaque})["transparency_loss"].item() == 0.0
+    clear = torch.cat([batch["image"], torch.zeros(NUM_RAYS, 1)], dim=-1)
+    assert model.get_loss_dict(outputs, {"image": clear})["transparency_loss"].item() > 0.0
 
 
 def test_a_batch_without_rays_says_so(model: LecoModel) -> None:
