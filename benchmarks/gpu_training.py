@@ -55,6 +55,7 @@ class Weights(NamedTuple):
     distortion_after: float = 0.04
     termination: float = 0.03
     nearness: float = 0.03
+    transparency: float = 1.0
 
 
 RATE = 5e-4
@@ -119,7 +120,9 @@ class Run:
             Weights(),
             shaded,
             intervals,
+            rays,
             pixels.colors,
+            None,
             None,
             span=self.span,
             unbounded=self.space.unbounded,
