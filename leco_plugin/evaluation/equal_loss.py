@@ -27,7 +27,7 @@ from leco_plugin.evaluation.reached_volume import (
     rays_of_photographs,
     reached_volume,
 )
-from leco_plugin.models.freezing import calibration_rays, dense_reference
+from leco_plugin.models.freezing import calibration_rays, dense_reference, evaluating
 from leco_plugin.models.gate import occupancy_from_logits
 from leco_plugin.models.leco import LecoModel
 from leco_plugin.models.rendering import Rays, mapped_middles
@@ -100,43 +100,43 @@ def at_equal_loss(
     Raises:
         ValueError: held-out rays see no surface.
     """
-    was_training = model.training
-    model.eval()
-    mapped, weights, occupancies = _measured(model, datamanager)
-    if not bool((weights > 0.0).any()):
-        raise ValueError("no surface is seen by the held-out rays, so that none can be lost")
-    taught = candidates_of(model, rays_of_photographs(datamanager, TAUGHT_RAYS))
-    volume = reached_volume(model, taught, VOLUME_POINTS)
-    kept = kept_shares(
-        weights, occupancies, in_parts(partial(_occupancy, model), volume), LOST_SURFACE_MASS
-    )
-    rows, left_out = [], []
-    if grids:
-        box = mapped_box(model)
+    with evaluating(model):
+        mapped, weights, occupancies = _measured(model, datamanager)
+        if not bool((weights > 0.0).any()):
+            raise ValueError("no surface is seen by the held-out rays, so that none can be lost")
+        taught = candidates_of(model, rays_of_photographs(datamanager, TAUGHT_RAYS))
+        volume = reached_volume(model, taught, VOLUME_POINTS)
+        kept = kept_shares(
+            weights, occupancies, in_parts(partial(_occupancy, model), volume), LOST_SURFACE_MASS
+        )
+        rows, left_out = [], []
+        if grids:
+            box = mapped_box(model)
 
-        def floor_of(scores: Tensor) -> float:
-            of_rays = looked_up(scores, box, mapped)
-            return threshold_losing(weights, of_rays, SPARED * LOST_SURFACE_MASS)
+            def floor_of(scores: Tensor) -> float:
+                of_rays = looked_up(scores, box, mapped)
+                return threshold_losing(weights, of_rays, SPARED * LOST_SURFACE_MASS)
 
-        known = taught, density_of(model, taught)
-        most = MOST_ON_CPU if model.device.type == "cpu" else math.inf
-        filling = FieldGrids(partial(density_of, model), box, known, floor_of, most)
-        for resolution in grids:
-            sizes = (resolution,) * 3 if isinstance(resolution, int) else resolution
-            scores = filling.fill(sizes) if fits_memory(math.prod(sizes)) else None
-            if scores is None:
-                left_out.append(resolution)
-                continue
-            of_rays, of_volume = (looked_up(scores, box, places) for places in (mapped, volume))
-            row: dict[str, Any] = {
-                "resolution": resolution,
-                "bytes": math.ceil(math.prod(sizes) / 8),
-                "update_seconds": round(filling.clock.seconds, 3),
-            }
-            rows.append(row | _shares(kept_shares(weights, of_rays, of_volume, LOST_SURFACE_MASS)))
-            if until_as_little and rows[-1]["kept_reached_volume"] <= round(kept[0], 5):
-                break
-    model.train(was_training)
+            known = taught, density_of(model, taught)
+            most = MOST_ON_CPU if model.device.type == "cpu" else math.inf
+            filling = FieldGrids(partial(density_of, model), box, known, floor_of, most)
+            for resolution in grids:
+                sizes = (resolution,) * 3 if isinstance(resolution, int) else resolution
+                scores = filling.fill(sizes) if fits_memory(math.prod(sizes)) else None
+                if scores is None:
+                    left_out.append(resolution)
+                    continue
+                of_rays, of_volume = (looked_up(scores, box, places) for places in (mapped, volume))
+                row: dict[str, Any] = {
+                    "resolution": resolution,
+                    "bytes": math.ceil(math.prod(sizes) / 8),
+                    "update_seconds": round(filling.clock.seconds, 3),
+                }
+                rows.append(
+                    row | _shares(kept_shares(weights, of_rays, of_volume, LOST_SURFACE_MASS))
+                )
+                if until_as_little and rows[-1]["kept_reached_volume"] <= round(kept[0], 5):
+                    break
     return {
         "lost_surface_mass": LOST_SURFACE_MASS,
         "reached_volume": round(len(volume) / VOLUME_POINTS, 5),

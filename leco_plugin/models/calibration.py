@@ -254,10 +254,10 @@ def measure(
     lost_surface = float(rays.lost_surface.sum()) / surface
     price = price_error = float("nan")
     if with_image and len(rays.weight):
+        dense, gated = (float(e.sum()) for e in (rays.dense_error, rays.gated_error))
         floor = EXACT * sum(truth.numel() for truth in truths)
-        dense, gated = (float(e.sum()) + floor for e in (rays.dense_error, rays.gated_error))
-        price = 10.0 * math.log10(gated / dense)
-        apart = rays.gated_error / gated - rays.dense_error / dense
+        price = price_db(gated, dense, floor)
+        apart = rays.gated_error / (gated + floor) - rays.dense_error / (dense + floor)
         price_error = 10.0 / math.log(10.0) * float(apart.square().sum().sqrt())
     return Measured(
         threshold,
@@ -279,14 +279,22 @@ def backdrop_price(
 
     Arguments as for `measure`.
     """
-    errors = torch.zeros(2, dtype=torch.float64)
-    pixels = 0
+    dense = without = floor = 0.0
     for i, (reference, truth) in enumerate(zip(references, truths)):
-        for which, rgb in enumerate((reference.rgb, render_kept(i, ~reference.always_kept))):
-            errors[which] += (rgb - truth).square().sum(dtype=torch.float64).cpu()
-        pixels += truth.numel()
-    dense, without = (errors + EXACT * pixels).tolist()
-    return 10.0 * math.log10(without / dense) if pixels else 0.0
+        rgb = render_kept(i, ~reference.always_kept)
+        dense += float((reference.rgb - truth).square().sum(dtype=torch.float64))
+        without += float((rgb - truth).square().sum(dtype=torch.float64))
+        floor += EXACT * truth.numel()
+    return price_db(without, dense, floor) if floor else 0.0
+
+
+def price_db(error: float, of_dense: float, floor: float) -> float:
+    """By how many dB of PSNR a squared error is worse than that of the dense image.
+
+    Args:
+        floor: squared error that is as good as none.
+    """
+    return 10.0 * math.log10((error + floor) / (of_dense + floor))
 
 
 def is_missed(

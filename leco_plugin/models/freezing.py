@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -86,12 +87,10 @@ def _priced(
 ) -> tuple[Measured, dict[str, Any]]:
     """The threshold with what it costs, and the report that the occupancy carries."""
     rays, truth = calibration_rays(model, datamanager)
-    was_training = model.training
-    model.eval()
-    rendering = dense_rendering(model, rays, truth)
-    measured = calibrate(*rendering, model.config.calibration)
-    of_backdrop = backdrop_price(*rendering)
-    model.train(was_training)
+    with evaluating(model):
+        rendering = dense_rendering(model, rays, truth)
+        measured = calibrate(*rendering, model.config.calibration)
+        of_backdrop = backdrop_price(*rendering)
     return measured, {
         "step": step,
         "train_seconds": round(learn_seconds, 2),
@@ -211,12 +210,20 @@ def calibrate_on(
         below: only thresholds below this are tried.
         missed_only: see `calibration.measure`.
     """
+    with evaluating(model):
+        rendering, config = dense_rendering(model, rays, truth), model.config.calibration
+        return calibrate(*rendering, config, below, missed_only)
+
+
+@contextmanager
+def evaluating(model: LecoModel) -> Iterator[None]:
+    """A model in evaluation mode for a while; then in the mode that it was in."""
     was_training = model.training
     model.eval()
-    rendering, config = dense_rendering(model, rays, truth), model.config.calibration
-    measured = calibrate(*rendering, config, below, missed_only)
-    model.train(was_training)
-    return measured
+    try:
+        yield
+    finally:
+        model.train(was_training)
 
 
 @torch.no_grad()

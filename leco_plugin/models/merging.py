@@ -15,7 +15,8 @@ from typing import TYPE_CHECKING, NamedTuple
 import torch
 from torch import Tensor
 
-from leco_plugin.models.calibration import near_median_depth
+from leco_plugin.models.calibration import EXACT, near_median_depth, price_db
+from leco_plugin.models.freezing import evaluating
 from leco_plugin.models.ranks import from_first, say
 from leco_plugin.models.rendering import Intervals, Rays
 
@@ -80,34 +81,29 @@ def find_unneeded(model: LecoModel, rays: Rays, truth: Tensor, bound: float) -> 
         truth: [R, 3 or 4] their pixels.
         bound: largest image price, dB.
     """
-    was_training = model.training
-    model.eval()
-    chunks, truths = _in_chunks(model, rays, truth)
-    experts = model.field.experts
-    shares, before = _surface_and_error(model, chunks, truths)
-    out: list[tuple[int, torch.nn.Module]] = []
-    dropped: list[Trial] = []
-    refused = None
-    while int(experts.left.sum()) > 1 and refused is None:
-        held = shares[1:].masked_fill(~experts.left.cpu(), torch.inf)
-        expert = int(held.argmin()) + 1
-        share = float(shares[expert])
-        out.append((expert, experts.drop(expert)))
-        shares_without, error = _surface_and_error(model, chunks, truths)
-        price = 10.0 * float(torch.log10((error + FLOOR) / (before + FLOOR)))
-        if price <= bound:
-            dropped.append(Trial(expert, share, price))
-            shares = shares_without
-        else:
-            refused = Trial(expert, share, price)
-    for expert, module in out:
-        experts.put_back(expert, module)
-    model.train(was_training)
+    with evaluating(model):
+        chunks, truths = _in_chunks(model, rays, truth)
+        experts = model.field.experts
+        shares, before = _surface_and_error(model, chunks, truths)
+        out: list[tuple[int, torch.nn.Module]] = []
+        dropped: list[Trial] = []
+        refused = None
+        while int(experts.left.sum()) > 1 and refused is None:
+            held = shares[1:].masked_fill(~experts.left.cpu(), torch.inf)
+            expert = int(held.argmin()) + 1
+            share = float(shares[expert])
+            out.append((expert, experts.drop(expert)))
+            shares_without, error = _surface_and_error(model, chunks, truths)
+            price = price_db(float(error), float(before), EXACT)
+            if price <= bound:
+                dropped.append(Trial(expert, share, price))
+                shares = shares_without
+            else:
+                refused = Trial(expert, share, price)
+        for expert, module in out:
+            experts.put_back(expert, module)
     return Merging(dropped, refused)
 
-
-FLOOR = 1e-10
-"""Mean squared error of 100 dB: below it an image is exact."""
 
 Chunk = tuple[Rays, Intervals]
 

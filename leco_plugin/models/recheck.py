@@ -20,6 +20,7 @@ from leco_plugin.models.freezing import (
     calibrate_on,
     calibration_rays,
     dense_rendering,
+    evaluating,
     held_out_sampler,
     images_of,
 )
@@ -97,11 +98,9 @@ def measure_again(model: LecoModel, datamanager: Any) -> None:
     def evidence() -> tuple[tuple[float, ...], tuple[float, ...]]:
         seed = progress.rechecks + 1
         rays, truth = calibration_rays(model, datamanager, config.recheck_rays, seed, "recheck")
-        was_training = model.training
-        model.eval()
-        prices = ray_prices(*dense_rendering(model, rays, truth), threshold, missed_only=True)
+        with evaluating(model):
+            prices = ray_prices(*dense_rendering(model, rays, truth), threshold, missed_only=True)
         found = prices.surface_excess(config), prices.image_excess(config)
-        model.train(was_training)
         before = (Evidence(*progress.surface), Evidence(*progress.image))
         most = rays_to_check_with(datamanager, config)
         surface, image = (old.with_rays(new, most) for old, new in zip(before, found))

@@ -7,10 +7,10 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from leco_plugin.models.objective import DARK
+
 MOST_PICTURES = 16
 """Pictures that are looked at: those with the most rays that miss."""
-DARK = 0.1
-"""Brightness, of the largest channel, up to which a pixel shows nothing."""
 
 
 def seen_beyond(dataset: Any, numbers: Tensor, misses: Tensor) -> float:

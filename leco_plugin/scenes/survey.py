@@ -142,10 +142,11 @@ def survey(
     origins, directions = covering_rays(cameras)
     chosen = chosen_cameras(len(cameras))
     poses = cameras.camera_to_worlds[chosen]
+    flat_origins, flat_directions = origins.reshape(-1, 3), directions.reshape(-1, 3)
     try:
         found = find_bounds(poses, directions, sparse_points(dataset), config)
         if found.from_above:
-            missing = lengths_inside(found, origins, directions) <= 0.0
+            missing = lengths_inside(found, flat_origins, flat_directions) <= 0.0
             seen = seen_beyond(dataset, chosen, missing.view(-1, SIDE, SIDE))
             if seen >= WORTH_IT:
                 found = up_to_the_cameras(found, poses[:, 2, 3], seen)
@@ -153,7 +154,6 @@ def survey(
         units = units_of(datamanager, config.metres_per_unit)
     except ValueError as error:
         raise InputError(str(error)) from None
-    flat_origins, flat_directions = origins.reshape(-1, 3), directions.reshape(-1, 3)
     lengths = lengths_inside(bounds, flat_origins, flat_directions)
     hits = lengths > 0.0
     if not bool(hits.any()):
@@ -177,8 +177,8 @@ def survey(
 
 
 def lengths_inside(bounds: SceneBounds, origins: Tensor, directions: Tensor) -> Tensor:
-    """Lengths of rays [..., 3] inside bounds [N], flat; at most 0 of those that miss them."""
-    enters, leaves = intersect_box(origins.reshape(-1, 3), directions.reshape(-1, 3), bounds.aabb)
+    """Lengths [N] of rays [N, 3] inside bounds, at most 0 of those that miss them."""
+    enters, leaves = intersect_box(origins, directions, bounds.aabb)
     return leaves.clamp(max=bounds.far) - enters.clamp(min=bounds.near)
 
 
