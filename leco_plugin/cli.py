@@ -135,7 +135,7 @@ def inspect(
 
 def swap(
     method: Annotated[str, tyro.conf.Positional],
-    occupancy: Path,
+    occupancy: Path | None = None,
     arguments: Annotated[tuple[str, ...], tyro.conf.Positional] = (),
     sampler: str = "learned-occupancy",
     options: Mapping[str, int | float] = MappingProxyType({}),
@@ -147,7 +147,8 @@ def swap(
 
     Args:
         method: As ns-train knows it: instant-ngp, nerfacto, or of another plugin.
-        occupancy: An occupancy.safetensors, or the folder of a run that left one.
+        occupancy: An occupancy.safetensors, or the folder of a run that left one. Without it, one
+            is learned first, for samplers that ask one.
         arguments: After --, what ns-train would be given for this method: -- --data DIR ...
         sampler: Of this package or of another, in place of the method's own.
         options: Of that sampler, by name: --options num_candidates 512 cache_bytes 4194304.

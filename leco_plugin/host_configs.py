@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Any
 
 from nerfstudio.cameras.camera_optimizers import CameraOptimizerConfig
 from nerfstudio.configs.base_config import MachineConfig, ViewerConfig
@@ -17,26 +16,20 @@ from nerfstudio.plugins.types import MethodSpecification
 
 from leco_plugin.compat.data_parallel import DataParallelTrainerConfig
 from leco_plugin.compat.dynamic_batch import ClampedDynamicBatchPipelineConfig
-from leco_plugin.method_configs import LEARNING, ON_GPU, STEPS, best_device
+from leco_plugin.method_configs import ON_GPU, STEPS, best_device
 from leco_plugin.models.guided import GuidedModelConfig
-from leco_plugin.models.guided_start import OccupancyConfig
 from leco_plugin.models.optimizers import FusedAdamConfig
-from leco_plugin.models.sizes import learning_only
 from leco_plugin.models.switch_config import SwitchNerfModelConfig
 from leco_plugin.models.switch_sizes import switch_sizes_for
 from leco_plugin.scenes.data_manager import LecoDataManagerConfig
 from leco_plugin.scenes.known_distances import KnownDistancePixelSamplerConfig
 from leco_plugin.scenes.photographs import LecoPhotographsDataParserConfig
-from leco_plugin.swap import with_sampler_swapped
+from leco_plugin.swap import learned_first, with_sampler_swapped
 
 
 def guided(host: ModelConfig) -> GuidedModelConfig:
     """The host, guided by an occupancy from a file or learned first."""
-    learning = LEARNING if ON_GPU else replace(LEARNING, sizes=learning_only(LEARNING.sizes))
-    return GuidedModelConfig(
-        host=host,
-        occupancy=OccupancyConfig(learning=learning, rays=4096 if ON_GPU else 1024),
-    )
+    return GuidedModelConfig(host=host, occupancy=learned_first())
 
 
 def learning_first(config: TrainerConfig, name: str) -> TrainerConfig:
@@ -47,8 +40,6 @@ def learning_first(config: TrainerConfig, name: str) -> TrainerConfig:
         InputError: its model learns or has an occupancy already.
     """
     made = with_sampler_swapped(config, None)
-    pipeline: Any = made.pipeline
-    pipeline.model = guided(pipeline.model.host)
     machine = replace(made.machine, device_type=best_device())
     return replace(made, method_name=name, machine=machine)
 

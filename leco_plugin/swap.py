@@ -16,9 +16,10 @@ from nerfstudio.models.base_model import ModelConfig
 from leco_plugin.compat.atomic_trainer import AtomicTrainer
 from leco_plugin.compat.data_parallel import DataParallelTrainerConfig
 from leco_plugin.compat.dynamic_batch import clamped
-from leco_plugin.method_configs import best_device
+from leco_plugin.method_configs import LEARNING, ON_GPU, best_device
 from leco_plugin.models.guided import GuidedModelConfig
 from leco_plugin.models.guided_start import OccupancyConfig, load_occupancy, occupancy_file
+from leco_plugin.models.sizes import learning_only
 from leco_plugin.samplers.registry import check_gate, refuse_unknown_options
 from leco_plugin.scenes.input_error import InputError
 
@@ -29,7 +30,7 @@ NO_OPTIONS: Mapping[str, int | float] = MappingProxyType({})
 
 def swapped_config(
     method: str,
-    file: Path,
+    file: Path | None,
     arguments: Sequence[str] = (),
     sampler: str = LEARNED,
     options: Mapping[str, int | float] = NO_OPTIONS,
@@ -38,7 +39,8 @@ def swapped_config(
 
     Args:
         method: name, as `ns-train` knows it.
-        file: an occupancy, or the folder of a run that left one.
+        file: an occupancy, or the folder of a run that left one; None learns one first, for a
+            sampler that asks one.
         arguments: what `ns-train METHOD` would be given.
         sampler: name in the registry of samplers.
         options: of that sampler, by name.
@@ -54,7 +56,7 @@ def swapped_config(
         tyro.conf.SuppressFixed[tyro.conf.FlagConversionOff[TrainerConfig]],
         default=registered(method),
         args=list(arguments),
-        prog=f"leco swap {method} --occupancy {file} --",
+        prog=f"leco swap {method}{'' if file is None else f' --occupancy {file}'} --",
     )
     if config.load_config is not None:
         raise InputError(
@@ -66,14 +68,17 @@ def swapped_config(
     return with_sampler_swapped(config, file, sampler, options)
 
 
-def check_sampler(file: Path, sampler: str, options: Mapping[str, int | float]) -> None:
+def check_sampler(file: Path | None, sampler: str, options: Mapping[str, int | float]) -> None:
     """Whether there is an occupancy, and a sampler with these options that asks gates of its kind.
 
+    Args:
+        file: an occupancy; None is one that will be learned.
     Raises:
         InputError: there is not.
     """
     try:
-        check_gate(sampler, load_occupancy(file).gate.config)
+        gate = LEARNING.sizes.gate if file is None else load_occupancy(file).gate.config
+        check_gate(sampler, gate)
         refuse_unknown_options(sampler, options)
     except ValueError as error:
         raise InputError(str(error)) from None
@@ -116,7 +121,7 @@ def with_sampler_swapped(
     if isinstance(host, GuidedModelConfig):
         raise InputError(
             f"{config.method_name} is guided already: ns-train {config.method_name} "
-            f"--pipeline.model.occupancy.path {file} guides it by this occupancy"
+            f"--pipeline.model.occupancy.path {file or 'FILE'} guides it by this occupancy"
         )
     if isinstance(host, LecoModelConfig):
         raise InputError(
@@ -127,7 +132,7 @@ def with_sampler_swapped(
             f"{config.method_name} has a pipeline without a model that could be guided"
         )
     path = None if file is None else occupancy_file(file.resolve())
-    occupancy = OccupancyConfig(path=path, sampler=sampler, options=dict(options))
+    occupancy = replace(learned_first(), path=path, sampler=sampler, options=dict(options))
     pipeline.model = GuidedModelConfig(host=host, occupancy=occupancy)
     if type(config) is TrainerConfig:
         values = {f.name: getattr(config, f.name) for f in fields(config)}
@@ -136,9 +141,15 @@ def with_sampler_swapped(
     return replace(config, pipeline=clamped(pipeline), _target=trainer)
 
 
+def learned_first() -> OccupancyConfig:
+    """How an occupancy is learned where a host is given none, on the device that is here."""
+    learning = LEARNING if ON_GPU else replace(LEARNING, sizes=learning_only(LEARNING.sizes))
+    return OccupancyConfig(learning=learning, rays=4096 if ON_GPU else 1024)
+
+
 def swap(
     method: str,
-    file: Path,
+    file: Path | None,
     arguments: Sequence[str] = (),
     sampler: str = LEARNED,
     options: Mapping[str, int | float] = NO_OPTIONS,

@@ -13,7 +13,7 @@ from nerfstudio.configs.method_configs import all_methods
 from leco_plugin.compat.dynamic_batch import ClampedDynamicBatchPipelineConfig
 from leco_plugin.models.guided import GuidedModelConfig
 from leco_plugin.scenes.input_error import InputError
-from leco_plugin.swap import registered, swapped_config
+from leco_plugin.swap import learned_first, registered, swapped_config
 
 
 @pytest.fixture(scope="module")
@@ -40,6 +40,29 @@ def test_options_of_the_sampler_are_in_the_config(file: Path) -> None:
     made: Any = swapped_config("nerfacto", file, options=options)
     assert made.pipeline.model.occupancy.options == options
     assert yaml.load(yaml.dump(made), Loader=yaml.Loader) == made
+
+
+def test_without_a_file_one_is_learned_first_in_the_sizes_of_this_device() -> None:
+    made: Any = swapped_config("instant-ngp", None)
+    guided = made.pipeline.model
+    assert guided.occupancy == learned_first() and guided.occupancy.path is None
+    assert guided.host == registered("instant-ngp").pipeline.model  # type: ignore[attr-defined]
+    ngp: Any = registered("leco-ngp")
+    assert guided.occupancy == ngp.pipeline.model.occupancy
+
+
+def test_a_sampler_that_asks_no_occupancy_is_given_none() -> None:
+    options = {"resolution": 32}
+    made: Any = swapped_config("instant-ngp", None, [], "occupancy-grid", options)
+    occupancy = made.pipeline.model.occupancy
+    assert occupancy.path is None and occupancy.sampler == "occupancy-grid"
+    assert occupancy.options == options
+
+
+def test_a_gate_that_would_not_be_learned_is_said_in_a_line() -> None:
+    with pytest.raises(InputError, match="asks a gate on hash features") as error:
+        swapped_config("nerfacto", None, [], "learned-occupancy-hash")
+    assert "\n" not in str(error.value)
 
 
 def test_an_option_that_the_sampler_does_not_have_is_said_in_a_line(file: Path) -> None:

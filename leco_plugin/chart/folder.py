@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import json
 import shutil
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
 from leco_plugin.chart.contender import Contender
+from leco_plugin.compat.run_folder import alone_in
 from leco_plugin.evaluation.json_file import read_object, write_json
 from leco_plugin.scenes.input_error import InputError
 
@@ -56,9 +58,20 @@ class ChartFolder:
             raise InputError(f"{path} holds something else; name a new folder with --out")
         if found is None:
             write_json(path / SETTINGS, dict(settings))
-        shutil.rmtree(path / UNFINISHED, ignore_errors=True)  # of a process that was killed
         for name in (RUNS, UNFINISHED, LOGS):
             (path / name).mkdir(exist_ok=True)
+
+    @contextmanager
+    def alone(self) -> Iterator[None]:
+        """While runs are made: no other process makes any here.
+
+        Raises:
+            InputError: another one does.
+        """
+        with alone_in(self.path, "chart"):
+            shutil.rmtree(self.path / UNFINISHED, ignore_errors=True)  # of one that was killed
+            (self.path / UNFINISHED).mkdir()
+            yield
 
     def stored(self) -> dict[str, dict[str, Any]]:
         """Finished runs by the name of their job; each has `contender`, `run`, and `made`, unless

@@ -93,7 +93,13 @@ class Chart:
                 several runs at once. It ends what is under way when `stop` is set.
             say: called with a line for each run.
             show: called with the share of all runs that is done.
+        Raises:
+            InputError: another process makes runs in the same folder.
         """
+        with self.folder.alone():
+            self._make_missing(runner, say, show)
+
+    def _make_missing(self, runner: Runner, say: Say, show: Callable[[float], None]) -> None:
         taken = take_over(self.folder, self.missing(), self.reuse)
         if taken:
             say(f"{_counted(len(taken), 'run')} taken over from other charts")

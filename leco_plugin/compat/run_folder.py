@@ -6,10 +6,13 @@ A new run deletes whatever checkpoints it finds in its folder as soon as it save
 from __future__ import annotations
 
 import os
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 from leco_plugin.compat.whole_checkpoints import step_of
+from leco_plugin.scenes.input_error import InputError
 
 try:
     import fcntl as _fcntl
@@ -51,6 +54,29 @@ def release(folder: Path) -> None:
     """Lets go of a folder before the process ends."""
     held = _held.pop(folder.resolve(), None)
     if held is not None:
+        os.close(held)
+
+
+@contextmanager
+def alone_in(folder: Path, work: str) -> Iterator[None]:
+    """Keeps a folder from every other process that would make the same runs in it.
+
+    Args:
+        folder: made where it is missing.
+        work: what is made there, for the message.
+    Raises:
+        InputError: another process is at work there.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    held = lock(folder)
+    if held is None:
+        raise InputError(
+            f"another process makes the {work} in {folder}, with all cores; wait for it, or name "
+            "another folder with --out"
+        )
+    try:
+        yield
+    finally:
         os.close(held)
 
 

@@ -22,6 +22,7 @@ from leco_plugin.samplers.base import DensityFn, Estimator
 from leco_plugin.samplers.registry import (
     SamplerSpec,
     build_estimator,
+    build_proposal,
     refuse_unknown_options,
     sampler_spec,
 )
@@ -148,10 +149,25 @@ class Guide(nn.Module):
         """
         if self._spec("estimator").needs_occupancy:
             return GuidedEstimator(self, aabb, outermost, density_fn)
-        estimator = build_estimator(self.sampler, aabb=aabb, occupancy=None, **self.options)
+        estimator = self.built("estimator", aabb=aabb, occupancy=None)
         if self.front_to_back and isinstance(estimator, Estimator):
             estimator.density_fn = density_fn
         return estimator
+
+    def built(self, kind: str, **given: Any) -> nn.Module:
+        """The sampler that this host calls, with its options.
+
+        Args:
+            kind: `estimator` or `proposal`.
+            given: what a host gives a builder.
+        Raises:
+            InputError: it cannot be built so.
+        """
+        build = {"estimator": build_estimator, "proposal": build_proposal}[kind]
+        try:
+            return build(self.sampler, **{**given, **self.options})
+        except ValueError as error:
+            raise InputError(f"{error} (occupancy.options {self.options})") from error
 
     def proposal(self, **options: Any) -> Sampler:
         """What goes where a proposal host has its sampler; options as for the registry.
@@ -159,8 +175,11 @@ class Guide(nn.Module):
         Raises:
             InputError: the sampler has nothing for proposal hosts, or not all of its options.
         """
-        self._spec("proposal")
-        return GuidedProposal(self, {**options, **self.options})
+        needs_occupancy = self._spec("proposal").needs_occupancy
+        made = GuidedProposal(self, options)
+        if not needs_occupancy:
+            _ = made.sampler  # what is wrong with its options is said now
+        return made
 
     def get_extra_state(self) -> dict[str, Any]:
         """What a checkpoint must say before the gate's weights can be read."""

@@ -81,7 +81,8 @@ class OccupancyGridEstimator(Estimator):
         levels: int = 1,
     ) -> None:
         super().__init__()
-        sizes = [resolution] * 3 if isinstance(resolution, int) else [int(n) for n in resolution]
+        along_axes = [resolution] * 3 if isinstance(resolution, int | float) else resolution
+        sizes = [int(n) for n in along_axes]
         box = torch.as_tensor(roi_aabb).detach().float().cpu().reshape(-1)
         if len(sizes) != 3 or min(sizes) < 1 or levels < 1:
             raise ValueError(f"a grid needs positive sizes, got {sizes} and {levels} levels")

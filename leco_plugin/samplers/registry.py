@@ -97,7 +97,8 @@ def build_estimator(name: str, **options: Any) -> nn.Module:
 
     Raises:
         ValueError: there is no such sampler, it does not serve packed hosts, or it needs an
-            occupancy and none is given, or one whose gate is on other features.
+            occupancy and none is given, or one whose gate is on other features, or an option is
+            wrong.
     """
     return _build(name, "estimator", options)
 
@@ -133,7 +134,10 @@ def _build(name: str, kind: str, options: dict[str, Any]) -> nn.Module:
         raise ValueError(f"sampler {name!r} needs an occupancy")
     if spec.needs_occupancy:
         check_gate(name, getattr(getattr(options["occupancy"], "gate", None), "config", None))
-    estimator: nn.Module = _loaded(builder)(**options)
+    try:
+        estimator: nn.Module = _loaded(builder)(**options)
+    except (ValueError, TypeError) as error:
+        raise ValueError(f"the sampler {name!r} cannot be built: {error}") from error
     return estimator
 
 

@@ -4,16 +4,14 @@ from __future__ import annotations
 
 import functools
 import math
-import os
 import shlex
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 from nerfstudio.utils.rich_utils import CONSOLE
 
-from leco_plugin.compat.run_folder import lock
+from leco_plugin.compat.run_folder import alone_in
 from leco_plugin.progress_bar import bar
 from leco_plugin.scenes.input_error import InputError
 from leco_plugin.stability.cases import cases_named
@@ -55,7 +53,7 @@ def make_table(
     say = functools.partial(CONSOLE.print, markup=False, highlight=False)
     named = {"cases": cases, "samplers": samplers, "seeds": seeds, "seeds-beside": seeds_beside}
     command, sizes = command_line(quick, named), QUICK if quick else FULL
-    with alone_in(out):
+    with alone_in(out, "table"):
         suite = Suite(out, chosen, compared, seeds, sizes, command, seeds_beside)
         if earlier is not None:
             say(f"{suite.take_over(earlier)} runs of earlier results are taken over")
@@ -65,26 +63,6 @@ def make_table(
         if left := len(suite.missing()):
             say(f"{left} runs are left or have failed; the same command goes on with them")
         return suite.draw()
-
-
-@contextmanager
-def alone_in(out: Path) -> Iterator[None]:
-    """Keeps a table's folder from every other process that would make the same runs in it.
-
-    Raises:
-        InputError: one is at work there.
-    """
-    out.mkdir(parents=True, exist_ok=True)
-    held = lock(out)
-    if held is None:
-        raise InputError(
-            f"another process makes the table in {out}, with all cores; wait for it, or name "
-            "another folder with --out"
-        )
-    try:
-        yield
-    finally:
-        os.close(held)
 
 
 def command_line(quick: bool, named: dict[str, Sequence[object]]) -> str:

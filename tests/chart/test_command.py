@@ -14,11 +14,12 @@ import pytest
 
 from leco_plugin import cli
 from leco_plugin.chart import command
-from leco_plugin.chart.folder import Job
+from leco_plugin.chart.folder import UNFINISHED, Job
 from leco_plugin.chart.processes import ProcessRunner, RunFailed
 from leco_plugin.chart.protocol import Protocol
 from leco_plugin.chart.run import Chart
 from leco_plugin.chart.suites import AT_ONCE, SUITES
+from leco_plugin.compat.run_folder import alone_in
 
 METHODS = ["--methods", "leco-occupancy", "leco-occupancy-never-frozen"]
 TIME = ["--seconds", 3]
@@ -86,6 +87,28 @@ def test_how_long_it_takes_is_said_before_it_is_started(
     beside = ["--data", tiny_scene, "--out", tmp_path / "beside", "--methods", "leco-occupancy"]
     assert run(*beside, "--seconds", 75, "--at-once", 2) == 0
     assert "3 runs of 75 s, 2 at a time, about 3 minutes on" in capsys.readouterr().out
+
+
+def test_while_a_chart_is_made_a_second_process_in_its_folder_is_refused_in_one_line(
+    started: Started,
+    tiny_scene: Path,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(Chart, "draw", Chart.write)
+    out = tmp_path / "out"
+    arguments = ["--data", tiny_scene, "--out", out, "--methods", "leco-occupancy", *TIME]
+    assert run(*arguments, "--seeds", 0) == 0
+    under_way = out / UNFINISHED / "a-run"
+    under_way.mkdir()
+    with alone_in(out, "chart"):
+        capsys.readouterr()
+        assert run(*arguments, "--seeds", 0, 1) == 2
+    error = capsys.readouterr().err
+    assert "another process makes the chart in" in error and error.count("\n") == 1
+    assert len(started) == 1 and under_way.exists()
+    assert run(*arguments, "--seeds", 0, 1) == 0 and len(started) == 2
 
 
 def test_several_suites_have_a_folder_each_and_none_makes_what_another_has_made(

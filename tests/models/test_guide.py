@@ -91,3 +91,20 @@ def test_options_that_a_host_of_its_kind_cannot_use_are_named():
         packed.proposal(num_samples=3)
     with pytest.raises(InputError, match="'num_candidates' in packed hosts; there are cache_"):
         proposal.estimator(BOX)
+
+
+@pytest.mark.parametrize(
+    ("sampler", "kind", "options", "said"),
+    [
+        ("occupancy-grid", "estimator", {"resolution": 0}, "a grid needs positive sizes"),
+        ("occupancy-grid", "estimator", {"resolution": 0.5}, "a grid needs positive sizes"),
+        ("dense-proposal", "proposal", {"samples": 0}, "samples"),
+    ],
+)
+def test_an_option_with_which_nothing_can_be_built_is_said_in_a_line_before_the_first_step(
+    sampler: str, kind: str, options: dict[str, float], said: str
+):
+    given = {"aabb": BOX} if kind == "estimator" else {}
+    with pytest.raises(InputError, match=f"{sampler}.* cannot be built: .*{said}") as error:
+        getattr(Guide(sampler, options), kind)(**given)
+    assert "\n" not in str(error.value) and str(options) in str(error.value)

@@ -9,6 +9,7 @@ import pytest
 from stability_runs import Runs
 
 from leco_plugin import cli
+from leco_plugin.compat.run_folder import alone_in
 from leco_plugin.stability import command, suite
 
 
@@ -67,7 +68,7 @@ def test_a_second_process_in_the_same_folder_is_refused_in_one_line(
     tmp_path: Path, runs: Runs, capsys: pytest.CaptureFixture[str]
 ) -> None:
     words = ("--cases", "yard", "--samplers", "grid-128")
-    with command.alone_in(tmp_path / "out"):
+    with alone_in(tmp_path / "out", "table"):
         assert stability(tmp_path / "out", *words) == 2
     error = capsys.readouterr().err
     assert "another process makes the table" in error and error.count("\n") == 1
