@@ -200,21 +200,6 @@ def images_of(datamanager: Any) -> dict[str, Any]:
     return loaded
 
 
-@torch.no_grad()
-def calibrate_on(
-    model: LecoModel, rays: Rays, truth: Tensor, below: float = 1.0, missed_only: bool = False
-) -> Measured:
-    """Finds the threshold of a model's gate on given rays; the model is left as it was.
-
-    Args:
-        below: only thresholds below this are tried.
-        missed_only: see `calibration.measure`.
-    """
-    with evaluating(model):
-        rendering, config = dense_rendering(model, rays, truth), model.config.calibration
-        return calibrate(*rendering, config, below, missed_only)
-
-
 @contextmanager
 def evaluating(model: LecoModel) -> Iterator[None]:
     """A model in evaluation mode for a while; then in the mode that it was in."""

@@ -4,20 +4,21 @@ Calibration bounds the price for the field of that moment. Every so many steps i
 on a few held-out rays that the calibration did not use. What is lost near surfaces counts where the
 photographs miss it: where the gate skips, the field is not trained any more, and shows haze. Where
 a price is found to be beyond its bounds, the threshold is calibrated again among lower ones; where
-none of these is within them, nothing is skipped any more.
+none of these is within them, nothing is skipped any more. A field that was begun anew at freezing
+has never learned what is skipped, and may show anything there: its image alone is asked.
 """
 
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import torch
 from torch import Tensor
 
-from leco_plugin.models.calibration import CalibrationConfig, Measured, ray_prices
+from leco_plugin.models.calibration import CalibrationConfig, Measured, calibrate, ray_prices
 from leco_plugin.models.freezing import (
-    calibrate_on,
     calibration_rays,
     dense_rendering,
     evaluating,
@@ -89,10 +90,17 @@ def steps_until_next(config: CalibrationConfig, seconds: float, a_step: float) -
     return max(config.steps_per_recheck, within_share)
 
 
+def bounds_of(model: LecoModel) -> CalibrationConfig:
+    """What skipping may cost the field as it is: of one that was begun anew, any of its surfaces,
+    which it has put before the haze of its first weights."""
+    config = model.config.calibration
+    return replace(config, lost_surface_mass=1.0) if model.config.schedule.restart else config
+
+
 @torch.no_grad()
 def measure_again(model: LecoModel, datamanager: Any) -> None:
     """Adds one measurement to the evidence in the model's progress; the model is left as it was."""
-    config, progress = model.config.calibration, model.progress
+    config, progress = bounds_of(model), model.progress
     threshold = float(model.threshold)
 
     def evidence() -> tuple[tuple[float, ...], tuple[float, ...]]:
@@ -128,7 +136,9 @@ def skip_less(model: LecoModel, datamanager: Any, step: int, why: str) -> Measur
 
     def again() -> Measured:
         rays, truth = calibration_rays(model, datamanager, seed=progress.rechecks, share="all")
-        return calibrate_on(model, rays, truth, below=before, missed_only=True)
+        with evaluating(model):
+            rendering = dense_rendering(model, rays, truth)
+            return calibrate(*rendering, bounds_of(model), below=before, missed_only=True)
 
     measured = from_first(again, model.device)
     model.threshold.fill_(measured.threshold)

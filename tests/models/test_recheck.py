@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
 
@@ -80,7 +81,11 @@ class Model(SimpleNamespace):
 
     def __init__(self, threshold: float = 0.4) -> None:
         super().__init__(
-            config=SimpleNamespace(calibration=CONFIG, sizes=SimpleNamespace(candidates=64)),
+            config=SimpleNamespace(
+                calibration=CONFIG,
+                schedule=SimpleNamespace(restart=False),
+                sizes=SimpleNamespace(candidates=64),
+            ),
             threshold=torch.tensor(threshold),
             device=torch.device("cpu"),
             progress=Progress(learn_steps=200, configured=200),
@@ -106,24 +111,29 @@ class Model(SimpleNamespace):
         self.training = mode
 
 
+@pytest.mark.parametrize("anew", [False, True])
 @pytest.mark.parametrize("found", [0.2, 0.0])
 def test_the_threshold_is_lowered_to_one_within_the_bounds_or_to_none(
-    found: float, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    found: float, anew: bool, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     asked: list[Any] = []
 
-    def calibrate_on(
-        model: Any, rays: Any, truth: Any, below: float, missed_only: bool
+    def calibrate(
+        rays: Any, truth: Any, config: CalibrationConfig, below: float, missed_only: bool
     ) -> Measured:
         assert missed_only
+        any_surface = replace(CONFIG, lost_surface_mass=1.0)
+        assert config == (any_surface if anew else CONFIG)  # haze is before a young field's
         asked.append((rays, below))
         return Measured(found, 1e-4, 2e-3, 0.01, 0.5 if found else 0.0)
 
     monkeypatch.setattr(
         recheck, "calibration_rays", lambda *_, seed, share: (f"{share} rays {seed}", None)
     )
-    monkeypatch.setattr(recheck, "calibrate_on", calibrate_on)
+    monkeypatch.setattr(recheck, "dense_rendering", lambda model, *rays: rays)
+    monkeypatch.setattr(recheck, "calibrate", calibrate)
     model = Model()
+    model.config.schedule.restart = anew
     model.progress.rechecks, model.progress.surface = 3, (9.0, 9.0, 9.0)
     before = model.report
     skip_less(model, None, 700, "lost surface mass")  # type: ignore[arg-type]
