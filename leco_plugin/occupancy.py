@@ -28,9 +28,9 @@ LARGEST_FILE = 64 * 2**20
 BACKDROP_PRICE = "backdrop_price_db"
 """In a report: what the image loses when rays do not end in a backdrop, dB."""
 NEEDS_A_BACKDROP = 1.0
-"""dB from which hosts of a bounded scene are given one. Half a per cent of sky is worth that much;
-what shines through surfaces that brief learning has not made opaque is worth up to half a dB, and a
-host that is given a backdrop for that loses a whole one."""
+"""dB from which hosts of a bounded scene are given one. What shines through surfaces that brief
+learning has not made opaque is worth up to 0.6 dB, and a host that is given a backdrop for that
+loses more; 2.4% of sky is worth 11 dB. A sky that is worth less than this stays black in hosts."""
 
 Precision = Literal["float32", "bfloat16", "float16"]
 

@@ -119,9 +119,9 @@ def with_sampler_swapped(
     pipeline: Any = copy.deepcopy(config.pipeline)
     host = getattr(pipeline, "model", None)
     if isinstance(host, GuidedModelConfig):
+        option = "learns one first" if file is None else f"--pipeline.model.occupancy.path {file}"
         raise InputError(
-            f"{config.method_name} is guided already: ns-train {config.method_name} "
-            f"--pipeline.model.occupancy.path {file or 'FILE'} guides it by this occupancy"
+            f"{config.method_name} is guided already: ns-train {config.method_name} {option}"
         )
     if isinstance(host, LecoModelConfig):
         raise InputError(

@@ -70,7 +70,7 @@ class ChartFolder:
         """
         with alone_in(self.path, "chart"):
             shutil.rmtree(self.path / UNFINISHED, ignore_errors=True)  # of one that was killed
-            (self.path / UNFINISHED).mkdir()
+            (self.path / UNFINISHED).mkdir(exist_ok=True)
             yield
 
     def stored(self) -> dict[str, dict[str, Any]]:

@@ -161,7 +161,7 @@ def _name_ends(axes: Any, lines: Sequence[Line], theme: Theme) -> None:
     ends = []
     for line in lines:
         times, mean, _, _ = line.curve()
-        ends.append((float(times[-1]), float(mean[-1]), f"{line.name}  {mean[-1]:.1f}"))
+        ends.append((float(times[-1]), float(mean[-1]), f"{line.name}  {line.psnr:.1f}"))
     low, high = axes.get_ylim()
     wanted = [(value - low) / (high - low) for _, value, _ in ends]
     for i, place in enumerate(spread(wanted, CLOSE)):

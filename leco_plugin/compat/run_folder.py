@@ -71,8 +71,8 @@ def alone_in(folder: Path, work: str) -> Iterator[None]:
     held = lock(folder)
     if held is None:
         raise InputError(
-            f"another process makes the {work} in {folder}, with all cores; wait for it, or name "
-            "another folder with --out"
+            f"another process makes the {work} in {folder}; wait for it, or name another folder "
+            "with --out"
         )
     try:
         yield

@@ -167,7 +167,8 @@ class Guide(nn.Module):
         try:
             return build(self.sampler, **{**given, **self.options})
         except ValueError as error:
-            raise InputError(f"{error} (occupancy.options {self.options})") from error
+            options = f" (its options: {self.options})" if self.options else ""
+            raise InputError(f"{error}{options}") from error
 
     def proposal(self, **options: Any) -> Sampler:
         """What goes where a proposal host has its sampler; options as for the registry.

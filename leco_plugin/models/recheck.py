@@ -92,7 +92,8 @@ def steps_until_next(config: CalibrationConfig, seconds: float, a_step: float) -
 
 def bounds_of(model: LecoModel) -> CalibrationConfig:
     """What skipping may cost the field as it is: of one that was begun anew, any of its surfaces,
-    which it has put before the haze of its first weights."""
+    which it has put before the haze of its first weights. That haze also makes any skipping look
+    good, so that such a field is in effect not watched."""
     config = model.config.calibration
     return replace(config, lost_surface_mass=1.0) if model.config.schedule.restart else config
 

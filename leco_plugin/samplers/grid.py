@@ -82,10 +82,12 @@ class OccupancyGridEstimator(Estimator):
     ) -> None:
         super().__init__()
         along_axes = [resolution] * 3 if isinstance(resolution, int | float) else resolution
-        sizes = [int(n) for n in along_axes]
+        sizes = [int(n) if n == int(n) else 0 for n in along_axes]
         box = torch.as_tensor(roi_aabb).detach().float().cpu().reshape(-1)
         if len(sizes) != 3 or min(sizes) < 1 or levels < 1:
-            raise ValueError(f"a grid needs positive sizes, got {sizes} and {levels} levels")
+            raise ValueError(
+                f"a grid needs whole positive sizes, got {resolution}, {levels} levels"
+            )
         if box.shape != (6,) or not bool((box[:3] < box[3:]).all()) or not box.isfinite().all():
             raise ValueError(f"roi_aabb must be a finite box (min, max), got {box.tolist()}")
         boxes = nested_boxes(box, levels)

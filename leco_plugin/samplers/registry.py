@@ -136,8 +136,9 @@ def _build(name: str, kind: str, options: dict[str, Any]) -> nn.Module:
         check_gate(name, getattr(getattr(options["occupancy"], "gate", None), "config", None))
     try:
         estimator: nn.Module = _loaded(builder)(**options)
-    except (ValueError, TypeError) as error:
-        raise ValueError(f"the sampler {name!r} cannot be built: {error}") from error
+    except (ValueError, TypeError, OverflowError, RuntimeError) as error:
+        first = str(error).splitlines()[0] if str(error) else type(error).__name__
+        raise ValueError(f"the sampler {name!r} cannot be built: {first}") from error
     return estimator
 
 

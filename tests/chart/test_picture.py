@@ -13,7 +13,7 @@ from matplotlib.figure import Figure
 from PIL import Image
 
 from leco_plugin.chart.panels import NAME_WIDTH, name_points
-from leco_plugin.chart.picture import CLOSE, balanced, best_so_far, draw, spread
+from leco_plugin.chart.picture import CLOSE, _name_ends, balanced, best_so_far, draw, spread
 from leco_plugin.chart.summary import lines_of
 from leco_plugin.chart.theme import DARK, LIGHT, Theme
 from leco_plugin.evaluation.charts import SOURCE, fingerprint
@@ -61,6 +61,17 @@ def test_names_at_the_ends_of_curves_keep_apart_and_in_order() -> None:
     assert sorted(range(5), key=lambda i: places[i]) == [0, 1, 2, 4, 3]
     assert np.diff(sorted(places)).min() >= 0.06 - 1e-9
     assert max(places) <= 1.0
+
+
+def test_names_at_the_ends_of_curves_give_the_mean_of_the_last_psnr_as_the_title_does() -> None:
+    seeds = [run("A", seed, 20.0 + seed) for seed in (0, 1)]
+    for point in seeds[1]["curve"]:
+        point[0] *= 2.0  # as many steps, twice the time: curves have a mean as far as the shorter
+    (line,) = lines_of(results(*seeds))
+    axes = Figure().add_subplot()
+    _name_ends(axes, [line], LIGHT)
+    assert [text.get_text() for text in axes.texts] == [f"A  {line.psnr:.1f}"] == ["A  20.5"]
+    assert line.curve()[1][-1] < 20.0
 
 
 @given(st.lists(st.floats(0.0, 1.0), min_size=1, max_size=12))

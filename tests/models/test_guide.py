@@ -96,8 +96,8 @@ def test_options_that_a_host_of_its_kind_cannot_use_are_named():
 @pytest.mark.parametrize(
     ("sampler", "kind", "options", "said"),
     [
-        ("occupancy-grid", "estimator", {"resolution": 0}, "a grid needs positive sizes"),
-        ("occupancy-grid", "estimator", {"resolution": 0.5}, "a grid needs positive sizes"),
+        ("occupancy-grid", "estimator", {"resolution": 0}, "a grid needs whole positive sizes"),
+        ("occupancy-grid", "estimator", {"resolution": 0.5}, "a grid needs whole positive sizes"),
         ("dense-proposal", "proposal", {"samples": 0}, "samples"),
     ],
 )

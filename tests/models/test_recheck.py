@@ -11,7 +11,7 @@ import pytest
 import torch
 
 from leco_plugin.models import freezing, guided_watch, recheck
-from leco_plugin.models.calibration import CalibrationConfig, Measured, Reference
+from leco_plugin.models.calibration import CalibrationConfig, Measured, RayPrices, Reference
 from leco_plugin.models.failures import GateCollapsed
 from leco_plugin.models.freezing import DenseRendering
 from leco_plugin.models.guided_watch import GuidedWatch
@@ -20,6 +20,7 @@ from leco_plugin.models.recheck import (
     SHARE_OF_TIME,
     Evidence,
     beyond_bounds,
+    measure_again,
     skip_less,
     steps_until_next,
 )
@@ -109,6 +110,24 @@ class Model(SimpleNamespace):
 
     def train(self, mode: bool) -> None:
         self.training = mode
+
+
+@pytest.mark.parametrize("anew", [False, True])
+def test_lost_surfaces_are_evidence_unless_the_field_has_never_learned_what_is_skipped(
+    anew: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    half, same = torch.full((64,), 0.5), torch.ones(64)
+    prices = RayPrices(same, half, half, same, same, same, 32, 64)
+    monkeypatch.setattr(recheck, "calibration_rays", lambda *_: (None, None))
+    monkeypatch.setattr(recheck, "dense_rendering", lambda *_: ())
+    monkeypatch.setattr(recheck, "ray_prices", lambda *_, missed_only: prices)
+    monkeypatch.setattr(recheck, "rays_to_check_with", lambda *_: math.inf)
+    model = Model()
+    model.config.schedule.restart = anew
+    measure_again(model, None)  # type: ignore[arg-type]
+    assert model.progress.rechecks == 1
+    found = beyond_bounds(model.progress)
+    assert found is None if anew else found == "lost surface mass"
 
 
 @pytest.mark.parametrize("anew", [False, True])
