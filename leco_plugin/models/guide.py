@@ -26,7 +26,7 @@ from leco_plugin.samplers.registry import (
     refuse_unknown_options,
     sampler_spec,
 )
-from leco_plugin.scenes.input_error import InputError
+from leco_plugin.scenes.input_error import InputError, one_line
 from leco_plugin.space import Space
 
 
@@ -166,9 +166,12 @@ class Guide(nn.Module):
         build = {"estimator": build_estimator, "proposal": build_proposal}[kind]
         try:
             return build(self.sampler, **{**given, **self.options})
-        except ValueError as error:
+        except (ValueError, TypeError, OverflowError, RuntimeError) as error:
             options = f" (its options: {self.options})" if self.options else ""
-            raise InputError(f"{error}{options}") from error
+            why = one_line(error) or type(error).__name__
+            raise InputError(
+                f"the sampler {self.sampler!r} cannot be built: {why}{options}"
+            ) from error
 
     def proposal(self, **options: Any) -> Sampler:
         """What goes where a proposal host has its sampler; options as for the registry.

@@ -97,8 +97,7 @@ def build_estimator(name: str, **options: Any) -> nn.Module:
 
     Raises:
         ValueError: there is no such sampler, it does not serve packed hosts, or it needs an
-            occupancy and none is given, or one whose gate is on other features, or an option is
-            wrong.
+            occupancy and none is given, or one whose gate is on other features.
     """
     return _build(name, "estimator", options)
 
@@ -134,11 +133,7 @@ def _build(name: str, kind: str, options: dict[str, Any]) -> nn.Module:
         raise ValueError(f"sampler {name!r} needs an occupancy")
     if spec.needs_occupancy:
         check_gate(name, getattr(getattr(options["occupancy"], "gate", None), "config", None))
-    try:
-        estimator: nn.Module = _loaded(builder)(**options)
-    except (ValueError, TypeError, OverflowError, RuntimeError) as error:
-        first = str(error).splitlines()[0] if str(error) else type(error).__name__
-        raise ValueError(f"the sampler {name!r} cannot be built: {first}") from error
+    estimator: nn.Module = _loaded(builder)(**options)
     return estimator
 
 
