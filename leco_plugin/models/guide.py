@@ -7,7 +7,7 @@ its own.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import torch
@@ -22,7 +22,6 @@ from leco_plugin.samplers.base import DensityFn, Estimator
 from leco_plugin.samplers.registry import (
     SamplerSpec,
     build_estimator,
-    build_proposal,
     refuse_unknown_options,
     sampler_spec,
 )
@@ -149,21 +148,20 @@ class Guide(nn.Module):
         """
         if self._spec("estimator").needs_occupancy:
             return GuidedEstimator(self, aabb, outermost, density_fn)
-        estimator = self.built("estimator", aabb=aabb, occupancy=None)
+        estimator = self.built(build_estimator, aabb=aabb, occupancy=None)
         if self.front_to_back and isinstance(estimator, Estimator):
             estimator.density_fn = density_fn
         return estimator
 
-    def built(self, kind: str, **given: Any) -> nn.Module:
+    def built(self, build: Callable[..., nn.Module], **given: Any) -> nn.Module:
         """The sampler that this host calls, with its options.
 
         Args:
-            kind: `estimator` or `proposal`.
+            build: the registry's `build_estimator` or `build_proposal`.
             given: what a host gives a builder.
         Raises:
             InputError: it cannot be built so.
         """
-        build = {"estimator": build_estimator, "proposal": build_proposal}[kind]
         try:
             return build(self.sampler, **{**given, **self.options})
         except (ValueError, TypeError, OverflowError, RuntimeError) as error:

@@ -18,7 +18,7 @@ from leco_plugin.models.rendering import Intervals, Rays, with_backdrop
 from leco_plugin.samplers.base import DensityFn, Estimator
 from leco_plugin.samplers.estimator import cell_centers
 from leco_plugin.samplers.rays import intersect_box, usable_rays
-from leco_plugin.samplers.registry import build_estimator
+from leco_plugin.samplers.registry import build_estimator, build_proposal
 from leco_plugin.scenes.frames import box_around, inverse, moved, turned
 
 if TYPE_CHECKING:
@@ -111,7 +111,7 @@ class GuidedEstimator(_StandIn):
         aabb = self._aabb
         if aabb is not None and not guide.same_frame():
             aabb = box_around(aabb, guide.frame.cpu())
-        estimator = guide.built("estimator", aabb=aabb, occupancy=guide.the_occupancy())
+        estimator = guide.built(build_estimator, aabb=aabb, occupancy=guide.the_occupancy())
         if guide.front_to_back and isinstance(estimator, Estimator):
             estimator.density_fn = self._density_of(guide)
         return estimator
@@ -221,7 +221,7 @@ class GuidedProposal(_StandIn, Sampler):
             options["occupancy"] = guide.the_occupancy()
             if not guide.same_frame():
                 options["frame"] = guide.frame
-        return guide.built("proposal", **options)
+        return guide.built(build_proposal, **options)
 
     def forward(self, *args: Any, **kwargs: Any) -> Any:
         return self.sampler(*args, **kwargs)

@@ -46,6 +46,12 @@ def started(monkeypatch: pytest.MonkeyPatch) -> Started:
     return runs
 
 
+@pytest.fixture
+def not_drawn(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Results are written, and no pictures of them."""
+    monkeypatch.setattr(Chart, "draw", Chart.write)
+
+
 def run(*arguments: object) -> int:
     return cli.main(["chart", *(str(argument) for argument in arguments)])
 
@@ -67,14 +73,13 @@ def test_a_crash_half_way_is_a_row_the_others_finish_and_the_status_is_one(
     assert run(*arguments) == 1 and len(started) == 6  # only what crashed is made again
 
 
+@pytest.mark.usefixtures("not_drawn")
 def test_how_long_it_takes_is_said_before_it_is_started(
     started: Started,
     tiny_scene: Path,
     tmp_path: Path,
     capsys: pytest.CaptureFixture[str],
-    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr(Chart, "draw", Chart.write)
     out = ["--data", tiny_scene, "--out", tmp_path / "chart", "--methods", "leco-occupancy"]
     assert run(*out, "--seconds", 75, "--seeds", 0, 1) == 0
     assert "2 runs of 75 s, about 4 minutes on two CPU cores" in capsys.readouterr().out
@@ -89,14 +94,13 @@ def test_how_long_it_takes_is_said_before_it_is_started(
     assert "3 runs of 75 s, 2 at a time, about 3 minutes on" in capsys.readouterr().out
 
 
+@pytest.mark.usefixtures("not_drawn")
 def test_while_a_chart_is_made_a_second_process_in_its_folder_is_refused_in_one_line(
     started: Started,
     tiny_scene: Path,
     tmp_path: Path,
     capsys: pytest.CaptureFixture[str],
-    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr(Chart, "draw", Chart.write)
     out = tmp_path / "out"
     arguments = ["--data", tiny_scene, "--out", out, "--methods", "leco-occupancy", *TIME]
     assert run(*arguments, "--seeds", 0) == 0
@@ -111,10 +115,10 @@ def test_while_a_chart_is_made_a_second_process_in_its_folder_is_refused_in_one_
     assert run(*arguments, "--seeds", 0, 1) == 0 and len(started) == 2
 
 
+@pytest.mark.usefixtures("not_drawn")
 def test_several_suites_have_a_folder_each_and_none_makes_what_another_has_made(
-    started: Started, tiny_scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    started: Started, tiny_scene: Path, tmp_path: Path
 ) -> None:
-    monkeypatch.setattr(Chart, "draw", Chart.write)
     out = tmp_path / "charts"
     arguments = ["--data", tiny_scene, "--out", out, "--seeds", 0]
     names = ["losses", "empty-expert", "representations"]
@@ -133,10 +137,8 @@ def test_several_suites_have_a_folder_each_and_none_makes_what_another_has_made(
     assert len(started) == len(keys)
 
 
-def test_all_suites_are_every_suite(
-    started: Started, tiny_scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(Chart, "draw", Chart.write)
+@pytest.mark.usefixtures("not_drawn")
+def test_all_suites_are_every_suite(started: Started, tiny_scene: Path, tmp_path: Path) -> None:
     out = tmp_path / "charts"
     assert run("--data", tiny_scene, "--out", out, "--suite", "all", "--seeds", 0) == 1
     assert {path.name for path in out.iterdir()} == set(SUITES)

@@ -192,7 +192,7 @@ def test_a_sampler_with_a_box_gets_the_hosts_in_the_coordinates_that_it_is_asked
         seen.update(options)
         return torch.nn.Identity()
 
-    monkeypatch.setattr("leco_plugin.models.guide.build_estimator", build)
+    monkeypatch.setattr("leco_plugin.models.stand_ins.build_estimator", build)
     guide = started(lopsided(readers["as it is"]), readers["turned by pca"])
     box = torch.tensor([-1.0, -1.0, -1.0, 1.0, 1.0, 1.0])
     _ = guide.estimator(box).sampler
