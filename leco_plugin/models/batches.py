@@ -6,7 +6,9 @@ from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
 from leco_plugin.models.ranks import mean
+from leco_plugin.scenes.held_out_pixels import held_out_sampler
 from leco_plugin.scenes.known_distances import KnownDistancePixelSampler, sampler_here
+from leco_plugin.scenes.lattice import Lattice
 from leco_plugin.scenes.sparse_pixels import SparsePixels, sparse_pixels
 from leco_plugin.scenes.survey import sparse_points
 
@@ -63,4 +65,8 @@ class Batches:
         """Where sparse points are seen; projected only once learning asks for it."""
         dataset: Any = self.data_manager.train_dataset
         points = sparse_points(dataset)
-        return sparse_pixels(dataset.cameras, points) if points is not None else None
+        if points is None:
+            return None
+        sampler = held_out_sampler(self.data_manager)
+        lattice = Lattice() if sampler is None else sampler.lattice
+        return sparse_pixels(dataset.cameras, points, lattice)

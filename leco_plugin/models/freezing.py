@@ -23,7 +23,8 @@ from leco_plugin.models.ranks import from_first, say
 from leco_plugin.models.rendering import Intervals, Rays
 from leco_plugin.occupancy import BACKDROP_PRICE, Occupancy
 from leco_plugin.scenes.frames import frame_of
-from leco_plugin.scenes.held_out_pixels import HeldOutPixelSampler, Share, some_images
+from leco_plugin.scenes.held_out_pixels import held_out_sampler, some_images
+from leco_plugin.scenes.lattice import Share
 from leco_plugin.scenes.survey import Survey
 
 if TYPE_CHECKING:
@@ -133,12 +134,6 @@ def leave_file(occupancy: Occupancy, folder: Path) -> None:
         say(f"{folder / FILE_NAME} could not be written ({error}); a resumed run writes it anew")
         return
     say(f"wrote {folder / FILE_NAME}")
-
-
-def held_out_sampler(datamanager: Any) -> HeldOutPixelSampler | None:
-    """The data manager's pixel sampler, if it keeps pixels back for calibration."""
-    sampler = getattr(datamanager, "train_pixel_sampler", None)
-    return sampler if isinstance(sampler, HeldOutPixelSampler) else None
 
 
 def held_out_bundle(

@@ -98,7 +98,8 @@ class GuidedWatch:
         if progress.recoveries == MOST_RECOVERIES:
             raise GateCollapsed(f"step {step}: {cause}, after {MOST_RECOVERIES} recoveries.")
         shares = torch.zeros(model.gate.head.out_features)
-        done = heal(model.gate.head, progress, Collapse(cause), shares, step)
+        losses = model.config.gate_loss
+        done = heal(model.gate.head, progress, Collapse(cause), shares, step, losses)
         share(model.gate.head.parameters())
         model.reopen()
         say(

@@ -4,13 +4,15 @@ A gate that is found collapsed at every look for `SUSPECTED_STEPS` steps, or at 
 the first phase, is healed, `MOST_RECOVERIES` times at most. Its last layer starts anew; learning
 goes on for half as long again: first on dense samples, while what teaches the gate comes in again
 from nothing and the field finds its surfaces without it; then as before, with the force that led to
-the collapse `EASED` times weaker. Where one scene expert took all points, they are shared out anew,
-and their balance counts `EASED` times as much.
+the collapse `EASED` times weaker. The last time a gate that is taught in the paper's form is taught
+in logit form, which has no empty ratio and no weights that could be wrong. Where one scene expert
+took all points, they are shared out anew, and their balance counts `EASED` times as much.
 """
 
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Literal
 
 import torch
 from torch import Tensor, nn
@@ -57,11 +59,19 @@ def is_collapsed(
     return collapse if lasted or last else None
 
 
-def heal(head: nn.Linear, progress: Progress, collapse: Collapse, shares: Tensor, step: int) -> str:
+def heal(
+    head: nn.Linear,
+    progress: Progress,
+    collapse: Collapse,
+    shares: Tensor,
+    step: int,
+    config: GateLossConfig,
+) -> str:
     """Heals the gate whose last layer this is; returns what was done, in words.
 
     Args:
         shares: [1 + n] share of points at each expert.
+        config: what the gate is taught by.
     """
     progress.recoveries += 1
     progress.suspected_since = -1
@@ -77,10 +87,16 @@ def heal(head: nn.Linear, progress: Progress, collapse: Collapse, shares: Tensor
     progress.dense_until = step + 1 + phase // 4
     progress.learn_steps = step + 1 + phase // 2
     progress.decisions = torch.zeros(0, dtype=torch.bool)
+    progress.paper_given_up = config.form == "paper" and progress.recoveries == MOST_RECOVERIES
+    then = "in logit form" if progress.paper_given_up else f"with {EASED:.0f} times less pressure"
     return (
-        f"its last layer starts anew, on dense samples to step {progress.dense_until}, then with "
-        f"{EASED:.0f} times less pressure"
+        f"its last layer starts anew, on dense samples to step {progress.dense_until}, then {then}"
     )
+
+
+def form_of(config: GateLossConfig, progress: Progress) -> Literal["logit", "paper"]:
+    """What the gate is taught in, after the recoveries so far."""
+    return "logit" if progress.paper_given_up else config.form
 
 
 def is_dense(progress: Progress, step: int) -> bool:
@@ -94,15 +110,16 @@ def annealed(config: GateLossConfig, progress: Progress, step: int) -> GateLossC
     While samples are dense all of it comes in again from nothing. The pull towards empty space is
     lambda_g in the paper's form, and 1 / k in logit form.
     """
-    weight = 1.0
+    weight, pull = 1.0, 1.0 if progress.paper_given_up else progress.pull
     if is_dense(progress, step):
         weight = (step - progress.healed_at) / (progress.dense_until - progress.healed_at)
     return replace(
         config,
+        form=form_of(config, progress),
         contribution=config.contribution * weight,
         agreement=config.agreement * weight,
-        imbalance=config.imbalance * weight * progress.pull,
+        imbalance=config.imbalance * weight * pull,
         density=config.density * weight,
-        emphasis=config.emphasis / progress.pull,
+        emphasis=config.emphasis / pull,
         balance=config.balance * progress.balance,
     )

@@ -18,7 +18,7 @@ from leco_plugin.models.failures import require_finite
 from leco_plugin.models.field import HMoEField
 from leco_plugin.models.front_to_back import is_no_slower, shade_front_to_back
 from leco_plugin.models.gate import Gate
-from leco_plugin.models.healing import annealed, is_dense
+from leco_plugin.models.healing import annealed, form_of, is_dense
 from leco_plugin.models.image_figures import image_figures
 from leco_plugin.models.leco_config import LecoModelConfig
 from leco_plugin.models.objective import field_losses, gate_losses
@@ -81,7 +81,6 @@ class LecoModel(Model):
         self.renderer_rgb = RGBRenderer(background_color="random")
         self.ramped = 0.0
         self.step = 0
-        self.routing = self._routing()
         # held in a tuple: the estimator shares the gate, which must not be registered twice
         self._estimator: tuple[LearnedOccupancyEstimator, ...] = ()
         self.report: dict[str, Any] = {}
@@ -94,11 +93,12 @@ class LecoModel(Model):
         self.gate = Gate(sizes.gate)
         self.field = HMoEField(sizes.field, self.num_train_data)
 
-    def _routing(self) -> Routing:
+    @property
+    def routing(self) -> Routing:
+        """Which expert each point is sent to."""
         losses = self.config.gate_loss
-        return Routing(
-            losses.empty_below if losses.form == "logit" else None, self.config.homogeneous
-        )
+        logit = form_of(losses, self.progress) == "logit"
+        return Routing(losses.empty_below if logit else None, self.config.homogeneous)
 
     def get_param_groups(self) -> dict[str, list[nn.Parameter]]:
         """`encoding` (tables of both, if any), and what else there is in `field` and `gate`."""

@@ -302,7 +302,8 @@ class Lifecycle:
                 "scene's bounds in the log above, and the weights under gate-loss; leco-occupancy "
                 "trains without skipping with --pipeline.model.schedule.freeze False."
             )
-        done = heal(model.gate.head, progress, collapse, shares, step)
+        losses = model.config.gate_loss
+        done = heal(model.gate.head, progress, collapse, shares, step, losses)
         share(model.gate.head.parameters())  # the remedy is drawn at random
         say(
             f"step {step}: {collapse.cause}; {done} "

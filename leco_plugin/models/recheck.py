@@ -22,11 +22,11 @@ from leco_plugin.models.freezing import (
     calibration_rays,
     dense_rendering,
     evaluating,
-    held_out_sampler,
     images_of,
 )
 from leco_plugin.models.progress import NO_EVIDENCE, Progress
 from leco_plugin.models.ranks import from_first, say
+from leco_plugin.scenes.held_out_pixels import held_out_sampler
 
 if TYPE_CHECKING:
     from leco_plugin.models.leco import LecoModel

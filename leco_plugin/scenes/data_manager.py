@@ -26,8 +26,9 @@ from leco_plugin.scenes.dataset_units import UP_IS_KNOWN
 from leco_plugin.scenes.detail import CAMERAS
 from leco_plugin.scenes.held_out_pixels import HeldOutPixelSampler
 from leco_plugin.scenes.input_error import InputError, one_line
+from leco_plugin.scenes.lattice import lattice_for
 from leco_plugin.scenes.photograph_files import names_what_it_cannot_read
-from leco_plugin.scenes.stored_pictures import store_pictures
+from leco_plugin.scenes.stored_pictures import picture_sizes, store_pictures
 from leco_plugin.scenes.survey import points_in
 from leco_plugin.scenes.upright import turn_to_upright, turned
 
@@ -82,6 +83,13 @@ class LecoDataManager(VanillaDataManager):  # type: ignore[type-arg]
     def create_eval_dataset(self) -> Any:
         """The test photographs."""
         return names_what_it_cannot_read(super().create_eval_dataset())
+
+    def _get_pixel_sampler(self, dataset: Any, num_rays_per_batch: int) -> Any:
+        """nerfstudio's choice; of small scenes more pixels are held out."""
+        sampler = super()._get_pixel_sampler(dataset, num_rays_per_batch)
+        if isinstance(sampler, HeldOutPixelSampler):
+            sampler.lattice = lattice_for(picture_sizes(dataset))
+        return sampler
 
     def on_disk(self) -> bool:
         """Whether pixels are read from files.
@@ -197,9 +205,7 @@ def _turn_of(outputs: DataparserOutputs) -> Tensor | None:
 
 def decoded_bytes(dataset: Any) -> int:
     """What all photographs of a dataset take in memory as nerfstudio decodes them, float32."""
-    cameras = dataset.cameras
-    pixels = int((cameras.height.long() * cameras.width.long()).sum())
-    return 12 * pixels
+    return 12 * int(picture_sizes(dataset).prod(dim=-1).sum())
 
 
 def free_memory(

@@ -1,7 +1,6 @@
 """Training pixels that are never trained on: what the threshold of the gate is calibrated with.
 
-A thin lattice of pixels of the training images is left out of every batch. It needs no memory, and
-is the same on every process and after every resume.
+A thin lattice of pixels of the training images is left out of every batch.
 """
 
 from __future__ import annotations
@@ -9,38 +8,20 @@ from __future__ import annotations
 import functools
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import Any, Literal
+from typing import Any
 
 import torch
 from nerfstudio.data.pixel_samplers import PixelSampler, PixelSamplerConfig
 from torch import Tensor
 
 from leco_plugin.scenes.input_error import InputError
+from leco_plugin.scenes.lattice import Lattice, Share
 from leco_plugin.scenes.stored_pictures import StoredPictures
 
-PERIOD = 11
-"""Of 121 pixels one is held out."""
-_OFFSET = 5
-Share = Literal["calibration", "recheck", "all"]
-"""Which held-out pixels: those that the threshold is calibrated with, those that it is checked with
-later, a quarter of all, or either."""
 DRAWN = 8
 """Times as many pixels as are wanted are drawn, before some are left out."""
 TRIES = 100
 """Draws of a pixel that no mask hides: one in three fails where 1% of the pixels are seen."""
-
-
-def is_held_out(indices: Tensor) -> Tensor:
-    """Whether pixels (image, row, column) [N, 3] are held out: bool [N]."""
-    return ((indices[:, 1] % PERIOD == _OFFSET) & (indices[:, 2] % PERIOD == _OFFSET)).bool()
-
-
-def is_of(indices: Tensor, share: Share) -> Tensor:
-    """Whether held-out pixels (image, row, column) [N, 3] belong to a share of them: bool [N]."""
-    if share == "all":
-        return torch.ones(len(indices), dtype=torch.bool)
-    checks = (indices[:, 1] // PERIOD + indices[:, 2] // PERIOD) % 4 == 3
-    return checks if share == "recheck" else ~checks
 
 
 def look_up(source: Any, which: Tensor, places: Tensor) -> Tensor:
@@ -58,15 +39,6 @@ def look_up(source: Any, which: Tensor, places: Tensor) -> Tensor:
         return source[which.to(source.device), rows.to(source.device), columns.to(source.device)]
     values = [source[i][r, c] for i, r, c in zip(which, rows, columns)]
     return torch.stack(values) if values else source[0].new_zeros(0, *source[0].shape[2:])
-
-
-def _aside(pictures: StoredPictures, count: int) -> Tensor:
-    """Pixels [count, 3] of stored pictures; held-out ones give way to their neighbours."""
-    indices = pictures.draw(count)
-    columns, widths = indices[:, 2], pictures.sizes[indices[:, 0], 1]
-    aside = torch.where(columns + 1 < widths, columns + 1, columns - 1)
-    indices[:, 2] = torch.where(is_held_out(indices), aside, columns)
-    return indices
 
 
 def some_images(dataset: Any, most: int = 16) -> dict[str, Any]:
@@ -111,6 +83,9 @@ class HeldOutPixelSamplerConfig(PixelSamplerConfig):
 class HeldOutPixelSampler(PixelSampler):
     """nerfstudio's sampler with a lattice of pixels left out of training."""
 
+    lattice = Lattice()
+    """The held-out pixels; whoever knows all pictures chooses it by them."""
+
     sample_method = _stepping_aside(PixelSampler.sample_method)
     sample_method_equirectangular = _stepping_aside(PixelSampler.sample_method_equirectangular)
     sample_method_fisheye = _stepping_aside(PixelSampler.sample_method_fisheye)
@@ -153,21 +128,30 @@ class HeldOutPixelSampler(PixelSampler):
         self, pictures: StoredPictures, masks: StoredPictures | None
     ) -> dict[str, Any]:
         """A batch of pixels that are neither held out nor, as far as there are others, masked."""
-        indices = _aside(pictures, self.num_rays_per_batch)
+        indices = self._drawn_aside(pictures, self.num_rays_per_batch)
         for _ in range(TRIES if masks is not None and not self.config.ignore_mask else 0):
             assert masks is not None
             seen = masks.read(indices[:, 0], indices[:, 1:])[:, 0] > 0
             if bool(seen.all()):
                 break
-            fresh = _aside(pictures, int((~seen).sum()))
-            indices[~seen] = fresh
+            indices[~seen] = self._drawn_aside(pictures, int((~seen).sum()))
         return {"image": pictures.read(indices[:, 0], indices[:, 1:]), "indices": indices}
+
+    def _drawn_aside(self, pictures: StoredPictures, count: int) -> Tensor:
+        """Pixels [count, 3] of stored pictures, none of them held out."""
+        indices = pictures.draw(count)
+        return self._aside(indices, pictures.sizes[indices[:, 0], 1])
+
+    def _aside(self, indices: Tensor, widths: Tensor | int) -> Tensor:
+        """Pixels [N, 3] of pictures so wide; held-out ones give way to their neighbours."""
+        columns = indices[:, 2]
+        aside = torch.where(columns + 1 < widths, columns + 1, columns - 1)
+        indices[:, 2] = torch.where(self.lattice.holds_out(indices), aside, columns)
+        return indices
 
     def _step_aside(self, indices: Tensor, image_width: int, mask: Tensor | None) -> Tensor:
         """Moves held-out pixels [N, 3] to their neighbours, or to others where those are masked."""
-        held_out, columns = is_held_out(indices), indices[:, 2]
-        aside = torch.where(columns + 1 < image_width, columns + 1, columns - 1)
-        indices[:, 2] = torch.where(held_out, aside, columns)
+        indices = self._aside(indices, image_width)
         if isinstance(mask, Tensor) and not self.config.ignore_mask:
             image, row, column = indices.to(mask.device).unbind(dim=-1)
             seen = mask[image, row, column].bool().flatten().to(indices.device)
@@ -208,32 +192,20 @@ class HeldOutPixelSampler(PixelSampler):
     ) -> tuple[Tensor, Tensor]:
         """Pictures [N] and places in them [N, 2]; arguments as of `sample_held_out`."""
         pictures = images["image"]
-        places = _drawn(pictures, DRAWN * count, torch.Generator().manual_seed(seed))
+        if isinstance(pictures, StoredPictures):
+            sizes = pictures.sizes
+        else:
+            sizes = torch.tensor([picture.shape[:2] for picture in pictures])
+        places = self.lattice.draw(sizes, DRAWN * count, torch.Generator().manual_seed(seed))
         if "mask" in images:
             seen = look_up(images["mask"], places[:, 0], places[:, 1:]).flatten(1).all(dim=1)
             places = places[seen.cpu()]
-        of_share = is_of(places, share)
+        of_share = self.lattice.is_of(places, share)
         places = places[of_share] if bool(of_share.any()) else places
         return places[:count, 0], places[:count, 1:]
 
 
-def _drawn(pictures: Any, count: int, generator: torch.Generator) -> Tensor:
-    """Held-out pixels [N, 3] int64 (picture, row, column) in random order, each once: up to so many
-    of some pictures."""
-    if isinstance(pictures, StoredPictures):
-        sizes = pictures.sizes
-    else:
-        sizes = torch.tensor([picture.shape[:2] for picture in pictures])
-    cells = ((sizes - _OFFSET - 1) // PERIOD + 1).clamp(min=1)
-    ends = cells.prod(dim=-1).cumsum(dim=0)
-    total = int(ends[-1])
-    if total <= count:
-        numbers = torch.randperm(total, generator=generator)
-    else:
-        numbers = torch.randint(total, (count,), generator=generator).unique()
-        numbers = numbers[torch.randperm(len(numbers), generator=generator)]
-    which = torch.searchsorted(ends, numbers, right=True)
-    numbers = numbers - (ends - cells.prod(dim=-1))[which]
-    columns = cells[which, 1]
-    places = torch.stack([numbers // columns, numbers % columns], dim=-1) * PERIOD + _OFFSET
-    return torch.cat([which[:, None], torch.minimum(places, sizes[which] - 1)], dim=-1)
+def held_out_sampler(datamanager: Any) -> HeldOutPixelSampler | None:
+    """The data manager's pixel sampler, if it keeps pixels back for calibration."""
+    sampler = getattr(datamanager, "train_pixel_sampler", None)
+    return sampler if isinstance(sampler, HeldOutPixelSampler) else None

@@ -14,7 +14,7 @@ import torch
 from nerfstudio.cameras.cameras import Cameras, CameraType
 from torch import Tensor
 
-from leco_plugin.scenes.held_out_pixels import is_held_out
+from leco_plugin.scenes.lattice import Lattice
 
 NEARER = 0.9
 """A point hides its neighbours in the image that are farther than it by more than this factor."""
@@ -36,12 +36,13 @@ class SparsePixels(NamedTuple):
     """[K] float32 along the unit ray, scene units."""
 
 
-def sparse_pixels(cameras: Cameras, points: Tensor) -> SparsePixels:
+def sparse_pixels(cameras: Cameras, points: Tensor, lattice: Lattice) -> SparsePixels:
     """Projects sparse points into the cameras and keeps what is seen; held-out pixels are left out.
 
     Args:
         cameras: of the training images, poses in scene units. Only perspective cameras are used.
         points: [P, 3] in the same coordinates.
+        lattice: of the held-out pixels.
     """
     cameras = cameras.to("cpu")
     points = _at_most(MOST_POINTS, points.detach().float().cpu())
@@ -57,7 +58,7 @@ def sparse_pixels(cameras: Cameras, points: Tensor) -> SparsePixels:
         pixels, lengths = pixels[inside].long(), lengths[inside]
         seen = ~hidden(pixels, lengths, height, width)
         found = torch.cat([torch.full((len(pixels), 1), number), pixels], dim=-1)
-        seen &= ~is_held_out(found)
+        seen &= ~lattice.holds_out(found)
         chosen = _at_most(for_each_image, seen.nonzero()[:, 0])
         indices.append(found[chosen])
         distances.append(lengths[chosen])

@@ -82,9 +82,7 @@ def store_pictures(dataset: Any, folder: Path, what: str = "photographs") -> dic
     Raises:
         InputError: nothing can be written there, or the pictures have no common form.
     """
-    sizes = torch.stack(
-        [dataset.cameras.height.flatten(), dataset.cameras.width.flatten()], dim=-1
-    ).long()
+    sizes = picture_sizes(dataset)
     masked = dataset._dataparser_outputs.mask_filenames is not None
     names = [_name(dataset, number) for number in range(len(dataset))]
     files = {"image": [folder / f"{name}.pixels" for name in names]}
@@ -100,6 +98,12 @@ def store_pictures(dataset: Any, folder: Path, what: str = "photographs") -> dic
         kind: StoredPictures(made, sizes, _channels(made, pixels)) for kind, made in files.items()
     }
     return stored | {"image_idx": torch.arange(len(dataset))}
+
+
+def picture_sizes(dataset: Any) -> Tensor:
+    """Height and width of all photographs of a dataset: [P, 2] int64."""
+    cameras = dataset.cameras
+    return torch.stack([cameras.height.flatten(), cameras.width.flatten()], dim=-1).long()
 
 
 def _name(dataset: Any, number: int) -> str:

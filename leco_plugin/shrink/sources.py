@@ -18,13 +18,12 @@ from leco_plugin.compat.evaluated_runs import whole_of
 from leco_plugin.compat.whole_checkpoints import step_of
 from leco_plugin.evaluation.inspection import cameras_of
 from leco_plugin.models.field_at_freezing import field_at_freezing
-from leco_plugin.models.freezing import held_out_sampler
 from leco_plugin.models.leco import LecoModel
 from leco_plugin.models.rendering import Rays
 from leco_plugin.models.scene_rays import cut_to_bounds
 from leco_plugin.occupancy import Occupancy
 from leco_plugin.scenes.frames import between, frame_of, moved, turned
-from leco_plugin.scenes.held_out_pixels import some_images
+from leco_plugin.scenes.held_out_pixels import held_out_sampler, some_images
 from leco_plugin.scenes.input_error import InputError, one_line
 
 CONFIG, CHECKPOINTS = "config.yml", "nerfstudio_models"

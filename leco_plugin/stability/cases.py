@@ -76,7 +76,6 @@ CASES = {
             "yard",
             "a yard",
             "nothing is difficult: who fails here fails everywhere",
-            fine_grid=True,
         ),
         Case(
             "poles-and-wires",

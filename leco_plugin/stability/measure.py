@@ -50,7 +50,7 @@ class Measured:
 
 @torch.no_grad()
 def measure(trainer: Trainer, data: Path, dense_samples: int) -> tuple[Measured, NDArray[np.uint8]]:
-    """Renders the held-out pictures of a case's scene.
+    """Looks at the held-out pictures of a case's scene, and renders what of them it needs.
 
     Args:
         trainer: with a trained host.
@@ -65,7 +65,6 @@ def measure(trainer: Trainer, data: Path, dense_samples: int) -> tuple[Measured,
     scale = float(pipeline.datamanager.train_dataparser_outputs.dataparser_scale)
     lost = met = samples = candidates = rays = without = 0
     errors: list[Tensor] = []
-    details: list[Tensor] = []
     colours: list[Tensor] = []
     shown = None
     for number, file in enumerate(dataset.image_filenames):
@@ -89,22 +88,23 @@ def measure(trainer: Trainer, data: Path, dense_samples: int) -> tuple[Measured,
         count = torch.cat(counts)
         samples, candidates = samples + int(count.sum()), candidates + most
         rays, without = rays + len(count), without + int((count == 0).sum())
-        rgb = render(pipeline.model, flat)
-        image = dataset.get_data(number)["image"].reshape(len(flat), -1)
-        wanted = true_image(pipeline.model, image, rgb).float().cpu()
-        errors.append((rgb.cpu() - wanted).square())
+        detail = torch.from_numpy(truth["detail"]).flatten()
+        asked = torch.ones_like(detail) if shown is None else detail
+        rgb = render(pipeline.model, flat[asked.to(pipeline.device)]).cpu()
+        image = dataset.get_data(number)["image"].reshape(len(flat), -1).to(pipeline.device)
+        wanted = true_image(pipeline.model, image, image).float().cpu()
         colours.append(wanted)
-        details.append(torch.from_numpy(truth["detail"]).flatten())
+        errors.append((rgb[detail[asked]] - wanted[detail]).square())
         if shown is None:
-            shown = (255 * rgb.cpu().view(height, width, 3)).round().byte().numpy()
+            shown = (255 * rgb.view(height, width, 3)).round().byte().numpy()
     pipeline.train()
-    error, colour, detail = torch.cat(errors), torch.cat(colours), torch.cat(details)
+    error, colour = torch.cat(errors), torch.cat(colours)
     assert shown is not None
     return (
         Measured(
             lost / met if met else None,
             samples / max(candidates, 1),
-            psnr(error[detail]) if bool(detail.any()) else None,
+            psnr(error) if len(error) else None,
             psnr((colour - colour.mean(dim=0)).square()),
             without / max(rays, 1),
         ),
@@ -133,8 +133,9 @@ def psnr(squared_errors: Tensor) -> float:
 def render(model: Any, bundle: RayBundle) -> Tensor:
     """Colours [N, 3] of rays, in [0, 1]."""
     parts = [bundle[i : i + RAYS_AT_ONCE] for i in range(0, len(bundle), RAYS_AT_ONCE)]
-    rendered: Tensor = torch.cat([model(part)["rgb"] for part in parts])
-    return rendered.clamp(0.0, 1.0)
+    if not parts:
+        return torch.zeros(0, 3, device=bundle.origins.device)
+    return torch.cat([model(part)["rgb"] for part in parts]).clamp(0.0, 1.0)
 
 
 def sampled(

@@ -61,7 +61,7 @@ class Sizes:
         }
 
 
-FULL = Sizes(steps=360, rays=192, learn_rays=384, learn_steps=200)
+FULL = Sizes(steps=720, rays=96, learn_rays=384, learn_steps=200)
 QUICK = Sizes(
     steps=40, rays=64, learn_rays=64, learn_steps=20, picture=0.5, views=0.4, dense_samples=48
 )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from types import SimpleNamespace
 
 import pytest
@@ -11,7 +12,15 @@ from leco_plugin.models import lifecycle
 from leco_plugin.models.encodings import EncodingConfig
 from leco_plugin.models.failures import GateCollapsed
 from leco_plugin.models.gate import Gate, GateConfig
-from leco_plugin.models.healing import EASED, annealed, heal, is_collapsed, is_dense
+from leco_plugin.models.healing import (
+    EASED,
+    MOST_RECOVERIES,
+    annealed,
+    form_of,
+    heal,
+    is_collapsed,
+    is_dense,
+)
 from leco_plugin.models.lifecycle import Lifecycle
 from leco_plugin.models.objective import GateLossConfig
 from leco_plugin.models.phases import Collapse, ScheduleConfig
@@ -98,6 +107,7 @@ def healthy_run(monkeypatch: pytest.MonkeyPatch):
             config=SimpleNamespace(
                 schedule=schedule,
                 homogeneous=False,
+                gate_loss=GateLossConfig(),
                 termination=0.0,
                 sizes=SimpleNamespace(guided_batch=1.0),
             ),
@@ -145,7 +155,7 @@ def test_a_collapse_must_last_unless_the_first_phase_is_over() -> None:
 def test_a_healed_gate_learns_on_dense_samples_first_and_under_less_pressure(kind, pull) -> None:
     progress = Progress(learn_steps=200, configured=200, suspected_since=90)
     head, losses = head_of([30.0, 0.0, 0.0]), GateLossConfig()
-    said = heal(head, progress, Collapse("a cause", kind), SPREAD, step=199)
+    said = heal(head, progress, Collapse("a cause", kind), SPREAD, 199, losses)
     assert not bool(head.bias.any()) and "dense samples to step 250" in said
     assert (progress.recoveries, progress.suspected_since) == (1, -1)
     assert (progress.learn_steps, progress.dense_until) == (300, 250)
@@ -162,10 +172,26 @@ def test_a_healed_gate_learns_on_dense_samples_first_and_under_less_pressure(kin
 
 def test_points_of_one_expert_are_shared_out_and_the_balance_counts_more() -> None:
     progress, head = Progress(learn_steps=200), head_of([0.0, 30.0, 0.0])
-    heal(head, progress, Collapse("a cause", "one expert"), ONE, step=150)
+    heal(head, progress, Collapse("a cause", "one expert"), ONE, 150, GateLossConfig())
     assert (head.bias[1] - head.bias[2]).abs() < 1e-6
     assert progress.learn_steps == 200 and not is_dense(progress, 151)
     assert annealed(GateLossConfig(), progress, 151).balance == EASED * GateLossConfig().balance
+
+
+def test_a_gate_in_the_papers_form_is_healed_the_last_time_in_logit_form() -> None:
+    paper, progress, head = (
+        GateLossConfig(form="paper"),
+        Progress(learn_steps=200),
+        head_of([0] * 3),
+    )
+    for number in range(MOST_RECOVERIES):
+        assert form_of(paper, progress) == "paper"
+        said = heal(head, progress, Collapse("a cause", "occupied"), SPREAD, 199 + number, paper)
+        assert ("logit form" in said) == (number == MOST_RECOVERIES - 1)
+    taught = annealed(paper, progress, 10_000)
+    assert taught == replace(paper, form="logit")  # nothing of what was wrong is eased or pressed
+    again = Progress.from_dict(progress.to_dict())
+    assert form_of(paper, again) == "logit" and form_of(GateLossConfig(), Progress()) == "logit"
 
 
 def test_a_run_that_was_never_healed_is_taught_as_configured() -> None:
@@ -174,5 +200,12 @@ def test_a_run_that_was_never_healed_is_taught_as_configured() -> None:
 
 def test_a_gate_that_was_opened_again_late_is_healed_as_quickly_as_an_early_one() -> None:
     progress, head = Progress(learn_steps=20_000, configured=200), head_of([0.0, 0.0, 0.0])
-    heal(head, progress, Collapse("the gate calls all space empty"), torch.ones(3) / 3, 19_000)
+    heal(
+        head,
+        progress,
+        Collapse("the gate calls all space empty"),
+        torch.ones(3) / 3,
+        19_000,
+        GateLossConfig(),
+    )
     assert (progress.learn_steps, progress.dense_until) == (19_101, 19_051)

@@ -28,6 +28,7 @@ from leco_plugin.models.prior import (
     warm_start,
 )
 from leco_plugin.models.sizes import Sizes
+from leco_plugin.scenes.lattice import Lattice
 from leco_plugin.scenes.sparse_pixels import sparse_pixels
 from leco_plugin.scenes.survey import survey
 
@@ -95,7 +96,9 @@ def test_free_positions_lie_between_a_camera_and_what_it_sees() -> None:
 
 def test_lines_of_sight_lead_to_the_points() -> None:
     points = hills()
-    origins, directions, distances = lines_of_sight(drone(), sparse_pixels(drone(), points))
+    origins, directions, distances = lines_of_sight(
+        drone(), sparse_pixels(drone(), points, Lattice())
+    )
     ends = origins + directions * distances[:, None]
     nearest = torch.cdist(ends, points).amin(dim=-1)
     assert len(ends) > 500
@@ -106,7 +109,7 @@ def test_a_gate_that_was_shown_points_keeps_them_and_skips_the_air_before_them()
     points = hills()
     air = points + torch.tensor([0.0, 0.0, 0.8])
     model, new = made(steps=80), made(steps=0)
-    loss = warm_start(model, drone(), points, sparse_pixels(drone(), points))
+    loss = warm_start(model, drone(), points, sparse_pixels(drone(), points, Lattice()))
     assert loss > 0.0
 
     def kept(of: LecoModel, places: torch.Tensor) -> float:

@@ -15,6 +15,7 @@ from leco_plugin.models.calibration import CalibrationConfig, Measured, RayPrice
 from leco_plugin.models.failures import GateCollapsed
 from leco_plugin.models.freezing import DenseRendering
 from leco_plugin.models.guided_watch import GuidedWatch
+from leco_plugin.models.objective import GateLossConfig
 from leco_plugin.models.progress import NO_EVIDENCE, Progress
 from leco_plugin.models.recheck import (
     SHARE_OF_TIME,
@@ -86,6 +87,7 @@ class Model(SimpleNamespace):
                 calibration=CONFIG,
                 schedule=SimpleNamespace(restart=False),
                 sizes=SimpleNamespace(candidates=64),
+                gate_loss=GateLossConfig(),
             ),
             threshold=torch.tensor(threshold),
             device=torch.device("cpu"),

@@ -6,15 +6,14 @@ import pytest
 import torch
 
 from leco_plugin.scenes.held_out_pixels import (
-    PERIOD,
     HeldOutPixelSampler,
     HeldOutPixelSamplerConfig,
-    Share,
-    is_held_out,
-    is_of,
     look_up,
 )
 from leco_plugin.scenes.input_error import InputError
+from leco_plugin.scenes.lattice import PERIODS, Lattice, Share
+
+THIN = Lattice()
 
 
 def images(masked: bool = False) -> dict[str, torch.Tensor]:
@@ -33,16 +32,18 @@ def sampler(**options) -> HeldOutPixelSampler:
     return made
 
 
+@pytest.mark.parametrize("lattice", [Lattice(period) for period in (*PERIODS, 2)])
 @pytest.mark.parametrize("masked", [False, True])
 @pytest.mark.parametrize("options", [{}, {"is_equirectangular": True}, {"fisheye_crop_radius": 15}])
-def test_training_never_samples_a_held_out_pixel(masked: bool, options) -> None:
+def test_training_never_samples_a_held_out_pixel(masked: bool, options, lattice: Lattice) -> None:
     made, batch = sampler(**options), images(masked)
+    made.lattice = lattice
     for seed in range(5):
         torch.manual_seed(seed)
         samples = made.sample(dict(batch))
         places = samples["image"].long()
         assert len(places) == 5000
-        assert not bool(is_held_out(places).any())
+        assert not bool(lattice.holds_out(places).any())
         assert torch.equal(samples["indices"][:, 0], batch["image_idx"][places[:, 0]])
         if masked:
             assert bool(batch["mask"][tuple(places.unbind(dim=-1))].all())
@@ -53,7 +54,7 @@ def test_training_reaches_every_other_pixel() -> None:
     places = torch.cat([sampler().sample(images())["image"].long() for _ in range(20)]).unique(
         dim=0
     )
-    assert len(places) == 3 * 40 * 39 - int(is_held_out(images()["image"].view(-1, 3)).sum())
+    assert len(places) == 3 * 40 * 39 - int(THIN.holds_out(images()["image"].view(-1, 3)).sum())
 
 
 @pytest.mark.parametrize("masked", [False, True])
@@ -61,14 +62,14 @@ def test_held_out_sampling_only_gives_held_out_pixels(masked: bool) -> None:
     batch = images(masked)
     samples = sampler().sample_held_out(batch, 1000, seed=0)
     places, indices = samples["image"].long(), samples["indices"]
-    assert bool(is_held_out(places).all()) and bool(is_held_out(indices).all())
+    assert bool(THIN.holds_out(places).all()) and bool(THIN.holds_out(indices).all())
     assert torch.equal(indices[:, 1:], places[:, 1:])
     assert torch.equal(indices[:, 0], batch["image_idx"][places[:, 0]])
     if masked:
         assert 0 < len(places) < 1000
         assert bool(batch["mask"][tuple(places.unbind(dim=-1))].all())
     else:
-        all_held_out = batch["image"].view(-1, 3)[is_held_out(batch["image"].view(-1, 3))]
+        all_held_out = batch["image"].view(-1, 3)[THIN.holds_out(batch["image"].view(-1, 3))]
         assert torch.equal(places.unique(dim=0), all_held_out.long().unique(dim=0))
 
 
@@ -104,7 +105,7 @@ def test_of_tiny_images_every_share_is_all(share: Share) -> None:
 def test_where_masks_leave_nothing_of_a_share_it_is_all_that_they_leave(hidden: Share) -> None:
     batch = images()
     places = batch["image"].long()
-    mask = ~is_of(places.view(-1, 3), hidden).view(*places.shape[:-1], 1)
+    mask = ~THIN.is_of(places.view(-1, 3), hidden).view(*places.shape[:-1], 1)
     shares: list[Share] = ["all", "calibration", "recheck"]
     all_of_them, *found = (pixels_of(batch | {"mask": mask}, 1000, 0, share) for share in shares)
     assert found == [all_of_them, all_of_them] and all_of_them
@@ -128,7 +129,7 @@ def test_images_of_many_sizes_are_sampled_as_a_list() -> None:
     pictures = [torch.rand(20, 30, 3), torch.rand(50, 12, 3)]
     batch = {"image": pictures, "image_idx": torch.tensor([0, 1])}
     samples = sampler().sample_held_out(batch, 50, seed=0)
-    assert bool(is_held_out(samples["indices"]).all())
+    assert bool(THIN.holds_out(samples["indices"]).all())
     for color, (image, row, column) in zip(samples["image"], samples["indices"].tolist()):
         assert torch.equal(color, pictures[image][row, column])
 
@@ -150,11 +151,6 @@ def test_images_of_many_sizes_that_are_masked_throughout_hold_no_held_out_pixel(
     assert samples["image"].shape == (0, 3) and samples["indices"].shape == (0, 3)
 
 
-def test_one_pixel_in_a_period_squared_is_held_out() -> None:
-    places = torch.cartesian_prod(torch.zeros(1).long(), *[torch.arange(5 * PERIOD)] * 2)
-    assert int(is_held_out(places).sum()) == 25
-
-
 def test_masked_images_of_many_sizes_are_sampled_where_they_are_seen() -> None:
     pictures = [torch.rand(20, 30, 3), torch.rand(50, 12, 3)]
     masks = [torch.zeros(*picture.shape[:2], 1, dtype=torch.bool) for picture in pictures]
@@ -162,7 +158,7 @@ def test_masked_images_of_many_sizes_are_sampled_where_they_are_seen() -> None:
     batch = {"image": pictures, "mask": masks, "image_idx": torch.tensor([0, 1])}
     samples = sampler().sample(batch)
     assert len(samples["indices"]) == 5000
-    assert not bool(is_held_out(samples["indices"]).any())
+    assert not bool(THIN.holds_out(samples["indices"]).any())
     for image, row, column in samples["indices"].tolist():
         assert bool(masks[image][row, column])
 

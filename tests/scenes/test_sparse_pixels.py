@@ -6,7 +6,7 @@ import pytest
 import torch
 from nerfstudio.cameras.cameras import Cameras, CameraType
 
-from leco_plugin.scenes.held_out_pixels import is_held_out
+from leco_plugin.scenes.lattice import Lattice
 from leco_plugin.scenes.sparse_pixels import FEWEST_POINTS, hidden, sparse_pixels
 
 WIDTH, HEIGHT = 160, 120
@@ -34,7 +34,7 @@ def ground(count: int = 400) -> torch.Tensor:
 @pytest.mark.parametrize("distortion", [None, [0.05, -0.02, 0.0, 0.0, 0.003, -0.002]])
 def test_the_ray_of_a_pixel_leads_to_its_point(distortion: list[float] | None) -> None:
     made, points = cameras(distortion), ground()
-    found = sparse_pixels(made, points)
+    found = sparse_pixels(made, points, Lattice())
     assert len(found.distances) > 300 and set(found.indices[:, 0].tolist()) == {0, 1}
     for image in (0, 1):
         of_image = found.indices[:, 0] == image
@@ -46,14 +46,14 @@ def test_the_ray_of_a_pixel_leads_to_its_point(distortion: list[float] | None) -
 
 
 def test_held_out_pixels_have_no_distance() -> None:
-    found = sparse_pixels(cameras(), ground(20_000))
+    found = sparse_pixels(cameras(), ground(20_000), Lattice())
     assert len(found.distances) > 1000
-    assert not bool(is_held_out(found.indices).any())
+    assert not bool(Lattice().holds_out(found.indices).any())
 
 
 def test_a_point_behind_a_roof_is_not_seen() -> None:
     roof = ground(400) / 4 + torch.tensor([0.0, 0.0, 4.0])
-    found = sparse_pixels(cameras(), torch.cat([ground(), roof]))
+    found = sparse_pixels(cameras(), torch.cat([ground(), roof]), Lattice())
     middle = (found.indices[:, 0] == 0) & (
         (found.indices[:, 1:] - torch.tensor([61, 79])).abs().amax(dim=-1) < 15
     )
@@ -63,9 +63,9 @@ def test_a_point_behind_a_roof_is_not_seen() -> None:
 
 def test_points_behind_the_camera_other_lenses_and_few_points_give_nothing() -> None:
     behind = ground() + torch.tensor([0.0, 0.0, 20.0])
-    assert len(sparse_pixels(cameras(), behind).distances) == 0
-    assert len(sparse_pixels(cameras(kind=CameraType.FISHEYE), ground()).distances) == 0
-    assert len(sparse_pixels(cameras(), ground(FEWEST_POINTS - 1)).distances) == 0
+    assert len(sparse_pixels(cameras(), behind, Lattice()).distances) == 0
+    assert len(sparse_pixels(cameras(kind=CameraType.FISHEYE), ground(), Lattice()).distances) == 0
+    assert len(sparse_pixels(cameras(), ground(FEWEST_POINTS - 1), Lattice()).distances) == 0
 
 
 def test_only_plainly_nearer_neighbours_hide_a_point() -> None:
@@ -82,6 +82,9 @@ def test_large_clouds_are_thinned_the_same_way_each_time(monkeypatch) -> None:
 
     monkeypatch.setattr(module, "MOST_POINTS", 200)
     monkeypatch.setattr(module, "MOST_PIXELS", 60)
-    first, second = sparse_pixels(cameras(), ground()), sparse_pixels(cameras(), ground())
+    first, second = (
+        sparse_pixels(cameras(), ground(), Lattice()),
+        sparse_pixels(cameras(), ground(), Lattice()),
+    )
     assert len(first.distances) == 60
     assert torch.equal(first.indices, second.indices)

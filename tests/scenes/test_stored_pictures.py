@@ -16,10 +16,10 @@ from PIL import Image
 from leco_plugin.scenes.held_out_pixels import (
     HeldOutPixelSampler,
     HeldOutPixelSamplerConfig,
-    is_held_out,
     some_images,
 )
 from leco_plugin.scenes.input_error import InputError
+from leco_plugin.scenes.lattice import Lattice
 from leco_plugin.scenes.stored_pictures import store_pictures
 
 SIZES = [(30, 40), (24, 36), (50, 20)]
@@ -87,7 +87,7 @@ def test_a_batch_is_of_pixels_that_are_not_held_out_and_not_masked(tmp_path: Pat
     indices = batch["indices"]
     assert batch["image"].shape == (4000, 3)
     widths = torch.tensor(SIZES)[indices[:, 0], 1]
-    assert not bool(is_held_out(indices).any())
+    assert not bool(Lattice().holds_out(indices).any())
     assert bool((indices[:, 2] < widths // 2).all())
 
 
@@ -96,7 +96,7 @@ def test_held_out_pixels_are_found_in_files_and_in_images_read_for_it(tmp_path: 
     for images in (store_pictures(dataset, tmp_path / "pixels"), some_images(dataset)):
         batch = sampler().sample_held_out(images, 200, seed=0)
         indices = batch["indices"]
-        assert 10 < len(indices) <= 200 and bool(is_held_out(indices).all())
+        assert 10 < len(indices) <= 200 and bool(Lattice().holds_out(indices).all())
         pictures = [dataset.get_data(number)["image"] for number in range(3)]
         expected = torch.stack([pictures[i][r, c] for i, r, c in indices.tolist()])
         torch.testing.assert_close(batch["image"], expected, atol=1e-6, rtol=0)
