@@ -4,8 +4,8 @@ A gate that is found collapsed at every look for `SUSPECTED_STEPS` steps, or at 
 the first phase, is healed, `MOST_RECOVERIES` times at most. Its last layer starts anew; learning
 goes on for half as long again: first on dense samples, while what teaches the gate comes in again
 from nothing and the field finds its surfaces without it; then as before, with the force that led to
-the collapse `EASED` times weaker. The last time a gate that is taught in the paper's form is taught
-in logit form, which has no empty ratio and no weights that could be wrong. Where one scene expert
+the collapse `EASED` times weaker. The last time a gate that is taught in the paper's form, with
+an empty ratio, is taught in logit form, which has neither that nor weights that could be wrong. Where one scene expert
 took all points, they are shared out anew, and their balance counts `EASED` times as much.
 """
 
@@ -87,7 +87,9 @@ def heal(
     progress.dense_until = step + 1 + phase // 4
     progress.learn_steps = step + 1 + phase // 2
     progress.decisions = torch.zeros(0, dtype=torch.bool)
-    progress.paper_given_up = config.form == "paper" and progress.recoveries == MOST_RECOVERIES
+    # shares that are to be equal, as Switch-NeRF's, are a comparison, which nobody has to save
+    in_paper_form = config.form == "paper" and config.empty_ratio is not None
+    progress.paper_given_up = in_paper_form and progress.recoveries == MOST_RECOVERIES
     then = "in logit form" if progress.paper_given_up else f"with {EASED:.0f} times less pressure"
     return (
         f"its last layer starts anew, on dense samples to step {progress.dense_until}, then {then}"

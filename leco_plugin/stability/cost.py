@@ -21,14 +21,17 @@ from leco_plugin.stability.sizes import Sizes
 START_SECONDS = 7.0
 """For a process to start, to read the scene and to build the host."""
 RAY_SECONDS: Mapping[str, float] = {
-    LEARNED: 2.1e-4,
+    LEARNED: 1.0e-4,
     GRID: 2.7e-4,
     PROPOSALS: 4.1e-4,
     DENSE: 7.6e-4,
     DENSE_PROPOSAL: 7.6e-4,
 }
-"""Of training, a ray of a step."""
-RENDERED = 25_000
+"""Of training, a ray of a step, where steps have two hundred."""
+STEP_SECONDS = 0.025
+"""Of a step of a guided host, however few its rays are: of those that skip least it is lost in the
+above."""
+RENDERED = 16_000
 """Rays that are looked at when a run in full sizes has ended..."""
 RENDERING = 0.45
 """...each for this share of what it takes to train on it."""
@@ -38,10 +41,14 @@ FREEZE_SECONDS = 3.0
 """To calibrate a gate and to build its cell cache."""
 FIRST_CELL_SECONDS = 6e-6
 """To ask the field about a cell of an occupancy grid for the first time, with memory to fetch..."""
-CELL_SECONDS = 1.25e-6
+CELL_SECONDS = 1.63e-6
 """...and later."""
 STEPS_PER_UPDATE = 16
-"""Of an occupancy grid; until step 256 it asks about every cell."""
+"""Of an occupancy grid..."""
+FULL_UPDATES = 16
+"""...which asks about every cell so many times..."""
+LATER_SHARE = 0.3
+"""...and then about a quarter of them, and about those that are occupied."""
 
 
 def core_seconds(runs: Sequence[Run], stored: Sequence[Mapping[str, Any]], sizes: Sizes) -> float:
@@ -67,12 +74,14 @@ def expected_seconds(run: Run, sizes: Sizes) -> float:
     seconds = START_SECONDS + (sizes.steps * rays + rendered) * RAY_SECONDS[kind]
     if kind == LEARNED:
         learning = contender.changes["occupancy.rays"] * sizes.learn_steps
-        seconds += FREEZE_SECONDS + learning * LEARNED_RAY_SECONDS
+        seconds += FREEZE_SECONDS + learning * LEARNED_RAY_SECONDS + sizes.steps * STEP_SECONDS
     if kind == GRID:
         options = contender.changes["occupancy.options"]
         cells = options["levels"] * options["resolution"] ** 3
-        later = -(-sizes.steps // STEPS_PER_UPDATE) - 1
-        seconds += cells * (FIRST_CELL_SECONDS + later * CELL_SECONDS)
+        updates = -(-sizes.steps // STEPS_PER_UPDATE)
+        full = min(updates, FULL_UPDATES)
+        again = full - 1 + LATER_SHARE * (updates - full)
+        seconds += cells * (FIRST_CELL_SECONDS + again * CELL_SECONDS)
     return float(seconds)
 
 

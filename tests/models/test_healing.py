@@ -194,6 +194,13 @@ def test_a_gate_in_the_papers_form_is_healed_the_last_time_in_logit_form() -> No
     assert form_of(paper, again) == "logit" and form_of(GateLossConfig(), Progress()) == "logit"
 
 
+def test_equal_shares_are_a_comparison_and_stay_in_the_form_that_is_asked_for() -> None:
+    equal, progress = GateLossConfig(form="paper", empty_ratio=None), Progress(learn_steps=200)
+    for number in range(MOST_RECOVERIES):
+        heal(head_of([0] * 3), progress, Collapse("a cause", "occupied"), SPREAD, number, equal)
+    assert form_of(equal, progress) == "paper"
+
+
 def test_a_run_that_was_never_healed_is_taught_as_configured() -> None:
     assert annealed(GateLossConfig(), Progress(), 0) == GateLossConfig()
 
