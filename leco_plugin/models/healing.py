@@ -5,8 +5,9 @@ the first phase, is healed, `MOST_RECOVERIES` times at most. Its last layer star
 goes on for half as long again: first on dense samples, while what teaches the gate comes in again
 from nothing and the field finds its surfaces without it; then as before, with the force that led to
 the collapse `EASED` times weaker. The last time a gate that is taught in the paper's form, with
-an empty ratio, is taught in logit form, which has neither that nor weights that could be wrong. Where one scene expert
-took all points, they are shared out anew, and their balance counts `EASED` times as much.
+an empty ratio, is taught in logit form, which has neither that nor weights that could be wrong.
+Where one scene expert took all points, they are shared out anew, and their balance counts `EASED`
+times as much.
 """
 
 from __future__ import annotations
