@@ -36,7 +36,7 @@ from leco_plugin.scenes.input_error import InputError
 
 ROOT = Path(__file__).resolve().parents[1]
 STEPS, LEARN_STEPS = 60, 24
-UNDISTURBED = 4
+UNDISTURBED = 40
 """Runs with other seeds that nobody kills, which say how much the end of a run varies; one more for
 each later call says how long a run takes now."""
 POLL_SECONDS = 0.05

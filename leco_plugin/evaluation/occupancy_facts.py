@@ -47,5 +47,6 @@ def occupancy_facts(
         highest = float(manager.train_dataset.cameras.camera_to_worlds[:, 2, 3].max())
         box = torch.tensor(report["aabb"])
         measured = compare_with_truth(occupancy, truth, box, report["step_size"], highest)
-    facts = {"params": occupancy.num_params, "bytes": file.stat().st_size}
+    facts: dict[str, Any] = {"params": occupancy.num_params, "bytes": file.stat().st_size}
+    facts["recoveries"] = report.get("recoveries")  # files of an earlier release do not say
     return finite_or_null(facts | {name: report[name] for name in FROM_REPORT} | measured)

@@ -105,6 +105,7 @@ def _priced(
         "price_error_db": measured.price_error_db,
         BACKDROP_PRICE: round(of_backdrop, 4),
         "calibration_rays": len(truth),
+        "recoveries": model.progress.recoveries,
         "held_out": held_out_sampler(datamanager) is not None,
         "bounds": survey.bounds.reason,
         "near": float(model.march_range[0]),

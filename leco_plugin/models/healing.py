@@ -5,7 +5,7 @@ the first phase, is healed, `MOST_RECOVERIES` times at most. Its last layer star
 goes on for half as long again: first on dense samples, while what teaches the gate comes in again
 from nothing and the field finds its surfaces without it; then as before, with the force that led to
 the collapse `EASED` times weaker. The last time a gate that is taught in the paper's form, with
-an empty ratio, is taught in logit form, which has neither that nor weights that could be wrong.
+an empty ratio, is taught in the logit form that is the default, at its default weights.
 Where one scene expert took all points, they are shared out anew, and their balance counts `EASED`
 times as much.
 """
@@ -33,7 +33,11 @@ FEWEST_STEPS = 100
 SUSPECTED_STEPS = 100
 """Steps for which a gate looks collapsed before it is healed."""
 STEPS_PER_LOOK = 50
-"""Most steps between two looks: with the above, a collapse is found within 150 steps."""
+"""Most steps between two looks: with the above, a collapse is found within 150 steps. That a gate
+keeps everything is one only after it had called some of it empty, or at the end of the phase."""
+HAS_LEARNED = 0.9
+"""Share of the probe positions below which a gate has called some space empty."""
+IN_LOGIT_FORM = ", and the gate is taught in logit form from now on"
 EASED = 4.0
 """How much weaker the force towards a collapse is after it."""
 
@@ -48,9 +52,10 @@ def is_collapsed(
         shares: [1 + n] share of them at each expert.
         last: whether this look ends the first phase.
     """
+    progress.fewest_kept = min(progress.fewest_kept, kept)
     if step + 1 < FEWEST_STEPS:
         return None
-    collapse = find_collapse(kept, shares, last)
+    collapse = find_collapse(kept, shares, last or progress.fewest_kept < HAS_LEARNED)
     if collapse is None:
         progress.suspected_since = -1
         return None
@@ -76,10 +81,13 @@ def heal(
     """
     progress.recoveries += 1
     progress.suspected_since = -1
+    # shares that are to be equal, as Switch-NeRF's, are a comparison, which nobody has to save
+    in_paper_form = config.form == "paper" and config.empty_ratio is not None
+    progress.paper_given_up = in_paper_form and progress.recoveries == MOST_RECOVERIES
     if collapse.kind == "one expert":
         spread_scene_experts(head, int(shares[1:].argmax()) + 1)
         progress.balance *= EASED
-        return "its points are shared out anew"
+        return "its points are shared out anew" + (IN_LOGIT_FORM if progress.paper_given_up else "")
     reset_gate_head(head)
     progress.pull *= 1.0 / EASED if collapse.kind == "empty" else EASED
     progress.healed_at = step
@@ -88,12 +96,11 @@ def heal(
     progress.dense_until = step + 1 + phase // 4
     progress.learn_steps = step + 1 + phase // 2
     progress.decisions = torch.zeros(0, dtype=torch.bool)
-    # shares that are to be equal, as Switch-NeRF's, are a comparison, which nobody has to save
-    in_paper_form = config.form == "paper" and config.empty_ratio is not None
-    progress.paper_given_up = in_paper_form and progress.recoveries == MOST_RECOVERIES
-    then = "in logit form" if progress.paper_given_up else f"with {EASED:.0f} times less pressure"
+    progress.fewest_kept = 1.0
+    less = f", then with {EASED:.0f} times less pressure"
     return (
-        f"its last layer starts anew, on dense samples to step {progress.dense_until}, then {then}"
+        f"its last layer starts anew, on dense samples to step {progress.dense_until}"
+        f"{IN_LOGIT_FORM if progress.paper_given_up else less}"
     )
 
 

@@ -101,18 +101,18 @@ class Collapse:
     everything else to one expert."""
 
 
-def find_collapse(kept_fraction: float, shares: Tensor, at_the_end: bool) -> Collapse | None:
+def find_collapse(kept_fraction: float, shares: Tensor, has_learned: bool) -> Collapse | None:
     """Names the collapse of a gate, if it has collapsed.
 
     Args:
         kept_fraction: share of candidates whose o(x) is at least 0.1.
         shares: [1 + n] share of points at each expert.
-        at_the_end: whether the first phase is over. Before, a gate that keeps everything has only
-            not learned enough yet.
+        has_learned: whether the gate has called something empty before, or the first phase is
+            over. Until then one that keeps everything has only not learned enough yet.
     """
     if kept_fraction < 2e-4:
         return Collapse("the gate calls all space empty")
-    if kept_fraction > 0.9995 and at_the_end:
+    if kept_fraction > 0.9995 and has_learned:
         return Collapse("the gate calls all space occupied", "occupied")
     scene = shares[1:]
     if len(scene) > 1 and float(scene.sum()) > 0.01 and float(scene.max() / scene.sum()) > 0.999:

@@ -28,6 +28,8 @@ class Progress:
     """How often a collapsed gate has been healed."""
     suspected_since: int = -1
     """Step since which the gate looks collapsed; -1 where it does not."""
+    fewest_kept: float = 1.0
+    """Smallest share of the probe positions that the gate has kept at any look since it began."""
     healed_at: int = -1
     """Step of the last recovery that began on dense samples; -1 is none."""
     dense_until: int = 0

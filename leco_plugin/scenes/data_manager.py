@@ -26,7 +26,7 @@ from leco_plugin.scenes.dataset_units import UP_IS_KNOWN
 from leco_plugin.scenes.detail import CAMERAS
 from leco_plugin.scenes.held_out_pixels import HeldOutPixelSampler
 from leco_plugin.scenes.input_error import InputError, one_line
-from leco_plugin.scenes.lattice import lattice_for
+from leco_plugin.scenes.lattice import PERIODS, Lattice, lattice_for
 from leco_plugin.scenes.photograph_files import names_what_it_cannot_read
 from leco_plugin.scenes.stored_pictures import picture_sizes, store_pictures
 from leco_plugin.scenes.survey import points_in
@@ -51,9 +51,13 @@ class LecoDataManagerConfig(VanillaDataManagerConfig):
     upright: bool = True
     """Whether a survey from the air that its reader leaves on its side is set upright."""
 
+    held_out_period: int | None = None
+    """Of so many pixels in both directions one is never trained on, and calibrates the occupancy.
+    None is what gives as many of them as are wanted: 11, in small scenes down to 5."""
+
     def __setstate__(self, state: dict[str, Any]) -> None:
-        """Called by yaml: a run that was begun before there was a choice stays as it lies."""
-        self.__dict__.update({"upright": False} | state)
+        """Called by yaml: a run that was begun before there was a choice stays as it is."""
+        self.__dict__.update({"upright": False, "held_out_period": PERIODS[0]} | state)
 
 
 class LecoDataManager(VanillaDataManager):  # type: ignore[type-arg]
@@ -88,7 +92,10 @@ class LecoDataManager(VanillaDataManager):  # type: ignore[type-arg]
         """nerfstudio's choice; of small scenes more pixels are held out."""
         sampler = super()._get_pixel_sampler(dataset, num_rays_per_batch)
         if isinstance(sampler, HeldOutPixelSampler):
-            sampler.lattice = lattice_for(picture_sizes(dataset))
+            period = getattr(self.config, "held_out_period", None)
+            sampler.lattice = (
+                lattice_for(picture_sizes(dataset)) if period is None else Lattice(period)
+            )
         return sampler
 
     def on_disk(self) -> bool:

@@ -12,6 +12,8 @@ from typing import Literal
 import torch
 from torch import Tensor
 
+from leco_plugin.scenes.input_error import InputError
+
 PERIODS = (11, 9, 7, 5)
 """Pixels between two that are held out, in both directions: 1 in 121 where pictures have enough, 1
 in 25 at most."""
@@ -27,6 +29,13 @@ class Lattice:
     """One pixel of `period` x `period`."""
 
     period: int = PERIODS[0]
+
+    def __post_init__(self) -> None:
+        if self.period < 2:
+            raise InputError(
+                f"of {self.period} pixels in both directions none is left to train on; "
+                "held-out-period is 2 or more"
+            )
 
     @property
     def offset(self) -> int:

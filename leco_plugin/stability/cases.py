@@ -214,8 +214,24 @@ CASES = {
             changes={"occupancy.rays": 32},
             settings={"pipeline.datamanager.train_num_rays_per_batch": 32},
         ),
+        *(
+            _learning(
+                f"emphasis-{word}",
+                f"k {sign} 10",
+                f"a lost contribution is ten times too {price}, in the losses used by default",
+                gate_loss__emphasis=8.0 * times,
+            )
+            for word, sign, price, times in (
+                ("high", "x", "dear", 10.0),
+                ("low", "/", "cheap", 0.1),
+            )
+        ),
         _learning(
-            "bf16", "bfloat16", "eight bits of mantissa decide what is kept", precision="bfloat16"
+            "bf16",
+            "bfloat16",
+            "eight bits of mantissa decide what is kept; the default on a processor that multiplies "
+            "them",
+            precision="bfloat16",
         ),
         _learning(
             "fp16", "float16", "small gradients vanish, large ones overflow", precision="float16"

@@ -34,26 +34,26 @@ def draw_failures(suite: Suite, results: Mapping[str, Any]) -> list[Path]:
         reference = suite.view_of(suite.reference_of(entry), worst)
         if shown is not None:
             path = folder / f"{entry.case.name}--{entry.sampler.name}.png"
-            pictures = {"what is there": suite.true_view(entry.case), "dense": reference}
-            name = entry.sampler.title if worst is None else f"{entry.sampler.title}, seed {worst}"
-            pictures[name] = shown
+            pictures = {"what is there": suite.true_view(entry.case)}
+            for name, view in (("dense", reference), (entry.sampler.title, shown)):
+                if view is not None:
+                    pictures[f"{name}, seed {view[1]}"] = view[0]
             title = f"{entry.case.title}: {cell['reason']}"
             drawn.append(side_by_side(pictures, title, path))
     return drawn
 
 
-def side_by_side(pictures: Mapping[str, Path | None], title: str, path: Path) -> Path:
-    """Pictures under their names in a row; those that are None are left out."""
+def side_by_side(pictures: Mapping[str, Path], title: str, path: Path) -> Path:
+    """Pictures under their names in a row."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
-    there = {name: picture for name, picture in pictures.items() if picture is not None}
-    figure = Figure(figsize=(_WIDTH * len(there), 0.75 * _WIDTH + 0.75), facecolor="white")
+    figure = Figure(figsize=(_WIDTH * len(pictures), 0.75 * _WIDTH + 0.75), facecolor="white")
     FigureCanvasAgg(figure)
     figure.text(0.01, 0.985, title, va="top", fontsize=11, fontweight="bold")
-    for number, (name, picture) in enumerate(there.items()):
-        left = number / len(there)
-        axes = figure.add_axes((left + 0.008, 0.02, 1 / len(there) - 0.016, 0.78))
+    for number, (name, picture) in enumerate(pictures.items()):
+        left = number / len(pictures)
+        axes = figure.add_axes((left + 0.008, 0.02, 1 / len(pictures) - 0.016, 0.78))
         axes.imshow(on_white(picture), interpolation="nearest")
         axes.set_title(name, fontsize=10, loc="left", pad=4)
         axes.axis("off")

@@ -55,9 +55,10 @@ def entries_of(
 
     Args:
         beside: seeds of the samplers that learned occupancy is compared with, also where a case
-            is about seeds; none is as for learned occupancy.
+            is about seeds, of which only learned occupancy is run with more than were asked for;
+            none is as for learned occupancy.
     """
-    ours = (OURS, SAMPLERS[OURS].reference)
+    ours, asked = (OURS, SAMPLERS[OURS].reference), dict.fromkeys(seeds)
     entries = []
     for case in cases:
         wanted = {one.name for one in samplers if case.is_about(one.name)}
@@ -67,8 +68,9 @@ def entries_of(
                 contender = contender_of(
                     sampler, sizes, case.changes, case.settings, case.grid_levels
                 )
-                fewer = beside and sampler.name not in ours
-                chosen = tuple(dict.fromkeys(beside)) if fewer else seeds_of(case, seeds)
+                chosen = seeds_of(case, seeds) if sampler.name == OURS else tuple(asked)
+                if beside and sampler.name not in ours:
+                    chosen = tuple(dict.fromkeys(beside))
                 entries.append(Entry(case, sampler, contender, chosen))
     return entries
 

@@ -16,6 +16,9 @@ if TYPE_CHECKING:
 Runs = Mapping[tuple[str, str], dict[str, Any]]
 """Records of finished runs by scene and name."""
 
+OF_OCCUPANCY = ("threshold", "lost_surface_mass", "image_price_db", "empty_fraction", "recoveries")
+"""What is kept of a learned occupancy."""
+
 
 def results_of(suite: Suite) -> dict[str, Any]:
     """Every cell with its verdict, its figures, and those of each of its runs."""
@@ -66,8 +69,7 @@ def _figures(run: Mapping[str, Any], name: str) -> dict[str, Any]:
     kept = {key: run[key] for key in ("seed", "psnr", "processor_seconds", "measured", "made")}
     facts = run.get("occupancy")
     if facts:
-        calibration = ("threshold", "lost_surface_mass", "image_price_db", "empty_fraction")
-        kept["occupancy"] = {key: facts.get(key) for key in calibration}
+        kept["occupancy"] = {key: facts.get(key) for key in OF_OCCUPANCY}
     return {"name": name, "sampler": run["sampler"], **kept}
 
 

@@ -217,14 +217,16 @@ class Suite:
             if other.case is entry.case and other.sampler.name == entry.sampler.reference
         )
 
-    def view_of(self, entry: Entry, seed: int | None) -> Path | None:
-        """The held-out picture as a run of a cell renders it: of this seed, or of another."""
+    def view_of(self, entry: Entry, seed: int | None) -> tuple[Path, int] | None:
+        """The held-out picture as a run of a cell renders it, of this seed or of another, and which
+        it is."""
         places = {
             run.job.seed: self.folders[run.scene].path / RUNS / f"{run.job.name}.png"
             for run in entry.runs
         }
         there = {number: place for number, place in places.items() if place.exists()}
-        return there.get(-1 if seed is None else seed, next(iter(there.values()), None))
+        found = seed if seed in there else next(iter(there), None)
+        return None if found is None else (there[found], found)
 
     def true_view(self, case: Case) -> Path:
         """The same picture as it is."""

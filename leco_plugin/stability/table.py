@@ -111,6 +111,9 @@ def figures(cell: Mapping[str, Any]) -> tuple[str, str, str]:
     if cell["gap"] is not None and cell["lost_mass"] is not None:
         parts.append(f"lost {cell['lost_mass']:.1%}")
     seeds = [f"worst {cell['worst']:+.2f}"] if cell["seeds"] > 1 else []
+    occupancies = [run.get("occupancy") or {} for run in cell.get("runs", ())]
+    if healed := max((one.get("recoveries") or 0 for one in occupancies), default=0):
+        seeds.append(f"healed {healed} x")
     if cell["missing"]:
         seeds.append(f"{cell['seeds']} of {cell['seeds'] + cell['missing']} seeds")
     return first, ", ".join(parts), ", ".join(seeds)

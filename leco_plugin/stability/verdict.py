@@ -102,6 +102,11 @@ def judge(
         verdict: Verdict = "no reference"
         if reference is None:
             reason, verdict = "does not train", "fail"
+        elif cell.gap is not None and cell.gap < -DEGRADED.below_reference:
+            reason, verdict = (
+                f"{-cell.gap:.2f} dB below a dense run that does not train",
+                "degraded",
+            )
         return Cell(**{**asdict(cell), "verdict": verdict, "reason": reason})
     lost = None
     if reference is not None and cell.lost_mass is not None:

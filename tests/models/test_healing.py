@@ -33,16 +33,20 @@ ONE = torch.tensor([0.5, 0.5, 0.0])
 @pytest.mark.parametrize("per_check", [25, 500])
 @pytest.mark.parametrize("starts", [130, 149, 1000, 1399])
 @pytest.mark.parametrize(
-    ("logits", "cause"),
-    [([20.0, 0.0, 0.0], "calls all space empty"), ([0.0, 20.0, 0.0], "scene expert 1 takes all")],
+    ("looks", "cause"),
+    [
+        ([[20.0, 0.0, 0.0]], "calls all space empty"),
+        ([[20.0, 0.0, 0.0], [0.0, 20.0, 0.0]], "scene expert 1 takes all"),
+        ([[0.0, 20.0, 0.0], [0.0, 0.0, 20.0]], "calls all space occupied"),
+    ],
 )
 def test_a_collapse_is_found_within_200_steps_of_its_start(
-    logits: list[float], cause: str, starts: int, per_check: int, healthy_run, capsys
+    looks: list[list[float]], cause: str, starts: int, per_check: int, healthy_run, capsys
 ) -> None:
     run = healthy_run(ScheduleConfig(learn_steps=2000, steps_per_check=per_check))
     for step in range(2000):
         if step == starts:
-            run.looks = torch.tensor([logits]).expand(100, 3)
+            run.looks = torch.tensor(looks).repeat(50, 1)
         run.lifecycle.before_step(step)
         run.lifecycle.after_step(step)
         if run.lifecycle.progress.recoveries:
@@ -192,6 +196,20 @@ def test_a_gate_in_the_papers_form_is_healed_the_last_time_in_logit_form() -> No
     assert taught == replace(paper, form="logit")  # nothing of what was wrong is eased or pressed
     again = Progress.from_dict(progress.to_dict())
     assert form_of(paper, again) == "logit" and form_of(GateLossConfig(), Progress()) == "logit"
+
+
+def test_a_gate_that_has_called_nothing_empty_yet_has_until_the_end_to_learn_it() -> None:
+    progress = Progress()
+    for step in range(49, 999, 50):
+        assert is_collapsed(progress, step, 1.0, SPREAD, last=False) is None
+    assert is_collapsed(progress, 999, 1.0, SPREAD, last=True) is not None
+
+
+def test_the_last_recovery_counts_whatever_it_is_from() -> None:
+    paper, progress = GateLossConfig(form="paper"), Progress(learn_steps=200)
+    for kind in ("empty", "empty", "one expert"):
+        said = heal(head_of([0] * 3), progress, Collapse("a cause", kind), ONE, 199, paper)
+    assert form_of(paper, progress) == "logit" and "logit form" in said
 
 
 def test_equal_shares_are_a_comparison_and_stay_in_the_form_that_is_asked_for() -> None:

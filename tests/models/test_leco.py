@@ -16,6 +16,7 @@ from leco_plugin.models.field import FieldConfig
 from leco_plugin.models.gate import GateConfig
 from leco_plugin.models.leco import LecoModel
 from leco_plugin.models.leco_config import LecoModelConfig
+from leco_plugin.models.objective import GateLossConfig
 from leco_plugin.models.rendering import Intervals, Rays
 from leco_plugin.models.sizes import Sizes
 from leco_plugin.scenes.bounds import SceneBounds
@@ -189,6 +190,23 @@ def test_a_checkpoint_restores_report_and_progress(model: LecoModel) -> None:
     assert (progress.learn_steps, progress.configured) == (150, 200)
     assert (progress.recoveries, progress.learn_seconds) == (2, 3.5)
     assert progress.decisions.tolist() == [True, False, True]
+
+
+def test_a_gate_that_has_given_up_the_papers_form_routes_as_the_other_also_when_resumed() -> None:
+    config = LecoModelConfig(sizes=TINY, gate_loss=GateLossConfig(form="paper"))
+    models = []
+    for _ in range(2):
+        made = config.setup(scene_box=SceneBox(torch.ones(2, 3)), num_train_data=3)
+        assert isinstance(made, LecoModel)
+        models.append(made)
+    first, resumed = models
+    assert first.routing.empty_below is None
+    first.progress.paper_given_up = True
+    resumed.load_state_dict(first.state_dict())
+    for model in models:
+        assert model.routing.empty_below == config.gate_loss.empty_below
+        outputs, batch = step(model.train())
+        assert "contribution_loss" in model.get_loss_dict(outputs, batch)
 
 
 def test_a_checkpoint_from_before_there_was_progress_is_read(model: LecoModel) -> None:

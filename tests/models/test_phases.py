@@ -62,28 +62,28 @@ def test_agreement_is_the_share_of_equal_decisions() -> None:
 
 
 @pytest.mark.parametrize(
-    ("kept", "shares", "at_the_end", "cause"),
+    ("kept", "shares", "has_learned", "cause"),
     [
         (0.0, [1.0, 0.0, 0.0], False, "all space empty"),
         (1.0, [0.0, 0.5, 0.5], True, "all space occupied"),
         (0.3, [0.7, 0.0, 0.3], False, "scene expert 2 takes all points"),
     ],
 )
-def test_a_collapse_is_named(kept: float, shares: list[float], at_the_end: bool, cause) -> None:
-    collapse = find_collapse(kept, torch.tensor(shares), at_the_end)
+def test_a_collapse_is_named(kept: float, shares: list[float], has_learned: bool, cause) -> None:
+    collapse = find_collapse(kept, torch.tensor(shares), has_learned)
     assert collapse is not None and cause in collapse.cause and "\n" not in collapse.cause
 
 
 @pytest.mark.parametrize(
-    ("kept", "shares", "at_the_end"),
+    ("kept", "shares", "has_learned"),
     [
         (0.3, [0.7, 0.2, 0.1], True),
         (1.0, [0.0, 0.5, 0.5], False),  # it has not learned enough yet
         (0.3, [0.7, 0.3], True),  # there is only one scene expert
     ],
 )
-def test_a_gate_that_decides_has_not_collapsed(kept: float, shares, at_the_end: bool) -> None:
-    assert find_collapse(kept, torch.tensor(shares), at_the_end) is None
+def test_a_gate_that_decides_has_not_collapsed(kept: float, shares, has_learned: bool) -> None:
+    assert find_collapse(kept, torch.tensor(shares), has_learned) is None
 
 
 def test_a_reset_gate_is_undecided_again() -> None:

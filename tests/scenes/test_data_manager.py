@@ -18,6 +18,7 @@ from nerfstudio.data.pixel_samplers import PixelSamplerConfig
 from nerfstudio.pipelines.base_pipeline import VanillaPipelineConfig
 
 from leco_plugin.models.calibration import CalibrationConfig
+from leco_plugin.models.freezing import held_out_bundle
 from leco_plugin.models.learn_first import learn_occupancy
 from leco_plugin.models.leco_config import LecoModelConfig
 from leco_plugin.models.phases import ScheduleConfig
@@ -30,8 +31,9 @@ from leco_plugin.scenes.data_manager import (
 )
 from leco_plugin.scenes.input_error import InputError
 from leco_plugin.scenes.known_distances import KnownDistancePixelSamplerConfig, sampler_here
+from leco_plugin.scenes.lattice import Lattice, lattice_for
 from leco_plugin.scenes.photographs import LecoPhotographsDataParserConfig
-from leco_plugin.scenes.stored_pictures import StoredPictures
+from leco_plugin.scenes.stored_pictures import StoredPictures, picture_sizes
 from leco_plugin.scenes.survey import survey
 
 # nerfstudio leaves images open that it has read
@@ -83,6 +85,30 @@ def test_a_manager_on_disk_gives_rays_and_pixels_of_the_same_places(
         torch.testing.assert_close(batch["image"], colours, atol=1e-6, rtol=0)
     camera, picture = stored.next_eval_image(0)
     assert camera.shape == (1,) and picture["image"].shape == (32, 32, 3)
+
+
+@pytest.mark.parametrize("kept", [True, False])
+def test_what_is_held_out_is_neither_trained_on_nor_known_by_its_distance(
+    kept: bool, tiny_scene: Path, tmp_path: Path
+) -> None:
+    made = on_disk(tiny_scene, tmp_path) if kept else LecoDataManagerConfig(**options(tiny_scene))
+    manager: Any = made.setup(device="cpu")
+    lattice = manager.train_pixel_sampler.lattice
+    assert lattice == lattice_for(picture_sizes(manager.train_dataset)) and lattice != Lattice()
+    trained = torch.cat([manager.next_train(step)[1]["indices"] for step in range(200)])
+    assert len(trained.unique(dim=0)) > 1000 and not bool(lattice.holds_out(trained).any())
+    held_out = held_out_bundle(manager, 50)[0].camera_indices
+    assert 0 < len(held_out) <= 50
+
+
+def test_a_run_of_before_there_was_a_choice_keeps_what_it_held_out(tiny_scene: Path) -> None:
+    config = LecoDataManagerConfig(**options(tiny_scene))
+    state = {name: value for name, value in vars(config).items() if name != "held_out_period"}
+    older = LecoDataManagerConfig(**options(tiny_scene))
+    older.__setstate__(state)
+    assert older.setup(device="cpu").train_pixel_sampler.lattice == Lattice(11)
+    with pytest.raises(InputError, match="held-out-period is 2 or more"):
+        LecoDataManagerConfig(**options(tiny_scene), held_out_period=1).setup(device="cpu")
 
 
 def test_an_occupancy_is_learned_and_calibrated_from_files(

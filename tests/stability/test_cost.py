@@ -25,7 +25,7 @@ def test_the_stored_table_takes_two_cores_less_than_two_hours() -> None:
 
 def test_finer_cells_and_more_levels_take_longer() -> None:
     (coarse,), (fine,) = (
-        [run for run in runs(("yard",), (name,)) if run.job.contender.sampler == name]
+        [run for run in runs(("poles-and-wires",), (name,)) if run.job.contender.sampler == name]
         for name in ("grid-128", "grid-256")
     )
     (far,) = [

@@ -109,4 +109,9 @@ def test_a_cell_that_was_not_run_or_does_not_exist_is_shown_as_such() -> None:
 
 def test_several_seeds_show_their_worst() -> None:
     text = table(results(("yard", False, {"learned": cell("pass", seeds=3, worst=-0.4)})))
-    assert "worst -0.40" in text
+    assert "worst -0.40" in text and "healed" not in text
+
+
+def test_a_gate_that_had_to_be_healed_says_so() -> None:
+    healed = cell("pass", runs=[{"occupancy": {"recoveries": times}} for times in (None, 3, 1)])
+    assert "healed 3 x" in table(results(("yard", False, {"learned": healed})))

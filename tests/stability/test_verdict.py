@@ -62,7 +62,9 @@ def test_a_wire_that_disappears_is_a_failure_though_it_costs_no_psnr() -> None:
 
 def test_nobody_is_held_to_a_reference_that_does_not_train() -> None:
     black = runs(12.3, 12.2, 12.4)
-    assert judge(runs(5.0), black).verdict == "no reference"
+    assert judge(runs(11.5), black).verdict == "no reference"
+    worse = judge(runs(5.0), black)
+    assert worse.verdict == "degraded" and "below a dense run that does not train" in worse.reason
     assert judge(black, None).verdict == "fail"
     assert judge(runs(31.0, trivial_psnr=30.5), None).verdict == "pass"  # a sky is one colour
 
