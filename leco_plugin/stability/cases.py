@@ -229,8 +229,8 @@ CASES = {
         _learning(
             "bf16",
             "bfloat16",
-            "eight bits of mantissa decide what is kept; the default on a processor that multiplies "
-            "them",
+            "eight bits of mantissa decide what is kept; the default where a processor has such "
+            "products",
             precision="bfloat16",
         ),
         _learning(
