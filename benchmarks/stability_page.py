@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import math
+import statistics
 from pathlib import Path
 from typing import Any
 
@@ -73,11 +75,29 @@ def of_kills(results: dict[str, Any]) -> str:
         f"of them lost something that was saved, or left a damaged checkpoint. "
         f"{finished} of {len(ends)} runs that were killed went on to their last step with a frozen "
         f"gate and an occupancy that loads, at {spread(ends)} on test pixels; {len(whole)} runs "
-        f"that nobody killed end at {spread(whole)}. {results['machine']['cpu']}."
+        f"that nobody killed end at {spread(whole)}{difference(ends, whole)}. "
+        f"{results['machine']['cpu']}."
     )
 
 
+def psnrs(runs: list[dict[str, Any]]) -> list[float]:
+    """Of the runs that have one."""
+    return [run["psnr"] for run in runs if "psnr" in run]
+
+
 def spread(runs: list[dict[str, Any]]) -> str:
-    """From the least PSNR to the most."""
-    values = [run["psnr"] for run in runs if "psnr" in run]
-    return f"{min(values):.2f} to {max(values):.2f} dB" if values else "no PSNR yet"
+    """From the least PSNR to the most, and their mean."""
+    values = psnrs(runs)
+    if not values:
+        return "no PSNR yet"
+    return f"{min(values):.2f} to {max(values):.2f} dB (mean {statistics.fmean(values):.2f})"
+
+
+def difference(killed: list[dict[str, Any]], whole: list[dict[str, Any]]) -> str:
+    """Of the means, with its standard error; nothing where too few runs say so."""
+    groups = [psnrs(killed), psnrs(whole)]
+    if min(map(len, groups)) < 2:
+        return ""
+    apart = statistics.fmean(groups[0]) - statistics.fmean(groups[1])
+    error = math.sqrt(sum(statistics.variance(values) / len(values) for values in groups))
+    return f"; the means differ by {apart:+.2f} dB with a standard error of {error:.2f}"
