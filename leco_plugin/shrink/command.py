@@ -73,8 +73,8 @@ def shrink(file: Path, data: Path, out: Path, bounds: Bounds, seed: int = 0) -> 
         smaller = _rounded_as_it_is(original)
     else:
         checked = check(source, original, smaller)
-    held_out = held_out_sampler(source.manager) is not None
-    smaller.report = report_of(original, ground, found, held_out)
+    untrained = held_out_sampler(source.manager) is not None
+    smaller.report = report_of(original, ground, found, untrained)
     out.parent.mkdir(parents=True, exist_ok=True)
     smaller.save(out)
     speedup, times = compare_queries(original, smaller)
@@ -161,11 +161,11 @@ def _rounded_as_it_is(original: Occupancy) -> Occupancy:
     return original
 
 
-def report_of(original: Occupancy, ground: Ground, found: Found, held_out: bool) -> dict[str, Any]:
+def report_of(original: Occupancy, ground: Ground, found: Found, untrained: bool) -> dict[str, Any]:
     """What the smaller occupancy declares: the original's loss and, on top, its own.
 
     Args:
-        held_out: whether nothing was trained on the pixels of the ground's rays.
+        untrained: whether nothing was trained on the pixels of the ground's rays.
     """
     report = {name: original.report[name] for name in COPIED if name in original.report}
     if "cameras" in report:
@@ -183,7 +183,7 @@ def report_of(original: Occupancy, ground: Ground, found: Found, held_out: bool)
             "threshold": found.occupancy.threshold,
             "lost_surface_mass": measured["lost_surface_mass_bound"],
             "calibration_rays": ground.references[0].verify.evidence.rays,
-            "held_out": held_out and bool(original.report.get("held_out", False)),
+            "held_out": untrained and bool(original.report.get("held_out", False)),
             "shrunk_from_params": original.num_params,
             "loss_measured_against": names_of(ground.references),
             "kept_volume_of_the_original": rung.kept_volume,
