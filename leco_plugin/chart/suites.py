@@ -67,7 +67,7 @@ def _leco(name: str, **changes: object) -> Contender:
 
 
 def _paper(name: str, **changes: object) -> Contender:
-    return _leco(name, gate_loss__form="paper", **changes)
+    return _leco(name, gate_loss__form="paper", gate_loss__fall_back=False, **changes)
 
 
 def _empty_mlp(layers: int) -> dict[str, object]:

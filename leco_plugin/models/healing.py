@@ -4,8 +4,8 @@ A gate that is found collapsed at every look for `SUSPECTED_STEPS` steps, or at 
 the first phase, is healed, `MOST_RECOVERIES` times at most. Its last layer starts anew; learning
 goes on for half as long again: first on dense samples, while what teaches the gate comes in again
 from nothing and the field finds its surfaces without it; then as before, with the force that led to
-the collapse `EASED` times weaker. The last time a gate that is taught in the paper's form, with
-an empty ratio, is taught in the logit form that is the default, at its default weights.
+the collapse `EASED` times weaker. The last time a gate that is taught in the paper's form is taught
+in the logit form that is the default, unless `fall_back` is off.
 Where one scene expert took all points, they are shared out anew, and their balance counts `EASED`
 times as much.
 """
@@ -81,9 +81,8 @@ def heal(
     """
     progress.recoveries += 1
     progress.suspected_since = -1
-    # shares that are to be equal, as Switch-NeRF's, are a comparison, which nobody has to save
-    in_paper_form = config.form == "paper" and config.empty_ratio is not None
-    progress.paper_given_up = in_paper_form and progress.recoveries == MOST_RECOVERIES
+    may_give_up = config.form == "paper" and config.fall_back
+    progress.paper_given_up = may_give_up and progress.recoveries == MOST_RECOVERIES
     if collapse.kind == "one expert":
         spread_scene_experts(head, int(shares[1:].argmax()) + 1)
         progress.balance *= EASED

@@ -249,6 +249,7 @@ CASES = {
                 "calibrated and never checked, skips surfaces: a suite that passes it is blind",
                 gate_loss__density=0.0,
                 gate_loss__empty_ratio=None,
+                gate_loss__fall_back=False,
                 sizes__field__experts__empty_expert="mlp",
                 sizes__field__experts__empty_layers=2,
                 calibration__lost_surface_mass=1.0,

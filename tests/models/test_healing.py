@@ -212,11 +212,11 @@ def test_the_last_recovery_counts_whatever_it_is_from() -> None:
     assert form_of(paper, progress) == "logit" and "logit form" in said
 
 
-def test_equal_shares_are_a_comparison_and_stay_in_the_form_that_is_asked_for() -> None:
-    equal, progress = GateLossConfig(form="paper", empty_ratio=None), Progress(learn_steps=200)
+def test_what_is_a_comparison_stays_in_the_form_that_is_asked_for() -> None:
+    losses, progress = GateLossConfig(form="paper", fall_back=False), Progress(learn_steps=200)
     for number in range(MOST_RECOVERIES):
-        heal(head_of([0] * 3), progress, Collapse("a cause", "occupied"), SPREAD, number, equal)
-    assert form_of(equal, progress) == "paper"
+        heal(head_of([0] * 3), progress, Collapse("a cause", "occupied"), SPREAD, number, losses)
+    assert form_of(losses, progress) == "paper"
 
 
 def test_a_run_that_was_never_healed_is_taught_as_configured() -> None:
