@@ -5,9 +5,9 @@ the first phase, is healed, `MOST_RECOVERIES` times at most. Its last layer star
 goes on for half as long again: first on dense samples, while what teaches the gate comes in again
 from nothing and the field finds its surfaces without it; then as before, with the force that led to
 the collapse `EASED` times weaker. The last time a gate that is taught in the paper's form is taught
-in the logit form that is the default, unless `fall_back` is off.
-Where one scene expert took all points, they are shared out anew, and their balance counts `EASED`
-times as much.
+in the logit form that is the default, unless `fall_back` is off; so is, at once, one of which no
+threshold is within bounds. Where one scene expert took all points, they are shared out anew, and
+their balance counts `EASED` times as much.
 """
 
 from __future__ import annotations
@@ -81,8 +81,8 @@ def heal(
     """
     progress.recoveries += 1
     progress.suspected_since = -1
-    may_give_up = config.form == "paper" and config.fall_back
-    progress.paper_given_up = may_give_up and progress.recoveries == MOST_RECOVERIES
+    last = progress.recoveries == MOST_RECOVERIES or collapse.kind == "useless"
+    progress.paper_given_up = last and may_fall_back(config)
     if collapse.kind == "one expert":
         spread_scene_experts(head, int(shares[1:].argmax()) + 1)
         progress.balance *= EASED
@@ -101,6 +101,11 @@ def heal(
         f"its last layer starts anew, on dense samples to step {progress.dense_until}"
         f"{IN_LOGIT_FORM if progress.paper_given_up else less}"
     )
+
+
+def may_fall_back(config: GateLossConfig) -> bool:
+    """Whether a gate may be taught otherwise than is asked for, where that has failed."""
+    return config.form == "paper" and config.fall_back
 
 
 def form_of(config: GateLossConfig, progress: Progress) -> Literal["logit", "paper"]:

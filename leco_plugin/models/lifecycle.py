@@ -24,12 +24,19 @@ from leco_plugin.models.field_at_freezing import carry_over, leave_field
 from leco_plugin.models.freezing import calibration_rays, freeze, write_occupancy
 from leco_plugin.models.gate import occupancy_from_logits, route
 from leco_plugin.models.guided_watch import GuidedWatch
-from leco_plugin.models.healing import MOST_RECOVERIES, STEPS_PER_LOOK, heal, is_collapsed
+from leco_plugin.models.healing import (
+    MOST_RECOVERIES,
+    STEPS_PER_LOOK,
+    heal,
+    is_collapsed,
+    may_fall_back,
+)
 from leco_plugin.models.history import GateHistory
 from leco_plugin.models.losses import expert_shares
 from leco_plugin.models.merging import merge
 from leco_plugin.models.phases import (
     PROBES,
+    Collapse,
     ScheduleConfig,
     converged,
     decisions_agree,
@@ -202,7 +209,9 @@ class Lifecycle:
                 f"{schedule.steps_per_check} steps ago; freezing the gate"
             )
             data, seconds = self.pipeline.datamanager, progress.learn_seconds
-            freeze(model, data, self.survey, self.folder, step, seconds)
+            measured = freeze(model, data, self.survey, self.folder, step, seconds)
+            if measured.threshold == 0.0 and self._falls_back(step):
+                return
             if self.folder is not None:
                 leave_field(model, self.folder)
             if self.trainer is not None and not schedule.restart:
@@ -215,6 +224,20 @@ class Lifecycle:
             if schedule.restart:
                 self._restart_field()
             self.save(step)  # a run killed from now on stays frozen
+
+    def _falls_back(self, step: int) -> bool:
+        """Has a gate that nothing can be skipped by taught otherwise, where there is another way;
+        returns whether there is."""
+        model, progress, losses = self.model, self.progress, self.model.config.gate_loss
+        if not may_fall_back(losses) or progress.paper_given_up:
+            return False
+        useless = Collapse("no threshold is within bounds", "useless")
+        head = model.gate.head
+        done = heal(head, progress, useless, torch.zeros(head.out_features), step, losses)
+        share(head.parameters())
+        model.reopen()
+        say(f"step {step}: {useless.cause}; the gate is opened again, {done}")
+        return True
 
     def _learn_on(self, step: int, agreement: float) -> None:
         progress = self.progress

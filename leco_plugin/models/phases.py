@@ -96,9 +96,9 @@ class Collapse:
     """A gate that has stopped deciding, and why it is thought so."""
 
     cause: str
-    kind: Literal["empty", "occupied", "one expert"] = "empty"
+    kind: Literal["empty", "occupied", "one expert", "useless"] = "empty"
     """What it calls everything; `one expert`: it still knows what is empty, and only sends
-    everything else to one expert."""
+    everything else to one expert; `useless`: no threshold on what it says is within bounds."""
 
 
 def find_collapse(kept_fraction: float, shares: Tensor, has_learned: bool) -> Collapse | None:

@@ -82,7 +82,7 @@ def test_a_gate_that_keeps_everything_after_three_recoveries_is_frozen_all_the_s
     healthy_run, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     frozen: list[int] = []
-    monkeypatch.setattr(lifecycle, "freeze", lambda *arguments: frozen.append(arguments[4]))
+    monkeypatch.setattr(lifecycle, "freeze", freezing_at(frozen, 0.5))
     run = healthy_run(ScheduleConfig(learn_steps=200))
     run.looks = torch.tensor([[0.0, 20.0, 20.0 - 1e-3]]).expand(100, 3)
     for step in range(10_000):
@@ -91,6 +91,44 @@ def test_a_gate_that_keeps_everything_after_three_recoveries_is_frozen_all_the_s
         if frozen:
             break
     assert run.lifecycle.progress.recoveries == 3
+
+
+@pytest.mark.parametrize(
+    ("losses", "recoveries"),
+    [
+        (GateLossConfig(form="paper"), 1),
+        (GateLossConfig(form="paper", fall_back=False), 0),
+        (GateLossConfig(), 0),
+    ],
+)
+def test_a_gate_in_the_papers_form_of_which_no_threshold_is_low_enough_is_taught_otherwise(
+    losses: GateLossConfig, recoveries: int, healthy_run, monkeypatch, capsys
+) -> None:
+    frozen: list[int] = []
+    monkeypatch.setattr(lifecycle, "freeze", freezing_at(frozen, 0.0))
+    run = healthy_run(ScheduleConfig(learn_steps=200))
+    run.lifecycle.model.config.gate_loss = losses
+    reopened: list[bool] = []
+    run.lifecycle.model.reopen = lambda: reopened.append(True)
+    for step in range(1000):
+        run.lifecycle.before_step(step)
+        run.lifecycle.after_step(step)
+        if len(frozen) > recoveries:
+            break
+    assert len(reopened) == run.lifecycle.progress.recoveries == recoveries
+    assert frozen[-1] - frozen[0] <= 100
+    said = "taught in logit form from now on" in " ".join(capsys.readouterr().out.split())
+    assert said == bool(recoveries)
+
+
+def freezing_at(steps: list[int], threshold: float):
+    """In place of `freeze`: notes the step, and finds this threshold."""
+
+    def freeze(*arguments: object) -> SimpleNamespace:
+        steps.append(arguments[4])
+        return SimpleNamespace(threshold=threshold)
+
+    return freeze
 
 
 @pytest.fixture
