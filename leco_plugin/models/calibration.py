@@ -50,7 +50,8 @@ class CalibrationConfig:
     rays_at_once: int = 1024
     """Rays rendered at a time."""
     recheck_rays: int = 512
-    """Other held-out rays on which prices are measured again in guided training; 0 is never."""
+    """Other held-out rays on which prices are measured again in guided training; 0 is never, and
+    hosts are not watched at all then."""
     steps_per_recheck: int = 100
     """Fewest steps between two such measurements; more where they take over 1% of the time."""
 

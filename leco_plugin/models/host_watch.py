@@ -51,12 +51,10 @@ class HostWatch:
         """Measures again where that is due; skips less where it has come to cost too much."""
         self.steps, self.seconds = self.steps + 1, self.seconds + time.monotonic() - self.started
         guide, config = self.guide, self.config
-        if guide.kept is None:
+        if guide.kept is None or config.recheck_rays == 0:
             return
         device, watched = guide.frame.device, guide.watched
         nothing = self._keeps_nothing(step, device)
-        if not nothing and config.recheck_rays == 0:
-            return
         if not nothing and step < watched.setdefault("due", step + config.steps_per_recheck):
             return
         if not guide.the_occupancy_skips():
