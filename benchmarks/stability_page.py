@@ -1,4 +1,4 @@
-"""What docs/stability.md shows of the stored results: the table, and runs that were killed."""
+"""What docs/stability.md shows: the stored table, the cases there are, and runs that were killed."""
 
 from __future__ import annotations
 
@@ -10,23 +10,37 @@ from typing import Any
 
 import checkout  # noqa: F401
 
+from leco_plugin.stability.cases import CASES
 from leco_plugin.stability.table import failures, headline, verdicts
 
 ROOT = Path(__file__).resolve().parent.parent
 PAGE = ROOT / "docs" / "stability.md"
 PICTURE = ROOT / "docs" / "images" / "stability.png"
 TABLE = "<!-- results: generated -->", "<!-- end of the results -->"
+CASE_LIST = "<!-- cases: generated -->", "<!-- end of the cases -->"
 KILLS = "<!-- kills: generated -->", "<!-- end of the kills -->"
 
 
 def page(text: str, results: Path) -> str:
     """The page with its generated parts renewed; a part whose results are not stored says so."""
-    for (begin, end), name, shown in ((TABLE, "stability", of_table), (KILLS, "kills", of_kills)):
+    for marks, name, shown in ((TABLE, "stability", of_table), (KILLS, "kills", of_kills)):
         stored = results / f"{name}.json"
         body = shown(json.loads(stored.read_text())) if stored.exists() else "Not run yet."
-        before, rest = text.split(begin)
-        text = f"{before}{begin}\n{body}\n{end}{rest.split(end)[1]}"
-    return text
+        text = between(text, marks, body)
+    return between(text, CASE_LIST, of_cases())
+
+
+def between(text: str, marks: tuple[str, str], body: str) -> str:
+    """The text with what is between two marks renewed."""
+    begin, end = marks
+    before, rest = text.split(begin)
+    return f"{before}{begin}\n{body}\n{end}{rest.split(end)[1]}"
+
+
+def of_cases() -> str:
+    """All cases, with the reason for each."""
+    rows = [f"| `{case.name}` | {case.title} | {case.why} |" for case in CASES.values()]
+    return "\n".join(["| name | case | why it is there |", "|---|---|---|", *rows])
 
 
 def of_table(results: dict[str, Any]) -> str:

@@ -15,14 +15,11 @@ PAGE = Path(__file__).parents[2] / "docs" / "stability.md"
 BEGIN, END = "<!-- cases: generated -->", "<!-- end of the cases -->"
 
 
-def cases_table() -> str:
-    rows = [f"| `{case.name}` | {case.title} | {case.why} |" for case in CASES.values()]
-    return "\n".join(["| name | case | why it is there |", "|---|---|---|", *rows])
-
-
 def test_the_page_lists_the_cases_there_are() -> None:
     text = PAGE.read_text()
-    assert text[text.index(BEGIN) + len(BEGIN) : text.index(END)].strip() == cases_table()
+    rows = text[text.index(BEGIN) + len(BEGIN) : text.index(END)].strip().splitlines()[2:]
+    assert [row.split(" | ")[0] for row in rows] == [f"| `{name}`" for name in CASES]
+    assert all(case.why in row for case, row in zip(CASES.values(), rows, strict=True))
 
 
 def test_the_page_names_every_sampler() -> None:
@@ -81,4 +78,4 @@ def test_the_page_counts_kills_and_what_they_lost(results: Path) -> None:
     assert "7 kills with SIGKILL at random moments of runs of 60 steps, 1 of them before" in shown
     assert "; 2 of them lost something" in shown
     assert "2 of 3 runs that were killed went on" in shown and "at 13.10 to 13.20 dB" in shown
-    assert "end at 13.00 to 13.50 dB. Some CPU." in shown
+    assert "end at 13.00 to 13.50 dB (mean 13.25); the means differ by -0.10 dB with a standard error" in shown
