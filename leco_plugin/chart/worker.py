@@ -66,6 +66,8 @@ def train_job(
     protocol: Protocol,
     folder: Path,
     on_progress: Callable[[float], None] | None = None,
+    *,
+    looked_at: bool = True,
 ) -> tuple[dict[str, Any], Trainer]:
     """Trains, evaluates and measures.
 
@@ -76,6 +78,7 @@ def train_job(
         protocol: how long, and how it is evaluated.
         folder: for the occupancy, if there is one, and for nerfstudio's own files.
         on_progress: called with the share that is done.
+        looked_at: False leaves the test images, and all figures of them, to the caller.
     Returns:
         A run of `results.json`, with an `occupancy` of its own, as JSON values; and the trainer
         with its model.
@@ -96,8 +99,8 @@ def train_job(
         budget,
         sampler=contender.sampler,
         seed=seed,
-        curve_points=protocol.curve_points,
-        images=protocol.images,
+        curve_points=protocol.curve_points if looked_at else 0,
+        images=protocol.images if looked_at else 0,
         on_progress=on_progress,
         on_frozen=when_frozen,
     )

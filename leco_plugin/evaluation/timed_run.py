@@ -6,6 +6,7 @@ Evaluation is off the clock; learning an occupancy is on it, and told apart.
 from __future__ import annotations
 
 import copy
+import math
 import random
 import statistics
 from collections.abc import Callable
@@ -47,8 +48,8 @@ class TimedRun:
     """Of the training time: until there was an occupancy, or all updates of a grid."""
     freeze_seconds: float | None = None
     """When there was an occupancy."""
-    psnr: float = 0.0
-    ssim: float = 0.0
+    psnr: float = math.nan
+    ssim: float = math.nan
     lpips: float | None = None
     samples_per_ray: float = 0.0
     field_queries_per_ray: float = 0.0
@@ -95,8 +96,10 @@ def timed_run(
         config: a method with its data; it is copied, not changed.
         budget: when the run is over.
         sampler: what to call the sampler in the record.
-        curve_points: evaluations, evenly spaced over the budget, the last at its end.
-        images: whole test images rendered at the end, for SSIM, LPIPS and the rendering time.
+        curve_points: evaluations, evenly spaced over the budget, the last at its end; 0 leaves
+            the PSNR to the caller.
+        images: whole test images rendered at the end, for SSIM, LPIPS and the rendering time;
+            none leaves those out.
         on_progress: called with the share of the budget that is used, after each step.
         on_frozen: called off the clock when a model that learns its occupancy itself has frozen it.
     Returns:
@@ -109,13 +112,12 @@ def timed_run(
         course = _Course(trainer, budget, run, queries, curve_points, on_progress, on_frozen)
         run_training(trainer)
         course.end()
-        run.curve.append((run.train_seconds, psnr_on_rays(trainer, CURVE_RAYS)))
-        run.psnr = run.curve[-1][1]
-        figures = evaluate_images(trainer, images, queries)
-    run.ssim, run.lpips = figures["ssim"], figures.get("lpips")
-    for name in ("samples", "field_queries", "proposal_queries"):
-        setattr(run, f"{name}_per_ray", figures[f"{name}_per_ray"])
-    run.render_seconds_per_image = figures["render_seconds_per_image"]
+        if curve_points:
+            run.curve.append((run.train_seconds, psnr_on_rays(trainer, CURVE_RAYS)))
+            run.psnr = run.curve[-1][1]
+        figures = evaluate_images(trainer, images, queries) if images else {}
+    for name in figures.keys() - {"psnr"}:
+        setattr(run, name, figures[name])
     return run, trainer
 
 

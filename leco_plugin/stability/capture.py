@@ -27,7 +27,7 @@ class Capture:
     views: int = 48
     """Training pictures: so many, so wide and from so far that three of them show nearly all that
     the held-out ones show. From 40 narrow ones nearer by, a wall was placed by chance."""
-    test_views: int = 4
+    test_views: int = 16
     """Held-out pictures."""
     width: int = 64
     """Of a picture, pixels."""

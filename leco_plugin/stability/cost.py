@@ -31,7 +31,7 @@ RAY_SECONDS: Mapping[str, float] = {
 STEP_SECONDS = 0.025
 """Of a step of a guided host, however few its rays are: of those that skip least it is lost in the
 above."""
-RENDERED = 16_000
+RENDERED = 18_500
 """Rays that are looked at when a run in full sizes has ended..."""
 RENDERING = 0.45
 """...each for this share of what it takes to train on it."""

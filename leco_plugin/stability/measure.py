@@ -24,6 +24,10 @@ from leco_plugin.stability.scene_folder import TRUTH
 NEAR = 0.03
 """A sample whose middle is within this share of the surface's distance is near it: the references
 step by about as much."""
+RASTER = 3
+"""Of the pixels of a held-out picture, one in so many is looked at, along diagonals. Where half of
+the error lies on silhouettes, many pictures of which a part is seen say more than few whole ones:
+seeds of learned occupancy differ by 0.36 dB in four pictures and by 0.24 in sixteen."""
 FEWEST_VIEWS = 2
 """Training pictures that show a surface for it to count: from one alone nobody can tell its depth,
 and what is kept there is chance."""
@@ -33,17 +37,19 @@ RAYS_AT_ONCE = 256
 
 @dataclass(frozen=True)
 class Measured:
-    """Of all held-out pictures together."""
+    """Of a raster over all held-out pictures together."""
 
+    psnr: float
+    """Of all that is looked at."""
     lost_mass: float | None
     """Of the rays that meet a surface which `FEWEST_VIEWS` show, the share without a sample near
     it; None without such surfaces."""
     kept_fraction: float
     """Samples as a share of the candidates of the dense reference."""
     detail_psnr: float | None
-    """PSNR on the pixels that show what the case is about; None where it is about no such thing."""
+    """PSNR on all pixels that show what the case is about; None where it is about no such thing."""
     trivial_psnr: float
-    """PSNR of the held-out pictures against their mean colour: of a method that saw nothing."""
+    """PSNR of the same pixels against their mean colour: of a method that saw nothing."""
     black_share: float
     """Share of the rays without any sample."""
 
@@ -65,6 +71,7 @@ def measure(trainer: Trainer, data: Path, dense_samples: int) -> tuple[Measured,
     scale = float(pipeline.datamanager.train_dataparser_outputs.dataparser_scale)
     lost = met = samples = candidates = rays = without = 0
     errors: list[Tensor] = []
+    detailed: list[Tensor] = []
     colours: list[Tensor] = []
     shown = None
     for number, file in enumerate(dataset.image_filenames):
@@ -72,44 +79,52 @@ def measure(trainer: Trainer, data: Path, dense_samples: int) -> tuple[Measured,
         depth = torch.from_numpy(truth["depth"]).flatten() * scale
         bundle = dataset.cameras.to("cpu").generate_rays(camera_indices=number).to(pipeline.device)
         height, width = bundle.shape
-        flat = bundle.flatten()
+        flat, looked_at = bundle.flatten(), raster(height, width)
+        seen, depth = flat[looked_at.to(pipeline.device)], depth[looked_at]
         nearest, counts, most = [], [], 0
-        for first in range(0, len(flat), RAYS_AT_ONCE):
-            part = flat[first : first + RAYS_AT_ONCE]
+        for first in range(0, len(seen), RAYS_AT_ONCE):
+            part = seen[first : first + RAYS_AT_ONCE]
             near, count, all_of_them = sampled(
                 pipeline.model, part, depth[first : first + RAYS_AT_ONCE], dense_samples
             )
             nearest.append(near)
             counts.append(count)
             most += all_of_them
-        shown_by = torch.from_numpy(truth["shown_by"]).flatten()
+        shown_by = torch.from_numpy(truth["shown_by"]).flatten()[looked_at]
         lost_here, met_here = lost_of(torch.cat(nearest), depth, shown_by)
         lost, met = lost + lost_here, met + met_here
         count = torch.cat(counts)
         samples, candidates = samples + int(count.sum()), candidates + most
         rays, without = rays + len(count), without + int((count == 0).sum())
         detail = torch.from_numpy(truth["detail"]).flatten()
-        asked = torch.ones_like(detail) if shown is None else detail
+        asked = torch.ones_like(detail) if shown is None else detail | looked_at
         rgb = render(pipeline.model, flat[asked.to(pipeline.device)]).cpu()
         image = dataset.get_data(number)["image"].reshape(len(flat), -1).to(pipeline.device)
         wanted = true_image(pipeline.model, image, image).float().cpu()
-        colours.append(wanted)
-        errors.append((rgb[detail[asked]] - wanted[detail]).square())
+        colours.append(wanted[looked_at])
+        errors.append((rgb[looked_at[asked]] - wanted[looked_at]).square())
+        detailed.append((rgb[detail[asked]] - wanted[detail]).square())
         if shown is None:
             shown = (255 * rgb.view(height, width, 3)).round().byte().numpy()
     pipeline.train()
-    error, colour = torch.cat(errors), torch.cat(colours)
+    detail_error, colour = torch.cat(detailed), torch.cat(colours)
     assert shown is not None
     return (
         Measured(
+            psnr(torch.cat(errors)),
             lost / met if met else None,
             samples / max(candidates, 1),
-            psnr(error) if len(error) else None,
+            psnr(detail_error) if len(detail_error) else None,
             psnr((colour - colour.mean(dim=0)).square()),
             without / max(rays, 1),
         ),
         shown,
     )
+
+
+def raster(height: int, width: int) -> Tensor:
+    """The pixels of a picture that are looked at: [height * width], True for one in `RASTER`."""
+    return ((torch.arange(height)[:, None] + torch.arange(width)) % RASTER == 0).flatten()
 
 
 def lost_of(nearest: Tensor, depth: Tensor, shown_by: Tensor) -> tuple[int, int]:

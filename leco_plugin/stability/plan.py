@@ -107,6 +107,7 @@ def capture_of(case: Case, sizes: Sizes) -> Capture:
     return replace(
         capture,
         views=max(4, views),
+        test_views=max(2, round(capture.test_views * sizes.views)),
         width=round(capture.width * sizes.picture),
         height=round(capture.height * sizes.picture),
     )

@@ -69,7 +69,7 @@ class Suite:
         self.entries = entries_of(cases, samplers, seeds, sizes, beside)
         shown = {entry.sampler.name for entry in self.entries}
         self.samplers = [one for one in samplers if one.name in shown]
-        self.protocol = Protocol(steps=sizes.steps, images=1, curve_points=1)
+        self.protocol = Protocol(steps=sizes.steps)
         self.stop = threading.Event()
         scenes = scenes_of(cases, sizes)
         self.digests = {name: digest_of(*scene) for name, scene in scenes.items()}

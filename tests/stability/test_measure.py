@@ -14,7 +14,7 @@ from torch import Tensor
 
 from leco_plugin.samplers.base import Estimator
 from leco_plugin.samplers.proposal import DenseSampler
-from leco_plugin.stability.measure import FEWEST_VIEWS, NEAR, lost_of, psnr, sampled
+from leco_plugin.stability.measure import FEWEST_VIEWS, NEAR, RASTER, lost_of, psnr, raster, sampled
 
 RADIUS = 0.5
 """Of the ball around the origin that the rays meet."""
@@ -95,6 +95,12 @@ def test_only_surfaces_that_enough_training_pictures_show_can_be_lost() -> None:
     nearest = torch.tensor([0.01, 0.5, math.inf, 0.5, math.inf])
     shown_by = torch.tensor([9, 9, FEWEST_VIEWS, FEWEST_VIEWS - 1, 0])
     assert lost_of(nearest, depth, shown_by) == (2, 3)
+
+
+def test_a_raster_takes_its_share_of_every_row_and_every_column() -> None:
+    taken = raster(9, 12).view(9, 12).float()
+    for share in (taken.mean(dim=0), taken.mean(dim=1)):
+        torch.testing.assert_close(share, torch.full_like(share, 1 / RASTER))
 
 
 def test_psnr_of_known_errors() -> None:

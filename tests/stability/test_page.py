@@ -78,4 +78,7 @@ def test_the_page_counts_kills_and_what_they_lost(results: Path) -> None:
     assert "7 kills with SIGKILL at random moments of runs of 60 steps, 1 of them before" in shown
     assert "; 2 of them lost something" in shown
     assert "2 of 3 runs that were killed went on" in shown and "at 13.10 to 13.20 dB" in shown
-    assert "end at 13.00 to 13.50 dB (mean 13.25); the means differ by -0.10 dB with a standard error" in shown
+    assert (
+        "end at 13.00 to 13.50 dB (mean 13.25); the means differ by -0.10 dB with a standard error"
+        in shown
+    )
