@@ -1,4 +1,4 @@
-"""What docs/stability.md shows: the stored table, the cases there are, and runs that were killed."""
+"""What docs/stability.md shows: the stored table, the cases, and runs that were killed."""
 
 from __future__ import annotations
 
