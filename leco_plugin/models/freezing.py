@@ -32,7 +32,8 @@ if TYPE_CHECKING:
 
 FILE_NAME = "occupancy.safetensors"
 HARDLY_ANYTHING = 0.05
-"""Share of all candidates below which a run that skips no more is given advice."""
+"""Share of all candidates below which a run that skips no more is given advice, and a gate in the
+paper's form is taught otherwise."""
 
 
 @torch.no_grad()

@@ -18,10 +18,16 @@ from torch import Tensor
 
 from leco_plugin.compat.optimizers import forget_the_gone
 from leco_plugin.models.batches import Batches
+from leco_plugin.models.calibration import Measured
 from leco_plugin.models.failures import GateCollapsed
 from leco_plugin.models.field import HMoEField
 from leco_plugin.models.field_at_freezing import carry_over, leave_field
-from leco_plugin.models.freezing import calibration_rays, freeze, write_occupancy
+from leco_plugin.models.freezing import (
+    HARDLY_ANYTHING,
+    calibration_rays,
+    freeze,
+    write_occupancy,
+)
 from leco_plugin.models.gate import occupancy_from_logits, route
 from leco_plugin.models.guided_watch import GuidedWatch
 from leco_plugin.models.healing import (
@@ -210,7 +216,7 @@ class Lifecycle:
             )
             data, seconds = self.pipeline.datamanager, progress.learn_seconds
             measured = freeze(model, data, self.survey, self.folder, step, seconds)
-            if measured.threshold == 0.0 and self._falls_back(step):
+            if self._falls_back(step, measured):
                 return
             if self.folder is not None:
                 leave_field(model, self.folder)
@@ -225,13 +231,16 @@ class Lifecycle:
                 self._restart_field()
             self.save(step)  # a run killed from now on stays frozen
 
-    def _falls_back(self, step: int) -> bool:
-        """Has a gate that nothing can be skipped by taught otherwise, where there is another way;
-        returns whether there is."""
+    def _falls_back(self, step: int, measured: Measured) -> bool:
+        """Has a gate that hardly anything can be skipped by taught otherwise, where there is
+        another way; returns whether it has."""
         model, progress, losses = self.model, self.progress, self.model.config.gate_loss
         if not may_fall_back(losses) or progress.paper_given_up:
             return False
-        useless = Collapse("no threshold is within bounds", "useless")
+        if measured.empty_fraction >= HARDLY_ANYTHING:
+            return False
+        skipped = f"{measured.empty_fraction:.1%} of all candidates"
+        useless = Collapse(f"no threshold within bounds skips more than {skipped}", "useless")
         head = model.gate.head
         done = heal(head, progress, useless, torch.zeros(head.out_features), step, losses)
         share(head.parameters())

@@ -98,7 +98,7 @@ class Collapse:
     cause: str
     kind: Literal["empty", "occupied", "one expert", "useless"] = "empty"
     """What it calls everything; `one expert`: it still knows what is empty, and only sends
-    everything else to one expert; `useless`: no threshold on what it says is within bounds."""
+    everything else to one expert; `useless`: no threshold within bounds skips much."""
 
 
 def find_collapse(kept_fraction: float, shares: Tensor, has_learned: bool) -> Collapse | None:

@@ -94,18 +94,20 @@ def test_a_gate_that_keeps_everything_after_three_recoveries_is_frozen_all_the_s
 
 
 @pytest.mark.parametrize(
-    ("losses", "recoveries"),
+    ("losses", "skipped", "recoveries"),
     [
-        (GateLossConfig(form="paper"), 1),
-        (GateLossConfig(form="paper", fall_back=False), 0),
-        (GateLossConfig(), 0),
+        (GateLossConfig(form="paper"), 0.0, 1),
+        (GateLossConfig(form="paper"), 0.04, 1),
+        (GateLossConfig(form="paper"), 0.3, 0),
+        (GateLossConfig(form="paper", fall_back=False), 0.0, 0),
+        (GateLossConfig(), 0.0, 0),
     ],
 )
-def test_a_gate_in_the_papers_form_of_which_no_threshold_is_low_enough_is_taught_otherwise(
-    losses: GateLossConfig, recoveries: int, healthy_run, monkeypatch, capsys
+def test_a_gate_in_the_papers_form_by_which_hardly_anything_is_skipped_is_taught_otherwise(
+    losses: GateLossConfig, skipped: float, recoveries: int, healthy_run, monkeypatch, capsys
 ) -> None:
     frozen: list[int] = []
-    monkeypatch.setattr(lifecycle, "freeze", freezing_at(frozen, 0.0))
+    monkeypatch.setattr(lifecycle, "freeze", freezing_at(frozen, 0.0, skipped))
     run = healthy_run(ScheduleConfig(learn_steps=200))
     run.lifecycle.model.config.gate_loss = losses
     reopened: list[bool] = []
@@ -121,12 +123,12 @@ def test_a_gate_in_the_papers_form_of_which_no_threshold_is_low_enough_is_taught
     assert said == bool(recoveries)
 
 
-def freezing_at(steps: list[int], threshold: float):
-    """In place of `freeze`: notes the step, and finds this threshold."""
+def freezing_at(steps: list[int], threshold: float, skipped: float = 0.8):
+    """In place of `freeze`: notes the step, and finds this threshold, which skips so much."""
 
     def freeze(*arguments: object) -> SimpleNamespace:
         steps.append(arguments[4])
-        return SimpleNamespace(threshold=threshold)
+        return SimpleNamespace(threshold=threshold, empty_fraction=skipped)
 
     return freeze
 
