@@ -109,8 +109,11 @@ def may_fall_back(config: GateLossConfig) -> bool:
 
 
 def form_of(config: GateLossConfig, progress: Progress) -> Literal["logit", "paper"]:
-    """What the gate is taught in, after the recoveries so far."""
-    return "logit" if progress.paper_given_up else config.form
+    """What the gate is taught in, after the recoveries so far.
+
+    A run that is resumed with the request to keep to its form does so from then on.
+    """
+    return "logit" if progress.paper_given_up and may_fall_back(config) else config.form
 
 
 def is_dense(progress: Progress, step: int) -> bool:

@@ -236,6 +236,7 @@ def test_a_gate_in_the_papers_form_is_healed_the_last_time_in_logit_form() -> No
     assert taught == replace(paper, form="logit")  # nothing of what was wrong is eased or pressed
     again = Progress.from_dict(progress.to_dict())
     assert form_of(paper, again) == "logit" and form_of(GateLossConfig(), Progress()) == "logit"
+    assert form_of(replace(paper, fall_back=False), again) == "paper"
 
 
 def test_a_gate_that_has_called_nothing_empty_yet_has_until_the_end_to_learn_it() -> None:
