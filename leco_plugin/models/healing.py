@@ -4,10 +4,11 @@ A gate that is found collapsed at every look for `SUSPECTED_STEPS` steps, or at 
 the first phase, is healed, `MOST_RECOVERIES` times at most. Its last layer starts anew; learning
 goes on for half as long again: first on dense samples, while what teaches the gate comes in again
 from nothing and the field finds its surfaces without it; then as before, with the force that led to
-the collapse `EASED` times weaker. The last time a gate that is taught in the paper's form is taught
-in the logit form that is the default, unless `fall_back` is off; so is, at once, one of which no
-threshold is within bounds. Where one scene expert took all points, they are shared out anew, and
-their balance counts `EASED` times as much.
+the collapse `EASED` times weaker. A gate in logit form that collapses again begins anew altogether,
+and the field with it, at rates `EASED` times smaller and for all of the phase. The last time a gate
+that is taught in the paper's form is taught in the logit form that is the default, unless
+`fall_back` is off; so is, at once, one by which hardly anything can be skipped. Where one scene
+expert took all points, they are shared out anew, and their balance counts `EASED` times as much.
 """
 
 from __future__ import annotations
@@ -79,6 +80,7 @@ def heal(
         shares: [1 + n] share of points at each expert.
         config: what the gate is taught by.
     """
+    anew = starts_anew(collapse, config, progress)
     progress.recoveries += 1
     progress.suspected_since = -1
     last = progress.recoveries == MOST_RECOVERIES or collapse.kind == "useless"
@@ -93,14 +95,31 @@ def heal(
     # of a gate that was re-opened late, the steps are counted from the run's first
     phase = min(progress.learn_steps, progress.configured or progress.learn_steps)
     progress.dense_until = step + 1 + phase // 4
-    progress.learn_steps = step + 1 + phase // 2
+    progress.learn_steps = step + 1 + (phase if anew else phase // 2)
     progress.decisions = torch.zeros(0, dtype=torch.bool)
     progress.fewest_kept = 1.0
     less = f", then with {EASED:.0f} times less pressure"
+    if anew:
+        progress.pace /= EASED
+        return (
+            f"gate and field start anew at {progress.pace:.2g} of the learning rates, on dense "
+            f"samples to step {progress.dense_until}"
+        )
     return (
         f"its last layer starts anew, on dense samples to step {progress.dense_until}"
         f"{IN_LOGIT_FORM if progress.paper_given_up else less}"
     )
+
+
+def starts_anew(collapse: Collapse, config: GateLossConfig, progress: Progress) -> bool:
+    """Whether all that has been learned goes, and is learned again more slowly.
+
+    So it is where a new last layer has collapsed as well. In logit form the forces on a gate are
+    bounded; what is left as a cause is steps that overshoot, and hidden layers, of gate and field,
+    that they have ruined.
+    """
+    again = collapse.kind != "one expert" and progress.recoveries > 0
+    return again and form_of(config, progress) == "logit"
 
 
 def may_fall_back(config: GateLossConfig) -> bool:

@@ -99,10 +99,12 @@ def learn_model(
     lifecycle = Lifecycle(model, TrainingCallbackAttributes(None, None, pipeline, None))
     lifecycle.batches.rays_per_batch = rays
     groups = model.get_param_groups()
-    optimizers = [FusedAdamConfig(lr=rate * RATES[name]).setup(p) for name, p in groups.items()]
+    lifecycle.optimizers = [
+        FusedAdamConfig(lr=rate * RATES[name]).setup(p) for name, p in groups.items()
+    ]
     try:
         with bar("Learning the occupancy") as show:
-            _train(trained, lifecycle, optimizers, manager, seconds, show)
+            _train(trained, lifecycle, manager, seconds, show)
     finally:
         if sampler is not None:
             sampler.set_num_rays_per_batch(before)
@@ -138,12 +140,11 @@ def keep_within(progress: Progress, more: float, done: int) -> None:
 def _train(
     trained: nn.Module,
     lifecycle: Lifecycle,
-    optimizers: list[Any],
     manager: Any,
     seconds: float | None,
     show: Any,
 ) -> None:
-    model = lifecycle.model
+    model, optimizers = lifecycle.model, lifecycle.optimizers
     started = time.monotonic()
     step, timed_from = 0, started
     while not bool(model.frozen):

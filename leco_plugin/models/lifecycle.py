@@ -28,7 +28,7 @@ from leco_plugin.models.freezing import (
     freeze,
     write_occupancy,
 )
-from leco_plugin.models.gate import occupancy_from_logits, route
+from leco_plugin.models.gate import Gate, occupancy_from_logits, route
 from leco_plugin.models.guided_watch import GuidedWatch
 from leco_plugin.models.healing import (
     MOST_RECOVERIES,
@@ -36,10 +36,12 @@ from leco_plugin.models.healing import (
     heal,
     is_collapsed,
     may_fall_back,
+    starts_anew,
 )
 from leco_plugin.models.history import GateHistory
 from leco_plugin.models.losses import expert_shares
 from leco_plugin.models.merging import merge
+from leco_plugin.models.pace import keep_pace
 from leco_plugin.models.phases import (
     PROBES,
     Collapse,
@@ -88,6 +90,8 @@ class Lifecycle:
             if sampler_here(self.pipeline.datamanager) is None:
                 say("batches come from elsewhere: they keep their size, and no pixel's distance")
             self._begin_with_points()
+        self.optimizers: list[Any] = []
+        """Those of the model, where they are not a trainer's."""
         self.step_started = 0.0
         self.history = GateHistory()
         self.guided = GuidedWatch(self)
@@ -157,6 +161,7 @@ class Lifecycle:
         model.ramped = ramp(step, self.schedule)
         never_frozen = model.config.homogeneous or not self.schedule.freeze
         model.learned = never_frozen and step >= self.schedule.learn_steps
+        keep_pace(self._optimizers(), self.progress.pace)
         past_learning = bool(model.frozen) or model.learned
         self.batches.prepare(learning=not past_learning)
         self.step_started = time.monotonic()
@@ -229,6 +234,7 @@ class Lifecycle:
                 self._record(step)
             if schedule.restart:
                 self._restart_field()
+                say("the field starts anew, guided from its first step")
             self.save(step)  # a run killed from now on stays frozen
 
     def _falls_back(self, step: int, measured: Measured) -> bool:
@@ -285,10 +291,13 @@ class Lifecycle:
         fresh = HMoEField(field.config, self.model.num_train_data)
         field.load_state_dict(fresh.state_dict())
         share(field.parameters())
-        if self.trainer is not None:
-            for optimizer in self.trainer.optimizers.optimizers.values():
-                optimizer.state.clear()
-        say("the field starts anew, guided from its first step")
+        for optimizer in self._optimizers():
+            optimizer.state.clear()
+
+    def _optimizers(self) -> list[Any]:
+        if self.trainer is None:
+            return self.optimizers
+        return list(self.trainer.optimizers.optimizers.values())
 
     @cached_property
     def probe_positions(self) -> Tensor:
@@ -335,6 +344,10 @@ class Lifecycle:
                 "trains without skipping with --pipeline.model.schedule.freeze False."
             )
         losses = model.config.gate_loss
+        if starts_anew(collapse, losses, progress):
+            model.gate.load_state_dict(Gate(model.gate.config).state_dict())
+            share(model.gate.parameters())
+            self._restart_field()
         done = heal(model.gate.head, progress, collapse, shares, step, losses)
         share(model.gate.head.parameters())  # the remedy is drawn at random
         say(

@@ -38,6 +38,8 @@ class Progress:
     """Factor, after recoveries, of what pulls the gate towards empty space."""
     balance: float = 1.0
     """Factor, after recoveries, of the balance among scene experts."""
+    pace: float = 1.0
+    """Factor, after recoveries, of all learning rates."""
     paper_given_up: bool = False
     """Whether the gate, after recoveries, is taught in logit form although the paper's is asked."""
     decisions: Tensor = field(default_factory=lambda: torch.zeros(0, dtype=torch.bool))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 from dataclasses import replace
 from types import SimpleNamespace
 
@@ -11,6 +12,7 @@ import torch
 from leco_plugin.models import lifecycle
 from leco_plugin.models.encodings import EncodingConfig
 from leco_plugin.models.failures import GateCollapsed
+from leco_plugin.models.field import FieldConfig, HMoEField
 from leco_plugin.models.gate import Gate, GateConfig
 from leco_plugin.models.healing import (
     EASED,
@@ -145,6 +147,8 @@ def healthy_run(monkeypatch: pytest.MonkeyPatch):
         )
         run.lifecycle = object.__new__(Lifecycle)
         run.lifecycle.trainer, run.lifecycle.survey = None, None
+        run.lifecycle.optimizers = [torch.optim.Adam(gate.parameters())]
+        field = HMoEField(FieldConfig(EncodingConfig("hash", levels=1, log2_table=4)), 2)
         run.lifecycle.batches = SimpleNamespace(prepare=lambda learning: None)
         run.lifecycle.pipeline = SimpleNamespace(datamanager=SimpleNamespace(train_dataset=None))
         run.lifecycle.model = SimpleNamespace(
@@ -159,6 +163,8 @@ def healthy_run(monkeypatch: pytest.MonkeyPatch):
             frozen=torch.tensor(False),
             learning_kept=1.0,
             gate=gate,
+            field=field,
+            num_train_data=2,
             routing=SimpleNamespace(empty_below=0.2),
             progress=Progress(learn_steps=schedule.learn_steps, configured=schedule.learn_steps),
         )
@@ -212,6 +218,31 @@ def test_a_healed_gate_learns_on_dense_samples_first_and_under_less_pressure(kin
     assert ends.imbalance == pytest.approx(pull * losses.imbalance)
     assert ends.emphasis == pytest.approx(losses.emphasis / pull)
     assert ends.balance == losses.balance
+
+
+def test_what_collapses_again_in_logit_form_is_learned_anew_and_more_slowly(healthy_run) -> None:
+    run = healthy_run(ScheduleConfig(learn_steps=400))
+    gate, field = run.lifecycle.model.gate, run.lifecycle.model.field
+    (group,) = run.lifecycle.optimizers[0].param_groups
+    first = copy.deepcopy([gate.hidden[0].weight, field.state_dict()])
+    run.looks = run.empty
+    paces = {}
+    for step in range(1500):
+        run.lifecycle.before_step(step)
+        run.lifecycle.after_step(step)
+        progress = run.lifecycle.progress
+        if progress.recoveries not in paces:
+            same = torch.equal(gate.hidden[0].weight, first[0])
+            assert same == (progress.recoveries < 2)  # a new last layer is tried first
+            as_it_was = zip(field.state_dict().values(), first[1].values(), strict=True)
+            assert all(torch.equal(a, b) for a, b in as_it_was) == same
+            run.lifecycle.before_step(step + 1)
+            paces[progress.recoveries] = group["lr"]
+            if progress.recoveries == 2:
+                assert progress.learn_steps == step + 1 + 400  # all of it again
+        if progress.recoveries == MOST_RECOVERIES:
+            break
+    assert list(paces.values()) == pytest.approx([1e-3, 1e-3, 1e-3 / EASED, 1e-3 / EASED**2])
 
 
 def test_points_of_one_expert_are_shared_out_and_the_balance_counts_more() -> None:
