@@ -23,8 +23,8 @@ from leco_plugin.models.ranks import from_first, is_first, mean, say
 from leco_plugin.models.recheck import Evidence, rays_to_check_with, steps_until_next
 
 LOWERED_TO = 0.25
-"""Share of the threshold that is left when it is lowered; the next measurements say if it is low
-enough."""
+"""Share of the threshold that is left when it is lowered; the next measurement, after the fewest
+steps, says if it is low enough."""
 
 
 class HostWatch:
@@ -116,6 +116,8 @@ class HostWatch:
         lowered = [*occupancy.report.get("lowered", []), [step, threshold]]
         occupancy.report = occupancy.report | {"threshold": threshold, "lowered": lowered}
         self.guide.watched["image"] = NO_EVIDENCE
+        # of what was wrong once it is soon asked whether it still is, however long that takes
+        self.guide.watched["due"] = step + self.config.steps_per_recheck
         self.guide.changed()
         now = f"lowered from {before:.4f} to {threshold:.4f}"
         nothing = "0: from now on nothing is skipped"

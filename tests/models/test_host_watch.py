@@ -95,6 +95,20 @@ def test_a_price_beyond_its_bound_lowers_the_threshold_until_it_is_not(watched: 
     assert len(watched.asked) == measured  # nothing is skipped, nothing is lost
 
 
+def test_what_was_wrong_once_is_soon_looked_at_again_however_long_that_takes(
+    watched: Watched, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(host_watch, "steps_until_next", lambda *_: 2000)
+    before = watched.guide.the_occupancy().threshold
+    watched.host.price = 0.05
+    watched.go(0, 201)
+    assert watched.guide.the_occupancy().threshold == pytest.approx(LOWERED_TO**2 * before)
+    watched.host.price = 0.0
+    watched.go(201, 1000)
+    assert watched.guide.the_occupancy().threshold == pytest.approx(LOWERED_TO**2 * before)
+    assert len(watched.asked) == 3  # nothing was found again, and the next look is far away
+
+
 def test_an_occupancy_that_keeps_nothing_is_not_followed(watched: Watched, capsys: Any) -> None:
     watched.kept = 0
     watched.go(0, 60)
