@@ -6,13 +6,11 @@ from __future__ import annotations
 import time
 from typing import TYPE_CHECKING
 
-import torch
-
 from leco_plugin.models.failures import GateCollapsed
 from leco_plugin.models.freezing import write_occupancy
-from leco_plugin.models.healing import MOST_RECOVERIES, SUSPECTED_STEPS, heal
+from leco_plugin.models.healing import MOST_RECOVERIES, SUSPECTED_STEPS
 from leco_plugin.models.phases import Collapse
-from leco_plugin.models.ranks import from_first, mean, say, share
+from leco_plugin.models.ranks import from_first, mean
 from leco_plugin.models.recheck import beyond_bounds, measure_again, skip_less, steps_until_next
 
 if TYPE_CHECKING:
@@ -93,16 +91,8 @@ class GuidedWatch:
             GateCollapsed: it has done so as often as it may.
         """
         lifecycle = self.lifecycle
-        model, progress = lifecycle.model, lifecycle.progress
+        progress = lifecycle.progress
         cause = "the frozen gate keeps nothing of what the cameras see"
-        if progress.recoveries == MOST_RECOVERIES:
+        if progress.recoveries >= MOST_RECOVERIES:
             raise GateCollapsed(f"step {step}: {cause}, after {MOST_RECOVERIES} recoveries.")
-        shares = torch.zeros(model.gate.head.out_features)
-        losses = model.config.gate_loss
-        done = heal(model.gate.head, progress, Collapse(cause), shares, step, losses)
-        share(model.gate.head.parameters())
-        model.reopen()
-        say(
-            f"step {step}: {cause}; the gate is opened again, {done} "
-            f"(recovery {progress.recoveries} of {MOST_RECOVERIES})"
-        )
+        lifecycle.reopen(Collapse(cause), step)

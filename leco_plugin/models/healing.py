@@ -54,7 +54,7 @@ def is_collapsed(
         last: whether this look ends the first phase.
     """
     progress.fewest_kept = min(progress.fewest_kept, kept)
-    if step + 1 < FEWEST_STEPS:
+    if step + 1 - progress.began < FEWEST_STEPS:
         return None
     collapse = find_collapse(kept, shares, last or progress.fewest_kept < HAS_LEARNED)
     if collapse is None:
@@ -84,27 +84,26 @@ def heal(
     progress.recoveries += 1
     progress.suspected_since = -1
     last = progress.recoveries == MOST_RECOVERIES or collapse.kind == "useless"
-    progress.paper_given_up = last and may_fall_back(config)
+    progress.paper_given_up |= last and may_fall_back(config)
     if collapse.kind == "one expert":
         spread_scene_experts(head, int(shares[1:].argmax()) + 1)
         progress.balance *= EASED
         return "its points are shared out anew" + (IN_LOGIT_FORM if progress.paper_given_up else "")
     reset_gate_head(head)
-    progress.pull *= 1.0 / EASED if collapse.kind == "empty" else EASED
     progress.healed_at = step
-    # of a gate that was re-opened late, the steps are counted from the run's first
-    phase = min(progress.learn_steps, progress.configured or progress.learn_steps)
+    phase = progress.phase or progress.configured or progress.learn_steps  # of older checkpoints
     progress.dense_until = step + 1 + phase // 4
     progress.learn_steps = step + 1 + (phase if anew else phase // 2)
     progress.decisions = torch.zeros(0, dtype=torch.bool)
     progress.fewest_kept = 1.0
     less = f", then with {EASED:.0f} times less pressure"
     if anew:
-        progress.pace /= EASED
+        progress.pace, progress.pull, progress.began = progress.pace / EASED, 1.0, step + 1
         return (
             f"gate and field start anew at {progress.pace:.2g} of the learning rates, on dense "
             f"samples to step {progress.dense_until}"
         )
+    progress.pull *= 1.0 / EASED if collapse.kind == "empty" else EASED
     return (
         f"its last layer starts anew, on dense samples to step {progress.dense_until}"
         f"{IN_LOGIT_FORM if progress.paper_given_up else less}"
@@ -118,7 +117,7 @@ def starts_anew(collapse: Collapse, config: GateLossConfig, progress: Progress) 
     bounded; what is left as a cause is steps that overshoot, and hidden layers, of gate and field,
     that they have ruined.
     """
-    again = collapse.kind != "one expert" and progress.recoveries > 0
+    again = collapse.kind != "one expert" and progress.healed_at >= 0
     return again and form_of(config, progress) == "logit"
 
 
@@ -146,12 +145,13 @@ def annealed(config: GateLossConfig, progress: Progress, step: int) -> GateLossC
     While samples are dense all of it comes in again from nothing. The pull towards empty space is
     lambda_g in the paper's form, and 1 / k in logit form.
     """
-    weight, pull = 1.0, 1.0 if progress.paper_given_up else progress.pull
+    weight, form = 1.0, form_of(config, progress)
+    pull = progress.pull if form == config.form else 1.0
     if is_dense(progress, step):
         weight = (step - progress.healed_at) / (progress.dense_until - progress.healed_at)
     return replace(
         config,
-        form=form_of(config, progress),
+        form=form,
         contribution=config.contribution * weight,
         agreement=config.agreement * weight,
         imbalance=config.imbalance * weight * pull,

@@ -139,6 +139,12 @@ class Lifecycle:
         return replace(self.model.config.schedule, learn_steps=self.progress.learn_steps)
 
     @property
+    def schedule_since(self) -> ScheduleConfig:
+        """The same, of what has begun at `Progress.began`."""
+        steps = self.progress.learn_steps - self.progress.began
+        return replace(self.model.config.schedule, learn_steps=steps)
+
+    @property
     def folder(self) -> Path | None:
         """The run's folder; None where no file is to be left, as by all processes but the first."""
         return Path(self.trainer.base_dir) if self.trainer is not None and is_first() else None
@@ -158,7 +164,7 @@ class Lifecycle:
         """Sets what follows from the step alone, so that a resumed run is where it was."""
         model = self.model
         model.step = step
-        model.ramped = ramp(step, self.schedule)
+        model.ramped = ramp(step - self.progress.began, self.schedule_since)
         never_frozen = model.config.homogeneous or not self.schedule.freeze
         model.learned = never_frozen and step >= self.schedule.learn_steps
         keep_pace(self._optimizers(), self.progress.pace)
@@ -186,10 +192,11 @@ class Lifecycle:
             )
 
     def _ends_after(self, step: int) -> bool:
-        if self.trainer is None:
-            return False
-        # nerfstudio counts its iterations from the step that is gone on from
-        return step + 1 >= self.trainer._start_step + int(self.trainer.config.max_num_iterations)
+        return self.trainer is not None and step + 1 >= self._end()
+
+    def _end(self) -> int:
+        """Steps of the run; nerfstudio counts its iterations from the step that is gone on from."""
+        return int(self.trainer._start_step) + int(self.trainer.config.max_num_iterations)
 
     def _after_learning_step(self, step: int) -> None:
         model, schedule, progress = self.model, self.schedule, self.progress
@@ -201,7 +208,7 @@ class Lifecycle:
             return
         logits = self._probe()
         kept = occupancy_from_logits(logits) >= KEPT_ABOVE
-        if schedule.freeze and self._healed(step, logits, kept, last):
+        if schedule.freeze and self._has_collapsed(step, logits, kept, last):
             return
         if not checks:
             return
@@ -211,10 +218,11 @@ class Lifecycle:
             return
         if not last and float(kept.float().mean()) > 0.95:
             return  # it agrees with itself only because it has not yet found anything empty
-        if last and is_unsettled(step, agreement, schedule, progress.extensions):
+        since, of_those = step - progress.began, self.schedule_since
+        if last and is_unsettled(since, agreement, of_those, progress.extensions):
             self._learn_on(step, agreement)
             return
-        if converged(step, agreement, schedule):
+        if converged(since, agreement, of_those):
             say(
                 f"step {step}: {agreement:.1%} of {len(kept)} decisions are those of "
                 f"{schedule.steps_per_check} steps ago; freezing the gate"
@@ -240,19 +248,37 @@ class Lifecycle:
     def _falls_back(self, step: int, measured: Measured) -> bool:
         """Has a gate that hardly anything can be skipped by taught otherwise, where there is
         another way; returns whether it has."""
-        model, progress, losses = self.model, self.progress, self.model.config.gate_loss
+        progress, losses = self.progress, self.model.config.gate_loss
         if not may_fall_back(losses) or progress.paper_given_up:
             return False
         if measured.empty_fraction >= HARDLY_ANYTHING:
             return False
         skipped = f"{measured.empty_fraction:.1%} of all candidates"
-        useless = Collapse(f"no threshold within bounds skips more than {skipped}", "useless")
-        head = model.gate.head
-        done = heal(head, progress, useless, torch.zeros(head.out_features), step, losses)
-        share(head.parameters())
-        model.reopen()
-        say(f"step {step}: {useless.cause}; the gate is opened again, {done}")
+        self.reopen(
+            Collapse(f"no threshold within bounds skips more than {skipped}", "useless"), step
+        )
         return True
+
+    def reopen(self, collapse: Collapse, step: int) -> None:
+        """Has a frozen gate learn once more, on dense samples first."""
+        shares = torch.zeros(self.model.gate.head.out_features)
+        done = self.healed(collapse, shares, step)
+        self.model.reopen()
+        say(f"step {step}: {collapse.cause}; the gate is opened again, {done}")
+
+    def healed(self, collapse: Collapse, shares: Tensor, step: int) -> str:
+        """Does what the rule says; returns what that is, in words. Arguments as for `heal`."""
+        model, progress, losses = self.model, self.progress, self.model.config.gate_loss
+        if starts_anew(collapse, losses, progress):
+            model.gate.load_state_dict(Gate(model.gate.config).state_dict())
+            share(model.gate.parameters())
+            self._restart_field()
+            self._begin_with_points()
+        done = heal(model.gate.head, progress, collapse, shares, step, losses)
+        share(model.gate.head.parameters())  # the remedy is drawn at random
+        if self.trainer is not None:  # what learns to the end of a run is frozen at its last step
+            progress.learn_steps = min(progress.learn_steps, max(step + 2, self._end()))
+        return f"{done} (recovery {progress.recoveries} of {MOST_RECOVERIES})"
 
     def _learn_on(self, step: int, agreement: float) -> None:
         progress = self.progress
@@ -289,6 +315,9 @@ class Lifecycle:
         """Gives the field the weights of a new one, and its optimizers nothing to remember."""
         field = self.model.field
         fresh = HMoEField(field.config, self.model.num_train_data)
+        for number, left in enumerate(field.experts.left.tolist(), 1):
+            if not left:
+                fresh.experts.drop(number)
         field.load_state_dict(fresh.state_dict())
         share(field.parameters())
         for optimizer in self._optimizers():
@@ -320,7 +349,7 @@ class Lifecycle:
         share([logits])
         return logits
 
-    def _healed(self, step: int, logits: Tensor, kept: Tensor, last: bool) -> bool:
+    def _has_collapsed(self, step: int, logits: Tensor, kept: Tensor, last: bool) -> bool:
         """Heals a gate that has collapsed for a while; returns whether it starts anew.
 
         Raises:
@@ -332,10 +361,8 @@ class Lifecycle:
         collapse = is_collapsed(progress, step, share_kept, shares, last)
         if collapse is None:
             return False
-        if progress.recoveries == MOST_RECOVERIES:
-            if (
-                collapse.kind == "occupied"
-            ):  # slow, and never wrong: what can be skipped is measured
+        if progress.recoveries >= MOST_RECOVERIES:
+            if collapse.kind == "occupied":  # slow, and never wrong: what can be is skipped
                 say(f"step {step}: {collapse.cause}, after {MOST_RECOVERIES} recoveries; so be it")
                 return False
             raise GateCollapsed(
@@ -343,15 +370,5 @@ class Lifecycle:
                 "scene's bounds in the log above, and the weights under gate-loss; leco-occupancy "
                 "trains without skipping with --pipeline.model.schedule.freeze False."
             )
-        losses = model.config.gate_loss
-        if starts_anew(collapse, losses, progress):
-            model.gate.load_state_dict(Gate(model.gate.config).state_dict())
-            share(model.gate.parameters())
-            self._restart_field()
-        done = heal(model.gate.head, progress, collapse, shares, step, losses)
-        share(model.gate.head.parameters())  # the remedy is drawn at random
-        say(
-            f"step {step}: {collapse.cause}; {done} "
-            f"(recovery {progress.recoveries} of {MOST_RECOVERIES})"
-        )
+        say(f"step {step}: {collapse.cause}; {self.healed(collapse, shares, step)}")
         return collapse.kind != "one expert"

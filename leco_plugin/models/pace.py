@@ -3,26 +3,37 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
+from typing import Any
 
 from torch.optim import Optimizer
 
-SET, ASKED = "leco_set_rate", "leco_asked_rate"
-"""Of a parameter group: the rate that was set here last, and the one that was there before."""
+PACE = "leco_pace"
+"""Of an optimizer: the multiple that it steps with."""
 
 
 def keep_pace(optimizers: Iterable[Optimizer], pace: float) -> None:
-    """Multiplies the learning rates; to be called before each step.
+    """Has optimizers step at a multiple of their learning rates from now on.
 
-    A scheduler that sets a rate sets the one that is multiplied. What is remembered travels with
-    the optimizers' own state.
+    The rates are multiplied for the time of a step only: schedulers and checkpoints see what was
+    asked for.
 
     Args:
-        pace: the multiple.
+        pace: the multiple; a power of two leaves rates as they were to the last bit.
     """
     for optimizer in optimizers:
-        for group in optimizer.param_groups:
-            if SET not in group and pace == 1.0:
-                continue  # as whoever made it wants it
-            if group.get(SET) != group["lr"]:
-                group[ASKED] = group["lr"]
-            group["lr"] = group[SET] = group[ASKED] * pace
+        if not hasattr(optimizer, PACE):
+            if pace == 1.0:
+                continue
+            optimizer.register_step_pre_hook(_slowed)
+            optimizer.register_step_post_hook(_as_asked)
+        setattr(optimizer, PACE, pace)
+
+
+def _slowed(optimizer: Optimizer, *_: Any) -> None:
+    for group in optimizer.param_groups:
+        group["lr"] *= getattr(optimizer, PACE)
+
+
+def _as_asked(optimizer: Optimizer, *_: Any) -> None:
+    for group in optimizer.param_groups:
+        group["lr"] /= getattr(optimizer, PACE)

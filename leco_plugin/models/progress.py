@@ -20,6 +20,10 @@ class Progress:
     lengthened by recoveries and extensions."""
     configured: int = 0
     """`ScheduleConfig.learn_steps` that they were made from; 0 before the first step."""
+    phase: int = 0
+    """Those of the config as far as this run has room for them; 0 before the first step."""
+    began: int = 0
+    """Step at which what is learned now began: after 0 where gate and field have begun anew."""
     learn_seconds: float = 0.0
     """Time spent in the first phase."""
     extensions: int = 0
@@ -62,7 +66,8 @@ class Progress:
             most: steps that this process leaves for the first phase.
         """
         if configured != self.configured:
-            self.learn_steps, self.configured = min(configured, most), configured
+            self.learn_steps = self.phase = min(configured, most)
+            self.configured = configured
 
     @classmethod
     def from_dict(cls, state: dict[str, Any]) -> Progress:

@@ -22,6 +22,7 @@ from leco_plugin.models.healing import (
     heal,
     is_collapsed,
     is_dense,
+    starts_anew,
 )
 from leco_plugin.models.lifecycle import Lifecycle
 from leco_plugin.models.objective import GateLossConfig
@@ -157,6 +158,7 @@ def healthy_run(monkeypatch: pytest.MonkeyPatch):
                 homogeneous=False,
                 gate_loss=GateLossConfig(),
                 termination=0.0,
+                prior=SimpleNamespace(steps=0),
                 sizes=SimpleNamespace(guided_batch=1.0),
             ),
             device=torch.device("cpu"),
@@ -220,29 +222,71 @@ def test_a_healed_gate_learns_on_dense_samples_first_and_under_less_pressure(kin
     assert ends.balance == losses.balance
 
 
-def test_what_collapses_again_in_logit_form_is_learned_anew_and_more_slowly(healthy_run) -> None:
-    run = healthy_run(ScheduleConfig(learn_steps=400))
+def test_what_collapses_again_in_logit_form_is_learned_anew_and_more_slowly(
+    healthy_run, monkeypatch
+) -> None:
+    run = healthy_run(ScheduleConfig(learn_steps=2000))
     gate, field = run.lifecycle.model.gate, run.lifecycle.model.field
-    (group,) = run.lifecycle.optimizers[0].param_groups
+    (optimizer,) = run.lifecycle.optimizers
+    gate.hidden[0].weight.grad = torch.ones_like(gate.hidden[0].weight)
+    optimizer.step()
     first = copy.deepcopy([gate.hidden[0].weight, field.state_dict()])
+    shared: set[int] = set()
+    note = shared.update
+    monkeypatch.setattr(lifecycle, "share", lambda tensors: note(map(id, tensors)))
     run.looks = run.empty
-    paces = {}
+    found = {}
     for step in range(1500):
         run.lifecycle.before_step(step)
         run.lifecycle.after_step(step)
         progress = run.lifecycle.progress
-        if progress.recoveries not in paces:
-            same = torch.equal(gate.hidden[0].weight, first[0])
-            assert same == (progress.recoveries < 2)  # a new last layer is tried first
-            as_it_was = zip(field.state_dict().values(), first[1].values(), strict=True)
-            assert all(torch.equal(a, b) for a, b in as_it_was) == same
+        if progress.recoveries in found:
+            continue
+        same = torch.equal(gate.hidden[0].weight, first[0])
+        as_it_was = zip(field.state_dict().values(), first[1].values(), strict=True)
+        assert all(torch.equal(a, b) for a, b in as_it_was) == bool(optimizer.state) == same
+        found[progress.recoveries] = same, progress.pace
+        if not same:
+            assert {id(p) for p in (*gate.parameters(), *field.parameters())} <= shared
+            assert progress.learn_steps == step + 1 + 2000  # all of it again
+            assert progress.pull == 1.0 and progress.began == step + 1
             run.lifecycle.before_step(step + 1)
-            paces[progress.recoveries] = group["lr"]
-            if progress.recoveries == 2:
-                assert progress.learn_steps == step + 1 + 400  # all of it again
+            assert run.lifecycle.model.ramped == 0.0
+            assert vars(optimizer)["leco_pace"] == progress.pace
         if progress.recoveries == MOST_RECOVERIES:
             break
-    assert list(paces.values()) == pytest.approx([1e-3, 1e-3, 1e-3 / EASED, 1e-3 / EASED**2])
+    # a new last layer is tried first
+    assert list(found.values()) == [(True, 1.0), (True, 1.0), (False, 0.25), (False, 0.0625)]
+
+
+def test_experts_that_were_dropped_stay_so_in_a_field_that_is_learned_anew(healthy_run) -> None:
+    field = healthy_run(ScheduleConfig()).lifecycle.model.field
+    made = object.__new__(Lifecycle)
+    made.trainer, made.optimizers = None, []
+    made.model = SimpleNamespace(field=field, num_train_data=2)
+    field.experts.drop(1)
+    before = list(field.parameters())
+    made._restart_field()
+    assert field.experts.left.tolist()[0] is False
+    assert all(one is other for one, other in zip(field.parameters(), before, strict=True))
+
+
+def test_a_form_that_was_given_up_stays_given_up() -> None:
+    paper, progress = GateLossConfig(form="paper"), Progress(learn_steps=200)
+    heal(head_of([0] * 3), progress, Collapse("a cause", "useless"), SPREAD, 199, paper)
+    assert form_of(paper, progress) == "logit"
+    heal(head_of([0] * 3), progress, Collapse("a cause", "occupied"), SPREAD, 299, paper)
+    assert form_of(paper, progress) == "logit" and progress.pace == 0.25
+    kept_to = annealed(replace(paper, fall_back=False), Progress(pull=4.0, paper_given_up=True), 0)
+    assert kept_to.imbalance == 4.0 * paper.imbalance  # what its own recoveries have earned
+
+
+def test_points_that_are_shared_out_are_no_new_last_layer() -> None:
+    progress = Progress(learn_steps=200)
+    heal(
+        head_of([0, 9, 0]), progress, Collapse("a cause", "one expert"), ONE, 150, GateLossConfig()
+    )
+    assert not starts_anew(Collapse("a cause", "empty"), GateLossConfig(), progress)
 
 
 def test_points_of_one_expert_are_shared_out_and_the_balance_counts_more() -> None:
