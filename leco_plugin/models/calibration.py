@@ -51,9 +51,10 @@ class CalibrationConfig:
     """Rays rendered at a time."""
     recheck_rays: int = 512
     """Other held-out rays on which prices are measured again in guided training; 0 is never, and
-    hosts are not watched at all then."""
+    hosts are not watched at all then, and follow the threshold from their first step."""
     steps_per_recheck: int = 100
-    """Fewest steps between two such measurements; more where they take over 1% of the time."""
+    """Fewest steps between two such measurements, also after one by which a host skips less; else
+    more where they take over 1% of the time."""
 
 
 class Measured(NamedTuple):

@@ -12,10 +12,12 @@ import torch
 from ball_occupancy import ball
 
 from leco_plugin.models import host_watch
-from leco_plugin.models.calibration import CalibrationConfig
+from leco_plugin.models.calibration import THRESHOLDS, CalibrationConfig
 from leco_plugin.models.guide import Guide
 from leco_plugin.models.guided import _refuse_what_is_not_finite
 from leco_plugin.models.host_watch import LOWERED_TO, HostWatch
+from leco_plugin.models.probation import CAREFUL, PROMISED, begin_carefully
+from leco_plugin.models.stand_ins import GuidedEstimator
 from leco_plugin.occupancy import Occupancy
 
 BOX = torch.tensor([-4.0, -4.0, -4.0, 4.0, 4.0, 4.0])
@@ -41,6 +43,12 @@ class Host:
         self.guide.kept = 0  # as if it sampled
         off = 0.1 + (0.0 if self.guide.dense else self.price)
         return {"rgb": truth + off}
+
+
+@pytest.fixture
+def packed(watched: Watched) -> torch.nn.Module:
+    """A host whose samples are packed."""
+    return torch.nn.ModuleList([GuidedEstimator(watched.guide, BOX)])
 
 
 class Watched(SimpleNamespace):
@@ -93,6 +101,62 @@ def test_a_price_beyond_its_bound_lowers_the_threshold_until_it_is_not(watched: 
     measured = len(watched.asked)
     watched.go(3000, 3500)
     assert len(watched.asked) == measured  # nothing is skipped, nothing is lost
+
+
+def test_a_host_that_can_afford_it_follows_the_calibrated_threshold_after_a_while(
+    watched: Watched, packed: Any, capsys: Any
+) -> None:
+    calibrated = watched.guide.the_occupancy().threshold
+    assert begin_carefully(packed, watched.guide)
+    assert watched.guide.the_occupancy().threshold == pytest.approx(CAREFUL * calibrated)
+    watched.go(0, 100)
+    assert watched.guide.the_occupancy().threshold == pytest.approx(CAREFUL * calibrated)
+    watched.go(100, 201)
+    assert watched.guide.the_occupancy().threshold == pytest.approx(calibrated)
+    assert PROMISED not in watched.guide.watched and watched.asked == [1, 2]
+    left = Occupancy.load(watched.out / "occupancy.safetensors")
+    assert left.threshold == pytest.approx(calibrated) and "lowered" not in left.report
+    assert f"its threshold is {calibrated:.4f} now" in " ".join(capsys.readouterr().out.split())
+
+
+def test_a_host_that_cannot_afford_it_stays_with_the_lower_threshold(
+    watched: Watched, packed: Any
+) -> None:
+    calibrated = watched.guide.the_occupancy().threshold
+    begin_carefully(packed, watched.guide)
+    watched.host.price = 0.05
+    watched.go(0, 101)
+    watched.host.price = 0.0
+    watched.go(101, 500)
+    after = watched.guide.the_occupancy()
+    assert after.threshold == pytest.approx(CAREFUL * calibrated)
+    left = Occupancy.load(watched.out / "occupancy.safetensors")
+    assert left.threshold == after.threshold and left.report["lowered"] == [[100, after.threshold]]
+
+
+def test_probation_goes_on_in_a_resumed_run(watched: Watched, packed: Any) -> None:
+    calibrated = watched.guide.the_occupancy().threshold
+    begin_carefully(packed, watched.guide)
+    watched.go(0, 50)
+    fresh = Guide()
+    fresh.load_state_dict(watched.guide.state_dict())
+    assert fresh.watched[PROMISED] == pytest.approx(calibrated)
+    assert fresh.the_occupancy().threshold == pytest.approx(CAREFUL * calibrated)
+
+
+def test_what_keeps_nothing_is_not_promised_anything(watched: Watched, packed: Any) -> None:
+    begin_carefully(packed, watched.guide)
+    watched.kept = 0
+    watched.go(0, 101)
+    assert watched.guide.the_occupancy().threshold == 0.0 and PROMISED not in watched.guide.watched
+
+
+def test_hosts_with_samples_of_a_fixed_number_and_thresholds_of_nothing_begin_as_they_are(
+    watched: Watched, packed: Any
+) -> None:
+    assert not begin_carefully(torch.nn.Linear(2, 2), watched.guide)
+    watched.guide.the_occupancy().threshold_value.fill_(THRESHOLDS[-1])
+    assert not begin_carefully(packed, watched.guide) and PROMISED not in watched.guide.watched
 
 
 def test_what_was_wrong_once_is_soon_looked_at_again_however_long_that_takes(
