@@ -75,6 +75,11 @@ class Occupancy(nn.Module):
         """tau: positions with o(x) >= tau are kept."""
         return float(self.threshold_value)
 
+    def with_threshold(self, threshold: float) -> Occupancy:
+        """One that shares all of this but its threshold; the report stays as it is."""
+        given = (self.gate, self.space, threshold, self.precision, self.report, self.walls)
+        return Occupancy(*given).to(self.walls.device).train(self.training)
+
     def shows_a_backdrop(self) -> bool:
         """Whether pictures show something behind all that the gate was taught about: distance or a
         sky, in an unbounded scene always, in a bounded one where calibration found it."""

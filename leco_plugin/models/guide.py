@@ -28,6 +28,9 @@ from leco_plugin.samplers.registry import (
 from leco_plugin.scenes.input_error import InputError, one_line
 from leco_plugin.space import Space
 
+CAREFULLY = "carefully"
+"""In `Guide.watched`: the lower threshold that a host follows for the beginning, if it does."""
+
 
 class NoOccupancyYet(RuntimeError, IOChangeException):
     """A guided host was asked before it had an occupancy.
@@ -122,6 +125,15 @@ class Guide(nn.Module):
                 "--pipeline.model.occupancy.path"
             )
         return self.occupancy
+
+    def followed(self) -> Occupancy:
+        """The occupancy with the threshold that packed samplers follow for now.
+
+        Raises:
+            NoOccupancyYet: there is none yet.
+        """
+        occupancy, lower = self.the_occupancy(), self.watched.get(CAREFULLY)
+        return occupancy if lower is None else occupancy.with_threshold(lower)
 
     def the_occupancy_skips(self) -> bool:
         """Whether it skips anything; at threshold 0 it does not, and need not be asked."""

@@ -14,7 +14,7 @@ from leco_plugin.models.freezing import FILE_NAME, leave_file
 from leco_plugin.models.guide import Guide
 from leco_plugin.models.leco_config import LecoModelConfig
 from leco_plugin.models.opaque_start import begin_opaque
-from leco_plugin.models.probation import PROMISED, begin_carefully
+from leco_plugin.models.probation import begin_carefully
 from leco_plugin.models.ranks import is_first, say
 from leco_plugin.models.sizes import SMALL, learning_only
 from leco_plugin.occupancy import Occupancy
@@ -151,8 +151,6 @@ class GuidedStart:
                 config.learning, self.pipeline, config.rays, config.seconds, config.rate
             )
             self.guide.set_occupancy(occupancy)
-        if self.trainer is not None and is_first() and PROMISED not in self.guide.watched:
-            leave_file(self.guide.the_occupancy(), Path(self.trainer.base_dir))
         watches = self.config.learning.calibration.recheck_rays > 0
         if step == 0 and watches and begin_carefully(self.host, self.guide):
             self.kept = None
@@ -161,6 +159,8 @@ class GuidedStart:
             if kept is None:
                 kept, _ = kept_of_rays(self.guide, self.pipeline.datamanager.train_dataset.cameras)
             begin_opaque(self.host, self.guide, kept)
+        if self.trainer is not None and is_first():
+            leave_file(self.guide.the_occupancy(), Path(self.trainer.base_dir))
 
     def _fit(self, occupancy: Occupancy) -> Tensor:
         """Finds how the occupancy's coordinates lie in the host's, and whether they are of one
@@ -193,7 +193,7 @@ def kept_of_rays(guide: Guide, cameras: Any) -> tuple[Tensor, Tensor]:
     Returns:
         Lengths [R] and [R], scene units of the host.
     """
-    occupancy = guide.the_occupancy()
+    occupancy = guide.followed()
     frame = guide.frame
     origins, directions = (part.reshape(-1, 3).to(frame) for part in covering_rays(cameras))
     origins, directions = moved(origins, frame), turned(directions, frame)

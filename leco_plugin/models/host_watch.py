@@ -18,7 +18,7 @@ from leco_plugin.models.calibration import THRESHOLDS, CalibrationConfig
 from leco_plugin.models.freezing import held_out_bundle, leave_file
 from leco_plugin.models.guide import Guide
 from leco_plugin.models.healing import SUSPECTED_STEPS
-from leco_plugin.models.probation import PROMISED, end_probation, follow
+from leco_plugin.models.probation import end_probation
 from leco_plugin.models.progress import NO_EVIDENCE
 from leco_plugin.models.ranks import from_first, is_first, mean, say
 from leco_plugin.models.recheck import Evidence, rays_to_check_with, steps_until_next
@@ -64,24 +64,21 @@ class HostWatch:
         if nothing:
             self._lower(step, 0.0, f"the occupancy kept nothing for {SUSPECTED_STEPS} steps")
             return
-        began, low = time.monotonic(), guide.the_occupancy().threshold
-        promised = watched.get(PROMISED)
-        if promised is not None:
-            follow(guide, promised)
+        began, low = time.monotonic(), end_probation(guide)
         watched["image"] = from_first(self._measured, device)
         watched["rechecks"] = watched.get("rechecks", 0) + 1
         seconds, a_step = time.monotonic() - began, self.seconds / self.steps
         wait = from_first(lambda: steps_until_next(config, seconds, a_step), device)
         watched["due"] = step + wait
-        if promised is not None:  # the time that was measured holds the building of a sampler
+        if low is not None:  # the time that was measured holds the building of a sampler
             watched["due"] = step + config.steps_per_recheck
         if Evidence(*watched["image"]).exceeds():
-            lower = LOWERED_TO * low if promised is None else low
+            lower = LOWERED_TO * guide.the_occupancy().threshold if low is None else low
             why = "the image price of skipping is beyond its bound"
             self._lower(step, lower if lower >= THRESHOLDS[-1] else 0.0, why)
-        elif promised is not None:
-            end_probation(guide, step)
-            self._leave_file()
+        elif low is not None:
+            now = f"its threshold is {guide.the_occupancy().threshold:.4f} now"
+            say(f"step {step}: skipping costs this host what it may; {now}")
 
     def _keeps_nothing(self, step: int, device: torch.device) -> bool:
         """Whether no process has kept a sample for `SUSPECTED_STEPS` steps; all say the same."""
@@ -120,18 +117,17 @@ class HostWatch:
 
     def _lower(self, step: int, threshold: float, why: str) -> None:
         occupancy = self.guide.the_occupancy()
-        before = self.guide.watched.pop(PROMISED, occupancy.threshold)
-        follow(self.guide, threshold)
+        before = occupancy.threshold
+        end_probation(self.guide)
+        occupancy.threshold_value.fill_(threshold)
         lowered = [*occupancy.report.get("lowered", []), [step, threshold]]
         occupancy.report = occupancy.report | {"threshold": threshold, "lowered": lowered}
         self.guide.watched["image"] = NO_EVIDENCE
         # of what was wrong once it is soon asked whether it still is, however long that takes
         self.guide.watched["due"] = step + self.config.steps_per_recheck
+        self.guide.changed()
         now = f"lowered from {before:.4f} to {threshold:.4f}"
         nothing = "0: from now on nothing is skipped"
         say(f"step {step}: {why}; the threshold is {now if threshold > 0.0 else nothing}")
-        self._leave_file()
-
-    def _leave_file(self) -> None:
         if self.trainer is not None and is_first():
-            leave_file(self.guide.the_occupancy(), Path(self.trainer.base_dir))
+            leave_file(occupancy, Path(self.trainer.base_dir))

@@ -11,35 +11,28 @@ from __future__ import annotations
 from torch import nn
 
 from leco_plugin.models.calibration import THRESHOLDS
-from leco_plugin.models.guide import Guide
-from leco_plugin.models.ranks import say
+from leco_plugin.models.guide import CAREFULLY, Guide
 from leco_plugin.models.stand_ins import GuidedEstimator
 
 CAREFUL = 1.0 / 16.0
 """Share of the calibrated threshold that a host begins with, where that is a threshold at all."""
-PROMISED = "promised"
-"""In `Guide.watched`, while it lasts: the calibrated threshold."""
 
 
 def begin_carefully(host: nn.Module, guide: Guide) -> bool:
-    """Lowers the threshold for the beginning, in a packed host; returns whether it has."""
+    """Has a packed host follow a lower threshold for the beginning; returns whether it does."""
     packed = any(isinstance(module, GuidedEstimator) for module in host.modules())
     calibrated = guide.the_occupancy().threshold
     lower = max(CAREFUL * calibrated, THRESHOLDS[-1])
     if not packed or calibrated < 1.1 * lower:
         return False
-    guide.watched[PROMISED] = calibrated
-    follow(guide, lower)
+    guide.watched[CAREFULLY] = lower
+    guide.changed()
     return True
 
 
-def end_probation(guide: Guide, step: int) -> None:
-    """Has a host stay with the calibrated threshold, which it follows now."""
-    calibrated = guide.watched.pop(PROMISED)
-    say(f"step {step}: skipping costs this host what it may; its threshold is {calibrated:.4f} now")
-
-
-def follow(guide: Guide, threshold: float) -> None:
-    """Has the host skip what is below this threshold."""
-    guide.the_occupancy().threshold_value.fill_(threshold)
-    guide.changed()
+def end_probation(guide: Guide) -> float | None:
+    """Has a host follow the calibrated threshold; returns the lower one, None where it has none."""
+    lower: float | None = guide.watched.pop(CAREFULLY, None)
+    if lower is not None:
+        guide.changed()
+    return lower

@@ -111,7 +111,7 @@ class GuidedEstimator(_StandIn):
         aabb = self._aabb
         if aabb is not None and not guide.same_frame():
             aabb = box_around(aabb, guide.frame.cpu())
-        estimator = guide.built(build_estimator, aabb=aabb, occupancy=guide.the_occupancy())
+        estimator = guide.built(build_estimator, aabb=aabb, occupancy=guide.followed())
         if guide.front_to_back and isinstance(estimator, Estimator):
             estimator.density_fn = self._density_of(guide)
         return estimator

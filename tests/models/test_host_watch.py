@@ -16,7 +16,7 @@ from leco_plugin.models.calibration import THRESHOLDS, CalibrationConfig
 from leco_plugin.models.guide import Guide
 from leco_plugin.models.guided import _refuse_what_is_not_finite
 from leco_plugin.models.host_watch import LOWERED_TO, HostWatch
-from leco_plugin.models.probation import CAREFUL, PROMISED, begin_carefully
+from leco_plugin.models.probation import CAREFUL, begin_carefully
 from leco_plugin.models.stand_ins import GuidedEstimator
 from leco_plugin.occupancy import Occupancy
 
@@ -106,16 +106,16 @@ def test_a_price_beyond_its_bound_lowers_the_threshold_until_it_is_not(watched: 
 def test_a_host_that_can_afford_it_follows_the_calibrated_threshold_after_a_while(
     watched: Watched, packed: Any, capsys: Any
 ) -> None:
-    calibrated = watched.guide.the_occupancy().threshold
-    assert begin_carefully(packed, watched.guide)
-    assert watched.guide.the_occupancy().threshold == pytest.approx(CAREFUL * calibrated)
+    calibrated, version = watched.guide.the_occupancy().threshold, watched.guide.version
+    assert begin_carefully(packed, watched.guide) and watched.guide.version > version
     watched.go(0, 100)
-    assert watched.guide.the_occupancy().threshold == pytest.approx(CAREFUL * calibrated)
+    assert watched.guide.followed().threshold == pytest.approx(CAREFUL * calibrated)
+    assert watched.guide.the_occupancy().threshold == calibrated  # as files and checkpoints say
+    version = watched.guide.version
     watched.go(100, 201)
-    assert watched.guide.the_occupancy().threshold == pytest.approx(calibrated)
-    assert PROMISED not in watched.guide.watched and watched.asked == [1, 2]
-    left = Occupancy.load(watched.out / "occupancy.safetensors")
-    assert left.threshold == pytest.approx(calibrated) and "lowered" not in left.report
+    assert watched.guide.followed() is watched.guide.the_occupancy()
+    assert watched.guide.version > version and watched.asked == [1, 2]
+    assert not (watched.out / "occupancy.safetensors").exists()  # nothing of it has changed
     assert f"its threshold is {calibrated:.4f} now" in " ".join(capsys.readouterr().out.split())
 
 
@@ -128,27 +128,29 @@ def test_a_host_that_cannot_afford_it_stays_with_the_lower_threshold(
     watched.go(0, 101)
     watched.host.price = 0.0
     watched.go(101, 500)
-    after = watched.guide.the_occupancy()
+    after = watched.guide.followed()
+    assert after is watched.guide.the_occupancy()
     assert after.threshold == pytest.approx(CAREFUL * calibrated)
     left = Occupancy.load(watched.out / "occupancy.safetensors")
-    assert left.threshold == after.threshold and left.report["lowered"] == [[100, after.threshold]]
+    assert left.threshold == after.threshold
+    assert left.report["lowered"] == [[100, pytest.approx(after.threshold)]]
 
 
-def test_probation_goes_on_in_a_resumed_run(watched: Watched, packed: Any) -> None:
+def test_the_careful_beginning_goes_on_in_a_resumed_run(watched: Watched, packed: Any) -> None:
     calibrated = watched.guide.the_occupancy().threshold
     begin_carefully(packed, watched.guide)
     watched.go(0, 50)
     fresh = Guide()
     fresh.load_state_dict(watched.guide.state_dict())
-    assert fresh.watched[PROMISED] == pytest.approx(calibrated)
-    assert fresh.the_occupancy().threshold == pytest.approx(CAREFUL * calibrated)
+    assert fresh.the_occupancy().threshold == pytest.approx(calibrated)
+    assert fresh.followed().threshold == pytest.approx(CAREFUL * calibrated)
 
 
-def test_what_keeps_nothing_is_not_promised_anything(watched: Watched, packed: Any) -> None:
+def test_what_keeps_nothing_is_followed_by_nobody(watched: Watched, packed: Any) -> None:
     begin_carefully(packed, watched.guide)
     watched.kept = 0
     watched.go(0, 101)
-    assert watched.guide.the_occupancy().threshold == 0.0 and PROMISED not in watched.guide.watched
+    assert watched.guide.followed().threshold == 0.0
 
 
 def test_hosts_with_samples_of_a_fixed_number_and_thresholds_of_nothing_begin_as_they_are(
@@ -156,7 +158,8 @@ def test_hosts_with_samples_of_a_fixed_number_and_thresholds_of_nothing_begin_as
 ) -> None:
     assert not begin_carefully(torch.nn.Linear(2, 2), watched.guide)
     watched.guide.the_occupancy().threshold_value.fill_(THRESHOLDS[-1])
-    assert not begin_carefully(packed, watched.guide) and PROMISED not in watched.guide.watched
+    assert not begin_carefully(packed, watched.guide)
+    assert watched.guide.followed() is watched.guide.the_occupancy()
 
 
 def test_what_was_wrong_once_is_soon_looked_at_again_however_long_that_takes(
