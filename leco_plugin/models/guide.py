@@ -52,7 +52,8 @@ class Guide(nn.Module):
         occupancy: None until there is one.
         dense: whether packed samplers keep every candidate for the moment, as a reference.
         kept: samples that a packed sampler kept when it was last asked in training.
-        watched: what was found of the price of skipping; travels with a checkpoint.
+        watched: what was found of the price of skipping, and what is followed until it is; travels
+            with a checkpoint.
         first_density: with which the host's field began, None for its own; see `opaque_start`.
         frame: [3, 4] takes positions of the host to those of the occupancy: a rotation times a
             scale, and a translation.

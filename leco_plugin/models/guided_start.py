@@ -138,7 +138,10 @@ class GuidedStart:
         self.kept = None if guide.occupancy is None else self._fit(guide.occupancy)
 
     def before_step(self, step: int) -> None:
-        """Learns the occupancy if there is none yet; leaves its file in the run's folder."""
+        """Learns the occupancy if there is none yet, and leaves its file in the run's folder.
+
+        A packed host begins carefully, and opaque.
+        """
         if self.begun:
             return
         self.begun = True
@@ -157,7 +160,8 @@ class GuidedStart:
         if step == 0 and self.config.opaque_start:
             kept = self.kept
             if kept is None:
-                kept, _ = kept_of_rays(self.guide, self.pipeline.datamanager.train_dataset.cameras)
+                cameras = self.pipeline.datamanager.train_dataset.cameras
+                kept, _ = kept_of_rays(self.guide, self.guide.followed(), cameras)
             begin_opaque(self.host, self.guide, kept)
         if self.trainer is not None and is_first():
             leave_file(self.guide.the_occupancy(), Path(self.trainer.base_dir))
@@ -170,7 +174,7 @@ class GuidedStart:
         if learned_in is not None and host is not None:
             self.guide.frame.copy_(between(host, learned_in))
             self.guide.changed()
-        kept, met = kept_of_rays(self.guide, manager.train_dataset.cameras)
+        kept, met = kept_of_rays(self.guide, occupancy, manager.train_dataset.cameras)
         share = float(kept.sum() / met.sum().clamp(min=1e-12))
         if share == 0.0:
             raise InputError(
@@ -187,13 +191,14 @@ class GuidedStart:
 
 
 @torch.no_grad()
-def kept_of_rays(guide: Guide, cameras: Any) -> tuple[Tensor, Tensor]:
-    """How much the occupancy keeps of rays through its box, and how much of them lies in it.
+def kept_of_rays(guide: Guide, occupancy: Occupancy, cameras: Any) -> tuple[Tensor, Tensor]:
+    """How much an occupancy keeps of rays through its box, and how much of them lies in it.
 
+    Args:
+        guide: says how the occupancy lies in the host.
     Returns:
         Lengths [R] and [R], scene units of the host.
     """
-    occupancy = guide.followed()
     frame = guide.frame
     origins, directions = (part.reshape(-1, 3).to(frame) for part in covering_rays(cameras))
     origins, directions = moved(origins, frame), turned(directions, frame)

@@ -43,6 +43,8 @@ class HostWatch:
         self.pipeline, self.trainer = pipeline, trainer
         self.started, self.steps, self.seconds = 0.0, 0, 0.0
         self.nothing_since: int | None = None
+        if config.recheck_rays == 0:
+            end_probation(guide)  # of an earlier run, with nothing to end it any more
 
     def before_step(self, step: int) -> None:
         """Called after everything else that happens before a step."""

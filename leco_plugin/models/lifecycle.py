@@ -31,6 +31,7 @@ from leco_plugin.models.freezing import (
 from leco_plugin.models.gate import Gate, occupancy_from_logits, route
 from leco_plugin.models.guided_watch import GuidedWatch
 from leco_plugin.models.healing import (
+    FEWEST_STEPS,
     MOST_RECOVERIES,
     STEPS_PER_LOOK,
     heal,
@@ -261,23 +262,25 @@ class Lifecycle:
 
     def reopen(self, collapse: Collapse, step: int) -> None:
         """Has a frozen gate learn once more, on dense samples first."""
-        shares = torch.zeros(self.model.gate.head.out_features)
-        done = self.healed(collapse, shares, step)
         self.model.reopen()
+        done = self.healed(collapse, torch.zeros(self.model.gate.head.out_features), step)
         say(f"step {step}: {collapse.cause}; the gate is opened again, {done}")
 
     def healed(self, collapse: Collapse, shares: Tensor, step: int) -> str:
         """Does what the rule says; returns what that is, in words. Arguments as for `heal`."""
         model, progress, losses = self.model, self.progress, self.model.config.gate_loss
-        if starts_anew(collapse, losses, progress):
+        anew = starts_anew(collapse, losses, progress)
+        if anew:
             model.gate.load_state_dict(Gate(model.gate.config).state_dict())
             share(model.gate.parameters())
             self._restart_field()
-            self._begin_with_points()
         done = heal(model.gate.head, progress, collapse, shares, step, losses)
         share(model.gate.head.parameters())  # the remedy is drawn at random
-        if self.trainer is not None:  # what learns to the end of a run is frozen at its last step
-            progress.learn_steps = min(progress.learn_steps, max(step + 2, self._end()))
+        if anew:
+            self._begin_with_points()
+        room = self._end() - (step + 1) if self.trainer is not None else 0
+        if room >= FEWEST_STEPS:  # no run that has those steps ends without an occupancy
+            progress.learn_steps = min(progress.learn_steps, self._end())
         return f"{done} (recovery {progress.recoveries} of {MOST_RECOVERIES})"
 
     def _learn_on(self, step: int, agreement: float) -> None:

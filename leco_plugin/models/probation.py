@@ -12,6 +12,7 @@ from torch import nn
 
 from leco_plugin.models.calibration import THRESHOLDS
 from leco_plugin.models.guide import CAREFULLY, Guide
+from leco_plugin.models.ranks import say
 from leco_plugin.models.stand_ins import GuidedEstimator
 
 CAREFUL = 1.0 / 16.0
@@ -27,6 +28,10 @@ def begin_carefully(host: nn.Module, guide: Guide) -> bool:
         return False
     guide.watched[CAREFULLY] = lower
     guide.changed()
+    say(
+        f"the host begins at threshold {lower:.4f} instead of {calibrated:.4f}, until skipping has "
+        "shown in it what it costs"
+    )
     return True
 
 

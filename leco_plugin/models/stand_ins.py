@@ -199,7 +199,7 @@ class GuidedEstimator(_StandIn):
         sampler: Any = self.sampler
         if guide.same_frame():
             return cast(Tensor, sampler.binaries)
-        occupied = self.occs >= guide.the_occupancy().threshold
+        occupied = self.occs >= guide.followed().threshold
         return occupied.view(-1, *sampler.resolution.tolist())
 
     def __getattr__(self, name: str) -> Any:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import shutil
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +20,7 @@ from nerfstudio.pipelines.base_pipeline import VanillaPipelineConfig
 from torch import Tensor, nn
 
 from leco_plugin.host_configs import leco_ngp
+from leco_plugin.models import guided_start
 from leco_plugin.models.encodings import EncodingConfig
 from leco_plugin.models.gate import Gate, GateConfig
 from leco_plugin.models.guide import Guide
@@ -27,6 +29,7 @@ from leco_plugin.models.guided_start import (
     OccupancyConfig,
     kept_of_rays,
 )
+from leco_plugin.models.stand_ins import GuidedEstimator
 from leco_plugin.occupancy import Occupancy
 from leco_plugin.scenes.frames import box_around, frame_of
 from leco_plugin.scenes.input_error import InputError
@@ -208,7 +211,8 @@ def test_the_ball_is_found_whatever_it_was_learned_in(readers: dict[str, Data]) 
         frame = frame_of(learned)
         assert frame is not None
         guide = started(ball_of_the_tiny_scene(frame), readers["turned up"])
-        kept, met = kept_of_rays(guide, readers["turned up"].train_dataset.cameras)
+        cameras = readers["turned up"].train_dataset.cameras
+        kept, met = kept_of_rays(guide, guide.the_occupancy(), cameras)
         shares.append(float(kept.sum() / met.sum()))
     assert shares == pytest.approx([shares[0]] * len(shares), rel=0.05)
     assert 0.05 < shares[0] < 0.6
@@ -282,6 +286,33 @@ def test_the_first_step_leaves_the_file_in_the_runs_folder(
     (Trainer.base_dir / NAME).unlink()
     start.before_step(1)
     assert not (Trainer.base_dir / NAME).exists()
+
+
+@pytest.mark.parametrize(
+    ("step", "rays", "careful"), [(0, 512, True), (7, 512, False), (0, 0, False)]
+)
+def test_a_packed_host_begins_carefully_and_is_opaque_by_what_it_then_keeps(
+    readers: dict[str, Data], monkeypatch: pytest.MonkeyPatch, step: int, rays: int, careful: bool
+) -> None:
+    guide, config = Guide(), OccupancyConfig()
+    guide.set_occupancy(ball_of_the_tiny_scene())
+    calibration = config.learning.calibration
+    config.learning.calibration = replace(calibration, recheck_rays=rays)
+    host = nn.ModuleList([GuidedEstimator(guide, None)])
+    lengths: list[Tensor] = []
+    monkeypatch.setattr(
+        guided_start, "begin_opaque", lambda host, guide, kept: lengths.append(kept)
+    )
+    data = readers["as it is"]
+    GuidedStart(host, guide, config, Pipe(data)).before_step(step)
+    calibrated = guide.the_occupancy().threshold
+    assert (guide.followed().threshold < calibrated) == careful
+    if step == 0:
+        cameras = data.train_dataset.cameras
+        expected, _ = kept_of_rays(guide, guide.followed(), cameras)
+        assert torch.equal(lengths[0], expected)
+        whole, _ = kept_of_rays(guide, guide.the_occupancy(), cameras)
+        assert (float(expected.sum()) > float(whole.sum())) == careful
 
 
 def test_before_learning_a_run_says_that_it_starts_over_where_it_is_stopped(

@@ -259,6 +259,20 @@ def test_what_collapses_again_in_logit_form_is_learned_anew_and_more_slowly(
     assert list(found.values()) == [(True, 1.0), (True, 1.0), (False, 0.25), (False, 0.0625)]
 
 
+@pytest.mark.parametrize(("end", "learns_to"), [(450, 450), (2000, 500), (380, 500)])
+def test_what_is_healed_is_frozen_in_its_run_where_that_has_the_steps(
+    healthy_run, end: int, learns_to: int
+) -> None:
+    run = healthy_run(ScheduleConfig(learn_steps=400))
+    run.lifecycle.trainer = SimpleNamespace(
+        _start_step=0,
+        config=SimpleNamespace(max_num_iterations=end),
+        optimizers=SimpleNamespace(optimizers={}),
+    )
+    run.lifecycle.healed(Collapse("a cause", "empty"), SPREAD, 299)
+    assert run.lifecycle.progress.learn_steps == learns_to
+
+
 def test_experts_that_were_dropped_stay_so_in_a_field_that_is_learned_anew(healthy_run) -> None:
     field = healthy_run(ScheduleConfig()).lifecycle.model.field
     made = object.__new__(Lifecycle)

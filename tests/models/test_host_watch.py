@@ -31,6 +31,7 @@ class Host:
 
     def __init__(self, guide: Guide) -> None:
         self.guide, self.price, self.training = guide, 0.0, True
+        self.thresholds: list[float] = []
 
     def eval(self) -> None:
         self.training = False
@@ -40,6 +41,7 @@ class Host:
 
     def __call__(self, truth: torch.Tensor) -> dict[str, torch.Tensor]:
         assert not self.training
+        self.thresholds.append(self.guide.followed().threshold)
         self.guide.kept = 0  # as if it sampled
         off = 0.1 + (0.0 if self.guide.dense else self.price)
         return {"rgb": truth + off}
@@ -115,6 +117,7 @@ def test_a_host_that_can_afford_it_follows_the_calibrated_threshold_after_a_whil
     watched.go(100, 201)
     assert watched.guide.followed() is watched.guide.the_occupancy()
     assert watched.guide.version > version and watched.asked == [1, 2]
+    assert set(watched.host.thresholds) == {calibrated}  # that is what is measured
     assert not (watched.out / "occupancy.safetensors").exists()  # nothing of it has changed
     assert f"its threshold is {calibrated:.4f} now" in " ".join(capsys.readouterr().out.split())
 
@@ -144,6 +147,13 @@ def test_the_careful_beginning_goes_on_in_a_resumed_run(watched: Watched, packed
     fresh.load_state_dict(watched.guide.state_dict())
     assert fresh.the_occupancy().threshold == pytest.approx(calibrated)
     assert fresh.followed().threshold == pytest.approx(CAREFUL * calibrated)
+
+
+def test_without_measurements_no_careful_beginning_goes_on(watched: Watched, packed: Any) -> None:
+    begin_carefully(packed, watched.guide)
+    never = CalibrationConfig(recheck_rays=0)
+    HostWatch(watched.host, watched.guide, never, watched.watch.pipeline, None)
+    assert watched.guide.followed() is watched.guide.the_occupancy()
 
 
 def test_what_keeps_nothing_is_followed_by_nobody(watched: Watched, packed: Any) -> None:

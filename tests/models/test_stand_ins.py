@@ -14,6 +14,7 @@ from nerfstudio.viewer.utils import parse_object
 from nerfstudio.viewer.viewer_elements import ViewerElement
 
 from leco_plugin.models.guide import Guide
+from leco_plugin.models.probation import begin_carefully, end_probation
 from leco_plugin.occupancy import BACKDROP_PRICE, Occupancy
 from leco_plugin.samplers.base import Estimator
 from leco_plugin.samplers.estimator import LearnedOccupancyEstimator
@@ -30,6 +31,17 @@ def test_a_host_samples_as_with_the_estimator_itself(guide: Guide):
     assert len(expected[0]) > 0
     for a, b in zip(found, expected):
         assert torch.equal(a, b)
+
+
+def test_a_host_that_begins_carefully_keeps_more_until_it_ends(guide: Guide):
+    estimator = guide.estimator(BOX).eval()
+    before = len(estimator.sampling(*rays(), **MARCH)[0])
+    assert begin_carefully(torch.nn.ModuleList([estimator]), guide)
+    lower = LearnedOccupancyEstimator(guide.the_occupancy().with_threshold(0.5 / 16)).eval()
+    expected = len(lower.sampling(*rays(), **MARCH)[0])
+    assert len(estimator.sampling(*rays(), **MARCH)[0]) == expected > before
+    assert end_probation(guide) == pytest.approx(0.5 / 16)
+    assert len(estimator.sampling(*rays(), **MARCH)[0]) == before
 
 
 def test_the_signature_is_that_of_estimators(guide: Guide):
