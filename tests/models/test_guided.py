@@ -232,7 +232,7 @@ def test_it_shades_where_the_occupancy_keeps_something(pair: Pair) -> None:
     turn, shift = guide.frame.split([3, 1], dim=1)
 
     def occupied(positions: Tensor) -> Tensor:
-        return guide.the_occupancy().occupied(positions @ turn.T + shift[:, 0])
+        return guide.followed().occupied(positions @ turn.T + shift[:, 0])
 
     found, before = kept_share(pair.guided, occupied), kept_share(pair.own, occupied)
     packed = any(isinstance(module, GuidedEstimator) for module in pair.guided.model.modules())

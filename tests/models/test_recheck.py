@@ -15,7 +15,9 @@ from leco_plugin.models.calibration import CalibrationConfig, Measured, RayPrice
 from leco_plugin.models.failures import GateCollapsed
 from leco_plugin.models.freezing import DenseRendering
 from leco_plugin.models.guided_watch import GuidedWatch
+from leco_plugin.models.healing import heal
 from leco_plugin.models.objective import GateLossConfig
+from leco_plugin.models.phases import Collapse
 from leco_plugin.models.progress import NO_EVIDENCE, Progress
 from leco_plugin.models.recheck import (
     SHARE_OF_TIME,
@@ -179,6 +181,13 @@ def watched(monkeypatch: pytest.MonkeyPatch) -> SimpleNamespace:
         save=made.saved.append,
     )
     lifecycle.progress = lifecycle.model.progress
+
+    def reopen(collapse: Collapse, step: int) -> None:
+        model = lifecycle.model
+        model.reopen()
+        heal(model.gate.head, model.progress, collapse, torch.zeros(3), step, GateLossConfig())
+
+    lifecycle.reopen = reopen
     made.model, made.watch = lifecycle.model, GuidedWatch(lifecycle)  # type: ignore[arg-type]
 
     def measure_again(model: Any, _: Any) -> None:
