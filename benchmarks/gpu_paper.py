@@ -14,7 +14,7 @@ from gpu_floor import Ceilings, floor_seconds, operations_per_position
 from gpu_twin import bytes_of_twin
 
 from leco_plugin.models.field import HMoEField
-from leco_plugin.models.sizes import LARGE, PAPER, SMALL, Sizes
+from leco_plugin.models.sizing.sizes import LARGE, PAPER, SMALL, Sizes
 
 CARDS = {"H100 SXM": Ceilings(3.35e12, 989e12), "A100 SXM": Ceilings(2.04e12, 312e12)}
 """Data sheets: memory bandwidth, and dense bf16 products."""

@@ -13,13 +13,13 @@ from gpu_training import peak_of
 from sampling_scene import fit_occupancy, rays_into
 from torch import Tensor
 
-from leco_plugin.models import grouped_trial
-from leco_plugin.models.dispatch import dispatch
+from leco_plugin.models.compute import grouped_trial
+from leco_plugin.models.compute.dispatch import dispatch
+from leco_plugin.models.compute.grouped import grouped_dispatch
 from leco_plugin.models.encodings import EncodingConfig
 from leco_plugin.models.gate import Gate, GateConfig
-from leco_plugin.models.grouped import grouped_dispatch
 from leco_plugin.models.hmoe import Expert
-from leco_plugin.models.sizes import LARGE, PAPER, SMALL
+from leco_plugin.models.sizing.sizes import LARGE, PAPER, SMALL
 from leco_plugin.occupancy import Occupancy
 from leco_plugin.samplers import fused
 from leco_plugin.samplers.estimator import LearnedOccupancyEstimator

@@ -7,7 +7,7 @@ from typing import Any
 
 import torch
 
-from leco_plugin.models.sizes import PAPER, SMALL, Sizes
+from leco_plugin.models.sizing.sizes import PAPER, SMALL, Sizes
 from leco_plugin.scenes.city import CityConfig
 from leco_plugin.scenes.city_capture import CaptureConfig
 

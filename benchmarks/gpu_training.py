@@ -21,17 +21,17 @@ from gpu_scale import Scale, figure
 from torch import Tensor
 
 from leco_plugin.evaluation.peak_memory import peak_process_bytes
-from leco_plugin.models.calibration import (
+from leco_plugin.models.field import HMoEField
+from leco_plugin.models.freezing.calibration import (
     CalibrationConfig,
     Measured,
     Reference,
     calibrate,
     reference_of,
 )
-from leco_plugin.models.field import HMoEField
 from leco_plugin.models.gate import Gate
+from leco_plugin.models.learning.phases import ScheduleConfig, ramp
 from leco_plugin.models.objective import GateLossConfig, field_losses, gate_losses
-from leco_plugin.models.phases import ScheduleConfig, ramp
 from leco_plugin.models.rendering import (
     Intervals,
     Rays,

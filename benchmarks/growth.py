@@ -31,13 +31,13 @@ from leco_plugin.evaluation.inspection import whole_box
 from leco_plugin.evaluation.json_file import write_json
 from leco_plugin.evaluation.machine import describe_machine
 from leco_plugin.method_configs import leco_occupancy
-from leco_plugin.models.calibration import CalibrationConfig
-from leco_plugin.models.freezing import calibration_rays, dense_rendering
+from leco_plugin.models.compute.optimizers import RATES, FusedAdamConfig
+from leco_plugin.models.freezing.calibration import CalibrationConfig
+from leco_plugin.models.freezing.freezing import calibration_rays, dense_rendering
 from leco_plugin.models.gate import GateConfig
-from leco_plugin.models.lifecycle import Lifecycle
-from leco_plugin.models.optimizers import RATES, FusedAdamConfig
-from leco_plugin.models.phases import ScheduleConfig
-from leco_plugin.models.sizes import sizes_for
+from leco_plugin.models.learning.lifecycle import Lifecycle
+from leco_plugin.models.learning.phases import ScheduleConfig
+from leco_plugin.models.sizing.sizes import sizes_for
 from leco_plugin.scenes.city import City, CityConfig
 from leco_plugin.scenes.city_capture import CaptureConfig
 from leco_plugin.scenes.city_folder import write_city

@@ -46,7 +46,7 @@ KILLS_A_RUN = 5
 PRELOADED = [
     "nerfstudio.scripts.train",
     "leco_plugin.compat.atomic_trainer",
-    "leco_plugin.models.lifecycle",
+    "leco_plugin.models.learning.lifecycle",
     "leco_plugin.evaluation.held_out_images",
 ]
 """Imported once for all runs."""

@@ -21,14 +21,14 @@ from nerfstudio.engine.callbacks import TrainingCallbackAttributes
 
 from leco_plugin.evaluation.machine import describe_machine
 from leco_plugin.method_configs import leco_occupancy
-from leco_plugin.models.calibration import Reference
-from leco_plugin.models.freezing import calibration_rays, dense_reference
+from leco_plugin.models.compute.optimizers import RATES, FusedAdamConfig
+from leco_plugin.models.freezing.calibration import Reference
+from leco_plugin.models.freezing.freezing import calibration_rays, dense_reference
 from leco_plugin.models.gate import occupancy_from_logits
+from leco_plugin.models.learning.lifecycle import Lifecycle
+from leco_plugin.models.learning.phases import ScheduleConfig
+from leco_plugin.models.learning.prior import PriorConfig
 from leco_plugin.models.leco import LecoModel
-from leco_plugin.models.lifecycle import Lifecycle
-from leco_plugin.models.optimizers import RATES, FusedAdamConfig
-from leco_plugin.models.phases import ScheduleConfig
-from leco_plugin.models.prior import PriorConfig
 from leco_plugin.models.rendering import Rays, mapped_middles
 from leco_plugin.occupancy import gate_precision
 

@@ -14,7 +14,7 @@ from sampling_scene import rays_into
 from leco_plugin.compat.host_lpips import setup_with_lazy_lpips
 from leco_plugin.models.field import HMoEField
 from leco_plugin.models.rendering import Intervals, Rays, Routing, shade
-from leco_plugin.models.sizes import PAPER
+from leco_plugin.models.sizing.sizes import PAPER
 from leco_plugin.occupancy import gate_precision
 from leco_plugin.samplers import nerfacc_cpu
 from leco_plugin.samplers.estimator import LearnedOccupancyEstimator

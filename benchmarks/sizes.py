@@ -25,9 +25,9 @@ from leco_plugin.evaluation.json_file import write_json
 from leco_plugin.evaluation.machine import describe_code, describe_machine
 from leco_plugin.evaluation.timed_run import timed_run
 from leco_plugin.method_configs import best_device, leco_occupancy
-from leco_plugin.models.scene_sizes import complete
-from leco_plugin.models.size_limits import values_of
-from leco_plugin.models.sizes import CHOSEN, Sizes, automatic, size_at, sizes_for, with_size
+from leco_plugin.models.sizing.scene_sizes import complete
+from leco_plugin.models.sizing.size_limits import values_of
+from leco_plugin.models.sizing.sizes import CHOSEN, Sizes, automatic, size_at, sizes_for, with_size
 from leco_plugin.scenes.bounds import BoundsConfig
 from leco_plugin.scenes.city import CityConfig
 from leco_plugin.scenes.city_capture import CaptureConfig

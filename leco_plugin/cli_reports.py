@@ -20,7 +20,7 @@ def occupancy_of(path: Path) -> Path:
         )
     if not path.is_dir():
         return path
-    from leco_plugin.models.guided_start import occupancy_file
+    from leco_plugin.models.hosts.guided_start import occupancy_file
 
     file = occupancy_file(path)
     if file is None or not file.exists():

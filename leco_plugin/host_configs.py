@@ -17,10 +17,10 @@ from nerfstudio.plugins.types import MethodSpecification
 from leco_plugin.compat.data_parallel import DataParallelTrainerConfig
 from leco_plugin.compat.dynamic_batch import ClampedDynamicBatchPipelineConfig
 from leco_plugin.method_configs import ON_GPU, STEPS, best_device
+from leco_plugin.models.compute.optimizers import FusedAdamConfig
 from leco_plugin.models.guided import GuidedModelConfig
-from leco_plugin.models.optimizers import FusedAdamConfig
-from leco_plugin.models.switch_config import SwitchNerfModelConfig
-from leco_plugin.models.switch_sizes import switch_sizes_for
+from leco_plugin.models.switch.config import SwitchNerfModelConfig
+from leco_plugin.models.switch.sizes import switch_sizes_for
 from leco_plugin.scenes.data_manager import LecoDataManagerConfig
 from leco_plugin.scenes.known_distances import KnownDistancePixelSamplerConfig
 from leco_plugin.scenes.photographs import LecoPhotographsDataParserConfig

@@ -8,7 +8,7 @@ from contextlib import contextmanager
 from nerfstudio.utils.rich_utils import CONSOLE
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
-from leco_plugin.models.ranks import is_first
+from leco_plugin.models.compute.ranks import is_first
 
 
 @contextmanager

@@ -18,8 +18,8 @@ from leco_plugin.compat.data_parallel import DataParallelTrainerConfig
 from leco_plugin.compat.dynamic_batch import clamped
 from leco_plugin.method_configs import LEARNING, ON_GPU, best_device
 from leco_plugin.models.guided import GuidedModelConfig
-from leco_plugin.models.guided_start import OccupancyConfig, load_occupancy, occupancy_file
-from leco_plugin.models.sizes import learning_only
+from leco_plugin.models.hosts.guided_start import OccupancyConfig, load_occupancy, occupancy_file
+from leco_plugin.models.sizing.sizes import learning_only
 from leco_plugin.samplers.registry import check_gate, refuse_unknown_options
 from leco_plugin.scenes.input_error import InputError
 

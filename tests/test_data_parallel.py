@@ -27,7 +27,7 @@ from leco_plugin.models.failures import TrainingStopped
 from leco_plugin.models.field import FieldConfig
 from leco_plugin.models.gate import Gate, GateConfig
 from leco_plugin.models.leco_config import LecoModelConfig
-from leco_plugin.models.sizes import Sizes
+from leco_plugin.models.sizing.sizes import Sizes
 from leco_plugin.occupancy import Occupancy
 from leco_plugin.samplers import estimator
 from leco_plugin.space import Space

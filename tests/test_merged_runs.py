@@ -13,9 +13,10 @@ from tiny_run import tiny_config
 
 from leco_plugin.compat.atomic_trainer import AtomicTrainer
 from leco_plugin.compat.optimizers import forget_the_gone
-from leco_plugin.models import leco, lifecycle
-from leco_plugin.models.field_at_freezing import FILE_NAME, field_at_freezing
-from leco_plugin.models.merging import MergingConfig
+from leco_plugin.models import leco
+from leco_plugin.models.freezing.field_at_freezing import FILE_NAME, field_at_freezing
+from leco_plugin.models.freezing.merging import MergingConfig
+from leco_plugin.models.learning import lifecycle
 
 pytestmark = [  # nerfstudio leaves an image open
     pytest.mark.filterwarnings("ignore:unclosed file:ResourceWarning"),

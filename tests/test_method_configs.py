@@ -12,7 +12,7 @@ from leco_plugin.method_configs import (
     leco_occupancy,
     leco_occupancy_paper,
 )
-from leco_plugin.models.sizes import left_open, sizes_for
+from leco_plugin.models.sizing.sizes import left_open, sizes_for
 from leco_plugin.scenes.held_out_pixels import HeldOutPixelSampler
 from leco_plugin.scenes.photographs import LecoPhotographs
 

@@ -13,8 +13,8 @@ from leco_plugin.evaluation.held_out_images import psnr_on_rays
 from leco_plugin.evaluation.timed_run import run_training
 from leco_plugin.host_configs import switch_nerf
 from leco_plugin.method_configs import leco_occupancy
-from leco_plugin.models.calibration import CalibrationConfig
-from leco_plugin.models.freezing import FILE_NAME
+from leco_plugin.models.freezing.calibration import CalibrationConfig
+from leco_plugin.models.freezing.freezing import FILE_NAME
 from leco_plugin.occupancy import Occupancy
 
 KINDS = {"brighton_beach": "box", "caliterra": "box", "banana": "box", "fox": "contraction"}

@@ -24,7 +24,7 @@ from sizes_tables import (  # noqa: E402
     sizes_table,
 )
 
-from leco_plugin.models.sizes import SMALL, size_at, with_size  # noqa: E402
+from leco_plugin.models.sizing.sizes import SMALL, size_at, with_size  # noqa: E402
 
 MEASURED = {"automatic": [20.0, 20.2], "table x 4": [20.1, 20.2], "table x 0.25": [19.0, 19.4]}
 PARAMETERS = {"automatic": 200, "table x 4": 800, "table x 0.25": 90}

@@ -50,7 +50,7 @@ def prepare(data: Path, folder: Path, learn_steps: int) -> Ground:
     if not data.is_dir():
         raise InputError(f"--data {data}: there is no such folder")
     from leco_plugin.method_configs import best_device, leco_occupancy
-    from leco_plugin.models.learn_first import learn_model
+    from leco_plugin.models.hosts.learn_first import learn_model
 
     torch.manual_seed(0)
     config: Any = copy.deepcopy(leco_occupancy.config.pipeline)

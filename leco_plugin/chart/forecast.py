@@ -7,7 +7,7 @@ from collections.abc import Iterable
 from leco_plugin.chart.contender import Contender
 from leco_plugin.chart.methods import DENSE
 from leco_plugin.chart.protocol import Protocol
-from leco_plugin.models.guided_start import OWN_SAMPLER
+from leco_plugin.models.hosts.guided_start import OWN_SAMPLER
 
 STEP_SECONDS = 0.15
 """Of a training step where steps end a run: 200 that learn an occupancy and 200 guided ones take

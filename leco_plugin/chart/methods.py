@@ -13,9 +13,9 @@ from typing import Any
 
 from leco_plugin.chart.contender import Contender
 from leco_plugin.models.guided import GuidedModelConfig
-from leco_plugin.models.guided_start import OWN_SAMPLER
+from leco_plugin.models.hosts.guided_start import OWN_SAMPLER
 from leco_plugin.models.leco_config import LecoModelConfig
-from leco_plugin.models.switch_config import SwitchNerfModelConfig
+from leco_plugin.models.switch.config import SwitchNerfModelConfig
 from leco_plugin.samplers.registry import samplers as registered_samplers
 from leco_plugin.scenes.input_error import InputError
 from leco_plugin.swap import registered

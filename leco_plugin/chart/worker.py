@@ -143,7 +143,7 @@ def _at_freezing(
 def _occupancy_of(trainer: Trainer, data: Path, folder: Path) -> dict[str, Any] | None:
     """What is known of the occupancy that a run has left, if any; its file is kept."""
     from leco_plugin.evaluation.occupancy_facts import occupancy_facts, truth_of
-    from leco_plugin.models.freezing import FILE_NAME
+    from leco_plugin.models.freezing.freezing import FILE_NAME
     from leco_plugin.occupancy import Occupancy
     from leco_plugin.scenes.photographs import folder_of
 

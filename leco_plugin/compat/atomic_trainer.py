@@ -21,8 +21,8 @@ from leco_plugin.compat.run_sizes import (
     with_sizes_of,
 )
 from leco_plugin.compat.whole_checkpoints import first_not_finite, newest_whole, previous_of
+from leco_plugin.models.compute.ranks import say, say_what_is_logged
 from leco_plugin.models.failures import GateCollapsed, TrainingStopped
-from leco_plugin.models.ranks import say, say_what_is_logged
 from leco_plugin.samplers.kernels_off import VARIABLE, kernels_off
 from leco_plugin.scenes.input_error import InputError
 

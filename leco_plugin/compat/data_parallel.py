@@ -21,8 +21,8 @@ from torch.nn.parallel import DistributedDataParallel
 
 from leco_plugin.compat.atomic_trainer import AtomicTrainer
 from leco_plugin.compat.run_folder import claim
+from leco_plugin.models.compute.ranks import say
 from leco_plugin.models.failures import TrainingStopped
-from leco_plugin.models.ranks import say
 from leco_plugin.scenes.input_error import InputError
 
 LOST = ("Connection closed by peer", "Connection reset by peer", "NCCL communicator was aborted")

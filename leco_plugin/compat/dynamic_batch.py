@@ -13,7 +13,7 @@ import torch
 from nerfstudio.pipelines.dynamic_batch import DynamicBatchPipeline, DynamicBatchPipelineConfig
 from torch import Tensor
 
-from leco_plugin.models.ranks import mean
+from leco_plugin.models.compute.ranks import mean
 
 MOST_GROWTH = 2.0
 """Factor by which a batch may grow from one step to the next; it shrinks as far as it must."""

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from leco_plugin.compat.whole_checkpoints import newest_whole, step_of
-from leco_plugin.models.ranks import say
+from leco_plugin.models.compute.ranks import say
 
 EVAL_UTILS = "nerfstudio.utils.eval_utils"
 

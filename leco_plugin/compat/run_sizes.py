@@ -14,8 +14,8 @@ import yaml
 
 from leco_plugin.compat.checkpoints import allow_checkpoint_globals
 from leco_plugin.compat.whole_checkpoints import newest_whole
-from leco_plugin.models.ranks import is_first
-from leco_plugin.models.stored_sizes import going_on, sizes_in
+from leco_plugin.models.compute.ranks import is_first
+from leco_plugin.models.sizing.stored_sizes import going_on, sizes_in
 from leco_plugin.scenes.input_error import InputError
 from leco_plugin.scenes.whole_files import write_whole
 

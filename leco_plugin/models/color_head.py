@@ -5,8 +5,8 @@ from __future__ import annotations
 import torch
 from torch import Tensor, nn
 
+from leco_plugin.models.compute.steady import steadied
 from leco_plugin.models.encodings import FrequencyEncoding
-from leco_plugin.models.steady import steadied
 
 OPPONENT = torch.tensor(
     [[1 / 3**0.5] * 3, [1 / 2**0.5, 0.0, -1 / 2**0.5], [1 / 6**0.5, -2 / 6**0.5, 1 / 6**0.5]]

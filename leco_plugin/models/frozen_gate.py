@@ -17,9 +17,9 @@ from weakref import WeakKeyDictionary
 import torch
 from torch import Tensor
 
+from leco_plugin.models.compute.steady import filled_size
 from leco_plugin.models.encodings import Encoding, FrequencyEncoding
 from leco_plugin.models.gate import EMPTY, Gate
-from leco_plugin.models.steady import filled_size
 
 LARGEST_LOGIT = 80.0
 """Sums of exponentials of up to this stay finite; o is 1 in float32 long before."""

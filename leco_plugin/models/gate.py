@@ -13,8 +13,8 @@ from typing import get_args
 import torch
 from torch import Tensor, nn
 
+from leco_plugin.models.compute.steady import steadied
 from leco_plugin.models.encodings import EncodingConfig, Kind, build_encoding
-from leco_plugin.models.steady import steadied
 
 EMPTY = 0
 """Index of the empty-space expert in logits, probabilities and routes."""

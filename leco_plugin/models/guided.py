@@ -28,18 +28,18 @@ from leco_plugin.compat.evaluated_runs import evaluate_whole_checkpoints
 from leco_plugin.compat.hash_encoding import speed_up_hash_encodings
 from leco_plugin.compat.host_lpips import setup_with_lazy_lpips
 from leco_plugin.compat.host_outputs import with_counts_as_floats
+from leco_plugin.models.compute.precision import keep_freed_memory
 from leco_plugin.models.failures import require_finite
-from leco_plugin.models.guide import Guide
-from leco_plugin.models.guided_start import (
+from leco_plugin.models.hosts.guide import Guide
+from leco_plugin.models.hosts.guided_start import (
     OWN_SAMPLER,
     GuidedStart,
     OccupancyConfig,
     load_occupancy,
 )
-from leco_plugin.models.host_watch import HostWatch
-from leco_plugin.models.opaque_start import set_first_density
-from leco_plugin.models.precision import keep_freed_memory
-from leco_plugin.models.seams import swap_sampler
+from leco_plugin.models.hosts.host_watch import HostWatch
+from leco_plugin.models.hosts.opaque_start import set_first_density
+from leco_plugin.models.hosts.seams import swap_sampler
 from leco_plugin.scenes.input_error import InputError
 
 

@@ -11,8 +11,8 @@ from typing import Any, Literal
 import torch
 from torch import Tensor, nn
 
-from leco_plugin.models.dispatch import dispatch
-from leco_plugin.models.grouped import grouped_dispatch, may_group
+from leco_plugin.models.compute.dispatch import dispatch
+from leco_plugin.models.compute.grouped import grouped_dispatch, may_group
 
 
 @dataclass(frozen=True)

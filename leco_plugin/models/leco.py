@@ -14,16 +14,22 @@ from torch import Tensor, nn
 
 from leco_plugin.compat.checkpoints import allow_checkpoint_globals
 from leco_plugin.compat.evaluated_runs import evaluate_whole_checkpoints
+from leco_plugin.models.compute.precision import fast_precision, keep_freed_memory
 from leco_plugin.models.failures import require_finite
 from leco_plugin.models.field import HMoEField
 from leco_plugin.models.front_to_back import is_no_slower, shade_front_to_back
 from leco_plugin.models.gate import Gate
-from leco_plugin.models.healing import annealed, form_of, is_dense
 from leco_plugin.models.image_figures import image_figures
+from leco_plugin.models.learning.healing import annealed, form_of, is_dense
+from leco_plugin.models.learning.progress import Progress
+from leco_plugin.models.learning.statistics import (
+    KEPT_ABOVE,
+    gate_statistics,
+    kept_fraction,
+    prices,
+)
 from leco_plugin.models.leco_config import LecoModelConfig
 from leco_plugin.models.objective import field_losses, gate_losses
-from leco_plugin.models.precision import fast_precision, keep_freed_memory
-from leco_plugin.models.progress import Progress
 from leco_plugin.models.rendering import (
     Intervals,
     Rays,
@@ -35,10 +41,9 @@ from leco_plugin.models.rendering import (
     with_backdrop,
 )
 from leco_plugin.models.scene_rays import cut_to_bounds, marching_rule, with_ends_for_all
-from leco_plugin.models.scene_sizes import complete
-from leco_plugin.models.sizes import Sizes
-from leco_plugin.models.statistics import KEPT_ABOVE, gate_statistics, kept_fraction, prices
-from leco_plugin.models.stored_sizes import SIZES, stored_in, to_store
+from leco_plugin.models.sizing.scene_sizes import complete
+from leco_plugin.models.sizing.sizes import Sizes
+from leco_plugin.models.sizing.stored_sizes import SIZES, stored_in, to_store
 from leco_plugin.occupancy import Occupancy, gate_precision
 from leco_plugin.samplers.estimator import LearnedOccupancyEstimator
 from leco_plugin.samplers.marching import march
@@ -115,7 +120,7 @@ class LecoModel(Model):
         self, training_callback_attributes: TrainingCallbackAttributes
     ) -> list[TrainingCallback]:
         """Finds the scene's bounds now, and returns what runs around each step."""
-        from leco_plugin.models.lifecycle import Lifecycle
+        from leco_plugin.models.learning.lifecycle import Lifecycle
 
         return Lifecycle(self, training_callback_attributes).callbacks()
 

@@ -7,12 +7,12 @@ from dataclasses import dataclass, field
 from nerfstudio.models.base_model import ModelConfig
 
 from leco_plugin.compat.earlier_configs import GrowingConfig
-from leco_plugin.models.calibration import CalibrationConfig
-from leco_plugin.models.merging import MergingConfig
+from leco_plugin.models.freezing.calibration import CalibrationConfig
+from leco_plugin.models.freezing.merging import MergingConfig
+from leco_plugin.models.learning.phases import ScheduleConfig
+from leco_plugin.models.learning.prior import PriorConfig
 from leco_plugin.models.objective import GateLossConfig
-from leco_plugin.models.phases import ScheduleConfig
-from leco_plugin.models.prior import PriorConfig
-from leco_plugin.models.sizes import SMALL, Sizes
+from leco_plugin.models.sizing.sizes import SMALL, Sizes
 from leco_plugin.occupancy import Precision
 from leco_plugin.scenes.bounds import BoundsConfig
 

@@ -8,9 +8,9 @@ import torch
 from torch import Tensor
 
 from leco_plugin.models.color_head import ColorHead
+from leco_plugin.models.compute.rows import select_rows
 from leco_plugin.models.field import HMoEField
 from leco_plugin.models.gate import EMPTY, Gate, occupancy_from_logits, route
-from leco_plugin.models.rows import select_rows
 from leco_plugin.samplers.packed import (
     accumulate_along_rays,
     pack_info,

@@ -17,9 +17,9 @@ from torch import Tensor, nn
 
 from leco_plugin.compat.checkpoints import allow_checkpoint_globals
 from leco_plugin.compat.evaluated_runs import evaluate_whole_checkpoints
+from leco_plugin.models.compute.precision import fast_precision, keep_freed_memory
 from leco_plugin.models.failures import require_finite
 from leco_plugin.models.image_figures import image_figures
-from leco_plugin.models.precision import fast_precision, keep_freed_memory
 from leco_plugin.models.rendering import (
     Intervals,
     Rays,
@@ -30,10 +30,10 @@ from leco_plugin.models.rendering import (
 )
 from leco_plugin.models.scene_grid import scene_grid
 from leco_plugin.models.scene_rays import cut_to_bounds, marching_rule, with_ends_for_all
-from leco_plugin.models.switch_config import SwitchNerfModelConfig
-from leco_plugin.models.switch_field import NEW_DENSITY, Answers, SwitchField
-from leco_plugin.models.switch_objective import switch_losses, switch_statistics
-from leco_plugin.models.switch_rendering import coarse_and_fine, kept_by, leading_expert, render
+from leco_plugin.models.switch.config import SwitchNerfModelConfig
+from leco_plugin.models.switch.field import NEW_DENSITY, Answers, SwitchField
+from leco_plugin.models.switch.objective import switch_losses, switch_statistics
+from leco_plugin.models.switch.rendering import coarse_and_fine, kept_by, leading_expert, render
 from leco_plugin.occupancy import gate_precision
 from leco_plugin.samplers.grid import OccupancyGridEstimator
 from leco_plugin.scenes.bounds import SceneBounds

@@ -21,7 +21,7 @@ from nerfstudio.data.utils.dataloaders import (
 from nerfstudio.model_components.ray_generators import RayGenerator
 from torch import Tensor
 
-from leco_plugin.models.ranks import say
+from leco_plugin.models.compute.ranks import say
 from leco_plugin.scenes.dataset_units import UP_IS_KNOWN
 from leco_plugin.scenes.detail import CAMERAS
 from leco_plugin.scenes.held_out_pixels import HeldOutPixelSampler

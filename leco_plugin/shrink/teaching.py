@@ -10,8 +10,8 @@ import torch
 from torch import Tensor
 from torch.nn.functional import softplus
 
+from leco_plugin.models.compute.optimizers import RATES
 from leco_plugin.models.gate import Gate, GateConfig, occupancy_logit
-from leco_plugin.models.optimizers import RATES
 from leco_plugin.occupancy import Precision, gate_precision
 
 BATCH = 1 << 14

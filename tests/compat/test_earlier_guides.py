@@ -7,7 +7,7 @@ from ball_occupancy import ball
 from torch import nn
 
 from leco_plugin.compat.earlier_guides import read_earlier_guide
-from leco_plugin.models.guide import Guide
+from leco_plugin.models.hosts.guide import Guide
 
 
 def host(of_its_own: nn.Module | None = None) -> nn.Module:

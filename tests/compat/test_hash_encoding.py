@@ -20,7 +20,7 @@ from leco_plugin.compat import hash_encoding
 from leco_plugin.compat.hash_encoding import CpuHashEncoding, speed_up_hash_encodings
 from leco_plugin.compat.host_lpips import setup_with_lazy_lpips
 from leco_plugin.models.guided import GuidedModelConfig
-from leco_plugin.models.guided_start import OWN_SAMPLER, OccupancyConfig
+from leco_plugin.models.hosts.guided_start import OWN_SAMPLER, OccupancyConfig
 
 Sizes = dict[str, int]
 SIZES: list[Sizes] = [

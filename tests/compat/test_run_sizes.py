@@ -16,9 +16,9 @@ from nerfstudio.utils.eval_utils import eval_setup
 
 from leco_plugin.compat.run_sizes import checkpoint_of
 from leco_plugin.method_configs import leco_occupancy
-from leco_plugin.models.calibration import CalibrationConfig
-from leco_plugin.models.phases import ScheduleConfig
-from leco_plugin.models.sizes import left_open, with_size
+from leco_plugin.models.freezing.calibration import CalibrationConfig
+from leco_plugin.models.learning.phases import ScheduleConfig
+from leco_plugin.models.sizing.sizes import left_open, with_size
 from leco_plugin.scenes.detail import CAMERAS
 from leco_plugin.scenes.input_error import InputError
 
@@ -139,7 +139,7 @@ def test_a_resumed_run_has_the_sizes_it_was_begun_with(
     def lost(*_: Any) -> Any:
         raise AssertionError("sizes are chosen anew")
 
-    monkeypatch.setattr("leco_plugin.models.scene_sizes.detail_of", lost)
+    monkeypatch.setattr("leco_plugin.models.sizing.scene_sizes.detail_of", lost)
     trainer = run(resumed(begun, scene, "resumed"))
     assert trainer.pipeline.model.config.sizes == begun.pipeline.model.config.sizes
     assert trainer.step == 2 * STEPS - 1

@@ -13,7 +13,7 @@ from nerfstudio.plugins.registry import discover_methods
 from leco_plugin.conformance.checking import host_cases, pairs
 from leco_plugin.conformance.host_rules import HOST_RULES
 from leco_plugin.conformance.rule import apply
-from leco_plugin.models import seams
+from leco_plugin.models.hosts import seams
 from leco_plugin.samplers import registry
 
 PARALLEL = "two-processes-step-alike"

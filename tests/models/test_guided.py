@@ -21,9 +21,9 @@ from small_hosts import SMALL, pipeline_of, small, unswapped
 from torch import Tensor, nn
 
 from leco_plugin.conformance.host_scene import model_arguments
-from leco_plugin.models.guide import Guide
 from leco_plugin.models.guided import GuidedModelConfig
-from leco_plugin.models.stand_ins import GuidedEstimator
+from leco_plugin.models.hosts.guide import Guide
+from leco_plugin.models.hosts.stand_ins import GuidedEstimator
 from leco_plugin.samplers import estimator
 from leco_plugin.swap import with_sampler_swapped
 

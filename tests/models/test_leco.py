@@ -18,7 +18,7 @@ from leco_plugin.models.leco import LecoModel
 from leco_plugin.models.leco_config import LecoModelConfig
 from leco_plugin.models.objective import GateLossConfig
 from leco_plugin.models.rendering import Intervals, Rays
-from leco_plugin.models.sizes import Sizes
+from leco_plugin.models.sizing.sizes import Sizes
 from leco_plugin.scenes.bounds import SceneBounds
 
 NUM_RAYS = 12

@@ -13,16 +13,16 @@ import torch
 from nerfstudio.engine.callbacks import TrainingCallbackAttributes, TrainingCallbackLocation
 
 from leco_plugin.method_configs import leco_occupancy
-from leco_plugin.models.calibration import CalibrationConfig
 from leco_plugin.models.encodings import EncodingConfig, Kind
 from leco_plugin.models.field import FieldConfig
-from leco_plugin.models.freezing import FILE_NAME
+from leco_plugin.models.freezing.calibration import CalibrationConfig
+from leco_plugin.models.freezing.freezing import FILE_NAME
 from leco_plugin.models.gate import GateConfig
 from leco_plugin.models.hmoe import HMoEConfig
+from leco_plugin.models.learning.phases import ScheduleConfig
 from leco_plugin.models.leco import LecoModel
 from leco_plugin.models.leco_config import LecoModelConfig
-from leco_plugin.models.phases import ScheduleConfig
-from leco_plugin.models.sizes import Sizes
+from leco_plugin.models.sizing.sizes import Sizes
 from leco_plugin.occupancy import Occupancy
 from leco_plugin.samplers.estimator import LearnedOccupancyEstimator
 from leco_plugin.samplers.registry import build_estimator

@@ -16,10 +16,10 @@ from nerfstudio.engine.callbacks import TrainingCallbackAttributes
 from torch import Tensor
 
 from leco_plugin.host_configs import switch_nerf
-from leco_plugin.models.switch_config import SwitchNerfModelConfig
-from leco_plugin.models.switch_field import SwitchFieldConfig
+from leco_plugin.models.switch.config import SwitchNerfModelConfig
+from leco_plugin.models.switch.field import SwitchFieldConfig
+from leco_plugin.models.switch.sizes import SwitchSizes
 from leco_plugin.models.switch_nerf import SwitchNerfModel
-from leco_plugin.models.switch_sizes import SwitchSizes
 from leco_plugin.samplers.estimator import LearnedOccupancyEstimator
 from leco_plugin.samplers.grid import DenseEstimator, OccupancyGridEstimator
 from leco_plugin.scenes.bounds import SceneBounds

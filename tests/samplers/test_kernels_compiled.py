@@ -13,7 +13,7 @@ from samplers.ahead_of_time import AT_HOME, CAPABILITIES, SHARED, Compiled, comp
 
 from leco_plugin.models.encodings import EncodingConfig
 from leco_plugin.models.gate import Gate, GateConfig
-from leco_plugin.models.sizes import LARGE, PAPER, SMALL
+from leco_plugin.models.sizing.sizes import LARGE, PAPER, SMALL
 from leco_plugin.occupancy import Occupancy
 from leco_plugin.samplers import fused
 from leco_plugin.samplers.cache import CacheReport, CellCache, Tables

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 import torch
 
-from leco_plugin.models import grouped
+from leco_plugin.models.compute import grouped
 from leco_plugin.samplers import fused
 from leco_plugin.samplers.kernels_off import NAMES, VARIABLE, kernels_off
 

@@ -17,11 +17,11 @@ from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataPars
 from nerfstudio.data.pixel_samplers import PixelSamplerConfig
 from nerfstudio.pipelines.base_pipeline import VanillaPipelineConfig
 
-from leco_plugin.models.calibration import CalibrationConfig
-from leco_plugin.models.freezing import held_out_bundle
-from leco_plugin.models.learn_first import learn_occupancy
+from leco_plugin.models.freezing.calibration import CalibrationConfig
+from leco_plugin.models.freezing.freezing import held_out_bundle
+from leco_plugin.models.hosts.learn_first import learn_occupancy
+from leco_plugin.models.learning.phases import ScheduleConfig
 from leco_plugin.models.leco_config import LecoModelConfig
-from leco_plugin.models.phases import ScheduleConfig
 from leco_plugin.scenes import data_manager
 from leco_plugin.scenes.data_manager import (
     LecoDataManager,

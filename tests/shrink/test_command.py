@@ -17,7 +17,7 @@ from tiny_scene import camera_to_world
 from leco_plugin import cli
 from leco_plugin.evaluation.inspection import describe
 from leco_plugin.models.encodings import EncodingConfig
-from leco_plugin.models.field_at_freezing import leave_field
+from leco_plugin.models.freezing.field_at_freezing import leave_field
 from leco_plugin.models.gate import GateConfig
 from leco_plugin.occupancy import Occupancy
 from leco_plugin.shrink import command, references, search, sources

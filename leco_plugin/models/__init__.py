@@ -1,0 +1,1 @@
+"""What is learned, and what it guides: gate, field, `leco-occupancy`, Switch-NeRF, guided hosts."""

@@ -1,0 +1,1 @@
+"""How points and products of matrices are moved on a machine, and among its processes."""

@@ -1,0 +1,119 @@
+"""Top-1 dispatch: each point through the one expert it is routed to, and back in its place."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from leco_plugin.models.compute.rows import permute_rows
+from leco_plugin.models.compute.steady import steady_size
+
+Expert = Callable[[Tensor], Tensor]
+"""Features [M, width] to [M, width]."""
+
+
+class Places:
+    """Where rows go that are sorted by a key, each key's rows up to a steady size.
+
+    Args:
+        keys: [N] int64 in [0, num_keys).
+        num_keys: how many keys there are.
+    """
+
+    sizes: list[int]
+    """Rows of each key, filling included; they sum up to P."""
+
+    def __init__(self, keys: Tensor, num_keys: int) -> None:
+        device = keys.device
+        sources = keys.argsort(stable=True)
+        counts = torch.bincount(keys, minlength=num_keys).tolist()  # one synchronisation
+        self.sizes = [steady_size(count, device.type) for count in counts]
+        numbers = torch.arange(len(keys), device=device)
+        self.filling: list[slice] = []
+        if self.sizes == counts:
+            self.sources, slots = sources, numbers
+        else:
+            filled = [size - count for size, count in zip(self.sizes, counts)]
+            ends = torch.tensor(self.sizes).cumsum(0).tolist()
+            self.filling = [slice(end - rows, end) for end, rows in zip(ends, filled) if rows]
+            before = (torch.tensor(filled).cumsum(0) - torch.tensor(filled)).to(device)
+            slots = numbers + before.index_select(0, keys.index_select(0, sources))
+            self.sources = sources.new_zeros(ends[-1]).scatter_(0, slots, sources)
+        self.slots = torch.empty_like(sources).scatter_(0, sources, slots)
+
+    def gather(self, rows: Tensor) -> Sequence[Tensor]:
+        """Rows [N, D] as one [size, D] for each key; filling holds copies of any row."""
+        return permute_rows(rows, self.sources, self.slots).split(self.sizes)
+
+    def put_back(self, rows: Tensor) -> Tensor:
+        """Placed rows [P, D] as [N, D], in the order of the keys; filling is left out."""
+        back: Tensor = _PutBack.apply(rows, self)
+        return back
+
+
+class _PutBack(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: Any, rows: Tensor, places: Places) -> Tensor:
+        ctx.places = places
+        return rows.index_select(0, places.slots)
+
+    @staticmethod
+    def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor, None]:
+        placed = gradient.index_select(0, ctx.places.sources)
+        for filling in ctx.places.filling:
+            placed[filling] = 0.0
+        return placed, None
+
+
+def dispatch(features: Tensor, routes: Tensor, experts: Sequence[Expert | None]) -> Tensor:
+    """Applies the experts, each to the points that are routed to it.
+
+    Args:
+        features: [N, width].
+        routes: [N] int64, numbers of experts.
+        experts: None stands for one that answers zero.
+    Returns:
+        [N, width] in the dtype of the last expert that has points.
+    """
+    places = Places(routes, len(experts))
+    parts = []
+    dtype = features.dtype
+    for expert, part in zip(experts, places.gather(features)):
+        if expert is None:
+            parts.append(torch.zeros_like(part))
+        elif len(part):
+            parts.append(expert(part))
+            dtype = parts[-1].dtype
+        else:
+            parts.append(part)
+    return places.put_back(torch.cat([part.to(dtype) for part in parts]))
+
+
+@torch.no_grad()
+def within_capacity(
+    routes: Tensor, gate_values: Tensor, num_experts: int, capacity_factor: float
+) -> Tensor:
+    """Which points find a place where each expert takes a limited number (GShard, section 2.2).
+
+    An expert takes floor(capacity_factor ceil(N / num_experts)) points, those with the highest
+    gate values first: the batch-prioritised routing with which Switch-NeRF is trained.
+
+    Args:
+        routes: [N] int64 in [0, num_experts).
+        gate_values: [N], the gate's probability of the chosen expert.
+        num_experts: number of experts.
+        capacity_factor: places, as a multiple of an equal share of the points.
+    Returns:
+        bool [N].
+    """
+    capacity = int(capacity_factor * -(-len(routes) // num_experts))
+    by_value = gate_values.argsort(descending=True, stable=True)
+    order = by_value.index_select(0, routes.index_select(0, by_value).argsort(stable=True))
+    counts = torch.bincount(routes, minlength=num_experts)
+    firsts = counts.cumsum(0) - counts
+    places = torch.arange(len(routes), device=routes.device)
+    within = places - firsts.index_select(0, routes.index_select(0, order)) < capacity
+    return torch.empty_like(within).scatter_(0, order, within)

@@ -1,0 +1,118 @@
+"""What the processes of a data-parallel run must agree on; where there is one process, nothing.
+
+Each process trains on rays of its own. Gradients are averaged, so that weights stay the same; what
+is measured or drawn would not, and is taken from the first process.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable, Iterable
+from typing import TypeVar
+
+import torch
+from nerfstudio.utils.rich_utils import CONSOLE
+from rich.markup import escape
+from torch import Tensor, distributed, nn
+from torch.nn.parallel import DistributedDataParallel
+
+T = TypeVar("T")
+
+
+def several() -> bool:
+    """Whether this is one of several processes."""
+    return (
+        distributed.is_available()
+        and distributed.is_initialized()
+        and distributed.get_world_size() > 1
+    )
+
+
+def is_first() -> bool:
+    """Whether this is the process that decides, writes files and speaks."""
+    return not several() or distributed.get_rank() == 0
+
+
+def say(line: str) -> None:
+    """A line in nerfstudio's log, said once for all processes."""
+    if is_first():
+        CONSOLE.log(f"\\[leco] {line}", _stack_offset=2)
+
+
+OF_A_DEVICE = ("leco_plugin.samplers.fused", "leco_plugin.models.compute.grouped_trial")
+"""Whose warnings are of the device of one process; all others have the same everywhere."""
+
+
+class _Says(logging.Handler):
+    """Says what is logged by samplers and experts, which know nothing of nerfstudio."""
+
+    def emit(self, record: logging.LogRecord) -> None:
+        line = escape(record.getMessage())
+        if is_first():
+            say(line)
+        elif record.levelno >= logging.WARNING and record.name in OF_A_DEVICE:
+            CONSOLE.log(f"\\[leco] process {distributed.get_rank()}: {line}")
+
+
+def say_what_is_logged() -> None:
+    """From now on lines of the package's logger, also those that are no warnings, are said."""
+    log = logging.getLogger("leco_plugin")
+    if not any(isinstance(handler, _Says) for handler in log.handlers):
+        log.addHandler(_Says())
+        log.setLevel(logging.INFO)
+
+
+@torch.no_grad()
+def share(tensors: Iterable[Tensor]) -> None:
+    """Gives the tensors of every process the values they have in the first one, in place.
+
+    Args:
+        tensors: of any types, equally shaped everywhere; with NCCL on the device of the process.
+    """
+    if not several():
+        return
+    for tensor in tensors:
+        values = tensor.detach().contiguous()
+        # as bytes: not every release's gloo knows every type
+        distributed.broadcast(values.view(-1).view(torch.uint8), src=0)
+        if not tensor.is_contiguous():
+            tensor.copy_(values)
+
+
+def from_first(make: Callable[[], T], device: torch.device) -> T:
+    """What `make` returns in the first process, plain values; the others wait and do not call it.
+
+    Args:
+        device: of the process.
+    """
+    if not several():
+        return make()
+    made = [make() if is_first() else None]
+    distributed.broadcast_object_list(made, src=0, device=device)
+    return made[0]  # type: ignore[return-value]
+
+
+def mean(value: float, device: torch.device) -> float:
+    """Mean of a number over all processes, the same to the last bit in each.
+
+    Args:
+        device: of the process.
+    """
+    if not several():
+        return value
+    total = torch.tensor(value, dtype=torch.float64, device=device)
+    distributed.all_reduce(total)
+    return float(total) / distributed.get_world_size()
+
+
+def averaging(model: nn.Module, device: torch.device) -> nn.Module:
+    """The model as one to train with: its weights become those of the first process, and gradients
+    after `backward` are the mean over all processes.
+
+    Args:
+        device: of the process, where the model is.
+    """
+    if not several():
+        return model
+    numbers = None if device.type == "cpu" else [device.index]
+    return DistributedDataParallel(model, device_ids=numbers, find_unused_parameters=True)

@@ -1,0 +1,153 @@
+"""Scene experts that no region needs leave the field when the gate is frozen.
+
+The expert with the least surface mass is tried first: its points go to the best expert that is
+left, and held-out rays are rendered again. While the image price of all that have gone is within
+its bound the next one is tried; at the first failure, or at the last expert, it is over. The gate
+stays as it is, and with it o(x) and everything that is skipped.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, NamedTuple
+
+import torch
+from torch import Tensor
+
+from leco_plugin.models.compute.ranks import from_first, say
+from leco_plugin.models.freezing.calibration import EXACT, near_median_depth, price_db
+from leco_plugin.models.freezing.freezing import evaluating
+from leco_plugin.models.rendering import Intervals, Rays
+
+if TYPE_CHECKING:
+    from leco_plugin.models.leco import LecoModel
+
+
+@dataclass(frozen=True)
+class MergingConfig:
+    """Which scene experts are left when the gate is frozen."""
+
+    image_price_db: float | None = 0.01
+    """Largest loss of PSNR on held-out rays for which scene experts are dropped, all together, dB;
+    with `calibration.image_price_db` it makes 0.05. None drops none."""
+    rays: int = 2048
+    """Held-out training rays to measure with."""
+
+
+class Trial(NamedTuple):
+    """What the image loses without some scene experts."""
+
+    expert: int
+    """The last that was taken out, in [1, n]."""
+    share: float
+    """Of the surface mass that it held."""
+    price_db: float
+    """Of all that had been taken out by then."""
+
+
+class Merging(NamedTuple):
+    """What was tried, in this order."""
+
+    dropped: list[Trial]
+    refused: Trial | None
+    """None where one expert is left."""
+
+
+def merge(model: LecoModel, draw: Callable[[int], tuple[Rays, Tensor]]) -> None:
+    """Drops the scene experts that a frozen model does not need, and says so.
+
+    All processes of a data-parallel run drop those that the first one finds.
+
+    Args:
+        draw: up to so many held-out rays, cut to the model's bounds, and their pixels [R, 3 or 4].
+    """
+    config, experts = model.config.merging, model.field.experts
+    bound = config.image_price_db
+    if bound is None or model.config.homogeneous or int(experts.left.sum()) == 1:
+        return
+    found = from_first(lambda: find_unneeded(model, *draw(config.rays), bound), model.device)
+    for trial in found.dropped:
+        experts.drop(trial.expert)
+    say(line_of(found, int(experts.left.sum())))
+
+
+@torch.no_grad()
+def find_unneeded(model: LecoModel, rays: Rays, truth: Tensor, bound: float) -> Merging:
+    """Tries scene experts as this module says; the model is left as it was.
+
+    Args:
+        rays: held-out rays, cut to the model's bounds.
+        truth: [R, 3 or 4] their pixels.
+        bound: largest image price, dB.
+    """
+    with evaluating(model):
+        chunks, truths = _in_chunks(model, rays, truth)
+        experts = model.field.experts
+        shares, before = _surface_and_error(model, chunks, truths)
+        out: list[tuple[int, torch.nn.Module]] = []
+        dropped: list[Trial] = []
+        refused = None
+        while int(experts.left.sum()) > 1 and refused is None:
+            held = shares[1:].masked_fill(~experts.left.cpu(), torch.inf)
+            expert = int(held.argmin()) + 1
+            share = float(shares[expert])
+            out.append((expert, experts.drop(expert)))
+            shares_without, error = _surface_and_error(model, chunks, truths)
+            price = price_db(float(error), float(before), EXACT)
+            if price <= bound:
+                dropped.append(Trial(expert, share, price))
+                shares = shares_without
+            else:
+                refused = Trial(expert, share, price)
+        for expert, module in out:
+            experts.put_back(expert, module)
+    return Merging(dropped, refused)
+
+
+Chunk = tuple[Rays, Intervals]
+
+
+def _in_chunks(model: LecoModel, rays: Rays, truth: Tensor) -> tuple[list[Chunk], list[Tensor]]:
+    """Rays, some at a time, with what the occupancy keeps along them, and their true pixels."""
+    at_once = model.config.calibration.rays_at_once
+    skips = float(model.threshold) > 0.0
+    chunks = []
+    for first in range(0, len(truth), at_once):
+        part = slice(first, first + at_once)
+        some = Rays._make(None if value is None else value[part] for value in rays)
+        chunks.append((some, model.intervals_of(some, guided=skips, learning=False)))
+    return chunks, list(model.renderer_rgb.blend_background(truth).split(at_once))
+
+
+def _surface_and_error(
+    model: LecoModel, chunks: list[Chunk], truths: list[Tensor]
+) -> tuple[Tensor, Tensor]:
+    """Share of the surface mass at each expert [1 + n], and the mean squared error of the image."""
+    mass = torch.zeros(1 + len(model.field.experts.left), dtype=torch.float64)
+    error, values = torch.zeros((), dtype=torch.float64), 0
+    for (rays, intervals), truth in zip(chunks, truths, strict=True):
+        shaded = model.shade(rays, intervals)
+        on_surface = (shaded.weights * near_median_depth(shaded, intervals)).double()
+        mass += torch.bincount(shaded.routes, on_surface, minlength=len(mass)).cpu()
+        error += (shaded.rgb - truth).square().sum(dtype=torch.float64).cpu()
+        values += truth.numel()
+    return mass / mass.sum().clamp(min=1e-12), error / max(values, 1)
+
+
+def line_of(found: Merging, left: int) -> str:
+    """What came out, for the log."""
+    parts = []
+    if found.dropped:
+        names = " and ".join(
+            f"{trial.expert} ({trial.share:.1%} of the surface mass)" for trial in found.dropped
+        )
+        price = found.dropped[-1].price_db
+        parts.append(f"dropped: {names}, for {price:+.3f} dB; their points go to those left")
+    if found.refused is not None:
+        trial = found.refused
+        parts.append(
+            f"without {trial.expert} ({trial.share:.1%}) the image would lose {trial.price_db:.3f} "
+            "dB"
+        )
+    return f"scene experts: {left} left; " + "; ".join(parts)

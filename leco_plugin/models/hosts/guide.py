@@ -1,0 +1,218 @@
+"""What guides a host: an occupancy with its place in the host's checkpoints.
+
+A host keeps stand-ins where it had its own samplers (`stand_ins`). They are made before there is an
+occupancy: it may still have to be learned, or to come with a checkpoint whose gate has a shape of
+its own.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import torch
+from nerfstudio.model_components.ray_samplers import Sampler
+from nerfstudio.viewer_legacy.server.viewer_utils import IOChangeException
+from torch import Tensor, nn
+
+from leco_plugin.models.gate import Gate, GateConfig
+from leco_plugin.models.hosts.stand_ins import GuidedEstimator, GuidedProposal
+from leco_plugin.occupancy import Occupancy
+from leco_plugin.samplers.base import DensityFn, Estimator
+from leco_plugin.samplers.registry import (
+    SamplerSpec,
+    build_estimator,
+    refuse_unknown_options,
+    sampler_spec,
+)
+from leco_plugin.scenes.input_error import InputError, one_line
+from leco_plugin.space import Space
+
+CAREFULLY = "carefully"
+"""In `Guide.watched`: the lower threshold that a host follows for the beginning, if it does."""
+
+
+class NoOccupancyYet(RuntimeError, IOChangeException):
+    """A guided host was asked before it had an occupancy.
+
+    As an `IOChangeException` it tells nerfstudio's viewer, which may have a client before the first
+    step, that there is no picture for now; any other exception would end its rendering for good.
+    """
+
+
+class Guide(nn.Module):
+    """The occupancy of a host, with its place in the host's checkpoints.
+
+    Args:
+        sampler: name in the registry of samplers.
+        options: of that sampler.
+        front_to_back: whether packed hosts render so, see `Estimator.density_fn`.
+
+    Attributes:
+        occupancy: None until there is one.
+        dense: whether packed samplers keep every candidate for the moment, as a reference.
+        kept: samples that a packed sampler kept when it was last asked in training.
+        watched: what was found of the price of skipping, and what is followed until it is; travels
+            with a checkpoint.
+        first_density: with which the host's field began, None for its own; see `opaque_start`.
+        frame: [3, 4] takes positions of the host to those of the occupancy: a rotation times a
+            scale, and a translation.
+    """
+
+    frame: Tensor
+
+    def __init__(
+        self,
+        sampler: str = "learned-occupancy",
+        options: Mapping[str, Any] | None = None,
+        front_to_back: bool = False,
+    ) -> None:
+        super().__init__()
+        self.sampler, self.front_to_back = sampler, front_to_back
+        self.options = dict(options or {})
+        self.occupancy: Occupancy | None = None
+        self.version = 0
+        self.dense = False
+        self.kept: int | None = None
+        self.watched: dict[str, Any] = {}
+        self.first_density: float | None = None
+        self.register_buffer("frame", torch.eye(3, 4))
+        self.register_load_state_dict_post_hook(lambda guide, _: guide.changed())
+
+    @property
+    def needs_occupancy(self) -> bool:
+        """Whether the sampler asks a gate at all; a grid does not.
+
+        Raises:
+            InputError: there is no such sampler.
+        """
+        return self._spec().needs_occupancy
+
+    def _spec(self, kind: str | None = None) -> SamplerSpec:
+        """What is registered under the sampler's name, and serves this kind of hosts."""
+        try:
+            spec = sampler_spec(self.sampler)
+            if kind is not None:
+                if getattr(spec, kind) is None:
+                    raise ValueError(
+                        f"the sampler {self.sampler!r} cannot go into this host: it has no {kind}"
+                    )
+                refuse_unknown_options(self.sampler, self.options, (kind,))
+        except ValueError as error:
+            raise InputError(str(error)) from None
+        return spec
+
+    def changed(self) -> None:
+        """Samplers that were made are made anew when they are next asked."""
+        self.version += 1
+
+    def set_occupancy(self, occupancy: Occupancy, frame: Tensor | None = None) -> None:
+        """Guides by this occupancy from now on; `frame` as the attribute, None for no change."""
+        self.occupancy = occupancy.to(self.frame.device).eval()
+        self.occupancy.requires_grad_(False)
+        if frame is not None:
+            self.frame.copy_(frame)
+        self.changed()
+
+    def the_occupancy(self) -> Occupancy:
+        """The occupancy.
+
+        Raises:
+            NoOccupancyYet: there is none yet.
+        """
+        if self.occupancy is None:
+            raise NoOccupancyYet(
+                "this model has no occupancy yet: train it, load a checkpoint, or give a file with "
+                "--pipeline.model.occupancy.path"
+            )
+        return self.occupancy
+
+    def followed(self) -> Occupancy:
+        """The occupancy with the threshold that packed samplers follow for now.
+
+        Raises:
+            NoOccupancyYet: there is none yet.
+        """
+        occupancy, lower = self.the_occupancy(), self.watched.get(CAREFULLY)
+        return occupancy if lower is None else occupancy.with_threshold(lower)
+
+    def the_occupancy_skips(self) -> bool:
+        """Whether it skips anything; at threshold 0 it does not, and need not be asked."""
+        return not self.needs_occupancy or self.the_occupancy().threshold > 0.0
+
+    def same_frame(self) -> bool:
+        """Whether host and occupancy share their coordinates."""
+        return torch.equal(self.frame, torch.eye(3, 4, device=self.frame.device))
+
+    def estimator(
+        self,
+        aabb: Tensor | None,
+        outermost: Tensor | None = None,
+        density_fn: DensityFn | None = None,
+    ) -> nn.Module:
+        """What goes where a packed host has its estimator.
+
+        Args:
+            aabb: box of that estimator, [6]; None where the host cuts its rays itself.
+            outermost: the box in which the host's own samples at all, [6]; None is no such box.
+            density_fn: the host's density at positions [N, 3], for rendering front to back.
+        Raises:
+            InputError: the sampler has no estimator, or not all of its options.
+        """
+        if self._spec("estimator").needs_occupancy:
+            return GuidedEstimator(self, aabb, outermost, density_fn)
+        estimator = self.built(build_estimator, aabb=aabb, occupancy=None)
+        if self.front_to_back and isinstance(estimator, Estimator):
+            estimator.density_fn = density_fn
+        return estimator
+
+    def built(self, build: Callable[..., nn.Module], **given: Any) -> nn.Module:
+        """The sampler that this host calls, with its options.
+
+        Args:
+            build: the registry's `build_estimator` or `build_proposal`.
+            given: what a host gives a builder.
+        Raises:
+            InputError: it cannot be built so.
+        """
+        try:
+            return build(self.sampler, **{**given, **self.options})
+        except (ValueError, TypeError, OverflowError, RuntimeError) as error:
+            options = f" (its options: {self.options})" if self.options else ""
+            why = one_line(error) or type(error).__name__
+            raise InputError(
+                f"the sampler {self.sampler!r} cannot be built: {why}{options}"
+            ) from error
+
+    def proposal(self, **options: Any) -> Sampler:
+        """What goes where a proposal host has its sampler; options as for the registry.
+
+        Raises:
+            InputError: the sampler has nothing for proposal hosts, or not all of its options.
+        """
+        needs_occupancy = self._spec("proposal").needs_occupancy
+        made = GuidedProposal(self, options)
+        if not needs_occupancy:
+            _ = made.sampler  # what is wrong with its options is said now
+        return made
+
+    def get_extra_state(self) -> dict[str, Any]:
+        """What a checkpoint must say before the gate's weights can be read."""
+        if self.occupancy is None:
+            return {}
+        return {
+            "gate": self.occupancy.gate.config.to_dict(),
+            "precision": self.occupancy.precision,
+            "report": self.occupancy.report,
+            "watched": self.watched,
+            "first_density": self.first_density,
+        }
+
+    def set_extra_state(self, state: dict[str, Any]) -> None:
+        """Makes an occupancy of the checkpoint's shape; torch then reads its weights."""
+        if state:
+            self.watched = dict(state.get("watched", {}))
+            self.first_density = state.get("first_density")
+            gate = Gate(GateConfig.from_dict(state["gate"]))
+            occupancy = Occupancy(gate, Space(), 0.0, state["precision"], state["report"])
+            self.set_occupancy(occupancy)

@@ -1,0 +1,170 @@
+"""Learns an occupancy inside the run of another method, before that method's own first step."""
+
+from __future__ import annotations
+
+import math
+import time
+from typing import Any
+
+import torch
+from nerfstudio.engine.callbacks import TrainingCallbackAttributes
+from torch import nn
+
+from leco_plugin.models.compute.optimizers import RATES, FusedAdamConfig
+from leco_plugin.models.compute.ranks import averaging, mean
+from leco_plugin.models.learning.lifecycle import Lifecycle
+from leco_plugin.models.learning.phases import MOST_EXTENSIONS, steps_of_an_extension
+from leco_plugin.models.learning.progress import Progress
+from leco_plugin.models.leco import LecoModel
+from leco_plugin.models.leco_config import LecoModelConfig
+from leco_plugin.occupancy import Occupancy
+from leco_plugin.progress_bar import bar
+from leco_plugin.scenes.detail import CAMERAS
+from leco_plugin.scenes.input_error import InputError
+from leco_plugin.scenes.known_distances import sampler_here
+
+FIRST_TIMED, TIMED_STEPS = 5, 15
+"""Steps between which a step is timed, to keep to a budget; the first ones are slow."""
+FEWEST_STEPS = 20
+OF_LEARNER, OF_HOST = "--pipeline.model.", "--pipeline.model.occupancy.learning."
+"""Where the options of what learns are, in `leco-occupancy` and in a guided host."""
+
+
+def learn_occupancy(
+    config: LecoModelConfig,
+    pipeline: Any,
+    rays: int,
+    seconds: float | None = None,
+    rate: float = 1.0,
+) -> Occupancy:
+    """Trains an HMoE on the pipeline's data until its gate is frozen and calibrated.
+
+    Arguments and errors as for `learn_model`, with options named as they are given to a host.
+
+    Returns:
+        The occupancy, in the coordinates of the pipeline's model.
+    """
+    try:
+        model = learn_model(config, pipeline, rays, seconds, rate)
+    except InputError as error:
+        raise InputError(str(error).replace(OF_LEARNER, OF_HOST)) from None
+    occupancy: Occupancy = model.occupancy()
+    return occupancy.eval()
+
+
+def learn_model(
+    config: LecoModelConfig,
+    pipeline: Any,
+    rays: int,
+    seconds: float | None = None,
+    rate: float = 1.0,
+) -> LecoModel:
+    """Trains an HMoE on the pipeline's data until its gate is frozen, field and all.
+
+    All processes of a data-parallel run learn it together, and have the same at the end.
+
+    Args:
+        config: of the HMoE.
+        pipeline: a nerfstudio pipeline; only its data manager and device are used, and its batches
+            are as long as before when this returns.
+        rays: of a batch.
+        seconds: how long this may take at most, about; None takes the config's learning steps.
+        rate: multiple of the learning rates.
+    Returns:
+        The model as it is at the moment of freezing.
+    Raises:
+        InputError: as `check_budget`; the gate would never be frozen; or its sizes cannot be.
+        FloatingPointError, RuntimeError: learning failed; one line says where and why.
+    """
+    check_budget(rays, seconds, rate)
+    manager = pipeline.datamanager
+    dataset = manager.train_dataset
+    if config.homogeneous or not config.schedule.freeze:
+        raise InputError(
+            "this run would learn an occupancy for ever: with homogeneous, or schedule.freeze "
+            "False, none is frozen. Those are for leco-occupancy, which guides no other method"
+        )
+    model: Any = config.setup(
+        scene_box=dataset.scene_box,
+        num_train_data=len(dataset),
+        metadata={**(dataset.metadata or {}), CAMERAS: dataset.cameras},
+        device=pipeline.device,
+    ).to(pipeline.device)
+    model.train()
+    trained = averaging(model, model.device)
+    sampler = sampler_here(manager)
+    before = sampler.num_rays_per_batch if sampler is not None else 0
+    if sampler is not None:
+        sampler.set_num_rays_per_batch(rays)
+    lifecycle = Lifecycle(model, TrainingCallbackAttributes(None, None, pipeline, None))
+    lifecycle.batches.rays_per_batch = rays
+    groups = model.get_param_groups()
+    lifecycle.optimizers = [
+        FusedAdamConfig(lr=rate * RATES[name]).setup(p) for name, p in groups.items()
+    ]
+    try:
+        with bar("Learning the occupancy") as show:
+            _train(trained, lifecycle, manager, seconds, show)
+    finally:
+        if sampler is not None:
+            sampler.set_num_rays_per_batch(before)
+    learned: LecoModel = model
+    return learned
+
+
+def check_budget(rays: int, seconds: float | None, rate: float) -> None:
+    """Whether something can be learned so; arguments as for `learn_model`.
+
+    Raises:
+        InputError: not so.
+    """
+    if seconds is not None and not 0.0 < seconds < math.inf:
+        raise InputError(f"an occupancy is learned in a positive number of seconds, not {seconds}")
+    if rays < 1:
+        raise InputError(f"an occupancy is learned on at least one ray a batch, not {rays}")
+    if not 0.0 < rate < math.inf:
+        raise InputError(f"the multiple of the learning rates must be positive, not {rate}")
+
+
+def keep_within(progress: Progress, more: float, done: int) -> None:
+    """Shortens learning to so many more steps, which fit into the time that is left.
+
+    What does not fit of the further steps that a gate gets when it has not settled, it has had.
+    """
+    fit = max(FEWEST_STEPS, done + int(more))
+    progress.learn_steps = min(progress.learn_steps, fit)
+    extensions = (fit - progress.learn_steps) // steps_of_an_extension(progress.configured)
+    progress.extensions = max(0, MOST_EXTENSIONS - extensions)
+
+
+def _train(
+    trained: nn.Module,
+    lifecycle: Lifecycle,
+    manager: Any,
+    seconds: float | None,
+    show: Any,
+) -> None:
+    model, optimizers = lifecycle.model, lifecycle.optimizers
+    started = time.monotonic()
+    step, timed_from = 0, started
+    while not bool(model.frozen):
+        lifecycle.before_step(step)
+        bundle, batch = manager.next_train(step)
+        losses = model.get_loss_dict(trained(bundle), batch)
+        for optimizer in optimizers:
+            optimizer.zero_grad(set_to_none=True)
+        torch.stack(list(losses.values())).sum().backward()
+        for optimizer in optimizers:
+            optimizer.step()
+        step += 1
+        if step == FIRST_TIMED:
+            timed_from = time.monotonic()
+        if seconds is not None and step >= TIMED_STEPS and lifecycle.progress.recoveries == 0:
+            left = mean(seconds - (time.monotonic() - started), model.device)
+            if step == TIMED_STEPS:
+                a_step = mean(time.monotonic() - timed_from, model.device) / (step - FIRST_TIMED)
+                keep_within(lifecycle.progress, left / a_step, step)
+            elif left <= 0.0:  # steps have become slower
+                keep_within(lifecycle.progress, 0.0, step)
+        lifecycle.after_step(step - 1)
+        show(min(1.0, step / lifecycle.progress.learn_steps))

@@ -1,0 +1,43 @@
+"""A guided host begins by skipping less, until skipping has shown its price in the host itself.
+
+A calibrated threshold keeps its price in the field that the gate was learned with. In haze, which
+that field explains by few places, another host that may not look elsewhere from its first step on
+never finds a better explanation. So a packed host begins with a lower threshold; after the first
+measurement (`host_watch`) it follows the calibrated one, unless that costs too much.
+"""
+
+from __future__ import annotations
+
+from torch import nn
+
+from leco_plugin.models.compute.ranks import say
+from leco_plugin.models.freezing.calibration import THRESHOLDS
+from leco_plugin.models.hosts.guide import CAREFULLY, Guide
+from leco_plugin.models.hosts.stand_ins import GuidedEstimator
+
+CAREFUL = 1.0 / 16.0
+"""Share of the calibrated threshold that a host begins with, where that is a threshold at all."""
+
+
+def begin_carefully(host: nn.Module, guide: Guide) -> bool:
+    """Has a packed host follow a lower threshold for the beginning; returns whether it does."""
+    packed = any(isinstance(module, GuidedEstimator) for module in host.modules())
+    calibrated = guide.the_occupancy().threshold
+    lower = max(CAREFUL * calibrated, THRESHOLDS[-1])
+    if not packed or calibrated < 1.1 * lower:
+        return False
+    guide.watched[CAREFULLY] = lower
+    guide.changed()
+    say(
+        f"the host begins at threshold {lower:.4f} instead of {calibrated:.4f}, until skipping has "
+        "shown in it what it costs"
+    )
+    return True
+
+
+def end_probation(guide: Guide) -> float | None:
+    """Has a host follow the calibrated threshold; returns the lower one, None where it has none."""
+    lower: float | None = guide.watched.pop(CAREFULLY, None)
+    if lower is not None:
+        guide.changed()
+    return lower

@@ -1,0 +1,248 @@
+"""Where a host asks for samples, and how that is replaced (entry-point group `leco_plugin.hosts`).
+
+A seam is found by its type, wherever the host keeps it and whatever it calls it. A host that
+samples in another way brings a `HostAdapter`.
+"""
+
+from __future__ import annotations
+
+import functools
+import warnings
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, cast
+
+from torch import nn
+
+from leco_plugin.entries import foreign_entries
+from leco_plugin.models.hosts.guide import Guide
+from leco_plugin.samplers.base import DensityFn, Estimator
+from leco_plugin.scenes.input_error import InputError
+
+if TYPE_CHECKING:
+    from nerfstudio.models.base_model import Model
+
+GROUP = "leco_plugin.hosts"
+
+
+@dataclass(frozen=True)
+class HostAdapter:
+    """How the sampler of a kind of host is replaced.
+
+    Of a model with the attributes `my_sampler` and `my_grid`:
+
+        def swap(host, guide):
+            host.my_sampler = guide.estimator(host.scene_box.aabb.flatten())
+            del host.my_grid
+
+        ADAPTER = HostAdapter("my grid", lambda host: isinstance(host, MyModel), swap)
+
+    and in that package's `pyproject.toml`:
+
+        [project.entry-points."leco_plugin.hosts"]
+        my-method = "my_package.adapting:ADAPTER"
+    """
+
+    description: str
+    """What it looks for, for the error that nothing was found."""
+    fits: Callable[[Model], bool]
+    """Whether a model is such a host."""
+    swap: Callable[[Model, Guide], None]
+    """Puts `guide.estimator(...)` or `guide.proposal(...)` in the place of the host's own sampling,
+    and takes away what that makes superfluous."""
+
+
+def adapters() -> dict[str, HostAdapter]:
+    """All adapters by name, those of other packages first."""
+    ours = {"sample-with": SAMPLE_WITH, "packed": PACKED, "proposal": PROPOSAL}
+    return {**foreign_entries(GROUP, HostAdapter, frozenset(ours)), **ours}
+
+
+def swap_sampler(host: Model, guide: Guide) -> str:
+    """Replaces the host's sampling by the guide's; returns the name of the adapter that did.
+
+    Raises:
+        InputError: the host has no seam that any adapter knows.
+    """
+    from leco_plugin.samplers import nerfacc_cpu
+
+    nerfacc_cpu.install()
+    known = adapters()
+    for name, adapter in known.items():
+        if _fits(name, adapter, host):
+            adapter.swap(host, guide)
+            _leave_out_what_is_not_trained(host, guide)
+            return name
+    looked_for = "; ".join(f"{name}: {adapter.description}" for name, adapter in known.items())
+    raise InputError(
+        f"{type(host).__name__} has no sampler that could be swapped. Looked for: {looked_for}. "
+        f"A package can bring a HostAdapter in the entry-point group {GROUP}: "
+        "see help(leco_plugin.models.hosts.seams.HostAdapter)"
+    )
+
+
+def _fits(name: str, adapter: HostAdapter, host: Model) -> bool:
+    """Whether an adapter takes this host; one that cannot tell does not keep others from it."""
+    try:
+        return adapter.fits(host)
+    except Exception as error:  # noqa: BLE001 (whatever a foreign adapter raises)
+        warnings.warn(f"{GROUP} {name!r} is left out: {error!r}", stacklevel=3)
+        return False
+
+
+def _sample_with(host: Any, guide: Guide) -> None:
+    """Such a host cuts its rays itself, at bounds that it may not know yet: it needs no box."""
+    if guide.sampler == "occupancy-grid":
+        raise InputError(
+            f"{type(host).__name__} makes a grid that fits its bounds itself: with "
+            "--pipeline.model.sampling occupancy-grid of the method that is not guided"
+        )
+    host.sample_with(guide.estimator(None, density_fn=getattr(host, "density_fn", None)))
+
+
+SAMPLE_WITH = HostAdapter(
+    "a method sample_with(estimator), as switch-nerf has",
+    lambda host: callable(getattr(host, "sample_with", None)),
+    _sample_with,
+)
+
+
+def _replace(host: nn.Module, old: nn.Module, new: nn.Module) -> None:
+    """Puts `new` wherever the host or a module in it holds `old`."""
+    for parent in list(host.modules()):
+        for name, child in list(parent._modules.items()):
+            if child is old:
+                setattr(parent, name, new)
+
+
+def _estimators(host: nn.Module) -> list[nn.Module]:
+    """What marches rays through boxes in a host."""
+    from nerfacc.estimators.base import AbstractEstimator
+    from nerfacc.estimators.prop_net import PropNetEstimator
+
+    return [
+        module
+        for module in host.modules()
+        if isinstance(module, AbstractEstimator | Estimator)
+        and not isinstance(module, PropNetEstimator)
+        and len(getattr(module, "aabbs", ())) > 0
+    ]
+
+
+def _density_beside(host: nn.Module, estimator: nn.Module) -> DensityFn | None:
+    """The host's density, as the sampler that holds the estimator has it."""
+    for module in host.modules():
+        if estimator in module._modules.values():
+            density_fn = getattr(module, "density_fn", None)
+            if callable(density_fn):
+                return cast(DensityFn, density_fn)
+    return None
+
+
+def _swap_packed(host: Model, guide: Guide) -> None:
+    for old in _estimators(host):
+        boxes: Any = old.aabbs
+        # of nested boxes the first is the scene's, and nothing is sampled outside the last
+        new = guide.estimator(boxes[0].detach(), boxes[-1].detach(), _density_beside(host, old))
+        _replace(host, old, new)
+
+
+PACKED = HostAdapter(
+    "an estimator of nerfacc (OccGridEstimator) that a volumetric sampler asks",
+    lambda host: bool(_estimators(host)),
+    _swap_packed,
+)
+
+
+def _proposal_samplers(host: nn.Module) -> list[Any]:
+    from nerfstudio.model_components.ray_samplers import ProposalNetworkSampler
+
+    return [module for module in host.modules() if isinstance(module, ProposalNetworkSampler)]
+
+
+def _swap_proposal(host: Model, guide: Guide) -> None:
+    for old in _proposal_samplers(host):
+        initial = old.initial_sampler
+        _replace(
+            host,
+            old,
+            guide.proposal(
+                num_samples=old.num_nerf_samples_per_ray,
+                initial_sampler=initial,
+                single_jitter=bool(getattr(initial, "single_jitter", False)),
+            ),
+        )
+    _remove_density_networks(host)
+    _leave_out_proposal_loss(host)
+
+
+PROPOSAL = HostAdapter(
+    "a ProposalNetworkSampler of nerfstudio",
+    lambda host: bool(_proposal_samplers(host)),
+    _swap_proposal,
+)
+
+
+def no_density(*_: Any, **__: Any) -> None:
+    """Stands in a host's list of proposal densities: their number is asked for, not they.
+
+    Raises:
+        RuntimeError: it is called after all.
+    """
+    raise RuntimeError("a guided host has no proposal networks to ask for a density")
+
+
+def _density_lists(host: nn.Module) -> Iterator[tuple[str, list[Any] | tuple[Any, ...]]]:
+    """Lists of methods of modules in the host, as proposal hosts hand to their sampler; those of
+    its own methods are for something else."""
+    for name, value in vars(host).items():
+        if isinstance(value, list | tuple) and value:
+            owners = [getattr(item, "__self__", None) for item in value]
+            if all(isinstance(owner, nn.Module) and owner is not host for owner in owners):
+                yield name, value
+
+
+def _remove_density_networks(host: nn.Module) -> None:
+    """Drops the proposal networks from memory, state dict and parameter groups.
+
+    An empty module takes their places: a host may go on listing their parameters.
+    """
+    field = getattr(host, "field", None)
+    for name, densities in list(_density_lists(host)):
+        for network in {density.__self__ for density in densities} - {field}:
+            _replace(host, network, nn.Module())
+        setattr(host, name, type(densities)([no_density] * len(densities)))
+
+
+def _leave_out_proposal_loss(host: Model) -> None:
+    """A loss that reaches no parameter, as the one of proposal networks now, is left out."""
+    with_all = host.get_loss_dict
+
+    @functools.wraps(with_all)
+    def get_loss_dict(*args: Any, **kwargs: Any) -> dict[str, Any]:
+        losses = with_all(*args, **kwargs)
+        if not host.training:
+            return losses
+        return {name: loss for name, loss in losses.items() if loss.requires_grad}
+
+    host.get_loss_dict = get_loss_dict  # type: ignore[method-assign]
+
+
+def _leave_out_what_is_not_trained(host: Model, guide: Guide) -> None:
+    """Groups of parameters are handed out without the gate, and not at all when they are empty.
+
+    An optimizer takes no empty list. A gate among its parameters would be one more of them in a run
+    that was given a file than in the same run resumed without.
+    """
+    with_all = host.get_param_groups
+
+    @functools.wraps(with_all)
+    def get_param_groups() -> dict[str, list[nn.Parameter]]:
+        frozen = {id(parameter) for parameter in guide.parameters()}
+        groups = {
+            name: [parameter for parameter in group if id(parameter) not in frozen]
+            for name, group in with_all().items()
+        }
+        return {name: group for name, group in groups.items() if group}
+
+    host.get_param_groups = get_param_groups  # type: ignore[method-assign]

@@ -1,0 +1,237 @@
+"""What stands where a host had its own grid or proposal networks.
+
+Behind it is a sampler of the registry, built when it is first asked and again when the occupancy
+has changed. It is asked in the occupancy's coordinates, and the host is answered in its own.
+"""
+
+from __future__ import annotations
+
+import functools
+import inspect
+from typing import TYPE_CHECKING, Any, cast
+
+import torch
+from nerfstudio.model_components.ray_samplers import Sampler
+from torch import Tensor, nn
+
+from leco_plugin.models.rendering import Intervals, Rays, with_backdrop
+from leco_plugin.samplers.base import DensityFn, Estimator
+from leco_plugin.samplers.estimator import cell_centers
+from leco_plugin.samplers.rays import intersect_box, usable_rays
+from leco_plugin.samplers.registry import build_estimator, build_proposal
+from leco_plugin.scenes.frames import box_around, inverse, moved, turned
+
+if TYPE_CHECKING:
+    from leco_plugin.models.hosts.guide import Guide
+
+
+class _StandIn(nn.Module):
+    """Builds the real sampler when it is first asked, and again when the occupancy has changed."""
+
+    def __init__(self, guide: Guide) -> None:
+        super().__init__()
+        # in tuples: neither the guide nor the sampler is a part of this module's state
+        self._guide = (guide,)
+        self._built: tuple[Any, tuple[nn.Module, ...]] = (None, ())
+
+    def _build(self, guide: Guide) -> nn.Module:
+        raise NotImplementedError
+
+    def __dir__(self) -> list[str]:
+        """Without properties: nerfstudio's viewer takes the value of every name that it finds here,
+        and these build a sampler, for which there may be no occupancy yet, and ask it at length."""
+        found = {name: getattr(type(self), name, None) for name in super().__dir__()}
+        return [name for name, value in found.items() if not isinstance(value, property)]
+
+    @property
+    def sampler(self) -> nn.Module:
+        """The sampler behind this; its mode follows the host's."""
+        (guide,) = self._guide
+        key = (guide.version, guide.frame.device)
+        if self._built[0] != key:
+            self._built = (key, (self._build(guide).to(guide.frame.device),))
+        return self._built[1][0].train(self.training)
+
+
+_SAMPLING = inspect.signature(Estimator.sampling)
+
+
+_DEFAULTS = {name: parameter.default for name, parameter in _SAMPLING.parameters.items()}
+
+
+def _ending_in_a_backdrop(
+    samples: tuple[Tensor, Tensor, Tensor],
+    rays_o: Tensor,
+    rays_d: Tensor,
+    options: dict[str, Any],
+    walls: Tensor,
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Packed samples whose rays end in one interval that no gate skips.
+
+    The gate was learned before such a backdrop, and skips what that shows: a host without one would
+    have no place for the sky.
+
+    Args:
+        samples: of a sampler, in which rays may have none.
+        options: of its `sampling`.
+        walls: [6] of the occupancy: where a ray leaves them its backdrop begins; one that misses
+            them has it at its end.
+    """
+    options = _DEFAULTS | options
+    ends = rays_o.new_full((len(rays_o),), float(options["far_plane"]))
+    ends = ends if options["t_max"] is None else ends.minimum(options["t_max"])
+    enters, leaves = intersect_box(rays_o, rays_d, walls)
+    ends = torch.where(leaves > enters.clamp(min=0.0), leaves.minimum(ends), ends)
+    begins = torch.full_like(ends, float(options["near_plane"]))
+    rays = Rays(rays_o, rays_d, begins, ends, None)
+    ended = with_backdrop(
+        Intervals(*samples), rays, options["render_step_size"], options["cone_angle"]
+    )
+    usable = usable_rays(torch.stack([rays_o.t(), rays_d.t()]), begins, ends)
+    kept = usable[ended.ray_indices] | (ended.t_ends < ends[ended.ray_indices])
+    return ended.ray_indices[kept], ended.t_starts[kept], ended.t_ends[kept]
+
+
+class GuidedEstimator(_StandIn):
+    """A packed sampler of the registry, in the host's coordinates."""
+
+    def __init__(
+        self,
+        guide: Guide,
+        aabb: Tensor | None,
+        outermost: Tensor | None = None,
+        density_fn: DensityFn | None = None,
+    ) -> None:
+        super().__init__(guide)
+        self._density_fn = density_fn
+        self._aabb = None if aabb is None else aabb.detach().cpu()
+        self._outermost = None if outermost is None else outermost.detach().cpu()
+
+    def _build(self, guide: Guide) -> nn.Module:
+        aabb = self._aabb
+        if aabb is not None and not guide.same_frame():
+            aabb = box_around(aabb, guide.frame.cpu())
+        estimator = guide.built(build_estimator, aabb=aabb, occupancy=guide.followed())
+        if guide.front_to_back and isinstance(estimator, Estimator):
+            estimator.density_fn = self._density_of(guide)
+        return estimator
+
+    def _density_of(self, guide: Guide) -> DensityFn | None:
+        """The host's density, asked at positions of the occupancy."""
+        ask = self._density_fn
+        if ask is None or guide.same_frame():
+            return ask
+        back = inverse(guide.frame)
+        return lambda positions: ask(moved(positions, back))
+
+    @functools.wraps(Estimator.sampling)
+    def sampling(self, rays_o: Tensor, rays_d: Tensor, *args: Any, **kwargs: Any) -> Any:
+        (guide,) = self._guide
+        estimator: Any = self.dense if guide.dense else self.sampler
+        options = self._with_an_end(_SAMPLING.bind(self, rays_o, rays_d, *args, **kwargs).arguments)
+        if not guide.same_frame():
+            # a direction carries the scale, so that distances along the ray stay the host's
+            frame = guide.frame.to(rays_o)
+            rays_o, rays_d = moved(rays_o, frame), turned(rays_d, frame)
+        samples = estimator.sampling(rays_o, rays_d, **options)
+        if self.training:
+            guide.kept = len(samples[0])
+        occupancy = guide.the_occupancy()
+        if occupancy.shows_a_backdrop() and not (guide.dense and self._is_endless()):
+            samples = _ending_in_a_backdrop(samples, rays_o, rays_d, options, occupancy.walls)
+        return samples
+
+    @property
+    def dense(self) -> nn.Module:
+        """Keeps every candidate that the sampler behind this asks about."""
+        (guide,) = self._guide
+        box = self.sampler.bounds() if isinstance(self.sampler, Estimator) else None
+        return build_estimator("dense", aabb=box).to(guide.frame.device).train(self.training)
+
+    def _with_an_end(self, arguments: dict[str, Any]) -> dict[str, Any]:
+        """The options of `sampling`; rays that would go on for ever end at the host's box.
+
+        A host whose steps do not grow relies on the box of its own estimator, and an unbounded
+        occupancy has none.
+        """
+        _, rays_o, rays_d = (arguments.pop(name) for name in ("self", "rays_o", "rays_d"))
+        if self._is_endless() and self._outermost is not None and not arguments.get("cone_angle"):
+            _, leaves = intersect_box(rays_o, rays_d, self._outermost.to(rays_o))
+            t_max = arguments.get("t_max")
+            arguments["t_max"] = leaves if t_max is None else leaves.minimum(t_max)
+        return arguments
+
+    def _is_endless(self) -> bool:
+        """Whether the occupancy goes on into the distance."""
+        (guide,) = self._guide
+        return guide.the_occupancy().space.kind == "contraction"
+
+    def update_every_n_steps(self, *args: Any, **kwargs: Any) -> None:
+        """Called by hosts before each training step; a frozen gate has nothing to update."""
+        estimator: Any = self.sampler
+        estimator.update_every_n_steps(*args, **kwargs)
+
+    @property
+    def aabbs(self) -> Tensor:
+        """Boxes of the sampler behind this, in the host's coordinates, [n_boxes, 6]."""
+        (guide,) = self._guide
+        boxes: Tensor = cast(Any, self.sampler).aabbs
+        if guide.same_frame():
+            return boxes
+        back = inverse(guide.frame)
+        return torch.stack([box_around(box, back) for box in boxes])
+
+    @property
+    def occs(self) -> Tensor:
+        """o at the centres of the cells of `aabbs`, [n_boxes * cells]."""
+        (guide,) = self._guide
+        sampler: Any = self.sampler
+        if guide.same_frame():
+            return cast(Tensor, sampler.occs)
+        cells = cell_centers(self.aabbs, sampler.resolution)
+        with torch.no_grad():
+            return guide.the_occupancy().query(moved(cells, guide.frame))
+
+    @property
+    def binaries(self) -> Tensor:
+        """Decisions at the centres of the cells of `aabbs`, bool [n_boxes, n, n, n]."""
+        (guide,) = self._guide
+        sampler: Any = self.sampler
+        if guide.same_frame():
+            return cast(Tensor, sampler.binaries)
+        occupied = self.occs >= guide.followed().threshold
+        return occupied.view(-1, *sampler.resolution.tolist())
+
+    def __getattr__(self, name: str) -> Any:
+        if name in ("resolution", "device"):
+            return getattr(self.sampler, name)
+        return super().__getattr__(name)
+
+
+class GuidedProposal(_StandIn, Sampler):
+    """A proposal sampler of the registry, in the host's coordinates."""
+
+    def __init__(self, guide: Guide, options: dict[str, Any]) -> None:
+        super().__init__(guide)
+        self._options = options
+
+    def _build(self, guide: Guide) -> nn.Module:
+        options = {**self._options, "occupancy": None}
+        if guide.needs_occupancy:
+            options["occupancy"] = guide.the_occupancy()
+            if not guide.same_frame():
+                options["frame"] = guide.frame
+        return guide.built(build_proposal, **options)
+
+    def forward(self, *args: Any, **kwargs: Any) -> Any:
+        return self.sampler(*args, **kwargs)
+
+    def generate_ray_samples(self, *args: Any, **kwargs: Any) -> Any:
+        """As of the sampler behind this."""
+        return self.sampler(*args, **kwargs)
+
+    def set_anneal(self, anneal: float) -> None:
+        """Called by hosts for proposal networks, of which there are none."""
+
+    def step_cb(self, step: int) -> None:
+        """Called by hosts after a training step; nothing is scheduled here."""

@@ -1,0 +1,161 @@
+"""What is done about a collapsed gate, as a stated rule.
+
+A gate that is found collapsed at every look for `SUSPECTED_STEPS` steps, or at the look that ends
+the first phase, is healed, `MOST_RECOVERIES` times at most. Its last layer starts anew; learning
+goes on for half as long again: first on dense samples, while what teaches the gate comes in again
+from nothing and the field finds its surfaces without it; then as before, with the force that led to
+the collapse `EASED` times weaker. A gate in logit form that collapses again begins anew altogether,
+and the field with it, at rates `EASED` times smaller and for all of the phase. The last time a gate
+that is taught in the paper's form is taught in the logit form that is the default, unless
+`fall_back` is off; so is, at once, one by which hardly anything can be skipped. Where one scene
+expert took all points, they are shared out anew, and their balance counts `EASED` times as much.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Literal
+
+import torch
+from torch import Tensor, nn
+
+from leco_plugin.models.learning.phases import (
+    Collapse,
+    find_collapse,
+    reset_gate_head,
+    spread_scene_experts,
+)
+from leco_plugin.models.learning.progress import Progress
+from leco_plugin.models.objective import GateLossConfig
+
+MOST_RECOVERIES = 3
+FEWEST_STEPS = 100
+"""A gate is not called collapsed before it has had this many steps."""
+SUSPECTED_STEPS = 100
+"""Steps for which a gate looks collapsed before it is healed."""
+STEPS_PER_LOOK = 50
+"""Most steps between two looks: with the above, a collapse is found within 150 steps. That a gate
+keeps everything is one only after it had called some of it empty, or at the end of the phase."""
+HAS_LEARNED = 0.9
+"""Share of the probe positions below which a gate has called some space empty."""
+IN_LOGIT_FORM = ", and the gate is taught in logit form from now on"
+EASED = 4.0
+"""How much weaker the force towards a collapse is after it."""
+
+
+def is_collapsed(
+    progress: Progress, step: int, kept: float, shares: Tensor, last: bool
+) -> Collapse | None:
+    """The collapse of a gate, if it has lasted; `progress` notes since when one is suspected.
+
+    Args:
+        kept: share of probe positions whose o(x) is at least 0.1.
+        shares: [1 + n] share of them at each expert.
+        last: whether this look ends the first phase.
+    """
+    progress.fewest_kept = min(progress.fewest_kept, kept)
+    if step + 1 - progress.began < FEWEST_STEPS:
+        return None
+    collapse = find_collapse(kept, shares, last or progress.fewest_kept < HAS_LEARNED)
+    if collapse is None:
+        progress.suspected_since = -1
+        return None
+    if progress.suspected_since < 0:
+        progress.suspected_since = step
+    lasted = step - progress.suspected_since >= SUSPECTED_STEPS
+    return collapse if lasted or last else None
+
+
+def heal(
+    head: nn.Linear,
+    progress: Progress,
+    collapse: Collapse,
+    shares: Tensor,
+    step: int,
+    config: GateLossConfig,
+) -> str:
+    """Heals the gate whose last layer this is; returns what was done, in words.
+
+    Args:
+        shares: [1 + n] share of points at each expert.
+        config: what the gate is taught by.
+    """
+    anew = starts_anew(collapse, config, progress)
+    progress.recoveries += 1
+    progress.suspected_since = -1
+    last = progress.recoveries == MOST_RECOVERIES or collapse.kind == "useless"
+    progress.paper_given_up |= last and may_fall_back(config)
+    if collapse.kind == "one expert":
+        spread_scene_experts(head, int(shares[1:].argmax()) + 1)
+        progress.balance *= EASED
+        return "its points are shared out anew" + (IN_LOGIT_FORM if progress.paper_given_up else "")
+    reset_gate_head(head)
+    progress.healed_at = step
+    phase = progress.phase or progress.configured or progress.learn_steps  # of older checkpoints
+    progress.dense_until = step + 1 + phase // 4
+    progress.learn_steps = step + 1 + (phase if anew else phase // 2)
+    progress.decisions = torch.zeros(0, dtype=torch.bool)
+    progress.fewest_kept = 1.0
+    less = f", then with {EASED:.0f} times less pressure"
+    if anew:
+        progress.pace, progress.pull, progress.began = progress.pace / EASED, 1.0, step + 1
+        return (
+            f"gate and field start anew at {progress.pace:.2g} of the learning rates, on dense "
+            f"samples to step {progress.dense_until}"
+        )
+    progress.pull *= 1.0 / EASED if collapse.kind == "empty" else EASED
+    return (
+        f"its last layer starts anew, on dense samples to step {progress.dense_until}"
+        f"{IN_LOGIT_FORM if progress.paper_given_up else less}"
+    )
+
+
+def starts_anew(collapse: Collapse, config: GateLossConfig, progress: Progress) -> bool:
+    """Whether all that has been learned goes, and is learned again more slowly.
+
+    So it is where a new last layer has collapsed as well. In logit form the forces on a gate are
+    bounded; what is left as a cause is steps that overshoot, and hidden layers, of gate and field,
+    that they have ruined.
+    """
+    again = collapse.kind != "one expert" and progress.healed_at >= 0
+    return again and form_of(config, progress) == "logit"
+
+
+def may_fall_back(config: GateLossConfig) -> bool:
+    """Whether a gate may be taught otherwise than is asked for, where that has failed."""
+    return config.form == "paper" and config.fall_back
+
+
+def form_of(config: GateLossConfig, progress: Progress) -> Literal["logit", "paper"]:
+    """What the gate is taught in, after the recoveries so far.
+
+    A run that is resumed with the request to keep to its form does so from then on.
+    """
+    return "logit" if progress.paper_given_up and may_fall_back(config) else config.form
+
+
+def is_dense(progress: Progress, step: int) -> bool:
+    """Whether a healed gate is not followed yet."""
+    return step < progress.dense_until
+
+
+def annealed(config: GateLossConfig, progress: Progress, step: int) -> GateLossConfig:
+    """What teaches the gate at a step, after the recoveries so far.
+
+    While samples are dense all of it comes in again from nothing. The pull towards empty space is
+    lambda_g in the paper's form, and 1 / k in logit form.
+    """
+    weight, form = 1.0, form_of(config, progress)
+    pull = progress.pull if form == config.form else 1.0
+    if is_dense(progress, step):
+        weight = (step - progress.healed_at) / (progress.dense_until - progress.healed_at)
+    return replace(
+        config,
+        form=form,
+        contribution=config.contribution * weight,
+        agreement=config.agreement * weight,
+        imbalance=config.imbalance * weight * pull,
+        density=config.density * weight,
+        emphasis=config.emphasis / pull,
+        balance=config.balance * progress.balance,
+    )

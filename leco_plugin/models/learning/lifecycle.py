@@ -1,0 +1,377 @@
+"""What happens around training steps: bounds before the first, ramps, freezing, healing."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import replace
+from functools import cached_property
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import torch
+from nerfstudio.engine.callbacks import (
+    TrainingCallback,
+    TrainingCallbackAttributes,
+    TrainingCallbackLocation,
+)
+from torch import Tensor
+
+from leco_plugin.compat.optimizers import forget_the_gone
+from leco_plugin.models.compute.ranks import is_first, say, share
+from leco_plugin.models.failures import GateCollapsed
+from leco_plugin.models.field import HMoEField
+from leco_plugin.models.freezing.calibration import Measured
+from leco_plugin.models.freezing.field_at_freezing import carry_over, leave_field
+from leco_plugin.models.freezing.freezing import (
+    HARDLY_ANYTHING,
+    calibration_rays,
+    freeze,
+    write_occupancy,
+)
+from leco_plugin.models.freezing.guided_watch import GuidedWatch
+from leco_plugin.models.freezing.merging import merge
+from leco_plugin.models.gate import Gate, occupancy_from_logits, route
+from leco_plugin.models.learning.batches import Batches
+from leco_plugin.models.learning.healing import (
+    FEWEST_STEPS,
+    MOST_RECOVERIES,
+    STEPS_PER_LOOK,
+    heal,
+    is_collapsed,
+    may_fall_back,
+    starts_anew,
+)
+from leco_plugin.models.learning.history import GateHistory
+from leco_plugin.models.learning.pace import keep_pace
+from leco_plugin.models.learning.phases import (
+    PROBES,
+    Collapse,
+    ScheduleConfig,
+    converged,
+    decisions_agree,
+    is_unsettled,
+    ramp,
+    steps_of_an_extension,
+)
+from leco_plugin.models.learning.prior import warm_start
+from leco_plugin.models.learning.progress import NO_EVIDENCE, Progress
+from leco_plugin.models.learning.statistics import KEPT_ABOVE
+from leco_plugin.models.losses import expert_shares
+from leco_plugin.models.rendering import gate_values_and_routes
+from leco_plugin.occupancy import gate_precision
+from leco_plugin.scenes.known_distances import sampler_here
+from leco_plugin.scenes.sparse_pixels import FEWEST_POINTS
+from leco_plugin.scenes.survey import announce, sparse_points, survey
+
+if TYPE_CHECKING:
+    from leco_plugin.models.leco import LecoModel
+
+
+class Lifecycle:
+    """Carries one run of a `LecoModel` from its first step to its last."""
+
+    def __init__(self, model: LecoModel, attributes: TrainingCallbackAttributes) -> None:
+        assert attributes.pipeline is not None
+        self.model = model
+        self.pipeline: Any = attributes.pipeline
+        self.trainer: Any = attributes.trainer
+        most = configured = model.config.schedule.learn_steps
+        if self.trainer is not None:
+            # a short run still passes through both phases
+            most = max(2, int(0.5 * self.trainer.config.max_num_iterations))
+            self._say_if_short(configured, most)
+        # nerfstudio makes callbacks after it has loaded a checkpoint
+        self.progress.begin(configured, most)
+        self.batches = Batches(model, self.pipeline.datamanager)
+        config = model.config
+        self.survey = survey(self.pipeline.datamanager, config.bounds, config.near, config.far)
+        if not bool(model.bounds_known):
+            model.set_bounds(self.survey.bounds, self.survey.median_length)
+            announce(self.survey)
+            if sampler_here(self.pipeline.datamanager) is None:
+                say("batches come from elsewhere: they keep their size, and no pixel's distance")
+            self._begin_with_points()
+        self.optimizers: list[Any] = []
+        """Those of the model, where they are not a trainer's."""
+        self.step_started = 0.0
+        self.history = GateHistory()
+        self.guided = GuidedWatch(self)
+        if bool(model.frozen) and self.trainer is not None and self.folder is not None:
+            write_occupancy(model, self.folder)  # a resumed run may have a folder of its own
+            resumed = self.trainer.config.load_checkpoint or self.trainer.config.load_dir
+            if resumed is not None:
+                carry_over(resumed, self.folder)
+
+    def _say_if_short(self, configured: int, most: int) -> None:
+        """Says so before a run that learns for fewer steps than are configured."""
+        if most < configured != self.progress.configured:
+            say(
+                f"a run of {self.trainer.config.max_num_iterations} steps learns the occupancy in "
+                f"its first half: {most} steps, not the {configured} of schedule.learn-steps"
+            )
+
+    def _begin_with_points(self) -> None:
+        """Shows the gate the sparse points, where that is asked for; it counts as learning time."""
+        model, prior = self.model, self.model.config.prior
+        if prior.steps == 0 or model.config.homogeneous or bool(model.frozen):
+            return
+        dataset: Any = self.pipeline.datamanager.train_dataset
+        points, sparse = sparse_points(dataset), self.batches.sparse
+        if points is None or sparse is None or len(points) < FEWEST_POINTS:
+            say("no prior: the scene has no sparse points")
+            return
+        started = time.monotonic()
+        loss = warm_start(model, dataset.cameras, points, sparse)
+        seconds = time.monotonic() - started
+        self.progress.learn_seconds += seconds
+        say(
+            f"{len(points)} sparse points and {len(sparse.distances)} lines of sight to them have "
+            f"taught the gate in {seconds:.1f} s (loss {loss:.3f})"
+        )
+
+    @property
+    def progress(self) -> Progress:
+        """Of the model, because that is what a checkpoint restores."""
+        return self.model.progress
+
+    @property
+    def schedule(self) -> ScheduleConfig:
+        """The config's, with the learning steps of this run."""
+        return replace(self.model.config.schedule, learn_steps=self.progress.learn_steps)
+
+    @property
+    def schedule_since(self) -> ScheduleConfig:
+        """The same, of what has begun at `Progress.began`."""
+        steps = self.progress.learn_steps - self.progress.began
+        return replace(self.model.config.schedule, learn_steps=steps)
+
+    @property
+    def folder(self) -> Path | None:
+        """The run's folder; None where no file is to be left, as by all processes but the first."""
+        return Path(self.trainer.base_dir) if self.trainer is not None and is_first() else None
+
+    def callbacks(self) -> list[TrainingCallback]:
+        """What nerfstudio's trainer calls before and after each step."""
+        before, after = (
+            TrainingCallbackLocation.BEFORE_TRAIN_ITERATION,
+            TrainingCallbackLocation.AFTER_TRAIN_ITERATION,
+        )
+        return [
+            TrainingCallback([before], self.before_step),
+            TrainingCallback([after], self.after_step),
+        ]
+
+    def before_step(self, step: int) -> None:
+        """Sets what follows from the step alone, so that a resumed run is where it was."""
+        model = self.model
+        model.step = step
+        model.ramped = ramp(step - self.progress.began, self.schedule_since)
+        never_frozen = model.config.homogeneous or not self.schedule.freeze
+        model.learned = never_frozen and step >= self.schedule.learn_steps
+        keep_pace(self._optimizers(), self.progress.pace)
+        past_learning = bool(model.frozen) or model.learned
+        self.batches.prepare(learning=not past_learning)
+        self.step_started = time.monotonic()
+
+    def after_step(self, step: int) -> None:
+        """Looks at the gate now and then, and freezes it when its decisions have settled; then at
+        what skipping costs."""
+        model = self.model
+        if model.learned or model.config.homogeneous:
+            return
+        seconds = time.monotonic() - self.step_started
+        if bool(model.frozen):
+            self.guided.after_step(step, seconds)
+            return
+        self.progress.learn_seconds += seconds
+        self._after_learning_step(step)
+        if self.schedule.freeze and not bool(model.frozen) and self._ends_after(step):
+            say(
+                f"step {step}: the run ends while its occupancy is still learned, to step "
+                f"{self.progress.learn_steps}, and nothing is frozen; go on from its checkpoint "
+                "with --load-dir"
+            )
+
+    def _ends_after(self, step: int) -> bool:
+        return self.trainer is not None and step + 1 >= self._end()
+
+    def _end(self) -> int:
+        """Steps of the run; nerfstudio counts its iterations from the step that is gone on from."""
+        return int(self.trainer._start_step) + int(self.trainer.config.max_num_iterations)
+
+    def _after_learning_step(self, step: int) -> None:
+        model, schedule, progress = self.model, self.schedule, self.progress
+        if schedule.steps_per_record > 0 and step % schedule.steps_per_record == 0:
+            self._record(step)
+        last = step + 1 >= schedule.learn_steps
+        checks = (step + 1) % schedule.steps_per_check == 0 or last
+        if not checks and (step + 1) % STEPS_PER_LOOK:
+            return
+        logits = self._probe()
+        kept = occupancy_from_logits(logits) >= KEPT_ABOVE
+        if schedule.freeze and self._has_collapsed(step, logits, kept, last):
+            return
+        if not checks:
+            return
+        agreement = decisions_agree(progress.decisions.to(kept.device), kept)
+        progress.decisions = kept
+        if not schedule.freeze or (progress.suspected_since >= 0 and not last):
+            return
+        if not last and float(kept.float().mean()) > 0.95:
+            return  # it agrees with itself only because it has not yet found anything empty
+        since, of_those = step - progress.began, self.schedule_since
+        if last and is_unsettled(since, agreement, of_those, progress.extensions):
+            self._learn_on(step, agreement)
+            return
+        if converged(since, agreement, of_those):
+            say(
+                f"step {step}: {agreement:.1%} of {len(kept)} decisions are those of "
+                f"{schedule.steps_per_check} steps ago; freezing the gate"
+            )
+            data, seconds = self.pipeline.datamanager, progress.learn_seconds
+            measured = freeze(model, data, self.survey, self.folder, step, seconds)
+            if self._falls_back(step, measured):
+                return
+            if self.folder is not None:
+                leave_field(model, self.folder)
+            if self.trainer is not None and not schedule.restart:
+                merge(model, lambda count: calibration_rays(model, data, count))
+                forget_the_gone(self.trainer.optimizers, model.get_param_groups())
+            progress.recheck_due, progress.surface, progress.image = 0, NO_EVIDENCE, NO_EVIDENCE
+            progress.suspected_since = -1  # of the gate as it is now
+            if schedule.steps_per_record > 0:
+                self._record(step)
+            if schedule.restart:
+                self._restart_field()
+                say("the field starts anew, guided from its first step")
+            self.save(step)  # a run killed from now on stays frozen
+
+    def _falls_back(self, step: int, measured: Measured) -> bool:
+        """Has a gate that hardly anything can be skipped by taught otherwise, where there is
+        another way; returns whether it has."""
+        progress, losses = self.progress, self.model.config.gate_loss
+        if not may_fall_back(losses) or progress.paper_given_up:
+            return False
+        if measured.empty_fraction >= HARDLY_ANYTHING:
+            return False
+        skipped = f"{measured.empty_fraction:.1%} of all candidates"
+        self.reopen(
+            Collapse(f"no threshold within bounds skips more than {skipped}", "useless"), step
+        )
+        return True
+
+    def reopen(self, collapse: Collapse, step: int) -> None:
+        """Has a frozen gate learn once more, on dense samples first."""
+        self.model.reopen()
+        done = self.healed(collapse, torch.zeros(self.model.gate.head.out_features), step)
+        say(f"step {step}: {collapse.cause}; the gate is opened again, {done}")
+
+    def healed(self, collapse: Collapse, shares: Tensor, step: int) -> str:
+        """Does what the rule says; returns what that is, in words. Arguments as for `heal`."""
+        model, progress, losses = self.model, self.progress, self.model.config.gate_loss
+        anew = starts_anew(collapse, losses, progress)
+        if anew:
+            model.gate.load_state_dict(Gate(model.gate.config).state_dict())
+            share(model.gate.parameters())
+            self._restart_field()
+        done = heal(model.gate.head, progress, collapse, shares, step, losses)
+        share(model.gate.head.parameters())  # the remedy is drawn at random
+        if anew:
+            self._begin_with_points()
+        room = self._end() - (step + 1) if self.trainer is not None else 0
+        if room >= FEWEST_STEPS:  # no run that has those steps ends without an occupancy
+            progress.learn_steps = min(progress.learn_steps, self._end())
+        return f"{done} (recovery {progress.recoveries} of {MOST_RECOVERIES})"
+
+    def _learn_on(self, step: int, agreement: float) -> None:
+        progress = self.progress
+        progress.extensions += 1
+        progress.learn_steps = step + 1 + steps_of_an_extension(progress.configured)
+        say(
+            f"step {step}: only {agreement:.1%} of the gate's decisions are those of the last "
+            f"check; it learns on until step {progress.learn_steps}"
+        )
+
+    def save(self, step: int) -> None:
+        """A checkpoint, where the run saves any."""
+        if self.trainer is not None and self.trainer.config.steps_per_save > 0:
+            self.trainer.save_checkpoint(step)
+
+    @torch.no_grad()
+    def _record(self, step: int) -> None:
+        """One more entry in the history of the gate, which is written each time."""
+        if self.folder is None:
+            return
+        model, positions = self.model, self.probe_positions
+        with gate_precision(model.device.type, model.precision):
+            gate_values, routes = gate_values_and_routes(
+                model.gate(positions), model.routing, model.field.experts.those_left()
+            )
+            sigmas, _ = model.field.density(positions, routes, gate_values)
+        self.history.look(step, self.progress.learn_seconds, model.gate, routes, sigmas)
+        try:
+            self.history.save(self.folder)
+        except OSError as error:
+            say(f"the history of the gate could not be written ({error})")
+
+    def _restart_field(self) -> None:
+        """Gives the field the weights of a new one, and its optimizers nothing to remember."""
+        field = self.model.field
+        fresh = HMoEField(field.config, self.model.num_train_data)
+        for number, left in enumerate(field.experts.left.tolist(), 1):
+            if not left:
+                fresh.experts.drop(number)
+        field.load_state_dict(fresh.state_dict())
+        share(field.parameters())
+        for optimizer in self._optimizers():
+            optimizer.state.clear()
+
+    def _optimizers(self) -> list[Any]:
+        if self.trainer is None:
+            return self.optimizers
+        return list(self.trainer.optimizers.optimizers.values())
+
+    @cached_property
+    def probe_positions(self) -> Tensor:
+        """Mapped candidates of a fixed set of training rays: [P, 3] in [-1, 1]."""
+        model = self.model
+        rays = self.survey.probe_rays(model.device, model.aabb, model.march_range)
+        generator = torch.Generator().manual_seed(0)
+        which = torch.randint(len(rays.origins), (PROBES,), generator=generator)
+        along = torch.rand(PROBES, generator=generator).to(model.device)
+        which = which.to(model.device)
+        distance = torch.lerp(rays.t_mins[which], rays.t_maxs[which], along)
+        positions = rays.origins[which] + rays.directions[which] * distance[:, None]
+        return model.space.map(positions).clamp(-1.0, 1.0)
+
+    @torch.no_grad()
+    def _probe(self) -> Tensor:
+        """The gate's logits [P, 1 + n] at the probe positions, the same ones in every process."""
+        with gate_precision(self.model.device.type, self.model.precision):
+            logits: Tensor = self.model.gate(self.probe_positions)
+        share([logits])
+        return logits
+
+    def _has_collapsed(self, step: int, logits: Tensor, kept: Tensor, last: bool) -> bool:
+        """Heals a gate that has collapsed for a while; returns whether it starts anew.
+
+        Raises:
+            GateCollapsed: more often than it may.
+        """
+        model, progress = self.model, self.progress
+        shares = expert_shares(route(logits, model.routing.empty_below), logits.shape[-1])
+        share_kept = float(kept.float().mean())
+        collapse = is_collapsed(progress, step, share_kept, shares, last)
+        if collapse is None:
+            return False
+        if progress.recoveries >= MOST_RECOVERIES:
+            if collapse.kind == "occupied":  # slow, and never wrong: what can be is skipped
+                say(f"step {step}: {collapse.cause}, after {MOST_RECOVERIES} recoveries; so be it")
+                return False
+            raise GateCollapsed(
+                f"step {step}: {collapse.cause}, after {MOST_RECOVERIES} recoveries. Check the "
+                "scene's bounds in the log above, and the weights under gate-loss; leco-occupancy "
+                "trains without skipping with --pipeline.model.schedule.freeze False."
+            )
+        say(f"step {step}: {collapse.cause}; {self.healed(collapse, shares, step)}")
+        return collapse.kind != "one expert"

@@ -1,0 +1,245 @@
+"""Sizes chosen from how much there is to see in a scene, before training: `leco-occupancy`'s own.
+
+What is counted is the footprint of a pixel at the scene's distance, a texel. A scene twice as wide
+has four times as many, and gets four times the experts and about twice the table, up to the sizes
+of the device. A size that is set by hand stays as it is, and what follows from it follows from
+that.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from typing import Any
+
+import torch
+
+from leco_plugin.models.compute.ranks import say
+from leco_plugin.models.encodings import EncodingConfig
+from leco_plugin.models.gate import GateConfig
+from leco_plugin.models.sizing.size_limits import (
+    check,
+    check_memory,
+    memory_of,
+    state_bytes,
+    values_of,
+)
+from leco_plugin.models.sizing.sizes import Sizes, left_open, size_at, sizes_for, with_size
+from leco_plugin.scenes.bounds import BoundsConfig
+from leco_plugin.scenes.detail import CAMERAS, SceneDetail, detail_of
+from leco_plugin.scenes.input_error import InputError
+from leco_plugin.scenes.survey import points_in, with_known_altitudes
+
+ENTRIES_PER_SIDE = 512.0
+"""Entries of a level of the hash table for each texel along the side of a square surface."""
+TEXELS_PER_EXPERT = 1 << 16
+"""Texels for each scene expert of the device's width; a scene of fewer gets a narrower one."""
+CELLS_PER_PERIOD = 32
+"""Finest cells of the field along the shortest period that the gate knows: what is occupied is
+coarser than what is seen."""
+UNITS_PER_FEATURE = 1.5
+"""Units of the gate's hidden layers for each feature of its encoding."""
+FEWEST_CELLS, FEWEST_ENTRIES, FEWEST_OCTAVES = 64, 10, 2
+"""Least finest cells, binary logarithm of the table's entries, and octaves of the gate."""
+GRANULE = 16
+"""Widths and finest cells are multiples of this."""
+SHARE_OF_MEMORY = 1 / 8
+"""Most of the device's memory that automatic sizes take for weights and what trains them."""
+
+
+@dataclass(frozen=True)
+class Choice:
+    """Complete sizes, and in words how they came about; no words where nothing was chosen."""
+
+    sizes: Sizes
+    lines: tuple[str, ...]
+
+
+def complete(
+    wanted: Sizes,
+    bounds: BoundsConfig,
+    metadata: dict[str, Any],
+    images: int,
+    device: torch.device | str,
+) -> Sizes:
+    """The sizes of a model on a device; those that are chosen are said in the log.
+
+    Args:
+        wanted: sizes, with `AUTOMATIC` where they are to be chosen.
+        bounds: where the scene lies, where the data do not say it.
+        metadata: what a dataset says of itself, with its cameras (`detail.CAMERAS`) and sparse
+            points; without cameras sizes are those of the device.
+        images: training photographs.
+    Raises:
+        InputError: sizes that cannot be together, or do not fit the device.
+    """
+    detail = None
+    if left_open(wanted) and CAMERAS in metadata:
+        bounds = with_known_altitudes(bounds, metadata)
+        detail = detail_of(metadata[CAMERAS], points_in(metadata), bounds)
+    most = sizes_for(torch.device(device).type)
+    try:
+        made = choose(wanted, most, detail, images, memory_of(device))
+    except ValueError as error:
+        raise InputError(str(error)) from None
+    for line in made.lines:
+        say(line)
+    return made.sizes
+
+
+def choose(
+    wanted: Sizes, most: Sizes, detail: SceneDetail | None, images: int, memory: int | None = None
+) -> Choice:
+    """Fills in what is automatic.
+
+    Args:
+        wanted: sizes, with `AUTOMATIC` where they are to be chosen.
+        most: complete sizes, the largest that are chosen.
+        detail: of the scene; None where nothing is known of it: all is as large as it may be.
+        images: training photographs, which have codes of their own.
+        memory: bytes of the device; None where it is not known.
+    Raises:
+        ValueError: sizes that cannot be together, or do not fit the device. One line.
+    """
+    sizes = _filled(wanted, most, detail)
+    check(sizes)
+    reason = f"entries a level, {ENTRIES_PER_SIDE:g} for each texel of the surface's side"
+    if memory is not None:
+        if not wanted.field.encoding.log2_table:
+            fitting = within(sizes, images, SHARE_OF_MEMORY * memory)
+            if fitting != sizes:
+                sizes, reason = fitting, "entries a level, what an eighth of the memory holds"
+        check_memory(sizes, images, memory)
+    lines = explain(wanted, most, sizes, detail, images, reason) if left_open(wanted) else ()
+    return Choice(sizes, lines)
+
+
+def _filled(wanted: Sizes, most: Sizes, detail: SceneDetail | None) -> Sizes:
+    texels = detail.texels if detail is not None else math.inf
+    across = detail.across if detail is not None else math.inf
+    # a number that is 0 is automatic: whatever stands before `or` has been set by hand
+    encoding, experts, gate = wanted.field.encoding, wanted.field.experts, wanted.gate
+    cells = finest_cells(across, most.field.encoding)
+    finest = encoding.finest or cells
+    encoding = replace(
+        encoding,
+        finest=finest,
+        levels=encoding.levels or levels_to(finest, most.field.encoding),
+        log2_table=encoding.log2_table or log2_entries(texels, most.field.encoding),
+    )
+    number = experts.scene_experts or gate.scene_experts or expert_number(texels, most)
+    experts = replace(
+        experts, scene_experts=number, width=experts.width or expert_width(texels, most)
+    )
+    octaves = gate.encoding.octaves or octaves_for(cells, most.gate)
+    gate = replace(
+        gate,
+        encoding=replace(gate.encoding, octaves=octaves),
+        width=gate.width or gate_width(octaves, most.gate),
+        scene_experts=gate.scene_experts or number,
+    )
+    return replace(
+        wanted, gate=gate, field=replace(wanted.field, encoding=encoding, experts=experts)
+    )
+
+
+def finest_cells(across: float, most: EncodingConfig) -> int:
+    """Cells no larger than a footprint, in sixteens."""
+    wanted = GRANULE * math.ceil(min(across, most.finest) / GRANULE)
+    return max(FEWEST_CELLS, min(wanted, most.finest))
+
+
+def levels_to(finest: int, most: EncodingConfig) -> int:
+    """Levels up to so many cells, about as far from one another as those of the device."""
+    step = math.log(most.finest / most.coarsest) / max(most.levels - 1, 1)
+    wanted = 1 + round(math.log(max(1.0, finest / most.coarsest)) / step)
+    return max(2, min(wanted, most.levels))
+
+
+def log2_entries(texels: float, most: EncodingConfig) -> int:
+    """Binary logarithm of a level's entries, rounded."""
+    if math.isinf(texels):
+        return most.log2_table
+    wanted = ENTRIES_PER_SIDE * math.sqrt(texels)
+    return max(FEWEST_ENTRIES, min(round(math.log2(max(1.0, wanted))), most.log2_table))
+
+
+def expert_number(texels: float, most: Sizes) -> int:
+    """Scene experts, rounded up."""
+    largest = most.field.experts.scene_experts
+    return max(1, min(math.ceil(min(texels / TEXELS_PER_EXPERT, largest)), largest))
+
+
+def expert_width(texels: float, most: Sizes) -> int:
+    """Units of an expert: the device's, or where one expert is too many as its values, which go
+    with the square, follow the texels."""
+    share = min(1.0, texels / TEXELS_PER_EXPERT)
+    return _in_granules(most.field.experts.width * math.sqrt(share), most.field.experts.width)
+
+
+def octaves_for(cells: int, most: GateConfig) -> int:
+    """Octaves down to a period of `CELLS_PER_PERIOD` finest cells."""
+    wanted = 1 + round(math.log2(max(1.0, cells / CELLS_PER_PERIOD)))
+    return max(FEWEST_OCTAVES, min(wanted, most.encoding.octaves))
+
+
+def gate_width(octaves: int, most: GateConfig) -> int:
+    """Units of the gate's hidden layers, in proportion to its features."""
+    return _in_granules(UNITS_PER_FEATURE * (3 + 6 * octaves), most.width)
+
+
+def _in_granules(wanted: float, most: int) -> int:
+    return min(most, GRANULE * max(1, math.ceil(wanted / GRANULE)))
+
+
+def within(sizes: Sizes, images: int, memory: float) -> Sizes:
+    """The same with the largest table, up to its own, that fits so many bytes in training."""
+    table = "field.encoding.log2_table"
+    while state_bytes(sizes, images) > memory and size_at(sizes, table) > FEWEST_ENTRIES:
+        sizes = with_size(sizes, table, size_at(sizes, table) - 1)
+    return sizes
+
+
+def explain(
+    wanted: Sizes,
+    most: Sizes,
+    sizes: Sizes,
+    detail: SceneDetail | None,
+    images: int,
+    table_reason: str,
+) -> tuple[str, ...]:
+    """For the log: what was counted, and each size that could be chosen with its reason.
+
+    Args:
+        wanted: with `AUTOMATIC` where a size was chosen.
+        most: the largest that are chosen.
+        sizes: as they are now.
+        detail: of the scene, if anything is known of it.
+        images: training photographs.
+        table_reason: for the size of the hash table.
+    """
+    head = "sizes of the device; nothing is known of the scene:"
+    if detail is not None:
+        head = (
+            f"sizes for a surface of {detail.texels:,.0f} texels in {detail.pixels:,} pixels of "
+            f"{detail.images} photographs, in a cube of {detail.across:,.0f} texels a side:"
+        )
+
+    def row(name: str, at: str, reason: str, power: bool = False) -> str:
+        by_hand, top, size = (size_at(each, at) for each in (wanted, most, sizes))
+        why = reason if size < top else f"the most on this device; {reason}"
+        text = f"2^{size}" if power else str(size)
+        return f"  {name:15}{text:>6}  {'set by hand' if by_hand else why}"
+
+    an_expert = f"one for {TEXELS_PER_EXPERT:,} texels"
+    a_period = f"a period of {CELLS_PER_PERIOD} finest cells"
+    rows = (
+        row("finest cells", "field.encoding.finest", "no larger than a texel"),
+        row("levels", "field.encoding.levels", "up to the finest cells"),
+        row("hash table", "field.encoding.log2_table", table_reason, power=True),
+        row("scene experts", "field.experts.scene_experts", an_expert),
+        row("expert width", "field.experts.width", "narrower where one is too many"),
+        row("gate octaves", "gate.encoding.octaves", a_period),
+        row("gate width", "gate.width", f"{UNITS_PER_FEATURE:g} units for each feature"),
+    )
+    return head, *rows, f"  {values_of(sizes, images):,} parameters of gate and field"

@@ -1,0 +1,1 @@
+"""The parts of `switch-nerf`: its field, its samples, its loss, its sizes."""

@@ -1,0 +1,93 @@
+"""Claims about what the frozen gate is measured on."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+
+import pytest
+import torch
+
+from leco_plugin.models.freezing.calibration import Measured
+from leco_plugin.models.freezing.freezing import advice_on, calibration_rays
+from leco_plugin.scenes.held_out_pixels import HeldOutPixelSampler, HeldOutPixelSamplerConfig
+
+COUNT = 50
+
+
+class Manager:
+    """A data manager that says which of its rays it gave."""
+
+    def __init__(self, keeps_pixels_back: bool) -> None:
+        image = torch.rand(2, 20, 30, 3)
+        self.images = {"image": image, "image_idx": torch.arange(2)}
+        self.train_pixel_sampler = (
+            HeldOutPixelSamplerConfig().setup(num_rays_per_batch=8) if keeps_pixels_back else None
+        )
+        self.iter_train_image_dataloader = iter([self.images])
+        self.train_dataset = SimpleNamespace(cameras=Cameras())
+
+    def next_train(self, step: int) -> tuple[Bundle, dict[str, torch.Tensor]]:
+        indices = torch.zeros(COUNT, 3, dtype=torch.int64)
+        return Bundle(indices), {"image": torch.zeros(COUNT, 3), "indices": indices}
+
+
+class Cameras:
+    """All of them at once, whose rays are pixels."""
+
+    def to(self, device: str) -> Cameras:
+        return self
+
+    def generate_rays(self, camera_indices: torch.Tensor, coords: torch.Tensor) -> Bundle:
+        return Bundle(torch.cat([camera_indices, (coords - 0.5).long()], dim=1))
+
+
+class Bundle:
+    """Rays that are the pixels they go through."""
+
+    def __init__(self, indices: torch.Tensor) -> None:
+        self.indices = indices
+
+    def __getitem__(self, which: slice) -> Bundle:
+        return Bundle(self.indices[which])
+
+    def to(self, device: torch.device) -> torch.Tensor:
+        return self.indices
+
+
+def a_model() -> SimpleNamespace:
+    return SimpleNamespace(
+        config=SimpleNamespace(calibration=SimpleNamespace(rays=COUNT)),
+        device=torch.device("cpu"),
+        rays_of=lambda indices: indices,
+    )
+
+
+def test_the_threshold_is_measured_on_pixels_that_training_never_sees() -> None:
+    manager = Manager(keeps_pixels_back=True)
+    pixels, colours = calibration_rays(a_model(), manager)
+    sampler = manager.train_pixel_sampler
+    assert isinstance(sampler, HeldOutPixelSampler) and 5 < len(pixels) <= COUNT
+    image, row, column = pixels.T
+    assert torch.equal(colours, manager.images["image"][image, row, column])
+    trained = sampler.sample(manager.images)["indices"]
+    held_out = {tuple(pixel) for pixel in pixels.tolist()}
+    assert not held_out & {tuple(pixel) for pixel in trained.tolist()}
+
+
+def test_without_held_out_pixels_it_is_measured_on_training_rays() -> None:
+    pixels, colours = calibration_rays(a_model(), Manager(keeps_pixels_back=False))
+    assert len(pixels) == len(colours) == COUNT
+    assert not colours.any()
+
+
+@pytest.mark.parametrize(
+    ("threshold", "skipped", "said"),
+    [(0.0, 0.0, "no threshold"), (0.04, 0.004, "hardly anything"), (0.3, 0.8, None)],
+)
+def test_what_skips_next_to_nothing_comes_with_advice(threshold, skipped, said) -> None:
+    advice = advice_on(Measured(threshold, 1e-4, 1e-3, 0.01, skipped))
+    assert (advice is None) == (said is None)
+    if advice is not None:  # where that option is differs between methods
+        assert advice.startswith(said)
+        assert "--pipeline.model of leco-occupancy" in advice
+        assert "--pipeline.model.occupancy.learning of guided methods" in advice

@@ -1,0 +1,389 @@
+"""Claims about where a guided host gets its occupancy, and about the coordinates it is asked in."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from ball_occupancy import ball_of_the_tiny_scene
+from nerfstudio.cameras.rays import RayBundle
+from nerfstudio.data.datamanagers.base_datamanager import VanillaDataManagerConfig
+from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataParserConfig
+from nerfstudio.engine.callbacks import TrainingCallbackAttributes
+from nerfstudio.model_components.ray_samplers import UniformSampler
+from nerfstudio.pipelines.base_pipeline import VanillaPipelineConfig
+from torch import Tensor, nn
+
+from leco_plugin.host_configs import leco_ngp
+from leco_plugin.models.encodings import EncodingConfig
+from leco_plugin.models.gate import Gate, GateConfig
+from leco_plugin.models.hosts import guided_start
+from leco_plugin.models.hosts.guide import Guide
+from leco_plugin.models.hosts.guided_start import (
+    GuidedStart,
+    OccupancyConfig,
+    kept_of_rays,
+)
+from leco_plugin.models.hosts.stand_ins import GuidedEstimator
+from leco_plugin.occupancy import Occupancy
+from leco_plugin.scenes.frames import box_around, frame_of
+from leco_plugin.scenes.input_error import InputError
+from leco_plugin.space import Space
+
+pytestmark = [
+    pytest.mark.usefixtures("without_cache"),
+    # nerfstudio leaves the images open whose size it has read
+    pytest.mark.filterwarnings("ignore:unclosed file:ResourceWarning"),
+    pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning"),
+]
+
+NAME = "occupancy.safetensors"
+STEP = 0.02
+CLEAR = 1e-3
+"""Decisions within this of the threshold may fall either way, by rounding alone."""
+
+
+class Data:
+    """What a data manager is asked for."""
+
+    def __init__(self, config: NerfstudioDataParserConfig) -> None:
+        manager: Any = VanillaDataManagerConfig(dataparser=config).setup(device="cpu")
+        self.train_dataset = manager.train_dataset
+        self.train_dataparser_outputs = manager.train_dataparser_outputs
+
+
+class Pipe:
+    """What a pipeline is asked for."""
+
+    def __init__(self, data: Data) -> None:
+        self.datamanager, self.device = data, "cpu"
+
+
+@pytest.fixture(scope="module")
+def tilted(tiny_scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The tiny scene without a word on its orientation: each reader turns it in its own way."""
+    folder = tmp_path_factory.mktemp("tilted") / "ball"
+    shutil.copytree(tiny_scene, folder)
+    description = folder / "transforms.json"
+    scene = json.loads(description.read_text())
+    del scene["orientation_override"]
+    description.write_text(json.dumps(scene))
+    return folder
+
+
+@pytest.fixture(scope="module")
+def readers(tilted: Path) -> dict[str, Data]:
+    """Readers of one scene, each with coordinates of its own."""
+    options: dict[str, dict[str, Any]] = {
+        "as it is": {"orientation_method": "none", "center_method": "none"},
+        "turned by pca": {"orientation_method": "pca", "scale_factor": 0.4},
+        "turned up": {"orientation_method": "up", "center_method": "focus"},
+    }
+    return {
+        name: Data(NerfstudioDataParserConfig(data=tilted, **values))
+        for name, values in options.items()
+    }
+
+
+def lopsided(data: Data) -> Occupancy:
+    """Half of the space around the ball, in no symmetric shape, as if learned by this reader."""
+    torch.manual_seed(3)
+    gate = Gate(GateConfig(EncodingConfig(octaves=2), 16, 1, 2))
+    frame = torch.tensor(frame_of(data), dtype=torch.float32)
+    center = frame[:, :3] @ torch.tensor([0.0, 0.0, 0.3]) + frame[:, 3]
+    half = 0.8 * float(torch.linalg.det(frame[:, :3])) ** (1 / 3)
+    made = Occupancy(gate, Space("box", tuple(center.tolist()), half), 0.0)
+    around = center + half * (2.0 * torch.rand(4096, 3) - 1.0)
+    made.threshold_value.fill_(float(made.query(around).median()))
+    made.report = {"frame": frame.tolist()}
+    return made.eval()
+
+
+def started(occupancy: Occupancy, data: Data, sampler: str = "learned-occupancy") -> Guide:
+    """A guide in the coordinates of a host that reads with `data`."""
+    guide = Guide(sampler)
+    guide.set_occupancy(occupancy)
+    GuidedStart(nn.Module(), guide, OccupancyConfig(sampler=sampler), Pipe(data))
+    return guide.eval()
+
+
+def in_other_coordinates(positions: Tensor, host: Data, learned: Data) -> Tensor:
+    """Through the scene's own coordinates, as nerfstudio's outputs say: slow, in float64."""
+
+    def similarity(data: Data) -> tuple[Tensor, Tensor]:
+        outputs = data.train_dataparser_outputs
+        transform = outputs.dataparser_transform.double()
+        return outputs.dataparser_scale * transform[:, :3], outputs.dataparser_scale * transform[
+            :, 3
+        ]
+
+    (a, a_shift), (b, b_shift) = similarity(host), similarity(learned)
+    in_the_scene = torch.linalg.solve(a, (positions.double() - a_shift).T).T
+    return (in_the_scene @ b.T + b_shift).float()
+
+
+PAIRS = [("turned by pca", "as it is"), ("as it is", "turned by pca"), ("turned up", "as it is")]
+
+
+@pytest.mark.parametrize(("host", "learned"), PAIRS)
+def test_a_packed_host_asks_in_the_coordinates_of_the_occupancy(
+    readers: dict[str, Data], host: str, learned: str
+) -> None:
+    occupancy = lopsided(readers[learned])
+    guide = started(occupancy, readers[host])
+    assert not guide.same_frame()
+    rays = readers[host].train_dataset.cameras.generate_rays(0).flatten()[::7]
+    march = {"render_step_size": STEP, "far_plane": 4.0}
+    box = torch.tensor([-9.0] * 3 + [9.0] * 3)
+    origins, directions = rays.origins, rays.directions
+    indices, starts, _ = guide.estimator(box).eval().sampling(origins, directions, **march)
+    dense = Guide("dense").estimator(box).eval()
+    every, t_starts, t_ends = dense.sampling(origins, directions, **march)
+    positions = origins[every] + directions[every] * (0.5 * (t_starts + t_ends))[:, None]
+    values = occupancy.query(in_other_coordinates(positions, readers[host], readers[learned]))
+    expected = values >= occupancy.threshold
+    clear = ((values - occupancy.threshold).abs() > CLEAR) & (values > 0.0)
+    # the same candidates: each is known by its ray and its number along it
+    kept = torch.zeros(len(rays), int(4.0 / STEP) + 1, dtype=torch.bool)
+    kept[indices, (starts / STEP).round().long()] = True
+    found = kept[every, (t_starts / STEP).round().long()]
+    assert int(expected.sum()) > 500
+    assert torch.equal(found[clear], expected[clear])
+    assert float(found[values == 0.0].float().mean()) < 1e-3  # outside the box of the occupancy
+
+
+@pytest.mark.parametrize(("host", "learned"), PAIRS)
+def test_a_proposal_host_asks_in_the_coordinates_of_the_occupancy(
+    readers: dict[str, Data], host: str, learned: str
+) -> None:
+    occupancy = lopsided(readers[learned])
+    guide = started(occupancy, readers[host])
+    rays: RayBundle = readers[host].train_dataset.cameras.generate_rays(0).flatten()[::31]
+    rays.nears = torch.full((len(rays), 1), 0.05)
+    rays.fars = torch.full((len(rays), 1), 4.0)
+    sampler = guide.proposal(num_samples=8, initial_sampler=UniformSampler()).eval()
+    _, (weights,), (candidates,) = sampler(rays)
+    positions = candidates.frustums.get_positions().reshape(-1, 3)
+    values = occupancy.query(in_other_coordinates(positions, readers[host], readers[learned]))
+    expected = values >= occupancy.threshold
+    clear = ((values - occupancy.threshold).abs() > CLEAR) & (values > 0.0)
+    assert int(expected.sum()) > 200
+    assert torch.equal(weights.flatten()[clear] > 0.0, expected[clear])
+
+
+def test_readers_that_agree_need_no_frame(readers: dict[str, Data]) -> None:
+    assert started(lopsided(readers["turned up"]), readers["turned up"]).same_frame()
+
+
+def test_an_occupancy_that_does_not_say_is_asked_as_it_is(readers: dict[str, Data]) -> None:
+    occupancy = lopsided(readers["as it is"])
+    occupancy.report = {}
+    assert started(occupancy, readers["as it is"]).same_frame()
+
+
+def test_a_sampler_with_a_box_gets_the_hosts_in_the_coordinates_that_it_is_asked_in(
+    readers: dict[str, Data], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    seen: dict[str, Any] = {}
+
+    def build(name: str, **options: Any) -> Any:
+        seen.update(options)
+        return torch.nn.Identity()
+
+    monkeypatch.setattr("leco_plugin.models.hosts.stand_ins.build_estimator", build)
+    guide = started(lopsided(readers["as it is"]), readers["turned by pca"])
+    box = torch.tensor([-1.0, -1.0, -1.0, 1.0, 1.0, 1.0])
+    _ = guide.estimator(box).sampler
+    torch.testing.assert_close(seen["aabb"], box_around(box, guide.frame))
+    guide.set_occupancy(guide.the_occupancy(), torch.eye(3, 4))
+    _ = guide.estimator(box).sampler
+    assert torch.equal(seen["aabb"], box)
+
+
+def test_the_ball_is_found_whatever_it_was_learned_in(readers: dict[str, Data]) -> None:
+    shares = []
+    for learned in readers.values():
+        frame = frame_of(learned)
+        assert frame is not None
+        guide = started(ball_of_the_tiny_scene(frame), readers["turned up"])
+        cameras = readers["turned up"].train_dataset.cameras
+        kept, met = kept_of_rays(guide, guide.the_occupancy(), cameras)
+        shares.append(float(kept.sum() / met.sum()))
+    assert shares == pytest.approx([shares[0]] * len(shares), rel=0.05)
+    assert 0.05 < shares[0] < 0.6
+
+
+def test_an_occupancy_of_another_scene_is_refused(readers: dict[str, Data]) -> None:
+    elsewhere = ball_of_the_tiny_scene([[1, 0, 0, 50.0], [0, 1, 0, 50.0], [0, 0, 1, 50.0]])
+    elsewhere.report = {"frame": torch.eye(3, 4).tolist()}
+    with pytest.raises(InputError, match=r"keeps nothing .* learned on another scene") as error:
+        started(elsewhere, readers["as it is"])
+    assert "\n" not in str(error.value)
+
+
+def test_training_says_what_was_wrong_with_a_path(readers: dict[str, Data], tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=r"there is no occupancy .*none: train leco-occupancy"):
+        config = OccupancyConfig(tmp_path / "none")
+        GuidedStart(nn.Module(), Guide(), config, Pipe(readers["as it is"]))
+
+
+def test_a_checkpoint_needs_no_file(readers: dict[str, Data]) -> None:
+    guide = Guide()
+    guide.set_occupancy(ball_of_the_tiny_scene())
+    GuidedStart(
+        nn.Module(), guide, OccupancyConfig(Path("deleted") / NAME), Pipe(readers["as it is"])
+    )
+    assert guide.occupancy is not None
+
+
+def test_a_sampler_and_a_gate_that_do_not_fit_are_refused_before_learning(
+    readers: dict[str, Data],
+) -> None:
+    data, name = readers["as it is"], "learned-occupancy-hash"
+    with pytest.raises(InputError, match=f"{name}.* asks a gate on hash features"):
+        started(ball_of_the_tiny_scene(), data, name)
+    learning = "--pipeline.model.occupancy.learning"
+    with pytest.raises(InputError, match=f"{name}.* asks a gate on hash features.*{learning}$"):
+        GuidedStart(nn.Module(), Guide(name), OccupancyConfig(sampler=name), Pipe(data))
+
+
+def test_a_budget_in_which_nothing_can_be_learned_is_refused_before_the_first_step(
+    readers: dict[str, Data],
+) -> None:
+    for config in (OccupancyConfig(seconds=0.0), OccupancyConfig(rays=0)):
+        with pytest.raises(InputError, match="an occupancy is learned"):
+            GuidedStart(nn.Module(), Guide(), config, Pipe(readers["as it is"]))
+
+
+def test_an_unknown_sampler_is_refused_in_a_line(tiny_scene: Path) -> None:
+    config: Any = leco_ngp.config.pipeline
+    data = VanillaDataManagerConfig(dataparser=NerfstudioDataParserConfig(data=tiny_scene))
+    occupancy = OccupancyConfig(sampler="lerned-occupancy")
+    model = type(config.model)(host=config.model.host, occupancy=occupancy)
+    pipeline = VanillaPipelineConfig(datamanager=data, model=model)
+    with pytest.raises(InputError, match="no sampler 'lerned-occupancy'; there are dense"):
+        pipeline.setup(device="cpu")
+
+
+def test_the_first_step_leaves_the_file_in_the_runs_folder(
+    readers: dict[str, Data], tmp_path: Path
+) -> None:
+    class Trainer:
+        base_dir, local_rank = tmp_path / "run", 0
+
+    guide = Guide()
+    guide.set_occupancy(ball_of_the_tiny_scene())
+    start = GuidedStart(nn.Module(), guide, OccupancyConfig(), Pipe(readers["as it is"]), Trainer())
+    assert not Trainer.base_dir.exists()
+    start.before_step(0)
+    left = Occupancy.load(Trainer.base_dir / NAME)
+    assert left.report == guide.the_occupancy().report
+    (Trainer.base_dir / NAME).unlink()
+    start.before_step(1)
+    assert not (Trainer.base_dir / NAME).exists()
+
+
+@pytest.mark.parametrize(
+    ("step", "rays", "careful"), [(0, 512, True), (7, 512, False), (0, 0, False)]
+)
+def test_a_packed_host_begins_carefully_and_is_opaque_by_what_it_then_keeps(
+    readers: dict[str, Data], monkeypatch: pytest.MonkeyPatch, step: int, rays: int, careful: bool
+) -> None:
+    guide, config = Guide(), OccupancyConfig()
+    guide.set_occupancy(ball_of_the_tiny_scene())
+    calibration = config.learning.calibration
+    config.learning.calibration = replace(calibration, recheck_rays=rays)
+    host = nn.ModuleList([GuidedEstimator(guide, None)])
+    lengths: list[Tensor] = []
+    monkeypatch.setattr(
+        guided_start, "begin_opaque", lambda host, guide, kept: lengths.append(kept)
+    )
+    data = readers["as it is"]
+    GuidedStart(host, guide, config, Pipe(data)).before_step(step)
+    calibrated = guide.the_occupancy().threshold
+    assert (guide.followed().threshold < calibrated) == careful
+    if step == 0:
+        cameras = data.train_dataset.cameras
+        expected, _ = kept_of_rays(guide, guide.followed(), cameras)
+        assert torch.equal(lengths[0], expected)
+        whole, _ = kept_of_rays(guide, guide.the_occupancy(), cameras)
+        assert (float(expected.sum()) > float(whole.sum())) == careful
+
+
+def test_before_learning_a_run_says_that_it_starts_over_where_it_is_stopped(
+    readers: dict[str, Data], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    said: list[str] = []
+
+    def learn(*_: object) -> Occupancy:
+        said.append("learned")
+        return ball_of_the_tiny_scene()
+
+    monkeypatch.setattr("leco_plugin.models.hosts.guided_start.say", said.append)
+    monkeypatch.setattr("leco_plugin.models.hosts.learn_first.learn_occupancy", learn)
+    guide = Guide()
+    GuidedStart(nn.Module(), guide, OccupancyConfig(), Pipe(readers["as it is"])).before_step(0)
+    assert "in no checkpoint until then" in said[0] and said[1] == "learned"
+    assert guide.occupancy is not None
+
+
+def test_a_host_that_asks_no_gate_needs_no_occupancy(tiny_scene: Path) -> None:
+    config: Any = leco_ngp.config.pipeline
+    data = VanillaDataManagerConfig(dataparser=NerfstudioDataParserConfig(data=tiny_scene))
+    occupancy = OccupancyConfig(Path("no") / "file", sampler="dense")
+    model = type(config.model)(host=config.model.host, occupancy=occupancy)
+    pipeline: Any = VanillaPipelineConfig(datamanager=data, model=model).setup(device="cpu")
+    attributes = TrainingCallbackAttributes(None, None, pipeline, None)  # type: ignore[arg-type]
+    pipeline.get_training_callbacks(attributes)
+    assert pipeline.model.leco_guide.occupancy is None
+
+
+def test_where_the_scene_lies_is_said_before_the_first_step(
+    readers: dict[str, Data], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    said: list[str] = []
+    for module in ("scenes.survey", "models.hosts.guided_start"):
+        monkeypatch.setattr(f"leco_plugin.{module}.say", said.append)
+    started(lopsided(readers["as it is"]), readers["as it is"])
+    assert any(line.startswith("near") for line in said)
+    assert "rays meet the scene" in said[-2]
+    assert "those for learning one, and do not change it" in said[-1]
+
+
+def test_a_range_that_no_ray_meets_is_refused_before_the_first_step(
+    readers: dict[str, Data],
+) -> None:
+    data = readers["as it is"]
+    config = OccupancyConfig()
+    config.learning.bounds.altitudes = (-9.0, -8.0)
+    config.learning.near, config.learning.far = 1e-3, 2e-3
+    guide = Guide("learned-occupancy")
+    guide.set_occupancy(lopsided(data))
+    with pytest.raises(InputError, match=r"^0% of the rays meet the scene"):
+        GuidedStart(nn.Module(), guide, config, Pipe(data))
+
+
+def test_a_full_disk_does_not_end_a_run_that_has_its_occupancy(
+    readers: dict[str, Data],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    class Trainer:
+        base_dir, local_rank = tmp_path / "run", 0
+
+    def full(*_: object) -> None:
+        raise OSError(28, "No space left on device")
+
+    guide = Guide()
+    guide.set_occupancy(ball_of_the_tiny_scene())
+    start = GuidedStart(nn.Module(), guide, OccupancyConfig(), Pipe(readers["as it is"]), Trainer())
+    monkeypatch.setattr(Occupancy, "save", full)
+    start.before_step(0)
+    said = " ".join(capsys.readouterr().out.split())
+    assert "could not be written" in said and "No space left on device" in said

@@ -1,0 +1,237 @@
+"""A guided host skips less where skipping has come to cost it too much."""
+
+from __future__ import annotations
+
+import copy
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+import torch
+from ball_occupancy import ball
+
+from leco_plugin.models.freezing.calibration import THRESHOLDS, CalibrationConfig
+from leco_plugin.models.guided import _refuse_what_is_not_finite
+from leco_plugin.models.hosts import host_watch
+from leco_plugin.models.hosts.guide import Guide
+from leco_plugin.models.hosts.host_watch import LOWERED_TO, HostWatch
+from leco_plugin.models.hosts.probation import CAREFUL, begin_carefully
+from leco_plugin.models.hosts.stand_ins import GuidedEstimator
+from leco_plugin.occupancy import Occupancy
+
+BOX = torch.tensor([-4.0, -4.0, -4.0, 4.0, 4.0, 4.0])
+RAYS = 64
+
+
+class Host:
+    """A host whose pixels are off by `price` where something is skipped."""
+
+    device = torch.device("cpu")
+
+    def __init__(self, guide: Guide) -> None:
+        self.guide, self.price, self.training = guide, 0.0, True
+        self.thresholds: list[float] = []
+
+    def eval(self) -> None:
+        self.training = False
+
+    def train(self, mode: bool = True) -> None:
+        self.training = mode
+
+    def __call__(self, truth: torch.Tensor) -> dict[str, torch.Tensor]:
+        assert not self.training
+        self.thresholds.append(self.guide.followed().threshold)
+        self.guide.kept = 0  # as if it sampled
+        off = 0.1 + (0.0 if self.guide.dense else self.price)
+        return {"rgb": truth + off}
+
+
+@pytest.fixture
+def packed(watched: Watched) -> torch.nn.Module:
+    """A host whose samples are packed."""
+    return torch.nn.ModuleList([GuidedEstimator(watched.guide, BOX)])
+
+
+class Watched(SimpleNamespace):
+    def go(self, first: int, last: int) -> None:
+        for step in range(first, last):
+            self.watch.before_step(step)
+            self.now[0] += 0.1
+            self.guide.kept = self.kept
+            self.watch.after_step(step)
+
+
+@pytest.fixture
+def watched(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Watched:
+    guide, now, asked = Guide(), [0.0], []
+    guide.set_occupancy(copy.deepcopy(ball()))
+    host = Host(guide)
+    monkeypatch.setattr(host_watch.time, "monotonic", lambda: now[0])
+
+    def held_out_bundle(_: Any, count: int, seed: int, share: str) -> Any:
+        assert share == "recheck"
+        asked.append(seed)
+        truth = torch.rand(RAYS, 3)
+        return truth, truth
+
+    monkeypatch.setattr(host_watch, "held_out_bundle", held_out_bundle)
+    watch = HostWatch(
+        host,
+        guide,
+        CalibrationConfig(),
+        SimpleNamespace(datamanager=None),
+        SimpleNamespace(base_dir=tmp_path),
+    )
+    return Watched(guide=guide, host=host, watch=watch, now=now, asked=asked, kept=9, out=tmp_path)
+
+
+def test_a_price_beyond_its_bound_lowers_the_threshold_until_it_is_not(watched: Watched) -> None:
+    before, version = watched.guide.the_occupancy().threshold, watched.guide.version
+    watched.go(0, 250)
+    assert watched.asked == [1, 2] and watched.guide.the_occupancy().threshold == before
+    watched.host.price = 0.05
+    watched.go(250, 301)
+    after = watched.guide.the_occupancy()
+    assert after.threshold == pytest.approx(LOWERED_TO * before)
+    assert watched.guide.version > version and not watched.guide.dense
+    assert watched.host.training and watched.guide.kept == 9
+    left = Occupancy.load(watched.out / "occupancy.safetensors")
+    assert left.threshold == after.threshold and left.report["lowered"] == [[300, after.threshold]]
+    watched.go(301, 3000)
+    assert watched.guide.the_occupancy().threshold == 0.0
+    measured = len(watched.asked)
+    watched.go(3000, 3500)
+    assert len(watched.asked) == measured  # nothing is skipped, nothing is lost
+
+
+def test_a_host_that_can_afford_it_follows_the_calibrated_threshold_after_a_while(
+    watched: Watched, packed: Any, capsys: Any
+) -> None:
+    calibrated, version = watched.guide.the_occupancy().threshold, watched.guide.version
+    assert begin_carefully(packed, watched.guide) and watched.guide.version > version
+    watched.go(0, 100)
+    assert watched.guide.followed().threshold == pytest.approx(CAREFUL * calibrated)
+    assert watched.guide.the_occupancy().threshold == calibrated  # as files and checkpoints say
+    version = watched.guide.version
+    watched.go(100, 201)
+    assert watched.guide.followed() is watched.guide.the_occupancy()
+    assert watched.guide.version > version and watched.asked == [1, 2]
+    assert set(watched.host.thresholds) == {calibrated}  # that is what is measured
+    assert not (watched.out / "occupancy.safetensors").exists()  # nothing of it has changed
+    assert f"its threshold is {calibrated:.4f} now" in " ".join(capsys.readouterr().out.split())
+
+
+def test_a_host_that_cannot_afford_it_stays_with_the_lower_threshold(
+    watched: Watched, packed: Any
+) -> None:
+    calibrated = watched.guide.the_occupancy().threshold
+    begin_carefully(packed, watched.guide)
+    watched.host.price = 0.05
+    watched.go(0, 101)
+    watched.host.price = 0.0
+    watched.go(101, 500)
+    after = watched.guide.followed()
+    assert after is watched.guide.the_occupancy()
+    assert after.threshold == pytest.approx(CAREFUL * calibrated)
+    left = Occupancy.load(watched.out / "occupancy.safetensors")
+    assert left.threshold == after.threshold
+    assert left.report["lowered"] == [[100, pytest.approx(after.threshold)]]
+
+
+def test_the_careful_beginning_goes_on_in_a_resumed_run(watched: Watched, packed: Any) -> None:
+    calibrated = watched.guide.the_occupancy().threshold
+    begin_carefully(packed, watched.guide)
+    watched.go(0, 50)
+    fresh = Guide()
+    fresh.load_state_dict(watched.guide.state_dict())
+    assert fresh.the_occupancy().threshold == pytest.approx(calibrated)
+    assert fresh.followed().threshold == pytest.approx(CAREFUL * calibrated)
+
+
+def test_without_measurements_no_careful_beginning_goes_on(watched: Watched, packed: Any) -> None:
+    begin_carefully(packed, watched.guide)
+    never = CalibrationConfig(recheck_rays=0)
+    HostWatch(watched.host, watched.guide, never, watched.watch.pipeline, None)
+    assert watched.guide.followed() is watched.guide.the_occupancy()
+
+
+def test_what_keeps_nothing_is_followed_by_nobody(watched: Watched, packed: Any) -> None:
+    begin_carefully(packed, watched.guide)
+    watched.kept = 0
+    watched.go(0, 101)
+    assert watched.guide.followed().threshold == 0.0
+
+
+def test_hosts_with_samples_of_a_fixed_number_and_thresholds_of_nothing_begin_as_they_are(
+    watched: Watched, packed: Any
+) -> None:
+    assert not begin_carefully(torch.nn.Linear(2, 2), watched.guide)
+    watched.guide.the_occupancy().threshold_value.fill_(THRESHOLDS[-1])
+    assert not begin_carefully(packed, watched.guide)
+    assert watched.guide.followed() is watched.guide.the_occupancy()
+
+
+def test_what_was_wrong_once_is_soon_looked_at_again_however_long_that_takes(
+    watched: Watched, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(host_watch, "steps_until_next", lambda *_: 2000)
+    before = watched.guide.the_occupancy().threshold
+    watched.host.price = 0.05
+    watched.go(0, 201)
+    assert watched.guide.the_occupancy().threshold == pytest.approx(LOWERED_TO**2 * before)
+    watched.host.price = 0.0
+    watched.go(201, 1000)
+    assert watched.guide.the_occupancy().threshold == pytest.approx(LOWERED_TO**2 * before)
+    assert len(watched.asked) == 3  # nothing was found again, and the next look is far away
+
+
+def test_an_occupancy_that_keeps_nothing_is_not_followed(watched: Watched, capsys: Any) -> None:
+    watched.kept = 0
+    watched.go(0, 60)
+    watched.kept = 3
+    watched.go(60, 70)
+    watched.kept = 0
+    watched.go(70, 170)
+    assert watched.guide.the_occupancy().threshold > 0.0
+    watched.go(170, 171)
+    assert watched.guide.the_occupancy().threshold == 0.0
+    said = " ".join(capsys.readouterr().out.split())
+    assert "step 170: the occupancy kept nothing for 100 steps" in said
+
+
+def test_what_was_found_travels_with_a_checkpoint(watched: Watched) -> None:
+    watched.go(0, 150)
+    fresh = Guide()
+    fresh.load_state_dict(watched.guide.state_dict())
+    assert fresh.watched == watched.guide.watched and fresh.watched["rechecks"] == 1
+
+
+@pytest.mark.parametrize("where", ["image", "loss", "weight"])
+def test_a_host_takes_no_step_with_a_loss_that_is_not_finite(where: str) -> None:
+    host: Any = torch.nn.Linear(2, 2)
+    loss = torch.ones(())
+    host.get_loss_dict = lambda outputs, batch, metrics=None: {"rgb_loss": loss}
+    _refuse_what_is_not_finite(host)
+    batch = {"image": torch.zeros(3)}
+    assert host.get_loss_dict({}, batch) == {"rgb_loss": loss}
+    loss.fill_(torch.nan)
+    if where == "image":
+        batch["image"][0] = torch.nan
+    if where == "weight":
+        host.weight.data[0] = torch.inf
+    cause = {"image": "training image", "loss": "the loss itself", "weight": "parameter weight"}
+    with pytest.raises(FloatingPointError, match=f"rgb_loss is not finite: .*{cause[where]}"):
+        host.get_loss_dict({}, batch)
+    host.eval()
+    host.get_loss_dict({}, batch)
+
+
+def test_all_processes_lower_the_threshold_or_none(
+    watched: Watched, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    kept_elsewhere = 7.0
+    monkeypatch.setattr(host_watch, "mean", lambda here, _: 0.5 * (here + kept_elsewhere))
+    watched.kept = 0
+    watched.go(0, 300)
+    assert watched.guide.the_occupancy().threshold > 0.0

@@ -1,0 +1,167 @@
+"""Where hosts keep their samplers, and what is taken away when those are swapped."""
+
+from __future__ import annotations
+
+import nerfacc
+import pytest
+import torch
+from ball_occupancy import ball
+from nerfstudio.model_components.ray_samplers import (
+    ProposalNetworkSampler,
+    UniformSampler,
+    VolumetricSampler,
+)
+from torch import nn
+
+from leco_plugin.models.hosts.guide import Guide
+from leco_plugin.models.hosts.seams import no_density, swap_sampler
+from leco_plugin.models.hosts.stand_ins import GuidedEstimator, GuidedProposal
+
+
+class Host(nn.Module):
+    """What a seam is sought in."""
+
+    def get_param_groups(self) -> dict[str, list[nn.Parameter]]:
+        return {}
+
+    def get_loss_dict(self, *_: object) -> dict[str, torch.Tensor]:
+        return {}
+
+
+class Packed(Host):
+    def __init__(self) -> None:
+        super().__init__()
+        self.gatekeeper = nerfacc.OccGridEstimator(torch.tensor([-1.0] * 3 + [1.0] * 3), 8, 1)
+        self.walker = VolumetricSampler(self.gatekeeper)
+
+
+class Network(nn.Module):
+    def __init__(self) -> None:
+        super().__init__()
+        self.layer = nn.Linear(3, 1)
+
+    def density_fn(self, positions: torch.Tensor) -> torch.Tensor:
+        return self.layer(positions)
+
+
+class Proposal(Host):
+    def __init__(self) -> None:
+        super().__init__()
+        self.field = Network()
+        self.scouts = nn.ModuleList([Network(), Network()])
+        self.alone = Network()
+        self.opinions = [net.density_fn for net in (*self.scouts, self.alone)]
+        self.chooser = ProposalNetworkSampler(
+            num_nerf_samples_per_ray=21, initial_sampler=UniformSampler(single_jitter=True)
+        )
+
+    def get_param_groups(self) -> dict[str, list[nn.Parameter]]:
+        return {
+            "scouts": list(self.scouts.parameters()),
+            "fields": list(self.field.parameters()),
+        }
+
+    def get_loss_dict(self, *_: object) -> dict[str, torch.Tensor]:
+        constant = torch.tensor(0.5)
+        return {"rgb": self.field.layer.weight.sum(), "scouting": constant}
+
+
+def test_a_packed_host_is_found_under_any_name(guide: Guide):
+    host = Packed()
+    assert swap_sampler(host, guide) == "packed"
+    assert isinstance(host.gatekeeper, GuidedEstimator)
+    assert host.walker.occupancy_grid is host.gatekeeper
+    assert not any("occs" in name for name in host.state_dict())
+
+
+def test_a_packed_host_lends_its_density_for_rendering_front_to_back():
+    host, network = Packed(), Network()
+    host.walker.density_fn = network.density_fn
+    made = Guide(front_to_back=True)
+    made.set_occupancy(ball())
+    swap_sampler(host, made)
+    assert host.gatekeeper.sampler.density_fn == network.density_fn
+
+
+def test_a_proposal_host_keeps_nothing_of_its_networks(guide: Guide):
+    host = Proposal()
+    assert swap_sampler(host, guide) == "proposal"
+    assert isinstance(host.chooser, GuidedProposal)
+    assert host.chooser._options["num_samples"] == 21
+    assert host.chooser._options["single_jitter"] is True
+    assert isinstance(host.chooser._options["initial_sampler"], UniformSampler)
+    assert not [*host.scouts.parameters(), *host.alone.parameters()]
+    assert host.opinions == [no_density] * 3
+    assert set(host.get_param_groups()) == {"fields"}
+    assert {name.split(".")[0] for name in host.state_dict()} == {"field"}
+
+
+class WithStages(Proposal):
+    """Holds its own methods in a list, too."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.stages = [self.get_loss_dict, self.get_param_groups]
+
+
+def test_a_list_of_the_hosts_own_methods_is_none_of_proposal_densities(guide: Guide):
+    host = WithStages()
+    before = list(host.stages)
+    swap_sampler(host, guide)
+    assert host.stages == before
+    assert host.opinions == [no_density] * 3
+
+
+class Boxless(nerfacc.OccGridEstimator):
+    """An estimator whose boxes are called otherwise."""
+
+    def __init__(self) -> None:
+        super().__init__(torch.tensor([-1.0] * 3 + [1.0] * 3), 8, 1)
+        del self.aabbs
+
+
+def test_an_estimator_without_boxes_needs_an_adapter(guide: Guide):
+    host = Packed()
+    host.gatekeeper = host.walker.occupancy_grid = Boxless()
+    with pytest.raises(ValueError, match="has no sampler that could be swapped"):
+        swap_sampler(host, guide)
+
+
+def test_a_loss_that_reaches_nothing_is_left_out_in_training_only(guide: Guide):
+    host = Proposal()
+    swap_sampler(host, guide)
+    assert set(host.train().get_loss_dict()) == {"rgb"}
+    assert set(host.eval().get_loss_dict()) == {"rgb", "scouting"}
+
+
+def test_a_grid_has_nothing_for_a_proposal_host():
+    with pytest.raises(ValueError, match="occupancy-grid"):
+        swap_sampler(Proposal(), Guide("occupancy-grid"))
+
+
+def test_a_host_without_a_seam_is_told_what_was_looked_for(guide: Guide):
+    with pytest.raises(ValueError, match=r"OccGridEstimator.*ProposalNetworkSampler.*HostAdapter"):
+        swap_sampler(Host(), guide)
+
+
+class SamplesWith(Host):
+    """A host that cuts its rays itself and takes any estimator."""
+
+    def sample_with(self, estimator: nn.Module | None) -> None:
+        self.estimator = estimator
+
+
+def test_a_host_that_takes_any_estimator_is_given_one_without_a_box(guide: Guide):
+    host = SamplesWith()
+    assert swap_sampler(host, guide) == "sample-with"
+    assert isinstance(host.estimator, GuidedEstimator)
+    dense = SamplesWith()
+    swap_sampler(dense, Guide("dense"))
+    far = torch.tensor([[50.0, 0.0, 0.0]])
+    samples = dense.estimator.sampling(far, torch.eye(3)[:1], far_plane=1.0, render_step_size=0.1)
+    assert len(samples[0]) == 10
+
+
+def test_such_a_host_has_a_grid_of_its_own():
+    with pytest.raises(ValueError, match="sampling occupancy-grid"):
+        swap_sampler(SamplesWith(), Guide("occupancy-grid"))

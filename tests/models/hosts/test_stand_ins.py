@@ -1,0 +1,240 @@
+"""A host's stand-ins ask samplers in the occupancy's coordinates, and answer in the host's."""
+
+from __future__ import annotations
+
+import copy
+import inspect
+from typing import Any
+
+import pytest
+import torch
+from ball_occupancy import BOX, CENTRE, MARCH, ball, rays
+from nerfstudio.cameras.rays import RayBundle
+from nerfstudio.viewer.utils import parse_object
+from nerfstudio.viewer.viewer_elements import ViewerElement
+
+from leco_plugin.models.hosts.guide import Guide
+from leco_plugin.models.hosts.probation import begin_carefully, end_probation
+from leco_plugin.occupancy import BACKDROP_PRICE, Occupancy
+from leco_plugin.samplers.base import Estimator
+from leco_plugin.samplers.estimator import LearnedOccupancyEstimator
+from leco_plugin.space import Space
+
+pytestmark = pytest.mark.usefixtures("without_cache")
+
+
+def test_a_host_samples_as_with_the_estimator_itself(guide: Guide):
+    own = LearnedOccupancyEstimator(ball()).eval()
+    origins, directions = rays()
+    expected = own.sampling(origins, directions, **MARCH)
+    found = guide.estimator(BOX).eval().sampling(origins, directions, **MARCH)
+    assert len(expected[0]) > 0
+    for a, b in zip(found, expected):
+        assert torch.equal(a, b)
+
+
+def test_a_host_that_begins_carefully_keeps_more_until_it_ends(guide: Guide):
+    estimator = guide.estimator(BOX).eval()
+    before = len(estimator.sampling(*rays(), **MARCH)[0])
+    assert begin_carefully(torch.nn.ModuleList([estimator]), guide)
+    lower = LearnedOccupancyEstimator(guide.the_occupancy().with_threshold(0.5 / 16)).eval()
+    expected = len(lower.sampling(*rays(), **MARCH)[0])
+    assert len(estimator.sampling(*rays(), **MARCH)[0]) == expected > before
+    assert end_probation(guide) == pytest.approx(0.5 / 16)
+    assert len(estimator.sampling(*rays(), **MARCH)[0]) == before
+
+
+def test_the_signature_is_that_of_estimators(guide: Guide):
+    stand_in = inspect.signature(type(guide.estimator(BOX)).sampling)
+    assert stand_in == inspect.signature(Estimator.sampling)
+
+
+def test_a_host_in_other_coordinates_gets_the_same_samples(guide: Guide):
+    turn, scale = torch.linalg.qr(torch.randn(3, 3))[0], 2.5
+    turn = turn * torch.det(turn)
+    shift = torch.tensor([0.3, -1.0, 0.2])
+    origins, directions = rays()
+    expected = guide.estimator(BOX).eval().sampling(origins, directions, **MARCH)
+    # where the host sees what the occupancy sees at p: (p - shift) turned back and shrunk
+    host_origins, host_directions = (origins - shift) @ turn / scale, directions @ turn
+    guide.set_occupancy(ball(), torch.cat([scale * turn, shift[:, None]], dim=1))
+    shorter = {name: value / scale for name, value in MARCH.items()}
+    found = guide.estimator(BOX).eval().sampling(host_origins, host_directions, **shorter)
+    assert abs(len(found[0]) - len(expected[0])) <= 2  # rounding at the ball's edge
+    both = min(len(found[0]), len(expected[0]))
+    torch.testing.assert_close(
+        found[1][:both].sort()[0] * scale, expected[1][:both].sort()[0], atol=0.06, rtol=0.0
+    )
+
+
+def test_boxes_and_cells_are_answered_in_the_hosts_coordinates(guide: Guide):
+    shift = torch.tensor([0.3, -1.0, 0.2])
+    here = guide.estimator(BOX)
+    boxes, opacities, decisions = here.aabbs, here.occs, here.binaries
+    guide.set_occupancy(ball(), torch.cat([2.0 * torch.eye(3), shift[:, None]], dim=1))
+    there = guide.estimator(BOX)
+    torch.testing.assert_close(there.aabbs, (boxes - shift.repeat(2)) / 2.0)
+    torch.testing.assert_close(there.occs, opacities, atol=0.02, rtol=0.0)
+    assert (there.binaries != decisions).float().mean() < 1e-3
+    assert 0.01 < decisions.float().mean() < 0.5
+
+
+def test_steps_that_do_not_grow_end_at_the_hosts_box():
+    """An unbounded occupancy has no end of its own, and nerfstudio's sampler gives none."""
+    guide = Guide()
+    space = Space("contraction", (0.0, 0.0, 0.0), 1.0)
+    guide.set_occupancy(Occupancy(ball().gate, space, 1e-9))
+    inner, outer = torch.tensor([-1.0] * 3 + [1.0] * 3), torch.tensor([-2.0] * 3 + [2.0] * 3)
+    origins = torch.tensor([[-3.0, 0.0, 0.0], [0.0, 1.5, 0.0], [0.0, 3.0, 0.0]])
+    directions = torch.tensor([[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [1.0, 0.0, 0.0]])
+    guided: Any = guide.estimator(inner, outer).eval()
+    march: dict[str, Any] = {"render_step_size": 0.125, "far_plane": 1e10}
+    indices, _, t_ends = guided.sampling(origins, directions, **march)
+    assert [float(t_ends[indices == ray].max()) for ray in (0, 1)] == pytest.approx([5.0, 0.5])
+    assert not bool((indices == 2).any())
+    sooner = torch.tensor([1.0, 9.0, 9.0])
+    indices, _, t_ends = guided.sampling(origins, directions, t_max=sooner, **march)
+    assert [float(t_ends[indices == ray].max()) for ray in (0, 1)] == pytest.approx([1.0, 0.5])
+    _, _, t_ends = guided.sampling(origins, directions, cone_angle=0.5, far_plane=50.0)
+    assert float(t_ends.max()) > 40.0
+
+
+def an_unbounded_guide(threshold: float) -> Guide:
+    guide = Guide()
+    space = Space("contraction", (0.0, 0.0, 0.0), 1.0)
+    guide.set_occupancy(Occupancy(ball().gate, space, threshold))
+    return guide
+
+
+def test_rays_of_an_unbounded_occupancy_end_in_a_place_for_the_sky():
+    guide = an_unbounded_guide(2.0)  # which keeps nothing
+    origins = torch.tensor([[0.0, 0.0, 0.0], [5.0, 0.0, 0.0], [0.0, torch.nan, 0.0]])
+    directions = torch.tensor([[0.0, 0.0, 1.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]])
+    march: dict[str, Any] = {"cone_angle": 0.125, "far_plane": 40.0, "render_step_size": 0.1}
+    guided: Any = guide.estimator(BOX).eval()
+    indices, t_starts, t_ends = guided.sampling(origins, directions, **march)
+    assert indices.tolist() == [0, 1]
+    assert t_starts.tolist() == [35.0, 35.0] and t_ends.tolist() == [40.0, 40.0]
+    sooner = torch.tensor([8.0, 40.0, 40.0])
+    _, t_starts, t_ends = guided.sampling(origins, directions, t_max=sooner, **march)
+    assert t_starts.tolist() == [7.0, 35.0] and t_ends.tolist() == [8.0, 40.0]
+
+
+def test_rays_of_a_bounded_occupancy_end_so_where_pictures_show_something_there():
+    walls = torch.tensor([-1.0, -1.0, -1.0, 1.0, 1.0, 1.0])
+    origins = torch.tensor([[0.0, 0.0, -3.0], [0.0, 5.0, -3.0]])  # one ray meets the box
+    directions = torch.tensor([[0.0, 0.0, 1.0], [0.0, 0.0, 1.0]])
+    march: dict[str, Any] = {"far_plane": 40.0, "render_step_size": 0.5}
+    for price, ends in ((0.0, []), (0.5, []), ("?", []), (2.0, [4.0, 40.0])):
+        guide, report = Guide(), {BACKDROP_PRICE: price}
+        space = Space("box", (0.0, 0.0, 0.0), 1.0)
+        guide.set_occupancy(Occupancy(ball().gate, space, 2.0, report=report, walls=walls))
+        guided: Any = guide.estimator(None).eval()
+        indices, t_starts, t_ends = guided.sampling(origins, directions, **march)
+        assert t_ends.tolist() == ends and indices.tolist() == list(range(len(ends)))
+        assert t_starts.tolist() == [end - 0.5 for end in ends]
+        guided.train()
+        guided.sampling(origins, directions, **march)
+        assert guide.kept == 0  # a backdrop is nothing that the gate keeps
+        guide.dense = True  # what skipping is measured against has the same sky
+        assert guided.sampling(origins, directions, **march)[2].max() == max(ends, default=4.0)
+
+
+def test_what_an_unbounded_occupancy_keeps_comes_before_the_backdrop_in_order():
+    origins, directions = rays()
+    march: dict[str, Any] = {"cone_angle": 0.05, "far_plane": 9.0, "render_step_size": 0.05}
+    guide = an_unbounded_guide(0.5)
+    own = LearnedOccupancyEstimator(guide.the_occupancy()).eval()
+    indices, t_starts, t_ends = own.sampling(origins, directions, **march)
+    before = 0.5 * (t_starts + t_ends) < 9.0 - 0.05 * 9.0
+    guided: Any = guide.estimator(BOX).eval()
+    found = guided.sampling(origins, directions, **march)
+    is_last = found[2] == 9.0
+    assert int(is_last.sum()) == len(origins)
+    assert bool((found[0].diff() >= 0).all())
+    assert bool(((found[1].diff() > 0) | (found[0].diff() > 0)).all())
+    for ours, theirs in zip(found, (indices, t_starts, t_ends)):
+        assert torch.equal(ours[~is_last], theirs[before])
+
+
+def wall_behind(x: float):
+    """A host's density: opaque beyond the plane z < x of the occupancy's coordinates."""
+    return lambda positions: 1e3 * (positions[:, 2:] < x).float()
+
+
+@pytest.mark.parametrize("scale", [1.0, 2.0], ids=["same frame", "another"])
+@pytest.mark.parametrize("sampler", ["learned-occupancy", "dense"])
+def test_rendering_front_to_back_hands_out_nothing_behind_a_wall(scale: float, sampler: str):
+    made = Guide(sampler, front_to_back=True)
+    made.set_occupancy(ball(), torch.cat([scale * torch.eye(3), torch.zeros(3, 1)], dim=1))
+    middle = CENTRE[2] / scale
+    estimator = made.estimator(BOX / scale, density_fn=wall_behind(middle)).eval()
+    origins, _ = rays(1)
+    march = {name: value / scale for name, value in MARCH.items()}
+
+    def depths() -> torch.Tensor:
+        down = torch.tensor([[0.0, 0.0, -1.0]])
+        _, starts, ends = estimator.sampling(origins / scale, down, **march)
+        return origins[0, 2] / scale - 0.5 * (starts + ends)
+
+    step = march["render_step_size"]
+    assert middle - 2 * step < depths().min() < middle
+    estimator.train()
+    assert depths().min() < middle - 0.5 / scale
+
+
+def test_a_proposal_host_in_other_coordinates_samples_the_ball(guide: Guide):
+    turn = torch.tensor([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
+    origins, directions = rays(3)
+    directions = torch.nn.functional.normalize(torch.tensor(CENTRE) - origins, dim=-1)
+    guide.set_occupancy(ball(), torch.cat([turn, torch.zeros(3, 1)], dim=1))
+    bundle = RayBundle(
+        origins=origins @ turn,
+        directions=directions @ turn,
+        pixel_area=torch.ones(3, 1),
+        nears=torch.zeros(3, 1),
+        fars=torch.full((3, 1), 8.0),
+    )
+    samples, _, _ = guide.proposal(num_samples=16).eval()(bundle)
+    inside = (samples.frustums.get_positions() @ turn.T - torch.tensor(CENTRE)).norm(dim=-1)
+    assert (inside < 1.3).float().mean() > 0.9
+
+
+def test_a_host_in_half_precision_moves_its_rays_in_full(guide: Guide):
+    turn = torch.linalg.qr(torch.randn(3, 3))[0]
+    guide.set_occupancy(ball(), torch.cat([turn * torch.det(turn), torch.ones(3, 1)], dim=1))
+    origins, directions = rays()
+    expected = guide.estimator(BOX).sampling(origins, directions, **MARCH)
+    with torch.autocast("cpu", torch.bfloat16):
+        found = guide.estimator(BOX).sampling(origins, directions, **MARCH)
+    assert torch.equal(found[1], expected[1])
+
+
+def test_a_guide_that_is_dense_for_the_moment_keeps_every_candidate(guide: Guide):
+    guide.set_occupancy(copy.deepcopy(ball()))
+    origins = (torch.tensor(CENTRE) + torch.tensor([0.0, 0.0, 3.0])).expand(4, 3)
+    directions = torch.tensor([[0.0, 0.0, -1.0]]).expand(4, 3)
+    march = MARCH | {"far_plane": 4.0}
+    stand_in = guide.estimator(BOX).train()
+    some = stand_in.sampling(origins, directions, **march)[0]
+    assert guide.kept == len(some)
+    guide.dense = True
+    every = stand_in.sampling(origins, directions, **march)[0]
+    guide.dense = False
+    guide.the_occupancy().threshold_value.fill_(0.0)
+    inside = stand_in.sampling(origins, directions, **march)[0]
+    assert 0 < len(some) < len(every) and abs(len(every) - len(inside)) <= 8
+
+
+def test_the_viewer_looks_for_its_elements_before_there_is_an_occupancy():
+    host = torch.nn.Module()
+    host.guide = Guide()
+    host.grid, host.chooser = host.guide.estimator(BOX), host.guide.proposal(num_samples=3)
+    assert parse_object(host, ViewerElement, "Custom Elements") == []
+
+
+def test_the_viewer_does_not_ask_a_gate_when_it_looks_for_its_elements(guide: Guide):
+    host = torch.nn.Module()
+    host.guide, host.grid = guide, guide.estimator(BOX)
+    parse_object(host, ViewerElement, "Custom Elements")
+    assert host.grid._built[0] is None
