@@ -1,6 +1,6 @@
 """The procedural city as rays with colours, traced by torch: training data without a data manager.
 
-Surfaces are painted as in `scenes/city_render.py`; shadows are left out.
+Surfaces are painted as in `scenes/city/render.py`; shadows are left out.
 """
 
 from __future__ import annotations
@@ -12,9 +12,9 @@ import torch
 from torch import Tensor
 
 from leco_plugin.samplers.rays import intersect_box
-from leco_plugin.scenes.city import City, CityConfig
-from leco_plugin.scenes.city_capture import CaptureConfig, View, views_of
-from leco_plugin.scenes.city_texture import paint_surface
+from leco_plugin.scenes.city.capture import CaptureConfig, View, views_of
+from leco_plugin.scenes.city.city import City, CityConfig
+from leco_plugin.scenes.city.texture import paint_surface
 
 SUN = (0.48, -0.36, 0.8)
 PAIRS = 1 << 24

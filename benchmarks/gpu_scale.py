@@ -8,8 +8,8 @@ from typing import Any
 import torch
 
 from leco_plugin.models.sizing.sizes import PAPER, SMALL, Sizes
-from leco_plugin.scenes.city import CityConfig
-from leco_plugin.scenes.city_capture import CaptureConfig
+from leco_plugin.scenes.city.capture import CaptureConfig
+from leco_plugin.scenes.city.city import CityConfig
 
 TINY = replace(
     SMALL,

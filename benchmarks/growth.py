@@ -38,9 +38,9 @@ from leco_plugin.models.gate import GateConfig
 from leco_plugin.models.learning.lifecycle import Lifecycle
 from leco_plugin.models.learning.phases import ScheduleConfig
 from leco_plugin.models.sizing.sizes import sizes_for
-from leco_plugin.scenes.city import City, CityConfig
-from leco_plugin.scenes.city_capture import CaptureConfig
-from leco_plugin.scenes.city_folder import write_city
+from leco_plugin.scenes.city.capture import CaptureConfig
+from leco_plugin.scenes.city.city import City, CityConfig
+from leco_plugin.scenes.city.folder import write_city
 
 RESULTS = Path(__file__).parent / "results"
 

@@ -113,8 +113,8 @@ def measure(way: Way, folder: Path, options: Options) -> dict[str, Any]:
     from leco_plugin.models.learning.phases import ScheduleConfig
     from leco_plugin.models.leco_config import LecoModelConfig
     from leco_plugin.scenes.data_manager import LecoDataManagerConfig, decoded_bytes
-    from leco_plugin.scenes.known_distances import KnownDistancePixelSamplerConfig
     from leco_plugin.scenes.photographs import LecoPhotographsDataParserConfig
+    from leco_plugin.scenes.pixels.known_distances import KnownDistancePixelSamplerConfig
 
     common: dict[str, Any] = {
         "dataparser": LecoPhotographsDataParserConfig(data=folder),

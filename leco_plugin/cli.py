@@ -56,8 +56,8 @@ def city(
         format: Of the scene: nerfstudio's, or Mega-NeRF's, for the data parser mega-nerf.
         json: File for what was written, as JSON.
     """
-    from leco_plugin.scenes.city import City, CityConfig
-    from leco_plugin.scenes.city_folder import CaptureConfig, count_pictures, write_city
+    from leco_plugin.scenes.city.city import City, CityConfig
+    from leco_plugin.scenes.city.folder import CaptureConfig, count_pictures, write_city
 
     config = CityConfig(blocks, seed, block_size, sky=sky, far_terrain=far_terrain)
     capture = CaptureConfig(width, height)

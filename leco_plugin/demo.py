@@ -27,9 +27,9 @@ from leco_plugin.method_configs import leco_occupancy
 from leco_plugin.models.freezing.freezing import FILE_NAME
 from leco_plugin.occupancy import Occupancy
 from leco_plugin.progress_bar import bar
-from leco_plugin.scenes.city import CityConfig
-from leco_plugin.scenes.city_folder import CaptureConfig, write_city
-from leco_plugin.scenes.city_truth import CityTruth
+from leco_plugin.scenes.city.city import CityConfig
+from leco_plugin.scenes.city.folder import CaptureConfig, write_city
+from leco_plugin.scenes.city.truth import CityTruth
 
 SECONDS = 130.0
 """Training time of each of the two runs; all of it then takes under six minutes on two cores."""

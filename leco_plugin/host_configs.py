@@ -22,8 +22,8 @@ from leco_plugin.models.guided import GuidedModelConfig
 from leco_plugin.models.switch.config import SwitchNerfModelConfig
 from leco_plugin.models.switch.sizes import switch_sizes_for
 from leco_plugin.scenes.data_manager import LecoDataManagerConfig
-from leco_plugin.scenes.known_distances import KnownDistancePixelSamplerConfig
 from leco_plugin.scenes.photographs import LecoPhotographsDataParserConfig
+from leco_plugin.scenes.pixels.known_distances import KnownDistancePixelSamplerConfig
 from leco_plugin.swap import learned_first, with_sampler_swapped
 
 

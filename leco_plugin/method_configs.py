@@ -17,8 +17,8 @@ from leco_plugin.models.learning.phases import ScheduleConfig
 from leco_plugin.models.leco_config import LecoModelConfig
 from leco_plugin.models.sizing.sizes import PAPER, automatic, sizes_for
 from leco_plugin.scenes.data_manager import LecoDataManagerConfig
-from leco_plugin.scenes.known_distances import KnownDistancePixelSamplerConfig
 from leco_plugin.scenes.photographs import LecoPhotographsDataParserConfig
+from leco_plugin.scenes.pixels.known_distances import KnownDistancePixelSamplerConfig
 
 
 def best_device() -> Literal["cpu", "cuda"]:

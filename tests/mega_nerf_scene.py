@@ -6,9 +6,9 @@ from pathlib import Path
 
 import numpy as np
 
-from leco_plugin.scenes.city_cameras import look_at
-from leco_plugin.scenes.mega_nerf_axes import Coordinates
-from leco_plugin.scenes.mega_nerf_writer import (
+from leco_plugin.scenes.city.cameras import look_at
+from leco_plugin.scenes.mega_nerf_format.axes import Coordinates
+from leco_plugin.scenes.mega_nerf_format.writer import (
     write_coordinates,
     write_mappings,
     write_mask,

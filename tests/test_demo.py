@@ -30,8 +30,8 @@ CODE = """
 import sys
 from pathlib import Path
 from leco_plugin.demo import run_demo
-from leco_plugin.scenes.city import CityConfig
-from leco_plugin.scenes.city_folder import CaptureConfig
+from leco_plugin.scenes.city.city import CityConfig
+from leco_plugin.scenes.city.folder import CaptureConfig
 run_demo(Path(sys.argv[1]), float(sys.argv[2]), CityConfig(blocks=1), CaptureConfig(48, 36))
 """
 

@@ -13,8 +13,8 @@ from leco_plugin.method_configs import (
     leco_occupancy_paper,
 )
 from leco_plugin.models.sizing.sizes import left_open, sizes_for
-from leco_plugin.scenes.held_out_pixels import HeldOutPixelSampler
 from leco_plugin.scenes.photographs import LecoPhotographs
+from leco_plugin.scenes.pixels.held_out_pixels import HeldOutPixelSampler
 
 METHODS = {"leco-occupancy": leco_occupancy, "leco-occupancy-paper": leco_occupancy_paper}
 

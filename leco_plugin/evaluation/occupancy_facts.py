@@ -10,8 +10,8 @@ import torch
 from leco_plugin.evaluation.json_file import finite_or_null
 from leco_plugin.evaluation.occupancy_truth import compare_with_truth
 from leco_plugin.occupancy import Occupancy
-from leco_plugin.scenes.city import DESCRIPTION
-from leco_plugin.scenes.city_truth import CityTruth
+from leco_plugin.scenes.city.city import DESCRIPTION
+from leco_plugin.scenes.city.truth import CityTruth
 
 FROM_REPORT = (
     "train_seconds",

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from leco_plugin.occupancy import Occupancy
-from leco_plugin.scenes.city_truth import CityTruth
+from leco_plugin.scenes.city.truth import CityTruth
 
 MOST_SURFACE_POINTS = 100_000
 AIR_POINTS = 50_000

@@ -48,7 +48,7 @@ from leco_plugin.occupancy import Occupancy, gate_precision
 from leco_plugin.samplers.estimator import LearnedOccupancyEstimator
 from leco_plugin.samplers.marching import march
 from leco_plugin.scenes.bounds import SceneBounds
-from leco_plugin.scenes.known_distances import DISTANCE
+from leco_plugin.scenes.pixels.known_distances import DISTANCE
 from leco_plugin.space import Space
 
 

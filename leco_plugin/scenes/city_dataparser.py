@@ -54,8 +54,8 @@ class LecoCity(Nerfstudio):
     config: LecoCityDataParserConfig
 
     def __init__(self, config: LecoCityDataParserConfig) -> None:
-        from leco_plugin.scenes.city import CityConfig
-        from leco_plugin.scenes.city_folder import CaptureConfig, write_city
+        from leco_plugin.scenes.city.city import CityConfig
+        from leco_plugin.scenes.city.folder import CaptureConfig, write_city
         from leco_plugin.scenes.input_error import InputError
 
         super().__init__(config)
@@ -71,7 +71,7 @@ class LecoCity(Nerfstudio):
     def _generate_dataparser_outputs(
         self, split: str = "train", **kwargs: Any
     ) -> DataparserOutputs:
-        from leco_plugin.scenes.city_layouts import POINTS as FILE
+        from leco_plugin.scenes.city.layouts import POINTS as FILE
         from leco_plugin.scenes.dataset_units import METRES_PER_UNIT, UP_IS_KNOWN
         from leco_plugin.scenes.photographs import POINTS, read_ply
 

@@ -24,11 +24,11 @@ from torch import Tensor
 from leco_plugin.models.compute.ranks import say
 from leco_plugin.scenes.dataset_units import UP_IS_KNOWN
 from leco_plugin.scenes.detail import CAMERAS
-from leco_plugin.scenes.held_out_pixels import HeldOutPixelSampler
 from leco_plugin.scenes.input_error import InputError, one_line
-from leco_plugin.scenes.lattice import PERIODS, Lattice, lattice_for
 from leco_plugin.scenes.photograph_files import names_what_it_cannot_read
-from leco_plugin.scenes.stored_pictures import picture_sizes, store_pictures
+from leco_plugin.scenes.pixels.held_out_pixels import HeldOutPixelSampler
+from leco_plugin.scenes.pixels.lattice import PERIODS, Lattice, lattice_for
+from leco_plugin.scenes.pixels.stored_pictures import picture_sizes, store_pictures
 from leco_plugin.scenes.survey import points_in
 from leco_plugin.scenes.upright import turn_to_upright, turned
 

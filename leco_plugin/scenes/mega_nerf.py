@@ -29,7 +29,7 @@ from torch import Tensor
 
 if TYPE_CHECKING:
     from leco_plugin.scenes.derived_images import DerivedImages
-    from leco_plugin.scenes.mega_nerf_files import Frame, MegaNerfScene
+    from leco_plugin.scenes.mega_nerf_format.files import Frame, MegaNerfScene
 
 
 @dataclass
@@ -111,7 +111,7 @@ class MegaNerf(DataParser):
         """The scene, read once, with a line that says what it is."""
         if self._scene is None:
             from leco_plugin.progress_bar import CONSOLE, bar
-            from leco_plugin.scenes.mega_nerf_files import read_scene
+            from leco_plugin.scenes.mega_nerf_format.files import read_scene
 
             _check(self.config)
             with bar("Reading the scene") as progress:
@@ -140,7 +140,7 @@ class MegaNerf(DataParser):
         self, frames: list[Frame], factor: int
     ) -> tuple[list[Frame], list[Path], list[Path] | None]:
         """Frames that have a pixel to train on, their pictures, and their masks if any has one."""
-        from leco_plugin.scenes.mega_nerf_images import mask_of, picture_of
+        from leco_plugin.scenes.mega_nerf_format.images import mask_of, picture_of
 
         derived = self._derived()
         folder = self.config.masks
@@ -165,7 +165,7 @@ class MegaNerf(DataParser):
         return frames, images, masks
 
     def _scored_files(self, frames: list[Frame], factor: int) -> list[Path]:
-        from leco_plugin.scenes.mega_nerf_images import picture_of
+        from leco_plugin.scenes.mega_nerf_format.images import picture_of
 
         derived, half = self._derived(), self.config.protocol == "half"
         return self._each(

@@ -16,7 +16,7 @@ from leco_plugin.evaluation.inspection import whole_box
 from leco_plugin.evaluation.machine import describe_machine
 from leco_plugin.occupancy import BACKDROP_PRICE, Occupancy
 from leco_plugin.progress_bar import bar
-from leco_plugin.scenes.held_out_pixels import held_out_sampler
+from leco_plugin.scenes.pixels.held_out_pixels import held_out_sampler
 from leco_plugin.shrink.evidence import Evidence, gather
 from leco_plugin.shrink.references import names_of, references, shares_lost
 from leco_plugin.shrink.search import Bounds, Found, Ground, Rung, check_room, search

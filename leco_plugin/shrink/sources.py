@@ -23,8 +23,8 @@ from leco_plugin.models.rendering import Rays
 from leco_plugin.models.scene_rays import cut_to_bounds
 from leco_plugin.occupancy import Occupancy
 from leco_plugin.scenes.frames import between, frame_of, moved, turned
-from leco_plugin.scenes.held_out_pixels import held_out_sampler, some_images
 from leco_plugin.scenes.input_error import InputError, one_line
+from leco_plugin.scenes.pixels.held_out_pixels import held_out_sampler, some_images
 
 CONFIG, CHECKPOINTS = "config.yml", "nerfstudio_models"
 SAME_PLACE = 1e-3

@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-from leco_plugin.scenes.city_layouts import POINTS, TRANSFORMS, write_points
+from leco_plugin.scenes.city.layouts import POINTS, TRANSFORMS, write_points
 from leco_plugin.stability.capture import Capture, Shot, shots_of
 from leco_plugin.stability.coverage import View, shown_by
 from leco_plugin.stability.matter import Array

@@ -18,7 +18,7 @@ from leco_plugin.chart.processes import ProcessRunner, RunFailed
 from leco_plugin.chart.protocol import Protocol, describe_scene, settings_of
 from leco_plugin.evaluation.json_file import write_json
 from leco_plugin.evaluation.machine import describe_code, describe_machine, usable_cores
-from leco_plugin.scenes.city_layouts import TRANSFORMS
+from leco_plugin.scenes.city.layouts import TRANSFORMS
 from leco_plugin.stability.cases import Case
 from leco_plugin.stability.contenders import Sampler
 from leco_plugin.stability.cost import core_seconds, in_words

@@ -19,8 +19,8 @@ from leco_plugin.models.leco_config import LecoModelConfig
 from leco_plugin.models.switch.config import SwitchNerfModelConfig
 from leco_plugin.scenes.bounds import BoundsConfig
 from leco_plugin.scenes.data_manager import LecoDataManager
-from leco_plugin.scenes.known_distances import KnownDistancePixelSamplerConfig
 from leco_plugin.scenes.photographs import LecoPhotographsDataParserConfig
+from leco_plugin.scenes.pixels.known_distances import KnownDistancePixelSamplerConfig
 
 # nerfstudio leaves images open that it has read
 pytestmark = [

@@ -9,9 +9,9 @@ import torch
 from torch import Tensor
 
 from leco_plugin.evaluation.occupancy_truth import compare_with_truth, free_points
-from leco_plugin.scenes.city import CityConfig
-from leco_plugin.scenes.city_folder import CaptureConfig, write_city
-from leco_plugin.scenes.city_truth import CityTruth
+from leco_plugin.scenes.city.city import CityConfig
+from leco_plugin.scenes.city.folder import CaptureConfig, write_city
+from leco_plugin.scenes.city.truth import CityTruth
 
 SCALE, STEP, HIGHEST = 0.02, 0.01, 1.2
 NO_WALLS = torch.tensor([-1e6] * 3 + [1e6] * 3)

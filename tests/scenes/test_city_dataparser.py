@@ -9,8 +9,8 @@ import torch
 from nerfstudio.data.dataparsers.base_dataparser import DataparserOutputs
 from nerfstudio.plugins.registry_dataparser import DataParserSpecification
 
+from leco_plugin.scenes.city.truth import CityTruth
 from leco_plugin.scenes.city_dataparser import LecoCityDataParserConfig, leco_city_dataparser
-from leco_plugin.scenes.city_truth import CityTruth
 from leco_plugin.scenes.dataset_units import METRES_PER_UNIT
 from leco_plugin.scenes.input_error import InputError
 from leco_plugin.scenes.photographs import POINTS

@@ -30,10 +30,10 @@ from leco_plugin.scenes.data_manager import (
     free_memory,
 )
 from leco_plugin.scenes.input_error import InputError
-from leco_plugin.scenes.known_distances import KnownDistancePixelSamplerConfig, sampler_here
-from leco_plugin.scenes.lattice import Lattice, lattice_for
 from leco_plugin.scenes.photographs import LecoPhotographsDataParserConfig
-from leco_plugin.scenes.stored_pictures import StoredPictures, picture_sizes
+from leco_plugin.scenes.pixels.known_distances import KnownDistancePixelSamplerConfig, sampler_here
+from leco_plugin.scenes.pixels.lattice import Lattice, lattice_for
+from leco_plugin.scenes.pixels.stored_pictures import StoredPictures, picture_sizes
 from leco_plugin.scenes.survey import survey
 
 # nerfstudio leaves images open that it has read

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from nerfstudio.process_data.odm_utils import cameras2nerfds
 
-from leco_plugin.scenes.city_cameras import look_at
+from leco_plugin.scenes.city.cameras import look_at
 from leco_plugin.scenes.data_manager import LecoDataManagerConfig
 from leco_plugin.scenes.photographs import LecoPhotographsDataParserConfig
 from leco_plugin.scenes.survey import survey

@@ -10,9 +10,9 @@ from nerfstudio.cameras.cameras import Cameras
 from tiny_scene import camera_to_world
 
 from leco_plugin.scenes.bounds import BoundsConfig
-from leco_plugin.scenes.city import CityConfig
-from leco_plugin.scenes.city_capture import CaptureConfig
-from leco_plugin.scenes.city_folder import write_city
+from leco_plugin.scenes.city.capture import CaptureConfig
+from leco_plugin.scenes.city.city import CityConfig
+from leco_plugin.scenes.city.folder import write_city
 from leco_plugin.scenes.input_error import InputError
 from leco_plugin.scenes.mega_nerf import MegaNerfDataParserConfig
 from leco_plugin.scenes.photographs import POINTS, LecoPhotographsDataParserConfig

@@ -16,7 +16,7 @@ import yaml
 from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataParserConfig
 from torch import Tensor
 
-from leco_plugin.scenes.city_cameras import look_at
+from leco_plugin.scenes.city.cameras import look_at
 from leco_plugin.scenes.data_manager import LecoDataManagerConfig, upright_outputs
 from leco_plugin.scenes.photographs import LecoPhotographsDataParserConfig, read_ply
 from leco_plugin.scenes.survey import survey

@@ -23,8 +23,8 @@ from leco_plugin.models.freezing.calibration import (
 from leco_plugin.models.rendering import Intervals, Rays
 from leco_plugin.occupancy import BACKDROP_PRICE, Occupancy
 from leco_plugin.scenes.frames import frame_of
-from leco_plugin.scenes.held_out_pixels import held_out_sampler, some_images
-from leco_plugin.scenes.lattice import Share
+from leco_plugin.scenes.pixels.held_out_pixels import held_out_sampler, some_images
+from leco_plugin.scenes.pixels.lattice import Share
 from leco_plugin.scenes.survey import Survey
 
 if TYPE_CHECKING:

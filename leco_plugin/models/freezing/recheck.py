@@ -31,7 +31,7 @@ from leco_plugin.models.freezing.freezing import (
     images_of,
 )
 from leco_plugin.models.learning.progress import NO_EVIDENCE, Progress
-from leco_plugin.scenes.held_out_pixels import held_out_sampler
+from leco_plugin.scenes.pixels.held_out_pixels import held_out_sampler
 
 if TYPE_CHECKING:
     from leco_plugin.models.leco import LecoModel

@@ -21,7 +21,7 @@ from leco_plugin.occupancy import Occupancy
 from leco_plugin.progress_bar import bar
 from leco_plugin.scenes.detail import CAMERAS
 from leco_plugin.scenes.input_error import InputError
-from leco_plugin.scenes.known_distances import sampler_here
+from leco_plugin.scenes.pixels.known_distances import sampler_here
 
 FIRST_TIMED, TIMED_STEPS = 5, 15
 """Steps between which a step is timed, to keep to a budget; the first ones are slow."""

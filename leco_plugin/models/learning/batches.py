@@ -6,10 +6,10 @@ from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
 from leco_plugin.models.compute.ranks import mean
-from leco_plugin.scenes.held_out_pixels import held_out_sampler
-from leco_plugin.scenes.known_distances import KnownDistancePixelSampler, sampler_here
-from leco_plugin.scenes.lattice import Lattice
-from leco_plugin.scenes.sparse_pixels import SparsePixels, sparse_pixels
+from leco_plugin.scenes.pixels.held_out_pixels import held_out_sampler
+from leco_plugin.scenes.pixels.known_distances import KnownDistancePixelSampler, sampler_here
+from leco_plugin.scenes.pixels.lattice import Lattice
+from leco_plugin.scenes.pixels.sparse_pixels import SparsePixels, sparse_pixels
 from leco_plugin.scenes.survey import sparse_points
 
 if TYPE_CHECKING:

@@ -59,8 +59,8 @@ from leco_plugin.models.learning.statistics import KEPT_ABOVE
 from leco_plugin.models.losses import expert_shares
 from leco_plugin.models.rendering import gate_values_and_routes
 from leco_plugin.occupancy import gate_precision
-from leco_plugin.scenes.known_distances import sampler_here
-from leco_plugin.scenes.sparse_pixels import FEWEST_POINTS
+from leco_plugin.scenes.pixels.known_distances import sampler_here
+from leco_plugin.scenes.pixels.sparse_pixels import FEWEST_POINTS
 from leco_plugin.scenes.survey import announce, sparse_points, survey
 
 if TYPE_CHECKING:

@@ -18,7 +18,7 @@ from leco_plugin.models.compute.ranks import share
 from leco_plugin.models.gate import occupancy_logit
 from leco_plugin.models.losses import balance_loss
 from leco_plugin.occupancy import gate_precision
-from leco_plugin.scenes.sparse_pixels import SparsePixels
+from leco_plugin.scenes.pixels.sparse_pixels import SparsePixels
 
 if TYPE_CHECKING:
     from leco_plugin.models.leco import LecoModel

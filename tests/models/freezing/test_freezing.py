@@ -9,7 +9,7 @@ import torch
 
 from leco_plugin.models.freezing.calibration import Measured
 from leco_plugin.models.freezing.freezing import advice_on, calibration_rays
-from leco_plugin.scenes.held_out_pixels import HeldOutPixelSampler, HeldOutPixelSamplerConfig
+from leco_plugin.scenes.pixels.held_out_pixels import HeldOutPixelSampler, HeldOutPixelSamplerConfig
 
 COUNT = 50
 

@@ -10,7 +10,7 @@ import torch
 
 from leco_plugin.models.learning import batches
 from leco_plugin.models.learning.batches import Batches
-from leco_plugin.scenes.known_distances import KnownDistancePixelSampler
+from leco_plugin.scenes.pixels.known_distances import KnownDistancePixelSampler
 
 
 class Sampler(KnownDistancePixelSampler):

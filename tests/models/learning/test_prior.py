@@ -28,8 +28,8 @@ from leco_plugin.models.learning.prior import (
 from leco_plugin.models.leco import LecoModel
 from leco_plugin.models.leco_config import LecoModelConfig
 from leco_plugin.models.sizing.sizes import Sizes
-from leco_plugin.scenes.lattice import Lattice
-from leco_plugin.scenes.sparse_pixels import sparse_pixels
+from leco_plugin.scenes.pixels.lattice import Lattice
+from leco_plugin.scenes.pixels.sparse_pixels import sparse_pixels
 from leco_plugin.scenes.survey import survey
 
 

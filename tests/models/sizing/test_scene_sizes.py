@@ -26,9 +26,9 @@ from leco_plugin.models.sizing.sizes import (
     with_size,
 )
 from leco_plugin.scenes.bounds import BoundsConfig
-from leco_plugin.scenes.city import CityConfig
-from leco_plugin.scenes.city_capture import CaptureConfig
-from leco_plugin.scenes.city_folder import write_city
+from leco_plugin.scenes.city.capture import CaptureConfig
+from leco_plugin.scenes.city.city import CityConfig
+from leco_plugin.scenes.city.folder import write_city
 from leco_plugin.scenes.detail import CAMERAS, SceneDetail, detail_of
 from leco_plugin.scenes.input_error import InputError
 from leco_plugin.scenes.photographs import LecoPhotographsDataParserConfig

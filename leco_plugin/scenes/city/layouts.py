@@ -1,0 +1,189 @@
+"""How the pictures of a city lie on disk: as a nerfstudio scene, or as a Mega-NeRF scene.
+
+nerfstudio:
+images/*.png       the pictures
+depths/*.npy       float32 [h, w], millimetres along the viewing axis, 0 where nothing is met:
+                   what nerfstudio's depth methods read by default
+transforms.json    cameras and splits
+sparse_pc.ply      some visible surface points, like those of structure from motion
+
+Mega-NeRF: as `mega_nerf_writer` says.
+"""
+
+from __future__ import annotations
+
+import json
+from abc import abstractmethod
+from pathlib import Path
+from typing import Any, Literal, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image
+
+from leco_plugin.scenes.city.capture import View
+from leco_plugin.scenes.city.lens import Lens
+from leco_plugin.scenes.whole_files import write_whole
+
+LayoutName = Literal["nerfstudio", "mega-nerf"]
+TRANSFORMS = "transforms.json"
+MAPPINGS = "mappings.txt"
+PARTS = (("rgbs", "png"), ("metadata", "pt"))
+"""Of a view in Mega-NeRF's format: the folders, and how the names in them end."""
+POINTS = "sparse_pc.ply"
+_SPARSE_POINTS_PER_VIEW = 100
+
+
+class Layout(Protocol):
+    """Writes pictures one by one, so that a city may be larger than memory, then the rest."""
+
+    @abstractmethod
+    def files(self, view: View) -> list[str]:
+        """What is there, relative to the folder, when a view is written."""
+
+    @abstractmethod
+    def write(
+        self, folder: Path, view: View, image: NDArray[np.uint8], depth: NDArray[np.float32]
+    ) -> None:
+        """Writes a view: `image` [h, w, 3 or 4], `depth` [h, w] metres along the rays."""
+
+    @abstractmethod
+    def finish(self, folder: Path) -> None:
+        """Writes what is about all views."""
+
+
+def layout_of(name: LayoutName, views: list[View], lens: Lens, seed: int) -> Layout:
+    """The layout of that name for these views."""
+    if name == "mega-nerf":
+        return MegaNerfLayout(views, lens)
+    return NerfstudioLayout(views, lens, seed)
+
+
+class NerfstudioLayout(Layout):
+    """transforms.json, with depths and sparse points."""
+
+    def __init__(self, views: list[View], lens: Lens, seed: int) -> None:
+        self.views, self.lens, self.seed = views, lens, seed
+
+    def files(self, view: View) -> list[str]:
+        return [f"images/{view.name}.png", f"depths/{view.name}.npy"]
+
+    def write(
+        self, folder: Path, view: View, image: NDArray[np.uint8], depth: NDArray[np.float32]
+    ) -> None:
+        picture, depths = self.files(view)
+        write_whole(folder / picture, lambda f: Image.fromarray(image).save(f, format="PNG"))
+        write_whole(folder / depths, lambda f: np.save(f, self.lens.axial(depth)))
+
+    def finish(self, folder: Path) -> None:
+        write_points(folder / POINTS, self._points(folder))
+        transforms = json.dumps(self._transforms(), indent=1) + "\n"
+        write_whole(folder / TRANSFORMS, lambda f: f.write(transforms.encode()))
+
+    def _transforms(self) -> dict[str, Any]:
+        frames, held_out = [], []
+        for view in self.views:
+            picture, depths = self.files(view)
+            matrix = [*view.pose.tolist(), [0.0, 0.0, 0.0, 1.0]]
+            frames.append(
+                {"file_path": picture, "depth_file_path": depths, "transform_matrix": matrix}
+            )
+            held_out += [picture] if view.held_out else []
+        paths = [self.files(view)[0] for view in self.views if not view.held_out]
+        lens = self.lens
+        return {
+            "camera_model": "OPENCV",
+            "w": lens.width,
+            "h": lens.height,
+            "fl_x": lens.focal,
+            "fl_y": lens.focal,
+            "cx": lens.width / 2,
+            "cy": lens.height / 2,
+            "orientation_override": "none",
+            "ply_file_path": POINTS,
+            "metres_per_unit": 1.0,
+            "frames": frames,
+            "train_filenames": paths,
+            "val_filenames": held_out,
+            "test_filenames": held_out,
+        }
+
+    def _points(self, folder: Path) -> NDArray[Any]:
+        """Some surface points of each view, read back from its files: what a killed run wrote too.
+
+        Returns:
+            [N] rows of `xyz` (metres) and `rgb`.
+        """
+        random = np.random.default_rng([self.seed, 13])
+        rows = []
+        for view in self.views:
+            picture, depths = self.files(view)
+            depth = self.lens.along_ray(np.load(folder / depths, allow_pickle=False))
+            seen = np.argwhere(np.isfinite(depth))
+            chosen = tuple(seen[random.permutation(len(seen))[:_SPARSE_POINTS_PER_VIEW]].T)
+            row = np.empty(len(chosen[0]), dtype=[("xyz", "<f4", 3), ("rgb", "u1", 3)])
+            row["xyz"] = self.lens.points(view.pose, depth)[chosen]
+            with Image.open(folder / picture) as image:
+                row["rgb"] = np.asarray(image)[chosen][:, :3]
+            rows.append(row)
+        return np.concatenate(rows)
+
+
+class MegaNerfLayout(Layout):
+    """Mega-NeRF's folders; held-out pictures are its validation set."""
+
+    def __init__(self, views: list[View], lens: Lens) -> None:
+        from leco_plugin.scenes.mega_nerf_format.axes import around
+
+        self.views, self.lens = views, lens
+        self.coordinates = around(np.stack([view.pose[:, 3] for view in views]))
+
+    def files(self, view: View) -> list[str]:
+        split = "val" if view.held_out else "train"
+        return [f"{split}/{folder}/{self._stem(view)}.{ending}" for folder, ending in PARTS]
+
+    def write(
+        self, folder: Path, view: View, image: NDArray[np.uint8], depth: NDArray[np.float32]
+    ) -> None:
+        from leco_plugin.scenes.mega_nerf_format.writer import write_view
+
+        lens = self.lens
+        write_view(
+            folder,
+            "val" if view.held_out else "train",
+            self._stem(view),
+            image,
+            self.coordinates.to_file(view.pose[None])[0],
+            (lens.focal, lens.focal, lens.width / 2, lens.height / 2),
+        )
+
+    def finish(self, folder: Path) -> None:
+        from leco_plugin.scenes.mega_nerf_format.writer import write_coordinates, write_mappings
+
+        write_coordinates(folder, self.coordinates)
+        write_mappings(folder, {f"{view.name}.png": self._stem(view) for view in self.views})
+
+    @staticmethod
+    def _stem(view: View) -> str:
+        return f"{view.number:06d}"
+
+
+def write_points(path: Path, rows: NDArray[Any]) -> None:
+    """Writes rows of `xyz` (metres) and `rgb` as a binary PLY file."""
+    fields = [f"property float {axis}" for axis in "xyz"]
+    fields += [f"property uchar {name}" for name in ("red", "green", "blue")]
+    head = [
+        "ply",
+        "format binary_little_endian 1.0",
+        f"element vertex {len(rows)}",
+        *fields,
+        "end_header",
+        "",
+    ]
+    write_whole(path, lambda file: file.write("\n".join(head).encode() + rows.tobytes()))
+
+
+def with_alpha(image: NDArray[np.uint8], depth: NDArray[np.floating]) -> NDArray[np.uint8]:
+    """[h, w, 4]: transparent where a ray meets nothing, so that no method has to model the void."""
+    alpha = np.where(np.isfinite(depth), 255, 0).astype(np.uint8)
+    return np.concatenate([image, alpha[..., None]], axis=-1)

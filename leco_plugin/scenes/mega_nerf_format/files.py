@@ -1,0 +1,219 @@
+"""Reads the files of a Mega-NeRF scene and says what is wrong with them, one line a fault."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from itertools import pairwise
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+import torch
+
+from leco_plugin.scenes.city.shapes import Array
+from leco_plugin.scenes.derived_images import image_header
+from leco_plugin.scenes.input_error import InputError
+from leco_plugin.scenes.mega_nerf_format.axes import Coordinates, wrong_axis
+from leco_plugin.scenes.mega_nerf_format.masks import describe
+from leco_plugin.scenes.mega_nerf_format.pt_file import read_pt
+from leco_plugin.scenes.rotations import distance_from_rotations
+
+ENDINGS = (".jpg", ".JPG", ".png", ".PNG")
+"""Of pictures, in the order in which Mega-NeRF looks for them."""
+_MOST_PIXELS = 1 << 16
+"""A side."""
+
+
+@dataclass(frozen=True)
+class Frame:
+    """One photograph, as its metadata say."""
+
+    stem: str
+    split: Literal["train", "val"]
+    image: Path
+    mode: str
+    """How Pillow names the kind of its pixels."""
+    image_size: tuple[int, int]
+    """Width and height of the file; Mega-NeRF resizes it to `width` x `height`."""
+    width: int
+    height: int
+    pose: Array
+    """[3, 4] camera to world, (down, right, back), units of the scene."""
+    intrinsics: Array
+    """[4] fx, fy, cx, cy, pixels at `width` x `height`."""
+
+
+@dataclass(frozen=True)
+class MegaNerfScene:
+    """All of a scene but its pixels."""
+
+    coordinates: Coordinates
+    frames: list[Frame]
+    """Sorted by stem, both splits together: the order of Mega-NeRF's appearance codes."""
+
+    def poses(self) -> Array:
+        """[C, 3, 4] of all frames."""
+        return np.stack([frame.pose for frame in self.frames])
+
+    def describe(self) -> str:
+        """One line for the log: sizes, and altitudes with their sign."""
+        validation = sum(frame.split == "val" for frame in self.frames)
+        altitudes = self.coordinates.altitudes(self.poses())
+        below = (
+            " (all below the datum: right for a local origin, else origin_drb has the wrong sign)"
+            if altitudes.max() < 0
+            else ""
+        )
+        return (
+            f"Mega-NeRF scene: {len(self.frames)} pictures, {validation} of them for validation; "
+            f"1 unit is {self.coordinates.metres:.4g} m; cameras at altitudes from "
+            f"{altitudes.min():.1f} to {altitudes.max():.1f} m{below}"
+        )
+
+
+def read_scene(
+    folder: Path, check_axes: bool = True, progress: Callable[[float], None] = lambda share: None
+) -> MegaNerfScene:
+    """Reads and checks everything but pixels.
+
+    Args:
+        check_axes: whether to refuse a world whose first axis does not point down.
+        progress: told the share of the files that are read.
+    Raises:
+        InputError: one line that names a file and what is wrong with it.
+    """
+    if not folder.is_dir():
+        raise InputError(f"there is no folder {folder}; give one with --data")
+    coordinates = read_coordinates(folder / "coordinates.pt")
+    pairs = sorted(_pairs(folder, "train") + _pairs(folder, "val"), key=lambda pair: pair[0].name)
+    for (before, _), (after, _) in pairwise(pairs):
+        if before.name == after.name:
+            raise InputError(f"{before.name} is both in train/metadata and in val/metadata")
+    frames = []
+    for number, (metadata, image) in enumerate(pairs):
+        frames.append(read_frame(metadata, image))
+        progress((number + 1) / len(pairs))
+    scene = MegaNerfScene(coordinates, frames)
+    _check_rotations(folder, frames)
+    fault = wrong_axis(scene.poses()) if check_axes else None
+    if fault is not None:
+        raise InputError(
+            f"{folder}: {fault}; the world of this format is (down, right, back), "
+            "and --check-axes False reads it as it is"
+        )
+    return scene
+
+
+def _pairs(folder: Path, split: str) -> list[tuple[Path, Path]]:
+    """The metadata files of a split and their pictures."""
+    rgbs, metadata = folder / split / "rgbs", folder / split / "metadata"
+    for place in (rgbs, metadata):
+        if not place.is_dir():
+            raise InputError(f"{folder} is not a Mega-NeRF scene: it has no {split}/{place.name}")
+    files = {path.stem: path for path in metadata.glob("[!.]*.pt")}
+    images: dict[str, Path] = {}
+    for ending in reversed(ENDINGS):
+        images |= {path.stem: path for path in rgbs.glob(f"[!.]*{ending}")}
+    if not files:
+        raise InputError(f"{metadata} holds no metadata (.pt)")
+    lonely = sorted(files.keys() ^ images.keys())
+    if lonely:
+        what = "metadata" if lonely[0] in images else f"picture ({' '.join(ENDINGS)})"
+        raise InputError(
+            f"{folder / split} holds {len(images)} pictures and {len(files)} metadata files; "
+            f"{lonely[0]} has no {what}"
+        )
+    return [(files[stem], images[stem]) for stem in files]
+
+
+def read_coordinates(path: Path) -> Coordinates:
+    """`coordinates.pt`. InputError if it does not say what it should."""
+    values = _read(path, "so this is no Mega-NeRF scene")
+    origin = _numbers(path, values, "origin_drb", (3,))
+    metres = _number(path, values, "pose_scale_factor")
+    if not (np.isfinite(metres) and metres > 0):
+        raise InputError(f"{path}: pose_scale_factor is {metres:g}, and must be above 0")
+    return Coordinates(origin, metres)
+
+
+def read_frame(metadata: Path, image: Path) -> Frame:
+    """A picture's metadata, checked against the picture's header. InputError if they are bad."""
+    values = _read(metadata, "so its picture cannot be used")
+    height, width = (_side(metadata, values, name) for name in ("H", "W"))
+    pose = _numbers(metadata, values, "c2w", (3, 4))
+    intrinsics = _numbers(metadata, values, "intrinsics", (4,))
+    if intrinsics[:2].min() <= 0:
+        raise InputError(f"{metadata}: a focal length in intrinsics is not above 0")
+    size, mode = image_header(image)
+    if abs(size[0] * height - size[1] * width) > max(width, height):
+        raise InputError(
+            f"{image} has {size[0]} x {size[1]} pixels, its metadata are for {width} x {height}"
+        )
+    split: Literal["train", "val"] = "val" if metadata.parent.parent.name == "val" else "train"
+    return Frame(metadata.stem, split, image, mode, size, width, height, pose, intrinsics)
+
+
+def _read(path: Path, otherwise: str) -> dict[str, Any]:
+    """A file's dictionary of tensors and numbers."""
+    if not path.exists():
+        raise InputError(f"there is no {path}, {otherwise}")
+    values = read_pt(path)
+    if not isinstance(values, dict):
+        raise InputError(f"{path} holds {describe(values)}, and not a dictionary")
+    for name, value in values.items():
+        if not isinstance(name, str) or not isinstance(value, (torch.Tensor, int, float)):
+            raise InputError(
+                f"{path}: {str(name)[:40]!r} is {describe(value)}; "
+                "only tensors and numbers belong there"
+            )
+    return values
+
+
+def _numbers(path: Path, values: dict[str, Any], name: str, shape: tuple[int, ...]) -> Array:
+    """A finite tensor of a known shape, float64."""
+    if name not in values:
+        raise InputError(f"{path} has no {name}")
+    value, wanted = values[name], " x ".join(str(n) for n in shape)
+    if not isinstance(value, torch.Tensor) or tuple(value.shape) != shape:
+        raise InputError(f"{path}: {name} is {describe(value)}, and not {wanted} numbers")
+    numbers: Array = value.detach().double().numpy().copy()
+    if not np.isfinite(numbers).all():
+        raise InputError(f"{path}: {name} holds values that are not finite")
+    return numbers
+
+
+def _number(path: Path, values: dict[str, Any], name: str) -> float:
+    if name not in values:
+        raise InputError(f"{path} has no {name}")
+    value = values[name]
+    if isinstance(value, torch.Tensor) and value.numel() != 1:
+        raise InputError(f"{path}: {name} is {describe(value)}, and not a number")
+    try:
+        return float(value.detach() if isinstance(value, torch.Tensor) else value)
+    except OverflowError:
+        raise InputError(f"{path}: {name} is too large a number") from None
+
+
+def _side(path: Path, values: dict[str, Any], name: str) -> int:
+    """A number of pixels."""
+    value = _number(path, values, name)
+    if not (1 <= value <= _MOST_PIXELS and value == int(value)):
+        raise InputError(f"{path}: {name} is {value:g}, and not a number of pixels")
+    return int(value)
+
+
+def _check_rotations(folder: Path, frames: list[Frame]) -> None:
+    rotations = np.stack([frame.pose[:, :3] for frame in frames])
+    errors = distance_from_rotations(rotations)
+    worst = int(errors.argmax())
+    if errors[worst] <= 0.05:
+        return
+    frame = frames[worst]
+    metadata = folder / frame.split / "metadata" / f"{frame.stem}.pt"
+    if (np.linalg.det(rotations) < 0).all():
+        raise InputError(
+            f"{metadata}: c2w is mirrored, as in all files: the axes of its world are not "
+            "(down, right, back), perhaps the first one points up"
+        )
+    raise InputError(f"{metadata}: c2w is no rotation and position")

@@ -1,0 +1,94 @@
+"""The pictures and masks of a Mega-NeRF scene, as files of the size and the part that is wanted."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+from PIL import Image
+
+from leco_plugin.scenes.derived_images import DerivedImages, image_header, open_image
+from leco_plugin.scenes.input_error import InputError
+from leco_plugin.scenes.mega_nerf_format.files import Frame
+from leco_plugin.scenes.mega_nerf_format.masks import read_mask
+
+_AS_THEY_ARE = ("L", "RGB", "RGBA")
+"""Modes that nerfstudio reads correctly."""
+
+
+def scaled(frame: Frame, factor: int) -> tuple[int, int]:
+    """Width and height of a picture divided by a factor.
+
+    Raises:
+        InputError: the factor does not divide them, or the file is smaller than that.
+    """
+    if frame.width % factor or frame.height % factor:
+        raise InputError(
+            f"{frame.image} has metadata for {frame.width} x {frame.height} pixels, "
+            f"which a scale factor of {factor} does not divide"
+        )
+    size = frame.width // factor, frame.height // factor
+    if frame.image_size[0] < size[0]:
+        raise InputError(
+            f"{frame.image} has {frame.image_size[0]} x {frame.image_size[1]} pixels, fewer than "
+            f"the {size[0]} x {size[1]} that are asked for; use a larger scale factor"
+        )
+    return size
+
+
+def picture_of(frame: Frame, factor: int, right_half: bool, derived: DerivedImages) -> Path:
+    """A file with the picture, resized as Mega-NeRF does it, or with its right half only."""
+    size = scaled(frame, factor)
+    if frame.image_size == size and frame.mode in _AS_THEY_ARE and not right_half:
+        return frame.image
+
+    def make() -> Image.Image:
+        image = open_image(frame.image)
+        if image.mode not in _AS_THEY_ARE:
+            transparent = image.mode in ("LA", "PA") or "transparency" in image.info
+            image = image.convert("RGBA" if transparent else "RGB")
+        if image.size != size:
+            image = image.resize(size, Image.Resampling.LANCZOS)
+        return image.crop((size[0] // 2, 0, *size)) if right_half else image
+
+    return derived.get(frame.image, f"{size} {'right' if right_half else 'whole'}", make)
+
+
+def mask_of(
+    frame: Frame, factor: int, left_half: bool, masks: Path | None, derived: DerivedImages
+) -> Path | None:
+    """A file with the pixels to train on, or None if there are none.
+
+    Args:
+        left_half: whether the right half of the picture is left out.
+        masks: folder of the scene's masks, if it has any.
+    """
+    size = scaled(frame, factor)
+    if masks is None:
+        part = "left" if left_half else "whole"
+        path = derived.folder / f"{part}-{size[0]}x{size[1]}.png"
+        if not path.exists():
+            derived.put(path, _cut(Image.new("L", size, 255), left_half))
+        return path
+
+    source = masks / f"{frame.stem}.pt"
+    if not source.is_file():
+        raise InputError(f"there is no {source}: each picture needs a mask, or none has one")
+
+    def make() -> Image.Image:
+        keep = read_mask(source, frame.width, frame.height)
+        mask = Image.fromarray(keep.astype(np.uint8) * 255)
+        if mask.size != size:
+            mask = mask.resize(size, Image.Resampling.NEAREST)
+        mask = _cut(mask, left_half)
+        return mask if mask.getbbox() else Image.new("L", (1, 1))
+
+    path = derived.get(source, f"{frame.width, frame.height} {size} {left_half}", make)
+    # a mask that keeps nothing is kept as one pixel, so that its header says so
+    return None if image_header(path)[0] != size else path
+
+
+def _cut(mask: Image.Image, left_half: bool) -> Image.Image:
+    if left_half:
+        mask.paste(0, (mask.width // 2, 0, *mask.size))
+    return mask

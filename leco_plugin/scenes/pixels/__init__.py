@@ -1,0 +1,1 @@
+"""Which pixels teach, which are held out for calibration, and which have a known distance."""

@@ -1,0 +1,211 @@
+"""Training pixels that are never trained on: what the threshold of the gate is calibrated with.
+
+A thin lattice of pixels of the training images is left out of every batch.
+"""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Any
+
+import torch
+from nerfstudio.data.pixel_samplers import PixelSampler, PixelSamplerConfig
+from torch import Tensor
+
+from leco_plugin.scenes.input_error import InputError
+from leco_plugin.scenes.pixels.lattice import Lattice, Share
+from leco_plugin.scenes.pixels.stored_pictures import StoredPictures
+
+DRAWN = 8
+"""Times as many pixels as are wanted are drawn, before some are left out."""
+TRIES = 100
+"""Draws of a pixel that no mask hides: one in three fails where 1% of the pixels are seen."""
+
+
+def look_up(source: Any, which: Tensor, places: Tensor) -> Tensor:
+    """Values of pixels: [K, ...].
+
+    Args:
+        source: images [P, H, W, ...], a list of one or more [H, W, ...], or stored ones.
+        which: [K] int64, number of the image in `source`.
+        places: [K, 2] int64, row and column.
+    """
+    if isinstance(source, StoredPictures):
+        return source.read(which, places)
+    rows, columns = places.unbind(dim=-1)
+    if isinstance(source, Tensor):
+        return source[which.to(source.device), rows.to(source.device), columns.to(source.device)]
+    values = [source[i][r, c] for i, r, c in zip(which, rows, columns)]
+    return torch.stack(values) if values else source[0].new_zeros(0, *source[0].shape[2:])
+
+
+def some_images(dataset: Any, most: int = 16) -> dict[str, Any]:
+    """A batch of up to so many images, spread evenly, decoded for the occasion.
+
+    Args:
+        dataset: nerfstudio's `InputDataset`.
+    """
+    chosen = torch.linspace(0, len(dataset) - 1, min(most, len(dataset))).long().unique()
+    read = [dataset.get_data(number) for number in chosen.tolist()]
+    images = {key: [data[key] for data in read] for key in ("image", "mask") if key in read[0]}
+    return images | {"image_idx": chosen}
+
+
+def _stepping_aside(sample: Callable[..., Tensor]) -> Callable[..., Tensor]:
+    """One of nerfstudio's ways to draw pixels, with held-out pixels giving way to others."""
+
+    @functools.wraps(sample)
+    def sample_others(
+        self: HeldOutPixelSampler,
+        batch_size: int,
+        num_images: int,
+        image_height: int,
+        image_width: int,
+        mask: Tensor | None = None,
+        device: torch.device | str = "cpu",
+    ) -> Tensor:
+        indices = sample(self, batch_size, num_images, image_height, image_width, mask, device)
+        return self._step_aside(indices, image_width, mask)
+
+    return sample_others
+
+
+@dataclass
+class HeldOutPixelSamplerConfig(PixelSamplerConfig):
+    """Samples pixels uniformly, except for a lattice that calibration keeps to itself."""
+
+    _target: type = field(default_factory=lambda: HeldOutPixelSampler)
+    """target class to instantiate"""
+
+
+class HeldOutPixelSampler(PixelSampler):
+    """nerfstudio's sampler with a lattice of pixels left out of training."""
+
+    lattice = Lattice()
+    """The held-out pixels; whoever knows all pictures chooses it by them."""
+
+    sample_method = _stepping_aside(PixelSampler.sample_method)
+    sample_method_equirectangular = _stepping_aside(PixelSampler.sample_method_equirectangular)
+    sample_method_fisheye = _stepping_aside(PixelSampler.sample_method_fisheye)
+
+    def rejection_sample_mask(
+        self,
+        mask: Tensor,
+        num_samples: int,
+        num_images: int,
+        image_height: int,
+        image_width: int,
+        device: torch.device | str,
+    ) -> Tensor:
+        """Pixels [N, 3] int64 of a mask [P, H, W, 1]; nerfstudio's own cannot sample one image.
+
+        Raises:
+            InputError: the mask leaves no pixel.
+        """
+        seen = mask.reshape(num_images, image_height, image_width).bool()
+        sizes = torch.tensor([num_images, image_height, image_width], device=device)
+        indices = (torch.rand((num_samples, 3), device=device) * sizes).long()
+        image, row, column = indices.to(seen.device).unbind(dim=-1)
+        hidden = ~seen[image, row, column].to(device)
+        if bool(hidden.any()):
+            others = seen.nonzero().to(device)
+            if len(others) == 0:
+                raise InputError("the masks leave no pixel of the training images")
+            indices[hidden] = others[torch.randint(len(others), (int(hidden.sum()),))]
+        return indices
+
+    def sample(self, image_batch: dict[str, Any]) -> dict[str, Any]:
+        """A batch as nerfstudio makes it, also of stored pictures."""
+        pictures = image_batch["image"]
+        if isinstance(pictures, StoredPictures):
+            return self._sample_stored(pictures, image_batch.get("mask"))
+        batch: dict[str, Any] = super().sample(image_batch)
+        return batch
+
+    def _sample_stored(
+        self, pictures: StoredPictures, masks: StoredPictures | None
+    ) -> dict[str, Any]:
+        """A batch of pixels that are neither held out nor, as far as there are others, masked."""
+        indices = self._drawn_aside(pictures, self.num_rays_per_batch)
+        for _ in range(TRIES if masks is not None and not self.config.ignore_mask else 0):
+            assert masks is not None
+            seen = masks.read(indices[:, 0], indices[:, 1:])[:, 0] > 0
+            if bool(seen.all()):
+                break
+            indices[~seen] = self._drawn_aside(pictures, int((~seen).sum()))
+        return {"image": pictures.read(indices[:, 0], indices[:, 1:]), "indices": indices}
+
+    def _drawn_aside(self, pictures: StoredPictures, count: int) -> Tensor:
+        """Pixels [count, 3] of stored pictures, none of them held out."""
+        indices = pictures.draw(count)
+        return self._aside(indices, pictures.sizes[indices[:, 0], 1])
+
+    def _aside(self, indices: Tensor, widths: Tensor | int) -> Tensor:
+        """Pixels [N, 3] of pictures so wide; held-out ones give way to their neighbours."""
+        columns = indices[:, 2]
+        aside = torch.where(columns + 1 < widths, columns + 1, columns - 1)
+        indices[:, 2] = torch.where(self.lattice.holds_out(indices), aside, columns)
+        return indices
+
+    def _step_aside(self, indices: Tensor, image_width: int, mask: Tensor | None) -> Tensor:
+        """Moves held-out pixels [N, 3] to their neighbours, or to others where those are masked."""
+        indices = self._aside(indices, image_width)
+        if isinstance(mask, Tensor) and not self.config.ignore_mask:
+            image, row, column = indices.to(mask.device).unbind(dim=-1)
+            seen = mask[image, row, column].bool().flatten().to(indices.device)
+            others = seen.nonzero()[:, 0]
+            if len(others) > 0:
+                drawn = torch.randint(len(others), (len(indices),), device=indices.device)
+                indices = torch.where(seen[:, None], indices, indices[others[drawn]])
+        return indices
+
+    def sample_held_out(
+        self, images: dict[str, Any], count: int, seed: int, share: Share = "all"
+    ) -> dict[str, Tensor]:
+        """A batch of held-out pixels, as `sample` returns it for training; the same for a seed.
+
+        Args:
+            images: a batch of the image data loader: `image` [K, H, W, C] (or a list of [H, W, C]),
+                `image_idx` [K], and `mask` where there are masks.
+            count: pixels wanted; fewer come back where there are fewer, or masks leave fewer.
+            seed: of the draw.
+            share: of the held-out pixels; all where images are so tiny, or masks hide so much, that
+                none of it is left.
+        Returns:
+            `image` [N, C] and `indices` [N, 3] int64 (image, row, column), each pixel once.
+        """
+        which, within = self._held_out(images, count, seed, share)
+        numbers = torch.as_tensor(images["image_idx"]).cpu()[which]
+        return {
+            "image": look_up(images["image"], which, within),
+            "indices": torch.cat([numbers[:, None], within], dim=-1),
+        }
+
+    def count_held_out(self, images: dict[str, Any], most: int, share: Share) -> int:
+        """How many pixels of a share there are, up to `most`; arguments as of `sample_held_out`."""
+        return len(self._held_out(images, most, 0, share)[0])
+
+    def _held_out(
+        self, images: dict[str, Any], count: int, seed: int, share: Share
+    ) -> tuple[Tensor, Tensor]:
+        """Pictures [N] and places in them [N, 2]; arguments as of `sample_held_out`."""
+        pictures = images["image"]
+        if isinstance(pictures, StoredPictures):
+            sizes = pictures.sizes
+        else:
+            sizes = torch.tensor([picture.shape[:2] for picture in pictures])
+        places = self.lattice.draw(sizes, DRAWN * count, torch.Generator().manual_seed(seed))
+        if "mask" in images:
+            seen = look_up(images["mask"], places[:, 0], places[:, 1:]).flatten(1).all(dim=1)
+            places = places[seen.cpu()]
+        of_share = self.lattice.is_of(places, share)
+        places = places[of_share] if bool(of_share.any()) else places
+        return places[:count, 0], places[:count, 1:]
+
+
+def held_out_sampler(datamanager: Any) -> HeldOutPixelSampler | None:
+    """The data manager's pixel sampler, if it keeps pixels back for calibration."""
+    sampler = getattr(datamanager, "train_pixel_sampler", None)
+    return sampler if isinstance(sampler, HeldOutPixelSampler) else None

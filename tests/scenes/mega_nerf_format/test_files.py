@@ -1,0 +1,174 @@
+"""A Mega-NeRF folder is read in its order, or what is wrong with it is said in one line."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import mega_nerf_scene
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+
+from leco_plugin.scenes.input_error import InputError
+from leco_plugin.scenes.mega_nerf_format.files import read_scene
+
+
+@pytest.fixture
+def scene(tmp_path: Path) -> Path:
+    return mega_nerf_scene.write(tmp_path / "scene")
+
+
+def metadata(scene: Path, number: int = 3, split: str = "train") -> Path:
+    return scene / split / "metadata" / f"{number:06d}.pt"
+
+
+def put(**values: Any) -> Callable[[Path], None]:
+    """Changes values in the metadata of picture 3; None removes one."""
+
+    def change(scene: Path) -> None:
+        _change(metadata(scene), values)
+
+    return change
+
+
+def _change(path: Path, values: dict[str, Any]) -> None:
+    held = torch.load(path, weights_only=True) | values
+    torch.save({name: value for name, value in held.items() if value is not None}, path)
+
+
+def coordinates(**values: Any) -> Callable[[Path], None]:
+    return lambda scene: _change(scene / "coordinates.pt", values)
+
+
+def turn(matrix: np.ndarray) -> Callable[[Path], None]:
+    """Applies a matrix to the world of all poses."""
+
+    def change(scene: Path) -> None:
+        for path in scene.glob("*/metadata/*.pt"):
+            c2w = torch.load(path, weights_only=True)["c2w"]
+            _change(path, {"c2w": torch.from_numpy(matrix).float() @ c2w})
+
+    return change
+
+
+def all_of(*changes: Callable[[Path], object]) -> Callable[[Path], None]:
+    def change(scene: Path) -> None:
+        for one in changes:
+            one(scene)
+
+    return change
+
+
+EYE = torch.eye(3, 4)
+POSE = torch.cat([EYE[:, :3] * 1.2, EYE[:, 3:]], dim=1)
+BAD: dict[str, tuple[Callable[[Path], object], str]] = {
+    "no folder": (shutil.rmtree, "there is no folder .*scene"),
+    "no coordinates": (lambda s: (s / "coordinates.pt").unlink(), r"no .*coordinates\.pt"),
+    "no val": (lambda s: shutil.rmtree(s / "val"), "it has no val/rgbs"),
+    "no metadata folder": (lambda s: shutil.rmtree(s / "train/metadata"), "no train/metadata"),
+    "empty metadata": (
+        lambda s: [p.unlink() for p in (s / "val/metadata").iterdir()],
+        "val/metadata holds no metadata",
+    ),
+    "a picture without metadata": (
+        lambda s: metadata(s).unlink(),
+        "train holds 5 pictures and 4 metadata files; 000003 has no metadata",
+    ),
+    "metadata without a picture": (
+        lambda s: (s / "val/rgbs/000002.png").unlink(),
+        "val holds 1 pictures and 2 metadata files; 000002 has no picture",
+    ),
+    "a picture of an unknown ending": (
+        lambda s: (s / "val/rgbs/000002.png").rename(s / "val/rgbs/000002.tif"),
+        "000002 has no picture",
+    ),
+    "a picture in both splits": (
+        lambda s: [
+            shutil.copy(p, s / "val" / p.relative_to(s / "train"))
+            for p in (s / "train").glob("*/000003.*")
+        ],
+        r"000003\.pt is both in train/metadata and in val/metadata",
+    ),
+    "scale 0": (coordinates(pose_scale_factor=0.0), r"coordinates\.pt: pose_scale_factor is 0"),
+    "scale NaN": (coordinates(pose_scale_factor=float("nan")), "pose_scale_factor is nan"),
+    "a vast scale": (coordinates(pose_scale_factor=10**400), "too large a number"),
+    "no scale": (coordinates(pose_scale_factor=None), r"coordinates\.pt has no pose_scale_factor"),
+    "an origin in the plane": (coordinates(origin_drb=torch.zeros(2)), "origin_drb is a tensor"),
+    "no c2w": (put(c2w=None), r"000003\.pt has no c2w"),
+    "c2w 3x3": (put(c2w=torch.eye(3)), "c2w is a tensor of float32, 3 x 3, and not 3 x 4"),
+    "c2w a number": (put(c2w=3), "c2w is a value of type int"),
+    "a pose of NaN": (put(c2w=EYE * float("nan")), "c2w holds values that are not finite"),
+    "a scaled pose": (put(c2w=POSE), r"000003\.pt: c2w is no rotation"),
+    "all mirrored": (turn(np.diag([-1.0, 1.0, 1.0])), "c2w is mirrored, as in all files"),
+    "up for down": (turn(np.diag([-1.0, -1.0, 1.0])), "first axis of its world points up"),
+    "no height": (put(H=0), "H is 0, and not a number of pixels"),
+    "half a pixel": (put(W=24.5), "W is 24.5"),
+    "a vast width": (put(W=1 << 40), "not a number of pixels"),
+    "a picture of another shape": (put(W=32), "24 x 16 pixels, its metadata are for 32 x 16"),
+    "a focal length of 0": (put(intrinsics=torch.tensor([0.0, 1, 1, 1])), "focal length"),
+    "a word": (put(name="DJI_0001"), "'name' is a value of type str; only tensors and numbers"),
+    "a numpy number": (put(H=np.int64(3)), r"000003\.pt holds numpy.* only tensors and numbers"),
+    "a list": (put(intrinsics=[1.0, 1.0, 1.0, 1.0]), "'intrinsics' is a value of type list"),
+    "no dictionary": (lambda s: torch.save(EYE, metadata(s)), "and not a dictionary"),
+    "no .pt at all": (lambda s: metadata(s).write_bytes(b"c2w"), "is not a file of torch.save"),
+    "a folder": (
+        all_of(lambda s: metadata(s).unlink(), lambda s: metadata(s).mkdir()),
+        "there is no file .*000003",
+    ),
+    "a picture that is none": (
+        lambda s: (s / "train/rgbs/000003.png").write_bytes(b"\x89PNG"),
+        r"000003\.png cannot be read as a picture",
+    ),
+}
+
+
+@pytest.mark.parametrize("name", BAD)
+def test_bad_input_gets_one_line_that_names_the_file(name: str, scene: Path) -> None:
+    spoil, message = BAD[name]
+    spoil(scene)
+    with pytest.raises(InputError, match=message) as caught:
+        read_scene(scene)
+    assert "\n" not in str(caught.value)
+
+
+def test_a_scene_is_read_in_the_order_of_names_across_splits(scene: Path) -> None:
+    read = read_scene(scene)
+    assert [frame.stem for frame in read.frames] == [f"{n:06d}" for n in range(7)]
+    assert [n for n, frame in enumerate(read.frames) if frame.split == "val"] == [2, 5]
+    expected = mega_nerf_scene.COORDINATES.to_file(mega_nerf_scene.poses())
+    np.testing.assert_allclose(read.poses(), expected, atol=1e-6)
+    assert read.frames[0].width == 24 and read.frames[0].height == 16
+
+
+def test_the_line_for_the_log_has_altitudes_with_their_sign(scene: Path) -> None:
+    altitudes = mega_nerf_scene.poses()[:, 2, 3]
+    said = read_scene(scene).describe()
+    assert "1 unit is 40 m" in said and "2 of them for validation" in said
+    assert f"from {altitudes.min():.1f} to {altitudes.max():.1f} m" in said
+    assert "below the datum" not in said
+    coordinates(origin_drb=torch.tensor([110.0, 0.0, 0.0]))(scene)
+    assert "else origin_drb has the wrong sign" in read_scene(scene).describe()
+
+
+def test_a_world_that_really_looks_up_can_be_read(scene: Path) -> None:
+    turn(np.diag([-1.0, -1.0, 1.0]))(scene)
+    assert len(read_scene(scene, check_axes=False).frames) == 7
+
+
+def test_a_jpeg_comes_before_a_png_and_other_files_are_left_out(scene: Path) -> None:
+    rgbs = scene / "train" / "rgbs"
+    Image.new("RGB", (24, 16)).save(rgbs / "000003.jpg")
+    (rgbs / "._000003.jpg").write_text("")
+    (rgbs / "Thumbs.db").write_text("")
+    frame = read_scene(scene).frames[3]
+    assert frame.image == rgbs / "000003.jpg"
+
+
+def test_numbers_may_be_tensors_and_pictures_smaller_than_their_metadata(scene: Path) -> None:
+    put(H=torch.tensor(32), W=torch.tensor([48]))(scene)
+    frame = read_scene(scene).frames[3]
+    assert (frame.width, frame.height, frame.image_size) == (48, 32, (24, 16))

@@ -1,0 +1,107 @@
+"""Pictures and masks in the size and the part that the protocol asks for."""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+
+import mega_nerf_scene
+import numpy as np
+import pytest
+from PIL import Image
+
+from leco_plugin.scenes.derived_images import DerivedImages, open_image
+from leco_plugin.scenes.input_error import InputError
+from leco_plugin.scenes.mega_nerf_format.files import Frame, read_scene
+from leco_plugin.scenes.mega_nerf_format.images import mask_of, picture_of, scaled
+
+
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return mega_nerf_scene.write(tmp_path_factory.mktemp("scenes") / "scene", masks=True)
+
+
+@pytest.fixture(scope="module")
+def frame(scene: Path) -> Frame:
+    return read_scene(scene).frames[2]
+
+
+@pytest.fixture
+def derived(tmp_path: Path) -> DerivedImages:
+    return DerivedImages(tmp_path / "cache")
+
+
+def pixels(path: Path | None) -> np.ndarray:
+    assert path is not None
+    return np.array(open_image(path))
+
+
+def test_a_picture_of_the_right_size_is_the_file_itself(
+    frame: Frame, derived: DerivedImages
+) -> None:
+    assert picture_of(frame, 1, False, derived) == frame.image
+    assert not derived.folder.exists()
+
+
+def test_a_smaller_picture_is_resized_by_lanczos(frame: Frame, derived: DerivedImages) -> None:
+    small = pixels(picture_of(frame, 4, False, derived))
+    whole = Image.fromarray(mega_nerf_scene.image(2))
+    np.testing.assert_array_equal(small, np.array(whole.resize((6, 4), Image.Resampling.LANCZOS)))
+    half = pixels(picture_of(frame, 4, True, derived))
+    np.testing.assert_array_equal(half, small[:, 3:])
+
+
+def test_the_right_half_of_an_odd_width_is_the_larger_one(
+    frame: Frame, derived: DerivedImages
+) -> None:
+    assert pixels(picture_of(frame, 8, True, derived)).shape == (2, 2, 3)  # of 3 columns
+
+
+def test_other_kinds_of_pixels_become_colours(
+    frame: Frame, derived: DerivedImages, tmp_path: Path
+) -> None:
+    whole = Image.fromarray(mega_nerf_scene.image(2))
+    for mode, channels in (("P", 3), ("LA", 4), ("CMYK", 3)):
+        path = tmp_path / f"{mode}.{'jpg' if mode == 'CMYK' else 'png'}"
+        whole.convert(mode).save(path)
+        other = dataclasses.replace(frame, image=path, mode=mode)
+        assert pixels(picture_of(other, 1, False, derived)).shape == (16, 24, channels)
+
+
+def test_factors_that_do_not_divide_or_enlarge_are_refused(frame: Frame) -> None:
+    with pytest.raises(InputError, match="scale factor of 5 does not divide"):
+        scaled(frame, 5)
+    small = dataclasses.replace(frame, image_size=(6, 4))
+    assert scaled(small, 4) == (6, 4)
+    with pytest.raises(InputError, match=r"fewer than the 12 x 8 .* larger scale factor"):
+        scaled(small, 2)
+
+
+def test_masks_are_unpacked_resized_and_cut(
+    scene: Path, frame: Frame, derived: DerivedImages
+) -> None:
+    keep = mega_nerf_scene.mask(2)
+    whole = pixels(mask_of(frame, 1, False, scene / "masks", derived))
+    np.testing.assert_array_equal(whole, 255 * keep)
+    left = pixels(mask_of(frame, 1, True, scene / "masks", derived))
+    np.testing.assert_array_equal(left[:, :12], whole[:, :12])
+    assert not left[:, 12:].any()
+    small = pixels(mask_of(frame, 2, False, scene / "masks", derived))
+    assert small.shape == (8, 12) and set(np.unique(small)) == {0, 255}
+
+
+def test_without_masks_only_halves_are_cut(frame: Frame, derived: DerivedImages) -> None:
+    assert pixels(mask_of(frame, 1, False, None, derived)).all()
+    left = pixels(mask_of(frame, 8, True, None, derived))
+    assert left[:, :1].all() and not left[:, 1:].any()
+
+
+def test_a_mask_that_keeps_nothing_is_none(scene: Path, derived: DerivedImages) -> None:
+    frame = read_scene(scene).frames[4]
+    for _ in range(2):  # the second time from its file
+        assert mask_of(frame, 1, False, scene / "masks", derived) is None
+
+
+def test_a_missing_mask_is_named(frame: Frame, derived: DerivedImages, tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=r"000002\.pt: each picture needs a mask"):
+        mask_of(frame, 1, False, tmp_path, derived)

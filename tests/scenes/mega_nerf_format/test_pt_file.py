@@ -1,0 +1,134 @@
+"""A .pt file is data: what could run, or claims more than it has, is refused in one line."""
+
+from __future__ import annotations
+
+import io
+import os
+import pickle
+import zipfile
+from collections import OrderedDict
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from leco_plugin.scenes.input_error import InputError
+from leco_plugin.scenes.mega_nerf_format.pt_file import load, read_pt
+
+VALUES = {
+    "c2w": torch.arange(12.0).view(3, 4),
+    "turned": torch.arange(12.0).view(3, 4).T,
+    "mask": torch.tensor([True, False]),
+    "half": torch.ones(2, dtype=torch.bfloat16),
+    "H": 4000,
+    "large": 1 << 70,
+    "scale": 0.5,
+    "flag": True,
+}
+
+
+def saved(value: object, **options: object) -> bytes:
+    file = io.BytesIO()
+    torch.save(value, file, **options)
+    return file.getvalue()
+
+
+def rebuilt(data: bytes, old: bytes, new: bytes) -> bytes:
+    """The same archive with something replaced in its pickle."""
+    file = io.BytesIO()
+    with zipfile.ZipFile(io.BytesIO(data)) as source, zipfile.ZipFile(file, "w") as target:
+        for entry in source.infolist():
+            record = source.read(entry)
+            if entry.filename.endswith("data.pkl"):
+                assert old in record
+                record = record.replace(old, new)
+            target.writestr(entry.filename, record)
+    return file.getvalue()
+
+
+def refusal(data: bytes) -> str:
+    with pytest.raises(InputError) as caught:
+        load(data, "poses/7.pt")
+    line = str(caught.value)
+    assert line.startswith("poses/7.pt ") and "\n" not in line
+    return line
+
+
+def test_what_torch_saves_comes_back() -> None:
+    loaded = load(saved(VALUES), "file")
+    assert loaded.keys() == VALUES.keys()
+    for name, value in VALUES.items():
+        if isinstance(value, torch.Tensor):
+            assert torch.equal(loaded[name], value) and loaded[name].dtype == value.dtype
+        else:
+            assert loaded[name] == value
+
+
+def test_views_and_shared_storages_come_back() -> None:
+    whole = torch.arange(20.0)
+    first, second = load(saved([whole[3:9:2], whole]), "file")
+    assert torch.equal(first, whole[3:9:2]) and torch.equal(second, whole)
+    assert load(saved(torch.zeros(0, 4)), "file").shape == (0, 4)
+    assert load(saved(OrderedDict(H=3)), "file") == {"H": 3}
+
+
+class Runs:
+    """Runs a command when unpickled by a reader that trusts it."""
+
+    def __init__(self, marker: Path) -> None:
+        self.marker = marker
+
+    def __reduce__(self) -> tuple[object, tuple[str]]:
+        return os.system, (f"touch {self.marker}",)
+
+
+def test_nothing_in_a_file_is_run(tmp_path: Path) -> None:
+    marker = tmp_path / "marker"
+    assert "posix.system" in refusal(saved({"H": Runs(marker)}))
+    assert "torch 1.6" in refusal(pickle.dumps({"H": Runs(marker)}))
+    assert "torch 1.6" in refusal(saved(Runs(marker), _use_new_zipfile_serialization=False))
+    assert not marker.exists()
+    pickle.loads(pickle.dumps(Runs(marker)))  # else this test would prove nothing
+    assert marker.exists()
+
+
+@pytest.mark.parametrize(
+    "value", [np.float64(1.0), Path("a"), np.zeros(3), torch.Size([1]), {1, 2}]
+)
+def test_what_is_no_tensor_and_no_number_is_named(value: object) -> None:
+    assert "only tensors and numbers are read" in refusal(saved({"x": value}))
+
+
+def test_an_archive_with_a_false_claim_is_refused() -> None:
+    data = rebuilt(saved(torch.zeros(12)), b"K\x0ctq", b"J\0\0\0\x70tq")
+    assert "claims 1879048192 values where it has 48 bytes" in refusal(data)
+
+
+def test_a_compressed_archive_is_refused_before_it_is_unpacked() -> None:
+    file = io.BytesIO()
+    with zipfile.ZipFile(file, "w", zipfile.ZIP_DEFLATED) as archive:
+        archive.writestr("archive/data.pkl", b"\x80\x02N.")
+        archive.writestr("archive/data/0", bytes(50_000_000))
+    assert len(file.getvalue()) < 100_000
+    assert "compressed" in refusal(file.getvalue())
+
+
+def test_a_zip_of_something_else_is_named() -> None:
+    file = io.BytesIO()
+    with zipfile.ZipFile(file, "w") as archive:
+        archive.writestr("holiday.txt", "sun")
+    assert "is a zip, but not one of torch.save" in refusal(file.getvalue())
+
+
+def test_files_that_cannot_be_read_are_named(tmp_path: Path) -> None:
+    (tmp_path / "large.pt").write_bytes(bytes(2000))
+    os.mkfifo(tmp_path / "pipe.pt")  # reading it would wait for ever
+    for name, reason in (
+        ("large.pt", "has 2000 bytes"),
+        ("none.pt", "no file"),
+        ("pipe.pt", "no file"),
+        (".", "no file"),
+    ):
+        with pytest.raises(InputError, match=reason):
+            read_pt(tmp_path / name, 1000)

@@ -1,0 +1,177 @@
+"""Training and calibration never see the same pixel."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+
+from leco_plugin.scenes.input_error import InputError
+from leco_plugin.scenes.pixels.held_out_pixels import (
+    HeldOutPixelSampler,
+    HeldOutPixelSamplerConfig,
+    look_up,
+)
+from leco_plugin.scenes.pixels.lattice import PERIODS, Lattice, Share
+
+THIN = Lattice()
+
+
+def images(masked: bool = False) -> dict[str, torch.Tensor]:
+    """Three images whose colours are their pixels' places; their own numbers are 7, 8, 9."""
+    places = torch.meshgrid(torch.arange(3), torch.arange(40), torch.arange(39), indexing="ij")
+    batch = {"image": torch.stack(places, dim=-1).float(), "image_idx": torch.tensor([7, 8, 9])}
+    if masked:  # neighbours of some held-out pixels, and some held-out pixels, are masked
+        batch["mask"] = torch.rand(3, 40, 39, 1, generator=torch.Generator().manual_seed(0)) > 0.5
+    return batch
+
+
+def sampler(**options) -> HeldOutPixelSampler:
+    config = HeldOutPixelSamplerConfig(num_rays_per_batch=5000, **options)
+    made = config.setup()
+    assert isinstance(made, HeldOutPixelSampler)
+    return made
+
+
+@pytest.mark.parametrize("lattice", [Lattice(period) for period in (*PERIODS, 2)])
+@pytest.mark.parametrize("masked", [False, True])
+@pytest.mark.parametrize("options", [{}, {"is_equirectangular": True}, {"fisheye_crop_radius": 15}])
+def test_training_never_samples_a_held_out_pixel(masked: bool, options, lattice: Lattice) -> None:
+    made, batch = sampler(**options), images(masked)
+    made.lattice = lattice
+    for seed in range(5):
+        torch.manual_seed(seed)
+        samples = made.sample(dict(batch))
+        places = samples["image"].long()
+        assert len(places) == 5000
+        assert not bool(lattice.holds_out(places).any())
+        assert torch.equal(samples["indices"][:, 0], batch["image_idx"][places[:, 0]])
+        if masked:
+            assert bool(batch["mask"][tuple(places.unbind(dim=-1))].all())
+
+
+def test_training_reaches_every_other_pixel() -> None:
+    torch.manual_seed(0)
+    places = torch.cat([sampler().sample(images())["image"].long() for _ in range(20)]).unique(
+        dim=0
+    )
+    assert len(places) == 3 * 40 * 39 - int(THIN.holds_out(images()["image"].view(-1, 3)).sum())
+
+
+@pytest.mark.parametrize("masked", [False, True])
+def test_held_out_sampling_only_gives_held_out_pixels(masked: bool) -> None:
+    batch = images(masked)
+    samples = sampler().sample_held_out(batch, 1000, seed=0)
+    places, indices = samples["image"].long(), samples["indices"]
+    assert bool(THIN.holds_out(places).all()) and bool(THIN.holds_out(indices).all())
+    assert torch.equal(indices[:, 1:], places[:, 1:])
+    assert torch.equal(indices[:, 0], batch["image_idx"][places[:, 0]])
+    if masked:
+        assert 0 < len(places) < 1000
+        assert bool(batch["mask"][tuple(places.unbind(dim=-1))].all())
+    else:
+        all_held_out = batch["image"].view(-1, 3)[THIN.holds_out(batch["image"].view(-1, 3))]
+        assert torch.equal(places.unique(dim=0), all_held_out.long().unique(dim=0))
+
+
+def test_held_out_samples_are_the_same_for_a_seed() -> None:
+    first, again = (sampler().sample_held_out(images(), 100, seed=3)["indices"] for _ in range(2))
+    assert torch.equal(first, again)
+
+
+def pixels_of(batch: dict[str, torch.Tensor], count: int, seed: int, share: Share) -> set[tuple]:
+    indices = sampler().sample_held_out(batch, count, seed, share)["indices"]
+    pixels = {tuple(pixel) for pixel in indices.tolist()}
+    assert len(pixels) == len(indices)  # none twice
+    return pixels
+
+
+@pytest.mark.parametrize("masked", [False, True])
+def test_what_calibrates_and_what_checks_share_no_pixel_and_leave_none_out(masked: bool) -> None:
+    batch = images(masked)
+    everything = pixels_of(batch, 1000, 0, "all")
+    calibrates, checks = (pixels_of(batch, 1000, 1, share) for share in ("calibration", "recheck"))
+    assert not calibrates & checks
+    assert calibrates | checks == everything
+    assert masked or len(checks) == pytest.approx(len(everything) / 4, rel=0.15)
+
+
+@pytest.mark.parametrize("share", ["calibration", "recheck"])
+def test_of_tiny_images_every_share_is_all(share: Share) -> None:
+    batch = {"image": torch.zeros(3, 12, 16, 3), "image_idx": torch.arange(3)}
+    assert pixels_of(batch, 10, 0, share) == {(0, 5, 5), (1, 5, 5), (2, 5, 5)}
+
+
+@pytest.mark.parametrize("hidden", ["calibration", "recheck"])
+def test_where_masks_leave_nothing_of_a_share_it_is_all_that_they_leave(hidden: Share) -> None:
+    batch = images()
+    places = batch["image"].long()
+    mask = ~THIN.is_of(places.view(-1, 3), hidden).view(*places.shape[:-1], 1)
+    shares: list[Share] = ["all", "calibration", "recheck"]
+    all_of_them, *found = (pixels_of(batch | {"mask": mask}, 1000, 0, share) for share in shares)
+    assert found == [all_of_them, all_of_them] and all_of_them
+
+
+@pytest.mark.parametrize("share", ["all", "calibration", "recheck"])
+def test_of_many_held_out_pixels_other_seeds_give_others_from_everywhere(share: Share) -> None:
+    pictures = [torch.zeros(400, 300, 3), torch.zeros(800, 600, 3)]
+    batch = {"image": pictures, "image_idx": torch.tensor([0, 1])}
+    first, second = (pixels_of(batch, 50, seed, share) for seed in (0, 1))
+    assert len(first) == len(second) == 50
+    assert len(first & second) < 25
+    many = torch.tensor(sorted(pixels_of(batch, 300, 2, share))).float()
+    assert float((many[:, 0] == 1).float().mean()) == pytest.approx(0.8, abs=0.1)  # its pixels
+    larger = many[many[:, 0] == 1, 1:] / torch.tensor([800.0, 600.0])
+    assert larger.mean(dim=0).tolist() == pytest.approx([0.5, 0.5], abs=0.07)
+    assert float(larger.amax()) > 0.95 and float(larger.amin()) < 0.05
+
+
+def test_images_of_many_sizes_are_sampled_as_a_list() -> None:
+    pictures = [torch.rand(20, 30, 3), torch.rand(50, 12, 3)]
+    batch = {"image": pictures, "image_idx": torch.tensor([0, 1])}
+    samples = sampler().sample_held_out(batch, 50, seed=0)
+    assert bool(THIN.holds_out(samples["indices"]).all())
+    for color, (image, row, column) in zip(samples["image"], samples["indices"].tolist()):
+        assert torch.equal(color, pictures[image][row, column])
+
+
+@pytest.mark.parametrize("kind", ["tensor", "list"])
+def test_no_pixels_have_no_values_of_the_right_shape_and_type(kind: str) -> None:
+    images = torch.zeros(2, 20, 30, 3, dtype=torch.uint8)
+    source = images if kind == "tensor" else list(images)
+    none = torch.zeros(0, dtype=torch.int64)
+    values = look_up(source, none, none.view(0, 2))
+    assert values.shape == (0, 3) and values.dtype == torch.uint8
+
+
+def test_images_of_many_sizes_that_are_masked_throughout_hold_no_held_out_pixel() -> None:
+    pictures = [torch.rand(20, 30, 3), torch.rand(50, 12, 3)]
+    masks = [torch.zeros(*picture.shape[:2], 1, dtype=torch.bool) for picture in pictures]
+    batch = {"image": pictures, "mask": masks, "image_idx": torch.tensor([0, 1])}
+    samples = sampler().sample_held_out(batch, 50, seed=0)
+    assert samples["image"].shape == (0, 3) and samples["indices"].shape == (0, 3)
+
+
+def test_masked_images_of_many_sizes_are_sampled_where_they_are_seen() -> None:
+    pictures = [torch.rand(20, 30, 3), torch.rand(50, 12, 3)]
+    masks = [torch.zeros(*picture.shape[:2], 1, dtype=torch.bool) for picture in pictures]
+    masks[0][3:9, 5:20], masks[1][40:, :4] = True, True
+    batch = {"image": pictures, "mask": masks, "image_idx": torch.tensor([0, 1])}
+    samples = sampler().sample(batch)
+    assert len(samples["indices"]) == 5000
+    assert not bool(THIN.holds_out(samples["indices"]).any())
+    for image, row, column in samples["indices"].tolist():
+        assert bool(masks[image][row, column])
+
+
+def test_a_mask_is_sampled_evenly() -> None:
+    torch.manual_seed(0)
+    mask = torch.zeros(1, 10, 20, 1, dtype=torch.bool)
+    mask[0, 2, :4] = True
+    found = sampler().rejection_sample_mask(mask, 4000, 1, 10, 20, "cpu")
+    assert bool(mask[tuple(found.unbind(dim=-1))].all())
+    assert (found[:, 2].bincount() - 1000).abs().max() < 150
+
+
+def test_a_mask_without_a_pixel_is_an_input_error() -> None:
+    with pytest.raises(InputError, match="leave no pixel"):
+        sampler().rejection_sample_mask(torch.zeros(1, 4, 4, 1), 3, 1, 4, 4, "cpu")
