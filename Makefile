@@ -18,7 +18,7 @@ demo: $(READY)
 	$(BIN)/leco demo $(DEMO)
 
 test: $(READY)
-	OMP_NUM_THREADS=1 $(BIN)/python -m pytest --numprocesses $(WORKERS) --dist loadgroup $(PYTEST)
+	OMP_NUM_THREADS=1 $(BIN)/python -m pytest --numprocesses $(WORKERS) --dist loadgroup --durations 40 $(PYTEST)
 
 lint: $(READY)
 	$(BIN)/ruff format --check .
