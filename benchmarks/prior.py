@@ -23,7 +23,7 @@ from leco_plugin.evaluation.machine import describe_machine
 from leco_plugin.method_configs import leco_occupancy
 from leco_plugin.models.compute.optimizers import RATES, FusedAdamConfig
 from leco_plugin.models.freezing.calibration import Reference
-from leco_plugin.models.freezing.freezing import calibration_rays, dense_reference
+from leco_plugin.models.freezing.held_out_rendering import calibration_rays, dense_reference
 from leco_plugin.models.gate import occupancy_from_logits
 from leco_plugin.models.learning.lifecycle import Lifecycle
 from leco_plugin.models.learning.phases import ScheduleConfig

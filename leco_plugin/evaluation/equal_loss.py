@@ -27,7 +27,11 @@ from leco_plugin.evaluation.reached_volume import (
     rays_of_photographs,
     reached_volume,
 )
-from leco_plugin.models.freezing.freezing import calibration_rays, dense_reference, evaluating
+from leco_plugin.models.freezing.held_out_rendering import (
+    calibration_rays,
+    dense_reference,
+    evaluating,
+)
 from leco_plugin.models.gate import occupancy_from_logits
 from leco_plugin.models.leco import LecoModel
 from leco_plugin.models.rendering import Rays, mapped_middles

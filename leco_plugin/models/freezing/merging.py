@@ -17,7 +17,7 @@ from torch import Tensor
 
 from leco_plugin.models.compute.ranks import from_first, say
 from leco_plugin.models.freezing.calibration import EXACT, near_median_depth, price_db
-from leco_plugin.models.freezing.freezing import evaluating
+from leco_plugin.models.freezing.held_out_rendering import evaluating
 from leco_plugin.models.rendering import Intervals, Rays
 
 if TYPE_CHECKING:

@@ -24,7 +24,7 @@ from leco_plugin.models.freezing.calibration import (
     calibrate,
     ray_prices,
 )
-from leco_plugin.models.freezing.freezing import (
+from leco_plugin.models.freezing.held_out_rendering import (
     calibration_rays,
     dense_rendering,
     evaluating,
@@ -150,13 +150,7 @@ def skip_less(model: LecoModel, datamanager: Any, step: int, why: str) -> Measur
     model.threshold.fill_(measured.threshold)
     # a new report: whoever was given the old one keeps what it said
     model.report = model.report | {
-        "threshold": measured.threshold,
-        "lost_surface_mass": measured.lost_surface_mass,
-        "lost_mass": measured.lost_mass,
-        "image_price_db": measured.image_price_db,
-        "empty_fraction": measured.empty_fraction,
-        "surface_error": measured.surface_error,
-        "price_error_db": measured.price_error_db,
+        **measured._asdict(),
         "lowered": [*model.report.get("lowered", []), [step, measured.threshold]],
     }
     model.forget_estimator()

@@ -16,7 +16,8 @@ from torch import Tensor
 
 from leco_plugin.models.compute.ranks import from_first, is_first, mean, say
 from leco_plugin.models.freezing.calibration import THRESHOLDS, CalibrationConfig
-from leco_plugin.models.freezing.freezing import held_out_bundle, leave_file
+from leco_plugin.models.freezing.freezing import leave_file
+from leco_plugin.models.freezing.held_out_rendering import held_out_bundle
 from leco_plugin.models.freezing.recheck import Evidence, rays_to_check_with, steps_until_next
 from leco_plugin.models.hosts.guide import Guide
 from leco_plugin.models.hosts.probation import end_probation

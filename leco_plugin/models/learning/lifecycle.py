@@ -22,13 +22,9 @@ from leco_plugin.models.failures import GateCollapsed
 from leco_plugin.models.field import HMoEField
 from leco_plugin.models.freezing.calibration import Measured
 from leco_plugin.models.freezing.field_at_freezing import carry_over, leave_field
-from leco_plugin.models.freezing.freezing import (
-    HARDLY_ANYTHING,
-    calibration_rays,
-    freeze,
-    write_occupancy,
-)
+from leco_plugin.models.freezing.freezing import HARDLY_ANYTHING, freeze, write_occupancy
 from leco_plugin.models.freezing.guided_watch import GuidedWatch
+from leco_plugin.models.freezing.held_out_rendering import calibration_rays
 from leco_plugin.models.freezing.merging import merge
 from leco_plugin.models.gate import Gate, occupancy_from_logits, route
 from leco_plugin.models.learning.batches import Batches

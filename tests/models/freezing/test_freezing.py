@@ -8,7 +8,8 @@ import pytest
 import torch
 
 from leco_plugin.models.freezing.calibration import Measured
-from leco_plugin.models.freezing.freezing import advice_on, calibration_rays
+from leco_plugin.models.freezing.freezing import advice_on
+from leco_plugin.models.freezing.held_out_rendering import calibration_rays
 from leco_plugin.scenes.pixels.held_out_pixels import HeldOutPixelSampler, HeldOutPixelSamplerConfig
 
 COUNT = 50

@@ -18,8 +18,8 @@ from leco_plugin.models.freezing.calibration import (
     RayPrices,
     Reference,
 )
-from leco_plugin.models.freezing.freezing import DenseRendering
 from leco_plugin.models.freezing.guided_watch import GuidedWatch
+from leco_plugin.models.freezing.held_out_rendering import DenseRendering
 from leco_plugin.models.freezing.recheck import (
     SHARE_OF_TIME,
     Evidence,
