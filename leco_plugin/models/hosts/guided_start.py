@@ -155,16 +155,24 @@ class GuidedStart:
             )
             self.guide.set_occupancy(occupancy)
         watches = self.config.learning.calibration.recheck_rays > 0
-        if step == 0 and watches and begin_carefully(self.host, self.guide):
+        if step == 0 and watches and begin_carefully(self.host, self.guide, self._skipped):
             self.kept = None
         if step == 0 and self.config.opaque_start:
             kept = self.kept
             if kept is None:
-                cameras = self.pipeline.datamanager.train_dataset.cameras
-                kept, _ = kept_of_rays(self.guide, self.guide.followed(), cameras)
+                kept, _ = self._kept(self.guide.followed())
             begin_opaque(self.host, self.guide, kept)
         if self.trainer is not None and is_first():
             leave_file(self.guide.the_occupancy(), Path(self.trainer.base_dir))
+
+    def _kept(self, occupancy: Occupancy) -> tuple[Tensor, Tensor]:
+        """`kept_of_rays` of the run's cameras."""
+        cameras = self.pipeline.datamanager.train_dataset.cameras
+        return kept_of_rays(self.guide, occupancy, cameras)
+
+    def _skipped(self, occupancy: Occupancy) -> float:
+        """Share of the run's rays that an occupancy skips."""
+        return 1.0 - share_of(*self._kept(occupancy))
 
     def _fit(self, occupancy: Occupancy) -> Tensor:
         """Finds how the occupancy's coordinates lie in the host's, and whether they are of one
@@ -174,8 +182,8 @@ class GuidedStart:
         if learned_in is not None and host is not None:
             self.guide.frame.copy_(between(host, learned_in))
             self.guide.changed()
-        kept, met = kept_of_rays(self.guide, occupancy, manager.train_dataset.cameras)
-        share = float(kept.sum() / met.sum().clamp(min=1e-12))
+        kept, met = self._kept(occupancy)
+        share = share_of(kept, met)
         if share == 0.0:
             raise InputError(
                 "the occupancy keeps nothing on the rays of these cameras: it was learned on "
@@ -188,6 +196,11 @@ class GuidedStart:
             "those for learning one, and do not change it"
         )
         return kept
+
+
+def share_of(kept: Tensor, met: Tensor) -> float:
+    """Share of lengths, as `kept_of_rays` returns them."""
+    return float(kept.sum() / met.sum().clamp(min=1e-12))
 
 
 @torch.no_grad()

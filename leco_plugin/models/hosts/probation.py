@@ -4,9 +4,14 @@ A calibrated threshold keeps its price in the field that the gate was learned wi
 that field explains by few places, another host that may not look elsewhere from its first step on
 never finds a better explanation. So a packed host begins with a lower threshold; after the first
 measurement (`host_watch`) it follows the calibrated one, unless that costs too much.
+
+A host that begins with nothing skipped explains pictures by haze anywhere, and that haze then
+forbids to skip. So what it follows at first skips 40% of what the calibrated threshold does.
 """
 
 from __future__ import annotations
+
+from collections.abc import Callable
 
 from torch import nn
 
@@ -14,18 +19,35 @@ from leco_plugin.models.compute.ranks import say
 from leco_plugin.models.freezing.calibration import THRESHOLDS
 from leco_plugin.models.hosts.guide import CAREFULLY, Guide
 from leco_plugin.models.hosts.stand_ins import GuidedEstimator
+from leco_plugin.occupancy import Occupancy
 
 CAREFUL = 1.0 / 16.0
-"""Share of the calibrated threshold that a host begins with, where that is a threshold at all."""
+"""Share of the calibrated threshold that a host begins with, where that skips enough."""
+STILL_SKIPPED = 0.4
+"""Of what the calibrated threshold skips within the scene's bounds, the least share that is skipped
+at first too."""
+ANYTHING = 1e-30
+"""A threshold that keeps all that is within the bounds."""
 
 
-def begin_carefully(host: nn.Module, guide: Guide) -> bool:
-    """Has a packed host follow a lower threshold for the beginning; returns whether it does."""
+def begin_carefully(host: nn.Module, guide: Guide, skipped: Callable[[Occupancy], float]) -> bool:
+    """Has a packed host follow a lower threshold for the beginning; returns whether it does.
+
+    Args:
+        skipped: share of what the cameras see that an occupancy skips.
+    """
     packed = any(isinstance(module, GuidedEstimator) for module in host.modules())
-    calibrated = guide.the_occupancy().threshold
+    occupancy = guide.the_occupancy()
+    calibrated = occupancy.threshold
     lower = max(CAREFUL * calibrated, THRESHOLDS[-1])
     if not packed or calibrated < 1.1 * lower:
         return False
+    beyond = skipped(occupancy.with_threshold(ANYTHING))
+    enough = beyond + STILL_SKIPPED * (skipped(occupancy) - beyond)
+    while skipped(occupancy.with_threshold(lower)) < enough:
+        lower *= 2.0
+        if calibrated < 1.1 * lower:
+            return False
     guide.watched[CAREFULLY] = lower
     guide.changed()
     say(

@@ -5,10 +5,11 @@ the first phase, is healed, `MOST_RECOVERIES` times at most. Its last layer star
 goes on for half as long again: first on dense samples, while what teaches the gate comes in again
 from nothing and the field finds its surfaces without it; then as before, with the force that led to
 the collapse `EASED` times weaker. A gate in logit form that collapses again begins anew altogether,
-and the field with it, at rates `EASED` times smaller and for all of the phase. The last time a gate
-that is taught in the paper's form is taught in the logit form that is the default, unless
-`fall_back` is off; so is, at once, one by which hardly anything can be skipped. Where one scene
-expert took all points, they are shared out anew, and their balance counts `EASED` times as much.
+and the field with it, at rates `EASED` times smaller and for all of the phase. A gate in
+the paper's form that less force has not healed is taught in the logit form that is the default,
+unless `fall_back` is off; so is, at once, one by which hardly anything can be skipped. Where one
+scene expert took all points, they are shared out anew, and their balance counts `EASED` times as
+much.
 """
 
 from __future__ import annotations
@@ -83,8 +84,8 @@ def heal(
     anew = starts_anew(collapse, config, progress)
     progress.recoveries += 1
     progress.suspected_since = -1
-    last = progress.recoveries == MOST_RECOVERIES or collapse.kind == "useless"
-    progress.paper_given_up |= last and may_fall_back(config)
+    form_fails = progress.recoveries > 1 or collapse.kind == "useless"
+    progress.paper_given_up |= form_fails and may_fall_back(config)
     if collapse.kind == "one expert":
         spread_scene_experts(head, int(shares[1:].argmax()) + 1)
         progress.balance *= EASED

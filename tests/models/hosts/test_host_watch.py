@@ -105,11 +105,41 @@ def test_a_price_beyond_its_bound_lowers_the_threshold_until_it_is_not(watched: 
     assert len(watched.asked) == measured  # nothing is skipped, nothing is lost
 
 
+def a_half(occupancy: Occupancy) -> float:
+    """What is skipped, where the threshold does not matter."""
+    return 0.5
+
+
+def test_what_skips_too_little_is_no_beginning(watched: Watched, packed: Any) -> None:
+    """The threshold is doubled until 40% as much is skipped as by the calibrated one, of what is
+    within the bounds: here 40% of the rays are not."""
+    calibrated = watched.guide.the_occupancy().threshold
+
+    def from_a_fifth_on(occupancy: Occupancy) -> float:
+        within = 0.8 if occupancy.threshold > 0.2 * calibrated else 0.3
+        return 0.4 + 0.6 * within if occupancy.threshold > 1e-20 else 0.4
+
+    assert begin_carefully(packed, watched.guide, from_a_fifth_on)
+    assert watched.guide.followed().threshold == pytest.approx(4.0 * CAREFUL * calibrated)
+
+
+def test_where_only_the_calibrated_threshold_skips_it_is_followed_at_once(
+    watched: Watched, packed: Any
+) -> None:
+    calibrated = watched.guide.the_occupancy().threshold
+
+    def all_or_nothing(occupancy: Occupancy) -> float:
+        return 0.8 if occupancy.threshold >= calibrated else 0.0
+
+    assert not begin_carefully(packed, watched.guide, all_or_nothing)
+    assert watched.guide.followed() is watched.guide.the_occupancy()
+
+
 def test_a_host_that_can_afford_it_follows_the_calibrated_threshold_after_a_while(
     watched: Watched, packed: Any, capsys: Any
 ) -> None:
     calibrated, version = watched.guide.the_occupancy().threshold, watched.guide.version
-    assert begin_carefully(packed, watched.guide) and watched.guide.version > version
+    assert begin_carefully(packed, watched.guide, a_half) and watched.guide.version > version
     watched.go(0, 100)
     assert watched.guide.followed().threshold == pytest.approx(CAREFUL * calibrated)
     assert watched.guide.the_occupancy().threshold == calibrated  # as files and checkpoints say
@@ -126,7 +156,7 @@ def test_a_host_that_cannot_afford_it_stays_with_the_lower_threshold(
     watched: Watched, packed: Any
 ) -> None:
     calibrated = watched.guide.the_occupancy().threshold
-    begin_carefully(packed, watched.guide)
+    begin_carefully(packed, watched.guide, a_half)
     watched.host.price = 0.05
     watched.go(0, 101)
     watched.host.price = 0.0
@@ -141,7 +171,7 @@ def test_a_host_that_cannot_afford_it_stays_with_the_lower_threshold(
 
 def test_the_careful_beginning_goes_on_in_a_resumed_run(watched: Watched, packed: Any) -> None:
     calibrated = watched.guide.the_occupancy().threshold
-    begin_carefully(packed, watched.guide)
+    begin_carefully(packed, watched.guide, a_half)
     watched.go(0, 50)
     fresh = Guide()
     fresh.load_state_dict(watched.guide.state_dict())
@@ -150,14 +180,14 @@ def test_the_careful_beginning_goes_on_in_a_resumed_run(watched: Watched, packed
 
 
 def test_without_measurements_no_careful_beginning_goes_on(watched: Watched, packed: Any) -> None:
-    begin_carefully(packed, watched.guide)
+    begin_carefully(packed, watched.guide, a_half)
     never = CalibrationConfig(recheck_rays=0)
     HostWatch(watched.host, watched.guide, never, watched.watch.pipeline, None)
     assert watched.guide.followed() is watched.guide.the_occupancy()
 
 
 def test_what_keeps_nothing_is_followed_by_nobody(watched: Watched, packed: Any) -> None:
-    begin_carefully(packed, watched.guide)
+    begin_carefully(packed, watched.guide, a_half)
     watched.kept = 0
     watched.go(0, 101)
     assert watched.guide.followed().threshold == 0.0
@@ -166,9 +196,9 @@ def test_what_keeps_nothing_is_followed_by_nobody(watched: Watched, packed: Any)
 def test_hosts_with_samples_of_a_fixed_number_and_thresholds_of_nothing_begin_as_they_are(
     watched: Watched, packed: Any
 ) -> None:
-    assert not begin_carefully(torch.nn.Linear(2, 2), watched.guide)
+    assert not begin_carefully(torch.nn.Linear(2, 2), watched.guide, a_half)
     watched.guide.the_occupancy().threshold_value.fill_(THRESHOLDS[-1])
-    assert not begin_carefully(packed, watched.guide)
+    assert not begin_carefully(packed, watched.guide, a_half)
     assert watched.guide.followed() is watched.guide.the_occupancy()
 
 

@@ -36,7 +36,7 @@ def test_a_host_samples_as_with_the_estimator_itself(guide: Guide):
 def test_a_host_that_begins_carefully_keeps_more_until_it_ends(guide: Guide):
     estimator = guide.estimator(BOX).eval()
     before = len(estimator.sampling(*rays(), **MARCH)[0])
-    assert begin_carefully(torch.nn.ModuleList([estimator]), guide)
+    assert begin_carefully(torch.nn.ModuleList([estimator]), guide, lambda _: 0.5)
     lower = LearnedOccupancyEstimator(guide.the_occupancy().with_threshold(0.5 / 16)).eval()
     expected = len(lower.sampling(*rays(), **MARCH)[0])
     assert len(estimator.sampling(*rays(), **MARCH)[0]) == expected > before
