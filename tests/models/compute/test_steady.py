@@ -70,7 +70,7 @@ def test_filling_changes_neither_answers_nor_gradients(monkeypatch: pytest.Monke
     mapped = torch.nn.functional.normalize(torch.randn(1003, 3), dim=-1)
     filled = gradients(field, gate, mapped)
     for module in ("steady", "dispatch"):
-        name = f"leco_plugin.models.{module}.steady_size"
+        name = f"leco_plugin.models.compute.{module}.steady_size"
         monkeypatch.setattr(name, lambda count, device_type: count)
     for mine, plain in zip(filled, gradients(field, gate, mapped), strict=True):
         scale = float(plain.abs().max())
