@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import torch
 from nerfstudio.cameras.rays import RayBundle
-from torch import Tensor
+from torch import Tensor, nn
 
 from leco_plugin.models.freezing.calibration import Reference, reference_of
 from leco_plugin.models.rendering import Intervals, Rays
@@ -79,7 +79,7 @@ def images_of(datamanager: Any) -> dict[str, Any]:
 
 
 @contextmanager
-def evaluating(model: LecoModel) -> Iterator[None]:
+def evaluating(model: nn.Module) -> Iterator[None]:
     """A model in evaluation mode for a while; then in the mode that it was in."""
     was_training = model.training
     model.eval()

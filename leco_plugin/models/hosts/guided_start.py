@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor, nn
@@ -135,7 +135,7 @@ class GuidedStart:
         except ValueError as error:
             here = "; or here, with that option at --pipeline.model.occupancy.learning"
             raise InputError(f"{error}{'' if learned else here}") from None
-        self.kept = None if guide.occupancy is None else self._fit(guide.occupancy)
+        self.along = None if guide.occupancy is None else self._fit(guide.occupancy)
 
     def before_step(self, step: int) -> None:
         """Learns the occupancy if there is none yet, and leaves its file in the run's folder.
@@ -155,35 +155,35 @@ class GuidedStart:
             )
             self.guide.set_occupancy(occupancy)
         watches = self.config.learning.calibration.recheck_rays > 0
-        if step == 0 and watches and begin_carefully(self.host, self.guide, self._skipped):
-            self.kept = None
+        if step == 0 and watches:
+            begin_carefully(self.host, self.guide, self._skipped)
         if step == 0 and self.config.opaque_start:
-            kept = self.kept
-            if kept is None:
-                kept, _ = self._kept(self.guide.followed())
+            kept = self._along_rays().kept(self.guide.followed().threshold)
             begin_opaque(self.host, self.guide, kept)
         if self.trainer is not None and is_first():
             leave_file(self.guide.the_occupancy(), Path(self.trainer.base_dir))
 
-    def _kept(self, occupancy: Occupancy) -> tuple[Tensor, Tensor]:
-        """`kept_of_rays` of the run's cameras."""
-        cameras = self.pipeline.datamanager.train_dataset.cameras
-        return kept_of_rays(self.guide, occupancy, cameras)
+    def _along_rays(self) -> AlongRays:
+        """The occupancy along the run's rays, asked once."""
+        if self.along is None:
+            cameras = self.pipeline.datamanager.train_dataset.cameras
+            self.along = along_rays(self.guide, self.guide.the_occupancy(), cameras)
+        return self.along
 
     def _skipped(self, occupancy: Occupancy) -> float:
-        """Share of the run's rays that an occupancy skips."""
-        return 1.0 - share_of(*self._kept(occupancy))
+        """Share of the run's rays that its occupancy skips at the threshold of this one."""
+        return 1.0 - self._along_rays().share_kept(occupancy.threshold)
 
-    def _fit(self, occupancy: Occupancy) -> Tensor:
+    def _fit(self, occupancy: Occupancy) -> AlongRays:
         """Finds how the occupancy's coordinates lie in the host's, and whether they are of one
-        scene; returns how much it keeps of rays, as `kept_of_rays` does."""
+        scene; returns it along the rays of the cameras."""
         manager = self.pipeline.datamanager
         learned_in, host = occupancy.report.get("frame"), frame_of(manager)
         if learned_in is not None and host is not None:
             self.guide.frame.copy_(between(host, learned_in))
             self.guide.changed()
-        kept, met = self._kept(occupancy)
-        share = share_of(kept, met)
+        along = along_rays(self.guide, occupancy, manager.train_dataset.cameras)
+        share = along.share_kept(occupancy.threshold)
         if share == 0.0:
             raise InputError(
                 "the occupancy keeps nothing on the rays of these cameras: it was learned on "
@@ -195,22 +195,32 @@ class GuidedStart:
             f"guided by an occupancy that keeps {share:.1%} along these rays; the bounds above are "
             "those for learning one, and do not change it"
         )
-        return kept
+        return along
 
 
-def share_of(kept: Tensor, met: Tensor) -> float:
-    """Share of lengths, as `kept_of_rays` returns them."""
-    return float(kept.sum() / met.sum().clamp(min=1e-12))
+class AlongRays(NamedTuple):
+    """An occupancy along the rays that meet its box."""
+
+    values: Tensor
+    """[R, `PLACES`] o(x), in stretches of one length on each ray."""
+    lengths: Tensor
+    """[R] of each ray within the box, scene units of the host."""
+
+    def kept(self, threshold: float) -> Tensor:
+        """[R], of those lengths, what a threshold keeps."""
+        return (self.values >= threshold).float().mean(dim=-1) * self.lengths
+
+    def share_kept(self, threshold: float) -> float:
+        """Share of all those lengths that a threshold keeps."""
+        return float(self.kept(threshold).sum() / self.lengths.sum().clamp(min=1e-12))
 
 
 @torch.no_grad()
-def kept_of_rays(guide: Guide, occupancy: Occupancy, cameras: Any) -> tuple[Tensor, Tensor]:
-    """How much an occupancy keeps of rays through its box, and how much of them lies in it.
+def along_rays(guide: Guide, occupancy: Occupancy, cameras: Any) -> AlongRays:
+    """An occupancy along rays through its box.
 
     Args:
         guide: says how the occupancy lies in the host.
-    Returns:
-        Lengths [R] and [R], scene units of the host.
     """
     frame = guide.frame
     origins, directions = (part.reshape(-1, 3).to(frame) for part in covering_rays(cameras))
@@ -226,6 +236,5 @@ def kept_of_rays(guide: Guide, occupancy: Occupancy, cameras: Any) -> tuple[Tens
     t = starts + (ends - starts) * along
     positions = origins[hits][:, None] + directions[hits][:, None] * t[..., None]
     parts = positions.reshape(-1, 3).split(1 << 18)
-    kept = torch.cat([occupancy.occupied(part) for part in parts]).view(t.shape)
-    lengths = (ends - starts)[:, 0]
-    return kept.float().mean(dim=-1) * lengths, lengths
+    values = torch.cat([occupancy.query(part) for part in parts]).view(t.shape)
+    return AlongRays(values, (ends - starts)[:, 0])

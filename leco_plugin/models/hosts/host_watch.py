@@ -17,7 +17,7 @@ from torch import Tensor
 from leco_plugin.models.compute.ranks import from_first, is_first, mean, say
 from leco_plugin.models.freezing.calibration import THRESHOLDS, CalibrationConfig
 from leco_plugin.models.freezing.freezing import leave_file
-from leco_plugin.models.freezing.held_out_rendering import held_out_bundle
+from leco_plugin.models.freezing.held_out_rendering import evaluating, held_out_bundle
 from leco_plugin.models.freezing.recheck import Evidence, rays_to_check_with, steps_until_next
 from leco_plugin.models.hosts.guide import Guide
 from leco_plugin.models.hosts.probation import end_probation
@@ -100,15 +100,14 @@ class HostWatch:
         data = self.pipeline.datamanager
         bundle, truth = held_out_bundle(data, config.recheck_rays, seed, "recheck")
         bundle, truth = bundle.to(host.device), truth.to(host.device).float()
-        was_training, kept = host.training, guide.kept
-        host.eval()
+        kept = guide.kept
         try:
-            gated = self._errors(bundle, truth)
-            guide.dense = True
-            dense = self._errors(bundle, truth)
+            with evaluating(host):
+                gated = self._errors(bundle, truth)
+                guide.dense = True
+                dense = self._errors(bundle, truth)
         finally:
             guide.dense, guide.kept = False, kept
-            host.train(was_training)
         excess = gated - 10.0 ** (0.1 * config.image_price_db) * dense
         before = Evidence(*guide.watched.get("image", NO_EVIDENCE))
         return tuple(before.with_rays(excess, rays_to_check_with(data, config)))

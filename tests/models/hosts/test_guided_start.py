@@ -27,7 +27,7 @@ from leco_plugin.models.hosts.guide import Guide
 from leco_plugin.models.hosts.guided_start import (
     GuidedStart,
     OccupancyConfig,
-    kept_of_rays,
+    along_rays,
 )
 from leco_plugin.models.hosts.stand_ins import GuidedEstimator
 from leco_plugin.occupancy import Occupancy
@@ -212,7 +212,8 @@ def test_the_ball_is_found_whatever_it_was_learned_in(readers: dict[str, Data]) 
         assert frame is not None
         guide = started(ball_of_the_tiny_scene(frame), readers["turned up"])
         cameras = readers["turned up"].train_dataset.cameras
-        kept, met = kept_of_rays(guide, guide.the_occupancy(), cameras)
+        along = along_rays(guide, guide.the_occupancy(), cameras)
+        kept, met = along.kept(guide.the_occupancy().threshold), along.lengths
         shares.append(float(kept.sum() / met.sum()))
     assert shares == pytest.approx([shares[0]] * len(shares), rel=0.05)
     assert 0.05 < shares[0] < 0.6
@@ -309,9 +310,10 @@ def test_a_packed_host_begins_carefully_and_is_opaque_by_what_it_then_keeps(
     assert (guide.followed().threshold < calibrated) == careful
     if step == 0:
         cameras = data.train_dataset.cameras
-        expected, _ = kept_of_rays(guide, guide.followed(), cameras)
+        along = along_rays(guide, guide.the_occupancy(), cameras)
+        expected = along.kept(guide.followed().threshold)
         assert torch.equal(lengths[0], expected)
-        whole, _ = kept_of_rays(guide, guide.the_occupancy(), cameras)
+        whole = along.kept(calibrated)
         assert (float(expected.sum()) > float(whole.sum())) == careful
 
 
