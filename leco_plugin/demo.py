@@ -14,9 +14,9 @@ from nerfstudio.engine.trainer import Trainer, TrainerConfig
 from torch import Tensor
 
 from leco_plugin.chart.theme import LIGHT, Theme
+from leco_plugin.compat.host_outputs import true_colours
 from leco_plugin.evaluation.charts import psnr_against_seconds
 from leco_plugin.evaluation.clock import Budget
-from leco_plugin.evaluation.held_out_images import true_image
 from leco_plugin.evaluation.inspection import ViewBox
 from leco_plugin.evaluation.json_file import write_json
 from leco_plugin.evaluation.machine import describe_machine
@@ -168,7 +168,7 @@ def _draw_picture(trainer: Trainer, occupancy: Occupancy, truth: CityTruth, path
     outputs = model.get_outputs_for_camera(dataset.cameras[number : number + 1].to(model.device))
     pipeline.train()
     rgb = outputs["rgb"].clamp(0.0, 1.0)
-    photograph = true_image(model, dataset.get_data(number)["image"], rgb)
+    photograph = true_colours(model, dataset.get_data(number)["image"].to(rgb.device))
     depth = (outputs["depth"][..., 0] / truth.scale).cpu()
     samples = float(outputs["samples_per_ray"].mean())
     draw_panels(photograph.cpu(), rgb.cpu(), samples, depth, occupancy, truth, path)

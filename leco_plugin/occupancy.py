@@ -32,6 +32,9 @@ NEEDS_A_BACKDROP = 1.0
 learning has not made opaque is worth up to 0.6 dB, and a host that is given a backdrop for that
 loses more; 2.4% of sky is worth 11 dB. A sky that is worth less than this stays black in hosts."""
 
+CALIBRATED_AT = "calibrated_threshold"
+"""In a report: the threshold that its figures are of, where a host has lowered it since."""
+
 Precision = Literal["float32", "bfloat16", "float16"]
 
 

@@ -1,4 +1,5 @@
-"""Images of a nerfstudio model as its commands and its viewer can draw them."""
+"""Images of a nerfstudio model as its commands and its viewer can draw them, and photographs as it
+is compared with them."""
 
 from __future__ import annotations
 
@@ -26,6 +27,16 @@ def with_counts_as_floats(model: Model) -> Model:
 
     model.get_outputs_for_camera_ray_bundle = get_outputs_for_camera_ray_bundle  # type: ignore[method-assign]
     return model
+
+
+def true_colours(host: Any, image: Tensor) -> Tensor:
+    """What the host should show of pixels [..., 3 or 4]: before its own background, [..., 3].
+
+    nerfstudio's models render premultiplied colours, and photographs have straight ones.
+    """
+    renderer = getattr(host, "renderer_rgb", None)
+    blended: Tensor = image[..., :3] if renderer is None else renderer.blend_background(image)
+    return blended
 
 
 def _drawable(image: Tensor) -> Tensor:

@@ -8,8 +8,8 @@ from typing import Any
 
 import torch
 from nerfstudio.engine.trainer import Trainer
-from torch import Tensor
 
+from leco_plugin.compat.host_outputs import true_colours
 from leco_plugin.evaluation.clock import Clock
 from leco_plugin.evaluation.field_queries import FieldQueries
 from leco_plugin.evaluation.metrics import image_metrics
@@ -39,7 +39,7 @@ def psnr_on_rays(trainer: Trainer, rays: int, seed: int = 0) -> float:
         bundle = camera.generate_rays(camera_indices=number, coords=coords).to(pipeline.device)
         parts = [bundle[i : i + RAYS_AT_ONCE] for i in range(0, per_image, RAYS_AT_ONCE)]
         rgb = torch.cat([pipeline.model(part)["rgb"] for part in parts]).clamp(0.0, 1.0)
-        truth = true_image(pipeline.model, image[rows, columns], rgb)
+        truth = true_colours(pipeline.model, image[rows, columns].to(rgb.device))
         squared_error += float(((rgb - truth) ** 2).sum(dtype=torch.float64))
         count += truth.numel()
     pipeline.train()
@@ -73,7 +73,8 @@ def evaluate_images(trainer: Trainer, most_images: int, queries: FieldQueries) -
         outputs = pipeline.model.get_outputs_for_camera(camera)
         times.append(clock.stop())
         predicted = outputs["rgb"].clamp(0.0, 1.0)
-        truth = true_image(pipeline.model, dataset.get_data(number)["image"], predicted)
+        image = dataset.get_data(number)["image"].to(predicted.device)
+        truth = true_colours(pipeline.model, image)
         figures = image_metrics(predicted, truth)
         asked, pixels = queries.since(before), predicted.numel() / 3
         figures["field_queries_per_ray"] = asked.field / pixels
@@ -86,10 +87,3 @@ def evaluate_images(trainer: Trainer, most_images: int, queries: FieldQueries) -
             sums[name] = sums.get(name, 0.0) + value / count
     pipeline.train()
     return sums | {"render_seconds_per_image": statistics.median(times)}
-
-
-def true_image(model: Any, image: Tensor, like: Tensor) -> Tensor:
-    """The truth [H, W, 3] behind the method's own background."""
-    image = image.to(like.device)
-    renderer = getattr(model, "renderer_rgb", None)
-    return renderer.blend_background(image) if renderer is not None else image[..., :3]

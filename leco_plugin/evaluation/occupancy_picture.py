@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from leco_plugin.evaluation.inspection import ViewBox, cameras_of, exposed, query, whole_box
-from leco_plugin.occupancy import Occupancy
+from leco_plugin.occupancy import CALIBRATED_AT, Occupancy
 
 SEARCH_CELLS = 64
 """Along the longest side, to find where anything is kept at all."""
@@ -197,6 +197,8 @@ def _title(occupancy: Occupancy, cameras: Tensor) -> str:
     parts.append(f"kept where o(x) ≥ {occupancy.threshold:.3g}")
     skipped = occupancy.report.get("empty_fraction")
     if isinstance(skipped, float):
-        parts.append(f"{skipped:.1%} of all candidates skipped")
+        before = occupancy.report.get(CALIBRATED_AT)
+        then = f" at {before:.3g}, before a host lowered it" if isinstance(before, float) else ""
+        parts.append(f"{skipped:.1%} of all candidates skipped{then}")
     parts.append("threshold blue" + (", cameras green" if len(cameras) else ""))
     return " · ".join(parts)

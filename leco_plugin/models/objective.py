@@ -33,8 +33,8 @@ class GateLossConfig:
     form: Literal["logit", "paper"] = "logit"
     """Contribution in logit form, or imbalanced gate loss and density loss as in the paper."""
     fall_back: bool = True
-    """Whether a gate in the paper's form is taught in logit form at its last recovery, and as soon
-    as hardly anything can be skipped by it; False where the paper's is what is compared."""
+    """Whether a gate in the paper's form is taught in logit form from its second recovery on, and
+    as soon as hardly anything can be skipped by it; False where the paper's is what is compared."""
     contribution: float = 0.02
     """Weight of the contribution loss (logit form)."""
     weight_at_full: float = 0.15

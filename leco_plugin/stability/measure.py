@@ -18,7 +18,7 @@ from nerfstudio.engine.trainer import Trainer
 from numpy.typing import NDArray
 from torch import Tensor
 
-from leco_plugin.evaluation.held_out_images import true_image
+from leco_plugin.compat.host_outputs import true_colours
 from leco_plugin.stability.scene_folder import TRUTH
 
 NEAR = 0.03
@@ -100,7 +100,7 @@ def measure(trainer: Trainer, data: Path, dense_samples: int) -> tuple[Measured,
         asked = torch.ones_like(detail) if shown is None else detail | looked_at
         rgb = render(pipeline.model, flat[asked.to(pipeline.device)]).cpu()
         image = dataset.get_data(number)["image"].reshape(len(flat), -1).to(pipeline.device)
-        wanted = true_image(pipeline.model, image, image).float().cpu()
+        wanted = true_colours(pipeline.model, image).float().cpu()
         colours.append(wanted[looked_at])
         errors.append((rgb[looked_at[asked]] - wanted[looked_at]).square())
         detailed.append((rgb[detail[asked]] - wanted[detail]).square())

@@ -7,6 +7,7 @@ from collections.abc import Mapping
 from dataclasses import asdict
 from typing import TYPE_CHECKING, Any
 
+from leco_plugin.occupancy import CALIBRATED_AT
 from leco_plugin.stability.plan import Entry
 from leco_plugin.stability.verdict import judge
 
@@ -16,7 +17,14 @@ if TYPE_CHECKING:
 Runs = Mapping[tuple[str, str], dict[str, Any]]
 """Records of finished runs by scene and name."""
 
-OF_OCCUPANCY = ("threshold", "lost_surface_mass", "image_price_db", "empty_fraction", "recoveries")
+OF_OCCUPANCY = (
+    "threshold",
+    "lost_surface_mass",
+    "image_price_db",
+    "empty_fraction",
+    "recoveries",
+    CALIBRATED_AT,
+)
 """What is kept of a learned occupancy."""
 
 

@@ -1,4 +1,4 @@
-"""The moment of freezing: calibrate on held-out rays, fix the threshold, write the file."""
+"""The moment of freezing: calibrate on held-out rays, fix the threshold; and the file."""
 
 from __future__ import annotations
 
@@ -34,11 +34,10 @@ def freeze(
     model: LecoModel,
     datamanager: Any,
     survey: Survey,
-    folder: Path | None,
     step: int,
     learn_seconds: float,
 ) -> Measured:
-    """Calibrates the gate, freezes it, and leaves `occupancy.safetensors` in the run's folder.
+    """Calibrates the gate and freezes it.
 
     In every process of a data-parallel run the gate is that of the first one, and so is its price.
     """
@@ -59,8 +58,6 @@ def freeze(
     advice = advice_on(measured)
     if advice is not None:
         say(advice)
-    if folder is not None:
-        write_occupancy(model, folder)
     return measured
 
 

@@ -15,7 +15,7 @@ from leco_plugin.models.freezing.recheck import (
     skip_less,
     steps_until_next,
 )
-from leco_plugin.models.learning.healing import MOST_RECOVERIES, SUSPECTED_STEPS
+from leco_plugin.models.learning.healing import MOST_RECOVERIES, REMEDY, SUSPECTED_STEPS
 from leco_plugin.models.learning.phases import Collapse
 
 if TYPE_CHECKING:
@@ -99,5 +99,7 @@ class GuidedWatch:
         progress = lifecycle.progress
         cause = "the frozen gate keeps nothing of what the cameras see"
         if progress.recoveries >= MOST_RECOVERIES:
-            raise GateCollapsed(f"step {step}: {cause}, after {MOST_RECOVERIES} recoveries.")
-        lifecycle.reopen(Collapse(cause), step)
+            raise GateCollapsed(
+                f"step {step}: {cause}, after {MOST_RECOVERIES} recoveries. {REMEDY}"
+            )
+        lifecycle.recoveries.reopen(Collapse(cause), step)

@@ -56,10 +56,11 @@ class Evidence(NamedTuple):
         """With the rays of one more measurement.
 
         Args:
-            values: [R], of one of the excesses of `calibration.RayPrices`.
+            values: [R], of one of the excesses of `calibration.RayPrices`. What is not finite is no
+                evidence; a field whose loss is not finite stops the run by itself.
             most: rays that there are: however often they are measured, they are no more evidence.
         """
-        values = values.double()
+        values = values[values.isfinite()].double()
         new = (float(len(values)), float(values.sum()), float(values.square().sum()))
         sums = [REMEMBERED * old + more for old, more in zip(self, new)]
         share = min(1.0, most / max(sums[0], 1e-9))

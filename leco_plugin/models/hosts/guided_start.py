@@ -107,9 +107,9 @@ class GuidedStart:
         config: where else to get one.
         pipeline, trainer: nerfstudio's; without a trainer no file is left.
     Raises:
-        InputError: the file is not there or cannot be read, its occupancy keeps nothing that the
-            cameras see, its gate is none that the sampler asks, or nothing can be learned in the
-            time or with the rays that are given.
+        InputError: the file is not there or cannot be read; its occupancy keeps nothing that the
+            cameras see, and this run has not begun with it; its gate is none that the sampler asks;
+            or nothing can be learned in the time or with the rays that are given.
     """
 
     def __init__(
@@ -184,10 +184,10 @@ class GuidedStart:
             self.guide.changed()
         along = along_rays(self.guide, occupancy, manager.train_dataset.cameras)
         share = along.share_kept(occupancy.threshold)
-        if share == 0.0:
+        if share == 0.0 and getattr(self.trainer, "_start_step", 0) == 0:
             raise InputError(
                 "the occupancy keeps nothing on the rays of these cameras: it was learned on "
-                "another scene, or the scene has been moved since"
+                "another scene, the scene has been moved since, or nothing is there"
             )
         learning = self.config.learning
         announce(survey(manager, learning.bounds, learning.near, learning.far))

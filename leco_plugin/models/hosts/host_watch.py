@@ -14,8 +14,13 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from leco_plugin.compat.host_outputs import true_colours
 from leco_plugin.models.compute.ranks import from_first, is_first, mean, say
-from leco_plugin.models.freezing.calibration import THRESHOLDS, CalibrationConfig
+from leco_plugin.models.freezing.calibration import (
+    THRESHOLDS,
+    CalibrationConfig,
+    Measured,
+)
 from leco_plugin.models.freezing.freezing import leave_file
 from leco_plugin.models.freezing.held_out_rendering import evaluating, held_out_bundle
 from leco_plugin.models.freezing.recheck import Evidence, rays_to_check_with, steps_until_next
@@ -23,6 +28,7 @@ from leco_plugin.models.hosts.guide import Guide
 from leco_plugin.models.hosts.probation import end_probation
 from leco_plugin.models.learning.healing import SUSPECTED_STEPS
 from leco_plugin.models.learning.progress import NO_EVIDENCE
+from leco_plugin.occupancy import CALIBRATED_AT
 
 LOWERED_TO = 0.25
 """Share of the threshold that is left when it is lowered; the next measurement, after the fewest
@@ -115,15 +121,14 @@ class HostWatch:
     def _errors(self, bundle: Any, truth: Tensor) -> Tensor:
         """Squared error of rendered rays: [R]."""
         rgb = self.host(bundle)["rgb"][:, :3].float()
-        return ((rgb - truth[:, :3]) ** 2).sum(dim=-1)
+        return ((rgb - true_colours(self.host, truth)) ** 2).sum(dim=-1)
 
     def _lower(self, step: int, threshold: float, why: str) -> None:
         occupancy = self.guide.the_occupancy()
         before = occupancy.threshold
         end_probation(self.guide)
         occupancy.threshold_value.fill_(threshold)
-        lowered = [*occupancy.report.get("lowered", []), [step, threshold]]
-        occupancy.report = occupancy.report | {"threshold": threshold, "lowered": lowered}
+        occupancy.report = _lowered(occupancy.report, step, threshold)
         self.guide.watched["image"] = NO_EVIDENCE
         # of what was wrong once it is soon asked whether it still is, however long that takes
         self.guide.watched["due"] = step + self.config.steps_per_recheck
@@ -133,3 +138,13 @@ class HostWatch:
         say(f"step {step}: {why}; the threshold is {now if threshold > 0.0 else nothing}")
         if self.trainer is not None and is_first():
             leave_file(occupancy, Path(self.trainer.base_dir))
+
+
+def _lowered(report: dict[str, Any], step: int, threshold: float) -> dict[str, Any]:
+    """What an occupancy says of itself with a lower threshold. Its figures stay those of the
+    threshold that was calibrated, which it names from then on; of nothing skipped all are known."""
+    lowered = {"threshold": threshold, "lowered": [*report.get("lowered", []), [step, threshold]]}
+    if threshold > 0.0:
+        return {CALIBRATED_AT: report.get("threshold"), **report, **lowered}
+    known = {name: value for name, value in report.items() if name != CALIBRATED_AT}
+    return known | dict.fromkeys(Measured._fields, 0.0) | lowered

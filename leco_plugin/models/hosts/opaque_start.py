@@ -12,7 +12,7 @@ import math
 
 from torch import Tensor, nn
 
-from leco_plugin.models.compute.ranks import say
+from leco_plugin.models.compute.ranks import from_first, say
 from leco_plugin.models.hosts.guide import Guide
 from leco_plugin.models.hosts.stand_ins import GuidedEstimator
 
@@ -30,18 +30,18 @@ def begin_opaque(host: nn.Module, guide: Guide, kept_lengths: Tensor) -> None:
         guide: remembers the density for checkpoints.
         kept_lengths: [R] kept of each ray, scene units of the host; those of 0 are left out.
     """
-    lengths = kept_lengths[kept_lengths > 0.0]
     scales = [float(getattr(module, SCALE)) for module in _scaled(host)]
-    if len(lengths) == 0 or not scales:
+    if not scales:
         return
-    wanted = -math.log(1.0 - OPACITY) / float(lengths.median())
-    if wanted <= min(scales):
+    lengths = kept_lengths[kept_lengths > 0.0]
+    length = from_first(lambda: float(lengths.median()) if len(lengths) else 0.0, lengths.device)
+    if length == 0.0 or (wanted := -math.log(1.0 - OPACITY) / length) <= min(scales):
         return
     guide.first_density = wanted
     set_first_density(host, guide)
     say(
         f"the host begins with a density of {wanted:.3g} instead of {min(scales):.3g}, with which "
-        f"the {float(lengths.median()):.3g} scene units that are kept of a ray are opaque"
+        f"the {length:.3g} scene units that are kept of a ray are opaque"
     )
 
 

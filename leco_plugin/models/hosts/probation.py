@@ -15,7 +15,7 @@ from collections.abc import Callable
 
 from torch import nn
 
-from leco_plugin.models.compute.ranks import say
+from leco_plugin.models.compute.ranks import from_first, say
 from leco_plugin.models.freezing.calibration import THRESHOLDS
 from leco_plugin.models.hosts.guide import CAREFULLY, Guide
 from leco_plugin.models.hosts.stand_ins import GuidedEstimator
@@ -36,25 +36,34 @@ def begin_carefully(host: nn.Module, guide: Guide, skipped: Callable[[Occupancy]
     Args:
         skipped: share of what the cameras see that an occupancy skips.
     """
-    packed = any(isinstance(module, GuidedEstimator) for module in host.modules())
+    if not any(isinstance(module, GuidedEstimator) for module in host.modules()):
+        return False
     occupancy = guide.the_occupancy()
+    lower = from_first(lambda: _first_threshold(occupancy, skipped), guide.frame.device)
+    if lower is None:
+        return False
+    guide.watched[CAREFULLY] = lower
+    guide.changed()
+    say(
+        f"the host begins at threshold {lower:.4f} instead of {occupancy.threshold:.4f}, until "
+        "skipping has shown in it what it costs"
+    )
+    return True
+
+
+def _first_threshold(occupancy: Occupancy, skipped: Callable[[Occupancy], float]) -> float | None:
+    """The lower threshold to begin with; None where only the calibrated one skips enough."""
     calibrated = occupancy.threshold
     lower = max(CAREFUL * calibrated, THRESHOLDS[-1])
-    if not packed or calibrated < 1.1 * lower:
-        return False
+    if calibrated < 1.1 * lower:
+        return None
     beyond = skipped(occupancy.with_threshold(ANYTHING))
     enough = beyond + STILL_SKIPPED * (skipped(occupancy) - beyond)
     while skipped(occupancy.with_threshold(lower)) < enough:
         lower *= 2.0
         if calibrated < 1.1 * lower:
-            return False
-    guide.watched[CAREFULLY] = lower
-    guide.changed()
-    say(
-        f"the host begins at threshold {lower:.4f} instead of {calibrated:.4f}, until skipping has "
-        "shown in it what it costs"
-    )
-    return True
+            return None
+    return lower
 
 
 def end_probation(guide: Guide) -> float | None:

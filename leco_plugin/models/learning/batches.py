@@ -6,6 +6,7 @@ from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
 from leco_plugin.models.compute.ranks import mean
+from leco_plugin.models.learning.healing import is_dense
 from leco_plugin.scenes.pixels.held_out_pixels import held_out_sampler
 from leco_plugin.scenes.pixels.known_distances import KnownDistancePixelSampler, sampler_here
 from leco_plugin.scenes.pixels.lattice import Lattice
@@ -49,6 +50,8 @@ class Batches:
         The same in every process: the mean of their gradients is then that of one large batch.
         """
         model = self.model
+        if is_dense(model.progress, model.step):
+            model.learning_kept = 1.0  # what a gate kept that has collapsed says nothing
         model.learning_kept = mean(model.learning_kept, model.device)
         wanted = min(model.config.sizes.guided_batch, 1.0 / model.learning_kept)
         return round(8 * wanted) / 8  # of few sizes; see `steady`

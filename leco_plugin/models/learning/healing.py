@@ -8,12 +8,14 @@ the collapse `EASED` times weaker. A gate in logit form that collapses again beg
 and the field with it, at rates `EASED` times smaller and for all of the phase. A gate in
 the paper's form that less force has not healed is taught in the logit form that is the default,
 unless `fall_back` is off; so is, at once, one by which hardly anything can be skipped. Where one
-scene expert took all points, they are shared out anew, and their balance counts `EASED` times as
-much.
+scene expert took all points, they are shared out anew, their balance counts `EASED` times as much,
+and at least a quarter of the phase is left to learn from them. Of these steps a gate gets what the
+run has, where that is `FEWEST_STEPS` at least: it is then frozen before the run ends.
 """
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 from typing import Literal
 
@@ -42,12 +44,18 @@ HAS_LEARNED = 0.9
 IN_LOGIT_FORM = ", and the gate is taught in logit form from now on"
 EASED = 4.0
 """How much weaker the force towards a collapse is after it."""
+REMEDY = (
+    "Check the scene's bounds in the log above, and the weights under gate-loss; leco-occupancy "
+    "trains without skipping with --pipeline.model.schedule.freeze False."
+)
+"""What a user does whose gate has collapsed for good."""
 
 
 def is_collapsed(
     progress: Progress, step: int, kept: float, shares: Tensor, last: bool
 ) -> Collapse | None:
-    """The collapse of a gate, if it has lasted; `progress` notes since when one is suspected.
+    """The collapse of a gate, if it has lasted; `progress` notes since when one is suspected. One
+    that has been left as it is, after all recoveries, is none any more.
 
     Args:
         kept: share of probe positions whose o(x) is at least 0.1.
@@ -58,7 +66,7 @@ def is_collapsed(
     if step + 1 - progress.began < FEWEST_STEPS:
         return None
     collapse = find_collapse(kept, shares, last or progress.fewest_kept < HAS_LEARNED)
-    if collapse is None:
+    if collapse is None or (collapse.kind == "occupied" and progress.left_occupied):
         progress.suspected_since = -1
         return None
     if progress.suspected_since < 0:
@@ -74,27 +82,34 @@ def heal(
     shares: Tensor,
     step: int,
     config: GateLossConfig,
+    room: float = math.inf,
 ) -> str:
     """Heals the gate whose last layer this is; returns what was done, in words.
 
     Args:
         shares: [1 + n] share of points at each expert.
         config: what the gate is taught by.
+        room: steps that the run has left.
     """
     anew = starts_anew(collapse, config, progress)
     progress.recoveries += 1
     progress.suspected_since = -1
     form_fails = progress.recoveries > 1 or collapse.kind == "useless"
     progress.paper_given_up |= form_fails and may_fall_back(config)
+    phase = progress.phase or progress.configured or progress.learn_steps  # of older checkpoints
     if collapse.kind == "one expert":
         spread_scene_experts(head, int(shares[1:].argmax()) + 1)
         progress.balance *= EASED
+        learn_to = step + 1 + int(min(phase // 4, room))
+        progress.learn_steps = max(progress.learn_steps, learn_to)
         return "its points are shared out anew" + (IN_LOGIT_FORM if progress.paper_given_up else "")
     reset_gate_head(head)
     progress.healed_at = step
-    phase = progress.phase or progress.configured or progress.learn_steps  # of older checkpoints
-    progress.dense_until = step + 1 + phase // 4
-    progress.learn_steps = step + 1 + (phase if anew else phase // 2)
+    steps = phase if anew else phase // 2
+    if room >= FEWEST_STEPS:
+        steps = int(min(steps, room))
+    progress.dense_until = step + 1 + min(phase // 4, steps // 2)
+    progress.learn_steps = step + 1 + steps
     progress.decisions = torch.zeros(0, dtype=torch.bool)
     progress.fewest_kept = 1.0
     less = f", then with {EASED:.0f} times less pressure"

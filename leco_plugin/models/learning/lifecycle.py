@@ -18,30 +18,19 @@ from torch import Tensor
 
 from leco_plugin.compat.optimizers import forget_the_gone
 from leco_plugin.models.compute.ranks import is_first, say, share
-from leco_plugin.models.failures import GateCollapsed
 from leco_plugin.models.field import HMoEField
-from leco_plugin.models.freezing.calibration import Measured
 from leco_plugin.models.freezing.field_at_freezing import carry_over, leave_field
-from leco_plugin.models.freezing.freezing import HARDLY_ANYTHING, freeze, write_occupancy
+from leco_plugin.models.freezing.freezing import freeze, write_occupancy
 from leco_plugin.models.freezing.guided_watch import GuidedWatch
 from leco_plugin.models.freezing.held_out_rendering import calibration_rays
 from leco_plugin.models.freezing.merging import merge
-from leco_plugin.models.gate import Gate, occupancy_from_logits, route
+from leco_plugin.models.gate import occupancy_from_logits
 from leco_plugin.models.learning.batches import Batches
-from leco_plugin.models.learning.healing import (
-    FEWEST_STEPS,
-    MOST_RECOVERIES,
-    STEPS_PER_LOOK,
-    heal,
-    is_collapsed,
-    may_fall_back,
-    starts_anew,
-)
+from leco_plugin.models.learning.healing import STEPS_PER_LOOK
 from leco_plugin.models.learning.history import GateHistory
 from leco_plugin.models.learning.pace import keep_pace
 from leco_plugin.models.learning.phases import (
     PROBES,
-    Collapse,
     ScheduleConfig,
     converged,
     decisions_agree,
@@ -51,8 +40,8 @@ from leco_plugin.models.learning.phases import (
 )
 from leco_plugin.models.learning.prior import warm_start
 from leco_plugin.models.learning.progress import NO_EVIDENCE, Progress
+from leco_plugin.models.learning.recoveries import Recoveries
 from leco_plugin.models.learning.statistics import KEPT_ABOVE
-from leco_plugin.models.losses import expert_shares
 from leco_plugin.models.rendering import gate_values_and_routes
 from leco_plugin.occupancy import gate_precision
 from leco_plugin.scenes.pixels.known_distances import sampler_here
@@ -86,7 +75,7 @@ class Lifecycle:
             announce(self.survey)
             if sampler_here(self.pipeline.datamanager) is None:
                 say("batches come from elsewhere: they keep their size, and no pixel's distance")
-            self._begin_with_points()
+            self.begin_with_points()
         self.optimizers: list[Any] = []
         """Those of the model, where they are not a trainer's."""
         self.step_started = 0.0
@@ -106,7 +95,7 @@ class Lifecycle:
                 f"its first half: {most} steps, not the {configured} of schedule.learn-steps"
             )
 
-    def _begin_with_points(self) -> None:
+    def begin_with_points(self) -> None:
         """Shows the gate the sparse points, where that is asked for; it counts as learning time."""
         model, prior = self.model, self.model.config.prior
         if prior.steps == 0 or model.config.homogeneous or bool(model.frozen):
@@ -124,6 +113,11 @@ class Lifecycle:
             f"{len(points)} sparse points and {len(sparse.distances)} lines of sight to them have "
             f"taught the gate in {seconds:.1f} s (loss {loss:.3f})"
         )
+
+    @cached_property
+    def recoveries(self) -> Recoveries:
+        """What is done about a gate that collapses."""
+        return Recoveries(self)
 
     @property
     def progress(self) -> Progress:
@@ -189,9 +183,9 @@ class Lifecycle:
             )
 
     def _ends_after(self, step: int) -> bool:
-        return self.trainer is not None and step + 1 >= self._end()
+        return self.trainer is not None and step + 1 >= self.end()
 
-    def _end(self) -> int:
+    def end(self) -> int:
         """Steps of the run; nerfstudio counts its iterations from the step that is gone on from."""
         return int(self.trainer._start_step) + int(self.trainer.config.max_num_iterations)
 
@@ -205,7 +199,7 @@ class Lifecycle:
             return
         logits = self._probe()
         kept = occupancy_from_logits(logits) >= KEPT_ABOVE
-        if schedule.freeze and self._has_collapsed(step, logits, kept, last):
+        if schedule.freeze and self.recoveries.after_look(step, logits, kept, last):
             return
         if not checks:
             return
@@ -216,8 +210,8 @@ class Lifecycle:
         if not last and float(kept.float().mean()) > 0.95:
             return  # it agrees with itself only because it has not yet found anything empty
         since, of_those = step - progress.began, self.schedule_since
-        if last and is_unsettled(since, agreement, of_those, progress.extensions):
-            self._learn_on(step, agreement)
+        unsettled = last and is_unsettled(since, agreement, of_those, progress.extensions)
+        if unsettled and self._learns_on(step, agreement):
             return
         if converged(since, agreement, of_those):
             say(
@@ -225,10 +219,11 @@ class Lifecycle:
                 f"{schedule.steps_per_check} steps ago; freezing the gate"
             )
             data, seconds = self.pipeline.datamanager, progress.learn_seconds
-            measured = freeze(model, data, self.survey, self.folder, step, seconds)
-            if self._falls_back(step, measured):
+            measured = freeze(model, data, self.survey, step, seconds)
+            if self.recoveries.falls_back(step, measured):
                 return
             if self.folder is not None:
+                write_occupancy(model, self.folder)
                 leave_field(model, self.folder)
             if self.trainer is not None and not schedule.restart:
                 merge(model, lambda count: calibration_rays(model, data, count))
@@ -238,55 +233,25 @@ class Lifecycle:
             if schedule.steps_per_record > 0:
                 self._record(step)
             if schedule.restart:
-                self._restart_field()
+                self.restart_field()
                 say("the field starts anew, guided from its first step")
             self.save(step)  # a run killed from now on stays frozen
 
-    def _falls_back(self, step: int, measured: Measured) -> bool:
-        """Has a gate that hardly anything can be skipped by taught otherwise, where there is
-        another way; returns whether it has."""
-        progress, losses = self.progress, self.model.config.gate_loss
-        if not may_fall_back(losses) or progress.paper_given_up:
-            return False
-        if measured.empty_fraction >= HARDLY_ANYTHING:
-            return False
-        skipped = f"{measured.empty_fraction:.1%} of all candidates"
-        self.reopen(
-            Collapse(f"no threshold within bounds skips more than {skipped}", "useless"), step
-        )
-        return True
-
-    def reopen(self, collapse: Collapse, step: int) -> None:
-        """Has a frozen gate learn once more, on dense samples first."""
-        self.model.reopen()
-        done = self.healed(collapse, torch.zeros(self.model.gate.head.out_features), step)
-        say(f"step {step}: {collapse.cause}; the gate is opened again, {done}")
-
-    def healed(self, collapse: Collapse, shares: Tensor, step: int) -> str:
-        """Does what the rule says; returns what that is, in words. Arguments as for `heal`."""
-        model, progress, losses = self.model, self.progress, self.model.config.gate_loss
-        anew = starts_anew(collapse, losses, progress)
-        if anew:
-            model.gate.load_state_dict(Gate(model.gate.config).state_dict())
-            share(model.gate.parameters())
-            self._restart_field()
-        done = heal(model.gate.head, progress, collapse, shares, step, losses)
-        share(model.gate.head.parameters())  # the remedy is drawn at random
-        if anew:
-            self._begin_with_points()
-        room = self._end() - (step + 1) if self.trainer is not None else 0
-        if room >= FEWEST_STEPS:  # no run that has those steps ends without an occupancy
-            progress.learn_steps = min(progress.learn_steps, self._end())
-        return f"{done} (recovery {progress.recoveries} of {MOST_RECOVERIES})"
-
-    def _learn_on(self, step: int, agreement: float) -> None:
+    def _learns_on(self, step: int, agreement: float) -> bool:
+        """Gives a gate that has not settled more steps, where the run has any; returns whether."""
         progress = self.progress
+        until = step + 1 + steps_of_an_extension(progress.phase or progress.configured)
+        if self.trainer is not None:
+            until = min(until, self.end())
+        if until <= step + 1:
+            return False
         progress.extensions += 1
-        progress.learn_steps = step + 1 + steps_of_an_extension(progress.configured)
+        progress.learn_steps = until
         say(
             f"step {step}: only {agreement:.1%} of the gate's decisions are those of the last "
             f"check; it learns on until step {progress.learn_steps}"
         )
+        return True
 
     def save(self, step: int) -> None:
         """A checkpoint, where the run saves any."""
@@ -310,7 +275,7 @@ class Lifecycle:
         except OSError as error:
             say(f"the history of the gate could not be written ({error})")
 
-    def _restart_field(self) -> None:
+    def restart_field(self) -> None:
         """Gives the field the weights of a new one, and its optimizers nothing to remember."""
         field = self.model.field
         fresh = HMoEField(field.config, self.model.num_train_data)
@@ -347,27 +312,3 @@ class Lifecycle:
             logits: Tensor = self.model.gate(self.probe_positions)
         share([logits])
         return logits
-
-    def _has_collapsed(self, step: int, logits: Tensor, kept: Tensor, last: bool) -> bool:
-        """Heals a gate that has collapsed for a while; returns whether it starts anew.
-
-        Raises:
-            GateCollapsed: more often than it may.
-        """
-        model, progress = self.model, self.progress
-        shares = expert_shares(route(logits, model.routing.empty_below), logits.shape[-1])
-        share_kept = float(kept.float().mean())
-        collapse = is_collapsed(progress, step, share_kept, shares, last)
-        if collapse is None:
-            return False
-        if progress.recoveries >= MOST_RECOVERIES:
-            if collapse.kind == "occupied":  # slow, and never wrong: what can be is skipped
-                say(f"step {step}: {collapse.cause}, after {MOST_RECOVERIES} recoveries; so be it")
-                return False
-            raise GateCollapsed(
-                f"step {step}: {collapse.cause}, after {MOST_RECOVERIES} recoveries. Check the "
-                "scene's bounds in the log above, and the weights under gate-loss; leco-occupancy "
-                "trains without skipping with --pipeline.model.schedule.freeze False."
-            )
-        say(f"step {step}: {collapse.cause}; {self.healed(collapse, shares, step)}")
-        return collapse.kind != "one expert"

@@ -46,6 +46,8 @@ class Progress:
     """Factor, after recoveries, of all learning rates."""
     paper_given_up: bool = False
     """Whether the gate, after recoveries, is taught in logit form although the paper's is asked."""
+    left_occupied: bool = False
+    """Whether a gate that calls everything occupied after all its recoveries is left so."""
     decisions: Tensor = field(default_factory=lambda: torch.zeros(0, dtype=torch.bool))
     """[P] bool, what the gate decided of the probe positions at the last check."""
 
@@ -66,7 +68,8 @@ class Progress:
             most: steps that this process leaves for the first phase.
         """
         if configured != self.configured:
-            self.learn_steps = self.phase = min(configured, most)
+            self.phase = min(configured, most)
+            self.learn_steps = self.began + self.phase
             self.configured = configured
 
     @classmethod

@@ -78,6 +78,13 @@ def test_a_price_at_its_bound_is_rarely_taken_for_more() -> None:
     assert not evidence_after(-0.5).exceeds()
 
 
+def test_a_ray_that_is_no_number_is_no_evidence() -> None:
+    values = torch.tensor([math.nan, 1.0, math.inf, 3.0])
+    evidence = Evidence(*NO_EVIDENCE).with_rays(values, math.inf)
+    assert evidence == (2.0, 4.0, 10.0)
+    assert evidence.with_rays(values[:1], math.inf).rays == pytest.approx(1.6)
+
+
 def test_measuring_again_keeps_to_its_share_of_the_time() -> None:
     for seconds, a_step in ((0.3, 0.1), (20.0, 0.1), (1e-3, 1.0), (1.0, 0.0)):
         steps = steps_until_next(CONFIG, seconds, a_step)
@@ -192,7 +199,7 @@ def watched(monkeypatch: pytest.MonkeyPatch) -> SimpleNamespace:
         model.reopen()
         heal(model.gate.head, model.progress, collapse, torch.zeros(3), step, GateLossConfig())
 
-    lifecycle.reopen = reopen
+    lifecycle.recoveries = SimpleNamespace(reopen=reopen)
     made.model, made.watch = lifecycle.model, GuidedWatch(lifecycle)  # type: ignore[arg-type]
 
     def measure_again(model: Any, _: Any) -> None:
@@ -241,7 +248,7 @@ def test_where_nothing_is_skipped_nothing_is_measured(watched: Any) -> None:
 
 def test_a_frozen_gate_that_keeps_nothing_is_opened_again_and_then_given_up(watched: Any) -> None:
     watched.model.guided_kept = 0.0
-    with pytest.raises(GateCollapsed, match=r"step \d+: the frozen gate keeps nothing"):
+    with pytest.raises(GateCollapsed, match=r"step \d+: the frozen gate keeps .* bounds"):
         watched.go(200, 2000)
     assert watched.model.reopened == watched.model.progress.recoveries == 3
     assert watched.step == 200 + 4 * 101 - 1

@@ -7,6 +7,7 @@ import shutil
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
+from unittest.mock import Mock
 
 import pytest
 import torch
@@ -219,12 +220,17 @@ def test_the_ball_is_found_whatever_it_was_learned_in(readers: dict[str, Data]) 
     assert 0.05 < shares[0] < 0.6
 
 
-def test_an_occupancy_of_another_scene_is_refused(readers: dict[str, Data]) -> None:
+def test_an_occupancy_of_another_scene_is_refused_unless_the_run_began_with_it(
+    readers: dict[str, Data],
+) -> None:
     elsewhere = ball_of_the_tiny_scene([[1, 0, 0, 50.0], [0, 1, 0, 50.0], [0, 0, 1, 50.0]])
     elsewhere.report = {"frame": torch.eye(3, 4).tolist()}
     with pytest.raises(InputError, match=r"keeps nothing .* learned on another scene") as error:
         started(elsewhere, readers["as it is"])
     assert "\n" not in str(error.value)
+    (guide := Guide()).set_occupancy(elsewhere)
+    (resumed := Mock())._start_step = 90
+    GuidedStart(nn.Module(), guide, OccupancyConfig(), Pipe(readers["as it is"]), resumed)
 
 
 def test_training_says_what_was_wrong_with_a_path(readers: dict[str, Data], tmp_path: Path) -> None:

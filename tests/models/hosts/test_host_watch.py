@@ -10,6 +10,7 @@ from typing import Any
 import pytest
 import torch
 from ball_occupancy import ball
+from nerfstudio.model_components.renderers import RGBRenderer
 
 from leco_plugin.models.freezing.calibration import THRESHOLDS, CalibrationConfig
 from leco_plugin.models.guided import _refuse_what_is_not_finite
@@ -18,7 +19,7 @@ from leco_plugin.models.hosts.guide import Guide
 from leco_plugin.models.hosts.host_watch import LOWERED_TO, HostWatch
 from leco_plugin.models.hosts.probation import CAREFUL, begin_carefully
 from leco_plugin.models.hosts.stand_ins import GuidedEstimator
-from leco_plugin.occupancy import Occupancy
+from leco_plugin.occupancy import CALIBRATED_AT, Occupancy
 
 BOX = torch.tensor([-4.0, -4.0, -4.0, 4.0, 4.0, 4.0])
 RAYS = 64
@@ -65,7 +66,9 @@ class Watched(SimpleNamespace):
 @pytest.fixture
 def watched(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Watched:
     guide, now, asked = Guide(), [0.0], []
-    guide.set_occupancy(copy.deepcopy(ball()))
+    occupancy = copy.deepcopy(ball())
+    occupancy.report = {"threshold": occupancy.threshold, "empty_fraction": 0.8, "params": 5}
+    guide.set_occupancy(occupancy)
     host = Host(guide)
     monkeypatch.setattr(host_watch.time, "monotonic", lambda: now[0])
 
@@ -98,11 +101,26 @@ def test_a_price_beyond_its_bound_lowers_the_threshold_until_it_is_not(watched: 
     assert watched.host.training and watched.guide.kept == 9
     left = Occupancy.load(watched.out / "occupancy.safetensors")
     assert left.threshold == after.threshold and left.report["lowered"] == [[300, after.threshold]]
+    assert left.report[CALIBRATED_AT] == before and left.report["empty_fraction"] == 0.8
     watched.go(301, 3000)
     assert watched.guide.the_occupancy().threshold == 0.0
+    nothing = watched.guide.the_occupancy().report
+    assert nothing["empty_fraction"] == nothing["image_price_db"] == 0.0
+    assert CALIBRATED_AT not in nothing and nothing["params"] == 5
     measured = len(watched.asked)
     watched.go(3000, 3500)
     assert len(watched.asked) == measured  # nothing is skipped, nothing is lost
+
+
+def test_photographs_with_alpha_are_compared_as_the_host_renders_them(watched: Watched) -> None:
+    """White under transparent pixels is black before the black that a random background is when a
+    host renders; as it stands in the file it would be an error that hides the price of skipping."""
+    watched.host.renderer_rgb = RGBRenderer(background_color="random")
+    seen, alpha = torch.zeros(RAYS, 3), (torch.arange(RAYS) % 2)[:, None].float()
+    truth = torch.cat([1.0 - alpha.expand(-1, 3), alpha], dim=-1)
+    host = watched.host
+    host.__class__ = type("Black", (Host,), {"__call__": lambda self, _: {"rgb": seen}})
+    assert not watched.watch._errors(None, truth).any()
 
 
 def a_half(occupancy: Occupancy) -> float:

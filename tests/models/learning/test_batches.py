@@ -10,6 +10,7 @@ import torch
 
 from leco_plugin.models.learning import batches
 from leco_plugin.models.learning.batches import Batches
+from leco_plugin.models.learning.progress import Progress
 from leco_plugin.scenes.pixels.known_distances import KnownDistancePixelSampler
 
 
@@ -32,6 +33,8 @@ def made(monkeypatch: pytest.MonkeyPatch) -> Any:
         device=torch.device("cpu"),
         frozen=torch.tensor(False),
         learning_kept=1.0,
+        progress=Progress(),
+        step=0,
         report={},
     )
     sampler = Sampler(100)
@@ -61,6 +64,15 @@ def test_while_learning_the_rays_follow_what_is_shaded_in_eighths(
     made.batches.prepare(learning=True)
     assert made.sampler.num_rays_per_batch == rays
     assert made.sampler.sets == int(rays != 100)  # not set again to what it is
+
+
+def test_a_healed_gate_is_not_followed_and_its_batches_are_no_longer_for_it(made: Any) -> None:
+    made.model.learning_kept, made.model.progress.dense_until = 0.1, 5
+    made.batches.prepare(learning=True)
+    assert made.sampler.num_rays_per_batch == 100
+    made.model.step = 5
+    made.batches.prepare(learning=True)
+    assert made.sampler.num_rays_per_batch == 100  # until it has been seen what it keeps now
 
 
 def test_known_distances_are_asked_for_only_while_learning_with_a_weight(

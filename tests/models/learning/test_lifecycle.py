@@ -85,7 +85,7 @@ def test_a_field_that_starts_anew_keeps_its_parameters_and_forgets_what_they_wer
     made.trainer = SimpleNamespace(optimizers=SimpleNamespace(optimizers={"field": optimizer}))
     before = list(field.parameters())
     learned = [parameter.detach().clone() for parameter in before]
-    made._restart_field()
+    made.restart_field()
     assert all(one is other for one, other in zip(field.parameters(), before, strict=True))
     assert not any(torch.equal(one, other) for one, other in zip(field.parameters(), learned))
     assert not optimizer.state
@@ -128,11 +128,28 @@ def test_a_short_run_says_once_that_half_of_it_is_for_learning(
 def test_learning_on_takes_a_quarter_more_and_is_said(
     looking: Lifecycle, capsys: pytest.CaptureFixture[str]
 ) -> None:
+    looking.trainer = None
     looking.model.progress = Progress(learn_steps=173, configured=200)  # type: ignore[assignment]
-    looking._learn_on(172, 0.86)
+    assert looking._learns_on(172, 0.86)
     assert looking.progress.learn_steps == 223 and looking.progress.extensions == 1
     said = capsys.readouterr().out
     assert "it learns" in said and "until step 223" in said
+
+
+@pytest.mark.parametrize(
+    ("step", "learns_to"), [(299, 375), (560, 600), (599, None)], ids=["fits", "cut", "no room"]
+)
+def test_learning_on_is_as_long_as_a_short_run_has_room(
+    looking: Lifecycle, step: int, learns_to: int | None
+) -> None:
+    """2000 steps are configured, of which a run of 600 has 300."""
+    looking.trainer = SimpleNamespace(_start_step=0, config=SimpleNamespace(max_num_iterations=600))
+    looking.model.progress = Progress()  # type: ignore[assignment]
+    looking.progress.begin(2000, 300)
+    looking.progress.learn_steps = step + 1
+    assert looking._learns_on(step, 0.86) == (learns_to is not None)
+    assert looking.progress.learn_steps == (learns_to or step + 1)
+    assert looking.progress.extensions == (learns_to is not None)
 
 
 @pytest.mark.parametrize(

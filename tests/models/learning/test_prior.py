@@ -137,12 +137,12 @@ def test_no_points_are_no_prior_and_a_frozen_gate_is_left_alone(
     run.pipeline = SimpleNamespace(datamanager=manager)
     run.batches = Batches(model, manager)
     before = [parameter.clone() for parameter in model.gate.parameters()]
-    run._begin_with_points()
+    run.begin_with_points()
     assert all(torch.equal(a, b) for a, b in zip(before, model.gate.parameters()))
     assert said == ([] if frozen else ["no prior: the scene has no sparse points"])
     dataset.metadata["points3D_xyz"] = hills()
     run.batches = Batches(model, manager)
-    run._begin_with_points()
+    run.begin_with_points()
     changed = any(not torch.equal(a, b) for a, b in zip(before, model.gate.parameters()))
     assert changed is not frozen
     assert (model.progress.learn_seconds > 0.0) is not frozen

@@ -29,6 +29,9 @@ def test_a_run_resumed_with_another_schedule_takes_that_one() -> None:
     progress = Progress(learn_steps=300, configured=200, recoveries=1)
     progress.begin(400, most=2000)
     assert progress.learn_steps == 400 and progress.recoveries == 1
+    anew = Progress(learn_steps=501, configured=200, recoveries=2, began=301)
+    anew.begin(400, most=2000)
+    assert anew.learn_steps == 701  # counted from where gate and field began anew
 
 
 def test_progress_is_read_back_without_unsafe_loading() -> None:
