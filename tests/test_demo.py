@@ -16,7 +16,7 @@ from leco_plugin.occupancy import Occupancy
 SECONDS = 8.0
 OCCUPANCY = {
     *("params", "bytes", "train_seconds", "empty_fraction", "lost_mass", "threshold"),
-    *("lost_surface_mass", "image_price_db", "kept_surface_recall"),
+    *("lost_surface_mass", "image_price_db", "kept_surface_recall", "calibrated_threshold"),
 }
 RUN = {
     *("method", "sampler", "seed", "steps", "train_seconds", "psnr", "ssim", "lpips"),

@@ -34,8 +34,8 @@ def true_colours(host: Any, image: Tensor) -> Tensor:
 
     nerfstudio's models render premultiplied colours, and photographs have straight ones.
     """
-    renderer = getattr(host, "renderer_rgb", None)
-    blended: Tensor = image[..., :3] if renderer is None else renderer.blend_background(image)
+    blend = getattr(getattr(host, "renderer_rgb", None), "blend_background", None)
+    blended: Tensor = image[..., :3] if blend is None else blend(image)
     return blended
 
 

@@ -9,7 +9,7 @@ import torch
 
 from leco_plugin.evaluation.json_file import finite_or_null
 from leco_plugin.evaluation.occupancy_truth import compare_with_truth
-from leco_plugin.occupancy import Occupancy
+from leco_plugin.occupancy import CALIBRATED_AT, Occupancy
 from leco_plugin.scenes.city.city import DESCRIPTION
 from leco_plugin.scenes.city.truth import CityTruth
 
@@ -48,5 +48,6 @@ def occupancy_facts(
         box = torch.tensor(report["aabb"])
         measured = compare_with_truth(occupancy, truth, box, report["step_size"], highest)
     facts: dict[str, Any] = {"params": occupancy.num_params, "bytes": file.stat().st_size}
-    facts["recoveries"] = report.get("recoveries")  # files of an earlier release do not say
+    for name in ("recoveries", CALIBRATED_AT):  # not every file says
+        facts[name] = report.get(name)
     return finite_or_null(facts | {name: report[name] for name in FROM_REPORT} | measured)

@@ -128,7 +128,7 @@ class HostWatch:
         before = occupancy.threshold
         end_probation(self.guide)
         occupancy.threshold_value.fill_(threshold)
-        occupancy.report = _lowered(occupancy.report, step, threshold)
+        occupancy.report = _lowered(occupancy.report, before, step, threshold)
         self.guide.watched["image"] = NO_EVIDENCE
         # of what was wrong once it is soon asked whether it still is, however long that takes
         self.guide.watched["due"] = step + self.config.steps_per_recheck
@@ -140,11 +140,11 @@ class HostWatch:
             leave_file(occupancy, Path(self.trainer.base_dir))
 
 
-def _lowered(report: dict[str, Any], step: int, threshold: float) -> dict[str, Any]:
+def _lowered(report: dict[str, Any], before: float, step: int, threshold: float) -> dict[str, Any]:
     """What an occupancy says of itself with a lower threshold. Its figures stay those of the
     threshold that was calibrated, which it names from then on; of nothing skipped all are known."""
     lowered = {"threshold": threshold, "lowered": [*report.get("lowered", []), [step, threshold]]}
     if threshold > 0.0:
-        return {CALIBRATED_AT: report.get("threshold"), **report, **lowered}
+        return {CALIBRATED_AT: before, **report, **lowered}
     known = {name: value for name, value in report.items() if name != CALIBRATED_AT}
     return known | dict.fromkeys(Measured._fields, 0.0) | lowered

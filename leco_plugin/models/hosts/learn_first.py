@@ -133,6 +133,7 @@ def keep_within(progress: Progress, more: float, done: int) -> None:
     """
     fit = max(FEWEST_STEPS, done + int(more))
     progress.learn_steps = min(progress.learn_steps, fit)
+    progress.phase = min(progress.phase or fit, fit)  # of which recoveries take their share
     extensions = (fit - progress.learn_steps) // steps_of_an_extension(progress.configured)
     progress.extensions = max(0, MOST_EXTENSIONS - extensions)
 

@@ -10,7 +10,8 @@ the paper's form that less force has not healed is taught in the logit form that
 unless `fall_back` is off; so is, at once, one by which hardly anything can be skipped. Where one
 scene expert took all points, they are shared out anew, their balance counts `EASED` times as much,
 and at least a quarter of the phase is left to learn from them. Of these steps a gate gets what the
-run has, where that is `FEWEST_STEPS` at least: it is then frozen before the run ends.
+run has, where that is `FEWEST_STEPS` at least, so that it is frozen before the run ends; with fewer
+it is not healed.
 """
 
 from __future__ import annotations
@@ -100,13 +101,14 @@ def heal(
     if collapse.kind == "one expert":
         spread_scene_experts(head, int(shares[1:].argmax()) + 1)
         progress.balance *= EASED
-        learn_to = step + 1 + int(min(phase // 4, room))
-        progress.learn_steps = max(progress.learn_steps, learn_to)
-        return "its points are shared out anew" + (IN_LOGIT_FORM if progress.paper_given_up else "")
+        learn_to = max(progress.learn_steps, step + 1 + int(min(phase // 4, room)))
+        progress.learn_steps = learn_to
+        form = IN_LOGIT_FORM if progress.paper_given_up else ""
+        return f"its points are shared out anew, to learn from until step {learn_to}{form}"
     reset_gate_head(head)
     progress.healed_at = step
     steps = phase if anew else phase // 2
-    if room >= FEWEST_STEPS:
+    if is_enough(room):
         steps = int(min(steps, room))
     progress.dense_until = step + 1 + min(phase // 4, steps // 2)
     progress.learn_steps = step + 1 + steps
@@ -124,6 +126,11 @@ def heal(
         f"its last layer starts anew, on dense samples to step {progress.dense_until}"
         f"{IN_LOGIT_FORM if progress.paper_given_up else less}"
     )
+
+
+def is_enough(room: float) -> bool:
+    """Whether the steps that a run has left are enough to heal a gate in."""
+    return room >= FEWEST_STEPS
 
 
 def starts_anew(collapse: Collapse, config: GateLossConfig, progress: Progress) -> bool:

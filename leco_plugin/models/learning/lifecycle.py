@@ -172,9 +172,9 @@ class Lifecycle:
         seconds = time.monotonic() - self.step_started
         if bool(model.frozen):
             self.guided.after_step(step, seconds)
-            return
-        self.progress.learn_seconds += seconds
-        self._after_learning_step(step)
+        else:
+            self.progress.learn_seconds += seconds
+            self._after_learning_step(step)
         if self.schedule.freeze and not bool(model.frozen) and self._ends_after(step):
             say(
                 f"step {step}: the run ends while its occupancy is still learned, to step "

@@ -69,7 +69,7 @@ class Progress:
         """
         if configured != self.configured:
             self.phase = min(configured, most)
-            self.learn_steps = self.began + self.phase
+            self.learn_steps = max(self.began, self.healed_at + 1) + self.phase
             self.configured = configured
 
     @classmethod

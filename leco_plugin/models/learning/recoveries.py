@@ -14,11 +14,11 @@ from leco_plugin.models.freezing.calibration import Measured
 from leco_plugin.models.freezing.freezing import FILE_NAME, HARDLY_ANYTHING
 from leco_plugin.models.gate import Gate, route
 from leco_plugin.models.learning.healing import (
-    FEWEST_STEPS,
     MOST_RECOVERIES,
     REMEDY,
     heal,
     is_collapsed,
+    is_enough,
     may_fall_back,
     starts_anew,
 )
@@ -51,8 +51,8 @@ class Recoveries:
         collapse = is_collapsed(progress, step, share_kept, shares, last)
         if collapse is None:
             return False
-        if collapse.kind == "one expert" and self._room(step) < 1:
-            return False  # what is empty it knows, and nothing would learn from the points it gives
+        if self._is_left(collapse, step, last):
+            return False
         if progress.recoveries >= MOST_RECOVERIES:
             cause = f"step {step}: {collapse.cause}, after {MOST_RECOVERIES} recoveries"
             if collapse.kind == "occupied":  # slow, and never wrong: what can be is skipped
@@ -60,8 +60,18 @@ class Recoveries:
                 say(f"{cause}; so be it")
                 return False
             raise GateCollapsed(f"{cause}. {REMEDY}")
+        progress.decisions = kept
         say(f"step {step}: {collapse.cause}; {self.heal(collapse, shares, step)}")
         return True
+
+    def _is_left(self, collapse: Collapse, step: int, last: bool) -> bool:
+        """Whether a gate is frozen as it is, collapsed or not: calibration makes it safe. So it is
+        where the run has no steps to heal it in, and at the end of a phase where the points of one
+        expert have been shared out before: what is empty that gate knows."""
+        progress, room = self.lifecycle.progress, self._room(step)
+        if collapse.kind == "one expert":
+            return last and (room < 1 or progress.balance > 1.0)
+        return not is_enough(room)
 
     def falls_back(self, step: int, measured: Measured) -> bool:
         """Has a gate that hardly anything can be skipped by taught otherwise, where there is
@@ -69,7 +79,7 @@ class Recoveries:
         progress, losses = self.lifecycle.progress, self.lifecycle.model.config.gate_loss
         if not may_fall_back(losses) or progress.paper_given_up:
             return False
-        if measured.empty_fraction >= HARDLY_ANYTHING or self._room(step) < FEWEST_STEPS:
+        if measured.empty_fraction >= HARDLY_ANYTHING or not is_enough(self._room(step)):
             return False
         skipped = f"{measured.empty_fraction:.1%} of all candidates"
         self.reopen(
@@ -80,11 +90,19 @@ class Recoveries:
     def reopen(self, collapse: Collapse, step: int) -> None:
         """Has a frozen gate learn once more, on dense samples first; its file is withdrawn."""
         self.lifecycle.model.reopen()
-        folder = self.lifecycle.folder
-        if folder is not None:
-            (folder / FILE_NAME).unlink(missing_ok=True)
+        self._withdraw_file()
         done = self.heal(collapse, torch.zeros(self.lifecycle.model.gate.head.out_features), step)
         say(f"step {step}: {collapse.cause}; the gate is opened again, {done}")
+
+    def _withdraw_file(self) -> None:
+        """Nobody should be guided by the gate as it was."""
+        if self.lifecycle.folder is None:
+            return
+        file = self.lifecycle.folder / FILE_NAME
+        try:
+            file.unlink(missing_ok=True)
+        except OSError as error:
+            say(f"{file} could not be withdrawn ({error}); its gate is of no use")
 
     def heal(self, collapse: Collapse, shares: Tensor, step: int) -> str:
         """Does what the rule says; returns what that is, in words. Arguments as of `heal`."""

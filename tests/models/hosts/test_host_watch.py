@@ -14,7 +14,7 @@ from nerfstudio.model_components.renderers import RGBRenderer
 
 from leco_plugin.models.freezing.calibration import THRESHOLDS, CalibrationConfig
 from leco_plugin.models.guided import _refuse_what_is_not_finite
-from leco_plugin.models.hosts import host_watch
+from leco_plugin.models.hosts import host_watch, probation
 from leco_plugin.models.hosts.guide import Guide
 from leco_plugin.models.hosts.host_watch import LOWERED_TO, HostWatch
 from leco_plugin.models.hosts.probation import CAREFUL, begin_carefully
@@ -126,6 +126,14 @@ def test_photographs_with_alpha_are_compared_as_the_host_renders_them(watched: W
 def a_half(occupancy: Occupancy) -> float:
     """What is skipped, where the threshold does not matter."""
     return 0.5
+
+
+def test_all_processes_begin_with_what_the_first_one_has_found(
+    watched: Watched, packed: torch.nn.Module, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(probation, "from_first", lambda make, device: 0.123)
+    assert begin_carefully(packed, watched.guide, a_half)
+    assert watched.guide.followed().threshold == pytest.approx(0.123)
 
 
 def test_what_skips_too_little_is_no_beginning(watched: Watched, packed: Any) -> None:

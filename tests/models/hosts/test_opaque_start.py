@@ -14,6 +14,7 @@ from nerfstudio.engine.callbacks import TrainingCallbackAttributes, TrainingCall
 from small_hosts import pipeline_of, small
 from torch import nn
 
+from leco_plugin.models.hosts import opaque_start
 from leco_plugin.models.hosts.guide import Guide
 from leco_plugin.models.hosts.opaque_start import begin_opaque
 from leco_plugin.models.hosts.stand_ins import GuidedEstimator
@@ -46,6 +47,15 @@ def test_half_of_the_rays_that_keep_anything_begin_opaque() -> None:
     begin_opaque(host, guide, LENGTHS)
     assert host.field.average_init_density == guide.first_density
     assert 1.0 - math.exp(-guide.first_density * 0.1) == pytest.approx(0.9)
+
+
+def test_all_processes_begin_with_what_the_first_one_has_found(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    host, guide = Host(packed=True), Guide()
+    monkeypatch.setattr(opaque_start, "from_first", lambda make, device: 0.01)
+    begin_opaque(host, guide, LENGTHS)
+    assert 1.0 - math.exp(-host.field.average_init_density * 0.01) == pytest.approx(0.9)
 
 
 def test_a_host_that_is_opaque_already_begins_as_it_would() -> None:

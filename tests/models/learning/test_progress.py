@@ -32,6 +32,9 @@ def test_a_run_resumed_with_another_schedule_takes_that_one() -> None:
     anew = Progress(learn_steps=501, configured=200, recoveries=2, began=301)
     anew.begin(400, most=2000)
     assert anew.learn_steps == 701  # counted from where gate and field began anew
+    healed = Progress(learn_steps=5091, configured=200, recoveries=1, healed_at=4990)
+    healed.begin(400, most=2000)
+    assert healed.learn_steps == 5391  # or from its new last layer
 
 
 def test_progress_is_read_back_without_unsafe_loading() -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import copy
 from pathlib import Path
 from types import SimpleNamespace
+from typing import Any
 
 import pytest
 import torch
@@ -86,7 +87,7 @@ def test_a_gate_that_keeps_everything_after_three_recoveries_is_frozen_all_the_s
         run.lifecycle.after_step(step)
         if frozen:
             break
-    assert run.lifecycle.progress.recoveries == 3
+    assert frozen and run.lifecycle.progress.recoveries == 3
 
 
 @pytest.mark.parametrize(
@@ -287,7 +288,45 @@ def test_points_that_are_shared_out_at_the_end_of_the_phase_are_learned_from(
     assert run.lifecycle.progress.recoveries == int(end > 200)
 
 
-def test_a_gate_that_is_left_as_it_is_is_said_so_once_and_is_saved_again(
+@pytest.mark.parametrize("form", ["logit", "paper"])
+def test_a_gate_that_stays_with_one_expert_is_frozen_all_the_same(
+    form: Any, healthy_run, monkeypatch
+) -> None:
+    frozen: list[int] = []
+    monkeypatch.setattr(lifecycle, "freeze", freezing_at(frozen, 0.5))
+    run = healthy_run(ScheduleConfig(learn_steps=200))
+    run.lifecycle.model.config.gate_loss = GateLossConfig(form=form, fall_back=False)
+    run.looks = torch.tensor([[20.0, 0.0, 0.0], [0.0, 20.0, 0.0]]).repeat(50, 1)
+    for step in range(1000):
+        run.lifecycle.before_step(step)
+        run.lifecycle.after_step(step)
+        if frozen:
+            break
+    assert frozen == [249] and run.lifecycle.progress.recoveries == 1
+
+
+@pytest.mark.parametrize("kind", ["empty", "occupied"])
+def test_without_steps_to_heal_it_in_a_gate_is_frozen_with_what_it_has_learned(
+    kind: str, healthy_run, monkeypatch
+) -> None:
+    frozen: list[int] = []
+    monkeypatch.setattr(lifecycle, "freeze", freezing_at(frozen, 0.0))
+    for name in ("write_occupancy", "leave_field", "merge", "forget_the_gone"):
+        monkeypatch.setattr(lifecycle, name, lambda *_: None)
+    run = healthy_run(ScheduleConfig(learn_steps=200))
+    run.lifecycle.trainer = of_a_run_of(299)
+    run.lifecycle.model.get_param_groups = dict
+    occupied = torch.tensor([[0.0, 20.0, 20.0 - 1e-3]]).expand(100, 3)
+    run.looks = run.empty if kind == "empty" else occupied
+    before = run.lifecycle.model.gate.head.weight.clone()
+    for step in range(200):
+        run.lifecycle.before_step(step)
+        run.lifecycle.after_step(step)
+    assert frozen == [199] and run.lifecycle.progress.recoveries == 0
+    assert torch.equal(run.lifecycle.model.gate.head.weight, before)
+
+
+def test_a_gate_that_is_left_as_it_is_is_said_so_once_and_is_no_longer_suspected(
     healthy_run, monkeypatch
 ) -> None:
     lines: list[str] = []
