@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+from collections.abc import Iterator
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -68,9 +69,7 @@ def test_a_gate_that_collapses_again_and_again_ends_the_run_in_one_line(healthy_
     run = healthy_run(ScheduleConfig(learn_steps=400))
     run.looks = run.empty
     with pytest.raises(GateCollapsed, match=r"step \d+: the gate calls .* 3 recoveries") as caught:
-        for step in range(10_000):
-            run.lifecycle.before_step(step)
-            run.lifecycle.after_step(step)
+        list(steps_of(run, 10_000))
     assert "\n" not in str(caught.value)
     assert run.lifecycle.progress.recoveries == 3
 
@@ -82,9 +81,7 @@ def test_a_gate_that_keeps_everything_after_three_recoveries_is_frozen_all_the_s
     monkeypatch.setattr(lifecycle, "freeze", freezing_at(frozen, 0.5))
     run = healthy_run(ScheduleConfig(learn_steps=200))
     run.looks = torch.tensor([[0.0, 20.0, 20.0 - 1e-3]]).expand(100, 3)
-    for step in range(10_000):
-        run.lifecycle.before_step(step)
-        run.lifecycle.after_step(step)
+    for _ in steps_of(run, 10_000):
         if frozen:
             break
     assert frozen and run.lifecycle.progress.recoveries == 3
@@ -109,9 +106,7 @@ def test_a_gate_in_the_papers_form_by_which_hardly_anything_is_skipped_is_taught
     run.lifecycle.model.config.gate_loss = losses
     reopened: list[bool] = []
     run.lifecycle.model.reopen = lambda: reopened.append(True)
-    for step in range(1000):
-        run.lifecycle.before_step(step)
-        run.lifecycle.after_step(step)
+    for _ in steps_of(run, 1000):
         if len(frozen) > recoveries:
             break
     assert len(reopened) == run.lifecycle.progress.recoveries == recoveries
@@ -126,10 +121,9 @@ def test_a_gate_is_opened_again_only_with_steps_to_learn_in_and_its_file_goes(
 ) -> None:
     frozen: list[int] = []
     monkeypatch.setattr(lifecycle, "freeze", freezing_at(frozen, 0.0, 0.0))
+    leave_nothing(monkeypatch)
     left: list[object] = []
     monkeypatch.setattr(lifecycle, "write_occupancy", lambda *_: left.append(0))
-    for name in ("leave_field", "merge", "forget_the_gone"):
-        monkeypatch.setattr(lifecycle, name, lambda *_: None)
     run = healthy_run(ScheduleConfig(learn_steps=200))
     run.lifecycle.trainer = of_a_run_of(end)
     run.lifecycle.trainer.base_dir = tmp_path
@@ -137,11 +131,23 @@ def test_a_gate_is_opened_again_only_with_steps_to_learn_in_and_its_file_goes(
     run.lifecycle.model.get_param_groups = dict
     run.lifecycle.model.reopen = lambda: None
     (tmp_path / FILE_NAME).write_text("of a gate before")
-    for step in range(175):  # by then its decisions have settled
-        run.lifecycle.before_step(step)
-        run.lifecycle.after_step(step)
+    list(steps_of(run, 175))  # by then its decisions have settled
     assert frozen == [174] and run.lifecycle.progress.recoveries == int(again)
     assert (tmp_path / FILE_NAME).exists() == bool(left) == (not again)
+
+
+def steps_of(run: SimpleNamespace, count: int) -> Iterator[int]:
+    """Takes so many steps, unless who takes them stops."""
+    for step in range(count):
+        run.lifecycle.before_step(step)
+        run.lifecycle.after_step(step)
+        yield step
+
+
+def leave_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Has a gate that is frozen leave no files, and its field as it is."""
+    for name in ("write_occupancy", "leave_field", "merge", "forget_the_gone"):
+        monkeypatch.setattr(lifecycle, name, lambda *_: None)
 
 
 def freezing_at(steps: list[int], threshold: float, skipped: float = 0.8):
@@ -218,9 +224,7 @@ def test_what_collapses_again_in_logit_form_is_learned_anew_and_more_slowly(
         monkeypatch.setattr(module, "share", lambda tensors: note(map(id, tensors)))
     run.looks = run.empty
     found = {}
-    for step in range(1500):
-        run.lifecycle.before_step(step)
-        run.lifecycle.after_step(step)
+    for step in steps_of(run, 1500):
         progress = run.lifecycle.progress
         if progress.recoveries in found:
             continue
@@ -271,15 +275,12 @@ def test_points_that_are_shared_out_at_the_end_of_the_phase_are_learned_from(
     """A quarter of the phase more, or what the run has; in its last step they are left as is."""
     frozen: list[int] = []
     monkeypatch.setattr(lifecycle, "freeze", freezing_at(frozen, 0.5))
-    for name in ("write_occupancy", "leave_field", "merge", "forget_the_gone"):
-        monkeypatch.setattr(lifecycle, name, lambda *_: None)
+    leave_nothing(monkeypatch)
     run = healthy_run(ScheduleConfig(learn_steps=200))
     run.lifecycle.trainer = of_a_run_of(end)
     run.lifecycle.model.get_param_groups = dict
     run.looks = torch.tensor([[20.0, 0.0, 0.0], [0.0, 20.0, 0.0]]).repeat(50, 1)
-    for step in range(end):
-        run.lifecycle.before_step(step)
-        run.lifecycle.after_step(step)
+    for _ in steps_of(run, end):
         if run.lifecycle.progress.recoveries:
             run.looks = run.sound
         if frozen:
@@ -297,9 +298,7 @@ def test_a_gate_that_stays_with_one_expert_is_frozen_all_the_same(
     run = healthy_run(ScheduleConfig(learn_steps=200))
     run.lifecycle.model.config.gate_loss = GateLossConfig(form=form, fall_back=False)
     run.looks = torch.tensor([[20.0, 0.0, 0.0], [0.0, 20.0, 0.0]]).repeat(50, 1)
-    for step in range(1000):
-        run.lifecycle.before_step(step)
-        run.lifecycle.after_step(step)
+    for _ in steps_of(run, 1000):
         if frozen:
             break
     assert frozen == [249] and run.lifecycle.progress.recoveries == 1
@@ -311,17 +310,14 @@ def test_without_steps_to_heal_it_in_a_gate_is_frozen_with_what_it_has_learned(
 ) -> None:
     frozen: list[int] = []
     monkeypatch.setattr(lifecycle, "freeze", freezing_at(frozen, 0.0))
-    for name in ("write_occupancy", "leave_field", "merge", "forget_the_gone"):
-        monkeypatch.setattr(lifecycle, name, lambda *_: None)
+    leave_nothing(monkeypatch)
     run = healthy_run(ScheduleConfig(learn_steps=200))
     run.lifecycle.trainer = of_a_run_of(299)
     run.lifecycle.model.get_param_groups = dict
     occupied = torch.tensor([[0.0, 20.0, 20.0 - 1e-3]]).expand(100, 3)
     run.looks = run.empty if kind == "empty" else occupied
     before = run.lifecycle.model.gate.head.weight.clone()
-    for step in range(200):
-        run.lifecycle.before_step(step)
-        run.lifecycle.after_step(step)
+    list(steps_of(run, 200))
     assert frozen == [199] and run.lifecycle.progress.recoveries == 0
     assert torch.equal(run.lifecycle.model.gate.head.weight, before)
 
@@ -334,9 +330,7 @@ def test_a_gate_that_is_left_as_it_is_is_said_so_once_and_is_no_longer_suspected
     run = healthy_run(ScheduleConfig(learn_steps=2000))
     run.lifecycle.progress.recoveries, run.lifecycle.progress.fewest_kept = MOST_RECOVERIES, 0.5
     run.looks = torch.tensor([[0.0, 20.0, 20.0 - 1e-3]]).expand(100, 3)
-    for step in range(1900):
-        run.lifecycle.before_step(step)
-        run.lifecycle.after_step(step)
+    list(steps_of(run, 1900))
     assert len(lines) == 1 and "so be it" in lines[0]
     assert run.lifecycle.progress.suspected_since == -1
 
