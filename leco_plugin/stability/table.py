@@ -103,17 +103,18 @@ def unproven(results: Mapping[str, Any]) -> bool:
 
 
 def figures(cell: Mapping[str, Any]) -> tuple[str, str, str]:
-    """The figures of a cell in short words: its PSNR, what it skips, and what its seeds say."""
+    """The figures of a cell in short words: its PSNR, what it skips and how often it was healed,
+    and what its seeds say."""
     if cell["psnr"] is None:
         return "-", "", ""
     first = f"{cell['psnr']:.1f} dB" if cell["gap"] is None else f"{cell['gap']:+.2f} dB"
     parts = [] if cell["gap"] is None else [f"kept {cell['kept_fraction']:.0%}"]
     if cell["gap"] is not None and cell["lost_mass"] is not None:
         parts.append(f"lost {cell['lost_mass']:.1%}")
-    seeds = [f"worst {cell['worst']:+.2f}"] if cell["seeds"] > 1 else []
     occupancies = [run.get("occupancy") or {} for run in cell.get("runs", ())]
     if healed := max((one.get("recoveries") or 0 for one in occupancies), default=0):
-        seeds.append(f"healed {healed} x")
+        parts.append(f"healed {healed} x")
+    seeds = [f"worst {cell['worst']:+.2f}"] if cell["seeds"] > 1 else []
     if cell["missing"]:
         seeds.append(f"{cell['seeds']} of {cell['seeds'] + cell['missing']} seeds")
     return first, ", ".join(parts), ", ".join(seeds)
