@@ -17,7 +17,7 @@ from leco_plugin.stability.table import figures, headline
 
 ROW, HEAD, FOOT = 0.36, 1.0, 0.7
 """Heights in inches."""
-NAMES, COLUMN = 2.75, 1.72
+NAMES, COLUMN = 2.75, 1.95
 """Widths in inches."""
 GAP = 0.03
 SIGNS = {"pass": "✓", "degraded": "~", "fail": "✗", "no reference": "-"}
