@@ -3,6 +3,8 @@
     python benchmarks/kills.py --kills 100 --minutes 10
 
 Each kill must lose nothing that had been saved, and each run must end as runs that nobody kills.
+Half of the moments before training begins, and all of it, are drawn from alike, so that few kills
+come before anything is there to be lost.
 The result is written after every run, and a later call goes on with it. Runs are as small as still
 pass through every phase, and ask their gate directly: building its cell cache would take most of
 the time, and nothing of it is ever saved.
@@ -95,7 +97,19 @@ def train(arguments: list[str], log: Path, end: Path) -> None:
 
     Trainer._after_train = after_train  # type: ignore[method-assign]
     sys.argv = ["ns-train", *arguments]
+    trained = Trainer.train
+
+    def train_from_here(trainer: Trainer) -> None:
+        write_json(begun_at(end), {"seconds": time.process_time()})
+        trained(trainer)
+
+    Trainer.train = train_from_here  # type: ignore[method-assign]
     ns_train.entrypoint()
+
+
+def begun_at(end: Path) -> Path:
+    """The file, beside that of a run's end, with the processor seconds until training began."""
+    return end.with_suffix(".begun.json")
 
 
 class Runs:
@@ -118,12 +132,13 @@ class Runs:
         return self.folder / "tiny" / "leco-occupancy" / name
 
     def start(self, name: str, seed: int, done: int) -> Any:
-        """A process that trains a run from its newest checkpoint on, after so many steps."""
+        """A process that trains a run from its newest checkpoint on, after so many steps; at its
+        last one, one step more, for it has an end to be measured."""
         checkpoints = self.base(name) / "nerfstudio_models"
         arguments = [
             *("leco-occupancy", "--data", str(self.scene), *ARGUMENTS),
             *("--output-dir", str(self.folder), "--experiment-name", "tiny", "--timestamp", name),
-            f"--max-num-iterations={STEPS - done}",
+            f"--max-num-iterations={max(1, STEPS - done)}",
             f"--machine.seed={seed}",
             *([f"--load-dir={checkpoints}"] if done else []),
         ]
@@ -150,15 +165,21 @@ class Runs:
         figures["threshold"] = round(occupancy.threshold, 4)
         return figures
 
+    def begun(self, name: str) -> float:
+        """Processor seconds until the training of a run began."""
+        found = json.loads(begun_at(self.folder / f"{name}.json").read_text())
+        return float(found["seconds"])
+
 
 def undisturbed(runs: Runs, seed: int) -> dict[str, Any]:
-    """A run that nobody kills, and the processor seconds that it takes."""
+    """A run that nobody kills, and the processor seconds that it takes, until training begins and
+    in all."""
     name = f"undisturbed-{seed}"
     process = runs.start(name, seed, 0)
     seconds = wait_for(process)
     if process.exitcode != 0:
         raise RuntimeError((runs.folder / f"{name}.log").read_text()[-3000:])
-    return runs.end(name) | {"seconds": round(seconds, 2)}
+    return runs.end(name) | {"begun": round(runs.begun(name), 2), "seconds": round(seconds, 2)}
 
 
 def wait_for(process: Any, most: float = math.inf) -> float:
@@ -176,37 +197,42 @@ def wait_for(process: Any, most: float = math.inf) -> float:
     return spent
 
 
-def killed(runs: Runs, number: int, kills: int, seconds: float, dice: random.Random) -> Any:
+def killed(
+    runs: Runs, number: int, kills: int, begun: float, seconds: float, dice: random.Random
+) -> Any:
     """A run that is killed up to so often, until it ends by itself.
 
+    Args:
+        begun, seconds: processor seconds of a run that nobody kills, until training begins and in
+            all.
     Returns:
-        Its end, with `kills`: for each, the step that was saved before and after, and after how
-        many processor seconds it came. A run that lost something, or that is left with a damaged
-        checkpoint, ends there; one that cannot go on says why in `failed`.
+        Its end, with `kills`: for each the step that was saved when its process began, just before
+        it and after it, and after how many processor seconds it came. A run that lost something, or
+        that is left with a damaged checkpoint, ends there; one that cannot go on says why in
+        `failed`.
     """
     name, found = f"killed-{number}", []
     while True:
-        done = runs.newest(name)[0] + 1
-        if done == STEPS:  # killed between its last checkpoint and its end
-            return {"step": STEPS - 1, "kills": found}
-        process, before = runs.start(name, number, done), done - 1
-        moment = dice.uniform(0.2, 1.1) * seconds * (1.0 - 0.7 * done / STEPS)
+        first = runs.newest(name)[0]
+        process = runs.start(name, number, first + 1)
+        left = 1.0 - (first + 1) / STEPS
+        moment = dice.uniform(0.5 * begun, begun + 1.1 * left * (seconds - begun))
         wait_for(process, moment if len(found) < kills else math.inf)
+        before, _ = runs.newest(name)
         if process.exitcode is None:
-            before, _ = runs.newest(name)
             os.kill(process.pid, signal.SIGKILL)
             process.join()
         if process.exitcode == -signal.SIGKILL:
             after, damaged = runs.newest(name)
-            kill = {"seconds": round(moment, 2), "before": before, "after": after}
+            kill = {"first": first, "before": before, "after": after, "seconds": round(moment, 2)}
             found.append(kill | ({"damaged": damaged} if damaged else {}))
-            if damaged or after < before:
+            if damaged or after < max(first, before):
                 return {"step": after, "kills": found}
         elif process.exitcode == 0:
             return runs.end(name) | {"kills": found}
         else:
             said = (runs.folder / f"{name}.log").read_text().strip().split("\n")[-1]
-            return {"step": done - 1, "kills": found, "failed": said[:200]}
+            return {"step": first, "kills": found, "failed": said[:200]}
 
 
 def main() -> None:
@@ -218,7 +244,7 @@ def main() -> None:
     ends = time.monotonic() + 60.0 * arguments.minutes
     allow_checkpoint_globals()
     os.environ["OMP_NUM_THREADS"] = "1"
-    result = {"format": 1, "steps": STEPS, "undisturbed": [], "killed": []}
+    result = {"format": 2, "steps": STEPS, "undisturbed": [], "killed": []}
     if arguments.out.exists():
         result = json.loads(arguments.out.read_text())
     result["machine"] = describe_machine()
@@ -227,11 +253,11 @@ def main() -> None:
         for _ in range(max(1, UNDISTURBED - len(result["undisturbed"]))):
             result["undisturbed"].append(undisturbed(runs, len(result["undisturbed"])))
             write_json(arguments.out, result)
-        seconds = result["undisturbed"][-1]["seconds"]
+        last = result["undisturbed"][-1]
         while (left := arguments.kills - total(result)) > 0 and time.monotonic() < ends:
             number = len(result["killed"])
             dice = random.Random(number)
-            run = killed(runs, number, min(KILLS_A_RUN, left), seconds, dice)
+            run = killed(runs, number, min(KILLS_A_RUN, left), last["begun"], last["seconds"], dice)
             result["killed"].append(run)
             write_json(arguments.out, result | {"kills": total(result)})
             print(f"{total(result)} of {arguments.kills} kills", flush=True)

@@ -77,21 +77,29 @@ def sentence(text: str) -> str:
 def of_kills(results: dict[str, Any]) -> str:
     """How often runs were killed, what that lost, and how they ended beside the others."""
     kills = [kill for run in results["killed"] for kill in run["kills"]]
-    early = sum(kill["before"] < 0 for kill in kills)
-    lost = sum(kill["after"] < kill["before"] or kill.get("damaged", 0) > 0 for kill in kills)
-    ends = [run for run in results["killed"] if run["kills"] and run.keys() & {"psnr", "failed"}]
+    early = sum(max(kill["first"], kill["before"]) < 0 for kill in kills)
+    saved = sum(kill["before"] > kill["first"] for kill in kills)
+    lost = sum(has_lost(kill) for kill in kills)
+    ends = [run for run in results["killed"] if run["kills"]]
     whole = results["undisturbed"]
     last = results["steps"] - 1
-    finished = sum(run["step"] == last and run.get("frozen", False) for run in ends)
+    finished = sum(run["step"] >= last and run.get("frozen", False) for run in ends)
     return (
         f"`python benchmarks/kills.py`: {len(kills)} kills with SIGKILL at random moments of runs "
-        f"of {results['steps']} steps, {early} of them before anything was saved; {lost or 'none'} "
-        f"of them lost something that was saved, or left a damaged checkpoint. "
+        f"of {results['steps']} steps, {early} of them before anything was saved, {saved} of "
+        f"processes that had saved something themselves; {lost or 'none'} of them lost something "
+        f"that was saved, or left a damaged checkpoint. "
         f"{finished} of {len(ends)} runs that were killed went on to their last step with a frozen "
         f"gate and an occupancy that loads, at {spread(ends)} on test pixels; {len(whole)} runs "
         f"that nobody killed end at {spread(whole)}{difference(ends, whole)}. "
         f"{results['machine']['cpu']}."
     )
+
+
+def has_lost(kill: dict[str, Any]) -> bool:
+    """Whether less is saved after it than when its process began or just before it, or whether
+    something damaged is left."""
+    return kill["after"] < max(kill["first"], kill["before"]) or kill.get("damaged", 0) > 0
 
 
 def psnrs(runs: list[dict[str, Any]]) -> list[float]:

@@ -20,3 +20,13 @@ def bar(what: str) -> Iterator[Callable[[float], None]]:
     ) as progress:
         task = progress.add_task(what, total=1.0)
         yield lambda share: progress.update(task, completed=share)
+
+
+@contextmanager
+def resumable(say: Callable[[str], None]) -> Iterator[None]:
+    """Around work of which every finished part is kept: says so when somebody stops it."""
+    try:
+        yield
+    except KeyboardInterrupt:
+        say("stopped; what is finished is kept, and the same command goes on with the rest")
+        raise

@@ -112,6 +112,18 @@ def spoil_a_batch(step: int) -> None:
     LecoModel.get_loss_dict = spoiled  # type: ignore[method-assign]
 
 
+def press_ctrl_c(step: int) -> None:
+    """Has somebody press Ctrl-C in the middle of a step."""
+    train_iteration = AtomicTrainer.train_iteration
+
+    def interrupted(self: AtomicTrainer, now: int) -> Any:
+        if now == step:
+            os.kill(os.getpid(), signal.SIGINT)
+        return train_iteration(self, now)
+
+    AtomicTrainer.train_iteration = interrupted  # type: ignore[method-assign]
+
+
 def run(
     arguments: list[str],
     log: Path,
@@ -119,6 +131,7 @@ def run(
     loaded: Path | None = None,
     collapses: bool = False,
     spoiled: int | None = None,
+    interrupted: int | None = None,
 ) -> None:
     """`ns-train` with these arguments; the target of a process.
 
@@ -128,6 +141,7 @@ def run(
         loaded: file for what it begins its first step with.
         collapses: whether the gate is found collapsed once.
         spoiled: step whose batch holds a value that is not finite.
+        interrupted: step in which somebody presses Ctrl-C.
     """
     with log.open("wb") as printed:
         os.dup2(printed.fileno(), sys.stdout.fileno())
@@ -141,5 +155,7 @@ def run(
         collapse_once()
     if spoiled is not None:
         spoil_a_batch(spoiled)
+    if interrupted is not None:
+        press_ctrl_c(interrupted)
     sys.argv = ["ns-train", *arguments]
     ns_train.entrypoint()

@@ -24,7 +24,6 @@ MEASURED = {
     "kept_fraction": 0.25,
     "detail_psnr": None,
     "trivial_psnr": 12.0,
-    "black_share": 0.0,
 }
 
 

@@ -71,7 +71,7 @@ class Runs:
         process.join(120)
         code = process.exitcode
         process.kill()
-        if code not in (0, -signal.SIGKILL) and "spoiled" not in mortality:
+        if code not in (0, -signal.SIGKILL) and not mortality.keys() & {"spoiled", "interrupted"}:
             pytest.fail(log.read_text()[-4000:])
         return code
 
@@ -210,6 +210,22 @@ def test_killed_after_it_was_healed_it_keeps_the_longer_schedule(runs: Runs) -> 
     progress = extra_of(last)["progress"]
     assert progress["recoveries"] == 1 and progress["learn_steps"] == HEALED_FREEZES_AT + 1
     assert progress["learn_seconds"] > extra_of(checkpoint)["progress"]["learn_seconds"] > 0.0
+
+
+def test_ctrl_c_ends_a_run_after_its_step_and_says_how_to_go_on(runs: Runs) -> None:
+    assert runs.train("run", STEPS, interrupted=7) == 1
+    said = (runs.outputs / "run.log").read_text()
+    last_line = said.strip().splitlines()[-1]
+    folder = runs.folder("run") / "nerfstudio_models"
+    assert last_line.startswith("step 7: stopped by Ctrl-C; the last good checkpoint is")
+    assert last_line.endswith(
+        f"--load-dir {folder} --max-num-iterations {STEPS - 8} goes on from there"
+    )
+    assert "Traceback" not in said and "stopping after this step" in said
+    checkpoint = newest(runs.folder("run"))
+    assert checkpoint["step"] == 7 and not is_frozen(checkpoint)
+    _, last = runs.resume("run", 7, into="run")
+    assert_finished(runs.folder("run"), last, FREEZES_AT)
 
 
 def test_a_batch_with_nan_ends_the_run_at_its_step_with_the_last_good_checkpoint(

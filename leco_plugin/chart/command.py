@@ -18,7 +18,7 @@ from leco_plugin.chart.reuse import fitting
 from leco_plugin.chart.run import Chart, Runner
 from leco_plugin.chart.suites import SUITES, in_order
 from leco_plugin.chart.suites import suite as suite_of
-from leco_plugin.progress_bar import bar
+from leco_plugin.progress_bar import bar, resumable
 from leco_plugin.scenes.input_error import InputError
 
 
@@ -132,7 +132,8 @@ def _made(chart: Chart, runner_for: Callable[[Chart], Runner]) -> dict[str, Any]
     """What is missing of a chart is made, and all of it drawn."""
     say = functools.partial(CONSOLE.print, markup=False, highlight=False)
     suite = f"{chart.suite[0]}, " if chart.suite is not None else ""
-    with bar(f"{chart.scene['name']}, {suite}{chart.protocol.describe()} a run") as show:
+    title = f"{chart.scene['name']}, {suite}{chart.protocol.describe()} a run"
+    with resumable(say), bar(title) as show:
         chart.make(runner_for(chart), say, show)
     return chart.draw()
 

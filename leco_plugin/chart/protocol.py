@@ -3,14 +3,18 @@
 from __future__ import annotations
 
 import hashlib
+from collections.abc import Iterable
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
 from leco_plugin.evaluation.clock import Budget
+from leco_plugin.scenes.input_error import InputError
 
 LEARN_SHARE = 0.4
 """Of the training time, at most, for learning an occupancy; short runs need most of that."""
+SEEDS = 1 << 32
+"""As many as numpy takes."""
 
 
 @dataclass(frozen=True)
@@ -68,6 +72,17 @@ class Protocol:
         if self.steps is not None:
             parts.append(f"{self.steps} steps")
         return " or ".join(parts)
+
+
+def require_seeds(seeds: Iterable[int]) -> None:
+    """Refuses what numpy does not take as a seed.
+
+    Raises:
+        InputError: one is no such number.
+    """
+    for seed in seeds:
+        if not 0 <= seed < SEEDS:
+            raise InputError(f"a seed is a whole number from 0 to {SEEDS - 1}, not {seed}")
 
 
 def describe_scene(data: Path) -> dict[str, Any]:

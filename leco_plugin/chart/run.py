@@ -14,19 +14,16 @@ from leco_plugin.chart import forecast
 from leco_plugin.chart.contender import Contender
 from leco_plugin.chart.folder import RESULTS, ChartFolder, Job
 from leco_plugin.chart.processes import RunFailed
-from leco_plugin.chart.protocol import Protocol, describe_scene, settings_of
+from leco_plugin.chart.protocol import Protocol, describe_scene, require_seeds, settings_of
 from leco_plugin.chart.reuse import check_sources, take_over
 from leco_plugin.chart.table import write_table
 from leco_plugin.evaluation.json_file import write_json
 from leco_plugin.evaluation.machine import describe_code, describe_machine
-from leco_plugin.scenes.input_error import InputError
 
 Runner = Callable[[Job, Callable[[float], None]], dict[str, Any]]
 Say = Callable[[str], None]
 
 TABLE = "table.md"
-SEEDS = 1 << 32
-"""As many as numpy takes."""
 
 
 def jobs_of(contenders: Sequence[Contender], seeds: Sequence[int]) -> list[Job]:
@@ -65,9 +62,7 @@ class Chart:
     ) -> None:
         if not contenders or not seeds:
             raise ValueError("a chart needs at least one method and one seed")
-        for seed in seeds:
-            if not 0 <= seed < SEEDS:
-                raise InputError(f"a seed is a whole number from 0 to {SEEDS - 1}, not {seed}")
+        require_seeds(seeds)
         self.data, self.scene, self.machine = data, describe_scene(data), describe_machine()
         self.machine["threads"] = protocol.threads(self.machine["threads"])
         self.protocol, self.suite, self.command = protocol, suite, command

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import shutil
+import threading
 import time
 from dataclasses import replace
 from pathlib import Path
@@ -14,6 +15,7 @@ from nerfstudio.engine.optimizers import Optimizers
 from nerfstudio.engine.trainer import Trainer
 from nerfstudio.utils.decorators import check_main_thread
 
+from leco_plugin.compat.interrupts import heard_between_steps
 from leco_plugin.compat.optimizers import OptimizersOfThePresent
 from leco_plugin.compat.run_sizes import (
     checkpoint_of,
@@ -43,6 +45,8 @@ class AtomicTrainer(Trainer):
     """When the last checkpoint was saved, or training began."""
     save_seconds = 0.0
     """What it took."""
+    asked_to_stop: threading.Event | None = None
+    """Set by Ctrl-C while it trains alone."""
 
     def setup(self, *arguments: Any, **options: Any) -> None:
         """As nerfstudio's, in the sizes of the run that is gone on with; then checkpoints are also
@@ -62,6 +66,7 @@ class AtomicTrainer(Trainer):
         self.saved_at = time.monotonic()
         where = [TrainingCallbackLocation.AFTER_TRAIN_ITERATION]
         self.callbacks.append(TrainingCallback(where, self.save_by_the_clock))
+        self.callbacks.append(TrainingCallback(where, self.stop_if_asked))
 
     def setup_optimizers(self) -> Optimizers:
         """nerfstudio's, which resume with the parameters that a checkpoint has left the model."""
@@ -77,13 +82,37 @@ class AtomicTrainer(Trainer):
         if time.monotonic() - self.saved_at > wait:
             self.save_checkpoint(step)
 
+    def stop_if_asked(self, step: int) -> None:
+        """Saves, and ends the run, after Ctrl-C.
+
+        Raises:
+            TrainingStopped: says how to go on.
+        """
+        if self.asked_to_stop is None or not self.asked_to_stop.is_set():
+            return
+        if self.config.steps_per_save > 0:
+            self.save_checkpoint(step)
+        left = self._start_step + self.config.max_num_iterations - step - 1
+        going_on = (
+            f"--load-dir {self.checkpoint_dir} --max-num-iterations {left} goes on from there"
+        )
+        parts = [f"step {step}: stopped by Ctrl-C", self._what_is_left()]
+        raise TrainingStopped("; ".join([*parts, *([going_on] if left > 0 else [])]))
+
     def train(self) -> None:
         """Trains to the last step.
 
         Raises:
-            TrainingStopped: a loss is not finite, and the step was not taken; or the gate has
-                collapsed more often than it may.
+            TrainingStopped: a loss is not finite, and the step was not taken; the gate has
+                collapsed more often than it may; or somebody has pressed Ctrl-C.
         """
+        if self.world_size > 1:  # its processes would not stop after the same step
+            self._train()
+            return
+        with heard_between_steps() as self.asked_to_stop:
+            self._train()
+
+    def _train(self) -> None:
         try:
             super().train()
         except FloatingPointError as error:

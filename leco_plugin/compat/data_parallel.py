@@ -40,15 +40,36 @@ class DataParallelTrainerConfig(TrainerConfig):
         """Prepares the launcher too: of a config, nothing else is called before processes start.
 
         Raises:
-            InputError: the processes that are asked for cannot be started, or find each other.
+            InputError: the processes that are asked for cannot be started, or find each other;
+                there is no step to take, or a folder is not there.
         """
         super().set_timestamp()
         machine = self.machine
+        self._require_what_is_named()
         require_startable(machine)
         if machine.num_devices * machine.num_machines > 1:
             name_the_lost()
         if machine.device_type == "cpu" and machine.num_devices * machine.num_machines > 1:
             launch_on_cpu()
+
+    def _require_what_is_named(self) -> None:
+        """Before anything of a run is written.
+
+        Raises:
+            InputError: there is no step to take, or a folder or file is not there.
+        """
+        if self.max_num_iterations < 1:
+            raise InputError(
+                f"--max-num-iterations is {self.max_num_iterations}; a run needs at least one step"
+            )
+        named = {
+            "data": self.data,
+            "load-dir": self.load_dir,
+            "load-checkpoint": self.load_checkpoint,
+        }
+        for option, path in named.items():
+            if path is not None and not path.exists():
+                raise InputError(f"--{option} {path}: there is no such folder or file")
 
     def save_config(self) -> None:
         """Takes the run's folder; one that another run has, or has left, gives way to a new one."""
@@ -131,10 +152,16 @@ def _stop(which: str, how: str, config: Any) -> None:
     Raises:
         TrainingStopped: always; the message says what is left.
     """
+    folder = config.get_checkpoint_dir()
+    saved = any(folder.glob("*.ckpt"))
     raise TrainingStopped(
         f"{which} of {config.machine.num_devices} processes here was lost ({how}), and the others "
-        "have stopped; nothing that was saved is lost: go on with --load-dir "
-        f"{config.get_checkpoint_dir()}"
+        "have stopped; "
+        + (
+            f"nothing that was saved is lost: go on with --load-dir {folder}"
+            if saved
+            else "no checkpoint was saved yet: begin anew"
+        )
     ) from None
 
 

@@ -65,9 +65,12 @@ def alone_in(folder: Path, work: str) -> Iterator[None]:
         folder: made where it is missing.
         work: what is made there, for the message.
     Raises:
-        InputError: another process is at work there.
+        InputError: another process is at work there, or it is no folder.
     """
-    folder.mkdir(parents=True, exist_ok=True)
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except (FileExistsError, NotADirectoryError):
+        raise InputError(f"{folder} is no folder; name another one with --out") from None
     held = lock(folder)
     if held is None:
         raise InputError(

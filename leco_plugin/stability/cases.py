@@ -8,11 +8,13 @@ from typing import Any
 
 from leco_plugin.scenes.input_error import InputError
 from leco_plugin.stability.capture import Capture
-from leco_plugin.stability.contenders import DENSE, GRID, LEARNED
+from leco_plugin.stability.contenders import DENSE, GRID, GRIDS, LEARNED
 
 LEARN = "occupancy.learning."
 FINE = 256
 """Cells along an axis of the finer occupancy grid."""
+BOUNDED = (LEARNED, *(f"{GRID}-{cells}" for cells in GRIDS), DENSE)
+"""Samplers whose host has bounds: Nerfacto contracts all of space, and has none."""
 
 
 @dataclass(frozen=True)
@@ -126,12 +128,14 @@ CASES = {
             "bounds 4 x too small",
             "bounds are guessed, and most of the scene lies outside them",
             settings={"pipeline.datamanager.dataparser.scene_scale": 0.25},
+            only=BOUNDED,
         ),
         Case(
             "bounds-too-large",
             "bounds 4 x too large",
             "bounds are guessed, and cells are four times as coarse",
             settings={"pipeline.datamanager.dataparser.scene_scale": 4.0},
+            only=BOUNDED,
             fine_grid=True,
         ),
         Case(

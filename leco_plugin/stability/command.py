@@ -12,7 +12,7 @@ from typing import Any
 from nerfstudio.utils.rich_utils import CONSOLE
 
 from leco_plugin.compat.run_folder import alone_in
-from leco_plugin.progress_bar import bar
+from leco_plugin.progress_bar import bar, resumable
 from leco_plugin.scenes.input_error import InputError
 from leco_plugin.stability.cases import cases_named
 from leco_plugin.stability.contenders import samplers_named
@@ -58,7 +58,7 @@ def make_table(
         if earlier is not None:
             say(f"{suite.take_over(earlier)} runs of earlier results are taken over")
         say(suite.estimate())
-        with bar(f"{len(chosen)} cases") as show:
+        with resumable(say), bar(f"{len(chosen)} cases") as show:
             suite.make(say, show, runner_for, math.inf if minutes is None else 60.0 * minutes)
         if left := len(suite.missing()):
             say(f"{left} runs are left or have failed; the same command goes on with them")

@@ -32,21 +32,16 @@ class Sampler:
     """In the table."""
     reference: str | None
     """The dense reference of its host; None is one."""
-    why: str
-    """How it skips, in a few words."""
 
 
 SAMPLERS = {
     one.name: one
     for one in (
-        Sampler(LEARNED, "learned occupancy", DENSE, "a frozen gate, learned first"),
-        *(
-            Sampler(f"{GRID}-{n}", f"grid {n}³", DENSE, "Instant-NGP's occupancy grid")
-            for n in GRIDS
-        ),
-        Sampler(PROPOSALS, "proposal networks", DENSE_PROPOSAL, "as Nerfacto has them"),
-        Sampler(DENSE, "dense (Instant-NGP)", None, "every candidate"),
-        Sampler(DENSE_PROPOSAL, "dense (Nerfacto)", None, "every candidate"),
+        Sampler(LEARNED, "learned occupancy", DENSE),
+        *(Sampler(f"{GRID}-{n}", f"grid {n}³", DENSE) for n in GRIDS),
+        Sampler(PROPOSALS, "proposal networks", DENSE_PROPOSAL),
+        Sampler(DENSE, "dense (Instant-NGP)", None),
+        Sampler(DENSE_PROPOSAL, "dense (Nerfacto)", None),
     )
 }
 OURS = LEARNED

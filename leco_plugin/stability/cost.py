@@ -1,6 +1,6 @@
 """How long a table takes: before its first run from stored figures, then from its own runs.
 
-The figures are seconds of one core of a server's CPU, with one thread.
+The figures are seconds of one core of the server that made the stored table, with one thread.
 """
 
 from __future__ import annotations
@@ -18,30 +18,30 @@ from leco_plugin.stability.contenders import (
 from leco_plugin.stability.plan import Run
 from leco_plugin.stability.sizes import Sizes
 
-START_SECONDS = 7.0
+START_SECONDS = 14.0
 """For a process to start, to read the scene and to build the host."""
 RAY_SECONDS: Mapping[str, float] = {
-    LEARNED: 1.0e-4,
-    GRID: 2.7e-4,
-    PROPOSALS: 4.1e-4,
-    DENSE: 7.6e-4,
-    DENSE_PROPOSAL: 7.6e-4,
+    LEARNED: 1.8e-4,
+    GRID: 5.1e-4,
+    PROPOSALS: 8.2e-4,
+    DENSE: 13.0e-4,
+    DENSE_PROPOSAL: 11.2e-4,
 }
 """Of training, a ray of a step, where steps have two hundred."""
-STEP_SECONDS = 0.025
+STEP_SECONDS = 0.042
 """Of a step of a guided host, however few its rays are: of those that skip least it is lost in the
 above."""
 RENDERED = 18_500
 """Rays that are looked at when a run in full sizes has ended..."""
 RENDERING = 0.45
 """...each for this share of what it takes to train on it."""
-LEARNED_RAY_SECONDS = 1.7e-4
+LEARNED_RAY_SECONDS = 3.0e-4
 """A ray of a step of learning."""
-FREEZE_SECONDS = 3.0
+FREEZE_SECONDS = 5.0
 """To calibrate a gate and to build its cell cache."""
-FIRST_CELL_SECONDS = 6e-6
+FIRST_CELL_SECONDS = 1.2e-5
 """To ask the field about a cell of an occupancy grid for the first time, with memory to fetch..."""
-CELL_SECONDS = 1.63e-6
+CELL_SECONDS = 3.3e-6
 """...and later."""
 STEPS_PER_UPDATE = 16
 """Of an occupancy grid..."""

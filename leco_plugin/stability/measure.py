@@ -50,8 +50,6 @@ class Measured:
     """PSNR on all pixels that show what the case is about; None where it is about no such thing."""
     trivial_psnr: float
     """PSNR of the same pixels against their mean colour: of a method that saw nothing."""
-    black_share: float
-    """Share of the rays without any sample."""
 
 
 @torch.no_grad()
@@ -69,7 +67,7 @@ def measure(trainer: Trainer, data: Path, dense_samples: int) -> tuple[Measured,
     pipeline.eval()
     dataset: Any = pipeline.datamanager.eval_dataset
     scale = float(pipeline.datamanager.train_dataparser_outputs.dataparser_scale)
-    lost = met = samples = candidates = rays = without = 0
+    lost = met = samples = candidates = 0
     errors: list[Tensor] = []
     detailed: list[Tensor] = []
     colours: list[Tensor] = []
@@ -95,7 +93,6 @@ def measure(trainer: Trainer, data: Path, dense_samples: int) -> tuple[Measured,
         lost, met = lost + lost_here, met + met_here
         count = torch.cat(counts)
         samples, candidates = samples + int(count.sum()), candidates + most
-        rays, without = rays + len(count), without + int((count == 0).sum())
         detail = torch.from_numpy(truth["detail"]).flatten()
         asked = torch.ones_like(detail) if shown is None else detail | looked_at
         rgb = render(pipeline.model, flat[asked.to(pipeline.device)]).cpu()
@@ -116,7 +113,6 @@ def measure(trainer: Trainer, data: Path, dense_samples: int) -> tuple[Measured,
             samples / max(candidates, 1),
             psnr(detail_error) if len(detail_error) else None,
             psnr((colour - colour.mean(dim=0)).square()),
-            without / max(rays, 1),
         ),
         shown,
     )

@@ -17,7 +17,7 @@ from leco_plugin.stability.table import figures, headline
 
 ROW, HEAD, FOOT = 0.36, 1.0, 0.7
 """Heights in inches."""
-NAMES, COLUMN = 2.75, 1.95
+NAMES, COLUMN = 2.75, 2.0
 """Widths in inches."""
 GAP = 0.03
 SIGNS = {"pass": "✓", "degraded": "~", "fail": "✗", "no reference": "-"}
@@ -111,8 +111,6 @@ def _draw_cell(axes: Any, cell: Mapping[str, Any], left: float, top: float, them
     )
     ink = tints.inks[verdict]
     first, second, seeds = figures(cell)
-    if cell["psnr"] is None and cell["reason"]:
-        first = "no result" if verdict == "fail" else cell["reason"]
     middle = top + ROW / 2
     offset = 0.065 if second else 0.0
     axes.text(left + 0.17, middle, SIGNS[verdict], ha="center", va="center", fontsize=12, color=ink)

@@ -19,7 +19,9 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
+from leco_plugin.evaluation.json_file import read_object
 from leco_plugin.scenes.city.layouts import POINTS, TRANSFORMS, write_points
+from leco_plugin.scenes.input_error import InputError
 from leco_plugin.stability.capture import Capture, Shot, shots_of
 from leco_plugin.stability.coverage import View, shown_by
 from leco_plugin.stability.matter import Array
@@ -35,17 +37,21 @@ def write_scene(stage: Stage, capture: Capture, folder: Path) -> Path:
 
     Returns:
         `folder`.
+    Raises:
+        InputError: `folder` holds no scene of ours.
     """
-    described = {"digest": digest_of(stage, capture), "capture": dataclasses.asdict(capture)}
-    if (folder / DESCRIPTION).is_file():
-        if json.loads((folder / DESCRIPTION).read_text())["digest"] == described["digest"]:
+    digest = digest_of(stage, capture)
+    shots = shots_of(capture)
+    if folder.exists() and not (folder / DESCRIPTION).is_file():
+        raise InputError(f"{folder} holds something else; delete it, or name a new --out")
+    if folder.exists():
+        if _is_whole(folder, digest, shots):
             return folder
         shutil.rmtree(folder)
     unfinished = folder.with_name(f".{folder.name}-{os.getpid()}")
     shutil.rmtree(unfinished, ignore_errors=True)
     for name in ("images", TRUTH):
         (unfinished / name).mkdir(parents=True)
-    shots = shots_of(capture)
     all_seen: list[Seen] = []
     for number, shot in enumerate(shots):
         with_car = stage.with_shapes(moving_car(number)) if shot.moving else stage
@@ -60,6 +66,7 @@ def write_scene(stage: Stage, capture: Capture, folder: Path) -> Path:
         write_points(unfinished / POINTS, cloud)
     transforms = _transforms(shots, capture, bool(len(cloud)))
     (unfinished / TRANSFORMS).write_text(json.dumps(transforms, indent=1) + "\n")
+    described = {"digest": digest, "capture": dataclasses.asdict(capture)}
     (unfinished / DESCRIPTION).write_text(json.dumps(described, indent=1) + "\n")
     unfinished.replace(folder)
     return folder
@@ -68,6 +75,18 @@ def write_scene(stage: Stage, capture: Capture, folder: Path) -> Path:
 def digest_of(stage: Stage, capture: Capture) -> str:
     """The same for the same pictures."""
     return hashlib.sha256(repr((stage, capture)).encode()).hexdigest()[:16]
+
+
+def _is_whole(folder: Path, digest: str, shots: list[Shot]) -> bool:
+    """Whether a folder holds all files of the scene with this digest."""
+    try:
+        if read_object(folder / DESCRIPTION, "is damaged").get("digest") != digest:
+            return False
+    except InputError:
+        return False
+    files = [TRANSFORMS, *(_file(shot) for shot in shots)]
+    files += [_truth(shot) for shot in shots if shot.held_out]
+    return all((folder / name).is_file() for name in files)
 
 
 def _write_image(folder: Path, shot: Shot, seen: Seen) -> None:
@@ -90,11 +109,15 @@ def _write_truth(folder: Path, capture: Capture, shots: list[Shot], all_seen: li
                 "detail": seen.detail,
                 "shown_by": shown_by(view, trained),
             }
-            np.savez(folder / TRUTH / f"{shot.name}.npz", **facts)
+            np.savez(folder / _truth(shot), **facts)
 
 
 def _file(shot: Shot) -> str:
     return f"images/{shot.name}.png"
+
+
+def _truth(shot: Shot) -> str:
+    return f"{TRUTH}/{shot.name}.npz"
 
 
 def _points(seen: Seen, shot: Shot, capture: Capture, number: int) -> NDArray[Any]:

@@ -1,9 +1,8 @@
-"""How large everything is: so that the stored table is to take two cores less than two hours."""
+"""How large everything is: so that the stored table takes two cores a few hours."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any
 
 
@@ -27,8 +26,6 @@ class Sizes:
     """Of a ray of the dense reference of proposal hosts."""
     table: int = 15
     """Binary logarithm of the entries of the hosts' hash tables."""
-    host: Mapping[str, Any] = field(default_factory=dict)
-    """Settings of Instant-NGP that differ besides."""
 
     @property
     def ngp(self) -> dict[str, Any]:
@@ -39,7 +36,6 @@ class Sizes:
             "host.grid_levels": 1,
             "host.cone_angle": 1 / 32,
             "host.far_plane": 20.0,
-            **self.host,
         }
 
     @property

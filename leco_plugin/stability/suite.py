@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 import sys
 import threading
@@ -13,12 +12,11 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-from leco_plugin.chart.folder import LOGS, RUNS, ChartFolder, Job
+from leco_plugin.chart.folder import LOGS, ChartFolder, Job
 from leco_plugin.chart.processes import ProcessRunner, RunFailed
-from leco_plugin.chart.protocol import Protocol, describe_scene, settings_of
+from leco_plugin.chart.protocol import Protocol, describe_scene, require_seeds, settings_of
 from leco_plugin.evaluation.json_file import write_json
 from leco_plugin.evaluation.machine import describe_code, describe_machine, usable_cores
-from leco_plugin.scenes.city.layouts import TRANSFORMS
 from leco_plugin.stability.cases import Case
 from leco_plugin.stability.contenders import Sampler
 from leco_plugin.stability.cost import core_seconds, in_words
@@ -26,6 +24,7 @@ from leco_plugin.stability.plan import Entry, Run, entries_of, runs_of, scenes_o
 from leco_plugin.stability.results import results_of, runs_in
 from leco_plugin.stability.scene_folder import digest_of, write_scene
 from leco_plugin.stability.sizes import Sizes
+from leco_plugin.stability.table_folder import RUNS, SCENES, finished_in, forget_unfinished, take
 
 WORKER = (sys.executable, "-W", "ignore", "-m", "leco_plugin.stability.worker")
 RESULTS = "stability.json"
@@ -48,7 +47,8 @@ class Suite:
         beside: seeds of the samplers that learned occupancy is compared with, see `entries_of`.
 
     Raises:
-        ValueError, OSError: nothing to run, or a folder with runs of other sizes or versions.
+        ValueError, OSError: nothing to run, no seed, or a folder of something else, of other sizes
+            or versions.
     """
 
     def __init__(
@@ -63,6 +63,8 @@ class Suite:
     ) -> None:
         if not cases or not samplers or not seeds:
             raise ValueError("a table needs at least one case, one sampler and one seed")
+        require_seeds([*seeds, *beside])
+        take(out, sizes)
         self.out, self.cases, self.sizes, self.command = out, list(cases), sizes, command
         self.machine = describe_machine()
         self.made = {"cpu": self.machine["cpu"], **describe_code()}
@@ -74,8 +76,7 @@ class Suite:
         scenes = scenes_of(cases, sizes)
         self.digests = {name: digest_of(*scene) for name, scene in scenes.items()}
         self.data = {
-            name: write_scene(*scene, _made(out / "scenes") / name)
-            for name, scene in scenes.items()
+            name: write_scene(*scene, out / SCENES / name) for name, scene in scenes.items()
         }
         self.folders = {name: self._folder(name) for name in self.data}
 
@@ -83,9 +84,7 @@ class Suite:
         described = describe_scene(self.data[scene])
         machine = {key: fact for key, fact in self.machine.items() if key not in PER_PORTION}
         settings = settings_of(described, self.protocol, None, machine)
-        return ChartFolder(
-            _made(self.out / "runs") / scene, settings | {"sizes": asdict(self.sizes)}
-        )
+        return ChartFolder(self.out / RUNS / scene, settings | {"sizes": asdict(self.sizes)})
 
     def runner(self, scene: str) -> Runner:
         """What makes the runs of a scene, in processes with one thread each."""
@@ -106,9 +105,9 @@ class Suite:
     def stored(self) -> dict[tuple[str, str], dict[str, Any]]:
         """Records of finished runs by scene and name."""
         return {
-            (scene, name): record["run"]
+            (scene, name): run
             for scene, folder in self.folders.items()
-            for name, record in folder.stored().items()
+            for name, run in finished_in(folder).items()
         }
 
     def failures(self) -> dict[tuple[str, str], str]:
@@ -154,6 +153,8 @@ class Suite:
         expected = [core_seconds([run], list(stored.values()), self.sizes) for run in todo]
         make_one, ends = runner_for or self.runner, time.monotonic() + seconds
         done = total - len(todo)
+        for folder in self.folders.values():
+            forget_unfinished(folder)
         self.write()
         with ThreadPoolExecutor(self.workers) as pool:
             under_way: set[Future[str]] = set()
@@ -217,23 +218,6 @@ class Suite:
             if other.case is entry.case and other.sampler.name == entry.sampler.reference
         )
 
-    def view_of(self, entry: Entry, seed: int | None) -> tuple[Path, int] | None:
-        """The held-out picture as a run of a cell renders it, of this seed or of another, and which
-        it is."""
-        places = {
-            run.job.seed: self.folders[run.scene].path / RUNS / f"{run.job.name}.png"
-            for run in entry.runs
-        }
-        there = {number: place for number, place in places.items() if place.exists()}
-        found = seed if seed in there else next(iter(there), None)
-        return None if found is None else (there[found], found)
-
-    def true_view(self, case: Case) -> Path:
-        """The same picture as it is."""
-        data = self.data[case.scene]
-        names = json.loads((data / TRANSFORMS).read_text())["test_filenames"]
-        return data / str(names[0])
-
     def write(self) -> dict[str, Any]:
         """`stability.json` and `table.md`, as far as there are runs."""
         from leco_plugin.stability.table import table
@@ -254,8 +238,3 @@ class Suite:
         draw(results, self.out / "stability-dark.png", DARK)
         draw_failures(self, results)
         return results
-
-
-def _made(folder: Path) -> Path:
-    folder.mkdir(parents=True, exist_ok=True)
-    return folder

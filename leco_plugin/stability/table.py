@@ -3,10 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import asdict
 from typing import Any
 
 from leco_plugin.stability.contenders import OURS
+from leco_plugin.stability.sizes import QUICK
 
+NOTHING = "nothing has been run yet"
+QUICKLY = "made with --quick, which shows that everything runs and no more"
+NO_VERDICT = "no verdict yet: nothing has been run beside a dense run that trains"
 SIGNS = {"pass": "pass", "degraded": "degraded", "fail": "**fail**", "no reference": "-"}
 
 
@@ -44,6 +49,11 @@ def failures(results: Mapping[str, Any]) -> str:
 
 def headline(results: Mapping[str, Any]) -> str:
     """What the table shows, in a sentence or two."""
+    quick = results.get("sizes") == asdict(QUICK)
+    return f"{QUICKLY}: {_counted(results)}" if quick else _counted(results)
+
+
+def _counted(results: Mapping[str, Any]) -> str:
     said = []
     for one in results["samplers"]:
         if one["reference"] is None:
@@ -53,7 +63,8 @@ def headline(results: Mapping[str, Any]) -> str:
         if held:
             said.append((one, held.count("pass"), len(held)))
     if not said:
-        return "nothing has been run yet"
+        ran = any(cell["seeds"] for row in results["cases"] for cell in row["cells"].values())
+        return NO_VERDICT if ran else NOTHING
     said.sort(key=lambda part: part[0]["name"] != OURS)
     first, *others = [f"{one['title']} passes {n} of {many}" for one, n, many in said]
     if more := without_reference(results):
@@ -106,7 +117,7 @@ def figures(cell: Mapping[str, Any]) -> tuple[str, str, str]:
     """The figures of a cell in short words: its PSNR, what it skips and how often it was healed,
     and what its seeds say."""
     if cell["psnr"] is None:
-        return "-", "", ""
+        return "no result" if cell["verdict"] == "fail" else cell["reason"], "", ""
     first = f"{cell['psnr']:.1f} dB" if cell["gap"] is None else f"{cell['gap']:+.2f} dB"
     parts = [] if cell["gap"] is None else [f"kept {cell['kept_fraction']:.0%}"]
     if cell["gap"] is not None and cell["lost_mass"] is not None:

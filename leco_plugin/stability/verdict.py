@@ -60,8 +60,6 @@ class Cell:
     """Median over seeds."""
     detail_gap: float | None = None
     """As `gap`, on the pixels that the case is about."""
-    black_share: float | None = None
-    """Share of the rays without a sample, worst over seeds."""
 
     def to_dict(self) -> dict[str, Any]:
         """JSON values, rounded to what they mean."""
@@ -183,7 +181,6 @@ def _figures(
         _worst(runs, "lost_mass"),
         _median(runs, "kept_fraction"),
         detail_gap,
-        _worst(runs, "black_share"),
     )
 
 

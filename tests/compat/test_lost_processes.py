@@ -12,9 +12,10 @@ from torch.multiprocessing import ProcessExitedException, ProcessRaisedException
 from leco_plugin.compat.data_parallel import _with_one_line
 from leco_plugin.models.failures import TrainingStopped
 
-CONFIG = SimpleNamespace(
-    machine=SimpleNamespace(num_devices=2), get_checkpoint_dir=lambda: Path("run/checkpoints")
-)
+
+def config_of(checkpoints: Path) -> Any:
+    machine = SimpleNamespace(num_devices=2)
+    return SimpleNamespace(machine=machine, get_checkpoint_dir=lambda: checkpoints)
 
 
 def launching(error: Exception) -> Any:
@@ -39,18 +40,23 @@ def raised(line: str) -> ProcessRaisedException:
         (raised("RuntimeError: [..] Connection closed by peer [::1]:7"), "one of 2 processes"),
     ],
 )
-def test_a_lost_process_is_named_with_what_is_left(error: Exception, message: str) -> None:
-    with pytest.raises(TrainingStopped, match=f"{message}.*--load-dir run/checkpoints") as caught:
-        launching(error)(config=CONFIG)
+def test_a_lost_process_is_named_with_what_is_left(
+    error: Exception, message: str, tmp_path: Path
+) -> None:
+    with pytest.raises(TrainingStopped, match=f"{message}.*; no checkpoint was saved yet"):
+        launching(error)(config=config_of(tmp_path))
+    (tmp_path / "step-000000007.ckpt").touch()
+    with pytest.raises(TrainingStopped, match=f"{message}.*--load-dir {tmp_path}$") as caught:
+        launching(error)(config=config_of(tmp_path))
     assert "\n" not in str(caught.value)
 
 
 def test_the_line_of_a_process_that_stopped_itself_is_the_line_of_the_run() -> None:
     error = raised("leco_plugin.models.failures.TrainingStopped: step 3: a reason: another")
     with pytest.raises(TrainingStopped, match=r"^step 3: a reason: another$"):
-        launching(error)(config=CONFIG)
+        launching(error)(config=config_of(Path()))
 
 
 def test_an_error_of_another_kind_stays_what_it_is() -> None:
     with pytest.raises(ProcessRaisedException):
-        launching(raised("KeyError: 3"))(config=CONFIG)
+        launching(raised("KeyError: 3"))(config=config_of(Path()))

@@ -3,18 +3,31 @@
 from __future__ import annotations
 
 import math
+from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
+import numpy as np
 import pytest
 import torch
+from nerfstudio.cameras.cameras import Cameras
 from nerfstudio.cameras.rays import RayBundle
 from nerfstudio.model_components.ray_samplers import UniformSampler
 from torch import Tensor
 
 from leco_plugin.samplers.base import Estimator
 from leco_plugin.samplers.proposal import DenseSampler
-from leco_plugin.stability.measure import FEWEST_VIEWS, NEAR, RASTER, lost_of, psnr, raster, sampled
+from leco_plugin.stability.measure import (
+    FEWEST_VIEWS,
+    NEAR,
+    RASTER,
+    lost_of,
+    measure,
+    psnr,
+    raster,
+    sampled,
+)
+from leco_plugin.stability.scene_folder import TRUTH
 
 RADIUS = 0.5
 """Of the ball around the origin that the rays meet."""
@@ -105,3 +118,70 @@ def test_a_raster_takes_its_share_of_every_row_and_every_column() -> None:
 
 def test_psnr_of_known_errors() -> None:
     assert psnr(torch.full((5, 3), 0.01)) == pytest.approx(20.0)
+
+
+HEIGHT, WIDTH = 9, 12
+DETAIL = 4
+"""Columns of a picture, at its left, that show what a case is about."""
+
+
+class Painter:
+    """A host whose pictures are wrong by a known amount: by 0.1 everywhere, by 0.3 in the columns
+    of the detail."""
+
+    def __init__(self) -> None:
+        vars(self).update(vars(packed(Shell(RADIUS, 0.1))))
+
+    def __call__(self, rays: RayBundle) -> dict[str, Tensor]:
+        assert rays.metadata is not None
+        column = rays.metadata["column"]
+        return {"rgb": (0.5 + torch.where(column < DETAIL, 0.3, 0.1)).expand(-1, 3)}
+
+
+class Pictures:
+    """Grey held-out pictures, whose rays know their column."""
+
+    def __init__(self, folder: Path, many: int) -> None:
+        (folder / TRUTH).mkdir()
+        self.image_filenames = [folder / "images" / f"{n}.png" for n in range(many)]
+        facts = {
+            "depth": np.full((HEIGHT, WIDTH), np.inf, np.float32),
+            "detail": np.arange(WIDTH)[None].repeat(HEIGHT, 0) < DETAIL,
+            "shown_by": np.zeros((HEIGHT, WIDTH), int),
+        }
+        for file in self.image_filenames:
+            np.savez(folder / TRUTH / f"{file.stem}.npz", **facts)
+        poses = torch.eye(4)[None, :3].repeat(many, 1, 1)
+        self.lens = Cameras(poses, 12.0, 12.0, WIDTH / 2, HEIGHT / 2, WIDTH, HEIGHT)
+
+    @property
+    def cameras(self) -> Pictures:
+        return self
+
+    def to(self, device: str) -> Pictures:
+        return self
+
+    def generate_rays(self, camera_indices: int) -> RayBundle:
+        rays: RayBundle = self.lens.generate_rays(camera_indices=camera_indices)
+        columns = torch.arange(WIDTH).expand(HEIGHT, WIDTH)[..., None]
+        rays.metadata = {"column": columns}
+        return rays
+
+    def get_data(self, number: int) -> dict[str, Tensor]:
+        return {"image": torch.full((HEIGHT, WIDTH, 3), 0.5)}
+
+
+def test_errors_of_pictures_are_those_of_the_pixels_that_are_looked_at(tmp_path: Path) -> None:
+    manager = SimpleNamespace(
+        eval_dataset=Pictures(tmp_path, 2),
+        train_dataparser_outputs=SimpleNamespace(dataparser_scale=1.0),
+    )
+    pipeline = SimpleNamespace(
+        datamanager=manager, model=Painter(), device="cpu", eval=lambda: None, train=lambda: None
+    )
+    found, shown = measure(SimpleNamespace(pipeline=pipeline), tmp_path, 64)
+    third = DETAIL / WIDTH
+    assert found.psnr == pytest.approx(-10 * math.log10(third * 0.09 + (1 - third) * 0.01))
+    assert found.detail_psnr == pytest.approx(-10 * math.log10(0.09))
+    assert found.lost_mass is None and found.trivial_psnr == pytest.approx(120.0)
+    assert shown.shape == (HEIGHT, WIDTH, 3) and set(shown[0, :, 0]) == {204, 153}

@@ -57,16 +57,19 @@ def test_the_page_counts_kills_and_what_they_lost(results: Path) -> None:
     import stability_page
 
     def ended(psnr: float, *kills: tuple[int, int]) -> dict[str, object]:
-        found = [{"seconds": 1.0, "before": before, "after": after} for before, after in kills]
+        found = [
+            {"seconds": 1.0, "first": -1, "before": before, "after": after}
+            for before, after in kills
+        ]
         return {"step": 59, "psnr": psnr, "frozen": True, "kills": found}
 
     def kill(before: int, **more: int) -> dict[str, object]:
-        return {"seconds": 1.0, "before": before, "after": before, **more}
+        return {"seconds": 1.0, "first": before, "before": before, "after": before, **more}
 
-    between = {"step": 59, "kills": [kill(59)]}
+    destroyed = {"step": -1, "kills": [kill(19) | {"before": -1, "after": -1}]}
     damaged = {"step": 19, "kills": [kill(19, damaged=1)]}
     stuck = {"step": 7, "kills": [kill(-1), kill(7)], "failed": "KeyError: 'gate'"}
-    unfinished = [between, damaged, stuck]
+    unfinished = [destroyed, damaged, stuck]
     stored = {
         "steps": 60,
         "undisturbed": [ended(13.0), ended(13.5)],
@@ -76,8 +79,8 @@ def test_the_page_counts_kills_and_what_they_lost(results: Path) -> None:
     (results / "kills.json").write_text(json.dumps(stored))
     shown = " ".join(stability_page.page(PAGE.read_text(), results).split())
     assert "7 kills with SIGKILL at random moments of runs of 60 steps, 1 of them before" in shown
-    assert "; 2 of them lost something" in shown
-    assert "2 of 3 runs that were killed went on" in shown and "at 13.10 to 13.20 dB" in shown
+    assert ", 3 of processes that had saved something themselves; 3 of them lost" in shown
+    assert "2 of 5 runs that were killed went on" in shown and "at 13.10 to 13.20 dB" in shown
     assert (
         "end at 13.00 to 13.50 dB (mean 13.25); the means differ by -0.10 dB with a standard error"
         in shown

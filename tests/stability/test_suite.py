@@ -113,7 +113,9 @@ def test_a_run_that_renders_no_number_fails_and_the_others_go_on(tmp_path: Path)
 
 def test_a_folder_of_other_sizes_is_refused(tmp_path: Path) -> None:
     make(suite(tmp_path, ("yard",), ("grid-128",)), Runs())
-    with pytest.raises(ValueError, match="another steps"):
+    with pytest.raises(
+        ValueError, match=r"other sizes, with --quick or without: steps \(40, not 41\)"
+    ):
         longer = replace(TINY, steps=41)
         suite_module.Suite(tmp_path, cases_named(("yard",)), samplers_named(()), (0,), longer)
 

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from dataclasses import asdict
 from typing import Any
 
 import pytest
 
-from leco_plugin.stability.table import blind, headline, table, unproven, verdicts_of
+from leco_plugin.stability.sizes import FULL, QUICK
+from leco_plugin.stability.table import QUICKLY, blind, headline, table, unproven, verdicts_of
 
 SAMPLERS = [
     {"name": "learned", "title": "learned occupancy", "reference": "dense"},
@@ -102,9 +104,25 @@ def test_every_failure_says_why() -> None:
 
 
 def test_a_cell_that_was_not_run_or_does_not_exist_is_shown_as_such() -> None:
-    unknown = cell("no reference", None, psnr=None)
-    text = table(results(("yard", False, {"learned": unknown})))
-    assert "| yard | -: - |  |  |" in text
+    unknown = cell("no reference", None, psnr=None, seeds=0, reason="not run")
+    broken = cell("fail", None, psnr=None, reason="1 of 1 runs ended: no memory")
+    text = table(results(("yard", False, {"learned": unknown}), ("fog", False, {"dense": broken})))
+    assert "| yard | -: not run |  |  |" in text
+    assert "| fog |  |  | **fail**: no result |" in text
+
+
+def test_a_table_without_verdicts_says_what_there_is() -> None:
+    nothing = cell("no reference", None, psnr=None, seeds=0, reason="not run")
+    assert headline(results(("yard", False, {"dense": nothing}))) == "nothing has been run yet"
+    assert headline(results(("yard", False, {"dense": cell("pass", None)}))).startswith(
+        "no verdict yet"
+    )
+
+
+def test_a_quick_table_says_that_its_verdicts_mean_nothing() -> None:
+    quick = TWO | {"sizes": asdict(QUICK)}
+    assert headline(quick) == f"{QUICKLY}: {headline(TWO)}"
+    assert headline(TWO | {"sizes": asdict(FULL)}) == headline(TWO)
 
 
 def test_several_seeds_show_their_worst() -> None:

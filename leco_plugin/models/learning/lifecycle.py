@@ -62,8 +62,9 @@ class Lifecycle:
         self.trainer: Any = attributes.trainer
         most = configured = model.config.schedule.learn_steps
         if self.trainer is not None:
-            # a short run still passes through both phases
+            # a short run still passes through both phases, and a resumed one has steps behind it
             most = max(2, int(0.5 * self.trainer.config.max_num_iterations))
+            most += max(0, self.trainer._start_step - self.progress.since)
             self._say_if_short(configured, most)
         # nerfstudio makes callbacks after it has loaded a checkpoint
         self.progress.begin(configured, most)
@@ -92,7 +93,8 @@ class Lifecycle:
         if most < configured != self.progress.configured:
             say(
                 f"a run of {self.trainer.config.max_num_iterations} steps learns the occupancy in "
-                f"its first half: {most} steps, not the {configured} of schedule.learn-steps"
+                f"its first half: until step {self.progress.since + most}, not for the "
+                f"{configured} steps of schedule.learn-steps"
             )
 
     def begin_with_points(self) -> None:

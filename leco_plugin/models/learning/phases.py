@@ -9,6 +9,8 @@ from typing import Literal
 import torch
 from torch import Tensor
 
+from leco_plugin.scenes.input_error import InputError
+
 PROBES = 16384
 """Positions at which the gate's decisions are compared between two checks."""
 
@@ -40,6 +42,12 @@ class ScheduleConfig:
     """Steps between two looks at the gate."""
     agreement: float = 0.99
     """Share of probe positions whose decision must be the same in two checks running."""
+
+    def __post_init__(self) -> None:
+        for name in ("learn_steps", "steps_per_check"):
+            if getattr(self, name) < 1:
+                option = f"schedule.{name.replace('_', '-')}"
+                raise InputError(f"{option} is {getattr(self, name)}; it takes at least one step")
 
 
 def ramp(step: int, config: ScheduleConfig) -> float:

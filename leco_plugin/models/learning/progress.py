@@ -60,16 +60,21 @@ class Progress:
     image: tuple[float, ...] = NO_EVIDENCE
     """The same of the image price."""
 
+    @property
+    def since(self) -> int:
+        """Step from which the first phase is counted: its beginning, or the last recovery's."""
+        return max(self.began, self.healed_at + 1)
+
     def begin(self, configured: int, most: int) -> None:
         """Sets `learn_steps`, unless a checkpoint did so under the same config.
 
         Args:
             configured: of the config; a resumed run may have been given another one.
-            most: steps that this process leaves for the first phase.
+            most: steps from `since` on that this process leaves for the first phase.
         """
         if configured != self.configured:
             self.phase = min(configured, most)
-            self.learn_steps = max(self.began, self.healed_at + 1) + self.phase
+            self.learn_steps = self.since + self.phase
             self.configured = configured
 
     @classmethod

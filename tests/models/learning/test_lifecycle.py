@@ -118,7 +118,7 @@ def test_a_short_run_says_once_that_half_of_it_is_for_learning(
     looking.model.progress = Progress()  # type: ignore[assignment]
     looking._say_if_short(200, 62)
     said = " ".join(capsys.readouterr().out.split())
-    assert "of 125 steps" in said and "62 steps," in said
+    assert "of 125 steps" in said and "until step 62," in said
     looking._say_if_short(50, 62)  # all of them fit
     looking.model.progress.begin(200, 62)
     looking._say_if_short(200, 62)  # resumed

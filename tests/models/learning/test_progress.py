@@ -37,6 +37,12 @@ def test_a_run_resumed_with_another_schedule_takes_that_one() -> None:
     assert healed.learn_steps == 5391  # or from its new last layer
 
 
+def test_a_learning_phase_is_counted_from_where_it_began() -> None:
+    assert Progress().since == 0
+    assert Progress(began=301, healed_at=20).since == 301
+    assert Progress(began=301, healed_at=4990).since == 4991
+
+
 def test_progress_is_read_back_without_unsafe_loading() -> None:
     progress = Progress(
         *(300, 200, 12.5, 1, 2),
