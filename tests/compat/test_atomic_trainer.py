@@ -32,7 +32,7 @@ def trainer(tmp_path: Path) -> AtomicTrainer:
     trainer.optimizers = SimpleNamespace(optimizers={}, schedulers={})
     trainer.grad_scaler = SimpleNamespace(state_dict=dict)
     trainer.config = SimpleNamespace(save_only_latest_checkpoint=True, steps_per_save=500)
-    trainer.training_state, trainer.step = "training", 20
+    trainer.training_state, trainer.step, trainer.world_size = "training", 20, 1
     return trainer
 
 
