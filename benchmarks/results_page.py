@@ -77,6 +77,21 @@ def sampling_table(report: dict[str, Any]) -> str:
     return "\n".join(rows)
 
 
+def sampling_section(report: dict[str, Any]) -> list[str]:
+    """The sampling benchmark on one machine; first results say neither their day nor their code."""
+    title, note = f"Sampling: {report['machine']['processor']}", " Ratios within one run."
+    if "code" in report:
+        title, note = f"{title}, {report['date']}", f"{note} {code_of(report)}."
+    command = "python benchmarks/sampling.py"
+    return section(title, command, report, sampling_table(report), note)
+
+
+def code_of(report: dict[str, Any]) -> str:
+    """Version and commit of the code that was measured."""
+    version, commit = report["code"]["version"], report["code"]["commit"] or "no commit"
+    return f"leco_plugin {version} at {commit}"
+
+
 def gpu_table(results: dict[str, Any]) -> str:
     """The bars of the GPU suite, with the milliseconds behind them, floors among them."""
     rows = ["| figure | measured | bar | reached | milliseconds |", "|---|---|---|---|---|"]
@@ -154,16 +169,12 @@ def page() -> str:
     parts += sizes_sections()
     parts += large_scene_sections()
     for sampling in sorted(RESULTS.glob("sampling*.json")):
-        report = json.loads(sampling.read_text())
-        command, note = "python benchmarks/sampling.py", " Ratios within one run."
-        title = f"Sampling: {report['machine']['processor']}"
-        parts += section(title, command, report, sampling_table(report), note)
+        parts += sampling_section(json.loads(sampling.read_text()))
     for path in sorted(RESULTS.glob("gpu-*.json")):
         report = json.loads(path.read_text())
         check_gpu(report)
         title = f"On a GPU: {report['machine']['device']}, {report['date']}"
-        version, commit = report["code"]["version"], report["code"]["commit"] or "no commit"
-        note = f" leco_plugin {version} at {commit}, sources {report['code']['sources']}."
+        note = f" {code_of(report)}, sources {report['code']['sources']}."
         parts += section(title, "python benchmarks/gpu.py", report, gpu_table(report), note)
     return "\n".join(parts)
 

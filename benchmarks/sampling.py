@@ -6,6 +6,7 @@ Every figure is a ratio of two things that run in turn in one process. Results g
 
 from __future__ import annotations
 
+import datetime
 import json
 import math
 from collections.abc import Callable
@@ -20,6 +21,7 @@ from sampling_scene import fit_occupancy, rays_into
 from timing import interleaved, machine, milliseconds, ratio
 from torch import Tensor
 
+from leco_plugin.evaluation.machine import describe_code
 from leco_plugin.models.compute.precision import keep_freed_memory
 from leco_plugin.occupancy import Occupancy
 from leco_plugin.samplers.estimator import LearnedOccupancyEstimator
@@ -214,6 +216,8 @@ def main(options: Options) -> None:
     report = LearnedOccupancyEstimator(occupancy).cache
     results = {
         "format": 1,
+        "date": f"{datetime.date.today()}",
+        "code": describe_code(),
         "machine": machine(),
         "scene": {"occupancy": str(options.occupancy or "fitted to boxes")},
         "cache": vars(report.report) if report is not None else None,

@@ -41,8 +41,9 @@ def _load(entry: EntryPoint, kind: type[Kind]) -> Kind | str:
     """What an entry names, or in one line why that is of no use."""
     try:
         found = entry.load()
-    except Exception as error:  # noqa: BLE001 (whatever a foreign module raises)
-        return f"{entry.value} cannot be loaded: {type(error).__name__}: {error}"
+    except (Exception, SystemExit) as error:  # noqa: BLE001 (whatever a foreign module raises)
+        said = ": ".join([type(error).__name__, *str(error).splitlines()[:1]])
+        return f"{entry.value} cannot be loaded: {said}"
     if isinstance(found, kind):
         return found
     return f"{entry.value} is of type {type(found).__name__}, where a {kind.__name__} is expected"

@@ -99,7 +99,10 @@ class Occupancy(nn.Module):
         Returns:
             [N] float32 in [0, 1]; 0 outside a bounded space or the walls, and where a position is
             not finite.
+        Raises:
+            ValueError: positions are of another shape.
         """
+        _check_shape(positions)
         # one coordinate after the other: on a CPU rows of three numbers take five times as long
         columns = torch.stack(positions.to(self.space.center.dtype).unbind(-1))
         mapped = self.space.map(columns.T)
@@ -117,10 +120,11 @@ class Occupancy(nn.Module):
         return values * inside
 
     def occupied(self, positions: Tensor) -> Tensor:
-        """Whether scene positions [N, 3] are kept: bool [N].
+        """Whether scene positions [N, 3] are kept: bool [N]; errors as of `query`.
 
         On CUDA by the fused kernel where it runs, which may differ close to the threshold.
         """
+        _check_shape(positions)
         decided = fused.decisions(self, positions)
         return self.query(positions) >= self.threshold_value if decided is None else decided
 
@@ -215,9 +219,14 @@ class Occupancy(nn.Module):
         if header.get("sha256") != _digest(header, tensors):
             raise ValueError(f"{path} is damaged: its contents do not match its checksum")
         report = report if isinstance(report, dict) else {}
-        occupancy = cls(Gate(config), Space(), 0.0, cast(Precision, precision), report)
+        occupancy = cls(Gate(config), Space(), 0.0, cast(Precision, precision), report).float()
         occupancy.load_state_dict(tensors)
         return occupancy.eval()
+
+
+def _check_shape(positions: Tensor) -> None:
+    if positions.dim() != 2 or positions.shape[-1] != 3:
+        raise ValueError(f"positions must be [N, 3], got {list(positions.shape)}")
 
 
 def _check_values(path: Path, tensors: dict[str, Tensor]) -> None:
@@ -294,7 +303,7 @@ def _expected_shapes(config: GateConfig) -> dict[str, _Described]:
     """Names, shapes and types that a file with this gate must hold, found without allocating it."""
     check_sizes(config)
     with torch.device("meta"):
-        module = Occupancy(Gate(config), Space(), 0.0)
+        module = Occupancy(Gate(config), Space(), 0.0).float()  # whatever torch's default is
     return {name: (tuple(value.shape), value.dtype) for name, value in module.state_dict().items()}
 
 

@@ -286,7 +286,6 @@ def test_a_guided_run_skips(stored: Path) -> None:
     run.freeze()
     assert run.estimator is not None
     run.estimator.occupancy.threshold_value.fill_(1.0)
-    run.estimator.cache = None
     kept = run.intervals_of(rays, 16, jittered=False)
     assert len(kept.t_starts) == len(rays.origins) < len(everything.t_starts)  # backdrops only
 

@@ -89,6 +89,30 @@ def test_a_gate_that_bfloat16_holds_exactly_takes_half_the_bytes(kind, tmp_path:
     assert (tmp_path / "again.safetensors").stat().st_size == len(short)
 
 
+@pytest.mark.parametrize("default", [torch.float64, torch.float16])
+def test_a_file_is_read_in_float32_whatever_torchs_default_is(default, tmp_path: Path) -> None:
+    saved = occupancy()
+    saved.save(tmp_path / "occupancy.safetensors")
+    positions = torch.randn(100, 3)
+    torch.set_default_dtype(default)
+    try:
+        loaded = Occupancy.load(tmp_path / "occupancy.safetensors")
+        values = loaded.query(positions)
+    finally:
+        torch.set_default_dtype(torch.float32)
+    floating = [value for value in loaded.state_dict().values() if value.is_floating_point()]
+    assert {value.dtype for value in floating} == {torch.float32}
+    assert values.equal(saved.query(positions))
+
+
+@pytest.mark.parametrize("shape", [(3,), (4, 2), (2, 4, 3), (3, 3, 3)])
+def test_positions_of_another_shape_are_refused_in_a_line(shape: tuple[int, ...]) -> None:
+    said = f"^positions must be \\[N, 3\\], got {re.escape(str(list(shape)))}$"
+    for ask in (occupancy().query, occupancy().occupied):
+        with pytest.raises(ValueError, match=said):
+            ask(torch.zeros(shape))
+
+
 def test_outside_a_box_and_where_a_position_is_not_finite_space_is_empty() -> None:
     boxed = Occupancy(Gate(GATES["frequency"]), Space("box"), 0.0)
     nowhere = torch.tensor([[1.01, 0.0, 0.0], [float("nan"), 0.0, 0.0], [0.0, float("inf"), 0.0]])

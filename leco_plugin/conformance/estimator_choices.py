@@ -20,6 +20,8 @@ CONE_ANGLE = 0.02
 """Growth of the steps with distance, which makes them half as long again at the far end."""
 SLACK = 1e-3
 """Relative distance from a threshold at which a rounding does not decide."""
+LOWEST_CAP = 0.1
+"""Of the mean opacity of all samples: the least that an opacity threshold may be lowered to."""
 
 
 def skips_only_what_it_may(case: EstimatorCase) -> None:
@@ -76,7 +78,8 @@ def all_kept_equals_dense(case: EstimatorCase) -> None:
 
 
 def visibility_pruning(case: EstimatorCase) -> None:
-    """With a density or opacity, what light does not reach is dropped, and nothing else."""
+    """With a density or opacity, what light does not reach and what is too faint is dropped, and
+    nothing else."""
     rays, sampler = crossing(), case.shared(EVERYTHING)
     for training in (False, True):
         sampler.train(training)
@@ -104,6 +107,7 @@ def _check_pruned(
     visible = light >= early_stop_eps * (1.0 + SLACK)
     visible &= alphas >= alpha_thre * (1.0 + SLACK)
     dark = light < early_stop_eps * (1.0 - SLACK)
+    faint = alphas < min(alpha_thre, LOWEST_CAP * float(alphas.mean())) * (1.0 - SLACK)
     limits = {"early_stop_eps": early_stop_eps, "alpha_thre": alpha_thre}
 
     def sigma_fn(*interval: Tensor) -> Tensor:
@@ -118,8 +122,9 @@ def _check_pruned(
         given = f"with {name}, early_stop_eps {early_stop_eps} and alpha_thre {alpha_thre}"
         lost = int((visible & ~kept).sum())
         require(lost == 0, f"{given}: {lost} of {int(visible.sum())} visible samples are dropped")
-        left = int((dark & kept).sum())
-        require(left == 0, f"{given}: {left} of {int(dark.sum())} samples in the dark are kept")
+        for kind, dropped in (("in the dark", dark), ("too faint to be seen", faint)):
+            left, count = int((dropped & kept).sum()), int(dropped.sum())
+            require(left == 0, f"{given}: {left} of {count} samples {kind} are kept")
 
 
 def _wall(rays: Rays, t_starts: Tensor, t_ends: Tensor, ray_indices: Tensor) -> Tensor:

@@ -119,10 +119,12 @@ SAMPLER_RULES = (
     ),
     Rule(
         name="visibility-pruning",
-        reason="hosts pass sigma_fn to shade only what light reaches; a visible sample that is "
-        "dropped is missing from the image and learns nothing.",
+        reason="hosts pass sigma_fn to shade only what light reaches and what shows; a visible "
+        "sample that is dropped is missing from the image and learns nothing.",
         remedy="drop a sample when its transmittance is below early_stop_eps or its opacity below "
-        "alpha_thre, both as given; with 0 for a limit, drop nothing for it.",
+        "alpha_thre, both as given but for one thing: where opacities are low throughout, "
+        "alpha_thre may be lowered, to no less than a tenth of their mean; with 0 for a limit, "
+        "drop nothing for it.",
         checks={ESTIMATOR: estimator_choices.visibility_pruning},
     ),
     Rule(

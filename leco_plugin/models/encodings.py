@@ -65,7 +65,8 @@ class FrequencyEncoding(nn.Module):
     def __init__(self, octaves: int) -> None:
         super().__init__()
         self.out_dim = 3 + 6 * octaves
-        self.register_buffer("scales", math.pi * 2.0 ** torch.arange(octaves), persistent=False)
+        powers = 2.0 ** torch.arange(octaves, dtype=torch.float32)
+        self.register_buffer("scales", math.pi * powers, persistent=False)
         self.register_buffer("start", torch.tensor([0.0, -1.0]).view(2, 1, 1), persistent=False)
 
     def forward(self, mapped: Tensor, dtype: torch.dtype | None = None) -> Tensor:

@@ -63,7 +63,6 @@ class _WeightedSum(torch.autograd.Function):
         return weighted.new_zeros(n_rays, values.shape[-1]).index_add_(0, ray_indices, weighted)
 
     @staticmethod
-    @torch.autograd.function.once_differentiable
     def backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, Tensor | None, None, None]:
         weights, values, ray_indices = ctx.saved_tensors
         grad = grad.index_select(0, ray_indices)

@@ -15,7 +15,7 @@ import torch
 from torch import Tensor, nn
 
 from leco_plugin.samplers.marching import NearFn, OccupiedFn, Samples, march, plan
-from leco_plugin.samplers.rays import intersect_box
+from leco_plugin.samplers.rays import check_rays, intersect_box
 from leco_plugin.samplers.visibility import SampleFn, front_to_back, prune
 
 DensityFn = Callable[[Tensor], Tensor]
@@ -113,10 +113,11 @@ class Estimator(nn.Module):
                 raise ValueError(f"{name} must be {list(t_mins.shape)}, got {list(limit.shape)}")
         t_mins = t_mins if t_min is None else t_mins.maximum(t_min.to(t_mins))
         t_maxs = t_maxs if t_max is None else t_maxs.minimum(t_max.to(t_maxs))
+        check_rays(rays_o, rays_d, t_mins, t_maxs)
         jitter = torch.rand_like(t_mins) if stratified else None
         t_enters = None
         bounds = self.bounds()
-        if bounds is not None and rays_o.shape == rays_d.shape:
+        if bounds is not None:
             t_enters, t_leaves = intersect_box(rays_o, rays_d, bounds.to(rays_o))
             t_maxs = t_maxs.minimum(t_leaves)
 
@@ -133,6 +134,7 @@ class Estimator(nn.Module):
                 near_occupied=near_occupied,
                 sigma_fn=densities_of_samples(self.density_fn, rays_o, rays_d),
                 early_stop_eps=early_stop_eps,
+                chunk_size=self.chunk_size,
             )
         samples = self.kept(
             rays_o, rays_d, t_mins, t_maxs, render_step_size, cone_angle, jitter, t_enters

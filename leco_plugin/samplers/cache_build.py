@@ -252,13 +252,12 @@ def _decisions(
     Returns:
         positions in world units [points, 3] and bool [points].
     """
-    generator = torch.Generator(filled.device).manual_seed(seed)
-    mapped = torch.rand(points, 3, device=filled.device, generator=generator)
+    device = filled.device
+    generator = torch.Generator(device).manual_seed(seed)
+    mapped = torch.rand(points, 3, dtype=torch.float32, device=device, generator=generator)
     cells = filled.nonzero()
     if len(cells):
-        chosen = torch.randint(
-            len(cells), (points // 2,), device=filled.device, generator=generator
-        )
+        chosen = torch.randint(len(cells), (points // 2,), device=device, generator=generator)
         mapped[: points // 2] = (mapped[: points // 2] + cells[chosen]) / len(filled)
     positions = occupancy.space.unmap(mapped * 2.0 - 1.0)
     decided = [occupancy.occupied(part) for part in positions.split(POINTS_AT_ONCE)]

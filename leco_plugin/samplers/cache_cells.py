@@ -73,7 +73,7 @@ def judge_coarse(
             max=len(seen.open) - 1
         )
         asked = seen.open[cell][:, cell][:, :, cell].nonzero()
-        corners[tuple(asked.T)] = logits_above(occupancy, asked * (2.0 / (size - 1)) - 1.0)
+        corners[tuple(asked.T)] = logits_above(occupancy, asked.float() * (2.0 / (size - 1)) - 1.0)
     return _judge(*_extremes(corners), margin), corners
 
 
@@ -86,7 +86,7 @@ def _extremes(corners: Tensor) -> tuple[Tensor, Tensor]:
 
 def _lattice(intervals: int, device: torch.device) -> Tensor:
     """Points of a lattice over the mapped cube, [(intervals + 1)^3, 3]."""
-    axis = torch.linspace(-1.0, 1.0, intervals + 1, device=device)
+    axis = torch.linspace(-1.0, 1.0, intervals + 1, dtype=torch.float32, device=device)
     return torch.stack(torch.meshgrid(axis, axis, axis, indexing="ij"), dim=-1).view(-1, 3)
 
 
@@ -95,7 +95,7 @@ def logits_above(occupancy: OccupancyLike, mapped: Tensor) -> Tensor:
 
     Finite: float32 says o = 1 from a logit of 17 on.
     """
-    threshold = torch.tensor(occupancy.threshold, device=mapped.device).logit(eps=1e-7)
+    threshold = mapped.new_tensor(occupancy.threshold).logit(eps=1e-7)
     values = [
         occupancy.query(occupancy.space.unmap(part)).float().logit(eps=1e-7) - threshold
         for part in mapped.split(POINTS_AT_ONCE)
@@ -125,7 +125,7 @@ def judge_fine(
     size = 2.0 / (len(corners) - 1)
     steps = torch.arange(BRICK, device=device)
     within = torch.stack(torch.meshgrid(steps, steps, steps, indexing="ij"), dim=-1).view(-1, 3)
-    places = (cells[:, None, :] * BRICK + within) * size - 1.0
+    places = (cells[:, None, :] * BRICK + within).float() * size - 1.0
     centres = logits_above(occupancy, (places + 0.5 * size).reshape(-1, 3)).view(n, BRICK**3, 1)
     eight = corners.unfold(0, 2, 1).unfold(1, 2, 1).unfold(2, 2, 1)
     x, y, z = (cells[:, None, :] * BRICK + within).unbind(-1)
@@ -148,7 +148,9 @@ def _random_points(places: Tensor, size: float) -> tuple[Tensor, Tensor]:
         but for [m, TRIALS, 3].
     """
     generator = torch.Generator(places.device).manual_seed(len(places))
-    random = torch.rand(len(places), TRIALS, 3, device=places.device, generator=generator)
+    random = torch.rand(
+        len(places), TRIALS, 3, dtype=places.dtype, device=places.device, generator=generator
+    )
     return (places[:, None, :] + random * size).view(-1, 3), random
 
 
@@ -166,10 +168,9 @@ def fit_planes(
         planes (a, b) in units of which the largest is 127, [m, 4], and doubts in these units [m]:
         the largest residual in the cell, where those far from the threshold count for less.
     """
-    device = values.device
     mapped, random = _random_points(places, size)
     values = torch.cat([values, logits_above(occupancy, mapped).view(len(values), TRIALS)], dim=1)
-    nine = torch.cat([_lattice(1, device), torch.zeros(1, 3, device=device)])
+    nine = torch.cat([_lattice(1, values.device), values.new_zeros(1, 3)])
     units = torch.cat([nine.expand(len(values), 9, 3), random * 2.0 - 1.0], dim=1)
     design = pad(units, (1, 0), value=1.0)  # [m, points, 4]
 
@@ -177,7 +178,7 @@ def fit_planes(
     scale = (values.amax(dim=1) - values.amin(dim=1)).clamp(min=1e-6) / 4.0
     weights = 1.0 / (1.0 + (values / scale[:, None]).square())
     weighted = (weights[:, :, None] * design).mT
-    system = weighted @ design + 1e-6 * torch.eye(4, device=device)
+    system = weighted @ design + 1e-6 * torch.eye(4, dtype=values.dtype, device=values.device)
     planes = torch.linalg.solve(system, weighted @ values[:, :, None])[..., 0]
     unit = planes.abs().amax(dim=1, keepdim=True).clamp(min=1e-6) / 127.0
     planes = (planes / unit).round()

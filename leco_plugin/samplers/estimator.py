@@ -17,7 +17,9 @@ from leco_plugin.samplers import fused
 from leco_plugin.samplers.base import Estimator
 from leco_plugin.samplers.cache import CellCache, OccupancyLike
 from leco_plugin.samplers.cache_build import build_cache
+from leco_plugin.samplers.changes import Seen
 from leco_plugin.samplers.marching import NearFn, OccupiedFn, Samples, number
+from leco_plugin.samplers.rays import checked_box
 
 _log = logging.getLogger(__name__)
 
@@ -28,6 +30,10 @@ ANSWER_RESOLUTION = 64
 class LearnedOccupancyEstimator(Estimator):
     """Samples where a frozen gate says that there is something.
 
+    Box and cells follow the occupancy: after another gate was loaded into it, its threshold was
+    changed or it was replaced, the next question has them made anew, in seconds. A gate that is
+    still trained is asked without cells (`cache_bytes=0`).
+
     Args:
         occupancy: the frozen gate with its space and threshold.
         aabb: box (min, max) to which rays are clipped, world units, [6]; None is the box of a
@@ -35,9 +41,14 @@ class LearnedOccupancyEstimator(Estimator):
         cache_bytes: budget of the cell cache; 0 asks the gate about every candidate.
         tolerance: largest share of decisions by which the cache may differ from the gate. Where no
             cache keeps it, the gate is asked about every candidate, and the log says so.
+
+    Raises:
+        ValueError: the box is empty or not finite.
     """
 
     _box: Tensor
+    _seen: Seen
+    _derived_from: list[Tensor]
 
     def __init__(
         self,
@@ -52,14 +63,24 @@ class LearnedOccupancyEstimator(Estimator):
         self.cache_bytes, self.tolerance = cache_bytes, tolerance
         self.to(occupancy.space.center.device)
         self._box_is_given = aabb is not None
-        box = torch.empty(0, 6) if aabb is None else torch.as_tensor(aabb).detach().reshape(1, 6)
-        self.register_buffer("_box", box.float().to(self.device), persistent=False)
+        box = torch.empty(0, 6) if aabb is None else checked_box(aabb)[None]
+        self.register_buffer("_box", box.to(self.device), persistent=False)
         self.cache: CellCache | None = None
         self._derive()
-        self.register_load_state_dict_post_hook(_derive_anew)
+
+    def _follow(self) -> None:
+        """Derives box and cells anew where the occupancy is no longer what they are of."""
+        if self._seen.is_still(self.occupancy):
+            return
+        if _same(_decisive(self.occupancy), self._derived_from):  # moved, or loaded once more
+            self._seen = Seen(self.occupancy)
+        else:
+            _log.info("the occupancy has changed: box and cells are made anew")
+            self._derive()
 
     def _derive(self) -> None:
         """Builds what follows from the occupancy: its box and the cells."""
+        self._seen = Seen(self.occupancy)
         self._derived_from = _decisive(self.occupancy)
         if not self._box_is_given:
             bounded = self.occupancy.space.kind == "box"
@@ -96,15 +117,18 @@ class LearnedOccupancyEstimator(Estimator):
     ) -> Samples:
         """As any estimator's, by the fused march where it runs."""
         rays = rays_o, rays_d, t_mins, t_maxs, step_size, cone_angle, jitter, t_enters
+        self._follow()
         samples = fused.march(self.occupancy, self.cache, rays_o.device, lambda: number(*rays))
         return super().kept(*rays) if samples is None else samples
 
     def bounds(self) -> Tensor | None:
+        self._follow()
         return self._box[0] if len(self._box) else None
 
     @torch.no_grad()
     def occupied(self, positions: Tensor) -> Tensor:
         """The gate's decision, from the cache where it is sure; positions [N, 3] to bool [N]."""
+        self._follow()
         if self.cache is None:
             return self.occupancy.occupied(positions)
         decided, left_open = self.cache.decide(positions)
@@ -119,6 +143,7 @@ class LearnedOccupancyEstimator(Estimator):
     @property
     def aabbs(self) -> Tensor:
         """Boxes as `OccGridEstimator` has them, [1, 6]; of an unbounded space the inner cube."""
+        self._follow()
         return self._box if len(self._box) else self._uncontracted_box()
 
     @property
@@ -152,14 +177,15 @@ def cell_centers(aabbs: Tensor, resolution: Tensor) -> Tensor:
 
 
 def _decisive(occupancy: OccupancyLike) -> list[Tensor]:
-    """Copies of what an occupancy's decisions depend on, as far as a state dict can change it."""
+    """Copies of what an occupancy's decisions depend on, as far as its tensors hold it."""
     if not isinstance(occupancy, torch.nn.Module):
         return []
     return [value.detach().cpu().clone() for value in occupancy.state_dict().values()]
 
 
-def _derive_anew(estimator: LearnedOccupancyEstimator, _: object) -> None:
-    """A checkpoint may hold another gate than the file that the estimator was built from."""
-    found = _decisive(estimator.occupancy)
-    if not all(map(torch.equal, found, estimator._derived_from)):
-        estimator._derive()
+def _same(some: list[Tensor], others: list[Tensor]) -> bool:
+    """Whether two such lists are alike in every type and value."""
+    return len(some) == len(others) and all(
+        one.dtype == other.dtype and torch.equal(one, other)
+        for one, other in zip(some, others, strict=True)
+    )

@@ -16,6 +16,7 @@ import torch
 from torch import Tensor, nn
 
 from leco_plugin.samplers.cache import CellCache
+from leco_plugin.samplers.changes import Seen
 from leco_plugin.samplers.gate_weights import (
     MOST_WIDTH,
     MOST_WIDTH_BUT_HOPPER,
@@ -49,10 +50,7 @@ class _Switch:
 class _Packed(NamedTuple):
     """The weights of an occupancy, and what they were packed from."""
 
-    state: tuple[Tensor, ...]
-    """Held, so that nothing else comes to lie at the same address."""
-    now: tuple[tuple[int, int], ...]
-    """Address and version of each."""
+    seen: Seen
     weights: GateWeights | None
 
 
@@ -210,16 +208,14 @@ def on(device: torch.device) -> AbstractContextManager[object]:
 
 def weights_of(occupancy: nn.Module) -> GateWeights | None:
     """The packed weights of an occupancy, packed anew when it has changed; None if none fit."""
-    state = (*occupancy.parameters(), *occupancy.buffers())
-    now = tuple((value.data_ptr(), _version(value)) for value in state)
     found = _packed.get(occupancy)
-    if found is None or found.now != now:
+    if found is None or not found.seen.is_still(occupancy):
+        state = (*occupancy.parameters(), *occupancy.buffers())
         device = state[0].device if state else torch.device("cpu")
         reason = _why_not(occupancy, device)
         if reason is not None and found is None:  # else it has been said
             _log.info("no fused gate: %s", reason)
-        held = tuple(value.detach() for value in state)
-        found = _Packed(held, now, gate_weights(occupancy) if reason is None else None)
+        found = _Packed(Seen(occupancy), gate_weights(occupancy) if reason is None else None)
         _packed[occupancy] = found
     return found.weights
 
@@ -234,7 +230,3 @@ def _why_not(occupancy: Any, device: torch.device) -> str | None:
     if getattr(occupancy, "precision", None) == "float32":
         return why_not(occupancy, MOST_WIDTH_FLOAT32)
     return why_not(occupancy, MOST_WIDTH if capability[0] == 9 else MOST_WIDTH_BUT_HOPPER)
-
-
-def _version(value: Any) -> int:
-    return 0 if value.is_inference() else value._version

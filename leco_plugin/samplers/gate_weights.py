@@ -156,7 +156,7 @@ def _looked_up(gate: Any, device: torch.device) -> dict[str, Any]:
     config, encoding = gate.config.encoding, gate.encoding
     levels, features, mask = 1, 1, 0
     sizes: list[int] = [0]
-    tables = [torch.zeros(1, device=device)]
+    tables = [torch.zeros(1, dtype=torch.float32, device=device)]
     if config.kind == "hash":
         levels, features, mask = config.levels, config.features, encoding.mask
         sizes, tables = [int(size) for size in encoding.resolutions.tolist()], [encoding.table]

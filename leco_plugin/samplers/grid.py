@@ -15,6 +15,7 @@ from torch import Tensor
 
 from leco_plugin.samplers.base import Estimator
 from leco_plugin.samplers.marching import NearFn, OccupiedFn
+from leco_plugin.samplers.rays import checked_box
 
 CELLS_AT_ONCE = 1 << 20
 """Cells evaluated in one call of the host's density; nerfacc asks 2 million at once."""
@@ -24,11 +25,11 @@ def nested_boxes(box: Sequence[float] | Tensor, levels: int) -> list[Tensor]:
     """A box [6] of (min, max), and around it others, each twice as wide as the one before.
 
     Raises:
-        ValueError: there is not even one level.
+        ValueError: the box is empty or not finite, or there is not even one level.
     """
     if levels < 1:
         raise ValueError(f"there is at least one box, not {levels}")
-    inner = torch.as_tensor(box).float()
+    inner = checked_box(box)
     center, half = (inner[:3] + inner[3:]) / 2, (inner[3:] - inner[:3]) / 2
     return [torch.cat([center - half * 2**i, center + half * 2**i]) for i in range(levels)]
 
@@ -38,13 +39,16 @@ class DenseEstimator(Estimator):
 
     Args:
         aabb: box (min, max) to which rays are clipped, [6]; None marches from near to far.
+
+    Raises:
+        ValueError: the box is empty or not finite.
     """
 
     aabbs: Tensor
 
     def __init__(self, aabb: Sequence[float] | Tensor | None = None) -> None:
         super().__init__()
-        boxes = torch.empty(0, 6) if aabb is None else torch.as_tensor(aabb).float().reshape(1, 6)
+        boxes = torch.empty(0, 6) if aabb is None else checked_box(aabb)[None]
         self.register_buffer("aabbs", boxes)
 
     def questions(self) -> tuple[OccupiedFn | None, NearFn | None]:
@@ -83,19 +87,16 @@ class OccupancyGridEstimator(Estimator):
         super().__init__()
         along_axes = [resolution] * 3 if isinstance(resolution, int | float) else resolution
         sizes = [int(n) if n == int(n) else 0 for n in along_axes]
-        box = torch.as_tensor(roi_aabb).detach().float().cpu().reshape(-1)
         if len(sizes) != 3 or min(sizes) < 1 or levels < 1:
             raise ValueError(
                 f"a grid needs whole positive sizes, got {resolution}, {levels} levels"
             )
-        if box.shape != (6,) or not bool((box[:3] < box[3:]).all()) or not box.isfinite().all():
-            raise ValueError(f"roi_aabb must be a finite box (min, max), got {box.tolist()}")
-        boxes = nested_boxes(box, levels)
+        boxes = nested_boxes(roi_aabb, levels)
         self.levels = levels
         self.cells_per_lvl = sizes[0] * sizes[1] * sizes[2]
         self.sizes = sizes
         self.register_buffer("resolution", torch.tensor(sizes, dtype=torch.int32))
-        self.register_buffer("aabbs", torch.stack(boxes))
+        self.register_buffer("aabbs", torch.stack(boxes).cpu())
         self.register_buffer("occs", torch.zeros(levels * self.cells_per_lvl))
         self.register_buffer("binaries", torch.zeros([levels, *sizes], dtype=torch.bool))
 

@@ -55,7 +55,7 @@ Samples = tuple[Tensor, Tensor, Tensor]
 CPU_CHUNK = 1 << 19
 DEVICE_CHUNK = 1 << 22
 """Positions asked at once: what fits the cache of a CPU core; elsewhere a training batch, because
-each chunk there waits for the device once."""
+each chunk there waits for the device."""
 
 
 @torch.no_grad()

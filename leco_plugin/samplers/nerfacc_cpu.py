@@ -4,13 +4,18 @@ nerfacc 0.5.2 packs, scans and traverses grids on CUDA only, so that a stock hos
 nerfstudio's `instant-ngp` cannot run anywhere else. `install` puts a switch in front of each of
 these functions: CUDA tensors go to nerfacc's kernels as before, all others to the functions here.
 It is called when a model is built, never as a side effect of an import.
+
+What a module imported by name before (`from nerfacc import pack_info`) is replaced there too. A
+function that was put elsewhere, in a class, a partial or a default argument, stays nerfacc's own.
 """
 
 from __future__ import annotations
 
 import functools
+import inspect
 import sys
 from collections.abc import Callable
+from types import ModuleType
 from typing import TYPE_CHECKING, Any
 
 import torch
@@ -24,45 +29,59 @@ from leco_plugin.samplers.rays import intersect_box
 if TYPE_CHECKING:
     from nerfacc import RayIntervals, RaySamples
 
-_originals: dict[str, Callable[..., Any]] = {}
+Function = Callable[..., Any]
+
+_switches: list[tuple[Function, Function]] = []
+"""Functions of nerfacc, and what stands in front of them."""
 
 
 def install() -> None:
     """Let nerfacc work on tensors of any device. Doing it twice does it once.
 
     Raises:
-        ImportError: nerfacc is not installed.
+        ImportError: nerfacc is not installed, or in a version whose functions are others.
     """
     import nerfacc
 
-    if _originals:
+    if _switches:
         return
     replacements = {name: getattr(packed, name) for name in packed.__all__}
     replacements |= {"traverse_grids": traverse_grids, "ray_aabb_intersect": ray_aabb_intersect}
     for name, replacement in replacements.items():
-        _originals[name] = getattr(nerfacc, name)
-        _rebind(_originals[name], _switch(_originals[name], replacement))
+        if not _takes_as_much(replacement, getattr(nerfacc, name, None)):
+            raise ImportError(
+                f"{name} of nerfacc {nerfacc.__version__} is not that of 0.5.2, for which this is "
+                "written: pip install nerfacc==0.5.2, which nerfstudio asks for too"
+            )
+    originals = {name: getattr(nerfacc, name) for name in replacements}
+    _switches.extend((old, _switch(old, replacements[name])) for name, old in originals.items())
+    _rebind(dict(_switches))
 
 
 def uninstall() -> None:
     """Give nerfacc its own functions back."""
-    import nerfacc
-
-    while _originals:
-        name, original = _originals.popitem()
-        _rebind(getattr(nerfacc, name), original)
+    _rebind({switch: original for original, switch in _switches})
+    _switches.clear()
 
 
-def _rebind(old: Callable[..., Any], new: Callable[..., Any]) -> None:
-    """Replace a function in every nerfacc module, since they import names from each other."""
-    modules = [m for name, m in sys.modules.items() if name.split(".")[0] == "nerfacc"]
-    for module in modules:
+def _takes_as_much(replacement: Function, original: Function | None) -> bool:
+    """Whether arguments for a function of nerfacc mean the same to its replacement."""
+    if original is None:
+        return False
+    theirs, ours = (list(inspect.signature(each).parameters) for each in (original, replacement))
+    return ours[: len(theirs)] == theirs
+
+
+def _rebind(replacements: dict[Function, Function]) -> None:
+    """Replace functions by others in every module that has one of them, nerfacc's or not."""
+    by_identity = {id(old): new for old, new in replacements.items()}
+    for module in [each for each in sys.modules.values() if isinstance(each, ModuleType)]:
         for name, value in list(vars(module).items()):
-            if value is old:
-                setattr(module, name, new)
+            if id(value) in by_identity:
+                setattr(module, name, by_identity[id(value)])
 
 
-def _switch(original: Callable[..., Any], replacement: Callable[..., Any]) -> Callable[..., Any]:
+def _switch(original: Function, replacement: Function) -> Function:
     @functools.wraps(original)
     def by_device(*args: Any, **kwargs: Any) -> Any:
         tensors = [value for value in (*args, *kwargs.values()) if isinstance(value, Tensor)]

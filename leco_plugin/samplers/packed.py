@@ -64,7 +64,6 @@ class _DensityWeights(torch.autograd.Function):
         return weights, trans, alphas
 
     @staticmethod
-    @torch.autograd.function.once_differentiable
     def backward(ctx: Any, *grads: Tensor | None) -> tuple[Tensor, None]:
         weights, trans, alphas = ctx.saved_tensors
         grad_weights, grad_trans, grad_alphas = grads

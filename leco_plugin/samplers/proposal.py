@@ -27,16 +27,19 @@ from leco_plugin.samplers.estimator import LearnedOccupancyEstimator
 def with_ends(ray_bundle: RayBundle | None) -> RayBundle:
     """The rays, if they can be sampled.
 
-    A ray that ends before it begins, or nowhere, has samples without length, all where it begins,
-    and at its origin if that is nowhere either.
+    A ray that ends before it begins, or at no number, has samples without length, all where it
+    begins; that is its origin if it is no finite number. A ray without end is followed as far as a
+    spacing in disparity, 1 - 1/(2t), can be told from 1: 4 million units in float32.
 
     Raises:
         ValueError: there are no rays, or they have no nears and fars.
     """
     if ray_bundle is None or ray_bundle.nears is None or ray_bundle.fars is None:
         raise ValueError("samples need a ray bundle with nears and fars (set by a collider)")
-    nears = ray_bundle.nears.where(~ray_bundle.nears.isnan(), 0.0)
-    return replace(ray_bundle, nears=nears, fars=ray_bundle.fars.fmax(nears))
+    farthest = 0.5 / torch.finfo(ray_bundle.nears.dtype).eps
+    nears = ray_bundle.nears.where(ray_bundle.nears.isfinite(), 0.0).clamp(max=farthest)
+    fars = ray_bundle.fars.fmax(nears).clamp(max=farthest)
+    return replace(ray_bundle, nears=nears, fars=fars)
 
 
 def check_positive(**sizes: int) -> None:
@@ -66,8 +69,10 @@ class LearnedOccupancySampler(Sampler):
             the same.
 
     Raises:
-        ValueError: there is not even one sample or candidate.
+        ValueError: there is not even one sample or candidate, or the frame is not [3, 4].
     """
+
+    frame: Tensor | None
 
     def __init__(
         self,
@@ -81,7 +86,10 @@ class LearnedOccupancySampler(Sampler):
     ) -> None:
         super().__init__()
         check_positive(num_samples=num_samples, num_candidates=num_candidates)
-        self.frame = frame
+        if frame is not None and frame.shape != (3, 4):
+            raise ValueError(f"frame must be [3, 4], got {list(frame.shape)}")
+        held = None if frame is None else frame.detach().float()
+        self.register_buffer("frame", held, persistent=False)
         self.estimator = LearnedOccupancyEstimator(occupancy, cache_bytes=cache_bytes)
         self.num_samples = num_samples
         self.num_candidates = num_candidates
@@ -137,7 +145,8 @@ class LearnedOccupancySampler(Sampler):
         flat = positions.reshape(-1, 3).float()  # a host may be in half or double precision
         if self.frame is not None:
             with torch.autocast(flat.device.type, enabled=False):
-                flat = flat @ self.frame[:, :3].T + self.frame[:, 3]
+                turn, shift = self.frame.float().split([3, 1], dim=1)
+                flat = flat @ turn.T + shift[:, 0]
         kept = self.estimator.occupied(flat).nonzero()[:, 0]
         worth = positions.new_zeros(len(flat))
         if kept.numel():

@@ -6,6 +6,8 @@ error: one bad pixel of a batch must not end a training run.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import torch
 from torch import Tensor
 
@@ -56,6 +58,18 @@ def usable_rays(coordinates: Tensor, t_mins: Tensor, t_maxs: Tensor) -> Tensor:
     origins, directions = coordinates.abs().amax(dim=1)
     largest = torch.maximum(origins, directions).maximum(t_mins.abs())  # NaN if anything is
     return (largest < torch.inf) & (directions > 0.0) & (t_mins < t_maxs)
+
+
+def checked_box(aabb: Sequence[float] | Tensor) -> Tensor:
+    """A box as float32 [6] of (min, max), where it is.
+
+    Raises:
+        ValueError: it is not six finite numbers, or it is empty.
+    """
+    box = torch.as_tensor(aabb).detach().float().reshape(-1)
+    if box.shape != (6,) or not bool((box[:3] < box[3:]).all() and box.isfinite().all()):
+        raise ValueError(f"aabb must be a finite box (min, max), got {box.tolist()}")
+    return box
 
 
 def intersect_box(origins: Tensor, directions: Tensor, aabb: Tensor) -> tuple[Tensor, Tensor]:

@@ -153,23 +153,27 @@ class _PackedSum(torch.autograd.Function):
 
 
 class _PackedProduct(torch.autograd.Function):
-    """Packed prefix product: exp of summed logarithms, with zeros and signs counted apart.
+    """Packed prefix product: exp of summed logarithms, with zeros, NaN and signs counted apart.
 
     Counting the zeros makes the gradient exact at a factor 0 (an opacity of exactly 1), where
-    dividing the product by the factor would give 0/0.
+    dividing the product by the factor would give 0/0. The gradient itself has none: torch says so
+    where one is asked for.
     """
 
     @staticmethod
     def forward(ctx: Any, inputs: Tensor, rays: Segments, exclusive: bool) -> Tensor:
         wide = inputs.to(_scan_dtype(inputs))
-        zero, negative = wide == 0, wide < 0
-        counts = segment_scan(zero.long() + (negative.long() << 31), rays, exclusive)
-        zeros, sign = counts & (2**31 - 1), 1 - 2 * ((counts >> 31) & 1)
-        logs = wide.masked_fill(zero, 1.0).abs().log()
+        zero, negative, bad = wide == 0, wide < 0, wide.isnan()
+        # of the negative ones only the last bit is asked for: the rest may run over
+        each = zero.long() + (bad.long() << 31) + (negative.long() << 62)
+        counts = segment_scan(each, rays, exclusive)
+        zeros, sign = counts & (2**31 - 1), 1 - 2 * ((counts >> 62) & 1)
+        met_bad = ((counts >> 31) & (2**31 - 1)) > 0
+        logs = wide.masked_fill(zero | bad, 1.0).abs().log()
         # exp(1e3) is already infinite and exp(-1e3) zero: clamping keeps rays apart, loses nothing.
-        logs = logs.nan_to_num(nan=1e3).clamp(-1e3, 1e3)
+        logs = logs.clamp(-1e3, 1e3)
         nonzero_product = segment_scan(logs, rays, exclusive).exp() * sign
-        outputs = nonzero_product.masked_fill(zeros > 0, 0.0)
+        outputs = nonzero_product.masked_fill(zeros > 0, 0.0).masked_fill(met_bad, torch.nan)
         ctx.rays, ctx.exclusive = rays, exclusive
         ctx.save_for_backward(wide, zero, outputs, nonzero_product.masked_fill(zeros != 1, 0.0))
         return outputs.to(inputs.dtype)

@@ -61,7 +61,9 @@ def try_march(occupancy: nn.Module, cache: CellCache, weights: GateWeights, cone
     directions = torch.nn.functional.normalize(_places(weights, RAYS) - origins.flip(0), dim=-1)
     step_size = float(weights.facts[3]) / 48.0
     t_mins = torch.zeros_like(origins[:, 0])
-    t_maxs = torch.linspace(0.0, STEPS * step_size, RAYS, device=origins.device)
+    t_maxs = torch.linspace(
+        0.0, STEPS * step_size, RAYS, dtype=origins.dtype, device=origins.device
+    )
     rays, cone_angle = (origins, directions, t_mins, t_maxs), 1.0 / 64.0 if coned else 0.0
     ours = march_kept(cache, weights, number(*rays, step_size, cone_angle))
     theirs = march(

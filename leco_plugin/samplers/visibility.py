@@ -19,6 +19,9 @@ from leco_plugin.samplers.packed import (
     render_transmittance_from_density,
 )
 
+HELD_AT_ONCE = 1 << 20
+"""Candidates that `front_to_back` holds at once, if it is told nothing else."""
+
 SampleFn = Callable[[Tensor, Tensor, Tensor], Tensor]
 """t_starts [N], t_ends [N], ray_indices [N] to densities or opacities [N]."""
 
@@ -106,7 +109,7 @@ def front_to_back(
     early_stop_eps: float,
     near_occupied: NearFn | None = None,
     slab: int = 64,
-    chunk_size: int = 1 << 20,
+    chunk_size: int | None = None,
 ) -> Samples:
     """The samples of `march` with T >= early_stop_eps, asking densities only as far as light goes.
 
@@ -117,7 +120,7 @@ def front_to_back(
         early_stop_eps: transmittance in (0, 1) below which a ray is given up; the colour of a
             pixel changes by no more than this.
         slab: candidates by which each ray advances between two looks at its transmittance.
-        chunk_size: most candidates held at once.
+        chunk_size: most candidates held at once (a slab of one ray at least); None is a million.
 
     Returns:
         Samples sorted by ray, then t.
@@ -127,7 +130,7 @@ def front_to_back(
     """
     if not 0.0 < early_stop_eps < 1.0:
         raise ValueError(f"front-to-back needs early_stop_eps in (0, 1), got {early_stop_eps}")
-    rays_at_once = max(1, chunk_size // slab)
+    rays_at_once = max(1, (HELD_AT_ONCE if chunk_size is None else chunk_size) // slab)
     kept: list[Samples] = []
     for first in range(0, len(candidates.counts), rays_at_once):
         rays = candidates.of_rays(slice(first, first + rays_at_once))

@@ -236,6 +236,14 @@ class StopsEarly(Sound):
         return super().sampling(rays_o, rays_d, *args, **options)
 
 
+class ShadesTheFaint(Sound):
+    """Takes no notice of the opacity below which nothing shows."""
+
+    def sampling(self, rays_o: Tensor, rays_d: Tensor, *args: Any, **options: Any) -> Samples:
+        options["alpha_thre"] = 0.0
+        return super().sampling(rays_o, rays_d, *args, **options)
+
+
 class DeafToDensities(Sound):
     def sampling(self, rays_o: Tensor, rays_d: Tensor, *args: Any, **options: Any) -> Samples:
         options |= {"sigma_fn": None, "alpha_fn": None}
@@ -302,7 +310,7 @@ MUTANTS: dict[str, tuple[type, ...]] = {
     "all-kept-equals-dense": (DropsTheFirst, StepsOfOneLength),
     "no-gradient-to-the-gate": (GateThaws, GradientsSwitchedOff),
     "zero-samples-well-formed": (StandInSample, FloatWhenEmpty),
-    "visibility-pruning": (StopsEarly, DeafToDensities),
+    "visibility-pruning": (StopsEarly, ShadesTheFaint, DeafToDensities),
     "update-while-frozen-is-harmless": (UpdatesByNameOnly, Learns),
     "state-dict-round-trip": (OutsideTheStateDict,),
     "two-processes": (DecidesByRank, ShortBuffer),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import inspect
 
 import pytest
@@ -10,6 +11,7 @@ from ball_occupancy import CENTRE, RADIUS, ball
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from samplers.analytic_occupancy import Balls, camera_rays, slow_march
+from waits import Waits
 
 from leco_plugin.conformance.scene import OTHER, SLAB, box, crossing
 from leco_plugin.samplers import estimator as module
@@ -120,6 +122,39 @@ def test_a_field_that_knows_nothing_yet_loses_no_sample(bare):
     assert len(pruned[0]) == len(plain[0])
 
 
+@settings(deadline=None, max_examples=30)
+@given(alpha_thre=st.floats(0.0, 0.3), brightest=st.floats(0.0, 1.0), seed=st.integers(0, 2**16))
+def test_samples_are_dropped_below_the_given_opacity_and_a_tenth_of_the_mean(
+    bare, alpha_thre, brightest, seed
+):
+    origins, directions = camera_rays(20)
+    plain = bare.sampling(origins, directions, render_step_size=0.03)
+    torch.manual_seed(seed)
+    alphas = torch.rand(len(plain[0])) * brightest
+    kept = bare.sampling(
+        origins,
+        directions,
+        alpha_fn=lambda *_: alphas,
+        alpha_thre=alpha_thre,
+        early_stop_eps=0.0,
+        render_step_size=0.03,
+    )
+    least = min(alpha_thre, sum(alphas.tolist()) / len(alphas) / 10.0)
+    expected = [n for n, alpha in enumerate(alphas.tolist()) if alpha >= least]
+    assert abs(len(kept[0]) - len(expected)) <= 1  # one may lie on the threshold
+    if len(kept[0]) == len(expected):
+        assert kept[1].equal(plain[1][expected])
+
+
+def test_a_threshold_of_opacity_drops_what_is_faint(bare):
+    origins, directions = camera_rays(20)
+    plain = bare.sampling(origins, directions, render_step_size=0.03)
+    alphas = torch.full_like(plain[1], 0.5).index_fill_(0, torch.arange(0, len(plain[1]), 2), 1e-3)
+    options = {"alpha_fn": lambda *_: alphas, "early_stop_eps": 0.0, "render_step_size": 0.03}
+    kept = bare.sampling(origins, directions, alpha_thre=0.01, **options)
+    assert kept[1].equal(plain[1][1::2])
+
+
 def test_evaluation_goes_front_to_back_once_it_knows_the_density(bare):
     origins, directions = camera_rays(100)
     plain = bare.eval().sampling(origins, directions, render_step_size=0.01)
@@ -132,6 +167,22 @@ def test_evaluation_goes_front_to_back_once_it_knows_the_density(bare):
     assert len(trained[0]) == len(plain[0])
     counts = packed.pack_info(plain[0], 100)[:, 1].clamp(max=10)
     assert packed.pack_info(seen[0], 100)[:, 1].equal(counts)
+
+
+@pytest.mark.parametrize("training", [True, False])
+def test_no_more_candidates_than_a_chunk_are_worked_on_at_once(training):
+    estimator, asked = LearnedOccupancyEstimator(Balls(), cache_bytes=0).train(training), []
+    estimator.density_fn = lambda positions: torch.full((len(positions), 1), 1.0)
+    estimator.occupancy.occupied = lambda positions: (
+        asked.append(len(positions)) or (positions[:, 0] > 0.0)
+    )
+    rays = camera_rays(100)
+    whole = estimator.sampling(*rays, render_step_size=0.01)
+    at_most, estimator.chunk_size = max(asked), 256
+    asked.clear()
+    in_chunks = estimator.sampling(*rays, render_step_size=0.01)
+    assert all(map(torch.equal, whole, in_chunks))
+    assert max(asked) <= 256 < at_most
 
 
 def test_a_frozen_gate_is_not_updated_and_answers_like_a_grid(learned):
@@ -161,27 +212,126 @@ def test_no_box_is_needed_and_one_may_be_given():
     assert positions[:, 0].min() > -0.1 - 1e-4
 
 
-@pytest.mark.parametrize("aabb", [None, [-0.1, -1.0, -1.0, 1.0, 1.0, 1.0]])
-def test_a_checkpoint_of_another_gate_decides_from_then_on(aabb, monkeypatch):
-    built = []
+def moved(by: float = 0.3):
+    """An occupancy whose box and slab are not those of `SLAB`."""
+    occupancy = OTHER.occupancy()
+    occupancy.space.set("box", occupancy.space.center + by, 1.0)
+    return occupancy
+
+
+@pytest.fixture
+def built(monkeypatch):
+    """The caches that are built, in their order."""
+    caches = []
 
     def build_cache(*args, **kwargs):
-        built.append(kwargs)
-        return really_build_cache(*args, **kwargs)
+        caches.append(really_build_cache(*args, **kwargs))
+        return caches[-1]
 
     monkeypatch.setattr(module, "build_cache", build_cache)
+    return caches
+
+
+def assert_decided_by(estimator, occupancy, aabb=None):
+    """Samples and box are those of an estimator that was built from this occupancy."""
+    own = LearnedOccupancyEstimator(occupancy, aabb, cache_bytes=BUDGET)
     rays = crossing()
+    samples = own.sampling(*rays[:2], render_step_size=0.05)
+    assert all(map(torch.equal, estimator.sampling(*rays[:2], render_step_size=0.05), samples))
+    assert estimator.aabbs.equal(own.aabbs)
+
+
+@pytest.mark.parametrize("aabb", [None, [-0.1, -1.0, -1.0, 1.0, 1.0, 1.0]])
+def test_a_checkpoint_of_another_gate_decides_from_then_on(aabb):
     saved = LearnedOccupancyEstimator(SLAB.occupancy(), aabb, cache_bytes=BUDGET)
-    moved = OTHER.occupancy()
-    moved.space.set("box", moved.space.center + 0.3, 1.0)
-    host = torch.nn.ModuleDict({"grid": LearnedOccupancyEstimator(moved, aabb, cache_bytes=BUDGET)})
+    grid = LearnedOccupancyEstimator(moved(), aabb, cache_bytes=BUDGET)
+    host = torch.nn.ModuleDict({"grid": grid})
     host.load_state_dict({f"grid.{name}": value for name, value in saved.state_dict().items()})
-    samples = saved.sampling(*rays[:2], render_step_size=0.05)
-    assert all(map(torch.equal, host["grid"].sampling(*rays[:2], render_step_size=0.05), samples))
-    assert host["grid"].aabbs.equal(box()[None] if aabb is None else torch.tensor([aabb]))
-    assert len(built) == 3
-    host.load_state_dict(host.state_dict())
-    assert len(built) == 3  # the same gate asks for no other cells
+    assert_decided_by(grid, SLAB.occupancy(), aabb)
+
+
+CHANGES = {
+    "loaded into it": lambda asked: asked.occupancy.load_state_dict(moved().state_dict()),
+    "put in its place": lambda asked: setattr(asked, "occupancy", moved()),
+    "its gate replaced": lambda asked: setattr(asked.occupancy, "gate", moved().gate),
+    "its space moved": lambda asked: asked.occupancy.space.center.add_(0.1),
+    "its threshold": lambda asked: asked.occupancy.threshold_value.fill_(0.7),
+}
+
+
+@pytest.mark.parametrize("change", CHANGES)
+def test_a_gate_that_changes_decides_from_the_next_question_on(change, caplog):
+    asked = LearnedOccupancyEstimator(SLAB.occupancy(), cache_bytes=BUDGET)
+    positions = torch.rand(2000, 3) * 3.0 + box()[:3]
+    before = asked.occupied(positions)
+    caplog.set_level("INFO")
+    CHANGES[change](asked)
+    assert_decided_by(asked, asked.occupancy)
+    now = LearnedOccupancyEstimator(asked.occupancy, cache_bytes=0).occupied(positions)
+    assert (asked.occupied(positions) == now).float().mean() > 0.999
+    assert not now.equal(before)
+    assert "the occupancy has changed: box and cells are made anew" in caplog.text
+
+
+def test_estimators_that_share_an_occupancy_all_follow_it():
+    occupancy, other = SLAB.occupancy(), LearnedOccupancyEstimator(moved(), cache_bytes=0)
+    sharing = [LearnedOccupancyEstimator(occupancy, cache_bytes=0) for _ in range(2)]
+    sharing[0].load_state_dict(other.state_dict())
+    for estimator in sharing:
+        assert estimator.aabbs.equal(other.aabbs)
+
+
+def test_cells_are_kept_while_the_gate_says_the_same(built):
+    asked = LearnedOccupancyEstimator(SLAB.occupancy(), cache_bytes=BUDGET)
+    rays = crossing()
+    for change in (
+        lambda: None,
+        lambda: asked.load_state_dict(asked.state_dict()),
+        lambda: asked.load_state_dict(asked.state_dict(), assign=True),
+        lambda: setattr(asked, "occupancy", SLAB.occupancy()),
+    ):
+        change()
+        asked.sampling(*rays[:2], render_step_size=0.05)
+        copy.deepcopy(asked).sampling(*rays[:2], render_step_size=0.05)
+    assert len(built) == 1
+
+
+def test_to_notice_a_change_waits_for_no_device():
+    asked = LearnedOccupancyEstimator(SLAB.occupancy(), cache_bytes=BUDGET)
+    with Waits() as waits:
+        asked._follow()
+    assert waits.seen == []
+
+
+NO_BOXES = {
+    "inverted": [1.0, 1.0, 1.0, 0.0, 0.0, 0.0],
+    "flat": [0.0, 0.0, 0.0, 1.0, 1.0, 0.0],
+    "NaN": [torch.nan] * 6,
+    "infinite": [0.0] * 3 + [torch.inf] * 3,
+    "of three numbers": [0.0, 1.0, 2.0],
+}
+
+
+@pytest.mark.parametrize("aabb", NO_BOXES.values(), ids=NO_BOXES)
+def test_what_is_no_box_is_refused_in_a_line(aabb):
+    for build in (
+        DenseEstimator,
+        OccupancyGridEstimator,
+        lambda aabb: LearnedOccupancyEstimator(Balls(), aabb, cache_bytes=0),
+    ):
+        with pytest.raises(ValueError, match=r"^aabb must be a finite box \(min, max\), got \["):
+            build(aabb)
+
+
+def test_torchs_default_type_changes_no_cell(built):
+    asked = ball()
+    torch.set_default_dtype(torch.float64)
+    try:
+        LearnedOccupancyEstimator(asked, cache_bytes=BUDGET)
+    finally:
+        torch.set_default_dtype(torch.float32)
+    LearnedOccupancyEstimator(asked, cache_bytes=BUDGET)
+    assert all(map(torch.equal, *(cache.tables() for cache in built)))
 
 
 def test_an_impossible_cache_is_done_without_and_said(caplog):
@@ -227,6 +377,11 @@ def test_rays_that_do_not_fit_are_named(bare):
         bare.sampling(origins.to("meta"), directions.to("meta"))
     with pytest.raises(ValueError, match=r"directions must be \[3, 3\]"):
         bare.sampling(origins, directions[:2])
+    for boxed in (bare, LearnedOccupancyEstimator(Balls("contraction"), cache_bytes=0)):
+        with pytest.raises(ValueError, match=r"^directions is torch\.float32 on meta, but origins"):
+            boxed.sampling(origins, directions.to("meta"), far_plane=4.0)
+        with pytest.raises(ValueError, match=r"^directions is torch\.float64 on cpu, but origins"):
+            boxed.sampling(origins, directions.double(), far_plane=4.0)
     for shape in ((3,), (1, 3, 3), (3, 2), ()):
         with pytest.raises(ValueError, match=r"rays_o must be \[n_rays, 3\], got \["):
             bare.sampling(torch.zeros(shape), directions)

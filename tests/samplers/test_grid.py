@@ -99,8 +99,6 @@ def test_a_filled_grid_finds_the_scene():
 
 
 def test_impossible_grids_are_refused():
-    with pytest.raises(ValueError, match="finite box"):
-        OccupancyGridEstimator([0.0] * 6)
     with pytest.raises(ValueError, match="positive sizes"):
         OccupancyGridEstimator(BOX, resolution=0)
     with pytest.raises(ValueError, match="positive sizes"):

@@ -7,10 +7,12 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from samplers.analytic_occupancy import Balls, camera_rays, slow_march
-from torch.utils._python_dispatch import TorchDispatchMode
+from waits import Waits
 
 from leco_plugin.samplers import marching
 from leco_plugin.samplers.columns import places_by_column
+from leco_plugin.samplers.estimator import LearnedOccupancyEstimator
+from leco_plugin.samplers.grid import OccupancyGridEstimator
 from leco_plugin.samplers.marching import RUN, march
 from leco_plugin.samplers.rays import intersect_box
 
@@ -179,21 +181,15 @@ def test_memory_is_bounded_by_the_chunk(length):
     assert largest <= 500
 
 
-class CountsSearches(TorchDispatchMode):
-    """Counts what a device is waited for: how many entries are true, and single numbers."""
-
-    waits = 0
-
-    def __torch_dispatch__(self, operation, types, arguments=(), options=None):
-        aten = torch.ops.aten
-        self.waits += operation in (aten.nonzero.default, aten._local_scalar_dense.default)
-        return operation(*arguments, **(options or {}))
-
-
-@pytest.mark.parametrize("chunk_size", [10**6, 2000])
-def test_each_chunk_is_waited_for_once(chunk_size, monkeypatch):
-    # as on all devices but a CPU
+@pytest.fixture
+def as_on_a_device(monkeypatch):
+    """On a CPU packing searches twice, which costs nothing there; elsewhere once."""
     monkeypatch.setattr(marching, "places_by_column_in_runs", places_by_column)
+
+
+@pytest.mark.usefixtures("as_on_a_device")
+@pytest.mark.parametrize("chunk_size", [10**6, 2000])
+def test_of_even_rays_each_chunk_is_waited_for_once(chunk_size):
     origins, directions = camera_rays(100)
     rays = origins, directions, torch.zeros(100), torch.ones(100)
     chunks = 0
@@ -203,10 +199,35 @@ def test_each_chunk_is_waited_for_once(chunk_size, monkeypatch):
         chunks += 1
         return positions[:, 0] > 0.0
 
-    with CountsSearches() as counted:
+    with Waits() as waits:
         march(*rays, step_size=0.01, occupied=occupied, chunk_size=chunk_size)
-    assert counted.waits == chunks
+    assert waits.seen == ["tolist"] + ["nonzero"] * chunks
     assert (chunks > 1) == (chunk_size < 10_000)
+
+
+def through_cells():
+    return LearnedOccupancyEstimator(Balls(), cache_bytes=1 << 16)
+
+
+def grid():
+    made = OccupancyGridEstimator([-1.0] * 3 + [1.0] * 3, resolution=16)
+    made.binaries.fill_(True)
+    return made
+
+
+@pytest.mark.usefixtures("as_on_a_device")
+@pytest.mark.parametrize(("build", "searches"), [(through_cells, 4), (grid, 2)])
+def test_an_estimator_waits_as_often_as_docs_gpu_says(build, searches):
+    estimator = build()
+
+    def waits() -> list[str]:
+        with Waits() as counted:
+            estimator.sampling(*camera_rays(500), render_step_size=0.08, far_plane=6.0)
+        return [name for name in counted.seen if name != "__bool__"]  # of a space, on a CPU only
+
+    assert waits() == ["tolist"] + ["nonzero"] * searches
+    estimator.eval().density_fn = lambda positions: torch.full((len(positions), 1), 0.5)
+    assert waits() == ["tolist"] + ["nonzero"] * (searches + 2)  # these steps are one slab
 
 
 @settings(deadline=None)

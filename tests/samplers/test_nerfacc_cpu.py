@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import sys
+from types import ModuleType
+
 import pytest
 import torch
 from samplers.analytic_occupancy import camera_rays, slow_march, slow_weights
@@ -37,6 +40,32 @@ def test_nothing_is_patched_by_an_import_and_everything_is_given_back():
     assert nerfacc.estimators.occ_grid.traverse_grids is nerfacc.traverse_grids
     nerfacc_cpu.uninstall()
     assert before == (nerfacc.pack_info, nerfacc.volrend.exclusive_sum, nerfacc.grid.traverse_grids)
+
+
+def test_what_was_imported_by_name_before_is_reached_too(monkeypatch):
+    nerfacc_cpu.uninstall()
+    earlier = ModuleType("a_host_of_somebody")
+    earlier.pack, earlier.other = nerfacc.pack_info, len
+    monkeypatch.setitem(sys.modules, earlier.__name__, earlier)
+    before = dict(vars(earlier))
+    nerfacc_cpu.install()
+    assert earlier.pack(torch.tensor([0, 1])).tolist() == [[0, 1], [1, 1]]
+    assert earlier.pack is nerfacc.pack_info and earlier.other is len
+    nerfacc_cpu.uninstall()
+    assert vars(earlier) == before
+
+
+def longer(rays_o, rays_d, binaries, aabbs, near, far, step_size, cone_angle, over_allocate): ...
+
+
+@pytest.mark.parametrize("theirs", [longer, None])
+def test_another_nerfacc_is_refused_in_a_line_and_left_as_it_is(monkeypatch, theirs):
+    nerfacc_cpu.uninstall()
+    monkeypatch.setattr(nerfacc, "traverse_grids", theirs)
+    before = nerfacc.pack_info
+    with pytest.raises(ImportError, match=r"^traverse_grids of nerfacc .* nerfacc==0\.5\.2[^\n]*$"):
+        nerfacc_cpu.install()
+    assert nerfacc.pack_info is before
 
 
 @pytest.mark.usefixtures("installed")

@@ -74,6 +74,30 @@ def test_weights_have_exact_gradients(batched):
         )
 
 
+@pytest.mark.parametrize("batched", [False, True])
+def test_weights_and_sums_have_exact_second_gradients(batched):
+    t_starts, t_ends, sigmas = random_samples()
+    shape = (2, 5) if batched else (10,)
+    rays = {} if batched else {"ray_indices": RAYS, "n_rays": N_RAYS}
+    inputs = [tensor.view(shape).requires_grad_() for tensor in (t_starts, t_ends, sigmas)]
+    assert torch.autograd.gradgradcheck(
+        lambda *samples: packed.render_weight_from_density(*samples, **rays), inputs
+    )
+    values = torch.rand(*shape, 3, dtype=torch.float64, requires_grad=True)
+    assert torch.autograd.gradgradcheck(
+        lambda weights, values: packed.accumulate_along_rays(weights, values, **rays),
+        (inputs[2], values),
+    )
+
+
+def test_a_packed_product_says_that_it_has_no_second_gradient():
+    alphas = torch.rand(10, requires_grad=True)
+    trans = packed.render_transmittance_from_alpha(alphas, ray_indices=RAYS, n_rays=N_RAYS)
+    (gradient,) = torch.autograd.grad(trans.square().sum(), alphas, create_graph=True)
+    with pytest.raises(RuntimeError, match="once_differentiable"):
+        gradient.sum().backward()
+
+
 def test_alpha_weights_have_exact_gradients_at_opaque_samples():
     alphas = torch.rand(10, dtype=torch.float64)
     alphas[[1, 5, 7, 9]] = 1.0

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import copy
+
 import pytest
 import torch
 from ball_occupancy import ball
@@ -175,11 +177,16 @@ BAD = {
     "no direction": ("directions", 0.0),
     "NaN near": ("nears", torch.nan),
     "NaN far": ("fars", torch.nan),
+    "infinite near": ("nears", torch.inf),
+    "no near": ("nears", -torch.inf),
+    "infinite far": ("fars", torch.inf),
+    "far as if infinite": ("fars", 1e10),
+    "far before all": ("fars", -torch.inf),
     "ends before it begins": ("fars", -1.0),
 }
 
 
-@settings(deadline=None, max_examples=40)
+@settings(deadline=None, max_examples=60)
 @given(n_rays=st.integers(0, 4), bad=st.sampled_from(sorted(BAD)), training=st.booleans())
 def test_bad_rays_give_samples_that_can_be_rendered_and_harm_no_other(
     sampler, n_rays, bad, training
@@ -198,6 +205,15 @@ def test_bad_rays_give_samples_that_can_be_rendered_and_harm_no_other(
     densities = torch.rand(n_rays, 32, 1, requires_grad=True)
     samples.get_weights(densities).sum().backward()
     assert densities.grad.isfinite().all()
+
+
+def test_a_frame_moves_with_its_sampler_and_is_in_no_checkpoint():
+    made = LearnedOccupancySampler(ball(), cache_bytes=0, frame=torch.eye(3, 4).double())
+    assert made.frame.dtype == torch.float32
+    assert copy.deepcopy(made).to("meta").frame.is_meta
+    assert not any("frame" in name for name in made.state_dict())
+    with pytest.raises(ValueError, match=r"^frame must be \[3, 4\], got \[4, 4\]$"):
+        LearnedOccupancySampler(ball(), cache_bytes=0, frame=torch.eye(4))
 
 
 @pytest.mark.parametrize("dtype", [torch.float64, torch.float16])

@@ -152,6 +152,27 @@ def test_entry_points_of_other_packages_are_found_and_broken_ones_left_out(monke
             build_estimator("builder", aabb=BOX)
 
 
+@pytest.mark.parametrize(
+    ("body", "said"),
+    [
+        ("raise SystemExit(3)", "SystemExit: 3"),
+        ("raise SystemExit", "SystemExit"),
+        ("raise ValueError('first\\nsecond')", "ValueError: first"),
+    ],
+)
+def test_a_module_that_ends_the_process_or_talks_at_length_is_left_out_in_a_line(
+    body, said, tmp_path, monkeypatch
+):
+    (tmp_path / "a_foreign_sampler.py").write_text(body)
+    monkeypatch.syspath_prepend(tmp_path)
+    entry = EntryPoint("foreign", "a_foreign_sampler:SPEC", registry.GROUP)
+    monkeypatch.setattr("leco_plugin.entries.entry_points", lambda group: [entry])
+    with pytest.warns(UserWarning) as warned:
+        assert set(samplers()) == set(registry.OURS)
+    (message,) = [str(each.message) for each in warned]
+    assert message.endswith(f"left out: a_foreign_sampler:SPEC cannot be loaded: {said}")
+
+
 def test_the_torch_core_imports_nothing_of_nerfstudio_or_nerfacc():
     import subprocess
     import sys

@@ -103,12 +103,36 @@ def test_ten_million_float32_samples_keep_their_digits():
 
 
 @pytest.mark.parametrize("bad", [torch.inf, -torch.inf, torch.nan])
-@pytest.mark.parametrize("function", [inclusive_sum, exclusive_sum])
+@pytest.mark.parametrize("function", SCANS)
 def test_a_bad_value_stays_on_its_ray(function, bad):
-    ray_indices, inputs = indices_of([2, 3, 2]), torch.ones(7)
-    inputs[3] = bad
+    ray_indices, inputs = indices_of([2, 3, 2]), torch.tensor([1.0, 2.0, -1.0, bad, 0.5, 3.0, 1.0])
     outputs = function(inputs, indices=ray_indices)
     expected = torch.tensor(slow_scan(function, inputs, ray_indices))
+    torch.testing.assert_close(outputs, expected, equal_nan=True)
+
+
+@pytest.mark.parametrize("function", [inclusive_prod, exclusive_prod])
+def test_signs_zeros_and_nan_of_a_product_are_counted_apart(function):
+    ray_indices = indices_of([3, 0, 4, 4, 3])
+    values = [
+        -1.0,
+        -2.0,
+        -3.0,
+        0.0,
+        torch.nan,
+        -1.0,
+        0.0,
+        torch.nan,
+        0.0,
+        0.0,
+        1.0,
+        -1.0,
+        -1.0,
+        5.0,
+    ]
+    inputs = torch.tensor(values, dtype=torch.float64)
+    expected = torch.tensor(slow_scan(function, inputs, ray_indices), dtype=torch.float64)
+    outputs = function(inputs, indices=ray_indices)
     torch.testing.assert_close(outputs, expected, equal_nan=True)
 
 
