@@ -113,24 +113,9 @@ def test_a_bad_value_stays_on_its_ray(function, bad):
 
 @pytest.mark.parametrize("function", [inclusive_prod, exclusive_prod])
 def test_signs_zeros_and_nan_of_a_product_are_counted_apart(function):
-    ray_indices = indices_of([3, 0, 4, 4, 3])
-    values = [
-        -1.0,
-        -2.0,
-        -3.0,
-        0.0,
-        torch.nan,
-        -1.0,
-        0.0,
-        torch.nan,
-        0.0,
-        0.0,
-        1.0,
-        -1.0,
-        -1.0,
-        5.0,
-    ]
-    inputs = torch.tensor(values, dtype=torch.float64)
+    rays = [-1, -2, -3], [], [0, torch.nan, -1, 0], [torch.nan, 0, 0, 1], [-1, -1, 5]
+    ray_indices = indices_of([len(ray) for ray in rays])
+    inputs = torch.tensor([value for ray in rays for value in ray], dtype=torch.float64)
     expected = torch.tensor(slow_scan(function, inputs, ray_indices), dtype=torch.float64)
     outputs = function(inputs, indices=ray_indices)
     torch.testing.assert_close(outputs, expected, equal_nan=True)

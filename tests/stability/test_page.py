@@ -42,7 +42,9 @@ def test_the_page_shows_the_stored_table_and_says_where_its_runs_come_from(
 
     empty = stability_page.page(PAGE.read_text(), results)
     assert empty.count("Not run yet.") == 2
-    table = make(suite(tmp_path / "table", ("yard",), ("grid-128",), (0, 1)), Runs({"grid-128": 23.0}))
+    table = make(
+        suite(tmp_path / "table", ("yard",), ("grid-128",), (0, 1)), Runs({"grid-128": 23.0})
+    )
     (results / "stability.json").write_text(json.dumps(table))
     shown = stability_page.page(empty, results)
     assert "Grid 128³ passes 0 of 1 cases." in shown
