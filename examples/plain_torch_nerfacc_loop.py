@@ -10,20 +10,21 @@ from leco_plugin.samplers.estimator import LearnedOccupancyEstimator
 from leco_plugin.samplers.nerfacc_cpu import install
 
 install()  # nerfacc alone needs CUDA
-estimator = LearnedOccupancyEstimator(Occupancy.load(sys.argv[1]))
+occupancy = Occupancy.load(sys.argv[1]) if len(sys.argv) > 1 else sys.exit(__doc__)
+options = {"far_plane": occupancy.report["far"], "render_step_size": 0.02, "stratified": True}
+estimator = LearnedOccupancyEstimator(occupancy)
 field = torch.nn.Sequential(torch.nn.Linear(3, 64), torch.nn.ReLU(), torch.nn.Linear(64, 4))
 optimizer = torch.optim.Adam(field.parameters(), lr=1e-2)
 for step in range(int(sys.argv[2]) if len(sys.argv) > 2 else 200):
-    rays_o = torch.nn.functional.normalize(torch.randn(512, 3), dim=-1)  # your rays and pixels here
+    rays_o = torch.nn.functional.normalize(torch.randn(512, 3), dim=-1)  # your rays here
     rays_d = torch.nn.functional.normalize(0.3 * torch.randn(512, 3) - rays_o, dim=-1)
-    pixels = rays_o * 0.5 + 0.5
 
     def rgb_sigma(t_starts, t_ends, rays, rays_o=rays_o, rays_d=rays_d):
         rgb_sigma = field(rays_o[rays] + rays_d[rays] * ((t_starts + t_ends) / 2)[:, None])
         return rgb_sigma[:, :3].sigmoid(), torch.nn.functional.softplus(rgb_sigma[:, 3])
 
-    rays, t0, t1 = estimator.sampling(rays_o, rays_d, render_step_size=0.02, stratified=True)
+    rays, t0, t1 = estimator.sampling(rays_o, rays_d, **options)
     rgb = nerfacc.rendering(t0, t1, rays, len(rays_o), rgb_sigma, render_bkgd=torch.ones(3))[0]
-    loss = torch.nn.functional.mse_loss(rgb, pixels)
+    loss = torch.nn.functional.mse_loss(rgb, rays_o * 0.5 + 0.5)  # your pixels
     optimizer.zero_grad(), loss.backward(), optimizer.step()
     print(f"step {step}: loss {loss.item():.4f}, {len(rays) / len(rays_o):.1f} samples per ray")

@@ -79,7 +79,13 @@ class Occupancy(nn.Module):
         return float(self.threshold_value)
 
     def with_threshold(self, threshold: float) -> Occupancy:
-        """One that shares all of this but its threshold; the report stays as it is."""
+        """One that shares all of this but its threshold; the report stays as it is.
+
+        Raises:
+            ValueError: it is not in [0, 1].
+        """
+        if not 0.0 <= threshold <= 1.0:
+            raise ValueError(f"a threshold is in [0, 1], not {threshold}")
         given = (self.gate, self.space, threshold, self.precision, self.report, self.walls)
         return Occupancy(*given).to(self.walls.device).train(self.training)
 

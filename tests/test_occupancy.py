@@ -113,6 +113,12 @@ def test_positions_of_another_shape_are_refused_in_a_line(shape: tuple[int, ...]
             ask(torch.zeros(shape))
 
 
+@pytest.mark.parametrize("threshold", [-0.1, 1.1, float("nan")])
+def test_a_threshold_is_in_zero_to_one(threshold: float) -> None:
+    with pytest.raises(ValueError, match=r"^a threshold is in \[0, 1\], not "):
+        occupancy().with_threshold(threshold)
+
+
 def test_outside_a_box_and_where_a_position_is_not_finite_space_is_empty() -> None:
     boxed = Occupancy(Gate(GATES["frequency"]), Space("box"), 0.0)
     nowhere = torch.tensor([[1.01, 0.0, 0.0], [float("nan"), 0.0, 0.0], [0.0, float("inf"), 0.0]])

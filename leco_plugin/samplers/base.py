@@ -39,6 +39,12 @@ class Estimator(nn.Module):
         self.density_fn: DensityFn | None = None
         self.chunk_size: int | None = None
 
+    def __setattr__(self, name: str, value: Any) -> None:
+        if name == "density_fn":  # a host's field is no part of this, nor of its checkpoints
+            object.__setattr__(self, name, value)
+        else:
+            super().__setattr__(name, value)
+
     @property
     def device(self) -> torch.device:
         """Where the estimator lives, and where rays must be."""
@@ -91,7 +97,8 @@ class Estimator(nn.Module):
             t_min, t_max: where each ray begins and ends, [n_rays]; the narrower range holds.
             render_step_size: shortest step, world units.
             early_stop_eps: transmittance below which a sample is unseen; 0 turns that off.
-            alpha_thre: opacity below which a sample is unseen, see `alpha_cap`; 0 turns it off.
+            alpha_thre: opacity below which a sample is unseen, where that is less than `alpha_cap`
+                (nerfacc's cap is ten times as high); 0 turns it off.
             stratified: shift each ray's samples by a random share of a step.
             cone_angle: growth of the step with distance.
 
@@ -100,7 +107,12 @@ class Estimator(nn.Module):
 
         Raises:
             ValueError: rays do not fit each other or this estimator's device, or have no end.
+            TypeError: rays or their limits are no tensors.
         """
+        given = {"rays_o": rays_o, "rays_d": rays_d, "t_min": t_min, "t_max": t_max}
+        for name, value in given.items():
+            if not (isinstance(value, Tensor) or (value is None and name.startswith("t_"))):
+                raise TypeError(f"{name} must be a tensor, got {type(value).__name__}")
         for name, rays in (("rays_o", rays_o), ("rays_d", rays_d)):
             if rays.dim() != 2 or rays.shape[-1] != 3:
                 raise ValueError(f"{name} must be [n_rays, 3], got {list(rays.shape)}")

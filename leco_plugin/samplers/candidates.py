@@ -138,5 +138,6 @@ def check_longest(highest: int, n_rays: int, step_size: float) -> None:
     if highest > MAX_CANDIDATES_PER_RAY:
         raise TooManyCandidates(
             f"the longest of {n_rays} rays has over 2^24 steps of {step_size:g}: give a far "
-            "plane, t_max or a box, begin nearer to it, or take a longer step or a cone angle"
+            "plane (the report of an occupancy has near and far), t_max or a box, begin nearer to "
+            "it, or take a longer step or a cone angle"
         )

@@ -19,7 +19,7 @@ from leco_plugin.samplers.cache import CellCache, OccupancyLike
 from leco_plugin.samplers.cache_build import build_cache
 from leco_plugin.samplers.changes import Seen
 from leco_plugin.samplers.marching import NearFn, OccupiedFn, Samples, number
-from leco_plugin.samplers.rays import checked_box
+from leco_plugin.samplers.rays import checked_box, intersect_box
 
 _log = logging.getLogger(__name__)
 
@@ -31,8 +31,9 @@ class LearnedOccupancyEstimator(Estimator):
     """Samples where a frozen gate says that there is something.
 
     Box and cells follow the occupancy: after another gate was loaded into it, its threshold was
-    changed or it was replaced, the next question has them made anew, in seconds. A gate that is
-    still trained is asked without cells (`cache_bytes=0`).
+    changed or it was replaced, the next question has them made anew, in seconds. Writes through
+    `.data`, and to tensors made in `inference_mode`, are not counted by torch and go unnoticed. A
+    gate that is still trained is asked without cells (`cache_bytes=0`).
 
     Args:
         occupancy: the frozen gate with its space and threshold.
@@ -44,6 +45,7 @@ class LearnedOccupancyEstimator(Estimator):
 
     Raises:
         ValueError: the box is empty or not finite.
+        TypeError: the occupancy is none.
     """
 
     _box: Tensor
@@ -59,7 +61,10 @@ class LearnedOccupancyEstimator(Estimator):
         tolerance: float = 1e-4,
     ) -> None:
         super().__init__()
+        if not hasattr(occupancy, "space"):
+            raise TypeError(f"Occupancy.load(FILE) gives an occupancy, and {occupancy!r} is none")
         self.occupancy = occupancy
+        self._warned = False
         self.cache_bytes, self.tolerance = cache_bytes, tolerance
         self.to(occupancy.space.center.device)
         self._box_is_given = aabb is not None
@@ -119,7 +124,26 @@ class LearnedOccupancyEstimator(Estimator):
         rays = rays_o, rays_d, t_mins, t_maxs, step_size, cone_angle, jitter, t_enters
         self._follow()
         samples = fused.march(self.occupancy, self.cache, rays_o.device, lambda: number(*rays))
-        return super().kept(*rays) if samples is None else samples
+        samples = super().kept(*rays) if samples is None else samples
+        if self.training and not (len(samples[0]) or self._warned):
+            self._warned = self._warn_of_rays_elsewhere(rays_o, rays_d, t_mins, t_maxs)
+        return samples
+
+    def _warn_of_rays_elsewhere(
+        self, rays_o: Tensor, rays_d: Tensor, t_mins: Tensor, t_maxs: Tensor
+    ) -> bool:
+        """Says so where no ray of a batch comes near: they are in other coordinates then."""
+        box = self.aabbs[0].to(rays_o)
+        enters, leaves = intersect_box(rays_o, rays_d, box)
+        if not len(rays_o) or bool((enters.maximum(t_mins) < leaves.minimum(t_maxs)).any()):
+            return False
+        _log.warning(
+            "none of %d rays comes near what this occupancy is of, %s: rays must be in the "
+            "coordinates in which it was learned (`frame` in its report leads there)",
+            len(rays_o),
+            " to ".join(str([round(x, 3) for x in corner]) for corner in box.view(2, 3).tolist()),
+        )
+        return True
 
     def bounds(self) -> Tensor | None:
         self._follow()

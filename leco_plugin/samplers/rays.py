@@ -32,8 +32,8 @@ def check_rays(
     n_rays = origins.shape[0] if origins.dim() else 0
     named = {"t_mins": t_mins, "t_maxs": t_maxs, "jitter": jitter, "t_enters": t_enters}
     shapes: dict[str, tuple[Tensor | None, tuple[int, ...]]] = {
-        "origins": (origins, (n_rays, 3)),
-        "directions": (directions, (n_rays, 3)),
+        "rays_o": (origins, (n_rays, 3)),
+        "rays_d": (directions, (n_rays, 3)),
         **{name: (tensor, (n_rays,)) for name, tensor in named.items()},
     }
     for name, (tensor, shape) in shapes.items():
@@ -43,7 +43,7 @@ def check_rays(
             raise ValueError(f"{name} must be {list(shape)}, got {list(tensor.shape)}")
         if tensor.dtype != origins.dtype or tensor.device != origins.device:
             raise ValueError(
-                f"{name} is {tensor.dtype} on {tensor.device}, but origins are {origins.dtype} on "
+                f"{name} is {tensor.dtype} on {tensor.device}, but rays_o is {origins.dtype} on "
                 f"{origins.device}"
             )
 

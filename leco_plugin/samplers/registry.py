@@ -31,8 +31,8 @@ class SamplerSpec:
     """One line for lists and help."""
     estimator: Callable[..., nn.Module] | str | None = None
     """Builds what a packed host calls (`base.Estimator`), or "module:attribute" of such. Called
-    with `aabb` (the host's box, [6]), `occupancy` (None when there is none) and options, which are
-    its other parameters."""
+    with `aabb` (the host's box, [6], which is that of its grid and not the scene's end),
+    `occupancy` (None when there is none) and options, which are its other parameters."""
     proposal: Callable[..., nn.Module] | str | None = None
     """Builds what a proposal host calls (`proposal.LearnedOccupancySampler`), likewise. Called with
     `occupancy`, with the host's `num_samples`, `initial_sampler` and `single_jitter`, and where
@@ -96,8 +96,8 @@ def build_estimator(name: str, **options: Any) -> nn.Module:
     """What a packed host calls; see `SamplerSpec.estimator` for the options.
 
     Raises:
-        ValueError: there is no such sampler, it does not serve packed hosts, or it needs an
-            occupancy and none is given, or one whose gate is on other features.
+        ValueError: there is no such sampler, it does not serve packed hosts or has no such option,
+            or it needs an occupancy and none is given, or one whose gate is on other features.
     """
     return _build(name, "estimator", options)
 
@@ -128,13 +128,18 @@ def _build(name: str, kind: str, options: dict[str, Any]) -> nn.Module:
     spec = sampler_spec(name)
     builder = getattr(spec, kind)
     if builder is None:
-        raise ValueError(f"sampler {name!r} has nothing for hosts that call a {kind}")
+        raise ValueError(f"sampler {name!r} has nothing for {HOSTS[kind]} hosts")
     if spec.needs_occupancy and options.get("occupancy") is None:
         raise ValueError(f"sampler {name!r} needs an occupancy")
     if spec.needs_occupancy:
         check_gate(name, getattr(getattr(options["occupancy"], "gate", None), "config", None))
-    estimator: nn.Module = _loaded(builder)(**options)
-    return estimator
+    refuse_unknown_options(name, [each for each in options if each not in GIVEN], (kind,))
+    build = _loaded(builder)
+    for needed, parameter in inspect.signature(build).parameters.items():
+        named = parameter.kind in (parameter.POSITIONAL_OR_KEYWORD, parameter.KEYWORD_ONLY)
+        if named and parameter.default is parameter.empty and needed not in options:
+            raise ValueError(f"sampler {name!r} needs {needed}")
+    return build(**options)
 
 
 def _loaded(builder: Callable[..., nn.Module] | str) -> Callable[..., nn.Module]:
@@ -210,7 +215,8 @@ def build_grid(
 def build_learned(
     occupancy: Any, aabb: Any = None, cache_bytes: int = 1 << 20, tolerance: float = 1e-4
 ) -> nn.Module:
-    """`estimator.LearnedOccupancyEstimator`; it needs no box, so the host's is left aside."""
+    """`estimator.LearnedOccupancyEstimator`; it needs no box, so the host's is left aside: that of
+    its grid would cut a scene off. Build the class itself to clip rays to a box."""
     from leco_plugin.samplers.estimator import LearnedOccupancyEstimator
 
     return LearnedOccupancyEstimator(occupancy, cache_bytes=cache_bytes, tolerance=tolerance)

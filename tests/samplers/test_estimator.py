@@ -375,18 +375,50 @@ def test_rays_that_do_not_fit_are_named(bare):
         bare.sampling(origins, directions, t_min=torch.zeros(2))
     with pytest.raises(ValueError, match="rays are on meta"):
         bare.sampling(origins.to("meta"), directions.to("meta"))
-    with pytest.raises(ValueError, match=r"directions must be \[3, 3\]"):
+    with pytest.raises(ValueError, match=r"rays_d must be \[3, 3\]"):
         bare.sampling(origins, directions[:2])
     for boxed in (bare, LearnedOccupancyEstimator(Balls("contraction"), cache_bytes=0)):
-        with pytest.raises(ValueError, match=r"^directions is torch\.float32 on meta, but origins"):
+        with pytest.raises(ValueError, match=r"^rays_d is torch\.float32 on meta, but rays_o"):
             boxed.sampling(origins, directions.to("meta"), far_plane=4.0)
-        with pytest.raises(ValueError, match=r"^directions is torch\.float64 on cpu, but origins"):
+        with pytest.raises(ValueError, match=r"^rays_d is torch\.float64 on cpu, but rays_o"):
             boxed.sampling(origins, directions.double(), far_plane=4.0)
     for shape in ((3,), (1, 3, 3), (3, 2), ()):
         with pytest.raises(ValueError, match=r"rays_o must be \[n_rays, 3\], got \["):
             bare.sampling(torch.zeros(shape), directions)
     with pytest.raises(ValueError, match="give a far plane"):
         DenseEstimator().sampling(origins, directions)
+    for wrong in ({"t_min": 0.2}, {"rays_o": origins.numpy()}, {"rays_d": None}):
+        with pytest.raises(TypeError, match=f"^{next(iter(wrong))} must be a tensor, got "):
+            bare.sampling(**{"rays_o": origins, "rays_d": directions, **wrong})
+
+
+def test_what_is_no_occupancy_is_refused_in_a_line():
+    with pytest.raises(TypeError, match=r"^Occupancy\.load\(FILE\) .*'box\.safetensors' is none$"):
+        LearnedOccupancyEstimator("box.safetensors")
+
+
+def test_a_hosts_field_is_no_part_of_its_estimator():
+    estimator = LearnedOccupancyEstimator(ball(), cache_bytes=0)
+    before = list(estimator.state_dict())
+    estimator.density_fn = torch.nn.Linear(3, 1)
+    assert list(estimator.state_dict()) == before
+    assert not any(isinstance(module, torch.nn.Linear) for module in estimator.children())
+
+
+@pytest.mark.parametrize("kind", ["box", "contraction"])
+def test_rays_in_other_coordinates_are_named_once(kind, caplog):
+    estimator = LearnedOccupancyEstimator(Balls(kind), cache_bytes=0)
+    origins, directions = camera_rays(5)
+    estimator.sampling(origins, directions, far_plane=0.01)  # they end before it: said, too
+    estimator.sampling(origins * 100.0, directions, far_plane=4.0)
+    said = [record.getMessage() for record in caplog.records]
+    assert len(said) == 1 and said[0].startswith("none of 5 rays comes near what this occupancy is")
+    caplog.clear()
+    quiet = LearnedOccupancyEstimator(Balls(kind), cache_bytes=0)
+    quiet.eval().sampling(origins * 100.0, directions, far_plane=4.0)  # a part of a picture
+    quiet.train().sampling(origins, directions, far_plane=4.0)
+    quiet.sampling(origins[:0], directions[:0], far_plane=4.0)
+    assert not caplog.records
 
 
 def test_rays_may_be_in_double_precision():

@@ -16,13 +16,15 @@ from leco_plugin.space import Space
 SCRIPT = Path(__file__).parents[2] / "examples" / "plain_torch_nerfacc_loop.py"
 
 
-def test_the_example_trains_in_thirty_lines_without_nerfstudio(tmp_path):
+@pytest.mark.parametrize("kind", ["box", "contraction"])
+def test_the_example_trains_in_thirty_lines_without_nerfstudio(kind, tmp_path):
     pytest.importorskip("nerfacc")
     lines = SCRIPT.read_text().splitlines()
     assert len(lines) <= 30
     assert "nerfstudio" not in "".join(lines)
     torch.manual_seed(0)
-    occupancy = Occupancy(Gate(GateConfig()), Space(), threshold=0.5)
+    report = {"near": 0.05, "far": 3.0}
+    occupancy = Occupancy(Gate(GateConfig()), Space(kind), threshold=0.5, report=report)
     occupancy.save(tmp_path / "occupancy.safetensors")
     command = [sys.executable, str(SCRIPT), str(tmp_path / "occupancy.safetensors"), "30"]
     result = subprocess.run(command, capture_output=True, text=True, check=False)

@@ -125,7 +125,11 @@ def test_mistakes_are_named():
         build_estimator("grid")
     with pytest.raises(ValueError, match="'learned-occupancy' needs an occupancy"):
         build_estimator("learned-occupancy", aabb=BOX)
-    with pytest.raises(ValueError, match="'dense' has nothing for hosts that call a proposal"):
+    with pytest.raises(ValueError, match="'dense' has no option 'foo' in packed hosts"):
+        build_estimator("dense", foo=1)
+    with pytest.raises(ValueError, match=r"^sampler 'occupancy-grid' needs aabb$"):
+        build_estimator("occupancy-grid")
+    with pytest.raises(ValueError, match="'dense' has nothing for proposal hosts"):
         build_proposal("dense")
 
 

@@ -1,0 +1,70 @@
+"""The code of docs/own-loop.md runs as it stands, and its frame leads where it says."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from samplers.analytic_occupancy import camera_rays
+
+from leco_plugin.models.gate import Gate, GateConfig
+from leco_plugin.occupancy import Occupancy
+from leco_plugin.samplers.registry import OURS
+from leco_plugin.space import Space
+
+PAGE = (Path(__file__).parents[2] / "docs" / "own-loop.md").read_text()
+SAMPLING, MOVING = re.findall(r"```python\n(.*?)```", PAGE, re.DOTALL)
+SCALE = 0.01
+
+
+@pytest.fixture
+def file(tmp_path: Path) -> Path:
+    """An occupancy in units of 100 metres."""
+    torch.manual_seed(0)
+    frame = torch.cat([torch.eye(3) * SCALE, torch.tensor([[0.1], [0.2], [0.3]])], dim=1)
+    report: dict[str, Any] = {"near": 0.5, "far": 4.0, "step_size": 0.02, "cone_angle": 0.01}
+    report["frame"] = frame.tolist()
+    occupancy = Occupancy(Gate(GateConfig()), Space(), threshold=0.5, report=report)
+    occupancy.save(tmp_path / "occupancy.safetensors")
+    return tmp_path / "occupancy.safetensors"
+
+
+def test_its_code_samples_in_the_scenes_coordinates_and_in_the_photographs(file: Path) -> None:
+    origins, directions = camera_rays(40)
+    code = SAMPLING.replace('"cuda"', '"cpu"').replace("occupancy.safetensors", str(file))
+    given: dict[str, Any] = {
+        "rays_o": origins,
+        "rays_d": directions,
+        "sigma_fn": lambda starts, ends, rays: torch.ones_like(starts),
+    }
+    exec(code.replace("stratified=True", "stratified=False"), given)
+    assert len(given["t_starts"]) > 100
+
+    (frame,) = [torch.tensor(given["occupancy"].report["frame"])]
+    metres = {"rays_o": (origins - frame[:, 3]) / SCALE, "rays_d": directions}
+    moved: dict[str, Any] = {**given, **metres, "torch": torch}
+    exec(MOVING, moved)
+    torch.testing.assert_close(moved["rays_o"], origins)
+    assert torch.allclose(frame[:, :3].det() ** (1 / 3), torch.tensor(SCALE))
+    report = given["occupancy"].report
+    rays, t_starts, _ = given["estimator"].sampling(
+        moved["rays_o"],
+        moved["rays_d"],
+        sigma_fn=lambda starts, ends, rays: torch.full_like(starts, SCALE),
+        near_plane=report["near"] / SCALE,
+        far_plane=report["far"] / SCALE,
+        render_step_size=report["step_size"] / SCALE,
+        cone_angle=report["cone_angle"],
+        alpha_thre=0.01,
+    )
+    assert rays.equal(given["ray_indices"])
+    torch.testing.assert_close(t_starts * SCALE, given["t_starts"], rtol=1e-3, atol=1e-4)
+
+
+def test_it_names_the_samplers_of_packed_hosts() -> None:
+    rows = re.findall(r"^\| `([\w-]+)` \| `(?:aabb|occupancy)`", PAGE, re.MULTILINE)
+    packed = {name for name, spec in OURS.items() if spec.estimator is not None}
+    assert set(rows) == {name for name in packed if OURS[name].gate_encoding is None}
