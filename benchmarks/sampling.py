@@ -208,7 +208,7 @@ def main(options: Options) -> None:
         occupancy = fit_occupancy(options.device)
     figures = [
         *compare_with_grid(occupancy, 4096, options.rounds),
-        compare_with_grid(occupancy, 256, options.rounds)[0],
+        compare_with_grid(occupancy, 256, 5 * options.rounds)[0],
         compare_with_matrix_products(occupancy, options.rounds),
         *compare_with_one_pass(options.device, options.rounds),
         *share_of_training(occupancy, options.rounds),

@@ -123,6 +123,8 @@ class Estimator(nn.Module):
         for name, limit in (("t_min", t_min), ("t_max", t_max)):
             if limit is not None and limit.shape != t_mins.shape:
                 raise ValueError(f"{name} must be {list(t_mins.shape)}, got {list(limit.shape)}")
+            if limit is not None and limit.device != self.device:
+                raise ValueError(f"{name} is on {limit.device}, the estimator on {self.device}")
         t_mins = t_mins if t_min is None else t_mins.maximum(t_min.to(t_mins))
         t_maxs = t_maxs if t_max is None else t_maxs.minimum(t_max.to(t_maxs))
         check_rays(rays_o, rays_d, t_mins, t_maxs)

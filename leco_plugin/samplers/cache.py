@@ -18,6 +18,8 @@ from typing import Literal, NamedTuple, Protocol
 import torch
 from torch import Tensor, nn
 
+from leco_plugin.space import contract
+
 EMPTY, OCCUPIED, MIXED = 0, 1, 2
 
 BRICK_BITS = 2
@@ -133,15 +135,13 @@ class CellCache(nn.Module):
         super().__init__()
         self.report = report
         self.resolution = report.resolution
-        self._map: Callable[[Tensor], Tensor] | None = None
+        self.contracted = space.kind == "contraction"
         scale = torch.full((1,), report.resolution / 2.0)
         shift = torch.full((3,), report.resolution / 2.0 + 1.0)
-        if space.kind == "box":
+        if not self.contracted:
             # An affine mapping folds into the scaling to cells.
             scale = scale / space.half_extent.detach().cpu()
             shift = shift - space.center.detach().cpu() * scale
-        else:
-            self._map = space.map
         center, half_extent = space.center.detach().clone(), space.half_extent.detach().clone()
         uniform = torch.tensor([[FINE_OCCUPIED], [FINE_EMPTY]], dtype=torch.uint8)
         uniform = uniform.to(tables.fine.device).expand(UNIFORM, BRICK**3)
@@ -236,7 +236,7 @@ class CellCache(nn.Module):
         The contraction f(x) = x (2 - 1/m) / m, m = max|x|, has Jacobian rows whose absolute sum is
         at most (4m - 3) / m^2, which grows to 4/3 at m = 3/2 and falls after.
         """
-        if self._map is None:
+        if not self.contracted:
             return self.scale[0]
         distance = (positions.T - self.center).abs().amax(dim=0)
         inner = ((distance - radii) / self.half_extent).clamp(min=1.5)
@@ -247,8 +247,9 @@ class CellCache(nn.Module):
 
         The border is the first and the last coarse cell.
         """
-        if self._map is not None:
-            positions = self._map(positions)
+        if self.contracted:
+            scaled = (positions - self.center.view(3)) / self.half_extent
+            positions = contract(scaled) * 0.5
         cells = torch.addcmul(self.shift * parts, positions.T, self.scale * parts)
         return cells.nan_to_num_(nan=0.0).clamp_(0.0, parts * (self.resolution + 1.5))
 

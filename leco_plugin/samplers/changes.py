@@ -8,11 +8,13 @@ from torch import Tensor, nn
 class Seen:
     """The tensors of a module at one time: where each lies, and how often it was written to.
 
-    Of what is no module nothing is known: it stays as it is. Of tensors made in
-    `torch.inference_mode` torch counts no writes, and those are not noticed.
+    Of what is no module nothing more is known than which it is. Writes that torch does not count
+    are not noticed: through `.data`, to tensors made in `torch.inference_mode`, and those by which
+    `DistributedDataParallel` gives one rank's buffers to the others.
     """
 
     def __init__(self, module: object) -> None:
+        self._which = id(module)  # held, it would never go from a weak dictionary
         tensors = _tensors(module)
         self._marks = [_mark(tensor) for tensor in tensors]
         # held, so that nothing else comes to lie at the same address
@@ -20,7 +22,8 @@ class Seen:
 
     def is_still(self, module: object) -> bool:
         """Whether a module has these tensors, unwritten since; False may be a false alarm."""
-        return [_mark(tensor) for tensor in _tensors(module)] == self._marks
+        same = id(module) == self._which
+        return same and [_mark(tensor) for tensor in _tensors(module)] == self._marks
 
 
 def _tensors(module: object) -> list[Tensor]:

@@ -26,14 +26,16 @@ _log = logging.getLogger(__name__)
 ANSWER_RESOLUTION = 64
 """Cells along each axis in which `binaries` and `occs` answer."""
 
+RAYS_THAT_TELL = 32
+"""Of a batch from random pixels not all look past a scene; a few rays into the sky do."""
+
 
 class LearnedOccupancyEstimator(Estimator):
     """Samples where a frozen gate says that there is something.
 
     Box and cells follow the occupancy: after another gate was loaded into it, its threshold was
-    changed or it was replaced, the next question has them made anew, in seconds. Writes through
-    `.data`, and to tensors made in `inference_mode`, are not counted by torch and go unnoticed. A
-    gate that is still trained is asked without cells (`cache_bytes=0`).
+    changed or it was replaced, the next question has them made anew, in seconds; `Seen` says what
+    goes unnoticed. A gate that is still trained is asked without cells (`cache_bytes=0`).
 
     Args:
         occupancy: the frozen gate with its space and threshold.
@@ -62,7 +64,8 @@ class LearnedOccupancyEstimator(Estimator):
     ) -> None:
         super().__init__()
         if not hasattr(occupancy, "space"):
-            raise TypeError(f"Occupancy.load(FILE) gives an occupancy, and {occupancy!r} is none")
+            given = type(occupancy).__name__
+            raise TypeError(f"Occupancy.load(FILE) gives an occupancy; a {given} is none")
         self.occupancy = occupancy
         self._warned = False
         self.cache_bytes, self.tolerance = cache_bytes, tolerance
@@ -77,28 +80,35 @@ class LearnedOccupancyEstimator(Estimator):
         """Derives box and cells anew where the occupancy is no longer what they are of."""
         if self._seen.is_still(self.occupancy):
             return
-        if _same(_decisive(self.occupancy), self._derived_from):  # moved, or loaded once more
-            self._seen = Seen(self.occupancy)
-        else:
+        if self.cache_bytes > 0:
+            # moved, or loaded once more
+            if _same(_decisive(self.occupancy), self._derived_from):
+                self._seen = Seen(self.occupancy)
+                return
             _log.info("the occupancy has changed: box and cells are made anew")
-            self._derive()
+        self._derive()
 
     def _derive(self) -> None:
         """Builds what follows from the occupancy: its box and the cells."""
-        self._seen = Seen(self.occupancy)
-        self._derived_from = _decisive(self.occupancy)
+        seen = Seen(self.occupancy)
         if not self._box_is_given:
             bounded = self.occupancy.space.kind == "box"
             self._box = self._uncontracted_box() if bounded else self._box[:0]
-        self.cache = None
         if self.cache_bytes > 0:
-            try:
-                with torch.autocast(self.device.type, enabled=False):  # whatever the host is in
-                    self.cache = build_cache(
-                        self.occupancy, budget=self.cache_bytes, tolerance=self.tolerance
-                    )
-            except ValueError as reason:
-                _log.warning("no cell cache, sampling will be slower: %s", reason)
+            decisive = _decisive(self.occupancy)
+            self.cache = self._built()
+            self._derived_from = decisive
+        self._seen = seen  # last: what is stopped on the way is begun anew
+
+    def _built(self) -> CellCache | None:
+        try:
+            with torch.autocast(self.device.type, enabled=False):  # whatever the host is in
+                return build_cache(
+                    self.occupancy, budget=self.cache_bytes, tolerance=self.tolerance
+                )
+        except ValueError as reason:
+            _log.warning("no cell cache, sampling will be slower: %s", reason)
+            return None
 
     def _uncontracted_box(self) -> Tensor:
         space = self.occupancy.space
@@ -107,6 +117,7 @@ class LearnedOccupancyEstimator(Estimator):
         ).reshape(1, 6)
 
     def questions(self) -> tuple[OccupiedFn | None, NearFn | None]:
+        self._follow()
         return self.occupied, None if self.cache is None else self.cache.near
 
     def kept(
@@ -125,7 +136,7 @@ class LearnedOccupancyEstimator(Estimator):
         self._follow()
         samples = fused.march(self.occupancy, self.cache, rays_o.device, lambda: number(*rays))
         samples = super().kept(*rays) if samples is None else samples
-        if self.training and not (len(samples[0]) or self._warned):
+        if self.training and not (self._warned or self._box_is_given or len(samples[0])):
             self._warned = self._warn_of_rays_elsewhere(rays_o, rays_d, t_mins, t_maxs)
         return samples
 
@@ -135,11 +146,12 @@ class LearnedOccupancyEstimator(Estimator):
         """Says so where no ray of a batch comes near: they are in other coordinates then."""
         box = self.aabbs[0].to(rays_o)
         enters, leaves = intersect_box(rays_o, rays_d, box)
-        if not len(rays_o) or bool((enters.maximum(t_mins) < leaves.minimum(t_maxs)).any()):
+        meets = enters.maximum(t_mins) < leaves.minimum(t_maxs)
+        if len(rays_o) < RAYS_THAT_TELL or bool(meets.any()):
             return False
         _log.warning(
-            "none of %d rays comes near what this occupancy is of, %s: rays must be in the "
-            "coordinates in which it was learned (`frame` in its report leads there)",
+            "none of a batch of %d rays comes near what this occupancy is of, %s: rays must be in "
+            "the coordinates in which it was learned (`frame` in its report leads there)",
             len(rays_o),
             " to ".join(str([round(x, 3) for x in corner]) for corner in box.view(2, 3).tolist()),
         )
@@ -153,9 +165,10 @@ class LearnedOccupancyEstimator(Estimator):
     def occupied(self, positions: Tensor) -> Tensor:
         """The gate's decision, from the cache where it is sure; positions [N, 3] to bool [N]."""
         self._follow()
-        if self.cache is None:
+        cache = self.cache
+        if cache is None:
             return self.occupancy.occupied(positions)
-        decided, left_open = self.cache.decide(positions)
+        decided, left_open = cache.decide(positions)
         if left_open.numel():
             asked = positions.T.index_select(1, left_open).T
             decided.index_copy_(0, left_open, self.occupancy.occupied(asked))
@@ -208,8 +221,8 @@ def _decisive(occupancy: OccupancyLike) -> list[Tensor]:
 
 
 def _same(some: list[Tensor], others: list[Tensor]) -> bool:
-    """Whether two such lists are alike in every type and value."""
-    return len(some) == len(others) and all(
+    """Whether two such lists are alike in every type and value, and hold any."""
+    return 0 < len(some) == len(others) and all(
         one.dtype == other.dtype and torch.equal(one, other)
         for one, other in zip(some, others, strict=True)
     )

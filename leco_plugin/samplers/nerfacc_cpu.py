@@ -75,8 +75,9 @@ def _takes_as_much(replacement: Function, original: Function | None) -> bool:
 def _rebind(replacements: dict[Function, Function]) -> None:
     """Replace functions by others in every module that has one of them, nerfacc's or not."""
     by_identity = {id(old): new for old, new in replacements.items()}
-    for module in [each for each in sys.modules.values() if isinstance(each, ModuleType)]:
-        for name, value in list(vars(module).items()):
+    for module in [each for each in list(sys.modules.values()) if isinstance(each, ModuleType)]:
+        # not vars: that would load a module which waits for its first use
+        for name, value in list(object.__getattribute__(module, "__dict__").items()):
             if id(value) in by_identity:
                 setattr(module, name, by_identity[id(value)])
 

@@ -74,6 +74,8 @@ class _DensityWeights(torch.autograd.Function):
             flow = torch.addcmul(flow, grad_trans, trans)
         if grad_alphas is not None:
             own = own + grad_alphas
+        # what is no number shows in its own sample; here it would reach all rays
+        flow = flow.nan_to_num(nan=0.0, posinf=0.0, neginf=0.0)
         later = _exclusive(flow, ctx.rays, reverse=True).to(flow.dtype)
         return torch.addcmul(own, own, alphas, value=-1.0) - later, None
 

@@ -66,7 +66,10 @@ def checked_box(aabb: Sequence[float] | Tensor) -> Tensor:
     Raises:
         ValueError: it is not six finite numbers, or it is empty.
     """
-    box = torch.as_tensor(aabb).detach().float().reshape(-1)
+    try:
+        box = torch.as_tensor(aabb).detach().float().reshape(-1)
+    except (TypeError, ValueError, RuntimeError):
+        raise ValueError(f"aabb must be a finite box (min, max), got {aabb!r}") from None
     if box.shape != (6,) or not bool((box[:3] < box[3:]).all() and box.isfinite().all()):
         raise ValueError(f"aabb must be a finite box (min, max), got {box.tolist()}")
     return box

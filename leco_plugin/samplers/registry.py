@@ -135,20 +135,38 @@ def _build(name: str, kind: str, options: dict[str, Any]) -> nn.Module:
         check_gate(name, getattr(getattr(options["occupancy"], "gate", None), "config", None))
     refuse_unknown_options(name, [each for each in options if each not in GIVEN], (kind,))
     build = _loaded(builder)
-    for needed, parameter in inspect.signature(build).parameters.items():
-        named = parameter.kind in (parameter.POSITIONAL_OR_KEYWORD, parameter.KEYWORD_ONLY)
-        if named and parameter.default is parameter.empty and needed not in options:
+    for needed, parameter in (_parameters(build) or {}).items():
+        if parameter.default is parameter.empty and needed not in options:
             raise ValueError(f"sampler {name!r} needs {needed}")
     return build(**options)
 
 
 def _loaded(builder: Callable[..., nn.Module] | str) -> Callable[..., nn.Module]:
-    """A builder, imported where a spec says where it is."""
+    """A builder, imported where a spec says where it is.
+
+    Raises:
+        ValueError: there is nothing.
+    """
     if not isinstance(builder, str):
         return builder
     module, _, attribute = builder.partition(":")
-    made: Callable[..., nn.Module] = getattr(importlib.import_module(module), attribute)
+    try:
+        made: Callable[..., nn.Module] = getattr(importlib.import_module(module), attribute)
+    except (ImportError, AttributeError) as error:
+        raise ValueError(f"the builder {builder} cannot be imported: {error}") from None
     return made
+
+
+def _parameters(builder: Callable[..., nn.Module]) -> dict[str, inspect.Parameter] | None:
+    """What a builder takes by name; None where it takes any, or nobody knows."""
+    try:
+        found = inspect.signature(builder).parameters
+    except ValueError:  # a class of a compiled extension
+        return None
+    if any(each.kind is each.VAR_KEYWORD for each in found.values()):
+        return None
+    by_name = (inspect.Parameter.POSITIONAL_OR_KEYWORD, inspect.Parameter.KEYWORD_ONLY)
+    return {name: each for name, each in found.items() if each.kind in by_name}
 
 
 def refuse_unknown_options(
@@ -167,8 +185,8 @@ def refuse_unknown_options(
     known: set[str] = set()
     for builder in (getattr(spec, kind) for kind in kinds):
         if builder is not None:
-            parameters = inspect.signature(_loaded(builder)).parameters
-            if any(each.kind is each.VAR_KEYWORD for each in parameters.values()):
+            parameters = _parameters(_loaded(builder))
+            if parameters is None:
                 return
             known |= parameters.keys() - GIVEN
     unknown = next((option for option in options if option not in known), None)

@@ -107,6 +107,21 @@ def segment_scan(
     return total - (inclusive if exclusive else before)
 
 
+def scan_of_any(
+    values: Tensor, rays: Segments, exclusive: bool = False, reverse: bool = False
+) -> Tensor:
+    """`segment_scan` of floating values that need not be finite; what is not stays on its ray."""
+    sums = segment_scan(values.masked_fill(~values.isfinite(), 0.0), rays, exclusive, reverse)
+    # A global scan would carry one ray's inf into all later rays: count infinities apart,
+    # +inf in the low half of an int64, -inf in the high half, NaN as both.
+    positive = ((values == torch.inf) | values.isnan()).long()
+    negative = ((values == -torch.inf) | values.isnan()).long()
+    met = segment_scan(positive + (negative << 31), rays, exclusive, reverse)
+    met_positive, met_negative = (met & (2**31 - 1)) > 0, (met >> 31) > 0
+    sums = sums.masked_fill(met_positive, torch.inf).masked_fill(met_negative, -torch.inf)
+    return sums.masked_fill(met_positive & met_negative, torch.nan)
+
+
 def _padded_scan(values: Tensor, rays: Segments, exclusive: bool, reverse: bool) -> Tensor:
     """`segment_scan` over a [n_rays, longest] matrix: its width waits for the device once."""
     places = torch.arange(len(values), device=values.device)
@@ -134,22 +149,13 @@ class _PackedSum(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, inputs: Tensor, rays: Segments, exclusive: bool) -> Tensor:
         ctx.rays, ctx.exclusive = rays, exclusive
-        finite = inputs.isfinite() if inputs.is_floating_point() else None
-        if finite is None:
+        if not inputs.is_floating_point():
             return segment_scan(inputs, rays, exclusive)
-        sums = segment_scan(inputs.masked_fill(~finite, 0.0), rays, exclusive)
-        # A global scan would carry one ray's inf into all later rays: count infinities apart,
-        # +inf in the low half of an int64, -inf in the high half, NaN as both.
-        positive = ((inputs == torch.inf) | inputs.isnan()).long()
-        negative = ((inputs == -torch.inf) | inputs.isnan()).long()
-        met = segment_scan(positive + (negative << 31), rays, exclusive)
-        met_positive, met_negative = (met & (2**31 - 1)) > 0, (met >> 31) > 0
-        sums = sums.masked_fill(met_positive, torch.inf).masked_fill(met_negative, -torch.inf)
-        return sums.masked_fill(met_positive & met_negative, torch.nan).to(inputs.dtype)
+        return scan_of_any(inputs, rays, exclusive).to(inputs.dtype)
 
     @staticmethod
     def backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, None, None]:
-        return segment_scan(grad, ctx.rays, ctx.exclusive, reverse=True).to(grad.dtype), None, None
+        return scan_of_any(grad, ctx.rays, ctx.exclusive, reverse=True).to(grad.dtype), None, None
 
 
 class _PackedProduct(torch.autograd.Function):
@@ -170,7 +176,8 @@ class _PackedProduct(torch.autograd.Function):
         zeros, sign = counts & (2**31 - 1), 1 - 2 * ((counts >> 62) & 1)
         met_bad = ((counts >> 31) & (2**31 - 1)) > 0
         logs = wide.masked_fill(zero | bad, 1.0).abs().log()
-        # exp(1e3) is already infinite and exp(-1e3) zero: clamping keeps rays apart, loses nothing.
+        # exp(1e3) is already infinite and exp(-1e3) zero: clamping keeps rays apart, and loses
+        # nothing but a product of infinity with what is nearly zero.
         logs = logs.clamp(-1e3, 1e3)
         nonzero_product = segment_scan(logs, rays, exclusive).exp() * sign
         outputs = nonzero_product.masked_fill(zeros > 0, 0.0).masked_fill(met_bad, torch.nan)
@@ -183,8 +190,8 @@ class _PackedProduct(torch.autograd.Function):
     def backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, None, None]:
         inputs, zero, outputs, outputs_but_for_one_zero = ctx.saved_tensors
         wide = grad.to(inputs.dtype)
-        later = segment_scan(wide * outputs, ctx.rays, ctx.exclusive, reverse=True)
-        at_zero = segment_scan(
+        later = scan_of_any(wide * outputs, ctx.rays, ctx.exclusive, reverse=True)
+        at_zero = scan_of_any(
             wide * outputs_but_for_one_zero, ctx.rays, ctx.exclusive, reverse=True
         )
         grads = torch.where(zero, at_zero, later / inputs.masked_fill(zero, 1.0))
@@ -219,7 +226,8 @@ def inclusive_sum(
         indices: ray of each sample, int64 [n_samples], non-decreasing.
 
     Returns:
-        Tensor like `inputs`; a non-finite value reaches later samples of its own ray only.
+        Tensor like `inputs`; a non-finite value reaches later samples of its own ray only. A finite
+        one 1e16 times as large as others drowns them on every ray.
     """
     return _scan(inputs, packed_info, indices, exclusive=False, product=False)
 

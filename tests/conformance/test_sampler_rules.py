@@ -79,7 +79,7 @@ def without_jitter(occupancy, num_samples, initial_sampler, frame=None):
     [
         (
             SamplerSpec("typo", estimator="leco_plugin.samplers.registry:build_dens"),
-            "the estimator of sampler 'crooked' cannot be built: AttributeError: .*build_dens",
+            "the estimator of sampler 'crooked' cannot be built: ValueError: .*build_dens",
         ),
         (
             SamplerSpec("no jitter", proposal=without_jitter, needs_occupancy=True),

@@ -19,6 +19,7 @@ from leco_plugin.samplers import packed
 from leco_plugin.samplers.cache_build import build_cache as really_build_cache
 from leco_plugin.samplers.estimator import LearnedOccupancyEstimator
 from leco_plugin.samplers.grid import DenseEstimator, OccupancyGridEstimator
+from leco_plugin.space import Space
 
 BUDGET = 1 << 16
 
@@ -273,6 +274,58 @@ def test_a_gate_that_changes_decides_from_the_next_question_on(change, caplog):
     assert "the occupancy has changed: box and cells are made anew" in caplog.text
 
 
+class Plain:
+    """An occupancy that is no module: half of space."""
+
+    threshold = 0.5
+
+    def __init__(self, towards: float) -> None:
+        self.space, self.towards = Space("box"), towards
+
+    def query(self, positions):
+        inside = (positions.abs() <= 1.0).all(dim=-1)
+        return torch.sigmoid(20.0 * self.towards * positions[:, 0]) * inside
+
+    def occupied(self, positions):
+        return self.query(positions) >= self.threshold
+
+
+def test_what_is_no_module_is_followed_when_it_is_replaced(built):
+    estimator = LearnedOccupancyEstimator(Plain(1.0), cache_bytes=BUDGET)
+    positions = torch.rand(500, 3) * 1.8 - 0.9
+    before = estimator.occupied(positions)
+    estimator.occupancy = Plain(-1.0)
+    assert estimator.occupied(positions).equal(~before) and len(built) == 2
+    assert estimator.occupied(positions).equal(~before) and len(built) == 2
+
+
+def test_cells_that_are_stopped_on_the_way_are_begun_anew(monkeypatch):
+    estimator = LearnedOccupancyEstimator(SLAB.occupancy(), cache_bytes=BUDGET)
+    estimator.occupancy = moved()
+    with monkeypatch.context() as patched, pytest.raises(KeyboardInterrupt):
+        patched.setattr(module, "build_cache", lambda *_, **__: exec("raise KeyboardInterrupt"))
+        estimator.occupied(torch.zeros(1, 3))
+    assert_decided_by(estimator, moved())
+
+
+def test_without_cells_a_gate_that_is_trained_is_followed_in_silence(caplog):
+    asked = LearnedOccupancyEstimator(SLAB.occupancy(), cache_bytes=0)
+    caplog.set_level("INFO")
+    asked.occupancy.space.center.add_(0.1)
+    assert_decided_by(asked, asked.occupancy)
+    assert "anew" not in caplog.text
+
+
+def test_cells_of_an_unbounded_space_are_no_part_of_the_occupancy():
+    balls = Balls("contraction")
+    estimator = LearnedOccupancyEstimator(balls, cache_bytes=BUDGET)
+    estimator.occupancy = copy.deepcopy(balls)
+    positions = torch.rand(2000, 3) * 4.0 - 2.0
+    before = estimator.occupied(positions)
+    balls.space.center.add_(1.0)
+    assert estimator.occupied(positions).equal(before)
+
+
 def test_estimators_that_share_an_occupancy_all_follow_it():
     occupancy, other = SLAB.occupancy(), LearnedOccupancyEstimator(moved(), cache_bytes=0)
     sharing = [LearnedOccupancyEstimator(occupancy, cache_bytes=0) for _ in range(2)]
@@ -296,7 +349,7 @@ def test_cells_are_kept_while_the_gate_says_the_same(built):
     assert len(built) == 1
 
 
-def test_to_notice_a_change_waits_for_no_device():
+def test_to_see_that_nothing_has_changed_waits_for_no_device():
     asked = LearnedOccupancyEstimator(SLAB.occupancy(), cache_bytes=BUDGET)
     with Waits() as waits:
         asked._follow()
@@ -309,6 +362,8 @@ NO_BOXES = {
     "NaN": [torch.nan] * 6,
     "infinite": [0.0] * 3 + [torch.inf] * 3,
     "of three numbers": [0.0, 1.0, 2.0],
+    "ragged": [[0.0], [1.0, 2.0]],
+    "a word": "box",
 }
 
 
@@ -319,7 +374,7 @@ def test_what_is_no_box_is_refused_in_a_line(aabb):
         OccupancyGridEstimator,
         lambda aabb: LearnedOccupancyEstimator(Balls(), aabb, cache_bytes=0),
     ):
-        with pytest.raises(ValueError, match=r"^aabb must be a finite box \(min, max\), got \["):
+        with pytest.raises(ValueError, match=r"^aabb must be a finite box \(min, max\), got "):
             build(aabb)
 
 
@@ -373,6 +428,8 @@ def test_rays_that_do_not_fit_are_named(bare):
     origins, directions = camera_rays(3)
     with pytest.raises(ValueError, match=r"t_min must be \[3\], got \[2\]"):
         bare.sampling(origins, directions, t_min=torch.zeros(2))
+    with pytest.raises(ValueError, match="t_max is on meta, the estimator on cpu"):
+        bare.sampling(origins, directions, t_max=torch.ones(3, device="meta"))
     with pytest.raises(ValueError, match="rays are on meta"):
         bare.sampling(origins.to("meta"), directions.to("meta"))
     with pytest.raises(ValueError, match=r"rays_d must be \[3, 3\]"):
@@ -393,7 +450,7 @@ def test_rays_that_do_not_fit_are_named(bare):
 
 
 def test_what_is_no_occupancy_is_refused_in_a_line():
-    with pytest.raises(TypeError, match=r"^Occupancy\.load\(FILE\) .*'box\.safetensors' is none$"):
+    with pytest.raises(TypeError, match=r"^Occupancy\.load\(FILE\) gives an .*; a str is none$"):
         LearnedOccupancyEstimator("box.safetensors")
 
 
@@ -408,16 +465,18 @@ def test_a_hosts_field_is_no_part_of_its_estimator():
 @pytest.mark.parametrize("kind", ["box", "contraction"])
 def test_rays_in_other_coordinates_are_named_once(kind, caplog):
     estimator = LearnedOccupancyEstimator(Balls(kind), cache_bytes=0)
-    origins, directions = camera_rays(5)
-    estimator.sampling(origins, directions, far_plane=0.01)  # they end before it: said, too
-    estimator.sampling(origins * 100.0, directions, far_plane=4.0)
+    origins, directions = camera_rays(40)
+    for _ in range(2):
+        estimator.sampling(origins * 100.0, directions, far_plane=4.0)
     said = [record.getMessage() for record in caplog.records]
-    assert len(said) == 1 and said[0].startswith("none of 5 rays comes near what this occupancy is")
+    assert len(said) == 1 and said[0].startswith("none of a batch of 40 rays comes near what this")
     caplog.clear()
     quiet = LearnedOccupancyEstimator(Balls(kind), cache_bytes=0)
     quiet.eval().sampling(origins * 100.0, directions, far_plane=4.0)  # a part of a picture
     quiet.train().sampling(origins, directions, far_plane=4.0)
-    quiet.sampling(origins[:0], directions[:0], far_plane=4.0)
+    quiet.sampling(origins[:9] * 100.0, directions[:9], far_plane=4.0)
+    given = LearnedOccupancyEstimator(Balls(kind), [5.0] * 3 + [6.0] * 3, cache_bytes=0)
+    given.sampling(origins, directions, far_plane=4.0)
     assert not caplog.records
 
 

@@ -153,7 +153,7 @@ def test_rays_that_cannot_be_marched_are_refused_in_one_line():
         march(origins, directions, zeros, ones * 3e9, step_size=1.0, t_enters=ones * 2e9)
     missed = march(origins, directions, zeros, ones * 2e9, step_size=1.0, t_enters=ones * 3e9)
     assert missed[0].numel() == 0
-    with pytest.raises(ValueError, match=r"directions must be \[3, 3\], got \[2, 3\]"):
+    with pytest.raises(ValueError, match=r"rays_d must be \[3, 3\], got \[2, 3\]"):
         march(origins, directions[:2], zeros, ones, step_size=0.1)
     with pytest.raises(ValueError, match=r"t_mins must be \[3\], got \[3, 1\]"):
         march(origins, directions, zeros[:, None], ones, step_size=0.1)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib.util
 import sys
 from types import ModuleType
 
@@ -53,6 +54,20 @@ def test_what_was_imported_by_name_before_is_reached_too(monkeypatch):
     assert earlier.pack is nerfacc.pack_info and earlier.other is len
     nerfacc_cpu.uninstall()
     assert vars(earlier) == before
+
+
+def test_a_module_that_waits_for_its_first_use_goes_on_waiting(monkeypatch, tmp_path):
+    nerfacc_cpu.uninstall()
+    (tmp_path / "a_lazy_module.py").write_text("raise ImportError('of no concern')")
+    monkeypatch.syspath_prepend(tmp_path)
+    spec = importlib.util.find_spec("a_lazy_module")
+    spec.loader = importlib.util.LazyLoader(spec.loader)
+    lazy = importlib.util.module_from_spec(spec)
+    monkeypatch.setitem(sys.modules, "a_lazy_module", lazy)
+    spec.loader.exec_module(lazy)
+    nerfacc_cpu.install()
+    with pytest.raises(ImportError, match="of no concern"):
+        _ = lazy.anything
 
 
 def longer(rays_o, rays_d, binaries, aabbs, near, far, step_size, cone_angle, over_allocate): ...

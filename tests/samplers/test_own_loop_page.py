@@ -24,7 +24,9 @@ SCALE = 0.01
 def file(tmp_path: Path) -> Path:
     """An occupancy in units of 100 metres."""
     torch.manual_seed(0)
-    frame = torch.cat([torch.eye(3) * SCALE, torch.tensor([[0.1], [0.2], [0.3]])], dim=1)
+    turn = torch.linalg.qr(torch.randn(3, 3))[0]
+    turn = turn * torch.linalg.det(turn).sign() * SCALE
+    frame = torch.cat([turn, torch.tensor([[0.1], [0.2], [0.3]])], dim=1)
     report: dict[str, Any] = {"near": 0.5, "far": 4.0, "step_size": 0.02, "cone_angle": 0.01}
     report["frame"] = frame.tolist()
     occupancy = Occupancy(Gate(GateConfig()), Space(), threshold=0.5, report=report)
@@ -44,10 +46,15 @@ def test_its_code_samples_in_the_scenes_coordinates_and_in_the_photographs(file:
     assert len(given["t_starts"]) > 100
 
     (frame,) = [torch.tensor(given["occupancy"].report["frame"])]
-    metres = {"rays_o": (origins - frame[:, 3]) / SCALE, "rays_d": directions}
+    back = torch.linalg.inv(frame[:, :3])
+    metres = {
+        "rays_o": (origins - frame[:, 3]) @ back.T,
+        "rays_d": directions @ back.T * SCALE,  # of length 1
+    }
     moved: dict[str, Any] = {**given, **metres, "torch": torch}
     exec(MOVING, moved)
     torch.testing.assert_close(moved["rays_o"], origins)
+    torch.testing.assert_close(moved["rays_d"], directions * SCALE)
     assert torch.allclose(frame[:, :3].det() ** (1 / 3), torch.tensor(SCALE))
     report = given["occupancy"].report
     rays, t_starts, _ = given["estimator"].sampling(

@@ -149,6 +149,29 @@ def test_a_bad_density_does_not_leave_its_ray(bad):
     assert weights[4].isnan() == (bad != bad)
 
 
+@pytest.mark.parametrize("bad", [torch.nan, torch.inf])
+@pytest.mark.parametrize("by", ["density", "alpha"])
+def test_what_a_bad_sample_does_to_gradients_stays_on_its_ray(by, bad):
+    t_starts, t_ends, sigmas = random_samples()
+    alphas, rays = sigmas / 4.0, {"ray_indices": RAYS, "n_rays": N_RAYS}
+
+    def gradients(value: float | None) -> Tensor:
+        inputs = (sigmas if by == "density" else alphas).clone()
+        if value is not None:
+            inputs[4] = value
+        inputs.requires_grad_()
+        if by == "density":
+            outputs = packed.render_weight_from_density(t_starts, t_ends, inputs, **rays)
+        else:
+            outputs = packed.render_weight_from_alpha(inputs, **rays)
+        sum((output * t_ends).sum() for output in outputs).backward()
+        return inputs.grad
+
+    found, clean = gradients(bad), gradients(None)
+    torch.testing.assert_close(found[RAYS != 2], clean[RAYS != 2])
+    assert found[4].isnan() or bad == bad
+
+
 def test_prefix_transmittance_scales_weights():
     t_starts, t_ends, sigmas = random_samples()
     rays = {"ray_indices": RAYS, "n_rays": N_RAYS}

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import contextlib
+import functools
 import inspect
 import re
 import warnings
@@ -78,6 +80,47 @@ def test_a_builder_that_takes_anything_is_not_asked_what(monkeypatch):
     spec = SamplerSpec("takes all", estimator=lambda aabb, **options: torch.nn.Identity())
     monkeypatch.setitem(registry.OURS, "takes-all", spec)
     refuse_unknown_options("takes-all", ["whatever"])
+
+
+class TakesMore(torch.nn.Module):
+    """A builder that is a class."""
+
+    def __init__(self, aabb, occupancy, cells=4, *, levels=1):
+        super().__init__()
+        self.cells = cells * levels
+
+
+@pytest.mark.parametrize(
+    ("builder", "options", "said"),
+    [
+        (TakesMore, {"cells": 2, "levels": 3}, None),
+        (
+            TakesMore,
+            {"cubes": 2},
+            r"has no option 'cubes' in packed .*are cells, levels$",
+        ),
+        (functools.partial(TakesMore, cells=8), {"levels": 3}, None),
+        (functools.partial(TakesMore, cells=8), {"cubes": 2}, "has no option 'cubes'"),
+        (dict, {"whatever": 2}, None),  # nobody knows what a compiled class takes
+        ("nowhere.at_all:build", {}, r"nowhere\.at_all:build cannot be imported: No module named"),
+        ("math:build", {}, "math:build cannot be imported: module 'math' has no attribute 'build'"),
+    ],
+)
+def test_builders_of_any_kind_are_asked_what_they_take(builder, options, said, monkeypatch):
+    monkeypatch.setitem(registry.OURS, "theirs", SamplerSpec("theirs", estimator=builder))
+    expected = contextlib.nullcontext() if said is None else pytest.raises(ValueError, match=said)
+    with expected:
+        build_estimator("theirs", aabb=BOX, occupancy=None, **options)
+    if "cubes" not in options and said is None:
+        refuse_unknown_options("theirs", options)
+
+
+def test_a_builder_that_needs_what_it_is_not_given_says_so(monkeypatch):
+    monkeypatch.setitem(registry.OURS, "theirs", SamplerSpec("theirs", estimator=TakesMore))
+    with pytest.raises(ValueError, match=r"^sampler 'theirs' needs occupancy$"):
+        build_estimator("theirs", aabb=BOX)
+    with pytest.raises(ValueError, match=r"^aabb must be a finite box \(min, max\), got None$"):
+        build_estimator("occupancy-grid", aabb=None)
 
 
 def test_a_proposal_host_gets_a_sampler():

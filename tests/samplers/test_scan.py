@@ -111,6 +111,31 @@ def test_a_bad_value_stays_on_its_ray(function, bad):
     torch.testing.assert_close(outputs, expected, equal_nan=True)
 
 
+@pytest.mark.parametrize("bad", [torch.inf, -torch.inf, torch.nan])
+@pytest.mark.parametrize("function", SCANS)
+def test_what_a_bad_value_does_to_gradients_stays_on_its_ray(function, bad):
+    ray_indices, values = indices_of([2, 3, 2]), torch.tensor([1.0, 2.0, -1.0, 4.0, 0.5, 3.0, 1.0])
+
+    def gradients(middle: float) -> Tensor:
+        inputs = values.clone()
+        inputs[3] = middle
+        inputs.requires_grad_()
+        (function(inputs, indices=ray_indices) * values).sum().backward()
+        return inputs.grad
+
+    elsewhere = ray_indices != 1
+    torch.testing.assert_close(gradients(bad)[elsewhere], gradients(4.0)[elsewhere])
+
+
+@pytest.mark.parametrize("function", SCANS)
+def test_a_bad_gradient_stays_on_its_ray(function):
+    ray_indices, inputs = indices_of([2, 3, 2]), torch.rand(7).add(0.5).requires_grad_()
+    weights = torch.tensor([1.0, 2.0, -1.0, torch.nan, 0.5, 3.0, 1.0])
+    (function(inputs, indices=ray_indices) * weights).sum().backward()
+    bad = inputs.grad.isnan()
+    assert bad[2] and not bad[[0, 1, 5, 6]].any()
+
+
 @pytest.mark.parametrize("function", [inclusive_prod, exclusive_prod])
 def test_signs_zeros_and_nan_of_a_product_are_counted_apart(function):
     rays = [-1, -2, -3], [], [0, torch.nan, -1, 0], [torch.nan, 0, 0, 1], [-1, -1, 5]
