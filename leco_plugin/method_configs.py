@@ -94,5 +94,6 @@ leco_occupancy_paper = MethodSpecification(
         ),
         optimizers=_optimizers(540_000, dict.fromkeys(RATES, 5e-4)),
     ),
-    description="The same with the sizes of the paper: 8 experts of 7 x 256, 257 samples.",
+    description="The same in the sizes of the paper (8 experts of 7 x 256, 257 samples); for its "
+    "losses too, --pipeline.model.gate-loss.form paper.",
 )

@@ -120,6 +120,7 @@ def _ground(source: Source) -> Ground:
 
 def lesson_of(mapped: Tensor, taught: Evidence, losses: GateLossConfig) -> Lesson:
     """The contribution loss with the field's weights, as `leco-occupancy` teaches its gate."""
-    wide = widen(taught.weights, taught.ray_indices)
+    rays = taught.ray_indices  # every candidate of each
+    wide = widen(taught.weights, rays[1:] == rays[:-1])
     target = (wide / losses.weight_at_full).clamp(max=1.0)
     return Lesson(mapped, losses.emphasis * target, 1.0 - target)

@@ -22,7 +22,12 @@ from leco_plugin.compat.run_sizes import (
     keep_sizes,
     with_sizes_of,
 )
-from leco_plugin.compat.whole_checkpoints import first_not_finite, newest_whole, previous_of
+from leco_plugin.compat.whole_checkpoints import (
+    first_not_finite,
+    newest_whole,
+    previous_of,
+    step_of,
+)
 from leco_plugin.models.compute.ranks import say, say_what_is_logged
 from leco_plugin.models.failures import GateCollapsed, TrainingStopped
 from leco_plugin.samplers.kernels_off import VARIABLE, kernels_off
@@ -92,12 +97,13 @@ class AtomicTrainer(Trainer):
             return
         if self.config.steps_per_save > 0:
             self.save_checkpoint(step)
-        left = self._start_step + self.config.max_num_iterations - step - 1
-        going_on = (
-            f"--load-dir {self.checkpoint_dir} --max-num-iterations {left} goes on from there"
-        )
         parts = [f"step {step}: stopped by Ctrl-C", self._what_is_left()]
-        raise TrainingStopped("; ".join([*parts, *([going_on] if left > 0 else [])]))
+        saved = sorted(self.checkpoint_dir.glob("*.ckpt"))
+        if saved:  # a step that is in doubt is not saved: it goes on from the one before
+            left = self._start_step + self.config.max_num_iterations - step_of(saved[-1]) - 1
+            resume = f"--load-dir {self.checkpoint_dir} --max-num-iterations {left}"
+            parts += [f"{resume} goes on from there"] if left > 0 else []
+        raise TrainingStopped("; ".join(parts))
 
     def train(self) -> None:
         """Trains to the last step.

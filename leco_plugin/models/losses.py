@@ -1,7 +1,7 @@
 """What teaches the gate: the paper's two losses and the same two forces in logit form.
 
-Beside them stands the distortion loss of the field. All of them run in float32 and are means
-over the points given, so that their weights do not depend on the batch; of no points they are zero.
+Beside them stands the distortion loss of the field. All of them run in float32, and do not grow
+with the batch: they are means over the points or rays given, or sums that the caller divides.
 """
 
 from __future__ import annotations
@@ -56,16 +56,27 @@ def balance_loss(probabilities: Tensor, routes: Tensor) -> Tensor:
     return num_experts * (expert_shares(routes, num_experts) * probabilities.mean(dim=0)).sum()
 
 
-def widen(weights: Tensor, ray_indices: Tensor) -> Tensor:
+def adjoining(intervals: Intervals) -> Tensor:
+    """Whether each sample but the first follows the one before it on a ray, with no other left out
+    between them: bool [M - 1]."""
+    rays, starts, ends = intervals
+    return (rays[1:] == rays[:-1]) & (2.0 * starts[1:] < 3.0 * ends[:-1] - starts[:-1])
+
+
+def widen(weights: Tensor, adjoin: Tensor) -> Tensor:
     """The largest of each sample's weight and those of its two neighbours on the ray: [M] to [M].
 
     A surface that is taught with a margin of one step is found again by rays whose steps fall
     elsewhere.
+
+    Args:
+        weights: [M] in the order of rays, then distance.
+        adjoin: bool [M - 1], whether a sample and the one before it are neighbours.
     """
-    same_ray = (ray_indices[1:] == ray_indices[:-1]).to(weights.dtype)
+    factors = adjoin.to(weights.dtype)
     widened = weights.clone()
-    widened[1:] = torch.maximum(widened[1:], weights[:-1] * same_ray)
-    widened[:-1] = torch.maximum(widened[:-1], weights[1:] * same_ray)
+    widened[1:] = torch.maximum(widened[1:], weights[:-1] * factors)
+    widened[:-1] = torch.maximum(widened[:-1], weights[1:] * factors)
     return widened
 
 

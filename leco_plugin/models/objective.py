@@ -10,6 +10,7 @@ from torch import Tensor
 
 from leco_plugin.models.gate import occupancy_from_logits
 from leco_plugin.models.losses import (
+    adjoining,
     agreement_loss,
     balance_loss,
     contribution_loss,
@@ -145,7 +146,7 @@ def gate_losses(
     if config.form == "logit":
         weights = widen(
             shaded.weights.detach().index_select(0, before),
-            intervals.ray_indices.index_select(0, before),
+            adjoining(Intervals(*(part.index_select(0, before) for part in intervals))),
         )
         contribution = contribution_loss(
             logits.index_select(0, before), weights, config.weight_at_full, config.emphasis

@@ -19,8 +19,8 @@ from leco_plugin.samplers.packed import (
 from leco_plugin.space import Space
 
 VISIBLE = 1e-4
-"""Samples whose rendering weight is below this are not coloured: all of a ray's together change a
-pixel by at most one step of an 8-bit image."""
+"""Samples whose rendering weight is below this are not coloured: each changes a pixel by a fortieth
+of a step of an 8-bit image at most, a ray that is nothing but such haze by a few steps."""
 
 
 OPAQUE = 1e6

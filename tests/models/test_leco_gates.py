@@ -115,3 +115,17 @@ def test_a_gate_on_any_features_is_learned_frozen_and_saved(
     estimator = build_estimator(f"learned-occupancy-{kind}", occupancy=occupancy, cache_bytes=0)
     positions = torch.rand(1000, 3) - 0.5
     assert torch.equal(estimator.occupied(positions), model.occupancy().occupied(positions))
+
+
+def test_a_frozen_run_that_is_resumed_with_more_learn_steps_does_not_learn_again(
+    tiny_scene: Path,
+) -> None:
+    pipeline, _ = pipeline_of("frequency", tiny_scene)
+    model, attributes = pipeline.model, TrainingCallbackAttributes(None, None, pipeline, None)  # type: ignore[arg-type]
+    model.frozen.fill_(True)
+    model.config.schedule = replace(model.config.schedule, learn_steps=100 * LEARN_STEPS)
+    pipeline.get_training_callbacks(attributes)
+    assert model.progress.learn_steps == LEARN_STEPS  # from which it follows what is learned from
+    model.frozen.fill_(False)
+    pipeline.get_training_callbacks(attributes)
+    assert model.progress.learn_steps == 100 * LEARN_STEPS

@@ -10,6 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from leco_plugin.models.losses import (
+    adjoining,
     agreement_loss,
     balance_loss,
     contribution_loss,
@@ -19,6 +20,7 @@ from leco_plugin.models.losses import (
     imbalanced_gate_loss,
     termination_loss,
     transparency_loss,
+    widen,
 )
 from leco_plugin.models.rendering import Intervals
 from leco_plugin.samplers.packed import pack_info
@@ -36,6 +38,21 @@ def gate_gradient(counts: list[int], empty_ratio: float) -> tuple[float, torch.T
     loss.backward()
     assert logits.grad is not None
     return loss.item(), logits.grad.sum(dim=0)
+
+
+@given(seed=st.integers(0, 2**16), jitter=st.floats(0.0, 0.9))
+def test_targets_reach_one_step_further_and_over_no_gap(seed: int, jitter: float) -> None:
+    generator = torch.Generator().manual_seed(seed)
+    rays, steps = 4, 9
+    edges = (torch.arange(steps + 1) + jitter) * 0.1
+    kept = (torch.rand(rays, steps, generator=generator) < 0.7).nonzero()
+    intervals = Intervals(kept[:, 0], edges[kept[:, 1]], edges[kept[:, 1] + 1])
+    weights = torch.rand(len(kept), generator=generator)
+    at = {tuple(place): weight for place, weight in zip(kept.tolist(), weights, strict=True)}
+    expected = [
+        max(at.get((ray, step + more), torch.zeros(())) for more in (-1, 0, 1)) for ray, step in at
+    ]
+    assert widen(weights, adjoining(intervals)).tolist() == [float(value) for value in expected]
 
 
 def test_target_ratio_is_the_stationary_point() -> None:

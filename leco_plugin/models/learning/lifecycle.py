@@ -67,7 +67,8 @@ class Lifecycle:
             most += max(0, self.trainer._start_step - self.progress.since)
             self._say_if_short(configured, most)
         # nerfstudio makes callbacks after it has loaded a checkpoint
-        self.progress.begin(configured, most)
+        if not bool(model.frozen):  # else other steps would take it back into the first phase
+            self.progress.begin(configured, most)
         self.batches = Batches(model, self.pipeline.datamanager)
         config = model.config
         self.survey = survey(self.pipeline.datamanager, config.bounds, config.near, config.far)

@@ -33,6 +33,7 @@ def made(monkeypatch: pytest.MonkeyPatch) -> Any:
         device=torch.device("cpu"),
         frozen=torch.tensor(False),
         learning_kept=1.0,
+        learned=False,
         progress=Progress(),
         step=0,
         report={},
@@ -73,6 +74,15 @@ def test_a_healed_gate_is_not_followed_and_its_batches_are_no_longer_for_it(made
     made.model.step = 5
     made.batches.prepare(learning=True)
     assert made.sampler.num_rays_per_batch == 100  # until it has been seen what it keeps now
+
+
+def test_a_gate_that_is_never_frozen_is_not_followed_once_it_has_learned(made: Any) -> None:
+    made.model.learning_kept = 0.3
+    made.batches.prepare(learning=True)
+    assert made.sampler.num_rays_per_batch > 300
+    made.model.learned = True
+    made.batches.prepare(learning=False)
+    assert made.sampler.num_rays_per_batch == 100
 
 
 def test_known_distances_are_asked_for_only_while_learning_with_a_weight(
