@@ -37,7 +37,12 @@ NVIDIA's instant-ngp.
 
 *Never frozen* is the same model, whose gate goes on learning: it renders without skipping. *Equal
 experts, no gate* has as many scene experts, none for empty space, as Switch-NeRF, and never skips.
-*Price* is what skipping costs on held-out pixels at the moment of freezing.
+*Price* is what skipping costs on held-out pixels at the moment of freezing. Over seeds, qualities
+are means; costs, comparisons of one method with another and figures of occupancies are medians.
+
+How much sooner one method is than another depends on the machine: learning takes a number of steps,
+and on cores half as fast twice the share of the same time
+([figures](decisions.md#at-equal-time-on-half-the-speed-learning-takes-its-share-first)).
 """
 
 
@@ -55,7 +60,8 @@ def demo_table(report: dict[str, Any]) -> str:
     facts = report["occupancy"]
     lines += [
         "",
-        f"Occupancy: {facts['bytes'] / 1000:.0f} kB, learned in {facts['train_seconds']:.0f} of "
+        f"Occupancy: {facts['bytes'] / 1000:.0f} kB, learned and frozen in "
+        f"{report['runs'][0]['freeze_seconds']:.0f} of "
         f"{report['runs'][0]['train_seconds']:.0f} s; {facts['empty_fraction']:.1%} of all "
         f"candidates skipped for {facts['image_price_db']:+.3f} dB and "
         f"{facts['lost_surface_mass']:.1e} of the surface mass on held-out rays. Against the exact "

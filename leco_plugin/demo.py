@@ -230,7 +230,7 @@ def summary(report: dict[str, Any]) -> list[str]:
     recall = facts["kept_surface_recall"]
     lines = [
         f"occupancy: {facts['params']} parameters, {facts['bytes'] / 1000:.0f} kB, "
-        f"learned in {facts['train_seconds']:.0f} s",
+        f"learned and frozen in {guided['freeze_seconds']:.0f} s",
         f"  skips {facts['empty_fraction']:.1%} of all candidates for "
         f"{facts['image_price_db']:+.3f} dB"
         + (f", keeps {recall:.2%} of the true surface" if recall is not None else ""),
