@@ -21,7 +21,7 @@ from torch import Tensor, distributed
 
 from leco_plugin.models.compute.ranks import from_first, is_first, mean, share
 from leco_plugin.models.freezing import merging
-from leco_plugin.models.learning import lifecycle
+from leco_plugin.models.learning import batches, lifecycle
 from leco_plugin.models.leco import LecoModel
 from leco_plugin.occupancy import Occupancy
 
@@ -71,7 +71,13 @@ def lose_one(local_rank: int, world_size: int, config: Any, global_rank: int = 0
 
 def look_elsewhere() -> None:
     """Has this process look at its gate where no other does, and find fewer places kept."""
-    LecoModel.learning_kept = 0.5
+    prepare = batches.Batches.prepare
+
+    def half_kept(self: batches.Batches, learning: bool) -> None:
+        self.model.progress.learning_kept = 0.5
+        prepare(self, learning)
+
+    batches.Batches.prepare = half_kept  # type: ignore[method-assign]
     lifecycle.Lifecycle.probe_positions = property(  # type: ignore[assignment]
         lambda self: torch.rand(lifecycle.PROBES, 3)
     )

@@ -240,13 +240,12 @@ class LecoModel(Model):
             likely = self.gate.occupancy(mapped) >= self.config.likely_above
         dense = torch.rand_like(rays.t_mins) < self.config.look_everywhere
         kept = (likely | dense.index_select(0, intervals.ray_indices)).nonzero()[:, 0]
-        self.learning_kept = 0.9 * self.learning_kept + 0.1 * len(kept) / max(len(likely), 1)
+        share, progress = len(kept) / max(len(likely), 1), self.progress
+        progress.learning_kept = 0.9 * progress.learning_kept + 0.1 * share
         return Intervals(*(part.index_select(0, kept) for part in intervals))
 
     guided_kept = 1.0
     """Samples a ray that the frozen gate kept of the last batch, backdrops left out."""
-    learning_kept = 1.0
-    """Share of candidates that are shaded while learning, a running mean."""
 
     def shade(self, rays: Rays, intervals: Intervals) -> Shaded:
         """Renders intervals in this device's fastest precision."""

@@ -49,12 +49,12 @@ class Batches:
 
         The same in every process: the mean of their gradients is then that of one large batch.
         """
-        model = self.model
-        if model.learned or is_dense(model.progress, model.step):
+        model, progress = self.model, self.model.progress
+        if model.learned or is_dense(progress, model.step):
             # no longer followed; and what a gate kept that has collapsed says nothing
-            model.learning_kept = 1.0
-        model.learning_kept = mean(model.learning_kept, model.device)
-        wanted = min(model.config.sizes.guided_batch, 1.0 / model.learning_kept)
+            progress.learning_kept = 1.0
+        progress.learning_kept = mean(progress.learning_kept, model.device)
+        wanted = min(model.config.sizes.guided_batch, 1.0 / progress.learning_kept)
         return round(8 * wanted) / 8  # of few sizes; see `steady`
 
     def guided(self) -> float:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from pathlib import Path
 
 import torch
@@ -51,6 +51,25 @@ class GateHistory:
         self.densities.append((sums / (shares * len(routes)).clamp(min=1.0)).cpu())
         state = gate.state_dict()
         self.weights.append({name: value.detach().cpu().clone() for name, value in state.items()})
+
+    @classmethod
+    def gone_on_from(cls, checkpoint: Path, step: int, gate: Gate) -> GateHistory:
+        """What a run had looked at before a step; nothing where it left no history of this gate.
+
+        Args:
+            checkpoint: of that run, or its folder of checkpoints.
+            step: the next one.
+        """
+        checkpoints = checkpoint if checkpoint.is_dir() else checkpoint.parent
+        try:
+            return cls.load(checkpoints.parent / FILE_NAME, gate).until(step)
+        except (OSError, ValueError):
+            return cls()
+
+    def until(self, step: int) -> GateHistory:
+        """The looks before a step, from which on a run goes on."""
+        looks = sum(look < step for look in self.steps)
+        return GateHistory(*(getattr(self, each.name)[:looks] for each in fields(self)))
 
     def save(self, folder: Path) -> Path:
         """Writes `occupancy_history.safetensors` in a folder, whole or not at all.

@@ -83,11 +83,21 @@ class Lifecycle:
         self.step_started = 0.0
         self.history = GateHistory()
         self.guided = GuidedWatch(self)
-        if bool(model.frozen) and self.trainer is not None and self.folder is not None:
-            write_occupancy(model, self.folder)  # a resumed run may have a folder of its own
+        resumed = None
+        if self.trainer is not None:
             resumed = self.trainer.config.load_checkpoint or self.trainer.config.load_dir
-            if resumed is not None:
-                carry_over(resumed, self.folder)
+        if resumed is not None and self.folder is not None:
+            self._take_along(Path(resumed), self.folder)
+
+    def _take_along(self, resumed: Path, folder: Path) -> None:
+        """What a resumed run leaves in its folder, which may be another one than before."""
+        model = self.model
+        self.history = GateHistory.gone_on_from(resumed, self.trainer._start_step, model.gate)
+        if len(self.history):
+            self._save_history(folder)
+        if bool(model.frozen):
+            write_occupancy(model, folder)
+            carry_over(resumed, folder)
 
     def _say_if_short(self, configured: int, most: int) -> None:
         """Says so before a run that learns for fewer steps than are configured."""
@@ -273,8 +283,11 @@ class Lifecycle:
             )
             sigmas, _ = model.field.density(positions, routes, gate_values)
         self.history.look(step, self.progress.learn_seconds, model.gate, routes, sigmas)
+        self._save_history(self.folder)
+
+    def _save_history(self, folder: Path) -> None:
         try:
-            self.history.save(self.folder)
+            self.history.save(folder)
         except OSError as error:
             say(f"the history of the gate could not be written ({error})")
 

@@ -46,6 +46,8 @@ class Progress:
     """Factor, after recoveries, of all learning rates."""
     paper_given_up: bool = False
     """Whether the gate, after recoveries, is taught in logit form although the paper's is asked."""
+    learning_kept: float = 1.0
+    """Share of candidates that are shaded while the gate is learned, a running mean."""
     left_occupied: bool = False
     """Whether a gate that calls everything occupied after all its recoveries is left so."""
     decisions: Tensor = field(default_factory=lambda: torch.zeros(0, dtype=torch.bool))

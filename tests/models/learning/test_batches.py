@@ -32,7 +32,6 @@ def made(monkeypatch: pytest.MonkeyPatch) -> Any:
         config=SimpleNamespace(sizes=sizes, termination=0.03),
         device=torch.device("cpu"),
         frozen=torch.tensor(False),
-        learning_kept=1.0,
         learned=False,
         progress=Progress(),
         step=0,
@@ -60,7 +59,7 @@ def test_a_guided_batch_has_the_samples_of_a_learning_one_within_limits(
 def test_while_learning_the_rays_follow_what_is_shaded_in_eighths(
     made: Any, kept: float, rays: int
 ) -> None:
-    made.model.learning_kept = kept
+    made.model.progress.learning_kept = kept
     made.batches.prepare(learning=True)
     made.batches.prepare(learning=True)
     assert made.sampler.num_rays_per_batch == rays
@@ -68,7 +67,7 @@ def test_while_learning_the_rays_follow_what_is_shaded_in_eighths(
 
 
 def test_a_healed_gate_is_not_followed_and_its_batches_are_no_longer_for_it(made: Any) -> None:
-    made.model.learning_kept, made.model.progress.dense_until = 0.1, 5
+    made.model.progress.learning_kept, made.model.progress.dense_until = 0.1, 5
     made.batches.prepare(learning=True)
     assert made.sampler.num_rays_per_batch == 100
     made.model.step = 5
@@ -77,7 +76,7 @@ def test_a_healed_gate_is_not_followed_and_its_batches_are_no_longer_for_it(made
 
 
 def test_a_gate_that_is_never_frozen_is_not_followed_once_it_has_learned(made: Any) -> None:
-    made.model.learning_kept = 0.3
+    made.model.progress.learning_kept = 0.3
     made.batches.prepare(learning=True)
     assert made.sampler.num_rays_per_batch > 300
     made.model.learned = True
@@ -98,6 +97,6 @@ def test_known_distances_are_asked_for_only_while_learning_with_a_weight(
 
 def test_a_sampler_elsewhere_is_left_alone(made: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(batches, "sampler_here", lambda manager: None)
-    made.model.learning_kept = 0.1
+    made.model.progress.learning_kept = 0.1
     made.batches.prepare(learning=True)
     assert made.sampler.num_rays_per_batch == 100

@@ -187,7 +187,6 @@ def healthy_run(monkeypatch: pytest.MonkeyPatch):
             ),
             device=torch.device("cpu"),
             frozen=torch.tensor(False),
-            learning_kept=1.0,
             gate=gate,
             field=field,
             num_train_data=2,
