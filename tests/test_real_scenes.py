@@ -56,11 +56,14 @@ def test_a_scene_trains_freezes_and_renders_without_a_flag(
     config.set_timestamp()
     trainer = config.setup(local_rank=0, world_size=1)
     trainer.setup()
+    untrained = psnr_on_rays(trainer, 200)
     run_training(trainer)
     model = trainer.pipeline.model
     assert bool(model.frozen)
     assert model.space.kind == KINDS[name]
-    assert psnr_on_rays(trainer, 200) > 7.0
+    trained = psnr_on_rays(trainer, 200)
+    print(name, untrained, trained)
+    assert trained > untrained + 2.0
     assert_renders(trainer)
     occupancy = Occupancy.load(trainer.base_dir / FILE_NAME)
     assert occupancy.report["held_out"]
@@ -87,6 +90,9 @@ def test_switch_nerf_trains_and_renders_without_a_flag(
     config.set_timestamp()
     trainer = config.setup(local_rank=0, world_size=1)
     trainer.setup()
+    untrained = psnr_on_rays(trainer, 200)
     run_training(trainer)
     assert trainer.pipeline.model.space.kind == KINDS[name]
-    assert psnr_on_rays(trainer, 200) > 7.0
+    trained = psnr_on_rays(trainer, 200)
+    print(name, untrained, trained)
+    assert trained > untrained + 2.0
