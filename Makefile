@@ -37,7 +37,8 @@ $(READY): pyproject.toml
 		{ echo "leco_plugin needs Python 3.10 or newer; try: make PYTHON=python3.11" >&2; exit 2; }
 	@test -x $(BIN)/python || $(PYTHON) -m venv $(VENV) || \
 		{ echo "no virtual environment can be made; on Debian: apt-get install python3-venv" >&2; exit 2; }
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[dev]'
+	@echo "filling $(VENV): about three minutes and 8 GB, most of it torch"
+	$(BIN)/python -m pip install --disable-pip-version-check --editable '.[dev]'
 	@touch $@
 
 clean:
