@@ -137,7 +137,8 @@ class Chart:
                 raise KeyboardInterrupt from None
             self.folder.fail(job, str(failure))
             return f"{title}: failed: {failure}"
-        self.folder.store(job, run, self._made())
+        code = run.pop("code", None) or describe_code()
+        self.folder.store(job, run, {**self._made(), **code})
         return (
             f"{title}: {run['psnr']:.2f} dB after {run['train_seconds']:.0f} s, "
             f"{run['render_seconds_per_image']:.2f} s an image"

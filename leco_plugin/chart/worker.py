@@ -171,8 +171,10 @@ def main(folder: Path, run: Callable[..., dict[str, Any]] = run_job) -> int:
     from leco_plugin.chart.contender import Contender
     from leco_plugin.chart.protocol import Protocol
     from leco_plugin.evaluation.json_file import write_json
+    from leco_plugin.evaluation.machine import describe_code
 
     die_with_parent()
+    code = describe_code()  # as it is when this process has loaded it
     job = json.loads((folder / JOB).read_text())
     shown = [0.0]
 
@@ -190,7 +192,7 @@ def main(folder: Path, run: Callable[..., dict[str, Any]] = run_job) -> int:
             folder,
             show,
         )
-        write_json(folder / RESULT, result)
+        write_json(folder / RESULT, {**result, "code": code})
     # whatever a method raises is a row of the table, and the others go on
     except BaseException as error:  # noqa: BLE001
         traceback.print_exc()

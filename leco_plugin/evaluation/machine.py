@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import os
 import platform
 from pathlib import Path
@@ -24,7 +25,8 @@ def describe_machine() -> dict[str, Any]:
 
 
 def describe_code() -> dict[str, Any]:
-    """Version of this package, and the commit if it is run from a checkout."""
+    """Version of this package, the commit if it is run from a checkout, and a digest of its files,
+    which also tells what was changed since that commit. To be asked before a measurement."""
     import subprocess
 
     from leco_plugin import __version__
@@ -37,7 +39,15 @@ def describe_code() -> dict[str, Any]:
         commit = asked.stdout.strip() if (here.parents[1] / ".git").exists() else ""
     except OSError:
         commit = ""
-    return {"version": __version__, "commit": commit or None}
+    return {"version": __version__, "commit": commit or None, "sources": _digest_of_sources()}
+
+
+def _digest_of_sources() -> str:
+    package = Path(__file__).resolve().parents[1]
+    digest = hashlib.sha256()
+    for path in sorted(package.rglob("*.py")):
+        digest.update(path.relative_to(package).as_posix().encode() + path.read_bytes())
+    return digest.hexdigest()[:12]
 
 
 def usable_cores() -> int:
