@@ -9,8 +9,9 @@ from typing import Any
 import checkout  # noqa: F401
 from page_parts import RESULTS, machine_line, picture
 
+from leco_plugin.chart.representations import COSTS, fronts_of, representations_of, verdict
 from leco_plugin.chart.suites import SUITES
-from leco_plugin.chart.summary import FRONTS, fronts_of, lines_of, representations_of, verdict
+from leco_plugin.chart.summary import lines_of
 from leco_plugin.chart.table import table
 
 CHARTS = RESULTS / "charts"
@@ -35,7 +36,9 @@ is ahead can be compared, figures cannot.
 | learned | 26.04, 0.772, 0.398 | 14.1 | 2.7 |
 """
 EMPTY_EXPERT = """The paper's rows: the gate learned with the imbalance loss alone for 40k steps,
-then Switch-NeRF guided by it. Their counterparts are those named after that loss.
+then Switch-NeRF guided by it. Rows of ours that are named after that loss learn with it too, for
+some hundred steps; where their gate was never frozen nothing was guided by it, and no row of ours
+is the counterpart.
 
 | paper | PSNR | SSIM | LPIPS |
 |---|---|---|---|
@@ -78,13 +81,17 @@ def stored(name: str) -> dict[str, Any]:
 
 
 def chart_sections() -> list[str]:
-    """All stored charts, each with its picture, its tables, its command and its machine."""
+    """All stored charts, each with its picture, its tables, its command and its machine; and with
+    what `notes.json` says of those that were made by code which has been mended since."""
     parts: list[str] = []
     said: set[str] = set()
+    file = RESULTS / "notes.json"
+    notes: dict[str, str] = json.loads(file.read_text()) if file.exists() else {}
     for name, title in titles().items():
         results = stored(name)
         _, body = table(results).split("\n", 1)
-        parts += [f"## {title}\n", picture(name), body, f"{machine_line(results)}.\n"]
+        note = [f"\n**{notes[name]}**"] if name in notes else []
+        parts += [f"## {title}\n", picture(name), *note, body, f"{machine_line(results)}.\n"]
         paper = PAPER_ROWS.get(results["suite"] or name)
         if paper is not None and paper not in said:
             said.add(paper)
@@ -95,7 +102,7 @@ def chart_sections() -> list[str]:
 def fronts_section(charts: Iterable[dict[str, Any]]) -> list[str]:
     """On which fronts our gate is, scene by scene, where representations were compared."""
     rows = []
-    counts = dict.fromkeys(FRONTS, 0)
+    counts = dict.fromkeys(COSTS, 0)
     for results in charts:
         held = representations_of(lines_of(results))
         ours = next((one for one in held if one.ours), None)
@@ -104,7 +111,7 @@ def fronts_section(charts: Iterable[dict[str, Any]]) -> list[str]:
         found = fronts_of(ours, held)
         for name in found:
             counts[name] += 1
-        marks = " | ".join("yes" if name in found else "**no**" for name in FRONTS)
+        marks = " | ".join("yes" if name in found else "**no**" for name in COSTS)
         rows.append(f"| {results['scene']['name']} | {ours.kept:.1f} | {marks} | {verdict(held)} |")
     if not rows:
         return []
@@ -116,8 +123,8 @@ def fronts_section(charts: Iterable[dict[str, Any]]) -> list[str]:
         f"against its size and against the time to learn it: of {scenes}, ours is on the front "
         f"{listed}. Grids are made from the field that taught our gate: their time is that of the "
         "field and of filling them, so that they differ from ours in size.\n",
-        f"| scene | volume kept by ours, % | {' | '.join(FRONTS)} | |",
-        f"|---|---|{'---|' * len(FRONTS)}---|",
+        f"| scene | volume kept by ours, % | {' | '.join(COSTS)} | |",
+        f"|---|---|{'---|' * len(COSTS)}---|",
         *rows,
         "",
     ]

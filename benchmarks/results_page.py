@@ -37,8 +37,22 @@ NVIDIA's instant-ngp.
 
 *Never frozen* is the same model, whose gate goes on learning: it renders without skipping. *Equal
 experts, no gate* has as many scene experts, none for empty space, as Switch-NeRF, and never skips.
-*Price* is what skipping costs on held-out pixels at the moment of freezing. Over seeds, qualities
-are means; costs, comparisons of one method with another and figures of occupancies are medians.
+
+How to read a table:
+
+- **PSNR** is of 8,192 pixels spread over all test images; SSIM, LPIPS and the seconds to render are
+  of one whole test image or two. Qualities are means over seeds, with the least and the most;
+  costs, comparisons of one method with another, and figures of occupancies are medians.
+- **s to X dB**: after how many seconds of training each method first reached what every run reached
+  at last. **Trained**: seconds until the last step had ended, which may be more than was given.
+- **Bold**: on the front of its column, so that nothing has more PSNR for less of it. **-**: not
+  measured, or not there, as LPIPS where its weights could not be had.
+- A *candidate* is a place on a ray at which a model that skips nothing would ask its network.
+  **Candidates skipped**, **price** and **lost surface mass** are of held-out pixels at the moment
+  of freezing, over the seeds in which a gate was frozen; **healed** counts recoveries from
+  collapse. **Volume kept at 1e-3** is of what rays reach of the scene, with the threshold that
+  loses one thousandth of the surface: so gates and grids are compared at the same price.
+- **True surface kept** and **free space skipped** compare with the exact city.
 
 How much sooner one method is than another depends on the machine: learning takes a number of steps,
 and on cores half as fast twice the share of the same time
@@ -168,7 +182,9 @@ def page() -> str:
     if demo.exists():
         report = json.loads(demo.read_text())
         title = "The demo: procedural city, one seed"
-        parts += section(title, "leco demo", report, demo_table(report))
+        made = report["made"]
+        note = f" {made['date']}, leco_plugin {made['version']} at {made['commit']}."
+        parts += section(title, made["command"], report, demo_table(report), note)
     parts += chart_sections()
     if (learning := RESULTS / "learning.json").exists():
         parts += learning_section(json.loads(learning.read_text()))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import datetime
 import math
 import shutil
 from dataclasses import replace
@@ -19,7 +20,7 @@ from leco_plugin.evaluation.charts import psnr_against_seconds
 from leco_plugin.evaluation.clock import Budget
 from leco_plugin.evaluation.inspection import ViewBox
 from leco_plugin.evaluation.json_file import write_json
-from leco_plugin.evaluation.machine import describe_machine
+from leco_plugin.evaluation.machine import describe_code, describe_machine
 from leco_plugin.evaluation.occupancy_facts import occupancy_facts, truth_of
 from leco_plugin.evaluation.occupancy_picture import draw_slice
 from leco_plugin.evaluation.timed_run import timed_run
@@ -65,6 +66,7 @@ def run_demo(
     """
     if not 0.0 < seconds < math.inf:
         raise ValueError(f"the training time is a positive number of seconds, not {seconds}")
+    code = describe_code()  # before anything is measured
     city, capture = city or CityConfig(), capture or AERIAL
     folder = write_city(city, out / "city", capture)
 
@@ -85,6 +87,7 @@ def run_demo(
     report = {
         "format": 1,
         "machine": describe_machine(),
+        "made": {"date": datetime.date.today().isoformat(), "command": "leco demo", **code},
         "scene": {
             "name": "city",
             "blocks": city.blocks,

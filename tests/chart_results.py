@@ -74,3 +74,12 @@ def results(*runs: dict[str, Any], **changes: Any) -> dict[str, Any]:
         "failures": [],
     }
     return values | changes
+
+
+def slow_front(points: list[tuple[float, float]]) -> set[tuple[float, float]]:
+    """Points that no other one matches in both and beats in one."""
+    return {
+        (cost, gain)
+        for cost, gain in points
+        if not any(c <= cost and g >= gain and (c < cost or g > gain) for c, g in points)
+    }

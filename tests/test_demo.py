@@ -45,6 +45,7 @@ def test_the_demo_reports_both_runs_in_the_agreed_form(tmp_path: Path) -> None:
     assert done.returncode == 0, done.stderr[-2000:]
     report = json.loads((tmp_path / "report.json").read_text())
     assert report["format"] == 1 and report["scene"]["blocks"] == 1
+    assert {"date", "command", "commit", "sources"} <= report["made"].keys()
     assert {"machine", "scene", "occupancy", "runs"} <= report.keys()
     assert report["occupancy"].keys() >= OCCUPANCY
     methods = [(run["method"], run["sampler"]) for run in report["runs"]]

@@ -7,6 +7,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from leco_plugin.chart.representations import Representation, representations_of
 from leco_plugin.chart.summary import (
     COSTS,
     LEARNING,
@@ -14,13 +15,10 @@ from leco_plugin.chart.summary import (
     Line,
     circumstances,
     front,
-    headline,
     lines_of,
-    representations_of,
-    sentence,
-    verdict,
 )
 from leco_plugin.chart.theme import LIGHT
+from leco_plugin.chart.title import title_of
 
 SYMBOLS = ("circle", "square", "diamond", "triangle-up", "triangle-down", "cross", "x", "star")
 FRONT = {"color": "rgba(120,120,120,0.45)", "width": 5, "shape": "hv"}
@@ -33,14 +31,14 @@ def write_page(results: Mapping[str, Any], path: Path) -> Path:
     """
     lines = lines_of(results)
     held = representations_of(lines)
-    title = html.escape(sentence(verdict(held) if len(held) > 1 else headline(results)))
+    title = html.escape(title_of(results))
     figure = _figure(lines)
-    if len(held) > 1:
+    if held:
         _add_representations(figure, held)
     figure.update_layout(
         title={"text": f"<b>{title}</b><br><sub>{html.escape(circumstances(results))}</sub>"},
         template="plotly_white",
-        height=1100 if len(held) > 1 else 820,
+        height=1100 if held else 820,
         legend={"orientation": "h", "y": -0.08},
         margin={"t": 110},
     )
@@ -53,7 +51,7 @@ def _figure(lines: Sequence[Line]) -> Any:
     import plotly.graph_objects as go
     from plotly.subplots import make_subplots
 
-    rows = 3 if len(representations_of(lines)) > 1 else 2
+    rows = 3 if representations_of(lines) else 2
     wide = [{"colspan": 3}, None, None]
     titles = ["", *(_titled(cost) for cost in COSTS)]
     if rows == 3:
@@ -132,12 +130,11 @@ def _front(points: Sequence[tuple[float, float]]) -> Any:
     )
 
 
-def _add_representations(figure: Any, held: Sequence[Any]) -> None:
+def _add_representations(figure: Any, held: Sequence[Representation]) -> None:
     import plotly.graph_objects as go
 
-    for column, values in enumerate(
-        ([one.size for one in held], [one.learn_seconds for one in held]), start=1
-    ):
+    for column, cost in enumerate(("size", "learn_seconds"), start=1):
+        values = [one.median(cost) for one in held]
         places = [(value, one.kept) for value, one in zip(values, held)]
         figure.add_trace(
             go.Scatter(

@@ -5,13 +5,9 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
-from leco_plugin.chart.summary import (
-    COSTS,
-    Cost,
-    Line,
-    Representation,
-    front,
-)
+from leco_plugin.chart.learned import Learned
+from leco_plugin.chart.representations import Representation
+from leco_plugin.chart.summary import COSTS, Cost, Line, front
 from leco_plugin.chart.theme import Theme, plain, style
 
 WIDE_RANGE = 8.0
@@ -108,6 +104,36 @@ def draw_kept(
     axes.invert_yaxis()
     _draw_front(axes, places, theme, sign=-1.0)
     return places
+
+
+def draw_learned(
+    axes: Any, learned: Sequence[Learned], lines: Sequence[Line], theme: Theme
+) -> None:
+    """What frozen gates skip against what they lose; contenders without any are named below."""
+    looks = {line.name: style(i, theme) for i, line in enumerate(lines)}
+    shown = [one for one in learned if one.facts]
+    figures = ("lost_surface_mass", "empty_fraction")
+    points = {
+        one.name: [tuple(100.0 * facts[name] for name in figures) for facts in one.facts]
+        for one in shown
+    }
+    places = [tuple(100.0 * (one.median(name) or 0.0) for name in figures) for one in shown]
+    _cost_axis(axes, "lost surface mass", "%", [x for of in points.values() for x, _ in of], theme)
+    for one, place in zip(shown, places):
+        look = looks[one.name]
+        for point in points[one.name]:
+            axes.plot(*point, alpha=0.45, markersize=6, **look)
+        axes.plot(*place, markersize=13, markeredgecolor=theme.page, zorder=3, **look)
+    axes.set_ylabel("candidates skipped, %")
+    _draw_front(axes, places, theme)
+    names = [
+        one.name if one.always_frozen else f"{one.name}: {len(one.facts)} of {one.seeds} frozen"
+        for one in shown
+    ]
+    name_points(axes, places, names, [looks[one.name]["color"] for one in shown])
+    if never := [one.name for one in learned if not one.facts]:
+        said = f"never frozen: {', '.join(never)}"
+        axes.text(0.01, 0.03, said, transform=axes.transAxes, fontsize=11)
 
 
 def name_points(

@@ -14,7 +14,15 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from leco_plugin.chart.panels import draw_all_costs, draw_cost, draw_kept, name_points
+from leco_plugin.chart.learned import learned_of
+from leco_plugin.chart.panels import (
+    draw_all_costs,
+    draw_cost,
+    draw_kept,
+    draw_learned,
+    name_points,
+)
+from leco_plugin.chart.representations import Representation, representations_of
 from leco_plugin.chart.summary import (
     BYTES,
     LEARNING,
@@ -22,15 +30,11 @@ from leco_plugin.chart.summary import (
     MEMORY,
     RENDERING,
     Line,
-    Representation,
     circumstances,
-    headline,
     lines_of,
-    representations_of,
-    sentence,
-    verdict,
 )
 from leco_plugin.chart.theme import LIGHT, Theme, plain, style, themed
+from leco_plugin.chart.title import asks_what_was_learned, title_of
 from leco_plugin.evaluation.charts import SOURCE, fingerprint
 
 CLOSE = 0.056
@@ -45,6 +49,10 @@ TOP, LINE = 0.985, 0.04
 HOW_TO_READ = "What it costs. Up and left is better; nothing is better in both than the grey line."
 KEPT_SPACE = (
     f"Space that must be sampled where each loses {LOST_SURFACE_MASS:.1%} of the surface. "
+    "Up and left is better:"
+)
+LEARNED_SPACE = (
+    "Candidates that the frozen gate skips against what it loses, each seed and their median. "
     "Up and left is better:"
 )
 WHAT_ELSE = "PSNR on unseen photographs, dB, against what it costs. Up and left is better:"
@@ -63,24 +71,27 @@ def draw(results: Mapping[str, Any], path: Path, theme: Theme = LIGHT) -> Path:
 
     lines = lines_of(results)
     held = representations_of(lines)
-    compared = len(held) > 1
+    of_gates = asks_what_was_learned(results)
     with themed(theme):
         figure = Figure(figsize=(10, 8.4), facecolor=theme.page)
         FigureCanvasAgg(figure)
-        title = balanced(sentence(verdict(held) if compared else headline(results)))
+        title = balanced(title_of(results))
         figure.text(0.015, TOP, title, va="top", fontsize=17, fontweight="bold")
         below_title = TOP - 0.01 - LINE * (title.count("\n") + 1)
         figure.text(0.015, below_title, circumstances(results), va="top", fontsize=11.5)
         height = below_title - 0.08 - 0.43
         below = [figure.add_axes((0.075 + 0.325 * i, 0.065, 0.255, 0.2)) for i in range(3)]
-        if compared:
+        if held or of_gates:
+            shown = KEPT_SPACE if held else LEARNED_SPACE
             figure.text(0.015, 0.335, WHAT_ELSE, va="top", fontsize=11.5)
-            figure.text(0.015, below_title - 0.035, KEPT_SPACE, va="top", fontsize=11.5)
-            beside = [
-                figure.add_axes((left, 0.43, width, height - 0.03))
-                for left, width in ((0.075, 0.56), (0.70, 0.28))
-            ]
-            _draw_compared(beside, below, held, lines, theme)
+            figure.text(0.015, below_title - 0.035, shown, va="top", fontsize=11.5)
+            places = ((0.075, 0.56), (0.70, 0.28)) if held else ((0.075, 0.905),)
+            above = [figure.add_axes((left, 0.43, width, height - 0.03)) for left, width in places]
+            if held:
+                _draw_compared(above, held, lines, theme)
+            else:
+                draw_learned(above[0], learned_of(lines), lines, theme)
+            _draw_runs(below, lines, theme)
         else:
             figure.text(0.015, 0.335, HOW_TO_READ, va="top", fontsize=11.5)
             widest = max(len(line.name) for line in lines)
@@ -102,23 +113,23 @@ def balanced(text: str, width: int = TITLE_WIDTH) -> str:
 
 
 def _draw_compared(
-    beside: Sequence[Any],
-    below: Sequence[Any],
-    held: Sequence[Representation],
-    lines: Sequence[Line],
-    theme: Theme,
+    beside: Sequence[Any], held: Sequence[Representation], lines: Sequence[Line], theme: Theme
 ) -> None:
-    """What each occupancy keeps against its size and its learning time; below, the runs."""
+    """What each occupancy keeps against its size and its learning time."""
     by_size, by_time = beside
-    below[0].set_ylabel("PSNR, dB")
-    places = draw_kept(by_size, BYTES, [one.size for one in held], held, lines, theme)
+    sizes, seconds = ([one.median(cost) for one in held] for cost in ("size", "learn_seconds"))
+    places = draw_kept(by_size, BYTES, sizes, held, lines, theme)
     by_size.set_ylabel("space kept, %")
     looks = {line.name: style(i, theme)["color"] for i, line in enumerate(lines)}
     colours = [looks.get(one.name, theme.ink) for one in held]
     name_points(by_size, places, [one.name for one in held], colours)
-    seconds = [one.learn_seconds for one in held]
     draw_kept(by_time, LEARNING, seconds, held, lines, theme)
     by_time.set_xlim(0.9 * min(seconds), 1.04 * max(seconds))
+
+
+def _draw_runs(below: Sequence[Any], lines: Sequence[Line], theme: Theme) -> None:
+    """PSNR against training time, rendering time and memory, small."""
+    below[0].set_ylabel("PSNR, dB")
     _draw_curves(below[0], lines, theme, small=True)
     for panel, cost in zip(below[1:], (RENDERING, MEMORY)):
         draw_cost(panel, cost, lines, theme)

@@ -41,6 +41,11 @@ class Protocol:
             "curve points": self.curve_points,
             "runs at once": self.at_once,
         }
+        if None not in (self.seconds, self.learn_seconds) and self.learn_seconds >= self.seconds:
+            raise ValueError(
+                f"learning an occupancy may take {self.learn_seconds:g} s of a run of "
+                f"{self.seconds:g} s, which leaves nothing to be guided: give less"
+            )
         for name, count in counts.items():
             if count < 1:
                 raise ValueError(f"at least one of the {name} is needed, not {count}")

@@ -164,7 +164,11 @@ class Chart:
 
     def results(self) -> dict[str, Any]:
         """All finished runs in the folder, the contenders of this call first."""
-        stored = self.folder.stored()
+        stored = {
+            name: record
+            for name, record in self.folder.stored().items()
+            if not _is_of_another(record, self.contenders)
+        }
         order = [contender.key for contender in self.contenders]
         records = sorted(stored.values(), key=lambda record: _place(record, order))
         runs = [_run_of(record, self.contenders) for record in records]
@@ -236,8 +240,18 @@ def _place(record: dict[str, Any], order: Sequence[str]) -> tuple[int, str, int]
     return place, key, record["run"]["seed"]
 
 
+def _is_of_another(record: dict[str, Any], contenders: Sequence[Contender]) -> bool:
+    """Whether a run bears the name of a contender and was made with other settings, as by an
+    earlier version: both in one line would be a mean of two things."""
+    made = Contender.from_dict(record["contender"])
+    same_name = [one for one in contenders if one.name == made.name]
+    return bool(same_name) and all(one.key != made.key for one in same_name)
+
+
 def _run_of(record: dict[str, Any], contenders: Sequence[Contender]) -> dict[str, Any]:
-    """The run under the name that its contender has now."""
+    """The run under the name that its contender has now, with the code that made it."""
     key = Contender.from_dict(record["contender"]).key
     names = {contender.key: contender.name for contender in contenders}
-    return {**record["run"], "name": names.get(key, record["contender"]["name"])}
+    made = record.get("made") or {}
+    code = made.get("sources") or made.get("commit")
+    return {**record["run"], "name": names.get(key, record["contender"]["name"]), "code": code}

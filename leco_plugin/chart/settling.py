@@ -27,11 +27,11 @@ def settling(lines: Sequence[Line]) -> str:
     gains = {line.name: last_gain(line) for line in lines}
     listed = ", ".join(f"{name} {gain:+.1f} dB" for name, gain in gains.items())
     rising = [name for name, gain in gains.items() if gain > ENOUGH]
-    said = "that was enough time for all of them"
+    said = "all of them have had enough time"
     if rising:
         who = "all of them" if len(rising) == len(gains) else " and ".join(rising)
-        said = f"not enough time for {who}, and who is ahead may still change"
+        said = f"{who} would gain by more time, and who is ahead may still change"
     return (
-        f"Gained in the last third of the time: {listed}. Where no more than {ENOUGH} dB is "
-        f"enough, {said}."
+        f"Gained in the last third of the time: {listed}. Counting {ENOUGH} dB and less as none, "
+        f"{said}."
     )

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import statistics
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -14,10 +14,8 @@ from leco_plugin.chart.contender import shared_method, short_names
 
 LOST_SURFACE_MASS = 1e-3
 """Of the weight near surfaces, at which `evaluation.equal_loss` compares representations."""
-OURS = "learned-occupancy"
-"""The sampler whose gate is the one that this package takes by default."""
-CURVE_TIMES = 60
-"""Common times at which the curves of several seeds are read."""
+CURVE_POINTS = 60
+"""Shares of the training at which the curves of several seeds are read."""
 
 
 @dataclass(frozen=True)
@@ -72,6 +70,11 @@ class Line:
         """Mean over seeds, dB."""
         return statistics.fmean(self.psnrs)
 
+    @property
+    def warming_up(self) -> bool:
+        """Whether it ends, with some seed, while its occupancy grid is in its warm-up."""
+        return any(run.get("warming_up") for run in self.runs)
+
     def mean(self, key: str) -> float | None:
         """Mean over seeds of a figure of quality; None where a seed has none."""
         values = [run.get(key) for run in self.runs]
@@ -83,18 +86,33 @@ class Line:
         return None if None in values else statistics.median(v for v in values if v is not None)
 
     def curve(self) -> tuple[NDArray[np.float64], ...]:
-        """Seconds [T], and mean, lowest and highest PSNR of the seeds there [T]."""
+        """Mean seconds [T], and mean, lowest and highest PSNR [T], of the seeds when each has had
+        the same share of its training; the last ones are those of the ends."""
         curves = [np.array(run["curve"], dtype=float) for run in self.runs]
-        begin, end = max(c[0, 0] for c in curves), min(c[-1, 0] for c in curves)
-        seconds = np.linspace(begin, end, CURVE_TIMES) if end > begin else np.array([end])
-        values = np.stack([np.interp(seconds, curve[:, 0], curve[:, 1]) for curve in curves])
+        ends = np.array([curve[-1, 0] for curve in curves])
+        begin = max(curve[0, 0] / end for curve, end in zip(curves, ends))
+        shares = np.linspace(begin, 1.0, CURVE_POINTS) if begin < 1.0 else np.ones(1)
+        values = np.stack([np.interp(shares * end, *curve.T) for curve, end in zip(curves, ends)])
+        seconds = shares * ends.mean()
         return seconds, values.mean(axis=0), values.min(axis=0), values.max(axis=0)
 
     def seconds_to(self, psnr: float) -> float | None:
-        """When its mean curve first reaches a PSNR; None if it does not."""
-        seconds, mean, _, _ = self.curve()
-        reached = np.flatnonzero(mean >= psnr)
-        return float(seconds[reached[0]]) if len(reached) else None
+        """When its runs first reach a PSNR, median over seeds; None if one of them does not."""
+        found = [seconds_to_pass(run["curve"], psnr) for run in self.runs]
+        return None if None in found else statistics.median(s for s in found if s is not None)
+
+
+def seconds_to_pass(curve: Sequence[Sequence[float]], psnr: float) -> float | None:
+    """When a curve [[seconds, PSNR], ...] first reaches a PSNR, between its points; or never."""
+    before = None
+    for seconds, value in curve:
+        if value >= psnr:
+            if before is None or value == before[1]:
+                return float(seconds)
+            share = (psnr - before[1]) / (value - before[1])
+            return float(before[0] + share * (seconds - before[0]))
+        before = (seconds, value)
+    return None
 
 
 def lines_of(results: Mapping[str, Any]) -> list[Line]:
@@ -109,8 +127,8 @@ def lines_of(results: Mapping[str, Any]) -> list[Line]:
 
 
 def common_psnr(lines: Sequence[Line]) -> float:
-    """What every contender reaches: the lowest of their last mean PSNRs, dB."""
-    return min(line.psnr for line in lines)
+    """What every run reaches: the lowest of their last PSNRs, dB."""
+    return min(run["curve"][-1][1] for line in lines for run in line.runs)
 
 
 def front(points: Sequence[tuple[float, float]]) -> list[int]:
@@ -123,86 +141,25 @@ def front(points: Sequence[tuple[float, float]]) -> list[int]:
     return found
 
 
-@dataclass(frozen=True)
-class Representation:
-    """One way to hold an occupancy, over all seeds: medians."""
-
-    name: str
-    size: float
-    """kB of its file, or of a grid's bits."""
-    learn_seconds: float
-    """Until it is there; for a grid, of the field it was made from, and its own updates."""
-    kept: float
-    """Percent of the volume that rays reach which it keeps when all lose equally much."""
-    ours: bool = False
-    """Whether it is the gate that this package takes by default."""
-
-    def beats(self, other: Representation, cost: Callable[[Representation], float]) -> bool:
-        """Whether it keeps no more at no more cost, and is better in one of the two."""
-        mine, theirs = (cost(self), self.kept), (cost(other), other.kept)
-        return mine != theirs and all(a <= b for a, b in zip(mine, theirs))
-
-
-FRONTS: dict[str, Callable[[Representation], float]] = {
-    "size": lambda one: one.size,
-    "learning time": lambda one: one.learn_seconds,
-}
-"""The costs on whose fronts representations are."""
-
-
-def representations_of(lines: Sequence[Line]) -> list[Representation]:
-    """Learned occupancies, and grids made from the same field, where they were measured.
-
-    None where all are gates of one kind: then something else is compared.
-    """
-    found: list[Representation] = []
-    kinds: set[str] = set()
-    for line in lines:
-        size, seconds, kept = (line.median(cost) for cost in (BYTES, LEARNING, KEPT))
-        if size is None or seconds is None or kept is None:
-            continue
-        found.append(Representation(line.name, size, seconds, kept, line.sampler == OURS))
-        kinds.add(line.sampler)
-        of_runs = [
-            {str(grid["resolution"]): grid for grid in run["occupancy"]["at_equal_loss"]["grids"]}
-            for run in line.runs
-        ]
-        for resolution in of_runs[0]:
-            grids = [grids[resolution] for grids in of_runs if resolution in grids]
-            kinds.add("grid")
-            updates = statistics.median(grid["update_seconds"] for grid in grids)
-            found.append(
-                Representation(
-                    f"grid {resolution}³",
-                    grids[0]["bytes"] / 1e3,
-                    seconds + updates,
-                    100.0 * statistics.median(grid["kept_reached_volume"] for grid in grids),
-                )
-            )
-    return found if len(kinds) > 1 else []
-
-
-def fronts_of(one: Representation, all_of_them: Sequence[Representation]) -> list[str]:
-    """The names of the `FRONTS` on which a representation is."""
-    return [
-        name
-        for name, cost in FRONTS.items()
-        if not any(other.beats(one, cost) for other in all_of_them)
-    ]
-
-
 def headline(results: Mapping[str, Any]) -> str:
-    """What the chart shows, in one sentence."""
+    """What the chart shows of accuracy, in one sentence."""
     lines = lines_of(results)
     ranked = sorted(lines, key=lambda line: -line.psnr)
     if len(ranked) < 2:
         return f"{ranked[0].name}: {ranked[0].psnr:.1f} dB"
     best, second = ranked[:2]
     lead = best.psnr - second.psnr
-    apart = len(best.runs) == 1 or min(best.psnrs) > max(second.psnrs)
-    if lead < 0.05 or not apart:
-        return f"{best.name} and {second.name} are level at {best.psnr:.1f} dB"
-    return f"{best.name} is ahead: {best.psnr:.1f} dB, {lead:.1f} more than {second.name}"
+    if lead < 0.05 or not ahead(best, second):
+        return f"{best.name} and {second.name} are level: {best.psnr:.1f} and {second.psnr:.1f} dB"
+    said = f"{best.name} is ahead: {best.psnr:.1f} dB, {lead:.1f} more than {second.name}"
+    return f"{said}, whose grid is still in its warm-up" if second.warming_up else said
+
+
+def ahead(one: Line, other: Line) -> bool:
+    """Whether a line is above another in each seed that both have; without any, all of it is."""
+    psnrs = {run["seed"]: run["psnr"] for run in other.runs}
+    pairs = [(run["psnr"], psnrs[run["seed"]]) for run in one.runs if run["seed"] in psnrs]
+    return all(a > b for a, b in pairs) if pairs else min(one.psnrs) > max(other.psnrs)
 
 
 def circumstances(results: Mapping[str, Any]) -> str:
@@ -223,25 +180,6 @@ def circumstances(results: Mapping[str, Any]) -> str:
     method = shared_method(list(dict.fromkeys(run["name"] for run in results["runs"])))
     what = f"{method} on {results['scene']['name']}" if method else results["scene"]["name"]
     return f"{what}, {' or '.join(parts)} of training on {where}, {many}"
-
-
-def verdict(representations: Sequence[Representation]) -> str:
-    """On which fronts ours is, and what beats it where it is not."""
-    ours = next((one for one in representations if one.ours), None)
-    if ours is None:
-        return "our own gate has no figures here"
-    held, beaten = fronts_of(ours, representations), []
-    for name, cost in FRONTS.items():
-        better = [one for one in representations if one.beats(ours, cost)]
-        if better:
-            beaten.append(f"in {name} by {min(better, key=lambda one: one.kept).name}")
-    if not beaten:
-        return (
-            f"{ours.name} is on both fronts: what keeps less space is larger and takes longer to "
-            "learn"
-        )
-    where = f"is on the front of {held[0]} only" if held else "is on neither front"
-    return f"{ours.name} {where}: it is beaten {' and '.join(beaten)}"
 
 
 def sentence(text: str) -> str:

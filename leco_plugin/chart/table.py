@@ -2,36 +2,41 @@
 
 from __future__ import annotations
 
-import statistics
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from leco_plugin.chart.cells import cell, number, rows, spread
+from leco_plugin.chart.learned import learned_of
+from leco_plugin.chart.occupancy_tables import left_out, occupancy_table, representations_table
+from leco_plugin.chart.representations import representations_of
 from leco_plugin.chart.settling import settling
 from leco_plugin.chart.summary import (
     COSTS,
-    KEPT,
     LEARNING,
     Cost,
     Line,
-    Representation,
     circumstances,
     common_psnr,
     front,
-    fronts_of,
-    headline,
     lines_of,
-    representations_of,
-    sentence,
-    verdict,
 )
+from leco_plugin.chart.title import title_of
 from leco_plugin.chart.versus import Versus, rivals
 
 STEPS = Cost("steps", "steps", "")
+TRAINED = Cost("train_seconds", "trained", "s")
 STEP_SECONDS = Cost("step_seconds", "a step", "ms", 1e3)
-TRAIN_QUERIES = Cost("train_queries.field", "field queries in training", "M", 1e-6)
-LEARN_QUERIES = Cost("train_queries.learning", "", "M", 1e-6)
-PROPOSALS = Cost("proposal_queries_per_ray", "proposal queries a ray", "")
+ASKED = (
+    Cost("field_queries_per_ray", "field, a ray", ""),
+    Cost("proposal_queries_per_ray", "proposals, a ray", ""),
+    Cost("gate_queries_per_ray", "frozen gate, a ray", ""),
+    Cost("train_queries.field", "field in training", "M", 1e-6),
+    Cost("train_queries.learning", "field that learns first", "M", 1e-6),
+    Cost("train_queries.proposal", "proposals in training", "M", 1e-6),
+    Cost("train_queries.gate", "frozen gate in training", "M", 1e-6),
+)
+"""Positions at which a network was asked."""
 
 
 def write_table(results: Mapping[str, Any], path: Path) -> Path:
@@ -42,31 +47,29 @@ def write_table(results: Mapping[str, Any], path: Path) -> Path:
 
 def table(results: Mapping[str, Any]) -> str:
     """The whole of `table.md`."""
-    made = results["made"]
     parts = [
         f"# {results['scene']['name']}" + (f": {results['suite']}" if results["suite"] else ""),
         *([results["question"]] if results["question"] else []),
     ]
     lines = lines_of(results) if results["runs"] else []
     if lines:
-        parts += [f"{sentence(headline(results))}. {circumstances(results)}.", runs_table(lines)]
-    duels = rivals(lines)
+        parts += [f"{title_of(results)}. {circumstances(results)}.", runs_table(lines)]
+    if warming := [line.name for line in lines if line.warming_up]:
+        parts.append(f"Still in the warm-up of their grid, which fills all cells: {_and(warming)}.")
+    duels = rivals(lines, results["protocol"]["seconds"])
     if duels:
         parts.append(versus_table(duels))
     if results["suite"] and lines and results["protocol"]["seconds"] is not None:
         parts.append(settling(lines))
     if results["failures"]:
         parts.append(failures_table(results["failures"]))
-    if any(run.get("occupancy") for line in lines for run in line.runs):
-        parts.append(occupancy_table(lines))
-    held = representations_of(lines)
-    if len(held) > 1:
-        parts += [representations_table(held), f"{sentence(verdict(held))}.{left_out(lines)}"]
-    commit = f" at {made['commit']}" if made["commit"] else ""
-    reused = sum(bool(run.get("reused")) for run in results["runs"])
-    taken = f" {reused} of the runs were made for other charts." if reused else ""
-    said = f"`{made['command']}`, {made['date']}, leco_plugin {made['version']}{commit}."
-    parts.append(said + taken)
+    if learned := learned_of(lines):
+        parts.append(occupancy_table(learned))
+    if held := representations_of(lines):
+        parts += [representations_table(held), f"{title_of(results)}.{left_out(lines)}"]
+    if lines:
+        parts.append(queries_table(lines))
+    parts.append(provenance(results))
     return "\n\n".join(parts) + "\n"
 
 
@@ -75,37 +78,28 @@ def runs_table(lines: Sequence[Line]) -> str:
     level = common_psnr(lines)
     header = [
         *("method", "seeds", "PSNR, dB", "SSIM", "LPIPS", f"s to {level:.1f} dB", "steps"),
-        "ms a step",
-        "of which learning, s",
-        *(f"{cost.title}{f', {cost.unit}' if cost.unit else ''}" for cost in COSTS),
-        *("proposal queries a ray", "field queries in training, M"),
+        *("trained, s", "of which learning, s", "ms a step"),
+        *(_titled(cost) for cost in COSTS),
     ]
     bold = {cost.key: _on_front(lines, cost) for cost in COSTS}
-    rows = []
+    cells = []
     for line in lines:
-        ssim, lpips, reached = line.mean("ssim"), line.mean("lpips"), line.seconds_to(level)
         costs = []
         for cost in COSTS:
-            shown = _number(line.median(cost))
+            shown = number(line.median(cost))
             costs.append(f"**{shown}**" if line.name in bold[cost.key] else shown)
-        asked = [line.median(TRAIN_QUERIES), line.median(LEARN_QUERIES)]
-        rows.append(
+        cells.append(
             [
                 line.name,
                 str(len(line.runs)),
                 _psnr(line),
-                "-" if ssim is None else f"{ssim:.3f}",
-                "-" if lpips is None else f"{lpips:.3f}",
-                _number(reached),
-                _number(line.median(STEPS)),
-                _number(line.median(STEP_SECONDS)),
-                _number(line.median(LEARNING)),
+                *(_quality(line.mean(name)) for name in ("ssim", "lpips")),
+                number(line.seconds_to(level)),
+                *(number(line.median(one)) for one in (STEPS, TRAINED, LEARNING, STEP_SECONDS)),
                 *costs,
-                _number(line.median(PROPOSALS)),
-                _number(sum(value or 0.0 for value in asked)),
             ]
         )
-    return _rows(header, rows)
+    return rows(header, cells)
 
 
 def versus_table(duels: Sequence[Versus]) -> str:
@@ -114,75 +108,56 @@ def versus_table(duels: Sequence[Versus]) -> str:
         *("against", "seeds", "PSNR, dB", "passes its last PSNR after, s"),
         *("sooner by, x", "renders faster by, x"),
     ]
-    rows = [
+    cells = [
         [
             f"{duel.ours} against {duel.theirs}",
             str(len(duel.gains)),
-            _spread(duel.gains, "+.2f"),
-            _spread(duel.passed, ".0f"),
-            _spread(duel.sooner, ".2f"),
-            _spread(duel.faster, ".1f"),
+            spread(duel.gains, "+.2f"),
+            spread(duel.passed, ".0f"),
+            spread(duel.sooner, ".2f"),
+            spread(duel.faster, ".1f"),
         ]
         for duel in duels
     ]
-    return _rows(header, rows)
+    return rows(header, cells)
+
+
+def queries_table(lines: Sequence[Line]) -> str:
+    """How often which network was asked, in rendering and in all of the training: medians."""
+    shown = [cost for cost in ASKED if any(line.median(cost) for line in lines)]
+    cells = [[line.name, *(number(line.median(cost)) for cost in shown)] for line in lines]
+    return rows(["positions asked of", *(_titled(cost) for cost in shown)], cells)
 
 
 def failures_table(failures: Sequence[Mapping[str, Any]]) -> str:
     """Runs that ended without a result."""
-    rows = [[f["name"], str(f["seed"]), f"failed: {_cell(f['reason'])}"] for f in failures]
-    return _rows(["method", "seed", "reason"], rows)
+    cells = [[f["name"], str(f["seed"]), f"failed: {cell(f['reason'])}"] for f in failures]
+    return rows(["method", "seed", "reason"], cells)
 
 
-def occupancy_table(lines: Sequence[Line]) -> str:
-    """What was learned, and what it costs: medians over seeds."""
-    columns = (
-        Cost("occupancy.params", "parameters", ""),
-        Cost("occupancy.bytes", "kB", "", 1e-3),
-        Cost("occupancy.learn_seconds", "learned in, s", ""),
-        Cost("occupancy.empty_fraction", "candidates skipped, %", "", 100.0),
-        Cost("occupancy.image_price_db", "price, dB", ""),
-        Cost("occupancy.lost_surface_mass", "lost surface mass", ""),
-        Cost(KEPT.key, "volume kept at 1e-3, %", "", 100.0),
-        Cost("occupancy.kept_surface_recall", "true surface kept, %", "", 100.0),
-        Cost("occupancy.free_space_skipped", "free space skipped, %", "", 100.0),
-    )
-    rows = [
-        [line.name, *(_number(line.median(column)) for column in columns)]
-        for line in lines
-        if all(run.get("occupancy") for run in line.runs)
-    ]
-    return _rows(["occupancy of", *(column.title for column in columns)], rows)
+def provenance(results: Mapping[str, Any]) -> str:
+    """When, how and by which code the runs were made, and whether it was the same for all."""
+    made, runs = results["made"], results["runs"]
+    commit = f" at {made['commit']}" if made["commit"] else ""
+    said = f"`{made['command']}`, {made['date']}, leco_plugin {made['version']}{commit}."
+    if minutes := sum(run.get("wall_seconds") or 0.0 for run in runs) / 60.0:
+        said += (
+            f" All runs together took {minutes / results['protocol'].get('at_once', 1):.0f} min."
+        )
+    if reused := sum(bool(run.get("reused")) for run in runs):
+        said += f" {reused} of the runs were made for other charts."
+    by_code: dict[str, list[str]] = {}
+    for run in runs:
+        names = by_code.setdefault(str(run.get("code")), [])
+        names += [run["name"]] if run["name"] not in names else []
+    if len(by_code) > 1:
+        of_each = "; ".join(f"{code}: {', '.join(names)}" for code, names in by_code.items())
+        said += f" Not all of them are of the same code ({of_each})."
+    return said
 
 
-def representations_table(held: Sequence[Representation]) -> str:
-    """What each keeps for its size and its learning time, and where nothing else beats it."""
-    header = ["representation", "kB", "learned in, s", "volume kept at equal loss, %"]
-    rows = [
-        [
-            one.name,
-            _number(one.size),
-            _number(one.learn_seconds),
-            f"{one.kept:.1f}",
-            ", ".join(fronts_of(one, held)) or "-",
-        ]
-        for one in held
-    ]
-    return _rows([*header, "on the front of"], rows)
-
-
-def left_out(lines: Sequence[Line]) -> str:
-    """Grids that were to be made from a field and were not, in a sentence after another."""
-    sizes = {
-        str(size)
-        for line in lines
-        for run in line.runs
-        for size in ((run.get("occupancy") or {}).get("at_equal_loss") or {}).get("left_out", [])
-    }
-    if not sizes:
-        return ""
-    listed = ", ".join(f"{size}³" for size in sorted(sizes, key=int))
-    return f" Not in every run, for want of memory or time: grid {listed}."
+def _titled(cost: Cost) -> str:
+    return f"{cost.title}, {cost.unit}" if cost.unit else cost.title
 
 
 def _on_front(lines: Sequence[Line], cost: Cost) -> set[str]:
@@ -198,30 +173,9 @@ def _psnr(line: Line) -> str:
     return f"{line.psnr:.2f} ({min(line.psnrs):.2f} to {max(line.psnrs):.2f})"
 
 
-def _spread(values: Sequence[float | None], form: str) -> str:
-    """Median, and where there are several, least and most; a dash where a seed has none."""
-    known = [value for value in values if value is not None]
-    if len(known) < len(values) or not known:
-        return "-"
-    middle = format(statistics.median(known), form)
-    if len(known) == 1:
-        return middle
-    return f"{middle} ({min(known):{form}} to {max(known):{form}})"
+def _quality(value: float | None) -> str:
+    return "-" if value is None else f"{value:.3f}"
 
 
-def _number(value: float | None) -> str:
-    """Three digits, or a dash where there is no number."""
-    if value is None:
-        return "-"
-    if abs(value) >= 100.0 or value == int(value):
-        return f"{value:.0f}"
-    return f"{value:.3g}"
-
-
-def _cell(text: str) -> str:
-    return text.replace("|", "\\|")
-
-
-def _rows(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
-    lines = [header, ["---"] * len(header), *rows]
-    return "\n".join(f"| {' | '.join(cells)} |" for cells in lines)
+def _and(names: Sequence[str]) -> str:
+    return " and ".join(names)

@@ -7,10 +7,12 @@ from __future__ import annotations
 
 import copy
 import json
+import math
 import os
 import shutil
 import sys
 import threading
+import time
 import traceback
 from collections.abc import Callable
 from pathlib import Path
@@ -104,6 +106,8 @@ def train_job(
         on_progress=on_progress,
         on_frozen=when_frozen,
     )
+    if looked_at and not math.isfinite(run.psnr):
+        raise ValueError("it has diverged: the PSNR at its end is no number")
     facts = _occupancy_of(trainer, data, folder)
     if facts is not None:
         facts["at_equal_loss"] = _at_freezing(trainer, frozen, contender.grids)
@@ -174,7 +178,7 @@ def main(folder: Path, run: Callable[..., dict[str, Any]] = run_job) -> int:
     from leco_plugin.evaluation.machine import describe_code
 
     die_with_parent()
-    code = describe_code()  # as it is when this process has loaded it
+    code, started = describe_code(), time.monotonic()  # as this process has loaded it
     job = json.loads((folder / JOB).read_text())
     shown = [0.0]
 
@@ -192,7 +196,8 @@ def main(folder: Path, run: Callable[..., dict[str, Any]] = run_job) -> int:
             folder,
             show,
         )
-        write_json(folder / RESULT, {**result, "code": code})
+        wall_seconds = round(time.monotonic() - started, 1)
+        write_json(folder / RESULT, {**result, "code": code, "wall_seconds": wall_seconds})
     # whatever a method raises is a row of the table, and the others go on
     except BaseException as error:  # noqa: BLE001
         traceback.print_exc()

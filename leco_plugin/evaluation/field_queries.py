@@ -1,8 +1,9 @@
 """How often a field is asked: every position whose density is computed, counted where it happens.
 
-Counted are all questions, also those for pruning samples and for updating a grid. Classes are
-wrapped rather than objects, so that a field which is made and dropped on the way, as the one that
-learns an occupancy for a host, is counted too.
+Counted are all questions, also those for pruning samples and for updating a grid; and those to a
+frozen gate, but for what kernels on CUDA ask it. Classes are wrapped rather than objects, so that a
+field which is made and dropped on the way, as the one that learns an occupancy for a host, is
+counted too.
 """
 
 from __future__ import annotations
@@ -19,8 +20,9 @@ from nerfstudio.fields.density_fields import HashMLPDensityField
 from torch import Tensor, nn
 
 from leco_plugin.models.field import HMoEField
+from leco_plugin.occupancy import Occupancy
 
-Kind = Literal["field", "proposal", "learning"]
+Kind = Literal["field", "proposal", "learning", "gate"]
 
 
 @dataclass
@@ -33,6 +35,8 @@ class FieldQueries:
     """Of proposal networks."""
     learning: int = 0
     """Of another field, which learned the occupancy."""
+    gate: int = 0
+    """Of a frozen gate, for what its cell cache does not know."""
 
     def since(self, before: FieldQueries) -> FieldQueries:
         """What has been asked since an earlier count."""
@@ -55,11 +59,14 @@ def counted(model: nn.Module) -> Iterator[FieldQueries]:
     fields: list[nn.Module] = [module for module in model.modules() if isinstance(module, Field)]
     if isinstance(own, nn.Module) and own not in fields:
         fields.append(own)
-    classes = {type(field) for field in fields} | {HMoEField}
+    doors = [(owner, _door(owner)) for owner in {*map(type, fields), HMoEField}]
+    doors += [(Occupancy, "query"), (Occupancy, "occupied")]
     of_model = {id(field) for field in fields}
     asking = False
 
     def kind(field: nn.Module) -> Kind:
+        if isinstance(field, Occupancy):
+            return "gate"
         if id(field) not in of_model:
             return "learning"
         return "proposal" if isinstance(field, HashMLPDensityField) else "field"
@@ -81,8 +88,7 @@ def counted(model: nn.Module) -> Iterator[FieldQueries]:
         return ask
 
     before = []
-    for owner in classes:
-        name = next(n for n in ("get_density", "density", "forward") if hasattr(owner, n))
+    for owner, name in doors:
         before.append((owner, name, owner.__dict__.get(name)))
         setattr(owner, name, counting(getattr(owner, name)))
     try:
@@ -93,6 +99,11 @@ def counted(model: nn.Module) -> Iterator[FieldQueries]:
                 delattr(owner, name)
             else:
                 setattr(owner, name, method)
+
+
+def _door(owner: type) -> str:
+    """The method through which the fields of a class are asked."""
+    return next(name for name in ("get_density", "density", "forward") if hasattr(owner, name))
 
 
 def number_of(positions: Any) -> int:

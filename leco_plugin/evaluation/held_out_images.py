@@ -56,7 +56,7 @@ def evaluate_images(trainer: Trainer, most_images: int, queries: FieldQueries) -
         queries: what the model's fields are asked, counted while this lasts.
     Returns:
         Means of `psnr`, `ssim`, `lpips` (absent without its network), `samples_per_ray`,
-        `field_queries_per_ray`, `proposal_queries_per_ray`; the median of
+        `field_queries_per_ray`, `proposal_queries_per_ray`, `gate_queries_per_ray`; the median of
         `render_seconds_per_image`.
     """
     pipeline = trainer.pipeline
@@ -79,6 +79,7 @@ def evaluate_images(trainer: Trainer, most_images: int, queries: FieldQueries) -
         asked, pixels = queries.since(before), predicted.numel() / 3
         figures["field_queries_per_ray"] = asked.field / pixels
         figures["proposal_queries_per_ray"] = asked.proposal / pixels
+        figures["gate_queries_per_ray"] = asked.gate / pixels
         figures["samples_per_ray"] = figures["field_queries_per_ray"]
         for name in ("samples_per_ray", "num_samples_per_ray"):
             if name in outputs:

@@ -29,6 +29,10 @@ from leco_plugin.models.hosts.learn_first import FIRST_TIMED, TIMED_STEPS, keep_
 CURVE_RAYS = 8192
 """Test pixels behind each point of a curve, its end included."""
 
+PRICES = ("threshold", "empty_fraction", "lost_mass", "lost_surface_mass", "image_price_db")
+WARM_UP = 256
+"""Steps in which nerfacc's grid fills all of its cells at each update."""
+
 ENDLESS = 10_000_000
 """Steps that no timed run reaches; the clock ends it."""
 
@@ -48,6 +52,12 @@ class TimedRun:
     """Of the training time: until there was an occupancy, or all updates of a grid."""
     freeze_seconds: float | None = None
     """When there was an occupancy."""
+    at_freezing: dict[str, Any] | None = None
+    """What it cost and saved then, `PRICES` of its report: a host may skip less later on."""
+    recoveries: int | None = None
+    """How often a collapsed gate was healed; None where a model learns none itself."""
+    warming_up: bool | None = None
+    """Whether the run ended in the warm-up of an occupancy grid, in which all cells are filled."""
     psnr: float = math.nan
     ssim: float = math.nan
     lpips: float | None = None
@@ -55,6 +65,8 @@ class TimedRun:
     field_queries_per_ray: float = 0.0
     """In rendering; those for pruning samples are counted too."""
     proposal_queries_per_ray: float = 0.0
+    gate_queries_per_ray: float = 0.0
+    """To a frozen gate, about what its cell cache does not know."""
     train_queries: FieldQueries = field(default_factory=FieldQueries)
     """In all of the training."""
     render_seconds_per_image: float = 0.0
@@ -167,7 +179,9 @@ class _Course:
             for optimizer in trainer.optimizers.optimizers.values()
             for group in optimizer.param_groups
         ]
-        self.has_grid = _time_updates(trainer.pipeline.model, self.grid_clock)
+        self.grids = _grids_of(trainer.pipeline.model)
+        for grid in self.grids:
+            grid.update_every_n_steps = timed(grid.update_every_n_steps, self.grid_clock)
         where = TrainingCallbackLocation
         trainer.callbacks.insert(0, TrainingCallback([where.BEFORE_TRAIN_ITERATION], self.before))
         trainer.callbacks.append(TrainingCallback([where.BEFORE_TRAIN_ITERATION], self.begun))
@@ -216,8 +230,11 @@ class _Course:
         run = self.run
         run.train_seconds = self.clock.seconds
         run.step_seconds = statistics.median(self.step_times) if self.step_times else None
-        if self.has_grid:
+        if self.grids:
             run.learn_seconds = self.grid_clock.seconds
+            run.warming_up = run.steps < WARM_UP
+        progress = getattr(self.trainer.pipeline.model, "progress", None)
+        run.recoveries = getattr(progress, "recoveries", None)
         run.peak_process_bytes = peak_process_bytes()
         run.peak_allocator_bytes = peak_allocator_bytes()
         run.peak_memory_bytes = run.peak_allocator_bytes or run.peak_process_bytes
@@ -226,10 +243,13 @@ class _Course:
         """Notes when there is an occupancy; returns whether there is one since the last look."""
         model: Any = self.trainer.pipeline.model
         guide = getattr(model, "leco_guide", None)
-        there = bool(getattr(model, "frozen", False)) or getattr(guide, "occupancy", None)
-        if self.run.freeze_seconds is not None or not there:
+        frozen = bool(getattr(model, "frozen", False))
+        learned = model if frozen else getattr(guide, "occupancy", None)
+        if self.run.freeze_seconds is not None or learned is None:
             return False
         self.run.freeze_seconds = self.run.learn_seconds = self.clock.now()
+        report = getattr(learned, "report", {})
+        self.run.at_freezing = {name: report.get(name) for name in PRICES}
         return True
 
     def _keep_to_learning_time(self) -> None:
@@ -242,12 +262,9 @@ class _Course:
         keep_within(progress, more, self.run.steps)
 
 
-def _time_updates(model: torch.nn.Module, clock: Clock) -> bool:
-    """Counts the time in which occupancy grids are updated; returns whether there is one."""
-    grids: list[Any] = [module for module in model.modules() if "occs" in module._buffers]
-    for grid in grids:
-        grid.update_every_n_steps = timed(grid.update_every_n_steps, clock)
-    return bool(grids)
+def _grids_of(model: torch.nn.Module) -> list[Any]:
+    """The occupancy grids of a model, nerfacc's or like those."""
+    return [module for module in model.modules() if "occs" in module._buffers]
 
 
 def run_training(trainer: Trainer) -> None:

@@ -31,6 +31,7 @@ def test_without_a_time_learning_is_left_to_the_method() -> None:
         {"seconds": math.inf},
         {"steps": 0},
         {"seconds": 1.0, "learn_seconds": 0.0},
+        {"seconds": 1.0, "learn_seconds": 1.0},
         {"seconds": 1.0, "images": 0},
         {"seconds": 1.0, "curve_points": 0},
         {"seconds": 1.0, "at_once": 0},

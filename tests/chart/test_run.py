@@ -185,6 +185,28 @@ def test_the_commits_are_those_at_which_the_runs_were_made(
     assert results["made"]["commit"] == "1b, 2a"
 
 
+def test_runs_of_the_same_name_and_other_settings_are_not_in_its_line(
+    tiny_scene: Path, tmp_path: Path
+) -> None:
+    before = [Contender("a", "a", "own", {"rate": 1.0})]
+    make(chart(tiny_scene, tmp_path, contenders=[*before, CONTENDERS[1]]), Runner())
+    results = make(chart(tiny_scene, tmp_path, contenders=CONTENDERS[:1]), Runner())
+    assert [(run["name"], run["seed"]) for run in results["runs"]] == [
+        (name, seed) for name in "ab" for seed in SEEDS
+    ]
+
+
+def test_a_run_says_which_code_has_made_it(tiny_scene: Path, tmp_path: Path) -> None:
+    def with_code(job: Job, show: Callable[[float], None]) -> dict[str, Any]:
+        code = {"version": "0.1.0", "commit": "1b", "sources": f"of seed {job.seed}"}
+        return {**Runner()(job, show), "code": code}
+
+    made = chart(tiny_scene, tmp_path, contenders=CONTENDERS[:1])
+    made.make(with_code, say=lambda line: None, show=lambda share: None)
+    assert [run["code"] for run in made.results()["runs"]] == ["of seed 0", "of seed 1"]
+    assert made.results()["made"]["commit"] == "1b"
+
+
 def test_the_first_occupancy_stands_for_all(tiny_scene: Path, tmp_path: Path) -> None:
     def learns(job: Job, show: Callable[[float], None]) -> dict[str, Any]:
         held = chart_results.occupancy(51_000 + job.seed, 0.1)

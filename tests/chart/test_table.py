@@ -36,9 +36,12 @@ def test_the_front_of_a_column_is_bold() -> None:
     assert "3" in rows(text, "C")[0] and "**3**" not in rows(text, "C")[0]
 
 
-def test_learning_elsewhere_is_a_part_of_the_field_queries() -> None:
-    queries = {"field": 3_000_000, "proposal": 0, "learning": 2_000_000}
-    assert rows(table(results(run("A", train_queries=queries))), "A")[0][-1] == "5"
+def test_every_kind_of_question_is_counted_and_those_that_nobody_asked_are_left_out() -> None:
+    queries = {"field": 3_000_000, "proposal": 0, "learning": 2_000_000, "gate": 7_000_000}
+    text = table(results(run("A", train_queries=queries)))
+    asked = ["field, a ray", "field in training, M", "field that learns first, M"]
+    assert rows(text, "positions asked of")[0][1:] == [*asked, "frozen gate in training, M"]
+    assert rows(text, "A")[-1][1:] == ["31", "3", "2", "7"]
 
 
 def test_failures_are_rows_and_cannot_break_the_table() -> None:
@@ -52,9 +55,38 @@ def test_a_chart_without_any_run_says_why(tmp_path: Path) -> None:
 
 
 def test_occupancies_have_a_table_of_their_own() -> None:
-    text = table(results(run("A", occupancy=occupancy(51_000, 0.125)), run("B")))
-    assert len(rows(text, "A")) == 2 and len(rows(text, "B")) == 1
-    assert rows(text, "A")[1][2] == "51" and "12.5" in rows(text, "A")[1]
+    text = table(results(run("A", occupancy=occupancy(51_000, 0.125)), run("B", sampler="own")))
+    assert len(rows(text, "A")) == 3 and len(rows(text, "B")) == 2
+    assert rows(text, "A")[1][4] == "51" and "12.5" in rows(text, "A")[1]
+
+
+def test_a_gate_that_was_not_frozen_with_every_seed_has_a_row_that_says_so() -> None:
+    skips = [occupancy(51_000, 0.1) | {"empty_fraction": share} for share in (0.6, 0.2)]
+    runs = [run("A", seed, occupancy=one, recoveries=1) for seed, one in enumerate(skips)]
+    never = run("A", 2, freeze_seconds=None, recoveries=3)
+    text = table(results(*runs, never, run("B", freeze_seconds=None, recoveries=0)))
+    assert rows(text, "A")[1][1:3] == ["2 of 3", "5"] and rows(text, "A")[1][6] == "40"
+    assert rows(text, "B")[1][1:3] == ["0 of 1", "0"]
+
+
+def test_what_a_gate_cost_when_it_was_frozen_stands_beside_what_it_skips_at_the_end() -> None:
+    at_first = {"empty_fraction": 0.9, "image_price_db": 0.02, "lost_surface_mass": 2e-4}
+    made = run("A", occupancy=occupancy(51_000, 0.1), at_freezing=at_first)
+    cells = rows(table(results(made)), "A")[1]
+    assert cells[6:10] == ["90", "0.02", "0.0002", "80"]
+
+
+def test_runs_of_several_states_of_the_code_are_named() -> None:
+    runs = [run("A", code="1b"), run("A", 1, code="1b"), run("B", code="2c")]
+    assert "Not all of them are of the same code (1b: A; 2c: B)." in table(results(*runs))
+    assert "same code" not in table(results(*runs[:2]))
+
+
+def test_it_is_said_how_long_all_runs_took_and_which_grids_are_still_warming_up() -> None:
+    runs = [run("A", wall_seconds=300.0), run("B", wall_seconds=300.0, warming_up=True)]
+    text = table(results(*runs, protocol={"seconds": 10.0, "steps": None, "at_once": 2}))
+    assert "All runs together took 5 min." in text
+    assert "Still in the warm-up of their grid, which fills all cells: B." in text
 
 
 def test_the_command_and_the_question_are_there() -> None:
@@ -77,8 +109,8 @@ def test_representations_say_on_which_front_they_are_and_whether_ours_is() -> No
         learn_seconds=8.0,
     )
     text = table(results(ours, other))
-    assert rows(text, "MLP (ours)")[-1] == ["MLP (ours)", "51", "9", "12.5", "size"]
-    assert rows(text, "hash grid")[-1][-1] == "size, learning time"
+    assert rows(text, "MLP (ours)")[2] == ["MLP (ours)", "51", "9", "12.5", "size"]
+    assert rows(text, "hash grid")[2][-1] == "size, learning time"
     assert (
         "MLP (ours) is on the front of size only: it is beaten in learning time by hash grid."
         in text
@@ -90,6 +122,5 @@ def test_grids_that_could_not_be_made_are_named() -> None:
     other = run("planes", sampler="learned-occupancy-vm", occupancy=occupancy(4_000_000, 0.1))
     assert "for want of" not in table(results(ours, other))
     ours["occupancy"]["at_equal_loss"]["left_out"] = [512, 1024]
-    assert "Not in every run, for want of memory or time: grid 512³, 1024³." in table(
-        results(ours, other)
-    )
+    said = "Left out, for want of memory or time in some run: grid 512³, 1024³."
+    assert said in table(results(ours, other))

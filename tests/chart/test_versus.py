@@ -5,9 +5,9 @@ from __future__ import annotations
 import pytest
 from chart_results import results, run
 
-from leco_plugin.chart.summary import lines_of
+from leco_plugin.chart.summary import lines_of, seconds_to_pass
 from leco_plugin.chart.table import table
-from leco_plugin.chart.versus import rivals, seconds_to_pass
+from leco_plugin.chart.versus import rivals
 
 CURVE = [[10.0, 18.0], [20.0, 20.0], [30.0, 19.0], [40.0, 21.0]]
 
@@ -34,6 +34,12 @@ def test_seeds_are_paired_and_those_that_one_lacks_are_left_out() -> None:
     assert found.passed == (9.0, 7.0)  # a decibel a second until second ten
     assert found.sooner == pytest.approx((10 / 9, 10 / 7))
     assert found.faster == (2.0, 2.0)
+
+
+def test_a_last_step_beyond_the_time_that_was_given_is_nobodys_gain() -> None:
+    lines = lines_of(results(*of_seeds("learned-occupancy", [21.0]), *of_seeds("own", [20.0])))
+    (found,) = rivals(lines, seconds=9.0)
+    assert found.passed == (9.0,) and found.sooner == (1.0,)
 
 
 def test_other_methods_are_no_rivals() -> None:

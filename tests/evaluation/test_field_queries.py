@@ -6,6 +6,7 @@ from typing import Any
 
 import pytest
 import torch
+from ball_occupancy import ball
 from nerfstudio.cameras.rays import Frustums, RaySamples
 from nerfstudio.fields.base_field import Field
 from nerfstudio.fields.density_fields import HashMLPDensityField
@@ -14,6 +15,7 @@ from torch import Tensor, nn
 from leco_plugin.evaluation.field_queries import counted
 from leco_plugin.models.encodings import EncodingConfig
 from leco_plugin.models.field import FieldConfig, HMoEField
+from leco_plugin.occupancy import Occupancy
 
 
 class Fog(Field):
@@ -78,7 +80,7 @@ def test_shading_pruning_and_updating_are_all_counted() -> None:
         host.field(samples(5, 7))
         host.field.density_fn(torch.zeros(11, 3))
         host.field.get_density(samples(2, 3))
-    assert vars(queries) == {"field": 35 + 11 + 6, "proposal": 0, "learning": 0}
+    assert vars(queries) == {"field": 35 + 11 + 6, "proposal": 0, "learning": 0, "gate": 0}
 
 
 def test_proposal_networks_are_counted_apart() -> None:
@@ -87,7 +89,7 @@ def test_proposal_networks_are_counted_apart() -> None:
         host.field(samples(5, 7))
         for density_fn in host.density_fns:
             density_fn(torch.zeros(4, 6, 3))
-    assert vars(queries) == {"field": 35, "proposal": 48, "learning": 0}
+    assert vars(queries) == {"field": 35, "proposal": 48, "learning": 0, "gate": 0}
 
 
 def test_a_field_that_asks_its_parent_class_is_asked_once() -> None:
@@ -110,7 +112,15 @@ def test_a_field_that_learns_for_a_host_is_counted_apart() -> None:
     with counted(Host(own)) as queries:
         ask(own, 3)
         ask(hmoe(), 4)
-    assert vars(queries) == {"field": 3, "proposal": 0, "learning": 4}
+    assert vars(queries) == {"field": 3, "proposal": 0, "learning": 4, "gate": 0}
+
+
+def test_a_frozen_gate_is_counted_once_whatever_is_asked_of_it() -> None:
+    occupancy = ball()
+    with counted(Host(Plain())) as queries:
+        occupancy.query(torch.zeros(3, 3))
+        occupancy.occupied(torch.zeros(4, 3))
+    assert vars(queries) == {"field": 0, "proposal": 0, "learning": 0, "gate": 7}
 
 
 def test_what_was_asked_since_a_moment() -> None:
@@ -123,11 +133,11 @@ def test_what_was_asked_since_a_moment() -> None:
 
 
 def test_afterwards_nothing_is_counted_and_the_classes_are_as_they_were() -> None:
-    own = {owner: dict(vars(owner)) for owner in (Fog, ThickFog, Plain, HMoEField)}
+    own = {owner: dict(vars(owner)) for owner in (Fog, ThickFog, Plain, HMoEField, Occupancy)}
     host = Host(ThickFog())
     with pytest.raises(RuntimeError), counted(host) as queries:
         raise RuntimeError
     host.field(samples(5, 7))
     ask(hmoe(), 4)
-    assert vars(queries) == {"field": 0, "proposal": 0, "learning": 0}
+    assert vars(queries) == {"field": 0, "proposal": 0, "learning": 0, "gate": 0}
     assert all(dict(vars(owner)) == before for owner, before in own.items())

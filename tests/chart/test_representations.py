@@ -1,0 +1,115 @@
+"""Claims about ways to hold an occupancy, side by side."""
+
+from __future__ import annotations
+
+import pytest
+from chart_results import occupancy, results, run, slow_front
+from hypothesis import given
+from hypothesis import strategies as st
+
+from leco_plugin.chart.representations import (
+    Held,
+    Representation,
+    fronts_of,
+    representations_of,
+    verdict,
+)
+from leco_plugin.chart.summary import lines_of
+
+GRIDS = [
+    {"resolution": 64, "bytes": 32768, "update_seconds": 2.0, "kept_reached_volume": 0.3},
+    {"resolution": 128, "bytes": 262144, "update_seconds": 4.0, "kept_reached_volume": 0.2},
+]
+
+
+def gates(*found: tuple[str, str, int, float, float]) -> list[Representation]:
+    """Of name, sampler, bytes, seconds of learning and share kept."""
+    runs = [
+        run(name, sampler=sampler, learn_seconds=seconds, occupancy=occupancy(size, kept))
+        for name, sampler, size, seconds, kept in found
+    ]
+    return representations_of(lines_of(results(*runs)))
+
+
+def test_grids_stand_beside_the_gates_of_whose_field_they_were_made() -> None:
+    ours = run("MLP (ours)", occupancy=occupancy(50_000, 0.1, GRIDS))
+    other = run("hash grid", sampler="learned-occupancy-hash", occupancy=occupancy(4_000_000, 0.2))
+    plain = run("never frozen", occupancy=None)
+    held = representations_of(lines_of(results(ours, other, plain)))
+    assert [(one.name, one.median("size")) for one in held] == [
+        ("MLP (ours)", 50.0),
+        ("grid 64³", 32.768),
+        ("grid 128³", 262.144),
+        ("hash grid", 4000.0),
+    ]
+    assert [one.median("learn_seconds") for one in held] == [3.0, 5.0, 7.0, 3.0]
+    assert [one.kept for one in held] == pytest.approx([10.0, 30.0, 20.0, 20.0])
+    assert [one.ours for one in held] == [True, False, False, False]
+    assert verdict(held) == (
+        "MLP (ours) is on both fronts: nothing keeps less space in every seed that is not larger, "
+        "or not longer in learning"
+    )
+
+
+@pytest.mark.parametrize("missing_in", [0, 1])
+def test_a_grid_that_did_not_fit_the_memory_once_is_not_compared(missing_in: int) -> None:
+    runs = [run("A", seed, occupancy=occupancy(50_000, 0.1, GRIDS)) for seed in (0, 1)]
+    runs[missing_in]["occupancy"]["at_equal_loss"]["grids"] = GRIDS[:1]
+    names = [one.name for one in representations_of(lines_of(results(*runs)))]
+    assert names == ["A", "grid 64³"]
+
+
+def held(name: str, *seeds: tuple[float, float]) -> Representation:
+    """Of seconds of learning and percent kept, seed by seed."""
+    return Representation(name, {i: Held(50.0, *figures) for i, figures in enumerate(seeds)})
+
+
+def test_what_one_seed_does_not_show_beats_nothing() -> None:
+    ours = held("ours", (9.0, 10.0), (9.0, 20.0))
+    assert held("less, always", (9.0, 9.0), (9.0, 19.0)).beats(ours, "learn_seconds")
+    assert held("less, once", (9.0, 9.0), (9.0, 20.0)).beats(ours, "learn_seconds")
+    assert not held("less in the middle", (9.0, 12.0), (9.0, 10.0)).beats(ours, "learn_seconds")
+    assert not held("faster once", (8.0, 10.0), (9.5, 20.0)).beats(ours, "learn_seconds")
+    assert not Representation("elsewhere", {5: Held(1.0, 1.0, 1.0)}).beats(ours, "learn_seconds")
+
+
+def test_what_was_measured_in_the_whole_box_is_not_compared() -> None:
+    before = occupancy(50_000, 0.1)
+    before["at_equal_loss"] = {"kept_volume": 0.1, "kept_candidates": 0.1, "grids": []}
+    other = run("B", sampler="learned-occupancy-hash", occupancy=before)
+    assert representations_of(lines_of(results(run("A", occupancy=before), other))) == []
+
+
+def test_gates_of_one_kind_are_no_comparison_of_representations() -> None:
+    runs = [run(name, occupancy=occupancy(50_000, 0.1)) for name in ("identity", "none")]
+    assert representations_of(lines_of(results(*runs))) == []
+
+
+def test_it_is_said_where_ours_is_not_on_the_front_and_what_beats_it() -> None:
+    ours = ("MLP (ours)", "learned-occupancy", 50_000, 9.0, 0.1)
+    faster = ("hash grid", "learned-occupancy-hash", 4_000_000, 3.0, 0.05)
+    smaller = ("K-planes", "learned-occupancy-k-planes", 40_000, 10.0, 0.1)
+    said = verdict(gates(faster, ours))  # whatever comes first
+    assert said == (
+        "MLP (ours) is on the front of size only: it is beaten in learning time by hash grid"
+    )
+    assert verdict(gates(ours, faster, smaller)) == (
+        "MLP (ours) is on neither front: it is beaten in size by K-planes and in learning time by "
+        "hash grid"
+    )
+    assert verdict(gates(faster, smaller)) == "our own gate has no figures here"
+
+
+def test_equals_do_not_beat_one_another() -> None:
+    held = gates(*[(name, name, 50_000, 9.0, 0.1) for name in "AB"])
+    assert [fronts_of(one, held) for one in held] == [["size", "learning time"]] * 2
+
+
+@given(st.lists(st.tuples(*[st.integers(1, 5)] * 3), min_size=1, max_size=8))
+def test_fronts_are_those_of_the_definition(rows: list[tuple[int, int, int]]) -> None:
+    held = [Representation(str(i), {0: Held(*map(float, row))}) for i, row in enumerate(rows)]
+    for one, (size, seconds, kept) in zip(held, rows):
+        by_size = (size, -kept) in slow_front([(a, -k) for a, _, k in rows])
+        by_time = (seconds, -kept) in slow_front([(b, -k) for _, b, k in rows])
+        expected = ["size"] * by_size + ["learning time"] * by_time
+        assert fronts_of(one, held) == expected
