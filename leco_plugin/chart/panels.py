@@ -130,18 +130,25 @@ def draw_learned(
         one.name if one.always_frozen else f"{one.name}: {len(one.facts)} of {one.seeds} frozen"
         for one in shown
     ]
-    name_points(axes, places, names, [looks[one.name]["color"] for one in shown])
+    others = [point for of in points.values() for point in of]
+    name_points(axes, places, names, [looks[one.name]["color"] for one in shown], others)
     if never := [one.name for one in learned if not one.facts]:
-        said = f"never frozen: {', '.join(never)}"
+        said = f"never frozen: {'; '.join(never)}"
         axes.text(0.01, 0.03, said, transform=axes.transAxes, fontsize=11)
 
 
 def name_points(
-    axes: Any, places: Sequence[tuple[float, float]], names: Sequence[str], colours: Sequence[str]
+    axes: Any,
+    places: Sequence[tuple[float, float]],
+    names: Sequence[str],
+    colours: Sequence[str],
+    others: Sequence[tuple[float, float]] = (),
 ) -> None:
-    """Names beside points, each where it covers neither another name nor a point."""
-    spots = axes.transAxes.inverted().transform(axes.transData.transform(places)).tolist()
-    taken = [(x - 0.012, y - 0.03, x + 0.012, y + 0.03) for x, y in spots]
+    """Names beside points, each where it covers neither another name nor a point, nor `others`."""
+    in_axes = axes.transAxes.inverted()
+    spots = in_axes.transform(axes.transData.transform(places)).tolist()
+    filled = in_axes.transform(axes.transData.transform([*places, *others])).tolist()
+    taken = [(x - 0.012, y - 0.03, x + 0.012, y + 0.03) for x, y in filled]
     for (x, y), name, colour in zip(spots, names, colours):
         width = NAME_WIDTH * len(name)
         corners = [

@@ -176,7 +176,7 @@ def circumstances(results: Mapping[str, Any]) -> str:
     if (at_once := protocol.get("at_once", 1)) > 1:
         where += f", {at_once} runs at a time"
     seeds = len({run["seed"] for run in results["runs"]})
-    many = "one seed" if seeds == 1 else f"mean of {seeds} seeds (bands: least to most)"
+    many = "one seed" if seeds == 1 else f"{seeds} seeds: means of PSNR, medians of costs"
     method = shared_method(list(dict.fromkeys(run["name"] for run in results["runs"])))
     what = f"{method} on {results['scene']['name']}" if method else results["scene"]["name"]
     return f"{what}, {' or '.join(parts)} of training on {where}, {many}"

@@ -87,7 +87,7 @@ def test_the_method_that_all_share_is_named_once_and_with_the_scene() -> None:
     )
     mixed = results(run("NGP + a"), run("LeCO, b", 1))
     assert circumstances(mixed) == (
-        "city, 10 s of training on 2 CPU cores, mean of 2 seeds (bands: least to most)"
+        "city, 10 s of training on 2 CPU cores, 2 seeds: means of PSNR, medians of costs"
     )
 
 

@@ -20,7 +20,8 @@ def rows(text: str, first: str) -> list[list[str]]:
 def test_every_contender_has_a_row_with_its_figures() -> None:
     runs = [run("A", 0, 20.0), run("A", 1, 21.0), run("B", psnr=19.0)]
     text = table(results(*runs))
-    (cells,) = rows(text, "A")
+    cells, asked = rows(text, "A")
+    assert asked[1] == "31"
     assert cells[1:3] == ["2", "20.50 (20.00 to 21.00)"]
     assert rows(text, "B")[0][2] == "19.00"
     assert "-" in cells  # no LPIPS

@@ -57,6 +57,8 @@ def test_a_job_comes_to_the_run_as_it_was_written(tiny_scene: Path, tmp_path: Pa
 
     assert main(job(tmp_path, tiny_scene), run) == 0
     found = json.loads((tmp_path / RESULT).read_text())
+    assert found.pop("wall_seconds") >= 0.0
+    assert {"version", "commit", "sources"} == found.pop("code").keys()
     assert found == {"same": True, "seed": 3, "data": str(tiny_scene)}
     assert (tmp_path / PROGRESS).read_text() == "0.500"
 
