@@ -83,7 +83,7 @@ def shrink(
     warnings.filterwarnings("ignore", module=r"nerfstudio|torch")
     from leco_plugin.shrink.command import shrink as find_smaller
     from leco_plugin.shrink.command import summary
-    from leco_plugin.shrink.search import Bounds
+    from leco_plugin.shrink.rungs import Bounds
 
     check_json(json)
     check_picture("--picture", picture)

@@ -19,7 +19,8 @@ from leco_plugin.progress_bar import bar
 from leco_plugin.scenes.pixels.held_out_pixels import held_out_sampler
 from leco_plugin.shrink.evidence import Evidence, gather
 from leco_plugin.shrink.references import names_of, references, shares_lost
-from leco_plugin.shrink.search import Bounds, Found, Ground, Rung, check_room, search
+from leco_plugin.shrink.rungs import Bounds, Found, Ground, Rung, check_room
+from leco_plugin.shrink.search import search
 from leco_plugin.shrink.sources import (
     Source,
     check_scene,

@@ -20,7 +20,7 @@ from leco_plugin.models.encodings import EncodingConfig
 from leco_plugin.models.freezing.field_at_freezing import leave_field
 from leco_plugin.models.gate import GateConfig
 from leco_plugin.occupancy import Occupancy
-from leco_plugin.shrink import command, references, search, sources
+from leco_plugin.shrink import command, references, rungs, search, sources
 from leco_plugin.shrink.command import compare_queries
 from leco_plugin.shrink.evidence import loss
 from leco_plugin.shrink.picture import draw
@@ -176,7 +176,7 @@ def test_the_model_of_the_run_says_what_is_lost(
     assert lost_on_unseen_rays(unseen, smaller)[0] <= smaller.report["lost_surface_mass"]
 
 
-def lost_on_unseen_rays(ground: search.Ground, smaller: Occupancy) -> list[float]:
+def lost_on_unseen_rays(ground: rungs.Ground, smaller: Occupancy) -> list[float]:
     """Shares of the surface mass, by definition, one a reference."""
     parts = [reference.verify.evidence for reference in ground.references]
     return [
@@ -205,10 +205,10 @@ def test_the_file_declares_what_rays_have_lost_that_the_search_did_not_see(
     known_run: Path, tiny_scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """On the rays of the search only the safest places are worth anything, on others all kept."""
-    grounds: list[search.Ground] = []
+    grounds: list[rungs.Ground] = []
     prepare = command._ground
 
-    def uneven(source: sources.Source, original: Occupancy) -> search.Ground:
+    def uneven(source: sources.Source, original: Occupancy) -> rungs.Ground:
         ground = prepare(source, original)
         (reference,) = ground.references
         searched, unseen = reference.search, reference.verify
@@ -271,10 +271,8 @@ def test_what_is_declared_holds_against_the_field_at_the_moment_of_freezing(
     lost = lost_on_unseen_rays(ground, smaller)
     assert lost[1] > lost[0] + 0.01  # what the original skips counts
     assert max(lost) <= smaller.report["lost_surface_mass"] == max(x["bound"] for x in against)
-    part = ground.references[1].verify
-    pixels = sum(len(one.truth) for one in part.rendered)
-    assert references.RAYS <= part.evidence.rays < references.RAYS + pixels
-    assert part.evidence.rays % pixels == 0
+    for part in ground.references[1][-2:]:
+        assert part.evidence.rays == references.RAYS > sum(len(one.truth) for one in part.rendered)
 
 
 def test_rays_from_between_the_cameras_begin_there(known_run: Path, tiny_scene: Path) -> None:

@@ -15,7 +15,9 @@ from leco_plugin.occupancy import Occupancy
 from leco_plugin.shrink import search as searching
 from leco_plugin.shrink.evidence import Evidence, query_in_parts
 from leco_plugin.shrink.references import Part, Reference, declared
-from leco_plugin.shrink.search import Bounds, Found, Ground, Rung, search, threshold_keeping
+from leco_plugin.shrink.rungs import Bounds, Found, Ground, Rung, check_room
+from leco_plugin.shrink.search import search, threshold_keeping
+from leco_plugin.shrink.verifying import verify
 
 TOO_SMALL = GateConfig(EncodingConfig(octaves=1), 1, 1, 1)
 ENOUGH = GateConfig(EncodingConfig(octaves=2), 16, 2, 1)
@@ -94,6 +96,24 @@ def test_what_fails_on_unseen_rays_is_not_chosen() -> None:
     assert [rung.verdict for rung in found.rungs] == ["fails on unseen rays"]
 
 
+def test_each_look_at_the_unseen_rays_is_counted_and_allowed_less() -> None:
+    known = original()
+    unseen = known_worth(known, 2)
+    far = (unseen.positions - torch.tensor(CENTRE)).norm(dim=-1) > 1.3
+    nobody = ground(known, unseen._replace(worth=far.float()))
+    rungs = search(nobody, Bounds(4e-3), [TOO_SMALL, ENOUGH, ENOUGH]).rungs
+    # a gate that fails there was taught twice, and looked at twice
+    assert [rung.look for rung in rungs] == [None, 2, 4]
+    (alone,) = walk(known, [ENOUGH], lost_surface_mass=4e-3).rungs
+    assert alone.look == 1
+    later = replace(alone)
+    found = Occupancy(known.gate, known.space, known.threshold).eval()
+    for rung, look in ((alone, 1), (later, 7)):
+        verify(ground(known), found, Bounds(4e-3), rung, look)
+    bounds = [float(rung.verified["lost_surface_mass_bound"] or 0.0) for rung in (alone, later)]
+    assert 0.0 < bounds[0] < bounds[1]
+
+
 def test_a_loss_that_the_search_has_seen_is_declared_too() -> None:
     known = original()
     here = ground(known)
@@ -111,7 +131,7 @@ def test_nothing_is_lost_beyond_what_the_original_leaves() -> None:
         walk(original(lost_surface_mass=3e-3), [ENOUGH], lost_surface_mass=1e-3)
     with pytest.raises(ValueError, match="raise --image-price"):
         walk(original(image_price_db=0.06), [ENOUGH])
-    searching.check_room(original(lost_surface_mass=4e-4, image_price_db=-0.1), Bounds())
+    check_room(original(lost_surface_mass=4e-4, image_price_db=-0.1), Bounds())
 
 
 def test_what_the_original_has_lost_is_declared_too() -> None:

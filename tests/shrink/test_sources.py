@@ -20,6 +20,7 @@ from leco_plugin.shrink.sources import (
     check_scene,
     find_source,
     held_out,
+    of_other_pixels,
     of_test_photographs,
 )
 
@@ -109,6 +110,19 @@ def test_test_photographs_say_what_a_smaller_gate_loses(known_run: Path, tiny_sc
     alone = source._replace(model=None)
     original.report |= THEIR_MARCH
     assert shares_lost(alone, original, everything, seen) == pytest.approx({BY_DECISIONS: 1e-4})
+
+
+def test_rays_of_other_pixels_have_each_another_one(known_run: Path, tiny_scene: Path) -> None:
+    file = known_run / "occupancy.safetensors"
+    source, original = find_source(file, tiny_scene), Occupancy.load(file)
+    seen = held_out(source, original, 200)
+    for count in (700, 700, 10**4):  # more than there are
+        seen.append(of_other_pixels(source, original, count, seen))
+    pixels = torch.cat([one.pixels for one in seen if one.pixels is not None])
+    assert len(pixels) == sum(len(one.truth) for one in seen) == len(pixels.unique(dim=0))
+    assert len(seen[2].truth) == len(seen[3].truth) == 700 and 3000 < len(seen[4].truth) < 10**4
+    picture = source.manager.train_dataset.get_data(int(seen[3].pixels[5, 0]))["image"]
+    assert torch.equal(seen[3].truth[5].cpu(), picture[tuple(seen[3].pixels[5, 1:])])
 
 
 def test_photographs_too_small_for_held_out_pixels_are_named(
