@@ -82,9 +82,9 @@ def shrink_table(reports: Mapping[str, Report]) -> str:
         reports: as `leco shrink --json` writes them, by the name of the scene.
     """
     lines = [
-        "| scene | values | file, kB | declared lost surface mass | lost on test photographs "
-        "| image price, dB | gates tried | queries faster by |",
-        "|" + "---|" * 8,
+        "| scene | values | file, kB | skipped, % | declared lost surface mass "
+        "| lost on test photographs | image price, dB | gates tried | queries faster by |",
+        "|" + "---|" * 9,
     ]
     for scene, report in reports.items():
         before, after = report["from"], report["to"]
@@ -93,10 +93,11 @@ def shrink_table(reports: Mapping[str, Report]) -> str:
         lost = None if checked is None else checked["lost_surface_mass"]
         size, speed = after["bytes"], report["query_speedup"]
         now = _flagged(f"{size / 1000:.1f}", size <= SHRUNK_BYTES)
-        price = after.get("image_price_db")
+        price, skipped = after.get("image_price_db"), after.get("empty_fraction")
         cells = (
             f"{before['params']} to {after['params']}",
             f"{before['bytes'] / 1000:.1f} to {now}",
+            "-" if skipped is None else f"{100 * skipped:.1f}",
             _flagged(f"{declared:.2e}", declared <= SHRUNK_LOSS),
             "-" if lost is None else _flagged(f"{lost:.2e}", lost <= declared),
             "-" if price is None else f"{price:+.3f}",

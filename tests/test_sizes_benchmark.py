@@ -138,7 +138,13 @@ def test_the_table_has_a_row_for_each_scene_point_and_bar() -> None:
 def shrunk(**after: Any) -> dict[str, Any]:
     return {
         "from": {"params": 11333, "bytes": 51200},
-        "to": {"params": 978, "bytes": 5900, "lost_surface_mass": 5.6e-4, "image_price_db": 0.01}
+        "to": {
+            "params": 978,
+            "bytes": 5900,
+            "empty_fraction": 0.816,
+            "lost_surface_mass": 5.6e-4,
+            "image_price_db": 0.01,
+        }
         | after,
         "query_speedup": 3.2,
         "checked": {"lost_surface_mass": 2e-4},
@@ -148,12 +154,13 @@ def shrunk(**after: Any) -> dict[str, Any]:
 
 def test_a_shrunk_gate_that_misses_a_bar_stands_out() -> None:
     row = shrink_table({"city-3": shrunk()}).splitlines()[-1]
-    cells = "11333 to 978 | 51.2 to 5.9 | 5.60e-04 | 2.00e-04 | +0.010 | 2 | 3.20 x"
+    cells = "11333 to 978 | 51.2 to 5.9 | 81.6 | 5.60e-04 | 2.00e-04 | +0.010 | 2 | 3.20 x"
     assert row == f"| city-3 | {cells} |"
     row = shrink_table({"city-3": shrunk(bytes=40_000, lost_surface_mass=1e-4)}).splitlines()[-1]
     assert "**40.0**" in row and "**2.00e-04**" in row
     unchanged = shrunk() | {"checked": None}
     assert "| - |" in shrink_table({"city-3": unchanged}).splitlines()[-1]
+    assert "to 5.9 | - | 5.60e-04 |" in shrink_table({"a": shrunk(empty_fraction=None)})
 
 
 def test_the_fine_grid_stands_beside_the_best_gate_of_a_hundredth_of_its_bytes() -> None:

@@ -14,6 +14,7 @@ from nerfstudio.utils.rich_utils import CONSOLE
 from leco_plugin.cli_reports import check_place
 from leco_plugin.evaluation.inspection import whole_box
 from leco_plugin.evaluation.machine import describe_machine
+from leco_plugin.models.freezing.freezing import HARDLY_ANYTHING
 from leco_plugin.occupancy import BACKDROP_PRICE, Occupancy
 from leco_plugin.progress_bar import bar
 from leco_plugin.scenes.pixels.held_out_pixels import held_out_sampler
@@ -60,6 +61,7 @@ def shrink(file: Path, data: Path, out: Path, bounds: Bounds, seed: int = 0) -> 
     original = Occupancy.load(file)
     check_room(original, bounds)
     check_march(original, file)
+    check_skips(original, file)
     torch.manual_seed(seed)
     source = find_source(file, data)
     check_scene(source, original, data)
@@ -106,6 +108,22 @@ def check_march(original: Occupancy, file: Path) -> None:
             raise ValueError(
                 f"{file} does not say how its rays are marched: its {name} is {value}, no distance"
             )
+
+
+def check_skips(original: Occupancy, file: Path) -> None:
+    """Whether an occupancy skips enough for a smaller gate to be worth anything.
+
+    Raises:
+        ValueError: it skips nothing, or next to nothing of all candidates.
+    """
+    skipped = original.report.get("empty_fraction")
+    if original.threshold == 0.0:
+        said = "skips nothing, for its threshold is 0"
+    elif isinstance(skipped, int | float) and skipped < HARDLY_ANYTHING:
+        said = f"skips {skipped:.1%} of all candidates, next to nothing"
+    else:
+        return
+    raise ValueError(f"{file} {said}: there is nothing to shrink; learn it for more steps")
 
 
 def check(source: Source, original: Occupancy, smaller: Occupancy) -> dict[str, Any] | None:

@@ -122,6 +122,11 @@ def test_bad_input_ends_with_one_line_and_status_2(
     aground = Occupancy.load(file)
     aground.report["step_size"] = "small"
     aground.save(tmp_path / "aground.safetensors")
+    idle, foggy = Occupancy.load(file), Occupancy.load(file)
+    idle.threshold_value.fill_(0.0)
+    idle.save(tmp_path / "idle.safetensors")
+    foggy.report["empty_fraction"] = 0.04
+    foggy.save(tmp_path / "foggy.safetensors")
     elsewhere = Occupancy.load(file)
     elsewhere.report["cameras"] = [[1.0, 0.1 * number, 0.7] for number in range(20)]
     elsewhere.save(tmp_path / "elsewhere.safetensors")
@@ -133,6 +138,11 @@ def test_bad_input_ends_with_one_line_and_status_2(
         "how its rays are marched": [tmp_path / "silent.safetensors", "--data", tiny_scene, *out],
         "not nan": [file, "--data", tiny_scene, *out, "--lost-surface-mass", "nan"],
         "step_size is small": [tmp_path / "aground.safetensors", "--data", tiny_scene, *out],
+        "its threshold is 0": [tmp_path / "idle.safetensors", "--data", tiny_scene, *out],
+        "skips 4.0% of all candidates": [
+            *(tmp_path / "foggy.safetensors", "--data", tiny_scene),
+            *out,
+        ],
         "of the 20 cameras": [tmp_path / "elsewhere.safetensors", "--data", tiny_scene, *out],
         "is a folder": [file, "--data", tiny_scene, "--out", tmp_path],
         "is the occupancy itself": [file, "--data", tiny_scene, "--out", file],
