@@ -82,8 +82,8 @@ def shrink(
     # what nerfstudio and torch think of each other is nothing that a user can act on
     warnings.filterwarnings("ignore", module=r"nerfstudio|torch")
     from leco_plugin.shrink.command import shrink as find_smaller
-    from leco_plugin.shrink.command import summary
     from leco_plugin.shrink.rungs import Bounds
+    from leco_plugin.shrink.saying import summary
 
     check_json(json)
     check_picture("--picture", picture)

@@ -21,6 +21,7 @@ from leco_plugin.scenes.pixels.held_out_pixels import held_out_sampler
 from leco_plugin.shrink.evidence import Evidence, gather
 from leco_plugin.shrink.references import names_of, references, shares_lost
 from leco_plugin.shrink.rungs import Bounds, Found, Ground, Rung, check_room
+from leco_plugin.shrink.saying import line_of, line_of_original
 from leco_plugin.shrink.search import search
 from leco_plugin.shrink.sources import (
     Source,
@@ -30,6 +31,7 @@ from leco_plugin.shrink.sources import (
     of_test_photographs,
     trained_on,
 )
+from leco_plugin.shrink.verifying import HOLDS, is_measured, of_original, verify
 
 RAYS = 4096
 TAUGHT_RAYS = 6144
@@ -67,17 +69,22 @@ def shrink(file: Path, data: Path, out: Path, bounds: Bounds, seed: int = 0) -> 
     check_scene(source, original, data)
     original = original.to(source.manager.device)
     ground = _ground(source, original)
-    with bar("Teaching smaller gates") as show:
-        found = search(ground, bounds, on_rung=_say, on_progress=show)
+    itself = of_original(ground, bounds)
+    _say(line_of_original(itself, is_measured(ground)))
+    found = Found(None, [])
+    if itself.verdict == HOLDS:
+        with bar("Teaching smaller gates") as show:
+            found = search(ground, bounds, on_rung=_tell, on_progress=show)
     before = {"params": original.num_params, "bytes": file.stat().st_size}
-    checked = None
     smaller = found.occupancy
     if smaller is None:
+        if is_measured(ground):
+            looks = max((rung.look or 0 for rung in found.rungs), default=0)
+            verify(ground, original, bounds, itself, looks + 1)
         smaller = _rounded_as_it_is(original)
-    else:
-        checked = check(source, original, smaller)
+    checked = check(source, original, smaller)
     untrained = held_out_sampler(source.manager) is not None
-    smaller.report = report_of(original, ground, found, untrained)
+    smaller.report = report_of(ground, found, itself, untrained)
     out.parent.mkdir(parents=True, exist_ok=True)
     smaller.save(out)
     speedup, times = compare_queries(original, smaller)
@@ -92,6 +99,7 @@ def shrink(file: Path, data: Path, out: Path, bounds: Bounds, seed: int = 0) -> 
         "query_milliseconds": times,
         "queried_positions": TIMED_POSITIONS,
         "checked": checked,
+        "original": itself.to_dict(),
         "rungs": [rung.to_dict() for rung in found.rungs],
     }
 
@@ -131,12 +139,14 @@ def check(source: Source, original: Occupancy, smaller: Occupancy) -> dict[str, 
 
     Returns:
         `rays`, the worst `lost_surface_mass` of any reference, and of each (`against`); None
-        without such photographs.
+        without such photographs, and of the original where nothing measures it.
     """
     seen = of_test_photographs(source, original, RAYS)
     if seen is None:
         return None
     shares = shares_lost(source, original, smaller, seen)
+    if not shares:
+        return None
     return {"rays": len(seen.truth), "lost_surface_mass": max(shares.values()), "against": shares}
 
 
@@ -180,34 +190,43 @@ def _rounded_as_it_is(original: Occupancy) -> Occupancy:
     return original
 
 
-def report_of(original: Occupancy, ground: Ground, found: Found, untrained: bool) -> dict[str, Any]:
+def report_of(ground: Ground, found: Found, itself: Rung, untrained: bool) -> dict[str, Any]:
     """What the smaller occupancy declares: the original's loss and, on top, its own.
 
     Args:
+        itself: the original, which is stored again where nothing smaller holds.
         untrained: whether nothing was trained on the pixels of the ground's rays.
     """
+    original = ground.original
     report = {name: original.report[name] for name in COPIED if name in original.report}
     if "cameras" in report:
         report["cameras"] = [[round(float(x), 4) for x in row] for row in report["cameras"]]
     if found.occupancy is None:
-        return {**original.report, **report}
+        report = {**original.report, **report}
+        return report | (_measured(ground, itself, untrained) if is_measured(ground) else {})
     rung = found.rungs[-1]
-    measured = rung.verified
-    unchanged = ("lost_mass", "image_price_db", "empty_fraction", "kept_candidates_dropped")
     return (
         report
-        | {name: measured[name] for name in unchanged}
+        | _measured(ground, rung, untrained)
         | {
             "params": rung.params,
             "threshold": found.occupancy.threshold,
-            "lost_surface_mass": measured["lost_surface_mass_bound"],
-            "calibration_rays": ground.references[0].verify.evidence.rays,
-            "held_out": untrained and bool(original.report.get("held_out", False)),
+            "kept_candidates_dropped": rung.verified["kept_candidates_dropped"],
             "shrunk_from_params": original.num_params,
-            "loss_measured_against": names_of(ground.references),
             "kept_volume_of_the_original": rung.kept_volume,
         }
     )
+
+
+def _measured(ground: Ground, rung: Rung, untrained: bool) -> dict[str, Any]:
+    """Of a report, what was measured on rays that the search did not see."""
+    measured = rung.verified
+    return {name: measured[name] for name in ("lost_mass", "image_price_db", "empty_fraction")} | {
+        "lost_surface_mass": measured["lost_surface_mass_bound"],
+        "calibration_rays": ground.references[0].verify.evidence.rays,
+        "held_out": untrained and bool(ground.original.report.get("held_out", False)),
+        "loss_measured_against": names_of(ground.references),
+    }
 
 
 def compare_queries(original: Occupancy, smaller: Occupancy) -> tuple[float, list[float]]:
@@ -238,38 +257,9 @@ def _seconds(occupancy: Occupancy, positions: torch.Tensor) -> float:
     return time.perf_counter() - started
 
 
-def _say(rung: Rung) -> None:
-    CONSOLE.print(line_of(rung), markup=False, highlight=False)
+def _tell(rung: Rung) -> None:
+    _say(line_of(rung))
 
 
-def line_of(rung: Rung) -> str:
-    """A rung as a line of the table."""
-    price = "     -" if rung.image_price_db is None else f"{rung.image_price_db:+6.3f}"
-    return (
-        f"{rung.name:<28}{rung.params:>8} values {rung.bytes / 1000:>7.1f} kB  loses "
-        f"{rung.lost_surface_mass:.1e}  {price} dB  keeps {rung.kept_volume:>6.1%} of the "
-        f"original's volume  {rung.verdict}"
-    )
-
-
-def summary(results: dict[str, Any], out: Path) -> list[str]:
-    """The outcome in a few lines, for the terminal."""
-    before, after, checked = results["from"], results["to"], results["checked"]
-    lines = []
-    if not any(rung["verdict"] == "chosen" for rung in results["rungs"]):
-        lines.append("no smaller gate holds these bounds: this is the same gate")
-    lines.append(
-        f"{out}: {before['bytes'] / 1000:.1f} kB before, {after['bytes'] / 1000:.1f} kB now; asked "
-        f"{results['query_speedup']:.1f} times faster"
-    )
-    lost, price = after.get("lost_surface_mass"), after.get("image_price_db")
-    if lost is not None:
-        cost = "" if price is None else f" and {price:+.3f} dB"
-        lines.append(f"declares {lost:.2e} of the surface mass{cost}, the original's included")
-    if "loss_measured_against" in after:
-        lines.append(f"measured against {after['loss_measured_against']}")
-    if checked is not None:
-        found = checked["lost_surface_mass"]
-        more = ", more than it declares" if found > (lost or 0.0) else ""
-        lines.append(f"{checked['rays']} rays of test photographs lose {found:.2e}{more}")
-    return lines
+def _say(line: str) -> None:
+    CONSOLE.print(line, markup=False, highlight=False)

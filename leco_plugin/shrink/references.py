@@ -53,6 +53,8 @@ class Reference(NamedTuple):
     """The same of the image price, dB."""
     search: Part
     verify: Part
+    guided: bool = True
+    """Rendered as the original guides it, which itself loses nothing there."""
 
 
 def references(
@@ -75,23 +77,28 @@ def references(
     if source.frozen is not None:
         before = source._replace(model=source.frozen)
         parts = [_rendered(before, None, *each) for each in zip(sides, moved)]
-        found.append(Reference(AT_FREEZING, source.frozen, 0.0, 0.0, 0.0, *parts))
+        found.append(Reference(AT_FREEZING, source.frozen, 0.0, 0.0, 0.0, *parts, guided=False))
     return found
 
 
 def shares_lost(
     source: Source, original: Occupancy, smaller: Occupancy, seen: Seen
 ) -> dict[str, float]:
-    """What a smaller gate loses on some rays: the share of the surface mass, by reference."""
+    """What a smaller gate loses on some rays: the share of the surface mass, by reference.
+
+    Of the original itself only what is measured: beyond itself it loses nothing.
+    """
 
     def share(part: Source, guiding: Occupancy | None) -> float:
         evidence, _ = gather(part, guiding, seen)
         skipped = query_in_parts(smaller, evidence.positions) < smaller.threshold
         return loss(evidence, skipped).share
 
-    name = NOW if source.model is not None else BY_DECISIONS
-    before = max(declared(original, "lost_surface_mass"), 0.0)
-    found = {name: before + share(source, original)}
+    found = {}
+    if smaller is not original:
+        name = NOW if source.model is not None else BY_DECISIONS
+        before = max(declared(original, "lost_surface_mass"), 0.0)
+        found[name] = before + share(source, original)
     if source.frozen is not None:
         found[AT_FREEZING] = share(source._replace(model=source.frozen), None)
     return found

@@ -37,6 +37,8 @@ class Rung:
     verified: dict[str, float | None] = field(default_factory=dict)
     verified_against: list[dict[str, str | float]] = field(default_factory=list)
     """The share that each reference has lost on rays of its own, and its bound."""
+    bound: float | None = None
+    """Of the original: what it loses on other rays than those of the search, at the most."""
     look: int | None = None
     """At the rays that verify, the how many-th of this search; None where it came to none."""
 

@@ -146,8 +146,9 @@ def _measured(
     if ratio > VOLUMES[-1] + 0.005:
         rung.verdict = "keeps too much"
         return rung
-    prices = [price_of(reference, reference.search, smaller) for reference in ground.references]
-    rung.image_price_db = worst(prices)
+    rung.image_price_db = worst(
+        [price_of(ground, each, each.search, smaller) for each in ground.references]
+    )
     if (rung.image_price_db or 0.0) > bounds.image_price_db:
         rung.verdict = "costs too much of the image"
         return rung

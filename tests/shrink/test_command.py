@@ -22,7 +22,7 @@ from leco_plugin.models.gate import GateConfig
 from leco_plugin.occupancy import Occupancy
 from leco_plugin.shrink import command, references, rungs, search, sources
 from leco_plugin.shrink.command import compare_queries
-from leco_plugin.shrink.evidence import loss
+from leco_plugin.shrink.evidence import loss, unlikely_at
 from leco_plugin.shrink.picture import draw
 
 pytestmark = [  # nerfstudio leaves an image open
@@ -245,11 +245,46 @@ def test_the_file_declares_what_rays_have_lost_that_the_search_did_not_see(
     assert rung["verified"]["lost_surface_mass"] == pytest.approx(lost + 1e-4, rel=1e-3)
     (known,) = grounds[0].references
     seen, unseen = (
-        loss(part.evidence, ~smaller.occupied(part.evidence.positions)).bound
+        loss(part.evidence, ~smaller.occupied(part.evidence.positions), unlikely_at(1)).bound
         for part in (known.search, known.verify)
     )
     assert smaller.report["lost_surface_mass"] == pytest.approx(unseen + 1e-4, rel=1e-3)
     assert unseen > seen
+
+
+def with_haze_at_freezing(known_run: Path, tiny_scene: Path, folder: Path) -> Path:
+    """A copy of the run whose field at freezing has matter where the original skips."""
+    shutil.copytree(known_run, folder)
+    now = sources.find_source(folder / "occupancy.safetensors", tiny_scene)
+    assert now.model is not None and now.frozen is None
+    frozen = copy.deepcopy(now.model)
+    with torch.no_grad():
+        frozen.field.density_head.bias.fill_(0.1)
+    leave_field(frozen, folder)
+    return folder / "occupancy.safetensors"
+
+
+def test_an_original_that_is_not_within_the_bounds_is_said_and_declared(
+    known_run: Path,
+    tiny_scene: Path,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    file = with_haze_at_freezing(known_run, tiny_scene, tmp_path / "run")
+    monkeypatch.setattr(command, "search", lambda *some, **more: pytest.fail("taught"))
+    out, report = tmp_path / "same", tmp_path / "a.json"
+    assert run("shrink", file, "--data", tiny_scene, "--out", out, "--json", report) == 0
+    said = " ".join(capsys.readouterr().out.split())
+    assert "it is not within the bounds by this measure, and no smaller one is looked for" in said
+    results, same = json.loads(report.read_text()), Occupancy.load(out)
+    assert results["rungs"] == [] and results["original"]["bound"] > 1e-3
+    declared = same.report["lost_surface_mass"]
+    assert declared == results["original"]["verified"]["lost_surface_mass_bound"] > 1e-3
+    assert list(results["checked"]["against"]) == [references.AT_FREEZING]
+    assert 0.0 < results["checked"]["lost_surface_mass"] < declared
+    positions = torch.rand(5000, 3) - 0.5
+    assert torch.equal(same.query(positions), Occupancy.load(file).query(positions))
 
 
 def test_what_is_declared_holds_against_the_field_at_the_moment_of_freezing(
@@ -259,15 +294,8 @@ def test_what_is_declared_holds_against_the_field_at_the_moment_of_freezing(
     monkeypatch.setattr(search, "MARGIN", 1.0)
     gates = [GateConfig(EncodingConfig(octaves=3), 16, 2, 1)]
     monkeypatch.setattr(search, "ladder", lambda most: gates)
-    folder = tmp_path / "run"
-    shutil.copytree(known_run, folder)
-    file, out, report = folder / "occupancy.safetensors", tmp_path / "small", tmp_path / "a.json"
-    now = sources.find_source(file, tiny_scene)
-    assert now.model is not None and now.frozen is None
-    frozen = copy.deepcopy(now.model)
-    with torch.no_grad():
-        frozen.field.density_head.bias.fill_(0.1)
-    leave_field(frozen, folder)
+    file = with_haze_at_freezing(known_run, tiny_scene, tmp_path / "run")
+    out, report = tmp_path / "small", tmp_path / "a.json"
     bounds = ["--lost-surface-mass", 0.99, "--image-price", 50, "--json", report]
     assert run("shrink", file, "--data", tiny_scene, "--out", out, *bounds) == 0
     smaller = Occupancy.load(out)
@@ -281,7 +309,7 @@ def test_what_is_declared_holds_against_the_field_at_the_moment_of_freezing(
     lost = lost_on_unseen_rays(ground, smaller)
     assert lost[1] > lost[0] + 0.01  # what the original skips counts
     assert max(lost) <= smaller.report["lost_surface_mass"] == max(x["bound"] for x in against)
-    for part in ground.references[1][-2:]:
+    for part in (ground.references[1].search, ground.references[1].verify):
         assert part.evidence.rays == references.RAYS > sum(len(one.truth) for one in part.rendered)
 
 
