@@ -88,9 +88,9 @@ def shrink_table(reports: Mapping[str, Report]) -> str:
     ]
     for scene, report in reports.items():
         before, after = report["from"], report["to"]
-        declared = after["lost_surface_mass"]
-        checked = report.get("checked")
-        lost = None if checked is None else checked["lost_surface_mass"]
+        declared = after.get("lost_surface_mass")
+        checked = report.get("checked") or {}
+        lost = checked.get("lost_surface_mass")
         size, speed = after["bytes"], report["query_speedup"]
         now = _flagged(f"{size / 1000:.1f}", size <= SHRUNK_BYTES)
         price, skipped = after.get("image_price_db"), after.get("empty_fraction")
@@ -98,8 +98,8 @@ def shrink_table(reports: Mapping[str, Report]) -> str:
             f"{before['params']} to {after['params']}",
             f"{before['bytes'] / 1000:.1f} to {now}",
             "-" if skipped is None else f"{100 * skipped:.1f}",
-            _flagged(f"{declared:.2e}", declared <= SHRUNK_LOSS),
-            "-" if lost is None else _flagged(f"{lost:.2e}", lost <= declared),
+            "-" if declared is None else _flagged(f"{declared:.2e}", declared <= SHRUNK_LOSS),
+            "-" if lost is None else _flagged(f"{lost:.2e}", lost <= (declared or 0.0)),
             "-" if price is None else f"{price:+.3f}",
             f"{len(report['rungs'])}",
             _flagged(f"{speed:.2f} x", speed >= SHRUNK_SPEEDUP),

@@ -19,7 +19,7 @@ from leco_plugin.occupancy import BACKDROP_PRICE, Occupancy
 from leco_plugin.progress_bar import bar
 from leco_plugin.scenes.pixels.held_out_pixels import held_out_sampler
 from leco_plugin.shrink.evidence import Evidence, gather
-from leco_plugin.shrink.references import names_of, references, shares_lost
+from leco_plugin.shrink.references import LOST_DECISIONS, names_of, references, shares_lost
 from leco_plugin.shrink.rungs import Bounds, Found, Ground, Rung, check_room
 from leco_plugin.shrink.saying import line_of, line_of_original
 from leco_plugin.shrink.search import search
@@ -67,6 +67,7 @@ def shrink(file: Path, data: Path, out: Path, bounds: Bounds, seed: int = 0) -> 
     torch.manual_seed(seed)
     source = find_source(file, data)
     check_scene(source, original, data)
+    check_known(source, original, file)
     original = original.to(source.manager.device)
     ground = _ground(source, original)
     itself = of_original(ground, bounds)
@@ -134,12 +135,26 @@ def check_skips(original: Occupancy, file: Path) -> None:
     raise ValueError(f"{file} {said}: there is nothing to shrink; learn it for more steps")
 
 
+def check_known(source: Source, original: Occupancy, file: Path) -> None:
+    """Whether what an occupancy has lost can be added to what a field says of a smaller one.
+
+    Raises:
+        ValueError: it was shrunk without a field.
+    """
+    if source.model is not None and LOST_DECISIONS in original.report:
+        raise ValueError(
+            f"{file} was shrunk without its run, so that nobody knows what it has lost of the "
+            "surface mass: shrink its original"
+        )
+
+
 def check(source: Source, original: Occupancy, smaller: Occupancy) -> dict[str, Any] | None:
     """What the smaller gate loses on rays of test photographs, which decided nothing here.
 
     Returns:
-        `rays`, the worst `lost_surface_mass` of any reference, and of each (`against`); None
-        without such photographs, and of the original where nothing measures it.
+        `rays`, the worst `lost_surface_mass` of any reference, or `lost_decisions` without a field,
+        and that of each (`against`); None without such photographs, and of the original where
+        nothing measures it.
     """
     seen = of_test_photographs(source, original, RAYS)
     if seen is None:
@@ -147,7 +162,8 @@ def check(source: Source, original: Occupancy, smaller: Occupancy) -> dict[str, 
     shares = shares_lost(source, original, smaller, seen)
     if not shares:
         return None
-    return {"rays": len(seen.truth), "lost_surface_mass": max(shares.values()), "against": shares}
+    lost = _lost(source.model is None, max(shares.values()))
+    return {"rays": len(seen.truth), **lost, "against": shares}
 
 
 def _ground(source: Source, original: Occupancy) -> Ground:
@@ -220,13 +236,24 @@ def report_of(ground: Ground, found: Found, itself: Rung, untrained: bool) -> di
 
 def _measured(ground: Ground, rung: Rung, untrained: bool) -> dict[str, Any]:
     """Of a report, what was measured on rays that the search did not see."""
-    measured = rung.verified
-    return {name: measured[name] for name in ("lost_mass", "image_price_db", "empty_fraction")} | {
-        "lost_surface_mass": measured["lost_surface_mass_bound"],
-        "calibration_rays": ground.references[0].verify.evidence.rays,
+    measured, first = rung.verified, ground.references[0]
+    alone = first.model is None
+    return {
+        **_lost(alone, measured["lost_surface_mass_bound"]),
+        "lost_mass": None if alone else measured["lost_mass"],
+        "image_price_db": measured["image_price_db"],
+        "empty_fraction": measured["empty_fraction"],
+        "calibration_rays": first.verify.evidence.rays,
         "held_out": untrained and bool(ground.original.report.get("held_out", False)),
         "loss_measured_against": names_of(ground.references),
     }
+
+
+def _lost(alone: bool, share: float | None) -> dict[str, float | None]:
+    """A loss by its name: without a field it is one of decisions, and that of surfaces unknown."""
+    if alone:
+        return {"lost_surface_mass": None, LOST_DECISIONS: share}
+    return {"lost_surface_mass": share}
 
 
 def compare_queries(original: Occupancy, smaller: Occupancy) -> tuple[float, list[float]]:

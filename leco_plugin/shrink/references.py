@@ -24,6 +24,9 @@ BY_DECISIONS = "the original's keep decisions, weighed by o(x): no rendering wei
 
 DECLARED = ("lost_surface_mass", "lost_mass", "image_price_db")
 """What a report says of the original's own losses."""
+LOST_DECISIONS = "lost_decisions"
+"""In the report of a gate that was shrunk without a field: what it drops of the keep
+decisions of the first original, weighed by o(x). What it loses of the surface mass is not known."""
 
 
 RAYS = 1 << 15
@@ -46,7 +49,8 @@ class Reference(NamedTuple):
     name: str
     model: LecoModel | None
     lost_before: float
-    """Share of the surface mass that the original has lost before anything is measured here."""
+    """Share of the surface mass, or without a field of the decisions, that the original has lost
+    before anything is measured here."""
     mass_before: float
     """The same of all rendering weight."""
     price_before: float
@@ -61,8 +65,6 @@ def references(
     source: Source, original: Occupancy, searched: Seen, verified: Seen
 ) -> list[Reference]:
     """All there are; what the original declares comes first where only the rest is measured."""
-    # that the original gains something is no licence to lose it
-    lost, mass, price = (max(declared(original, name), 0.0) for name in DECLARED)
     sides = searched, verified
     more = _more_rays(source, original, sides)
     if source.model is None:
@@ -70,7 +72,10 @@ def references(
             Part(join([gather(source, original, seen)[0] for seen in each]))
             for each in zip(sides, more)
         ]
-        return [Reference(BY_DECISIONS, None, lost, mass, price, *parts)]
+        before = max(declared(original, LOST_DECISIONS), 0.0)
+        return [Reference(BY_DECISIONS, None, before, 0.0, 0.0, *parts)]
+    # that the original gains something is no licence to lose it
+    lost, mass, price = (max(declared(original, name), 0.0) for name in DECLARED)
     moved = [from_between_cameras(source, seen, seed=side) for side, seen in enumerate(more)]
     parts = [_rendered(source, original, *each) for each in zip(sides, moved)]
     found = [Reference(NOW, source.model, lost, mass, price, *parts)]
@@ -84,7 +89,8 @@ def references(
 def shares_lost(
     source: Source, original: Occupancy, smaller: Occupancy, seen: Seen
 ) -> dict[str, float]:
-    """What a smaller gate loses on some rays: the share of the surface mass, by reference.
+    """What a smaller gate loses on some rays by each reference: a share of the surface mass, or of
+    the decisions where there is no field.
 
     Of the original itself only what is measured: beyond itself it loses nothing.
     """
@@ -96,9 +102,9 @@ def shares_lost(
 
     found = {}
     if smaller is not original:
-        name = NOW if source.model is not None else BY_DECISIONS
-        before = max(declared(original, "lost_surface_mass"), 0.0)
-        found[name] = before + share(source, original)
+        alone = source.model is None
+        before = declared(original, LOST_DECISIONS if alone else "lost_surface_mass")
+        found[BY_DECISIONS if alone else NOW] = max(before, 0.0) + share(source, original)
     if source.frozen is not None:
         found[AT_FREEZING] = share(source._replace(model=source.frozen), None)
     return found

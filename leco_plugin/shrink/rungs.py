@@ -9,12 +9,13 @@ from typing import Any, NamedTuple
 
 from leco_plugin.occupancy import Occupancy
 from leco_plugin.shrink.evidence import Evidence
-from leco_plugin.shrink.references import Reference, declared
+from leco_plugin.shrink.references import LOST_DECISIONS, Reference, declared
 
 
 @dataclass(frozen=True)
 class Bounds:
-    """What the smaller occupancy may declare in all, the original's share included."""
+    """What the smaller occupancy may declare in all, the original's share included; without a field
+    it is the lost decisions that the first one bounds."""
 
     lost_surface_mass: float = 1e-3
     image_price_db: float = 0.05
@@ -22,7 +23,8 @@ class Bounds:
 
 @dataclass
 class Rung:
-    """One gate that was tried. Losses are the worst of any reference, the original's included."""
+    """One gate that was tried. Losses are the worst of any reference, the original's included;
+    without a field they are of its decisions."""
 
     name: str
     params: int
@@ -72,9 +74,15 @@ def check_room(original: Occupancy, bounds: Bounds) -> None:
             "bounds are a lost surface mass from 0 to 1 and a number of dB, not "
             f"{bounds.lost_surface_mass} and {bounds.image_price_db}"
         )
-    lost, price = (
-        max(declared(original, name), 0.0) for name in ("lost_surface_mass", "image_price_db")
+    lost, decisions, price = (
+        max(declared(original, name), 0.0)
+        for name in ("lost_surface_mass", LOST_DECISIONS, "image_price_db")
     )
+    if decisions >= bounds.lost_surface_mass:
+        raise ValueError(
+            f"the occupancy itself has lost {decisions:.2e} of the decisions, which leaves nothing "
+            f"of {bounds.lost_surface_mass:.2e}: raise --lost-surface-mass, or shrink its original"
+        )
     if lost >= bounds.lost_surface_mass:
         raise ValueError(
             f"the occupancy itself declares a lost surface mass of {lost:.2e}, which leaves "

@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
+from leco_plugin.shrink.references import LOST_DECISIONS
 from leco_plugin.shrink.rungs import Rung
 from leco_plugin.shrink.verifying import HOLDS
 
@@ -15,11 +16,11 @@ def line_of_original(itself: Rung, measured: bool) -> str:
     Args:
         measured: whether a reference measures the original itself.
     """
-    lost = f"{itself.lost_surface_mass:.1e} of the surface mass"
     if not measured:
-        return f"the original declares that it loses {lost}; nothing here measures it"
+        return "nothing here measures what the original itself loses"
     price = "" if itself.image_price_db is None else f", {itself.image_price_db:+.3f} dB"
-    said = f"the original loses {lost}, at most {itself.bound:.1e}{price}"
+    lost = f"{itself.lost_surface_mass:.1e} of the surface mass, at most {itself.bound:.1e}"
+    said = f"the original loses {lost}{price}"
     if itself.verdict == HOLDS:
         return said
     return f"{said}: it {itself.verdict} by this measure, and no smaller one is looked for"
@@ -51,10 +52,16 @@ def summary(results: dict[str, Any], out: Path) -> list[str]:
     if lost is not None:
         cost = "" if price is None else f" and {price:+.3f} dB"
         lines.append(f"declares {lost:.2e} of the surface mass{cost}, the original's included")
+    elif (lost := after.get(LOST_DECISIONS)) is not None:
+        lines.append(
+            f"drops {lost:.2e} of what the original keeps; no field was at hand, and neither "
+            "surface mass nor image price was measured"
+        )
     if "loss_measured_against" in after:
         lines.append(f"measured against {after['loss_measured_against']}")
     if checked is not None:
         found = checked["lost_surface_mass"]
+        found = checked[LOST_DECISIONS] if found is None else found
         more = ", more than it declares" if found > (lost or 0.0) else ""
         lines.append(f"{checked['rays']} rays of test photographs lose {found:.2e}{more}")
     return lines

@@ -159,7 +159,7 @@ def test_the_worst_reference_decides_and_is_declared() -> None:
     unseen = kind.verify.evidence
     far = (unseen.positions - torch.tensor(CENTRE)).norm(dim=-1) > 1.3
     strict = kind._replace(
-        name="strict", verify=Part(unseen._replace(worth=unseen.worth + 1e-5 * far.float()))
+        name="strict", verify=Part(unseen._replace(worth=unseen.worth + 1e-4 * far.float()))
     )
     both = here._replace(references=[kind, strict])
     (lenient,), (found,) = (search(one, Bounds(4e-3), [ENOUGH]).rungs for one in (here, both))
