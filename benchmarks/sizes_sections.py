@@ -6,6 +6,7 @@ import json
 from typing import Any
 
 from page_parts import RESULTS, picture, section
+from sizes_figures import AS_GOOD
 from sizes_tables import capacity_table, shrink_table, sizes_table
 
 CAPACITY = "capacity-"
@@ -20,7 +21,8 @@ def sizes_sections() -> list[str]:
         steps, learn = report["settings"]["steps"], report["settings"]["learn_steps"]
         note = (
             f" {steps} steps each, {learn} of them learning; PSNR of test pixels, differences in "
-            "pairs of one seed."
+            "pairs of one seed. Best is the smallest that lies within the error, or within "
+            f"{AS_GOOD:g} dB, of the highest mean."
         )
         named = [scene["scene"] for scene in report["scenes"] if "blocks" not in scene]
         command = " ".join(["python benchmarks/sizes.py", *named])
