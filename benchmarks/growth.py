@@ -29,7 +29,7 @@ from leco_plugin.evaluation.clock import Clock, warm_up
 from leco_plugin.evaluation.equal_loss import LOST_SURFACE_MASS, at_equal_loss
 from leco_plugin.evaluation.inspection import whole_box
 from leco_plugin.evaluation.json_file import write_json
-from leco_plugin.evaluation.machine import describe_machine
+from leco_plugin.evaluation.machine import describe_code, describe_machine, made_by
 from leco_plugin.method_configs import leco_occupancy
 from leco_plugin.models.compute.optimizers import RATES, FusedAdamConfig
 from leco_plugin.models.freezing.calibration import CalibrationConfig
@@ -245,13 +245,14 @@ def stored_rows(out: Path, settings: dict[str, Any]) -> list[dict[str, Any]]:
 
 def main(options: Options) -> None:
     options = dry(options) if options.dry_run else options
-    settings = settings_of(options)
+    settings, code = settings_of(options), describe_code()
     rows = stored_rows(options.out, settings)
     for seed, blocks in itertools.product(options.seeds, options.blocks):
         if any((row["blocks"], row["seed"]) == (blocks, seed) for row in rows):
             print(f"{blocks} blocks, seed {seed}: stored already")
             continue
         row = learn(blocks, seed, options, first_schedule(rows, blocks, seed, options))
+        row |= made_by(code)
         rows = sorted([*rows, row], key=lambda row: (row["blocks"], row["seed"]))
         report = {
             "format": 1,

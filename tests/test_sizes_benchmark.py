@@ -15,6 +15,7 @@ ROOT = Path(__file__).resolve().parent.parent
 sys.path.insert(0, str(ROOT / "benchmarks"))
 
 import sizes_sections  # noqa: E402
+from page_parts import made_line  # noqa: E402
 from sizes import TABLE, Options, dry, larger, stored_rows, sweep  # noqa: E402
 from sizes_figures import ahead, bars, points_of, verdict  # noqa: E402
 from sizes_tables import (  # noqa: E402
@@ -93,6 +94,16 @@ def test_the_smallest_city_is_put_beside_the_largest_and_each_beside_larger_mode
     assert bars(scenes, runs("city-1")) == []
     worse = bars(scenes, runs("city-1", MEASURED | {"table x 4": [20.5, 20.5]}) + runs("city-8"))
     assert not worse[1]["reached"]
+
+
+def test_each_row_says_which_code_made_it_as_far_as_it_is_known() -> None:
+    code = {"version": "0.1.0", "commit": "abc", "sources": "123"}
+    new, changed = ({"code": code | {"commit": c}, "date": "2026-11-23"} for c in ("abc", None))
+    assert made_line([{}, {}]) == "of an earlier commit, not noted"
+    assert made_line([new]) == "by leco_plugin 0.1.0 at abc, sources 123, 2026-11-23"
+    parts = made_line([{}, new, changed, new]).split("; ")
+    assert parts[0].startswith("1 by leco_plugin 0.1.0 at no commit")
+    assert parts[1:] == ["1 of an earlier commit, not noted", f"2 {made_line([new])}"]
 
 
 def test_a_sweep_has_no_sizes_twice_and_beside_larger_ones_none_that_is_smaller() -> None:

@@ -16,7 +16,7 @@ from leco_plugin.chart.theme import DARK, LIGHT
 from leco_plugin.evaluation.equal_loss import MOST_ON_CPU
 from leco_plugin.evaluation.field_grids import fits_memory
 from leco_plugin.evaluation.json_file import read_object, write_json
-from leco_plugin.evaluation.machine import describe_machine
+from leco_plugin.evaluation.machine import describe_code, describe_machine, made_by
 from leco_plugin.progress_bar import bar
 from leco_plugin.scenes.description import describe_scene
 from leco_plugin.scenes.input_error import InputError
@@ -57,7 +57,7 @@ def capacity(
         raise ValueError("a field is learned in one step or more, a grid has 2 cells or more")
     if not data.is_dir():
         raise InputError(f"--data {data}: there is no such folder")
-    scene, machine = describe_scene(data), describe_machine()
+    scene, machine, code = describe_scene(data), describe_machine(), describe_code()
     settings = {"lost_surface_mass": lost_surface_mass, "learn_steps": learn_steps}
     _settle(out, {"scene": scene, **settings}, data)
     wanted = list(gates() if gate_candidates is None else gate_candidates)
@@ -68,9 +68,10 @@ def capacity(
     with bar("Teaching representations") as show:
         for number, candidate in enumerate(wanted):
             row = _stored(out, candidate)
-            rows.append(
-                row or _store(out, candidate, of_gate(ground, candidate, lost_surface_mass))
-            )
+            if row is None:
+                row = of_gate(ground, candidate, lost_surface_mass)
+                _store(out, candidate, row, code)
+            rows.append(row)
             show((number + 1) / (len(wanted) + len(of_cells)))
         stored = [_stored(out, candidate) for candidate in of_cells]
         if all(row is not None for row in stored):
@@ -78,7 +79,8 @@ def capacity(
         else:  # each grid is refined from the one before
             filling = of_grids(ground, of_cells, lost_surface_mass)
             for number, (candidate, row) in enumerate(filling):
-                rows.append(_store(out, candidate, row))
+                _store(out, candidate, row, code)
+                rows.append(row)
                 show((len(wanted) + number + 1) / (len(wanted) + len(of_cells)))
             left_out = [candidate.size for candidate in of_cells[len(rows) - len(wanted) :]]
             for size in left_out:
@@ -165,10 +167,11 @@ def _stored(out: Path, candidate: Candidate) -> dict[str, Any] | None:
     return row
 
 
-def _store(out: Path, candidate: Candidate, row: dict[str, Any]) -> dict[str, Any]:
+def _store(out: Path, candidate: Candidate, row: dict[str, Any], code: dict[str, Any]) -> None:
+    """Leaves a row that was measured now, with what made it."""
+    row |= made_by(code)
     write_json(out / POINTS / f"{candidate.key}.json", row)
     CONSOLE.print(line_of(row), markup=False, highlight=False)
-    return row
 
 
 def line_of(row: dict[str, Any]) -> str:

@@ -13,7 +13,7 @@ from nerfstudio.utils.rich_utils import CONSOLE
 
 from leco_plugin.cli_reports import check_place
 from leco_plugin.evaluation.inspection import whole_box
-from leco_plugin.evaluation.machine import describe_machine
+from leco_plugin.evaluation.machine import describe_code, describe_machine, made_by
 from leco_plugin.models.freezing.freezing import HARDLY_ANYTHING
 from leco_plugin.occupancy import BACKDROP_PRICE, Occupancy
 from leco_plugin.progress_bar import bar
@@ -57,6 +57,7 @@ def shrink(file: Path, data: Path, out: Path, bounds: Bounds, seed: int = 0) -> 
     Raises:
         ValueError, OSError: a file, a folder or a bound is wrong; nothing was written.
     """
+    code = describe_code()
     check_place("--out", out)
     if out.exists() and out.samefile(file):
         raise ValueError(f"--out {out} is the occupancy itself; name another file")
@@ -93,6 +94,7 @@ def shrink(file: Path, data: Path, out: Path, bounds: Bounds, seed: int = 0) -> 
     return {
         "format": 1,
         "machine": describe_machine(),
+        **made_by(code),
         "from": before,
         "to": {"params": smaller.num_params, "bytes": out.stat().st_size, **reported},
         "bounds": {**vars(bounds)},

@@ -75,6 +75,7 @@ def test_what_was_finished_is_kept(
     assert len(set(taught)) == len(taught)
     results = json.loads((out / "results.json").read_text())
     assert len(results["representations"]) == len(taught) - 1
+    assert all(row["code"]["sources"] and row["date"] for row in results["representations"])
     assert results["verdict"] in capsys.readouterr().out
     for name in ("capacity.png", "capacity-dark.png"):
         with Image.open(out / name) as image:

@@ -16,6 +16,7 @@ from tiny_scene import camera_to_world
 
 from leco_plugin import cli
 from leco_plugin.evaluation.inspection import describe
+from leco_plugin.evaluation.machine import describe_code
 from leco_plugin.models.encodings import EncodingConfig
 from leco_plugin.models.freezing.field_at_freezing import leave_field
 from leco_plugin.models.gate import GateConfig
@@ -73,6 +74,7 @@ def test_without_a_run_it_keeps_to_the_decisions_and_says_so(
     said = capsys.readouterr().out
     assert "the original's keep decisions, weighed by o(x)" in " ".join(said.split())
     results = json.loads(report.read_text())
+    assert results["code"] == describe_code() and results["date"] > "2026"
     checked = results["checked"]
     assert checked["rays"] == 512 and checked["lost_surface_mass"] is None
     assert f"test photographs lose {checked['lost_decisions']:.2e}" in " ".join(said.split())
