@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-import math
 import statistics
 import time
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -14,13 +14,13 @@ from nerfstudio.utils.rich_utils import CONSOLE
 from leco_plugin.cli_reports import check_place
 from leco_plugin.evaluation.inspection import whole_box
 from leco_plugin.evaluation.machine import describe_code, describe_machine, made_by
-from leco_plugin.models.freezing.freezing import HARDLY_ANYTHING
 from leco_plugin.occupancy import BACKDROP_PRICE, Occupancy
 from leco_plugin.progress_bar import bar
 from leco_plugin.scenes.pixels.held_out_pixels import held_out_sampler
+from leco_plugin.shrink.checks import check_known, check_march, check_room, check_skips
 from leco_plugin.shrink.evidence import Evidence, gather
 from leco_plugin.shrink.references import LOST_DECISIONS, names_of, references, shares_lost
-from leco_plugin.shrink.rungs import Bounds, Found, Ground, Rung, check_room
+from leco_plugin.shrink.rungs import Bounds, Found, Ground, Rung
 from leco_plugin.shrink.saying import line_of, line_of_original
 from leco_plugin.shrink.search import search
 from leco_plugin.shrink.sources import (
@@ -43,7 +43,14 @@ COPIED = (
 """What a smaller occupancy's report takes over from the original's."""
 
 
-def shrink(file: Path, data: Path, out: Path, bounds: Bounds, seed: int = 0) -> dict[str, Any]:
+def shrink(
+    file: Path,
+    data: Path,
+    out: Path,
+    bounds: Bounds,
+    seed: int = 0,
+    keep: Callable[[dict[str, Any]], None] | None = None,
+) -> dict[str, Any]:
     """Finds the smallest gate that decides as a frozen one does, and writes it.
 
     Args:
@@ -52,6 +59,7 @@ def shrink(file: Path, data: Path, out: Path, bounds: Bounds, seed: int = 0) -> 
         out: of the smaller occupancy.
         bounds: what it may declare.
         seed: of rays that were trained on.
+        keep: called with what is known so far after each gate that was tried: JSON values.
     Returns:
         The frontier that was walked, and what was written: JSON values.
     Raises:
@@ -73,11 +81,26 @@ def shrink(file: Path, data: Path, out: Path, bounds: Bounds, seed: int = 0) -> 
     ground = _ground(source, original)
     itself = of_original(ground, bounds)
     _say(line_of_original(itself, is_measured(ground)))
+    known = {
+        "format": 1,
+        "machine": describe_machine(),
+        **made_by(code),
+        "from": {"params": original.num_params, "bytes": file.stat().st_size},
+        "bounds": {**vars(bounds)},
+        "original": itself.to_dict(),
+    }
+    rungs: list[dict[str, Any]] = []
+
+    def tell(rung: Rung) -> None:
+        _say(line_of(rung))
+        rungs.append(rung.to_dict())
+        if keep is not None:
+            keep({**known, "rungs": rungs})
+
     found = Found(None, [])
     if itself.verdict == HOLDS:
         with bar("Teaching smaller gates") as show:
-            found = search(ground, bounds, on_rung=_tell, on_progress=show)
-    before = {"params": original.num_params, "bytes": file.stat().st_size}
+            found = search(ground, bounds, on_rung=tell, on_progress=show)
     smaller = found.occupancy
     if smaller is None:
         if is_measured(ground):
@@ -92,62 +115,15 @@ def shrink(file: Path, data: Path, out: Path, bounds: Bounds, seed: int = 0) -> 
     speedup, times = compare_queries(original, smaller)
     reported = {name: value for name, value in smaller.report.items() if name not in COPIED}
     return {
-        "format": 1,
-        "machine": describe_machine(),
-        **made_by(code),
-        "from": before,
+        **known,
+        "original": itself.to_dict(),
         "to": {"params": smaller.num_params, "bytes": out.stat().st_size, **reported},
-        "bounds": {**vars(bounds)},
         "query_speedup": speedup,
         "query_milliseconds": times,
         "queried_positions": TIMED_POSITIONS,
         "checked": checked,
-        "original": itself.to_dict(),
-        "rungs": [rung.to_dict() for rung in found.rungs],
+        "rungs": rungs,
     }
-
-
-def check_march(original: Occupancy, file: Path) -> None:
-    """Whether an occupancy says how its rays are marched.
-
-    Raises:
-        ValueError: it does not, or not in numbers.
-    """
-    for name in ("near", "far", "step_size"):
-        value = original.report.get(name)
-        if not (isinstance(value, int | float) and 0.0 <= value < math.inf):
-            raise ValueError(
-                f"{file} does not say how its rays are marched: its {name} is {value}, no distance"
-            )
-
-
-def check_skips(original: Occupancy, file: Path) -> None:
-    """Whether an occupancy skips enough for a smaller gate to be worth anything.
-
-    Raises:
-        ValueError: it skips nothing, or next to nothing of all candidates.
-    """
-    skipped = original.report.get("empty_fraction")
-    if original.threshold == 0.0:
-        said = "skips nothing, for its threshold is 0"
-    elif isinstance(skipped, int | float) and skipped < HARDLY_ANYTHING:
-        said = f"skips {skipped:.1%} of all candidates, next to nothing"
-    else:
-        return
-    raise ValueError(f"{file} {said}: there is nothing to shrink; learn it for more steps")
-
-
-def check_known(source: Source, original: Occupancy, file: Path) -> None:
-    """Whether what an occupancy has lost can be added to what a field says of a smaller one.
-
-    Raises:
-        ValueError: it was shrunk without a field.
-    """
-    if source.model is not None and LOST_DECISIONS in original.report:
-        raise ValueError(
-            f"{file} was shrunk without its run, so that nobody knows what it has lost of the "
-            "surface mass: shrink its original"
-        )
 
 
 def check(source: Source, original: Occupancy, smaller: Occupancy) -> dict[str, Any] | None:
@@ -284,10 +260,6 @@ def _seconds(occupancy: Occupancy, positions: torch.Tensor) -> float:
     occupancy.occupied(positions)
     synchronize()
     return time.perf_counter() - started
-
-
-def _tell(rung: Rung) -> None:
-    _say(line_of(rung))
 
 
 def _say(line: str) -> None:

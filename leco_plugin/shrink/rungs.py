@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field
 from typing import Any, NamedTuple
 
 from leco_plugin.occupancy import Occupancy
 from leco_plugin.shrink.evidence import Evidence
-from leco_plugin.shrink.references import LOST_DECISIONS, Reference, declared
+from leco_plugin.shrink.references import Reference
 
 
 @dataclass(frozen=True)
@@ -61,35 +60,3 @@ class Found(NamedTuple):
 
     occupancy: Occupancy | None
     rungs: list[Rung]
-
-
-def check_room(original: Occupancy, bounds: Bounds) -> None:
-    """Whether anything is left to lose after what the original declares.
-
-    Raises:
-        ValueError: nothing is, or a bound is out of range.
-    """
-    if not 0.0 <= bounds.lost_surface_mass < 1.0 or not math.isfinite(bounds.image_price_db):
-        raise ValueError(
-            "bounds are a lost surface mass from 0 to 1 and a number of dB, not "
-            f"{bounds.lost_surface_mass} and {bounds.image_price_db}"
-        )
-    lost, decisions, price = (
-        max(declared(original, name), 0.0)
-        for name in ("lost_surface_mass", LOST_DECISIONS, "image_price_db")
-    )
-    if decisions >= bounds.lost_surface_mass:
-        raise ValueError(
-            f"the occupancy itself has lost {decisions:.2e} of the decisions, which leaves nothing "
-            f"of {bounds.lost_surface_mass:.2e}: raise --lost-surface-mass, or shrink its original"
-        )
-    if lost >= bounds.lost_surface_mass:
-        raise ValueError(
-            f"the occupancy itself declares a lost surface mass of {lost:.2e}, which leaves "
-            f"nothing of {bounds.lost_surface_mass:.2e}: raise --lost-surface-mass"
-        )
-    if price >= bounds.image_price_db:
-        raise ValueError(
-            f"the occupancy itself declares an image price of {price:.3f} dB, which leaves nothing "
-            f"of {bounds.image_price_db:.3f} dB: raise --image-price"
-        )

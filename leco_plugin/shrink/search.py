@@ -16,9 +16,10 @@ from torch import Tensor
 from leco_plugin.evaluation.inspection import whole_box
 from leco_plugin.models.gate import GateConfig
 from leco_plugin.occupancy import Occupancy
+from leco_plugin.shrink.checks import check_room
 from leco_plugin.shrink.evidence import Evidence, loss, query_in_parts
 from leco_plugin.shrink.ladder import ladder, name_of, values_of
-from leco_plugin.shrink.rungs import Bounds, Found, Ground, Rung, check_room
+from leco_plugin.shrink.rungs import Bounds, Found, Ground, Rung
 from leco_plugin.shrink.teaching import Lesson, round_weights, teach
 from leco_plugin.shrink.verifying import price_of, verify, worst
 

@@ -101,6 +101,26 @@ def test_without_a_run_it_keeps_to_the_decisions_and_says_so(
     assert draw(results, tmp_path / "again.png").exists()
 
 
+def test_a_search_that_is_stopped_leaves_the_gates_that_it_tried(
+    file: Path, tiny_scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    smallest = [GateConfig(EncodingConfig(octaves=2), width, 1, 1) for width in (1, 2)]
+    monkeypatch.setattr(search, "ladder", lambda most: smallest)
+    real = search._taught
+
+    def stopped_at_the_second(config: GateConfig, *some: object) -> Occupancy:
+        if config is smallest[1]:
+            raise KeyboardInterrupt
+        return real(config, *some)
+
+    monkeypatch.setattr(search, "_taught", stopped_at_the_second)
+    out, report = tmp_path / "small", tmp_path / "small.json"
+    assert run("shrink", file, "--data", tiny_scene, "--out", out, "--json", report) == 130
+    known = json.loads(report.read_text())
+    assert len(known["rungs"]) == 1 and known["original"]["verdict"] == "holds"
+    assert "to" not in known and not out.exists()
+
+
 def test_where_nothing_smaller_holds_the_same_gate_is_stored(
     file: Path,
     tiny_scene: Path,

@@ -13,9 +13,10 @@ from leco_plugin.models.encodings import EncodingConfig
 from leco_plugin.models.gate import GateConfig
 from leco_plugin.occupancy import Occupancy
 from leco_plugin.shrink import search as searching
+from leco_plugin.shrink.checks import check_room
 from leco_plugin.shrink.evidence import Evidence, query_in_parts
 from leco_plugin.shrink.references import Part, Reference, declared
-from leco_plugin.shrink.rungs import Bounds, Found, Ground, Rung, check_room
+from leco_plugin.shrink.rungs import Bounds, Found, Ground, Rung
 from leco_plugin.shrink.search import search, threshold_keeping
 from leco_plugin.shrink.verifying import verify
 
