@@ -16,7 +16,7 @@ import itertools
 import json
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -226,20 +226,28 @@ def first_schedule(rows: Sequence[dict[str, Any]], blocks: int, seed: int, optio
 
 
 def settings_of(options: Options) -> dict[str, Any]:
-    """What a stored row depends on, besides its number of blocks, as JSON values."""
+    """What a stored row depends on besides its number of blocks, the sizes of gate and field among
+    them, as JSON values."""
     left_out = ("blocks", "seeds", "out", "cities")
     values = {name: value for name, value in vars(options).items() if name not in left_out}
     values["capture"] = vars(options.capture)
+    values["sizes"] = asdict(sizes_for(leco_occupancy.config.machine.device_type))
     settings: dict[str, Any] = json.loads(json.dumps(values))
     return settings
 
 
 def stored_rows(out: Path, settings: dict[str, Any]) -> list[dict[str, Any]]:
-    """Rows that an earlier run of the same settings has left."""
+    """Rows that an earlier run of the same settings has left.
+
+    Raises:
+        SystemExit: they are of other settings, or of a field of other sizes.
+    """
     if not out.is_file():
         return []
     stored = json.loads(out.read_text())
-    rows: list[dict[str, Any]] = stored["rows"] if stored["settings"] == settings else []
+    if stored["settings"] != settings:
+        raise SystemExit(f"{out} holds rows of other settings or sizes; name another --out")
+    rows: list[dict[str, Any]] = stored["rows"]
     return rows
 
 
