@@ -16,7 +16,7 @@ import itertools
 import json
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -29,7 +29,7 @@ from leco_plugin.evaluation.clock import Clock, warm_up
 from leco_plugin.evaluation.equal_loss import LOST_SURFACE_MASS, at_equal_loss
 from leco_plugin.evaluation.inspection import whole_box
 from leco_plugin.evaluation.json_file import write_json
-from leco_plugin.evaluation.machine import describe_machine
+from leco_plugin.evaluation.machine import describe_code, describe_machine, made_by
 from leco_plugin.method_configs import leco_occupancy
 from leco_plugin.models.compute.optimizers import RATES, FusedAdamConfig
 from leco_plugin.models.freezing.calibration import CalibrationConfig
@@ -226,32 +226,41 @@ def first_schedule(rows: Sequence[dict[str, Any]], blocks: int, seed: int, optio
 
 
 def settings_of(options: Options) -> dict[str, Any]:
-    """What a stored row depends on, besides its number of blocks, as JSON values."""
+    """What a stored row depends on besides its number of blocks, the sizes of gate and field among
+    them, as JSON values."""
     left_out = ("blocks", "seeds", "out", "cities")
     values = {name: value for name, value in vars(options).items() if name not in left_out}
     values["capture"] = vars(options.capture)
+    values["sizes"] = asdict(sizes_for(leco_occupancy.config.machine.device_type))
     settings: dict[str, Any] = json.loads(json.dumps(values))
     return settings
 
 
 def stored_rows(out: Path, settings: dict[str, Any]) -> list[dict[str, Any]]:
-    """Rows that an earlier run of the same settings has left."""
+    """Rows that an earlier run of the same settings has left.
+
+    Raises:
+        SystemExit: they are of other settings, or of a field of other sizes.
+    """
     if not out.is_file():
         return []
     stored = json.loads(out.read_text())
-    rows: list[dict[str, Any]] = stored["rows"] if stored["settings"] == settings else []
+    if stored["settings"] != settings:
+        raise SystemExit(f"{out} holds rows of other settings or sizes; name another --out")
+    rows: list[dict[str, Any]] = stored["rows"]
     return rows
 
 
 def main(options: Options) -> None:
     options = dry(options) if options.dry_run else options
-    settings = settings_of(options)
+    settings, code = settings_of(options), describe_code()
     rows = stored_rows(options.out, settings)
     for seed, blocks in itertools.product(options.seeds, options.blocks):
         if any((row["blocks"], row["seed"]) == (blocks, seed) for row in rows):
             print(f"{blocks} blocks, seed {seed}: stored already")
             continue
         row = learn(blocks, seed, options, first_schedule(rows, blocks, seed, options))
+        row |= made_by(code)
         rows = sorted([*rows, row], key=lambda row: (row["blocks"], row["seed"]))
         report = {
             "format": 1,

@@ -9,7 +9,10 @@ from leco_plugin.chart.theme import LIGHT, Theme, plain, style, themed
 from leco_plugin.evaluation.charts import SOURCE, fingerprint
 
 PANELS = (
-    ("bytes of the occupancy", (("gate_bytes", "gate"), ("grid_bytes", "grid, a bit a cell"))),
+    (
+        "bytes of the occupancy",
+        (("gate_bytes", "gate, by its rule"), ("grid_bytes", "grid, a bit a cell")),
+    ),
     (
         "seconds",
         (("seconds", "learning the gate"), ("grid_seconds", "filling the grid from that field")),

@@ -2,16 +2,35 @@
 
 from __future__ import annotations
 
+from collections import Counter
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
 ROOT = Path(__file__).resolve().parent.parent
 RESULTS = ROOT / "benchmarks" / "results"
+NOT_NOTED = "of an earlier commit, not noted"
 
 
 def machine_line(report: dict[str, Any]) -> str:
     """What it ran on, in one line."""
     return ", ".join(f"{name}: {value}" for name, value in report["machine"].items())
+
+
+def made_line(rows: Iterable[Mapping[str, Any]]) -> str:
+    """Which code made some rows, and when, as far as they say so."""
+    counted = Counter(_made(row) for row in rows)
+    if len(counted) == 1:
+        return next(iter(counted))
+    return "; ".join(f"{count} {made}" for made, count in sorted(counted.items()))
+
+
+def _made(row: Mapping[str, Any]) -> str:
+    if "code" not in row:
+        return NOT_NOTED
+    code = row["code"]
+    commit = code["commit"] or "no commit"
+    return f"by leco_plugin {code['version']} at {commit}, sources {code['sources']}, {row['date']}"
 
 
 def picture(name: str) -> str:

@@ -22,7 +22,7 @@ from sizes_figures import AUTOMATIC, bars, verdict
 
 from leco_plugin.evaluation.clock import Budget
 from leco_plugin.evaluation.json_file import write_json
-from leco_plugin.evaluation.machine import describe_code, describe_machine
+from leco_plugin.evaluation.machine import describe_code, describe_machine, made_by
 from leco_plugin.evaluation.timed_run import timed_run
 from leco_plugin.method_configs import best_device, leco_occupancy
 from leco_plugin.models.sizing.scene_sizes import complete
@@ -227,6 +227,7 @@ def main(options: Options) -> None:
     """
     options = dry(options) if options.dry_run else options
     settings = {"steps": options.steps, "learn_steps": options.learn_steps}
+    code = describe_code()
     rows = stored_rows(options.out, settings)
     cities = cities_of(options)
     blocks = {folder: n for n, folder in cities.items()}
@@ -242,14 +243,13 @@ def main(options: Options) -> None:
     for data, name, sizes, seed in wanted:
         row = find(rows, data.name, sizes, seed)
         if row is None:
-            row = train(data, sizes, seed, options)
+            row = {**train(data, sizes, seed, options), **made_by(code)}
             rows.append(row)
             print(f"{data.name}, {name}, seed {seed}: {row['psnr']:.2f} dB", flush=True)
         done.append({**row, "point": name})
         report = {
             "format": 1,
             "machine": describe_machine(),
-            "code": describe_code(),
             "settings": settings,
             "scenes": list(scenes.values()),
             "verdict": verdict(done),

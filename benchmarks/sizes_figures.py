@@ -10,6 +10,8 @@ from typing import Any
 MAY_LOSE, MAY_HAVE, SMALL_AGAINST_LARGE = 0.1, 1.25, 0.25
 """dB below the best of the sweep and below a larger model, parameters of the best times this, and
 parameters of the smallest city against those of the largest: the bars."""
+AS_GOOD = 0.05
+"""dB below the highest mean of a sweep that count as none, as does the error of the difference."""
 AUTOMATIC = "automatic"
 
 Run = Mapping[str, Any]
@@ -40,6 +42,17 @@ def ahead(of: Mapping[int, Run], others: Mapping[int, Run]) -> tuple[float, floa
     return statistics.fmean(gains), error
 
 
+def best_of(points: Mapping[str, dict[int, Run]]) -> str:
+    """The smallest point that is as good as the highest mean."""
+    highest = max(points, key=lambda name: mean_psnr(points[name]))
+
+    def is_as_good(name: str) -> bool:
+        behind, error = ahead(points[highest], points[name])
+        return behind <= max(AS_GOOD, error or 0.0)
+
+    return min(filter(is_as_good, points), key=lambda name: _parameters(points[name]))
+
+
 def verdict(rows: Sequence[Run]) -> dict[str, dict[str, Any]]:
     """Of each scene: automatic beside the best of the sweep; only points with all their seeds.
 
@@ -52,7 +65,7 @@ def verdict(rows: Sequence[Run]) -> dict[str, dict[str, Any]]:
         if AUTOMATIC not in points or len(points) < 2:
             continue
         ours = points[AUTOMATIC]
-        best = max(points, key=lambda name: mean_psnr(points[name]))
+        best = best_of(points)
         behind, error = ahead(points[best], ours)
         parameters, its = (_parameters(points[name]) for name in (AUTOMATIC, best))
         found[scene] = {
@@ -61,6 +74,7 @@ def verdict(rows: Sequence[Run]) -> dict[str, dict[str, Any]]:
             "best_psnr": mean_psnr(points[best]),
             "behind": behind,
             "error": error,
+            "seeds": len(ours),
             "parameters": parameters,
             "best_parameters": its,
             "reached": behind <= MAY_LOSE and parameters <= MAY_HAVE * its,
@@ -89,6 +103,7 @@ def bars(scenes: Sequence[Mapping[str, Any]], rows: Sequence[Run]) -> list[dict[
             "name": f"parameters of {small['scene']} against {large['scene']}",
             "value": share,
             "error": None,
+            "seeds": None,
             "bar": SMALL_AGAINST_LARGE,
             "reached": share <= SMALL_AGAINST_LARGE,
         }
@@ -105,6 +120,7 @@ def bars(scenes: Sequence[Mapping[str, Any]], rows: Sequence[Run]) -> list[dict[
                 "name": f"{city['scene']}: best larger model ahead by, dB",
                 "value": behind,
                 "error": error,
+                "seeds": len(ours),
                 "bar": MAY_LOSE,
                 "reached": behind <= MAY_LOSE,
             }

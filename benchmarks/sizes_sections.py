@@ -5,7 +5,8 @@ from __future__ import annotations
 import json
 from typing import Any
 
-from page_parts import RESULTS, picture, section
+from page_parts import RESULTS, made_line, picture, section
+from sizes_figures import AS_GOOD
 from sizes_tables import capacity_table, shrink_table, sizes_table
 
 CAPACITY = "capacity-"
@@ -20,17 +21,19 @@ def sizes_sections() -> list[str]:
         steps, learn = report["settings"]["steps"], report["settings"]["learn_steps"]
         note = (
             f" {steps} steps each, {learn} of them learning; PSNR of test pixels, differences in "
-            "pairs of one seed."
+            "pairs of one seed. Best is the smallest that lies within the error, or within "
+            f"{AS_GOOD:g} dB, of the highest mean. Runs {made_line(report['runs'])}."
         )
         named = [scene["scene"] for scene in report["scenes"] if "blocks" not in scene]
         command = " ".join(["python benchmarks/sizes.py", *named])
         title = "Automatic sizes, and a sweep around them"
         parts += section(title, command, report, sizes_table(report), note)
-    if shrunk := scene_results("shrink"):
+    stored = scene_results("shrink").items()
+    if shrunk := {name: report for name, report in stored if "to" in report}:  # not stopped
         note = (
             " In bold: a bar is missed, 32 kB, a declared loss of 1e-3, three times faster queries "
             "(65536 positions, interleaved), or a declaration below what rays of test photographs "
-            "have lost, which decided nothing."
+            f"have lost, which decided nothing. Gates {made_line(shrunk.values())}."
         )
         command = (
             "leco shrink RUN --data SCENE --out FILE --json benchmarks/results/shrink/SCENE.json"
@@ -39,10 +42,11 @@ def sizes_sections() -> list[str]:
         parts += section(title, command, next(iter(shrunk.values())), shrink_table(shrunk), note)
     if measured := scene_results("capacity"):
         first = next(iter(measured.values()))
+        rows = [row for report in measured.values() for row in report["representations"]]
         note = (
             f" Each loses {first['lost_surface_mass']:.1%} of the weight near surfaces; kept is a "
             "share of the volume that rays reach. The last column: whether such a gate keeps no "
-            "more than the grid."
+            f"more than the grid. Rows {made_line(rows)}."
         )
         command = "leco capacity --data SCENE --out DIR --json results/capacity/SCENE.json"
         title = "How much a scene needs: gates and grids at equal loss"

@@ -6,7 +6,7 @@ import statistics
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from sizes_figures import MAY_LOSE
+from sizes_figures import MAY_LOSE, bars, verdict
 
 from leco_plugin.capacity.choice import (
     USUAL_GRID,
@@ -40,8 +40,8 @@ def sizes_table(report: Report) -> str:
         )
     lines += [
         "",
-        "| scene | sizes | parameters | PSNR, mean (least to most) |",
-        "|---|---|---|---|",
+        "| scene | sizes | parameters | seeds | PSNR, mean (least to most) |",
+        "|---|---|---|---|---|",
     ]
     points: dict[tuple[str, str], list[Report]] = {}
     for row in report["runs"]:
@@ -50,27 +50,29 @@ def sizes_table(report: Report) -> str:
     for (scene, point), runs in sorted(points.items(), key=lambda item: item[0][0]):
         values = [run["psnr"] for run in runs]
         lines.append(
-            f"| {scene} | {point} | {runs[0]['parameters']:,} | {statistics.fmean(values):.2f} dB "
-            f"({min(values):.2f} to {max(values):.2f}) |"
+            f"| {scene} | {point} | {runs[0]['parameters']:,} | {len(runs)} "
+            f"| {statistics.fmean(values):.2f} dB ({min(values):.2f} to {max(values):.2f}) |"
         )
     lines += [
         "",
-        "| scene | automatic | best of the sweep | behind it by (standard error) | within bounds |",
-        "|---|---|---|---|---|",
+        "| scene | seeds | automatic | best of the sweep | behind it by (standard error) "
+        "| within bounds |",
+        "|" + "---|" * 6,
     ]
-    for scene, found in report["verdict"].items():
+    for scene, found in verdict(report["runs"]).items():
         lines.append(
-            f"| {scene} | {found['psnr']:.2f} dB, {found['parameters']:,} "
+            f"| {scene} | {found['seeds']} | {found['psnr']:.2f} dB, {found['parameters']:,} "
             f"| {found['best']}: {found['best_psnr']:.2f} dB, {found['best_parameters']:,} "
             f"| {_with_error(found['behind'], found['error'])} dB "
-            f"| {_told_apart(found['reached'], found['behind'] - MAY_LOSE, found['error'])} |"
+            f"| {_told_apart(found, found['behind'] - MAY_LOSE)} |"
         )
-    if report["bars"]:
+    measured = bars(report["scenes"], report["runs"])
+    if measured:
         lines += ["", "| figure | measured (standard error) | at most | reached |"]
         lines.append("|---|---|---|---|")
-    for bar in report["bars"]:
+    for bar in measured:
         value = _with_error(bar["value"], bar["error"])
-        reached = _told_apart(bar["reached"], bar["value"] - bar["bar"], bar["error"])
+        reached = _told_apart(bar, bar["value"] - bar["bar"])
         lines.append(f"| {bar['name']} | {value} | {bar['bar']:g} | {reached} |")
     return "\n".join(lines)
 
@@ -82,23 +84,24 @@ def shrink_table(reports: Mapping[str, Report]) -> str:
         reports: as `leco shrink --json` writes them, by the name of the scene.
     """
     lines = [
-        "| scene | values | file, kB | declared lost surface mass | lost on test photographs "
-        "| image price, dB | gates tried | queries faster by |",
-        "|" + "---|" * 8,
+        "| scene | values | file, kB | skipped, % | declared lost surface mass "
+        "| lost on test photographs | image price, dB | gates tried | queries faster by |",
+        "|" + "---|" * 9,
     ]
     for scene, report in reports.items():
         before, after = report["from"], report["to"]
-        declared = after["lost_surface_mass"]
-        checked = report.get("checked")
-        lost = None if checked is None else checked["lost_surface_mass"]
+        declared = after.get("lost_surface_mass")
+        checked = report.get("checked") or {}
+        lost = checked.get("lost_surface_mass")
         size, speed = after["bytes"], report["query_speedup"]
         now = _flagged(f"{size / 1000:.1f}", size <= SHRUNK_BYTES)
-        price = after.get("image_price_db")
+        price, skipped = after.get("image_price_db"), after.get("empty_fraction")
         cells = (
             f"{before['params']} to {after['params']}",
             f"{before['bytes'] / 1000:.1f} to {now}",
-            _flagged(f"{declared:.2e}", declared <= SHRUNK_LOSS),
-            "-" if lost is None else _flagged(f"{lost:.2e}", lost <= declared),
+            "-" if skipped is None else f"{100 * skipped:.1f}",
+            "-" if declared is None else _flagged(f"{declared:.2e}", declared <= SHRUNK_LOSS),
+            "-" if lost is None else _flagged(f"{lost:.2e}", lost <= (declared or 0.0)),
             "-" if price is None else f"{price:+.3f}",
             f"{len(report['rungs'])}",
             _flagged(f"{speed:.2f} x", speed >= SHRUNK_SPEEDUP),
@@ -181,15 +184,17 @@ def _yes(reached: bool) -> str:
     return "yes" if reached else "**no**"
 
 
-def _told_apart(reached: bool, beyond: float, error: float | None) -> str:
-    """Whether a bar is reached, and whether its error leaves that open.
+def _told_apart(found: Report, beyond: float) -> str:
+    """Whether a bar is reached, and whether its error leaves that open or is not known.
 
     Args:
-        beyond: how far a figure lies above its bar.
-        error: its standard error.
+        found: `reached`, the standard `error` of a figure, and of how many `seeds` it is.
+        beyond: how far it lies above its bar.
     """
-    is_open = error is not None and abs(beyond) < error
-    return f"{_yes(reached)}{', within the error' if is_open else ''}"
+    said, error = _yes(found["reached"]), found["error"]
+    if found["seeds"] == 1:
+        return f"{said}, one seed"
+    return f"{said}, within the error" if error is not None and abs(beyond) < error else said
 
 
 def _flagged(value: str, reached: bool) -> str:

@@ -75,19 +75,23 @@ def shrink(
             share included.
         image_price: Most dB that it may declare, the original's share included.
         picture: File for a picture of the gates that were tried.
-        json: File for the gates that were tried and the one that was chosen, as JSON.
+        json: File for the gates that were tried and the one that was chosen, as JSON; each is
+            written when it was tried, so that a search that is stopped leaves those.
     """
     import warnings
 
     # what nerfstudio and torch think of each other is nothing that a user can act on
     warnings.filterwarnings("ignore", module=r"nerfstudio|torch")
     from leco_plugin.shrink.command import shrink as find_smaller
-    from leco_plugin.shrink.command import summary
-    from leco_plugin.shrink.search import Bounds
+    from leco_plugin.shrink.rungs import Bounds
+    from leco_plugin.shrink.saying import summary
 
     check_json(json)
     check_picture("--picture", picture)
-    results = find_smaller(occupancy_of(file), data, out, Bounds(lost_surface_mass, image_price))
+    bounds = Bounds(lost_surface_mass, image_price)
+    results = find_smaller(
+        occupancy_of(file), data, out, bounds, keep=lambda known: write_json(json, known)
+    )
     print("\n".join(summary(results, out)))
     write_json(json, results)
     if picture is not None:

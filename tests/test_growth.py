@@ -13,7 +13,14 @@ import pytest
 ROOT = Path(__file__).resolve().parent.parent
 sys.path.insert(0, str(ROOT / "benchmarks"))
 
-from growth import Options, first_schedule, gate_of, look_steps  # noqa: E402
+from growth import (  # noqa: E402
+    Options,
+    first_schedule,
+    gate_of,
+    look_steps,
+    settings_of,
+    stored_rows,
+)
 from growth_figures import bytes_for, exponents, grid_for, slope  # noqa: E402
 from large_scene_tables import growth_table  # noqa: E402
 
@@ -67,6 +74,18 @@ def test_a_city_begins_with_the_schedule_of_the_next_smaller_one() -> None:
     rows = [row | {"seed": 0} for row in rows] + [{"blocks": 4, "schedule": 40, "seed": 1}]
     assert [first_schedule(rows, blocks, 0, options) for blocks in (1, 3, 8)] == [0, 0, 1]
     assert [first_schedule(rows, blocks, 1, options) for blocks in (4, 8)] == [0, 2]
+
+
+def test_rows_of_another_field_are_not_gone_on_with(tmp_path: Path) -> None:
+    out = tmp_path / "growth.json"
+    settings = settings_of(Options())
+    assert settings["sizes"]["field"]["encoding"]["log2_table"] > 0
+    assert settings == settings_of(Options(blocks=(2,), seeds=(5,), out=out))
+    assert stored_rows(out, settings) == []
+    out.write_text(json.dumps({"settings": settings, "rows": [{"blocks": 2}]}))
+    assert stored_rows(out, settings) == [{"blocks": 2}]
+    with pytest.raises(SystemExit, match="other settings or sizes"):
+        stored_rows(out, settings | {"sizes": {}})
 
 
 def test_looks_lie_in_the_second_half_and_the_last_at_the_end() -> None:

@@ -54,20 +54,21 @@ def growth_report(grid_bytes: float | None = 4e6, learned: bool = True) -> dict[
     }
 
 
-def test_growth_says_each_city_and_whether_the_gate_grows_more_slowly_than_the_area() -> None:
+def test_growth_says_each_city_and_that_the_gates_size_is_a_rule() -> None:
     table = growth_table(growth_report())
     assert "| 2 (0) | 6,400 | 34 | 51 | 9.4 | 8.1 | 11 | 75 of 100 | 1.3 | 19.1 dB |" in table
     assert "| area | 0.05 (0.05, 0.15) | 1.04 (1.04, 1.14) | - | 0.90 (0.90, 1.00) |" in table
-    assert "more slowly than the area: yes." in table
+    assert "by construction its bytes grow as the area to the 0.05." in table
+    assert "learns each city: yes." in table
 
 
 def test_growth_without_a_grid_that_does_says_how_large_one_did_not() -> None:
     assert "| 16 (0) | 409,600 | 34 | 51 | over 4 | 8.1 |" in growth_table(growth_report(None))
 
 
-def test_a_gate_that_has_not_learned_does_not_count_as_growing_slowly() -> None:
+def test_a_gate_that_has_not_learned_is_said_to_be_too_small() -> None:
     table = growth_table(growth_report(learned=False))
-    assert "more slowly than the area: **no**." in table
+    assert "learns each city: **no**." in table
     assert "Not learned in any schedule: 16 (0) blocks a side." in table
 
 

@@ -16,11 +16,13 @@ from leco_plugin.chart.theme import DARK, LIGHT
 from leco_plugin.evaluation.equal_loss import MOST_ON_CPU
 from leco_plugin.evaluation.field_grids import fits_memory
 from leco_plugin.evaluation.json_file import read_object, write_json
-from leco_plugin.evaluation.machine import describe_machine
+from leco_plugin.evaluation.machine import describe_code, describe_machine, made_by
 from leco_plugin.progress_bar import bar
+from leco_plugin.scenes.description import describe_scene
 from leco_plugin.scenes.input_error import InputError
 
-SETTINGS, POINTS = "settings.json", "points"
+SETTINGS, POINTS, LEFT_OUT = "settings.json", "points", "left_out.json"
+TOO_MANY = f"would ask the field at more than {MOST_ON_CPU / 1e6:.0f} million places"
 DAMAGED = "is damaged; delete it, or name a new folder with --out"
 MEASURED = {"family", "size", "kept_volume", "lost_at_volumes"}
 """What a row must have beside its bytes."""
@@ -55,27 +57,21 @@ def capacity(
         raise ValueError("a field is learned in one step or more, a grid has 2 cells or more")
     if not data.is_dir():
         raise InputError(f"--data {data}: there is no such folder")
-    _settle(
-        out,
-        {
-            "data": data.resolve().name,
-            "lost_surface_mass": lost_surface_mass,
-            "learn_steps": learn_steps,
-        },
-    )
+    scene, machine, code = describe_scene(data), describe_machine(), describe_code()
+    settings = {"lost_surface_mass": lost_surface_mass, "learn_steps": learn_steps}
+    _settle(out, {"scene": scene, **settings}, data)
     wanted = list(gates() if gate_candidates is None else gate_candidates)
-    fitting = [n for n in resolutions if fits_memory(n**3)]
-    for n in sorted(set(resolutions) - set(fitting)):
-        CONSOLE.print(f"a grid of {n}^3 cells does not fit the free memory; it is left out")
-    of_cells = grids(tuple(dict.fromkeys(fitting)))
+    known = _left_out(out) if machine["device"] == "cpu" else []
+    of_cells = _grids_to_fill(resolutions, known)
     ground = prepare(data, out, learn_steps)
     rows: list[dict[str, Any]] = []
     with bar("Teaching representations") as show:
         for number, candidate in enumerate(wanted):
             row = _stored(out, candidate)
-            rows.append(
-                row or _store(out, candidate, of_gate(ground, candidate, lost_surface_mass))
-            )
+            if row is None:
+                row = of_gate(ground, candidate, lost_surface_mass)
+                _store(out, candidate, row, code)
+            rows.append(row)
             show((number + 1) / (len(wanted) + len(of_cells)))
         stored = [_stored(out, candidate) for candidate in of_cells]
         if all(row is not None for row in stored):
@@ -83,18 +79,19 @@ def capacity(
         else:  # each grid is refined from the one before
             filling = of_grids(ground, of_cells, lost_surface_mass)
             for number, (candidate, row) in enumerate(filling):
-                rows.append(_store(out, candidate, row))
+                _store(out, candidate, row, code)
+                rows.append(row)
                 show((len(wanted) + number + 1) / (len(wanted) + len(of_cells)))
-            for left_out in of_cells[len(rows) - len(wanted) :]:
-                CONSOLE.print(
-                    f"a grid of {left_out.size}^3 cells would ask the field at more than "
-                    f"{MOST_ON_CPU / 1e6:.0f} million places; it is left out"
-                )
+            left_out = [candidate.size for candidate in of_cells[len(rows) - len(wanted) :]]
+            for size in left_out:
+                CONSOLE.print(f"a grid of {size}^3 cells {TOO_MANY}; it is left out")
+            if left_out:
+                write_json(out / LEFT_OUT, {"places": MOST_ON_CPU, "grids": [*known, *left_out]})
     manager_images = int(ground.model.num_train_data)
     results = {
         "format": 1,
-        "machine": describe_machine(),
-        "scene": {"name": data.resolve().name, "train_images": manager_images},
+        "machine": machine,
+        "scene": {**scene, "train_images": manager_images},
         "lost_surface_mass": lost_surface_mass,
         "learn_steps": learn_steps,
         "rays": ground.held_out.rays,
@@ -108,15 +105,20 @@ def capacity(
     return results
 
 
-def _settle(out: Path, settings: dict[str, Any]) -> None:
+def _settle(out: Path, settings: dict[str, Any], data: Path) -> None:
     """Whether a folder may hold points of these settings.
 
     Raises:
-        InputError: it holds something else, or points of other settings.
+        InputError: it holds something else, or points of another scene or of other settings.
     """
     file = out / SETTINGS
     if file.exists():
         found = read_object(file, DAMAGED)
+        if found.get("scene") != settings["scene"]:
+            raise InputError(
+                f"{out} holds points of another scene than {data}, or of an earlier version; "
+                "name a new folder with --out"
+            )
         names = [name for name, value in settings.items() if found.get(name) != value]
         if names:
             raise InputError(
@@ -129,6 +131,32 @@ def _settle(out: Path, settings: dict[str, Any]) -> None:
         write_json(file, settings)
 
 
+def _grids_to_fill(resolutions: Sequence[int], known: Sequence[str]) -> list[Candidate]:
+    """The grids that fit the memory and are not known to take too long; says which are left out."""
+    found = []
+    for candidate in grids(tuple(dict.fromkeys(resolutions))):
+        if not fits_memory(int(candidate.size) ** 3):
+            CONSOLE.print(
+                f"a grid of {candidate.size}^3 cells does not fit the free memory; it is left out"
+            )
+        elif candidate.size in known:
+            CONSOLE.print(f"a grid of {candidate.size}^3 cells {TOO_MANY}; left out, as before")
+        else:
+            found.append(candidate)
+    return found
+
+
+def _left_out(out: Path) -> list[str]:
+    """Sizes of the grids that an earlier call on a CPU found to take too long."""
+    file = out / LEFT_OUT
+    if not file.exists():
+        return []
+    found = read_object(file, DAMAGED)
+    sizes = found.get("grids")
+    same = found.get("places") == MOST_ON_CPU and isinstance(sizes, list)
+    return [str(size) for size in sizes if str(size).isdigit()] if same and sizes else []
+
+
 def _stored(out: Path, candidate: Candidate) -> dict[str, Any] | None:
     file = out / POINTS / f"{candidate.key}.json"
     if not file.exists():
@@ -139,10 +167,11 @@ def _stored(out: Path, candidate: Candidate) -> dict[str, Any] | None:
     return row
 
 
-def _store(out: Path, candidate: Candidate, row: dict[str, Any]) -> dict[str, Any]:
+def _store(out: Path, candidate: Candidate, row: dict[str, Any], code: dict[str, Any]) -> None:
+    """Leaves a row that was measured now, with what made it."""
+    row |= made_by(code)
     write_json(out / POINTS / f"{candidate.key}.json", row)
     CONSOLE.print(line_of(row), markup=False, highlight=False)
-    return row
 
 
 def line_of(row: dict[str, Any]) -> str:

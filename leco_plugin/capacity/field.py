@@ -67,7 +67,7 @@ def prepare(data: Path, folder: Path, learn_steps: int) -> Ground:
             metadata=dataset.metadata,
             device=device,
         ).to(device)
-        _load(model, stored, len(dataset))
+        _load(model, stored)
     else:
         pipeline = SimpleNamespace(datamanager=manager, device=torch.device(device))
         rays = config.datamanager.train_num_rays_per_batch
@@ -76,25 +76,20 @@ def prepare(data: Path, folder: Path, learn_steps: int) -> Ground:
     return _ground(Source(manager, model.eval()))
 
 
-def _load(model: LecoModel, stored: Path, images: int) -> None:
+def _load(model: LecoModel, stored: Path) -> None:
     """Restores the field that an earlier call left.
 
-    Args:
-        images: training photographs of the scene.
     Raises:
-        InputError: the file is damaged, or of another number of photographs.
+        InputError: the file is damaged, or does not fit the scene.
     """
-    remedy = f"name a new folder with --out, or delete {stored} and the points beside it"
     try:
         model.load_state_dict(torch.load(stored, map_location=model.device, weights_only=True))
     except (OSError, RuntimeError, ValueError, KeyError, EOFError, UnpicklingError) as error:
         line = one_line(error, 200)
-        raise InputError(f"{stored} cannot be used ({line}): {remedy}") from None
-    if model.num_train_data != images:
         raise InputError(
-            f"{stored} was learned on {model.num_train_data} photographs, and this scene has "
-            f"{images}: {remedy}"
-        )
+            f"{stored} cannot be used ({line}): name a new folder with --out, or delete {stored} "
+            "and the points beside it"
+        ) from None
 
 
 def _ground(source: Source) -> Ground:
@@ -106,8 +101,8 @@ def _ground(source: Source) -> Ground:
     measured, _ = gather(source, None, held_out(source, occupancy, RAYS, parts=1)[0])
     if not bool(measured.worth.any()):
         raise InputError(
-            "the field shows nothing along held-out rays, so that no loss can be measured: let it "
-            "learn longer (--learn-steps)"
+            "the field shows nothing along held-out rays, so that no loss can be measured: let one "
+            "learn longer, with a larger --learn-steps and a new folder at --out"
         )
 
     def mapped(places: Tensor) -> Tensor:

@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import hashlib
 from collections.abc import Iterable
 from dataclasses import asdict, dataclass
-from pathlib import Path
 from typing import Any
 
 from leco_plugin.evaluation.clock import Budget
@@ -88,21 +86,6 @@ def require_seeds(seeds: Iterable[int]) -> None:
     for seed in seeds:
         if not 0 <= seed < SEEDS:
             raise InputError(f"a seed is a whole number from 0 to {SEEDS - 1}, not {seed}")
-
-
-def describe_scene(data: Path) -> dict[str, Any]:
-    """Name, number of images, and what tells the scene from another: JSON values.
-
-    Raises:
-        InputError: it is no scene that can be read.
-    """
-    from leco_plugin.scenes.photographs import check_scene, folder_of
-
-    meta = check_scene(data)
-    description = data if data.suffix == ".json" else data / "transforms.json"
-    digest = hashlib.sha256(description.read_bytes()).hexdigest()
-    name = folder_of(data).resolve().name
-    return {"name": name, "images": len(meta["frames"]), "digest": digest[:16]}
 
 
 def settings_of(

@@ -14,11 +14,12 @@ from leco_plugin.chart import forecast
 from leco_plugin.chart.contender import Contender
 from leco_plugin.chart.folder import RESULTS, ChartFolder, Job
 from leco_plugin.chart.processes import RunFailed
-from leco_plugin.chart.protocol import Protocol, describe_scene, require_seeds, settings_of
+from leco_plugin.chart.protocol import Protocol, require_seeds, settings_of
 from leco_plugin.chart.reuse import check_sources, take_over
 from leco_plugin.chart.table import write_table
 from leco_plugin.evaluation.json_file import write_json
 from leco_plugin.evaluation.machine import describe_code, describe_machine
+from leco_plugin.scenes.description import describe_scene
 
 Runner = Callable[[Job, Callable[[float], None]], dict[str, Any]]
 Say = Callable[[str], None]

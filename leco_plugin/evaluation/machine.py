@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import datetime
 import hashlib
 import os
 import platform
@@ -40,6 +41,15 @@ def describe_code() -> dict[str, Any]:
     except OSError:
         commit = ""
     return {"version": __version__, "commit": commit or None, "sources": _digest_of_sources()}
+
+
+def made_by(code: dict[str, Any]) -> dict[str, Any]:
+    """What a stored figure says of its making: the code as it was loaded, and today's date.
+
+    Args:
+        code: `describe_code()`, asked before anything was measured.
+    """
+    return {"code": code, "date": datetime.date.today().isoformat()}
 
 
 def _digest_of_sources() -> str:

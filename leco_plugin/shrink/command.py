@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-import math
 import statistics
 import time
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -13,13 +13,16 @@ from nerfstudio.utils.rich_utils import CONSOLE
 
 from leco_plugin.cli_reports import check_place
 from leco_plugin.evaluation.inspection import whole_box
-from leco_plugin.evaluation.machine import describe_machine
+from leco_plugin.evaluation.machine import describe_code, describe_machine, made_by
 from leco_plugin.occupancy import BACKDROP_PRICE, Occupancy
 from leco_plugin.progress_bar import bar
 from leco_plugin.scenes.pixels.held_out_pixels import held_out_sampler
+from leco_plugin.shrink.checks import check_known, check_march, check_room, check_skips
 from leco_plugin.shrink.evidence import Evidence, gather
-from leco_plugin.shrink.references import names_of, references, shares_lost
-from leco_plugin.shrink.search import Bounds, Found, Ground, Rung, check_room, search
+from leco_plugin.shrink.references import LOST_DECISIONS, names_of, references, shares_lost
+from leco_plugin.shrink.rungs import Bounds, Found, Ground, Rung
+from leco_plugin.shrink.saying import line_of, line_of_original
+from leco_plugin.shrink.search import search
 from leco_plugin.shrink.sources import (
     Source,
     check_scene,
@@ -28,6 +31,7 @@ from leco_plugin.shrink.sources import (
     of_test_photographs,
     trained_on,
 )
+from leco_plugin.shrink.verifying import HOLDS, is_measured, of_original, verify
 
 RAYS = 4096
 TAUGHT_RAYS = 6144
@@ -39,7 +43,14 @@ COPIED = (
 """What a smaller occupancy's report takes over from the original's."""
 
 
-def shrink(file: Path, data: Path, out: Path, bounds: Bounds, seed: int = 0) -> dict[str, Any]:
+def shrink(
+    file: Path,
+    data: Path,
+    out: Path,
+    bounds: Bounds,
+    seed: int = 0,
+    keep: Callable[[dict[str, Any]], None] | None = None,
+) -> dict[str, Any]:
     """Finds the smallest gate that decides as a frozen one does, and writes it.
 
     Args:
@@ -48,77 +59,89 @@ def shrink(file: Path, data: Path, out: Path, bounds: Bounds, seed: int = 0) -> 
         out: of the smaller occupancy.
         bounds: what it may declare.
         seed: of rays that were trained on.
+        keep: called with what is known so far after each gate that was tried: JSON values.
     Returns:
         The frontier that was walked, and what was written: JSON values.
     Raises:
         ValueError, OSError: a file, a folder or a bound is wrong; nothing was written.
     """
+    code = describe_code()
     check_place("--out", out)
     if out.exists() and out.samefile(file):
         raise ValueError(f"--out {out} is the occupancy itself; name another file")
     original = Occupancy.load(file)
     check_room(original, bounds)
     check_march(original, file)
+    check_skips(original, file)
     torch.manual_seed(seed)
     source = find_source(file, data)
     check_scene(source, original, data)
+    check_known(source, original, file)
     original = original.to(source.manager.device)
     ground = _ground(source, original)
-    with bar("Teaching smaller gates") as show:
-        found = search(ground, bounds, on_rung=_say, on_progress=show)
-    before = {"params": original.num_params, "bytes": file.stat().st_size}
-    checked = None
+    itself = of_original(ground, bounds)
+    _say(line_of_original(itself, is_measured(ground)))
+    known = {
+        "format": 1,
+        "machine": describe_machine(),
+        **made_by(code),
+        "from": {"params": original.num_params, "bytes": file.stat().st_size},
+        "bounds": {**vars(bounds)},
+        "original": itself.to_dict(),
+    }
+    rungs: list[dict[str, Any]] = []
+
+    def tell(rung: Rung) -> None:
+        _say(line_of(rung))
+        rungs.append(rung.to_dict())
+        if keep is not None:
+            keep({**known, "rungs": rungs})
+
+    found = Found(None, [])
+    if itself.verdict == HOLDS:
+        with bar("Teaching smaller gates") as show:
+            found = search(ground, bounds, on_rung=tell, on_progress=show)
     smaller = found.occupancy
     if smaller is None:
+        if is_measured(ground):
+            looks = max((rung.look or 0 for rung in found.rungs), default=0)
+            verify(ground, original, bounds, itself, looks + 1)
         smaller = _rounded_as_it_is(original)
-    else:
-        checked = check(source, original, smaller)
+    checked = check(source, original, smaller)
     untrained = held_out_sampler(source.manager) is not None
-    smaller.report = report_of(original, ground, found, untrained)
+    smaller.report = report_of(ground, found, itself, untrained)
     out.parent.mkdir(parents=True, exist_ok=True)
     smaller.save(out)
     speedup, times = compare_queries(original, smaller)
     reported = {name: value for name, value in smaller.report.items() if name not in COPIED}
     return {
-        "format": 1,
-        "machine": describe_machine(),
-        "from": before,
+        **known,
+        "original": itself.to_dict(),
         "to": {"params": smaller.num_params, "bytes": out.stat().st_size, **reported},
-        "bounds": {**vars(bounds)},
         "query_speedup": speedup,
         "query_milliseconds": times,
         "queried_positions": TIMED_POSITIONS,
         "checked": checked,
-        "rungs": [rung.to_dict() for rung in found.rungs],
+        "rungs": rungs,
     }
-
-
-def check_march(original: Occupancy, file: Path) -> None:
-    """Whether an occupancy says how its rays are marched.
-
-    Raises:
-        ValueError: it does not, or not in numbers.
-    """
-    for name in ("near", "far", "step_size"):
-        value = original.report.get(name)
-        if not (isinstance(value, int | float) and 0.0 <= value < math.inf):
-            raise ValueError(
-                f"{file} does not say how its rays are marched: its {name} is {value}, no distance"
-            )
 
 
 def check(source: Source, original: Occupancy, smaller: Occupancy) -> dict[str, Any] | None:
     """What the smaller gate loses on rays of test photographs, which decided nothing here.
 
     Returns:
-        `rays`, the worst `lost_surface_mass` of any reference, and of each (`against`); None
-        without such photographs.
+        `rays`, the worst `lost_surface_mass` of any reference, or `lost_decisions` without a field,
+        and that of each (`against`); None without such photographs, and of the original where
+        nothing measures it.
     """
     seen = of_test_photographs(source, original, RAYS)
     if seen is None:
         return None
     shares = shares_lost(source, original, smaller, seen)
-    return {"rays": len(seen.truth), "lost_surface_mass": max(shares.values()), "against": shares}
+    if not shares:
+        return None
+    lost = _lost(source.model is None, max(shares.values()))
+    return {"rays": len(seen.truth), **lost, "against": shares}
 
 
 def _ground(source: Source, original: Occupancy) -> Ground:
@@ -161,34 +184,54 @@ def _rounded_as_it_is(original: Occupancy) -> Occupancy:
     return original
 
 
-def report_of(original: Occupancy, ground: Ground, found: Found, untrained: bool) -> dict[str, Any]:
+def report_of(ground: Ground, found: Found, itself: Rung, untrained: bool) -> dict[str, Any]:
     """What the smaller occupancy declares: the original's loss and, on top, its own.
 
     Args:
+        itself: the original, which is stored again where nothing smaller holds.
         untrained: whether nothing was trained on the pixels of the ground's rays.
     """
+    original = ground.original
     report = {name: original.report[name] for name in COPIED if name in original.report}
     if "cameras" in report:
         report["cameras"] = [[round(float(x), 4) for x in row] for row in report["cameras"]]
     if found.occupancy is None:
-        return {**original.report, **report}
+        report = {**original.report, **report}
+        return report | (_measured(ground, itself, untrained) if is_measured(ground) else {})
     rung = found.rungs[-1]
-    measured = rung.verified
-    unchanged = ("lost_mass", "image_price_db", "empty_fraction", "kept_candidates_dropped")
     return (
         report
-        | {name: measured[name] for name in unchanged}
+        | _measured(ground, rung, untrained)
         | {
             "params": rung.params,
             "threshold": found.occupancy.threshold,
-            "lost_surface_mass": measured["lost_surface_mass_bound"],
-            "calibration_rays": ground.references[0].verify.evidence.rays,
-            "held_out": untrained and bool(original.report.get("held_out", False)),
+            "kept_candidates_dropped": rung.verified["kept_candidates_dropped"],
             "shrunk_from_params": original.num_params,
-            "loss_measured_against": names_of(ground.references),
             "kept_volume_of_the_original": rung.kept_volume,
         }
     )
+
+
+def _measured(ground: Ground, rung: Rung, untrained: bool) -> dict[str, Any]:
+    """Of a report, what was measured on rays that the search did not see."""
+    measured, first = rung.verified, ground.references[0]
+    alone = first.model is None
+    return {
+        **_lost(alone, measured["lost_surface_mass_bound"]),
+        "lost_mass": None if alone else measured["lost_mass"],
+        "image_price_db": measured["image_price_db"],
+        "empty_fraction": measured["empty_fraction"],
+        "calibration_rays": first.verify.evidence.rays,
+        "held_out": untrained and bool(ground.original.report.get("held_out", False)),
+        "loss_measured_against": names_of(ground.references),
+    }
+
+
+def _lost(alone: bool, share: float | None) -> dict[str, float | None]:
+    """A loss by its name: without a field it is one of decisions, and that of surfaces unknown."""
+    if alone:
+        return {"lost_surface_mass": None, LOST_DECISIONS: share}
+    return {"lost_surface_mass": share}
 
 
 def compare_queries(original: Occupancy, smaller: Occupancy) -> tuple[float, list[float]]:
@@ -219,38 +262,5 @@ def _seconds(occupancy: Occupancy, positions: torch.Tensor) -> float:
     return time.perf_counter() - started
 
 
-def _say(rung: Rung) -> None:
-    CONSOLE.print(line_of(rung), markup=False, highlight=False)
-
-
-def line_of(rung: Rung) -> str:
-    """A rung as a line of the table."""
-    price = "     -" if rung.image_price_db is None else f"{rung.image_price_db:+6.3f}"
-    return (
-        f"{rung.name:<28}{rung.params:>8} values {rung.bytes / 1000:>7.1f} kB  loses "
-        f"{rung.lost_surface_mass:.1e}  {price} dB  keeps {rung.kept_volume:>6.1%} of the "
-        f"original's volume  {rung.verdict}"
-    )
-
-
-def summary(results: dict[str, Any], out: Path) -> list[str]:
-    """The outcome in a few lines, for the terminal."""
-    before, after, checked = results["from"], results["to"], results["checked"]
-    lines = []
-    if not any(rung["verdict"] == "chosen" for rung in results["rungs"]):
-        lines.append("no smaller gate holds these bounds: this is the same gate")
-    lines.append(
-        f"{out}: {before['bytes'] / 1000:.1f} kB before, {after['bytes'] / 1000:.1f} kB now; asked "
-        f"{results['query_speedup']:.1f} times faster"
-    )
-    lost, price = after.get("lost_surface_mass"), after.get("image_price_db")
-    if lost is not None:
-        cost = "" if price is None else f" and {price:+.3f} dB"
-        lines.append(f"declares {lost:.2e} of the surface mass{cost}, the original's included")
-    if "loss_measured_against" in after:
-        lines.append(f"measured against {after['loss_measured_against']}")
-    if checked is not None:
-        found = checked["lost_surface_mass"]
-        more = ", more than it declares" if found > (lost or 0.0) else ""
-        lines.append(f"{checked['rays']} rays of test photographs lose {found:.2e}{more}")
-    return lines
+def _say(line: str) -> None:
+    CONSOLE.print(line, markup=False, highlight=False)

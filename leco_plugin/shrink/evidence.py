@@ -162,39 +162,50 @@ class Loss(NamedTuple):
     share: float
     """Of the worth of all candidates."""
     bound: float
-    """One that the share on other rays of the scene should stay below 99 times in 100."""
+    """One that the share on other rays of the scene stays below, but for the allowed few times."""
     lost_mass: float
     """Share of all rendering weight before the backdrop, haze included."""
 
 
 UNLIKELY = 0.01
-"""How often the share on other rays may lie above the bound."""
-CONFIDENCE, BEYOND = math.sqrt(2.0 * math.log(1.0 / UNLIKELY)), math.log(1.0 / UNLIKELY) / 3.0
-"""Of Bernstein's inequality: errors, and rays of average worth, that are added to the mean."""
+"""How often what is declared may lie below the share on other rays of the scene."""
 
 
-def loss(evidence: Evidence, skipped: Tensor) -> Loss:
+def unlikely_at(look: int) -> float:
+    """How often the bound of the k-th look at the same rays may be wrong; all add to `UNLIKELY`."""
+    return UNLIKELY / (look * (look + 1))
+
+
+def loss(evidence: Evidence, skipped: Tensor, unlikely: float = UNLIKELY) -> Loss:
     """The share of the worth that is skipped, and Bernstein's bound of a ratio of sums over rays.
 
-    The error is reckoned as if one more ray of average worth were lost: a loss that no ray has seen
-    yet has no spread. Without any loss that makes 4.6 / n, which n rays without one do exclude.
+    Rays count by what they are worth: n = (sum worth)^2 / sum worth^2, so that a ray of sky is no
+    evidence. A loss that no ray has seen yet has no spread: the error is reckoned as if a few more
+    rays of average worth were lost, so many that without any loss the bound is
+    log(1 / unlikely) / n, which n rays without one do exclude.
 
     Args:
         skipped: bool [M].
+        unlikely: how often the bound may be wrong.
     """
     lost_all, all_weight = (float((evidence.weights * m).sum()) for m in (skipped, 1.0))
+    lost_mass = lost_all / max(all_weight, 1e-12)
     lost, worth = (
         torch.zeros(evidence.rays, dtype=torch.float64, device=evidence.worth.device).index_add_(
             0, evidence.ray_indices, values.double()
         )
         for values in (evidence.worth * skipped, evidence.worth)
     )
-    total = max(float(worth.sum()), 1e-12)
+    total = float(worth.sum())
+    if total == 0.0:  # nothing is known
+        return Loss(0.0, 1.0, lost_mass)
     share = float(lost.sum()) / total
-    one_more = (total / max(evidence.rays, 1)) ** 2
-    error = math.sqrt(float((lost - share * worth).square().sum()) + one_more) / total
-    bound = share + CONFIDENCE * error + BEYOND / max(evidence.rays, 1)
-    return Loss(share, bound, lost_all / max(all_weight, 1e-12))
+    one_ray = float(worth.square().sum()) / total**2
+    nepers = math.log(1.0 / unlikely)
+    unseen = 2.0 / 9.0 * nepers * one_ray**2
+    spread = float((lost - share * worth).square().sum()) / total**2
+    bound = share + math.sqrt(2.0 * nepers * (spread + unseen)) + nepers / 3.0 * one_ray
+    return Loss(share, bound, lost_mass)
 
 
 def image_price(model: LecoModel, rendered: Sequence[Rendered], smaller: Occupancy) -> float:

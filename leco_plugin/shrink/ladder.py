@@ -14,6 +14,8 @@ FREQUENCY = (
 """Octaves, width and layers of gates on frequencies."""
 ENOUGH_OCTAVES = 5
 """From so many on, a gate without a norm decides as well as one with it, and answers sooner."""
+HASH_TABLES = (6, 7, 8)
+"""Binary logarithms of the entries a level of gates on hash grids."""
 PLANES = ((16, 2), (32, 2), (64, 2), (64, 4), (128, 4))
 """Cells, and features or components, of gates on K-planes and on vector-matrix products."""
 
@@ -25,6 +27,9 @@ def ladder(most_values: int) -> list[GateConfig]:
         GateConfig(EncodingConfig(octaves=octaves), width, layers, 1, octaves < ENOUGH_OCTAVES)
         for octaves, width, layers in FREQUENCY
     ]
+    for table in HASH_TABLES:
+        grid = EncodingConfig("hash", levels=4, log2_table=table, finest=64)
+        gates.append(GateConfig(grid, 16, 1, 1))
     for cells, features in PLANES:
         planes = EncodingConfig(plane_cells=cells, levels=1, coarsest=cells)
         gates += [

@@ -66,7 +66,9 @@ def draw(results: Mapping[str, Any], path: Path, theme: Theme = LIGHT) -> Path:
                 fontsize=9.5,
             )
         axes.set_xlim(0.7 * min(sizes, default=1.0), 4.0 * max(sizes, default=1.0))
-        axes.set(xscale="log", yscale="log", xlabel="kB of weights", ylabel="lost surface mass")
+        unknown = results["to"].get("lost_surface_mass") is None
+        of_what = "lost decisions" if unknown else "lost surface mass"
+        axes.set(xscale="log", yscale="log", xlabel="kB of weights", ylabel=of_what)
         heights = [*losses, allowed]
         axes.set_ylim(min(heights) / 3.0, 30.0 * max(heights))
         axes.xaxis.set_major_formatter(StrMethodFormatter("{x:g}"))

@@ -6,12 +6,9 @@ is found on rays of its own; what is declared is measured on others.
 
 from __future__ import annotations
 
-import math
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass, field
 from itertools import pairwise
-from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -19,10 +16,12 @@ from torch import Tensor
 from leco_plugin.evaluation.inspection import whole_box
 from leco_plugin.models.gate import GateConfig
 from leco_plugin.occupancy import Occupancy
-from leco_plugin.shrink.evidence import Evidence, Loss, image_price, loss, query_in_parts
+from leco_plugin.shrink.checks import check_room
+from leco_plugin.shrink.evidence import Evidence, loss, query_in_parts
 from leco_plugin.shrink.ladder import ladder, name_of, values_of
-from leco_plugin.shrink.references import Part, Reference, declared
+from leco_plugin.shrink.rungs import Bounds, Found, Ground, Rung
 from leco_plugin.shrink.teaching import Lesson, round_weights, teach
+from leco_plugin.shrink.verifying import price_of, verify, worst
 
 STEPS, LONGER, NEARLY = 1200, 3, 3.0
 """Of teaching; how many times as many a gate gets that nearly holds, and what that means: a loss of
@@ -35,51 +34,6 @@ VOLUME_POINTS = 1 << 17
 TAUGHT_POINTS = 1 << 18
 VOLUMES = (1.0, 1.05)
 """Kept volumes that are tried, as shares of the original's."""
-
-
-@dataclass(frozen=True)
-class Bounds:
-    """What the smaller occupancy may declare in all, the original's share included."""
-
-    lost_surface_mass: float = 1e-3
-    image_price_db: float = 0.05
-
-
-@dataclass
-class Rung:
-    """One gate that was tried. Losses are the worst of any reference, the original's included."""
-
-    name: str
-    params: int
-    bytes: int
-    """Of its weights in bfloat16."""
-    kept_volume: float
-    """Share of the original's."""
-    lost_surface_mass: float
-    image_price_db: float | None
-    verdict: str
-    seconds: float
-    verified: dict[str, float | None] = field(default_factory=dict)
-    verified_against: list[dict[str, str | float]] = field(default_factory=list)
-    """The share that each reference has lost on rays of its own, and its bound."""
-
-    def to_dict(self) -> dict[str, Any]:
-        return asdict(self)
-
-
-class Ground(NamedTuple):
-    """What gates are taught and measured on."""
-
-    original: Occupancy
-    taught: Evidence
-    references: Sequence[Reference]
-
-
-class Found(NamedTuple):
-    """The outcome: None is that nothing smaller holds."""
-
-    occupancy: Occupancy | None
-    rungs: list[Rung]
 
 
 def search(
@@ -104,13 +58,15 @@ def search(
     kept = query_in_parts(ground.original, volume) >= ground.original.threshold
     lesson = lesson_of(ground.original, ground.taught)
     rungs: list[Rung] = []
+    looks = 0
     show = on_progress or (lambda share: None)
     for number, config in enumerate(gates):
         started = time.monotonic()
         parts = [(number + done) / len(gates) for done in (0.0, 1.0 / (1 + LONGER), 1.0)]
         for times, part in zip((1, LONGER), pairwise(parts)):
             gate = _taught(config, lesson, times * STEPS, ground.original, part_of(show, *part))
-            rung = _measured(ground, gate, bounds, volume, kept)
+            rung = _measured(ground, gate, bounds, volume, kept, looks + 1)
+            looks = rung.look or looks
             nearly = rung.lost_surface_mass <= NEARLY * MARGIN * bounds.lost_surface_mass
             if rung.verdict == "chosen" or not nearly:
                 break
@@ -142,32 +98,6 @@ def _taught(
     return smaller.to(original.threshold_value.device).eval()
 
 
-def check_room(original: Occupancy, bounds: Bounds) -> None:
-    """Whether anything is left to lose after what the original declares.
-
-    Raises:
-        ValueError: nothing is, or a bound is out of range.
-    """
-    if not 0.0 <= bounds.lost_surface_mass < 1.0 or not math.isfinite(bounds.image_price_db):
-        raise ValueError(
-            "bounds are a lost surface mass from 0 to 1 and a number of dB, not "
-            f"{bounds.lost_surface_mass} and {bounds.image_price_db}"
-        )
-    lost, price = (
-        max(declared(original, name), 0.0) for name in ("lost_surface_mass", "image_price_db")
-    )
-    if lost >= bounds.lost_surface_mass:
-        raise ValueError(
-            f"the occupancy itself declares a lost surface mass of {lost:.2e}, which leaves "
-            f"nothing of {bounds.lost_surface_mass:.2e}: raise --lost-surface-mass"
-        )
-    if price >= bounds.image_price_db:
-        raise ValueError(
-            f"the occupancy itself declares an image price of {price:.3f} dB, which leaves nothing "
-            f"of {bounds.image_price_db:.3f} dB: raise --image-price"
-        )
-
-
 def lesson_of(original: Occupancy, taught: Evidence) -> Lesson:
     """The original's decisions on candidates of rays, and as many places anywhere in its box."""
     anywhere = _volume(original, TAUGHT_POINTS, seed=6)
@@ -180,9 +110,13 @@ def lesson_of(original: Occupancy, taught: Evidence) -> Lesson:
 
 
 def _measured(
-    ground: Ground, smaller: Occupancy, bounds: Bounds, volume: Tensor, kept: Tensor
+    ground: Ground, smaller: Occupancy, bounds: Bounds, volume: Tensor, kept: Tensor, look: int
 ) -> Rung:
-    """Gives the gate the threshold that suits it; what was found."""
+    """Gives the gate the threshold that suits it; what was found.
+
+    Args:
+        look: at the rays that verify, the how many-th it would be.
+    """
     scores = [
         query_in_parts(smaller, reference.search.evidence.positions)
         for reference in ground.references
@@ -213,70 +147,15 @@ def _measured(
     if ratio > VOLUMES[-1] + 0.005:
         rung.verdict = "keeps too much"
         return rung
-    prices = [price_of(reference, reference.search, smaller) for reference in ground.references]
-    rung.image_price_db = worst(prices)
+    rung.image_price_db = worst(
+        [price_of(ground, each, each.search, smaller) for each in ground.references]
+    )
     if (rung.image_price_db or 0.0) > bounds.image_price_db:
         rung.verdict = "costs too much of the image"
         return rung
-    rung.verdict = "chosen" if _verified(ground, smaller, bounds, rung) else "fails on unseen rays"
+    holds = verify(ground, smaller, bounds, rung, look)
+    rung.verdict = "chosen" if holds else "fails on unseen rays"
     return rung
-
-
-def price_of(reference: Reference, part: Part, smaller: Occupancy) -> float | None:
-    """The image price of skipping what a gate skips, dB; None where nothing is rendered."""
-    if reference.model is None or not part.rendered:
-        return None
-    return reference.price_before + image_price(reference.model, part.rendered, smaller)
-
-
-def worst(values: Sequence[float | None]) -> float | None:
-    """The largest of what was measured; None where nothing was."""
-    return max((value for value in values if value is not None), default=None)
-
-
-def _verified(ground: Ground, smaller: Occupancy, bounds: Bounds, rung: Rung) -> bool:
-    """Whether the bounds hold on rays that the search did not see; measures what to declare.
-
-    What the rays of the search have lost counts as well, where it is more: most of a loss lies on
-    few rays, and they may all be among those.
-    """
-    found: list[Loss] = []
-    prices: list[float | None] = []
-    for reference in ground.references:
-        parts = reference.search, reference.verify
-        searched, unseen = (loss(part.evidence, _skipped(smaller, part)) for part in parts)
-        before = reference.lost_before
-        found.append(
-            Loss(
-                before + unseen.share,
-                before + max(searched.bound, unseen.bound),
-                reference.mass_before + unseen.lost_mass,
-            )
-        )
-        prices += [price_of(reference, part, smaller) for part in parts]
-    first = ground.references[0].verify
-    kept, skipped = first.evidence.kept, _skipped(smaller, first)
-    rung.verified = {
-        "lost_surface_mass": max(one.share for one in found),
-        "lost_surface_mass_bound": max(one.bound for one in found),
-        "lost_mass": max(one.lost_mass for one in found),
-        "image_price_db": worst(prices),
-        "empty_fraction": float(skipped.double().mean()),
-        "kept_candidates_dropped": float((skipped & kept).sum() / kept.sum().clamp(min=1)),
-    }
-    rung.verified_against = [
-        {"reference": reference.name, "lost_surface_mass": one.share, "bound": one.bound}
-        for reference, one in zip(ground.references, found)
-    ]
-    price = rung.verified["image_price_db"] or 0.0
-    return (
-        max(one.bound for one in found) <= bounds.lost_surface_mass
-        and price <= bounds.image_price_db
-    )
-
-
-def _skipped(smaller: Occupancy, part: Part) -> Tensor:
-    return query_in_parts(smaller, part.evidence.positions) < smaller.threshold
 
 
 def threshold_keeping(scores: Tensor, share: float) -> float:

@@ -7,6 +7,7 @@ reference: its rendering weights say what a dropped candidate was worth. Without
 from __future__ import annotations
 
 import copy
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -29,6 +30,8 @@ from leco_plugin.scenes.pixels.held_out_pixels import held_out_sampler, some_ima
 CONFIG, CHECKPOINTS = "config.yml", "nerfstudio_models"
 SAME_PLACE = 1e-3
 """Of the half extent: two cameras that are no further apart are one."""
+DRAWS = 8
+"""Of pixels, until there are as many different ones as are wanted."""
 
 
 class Source(NamedTuple):
@@ -47,7 +50,9 @@ class Seen(NamedTuple):
 
     rays: Rays
     truth: Tensor
-    """[R, 3 or 4] pixels."""
+    """[R, 3 or 4] colours."""
+    pixels: Tensor | None = None
+    """[R, 3] int64, image, row and column; None where nobody asks which they are."""
 
 
 def find_source(file: Path, data: Path) -> Source:
@@ -138,35 +143,83 @@ def _device() -> str:
 def held_out(source: Source, occupancy: Occupancy, count: int, parts: int = 2) -> list[Seen]:
     """Rays of pixels that nothing was trained on, in disjoint parts of up to `count` rays each.
 
-    A data manager that holds none back gives ordinary training rays.
+    A data manager that holds none back gives rays of training pixels, no pixel twice.
     """
     sampler = held_out_sampler(source.manager)
     if sampler is None:
-        return [trained_on(source, occupancy, count) for _ in range(parts)]
+        given: list[Seen] = []
+        for _ in range(parts):
+            given.append(of_other_pixels(source, occupancy, count, given))
+        return given
     images = next(source.manager.iter_train_image_dataloader)
     batch = sampler.sample_held_out(images, parts * count, seed=1)
     each = min(count, len(batch["indices"]) // parts)
     if each == 0:
         raise InputError("the photographs have no pixels that nothing was trained on")
     return [
-        _seen(
-            source,
-            occupancy,
-            source.manager.train_ray_generator(batch["indices"][part]),
-            batch["image"][part],
-        )
+        _of_pixels(source, occupancy, batch["indices"][part], batch["image"][part])
         for part in torch.arange(each * parts).split(each)
     ]
 
 
 def trained_on(source: Source, occupancy: Occupancy, count: int) -> Seen:
     """Rays of training pixels."""
+    bundle, batch = _batch(source, count)
+    return _seen(source, occupancy, bundle, batch["image"])
+
+
+def of_other_pixels(
+    source: Source, occupancy: Occupancy, count: int, besides: Iterable[Seen]
+) -> Seen:
+    """Rays of training pixels, each another one: evidence of its own.
+
+    Args:
+        count: wanted; fewer come back where the photographs have hardly more pixels.
+        besides: rays whose pixels are not drawn again.
+    """
+    known = [_numbers(seen.pixels) for seen in besides if seen.pixels is not None]
+    taken = torch.cat([torch.empty(0, dtype=torch.int64), *known])
+    pieces: list[tuple[Tensor, Tensor]] = []
+    for _ in range(DRAWS):
+        batch = _batch(source, count)[1]
+        numbers = _numbers(batch["indices"])
+        new = _first_of_each(numbers) & ~torch.isin(numbers, taken)
+        taken = torch.cat([taken, numbers[new]])
+        pieces.append((batch["indices"].cpu()[new], batch["image"].cpu()[new]))
+        if sum(len(pixels) for pixels, _ in pieces) >= count:
+            break
+    pixels, truth = (torch.cat(parts)[:count] for parts in zip(*pieces))
+    return _of_pixels(source, occupancy, pixels, truth)
+
+
+def _batch(source: Source, count: int) -> tuple[RayBundle, dict[str, Tensor]]:
+    """So many rays of random training pixels, and the pixels."""
     sampler = source.manager.train_pixel_sampler
     before = sampler.num_rays_per_batch
     sampler.set_num_rays_per_batch(count)
     bundle, batch = source.manager.next_train(0)
     sampler.set_num_rays_per_batch(before)
-    return _seen(source, occupancy, bundle, batch["image"])
+    return bundle, batch
+
+
+def _of_pixels(source: Source, occupancy: Occupancy, pixels: Tensor, truth: Tensor) -> Seen:
+    """Rays of training pixels [R, 3]."""
+    bundle = source.manager.train_ray_generator(pixels)
+    return _seen(source, occupancy, bundle, truth)._replace(pixels=pixels)
+
+
+def _numbers(pixels: Tensor) -> Tensor:
+    """A number for each pixel [R, 3], another one for each."""
+    image, row, column = pixels.cpu().unbind(dim=1)
+    return (image << 40) + (row << 20) + column
+
+
+def _first_of_each(numbers: Tensor) -> Tensor:
+    """[R] bool: whether a number [R] stands there for the first time."""
+    values, which = numbers.unique(return_inverse=True)
+    places = torch.arange(len(numbers))
+    first = places.new_full(values.shape, len(numbers)).scatter_reduce(0, which, places, "amin")
+    return places == first[which]
 
 
 def from_between_cameras(source: Source, seen: Seen, seed: int) -> Seen:
@@ -189,7 +242,7 @@ def from_between_cameras(source: Source, seen: Seen, seed: int) -> Seen:
         pixel_area=torch.ones_like(rays.t_mins)[:, None],
         camera_indices=rays.images[:, None],
     )
-    return _seen(source, None, bundle, seen.truth)
+    return _seen(source, None, bundle, seen.truth)._replace(pixels=seen.pixels)
 
 
 def of_test_photographs(source: Source, occupancy: Occupancy, count: int) -> Seen | None:

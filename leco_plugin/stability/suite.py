@@ -14,9 +14,10 @@ from typing import Any
 
 from leco_plugin.chart.folder import LOGS, ChartFolder, Job
 from leco_plugin.chart.processes import ProcessRunner, RunFailed
-from leco_plugin.chart.protocol import Protocol, describe_scene, require_seeds, settings_of
+from leco_plugin.chart.protocol import Protocol, require_seeds, settings_of
 from leco_plugin.evaluation.json_file import write_json
 from leco_plugin.evaluation.machine import describe_code, describe_machine, usable_cores
+from leco_plugin.scenes.description import describe_scene
 from leco_plugin.stability.cases import Case
 from leco_plugin.stability.contenders import Sampler
 from leco_plugin.stability.cost import core_seconds, in_words

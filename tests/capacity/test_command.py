@@ -75,6 +75,7 @@ def test_what_was_finished_is_kept(
     assert len(set(taught)) == len(taught)
     results = json.loads((out / "results.json").read_text())
     assert len(results["representations"]) == len(taught) - 1
+    assert all(row["code"]["sources"] and row["date"] for row in results["representations"])
     assert results["verdict"] in capsys.readouterr().out
     for name in ("capacity.png", "capacity-dark.png"):
         with Image.open(out / name) as image:
@@ -158,7 +159,7 @@ def test_one_field_teaches_gates_and_grids(
         for file in (out / "points").glob("grid*"):
             file.unlink()
     other = tiny_scene_writer.write(tmp_path / "other" / tiny_scene.name, train=4, test=2)
-    with pytest.raises(InputError, match="learned on 7 photographs, and this scene has 4"):
+    with pytest.raises(InputError, match="another scene"):
         command.capacity(other, out, (8, 16), 0.01, 4, some)
     (out / "field.pt").write_bytes(b"no field")
     with pytest.raises(InputError, match=r"field\.pt cannot be used"):
@@ -184,3 +185,25 @@ def test_a_grid_that_would_take_too_long_is_left_out_and_said(
     )
     rows = json.loads((out / "results.json").read_text())["representations"]
     assert [row["size"] for row in rows if row["family"] == "grid"] == ["8", "16"]
+    before = len(taught)
+    assert run("capacity", "--data", tiny_scene, "--out", out, "--grids", 8, 16, 32) == 0
+    assert len(taught) == before  # none is filled again for the sake of the one left out
+    assert "left out, as before" in " ".join(capsys.readouterr().out.split())
+    again = json.loads((out / "results.json").read_text())["representations"]
+    assert again == rows
+
+
+def test_scenes_of_one_name_are_not_mixed_and_no_scene_blocks_nothing(
+    taught: list[str], tiny_scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out, empty = tmp_path / "out", tmp_path / "empty"
+    empty.mkdir()
+    taught += [""] * 6
+    arguments = ["--out", out, "--grids", 8]
+    assert run("capacity", "--data", empty, *arguments) == 2 and not out.exists()
+    assert run("capacity", "--data", tiny_scene, *arguments) == 0
+    other = tiny_scene_writer.write(tmp_path / "other" / tiny_scene.name, train=4, test=2)
+    capsys.readouterr()
+    assert run("capacity", "--data", other, *arguments) == 2
+    said = capsys.readouterr().err
+    assert "another scene" in said and "new folder with --out" in said and said.count("\n") == 1

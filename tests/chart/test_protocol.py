@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import math
-from pathlib import Path
 
 import pytest
 
-from leco_plugin.chart.protocol import LEARN_SHARE, Protocol, describe_scene, settings_of
+from leco_plugin.chart.protocol import LEARN_SHARE, Protocol, settings_of
 
 
 def test_more_time_is_more_time_for_everything_but_learning() -> None:
@@ -41,18 +40,6 @@ def test_no_time_is_refused_in_a_line(values: dict[str, float]) -> None:
     with pytest.raises(ValueError) as refused:
         Protocol(**values)
     assert "\n" not in str(refused.value)
-
-
-def test_scenes_are_told_apart_by_what_is_in_them(tiny_scene: Path, tmp_path: Path) -> None:
-    seen = describe_scene(tiny_scene)
-    assert seen == describe_scene(tiny_scene / "transforms.json")
-    assert seen["name"] == tiny_scene.name and seen["images"] == 9
-    moved = tmp_path / tiny_scene.name
-    moved.mkdir()
-    (moved / "images").symlink_to(tiny_scene / "images")
-    text = (tiny_scene / "transforms.json").read_text()
-    (moved / "transforms.json").write_text(text.replace('"fl_x": 32.0', '"fl_x": 33.0'))
-    assert describe_scene(moved)["digest"] != seen["digest"]
 
 
 def test_settings_hold_what_makes_runs_comparable() -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import datetime
 import json
 import platform
 from pathlib import Path
@@ -13,7 +14,7 @@ from PIL import Image
 from leco_plugin.chart.theme import DARK, LIGHT, Theme
 from leco_plugin.evaluation.charts import psnr_against_seconds
 from leco_plugin.evaluation.json_file import write_json
-from leco_plugin.evaluation.machine import describe_machine
+from leco_plugin.evaluation.machine import describe_code, describe_machine, made_by
 
 
 def test_the_machine_is_described_without_its_name() -> None:
@@ -21,6 +22,13 @@ def test_the_machine_is_described_without_its_name() -> None:
     assert {"cpu", "cores", "device", "torch"} <= json.loads(text).keys()
     assert "/" not in json.loads(text)["device"]
     assert not platform.node() or platform.node() not in text
+
+
+def test_a_figure_says_what_made_it_and_when() -> None:
+    code = describe_code()
+    assert code == describe_code() and len(code["sources"]) == 12
+    made = made_by(code)
+    assert made["code"] == code and datetime.date.fromisoformat(made["date"])
 
 
 def test_what_is_no_json_leaves_no_file(tmp_path: Path) -> None:

@@ -16,13 +16,15 @@ from tiny_scene import camera_to_world
 
 from leco_plugin import cli
 from leco_plugin.evaluation.inspection import describe
+from leco_plugin.evaluation.machine import describe_code
 from leco_plugin.models.encodings import EncodingConfig
 from leco_plugin.models.freezing.field_at_freezing import leave_field
 from leco_plugin.models.gate import GateConfig
+from leco_plugin.models.learning.statistics import prices
 from leco_plugin.occupancy import Occupancy
-from leco_plugin.shrink import command, references, search, sources
+from leco_plugin.shrink import command, references, rungs, search, sources
 from leco_plugin.shrink.command import compare_queries
-from leco_plugin.shrink.evidence import loss
+from leco_plugin.shrink.evidence import Evidence, gather, loss, unlikely_at
 from leco_plugin.shrink.picture import draw
 
 pytestmark = [  # nerfstudio leaves an image open
@@ -72,21 +74,51 @@ def test_without_a_run_it_keeps_to_the_decisions_and_says_so(
     said = capsys.readouterr().out
     assert "the original's keep decisions, weighed by o(x)" in " ".join(said.split())
     results = json.loads(report.read_text())
+    assert results["code"] == describe_code() and results["date"] > "2026"
     checked = results["checked"]
-    assert checked["rays"] == 512 and checked["lost_surface_mass"] >= 1e-4  # of the original
-    assert f"test photographs lose {checked['lost_surface_mass']:.2e}" in " ".join(said.split())
+    assert checked["rays"] == 512 and checked["lost_surface_mass"] is None
+    assert f"test photographs lose {checked['lost_decisions']:.2e}" in " ".join(said.split())
+    assert "neither surface mass nor image price was measured" in " ".join(said.split())
     smaller = Occupancy.load(out)
     assert out.stat().st_size == results["to"]["bytes"] < file.stat().st_size
     assert [rung["verdict"] for rung in results["rungs"]][-1] == "chosen"
     assert smaller.report["cameras"][1] == [0.766, 0.6428, 0.7]
     beyond = results["rungs"][-1]["verified"]["lost_surface_mass_bound"]
-    assert beyond >= 1e-4 and smaller.report["lost_surface_mass"] == pytest.approx(beyond)
+    assert beyond > 0.0 and smaller.report["lost_decisions"] == pytest.approx(beyond)
+    unknown = ("lost_surface_mass", "lost_mass", "image_price_db")
+    assert [smaller.report[name] for name in unknown] == [None] * 3
+    assert prices(smaller.report) == {}
+    assert run("inspect", out) == 0 and "lost decisions: " in capsys.readouterr().out
+    monkeypatch.setattr(search, "ladder", lambda most: [])
+    again = ["--out", tmp_path / "again", *options[:2]]
+    assert run("shrink", out, "--data", tiny_scene, *again) == 0
+    assert Occupancy.load(tmp_path / "again").report["lost_decisions"] == pytest.approx(beyond)
     assert describe(smaller)["kept_share_of_box"] == pytest.approx(
         describe(Occupancy.load(file))["kept_share_of_box"], rel=0.1
     )
     with Image.open(picture) as image:
         assert image.size[0] > 500
     assert draw(results, tmp_path / "again.png").exists()
+
+
+def test_a_search_that_is_stopped_leaves_the_gates_that_it_tried(
+    file: Path, tiny_scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    smallest = [GateConfig(EncodingConfig(octaves=2), width, 1, 1) for width in (1, 2)]
+    monkeypatch.setattr(search, "ladder", lambda most: smallest)
+    real = search._taught
+
+    def stopped_at_the_second(config: GateConfig, *some: object) -> Occupancy:
+        if config is smallest[1]:
+            raise KeyboardInterrupt
+        return real(config, *some)
+
+    monkeypatch.setattr(search, "_taught", stopped_at_the_second)
+    out, report = tmp_path / "small", tmp_path / "small.json"
+    assert run("shrink", file, "--data", tiny_scene, "--out", out, "--json", report) == 130
+    known = json.loads(report.read_text())
+    assert len(known["rungs"]) == 1 and known["original"]["verdict"] == "holds"
+    assert "to" not in known and not out.exists()
 
 
 def test_where_nothing_smaller_holds_the_same_gate_is_stored(
@@ -122,6 +154,11 @@ def test_bad_input_ends_with_one_line_and_status_2(
     aground = Occupancy.load(file)
     aground.report["step_size"] = "small"
     aground.save(tmp_path / "aground.safetensors")
+    idle, foggy = Occupancy.load(file), Occupancy.load(file)
+    idle.threshold_value.fill_(0.0)
+    idle.save(tmp_path / "idle.safetensors")
+    foggy.report["empty_fraction"] = 0.04
+    foggy.save(tmp_path / "foggy.safetensors")
     elsewhere = Occupancy.load(file)
     elsewhere.report["cameras"] = [[1.0, 0.1 * number, 0.7] for number in range(20)]
     elsewhere.save(tmp_path / "elsewhere.safetensors")
@@ -133,6 +170,11 @@ def test_bad_input_ends_with_one_line_and_status_2(
         "how its rays are marched": [tmp_path / "silent.safetensors", "--data", tiny_scene, *out],
         "not nan": [file, "--data", tiny_scene, *out, "--lost-surface-mass", "nan"],
         "step_size is small": [tmp_path / "aground.safetensors", "--data", tiny_scene, *out],
+        "its threshold is 0": [tmp_path / "idle.safetensors", "--data", tiny_scene, *out],
+        "skips 4.0% of all candidates": [
+            *(tmp_path / "foggy.safetensors", "--data", tiny_scene),
+            *out,
+        ],
         "of the 20 cameras": [tmp_path / "elsewhere.safetensors", "--data", tiny_scene, *out],
         "is a folder": [file, "--data", tiny_scene, "--out", tmp_path],
         "is the occupancy itself": [file, "--data", tiny_scene, "--out", file],
@@ -171,54 +213,44 @@ def test_the_model_of_the_run_says_what_is_lost(
     assert results["to"]["loss_measured_against"] == references.NOW
     assert smaller.num_params < original.num_params
     assert isinstance(smaller.report["image_price_db"], float)
-    source = sources.find_source(file, tiny_scene)
-    unseen = command._ground(source, original)  # the same rays again, by the same seeds
-    assert lost_on_unseen_rays(unseen, smaller)[0] <= smaller.report["lost_surface_mass"]
+    (lost,) = lost_on_test_photographs(file, tiny_scene, smaller)
+    assert lost <= smaller.report["lost_surface_mass"]
 
 
-def lost_on_unseen_rays(ground: search.Ground, smaller: Occupancy) -> list[float]:
-    """Shares of the surface mass, by definition, one a reference."""
-    parts = [reference.verify.evidence for reference in ground.references]
-    return [
-        float((part.worth * ~smaller.occupied(part.positions)).sum() / part.worth.sum())
-        for part in parts
-    ]
+def lost_on_test_photographs(file: Path, data: Path, smaller: Occupancy) -> list[float]:
+    """Shares of the surface mass, by definition, one a reference, on rays that decided nothing."""
+    source, original = sources.find_source(file, data), Occupancy.load(file)
+    seen = sources.of_test_photographs(source, original, 1000)
+    assert seen is not None
+    parts = [gather(source, original, seen)[0]]
+    if source.frozen is not None:
+        parts.append(gather(source._replace(model=source.frozen), None, seen)[0])
+    return [lost_of(part, smaller) for part in parts]
 
 
-def test_search_verification_and_teaching_have_no_pixel_in_common(
-    known_run: Path, tiny_scene: Path
-) -> None:
-    file = known_run / "occupancy.safetensors"
-    source, original = sources.find_source(file, tiny_scene), Occupancy.load(file)
-    seen = [*sources.held_out(source, original, 512), sources.trained_on(source, original, 512)]
-    pixels = [
-        {(int(image), *map(float, ray)) for image, ray in zip(one.rays.images, one.rays.directions)}
-        for one in seen
-        if one.rays.images is not None
-    ]
-    searched, verified, taught = pixels
-    assert min(len(searched), len(verified)) > 20
-    assert not searched & verified and not (searched | verified) & taught
+def lost_of(part: Evidence, smaller: Occupancy) -> float:
+    """The skipped share of the worth, by definition."""
+    return float((part.worth * ~smaller.occupied(part.positions)).sum() / part.worth.sum())
 
 
 def test_the_file_declares_what_rays_have_lost_that_the_search_did_not_see(
     known_run: Path, tiny_scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """On the rays of the search only the safest places are worth anything, on others all kept."""
-    grounds: list[search.Ground] = []
+    """On the rays of the search only the safest places are worth anything, on others the least."""
+    grounds: list[rungs.Ground] = []
     prepare = command._ground
 
-    def uneven(source: sources.Source, original: Occupancy) -> search.Ground:
+    def uneven(source: sources.Source, original: Occupancy) -> rungs.Ground:
         ground = prepare(source, original)
         (reference,) = ground.references
         searched, unseen = reference.search, reference.verify
         values = original.query(searched.evidence.positions)
         safest = (values >= values.quantile(0.99)).float()
+        others, kept = original.query(unseen.evidence.positions), unseen.evidence.kept
+        least = kept & (others <= others[kept].quantile(0.25))
         known = reference._replace(
             search=searched._replace(evidence=searched.evidence._replace(worth=safest)),
-            verify=unseen._replace(
-                evidence=unseen.evidence._replace(worth=unseen.evidence.kept.float())
-            ),
+            verify=unseen._replace(evidence=unseen.evidence._replace(worth=least.float())),
         )
         grounds.append(ground._replace(references=[known]))
         return grounds[-1]
@@ -230,16 +262,51 @@ def test_the_file_declares_what_rays_have_lost_that_the_search_did_not_see(
     bounds = ["--lost-surface-mass", 0.99, "--image-price", 50, "--json", report]
     assert run("shrink", file, "--data", tiny_scene, "--out", out, *bounds) == 0
     smaller, rung = Occupancy.load(out), json.loads(report.read_text())["rungs"][-1]
-    (lost,) = lost_on_unseen_rays(grounds[0], smaller)
+    lost = lost_of(grounds[0].references[0].verify.evidence, smaller)
     assert lost > 0.0 and rung["lost_surface_mass"] == pytest.approx(1e-4)  # of the original
     assert rung["verified"]["lost_surface_mass"] == pytest.approx(lost + 1e-4, rel=1e-3)
     (known,) = grounds[0].references
     seen, unseen = (
-        loss(part.evidence, ~smaller.occupied(part.evidence.positions)).bound
+        loss(part.evidence, ~smaller.occupied(part.evidence.positions), unlikely_at(1)).bound
         for part in (known.search, known.verify)
     )
     assert smaller.report["lost_surface_mass"] == pytest.approx(unseen + 1e-4, rel=1e-3)
     assert unseen > seen
+
+
+def with_haze_at_freezing(known_run: Path, tiny_scene: Path, folder: Path) -> Path:
+    """A copy of the run whose field at freezing has matter where the original skips."""
+    shutil.copytree(known_run, folder)
+    now = sources.find_source(folder / "occupancy.safetensors", tiny_scene)
+    assert now.model is not None and now.frozen is None
+    frozen = copy.deepcopy(now.model)
+    with torch.no_grad():
+        frozen.field.density_head.bias.fill_(0.1)
+    leave_field(frozen, folder)
+    return folder / "occupancy.safetensors"
+
+
+def test_an_original_that_is_not_within_the_bounds_is_said_and_declared(
+    known_run: Path,
+    tiny_scene: Path,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    file = with_haze_at_freezing(known_run, tiny_scene, tmp_path / "run")
+    monkeypatch.setattr(command, "search", lambda *some, **more: pytest.fail("taught"))
+    out, report = tmp_path / "same", tmp_path / "a.json"
+    assert run("shrink", file, "--data", tiny_scene, "--out", out, "--json", report) == 0
+    said = " ".join(capsys.readouterr().out.split())
+    assert "it is not within the bounds by this measure, and no smaller one is looked for" in said
+    results, same = json.loads(report.read_text()), Occupancy.load(out)
+    assert results["rungs"] == [] and results["original"]["bound"] > 1e-3
+    declared = same.report["lost_surface_mass"]
+    assert declared == results["original"]["verified"]["lost_surface_mass_bound"] > 1e-3
+    assert list(results["checked"]["against"]) == [references.AT_FREEZING]
+    assert 0.0 < results["checked"]["lost_surface_mass"] < declared
+    positions = torch.rand(5000, 3) - 0.5
+    assert torch.equal(same.query(positions), Occupancy.load(file).query(positions))
 
 
 def test_what_is_declared_holds_against_the_field_at_the_moment_of_freezing(
@@ -249,15 +316,8 @@ def test_what_is_declared_holds_against_the_field_at_the_moment_of_freezing(
     monkeypatch.setattr(search, "MARGIN", 1.0)
     gates = [GateConfig(EncodingConfig(octaves=3), 16, 2, 1)]
     monkeypatch.setattr(search, "ladder", lambda most: gates)
-    folder = tmp_path / "run"
-    shutil.copytree(known_run, folder)
-    file, out, report = folder / "occupancy.safetensors", tmp_path / "small", tmp_path / "a.json"
-    now = sources.find_source(file, tiny_scene)
-    assert now.model is not None and now.frozen is None
-    frozen = copy.deepcopy(now.model)
-    with torch.no_grad():
-        frozen.field.density_head.bias.fill_(0.1)
-    leave_field(frozen, folder)
+    file = with_haze_at_freezing(known_run, tiny_scene, tmp_path / "run")
+    out, report = tmp_path / "small", tmp_path / "a.json"
     bounds = ["--lost-surface-mass", 0.99, "--image-price", 50, "--json", report]
     assert run("shrink", file, "--data", tiny_scene, "--out", out, *bounds) == 0
     smaller = Occupancy.load(out)
@@ -267,31 +327,12 @@ def test_what_is_declared_holds_against_the_field_at_the_moment_of_freezing(
         references.NOW,
         references.AT_FREEZING,
     ]
-    ground = command._ground(sources.find_source(file, tiny_scene), Occupancy.load(file))
-    lost = lost_on_unseen_rays(ground, smaller)
+    lost = lost_on_test_photographs(file, tiny_scene, smaller)
     assert lost[1] > lost[0] + 0.01  # what the original skips counts
     assert max(lost) <= smaller.report["lost_surface_mass"] == max(x["bound"] for x in against)
-    part = ground.references[1].verify
-    pixels = sum(len(one.truth) for one in part.rendered)
-    assert references.RAYS <= part.evidence.rays < references.RAYS + pixels
-    assert part.evidence.rays % pixels == 0
-
-
-def test_rays_from_between_the_cameras_begin_there(known_run: Path, tiny_scene: Path) -> None:
-    source = sources.find_source(known_run / "occupancy.safetensors", tiny_scene)
-    seen, _ = sources.held_out(source, Occupancy.load(known_run / "occupancy.safetensors"), 200)
-    moved = sources.from_between_cameras(source, seen, seed=3)
-    cameras = source.manager.train_dataset.cameras.camera_to_worlds[:, :3, 3]
-    assert seen.rays.images is not None
-    for origin, direction, image, ours in zip(
-        moved.rays.origins, moved.rays.directions, seen.rays.images, seen.rays.directions
-    ):
-        here = cameras[image]
-        apart = (cameras - here).norm(dim=-1)
-        nearest = cameras[apart.masked_fill(apart == 0.0, torch.inf).argmin()]
-        along = (origin - here) @ (nearest - here) / (nearest - here).square().sum()
-        assert 0.0 <= float(along) <= 1.0 and torch.equal(direction, ours)
-        torch.testing.assert_close(origin, torch.lerp(here, nearest, along), atol=1e-5, rtol=1e-4)
+    ground = command._ground(sources.find_source(file, tiny_scene), Occupancy.load(file))
+    for part in (ground.references[1].search, ground.references[1].verify):
+        assert part.evidence.rays == references.RAYS > sum(len(one.truth) for one in part.rendered)
 
 
 def test_a_field_that_renders_nothing_is_no_reference(known_run: Path, tiny_scene: Path) -> None:

@@ -10,7 +10,7 @@ from ball_occupancy import CENTRE, ball
 
 from leco_plugin.models.rendering import Rays
 from leco_plugin.occupancy import Occupancy
-from leco_plugin.shrink.evidence import BEYOND, CONFIDENCE, Evidence, gather, join, loss
+from leco_plugin.shrink.evidence import UNLIKELY, Evidence, gather, join, loss, unlikely_at
 from leco_plugin.shrink.sources import Seen, Source
 
 
@@ -35,13 +35,47 @@ def test_the_loss_is_the_skipped_share_of_the_worth() -> None:
     assert found.bound > found.share
 
 
-def test_a_loss_that_nobody_has_seen_is_bounded_by_the_number_of_rays() -> None:
+def rays_of(worth: torch.Tensor) -> Evidence:
+    """One candidate a ray, worth so much: [R]."""
+    count = len(worth)
+    kept = torch.ones(count, dtype=torch.bool)
+    return Evidence(torch.zeros(count, 3), torch.arange(count), kept, worth, worth, count)
+
+
+@pytest.mark.parametrize("unlikely", [0.01, 1e-3, 1e-5])
+def test_a_loss_that_nobody_has_seen_is_bounded_by_the_number_of_rays(unlikely: float) -> None:
     for rays in (50, 500):
-        known = evidence(rays)
-        share, bound, mass = loss(known, torch.zeros_like(known.kept))
-        assert share == mass == 0.0 and bound == pytest.approx((CONFIDENCE + BEYOND) / rays)
-        # a share of so many would have been seen by n rays in 99 of 100 cases
-        assert bound == pytest.approx(math.log(100) / rays, rel=0.02)
+        known = rays_of(torch.ones(rays))
+        share, bound, mass = loss(known, ~known.kept, unlikely)
+        # a share of so many would have been seen by n rays but for a few times
+        assert share == mass == 0.0 and bound == pytest.approx(math.log(1.0 / unlikely) / rays)
+
+
+def test_rays_of_no_worth_are_no_evidence() -> None:
+    alone = rays_of(torch.ones(100))
+    among_sky = rays_of(torch.cat([torch.ones(100), torch.zeros(900)]))
+    for lost in (0, 1, 7):
+        bounds = [
+            loss(known, torch.arange(known.rays) < lost).bound for known in (alone, among_sky)
+        ]
+        assert bounds[1] == pytest.approx(bounds[0])
+    nothing = rays_of(torch.zeros(100))
+    assert loss(nothing, nothing.kept)[:2] == (0.0, 1.0)
+
+
+def test_rays_that_are_worth_little_are_little_evidence() -> None:
+    even, uneven = rays_of(torch.ones(1000)), rays_of(torch.linspace(1.0, 1e-3, 1000) ** 4)
+    bounds = [loss(known, ~known.kept).bound for known in (even, uneven)]
+    assert bounds[1] == pytest.approx(5**2 / 9 * bounds[0], rel=0.02)  # of fourth powers
+
+
+def test_the_looks_together_are_wrong_no_more_often_than_one() -> None:
+    allowed = [unlikely_at(look) for look in range(1, 10_000)]
+    assert allowed[0] == UNLIKELY / 2 and allowed == sorted(allowed, reverse=True)
+    assert 0.999 * UNLIKELY < sum(allowed) < UNLIKELY
+    known = rays_of(torch.ones(500))
+    bounds = [loss(known, torch.arange(500) < 3, unlikely_at(look)).bound for look in (1, 2, 9)]
+    assert bounds == sorted(bounds) and bounds[0] > loss(known, torch.arange(500) < 3).bound
 
 
 def test_evidence_is_joined_ray_by_ray() -> None:
@@ -54,14 +88,17 @@ def test_evidence_is_joined_ray_by_ray() -> None:
     torch.testing.assert_close(per_ray, expected)
 
 
-@pytest.mark.parametrize(("often", "most"), [(0.05, 1.0), (2e-3, 1.0), (2e-3, 0.1)])
-def test_the_bound_holds_on_other_rays_of_the_same_kind(often, most) -> None:
-    """Also where few rays have lost all that is lost."""
+@pytest.mark.parametrize(
+    ("often", "most", "seeing"),
+    [(0.05, 1.0, 1.0), (2e-3, 1.0, 1.0), (2e-3, 0.1, 1.0), (0.05, 1.0, 0.1), (0.02, 1.0, 0.1)],
+)
+def test_the_bound_holds_on_other_rays_of_the_same_kind(often, most, seeing) -> None:
+    """Also where few rays have lost all that is lost, and where few see a surface at all."""
     torch.manual_seed(1)
     rays, broken = 1000, 0
     truth = often * 0.5 * most
     for _ in range(300):
-        whole = torch.rand(rays)
+        whole = torch.rand(rays) * (torch.rand(rays) < seeing)
         lost = whole * (torch.rand(rays) < often) * torch.rand(rays) * most
         worth = torch.stack([lost, whole - lost], dim=1).reshape(-1)
         skipped = torch.tensor([True, False]).repeat(rays)

@@ -6,16 +6,19 @@ from dataclasses import replace
 
 import pytest
 import torch
-from ball_occupancy import CENTRE, HALF, ball
+from ball_occupancy import CENTRE, HALF, RADIUS, ball
 
 from leco_plugin.evaluation.inspection import whole_box
 from leco_plugin.models.encodings import EncodingConfig
 from leco_plugin.models.gate import GateConfig
 from leco_plugin.occupancy import Occupancy
 from leco_plugin.shrink import search as searching
+from leco_plugin.shrink.checks import check_room
 from leco_plugin.shrink.evidence import Evidence, query_in_parts
 from leco_plugin.shrink.references import Part, Reference, declared
-from leco_plugin.shrink.search import Bounds, Found, Ground, Rung, search, threshold_keeping
+from leco_plugin.shrink.rungs import Bounds, Found, Ground, Rung
+from leco_plugin.shrink.search import search, threshold_keeping
+from leco_plugin.shrink.verifying import verify
 
 TOO_SMALL = GateConfig(EncodingConfig(octaves=1), 1, 1, 1)
 ENOUGH = GateConfig(EncodingConfig(octaves=2), 16, 2, 1)
@@ -35,13 +38,16 @@ def original(**report: object) -> Occupancy:
 
 
 def known_worth(occupancy: Occupancy, seed: int) -> Evidence:
-    """Places in the ball's box; the deeper inside it, the more they are worth."""
+    """Rays of a place in the ball, the deeper the more it is worth, and one anywhere in its box."""
     generator = torch.Generator().manual_seed(seed)
-    positions = torch.tensor(CENTRE) + HALF * (2.0 * torch.rand(20_000, 3, generator=generator) - 1)
+    anywhere, along = 2.0 * torch.rand(2, 10_000, 3, generator=generator) - 1
+    depth = torch.rand(10_000, 1, generator=generator) ** (1 / 3)
+    inside = RADIUS * depth * along / along.norm(dim=-1, keepdim=True)
+    positions = torch.tensor(CENTRE) + torch.stack([inside, HALF * anywhere], dim=1).view(-1, 3)
     kept = occupancy.occupied(positions)
-    depth = (1.0 - (positions - torch.tensor(CENTRE)).norm(dim=-1)).clamp(min=0.0)
-    worth = depth * kept
-    return Evidence(positions, torch.arange(20_000) // 4, kept, worth, worth, 5000)
+    inward = (1.0 - (positions - torch.tensor(CENTRE)).norm(dim=-1)).clamp(min=0.0)
+    worth = inward * kept
+    return Evidence(positions, torch.arange(20_000) // 2, kept, worth, worth, 10_000)
 
 
 def ground(occupancy: Occupancy, verify: Evidence | None = None) -> Ground:
@@ -94,6 +100,27 @@ def test_what_fails_on_unseen_rays_is_not_chosen() -> None:
     assert [rung.verdict for rung in found.rungs] == ["fails on unseen rays"]
 
 
+def test_each_look_at_the_unseen_rays_is_counted_and_allowed_less(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(searching, "LONGER", 1)
+    known = original()
+    unseen = known_worth(known, 2)
+    far = (unseen.positions - torch.tensor(CENTRE)).norm(dim=-1) > 1.3
+    nobody = ground(known, unseen._replace(worth=far.float()))
+    rungs = search(nobody, Bounds(4e-3), [TOO_SMALL, ENOUGH]).rungs
+    # a gate that fails there was taught twice, and looked at twice
+    assert [rung.look for rung in rungs] == [None, 2]
+    (alone,) = walk(known, [ENOUGH], lost_surface_mass=4e-3).rungs
+    assert alone.look == 1
+    later = replace(alone)
+    found = Occupancy(known.gate, known.space, known.threshold).eval()
+    for rung, look in ((alone, 1), (later, 7)):
+        verify(ground(known), found, Bounds(4e-3), rung, look)
+    bounds = [float(rung.verified["lost_surface_mass_bound"] or 0.0) for rung in (alone, later)]
+    assert 0.0 < bounds[0] < bounds[1]
+
+
 def test_a_loss_that_the_search_has_seen_is_declared_too() -> None:
     known = original()
     here = ground(known)
@@ -111,7 +138,7 @@ def test_nothing_is_lost_beyond_what_the_original_leaves() -> None:
         walk(original(lost_surface_mass=3e-3), [ENOUGH], lost_surface_mass=1e-3)
     with pytest.raises(ValueError, match="raise --image-price"):
         walk(original(image_price_db=0.06), [ENOUGH])
-    searching.check_room(original(lost_surface_mass=4e-4, image_price_db=-0.1), Bounds())
+    check_room(original(lost_surface_mass=4e-4, image_price_db=-0.1), Bounds())
 
 
 def test_what_the_original_has_lost_is_declared_too() -> None:
@@ -133,7 +160,7 @@ def test_the_worst_reference_decides_and_is_declared() -> None:
     unseen = kind.verify.evidence
     far = (unseen.positions - torch.tensor(CENTRE)).norm(dim=-1) > 1.3
     strict = kind._replace(
-        name="strict", verify=Part(unseen._replace(worth=unseen.worth + 1e-5 * far.float()))
+        name="strict", verify=Part(unseen._replace(worth=unseen.worth + 1e-4 * far.float()))
     )
     both = here._replace(references=[kind, strict])
     (lenient,), (found,) = (search(one, Bounds(4e-3), [ENOUGH]).rungs for one in (here, both))

@@ -19,8 +19,11 @@ from leco_plugin.shrink.sources import (
     CONFIG,
     check_scene,
     find_source,
+    from_between_cameras,
     held_out,
+    of_other_pixels,
     of_test_photographs,
+    trained_on,
 )
 
 pytestmark = [  # nerfstudio leaves an image open
@@ -108,7 +111,53 @@ def test_test_photographs_say_what_a_smaller_gate_loses(known_run: Path, tiny_sc
     assert lost == pytest.approx({NOW: 1e-4, AT_FREEZING: 0.0})
     alone = source._replace(model=None)
     original.report |= THEIR_MARCH
-    assert shares_lost(alone, original, everything, seen) == pytest.approx({BY_DECISIONS: 1e-4})
+    assert shares_lost(alone, original, everything, seen) == {BY_DECISIONS: 0.0}
+
+
+def test_rays_of_other_pixels_have_each_another_one(known_run: Path, tiny_scene: Path) -> None:
+    file = known_run / "occupancy.safetensors"
+    source, original = find_source(file, tiny_scene), Occupancy.load(file)
+    seen = held_out(source, original, 200)
+    for count in (700, 700, 10**4):  # more than there are
+        seen.append(of_other_pixels(source, original, count, seen))
+    pixels = torch.cat([one.pixels for one in seen if one.pixels is not None])
+    assert len(pixels) == sum(len(one.truth) for one in seen) == len(pixels.unique(dim=0))
+    assert len(seen[2].truth) == len(seen[3].truth) == 700 and 3000 < len(seen[4].truth) < 10**4
+    picture = source.manager.train_dataset.get_data(int(seen[3].pixels[5, 0]))["image"]
+    assert torch.equal(seen[3].truth[5].cpu(), picture[tuple(seen[3].pixels[5, 1:])])
+
+
+def test_search_verification_and_teaching_have_no_pixel_in_common(
+    known_run: Path, tiny_scene: Path
+) -> None:
+    file = known_run / "occupancy.safetensors"
+    source, original = find_source(file, tiny_scene), Occupancy.load(file)
+    seen = [*held_out(source, original, 512), trained_on(source, original, 512)]
+    pixels = [
+        {(int(image), *map(float, ray)) for image, ray in zip(one.rays.images, one.rays.directions)}
+        for one in seen
+        if one.rays.images is not None
+    ]
+    searched, verified, taught = pixels
+    assert min(len(searched), len(verified)) > 20
+    assert not searched & verified and not (searched | verified) & taught
+
+
+def test_rays_from_between_the_cameras_begin_there(known_run: Path, tiny_scene: Path) -> None:
+    source = find_source(known_run / "occupancy.safetensors", tiny_scene)
+    seen, _ = held_out(source, Occupancy.load(known_run / "occupancy.safetensors"), 200)
+    moved = from_between_cameras(source, seen, seed=3)
+    cameras = source.manager.train_dataset.cameras.camera_to_worlds[:, :3, 3]
+    assert seen.rays.images is not None
+    for origin, direction, image, ours in zip(
+        moved.rays.origins, moved.rays.directions, seen.rays.images, seen.rays.directions
+    ):
+        here = cameras[image]
+        apart = (cameras - here).norm(dim=-1)
+        nearest = cameras[apart.masked_fill(apart == 0.0, torch.inf).argmin()]
+        along = (origin - here) @ (nearest - here) / (nearest - here).square().sum()
+        assert 0.0 <= float(along) <= 1.0 and torch.equal(direction, ours)
+        torch.testing.assert_close(origin, torch.lerp(here, nearest, along), atol=1e-5, rtol=1e-4)
 
 
 def test_photographs_too_small_for_held_out_pixels_are_named(

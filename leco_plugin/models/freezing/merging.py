@@ -29,8 +29,9 @@ class MergingConfig:
     """Which scene experts are left when the gate is frozen."""
 
     image_price_db: float | None = 0.01
-    """Largest loss of PSNR on held-out rays for which scene experts are dropped, all together, dB;
-    with `calibration.image_price_db` it makes 0.05. None drops none."""
+    """Largest loss of PSNR on held-out rays for which scene experts are dropped, all together, dB.
+    It comes on top of `calibration.image_price_db`, beyond which a price may lie by a standard
+    error. None drops none."""
     rays: int = 2048
     """Held-out training rays to measure with."""
 

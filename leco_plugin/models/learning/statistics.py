@@ -69,6 +69,8 @@ def prices(report: dict[str, Any]) -> dict[str, Tensor]:
     """What skipping costs as it was last measured: float scalars.
 
     Args:
-        report: of a frozen gate; of an older release it may lack some.
+        report: of a frozen gate; of an older release it may lack some, and those of a gate that
+            was shrunk without a field are None.
     """
-    return {name: torch.tensor(float(report[name])) for name in PRICES if name in report}
+    known = {name: report.get(name) for name in PRICES}
+    return {name: torch.tensor(float(x)) for name, x in known.items() if x is not None}

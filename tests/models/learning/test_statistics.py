@@ -80,7 +80,12 @@ def test_shares_and_mean_densities_are_those_of_each_expert() -> None:
 
 
 def test_prices_are_those_of_the_report_as_far_as_it_has_them() -> None:
-    report = {"lost_mass": 0.5, "image_price_db": -0.01, "bounds": "a box"}
+    report = {
+        "lost_mass": 0.5,
+        "image_price_db": -0.01,
+        "bounds": "a box",
+        "lost_surface_mass": None,
+    }
     found = prices(report)
     assert {name: float(value) for name, value in found.items()} == {
         "lost_mass": 0.5,

@@ -1,0 +1,65 @@
+"""Claims about what a gate may declare, the original among them."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+import torch
+from ball_occupancy import ball
+
+from leco_plugin.occupancy import Occupancy
+from leco_plugin.shrink.evidence import Evidence, loss, unlikely_at
+from leco_plugin.shrink.references import Part, Reference
+from leco_plugin.shrink.rungs import Bounds, Ground
+from leco_plugin.shrink.verifying import HOLDS, is_measured, of_original, verify
+
+
+def original() -> Occupancy:
+    known = ball()
+    return Occupancy(known.gate, known.space, known.threshold).eval()
+
+
+def everywhere(occupancy: Occupancy, seed: int) -> Evidence:
+    """Rays of two places of the ball's box, the second worth a hundredth of the first."""
+    generator = torch.Generator().manual_seed(seed)
+    positions = occupancy.space.unmap(2.0 * torch.rand(4000, 3, generator=generator) - 1.0)
+    kept = occupancy.occupied(positions)
+    worth = kept + 0.01 * ~kept
+    return Evidence(positions, torch.arange(4000) // 2, kept, worth, worth, 2000)
+
+
+def ground(*guided: bool) -> Ground:
+    """References that value the same places, whether or not the original guides them."""
+    known = original()
+    searched, unseen = (everywhere(known, seed) for seed in (1, 2))
+    sides = Part(searched), Part(unseen)
+    references = [
+        Reference("known", None, 1e-4 * each, 0.0, 0.0, *sides, guided=each) for each in guided
+    ]
+    return Ground(known, searched, references)
+
+
+def test_an_original_that_guides_its_reference_loses_what_it_declares() -> None:
+    here = ground(True)
+    itself = of_original(here, Bounds(2e-4))
+    assert not is_measured(here) and itself.verdict == HOLDS
+    assert itself.lost_surface_mass == itself.bound == 1e-4
+
+
+def test_an_original_is_measured_where_all_candidates_are_rendered() -> None:
+    here = ground(True, False)
+    searched, unseen = (
+        loss(part.evidence, ~part.evidence.kept, unlikely_at(1))
+        for part in (here.references[1].search, here.references[1].verify)
+    )
+    assert is_measured(here) and searched.share > 1e-2
+    itself = of_original(here, Bounds(0.9))
+    assert itself.verdict == HOLDS and itself.bound == pytest.approx(searched.bound)
+    assert of_original(here, Bounds(searched.share)).verdict != HOLDS
+    fourth = replace(itself)
+    for rung, look in ((itself, 1), (fourth, 4)):
+        assert verify(here, here.original, Bounds(0.9), rung, look)
+    declared = itself.verified["lost_surface_mass_bound"]
+    assert declared == pytest.approx(max(searched.bound, unseen.bound))
+    assert float(fourth.verified["lost_surface_mass_bound"] or 0.0) > float(declared or 1.0)
