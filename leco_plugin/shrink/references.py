@@ -20,8 +20,6 @@ from leco_plugin.shrink.sources import Seen, Source, from_between_cameras, of_ot
 NOW = "the run's field as it is now, beyond what the original declares"
 AT_FREEZING = "the field at the moment of freezing, all of it"
 BY_DECISIONS = "the original's keep decisions, weighed by o(x): no rendering weights were at hand"
-
-
 DECLARED = ("lost_surface_mass", "lost_mass", "image_price_db")
 """What a report says of the original's own losses."""
 LOST_DECISIONS = "lost_decisions"
@@ -100,7 +98,7 @@ def shares_lost(
         skipped = query_in_parts(smaller, evidence.positions) < smaller.threshold
         return loss(evidence, skipped).share
 
-    found = {}
+    found: dict[str, float] = {}
     if smaller is not original:
         alone = source.model is None
         before = declared(original, LOST_DECISIONS if alone else "lost_surface_mass")
