@@ -72,7 +72,7 @@ def shrink(
         data: The scene that it was learned on.
         out: File for the smaller occupancy.
         lost_surface_mass: Most of the weight near surfaces that it may declare lost, the original's
-            share included.
+            share included; without a run, most of the original's decisions.
         image_price: Most dB that it may declare, the original's share included.
         picture: File for a picture of the gates that were tried.
         json: File for the gates that were tried and the one that was chosen, as JSON; each is

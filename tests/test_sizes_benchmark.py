@@ -102,8 +102,8 @@ def test_each_row_says_which_code_made_it_as_far_as_it_is_known() -> None:
     assert made_line([{}, {}]) == "of an earlier commit, not noted"
     assert made_line([new]) == "by leco_plugin 0.1.0 at abc, sources 123, 2026-11-23"
     parts = made_line([{}, new, changed, new]).split("; ")
-    assert parts[0].startswith("1 by leco_plugin 0.1.0 at no commit")
-    assert parts[1:] == ["1 of an earlier commit, not noted", f"2 {made_line([new])}"]
+    assert parts[0] == f"2 {made_line([new])}" and parts[2] == "1 of an earlier commit, not noted"
+    assert parts[1].startswith("1 by leco_plugin 0.1.0 at no commit")
 
 
 def test_a_sweep_has_no_sizes_twice_and_beside_larger_ones_none_that_is_smaller() -> None:

@@ -20,8 +20,6 @@ from leco_plugin.shrink.sources import Seen, Source, from_between_cameras, of_ot
 NOW = "the run's field as it is now, beyond what the original declares"
 AT_FREEZING = "the field at the moment of freezing, all of it"
 BY_DECISIONS = "the original's keep decisions, weighed by o(x): no rendering weights were at hand"
-
-
 DECLARED = ("lost_surface_mass", "lost_mass", "image_price_db")
 """What a report says of the original's own losses."""
 LOST_DECISIONS = "lost_decisions"
@@ -68,21 +66,23 @@ def references(
     sides = searched, verified
     more = _more_rays(source, original, sides)
     if source.model is None:
-        parts = [
+        search, verify = (
             Part(join([gather(source, original, seen)[0] for seen in each]))
             for each in zip(sides, more)
-        ]
-        before = max(declared(original, LOST_DECISIONS), 0.0)
-        return [Reference(BY_DECISIONS, None, before, 0.0, 0.0, *parts)]
+        )
+        dropped = max(declared(original, LOST_DECISIONS), 0.0)
+        return [Reference(BY_DECISIONS, None, dropped, 0.0, 0.0, search, verify)]
     # that the original gains something is no licence to lose it
     lost, mass, price = (max(declared(original, name), 0.0) for name in DECLARED)
     moved = [from_between_cameras(source, seen, seed=side) for side, seen in enumerate(more)]
-    parts = [_rendered(source, original, *each) for each in zip(sides, moved)]
-    found = [Reference(NOW, source.model, lost, mass, price, *parts)]
+    search, verify = (_rendered(source, original, *each) for each in zip(sides, moved))
+    found = [Reference(NOW, source.model, lost, mass, price, search, verify)]
     if source.frozen is not None:
         before = source._replace(model=source.frozen)
-        parts = [_rendered(before, None, *each) for each in zip(sides, moved)]
-        found.append(Reference(AT_FREEZING, source.frozen, 0.0, 0.0, 0.0, *parts, guided=False))
+        search, verify = (_rendered(before, None, *each) for each in zip(sides, moved))
+        found.append(
+            Reference(AT_FREEZING, source.frozen, 0.0, 0.0, 0.0, search, verify, guided=False)
+        )
     return found
 
 
@@ -100,7 +100,7 @@ def shares_lost(
         skipped = query_in_parts(smaller, evidence.positions) < smaller.threshold
         return loss(evidence, skipped).share
 
-    found = {}
+    found: dict[str, float] = {}
     if smaller is not original:
         alone = source.model is None
         before = declared(original, LOST_DECISIONS if alone else "lost_surface_mass")

@@ -213,15 +213,17 @@ def test_the_model_of_the_run_says_what_is_lost(
     assert results["to"]["loss_measured_against"] == references.NOW
     assert smaller.num_params < original.num_params
     assert isinstance(smaller.report["image_price_db"], float)
-    (lost,) = lost_on_test_photographs(file, tiny_scene, smaller)
+    (lost,) = lost_on_other_rays(file, tiny_scene, smaller)
     assert lost <= smaller.report["lost_surface_mass"]
 
 
-def lost_on_test_photographs(file: Path, data: Path, smaller: Occupancy) -> list[float]:
-    """Shares of the surface mass, by definition, one a reference, on rays that decided nothing."""
+def lost_on_other_rays(file: Path, data: Path, smaller: Occupancy) -> list[float]:
+    """Shares of the surface mass, by definition, one a reference, on rays that decided nothing: of
+    other pixels, and from other places between the cameras."""
     source, original = sources.find_source(file, data), Occupancy.load(file)
-    seen = sources.of_test_photographs(source, original, 1000)
-    assert seen is not None
+    torch.manual_seed(99)
+    pixels = sources.of_other_pixels(source, original, 1500, [])
+    seen = sources.from_between_cameras(source, pixels, seed=99)
     parts = [gather(source, original, seen)[0]]
     if source.frozen is not None:
         parts.append(gather(source._replace(model=source.frozen), None, seen)[0])
@@ -327,7 +329,7 @@ def test_what_is_declared_holds_against_the_field_at_the_moment_of_freezing(
         references.NOW,
         references.AT_FREEZING,
     ]
-    lost = lost_on_test_photographs(file, tiny_scene, smaller)
+    lost = lost_on_other_rays(file, tiny_scene, smaller)
     assert lost[1] > lost[0] + 0.01  # what the original skips counts
     assert max(lost) <= smaller.report["lost_surface_mass"] == max(x["bound"] for x in against)
     ground = command._ground(sources.find_source(file, tiny_scene), Occupancy.load(file))
