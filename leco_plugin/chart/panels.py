@@ -112,12 +112,14 @@ def draw_learned(
     """What frozen gates skip against what they lose; contenders without any are named below."""
     looks = {line.name: style(i, theme) for i, line in enumerate(lines)}
     shown = [one for one in learned if one.facts]
-    figures = ("lost_surface_mass", "empty_fraction")
+    lost, skipped = "lost_surface_mass", "empty_fraction"
     points = {
-        one.name: [tuple(100.0 * facts[name] for name in figures) for facts in one.facts]
+        one.name: [(100.0 * facts[lost], 100.0 * facts[skipped]) for facts in one.facts]
         for one in shown
     }
-    places = [tuple(100.0 * (one.median(name) or 0.0) for name in figures) for one in shown]
+    places = [
+        (100.0 * (one.median(lost) or 0.0), 100.0 * (one.median(skipped) or 0.0)) for one in shown
+    ]
     _cost_axis(axes, "lost surface mass", "%", [x for of in points.values() for x, _ in of], theme)
     for one, place in zip(shown, places):
         look = looks[one.name]

@@ -39,7 +39,11 @@ class Protocol:
             "curve points": self.curve_points,
             "runs at once": self.at_once,
         }
-        if None not in (self.seconds, self.learn_seconds) and self.learn_seconds >= self.seconds:
+        if (
+            self.seconds is not None
+            and self.learn_seconds is not None
+            and self.learn_seconds >= self.seconds
+        ):
             raise ValueError(
                 f"learning an occupancy may take {self.learn_seconds:g} s of a run of "
                 f"{self.seconds:g} s, which leaves nothing to be guided: give less"
