@@ -60,18 +60,26 @@ def _draw_front(
     )
 
 
-def _cost_axis(axes: Any, title: str, unit: str, values: Sequence[float], theme: Theme) -> None:
+def _cost_axis(
+    axes: Any,
+    title: str,
+    unit: str,
+    values: Sequence[float],
+    theme: Theme,
+    from_zero: bool = False,
+) -> None:
+    """The axis of a cost, logarithmic over a wide range unless it is to begin at zero."""
     from matplotlib.ticker import LogLocator, MaxNLocator, NullFormatter, StrMethodFormatter
 
     plain(axes, theme)
     positive = [value for value in values if value > 0.0]
-    if positive and max(positive) > WIDE_RANGE * min(positive):
+    if positive and max(positive) > WIDE_RANGE * min(positive) and not from_zero:
         axes.set_xscale("log")
         axes.set_xlim(0.6 * min(positive), 1.7 * max(positive))
         axes.xaxis.set_major_locator(LogLocator(subs=(1.0, 3.0)))
         axes.xaxis.set_minor_formatter(NullFormatter())
     elif positive:
-        axes.set_xlim(0.0, 1.15 * max(positive))
+        axes.set_xlim(-0.02 * max(positive) * from_zero, 1.15 * max(positive))
         axes.xaxis.set_major_locator(MaxNLocator(4))
     axes.xaxis.set_major_formatter(StrMethodFormatter("{x:g}"))
     axes.yaxis.set_major_locator(MaxNLocator(4))
@@ -120,7 +128,8 @@ def draw_learned(
     places = [
         (100.0 * (one.median(lost) or 0.0), 100.0 * (one.median(skipped) or 0.0)) for one in shown
     ]
-    _cost_axis(axes, "lost surface mass", "%", [x for of in points.values() for x, _ in of], theme)
+    losses = [x for of in points.values() for x, _ in of]
+    _cost_axis(axes, "lost surface mass", "%", losses, theme, from_zero=True)
     for one, place in zip(shown, places):
         look = looks[one.name]
         for point in points[one.name]:
