@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import argparse
 import datetime
-import hashlib
 import importlib.metadata
 import json
 import logging
@@ -30,7 +29,7 @@ from gpu_scale import Scale
 from gpu_training import dense, learned
 
 from leco_plugin.evaluation.json_file import write_json
-from leco_plugin.evaluation.machine import describe_code, describe_machine
+from leco_plugin.evaluation.machine import describe_code, describe_machine, digest_of_sources
 
 ROOT = Path(__file__).resolve().parent.parent
 RESULTS = ROOT / "benchmarks" / "results"
@@ -80,11 +79,8 @@ def machine() -> dict[str, Any]:
 
 def code() -> dict[str, Any]:
     """What was measured: a commit does not tell of a kernel that was changed since."""
-    digest = hashlib.sha256()
-    for folder in ("benchmarks", "leco_plugin"):
-        for path in sorted((ROOT / folder).rglob("*.py")):
-            digest.update(path.read_bytes())
-    return {**describe_code(), "sources": digest.hexdigest()[:12]}
+    folders = (ROOT / "benchmarks", ROOT / "leco_plugin")
+    return {**describe_code(), "sources": digest_of_sources(*folders)}
 
 
 def results_path() -> Path:

@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from leco_plugin.chart.summary import Line
+from leco_plugin.chart.summary import Line, figure_in
 
 
 @dataclass(frozen=True)
@@ -23,19 +23,13 @@ class Learned:
 
     def median(self, name: str) -> float | None:
         """A figure over the seeds that have one, a dot into their facts; None where none has."""
-        values = [value for facts in self.facts if (value := _within(facts, name)) is not None]
+        values = [value for facts in self.facts if (value := figure_in(facts, name)) is not None]
         return statistics.median(values) if values else None
 
     @property
     def always_frozen(self) -> bool:
         """Whether there is an occupancy with every seed."""
         return len(self.facts) == self.seeds
-
-
-def _within(facts: Any, name: str) -> float | None:
-    for part in name.split("."):
-        facts = facts.get(part) if isinstance(facts, Mapping) else None
-    return None if facts is None else float(facts)
 
 
 def learned_of(lines: Sequence[Line]) -> list[Learned]:
@@ -56,7 +50,7 @@ def _learned(line: Line) -> Learned:
         for run in line.runs
         if run.get("occupancy") and run.get("freeze_seconds") is not None
     ]
-    healed = [run.get("recoveries", _within(run, "occupancy.recoveries")) for run in line.runs]
+    healed = [run.get("recoveries", figure_in(run, "occupancy.recoveries")) for run in line.runs]
     known = [int(count) for count in healed if count is not None]
     return Learned(
         line.name,

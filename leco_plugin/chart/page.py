@@ -11,7 +11,6 @@ from leco_plugin.chart.representations import Representation, representations_of
 from leco_plugin.chart.summary import (
     COSTS,
     LEARNING,
-    Cost,
     Line,
     circumstances,
     front,
@@ -53,7 +52,7 @@ def _figure(lines: Sequence[Line]) -> Any:
 
     rows = 3 if representations_of(lines) else 2
     wide = [{"colspan": 3}, None, None]
-    titles = ["", *(_titled(cost) for cost in COSTS)]
+    titles = ["", *(cost.titled for cost in COSTS)]
     if rows == 3:
         titles += ["size of the occupancy, kB", "learning the occupancy, s", ""]
     figure = make_subplots(
@@ -92,10 +91,6 @@ def _figure(lines: Sequence[Line]) -> Any:
     figure.update_yaxes(title_text="PSNR on test images, dB", row=1, col=1)
     figure.update_yaxes(title_text="PSNR, dB", row=2, col=1)
     return figure
-
-
-def _titled(cost: Cost) -> str:
-    return f"{cost.title}, {cost.unit}" if cost.unit else cost.title
 
 
 def _point(line: Line, i: int, value: float) -> Any:

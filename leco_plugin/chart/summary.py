@@ -31,10 +31,20 @@ class Cost:
 
     def of(self, run: Mapping[str, Any]) -> float | None:
         """Its value in a run, in the unit shown; None where the run has none."""
-        value: Any = run
-        for name in self.key.split("."):
-            value = value.get(name) if isinstance(value, Mapping) else None
-        return None if value is None else float(value) * self.scale
+        value = figure_in(run, self.key)
+        return None if value is None else value * self.scale
+
+    @property
+    def titled(self) -> str:
+        """Its title with its unit, if it has one."""
+        return f"{self.title}, {self.unit}" if self.unit else self.title
+
+
+def figure_in(values: Any, key: str) -> float | None:
+    """A number by its key, with a dot into each mapping below; None where there is none."""
+    for name in key.split("."):
+        values = values.get(name) if isinstance(values, Mapping) else None
+    return None if values is None else float(values)
 
 
 RENDERING = Cost("render_seconds_per_image", "rendering an image", "s")

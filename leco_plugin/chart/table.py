@@ -79,7 +79,7 @@ def runs_table(lines: Sequence[Line]) -> str:
     header = [
         *("method", "seeds", "PSNR, dB", "SSIM", "LPIPS", f"s to {level:.1f} dB", "steps"),
         *("trained, s", "of which learning, s", "ms a step"),
-        *(_titled(cost) for cost in COSTS),
+        *(cost.titled for cost in COSTS),
     ]
     bold = {cost.key: _on_front(lines, cost) for cost in COSTS}
     cells = []
@@ -126,7 +126,7 @@ def queries_table(lines: Sequence[Line]) -> str:
     """How often which network was asked, in rendering and in all of the training: medians."""
     shown = [cost for cost in ASKED if any(line.median(cost) for line in lines)]
     cells = [[line.name, *(number(line.median(cost)) for cost in shown)] for line in lines]
-    return rows(["positions asked of", *(_titled(cost) for cost in shown)], cells)
+    return rows(["positions asked of", *(cost.titled for cost in shown)], cells)
 
 
 def failures_table(failures: Sequence[Mapping[str, Any]]) -> str:
@@ -154,10 +154,6 @@ def provenance(results: Mapping[str, Any]) -> str:
         of_each = "; ".join(f"{code}: {', '.join(names)}" for code, names in by_code.items())
         said += f" Not all of them are of the same code ({of_each})."
     return said
-
-
-def _titled(cost: Cost) -> str:
-    return f"{cost.title}, {cost.unit}" if cost.unit else cost.title
 
 
 def _on_front(lines: Sequence[Line], cost: Cost) -> set[str]:

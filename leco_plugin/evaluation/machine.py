@@ -9,6 +9,8 @@ import platform
 from pathlib import Path
 from typing import Any
 
+PACKAGE = Path(__file__).resolve().parents[1]
+
 
 def describe_machine() -> dict[str, Any]:
     """Processor, cores, threads, device and versions: JSON values, without names or paths."""
@@ -40,7 +42,7 @@ def describe_code() -> dict[str, Any]:
         commit = asked.stdout.strip() if (here.parents[1] / ".git").exists() else ""
     except OSError:
         commit = ""
-    return {"version": __version__, "commit": commit or None, "sources": _digest_of_sources()}
+    return {"version": __version__, "commit": commit or None, "sources": digest_of_sources(PACKAGE)}
 
 
 def made_by(code: dict[str, Any]) -> dict[str, Any]:
@@ -52,11 +54,12 @@ def made_by(code: dict[str, Any]) -> dict[str, Any]:
     return {"code": code, "date": datetime.date.today().isoformat()}
 
 
-def _digest_of_sources() -> str:
-    package = Path(__file__).resolve().parents[1]
+def digest_of_sources(*folders: Path) -> str:
+    """What tells the Python files of folders, by name and content, from others."""
     digest = hashlib.sha256()
-    for path in sorted(package.rglob("*.py")):
-        digest.update(path.relative_to(package).as_posix().encode() + path.read_bytes())
+    for folder in folders:
+        for path in sorted(folder.rglob("*.py")):
+            digest.update(path.relative_to(folder).as_posix().encode() + path.read_bytes())
     return digest.hexdigest()[:12]
 
 
