@@ -22,7 +22,7 @@ import tyro
 
 from leco_plugin.evaluation.clock import Budget
 from leco_plugin.evaluation.json_file import write_json
-from leco_plugin.evaluation.machine import describe_machine
+from leco_plugin.evaluation.machine import describe_code, describe_machine, made_by
 from leco_plugin.evaluation.timed_run import timed_run
 from leco_plugin.method_configs import leco_occupancy
 from leco_plugin.models.failures import GateCollapsed, TrainingStopped
@@ -145,6 +145,7 @@ def wanted_runs(options: Options) -> list[tuple[Pair | None, bool, int]]:
 def main(options: Options) -> None:
     if options.dry_run:
         options = replace(options, pairs=options.pairs[:2])
+    code = describe_code()  # before anything is measured
     settings = {
         "scene": options.data.name,
         "seconds": options.seconds,
@@ -158,7 +159,7 @@ def main(options: Options) -> None:
         key = [list(pair) if pair is not None else None, planes, seed]
         if any([row["range"], row["planes"], row["seed"]] == key for row in rows):
             continue
-        rows.append(run(options, pair, planes, seed))
+        rows.append(run(options, pair, planes, seed) | made_by(code))
         report = {
             "format": 1,
             "machine": describe_machine(),

@@ -8,6 +8,7 @@ from typing import Any
 
 import checkout  # noqa: F401
 from page_parts import RESULTS, machine_line, picture
+from paper_rows import PAPER_ROWS
 
 from leco_plugin.chart.representations import COSTS, fronts_of, representations_of, verdict
 from leco_plugin.chart.suites import SUITES
@@ -15,44 +16,6 @@ from leco_plugin.chart.summary import lines_of
 from leco_plugin.chart.table import table
 
 CHARTS = RESULTS / "charts"
-
-ENOUGH_TIME = """The paper's three columns, on its own scenes and by its own protocol (500k
-steps; the rebuttal's table of enough training time, 41.5 and 43.4 h). Figures of the two protocols
-cannot be compared; who is ahead can.
-
-| paper | Switch-NeRF | + occupancy grid | + learned occupancy |
-|---|---|---|---|
-| Rubble: PSNR, SSIM, LPIPS | 24.31, 0.562, 0.496 | 23.94, 0.538, 0.526 | 24.52, 0.581, 0.477 |
-| Residence: PSNR, SSIM, LPIPS | 22.57, 0.654, 0.457 | 22.48, 0.645, 0.474 | 22.88, 0.658, 0.454 |
-| speed-up of guided training | | | 2.5 x |
-"""
-GRID_RESOLUTION = """The paper's rows, Switch-NeRF guided for 500k steps by its own protocol; who
-is ahead can be compared, figures cannot.
-
-| paper | PSNR, SSIM, LPIPS | time, h | memory, GB |
-|---|---|---|---|
-| grid 128³ | 25.48, 0.760, 0.413 | 14.1 | 5.8 |
-| grid 256³ | 25.86, 0.764, 0.409 | 46.0 | 12.5 |
-| learned | 26.04, 0.772, 0.398 | 14.1 | 2.7 |
-"""
-EMPTY_EXPERT = """The paper's rows: the gate learned with the imbalance loss alone for 40k steps,
-then Switch-NeRF guided by it. Rows of ours that are named after that loss learn with it too, for
-some hundred steps; where their gate was never frozen nothing was guided by it, and no row of ours
-is the counterpart.
-
-| paper | PSNR | SSIM | LPIPS |
-|---|---|---|---|
-| as large as a scene expert (7 layers) | 20.23 | 0.631 | 0.506 |
-| 4 layers | 23.62 | 0.701 | 0.463 |
-| identity | 26.30 | 0.781 | 0.383 |
-"""
-PAPER_ROWS = {
-    "enough-time": ENOUGH_TIME,
-    "city-4-switch": ENOUGH_TIME,
-    "grid-resolution": GRID_RESOLUTION,
-    "empty-expert": EMPTY_EXPERT,
-}
-"""What the paper says beside the first chart of ours with such a suite, or such a name."""
 
 
 def titles() -> dict[str, str]:

@@ -190,15 +190,15 @@ def main(options: Options) -> None:
         assert options.folder is not None
         print(json.dumps(measure(options.measure, options.folder, options)))
         return
-    from leco_plugin.evaluation.machine import describe_machine
+    from leco_plugin.evaluation.machine import describe_code, describe_machine, made_by
 
-    rows = []
+    rows, code = [], describe_code()  # before anything is measured
     with tempfile.TemporaryDirectory() as temporary:
         folder = write_photographs(options.folder or Path(temporary) / "full", options)
         tenth = replace(options, width=options.width // 10, height=options.height // 10)
         small = write_photographs(Path(temporary) / "tenth", tenth)
         for way in options.ways:
-            row = compared(way, folder, small, options)
+            row = compared(way, folder, small, options) | made_by(code)
             taken = f"{row['added_bytes'] / 1e6:.0f} MB" if row["within_allowance"] else "over"
             print(f"{way}: {taken}", flush=True)
             rows.append(row)

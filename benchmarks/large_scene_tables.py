@@ -7,8 +7,6 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
-from page_parts import made_line
-
 Report = dict[str, Any]
 
 
@@ -125,7 +123,7 @@ def _growth_note(report: Report) -> str:
         f"{report['settings']['kept']:.0%} of the candidates or fewer are kept where "
         f"{report['lost_surface_mass']:.1%} of the weight near surfaces is lost. The grid is filled"
         " from the same field, loses as much and keeps the same share of the volume that rays "
-        f"reach; its bytes are interpolated between grids. Rows {made_line(report['rows'])}."
+        f"reach; its bytes are interpolated between grids."
     )
 
 

@@ -19,7 +19,7 @@ import torch
 import tyro
 from nerfstudio.engine.callbacks import TrainingCallbackAttributes
 
-from leco_plugin.evaluation.machine import describe_machine
+from leco_plugin.evaluation.machine import describe_code, describe_machine, made_by
 from leco_plugin.method_configs import leco_occupancy
 from leco_plugin.models.compute.optimizers import RATES, FusedAdamConfig
 from leco_plugin.models.freezing.calibration import Reference
@@ -169,7 +169,8 @@ def compare(data: Path, options: Options) -> list[dict[str, Any]]:
 
 
 def main(options: Options) -> None:
-    rows = [row for data in options.data for row in compare(data, options)]
+    code = describe_code()  # before anything is measured
+    rows = [row | made_by(code) for data in options.data for row in compare(data, options)]
     results = {
         "format": 1,
         "machine": describe_machine(),

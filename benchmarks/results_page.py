@@ -15,7 +15,7 @@ import checkout  # noqa: F401
 from chart_sections import chart_sections
 from large_scene_tables import LARGE_SCENES
 from learning import sentence as learning_sentence
-from page_parts import RESULTS, ROOT, machine_line, picture, section
+from page_parts import RESULTS, ROOT, machine_line, made_line, picture, section
 from page_pictures import GROWTH, LEARNING, draw_pictures, is_stale, pictures
 from sizes_sections import sizes_sections
 from stability_page import PAGE as STABILITY_PAGE
@@ -169,8 +169,9 @@ def large_scene_sections() -> list[str]:
         if not (path := RESULTS / f"{name}.json").exists():
             continue
         report = json.loads(path.read_text())
-        texts = (part(report) for part in (shown.table, shown.note))
-        head, *rest = section(shown.title, shown.command(report), report, *texts)
+        made = f" Rows {made_line(report['rows' if 'rows' in report else 'runs'])}."
+        command, note = shown.command(report), shown.note(report) + made
+        head, *rest = section(shown.title, command, report, shown.table(report), note)
         parts += [head, f"{picture(name)}\n", *rest] if name == GROWTH.stem else [head, *rest]
     return parts
 

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import pytest
 
+from leco_plugin.chart.forecast import FAST, SLOW
 from leco_plugin.chart.protocol import Protocol
 from leco_plugin.chart.suites import SUITES, minutes_together
 from leco_plugin.method_configs import ON_GPU
@@ -19,7 +20,7 @@ PLACE = re.compile(r"`((?:\w+/)*\w+)\.py: ([\w.]+)`")
 LINK = re.compile(r"\]\(decisions\.md#([\w-]+)\)")
 NUMBER = re.compile(r"(?<![\w.])\d+(?:\.\d+)?(?:e-\d+)?%?(?![\w.]*\w)")
 SUITE_ROW = re.compile(
-    r"^\| `([\w-]+)` \| (\d+) \| ([\d-]*) ?\| ([^|]*?) ?\| (\d+) \|$", re.MULTILINE
+    r"^\| `([\w-]+)` \| (\d+) \| ([\d-]*) ?\| ([^|]*?) ?\| (\d+ to \d+) \|$", re.MULTILINE
 )
 
 PLACES = sorted(set(PLACE.findall(PAGE)))
@@ -68,10 +69,11 @@ def test_the_table_of_suites_says_how_many_runs_they_have_and_how_long_they_take
         wanted = {(contender.without_grids().key, one.protocol) for contender in one.contenders}
         count, shared, _, minutes = rows[name]
         assert int(count) == len(wanted) and int(shared.replace("-", "0")) == len(wanted & made)
-        assert int(minutes) == round(one.minutes())
+        assert minutes == f"{one.minutes(FAST):.0f} to {one.minutes(SLOW):.0f}"
         made |= wanted
     assert int(rows["all"][0]) == len(made)
-    assert int(rows["all"][3]) == round(minutes_together(list(SUITES)))
+    fast, slow = (minutes_together(list(SUITES), cores) for cores in (FAST, SLOW))
+    assert rows["all"][3] == f"{fast:.0f} to {slow:.0f}"
 
 
 @pytest.mark.parametrize("name", SUITES)

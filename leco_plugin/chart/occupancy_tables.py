@@ -60,7 +60,7 @@ def representations_table(held: Sequence[Representation]) -> str:
 
 
 def left_out(lines: Sequence[Line]) -> str:
-    """Grids that were to be made from each field and were not, in a sentence after another."""
+    """Grids that were to be made from each field and were not, in a sentence; or nothing."""
     sizes = {
         str(size)
         for line in lines
@@ -70,4 +70,4 @@ def left_out(lines: Sequence[Line]) -> str:
     if not sizes:
         return ""
     listed = ", ".join(f"{size}³" for size in sorted(sizes, key=int))
-    return f" Left out, for want of memory or time in some run: grid {listed}."
+    return f"Left out, for want of memory or time in some run: grid {listed}."

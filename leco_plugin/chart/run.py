@@ -155,13 +155,12 @@ class Chart:
 
     def forecast(self, todo: Sequence[Job]) -> str:
         """How many runs are to be made, and about how long that takes."""
-        minutes = forecast.minutes((job.contender for job in todo), self.protocol)
+        about = forecast.about((job.contender for job in todo), self.protocol)
         runs = f"{_counted(len(todo), 'run')} of {self.protocol.describe()}"
         beside = f", {self.protocol.at_once} at a time" if self.protocol.at_once > 1 else ""
         stored = len(self.jobs) - len(todo)
         there = f" ({stored} more are there already)" if stored else ""
-        about = _counted(max(1, round(minutes)), "minute")
-        return f"{runs}{beside}, about {about} on two CPU cores{there}"
+        return f"{runs}{beside}, {about}{there}"
 
     def results(self) -> dict[str, Any]:
         """All finished runs in the folder, the contenders of this call first."""

@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 
 from leco_plugin.chart import forecast
 from leco_plugin.chart.contender import Contender
+from leco_plugin.chart.forecast import Cores
 from leco_plugin.chart.methods import GRID, LEARNED, NEVER_FROZEN, VARIANTS
 from leco_plugin.chart.protocol import Protocol
 from leco_plugin.evaluation.machine import usable_cores
@@ -25,8 +26,8 @@ MADE_GRIDS = (64, 128, 256, 512)
 STEPS = 2 * LEARNING.schedule.learn_steps
 """Where the question is what was learned: learning has its half, and half of that again where a
 gate has not settled."""
-STEPS_SECONDS = 60.0
-"""That many on two CPU cores that do not share a run: 200 that learn, 37 s, and 200 guided ones."""
+CPU_STEPS = 400
+"""What that is on a CPU, for forecasts."""
 AT_ONCE = 1 if ON_GPU else min(2, usable_cores())
 """Runs beside each other: small tensors gain more by another run than by another thread."""
 ALL = "all"
@@ -53,11 +54,12 @@ class Suite:
     @property
     def on_two_cores(self) -> Protocol:
         """The same for a forecast, whatever machine this is."""
-        return Protocol(self.seconds or STEPS_SECONDS, None, self.learn_seconds, at_once=2)
+        steps = CPU_STEPS if self.seconds is None else None
+        return Protocol(self.seconds, steps, self.learn_seconds, at_once=2)
 
-    def minutes(self, seeds: int = 3) -> float:
+    def minutes(self, cores: Cores, seeds: int = 3) -> float:
         """About how long all of it takes on two CPU cores."""
-        return seeds * forecast.minutes(self.contenders, self.on_two_cores)
+        return seeds * forecast.minutes(self.contenders, self.on_two_cores, cores)
 
 
 def _leco(name: str, **changes: object) -> Contender:
@@ -187,12 +189,12 @@ def in_order(names: Sequence[str]) -> list[str]:
     return [name for name in SUITES if name in names or ALL in names]
 
 
-def minutes_together(names: Sequence[str], seeds: int = 3) -> float:
+def minutes_together(names: Sequence[str], cores: Cores, seeds: int = 3) -> float:
     """About how long suites take on two CPU cores when each takes over what others have made."""
     made: set[tuple[str, Protocol]] = set()
     minutes = 0.0
     for one in (SUITES[name] for name in names):
         new = [c for c in one.contenders if (c.without_grids().key, one.protocol) not in made]
         made |= {(contender.without_grids().key, one.protocol) for contender in new}
-        minutes += seeds * forecast.minutes(new, one.on_two_cores)
+        minutes += seeds * forecast.minutes(new, one.on_two_cores, cores)
     return minutes

@@ -66,7 +66,9 @@ def table(results: Mapping[str, Any]) -> str:
     if learned := learned_of(lines):
         parts.append(occupancy_table(learned))
     if held := representations_of(lines):
-        parts += [representations_table(held), f"{title_of(results)}.{left_out(lines)}"]
+        parts.append(representations_table(held))
+        if without := left_out(lines):
+            parts.append(without)
     if lines:
         parts.append(queries_table(lines))
     parts.append(provenance(results))

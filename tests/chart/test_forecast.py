@@ -8,36 +8,42 @@ import pytest
 
 from leco_plugin.chart import forecast
 from leco_plugin.chart.contender import Contender
+from leco_plugin.chart.forecast import FAST, SLOW
 from leco_plugin.chart.protocol import Protocol
-from leco_plugin.chart.suites import STEPS_SECONDS
 
 GUIDED = Contender("guided", "leco-occupancy", "learned-occupancy")
 DENSE = Contender("dense", "leco-occupancy", "dense")
 
 
-def test_a_run_takes_its_time_and_what_is_beside_it() -> None:
+@pytest.mark.parametrize("cores", [FAST, SLOW])
+def test_a_run_takes_its_time_and_what_is_beside_it(cores: forecast.Cores) -> None:
     protocol = Protocol(100.0)
-    guided = forecast.run_seconds(GUIDED, protocol)
-    assert guided == 100.0 + forecast.OVERHEAD_SECONDS
-    assert forecast.run_seconds(DENSE, protocol) == guided + forecast.UNGUIDED_SECONDS
-    assert forecast.run_seconds(replace(GUIDED, budget=2.0), protocol) == guided + 100.0
+    guided = forecast.run_seconds(GUIDED, protocol, cores)
+    assert guided == 100.0 + cores.overhead
+    assert forecast.run_seconds(DENSE, protocol, cores) == guided + cores.unguided
+    assert forecast.run_seconds(replace(GUIDED, budget=2.0), protocol, cores) == guided + 100.0
     with_grids = replace(GUIDED, grids=(64,))
-    assert forecast.run_seconds(with_grids, protocol) == guided + forecast.GRIDS_SECONDS
+    assert forecast.run_seconds(with_grids, protocol, cores) == guided + cores.grids
 
 
 def test_a_run_ends_with_its_time_or_its_steps() -> None:
     few, many = (Protocol(100.0, steps) for steps in (10, 10_000))
-    assert forecast.run_seconds(GUIDED, many) == forecast.run_seconds(GUIDED, Protocol(100.0))
-    assert forecast.run_seconds(GUIDED, few) == 10 * forecast.STEP_SECONDS + 30.0
+    in_time = forecast.run_seconds(GUIDED, Protocol(100.0), FAST)
+    assert forecast.run_seconds(GUIDED, many, FAST) == in_time
+    assert forecast.run_seconds(GUIDED, few, FAST) == 10 * FAST.step + FAST.overhead
 
 
 def test_two_runs_at_a_time_take_half_as_long() -> None:
     alone, beside = (Protocol(100.0, at_once=count) for count in (1, 2))
-    minutes = forecast.minutes([GUIDED, DENSE], alone)
+    minutes = forecast.minutes([GUIDED, DENSE], alone, FAST)
     assert minutes == pytest.approx((130.0 + 155.0) / 60.0)
-    assert forecast.minutes([GUIDED, DENSE], beside) == pytest.approx(minutes / 2)
+    assert forecast.minutes([GUIDED, DENSE], beside, FAST) == pytest.approx(minutes / 2)
 
 
-def test_the_steps_of_suites_take_what_their_forecast_says() -> None:
-    seconds = forecast.run_seconds(GUIDED, Protocol(None, 400)) - forecast.OVERHEAD_SECONDS
-    assert seconds == pytest.approx(STEPS_SECONDS)
+def test_what_is_said_holds_for_fast_cores_and_for_slow_ones() -> None:
+    runs = [GUIDED] * 12
+    protocol = Protocol(None, 400, at_once=2)
+    fast, slow = (round(forecast.minutes(runs, protocol, cores)) for cores in (FAST, SLOW))
+    said = forecast.about(runs, protocol)
+    assert said == f"about {fast} to {slow} minutes on two CPU cores, by their speed"
+    assert forecast.about([GUIDED], Protocol(20.0)) == "about 1 minute on two CPU cores"
