@@ -30,13 +30,13 @@ from leco_plugin.models.learning.statistics import (
 )
 from leco_plugin.models.leco_config import LecoModelConfig
 from leco_plugin.models.objective import field_losses, gate_losses
+from leco_plugin.models.ray_pictures import before_the_backdrop, gate_pictures, with_alpha
 from leco_plugin.models.rendering import (
     Intervals,
     Rays,
     Routing,
     Shaded,
     mapped_middles,
-    per_ray_pictures,
     shade,
     with_backdrop,
 )
@@ -131,9 +131,10 @@ class LecoModel(Model):
         Args:
             bounds: of the scene.
             median_length: median length of rays inside the bounds, scene units.
+        Raises:
+            InputError: the configured range is empty or begins at the camera.
         """
-        near = self.config.near if self.config.near is not None else bounds.near
-        far = self.config.far if self.config.far is not None else bounds.far
+        near, far = bounds.range(self.config.near, self.config.far)
         self.space.set(bounds.kind, bounds.center, bounds.half_extent)
         self.aabb.copy_(bounds.aabb)
         sizes, kind = self.config.sizes, bounds.kind
@@ -142,11 +143,17 @@ class LecoModel(Model):
         self.march_range.copy_(torch.tensor([near, far, step, learning[0], cone, learning[1]]))
         self.bounds_known.fill_(True)
 
-    def rays_of(self, bundle: RayBundle) -> Rays:
+    def rays_of(self, bundle: RayBundle, with_images: bool | None = None) -> Rays:
         """The bundle's rays, cut to the scene's bounds; of one that misses them the backdrop is
-        left, far off, as its sky."""
+        left, far off, as its sky.
+
+        Args:
+            with_images: whether rays show the appearance of their training image, or the mean of
+                all; None is in training only.
+        """
         near, far, *steps = self.march_range[:4]
-        cut = cut_to_bounds(bundle, self.aabb, near, far, with_images=self.training)
+        known = self.training if with_images is None else with_images
+        cut = cut_to_bounds(bundle, self.aabb, near, far, with_images=known)
         return with_ends_for_all(cut, far, torch.minimum(*steps))
 
     @property
@@ -285,16 +292,17 @@ class LecoModel(Model):
             shaded, intervals = self.shade_what_is_seen(rays, intervals)
         else:
             shaded = self.shade(rays, intervals)
-        outputs: dict[str, Any] = {
-            "rgb": shaded.rgb,
-            "depth": shaded.depth[:, None],
-            "accumulation": shaded.accumulation[:, None],
-        }
+        met, shown = before_the_backdrop(shaded, intervals, rays)
+        outputs: dict[str, Any] = {"rgb": shaded.rgb, **shown}
         if self.training:
             rule = (threshold if frozen else KEPT_ABOVE, *self.step_and_angle(learning))
             batch_of = {"shaded": shaded, "intervals": intervals, "rays": rays}
             return outputs | batch_of | {"kept_rule": rule}
-        return outputs | per_ray_pictures(shaded, intervals.ray_indices, len(rays.origins))
+        return outputs | gate_pictures(met, intervals.ray_indices)
+
+    def get_rgba_image(self, outputs: dict[str, Tensor], output_name: str = "rgb") -> Tensor:
+        """Colours with what was met before the backdrop as their alpha, [..., 4]."""
+        return with_alpha(outputs, output_name)
 
     def is_learning(self) -> bool:
         """Whether the coarse candidates of the first phase are still used."""

@@ -10,7 +10,7 @@ from torch import Tensor
 from leco_plugin.models.color_head import ColorHead
 from leco_plugin.models.compute.rows import select_rows
 from leco_plugin.models.field import HMoEField
-from leco_plugin.models.gate import EMPTY, Gate, occupancy_from_logits, route
+from leco_plugin.models.gate import EMPTY, Gate, route
 from leco_plugin.samplers.packed import (
     accumulate_along_rays,
     pack_info,
@@ -59,11 +59,11 @@ class Shaded(NamedTuple):
     rgb: Tensor
     """[R, 3] without background."""
     accumulation: Tensor
-    """[R]."""
+    """[R], that of a backdrop included where `weights` include it."""
     depth: Tensor
     """[R] expected distance, scene units; the end of the ray where it meets nothing."""
     weights: Tensor
-    """[M] rendering weights."""
+    """[M] rendering weights; what is shown and exported leaves those of backdrops out."""
     sigmas: Tensor
     """[M] densities per half extent."""
     logits: Tensor
@@ -294,21 +294,3 @@ def sum_up(weights: Tensor, rays: Rays, intervals: Intervals) -> tuple[Tensor, T
     accumulation = sums[:, 0]
     depth = torch.where(accumulation > 1e-6, sums[:, 1] / accumulation.clamp(min=1e-6), rays.t_maxs)
     return accumulation, depth
-
-
-def per_ray_pictures(shaded: Shaded, ray_indices: Tensor, num_rays: int) -> dict[str, Tensor]:
-    """What the gate did along each ray, for the viewer: each [R, 1] float32.
-
-    `occupancy` is o(x) and `expert` the number of the expert, both averaged with the rendering
-    weights; `samples_per_ray` is a float because nerfstudio cannot show integers.
-    """
-    seen = torch.stack(
-        [occupancy_from_logits(shaded.logits), shaded.routes.to(shaded.weights.dtype)], dim=-1
-    )
-    sums = accumulate_along_rays(shaded.weights, seen, ray_indices, num_rays)
-    means = sums / shaded.accumulation.clamp(min=1e-6)[:, None]
-    return {
-        "occupancy": means[:, :1],
-        "expert": means[:, 1:],
-        "samples_per_ray": shaded.packed_info[:, 1:].float(),
-    }

@@ -20,6 +20,7 @@ from leco_plugin.compat.evaluated_runs import evaluate_whole_checkpoints
 from leco_plugin.models.compute.precision import fast_precision, keep_freed_memory
 from leco_plugin.models.failures import require_finite
 from leco_plugin.models.image_figures import image_figures
+from leco_plugin.models.ray_pictures import leading_expert, with_alpha
 from leco_plugin.models.rendering import (
     Intervals,
     Rays,
@@ -33,7 +34,7 @@ from leco_plugin.models.scene_rays import cut_to_bounds, marching_rule, with_end
 from leco_plugin.models.switch.config import SwitchNerfModelConfig
 from leco_plugin.models.switch.field import NEW_DENSITY, Answers, SwitchField
 from leco_plugin.models.switch.objective import switch_losses, switch_statistics
-from leco_plugin.models.switch.rendering import coarse_and_fine, kept_by, leading_expert, render
+from leco_plugin.models.switch.rendering import coarse_and_fine, kept_by, render
 from leco_plugin.occupancy import gate_precision
 from leco_plugin.samplers.grid import OccupancyGridEstimator
 from leco_plugin.scenes.bounds import SceneBounds
@@ -128,10 +129,7 @@ class SwitchNerfModel(Model):
         Raises:
             InputError: the configured range is empty or begins at the camera.
         """
-        near = self.config.near if self.config.near is not None else bounds.near
-        far = self.config.far if self.config.far is not None else bounds.far
-        if not 0.0 < near < far:
-            raise InputError(f"rays need 0 < near < far, got near {near:g} and far {far:g}")
+        near, far = bounds.range(self.config.near, self.config.far)
         self.space.set(bounds.kind, bounds.center, bounds.half_extent)
         self.aabb.copy_(bounds.aabb)
         rule = marching_rule(bounds.kind, near, far, self.config.sizes.candidates, median_length)
@@ -219,7 +217,7 @@ class SwitchNerfModel(Model):
 
         `samples_per_ray` counts the points at which the field was asked, as a float because
         nerfstudio cannot show integers. `expert`, in evaluation, is the number from 1 of the one
-        with the greatest weight along the ray.
+        with the greatest weight along the ray, 0 where it meets nothing.
         """
         rays = self.rays_of(ray_bundle)
         with gate_precision(self.device.type, self.precision):
@@ -234,13 +232,13 @@ class SwitchNerfModel(Model):
         }
         if not self.training:
             experts = self.config.sizes.field.experts
-            outputs["expert"] = leading_expert(shaded, intervals.ray_indices, experts)
+            leading = leading_expert(shaded, intervals.ray_indices, experts)
+            outputs["expert"] = (leading + 1).float()
         return outputs
 
     def get_rgba_image(self, outputs: dict[str, Tensor], output_name: str = "rgb") -> Tensor:
         """Colours with what was met before the backdrop as their alpha, [..., 4]."""
-        accumulation = outputs[output_name.replace("rgb", "accumulation")]
-        return torch.cat([outputs[output_name], accumulation], dim=-1)
+        return with_alpha(outputs, output_name)
 
     def get_loss_dict(
         self, outputs: dict[str, Any], batch: dict[str, Tensor], metrics_dict: Any = None

@@ -14,6 +14,7 @@ from typing import Literal
 import torch
 from torch import Tensor
 
+from leco_plugin.scenes.input_error import InputError
 from leco_plugin.space import NO_WALL, SpaceKind
 
 
@@ -57,6 +58,20 @@ class SceneBounds:
     """One line for the log: what was seen in the data."""
     from_above: bool = False
     """Whether planes were found for it because it was photographed from above."""
+
+    def range(self, near: float | None, far: float | None) -> tuple[float, float]:
+        """Where rays begin and end, as found unless it is said.
+
+        Args:
+            near, far: as configured, scene units; None is not.
+        Raises:
+            InputError: the range is empty or begins at the camera.
+        """
+        begin = self.near if near is None else near
+        end = self.far if far is None else far
+        if not 0.0 < begin < end:
+            raise InputError(f"rays need 0 < near < far, got near {begin:g} and far {end:g}")
+        return begin, end
 
 
 def find_bounds(

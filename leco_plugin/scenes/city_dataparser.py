@@ -73,12 +73,12 @@ class LecoCity(Nerfstudio):
     ) -> DataparserOutputs:
         from leco_plugin.scenes.city.layouts import POINTS as FILE
         from leco_plugin.scenes.dataset_units import METRES_PER_UNIT, UP_IS_KNOWN
+        from leco_plugin.scenes.frames import moved, parsed_frame
         from leco_plugin.scenes.photographs import POINTS, read_ply
 
         outputs: DataparserOutputs = super()._generate_dataparser_outputs(split)
-        transform, scale = outputs.dataparser_transform, outputs.dataparser_scale
         points = read_ply(self.config.data / FILE)
-        outputs.metadata[POINTS] = scale * (points @ transform[:, :3].T + transform[:, 3])
+        outputs.metadata[POINTS] = moved(points, parsed_frame(outputs).float())
         outputs.metadata |= {METRES_PER_UNIT: 1.0, UP_IS_KNOWN: True}
         return outputs
 

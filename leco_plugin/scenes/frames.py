@@ -13,13 +13,50 @@ from torch import Tensor
 
 
 def frame_of(datamanager: Any) -> list[list[float]] | None:
-    """What took the scene's coordinates to the model's: [3, 4], JSON values; None is not known."""
+    """What took the scene's coordinates to the model's: [3, 4], JSON values; None is not known.
+
+    The scene's are those of its reconstruction, before any `applied_transform` of its file, so that
+    all readers of it mean the same.
+    """
     outputs = getattr(datamanager, "train_dataparser_outputs", None)
     if outputs is None:
         return None
-    transform = torch.as_tensor(outputs.dataparser_transform).double()[:3]
-    frame: list[list[float]] = (float(outputs.dataparser_scale) * transform).tolist()
+    frame: list[list[float]] = parsed_frame(outputs).tolist()
     return frame
+
+
+def parsed_frame(outputs: Any) -> Tensor:
+    """What a dataparser says that it did to the scene's coordinates: [3, 4] float64."""
+    transform = torch.as_tensor(outputs.dataparser_transform).double()[:3]
+    return float(outputs.dataparser_scale) * transform
+
+
+def from_file(
+    frame: list[list[float]] | Tensor,
+    applied_transform: list[list[float]] | None,
+    applied_scale: float = 1.0,
+) -> Tensor:
+    """The frame for positions as a transforms.json has them: [3, 4] float32.
+
+    What ns-process-data has done to poses and points before it wrote them, a frame does too.
+
+    Args:
+        frame: [3, 4] from the scene's coordinates, as of `frame_of`.
+        applied_transform: [3, 4] of that file; None where it has none.
+        applied_scale: of that file.
+    Raises:
+        ValueError: they are not finite, or lead nowhere back.
+    """
+    frame = torch.as_tensor(frame, dtype=torch.float64)
+    applied = torch.eye(3, 4) if applied_transform is None else applied_transform
+    matrix = torch.as_tensor(applied, dtype=torch.float64)
+    if matrix.shape not in ((3, 4), (4, 4)) or not 1e-9 < abs(matrix[:3, :3].det()) < torch.inf:
+        raise ValueError("the applied_transform is no [3, 4] matrix that can be undone")
+    if not 0.0 < applied_scale < torch.inf:
+        raise ValueError(f"the applied_scale is {applied_scale}, not a positive number")
+    back = inverse(matrix[:3])
+    shift = frame[:, :3] @ back[:, 3:] + frame[:, 3:]
+    return (torch.cat([frame[:, :3] @ back[:, :3], shift], dim=1) / applied_scale).float()
 
 
 def between(host: list[list[float]], other: list[list[float]]) -> Tensor:

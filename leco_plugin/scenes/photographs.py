@@ -18,7 +18,9 @@ from nerfstudio.data.dataparsers.nerfstudio_dataparser import Nerfstudio, Nerfst
 from nerfstudio.plugins.registry_dataparser import DataParserSpecification
 from torch import Tensor
 
+from leco_plugin.models.compute.ranks import say
 from leco_plugin.scenes.dataset_units import METRES_PER_UNIT, UP_IS_KNOWN
+from leco_plugin.scenes.frames import from_file, moved, parsed_frame
 from leco_plugin.scenes.input_error import InputError, one_line
 from leco_plugin.scenes.photograph_files import check_images, check_smaller_images
 from leco_plugin.scenes.photograph_intrinsics import check_intrinsics
@@ -29,6 +31,8 @@ POINTS = "leco_sparse_points"
 """Key of the dataset's metadata with the sparse points [P, 3] in model coordinates."""
 POINT_KEYS = (POINTS, "points3D_xyz")
 """Ours, and that of nerfstudio's own readers."""
+APPLIED_EARLIER = [[0.0, 1.0, 0.0, 0.0], [1.0, 0.0, 0.0, 0.0], [0.0, 0.0, -1.0, 0.0]]
+"""What ns-process-data did to COLMAP's coordinates before files said so, as nerfstudio takes it."""
 
 
 @dataclass
@@ -65,13 +69,23 @@ class LecoPhotographs(Nerfstudio):
             check_smaller_images(outputs.image_filenames, outputs.cameras)
         points = read_points(meta, folder_of(self.config.data))
         if points is not None:
-            transform, scale = outputs.dataparser_transform, outputs.dataparser_scale
-            outputs.metadata[POINTS] = scale * (points @ transform[:, :3].T + transform[:, 3])
+            outputs.metadata[POINTS] = moved(points, self._frame_of_file(outputs, meta))
         if up_is_known:
             outputs.metadata[UP_IS_KNOWN] = True
         if "metres_per_unit" in meta:
             outputs.metadata[METRES_PER_UNIT] = _metres(meta, self.config.data)
         return outputs
+
+    def _frame_of_file(self, outputs: DataparserOutputs, meta: dict[str, Any]) -> Tensor:
+        """What took positions in the file to the model's: [3, 4]."""
+        applied = meta.get("applied_transform")
+        if applied is None and (self.config.data / "colmap/sparse/0").exists():
+            applied = APPLIED_EARLIER
+        try:
+            scale = float(meta.get("applied_scale", 1.0))
+            return from_file(parsed_frame(outputs), applied, scale)
+        except (ValueError, TypeError, RuntimeError) as error:
+            raise InputError(f"{self.config.data} cannot be read: {one_line(error, 120)}") from None
 
     def _knows_up(self, meta: dict[str, Any]) -> bool:
         """Whether z is up in the file already: it says so, or its cameras look down along it."""
@@ -146,15 +160,21 @@ def check_scene(data: Path) -> dict[str, Any]:
 
 
 def read_points(meta: dict[str, Any], folder: Path) -> Tensor | None:
-    """Sparse points [P, 3] float32 in the scene's coordinates, or None when there are none.
+    """Sparse points [P, 3] float32 in the coordinates of the file, or None when there are none.
+
+    A file that is named and not there is said, for learning without points is slower.
 
     Raises:
         InputError: a file is named, but cannot be read as points.
     """
     name = meta.get("ply_file_path")
-    if name is None or not (folder / str(name)).is_file():
+    if name is None:
         return None
-    return read_ply(folder / str(name))
+    path = folder / str(name)
+    if not path.is_file():
+        say(f"sparse points {path} are named by the scene and not there: going on without any")
+        return None
+    return read_ply(path)
 
 
 def read_ply(path: Path) -> Tensor:

@@ -10,6 +10,7 @@ from leco_plugin.models.encodings import EncodingConfig
 from leco_plugin.models.field import FieldConfig, HMoEField
 from leco_plugin.models.gate import Gate, GateConfig
 from leco_plugin.models.hmoe import HMoEConfig
+from leco_plugin.models.ray_pictures import before_the_backdrop, gate_pictures
 from leco_plugin.models.rendering import (
     Intervals,
     Rays,
@@ -17,7 +18,6 @@ from leco_plugin.models.rendering import (
     Shaded,
     backdrop_of,
     gate_values_and_routes,
-    per_ray_pictures,
     shade,
     with_backdrop,
 )
@@ -95,7 +95,8 @@ def test_there_may_be_no_rays_and_no_samples(routing: Routing, rays: int, kept: 
     assert len(shaded.weights) == len(intervals.ray_indices)
     if not kept:
         assert not bool(shaded.rgb.any()) and torch.equal(shaded.depth, batch.t_maxs)
-    for picture in per_ray_pictures(shaded, intervals.ray_indices, rays).values():
+    met, shown = before_the_backdrop(shaded, intervals, batch)
+    for picture in (shown | gate_pictures(met, intervals.ray_indices)).values():
         assert picture.shape == (rays, 1) and picture.dtype == torch.float32
         assert bool(picture.isfinite().all())
     (shaded.rgb.sum() + shaded.depth.sum() + shaded.accumulation.sum()).backward()

@@ -20,6 +20,10 @@ SAMPLING, MOVING = re.findall(r"```python\n(.*?)```", PAGE, re.DOTALL)
 SCALE = 0.01
 
 
+def turned(positions: torch.Tensor, matrix: torch.Tensor) -> torch.Tensor:
+    return positions @ matrix[:, :3].T + matrix[:, 3]
+
+
 @pytest.fixture
 def file(tmp_path: Path) -> Path:
     """An occupancy in units of 100 metres."""
@@ -34,7 +38,10 @@ def file(tmp_path: Path) -> Path:
     return tmp_path / "occupancy.safetensors"
 
 
-def test_its_code_samples_in_the_scenes_coordinates_and_in_the_photographs(file: Path) -> None:
+@pytest.mark.parametrize("applied", [None, [[1, 0, 0, 0.4], [0, 0, 1, 0.0], [0, -1, 0, 2.0]]])
+def test_its_code_samples_in_the_scenes_coordinates_and_in_the_photographs(
+    file: Path, applied: list[list[float]] | None
+) -> None:
     origins, directions = camera_rays(40)
     code = SAMPLING.replace('"cuda"', '"cpu"').replace("occupancy.safetensors", str(file))
     given: dict[str, Any] = {
@@ -47,13 +54,15 @@ def test_its_code_samples_in_the_scenes_coordinates_and_in_the_photographs(file:
 
     (frame,) = [torch.tensor(given["occupancy"].report["frame"])]
     back = torch.linalg.inv(frame[:, :3])
+    saved = torch.eye(3, 4) if applied is None else torch.tensor(applied)
     metres = {
-        "rays_o": (origins - frame[:, 3]) @ back.T,
-        "rays_d": directions @ back.T * SCALE,  # of length 1
+        "rays_o": turned((origins - frame[:, 3]) @ back.T, saved),
+        "rays_d": directions @ back.T @ saved[:, :3].T * SCALE,  # of length 1
+        "meta": {} if applied is None else {"applied_transform": applied},
     }
-    moved: dict[str, Any] = {**given, **metres, "torch": torch}
+    moved: dict[str, Any] = {**given, **metres}
     exec(MOVING, moved)
-    torch.testing.assert_close(moved["rays_o"], origins)
+    torch.testing.assert_close(moved["rays_o"], origins, rtol=1e-4, atol=1e-5)
     torch.testing.assert_close(moved["rays_d"], directions * SCALE)
     assert torch.allclose(frame[:, :3].det() ** (1 / 3), torch.tensor(SCALE))
     report = given["occupancy"].report

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 from types import SimpleNamespace
 
+import pytest
 import torch
 
-from leco_plugin.scenes.frames import between, box_around, frame_of, inverse, moved
+from leco_plugin.scenes.frames import between, box_around, frame_of, from_file, inverse, moved
 
 
 def rotation(seed: int) -> torch.Tensor:
@@ -68,3 +69,20 @@ def test_a_turned_box_holds_the_box_and_no_more():
     corners = torch.stack([g.flatten() for g in torch.meshgrid(x, y, z, indexing="ij")], dim=-1)
     corners = corners @ frame[:, :3].T + frame[:, 3]
     torch.testing.assert_close(around, torch.cat([corners.amin(0), corners.amax(0)]))
+
+
+@pytest.mark.parametrize("scale", [1.0, 2.5])
+def test_what_was_applied_before_a_file_was_written_is_undone(scale: float):
+    """nerfstudio scales what it says it did by `applied_scale`, and puts the transform before."""
+    applied, points = torch.cat([rotation(4), torch.ones(3, 1)], dim=1), torch.randn(20, 3).double()
+    of_file = torch.cat([0.3 * rotation(1), torch.full((3, 1), 0.1)], dim=1)
+    said = scale * torch.cat(
+        [of_file[:, :3] @ applied[:, :3], of_file[:, :3] @ applied[:, 3:] + of_file[:, 3:]], dim=1
+    )
+    found = from_file(said.tolist(), applied.tolist(), scale)
+    torch.testing.assert_close(moved(points.float(), found), moved(points, of_file).float())
+
+
+def test_a_file_to_which_nothing_was_applied_has_the_frame_itself():
+    frame = torch.tensor(frame_of(reader(3, 0.7)))
+    assert torch.equal(from_file(frame, None), frame)

@@ -192,18 +192,60 @@ def test_a_sound_scene_passes_as_a_folder_and_as_a_file(scene: Path) -> None:
     assert check_scene(scene / "transforms.json") == check_scene(scene)
 
 
+APPLIED = [[1.0, 0.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.2], [0.0, -1.0, 0.0, 0.0]]
+
+
+def earlier(scene: Path) -> None:
+    """As ns-process-data left scenes before it wrote down what it had applied."""
+    (scene / "colmap/sparse/0").mkdir(parents=True)
+
+
 @pytest.mark.filterwarnings("ignore::ResourceWarning")  # nerfstudio leaves an image open
 @pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
-def test_sparse_points_follow_the_cameras_into_model_coordinates(scene: Path) -> None:
+@pytest.mark.parametrize(
+    "process",
+    [
+        lambda scene: None,
+        lambda scene: change(scene, lambda m: m.update(applied_transform=APPLIED)),
+        lambda scene: change(scene, lambda m: m.update(applied_scale=2.5)),
+        earlier,
+    ],
+    ids=["as it was", "transformed", "scaled", "transformed and not said"],
+)
+def test_sparse_points_follow_the_cameras_into_model_coordinates(
+    scene: Path, process: Callable[[Path], None]
+) -> None:
     """A point at each camera's position lies at that camera's position after parsing."""
     meta = check_scene(scene)
     places = np.array([frame["transform_matrix"] for frame in meta["frames"]])[:, :3, 3]
     trimesh.PointCloud(places).export(scene / "points.ply")
     change(scene, lambda m: m.update(ply_file_path="points.ply"))
+    process(scene)
     outputs = LecoPhotographsDataParserConfig(data=scene).setup().get_dataparser_outputs("train")
     distances = torch.cdist(outputs.cameras.camera_to_worlds[:, :, 3], outputs.metadata[POINTS])
     assert len(outputs.metadata[POINTS]) == 9
     assert float(distances.amin(dim=1).max()) < 1e-5
+
+
+@pytest.mark.filterwarnings("ignore::ResourceWarning")
+@pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
+@pytest.mark.parametrize(
+    "applied",
+    [
+        {"applied_transform": np.zeros((3, 4)).tolist()},
+        {"applied_transform": [[1.0, 0.0], [0.0, 1.0]]},
+        {"applied_scale": 0.0},
+    ],
+    ids=["flat", "too small", "no scale"],
+)
+def test_an_applied_transform_that_cannot_be_undone_is_said_in_a_line(
+    scene: Path, applied: dict[str, Any]
+) -> None:
+    trimesh.PointCloud(np.eye(3)).export(scene / "points.ply")
+    change(scene, lambda m: m.update(ply_file_path="points.ply", **applied))
+    with pytest.raises(InputError, match="cannot be read") as caught:
+        LecoPhotographsDataParserConfig(data=scene).setup().get_dataparser_outputs("train")
+    assert "\n" not in str(caught.value)
 
 
 def test_a_file_that_holds_no_points_is_named(scene: Path) -> None:
@@ -213,9 +255,13 @@ def test_a_file_that_holds_no_points_is_named(scene: Path) -> None:
     assert "\n" not in str(caught.value)
 
 
-def test_a_scene_without_points_has_none(scene: Path) -> None:
-    assert read_points({}, scene) is None
+def test_a_scene_without_points_has_none_and_missing_ones_are_said(
+    scene: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert read_points({}, scene) is None and not capsys.readouterr().out
     assert read_points({"ply_file_path": "nowhere.ply"}, scene) is None
+    said = " ".join(capsys.readouterr().out.split())
+    assert "nowhere.ply" in said and "not there: going on without any" in said
 
 
 def test_only_cameras_that_look_down_are_above() -> None:

@@ -52,13 +52,17 @@ def calibration_rays(
 ) -> tuple[Rays, Tensor]:
     """Held-out rays, cut to the model's bounds, and their true colours [R, 3 or 4].
 
+    They are of training images, whose appearance is known: an exposure that the mean of all does
+    not show would stand in every error, and hide what skipping adds to it.
+
     Args:
         count: None is what a calibration takes.
         seed, share: see `held_out_bundle`.
     """
     count = count or model.config.calibration.rays
     bundle, truth = held_out_bundle(datamanager, count, seed, share)
-    return model.rays_of(bundle.to(model.device)), truth.to(model.device).float()
+    rays = model.rays_of(bundle.to(model.device), with_images=True)
+    return rays, truth.to(model.device).float()
 
 
 class DenseRendering(NamedTuple):

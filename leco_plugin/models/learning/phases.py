@@ -137,9 +137,10 @@ def reset_gate_head(head: torch.nn.Linear) -> None:
 
 @torch.no_grad()
 def spread_scene_experts(head: torch.nn.Linear, dominant: int) -> None:
-    """Shares the points of one scene expert out among all; o(x) stays as it was.
+    """Shares the points of one scene expert out among all.
 
-    n equal logits have the log-sum-exp of one that is log n higher.
+    n equal logits have the log-sum-exp of one that is log n higher, so that o(x) stays as it was
+    where that expert was far ahead, and falls by the share of the others where it was not.
 
     Args:
         head: last layer of the gate, [1 + n, width].

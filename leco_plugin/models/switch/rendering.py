@@ -22,7 +22,6 @@ from leco_plugin.models.rendering import (
 )
 from leco_plugin.models.switch.field import Answers
 from leco_plugin.models.switch.sampling import draw, edges_around, spread, strata
-from leco_plugin.samplers.accumulate import accumulate_along_rays
 from leco_plugin.samplers.base import densities_of_samples
 from leco_plugin.samplers.packed import render_weight_from_density
 from leco_plugin.space import Space
@@ -152,12 +151,3 @@ def render(
     accumulation, depth = sum_up(met, rays, intervals)
     sigmas, _, logits, routes = answers
     return Shaded(rgb, accumulation, depth, met, sigmas, logits, routes, packed_info)
-
-
-@torch.no_grad()
-def leading_expert(shaded: Shaded, ray_indices: Tensor, experts: int) -> Tensor:
-    """The expert with the greatest weight along each ray, [R, 1] float32 from 1; 0 is none."""
-    chosen = torch.nn.functional.one_hot(shaded.routes, experts).to(shaded.weights.dtype)
-    sums = accumulate_along_rays(shaded.weights, chosen, ray_indices, len(shaded.rgb))
-    most, expert = sums.max(dim=-1, keepdim=True)
-    return torch.where(most > 0.0, expert + 1, 0).float()

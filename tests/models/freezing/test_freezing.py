@@ -6,10 +6,21 @@ from types import SimpleNamespace
 
 import pytest
 import torch
+from nerfstudio.cameras.rays import RayBundle
+from nerfstudio.data.scene_box import SceneBox
 
+from leco_plugin.models.encodings import EncodingConfig
+from leco_plugin.models.field import FieldConfig
 from leco_plugin.models.freezing.calibration import Measured
 from leco_plugin.models.freezing.freezing import advice_on
-from leco_plugin.models.freezing.held_out_rendering import calibration_rays
+from leco_plugin.models.freezing.held_out_rendering import (
+    calibration_rays,
+    dense_rendering,
+    evaluating,
+)
+from leco_plugin.models.gate import GateConfig
+from leco_plugin.models.leco_config import LecoModelConfig
+from leco_plugin.models.sizing.sizes import Sizes
 from leco_plugin.scenes.pixels.held_out_pixels import HeldOutPixelSampler, HeldOutPixelSamplerConfig
 
 COUNT = 50
@@ -59,7 +70,7 @@ def a_model() -> SimpleNamespace:
     return SimpleNamespace(
         config=SimpleNamespace(calibration=SimpleNamespace(rays=COUNT)),
         device=torch.device("cpu"),
-        rays_of=lambda indices: indices,
+        rays_of=lambda indices, with_images: indices,
     )
 
 
@@ -92,3 +103,24 @@ def test_what_skips_next_to_nothing_comes_with_advice(threshold, skipped, said) 
         assert advice.startswith(said)
         assert "--pipeline.model of leco-occupancy" in advice
         assert "--pipeline.model.occupancy.learning of guided methods" in advice
+
+
+def test_prices_are_measured_in_the_appearance_of_each_image() -> None:
+    sizes = Sizes(
+        gate=GateConfig(EncodingConfig(octaves=1), width=8, layers=1, scene_experts=2),
+        field=FieldConfig(EncodingConfig(kind="hash", log2_table=8), appearance_dim=1),
+        learn_candidates=8,
+        candidates=16,
+    )
+    box = SceneBox(torch.tensor([[-1.0] * 3, [1.0] * 3]))
+    model = LecoModelConfig(sizes=sizes).setup(scene_box=box, num_train_data=2)
+    model.field.color.appearance.weight.data = torch.tensor([[500.0], [-500.0]])
+    ahead = torch.tensor([[0.0, 0.0, 1.0]]).expand(2, 3)
+    bundle = RayBundle(-0.5 * ahead, ahead, torch.ones(2, 1), torch.tensor([[0], [1]]))
+    manager = SimpleNamespace(next_train=lambda step: (bundle, {"image": torch.rand(2, 3)}))
+    rays, truth = calibration_rays(model, manager)
+    with evaluating(model):
+        (reference,) = dense_rendering(model, rays, truth).references
+        of_the_mean = model.get_outputs(bundle)["rgb"]
+    assert torch.equal(of_the_mean[0], of_the_mean[1])
+    assert float((reference.rgb[0] - reference.rgb[1]).abs().max()) > 0.05

@@ -7,9 +7,9 @@ import torch
 from torch import Tensor
 
 from leco_plugin.models.color_head import ColorHead
-from leco_plugin.models.rendering import Intervals, Rays, backdrop_of, with_backdrop
+from leco_plugin.models.rendering import Rays, backdrop_of, with_backdrop
 from leco_plugin.models.switch.field import Answers
-from leco_plugin.models.switch.rendering import coarse_and_fine, kept_by, leading_expert, render
+from leco_plugin.models.switch.rendering import coarse_and_fine, kept_by, render
 from leco_plugin.samplers.grid import DenseEstimator
 from leco_plugin.space import Space
 
@@ -105,19 +105,6 @@ def test_pruning_leaves_out_what_lies_behind_an_opaque_place() -> None:
     assert 3.0 < float(seen.t_ends.max()) < 5.0 < float(everything.t_ends.max())
 
 
-def test_the_leading_expert_has_the_greatest_weight_and_none_is_zero() -> None:
-    rays = some_rays(2)
-    intervals, answers = coarse_and_fine(ball, SPACE, rays, rays.t_maxs - 0.5, (8, 8), False, False)
-    color = ColorHead(3, 8, 1, 0, 1)
-    shaded = render(color, answers, rays, intervals, SPACE.half_extent)
-    weights = torch.zeros(34)
-    weights[1], weights[5], weights[9] = 0.3, 0.2, 0.25
-    routes = torch.zeros(34, dtype=torch.int64)
-    routes[5] = routes[9] = 2
-    shaded = shaded._replace(weights=weights, routes=routes)
-    assert leading_expert(shaded, intervals.ray_indices, 3).tolist() == [[3.0], [0.0]]
-
-
 def test_there_may_be_no_rays() -> None:
     rays = some_rays(1)._replace(
         origins=torch.zeros(0, 3),
@@ -128,4 +115,3 @@ def test_there_may_be_no_rays() -> None:
     intervals, answers = coarse_and_fine(ball, SPACE, rays, rays.t_maxs, (4, 4), True, True)
     shaded = render(ColorHead(3, 8, 1, 0, 1), answers, rays, intervals, SPACE.half_extent)
     assert shaded.rgb.shape == (0, 3)
-    assert leading_expert(shaded, Intervals(*intervals).ray_indices, 2).shape == (0, 1)
