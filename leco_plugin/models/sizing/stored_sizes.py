@@ -55,7 +55,7 @@ def stored_in(extra: Any, now: tuple[Sizes, int]) -> tuple[Sizes, int]:
 
 def sizes_in(checkpoint: Path) -> dict[str, Any] | None:
     """What `to_store` gave the model of a checkpoint of nerfstudio; None in those without."""
-    state = torch.load(checkpoint, map_location="cpu", mmap=True)["pipeline"]
+    state = torch.load(checkpoint, map_location="cpu", mmap=True, weights_only=True)["pipeline"]
     extras = (value for key, value in state.items() if key.endswith("_extra_state"))
     found = (extra.get(SIZES) for extra in extras if isinstance(extra, dict))
     return next((values for values in found if values is not None), None)
