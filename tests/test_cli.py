@@ -173,6 +173,14 @@ def bad_inputs(folder: Path, file: Path) -> dict[str, list[object]]:
         "an export where a folder is": [
             *("export", file, "--format", "ply", "--out", folder / "taken")
         ],
+        "a surface of too many cells": [
+            *("export", file, "--format", "ply", "--resolution", 10**15),
+            *("--out", folder / "kept.ply"),
+        ],
+        "a grid of too many cells": [
+            *("export", file, "--format", "nerfacc-grid", "--resolution", 646),
+            *("--out", folder / "grid.pt"),
+        ],
         "an export of a foreign file": [
             *("export", folder / "text.safetensors", "--format", "ply"),
             *("--out", folder / "kept.ply"),
