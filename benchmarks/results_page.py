@@ -12,6 +12,7 @@ import sys
 from typing import Any
 
 import checkout  # noqa: F401
+from bars import bars_section
 from chart_sections import chart_sections
 from large_scene_tables import LARGE_SCENES
 from learning import sentence as learning_sentence
@@ -178,7 +179,7 @@ def large_scene_sections() -> list[str]:
 
 def page() -> str:
     """The whole of `docs/results.md`."""
-    parts = [HEAD]
+    parts = [HEAD, *bars_section(RESULTS)]
     demo = RESULTS / "demo.json"
     if demo.exists():
         report = json.loads(demo.read_text())

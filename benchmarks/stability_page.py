@@ -80,10 +80,9 @@ def of_kills(results: dict[str, Any]) -> str:
     early = sum(max(kill["first"], kill["before"]) < 0 for kill in kills)
     saved = sum(kill["before"] > kill["first"] for kill in kills)
     lost = sum(has_lost(kill) for kill in kills)
-    ends = [run for run in results["killed"] if run["kills"]]
+    ends = runs_killed(results)
     whole = results["undisturbed"]
-    last = results["steps"] - 1
-    finished = sum(run["step"] >= last and run.get("frozen", False) for run in ends)
+    finished, _ = runs_gone_on(results)
     return (
         f"`python benchmarks/kills.py`: {len(kills)} kills with SIGKILL at random moments of runs "
         f"of {results['steps']} steps, {early} of them before anything was saved, {saved} of "
@@ -94,6 +93,18 @@ def of_kills(results: dict[str, Any]) -> str:
         f"that nobody killed end at {spread(whole)}{difference(ends, whole)}. "
         f"{results['machine']['cpu']}."
     )
+
+
+def runs_killed(results: dict[str, Any]) -> list[dict[str, Any]]:
+    """Runs that were killed at least once."""
+    return [run for run in results["killed"] if run["kills"]]
+
+
+def runs_gone_on(results: dict[str, Any]) -> tuple[int, int]:
+    """How many of the runs that were killed went on to their last step with a frozen gate, and how
+    many there are."""
+    last, ends = results["steps"] - 1, runs_killed(results)
+    return sum(run["step"] >= last and run.get("frozen", False) for run in ends), len(ends)
 
 
 def has_lost(kill: dict[str, Any]) -> bool:

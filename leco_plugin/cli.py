@@ -13,7 +13,7 @@ import tyro
 
 from leco_plugin.cli_capacity import capacity, export, shrink
 from leco_plugin.cli_reports import check_json as _check_json
-from leco_plugin.cli_reports import occupancy_of
+from leco_plugin.cli_reports import check_picture, occupancy_of
 from leco_plugin.cli_reports import write_json as _write_json
 from leco_plugin.scenes.input_error import one_line
 
@@ -56,6 +56,7 @@ def city(
         format: Of the scene: nerfstudio's, or Mega-NeRF's, for the data parser mega-nerf.
         json: File for what was written, as JSON.
     """
+    _check_json(json)
     from leco_plugin.scenes.city.city import City, CityConfig
     from leco_plugin.scenes.city.folder import CaptureConfig, count_pictures, write_city
 
@@ -104,6 +105,9 @@ def inspect(
             leco-occupancy with --pipeline.model.schedule.steps-per-record 10, say.
         json: File for the same as JSON.
     """
+    _check_json(json)
+    check_picture("--picture", picture)
+    check_picture("--history", history, moving=True)
     from leco_plugin.evaluation.inspection import describe
     from leco_plugin.occupancy import Occupancy
 
@@ -166,7 +170,7 @@ def swap(
 def demo(out: Path = Path("runs/demo"), seconds: float = 130.0, json: Path | None = None) -> None:
     """Learn the occupancy of a small city, go on guided, and compare with never freezing.
 
-    Writes report.json, chart.png, picture.png and occupancy.safetensors. Under six minutes on two
+    Writes report.json, chart.png, picture.png and occupancy.safetensors. About six minutes on two
     CPU cores.
 
     Args:
@@ -174,14 +178,17 @@ def demo(out: Path = Path("runs/demo"), seconds: float = 130.0, json: Path | Non
         seconds: Training time of each of the two runs.
         json: Another file for the report.
     """
+    import time
     import warnings
+
+    began = time.monotonic()
 
     # what nerfstudio and torch think of each other is nothing that a user can act on
     warnings.filterwarnings("ignore", module=r"nerfstudio|torch")
     from leco_plugin.demo import run_demo, summary
 
     _check_json(json)
-    report = run_demo(out, seconds)
+    report = run_demo(out, seconds, began=began)
     print("\n".join(summary(report)))
     print(f"see report.json, chart.png and picture.png in {out}")
     _write_json(json, report)
@@ -303,6 +310,7 @@ def check(name: Annotated[str, tyro.conf.Positional], json: Path | None = None) 
         name: A registered sampler or nerfstudio method, of this package or of another.
         json: File for the verdicts as JSON.
     """
+    _check_json(json)
     import warnings
 
     # what nerfstudio and torch think of each other is nothing that a user can act on

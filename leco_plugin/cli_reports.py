@@ -50,14 +50,20 @@ def check_place(option: str, path: Path | None) -> None:
         raise ValueError(f"{option} {path}: {nearest} cannot be written to")
 
 
-def check_picture(option: str, path: Path | None) -> None:
-    """As `check_place`, and whether a picture of this kind can be drawn."""
+def check_picture(option: str, path: Path | None, moving: bool = False) -> None:
+    """As `check_place`, and whether a picture of this kind can be drawn.
+
+    Args:
+        moving: whether a .gif may be asked for, too.
+    Raises:
+        ValueError: as `check_place`, or its kind is not known.
+    """
     check_place(option, path)
     if path is None:
         return
     from matplotlib.backend_bases import FigureCanvasBase
 
-    kinds = FigureCanvasBase.get_supported_filetypes()
+    kinds = {*FigureCanvasBase.get_supported_filetypes(), *(["gif"] if moving else [])}
     if path.suffix[1:].lower() not in kinds:
         raise ValueError(f"{option} {path} ends in none of {', '.join(sorted(kinds))}")
 

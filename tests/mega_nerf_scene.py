@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
+import io
+import zipfile
 from pathlib import Path
 
 import numpy as np
+import torch
 
 from leco_plugin.scenes.city.cameras import look_at
 from leco_plugin.scenes.mega_nerf_format.axes import Coordinates
 from leco_plugin.scenes.mega_nerf_format.writer import (
     write_coordinates,
     write_mappings,
-    write_mask,
     write_view,
 )
 
@@ -57,3 +59,18 @@ def mask(number: int) -> np.ndarray:
     """bool [HEIGHT, WIDTH]; that of picture 4 keeps nothing."""
     keep = np.random.default_rng(number).random((HEIGHT, WIDTH)) < 0.7
     return keep & (number != 4)
+
+
+def write_mask(folder: Path, stem: str, keep: np.ndarray) -> None:
+    """Writes the mask [H, W] of a picture into `folder`; False leaves a pixel out of training."""
+    folder.mkdir(exist_ok=True)
+    pack(folder / f"{stem}.pt", torch.from_numpy(keep), f"{stem}.pt")
+
+
+def pack(path: Path, value: object, name: str = "a.pt", **options: int) -> Path:
+    """Writes a zip that holds a value under a name, as masks are held; returns `path`."""
+    inside = io.BytesIO()
+    torch.save(value, inside)
+    with zipfile.ZipFile(path, "w", **options) as archive:
+        archive.writestr(name, inside.getvalue())
+    return path

@@ -173,6 +173,14 @@ def bad_inputs(folder: Path, file: Path) -> dict[str, list[object]]:
         "an export where a folder is": [
             *("export", file, "--format", "ply", "--out", folder / "taken")
         ],
+        "a surface of too many cells": [
+            *("export", file, "--format", "ply", "--resolution", 10**15),
+            *("--out", folder / "kept.ply"),
+        ],
+        "a grid of too many cells": [
+            *("export", file, "--format", "nerfacc-grid", "--resolution", 646),
+            *("--out", folder / "grid.pt"),
+        ],
         "an export of a foreign file": [
             *("export", folder / "text.safetensors", "--format", "ply"),
             *("--out", folder / "kept.ply"),
@@ -198,6 +206,47 @@ def test_bad_input_ends_with_one_line_and_status_2(
         assert run(*arguments) == 2, what
         said = capsys.readouterr().err
         assert said.startswith("leco: ") and said.count("\n") == 1, (what, said)
+
+
+@pytest.mark.parametrize(
+    ("option", "command"),
+    [
+        ("--json", ["city", "--out", "city"]),
+        ("--json", ["inspect", "text.safetensors"]),
+        ("--picture", ["inspect", "text.safetensors"]),
+        ("--history", ["inspect", "text.safetensors"]),
+        ("--json", ["export", "text.safetensors", "--format", "ply", "--out", "kept.ply"]),
+        ("--out", ["export", "text.safetensors", "--format", "ply"]),
+        ("--json", ["check", "grit"]),
+    ],
+)
+def test_a_place_that_cannot_be_written_to_is_named_before_anything_is_read_or_written(
+    option: str,
+    command: list[str],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    Path("text.safetensors").write_text("not an occupancy")
+    Path("taken.png").mkdir()
+    assert run(*command, option, Path("taken.png")) == 2
+    assert run(*command, option, Path("text.safetensors", "report.png")) == 2
+    folder, below_a_file = capsys.readouterr().err.splitlines()
+    assert folder == f"leco: {option} taken.png is a folder; give a file"
+    assert below_a_file.startswith(f"leco: {option} ") and below_a_file.endswith("not a folder")
+    assert {path.name for path in tmp_path.iterdir()} == {"text.safetensors", "taken.png"}
+
+
+@pytest.mark.parametrize("option", ["--picture", "--history"])
+def test_a_kind_of_picture_that_cannot_be_drawn_is_named_before_the_file_is_read(
+    option: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert run("inspect", tmp_path / "none.safetensors", option, tmp_path / "new" / "x.foo") == 2
+    said = capsys.readouterr().err
+    assert said.startswith(f"leco: {option} ") and "ends in none of" in said and "png" in said
+    assert ("gif" in said) or option == "--picture"
+    assert not list(tmp_path.iterdir())
 
 
 @pytest.mark.parametrize("arguments", [[], ["fly"], ["inspect"], ["city", "--blocks", "many"]])

@@ -63,6 +63,10 @@ def test_the_demo_reports_both_runs_in_the_agreed_form(tmp_path: Path) -> None:
     file = tmp_path / "occupancy.safetensors"
     assert report["occupancy"]["bytes"] == file.stat().st_size
     assert report["occupancy"]["params"] == Occupancy.load(file).num_params
+    assert report["seconds_in_all"] > sum(run["train_seconds"] for run in report["runs"])
     for name in ("chart.png", "picture.png"):
         assert np.asarray(Image.open(tmp_path / name)).std() > 10
     assert any("leco-occupancy-never-frozen" in line for line in summary(report))
+    assert summary(report)[-1] == f"all of it took {report['seconds_in_all'] / 60:.1f} minutes"
+    older = {name: value for name, value in report.items() if name != "seconds_in_all"}
+    assert summary(older) == summary(report)[:-1]

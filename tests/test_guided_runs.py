@@ -334,6 +334,22 @@ def test_an_occupancy_that_cannot_guide_ends_training_with_one_line(
     assert not (runs.folder(method, "refused") / "nerfstudio_models").exists()
 
 
+@pytest.mark.parametrize(
+    ("method", "option", "value"),
+    [
+        ("leco-occupancy", "gate-loss.empty-ratio", "1.5"),
+        ("leco-ngp", "occupancy.learning.calibration.rays", "0"),
+    ],
+)
+def test_an_option_that_cannot_work_ends_training_before_the_data_are_read(
+    runs: Runs, method: str, option: str, value: str, tmp_path: Path
+) -> None:
+    arguments = (f"--pipeline.model.{option}={value}", "--data", tmp_path / "none")
+    printed = runs.command("ns-train", method, *arguments, status=2)
+    assert f"is {value}; it must be" in printed
+    assert "Traceback" not in printed and "there is no such folder" not in printed
+
+
 def test_a_scene_that_the_occupancy_does_not_know_ends_a_swap(runs: Runs, tmp_path: Path) -> None:
     another_scene(tmp_path / NAME)
     printed = runs.command(

@@ -187,14 +187,3 @@ def in_order(names: Sequence[str]) -> list[str]:
         if name != ALL:
             suite(name)
     return [name for name in SUITES if name in names or ALL in names]
-
-
-def minutes_together(names: Sequence[str], cores: Cores, seeds: int = 3) -> float:
-    """About how long suites take on two CPU cores when each takes over what others have made."""
-    made: set[tuple[str, Protocol]] = set()
-    minutes = 0.0
-    for one in (SUITES[name] for name in names):
-        new = [c for c in one.contenders if (c.without_grids().key, one.protocol) not in made]
-        made |= {(contender.without_grids().key, one.protocol) for contender in new}
-        minutes += seeds * forecast.minutes(new, one.on_two_cores, cores)
-    return minutes

@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any, Literal
 
+from leco_plugin.cli_reports import check_place
 from leco_plugin.occupancy import Occupancy
 from leco_plugin.progress_bar import bar
 
@@ -30,8 +31,7 @@ def export(
     """
     if format == "ply" and levels is not None:
         raise ValueError("points have no levels: --levels goes with --format nerfacc-grid")
-    if out.is_dir():
-        raise ValueError(f"--out {out} is a folder; give a file")
+    check_place("--out", out)
     occupancy = Occupancy.load(file)
     if format == "ply":
         from leco_plugin.export.points import kept_surface, write_ply

@@ -15,6 +15,7 @@ from torch import Tensor
 from torch.nn.functional import max_pool3d
 
 from leco_plugin.evaluation.inspection import numbers, query
+from leco_plugin.export.cell_limit import require_few
 from leco_plugin.occupancy import Occupancy
 from leco_plugin.samplers.grid import OccupancyGridEstimator
 from leco_plugin.scenes.whole_files import write_whole
@@ -23,7 +24,6 @@ STEPS = 2
 """Steps from one corner of a cell to the next: 27 probed points, those on faces shared."""
 POINTS_AT_ONCE = 1 << 20
 MOST_LEVELS = 8
-MOST_CELLS = 1 << 28
 
 
 def grid_buffers(
@@ -48,11 +48,11 @@ def grid_buffers(
     unbounded = occupancy.space.kind != "box"
     if levels is None:
         levels = reaching_levels(occupancy) if unbounded else 1
-    if resolution < 1 or levels < 1 or levels * resolution**3 > MOST_CELLS:
+    if resolution < 1 or levels < 1:
         raise ValueError(
-            f"{levels} levels of {resolution}^3 cells: a grid has at least one level and one cell, "
-            f"and at most {MOST_CELLS} cells"
+            f"{levels} levels of {resolution}^3 cells: a grid has at least one level and one cell"
         )
+    require_few(levels * resolution**3, f"{levels} x {resolution}^3")
     if unbounded and levels == 1:
         raise ValueError(
             "the scene is unbounded, and a grid of one level ends at its innermost box: give two "

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -9,11 +11,14 @@ import torch
 from torch import Tensor
 
 from leco_plugin.evaluation.inspection import ViewBox, exposed, query, whole_box
+from leco_plugin.export.cell_limit import MOST_CELLS, require_few
 from leco_plugin.occupancy import Occupancy
 from leco_plugin.scenes.whole_files import write_whole
 
 COLOURS = "magma"
 """Of matplotlib, for o(x) in [0, 1]: as in the picture of `leco inspect`."""
+CELLS_AT_ONCE = 1 << 20
+"""Of which the places are known together; of the others only o(x)."""
 
 
 class KeptSurface(NamedTuple):
@@ -32,23 +37,35 @@ def kept_surface(occupancy: Occupancy, resolution: int) -> KeptSurface:
         resolution: cells along the longest side of the space in which the gate was taught. Those of
             an unbounded scene grow with distance, as its mapping has it.
     Raises:
-        ValueError: the resolution is not positive, or nothing is kept.
+        ValueError: the resolution is below 2 or makes too many cells, or nothing is kept.
     """
     if resolution < 2:
         raise ValueError(f"a surface takes at least 2 cells along a side, not {resolution}")
-    device = occupancy.threshold_value.device
     box = _mapped_box(occupancy)
-    axes = [box.axis(number, count) for number, count in enumerate(box.cells(resolution))]
-    mapped = torch.stack(torch.meshgrid(*axes, indexing="ij"), dim=-1).to(device)
-    positions = occupancy.space.unmap(mapped).cpu()
-    values = query(occupancy, positions)
+    counts = box.cells(min(resolution, MOST_CELLS))  # which are too many along one side alone
+    require_few(math.prod(counts), f"{resolution} along the longest side")
+    axes = [box.axis(number, count) for number, count in enumerate(counts)]
+    layers = max(1, CELLS_AT_ONCE // (counts[1] * counts[2]))
+    values = torch.cat(
+        [
+            query(occupancy, _positions(occupancy, torch.meshgrid(x, *axes[1:], indexing="ij")))
+            for x in axes[0].split(layers)
+        ]
+    )
     chosen = exposed(values >= occupancy.threshold)
     if not bool(chosen.any()):
         raise ValueError(
             f"the occupancy keeps nothing in cells of 1/{resolution} of its space: there is no "
             "surface to export"
         )
-    return KeptSurface(positions[chosen], values[chosen])
+    places = [axis[index] for axis, index in zip(axes, chosen.nonzero(as_tuple=True))]
+    return KeptSurface(_positions(occupancy, places), values[chosen])
+
+
+def _positions(occupancy: Occupancy, mapped: Sequence[Tensor]) -> Tensor:
+    """Scene positions [..., 3] on the CPU, of their three mapped coordinates [...] each."""
+    device = occupancy.threshold_value.device
+    return occupancy.space.unmap(torch.stack(list(mapped), dim=-1).to(device)).cpu()
 
 
 def _mapped_box(occupancy: Occupancy) -> ViewBox:

@@ -173,12 +173,7 @@ class HashEncoding(nn.Module):
         self.register_buffer(
             "offsets", torch.arange(levels, dtype=torch.int32) << log2_table, persistent=False
         )
-        # the primes of Instant-NGP; int32 products wrap around, which a hash does not mind
-        self.register_buffer(
-            "primes",
-            torch.tensor([1, 2654435761 - 2**32, 805459861], dtype=torch.int32),
-            persistent=False,
-        )
+        self.register_buffer("primes", torch.tensor(PRIMES, dtype=torch.int32), persistent=False)
         self.table = nn.Parameter(torch.empty(levels << log2_table, features).uniform_(-1e-4, 1e-4))
 
     def rows_and_weights(self, mapped: Tensor) -> tuple[Tensor, Tensor]:

@@ -11,10 +11,12 @@ from leco_plugin.models.freezing.calibration import CalibrationConfig
 from leco_plugin.models.freezing.merging import MergingConfig
 from leco_plugin.models.learning.phases import ScheduleConfig
 from leco_plugin.models.learning.prior import PriorConfig
+from leco_plugin.models.learning.statistics import KEPT_ABOVE
 from leco_plugin.models.objective import GateLossConfig
 from leco_plugin.models.sizing.sizes import SMALL, Sizes
 from leco_plugin.occupancy import Precision
 from leco_plugin.scenes.bounds import BoundsConfig
+from leco_plugin.scenes.input_error import require
 
 
 def _model() -> type:
@@ -58,7 +60,8 @@ class LecoModelConfig(GrowingConfig, ModelConfig):
     look_everywhere: float = 0.125
     """Share of rays that shade all candidates while the others follow the gate being learned."""
     likely_above: float = 0.05
-    """o(x) from which those others shade a candidate."""
+    """o(x) from which those others shade a candidate, at most 0.1: from there on the log counts it
+    as kept."""
     distortion_after: float = 0.04
     """Share of the distortion loss that stays when the first phase is over and detail is wanted."""
     front_to_back: bool | None = None
@@ -76,3 +79,9 @@ class LecoModelConfig(GrowingConfig, ModelConfig):
     """Where rays end, scene units; None is found from the data."""
     bounds: BoundsConfig = field(default_factory=BoundsConfig)
     """Where the scene lies, where the data do not say it right."""
+
+    def __post_init__(self) -> None:
+        everywhere, above = self.look_everywhere, self.likely_above
+        require(0.0 < everywhere <= 1.0, "look-everywhere", everywhere, "above 0 and at most 1")
+        within = f"from 0 to {KEPT_ABOVE}, from where on all that is kept is counted"
+        require(0.0 <= above <= KEPT_ABOVE, "likely-above", above, within)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Literal, Protocol
 
@@ -22,6 +23,7 @@ from leco_plugin.models.losses import (
     widen,
 )
 from leco_plugin.models.rendering import Intervals, Rays, Shaded, backdrop_of
+from leco_plugin.scenes.input_error import require
 
 DARK = 0.1
 """Brightness, of the largest channel, from which a pixel of a bounded scene shows something."""
@@ -55,6 +57,18 @@ class GateLossConfig:
     as Switch-NeRF does."""
     density: float = 1.0
     """lambda_d, weight of the density loss (paper form)."""
+
+    def __post_init__(self) -> None:
+        inside = "above 0 and below 1"
+        for name in ("contribution", "agreement", "balance", "imbalance", "density"):
+            weight = getattr(self, name)
+            require(0.0 <= weight < math.inf, f"gate-loss.{name}", weight, "a number, at least 0")
+        for option, value in (("weight-at-full", self.weight_at_full), ("emphasis", self.emphasis)):
+            require(0.0 < value < math.inf, f"gate-loss.{option}", value, "a number above 0")
+        below, ratio = self.empty_below, self.empty_ratio
+        require(0.0 < below < 1.0, "gate-loss.empty-below", below, inside)
+        asked = ratio is None or 0.0 < ratio < 1.0
+        require(asked, "gate-loss.empty-ratio", ratio, f"{inside}, or None for equal shares")
 
 
 class FieldLossWeights(Protocol):

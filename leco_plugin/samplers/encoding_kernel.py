@@ -14,10 +14,11 @@ from __future__ import annotations
 import triton
 import triton.language as tl
 
+from leco_plugin.models.encodings import PRIMES
 from leco_plugin.samplers.gate_weights import HASH, VM
 
 _HASH, _VM = tl.constexpr(HASH), tl.constexpr(VM)
-_PRIME_Y, _PRIME_Z = tl.constexpr(2654435761 - 2**32), tl.constexpr(805459861)
+_PRIME_Y, _PRIME_Z = (tl.constexpr(prime) for prime in PRIMES[1:])
 _ROUNDING = tl.constexpr(1.5 * 2**23)
 """Added to a number below 2^22 it leaves the nearest whole one, whose last bit says whether it is
 odd; rounding instructions run at an eighth of the rate of additions."""

@@ -14,6 +14,20 @@ class InputError(SystemExit, ValueError):
         return str(self.code)
 
 
+def require(holds: bool, option: str, value: object, wanted: str) -> None:
+    """Refuses the value of an option.
+
+    Args:
+        holds: whether the value will do.
+        option: as it is given, without the dashes before it.
+        wanted: the values that will do, as `at least 1`.
+    Raises:
+        InputError: it will not.
+    """
+    if not holds:
+        raise InputError(f"{option} is {value}; it must be {wanted}")
+
+
 def one_line(error: BaseException, most: int | None = None) -> str:
     """What an error says, in one line of at most so many characters; empty if it says nothing."""
     return " ".join(str(error).split())[:most]

@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
+from suite_minutes import minutes_together
 
 from leco_plugin import cli
 from leco_plugin.chart.configs import config_of
@@ -17,7 +18,6 @@ from leco_plugin.chart.suites import (
     SUITES,
     SWITCH_CELLS,
     in_order,
-    minutes_together,
     suite,
 )
 from leco_plugin.method_configs import LEARNING, ON_GPU

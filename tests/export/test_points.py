@@ -53,3 +53,20 @@ def test_an_occupancy_that_keeps_nothing_is_refused_in_one_line() -> None:
     assert "\n" not in str(error.value)
     with pytest.raises(ValueError, match="at least 2 cells"):
         kept_surface(ball(), 1)
+
+
+def test_slabs_do_not_change_the_surface(monkeypatch: pytest.MonkeyPatch) -> None:
+    whole = kept_surface(ball(), 20)
+    monkeypatch.setattr("leco_plugin.export.points.CELLS_AT_ONCE", 1000)
+    parts = kept_surface(ball(), 20)
+    assert torch.equal(whole.positions, parts.positions)
+    assert torch.equal(whole.values, parts.values)
+
+
+@pytest.mark.parametrize("resolution", [2000, 10**30])
+def test_more_cells_than_memory_holds_are_refused_before_the_gate_is_asked(
+    resolution: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("leco_plugin.export.points.query", None)
+    with pytest.raises(ValueError, match=f"^{resolution} along .* too many .* smaller --resol"):
+        kept_surface(ball(), resolution)

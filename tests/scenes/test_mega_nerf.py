@@ -142,10 +142,8 @@ def test_masks_of_a_cluster_come_from_their_folder(masked: Path, tmp_path: Path)
 
 
 def test_masks_that_keep_nothing_at_all_are_named(masked: Path) -> None:
-    from leco_plugin.scenes.mega_nerf_format.writer import write_mask
-
     for number in range(7):
-        write_mask(masked / "masks", f"{number:06d}", np.zeros((16, 24), bool))
+        mega_nerf_scene.write_mask(masked / "masks", f"{number:06d}", np.zeros((16, 24), bool))
     with pytest.raises(InputError, match="leave no pixel to train on"):
         parse(masked)
 

@@ -17,6 +17,7 @@ from torch import Tensor
 from leco_plugin.models.gate import occupancy_from_logits
 from leco_plugin.models.rendering import Intervals, Rays, Shaded, backdrop_of
 from leco_plugin.samplers.packed import accumulate_along_rays, inclusive_sum
+from leco_plugin.scenes.input_error import require
 
 THRESHOLDS = tuple(0.75 * 0.8**i for i in range(32))
 """Tried from the largest down, to 0.0007; below that a gate that fails is kept out of use (0)."""
@@ -55,6 +56,17 @@ class CalibrationConfig:
     steps_per_recheck: int = 100
     """Fewest steps between two such measurements, also after one by which a host skips less; else
     more where they take over 1% of the time."""
+
+    def __post_init__(self) -> None:
+        fewest = {"rays": 1, "rays_at_once": 1, "recheck_rays": 0, "steps_per_recheck": 1}
+        for name, least in fewest.items():
+            value = getattr(self, name)
+            option = f"calibration.{name.replace('_', '-')}"
+            require(value >= least, option, value, f"at least {least}")
+        for name in ("lost_surface_mass", "image_price_db"):
+            value = getattr(self, name)
+            option = f"calibration.{name.replace('_', '-')}"
+            require(0.0 <= value < math.inf, option, value, "a number, at least 0")
 
 
 class Measured(NamedTuple):

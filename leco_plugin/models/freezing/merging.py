@@ -8,6 +8,7 @@ stays as it is, and with it o(x) and everything that is skipped.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, NamedTuple
@@ -19,6 +20,7 @@ from leco_plugin.models.compute.ranks import from_first, say
 from leco_plugin.models.freezing.calibration import EXACT, near_median_depth, price_db
 from leco_plugin.models.freezing.held_out_rendering import evaluating
 from leco_plugin.models.rendering import Intervals, Rays
+from leco_plugin.scenes.input_error import require
 
 if TYPE_CHECKING:
     from leco_plugin.models.leco import LecoModel
@@ -31,9 +33,15 @@ class MergingConfig:
     image_price_db: float | None = 0.01
     """Largest loss of PSNR on held-out rays for which scene experts are dropped, all together, dB.
     It comes on top of `calibration.image_price_db`, beyond which a price may lie by a standard
-    error. None drops none."""
+    error. None drops none; below 0 the image must gain as much by it."""
     rays: int = 2048
     """Held-out training rays to measure with."""
+
+    def __post_init__(self) -> None:
+        price = self.image_price_db
+        known = price is None or not math.isnan(price)
+        require(known, "merging.image-price-db", price, "a number, or None to drop none")
+        require(self.rays >= 1, "merging.rays", self.rays, "at least 1")
 
 
 class Trial(NamedTuple):

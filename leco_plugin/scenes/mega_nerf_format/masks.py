@@ -1,4 +1,6 @@
-"""Masks of Mega-NeRF's format: a zip that holds a .pt file of the same name."""
+"""Masks of Mega-NeRF's format: masks/<stem>.pt is a zip that holds <stem>.pt, a tensor of bool
+[H, W]: which pixels of a picture to keep.
+"""
 
 from __future__ import annotations
 

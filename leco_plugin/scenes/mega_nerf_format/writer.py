@@ -1,16 +1,13 @@
-"""Writes Mega-NeRF's format, picture by picture.
+"""Writes Mega-NeRF's format, picture by picture, without masks.
 
 coordinates.pt                    origin_drb [3] metres, pose_scale_factor in metres
 mappings.txt                      "<original name>,<metadata file>" in each line
 train|val/rgbs/<stem>.png         the pictures
 train|val/metadata/<stem>.pt      H, W, c2w [3, 4], intrinsics [4], distortion [4]
-masks/<stem>.pt                   a zip that holds <stem>.pt, bool [H, W]: which pixels to keep
 """
 
 from __future__ import annotations
 
-import io
-import zipfile
 from pathlib import Path
 from typing import Any, Literal
 
@@ -66,15 +63,3 @@ def write_view(
     rgb, data = folder / split / "rgbs" / f"{stem}.png", folder / split / "metadata" / f"{stem}.pt"
     write_whole(rgb, lambda file: Image.fromarray(image).save(file, format="PNG"))
     write_whole(data, lambda file: torch.save(metadata, file))
-
-
-def write_mask(folder: Path, stem: str, keep: NDArray[np.bool_]) -> None:
-    """Writes the mask [H, W] of a picture into `folder`; False leaves a pixel out of training."""
-    inside = io.BytesIO()
-    torch.save(torch.from_numpy(np.ascontiguousarray(keep)), inside)
-
-    def pack(file: Any) -> None:
-        with zipfile.ZipFile(file, "w", zipfile.ZIP_DEFLATED) as archive:
-            archive.writestr(f"{stem}.pt", inside.getvalue())
-
-    write_whole(folder / f"{stem}.pt", pack)

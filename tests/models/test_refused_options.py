@@ -1,0 +1,99 @@
+"""Options of the model that cannot work are refused when they are given, in one line."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from typing import Any
+
+import pytest
+import tyro
+
+from leco_plugin.models.freezing.calibration import CalibrationConfig
+from leco_plugin.models.freezing.merging import MergingConfig
+from leco_plugin.models.learning.phases import ScheduleConfig
+from leco_plugin.models.learning.statistics import KEPT_ABOVE
+from leco_plugin.models.leco_config import LecoModelConfig
+from leco_plugin.models.objective import GateLossConfig
+from leco_plugin.scenes.input_error import InputError
+
+NO_NUMBERS = (math.nan, math.inf)
+REFUSED: dict[tuple[Any, str], tuple[Any, ...]] = {
+    (ScheduleConfig(), "learn_steps"): (0, -1),
+    (CalibrationConfig(), "rays"): (0, -1),
+    (CalibrationConfig(), "rays_at_once"): (0, -1),
+    (CalibrationConfig(), "recheck_rays"): (-1,),
+    (CalibrationConfig(), "steps_per_recheck"): (0, -1),
+    (CalibrationConfig(), "lost_surface_mass"): (-1e-6, *NO_NUMBERS),
+    (CalibrationConfig(), "image_price_db"): (-1e-6, *NO_NUMBERS),
+    (MergingConfig(), "rays"): (0, -1),
+    (MergingConfig(), "image_price_db"): (math.nan,),
+}
+REFUSED_OF_THE_GATE: dict[str, tuple[float, ...]] = {
+    **dict.fromkeys(("contribution", "agreement", "balance"), (-1e-6, *NO_NUMBERS)),
+    **dict.fromkeys(("imbalance", "density"), (-1e-6, *NO_NUMBERS)),
+    **dict.fromkeys(("weight_at_full", "emphasis"), (0.0, -1.0, *NO_NUMBERS)),
+    **dict.fromkeys(("empty_below", "empty_ratio"), (0.0, 1.0, 1.5, -0.5, math.nan)),
+}
+REFUSED_OF_THE_MODEL: dict[str, tuple[float, ...]] = {
+    "look_everywhere": (0.0, -0.1, 1.1, math.nan),
+    "likely_above": (-0.1, KEPT_ABOVE + 1e-6, 1.0, math.nan),
+}
+ALLOWED: dict[Any, dict[str, Any]] = {
+    CalibrationConfig(): {"recheck_rays": 0, "lost_surface_mass": 0.0, "image_price_db": 0.0},
+    MergingConfig(): {"image_price_db": -0.01, "rays": 1},
+}
+
+
+def name_of(field: str) -> str:
+    """As it is given on the command line."""
+    return field.replace("_", "-")
+
+
+@pytest.mark.parametrize(
+    ("config", "field", "value"),
+    [
+        *((config, field, value) for (config, field), some in REFUSED.items() for value in some),
+        *(
+            (GateLossConfig(), f, value)
+            for f, some in REFUSED_OF_THE_GATE.items()
+            for value in some
+        ),
+        *((LecoModelConfig(), f, v) for f, some in REFUSED_OF_THE_MODEL.items() for v in some),
+    ],
+)
+def test_a_value_that_cannot_work_is_named_with_what_would(
+    config: Any, field: str, value: float
+) -> None:
+    with pytest.raises(InputError, match=f"{name_of(field)} is {value}; it ") as refused:
+        replace(config, **{field: value})
+    assert "\n" not in str(refused.value)
+
+
+def test_the_ends_of_what_works_are_allowed() -> None:
+    for config, values in ALLOWED.items():
+        for field, value in values.items():
+            assert getattr(replace(config, **{field: value}), field) == value
+    assert GateLossConfig(empty_ratio=None, density=0.0).empty_ratio is None
+    assert LecoModelConfig(look_everywhere=1.0, likely_above=0.0).look_everywhere == 1.0
+    assert LecoModelConfig(likely_above=KEPT_ABOVE).likely_above == KEPT_ABOVE
+
+
+@pytest.mark.parametrize(
+    ("option", "value"),
+    [
+        ("gate-loss.empty-ratio", "1.5"),
+        ("calibration.rays-at-once", "0"),
+        ("merging.rays", "0"),
+        ("likely-above", "0.3"),
+    ],
+)
+def test_on_the_command_line_it_ends_with_status_2(
+    option: str, value: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with pytest.raises(SystemExit) as end:
+        tyro.cli(LecoModelConfig, args=[f"--{option}", value])
+    assert end.value.code == 2
+    said = capsys.readouterr().err
+    assert f"{option} is {value}; it must be" in " ".join(said.replace("│", " ").split())
+    assert "Traceback" not in said
