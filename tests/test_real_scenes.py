@@ -3,26 +3,42 @@
 from __future__ import annotations
 
 import copy
+import math
 from pathlib import Path
 from typing import Any
 
 import pytest
 import torch
+from nerfstudio.cameras.rays import RayBundle
+from torch import Tensor
 
-from leco_plugin.evaluation.held_out_images import psnr_on_rays
 from leco_plugin.evaluation.timed_run import run_training
 from leco_plugin.host_configs import switch_nerf
 from leco_plugin.method_configs import leco_occupancy
 from leco_plugin.models.freezing.calibration import CalibrationConfig
 from leco_plugin.models.freezing.freezing import FILE_NAME
+from leco_plugin.models.freezing.held_out_rendering import evaluating, held_out_bundle
 from leco_plugin.occupancy import Occupancy
 
-SCATTER = 0.5
-"""dB by which some 20 steps of 128 rays may miss what they began with: on `fox` they gained from
-0.3 to more than 2 from one run to the next."""
+LEAST = 0.3
+"""dB that some 20 steps of 128 rays gain on 512 pixels which are the same before and after: of 23
+runs, each with a seed of its own, the least was 0.9 (`banana`, which begins at 18.5 dB)."""
 KINDS = {"brighton_beach": "box", "caliterra": "box", "banana": "box", "fox": "contraction"}
 
 OUTPUTS = {"rgb", "depth", "accumulation", "occupancy", "expert", "samples_per_ray"}
+
+
+def some_pixels(trainer: Any) -> tuple[RayBundle, Tensor]:
+    """Rays of the scene's training images, always the same, and their colours."""
+    return held_out_bundle(trainer.pipeline.datamanager, 512)
+
+
+@torch.no_grad()
+def psnr_on(trainer: Any, rays: RayBundle, truth: Tensor) -> float:
+    """Of those pixels, dB."""
+    with evaluating(trainer.pipeline.model):
+        rgb = trainer.pipeline.model.get_outputs(rays)["rgb"]
+    return -10.0 * math.log10(float((rgb - truth[:, :3]).square().mean()))
 
 
 def assert_renders(trainer: Any) -> None:
@@ -59,13 +75,13 @@ def test_a_scene_trains_freezes_and_renders_without_a_flag(
     config.set_timestamp()
     trainer = config.setup(local_rank=0, world_size=1)
     trainer.setup()
-    untrained = psnr_on_rays(trainer, 200)
+    pixels = some_pixels(trainer)
+    untrained = psnr_on(trainer, *pixels)
     run_training(trainer)
     model = trainer.pipeline.model
     assert bool(model.frozen)
     assert model.space.kind == KINDS[name]
-    trained = psnr_on_rays(trainer, 200)
-    assert trained > untrained - SCATTER
+    assert psnr_on(trainer, *pixels) > untrained + LEAST
     assert_renders(trainer)
     occupancy = Occupancy.load(trainer.base_dir / FILE_NAME)
     assert occupancy.report["held_out"]
@@ -92,8 +108,8 @@ def test_switch_nerf_trains_and_renders_without_a_flag(
     config.set_timestamp()
     trainer = config.setup(local_rank=0, world_size=1)
     trainer.setup()
-    untrained = psnr_on_rays(trainer, 200)
+    pixels = some_pixels(trainer)
+    untrained = psnr_on(trainer, *pixels)
     run_training(trainer)
     assert trainer.pipeline.model.space.kind == KINDS[name]
-    trained = psnr_on_rays(trainer, 200)
-    assert trained > untrained - SCATTER
+    assert psnr_on(trainer, *pixels) > untrained + LEAST
