@@ -177,7 +177,8 @@ def _draw_picture(trainer: Trainer, occupancy: Occupancy, truth: CityTruth, path
     pipeline.train()
     rgb = outputs["rgb"].clamp(0.0, 1.0)
     photograph = true_colours(model, dataset.get_data(number)["image"].to(rgb.device))
-    depth = (outputs["depth"][..., 0] / truth.scale).cpu()
+    met = outputs["accumulation"][..., 0] > 0.5
+    depth = (outputs["depth"][..., 0] / truth.scale).where(met, torch.nan).cpu()
     samples = float(outputs["samples_per_ray"].mean())
     draw_panels(photograph.cpu(), rgb.cpu(), samples, depth, occupancy, truth, path)
 
@@ -196,14 +197,14 @@ def draw_panels(
     Args:
         photograph, rgb: [H, W, 3] in [0, 1].
         samples: a ray, mean over the image.
-        depth: [H, W] in metres.
+        depth: [H, W] in metres, NaN where nothing is met.
         occupancy, truth: in the same coordinates.
         path: of the picture.
     """
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
-    seen = torch.quantile(depth, torch.tensor([0.01, 0.95])).tolist()
+    seen = torch.nanquantile(depth, torch.tensor([0.01, 0.99])).nan_to_num().tolist()
     # letters of this size can still be read where a page shows the picture half as wide
     figure = Figure(figsize=(11, 2.9), layout="constrained", facecolor="white")
     FigureCanvasAgg(figure)

@@ -69,6 +69,7 @@ def seconds_of_ended_processes() -> float:
     return used.ru_utime + used.ru_stime
 
 
+@pytest.mark.long
 def test_every_line_is_exercised_without_a_gpu() -> None:
     command = [sys.executable, str(HERE / "gpu_suite_traced.py")]
     done = subprocess.run(
