@@ -36,8 +36,9 @@ def some_pixels(trainer: Any) -> tuple[RayBundle, Tensor]:
 @torch.no_grad()
 def psnr_on(trainer: Any, rays: RayBundle, truth: Tensor) -> float:
     """Of those pixels, dB."""
-    with evaluating(trainer.pipeline.model):
-        rgb = trainer.pipeline.model.get_outputs(rays)["rgb"]
+    model = trainer.pipeline.model
+    with evaluating(model):
+        rgb = model.get_outputs(rays.to(model.device))["rgb"].cpu()
     return -10.0 * math.log10(float((rgb - truth[:, :3]).square().mean()))
 
 

@@ -28,7 +28,7 @@ class Cores:
 FAST = Cores(step=0.15, overhead=30.0, unguided=25.0, grids=100.0)
 """An AMD EPYC with AVX-512 bfloat16; cities, and surveys of 480 x 360 pixels."""
 SLOW = Cores(step=0.45, overhead=45.0, unguided=60.0, grids=100.0)
-"""A Xeon with it at half that speed, whose caches are shared with other machines."""
+"""A Xeon with it at a third of that speed, whose caches are shared with other machines."""
 
 
 def run_seconds(contender: Contender, protocol: Protocol, cores: Cores) -> float:

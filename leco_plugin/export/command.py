@@ -36,7 +36,8 @@ def export(
     if format == "ply":
         from leco_plugin.export.points import kept_surface, write_ply
 
-        surface = kept_surface(occupancy, resolution)
+        with bar(f"Asking the gate about cells of 1/{resolution}") as show:
+            surface = kept_surface(occupancy, resolution, show)
         write_ply(surface, out)
         facts: dict[str, Any] = {"points": len(surface.positions)}
     else:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -30,12 +30,15 @@ class KeptSurface(NamedTuple):
     """[P] o(x)."""
 
 
-def kept_surface(occupancy: Occupancy, resolution: int) -> KeptSurface:
+def kept_surface(
+    occupancy: Occupancy, resolution: int, on_progress: Callable[[float], None] | None = None
+) -> KeptSurface:
     """Where the kept set ends.
 
     Args:
         resolution: cells along the longest side of the space in which the gate was taught. Those of
             an unbounded scene grow with distance, as its mapping has it.
+        on_progress: called with the share that is done.
     Raises:
         ValueError: the resolution is below 2 or makes too many cells, or nothing is kept.
     """
@@ -45,13 +48,15 @@ def kept_surface(occupancy: Occupancy, resolution: int) -> KeptSurface:
     counts = box.cells(min(resolution, MOST_CELLS))  # which are too many along one side alone
     require_few(math.prod(counts), f"{resolution} along the longest side")
     axes = [box.axis(number, count) for number, count in enumerate(counts)]
-    layers = max(1, CELLS_AT_ONCE // (counts[1] * counts[2]))
-    values = torch.cat(
-        [
-            query(occupancy, _positions(occupancy, torch.meshgrid(x, *axes[1:], indexing="ij")))
-            for x in axes[0].split(layers)
-        ]
-    )
+    cells, parts = math.prod(counts), []
+    for first in range(0, cells, CELLS_AT_ONCE):
+        numbers = torch.arange(first, min(first + CELLS_AT_ONCE, cells))
+        indices = torch.unravel_index(numbers, counts)
+        places = [axis[index] for axis, index in zip(axes, indices)]
+        parts.append(query(occupancy, _positions(occupancy, places)))
+        if on_progress is not None:
+            on_progress((first + len(numbers)) / cells)
+    values = torch.cat(parts).view(*counts)
     chosen = exposed(values >= occupancy.threshold)
     if not bool(chosen.any()):
         raise ValueError(

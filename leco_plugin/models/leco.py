@@ -47,7 +47,7 @@ from leco_plugin.models.sizing.stored_sizes import SIZES, stored_in, to_store
 from leco_plugin.occupancy import Occupancy, gate_precision
 from leco_plugin.samplers.estimator import LearnedOccupancyEstimator
 from leco_plugin.samplers.marching import march
-from leco_plugin.scenes.bounds import SceneBounds
+from leco_plugin.scenes.bounds import SceneBounds, with_range
 from leco_plugin.scenes.pixels.known_distances import DISTANCE
 from leco_plugin.space import Space
 
@@ -134,7 +134,8 @@ class LecoModel(Model):
         Raises:
             InputError: the configured range is empty or begins at the camera.
         """
-        near, far = bounds.range(self.config.near, self.config.far)
+        bounds = with_range(bounds, self.config.near, self.config.far)
+        near, far = bounds.near, bounds.far
         self.space.set(bounds.kind, bounds.center, bounds.half_extent)
         self.aabb.copy_(bounds.aabb)
         sizes, kind = self.config.sizes, bounds.kind
@@ -276,7 +277,11 @@ class LecoModel(Model):
 
     def get_outputs(self, ray_bundle: RayBundle) -> dict[str, Any]:  # type: ignore[override]
         """Pixels of rays; in training also what losses and log need: `shaded`, `intervals`, `rays`,
-        and `kept_rule`, the last three arguments of `kept_fraction`."""
+        and `kept_rule`, the last three arguments of `kept_fraction`.
+
+        In training accumulation and depth are those that losses see, with the backdrop; in
+        evaluation the backdrop is nothing met.
+        """
         rays = self.rays_of(ray_bundle)
         frozen, threshold = bool(self.frozen), float(self.threshold)
         guided = frozen and threshold > 0.0  # at 0 nothing is skipped
@@ -292,13 +297,19 @@ class LecoModel(Model):
             shaded, intervals = self.shade_what_is_seen(rays, intervals)
         else:
             shaded = self.shade(rays, intervals)
-        met, shown = before_the_backdrop(shaded, intervals, rays)
-        outputs: dict[str, Any] = {"rgb": shaded.rgb, **shown}
         if self.training:
-            rule = (threshold if frozen else KEPT_ABOVE, *self.step_and_angle(learning))
-            batch_of = {"shaded": shaded, "intervals": intervals, "rays": rays}
-            return outputs | batch_of | {"kept_rule": rule}
-        return outputs | gate_pictures(met, intervals.ray_indices)
+            above = threshold if frozen else max(KEPT_ABOVE, self.config.likely_above)
+            return {
+                "rgb": shaded.rgb,
+                "depth": shaded.depth[:, None],
+                "accumulation": shaded.accumulation[:, None],
+                "shaded": shaded,
+                "intervals": intervals,
+                "rays": rays,
+                "kept_rule": (above, *self.step_and_angle(learning)),
+            }
+        met, shown = before_the_backdrop(shaded, intervals, rays)
+        return {"rgb": shaded.rgb, **shown, **gate_pictures(met, intervals.ray_indices)}
 
     def get_rgba_image(self, outputs: dict[str, Tensor], output_name: str = "rgb") -> Tensor:
         """Colours with what was met before the backdrop as their alpha, [..., 4]."""

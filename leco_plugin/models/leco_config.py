@@ -11,7 +11,6 @@ from leco_plugin.models.freezing.calibration import CalibrationConfig
 from leco_plugin.models.freezing.merging import MergingConfig
 from leco_plugin.models.learning.phases import ScheduleConfig
 from leco_plugin.models.learning.prior import PriorConfig
-from leco_plugin.models.learning.statistics import KEPT_ABOVE
 from leco_plugin.models.objective import GateLossConfig
 from leco_plugin.models.sizing.sizes import SMALL, Sizes
 from leco_plugin.occupancy import Precision
@@ -82,6 +81,5 @@ class LecoModelConfig(GrowingConfig, ModelConfig):
 
     def __post_init__(self) -> None:
         everywhere, above = self.look_everywhere, self.likely_above
-        require(0.0 < everywhere <= 1.0, "look-everywhere", everywhere, "above 0 and at most 1")
-        within = f"from 0 to {KEPT_ABOVE}, from where on all that is kept is counted"
-        require(0.0 <= above <= KEPT_ABOVE, "likely-above", above, within)
+        require(0.0 <= everywhere <= 1.0, "look-everywhere", everywhere, "from 0 to 1")
+        require(0.0 <= above < 1.0, "likely-above", above, "at least 0 and below 1")

@@ -6,11 +6,13 @@ asks for opacities, and no export makes points of it.
 
 from __future__ import annotations
 
+import warnings
+
 import torch
 from torch import Tensor
 
 from leco_plugin.models.gate import EMPTY, occupancy_from_logits
-from leco_plugin.models.rendering import Intervals, Rays, Shaded, backdrop_of, sum_up
+from leco_plugin.models.rendering import MET, Intervals, Rays, Shaded, backdrop_of, sum_up
 from leco_plugin.samplers.packed import accumulate_along_rays
 
 NONE = -1
@@ -24,8 +26,8 @@ def before_the_backdrop(
     """A rendering with weights, accumulation and depth of what lies before the backdrop alone.
 
     Returns:
-        That rendering, and its `depth` and `accumulation`, [R, 1] each. A ray that meets nothing
-        has depth `t_maxs`, scene units.
+        That rendering, and its `depth` and `accumulation`, [R, 1] each. A ray with an accumulation
+        below `MET` meets nothing, and has depth `t_maxs`, scene units.
     """
     met = shaded.weights.detach().masked_fill(backdrop_of(intervals, rays), 0.0)
     accumulation, depth = sum_up(met, rays, intervals)
@@ -38,8 +40,8 @@ def gate_pictures(met: Shaded, ray_indices: Tensor) -> dict[str, Tensor]:
     """What the gate did along each ray, for the viewer: each [R, 1] float32.
 
     `occupancy` is o(x), averaged with the rendering weights; `expert` the number of the one with
-    the greatest weight, 0 for the empty-space expert and where nothing is met; `samples_per_ray` a
-    float because nerfstudio cannot show integers.
+    the greatest weight, 0 for the empty-space expert; both are 0 where nothing is met.
+    `samples_per_ray` is a float because nerfstudio cannot show integers.
 
     Args:
         met: without the weight of backdrops.
@@ -48,8 +50,9 @@ def gate_pictures(met: Shaded, ray_indices: Tensor) -> dict[str, Tensor]:
     occupancies = occupancy_from_logits(met.logits)[:, None]
     seen = accumulate_along_rays(met.weights, occupancies, ray_indices, len(met.rgb))
     expert = leading_expert(met, ray_indices, met.logits.shape[-1])
+    met_something = met.accumulation[:, None] >= MET
     return {
-        "occupancy": seen / met.accumulation.clamp(min=1e-6)[:, None],
+        "occupancy": (seen / met.accumulation.clamp(min=MET)[:, None]).where(met_something, 0.0),
         "expert": expert.clamp(min=EMPTY).float(),
         "samples_per_ray": met.packed_info[:, 1:].float(),
     }
@@ -66,15 +69,23 @@ def leading_expert(met: Shaded, ray_indices: Tensor, experts: int) -> Tensor:
     """
     sums = met.weights.new_zeros(len(met.rgb) * experts)
     sums.index_add_(0, ray_indices * experts + met.routes, met.weights)
-    most, expert = sums.view(-1, experts).max(dim=-1, keepdim=True)
-    return expert.where(most > 0.0, NONE)
+    expert = sums.view(-1, experts).argmax(dim=-1, keepdim=True)
+    return expert.where(met.accumulation[:, None] >= MET, NONE)
 
 
 def with_alpha(outputs: dict[str, Tensor], output_name: str) -> Tensor:
     """A colour picture with what was met before the backdrop as its alpha, [..., 4].
 
+    Warns where nothing is met at all, for nerfstudio's exporter goes on until it has met enough.
+
     Args:
         output_name: of the picture, `rgb` somewhere in it.
     """
     accumulation = outputs[output_name.replace("rgb", "accumulation")]
+    if not bool((accumulation >= MET).any()):
+        warnings.warn(
+            "none of these rays meets anything but the backdrop: an export finds no points there, "
+            "and waits for ever if that is so everywhere, as in a run of a few steps",
+            stacklevel=3,
+        )
     return torch.cat([outputs[output_name], accumulation], dim=-1)

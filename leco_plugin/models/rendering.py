@@ -26,6 +26,10 @@ of a step of an 8-bit image at most, a ray that is nothing but such haze by a fe
 OPAQUE = 1e6
 """Density, per half extent, that is added to the backdrop."""
 
+MET = 0.5
+"""Accumulation from which a ray meets something, as nerfstudio's exporter has it. Below it there is
+haze, whose distance is nobody's."""
+
 
 class Rays(NamedTuple):
     """A batch of rays."""
@@ -39,7 +43,7 @@ class Rays(NamedTuple):
     t_maxs: Tensor
     """[R] where each ray ends."""
     images: Tensor | None
-    """[R] int64 of the training image, or None at evaluation."""
+    """[R] int64 of the training image whose appearance is shown, or None for the mean of all."""
 
 
 class Intervals(NamedTuple):
@@ -283,7 +287,10 @@ def composite(
 
 
 def sum_up(weights: Tensor, rays: Rays, intervals: Intervals) -> tuple[Tensor, Tensor]:
-    """Accumulation and expected depth of rays, both [R]; one that meets nothing has its end."""
+    """Accumulation and expected depth of rays, both [R]; one that meets nothing has its end.
+
+    Depth is that of what is met, so that a leaf half transparent is not moved towards the sky.
+    """
     middles = 0.5 * (intervals.t_starts + intervals.t_ends)
     sums = accumulate_along_rays(
         weights,
@@ -292,5 +299,5 @@ def sum_up(weights: Tensor, rays: Rays, intervals: Intervals) -> tuple[Tensor, T
         len(rays.origins),
     )
     accumulation = sums[:, 0]
-    depth = torch.where(accumulation > 1e-6, sums[:, 1] / accumulation.clamp(min=1e-6), rays.t_maxs)
+    depth = torch.where(accumulation >= MET, sums[:, 1] / accumulation.clamp(min=MET), rays.t_maxs)
     return accumulation, depth

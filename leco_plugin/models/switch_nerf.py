@@ -37,7 +37,7 @@ from leco_plugin.models.switch.objective import switch_losses, switch_statistics
 from leco_plugin.models.switch.rendering import coarse_and_fine, kept_by, render
 from leco_plugin.occupancy import gate_precision
 from leco_plugin.samplers.grid import OccupancyGridEstimator
-from leco_plugin.scenes.bounds import SceneBounds
+from leco_plugin.scenes.bounds import SceneBounds, with_range
 from leco_plugin.scenes.input_error import InputError
 from leco_plugin.scenes.survey import announce, survey
 from leco_plugin.space import Space
@@ -129,7 +129,8 @@ class SwitchNerfModel(Model):
         Raises:
             InputError: the configured range is empty or begins at the camera.
         """
-        near, far = bounds.range(self.config.near, self.config.far)
+        bounds = with_range(bounds, self.config.near, self.config.far)
+        near, far = bounds.near, bounds.far
         self.space.set(bounds.kind, bounds.center, bounds.half_extent)
         self.aabb.copy_(bounds.aabb)
         rule = marching_rule(bounds.kind, near, far, self.config.sizes.candidates, median_length)

@@ -59,20 +59,6 @@ class SceneBounds:
     from_above: bool = False
     """Whether planes were found for it because it was photographed from above."""
 
-    def range(self, near: float | None, far: float | None) -> tuple[float, float]:
-        """Where rays begin and end, as found unless it is said.
-
-        Args:
-            near, far: as configured, scene units; None is not.
-        Raises:
-            InputError: the range is empty or begins at the camera.
-        """
-        begin = self.near if near is None else near
-        end = self.far if far is None else far
-        if not 0.0 < begin < end:
-            raise InputError(f"rays need 0 < near < far, got near {begin:g} and far {end:g}")
-        return begin, end
-
 
 def find_bounds(
     camera_to_worlds: Tensor,
@@ -132,11 +118,11 @@ def with_range(bounds: SceneBounds, near: float | None, far: float | None) -> Sc
     """The bounds with near and far set by hand; None leaves what was found.
 
     Raises:
-        ValueError: the range is empty or begins at the camera.
+        InputError: the range is empty or begins at the camera.
     """
     near, far = bounds.near if near is None else near, bounds.far if far is None else far
     if not 0.0 < near < far < math.inf:
-        raise ValueError(f"rays need 0 < near < far, got near {near:g} and far {far:g}")
+        raise InputError(f"rays need 0 < near < far, got near {near:g} and far {far:g}")
     return replace(bounds, near=near, far=far)
 
 

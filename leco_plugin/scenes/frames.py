@@ -6,6 +6,7 @@ coordinates of one is asked in those of another.
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Any
 
 import torch
@@ -31,6 +32,27 @@ def parsed_frame(outputs: Any) -> Tensor:
     return float(outputs.dataparser_scale) * transform
 
 
+APPLIED_EARLIER = [[0.0, 1.0, 0.0, 0.0], [1.0, 0.0, 0.0, 0.0], [0.0, 0.0, -1.0, 0.0]]
+"""What ns-process-data did to COLMAP's coordinates before files said so, as nerfstudio takes it."""
+FLAT = 1e-6
+"""Volume, of that of a cube with the longest side, below which a transform leads nowhere back."""
+
+
+def applied_in(meta: dict[str, Any], folder: Path) -> tuple[Any, float]:
+    """What was done to the scene's coordinates before a transforms.json was written.
+
+    Args:
+        meta: what the file says.
+        folder: that it lies in.
+    Returns:
+        `applied_transform` [3, 4], or None, and `applied_scale`.
+    """
+    applied = meta.get("applied_transform")
+    if applied is None and (folder / "colmap/sparse/0").exists():
+        applied = APPLIED_EARLIER
+    return applied, float(meta.get("applied_scale", 1.0))
+
+
 def from_file(
     frame: list[list[float]] | Tensor,
     applied_transform: list[list[float]] | None,
@@ -42,16 +64,18 @@ def from_file(
 
     Args:
         frame: [3, 4] from the scene's coordinates, as of `frame_of`.
-        applied_transform: [3, 4] of that file; None where it has none.
-        applied_scale: of that file.
+        applied_transform, applied_scale: of that file, as of `applied_in`.
     Raises:
         ValueError: they are not finite, or lead nowhere back.
     """
     frame = torch.as_tensor(frame, dtype=torch.float64)
     applied = torch.eye(3, 4) if applied_transform is None else applied_transform
     matrix = torch.as_tensor(applied, dtype=torch.float64)
-    if matrix.shape not in ((3, 4), (4, 4)) or not 1e-9 < abs(matrix[:3, :3].det()) < torch.inf:
-        raise ValueError("the applied_transform is no [3, 4] matrix that can be undone")
+    if matrix.shape not in ((3, 4), (4, 4)) or not bool(matrix.isfinite().all()):
+        raise ValueError("the applied_transform is no finite [3, 4] matrix")
+    longest = float(matrix[:3, :3].norm(dim=0).max())
+    if not abs(float(matrix[:3, :3].det())) > FLAT * longest**3:
+        raise ValueError("the applied_transform is flat, and cannot be undone")
     if not 0.0 < applied_scale < torch.inf:
         raise ValueError(f"the applied_scale is {applied_scale}, not a positive number")
     back = inverse(matrix[:3])

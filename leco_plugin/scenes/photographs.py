@@ -16,11 +16,12 @@ import torch
 from nerfstudio.data.dataparsers.base_dataparser import DataparserOutputs
 from nerfstudio.data.dataparsers.nerfstudio_dataparser import Nerfstudio, NerfstudioDataParserConfig
 from nerfstudio.plugins.registry_dataparser import DataParserSpecification
+from rich.markup import escape
 from torch import Tensor
 
 from leco_plugin.models.compute.ranks import say
 from leco_plugin.scenes.dataset_units import METRES_PER_UNIT, UP_IS_KNOWN
-from leco_plugin.scenes.frames import from_file, moved, parsed_frame
+from leco_plugin.scenes.frames import applied_in, from_file, moved, parsed_frame
 from leco_plugin.scenes.input_error import InputError, one_line
 from leco_plugin.scenes.photograph_files import check_images, check_smaller_images
 from leco_plugin.scenes.photograph_intrinsics import check_intrinsics
@@ -31,8 +32,6 @@ POINTS = "leco_sparse_points"
 """Key of the dataset's metadata with the sparse points [P, 3] in model coordinates."""
 POINT_KEYS = (POINTS, "points3D_xyz")
 """Ours, and that of nerfstudio's own readers."""
-APPLIED_EARLIER = [[0.0, 1.0, 0.0, 0.0], [1.0, 0.0, 0.0, 0.0], [0.0, 0.0, -1.0, 0.0]]
-"""What ns-process-data did to COLMAP's coordinates before files said so, as nerfstudio takes it."""
 
 
 @dataclass
@@ -67,23 +66,23 @@ class LecoPhotographs(Nerfstudio):
             raise InputError(f"{self.config.data}: no image is left for the split {split!r}")
         if self.downscale_factor != 1:
             check_smaller_images(outputs.image_filenames, outputs.cameras)
+        frame, applied_scale = self._frame_of_file(outputs, meta)
         points = read_points(meta, folder_of(self.config.data))
         if points is not None:
-            outputs.metadata[POINTS] = moved(points, self._frame_of_file(outputs, meta))
+            outputs.metadata[POINTS] = moved(points, frame)
         if up_is_known:
             outputs.metadata[UP_IS_KNOWN] = True
         if "metres_per_unit" in meta:
-            outputs.metadata[METRES_PER_UNIT] = _metres(meta, self.config.data)
+            outputs.metadata[METRES_PER_UNIT] = applied_scale * _metres(meta, self.config.data)
         return outputs
 
-    def _frame_of_file(self, outputs: DataparserOutputs, meta: dict[str, Any]) -> Tensor:
-        """What took positions in the file to the model's: [3, 4]."""
-        applied = meta.get("applied_transform")
-        if applied is None and (self.config.data / "colmap/sparse/0").exists():
-            applied = APPLIED_EARLIER
+    def _frame_of_file(
+        self, outputs: DataparserOutputs, meta: dict[str, Any]
+    ) -> tuple[Tensor, float]:
+        """What took positions in the file to the model's [3, 4], and what had scaled them."""
         try:
-            scale = float(meta.get("applied_scale", 1.0))
-            return from_file(parsed_frame(outputs), applied, scale)
+            applied, scale = applied_in(meta, self.config.data)
+            return from_file(parsed_frame(outputs), applied, scale), scale
         except (ValueError, TypeError, RuntimeError) as error:
             raise InputError(f"{self.config.data} cannot be read: {one_line(error, 120)}") from None
 
@@ -172,7 +171,7 @@ def read_points(meta: dict[str, Any], folder: Path) -> Tensor | None:
         return None
     path = folder / str(name)
     if not path.is_file():
-        say(f"sparse points {path} are named by the scene and not there: going on without any")
+        say(f"the scene names sparse points that are not there: {escape(str(path))}")
         return None
     return read_ply(path)
 

@@ -275,9 +275,7 @@ def _seen(
 ) -> Seen:
     model = source.model
     if model is not None:
-        model.train(of_training)  # rays know their training image, and so its appearance
-        rays = model.rays_of(bundle.to(model.device))
-        model.eval()
+        rays = model.rays_of(bundle.to(model.device), with_images=of_training)
         return Seen(rays, truth.to(model.device).float())
     assert occupancy is not None
     bundle = bundle.to(occupancy.walls.device)

@@ -12,7 +12,6 @@ import tyro
 from leco_plugin.models.freezing.calibration import CalibrationConfig
 from leco_plugin.models.freezing.merging import MergingConfig
 from leco_plugin.models.learning.phases import ScheduleConfig
-from leco_plugin.models.learning.statistics import KEPT_ABOVE
 from leco_plugin.models.leco_config import LecoModelConfig
 from leco_plugin.models.objective import GateLossConfig
 from leco_plugin.scenes.input_error import InputError
@@ -36,8 +35,8 @@ REFUSED_OF_THE_GATE: dict[str, tuple[float, ...]] = {
     **dict.fromkeys(("empty_below", "empty_ratio"), (0.0, 1.0, 1.5, -0.5, math.nan)),
 }
 REFUSED_OF_THE_MODEL: dict[str, tuple[float, ...]] = {
-    "look_everywhere": (0.0, -0.1, 1.1, math.nan),
-    "likely_above": (-0.1, KEPT_ABOVE + 1e-6, 1.0, math.nan),
+    "look_everywhere": (-0.1, 1.1, math.nan),
+    "likely_above": (-0.1, 1.0, math.nan),
 }
 ALLOWED: dict[Any, dict[str, Any]] = {
     CalibrationConfig(): {"recheck_rays": 0, "lost_surface_mass": 0.0, "image_price_db": 0.0},
@@ -76,7 +75,7 @@ def test_the_ends_of_what_works_are_allowed() -> None:
             assert getattr(replace(config, **{field: value}), field) == value
     assert GateLossConfig(empty_ratio=None, density=0.0).empty_ratio is None
     assert LecoModelConfig(look_everywhere=1.0, likely_above=0.0).look_everywhere == 1.0
-    assert LecoModelConfig(likely_above=KEPT_ABOVE).likely_above == KEPT_ABOVE
+    assert LecoModelConfig(likely_above=0.2, look_everywhere=0.0).likely_above == 0.2
 
 
 @pytest.mark.parametrize(
@@ -85,7 +84,7 @@ def test_the_ends_of_what_works_are_allowed() -> None:
         ("gate-loss.empty-ratio", "1.5"),
         ("calibration.rays-at-once", "0"),
         ("merging.rays", "0"),
-        ("likely-above", "0.3"),
+        ("likely-above", "1.5"),
     ],
 )
 def test_on_the_command_line_it_ends_with_status_2(

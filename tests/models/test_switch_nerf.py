@@ -273,6 +273,7 @@ def test_a_loss_that_is_not_finite_names_its_cause() -> None:
 def test_colours_come_with_what_was_met_as_their_alpha() -> None:
     model = new_model().eval()
     outputs = model(bundle())
+    outputs["accumulation"][0] = 1.0  # an untrained field meets next to nothing
     rgba = model.get_rgba_image(outputs)
     assert torch.equal(rgba[:, :3], outputs["rgb"])
     assert torch.equal(rgba[:, 3:], outputs["accumulation"])

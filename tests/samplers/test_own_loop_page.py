@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import re
 from pathlib import Path
 from typing import Any
@@ -13,6 +14,7 @@ from samplers.analytic_occupancy import camera_rays
 from leco_plugin.models.gate import Gate, GateConfig
 from leco_plugin.occupancy import Occupancy
 from leco_plugin.samplers.registry import OURS
+from leco_plugin.scenes.frames import APPLIED_EARLIER
 from leco_plugin.space import Space
 
 PAGE = (Path(__file__).parents[2] / "docs" / "own-loop.md").read_text()
@@ -38,9 +40,9 @@ def file(tmp_path: Path) -> Path:
     return tmp_path / "occupancy.safetensors"
 
 
-@pytest.mark.parametrize("applied", [None, [[1, 0, 0, 0.4], [0, 0, 1, 0.0], [0, -1, 0, 2.0]]])
+@pytest.mark.parametrize("processed", ["not at all", "and said", "and not said"])
 def test_its_code_samples_in_the_scenes_coordinates_and_in_the_photographs(
-    file: Path, applied: list[list[float]] | None
+    file: Path, tmp_path: Path, processed: str
 ) -> None:
     origins, directions = camera_rays(40)
     code = SAMPLING.replace('"cuda"', '"cpu"').replace("occupancy.safetensors", str(file))
@@ -54,11 +56,18 @@ def test_its_code_samples_in_the_scenes_coordinates_and_in_the_photographs(
 
     (frame,) = [torch.tensor(given["occupancy"].report["frame"])]
     back = torch.linalg.inv(frame[:, :3])
-    saved = torch.eye(3, 4) if applied is None else torch.tensor(applied)
+    saved, meta = torch.eye(3, 4), {}
+    if processed == "and said":
+        saved = torch.tensor([[1.0, 0.0, 0.0, 0.4], [0.0, 0.0, 1.0, 0.0], [0.0, -1.0, 0.0, 2.0]])
+        meta = {"applied_transform": saved.tolist()}
+    if processed == "and not said":
+        saved = torch.tensor(APPLIED_EARLIER)
+        (tmp_path / "colmap/sparse/0").mkdir(parents=True)
+    (tmp_path / "transforms.json").write_text(json.dumps(meta))
     metres = {
         "rays_o": turned((origins - frame[:, 3]) @ back.T, saved),
         "rays_d": directions @ back.T @ saved[:, :3].T * SCALE,  # of length 1
-        "meta": {} if applied is None else {"applied_transform": applied},
+        "folder": tmp_path,
     }
     moved: dict[str, Any] = {**given, **metres}
     exec(MOVING, moved)

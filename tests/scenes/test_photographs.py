@@ -192,6 +192,7 @@ def test_a_sound_scene_passes_as_a_folder_and_as_a_file(scene: Path) -> None:
     assert check_scene(scene / "transforms.json") == check_scene(scene)
 
 
+IN_MILLIMETRES = (1e-3 * np.eye(3, 4)).tolist()
 APPLIED = [[1.0, 0.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.2], [0.0, -1.0, 0.0, 0.0]]
 
 
@@ -208,9 +209,10 @@ def earlier(scene: Path) -> None:
         lambda scene: None,
         lambda scene: change(scene, lambda m: m.update(applied_transform=APPLIED)),
         lambda scene: change(scene, lambda m: m.update(applied_scale=2.5)),
+        lambda scene: change(scene, lambda m: m.update(applied_transform=IN_MILLIMETRES)),
         earlier,
     ],
-    ids=["as it was", "transformed", "scaled", "transformed and not said"],
+    ids=["as it was", "transformed", "scaled", "in millimetres", "transformed and not said"],
 )
 def test_sparse_points_follow_the_cameras_into_model_coordinates(
     scene: Path, process: Callable[[Path], None]
@@ -234,9 +236,10 @@ def test_sparse_points_follow_the_cameras_into_model_coordinates(
     [
         {"applied_transform": np.zeros((3, 4)).tolist()},
         {"applied_transform": [[1.0, 0.0], [0.0, 1.0]]},
+        {"applied_transform": [[1.0, 0.0, 0.0, float("nan")], *np.eye(3, 4).tolist()[1:]]},
         {"applied_scale": 0.0},
     ],
-    ids=["flat", "too small", "no scale"],
+    ids=["flat", "too small", "no number", "no scale"],
 )
 def test_an_applied_transform_that_cannot_be_undone_is_said_in_a_line(
     scene: Path, applied: dict[str, Any]
@@ -259,9 +262,10 @@ def test_a_scene_without_points_has_none_and_missing_ones_are_said(
     scene: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert read_points({}, scene) is None and not capsys.readouterr().out
-    assert read_points({"ply_file_path": "nowhere.ply"}, scene) is None
-    said = " ".join(capsys.readouterr().out.split())
-    assert "nowhere.ply" in said and "not there: going on without any" in said
+    assert read_points({"ply_file_path": "[of]/nowhere.ply"}, scene) is None
+    said = capsys.readouterr().out
+    assert "names sparse points that are not there" in " ".join(said.split())
+    assert "[of]/nowhere.ply" in "".join(said.split())  # wherever the line was broken
 
 
 def test_only_cameras_that_look_down_are_above() -> None:

@@ -106,6 +106,7 @@ def test_what_skips_next_to_nothing_comes_with_advice(threshold, skipped, said) 
 
 
 def test_prices_are_measured_in_the_appearance_of_each_image() -> None:
+    torch.manual_seed(0)
     sizes = Sizes(
         gate=GateConfig(EncodingConfig(octaves=1), width=8, layers=1, scene_experts=2),
         field=FieldConfig(EncodingConfig(kind="hash", log2_table=8), appearance_dim=1),
