@@ -21,8 +21,8 @@ from leco_plugin.models.gate import Gate, GateConfig
 from leco_plugin.models.hmoe import Expert
 from leco_plugin.models.sizing.sizes import LARGE, PAPER, SMALL
 from leco_plugin.occupancy import Occupancy
-from leco_plugin.samplers import fused
 from leco_plugin.samplers.estimator import LearnedOccupancyEstimator
+from leco_plugin.samplers.kernels import fused
 from leco_plugin.space import Space
 
 NEAR_THRESHOLD = 2e-2

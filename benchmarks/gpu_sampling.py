@@ -18,9 +18,9 @@ from sampling_scene import fit_occupancy, rays_into
 from torch import Tensor
 
 from leco_plugin.occupancy import Occupancy
-from leco_plugin.samplers import fused
 from leco_plugin.samplers.estimator import LearnedOccupancyEstimator, cell_centers
 from leco_plugin.samplers.grid import OccupancyGridEstimator
+from leco_plugin.samplers.kernels import fused
 from leco_plugin.samplers.marching import number
 from leco_plugin.space import Space
 

@@ -41,10 +41,10 @@ from leco_plugin.models.rendering import (
     with_backdrop,
 )
 from leco_plugin.occupancy import Occupancy, gate_precision
-from leco_plugin.samplers import fused
 from leco_plugin.samplers.estimator import LearnedOccupancyEstimator
+from leco_plugin.samplers.kernels import fused
 from leco_plugin.samplers.marching import march
-from leco_plugin.samplers.rays import intersect_box
+from leco_plugin.samplers.marching.rays import intersect_box
 from leco_plugin.space import Space
 
 

@@ -17,7 +17,7 @@ from torch import Tensor, nn
 
 from leco_plugin.models.frozen_gate import occupancy_of
 from leco_plugin.models.gate import Gate, GateConfig, check_sizes
-from leco_plugin.samplers import fused
+from leco_plugin.samplers.kernels import fused
 from leco_plugin.space import NO_WALL, Space
 
 FORMAT = "leco-occupancy"

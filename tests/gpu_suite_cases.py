@@ -25,8 +25,9 @@ from gpu_scale import Scale
 from sampling_scene import rays_into
 
 from leco_plugin.occupancy import Occupancy
-from leco_plugin.samplers import fused, nerfacc_cpu
+from leco_plugin.samplers import nerfacc_cpu
 from leco_plugin.samplers.estimator import LearnedOccupancyEstimator
+from leco_plugin.samplers.kernels import fused
 from leco_plugin.samplers.marching import march, number
 
 CPU = torch.device("cpu")
@@ -327,7 +328,7 @@ def test_stretches_are_those_in_which_the_twin_leaves_candidates_open(cone_angle
 
 def test_stretches_are_as_long_as_the_kernels() -> None:
     pytest.importorskip("triton")
-    from leco_plugin.samplers.march_kernel import STEPS
+    from leco_plugin.samplers.kernels.march_kernel import STEPS
 
     assert gpu_counts.STEPS == STEPS
 

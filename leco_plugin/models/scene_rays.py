@@ -6,7 +6,7 @@ from nerfstudio.cameras.rays import RayBundle
 from torch import Tensor
 
 from leco_plugin.models.rendering import Rays
-from leco_plugin.samplers.rays import intersect_box
+from leco_plugin.samplers.marching.rays import intersect_box
 from leco_plugin.space import SpaceKind
 
 

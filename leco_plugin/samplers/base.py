@@ -15,8 +15,8 @@ import torch
 from torch import Tensor, nn
 
 from leco_plugin.samplers.marching import NearFn, OccupiedFn, Samples, march, plan
-from leco_plugin.samplers.rays import check_rays, intersect_box
-from leco_plugin.samplers.visibility import SampleFn, front_to_back, prune
+from leco_plugin.samplers.marching.rays import check_rays, intersect_box
+from leco_plugin.samplers.marching.visibility import SampleFn, front_to_back, prune
 
 DensityFn = Callable[[Tensor], Tensor]
 """Positions [N, 3] to densities [N] or [N, 1]."""

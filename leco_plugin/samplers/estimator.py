@@ -13,13 +13,13 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from leco_plugin.samplers import fused
 from leco_plugin.samplers.base import Estimator
-from leco_plugin.samplers.cache import CellCache, OccupancyLike
-from leco_plugin.samplers.cache_build import build_cache
+from leco_plugin.samplers.cells.build import build_cache
+from leco_plugin.samplers.cells.cache import CellCache, OccupancyLike
 from leco_plugin.samplers.changes import Seen
+from leco_plugin.samplers.kernels import fused
 from leco_plugin.samplers.marching import NearFn, OccupiedFn, Samples, number
-from leco_plugin.samplers.rays import checked_box, intersect_box
+from leco_plugin.samplers.marching.rays import checked_box, intersect_box
 
 _log = logging.getLogger(__name__)
 

@@ -15,7 +15,7 @@ from torch import Tensor
 
 from leco_plugin.samplers.base import Estimator
 from leco_plugin.samplers.marching import NearFn, OccupiedFn
-from leco_plugin.samplers.rays import checked_box
+from leco_plugin.samplers.marching.rays import checked_box
 
 CELLS_AT_ONCE = 1 << 20
 """Cells evaluated in one call of the host's density; nerfacc asks 2 million at once."""

@@ -24,7 +24,7 @@ from torch import Tensor
 from leco_plugin.samplers import packed
 from leco_plugin.samplers.grid import lookup
 from leco_plugin.samplers.marching import march
-from leco_plugin.samplers.rays import intersect_box
+from leco_plugin.samplers.marching.rays import intersect_box
 
 if TYPE_CHECKING:
     from nerfacc import RayIntervals, RaySamples

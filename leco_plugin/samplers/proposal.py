@@ -20,7 +20,7 @@ from nerfstudio.model_components.ray_samplers import (
 )
 from torch import Tensor
 
-from leco_plugin.samplers.cache import OccupancyLike
+from leco_plugin.samplers.cells.cache import OccupancyLike
 from leco_plugin.samplers.estimator import LearnedOccupancyEstimator
 
 

@@ -14,7 +14,7 @@ import torch
 from leco_plugin.models.encodings import EncodingConfig
 from leco_plugin.models.gate import Gate, GateConfig
 from leco_plugin.occupancy import Occupancy
-from leco_plugin.samplers.fused import _why_not
+from leco_plugin.samplers.kernels.fused import _why_not
 from leco_plugin.space import Space
 
 INTERPRETED = os.environ.get("TRITON_INTERPRET") == "1"

@@ -13,14 +13,14 @@ from samplers.analytic_occupancy import Balls, camera_rays
 from leco_plugin.models.encodings import EncodingConfig
 from leco_plugin.models.gate import Gate, GateConfig
 from leco_plugin.occupancy import Occupancy
-from leco_plugin.samplers.cache import (
+from leco_plugin.samplers.cells.build import build_cache
+from leco_plugin.samplers.cells.cache import (
     BRICK,
     COARSE_OCCUPIED,
     FINE_EMPTY,
     FINE_OCCUPIED,
     CellCache,
 )
-from leco_plugin.samplers.cache_build import build_cache
 from leco_plugin.samplers.estimator import LearnedOccupancyEstimator
 from leco_plugin.samplers.marching import march
 from leco_plugin.space import Space

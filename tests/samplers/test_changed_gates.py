@@ -12,7 +12,7 @@ from waits import Waits
 
 from leco_plugin.conformance.scene import OTHER, SLAB, box, crossing
 from leco_plugin.samplers import estimator as module
-from leco_plugin.samplers.cache_build import build_cache as really_build_cache
+from leco_plugin.samplers.cells.build import build_cache as really_build_cache
 from leco_plugin.samplers.estimator import LearnedOccupancyEstimator
 from leco_plugin.space import Space
 

@@ -6,7 +6,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from leco_plugin.samplers.columns import (
+from leco_plugin.samplers.marching.columns import (
     RUN,
     by_column,
     places_by_column,

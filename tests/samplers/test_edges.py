@@ -7,7 +7,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from leco_plugin.samplers.edges import candidate_counts, candidate_edges
+from leco_plugin.samplers.marching.edges import candidate_counts, candidate_edges
 
 
 @pytest.mark.parametrize("cone_angle", [0.0, 0.02])

@@ -16,18 +16,18 @@ from ball_occupancy import ENCODINGS, ball
 from leco_plugin.models.encodings import EncodingConfig
 from leco_plugin.models.gate import Gate, GateConfig
 from leco_plugin.occupancy import Occupancy
-from leco_plugin.samplers import fused, trials
-from leco_plugin.samplers.cache import CellCache
-from leco_plugin.samplers.edges import candidate_counts, switch
+from leco_plugin.samplers.cells.cache import CellCache
 from leco_plugin.samplers.estimator import LearnedOccupancyEstimator
-from leco_plugin.samplers.gate_weights import GateWeights, gate_weights, why_not
-from leco_plugin.samplers.growth import growth_table, powers_needed
+from leco_plugin.samplers.kernels import fused, trials
+from leco_plugin.samplers.kernels.gate_weights import GateWeights, gate_weights, why_not
 from leco_plugin.samplers.marching import (
     Candidates,
     Samples,
     TooManyCandidates,
     keep,
 )
+from leco_plugin.samplers.marching.edges import candidate_counts, switch
+from leco_plugin.samplers.marching.growth import growth_table, powers_needed
 from leco_plugin.space import Space
 
 
@@ -56,7 +56,7 @@ def test_a_failing_kernel_is_said_once_and_its_twin_answers(monkeypatch, caplog)
     asked = Occupancy(Gate(GateConfig()), Space(), 0.5)
     monkeypatch.setattr(fused, "ready", lambda device: not fused._switch.off)
 
-    monkeypatch.setitem(sys.modules, "leco_plugin.samplers.gate_kernel", None)
+    monkeypatch.setitem(sys.modules, "leco_plugin.samplers.kernels.gate_kernel", None)
     places = torch.randn(50, 3)
     with caplog.at_level(logging.WARNING):
         first, second = asked.occupied(places), asked.occupied(places)
@@ -119,8 +119,8 @@ def test_a_march_that_keeps_otherwise_is_never_believed(
     kernel = MarchKernel(steep, fault)
     gate = SimpleNamespace(gate_decisions=lambda w, x: steep.occupancy.query(x) >= w.facts[10])
     monkeypatch.setattr(fused, "ready", lambda device, name="gate": name not in fused._switch.off)
-    monkeypatch.setitem(sys.modules, "leco_plugin.samplers.march_kernel", kernel)
-    monkeypatch.setitem(sys.modules, "leco_plugin.samplers.gate_kernel", gate)
+    monkeypatch.setitem(sys.modules, "leco_plugin.samplers.kernels.march_kernel", kernel)
+    monkeypatch.setitem(sys.modules, "leco_plugin.samplers.kernels.gate_kernel", gate)
     rays = torch.rand(9, 3), torch.randn(9, 3)
     options = {"render_step_size": 0.05, "cone_angle": cone_angle, "far_plane": 4.0}
     with caplog.at_level(logging.WARNING):
@@ -137,8 +137,8 @@ def test_a_march_is_compared_with_its_twin_once_for_each_kind_of_step(steep, mon
     kernel = MarchKernel(steep, "none")
     gate = SimpleNamespace(gate_decisions=lambda w, x: steep.occupancy.query(x) >= w.facts[10])
     monkeypatch.setattr(fused, "ready", lambda device, name="gate": name not in fused._switch.off)
-    monkeypatch.setitem(sys.modules, "leco_plugin.samplers.march_kernel", kernel)
-    monkeypatch.setitem(sys.modules, "leco_plugin.samplers.gate_kernel", gate)
+    monkeypatch.setitem(sys.modules, "leco_plugin.samplers.kernels.march_kernel", kernel)
+    monkeypatch.setitem(sys.modules, "leco_plugin.samplers.kernels.gate_kernel", gate)
     calls = []
     for cone_angle in (0.0, 0.0, 0.01, 0.0, 0.01):
         steep.sampling(
@@ -155,7 +155,7 @@ def test_a_kernel_that_decides_otherwise_is_never_believed(monkeypatch, caplog) 
     asked = Occupancy(Gate(GateConfig()), Space(), 0.0)
     wrong = SimpleNamespace(gate_decisions=lambda weights, x: torch.zeros(len(x), dtype=bool))
     monkeypatch.setattr(fused, "ready", lambda device: not fused._switch.off)
-    monkeypatch.setitem(sys.modules, "leco_plugin.samplers.gate_kernel", wrong)
+    monkeypatch.setitem(sys.modules, "leco_plugin.samplers.kernels.gate_kernel", wrong)
     with caplog.at_level(logging.WARNING):
         assert asked.occupied(torch.rand(50, 3)).all()
         assert asked.occupied(torch.rand(50, 3)).all()
@@ -173,7 +173,7 @@ def test_a_kernel_is_compared_with_its_twin_once_for_each_gate(monkeypatch) -> N
 
     monkeypatch.setattr(fused, "ready", lambda device: not fused._switch.off)
     kernel = SimpleNamespace(gate_decisions=answer)
-    monkeypatch.setitem(sys.modules, "leco_plugin.samplers.gate_kernel", kernel)
+    monkeypatch.setitem(sys.modules, "leco_plugin.samplers.kernels.gate_kernel", kernel)
     for _ in range(2):
         asked.occupied(torch.rand(50, 3))
     assert sizes == [trials.CHECKED, 50, 50]
@@ -202,7 +202,7 @@ def test_positions_on_another_device_are_no_failure_of_a_kernel(steep, monkeypat
 @pytest.mark.parametrize("dtype", [torch.float64, torch.float16])
 def test_positions_that_are_not_in_float32_are_left_to_torch(dtype, steep, monkeypatch) -> None:
     monkeypatch.setattr(fused, "ready", lambda device, name="gate": name not in fused._switch.off)
-    monkeypatch.setitem(sys.modules, "leco_plugin.samplers.gate_kernel", None)
+    monkeypatch.setitem(sys.modules, "leco_plugin.samplers.kernels.gate_kernel", None)
     places, occupancy = torch.rand(50, 3, dtype=dtype), steep.occupancy
     assert torch.equal(occupancy.occupied(places), occupancy.query(places) >= occupancy.threshold)
     assert not fused._switch.off
@@ -213,8 +213,8 @@ def test_rays_in_double_are_left_to_torch(cone_angle: float, steep, monkeypatch)
     torch.manual_seed(0)
     gate = SimpleNamespace(gate_decisions=lambda w, x: steep.occupancy.query(x) >= w.facts[10])
     monkeypatch.setattr(fused, "ready", lambda device, name="gate": name not in fused._switch.off)
-    monkeypatch.setitem(sys.modules, "leco_plugin.samplers.gate_kernel", gate)
-    monkeypatch.setitem(sys.modules, "leco_plugin.samplers.march_kernel", None)
+    monkeypatch.setitem(sys.modules, "leco_plugin.samplers.kernels.gate_kernel", gate)
+    monkeypatch.setitem(sys.modules, "leco_plugin.samplers.kernels.march_kernel", None)
     rays = torch.rand(9, 3).double(), torch.randn(9, 3).double()
     options = {"render_step_size": 0.05, "cone_angle": cone_angle, "far_plane": 4.0}
     samples = steep.sampling(*rays, **options)

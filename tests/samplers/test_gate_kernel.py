@@ -15,14 +15,14 @@ from samplers.kernel_cases import (
 
 from leco_plugin.models.encodings import EncodingConfig
 from leco_plugin.occupancy import Occupancy
-from leco_plugin.samplers.fused import twins_only
-from leco_plugin.samplers.gate_weights import gate_weights
+from leco_plugin.samplers.kernels.fused import twins_only
+from leco_plugin.samplers.kernels.gate_weights import gate_weights
 
 pytestmark = ON_KERNELS
 
 
 def fused(asked: Occupancy, places: torch.Tensor) -> torch.Tensor:
-    from leco_plugin.samplers.gate_kernel import gate_decisions
+    from leco_plugin.samplers.kernels.gate_kernel import gate_decisions
 
     if reason := left_to_torch(asked):
         pytest.skip(reason)

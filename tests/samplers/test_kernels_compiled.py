@@ -15,9 +15,9 @@ from leco_plugin.models.encodings import EncodingConfig
 from leco_plugin.models.gate import Gate, GateConfig
 from leco_plugin.models.sizing.sizes import LARGE, PAPER, SMALL
 from leco_plugin.occupancy import Occupancy
-from leco_plugin.samplers import fused
-from leco_plugin.samplers.cache import CacheReport, CellCache, Tables
-from leco_plugin.samplers.gate_weights import GateWeights, gate_weights
+from leco_plugin.samplers.cells.cache import CacheReport, CellCache, Tables
+from leco_plugin.samplers.kernels import fused
+from leco_plugin.samplers.kernels.gate_weights import GateWeights, gate_weights
 from leco_plugin.samplers.marching import number
 from leco_plugin.space import Space
 
@@ -79,7 +79,7 @@ QUICK = {
 
 @pytest.mark.parametrize(("name", "capability"), on_each_card(GATES, QUICK))
 def test_the_gate_compiles(name: str, capability: int, folder: Path, monkeypatch) -> None:
-    from leco_plugin.samplers import gate_kernel
+    from leco_plugin.samplers.kernels import gate_kernel
 
     weights = weights_of(name, capability, monkeypatch)
     with compiling(gate_kernel, "_gate_kernel", capability, folder) as compiled:
@@ -89,7 +89,7 @@ def test_the_gate_compiles(name: str, capability: int, folder: Path, monkeypatch
 
 
 def test_the_gate_compiles_for_any_strides(folder: Path, monkeypatch) -> None:
-    from leco_plugin.samplers import gate_kernel
+    from leco_plugin.samplers.kernels import gate_kernel
 
     weights = weights_of("width 16", 90, monkeypatch)
     with compiling(gate_kernel, "_gate_kernel", 90, folder) as compiled:
@@ -135,7 +135,7 @@ def test_the_march_compiles(name: str, capability: int, folder: Path, monkeypatc
 
 
 def compile_march(name: str, weights: GateWeights, capability: int, folder: Path) -> None:
-    from leco_plugin.samplers import march_kernel
+    from leco_plugin.samplers.kernels import march_kernel
 
     gate, cone_angle, dtype = MARCHES[name]
     cache = cells(Space(GATES[gate][1]), dtype)
@@ -152,7 +152,7 @@ def compile_march(name: str, weights: GateWeights, capability: int, folder: Path
 def test_the_automatic_sizes_compile_for_cards_at_home(
     capability: int, folder: Path, monkeypatch
 ) -> None:
-    from leco_plugin.samplers import gate_kernel
+    from leco_plugin.samplers.kernels import gate_kernel
 
     weights = weights_of("large", capability, monkeypatch)
     with compiling(gate_kernel, "_gate_kernel", capability, folder) as compiled:

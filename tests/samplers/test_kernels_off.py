@@ -6,8 +6,8 @@ import pytest
 import torch
 
 from leco_plugin.models.compute import grouped
-from leco_plugin.samplers import fused
-from leco_plugin.samplers.kernels_off import NAMES, VARIABLE, kernels_off
+from leco_plugin.samplers.kernels import fused
+from leco_plugin.samplers.kernels.off import NAMES, VARIABLE, kernels_off
 
 CUDA = torch.device("cuda")
 

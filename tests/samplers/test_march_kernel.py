@@ -11,10 +11,10 @@ from samplers.kernel_cases import DEVICE, NEAR_THRESHOLD, ON_KERNELS, occupancy
 from waits import Waits
 
 from leco_plugin.models.encodings import EncodingConfig
-from leco_plugin.samplers.cache_build import build_cache
+from leco_plugin.samplers.cells.build import build_cache
 from leco_plugin.samplers.estimator import LearnedOccupancyEstimator
-from leco_plugin.samplers.fused import twins_only
-from leco_plugin.samplers.gate_weights import gate_weights
+from leco_plugin.samplers.kernels.fused import twins_only
+from leco_plugin.samplers.kernels.gate_weights import gate_weights
 from leco_plugin.samplers.marching import Samples, march, number
 
 pytestmark = ON_KERNELS
@@ -40,7 +40,7 @@ def rays(count: int) -> list[torch.Tensor]:
 
 
 def fused(made: LearnedOccupancyEstimator, *arguments, **options) -> Samples:
-    from leco_plugin.samplers.march_kernel import march_kept
+    from leco_plugin.samplers.kernels.march_kernel import march_kept
 
     assert made.cache is not None
     return march_kept(made.cache, gate_weights(made.occupancy), number(*arguments, **options))
@@ -165,7 +165,7 @@ def test_rays_that_are_no_rays_keep_nothing_and_harm_no_other() -> None:
 
 
 def test_rays_wait_once_for_the_device(monkeypatch) -> None:
-    from leco_plugin.samplers import march_kernel
+    from leco_plugin.samplers.kernels import march_kernel
 
     made, count = estimator("contraction"), 4
     weights = gate_weights(made.occupancy)

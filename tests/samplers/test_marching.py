@@ -9,12 +9,11 @@ from hypothesis import strategies as st
 from samplers.analytic_occupancy import Balls, camera_rays, slow_march
 from waits import Waits
 
-from leco_plugin.samplers import marching
-from leco_plugin.samplers.columns import places_by_column
 from leco_plugin.samplers.estimator import LearnedOccupancyEstimator
 from leco_plugin.samplers.grid import OccupancyGridEstimator
-from leco_plugin.samplers.marching import RUN, march
-from leco_plugin.samplers.rays import intersect_box
+from leco_plugin.samplers.marching import march, rule
+from leco_plugin.samplers.marching.columns import RUN, places_by_column
+from leco_plugin.samplers.marching.rays import intersect_box
 
 finite = st.floats(-2.0, 4.0)
 
@@ -184,7 +183,7 @@ def test_memory_is_bounded_by_the_chunk(length):
 @pytest.fixture
 def as_on_a_device(monkeypatch):
     """On a CPU packing searches twice, which costs nothing there; elsewhere once."""
-    monkeypatch.setattr(marching, "places_by_column_in_runs", places_by_column)
+    monkeypatch.setattr(rule, "places_by_column_in_runs", places_by_column)
 
 
 @pytest.mark.usefixtures("as_on_a_device")

@@ -224,8 +224,8 @@ def test_the_torch_core_imports_nothing_of_nerfstudio_or_nerfacc():
     import subprocess
     import sys
 
-    names = ["estimator", "cache", "cache_build", "marching", "packed", "grid", "registry", "base"]
-    names += ["visibility", "nerfacc_cpu"]
+    names = ["estimator", "base", "grid", "registry", "nerfacc_cpu", "packed", "cells.build"]
+    names += ["marching", "marching.visibility", "kernels.fused"]
     code = f"""
 import importlib, sys
 for name in {names}:

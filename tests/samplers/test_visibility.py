@@ -9,7 +9,7 @@ from samplers.analytic_occupancy import Balls, camera_rays
 from leco_plugin.samplers import packed
 from leco_plugin.samplers.base import densities_of_samples
 from leco_plugin.samplers.marching import march, plan
-from leco_plugin.samplers.visibility import front_to_back, prune
+from leco_plugin.samplers.marching.visibility import front_to_back, prune
 
 N_RAYS, STEP = 150, 0.01
 BALLS = Balls()

@@ -39,7 +39,7 @@ def say(line: str) -> None:
         CONSOLE.log(f"\\[leco] {line}", _stack_offset=2)
 
 
-OF_A_DEVICE = ("leco_plugin.samplers.fused", "leco_plugin.models.compute.grouped_trial")
+OF_A_DEVICE = ("leco_plugin.samplers.kernels.fused", "leco_plugin.models.compute.grouped_trial")
 """Whose warnings are of the device of one process; all others have the same everywhere."""
 
 

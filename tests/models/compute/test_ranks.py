@@ -63,7 +63,7 @@ def test_a_process_that_is_not_the_first_only_warns(
 ) -> None:
     monkeypatch.setattr(ranks, "is_first", lambda: False)
     monkeypatch.setattr(ranks.distributed, "get_rank", lambda: 3)
-    of_its_card = logging.getLogger("leco_plugin.samplers.fused")
+    of_its_card = logging.getLogger("leco_plugin.samplers.kernels.fused")
     of_its_card.info("the fused gate answers")
     of_its_card.warning("the fused gate does not run")
     logged.warning("no cell cache in any process")

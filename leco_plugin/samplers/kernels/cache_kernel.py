@@ -5,8 +5,8 @@ from __future__ import annotations
 import triton
 import triton.language as tl
 
-from leco_plugin.samplers.cache import BRICK, COARSE_OCCUPIED, FINE_EMPTY, FINE_OCCUPIED
-from leco_plugin.samplers.gate_kernel import largest_of, mapped_of
+from leco_plugin.samplers.cells.cache import BRICK, COARSE_OCCUPIED, FINE_EMPTY, FINE_OCCUPIED
+from leco_plugin.samplers.kernels.gate_kernel import largest_of, mapped_of
 
 _BRICK = tl.constexpr(BRICK)
 _COARSE_OCCUPIED = tl.constexpr(COARSE_OCCUPIED)

@@ -14,33 +14,16 @@ from collections.abc import Callable, Iterator
 import torch
 from torch import Tensor
 
-from leco_plugin.samplers.candidates import (
+from leco_plugin.samplers.marching.candidates import (
     Candidates,
-    TooManyCandidates,
-    check_longest,
-    number,
     plan,
 )
-from leco_plugin.samplers.columns import (
+from leco_plugin.samplers.marching.columns import (
     RUN,
     by_column,
     places_by_column,
     places_by_column_in_runs,
 )
-
-__all__ = [
-    "Candidates",
-    "NearFn",
-    "OccupiedFn",
-    "Samples",
-    "TooManyCandidates",
-    "check_longest",
-    "join",
-    "keep",
-    "march",
-    "number",
-    "plan",
-]
 
 OccupiedFn = Callable[[Tensor], Tensor]
 """Positions [N, 3] to bool [N]."""

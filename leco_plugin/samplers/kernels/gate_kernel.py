@@ -13,8 +13,8 @@ import triton
 import triton.language as tl
 from torch import Tensor
 
-from leco_plugin.samplers.encoding_kernel import frequencies, looked_up
-from leco_plugin.samplers.gate_weights import FREQUENCY, GateWeights
+from leco_plugin.samplers.kernels.encoding_kernel import frequencies, looked_up
+from leco_plugin.samplers.kernels.gate_weights import FREQUENCY, GateWeights
 
 INTERPRETED = os.environ.get("TRITON_INTERPRET") == "1"
 """Whether kernels run in Triton's interpreter; decided when Triton was imported."""

@@ -10,9 +10,9 @@ import torch
 from samplers.analytic_occupancy import Balls
 from torch import Tensor
 
-from leco_plugin.samplers import cache_cells
-from leco_plugin.samplers.cache import BRICK, EMPTY, FARTHEST, MIXED, OCCUPIED
-from leco_plugin.samplers.cache_cells import (
+from leco_plugin.samplers.cells import judging
+from leco_plugin.samplers.cells.cache import BRICK, EMPTY, FARTHEST, MIXED, OCCUPIED
+from leco_plugin.samplers.cells.judging import (
     CLOSE,
     LEAST_MARGIN,
     PLAIN_MARGIN,
@@ -144,7 +144,7 @@ def test_what_corners_and_centres_miss_is_found_where_it_is_close(monkeypatch):
             (torch.arange(BRICK**3 * TRIALS) % (2 * TRIALS) == 5) * 2.0 - 1.0,
         ]
     )
-    monkeypatch.setattr(cache_cells, "logits_above", lambda *_: next(answers))
+    monkeypatch.setattr(judging, "logits_above", lambda *_: next(answers))
     checkered = torch.arange(BRICK * N + 1)
     checkered = (checkered[:, None, None] + checkered[:, None] + checkered) % 2
     corners = -1.0 - 3.0 * checkered  # empty by a third of their spread
@@ -163,7 +163,7 @@ def test_planes_are_weighted_least_squares_and_doubts_their_largest_residual(bal
         tried.append(mapped)
         return logits_above(occupancy, mapped)
 
-    monkeypatch.setattr(cache_cells, "logits_above", remembered)
+    monkeypatch.setattr(judging, "logits_above", remembered)
     planes, doubts = fit_planes(balls, values, places, size)
     assert planes.abs().amax(dim=1).equal(torch.full((len(values),), 127.0))
     (random,) = (place.view(-1, TRIALS, 3).double() for place in tried)

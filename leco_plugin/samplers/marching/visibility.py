@@ -13,7 +13,7 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
-from leco_plugin.samplers.marching import Candidates, NearFn, OccupiedFn, Samples, join, keep
+from leco_plugin.samplers.marching.rule import Candidates, NearFn, OccupiedFn, Samples, join, keep
 from leco_plugin.samplers.packed import (
     render_transmittance_from_alpha,
     render_transmittance_from_density,

@@ -13,32 +13,14 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from leco_plugin.samplers.accumulate import accumulate_along_rays, at_least_float32
-from leco_plugin.samplers.scan import (
+from leco_plugin.samplers.packed.accumulate import at_least_float32
+from leco_plugin.samplers.packed.scan import (
     Segments,
     exclusive_prod,
-    exclusive_sum,
-    inclusive_prod,
-    inclusive_sum,
     pack_info,
     segment_scan,
     segments,
 )
-
-__all__ = [
-    "accumulate_along_rays",
-    "exclusive_prod",
-    "exclusive_sum",
-    "inclusive_prod",
-    "inclusive_sum",
-    "pack_info",
-    "render_transmittance_from_alpha",
-    "render_transmittance_from_density",
-    "render_visibility_from_alpha",
-    "render_visibility_from_density",
-    "render_weight_from_alpha",
-    "render_weight_from_density",
-]
 
 OPAQUE = 1e3
 """Optical depth beyond which exp(-tau) is zero in float64 too: clamping there changes no result

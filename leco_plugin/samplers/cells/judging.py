@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import interpolate, max_pool3d, pad
 
-from leco_plugin.samplers.cache import (
+from leco_plugin.samplers.cells.cache import (
     BRICK,
     EMPTY,
     FARTHEST,

@@ -5,8 +5,8 @@ empty, occupied or mixed. A mixed one owns a brick of 4^3 fine cells, each again
 mixed. A mixed fine cell holds a plane, the gate's logit to first order, with the error to expect
 of it: beside the plane it decides, on it the gate is asked. Where a
 2-bit state for each cell would leave 2% of the cube to the gate, a plane for each mixed cell of
-half the resolution leaves 0.5% in the same memory. See `cache_cells.py` for how cells are
-judged and `cache_build.py` for how many there are.
+half the resolution leaves 0.5% in the same memory. See `judging.py` for how cells are
+judged and `build.py` for how many there are.
 """
 
 from __future__ import annotations
@@ -113,7 +113,7 @@ class Tables(NamedTuple):
 
 
 class CellCache(nn.Module):
-    """Lookup of cell decisions; build one with `cache_build.build_cache`.
+    """Lookup of cell decisions; build one with `build.build_cache`.
 
     Args:
         tables: the cells.

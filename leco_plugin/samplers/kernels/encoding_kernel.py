@@ -15,7 +15,7 @@ import triton
 import triton.language as tl
 
 from leco_plugin.models.encodings import PRIMES
-from leco_plugin.samplers.gate_weights import HASH, VM
+from leco_plugin.samplers.kernels.gate_weights import HASH, VM
 
 _HASH, _VM = tl.constexpr(HASH), tl.constexpr(VM)
 _PRIME_Y, _PRIME_Z = (tl.constexpr(prime) for prime in PRIMES[1:])

@@ -15,9 +15,9 @@ from weakref import WeakKeyDictionary
 import torch
 from torch import Tensor, nn
 
-from leco_plugin.samplers.cache import CellCache
+from leco_plugin.samplers.cells.cache import CellCache
 from leco_plugin.samplers.changes import Seen
-from leco_plugin.samplers.gate_weights import (
+from leco_plugin.samplers.kernels.gate_weights import (
     MOST_WIDTH,
     MOST_WIDTH_BUT_HOPPER,
     MOST_WIDTH_FLOAT32,
@@ -25,9 +25,9 @@ from leco_plugin.samplers.gate_weights import (
     gate_weights,
     why_not,
 )
-from leco_plugin.samplers.growth import MOST_POWERS, powers_needed
-from leco_plugin.samplers.kernels_off import kernels_off
+from leco_plugin.samplers.kernels.off import kernels_off
 from leco_plugin.samplers.marching import Candidates, Samples, TooManyCandidates
+from leco_plugin.samplers.marching.growth import MOST_POWERS, powers_needed
 
 _log = logging.getLogger(__name__)
 
@@ -94,7 +94,7 @@ def decisions(occupancy: nn.Module, positions: Tensor) -> Tensor | None:
         return None
 
     def ask() -> Tensor:
-        from leco_plugin.samplers.gate_kernel import gate_decisions
+        from leco_plugin.samplers.kernels.gate_kernel import gate_decisions
 
         return gate_decisions(weights, positions)
 
@@ -106,7 +106,7 @@ def trusted(occupancy: nn.Module, weights: GateWeights) -> bool:
 
     A kernel that does not is switched off, and the log says so.
     """
-    from leco_plugin.samplers.trials import try_gate
+    from leco_plugin.samplers.kernels.trials import try_gate
 
     return _passes("gate", "gate", occupancy, weights, lambda: try_gate(occupancy, weights))
 
@@ -163,7 +163,7 @@ def march(
     kind = "march with growing steps" if coned else "march"
 
     def trial() -> None:
-        from leco_plugin.samplers.trials import try_march
+        from leco_plugin.samplers.kernels.trials import try_march
 
         try_march(occupancy, cache, weights, coned)
 
@@ -171,7 +171,7 @@ def march(
         return None
 
     def ask() -> Samples:
-        from leco_plugin.samplers.march_kernel import march_kept
+        from leco_plugin.samplers.kernels.march_kernel import march_kept
 
         return march_kept(cache, weights, candidates)
 

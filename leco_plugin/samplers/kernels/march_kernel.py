@@ -14,13 +14,13 @@ import triton
 import triton.language as tl
 from torch import Tensor
 
-from leco_plugin.samplers.cache import CellCache
-from leco_plugin.samplers.cache_kernel import cells_decide, cells_near
-from leco_plugin.samplers.edges import MAX_CANDIDATES_PER_RAY, switch
-from leco_plugin.samplers.gate_kernel import gate_keeps, sizes_of
-from leco_plugin.samplers.gate_weights import GateWeights
-from leco_plugin.samplers.growth import growth_table
+from leco_plugin.samplers.cells.cache import CellCache
+from leco_plugin.samplers.kernels.cache_kernel import cells_decide, cells_near
+from leco_plugin.samplers.kernels.gate_kernel import gate_keeps, sizes_of
+from leco_plugin.samplers.kernels.gate_weights import GateWeights
 from leco_plugin.samplers.marching import Candidates, Samples, check_longest
+from leco_plugin.samplers.marching.edges import MAX_CANDIDATES_PER_RAY, switch
+from leco_plugin.samplers.marching.growth import growth_table
 
 STEPS = 32
 """Candidates that a program works on at once: one coarse question for all of them, and the gate's

@@ -11,8 +11,12 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from leco_plugin.samplers.edges import MAX_CANDIDATES_PER_RAY, candidate_counts, candidate_edges
-from leco_plugin.samplers.rays import check_rays, usable_rays
+from leco_plugin.samplers.marching.edges import (
+    MAX_CANDIDATES_PER_RAY,
+    candidate_counts,
+    candidate_edges,
+)
+from leco_plugin.samplers.marching.rays import check_rays, usable_rays
 
 
 class TooManyCandidates(ValueError):

@@ -9,8 +9,8 @@ from __future__ import annotations
 import torch
 from torch import Tensor, nn
 
-from leco_plugin.samplers.cache import CellCache
-from leco_plugin.samplers.gate_weights import GateWeights
+from leco_plugin.samplers.cells.cache import CellCache
+from leco_plugin.samplers.kernels.gate_weights import GateWeights
 from leco_plugin.samplers.marching import Samples, march, number
 
 CHECKED = 4096
@@ -31,7 +31,7 @@ def try_gate(occupancy: nn.Module, weights: GateWeights) -> None:
     Raises:
         ValueError: it decides otherwise.
     """
-    from leco_plugin.samplers.gate_kernel import gate_decisions
+    from leco_plugin.samplers.kernels.gate_kernel import gate_decisions
 
     positions = _places(weights, CHECKED)
     kept = gate_decisions(weights, positions)
@@ -50,7 +50,7 @@ def try_march(occupancy: nn.Module, cache: CellCache, weights: GateWeights, cone
     Raises:
         ValueError: it keeps other candidates, or in another order.
     """
-    from leco_plugin.samplers.march_kernel import march_kept
+    from leco_plugin.samplers.kernels.march_kernel import march_kept
 
     def occupied(positions: Tensor) -> Tensor:
         decided, left_open = cache.decide(positions)

@@ -2,7 +2,7 @@
 
 Random decisions are compared with the gate's own, half of them anywhere in the mapped cube, half
 where it is not empty, because rays look at surfaces. While too many differ, the caution with which
-planes decide grows, then the margin with which cells are judged (`cache_cells.py`).
+planes decide grows, then the margin with which cells are judged (`judging.py`).
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import pad
 
-from leco_plugin.samplers.cache import (
+from leco_plugin.samplers.cells.cache import (
     BRICK,
     COARSE_EMPTY,
     COARSE_OCCUPIED,
@@ -29,7 +29,7 @@ from leco_plugin.samplers.cache import (
     OccupancyLike,
     Tables,
 )
-from leco_plugin.samplers.cache_cells import (
+from leco_plugin.samplers.cells.judging import (
     LEAST_MARGIN,
     POINTS_AT_ONCE,
     Look,
