@@ -24,7 +24,10 @@ def occupancy_of(path: Path) -> Path:
 
     file = occupancy_file(path)
     if file is None or not file.exists():
-        raise ValueError(f"there is no occupancy.safetensors in {path}: no run has frozen its gate")
+        raise ValueError(
+            f"there is no occupancy.safetensors in {path}: give the folder of a run that has "
+            "learned its occupancy, as outputs/SCENE/leco-occupancy"
+        )
     return file
 
 

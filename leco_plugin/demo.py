@@ -37,6 +37,8 @@ SECONDS = 130.0
 """Training time of each of the two runs; all of it then takes about six minutes on two cores."""
 FULL_LEARNING = 150.0
 """Training time from which the occupancy is learned in the method's own number of steps."""
+MOST_LEARNING = 0.5
+"""Share of the training time that learning may take; a slow machine learns for fewer steps."""
 AERIAL = CaptureConfig(street_per_block=0.0)
 """A drone survey: pictures from the street, too, would let all rays begin at the lens."""
 FEWEST_LEARN_STEPS = 10
@@ -75,9 +77,10 @@ def run_demo(
     folder = write_city(city, out / "city", capture)
 
     guided = _config(folder, out, seconds)
+    budget = Budget(seconds, learn_seconds=MOST_LEARNING * seconds)
     with bar("Guided: learns, freezes, goes on") as show:
         guided_run, trainer = timed_run(
-            guided, Budget(seconds), sampler="learned-occupancy", on_progress=show
+            guided, budget, sampler="learned-occupancy", on_progress=show
         )
     occupancy, facts, truth = _frozen_occupancy(trainer, folder, out)
     _draw_picture(trainer, occupancy, truth, out / "picture.png")
@@ -85,7 +88,7 @@ def run_demo(
 
     with bar("The same, never frozen") as show:
         other_run, trainer = timed_run(
-            never_frozen(guided), Budget(seconds), sampler="dense", on_progress=show
+            never_frozen(guided), budget, sampler="dense", on_progress=show
         )
     manager: Any = trainer.pipeline.datamanager
     report = {

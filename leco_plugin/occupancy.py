@@ -42,7 +42,8 @@ class Occupancy(nn.Module):
     """Where a scene is occupied: o(x) = 1 - G_0(x), and whether o(x) reaches the threshold.
 
     Attributes:
-        gate: the frozen gating network.
+        gate: the gating network, shared with who gave it and left as it is: whoever freezes it says
+            so. That of a file is frozen.
         space: scene positions to the gate's cube.
         precision: the type of matrix products it was trained and calibrated in; queries keep to it,
             because the same weights decide otherwise in another one (DESIGN, section 3).
@@ -71,7 +72,6 @@ class Occupancy(nn.Module):
         self.register_buffer("threshold_value", torch.tensor(float(threshold)))
         everywhere = torch.tensor([-NO_WALL] * 3 + [NO_WALL] * 3)
         self.register_buffer("walls", everywhere if walls is None else walls.detach().clone())
-        self.requires_grad_(False)
 
     @property
     def threshold(self) -> float:
@@ -195,7 +195,10 @@ class Occupancy(nn.Module):
         except OSError as error:
             raise OSError(f"{path} cannot be read: {_line(error)}") from None
         except (SafetensorError, *_UNREADABLE) as error:
-            raise ValueError(f"{path} is not a whole safetensors file: {_line(error)}") from None
+            raise ValueError(
+                f"{path} is no safetensors file, or not a whole one ({_line(error)}): give the "
+                "occupancy.safetensors of a run"
+            ) from None
         return cls._checked(path, header, tensors).to(device)
 
     @classmethod
@@ -227,7 +230,7 @@ class Occupancy(nn.Module):
         report = report if isinstance(report, dict) else {}
         occupancy = cls(Gate(config), Space(), 0.0, cast(Precision, precision), report).float()
         occupancy.load_state_dict(tensors)
-        return occupancy.eval()
+        return occupancy.requires_grad_(False).eval()
 
 
 def _check_shape(positions: Tensor) -> None:

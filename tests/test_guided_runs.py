@@ -313,7 +313,7 @@ def damaged(path: Path) -> None:
 
 BAD: dict[str, tuple[Callable[[Path], Any], str]] = {
     "missing": (lambda path: None, "there is no occupancy"),
-    "damaged": (damaged, "is not a whole safetensors file"),
+    "damaged": (damaged, "or not a whole one"),
     "another scene": (another_scene, "keeps nothing on the rays of these cameras"),
 }
 

@@ -121,7 +121,8 @@ class Slab:
         scale = float(turn.abs().max())  # turns are by right angles
         gate = slab_gate(turn @ torch.tensor(self.normal) / scale, self.half_width, kind)
         x, y, z = (turn @ torch.tensor(CENTRE) + shift).tolist()
-        return Occupancy(gate, Space("box", (x, y, z), scale * HALF), threshold=0.5).eval()
+        known = Occupancy(gate, Space("box", (x, y, z), scale * HALF), threshold=0.5)
+        return known.requires_grad_(False).eval()
 
 
 SLAB = Slab((0.6, 0.64, 0.48), 0.4)

@@ -145,9 +145,11 @@ def heights_seen_from_above(occupancy: Occupancy, box: ViewBox) -> tuple[float, 
     _, positions, kept = _kept_cells(occupancy, box, CELLS)
     heights = torch.where(kept, positions[..., 2], -torch.inf).amax(dim=-1)
     heights = heights[heights.isfinite()].sort().values
-    if len(heights) == 0:
-        return float(box.low[2]), float(box.high[2])
-    return float(heights[len(heights) // 20]), float(heights[-1 - len(heights) // 200])
+    if len(heights) > 0:
+        low, high = float(heights[len(heights) // 20]), float(heights[-1 - len(heights) // 200])
+        if low < high:  # else one sees the lid of a box that is kept throughout, or of one layer
+            return low, high
+    return float(box.low[2]), float(box.high[2])
 
 
 def surface_points(occupancy: Occupancy, box: ViewBox, lowest: float) -> tuple[Tensor, Tensor]:
@@ -174,10 +176,11 @@ def _draw_points(axes: Any, points: Tensor, normals: Tensor, heights: tuple[floa
     """The kept points, coloured by height and lit from above, so that shapes can be read."""
     from matplotlib import colormaps
 
-    axes.set_title(f"{len(points)} kept points, coloured by height", fontsize=10)
     axes.set_axis_off()
     if len(points) == 0:
+        axes.set_title("no surface: all of this is kept, or nothing", fontsize=10)
         return
+    axes.set_title(f"{len(points)} kept points, coloured by height", fontsize=10)
     low, high = heights
     shares = ((points[:, 2] - low) / max(high - low, 1e-9)).clamp(0, 1)
     light = torch.nn.functional.normalize(torch.tensor([0.35, -0.55, 0.75]), dim=0)

@@ -255,7 +255,8 @@ class _Course:
     def _keep_to_learning_time(self) -> None:
         """As a host that learns first does: a model that learns itself freezes in time."""
         progress = getattr(self.trainer.pipeline.model, "progress", None)
-        if progress is None or self.budget.learn_seconds is None:
+        learned = self.run.freeze_seconds is not None
+        if progress is None or learned or self.budget.learn_seconds is None:
             return
         a_step = statistics.fmean(self.step_times[FIRST_TIMED:])
         more = (self.budget.learn_seconds - self.clock.seconds) / a_step

@@ -157,13 +157,13 @@ class LecoModel(Model):
         cut = cut_to_bounds(bundle, self.aabb, near, far, with_images=known)
         return with_ends_for_all(cut, far, torch.minimum(*steps))
 
-    @property
     def estimator(self) -> LearnedOccupancyEstimator:
-        """Samples where the frozen gate says so; built on first use, also after a checkpoint."""
+        """Samples where the frozen gate says so; built on first use, also after a checkpoint.
+
+        No property: nerfstudio's viewer reads all that it finds, before the first step.
+        """
         if not self._estimator:
-            occupancy = self.occupancy()
-            self._estimator = (LearnedOccupancyEstimator(occupancy).to(self.device),)
-            self._estimator[0].requires_grad_(False)
+            self._estimator = (LearnedOccupancyEstimator(self.occupancy()).to(self.device),)
         return self._estimator[0]
 
     def get_extra_state(self) -> dict[str, Any]:
@@ -194,6 +194,7 @@ class LecoModel(Model):
         self.progress = Progress.from_dict(state.get("progress", {}))
         # a gate decides otherwise in another precision than the one it was taught in
         self.precision = state.get("precision", self.precision)
+        self.gate.requires_grad_(not bool(self.frozen))
         self.forget_estimator()
 
     def reopen(self) -> None:
@@ -230,7 +231,7 @@ class LecoModel(Model):
         jitter = torch.rand_like(rays.t_mins) if self.training else None
         along = rays.origins, rays.directions, rays.t_mins, rays.t_maxs
         if guided:
-            samples = self.estimator.kept(*along, size, angle, jitter, t_enters=None)
+            samples = self.estimator().kept(*along, size, angle, jitter, t_enters=None)
         else:
             samples = march(*along, step_size=size, cone_angle=angle, jitter=jitter)
         intervals = Intervals(*samples)

@@ -42,8 +42,8 @@ def bad_paths(folder: Path) -> dict[str, tuple[Path, str]]:
         "no file": (folder / "none", "there is no occupancy .*none: train leco-occupancy"),
         "no file in a folder": (folder / "empty", f"there is no occupancy .*empty/{NAME}"),
         "a damaged file": (folder / "damaged", "damaged is damaged: .* checksum"),
-        "a file cut short": (folder / "cut", "cut is not a whole safetensors file"),
-        "another file": (folder / "text", "text is not a whole safetensors file"),
+        "a file cut short": (folder / "cut", "cut is no safetensors file, or not a whole one"),
+        "another file": (folder / "text", "text is no safetensors file, or not a whole one"),
     }
 
 

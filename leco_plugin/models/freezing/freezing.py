@@ -55,23 +55,33 @@ def freeze(
         f"dB and {measured.lost_surface_mass:.2e} of the surface mass "
         f"({measured.lost_mass:.2e} of all)"
     )
-    advice = advice_on(measured)
+    advice = advice_on(measured, model.progress.phase, model.progress.recoveries)
     if advice is not None:
         say(advice)
     return measured
 
 
-def advice_on(measured: Measured) -> str | None:
-    """What to do about an occupancy that skips next to nothing; None for one that skips."""
+def advice_on(measured: Measured, steps: int, recoveries: int) -> str | None:
+    """What to do about an occupancy that skips next to nothing; None for one that skips.
+
+    Args:
+        steps: that it was learned for, from its beginning or its last recovery.
+        recoveries: how often its gate was healed.
+    """
+    more = max(1, 2 * steps)
     longer = (
-        "more learning steps usually help: schedule.learn-steps, at --pipeline.model of "
-        "leco-occupancy and at --pipeline.model.occupancy.learning of guided methods"
+        f"{more} learning steps in a run of {2 * more} or more may help: schedule.learn-steps, at "
+        "--pipeline.model of leco-occupancy and at --pipeline.model.occupancy.learning of guided "
+        "methods"
     )
     if measured.threshold == 0.0:
         return f"no threshold keeps the price within its bounds, so nothing is skipped; {longer}"
-    if measured.empty_fraction < HARDLY_ANYTHING:
-        return f"hardly anything is skipped, which is right for a scene full of fog; else {longer}"
-    return None
+    if measured.empty_fraction >= HARDLY_ANYTHING:
+        return None
+    if recoveries:
+        often = "once" if recoveries == 1 else f"{recoveries} times"
+        return f"hardly anything is skipped: the gate collapsed {often}, as said above; {longer}"
+    return f"hardly anything is skipped, which is right for a scene full of fog; else {longer}"
 
 
 def _priced(

@@ -93,14 +93,21 @@ def test_without_held_out_pixels_it_is_measured_on_training_rays() -> None:
 
 
 @pytest.mark.parametrize(
-    ("threshold", "skipped", "said"),
-    [(0.0, 0.0, "no threshold"), (0.04, 0.004, "hardly anything"), (0.3, 0.8, None)],
+    ("threshold", "skipped", "recoveries", "said"),
+    [
+        (0.0, 0.0, 0, "no threshold"),
+        (0.04, 0.004, 0, "hardly anything is skipped, which is right for a scene full of fog"),
+        (0.04, 0.004, 1, "hardly anything is skipped: the gate collapsed once"),
+        (0.04, 0.004, 2, "hardly anything is skipped: the gate collapsed 2 times"),
+        (0.3, 0.8, 1, None),
+    ],
 )
-def test_what_skips_next_to_nothing_comes_with_advice(threshold, skipped, said) -> None:
-    advice = advice_on(Measured(threshold, 1e-4, 1e-3, 0.01, skipped))
+def test_what_skips_next_to_nothing_comes_with_advice(threshold, skipped, recoveries, said) -> None:
+    advice = advice_on(Measured(threshold, 1e-4, 1e-3, 0.01, skipped), 150, recoveries)
     assert (advice is None) == (said is None)
     if advice is not None:  # where that option is differs between methods
         assert advice.startswith(said)
+        assert "300 learning steps in a run of 600" in advice
         assert "--pipeline.model of leco-occupancy" in advice
         assert "--pipeline.model.occupancy.learning of guided methods" in advice
 
