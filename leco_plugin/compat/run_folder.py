@@ -5,9 +5,10 @@ A new run deletes whatever checkpoints it finds in its folder as soon as it save
 
 from __future__ import annotations
 
+import atexit
 import os
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
@@ -22,7 +23,8 @@ except ImportError:  # Windows has no such locks: there only checkpoints are loo
     fcntl = None
 
 LOCK = ".running"
-"""File that a run holds locked; the system lets go of it however the run ends."""
+"""File that a run holds locked; the system lets go of it however the run ends, and one that ends by
+itself takes it away."""
 
 _held: dict[Path, int] = {}
 """Descriptors of this process's locks, by folder."""
@@ -42,6 +44,8 @@ def claim(folder: Path, checkpoints: Path, load_from: Path | None) -> str | None
         held = lock(folder)
         if held is None:
             return f"another run is going on in {folder}"
+        if not _held:
+            atexit.register(_release_all, os.getpid())
         _held[place] = held
     theirs = [path for path in checkpoints.glob("*.ckpt") if step_of(path) >= 0]
     if theirs and (load_from is None or not _goes_on(load_from, checkpoints)):
@@ -54,7 +58,14 @@ def release(folder: Path) -> None:
     """Lets go of a folder before the process ends."""
     held = _held.pop(folder.resolve(), None)
     if held is not None:
-        os.close(held)
+        _unlock(folder, held)
+
+
+def _release_all(process: int) -> None:
+    """When a process ends; one that was forked from it has nothing to let go of."""
+    if os.getpid() == process:
+        for folder in list(_held):
+            release(folder)
 
 
 @contextmanager
@@ -80,23 +91,42 @@ def alone_in(folder: Path, work: str) -> Iterator[None]:
     try:
         yield
     finally:
-        os.close(held)
+        _unlock(folder, held)
 
 
 def lock(folder: Path) -> int | None:
     """An open file in a folder that is locked until it is closed, which the system does for a
     process that ends; None where another process has locked it."""
-    held = os.open(folder / LOCK, os.O_CREAT | os.O_RDWR, 0o644)
-    if fcntl is None:
-        return held
+    while True:
+        held = os.open(folder / LOCK, os.O_CREAT | os.O_RDWR, 0o644)
+        if fcntl is None:
+            return held
+        try:
+            fcntl.flock(held, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            os.close(held)
+            return None
+        except OSError:
+            return held  # a file system without locks
+        if _lies_in(folder, held):
+            return held
+        os.close(held)  # taken away by who held it, after it was opened here
+
+
+def _lies_in(folder: Path, held: int) -> bool:
+    """Whether the folder's lock is still this open file."""
     try:
-        fcntl.flock(held, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except BlockingIOError:
-        os.close(held)
-        return None
-    except OSError:
-        return held  # a file system without locks
-    return held
+        return os.path.samestat(os.stat(folder / LOCK), os.fstat(held))
+    except FileNotFoundError:
+        return False
+
+
+def _unlock(folder: Path, held: int) -> None:
+    """Takes the lock away while it is held, so that nobody else's is taken away."""
+    with suppress(OSError):  # Windows keeps files that are open
+        if _lies_in(folder, held):
+            (folder / LOCK).unlink()
+    os.close(held)
 
 
 def _goes_on(load_from: Path, checkpoints: Path) -> bool:

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import copy
+import os
 import subprocess
 import sys
 from pathlib import Path
 
 import pytest
 
+from leco_plugin.compat import run_folder
 from leco_plugin.compat.run_folder import claim, release
 from leco_plugin.method_configs import leco_occupancy
 
@@ -42,6 +44,40 @@ def test_a_folder_in_which_a_run_goes_on_is_refused_until_that_run_is_dead(folde
         other.kill()  # SIGKILL: the system lets go of the lock
     assert claim(folder, folder / "checkpoints", None) is None
     assert claim(folder, folder / "checkpoints", None) is None  # this run's already
+
+
+def test_a_run_that_ends_by_itself_leaves_no_lock_and_one_that_has_it_keeps_it(
+    folder: Path,
+) -> None:
+    code = HOLD.replace("sys.stdin.read()", "")
+    subprocess.run([sys.executable, "-c", code, str(folder)], check=True, capture_output=True)
+    assert list(folder.iterdir()) == []
+    assert claim(folder, folder / "checkpoints", None) is None
+    refused = subprocess.run([sys.executable, "-c", code, str(folder)], capture_output=True)
+    assert b"another run is going on" in refused.stdout
+    assert [path.name for path in folder.iterdir()] == [run_folder.LOCK]
+    release(folder)
+    assert list(folder.iterdir()) == []
+
+
+def test_a_lock_that_is_taken_away_while_it_is_opened_is_made_anew(
+    folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folder.mkdir()
+    flock, opened = run_folder.fcntl.flock, []
+
+    def late(held: int, how: int) -> None:
+        opened.append(held)
+        if len(opened) == 1:  # who held it ends between this one's opening and locking
+            (folder / run_folder.LOCK).unlink()
+        flock(held, how)
+
+    monkeypatch.setattr(run_folder.fcntl, "flock", late)
+    held = run_folder.lock(folder)
+    assert len(opened) == 2 and held is not None
+    assert os.path.samestat(os.stat(folder / run_folder.LOCK), os.fstat(held))
+    assert run_folder.lock(folder) is None
+    os.close(held)
 
 
 def test_a_new_run_does_not_take_a_folder_with_checkpoints(folder: Path) -> None:
