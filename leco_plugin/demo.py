@@ -35,7 +35,7 @@ from leco_plugin.scenes.city.truth import CityTruth
 
 SECONDS = 130.0
 """Training time of each of the two runs; all of it then takes about six minutes on two cores."""
-FULL_LEARNING = 225.0
+FULL_LEARNING = 150.0
 """Training time from which the occupancy is learned in the method's own number of steps."""
 MOST_LEARNING = 0.5
 """Share of the training time that learning may take; a slow machine learns for fewer steps."""
