@@ -181,6 +181,7 @@ class Run:
         truths = [chunk.colors for chunk in chunks]
         measured = calibrate(references, truths, render_kept, CalibrationConfig())
         self.end_learning()
+        self.gate.requires_grad_(False)
         box = self.scene.box
         occupancy = Occupancy(self.gate, self.space, measured.threshold, "bfloat16", walls=box)
         self.estimator = LearnedOccupancyEstimator(

@@ -84,12 +84,12 @@ def run_demo(
         )
     occupancy, facts, truth = _frozen_occupancy(trainer, folder, out)
     _draw_picture(trainer, occupancy, truth, out / "picture.png")
-    del trainer
+    learned: Any = trainer.pipeline.model
+    other = never_frozen(guided, learned.progress.learn_steps)
+    del trainer, learned
 
     with bar("The same, never frozen") as show:
-        other_run, trainer = timed_run(
-            never_frozen(guided), budget, sampler="dense", on_progress=show
-        )
+        other_run, trainer = timed_run(other, Budget(seconds), sampler="dense", on_progress=show)
     manager: Any = trainer.pipeline.datamanager
     report = {
         "format": 1,
@@ -124,12 +124,12 @@ def draw_chart(report: dict[str, Any], path: Path, theme: Theme = LIGHT) -> Path
     return psnr_against_seconds(report["runs"], path, title, scene, labels, theme)
 
 
-def never_frozen(config: TrainerConfig) -> TrainerConfig:
-    """The same method with its gate trained to the end and nothing skipped."""
+def never_frozen(config: TrainerConfig, learn_steps: int) -> TrainerConfig:
+    """The same method, of as many learning steps, its gate trained to the end, nothing skipped."""
     config = copy.deepcopy(config)
     config.method_name = NEVER_FROZEN
     model: Any = config.pipeline.model
-    model.schedule = replace(model.schedule, freeze=False)
+    model.schedule = replace(model.schedule, freeze=False, learn_steps=learn_steps)
     return config
 
 

@@ -1,4 +1,4 @@
-"""`Occupancy`: a frozen gate with its space, threshold and report, a module and one small file.
+"""`Occupancy`: a gate with its space, threshold and report, a module and one small file.
 
 Torch and safetensors only: any project that samples rays can load `occupancy.safetensors`. Nothing
 in such a file is ever executed, and a file that is not sound is refused in one line.

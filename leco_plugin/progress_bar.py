@@ -21,10 +21,10 @@ def bar(what: str) -> Iterator[Callable[[float], None]]:
 
     In a file or a pipe, where no bar can be drawn, it is a line a minute.
     """
-    if not CONSOLE.is_terminal:
+    if not (CONSOLE.is_terminal or CONSOLE.is_jupyter):
         yield _lines(what) if is_first() else lambda share: None
         return
-    columns = (TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn())
+    columns = (TextColumn("{task.description}", markup=False), BarColumn(), TimeElapsedColumn())
     with Progress(
         *columns, TimeRemainingColumn(), console=CONSOLE, transient=True, disable=not is_first()
     ) as progress:
@@ -40,7 +40,8 @@ def _lines(what: str) -> Callable[[float], None]:
         now = time.monotonic()
         if now - said >= SECONDS_A_LINE:
             said = now
-            CONSOLE.print(f"{what}: {share:.0%} after {now - began:.0f} s")
+            said_now = f"{what}: {share:.0%} after {now - began:.0f} s"
+            CONSOLE.print(said_now, markup=False, highlight=False)
 
     return show
 

@@ -57,8 +57,11 @@ def test_it_is_frozen_merged_saved_and_resumed(
     monkeypatch.setattr(lifecycle, "PROBES", 256)
     monkeypatch.setattr(leco, "LearnedOccupancyEstimator", without_cells)
     first = trainer_of(tiny_scene, tmp_path / "first")
-    take_steps(first, 0, 4)
     model = first.pipeline.model
+    model.estimator()  # of a gate that is not frozen: nobody's afterwards
+    take_steps(first, 0, 4)
+    assert model.estimator().occupancy.threshold == float(model.threshold)
+    assert not any(parameter.requires_grad for parameter in model.gate.parameters())
     assert bool(model.frozen) and int(model.field.experts.left.sum()) == 1
     optimizer: Any = first.optimizers.optimizers["field"]
     there = {id(parameter) for parameter in model.field.parameters()}
@@ -71,6 +74,7 @@ def test_it_is_frozen_merged_saved_and_resumed(
     first.save_checkpoint(4)
     second = trainer_of(tiny_scene, tmp_path / "second", first.checkpoint_dir)
     again = second.pipeline.model
+    assert not any(parameter.requires_grad for parameter in again.gate.parameters())
     state = again.state_dict()
     for name, value in model.state_dict().items():
         if isinstance(value, torch.Tensor):

@@ -24,7 +24,7 @@ except ImportError:  # Windows has no such locks: there only checkpoints are loo
 
 LOCK = ".running"
 """File that a run holds locked; the system lets go of it however the run ends, and one that ends by
-itself takes it away."""
+itself takes it away where there are such locks."""
 
 _held: dict[Path, int] = {}
 """Descriptors of this process's locks, by folder."""
@@ -97,7 +97,7 @@ def alone_in(folder: Path, work: str) -> Iterator[None]:
 def lock(folder: Path) -> int | None:
     """An open file in a folder that is locked until it is closed, which the system does for a
     process that ends; None where another process has locked it."""
-    while True:
+    for _ in range(5):
         held = os.open(folder / LOCK, os.O_CREAT | os.O_RDWR, 0o644)
         if fcntl is None:
             return held
@@ -111,6 +111,7 @@ def lock(folder: Path) -> int | None:
         if _lies_in(folder, held):
             return held
         os.close(held)  # taken away by who held it, after it was opened here
+    return os.open(folder / LOCK, os.O_CREAT | os.O_RDWR, 0o644)  # files have no identity here
 
 
 def _lies_in(folder: Path, held: int) -> bool:
@@ -123,8 +124,8 @@ def _lies_in(folder: Path, held: int) -> bool:
 
 def _unlock(folder: Path, held: int) -> None:
     """Takes the lock away while it is held, so that nobody else's is taken away."""
-    with suppress(OSError):  # Windows keeps files that are open
-        if _lies_in(folder, held):
+    with suppress(OSError):
+        if fcntl is not None and _lies_in(folder, held):
             (folder / LOCK).unlink()
     os.close(held)
 

@@ -147,7 +147,10 @@ def heights_seen_from_above(occupancy: Occupancy, box: ViewBox) -> tuple[float, 
     heights = heights[heights.isfinite()].sort().values
     if len(heights) > 0:
         low, high = float(heights[len(heights) // 20]), float(heights[-1 - len(heights) // 200])
-        if low < high:  # else one sees the lid of a box that is kept throughout, or of one layer
+        if low == high and not bool(kept.all()):  # of a single layer
+            around = 2.0 * float(box.high[2] - box.low[2]) / kept.shape[2]
+            return low - around, high + around
+        if low < high:  # else one sees the lid of a box that is kept throughout
             return low, high
     return float(box.low[2]), float(box.high[2])
 

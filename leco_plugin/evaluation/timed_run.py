@@ -214,7 +214,7 @@ class _Course:
         else:
             self.step_times.append(seconds)
         run.steps = step + 1
-        if run.steps == TIMED_STEPS:
+        if run.steps == TIMED_STEPS or self._learning_time_left() <= 0.0:
             self._keep_to_learning_time()
         share = self.budget.share(clock.seconds, run.steps)
         if self.on_progress is not None:
@@ -252,14 +252,18 @@ class _Course:
         self.run.at_freezing = {name: report.get(name) for name in PRICES}
         return True
 
+    def _learning_time_left(self) -> float:
+        """Seconds of it; without end where there is no such limit."""
+        return (self.budget.learn_seconds or math.inf) - self.clock.seconds
+
     def _keep_to_learning_time(self) -> None:
         """As a host that learns first does: a model that learns itself freezes in time."""
         progress = getattr(self.trainer.pipeline.model, "progress", None)
         learned = self.run.freeze_seconds is not None
         if progress is None or learned or self.budget.learn_seconds is None:
             return
-        a_step = statistics.fmean(self.step_times[FIRST_TIMED:])
-        more = (self.budget.learn_seconds - self.clock.seconds) / a_step
+        left = self._learning_time_left()
+        more = left / statistics.fmean(self.step_times[FIRST_TIMED:]) if left > 0.0 else 0.0
         keep_within(progress, more, self.run.steps)
 
 

@@ -49,13 +49,15 @@ def freeze(
     model.frozen.fill_(True)
     model.gate.requires_grad_(False)
     model.report = report
+    model.forget_estimator()  # one that somebody asked for before has the threshold of before
     say(
         f"occupancy learned in {learn_seconds:.0f} s: threshold {measured.threshold:.4f} "
         f"skips {measured.empty_fraction:.1%} of all candidates for {measured.image_price_db:+.3f} "
         f"dB and {measured.lost_surface_mass:.2e} of the surface mass "
         f"({measured.lost_mass:.2e} of all)"
     )
-    advice = advice_on(measured, model.progress.phase, model.progress.recoveries)
+    learned_for = step + 1 - model.progress.since
+    advice = advice_on(measured, learned_for, model.progress.recoveries)
     if advice is not None:
         say(advice)
     return measured
@@ -68,20 +70,22 @@ def advice_on(measured: Measured, steps: int, recoveries: int) -> str | None:
         steps: that it was learned for, from its beginning or its last recovery.
         recoveries: how often its gate was healed.
     """
-    more = max(1, 2 * steps)
     longer = (
-        f"{more} learning steps in a run of {2 * more} or more may help: schedule.learn-steps, at "
-        "--pipeline.model of leco-occupancy and at --pipeline.model.occupancy.learning of guided "
-        "methods"
+        f"it learned for {steps} steps, and more usually help: schedule.learn-steps, at "
+        "--pipeline.model of leco-occupancy, in a run of twice as many, and at "
+        "--pipeline.model.occupancy.learning of guided methods"
     )
+    often = "once" if recoveries == 1 else f"{recoveries} times"
+    before = f"its gate collapsed {often} before; " if recoveries else ""
     if measured.threshold == 0.0:
-        return f"no threshold keeps the price within its bounds, so nothing is skipped; {longer}"
-    if measured.empty_fraction >= HARDLY_ANYTHING:
+        said = "no threshold keeps the price within its bounds, so nothing is skipped"
+    elif measured.empty_fraction >= HARDLY_ANYTHING:
         return None
-    if recoveries:
-        often = "once" if recoveries == 1 else f"{recoveries} times"
-        return f"hardly anything is skipped: the gate collapsed {often}, as said above; {longer}"
-    return f"hardly anything is skipped, which is right for a scene full of fog; else {longer}"
+    elif recoveries:
+        said = "hardly anything is skipped"
+    else:
+        said = "hardly anything is skipped, which is right for a scene full of fog; else"
+    return f"{said}{'' if said.endswith('else') else ';'} {before}{longer}"
 
 
 def _priced(

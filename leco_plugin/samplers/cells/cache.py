@@ -113,7 +113,7 @@ class Tables(NamedTuple):
 
 
 class CellCache(nn.Module):
-    """Lookup of cell decisions; build one with `build.build_cache`.
+    """Lookup of cell decisions; build one with `cells.build.build_cache`.
 
     Args:
         tables: the cells.

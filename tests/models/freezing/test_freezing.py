@@ -97,8 +97,8 @@ def test_without_held_out_pixels_it_is_measured_on_training_rays() -> None:
     [
         (0.0, 0.0, 0, "no threshold"),
         (0.04, 0.004, 0, "hardly anything is skipped, which is right for a scene full of fog"),
-        (0.04, 0.004, 1, "hardly anything is skipped: the gate collapsed once"),
-        (0.04, 0.004, 2, "hardly anything is skipped: the gate collapsed 2 times"),
+        (0.04, 0.004, 1, "hardly anything is skipped; its gate collapsed once before; it learned"),
+        (0.0, 0.0, 2, "no threshold keeps the price within its bounds, so nothing is skipped; its"),
         (0.3, 0.8, 1, None),
     ],
 )
@@ -107,7 +107,7 @@ def test_what_skips_next_to_nothing_comes_with_advice(threshold, skipped, recove
     assert (advice is None) == (said is None)
     if advice is not None:  # where that option is differs between methods
         assert advice.startswith(said)
-        assert "300 learning steps in a run of 600" in advice
+        assert "it learned for 150 steps, and more usually help" in advice
         assert "--pipeline.model of leco-occupancy" in advice
         assert "--pipeline.model.occupancy.learning of guided methods" in advice
 
