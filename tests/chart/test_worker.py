@@ -150,3 +150,16 @@ def test_a_run_that_starts_anew_when_frozen_has_no_field_to_measure(
     one = Contender("LeCO", "leco-occupancy", "learned-occupancy", changes)
     found = run_job(one, 0, tiny_scene, SHORT, tmp_path)
     assert found["occupancy"]["at_equal_loss"] is None and found["steps"] == 6
+
+
+def test_learning_time_is_held_to_whenever_it_is_over(
+    tiny_scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(timed_run, "TIMED_STEPS", 10**6)  # no forecast from the first steps
+    changes = {**SMALL, "schedule.learn_steps": 200}
+    contender = Contender("LeCO", "leco-occupancy", "learned-occupancy", changes)
+    protocol = Protocol(steps=30, images=1, curve_points=2, learn_seconds=0.01)
+    folder = job(tmp_path, tiny_scene)
+    record = run_job(contender, 3, tiny_scene, protocol, folder)
+    assert record["freeze_seconds"] is not None
+    assert record["freeze_seconds"] < record["train_seconds"]
