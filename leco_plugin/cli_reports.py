@@ -13,21 +13,19 @@ def occupancy_of(path: Path) -> Path:
     Raises:
         ValueError: there is neither, or none in the folder.
     """
+    give = (
+        "give an occupancy.safetensors, or a folder with a run that left one, as "
+        "outputs/SCENE/leco-occupancy"
+    )
     if not path.exists():
-        raise ValueError(
-            f"there is no {path}: give an occupancy.safetensors, or a folder with a run that left "
-            "one, as outputs/SCENE/leco-occupancy"
-        )
+        raise ValueError(f"there is no {path}: {give}")
     if not path.is_dir():
         return path
     from leco_plugin.models.hosts.guided_start import occupancy_file
 
     file = occupancy_file(path)
     if file is None or not file.exists():
-        raise ValueError(
-            f"there is no occupancy.safetensors in {path}: give the folder of a run that has "
-            "learned its occupancy, as outputs/SCENE/leco-occupancy"
-        )
+        raise ValueError(f"there is no occupancy.safetensors in {path}: {give}")
     return file
 
 

@@ -94,24 +94,23 @@ def alone_in(folder: Path, work: str) -> Iterator[None]:
         _unlock(folder, held)
 
 
-def lock(folder: Path) -> int | None:
+def lock(folder: Path, tries: int = 5) -> int | None:
     """An open file in a folder that is locked until it is closed, which the system does for a
     process that ends; None where another process has locked it."""
-    for _ in range(5):
-        held = os.open(folder / LOCK, os.O_CREAT | os.O_RDWR, 0o644)
-        if fcntl is None:
-            return held
-        try:
-            fcntl.flock(held, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
-            os.close(held)
-            return None
-        except OSError:
-            return held  # a file system without locks
-        if _lies_in(folder, held):
-            return held
-        os.close(held)  # taken away by who held it, after it was opened here
-    return os.open(folder / LOCK, os.O_CREAT | os.O_RDWR, 0o644)  # files have no identity here
+    held = os.open(folder / LOCK, os.O_CREAT | os.O_RDWR, 0o644)
+    if fcntl is None:
+        return held
+    try:
+        fcntl.flock(held, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        os.close(held)
+        return None
+    except OSError:
+        return held  # a file system without locks
+    if tries > 1 and not _lies_in(folder, held):  # taken away by who held it, or never the same
+        os.close(held)
+        return lock(folder, tries - 1)
+    return held
 
 
 def _lies_in(folder: Path, held: int) -> bool:

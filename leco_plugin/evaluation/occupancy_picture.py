@@ -145,14 +145,11 @@ def heights_seen_from_above(occupancy: Occupancy, box: ViewBox) -> tuple[float, 
     _, positions, kept = _kept_cells(occupancy, box, CELLS)
     heights = torch.where(kept, positions[..., 2], -torch.inf).amax(dim=-1)
     heights = heights[heights.isfinite()].sort().values
-    if len(heights) > 0:
-        low, high = float(heights[len(heights) // 20]), float(heights[-1 - len(heights) // 200])
-        if low == high and not bool(kept.all()):  # of a single layer
-            around = 2.0 * float(box.high[2] - box.low[2]) / kept.shape[2]
-            return low - around, high + around
-        if low < high:  # else one sees the lid of a box that is kept throughout
-            return low, high
-    return float(box.low[2]), float(box.high[2])
+    if len(heights) == 0 or heights[len(heights) // 20] == positions[..., 2].max():
+        return float(box.low[2]), float(box.high[2])  # nothing, or the lid of what is all kept
+    low, high = float(heights[len(heights) // 20]), float(heights[-1 - len(heights) // 200])
+    around = 2.0 * float(box.high[2] - box.low[2]) / kept.shape[2] if low == high else 0.0
+    return low - around, high + around
 
 
 def surface_points(occupancy: Occupancy, box: ViewBox, lowest: float) -> tuple[Tensor, Tensor]:

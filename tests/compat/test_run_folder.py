@@ -80,6 +80,16 @@ def test_a_lock_that_is_taken_away_while_it_is_opened_is_made_anew(
     os.close(held)
 
 
+def test_a_lock_is_held_where_files_are_never_the_same(
+    folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folder.mkdir()
+    monkeypatch.setattr(run_folder, "_lies_in", lambda *_: False)
+    held = run_folder.lock(folder)
+    assert held is not None and run_folder.lock(folder) is None
+    os.close(held)
+
+
 def test_a_new_run_does_not_take_a_folder_with_checkpoints(folder: Path) -> None:
     checkpoints = folder / "checkpoints"
     checkpoints.mkdir(parents=True)

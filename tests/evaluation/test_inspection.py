@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import math
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -11,8 +13,13 @@ import torch
 from ball_occupancy import CENTRE, HALF, RADIUS, ball
 from PIL import Image
 
-from leco_plugin.evaluation.inspection import cameras_of, describe, exposed, whole_box
-from leco_plugin.evaluation.occupancy_picture import draw, interesting_box, surface_points
+from leco_plugin.evaluation.inspection import ViewBox, cameras_of, describe, exposed, whole_box
+from leco_plugin.evaluation.occupancy_picture import (
+    draw,
+    heights_seen_from_above,
+    interesting_box,
+    surface_points,
+)
 from leco_plugin.occupancy import Occupancy
 
 NO_CAMERAS = torch.zeros(0, 3)
@@ -64,6 +71,26 @@ def test_points_are_on_the_surface_and_face_outwards() -> None:
     assert float((offsets.norm(dim=-1) - RADIUS).abs().mean()) < 0.08
     outwards = torch.nn.functional.normalize(offsets, dim=-1)
     assert float((normals * outwards).sum(dim=-1).mean()) > 0.9
+
+
+@pytest.mark.parametrize(
+    ("kept", "seen"),
+    [
+        (lambda at: at[:, 2] < 9.0, (0.0, 4.0)),
+        (lambda at: (at - 1.0).norm(dim=-1) > 0.3, (0.0, 4.0)),
+        (lambda at: at[:, 2] > 9.0, (0.0, 4.0)),
+        (lambda at: (at[:, 2] - 2.0).abs() < 0.03, (1.95, 2.08)),
+        (lambda at: at[:, 2] < torch.where(at[:, 0] < 2.0, 1.0, 3.0), (0.98, 2.98)),
+    ],
+    ids=["all", "nearly all", "nothing", "a layer", "a step"],
+)
+def test_heights_are_those_of_what_is_met_from_above(kept: Any, seen: tuple[float, float]) -> None:
+    value = torch.tensor(0.5)
+    known: Any = SimpleNamespace(
+        threshold=0.5, threshold_value=value, query=lambda at: kept(at).float()
+    )
+    box = ViewBox(torch.zeros(3), torch.full((3,), 4.0))
+    assert heights_seen_from_above(known, box) == pytest.approx(seen, abs=0.05)
 
 
 @pytest.mark.parametrize("threshold", [0.0, 1.0])

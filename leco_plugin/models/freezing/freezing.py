@@ -70,22 +70,22 @@ def advice_on(measured: Measured, steps: int, recoveries: int) -> str | None:
         steps: that it was learned for, from its beginning or its last recovery.
         recoveries: how often its gate was healed.
     """
-    longer = (
-        f"it learned for {steps} steps, and more usually help: schedule.learn-steps, at "
-        "--pipeline.model of leco-occupancy, in a run of twice as many, and at "
-        "--pipeline.model.occupancy.learning of guided methods"
-    )
-    often = "once" if recoveries == 1 else f"{recoveries} times"
-    before = f"its gate collapsed {often} before; " if recoveries else ""
     if measured.threshold == 0.0:
-        said = "no threshold keeps the price within its bounds, so nothing is skipped"
+        said = "no threshold keeps the price within its bounds, so nothing is skipped;"
     elif measured.empty_fraction >= HARDLY_ANYTHING:
         return None
     elif recoveries:
-        said = "hardly anything is skipped"
+        said = "hardly anything is skipped;"
     else:
         said = "hardly anything is skipped, which is right for a scene full of fog; else"
-    return f"{said}{'' if said.endswith('else') else ';'} {before}{longer}"
+    if recoveries:
+        often = "once" if recoveries == 1 else f"{recoveries} times"
+        said += f" its gate collapsed {often} before;"
+    return (
+        f"{said} it learned for {steps} steps, and more usually help: schedule.learn-steps, at "
+        "--pipeline.model of leco-occupancy, in a run of twice as many, and at "
+        "--pipeline.model.occupancy.learning of guided methods"
+    )
 
 
 def _priced(
