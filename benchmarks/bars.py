@@ -12,11 +12,11 @@ from typing import Any
 import checkout  # noqa: F401
 from stability_page import has_lost, runs_gone_on
 
-from leco_plugin.chart.cells import rows
-from leco_plugin.chart.learned import learned_of
-from leco_plugin.chart.methods import NEVER_FROZEN, VARIANTS
-from leco_plugin.chart.summary import figure_in, lines_of
-from leco_plugin.chart.versus import versus
+from leco_plugin.chart.contenders.methods import NEVER_FROZEN, VARIANTS
+from leco_plugin.chart.drawing.cells import rows
+from leco_plugin.chart.findings.learned import learned_of
+from leco_plugin.chart.findings.summary import figure_in, lines_of
+from leco_plugin.chart.findings.versus import versus
 
 EQUAL_EXPERTS = VARIANTS["leco-occupancy-homogeneous"]
 CITY, SURVEY, SURVEY_NAME = "charts/city-3", "charts/caliterra", "`caliterra`"

@@ -10,10 +10,10 @@ import checkout  # noqa: F401
 from page_parts import RESULTS, machine_line, picture
 from paper_rows import PAPER_ROWS
 
-from leco_plugin.chart.representations import COSTS, fronts_of, representations_of, verdict
-from leco_plugin.chart.suites import SUITES
-from leco_plugin.chart.summary import lines_of
-from leco_plugin.chart.table import table
+from leco_plugin.chart.contenders.suites import SUITES
+from leco_plugin.chart.drawing.table import table
+from leco_plugin.chart.findings.representations import COSTS, fronts_of, representations_of, verdict
+from leco_plugin.chart.findings.summary import lines_of
 
 CHARTS = RESULTS / "charts"
 

@@ -16,7 +16,7 @@ from typing import Any
 
 import checkout  # noqa: F401
 
-from leco_plugin.chart.theme import LIGHT, Theme, plain, themed
+from leco_plugin.chart.drawing.theme import LIGHT, Theme, plain, themed
 from leco_plugin.cli_reports import occupancy_of
 from leco_plugin.evaluation.charts import SOURCE, fingerprint
 from leco_plugin.evaluation.history_picture import OPAQUE

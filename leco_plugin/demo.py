@@ -15,7 +15,7 @@ import torch
 from nerfstudio.engine.trainer import Trainer, TrainerConfig
 from torch import Tensor
 
-from leco_plugin.chart.theme import LIGHT, Theme
+from leco_plugin.chart.drawing.theme import LIGHT, Theme
 from leco_plugin.compat.host_outputs import true_colours
 from leco_plugin.evaluation.charts import psnr_against_seconds
 from leco_plugin.evaluation.clock import Budget

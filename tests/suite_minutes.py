@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from leco_plugin.chart import forecast
-from leco_plugin.chart.forecast import Cores
-from leco_plugin.chart.protocol import Protocol
-from leco_plugin.chart.suites import SUITES
+from leco_plugin.chart.contenders import forecast
+from leco_plugin.chart.contenders.forecast import Cores
+from leco_plugin.chart.contenders.protocol import Protocol
+from leco_plugin.chart.contenders.suites import SUITES
 
 
 def minutes_together(names: Sequence[str], cores: Cores) -> float:

@@ -12,7 +12,7 @@ from leco_plugin.capacity.choice import choose, kilobytes, verdict
 from leco_plugin.capacity.field import prepare
 from leco_plugin.capacity.measuring import Candidate, gates, grids, of_gate, of_grids
 from leco_plugin.capacity.picture import draw
-from leco_plugin.chart.theme import DARK, LIGHT
+from leco_plugin.chart.drawing.theme import DARK, LIGHT
 from leco_plugin.evaluation.equal_loss import MOST_ON_CPU
 from leco_plugin.evaluation.field_grids import fits_memory
 from leco_plugin.evaluation.json_file import read_object, write_json

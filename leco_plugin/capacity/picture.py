@@ -9,7 +9,7 @@ from typing import Any
 
 from leco_plugin.capacity.choice import NAMES, choose, common_volume, verdict
 from leco_plugin.capacity.measuring import FAMILIES, VOLUMES
-from leco_plugin.chart.theme import LIGHT, Theme, plain, style, themed
+from leco_plugin.chart.drawing.theme import LIGHT, Theme, plain, style, themed
 from leco_plugin.evaluation.charts import SOURCE, fingerprint
 
 LEAST = 1e-5

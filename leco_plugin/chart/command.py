@@ -11,13 +11,13 @@ from typing import Any
 
 from nerfstudio.utils.rich_utils import CONSOLE
 
-from leco_plugin.chart.methods import contenders
-from leco_plugin.chart.processes import ProcessRunner
-from leco_plugin.chart.protocol import Protocol
-from leco_plugin.chart.reuse import fitting
-from leco_plugin.chart.run import Chart, Runner
-from leco_plugin.chart.suites import SUITES, in_order
-from leco_plugin.chart.suites import suite as suite_of
+from leco_plugin.chart.contenders.methods import contenders
+from leco_plugin.chart.contenders.protocol import Protocol
+from leco_plugin.chart.contenders.suites import SUITES, in_order
+from leco_plugin.chart.contenders.suites import suite as suite_of
+from leco_plugin.chart.runs.processes import ProcessRunner
+from leco_plugin.chart.runs.reuse import fitting
+from leco_plugin.chart.runs.run import Chart, Runner
 from leco_plugin.progress_bar import bar, resumable
 from leco_plugin.scenes.input_error import InputError
 

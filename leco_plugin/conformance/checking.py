@@ -6,14 +6,14 @@ from collections.abc import Iterator
 
 import torch
 
-from leco_plugin.conformance.estimator_case import EstimatorCase
-from leco_plugin.conformance.host_case import HostCase
-from leco_plugin.conformance.host_rules import HOST_RULES
-from leco_plugin.conformance.proposal_case import ProposalCase
+from leco_plugin.conformance.hosts.host_case import HostCase
+from leco_plugin.conformance.hosts.host_rules import HOST_RULES
+from leco_plugin.conformance.kit.scene import SLAB
 from leco_plugin.conformance.rule import Case, Rule, Verdict, apply
-from leco_plugin.conformance.sampler_case import SamplerCase
-from leco_plugin.conformance.sampler_rules import SAMPLER_RULES
-from leco_plugin.conformance.scene import SLAB
+from leco_plugin.conformance.samplers.estimator_case import EstimatorCase
+from leco_plugin.conformance.samplers.proposal_case import ProposalCase
+from leco_plugin.conformance.samplers.sampler_case import SamplerCase
+from leco_plugin.conformance.samplers.sampler_rules import SAMPLER_RULES
 from leco_plugin.entries import why_left_out
 from leco_plugin.samplers.registry import GROUP, SamplerSpec, sampler_spec, samplers
 from leco_plugin.scenes.input_error import InputError

@@ -9,7 +9,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from leco_plugin.chart.theme import LIGHT, Theme, plain, style, themed
+from leco_plugin.chart.drawing.theme import LIGHT, Theme, plain, style, themed
 
 COLOURS = ("#0b6e8f", "#d1602b", "#6b8e23", "#7d4fa3", "#555555")
 """Told apart also in grey and by colour-blind readers."""

@@ -7,7 +7,7 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-from leco_plugin.chart.folder import UNFINISHED, ChartFolder, difference
+from leco_plugin.chart.runs.folder import UNFINISHED, ChartFolder, difference
 from leco_plugin.compat.run_folder import LOCK
 from leco_plugin.evaluation.json_file import read_object, write_json
 from leco_plugin.scenes.input_error import InputError

@@ -8,9 +8,9 @@ from typing import Any
 
 import pytest
 
-from leco_plugin.chart.configs import config_of
-from leco_plugin.chart.contender import Contender
-from leco_plugin.chart.methods import contenders
+from leco_plugin.chart.contenders.configs import config_of
+from leco_plugin.chart.contenders.contender import Contender
+from leco_plugin.chart.contenders.methods import contenders
 from leco_plugin.host_configs import leco_ngp
 from leco_plugin.method_configs import best_device
 from leco_plugin.models.guided import GuidedModelConfig

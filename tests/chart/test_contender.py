@@ -7,7 +7,7 @@ from dataclasses import asdict, dataclass, field, replace
 
 import pytest
 
-from leco_plugin.chart.contender import Contender, changed, short_names
+from leco_plugin.chart.contenders.contender import Contender, changed, short_names
 
 
 @dataclass(frozen=True)

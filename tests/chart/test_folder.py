@@ -7,8 +7,8 @@ from pathlib import Path
 
 import pytest
 
-from leco_plugin.chart.contender import Contender
-from leco_plugin.chart.folder import RUNS, UNFINISHED, ChartFolder, Job
+from leco_plugin.chart.contenders.contender import Contender
+from leco_plugin.chart.runs.folder import RUNS, UNFINISHED, ChartFolder, Job
 from leco_plugin.scenes.input_error import InputError
 
 SETTINGS = {"seconds": 10.0, "machine": {"cores": 2, "device": "cpu"}, "sizes": (1, 2)}

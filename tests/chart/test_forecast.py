@@ -6,10 +6,10 @@ from dataclasses import replace
 
 import pytest
 
-from leco_plugin.chart import forecast
-from leco_plugin.chart.contender import Contender
-from leco_plugin.chart.forecast import FAST, SLOW
-from leco_plugin.chart.protocol import Protocol
+from leco_plugin.chart.contenders import forecast
+from leco_plugin.chart.contenders.contender import Contender
+from leco_plugin.chart.contenders.forecast import FAST, SLOW
+from leco_plugin.chart.contenders.protocol import Protocol
 
 GUIDED = Contender("guided", "leco-occupancy", "learned-occupancy")
 DENSE = Contender("dense", "leco-occupancy", "dense")

@@ -12,17 +12,17 @@ from pathlib import Path
 
 import chart_results
 
-from leco_plugin.chart.contender import Contender
-from leco_plugin.chart.folder import RUNS, UNFINISHED
-from leco_plugin.chart.processes import ProcessRunner
-from leco_plugin.chart.protocol import Protocol
-from leco_plugin.chart.run import Chart
+from leco_plugin.chart.contenders.contender import Contender
+from leco_plugin.chart.contenders.protocol import Protocol
+from leco_plugin.chart.runs.folder import RUNS, UNFINISHED
+from leco_plugin.chart.runs.processes import ProcessRunner
+from leco_plugin.chart.runs.run import Chart
 
 NAMES = ("first", "second", "third")
 WORKER = """
 import json, sys, time
 from pathlib import Path
-from leco_plugin.chart.worker import die_with_parent
+from leco_plugin.chart.runs.worker import die_with_parent
 die_with_parent()
 work = Path(sys.argv[-1])
 name = json.loads((work / "job.json").read_text())["contender"]["name"]

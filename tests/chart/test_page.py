@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 from chart_results import occupancy, results, run
 
-from leco_plugin.chart.page import write_page
+from leco_plugin.chart.drawing.page import write_page
 
 
 @pytest.fixture(scope="module")

@@ -12,10 +12,10 @@ from hypothesis import strategies as st
 from matplotlib.figure import Figure
 from PIL import Image
 
-from leco_plugin.chart.panels import NAME_WIDTH, name_points
-from leco_plugin.chart.picture import CLOSE, _name_ends, balanced, best_so_far, draw, spread
-from leco_plugin.chart.summary import lines_of
-from leco_plugin.chart.theme import DARK, LIGHT, Theme
+from leco_plugin.chart.drawing.panels import NAME_WIDTH, name_points
+from leco_plugin.chart.drawing.picture import CLOSE, _name_ends, balanced, best_so_far, draw, spread
+from leco_plugin.chart.drawing.theme import DARK, LIGHT, Theme
+from leco_plugin.chart.findings.summary import lines_of
 from leco_plugin.evaluation.charts import SOURCE, fingerprint
 
 RUNS = [

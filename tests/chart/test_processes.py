@@ -9,10 +9,10 @@ from pathlib import Path
 
 import pytest
 
-from leco_plugin.chart.contender import Contender
-from leco_plugin.chart.folder import LOGS, RUNS, UNFINISHED, ChartFolder, Job
-from leco_plugin.chart.processes import ProcessRunner, RunFailed
-from leco_plugin.chart.protocol import Protocol
+from leco_plugin.chart.contenders.contender import Contender
+from leco_plugin.chart.contenders.protocol import Protocol
+from leco_plugin.chart.runs.folder import LOGS, RUNS, UNFINISHED, ChartFolder, Job
+from leco_plugin.chart.runs.processes import ProcessRunner, RunFailed
 
 JOB = Job(Contender("A + b", "a", "b"), 3)
 OPENED = "import json, os, sys, time; from pathlib import Path; work = Path(sys.argv[-1]); "
@@ -78,7 +78,7 @@ def test_stopping_the_chart_ends_the_run_that_is_under_way(folder: ChartFolder) 
 
 def test_a_run_ends_when_the_process_that_waits_for_it_is_gone() -> None:
     code = (
-        "import time; from leco_plugin.chart.worker import die_with_parent; "
+        "import time; from leco_plugin.chart.runs.worker import die_with_parent; "
         "die_with_parent(); print('up', flush=True); time.sleep(60)"
     )
     child = subprocess.Popen(

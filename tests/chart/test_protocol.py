@@ -6,7 +6,7 @@ import math
 
 import pytest
 
-from leco_plugin.chart.protocol import LEARN_SHARE, Protocol, settings_of
+from leco_plugin.chart.contenders.protocol import LEARN_SHARE, Protocol, settings_of
 
 
 def test_more_time_is_more_time_for_everything_but_learning() -> None:

@@ -7,14 +7,14 @@ from chart_results import occupancy, results, run, slow_front
 from hypothesis import given
 from hypothesis import strategies as st
 
-from leco_plugin.chart.representations import (
+from leco_plugin.chart.findings.representations import (
     Held,
     Representation,
     fronts_of,
     representations_of,
     verdict,
 )
-from leco_plugin.chart.summary import lines_of
+from leco_plugin.chart.findings.summary import lines_of
 
 GRIDS = [
     {"resolution": 64, "bytes": 32768, "update_seconds": 2.0, "kept_reached_volume": 0.3},

@@ -11,11 +11,11 @@ from typing import Any
 import chart_results
 import pytest
 
-from leco_plugin.chart.contender import Contender
-from leco_plugin.chart.folder import RUNS, Job
-from leco_plugin.chart.protocol import Protocol
-from leco_plugin.chart.reuse import fitting
-from leco_plugin.chart.run import Chart
+from leco_plugin.chart.contenders.contender import Contender
+from leco_plugin.chart.contenders.protocol import Protocol
+from leco_plugin.chart.runs.folder import RUNS, Job
+from leco_plugin.chart.runs.reuse import fitting
+from leco_plugin.chart.runs.run import Chart
 from leco_plugin.scenes.input_error import InputError
 
 PLAIN = Contender("learn", "leco-occupancy", "learned-occupancy", {"distortion": 0.1})

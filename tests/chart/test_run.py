@@ -11,12 +11,12 @@ from typing import Any
 import chart_results
 import pytest
 
-from leco_plugin.chart import picture
-from leco_plugin.chart.contender import Contender
-from leco_plugin.chart.folder import Job
-from leco_plugin.chart.processes import RunFailed
-from leco_plugin.chart.protocol import Protocol
-from leco_plugin.chart.run import Chart
+from leco_plugin.chart.contenders.contender import Contender
+from leco_plugin.chart.contenders.protocol import Protocol
+from leco_plugin.chart.drawing import picture
+from leco_plugin.chart.runs.folder import Job
+from leco_plugin.chart.runs.processes import RunFailed
+from leco_plugin.chart.runs.run import Chart
 
 CONTENDERS = [Contender(name, name, "own") for name in ("a", "b", "c")]
 SEEDS = (0, 1)
@@ -180,7 +180,7 @@ def test_the_commits_are_those_at_which_the_runs_were_made(
 ) -> None:
     for commit, compared in (("1b", CONTENDERS[:1]), ("2a", CONTENDERS[1:2])):
         code = {"version": "0.1.0", "commit": commit}
-        monkeypatch.setattr("leco_plugin.chart.run.describe_code", lambda code=code: code)
+        monkeypatch.setattr("leco_plugin.chart.runs.run.describe_code", lambda code=code: code)
         results = make(chart(tiny_scene, tmp_path, contenders=compared), Runner())
     assert results["made"]["commit"] == "1b, 2a"
 

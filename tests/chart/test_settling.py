@@ -5,9 +5,9 @@ from __future__ import annotations
 import pytest
 from chart_results import results, run
 
-from leco_plugin.chart.settling import last_gain, settling
-from leco_plugin.chart.summary import lines_of
-from leco_plugin.chart.table import table
+from leco_plugin.chart.drawing.table import table
+from leco_plugin.chart.findings.settling import last_gain, settling
+from leco_plugin.chart.findings.summary import lines_of
 
 STILL = [[3.0, 18.0], [6.0, 20.0], [9.0, 20.2]]
 RISING = [[3.0, 15.0], [6.0, 18.0], [9.0, 21.0]]

@@ -8,10 +8,10 @@ from typing import Any
 
 import pytest
 
-from leco_plugin.chart.contender import Contender
-from leco_plugin.chart.protocol import Protocol
-from leco_plugin.chart.suites import SUITES
-from leco_plugin.chart.worker import run_job
+from leco_plugin.chart.contenders.contender import Contender
+from leco_plugin.chart.contenders.protocol import Protocol
+from leco_plugin.chart.contenders.suites import SUITES
+from leco_plugin.chart.runs.worker import run_job
 from leco_plugin.evaluation import timed_run
 
 pytestmark = [  # nerfstudio leaves an image open

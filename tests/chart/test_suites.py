@@ -8,10 +8,10 @@ import pytest
 from suite_minutes import minutes_together
 
 from leco_plugin import cli
-from leco_plugin.chart.configs import config_of
-from leco_plugin.chart.forecast import FAST, SLOW, Cores, run_seconds
-from leco_plugin.chart.methods import contenders
-from leco_plugin.chart.suites import (
+from leco_plugin.chart.contenders.configs import config_of
+from leco_plugin.chart.contenders.forecast import FAST, SLOW, Cores, run_seconds
+from leco_plugin.chart.contenders.methods import contenders
+from leco_plugin.chart.contenders.suites import (
     AT_ONCE,
     CPU_STEPS,
     STEPS,

@@ -7,7 +7,7 @@ from chart_results import results, run, slow_front
 from hypothesis import given
 from hypothesis import strategies as st
 
-from leco_plugin.chart.summary import (
+from leco_plugin.chart.findings.summary import (
     KEPT,
     MEMORY,
     RENDERING,

@@ -6,7 +6,7 @@ from pathlib import Path
 
 from chart_results import occupancy, results, run
 
-from leco_plugin.chart.table import table, write_table
+from leco_plugin.chart.drawing.table import table, write_table
 
 FAILURE = {"name": "B", "method": "b", "sampler": "own", "seed": 1, "reason": "a | b"}
 

@@ -5,9 +5,9 @@ from __future__ import annotations
 import pytest
 from chart_results import results, run
 
-from leco_plugin.chart.summary import lines_of, seconds_to_pass
-from leco_plugin.chart.table import table
-from leco_plugin.chart.versus import rivals
+from leco_plugin.chart.drawing.table import table
+from leco_plugin.chart.findings.summary import lines_of, seconds_to_pass
+from leco_plugin.chart.findings.versus import rivals
 
 CURVE = [[10.0, 18.0], [20.0, 20.0], [30.0, 19.0], [40.0, 21.0]]
 

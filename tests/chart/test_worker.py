@@ -12,10 +12,10 @@ from typing import Any
 import pytest
 import torch
 
-from leco_plugin.chart import worker
-from leco_plugin.chart.contender import Contender
-from leco_plugin.chart.protocol import Protocol
-from leco_plugin.chart.worker import FAILURE, JOB, PROGRESS, RESULT, main, run_job, train_job
+from leco_plugin.chart.contenders.contender import Contender
+from leco_plugin.chart.contenders.protocol import Protocol
+from leco_plugin.chart.runs import worker
+from leco_plugin.chart.runs.worker import FAILURE, JOB, PROGRESS, RESULT, main, run_job, train_job
 from leco_plugin.evaluation import timed_run
 
 pytestmark = [  # nerfstudio leaves an image open
@@ -111,7 +111,7 @@ def test_a_method_that_crashes_half_way_has_its_own_reason(
 def test_gate_and_grids_are_measured_on_the_field_of_the_moment_of_freezing(
     tiny_scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    from leco_plugin.chart.configs import config_of
+    from leco_plugin.chart.contenders.configs import config_of
     from leco_plugin.evaluation import equal_loss
 
     asked: list[dict[str, torch.Tensor]] = []

@@ -11,7 +11,7 @@ from nerfstudio.configs.method_configs import all_methods
 from nerfstudio.plugins.registry import discover_methods
 
 from leco_plugin.conformance.checking import host_cases, pairs
-from leco_plugin.conformance.host_rules import HOST_RULES
+from leco_plugin.conformance.hosts.host_rules import HOST_RULES
 from leco_plugin.conformance.rule import apply
 from leco_plugin.models.hosts import seams
 from leco_plugin.samplers import registry

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from leco_plugin.conformance.sampler_rules import SAMPLER_RULES
+from leco_plugin.conformance.samplers.sampler_rules import SAMPLER_RULES
 from leco_plugin.conformance.table import with_table
 
 PAGE = Path(__file__).resolve().parents[2] / "docs" / "conformance.md"

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from leco_plugin.chart.theme import DARK, LIGHT, Theme
+from leco_plugin.chart.drawing.theme import DARK, LIGHT, Theme
 from leco_plugin.evaluation.charts import psnr_against_seconds
 from leco_plugin.evaluation.json_file import write_json
 from leco_plugin.evaluation.machine import describe_code, describe_machine, made_by

@@ -1,0 +1,1 @@
+"""A chart for people: picture, page and tables."""

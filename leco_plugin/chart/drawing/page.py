@@ -1,0 +1,154 @@
+"""`chart.html`: the same chart to look into. One file that asks no other machine for anything."""
+
+from __future__ import annotations
+
+import html
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from leco_plugin.chart.drawing.theme import LIGHT
+from leco_plugin.chart.drawing.title import title_of
+from leco_plugin.chart.findings.representations import Representation, representations_of
+from leco_plugin.chart.findings.summary import (
+    COSTS,
+    LEARNING,
+    Line,
+    circumstances,
+    front,
+    lines_of,
+)
+
+SYMBOLS = ("circle", "square", "diamond", "triangle-up", "triangle-down", "cross", "x", "star")
+FRONT = {"color": "rgba(120,120,120,0.45)", "width": 5, "shape": "hv"}
+
+
+def write_page(results: Mapping[str, Any], path: Path) -> Path:
+    """Writes the page of results that hold at least one run.
+
+    A click on a name hides it everywhere, two clicks show it alone; a pointer shows figures.
+    """
+    lines = lines_of(results)
+    held = representations_of(lines)
+    title = html.escape(title_of(results))
+    figure = _figure(lines)
+    if held:
+        _add_representations(figure, held)
+    figure.update_layout(
+        title={"text": f"<b>{title}</b><br><sub>{html.escape(circumstances(results))}</sub>"},
+        template="plotly_white",
+        height=1100 if held else 820,
+        legend={"orientation": "h", "y": -0.08},
+        margin={"t": 110},
+    )
+    figure.write_html(path, include_plotlyjs=True, full_html=True)
+    return path
+
+
+def _figure(lines: Sequence[Line]) -> Any:
+    """Curves on top, costs below; a third row is left for representations if there are any."""
+    import plotly.graph_objects as go
+    from plotly.subplots import make_subplots
+
+    rows = 3 if representations_of(lines) else 2
+    wide = [{"colspan": 3}, None, None]
+    titles = ["", *(cost.titled for cost in COSTS)]
+    if rows == 3:
+        titles += ["size of the occupancy, kB", "learning the occupancy, s", ""]
+    figure = make_subplots(
+        rows=rows,
+        cols=3,
+        specs=[wide, *([[{}, {}, {}]] * (rows - 1))],
+        subplot_titles=titles,
+        vertical_spacing=0.13,
+    )
+    for i, line in enumerate(lines):
+        colour = LIGHT.colours[i % len(LIGHT.colours)]
+        for run in line.runs:
+            seconds, psnrs = zip(*run["curve"])
+            figure.add_trace(
+                go.Scatter(
+                    x=seconds,
+                    y=psnrs,
+                    name=line.name,
+                    legendgroup=line.name,
+                    showlegend=run is line.runs[0],
+                    mode="lines+markers",
+                    line={"color": colour, "dash": "solid" if line.learned else "dash"},
+                    hovertemplate=f"%{{x:.1f}} s, %{{y:.2f}} dB, seed {run['seed']}",
+                ),
+                row=1,
+                col=1,
+            )
+        for column, cost in enumerate(COSTS, start=1):
+            value = line.median(cost)
+            if value is not None:
+                figure.add_trace(_point(line, i, value), row=2, col=column)
+    for column, cost in enumerate(COSTS, start=1):
+        known = [(value, line.psnr) for line in lines if (value := line.median(cost)) is not None]
+        figure.add_trace(_front([known[j] for j in front(known)]), row=2, col=column)
+    figure.update_xaxes(title_text="seconds of training", row=1, col=1)
+    figure.update_yaxes(title_text="PSNR on test images, dB", row=1, col=1)
+    figure.update_yaxes(title_text="PSNR, dB", row=2, col=1)
+    return figure
+
+
+def _point(line: Line, i: int, value: float) -> Any:
+    import plotly.graph_objects as go
+
+    learning = line.median(LEARNING)
+    spread = [max(line.psnrs) - line.psnr], [line.psnr - min(line.psnrs)]
+    return go.Scatter(
+        x=[value],
+        y=[line.psnr],
+        error_y={"array": spread[0], "arrayminus": spread[1], "symmetric": False},
+        name=line.name,
+        legendgroup=line.name,
+        showlegend=False,
+        mode="markers",
+        marker={
+            "size": 13,
+            "symbol": SYMBOLS[i % len(SYMBOLS)],
+            "color": LIGHT.colours[i % len(LIGHT.colours)],
+        },
+        hovertemplate="%{x:.3g}, %{y:.2f} dB"
+        + (f", learned in {learning:.0f} s" if learning is not None else ""),
+    )
+
+
+def _front(points: Sequence[tuple[float, float]]) -> Any:
+    import plotly.graph_objects as go
+
+    costs, gains = zip(*points) if points else ((), ())
+    return go.Scatter(
+        x=costs, y=gains, mode="lines", line=FRONT, showlegend=False, hoverinfo="skip"
+    )
+
+
+def _add_representations(figure: Any, held: Sequence[Representation]) -> None:
+    import plotly.graph_objects as go
+
+    for column, cost in enumerate(("size", "learn_seconds"), start=1):
+        values = [one.median(cost) for one in held]
+        places = [(value, one.kept) for value, one in zip(values, held)]
+        figure.add_trace(
+            go.Scatter(
+                x=values,
+                y=[one.kept for one in held],
+                text=[one.name for one in held],
+                mode="markers+text",
+                textposition="top center",
+                marker={"size": 12, "color": LIGHT.colours[0]},
+                showlegend=False,
+                hovertemplate="%{text}: %{x:.3g}, %{y:.1f}%<extra></extra>",
+            ),
+            row=3,
+            col=column,
+        )
+        best = [places[i] for i in front([(value, -kept) for value, kept in places])]
+        figure.add_trace(_front(best), row=3, col=column)
+    figure.update_xaxes(type="log", row=3, col=1)
+    figure.update_yaxes(
+        title_text="volume kept at equal loss, %", autorange="reversed", row=3, col=1
+    )
+    figure.update_yaxes(autorange="reversed", row=3, col=2)

@@ -1,0 +1,197 @@
+"""What the runs of a chart say together: one line for each contender, and who is on the front."""
+
+from __future__ import annotations
+
+import statistics
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from leco_plugin.chart.contenders.contender import shared_method, short_names
+
+LOST_SURFACE_MASS = 1e-3
+"""Of the weight near surfaces, at which `evaluation.equal_loss` compares representations."""
+CURVE_POINTS = 60
+"""Shares of the training at which the curves of several seeds are read."""
+
+
+@dataclass(frozen=True)
+class Cost:
+    """Something that is better when it is less."""
+
+    key: str
+    """In a run, with a dot into its `occupancy`."""
+    title: str
+    unit: str
+    scale: float = 1.0
+    """From the run's unit to the one shown."""
+
+    def of(self, run: Mapping[str, Any]) -> float | None:
+        """Its value in a run, in the unit shown; None where the run has none."""
+        value = figure_in(run, self.key)
+        return None if value is None else value * self.scale
+
+    @property
+    def titled(self) -> str:
+        """Its title with its unit, if it has one."""
+        return f"{self.title}, {self.unit}" if self.unit else self.title
+
+
+def figure_in(values: Any, key: str) -> float | None:
+    """A number by its key, with a dot into each mapping below; None where there is none."""
+    for name in key.split("."):
+        values = values.get(name) if isinstance(values, Mapping) else None
+    return None if values is None else float(values)
+
+
+RENDERING = Cost("render_seconds_per_image", "rendering an image", "s")
+MEMORY = Cost("peak_memory_bytes", "peak memory in training", "GB", 1e-9)
+QUERIES = Cost("field_queries_per_ray", "field queries a ray", "")
+LEARNING = Cost("learn_seconds", "learning the occupancy", "s")
+BYTES = Cost("occupancy.bytes", "size of the occupancy", "kB", 1e-3)
+KEPT = Cost("occupancy.at_equal_loss.kept_reached_volume", "volume kept at equal loss", "%", 100.0)
+COSTS = (RENDERING, MEMORY, QUERIES)
+
+
+@dataclass(frozen=True)
+class Line:
+    """All seeds of one contender."""
+
+    name: str
+    method: str
+    sampler: str
+    runs: tuple[dict[str, Any], ...]
+
+    @property
+    def learned(self) -> bool:
+        """Whether it asks a learned occupancy."""
+        return self.sampler.startswith("learned-occupancy")
+
+    @property
+    def psnrs(self) -> list[float]:
+        """Of each seed, dB."""
+        return [run["psnr"] for run in self.runs]
+
+    @property
+    def psnr(self) -> float:
+        """Mean over seeds, dB."""
+        return statistics.fmean(self.psnrs)
+
+    @property
+    def warming_up(self) -> bool:
+        """Whether it ends, with some seed, while its occupancy grid is in its warm-up."""
+        return any(run.get("warming_up") for run in self.runs)
+
+    def mean(self, key: str) -> float | None:
+        """Mean over seeds of a figure of quality; None where a seed has none."""
+        values = [run.get(key) for run in self.runs]
+        return None if None in values else statistics.fmean(v for v in values if v is not None)
+
+    def median(self, cost: Cost) -> float | None:
+        """Median over seeds of a cost; None where a seed has none."""
+        values = [cost.of(run) for run in self.runs]
+        return None if None in values else statistics.median(v for v in values if v is not None)
+
+    def curve(self) -> tuple[NDArray[np.float64], ...]:
+        """Mean seconds [T], and mean, lowest and highest PSNR [T], of the seeds when each has had
+        the same share of its training; the last ones are those of the ends."""
+        curves = [np.array(run["curve"], dtype=float) for run in self.runs]
+        ends = np.array([curve[-1, 0] for curve in curves])
+        begin = max(curve[0, 0] / end for curve, end in zip(curves, ends))
+        shares = np.linspace(begin, 1.0, CURVE_POINTS) if begin < 1.0 else np.ones(1)
+        values = np.stack([np.interp(shares * end, *curve.T) for curve, end in zip(curves, ends)])
+        seconds = shares * ends.mean()
+        return seconds, values.mean(axis=0), values.min(axis=0), values.max(axis=0)
+
+    def seconds_to(self, psnr: float) -> float | None:
+        """When its runs first reach a PSNR, median over seeds; None if one of them does not."""
+        found = [seconds_to_pass(run["curve"], psnr) for run in self.runs]
+        return None if None in found else statistics.median(s for s in found if s is not None)
+
+
+def seconds_to_pass(curve: Sequence[Sequence[float]], psnr: float) -> float | None:
+    """When a curve [[seconds, PSNR], ...] first reaches a PSNR, between its points; or never."""
+    before = None
+    for seconds, value in curve:
+        if value >= psnr:
+            if before is None or value == before[1]:
+                return float(seconds)
+            share = (psnr - before[1]) / (value - before[1])
+            return float(before[0] + share * (seconds - before[0]))
+        before = (seconds, value)
+    return None
+
+
+def lines_of(results: Mapping[str, Any]) -> list[Line]:
+    """The contenders of a chart in their order, under names without what all share."""
+    groups: dict[str, list[dict[str, Any]]] = {}
+    for run in results["runs"]:
+        groups.setdefault(run["name"], []).append(run)
+    return [
+        Line(name, runs[0]["method"], runs[0]["sampler"], tuple(runs))
+        for name, runs in zip(short_names(list(groups)), groups.values())
+    ]
+
+
+def common_psnr(lines: Sequence[Line]) -> float:
+    """What every run reaches: the lowest of their last PSNRs, dB."""
+    return min(run["curve"][-1][1] for line in lines for run in line.runs)
+
+
+def front(points: Sequence[tuple[float, float]]) -> list[int]:
+    """Which points (cost, gain) no other one beats in both: their numbers, by rising cost."""
+    order = sorted(range(len(points)), key=lambda i: (points[i][0], -points[i][1]))
+    found: list[int] = []
+    for i in order:
+        if not found or points[i][1] > points[found[-1]][1]:
+            found.append(i)
+    return found
+
+
+def headline(results: Mapping[str, Any]) -> str:
+    """What the chart shows of accuracy, in one sentence."""
+    lines = lines_of(results)
+    ranked = sorted(lines, key=lambda line: -line.psnr)
+    if len(ranked) < 2:
+        return f"{ranked[0].name}: {ranked[0].psnr:.1f} dB"
+    best, second = ranked[:2]
+    lead = best.psnr - second.psnr
+    if lead < 0.05 or not ahead(best, second):
+        return f"{best.name} and {second.name} are level: {best.psnr:.1f} and {second.psnr:.1f} dB"
+    said = f"{best.name} is ahead: {best.psnr:.1f} dB, {lead:.1f} more than {second.name}"
+    return f"{said}, whose grid is still in its warm-up" if second.warming_up else said
+
+
+def ahead(one: Line, other: Line) -> bool:
+    """Whether a line is above another in each seed that both have; without any, all of it is."""
+    psnrs = {run["seed"]: run["psnr"] for run in other.runs}
+    pairs = [(run["psnr"], psnrs[run["seed"]]) for run in one.runs if run["seed"] in psnrs]
+    return all(a > b for a, b in pairs) if pairs else min(one.psnrs) > max(other.psnrs)
+
+
+def circumstances(results: Mapping[str, Any]) -> str:
+    """Method, scene, machine, budget and seeds, in one line."""
+    machine, protocol = results["machine"], results["protocol"]
+    where = (
+        f"{machine['cores']} CPU cores" if machine["device"] == "cpu" else str(machine["device"])
+    )
+    parts = []
+    if protocol["seconds"] is not None:
+        parts.append(f"{protocol['seconds']:g} s")
+    if protocol["steps"] is not None:
+        parts.append(f"{protocol['steps']} steps")
+    if (at_once := protocol.get("at_once", 1)) > 1:
+        where += f", {at_once} runs at a time"
+    seeds = len({run["seed"] for run in results["runs"]})
+    many = "one seed" if seeds == 1 else f"{seeds} seeds: means of PSNR, medians of costs"
+    method = shared_method(list(dict.fromkeys(run["name"] for run in results["runs"])))
+    what = f"{method} on {results['scene']['name']}" if method else results["scene"]["name"]
+    return f"{what}, {' or '.join(parts)} of training on {where}, {many}"
+
+
+def sentence(text: str) -> str:
+    """The text as it begins a line."""
+    return text[:1].upper() + text[1:]

@@ -1,0 +1,166 @@
+"""A registered method, built guided on the scene of the kit: what the rules for hosts are for."""
+
+from __future__ import annotations
+
+import copy
+import functools
+import shutil
+import tempfile
+import weakref
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, ClassVar, cast
+
+import torch
+from torch import Tensor
+
+from leco_plugin.conformance.kit.host_scene import model_arguments, pipeline_of
+from leco_plugin.conformance.kit.scene import HERE, MOVED, SLAB, Slab
+from leco_plugin.models.encodings import Kind
+from leco_plugin.occupancy import Occupancy
+from leco_plugin.samplers.registry import sampler_spec
+from leco_plugin.scenes.input_error import InputError
+
+if TYPE_CHECKING:
+    from nerfstudio.cameras.rays import RayBundle
+    from nerfstudio.engine.callbacks import TrainingCallback
+    from nerfstudio.engine.trainer import TrainerConfig
+    from nerfstudio.models.base_model import Model
+
+
+class HostCase:
+    """A method whose model is guided: as it is, or with its sampler swapped.
+
+    Args:
+        name: of the method, as `ns-train` knows it.
+
+    Attributes:
+        config: of the method, guided by a file that holds the occupancy of `SLAB`.
+
+    Raises:
+        InputError: there is no such method, or none that an occupancy could guide.
+    """
+
+    seam: ClassVar[str] = "host"
+    imports: ClassVar[tuple[str, ...]] = ("torch", "torchmetrics", "leco_plugin.models.guided")
+    """Modules behind every model that take time to import."""
+
+    def __init__(self, name: str) -> None:
+        self.name = name
+        folder = tempfile.mkdtemp()
+        weakref.finalize(self, shutil.rmtree, folder, ignore_errors=True)
+        self.file = Path(folder) / "occupancy.safetensors"
+        self.config, self._kind = guided(name, self.file)
+        self.occupancy(SLAB).save(self.file)
+        self._model: Model | None = None
+        self._guided_by = (SLAB, False)
+
+    def forget(self) -> None:
+        """Builds the model anew from now on."""
+        self._model = None
+
+    def occupancy(self, scene: Slab, frame: Tensor = HERE) -> Occupancy:
+        """The occupancy of a scene, its gate on the features that the method's sampler asks."""
+        return scene.occupancy(self._kind, frame)
+
+    def shared(self, scene: Slab = SLAB, moved: bool = False) -> Model:
+        """The model as a run has it before its first step, guided in a scene, in evaluation.
+
+        Args:
+            moved: whether its occupancy has other coordinates than the host.
+        """
+        if self._model is None:
+            self._model, self._guided_by = build(self.config.pipeline.model), (SLAB, False)
+            callbacks(self._model)
+        if (scene, moved) != self._guided_by:
+            frame = MOVED if moved else HERE
+            cast(Any, self._model).leco_guide.set_occupancy(self.occupancy(scene, frame), frame)
+            self._guided_by = scene, moved
+        return self._model.eval()
+
+    def unguided(self) -> Model:
+        """The host with its own sampler, as a run has it before its first step."""
+        config: Any = copy.deepcopy(self.config.pipeline.model)
+        config.occupancy = replace(config.occupancy, sampler="own", options={})
+        model = build(config)
+        callbacks(model)
+        return model.eval()
+
+
+def guided(name: str, file: Path) -> tuple[TrainerConfig, Kind]:
+    """The config of a method, guided by a file, and the features its gate must be on.
+
+    Raises:
+        InputError: as `HostCase`.
+    """
+    from leco_plugin.models.guided import GuidedModelConfig
+    from leco_plugin.models.leco_config import LecoModelConfig
+    from leco_plugin.swap import registered, with_sampler_swapped
+
+    config = registered(name)
+    model = getattr(config.pipeline, "model", None)
+    if isinstance(model, LecoModelConfig):
+        raise InputError(
+            f"{name} is no host: it learns the occupancy by which hosts are guided, and has no "
+            "sampler to swap. Check a guided method (leco-ngp) or a sampler (learned-occupancy)"
+        )
+    if not isinstance(model, GuidedModelConfig):
+        config = with_sampler_swapped(config, file)
+    guided: Any = config.pipeline.model
+    occupancy = guided.occupancy
+    spec = None if occupancy.sampler == "own" else sampler_spec(occupancy.sampler)
+    if spec is None or not spec.needs_occupancy:
+        raise InputError(f"{name} is guided by no occupancy: its sampler is {occupancy.sampler!r}")
+    occupancy.path = file
+    occupancy.options = {**spec.check_options, **occupancy.options}
+    return config, cast(Kind, spec.gate_encoding or "frequency")
+
+
+def build(config: Any, seed: int = 0) -> Model:
+    """The model of a model's config, as a pipeline builds it, with random numbers from `seed`."""
+    torch.manual_seed(seed)
+    with quietly():
+        model: Model = config.setup(**model_arguments())
+    return model
+
+
+def callbacks(model: Model, optimizers: Any = None) -> list[TrainingCallback]:
+    """What a model wants to be called at in a run; asking for it is what begins one."""
+    from nerfstudio.engine.callbacks import TrainingCallbackAttributes
+
+    attributes = TrainingCallbackAttributes(optimizers, None, pipeline_of(model), None)
+    with quietly():
+        return model.get_training_callbacks(attributes)
+
+
+def loss_of(model: Model, rays: RayBundle, batch: dict[str, Tensor], forward: Any = None) -> Tensor:
+    """The loss of a batch, as nerfstudio's pipeline and trainer compute it.
+
+    Args:
+        forward: stands for the model where outputs are asked, as data-parallel training has it.
+    """
+    outputs = (forward or model)(rays)
+    metrics = model.get_metrics_dict(outputs, batch)
+    losses = model.get_loss_dict(outputs, batch, metrics)
+    return functools.reduce(torch.add, losses.values())
+
+
+@contextmanager
+def quietly() -> Iterator[None]:
+    """While this lasts, nerfstudio prints nothing: verdicts are what is to be read.
+
+    Raises:
+        RuntimeError: nerfstudio ends the process; what it printed last.
+    """
+    from nerfstudio.utils.rich_utils import CONSOLE
+
+    printed = CONSOLE.capture()
+    try:
+        with printed:
+            yield
+    except SystemExit as end:
+        if isinstance(end, InputError):
+            raise
+        raise RuntimeError(" ".join(printed.get().split()) or f"it ends with {end}") from end

@@ -1,0 +1,185 @@
+"""Checks of what a guided host renders, and where it asks its field."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import torch
+from torch import Tensor
+
+from leco_plugin.conformance.hosts.host_case import HostCase, loss_of
+from leco_plugin.conformance.kit.host_scene import (
+    NOTHING,
+    as_rays,
+    batch,
+    bundle,
+    cameras,
+    inside_the_box,
+    turned_away,
+)
+from leco_plugin.conformance.kit.scene import EVERYTHING, MARGIN, SLAB
+from leco_plugin.conformance.kit.watching import densely, is_packed, shaded
+from leco_plugin.conformance.rule import Broken, require
+from leco_plugin.conformance.samplers.proposal_checks import CHORD, INSIDE, NEARBY, chords
+from leco_plugin.conformance.samplers.sampler_case import devices
+
+if TYPE_CHECKING:
+    from nerfstudio.cameras.rays import RayBundle
+    from nerfstudio.models.base_model import Model
+
+CHANNELS = {"rgb": 3, "depth": 1, "accumulation": 1}
+"""Outputs that nerfstudio's commands rely on."""
+TOLERANCE = {True: 1e-3, False: 0.25}
+"""Of a packed host, and of one with a fixed number of samples, which are few: the largest
+difference between guided by everything and dense, as a share of the largest value."""
+OPAQUE = 1e-4
+"""Accumulation up to which a ray has met nothing."""
+
+
+def outputs_can_be_drawn(case: HostCase) -> None:
+    """Colour, depth and accumulation have their channels; every output can be made a picture."""
+    for device in devices():
+        model = case.shared().to(device)
+        rays = bundle().to(device)
+        with torch.no_grad():
+            flat = model(rays)
+            images = model.get_outputs_for_camera(cameras()[:1].to(device))
+        for name, channels in CHANNELS.items():
+            _check_output(name, flat.get(name), (len(rays), channels), rays.origins)
+        for name, image in images.items():
+            _check_picture(name, image)
+        model.to("cpu")
+
+
+def _check_output(name: str, value: Any, shape: tuple[int, int], rays: Tensor) -> None:
+    require(isinstance(value, Tensor), f"there is no output {name!r}")
+    found = tuple(value.shape)
+    require(found == shape, f"the output {name!r} has shape {list(found)}, not {list(shape)}")
+    require(value.dtype == rays.dtype, f"the output {name!r} is {value.dtype}")
+    require(value.device == rays.device, f"the output {name!r} is on {value.device}")
+    require(bool(value.isfinite().all()), f"the output {name!r} holds values that are not finite")
+
+
+def _check_picture(name: str, image: Tensor) -> None:
+    """As ns-render and the viewer make one of an output."""
+    from nerfstudio.utils.colormaps import apply_colormap, apply_depth_colormap
+
+    draw = apply_depth_colormap if "depth" in name else apply_colormap
+    try:
+        draw(image)
+    except Exception as error:
+        what = f"{image.dtype} with {image.shape[-1]} channels"
+        said = f"{type(error).__name__} {error}".strip()
+        raise Broken(f"no picture can be made of the output {name!r}, {what}: {said}") from error
+
+
+def same_image_in_eval(case: HostCase) -> None:
+    """Evaluation does not depend on random numbers."""
+    model = case.shared()
+    one, other = (rendered(model, bundle(), seed) for seed in (1, 2))
+    for name, value in one.items():
+        require(value.equal(other[name]), f"two evaluations of the same rays differ in {name!r}")
+
+
+@torch.no_grad()
+def rendered(model: Model, rays: RayBundle, seed: int = 0) -> dict[str, Tensor]:
+    """Outputs that are tensors, in evaluation, with random numbers from `seed`."""
+    torch.manual_seed(seed)
+    outputs = model.eval()(rays)
+    return {name: value for name, value in outputs.items() if isinstance(value, Tensor)}
+
+
+def empty_rays_show_background(case: HostCase) -> None:
+    """Nothing to sample, in a whole batch or a part of it, is no failure and no light."""
+    for why, model, rays in (
+        ("rays that miss the scene", case.shared(SLAB), turned_away),
+        ("an occupancy that keeps nothing", case.shared(NOTHING), bundle),
+    ):
+        outputs = rendered(model, rays())
+        for name in CHANNELS:
+            finite = bool(outputs[name].isfinite().all())
+            require(finite, f"{why}: the output {name!r} holds values that are not finite")
+        if is_packed(model):
+            _check_background(why, model, outputs)
+        loss = loss_of(model.train(), rays(), batch())
+        require(bool(loss.isfinite()), f"{why}: the loss is {loss.item()}")
+        require(loss.requires_grad, f"{why}: the loss has no gradient, so that the step fails")
+        loss.backward()  # type: ignore[no-untyped-call]
+        gradients = [parameter.grad for parameter in model.parameters()]
+        finite = all(bool(grad.isfinite().all()) for grad in gradients if grad is not None)
+        require(finite, f"{why}: a gradient is not finite")
+        model.zero_grad()
+
+
+def _check_background(why: str, model: Model, outputs: dict[str, Tensor]) -> None:
+    """A ray without samples has met nothing, and has the colour that the host's renderer names."""
+    most = float(outputs["accumulation"].max())
+    require(most <= OPAQUE, f"{why}: a ray that has no samples has accumulation {most:.2g}")
+    colour = _background_of(model)
+    if colour is not None:
+        rgb = outputs["rgb"]
+        shown = torch.allclose(rgb, colour.expand_as(rgb), atol=1e-3)
+        require(shown, f"{why}: colours {_listed(rgb[0])} instead of {_listed(colour)}")
+
+
+def _background_of(model: Model) -> Tensor | None:
+    """The background of a host that has one colour for it."""
+    from nerfstudio.model_components.renderers import RGBRenderer
+
+    renderers = [module for module in model.modules() if isinstance(module, RGBRenderer)]
+    if len(renderers) != 1 or renderers[0].background_color in ("random", "last_sample"):
+        return None
+    return renderers[0].get_background_color(
+        renderers[0].background_color, (3,), torch.device("cpu")
+    )
+
+
+def _listed(colour: Tensor) -> list[float]:
+    return [round(value, 2) for value in colour.tolist()]
+
+
+def shades_only_what_is_kept(case: HostCase) -> None:
+    """The field is asked where the occupancy keeps something, on every ray, and nowhere else."""
+    rays = as_rays(bundle())
+    enters, leaves = chords(rays)
+    require(bool((leaves - enters > CHORD).all()), "the kit's rays do not all cross its slab")
+    for training, moved in ((False, False), (True, False), (False, True)):
+        model = case.shared(SLAB, moved).train(training)
+        with torch.no_grad(), shaded(model) as places:
+            model(bundle())
+        require(bool(places), "the field is asked about no sample at all")
+        positions = torch.cat(places)
+        depths = SLAB.depth(positions)
+        met = _rays_through(positions[depths > 0.0], rays.origins, rays.directions)
+        bare = int((~met).sum())
+        require(bare == 0, f"{bare} of {len(met)} rays have no sample in what is occupied")
+        if is_packed(model):
+            outside = int((depths < -MARGIN).sum())
+            share = f"{outside} of {len(depths)} places"
+            require(outside == 0, f"the field is asked about {share} where all is empty")
+        else:
+            near = float((depths > -NEARBY).float().mean())
+            require(near >= INSIDE, f"{near:.0%} of all samples lie in or near what is occupied")
+
+
+def _rays_through(positions: Tensor, origins: Tensor, directions: Tensor) -> Tensor:
+    """Which rays [R, 3] have one of the positions [N, 3] on them: bool [R]."""
+    offsets = positions - origins[:, None]
+    beside = torch.linalg.cross(offsets, directions[:, None].expand_as(offsets)).norm(dim=-1)
+    return (beside < 1e-3).any(dim=1)
+
+
+def guided_by_everything_is_dense(case: HostCase) -> None:
+    """Where everything is occupied, an image is the one without guidance, but for the sampling."""
+    model = case.shared(EVERYTHING)
+    found = rendered(model, inside_the_box())
+    with densely(model):
+        expected = rendered(model, inside_the_box())
+    tolerance = TOLERANCE[is_packed(model)]
+    for name in CHANNELS:
+        largest = float(expected[name].abs().max().clamp(min=1e-6))
+        apart = float((found[name] - expected[name]).abs().max()) / largest
+        require(
+            apart <= tolerance,
+            f"{name!r} differs by {apart:.1%} of its largest value from dense sampling",
+        )

@@ -1,0 +1,1 @@
+"""The rules for samplers, at the seams of packed hosts and of proposal hosts."""

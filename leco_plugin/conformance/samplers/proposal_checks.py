@@ -1,0 +1,200 @@
+"""Checks of what a sampler for proposal hosts returns."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+from leco_plugin.conformance.kit.intervals import ROUNDING, check_intervals, check_order, same
+from leco_plugin.conformance.kit.scene import (
+    EVERYTHING,
+    MOVED,
+    SLAB,
+    Field,
+    Rays,
+    crossing,
+    cut_short,
+    without_samples,
+)
+from leco_plugin.conformance.rule import Broken, require
+from leco_plugin.conformance.samplers.proposal_case import LEVELS, ProposalCase, no_density, packed
+from leco_plugin.conformance.samplers.sampler_case import devices
+
+NEARBY = 0.25
+"""World units beyond what is kept where a sample may lie: a histogram is as fine as its cells."""
+CHORD = 0.8
+"""World units that a ray spends in the slab at least, for what is asked of its samples."""
+INSIDE = 0.9
+"""Share of a ray's samples that must lie in or near what is kept."""
+UNREACHED = 0.1
+"""Share of a ray, in the host's spacing, that may be left out at either end."""
+UNEVEN = 1.5
+"""In units of their mean, how far places may be from evenly spaced when everything is kept."""
+
+
+def signature(case: ProposalCase) -> None:
+    """A module with the call and the two callbacks of nerfstudio's `ProposalNetworkSampler`."""
+    sampler = case.shared(SLAB)
+    require(isinstance(sampler, nn.Module), f"it is a {type(sampler).__name__}, no torch module")
+    for callback in ("set_anneal", "step_cb"):
+        require(callable(getattr(sampler, callback, None)), f"it has no method {callback}")
+    density = no_density if case.needs_occupancy else None
+    ray_samples, weights, candidates = case.answer(sampler, crossing(), density=density)
+    require(
+        hasattr(ray_samples, "frustums"),
+        f"the first of three is {type(ray_samples).__name__}, not RaySamples",
+    )
+    for name, found in (("weights_list", weights), ("ray_samples_list", candidates)):
+        require(isinstance(found, list), f"{name} is {type(found).__name__}; hosts append to it")
+
+
+def shapes_types_devices(case: ProposalCase) -> None:
+    """As many samples on each ray; weights for the samples of each level that the host has."""
+    for device in devices():
+        sampler, rays = case.shared(SLAB).to(device), crossing().to(device)
+        ray_samples, weights, candidates = case.answer(sampler, rays)
+        require(
+            len(weights) == len(candidates) == LEVELS,
+            f"{LEVELS} density_fns got {len(weights)} weights and {len(candidates)} samples",
+        )
+        _check_tensors("ray_samples", rays, *_edges(ray_samples))
+        for level in range(LEVELS):
+            starts, ends = _edges(candidates[level])
+            _check_tensors(f"level {level}", rays, starts, ends, weights[level])
+            require(bool((weights[level] >= 0.0).all()), f"level {level} has weights below 0")
+        sampler.to("cpu")
+
+
+def _edges(ray_samples: Any) -> tuple[Tensor, Tensor]:
+    return ray_samples.frustums.starts, ray_samples.frustums.ends
+
+
+def _check_tensors(where: str, rays: Rays, *tensors: Tensor) -> None:
+    shapes = [list(tensor.shape) for tensor in tensors]
+    n_samples = shapes[0][1] if len(shapes[0]) == 3 else 0
+    expected = [len(rays.origins), n_samples, 1]
+    require(
+        n_samples > 0 and all(shape == expected for shape in shapes),
+        f"{where}: shapes {shapes}, expected [{len(rays.origins)}, n_samples, 1]",
+    )
+    for tensor in tensors:
+        require(tensor.dtype == rays.origins.dtype, f"{where}: a tensor is {tensor.dtype}")
+        require(tensor.device == rays.origins.device, f"{where}: a tensor is on {tensor.device}")
+        require(bool(tensor.isfinite().all()), f"{where}: values are not finite")
+
+
+def sorted_disjoint_inside(case: ProposalCase) -> None:
+    """Along each ray, samples follow one another between its ends; so do the levels' samples."""
+    rays = cut_short()
+    ray_samples, _, candidates = case.answer(case.shared(SLAB), rays)
+    for samples in (packed(ray_samples), *map(packed, candidates)):
+        check_intervals(rays, samples)
+        beyond = samples[2] > rays.t_max[samples[0]] + ROUNDING
+        require(not bool(beyond.any()), f"{int(beyond.sum())} samples end beyond a ray's far end")
+    check_order(packed(case.answer(case.shared(SLAB).train(), rays)[0]))
+
+
+def skips_only_what_it_may(case: ProposalCase) -> None:
+    """Samples gather in what is kept, from where a ray enters it to where it leaves."""
+    for training in (False, True):
+        _check_gathered(case, case.shared(SLAB).train(training))
+    if case.needs_occupancy:
+        _check_gathered(case, _in_other_coordinates(case).eval())
+
+
+def _in_other_coordinates(case: ProposalCase) -> Any:
+    """The sampler for a host whose coordinates are not those of the occupancy."""
+    try:
+        return case.build(SLAB.occupancy(case.gate_encoding, MOVED), frame=MOVED)
+    except TypeError as error:
+        raise Broken(f"no host in other coordinates can have it (frame=): {error}") from error
+
+
+def _check_gathered(case: ProposalCase, sampler: Any) -> None:
+    rays = crossing()
+    enters, leaves = chords(rays)
+    long = leaves - enters >= CHORD
+    ray_indices, t_starts, t_ends = case.sample(sampler, rays)
+    middles = (t_starts + t_ends) / 2.0
+    depths = SLAB.depth(rays.at(ray_indices, middles)).view(len(rays.origins), -1)[long]
+    middles = middles.view(len(rays.origins), -1)[long]
+    inside = depths > 0.0
+    without = int((~inside.any(dim=1)).sum())
+    require(without == 0, f"{without} rays have no sample in what is occupied")
+    if not case.needs_occupancy:
+        return
+    least = float((depths > -NEARBY).float().mean(dim=1).min())
+    require(least >= INSIDE, f"a ray has {least:.0%} of its samples in or near what is kept")
+    halfway = ((enters + leaves) / 2.0)[long, None]
+    for half, there in (("near", middles < halfway), ("far", middles > halfway)):
+        bare = int((~(inside & there).any(dim=1)).sum())
+        require(bare == 0, f"{bare} rays have no sample in the {half} half of what is kept")
+
+
+def chords(rays: Rays) -> tuple[Tensor, Tensor]:
+    """Where each ray enters and leaves the slab, [n_rays] each, to a hundredth; 0 if never."""
+    t = torch.arange(0.0, 8.0, 0.01)
+    positions = rays.origins[:, None] + rays.directions[:, None] * t[:, None]
+    inside = SLAB.depth(positions) >= 0.0
+    first, last = inside.int().argmax(dim=1), len(t) - 1 - inside.flip(1).int().argmax(dim=1)
+    met = inside.any(dim=1)
+    return t[first] * met, t[last] * met
+
+
+def all_kept_equals_dense(case: ProposalCase) -> None:
+    """Where everything is occupied, a ray is sampled from end to end; evenly, if a gate decides."""
+    rays = cut_short()  # which lie within the box: outside it nothing is occupied
+    ray_samples, _, _ = case.answer(case.shared(EVERYTHING), rays, EVERYTHING)
+    starts, ends = ray_samples.spacing_starts, ray_samples.spacing_ends
+    require(starts is not None and ends is not None, "ray_samples have no spacing_starts and ends")
+    reaches = float(starts.amin(dim=1).max()), float(ends.amax(dim=1).min())
+    require(
+        reaches[0] <= UNREACHED and reaches[1] >= 1.0 - UNREACHED,
+        f"a ray is sampled from {reaches[0]:.0%} to {reaches[1]:.0%} of it only",
+    )
+    if not case.needs_occupancy:
+        return  # weights of a density depend on what lies in front
+    places = ((starts + ends) / 2.0).view(len(rays.origins), -1)
+    n_samples = places.shape[1]
+    even = (torch.arange(n_samples) + 0.5) / n_samples
+    farthest = float((places - even).abs().max()) * n_samples
+    require(
+        farthest <= UNEVEN,
+        f"a sample is {farthest:.1f} places away from where even spacing would have it",
+    )
+
+
+def zero_samples_well_formed(case: ProposalCase) -> None:
+    """No rays, and rays on which everything is empty, still give what a host can render."""
+    sampler, without = case.shared(SLAB), without_samples()
+    for training in (False, True):
+        sampler.train(training)
+        for why in ("no rays", "rays that miss the box"):
+            rays, field = without[why], Field()
+            ray_samples, weights, candidates = case.answer(sampler, rays)
+            starts, ends = _edges(ray_samples)
+            _check_tensors(why, rays, starts, ends)
+            for level_weights, level in zip(weights, candidates, strict=True):
+                _check_tensors(why, rays, *_edges(level), level_weights)
+            if len(rays.origins):
+                check_intervals(rays, packed(ray_samples))
+            case.colours(sampler, rays, field).sum().backward()
+            gradients = [parameter.grad for parameter in field.parameters()]
+            finite = all(grad is not None and grad.isfinite().all() for grad in gradients)
+            require(finite, f"{why}: gradients are missing or not finite")
+
+
+def update_while_frozen_is_harmless(case: ProposalCase) -> None:
+    """The callbacks of hosts that train proposal networks are accepted, and change no decision."""
+    sampler, rays = case.shared(SLAB), crossing()
+    before = case.sample(sampler, rays)
+    sampler.train()
+    for step, anneal in ((0, 0.0), (100, 0.3), (2000, 1.0)):
+        sampler.set_anneal(anneal)
+        sampler.step_cb(step)
+        case.sample(sampler, rays)
+    after = case.sample(sampler.eval(), rays)
+    if case.needs_occupancy:
+        require(same(before, after), "set_anneal and step_cb changed what is sampled")
