@@ -1,8 +1,8 @@
 """Sizes chosen from how much there is to see in a scene, before training: `leco-occupancy`'s own.
 
 What is counted is the footprint of a pixel at the scene's distance, a texel. A scene twice as wide
-has four times as many, and gets four times the experts and about twice the table, up to the sizes
-of the device. A size that is set by hand stays as it is, and what follows from it follows from
+has four times as many, and gets four times the experts and the table, up to the sizes of the
+device. A size that is set by hand stays as it is, and what follows from it follows from
 that.
 """
 
@@ -30,8 +30,9 @@ from leco_plugin.scenes.detail import CAMERAS, SceneDetail, detail_of
 from leco_plugin.scenes.input_error import InputError
 from leco_plugin.scenes.survey import points_in, with_known_altitudes
 
-ENTRIES_PER_SIDE = 512.0
-"""Entries of a level of the hash table for each texel along the side of a square surface."""
+ENTRIES_PER_TEXEL = 2.5
+"""Entries of a level of the hash table for each texel of the surface: a layer of cells has two
+corners for each of its cells, and where it runs across the grid some more."""
 TEXELS_PER_EXPERT = 1 << 16
 """Texels for each scene expert of the device's width; a scene of fewer gets a narrower one."""
 CELLS_PER_PERIOD = 32
@@ -103,7 +104,7 @@ def choose(
     """
     sizes = _filled(wanted, most, detail)
     check(sizes)
-    reason = f"entries a level, {ENTRIES_PER_SIDE:g} for each texel of the surface's side"
+    reason = f"entries a level, {ENTRIES_PER_TEXEL:g} for each texel"
     if memory is not None:
         if not wanted.field.encoding.log2_table:
             fitting = within(sizes, images, SHARE_OF_MEMORY * memory)
@@ -160,7 +161,7 @@ def log2_entries(texels: float, most: EncodingConfig) -> int:
     """Binary logarithm of a level's entries, rounded."""
     if math.isinf(texels):
         return most.log2_table
-    wanted = ENTRIES_PER_SIDE * math.sqrt(texels)
+    wanted = ENTRIES_PER_TEXEL * texels
     return max(FEWEST_ENTRIES, min(round(math.log2(max(1.0, wanted))), most.log2_table))
 
 
