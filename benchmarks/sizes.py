@@ -63,7 +63,7 @@ class Options:
     """Of the runs, one after the other: what is there is whole whenever this is stopped."""
     tables: tuple[int, ...] = (-2, 2)
     """Added to the binary logarithm of the table that is chosen."""
-    experts: tuple[float, ...] = ()
+    experts: tuple[float, ...] = (0.5,)
     """Times the scene experts that are chosen."""
     folder: Path = Path("data/sizes")
     """Where the cities are, or will be."""
