@@ -3,7 +3,8 @@
 What a smaller gate declares holds against each of them, along rays of held-out pixels and rays from
 between the cameras, which nobody has photographed; no two of all these share a pixel:
 - the field at the moment of freezing, every candidate rendered: the gate's loss, absolutely;
-- the run's field as it is now, rendered as the original guides it: the loss beyond the original's.
+- the run's field as it is now, rendered as the original guides it: the loss beyond the original's,
+  which is added.
 Without a run, the original's own decisions stand in, along rays of held-out and training pixels.
 """
 
@@ -17,7 +18,7 @@ from leco_plugin.occupancy import Occupancy
 from leco_plugin.shrink.evidence import Evidence, Rendered, gather, join, loss, query_in_parts
 from leco_plugin.shrink.sources import Seen, Source, from_between_cameras, of_other_pixels
 
-NOW = "the run's field as it is now, beyond what the original declares"
+NOW = "the run's field as it is now, beyond what the original loses"
 AT_FREEZING = "the field at the moment of freezing, all of it"
 BY_DECISIONS = "the original's keep decisions, weighed by o(x): no rendering weights were at hand"
 DECLARED = ("lost_surface_mass", "lost_mass", "image_price_db")
@@ -59,31 +60,57 @@ class Reference(NamedTuple):
     """Rendered as the original guides it, which itself loses nothing there."""
 
 
-def references(
-    source: Source, original: Occupancy, searched: Seen, verified: Seen
-) -> list[Reference]:
-    """All there are; what the original declares comes first where only the rest is measured."""
-    sides = searched, verified
-    more = _more_rays(source, original, sides)
+class Side(NamedTuple):
+    """Rays on one side of a search: to search on, or to verify on."""
+
+    held_out: Seen
+    """With an image price where there is a field."""
+    others: Seen
+    """As many as are missing to `RAYS`: of other training pixels, where there is a field from
+    between the cameras, and without an image price."""
+
+
+def sides_of(source: Source, original: Occupancy, held_out: Sequence[Seen]) -> list[Side]:
+    """Fills up rays of held-out pixels; no two of all these share a pixel."""
+    more: list[Seen] = []
+    for seen in held_out:
+        missing = max(1, RAYS - len(seen.truth))
+        more.append(of_other_pixels(source, original, missing, [*held_out, *more]))
+    if source.model is not None:
+        more = [from_between_cameras(source, seen, seed=side) for side, seen in enumerate(more)]
+    return [Side(*each) for each in zip(held_out, more)]
+
+
+def references(source: Source, original: Occupancy, sides: Sequence[Side]) -> list[Reference]:
+    """All there are. Where only the rest is measured, what the original loses is added: what the
+    field at freezing says of it, or without that what it declares.
+
+    Args:
+        sides: to search on, and to verify on.
+    """
     if source.model is None:
         search, verify = (
-            Part(join([gather(source, original, seen)[0] for seen in each]))
-            for each in zip(sides, more)
+            Part(join([gather(source, original, seen)[0] for seen in side])) for side in sides
         )
         dropped = max(declared(original, LOST_DECISIONS), 0.0)
         return [Reference(BY_DECISIONS, None, dropped, 0.0, 0.0, search, verify)]
     # that the original gains something is no licence to lose it
     lost, mass, price = (max(declared(original, name), 0.0) for name in DECLARED)
-    moved = [from_between_cameras(source, seen, seed=side) for side, seen in enumerate(more)]
-    search, verify = (_rendered(source, original, *each) for each in zip(sides, moved))
-    found = [Reference(NOW, source.model, lost, mass, price, search, verify)]
-    if source.frozen is not None:
-        before = source._replace(model=source.frozen)
-        search, verify = (_rendered(before, None, *each) for each in zip(sides, moved))
-        found.append(
-            Reference(AT_FREEZING, source.frozen, 0.0, 0.0, 0.0, search, verify, guided=False)
-        )
-    return found
+    search, verify = (_rendered(source, original, side) for side in sides)
+    now = Reference(NOW, source.model, lost, mass, price, search, verify)
+    if source.frozen is None:
+        return [now]
+    before = source._replace(model=source.frozen)
+    search, verify = (_rendered(before, None, side) for side in sides)
+    frozen = Reference(AT_FREEZING, source.frozen, 0.0, 0.0, 0.0, search, verify, guided=False)
+    # on more rays than those of its calibration, and at the threshold that it has here
+    return [now._replace(lost_before=_lost_by(original, search.evidence)), frozen]
+
+
+def _lost_by(occupancy: Occupancy, evidence: Evidence) -> float:
+    """The share of the surface mass that an occupancy skips."""
+    skipped = query_in_parts(occupancy, evidence.positions) < occupancy.threshold
+    return loss(evidence, skipped).share
 
 
 def shares_lost(
@@ -94,35 +121,22 @@ def shares_lost(
 
     Of the original itself only what is measured: beyond itself it loses nothing.
     """
-
-    def share(part: Source, guiding: Occupancy | None) -> float:
-        evidence, _ = gather(part, guiding, seen)
-        skipped = query_in_parts(smaller, evidence.positions) < smaller.threshold
-        return loss(evidence, skipped).share
-
-    found: dict[str, float] = {}
-    if smaller is not original:
-        alone = source.model is None
-        before = declared(original, LOST_DECISIONS if alone else "lost_surface_mass")
-        found[BY_DECISIONS if alone else NOW] = max(before, 0.0) + share(source, original)
+    alone, found = source.model is None, dict[str, float]()
+    before = max(declared(original, LOST_DECISIONS if alone else "lost_surface_mass"), 0.0)
     if source.frozen is not None:
-        found[AT_FREEZING] = share(source._replace(model=source.frozen), None)
+        evidence, _ = gather(source._replace(model=source.frozen), None, seen)
+        before = _lost_by(original, evidence)
+        found[AT_FREEZING] = _lost_by(smaller, evidence)
+    if smaller is not original:
+        evidence, _ = gather(source, original, seen)
+        found[BY_DECISIONS if alone else NOW] = before + _lost_by(smaller, evidence)
     return found
 
 
-def _more_rays(source: Source, original: Occupancy, sides: Sequence[Seen]) -> list[Seen]:
-    """Of each side, rays of as many training pixels as are missing to `RAYS`."""
-    found: list[Seen] = []
-    for seen in sides:
-        missing = max(1, RAYS - len(seen.truth))
-        found.append(of_other_pixels(source, original, missing, [*sides, *found]))
-    return found
-
-
-def _rendered(source: Source, occupancy: Occupancy | None, seen: Seen, moved: Seen) -> Part:
+def _rendered(source: Source, occupancy: Occupancy | None, side: Side) -> Part:
     """Held-out pixels with their renderings, and rays from between the cameras without."""
-    evidence, rendered = gather(source, occupancy, seen)
-    return Part(join([evidence, gather(source, occupancy, moved)[0]]), rendered)
+    evidence, rendered = gather(source, occupancy, side.held_out)
+    return Part(join([evidence, gather(source, occupancy, side.others)[0]]), rendered)
 
 
 def declared(original: Occupancy, name: str) -> float:

@@ -11,19 +11,29 @@ from leco_plugin.shrink.verifying import HOLDS
 
 
 def line_of_original(itself: Rung, measured: bool) -> str:
-    """What the original loses by the bar of smaller ones, and whether any are looked for.
+    """What the original loses by the bar of smaller ones.
 
     Args:
         measured: whether a reference measures the original itself.
     """
     if not measured:
         return "nothing here measures what the original itself loses"
+    return f"the original {_losses(itself)}"
+
+
+def line_of_lowered(itself: Rung, facts: dict[str, float]) -> str:
+    """At which threshold the original is shrunk instead, and what it loses there."""
+    return (
+        f"its threshold is lowered from {facts['from']:.3g} to {facts['to']:.3g}, at which it "
+        f"keeps {facts['kept_volume']:.2f} times as much of the volume and {_losses(itself)}"
+    )
+
+
+def _losses(itself: Rung) -> str:
     price = "" if itself.image_price_db is None else f", {itself.image_price_db:+.3f} dB"
     lost = f"{itself.lost_surface_mass:.1e} of the surface mass, at most {itself.bound:.1e}"
-    said = f"the original loses {lost}{price}"
-    if itself.verdict == HOLDS:
-        return said
-    return f"{said}: it {itself.verdict} by this measure, and no smaller one is looked for"
+    outside = "" if itself.verdict == HOLDS else f": it {itself.verdict} by this measure"
+    return f"loses {lost}{price}{outside}"
 
 
 def line_of(rung: Rung) -> str:
@@ -40,6 +50,12 @@ def summary(results: dict[str, Any], out: Path) -> list[str]:
     """The outcome in a few lines, for the terminal."""
     before, after, checked = results["from"], results["to"], results["checked"]
     lines = []
+    if (lowered := results["lowered"]) is not None:
+        lines.append(
+            f"taught by the original at a threshold of {lowered['to']:.3g}, not "
+            f"{lowered['from']:.3g}, with {lowered['kept_volume']:.2f} times its kept volume: at "
+            "its own it loses more than these bounds leave to a smaller gate"
+        )
     if results["original"]["verdict"] != HOLDS:
         lines.append("the original is not within these bounds: this is the same gate")
     elif not any(rung["verdict"] == "chosen" for rung in results["rungs"]):

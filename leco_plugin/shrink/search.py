@@ -17,7 +17,7 @@ from leco_plugin.evaluation.inspection import whole_box
 from leco_plugin.models.gate import GateConfig
 from leco_plugin.occupancy import Occupancy
 from leco_plugin.shrink.checks import check_room
-from leco_plugin.shrink.evidence import Evidence, loss, query_in_parts
+from leco_plugin.shrink.evidence import Evidence, loss, query_in_parts, unlikely_at
 from leco_plugin.shrink.ladder import ladder, name_of, values_of
 from leco_plugin.shrink.rungs import Bounds, Found, Ground, Rung
 from leco_plugin.shrink.teaching import Lesson, round_weights, teach
@@ -54,7 +54,7 @@ def search(
     """
     check_room(ground.original, bounds)
     gates = ladder(values_of(ground.original.gate.config)) if gates is None else gates
-    volume = _volume(ground.original, VOLUME_POINTS, seed=5)
+    volume = _places_to_count(ground.original)
     kept = query_in_parts(ground.original, volume) >= ground.original.threshold
     lesson = lesson_of(ground.original, ground.taught)
     rungs: list[Rung] = []
@@ -126,14 +126,17 @@ def _measured(
     holds, ratio = False, 0.0
     for share in VOLUMES:
         threshold = threshold_keeping(of_volume, share * float(kept.double().mean()))
-        losses = [
-            reference.lost_before + loss(reference.search.evidence, found < threshold).share
+        beyond = [
+            loss(reference.search.evidence, found < threshold, unlikely_at(look))
             for reference, found in zip(ground.references, scores)
         ]
+        losses = [each.lost_before + one.share for each, one in zip(ground.references, beyond)]
         ratio = float((of_volume >= threshold).double().mean() / kept.double().mean())
+        # what is not within the bounds here needs no look at the rays that verify
         holds = all(
             lost <= MARGIN * bounds.lost_surface_mass + (1.0 - MARGIN) * reference.lost_before
-            for reference, lost in zip(ground.references, losses)
+            and reference.lost_before + one.bound <= bounds.lost_surface_mass
+            for reference, lost, one in zip(ground.references, losses, beyond)
         )
         if holds:
             break
@@ -162,6 +165,16 @@ def threshold_keeping(scores: Tensor, share: float) -> float:
     """The threshold at which a share of places, with scores [M], is kept."""
     ordered = scores.double().sort(descending=True).values
     return float(ordered[min(max(round(share * len(ordered)) - 1, 0), len(ordered) - 1)])
+
+
+def kept_of_box(occupancy: Occupancy) -> float:
+    """Share of an occupancy's box, or of a contracted cube, that it keeps."""
+    kept = query_in_parts(occupancy, _places_to_count(occupancy)) >= occupancy.threshold
+    return float(kept.double().mean())
+
+
+def _places_to_count(occupancy: Occupancy) -> Tensor:
+    return _volume(occupancy, VOLUME_POINTS, seed=5)
 
 
 def _volume(occupancy: Occupancy, count: int, seed: int) -> Tensor:

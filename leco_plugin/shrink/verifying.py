@@ -51,7 +51,7 @@ def verify(ground: Ground, smaller: Occupancy, bounds: Bounds, rung: Rung, look:
         {"reference": reference.name, "lost_surface_mass": one.share, "bound": one.bound}
         for reference, one in zip(ground.references, found)
     ]
-    return _within(bounds, max(one.bound for one in found), rung.verified["image_price_db"])
+    return within(bounds, max(one.bound for one in found), rung.verified["image_price_db"])
 
 
 def of_original(ground: Ground, bounds: Bounds) -> Rung:
@@ -63,7 +63,7 @@ def of_original(ground: Ground, bounds: Bounds) -> Rung:
     found = [_loss(ground, *each, ground.original, unlikely_at(1)) for each in parts]
     price = worst([price_of(ground, *each, ground.original) for each in parts])
     bound, params = max(one.bound for one in found), ground.original.num_params
-    verdict = HOLDS if _within(bounds, bound, price) else "is not within the bounds"
+    verdict = HOLDS if within(bounds, bound, price) else "is not within the bounds"
     lost = max(one.share for one in found)
     return Rung(
         "the original", params, 2 * params, 1.0, lost, price, verdict, seconds=0.0, bound=bound
@@ -75,7 +75,8 @@ def is_measured(ground: Ground) -> bool:
     return not all(reference.guided for reference in ground.references)
 
 
-def _within(bounds: Bounds, bound: float, price: float | None) -> bool:
+def within(bounds: Bounds, bound: float, price: float | None) -> bool:
+    """Whether a loss, as it would be declared, and an image price are allowed."""
     return bound <= bounds.lost_surface_mass and (price or 0.0) <= bounds.image_price_db
 
 

@@ -23,9 +23,9 @@ from leco_plugin.models.gate import GateConfig
 from leco_plugin.models.learning.statistics import prices
 from leco_plugin.occupancy import Occupancy
 from leco_plugin.shrink import command, references, rungs, search, sources
-from leco_plugin.shrink.command import compare_queries
 from leco_plugin.shrink.evidence import Evidence, gather, loss, unlikely_at
 from leco_plugin.shrink.picture import draw
+from leco_plugin.shrink.timing import compare_queries
 
 pytestmark = [  # nerfstudio leaves an image open
     pytest.mark.filterwarnings("ignore:unclosed file:ResourceWarning"),
@@ -40,7 +40,7 @@ def quick(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(search, "TAUGHT_POINTS", 1 << 14)
     monkeypatch.setattr(command, "RAYS", 512)
     monkeypatch.setattr(command, "TAUGHT_RAYS", 512)
-    monkeypatch.setattr(command, "TIMED_POSITIONS", 512)
+    monkeypatch.setattr("leco_plugin.shrink.timing.TIMED_POSITIONS", 512)
     monkeypatch.setattr("leco_plugin.shrink.teaching.BATCH", 4096)
 
 
@@ -242,8 +242,8 @@ def test_the_file_declares_what_rays_have_lost_that_the_search_did_not_see(
     grounds: list[rungs.Ground] = []
     prepare = command._ground
 
-    def uneven(source: sources.Source, original: Occupancy) -> rungs.Ground:
-        ground = prepare(source, original)
+    def uneven(source: sources.Source, original: Occupancy, drawn: command.Drawn) -> rungs.Ground:
+        ground = prepare(source, original, drawn)
         (reference,) = ground.references
         searched, unseen = reference.search, reference.verify
         values = original.query(searched.evidence.positions)
@@ -300,7 +300,8 @@ def test_an_original_that_is_not_within_the_bounds_is_said_and_declared(
     out, report = tmp_path / "same", tmp_path / "a.json"
     assert run("shrink", file, "--data", tiny_scene, "--out", out, "--json", report) == 0
     said = " ".join(capsys.readouterr().out.split())
-    assert "it is not within the bounds by this measure, and no smaller one is looked for" in said
+    assert "it is not within the bounds by this measure" in said
+    assert "no threshold is within them, and no smaller gate is looked for" in said
     results, same = json.loads(report.read_text()), Occupancy.load(out)
     assert results["rungs"] == [] and results["original"]["bound"] > 1e-3
     declared = same.report["lost_surface_mass"]
@@ -332,19 +333,20 @@ def test_what_is_declared_holds_against_the_field_at_the_moment_of_freezing(
     lost = lost_on_other_rays(file, tiny_scene, smaller)
     assert lost[1] > lost[0] + 0.01  # what the original skips counts
     assert max(lost) <= smaller.report["lost_surface_mass"] == max(x["bound"] for x in against)
-    ground = command._ground(sources.find_source(file, tiny_scene), Occupancy.load(file))
+    source, original = sources.find_source(file, tiny_scene), Occupancy.load(file)
+    ground = command._ground(source, original, command._draw(source, original))
     for part in (ground.references[1].search, ground.references[1].verify):
         assert part.evidence.rays == references.RAYS > sum(len(one.truth) for one in part.rendered)
 
 
 def test_a_field_that_renders_nothing_is_no_reference(known_run: Path, tiny_scene: Path) -> None:
     file = known_run / "occupancy.safetensors"
-    source = sources.find_source(file, tiny_scene)
+    source, original = sources.find_source(file, tiny_scene), Occupancy.load(file)
     assert source.model is not None
     with torch.no_grad():
         source.model.field.density_head.bias.fill_(-50.0)
     with pytest.raises(ValueError, match="renders nothing"):
-        command._ground(source, Occupancy.load(file))
+        command._ground(source, original, command._draw(source, original))
 
 
 def test_a_run_whose_model_does_not_fit_is_refused_in_one_line(
