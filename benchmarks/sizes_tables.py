@@ -28,13 +28,15 @@ FINE_GRID, SHARE_OF_ITS_BYTES = "256", 1 / 100
 def sizes_table(report: Report) -> str:
     """Sizes that were chosen, the sweep, automatic beside its best, and the bars of two cities."""
     lines = [
-        "| scene | photographs | texels | table | experts | parameters | of the device's |",
-        "|---|---|---|---|---|---|---|",
+        "| scene | photographs | pixels a side of a texel | texels | table | experts | parameters "
+        "| of the device's |",
+        "|" + "---|" * 8,
     ]
     for scene in report["scenes"]:
         sizes, share = scene["sizes"], scene["parameters"] / scene["device_parameters"]
         lines.append(
-            f"| {scene['scene']} | {scene['images']} | {scene['texels']:,} "
+            f"| {scene['scene']} | {scene['images']} | {scene['resolved']:.1f} "
+            f"| {scene['texels']:,} "
             f"| {sizes['field.encoding.levels']} x 2^{sizes['field.encoding.log2_table']} "
             f"| {sizes['field.experts.scene_experts']} | {scene['parameters']:,} | {share:.0%} |"
         )
@@ -84,9 +86,9 @@ def shrink_table(reports: Mapping[str, Report]) -> str:
         reports: as `leco shrink --json` writes them, by the name of the scene.
     """
     lines = [
-        "| scene | values | file, kB | skipped, % | declared lost surface mass "
+        "| scene | original lowered | values | file, kB | skipped, % | declared lost surface mass "
         "| lost on test photographs | image price, dB | gates tried | queries faster by |",
-        "|" + "---|" * 9,
+        "|" + "---|" * 10,
     ]
     for scene, report in reports.items():
         before, after = report["from"], report["to"]
@@ -97,6 +99,7 @@ def shrink_table(reports: Mapping[str, Report]) -> str:
         now = _flagged(f"{size / 1000:.1f}", size <= SHRUNK_BYTES)
         price, skipped = after.get("image_price_db"), after.get("empty_fraction")
         cells = (
+            _lowered(report["lowered"]),
             f"{before['params']} to {after['params']}",
             f"{before['bytes'] / 1000:.1f} to {now}",
             "-" if skipped is None else f"{100 * skipped:.1f}",
@@ -108,6 +111,13 @@ def shrink_table(reports: Mapping[str, Report]) -> str:
         )
         lines.append(f"| {scene} | {' | '.join(cells)} |")
     return "\n".join(lines)
+
+
+def _lowered(facts: Report | None) -> str:
+    """How much more of the volume an original keeps at the threshold that smaller gates follow."""
+    if facts is None:
+        return "no"
+    return f"{facts['from']:.2f} to {facts['to']:.2f}, keeps {facts['kept_volume']:.2f} x"
 
 
 def capacity_table(reports: Mapping[str, Report]) -> str:

@@ -131,6 +131,7 @@ def test_the_table_has_a_row_for_each_scene_point_and_bar() -> None:
         "scene": "city-1",
         "images": 9,
         "texels": 57486,
+        "resolved": 1.44,
         "sizes": {
             "field.encoding.levels": 7,
             "field.encoding.log2_table": 14,
@@ -142,7 +143,7 @@ def test_the_table_has_a_row_for_each_scene_point_and_bar() -> None:
     near = MEASURED | {"table x 4": [20.1, 20.15]}
     report: dict[str, Any] = {"scenes": [scene], "runs": runs("city-1", near)}
     rows = sizes_table(report).splitlines()
-    assert "| city-1 | 9 | 57,486 | 7 x 2^14 | 1 | 250 | 25% |" in rows
+    assert "| city-1 | 9 | 1.4 | 57,486 | 7 x 2^14 | 1 | 250 | 25% |" in rows
     assert "| city-1 | automatic | 200 | 2 | 20.10 dB (20.00 to 20.20) |" in rows
     assert rows[-1].startswith("| city-1 | 2 | 20.10 dB, 200 | automatic: 20.10 dB, 200 | 0.00 ")
     large = scene | {"scene": "city-8", "blocks": 8}
@@ -157,6 +158,7 @@ def test_the_table_has_a_row_for_each_scene_point_and_bar() -> None:
 
 def shrunk(**after: Any) -> dict[str, Any]:
     return {
+        "lowered": None,
         "from": {"params": 11333, "bytes": 51200},
         "to": {
             "params": 978,
@@ -174,10 +176,12 @@ def shrunk(**after: Any) -> dict[str, Any]:
 
 def test_a_shrunk_gate_that_misses_a_bar_stands_out() -> None:
     row = shrink_table({"city-3": shrunk()}).splitlines()[-1]
-    cells = "11333 to 978 | 51.2 to 5.9 | 81.6 | 5.60e-04 | 2.00e-04 | +0.010 | 2 | 3.20 x"
+    cells = "no | 11333 to 978 | 51.2 to 5.9 | 81.6 | 5.60e-04 | 2.00e-04 | +0.010 | 2 | 3.20 x"
     assert row == f"| city-3 | {cells} |"
     row = shrink_table({"city-3": shrunk(bytes=40_000, lost_surface_mass=1e-4)}).splitlines()[-1]
     assert "**40.0**" in row and "**2.00e-04**" in row
+    lower = shrunk() | {"lowered": {"from": 0.3072, "to": 0.1966, "kept_volume": 1.158}}
+    assert "| 0.31 to 0.20, keeps 1.16 x |" in shrink_table({"city-3": lower}).splitlines()[-1]
     unchanged = shrunk() | {"checked": None}
     assert "| - |" in shrink_table({"city-3": unchanged}).splitlines()[-1]
     assert "to 5.9 | - | 5.60e-04 |" in shrink_table({"a": shrunk(empty_fraction=None)})
