@@ -15,6 +15,7 @@ import copy
 import itertools
 import json
 import math
+import random
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
@@ -159,6 +160,7 @@ def learned_in(steps: int, folder: Path, blocks: int, seed: int, options: Option
     sizes = sizes_for(device)
     gate = gate_of(sizes.gate, blocks, options.octaves_per_doubling)
     config.model.sizes = replace(sizes, gate=gate)
+    random.seed(seed)  # nerfstudio caches images in an order of its own
     torch.manual_seed(seed)
     pipeline: Any = config.setup(device=device)
     attempt = Attempt(pipeline.model, pipeline.datamanager)

@@ -18,7 +18,6 @@ from typing import Any
 
 import checkout  # noqa: F401
 import tyro
-from nerfstudio.data.datasets.base_dataset import InputDataset
 from sizes_figures import AUTOMATIC, bars, verdict
 
 from leco_plugin.evaluation.clock import Budget
@@ -34,7 +33,6 @@ from leco_plugin.scenes.city.capture import CaptureConfig
 from leco_plugin.scenes.city.city import CityConfig
 from leco_plugin.scenes.city.folder import write_city
 from leco_plugin.scenes.detail import CAMERAS, detail_of
-from leco_plugin.scenes.resolved import PICTURES, pixels_resolved
 from leco_plugin.scenes.survey import points_in
 
 DEVICE = "the device's"
@@ -124,17 +122,14 @@ def look(data: Path) -> dict[str, Any]:
     parser.data = data
     outputs = parser.setup().get_dataparser_outputs("train")
     images, device = len(outputs.image_filenames), best_device()
-    pictures = InputDataset(outputs)
-    metadata = {**outputs.metadata, CAMERAS: outputs.cameras, PICTURES: pictures}
+    metadata = {**outputs.metadata, CAMERAS: outputs.cameras}
     chosen = complete(automatic(sizes_for(device)), BoundsConfig(), metadata, images, device)
-    resolved = pixels_resolved(pictures)
-    found = detail_of(outputs.cameras, points_in(outputs.metadata), resolved=resolved)
+    found = detail_of(outputs.cameras, points_in(outputs.metadata))
     return {
         "scene": data.name,
         "images": images,
         "pixels": found.pixels,
         "texels": round(found.texels),
-        "resolved": round(found.resolved, 2),
         "across": round(found.across),
         "sizes": {path: size_at(chosen, path) for path in CHOSEN},
         "parameters": values_of(chosen, images),

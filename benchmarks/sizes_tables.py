@@ -28,15 +28,13 @@ FINE_GRID, SHARE_OF_ITS_BYTES = "256", 1 / 100
 def sizes_table(report: Report) -> str:
     """Sizes that were chosen, the sweep, automatic beside its best, and the bars of two cities."""
     lines = [
-        "| scene | photographs | pixels a side of a texel | texels | table | experts | parameters "
-        "| of the device's |",
-        "|" + "---|" * 8,
+        "| scene | photographs | texels | table | experts | parameters | of the device's |",
+        "|---|---|---|---|---|---|---|",
     ]
     for scene in report["scenes"]:
         sizes, share = scene["sizes"], scene["parameters"] / scene["device_parameters"]
         lines.append(
-            f"| {scene['scene']} | {scene['images']} | {scene['resolved']:.1f} "
-            f"| {scene['texels']:,} "
+            f"| {scene['scene']} | {scene['images']} | {scene['texels']:,} "
             f"| {sizes['field.encoding.levels']} x 2^{sizes['field.encoding.log2_table']} "
             f"| {sizes['field.experts.scene_experts']} | {scene['parameters']:,} | {share:.0%} |"
         )

@@ -131,7 +131,6 @@ def test_the_table_has_a_row_for_each_scene_point_and_bar() -> None:
         "scene": "city-1",
         "images": 9,
         "texels": 57486,
-        "resolved": 1.44,
         "sizes": {
             "field.encoding.levels": 7,
             "field.encoding.log2_table": 14,
@@ -143,7 +142,7 @@ def test_the_table_has_a_row_for_each_scene_point_and_bar() -> None:
     near = MEASURED | {"table x 4": [20.1, 20.15]}
     report: dict[str, Any] = {"scenes": [scene], "runs": runs("city-1", near)}
     rows = sizes_table(report).splitlines()
-    assert "| city-1 | 9 | 1.4 | 57,486 | 7 x 2^14 | 1 | 250 | 25% |" in rows
+    assert "| city-1 | 9 | 57,486 | 7 x 2^14 | 1 | 250 | 25% |" in rows
     assert "| city-1 | automatic | 200 | 2 | 20.10 dB (20.00 to 20.20) |" in rows
     assert rows[-1].startswith("| city-1 | 2 | 20.10 dB, 200 | automatic: 20.10 dB, 200 | 0.00 ")
     large = scene | {"scene": "city-8", "blocks": 8}

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import random
 from dataclasses import replace
 from pathlib import Path
 from pickle import UnpicklingError
@@ -52,6 +53,7 @@ def prepare(data: Path, folder: Path, learn_steps: int) -> Ground:
     from leco_plugin.method_configs import best_device, leco_occupancy
     from leco_plugin.models.hosts.learn_first import learn_model
 
+    random.seed(0)  # nerfstudio caches images in an order of its own
     torch.manual_seed(0)
     config: Any = copy.deepcopy(leco_occupancy.config.pipeline)
     config.datamanager.data = data

@@ -29,7 +29,6 @@ from leco_plugin.scenes.photograph_files import names_what_it_cannot_read
 from leco_plugin.scenes.pixels.held_out_pixels import HeldOutPixelSampler
 from leco_plugin.scenes.pixels.lattice import PERIODS, Lattice, lattice_for
 from leco_plugin.scenes.pixels.stored_pictures import picture_sizes, store_pictures
-from leco_plugin.scenes.resolved import PICTURES
 from leco_plugin.scenes.survey import points_in
 from leco_plugin.scenes.upright import turn_to_upright, turned
 
@@ -80,9 +79,9 @@ class LecoDataManager(VanillaDataManager):  # type: ignore[type-arg]
             parser.get_dataparser_outputs = upright_outputs(parser.get_dataparser_outputs)
 
     def create_train_dataset(self) -> Any:
-        """The training photographs; the model is told of them and their cameras, for its sizes."""
+        """The training photographs; the model is told of their cameras, for its sizes."""
         dataset = names_what_it_cannot_read(super().create_train_dataset())
-        dataset.metadata |= {CAMERAS: dataset.cameras, PICTURES: dataset}
+        dataset.metadata[CAMERAS] = dataset.cameras
         return dataset
 
     def create_eval_dataset(self) -> Any:

@@ -1,6 +1,6 @@
 """How much there is to see in a scene, counted in the smallest things that its photographs resolve.
 
-From cameras and sparse points alone; how many pixels the smallest things take is told.
+From cameras and sparse points alone: no image is opened.
 """
 
 from __future__ import annotations
@@ -17,8 +17,7 @@ from leco_plugin.scenes.input_error import InputError
 from leco_plugin.scenes.survey import chosen_cameras, covering_rays
 
 CAMERAS = "leco_cameras"
-"""Key of the metadata that a data manager hands to a model: the training cameras. Without them
-nothing is known of the scene."""
+"""Key of the metadata that a data manager hands to a model: the training cameras."""
 MOST_POINTS = 1 << 14
 """Sparse points that are looked up in every camera."""
 FEWEST_POINTS = 32
@@ -29,26 +28,21 @@ NEIGHBOURS = 8
 
 @dataclass(frozen=True)
 class SceneDetail:
-    """The size of a scene in texels: the smallest things that the nearest photograph resolves."""
+    """The size of a scene in footprints of a pixel, each of the photograph that is nearest."""
 
     images: int
     """Training photographs."""
     pixels: int
     """Their pixels; masks are not looked at."""
     texels: float
-    """Smallest things that cover the scene's surface; no more than there are in the photographs."""
+    """Footprints that cover the scene's surface; no more than there are pixels."""
     across: float
-    """The same (by the ground sampling distance, median over the scene) along the cube that is
+    """Footprints (the ground sampling distance, median over the scene) along the cube that is
     encoded."""
-    resolved: float = 1.0
-    """Pixels along the side of such a thing."""
 
 
 def detail_of(
-    cameras: Cameras,
-    points: Tensor | None = None,
-    config: BoundsConfig | None = None,
-    resolved: float = 1.0,
+    cameras: Cameras, points: Tensor | None = None, config: BoundsConfig | None = None
 ) -> SceneDetail:
     """The size of the scene that these cameras see.
 
@@ -56,8 +50,6 @@ def detail_of(
         cameras: of the training photographs.
         points: [P, 3] sparse points in the same coordinates, or None.
         config: where the scene lies, where the data do not say it.
-        resolved: pixels along the side of the smallest things in the photographs
-            (`resolved.pixels_resolved`).
     Raises:
         InputError: there are no cameras, none sees a point, or what is configured is no range.
     """
@@ -84,9 +76,8 @@ def detail_of(
     # a contraction gives half of the cube to what lies outside
     cube = (4.0 if bounds.kind == "contraction" else 2.0) * bounds.half_extent
     # few photographs are taken from close by, and what they resolve is not what the rest shows
-    covering = _pixels_on_surface(places[seen], density[seen].clamp(max=typical), footprint)
-    texels = min(covering, float(pixels)) / resolved**2
-    return SceneDetail(len(cameras), pixels, texels, cube / footprint / resolved, resolved)
+    texels = _pixels_on_surface(places[seen], density[seen].clamp(max=typical), footprint)
+    return SceneDetail(len(cameras), pixels, min(texels, float(pixels)), cube / footprint)
 
 
 def _pixels_on_surface(places: Tensor, density: Tensor, size: float) -> float:

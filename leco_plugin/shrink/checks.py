@@ -8,21 +8,29 @@ from pathlib import Path
 from leco_plugin.models.freezing.freezing import HARDLY_ANYTHING
 from leco_plugin.occupancy import Occupancy
 from leco_plugin.shrink.references import LOST_DECISIONS, declared
-from leco_plugin.shrink.rungs import Bounds
+from leco_plugin.shrink.rungs import Bounds, Ground
 from leco_plugin.shrink.sources import Source
 
 
-def check_room(original: Occupancy, bounds: Bounds) -> None:
-    """Whether anything is left to lose after what the original declares.
+def check_bounds(bounds: Bounds) -> None:
+    """Whether bounds are numbers that can be kept.
 
     Raises:
-        ValueError: nothing is, or a bound is out of range.
+        ValueError: one is out of range.
     """
     if not 0.0 <= bounds.lost_surface_mass < 1.0 or not math.isfinite(bounds.image_price_db):
         raise ValueError(
             "bounds are a lost surface mass from 0 to 1 and a number of dB, not "
             f"{bounds.lost_surface_mass} and {bounds.image_price_db}"
         )
+
+
+def check_room(original: Occupancy, bounds: Bounds) -> None:
+    """Whether anything is left to lose after what the original declares.
+
+    Raises:
+        ValueError: nothing is.
+    """
     lost, decisions, price = (
         max(declared(original, name), 0.0)
         for name in ("lost_surface_mass", LOST_DECISIONS, "image_price_db")
@@ -72,6 +80,20 @@ def check_skips(original: Occupancy, file: Path) -> None:
     else:
         return
     raise ValueError(f"{file} {said}: there is nothing to shrink; learn it for more steps")
+
+
+def check_still_skips(ground: Ground, file: Path) -> None:
+    """Whether an original still skips enough at a threshold that was lowered for it.
+
+    Raises:
+        ValueError: it skips next to nothing of all candidates.
+    """
+    kept = float(ground.references[0].search.evidence.kept.double().mean())
+    if 1.0 - kept < HARDLY_ANYTHING:
+        raise ValueError(
+            f"{file} is within these bounds only where it skips {1.0 - kept:.1%} of all "
+            "candidates, next to nothing: raise --lost-surface-mass, or learn it for more steps"
+        )
 
 
 def check_known(source: Source, original: Occupancy, file: Path) -> None:

@@ -15,7 +15,14 @@ from leco_plugin.evaluation.machine import describe_code, describe_machine, made
 from leco_plugin.occupancy import Occupancy
 from leco_plugin.progress_bar import bar
 from leco_plugin.scenes.pixels.held_out_pixels import held_out_sampler
-from leco_plugin.shrink.checks import check_known, check_march, check_room, check_skips
+from leco_plugin.shrink.checks import (
+    check_bounds,
+    check_known,
+    check_march,
+    check_room,
+    check_skips,
+    check_still_skips,
+)
 from leco_plugin.shrink.evidence import Evidence, gather
 from leco_plugin.shrink.lowering import facts_of, lowered
 from leco_plugin.shrink.references import Side, references, shares_lost, sides_of
@@ -66,7 +73,7 @@ def shrink(
     if out.exists() and out.samefile(file):
         raise ValueError(f"--out {out} is the occupancy itself; name another file")
     original = Occupancy.load(file)
-    check_room(original, bounds)
+    check_bounds(bounds)
     check_march(original, file)
     check_skips(original, file)
     random.seed(seed)  # nerfstudio caches images in an order of its own
@@ -74,6 +81,8 @@ def shrink(
     source = find_source(file, data)
     check_scene(source, original, data)
     check_known(source, original, file)
+    if source.frozen is None:  # with it the threshold can be lowered
+        check_room(original, bounds)
     original = original.to(source.manager.device)
     drawn = _draw(source, original)
     ground = _ground(source, original, drawn)
@@ -85,6 +94,7 @@ def shrink(
         ground = _ground(source, original, drawn)
         itself = of_original(ground, bounds)
         _say(line_of_lowered(itself, facts))
+        check_still_skips(ground, file)
     elif itself.verdict != HOLDS:
         _say("no threshold is within them, and no smaller gate is looked for")
     known = {
@@ -116,7 +126,8 @@ def shrink(
         smaller = _rounded_as_it_is(original)
     checked = check(source, original, smaller)
     untrained = held_out_sampler(source.manager) is not None
-    smaller.report = report_of(ground, found, itself, untrained)
+    kept_more = 1.0 if facts is None else facts["kept_volume"]
+    smaller.report = report_of(ground, found, itself, untrained, kept_more)
     out.parent.mkdir(parents=True, exist_ok=True)
     smaller.save(out)
     speedup, times = compare_queries(original, smaller)

@@ -16,12 +16,16 @@ COPIED = (
 """What a smaller occupancy's report takes over from the original's."""
 
 
-def report_of(ground: Ground, found: Found, itself: Rung, untrained: bool) -> dict[str, Any]:
+def report_of(
+    ground: Ground, found: Found, itself: Rung, untrained: bool, kept_more: float = 1.0
+) -> dict[str, Any]:
     """What the smaller occupancy declares: the original's loss and, on top, its own.
 
     Args:
         itself: the original, which is stored again where nothing smaller holds.
         untrained: whether nothing was trained on the pixels of the ground's rays.
+        kept_more: times the volume that the original keeps at its own threshold, which the ground's
+            keeps.
     """
     original = ground.original
     report = {name: original.report[name] for name in COPIED if name in original.report}
@@ -39,7 +43,7 @@ def report_of(ground: Ground, found: Found, itself: Rung, untrained: bool) -> di
             "threshold": found.occupancy.threshold,
             "kept_candidates_dropped": rung.verified["kept_candidates_dropped"],
             "shrunk_from_params": original.num_params,
-            "kept_volume_of_the_original": rung.kept_volume,
+            "kept_volume_of_the_original": round(kept_more * rung.kept_volume, 4),
         }
     )
 

@@ -16,7 +16,6 @@ from torch import Tensor
 from leco_plugin.evaluation.inspection import whole_box
 from leco_plugin.models.gate import GateConfig
 from leco_plugin.occupancy import Occupancy
-from leco_plugin.shrink.checks import check_room
 from leco_plugin.shrink.evidence import Evidence, loss, query_in_parts, unlikely_at
 from leco_plugin.shrink.ladder import ladder, name_of, values_of
 from leco_plugin.shrink.rungs import Bounds, Found, Ground, Rung
@@ -49,10 +48,7 @@ def search(
         gates: by size; those smaller than the original by default.
         on_rung: called with each gate that was tried.
         on_progress: called with the share of the ladder that is done.
-    Raises:
-        ValueError: what the original declares already leaves nothing to lose.
     """
-    check_room(ground.original, bounds)
     gates = ladder(values_of(ground.original.gate.config)) if gates is None else gates
     volume = _places_to_count(ground.original)
     kept = query_in_parts(ground.original, volume) >= ground.original.threshold

@@ -61,13 +61,6 @@ def test_finer_photographs_show_more() -> None:
     assert fine.across == pytest.approx(2.0 * coarse.across, rel=0.05)
 
 
-def test_photographs_that_resolve_nothing_as_small_as_a_pixel_show_less() -> None:
-    sharp, blurred = (detail_of(survey(6.0), ground(6.0), resolved=each) for each in (1.0, 2.0))
-    assert blurred.texels == pytest.approx(sharp.texels / 4.0)
-    assert blurred.across == pytest.approx(sharp.across / 2.0)
-    assert blurred.pixels == sharp.pixels
-
-
 def test_of_distances_the_nearest_counts() -> None:
     near = survey(6.0)
     poses = near.camera_to_worlds.clone()

@@ -22,7 +22,6 @@ from leco_plugin.progress_bar import bar
 from leco_plugin.scenes.detail import CAMERAS
 from leco_plugin.scenes.input_error import InputError
 from leco_plugin.scenes.pixels.known_distances import sampler_here
-from leco_plugin.scenes.resolved import PICTURES
 
 FIRST_TIMED, TIMED_STEPS = 5, 15
 """Steps between which a step is timed, to keep to a budget; the first ones are slow."""
@@ -88,7 +87,7 @@ def learn_model(
     model: Any = config.setup(
         scene_box=dataset.scene_box,
         num_train_data=len(dataset),
-        metadata={**(dataset.metadata or {}), CAMERAS: dataset.cameras, PICTURES: dataset},
+        metadata={**(dataset.metadata or {}), CAMERAS: dataset.cameras},
         device=pipeline.device,
     ).to(pipeline.device)
     model.train()

@@ -1,10 +1,9 @@
 """Sizes chosen from how much there is to see in a scene, before training: `leco-occupancy`'s own.
 
-What is counted are texels, the smallest things that the photographs resolve: the footprint of a
-pixel at the scene's distance, or of more of them where the photographs show nothing as small. A
-scene twice as wide has four times as many, and gets four times the experts and the table, up to
-the sizes of the device. A size that is set by hand stays as it is, and what follows from it follows
-from that.
+What is counted is the footprint of a pixel at the scene's distance, a texel. A scene twice as wide
+has four times as many, and gets four times the experts and the table, up to the sizes of the
+device. A size that is set by hand stays as it is, and what follows from it follows from
+that.
 """
 
 from __future__ import annotations
@@ -29,7 +28,6 @@ from leco_plugin.models.sizing.sizes import Sizes, left_open, size_at, sizes_for
 from leco_plugin.scenes.bounds import BoundsConfig
 from leco_plugin.scenes.detail import CAMERAS, SceneDetail, detail_of
 from leco_plugin.scenes.input_error import InputError
-from leco_plugin.scenes.resolved import PICTURES, pixels_resolved
 from leco_plugin.scenes.survey import points_in, with_known_altitudes
 
 ENTRIES_PER_TEXEL = 2.5
@@ -70,8 +68,8 @@ def complete(
     Args:
         wanted: sizes, with `AUTOMATIC` where they are to be chosen.
         bounds: where the scene lies, where the data do not say it.
-        metadata: what a dataset says of itself, with its cameras (`detail.CAMERAS`), photographs
-            (`resolved.PICTURES`) and sparse points; without cameras sizes are those of the device.
+        metadata: what a dataset says of itself, with its cameras (`detail.CAMERAS`) and sparse
+            points; without cameras sizes are those of the device.
         images: training photographs.
     Raises:
         InputError: sizes that cannot be together, or do not fit the device.
@@ -79,9 +77,7 @@ def complete(
     detail = None
     if left_open(wanted) and CAMERAS in metadata:
         bounds = with_known_altitudes(bounds, metadata)
-        pictures = metadata.get(PICTURES)
-        resolved = 1.0 if pictures is None else pixels_resolved(pictures)
-        detail = detail_of(metadata[CAMERAS], points_in(metadata), bounds, resolved)
+        detail = detail_of(metadata[CAMERAS], points_in(metadata), bounds)
     most = sizes_for(torch.device(device).type)
     try:
         made = choose(wanted, most, detail, images, memory_of(device))
@@ -227,8 +223,7 @@ def explain(
     if detail is not None:
         head = (
             f"sizes for a surface of {detail.texels:,.0f} texels in {detail.pixels:,} pixels of "
-            f"{detail.images} photographs, which show nothing smaller than {detail.resolved:.1f} "
-            f"pixels, in a cube of {detail.across:,.0f} texels a side:"
+            f"{detail.images} photographs, in a cube of {detail.across:,.0f} texels a side:"
         )
 
     def row(name: str, at: str, reason: str, power: bool = False) -> str:

@@ -32,7 +32,6 @@ from leco_plugin.scenes.city.folder import write_city
 from leco_plugin.scenes.detail import CAMERAS, SceneDetail, detail_of
 from leco_plugin.scenes.input_error import InputError
 from leco_plugin.scenes.photographs import LecoPhotographsDataParserConfig
-from leco_plugin.scenes.resolved import PICTURES
 from leco_plugin.scenes.survey import points_in
 
 IMAGES = 20
@@ -212,18 +211,12 @@ def test_a_model_asks_its_scene_only_where_a_size_is_open(
         asked.append(arguments)
         return scene(5000.0, 200.0)
 
-    def resolved(pictures: Any) -> float:
-        asked.append(pictures)
-        return 2.5
-
     monkeypatch.setattr(scene_sizes, "detail_of", detail)
-    monkeypatch.setattr(scene_sizes, "pixels_resolved", resolved)
-    metadata = {CAMERAS: "cameras", PICTURES: "pictures"}
+    metadata = {CAMERAS: "cameras"}
     assert complete(SMALL, BoundsConfig(), metadata, IMAGES, "cpu") == SMALL
     assert not asked and capsys.readouterr().out == ""
     sizes = complete(automatic(SMALL), BoundsConfig(), metadata, IMAGES, "cpu")
-    assert asked[0] == "pictures" and asked[1][-1] == 2.5 and len(asked) == 2
-    assert size_at(sizes, TABLE) < size_at(SMALL, TABLE)
+    assert len(asked) == 1 and size_at(sizes, TABLE) < size_at(SMALL, TABLE)
     assert "5,000 texels" in capsys.readouterr().out
     assert complete(automatic(SMALL), BoundsConfig(), {}, IMAGES, "cpu") == SMALL
     assert "nothing is known of the scene" in capsys.readouterr().out
