@@ -1,10 +1,11 @@
 """Automatic sizes against a sweep: `python benchmarks/sizes.py [SCENE ...]`.
 
 `leco-occupancy` trains for the same number of steps, on drone surveys of cities and on scenes that
-are named: in the sizes that it chooses, in those of the device, and with smaller and larger tables
-than chosen; on the largest city in automatic sizes and larger ones only. Steps and not seconds: it
-may run beside other work. A run is stored when it is done; a benchmark that was stopped goes on
-there. `--dry-run` passes through everything in seconds and means nothing.
+are named: in the sizes that it chooses, in those of the device, with smaller and larger tables and
+with fewer experts than chosen; on the largest city in automatic sizes and larger ones only. Steps
+and not seconds: it may run beside other work. A run is stored when it is done; a benchmark that was
+stopped goes on there, and a run is known by its scene, sizes and seed, whatever code made it, which
+the page says. `--dry-run` passes through everything in seconds and means nothing.
 """
 
 from __future__ import annotations
@@ -238,15 +239,10 @@ def main(options: Options) -> None:
     wanted = wanted_runs(scenes, cities, options)
     left = sum(find(rows, data.name, sizes, seed) is None for data, _, sizes, seed in wanted)
     print(f"{left} of {len(wanted)} runs to do", flush=True)
-    done: list[dict[str, Any]] = []
-    report: dict[str, Any] = {"verdict": {}, "bars": []}
-    for data, name, sizes, seed in wanted:
-        row = find(rows, data.name, sizes, seed)
-        if row is None:
-            row = {**train(data, sizes, seed, options), **made_by(code)}
-            rows.append(row)
-            print(f"{data.name}, {name}, seed {seed}: {row['psnr']:.2f} dB", flush=True)
-        done.append({**row, "point": name})
+
+    def store() -> dict[str, Any]:
+        done = named(rows, wanted)
+        others = ({**row, "point": None} for row in rows if not _among(row, done))
         report = {
             "format": 1,
             "machine": describe_machine(),
@@ -254,10 +250,26 @@ def main(options: Options) -> None:
             "scenes": list(scenes.values()),
             "verdict": verdict(done),
             "bars": bars(list(scenes.values()), done),
-            "runs": [*done, *({**row, "point": None} for row in rows if not _among(row, done))],
+            "runs": [*done, *others],
         }
         write_json(options.out, report)
+        return report
+
+    report = store()
+    for data, name, sizes, seed in wanted:
+        if find(rows, data.name, sizes, seed) is None:
+            rows.append({**train(data, sizes, seed, options), **made_by(code)})
+            print(f"{data.name}, {name}, seed {seed}: {rows[-1]['psnr']:.2f} dB", flush=True)
+            report = store()
     print(json.dumps([report["verdict"], report["bars"]], indent=1))
+
+
+def named(
+    rows: Sequence[dict[str, Any]], wanted: Sequence[tuple[Path, str, Sizes, int]]
+) -> list[dict[str, Any]]:
+    """Those of the wanted runs that are there, with the names of their points."""
+    found = ((find(rows, data.name, sizes, seed), name) for data, name, sizes, seed in wanted)
+    return [{**row, "point": name} for row, name in found if row is not None]
 
 
 def find(

@@ -135,9 +135,9 @@ def test_a_loss_that_the_search_has_seen_is_declared_too() -> None:
 
 def test_nothing_is_lost_beyond_what_the_original_leaves() -> None:
     with pytest.raises(ValueError, match="raise --lost-surface-mass"):
-        walk(original(lost_surface_mass=3e-3), [ENOUGH], lost_surface_mass=1e-3)
+        check_room(original(lost_surface_mass=3e-3), Bounds(1e-3))
     with pytest.raises(ValueError, match="raise --image-price"):
-        walk(original(image_price_db=0.06), [ENOUGH])
+        check_room(original(image_price_db=0.06), Bounds())
     check_room(original(lost_surface_mass=4e-4, image_price_db=-0.1), Bounds())
 
 

@@ -102,6 +102,9 @@ def choose(
     Raises:
         ValueError: sizes that cannot be together, or do not fit the device. One line.
     """
+    if wanted.largest_table is not None:
+        table = min(wanted.largest_table, most.field.encoding.log2_table)
+        most = with_size(most, "field.encoding.log2_table", table)
     sizes = _filled(wanted, most, detail)
     check(sizes)
     reason = f"entries a level, {ENTRIES_PER_TEXEL:g} for each texel"
@@ -132,7 +135,7 @@ def _filled(wanted: Sizes, most: Sizes, detail: SceneDetail | None) -> Sizes:
     experts = replace(
         experts, scene_experts=number, width=experts.width or expert_width(texels, most)
     )
-    octaves = gate.encoding.octaves or octaves_for(cells, most.gate)
+    octaves = gate.encoding.octaves or octaves_for(finest, most.gate)
     gate = replace(
         gate,
         encoding=replace(gate.encoding, octaves=octaves),
@@ -228,11 +231,14 @@ def explain(
 
     def row(name: str, at: str, reason: str, power: bool = False) -> str:
         by_hand, top, size = (size_at(each, at) for each in (wanted, most, sizes))
-        why = reason if size < top else f"the most on this device; {reason}"
+        left_behind = power and wanted.largest_table is not None
+        where = "for a field that only learns an occupancy" if left_behind else "on this device"
+        why = reason if size < top else f"the most {where}; {reason}"
         text = f"2^{size}" if power else str(size)
         return f"  {name:15}{text:>6}  {'set by hand' if by_hand else why}"
 
-    an_expert = f"one for {TEXELS_PER_EXPERT:,} texels"
+    alike = "as many as the gate's, which are set by hand"
+    an_expert = alike if wanted.gate.scene_experts else f"one for {TEXELS_PER_EXPERT:,} texels"
     a_period = f"a period of {CELLS_PER_PERIOD} finest cells"
     rows = (
         row("finest cells", "field.encoding.finest", "no larger than a texel"),

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
-from typing import Any, cast
+from typing import Any
 
 from leco_plugin.models.encodings import EncodingConfig
 from leco_plugin.models.field import FieldConfig
@@ -26,6 +26,9 @@ class Sizes:
     and the batch grows until it shades as many as before."""
     candidates: int = 128
     """Candidates along a ray once the occupancy guides, and in every rendering."""
+    largest_table: int | None = None
+    """Binary logarithm of the entries of the largest hash table that is chosen; None is that of the
+    device."""
 
 
 SMALL = Sizes()
@@ -108,7 +111,9 @@ few hundred steps that it is there, larger tables take time and give nothing."""
 
 def learning_only(sizes: Sizes) -> Sizes:
     """The same for a field that is left behind when the occupancy is learned."""
-    return cast(Sizes, with_size(sizes, "field.encoding.log2_table", FIRST_TABLE))
+    table = "field.encoding.log2_table"
+    smaller: Sizes = with_size(sizes, table, min(size_at(sizes, table), FIRST_TABLE))
+    return replace(smaller, largest_table=FIRST_TABLE)
 
 
 def left_open(sizes: Sizes) -> list[str]:

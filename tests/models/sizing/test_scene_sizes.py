@@ -16,11 +16,13 @@ from leco_plugin.models.sizing.size_limits import BYTES_PER_VALUE, values_of
 from leco_plugin.models.sizing.sizes import (
     AUTOMATIC,
     CHOSEN,
+    FIRST_TABLE,
     LARGE,
     PAPER,
     SMALL,
     Sizes,
     automatic,
+    learning_only,
     left_open,
     size_at,
     with_size,
@@ -120,8 +122,29 @@ def test_what_follows_from_a_size_follows_from_the_one_that_is_set() -> None:
     assert chosen_from(wanted).field.experts.scene_experts == 2
     coarse = chosen_from(with_size(automatic(SMALL), "field.encoding.finest", 64))
     assert coarse.field.encoding.levels < SMALL.field.encoding.levels
+    assert coarse.gate.encoding.octaves < SMALL.gate.encoding.octaves
     few = chosen_from(with_size(automatic(SMALL), "gate.encoding.octaves", 2))
     assert few.gate.width < SMALL.gate.width
+
+
+def test_experts_that_follow_the_gate_do_not_claim_to_follow_texels() -> None:
+    wanted = with_size(automatic(SMALL), "gate.scene_experts", 3)
+    lines = choose(wanted, SMALL, scene(5e4, 4000.0), IMAGES).lines
+    (line,) = (line for line in lines if "scene experts" in line)
+    assert "the gate's" in line and "texels" not in line
+
+
+def test_a_field_that_is_left_behind_has_a_smaller_table_and_never_a_larger_one() -> None:
+    few, many = scene(5e3, 4000.0), scene(1e7, 4000.0)
+    first, alone = learning_only(automatic(SMALL)), automatic(SMALL)
+    for seen, table in ((few, size_at(chosen(SMALL, few), TABLE)), (many, FIRST_TABLE)):
+        assert size_at(choose(first, SMALL, seen, IMAGES).sizes, TABLE) == table
+    assert size_at(choose(alone, SMALL, many, IMAGES).sizes, TABLE) > FIRST_TABLE
+    (line,) = (x for x in choose(first, SMALL, many, IMAGES).lines if "hash table" in x)
+    assert "only learns an occupancy" in line and "by hand" not in line
+    assert size_at(learning_only(SMALL), TABLE) == FIRST_TABLE
+    small = with_size(SMALL, TABLE, 12)
+    assert size_at(learning_only(small), TABLE) == 12
 
 
 def chosen_from(wanted: Sizes) -> Sizes:
