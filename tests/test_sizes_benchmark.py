@@ -199,11 +199,18 @@ def test_the_fine_grid_stands_beside_the_best_gate_of_a_hundredth_of_its_bytes()
     grid, gate = beside_fine_grid(rows)
     assert grid is rows[3] and gate is rows[1]
     assert beside_fine_grid(rows[:3]) == (None, None)
+    coarse = {"family": "grid", "size": "32", "bytes": 32**3 // 8, "kept_volume": 0.04}
+    finer = {"family": "grid", "size": "512", "bytes": 512**3 // 8, "kept_volume": 0.01}
+    grid, gate = beside_fine_grid([*rows, coarse, finer])  # a coarser one that keeps less counts
+    assert grid is coarse and gate is rows[1]
     report = {"scene": {"train_images": 53}, "representations": rows}
     usual = {"family": "grid", "size": "64", "bytes": 64**3 // 8, "kept_volume": 0.02}
     of_object = report | {"representations": [*rows, usual]}
     *_, line, _, _, said = capacity_table({"city-3": report, "fox": of_object}).splitlines()
-    assert line == "| city-3 | 53 | hash 8 | 30.0 | 2.00 | none | 6.00 | 5.00 (vm, 20.0 kB) | yes |"
+    assert (
+        line
+        == "| city-3 | 53 | hash 8 | 30.0 | 2.00 | none | 6.00 (256^3) | 5.00 (vm, 20.0 kB) | yes |"
+    )
     assert "suffices, for: fox." in said and said.endswith("pays for: city-3.")
 
 

@@ -10,6 +10,9 @@ from leco_plugin.capacity.measuring import VOLUMES
 
 TOLERANCE = 1.05
 """Kept volume that counts as no more than another's."""
+TOLD_APART = 1.2
+"""Times the kept volume from which on another certainly keeps more: all is measured with one field
+and one seed."""
 WORTH_TEN_TIMES = 2 / 3
 """Of the kept volume: what ten times the bytes must leave at most, to be worth them. The largest
 nearly always keep a little less, and a scene would need whatever is the last to be tried."""
@@ -31,10 +34,11 @@ def choose(rows: Sequence[Mapping[str, Any]]) -> Mapping[str, Any]:
 
 
 def smallest_grid(
-    rows: Sequence[Mapping[str, Any]], chosen: Mapping[str, Any]
+    rows: Sequence[Mapping[str, Any]], chosen: Mapping[str, Any], times: float = TOLERANCE
 ) -> Mapping[str, Any] | None:
-    """The smallest grid that keeps no more than what was chosen; None where none does."""
-    limit = TOLERANCE * chosen["kept_volume"]
+    """The smallest grid that keeps no more than so many times what was chosen; None where none
+    does."""
+    limit = times * chosen["kept_volume"]
     enough = [row for row in rows if row["family"] == "grid" and row["kept_volume"] <= limit]
     return min(enough, key=lambda row: row["bytes"], default=None)
 
@@ -42,6 +46,14 @@ def smallest_grid(
 def grid_that_suffices(rows: Sequence[Mapping[str, Any]]) -> Mapping[str, Any] | None:
     """A grid of a usual size that keeps no more than what was chosen; None where none does."""
     grid = smallest_grid(rows, choose(rows))
+    return grid if grid is not None and int(grid["size"]) <= USUAL_GRID else None
+
+
+def grid_that_nearly_suffices(rows: Sequence[Mapping[str, Any]]) -> Mapping[str, Any] | None:
+    """A grid of a usual size that keeps more, but not so much that one field tells them apart."""
+    if grid_that_suffices(rows) is not None:
+        return None
+    grid = smallest_grid(rows, choose(rows), TOLD_APART)
     return grid if grid is not None and int(grid["size"]) <= USUAL_GRID else None
 
 
@@ -55,6 +67,12 @@ def verdict(rows: Sequence[Mapping[str, Any]]) -> str:
     said = f"This scene needs {kilobytes(chosen)}: {gate}."
     if not any(row["family"] == "grid" for row in rows):
         return said
+    nearly = grid_that_nearly_suffices(rows)
+    if nearly is not None:
+        return (
+            f"{said} A grid of {_of_cells(nearly)}, keeps {nearly['kept_volume']:.1%}: with one "
+            "field the two are not told apart, and a grid may suffice."
+        )
     grid = smallest_grid(rows, chosen)
     if grid is None:
         finest = max((int(row["size"]) for row in rows if row["family"] == "grid"), default=0)

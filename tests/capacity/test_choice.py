@@ -10,6 +10,7 @@ from leco_plugin.capacity.choice import (
     WORTH_TEN_TIMES,
     choose,
     common_volume,
+    grid_that_nearly_suffices,
     grid_that_suffices,
     kilobytes,
     smallest_grid,
@@ -61,6 +62,16 @@ def test_a_usual_grid_that_keeps_as_little_as_a_smaller_gate_suffices() -> None:
     assert choose(rows) is SMALL_GATE and grid_that_suffices(rows) is usual
     said = verdict(rows)
     assert said.startswith("A grid suffices: 128^3 cells, 262.1 kB.") and "With 3.0 kB" in said
+
+
+def test_a_grid_that_keeps_hardly_more_is_not_called_worse() -> None:
+    """One field and one seed do not tell them apart."""
+    hardly, more = (row("grid", "32", 4_096, factor * 0.062) for factor in (1.15, 1.25))
+    assert grid_that_nearly_suffices([SMALL_GATE, hardly]) is hardly
+    assert "4.1 kB, keeps 7.1%: with one field" in verdict([SMALL_GATE, hardly])
+    assert grid_that_nearly_suffices([SMALL_GATE, more]) is None
+    assert grid_that_nearly_suffices([SMALL_GATE, FINE]) is None  # no usual one
+    assert grid_that_nearly_suffices([SMALL_GATE, row("grid", "64", 32_768, 0.06)]) is None
 
 
 def test_grids_that_never_keep_as_little_are_named() -> None:
