@@ -1,0 +1,163 @@
+"""What becomes of the candidates along a ray: `python benchmarks/samples.py RUN=SCENE ...`.
+
+Of runs of `leco-occupancy`, on their test photographs: how many candidates a ray has, how many are
+formed after the coarse question has jumped over empty stretches, how many of those cells leave to
+the gate, how many are kept, and how many of these are shaded where rendering ends behind opaque
+surfaces; with PSNR and time of either rendering, in turns. Stored in `results/samples.json`.
+"""
+
+from __future__ import annotations
+
+import math
+import statistics
+from collections.abc import Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+from unittest.mock import patch
+
+import checkout  # noqa: F401
+import torch
+import tyro
+from timing import interleaved, ratio
+
+from leco_plugin.cli_reports import occupancy_of
+from leco_plugin.compat.host_outputs import true_colours
+from leco_plugin.evaluation.field_queries import counted
+from leco_plugin.evaluation.json_file import write_json
+from leco_plugin.evaluation.machine import describe_code, describe_machine, made_by
+from leco_plugin.models.leco import LecoModel
+from leco_plugin.samplers.estimator import LearnedOccupancyEstimator
+from leco_plugin.samplers.marching import march
+from leco_plugin.shrink.sources import find_source
+
+IMAGES = 4
+"""Test photographs, evenly chosen."""
+ROUNDS = 3
+
+
+@dataclass
+class Options:
+    """Settings of the benchmark."""
+
+    runs: tyro.conf.Positional[tuple[str, ...]]
+    """Folders of runs and their scenes, as RUN=SCENE."""
+    out: Path = Path(__file__).parent / "results" / "samples.json"
+    """Where the figures go; rows of scenes that are not named stay."""
+
+
+@contextmanager
+def asked_along(estimator: LearnedOccupancyEstimator) -> Any:
+    """Counts what a march asks of an estimator: `coarse` questions and `formed` candidates."""
+    count = {"coarse": 0, "formed": 0}
+    occupied, near = estimator.questions()
+    assert occupied is not None
+
+    def fine(positions: torch.Tensor) -> torch.Tensor:
+        count["formed"] += len(positions)
+        return occupied(positions)
+
+    def coarse(positions: torch.Tensor, radii: torch.Tensor) -> torch.Tensor:
+        assert near is not None
+        count["coarse"] += len(positions)
+        return near(positions, radii)
+
+    with patch.object(estimator, "questions", lambda: (fine, None if near is None else coarse)):
+        yield count
+
+
+def bundles_of(manager: Any, device: torch.device) -> list[tuple[Any, torch.Tensor]]:
+    """Rays and colours of some test photographs."""
+    dataset = manager.eval_dataset
+    count = min(IMAGES, len(dataset))
+    found = []
+    for number in torch.linspace(0, len(dataset) - 1, count).round().long().tolist():
+        rays = dataset.cameras[number : number + 1].to(device).generate_rays(0, keep_shape=True)
+        found.append((rays, dataset.get_data(number)["image"]))
+    return found
+
+
+@torch.no_grad()
+def along_rays(model: LecoModel, bundles: Sequence[Any]) -> dict[str, float]:
+    """Means over rays of `candidates`, `coarse`, `formed`, `gate` and `kept`."""
+    size, angle = model.step_and_angle(learning=False)
+    sums = dict.fromkeys(("candidates", "coarse", "formed", "gate", "kept"), 0.0)
+    total = 0
+    for bundle in bundles:
+        flat, at_once = bundle.flatten(), model.config.eval_num_rays_per_chunk
+        for first in range(0, len(flat), at_once):
+            rays = model.rays_of(flat[first : first + at_once])
+            along = rays.origins, rays.directions, rays.t_mins, rays.t_maxs
+            total += len(rays.origins)
+            sums["candidates"] += len(march(*along, step_size=size, cone_angle=angle)[0])
+            estimator = model.estimator()
+            with asked_along(estimator) as count, counted(model) as queries:
+                kept = estimator.kept(*along, size, angle, None, None)
+            sums["kept"] += len(kept[0])
+            sums["gate"] += queries.gate
+            for name, asked in count.items():
+                sums[name] += asked
+    return {name: value / max(total, 1) for name, value in sums.items()}
+
+
+@torch.no_grad()
+def rendered(
+    model: LecoModel, pictures: Sequence[tuple[Any, torch.Tensor]], front: bool
+) -> tuple[float, float]:
+    """PSNR of test photographs, and how many samples a ray of them are shaded."""
+    model.config.front_to_back = front
+    squares, values, rays = 0.0, 0, 0
+    with counted(model) as queries:
+        for bundle, image in pictures:
+            rgb = model.get_outputs_for_camera_ray_bundle(bundle)["rgb"].clamp(0.0, 1.0)
+            truth = true_colours(model, image.to(rgb.device))
+            squares += float((rgb - truth).square().sum(dtype=torch.float64))
+            values, rays = values + truth.numel(), rays + rgb.shape[0] * rgb.shape[1]
+    return -10.0 * math.log10(max(squares / values, 1e-12)), queries.field / rays
+
+
+def row_of(run: Path, data: Path) -> dict[str, Any]:
+    """The figures of one run."""
+    source = find_source(occupancy_of(run), data)
+    model = source.model
+    if model is None or not bool(model.frozen):
+        raise SystemExit(f"{run} is no run of leco-occupancy that has frozen its gate")
+    pictures = bundles_of(source.manager, model.device)
+    every, front = (rendered(model, pictures, front) for front in (False, True))
+    timings = interleaved(
+        {
+            "all": lambda: rendered(model, pictures[:1], False),
+            "front": lambda: rendered(model, pictures[:1], True),
+        },
+        ROUNDS,
+    )
+    return {
+        **along_rays(model, [bundle for bundle, _ in pictures]),
+        "shaded": every[1],
+        "psnr": every[0],
+        "shaded_from_the_front": front[1],
+        "psnr_from_the_front": front[0],
+        "seconds": statistics.median(timings["all"]),
+        "time_from_the_front": ratio(timings, "front", "all"),
+    }
+
+
+def main(options: Options) -> None:
+    """Measures the runs that are named, one after the other."""
+    from leco_plugin.evaluation.json_file import read_object
+
+    known = read_object(options.out, "is damaged; delete it") if options.out.exists() else {}
+    rows: dict[str, Any] = known.get("scenes", {})
+    code = describe_code()
+    for pair in options.runs:
+        run, _, data = pair.partition("=")
+        if not data:
+            raise SystemExit(f"{pair} is not RUN=SCENE")
+        rows[Path(data).name] = {**row_of(Path(run), Path(data)), **made_by(code)}
+        print(Path(data).name, rows[Path(data).name], flush=True)
+        write_json(options.out, {"format": 1, "machine": describe_machine(), "scenes": rows})
+
+
+if __name__ == "__main__":
+    main(tyro.cli(Options))
