@@ -7,7 +7,7 @@ from typing import Any
 
 from page_parts import RESULTS, made_line, picture, section
 from sizes_figures import AS_GOOD
-from sizes_tables import capacity_table, shrink_table, sizes_table
+from sizes_tables import capacity_table, samples_table, shrink_table, sizes_table
 
 CAPACITY = "capacity-"
 """How the names of pictures of `leco capacity` begin."""
@@ -43,6 +43,19 @@ def sizes_sections() -> list[str]:
         )
         title = "Gates shrunk to what decides alike"
         parts += section(title, command, next(iter(shrunk.values())), shrink_table(shrunk), note)
+    if (stored_samples := RESULTS / "samples.json").exists():
+        samples = json.loads(stored_samples.read_text())
+        rows = dict(sorted(samples["scenes"].items(), key=lambda item: _in_order(item[0])))
+        note = (
+            " The same runs, of 600 steps, on up to four test photographs. Of the candidates a "
+            "coarse question, one for 16 in a row, jumps over empty stretches; cells answer for "
+            "nearly all of the rest. What is shaded counts the backdrop that ends each ray; time "
+            "is that of the same picture with all that is kept shaded, in turns. Rows "
+            f"{made_line(rows.values())}."
+        )
+        command = "python benchmarks/samples.py RUN=SCENE ..."
+        title = "Samples along a ray"
+        parts += section(title, command, samples, samples_table(rows), note)
     if measured := scene_results("capacity"):
         first = next(iter(measured.values()))
         rows = [row for report in measured.values() for row in report["representations"]]

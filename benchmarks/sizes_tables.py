@@ -121,6 +121,32 @@ def _lowered(facts: Report | None) -> str:
     return f"{facts['from']:.2f} to {facts['to']:.2f}, keeps {facts['kept_volume']:.2f} x"
 
 
+def samples_table(rows: Mapping[str, Report]) -> str:
+    """A row a scene: what becomes of the candidates along a ray, and what rendering from the front
+    saves.
+
+    Args:
+        rows: as `samples.py` stores them, by the name of the scene.
+    """
+    lines = [
+        "| scene | candidates a ray | coarse questions | looked up in cells | left to the gate "
+        "| kept | shaded, from the front | PSNR, all of them shaded | from the front "
+        "| time of that |",
+        "|" + "---|" * 10,
+    ]
+    for scene, row in rows.items():
+        counts = (f"{row[name]:.1f}" for name in ("candidates", "coarse", "formed", "gate", "kept"))
+        cells = (
+            *counts,
+            f"{row['shaded_from_the_front']:.1f}",
+            f"{row['psnr']:.3f} dB",
+            f"{row['psnr_from_the_front']:.3f} dB",
+            f"{row['time_from_the_front']:.2f} x",
+        )
+        lines.append(f"| {scene} | {' | '.join(cells)} |")
+    return "\n".join(lines)
+
+
 def capacity_table(reports: Mapping[str, Report]) -> str:
     """A row a scene: what was chosen, and the fine grid beside the best gate of few bytes.
 
