@@ -94,6 +94,7 @@ def shrink_table(reports: Mapping[str, Report]) -> str:
     for scene, report in reports.items():
         before, after = report["from"], report["to"]
         declared = after.get("lost_surface_mass")
+        verified = after.get("verified_lost_surface_mass", declared)
         checked = report.get("checked") or {}
         lost = checked.get("lost_surface_mass")
         size, speed = after["bytes"], report["query_speedup"]
@@ -105,7 +106,7 @@ def shrink_table(reports: Mapping[str, Report]) -> str:
             f"{before['bytes'] / 1000:.1f} to {now}",
             "-" if skipped is None else f"{100 * skipped:.1f}",
             "-" if declared is None else _flagged(f"{declared:.2e}", declared <= SHRUNK_LOSS),
-            "-" if lost is None else _flagged(f"{lost:.2e}", lost <= (declared or 0.0)),
+            "-" if lost is None else _flagged(f"{lost:.2e}", lost <= (verified or 0.0)),
             "-" if price is None else f"{price:+.3f}",
             f"{len(report['rungs'])}",
             _flagged(f"{speed:.2f} x", speed >= SHRUNK_SPEEDUP),

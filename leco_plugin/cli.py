@@ -362,6 +362,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except (RuntimeError, FloatingPointError, ImportError) as error:
         return _complain(error, FAILURE)
     except KeyboardInterrupt:
+        print("leco: stopped; what had been stored stays", file=sys.stderr)
         return 130
     return 0
 
@@ -375,7 +376,7 @@ def _complain(error: BaseException, status: int) -> int:
 def _said(value: bool | float | str) -> str:
     if isinstance(value, bool):
         return "yes" if value else "no"
-    return value if isinstance(value, str) else f"{value:.4g}"
+    return str(value) if isinstance(value, str | int) else f"{value:.4g}"
 
 
 def _listed(values: Sequence[float]) -> str:

@@ -10,7 +10,7 @@ from nerfstudio.utils.rich_utils import CONSOLE
 
 from leco_plugin.capacity.choice import choose, kilobytes, verdict
 from leco_plugin.capacity.field import prepare
-from leco_plugin.capacity.measuring import Candidate, gates, grids, of_gate, of_grids
+from leco_plugin.capacity.measuring import STEPS, Candidate, gates, grids, of_gate, of_grids
 from leco_plugin.capacity.picture import draw
 from leco_plugin.chart.drawing.theme import DARK, LIGHT
 from leco_plugin.evaluation.equal_loss import MOST_ON_CPU
@@ -52,13 +52,21 @@ def capacity(
         ValueError, OSError: a folder or a size is wrong; nothing was started.
     """
     if not 0.0 < lost_surface_mass < 0.5:
-        raise ValueError(f"a lost surface mass lies between 0 and 0.5, not at {lost_surface_mass}")
-    if learn_steps < 1 or any(n < 2 for n in resolutions):
-        raise ValueError("a field is learned in one step or more, a grid has 2 cells or more")
+        raise ValueError(f"--lost-surface-mass is {lost_surface_mass}, not between 0 and 0.5")
+    if learn_steps < 1:
+        raise ValueError(f"--learn-steps is {learn_steps}; a field is learned in one or more")
+    if any(n < 2 for n in resolutions):
+        raise ValueError(
+            f"--grids has {min(resolutions)}; a grid has 2 cells or more along an axis"
+        )
     if not data.is_dir():
-        raise InputError(f"--data {data}: there is no such folder")
+        raise InputError(f"--data {data}: there is no such folder{', but a file' * data.exists()}")
     scene, machine, code = describe_scene(data), describe_machine(), describe_code()
-    settings = {"lost_surface_mass": lost_surface_mass, "learn_steps": learn_steps}
+    settings = {
+        "lost_surface_mass": lost_surface_mass,
+        "learn_steps": learn_steps,
+        "teach_steps": STEPS,
+    }
     _settle(out, {"scene": scene, **settings}, data)
     wanted = list(gates() if gate_candidates is None else gate_candidates)
     known = _left_out(out) if machine["device"] == "cpu" else []
@@ -94,6 +102,7 @@ def capacity(
         "scene": {**scene, "train_images": manager_images},
         "lost_surface_mass": lost_surface_mass,
         "learn_steps": learn_steps,
+        "teach_steps": STEPS,
         "rays": ground.held_out.rays,
         "representations": rows,
         "chosen": dict(choose(rows)),

@@ -49,33 +49,38 @@ def prepare(data: Path, folder: Path, learn_steps: int) -> Ground:
         InputError: `data` is no folder, or what was left is not of it.
     """
     if not data.is_dir():
-        raise InputError(f"--data {data}: there is no such folder")
+        raise InputError(f"--data {data}: there is no such folder{', but a file' * data.exists()}")
     from leco_plugin.method_configs import best_device, leco_occupancy
     from leco_plugin.models.hosts.learn_first import learn_model
 
-    random.seed(0)  # nerfstudio caches images in an order of its own
-    torch.manual_seed(0)
     config: Any = copy.deepcopy(leco_occupancy.config.pipeline)
     config.datamanager.data = data
     config.model.schedule = replace(config.model.schedule, learn_steps=learn_steps)
-    device = best_device()
-    manager = config.datamanager.setup(device=device, test_mode="val")
-    stored = folder / FIELD
-    if stored.exists():
-        dataset = manager.train_dataset
-        model: LecoModel = config.model.setup(
-            scene_box=dataset.scene_box,
-            num_train_data=len(dataset),
-            metadata=dataset.metadata,
-            device=device,
-        ).to(device)
-        _load(model, stored)
-    else:
+    device, stored = best_device(), folder / FIELD
+    if not stored.exists():
+        manager = _photographs(config, device)
         pipeline = SimpleNamespace(datamanager=manager, device=torch.device(device))
         rays = config.datamanager.train_num_rays_per_batch
-        model = learn_model(config.model, pipeline, rays)
-        write_whole(stored, lambda file: torch.save(model.state_dict(), file))
+        learned = learn_model(config.model, pipeline, rays)
+        write_whole(stored, lambda file: torch.save(learned.state_dict(), file))
+    # also whoever has learned it begins anew: a manager that has trained gives other rays
+    manager = _photographs(config, device)
+    dataset = manager.train_dataset
+    model: LecoModel = config.model.setup(
+        scene_box=dataset.scene_box,
+        num_train_data=len(dataset),
+        metadata=dataset.metadata,
+        device=device,
+    ).to(device)
+    _load(model, stored)
     return _ground(Source(manager, model.eval()))
+
+
+def _photographs(config: Any, device: str) -> Any:
+    """A data manager; nerfstudio caches images in an order that Python's own generator draws."""
+    random.seed(0)
+    torch.manual_seed(0)
+    return config.datamanager.setup(device=device, test_mode="val")
 
 
 def _load(model: LecoModel, stored: Path) -> None:

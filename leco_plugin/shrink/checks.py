@@ -20,7 +20,7 @@ def check_bounds(bounds: Bounds) -> None:
     """
     if not 0.0 <= bounds.lost_surface_mass < 1.0 or not math.isfinite(bounds.image_price_db):
         raise ValueError(
-            "bounds are a lost surface mass from 0 to 1 and a number of dB, not "
+            f"--lost-surface-mass is from 0 to 1 and --image-price a number of dB, not "
             f"{bounds.lost_surface_mass} and {bounds.image_price_db}"
         )
 

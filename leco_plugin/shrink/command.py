@@ -26,7 +26,12 @@ from leco_plugin.shrink.checks import (
 from leco_plugin.shrink.evidence import Evidence, gather
 from leco_plugin.shrink.lowering import facts_of, lowered
 from leco_plugin.shrink.references import Side, references, shares_lost, sides_of
-from leco_plugin.shrink.report import COPIED, lost_by_name, report_of
+from leco_plugin.shrink.report import (
+    COPIED,
+    lost_by_name,
+    report_of,
+    with_test_photographs,
+)
 from leco_plugin.shrink.rungs import Bounds, Found, Ground, Rung
 from leco_plugin.shrink.saying import line_of, line_of_lowered, line_of_original
 from leco_plugin.shrink.search import search
@@ -127,7 +132,9 @@ def shrink(
     checked = check(source, original, smaller)
     untrained = held_out_sampler(source.manager) is not None
     kept_more = 1.0 if facts is None else facts["kept_volume"]
-    smaller.report = report_of(ground, found, itself, untrained, kept_more)
+    smaller.report = with_test_photographs(
+        report_of(ground, found, itself, untrained, kept_more), checked
+    )
     out.parent.mkdir(parents=True, exist_ok=True)
     smaller.save(out)
     speedup, times = compare_queries(original, smaller)

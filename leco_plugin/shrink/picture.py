@@ -85,7 +85,10 @@ def headline(results: Mapping[str, Any]) -> str:
     before, after = results["from"], results["to"]
     if not any(rung["verdict"] == "chosen" for rung in results["rungs"]):
         return f"{before['bytes'] / 1000:.1f} kB, and nothing smaller holds the bounds"
+    checked = after.get("lost_on_test_photographs")
+    more = checked is not None and checked > after["verified_lost_surface_mass"]
+    warned = f", but test photographs lose {checked:.1e}" if more else ""
     return (
         f"{before['bytes'] / 1000:.0f} kB to {after['bytes'] / 1000:.1f} kB, "
-        f"{results['query_speedup']:.1f} times faster"
+        f"{results['query_speedup']:.1f} times faster{warned}"
     )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any
 
 from leco_plugin.occupancy import BACKDROP_PRICE
@@ -46,6 +47,26 @@ def report_of(
             "kept_volume_of_the_original": round(kept_more * rung.kept_volume, 4),
         }
     )
+
+
+def with_test_photographs(
+    report: dict[str, Any], checked: Mapping[str, Any] | None
+) -> dict[str, Any]:
+    """A report that declares no less than what rays of test photographs have lost.
+
+    Args:
+        checked: what those have lost, None where there are none. They have chosen nothing; what
+            holds without them stays beside it.
+    """
+    lost = None if checked is None else checked["lost_surface_mass"]
+    verified = report.get("lost_surface_mass")
+    if lost is None or verified is None:
+        return report
+    return report | {
+        "lost_surface_mass": max(verified, lost),
+        "verified_lost_surface_mass": verified,
+        "lost_on_test_photographs": lost,
+    }
 
 
 def _measured(ground: Ground, rung: Rung, untrained: bool) -> dict[str, Any]:

@@ -62,7 +62,7 @@ def find_source(file: Path, data: Path) -> Source:
         InputError: `data` is no folder, or the run's model cannot be loaded.
     """
     if not data.is_dir():
-        raise InputError(f"--data {data}: there is no such folder")
+        raise InputError(f"--data {data}: there is no such folder{', but a file' * data.exists()}")
     folder = file.resolve().parent
     if (folder / CONFIG).is_file() and any((folder / CHECKPOINTS).glob("step-*.ckpt")):
         source = _of_run(folder, data.resolve())

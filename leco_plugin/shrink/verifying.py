@@ -63,7 +63,11 @@ def of_original(ground: Ground, bounds: Bounds) -> Rung:
     found = [_loss(ground, *each, ground.original, unlikely_at(1)) for each in parts]
     price = worst([price_of(ground, *each, ground.original) for each in parts])
     bound, params = max(one.bound for one in found), ground.original.num_params
-    verdict = HOLDS if within(bounds, bound, price) else "is not within the bounds"
+    verdict = HOLDS
+    if not within(bounds, bound, None):
+        verdict = "is not within the bounds"
+    elif not within(bounds, bound, price):
+        verdict = "costs more of the image than the bounds allow"
     lost = max(one.share for one in found)
     return Rung(
         "the original", params, 2 * params, 1.0, lost, price, verdict, seconds=0.0, bound=bound
