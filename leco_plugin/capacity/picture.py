@@ -124,6 +124,6 @@ def circumstances(results: Mapping[str, Any]) -> str:
     return (
         f"{scene['name']}, {scene['train_images']} photographs; one field of "
         f"{results['learn_steps']} steps teaches all; {results['rays']} held-out rays; {where}.\n"
-        "Gates in bfloat16, grids in one bit a cell. Down and to the left is better; chosen where "
-        "ten times the bytes would not save a third of the volume."
+        "Gates in bfloat16, grids one bit a cell; down and left is better. Ten times the bytes of "
+        "the chosen save less than a third."
     )
