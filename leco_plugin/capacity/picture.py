@@ -113,7 +113,9 @@ def _draw_panel(panel: Any, rows: Any, values: list[float], theme: Theme) -> Non
         panel.yaxis.set_minor_locator(LogLocator(subs=(2.0, 5.0)))
         panel.yaxis.set_minor_formatter(StrMethodFormatter("{x:g}"))
         panel.tick_params(axis="y", which="minor", labelsize=9)
-    panel.margins(y=0.16)
+    else:
+        panel.yaxis.set_minor_formatter(NullFormatter())
+    panel.margins(x=0.1, y=0.16)
     plain(panel, theme)
 
 
