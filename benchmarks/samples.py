@@ -25,7 +25,7 @@ from timing import interleaved, ratio
 from leco_plugin.cli_reports import occupancy_of
 from leco_plugin.compat.host_outputs import true_colours
 from leco_plugin.evaluation.field_queries import counted
-from leco_plugin.evaluation.json_file import write_json
+from leco_plugin.evaluation.json_file import read_object, write_json
 from leco_plugin.evaluation.machine import describe_code, describe_machine, made_by
 from leco_plugin.models.leco import LecoModel
 from leco_plugin.samplers.estimator import LearnedOccupancyEstimator
@@ -145,8 +145,6 @@ def row_of(run: Path, data: Path) -> dict[str, Any]:
 
 def main(options: Options) -> None:
     """Measures the runs that are named, one after the other."""
-    from leco_plugin.evaluation.json_file import read_object
-
     known = read_object(options.out, "is damaged; delete it") if options.out.exists() else {}
     rows: dict[str, Any] = known.get("scenes", {})
     code = describe_code()

@@ -45,10 +45,10 @@ def test_less_is_left_of_a_ray_after_each_question(
 def test_what_is_kept_is_what_the_occupancy_keeps_of_all_candidates(
     samples: ModuleType, known_run: Path, tiny_scene: Path
 ) -> None:
-    model = find_source(known_run / "occupancy.safetensors", tiny_scene).model
+    source = find_source(known_run / "occupancy.safetensors", tiny_scene)
+    model = source.model
     assert model is not None
-    found = find_source(known_run / "occupancy.safetensors", tiny_scene)
-    pictures = samples.bundles_of(found.manager, model.device)
+    pictures = samples.bundles_of(source.manager, model.device)
     counts = samples.along_rays(model, [bundle for bundle, _ in pictures])
     occupancy = Occupancy.load(known_run / "occupancy.safetensors")
     kept = total = 0

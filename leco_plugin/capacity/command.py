@@ -19,7 +19,7 @@ from leco_plugin.evaluation.json_file import read_object, write_json
 from leco_plugin.evaluation.machine import describe_code, describe_machine, made_by
 from leco_plugin.progress_bar import bar
 from leco_plugin.scenes.description import describe_scene
-from leco_plugin.scenes.input_error import InputError
+from leco_plugin.scenes.input_error import InputError, require_folder
 
 SETTINGS, POINTS, LEFT_OUT = "settings.json", "points", "left_out.json"
 TOO_MANY = f"would ask the field at more than {MOST_ON_CPU / 1e6:.0f} million places"
@@ -59,8 +59,7 @@ def capacity(
         raise ValueError(
             f"--grids has {min(resolutions)}; a grid has 2 cells or more along an axis"
         )
-    if not data.is_dir():
-        raise InputError(f"--data {data}: there is no such folder{', but a file' * data.exists()}")
+    require_folder("--data", data)
     scene, machine, code = describe_scene(data), describe_machine(), describe_code()
     settings = {
         "lost_surface_mass": lost_surface_mass,

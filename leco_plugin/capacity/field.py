@@ -17,7 +17,7 @@ from leco_plugin.evaluation.reached_volume import reached_volume
 from leco_plugin.models.leco import LecoModel
 from leco_plugin.models.losses import widen
 from leco_plugin.models.objective import GateLossConfig
-from leco_plugin.scenes.input_error import InputError, one_line
+from leco_plugin.scenes.input_error import InputError, one_line, require_folder
 from leco_plugin.scenes.whole_files import write_whole
 from leco_plugin.shrink.evidence import Evidence, gather
 from leco_plugin.shrink.sources import Source, held_out, trained_on
@@ -48,8 +48,7 @@ def prepare(data: Path, folder: Path, learn_steps: int) -> Ground:
     Raises:
         InputError: `data` is no folder, or what was left is not of it.
     """
-    if not data.is_dir():
-        raise InputError(f"--data {data}: there is no such folder{', but a file' * data.exists()}")
+    require_folder("--data", data)
     from leco_plugin.method_configs import best_device, leco_occupancy
     from leco_plugin.models.hosts.learn_first import learn_model
 

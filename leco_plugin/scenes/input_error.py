@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 
 class InputError(SystemExit, ValueError):
     """Something given to a command is wrong; the message names the cause and the remedy.
@@ -26,6 +28,19 @@ def require(holds: bool, option: str, value: object, wanted: str) -> None:
     """
     if not holds:
         raise InputError(f"{option} is {value}; it must be {wanted}")
+
+
+def require_folder(option: str, path: Path) -> None:
+    """Refuses a path that is no folder.
+
+    Args:
+        option: as it is given, with the dashes before it.
+    Raises:
+        InputError: there is none, or a file.
+    """
+    if not path.is_dir():
+        instead = ", but a file" if path.exists() else ""
+        raise InputError(f"{option} {path}: there is no such folder{instead}")
 
 
 def one_line(error: BaseException, most: int | None = None) -> str:

@@ -156,6 +156,11 @@ def query_in_parts(occupancy: Occupancy, positions: Tensor) -> Tensor:
     return torch.cat([occupancy.query(part) for part in positions.split(POINTS_AT_ONCE)])
 
 
+def skipped_by(occupancy: Occupancy, evidence: Evidence) -> Tensor:
+    """Which candidates an occupancy skips: bool [M]."""
+    return query_in_parts(occupancy, evidence.positions) < occupancy.threshold
+
+
 class Loss(NamedTuple):
     """What skipping costs beyond the original, on one set of rays."""
 

@@ -33,11 +33,9 @@ def lowered(ground: Ground, bounds: Bounds) -> Occupancy | None:
             loss(each.search.evidence, found < there.threshold, unlikely_at(1))
             for each, found in zip(absolute, scores)
         ]
-        bound = max(one.bound for one in losses)
-        if max(one.share for one in losses) > MARGIN * bounds.lost_surface_mass:
-            return False
-        if not within(bounds, bound, None):
-            return False
+        share, bound = max(one.share for one in losses), max(one.bound for one in losses)
+        if share > MARGIN * bounds.lost_surface_mass or not within(bounds, bound, None):
+            return False  # before anything is rendered
         prices = [price_of(ground, each, each.search, there) for each in absolute]
         return within(bounds, bound, worst(prices))
 

@@ -15,7 +15,7 @@ from typing import NamedTuple
 
 from leco_plugin.models.leco import LecoModel
 from leco_plugin.occupancy import Occupancy
-from leco_plugin.shrink.evidence import Evidence, Rendered, gather, join, loss, query_in_parts
+from leco_plugin.shrink.evidence import Evidence, Rendered, gather, join, loss, skipped_by
 from leco_plugin.shrink.sources import Seen, Source, from_between_cameras, of_other_pixels
 
 NOW = "the run's field as it is now, beyond what the original loses"
@@ -109,8 +109,7 @@ def references(source: Source, original: Occupancy, sides: Sequence[Side]) -> li
 
 def _lost_by(occupancy: Occupancy, evidence: Evidence) -> float:
     """The share of the surface mass that an occupancy skips."""
-    skipped = query_in_parts(occupancy, evidence.positions) < occupancy.threshold
-    return loss(evidence, skipped).share
+    return loss(evidence, skipped_by(occupancy, evidence)).share
 
 
 def shares_lost(

@@ -24,7 +24,7 @@ from leco_plugin.models.rendering import Rays
 from leco_plugin.models.scene_rays import cut_to_bounds
 from leco_plugin.occupancy import Occupancy
 from leco_plugin.scenes.frames import between, frame_of, moved, turned
-from leco_plugin.scenes.input_error import InputError, one_line
+from leco_plugin.scenes.input_error import InputError, one_line, require_folder
 from leco_plugin.scenes.pixels.held_out_pixels import held_out_sampler, some_images
 
 CONFIG, CHECKPOINTS = "config.yml", "nerfstudio_models"
@@ -61,8 +61,7 @@ def find_source(file: Path, data: Path) -> Source:
     Raises:
         InputError: `data` is no folder, or the run's model cannot be loaded.
     """
-    if not data.is_dir():
-        raise InputError(f"--data {data}: there is no such folder{', but a file' * data.exists()}")
+    require_folder("--data", data)
     folder = file.resolve().parent
     if (folder / CONFIG).is_file() and any((folder / CHECKPOINTS).glob("step-*.ckpt")):
         source = _of_run(folder, data.resolve())

@@ -7,10 +7,8 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from torch import Tensor
-
 from leco_plugin.occupancy import Occupancy
-from leco_plugin.shrink.evidence import Loss, image_price, loss, query_in_parts, unlikely_at
+from leco_plugin.shrink.evidence import Loss, image_price, loss, skipped_by, unlikely_at
 from leco_plugin.shrink.references import Part, Reference
 from leco_plugin.shrink.rungs import Bounds, Ground, Rung
 
@@ -37,7 +35,7 @@ def verify(ground: Ground, smaller: Occupancy, bounds: Bounds, rung: Rung, look:
         found.append(unseen._replace(bound=max(searched.bound, unseen.bound)))
         prices += [price_of(ground, reference, part, smaller) for part in parts]
     first = ground.references[0].verify
-    kept, skipped = first.evidence.kept, _skipped(smaller, first)
+    kept, skipped = first.evidence.kept, skipped_by(smaller, first.evidence)
     rung.look = look
     rung.verified = {
         "lost_surface_mass": max(one.share for one in found),
@@ -90,16 +88,12 @@ def _loss(
     """What a gate loses in all; of the original, exactly what it declares where it guides."""
     beyond = Loss(0.0, 0.0, 0.0)
     if gate is not ground.original or not reference.guided:
-        beyond = loss(part.evidence, _skipped(gate, part), unlikely)
+        beyond = loss(part.evidence, skipped_by(gate, part.evidence), unlikely)
     return Loss(
         reference.lost_before + beyond.share,
         reference.lost_before + beyond.bound,
         reference.mass_before + beyond.lost_mass,
     )
-
-
-def _skipped(smaller: Occupancy, part: Part) -> Tensor:
-    return query_in_parts(smaller, part.evidence.positions) < smaller.threshold
 
 
 def price_of(ground: Ground, reference: Reference, part: Part, gate: Occupancy) -> float | None:
