@@ -1,4 +1,4 @@
-"""What `docs/results.md` shows of stored charts: pictures, tables, the paper's figures beside."""
+"""What the pages show of stored charts: pictures, tables, the paper's figures beside."""
 
 from __future__ import annotations
 
@@ -12,8 +12,6 @@ from paper_rows import PAPER_ROWS
 
 from leco_plugin.chart.contenders.suites import SUITES
 from leco_plugin.chart.drawing.table import table
-from leco_plugin.chart.findings.representations import COSTS, fronts_of, representations_of, verdict
-from leco_plugin.chart.findings.summary import lines_of
 
 CHARTS = RESULTS / "charts"
 
@@ -43,51 +41,35 @@ def stored(name: str) -> dict[str, Any]:
     return found
 
 
+def notes() -> dict[str, str]:
+    """What is said of charts that were made by code which has been mended since."""
+    file = RESULTS / "notes.json"
+    found: dict[str, str] = json.loads(file.read_text()) if file.exists() else {}
+    return found
+
+
 def chart_sections() -> list[str]:
-    """All stored charts, each with its picture, its tables, its command and its machine; and with
-    what `notes.json` says of those that were made by code which has been mended since."""
+    """Charts of `docs/results.md`: those that belong to no suite."""
+    return _sections(name for name in titles() if stored(name)["suite"] is None)
+
+
+def suite_sections() -> list[str]:
+    """Charts of `docs/suites.md`."""
+    return _sections(name for name in titles() if stored(name)["suite"] is not None)
+
+
+def _sections(names: Iterable[str]) -> list[str]:
+    """Each chart with its picture, its tables, its command, its machine and its note."""
     parts: list[str] = []
     said: set[str] = set()
-    file = RESULTS / "notes.json"
-    notes: dict[str, str] = json.loads(file.read_text()) if file.exists() else {}
-    for name, title in titles().items():
+    for name in names:
         results = stored(name)
         _, body = table(results).split("\n", 1)
-        note = [f"\n**{notes[name]}**"] if name in notes else []
-        parts += [f"## {title}\n", picture(name), *note, body, f"{machine_line(results)}.\n"]
+        note = [f"\n**{notes()[name]}**"] if name in notes() else []
+        parts += [f"## {titles()[name]}\n", picture(name), *note, body]
+        parts.append(f"{machine_line(results)}.\n")
         paper = PAPER_ROWS.get(results["suite"] or name)
         if paper is not None and paper not in said:
             said.add(paper)
             parts.append(paper)
-    return parts + fronts_section(stored(name) for name in titles())
-
-
-def fronts_section(charts: Iterable[dict[str, Any]]) -> list[str]:
-    """On which fronts our gate is, scene by scene, where representations were compared."""
-    rows = []
-    counts = dict.fromkeys(COSTS, 0)
-    for results in charts:
-        held = representations_of(lines_of(results))
-        ours = next((one for one in held if one.ours), None)
-        if ours is None or results["suite"] != "representations":
-            continue
-        found = fronts_of(ours, held)
-        for name in found:
-            counts[name] += 1
-        marks = " | ".join("yes" if name in found else "**no**" for name in COSTS)
-        rows.append(f"| {results['scene']['name']} | {ours.kept:.1f} | {marks} | {verdict(held)} |")
-    if not rows:
-        return []
-    listed = " and ".join(f"of {name} on {count}" for name, count in counts.items())
-    scenes = f"{len(rows)} scene{'s' if len(rows) > 1 else ''}"
-    return [
-        "## Whether our gate is on the front, scene by scene\n",
-        "Volume kept of what rays reach where each representation loses 0.1% of the surface mass, "
-        f"against its size and against the time to learn it: of {scenes}, ours is on the front "
-        f"{listed}. Grids are made from the field that taught our gate: their time is that of the "
-        "field and of filling them, so that they differ from ours in size.\n",
-        f"| scene | volume kept by ours, % | {' | '.join(COSTS)} | |",
-        f"|---|---|{'---|' * len(COSTS)}---|",
-        *rows,
-        "",
-    ]
+    return parts

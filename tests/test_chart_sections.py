@@ -10,7 +10,7 @@ from types import ModuleType
 from typing import Any
 
 import pytest
-from chart_results import occupancy, results, run
+from chart_results import results, run
 
 ROOT = Path(__file__).resolve().parent.parent
 
@@ -38,30 +38,11 @@ def of_suite(suite: str, scene: str, *runs: dict[str, Any]) -> dict[str, Any]:
     return results(*runs, suite=suite, question="Why?", scene={"name": scene}, made=made)
 
 
-def representations(scene: str, other_seconds: float, grid_kept: float = 0.3) -> dict[str, Any]:
-    grids = [
-        {
-            "resolution": 64,
-            "bytes": 32768,
-            "update_seconds": 2.0,
-            "kept_reached_volume": grid_kept,
-        }
-    ]
-    ours = run("MLP (ours)", occupancy=occupancy(50_000, 0.125, grids), learn_seconds=9.0)
-    other = run(
-        "hash grid",
-        sampler="learned-occupancy-hash",
-        occupancy=occupancy(4_000_000, 0.1),
-        learn_seconds=other_seconds,
-    )
-    return of_suite("representations", scene, ours, other)
-
-
 def test_a_suite_is_shown_with_its_question_picture_figures_command_and_machine(
     sections: ModuleType,
 ) -> None:
     store(sections, "fox-losses", of_suite("losses", "fox", run("A", psnr=21.0), run("B")))
-    text = "\n".join(sections.chart_sections())
+    text = "\n".join(sections.suite_sections())
     assert "## Suite `losses` on fox" in text and "Why?" in text
     assert "images/charts/fox-losses-dark.png" in text and "| A | 1 | 21.00 |" in text
     assert "`leco chart --data fox --suite losses`, 2024-02-29, leco_plugin 0.1.0 at 1b." in text
@@ -76,31 +57,16 @@ def test_charts_with_a_title_come_first_and_suites_in_their_order(sections: Modu
     assert sections.titles()["z"] == "Z"
 
 
-def test_it_is_said_for_every_scene_whether_ours_is_on_the_fronts(sections: ModuleType) -> None:
-    store(sections, "one", representations("city", other_seconds=10.0))
-    store(sections, "two", representations("fox", other_seconds=8.0))
-    text = "\n".join(sections.chart_sections())
-    assert "of 2 scenes, ours is on the front of size on 2 and of learning time on 1." in text
-    assert "| city | 12.5 | yes | yes | MLP (ours) is on both fronts" in text
-    beaten = "on the front of size only: it is beaten in learning time by hash grid"
-    assert f"| fox | 12.5 | yes | **no** | MLP (ours) is {beaten} |" in text
-
-
-def test_a_grid_that_is_smaller_and_keeps_less_is_named(sections: ModuleType) -> None:
-    store(sections, "one", representations("city", other_seconds=10.0, grid_kept=0.05))
-    text = "\n".join(sections.chart_sections())
-    assert "| city | 12.5 | **no** | yes |" in text and "beaten in size by grid 64³" in text
-
-
-def test_without_such_a_suite_nothing_is_said_of_fronts(sections: ModuleType) -> None:
-    store(sections, "one", of_suite("losses", "fox", run("A")))
-    assert "front, scene by scene" not in "\n".join(sections.chart_sections())
+def test_a_chart_that_belongs_to_no_suite_is_on_the_other_page(sections: ModuleType) -> None:
+    store(sections, "z", of_suite("losses", "z", run("A")) | {"suite": None})
+    assert "## z" in "\n".join(sections.chart_sections())
+    assert sections.suite_sections() == []
 
 
 def test_the_papers_rows_stand_once_and_beside_the_first_chart(sections: ModuleType) -> None:
     for scene in ("city", "fox"):
         made = of_suite("grid-resolution", scene, run("A"))
         store(sections, f"{scene}-grid", made)
-    text = "\n".join(sections.chart_sections())
+    text = "\n".join(sections.suite_sections())
     assert text.count("| grid 256³ | 25.86, 0.764, 0.409 | 46.0 | 12.5 |") == 1
     assert text.index("25.86") < text.index("on fox")

@@ -1,0 +1,121 @@
+"""The reviewers' questions, each with an answer from every scene."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
+
+import checkout  # noqa: F401
+from chart_sections import notes, stored, titles
+
+from leco_plugin.chart.contenders.suites import SUITES
+from leco_plugin.chart.drawing.title import asks_what_was_learned, title_of
+from leco_plugin.chart.findings.learned import learned_of
+from leco_plugin.chart.findings.representations import (
+    COSTS,
+    Representation,
+    fronts_of,
+    representations_of,
+)
+from leco_plugin.chart.findings.summary import RENDERING, Line, lines_of
+
+HEAD = """## The reviewers' questions, answered
+
+What each suite of `leco chart --suite` found on each scene. Costs, spread over seeds, pictures and
+commands are on [a page of their own](suites.md); a chart marked (*) was made before a mend that is
+named there.
+"""
+KEPT = """Volume kept, of what rays reach, where each loses 0.1% of the surface mass, and the size
+of the occupancy: less is better in both. Grids are made from the field that taught our gate.
+"""
+LEARNED = """Candidates skipped by the calibrated gate, and PSNR after equally many steps.
+"""
+TIMED = """PSNR after equal time, and seconds to render a test image.
+"""
+
+
+def answers_section() -> list[str]:
+    """Suite by suite, a row for each scene; nothing where no suite is stored."""
+    charts = [(name, stored(name)) for name in titles()]
+    parts = []
+    for suite, its in SUITES.items():
+        rows = [(name, results) for name, results in charts if results["suite"] == suite]
+        if rows:
+            parts += [f"### {its.question}\n", *_answer(rows)]
+    return [HEAD, *parts] if parts else []
+
+
+def _answer(charts: Sequence[tuple[str, dict[str, Any]]]) -> list[str]:
+    figures, cells_of = _kind(charts[0][1])
+    cells = [cells_of(lines_of(results)) for _, results in charts]
+    columns = list(dict.fromkeys(column for row in cells for column in row))
+    rows = [f"| scene | {' | '.join(columns)} | |", f"|---|{'---|' * len(columns)}---|"]
+    for (name, results), row in zip(charts, cells):
+        shown = " | ".join(row.get(column, "-") for column in columns)
+        mark = " (*)" if name in notes() else ""
+        rows.append(f"| {_link(results)}{mark} | {shown} | {title_of(results)} |")
+    counted = [_fronts([results for _, results in charts])] if figures == KEPT else []
+    return [figures, *rows, "", *counted]
+
+
+def _link(results: Mapping[str, Any]) -> str:
+    scene = results["scene"]["name"]
+    return f"[{scene}](suites.md#suite-{results['suite']}-on-{scene})"
+
+
+def _kind(results: Mapping[str, Any]) -> tuple[str, Callable[[Sequence[Line]], dict[str, str]]]:
+    """What the figures of a suite are, and how those of a scene are found, by contender."""
+    if representations_of(lines_of(results)):
+        return KEPT, _kept
+    return (LEARNED, _learned) if asks_what_was_learned(results) else (TIMED, _timed)
+
+
+def _kept(lines: Sequence[Line]) -> dict[str, str]:
+    held = representations_of(lines)
+    return {one.name: f"{one.kept:.1f}%, {one.median('size'):.0f} kB" for one in held}
+
+
+def _learned(lines: Sequence[Line]) -> dict[str, str]:
+    found = {one.name: one for one in learned_of(lines)}
+    cells = {}
+    for line in lines:
+        one = found.get(line.name)
+        skipped = one.median("empty_fraction") if one is not None else None
+        share = "not frozen" if skipped is None else f"{skipped:.0%}"
+        if one is not None and one.facts and not one.always_frozen:
+            share += f" ({len(one.facts)} of {one.seeds} frozen)"
+        cells[line.name] = f"{share}, {line.psnr:.1f} dB"
+    return cells
+
+
+def _timed(lines: Sequence[Line]) -> dict[str, str]:
+    return {line.name: f"{line.psnr:.1f} dB, {line.median(RENDERING):.2g} s" for line in lines}
+
+
+def _fronts(charts: Sequence[Mapping[str, Any]]) -> str:
+    """On the fronts of how many scenes our gate is, and where only its spread leaves it there."""
+    counts = dict.fromkeys(COSTS, 0)
+    close = []
+    for results in charts:
+        held = representations_of(lines_of(results))
+        for ours in (one for one in held if one.ours):
+            found = fronts_of(ours, held)
+            for name in found:
+                counts[name] += 1
+                close += [
+                    f"on {results['scene']['name']} by {other.name} in {name}"
+                    for other in held
+                    if _less_in_the_median(other, ours, COSTS[name])
+                ]
+    listed = " and ".join(f"of {name} on {count}" for name, count in counts.items())
+    scenes = f"{len(charts)} scene{'s' if len(charts) > 1 else ''}"
+    said = f"Of {scenes}, ours is on the front {listed}."
+    if close:
+        said += f" In the median, but not with every seed, it is beaten there {', '.join(close)}."
+    shrunk = "[Shrunk](#gates-shrunk-to-what-decides-alike), our gate"
+    return f"{said} {shrunk} is a sixth to an eleventh as large.\n"
+
+
+def _less_in_the_median(one: Representation, other: Representation, figure: str) -> bool:
+    costs = one.median(figure), other.median(figure)
+    return one is not other and costs[0] <= costs[1] and one.kept < other.kept

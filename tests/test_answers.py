@@ -1,0 +1,121 @@
+"""Claims about the answers that stored suites give, with results that are made up."""
+
+from __future__ import annotations
+
+import importlib
+import json
+import sys
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+import pytest
+from chart_results import occupancy, results, run
+
+ROOT = Path(__file__).resolve().parent.parent
+
+
+@pytest.fixture
+def answers(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> ModuleType:
+    """The answers' module, with no chart stored yet."""
+    monkeypatch.syspath_prepend(str(ROOT / "benchmarks"))
+    for name in ("chart_sections", "answers"):
+        monkeypatch.delitem(sys.modules, name, raising=False)
+    charts = importlib.import_module("chart_sections")
+    monkeypatch.setattr(charts, "RESULTS", tmp_path)
+    monkeypatch.setattr(charts, "CHARTS", tmp_path / "charts")
+    (tmp_path / "charts.json").write_text("{}")
+    (tmp_path / "charts").mkdir()
+    return importlib.import_module("answers")
+
+
+@pytest.fixture
+def store(answers: ModuleType, tmp_path: Path) -> Any:
+    def write(suite: str, scene: str, *runs: dict[str, Any], **changes: Any) -> None:
+        made = results(*runs, suite=suite, scene={"name": scene}, **changes)
+        (tmp_path / "charts" / f"{scene}-{suite}.json").write_text(json.dumps(made))
+
+    return write
+
+
+def text_of(answers: ModuleType) -> str:
+    return "\n".join(answers.answers_section())
+
+
+def representations(other_seconds: float, grid_kept: tuple[float, ...] = (0.3,)) -> list[Any]:
+    """Runs of our gate, grids from its field, and of a larger gate, for each seed."""
+    runs = []
+    for seed, kept in enumerate(grid_kept):
+        grid = {"resolution": 64, "bytes": 32768, "update_seconds": 2.0}
+        held = occupancy(50_000, 0.125, [{**grid, "kept_reached_volume": kept}])
+        runs.append(run("MLP (ours)", seed, occupancy=held, learn_seconds=9.0))
+        larger = {"occupancy": occupancy(4_000_000, 0.1), "learn_seconds": other_seconds}
+        runs.append(run("hash grid", seed, sampler="learned-occupancy-hash", **larger))
+    return runs
+
+
+def test_without_suites_there_are_no_answers(answers: ModuleType) -> None:
+    assert answers.answers_section() == []
+
+
+def test_it_is_said_for_every_scene_whether_ours_is_on_the_fronts(
+    answers: ModuleType, store: Any
+) -> None:
+    store("representations", "city", *representations(other_seconds=10.0))
+    store("representations", "fox", *representations(other_seconds=8.0))
+    text = text_of(answers)
+    assert "Of 2 scenes, ours is on the front of size on 2 and of learning time on 1." in text
+    link = "suites.md#suite-representations-on-city"
+    kept = "| 12.5%, 50 kB | 30.0%, 33 kB | 10.0%, 4000 kB |"
+    assert f"| [city]({link}) {kept} MLP (ours) is on both fronts" in text
+    assert "MLP (ours) is on the front of size only: it is beaten in learning time by hash" in text
+
+
+def test_a_grid_that_is_smaller_and_keeps_less_is_named(answers: ModuleType, store: Any) -> None:
+    store("representations", "city", *representations(10.0, grid_kept=(0.05,)))
+    text = text_of(answers)
+    assert "on the front of size on 0" in text and "beaten in size by grid 64³" in text
+    assert "In the median" not in text
+
+
+def test_one_that_keeps_less_with_most_seeds_only_is_named_too(
+    answers: ModuleType, store: Any
+) -> None:
+    store("representations", "city", *representations(10.0, grid_kept=(0.05, 0.05, 0.3)))
+    text = text_of(answers)
+    assert "on the front of size on 1" in text
+    assert "not with every seed, it is beaten there on city by grid 64³ in size." in text
+
+
+def test_gates_are_compared_by_what_they_skip_and_runs_of_equal_time_by_their_ends(
+    answers: ModuleType, store: Any
+) -> None:
+    frozen, not_frozen = occupancy(50_000, 0.1), {"freeze_seconds": None}
+    steps = {"protocol": {"seconds": None, "steps": 400}}
+    store("losses", "fox", run("A", occupancy=frozen), run("B", **not_frozen), **steps)
+    store("freeze", "fox", run("A", psnr=21.0), run("B"))
+    text = text_of(answers)
+    assert "| 80%, 20.0 dB | not frozen, 20.0 dB |" in text
+    assert "| 21.0 dB, 1 s | 20.0 dB, 1 s | A is ahead: 21.0 dB, 1.0 more than B |" in text
+
+
+def test_a_gate_that_is_not_frozen_with_every_seed_says_with_how_many(
+    answers: ModuleType, store: Any
+) -> None:
+    runs = [run("A", 0, occupancy=occupancy(5, 0.1)), run("A", 1, freeze_seconds=None)]
+    store("losses", "fox", *runs, protocol={"seconds": None, "steps": 400})
+    assert "| 80% (1 of 2 frozen), 20.0 dB |" in text_of(answers)
+
+
+def test_a_contender_that_a_scene_lacks_has_no_figure_there(
+    answers: ModuleType, store: Any
+) -> None:
+    store("freeze", "city", run("A"))
+    store("freeze", "fox", run("A"), run("B"))
+    assert "| 20.0 dB, 1 s | - | A: 20.0 dB |" in text_of(answers)
+
+
+def test_a_chart_with_a_note_is_marked(answers: ModuleType, store: Any, tmp_path: Path) -> None:
+    store("freeze", "city", run("A"))
+    (tmp_path / "notes.json").write_text('{"city-freeze": "Made before."}')
+    assert "[city](suites.md#suite-freeze-on-city) (*) |" in text_of(answers)
