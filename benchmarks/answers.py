@@ -13,8 +13,8 @@ from leco_plugin.chart.drawing.title import asks_what_was_learned, title_of
 from leco_plugin.chart.findings.learned import learned_of
 from leco_plugin.chart.findings.representations import (
     COSTS,
-    Representation,
     fronts_of,
+    in_doubt,
     representations_of,
 )
 from leco_plugin.chart.findings.summary import RENDERING, Line, lines_of
@@ -94,28 +94,21 @@ def _timed(lines: Sequence[Line]) -> dict[str, str]:
 
 def _fronts(charts: Sequence[Mapping[str, Any]]) -> str:
     """On the fronts of how many scenes our gate is, and where only its spread leaves it there."""
-    counts = dict.fromkeys(COSTS, 0)
-    close = []
+    counts, doubts = dict.fromkeys(COSTS, 0), dict.fromkeys(COSTS, 0)
     for results in charts:
         held = representations_of(lines_of(results))
         for ours in (one for one in held if one.ours):
-            found = fronts_of(ours, held)
-            for name in found:
+            for name in fronts_of(ours, held):
                 counts[name] += 1
-                close += [
-                    f"on {results['scene']['name']} by {other.name} in {name}"
-                    for other in held
-                    if _less_in_the_median(other, ours, COSTS[name])
-                ]
-    listed = " and ".join(f"of {name} on {count}" for name, count in counts.items())
+            for name in in_doubt(ours, held):
+                doubts[name] += 1
+    listed = " and ".join(
+        f"of {name} on {count}" + (f" ({doubts[name]} in doubt)" if doubts[name] else "")
+        for name, count in counts.items()
+    )
     scenes = f"{len(charts)} scene{'s' if len(charts) > 1 else ''}"
-    said = f"Of {scenes}, ours is on the front {listed}."
-    if close:
-        said += f" In the median, but not with every seed, it is beaten there {', '.join(close)}."
     shrunk = "[Shrunk](#gates-shrunk-to-what-decides-alike), our gate"
-    return f"{said} {shrunk} is a sixth to an eleventh as large.\n"
-
-
-def _less_in_the_median(one: Representation, other: Representation, figure: str) -> bool:
-    costs = one.median(figure), other.median(figure)
-    return one is not other and costs[0] <= costs[1] and one.kept < other.kept
+    return (
+        f"Of {scenes}, ours is on the front {listed}. {shrunk} is a sixth to an eleventh as large."
+        "\n"
+    )

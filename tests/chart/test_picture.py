@@ -13,7 +13,15 @@ from matplotlib.figure import Figure
 from PIL import Image
 
 from leco_plugin.chart.drawing.panels import NAME_WIDTH, name_points
-from leco_plugin.chart.drawing.picture import CLOSE, _name_ends, balanced, best_so_far, draw, spread
+from leco_plugin.chart.drawing.picture import (
+    CLOSE,
+    _name_ends,
+    balanced,
+    best_so_far,
+    draw,
+    name_of_end,
+    spread,
+)
 from leco_plugin.chart.drawing.theme import DARK, LIGHT, Theme
 from leco_plugin.chart.findings.summary import lines_of
 from leco_plugin.evaluation.charts import SOURCE, fingerprint
@@ -28,6 +36,11 @@ def share_of(colour: str, path: Path) -> float:
     pixels = np.asarray(Image.open(path).convert("RGB")).astype(int)
     wanted = np.array([int(colour[i : i + 2], 16) for i in (1, 3, 5)])
     return float((np.abs(pixels - wanted).max(axis=-1) < 8).mean())
+
+
+def test_the_end_of_a_curve_says_that_a_grid_does_not_skip_yet() -> None:
+    warm, cold = lines_of(results(run("A", warming_up=False), run("B", warming_up=True)))
+    assert (name_of_end(warm), name_of_end(cold)) == ("A  20.0", "B  20.0 (warm-up)")
 
 
 @pytest.mark.parametrize("theme", [LIGHT, DARK], ids=["light", "dark"])

@@ -11,6 +11,7 @@ from leco_plugin.chart.findings.representations import (
     Held,
     Representation,
     fronts_of,
+    in_doubt,
     representations_of,
     verdict,
 )
@@ -46,8 +47,7 @@ def test_grids_stand_beside_the_gates_of_whose_field_they_were_made() -> None:
     assert [one.kept for one in held] == pytest.approx([10.0, 30.0, 20.0, 20.0])
     assert [one.ours for one in held] == [True, False, False, False]
     assert verdict(held) == (
-        "MLP (ours) is on both fronts: nothing keeps less space in every seed that is not larger, "
-        "or not longer in learning"
+        "MLP (ours) is on both fronts: what keeps less space is larger, and takes longer to learn"
     )
 
 
@@ -98,6 +98,20 @@ def test_it_is_said_where_ours_is_not_on_the_front_and_what_beats_it() -> None:
         "hash grid"
     )
     assert verdict(gates(faster, smaller)) == "our own gate has no figures here"
+
+
+def test_what_leads_in_the_median_but_not_with_every_seed_is_named() -> None:
+    ours = Representation("ours", {i: Held(50.0, 9.0, 10.0) for i in range(3)}, ours=True)
+    other = held("planes", (8.0, 9.0), (8.0, 9.0), (8.0, 11.0))
+    assert fronts_of(ours, [ours, other]) == ["size", "learning time"]
+    larger = Representation("larger", {i: Held(60.0, 8.0, 9.5) for i in range(3)})
+    assert in_doubt(ours, [ours, other]) == {"size": other, "learning time": other}
+    assert verdict([ours, other]) == (
+        "nothing beats ours with every seed; in the median, planes in size, planes in learning time"
+    )
+    assert verdict([ours, other, larger]) == (
+        "ours is on the front of size only: it is beaten in learning time by larger"
+    )
 
 
 def test_equals_do_not_beat_one_another() -> None:

@@ -94,8 +94,8 @@ def draw(results: Mapping[str, Any], path: Path, theme: Theme = LIGHT) -> Path:
             _draw_runs(below, lines, theme)
         else:
             figure.text(0.015, 0.335, HOW_TO_READ, va="top", fontsize=11.5)
-            widest = max(len(line.name) for line in lines)
-            right = 0.93 - CHARACTER * min(widest + 6, 40)
+            widest = max(len(name_of_end(line)) for line in lines)
+            right = 0.93 - CHARACTER * min(widest, 40)
             main = figure.add_axes((0.075, 0.43, right - 0.075, height))
             _draw_curves(main, lines, theme)
             _draw_learning(main, lines, theme)
@@ -172,7 +172,7 @@ def _name_ends(axes: Any, lines: Sequence[Line], theme: Theme) -> None:
     ends = []
     for line in lines:
         times, mean, _, _ = line.curve()
-        ends.append((float(times[-1]), float(mean[-1]), f"{line.name}  {line.psnr:.1f}"))
+        ends.append((float(times[-1]), float(mean[-1]), name_of_end(line)))
     low, high = axes.get_ylim()
     wanted = [(value - low) / (high - low) for _, value, _ in ends]
     for i, place in enumerate(spread(wanted, CLOSE)):
@@ -194,6 +194,12 @@ def _name_ends(axes: Any, lines: Sequence[Line], theme: Theme) -> None:
                 "shrinkB": 6.0,
             },
         )
+
+
+def name_of_end(line: Line) -> str:
+    """What stands at the end of a curve: whose it is, its PSNR, and whether that is of a grid which
+    does not skip yet."""
+    return f"{line.name}  {line.psnr:.1f}" + (" (warm-up)" if line.warming_up else "")
 
 
 def spread(wanted: Sequence[float], apart: float) -> list[float]:

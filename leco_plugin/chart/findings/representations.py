@@ -60,6 +60,11 @@ class Representation:
         never_worse = all(a <= b for mine, theirs in pairs for a, b in zip(mine, theirs))
         return never_worse and any(mine != theirs for mine, theirs in pairs)
 
+    def leads(self, other: Representation, figure: str) -> bool:
+        """Whether it keeps less at no more cost in the median, which may be chance."""
+        cheaper = self.median(figure) <= other.median(figure)
+        return self is not other and cheaper and self.kept < other.kept
+
 
 def representations_of(lines: Sequence[Line]) -> list[Representation]:
     """Learned occupancies, and grids made from the same field, that were measured in every run.
@@ -119,8 +124,20 @@ def fronts_of(one: Representation, all_of_them: Sequence[Representation]) -> lis
     ]
 
 
+def in_doubt(
+    one: Representation, all_of_them: Sequence[Representation]
+) -> dict[str, Representation]:
+    """By names of the fronts that it is on: what leads there in the median, though not with every
+    seed, and of that what keeps least."""
+    leaders = {
+        name: [other for other in all_of_them if other.leads(one, COSTS[name])]
+        for name in fronts_of(one, all_of_them)
+    }
+    return {name: min(them, key=lambda o: o.kept) for name, them in leaders.items() if them}
+
+
 def verdict(representations: Sequence[Representation]) -> str:
-    """On which fronts ours is, and what beats it where it is not."""
+    """On which fronts ours is, what beats it where it is not, and where that is in doubt."""
     ours = next((one for one in representations if one.ours), None)
     if ours is None:
         return "our own gate has no figures here"
@@ -129,10 +146,13 @@ def verdict(representations: Sequence[Representation]) -> str:
         better = [one for one in representations if one.beats(ours, figure)]
         if better:
             beaten.append(f"in {name} by {min(better, key=lambda one: one.kept).name}")
-    if not beaten:
-        return (
-            f"{ours.name} is on both fronts: nothing keeps less space in every seed that is not "
-            "larger, or not longer in learning"
-        )
-    where = f"is on the front of {held[0]} only" if held else "is on neither front"
-    return f"{ours.name} {where}: it is beaten {' and '.join(beaten)}"
+    doubts = in_doubt(ours, representations)
+    if beaten:
+        where = f"is on the front of {held[0]} only" if held else "is on neither front"
+        return f"{ours.name} {where}: it is beaten {' and '.join(beaten)}"
+    if doubts:
+        leaders = ", ".join(f"{one.name} in {name}" for name, one in doubts.items())
+        return f"nothing beats {ours.name} with every seed; in the median, {leaders}"
+    return (
+        f"{ours.name} is on both fronts: what keeps less space is larger, and takes longer to learn"
+    )
