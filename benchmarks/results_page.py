@@ -46,14 +46,16 @@ experts, no gate* has as many scene experts, none for empty space, as Switch-NeR
 
 - **PSNR** is of 8,192 pixels spread over all test images; SSIM, LPIPS and the seconds to render are
   of one whole test image or two. Qualities are means over seeds, with the least and the most;
-  costs, comparisons of one method with another, and figures of occupancies are medians.
-- **s to X dB**: after how many seconds of training each method first reached what every run reached
-  at last. **Trained**: seconds until the last step had ended, which may be more than was given.
+  costs, ratios, and figures of occupancies are medians.
+- **s to X dB**: after how many seconds of training each method reached what every run reached at
+  last, to stay above it. **Trained**: seconds until the last step had ended, which may be more
+  than was given.
 - **Bold**: on the front of its column, so that nothing has more PSNR for less of it. **-**: not
   measured, or not there, as LPIPS where its weights could not be had.
 - A *candidate* is a place on a ray at which a model that skips nothing would ask its network.
   **Candidates skipped**, **price** and **lost surface mass** are of held-out pixels at the moment
-  of freezing, over the seeds in which a gate was frozen; **healed** counts recoveries from
+  of freezing (in charts of before 24 November 2026 at the end, which differs where a threshold was
+  lowered), over the seeds in which a gate was frozen; **healed** counts recoveries from
   collapse. **Volume kept at 1e-3** is of what rays reach of the scene, with the threshold that
   loses one thousandth of the surface: so gates and grids are compared at the same price.
 - **True surface kept** and **free space skipped** compare with the exact city.

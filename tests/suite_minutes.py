@@ -15,7 +15,7 @@ def minutes_together(names: Sequence[str], cores: Cores) -> float:
     made: set[tuple[str, Protocol]] = set()
     minutes = 0.0
     for one in (SUITES[name] for name in names):
-        new = [c for c in one.contenders if (c.without_grids().key, one.protocol) not in made]
-        made |= {(contender.without_grids().key, one.protocol) for contender in new}
+        new = [c for c in one.contenders if (c.alone().key, one.protocol) not in made]
+        made |= {(contender.alone().key, one.protocol) for contender in new}
         minutes += 3 * forecast.minutes(new, one.on_two_cores, cores)
     return minutes

@@ -67,7 +67,7 @@ def test_the_table_of_suites_says_how_many_runs_they_have_and_how_long_they_take
     assert list(rows) == [*SUITES, "all"]
     made: set[tuple[str, Protocol]] = set()
     for name, one in SUITES.items():
-        wanted = {(contender.without_grids().key, one.protocol) for contender in one.contenders}
+        wanted = {(contender.alone().key, one.protocol) for contender in one.contenders}
         count, shared, _, minutes = rows[name]
         assert int(count) == len(wanted) and int(shared.replace("-", "0")) == len(wanted & made)
         assert minutes == f"{one.minutes(FAST):.0f} to {one.minutes(SLOW):.0f}"

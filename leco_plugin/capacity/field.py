@@ -102,8 +102,8 @@ def _ground(source: Source) -> Ground:
     model = source.model
     assert model is not None
     torch.manual_seed(1)  # so that whoever goes on is taught by the same rays
+    lesson = lesson_by(source)
     occupancy = model.occupancy().eval()
-    taught, _ = gather(source, None, trained_on(source, occupancy, TAUGHT_RAYS))
     measured, _ = gather(source, None, held_out(source, occupancy, RAYS, parts=1)[0])
     if not bool(measured.worth.any()):
         raise InputError(
@@ -111,12 +111,20 @@ def _ground(source: Source) -> Ground:
             "learn longer, with a larger --learn-steps and a new folder at --out"
         )
 
-    def mapped(places: Tensor) -> Tensor:
-        return model.space.map(places).clamp(-1.0, 1.0)
-
-    lesson = lesson_of(mapped(taught.positions), taught, model.config.gate_loss)
     volume = reached_volume(model, lesson.mapped, VOLUME_POINTS, seed=5)
-    return Ground(model, lesson, measured, mapped(measured.positions), volume)
+    return Ground(model, lesson, measured, _mapped(model, measured.positions), volume)
+
+
+def lesson_by(source: Source) -> Lesson:
+    """What a source's field has to teach along rays that it was trained on, nothing skipped."""
+    model = source.model
+    assert model is not None
+    taught, _ = gather(source, None, trained_on(source, model.occupancy().eval(), TAUGHT_RAYS))
+    return lesson_of(_mapped(model, taught.positions), taught, model.config.gate_loss)
+
+
+def _mapped(model: LecoModel, places: Tensor) -> Tensor:
+    return model.space.map(places).clamp(-1.0, 1.0)
 
 
 def lesson_of(mapped: Tensor, taught: Evidence, losses: GateLossConfig) -> Lesson:

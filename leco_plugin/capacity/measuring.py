@@ -14,7 +14,13 @@ from torch import Tensor
 
 from leco_plugin.capacity.field import Ground
 from leco_plugin.evaluation.equal_loss import MOST_ON_CPU, SPARED, kept_shares, threshold_losing
-from leco_plugin.evaluation.field_grids import FieldGrids, density_of, in_parts, looked_up
+from leco_plugin.evaluation.field_grids import (
+    FieldGrids,
+    density_of,
+    dilate,
+    in_parts,
+    looked_up,
+)
 from leco_plugin.evaluation.reached_volume import mapped_box
 from leco_plugin.models.encodings import EncodingConfig
 from leco_plugin.models.gate import GateConfig, occupancy_logit
@@ -152,7 +158,8 @@ def of_grids(
 ) -> Iterator[tuple[Candidate, dict[str, Any]]]:
     """Fills grids from the field's density, each from one half as fine; yields a row for each.
 
-    They hear of the places that gates are taught by, and of random ones. Ends with the first that
+    They hear of the places that gates are taught by, and of random ones, and are dilated by a cell
+    where they keep less so. Ends with the first that
     would ask the field more often than `MOST_ON_CPU` on a CPU.
 
     Args:
@@ -175,11 +182,13 @@ def of_grids(
         scores = grids.fill((candidate.resolution,) * 3)
         if scores is None:
             return
-        of_rays, of_volume = (
-            looked_up(scores, box, mapped) for mapped in (ground.mapped, ground.volume)
-        )
-        found = measured(ground.held_out, of_rays, of_volume, lost)
-        yield candidate, _row(candidate, started, found)
+        both = []
+        for some in (scores, dilate(scores)):
+            of_rays, of_volume = (
+                looked_up(some, box, mapped) for mapped in (ground.mapped, ground.volume)
+            )
+            both.append(measured(ground.held_out, of_rays, of_volume, lost))
+        yield candidate, _row(candidate, started, min(both, key=lambda one: one["kept_volume"]))
 
 
 def _row(candidate: Candidate, started: float, found: dict[str, Any]) -> dict[str, Any]:

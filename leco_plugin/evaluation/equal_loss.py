@@ -7,7 +7,7 @@ its threshold is set so that exactly the same share of the weight near surfaces 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from typing import Any
 
@@ -17,10 +17,12 @@ from torch import Tensor
 from leco_plugin.evaluation.field_grids import (
     FieldGrids,
     density_of,
+    dilate,
     fits_memory,
     in_parts,
     looked_up,
 )
+from leco_plugin.evaluation.inspection import ViewBox
 from leco_plugin.evaluation.reached_volume import (
     candidates_of,
     mapped_box,
@@ -83,6 +85,7 @@ def at_equal_loss(
     datamanager: Any,
     grids: Sequence[int | tuple[int, int, int]] = (),
     until_as_little: bool = False,
+    others: Mapping[str, Callable[[Tensor], Tensor]] | None = None,
 ) -> dict[str, Any]:
     """What the model's gate keeps at `LOST_SURFACE_MASS`, and grids made from the same field.
 
@@ -95,11 +98,13 @@ def at_equal_loss(
         datamanager: with held-out training pixels.
         grids: cells along each axis of the grids, one number for all three or one for each.
         until_as_little: whether the first grid that keeps as little as the gate is the last.
+        others: further representations by name, each a score of mapped positions [N, 3]: [N].
     Returns:
         `lost_surface_mass`; `reached_volume`, the share of the scene's box that rays reach;
         `kept_reached_volume` and `kept_candidates`, shares of that and of the candidates between
         near and far; `grids`, the same for each with its `resolution`, its `bytes` at one bit a
-        cell and the `update_seconds` that it took beyond the field, coarser grids included; and
+        cell, the `update_seconds` that it took beyond the field, coarser grids included, and
+        whether it keeps least `dilated` by a cell; `others`, what each keeps if there are any; and
         `left_out`, resolutions that would not fit the free memory, or take minutes of a CPU.
     Raises:
         ValueError: held-out rays see no surface.
@@ -113,6 +118,10 @@ def at_equal_loss(
         kept = kept_shares(
             weights, occupancies, in_parts(partial(_occupancy, model), volume), LOST_SURFACE_MASS
         )
+        beside = {}
+        for name, score in (others or {}).items():
+            of_rays, of_volume = in_parts(score, mapped), in_parts(score, volume)
+            beside[name] = _shares(kept_shares(weights, of_rays, of_volume, LOST_SURFACE_MASS))
         rows, left_out = [], []
         if grids:
             box = mapped_box(model)
@@ -130,24 +139,36 @@ def at_equal_loss(
                 if scores is None:
                     left_out.append(resolution)
                     continue
-                of_rays, of_volume = (looked_up(scores, box, places) for places in (mapped, volume))
                 row: dict[str, Any] = {
                     "resolution": resolution,
                     "bytes": math.ceil(math.prod(sizes) / 8),
                     "update_seconds": round(filling.clock.seconds, 3),
                 }
-                rows.append(
-                    row | _shares(kept_shares(weights, of_rays, of_volume, LOST_SURFACE_MASS))
-                )
+                rows.append(row | _better_of_dilations(scores, box, mapped, weights, volume))
                 if until_as_little and rows[-1]["kept_reached_volume"] <= round(kept[0], 5):
                     break
     return {
         "lost_surface_mass": LOST_SURFACE_MASS,
         "reached_volume": round(len(volume) / VOLUME_POINTS, 5),
         **_shares(kept),
+        **({"others": beside} if beside else {}),
         "grids": rows,
         "left_out": left_out,
     }
+
+
+def _better_of_dilations(
+    scores: Tensor, box: ViewBox, mapped: Tensor, weights: Tensor, volume: Tensor
+) -> dict[str, Any]:
+    """What a grid keeps as it is, or dilated, whichever is less."""
+    found = []
+    for dilated in (False, True):
+        if dilated:
+            scores = dilate(scores)
+        of_rays, of_volume = (looked_up(scores, box, places) for places in (mapped, volume))
+        kept = kept_shares(weights, of_rays, of_volume, LOST_SURFACE_MASS)
+        found.append({"dilated": dilated, **_shares(kept)})
+    return min(found, key=lambda one: one["kept_reached_volume"])
 
 
 def _shares(kept: tuple[float, float]) -> dict[str, float]:

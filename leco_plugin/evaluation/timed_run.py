@@ -31,7 +31,7 @@ CURVE_RAYS = 8192
 
 PRICES = ("threshold", "empty_fraction", "lost_mass", "lost_surface_mass", "image_price_db")
 WARM_UP = 256
-"""Steps in which nerfacc's grid fills all of its cells at each update."""
+"""Steps in which nerfacc's grid asks all of its cells at each update."""
 
 ENDLESS = 10_000_000
 """Steps that no timed run reaches; the clock ends it."""
@@ -57,7 +57,7 @@ class TimedRun:
     recoveries: int | None = None
     """How often a collapsed gate was healed; None where a model learns none itself."""
     warming_up: bool | None = None
-    """Whether the run ended in the warm-up of an occupancy grid, in which all cells are filled."""
+    """Whether the run ended in the warm-up of an occupancy grid, in which all cells are asked."""
     psnr: float = math.nan
     ssim: float = math.nan
     lpips: float | None = None
@@ -232,7 +232,8 @@ class _Course:
         run.step_seconds = statistics.median(self.step_times) if self.step_times else None
         if self.grids:
             run.learn_seconds = self.grid_clock.seconds
-            run.warming_up = run.steps < WARM_UP
+            sizes = getattr(getattr(self.trainer.pipeline.model, "config", None), "sizes", None)
+            run.warming_up = run.steps < getattr(sizes, "grid_warmup_steps", WARM_UP)
         progress = getattr(self.trainer.pipeline.model, "progress", None)
         run.recoveries = getattr(progress, "recoveries", None)
         run.peak_process_bytes = peak_process_bytes()

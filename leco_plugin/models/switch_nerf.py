@@ -143,7 +143,11 @@ class SwitchNerfModel(Model):
         """Lets the estimator ask the field, as packed hosts do before each training step."""
         if self.occupancy_grid is not None:
             update: Any = self.occupancy_grid.update_every_n_steps
-            update(step=step, occ_eval_fn=self.opacity_of_a_step)
+            update(
+                step=step,
+                occ_eval_fn=self.opacity_of_a_step,
+                warmup_steps=self.config.sizes.grid_warmup_steps,
+            )
 
     @torch.no_grad()
     def opacity_of_a_step(self, positions: Tensor) -> Tensor:

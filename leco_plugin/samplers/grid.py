@@ -17,8 +17,9 @@ from leco_plugin.samplers.base import Estimator
 from leco_plugin.samplers.marching import NearFn, OccupiedFn
 from leco_plugin.samplers.marching.rays import checked_box
 
-CELLS_AT_ONCE = 1 << 20
-"""Cells evaluated in one call of the host's density; nerfacc asks 2 million at once."""
+CELLS_AT_ONCE = 1 << 18
+"""Cells evaluated in one call of the host's density; nerfacc asks 2 million at once, for which a
+host on a CPU needs gigabytes."""
 
 
 def nested_boxes(box: Sequence[float] | Tensor, levels: int) -> list[Tensor]:

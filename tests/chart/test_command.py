@@ -130,7 +130,7 @@ def test_several_suites_have_a_folder_each_and_none_makes_what_another_has_made(
         assert stored[name] == json.loads((out / name / "results.json").read_text())
         words = stored[name]["made"]["command"]
         assert f"--suite {name} --steps" in words and f"--at-once {AT_ONCE}" in words
-    keys = {one.without_grids().key for name in names for one in SUITES[name].contenders}
+    keys = {one.alone().key for name in names for one in SUITES[name].contenders}
     assert len(started) == len(keys)
     assert run(*arguments, "--suite", *names) == 0 and len(started) == len(keys)
     assert run(*arguments, "--suite", "freeze", "losses", "--seconds", 7) == 2  # losses had steps

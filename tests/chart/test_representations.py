@@ -8,10 +8,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from leco_plugin.chart.findings.representations import (
+    TAUGHT,
     Held,
     Representation,
     fronts_of,
-    in_doubt,
     representations_of,
     verdict,
 )
@@ -66,11 +66,15 @@ def held(name: str, *seeds: tuple[float, float]) -> Representation:
 
 def test_what_one_seed_does_not_show_beats_nothing() -> None:
     ours = held("ours", (9.0, 10.0), (9.0, 20.0))
-    assert held("less, always", (9.0, 9.0), (9.0, 19.0)).beats(ours, "learn_seconds")
-    assert held("less, once", (9.0, 9.0), (9.0, 20.0)).beats(ours, "learn_seconds")
-    assert not held("less in the middle", (9.0, 12.0), (9.0, 10.0)).beats(ours, "learn_seconds")
-    assert not held("faster once", (8.0, 10.0), (9.5, 20.0)).beats(ours, "learn_seconds")
-    assert not Representation("elsewhere", {5: Held(1.0, 1.0, 1.0)}).beats(ours, "learn_seconds")
+    assert held("less, always", (9.0, 9.0), (9.0, 19.0)).leads_always(ours, "learn_seconds")
+    assert held("less, once", (9.0, 9.0), (9.0, 20.0)).leads_always(ours, "learn_seconds")
+    assert not held("less in the middle", (9.0, 12.0), (9.0, 10.0)).leads_always(
+        ours, "learn_seconds"
+    )
+    assert not held("faster once", (8.0, 10.0), (9.5, 20.0)).leads_always(ours, "learn_seconds")
+    assert not Representation("elsewhere", {5: Held(1.0, 1.0, 1.0)}).leads_always(
+        ours, "learn_seconds"
+    )
 
 
 def test_what_was_measured_in_the_whole_box_is_not_compared() -> None:
@@ -90,28 +94,45 @@ def test_it_is_said_where_ours_is_not_on_the_front_and_what_beats_it() -> None:
     faster = ("hash grid", "learned-occupancy-hash", 4_000_000, 3.0, 0.05)
     smaller = ("K-planes", "learned-occupancy-k-planes", 40_000, 10.0, 0.1)
     said = verdict(gates(faster, ours))  # whatever comes first
-    assert said == (
-        "MLP (ours) is on the front of size only: it is beaten in learning time by hash grid"
-    )
+    assert said == ("MLP (ours) is on the front of size; in learning time hash grid is ahead")
     assert verdict(gates(ours, faster, smaller)) == (
-        "MLP (ours) is on neither front: it is beaten in size by K-planes and in learning time by "
-        "hash grid"
+        "MLP (ours) is on neither front; in size K-planes is ahead; in learning time hash grid is "
+        "ahead"
     )
     assert verdict(gates(faster, smaller)) == "our own gate has no figures here"
 
 
-def test_what_leads_in_the_median_but_not_with_every_seed_is_named() -> None:
+def test_what_leads_in_the_median_but_not_with_every_seed_is_said_to() -> None:
     ours = Representation("ours", {i: Held(50.0, 9.0, 10.0) for i in range(3)}, ours=True)
     other = held("planes", (8.0, 9.0), (8.0, 9.0), (8.0, 11.0))
-    assert fronts_of(ours, [ours, other]) == ["size", "learning time"]
-    larger = Representation("larger", {i: Held(60.0, 8.0, 9.5) for i in range(3)})
-    assert in_doubt(ours, [ours, other]) == {"size": other, "learning time": other}
+    assert fronts_of(ours, [ours, other]) == []
     assert verdict([ours, other]) == (
-        "nothing beats ours with every seed; in the median, planes in size, planes in learning time"
+        "ours is on neither front; in size planes is ahead, not with every seed; in learning time "
+        "planes is ahead, not with every seed"
     )
-    assert verdict([ours, other, larger]) == (
-        "ours is on the front of size only: it is beaten in learning time by larger"
+    larger = Representation("larger", {i: Held(60.0, 8.0, 9.5) for i in range(3)})
+    assert verdict([ours, larger]) == (
+        "ours is on the front of size; in learning time larger is ahead"
     )
+
+
+def test_a_small_gate_that_the_field_has_taught_is_ours_too() -> None:
+    facts = occupancy(50_000, 0.2)
+    facts["at_equal_loss"]["taught"] = {"bytes": 5000, "seconds": 20.0, "kept_reached_volume": 0.1}
+    ours = run("MLP (ours)", learn_seconds=9.0, occupancy=facts)
+    rival = run("hash grid", sampler="learned-occupancy-hash", occupancy=occupancy(10**6, 0.15))
+    held = representations_of(lines_of(results(ours, rival)))
+    assert [one.name for one in held] == ["MLP (ours)", TAUGHT, "hash grid"]
+    assert held[1].by_seed == {0: Held(5.0, 29.0, 10.0)} and held[1].ours
+    said = f"{TAUGHT} is on both fronts: what keeps less space is larger, and takes longer to learn"
+    assert verdict(held) == said
+
+
+def test_grids_have_no_learning_time_and_are_on_no_front_of_it() -> None:
+    ours = run("MLP (ours)", learn_seconds=9.0, occupancy=occupancy(50_000, 0.3, GRIDS))
+    held = representations_of(lines_of(results(ours)))
+    assert [one.has("learn_seconds") for one in held] == [True, False, False]
+    assert [fronts_of(one, held) for one in held] == [["learning time"], ["size"], ["size"]]
 
 
 def test_equals_do_not_beat_one_another() -> None:

@@ -25,8 +25,8 @@ SMALL: dict[str, Any] = {
     "calibration.rays": 64,
     "schedule.learn_steps": 3,
 }
-CONTENDERS = {one.without_grids().key: one for found in SUITES.values() for one in found.contenders}
-BY_DEFAULT = {one.without_grids().key for one in SUITES["losses"].contenders}
+CONTENDERS = {one.alone().key: one for found in SUITES.values() for one in found.contenders}
+BY_DEFAULT = {one.alone().key for one in SUITES["losses"].contenders}
 """The others take a minute of one core, and run only when long tests are asked for."""
 
 

@@ -27,6 +27,8 @@ class Contender:
     grids: tuple[int, ...] = ()
     """Cells along each axis of occupancy grids that are made from its field when it freezes, and
     compared with its gate."""
+    taught: bool = False
+    """Whether a small gate is taught by its field when it freezes, and compared with its gate."""
     settings: Mapping[str, Any] = field(default_factory=dict)
     """Settings of the whole method, by their path; keys of dictionaries are steps of it too."""
 
@@ -36,12 +38,14 @@ class Contender:
         what = {name: value for name, value in asdict(self).items() if name != "name"}
         if not self.settings:
             del what["settings"]  # charts that are stored were made before there were any
+        if not self.taught:
+            del what["taught"]
         digest = hashlib.sha256(json.dumps(what, sort_keys=True).encode()).hexdigest()
         return f"{self.method}-{self.sampler}-{digest[:8]}"
 
-    def without_grids(self) -> Contender:
-        """The same training: grids are made after it."""
-        return replace(self, grids=())
+    def alone(self) -> Contender:
+        """The same training: what is compared with its gate is made after it."""
+        return replace(self, grids=(), taught=False)
 
     @staticmethod
     def from_dict(values: Mapping[str, Any]) -> Contender:

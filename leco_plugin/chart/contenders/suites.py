@@ -104,7 +104,7 @@ SUITES = {
     "representations": Suite(
         "Is a small MLP the best place for an occupancy? (reviews 1 and 2)",
         (
-            replace(_leco("MLP on frequencies (ours)"), grids=MADE_GRIDS),
+            replace(_leco("MLP on frequencies (ours)"), grids=MADE_GRIDS, taught=True),
             *(
                 Contender(
                     name, "leco-occupancy", f"{LEARNED}-{kind}", {"sizes.gate.encoding.kind": kind}

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import statistics
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 
 def rows(header: Sequence[str], cells: Sequence[Sequence[str]]) -> str:
@@ -26,12 +26,16 @@ def number(value: float | None) -> str:
     return f"{value:.3g}"
 
 
-def spread(values: Sequence[float | None], form: str) -> str:
-    """Median, and where there are several, least and most; a dash where a seed has none."""
+def spread(
+    values: Sequence[float | None],
+    form: str,
+    middle_of: Callable[[Sequence[float]], float] = statistics.median,
+) -> str:
+    """Median or mean, and where there are several, least and most; a dash where a seed has none."""
     known = [value for value in values if value is not None]
     if len(known) < len(values) or not known:
         return "-"
-    middle = format(statistics.median(known), form)
+    middle = format(middle_of(known), form)
     if len(known) == 1:
         return middle
     return f"{middle} ({min(known):{form}} to {max(known):{form}})"

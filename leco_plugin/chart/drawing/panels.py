@@ -12,6 +12,8 @@ from leco_plugin.chart.findings.summary import COSTS, Cost, Line, front
 
 WIDE_RANGE = 8.0
 """Ratio of costs from which their axis is logarithmic."""
+FAR = 0.1
+"""Of the panel's height: from there on a line leads from a point to its name."""
 NAME_WIDTH = 0.019
 """Of a letter beside a point of the large panel, of the panel's."""
 
@@ -104,14 +106,26 @@ def draw_kept(
     """
     places = [(value, one.kept) for value, one in zip(values, held)]
     _cost_axis(axes, cost.title, cost.unit, values, theme)
-    names = [line.name for line in lines]
     for place, one in zip(places, held):
-        look = style(names.index(one.name), theme) if one.name in names else {"marker": "x"}
         size = 15 if one.ours else 11
-        axes.plot(*place, markersize=size, zorder=3, **{"color": theme.ink, **look})
+        axes.plot(*place, markersize=size, zorder=3, **look_of(one, held, lines, theme))
     axes.invert_yaxis()
     _draw_front(axes, places, theme, sign=-1.0)
     return places
+
+
+def look_of(
+    one: Representation, held: Sequence[Representation], lines: Sequence[Line], theme: Theme
+) -> dict[str, Any]:
+    """Colour and marker: those of its line, a star of our colour for what our field has taught, and
+    a cross for grids."""
+    names = [line.name for line in lines]
+    if one.name in names:
+        return style(names.index(one.name), theme)
+    ours = [names.index(other.name) for other in held if other.ours and other.name in names]
+    if one.ours and ours:
+        return {**style(ours[0], theme), "marker": "*"}
+    return {"marker": "x", "color": theme.ink, "linestyle": "none"}
 
 
 def draw_learned(
@@ -143,9 +157,15 @@ def draw_learned(
     ]
     others = [point for of in points.values() for point in of]
     name_points(axes, places, names, [looks[one.name]["color"] for one in shown], others)
-    if never := [one.name for one in learned if not one.facts]:
-        said = f"never frozen: {'; '.join(never)}"
-        axes.text(0.01, 0.03, said, transform=axes.transAxes, fontsize=11)
+    never = [one.name for one in learned if not one.facts]
+    for row, name in enumerate(reversed(never)):
+        axes.annotate(
+            f"{name}: no gate was frozen",
+            (0.01, 0.03 + 0.065 * row),
+            xycoords="axes fraction",
+            color=looks[name]["color"],
+            fontweight="bold",
+        )
 
 
 def name_points(
@@ -164,13 +184,16 @@ def name_points(
         width = NAME_WIDTH * len(name)
         corners = [
             (x + across if across > 0 else x + across - width, y + up)
-            for up in (0.06, -0.06, 0.0, 0.13, -0.13)
+            for up in (0.06, -0.06, 0.0, 0.13, -0.13, 0.2, -0.2, 0.27, -0.27)
             for across in (0.022, -0.022)
         ]
         inside = [corner for corner in corners if _is_free(corner, width, ())] or corners
         free = [corner for corner in inside if _is_free(corner, width, taken)]
         left, middle = (free or inside)[0]
         taken.append((left, middle - 0.035, left + width, middle + 0.035))
+        if abs(middle - y) > FAR:
+            end = left if left > x else left + width
+            axes.plot([x, end], [y, middle], transform=axes.transAxes, color=colour, linewidth=1.2)
         axes.text(
             *(left, middle, name),
             transform=axes.transAxes,

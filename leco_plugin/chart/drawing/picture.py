@@ -19,6 +19,7 @@ from leco_plugin.chart.drawing.panels import (
     draw_cost,
     draw_kept,
     draw_learned,
+    look_of,
     name_points,
 )
 from leco_plugin.chart.drawing.theme import LIGHT, Theme, plain, style, themed
@@ -117,14 +118,15 @@ def _draw_compared(
 ) -> None:
     """What each occupancy keeps against its size and its learning time."""
     by_size, by_time = beside
-    sizes, seconds = ([one.median(cost) for one in held] for cost in ("size", "learn_seconds"))
+    timed = [one for one in held if one.has("learn_seconds")]
+    sizes = [one.median("size") for one in held]
+    seconds = [one.median("learn_seconds") for one in timed]
     places = draw_kept(by_size, BYTES, sizes, held, lines, theme)
     by_size.set_ylabel("space kept, %")
-    looks = {line.name: style(i, theme)["color"] for i, line in enumerate(lines)}
-    colours = [looks.get(one.name, theme.ink) for one in held]
+    colours = [look_of(one, held, lines, theme)["color"] for one in held]
     name_points(by_size, places, [one.name for one in held], colours)
-    draw_kept(by_time, LEARNING, seconds, held, lines, theme)
-    by_time.set_xlim(0.9 * min(seconds), 1.04 * max(seconds))
+    draw_kept(by_time, LEARNING, seconds, timed, lines, theme)
+    by_time.set_xlim(0.9 * min(seconds), 1.06 * max(seconds))
 
 
 def _draw_runs(below: Sequence[Any], lines: Sequence[Line], theme: Theme) -> None:
@@ -197,8 +199,8 @@ def _name_ends(axes: Any, lines: Sequence[Line], theme: Theme) -> None:
 
 
 def name_of_end(line: Line) -> str:
-    """What stands at the end of a curve: whose it is, its PSNR, and whether that is of a grid which
-    does not skip yet."""
+    """What stands at the end of a curve: whose, its PSNR, and whether that is of a grid in its
+    warm-up."""
     return f"{line.name}  {line.psnr:.1f}" + (" (warm-up)" if line.warming_up else "")
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import statistics
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -59,11 +60,11 @@ def table(results: Mapping[str, Any]) -> str:
     if lines:
         parts += [f"{title_of(results)}. {circumstances(results)}.", runs_table(lines)]
     if warming := [line.name for line in lines if line.warming_up]:
-        parts.append(f"Still in the warm-up of their grid, which fills all cells: {_and(warming)}.")
+        parts.append(f"Ended in the warm-up of their grid, which asks all cells: {_and(warming)}.")
     duels = rivals(lines, results["protocol"]["seconds"])
     if duels:
         parts.append(versus_table(duels))
-    if results["suite"] and lines and results["protocol"]["seconds"] is not None:
+    if len(lines) > 1 and results["protocol"]["seconds"] is not None:
         parts.append(settling(lines))
     if results["failures"]:
         parts.append(failures_table(results["failures"]))
@@ -109,7 +110,8 @@ def runs_table(lines: Sequence[Line]) -> str:
 
 
 def versus_table(duels: Sequence[Versus]) -> str:
-    """What learned occupancies gain: medians over seeds, and the least and the most."""
+    """What learned occupancies gain: means of PSNR over seeds, medians of times and of ratios, and
+    the least and the most."""
     header = [
         *("against", "seeds", "PSNR, dB", "passes its last PSNR after, s"),
         *("sooner by, x", "renders faster by, x"),
@@ -118,7 +120,7 @@ def versus_table(duels: Sequence[Versus]) -> str:
         [
             f"{duel.ours} against {duel.theirs}",
             str(len(duel.gains)),
-            spread(duel.gains, "+.2f"),
+            spread(duel.gains, "+.2f", statistics.fmean),
             spread(duel.passed, ".0f"),
             spread(duel.sooner, ".2f"),
             spread(duel.faster, ".1f"),

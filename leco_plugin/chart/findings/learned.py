@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import statistics
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 from leco_plugin.chart.findings.summary import Line, figure_in
+
+OURS = "(ours)"
+"""In the name of the contender that a suite asks about."""
 
 
 @dataclass(frozen=True)
@@ -61,21 +64,42 @@ def _learned(line: Line) -> Learned:
 
 
 def learned_headline(learned: Sequence[Learned]) -> str:
-    """Whose occupancies skip most, in one sentence: where all runs had as many steps, PSNR says
-    nothing of where they would end. Who does not skip more with every seed skips alike."""
+    """What ours, or else the first that always froze, skips, and who of the others skips more or
+    less than it with every seed: where all runs had as many steps, PSNR says nothing of where they
+    would end."""
     frozen = [one for one in learned if one.always_frozen]
-    ranked = sorted(frozen, key=lambda one: -_skipped(one))
-    if not ranked:
-        return "No gate was frozen with every seed"
-    alike = [one for one in ranked if not _skips_more(ranked[0], one)]
-    said = f"{ranked[0].name} skips {_skipped(ranked[0]):.0%} of the candidates"
-    if len(alike) > 1:
-        least, most = _skipped(alike[-1]), _skipped(alike[0])
-        said = f"{len(alike)} of {len(learned)} skip alike, {least:.0%} to {most:.0%}"
-    elif len(ranked) > 1:
-        said += f", {ranked[1].name} {_skipped(ranked[1]):.0%}"
-    rest = len(learned) - len(frozen)
-    return f"{said}; {rest} not frozen with every seed" if rest else said
+    if not frozen:
+        return "no gate was frozen with every seed"
+    ours = next((one for one in frozen if OURS in one.name), frozen[0])
+    others = [one for one in frozen if one is not ours]
+    more = [one for one in others if _skips_more(one, ours)]
+    less = [one for one in others if _skips_more(ours, one)]
+    alike = [one for one in others if one not in more and one not in less]
+    never = [one for one in learned if not one.facts]
+    parts = [
+        _counted(more, "more", max),
+        _counted(alike, "as much but for the seeds", None),
+        _counted(less, "less", min),
+        _counted(
+            [one for one in learned if one.facts and one not in frozen], "partly frozen", None
+        ),
+        _counted(never, "never frozen", None),
+    ]
+    said = f"{ours.name} skips {_skipped(ours):.0%} of the candidates"
+    return ": ".join([said, ", ".join(part for part in parts if part)]).removesuffix(": ")
+
+
+def _counted(
+    some: Sequence[Learned], what: str, extreme: Callable[..., Learned] | None
+) -> str | None:
+    """Who does what, by name if it is one, and the share of the one that does it most."""
+    if not some:
+        return None
+    who = some[0].name if len(some) == 1 else str(len(some))
+    if extreme is None:
+        return f"{who} {what}"
+    share = f"{_skipped(extreme(some, key=_skipped)):.0%}"
+    return f"{who} {what}, {share if len(some) == 1 else f'up to {share}'}"
 
 
 def _skips_more(one: Learned, other: Learned) -> bool:

@@ -13,13 +13,17 @@ OURS = "learned-occupancy"
 """The sampler whose gate is the one that this package takes by default."""
 
 
+TAUGHT = "small MLP, taught after (ours)"
+"""A small gate that a field has taught whose own gate was learned with it."""
+
+
 class Held(NamedTuple):
     """One representation in one run."""
 
     size: float
     """kB of its file, or of a grid's bits."""
-    learn_seconds: float
-    """Until it is there; for a grid, of the field it was made from, and its own updates."""
+    learn_seconds: float | None
+    """Until it is there; None for a grid, which is made from a field that learned a gate too."""
     kept: float
     """Percent of the volume that rays reach which it keeps when all lose equally much."""
 
@@ -35,11 +39,16 @@ class Representation:
     name: str
     by_seed: Mapping[int, Held]
     ours: bool = False
-    """Whether it is the gate that this package takes by default."""
+    """Whether it is the gate that this package takes by default, or a small one that the same field
+    has taught."""
 
     def of_seeds(self, figure: str) -> list[float]:
         """A figure of `Held` in each run."""
         return [getattr(held, figure) for held in self.by_seed.values()]
+
+    def has(self, figure: str) -> bool:
+        """Whether it was measured."""
+        return None not in self.of_seeds(figure)
 
     def median(self, figure: str) -> float:
         """The same, over seeds."""
@@ -50,20 +59,19 @@ class Representation:
         """Median of what it keeps, percent."""
         return self.median("kept")
 
-    def beats(self, other: Representation, figure: str) -> bool:
-        """Whether in each seed that both have it keeps no more at no more cost, and is better in
-        one of the two in some: what only some seeds show may be chance."""
+    def leads(self, other: Representation, figure: str) -> bool:
+        """Whether it keeps no more at no more cost, and is better in one of the two: medians."""
+        mine, theirs = ((one.median(figure), one.kept) for one in (self, other))
+        return mine != theirs and all(a <= b for a, b in zip(mine, theirs))
+
+    def leads_always(self, other: Representation, figure: str) -> bool:
+        """Whether the same holds in each seed that both have."""
         shared = [
             (held, other.by_seed[s]) for s, held in self.by_seed.items() if s in other.by_seed
         ]
         pairs = [((getattr(a, figure), a.kept), (getattr(b, figure), b.kept)) for a, b in shared]
         never_worse = all(a <= b for mine, theirs in pairs for a, b in zip(mine, theirs))
         return never_worse and any(mine != theirs for mine, theirs in pairs)
-
-    def leads(self, other: Representation, figure: str) -> bool:
-        """Whether it keeps less at no more cost in the median, which may be chance."""
-        cheaper = self.median(figure) <= other.median(figure)
-        return self is not other and cheaper and self.kept < other.kept
 
 
 def representations_of(lines: Sequence[Line]) -> list[Representation]:
@@ -78,8 +86,13 @@ def representations_of(lines: Sequence[Line]) -> list[Representation]:
         if any(gate is None for gate in gates.values()):
             continue
         measured = {seed: gate for seed, gate in gates.items() if gate is not None}
-        found.append(Representation(line.name, measured, line.sampler == OURS))
+        ours = line.sampler == OURS
+        found.append(Representation(line.name, measured, ours))
         kinds.add(line.sampler)
+        taught = {run["seed"]: _of_taught(run) for run in line.runs}
+        made = {seed: gate for seed, gate in taught.items() if gate is not None}
+        if len(made) == len(taught):
+            found.append(Representation(TAUGHT, made, ours))
         for resolution in resolutions_of(line.runs):
             grids = {run["seed"]: _of_grid(run, resolution) for run in line.runs}
             made = {seed: grid for seed, grid in grids.items() if grid is not None}
@@ -107,52 +120,51 @@ def _of_gate(run: Mapping[str, Any]) -> Held | None:
     return Held(size, seconds, kept)
 
 
+def _of_taught(run: Mapping[str, Any]) -> Held | None:
+    taught = run["occupancy"]["at_equal_loss"].get("taught")
+    if taught is None:
+        return None
+    seconds = run["learn_seconds"] + taught["seconds"]
+    return Held(taught["bytes"] / 1e3, seconds, 100.0 * taught["kept_reached_volume"])
+
+
 def _of_grid(run: Mapping[str, Any], resolution: str) -> Held | None:
     for grid in _grids(run):
         if str(grid["resolution"]) == resolution:
-            seconds = run["learn_seconds"] + grid["update_seconds"]
-            return Held(grid["bytes"] / 1e3, seconds, 100.0 * grid["kept_reached_volume"])
+            return Held(grid["bytes"] / 1e3, None, 100.0 * grid["kept_reached_volume"])
     return None
 
 
 def fronts_of(one: Representation, all_of_them: Sequence[Representation]) -> list[str]:
-    """The names of the `COSTS` on whose fronts a representation is."""
+    """The names of the `COSTS` on whose fronts a representation is, which are those of medians."""
     return [
         name
         for name, figure in COSTS.items()
-        if not any(other.beats(one, figure) for other in all_of_them)
+        if one.has(figure)
+        and not any(other.leads(one, figure) for other in all_of_them if other.has(figure))
     ]
 
 
-def in_doubt(
-    one: Representation, all_of_them: Sequence[Representation]
-) -> dict[str, Representation]:
-    """By names of the fronts that it is on: what leads there in the median, though not with every
-    seed, and of that what keeps least."""
-    leaders = {
-        name: [other for other in all_of_them if other.leads(one, COSTS[name])]
-        for name in fronts_of(one, all_of_them)
-    }
-    return {name: min(them, key=lambda o: o.kept) for name, them in leaders.items() if them}
-
-
 def verdict(representations: Sequence[Representation]) -> str:
-    """On which fronts ours is, what beats it where it is not, and where that is in doubt."""
-    ours = next((one for one in representations if one.ours), None)
-    if ours is None:
+    """Which of ours is on which front; and where none is, what is ahead, always or mostly."""
+    ours = [one for one in representations if one.ours]
+    if not ours:
         return "our own gate has no figures here"
-    held, beaten = fronts_of(ours, representations), []
+    fronts = {one.name: fronts_of(one, representations) for one in ours}
+    if both := [name for name, found in fronts.items() if found == list(COSTS)]:
+        least = "what keeps less space is larger, and takes longer to learn"
+        return f"{both[0]} is on both fronts: {least}"
+    held = [f"{name} is on the front of {found[0]}" for name, found in fronts.items() if found]
+    said = [", ".join(held) or f"{ours[0].name} is on neither front"]
     for name, figure in COSTS.items():
-        better = [one for one in representations if one.beats(ours, figure)]
-        if better:
-            beaten.append(f"in {name} by {min(better, key=lambda one: one.kept).name}")
-    doubts = in_doubt(ours, representations)
-    if beaten:
-        where = f"is on the front of {held[0]} only" if held else "is on neither front"
-        return f"{ours.name} {where}: it is beaten {' and '.join(beaten)}"
-    if doubts:
-        leaders = ", ".join(f"{one.name} in {name}" for name, one in doubts.items())
-        return f"nothing beats {ours.name} with every seed; in the median, {leaders}"
-    return (
-        f"{ours.name} is on both fronts: what keeps less space is larger, and takes longer to learn"
-    )
+        if not any(name in found for found in fronts.values()):
+            said.append(f"in {name} {_ahead(ours[0], representations, figure)}")
+    return "; ".join(said)
+
+
+def _ahead(one: Representation, others: Sequence[Representation], figure: str) -> str:
+    """What leads a representation and keeps least, and whether anything does so with every seed."""
+    leaders = [other for other in others if other.has(figure) and other.leads(one, figure)]
+    best = min(leaders, key=lambda other: other.kept)
+    always = any(other.leads_always(one, figure) for other in leaders)
+    return f"{best.name} is ahead" + ("" if always else ", not with every seed")

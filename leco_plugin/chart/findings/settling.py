@@ -22,11 +22,16 @@ def last_gain(line: Line) -> float:
     return statistics.fmean(gains)
 
 
+def still_rising(lines: Sequence[Line]) -> list[str]:
+    """Who gained more than `ENOUGH` at last, as far as a gain is shown."""
+    return [line.name for line in lines if round(last_gain(line), 1) > ENOUGH]
+
+
 def settling(lines: Sequence[Line]) -> str:
     """In two sentences, what all gained at last, and whether that is enough time."""
     gains = {line.name: last_gain(line) for line in lines}
     listed = ", ".join(f"{name} {gain:+.1f} dB" for name, gain in gains.items())
-    rising = [name for name, gain in gains.items() if gain > ENOUGH]
+    rising = still_rising(lines)
     said = "all of them have had enough time"
     if rising:
         who = "all of them" if len(rising) == len(gains) else " and ".join(rising)

@@ -107,22 +107,21 @@ class Line:
         return seconds, values.mean(axis=0), values.min(axis=0), values.max(axis=0)
 
     def seconds_to(self, psnr: float) -> float | None:
-        """When its runs first reach a PSNR, median over seeds; None if one of them does not."""
+        """When its runs reach a PSNR to stay, median over seeds; None if one of them does not."""
         found = [seconds_to_pass(run["curve"], psnr) for run in self.runs]
         return None if None in found else statistics.median(s for s in found if s is not None)
 
 
 def seconds_to_pass(curve: Sequence[Sequence[float]], psnr: float) -> float | None:
-    """When a curve [[seconds, PSNR], ...] first reaches a PSNR, between its points; or never."""
-    before = None
-    for seconds, value in curve:
-        if value >= psnr:
-            if before is None or value == before[1]:
-                return float(seconds)
-            share = (psnr - before[1]) / (value - before[1])
-            return float(before[0] + share * (seconds - before[0]))
-        before = (seconds, value)
-    return None
+    """When a curve [[seconds, PSNR], ...] reaches a PSNR to stay above it, between its points; or
+    never. A field that begins anew has not kept what the one before it had."""
+    below = [i for i, (_, value) in enumerate(curve) if value < psnr]
+    if not below:
+        return float(curve[0][0])
+    if below[-1] == len(curve) - 1:
+        return None
+    (before, low), (after, high) = curve[below[-1]], curve[below[-1] + 1]
+    return float(before + (psnr - low) / (high - low) * (after - before))
 
 
 def lines_of(results: Mapping[str, Any]) -> list[Line]:

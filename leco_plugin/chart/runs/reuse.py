@@ -87,21 +87,23 @@ def _made_before(source: Path) -> dict[str, Any] | None:
 def serves(record: Mapping[str, Any], job: Job) -> bool:
     """Whether a stored run is the one that a job asks for.
 
-    Grids are made after a run, from its field: a run that had more of them is the same run.
+    Grids and a taught gate are made after a run, from its field: a run that had more of them is
+    the same run.
     """
     made = Contender.from_dict(record["contender"])
-    alike = made.without_grids().key == job.contender.without_grids().key
-    return (
-        alike and record["run"]["seed"] == job.seed and set(job.contender.grids) <= set(made.grids)
-    )
+    alike = made.alone().key == job.contender.alone().key
+    has_all = set(job.contender.grids) <= set(made.grids) and job.contender.taught <= made.taught
+    return alike and record["run"]["seed"] == job.seed and has_all
 
 
 def run_for(record: Mapping[str, Any], job: Job) -> dict[str, Any]:
-    """The run of a record with those grids only that the job asks for."""
+    """The run of a record with those representations of its field only that the job asks for."""
     run: dict[str, Any] = copy.deepcopy(record["run"])
     facts = (run.get("occupancy") or {}).get("at_equal_loss")
     if facts:
         asked = job.contender.grids
         facts["grids"] = [grid for grid in facts["grids"] if grid["resolution"] in asked]
         facts["left_out"] = [size for size in facts["left_out"] if size in asked]
+        if not job.contender.taught:
+            facts.pop("taught", None)
     return run

@@ -28,9 +28,14 @@ TABLE = "table.md"
 
 
 def jobs_of(contenders: Sequence[Contender], seeds: Sequence[int]) -> list[Job]:
-    """All runs: the contenders take turns within a seed, so that a machine whose speed drifts
-    treats them alike."""
-    return [Job(contender, seed) for seed in dict.fromkeys(seeds) for contender in contenders]
+    """All runs: the contenders take turns within a seed, each seed beginning with another, so that a
+    machine whose speed drifts treats them alike and no two always run beside each other."""
+    jobs = []
+    for turn, seed in enumerate(dict.fromkeys(seeds)):
+        first = turn % len(contenders)
+        order = [*contenders[first:], *contenders[:first]]
+        jobs += [Job(contender, seed) for contender in order]
+    return jobs
 
 
 class Chart:
@@ -162,6 +167,12 @@ class Chart:
         there = f" ({stored} more are there already)" if stored else ""
         return f"{runs}{beside}, {about}{there}"
 
+    def _failures(self) -> list[dict[str, Any]]:
+        """All that ended without a result, and whether this call asked for them."""
+        asked = {(job.contender.name, job.seed) for job in self.jobs}
+        found = self.folder.failures()
+        return [{**one, "asked": (one["name"], one["seed"]) in asked} for one in found]
+
     def results(self) -> dict[str, Any]:
         """All finished runs in the folder, the contenders of this call first."""
         stored = {
@@ -183,7 +194,7 @@ class Chart:
             "made": self._made_of(stored),
             "occupancy": occupancies[0] if occupancies else None,
             "runs": runs,
-            "failures": self.folder.failures(),
+            "failures": self._failures(),
         }
 
     def _made(self) -> dict[str, Any]:

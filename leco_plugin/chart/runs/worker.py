@@ -110,23 +110,20 @@ def train_job(
         raise ValueError("it has diverged: the PSNR at its end is no number")
     facts = _occupancy_of(trainer, data, folder)
     if facts is not None:
-        facts["at_equal_loss"] = _at_freezing(trainer, frozen, contender.grids)
+        facts["at_equal_loss"] = _at_freezing(trainer, frozen, contender)
         facts["learn_seconds"] = run.learn_seconds
     return {**run.to_dict(), "name": contender.name, "occupancy": facts}, trainer
 
 
-def _weights_of(model: LecoModel) -> dict[str, Any]:
-    return {name: copy.deepcopy(getattr(model, name).state_dict()) for name in ("gate", "field")}
-
-
 def _at_freezing(
-    trainer: Trainer, frozen: dict[str, Any], grids: tuple[int, ...]
+    trainer: Trainer, frozen: dict[str, Any], contender: Contender
 ) -> dict[str, Any] | None:
-    """What the gate and grids keep of the field as it was when the gate was frozen, if it ever was.
+    """What the gate, and representations made of the field, keep of the field as it was when the
+    gate was frozen, if it ever was.
 
     After the run, so that neither its memory nor its random numbers know of it.
     """
-    from leco_plugin.evaluation.equal_loss import at_equal_loss
+    from leco_plugin.chart.runs.beside import compared
 
     if not frozen:
         return None
@@ -136,12 +133,16 @@ def _at_freezing(
         getattr(model, name).load_state_dict(weights)
     found: dict[str, Any] | None = None
     try:
-        found = at_equal_loss(model, trainer.pipeline.datamanager, grids)
+        found = compared(model, trainer.pipeline.datamanager, contender)
     except ValueError as error:  # the run itself is whole
         print(error)
     for name, weights in now.items():
         getattr(model, name).load_state_dict(weights)
     return found
+
+
+def _weights_of(model: LecoModel) -> dict[str, Any]:
+    return {name: copy.deepcopy(getattr(model, name).state_dict()) for name in ("gate", "field")}
 
 
 def _occupancy_of(trainer: Trainer, data: Path, folder: Path) -> dict[str, Any] | None:

@@ -21,6 +21,8 @@ class SwitchSizes:
     """Candidates of a median ray, of which an estimator keeps some."""
     grid_resolution: int = 128
     """Cells of the occupancy grid along each axis, at each level."""
+    grid_warmup_steps: int = 256
+    """Steps in which all cells are asked at each update, as nerfacc has it."""
 
 
 PAPER = SwitchSizes()
@@ -42,6 +44,7 @@ SMALL = SwitchSizes(
     fine=64,
     candidates=128,
     grid_resolution=64,
+    grid_warmup_steps=64,
 )
 """Two CPU cores: a training step of 512 rays in a third of a second."""
 
