@@ -39,16 +39,18 @@ def test_an_occupancy_that_is_left_of_a_gate_that_was_opened_again_is_none() -> 
     assert learned_of(lines_of(results(left))) == []
 
 
-def test_the_title_of_a_suite_by_steps_says_who_skips_most_and_not_whose_psnr_is_higher() -> None:
+def test_the_title_of_a_suite_by_steps_says_who_skips_more_and_not_whose_psnr_is_higher() -> None:
     runs = [*skipping("A", 0.7, 0.8), *skipping("B", 0.6, 0.5), *skipping("C", None, 0.9)]
     made = results(*runs, **BY_STEPS)
-    said = "A skips 75% of the candidates, B 55%; 1 not frozen with every seed"
+    said = "A skips 75% of the candidates: B less, 55%, C partly frozen"
     assert title_of(made) == said
     alike = [*skipping("A", 0.7, 0.8), *skipping("B", 0.71, 0.6), *skipping("C", 0.1, 0.1)]
-    assert title_of(results(*alike, **BY_STEPS)) == "2 of 3 skip alike, 66% to 75%"
+    assert title_of(results(*alike, **BY_STEPS)) == (
+        "A skips 75% of the candidates: B as much but for the seeds, C less, 10%"
+    )
     assert "ahead" in title_of(results(run("A", psnr=22.0), run("B"), suite="freeze"))
     assert learned_headline(learned_of(lines_of(results(*skipping("C", None, 0.9))))) == (
-        "No gate was frozen with every seed"
+        "no gate was frozen with every seed"
     )
 
 

@@ -20,6 +20,8 @@ from leco_plugin.chart.runs.run import Chart
 
 CONTENDERS = [Contender(name, name, "own") for name in ("a", "b", "c")]
 SEEDS = (0, 1)
+IN_TURNS = [("a", 0), ("b", 0), ("c", 0), ("b", 1), ("c", 1), ("a", 1)]
+"""Each seed begins with another."""
 
 
 class Runner:
@@ -52,7 +54,7 @@ def make(made: Chart, runner: Runner) -> dict[str, Any]:
 def test_contenders_take_turns_within_a_seed(tiny_scene: Path, tmp_path: Path) -> None:
     runner = Runner()
     make(chart(tiny_scene, tmp_path), runner)
-    assert runner.made == [(name, seed) for seed in SEEDS for name in "abc"]
+    assert runner.made == IN_TURNS
 
 
 def test_runs_at_once_are_under_way_beside_each_other(tiny_scene: Path, tmp_path: Path) -> None:
@@ -101,7 +103,7 @@ def test_after_a_kill_only_what_is_missing_is_made(
     stored = json.loads((tmp_path / "results.json").read_text())["runs"]
     assert len(stored) == stops_at
     results = make(chart(tiny_scene, tmp_path), second)
-    assert first.made + second.made == [(name, seed) for seed in SEEDS for name in "abc"]
+    assert first.made + second.made == IN_TURNS
     whole = make(chart(tiny_scene, tmp_path / "whole"), Runner())
     assert results["runs"] == whole["runs"]
 

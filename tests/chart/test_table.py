@@ -87,7 +87,7 @@ def test_it_is_said_how_long_all_runs_took_and_which_grids_are_still_warming_up(
     runs = [run("A", wall_seconds=300.0), run("B", wall_seconds=300.0, warming_up=True)]
     text = table(results(*runs, protocol={"seconds": 10.0, "steps": None, "at_once": 2}))
     assert "All runs together took 5 min." in text
-    assert "Still in the warm-up of their grid, which fills all cells: B." in text
+    assert "Ended in the warm-up of their grid, which asks all cells: B." in text
 
 
 def test_the_command_and_the_question_are_there() -> None:

@@ -112,7 +112,7 @@ def test_gate_and_grids_are_measured_on_the_field_of_the_moment_of_freezing(
     tiny_scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     from leco_plugin.chart.contenders.configs import config_of
-    from leco_plugin.evaluation import equal_loss
+    from leco_plugin.chart.runs import beside
 
     asked: list[dict[str, torch.Tensor]] = []
 
@@ -122,7 +122,7 @@ def test_gate_and_grids_are_measured_on_the_field_of_the_moment_of_freezing(
         )
         return {"grids": list(grids)}
 
-    monkeypatch.setattr(equal_loss, "at_equal_loss", at_equal_loss)
+    monkeypatch.setattr(beside, "at_equal_loss", at_equal_loss)
     one = Contender("LeCO", "leco-occupancy", "learned-occupancy", SMALL, grids=(8, 16))
     config = config_of(one, tiny_scene, tmp_path / "nerfstudio")
     result, trainer = train_job(config, one, 3, tiny_scene, SHORT, tmp_path)
