@@ -191,15 +191,18 @@ def name_points(
         free = [corner for corner in inside if _is_free(corner, width, taken)]
         left, middle = (free or inside)[0]
         taken.append((left, middle - 0.035, left + width, middle + 0.035))
-        if abs(middle - y) > FAR:
-            end = left if left > x else left + width
-            axes.plot([x, end], [y, middle], transform=axes.transAxes, color=colour, linewidth=1.2)
-        axes.text(
-            *(left, middle, name),
-            transform=axes.transAxes,
+        side = 0.0 if left > x else 1.0
+        leader = {"arrowstyle": "-", "color": colour, "relpos": (side, 0.5)}
+        axes.annotate(
+            name,
+            (x, y),
+            xycoords="axes fraction",
+            xytext=(left + side * width, middle),
+            ha="right" if side else "left",
             va="center",
             color=colour,
             fontweight="bold",
+            arrowprops=leader if abs(middle - y) > FAR else None,
         )
 
 

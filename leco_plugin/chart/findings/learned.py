@@ -78,7 +78,7 @@ def learned_headline(learned: Sequence[Learned]) -> str:
     never = [one for one in learned if not one.facts]
     parts = [
         _counted(more, "more", max),
-        _counted(alike, "as much but for the seeds", None),
+        _counted(alike, "alike", None),
         _counted(less, "less", min),
         _counted(
             [one for one in learned if one.facts and one not in frozen], "partly frozen", None
@@ -98,8 +98,9 @@ def _counted(
     who = some[0].name if len(some) == 1 else str(len(some))
     if extreme is None:
         return f"{who} {what}"
+    reach = "up to" if extreme is max else "down to"
     share = f"{_skipped(extreme(some, key=_skipped)):.0%}"
-    return f"{who} {what}, {share if len(some) == 1 else f'up to {share}'}"
+    return f"{who} {what}, {share if len(some) == 1 else f'{reach} {share}'}"
 
 
 def _skips_more(one: Learned, other: Learned) -> bool:
