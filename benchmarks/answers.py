@@ -48,13 +48,14 @@ def answers_section() -> list[str]:
 
 
 def _answer(charts: Sequence[tuple[str, dict[str, Any]]]) -> list[str]:
+    noted = notes()
     figures, cells_of = _kind(charts[0][1])
     cells = [cells_of(lines_of(results)) for _, results in charts]
     columns = list(dict.fromkeys(column for row in cells for column in row))
     rows = [f"| scene | {' | '.join(columns)} | |", f"|---|{'---|' * len(columns)}---|"]
     for (name, results), row in zip(charts, cells):
         shown = " | ".join(row.get(column, "-") for column in columns)
-        mark = " (*)" if name in notes() else ""
+        mark = " (*)" if name in noted else ""
         rows.append(f"| {_link(results)}{mark} | {shown} | {_answer_of(results)} |")
     counted = [_fronts([results for _, results in charts])] if figures == KEPT else []
     return [figures, *rows, "", *counted]
@@ -109,10 +110,9 @@ def _fronts(charts: Sequence[Mapping[str, Any]]) -> str:
 
 def _answer_of(results: Mapping[str, Any]) -> str:
     """The title of a chart, and who has not had enough time."""
-    rising = []
-    if results["protocol"]["seconds"] is not None:
-        rising = still_rising(lines_of(results))
+    lines = lines_of(results)
+    rising = still_rising(lines) if results["protocol"]["seconds"] is not None else []
     if not rising:
         return title_of(results)
-    who = "all" if len(rising) == len(lines_of(results)) else ", ".join(rising)
+    who = "all" if len(rising) == len(lines) else ", ".join(rising)
     return f"{title_of(results)}; still rising at the end: {who}"

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable
 from typing import Any
 
 import checkout  # noqa: F401
@@ -50,24 +49,26 @@ def notes() -> dict[str, str]:
 
 def chart_sections() -> list[str]:
     """Charts of `docs/results.md`: those that belong to no suite."""
-    return _sections(name for name in titles() if stored(name)["suite"] is None)
+    return _sections(of_suites=False)
 
 
 def suite_sections() -> list[str]:
     """Charts of `docs/suites.md`."""
-    return _sections(name for name in titles() if stored(name)["suite"] is not None)
+    return _sections(of_suites=True)
 
 
-def _sections(names: Iterable[str]) -> list[str]:
+def _sections(of_suites: bool) -> list[str]:
     """Each chart with its picture, its tables, its command, its machine and its note."""
     parts: list[str] = []
     said: set[str] = set()
-    for name in names:
+    noted = notes()
+    for name, title in titles().items():
         results = stored(name)
+        if (results["suite"] is not None) != of_suites:
+            continue
         _, body = table(results).split("\n", 1)
-        note = [f"\n**{notes()[name]}**"] if name in notes() else []
-        parts += [f"## {titles()[name]}\n", picture(name), *note, body]
-        parts.append(f"{machine_line(results)}.\n")
+        note = [f"\n**{noted[name]}**"] if name in noted else []
+        parts += [f"## {title}\n", picture(name), *note, body, f"{machine_line(results)}.\n"]
         paper = PAPER_ROWS.get(results["suite"] or name)
         if paper is not None and paper not in said:
             said.add(paper)

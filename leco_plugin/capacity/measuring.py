@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
 from typing import Any
@@ -24,11 +24,11 @@ from leco_plugin.evaluation.field_grids import (
 from leco_plugin.evaluation.reached_volume import mapped_box
 from leco_plugin.models.encodings import EncodingConfig
 from leco_plugin.models.gate import GateConfig, occupancy_logit
-from leco_plugin.occupancy import gate_precision
+from leco_plugin.occupancy import Precision, gate_precision
 from leco_plugin.shrink.evidence import Evidence
 from leco_plugin.shrink.ladder import values_of
 from leco_plugin.shrink.search import threshold_keeping
-from leco_plugin.shrink.teaching import round_weights, teach
+from leco_plugin.shrink.teaching import Lesson, round_weights, teach
 
 STEPS = 1000
 """With which each gate is taught. After 300 small ones still keep two to nine times what they keep
@@ -141,16 +141,24 @@ def of_gate(ground: Ground, candidate: Candidate, lost: float) -> dict[str, Any]
     """Teaches a gate and measures it, as it would be stored and asked."""
     assert candidate.gate is not None
     started = time.monotonic()
-    precision = ground.model.precision
-    gate = round_weights(teach(candidate.gate, ground.lesson, STEPS, precision))
+    score = taught_score(candidate.gate, ground.lesson, ground.model.precision)
+    scores, of_volume = in_parts(score, ground.mapped), in_parts(score, ground.volume)
+    return _row(candidate, started, measured(ground.held_out, scores, of_volume, lost))
+
+
+def taught_score(
+    config: GateConfig, lesson: Lesson, precision: Precision
+) -> Callable[[Tensor], Tensor]:
+    """The logit of a gate that is taught now, as it would be stored and asked: of mapped positions
+    [N, 3], [N]."""
+    gate = round_weights(teach(config, lesson, STEPS, precision))
 
     @torch.no_grad()
     def score(mapped: Tensor) -> Tensor:
         with gate_precision(mapped.device.type, precision):
             return occupancy_logit(gate(mapped))
 
-    scores, of_volume = in_parts(score, ground.mapped), in_parts(score, ground.volume)
-    return _row(candidate, started, measured(ground.held_out, scores, of_volume, lost))
+    return score
 
 
 def of_grids(

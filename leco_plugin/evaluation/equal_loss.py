@@ -162,12 +162,10 @@ def _better_of_dilations(
 ) -> dict[str, Any]:
     """What a grid keeps as it is, or dilated, whichever is less."""
     found = []
-    for dilated in (False, True):
-        if dilated:
-            scores = dilate(scores)
-        of_rays, of_volume = (looked_up(scores, box, places) for places in (mapped, volume))
+    for dilated, some in enumerate((scores, dilate(scores))):
+        of_rays, of_volume = (looked_up(some, box, places) for places in (mapped, volume))
         kept = kept_shares(weights, of_rays, of_volume, LOST_SURFACE_MASS)
-        found.append({"dilated": dilated, **_shares(kept)})
+        found.append({"dilated": bool(dilated), **_shares(kept)})
     return min(found, key=lambda one: one["kept_reached_volume"])
 
 
