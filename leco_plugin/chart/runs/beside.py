@@ -1,4 +1,4 @@
-"""Representations that are made of a run's field and compared with the gate that learned with it."""
+"""Representations that are made of a run's field, and compared with the gate that learned it."""
 
 from __future__ import annotations
 

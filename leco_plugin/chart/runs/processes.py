@@ -16,8 +16,8 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-from leco_plugin.chart.runs.folder import LOGS, RUNS, UNFINISHED, ChartFolder, Job
 from leco_plugin.chart.contenders.protocol import Protocol
+from leco_plugin.chart.runs.folder import LOGS, RUNS, UNFINISHED, ChartFolder, Job
 from leco_plugin.chart.runs.worker import FAILURE, JOB, PROGRESS, RESULT
 from leco_plugin.evaluation.json_file import write_json
 

@@ -12,11 +12,11 @@ from typing import Any
 
 from leco_plugin.chart.contenders import forecast
 from leco_plugin.chart.contenders.contender import Contender
+from leco_plugin.chart.contenders.protocol import Protocol, require_seeds, settings_of
+from leco_plugin.chart.drawing.table import write_table
 from leco_plugin.chart.runs.folder import RESULTS, ChartFolder, Job
 from leco_plugin.chart.runs.processes import RunFailed
-from leco_plugin.chart.contenders.protocol import Protocol, require_seeds, settings_of
 from leco_plugin.chart.runs.reuse import check_sources, take_over
-from leco_plugin.chart.drawing.table import write_table
 from leco_plugin.evaluation.json_file import write_json
 from leco_plugin.evaluation.machine import describe_code, describe_machine
 from leco_plugin.scenes.description import describe_scene
@@ -28,8 +28,8 @@ TABLE = "table.md"
 
 
 def jobs_of(contenders: Sequence[Contender], seeds: Sequence[int]) -> list[Job]:
-    """All runs: the contenders take turns within a seed, each seed beginning with another, so that a
-    machine whose speed drifts treats them alike and no two always run beside each other."""
+    """All runs: the contenders take turns within a seed, each seed beginning with another, so that
+    a machine whose speed drifts treats them alike and no two always run beside each other."""
     jobs = []
     for turn, seed in enumerate(dict.fromkeys(seeds)):
         first = turn % len(contenders)
