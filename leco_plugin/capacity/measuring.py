@@ -167,8 +167,8 @@ def of_grids(
     """Fills grids from the field's density, each from one half as fine; yields a row for each.
 
     They hear of the places that gates are taught by, and of random ones, and are dilated by a cell
-    where they keep less so. Ends with the first that
-    would ask the field more often than `MOST_ON_CPU` on a CPU.
+    where they keep less so. Ends with the first that would ask the field more often than
+    `MOST_ON_CPU` on a CPU.
 
     Args:
         candidates: by resolution.

@@ -143,6 +143,40 @@ def test_a_whole_run_has_its_figures(tiny_scene: Path, tmp_path: Path) -> None:
     assert kept["grids"][0]["bytes"] == 64
 
 
+def test_a_small_gate_is_taught_by_the_field_as_it_was_and_stands_beside(
+    tiny_scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from leco_plugin.capacity import field, measuring
+    from leco_plugin.chart.contenders.configs import config_of
+    from leco_plugin.chart.runs import beside
+    from leco_plugin.evaluation.equal_loss import at_equal_loss
+
+    monkeypatch.setattr(measuring, "STEPS", 20)
+    monkeypatch.setattr(field, "TAUGHT_RAYS", 256)
+    alone: list[dict[str, Any]] = []
+    tables: list[torch.Tensor] = []
+
+    def compared(model: Any, manager: Any, *rest: Any, **others: Any) -> dict[str, Any]:
+        tables.append(torch.cat([p.detach().flatten() for p in model.field.parameters()]))
+        torch.manual_seed(7)
+        alone.append(at_equal_loss(model, manager, *rest))
+        torch.manual_seed(7)
+        return at_equal_loss(model, manager, *rest, **others)
+
+    monkeypatch.setattr(beside, "at_equal_loss", compared)
+    one = Contender("LeCO", "leco-occupancy", "learned-occupancy", SMALL, taught=True)
+    config = config_of(one, tiny_scene, tmp_path / "nerfstudio")
+    result, trainer = train_job(config, one, 3, tiny_scene, SHORT, tmp_path)
+    found = result["occupancy"]["at_equal_loss"]
+    taught = found.pop("taught")
+    assert found == alone[0] and "others" not in found  # the gate's own row knows nothing of it
+    assert 0.0 < taught["kept_reached_volume"] <= 1.0 and taught["seconds"] > 0.0
+    assert taught["bytes"] == beside.TAUGHT.bytes < 5000
+    now = torch.cat([p.detach().flatten() for p in trainer.pipeline.model.field.parameters()])
+    assert not torch.equal(tables[0], now)
+    assert json.loads(json.dumps(result)) == result
+
+
 def test_a_run_that_starts_anew_when_frozen_has_no_field_to_measure(
     tiny_scene: Path, tmp_path: Path
 ) -> None:
