@@ -19,8 +19,9 @@ from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackLocati
 from nerfstudio.engine.trainer import Trainer, TrainerConfig
 from nerfstudio.utils import writer
 
-from leco_plugin.evaluation.clock import Budget, Clock, timed, warm_up
+from leco_plugin.evaluation.clock import Budget, Clock, warm_up
 from leco_plugin.evaluation.field_queries import FieldQueries, counted
+from leco_plugin.evaluation.grid_updates import GridUpdates
 from leco_plugin.evaluation.held_out_images import evaluate_images, psnr_on_rays
 from leco_plugin.evaluation.json_file import finite_or_null
 from leco_plugin.evaluation.peak_memory import peak_allocator_bytes, peak_process_bytes
@@ -30,9 +31,6 @@ CURVE_RAYS = 8192
 """Test pixels behind each point of a curve, its end included."""
 
 PRICES = ("threshold", "empty_fraction", "lost_mass", "lost_surface_mass", "image_price_db")
-WARM_UP = 256
-"""Steps in which nerfacc's grid asks all of its cells at each update."""
-
 ENDLESS = 10_000_000
 """Steps that no timed run reaches; the clock ends it."""
 
@@ -170,7 +168,7 @@ class _Course:
     ) -> None:
         self.trainer, self.budget, self.run, self.queries = trainer, budget, run, queries
         self.on_progress, self.on_frozen = on_progress, on_frozen
-        self.clock, self.grid_clock = Clock(), Clock()
+        self.clock = Clock()
         self.marks = [(i + 1) / curve_points for i in range(curve_points - 1)]
         self.step_times: list[float] = []
         self.before_step = queries.copy()
@@ -179,9 +177,7 @@ class _Course:
             for optimizer in trainer.optimizers.optimizers.values()
             for group in optimizer.param_groups
         ]
-        self.grids = _grids_of(trainer.pipeline.model)
-        for grid in self.grids:
-            grid.update_every_n_steps = timed(grid.update_every_n_steps, self.grid_clock)
+        self.updates = GridUpdates(trainer.pipeline.model)
         where = TrainingCallbackLocation
         trainer.callbacks.insert(0, TrainingCallback([where.BEFORE_TRAIN_ITERATION], self.before))
         trainer.callbacks.append(TrainingCallback([where.BEFORE_TRAIN_ITERATION], self.begun))
@@ -230,10 +226,9 @@ class _Course:
         run = self.run
         run.train_seconds = self.clock.seconds
         run.step_seconds = statistics.median(self.step_times) if self.step_times else None
-        if self.grids:
-            run.learn_seconds = self.grid_clock.seconds
-            sizes = getattr(getattr(self.trainer.pipeline.model, "config", None), "sizes", None)
-            run.warming_up = run.steps < getattr(sizes, "grid_warmup_steps", WARM_UP)
+        if self.updates.grids:
+            run.learn_seconds = self.updates.clock.seconds
+            run.warming_up = self.updates.warming_up
         progress = getattr(self.trainer.pipeline.model, "progress", None)
         run.recoveries = getattr(progress, "recoveries", None)
         run.peak_process_bytes = peak_process_bytes()
@@ -266,11 +261,6 @@ class _Course:
         left = self._learning_time_left()
         more = left / statistics.fmean(self.step_times[FIRST_TIMED:]) if left > 0.0 else 0.0
         keep_within(progress, more, self.run.steps)
-
-
-def _grids_of(model: torch.nn.Module) -> list[Any]:
-    """The occupancy grids of a model, nerfacc's or like those."""
-    return [module for module in model.modules() if "occs" in module._buffers]
 
 
 def run_training(trainer: Trainer) -> None:
