@@ -24,7 +24,7 @@ class GridUpdates:
         self.warming_up: bool | None = None
         """Whether the last step asked for an update in a grid's warm-up, when nerfacc asks all of
         its cells; None where there is no grid, or one that does not say."""
-        self.grids = [module for module in model.modules() if "occs" in module._buffers]
+        self.grids: list[Any] = [module for module in model.modules() if "occs" in module._buffers]
         for grid in self.grids:
             vars(grid)["update_every_n_steps"] = self._watched(grid.update_every_n_steps)
 
