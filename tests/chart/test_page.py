@@ -32,3 +32,13 @@ def test_every_contender_is_in_it_with_its_curve(page: str) -> None:
 def test_a_chart_without_occupancies_has_no_row_for_them(tmp_path: Path) -> None:
     text = write_page(results(run("A"), run("B")), tmp_path / "chart.html").read_text()
     assert "volume kept at equal loss" not in text
+
+
+def test_a_grid_without_a_learning_time_stands_where_sizes_are_compared_alone(
+    tmp_path: Path,
+) -> None:
+    grids = [{"resolution": 64, "bytes": 32768, "update_seconds": 2.0, "kept_reached_volume": 0.3}]
+    ours = run("MLP", occupancy=occupancy(50_000, 0.1, grids))
+    text = write_page(results(ours), tmp_path / "chart.html").read_text()
+    named = re.findall(r'"text":\["MLP"(,"grid 64[^"]*")?\]', text)
+    assert len(named) == 2 and [bool(grid) for grid in named] == [True, False]

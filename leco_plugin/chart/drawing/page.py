@@ -129,13 +129,13 @@ def _add_representations(figure: Any, held: Sequence[Representation]) -> None:
     import plotly.graph_objects as go
 
     for column, cost in enumerate(("size", "learn_seconds"), start=1):
-        values = [one.median(cost) for one in held]
-        places = [(value, one.kept) for value, one in zip(values, held)]
+        shown = [one for one in held if one.has(cost)]
+        places = [(one.median(cost), one.kept) for one in shown]
         figure.add_trace(
             go.Scatter(
-                x=values,
-                y=[one.kept for one in held],
-                text=[one.name for one in held],
+                x=[value for value, _ in places],
+                y=[kept for _, kept in places],
+                text=[one.name for one in shown],
                 mode="markers+text",
                 textposition="top center",
                 marker={"size": 12, "color": LIGHT.colours[0]},
