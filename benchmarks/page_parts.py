@@ -33,6 +33,13 @@ def _made(row: Mapping[str, Any]) -> str:
     return f"by leco_plugin {code['version']} at {commit}, sources {code['sources']}, {row['date']}"
 
 
+def between(text: str, marks: tuple[str, str], body: str) -> str:
+    """The text with what is between two marks renewed."""
+    begin, end = marks
+    before, rest = text.split(begin)
+    return f"{before}{begin}\n{body}\n{end}{rest.split(end)[1]}"
+
+
 def picture(name: str) -> str:
     """A picture in the page, in the page's colours."""
     image = f"images/charts/{name}"

@@ -19,6 +19,7 @@ from large_scene_tables import LARGE_SCENES
 from learning import sentence as learning_sentence
 from page_parts import RESULTS, ROOT, machine_line, made_line, picture, section
 from page_pictures import GROWTH, LEARNING, draw_pictures, is_stale, pictures
+from readme_parts import demo_table, readme
 from sizes_sections import sizes_sections
 from stability_page import PAGE as STABILITY_PAGE
 from stability_page import page as stability_page
@@ -26,7 +27,6 @@ from stability_page import page as stability_page
 PAGE = ROOT / "docs" / "results.md"
 SUITES_PAGE = ROOT / "docs" / "suites.md"
 README = ROOT / "README.md"
-BEGIN, END = "<!-- demo table: generated -->", "<!-- end of the demo table -->"
 
 HEAD = """# Results
 
@@ -70,31 +70,6 @@ Generated as [results.md](results.md) is, which says which scenes these are, [ho
 table](results.md#how-to-read-a-table), and has [the answers in
 short](results.md#the-reviewers-questions-answered).
 """
-
-
-def demo_table(report: dict[str, Any]) -> str:
-    """The two runs of a demo, side by side."""
-    lines = [
-        "| run | PSNR | SSIM | steps | samples a ray | seconds to render an image |",
-        "|---|---|---|---|---|---|",
-    ]
-    lines += [
-        f"| {run['method']} | {run['psnr']:.2f} dB | {run['ssim']:.3f} | {run['steps']} "
-        f"| {run['samples_per_ray']:.1f} | {run['render_seconds_per_image']:.2f} |"
-        for run in report["runs"]
-    ]
-    facts = report["occupancy"]
-    lines += [
-        "",
-        f"Occupancy: {facts['bytes'] / 1000:.0f} kB, learned and frozen in "
-        f"{report['runs'][0]['freeze_seconds']:.0f} of "
-        f"{report['runs'][0]['train_seconds']:.0f} s; {facts['empty_fraction']:.1%} of all "
-        f"candidates skipped for {facts['image_price_db']:+.3f} dB and "
-        f"{facts['lost_surface_mass']:.1e} of the surface mass on held-out rays. Against the exact "
-        f"city: {facts['kept_surface_recall']:.1%} of the visible surface kept, "
-        f"{facts['free_space_skipped']:.1%} of free space skipped.",
-    ]
-    return "\n".join(lines)
 
 
 def sampling_table(report: dict[str, Any]) -> str:
@@ -235,14 +210,6 @@ def learning_section(report: dict[str, Any]) -> list[str]:
         f"{machine_line(report)}. The slices: `leco inspect outputs/{report['scene']}/"
         "leco-occupancy --history learned.gif`, of the same kind of run.\n",
     ]
-
-
-def readme(text: str) -> str:
-    """The README with its table renewed."""
-    report = json.loads((RESULTS / "demo.json").read_text())
-    before, rest = text.split(BEGIN)
-    _, after = rest.split(END)
-    return f"{before}{BEGIN}\n{demo_table(report)}\n{END}{after}"
 
 
 def main() -> int:

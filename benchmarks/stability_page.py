@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import checkout  # noqa: F401
+from page_parts import between
 
 from leco_plugin.stability.cases import CASES
 from leco_plugin.stability.table import failures, headline, verdicts
@@ -28,13 +29,6 @@ def page(text: str, results: Path) -> str:
         body = shown(json.loads(stored.read_text())) if stored.exists() else "Not run yet."
         text = between(text, marks, body)
     return between(text, CASE_LIST, of_cases())
-
-
-def between(text: str, marks: tuple[str, str], body: str) -> str:
-    """The text with what is between two marks renewed."""
-    begin, end = marks
-    before, rest = text.split(begin)
-    return f"{before}{begin}\n{body}\n{end}{rest.split(end)[1]}"
 
 
 def of_cases() -> str:

@@ -1,0 +1,70 @@
+"""Claims about what the README shows of stored results, with results that are made up."""
+
+from __future__ import annotations
+
+import importlib
+import json
+import sys
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+import pytest
+from chart_results import occupancy, results, run
+
+ROOT = Path(__file__).resolve().parent.parent
+
+
+@pytest.fixture
+def parts(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> ModuleType:
+    """The README's module, with no chart stored yet."""
+    monkeypatch.syspath_prepend(str(ROOT / "benchmarks"))
+    for name in ("chart_sections", "readme_parts"):
+        monkeypatch.delitem(sys.modules, name, raising=False)
+    charts = importlib.import_module("chart_sections")
+    monkeypatch.setattr(charts, "RESULTS", tmp_path)
+    monkeypatch.setattr(charts, "CHARTS", tmp_path / "charts")
+    (tmp_path / "charts.json").write_text("{}")
+    (tmp_path / "charts").mkdir()
+    return importlib.import_module("readme_parts")
+
+
+def store(folder: Path, suite: str, scene: str, *runs: dict[str, Any]) -> None:
+    made = results(*runs, suite=suite, scene={"name": scene})
+    (folder / "charts" / f"{scene}-{suite}.json").write_text(json.dumps(made))
+
+
+def test_scenes_of_which_one_suite_is_missing_have_no_row(
+    parts: ModuleType, tmp_path: Path
+) -> None:
+    assert parts.rivals_table() == "Not measured yet."
+    store(tmp_path, "enough-time", "city", run("Switch-NeRF + learned occupancy"))
+    assert parts.rivals_table() == "Not measured yet."
+
+
+def test_ours_and_the_grid_that_keep_least_stand_beside_equal_time(
+    parts: ModuleType, tmp_path: Path
+) -> None:
+    grids = [
+        {"resolution": cells, "bytes": size, "kept_reached_volume": kept, "update_seconds": 1.0}
+        for cells, size, kept in ((64, 32768, 0.3), (128, 262144, 0.25), (256, 2097152, 0.28))
+    ]
+    facts = occupancy(50_000, 0.2, grids)
+    facts["at_equal_loss"]["taught"] = {"bytes": 4932, "seconds": 9.0, "kept_reached_volume": 0.1}
+    store(tmp_path, "representations", "city", run("MLP (ours)", occupancy=facts))
+    own = run("Switch-NeRF + coarse and fine samples", psnr=17.25)
+    ours = run("Switch-NeRF + learned occupancy", psnr=19.0)
+    store(tmp_path, "enough-time", "city", ours, own)
+    head, _, row = parts.rivals_table().splitlines()
+    assert head.endswith("Switch-NeRF after 10 s: learned occupancy | coarse and fine samples |")
+    assert row == "| city | 10.0% in 5 kB | 25.0% in 262 kB (128³) | 19.0 dB | 17.2 dB |"
+
+
+def test_what_is_around_the_tables_is_left_as_it_is(
+    parts: ModuleType, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(parts, "demo_table", lambda report: "demo")
+    (before, after), (begin, end) = parts.DEMO, parts.RIVALS
+    text = f"A\n{before}\nstale\n{after}\nB\n{begin}\n{end}\nC\n"
+    expected = f"A\n{before}\ndemo\n{after}\nB\n{begin}\nNot measured yet.\n{end}\nC\n"
+    assert parts.readme(text) == expected
