@@ -3,17 +3,15 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
 from chart_results import occupancy, results, run
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from matplotlib.figure import Figure
 from PIL import Image
 
-from leco_plugin.chart.drawing.panels import NAME_WIDTH, name_points
 from leco_plugin.chart.drawing.picture import (
     CLOSE,
     _name_ends,
@@ -133,37 +131,3 @@ def test_a_title_has_as_few_lines_as_it_can_and_no_short_one() -> None:
     first, second = balanced(text).split("\n")
     assert f"{first} {second}" == text and abs(len(first) - len(second)) < 12
     assert balanced("short") == "short"
-
-
-def place_of(text: Any) -> tuple[float, float]:
-    """Where a name begins, and its middle."""
-    x, y = text.get_position()
-    width = NAME_WIDTH * len(text.get_text())
-    return (x - width if text.get_horizontalalignment() == "right" else x), y
-
-
-@settings(deadline=None, max_examples=30)
-@given(st.lists(st.tuples(*[st.floats(0.05, 0.95)] * 2), min_size=2, max_size=6, unique=True))
-def test_names_of_points_lie_in_the_panel(
-    places: list[tuple[float, float]],
-) -> None:
-    figure = Figure()
-    axes = figure.add_axes((0.0, 0.0, 1.0, 1.0))
-    axes.set(xlim=(0.0, 1.0), ylim=(0.0, 1.0))
-    names = [f"name {i}" for i in range(len(places))]
-    name_points(axes, places, names, ["black"] * len(places))
-    boxes = [(*place_of(text), text.get_text()) for text in axes.texts]
-    assert [name for _, _, name in boxes] == names
-    width = NAME_WIDTH * len(names[0])
-    assert all(-1e-9 <= x <= 1.0 - width + 1e-9 and 0.0 <= y <= 1.0 for x, y, _ in boxes)
-
-
-def test_names_of_neighbours_do_not_cover_one_another() -> None:
-    figure = Figure()
-    axes = figure.add_axes((0.0, 0.0, 1.0, 1.0))
-    axes.set(xlim=(0.0, 1.0), ylim=(0.0, 1.0))
-    name_points(axes, [(0.5, 0.5), (0.52, 0.5), (0.51, 0.52)], ["one", "two", "six"], ["red"] * 3)
-    spots = [place_of(text) for text in axes.texts]
-    for i, (x, y) in enumerate(spots):
-        for other_x, other_y in spots[:i]:
-            assert abs(x - other_x) >= 3 * NAME_WIDTH or abs(y - other_y) >= 0.07

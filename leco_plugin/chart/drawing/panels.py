@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
+from leco_plugin.chart.drawing.names import name_points
 from leco_plugin.chart.drawing.theme import Theme, plain, style
 from leco_plugin.chart.findings.learned import Learned
 from leco_plugin.chart.findings.representations import Representation
@@ -12,10 +13,6 @@ from leco_plugin.chart.findings.summary import COSTS, Cost, Line, front
 
 WIDE_RANGE = 8.0
 """Ratio of costs from which their axis is logarithmic."""
-FAR = 0.1
-"""Of the panel's height: from there on a line leads from a point to its name."""
-NAME_WIDTH = 0.019
-"""Of a letter beside a point of the large panel, of the panel's."""
 
 
 def draw_all_costs(panels: Sequence[Any], lines: Sequence[Line], theme: Theme) -> None:
@@ -166,54 +163,3 @@ def draw_learned(
             color=looks[name]["color"],
             fontweight="bold",
         )
-
-
-def name_points(
-    axes: Any,
-    places: Sequence[tuple[float, float]],
-    names: Sequence[str],
-    colours: Sequence[str],
-    others: Sequence[tuple[float, float]] = (),
-) -> None:
-    """Names beside points, each where it covers neither another name nor a point, nor `others`."""
-    in_axes = axes.transAxes.inverted()
-    spots = in_axes.transform(axes.transData.transform(places)).tolist()
-    filled = in_axes.transform(axes.transData.transform([*places, *others])).tolist()
-    taken = [(x - 0.012, y - 0.03, x + 0.012, y + 0.03) for x, y in filled]
-    for (x, y), name, colour in zip(spots, names, colours):
-        width = NAME_WIDTH * len(name)
-        corners = [
-            (x + across if across > 0 else x + across - width, y + up)
-            for up in (0.06, -0.06, 0.0, 0.13, -0.13, 0.2, -0.2, 0.27, -0.27)
-            for across in (0.022, -0.022)
-        ]
-        inside = [corner for corner in corners if _is_free(corner, width, ())] or corners
-        free = [corner for corner in inside if _is_free(corner, width, taken)]
-        left, middle = (free or inside)[0]
-        taken.append((left, middle - 0.035, left + width, middle + 0.035))
-        side = 0.0 if left > x else 1.0
-        leader = {"arrowstyle": "-", "color": colour, "relpos": (side, 0.5)}
-        axes.annotate(
-            name,
-            (x, y),
-            xycoords="axes fraction",
-            xytext=(left + side * width, middle),
-            ha="right" if side else "left",
-            va="center",
-            color=colour,
-            fontweight="bold",
-            arrowprops=leader if abs(middle - y) > FAR else None,
-        )
-
-
-def _is_free(
-    corner: tuple[float, float], width: float, taken: Sequence[tuple[float, float, float, float]]
-) -> bool:
-    """Whether a name that begins there lies in the panel and on nothing else."""
-    left, middle = corner
-    low, high, right = middle - 0.035, middle + 0.035, left + width
-    inside = left >= 0.0 and right <= 1.0 and low >= 0.0 and high <= 1.0
-    return inside and not any(
-        left < b_right and right > b_left and low < b_high and high > b_low
-        for b_left, b_low, b_right, b_high in taken
-    )

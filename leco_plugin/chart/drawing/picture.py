@@ -14,13 +14,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from leco_plugin.chart.drawing.names import name_points
 from leco_plugin.chart.drawing.panels import (
     draw_all_costs,
     draw_cost,
     draw_kept,
     draw_learned,
     look_of,
-    name_points,
 )
 from leco_plugin.chart.drawing.theme import LIGHT, Theme, plain, style, themed
 from leco_plugin.chart.drawing.title import asks_what_was_learned, title_of
