@@ -54,6 +54,13 @@ def test_the_title_of_a_suite_by_steps_says_who_skips_more_and_not_whose_psnr_is
     )
 
 
+def test_less_than_a_hundredth_is_not_told_apart_whatever_its_sign() -> None:
+    runs = [*skipping("A", 0.8, 0.8, 0.8), *skipping("B", 0.799, 0.7905, 0.7)]
+    assert title_of(results(*runs, **BY_STEPS)) == "A skips 80% of the candidates: B alike"
+    runs[4]["occupancy"]["empty_fraction"] = 0.78
+    assert title_of(results(*runs, **BY_STEPS)) == "A skips 80% of the candidates: B less, 78%"
+
+
 def test_the_picture_of_such_a_suite_is_drawn(tmp_path: Path) -> None:
     runs = [*skipping("A", 0.7, 0.8), *skipping("B", 0.6, None), *skipping("C", None, None)]
     with Image.open(draw(results(*runs, **BY_STEPS), tmp_path / "chart.png")) as image:
