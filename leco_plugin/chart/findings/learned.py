@@ -67,8 +67,10 @@ def _learned(line: Line) -> Learned:
 
 def learned_headline(learned: Sequence[Learned]) -> str:
     """What ours, or else the first that always froze, skips, and who of the others skips more or
-    less than it with every seed, and by more than `ALIKE` in the median: where all runs had as many steps, PSNR says nothing of where they
-    would end."""
+    less than it: with every seed, and by `ALIKE` in the median.
+
+    Where all runs had as many steps, PSNR says nothing of where they would end.
+    """
     frozen = [one for one in learned if one.always_frozen]
     if not frozen:
         return "no gate was frozen with every seed"
