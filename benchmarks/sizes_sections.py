@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from typing import Any
 
+from chart_sections import notes
 from page_parts import RESULTS, made_line, picture, section
 from sizes_figures import AS_GOOD
 from sizes_tables import capacity_table, samples_table, shrink_table, sizes_table
@@ -67,7 +68,8 @@ def sizes_sections() -> list[str]:
         command = "leco capacity --data SCENE --out DIR --json results/capacity/SCENE.json"
         title = "How much a scene needs: gates and grids at equal loss"
         head, *rest = section(title, command, first, capacity_table(measured), note)
-        parts += [head, *(f"{picture(CAPACITY + name)}\n" for name in measured), *rest]
+        noted = [f"**{notes()['capacity']}**\n"] if "capacity" in notes() else []
+        parts += [head, *noted, *(f"{picture(CAPACITY + name)}\n" for name in measured), *rest]
     return parts
 
 
