@@ -10,12 +10,9 @@ from chart_sections import notes, stored, titles
 
 from leco_plugin.chart.contenders.suites import SUITES
 from leco_plugin.chart.drawing.title import asks_what_was_learned, title_of
-from leco_plugin.chart.findings.learned import learned_of
-from leco_plugin.chart.findings.representations import (
-    COSTS,
-    fronts_of,
-    representations_of,
-)
+from leco_plugin.chart.findings.fronts import COSTS, fronts_of
+from leco_plugin.chart.findings.learned import learned_of, percent
+from leco_plugin.chart.findings.representations import representations_of
 from leco_plugin.chart.findings.settling import still_rising
 from leco_plugin.chart.findings.summary import RENDERING, Line, lines_of
 
@@ -27,12 +24,16 @@ named there.
 """
 KEPT = """Volume kept, of what rays reach, where each loses 0.1% of the surface mass, and the size
 of the occupancy: less is better in both, and what is on the front is so in the median over seeds.
-Grids, and a small MLP of ours, are made from the field that learned with our gate.
+Grids, and a small gate of each kind, are made from the field that learned with our gate; more sizes
+of all are [below](#how-much-a-scene-needs-gates-and-grids-at-equal-loss). Sizes are those of the
+numbers in bfloat16, and of a grid's cells in bits.
 """
-LEARNED = """Candidates skipped by the calibrated gate, and PSNR after equally many steps.
+LEARNED = """Space that each gate keeps, of what rays reach, where it loses 0.1% of the surface, and
+PSNR after equally many steps. A gate that was frozen with the last of them has guided nothing.
 """
 TIMED = """PSNR after equal time, and seconds to render a test image. Whoever gained more than
-0.3 dB in the last third of the time is still rising: who is ahead may change with more of it.
+0.3 dB in the last third of the time is still rising. That others are not does not mean that more
+time would not help them: rates fall to a tenth over whatever time is given.
 """
 
 
@@ -49,7 +50,8 @@ def answers_section() -> list[str]:
 
 def _answer(charts: Sequence[tuple[str, dict[str, Any]]]) -> list[str]:
     noted = notes()
-    figures, cells_of = _kind(charts[0][1])
+    kinds = [_kind(results) for _, results in charts]
+    figures, cells_of = next((kind for kind in kinds if kind[0] == KEPT), kinds[0])
     cells = [cells_of(lines_of(results)) for _, results in charts]
     columns = list(dict.fromkeys(column for row in cells for column in row))
     rows = [f"| scene | {' | '.join(columns)} | |", f"|---|{'---|' * len(columns)}---|"]
@@ -83,11 +85,16 @@ def _learned(lines: Sequence[Line]) -> dict[str, str]:
     cells = {}
     for line in lines:
         one = found.get(line.name)
-        skipped = one.median("empty_fraction") if one is not None else None
-        share = "not frozen" if skipped is None else f"{skipped:.0%}"
-        if one is not None and one.facts and not one.always_frozen:
-            share += f" ({len(one.facts)} of {one.seeds} frozen)"
-        cells[line.name] = f"{share}, {line.psnr:.1f} dB"
+        kept = one.kept if one is not None else None
+        if one is None or not one.facts:
+            said = "not frozen"
+        elif kept is None:
+            said = f"{len(one.facts)} of {one.seeds} frozen"
+        else:
+            said = percent(kept)
+        if one is not None and one.guided_nothing:
+            said += f" ({one.guided_nothing} of {one.seeds} frozen at the end)"
+        cells[line.name] = f"{said}, {line.psnr:.1f} dB"
     return cells
 
 
@@ -96,16 +103,20 @@ def _timed(lines: Sequence[Line]) -> dict[str, str]:
 
 
 def _fronts(charts: Sequence[Mapping[str, Any]]) -> str:
-    """On the fronts of how many scenes a gate of ours is."""
-    counts = dict.fromkeys(COSTS, 0)
+    """On the fronts of how many scenes each of ours is."""
+    counts: dict[str, dict[str, int]] = {}
     for results in charts:
         held = representations_of(lines_of(results))
-        found = {name for one in held if one.ours for name in fronts_of(one, held)}
-        for name in found:
-            counts[name] += 1
-    listed = " and ".join(f"of {name} on {count}" for name, count in counts.items())
+        for one in (one for one in held if one.ours):
+            its = counts.setdefault(one.name, dict.fromkeys(COSTS, 0))
+            for name in fronts_of(one, held):
+                its[name] += 1
+    said = [
+        f"{who} is on the front {' and '.join(f'of {name} on {n}' for name, n in its.items())}"
+        for who, its in counts.items()
+    ]
     scenes = f"{len(charts)} scene{'s' if len(charts) > 1 else ''}"
-    return f"Of {scenes}, a gate of ours is on the front {listed}.\n"
+    return f"Of {scenes}, {'; '.join(said)}.\n"
 
 
 def _answer_of(results: Mapping[str, Any]) -> str:

@@ -130,6 +130,7 @@ def never_frozen(config: TrainerConfig, learn_steps: int) -> TrainerConfig:
     config.method_name = NEVER_FROZEN
     model: Any = config.pipeline.model
     model.schedule = replace(model.schedule, freeze=False, learn_steps=learn_steps)
+    model.front_to_back = True  # as guided images are rendered by themselves
     return config
 
 

@@ -7,13 +7,12 @@ from chart_results import occupancy, results, run, slow_front
 from hypothesis import given
 from hypothesis import strategies as st
 
+from leco_plugin.chart.findings.fronts import fronts_of, verdict
 from leco_plugin.chart.findings.representations import (
-    TAUGHT,
+    SMALL_OURS,
     Held,
     Representation,
-    fronts_of,
     representations_of,
-    verdict,
 )
 from leco_plugin.chart.findings.summary import lines_of
 
@@ -116,16 +115,42 @@ def test_what_leads_in_the_median_but_not_with_every_seed_is_said_to() -> None:
     )
 
 
-def test_a_small_gate_that_the_field_has_taught_is_ours_too() -> None:
+def taught(name: str, size: int, kept: float) -> dict[str, object]:
+    return {"name": name, "bytes": size, "seconds": 20.0, "kept_reached_volume": kept}
+
+
+def test_small_gates_that_the_field_has_taught_stand_beside_those_of_their_kind() -> None:
     facts = occupancy(50_000, 0.2)
-    facts["at_equal_loss"]["taught"] = {"bytes": 5000, "seconds": 20.0, "kept_reached_volume": 0.1}
+    facts["at_equal_loss"]["taught"] = [taught("MLP", 5000, 0.1), taught("hash grid", 9000, 0.12)]
     ours = run("MLP (ours)", learn_seconds=9.0, occupancy=facts)
     rival = run("hash grid", sampler="learned-occupancy-hash", occupancy=occupancy(10**6, 0.15))
     held = representations_of(lines_of(results(ours, rival)))
-    assert [one.name for one in held] == ["MLP (ours)", TAUGHT, "hash grid"]
-    assert held[1].by_seed == {0: Held(5.0, 29.0, 10.0)} and held[1].ours
-    said = f"{TAUGHT} is on both fronts: what keeps less space is larger, and takes longer to learn"
-    assert verdict(held) == said
+    assert [one.name for one in held] == [
+        "MLP (ours)",
+        SMALL_OURS,
+        "small hash grid",
+        "hash grid",
+    ]
+    large, small, hashed, rival_gate = held
+    assert small.by_seed == {0: Held(5.0, 29.0, 10.0)} and small.ours and not hashed.ours
+    assert small.is_small_of(large) and hashed.is_small_of(rival_gate)
+    assert not small.is_small_of(rival_gate) and not large.is_small_of(large)
+    assert verdict(held) == (
+        "small MLP (ours) keeps least space, 10.0% in 5 kB; MLP (ours) is on neither front; "
+        "in learning time hash grid is ahead"
+    )
+
+
+def test_a_small_gate_that_is_missing_with_one_seed_is_not_compared() -> None:
+    runs = []
+    for seed in (0, 1):
+        facts = occupancy(50_000, 0.2)
+        facts["at_equal_loss"]["taught"] = [taught("MLP", 5000, 0.1)][seed:]
+        runs.append(run("MLP (ours)", seed, occupancy=facts))
+        other = occupancy(10**6, 0.15)
+        runs.append(run("hash grid", seed, sampler="learned-occupancy-hash", occupancy=other))
+    names = [one.name for one in representations_of(lines_of(results(*runs)))]
+    assert names == ["MLP (ours)", "hash grid"]
 
 
 def test_grids_have_no_learning_time_and_are_on_no_front_of_it() -> None:

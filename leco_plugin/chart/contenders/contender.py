@@ -28,7 +28,7 @@ class Contender:
     """Cells along each axis of occupancy grids that are made from its field when it freezes, and
     compared with its gate."""
     taught: bool = False
-    """Whether a small gate is taught by its field when it freezes, and compared with its gate."""
+    """Whether small gates are taught by its field when it freezes, and compared with its gate."""
     settings: Mapping[str, Any] = field(default_factory=dict)
     """Settings of the whole method, by their path; keys of dictionaries are steps of it too."""
 

@@ -23,7 +23,9 @@ from leco_plugin.swap import registered
 LEARNED, GRID, DENSE = "learned-occupancy", "occupancy-grid", "dense"
 SIZED_GRID = re.compile(rf"{GRID}-(\d+)")
 
-NEVER_FROZEN = Contender("LeCO, never frozen", "leco-occupancy", DENSE, {"schedule.freeze": False})
+SKIPPING_NOTHING = {"schedule.freeze": False, "front_to_back": True}
+"""Never frozen, and rendered as fast as it can be: guided images go front to back by themselves."""
+NEVER_FROZEN = Contender("LeCO, never frozen", "leco-occupancy", DENSE, SKIPPING_NOTHING)
 VARIANTS = {
     "leco-occupancy-never-frozen": NEVER_FROZEN,
     "leco-occupancy-retrained": Contender(
@@ -33,7 +35,7 @@ VARIANTS = {
         "LeCO, equal experts, no gate",
         "leco-occupancy",
         DENSE,
-        {"schedule.freeze": False, "homogeneous": True},
+        SKIPPING_NOTHING | {"homogeneous": True},
     ),
 }
 """Methods for the chart only: `leco-occupancy` with its phases changed."""

@@ -5,8 +5,9 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from leco_plugin.chart.drawing.cells import number, rows, spread
+from leco_plugin.chart.findings.fronts import fronts_of
 from leco_plugin.chart.findings.learned import Learned
-from leco_plugin.chart.findings.representations import Representation, fronts_of
+from leco_plugin.chart.findings.representations import Representation
 from leco_plugin.chart.findings.summary import Line
 
 COLUMNS = (
@@ -30,13 +31,17 @@ def occupancy_table(learned: Sequence[Learned]) -> str:
     cells = [
         [
             one.name,
-            f"{len(one.facts)} of {one.seeds}",
+            f"{len(one.facts)} of {one.seeds}" + _at_the_end(one),
             "-" if one.healed is None else str(one.healed),
             *(_scaled(one.median(name), scale) for name, _, scale in COLUMNS),
         ]
         for one in learned
     ]
     return rows(header, cells)
+
+
+def _at_the_end(one: Learned) -> str:
+    return f", {one.guided_nothing} at the end" if one.guided_nothing else ""
 
 
 def _scaled(value: float | None, scale: float) -> str:

@@ -7,9 +7,9 @@ from typing import Any
 
 from leco_plugin.chart.drawing.names import name_points
 from leco_plugin.chart.drawing.theme import Theme, plain, style
-from leco_plugin.chart.findings.learned import Learned
+from leco_plugin.chart.findings.learned import KEPT, Learned
 from leco_plugin.chart.findings.representations import Representation
-from leco_plugin.chart.findings.summary import COSTS, Cost, Line, front
+from leco_plugin.chart.findings.summary import COSTS, Cost, Line, figure_in, front
 
 WIDE_RANGE = 8.0
 """Ratio of costs from which their axis is logarithmic."""
@@ -33,7 +33,7 @@ def draw_cost(axes: Any, cost: Cost, lines: Sequence[Line], theme: Theme) -> Non
         look = style(i, theme)
         axes.plot([value, value], [min(line.psnrs), max(line.psnrs)], color=look["color"])
         axes.plot(value, line.psnr, markersize=11, markeredgecolor=theme.page, **look)
-    _cost_axis(axes, cost.title, cost.unit, [value for value, _ in places], theme)
+    _cost_axis(axes, cost.titled, [value for value, _ in places], theme)
     _draw_front(axes, places, theme)
 
 
@@ -59,37 +59,30 @@ def _draw_front(
     )
 
 
-def _cost_axis(
-    axes: Any,
-    title: str,
-    unit: str,
-    values: Sequence[float],
-    theme: Theme,
-    from_zero: bool = False,
-) -> None:
-    """The axis of a cost, logarithmic over a wide range unless it is to begin at zero."""
+def _cost_axis(axes: Any, title: str, values: Sequence[float], theme: Theme) -> None:
+    """The axis of a cost, logarithmic over a wide range."""
     from matplotlib.ticker import LogLocator, MaxNLocator, NullFormatter, StrMethodFormatter
 
     plain(axes, theme)
     positive = [value for value in values if value > 0.0]
-    if positive and max(positive) > WIDE_RANGE * min(positive) and not from_zero:
+    if positive and max(positive) > WIDE_RANGE * min(positive):
         axes.set_xscale("log")
         axes.set_xlim(0.6 * min(positive), 1.7 * max(positive))
         axes.xaxis.set_major_locator(LogLocator(subs=(1.0, 3.0)))
         axes.xaxis.set_minor_formatter(NullFormatter())
     elif positive:
-        axes.set_xlim(-0.02 * max(positive) * from_zero, 1.15 * max(positive))
+        axes.set_xlim(0.0, 1.15 * max(positive))
         axes.xaxis.set_major_locator(MaxNLocator(4))
     axes.xaxis.set_major_formatter(StrMethodFormatter("{x:g}"))
     axes.yaxis.set_major_locator(MaxNLocator(4))
     axes.margins(y=0.18)
-    axes.set_title(f"{title}, {unit}" if unit else title, fontsize=11.5, loc="left")
+    axes.set_title(title, fontsize=11.5, loc="left")
 
 
 def draw_kept(
     axes: Any,
-    cost: Cost,
-    values: Sequence[float],
+    title: str,
+    figure: str,
     held: Sequence[Representation],
     lines: Sequence[Line],
     theme: Theme,
@@ -97,15 +90,16 @@ def draw_kept(
     """What each occupancy keeps of the scene against one cost of it, less of both up and left.
 
     Args:
-        values: of the cost, in the unit shown, for each of `held`.
+        title: of the cost, with its unit.
+        figure: its name in `Held`, which all of `held` have.
     Returns:
         The places of the points.
     """
+    values = [one.median(figure) for one in held]
     places = [(value, one.kept) for value, one in zip(values, held)]
-    _cost_axis(axes, cost.title, cost.unit, values, theme)
+    _cost_axis(axes, title, values, theme)
     for place, one in zip(places, held):
-        size = 15 if one.ours else 11
-        axes.plot(*place, markersize=size, zorder=3, **look_of(one, held, lines, theme))
+        axes.plot(*place, zorder=3, **look_of(one, held, lines, theme))
     axes.invert_yaxis()
     _draw_front(axes, places, theme, sign=-1.0)
     return places
@@ -114,52 +108,75 @@ def draw_kept(
 def look_of(
     one: Representation, held: Sequence[Representation], lines: Sequence[Line], theme: Theme
 ) -> dict[str, Any]:
-    """Colour and marker: those of its line, a star of our colour for what our field has taught, and
-    a cross for grids."""
+    """Colour and marker: those of its line, ours larger; for small gates those of the large one of
+    their kind, hollow but a star for ours; a cross for grids."""
     names = [line.name for line in lines]
+    size = {"markersize": 15 if one.ours else 11}
     if one.name in names:
-        return style(names.index(one.name), theme)
-    ours = [names.index(other.name) for other in held if other.ours and other.name in names]
-    if one.ours and ours:
-        return {**style(ours[0], theme), "marker": "*"}
-    return {"marker": "x", "color": theme.ink, "linestyle": "none"}
+        return style(names.index(one.name), theme) | size
+    large = [other.name for other in held if other.name in names and one.is_small_of(other)]
+    if not large:
+        return {"marker": "x", "color": theme.ink, "linestyle": "none"} | size
+    look = style(names.index(large[0]), theme) | size
+    if one.ours:
+        return look | {"marker": "*"}
+    return look | {"markerfacecolor": theme.page, "markeredgewidth": 2.0, "linestyle": "none"}
 
 
 def draw_learned(
     axes: Any, learned: Sequence[Learned], lines: Sequence[Line], theme: Theme
 ) -> None:
-    """What frozen gates skip against what they lose; contenders without any are named below."""
+    """Space that gates keep at equal loss against PSNR after equal steps, each seed and all of
+    them; who did not always freeze one is named below."""
+    from matplotlib.ticker import LogLocator, MaxNLocator, NullFormatter, StrMethodFormatter
+
     looks = {line.name: style(i, theme) for i, line in enumerate(lines)}
-    shown = [one for one in learned if one.facts]
-    lost, skipped = "lost_surface_mass", "empty_fraction"
-    points = {
-        one.name: [(100.0 * facts[lost], 100.0 * facts[skipped]) for facts in one.facts]
-        for one in shown
-    }
-    places = [
-        (100.0 * (one.median(lost) or 0.0), 100.0 * (one.median(skipped) or 0.0)) for one in shown
-    ]
-    losses = [x for of in points.values() for x, _ in of]
-    _cost_axis(axes, "lost surface mass", "%", losses, theme, from_zero=True)
+    shown = [one for one in learned if one.kept is not None]
+    places = [(one.psnr, one.kept or 0.0) for one in shown]
+    seeds = []
     for one, place in zip(shown, places):
         look = looks[one.name]
-        for point in points[one.name]:
-            axes.plot(*point, alpha=0.45, markersize=6, **look)
+        for facts in one.facts:
+            seeds.append((one.psnrs[facts["seed"]], 100.0 * (figure_in(facts, KEPT) or 0.0)))
+            axes.plot(*seeds[-1], alpha=0.45, markersize=6, **look)
         axes.plot(*place, markersize=13, markeredgecolor=theme.page, zorder=3, **look)
-    axes.set_ylabel("candidates skipped, %")
-    _draw_front(axes, places, theme)
-    names = [
-        one.name if one.always_frozen else f"{one.name}: {len(one.facts)} of {one.seeds} frozen"
-        for one in shown
-    ]
-    others = [point for of in points.values() for point in of]
-    name_points(axes, places, names, [looks[one.name]["color"] for one in shown], others)
-    never = [one.name for one in learned if not one.facts]
+    plain(axes, theme)
+    axes.set_yscale("log")
+    axes.margins(x=0.08, y=0.18)
+    axes.yaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+    axes.yaxis.set_major_formatter(StrMethodFormatter("{x:g}"))
+    axes.yaxis.set_minor_formatter(NullFormatter())
+    axes.xaxis.set_major_locator(MaxNLocator(6))
+    axes.invert_yaxis()
+    axes.set_ylabel("space kept, %")
+    axes.set_xlabel("PSNR on unseen photographs, dB")
+    best = [places[i] for i in front([(-psnr, -kept) for psnr, kept in places])]
+    corners = [(best[0][0], axes.get_ylim()[0])] if best else []
+    for psnr, kept in best:
+        corners += [(psnr, corners[-1][1]), (psnr, kept)]
+    corners += [(axes.get_xlim()[0], corners[-1][1])] if best else []
+    axes.plot(
+        *zip(*corners),
+        color=theme.ink,
+        alpha=0.3,
+        linewidth=5,
+        zorder=1,
+        scalex=False,
+        scaley=False,
+    )
+    names = [f"{one.name}{_never_guided(one)}" for one in shown]
+    name_points(axes, places, names, [looks[one.name]["color"] for one in shown], seeds)
+    never = [one.name for one in learned if one.kept is None]
     for row, name in enumerate(reversed(never)):
         axes.annotate(
-            f"{name}: no gate was frozen",
+            f"{name}: not always frozen",
             (0.01, 0.03 + 0.065 * row),
             xycoords="axes fraction",
             color=looks[name]["color"],
             fontweight="bold",
         )
+
+
+def _never_guided(one: Learned) -> str:
+    """What is added to the name of a contender whose gates were frozen as the training ended."""
+    return " (frozen at the end)" if one.guided_nothing == one.seeds else ""

@@ -27,7 +27,6 @@ from leco_plugin.chart.drawing.title import asks_what_was_learned, title_of
 from leco_plugin.chart.findings.learned import learned_of
 from leco_plugin.chart.findings.representations import Representation, representations_of
 from leco_plugin.chart.findings.summary import (
-    BYTES,
     LEARNING,
     LOST_SURFACE_MASS,
     MEMORY,
@@ -52,9 +51,10 @@ KEPT_SPACE = (
     f"Space that must be sampled where each loses {LOST_SURFACE_MASS:.1%} of the surface. "
     "Up and left is better:"
 )
+SIZE = "size, kB: numbers in bfloat16, cells of grids in bits"
 LEARNED_SPACE = (
-    "Candidates that the frozen gate skips against what it loses, each seed and their median. "
-    "Up and left is better:"
+    f"Space that must be sampled where each loses {LOST_SURFACE_MASS:.1%} of the surface, against "
+    "PSNR. Up and right is better:"
 )
 WHAT_ELSE = "PSNR on unseen photographs, dB, against what it costs. Up and left is better:"
 
@@ -86,8 +86,9 @@ def draw(results: Mapping[str, Any], path: Path, theme: Theme = LIGHT) -> Path:
             shown = KEPT_SPACE if held else LEARNED_SPACE
             figure.text(0.015, 0.335, WHAT_ELSE, va="top", fontsize=11.5)
             figure.text(0.015, below_title - 0.035, shown, va="top", fontsize=11.5)
-            places = ((0.075, 0.56), (0.70, 0.28)) if held else ((0.075, 0.905),)
-            above = [figure.add_axes((left, 0.43, width, height - 0.03)) for left, width in places]
+            places = ((0.075, 0.56), (0.70, 0.28)) if held else ((0.085, 0.895),)
+            low = 0.43 if held else 0.455
+            above = [figure.add_axes((x, low, wide, 0.4 + height - low)) for x, wide in places]
             if held:
                 _draw_compared(above, held, lines, theme)
             else:
@@ -118,14 +119,13 @@ def _draw_compared(
 ) -> None:
     """What each occupancy keeps against its size and its learning time."""
     by_size, by_time = beside
-    timed = [one for one in held if one.has("learn_seconds")]
-    sizes = [one.median("size") for one in held]
+    timed = [one for one in held if not one.is_grid]
     seconds = [one.median("learn_seconds") for one in timed]
-    places = draw_kept(by_size, BYTES, sizes, held, lines, theme)
+    places = draw_kept(by_size, SIZE, "size", held, lines, theme)
     by_size.set_ylabel("space kept, %")
     colours = [look_of(one, held, lines, theme)["color"] for one in held]
     name_points(by_size, places, [one.name for one in held], colours)
-    draw_kept(by_time, LEARNING, seconds, timed, lines, theme)
+    draw_kept(by_time, LEARNING.titled, "learn_seconds", timed, lines, theme)
     by_time.set_xlim(0.9 * min(seconds), 1.06 * max(seconds))
 
 

@@ -5,8 +5,9 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
+from leco_plugin.chart.findings.fronts import verdict
 from leco_plugin.chart.findings.learned import learned_headline, learned_of
-from leco_plugin.chart.findings.representations import representations_of, verdict
+from leco_plugin.chart.findings.representations import representations_of
 from leco_plugin.chart.findings.summary import headline, lines_of, sentence
 
 

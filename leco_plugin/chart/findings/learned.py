@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import statistics
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -11,8 +11,10 @@ from leco_plugin.chart.findings.summary import Line, figure_in
 
 OURS = "(ours)"
 """In the name of the contender that a suite asks about."""
-ALIKE = 0.01
-"""Of the candidates: less than that is not told apart."""
+KEPT = "at_equal_loss.kept_reached_volume"
+"""Share of what rays reach that a gate keeps where all lose equally much of the surface."""
+AT_THE_END = 0.99
+"""Of the training time: what is frozen later has guided nothing."""
 
 
 @dataclass(frozen=True)
@@ -23,6 +25,8 @@ class Learned:
     facts: tuple[Mapping[str, Any], ...]
     """Of each seed with a frozen gate, as it was frozen: as a run's `occupancy`, and its `seed`."""
     seeds: int
+    psnrs: Mapping[int, float]
+    """Of each seed, dB."""
     healed: int | None
     """How often a collapsed gate was, in all seeds together; None where runs did not note it."""
 
@@ -30,6 +34,23 @@ class Learned:
         """A figure over the seeds that have one, a dot into their facts; None where none has."""
         values = [value for facts in self.facts if (value := figure_in(facts, name)) is not None]
         return statistics.median(values) if values else None
+
+    @property
+    def psnr(self) -> float:
+        """Mean over seeds, dB."""
+        return statistics.fmean(self.psnrs.values())
+
+    @property
+    def kept(self) -> float | None:
+        """Percent of the space, median over seeds; None where it was not measured in all."""
+        found = [figure_in(facts, KEPT) for facts in self.facts]
+        known = [share for share in found if share is not None]
+        return 100.0 * statistics.median(known) if known and len(known) == self.seeds else None
+
+    @property
+    def guided_nothing(self) -> int:
+        """In how many seeds the gate was frozen as the training ended."""
+        return sum(facts["at_the_end"] for facts in self.facts)
 
     @property
     def always_frozen(self) -> bool:
@@ -51,6 +72,7 @@ def _learned(line: Line) -> Learned:
             **(run.get("at_freezing") or {}),
             "at_end": run["occupancy"],
             "seed": run["seed"],
+            "at_the_end": run["freeze_seconds"] >= AT_THE_END * run["train_seconds"],
         }
         for run in line.runs
         if run.get("occupancy") and run.get("freeze_seconds") is not None
@@ -61,59 +83,54 @@ def _learned(line: Line) -> Learned:
         line.name,
         tuple(facts),
         len(line.runs),
+        {run["seed"]: run["psnr"] for run in line.runs},
         sum(known) if len(known) == len(line.runs) else None,
     )
 
 
 def learned_headline(learned: Sequence[Learned]) -> str:
-    """What ours, or else the first that always froze, skips, and who of the others skips more or
-    less than it: with every seed, and by `ALIKE` in the median.
-
-    Where all runs had as many steps, PSNR says nothing of where they would end.
-    """
-    frozen = [one for one in learned if one.always_frozen]
-    if not frozen:
+    """How much space ours, or else the first that always froze, keeps where all lose equally much,
+    at which PSNR after equal steps, and who of the others is better in both with every seed."""
+    known = [one for one in learned if one.kept is not None]
+    if not known:
         return "no gate was frozen with every seed"
-    ours = next((one for one in frozen if OURS in one.name), frozen[0])
-    others = [one for one in frozen if one is not ours]
-    more = [one for one in others if _skips_more(one, ours)]
-    less = [one for one in others if _skips_more(ours, one)]
-    alike = [one for one in others if one not in more and one not in less]
-    never = [one for one in learned if not one.facts]
-    parts = [
-        _counted(more, "more", max),
-        _counted(alike, "alike", None),
-        _counted(less, "less", min),
-        _counted(
-            [one for one in learned if one.facts and one not in frozen], "partly frozen", None
-        ),
-        _counted(never, "never frozen", None),
-    ]
-    said = f"{ours.name} skips {_skipped(ours):.0%} of the candidates"
-    return ": ".join([said, ", ".join(part for part in parts if part)]).removesuffix(": ")
+    ours = next((one for one in known if OURS in one.name), known[0])
+    others = [one for one in known if one is not ours]
+    if better := [one for one in others if _is_better(one, ours)]:
+        best = min(better, key=lambda one: one.kept or 0.0)
+        return f"{best.name} keeps {_figures(best)}, {ours.name} {_figures(ours)}"
+    said = f"{ours.name} keeps {_figures(ours)}"
+    if others:
+        kept = sorted(one.kept or 0.0 for one in others)
+        shares = " to ".join(dict.fromkeys(percent(share) for share in (kept[0], kept[-1])))
+        said += f": {_standing(ours, others)}, the others keep {shares}"
+    never = [one.name for one in learned if one.kept is None]
+    return said + (f"; {len(never)} not always frozen" if never else "")
 
 
-def _counted(
-    some: Sequence[Learned], what: str, extreme: Callable[..., Learned] | None
-) -> str | None:
-    """Who does what, by name if it is one, and the share of the one that does it most."""
-    if not some:
-        return None
-    who = some[0].name if len(some) == 1 else str(len(some))
-    if extreme is None:
-        return f"{who} {what}"
-    reach = "up to" if extreme is max else "down to"
-    share = f"{_skipped(extreme(some, key=_skipped)):.0%}"
-    return f"{who} {what}, {share if len(some) == 1 else f'{reach} {share}'}"
+def _standing(one: Learned, others: Sequence[Learned]) -> str:
+    """How one stands that no other beats in both with every seed."""
+    least = all((one.kept or 0.0) < (other.kept or 0.0) for other in others)
+    highest = all(one.psnr > other.psnr for other in others)
+    if least and highest:
+        return "the least, at the highest PSNR"
+    return "none is better in both"
 
 
-def _skips_more(one: Learned, other: Learned) -> bool:
-    shares = {facts["seed"]: facts["empty_fraction"] for facts in other.facts}
-    pairs = [(facts["empty_fraction"], shares.get(facts["seed"])) for facts in one.facts]
-    gains = [a - b for a, b in pairs if b is not None]
-    enough = len(gains) == len(pairs) and statistics.median(gains) >= ALIKE
-    return enough and min(gains) > 0.0
+def _is_better(one: Learned, other: Learned) -> bool:
+    """Whether one keeps less space at more PSNR with every seed."""
+    theirs = {facts["seed"]: figure_in(facts, KEPT) for facts in other.facts}
+    return all(
+        (figure_in(facts, KEPT) or 0.0) < (theirs.get(facts["seed"]) or 0.0)
+        and one.psnrs[facts["seed"]] > other.psnrs[facts["seed"]]
+        for facts in one.facts
+    )
 
 
-def _skipped(one: Learned) -> float:
-    return one.median("empty_fraction") or 0.0
+def _figures(one: Learned) -> str:
+    return f"{percent(one.kept or 0.0)} of the space at {one.psnr:.1f} dB"
+
+
+def percent(value: float) -> str:
+    """Percent with as many digits as mean something."""
+    return f"{value:.1f}%" if value < 10.0 else f"{value:.0f}%"

@@ -7,29 +7,29 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
-from leco_plugin.chart.findings.summary import BYTES, KEPT, LEARNING, Line
+from leco_plugin.chart.findings.summary import KEPT, LEARNING, Line
 
 OURS = "learned-occupancy"
 """The sampler whose gate is the one that this package takes by default."""
-
-
-TAUGHT = "small MLP, taught after (ours)"
-"""A small gate that a field has taught whose own gate was learned with it."""
+OUR_KIND = "MLP"
+"""Of the gate that this package takes by default."""
+SMALL_OURS = "small MLP (ours)"
+"""The small gate of that kind: like those of other kinds, it was taught by the field of a run whose
+own gate had learned with it."""
+BYTES_A_NUMBER = 2
+"""In bfloat16, in which gates are asked on a CPU."""
 
 
 class Held(NamedTuple):
     """One representation in one run."""
 
     size: float
-    """kB of its file, or of a grid's bits."""
+    """kB of what it consists of: a gate's numbers in bfloat16, a grid's cells in bits. Files have a
+    head besides, and `leco-occupancy` writes float32."""
     learn_seconds: float | None
     """Until it is there; None for a grid, which is made from a field that learned a gate too."""
     kept: float
     """Percent of the volume that rays reach which it keeps when all lose equally much."""
-
-
-COSTS = {"size": "size", "learning time": "learn_seconds"}
-"""Those on whose fronts representations are, and the figure of each in `Held`."""
 
 
 @dataclass(frozen=True)
@@ -39,8 +39,18 @@ class Representation:
     name: str
     by_seed: Mapping[int, Held]
     ours: bool = False
-    """Whether it is the gate that this package takes by default, or a small one that the same field
-    has taught."""
+    """Whether it is the gate that this package takes by default, or a small one of its kind."""
+    kind: str | None = None
+    """Of a small gate taught after: the kind, as a suite calls the large one."""
+
+    @property
+    def is_grid(self) -> bool:
+        """Whether it is an occupancy grid."""
+        return not self.has("learn_seconds")
+
+    def is_small_of(self, large: Representation) -> bool:
+        """Whether it is the small gate of the kind of a large one."""
+        return self.kind is not None and ((self.ours and large.ours) or self.kind == large.name)
 
     def of_seeds(self, figure: str) -> list[float]:
         """A figure of `Held` in each run."""
@@ -89,10 +99,7 @@ def representations_of(lines: Sequence[Line]) -> list[Representation]:
         ours = line.sampler == OURS
         found.append(Representation(line.name, measured, ours))
         kinds.add(line.sampler)
-        taught = {run["seed"]: _of_taught(run) for run in line.runs}
-        made = {seed: gate for seed, gate in taught.items() if gate is not None}
-        if len(made) == len(taught):
-            found.append(Representation(TAUGHT, made, ours))
+        found += _taught(line, ours)
         for resolution in resolutions_of(line.runs):
             grids = {run["seed"]: _of_grid(run, resolution) for run in line.runs}
             made = {seed: grid for seed, grid in grids.items() if grid is not None}
@@ -114,18 +121,27 @@ def _grids(run: Mapping[str, Any]) -> Sequence[Mapping[str, Any]]:
 
 
 def _of_gate(run: Mapping[str, Any]) -> Held | None:
-    size, seconds, kept = (cost.of(run) for cost in (BYTES, LEARNING, KEPT))
-    if size is None or seconds is None or kept is None:
+    seconds, kept = (cost.of(run) for cost in (LEARNING, KEPT))
+    if seconds is None or kept is None:
         return None
-    return Held(size, seconds, kept)
+    return Held(BYTES_A_NUMBER * run["occupancy"]["params"] / 1e3, seconds, kept)
 
 
-def _of_taught(run: Mapping[str, Any]) -> Held | None:
-    taught = run["occupancy"]["at_equal_loss"].get("taught")
-    if taught is None:
-        return None
-    seconds = run["learn_seconds"] + taught["seconds"]
-    return Held(taught["bytes"] / 1e3, seconds, 100.0 * taught["kept_reached_volume"])
+def _taught(line: Line, ours: bool) -> list[Representation]:
+    """The small gates that the field of a line has taught in every run."""
+    by_kind: dict[str, dict[int, Held]] = {}
+    for run in line.runs:
+        for row in run["occupancy"]["at_equal_loss"].get("taught", ()):
+            seconds = run["learn_seconds"] + row["seconds"]
+            held = Held(row["bytes"] / 1e3, seconds, 100.0 * row["kept_reached_volume"])
+            by_kind.setdefault(row["name"], {})[run["seed"]] = held
+    return [
+        Representation(SMALL_OURS, held, True, kind)
+        if ours and kind == OUR_KIND
+        else Representation(f"small {kind}", held, kind=kind)
+        for kind, held in by_kind.items()
+        if len(held) == len(line.runs)
+    ]
 
 
 def _of_grid(run: Mapping[str, Any], resolution: str) -> Held | None:
@@ -133,38 +149,3 @@ def _of_grid(run: Mapping[str, Any], resolution: str) -> Held | None:
         if str(grid["resolution"]) == resolution:
             return Held(grid["bytes"] / 1e3, None, 100.0 * grid["kept_reached_volume"])
     return None
-
-
-def fronts_of(one: Representation, all_of_them: Sequence[Representation]) -> list[str]:
-    """The names of the `COSTS` on whose fronts a representation is, which are those of medians."""
-    return [
-        name
-        for name, figure in COSTS.items()
-        if one.has(figure)
-        and not any(other.leads(one, figure) for other in all_of_them if other.has(figure))
-    ]
-
-
-def verdict(representations: Sequence[Representation]) -> str:
-    """Which of ours is on which front; and where none is, what is ahead, always or mostly."""
-    ours = [one for one in representations if one.ours]
-    if not ours:
-        return "our own gate has no figures here"
-    fronts = {one.name: fronts_of(one, representations) for one in ours}
-    if both := [name for name, found in fronts.items() if found == list(COSTS)]:
-        least = "what keeps less space is larger, and takes longer to learn"
-        return f"{both[0]} is on both fronts: {least}"
-    held = [f"{name} is on the front of {found[0]}" for name, found in fronts.items() if found]
-    said = [", ".join(held) or f"{ours[0].name} is on neither front"]
-    for name, figure in COSTS.items():
-        if not any(name in found for found in fronts.values()):
-            said.append(f"in {name} {_ahead(ours[0], representations, figure)}")
-    return "; ".join(said)
-
-
-def _ahead(one: Representation, others: Sequence[Representation], figure: str) -> str:
-    """What leads a representation and keeps least, and whether anything does so with every seed."""
-    leaders = [other for other in others if other.has(figure) and other.leads(one, figure)]
-    best = min(leaders, key=lambda other: other.kept)
-    always = any(other.leads_always(one, figure) for other in leaders)
-    return f"{best.name} is ahead" + ("" if always else ", not with every seed")

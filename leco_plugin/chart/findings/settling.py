@@ -1,4 +1,8 @@
-"""Whether runs have had enough time: what they still gained in the last third of it."""
+"""What runs still gained in the last third of their time.
+
+Learning rates fall to a tenth over whatever time is given, so that every curve flattens: who still
+rises has had too little, who does not may have more of it with more.
+"""
 
 from __future__ import annotations
 
@@ -10,33 +14,44 @@ import numpy as np
 from leco_plugin.chart.findings.summary import Line
 
 ENOUGH = 0.3
-"""dB in the last third of a run's time: who gains no more has had enough of it."""
+"""dB in the last third of a run's time: who gains more is still rising."""
 
 
-def last_gain(line: Line) -> float:
-    """Mean over seeds of the PSNR gained in the last third of the training time, dB."""
+def last_gain(line: Line) -> float | None:
+    """Mean over seeds of the PSNR gained in the last third of the training time, dB; None where the
+    curve of one has no point before that."""
     gains = []
     for run in line.runs:
         seconds, psnrs = zip(*run["curve"])
-        gains.append(psnrs[-1] - float(np.interp(2.0 / 3.0 * seconds[-1], seconds, psnrs)))
+        before = 2.0 / 3.0 * seconds[-1]
+        if seconds[0] > before:
+            return None
+        gains.append(psnrs[-1] - float(np.interp(before, seconds, psnrs)))
     return statistics.fmean(gains)
 
 
 def still_rising(lines: Sequence[Line]) -> list[str]:
-    """Who gained more than `ENOUGH` at last, as far as a gain is shown."""
-    return [line.name for line in lines if round(last_gain(line), 1) > ENOUGH]
+    """Who gained more than `ENOUGH` at last, as far as a gain is shown, or is not known to gain
+    less, or whose grid has not skipped anything yet."""
+    gains = [(line, last_gain(line)) for line in lines]
+    return [
+        line.name
+        for line, gain in gains
+        if gain is None or round(gain, 1) > ENOUGH or line.warming_up
+    ]
 
 
 def settling(lines: Sequence[Line]) -> str:
-    """In two sentences, what all gained at last, and whether that is enough time."""
-    gains = {line.name: last_gain(line) for line in lines}
-    listed = ", ".join(f"{name} {gain:+.1f} dB" for name, gain in gains.items())
+    """In two sentences, what all gained at last, and who is still rising."""
+    listed = ", ".join(
+        f"{line.name} {'unknown' if gain is None else f'{gain:+.1f} dB'}"
+        for line in lines
+        for gain in [last_gain(line)]
+    )
     rising = still_rising(lines)
-    said = "all of them have had enough time"
-    if rising:
-        who = "all of them" if len(rising) == len(gains) else " and ".join(rising)
-        said = f"{who} would gain by more time, and who is ahead may still change"
+    who = "all of them" if len(rising) == len(lines) else " and ".join(rising)
+    said = f"Still rising: {who or 'none'}"
     return (
-        f"Gained in the last third of the time: {listed}. Counting {ENOUGH} dB and less as none, "
-        f"{said}."
+        f"Gained in the last third of the time: {listed}. {said}; rates fall to a tenth over the "
+        "time that is given, so that others may gain by more of it too."
     )

@@ -87,7 +87,7 @@ def _made_before(source: Path) -> dict[str, Any] | None:
 def serves(record: Mapping[str, Any], job: Job) -> bool:
     """Whether a stored run is the one that a job asks for.
 
-    Grids and a taught gate are made after a run, from its field: a run that had more of them is
+    Grids and taught gates are made after a run, from its field: a run that had more of them is
     the same run.
     """
     made = Contender.from_dict(record["contender"])
