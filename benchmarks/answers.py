@@ -7,6 +7,7 @@ from typing import Any
 
 import checkout  # noqa: F401
 from chart_sections import notes, stored, titles
+from page_parts import size
 
 from leco_plugin.chart.contenders.suites import SUITES
 from leco_plugin.chart.drawing.title import asks_what_was_learned, title_of
@@ -77,7 +78,7 @@ def _kind(results: Mapping[str, Any]) -> tuple[str, Callable[[Sequence[Line]], d
 
 def _kept(lines: Sequence[Line]) -> dict[str, str]:
     held = representations_of(lines)
-    return {one.name: f"{one.kept:.1f}%, {one.median('size'):.0f} kB" for one in held}
+    return {one.name: f"{one.kept:.1f}%, {size(one.median('size'))}" for one in held}
 
 
 def _learned(lines: Sequence[Line]) -> dict[str, str]:

@@ -40,6 +40,11 @@ def between(text: str, marks: tuple[str, str], body: str) -> str:
     return f"{before}{begin}\n{body}\n{end}{rest.split(end)[1]}"
 
 
+def size(kilobytes: float) -> str:
+    """A size in words."""
+    return f"{kilobytes / 1e3:.1f} MB" if kilobytes >= 1e3 else f"{kilobytes:.0f} kB"
+
+
 def picture(name: str) -> str:
     """A picture in the page, in the page's colours."""
     image = f"images/charts/{name}"

@@ -6,11 +6,11 @@ import json
 from typing import Any
 
 import checkout  # noqa: F401
-from chart_sections import stored, titles
-from page_parts import RESULTS, between
+from chart_sections import notes, stored, titles
+from page_parts import RESULTS, between, size
 
 from leco_plugin.chart.findings.representations import Representation, representations_of
-from leco_plugin.chart.findings.summary import Line, lines_of
+from leco_plugin.chart.findings.summary import lines_of
 
 DEMO = "<!-- demo table: generated -->", "<!-- end of the demo table -->"
 RIVALS = "<!-- rivals: generated -->", "<!-- end of the rivals -->"
@@ -49,51 +49,61 @@ def demo_table(report: dict[str, Any]) -> str:
 
 def rivals_table() -> str:
     """A row for each scene of which both suites are stored: what must be sampled, and accuracy
-    after equal time."""
-    suites: dict[str, dict[str, Any]] = {"representations": {}, "enough-time": {}}
-    for name in titles():
-        results = stored(name)
-        if results["suite"] in suites:
-            suites[results["suite"]][results["scene"]["name"]] = results
-    space, times = suites.values()
-    names: list[str] = []
-    rows = []
-    for scene in sorted(space.keys() & times.keys()):
-        runs = lines_of(times[scene])
-        names = names or [line.name.split(" + ")[-1] for line in runs]
-        cells = _kept(representations_of(lines_of(space[scene]))) + _reached(runs)
-        rows.append(f"| {scene} | {' | '.join(cells)} |")
+    after equal time, with the least and the most of all seeds."""
+    space, times = of_suite("representations"), of_suite("enough-time")
+    rows = {
+        _marked(scene, [space[scene][0], times[scene][0]]): {
+            **_kept(representations_of(lines_of(space[scene][1]))),
+            **_reached(times[scene][1]),
+        }
+        for scene in sorted(space.keys() & times.keys())
+    }
     if not rows:
         return "Not measured yet."
-    seconds = next(iter(times.values()))["protocol"]["seconds"]
-    head = [
-        "scene",
-        "space that must be sampled: ours",
-        "best occupancy grid",
-        *(
-            f"Switch-NeRF after {seconds:g} s: {name}" if i == 0 else name
-            for i, name in enumerate(names)
-        ),
-    ]
-    return "\n".join([f"| {' | '.join(head)} |", f"|{'---|' * len(head)}", *rows])
+    columns = list(dict.fromkeys(column for row in rows.values() for column in row))
+    lines = [f"| scene | {' | '.join(columns)} |", f"|---|{'---|' * len(columns)}"]
+    for scene, row in rows.items():
+        lines.append(f"| {scene} | {' | '.join(row.get(name, '-') for name in columns)} |")
+    return "\n".join(lines)
 
 
-def _kept(held: list[Representation]) -> list[str]:
-    """The one of ours, and the grid, that keep least."""
-    cells = []
-    for group in (
-        [one for one in held if one.ours],
-        [one for one in held if one.name.startswith("grid ")],
-    ):
-        best = min(group, key=lambda one: one.kept)
-        resolution = f" ({best.name.removeprefix('grid ')})" if not best.ours else ""
-        cells.append(f"{best.kept:.1f}% in {_size(best.median('size'))}{resolution}")
-    return cells
+def of_suite(suite: str) -> dict[str, tuple[str, dict[str, Any]]]:
+    """Name and results of the stored charts of a suite, by scene."""
+    charts = [(name, stored(name)) for name in titles()]
+    return {
+        results["scene"]["name"]: (name, results)
+        for name, results in charts
+        if results["suite"] == suite
+    }
 
 
-def _size(kilobytes: float) -> str:
-    return f"{kilobytes / 1e3:.1f} MB" if kilobytes >= 1e3 else f"{kilobytes:.0f} kB"
+def _marked(scene: str, charts: list[str]) -> str:
+    """A scene, marked where one of its charts was made before a mend."""
+    return f"{scene} (*)" if notes().keys() & set(charts) else scene
 
 
-def _reached(lines: list[Line]) -> list[str]:
-    return [f"{line.psnr:.1f} dB" for line in lines]
+def _kept(held: list[Representation]) -> dict[str, str]:
+    """What each of ours keeps, and those that keep least of the grids and of the other gates."""
+    groups = {
+        "kept: `leco-occupancy`": [one for one in held if one.ours and one.kind is None],
+        "small MLP of ours": [one for one in held if one.ours and one.kind is not None],
+        "best other gate": [one for one in held if not one.ours and not one.is_grid],
+        "best grid": [one for one in held if one.is_grid],
+    }
+    best = {title: min(some, key=lambda one: one.kept) for title, some in groups.items() if some}
+    return {
+        title: f"{one.kept:.1f}%, {size(one.median('size'))}"
+        + ("" if one.ours else f" ({one.name.removeprefix('grid ')})")
+        for title, one in best.items()
+    }
+
+
+def _reached(results: dict[str, Any]) -> dict[str, str]:
+    """PSNR of each contender at the end."""
+    seconds = results["protocol"]["seconds"]
+    return {
+        f"PSNR after {seconds:g} s: {line.name.split(' + ')[-1]}": (
+            f"{line.psnr:.1f} ({min(line.psnrs):.1f} to {max(line.psnrs):.1f})"
+        )
+        for line in lines_of(results)
+    }

@@ -65,13 +65,10 @@ def test_it_is_said_for_every_scene_whether_ours_is_on_the_fronts(
     store("representations", "city", *representations(other_seconds=10.0))
     store("representations", "fox", *representations(other_seconds=8.0))
     text = text_of(answers)
-    assert (
-        "Of 2 scenes, a gate of ours is on the front of size on 2 and of learning time on 1."
-        in text
-    )
+    assert "Of 2 scenes, MLP (ours) is on the front of size on 2 and of learning time on 1." in text
     link = "suites.md#suite-representations-on-city"
-    kept = "| 12.5%, 50 kB | 30.0%, 33 kB | 10.0%, 4000 kB |"
-    assert f"| [city]({link}) {kept} MLP (ours) is on both fronts" in text
+    kept = "| 12.5%, 50 kB | 30.0%, 33 kB | 10.0%, 4.0 MB |"
+    assert f"| [city]({link}) {kept} MLP (ours) is on both fronts |" in text
     assert "MLP (ours) is on the front of size; in learning time hash grid is ahead" in text
 
 
@@ -90,14 +87,14 @@ def test_one_that_keeps_less_with_most_seeds_only_is_named_too(
     assert "in size grid 64³ is ahead, not with every seed |" in text
 
 
-def test_gates_are_compared_by_what_they_skip_and_runs_of_equal_time_by_their_ends(
+def test_gates_are_compared_by_what_they_keep_and_runs_of_equal_time_by_their_ends(
     answers: ModuleType, store: Any
 ) -> None:
     frozen, not_frozen = occupancy(50_000, 0.1), {"freeze_seconds": None}
     store("losses", "fox", run("A", occupancy=frozen), run("B", **not_frozen), **STEPS)
     store("freeze", "fox", run("A", psnr=21.0), run("B"))
     text = text_of(answers)
-    assert "| 80%, 20.0 dB | not frozen, 20.0 dB |" in text
+    assert "| 10%, 20.0 dB | not frozen, 20.0 dB |" in text
     said = "A is ahead: 21.0 dB, 1.0 more than B; still rising at the end: all"
     assert f"| 21.0 dB, 1 s | 20.0 dB, 1 s | {said} |" in text
 
@@ -107,7 +104,25 @@ def test_a_gate_that_is_not_frozen_with_every_seed_says_with_how_many(
 ) -> None:
     runs = [run("A", 0, occupancy=occupancy(5, 0.1)), run("A", 1, freeze_seconds=None)]
     store("losses", "fox", *runs, protocol={"seconds": None, "steps": 400})
-    assert "| 80% (1 of 2 frozen), 20.0 dB |" in text_of(answers)
+    assert "| 1 of 2 frozen, 20.0 dB |" in text_of(answers)
+
+
+def test_a_gate_that_was_frozen_with_the_last_step_is_told_apart(
+    answers: ModuleType, store: Any
+) -> None:
+    runs = [run("A", 0, occupancy=occupancy(5, 0.03)), run("A", 1, occupancy=occupancy(5, 0.03))]
+    runs[1]["freeze_seconds"] = runs[1]["train_seconds"]
+    store("losses", "fox", *runs, protocol={"seconds": None, "steps": 400})
+    assert "| 3.0% (1 of 2 frozen at the end), 20.0 dB |" in text_of(answers)
+
+
+def test_a_scene_where_ours_has_no_figures_does_not_change_the_table_of_others(
+    answers: ModuleType, store: Any
+) -> None:
+    store("representations", "city", run("MLP (ours)", freeze_seconds=None), **STEPS)
+    store("representations", "fox", *representations(other_seconds=10.0), **STEPS)
+    text = text_of(answers)
+    assert "| 12.5%, 50 kB |" in text and "Of 2 scenes, MLP (ours)" in text
 
 
 def test_a_contender_that_a_scene_lacks_has_no_figure_there(

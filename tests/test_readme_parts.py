@@ -42,22 +42,45 @@ def test_scenes_of_which_one_suite_is_missing_have_no_row(
     assert parts.rivals_table() == "Not measured yet."
 
 
-def test_ours_and_the_grid_that_keep_least_stand_beside_equal_time(
+def test_ours_and_the_rivals_that_keep_least_stand_beside_equal_time(
     parts: ModuleType, tmp_path: Path
 ) -> None:
     grids = [
         {"resolution": cells, "bytes": size, "kept_reached_volume": kept, "update_seconds": 1.0}
         for cells, size, kept in ((64, 32768, 0.3), (128, 262144, 0.25), (256, 2097152, 0.28))
     ]
-    facts = occupancy(50_000, 0.2, grids)
-    facts["at_equal_loss"]["taught"] = {"bytes": 4932, "seconds": 9.0, "kept_reached_volume": 0.1}
-    store(tmp_path, "representations", "city", run("MLP (ours)", occupancy=facts))
+    facts = occupancy(23_000, 0.2, grids)
+    small = {"bytes": 4932, "seconds": 9.0, "kept_reached_volume": 0.1, "name": "MLP"}
+    facts["at_equal_loss"]["taught"] = [small]
+    planes = run("K-planes", sampler="learned-occupancy-k-planes", occupancy=occupancy(10**6, 0.3))
+    store(tmp_path, "representations", "city", run("MLP (ours)", occupancy=facts), planes)
     own = run("Switch-NeRF + coarse and fine samples", psnr=17.25)
     ours = run("Switch-NeRF + learned occupancy", psnr=19.0)
     store(tmp_path, "enough-time", "city", ours, own)
     head, _, row = parts.rivals_table().splitlines()
-    assert head.endswith("Switch-NeRF after 10 s: learned occupancy | coarse and fine samples |")
-    assert row == "| city | 10.0% in 5 kB | 25.0% in 262 kB (128³) | 19.0 dB | 17.2 dB |"
+    assert head.endswith(
+        "| PSNR after 10 s: learned occupancy | PSNR after 10 s: coarse and fine samples |"
+    )
+    assert row == (
+        "| city | 20.0%, 23 kB | 10.0%, 5 kB | 30.0%, 1.0 MB (K-planes) | 25.0%, 262 kB (128³) "
+        "| 19.0 (19.0 to 19.0) | 17.2 (17.2 to 17.2) |"
+    )
+
+
+def test_columns_are_those_of_all_scenes_and_old_charts_are_marked(
+    parts: ModuleType, tmp_path: Path
+) -> None:
+    for scene in ("city", "fox"):
+        runs = [run("MLP (ours)", occupancy=occupancy(23_000, 0.2))]
+        hashed = occupancy(10**6, 0.3)
+        runs.append(run("hash grid", sampler="learned-occupancy-hash", occupancy=hashed))
+        store(tmp_path, "representations", scene, *(runs if scene == "city" else runs[1:]))
+        names = ["a", "b"] if scene == "city" else ["b"]
+        store(tmp_path, "enough-time", scene, *(run(f"Host + {name}") for name in names))
+    (tmp_path / "notes.json").write_text('{"fox-enough-time": "Made before."}')
+    head, _, city, fox = parts.rivals_table().splitlines()
+    assert head.count("|") == city.count("|") == fox.count("|")
+    assert city.startswith("| city |") and fox.startswith("| fox (*) | - |")
 
 
 def test_what_is_around_the_tables_is_left_as_it_is(

@@ -9,6 +9,7 @@ from chart_results import occupancy, results, run
 from PIL import Image
 
 from leco_plugin.chart.drawing.picture import draw
+from leco_plugin.chart.drawing.table import table
 from leco_plugin.chart.drawing.title import title_of
 from leco_plugin.chart.findings.learned import learned_headline, learned_of
 from leco_plugin.chart.findings.summary import lines_of
@@ -39,26 +40,54 @@ def test_an_occupancy_that_is_left_of_a_gate_that_was_opened_again_is_none() -> 
     assert learned_of(lines_of(results(left))) == []
 
 
-def test_the_title_of_a_suite_by_steps_says_who_skips_more_and_not_whose_psnr_is_higher() -> None:
-    runs = [*skipping("A", 0.7, 0.8), *skipping("B", 0.6, 0.5), *skipping("C", None, 0.9)]
-    made = results(*runs, **BY_STEPS)
-    said = "A skips 75% of the candidates: B less, 55%, C partly frozen"
-    assert title_of(made) == said
-    alike = [*skipping("A", 0.7, 0.8), *skipping("B", 0.71, 0.6), *skipping("C", 0.1, 0.1)]
-    assert title_of(results(*alike, **BY_STEPS)) == (
-        "A skips 75% of the candidates: B alike, C less, 10%"
+def keeping(name: str, *figures: tuple[float, float]) -> list[dict]:
+    """A run for each share of space kept and PSNR."""
+    return [
+        run(name, seed, psnr=psnr, occupancy=occupancy(51_000, kept))
+        for seed, (kept, psnr) in enumerate(figures)
+    ]
+
+
+OURS = keeping("A (ours)", (0.05, 21.0), (0.06, 20.0), (0.05, 21.0))
+
+
+def title(*others: list[dict]) -> str:
+    return title_of(results(*OURS, *(run for of in others for run in of), **BY_STEPS))
+
+
+def test_the_title_of_a_suite_by_steps_is_of_space_kept_at_equal_loss_and_of_psnr() -> None:
+    worse = keeping("B", (0.5, 19.0), (0.4, 19.5), (1.0, 19.0))
+    wasteful = keeping("C", *[(0.9, 22.0)] * 3)
+    assert title(worse) == (
+        "A (ours) keeps 5.0% of the space at 20.7 dB: the least, at the highest PSNR; the others "
+        "keep 50%"
     )
+    assert title(worse, wasteful) == (
+        "A (ours) keeps 5.0% of the space at 20.7 dB: none is better in both; the others keep 50% "
+        "to 90%"
+    )
+    assert title(worse, skipping("D", 0.8, None, 0.8)).endswith("; 1 not always frozen")
     assert "ahead" in title_of(results(run("A", psnr=22.0), run("B"), suite="freeze"))
     assert learned_headline(learned_of(lines_of(results(*skipping("C", None, 0.9))))) == (
         "no gate was frozen with every seed"
     )
 
 
-def test_less_than_a_hundredth_is_not_told_apart_whatever_its_sign() -> None:
-    runs = [*skipping("A", 0.8, 0.8, 0.8), *skipping("B", 0.799, 0.7905, 0.7)]
-    assert title_of(results(*runs, **BY_STEPS)) == "A skips 80% of the candidates: B alike"
-    runs[4]["occupancy"]["empty_fraction"] = 0.78
-    assert title_of(results(*runs, **BY_STEPS)) == "A skips 80% of the candidates: B less, 78%"
+def test_what_is_better_in_both_with_every_seed_leads_the_title() -> None:
+    better = keeping("B", *[(0.04, 22.0)] * 3)
+    said = "B keeps 4.0% of the space at 22.0 dB, A (ours) 5.0% of the space at 20.7 dB"
+    assert title(better) == said
+    once_worse = keeping("B", (0.04, 22.0), (0.04, 22.0), (0.055, 22.0))
+    assert "none is better in both" in title(once_worse)
+
+
+def test_a_gate_that_was_frozen_with_the_last_step_has_guided_nothing() -> None:
+    late = run("A", freeze_seconds=9.95, occupancy=occupancy(51_000, 0.1))
+    (one,) = learned_of(lines_of(results(late, run("A", 1, occupancy=occupancy(51_000, 0.1)))))
+    assert (one.guided_nothing, one.always_frozen) == (1, True)
+    assert "| 2 of 2, 1 at the end |" in table(
+        results(late, run("A", 1, occupancy=occupancy(51_000, 0.1)))
+    )
 
 
 def test_the_picture_of_such_a_suite_is_drawn(tmp_path: Path) -> None:

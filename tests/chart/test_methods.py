@@ -77,9 +77,9 @@ def test_names_say_what_a_host_does_by_itself() -> None:
 def test_the_phases_of_learning_are_methods_of_the_chart() -> None:
     names = [f"leco-occupancy-{what}" for what in ("never-frozen", "retrained", "homogeneous")]
     never, retrained, homogeneous = contenders(names)
-    assert never.changes == {"schedule.freeze": False}
+    assert never.changes == {"schedule.freeze": False, "front_to_back": True}
     assert retrained.changes == {"schedule.restart": True}
-    assert homogeneous.changes == {"schedule.freeze": False, "homogeneous": True}
+    assert homogeneous.changes == never.changes | {"homogeneous": True}
     assert contenders(["leco-occupancy"], ["dense"]) == [never]
 
 

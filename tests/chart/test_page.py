@@ -42,3 +42,11 @@ def test_a_grid_without_a_learning_time_stands_where_sizes_are_compared_alone(
     text = write_page(results(ours), tmp_path / "chart.html").read_text()
     named = re.findall(r'"text":\["MLP"(,"grid 64[^"]*")?\]', text)
     assert len(named) == 2 and [bool(grid) for grid in named] == [True, False]
+
+
+def test_a_suite_by_steps_shows_what_its_title_is_about(tmp_path: Path) -> None:
+    by_steps = {"suite": "losses", "protocol": {"seconds": None, "steps": 400}}
+    runs = [run(name, occupancy=occupancy(50_000, 0.1)) for name in ("A (ours)", "B")]
+    text = write_page(results(*runs, **by_steps), tmp_path / "chart.html").read_text()
+    assert "space kept at equal loss, against PSNR" in text
+    assert text.count("% of the space") >= 2

@@ -6,7 +6,7 @@ import pytest
 from chart_results import results, run
 
 from leco_plugin.chart.drawing.table import table
-from leco_plugin.chart.findings.settling import last_gain, settling
+from leco_plugin.chart.findings.settling import last_gain, settling, still_rising
 from leco_plugin.chart.findings.summary import lines_of
 
 STILL = [[3.0, 18.0], [6.0, 20.0], [9.0, 20.2]]
@@ -18,15 +18,22 @@ def test_the_gain_of_the_last_third_is_between_two_thirds_of_the_time_and_its_en
     assert last_gain(still) == pytest.approx(0.2)
     assert last_gain(rising) == pytest.approx(3.0)
     begun_late = lines_of(results(run("C", curve=[[8.0, 15.0], [9.0, 17.0]])))[0]
-    assert last_gain(begun_late) == pytest.approx(2.0)
+    assert last_gain(begun_late) is None
 
 
-def test_who_rises_has_not_had_enough_time() -> None:
+def test_who_rises_or_may_rise_is_named_and_nobody_is_said_to_have_had_enough() -> None:
     lines = lines_of(results(run("A", curve=STILL), run("B", curve=RISING)))
     said = settling(lines)
-    assert "A +0.2 dB, B +3.0 dB" in said and "none, B would gain by more time" in said
-    assert "all of them have had enough time" in settling(lines[:1])
-    assert "all of them would gain by more time" in settling(lines[1:])
+    assert "A +0.2 dB, B +3.0 dB. Still rising: B; rates fall" in said
+    assert "Still rising: none;" in settling(lines[:1])
+    assert "Still rising: all of them;" in settling(lines[1:])
+    late = lines_of(results(run("A", curve=STILL), run("C", curve=[[9.0, 17.0]])))
+    assert "C unknown. Still rising: C;" in settling(late)
+
+
+def test_a_grid_that_has_skipped_nothing_yet_is_still_rising() -> None:
+    cold = run("grid", curve=STILL, warming_up=True)
+    assert still_rising(lines_of(results(run("A", curve=STILL), cold))) == ["grid"]
 
 
 def test_tables_of_runs_of_equal_time_say_it_and_no_others() -> None:

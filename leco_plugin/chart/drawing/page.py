@@ -7,8 +7,11 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from leco_plugin.chart.drawing.panels import look_of
 from leco_plugin.chart.drawing.theme import LIGHT
-from leco_plugin.chart.drawing.title import title_of
+from leco_plugin.chart.drawing.title import asks_what_was_learned, title_of
+from leco_plugin.chart.findings.fronts import COSTS as COSTS_OF_HELD
+from leco_plugin.chart.findings.learned import Learned, learned_of
 from leco_plugin.chart.findings.representations import Representation, representations_of
 from leco_plugin.chart.findings.summary import (
     COSTS,
@@ -20,6 +23,8 @@ from leco_plugin.chart.findings.summary import (
 )
 
 SYMBOLS = ("circle", "square", "diamond", "triangle-up", "triangle-down", "cross", "x", "star")
+SIZES = ("size of the occupancy, kB", "learning the occupancy, s", "")
+KEPT_AGAINST_PSNR = ("space kept at equal loss, against PSNR, dB", "", "")
 FRONT = {"color": "rgba(120,120,120,0.45)", "width": 5, "shape": "hv"}
 
 
@@ -31,13 +36,16 @@ def write_page(results: Mapping[str, Any], path: Path) -> Path:
     lines = lines_of(results)
     held = representations_of(lines)
     title = html.escape(title_of(results))
-    figure = _figure(lines)
+    learned = learned_of(lines) if asks_what_was_learned(results) and not held else []
+    figure = _figure(lines, SIZES if held else KEPT_AGAINST_PSNR if learned else ())
     if held:
-        _add_representations(figure, held)
+        _add_representations(figure, held, lines)
+    elif learned:
+        _add_learned(figure, learned, lines)
     figure.update_layout(
         title={"text": f"<b>{title}</b><br><sub>{html.escape(circumstances(results))}</sub>"},
         template="plotly_white",
-        height=1100 if held else 820,
+        height=1100 if held or learned else 820,
         legend={"orientation": "h", "y": -0.08},
         margin={"t": 110},
     )
@@ -45,16 +53,14 @@ def write_page(results: Mapping[str, Any], path: Path) -> Path:
     return path
 
 
-def _figure(lines: Sequence[Line]) -> Any:
-    """Curves on top, costs below; a third row is left for representations if there are any."""
+def _figure(lines: Sequence[Line], last: Sequence[str] = ()) -> Any:
+    """Curves on top, costs below; a third row is left for panels with the `last` titles."""
     import plotly.graph_objects as go
     from plotly.subplots import make_subplots
 
-    rows = 3 if representations_of(lines) else 2
+    rows = 3 if last else 2
     wide = [{"colspan": 3}, None, None]
-    titles = ["", *(cost.titled for cost in COSTS)]
-    if rows == 3:
-        titles += ["size of the occupancy, kB", "learning the occupancy, s", ""]
+    titles = ["", *(cost.titled for cost in COSTS), *last]
     figure = make_subplots(
         rows=rows,
         cols=3,
@@ -125,10 +131,13 @@ def _front(points: Sequence[tuple[float, float]]) -> Any:
     )
 
 
-def _add_representations(figure: Any, held: Sequence[Representation]) -> None:
+def _add_representations(
+    figure: Any, held: Sequence[Representation], lines: Sequence[Line]
+) -> None:
+    """What each occupancy keeps against its size and its learning time."""
     import plotly.graph_objects as go
 
-    for column, cost in enumerate(("size", "learn_seconds"), start=1):
+    for column, cost in enumerate(COSTS_OF_HELD.values(), start=1):
         shown = [one for one in held if one.has(cost)]
         places = [(one.median(cost), one.kept) for one in shown]
         figure.add_trace(
@@ -138,7 +147,10 @@ def _add_representations(figure: Any, held: Sequence[Representation]) -> None:
                 text=[one.name for one in shown],
                 mode="markers+text",
                 textposition="top center",
-                marker={"size": 12, "color": LIGHT.colours[0]},
+                marker={
+                    "size": [16 if one.ours else 11 for one in shown],
+                    "color": [look_of(one, held, lines, LIGHT)["color"] for one in shown],
+                },
                 showlegend=False,
                 hovertemplate="%{text}: %{x:.3g}, %{y:.1f}%<extra></extra>",
             ),
@@ -147,8 +159,34 @@ def _add_representations(figure: Any, held: Sequence[Representation]) -> None:
         )
         best = [places[i] for i in front([(value, -kept) for value, kept in places])]
         figure.add_trace(_front(best), row=3, col=column)
+        figure.update_yaxes(autorange="reversed", row=3, col=column)
     figure.update_xaxes(type="log", row=3, col=1)
-    figure.update_yaxes(
-        title_text="volume kept at equal loss, %", autorange="reversed", row=3, col=1
-    )
-    figure.update_yaxes(autorange="reversed", row=3, col=2)
+    figure.update_yaxes(title_text="volume kept at equal loss, %", row=3, col=1)
+
+
+def _add_learned(figure: Any, learned: Sequence[Learned], lines: Sequence[Line]) -> None:
+    """Space that gates keep at equal loss against PSNR after equal steps."""
+    import plotly.graph_objects as go
+
+    numbers = {line.name: i for i, line in enumerate(lines)}
+    for one in (one for one in learned if one.kept is not None):
+        i = numbers[one.name]
+        figure.add_trace(
+            go.Scatter(
+                x=[one.psnr],
+                y=[one.kept],
+                name=one.name,
+                legendgroup=one.name,
+                showlegend=False,
+                mode="markers",
+                marker={
+                    "size": 14,
+                    "symbol": SYMBOLS[i % len(SYMBOLS)],
+                    "color": LIGHT.colours[i % len(LIGHT.colours)],
+                },
+                hovertemplate="%{x:.2f} dB, %{y:.1f}% of the space",
+            ),
+            row=3,
+            col=1,
+        )
+    figure.update_yaxes(type="log", autorange="reversed", title_text="%", row=3, col=1)

@@ -103,7 +103,7 @@ def learned_headline(learned: Sequence[Learned]) -> str:
     if others:
         kept = sorted(one.kept or 0.0 for one in others)
         shares = " to ".join(dict.fromkeys(percent(share) for share in (kept[0], kept[-1])))
-        said += f": {_standing(ours, others)}, the others keep {shares}"
+        said += f": {_standing(ours, others)}; the others keep {shares}"
     never = [one.name for one in learned if one.kept is None]
     return said + (f"; {len(never)} not always frozen" if never else "")
 
