@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import checkout  # noqa: F401
+from page_parts import noted
 from stability_page import has_lost, runs_gone_on
 
 from leco_plugin.chart.contenders.methods import NEVER_FROZEN, VARIANTS
@@ -27,7 +28,8 @@ Values = Sequence[float | None]
 
 HEAD = """What `leco-occupancy` was to reach on two CPU cores, set before it was built. Each figure
 is read from the stored result named beside it: the median over seeds, with the least and the most.
-*Yes* is with every seed, *in the median* not with all of them."""
+*Yes* is with every seed, *in the median* not with all of them. A chart marked (*) was made before a
+mend that is named beside it."""
 
 
 @dataclass(frozen=True)
@@ -52,7 +54,8 @@ class Bar:
         values = self.read(json.loads(path.read_text())) if path.exists() else None
         if not values:
             return [asked, "not stored", "-", "-"]
-        return [asked, self.measured(values), self.reached(values), f"`{self.stored}`"]
+        mark = " (*)" if Path(self.stored).name in noted(folder) else ""
+        return [asked, self.measured(values), self.reached(values), f"`{self.stored}`{mark}"]
 
     def measured(self, values: Values) -> str:
         """The values of some seeds, in words."""

@@ -6,7 +6,7 @@ import json
 from typing import Any
 
 import checkout  # noqa: F401
-from page_parts import RESULTS, machine_line, picture
+from page_parts import RESULTS, machine_line, noted, picture
 from paper_rows import PAPER_ROWS
 
 from leco_plugin.chart.contenders.suites import SUITES
@@ -42,9 +42,7 @@ def stored(name: str) -> dict[str, Any]:
 
 def notes() -> dict[str, str]:
     """What is said of charts that were made by code which has been mended since."""
-    file = RESULTS / "notes.json"
-    found: dict[str, str] = json.loads(file.read_text()) if file.exists() else {}
-    return found
+    return noted(RESULTS)
 
 
 def chart_sections() -> list[str]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections import Counter
 from collections.abc import Iterable, Mapping
 from pathlib import Path
@@ -38,6 +39,13 @@ def between(text: str, marks: tuple[str, str], body: str) -> str:
     begin, end = marks
     before, rest = text.split(begin)
     return f"{before}{begin}\n{body}\n{end}{rest.split(end)[1]}"
+
+
+def noted(folder: Path) -> dict[str, str]:
+    """What is said of stored charts that were made before a mend, by their names."""
+    file = folder / "notes.json"
+    found: dict[str, str] = json.loads(file.read_text()) if file.exists() else {}
+    return found
 
 
 def size(kilobytes: float) -> str:

@@ -155,3 +155,11 @@ def test_the_page_begins_with_the_bars_of_what_is_stored(bars: ModuleType) -> No
 
 def test_every_file_that_claims_a_bar_is_there(bars: ModuleType) -> None:
     assert all((ROOT / "tests" / file).exists() for file in bars.CLAIMED.values())
+
+
+def test_a_bar_of_a_chart_that_was_made_before_a_mend_is_marked(
+    bars: ModuleType, tmp_path: Path
+) -> None:
+    store(tmp_path, "charts/city-3", chart([0.996]))
+    (tmp_path / "notes.json").write_text('{"city-3": "Made before."}')
+    assert row(bars, tmp_path, "City: visible surface kept")[-1] == "`charts/city-3` (*)"
