@@ -56,9 +56,8 @@ is the counterpart.
 | identity | 26.30 | 0.781 | 0.383 |
 """
 PAPER_ROWS = {
-    "city-4-switch": SWITCH,
     "city-4-ngp": INSTANT_NGP,
-    "enough-time": ENOUGH_TIME,
+    "enough-time": f"{ENOUGH_TIME}\n{SWITCH}",
     "grid-resolution": GRID_RESOLUTION,
     "empty-expert": EMPTY_EXPERT,
 }
