@@ -7,10 +7,9 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
+from leco_plugin.chart.contenders.methods import LEARNED
 from leco_plugin.chart.findings.summary import KEPT, LEARNING, Line
 
-OURS = "learned-occupancy"
-"""The sampler whose gate is the one that this package takes by default."""
 OUR_KIND = "MLP"
 """Of the gate that this package takes by default."""
 SMALL_OURS = "small MLP (ours)"
@@ -96,7 +95,7 @@ def representations_of(lines: Sequence[Line]) -> list[Representation]:
         if any(gate is None for gate in gates.values()):
             continue
         measured = {seed: gate for seed, gate in gates.items() if gate is not None}
-        ours = line.sampler == OURS
+        ours = line.sampler == LEARNED
         found.append(Representation(line.name, measured, ours))
         kinds.add(line.sampler)
         found += _taught(line, ours)
