@@ -86,13 +86,12 @@ def _learned(lines: Sequence[Line]) -> dict[str, str]:
     cells = {}
     for line in lines:
         one = found.get(line.name)
-        kept = one.kept if one is not None else None
         if one is None or not one.facts:
             said = "not frozen"
-        elif kept is None:
+        elif not one.is_measured:
             said = f"{len(one.facts)} of {one.seeds} frozen"
         else:
-            said = percent(kept)
+            said = percent(one.kept)
         if one is not None and one.guided_nothing:
             said += f" ({one.guided_nothing} of {one.seeds} frozen at the end)"
         cells[line.name] = f"{said}, {line.psnr:.1f} dB"
@@ -121,7 +120,7 @@ def _fronts(charts: Sequence[Mapping[str, Any]]) -> str:
 
 
 def _answer_of(results: Mapping[str, Any]) -> str:
-    """The title of a chart, and who has not had enough time."""
+    """The title of a chart, and who is still rising."""
     lines = lines_of(results)
     rising = still_rising(lines) if results["protocol"]["seconds"] is not None else []
     if not rising:

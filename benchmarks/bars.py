@@ -29,7 +29,7 @@ Values = Sequence[float | None]
 HEAD = """What `leco-occupancy` was to reach on two CPU cores, set before it was built. Each figure
 is read from the stored result named beside it: the median over seeds, with the least and the most.
 *Yes* is with every seed, *in the median* not with all of them. A chart marked (*) was made before a
-mend that is named beside it."""
+mend that is named with it."""
 
 
 @dataclass(frozen=True)

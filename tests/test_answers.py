@@ -2,32 +2,22 @@
 
 from __future__ import annotations
 
-import importlib
 import json
-import sys
 from pathlib import Path
 from types import ModuleType
 from typing import Any
 
 import pytest
 from chart_results import occupancy, results, run
+from stored_charts import reading
 
 STEPS = {"protocol": {"seconds": None, "steps": 400}}
-ROOT = Path(__file__).resolve().parent.parent
 
 
 @pytest.fixture
 def answers(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> ModuleType:
     """The answers' module, with no chart stored yet."""
-    monkeypatch.syspath_prepend(str(ROOT / "benchmarks"))
-    for name in ("chart_sections", "answers"):
-        monkeypatch.delitem(sys.modules, name, raising=False)
-    charts = importlib.import_module("chart_sections")
-    monkeypatch.setattr(charts, "RESULTS", tmp_path)
-    monkeypatch.setattr(charts, "CHARTS", tmp_path / "charts")
-    (tmp_path / "charts.json").write_text("{}")
-    (tmp_path / "charts").mkdir()
-    return importlib.import_module("answers")
+    return reading("answers", tmp_path, monkeypatch)
 
 
 @pytest.fixture

@@ -2,30 +2,20 @@
 
 from __future__ import annotations
 
-import importlib
 import json
-import sys
 from pathlib import Path
 from types import ModuleType
 from typing import Any
 
 import pytest
 from chart_results import results, run
-
-ROOT = Path(__file__).resolve().parent.parent
+from stored_charts import reading
 
 
 @pytest.fixture
 def sections(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> ModuleType:
     """The page's charts, of which none is stored yet."""
-    monkeypatch.syspath_prepend(str(ROOT / "benchmarks"))
-    monkeypatch.delitem(sys.modules, "chart_sections", raising=False)
-    found = importlib.import_module("chart_sections")
-    monkeypatch.setattr(found, "RESULTS", tmp_path)
-    (tmp_path / "charts.json").write_text("{}")
-    monkeypatch.setattr(found, "CHARTS", tmp_path / "charts")
-    (tmp_path / "charts").mkdir()
-    return found
+    return reading("chart_sections", tmp_path, monkeypatch)
 
 
 def store(sections: ModuleType, name: str, made: dict[str, Any]) -> None:

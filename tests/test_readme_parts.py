@@ -2,31 +2,20 @@
 
 from __future__ import annotations
 
-import importlib
 import json
-import sys
 from pathlib import Path
 from types import ModuleType
 from typing import Any
 
 import pytest
 from chart_results import occupancy, results, run
-
-ROOT = Path(__file__).resolve().parent.parent
+from stored_charts import reading
 
 
 @pytest.fixture
 def parts(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> ModuleType:
     """The README's module, with no chart stored yet."""
-    monkeypatch.syspath_prepend(str(ROOT / "benchmarks"))
-    for name in ("chart_sections", "readme_parts"):
-        monkeypatch.delitem(sys.modules, name, raising=False)
-    charts = importlib.import_module("chart_sections")
-    monkeypatch.setattr(charts, "RESULTS", tmp_path)
-    monkeypatch.setattr(charts, "CHARTS", tmp_path / "charts")
-    (tmp_path / "charts.json").write_text("{}")
-    (tmp_path / "charts").mkdir()
-    return importlib.import_module("readme_parts")
+    return reading("readme_parts", tmp_path, monkeypatch)
 
 
 def store(folder: Path, suite: str, scene: str, *runs: dict[str, Any]) -> None:

@@ -17,9 +17,9 @@ from leco_plugin.evaluation.equal_loss import MOST_ON_CPU, SPARED, kept_shares, 
 from leco_plugin.evaluation.field_grids import (
     FieldGrids,
     density_of,
-    dilate,
     in_parts,
     looked_up,
+    plain_and_dilated,
 )
 from leco_plugin.evaluation.reached_volume import mapped_box
 from leco_plugin.models.encodings import EncodingConfig
@@ -190,12 +190,10 @@ def of_grids(
         scores = grids.fill((candidate.resolution,) * 3)
         if scores is None:
             return
-        both = []
-        for some in (scores, dilate(scores)):
-            of_rays, of_volume = (
-                looked_up(some, box, mapped) for mapped in (ground.mapped, ground.volume)
-            )
-            both.append(measured(ground.held_out, of_rays, of_volume, lost))
+        both = [
+            measured(ground.held_out, of_rays, of_volume, lost)
+            for of_rays, of_volume in plain_and_dilated(scores, box, ground.mapped, ground.volume)
+        ]
         yield candidate, _row(candidate, started, min(both, key=lambda one: one["kept_volume"]))
 
 

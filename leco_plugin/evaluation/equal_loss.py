@@ -17,10 +17,10 @@ from torch import Tensor
 from leco_plugin.evaluation.field_grids import (
     FieldGrids,
     density_of,
-    dilate,
     fits_memory,
     in_parts,
     looked_up,
+    plain_and_dilated,
 )
 from leco_plugin.evaluation.inspection import ViewBox
 from leco_plugin.evaluation.reached_volume import (
@@ -162,8 +162,7 @@ def _better_of_dilations(
 ) -> dict[str, Any]:
     """What a grid keeps as it is, or dilated, whichever is less."""
     found = []
-    for dilated, some in enumerate((scores, dilate(scores))):
-        of_rays, of_volume = (looked_up(some, box, places) for places in (mapped, volume))
+    for dilated, (of_rays, of_volume) in enumerate(plain_and_dilated(scores, box, mapped, volume)):
         kept = kept_shares(weights, of_rays, of_volume, LOST_SURFACE_MASS)
         found.append({"dilated": bool(dilated), **_shares(kept)})
     return min(found, key=lambda one: one["kept_reached_volume"])

@@ -7,7 +7,7 @@ A cell is asked only where the coarser grid, or a neighbour of its cell, has not
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 
 import psutil
 import torch
@@ -168,6 +168,14 @@ def looked_up(scores: Tensor, box: ViewBox, mapped: Tensor) -> Tensor:
     """Scores of the cells that hold mapped positions [N, 3]; zero outside: [N]."""
     index, inside = _cells(scores, box, mapped)
     return scores.view(-1).index_select(0, index) * inside
+
+
+def plain_and_dilated(
+    scores: Tensor, box: ViewBox, *places: Tensor
+) -> Iterator[tuple[Tensor, ...]]:
+    """What a grid says of mapped positions, several [N, 3], as it is and then dilated: [N] each."""
+    for some in (scores, dilate(scores)):
+        yield tuple(looked_up(some, box, mapped) for mapped in places)
 
 
 def _cells(scores: Tensor, box: ViewBox, mapped: Tensor) -> tuple[Tensor, Tensor]:

@@ -29,7 +29,7 @@ def skipping(name: str, *shares: float | None) -> list[dict]:
 
 def test_figures_are_of_the_seeds_that_froze_a_gate() -> None:
     (one,) = learned_of(lines_of(results(*skipping("A", 0.5, None, 0.7))))
-    assert (len(one.facts), one.seeds, one.always_frozen) == (2, 3, False)
+    assert (len(one.facts), one.seeds, one.is_measured) == (2, 3, False)
     assert one.median("empty_fraction") == pytest.approx(0.6)
     assert one.median("at_equal_loss.kept_reached_volume") == 0.1
     assert one.median("kept_surface_recall") is None and one.healed is None
@@ -84,7 +84,7 @@ def test_what_is_better_in_both_with_every_seed_leads_the_title() -> None:
 def test_a_gate_that_was_frozen_with_the_last_step_has_guided_nothing() -> None:
     late = run("A", freeze_seconds=9.95, occupancy=occupancy(51_000, 0.1))
     (one,) = learned_of(lines_of(results(late, run("A", 1, occupancy=occupancy(51_000, 0.1)))))
-    assert (one.guided_nothing, one.always_frozen) == (1, True)
+    assert (one.guided_nothing, one.is_measured) == (1, True)
     assert "| 2 of 2, 1 at the end |" in table(
         results(late, run("A", 1, occupancy=occupancy(51_000, 0.1)))
     )

@@ -112,14 +112,16 @@ def _point(line: Line, i: int, value: float) -> Any:
         legendgroup=line.name,
         showlegend=False,
         mode="markers",
-        marker={
-            "size": 13,
-            "symbol": SYMBOLS[i % len(SYMBOLS)],
-            "color": LIGHT.colours[i % len(LIGHT.colours)],
-        },
+        marker=_marker(i, 13),
         hovertemplate="%{x:.3g}, %{y:.2f} dB"
         + (f", learned in {learning:.0f} s" if learning is not None else ""),
     )
+
+
+def _marker(i: int, size: int) -> dict[str, Any]:
+    """How the points of a line look."""
+    colour = LIGHT.colours[i % len(LIGHT.colours)]
+    return {"size": size, "symbol": SYMBOLS[i % len(SYMBOLS)], "color": colour}
 
 
 def _front(points: Sequence[tuple[float, float]]) -> Any:
@@ -169,7 +171,7 @@ def _add_learned(figure: Any, learned: Sequence[Learned], lines: Sequence[Line])
     import plotly.graph_objects as go
 
     numbers = {line.name: i for i, line in enumerate(lines)}
-    for one in (one for one in learned if one.kept is not None):
+    for one in (one for one in learned if one.is_measured):
         i = numbers[one.name]
         figure.add_trace(
             go.Scatter(
@@ -179,11 +181,7 @@ def _add_learned(figure: Any, learned: Sequence[Learned], lines: Sequence[Line])
                 legendgroup=one.name,
                 showlegend=False,
                 mode="markers",
-                marker={
-                    "size": 14,
-                    "symbol": SYMBOLS[i % len(SYMBOLS)],
-                    "color": LIGHT.colours[i % len(LIGHT.colours)],
-                },
+                marker=_marker(i, 14),
                 hovertemplate="%{x:.2f} dB, %{y:.1f}% of the space",
             ),
             row=3,

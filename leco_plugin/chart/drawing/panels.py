@@ -7,9 +7,9 @@ from typing import Any
 
 from leco_plugin.chart.drawing.names import name_points
 from leco_plugin.chart.drawing.theme import Theme, plain, style
-from leco_plugin.chart.findings.learned import KEPT, Learned
+from leco_plugin.chart.findings.learned import Learned
 from leco_plugin.chart.findings.representations import Representation
-from leco_plugin.chart.findings.summary import COSTS, Cost, Line, figure_in, front
+from leco_plugin.chart.findings.summary import COSTS, Cost, Line, front
 
 WIDE_RANGE = 8.0
 """Ratio of costs from which their axis is logarithmic."""
@@ -38,14 +38,24 @@ def draw_cost(axes: Any, cost: Cost, lines: Sequence[Line], theme: Theme) -> Non
 
 
 def _draw_front(
-    axes: Any, places: Sequence[tuple[float, float]], theme: Theme, sign: float = 1.0
+    axes: Any,
+    places: Sequence[tuple[float, float]],
+    theme: Theme,
+    sign: float = 1.0,
+    rightwards: bool = False,
 ) -> None:
-    """The border of what is beaten, as far as the panel goes; `sign` is -1 where less is better."""
-    best = [places[i] for i in front([(cost, sign * gain) for cost, gain in places])]
+    """The border of what is beaten, as far as the panel goes.
+
+    Args:
+        sign: -1 where less of the vertical axis is better.
+        rightwards: whether more of the horizontal one is.
+    """
+    across = -1.0 if rightwards else 1.0
+    best = [places[i] for i in front([(across * cost, sign * gain) for cost, gain in places])]
     if not best:
         return
     costs, gains = ([point[i] for point in best] for i in (0, 1))
-    worst, farthest = axes.get_ylim()[0], axes.get_xlim()[1]
+    worst, farthest = axes.get_ylim()[0], axes.get_xlim()[0 if rightwards else 1]
     axes.step(
         [costs[0], *costs, farthest],
         [worst, *gains, gains[-1]],
@@ -131,13 +141,13 @@ def draw_learned(
     from matplotlib.ticker import LogLocator, MaxNLocator, NullFormatter, StrMethodFormatter
 
     looks = {line.name: style(i, theme) for i, line in enumerate(lines)}
-    shown = [one for one in learned if one.kept is not None]
-    places = [(one.psnr, one.kept or 0.0) for one in shown]
+    shown = [one for one in learned if one.is_measured]
+    places = [(one.psnr, one.kept) for one in shown]
     seeds = []
     for one, place in zip(shown, places):
         look = looks[one.name]
-        for facts in one.facts:
-            seeds.append((one.psnrs[facts["seed"]], 100.0 * (figure_in(facts, KEPT) or 0.0)))
+        for seed, kept in one.kept_by_seed.items():
+            seeds.append((one.psnrs[seed], kept))
             axes.plot(*seeds[-1], alpha=0.45, markersize=6, **look)
         axes.plot(*place, markersize=13, markeredgecolor=theme.page, zorder=3, **look)
     plain(axes, theme)
@@ -150,23 +160,10 @@ def draw_learned(
     axes.invert_yaxis()
     axes.set_ylabel("space kept, %")
     axes.set_xlabel("PSNR on unseen photographs, dB")
-    best = [places[i] for i in front([(-psnr, -kept) for psnr, kept in places])]
-    corners = [(best[0][0], axes.get_ylim()[0])] if best else []
-    for psnr, kept in best:
-        corners += [(psnr, corners[-1][1]), (psnr, kept)]
-    corners += [(axes.get_xlim()[0], corners[-1][1])] if best else []
-    axes.plot(
-        *zip(*corners),
-        color=theme.ink,
-        alpha=0.3,
-        linewidth=5,
-        zorder=1,
-        scalex=False,
-        scaley=False,
-    )
+    _draw_front(axes, places, theme, sign=-1.0, rightwards=True)
     names = [f"{one.name}{_never_guided(one)}" for one in shown]
     name_points(axes, places, names, [looks[one.name]["color"] for one in shown], seeds)
-    never = [one.name for one in learned if one.kept is None]
+    never = [one.name for one in learned if not one.is_measured]
     for row, name in enumerate(reversed(never)):
         axes.annotate(
             f"{name}: not always frozen",

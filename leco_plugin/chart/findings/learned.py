@@ -41,21 +41,25 @@ class Learned:
         return statistics.fmean(self.psnrs.values())
 
     @property
-    def kept(self) -> float | None:
-        """Percent of the space, median over seeds; None where it was not measured in all."""
-        found = [figure_in(facts, KEPT) for facts in self.facts]
-        known = [share for share in found if share is not None]
-        return 100.0 * statistics.median(known) if known and len(known) == self.seeds else None
+    def kept_by_seed(self) -> dict[int, float]:
+        """Percent of the space, of each seed of which it was measured."""
+        found = {facts["seed"]: figure_in(facts, KEPT) for facts in self.facts}
+        return {seed: 100.0 * share for seed, share in found.items() if share is not None}
+
+    @property
+    def is_measured(self) -> bool:
+        """Whether it is known of every seed what was kept."""
+        return len(self.kept_by_seed) == self.seeds
+
+    @property
+    def kept(self) -> float:
+        """Percent of the space, median over the seeds of which it was measured."""
+        return statistics.median(self.kept_by_seed.values())
 
     @property
     def guided_nothing(self) -> int:
         """In how many seeds the gate was frozen as the training ended."""
         return sum(facts["at_the_end"] for facts in self.facts)
-
-    @property
-    def always_frozen(self) -> bool:
-        """Whether there is an occupancy with every seed."""
-        return len(self.facts) == self.seeds
 
 
 def learned_of(lines: Sequence[Line]) -> list[Learned]:
@@ -91,26 +95,26 @@ def _learned(line: Line) -> Learned:
 def learned_headline(learned: Sequence[Learned]) -> str:
     """How much space ours, or else the first that always froze, keeps where all lose equally much,
     at which PSNR after equal steps, and who of the others is better in both with every seed."""
-    known = [one for one in learned if one.kept is not None]
+    known = [one for one in learned if one.is_measured]
     if not known:
         return "no gate was frozen with every seed"
     ours = next((one for one in known if OURS in one.name), known[0])
     others = [one for one in known if one is not ours]
     if better := [one for one in others if _is_better(one, ours)]:
-        best = min(better, key=lambda one: one.kept or 0.0)
+        best = min(better, key=lambda one: one.kept)
         return f"{best.name} keeps {_figures(best)}, {ours.name} {_figures(ours)}"
     said = f"{ours.name} keeps {_figures(ours)}"
     if others:
-        kept = sorted(one.kept or 0.0 for one in others)
+        kept = sorted(one.kept for one in others)
         shares = " to ".join(dict.fromkeys(percent(share) for share in (kept[0], kept[-1])))
         said += f": {_standing(ours, others)}; the others keep {shares}"
-    never = [one.name for one in learned if one.kept is None]
-    return said + (f"; {len(never)} not always frozen" if never else "")
+    never = len(learned) - len(known)
+    return said + (f"; {never} not always frozen" if never else "")
 
 
 def _standing(one: Learned, others: Sequence[Learned]) -> str:
     """How one stands that no other beats in both with every seed."""
-    least = all((one.kept or 0.0) < (other.kept or 0.0) for other in others)
+    least = all(one.kept < other.kept for other in others)
     highest = all(one.psnr > other.psnr for other in others)
     if least and highest:
         return "the least, at the highest PSNR"
@@ -119,16 +123,15 @@ def _standing(one: Learned, others: Sequence[Learned]) -> str:
 
 def _is_better(one: Learned, other: Learned) -> bool:
     """Whether one keeps less space at more PSNR with every seed."""
-    theirs = {facts["seed"]: figure_in(facts, KEPT) for facts in other.facts}
+    theirs = other.kept_by_seed
     return all(
-        (figure_in(facts, KEPT) or 0.0) < (theirs.get(facts["seed"]) or 0.0)
-        and one.psnrs[facts["seed"]] > other.psnrs[facts["seed"]]
-        for facts in one.facts
+        kept < theirs.get(seed, 0.0) and one.psnrs[seed] > other.psnrs[seed]
+        for seed, kept in one.kept_by_seed.items()
     )
 
 
 def _figures(one: Learned) -> str:
-    return f"{percent(one.kept or 0.0)} of the space at {one.psnr:.1f} dB"
+    return f"{percent(one.kept)} of the space at {one.psnr:.1f} dB"
 
 
 def percent(value: float) -> str:

@@ -6,35 +6,19 @@ import time
 from typing import Any
 
 from leco_plugin.capacity.field import lesson_by
-from leco_plugin.capacity.measuring import Candidate, taught_score
+from leco_plugin.capacity.measuring import gates, taught_score
 from leco_plugin.chart.contenders.contender import Contender
 from leco_plugin.evaluation.equal_loss import at_equal_loss
-from leco_plugin.models.encodings import EncodingConfig
 from leco_plugin.models.freezing.held_out_rendering import evaluating
-from leco_plugin.models.gate import GateConfig
 from leco_plugin.models.leco import LecoModel
 from leco_plugin.shrink.sources import Source
 
+_GATES = {gate.key: gate for gate in gates()}
 SMALL = {
-    "MLP": Candidate("frequency", "6-32-2", GateConfig(EncodingConfig(octaves=6), 32, 2, 1)),
-    "hash grid": Candidate(
-        "hash",
-        "4-10",
-        GateConfig(EncodingConfig("hash", levels=4, log2_table=10, finest=128), 16, 1, 1),
-    ),
-    "TensoRF planes": Candidate(
-        "vm",
-        "32-4",
-        GateConfig(EncodingConfig("vm", components=4, plane_cells=32), 16, 1, 1),
-    ),
-    "K-planes": Candidate(
-        "k-planes",
-        "32-4-1",
-        GateConfig(
-            EncodingConfig("k-planes", levels=1, features=4, coarsest=32, plane_cells=32),
-            *(16, 1, 1),
-        ),
-    ),
+    "MLP": _GATES["frequency-6-32-2"],
+    "hash grid": _GATES["hash-4-10"],
+    "TensoRF planes": _GATES["vm-32-4"],
+    "K-planes": _GATES["k-planes-32-4-1"],
 }
 """Of each kind a size that keeps little for its bytes in `leco capacity`: 5 to 27 kB."""
 
