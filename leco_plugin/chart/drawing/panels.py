@@ -13,6 +13,8 @@ from leco_plugin.chart.findings.summary import COSTS, Cost, Line, front
 
 WIDE_RANGE = 8.0
 """Ratio of costs from which their axis is logarithmic."""
+ROW = 0.065
+"""Height of a name at the foot of a panel, of the panel's."""
 
 
 def draw_all_costs(panels: Sequence[Any], lines: Sequence[Line], theme: Theme) -> None:
@@ -160,16 +162,29 @@ def draw_learned(
     axes.invert_yaxis()
     axes.set_ylabel("space kept, %")
     axes.set_xlabel("PSNR on unseen photographs, dB")
+    never = [one.name for one in learned if not one.is_measured]
+    _name_at_foot(
+        axes, [f"{name}: not always frozen" for name in never], [looks[one]["color"] for one in never]
+    )
     _draw_front(axes, places, theme, sign=-1.0, rightwards=True)
     names = [f"{one.name}{_never_guided(one)}" for one in shown]
     name_points(axes, places, names, [looks[one.name]["color"] for one in shown], seeds)
-    never = [one.name for one in learned if not one.is_measured]
-    for row, name in enumerate(reversed(never)):
+
+
+def _name_at_foot(axes: Any, names: Sequence[str], colours: Sequence[str]) -> None:
+    """Names one over another at the foot of a panel whose vertical axis is logarithmic and less of
+    which is up; the axis goes on there as far as they need."""
+    if not names:
+        return
+    share = ROW * (len(names) + 0.5)
+    worst, best = axes.get_ylim()
+    axes.set_ylim(worst * (worst / best) ** (share / (1.0 - share)), best)
+    for row, (name, colour) in enumerate(zip(reversed(names), reversed(colours))):
         axes.annotate(
-            f"{name}: not always frozen",
-            (0.01, 0.03 + 0.065 * row),
+            name,
+            (0.01, 0.03 + ROW * row),
             xycoords="axes fraction",
-            color=looks[name]["color"],
+            color=colour,
             fontweight="bold",
         )
 
