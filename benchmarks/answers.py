@@ -2,17 +2,25 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import checkout  # noqa: F401
-from chart_sections import notes, stored, titles
+from chart_sections import by_scene, length_of, notes, titles
 from page_parts import size
+from suite_times import minutes_section
 
 from leco_plugin.chart.contenders.suites import SUITES
 from leco_plugin.chart.drawing.title import asks_what_was_learned, title_of
 from leco_plugin.chart.findings.fronts import COSTS, fronts_of
-from leco_plugin.chart.findings.learned import learned_of, percent
+from leco_plugin.chart.findings.learned import (
+    Learned,
+    learned_of,
+    level_with,
+    ours_of,
+    percent,
+)
 from leco_plugin.chart.findings.representations import representations_of
 from leco_plugin.chart.findings.settling import still_rising
 from leco_plugin.chart.findings.summary import RENDERING, Line, lines_of
@@ -32,25 +40,27 @@ numbers in bfloat16, and of a grid's cells in bits.
 LEARNED = """Space that each gate keeps, of what rays reach, where it loses 0.1% of the surface, and
 PSNR after equally many steps. A gate that was frozen with the last of them has guided nothing.
 """
-TIMED = """PSNR after equal time, and seconds to render a test image. Whoever gained more than
-0.3 dB in the last third of the time is still rising. That others are not does not mean that more
-time would not help them: rates fall to a tenth over whatever time is given.
+TIMED = """PSNR after equal time, and seconds to render a test image. What keeping a grid up takes
+is missing in training with it: a fine one shows here what it costs on two cores, and not how good
+it would be. Whoever gained more than 0.3 dB in the last third of the time is still rising. That
+others are not does not mean that more time would not help them: rates fall to a tenth over whatever
+time is given.
 """
 
 
 def answers_section() -> list[str]:
     """Suite by suite, a row for each scene; nothing where no suite is stored."""
-    charts = [(name, stored(name)) for name in titles()]
-    parts = []
+    parts, shortest = [], []
     for suite, its in SUITES.items():
-        rows = [(name, results) for name, results in charts if results["suite"] == suite]
-        if rows:
+        scenes = by_scene(suite).values()
+        shortest += [charts[0][1] for charts in scenes]
+        if rows := [chart for charts in scenes for chart in charts]:
             parts += [f"### {its.question}\n", *_answer(rows)]
-    return [HEAD, *parts] if parts else []
+    return [HEAD, *parts, *minutes_section(shortest)] if parts else []
 
 
 def _answer(charts: Sequence[tuple[str, dict[str, Any]]]) -> list[str]:
-    noted = notes()
+    noted, titled = notes(), titles()
     kinds = [_kind(results) for _, results in charts]
     figures, cells_of = next((kind for kind in kinds if kind[0] == KEPT), kinds[0])
     cells = [cells_of(lines_of(results)) for _, results in charts]
@@ -59,14 +69,20 @@ def _answer(charts: Sequence[tuple[str, dict[str, Any]]]) -> list[str]:
     for (name, results), row in zip(charts, cells):
         shown = " | ".join(row.get(column, "-") for column in columns)
         mark = " (*)" if name in noted else ""
-        rows.append(f"| {_link(results)}{mark} | {shown} | {_answer_of(results)} |")
+        rows.append(
+            f"| {_link(results, titled[name], charts)}{mark} | {shown} | {_answer_of(results)} |"
+        )
     counted = [_fronts([results for _, results in charts])] if figures == KEPT else []
     return [figures, *rows, "", *counted]
 
 
-def _link(results: Mapping[str, Any]) -> str:
+def _link(results: dict[str, Any], title: str, charts: Sequence[tuple[str, dict[str, Any]]]) -> str:
+    """The scene, with the length of the runs where there are several charts of it."""
     scene = results["scene"]["name"]
-    return f"[{scene}](suites.md#suite-{results['suite']}-on-{scene})"
+    several = sum(other["scene"]["name"] == scene for _, other in charts) > 1
+    said = f"{scene}, {length_of(results)}" if several else scene
+    anchor = re.sub(r"[^\w -]", "", title.lower()).replace(" ", "-")
+    return f"[{said}](suites.md#{anchor})"
 
 
 def _kind(results: Mapping[str, Any]) -> tuple[str, Callable[[Sequence[Line]], dict[str, str]]]:
@@ -99,7 +115,14 @@ def _learned(lines: Sequence[Line]) -> dict[str, str]:
 
 
 def _timed(lines: Sequence[Line]) -> dict[str, str]:
-    return {line.name: f"{line.psnr:.1f} dB, {line.median(RENDERING):.2g} s" for line in lines}
+    return {
+        line.name: f"{line.psnr:.1f} dB, {line.median(RENDERING):.2g} s" + _kept_up(line)
+        for line in lines
+    }
+
+
+def _kept_up(line: Line) -> str:
+    return f" ({line.kept_up:.0%} of the time for its grid)" if line.kept_up else ""
 
 
 def _fronts(charts: Sequence[Mapping[str, Any]]) -> str:
@@ -119,9 +142,20 @@ def _fronts(charts: Sequence[Mapping[str, Any]]) -> str:
     return f"Of {scenes}, {'; '.join(said)}.\n"
 
 
+def _level(learned: Sequence[Learned]) -> str:
+    """Whose seeds overlap with those of ours, in space kept and in PSNR."""
+    ours = ours_of(learned)
+    if ours is None or not ours.is_measured:
+        return ""
+    names = [one.name for one in level_with(ours, learned)]
+    return f"; no difference beyond that of seeds to: {', '.join(names)}" if names else ""
+
+
 def _answer_of(results: Mapping[str, Any]) -> str:
-    """The title of a chart, and who is still rising."""
+    """The title of a chart, and who is level with ours or still rising."""
     lines = lines_of(results)
+    if asks_what_was_learned(results) and not representations_of(lines):
+        return title_of(results) + _level(learned_of(lines))
     rising = still_rising(lines) if results["protocol"]["seconds"] is not None else []
     if not rising:
         return title_of(results)

@@ -6,7 +6,7 @@ import json
 from typing import Any
 
 import checkout  # noqa: F401
-from chart_sections import notes, stored, titles
+from chart_sections import by_scene, notes
 from page_parts import RESULTS, between, size
 
 from leco_plugin.chart.findings.representations import Representation, representations_of
@@ -50,7 +50,7 @@ def demo_table(report: dict[str, Any]) -> str:
 def rivals_table() -> str:
     """A row for each scene of which both suites are stored: what must be sampled, and accuracy
     after equal time, with the least and the most of all seeds."""
-    space, times = of_suite("representations"), of_suite("enough-time")
+    space, times = (_shortest(suite) for suite in ("representations", "enough-time"))
     rows = {
         _marked(scene, [space[scene][0], times[scene][0]]): {
             **_kept(representations_of(lines_of(space[scene][1]))),
@@ -67,14 +67,9 @@ def rivals_table() -> str:
     return "\n".join(lines)
 
 
-def of_suite(suite: str) -> dict[str, tuple[str, dict[str, Any]]]:
-    """Name and results of the stored charts of a suite, by scene."""
-    charts = [(name, stored(name)) for name in titles()]
-    return {
-        results["scene"]["name"]: (name, results)
-        for name, results in charts
-        if results["suite"] == suite
-    }
+def _shortest(suite: str) -> dict[str, tuple[str, dict[str, Any]]]:
+    """Name and results of a suite's chart of each scene."""
+    return {scene: charts[0] for scene, charts in by_scene(suite).items()}
 
 
 def _marked(scene: str, charts: list[str]) -> str:

@@ -225,10 +225,10 @@ def chart(
         samplers: Of the registry, occupancy-grid-N for N cells along an axis, or own. By default
             learned-occupancy and own where the method can have both.
         suite: A named comparison instead of methods and samplers. Minutes that it takes on two CPU
-            cores with three seeds, by their speed: representations 12 to 25, empty-expert 14 to 34,
+            cores with three seeds, by their speed: representations 12 to 30, empty-expert 14 to 34,
             losses 9 to 22, freeze 13 to 16, enough-time 12 to 14, grid-resolution 15 to 16. Several
-            of them, or all, have a folder each in that of --out and share their runs: all take 60
-            to 103 minutes.
+            of them, or all, have a folder each in that of --out and share their runs: all take 61
+            to 108 minutes.
         seconds: Training time of each run.
         steps: Training steps of each run; with both, a run ends with the first.
         seeds: Seeds.

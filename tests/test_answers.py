@@ -58,8 +58,8 @@ def test_it_is_said_for_every_scene_whether_ours_is_on_the_fronts(
     assert "Of 2 scenes, MLP (ours) is on the front of size on 2 and of learning time on 1." in text
     link = "suites.md#suite-representations-on-city"
     kept = "| 12.5%, 50 kB | 30.0%, 33 kB | 10.0%, 4.0 MB |"
-    assert f"| [city]({link}) {kept} MLP (ours) is on both fronts" in text
-    assert "MLP (ours) is on the front of size; in learning time hash grid is ahead" in text
+    assert f"| [city]({link}) {kept} MLP (ours) is the smallest and the soonest learned" in text
+    assert "MLP (ours) is the smallest; in learning time hash grid is ahead" in text
 
 
 def test_a_grid_that_is_smaller_and_keeps_less_is_named(answers: ModuleType, store: Any) -> None:
@@ -77,13 +77,29 @@ def test_one_that_keeps_less_with_most_seeds_only_is_named_too(
     assert "in size grid 64³ is ahead, not with every seed |" in text
 
 
+def test_minutes_are_those_of_runs_two_at_a_time_and_shared_ones_count_once(
+    answers: ModuleType, store: Any
+) -> None:
+    two = {"protocol": {"seconds": 60.0, "at_once": 2}}
+    shared = run("A", wall_seconds=120.0)
+    store("enough-time", "fox", shared, run("B", wall_seconds=240.0), **two)
+    store("grid-resolution", "fox", {**shared, "reused": True}, run("C", wall_seconds=60.0), **two)
+    store("freeze", "city", run("A", wall_seconds=60.0), run("B"), **two)
+    text = text_of(answers)
+    assert "| fox | - | - | - | - | 3 | 2 | 4 |" in text  # 1.5 of the last: 3.0 and 0.5 of its own
+    assert "| city | - | - | - | - | - | - | - |" in text
+
+
 def test_gates_are_compared_by_what_they_keep_and_runs_of_equal_time_by_their_ends(
     answers: ModuleType, store: Any
 ) -> None:
     frozen, not_frozen = occupancy(50_000, 0.1), {"freeze_seconds": None}
     store("losses", "fox", run("A", occupancy=frozen), run("B", **not_frozen), **STEPS)
     store("freeze", "fox", run("A", psnr=21.0), run("B"))
+    grid = {"sampler": "occupancy-grid-64", "train_seconds": 10.0, "learn_seconds": 5.0}
+    store("grid-resolution", "fox", run("A"), run("B", **grid))
     text = text_of(answers)
+    assert "| 20.0 dB, 1 s | 20.0 dB, 1 s (50% of the time for its grid) |" in text
     assert "| 10%, 20.0 dB | not frozen, 20.0 dB |" in text
     said = "A is ahead: 21.0 dB, 1.0 more than B; still rising at the end: all"
     assert f"| 21.0 dB, 1 s | 20.0 dB, 1 s | {said} |" in text

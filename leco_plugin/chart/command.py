@@ -21,6 +21,9 @@ from leco_plugin.chart.runs.run import Chart, Runner
 from leco_plugin.progress_bar import bar, resumable
 from leco_plugin.scenes.input_error import InputError
 
+LEFT_BY_SYSTEMS = (".DS_Store", "Thumbs.db")
+"""In folders that somebody has looked into."""
+
 
 @dataclass(frozen=True)
 class Asked:
@@ -84,12 +87,29 @@ def make_charts(
     if len(names) > 1:
         if asked.reuse:
             raise InputError("several suites share their runs by themselves: --reuse is for one")
+        _check_shared(out)
         charts = [_chart_of_suite(data, out / name, name, asked, out) for name in names]
     elif names:
         charts = [_chart_of_suite(data, out, names[0], asked)]
     else:
         charts = [_chart_of_methods(data, out, methods, samplers, asked)]
     return {chart.folder.path: _made(chart, runner_for) for chart in charts}
+
+
+def _check_shared(out: Path) -> None:
+    """Whether the suites may have their folders in one.
+
+    Raises:
+        InputError: it holds something else.
+    """
+    known = [*SUITES, *LEFT_BY_SYSTEMS]
+    held = sorted(path.name for path in out.iterdir()) if out.exists() else []
+    others = [name for name in held if name not in known]
+    if others:
+        raise InputError(
+            f"{out} holds something else ({others[0]}); name a new folder with --out, in which "
+            "each suite has one of its own"
+        )
 
 
 def _chart_of_suite(

@@ -228,6 +228,8 @@ def test_folders_and_scenes_that_do_not_fit_are_one_line_too(
         "another suite": [*scene, "--out", good, *METHODS, *TIME],
         "another seconds": [*scene, "--out", good, "--suite", "losses", "--seconds", 7],
         "holds something else": [*scene, "--out", taken, *METHODS, *TIME],
+        "else (thesis.txt)": [*scene, "--out", taken, "--suite", "losses", "freeze"],
+        "else (chart-dark.png)": [*scene, "--out", good, "--suite", "all"],
         "thesis.txt": [*scene, "--out", taken / "thesis.txt", *METHODS, *TIME],
         "nowhere": ["--data", tmp_path / "nowhere", *new, *METHODS, *TIME],
     }

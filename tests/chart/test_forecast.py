@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import json
 from dataclasses import replace
+from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -10,7 +13,9 @@ from leco_plugin.chart.contenders import forecast
 from leco_plugin.chart.contenders.contender import Contender
 from leco_plugin.chart.contenders.forecast import FAST, SLOW
 from leco_plugin.chart.contenders.protocol import Protocol
+from leco_plugin.chart.contenders.suites import SUITES
 
+CHARTS = Path(__file__).parents[2] / "benchmarks" / "results" / "charts"
 GUIDED = Contender("guided", "leco-occupancy", "learned-occupancy")
 DENSE = Contender("dense", "leco-occupancy", "dense")
 
@@ -47,3 +52,25 @@ def test_what_is_said_holds_for_fast_cores_and_for_slow_ones() -> None:
     said = forecast.about(runs, protocol)
     assert said == f"about {fast} to {slow} minutes on two CPU cores, by their speed"
     assert forecast.about([GUIDED], Protocol(20.0)) == "about 1 minute on two CPU cores"
+
+
+def of_suites() -> list[tuple[str, dict[str, Any]]]:
+    """Stored charts of suites that say how long their runs took."""
+    found = [(path.stem, json.loads(path.read_text())) for path in sorted(CHARTS.glob("*.json"))]
+    return [
+        (name, results)
+        for name, results in found
+        if results["suite"] and all(run.get("wall_seconds") for run in results["runs"])
+    ]
+
+
+@pytest.mark.parametrize(
+    ("name", "results"), [pytest.param(*one, id=one[0]) for one in of_suites()]
+)
+def test_suites_took_about_as_long_as_is_said(name: str, results: dict[str, Any]) -> None:
+    contenders = {one.name: one for one in SUITES[results["suite"]].contenders}
+    made = [contenders[run["name"]] for run in results["runs"]]
+    protocol = Protocol(**results["protocol"])
+    fast, slow = (forecast.minutes(made, protocol, cores) for cores in (FAST, SLOW))
+    took = sum(run["wall_seconds"] for run in results["runs"]) / 60.0 / protocol.at_once
+    assert 0.8 * fast <= took <= 1.1 * slow, name

@@ -11,7 +11,7 @@ from PIL import Image
 from leco_plugin.chart.drawing.picture import draw
 from leco_plugin.chart.drawing.table import table
 from leco_plugin.chart.drawing.title import title_of
-from leco_plugin.chart.findings.learned import learned_headline, learned_of
+from leco_plugin.chart.findings.learned import learned_headline, learned_of, level_with
 from leco_plugin.chart.findings.summary import lines_of
 
 BY_STEPS = {"suite": "losses", "protocol": {"seconds": None, "steps": 400}}
@@ -73,12 +73,26 @@ def test_the_title_of_a_suite_by_steps_is_of_space_kept_at_equal_loss_and_of_psn
     )
 
 
-def test_what_is_better_in_both_with_every_seed_leads_the_title() -> None:
+def test_what_is_better_in_both_leads_the_title() -> None:
     better = keeping("B", *[(0.04, 22.0)] * 3)
     said = "B keeps 4.0% of the space at 22.0 dB, A (ours) 5.0% of the space at 20.7 dB"
     assert title(better) == said
     once_worse = keeping("B", (0.04, 22.0), (0.04, 22.0), (0.055, 22.0))
-    assert "none is better in both" in title(once_worse)
+    assert title(once_worse) == f"{said}, level by seeds"
+
+
+def test_a_title_without_ours_says_so() -> None:
+    other = keeping("B", *[(0.04, 22.0)] * 3)
+    never = skipping("A (ours)", 0.8, None, 0.8)
+    assert title_of(results(*never, *other, **BY_STEPS)) == "Ours was not frozen with every seed"
+
+
+def test_those_whose_seeds_overlap_in_both_are_level() -> None:
+    near = keeping("near", (0.055, 20.5), (0.07, 22.0), (0.08, 22.0))
+    more = keeping("more", (0.055, 25.0), (0.07, 25.0), (0.08, 25.0))
+    wide = keeping("wide", (0.2, 20.5), (0.3, 20.5), (0.4, 20.5))
+    learned = learned_of(lines_of(results(*OURS, *near, *more, *wide, *skipping("never", 0.5))))
+    assert [one.name for one in level_with(learned[0], learned)] == ["near"]
 
 
 def test_a_gate_that_was_frozen_with_the_last_step_has_guided_nothing() -> None:

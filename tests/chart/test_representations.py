@@ -7,6 +7,8 @@ from chart_results import occupancy, results, run, slow_front
 from hypothesis import given
 from hypothesis import strategies as st
 
+from leco_plugin.chart.drawing.table import table
+from leco_plugin.chart.drawing.title import title_of
 from leco_plugin.chart.findings.fronts import fronts_of, verdict
 from leco_plugin.chart.findings.representations import (
     SMALL_OURS,
@@ -91,12 +93,12 @@ def test_it_is_said_where_ours_is_not_on_the_front_and_what_beats_it() -> None:
     faster = ("hash grid", "learned-occupancy-hash", 4_000_000, 3.0, 0.05)
     smaller = ("K-planes", "learned-occupancy-k-planes", 40_000, 10.0, 0.1)
     said = verdict(gates(faster, ours))  # whatever comes first
-    assert said == ("MLP (ours) is on the front of size; in learning time hash grid is ahead")
+    assert said == "MLP (ours) is the smallest; in learning time hash grid is ahead"
     assert verdict(gates(ours, faster, smaller)) == (
         "MLP (ours) is on neither front; in size K-planes is ahead; in learning time hash grid is "
         "ahead"
     )
-    assert verdict(gates(faster, smaller)) == "our own gate has no figures here"
+    assert verdict(gates(faster, smaller)) == "our own gate was not frozen with every seed"
 
 
 def test_what_leads_in_the_median_but_not_with_every_seed_is_said_to() -> None:
@@ -108,9 +110,7 @@ def test_what_leads_in_the_median_but_not_with_every_seed_is_said_to() -> None:
         "planes is ahead, not with every seed"
     )
     larger = Representation("larger", {i: Held(60.0, 8.0, 9.5) for i in range(3)})
-    assert verdict([ours, larger]) == (
-        "ours is on the front of size; in learning time larger is ahead"
-    )
+    assert verdict([ours, larger]) == ("ours is the smallest; in learning time larger is ahead")
 
 
 def taught(name: str, size: int, kept: float) -> dict[str, object]:
@@ -130,12 +130,43 @@ def test_small_gates_that_the_field_has_taught_stand_beside_those_of_their_kind(
         "hash grid",
     ]
     large, small, hashed, rival_gate = held
-    assert small.by_seed == {0: Held(5.0, 29.0, 10.0)} and small.ours and not hashed.ours
+    assert small.by_seed == {0: Held(5.0, 29.0, 10.0, 20.0)} and small.ours and not hashed.ours
     assert small.is_small_of(large) and hashed.is_small_of(rival_gate)
     assert not small.is_small_of(rival_gate) and not large.is_small_of(large)
     assert verdict(held) == (
-        "small MLP (ours) keeps least space, 10.0% in 5 kB; MLP (ours) is on neither front"
+        "small MLP (ours) keeps least space, 10.0% in 5 kB; MLP (ours) is on neither front; in "
+        "size small MLP (ours) is ahead; in learning time hash grid is ahead"
     )
+
+
+def test_who_costs_least_is_not_said_to_be_on_a_front_for_more_than_that() -> None:
+    ours = ("MLP (ours)", "learned-occupancy", 50_000, 9.0, 0.3)
+    less = ("hash grid", "learned-occupancy-hash", 60_000, 10.0, 0.2)
+    least = ("planes", "learned-occupancy-vm", 40_000, 12.0, 0.4)
+    assert verdict(gates(ours, less)) == "MLP (ours) is the smallest and the soonest learned"
+    assert verdict(gates(ours, less, least)) == (
+        "MLP (ours) is the soonest learned and on the front of size"
+    )
+
+
+def test_what_is_ahead_of_the_gate_that_a_run_writes_is_said_whatever_a_small_one_keeps() -> None:
+    facts = occupancy(50_000, 0.3)
+    facts["at_equal_loss"]["taught"] = [taught("MLP", 5000, 0.2)]
+    other = run("hash grid", sampler="learned-occupancy-hash", occupancy=occupancy(9_000, 0.1))
+    ours = run("MLP (ours)", occupancy=facts)
+    said = verdict(representations_of(lines_of(results(ours, other))))
+    assert said.startswith("small MLP (ours) is the smallest; MLP (ours) is on neither front; ")
+    assert "in size hash grid is ahead" in said
+
+
+def test_a_gate_that_was_not_always_frozen_is_named() -> None:
+    ours, hashed, planes = (f"learned-occupancy{kind}" for kind in ("", "-hash", "-vm"))
+    runs = [
+        run(f"gate{kind}", sampler=kind, occupancy=occupancy(9, 0.1)) for kind in (ours, hashed)
+    ]
+    made = results(*runs, run("planes", sampler=planes))
+    assert title_of(made).endswith("; 1 not always frozen")
+    assert "Left out, for not frozen with every seed: planes." in table(made)
 
 
 def test_a_small_gate_that_is_missing_with_one_seed_is_not_compared() -> None:

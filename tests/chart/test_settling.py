@@ -36,6 +36,16 @@ def test_a_grid_that_has_skipped_nothing_yet_is_still_rising() -> None:
     assert still_rising(lines_of(results(run("A", curve=STILL), cold))) == ["grid"]
 
 
+def test_a_grid_that_took_the_time_of_training_is_named() -> None:
+    fine = run(
+        "fine", curve=STILL, train_seconds=9.0, learn_seconds=8.0, sampler="occupancy-grid-9"
+    )
+    gate = run("gate", curve=STILL, train_seconds=9.0, learn_seconds=8.0)
+    lines = lines_of(results(gate, fine))
+    assert still_rising(lines) == ["fine"]
+    assert "Updated its grid instead of training: fine for 89% of its time." in settling(lines)
+
+
 def test_tables_of_runs_of_equal_time_say_it_and_no_others() -> None:
     both = [run("A", curve=STILL), run("B", curve=RISING)]
     suite = {"suite": "freeze", "question": "Why?"}

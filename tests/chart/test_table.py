@@ -79,7 +79,9 @@ def test_what_a_gate_cost_when_it_was_frozen_stands_beside_what_it_skips_at_the_
 
 def test_runs_of_several_states_of_the_code_are_named() -> None:
     runs = [run("A", code="1b"), run("A", 1, code="1b"), run("B", code="2c")]
-    assert "Not all of them are of the same code (1b: A; 2c: B)." in table(results(*runs))
+    assert "Not all of them are of the same code, nor made in turns (1b: A; 2c: B)." in table(
+        results(*runs)
+    )
     assert "same code" not in table(results(*runs[:2]))
 
 

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from leco_plugin.chart.drawing.cells import number, rows, spread
 from leco_plugin.chart.findings.fronts import fronts_of
 from leco_plugin.chart.findings.learned import Learned
-from leco_plugin.chart.findings.representations import Representation
+from leco_plugin.chart.findings.representations import Representation, never_held_of
 from leco_plugin.chart.findings.summary import Line
 
 COLUMNS = (
@@ -50,18 +50,26 @@ def _scaled(value: float | None, scale: float) -> str:
 
 def representations_table(held: Sequence[Representation]) -> str:
     """What each keeps for its size and its learning time, and where nothing else beats it."""
-    header = ["representation", "kB", "learned in, s", "volume kept at equal loss, %"]
+    header = ["representation", "kB", "learned in, s", "of which beyond the field, s"]
+    header += ["volume kept at equal loss, %", "on the front of"]
     cells = [
         [
             one.name,
             number(one.median("size")),
             spread(one.of_seeds("learn_seconds"), ".0f"),
+            spread(one.of_seeds("beyond"), ".0f"),
             spread(one.of_seeds("kept"), ".1f"),
             ", ".join(fronts_of(one, held)) or "-",
         ]
         for one in held
     ]
-    return rows([*header, "on the front of"], cells)
+    return rows(header, cells)
+
+
+def never_held(lines: Sequence[Line]) -> str:
+    """Whose gate is not in the table, in a sentence; or nothing."""
+    names = never_held_of(lines)
+    return f"Left out, for not frozen with every seed: {', '.join(names)}." if names else ""
 
 
 def left_out(lines: Sequence[Line]) -> str:

@@ -17,6 +17,7 @@ from leco_plugin.chart.findings.summary import (
     COSTS,
     LEARNING,
     Line,
+    best_so_far,
     circumstances,
     front,
     lines_of,
@@ -25,7 +26,7 @@ from leco_plugin.chart.findings.summary import (
 SYMBOLS = ("circle", "square", "diamond", "triangle-up", "triangle-down", "cross", "x", "star")
 SIZES = ("size of the occupancy, kB", "learning the occupancy, s", "")
 KEPT_AGAINST_PSNR = ("space kept at equal loss, against PSNR, dB", "", "")
-FRONT = {"color": "rgba(120,120,120,0.45)", "width": 5, "shape": "hv"}
+FRONT = {"color": "rgba(120,120,120,0.45)", "width": 5}
 
 
 def write_page(results: Mapping[str, Any], path: Path) -> Path:
@@ -90,6 +91,8 @@ def _figure(lines: Sequence[Line], last: Sequence[str] = ()) -> Any:
             value = line.median(cost)
             if value is not None:
                 figure.add_trace(_point(line, i, value), row=2, col=column)
+    times, best = best_so_far(lines)
+    figure.add_trace(_front(list(zip(times.tolist(), best.tolist())), "linear"), row=1, col=1)
     for column, cost in enumerate(COSTS, start=1):
         known = [(value, line.psnr) for line in lines if (value := line.median(cost)) is not None]
         figure.add_trace(_front([known[j] for j in front(known)]), row=2, col=column)
@@ -124,12 +127,17 @@ def _marker(i: int, size: int) -> dict[str, Any]:
     return {"size": size, "symbol": SYMBOLS[i % len(SYMBOLS)], "color": colour}
 
 
-def _front(points: Sequence[tuple[float, float]]) -> Any:
+def _front(points: Sequence[tuple[float, float]], shape: str = "hv") -> Any:
     import plotly.graph_objects as go
 
     costs, gains = zip(*points) if points else ((), ())
     return go.Scatter(
-        x=costs, y=gains, mode="lines", line=FRONT, showlegend=False, hoverinfo="skip"
+        x=costs,
+        y=gains,
+        mode="lines",
+        line=FRONT | {"shape": shape},
+        showlegend=False,
+        hoverinfo="skip",
     )
 
 

@@ -164,7 +164,9 @@ def draw_learned(
     axes.set_xlabel("PSNR on unseen photographs, dB")
     never = [one.name for one in learned if not one.is_measured]
     _name_at_foot(
-        axes, [f"{name}: not always frozen" for name in never], [looks[one]["color"] for one in never]
+        axes,
+        [f"{name}: not always frozen" for name in never],
+        [looks[one]["color"] for one in never],
     )
     _draw_front(axes, places, theme, sign=-1.0, rightwards=True)
     names = [f"{one.name}{_never_guided(one)}" for one in shown]

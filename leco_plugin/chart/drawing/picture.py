@@ -11,9 +11,6 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-from numpy.typing import NDArray
-
 from leco_plugin.chart.drawing.names import name_points
 from leco_plugin.chart.drawing.panels import (
     draw_all_costs,
@@ -27,11 +24,11 @@ from leco_plugin.chart.drawing.title import asks_what_was_learned, title_of
 from leco_plugin.chart.findings.learned import learned_of
 from leco_plugin.chart.findings.representations import Representation, representations_of
 from leco_plugin.chart.findings.summary import (
+    COSTS,
     LEARNING,
     LOST_SURFACE_MASS,
-    MEMORY,
-    RENDERING,
     Line,
+    best_so_far,
     circumstances,
     lines_of,
 )
@@ -81,8 +78,8 @@ def draw(results: Mapping[str, Any], path: Path, theme: Theme = LIGHT) -> Path:
         below_title = TOP - 0.01 - LINE * (title.count("\n") + 1)
         figure.text(0.015, below_title, circumstances(results), va="top", fontsize=11.5)
         height = below_title - 0.08 - 0.43
-        below = [figure.add_axes((0.075 + 0.325 * i, 0.065, 0.255, 0.2)) for i in range(3)]
         if held or of_gates:
+            below = [figure.add_axes((0.075 + 0.24 * i, 0.065, 0.17, 0.2)) for i in range(4)]
             shown = KEPT_SPACE if held else LEARNED_SPACE
             figure.text(0.015, 0.335, WHAT_ELSE, va="top", fontsize=11.5)
             figure.text(0.015, below_title - 0.035, shown, va="top", fontsize=11.5)
@@ -99,6 +96,7 @@ def draw(results: Mapping[str, Any], path: Path, theme: Theme = LIGHT) -> Path:
             widest = max(len(name_of_end(line)) for line in lines)
             right = 0.93 - CHARACTER * min(widest, 40)
             main = figure.add_axes((0.075, 0.43, right - 0.075, height))
+            below = [figure.add_axes((0.075 + 0.325 * i, 0.065, 0.255, 0.2)) for i in range(3)]
             _draw_curves(main, lines, theme)
             _draw_learning(main, lines, theme)
             _name_ends(main, lines, theme)
@@ -130,10 +128,10 @@ def _draw_compared(
 
 
 def _draw_runs(below: Sequence[Any], lines: Sequence[Line], theme: Theme) -> None:
-    """PSNR against training time, rendering time and memory, small."""
+    """PSNR against training time and each of `COSTS`, small."""
     below[0].set_ylabel("PSNR, dB")
     _draw_curves(below[0], lines, theme, small=True)
-    for panel, cost in zip(below[1:], (RENDERING, MEMORY)):
+    for panel, cost in zip(below[1:], COSTS):
         draw_cost(panel, cost, lines, theme)
 
 
@@ -147,9 +145,8 @@ def _draw_curves(axes: Any, lines: Sequence[Line], theme: Theme, small: bool = F
         axes.plot(seconds, mean, linestyle=dashes, linewidth=width, color=look["color"])
         axes.fill_between(seconds, low, high, color=look["color"], alpha=0.16, linewidth=0)
         axes.plot(seconds[-1], mean[-1], markersize=size, **look)
-    if not small:
-        times, best = best_so_far(lines)
-        axes.plot(times, best, color=theme.ink, alpha=0.25, linewidth=9, zorder=1)
+    times, best = best_so_far(lines)
+    axes.plot(times, best, color=theme.ink, alpha=0.25, linewidth=5 if small else 9, zorder=1)
     plain(axes, theme)
     axes.set_xlim(0.0, 1.02 * longest)
     axes.margins(y=0.05)
@@ -158,15 +155,6 @@ def _draw_curves(axes: Any, lines: Sequence[Line], theme: Theme, small: bool = F
     else:
         axes.set_title("PSNR on unseen photographs, dB: more is better", fontsize=11.5, loc="left")
         axes.set_xlabel("seconds of training")
-
-
-def best_so_far(lines: Sequence[Line]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """The front of accuracy against training time: seconds [T], and the highest mean PSNR that any
-    contender has reached by then [T]."""
-    curves = [line.curve()[:2] for line in lines]
-    times = np.unique(np.concatenate([seconds for seconds, _ in curves]))
-    reached = [np.interp(times, seconds, psnr, left=-np.inf) for seconds, psnr in curves]
-    return times, np.maximum.accumulate(np.max(reached, axis=0))
 
 
 def _name_ends(axes: Any, lines: Sequence[Line], theme: Theme) -> None:

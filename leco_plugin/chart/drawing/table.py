@@ -10,6 +10,7 @@ from typing import Any
 from leco_plugin.chart.drawing.cells import cell, number, rows, spread
 from leco_plugin.chart.drawing.occupancy_tables import (
     left_out,
+    never_held,
     occupancy_table,
     representations_table,
 )
@@ -72,8 +73,7 @@ def table(results: Mapping[str, Any]) -> str:
         parts.append(occupancy_table(learned))
     if held := representations_of(lines):
         parts.append(representations_table(held))
-        if without := left_out(lines):
-            parts.append(without)
+        parts += [said for said in (never_held(lines), left_out(lines)) if said]
     if lines:
         parts.append(queries_table(lines))
     parts.append(provenance(results))
@@ -160,7 +160,7 @@ def provenance(results: Mapping[str, Any]) -> str:
         names += [run["name"]] if run["name"] not in names else []
     if len(by_code) > 1:
         of_each = "; ".join(f"{code}: {', '.join(names)}" for code, names in by_code.items())
-        said += f" Not all of them are of the same code ({of_each})."
+        said += f" Not all of them are of the same code, nor made in turns ({of_each})."
     return said
 
 

@@ -7,7 +7,7 @@ from typing import Any
 
 from leco_plugin.chart.findings.fronts import verdict
 from leco_plugin.chart.findings.learned import learned_headline, learned_of
-from leco_plugin.chart.findings.representations import representations_of
+from leco_plugin.chart.findings.representations import never_held_of, representations_of
 from leco_plugin.chart.findings.summary import headline, lines_of, sentence
 
 
@@ -16,7 +16,8 @@ def title_of(results: Mapping[str, Any]) -> str:
     lines = lines_of(results)
     held = representations_of(lines)
     if held:
-        return sentence(verdict(held))
+        never = len(never_held_of(lines))
+        return sentence(verdict(held)) + (f"; {never} not always frozen" if never else "")
     if asks_what_was_learned(results):
         return sentence(learned_headline(learned_of(lines)))
     return sentence(headline(results))

@@ -8,6 +8,8 @@ from leco_plugin.chart.findings.representations import Representation
 
 COSTS = {"size": "size", "learning time": "learn_seconds"}
 """Those on whose fronts representations are, and the figure of each in `Held`."""
+CHEAPEST = {"size": "smallest", "learning time": "soonest learned"}
+"""What is said of who is on a front because nothing costs less."""
 
 
 def fronts_of(one: Representation, all_of_them: Sequence[Representation]) -> list[str]:
@@ -21,27 +23,42 @@ def fronts_of(one: Representation, all_of_them: Sequence[Representation]) -> lis
 
 
 def verdict(representations: Sequence[Representation]) -> str:
-    """Which of ours keeps least space or is on which front; and on a front where none is, what is
-    ahead, always or mostly."""
+    """Where each of ours stands, and what is ahead of the gate that a run learns and writes on each
+    front that it is not on."""
     ours = [one for one in representations if one.ours]
     if not ours:
-        return "our own gate has no figures here"
-    fronts = {one.name: fronts_of(one, representations) for one in ours}
-    least = min(representations, key=lambda one: one.kept)
-    said = [_place_of(one, fronts[one.name], one is least) for one in reversed(ours)]
-    for name, figure in COSTS.items():
-        if not any(name in found for found in fronts.values()):
-            said.append(f"in {name} {_ahead(ours[-1], representations, figure)}")
+        return "our own gate was not frozen with every seed"
+    said = [_place_of(one, representations) for one in reversed(ours)]
+    learned = ours[0]
+    fronts = fronts_of(learned, representations)
+    said += [
+        f"in {name} {_ahead(learned, representations, figure)}"
+        for name, figure in COSTS.items()
+        if name not in fronts
+    ]
     return "; ".join(said)
 
 
-def _place_of(one: Representation, fronts: Sequence[str], is_least: bool) -> str:
-    """Where one of ours stands."""
-    if is_least:
+def _place_of(one: Representation, all_of_them: Sequence[Representation]) -> str:
+    """Where one of ours stands: whoever costs least is on a front whatever it keeps."""
+    if one is min(all_of_them, key=lambda other: other.kept):
         return f"{one.name} keeps least space, {one.kept:.1f}% in {one.median('size'):.0f} kB"
-    if not fronts:
-        return f"{one.name} is on neither front"
-    return f"{one.name} is on {'both fronts' if len(fronts) > 1 else f'the front of {fronts[0]}'}"
+    fronts = fronts_of(one, all_of_them)
+    by_cost = [name for name in fronts if _costs_least(one, all_of_them, COSTS[name])]
+    by_space = [name for name in fronts if name not in by_cost]
+    said = [f"the {CHEAPEST[name]}" for name in by_cost]
+    if by_space:
+        said.append("on both fronts" if len(by_space) > 1 else f"on the front of {by_space[0]}")
+    return f"{one.name} is {' and '.join(said) or 'on neither front'}"
+
+
+def _costs_least(one: Representation, others: Sequence[Representation], figure: str) -> bool:
+    """Whether nothing that is beside it costs as little."""
+    return all(
+        other is one or other.median(figure) > one.median(figure)
+        for other in others
+        if other.has(figure)
+    )
 
 
 def _ahead(one: Representation, others: Sequence[Representation], figure: str) -> str:

@@ -29,6 +29,8 @@ class Held(NamedTuple):
     """Until it is there; None for a grid, which is made from a field that learned a gate too."""
     kept: float
     """Percent of the volume that rays reach which it keeps when all lose equally much."""
+    beyond: float | None = None
+    """Seconds to make it of a field that has learned a gate; None for the gate itself."""
 
 
 @dataclass(frozen=True)
@@ -108,6 +110,12 @@ def representations_of(lines: Sequence[Line]) -> list[Representation]:
     return found if len(kinds) > 1 else []
 
 
+def never_held_of(lines: Sequence[Line]) -> list[str]:
+    """Whose gate was not frozen and measured in every run, and is left out for that."""
+    gates = [line for line in lines if line.learned]
+    return [line.name for line in gates if any(_of_gate(run) is None for run in line.runs)]
+
+
 def resolutions_of(runs: Sequence[Mapping[str, Any]]) -> list[str]:
     """Of the grids that were made in some run, from coarse to fine."""
     made = {str(grid["resolution"]) for run in runs for grid in _grids(run)}
@@ -132,7 +140,8 @@ def _taught(line: Line, ours: bool) -> list[Representation]:
     for run in line.runs:
         for row in run["occupancy"]["at_equal_loss"].get("taught", ()):
             seconds = run["learn_seconds"] + row["seconds"]
-            held = Held(row["bytes"] / 1e3, seconds, 100.0 * row["kept_reached_volume"])
+            kept = 100.0 * row["kept_reached_volume"]
+            held = Held(row["bytes"] / 1e3, seconds, kept, row["seconds"])
             by_kind.setdefault(row["name"], {})[run["seed"]] = held
     return [
         Representation(SMALL_OURS, held, True, kind)
@@ -146,5 +155,6 @@ def _taught(line: Line, ours: bool) -> list[Representation]:
 def _of_grid(run: Mapping[str, Any], resolution: str) -> Held | None:
     for grid in _grids(run):
         if str(grid["resolution"]) == resolution:
-            return Held(grid["bytes"] / 1e3, None, 100.0 * grid["kept_reached_volume"])
+            kept = 100.0 * grid["kept_reached_volume"]
+            return Held(grid["bytes"] / 1e3, None, kept, grid.get("update_seconds"))
     return None

@@ -15,6 +15,8 @@ from leco_plugin.chart.findings.summary import Line
 
 ENOUGH = 0.3
 """dB in the last third of a run's time: who gains more is still rising."""
+HARDLY_TRAINED = 0.4
+"""Share of its time from which on a run that kept its grid up has hardly trained."""
 
 
 def last_gain(line: Line) -> float | None:
@@ -32,17 +34,21 @@ def last_gain(line: Line) -> float | None:
 
 def still_rising(lines: Sequence[Line]) -> list[str]:
     """Who gained more than `ENOUGH` at last, as far as a gain is shown, or is not known to gain
-    less, or whose grid has not skipped anything yet."""
+    less, or whose grid has not skipped anything yet or has taken the time of training."""
     gains = [(line, last_gain(line)) for line in lines]
     return [
         line.name
         for line, gain in gains
-        if gain is None or round(gain, 1) > ENOUGH or line.warming_up
+        if gain is None
+        or round(gain, 1) > ENOUGH
+        or line.warming_up
+        or line.kept_up > HARDLY_TRAINED
     ]
 
 
 def settling(lines: Sequence[Line]) -> str:
-    """In two sentences, what all gained at last, and who is still rising."""
+    """In two sentences, what all gained at last, and who is still rising; and whose grid has taken
+    the time of training."""
     listed = ", ".join(
         f"{line.name} {'unknown' if gain is None else f'{gain:+.1f} dB'}"
         for line in lines
@@ -51,7 +57,13 @@ def settling(lines: Sequence[Line]) -> str:
     rising = still_rising(lines)
     who = "all of them" if len(rising) == len(lines) else " and ".join(rising)
     said = f"Still rising: {who or 'none'}"
+    hardly = [
+        f"{line.name} for {line.kept_up:.0%} of its time"
+        for line in lines
+        if line.kept_up > HARDLY_TRAINED
+    ]
+    kept_up = f" Updated its grid instead of training: {', '.join(hardly)}." if hardly else ""
     return (
         f"Gained in the last third of the time: {listed}. {said}; rates fall to a tenth over the "
-        "time that is given, so that others may gain by more of it too."
+        f"time that is given, so that others may gain by more of it too.{kept_up}"
     )

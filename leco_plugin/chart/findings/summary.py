@@ -84,6 +84,17 @@ class Line:
         """Whether it ends, with some seed, while its occupancy grid is in its warm-up."""
         return any(run.get("warming_up") for run in self.runs)
 
+    @property
+    def kept_up(self) -> float:
+        """Share of its training in which an occupancy grid was updated, median over seeds; 0 where
+        it has none."""
+        seconds = None if self.learned else self.median(LEARNING)
+        return (
+            0.0
+            if seconds is None
+            else seconds / statistics.median(run["train_seconds"] for run in self.runs)
+        )
+
     def mean(self, key: str) -> float | None:
         """Mean over seeds of a figure of quality; None where a seed has none."""
         values = [run.get(key) for run in self.runs]
@@ -147,6 +158,15 @@ def front(points: Sequence[tuple[float, float]]) -> list[int]:
         if not found or points[i][1] > points[found[-1]][1]:
             found.append(i)
     return found
+
+
+def best_so_far(lines: Sequence[Line]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """The front of accuracy against training time: seconds [T], and the highest mean PSNR that any
+    contender has reached by then [T]."""
+    curves = [line.curve()[:2] for line in lines]
+    times = np.unique(np.concatenate([seconds for seconds, _ in curves]))
+    reached = [np.interp(times, seconds, psnr, left=-np.inf) for seconds, psnr in curves]
+    return times, np.maximum.accumulate(np.max(reached, axis=0))
 
 
 def headline(results: Mapping[str, Any]) -> str:

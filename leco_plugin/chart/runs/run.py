@@ -29,7 +29,7 @@ TABLE = "table.md"
 
 def jobs_of(contenders: Sequence[Contender], seeds: Sequence[int]) -> list[Job]:
     """All runs: the contenders take turns within a seed, each seed beginning with another, so that
-    a machine whose speed drifts treats them alike and no two always run beside each other."""
+    a machine whose speed drifts treats them alike."""
     jobs = []
     for turn, seed in enumerate(dict.fromkeys(seeds)):
         first = turn % len(contenders)

@@ -121,7 +121,8 @@ def _at_freezing(
     """What the gate, and representations made of the field, keep of the field as it was when the
     gate was frozen, if it ever was.
 
-    After the run, so that neither its memory nor its random numbers know of it.
+    After the run, so that its random numbers know nothing of it; of its memory only the weights
+    that were set aside at freezing.
     """
     from leco_plugin.chart.runs.beside import compared
 
