@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+import warnings
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -183,12 +184,9 @@ def demo(out: Path = Path("runs/demo"), seconds: float = 130.0, json: Path | Non
         json: Another file for the report.
     """
     import time
-    import warnings
 
     began = time.monotonic()
 
-    # what nerfstudio and torch think of each other is nothing that a user can act on
-    warnings.filterwarnings("ignore", module=r"nerfstudio|torch")
     from leco_plugin.demo import run_demo, summary
 
     _check_json(json)
@@ -229,7 +227,9 @@ def chart(
             losses 9 to 22, freeze 13 to 16, enough-time 12 to 14, grid-resolution 15 to 16. Several
             of them, or all, have a folder each in that of --out and share their runs: all take 61
             to 108 minutes.
-        seconds: Training time of each run.
+        seconds: Training time of each run. Methods need it or --steps; without either, runs of a
+            suite end after 400 steps (4,000 on a GPU), or after 90 s (freeze) or 120 s where times
+            are compared.
         steps: Training steps of each run; with both, a run ends with the first.
         seeds: Seeds.
         learn_seconds: Most of a run, about, that learning its occupancy may take. By default 0.4 of
@@ -289,10 +289,7 @@ def stability(
         quick: Tiny pictures and few steps, to see whether everything works; no verdicts.
         json: Another file for the results.
     """
-    import warnings
 
-    # what nerfstudio and torch think of each other is nothing that a user can act on
-    warnings.filterwarnings("ignore", module=r"nerfstudio|torch")
     from leco_plugin.stability.command import make_table
     from leco_plugin.stability.table import blind, headline
 
@@ -315,10 +312,7 @@ def check(name: Annotated[str, tyro.conf.Positional], json: Path | None = None) 
         json: File for the verdicts as JSON.
     """
     _check_json(json)
-    import warnings
 
-    # what nerfstudio and torch think of each other is nothing that a user can act on
-    warnings.filterwarnings("ignore", module=r"nerfstudio|torch")
     from leco_plugin.conformance.checking import check as verdicts_on
 
     verdicts = []
@@ -350,6 +344,8 @@ COMMANDS: dict[str, Callable[..., None]] = {
 def main(arguments: Sequence[str] | None = None) -> int:
     """Runs `leco`: 0, or one line on stderr and 2 for bad input, 1 for a failure."""
     given = list(sys.argv[1:] if arguments is None else arguments)
+    # what nerfstudio and torch think of each other is nothing that a user can act on
+    warnings.filterwarnings("ignore", module=r"nerfstudio|torch")
     try:
         tyro.extras.subcommand_cli_from_dict(
             COMMANDS,

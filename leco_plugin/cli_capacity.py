@@ -78,10 +78,7 @@ def shrink(
         json: File for the gates that were tried and the one that was chosen, as JSON; each is
             written when it was tried, so that a search that is stopped leaves those.
     """
-    import warnings
 
-    # what nerfstudio and torch think of each other is nothing that a user can act on
-    warnings.filterwarnings("ignore", module=r"nerfstudio|torch")
     from leco_plugin.shrink.command import shrink as find_smaller
     from leco_plugin.shrink.rungs import Bounds
     from leco_plugin.shrink.saying import summary
@@ -121,10 +118,7 @@ def capacity(
         learn_steps: Steps in which the field is learned, at most.
         json: Another file for the results.
     """
-    import warnings
 
-    # what nerfstudio and torch think of each other is nothing that a user can act on
-    warnings.filterwarnings("ignore", module=r"nerfstudio|torch")
     from leco_plugin.capacity.command import capacity as measure
 
     check_json(json)

@@ -58,14 +58,17 @@ def test_it_is_said_for_every_scene_whether_ours_is_on_the_fronts(
     assert "Of 2 scenes, MLP (ours) is on the front of size on 2 and of learning time on 1." in text
     link = "suites.md#suite-representations-on-city"
     kept = "| 12.5%, 50 kB | 30.0%, 33 kB | 10.0%, 4.0 MB |"
-    assert f"| [city]({link}) {kept} MLP (ours) is the smallest and the soonest learned" in text
-    assert "MLP (ours) is the smallest; in learning time hash grid is ahead" in text
+    assert (
+        f"| [city]({link}) {kept} MLP (ours) is the soonest learned and on the front of size"
+        in text
+    )
+    assert "MLP (ours) is on the front of size, behind hash grid in learning time" in text
 
 
 def test_a_grid_that_is_smaller_and_keeps_less_is_named(answers: ModuleType, store: Any) -> None:
     store("representations", "city", *representations(10.0, grid_kept=(0.05,)), **STEPS)
     text = text_of(answers)
-    assert "on the front of size on 0" in text and "in size grid 64³ is ahead |" in text
+    assert "on the front of size on 0" in text and "behind grid 64³ in size |" in text
 
 
 def test_one_that_keeps_less_with_most_seeds_only_is_named_too(
@@ -74,7 +77,7 @@ def test_one_that_keeps_less_with_most_seeds_only_is_named_too(
     store("representations", "city", *representations(10.0, grid_kept=(0.05, 0.05, 0.3)), **STEPS)
     text = text_of(answers)
     assert "of size on 0 and of learning time on 1." in text
-    assert "in size grid 64³ is ahead, not with every seed |" in text
+    assert "behind grid 64³ (not with every seed) in size |" in text
 
 
 def test_minutes_are_those_of_runs_two_at_a_time_and_shared_ones_count_once(

@@ -46,7 +46,11 @@ def test_ours_and_the_rivals_that_keep_least_stand_beside_equal_time(
     own = run("Switch-NeRF + coarse and fine samples", psnr=17.25)
     ours = run("Switch-NeRF + learned occupancy", psnr=19.0)
     store(tmp_path, "enough-time", "city", ours, own)
-    head, _, row = parts.rivals_table().splitlines()
+    head, _, row, _, said = parts.rivals_table().splitlines()
+    assert said == (
+        "`leco-occupancy` keeps less than the best other gate on 0 of 1 scenes and less than the "
+        "best grid on 1; a learned occupancy has the highest PSNR with every seed on 1 of 1."
+    )
     assert head.endswith(
         "| PSNR after 10 s: learned occupancy | PSNR after 10 s: coarse and fine samples |"
     )
@@ -67,7 +71,8 @@ def test_columns_are_those_of_all_scenes_and_old_charts_are_marked(
         names = ["a", "b"] if scene == "city" else ["b"]
         store(tmp_path, "enough-time", scene, *(run(f"Host + {name}") for name in names))
     (tmp_path / "notes.json").write_text('{"fox-enough-time": "Made before."}')
-    head, _, city, fox = parts.rivals_table().splitlines()
+    head, _, city, fox, _, said = parts.rivals_table().splitlines()
+    assert "on 1 of 2 scenes" in said and "every seed on 0 of 2" in said
     assert head.count("|") == city.count("|") == fox.count("|")
     assert city.startswith("| city |") and fox.startswith("| fox (*) | - |")
 

@@ -100,8 +100,10 @@ def test_after_a_kill_only_what_is_missing_is_made(
     first, second = Runner(stops_at), Runner()
     with pytest.raises(KeyboardInterrupt):
         make(chart(tiny_scene, tmp_path), first)
-    stored = json.loads((tmp_path / "results.json").read_text())["runs"]
-    assert len(stored) == stops_at
+    found = json.loads((tmp_path / "results.json").read_text())
+    assert (len(found["runs"]), found["missing"]) == (stops_at, 6 - stops_at)
+    said = f"**{stops_at} of 6 runs so far**: what is said here may change."
+    assert said in (tmp_path / "table.md").read_text()
     results = make(chart(tiny_scene, tmp_path), second)
     assert first.made + second.made == IN_TURNS
     whole = make(chart(tiny_scene, tmp_path / "whole"), Runner())
@@ -119,7 +121,7 @@ def test_a_crash_is_a_row_and_the_others_finish(tiny_scene: Path, tmp_path: Path
         ("b", 1, "b is broken"),
     ]
     table = (tmp_path / "table.md").read_text()
-    assert "| b | 0 | failed: b is broken |" in table
+    assert "| b | 0 | failed: b is broken |" in table and "so far" not in table
     assert "seed 1, b: failed: b is broken" in said
 
 

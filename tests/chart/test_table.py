@@ -112,9 +112,9 @@ def test_representations_say_on_which_front_they_are_and_whether_ours_is() -> No
         learn_seconds=8.0,
     )
     text = table(results(ours, other))
-    assert rows(text, "MLP (ours)")[2] == ["MLP (ours)", "51", "9", "12.5", "size"]
+    assert rows(text, "MLP (ours)")[2] == ["MLP (ours)", "51", "9", "-", "12.5", "size"]
     assert rows(text, "hash grid")[2][-1] == "size, learning time"
-    assert "MLP (ours) is on the front of size; in learning time hash grid is ahead." in text
+    assert "MLP (ours) is the smallest, behind hash grid in learning time." in text
 
 
 def test_grids_that_could_not_be_made_are_named() -> None:

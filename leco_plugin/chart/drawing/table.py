@@ -58,6 +58,9 @@ def table(results: Mapping[str, Any]) -> str:
         *([results["question"]] if results["question"] else []),
     ]
     lines = lines_of(results) if results["runs"] else []
+    if missing := results.get("missing", 0):
+        made = len(results["runs"])
+        parts.append(f"**{made} of {made + missing} runs so far**: what is said here may change.")
     if lines:
         parts += [f"{title_of(results)}. {circumstances(results)}.", runs_table(lines)]
     if warming := [line.name for line in lines if line.warming_up]:

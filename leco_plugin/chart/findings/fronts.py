@@ -28,19 +28,22 @@ def verdict(representations: Sequence[Representation]) -> str:
     ours = [one for one in representations if one.ours]
     if not ours:
         return "our own gate was not frozen with every seed"
-    said = [_place_of(one, representations) for one in reversed(ours)]
-    learned = ours[0]
+    learned, *small = ours
+    said = [_place_of(one, representations) or f"{one.name} is on neither front" for one in small]
     fronts = fronts_of(learned, representations)
-    said += [
-        f"in {name} {_ahead(learned, representations, figure)}"
+    behind = [
+        f"behind {_ahead(learned, representations, figure)} in {name}"
         for name, figure in COSTS.items()
         if name not in fronts
     ]
-    return "; ".join(said)
+    place = _place_of(learned, representations)
+    if behind:
+        place = f"{place or f'{learned.name} is'}{', ' if place else ' '}{', '.join(behind)}"
+    return "; ".join([*said, place])
 
 
 def _place_of(one: Representation, all_of_them: Sequence[Representation]) -> str:
-    """Where one of ours stands: whoever costs least is on a front whatever it keeps."""
+    """Where one of ours stands, if it is on a front: whoever costs least is, whatever it keeps."""
     if one is min(all_of_them, key=lambda other: other.kept):
         return f"{one.name} keeps least space, {one.kept:.1f}% in {one.median('size'):.0f} kB"
     fronts = fronts_of(one, all_of_them)
@@ -49,7 +52,7 @@ def _place_of(one: Representation, all_of_them: Sequence[Representation]) -> str
     said = [f"the {CHEAPEST[name]}" for name in by_cost]
     if by_space:
         said.append("on both fronts" if len(by_space) > 1 else f"on the front of {by_space[0]}")
-    return f"{one.name} is {' and '.join(said) or 'on neither front'}"
+    return f"{one.name} is {' and '.join(said)}" if said else ""
 
 
 def _costs_least(one: Representation, others: Sequence[Representation], figure: str) -> bool:
@@ -66,4 +69,4 @@ def _ahead(one: Representation, others: Sequence[Representation], figure: str) -
     leaders = [other for other in others if other.has(figure) and other.leads(one, figure)]
     best = min(leaders, key=lambda other: other.kept)
     always = best.leads_always(one, figure)
-    return f"{best.name} is ahead" + ("" if always else ", not with every seed")
+    return best.name + ("" if always else " (not with every seed)")

@@ -48,7 +48,7 @@ def figure_in(values: Any, key: str) -> float | None:
 
 
 RENDERING = Cost("render_seconds_per_image", "rendering an image", "s")
-MEMORY = Cost("peak_memory_bytes", "peak memory in training", "GB", 1e-9)
+MEMORY = Cost("peak_memory_bytes", "peak memory", "GB", 1e-9)
 QUERIES = Cost("field_queries_per_ray", "field queries a ray", "")
 LEARNING = Cost("learn_seconds", "learning the occupancy", "s")
 KEPT = Cost("occupancy.at_equal_loss.kept_reached_volume", "volume kept at equal loss", "%", 100.0)

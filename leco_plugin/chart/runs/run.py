@@ -195,7 +195,14 @@ class Chart:
             "occupancy": occupancies[0] if occupancies else None,
             "runs": runs,
             "failures": self._failures(),
+            "missing": self._unfinished(stored),
         }
+
+    def _unfinished(self, stored: Mapping[str, object]) -> int:
+        """How many of the runs of this call have neither ended well nor failed yet."""
+        failed = {(one["name"], one["seed"]) for one in self.folder.failures()}
+        todo = [job for job in self.jobs if job.name not in stored]
+        return sum((job.contender.name, job.seed) not in failed for job in todo)
 
     def _made(self) -> dict[str, Any]:
         """When, how and by which code something is made now."""
