@@ -15,6 +15,7 @@ from leco_plugin.chart.findings.summary import Line, ahead, lines_of
 
 DEMO = "<!-- demo table: generated -->", "<!-- end of the demo table -->"
 OURS = "kept, less is better: `leco-occupancy`"
+SMALL, OTHER_GATE, GRID = "small MLP of ours", "best other gate", "best grid"
 RIVALS = "<!-- rivals: generated -->", "<!-- end of the rivals -->"
 
 
@@ -74,24 +75,23 @@ def rivals_table() -> str:
 def _standing(held: Sequence[list[Representation]], timed: Sequence[list[Line]]) -> str:
     """On how many scenes ours is ahead of its rivals, in a sentence."""
     many = len(timed)
-    counts = {
-        title: sum(_keeps_least(_grouped(of), title) for of in held)
-        for title in ("best other gate", "best grid")
-    }
+    best = [_grouped(of) for of in held]
+    gates, grids = (sum(_less(of, OURS, one) for of in best) for one in (OTHER_GATE, GRID))
+    small = sum(_less(of, SMALL, GRID) for of in best)
     ours = [next((line for line in lines if line.learned), None) for lines in timed]
     ahead_of_all = sum(
         one is not None and all(ahead(one, other) for other in lines if other is not one)
         for one, lines in zip(ours, timed)
     )
     return (
-        f"`leco-occupancy` keeps less than the best other gate on {counts['best other gate']} of "
-        f"{many} scenes and less than the best grid on {counts['best grid']}; a learned occupancy "
-        f"has the highest PSNR with every seed on {ahead_of_all} of {many}."
+        f"Of {many} scenes, `leco-occupancy` keeps less than the best other gate on {gates} and "
+        f"less than the best grid on {grids}, a small MLP less than the best grid on {small}; a learned "
+        f"occupancy has the highest PSNR with every seed on {ahead_of_all}."
     )
 
 
-def _keeps_least(best: dict[str, Representation], rival: str) -> bool:
-    return OURS in best and rival in best and best[OURS].kept < best[rival].kept
+def _less(best: dict[str, Representation], one: str, rival: str) -> bool:
+    return one in best and rival in best and best[one].kept < best[rival].kept
 
 
 def _shortest(suite: str) -> dict[str, tuple[str, dict[str, Any]]]:
@@ -108,9 +108,9 @@ def _grouped(held: list[Representation]) -> dict[str, Representation]:
     """Each of ours, and those that keep least of the grids and of the other gates."""
     groups = {
         OURS: [one for one in held if one.ours and one.kind is None],
-        "small MLP of ours": [one for one in held if one.ours and one.kind is not None],
-        "best other gate": [one for one in held if not one.ours and not one.is_grid],
-        "best grid": [one for one in held if one.is_grid],
+        SMALL: [one for one in held if one.ours and one.kind is not None],
+        OTHER_GATE: [one for one in held if not one.ours and not one.is_grid],
+        GRID: [one for one in held if one.is_grid],
     }
     return {title: min(some, key=lambda one: one.kept) for title, some in groups.items() if some}
 
