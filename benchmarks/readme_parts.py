@@ -85,8 +85,8 @@ def _standing(held: Sequence[list[Representation]], timed: Sequence[list[Line]])
     )
     return (
         f"Of {many} scenes, `leco-occupancy` keeps less than the best other gate on {gates} and "
-        f"less than the best grid on {grids}, a small MLP less than the best grid on {small}; a learned "
-        f"occupancy has the highest PSNR with every seed on {ahead_of_all}."
+        f"less than the best grid on {grids}, a small MLP less than the best grid on {small}; a "
+        f"learned occupancy has the highest PSNR with every seed on {ahead_of_all}."
     )
 
 
