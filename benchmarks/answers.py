@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import checkout  # noqa: F401
-from chart_sections import by_scene, length_of, notes, titles
+from chart_sections import by_scene, notes
 from page_parts import size
 from suite_times import minutes_section
 
@@ -50,17 +49,16 @@ time is given.
 
 def answers_section() -> list[str]:
     """Suite by suite, a row for each scene; nothing where no suite is stored."""
-    parts, shortest = [], []
+    parts, shown = [], []
     for suite, its in SUITES.items():
-        scenes = by_scene(suite).values()
-        shortest += [charts[0][1] for charts in scenes]
-        if rows := [chart for charts in scenes for chart in charts]:
-            parts += [f"### {its.question}\n", *_answer(rows)]
-    return [HEAD, *parts, *minutes_section(shortest)] if parts else []
+        if charts := list(by_scene(suite).values()):
+            parts += [f"### {its.question}\n", *_answer(charts)]
+            shown += [results for _, results in charts]
+    return [HEAD, *parts, *minutes_section(shown)] if parts else []
 
 
 def _answer(charts: Sequence[tuple[str, dict[str, Any]]]) -> list[str]:
-    noted, titled = notes(), titles()
+    noted = notes()
     kinds = [_kind(results) for _, results in charts]
     figures, cells_of = next((kind for kind in kinds if kind[0] == KEPT), kinds[0])
     cells = [cells_of(lines_of(results)) for _, results in charts]
@@ -69,20 +67,14 @@ def _answer(charts: Sequence[tuple[str, dict[str, Any]]]) -> list[str]:
     for (name, results), row in zip(charts, cells):
         shown = " | ".join(row.get(column, "-") for column in columns)
         mark = " (*)" if name in noted else ""
-        rows.append(
-            f"| {_link(results, titled[name], charts)}{mark} | {shown} | {_answer_of(results)} |"
-        )
+        rows.append(f"| {_link(results)}{mark} | {shown} | {_answer_of(results)} |")
     counted = [_fronts([results for _, results in charts])] if figures == KEPT else []
     return [figures, *rows, "", *counted]
 
 
-def _link(results: dict[str, Any], title: str, charts: Sequence[tuple[str, dict[str, Any]]]) -> str:
-    """The scene, with the length of the runs where there are several charts of it."""
+def _link(results: Mapping[str, Any]) -> str:
     scene = results["scene"]["name"]
-    several = sum(other["scene"]["name"] == scene for _, other in charts) > 1
-    said = f"{scene}, {length_of(results)}" if several else scene
-    anchor = re.sub(r"[^\w -]", "", title.lower()).replace(" ", "-")
-    return f"[{said}](suites.md#{anchor})"
+    return f"[{scene}](suites.md#suite-{results['suite']}-on-{scene})"
 
 
 def _kind(results: Mapping[str, Any]) -> tuple[str, Callable[[Sequence[Line]], dict[str, str]]]:

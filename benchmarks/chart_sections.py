@@ -26,29 +26,18 @@ def titles() -> dict[str, str]:
         key=lambda name: (_place(others[name], order), name),
     ):
         scene, suite = others[name]["scene"]["name"], others[name]["suite"]
-        title = f"Suite `{suite}` on {scene}" if suite else scene
-        found[name] = (
-            title if title not in found.values() else f"{title}, {length_of(others[name])}"
-        )
+        found[name] = f"Suite `{suite}` on {scene}" if suite else scene
     return found
 
 
-def length_of(results: dict[str, Any]) -> str:
-    """Of the runs of a chart."""
-    protocol = results["protocol"]
-    seconds, steps = protocol["seconds"], protocol.get("steps")
-    return f"{steps} steps" if seconds is None else f"{seconds:g} s"
-
-
-def by_scene(suite: str) -> dict[str, list[tuple[str, dict[str, Any]]]]:
-    """Names and results of the stored charts of a suite, those with the shortest runs first."""
-    found: dict[str, list[tuple[str, dict[str, Any]]]] = {}
-    for name, results in ((name, stored(name)) for name in titles()):
-        if results["suite"] == suite:
-            found.setdefault(results["scene"]["name"], []).append((name, results))
-    for charts in found.values():
-        charts.sort(key=lambda chart: chart[1]["protocol"]["seconds"] or 0.0)
-    return found
+def by_scene(suite: str) -> dict[str, tuple[str, dict[str, Any]]]:
+    """Name and results of the stored charts of a suite, by scene."""
+    charts = [(name, stored(name)) for name in titles()]
+    return {
+        results["scene"]["name"]: (name, results)
+        for name, results in charts
+        if results["suite"] == suite
+    }
 
 
 def _place(results: dict[str, Any], order: list[str]) -> int:

@@ -53,13 +53,15 @@ def demo_table(report: dict[str, Any]) -> str:
 def rivals_table() -> str:
     """A row for each scene of which both suites are stored: what must be sampled, and accuracy
     after equal time, with the least and the most of all seeds."""
-    space, times = (_shortest(suite) for suite in ("representations", "enough-time"))
+    space, times = by_scene("representations"), by_scene("enough-time")
+    scenes = sorted(space.keys() & times.keys())
+    best = {scene: _grouped(representations_of(lines_of(space[scene][1]))) for scene in scenes}
     rows = {
         _marked(scene, [space[scene][0], times[scene][0]]): {
-            **_kept(representations_of(lines_of(space[scene][1]))),
+            **_kept(best[scene]),
             **_reached(times[scene][1]),
         }
-        for scene in sorted(space.keys() & times.keys())
+        for scene in scenes
     }
     if not rows:
         return "Not measured yet."
@@ -67,15 +69,13 @@ def rivals_table() -> str:
     lines = [f"| scene | {' | '.join(columns)} |", f"|---|{'---|' * len(columns)}"]
     for scene, row in rows.items():
         lines.append(f"| {scene} | {' | '.join(row.get(name, '-') for name in columns)} |")
-    scenes = sorted(space.keys() & times.keys())
-    held = [representations_of(lines_of(space[scene][1])) for scene in scenes]
-    return "\n".join([*lines, "", _standing(held, [lines_of(times[scene][1]) for scene in scenes])])
+    timed = [lines_of(times[scene][1]) for scene in scenes]
+    return "\n".join([*lines, "", _standing(list(best.values()), timed)])
 
 
-def _standing(held: Sequence[list[Representation]], timed: Sequence[list[Line]]) -> str:
+def _standing(best: Sequence[dict[str, Representation]], timed: Sequence[list[Line]]) -> str:
     """On how many scenes ours is ahead of its rivals, in a sentence."""
     many = len(timed)
-    best = [_grouped(of) for of in held]
     gates, grids = (sum(_less(of, OURS, one) for of in best) for one in (OTHER_GATE, GRID))
     small = sum(_less(of, SMALL, GRID) for of in best)
     ours = [next((line for line in lines if line.learned), None) for lines in timed]
@@ -94,11 +94,6 @@ def _less(best: dict[str, Representation], one: str, rival: str) -> bool:
     return one in best and rival in best and best[one].kept < best[rival].kept
 
 
-def _shortest(suite: str) -> dict[str, tuple[str, dict[str, Any]]]:
-    """Name and results of a suite's chart of each scene."""
-    return {scene: charts[0] for scene, charts in by_scene(suite).items()}
-
-
 def _marked(scene: str, charts: list[str]) -> str:
     """A scene, marked where one of its charts was made before a mend."""
     return f"{scene} (*)" if notes().keys() & set(charts) else scene
@@ -115,12 +110,12 @@ def _grouped(held: list[Representation]) -> dict[str, Representation]:
     return {title: min(some, key=lambda one: one.kept) for title, some in groups.items() if some}
 
 
-def _kept(held: list[Representation]) -> dict[str, str]:
+def _kept(best: dict[str, Representation]) -> dict[str, str]:
     """What they keep, and their sizes."""
     return {
         title: f"{one.kept:.1f}%, {size(one.median('size'))}"
         + ("" if one.ours else f" ({one.name.removeprefix('grid ')})")
-        for title, one in _grouped(held).items()
+        for title, one in best.items()
     }
 
 

@@ -27,8 +27,6 @@ def minutes_section(charts: Sequence[dict[str, Any]]) -> list[str]:
     times: dict[str, dict[str, str]] = {}
     together: dict[str, float] = {}
     for results in charts:
-        if results["suite"] is None:
-            continue
         scene = results["scene"]["name"]
         its = times.setdefault(scene, {})
         spent = [run.get("wall_seconds") for run in results["runs"]]

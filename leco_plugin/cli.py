@@ -186,7 +186,6 @@ def demo(out: Path = Path("runs/demo"), seconds: float = 130.0, json: Path | Non
     import time
 
     began = time.monotonic()
-
     from leco_plugin.demo import run_demo, summary
 
     _check_json(json)
@@ -289,7 +288,6 @@ def stability(
         quick: Tiny pictures and few steps, to see whether everything works; no verdicts.
         json: Another file for the results.
     """
-
     from leco_plugin.stability.command import make_table
     from leco_plugin.stability.table import blind, headline
 
@@ -312,7 +310,6 @@ def check(name: Annotated[str, tyro.conf.Positional], json: Path | None = None) 
         json: File for the verdicts as JSON.
     """
     _check_json(json)
-
     from leco_plugin.conformance.checking import check as verdicts_on
 
     verdicts = []

@@ -78,7 +78,6 @@ def shrink(
         json: File for the gates that were tried and the one that was chosen, as JSON; each is
             written when it was tried, so that a search that is stopped leaves those.
     """
-
     from leco_plugin.shrink.command import shrink as find_smaller
     from leco_plugin.shrink.rungs import Bounds
     from leco_plugin.shrink.saying import summary
@@ -118,7 +117,6 @@ def capacity(
         learn_steps: Steps in which the field is learned, at most.
         json: Another file for the results.
     """
-
     from leco_plugin.capacity.command import capacity as measure
 
     check_json(json)

@@ -106,7 +106,7 @@ def learned_headline(learned: Sequence[Learned]) -> str:
     others = [one for one in known if one is not ours]
     if better := [one for one in others if one.kept < ours.kept and one.psnr > ours.psnr]:
         best = min(better, key=lambda one: one.kept)
-        level = "" if is_better(best, ours) else ", level by seeds"
+        level = "" if _is_better(best, ours) else ", level by seeds"
         return f"{best.name} keeps {_figures(best)}, {ours.name} {_figures(ours)}{level}"
     said = f"{ours.name} keeps {_figures(ours)}"
     if others:
@@ -148,7 +148,7 @@ def _is_level(one: Learned, other: Learned) -> bool:
     )
 
 
-def is_better(one: Learned, other: Learned) -> bool:
+def _is_better(one: Learned, other: Learned) -> bool:
     """Whether one keeps less space at more PSNR with every seed."""
     theirs = other.kept_by_seed
     return all(
