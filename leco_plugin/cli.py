@@ -148,6 +148,7 @@ def swap(
     arguments: Annotated[tuple[str, ...], tyro.conf.Positional] = (),
     sampler: str = "learned-occupancy",
     options: Mapping[str, int | float] = MappingProxyType({}),
+    codes: Literal["small", "own"] = "small",
     json: Path | None = None,
 ) -> None:
     """Train any registered nerfstudio method with its sampler swapped for a learned occupancy.
@@ -161,15 +162,17 @@ def swap(
         arguments: After --, what ns-train would be given for this method: -- --data DIR ...
         sampler: Of this package or of another, in place of the method's own.
         options: Of that sampler, by name: --options num_candidates 512 cache_bytes 4194304.
+        codes: Of the host, for the light of each photograph. small: they begin at zero and are
+            scaled by 0.1. own: as the method has them, which can cost test views several dB.
         json: File for the folder of the run, as JSON.
     """
     from leco_plugin.swap import swap as train_swapped
 
     _check_json(json)
-    folder = train_swapped(method, occupancy, arguments, sampler, options)
+    folder = train_swapped(method, occupancy, arguments, sampler, options, codes)
     print(f"{method}, guided: {folder}")
-    facts = {"method": method, "sampler": sampler, "options": dict(options), "folder": str(folder)}
-    _write_json(json, {"format": 1, **facts})
+    facts = {"method": method, "sampler": sampler, "options": dict(options), "codes": codes}
+    _write_json(json, {"format": 1, **facts, "folder": str(folder)})
 
 
 def demo(out: Path = Path("runs/demo"), seconds: float = 130.0, json: Path | None = None) -> None:

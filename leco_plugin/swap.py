@@ -18,6 +18,7 @@ from leco_plugin.compat.data_parallel import DataParallelTrainerConfig
 from leco_plugin.compat.dynamic_batch import clamped
 from leco_plugin.method_configs import LEARNING, ON_GPU, best_device
 from leco_plugin.models.guided import GuidedModelConfig
+from leco_plugin.models.hosts.appearance_codes import Codes
 from leco_plugin.models.hosts.guided_start import OccupancyConfig, load_occupancy, occupancy_file
 from leco_plugin.models.sizing.sizes import learning_only
 from leco_plugin.samplers.registry import check_gate, refuse_unknown_options
@@ -34,6 +35,7 @@ def swapped_config(
     arguments: Sequence[str] = (),
     sampler: str = LEARNED,
     options: Mapping[str, int | float] = NO_OPTIONS,
+    codes: Codes = "small",
 ) -> TrainerConfig:
     """The config of a registered method with its sampler swapped.
 
@@ -44,6 +46,7 @@ def swapped_config(
         arguments: what `ns-train METHOD` would be given.
         sampler: name in the registry of samplers.
         options: of that sampler, by name.
+        codes: of the host's photographs, as `GuidedModelConfig.codes`.
     Raises:
         InputError: there is no such method, or it is guided or learns occupancy itself; there is no
             such sampler, or it asks another kind of gate, or has no such option; there is no such
@@ -65,7 +68,7 @@ def swapped_config(
         )
     if config.data is not None and not config.data.exists():
         raise InputError(f"there is no scene {config.data} (--data)")
-    return with_sampler_swapped(config, file, sampler, options)
+    return with_sampler_swapped(config, file, sampler, options, codes)
 
 
 def check_sampler(file: Path | None, sampler: str, options: Mapping[str, int | float]) -> None:
@@ -107,6 +110,7 @@ def with_sampler_swapped(
     file: Path | None,
     sampler: str = LEARNED,
     options: Mapping[str, int | float] = NO_OPTIONS,
+    codes: Codes = "small",
 ) -> TrainerConfig:
     """The same training with its model guided by an occupancy, learned first where there is no
     file; the config given is not changed.
@@ -133,7 +137,7 @@ def with_sampler_swapped(
         )
     path = None if file is None else occupancy_file(file.resolve())
     occupancy = replace(learned_first(), path=path, sampler=sampler, options=dict(options))
-    pipeline.model = GuidedModelConfig(host=host, occupancy=occupancy)
+    pipeline.model = GuidedModelConfig(host=host, occupancy=occupancy, codes=codes)
     if type(config) is TrainerConfig:
         values = {f.name: getattr(config, f.name) for f in fields(config)}
         config = DataParallelTrainerConfig(**values)
@@ -153,10 +157,11 @@ def swap(
     arguments: Sequence[str] = (),
     sampler: str = LEARNED,
     options: Mapping[str, int | float] = NO_OPTIONS,
+    codes: Codes = "small",
 ) -> Path:
     """Trains, and returns the folder of the run. Arguments and errors as for `swapped_config`."""
     from nerfstudio.scripts.train import main as train
 
-    config = swapped_config(method, file, arguments, sampler, options)
+    config = swapped_config(method, file, arguments, sampler, options, codes)
     train(config)
     return config.get_base_dir()

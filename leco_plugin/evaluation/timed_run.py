@@ -100,7 +100,8 @@ def timed_run(
     """Trains until the budget is used and evaluates on the test images.
 
     The learning rates of all groups decay to a tenth over the budget, whatever the number of steps;
-    nerfstudio's own schedulers count steps, and a slow method would end with a high rate.
+    nerfstudio's own schedulers count steps, and a slow method would end with a high rate. A host
+    that learns its occupancy first has the full rates at its own first step, as in `ns-train`.
 
     Args:
         config: a method with its data; it is copied, not changed.
@@ -172,6 +173,7 @@ class _Course:
         self.marks = [(i + 1) / curve_points for i in range(curve_points - 1)]
         self.step_times: list[float] = []
         self.before_step = queries.copy()
+        self.share_before = 0.0
         self.rates = [
             (group, group["lr"])
             for optimizer in trainer.optimizers.optimizers.values()
@@ -186,14 +188,16 @@ class _Course:
     def before(self, step: int) -> None:
         """Before everything else that happens before a step."""
         share = self.budget.share(self.clock.seconds, step)
+        trained = max(0.0, share - self.share_before) / max(1.0 - self.share_before, 1e-9)
         for group, rate in self.rates:
-            group["lr"] = rate * 0.1**share
+            group["lr"] = rate * 0.1**trained
         self.before_step = self.queries.copy()
         self.clock.start()
 
     def begun(self, step: int) -> None:
         """Before a step, after everything else: a host that learns its occupancy first has it."""
-        self._look_for_occupancy()
+        if self._look_for_occupancy() and hasattr(self.trainer.pipeline.model, "leco_guide"):
+            self.share_before = self.budget.share(self.clock.now(), step)
 
     def after(self, step: int) -> None:
         """After everything else that happens after a step."""

@@ -30,6 +30,7 @@ from leco_plugin.compat.host_lpips import setup_with_lazy_lpips
 from leco_plugin.compat.host_outputs import with_counts_as_floats
 from leco_plugin.models.compute.precision import keep_freed_memory
 from leco_plugin.models.failures import require_finite
+from leco_plugin.models.hosts.appearance_codes import Codes, begin_with_small_codes
 from leco_plugin.models.hosts.guide import Guide
 from leco_plugin.models.hosts.guided_start import (
     OWN_SAMPLER,
@@ -53,6 +54,10 @@ class GuidedModelConfig(GrowingConfig, ModelConfig):
     """The host, as its own method has it."""
     occupancy: OccupancyConfig = field(default_factory=OccupancyConfig)
     """What guides it."""
+    codes: Codes = "small"
+    """Codes of the host for the light of each photograph. small: they begin at zero and are scaled
+    by 0.1, as those of leco-occupancy. own: as the host has them; nerfstudio draws them from a unit
+    normal, which can cost test views several dB."""
     eval_num_rays_per_chunk: int | None = None  # type: ignore[assignment]
     """Rays rendered at a time; None is the host's own."""
     # every model config has these, and of a guided one the host's own count: they are no options
@@ -60,6 +65,10 @@ class GuidedModelConfig(GrowingConfig, ModelConfig):
     collider_params: tyro.conf.Suppress[dict[str, float] | None] = None
     loss_coefficients: tyro.conf.Suppress[dict[str, float]] = field(default_factory=dict)
     prompt: tyro.conf.Suppress[str | None] = None
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        """Called by yaml: a run that was begun before there was a choice keeps its codes."""
+        super().__setstate__({"codes": "own"} | state)
 
 
 def set_up_guided(config: GuidedModelConfig, **arguments: Any) -> Model:
@@ -80,14 +89,14 @@ def set_up_guided(config: GuidedModelConfig, **arguments: Any) -> Model:
     if config.eval_num_rays_per_chunk is not None:
         host_config.eval_num_rays_per_chunk = config.eval_num_rays_per_chunk
     if config.occupancy.sampler == OWN_SAMPLER:
-        return _as_it_is(host_config, arguments)
+        return _as_it_is(host_config, config.codes, arguments)
     guide = Guide(
         config.occupancy.sampler, config.occupancy.options, config.occupancy.front_to_back
     )
     if guide.needs_occupancy and config.occupancy.path is not None:
         with suppress(InputError):  # a checkpoint brings its own; without one, training says it
             guide.set_occupancy(load_occupancy(config.occupancy.path))
-    host = _built(host_config, arguments)
+    host = _built(host_config, config.codes, arguments)
     host.leco_guide = guide  # by no name that the host may have given something of its own
     read_earlier_guide(host)
     swap_sampler(host, guide)
@@ -97,18 +106,20 @@ def set_up_guided(config: GuidedModelConfig, **arguments: Any) -> Model:
     return host
 
 
-def _as_it_is(host_config: ModelConfig, arguments: dict[str, Any]) -> Model:
+def _as_it_is(host_config: ModelConfig, codes: Codes, arguments: dict[str, Any]) -> Model:
     """The host with its own sampler, for comparison, on any device and without a network."""
     from leco_plugin.samplers import nerfacc_cpu
 
     nerfacc_cpu.install()
-    return _built(host_config, arguments)
+    return _built(host_config, codes, arguments)
 
 
-def _built(host_config: ModelConfig, arguments: dict[str, Any]) -> Model:
+def _built(host_config: ModelConfig, codes: Codes, arguments: dict[str, Any]) -> Model:
     """The host as nerfstudio builds it, without a network, fit for a CPU and for its commands."""
     host = with_counts_as_floats(setup_with_lazy_lpips(host_config, **arguments))
     speed_up_hash_encodings(host)
+    if codes == "small":
+        begin_with_small_codes(host)
     return host
 
 

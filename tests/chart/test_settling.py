@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import pytest
 from chart_results import results, run
 
+from leco_plugin.chart.drawing.page import write_page
 from leco_plugin.chart.drawing.table import table
-from leco_plugin.chart.findings.settling import last_gain, settling, still_rising
+from leco_plugin.chart.findings.settling import falls, last_gain, settling, still_rising
 from leco_plugin.chart.findings.summary import lines_of
 
 STILL = [[3.0, 18.0], [6.0, 20.0], [9.0, 20.2]]
@@ -53,3 +56,13 @@ def test_tables_of_runs_of_equal_time_say_it_and_no_others() -> None:
     assert "last third" in table(results(*both, **suite))
     assert "last third" in table(results(*both))
     assert "last third" not in table(results(*both, **suite, **steps))
+
+
+def test_runs_that_end_below_their_best_point_are_named_on_table_and_page(tmp_path: Path) -> None:
+    fell = run("B", curve=[[3.0, 18.0], [6.0, 20.0], [9.0, 19.6]])
+    both = results(run("A", curve=STILL), fell)
+    said = "Fell from their own best point: B by 0.4 dB (0.40 to 0.40)."
+    assert falls(lines_of(both)) == said
+    assert said in table(both) and said in write_page(both, tmp_path / "chart.html").read_text()
+    hardly = run("B", curve=[[3.0, 18.0], [6.0, 20.0], [9.0, 19.95]])
+    assert falls(lines_of(results(run("A", curve=STILL), hardly))) is None

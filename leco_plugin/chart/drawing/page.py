@@ -13,6 +13,7 @@ from leco_plugin.chart.drawing.title import asks_what_was_learned, title_of
 from leco_plugin.chart.findings.fronts import COSTS as COSTS_OF_HELD
 from leco_plugin.chart.findings.learned import Learned, learned_of
 from leco_plugin.chart.findings.representations import Representation, representations_of
+from leco_plugin.chart.findings.settling import falls
 from leco_plugin.chart.findings.summary import (
     COSTS,
     LEARNING,
@@ -43,8 +44,9 @@ def write_page(results: Mapping[str, Any], path: Path) -> Path:
         _add_representations(figure, held, lines)
     elif learned:
         _add_learned(figure, learned, lines)
+    below = ". ".join(filter(None, [circumstances(results), falls(lines)]))
     figure.update_layout(
-        title={"text": f"<b>{title}</b><br><sub>{html.escape(circumstances(results))}</sub>"},
+        title={"text": f"<b>{title}</b><br><sub>{html.escape(below)}</sub>"},
         template="plotly_white",
         height=1100 if held or learned else 820,
         legend={"orientation": "h", "y": -0.08},

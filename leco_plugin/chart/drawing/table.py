@@ -17,7 +17,7 @@ from leco_plugin.chart.drawing.occupancy_tables import (
 from leco_plugin.chart.drawing.title import title_of
 from leco_plugin.chart.findings.learned import learned_of
 from leco_plugin.chart.findings.representations import representations_of
-from leco_plugin.chart.findings.settling import settling
+from leco_plugin.chart.findings.settling import falls, settling
 from leco_plugin.chart.findings.summary import (
     COSTS,
     LEARNING,
@@ -70,6 +70,8 @@ def table(results: Mapping[str, Any]) -> str:
         parts.append(versus_table(duels))
     if len(lines) > 1 and results["protocol"]["seconds"] is not None:
         parts.append(settling(lines))
+    if fallen := falls(lines):
+        parts.append(fallen)
     if results["failures"]:
         parts.append(failures_table(results["failures"]))
     if learned := learned_of(lines):

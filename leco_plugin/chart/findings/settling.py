@@ -17,6 +17,8 @@ ENOUGH = 0.3
 """dB in the last third of a run's time: who gains more is still rising."""
 HARDLY_TRAINED = 0.4
 """Share of its time from which on a run that kept its grid up has hardly trained."""
+FALL = 0.1
+"""dB below the best point of a run's own curve from which on its end is said to have fallen."""
 
 
 def last_gain(line: Line) -> float | None:
@@ -67,3 +69,15 @@ def settling(lines: Sequence[Line]) -> str:
         f"Gained in the last third of the time: {listed}. {said}; rates fall to a tenth over the "
         f"time that is given, so that others may gain by more of it too.{kept_up}"
     )
+
+
+def falls(lines: Sequence[Line]) -> str | None:
+    """In one sentence, whose runs end more than `FALL` below their own best point: the median over
+    seeds, and the least and the most. None where no run does."""
+    fallen = []
+    for line in lines:
+        below = [max(psnr for _, psnr in run["curve"]) - run["curve"][-1][1] for run in line.runs]
+        if max(below) > FALL:
+            median = f"{statistics.median(below):.1f} dB"
+            fallen.append(f"{line.name} by {median} ({min(below):.2f} to {max(below):.2f})")
+    return f"Fell from their own best point: {', '.join(fallen)}." if fallen else None

@@ -107,7 +107,7 @@ SAMPLE_WITH = HostAdapter(
 )
 
 
-def _replace(host: nn.Module, old: nn.Module, new: nn.Module) -> None:
+def replace_module(host: nn.Module, old: nn.Module, new: nn.Module) -> None:
     """Puts `new` wherever the host or a module in it holds `old`."""
     for parent in list(host.modules()):
         for name, child in list(parent._modules.items()):
@@ -144,7 +144,7 @@ def _swap_packed(host: Model, guide: Guide) -> None:
         boxes: Any = old.aabbs
         # of nested boxes the first is the scene's, and nothing is sampled outside the last
         new = guide.estimator(boxes[0].detach(), boxes[-1].detach(), _density_beside(host, old))
-        _replace(host, old, new)
+        replace_module(host, old, new)
 
 
 PACKED = HostAdapter(
@@ -163,7 +163,7 @@ def _proposal_samplers(host: nn.Module) -> list[Any]:
 def _swap_proposal(host: Model, guide: Guide) -> None:
     for old in _proposal_samplers(host):
         initial = old.initial_sampler
-        _replace(
+        replace_module(
             host,
             old,
             guide.proposal(
@@ -210,7 +210,7 @@ def _remove_density_networks(host: nn.Module) -> None:
     field = getattr(host, "field", None)
     for name, densities in list(_density_lists(host)):
         for network in {density.__self__ for density in densities} - {field}:
-            _replace(host, network, nn.Module())
+            replace_module(host, network, nn.Module())
         setattr(host, name, type(densities)([no_density] * len(densities)))
 
 

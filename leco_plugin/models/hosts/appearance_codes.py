@@ -1,0 +1,87 @@
+"""Appearance codes of hosts that do no harm: alike at first, and slow to part.
+
+nerfstudio draws the code of each photograph from a unit normal, and shows other views by the mean
+of the codes or by zeros. A field that learns from codes far apart has never met the code of another
+view: Instant-NGP lost 8.5 dB on a drone survey, Nerfacto 4.5 dB (docs/decisions.md).
+"""
+
+from __future__ import annotations
+
+from typing import Any, Literal
+
+import torch
+from nerfstudio.field_components.embedding import Embedding
+from nerfstudio.models.base_model import Model
+from torch import Tensor, nn
+
+from leco_plugin.models.color_head import APPEARANCE_SCALE
+from leco_plugin.models.compute.ranks import say
+from leco_plugin.models.hosts.seams import replace_module
+
+Codes = Literal["small", "own"]
+"""How a host's codes begin: at zero and scaled down, or as the host has them."""
+OF_WHOM = ("nerfstudio.", "leco_plugin.")
+"""Packages whose hosts need no line: docs/hosts.md speaks of their codes."""
+
+
+class SmallCodes(Embedding):
+    """nerfstudio's table of codes with zeros in it, whose answers are scaled and have mean zero.
+
+    Other views look the same whether their host shows them by the mean code or by zeros. The names
+    in a state dict are those of nerfstudio's table.
+    """
+
+    def build_nn_modules(self) -> None:
+        """Makes the table [in_dim, out_dim]."""
+        zeros = torch.zeros(self.in_dim, self.out_dim)
+        self.embedding = nn.Embedding.from_pretrained(zeros, freeze=False)
+
+    def mean(self, dim: int = 0) -> Tensor:
+        """The mean code: zeros [out_dim]."""
+        return torch.zeros_like(self.embedding.weight.sum(dim))
+
+    def forward(self, in_tensor: Tensor) -> Tensor:
+        """Codes [..., out_dim] of photographs [...] int64."""
+        return APPEARANCE_SCALE * (self.embedding(in_tensor) - self.embedding.weight.mean(dim=0))
+
+
+def begin_with_small_codes(host: Model) -> None:
+    """Has the codes of a host's photographs begin at zero, scaled down.
+
+    Of a host that is neither nerfstudio's nor ours, the log says what was done; where its codes are
+    of a kind that is not known here, it says that they stay.
+    """
+    count: Any = getattr(host, "num_train_data", None)
+    known = {
+        name: module
+        for name, module in host.named_modules()
+        if type(module) is Embedding and module.in_dim == count
+    }
+    for codes in known.values():
+        replace_module(
+            host, codes, SmallCodes(codes.in_dim, codes.out_dim).to(codes.embedding.weight)
+        )
+    if type(host).__module__.startswith(OF_WHOM):
+        return
+    if known:
+        say(
+            f"{type(host).__name__}: appearance codes ({', '.join(known)}) begin at zero and are "
+            f"scaled by {APPEARANCE_SCALE}; --codes own (--pipeline.model.codes own) leaves them"
+        )
+    if unknown := _drawn_at_random(host, count):
+        say(
+            f"{type(host).__name__}: {', '.join(unknown)} begins with a random code for each "
+            "photograph, which can cost test views several dB; begin with zeros (docs/hosts.md)"
+        )
+
+
+def _drawn_at_random(host: Model, count: Any) -> list[str]:
+    """Names of other tables with a row for each photograph that differ from row to row."""
+    return [
+        name
+        for name, module in host.named_modules()
+        if isinstance(module, nn.Embedding)
+        and module.num_embeddings == count
+        and count > 1
+        and bool((module.weight != module.weight[0]).any())
+    ]

@@ -1,0 +1,113 @@
+"""Claims about the codes that hosts give their photographs."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+import torch
+import yaml
+from nerfstudio.field_components.embedding import Embedding
+from nerfstudio.models.instant_ngp import InstantNGPModelConfig, NGPModel
+from nerfstudio.models.nerfacto import NerfactoModelConfig
+from small_hosts import what_a_model_gets
+from torch import nn
+
+from leco_plugin.models.guided import GuidedModelConfig
+from leco_plugin.models.hosts.appearance_codes import SmallCodes
+from leco_plugin.models.hosts.guided_start import OccupancyConfig
+from leco_plugin.swap import registered, swapped_config
+
+NGP = {"log2_hashmap_size": 8, "max_res": 64, "grid_resolution": 16, "grid_levels": 2}
+HOSTS = {
+    "instant-ngp": InstantNGPModelConfig(**NGP),
+    "nerfacto": NerfactoModelConfig(
+        implementation="torch", num_levels=2, log2_hashmap_size=8, max_res=64
+    ),
+}
+
+
+def built(host: Any, codes: Any = "small", sampler: str = "own") -> Any:
+    config = GuidedModelConfig(host=host, occupancy=OccupancyConfig(sampler=sampler), codes=codes)
+    return config.setup(**what_a_model_gets())
+
+
+@pytest.mark.parametrize("name", HOSTS)
+@pytest.mark.parametrize("sampler", ["own", "learned-occupancy"])
+def test_photographs_and_other_views_look_alike_before_the_first_step(
+    name: str, sampler: str
+) -> None:
+    codes = built(HOSTS[name], sampler=sampler).field.embedding_appearance
+    of_all = codes(torch.tensor([0, 1]))
+    assert torch.equal(of_all, torch.zeros(2, 32)) and torch.equal(codes.mean(), torch.zeros(32))
+
+
+@pytest.mark.parametrize("name", HOSTS)
+def test_own_codes_are_left_as_nerfstudio_has_them(name: str) -> None:
+    codes = built(HOSTS[name], "own").field.embedding_appearance
+    assert type(codes) is Embedding
+    assert 0.5 < float(codes(torch.tensor([0, 1])).detach().std()) < 1.5
+
+
+def test_codes_part_slowly_and_around_the_one_that_other_views_have() -> None:
+    small = SmallCodes(4, 8)
+    nn.init.normal_(small.embedding.weight, mean=3.0)
+    codes = small(torch.arange(4))
+    raw = small.embedding.weight
+    assert torch.allclose(codes.mean(dim=0), small.mean(), atol=1e-6)
+    assert torch.allclose(codes[1] - codes[0], 0.1 * (raw[1] - raw[0]), atol=1e-6)
+
+
+def test_a_checkpoint_has_the_names_of_nerfstudio() -> None:
+    host = HOSTS["instant-ngp"]
+    assert built(host).state_dict().keys() == built(host, "own").state_dict().keys()
+
+
+def test_a_config_of_before_there_was_a_choice_keeps_its_codes() -> None:
+    text = yaml.dump(GuidedModelConfig(host=HOSTS["instant-ngp"]))
+    assert "codes: small\n" in text
+    assert yaml.load(text, Loader=yaml.Loader).codes == "small"
+    before = yaml.load(text.replace("codes: small\n", ""), Loader=yaml.Loader)
+    assert before.codes == "own"
+
+
+@pytest.mark.parametrize("name", ["leco-ngp", "leco-nerfacto"])
+def test_guided_methods_and_swapped_ones_begin_with_small_codes(name: str) -> None:
+    ours: Any = registered(name)
+    assert ours.pipeline.model.codes == "small"
+    other: Any = swapped_config("nerfacto", None)
+    assert other.pipeline.model.codes == "small"
+    own: Any = swapped_config("nerfacto", None, codes="own")
+    assert own.pipeline.model.codes == "own"
+
+
+def test_the_flag_of_instant_ngp_is_still_inverted() -> None:
+    """Once nerfstudio mends it, Instant-NGP has no codes by default: then docs/hosts.md, and charts
+    of Instant-NGP with codes, are to be made anew."""
+    without: Any = built(InstantNGPModelConfig(**NGP, use_appearance_embedding=True), "own")
+    assert without.field.embedding_appearance is None
+    assert InstantNGPModelConfig().use_appearance_embedding is False
+    assert isinstance(built(HOSTS["instant-ngp"], "own").field.embedding_appearance, Embedding)
+
+
+class Elsewhere(NGPModel):
+    """Of another package, with a table of its own beside nerfstudio's."""
+
+    def populate_modules(self) -> None:
+        super().populate_modules()
+        self.moods = nn.Embedding(self.num_train_data, 4)
+        self.words = nn.Embedding(50, 4)
+
+
+def test_a_host_of_another_package_gets_a_line_about_what_was_done_and_what_not(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    config = InstantNGPModelConfig(_target=Elsewhere, **NGP)
+    host = built(config)
+    said = " ".join(capsys.readouterr().out.split())
+    assert "field.embedding_appearance" in said and "--codes own" in said
+    assert "moods begins with a random code" in said and "words" not in said
+    assert float(host.moods.weight.detach().std()) > 0.1
+    built(config, "own")
+    built(HOSTS["instant-ngp"])
+    assert "codes" not in capsys.readouterr().out
