@@ -7,7 +7,7 @@ view: Instant-NGP lost 8.5 dB on a drone survey, Nerfacto 4.5 dB (docs/decisions
 
 from __future__ import annotations
 
-from typing import Any, Literal
+from typing import Any, Literal, cast
 
 import torch
 from nerfstudio.field_components.embedding import Embedding
@@ -33,12 +33,12 @@ class SmallCodes(Embedding):
 
     def build_nn_modules(self) -> None:
         """Makes the table [in_dim, out_dim]."""
-        zeros = torch.zeros(self.in_dim, self.out_dim)
+        zeros = torch.zeros(cast(int, self.in_dim), cast(int, self.out_dim))
         self.embedding = nn.Embedding.from_pretrained(zeros, freeze=False)
 
     def mean(self, dim: int = 0) -> Tensor:
         """The mean code: zeros [out_dim]."""
-        return torch.zeros_like(self.embedding.weight.sum(dim))
+        return torch.zeros_like(self.embedding.weight).mean(dim)
 
     def forward(self, in_tensor: Tensor) -> Tensor:
         """Codes [..., out_dim] of photographs [...] int64."""
@@ -58,9 +58,8 @@ def begin_with_small_codes(host: Model) -> None:
         if type(module) is Embedding and module.in_dim == count
     }
     for codes in known.values():
-        replace_module(
-            host, codes, SmallCodes(codes.in_dim, codes.out_dim).to(codes.embedding.weight)
-        )
+        weight = codes.embedding.weight
+        replace_module(host, codes, SmallCodes(*weight.shape).to(weight))
     if type(host).__module__.startswith(OF_WHOM):
         return
     if known:
