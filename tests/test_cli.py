@@ -283,8 +283,21 @@ def test_a_swap_hands_options_of_the_sampler_on(
     arguments = ["--json", report, "--", "--data", "SCENE"]
     assert run("swap", "nerfacto", "--occupancy", file, *options, *arguments) == 0
     expected = {"num_candidates": 512, "tolerance": 1e-3}
-    assert given == ["nerfacto", file, ("--data", "SCENE"), "learned-occupancy", expected]
+    scene = ("--data", "SCENE")
+    assert given == ["nerfacto", file, scene, "learned-occupancy", expected, "small"]
     assert json.loads(report.read_text())["options"] == expected
+
+
+def test_a_swap_can_leave_the_codes_of_a_host_as_they_are(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from leco_plugin import swap
+
+    given: list[object] = []
+    monkeypatch.setattr(swap, "swap", lambda *arguments: given.extend(arguments) or tmp_path)
+    report = tmp_path / "swap.json"
+    assert run("swap", "nerfacto", "--codes", "own", "--json", report) == 0
+    assert given[-1] == "own" and json.loads(report.read_text())["codes"] == "own"
 
 
 def test_a_failure_ends_with_one_line_and_status_1(
