@@ -5,6 +5,9 @@ VENV := .venv
 BIN := $(VENV)/bin
 READY := $(VENV)/.ready
 
+# nerfstudio asks for nerfacc 0.5.2; tests run with this one too, from a folder of its own.
+NERFACC := nerfacc==0.5.3
+
 # Other targets' arguments: make test PYTEST='-k gate', make demo DEMO='--out runs/other'
 PYTEST ?=
 DEMO ?=
@@ -39,6 +42,8 @@ $(READY): pyproject.toml
 		{ echo "no virtual environment can be made; on Debian: apt-get install python3-venv" >&2; exit 2; }
 	@echo "filling $(VENV): about three minutes and 8 GB, most of it torch"
 	$(BIN)/python -m pip install --disable-pip-version-check --editable '.[dev]'
+	$(BIN)/python -m pip install --disable-pip-version-check --no-deps --upgrade \
+		--target $(VENV)/$(subst ==,-,$(NERFACC)) $(NERFACC)
 	@touch $@
 
 clean:

@@ -30,6 +30,7 @@ from typing import Any
 import psutil
 
 from leco_plugin.compat.checkpoints import allow_checkpoint_globals
+from leco_plugin.compat.nerfstudio_changes import iterations_until
 from leco_plugin.compat.whole_checkpoints import newest_whole, previous_of, step_of
 from leco_plugin.evaluation.json_file import write_json
 from leco_plugin.evaluation.machine import describe_machine
@@ -138,7 +139,7 @@ class Runs:
         arguments = [
             *("leco-occupancy", "--data", str(self.scene), *ARGUMENTS),
             *("--output-dir", str(self.folder), "--experiment-name", "tiny", "--timestamp", name),
-            f"--max-num-iterations={max(1, STEPS - done)}",
+            f"--max-num-iterations={iterations_until(max(STEPS, done + 1), done)}",
             f"--machine.seed={seed}",
             *([f"--load-dir={checkpoints}"] if done else []),
         ]

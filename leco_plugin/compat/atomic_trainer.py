@@ -16,6 +16,7 @@ from nerfstudio.engine.trainer import Trainer
 from nerfstudio.utils.decorators import check_main_thread
 
 from leco_plugin.compat.interrupts import heard_between_steps
+from leco_plugin.compat.nerfstudio_changes import end_of, iterations_until
 from leco_plugin.compat.optimizers import OptimizersOfThePresent
 from leco_plugin.compat.run_sizes import (
     checkpoint_of,
@@ -58,15 +59,20 @@ class AtomicTrainer(Trainer):
         saved by the clock.
 
         Raises:
-            InputError: there is no whole checkpoint to go on from, its sizes are not those that are
-                set by hand, the scene has other photographs now, or there is no kernel of a name
-                that is to be off.
+            InputError: there is no whole checkpoint to go on from, or no step left; its sizes are
+                not those that are set by hand, the scene has other photographs now, or there is no
+                kernel of a name that is to be off.
         """
         say_what_is_logged()
         _say_which_kernels_are_off()
         asked = self.config.pipeline.model
         self.config = with_sizes_of(self.config, checkpoint_of(self.config))
         super().setup(*arguments, **options)
+        if self._start_step >= end_of(self):
+            raise InputError(
+                f"the checkpoint has {self._start_step} steps already: this nerfstudio counts them "
+                f"in --max-num-iterations {self.config.max_num_iterations}, so give more"
+            )
         self.config = keep_sizes(self.config, self.pipeline.model, asked)
         self.saved_at = time.monotonic()
         where = [TrainingCallbackLocation.AFTER_TRAIN_ITERATION]
@@ -100,9 +106,10 @@ class AtomicTrainer(Trainer):
         parts = [f"step {step}: stopped by Ctrl-C", self._what_is_left()]
         saved = sorted(self.checkpoint_dir.glob("*.ckpt"))
         if saved:  # a step that is in doubt is not saved: it goes on from the one before
-            left = self._start_step + self.config.max_num_iterations - step_of(saved[-1]) - 1
-            resume = f"--load-dir {self.checkpoint_dir} --max-num-iterations {left}"
-            parts += [f"{resume} goes on from there"] if left > 0 else []
+            done, end = step_of(saved[-1]) + 1, end_of(self)
+            steps = f"--max-num-iterations {iterations_until(end, done)}"
+            resume = f"--load-dir {self.checkpoint_dir} {steps} goes on from there"
+            parts += [resume] if done < end else []
         raise TrainingStopped("; ".join(parts))
 
     def train(self) -> None:

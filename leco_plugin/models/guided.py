@@ -41,6 +41,7 @@ from leco_plugin.models.hosts.guided_start import (
 from leco_plugin.models.hosts.host_watch import HostWatch
 from leco_plugin.models.hosts.opaque_start import set_first_density
 from leco_plugin.models.hosts.seams import swap_sampler
+from leco_plugin.samplers.nerfacc_cpu import install_for
 from leco_plugin.scenes.input_error import InputError
 
 
@@ -83,13 +84,14 @@ def set_up_guided(config: GuidedModelConfig, **arguments: Any) -> Model:
     """
     allow_checkpoint_globals()
     evaluate_whole_checkpoints()
+    install_for(arguments.get("device"))
     if torch.device(arguments.get("device", "cpu")).type == "cpu":
         keep_freed_memory()
     host_config = copy.deepcopy(config.host)
     if config.eval_num_rays_per_chunk is not None:
         host_config.eval_num_rays_per_chunk = config.eval_num_rays_per_chunk
     if config.occupancy.sampler == OWN_SAMPLER:
-        return _as_it_is(host_config, config.codes, arguments)
+        return _built(host_config, config.codes, arguments)
     guide = Guide(
         config.occupancy.sampler, config.occupancy.options, config.occupancy.front_to_back
     )
@@ -104,14 +106,6 @@ def set_up_guided(config: GuidedModelConfig, **arguments: Any) -> Model:
     _refuse_what_is_not_finite(host)
     _begin_with_occupancy(host, guide, config.occupancy)
     return host
-
-
-def _as_it_is(host_config: ModelConfig, codes: Codes, arguments: dict[str, Any]) -> Model:
-    """The host with its own sampler, for comparison, on any device and without a network."""
-    from leco_plugin.samplers import nerfacc_cpu
-
-    nerfacc_cpu.install()
-    return _built(host_config, codes, arguments)
 
 
 def _built(host_config: ModelConfig, codes: Codes, arguments: dict[str, Any]) -> Model:

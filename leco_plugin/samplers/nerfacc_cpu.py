@@ -1,9 +1,9 @@
 """nerfacc where there is no CUDA: its kernels replaced by this package's plain torch.
 
-nerfacc 0.5.2 packs, scans and traverses grids on CUDA only, so that a stock host such as
+nerfacc 0.5.2 and 0.5.3 pack, scan and traverse grids on CUDA only, so that a stock host such as
 nerfstudio's `instant-ngp` cannot run anywhere else. `install` puts a switch in front of each of
 these functions: CUDA tensors go to nerfacc's kernels as before, all others to the functions here.
-It is called when a model is built, never as a side effect of an import.
+A model that is built for another device than CUDA calls `install_for`; no import installs anything.
 
 What a module imported by name before (`from nerfacc import pack_info`) is replaced there too. A
 function that was put elsewhere, in a class, a partial or a default argument, stays nerfacc's own.
@@ -23,7 +23,8 @@ from torch import Tensor
 
 from leco_plugin.samplers import packed
 from leco_plugin.samplers.grid import lookup
-from leco_plugin.samplers.marching import march
+from leco_plugin.samplers.marching import march, number
+from leco_plugin.samplers.marching.edges import candidate_edges
 from leco_plugin.samplers.marching.rays import intersect_box
 
 if TYPE_CHECKING:
@@ -33,6 +34,19 @@ Function = Callable[..., Any]
 
 _switches: list[tuple[Function, Function]] = []
 """Functions of nerfacc, and what stands in front of them."""
+
+
+def install_for(device: torch.device | str | None) -> None:
+    """`install` for a model that is built for this device, unless that is CUDA.
+
+    Args:
+        device: None where it is not known; then the stand-in is for machines without CUDA.
+
+    Raises:
+        ImportError: as `install`.
+    """
+    if torch.device(device or ("cuda" if torch.cuda.is_available() else "cpu")).type != "cuda":
+        install()
 
 
 def install() -> None:
@@ -50,8 +64,8 @@ def install() -> None:
     for name, replacement in replacements.items():
         if not _takes_as_much(replacement, getattr(nerfacc, name, None)):
             raise ImportError(
-                f"{name} of nerfacc {nerfacc.__version__} is not that of 0.5.2, for which this is "
-                "written: pip install nerfacc==0.5.2, which nerfstudio asks for too"
+                f"{name} of nerfacc {nerfacc.__version__} is not that of 0.5.2 or 0.5.3, for which "
+                "this is written: pip install nerfacc==0.5.2, which nerfstudio asks for too"
             )
     originals = {name: getattr(nerfacc, name) for name in replacements}
     _switches.extend((old, _switch(old, replacements[name])) for name, old in originals.items())
@@ -123,7 +137,13 @@ def traverse_grids(
     far_planes: Tensor | None = None,
     step_size: float = 1e-3,
     cone_angle: float = 0.0,
-) -> tuple[RayIntervals, RaySamples]:
+    traverse_steps_limit: int | None = None,
+    over_allocate: bool = False,
+    rays_mask: Tensor | None = None,
+    t_sorted: Tensor | None = None,
+    t_indices: Tensor | None = None,
+    hits: Tensor | None = None,
+) -> tuple[RayIntervals, RaySamples] | tuple[RayIntervals, RaySamples, Tensor]:
     """March rays through nested grids (nerfacc's function of that name).
 
     With a constant step the samples are nerfacc's. With a cone angle nerfacc keeps the step it had
@@ -137,24 +157,56 @@ def traverse_grids(
         near_planes, far_planes: where rays begin and end, [n_rays].
         step_size: shortest step, > 0.
         cone_angle: growth of the step with distance.
+        traverse_steps_limit: most samples of a ray, its first ones; None or 0 for all.
+        over_allocate: needs a limit, as in nerfacc, and changes nothing: no padding is made.
+        rays_mask: rays to march, bool [n_rays]. nerfacc obeys it with `over_allocate` only.
+        t_sorted, t_indices, hits: where rays cross the boxes, if that is known: sorted
+            [n_rays, 2 levels], the box of each (leaving is counted from `levels` on), and
+            bool [n_rays, levels]. A ray is marched from its first to its last crossing.
 
     Returns:
-        the intervals, neighbours sharing an edge, and the samples at their midpoints.
+        the intervals, neighbours sharing an edge, and the samples at their midpoints. From nerfacc
+        0.5.3 on also where each ray was left, [n_rays]: the end of its last step, kept or not, or
+        of its last sample where it met the limit; its near plane if it was not marched.
+
+    Raises:
+        ValueError: a step is not positive, tensors do not fit, or `over_allocate` has no limit.
     """
     from nerfacc import RayIntervals, RaySamples
 
-    t_enters, t_leaves = intersect_box(rays_o, rays_d, aabbs[-1])
+    limit = traverse_steps_limit or 0
+    if over_allocate and limit <= 0:
+        raise ValueError("over_allocate needs a positive traverse_steps_limit")
+    if t_sorted is None or t_indices is None or hits is None:
+        t_enters, t_leaves = intersect_box(rays_o, rays_d, aabbs[-1])
+    else:
+        crossed = hits.gather(1, t_indices % len(aabbs))
+        t_enters = t_sorted.where(crossed, torch.inf).amin(dim=1)
+        t_leaves = t_sorted.where(crossed, -torch.inf).amax(dim=1)
+    if far_planes is not None:
+        t_leaves = t_leaves.minimum(far_planes)
+    if rays_mask is not None:
+        t_leaves = t_leaves.where(rays_mask, -torch.inf)
     t_mins = torch.zeros_like(t_leaves) if near_planes is None else near_planes
     ray_indices, t_starts, t_ends = march(
         rays_o,
         rays_d,
         t_mins,
-        t_leaves if far_planes is None else t_leaves.minimum(far_planes),
+        t_leaves,
         step_size=step_size,
         cone_angle=cone_angle,
         occupied=lambda positions: lookup(binaries, aabbs[0], positions),
         t_enters=t_enters,
     )
+    steps = number(rays_o, rays_d, t_mins, t_leaves, step_size, cone_angle, t_enters=t_enters)
+    n_steps = steps.first + steps.counts
+    left = candidate_edges(steps.t_mins, n_steps, step_size, cone_angle).where(n_steps > 0, t_mins)
+    if limit > 0:
+        firsts = packed.pack_info(ray_indices, len(rays_o))[:, 0]
+        place = torch.arange(len(ray_indices), device=firsts.device) - firsts[ray_indices]
+        left[ray_indices[place == limit - 1]] = t_ends[place == limit - 1]
+        within = place < limit
+        ray_indices, t_starts, t_ends = ray_indices[within], t_starts[within], t_ends[within]
     begins = torch.ones_like(ray_indices, dtype=torch.bool)
     begins[1:] = (ray_indices[1:] != ray_indices[:-1]) | (t_starts[1:] != t_ends[:-1])
     right = torch.arange(len(begins), device=begins.device) + begins.cumsum(0)
@@ -177,4 +229,7 @@ def traverse_grids(
         packed_info=packed.pack_info(ray_indices, len(rays_o)),
         ray_indices=ray_indices,
     )
-    return intervals, samples
+    if not hasattr(RaySamples, "is_valid"):  # 0.5.2
+        return intervals, samples
+    samples.is_valid = torch.ones_like(ray_indices, dtype=torch.bool)
+    return intervals, samples, left

@@ -21,6 +21,7 @@ from nerfstudio.data.utils.dataloaders import (
 from nerfstudio.model_components.ray_generators import RayGenerator
 from torch import Tensor
 
+from leco_plugin.compat.nerfstudio_changes import keeps_all_images
 from leco_plugin.models.compute.ranks import say
 from leco_plugin.scenes.dataset_units import UP_IS_KNOWN
 from leco_plugin.scenes.detail import CAMERAS
@@ -106,7 +107,7 @@ class LecoDataManager(VanillaDataManager):  # type: ignore[type-arg]
         """
         config = self.config
         wanted = getattr(config, "images", "auto")
-        if wanted == "memory" or config.train_num_images_to_sample_from != -1:
+        if wanted == "memory" or not keeps_all_images(config, len(self.train_dataset)):
             return False
         obstacle = self._obstacle()
         if wanted == "disk":

@@ -144,7 +144,7 @@ def test_our_grid_clips_shifts_and_prunes_as_nerfaccs_own_code(asked, largest, s
 def test_intervals_share_edges_as_nerfacc_has_them():
     grid = stock_grid(levels=1)
     origins, directions = camera_rays(60)
-    intervals, samples = nerfacc.traverse_grids(
+    intervals, samples, *_ = nerfacc.traverse_grids(
         origins, directions, grid.binaries, grid.aabbs, step_size=0.03
     )
     t_starts, t_ends = intervals.vals[intervals.is_left], intervals.vals[intervals.is_right]

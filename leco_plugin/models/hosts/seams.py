@@ -17,6 +17,7 @@ from torch import nn
 from leco_plugin.entries import foreign_entries
 from leco_plugin.models.hosts.guide import Guide
 from leco_plugin.samplers.base import DensityFn, Estimator
+from leco_plugin.samplers.nerfacc_cpu import install_for
 from leco_plugin.scenes.input_error import InputError
 
 if TYPE_CHECKING:
@@ -64,9 +65,7 @@ def swap_sampler(host: Model, guide: Guide) -> str:
     Raises:
         InputError: the host has no seam that any adapter knows.
     """
-    from leco_plugin.samplers import nerfacc_cpu
-
-    nerfacc_cpu.install()
+    install_for(None)
     known = adapters()
     for name, adapter in known.items():
         if _fits(name, adapter, host):

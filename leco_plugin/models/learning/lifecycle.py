@@ -16,6 +16,7 @@ from nerfstudio.engine.callbacks import (
 )
 from torch import Tensor
 
+from leco_plugin.compat.nerfstudio_changes import end_of
 from leco_plugin.compat.optimizers import forget_the_gone
 from leco_plugin.models.compute.ranks import is_first, say, share
 from leco_plugin.models.field import HMoEField
@@ -63,9 +64,10 @@ class Lifecycle:
         most = configured = model.config.schedule.learn_steps
         if self.trainer is not None:
             # a short run still passes through both phases, and a resumed one has steps behind it
-            most = max(2, int(0.5 * self.trainer.config.max_num_iterations))
+            steps = self.end() - self.trainer._start_step
+            most = max(2, int(0.5 * steps))
             most += max(0, self.trainer._start_step - self.progress.since)
-            self._say_if_short(configured, most)
+            self._say_if_short(configured, most, steps)
         # nerfstudio makes callbacks after it has loaded a checkpoint
         if not bool(model.frozen):  # else other steps would take it back into the first phase
             self.progress.begin(configured, most)
@@ -99,11 +101,11 @@ class Lifecycle:
             write_occupancy(model, folder)
             carry_over(resumed, folder)
 
-    def _say_if_short(self, configured: int, most: int) -> None:
-        """Says so before a run that learns for fewer steps than are configured."""
+    def _say_if_short(self, configured: int, most: int, steps: int) -> None:
+        """Says so before a run of few steps that learns for fewer than are configured."""
         if most < configured != self.progress.configured:
             say(
-                f"a run of {self.trainer.config.max_num_iterations} steps learns the occupancy in "
+                f"a run of {steps} steps learns the occupancy in "
                 f"its first half: until step {self.progress.since + most}, not for the "
                 f"{configured} steps of schedule.learn-steps"
             )
@@ -199,8 +201,8 @@ class Lifecycle:
         return self.trainer is not None and step + 1 >= self.end()
 
     def end(self) -> int:
-        """Steps of the run; nerfstudio counts its iterations from the step that is gone on from."""
-        return int(self.trainer._start_step) + int(self.trainer.config.max_num_iterations)
+        """Steps of the run when it ends, those before it was resumed included."""
+        return end_of(self.trainer)
 
     def _after_learning_step(self, step: int) -> None:
         model, schedule, progress = self.model, self.schedule, self.progress

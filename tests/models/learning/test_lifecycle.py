@@ -114,14 +114,13 @@ def test_a_full_disk_costs_the_history_and_not_the_run(
 def test_a_short_run_says_once_that_half_of_it_is_for_learning(
     looking: Lifecycle, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    looking.trainer = SimpleNamespace(config=SimpleNamespace(max_num_iterations=125))
     looking.model.progress = Progress()  # type: ignore[assignment]
-    looking._say_if_short(200, 62)
+    looking._say_if_short(200, 62, 125)
     said = " ".join(capsys.readouterr().out.split())
     assert "of 125 steps" in said and "until step 62," in said
-    looking._say_if_short(50, 62)  # all of them fit
+    looking._say_if_short(50, 62, 125)  # all of them fit
     looking.model.progress.begin(200, 62)
-    looking._say_if_short(200, 62)  # resumed
+    looking._say_if_short(200, 62, 125)  # resumed
     assert capsys.readouterr().out == ""
 
 
