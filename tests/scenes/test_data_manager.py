@@ -164,6 +164,34 @@ def test_free_memory_is_the_smaller_of_machine_and_container(tmp_path: Path) -> 
     assert free_memory(tmp_path / "none", tmp_path / "none") is None
 
 
+class PlainManager:
+    """The manager as on nerfstudio's main, where it is no torch module."""
+
+    def __init__(self, module: LecoDataManager) -> None:
+        self.module = module
+
+    def to(self, device: Any) -> None:
+        """For the release's pipeline; main's does not ask."""
+
+    def __getattr__(self, name: str) -> Any:
+        if hasattr(torch.nn.Module, name):
+            raise AttributeError(name)
+        return getattr(self.module, name)
+
+
+@pytest.mark.parametrize("kept", [False, True])
+def test_an_occupancy_is_learned_where_a_manager_is_no_module(
+    tiny_scene: Path, tmp_path: Path, kept: bool
+) -> None:
+    options_of_main = {"train_num_images_to_sample_from": float("inf")}
+    made = on_disk(tiny_scene, tmp_path, **options_of_main)
+    config = made if kept else LecoDataManagerConfig(**options(tiny_scene), **options_of_main)
+    config._target = lambda config, **given: PlainManager(LecoDataManager(config, **given))
+    report, manager = learned(config)
+    assert isinstance(manager, PlainManager) and manager.on_disk() is kept
+    assert report["held_out"] and report["calibration_rays"] > 0
+
+
 def test_whole_images_are_refused_before_the_first_step(tiny_scene: Path) -> None:
     config = FullImageDatamanagerConfig(
         dataparser=LecoPhotographsDataParserConfig(data=tiny_scene), cache_images="cpu"
