@@ -10,8 +10,11 @@ import pytest
 import torch
 from samplers.analytic_occupancy import camera_rays, slow_march, slow_weights
 
+from leco_plugin.models.hosts.guide import Guide
+from leco_plugin.models.hosts.seams import swap_sampler
 from leco_plugin.samplers import nerfacc_cpu
 from leco_plugin.samplers.grid import OccupancyGridEstimator
+from leco_plugin.scenes.input_error import InputError
 
 nerfacc = pytest.importorskip("nerfacc")
 
@@ -81,6 +84,30 @@ def test_another_nerfacc_is_refused_in_a_line_and_left_as_it_is(monkeypatch, the
     with pytest.raises(ImportError, match=r"^traverse_grids of nerfacc .* nerfacc==0\.5\.2[^\n]*$"):
         nerfacc_cpu.install()
     assert nerfacc.pack_info is before
+
+
+def test_with_cuda_nerfacc_is_touched_for_a_model_on_another_device_only(monkeypatch):
+    nerfacc_cpu.uninstall()
+    before = nerfacc.pack_info
+    with monkeypatch.context() as machine:
+        machine.setattr(torch.cuda, "is_available", lambda: True)
+        machine.setattr(nerfacc, "traverse_grids", longer)  # a nerfacc that nobody here knows
+        for device in (None, "cuda", torch.device("cuda:1")):
+            nerfacc_cpu.install_for(device)
+        with pytest.raises(InputError, match="no sampler that could be swapped"):
+            swap_sampler(torch.nn.Identity(), Guide())
+        with pytest.raises(ImportError):
+            nerfacc_cpu.install_for("cpu")
+        machine.undo()
+        machine.setattr(torch.cuda, "is_available", lambda: True)
+        assert nerfacc.pack_info is before
+        nerfacc_cpu.install_for("cpu")
+        assert nerfacc.pack_info is not before
+        nerfacc_cpu.uninstall()
+        machine.setattr(torch.cuda, "is_available", lambda: False)
+        nerfacc_cpu.install_for(None)
+        assert nerfacc.pack_info is not before
+    nerfacc_cpu.uninstall()
 
 
 @pytest.mark.usefixtures("installed")
