@@ -104,6 +104,7 @@ def set_up_guided(config: GuidedModelConfig, **arguments: Any) -> Model:
     swap_sampler(host, guide)
     guide.register_load_state_dict_post_hook(lambda guide, _: set_first_density(host, guide))
     _refuse_what_is_not_finite(host)
+    _tell_of_crops(host, guide)
     _begin_with_occupancy(host, guide, config.occupancy)
     return host
 
@@ -129,6 +130,21 @@ def _refuse_what_is_not_finite(host: Model) -> None:
         return losses
 
     host.get_loss_dict = get_loss_dict  # type: ignore[method-assign]
+
+
+def _tell_of_crops(host: Model, guide: Guide) -> None:
+    """The guide learns whether rays come with limits of their own, before a collider sets them."""
+    own_forward = host.forward
+
+    @functools.wraps(own_forward)
+    def forward(ray_bundle: Any) -> dict[str, Any]:
+        guide.cropped = not host.training and getattr(ray_bundle, "nears", None) is not None
+        try:
+            return own_forward(ray_bundle)
+        finally:
+            guide.cropped = False
+
+    host.forward = forward  # type: ignore[method-assign]
 
 
 def _begin_with_occupancy(host: Model, guide: Guide, config: OccupancyConfig) -> None:

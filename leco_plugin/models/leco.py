@@ -40,7 +40,14 @@ from leco_plugin.models.rendering import (
     shade,
     with_backdrop,
 )
-from leco_plugin.models.scene_rays import cut_to_bounds, marching_rule, with_ends_for_all
+from leco_plugin.models.scene_rays import (
+    SeenBackdrops,
+    cut_to_bounds,
+    marching_rule,
+    over_background,
+    with_ends_for_all,
+    within_crop,
+)
 from leco_plugin.models.sizing.scene_sizes import complete
 from leco_plugin.models.sizing.sizes import Sizes
 from leco_plugin.models.sizing.stored_sizes import SIZES, stored_in, to_store
@@ -83,6 +90,7 @@ class LecoModel(Model):
         # near, far, step at `candidates`, step at `learn_candidates`, cone angles of both
         self.register_buffer("march_range", torch.tensor([0.05, 4.0, 0.03, 0.06, 0.0, 0.0]))
         self.register_buffer("aabb", torch.tensor([-1.0] * 3 + [1.0] * 3))
+        self.backdrops = SeenBackdrops()
         self.renderer_rgb = RGBRenderer(background_color="random")
         self.ramped = 0.0
         self.step = 0
@@ -145,8 +153,10 @@ class LecoModel(Model):
         self.bounds_known.fill_(True)
 
     def rays_of(self, bundle: RayBundle, with_images: bool | None = None) -> Rays:
-        """The bundle's rays, cut to the scene's bounds; of one that misses them the backdrop is
-        left, far off, as its sky.
+        """The bundle's rays, cut to the scene's bounds and to a crop.
+
+        A ray that misses the bounds keeps a backdrop at the far end, as its sky. Rays of no
+        training image have a backdrop only where training has seen one.
 
         Args:
             with_images: whether rays show the appearance of their training image, or the mean of
@@ -155,7 +165,10 @@ class LecoModel(Model):
         near, far, *steps = self.march_range[:4]
         known = self.training if with_images is None else with_images
         cut = cut_to_bounds(bundle, self.aabb, near, far, with_images=known)
-        return with_ends_for_all(cut, far, torch.minimum(*steps))
+        if not known:
+            cut = cut._replace(cut_off=~self.backdrops(cut, self.space, self.aabb))
+        rays = with_ends_for_all(cut, far, torch.minimum(*steps))
+        return within_crop(rays, bundle.nears, bundle.fars)
 
     def estimator(self) -> LearnedOccupancyEstimator:
         """Samples where the frozen gate says so; built on first use, also after a checkpoint.
@@ -310,7 +323,8 @@ class LecoModel(Model):
                 "kept_rule": (above, *self.step_and_angle(learning)),
             }
         met, shown = before_the_backdrop(shaded, intervals, rays)
-        return {"rgb": shaded.rgb, **shown, **gate_pictures(met, intervals.ray_indices)}
+        colors = over_background(shaded, rays)
+        return {"rgb": colors, **shown, **gate_pictures(met, intervals.ray_indices)}
 
     def get_rgba_image(self, outputs: dict[str, Tensor], output_name: str = "rgb") -> Tensor:
         """Colours with what was met before the backdrop as their alpha, [..., 4]."""

@@ -44,6 +44,8 @@ class Rays(NamedTuple):
     """[R] where each ray ends."""
     images: Tensor | None
     """[R] int64 of the training image whose appearance is shown, or None for the mean of all."""
+    cut_off: Tensor | None = None
+    """[R] bool, rays without a backdrop, behind which the background shows; None is no ray."""
 
 
 class Intervals(NamedTuple):
@@ -165,13 +167,21 @@ def with_backdrop(
 
 
 def backdrop_starts(rays: Rays, step_size: float, cone_angle: float) -> Tensor:
-    """Where the backdrop of each ray begins [R]: the march's last step before the ray's end."""
-    return rays.t_maxs - (rays.t_maxs * cone_angle).clamp(min=step_size)
+    """Where the backdrop of each ray begins [R]: the march's last step before the ray's end.
+
+    The backdrop of a ray that is cut off has no length.
+    """
+    starts = rays.t_maxs - (rays.t_maxs * cone_angle).clamp(min=step_size)
+    if rays.cut_off is None:
+        return starts
+    return torch.where(rays.cut_off, rays.t_maxs, starts.maximum(rays.t_mins))
 
 
 def backdrop_of(intervals: Intervals, rays: Rays) -> Tensor:
     """Which intervals [M] are the backdrop of a ray that meets the scene."""
-    ends = rays.t_maxs.masked_fill(rays.t_maxs <= rays.t_mins, torch.inf)
+    without = rays.t_maxs <= rays.t_mins
+    without = without if rays.cut_off is None else without | rays.cut_off
+    ends = rays.t_maxs.masked_fill(without, torch.inf)
     return intervals.t_ends >= ends.index_select(0, intervals.ray_indices)
 
 

@@ -30,7 +30,14 @@ from leco_plugin.models.rendering import (
     with_backdrop,
 )
 from leco_plugin.models.scene_grid import scene_grid
-from leco_plugin.models.scene_rays import cut_to_bounds, marching_rule, with_ends_for_all
+from leco_plugin.models.scene_rays import (
+    SeenBackdrops,
+    cut_to_bounds,
+    marching_rule,
+    over_background,
+    with_ends_for_all,
+    within_crop,
+)
 from leco_plugin.models.switch.config import SwitchNerfModelConfig
 from leco_plugin.models.switch.field import NEW_DENSITY, Answers, SwitchField
 from leco_plugin.models.switch.objective import switch_losses, switch_statistics
@@ -80,6 +87,7 @@ class SwitchNerfModel(Model):
         # near, far, step and cone angle
         self.register_buffer("march_range", torch.tensor([0.05, 4.0, 0.03, 0.0]))
         self.register_buffer("aabb", torch.tensor([-1.0] * 3 + [1.0] * 3))
+        self.backdrops = SeenBackdrops()
         self.renderer_rgb = RGBRenderer(background_color="random")
         self.occupancy_grid = None
         if self.config.sampling == "occupancy-grid":
@@ -115,6 +123,8 @@ class SwitchNerfModel(Model):
             manager, config = training_callback_attributes.pipeline.datamanager, self.config
             seen = survey(manager, config.bounds, config.near, config.far)
             self.set_bounds(seen.bounds, seen.median_length)
+            cameras = manager.train_dataset.cameras
+            self.backdrops.look(cameras, self.space, self.aabb, *self.march_range[:2])
             announce(seen)
         before = TrainingCallbackLocation.BEFORE_TRAIN_ITERATION
         return [TrainingCallback([before], self.update_estimator)]
@@ -182,10 +192,14 @@ class SwitchNerfModel(Model):
         return answers
 
     def rays_of(self, bundle: RayBundle) -> Rays:
-        """The bundle's rays, cut to the scene's bounds; those that miss end where all do."""
+        """The bundle's rays, cut to the scene's bounds and to a crop; those that miss end where all
+        do. In evaluation they have a backdrop only where training has seen one."""
         near, far, step, cone_angle = self.march_range
         rays = cut_to_bounds(bundle, self.aabb, near, far, with_images=self.training)
-        return with_ends_for_all(rays, far, step.maximum(far * cone_angle))
+        if not self.training:
+            rays = rays._replace(cut_off=~self.backdrops(rays, self.space, self.aabb))
+        rays = with_ends_for_all(rays, far, step.maximum(far * cone_angle))
+        return within_crop(rays, bundle.nears, bundle.fars)
 
     def _shade(self, rays: Rays) -> tuple[Intervals, Shaded]:
         """Samples along rays in whichever way, shaded."""
@@ -228,7 +242,7 @@ class SwitchNerfModel(Model):
         with gate_precision(self.device.type, self.precision):
             intervals, shaded = self._shade(rays)
         outputs: dict[str, Any] = {
-            "rgb": shaded.rgb,
+            "rgb": over_background(shaded, rays),
             "depth": shaded.depth[:, None],
             "accumulation": shaded.accumulation[:, None],
             "samples_per_ray": shaded.packed_info[:, 1:].float(),

@@ -193,18 +193,20 @@ def chosen_cameras(count: int) -> Tensor:
     return torch.linspace(0, count - 1, min(count, MOST_CAMERAS)).long().unique()
 
 
-def covering_rays(cameras: Cameras) -> tuple[Tensor, Tensor]:
+def covering_rays(cameras: Cameras, side: int = SIDE) -> tuple[Tensor, Tensor]:
     """Rays that cover the images of up to `MOST_CAMERAS` cameras.
 
+    Args:
+        side: rays along each side of an image.
     Returns:
-        origins and unit directions, [C, SIDE * SIDE, 3] float32 on the CPU.
+        origins and unit directions, [C, side * side, 3] float32 on the CPU.
     """
     cameras = cameras.to("cpu")
     origins, directions = [], []
     for number in chosen_cameras(len(cameras)).tolist():
         height, width = float(cameras.height[number]), float(cameras.width[number])
-        rows = torch.linspace(0.5, height - 0.5, SIDE)
-        columns = torch.linspace(0.5, width - 0.5, SIDE)
+        rows = torch.linspace(0.5, height - 0.5, side)
+        columns = torch.linspace(0.5, width - 0.5, side)
         coords = torch.stack(torch.meshgrid(rows, columns, indexing="ij"), dim=-1).view(-1, 2)
         bundle = cameras.generate_rays(camera_indices=number, coords=coords)
         origins.append(bundle.origins.float())

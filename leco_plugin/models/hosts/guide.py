@@ -51,6 +51,7 @@ class Guide(nn.Module):
     Attributes:
         occupancy: None until there is one.
         dense: whether packed samplers keep every candidate for the moment, as a reference.
+        cropped: whether the limits of the rays that are rendered now are those of a crop.
         kept: samples that a packed sampler kept when it was last asked in training.
         watched: what was found of the price of skipping, and what is followed until it is; travels
             with a checkpoint.
@@ -72,7 +73,7 @@ class Guide(nn.Module):
         self.options = dict(options or {})
         self.occupancy: Occupancy | None = None
         self.version = 0
-        self.dense = False
+        self.dense = self.cropped = False
         self.kept: int | None = None
         self.watched: dict[str, Any] = {}
         self.first_density: float | None = None

@@ -15,6 +15,7 @@ from nerfstudio.model_components.ray_samplers import Sampler
 from torch import Tensor, nn
 
 from leco_plugin.models.rendering import Intervals, Rays, with_backdrop
+from leco_plugin.models.scene_rays import within_crop
 from leco_plugin.samplers.base import DensityFn, Estimator
 from leco_plugin.samplers.estimator import cell_centers
 from leco_plugin.samplers.marching.rays import intersect_box, usable_rays
@@ -65,6 +66,7 @@ def _ending_in_a_backdrop(
     rays_d: Tensor,
     options: dict[str, Any],
     walls: Tensor,
+    crop: tuple[Tensor | None, Tensor | None],
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Packed samples whose rays end in one interval that no gate skips.
 
@@ -76,6 +78,7 @@ def _ending_in_a_backdrop(
         options: of its `sampling`.
         walls: [6] of the occupancy: where a ray leaves them its backdrop begins; one that misses
             them has it at its end.
+        crop: where each ray begins and ends in it, [R] each; a ray that it ends has no backdrop.
     """
     options = _DEFAULTS | options
     ends = rays_o.new_full((len(rays_o),), float(options["far_plane"]))
@@ -83,12 +86,13 @@ def _ending_in_a_backdrop(
     enters, leaves = intersect_box(rays_o, rays_d, walls)
     ends = torch.where(leaves > enters.clamp(min=0.0), leaves.minimum(ends), ends)
     begins = torch.full_like(ends, float(options["near_plane"]))
-    rays = Rays(rays_o, rays_d, begins, ends, None)
+    rays = within_crop(Rays(rays_o, rays_d, begins, ends, None), *crop)
     ended = with_backdrop(
         Intervals(*samples), rays, options["render_step_size"], options["cone_angle"]
     )
-    usable = usable_rays(torch.stack([rays_o.t(), rays_d.t()]), begins, ends)
-    kept = usable[ended.ray_indices] | (ended.t_ends < ends[ended.ray_indices])
+    usable = usable_rays(torch.stack([rays_o.t(), rays_d.t()]), rays.t_mins, rays.t_maxs)
+    kept = usable[ended.ray_indices] | (ended.t_ends < rays.t_maxs[ended.ray_indices])
+    kept &= ended.t_ends > ended.t_starts
     return ended.ray_indices[kept], ended.t_starts[kept], ended.t_ends[kept]
 
 
@@ -128,7 +132,14 @@ class GuidedEstimator(_StandIn):
     def sampling(self, rays_o: Tensor, rays_d: Tensor, *args: Any, **kwargs: Any) -> Any:
         (guide,) = self._guide
         estimator: Any = self.dense if guide.dense else self.sampler
-        options = self._with_an_end(_SAMPLING.bind(self, rays_o, rays_d, *args, **kwargs).arguments)
+        given = dict(_SAMPLING.bind(self, rays_o, rays_d, *args, **kwargs).arguments)
+        for name in ("self", "rays_o", "rays_d"):
+            del given[name]
+        options = uncropped = self._with_an_end(rays_o, rays_d, given)
+        crop: tuple[Tensor | None, Tensor | None] = (None, None)
+        if guide.cropped:
+            crop = given.get("t_min"), given.get("t_max")
+            uncropped = self._with_an_end(rays_o, rays_d, given | {"t_max": None})
         if not guide.same_frame():
             # a direction carries the scale, so that distances along the ray stay the host's
             frame = guide.frame.to(rays_o)
@@ -138,7 +149,8 @@ class GuidedEstimator(_StandIn):
             guide.kept = len(samples[0])
         occupancy = guide.the_occupancy()
         if occupancy.shows_a_backdrop() and not (guide.dense and self._is_endless()):
-            samples = _ending_in_a_backdrop(samples, rays_o, rays_d, options, occupancy.walls)
+            walls = occupancy.walls
+            samples = _ending_in_a_backdrop(samples, rays_o, rays_d, uncropped, walls, crop)
         return samples
 
     @property
@@ -148,18 +160,17 @@ class GuidedEstimator(_StandIn):
         box = self.sampler.bounds() if isinstance(self.sampler, Estimator) else None
         return build_estimator("dense", aabb=box).to(guide.frame.device).train(self.training)
 
-    def _with_an_end(self, arguments: dict[str, Any]) -> dict[str, Any]:
+    def _with_an_end(self, rays_o: Tensor, rays_d: Tensor, given: dict[str, Any]) -> dict[str, Any]:
         """The options of `sampling`; rays that would go on for ever end at the host's box.
 
         A host whose steps do not grow relies on the box of its own estimator, and an unbounded
         occupancy has none.
         """
-        _, rays_o, rays_d = (arguments.pop(name) for name in ("self", "rays_o", "rays_d"))
-        if self._is_endless() and self._outermost is not None and not arguments.get("cone_angle"):
-            _, leaves = intersect_box(rays_o, rays_d, self._outermost.to(rays_o))
-            t_max = arguments.get("t_max")
-            arguments["t_max"] = leaves if t_max is None else leaves.minimum(t_max)
-        return arguments
+        if not self._is_endless() or self._outermost is None or given.get("cone_angle"):
+            return given
+        _, leaves = intersect_box(rays_o, rays_d, self._outermost.to(rays_o))
+        t_max = given.get("t_max")
+        return given | {"t_max": leaves if t_max is None else leaves.minimum(t_max)}
 
     def _is_endless(self) -> bool:
         """Whether the occupancy goes on into the distance."""
