@@ -20,6 +20,7 @@ from torch.multiprocessing import ProcessExitedException, ProcessRaisedException
 from torch.nn.parallel import DistributedDataParallel
 
 from leco_plugin.compat.atomic_trainer import AtomicTrainer
+from leco_plugin.compat.moved_runs import follow_data
 from leco_plugin.compat.run_folder import claim
 from leco_plugin.models.compute.ranks import say
 from leco_plugin.models.failures import TrainingStopped
@@ -35,6 +36,15 @@ class DataParallelTrainerConfig(TrainerConfig):
 
     _target: type = field(default_factory=lambda: AtomicTrainer)
     """target class to instantiate"""
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        """Called by yaml: data that were moved with their run are found before they are read.
+
+        Raises:
+            InputError: they are not found.
+        """
+        self.__dict__.update(state)
+        follow_data(self)
 
     def set_timestamp(self) -> None:
         """Prepares the launcher too: of a config, nothing else is called before processes start.

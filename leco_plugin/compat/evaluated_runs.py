@@ -12,6 +12,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+from leco_plugin.compat.moved_runs import checkpoints_of
 from leco_plugin.compat.whole_checkpoints import newest_whole, step_of
 from leco_plugin.models.compute.ranks import say
 
@@ -43,7 +44,8 @@ def from_whole(load: Callable[..., tuple[Path, int]]) -> Callable[..., tuple[Pat
 
     @functools.wraps(load)
     def loading(config: Any, pipeline: Any) -> tuple[Path, int]:
-        folder, step = Path(config.load_dir), config.load_step
+        folder = config.load_dir = checkpoints_of(config)
+        step = config.load_step
         if step is None or not (folder / f"step-{step:09d}.ckpt").exists():
             path = whole_of(folder)
             config.load_dir, config.load_step = path.parent, step_of(path)

@@ -13,6 +13,7 @@ from leco_plugin.compat.host_outputs import true_colours
 from leco_plugin.evaluation.clock import Clock
 from leco_plugin.evaluation.field_queries import FieldQueries
 from leco_plugin.evaluation.metrics import image_metrics
+from leco_plugin.scenes.input_error import InputError
 
 RAYS_AT_ONCE = 1024
 """Of pixels spread over the images: few, so that looking at a run does not set its peak memory."""
@@ -27,6 +28,8 @@ def psnr_on_rays(trainer: Trainer, rays: int, seed: int = 0) -> float:
     pipeline = trainer.pipeline
     pipeline.eval()
     dataset: Any = pipeline.datamanager.eval_dataset
+    if len(dataset) == 0:
+        raise InputError("the scene has no test image, on which runs could be compared")
     generator = torch.Generator().manual_seed(seed)
     per_image = -(-rays // len(dataset))
     squared_error, count = 0.0, 0

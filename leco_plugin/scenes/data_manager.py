@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
@@ -86,12 +86,29 @@ class LecoDataManager(VanillaDataManager):  # type: ignore[type-arg]
         return dataset
 
     def create_eval_dataset(self) -> Any:
-        """The test photographs."""
-        return names_what_it_cannot_read(super().create_eval_dataset())
+        """The test photographs; there may be none."""
+        dataset = names_what_it_cannot_read(super().create_eval_dataset())
+        if len(dataset) == 0:
+            if self.test_mode == "val":
+                count = len(self.train_dataset)
+                say(f"no test image: the run trains on all {count} and evaluates nothing")
+            self.eval_dataloader = self.fixed_indices_eval_dataloader = NoTestImages(
+                f"{self.get_datapath()} has no test image in this run, and nothing can be "
+                "evaluated; ns-render shows what it has learned"
+            )
+        return dataset
 
     def _get_pixel_sampler(self, dataset: Any, num_rays_per_batch: int) -> Any:
-        """nerfstudio's choice; of small scenes more pixels are held out."""
+        """nerfstudio's choice; of small scenes more pixels are held out.
+
+        The radius of a fisheye's circle is that of the full-size image, or given by hand.
+        """
+        by_hand = self.config.pixel_sampler.fisheye_crop_radius
         sampler = super()._get_pixel_sampler(dataset, num_rays_per_batch)
+        of_scene = (dataset.cameras.metadata or {}).get("fisheye_crop_radius")
+        factor = getattr(self.dataparser, "downscale_factor", None) or 1
+        radius = by_hand if of_scene is None else of_scene * dataset.scale_factor / factor
+        sampler.config.fisheye_crop_radius = radius
         if isinstance(sampler, HeldOutPixelSampler):
             period = getattr(self.config, "held_out_period", None)
             sampler.lattice = (
@@ -163,6 +180,19 @@ class LecoDataManager(VanillaDataManager):  # type: ignore[type-arg]
         self.eval_dataloader = RandIndicesEvalDataloader(
             input_dataset=self.eval_dataset, device=self.device
         )
+
+
+@dataclass
+class NoTestImages:
+    """Stands where nerfstudio has its loaders of test images, and says that there are none."""
+
+    why: str
+
+    def __len__(self) -> int:
+        raise InputError(self.why)
+
+    def __iter__(self) -> Iterator[Any]:
+        raise InputError(self.why)
 
 
 def in_one_line(read: Callable[..., DataparserOutputs], config: Any) -> Callable[..., Any]:

@@ -62,7 +62,7 @@ class LecoPhotographs(Nerfstudio):
         except Exception as error:
             reason = f"{type(error).__name__}: {one_line(error, 120)}"
             raise InputError(f"{self.config.data} cannot be read ({reason})") from error
-        if len(outputs.image_filenames) == 0:
+        if len(outputs.image_filenames) == 0 and split == "train":
             raise InputError(f"{self.config.data}: no image is left for the split {split!r}")
         if self.downscale_factor != 1:
             check_smaller_images(outputs.image_filenames, outputs.cameras)

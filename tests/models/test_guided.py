@@ -12,9 +12,11 @@ import torch
 import yaml
 from ball_occupancy import ball_of_the_tiny_scene
 from nerfacc import OccGridEstimator
+from nerfstudio.data.scene_box import OrientedBox
 from nerfstudio.engine.callbacks import TrainingCallbackAttributes, TrainingCallbackLocation
 from nerfstudio.fields.density_fields import HashMLPDensityField
 from nerfstudio.model_components.ray_samplers import ProposalNetworkSampler
+from nerfstudio.model_components.renderers import background_color_override_context
 from nerfstudio.models.base_model import Model
 from nerfstudio.models.instant_ngp import NGPModel
 from small_hosts import SMALL, pipeline_of, small, unswapped
@@ -105,6 +107,27 @@ class HasAGuide(NGPModel):
     def populate_modules(self) -> None:
         super().populate_modules()
         self.guide = nn.Linear(2, 2)
+
+
+MAGENTA = torch.tensor([1.0, 0.0, 1.0])
+
+
+def test_a_crop_that_rays_do_not_meet_leaves_the_background(pair: Pair) -> None:
+    """Behind the cameras of any host, and beyond the far plane of hosts that end there."""
+    renders_as_nerfstudio = hasattr(pair.guided.model, "renderer_rgb")
+    ends = pair.name not in ("nerfacto", "elsewhere-proposal", "elsewhere-places")
+    camera = pair.guided.datamanager.eval_dataset.cameras[:1]
+    origin, back = camera.camera_to_worlds[0, :, 3], camera.camera_to_worlds[0, :, 2]
+    pair.guided.eval()
+    for away in (50.0, -50.0) if ends else (50.0,):
+        middle = (origin + away * back).tolist()
+        box = OrientedBox.from_params(tuple(middle), (0.0, 0.0, 0.0), (4.0, 4.0, 4.0))
+        with background_color_override_context(MAGENTA):
+            outputs = pair.guided.model.get_outputs_for_camera(camera, obb_box=box)
+        assert float(outputs["accumulation"].max()) == 0.0
+        if renders_as_nerfstudio:
+            torch.testing.assert_close(outputs["rgb"], MAGENTA.expand_as(outputs["rgb"]))
+    pair.guided.train()
 
 
 def test_what_guides_a_host_takes_the_place_of_nothing_that_it_has() -> None:

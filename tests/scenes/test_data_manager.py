@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import shutil
 from pathlib import Path
 from types import SimpleNamespace
@@ -243,3 +244,59 @@ def test_a_folder_that_is_not_there_is_one_line_of_any_reader(reader: Any, tmp_p
     with pytest.raises(InputError, match="nowhere cannot be read as a scene") as caught:
         config.setup(device="cpu")
     assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("kept", ["memory", "disk"])
+@pytest.mark.parametrize("by_hand", [False, True])
+def test_a_fisheye_is_read_as_far_as_its_lens_shows(
+    kept: Any, by_hand: bool, tiny_scene: Path, tmp_path: Path
+) -> None:
+    scene = Path(shutil.copytree(tiny_scene, tmp_path / "scene"))
+    meta = json.loads((scene / "transforms.json").read_text())
+    meta |= {"camera_model": "OPENCV_FISHEYE"} | ({} if by_hand else {"fisheye_crop_radius": 20})
+    (scene / "transforms.json").write_text(json.dumps(meta))
+    config = LecoDataManagerConfig(
+        images=kept, pixels=tmp_path, camera_res_scale_factor=0.5, **options(scene)
+    )
+    if by_hand:
+        config.pixel_sampler.fisheye_crop_radius = 10.0
+    manager: Any = config.setup(device="cpu")
+    drawn = torch.cat([manager.next_train(step)[1]["indices"] for step in range(50)])
+    drawn = torch.cat([drawn, manager.next_eval(0)[1]["indices"]])
+    held_out = manager.train_pixel_sampler.sample_held_out(
+        next(manager.iter_train_image_dataloader), 500, seed=0
+    )["indices"]
+    # half of 32 pixels, and half of the radius
+    for pixels in (drawn, held_out):
+        distances = (pixels[:, 1:] + 0.5 - 8.0).norm(dim=-1)
+        assert 7.0 < float(distances.max()) <= 10.0
+
+
+def everything_trains(tiny_scene: Path, folder: Path) -> Path:
+    """The tiny scene without lists of its splits."""
+    scene = Path(shutil.copytree(tiny_scene, folder / "scene"))
+    meta = json.loads((scene / "transforms.json").read_text())
+    kept = {name: value for name, value in meta.items() if not name.endswith("_filenames")}
+    (scene / "transforms.json").write_text(json.dumps(kept))
+    return scene
+
+
+@pytest.mark.parametrize("kept", ["memory", "disk"])
+@pytest.mark.parametrize("reader", [LecoPhotographsDataParserConfig, NerfstudioDataParserConfig])
+def test_all_photographs_may_train(
+    reader: Any, kept: Any, tiny_scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    scene = everything_trains(tiny_scene, tmp_path)
+    parser = reader(data=scene, train_split_fraction=1.0)
+    made = {**options(scene), "dataparser": parser}
+    config = LecoDataManagerConfig(images=kept, pixels=tmp_path, **made)
+    manager: Any = config.setup(device="cpu")
+    assert len(manager.train_dataset) == 9 and not manager.eval_dataset
+    assert manager.next_train(0)[1]["image"].shape == (64, 3)
+    assert capsys.readouterr().out.count("no test image: the run trains on all 9") == 1
+    manager = config.setup(device="cpu", test_mode="test")
+    for ask in (len, iter, lambda loader: manager.next_eval_image(0)):
+        with pytest.raises(InputError, match="no test image in this run") as caught:
+            ask(manager.fixed_indices_eval_dataloader)
+        assert "\n" not in str(caught.value)
+    assert "no test image" not in capsys.readouterr().out

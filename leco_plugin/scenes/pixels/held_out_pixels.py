@@ -8,6 +8,7 @@ from __future__ import annotations
 import functools
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from functools import partial
 from typing import Any
 
 import torch
@@ -41,6 +42,13 @@ def look_up(source: Any, which: Tensor, places: Tensor) -> Tensor:
     return torch.stack(values) if values else source[0].new_zeros(0, *source[0].shape[2:])
 
 
+def sizes_of(pictures: Any) -> Tensor:
+    """Height and width [P, 2] of pictures, as `look_up` takes them."""
+    if isinstance(pictures, StoredPictures):
+        return pictures.sizes
+    return torch.tensor([picture.shape[:2] for picture in pictures])
+
+
 def some_images(dataset: Any, most: int = 16) -> dict[str, Any]:
     """A batch of up to so many images, spread evenly, decoded for the occasion.
 
@@ -66,8 +74,11 @@ def _stepping_aside(sample: Callable[..., Tensor]) -> Callable[..., Tensor]:
         mask: Tensor | None = None,
         device: torch.device | str = "cpu",
     ) -> Tensor:
-        indices = sample(self, batch_size, num_images, image_height, image_width, mask, device)
-        return self._step_aside(indices, image_width, mask)
+        def drawn(count: int) -> Tensor:
+            return sample(self, count, num_images, image_height, image_width, mask, device)
+
+        sizes = torch.tensor([image_height, image_width], device=device)
+        return self._step_aside(self._through_the_lens(drawn, batch_size, sizes), sizes, mask)
 
     return sample_others
 
@@ -124,6 +135,38 @@ class HeldOutPixelSampler(PixelSampler):
         batch: dict[str, Any] = super().sample(image_batch)
         return batch
 
+    def shown(self, pixels: Tensor, sizes: Tensor) -> Tensor:
+        """Whether a fisheye shows pixels (image, row, column) [N, 3] as a whole: bool [N].
+
+        Args:
+            sizes: [2] or [N, 2], height and width of their pictures.
+        """
+        radius = self.config.fisheye_crop_radius
+        if radius is None:
+            return torch.ones(len(pixels), dtype=torch.bool, device=pixels.device)
+        # the middle that nerfstudio draws around
+        corners = pixels[:, 1:] - torch.div(sizes, 2, rounding_mode="floor")
+        return corners.abs().maximum((corners + 1).abs()).square().sum(dim=-1) <= radius**2
+
+    def _through_the_lens(self, draw: Callable[[int], Tensor], count: int, sizes: Tensor) -> Tensor:
+        """Drawn pixels [count, 3], those drawn anew that a fisheye does not show.
+
+        Args:
+            sizes: as of `shown`, or [P, 2] of all pictures.
+        Raises:
+            InputError: it shows next to none.
+        """
+        pixels = draw(count)
+        for _ in range(TRIES):
+            hidden = ~self.shown(pixels, sizes if sizes.dim() == 1 else sizes[pixels[:, 0]])
+            if not bool(hidden.any()):
+                return pixels
+            pixels[hidden] = draw(int(hidden.sum()))
+        raise InputError(
+            f"a fisheye_crop_radius of {self.config.fisheye_crop_radius} pixels shows next to "
+            "nothing of the training images: it is in pixels of the images as they are read"
+        )
+
     def _sample_stored(
         self, pictures: StoredPictures, masks: StoredPictures | None
     ) -> dict[str, Any]:
@@ -139,19 +182,21 @@ class HeldOutPixelSampler(PixelSampler):
 
     def _drawn_aside(self, pictures: StoredPictures, count: int) -> Tensor:
         """Pixels [count, 3] of stored pictures, none of them held out."""
-        indices = pictures.draw(count)
-        return self._aside(indices, pictures.sizes[indices[:, 0], 1])
+        draw = partial(pictures.draw, by_solid_angle=bool(self.config.is_equirectangular))
+        indices = self._through_the_lens(draw, count, pictures.sizes)
+        return self._aside(indices, pictures.sizes[indices[:, 0]])
 
-    def _aside(self, indices: Tensor, widths: Tensor | int) -> Tensor:
-        """Pixels [N, 3] of pictures so wide; held-out ones give way to their neighbours."""
+    def _aside(self, indices: Tensor, sizes: Tensor) -> Tensor:
+        """Pixels [N, 3] of pictures of sizes [2] or [N, 2]; held-out ones give way to their
+        neighbours, towards the middle."""
         columns = indices[:, 2]
-        aside = torch.where(columns + 1 < widths, columns + 1, columns - 1)
+        aside = torch.where(columns < sizes[..., 1] // 2, columns + 1, columns - 1)
         indices[:, 2] = torch.where(self.lattice.holds_out(indices), aside, columns)
         return indices
 
-    def _step_aside(self, indices: Tensor, image_width: int, mask: Tensor | None) -> Tensor:
+    def _step_aside(self, indices: Tensor, sizes: Tensor, mask: Tensor | None) -> Tensor:
         """Moves held-out pixels [N, 3] to their neighbours, or to others where those are masked."""
-        indices = self._aside(indices, image_width)
+        indices = self._aside(indices, sizes)
         if isinstance(mask, Tensor) and not self.config.ignore_mask:
             image, row, column = indices.to(mask.device).unbind(dim=-1)
             seen = mask[image, row, column].bool().flatten().to(indices.device)
@@ -191,12 +236,9 @@ class HeldOutPixelSampler(PixelSampler):
         self, images: dict[str, Any], count: int, seed: int, share: Share
     ) -> tuple[Tensor, Tensor]:
         """Pictures [N] and places in them [N, 2]; arguments as of `sample_held_out`."""
-        pictures = images["image"]
-        if isinstance(pictures, StoredPictures):
-            sizes = pictures.sizes
-        else:
-            sizes = torch.tensor([picture.shape[:2] for picture in pictures])
+        sizes = sizes_of(images["image"])
         places = self.lattice.draw(sizes, DRAWN * count, torch.Generator().manual_seed(seed))
+        places = places[self.shown(places, sizes[places[:, 0]])]
         if "mask" in images:
             seen = look_up(images["mask"], places[:, 0], places[:, 1:]).flatten(1).all(dim=1)
             places = places[seen.cpu()]

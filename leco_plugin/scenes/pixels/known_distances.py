@@ -11,6 +11,7 @@ from leco_plugin.scenes.pixels.held_out_pixels import (
     HeldOutPixelSampler,
     HeldOutPixelSamplerConfig,
     look_up,
+    sizes_of,
 )
 from leco_plugin.scenes.pixels.sparse_pixels import SparsePixels
 
@@ -66,6 +67,8 @@ class KnownDistancePixelSampler(HeldOutPixelSampler):
         places = place_of[pixels[:, 0]]
         loaded = places >= 0
         drawn, pixels, places = drawn[loaded], pixels[loaded], places[loaded]
+        inside = self.shown(pixels, sizes_of(images["image"])[places])
+        drawn, pixels, places = drawn[inside], pixels[inside], places[inside]
         if "mask" in images:
             seen = look_up(images["mask"], places, pixels[:, 1:]).flatten(1).all(dim=1).cpu()
             drawn, pixels, places = drawn[seen], pixels[seen], places[seen]

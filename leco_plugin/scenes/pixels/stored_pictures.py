@@ -39,14 +39,23 @@ class StoredPictures:
     def __len__(self) -> int:
         return len(self.files)
 
-    def draw(self, count: int) -> Tensor:
-        """Pixels, each of all pictures as likely as any other: [count, 3] picture, row, column."""
+    def draw(self, count: int, by_solid_angle: bool = False) -> Tensor:
+        """Pixels, each of all pictures as likely as any other: [count, 3] picture, row, column.
+
+        Args:
+            by_solid_angle: in panoramas, pixels are as likely as the solid angle they show.
+        """
         total = int(self._pixels_until[-1])
         drawn = torch.randint(total, (count,))
         which = torch.searchsorted(self._pixels_until, drawn, right=True)
         within = drawn - (self._pixels_until[which] - self.sizes[which].prod(dim=-1))
         width = self.sizes[which, 1]
-        return torch.stack([which, within // width, within % width], dim=-1)
+        rows, columns = within // width, within % width
+        if by_solid_angle:
+            heights = self.sizes[which, 0]
+            polar = torch.acos(1.0 - 2.0 * torch.rand(count)) / torch.pi
+            rows = (polar * heights).long().minimum(heights - 1)
+        return torch.stack([which, rows, columns], dim=-1)
 
     def read(self, which: Tensor, places: Tensor) -> Tensor:
         """Values of pixels: [K, C] float32 in [0, 1].

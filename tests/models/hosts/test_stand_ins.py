@@ -120,6 +120,22 @@ def test_rays_of_an_unbounded_occupancy_end_in_a_place_for_the_sky():
     assert t_starts.tolist() == [7.0, 35.0] and t_ends.tolist() == [8.0, 40.0]
 
 
+def test_a_ray_that_a_crop_ends_has_no_place_for_the_sky():
+    guide = an_unbounded_guide(2.0)  # which keeps nothing
+    origins, directions = torch.zeros(4, 3), torch.tensor([[0.0, 0.0, 1.0]]).expand(4, 3)
+    march: dict[str, Any] = {"cone_angle": 0.125, "far_plane": 40.0, "render_step_size": 0.1}
+    guided: Any = guide.estimator(BOX).eval()
+    # cut off, around the sky and more, beyond everything, and as nerfstudio says that a ray misses
+    limits = torch.tensor([[0.0, 8.0], [1.0, 90.0], [50.0, 60.0], [1e10, 1e10]])
+    guide.cropped = True
+    nears, fars = limits.T
+    indices, t_starts, t_ends = guided.sampling(
+        origins, directions, t_min=nears, t_max=fars, **march
+    )
+    assert indices.tolist() == [1]
+    assert t_starts.tolist() == [35.0] and t_ends.tolist() == [40.0]
+
+
 def test_rays_of_a_bounded_occupancy_end_so_where_pictures_show_something_there():
     walls = torch.tensor([-1.0, -1.0, -1.0, 1.0, 1.0, 1.0])
     origins = torch.tensor([[0.0, 0.0, -3.0], [0.0, 5.0, -3.0]])  # one ray meets the box

@@ -175,3 +175,37 @@ def test_a_mask_is_sampled_evenly() -> None:
 def test_a_mask_without_a_pixel_is_an_input_error() -> None:
     with pytest.raises(InputError, match="leave no pixel"):
         sampler().rejection_sample_mask(torch.zeros(1, 4, 4, 1), 3, 1, 4, 4, "cpu")
+
+
+def inside_circle(places: torch.Tensor, sizes: torch.Tensor, radius: float) -> torch.Tensor:
+    offsets = places[:, 1:] + 0.5 - sizes / 2
+    return offsets.norm(dim=-1) <= radius
+
+
+@pytest.mark.parametrize("kind", ["alike", "masked", "list"])
+def test_nothing_is_drawn_outside_of_what_a_fisheye_shows(kind: str) -> None:
+    batch: dict = images(masked=kind == "masked")
+    if kind == "list":
+        batch["image"] = list(batch["image"])
+    made, sizes = sampler(fisheye_crop_radius=12.0), torch.tensor([40.0, 39.0])
+    made.set_num_rays_per_batch(6000)
+    torch.manual_seed(0)
+    trained = made.sample(dict(batch))["image"].long()
+    assert bool(
+        inside_circle(trained, sizes, 12.5).all()
+    )  # nerfstudio's middle is half a pixel off
+    assert not bool(THIN.holds_out(trained).any())
+    seen = batch["mask"][..., 0].long() if "mask" in batch else torch.ones(3, 40, 39).long()
+    area = 3.14159 * 12.0**2 * 3 * float(seen.float().mean())
+    assert 0.8 * area < len(trained.unique(dim=0)) < area
+    calibrated = made.sample_held_out(batch, 1000, seed=0)["image"].long()
+    assert len(calibrated) >= 3 and bool(inside_circle(calibrated, sizes, 12.5).all())
+    assert bool(THIN.holds_out(calibrated).all())
+
+
+def test_a_circle_that_shows_nothing_is_one_line() -> None:
+    made = sampler(fisheye_crop_radius=0.5)
+    with pytest.raises(
+        InputError, match=r"a fisheye_crop_radius of 0\.5 pixels shows next to nothing"
+    ):
+        made.sample(images())

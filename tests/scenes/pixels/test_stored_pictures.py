@@ -54,8 +54,8 @@ def write(folder: Path, masked: bool = False, channels: int = 3) -> InputDataset
     )
 
 
-def sampler(rays: int = 4000) -> HeldOutPixelSampler:
-    made = HeldOutPixelSamplerConfig().setup(num_rays_per_batch=rays)
+def sampler(rays: int = 4000, **options: object) -> HeldOutPixelSampler:
+    made = HeldOutPixelSamplerConfig().setup(num_rays_per_batch=rays, **options)
     assert isinstance(made, HeldOutPixelSampler)
     return made
 
@@ -89,6 +89,25 @@ def test_a_batch_is_of_pixels_that_are_not_held_out_and_not_masked(tmp_path: Pat
     widths = torch.tensor(SIZES)[indices[:, 0], 1]
     assert not bool(Lattice().holds_out(indices).any())
     assert bool((indices[:, 2] < widths // 2).all())
+
+
+def test_pixels_in_files_are_those_that_a_fisheye_shows(tmp_path: Path) -> None:
+    stored = store_pictures(write(tmp_path), tmp_path / "pixels")
+    made, sizes = sampler(fisheye_crop_radius=9.0), torch.tensor(SIZES)
+    for pixels in (made.sample(stored)["indices"], made.sample_held_out(stored, 50, 0)["indices"]):
+        offsets = pixels[:, 1:] + 0.5 - sizes[pixels[:, 0]] / 2
+        assert len(pixels) > 5 and float(offsets.norm(dim=-1).max()) <= 9.0
+
+
+def test_pixels_of_panoramas_in_files_are_drawn_by_solid_angle(tmp_path: Path) -> None:
+    stored = store_pictures(write(tmp_path), tmp_path / "pixels")
+    indices = sampler(60_000, is_equirectangular=True).sample(stored)["indices"]
+    heights = torch.tensor(SIZES)[indices[:, 0], 0]
+    polar = (indices[:, 1] + 0.5) / heights
+    for low, high in ((0.0, 0.25), (0.25, 0.5), (0.5, 1.0)):
+        share = ((polar >= low) & (polar < high)).float().mean()
+        expected = 0.5 * (np.cos(np.pi * low) - np.cos(np.pi * high))
+        assert float(share) == pytest.approx(expected, abs=0.03)
 
 
 def test_held_out_pixels_are_found_in_files_and_in_images_read_for_it(tmp_path: Path) -> None:

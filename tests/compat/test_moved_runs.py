@@ -1,0 +1,84 @@
+"""A run that was moved after it was trained is evaluated where it is now."""
+
+from __future__ import annotations
+
+import shutil
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+from nerfstudio.utils import eval_utils
+from tiny_run import tiny_trainer
+
+from leco_plugin.compat.moved_runs import config_in_use, found_around
+from leco_plugin.method_configs import leco_occupancy
+from leco_plugin.scenes.input_error import InputError
+
+pytestmark = [  # nerfstudio leaves an image open
+    pytest.mark.filterwarnings("ignore:unclosed file:ResourceWarning"),
+    pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning"),
+]
+
+
+@pytest.fixture(scope="module")
+def trained(tiny_scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with a scene and a checkpoint of a run on it, moved since it was trained."""
+    gate = replace(leco_occupancy.config.pipeline.model.sizes.gate, width=8, layers=1)
+    place = tmp_path_factory.mktemp("place")
+    project = place / "project"
+    shutil.copytree(tiny_scene, project / "data" / "scene")
+    trainer = tiny_trainer(project / "data" / "scene", project / "outputs", gate, candidates=32)
+    trainer.save_checkpoint(7)
+    return Path(shutil.move(project, place / "moved"))
+
+
+def config_of(project: Path) -> Path:
+    return next(project.rglob("config.yml"))
+
+
+def test_a_run_is_found_beside_its_config_and_its_data_where_they_lay(
+    trained: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    project = Path(shutil.copytree(trained, tmp_path / "project"))
+    loaded: tuple[Any, ...] = eval_utils.eval_setup(config_of(project))
+    _, pipeline, checkpoint, step = loaded
+    assert step == 7 and checkpoint.parent == config_of(project).parent / "nerfstudio_models"
+    assert pipeline.datamanager.get_datapath() == project / "data" / "scene"
+    assert "is not there; the data are" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("linked", [False, True])
+def test_what_the_error_asks_for_is_enough(trained: Path, tmp_path: Path, linked: bool) -> None:
+    run = Path(shutil.copytree(config_of(trained).parent, tmp_path / "run"))
+    scene = Path(shutil.copytree(trained / "data" / "scene", tmp_path / "elsewhere" / "photos"))
+    with pytest.raises(InputError) as caught:
+        eval_utils.eval_setup(run / "config.yml")
+    said = str(caught.value)
+    assert "\n" not in said and "--data" not in said
+    assert f"a link with the name scene, beside {run / 'config.yml'}" in said
+    if linked:
+        (run / "scene").symlink_to(scene)
+    else:
+        scene.rename(run / "scene")
+    assert eval_utils.eval_setup(run / "config.yml")[3] == 7
+    shutil.move(run / "nerfstudio_models", tmp_path / "kept")
+    with pytest.raises(InputError, match=r"put the folder nerfstudio_models of this run beside"):
+        eval_utils.eval_setup(run / "config.yml")
+
+
+def test_the_longest_part_of_a_path_that_is_there_is_taken_and_no_folder_of_the_run(
+    tmp_path: Path,
+) -> None:
+    run = tmp_path / "outputs" / "scene" / "method" / "run"
+    run.mkdir(parents=True)
+    assert found_around(Path("/gone/data/scene"), run) is None
+    (tmp_path / "scene").mkdir()
+    assert found_around(Path("/gone/data/scene"), run) == tmp_path / "scene"
+    (tmp_path / "data" / "scene").mkdir(parents=True)
+    assert found_around(Path("/gone/data/scene"), run) == tmp_path / "data" / "scene"
+    assert found_around(Path("data/scene"), run) == tmp_path / "data" / "scene"
+
+
+def test_outside_of_an_evaluation_no_config_is_in_use() -> None:
+    assert config_in_use() is None
