@@ -37,7 +37,8 @@ def follow_data(config: Any) -> None:
     Raises:
         InputError: they are nowhere around the file.
     """
-    path, manager = config_in_use(), getattr(config.pipeline, "datamanager", None)
+    path = config_in_use()
+    manager: Any = getattr(config.pipeline, "datamanager", None)
     parser = getattr(manager, "dataparser", None)
     named = getattr(manager, "data", None) or getattr(parser, "data", None)
     if path is None or named is None or Path(named).exists():

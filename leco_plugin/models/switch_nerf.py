@@ -123,8 +123,8 @@ class SwitchNerfModel(Model):
             manager, config = training_callback_attributes.pipeline.datamanager, self.config
             seen = survey(manager, config.bounds, config.near, config.far)
             self.set_bounds(seen.bounds, seen.median_length)
-            cameras = manager.train_dataset.cameras
-            self.backdrops.look(cameras, self.space, self.aabb, *self.march_range[:2])
+            dataset: Any = manager.train_dataset
+            self.backdrops.look(dataset.cameras, self.space, self.aabb, *self.march_range[:2])
             announce(seen)
         before = TrainingCallbackLocation.BEFORE_TRAIN_ITERATION
         return [TrainingCallback([before], self.update_estimator)]

@@ -92,10 +92,11 @@ class LecoDataManager(VanillaDataManager):  # type: ignore[type-arg]
             if self.test_mode == "val":
                 count = len(self.train_dataset)
                 say(f"no test image: the run trains on all {count} and evaluates nothing")
-            self.eval_dataloader = self.fixed_indices_eval_dataloader = NoTestImages(
+            none: Any = NoTestImages(
                 f"{self.get_datapath()} has no test image in this run, and nothing can be "
                 "evaluated; ns-render shows what it has learned"
             )
+            self.eval_dataloader = self.fixed_indices_eval_dataloader = none
         return dataset
 
     def _get_pixel_sampler(self, dataset: Any, num_rays_per_batch: int) -> Any:

@@ -76,8 +76,8 @@ class Lifecycle:
         self.survey = survey(self.pipeline.datamanager, config.bounds, config.near, config.far)
         if not bool(model.bounds_known):
             model.set_bounds(self.survey.bounds, self.survey.median_length)
-            cameras = self.pipeline.datamanager.train_dataset.cameras
-            model.backdrops.look(cameras, model.space, model.aabb, *model.march_range[:2])
+            dataset: Any = self.pipeline.datamanager.train_dataset
+            model.backdrops.look(dataset.cameras, model.space, model.aabb, *model.march_range[:2])
             announce(self.survey)
             if sampler_here(self.pipeline.datamanager) is None:
                 say("batches come from elsewhere: they keep their size, and no pixel's distance")
