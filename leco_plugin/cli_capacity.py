@@ -21,6 +21,7 @@ def export(
     out: Path,
     resolution: int = 128,
     levels: int | None = None,
+    frame: Literal["data", "run"] | None = None,
     json: Path | None = None,
 ) -> None:
     """Write an occupancy for other programs: kept points, or an occupancy grid of nerfacc.
@@ -34,14 +35,19 @@ def export(
         resolution: Cells along the longest side of the space, or along each axis of a grid.
         levels: Nested boxes of a grid, each twice as wide as the one inside it. By default one, or
             as many as the rays of an unbounded scene reach.
+        frame: Coordinates of points. data, the default, are those of the poses and sparse points in
+            the data's own files, as of UTM; run are those in which the run works. A grid is always
+            in those of the run, for its boxes lie along the axes.
         json: File for what was written, as JSON.
     """
     from leco_plugin.export.command import export as write
 
     check_json(json)
-    facts = write(occupancy_of(file), format, out, resolution, levels)
+    facts = write(occupancy_of(file), format, out, resolution, levels, frame)
     if format == "ply":
-        print(f"{out}: {facts['points']} points")
+        print(f"{out}: {facts['points']} points in the coordinates of the {facts['frame']}")
+        if frame != facts["frame"] == "run":
+            print("the file does not say how its run moved the data: older runs did not record it")
     else:
         print(
             f"{out}: {facts['levels']} x {resolution}^3 cells, {facts['kept_share_of_cells']:.2%} "

@@ -10,10 +10,16 @@ from leco_plugin.occupancy import Occupancy
 from leco_plugin.progress_bar import bar
 
 Format = Literal["ply", "nerfacc-grid"]
+Frame = Literal["data", "run"]
 
 
 def export(
-    file: Path, format: Format, out: Path, resolution: int = 128, levels: int | None = None
+    file: Path,
+    format: Format,
+    out: Path,
+    resolution: int = 128,
+    levels: int | None = None,
+    frame: Frame | None = None,
 ) -> dict[str, Any]:
     """Writes an occupancy in another format.
 
@@ -23,6 +29,8 @@ def export(
         out: of what is written.
         resolution: cells along the longest side, or along each axis of a grid.
         levels: of a grid.
+        frame: of points, `data` for the coordinates of the data's own files, `run` for those of the
+            run. None is `data` where the file says how. A grid is in those of the run.
     Returns:
         What was written, as JSON values.
     Raises:
@@ -31,15 +39,27 @@ def export(
     """
     if format == "ply" and levels is not None:
         raise ValueError("points have no levels: --levels goes with --format nerfacc-grid")
+    if format != "ply" and frame == "data":
+        raise ValueError(
+            "a grid lies along the axes of the run: --frame data goes with --format ply"
+        )
     check_place("--out", out)
     occupancy = Occupancy.load(file)
     if format == "ply":
-        from leco_plugin.export.points import kept_surface, write_ply
+        from leco_plugin.export.points import in_the_data, kept_surface, write_ply
 
         with bar(f"Asking the gate about cells of 1/{resolution}") as show:
             surface = kept_surface(occupancy, resolution, show)
-        write_ply(surface, out)
-        facts: dict[str, Any] = {"points": len(surface.positions)}
+        known = None if frame == "run" else in_the_data(surface.positions, occupancy)
+        if known is None and frame == "data":
+            raise ValueError(
+                f"{file} does not say how its run moved and scaled the data: give --frame run"
+            )
+        write_ply(surface if known is None else surface._replace(positions=known), out)
+        facts: dict[str, Any] = {
+            "points": len(surface.positions),
+            "frame": "run" if known is None else "data",
+        }
     else:
         from leco_plugin.export.nerfacc_grid import grid_buffers, write_grid
 
@@ -47,6 +67,7 @@ def export(
             buffers = grid_buffers(occupancy, resolution, levels, show)
         write_grid(buffers, out)
         facts = {
+            "frame": "run",
             "levels": len(buffers["aabbs"]),
             "aabbs": buffers["aabbs"].tolist(),
             "kept_share_of_cells": float(buffers["binaries"].double().mean()),

@@ -7,16 +7,19 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
+import numpy as np
 import torch
 from torch import Tensor
 
-from leco_plugin.evaluation.inspection import ViewBox, exposed, query, whole_box
+from leco_plugin.evaluation.inspection import ViewBox, exposed, numbers, query, whole_box
 from leco_plugin.export.cell_limit import MOST_CELLS, require_few
 from leco_plugin.occupancy import Occupancy
+from leco_plugin.scenes.frames import inverse, moved
 from leco_plugin.scenes.whole_files import write_whole
 
 COLOURS = "magma"
 """Of matplotlib, for o(x) in [0, 1]: as in the picture of `leco inspect`."""
+COLOUR = ("red", "green", "blue", "alpha")
 CELLS_AT_ONCE = 1 << 20
 """Of which the places are known together; of the others only o(x)."""
 
@@ -25,7 +28,7 @@ class KeptSurface(NamedTuple):
     """Middles of kept cells that touch a skipped one."""
 
     positions: Tensor
-    """[P, 3] scene units."""
+    """[P, 3] scene units, or float64 in coordinates of the data."""
     values: Tensor
     """[P] o(x)."""
 
@@ -83,16 +86,40 @@ def _mapped_box(occupancy: Occupancy) -> ViewBox:
     return ViewBox(low, high)
 
 
+def in_the_data(positions: Tensor, occupancy: Occupancy) -> Tensor | None:
+    """Positions [P, 3] of the run as the data's own files would have them: [P, 3] float64.
+
+    None where the file does not say how its run turned, moved and scaled the data. Files of before
+    `data_frame` was recorded lead to the coordinates before any `applied_transform`.
+    """
+    frame = occupancy.report.get("data_frame") or occupancy.report.get("frame")
+    rows = [numbers(row) for row in frame] if isinstance(frame, list) else []
+    if [len(row) for row in rows] != [4, 4, 4]:
+        return None
+    known = torch.tensor(rows, dtype=torch.float64)
+    if float(known[:, :3].det()) == 0.0:
+        return None
+    return moved(positions.double(), inverse(known))
+
+
 def write_ply(surface: KeptSurface, path: Path) -> None:
-    """Writes binary PLY with a colour for each point; whole, or not at all.
+    """Writes binary PLY of float64 with a colour for each point; whole, or not at all.
 
     Raises:
         OSError: it cannot be written there.
     """
-    import trimesh
     from matplotlib import colormaps
 
+    names = ("x", "<f8"), ("y", "<f8"), ("z", "<f8"), *((c, "u1") for c in COLOUR)
+    rows = np.empty(len(surface.values), dtype=list(names))
     colours = colormaps[COLOURS](surface.values.clamp(0.0, 1.0).numpy(), bytes=True)
-    cloud = trimesh.PointCloud(surface.positions.numpy(), colors=colours)
-    content = cloud.export(file_type="ply")
+    for number, axis in enumerate("xyz"):
+        rows[axis] = surface.positions[:, number].numpy()
+    for number, name in enumerate(COLOUR):
+        rows[name] = colours[:, number]
+    properties = [f"property double {axis}" for axis in "xyz"]
+    properties += [f"property uchar {name}" for name in COLOUR]
+    count = f"element vertex {len(rows)}"
+    head = ["ply", "format binary_little_endian 1.0", count, *properties, "end_header\n"]
+    content = "\n".join(head).encode() + rows.tobytes()
     write_whole(path, lambda file: file.write(content))

@@ -26,6 +26,7 @@ from leco_plugin.models.compute.ranks import say
 from leco_plugin.scenes.dataset_units import UP_IS_KNOWN
 from leco_plugin.scenes.detail import CAMERAS
 from leco_plugin.scenes.input_error import InputError, one_line
+from leco_plugin.scenes.large_coordinates import read_near, say_if_rounded
 from leco_plugin.scenes.photograph_files import names_what_it_cannot_read
 from leco_plugin.scenes.pixels.held_out_pixels import HeldOutPixelSampler
 from leco_plugin.scenes.pixels.lattice import PERIODS, Lattice, lattice_for
@@ -74,6 +75,7 @@ class LecoDataManager(VanillaDataManager):  # type: ignore[type-arg]
     @dataparser.setter
     def dataparser(self, parser: Any) -> None:
         self._dataparser = parser
+        read_near(parser)
         parser.get_dataparser_outputs = in_one_line(parser.get_dataparser_outputs, parser.config)
         # nerfstudio sets this class as the target of configs that an earlier release stored
         if getattr(self.config, "upright", False):
@@ -81,6 +83,7 @@ class LecoDataManager(VanillaDataManager):  # type: ignore[type-arg]
 
     def create_train_dataset(self) -> Any:
         """The training photographs; the model is told of their cameras, for its sizes."""
+        say_if_rounded(self.train_dataparser_outputs, type(self.dataparser).__name__)
         dataset = names_what_it_cannot_read(super().create_train_dataset())
         dataset.metadata[CAMERAS] = dataset.cameras
         return dataset

@@ -11,12 +11,16 @@ from typing import Any
 
 import torch
 
+from leco_plugin.scenes.frames import inverse, parsed_frame
+
 METRES_PER_UNIT = "leco_metres_per_unit"
 """Key of a dataparser's metadata: metres in a unit of the dataset's own poses, float."""
 ALTITUDES = "leco_altitudes"
 """Key of a dataparser's metadata: z of the ground and of the top, scene units, two floats."""
 UP_IS_KNOWN = "leco_up_is_known"
 """Key of a dataparser's metadata: there where z is up in the dataset already."""
+UPRIGHT = 0.94
+"""Cosine of 20 degrees. An axis of the dataset that is this near to the model's z is up there."""
 
 
 @dataclass(frozen=True)
@@ -26,7 +30,9 @@ class DatasetUnits:
     per_scene_unit: float
     """Metres, or units of the dataset's poses, in a scene unit."""
     zero: float
-    """Altitude of the scene's z = 0 in the same units, along the model's up axis."""
+    """Altitude of the scene's origin in the same units: along the dataset's own axis where one is
+    up, for a tilt of a hundredth of a degree is a kilometre in coordinates of UTM; else along the
+    model's z."""
     metric: bool
     """Whether these units are metres."""
 
@@ -57,5 +63,11 @@ def units_of(datamanager: Any, metres_per_unit: float | None = None) -> DatasetU
     if known is not None and not 0.0 < float(known) < math.inf:
         raise ValueError(f"a unit of the dataset is a positive number of metres, not {known}")
     metres = 1.0 if known is None else float(known)
-    shift = float(torch.as_tensor(outputs.dataparser_transform)[2, 3])
-    return DatasetUnits(metres / scale, -metres * shift, known is not None)
+    frame = parsed_frame(outputs)
+    up = frame[2, :3] / scale
+    near = up.abs().argmax()
+    if float(up[near].abs()) > UPRIGHT:
+        up = torch.zeros_like(up).index_fill_(0, near, up[near].sign())
+    return DatasetUnits(
+        metres / scale, metres * float(up @ inverse(frame)[:, 3]), known is not None
+    )

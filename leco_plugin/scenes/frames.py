@@ -26,16 +26,37 @@ def frame_of(datamanager: Any) -> list[list[float]] | None:
     return frame
 
 
+def data_frame_of(datamanager: Any) -> list[list[float]] | None:
+    """What took positions as the data's own files have them to the model's: [3, 4], JSON values.
+
+    It differs from `frame_of` where a transforms.json has an `applied_transform`.
+    """
+    frame = frame_of(datamanager)
+    if frame is None:
+        return None
+    metadata = getattr(datamanager.train_dataparser_outputs, "metadata", None) or {}
+    applied, scale = metadata.get(APPLIED, (None, 1.0))
+    try:
+        of_file: list[list[float]] = from_file(frame, applied, scale, torch.float64).tolist()
+    except (ValueError, TypeError, RuntimeError):  # it leads nowhere back
+        return None
+    return of_file
+
+
 def parsed_frame(outputs: Any) -> Tensor:
     """What a dataparser says that it did to the scene's coordinates: [3, 4] float64."""
     transform = torch.as_tensor(outputs.dataparser_transform).double()[:3]
     return float(outputs.dataparser_scale) * transform
 
 
+APPLIED = "leco_applied"
+"""Key of a dataparser's metadata: `applied_transform`, or None, and `applied_scale` of its file."""
 APPLIED_EARLIER = [[0.0, 1.0, 0.0, 0.0], [1.0, 0.0, 0.0, 0.0], [0.0, 0.0, -1.0, 0.0]]
 """What ns-process-data did to COLMAP's coordinates before files said so, as nerfstudio takes it."""
 FLAT = 1e-6
 """Volume, of that of a cube with the longest side, below which a transform leads nowhere back."""
+SAME_PLACE = 1e-3
+"""Of the half extent: two cameras that are no further apart are one."""
 
 
 def applied_in(meta: dict[str, Any], folder: Path) -> tuple[Any, float]:
@@ -57,14 +78,16 @@ def from_file(
     frame: list[list[float]] | Tensor,
     applied_transform: list[list[float]] | None,
     applied_scale: float = 1.0,
+    dtype: torch.dtype = torch.float32,
 ) -> Tensor:
-    """The frame for positions as a transforms.json has them: [3, 4] float32.
+    """The frame for positions as a transforms.json has them: [3, 4].
 
     What ns-process-data has done to poses and points before it wrote them, a frame does too.
 
     Args:
         frame: [3, 4] from the scene's coordinates, as of `frame_of`.
         applied_transform, applied_scale: of that file, as of `applied_in`.
+        dtype: of the frame. Coordinates as large as UTM's need float64.
     Raises:
         ValueError: they are not finite, or lead nowhere back.
     """
@@ -80,7 +103,7 @@ def from_file(
         raise ValueError(f"the applied_scale is {applied_scale}, not a positive number")
     back = inverse(matrix[:3])
     shift = frame[:, :3] @ back[:, 3:] + frame[:, 3:]
-    return (torch.cat([frame[:, :3] @ back[:, :3], shift], dim=1) / applied_scale).float()
+    return (torch.cat([frame[:, :3] @ back[:, :3], shift], dim=1) / applied_scale).to(dtype)
 
 
 def between(host: list[list[float]], other: list[list[float]]) -> Tensor:
@@ -113,6 +136,15 @@ def turned(directions: Tensor, frame: Tensor) -> Tensor:
 def moved(positions: Tensor, frame: Tensor) -> Tensor:
     """Positions [N, 3] taken to another frame [3, 4]."""
     return turned(positions, frame) + frame[:, 3]
+
+
+def found_again(known: Tensor, here: Tensor, half_extent: float) -> Tensor:
+    """Which of the cameras at places [K, 3] are among those at others [C, 3], one frame: bool [K].
+
+    Args:
+        half_extent: of the scene.
+    """
+    return torch.cdist(known.float(), here.float()).amin(dim=1) <= SAME_PLACE * half_extent
 
 
 def box_around(box: Tensor, frame: Tensor) -> Tensor:

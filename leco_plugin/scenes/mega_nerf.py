@@ -86,10 +86,12 @@ class MegaNerf(DataParser):
             images = self._scored_files(frames, factor)
         cameras = _cameras(scene, frames, factor, right_half=half and not training)
         from leco_plugin.scenes.dataset_units import ALTITUDES, METRES_PER_UNIT, UP_IS_KNOWN
+        from leco_plugin.scenes.frames import moved
+        from leco_plugin.scenes.large_coordinates import far_origin, with_transform
         from leco_plugin.scenes.photographs import POINTS
 
         coordinates = scene.coordinates
-        transform = torch.from_numpy(coordinates.transform()).float()
+        transform = torch.from_numpy(coordinates.transform())
         # the poses, scaled back, are in metres
         metadata: dict[str, Any] = {METRES_PER_UNIT: 1.0, UP_IS_KNOWN: True}
         if config.ray_altitude_range is not None:
@@ -97,15 +99,17 @@ class MegaNerf(DataParser):
             metadata[ALTITUDES] = coordinates.height_of(ground), coordinates.height_of(top)
         points = self._points()
         if points is not None:
-            metadata[POINTS] = (points @ transform[:, :3].T + transform[:, 3]) / coordinates.metres
-        return DataparserOutputs(
+            metadata[POINTS] = (moved(points, transform) / coordinates.metres).float()
+        outputs = DataparserOutputs(
             image_filenames=images,
             cameras=cameras,
             mask_filenames=masks,
             metadata=metadata,
-            dataparser_transform=transform,
+            dataparser_transform=transform.float(),
             dataparser_scale=1.0 / coordinates.metres,
         )
+        far = far_origin(scene.poses()[:, :, 3] * coordinates.metres + coordinates.origin_drb)
+        return outputs if far is None else with_transform(outputs, transform)
 
     def _read(self) -> MegaNerfScene:
         """The scene, read once, with a line that says what it is."""
@@ -126,7 +130,7 @@ class MegaNerf(DataParser):
 
         path = self.config.points or self.config.data / "points.ply"
         if path.is_file():
-            return read_ply(path)
+            return read_ply(path, torch.float64)
         if self.config.points is not None:
             raise InputError(f"there is no file {path} with sparse points")
         return None

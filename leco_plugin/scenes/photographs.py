@@ -23,6 +23,7 @@ from leco_plugin.models.compute.ranks import say
 from leco_plugin.scenes.dataset_units import METRES_PER_UNIT, UP_IS_KNOWN
 from leco_plugin.scenes.frames import applied_in, from_file, moved, parsed_frame
 from leco_plugin.scenes.input_error import InputError, one_line
+from leco_plugin.scenes.large_coordinates import ReadsNear
 from leco_plugin.scenes.photograph_files import check_images, check_smaller_images
 from leco_plugin.scenes.photograph_intrinsics import check_intrinsics
 from leco_plugin.scenes.photograph_masks import check_masks
@@ -42,7 +43,7 @@ class LecoPhotographsDataParserConfig(NerfstudioDataParserConfig):
     """target class to instantiate"""
 
 
-class LecoPhotographs(Nerfstudio):
+class LecoPhotographs(ReadsNear, Nerfstudio):
     """Reads transforms.json and its images."""
 
     config: LecoPhotographsDataParserConfig
@@ -69,7 +70,7 @@ class LecoPhotographs(Nerfstudio):
         frame, applied_scale = self._frame_of_file(outputs, meta)
         points = read_points(meta, folder_of(self.config.data))
         if points is not None:
-            outputs.metadata[POINTS] = moved(points, frame)
+            outputs.metadata[POINTS] = moved(points, frame).float()
         if up_is_known:
             outputs.metadata[UP_IS_KNOWN] = True
         if "metres_per_unit" in meta:
@@ -82,7 +83,7 @@ class LecoPhotographs(Nerfstudio):
         """What took positions in the file to the model's [3, 4], and what had scaled them."""
         try:
             applied, scale = applied_in(meta, self.config.data)
-            return from_file(parsed_frame(outputs), applied, scale), scale
+            return from_file(parsed_frame(outputs), applied, scale, torch.float64), scale
         except (ValueError, TypeError, RuntimeError) as error:
             raise InputError(f"{self.config.data} cannot be read: {one_line(error, 120)}") from None
 
@@ -159,7 +160,7 @@ def check_scene(data: Path) -> dict[str, Any]:
 
 
 def read_points(meta: dict[str, Any], folder: Path) -> Tensor | None:
-    """Sparse points [P, 3] float32 in the coordinates of the file, or None when there are none.
+    """Sparse points [P, 3] float64 in the coordinates of the file, or None when there are none.
 
     A file that is named and not there is said, for learning without points is slower.
 
@@ -173,11 +174,14 @@ def read_points(meta: dict[str, Any], folder: Path) -> Tensor | None:
     if not path.is_file():
         say(f"the scene names sparse points that are not there: {escape(str(path))}")
         return None
-    return read_ply(path)
+    return read_ply(path, torch.float64)
 
 
-def read_ply(path: Path) -> Tensor:
-    """The vertices [P, 3] float32 of a file.
+def read_ply(path: Path, dtype: torch.dtype = torch.float32) -> Tensor:
+    """The vertices [P, 3] of a file.
+
+    Args:
+        dtype: of the vertices. Coordinates as large as UTM's need float64.
 
     Raises:
         InputError: it cannot be read as points.
@@ -188,12 +192,12 @@ def read_ply(path: Path) -> Tensor:
         # as a file and not by its name: nothing else is read that it may point to
         with path.open("rb") as file:
             loaded: Any = trimesh.load(file, file_type="ply")
-        vertices = np.asarray(loaded.vertices, dtype=np.float32).reshape(-1, 3)
+        vertices = np.asarray(loaded.vertices, dtype=np.float64).reshape(-1, 3)
     except Exception as error:  # noqa: BLE001  trimesh raises whatever its parsers meet
         raise InputError(
             f"{path} cannot be read as sparse points: {one_line(error, 120)}"
         ) from None
-    return torch.from_numpy(vertices[np.isfinite(vertices).all(axis=1)].copy())
+    return torch.from_numpy(vertices[np.isfinite(vertices).all(axis=1)].copy()).to(dtype)
 
 
 leco_photographs_dataparser = DataParserSpecification(

@@ -12,7 +12,7 @@ from leco_plugin.shrink.verifying import is_measured
 
 COPIED = (
     *("step", "train_seconds", "bounds", "near", "far", "step_size", "cone_angle", "aabb"),
-    *("frame", "cameras", BACKDROP_PRICE),
+    *("frame", "data_frame", "cameras", BACKDROP_PRICE),
 )
 """What a smaller occupancy's report takes over from the original's."""
 

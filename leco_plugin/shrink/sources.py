@@ -23,13 +23,11 @@ from leco_plugin.models.leco import LecoModel
 from leco_plugin.models.rendering import Rays
 from leco_plugin.models.scene_rays import cut_to_bounds
 from leco_plugin.occupancy import Occupancy
-from leco_plugin.scenes.frames import between, frame_of, moved, turned
+from leco_plugin.scenes.frames import between, found_again, frame_of, moved, turned
 from leco_plugin.scenes.input_error import InputError, one_line, require_folder
 from leco_plugin.scenes.pixels.held_out_pixels import held_out_sampler, some_images
 
 CONFIG, CHECKPOINTS = "config.yml", "nerfstudio_models"
-SAME_PLACE = 1e-3
-"""Of the half extent: two cameras that are no further apart are one."""
 DRAWS = 8
 """Of pixels, until there are as many different ones as are wanted."""
 
@@ -109,8 +107,7 @@ def check_scene(source: Source, occupancy: Occupancy, data: Path) -> None:
     here = source.manager.train_dataset.cameras.camera_to_worlds[:, :3, 3].cpu().float()
     if source.model is None and (frame := _frame_to(source, occupancy)) is not None:
         here = moved(here, frame)
-    near = SAME_PLACE * float(occupancy.space.half_extent)
-    found = torch.cdist(known, here).amin(dim=1) <= near
+    found = found_again(known, here, float(occupancy.space.half_extent))
     if float(found.float().mean()) < 0.5:
         raise InputError(
             f"--data {data}: {int(found.sum())} of the {len(known)} cameras that the occupancy "

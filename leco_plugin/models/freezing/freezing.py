@@ -16,7 +16,7 @@ from leco_plugin.models.freezing.held_out_rendering import (
     evaluating,
 )
 from leco_plugin.occupancy import BACKDROP_PRICE, Occupancy
-from leco_plugin.scenes.frames import frame_of
+from leco_plugin.scenes.frames import data_frame_of, frame_of
 from leco_plugin.scenes.pixels.held_out_pixels import held_out_sampler
 from leco_plugin.scenes.survey import Survey
 
@@ -114,6 +114,7 @@ def _priced(
         "aabb": model.aabb.tolist(),
         "cameras": survey.positions.tolist(),
         "frame": frame_of(datamanager),
+        "data_frame": data_frame_of(datamanager),
     }
 
 

@@ -10,6 +10,7 @@ import torch
 from torch import Tensor, nn
 
 from leco_plugin.compat.earlier_configs import GrowingConfig
+from leco_plugin.evaluation.inspection import cameras_of
 from leco_plugin.models.compute.ranks import is_first, say
 from leco_plugin.models.freezing.freezing import FILE_NAME, leave_file
 from leco_plugin.models.hosts.guide import Guide
@@ -20,12 +21,14 @@ from leco_plugin.models.sizing.sizes import SMALL, learning_only
 from leco_plugin.occupancy import Occupancy
 from leco_plugin.samplers.marching.rays import intersect_box
 from leco_plugin.samplers.registry import check_gate
-from leco_plugin.scenes.frames import between, frame_of, moved, turned
+from leco_plugin.scenes.frames import between, found_again, frame_of, moved, turned
 from leco_plugin.scenes.input_error import InputError
 from leco_plugin.scenes.survey import announce, covering_rays, survey
 
 PLACES = 128
 """Positions on each ray at which a file is asked whether it fits the cameras."""
+SAME_SCENE = 0.1
+"""Share of cameras, of the fewer, that an occupancy and a run on its scene have in common."""
 
 LEARNING = (
     "the occupancy is learned first, and is in no checkpoint until then: a run that is stopped "
@@ -182,6 +185,7 @@ class GuidedStart:
         if learned_in is not None and host is not None:
             self.guide.frame.copy_(between(host, learned_in))
             self.guide.changed()
+            warn_of_another_scene(occupancy, manager, self.guide.frame)
         along = along_rays(self.guide, occupancy, manager.train_dataset.cameras)
         share = along.share_kept(occupancy.threshold)
         if share == 0.0 and getattr(self.trainer, "_start_step", 0) == 0:
@@ -196,6 +200,31 @@ class GuidedStart:
             "those for learning one, and do not change it"
         )
         return along
+
+
+def warn_of_another_scene(occupancy: Occupancy, manager: Any, frame: Tensor) -> None:
+    """Says so where hardly any camera that an occupancy was learned on is among a run's.
+
+    Test photographs count too, so that another split is no other scene; so do photographs that were
+    added or taken away since.
+
+    Args:
+        manager: nerfstudio's data manager of the run.
+        frame: [3, 4] from the run's coordinates to those of the occupancy.
+    """
+    known = cameras_of(occupancy)
+    sets = (manager.train_dataset, getattr(manager, "eval_dataset", None))
+    poses = [part.cameras.camera_to_worlds.cpu().float() for part in sets if part is not None]
+    here = moved(torch.cat(poses)[:, :3, 3], frame.cpu())
+    if len(known) == 0:
+        return
+    found = int(found_again(known, here, float(occupancy.space.half_extent)).sum())
+    if found < SAME_SCENE * min(len(known), len(here)):
+        say(
+            f"the occupancy seems to be of another scene: of the {len(known)} cameras that its "
+            f"file names {found} are among the {len(here)} here. It may skip what is there: give "
+            "the folder of a run on this scene, or no path to learn it first"
+        )
 
 
 class AlongRays(NamedTuple):
