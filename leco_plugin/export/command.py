@@ -8,6 +8,7 @@ from typing import Any, Literal
 from leco_plugin.cli_reports import check_place
 from leco_plugin.occupancy import Occupancy
 from leco_plugin.progress_bar import bar
+from leco_plugin.scenes.frames import moved
 
 Format = Literal["ply", "nerfacc-grid"]
 Frame = Literal["data", "run"]
@@ -46,19 +47,21 @@ def export(
     check_place("--out", out)
     occupancy = Occupancy.load(file)
     if format == "ply":
-        from leco_plugin.export.points import in_the_data, kept_surface, write_ply
+        from leco_plugin.export.points import kept_surface, to_the_data, write_ply
 
-        with bar(f"Asking the gate about cells of 1/{resolution}") as show:
-            surface = kept_surface(occupancy, resolution, show)
-        known = None if frame == "run" else in_the_data(surface.positions, occupancy)
-        if known is None and frame == "data":
+        back = None if frame == "run" else to_the_data(occupancy)
+        if back is None and frame == "data":
             raise ValueError(
                 f"{file} does not say how its run moved and scaled the data: give --frame run"
             )
-        write_ply(surface if known is None else surface._replace(positions=known), out)
+        with bar(f"Asking the gate about cells of 1/{resolution}") as show:
+            surface = kept_surface(occupancy, resolution, show)
+        if back is not None:
+            surface = surface._replace(positions=moved(surface.positions.double(), back))
+        write_ply(surface, out)
         facts: dict[str, Any] = {
             "points": len(surface.positions),
-            "frame": "run" if known is None else "data",
+            "frame": "run" if back is None else "data",
         }
     else:
         from leco_plugin.export.nerfacc_grid import grid_buffers, write_grid

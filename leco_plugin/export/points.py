@@ -14,7 +14,7 @@ from torch import Tensor
 from leco_plugin.evaluation.inspection import ViewBox, exposed, numbers, query, whole_box
 from leco_plugin.export.cell_limit import MOST_CELLS, require_few
 from leco_plugin.occupancy import Occupancy
-from leco_plugin.scenes.frames import inverse, moved
+from leco_plugin.scenes.frames import inverse
 from leco_plugin.scenes.whole_files import write_whole
 
 COLOURS = "magma"
@@ -86,8 +86,8 @@ def _mapped_box(occupancy: Occupancy) -> ViewBox:
     return ViewBox(low, high)
 
 
-def in_the_data(positions: Tensor, occupancy: Occupancy) -> Tensor | None:
-    """Positions [P, 3] of the run as the data's own files would have them: [P, 3] float64.
+def to_the_data(occupancy: Occupancy) -> Tensor | None:
+    """Takes positions of the run to those that the data's own files have: [3, 4] float64.
 
     None where the file does not say how its run turned, moved and scaled the data. Files of before
     `data_frame` was recorded lead to the coordinates before any `applied_transform`.
@@ -97,9 +97,7 @@ def in_the_data(positions: Tensor, occupancy: Occupancy) -> Tensor | None:
     if [len(row) for row in rows] != [4, 4, 4]:
         return None
     known = torch.tensor(rows, dtype=torch.float64)
-    if float(known[:, :3].det()) == 0.0:
-        return None
-    return moved(positions.double(), inverse(known))
+    return inverse(known) if float(known[:, :3].det()) != 0.0 else None
 
 
 def write_ply(surface: KeptSurface, path: Path) -> None:

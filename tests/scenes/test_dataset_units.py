@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from types import SimpleNamespace
 from typing import Any
 
@@ -36,6 +37,24 @@ def test_altitudes_are_those_of_the_poses_before_the_dataparser_moved_them() -> 
         # y of the dataset is up, and its unit half a metre
         assert units.altitude(float(mapped[2])) == pytest.approx(0.5 * float(place[1]), abs=1e-4)
     assert units.per_scene_unit == pytest.approx(2.0)
+
+
+def test_a_tilt_does_not_reach_altitudes_through_large_coordinates() -> None:
+    """A hundredth of a degree is 900 m of 5,200 km of northings; the height is one of the data."""
+    angle = math.radians(0.01)
+    turn = torch.tensor(
+        [
+            [1.0, 0.0, 0.0],
+            [0.0, math.cos(angle), -math.sin(angle)],
+            [0.0, math.sin(angle), math.cos(angle)],
+        ],
+        dtype=torch.float64,
+    )
+    middle = torch.tensor([500_000.0, 5_200_000.0, 300.0], dtype=torch.float64)
+    units = units_of(manager(0.01, torch.cat([turn, -(turn @ middle)[:, None]], dim=1)), 1.0)
+    assert units is not None
+    assert units.altitude(0.0) == pytest.approx(300.0, abs=1e-3)
+    assert units.altitude(0.5) == pytest.approx(350.0, abs=1e-3)
 
 
 def test_units_are_metres_only_where_somebody_says_so() -> None:

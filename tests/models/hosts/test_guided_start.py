@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import copy
 import json
 import shutil
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 from unittest.mock import Mock
 
@@ -29,6 +31,7 @@ from leco_plugin.models.hosts.guided_start import (
     GuidedStart,
     OccupancyConfig,
     along_rays,
+    warn_of_another_scene,
 )
 from leco_plugin.models.hosts.stand_ins import GuidedEstimator
 from leco_plugin.occupancy import Occupancy
@@ -231,6 +234,67 @@ def test_an_occupancy_of_another_scene_is_refused_unless_the_run_began_with_it(
     (guide := Guide()).set_occupancy(elsewhere)
     (resumed := Mock())._start_step = 90
     GuidedStart(nn.Module(), guide, OccupancyConfig(), Pipe(readers["as it is"]), resumed)
+
+
+ANOTHER = "the occupancy seems to be of another scene"
+
+
+def learned_by(data: Data, **report: Any) -> Occupancy:
+    """The ball, as a run on these cameras would leave it."""
+    occupancy = ball_of_the_tiny_scene(frame_of(data) or [])
+    places = data.train_dataset.cameras.camera_to_worlds[:, :3, 3]
+    occupancy.report |= {"cameras": places.tolist()} | report
+    return occupancy
+
+
+def test_an_occupancy_of_other_cameras_is_said_to_be_of_another_scene(
+    readers: dict[str, Data], capsys: pytest.CaptureFixture[str]
+) -> None:
+    places = readers["as it is"].train_dataset.cameras.camera_to_worlds[:, :3, 3]
+    other = learned_by(readers["as it is"], cameras=(places + 0.05).tolist())
+    started(other, readers["as it is"])
+    said = " ".join(capsys.readouterr().out.split())
+    assert ANOTHER in said and f"of the {len(places)} cameras that its file names 0" in said
+
+
+@pytest.mark.parametrize("kept", [1, 3, 9])
+def test_photographs_that_were_added_or_taken_away_are_no_other_scene(
+    kept: int, readers: dict[str, Data], capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Nor is another reader."""
+    occupancy = learned_by(readers["turned by pca"])
+    occupancy.report["cameras"] = occupancy.report["cameras"][:kept]
+    started(occupancy, readers["turned up"])
+    assert ANOTHER not in " ".join(capsys.readouterr().out.split())
+
+
+def test_another_split_is_no_other_scene(
+    readers: dict[str, Data], capsys: pytest.CaptureFixture[str]
+) -> None:
+    """It was learned on what is tested on here."""
+    data = copy.copy(readers["as it is"])
+    occupancy = learned_by(data)
+    data.eval_dataset = data.train_dataset
+    data.train_dataset = SimpleNamespace(
+        cameras=copy.copy(data.eval_dataset.cameras), metadata=data.eval_dataset.metadata
+    )
+    data.train_dataset.cameras.camera_to_worlds = (
+        data.eval_dataset.cameras.camera_to_worlds + torch.tensor([0.0, 0.0, 0.0, 0.03])
+    )
+    frame = torch.eye(3, 4)
+    warn_of_another_scene(occupancy, data, frame)
+    assert ANOTHER not in capsys.readouterr().out
+    data.eval_dataset = None
+    warn_of_another_scene(occupancy, data, frame)
+    assert ANOTHER in " ".join(capsys.readouterr().out.split())
+
+
+@pytest.mark.parametrize("cameras", [None, [], "none", [[0.0]]])
+def test_a_file_that_names_no_cameras_is_not_compared(
+    cameras: Any, readers: dict[str, Data], capsys: pytest.CaptureFixture[str]
+) -> None:
+    started(learned_by(readers["as it is"], cameras=cameras), readers["as it is"])
+    assert ANOTHER not in " ".join(capsys.readouterr().out.split())
 
 
 def test_training_says_what_was_wrong_with_a_path(readers: dict[str, Data], tmp_path: Path) -> None:
