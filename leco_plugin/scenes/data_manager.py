@@ -26,7 +26,7 @@ from leco_plugin.models.compute.ranks import say
 from leco_plugin.scenes.dataset_units import UP_IS_KNOWN
 from leco_plugin.scenes.detail import CAMERAS
 from leco_plugin.scenes.input_error import InputError, one_line
-from leco_plugin.scenes.large_coordinates import read_near, say_if_rounded
+from leco_plugin.scenes.large_coordinates import read_near
 from leco_plugin.scenes.photograph_files import names_what_it_cannot_read
 from leco_plugin.scenes.pixels.held_out_pixels import HeldOutPixelSampler
 from leco_plugin.scenes.pixels.lattice import PERIODS, Lattice, lattice_for
@@ -83,7 +83,6 @@ class LecoDataManager(VanillaDataManager):  # type: ignore[type-arg]
 
     def create_train_dataset(self) -> Any:
         """The training photographs; the model is told of their cameras, for its sizes."""
-        say_if_rounded(self.train_dataparser_outputs, type(self.dataparser).__name__)
         dataset = names_what_it_cannot_read(super().create_train_dataset())
         dataset.metadata[CAMERAS] = dataset.cameras
         return dataset

@@ -20,7 +20,6 @@ from nerfstudio.data.dataparsers.base_dataparser import (
 from nerfstudio.data.dataparsers.colmap_dataparser import ColmapDataParser
 from nerfstudio.data.dataparsers.nerfstudio_dataparser import Nerfstudio
 from nerfstudio.data.utils import colmap_parsing_utils
-from nerfstudio.utils.io import load_from_json
 from numpy.typing import NDArray
 from torch import Tensor
 
@@ -74,10 +73,8 @@ class ReadsNear(DataParser):
         self, split: str = "train", **kwargs: Any
     ) -> DataparserOutputs:
         read: Any = super()._generate_dataparser_outputs  # type: ignore[safe-super]
-        names = {
-            **read.__globals__,
-            "load_from_json": lambda path: self._near(load_from_json(path)),
-        }
+        load = read.__globals__.get("load_from_json")
+        names = {**read.__globals__, "load_from_json": lambda path: self._near(load(path))}
         near = FunctionType(
             read.__code__, names, read.__name__, read.__defaults__, read.__func__.__closure__
         )
@@ -92,10 +89,6 @@ class ReadsNear(DataParser):
         transform = torch.as_tensor(outputs.dataparser_transform).double()[:3].clone()
         transform[:, 3] -= transform[:, :3] @ torch.from_numpy(self._in_the_data())
         return with_transform(outputs, transform)
-
-    def _load(self, path: Path) -> dict[str, Any]:
-        """A JSON file, its poses shifted."""
-        return self._near(load_from_json(path))
 
     def _get_all_images_and_cameras(self, *arguments: Any) -> dict[str, Any]:
         """COLMAP's poses, shifted."""
@@ -125,7 +118,7 @@ class ReadsNear(DataParser):
             if origin is not None:
                 say(
                     f"coordinates are large: float32 would round them to {_rounding(origin):.2g}. "
-                    f"They are read from ({_listed(self._in_the_data())}) on, and exports have it"
+                    f"They are read relative to ({_listed(self._in_the_data())})"
                 )
         if self.shift.any():
             positions -= self.shift
@@ -165,18 +158,26 @@ def read_near(parser: Any) -> None:
             return
 
 
-def say_if_rounded(outputs: DataparserOutputs, reader: str) -> None:
-    """Says that a reader which was not helped has rounded large coordinates, if it has."""
-    transform = torch.as_tensor(outputs.dataparser_transform)
-    if transform.dtype == torch.float64 or not 0.0 < float(outputs.dataparser_scale) < np.inf:
-        return
-    places = outputs.cameras.camera_to_worlds[..., :3, 3].reshape(-1, 3).double().cpu()
+def rounded_by(datamanager: Any) -> str | None:
+    """A line on the large coordinates that a data manager's reader has rounded; None if it has not.
+
+    A reader with a float64 `dataparser_transform` has not.
+    """
+    outputs = getattr(datamanager, "train_dataparser_outputs", None)
+    if outputs is None or not 0.0 < float(outputs.dataparser_scale) < np.inf:
+        return None
+    if torch.as_tensor(outputs.dataparser_transform).dtype == torch.float64:
+        return None
+    places = datamanager.train_dataset.cameras.camera_to_worlds[:, :3, 3].double().cpu()
     origin = far_origin(moved(places, inverse(parsed_frame(outputs))).numpy())
-    if origin is not None:
-        say(
-            f"the reader {reader} rounds large coordinates to {_rounding(origin):.2g}: take "
-            f"({_listed(origin)}) off all poses and points of the data"
-        )
+    if origin is None:
+        return None
+    reader = type(getattr(datamanager, "dataparser", None)).__name__
+    return (
+        f"the reader {reader} rounds large coordinates to {_rounding(origin):.2g}: take "
+        f"({_listed(origin)}) off all poses and points of the data, or read a transforms.json by "
+        "leco-photographs, which does not round"
+    )
 
 
 def _rounding(origin: Array) -> float:

@@ -21,6 +21,7 @@ from leco_plugin.scenes.bounds import (
 )
 from leco_plugin.scenes.dataset_units import ALTITUDES, DatasetUnits, units_of
 from leco_plugin.scenes.input_error import InputError
+from leco_plugin.scenes.large_coordinates import rounded_by
 from leco_plugin.scenes.photographs import POINT_KEYS
 from leco_plugin.scenes.seen_beyond import seen_beyond
 
@@ -51,6 +52,8 @@ class Survey:
     """How many rays were looked at."""
     units: DatasetUnits | None = None
     """Those of the dataset, if its dataparser says what it did to them."""
+    rounded: str | None = None
+    """A line on coordinates that its dataparser has rounded, if it has."""
 
     def lines(self) -> list[str]:
         """For the log: what was chosen and why, the range in scene units and beside it in metres,
@@ -80,7 +83,7 @@ class Survey:
         meeting = (
             f"{self.meeting:.1%} of {self.rays} rays meet the scene, half of them for {length}"
         )
-        return [bounds.reason, *table, meeting]
+        return [bounds.reason, *table, meeting, *([self.rounded] if self.rounded else [])]
 
     def probe_rays(self, device: torch.device, aabb: Tensor, march_range: Tensor) -> Rays:
         """The rays of the survey, cut to a model's bounds; rays that miss are left out."""
@@ -173,6 +176,7 @@ def survey(
         origins[:, 0],
         len(hits),
         units,
+        rounded_by(datamanager),
     )
 
 

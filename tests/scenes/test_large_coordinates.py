@@ -15,9 +15,9 @@ import numpy as np
 import pytest
 import torch
 from nerfstudio.cameras.cameras import Cameras
+from nerfstudio.data.datamanagers.base_datamanager import VanillaDataManagerConfig
 from nerfstudio.data.dataparsers.base_dataparser import (
     DataParser,
-    DataParserConfig,
     DataparserOutputs,
 )
 from nerfstudio.data.dataparsers.blender_dataparser import BlenderDataParserConfig
@@ -326,15 +326,31 @@ class Unhelped(DataParser):
 
 
 @pytest.mark.parametrize("offset", [UTM, np.array([30.0, -10.0, 5.0])], ids=["far", "near"])
+@pytest.mark.parametrize("reader", [Unhelped, Nerfstudio], ids=lambda reader: reader.__name__)
 def test_a_reader_that_cannot_be_helped_is_named(
-    offset: np.ndarray, tiny_scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    reader: type, offset: np.ndarray, tiny_scene: Path, tmp_path: Path
 ) -> None:
+    """In a method with a data manager of its own nerfstudio's readers are none of ours."""
     as_nerfstudio(tiny_scene, tmp_path / "scene", offset)
-    parser = DataParserConfig(_target=Unhelped, data=tmp_path / "scene")
-    LecoDataManagerConfig(dataparser=parser, images="memory").setup(device="cpu")
-    said = " ".join(capsys.readouterr().out.split())
-    named = "reader Unhelped rounds large coordinates to 0.5: take (50000"
-    assert (named in said) == (offset is UTM) and "coordinates are large" not in said
+    parser: Any = NerfstudioDataParserConfig(_target=reader, data=tmp_path / "scene")
+    own = LecoDataManagerConfig if reader is Unhelped else VanillaDataManagerConfig
+    manager: Any = own(dataparser=parser).setup(device="cpu")
+    said = [line for line in survey(manager).lines() if "rounds" in line]
+    assert len(said) == (offset is UTM)
+    named = f"the reader {reader.__name__} rounds large coordinates to 0.5: take (50000"
+    assert all(line.startswith(named) for line in said)
+
+
+def test_our_reader_does_not_round_in_whatever_data_manager(
+    tiny_scene: Path, tmp_path: Path
+) -> None:
+    as_nerfstudio(tiny_scene, tmp_path / "scene", UTM)
+    parser = LecoPhotographsDataParserConfig(data=tmp_path / "scene")
+    manager: Any = VanillaDataManagerConfig(dataparser=parser).setup(device="cpu")
+    found, names = places_in_the_data(manager, manager.train_dataparser_outputs)
+    expected = np.array([exact(tmp_path / "scene")[name] for name in names])
+    np.testing.assert_allclose(found, expected, atol=2e-4, rtol=0)
+    assert not any("rounds" in line for line in survey(manager).lines())
 
 
 def test_points_and_frame_of_mega_nerfs_format_keep_their_metres(
