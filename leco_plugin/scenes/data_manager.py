@@ -25,12 +25,13 @@ from leco_plugin.compat.nerfstudio_changes import keeps_all_images
 from leco_plugin.models.compute.ranks import say
 from leco_plugin.scenes.dataset_units import UP_IS_KNOWN
 from leco_plugin.scenes.detail import CAMERAS
-from leco_plugin.scenes.input_error import InputError, one_line
+from leco_plugin.scenes.input_error import InputError
 from leco_plugin.scenes.large_coordinates import read_near
 from leco_plugin.scenes.photograph_files import names_what_it_cannot_read
 from leco_plugin.scenes.pixels.held_out_pixels import HeldOutPixelSampler
 from leco_plugin.scenes.pixels.lattice import PERIODS, Lattice, lattice_for
 from leco_plugin.scenes.pixels.stored_pictures import picture_sizes, store_pictures
+from leco_plugin.scenes.reading import in_one_line
 from leco_plugin.scenes.survey import points_in
 from leco_plugin.scenes.upright import turn_to_upright, turned
 
@@ -196,23 +197,6 @@ class NoTestImages:
 
     def __iter__(self) -> Iterator[Any]:
         raise InputError(self.why)
-
-
-def in_one_line(read: Callable[..., DataparserOutputs], config: Any) -> Callable[..., Any]:
-    """A reader of splits which says in one line what any reader asserts of a scene, or misses.
-
-    Args:
-        config: of the reader.
-    """
-
-    def outputs_of(*arguments: Any, **options: Any) -> DataparserOutputs:
-        try:
-            return read(*arguments, **options)
-        except (AssertionError, OSError) as error:
-            reason = one_line(error, 200) or type(error).__name__
-            raise InputError(f"{config.data} cannot be read as a scene: {reason}") from error
-
-    return outputs_of
 
 
 def upright_outputs(read: Callable[..., DataparserOutputs]) -> Callable[..., DataparserOutputs]:

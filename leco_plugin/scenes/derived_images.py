@@ -25,8 +25,11 @@ class DerivedImages:
     of it, so that a changed source is never taken for the old one.
     """
 
-    def __init__(self, folder: Path) -> None:
-        self.folder = folder
+    def __init__(
+        self, folder: Path, remedy: str = "give another folder for derived pictures with --cache"
+    ) -> None:
+        """With what to do where nothing can be written."""
+        self.folder, self.remedy = folder, remedy
 
     def get(self, source: Path, recipe: str, make: Callable[[], Image.Image]) -> Path:
         """The file with what `make` makes of `source`; `recipe` names it.
@@ -48,8 +51,7 @@ class DerivedImages:
             write_whole(path, lambda file: image.save(file, format="PNG"))
         except OSError as error:
             raise InputError(
-                f"{path} cannot be written ({error.strerror or error}); "
-                "give another folder for derived pictures with --cache"
+                f"{path} cannot be written ({error.strerror or error}); {self.remedy}"
             ) from None
 
 

@@ -1,92 +1,144 @@
-"""The files of photographs: there, of the right size, and of a kind that nerfstudio reads rightly.
+"""The files of photographs: there, whole, and of a kind that nerfstudio reads rightly.
 
 nerfstudio takes the numbers of a palette for greys and the low bytes of 16 bits for all of them,
-and a file that is cut off ends it in the middle of loading.
+turns no photograph as its EXIF says, and a file that is cut off ends it in the middle of loading.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, NamedTuple, TypeVar
 
-from nerfstudio.cameras.cameras import Cameras
-from PIL import Image, UnidentifiedImageError
+from PIL import ExifTags, Image, ImageOps
 
 from leco_plugin.scenes.input_error import InputError, one_line
 
 READ_RIGHTLY = ("L", "RGB", "RGBA")
 """Pillow's modes of images that nerfstudio reads as they are."""
+CONVERTED = ("1", "P", "PA", "LA", "CMYK")
+"""Modes that become one of these; of CMYK by Pillow's formula, without a colour profile."""
 
 Read = TypeVar("Read")
 
 
-def check_images(meta: dict[str, Any], frames: list[dict[str, Any]], folder: Path) -> None:
-    """Every image is there, of the size that its intrinsics are for, and of one kind with all.
+class Header(NamedTuple):
+    """What a file of an image says before it is decoded."""
 
-    Raises:
-        InputError: one line.
-    """
-    paths = [folder / frame["file_path"] for frame in frames]
-    missing = [path for path in paths if not path.exists()]
-    if missing:
-        raise InputError(
-            f"{len(missing)} of {len(frames)} images are not there, the first is {missing[0]}"
-        )
-    transparent = []
-    for frame, path in zip(frames, paths):
-        width, height = (int(meta[n] if n in meta else frame[n]) for n in ("w", "h"))
-        size, mode = header_of(path)
-        if size != (width, height):
-            raise InputError(
-                f"{path} has {size[0]} x {size[1]} pixels, "
-                f"its intrinsics are for {width} x {height}"
-            )
-        if mode not in READ_RIGHTLY:
-            raise InputError(
-                f"{path} is of Pillow's mode {mode!r}, which nerfstudio reads wrongly: save it "
-                "with 8 bits a channel as RGB, RGBA or grey"
-            )
-        if mode == "RGBA":
-            transparent.append(path)
-    if 0 < len(transparent) < len(paths):
-        raise InputError(
-            f"{len(transparent)} of {len(paths)} images have transparency, the first is "
-            f"{transparent[0]}: save all of them with it, or all without"
-        )
+    size: tuple[int, int]
+    """Width and height of what is stored."""
+    mode: str
+    """Pillow's."""
+    transparent: bool
+    """Whether one colour is transparent, or pixels have an alpha."""
+    orientation: int
+    """EXIF's: 1 is upright, from 5 on width and height change places."""
+    several: bool
+    """Whether it holds more pictures than one and a preview."""
 
 
-def check_smaller_images(paths: list[Path], cameras: Cameras) -> None:
-    """Images in a folder like images_2 are there, and of their cameras' size but for rounding.
-
-    Raises:
-        InputError: one line.
-    """
-    for path, width, height in zip(paths, cameras.width.flatten(), cameras.height.flatten()):
-        if not path.exists():
-            raise InputError(
-                f"{path} is not there; make smaller images with ns-process-data, or set no "
-                "--pipeline.datamanager.dataparser.downscale-factor"
-            )
-        (wide, high), _ = header_of(path)
-        if abs(wide - int(width)) > 1 or abs(high - int(height)) > 1:
-            raise InputError(
-                f"{path} has {wide} x {high} pixels, at its factor the camera's are "
-                f"{int(width)} x {int(height)}"
-            )
-
-
-def header_of(path: Path) -> tuple[tuple[int, int], str]:
-    """Width and height of an image, and its mode in Pillow's words.
+def header_of(path: Path) -> Header:
+    """What a file of an image says.
 
     Raises:
         InputError: it is none.
     """
     try:
         with Image.open(path) as image:
-            return image.size, image.mode
-    except (OSError, UnidentifiedImageError, Image.DecompressionBombError):
-        raise InputError(f"{path} cannot be read as an image") from None
+            several = image.format != "MPO" and getattr(image, "n_frames", 1) > 1
+            transparent = image.mode in ("LA", "PA", "RGBA") or "transparency" in image.info
+            return Header(image.size, image.mode, transparent, _orientation(image), several)
+    except (OSError, ValueError, EOFError, SyntaxError, Image.DecompressionBombError):
+        if not path.exists():
+            raise InputError(f"the image {path} is not there{slashes(path)}") from None
+        raise InputError(f"{path} cannot be read as an image: is the file whole?") from None
+
+
+def _orientation(image: Image.Image) -> int:
+    try:
+        return int(image.getexif().get(ExifTags.Base.Orientation, 1))
+    except Exception:  # noqa: BLE001  damaged EXIF raises whatever its parser meets
+        return 1
+
+
+def as_it_is_there(path: Path) -> Path:
+    """A file of that name, of its name with slashes, or of one of these with an ending."""
+    for name in (str(path), str(path).replace("\\", "/")):
+        for ending in ("", ".png", ".jpg", ".jpeg", ".JPG"):
+            if (there := Path(name + ending)).is_file():
+                return there
+    return path
+
+
+def check_images(frames: list[dict[str, Any]], folder: Path) -> None:
+    """Every image is there.
+
+    Raises:
+        InputError: one line.
+    """
+    paths = [as_it_is_there(folder / frame["file_path"]) for frame in frames]
+    missing = [path for path in paths if not path.exists()]
+    if missing:
+        raise InputError(
+            f"{len(missing)} of {len(frames)} images are not there, the first is "
+            f"{missing[0]}{slashes(missing[0])}"
+        )
+
+
+def slashes(path: Path) -> str:
+    """What to add to a line about a file that is missing, where Windows wrote its name."""
+    if "\\" not in str(path):
+        return ""
+    return ": its name was written by Windows, write / for each backslash"
+
+
+def check_kind(path: Path, header: Header) -> None:
+    """The colours of an image can be read.
+
+    Raises:
+        InputError: one line.
+    """
+    if header.mode not in READ_RIGHTLY + CONVERTED:
+        raise InputError(
+            f"{path} is of Pillow's mode {header.mode!r}, which nerfstudio reads wrongly: save it "
+            "with 8 bits a channel as RGB, RGBA or grey"
+        )
+    if header.several:
+        raise InputError(f"{path} holds more pictures than one: save the one that is meant alone")
+
+
+def is_plain(header: Header) -> bool:
+    """Whether nerfstudio reads all colours of an image as they are."""
+    return header.mode in READ_RIGHTLY and header.transparent == (header.mode == "RGBA")
+
+
+def plain(image: Image.Image) -> Image.Image:
+    """The same colours of an image that passes `check_kind`, in a mode that nerfstudio reads."""
+    if image.mode in ("LA", "PA") or "transparency" in image.info:
+        return image.convert("RGBA")
+    return (
+        image if image.mode in READ_RIGHTLY else image.convert("L" if image.mode == "1" else "RGB")
+    )
+
+
+def is_turned(header: Header, size: tuple[int, int]) -> bool:
+    """Whether a picture of that size is what is stored, turned as EXIF says."""
+    return header.orientation >= 5 and header.size != size and header.size[::-1] == size
+
+
+def decode(path: Path, turn: bool) -> Image.Image:
+    """The plain colours of an image, turned as EXIF says if that is asked.
+
+    Raises:
+        InputError: it cannot be decoded.
+    """
+    try:
+        with Image.open(path) as image:
+            turned = ImageOps.exif_transpose(image) if turn else image
+            return plain(turned).copy()
+    except (OSError, ValueError, SyntaxError, Image.DecompressionBombError) as error:
+        reason = one_line(error, 120)
+    raise InputError(f"{path} cannot be read ({reason}): is the file whole?")
 
 
 def names_what_it_cannot_read(dataset: Any) -> Any:
@@ -102,7 +154,7 @@ def _naming(read: Callable[..., Read], paths: list[Path]) -> Callable[..., Read]
             return read(image_idx, *arguments, **options)
         except InputError:
             raise
-        except (AssertionError, OSError, SyntaxError, ValueError) as error:  # of Pillow's readers
+        except Exception as error:  # noqa: BLE001  decoders raise whatever they meet
             reason = one_line(error, 200) or type(error).__name__
         # out here, because that error holds the file that nerfstudio has left open
         raise InputError(f"{paths[image_idx]} cannot be read ({reason}): is the file whole?")

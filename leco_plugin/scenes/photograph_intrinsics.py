@@ -8,8 +8,7 @@ from typing import Any
 from nerfstudio.cameras.cameras import CAMERA_MODEL_TO_TYPE
 
 from leco_plugin.scenes.input_error import InputError
-
-DISTORTIONS = ("k1", "k2", "k3", "k4", "p1", "p2")
+from leco_plugin.scenes.lenses import ANGLES, DISTORTIONS, PINHOLE_FIELDS, check_kinds, lens_of
 
 
 def check_intrinsics(meta: dict[str, Any], frames: list[dict[str, Any]], description: Path) -> None:
@@ -22,12 +21,16 @@ def check_intrinsics(meta: dict[str, Any], frames: list[dict[str, Any]], descrip
     if "camera_model" in meta and model not in list(CAMERA_MODEL_TO_TYPE):
         known = ", ".join(CAMERA_MODEL_TO_TYPE)
         raise InputError(f"{description}: camera_model {str(model)[:40]!r} is none of {known}")
-    for name in ("w", "h", "fl_x", "fl_y", "cx", "cy"):
+    for name in PINHOLE_FIELDS:
         for frame in frames:
-            # the scene's own goes before that of a frame, as in nerfstudio
-            value = meta.get(name, frame.get(name))
+            value = frame.get(name, meta.get(name))
             if value is None:
-                raise InputError(f"{description}: {frame['file_path']} has no {name}")
+                hint = (
+                    "; `ns-train METHOD instant-ngp-data --data DIR` reads fields of view instead"
+                    if any(angle in meta for angle in ANGLES)
+                    else ""
+                )
+                raise InputError(f"{description}: {frame['file_path']} has no {name}{hint}")
             sound = type(value) in (int, float) and abs(value) < 1e9
             if not sound or (name[0] != "c" and not value >= 1e-3):
                 raise InputError(
@@ -41,6 +44,10 @@ def check_intrinsics(meta: dict[str, Any], frames: list[dict[str, Any]], descrip
                 raise InputError(
                     f"{description}: {name} of {who} is {str(value)[:40]!r}, and not a number"
                 )
+    check_kinds(
+        [lens_of(meta, frame, f"{description}: {frame['file_path']}") for frame in frames],
+        str(description),
+    )
 
 
 def _distortions(owner: dict[str, Any]) -> list[tuple[str, Any]]:

@@ -23,10 +23,12 @@ from leco_plugin.models.compute.ranks import say
 from leco_plugin.scenes.dataset_units import METRES_PER_UNIT, UP_IS_KNOWN
 from leco_plugin.scenes.frames import applied_in, from_file, moved, parsed_frame
 from leco_plugin.scenes.input_error import InputError, one_line
+from leco_plugin.scenes.known_folders import remedy_for
 from leco_plugin.scenes.large_coordinates import ReadsNear
-from leco_plugin.scenes.photograph_files import check_images, check_smaller_images
+from leco_plugin.scenes.photograph_files import as_it_is_there, check_images
 from leco_plugin.scenes.photograph_intrinsics import check_intrinsics
-from leco_plugin.scenes.photograph_masks import check_masks
+from leco_plugin.scenes.photograph_masks import check_masked
+from leco_plugin.scenes.reading import checked
 from leco_plugin.scenes.rotations import distance_from_rotations
 
 POINTS = "leco_sparse_points"
@@ -65,8 +67,6 @@ class LecoPhotographs(ReadsNear, Nerfstudio):
             raise InputError(f"{self.config.data} cannot be read ({reason})") from error
         if len(outputs.image_filenames) == 0 and split == "train":
             raise InputError(f"{self.config.data}: no image is left for the split {split!r}")
-        if self.downscale_factor != 1:
-            check_smaller_images(outputs.image_filenames, outputs.cameras)
         frame, applied_scale = self._frame_of_file(outputs, meta)
         points = read_points(meta, folder_of(self.config.data))
         if points is not None:
@@ -75,7 +75,17 @@ class LecoPhotographs(ReadsNear, Nerfstudio):
             outputs.metadata[UP_IS_KNOWN] = True
         if "metres_per_unit" in meta:
             outputs.metadata[METRES_PER_UNIT] = applied_scale * _metres(meta, self.config.data)
-        return outputs
+        return checked(outputs, self.config, split)
+
+    def _get_fname(
+        self, filepath: Path, data_dir: Path, downsample_folder_prefix: str = "images_"
+    ) -> Path:
+        """nerfstudio's choice of a file, by a name as Windows or instant-ngp write it, too; a mask
+        of full size where there is no smaller one."""
+        there = as_it_is_there(data_dir / filepath)
+        name = there.relative_to(data_dir) if there.is_relative_to(data_dir) else there
+        path: Path = super()._get_fname(name, data_dir, downsample_folder_prefix)
+        return there if downsample_folder_prefix == "masks_" and not path.exists() else path
 
     def _frame_of_file(
         self, outputs: DataparserOutputs, meta: dict[str, Any]
@@ -117,18 +127,17 @@ def check_scene(data: Path) -> dict[str, Any]:
     """Reads the description of a scene and says what is wrong with it, if anything is.
 
     Raises:
-        InputError: one line: no such folder, no cameras or a single place, missing images, images
-            that disagree with the intrinsics or are of a kind that would be read wrongly, masks
-            that hide everything, poses that are not poses.
+        InputError: one line: no such folder, no cameras or a single place, missing images, lenses
+            that nerfstudio's cameras lack, poses that are not poses.
     """
     if not data.exists():
         raise InputError(f"there is no folder {data}; give one with --data")
     description = data if data.suffix == ".json" else data / "transforms.json"
     if not description.exists():
-        raise InputError(
-            f"{data} holds no transforms.json; give a folder with one by --data, or make one from "
-            "photographs with ns-process-data"
+        instead = remedy_for(data, "leco-photographs") or (
+            "give a folder with one, or make one from photographs with ns-process-data"
         )
+        raise InputError(f"{data} holds no transforms.json; {instead}")
     try:
         meta = json.loads(description.read_text())
         frames = meta["frames"]
@@ -154,8 +163,8 @@ def check_scene(data: Path) -> dict[str, Any]:
         raise InputError(f"{description} has {number}; a scene is seen from two places at least")
     folder = folder_of(data)
     check_intrinsics(meta, frames, description)
-    check_images(meta, frames, folder)
-    check_masks(frames, folder)
+    check_images(frames, folder)
+    check_masked(frames, folder)
     return dict(meta)
 
 
@@ -170,7 +179,7 @@ def read_points(meta: dict[str, Any], folder: Path) -> Tensor | None:
     name = meta.get("ply_file_path")
     if name is None:
         return None
-    path = folder / str(name)
+    path = as_it_is_there(folder / str(name))
     if not path.is_file():
         say(f"the scene names sparse points that are not there: {escape(str(path))}")
         return None

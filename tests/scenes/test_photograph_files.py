@@ -1,26 +1,24 @@
-"""Files that nerfstudio would read wrongly, or fail at, are refused by name."""
+"""Files that nerfstudio would read wrongly, or fail at, are converted or refused by name."""
 
 from __future__ import annotations
 
-import shutil
 from pathlib import Path
-from types import SimpleNamespace
 from typing import ClassVar
 
 import numpy as np
 import pytest
-import torch
 from PIL import Image
 
 from leco_plugin.scenes.input_error import InputError
 from leco_plugin.scenes.photograph_files import (
+    as_it_is_there,
     check_images,
-    check_smaller_images,
+    check_kind,
+    decode,
+    header_of,
+    is_plain,
     names_what_it_cannot_read,
 )
-from leco_plugin.scenes.photographs import LecoPhotographsDataParserConfig
-
-META = {"w": 8, "h": 6}
 
 
 class Dataset:
@@ -31,6 +29,8 @@ class Dataset:
     def get_data(self, image_idx: int, image_type: str = "float32") -> str:
         if image_type == "uint8":
             raise FileNotFoundError(2, "No such file or directory", "scene/masks_2/0.png")
+        if image_type == "struct":
+            raise RuntimeError("encoder error")
         return f"image {image_idx}"
 
 
@@ -39,65 +39,78 @@ def test_what_cannot_be_read_with_an_image_is_named_beside_it() -> None:
     assert dataset.get_data(0) == "image 0"
     with pytest.raises(InputError, match=r"scene/0\.png cannot be read .*masks_2/0\.png"):
         dataset.get_data(0, image_type="uint8")
+    with pytest.raises(InputError, match=r"scene/0\.png cannot be read .*encoder error"):
+        dataset.get_data(0, image_type="struct")
 
 
-def images_of(folder: Path, *modes: str) -> list[dict[str, str]]:
-    """Writes an image of each of Pillow's modes; returns their frames."""
-    frames = []
-    for number, mode in enumerate(modes):
-        name = f"{number}.{'jpg' if mode == 'CMYK' else 'png'}"
-        if mode == "I;16":
-            Image.fromarray(np.full((6, 8), 40_000, dtype=np.uint16)).save(folder / name)
-        else:
-            Image.new(mode, (8, 6)).save(folder / name)
-        frames.append({"file_path": name})
-    return frames
+def write(path: Path, mode: str) -> Path:
+    """An image of 8 x 6 in one of Pillow's modes."""
+    values = np.arange(48, dtype=np.uint8).reshape(6, 8)
+    if mode in ("I;16", "I", "F"):
+        kind = {"I;16": np.uint16, "I": np.int32, "F": np.float32}[mode]
+        Image.fromarray(values.astype(kind) * 100).save(path)
+    else:
+        Image.fromarray(np.stack([values, values * 2, values * 5], axis=-1)).convert(mode).save(
+            path
+        )
+    return path
 
 
-@pytest.mark.parametrize("modes", [["RGB", "RGB"], ["RGBA", "RGBA"], ["L", "RGB", "L"]])
-def test_images_that_are_read_rightly_are_accepted(modes: list[str], tmp_path: Path) -> None:
-    check_images(META, images_of(tmp_path, *modes), tmp_path)
+@pytest.mark.parametrize(
+    ("mode", "ending", "plain"),
+    [
+        ("1", "png", "L"),
+        ("P", "png", "RGB"),
+        ("P", "gif", "RGB"),
+        ("LA", "png", "RGBA"),
+        ("CMYK", "jpg", "RGB"),
+    ],
+)
+def test_modes_that_nerfstudio_takes_for_others_are_converted(
+    mode: str, ending: str, plain: str, tmp_path: Path
+) -> None:
+    path = write(tmp_path / f"a.{ending}", mode)
+    header = header_of(path)
+    check_kind(path, header)
+    assert not is_plain(header)
+    found = decode(path, turn=False)
+    assert found.mode == plain
+    with Image.open(path) as image:
+        expected = np.asarray(image.convert("RGBA" if plain == "RGBA" else "RGB"))
+    np.testing.assert_array_equal(
+        np.asarray(found.convert("RGBA" if plain == "RGBA" else "RGB")), expected
+    )
 
 
-@pytest.mark.parametrize("mode", ["P", "I;16", "LA", "CMYK", "1"])
-def test_an_image_that_would_be_read_wrongly_is_named(mode: str, tmp_path: Path) -> None:
-    with pytest.raises(InputError, match=f"1[.].*mode '{mode}'.*8 bits a channel") as caught:
-        check_images(META, images_of(tmp_path, "RGB", mode), tmp_path)
+@pytest.mark.parametrize("mode", ["L", "RGB", "RGBA"])
+def test_images_that_are_read_rightly_stay_as_they_are(mode: str, tmp_path: Path) -> None:
+    path = write(tmp_path / "a.png", mode)
+    check_kind(path, header_of(path))
+    assert is_plain(header_of(path))
+
+
+@pytest.mark.parametrize("mode", ["I;16", "I", "F"])
+def test_deep_images_are_refused_by_name(mode: str, tmp_path: Path) -> None:
+    path = write(tmp_path / "a.tiff", mode)
+    with pytest.raises(InputError, match=f"a[.]tiff.*mode '{mode}'.*8 bits a channel") as caught:
+        check_kind(path, header_of(path))
     assert "\n" not in str(caught.value)
 
 
-def test_some_transparent_images_among_others_are_named(tmp_path: Path) -> None:
-    frames = images_of(tmp_path, "RGB", "RGBA", "L")
-    with pytest.raises(InputError, match=r"1 of 3 images have transparency.*1\.png"):
-        check_images(META, frames, tmp_path)
+def test_an_animation_is_refused_and_a_preview_is_not(tmp_path: Path) -> None:
+    frames = [Image.new("RGB", (8, 6), (shade, 0, 0)) for shade in (0, 200)]
+    frames[0].save(tmp_path / "a.gif", save_all=True, append_images=frames[1:])
+    with pytest.raises(InputError, match=r"a\.gif holds more pictures than one"):
+        check_kind(tmp_path / "a.gif", header_of(tmp_path / "a.gif"))
+    frames[0].save(tmp_path / "a.jpg", format="MPO", save_all=True, append_images=frames[1:])
+    check_kind(tmp_path / "a.jpg", header_of(tmp_path / "a.jpg"))
 
 
-def test_smaller_images_are_there_and_of_their_size_but_for_rounding(tmp_path: Path) -> None:
-    names = [frame["file_path"] for frame in images_of(tmp_path, "RGB", "RGB")]
-    paths = [tmp_path / name for name in names]
-
-    def cameras(width: int, height: int) -> SimpleNamespace:
-        return SimpleNamespace(
-            width=torch.tensor([[8], [width]]), height=torch.tensor([[6], [height]])
-        )
-
-    for width, height in ((8, 6), (7, 7)):
-        check_smaller_images(paths, cameras(width, height))
-    with pytest.raises(InputError, match=r"1\.png has 8 x 6 pixels.*are 16 x 6"):
-        check_smaller_images(paths, cameras(16, 6))
-    paths[1].unlink()
-    with pytest.raises(InputError, match=r"1\.png is not there.*downscale-factor"):
-        check_smaller_images(paths, cameras(8, 6))
-
-
-@pytest.mark.filterwarnings("ignore:unclosed file:ResourceWarning")
-@pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
-def test_a_factor_without_its_folder_of_images_is_refused(tiny_scene: Path, tmp_path: Path) -> None:
-    scene = Path(shutil.copytree(tiny_scene, tmp_path / "scene"))
-    reader = LecoPhotographsDataParserConfig(data=scene, downscale_factor=2).setup()
-    with pytest.raises(InputError, match=r"images_2/.*is not there"):
-        reader.get_dataparser_outputs("train")
-    (scene / "images_2").mkdir()
-    for path in (scene / "images").iterdir():
-        Image.new("RGB", (16, 16)).save(scene / "images_2" / path.name)
-    assert len(reader.get_dataparser_outputs("train").image_filenames) == 7
+def test_names_as_windows_and_instant_ngp_write_them_are_found(tmp_path: Path) -> None:
+    (tmp_path / "images").mkdir()
+    path = write(tmp_path / "images" / "a.png", "RGB")
+    for name in ("images/a.png", "images\\a.png", "images/a", "images\\a"):
+        assert as_it_is_there(tmp_path / name) == path
+        check_images([{"file_path": name}], tmp_path)
+    with pytest.raises(InputError, match=r"1 of 1 images.*written by Windows.*backslash"):
+        check_images([{"file_path": "images\\b.png"}], tmp_path)

@@ -11,9 +11,7 @@ from leco_plugin.scenes.derived_images import DerivedImages, image_header, open_
 from leco_plugin.scenes.input_error import InputError
 from leco_plugin.scenes.mega_nerf_format.files import Frame
 from leco_plugin.scenes.mega_nerf_format.masks import read_mask
-
-_AS_THEY_ARE = ("L", "RGB", "RGBA")
-"""Modes that nerfstudio reads correctly."""
+from leco_plugin.scenes.photograph_files import check_kind, header_of, is_plain, plain
 
 
 def scaled(frame: Frame, factor: int) -> tuple[int, int]:
@@ -39,14 +37,13 @@ def scaled(frame: Frame, factor: int) -> tuple[int, int]:
 def picture_of(frame: Frame, factor: int, right_half: bool, derived: DerivedImages) -> Path:
     """A file with the picture, resized as Mega-NeRF does it, or with its right half only."""
     size = scaled(frame, factor)
-    if frame.image_size == size and frame.mode in _AS_THEY_ARE and not right_half:
+    header = header_of(frame.image)
+    check_kind(frame.image, header)
+    if frame.image_size == size and is_plain(header) and not right_half:
         return frame.image
 
     def make() -> Image.Image:
-        image = open_image(frame.image)
-        if image.mode not in _AS_THEY_ARE:
-            transparent = image.mode in ("LA", "PA") or "transparency" in image.info
-            image = image.convert("RGBA" if transparent else "RGB")
+        image = plain(open_image(frame.image))
         if image.size != size:
             image = image.resize(size, Image.Resampling.LANCZOS)
         return image.crop((size[0] // 2, 0, *size)) if right_half else image

@@ -1,0 +1,91 @@
+"""Every field of a lens is read, or refused in one line; none is dropped."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import Any
+
+import pytest
+from nerfstudio.cameras.cameras import CameraType
+
+from leco_plugin.scenes.input_error import InputError
+from leco_plugin.scenes.lenses import check_kinds, lens_of
+from leco_plugin.scenes.scene_fields import unused_fields
+
+SCENE: dict[str, Any] = {
+    "w": 40,
+    "h": 30,
+    "fl_x": 20.0,
+    "fl_y": 21.0,
+    "cx": 20,
+    "cy": 15,
+    "k1": 0.1,
+}
+
+
+def test_a_frame_goes_before_its_scene() -> None:
+    frame = {"fl_x": 25.0, "camera_model": "OPENCV_FISHEYE", "k2": 0.2, "k4": 0.4}
+    lens = lens_of(SCENE, frame, "here")
+    assert (lens.fx, lens.fy, lens.kind) == (25.0, 21.0, CameraType.FISHEYE)
+    assert lens.distortion == [0.0, 0.2, 0.0, 0.4, 0.0, 0.0]
+    assert lens_of(SCENE, {}, "here").distortion == [0.1, 0, 0, 0, 0, 0]
+    assert lens_of({"k4": 0.3}, {}, "here").distortion == [0, 0, 0, 0.3, 0, 0]
+
+
+def test_fields_of_view_are_focal_lengths() -> None:
+    angles = {"w": 40, "h": 30, "camera_angle_x": math.pi / 2, "y_fov": 90.0}
+    lens = lens_of(angles, {}, "here")
+    assert lens.fx == pytest.approx(20.0) and lens.fy == pytest.approx(15.0)
+    del angles["y_fov"]
+    assert lens_of(angles, {}, "here").fy == pytest.approx(20.0)
+
+
+def test_a_fisheye_of_instant_ngp_is_one() -> None:
+    assert lens_of({"is_fisheye": True}, {}, "here").kind is CameraType.FISHEYE
+    assert lens_of({}, {"is_fisheye": True}, "here").kind is CameraType.FISHEYE
+    assert lens_of({"is_fisheye": False}, {}, "here").kind is None
+
+
+@pytest.mark.parametrize(
+    ("more", "message"),
+    [
+        ({"camera_model": "OPENCV", "is_fisheye": True}, "is_fisheye is set: remove one"),
+        ({"camera_model": "FULL_OPENCV"}, "FULL_OPENCV' is none of"),
+        ({"k5": 0.1}, "k5 describes a lens"),
+        ({"ftheta_p0": 0.1}, "ftheta_p0 describes a lens"),
+        ({"equirectangular": True}, "equirectangular describes a lens"),
+        ({"b1": 2.0}, "b1 describes a lens"),
+        ({"camera_model": "EQUIRECTANGULAR", "k1": 0.1}, "no distortion of EQUIRECTANGULAR"),
+        ({"distortion_params": [0.0] * 6, "k1": 0.1}, "differ: remove one"),
+        ({"from_mitsuba": True}, "from_mitsuba"),
+        ({"transform_matrix_start": [1], "transform_matrix": [2]}, "the camera moves"),
+        ({"k2": "0.1"}, "k2 is '0.1'"),
+    ],
+)
+def test_what_would_be_dropped_is_refused(more: dict[str, Any], message: str) -> None:
+    for meta, frame in ((more, {}), ({}, more)):
+        with pytest.raises(InputError, match=f"here.*{message}") as caught:
+            lens_of(meta, frame, "here")
+        assert "\n" not in str(caught.value)
+
+
+def test_what_says_nothing_is_no_lens_of_another_kind() -> None:
+    lens_of({"k5": 0.0, "skew": 0, "lens_mode": "perspective", "rolling_shutter": [0] * 4}, {}, "x")
+
+
+def test_perspective_and_fisheye_may_be_mixed_and_others_not() -> None:
+    def kinds(*models: str) -> list[Any]:
+        return [lens_of({}, {"camera_model": model}, "here") for model in models]
+
+    check_kinds(kinds("OPENCV", "PINHOLE", "OPENCV_FISHEYE"), "here")
+    check_kinds(kinds("EQUIRECTANGULAR", "EQUIRECTANGULAR"), "here")
+    with pytest.raises(InputError, match="here mixes EQUIRECTANGULAR and PERSPECTIVE"):
+        check_kinds(kinds("OPENCV", "EQUIRECTANGULAR"), "here")
+
+
+def test_fields_that_are_not_used_are_said() -> None:
+    frames = [{"file_path": "a.png", "sharpness": 3.0, "driver_parameters": {"LightX": 1.0}}]
+    meta = {"frames": frames, "aabb_scale": 4, "envmap": "sky.png", "sharpen": 0, "mine": [1]}
+    assert unused_fields(meta) == ["driver_parameters", "envmap", "mine"]
+    assert Path("a.png") == Path(str(frames[0]["file_path"]))

@@ -1,0 +1,109 @@
+"""A mask shows the same pixels, whichever program wrote it."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from nerfstudio.data.utils.data_utils import get_image_mask_tensor_from_path
+from PIL import Image
+
+from leco_plugin.scenes.derived_images import DerivedImages
+from leco_plugin.scenes.input_error import InputError
+from leco_plugin.scenes.photograph_masks import masks_as_read
+
+SEEN = np.zeros((16, 24), dtype=bool)
+SEEN[4:12, 6:18] = True
+WHITE = Image.fromarray(SEEN.astype(np.uint8) * 255)
+
+
+def palette(white: int) -> Image.Image:
+    """With white as one of its two numbers."""
+    image = Image.fromarray((white == SEEN).astype(np.uint8))
+    image.putpalette([255 * (white == 0)] * 3 + [255 * (white == 1)] * 3)
+    return image
+
+
+def alpha(mode: str) -> Image.Image:
+    """White, and transparent where it hides."""
+    image = Image.new(mode, WHITE.size, "white")
+    image.putalpha(WHITE)
+    return image
+
+
+WAYS = {
+    "grey": (WHITE, "png"),
+    "of 0 and 1": (Image.fromarray(SEEN.astype(np.uint8)), "png"),
+    "one bit": (WHITE.convert("1"), "png"),
+    "palette, white first": (palette(0), "png"),
+    "palette, black first": (palette(1), "png"),
+    "RGB": (WHITE.convert("RGB"), "png"),
+    "opaque RGBA": (WHITE.convert("RGBA"), "png"),
+    "transparent": (alpha("RGBA"), "png"),
+    "grey and transparent": (alpha("LA"), "png"),
+    "16 bits": (Image.fromarray(SEEN.astype(np.uint16) * 65535), "png"),
+    "32 bits": (Image.fromarray(SEEN.astype(np.int32)), "tiff"),
+    "floats": (Image.fromarray(SEEN.astype(np.float32)), "tiff"),
+    "jpeg": (WHITE, "jpg"),
+    "CMYK": (WHITE.convert("CMYK"), "tiff"),
+    "coloured jpeg": (WHITE.convert("RGB"), "jpg"),
+    "of twice the size": (WHITE.resize((48, 32), Image.Resampling.NEAREST), "png"),
+}
+
+
+def read(path: Path, size: tuple[int, int] = (24, 16)) -> np.ndarray:
+    """What nerfstudio takes for seen of the file that it is given."""
+    derived = DerivedImages(path.parent / "cache")
+    (made,) = masks_as_read([path], [Path("a.jpg")], [size], derived, speak=False)
+    seen: np.ndarray = get_image_mask_tensor_from_path(made)[..., 0].numpy()
+    return seen
+
+
+@pytest.mark.filterwarnings("ignore::ResourceWarning")
+@pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
+@pytest.mark.parametrize("way", WAYS)
+def test_the_same_pixels_are_seen(way: str, tmp_path: Path) -> None:
+    image, ending = WAYS[way]
+    path = tmp_path / f"a.{ending}"
+    image.save(path, **({"quality": 60} if ending == "jpg" else {}))
+    np.testing.assert_array_equal(read(path), SEEN)
+    assert (tmp_path / "cache").exists() is (way not in ("grey", "of 0 and 1"))
+
+
+@pytest.mark.filterwarnings("ignore::ResourceWarning")
+@pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
+def test_a_smaller_mask_is_made_of_the_one_of_full_size(tmp_path: Path) -> None:
+    for place in ("masks", "masks_3/of_one"):
+        (tmp_path / place).mkdir(parents=True)
+        WHITE.save(tmp_path / place / "b.png")
+    (tmp_path / "masks_3/of_one/b.png").unlink()
+    (tmp_path / "masks/of_one").mkdir()
+    WHITE.save(tmp_path / "masks/of_one/b.jpg.png")
+    for name in ("masks_2/b.png", "masks_2/of_one/b.png"):
+        derived = DerivedImages(tmp_path / "cache")
+        made = masks_as_read([tmp_path / name], [Path("b.jpg")], [(12, 8)], derived, False)
+        seen = get_image_mask_tensor_from_path(made[0])[..., 0].numpy()
+        np.testing.assert_array_equal(seen, SEEN[::2, ::2])
+
+
+COLOURS = Image.fromarray(np.stack([SEEN * 255, SEEN * 0, SEEN * 0], axis=-1).astype(np.uint8))
+BAD = {
+    "colours": (COLOURS, "has colours.*black.*white"),
+    "another size": (WHITE.resize((10, 10)), "has 10 x 10 pixels, its image 24 x 16"),
+    "all black": (Image.new("L", (24, 16)), "leave no pixel"),
+}
+
+
+@pytest.mark.parametrize("name", BAD)
+def test_the_mask_is_named(name: str, tmp_path: Path) -> None:
+    image, message = BAD[name]
+    image.save(tmp_path / "m.tiff")
+    with pytest.raises(InputError, match=f"mask.*{message}|{message}.*mask") as caught:
+        read(tmp_path / "m.tiff")
+    assert "m.tiff" in str(caught.value) and "\n" not in str(caught.value)
+
+
+def test_a_missing_mask_is_named_and_not_its_photograph(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=r"the mask .*masks_2/c\.png is not there"):
+        read(tmp_path / "masks_2" / "c.png")
