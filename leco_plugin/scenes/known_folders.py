@@ -69,6 +69,7 @@ def remedy_for(data: Path, used: str) -> str | None:
     known = [each for folder in (data, data.parent) for each in _commands_for(folder)]
     others = [command for reader, command in known if reader != used]
     if others:
-        return f"`{others[0]}` reads it"
+        doubt = ", or names what is wrong" if READERS["transforms.json"] in others[0] else ""
+        return f"`{others[0]}` reads it{doubt}"
     converter = None if known else converter_for(data)
     return None if converter is None else f"`{converter}` makes a scene of it"

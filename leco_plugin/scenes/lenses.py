@@ -84,7 +84,8 @@ def set_lenses(cameras: Cameras, lenses: list[Lens | None], factors: list[int]) 
     """
     for name in ("fx", "fy", "cx", "cy", "camera_type", "distortion_params"):
         shared = getattr(cameras, name)  # by all cameras, where they were given one value
-        setattr(cameras, name, None if shared is None else shared.clone())
+        own = None if shared is None else shared.expand(len(lenses), -1).clone()
+        setattr(cameras, name, own)
     for number, (lens, factor) in enumerate(zip(lenses, factors)):
         if lens is None:
             continue

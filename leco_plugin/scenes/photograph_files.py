@@ -56,7 +56,8 @@ def header_of(path: Path) -> Header:
 
 def _orientation(image: Image.Image) -> int:
     try:
-        return int(image.getexif().get(ExifTags.Base.Orientation, 1))
+        noted = int(image.getexif().get(ExifTags.Base.Orientation, 1))
+        return noted if noted in range(1, 9) else 1
     except Exception:  # noqa: BLE001  damaged EXIF raises whatever its parser meets
         return 1
 

@@ -148,7 +148,8 @@ def check_scene(data: Path) -> dict[str, Any]:
     except (OSError, ValueError, KeyError, TypeError, OverflowError, RecursionError) as error:
         reason = f"{type(error).__name__}: {one_line(error, 120)}"
         raise InputError(
-            f"{description} is not a scene in nerfstudio's format ({reason})"
+            f"{description} is not a scene in nerfstudio's format ({reason}); mend it, or make it "
+            "anew with ns-process-data"
         ) from None
     if len(frames) == 0:
         raise InputError(f"{description} has no cameras: its list of frames is empty")

@@ -9,15 +9,18 @@ from __future__ import annotations
 import json
 from collections import Counter
 from collections.abc import Callable
+from contextlib import nullcontext
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import torch
-from nerfstudio.cameras.cameras import Cameras
+from nerfstudio.cameras.cameras import CameraType
 from nerfstudio.data.dataparsers.base_dataparser import DataparserOutputs
 from rich.markup import escape
 
 from leco_plugin.models.compute.ranks import say
+from leco_plugin.progress_bar import bar
 from leco_plugin.scenes.derived_images import DerivedImages
 from leco_plugin.scenes.input_error import InputError, one_line
 from leco_plugin.scenes.known_folders import remedy_for
@@ -107,13 +110,18 @@ def checked(outputs: DataparserOutputs, config: Any, split: str) -> DataparserOu
         InputError: one line.
     """
     outputs.metadata = dict(outputs.metadata)
-    if outputs.metadata.get(CHECKED):
+    if outputs.metadata.get(CHECKED) or not outputs.image_filenames:
         return outputs
     data, speak = Path(config.data), split == "train"
     derived = DerivedImages(
         (data if data.is_dir() else data.parent) / "leco-cache" / "pictures", UNWRITABLE
     )
     images = [Path(path) for path in outputs.image_filenames]
+    if outputs.cameras.camera_to_worlds.shape != (len(images), 3, 4):
+        raise InputError(  # as nerfstudio's reader of instant-ngp makes them of one photograph
+            f"{data}: {reader_name(config)} makes no cameras of {len(images)} photographs of the "
+            f"split {split}: hold out more, or name another reader after the method"
+        )
     headers = [header_of(path) for path in images]
     cameras, factors = outputs.cameras, [1] * len(images)
     lenses: list[Lens | None] = [None] * len(images)
@@ -124,18 +132,20 @@ def checked(outputs: DataparserOutputs, config: Any, split: str) -> DataparserOu
         for number, frame in enumerate(frames):
             if frame is not None:
                 lenses[number] = lens_of(meta, frame, f"{file}: {frame['file_path']}")
-                factors[number] = factor_of(meta, frame, int(cameras.width[number]))
+                if hasattr(config, "downscale_factor") or "w" in meta:
+                    factors[number] = factor_of(meta, frame, int(cameras.width[number]))
         check_kinds([lens for lens in lenses if lens is not None], str(file))
+        radius = meta.get("fisheye_crop_radius")
+        if radius is not None and any(lens and lens.kind is CameraType.FISHEYE for lens in lenses):
+            cameras.metadata = (cameras.metadata or {}) | {"fisheye_crop_radius": radius}
         check_masked(meta["frames"], file.parent)
         masked = [frame["mask_path"] for frame in frames if frame and "mask_path" in frame]
         if outputs.mask_filenames is None and len(masked) == len(images):
             outputs.mask_filenames = [file.parent / path.replace("\\", "/") for path in masked]
         if speak:
             say_unused(meta, file)
-    sizes = [
-        _size_of(path, header, lens, cameras[number], factor)
-        for number, (path, header, lens, factor) in enumerate(zip(images, headers, lenses, factors))
-    ]
+    made = torch.cat([cameras.width, cameras.height], dim=-1).expand(len(images), -1).tolist()
+    sizes = [_size_of(*each) for each in zip(images, headers, lenses, made, factors)]
     set_lenses(cameras, lenses, factors)
     cameras.width, cameras.height = torch.tensor(sizes).to(cameras.width).split(1, dim=1)
     outputs.image_filenames = _plain_pictures(images, headers, sizes, derived, speak)
@@ -196,16 +206,18 @@ def _is_at(image: Path, frame: dict[str, Any], folder: Path) -> bool:
 
 
 def _size_of(
-    path: Path, header: Header, lens: Lens | None, camera: Cameras, factor: int
+    path: Path, header: Header, lens: Lens | None, wanted: list[int], factor: int
 ) -> tuple[int, int]:
     """Width and height of a picture as it will be read.
 
+    Args:
+        wanted: of its camera, by its reader.
     Raises:
         InputError: they are not those of its lens or, where that is not known, of its camera.
     """
-    wanted, slack = (int(camera.width), int(camera.height)), 1
+    slack = 1
     if lens is not None and lens.width is not None and lens.height is not None:
-        wanted = int(lens.width) // factor, int(lens.height) // factor
+        wanted = [int(lens.width) // factor, int(lens.height) // factor]
         slack = min(1, factor - 1)
     sizes = [header.size] + [header.size[::-1]] * (header.orientation >= 5)
     for size in sizes:
@@ -226,16 +238,19 @@ def _plain_pictures(
 ) -> list[Path]:
     """Files of the pictures that nerfstudio reads rightly."""
     paths, converted, as_stored = [], Counter[str](), []
-    for path, header, size in zip(images, headers, sizes):
-        check_kind(path, header)
-        turn = is_turned(header, size)
-        if header.orientation != 1 and not turn:
-            as_stored.append(path)
-        if is_plain(header) and not turn:
-            paths.append(path)
-            continue
-        converted["turned as EXIF says" if turn else f"of mode {header.mode}"] += 1
-        paths.append(derived.get(path, f"plain {turn}", lambda: decode(path, turn)))  # noqa: B023
+    turns = [is_turned(header, size) for header, size in zip(headers, sizes)]
+    needed = any(turns) or not all(is_plain(header) for header in headers)
+    with bar("Converting photographs") if needed else nullcontext(lambda share: None) as progress:
+        for path, header, turn in zip(images, headers, turns):
+            check_kind(path, header)
+            if header.orientation != 1 and not turn:
+                as_stored.append(path)
+            if is_plain(header) and not turn:
+                paths.append(path)
+                continue
+            converted["turned as EXIF says" if turn else f"of mode {header.mode}"] += 1
+            paths.append(derived.get(path, f"plain {turn}", partial(decode, path, turn)))
+            progress(len(paths) / len(images))
     transparent = [path for path, header in zip(images, headers) if header.transparent]
     if 0 < len(transparent) < len(images):
         raise InputError(

@@ -81,9 +81,9 @@ READERS: dict[str, Callable[[Path], Any]] = {
 OF_A_FILE = ["leco-photographs", "nerfstudio-data", "instant-ngp-data", "blender-data"]
 
 
-def read(config: Any) -> Any:
-    """The training split as our data manager has it."""
-    return in_one_line(config.setup().get_dataparser_outputs, config)("train")
+def read(config: Any, split: str = "train") -> Any:
+    """A split as our data manager has it."""
+    return in_one_line(config.setup().get_dataparser_outputs, config)(split)
 
 
 def picture(path: Path) -> np.ndarray:
@@ -153,15 +153,34 @@ def test_every_reader_of_a_file_has_the_lens_of_each_frame(reader: str, scene: P
         assert int(cameras.camera_type[row]) == kind.value
         assert float(cameras.fx[row]) == 30.0 + number and float(cameras.fy[row]) == 20.0
         assert float(cameras.distortion_params[row, 0]) == pytest.approx(0.01 * number)
-    rays = cameras.generate_rays(camera_indices=torch.tensor([[0]]))
-    assert bool(rays.directions.isfinite().all())
+    assert bool(cameras.generate_rays(torch.tensor([[0]])).directions.isfinite().all())
+
+
+def test_fields_of_view_go_for_both_axes(scene: Path) -> None:
+    def leave_out(meta: dict[str, Any]) -> None:
+        del meta["fl_x"], meta["fl_y"]
+        meta |= {"camera_angle_x": np.pi / 2, "camera_angle_y": np.pi / 3, "k2": 0.5}
+
+    change(scene, leave_out)
+    config = InstantNGPDataParserConfig(data=scene, train_split_fraction=0.7)
+    cameras = read(config, "val").cameras
+    assert float(cameras.fx[1]) == pytest.approx(16.0)
+    assert float(cameras.fy[1]) == pytest.approx(16.0 * 3**0.5)
+    assert cameras.distortion_params[1].tolist() == [0.0, 0.5, 0.0, 0.0, 0.0, 0.0]
+    config.train_split_fraction = 0.85  # of one photograph nerfstudio makes four half cameras
+    with pytest.raises(InputError, match=r"makes no cameras of 1 photographs.*hold out more"):
+        read(config, "val")
+    with pytest.raises(InputError, match=r"has no fl_x; .*instant-ngp-data"):
+        read(LecoPhotographsDataParserConfig(data=scene))
 
 
 @pytest.mark.parametrize("reader", OF_A_FILE)
 def test_every_reader_of_a_file_reads_is_fisheye(reader: str, scene: Path) -> None:
     change(scene, lambda meta: (meta.pop("camera_model", None), meta.update(is_fisheye=True)))
-    kinds = read(READERS[reader](scene)).cameras.camera_type
-    assert set(kinds.flatten().tolist()) == {CameraType.FISHEYE.value}
+    change(scene, lambda meta: meta.update(fisheye_crop_radius=9))
+    cameras = read(READERS[reader](scene)).cameras
+    assert set(cameras.camera_type.flatten().tolist()) == {CameraType.FISHEYE.value}
+    assert cameras.metadata["fisheye_crop_radius"] == 9
 
 
 def test_a_photograph_is_turned_where_its_intrinsics_are_for_that(scene: Path) -> None:
