@@ -10,6 +10,7 @@ from types import MappingProxyType
 from typing import Any
 
 import tyro
+from nerfstudio.data.dataparsers.base_dataparser import DataParserConfig
 from nerfstudio.engine.trainer import Trainer, TrainerConfig
 from nerfstudio.models.base_model import ModelConfig
 
@@ -23,6 +24,7 @@ from leco_plugin.models.hosts.guided_start import OccupancyConfig, load_occupanc
 from leco_plugin.models.sizing.sizes import learning_only
 from leco_plugin.samplers.registry import check_gate, refuse_unknown_options
 from leco_plugin.scenes.input_error import InputError
+from leco_plugin.scenes.reading import with_checks
 
 LEARNED = "learned-occupancy"
 """Name of the sampler that goes into a host unless another one is asked for."""
@@ -138,6 +140,9 @@ def with_sampler_swapped(
     path = None if file is None else occupancy_file(file.resolve())
     occupancy = replace(learned_first(), path=path, sampler=sampler, options=dict(options))
     pipeline.model = GuidedModelConfig(host=host, occupancy=occupancy, codes=codes)
+    parser = getattr(getattr(pipeline, "datamanager", None), "dataparser", None)
+    if isinstance(parser, DataParserConfig):
+        pipeline.datamanager.dataparser = with_checks(parser)
     if type(config) is TrainerConfig:
         values = {f.name: getattr(config, f.name) for f in fields(config)}
         config = DataParallelTrainerConfig(**values)

@@ -2,13 +2,21 @@
 
 from __future__ import annotations
 
+import shutil
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 import yaml
 from ball_occupancy import ball
 from nerfstudio.configs.method_configs import all_methods
+from nerfstudio.data.dataparsers.nerfstudio_dataparser import (
+    Nerfstudio,
+    NerfstudioDataParserConfig,
+)
+from PIL import Image
 
 from leco_plugin.compat.dynamic_batch import ClampedDynamicBatchPipelineConfig
 from leco_plugin.models.guided import GuidedModelConfig
@@ -33,6 +41,26 @@ def test_only_sampler_batches_and_trainer_are_others(file: Path) -> None:
     assert isinstance(guided, GuidedModelConfig)
     assert guided.host == before.pipeline.model  # type: ignore[attr-defined]
     assert guided.occupancy.path == file and guided.occupancy.sampler == "learned-occupancy"
+
+
+# nerfstudio leaves the images open whose size it has read
+@pytest.mark.filterwarnings("ignore:unclosed file:ResourceWarning")
+@pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
+def test_pictures_of_a_swapped_method_are_checked_by_its_own_reader_too(
+    file: Path, tiny_scene: Path, tmp_path: Path
+) -> None:
+    scene = Path(shutil.copytree(tiny_scene, tmp_path / "scene"))
+    for path in scene.glob("images/*"):
+        grey = np.asarray(Image.open(path).convert("L"), dtype=np.uint16)
+        Image.fromarray(256 * grey).save(path)
+    made: Any = swapped_config("nerfacto", file, ["--data", str(scene)])
+    reader = made.pipeline.datamanager.dataparser
+    assert type(reader) is NerfstudioDataParserConfig
+    parser = replace(yaml.load(yaml.dump(reader), Loader=yaml.Loader), data=scene).setup()
+    assert isinstance(parser, Nerfstudio)
+    with pytest.raises(InputError, match="16") as error:
+        parser.get_dataparser_outputs("train")
+    assert "\n" not in str(error.value)
 
 
 def test_options_of_the_sampler_are_in_the_config(file: Path) -> None:

@@ -26,12 +26,11 @@ from leco_plugin.models.compute.ranks import say
 from leco_plugin.scenes.dataset_units import UP_IS_KNOWN
 from leco_plugin.scenes.detail import CAMERAS
 from leco_plugin.scenes.input_error import InputError
-from leco_plugin.scenes.large_coordinates import read_near
 from leco_plugin.scenes.photograph_files import names_what_it_cannot_read
 from leco_plugin.scenes.pixels.held_out_pixels import HeldOutPixelSampler
 from leco_plugin.scenes.pixels.lattice import PERIODS, Lattice, lattice_for
 from leco_plugin.scenes.pixels.stored_pictures import picture_sizes, store_pictures
-from leco_plugin.scenes.reading import in_one_line
+from leco_plugin.scenes.reading import read_checked
 from leco_plugin.scenes.survey import points_in
 from leco_plugin.scenes.upright import turn_to_upright, turned
 
@@ -75,9 +74,7 @@ class LecoDataManager(VanillaDataManager):  # type: ignore[type-arg]
 
     @dataparser.setter
     def dataparser(self, parser: Any) -> None:
-        self._dataparser = parser
-        read_near(parser)
-        parser.get_dataparser_outputs = in_one_line(parser.get_dataparser_outputs, parser.config)
+        self._dataparser = read_checked(parser)
         # nerfstudio sets this class as the target of configs that an earlier release stored
         if getattr(self.config, "upright", False):
             parser.get_dataparser_outputs = upright_outputs(parser.get_dataparser_outputs)

@@ -10,13 +10,14 @@ import json
 from collections import Counter
 from collections.abc import Callable
 from contextlib import nullcontext
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
 
 import torch
 from nerfstudio.cameras.cameras import CameraType
-from nerfstudio.data.dataparsers.base_dataparser import DataparserOutputs
+from nerfstudio.data.dataparsers.base_dataparser import DataParserConfig, DataparserOutputs
 from rich.markup import escape
 
 from leco_plugin.models.compute.ranks import say
@@ -24,6 +25,7 @@ from leco_plugin.progress_bar import bar
 from leco_plugin.scenes.derived_images import DerivedImages
 from leco_plugin.scenes.input_error import InputError, one_line
 from leco_plugin.scenes.known_folders import remedy_for
+from leco_plugin.scenes.large_coordinates import read_near
 from leco_plugin.scenes.lenses import Lens, check_kinds, factor_of, lens_of, set_lenses
 from leco_plugin.scenes.photograph_files import (
     Header,
@@ -39,6 +41,30 @@ from leco_plugin.scenes.scene_fields import say_unused
 CHECKED = "leco_checked"
 """Key of a dataparser's metadata: there where `checked` has been at its outputs."""
 UNWRITABLE = "make the folder of the scene writable, or convert its pictures and masks by hand"
+
+
+def read_checked(parser: Any) -> Any:
+    """The reader with its outputs checked, large positions shifted, and each error in one line."""
+    read_near(parser)
+    parser.get_dataparser_outputs = in_one_line(parser.get_dataparser_outputs, parser.config)
+    return parser
+
+
+def set_up_checked(config: Any, **options: Any) -> Any:
+    """What a config of `with_checks` sets up: its own reader, as of `read_checked`."""
+    return read_checked(_own_target(config)(config, **options))
+
+
+def with_checks(config: DataParserConfig) -> DataParserConfig:
+    """The config of a reader that will be checked in whatever data manager."""
+    return replace(config, _target=set_up_checked)  # type: ignore[arg-type]
+
+
+def _own_target(config: Any) -> Any:
+    """The class of a config's reader."""
+    if config._target is not set_up_checked:
+        return config._target
+    return type(config)()._target
 
 
 def in_one_line(read: Callable[..., DataparserOutputs], config: Any) -> Callable[..., Any]:
@@ -166,11 +192,10 @@ def _description(config: Any, split: str) -> Path | None:
     from nerfstudio.data.dataparsers.nerfstudio_dataparser import Nerfstudio
 
     data = Path(config.data)
-    if issubclass(config._target, Nerfstudio | InstantNGP):
+    target = _own_target(config)
+    if issubclass(target, Nerfstudio | InstantNGP):
         return data if data.suffix == ".json" else data / "transforms.json"
-    return (
-        data / f"transforms_{split}.json" if issubclass(config._target, Blender | DNeRF) else None
-    )
+    return data / f"transforms_{split}.json" if issubclass(target, Blender | DNeRF) else None
 
 
 def _frames_of(images: list[Path], meta: dict[str, Any], file: Path) -> list[dict[str, Any] | None]:

@@ -25,10 +25,9 @@ OF_WHOM = ("nerfstudio.", "leco_plugin.")
 
 
 class SmallCodes(Embedding):
-    """nerfstudio's table of codes with zeros in it, whose answers are scaled and have mean zero.
+    """nerfstudio's table of codes with zeros in it, whose answers are scaled by `APPEARANCE_SCALE`.
 
-    Other views look the same whether their host shows them by the mean code or by zeros. The names
-    in a state dict are those of nerfstudio's table.
+    The names in a state dict are those of nerfstudio's table.
     """
 
     def build_nn_modules(self) -> None:
@@ -37,12 +36,12 @@ class SmallCodes(Embedding):
         self.embedding = nn.Embedding.from_pretrained(zeros, freeze=False)
 
     def mean(self, dim: int = 0) -> Tensor:
-        """The mean code: zeros [out_dim]."""
-        return torch.zeros_like(self.embedding.weight).mean(dim)
+        """The mean code, [out_dim]."""
+        return APPEARANCE_SCALE * super().mean(dim)
 
     def forward(self, in_tensor: Tensor) -> Tensor:
         """Codes [..., out_dim] of photographs [...] int64."""
-        return APPEARANCE_SCALE * (self.embedding(in_tensor) - self.embedding.weight.mean(dim=0))
+        return APPEARANCE_SCALE * super().forward(in_tensor)
 
 
 def begin_with_small_codes(host: Model) -> None:
