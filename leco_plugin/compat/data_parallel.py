@@ -38,11 +38,7 @@ class DataParallelTrainerConfig(TrainerConfig):
     """target class to instantiate"""
 
     def __setstate__(self, state: dict[str, Any]) -> None:
-        """Called by yaml: data that were moved with their run are found before they are read.
-
-        Raises:
-            InputError: they are not found.
-        """
+        """Called by yaml: data that were moved with their run are found before they are read."""
         self.__dict__.update(state)
         follow_data(self)
 

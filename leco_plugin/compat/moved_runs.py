@@ -7,6 +7,7 @@ there is looked for around the config that the command was given.
 from __future__ import annotations
 
 import inspect
+import os
 from pathlib import Path
 from typing import Any
 
@@ -32,33 +33,45 @@ def config_in_use() -> Path | None:
 def follow_data(config: Any) -> None:
     """Has a config that is being loaded for evaluation name its data where they are now.
 
+    A config whose data are nowhere stays as it is: nerfstudio may be about to name others.
+
     Args:
         config: a `TrainerConfig`, just read from its file.
-    Raises:
-        InputError: they are nowhere around the file.
     """
     path = config_in_use()
-    manager: Any = getattr(config.pipeline, "datamanager", None)
+    manager: Any = getattr(getattr(config, "pipeline", None), "datamanager", None)
     parser = getattr(manager, "dataparser", None)
     named = getattr(manager, "data", None) or getattr(parser, "data", None)
-    if path is None or named is None or Path(named).exists():
+    if path is None or named is None or os.path.exists(named):
         return
     found = found_around(Path(named), path.parent)
     if found is None:
-        raise InputError(
-            f"{named}, with the data of this run, is not there: put it, or a link with the name "
-            f"{Path(named).name}, beside {path}"
-        )
+        return
     say(f"{named} is not there; the data are read from {found}")
     config.data = manager.data = found
     if parser is not None:
         parser.data = found
 
 
+def require_data(named: Path) -> None:
+    """Called where data are read.
+
+    Raises:
+        InputError: a run is being loaded for evaluation, and its data are not there.
+    """
+    path = config_in_use()
+    if path is not None and not os.path.exists(named):
+        raise InputError(
+            f"{named}, with the data of this run, is not there: put it, or a link with the name "
+            f"{named.name}, beside {path}"
+        )
+
+
 def found_around(named: Path, folder: Path) -> Path | None:
     """What a path has become that was moved together with a folder, or put into it; None if lost.
 
-    As much of the path as possible is found again, in the folder or one that holds it.
+    As much of the path as possible is found again, in the folder or one that holds it. Scenes'
+    files share one name: one that is not in the folder has to be in a folder of its old name too.
     """
     folder = folder.resolve()
     around = [place for place in (folder, *folder.parents) if place != place.parent]
@@ -66,9 +79,17 @@ def found_around(named: Path, folder: Path) -> Path | None:
     for first in range(len(parts)):
         for place in around:
             found = place.joinpath(*parts[first:])
-            if found.exists() and found.resolve() not in around:  # a run may have its data's name
+            if not os.path.exists(found) or found.resolve() in around:
+                continue
+            elsewhere = found.is_file() and parts[first:] == parts[-1:] and place != folder
+            if not elsewhere and not holds_runs(found):
                 return found
     return None
+
+
+def holds_runs(folder: Path) -> bool:
+    """Whether this is nerfstudio's folder of the runs on some data, which has the data's name."""
+    return any(folder.glob("*/*/config.yml"))
 
 
 def checkpoints_of(config: Any) -> Path:

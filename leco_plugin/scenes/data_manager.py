@@ -5,10 +5,12 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal
 
+import torch
+from nerfstudio.cameras.cameras import CameraType
 from nerfstudio.data.datamanagers.base_datamanager import (
     VanillaDataManager,
     VanillaDataManagerConfig,
@@ -102,15 +104,22 @@ class LecoDataManager(VanillaDataManager):  # type: ignore[type-arg]
     def _get_pixel_sampler(self, dataset: Any, num_rays_per_batch: int) -> Any:
         """nerfstudio's choice; of small scenes more pixels are held out.
 
-        The radius of a fisheye's circle is that of the full-size image, or given by hand.
+        The radius of a fisheye's circle is given by hand, or that of the full-size image.
         """
         by_hand = self.config.pixel_sampler.fisheye_crop_radius
         sampler = super()._get_pixel_sampler(dataset, num_rays_per_batch)
         of_scene = (dataset.cameras.metadata or {}).get("fisheye_crop_radius")
         factor = getattr(self.dataparser, "downscale_factor", None) or 1
-        radius = by_hand if of_scene is None else of_scene * dataset.scale_factor / factor
-        sampler.config.fisheye_crop_radius = radius
+        radius = by_hand
+        if by_hand is None and of_scene is not None:
+            radius = of_scene * dataset.scale_factor / factor
+        self.config.pixel_sampler.fisheye_crop_radius = by_hand  # nerfstudio has overwritten it
+        sampler.config = replace(sampler.config, fisheye_crop_radius=radius)
         if isinstance(sampler, HeldOutPixelSampler):
+            fisheyes = dataset.cameras.camera_type.flatten().cpu() == CameraType.FISHEYE.value
+            if radius is not None and 0 < int(fisheyes.sum()) < len(fisheyes):
+                sampler.radii = torch.where(fisheyes, float(radius), math.inf)
+                sampler.config.fisheye_crop_radius = None
             period = getattr(self.config, "held_out_period", None)
             sampler.lattice = (
                 lattice_for(picture_sizes(dataset)) if period is None else Lattice(period)

@@ -131,7 +131,9 @@ def check_scene(data: Path) -> dict[str, Any]:
             that nerfstudio's cameras lack, poses that are not poses.
     """
     if not data.exists():
-        raise InputError(f"there is no folder {data}; give one with --data")
+        raise InputError(
+            f"there is no folder {data}: put it, or a link, there, or give another with --data"
+        )
     description = data if data.suffix == ".json" else data / "transforms.json"
     if not description.exists():
         instead = remedy_for(data, "leco-photographs") or (

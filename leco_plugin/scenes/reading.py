@@ -20,6 +20,7 @@ from nerfstudio.cameras.cameras import CameraType
 from nerfstudio.data.dataparsers.base_dataparser import DataParserConfig, DataparserOutputs
 from rich.markup import escape
 
+from leco_plugin.compat.moved_runs import require_data
 from leco_plugin.models.compute.ranks import say
 from leco_plugin.progress_bar import bar
 from leco_plugin.scenes.derived_images import DerivedImages
@@ -76,6 +77,7 @@ def in_one_line(read: Callable[..., DataparserOutputs], config: Any) -> Callable
     """
 
     def outputs_of(split: str = "train", **options: Any) -> DataparserOutputs:
+        require_data(Path(config.data))
         try:
             return checked(read(split=split, **options), config, split)
         except InputError:
@@ -112,7 +114,7 @@ def _remedy(error: BaseException, config: Any) -> str:
     """What to do about an error of a reader."""
     data, name = Path(config.data), reader_name(config)
     if not data.exists():
-        return "there is no such folder: is its path right?"
+        return "there is no such folder: put it, or a link, there, or give another with --data"
     if isinstance(error, EOFError | SystemExit) and name == "colmap":
         return (
             "it would make smaller copies of photographs of more than 1600 pixels: "

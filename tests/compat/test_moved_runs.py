@@ -67,6 +67,48 @@ def test_what_the_error_asks_for_is_enough(trained: Path, tmp_path: Path, linked
         eval_utils.eval_setup(run / "config.yml")
 
 
+def test_data_that_a_command_names_are_read_although_the_old_ones_are_gone(
+    trained: Path, tmp_path: Path
+) -> None:
+    run = Path(shutil.copytree(config_of(trained).parent, tmp_path / "run"))
+    scene = Path(shutil.copytree(trained / "data" / "scene", tmp_path / "elsewhere" / "photos"))
+
+    def named_by_command(config: Any) -> Any:  # as ns-render dataset --data
+        config.pipeline.datamanager.data = scene
+        return config
+
+    loaded: tuple[Any, ...] = eval_utils.eval_setup(
+        run / "config.yml", update_config_callback=named_by_command
+    )
+    assert loaded[3] == 7 and loaded[1].datamanager.get_datapath() == scene
+    shutil.rmtree(scene)
+    with pytest.raises(InputError, match="a link with the name photos, beside"):
+        eval_utils.eval_setup(run / "config.yml", update_config_callback=named_by_command)
+
+
+def test_neither_runs_on_the_data_nor_another_scenes_file_are_taken_for_them(
+    tmp_path: Path,
+) -> None:
+    run = tmp_path / "outputs" / "exp2" / "leco-ngp" / "b"
+    other = tmp_path / "outputs" / "caliterra" / "leco-ngp" / "a"
+    for folder in (run, other):
+        folder.mkdir(parents=True)
+        (folder / "config.yml").touch()
+    named = Path("/gone/data/caliterra")
+    assert found_around(named, run) is None
+    (tmp_path / "caliterra" / "images").mkdir(parents=True)
+    assert found_around(named, run) == tmp_path / "caliterra"
+
+    file = Path("/gone/siteA/transforms.json")
+    (tmp_path / "transforms.json").touch()
+    assert found_around(file, run) is None
+    (run / "transforms.json").touch()
+    assert found_around(file, run) == run / "transforms.json"
+    (tmp_path / "siteA").mkdir()
+    (tmp_path / "siteA" / "transforms.json").touch()
+    assert found_around(file, run) == tmp_path / "siteA" / "transforms.json"
+
+
 def test_the_longest_part_of_a_path_that_is_there_is_taken_and_no_folder_of_the_run(
     tmp_path: Path,
 ) -> None:

@@ -10,6 +10,7 @@ from typing import Any
 
 import pytest
 import torch
+from nerfstudio.cameras.cameras import CameraType
 from nerfstudio.data.datamanagers.base_datamanager import VanillaDataManagerConfig
 from nerfstudio.data.datamanagers.full_images_datamanager import FullImageDatamanagerConfig
 from nerfstudio.data.datamanagers.parallel_datamanager import ParallelDataManagerConfig
@@ -17,6 +18,7 @@ from nerfstudio.data.dataparsers.blender_dataparser import BlenderDataParserConf
 from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataParserConfig
 from nerfstudio.data.pixel_samplers import PixelSamplerConfig
 from nerfstudio.pipelines.base_pipeline import VanillaPipelineConfig
+from PIL import Image
 
 from leco_plugin.models.freezing.calibration import CalibrationConfig
 from leco_plugin.models.freezing.held_out_rendering import held_out_bundle
@@ -253,7 +255,8 @@ def test_a_fisheye_is_read_as_far_as_its_lens_shows(
 ) -> None:
     scene = Path(shutil.copytree(tiny_scene, tmp_path / "scene"))
     meta = json.loads((scene / "transforms.json").read_text())
-    meta |= {"camera_model": "OPENCV_FISHEYE"} | ({} if by_hand else {"fisheye_crop_radius": 20})
+    radius = 3 if by_hand else 20  # what is given by hand goes before it
+    meta |= {"camera_model": "OPENCV_FISHEYE", "fisheye_crop_radius": radius}
     (scene / "transforms.json").write_text(json.dumps(meta))
     config = LecoDataManagerConfig(
         images=kept, pixels=tmp_path, camera_res_scale_factor=0.5, **options(scene)
@@ -270,6 +273,43 @@ def test_a_fisheye_is_read_as_far_as_its_lens_shows(
     for pixels in (drawn, held_out):
         distances = (pixels[:, 1:] + 0.5 - 8.0).norm(dim=-1)
         assert 7.0 < float(distances.max()) <= 10.0
+
+
+@pytest.mark.parametrize("kept", ["memory", "disk"])
+@pytest.mark.parametrize("sizes", ["one size", "two sizes"])
+def test_beside_fisheyes_perspective_photographs_are_read_as_a_whole(
+    kept: Any, sizes: str, tiny_scene: Path, tmp_path: Path
+) -> None:
+    scene = Path(shutil.copytree(tiny_scene, tmp_path / "scene"))
+    meta = json.loads((scene / "transforms.json").read_text())
+    own = {key: meta.pop(key) for key in ("w", "h", "fl_x", "fl_y", "cx", "cy")}
+    for number, frame in enumerate(meta["frames"]):
+        frame |= own | {"camera_model": ("OPENCV_FISHEYE" if number % 3 else "OPENCV")}
+        if sizes == "two sizes" and number % 3 == 0:
+            path = scene / frame["file_path"]
+            Image.open(path).resize((16, 16)).save(path)
+            frame |= {key: value / 2 for key, value in own.items()} | {"w": 16, "h": 16}
+    meta |= {"fisheye_crop_radius": 6}
+    (scene / "transforms.json").write_text(json.dumps(meta))
+    config = LecoDataManagerConfig(images=kept, pixels=tmp_path, **options(scene))
+    manager: Any = config.setup(device="cpu")
+    held_out = manager.train_pixel_sampler.sample_held_out(
+        next(manager.iter_train_image_dataloader), 500, seed=0
+    )["indices"]
+    drawn = torch.cat([manager.next_train(step)[1]["indices"] for step in range(80)])
+    for pixels, dataset in (
+        (drawn, manager.train_dataset),
+        (held_out, manager.train_dataset),
+        (manager.next_eval(0)[1]["indices"], manager.eval_dataset),
+    ):
+        cameras = dataset.cameras[pixels[:, 0]]
+        middle = torch.cat([cameras.height, cameras.width], dim=-1) / 2
+        distances = (pixels[:, 1:] + 0.5 - middle).norm(dim=-1)
+        fisheyes = (cameras.camera_type == CameraType.FISHEYE.value).flatten()
+        assert bool((distances[fisheyes] <= 6.0).all())
+        corner = (distances / middle[:, 0])[~fisheyes].max()
+        assert bool(fisheyes.any()) and float(corner) > 0.8
+    assert manager.config.pixel_sampler.fisheye_crop_radius is None
 
 
 def everything_trains(tiny_scene: Path, folder: Path) -> Path:

@@ -77,8 +77,12 @@ def _stepping_aside(sample: Callable[..., Tensor]) -> Callable[..., Tensor]:
         def drawn(count: int) -> Tensor:
             return sample(self, count, num_images, image_height, image_width, mask, device)
 
+        # nerfstudio draws of all pictures at once, or of one after the other
+        numbers, self.numbers = self.numbers[:num_images], self.numbers[num_images:]
         sizes = torch.tensor([image_height, image_width], device=device)
-        return self._step_aside(self._through_the_lens(drawn, batch_size, sizes), sizes, mask)
+        return self._step_aside(
+            self._through_the_lens(drawn, batch_size, sizes, numbers), sizes, mask
+        )
 
     return sample_others
 
@@ -96,6 +100,11 @@ class HeldOutPixelSampler(PixelSampler):
 
     lattice = Lattice()
     """The held-out pixels; whoever knows all pictures chooses it by them."""
+    radii: Tensor | None = None
+    """[P] in place of the one `fisheye_crop_radius`, by the dataset's number of a picture; infinite
+    where its camera is no fisheye."""
+    numbers = torch.zeros(0, dtype=torch.int64)
+    """Numbers in the dataset of the batch's pictures that are still to be drawn of."""
 
     sample_method = _stepping_aside(PixelSampler.sample_method)
     sample_method_equirectangular = _stepping_aside(PixelSampler.sample_method_equirectangular)
@@ -132,38 +141,53 @@ class HeldOutPixelSampler(PixelSampler):
         pictures = image_batch["image"]
         if isinstance(pictures, StoredPictures):
             return self._sample_stored(pictures, image_batch.get("mask"))
+        self.numbers = torch.as_tensor(image_batch["image_idx"]).cpu()
         batch: dict[str, Any] = super().sample(image_batch)
         return batch
 
-    def shown(self, pixels: Tensor, sizes: Tensor) -> Tensor:
+    def shown(self, pixels: Tensor, sizes: Tensor, numbers: Tensor | None = None) -> Tensor:
         """Whether a fisheye shows pixels (image, row, column) [N, 3] as a whole: bool [N].
 
         Args:
             sizes: [2] or [N, 2], height and width of their pictures.
+            numbers: those in the dataset, where pixels name pictures by their place in a batch.
         """
-        radius = self.config.fisheye_crop_radius
+        radius: Any = self.config.fisheye_crop_radius
+        if self.radii is not None:
+            images = pixels[:, 0].cpu()
+            images = images if numbers is None else numbers[images]
+            radius = self.radii[images].to(pixels.device)
         if radius is None:
             return torch.ones(len(pixels), dtype=torch.bool, device=pixels.device)
         # the middle that nerfstudio draws around
         corners = pixels[:, 1:] - torch.div(sizes, 2, rounding_mode="floor")
         return corners.abs().maximum((corners + 1).abs()).square().sum(dim=-1) <= radius**2
 
-    def _through_the_lens(self, draw: Callable[[int], Tensor], count: int, sizes: Tensor) -> Tensor:
+    def _through_the_lens(
+        self,
+        draw: Callable[[int], Tensor],
+        count: int,
+        sizes: Tensor,
+        numbers: Tensor | None = None,
+    ) -> Tensor:
         """Drawn pixels [count, 3], those drawn anew that a fisheye does not show.
 
         Args:
             sizes: as of `shown`, or [P, 2] of all pictures.
+            numbers: as of `shown`.
         Raises:
             InputError: it shows next to none.
         """
         pixels = draw(count)
         for _ in range(TRIES):
-            hidden = ~self.shown(pixels, sizes if sizes.dim() == 1 else sizes[pixels[:, 0]])
+            each = sizes if sizes.dim() == 1 else sizes[pixels[:, 0]]
+            hidden = ~self.shown(pixels, each, numbers)
             if not bool(hidden.any()):
                 return pixels
             pixels[hidden] = draw(int(hidden.sum()))
+        radius = self.config.fisheye_crop_radius if self.radii is None else float(self.radii.min())
         raise InputError(
-            f"a fisheye_crop_radius of {self.config.fisheye_crop_radius} pixels shows next to "
+            f"a fisheye_crop_radius of {radius} pixels shows next to "
             "nothing of the training images: it is in pixels of the images as they are read"
         )
 
@@ -238,7 +262,8 @@ class HeldOutPixelSampler(PixelSampler):
         """Pictures [N] and places in them [N, 2]; arguments as of `sample_held_out`."""
         sizes = sizes_of(images["image"])
         places = self.lattice.draw(sizes, DRAWN * count, torch.Generator().manual_seed(seed))
-        places = places[self.shown(places, sizes[places[:, 0]])]
+        numbers = torch.as_tensor(images["image_idx"]).cpu()
+        places = places[self.shown(places, sizes[places[:, 0]], numbers)]
         if "mask" in images:
             seen = look_up(images["mask"], places[:, 0], places[:, 1:]).flatten(1).all(dim=1)
             places = places[seen.cpu()]
