@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from nerfstudio.utils import eval_utils
+from nerfstudio.utils import eval_utils, writer
 from tiny_run import tiny_trainer
 
 from leco_plugin.compat.moved_runs import config_in_use, found_around
@@ -30,6 +30,10 @@ def trained(tiny_scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     shutil.copytree(tiny_scene, project / "data" / "scene")
     trainer = tiny_trainer(project / "data" / "scene", project / "outputs", gate, candidates=32)
     trainer.save_checkpoint(7)
+    for each in writer.EVENT_WRITERS:
+        if isinstance(each, writer.TensorboardWriter):
+            each.tb_writer.close()  # its thread would miss its folder in a later test
+    writer.EVENT_WRITERS.clear()
     return Path(shutil.move(project, place / "moved"))
 
 
