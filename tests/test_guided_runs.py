@@ -145,6 +145,7 @@ def swapped(
         "method": request.param,
         "sampler": "learned-occupancy",
         "options": {},
+        "codes": "small",
         "folder": str(folder),
     }
     file.unlink()

@@ -133,9 +133,9 @@ class SeenBackdrops(nn.Module):
         return ends_on_floor(cut, space, aabb) | ((heights <= high) & (-heights <= low))
 
     def _load_from_state_dict(self, state_dict: dict[str, Any], prefix: str, *rest: Any) -> None:
-        """A checkpoint without limits, of an earlier release, takes every direction for seen."""
-        state_dict.setdefault(f"{prefix}limits", torch.full_like(self.limits, 2.0))
-        super()._load_from_state_dict(state_dict, prefix, *rest)
+        """A state without limits, of an earlier release or a part of one, changes nothing."""
+        if f"{prefix}limits" in state_dict:
+            super()._load_from_state_dict(state_dict, prefix, *rest)
 
 
 def cells_of(directions: Tensor) -> Tensor:

@@ -35,14 +35,14 @@ def _commands_for(folder: Path) -> list[tuple[str, str]]:
     """Readers that may read a folder, each with the command that a user types."""
     given = f"--data {shlex.quote(str(folder))}"
     found = [
-        (reader, f"ns-train METHOD {reader} {given}")
+        (reader, f"ns-train METHOD {given} {reader}")
         for sign, reader in READERS.items()
         if (folder / sign).is_file()
     ]
     for place in COLMAP:
         if any((folder / place / f"cameras.{ending}").is_file() for ending in ("bin", "txt")):
             path = "" if place == COLMAP[0] else f" --colmap-path {place}"
-            found.append((f"colmap {place}", f"ns-train METHOD colmap {given}{path}"))
+            found.append((f"colmap {place}", f"ns-train METHOD {given} colmap{path}"))
             break
     return found
 

@@ -17,6 +17,8 @@ from leco_plugin.scenes.input_error import InputError
 
 DISTORTIONS = ("k1", "k2", "k3", "k4", "p1", "p2")
 """In the order of nerfstudio's `distortion_params`."""
+COUNTS = (len(DISTORTIONS), 12)
+"""Numbers in `distortion_params`; 12 are those of FISHEYE624."""
 PINHOLE_FIELDS = ("w", "h", "fl_x", "fl_y", "cx", "cy")
 ANGLES = ("x_fov", "y_fov", "camera_angle_x", "camera_angle_y", "fovx", "fovy")
 """Fields of view: what instant-ngp and Blender write beside or instead of focal lengths."""
@@ -159,6 +161,10 @@ def _distortion(owner: dict[str, Any], where: str) -> list[float] | None:
             f"{where}: distortion_params is {str(listed)[:40]!r}, and not a list of numbers"
         )
     listed = [_number(value, "distortion_params", where) for value in listed]
+    if len(listed) not in COUNTS:
+        raise InputError(
+            f"{where}: distortion_params has {len(listed)} numbers: give {', '.join(DISTORTIONS)}"
+        )
     if any(named) and named != listed:
         raise InputError(f"{where}: distortion_params and {DISTORTIONS[0]}.. differ: remove one")
     return listed

@@ -26,7 +26,7 @@ def check_intrinsics(meta: dict[str, Any], frames: list[dict[str, Any]], descrip
             value = frame.get(name, meta.get(name))
             if value is None:
                 hint = (
-                    "; `ns-train METHOD instant-ngp-data --data DIR` reads fields of view instead"
+                    "; `ns-train METHOD --data DIR instant-ngp-data` reads fields of view instead"
                     if any(angle in meta for angle in ANGLES)
                     else ""
                 )

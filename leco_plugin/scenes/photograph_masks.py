@@ -130,7 +130,7 @@ def _values(path: Path) -> NDArray[np.uint8]:
 
 def _is_grey(path: Path) -> bool:
     with Image.open(path) as image:
-        return image.mode == "L"
+        return image.mode == "L" and "transparency" not in image.info
 
 
 def _fit(seen: NDArray[np.bool_], size: tuple[int, int], path: Path) -> NDArray[np.bool_]:

@@ -58,6 +58,7 @@ def test_a_fisheye_of_instant_ngp_is_one() -> None:
         ({"b1": 2.0}, "b1 describes a lens"),
         ({"camera_model": "EQUIRECTANGULAR", "k1": 0.1}, "no distortion of EQUIRECTANGULAR"),
         ({"distortion_params": [0.0] * 6, "k1": 0.1}, "differ: remove one"),
+        ({"distortion_params": [0.01] * 4}, "has 4 numbers: give k1, k2, k3, k4, p1, p2"),
         ({"from_mitsuba": True}, "from_mitsuba"),
         ({"transform_matrix_start": [1], "transform_matrix": [2]}, "the camera moves"),
         ({"k2": "0.1"}, "k2 is '0.1'"),

@@ -251,7 +251,7 @@ def test_a_lens_that_nerfstudio_lacks_is_to_be_undistorted(scene: Path) -> None:
 def test_a_folder_of_another_reader_names_it(scene: Path, tmp_path: Path) -> None:
     as_colmap(scene)
     (scene / "transforms.json").unlink()
-    command = f"`ns-train METHOD colmap --data {scene} --colmap-path sparse/0` reads it"
+    command = f"`ns-train METHOD --data {scene} colmap --colmap-path sparse/0` reads it"
     with pytest.raises(InputError, match=r"holds no transforms\.json") as caught:
         read(LecoPhotographsDataParserConfig(data=scene))
     assert command in str(caught.value)
