@@ -12,6 +12,7 @@ from nerfstudio.cameras.cameras import Cameras
 from nerfstudio.cameras.rays import RayBundle
 from nerfstudio.data.scene_box import OrientedBox, SceneBox
 from nerfstudio.model_components.renderers import background_color_override_context
+from torch import nn
 
 from leco_plugin.host_configs import switch_nerf_host
 from leco_plugin.method_configs import LEARNING
@@ -131,9 +132,17 @@ def test_a_checkpoint_of_an_earlier_release_shows_every_backdrop() -> None:
     model = model_of("leco-occupancy", "box")
     state = model.state_dict()
     del state["backdrops.limits"]
-    model.backdrops.limits.fill_(-2.0)
-    model.load_state_dict(state)
-    assert bool((model.backdrops.limits == 2.0).all())
+    loaded = model_of("leco-occupancy", "box")
+    loaded.load_state_dict(state)
+    assert bool((loaded.backdrops.limits == 2.0).all())
+
+
+def test_a_checkpoint_keeps_the_backdrops_that_were_seen_as_nerfstudio_loads_it() -> None:
+    model, loaded = (model_of("leco-occupancy", "box") for _ in range(2))
+    model.backdrops.limits.fill_(0.5)
+    loaded.load_state_dict(model.state_dict())
+    nn.ModuleDict({"_model": loaded}).load_state_dict({}, strict=False)  # the pipeline's own state
+    assert bool((loaded.backdrops.limits == 0.5).all())
 
 
 @pytest.mark.parametrize("name", ["leco-occupancy", "switch-nerf"])
