@@ -10,7 +10,6 @@ from leco_plugin.compat.earlier_configs import GrowingConfig
 from leco_plugin.models.freezing.calibration import CalibrationConfig
 from leco_plugin.models.freezing.merging import MergingConfig
 from leco_plugin.models.learning.phases import ScheduleConfig
-from leco_plugin.models.learning.prior import PriorConfig
 from leco_plugin.models.objective import GateLossConfig
 from leco_plugin.models.sizing.sizes import SMALL, Sizes
 from leco_plugin.occupancy import Precision
@@ -40,8 +39,6 @@ class LecoModelConfig(GrowingConfig, ModelConfig):
     """When the gate is frozen."""
     gate_loss: GateLossConfig = field(default_factory=GateLossConfig)
     """What teaches the gate."""
-    prior: PriorConfig = field(default_factory=PriorConfig)
-    """What sparse points teach the gate before the first step; off by default."""
     calibration: CalibrationConfig = field(default_factory=CalibrationConfig)
     """What skipping may cost."""
     merging: MergingConfig = field(default_factory=MergingConfig)

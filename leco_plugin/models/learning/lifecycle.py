@@ -39,15 +39,13 @@ from leco_plugin.models.learning.phases import (
     ramp,
     steps_of_an_extension,
 )
-from leco_plugin.models.learning.prior import warm_start
 from leco_plugin.models.learning.progress import NO_EVIDENCE, Progress
 from leco_plugin.models.learning.recoveries import Recoveries
 from leco_plugin.models.learning.statistics import KEPT_ABOVE
 from leco_plugin.models.rendering import gate_values_and_routes
 from leco_plugin.occupancy import gate_precision
 from leco_plugin.scenes.pixels.known_distances import sampler_here
-from leco_plugin.scenes.pixels.sparse_pixels import FEWEST_POINTS
-from leco_plugin.scenes.survey import announce, sparse_points, survey
+from leco_plugin.scenes.survey import announce, survey
 
 if TYPE_CHECKING:
     from leco_plugin.models.leco import LecoModel
@@ -81,7 +79,6 @@ class Lifecycle:
             announce(self.survey)
             if sampler_here(self.pipeline.datamanager) is None:
                 say("batches come from elsewhere: they keep their size, and no pixel's distance")
-            self.begin_with_points()
         self.optimizers: list[Any] = []
         """Those of the model, where they are not a trainer's."""
         self.step_started = 0.0
@@ -111,25 +108,6 @@ class Lifecycle:
                 f"its first half: until step {self.progress.since + most}, not for the "
                 f"{configured} steps of schedule.learn-steps"
             )
-
-    def begin_with_points(self) -> None:
-        """Shows the gate the sparse points, where that is asked for; it counts as learning time."""
-        model, prior = self.model, self.model.config.prior
-        if prior.steps == 0 or model.config.homogeneous or bool(model.frozen):
-            return
-        dataset: Any = self.pipeline.datamanager.train_dataset
-        points, sparse = sparse_points(dataset), self.batches.sparse
-        if points is None or sparse is None or len(points) < FEWEST_POINTS:
-            say("no prior: the scene has no sparse points")
-            return
-        started = time.monotonic()
-        loss = warm_start(model, dataset.cameras, points, sparse)
-        seconds = time.monotonic() - started
-        self.progress.learn_seconds += seconds
-        say(
-            f"{len(points)} sparse points and {len(sparse.distances)} lines of sight to them have "
-            f"taught the gate in {seconds:.1f} s (loss {loss:.3f})"
-        )
 
     @cached_property
     def recoveries(self) -> Recoveries:

@@ -119,8 +119,6 @@ class Recoveries:
             lifecycle.restart_field()
         done = heal(model.gate.head, progress, collapse, shares, step, losses, self._room(step))
         share(model.gate.head.parameters())  # the remedy is drawn at random
-        if anew:
-            lifecycle.begin_with_points()
         return f"{done} (recovery {progress.recoveries} of {MOST_RECOVERIES})"
 
     def _room(self, step: int) -> float:

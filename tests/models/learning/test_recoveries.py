@@ -182,7 +182,6 @@ def healthy_run(monkeypatch: pytest.MonkeyPatch):
                 homogeneous=False,
                 gate_loss=GateLossConfig(),
                 termination=0.0,
-                prior=SimpleNamespace(steps=0),
                 sizes=SimpleNamespace(guided_batch=1.0),
             ),
             device=torch.device("cpu"),
