@@ -22,7 +22,7 @@ from torch import Tensor
 
 from leco_plugin.evaluation.peak_memory import peak_process_bytes
 from leco_plugin.models.field import HMoEField
-from leco_plugin.models.freezing.calibration import (
+from leco_plugin.learning.calibration import (
     CalibrationConfig,
     Measured,
     Reference,
@@ -30,7 +30,7 @@ from leco_plugin.models.freezing.calibration import (
     reference_of,
 )
 from leco_plugin.models.gate import Gate
-from leco_plugin.models.learning.phases import ScheduleConfig, ramp
+from leco_plugin.learning.schedule import ScheduleConfig, ramp
 from leco_plugin.models.objective import GateLossConfig, field_losses, gate_losses
 from leco_plugin.models.rendering import (
     Intervals,

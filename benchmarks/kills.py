@@ -49,7 +49,7 @@ KILLS_A_RUN = 5
 PRELOADED = [
     "nerfstudio.scripts.train",
     "leco_plugin.compat.atomic_trainer",
-    "leco_plugin.models.learning.lifecycle",
+    "leco_plugin.learning.learner",
     "leco_plugin.evaluation.held_out_images",
 ]
 """Imported once for all runs."""

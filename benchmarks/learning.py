@@ -22,7 +22,7 @@ from leco_plugin.evaluation.charts import SOURCE, fingerprint
 from leco_plugin.evaluation.history_picture import OPAQUE
 from leco_plugin.evaluation.json_file import write_json
 from leco_plugin.evaluation.machine import describe_machine
-from leco_plugin.models.learning.history import FILE_NAME, GateHistory
+from leco_plugin.learning.history import FILE_NAME, GateHistory
 from leco_plugin.occupancy import Occupancy
 
 OUT = Path(__file__).resolve().parent / "results" / "learning.json"

@@ -39,7 +39,8 @@ def run(data: Path, seed: int, folder: Path) -> dict[str, Any]:
     for sow in (random.seed, np.random.seed, torch.manual_seed):
         sow(seed)
     config = copy.deepcopy(leco_occupancy.config)
-    config.data, config.output_dir = data, folder
+    config.pipeline.datamanager.data = config.data = data
+    config.output_dir = folder
     config.max_num_iterations, config.vis, config.steps_per_save = STEPS, "tensorboard", 0
     config.machine.seed = seed
     config.steps_per_eval_image = config.steps_per_eval_batch = 0

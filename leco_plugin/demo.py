@@ -25,10 +25,10 @@ from leco_plugin.evaluation.machine import describe_code, describe_machine
 from leco_plugin.evaluation.occupancy_facts import occupancy_facts, truth_of
 from leco_plugin.evaluation.occupancy_picture import draw_slice
 from leco_plugin.evaluation.timed_run import timed_run
+from leco_plugin.learning.freezing import FILE_NAME
+from leco_plugin.log import bar
 from leco_plugin.method_configs import leco_occupancy
-from leco_plugin.models.freezing.freezing import FILE_NAME
 from leco_plugin.occupancy import Occupancy
-from leco_plugin.progress_bar import bar
 from leco_plugin.scenes.city.city import CityConfig
 from leco_plugin.scenes.city.folder import CaptureConfig, write_city
 from leco_plugin.scenes.city.truth import CityTruth

@@ -20,8 +20,8 @@ from nerfstudio.scripts import train as ns_train
 from torch import Tensor, distributed
 
 from leco_plugin.models.compute.ranks import from_first, is_first, mean, share
-from leco_plugin.models.freezing import merging
-from leco_plugin.models.learning import batches, lifecycle
+from leco_plugin.learning import merging
+from leco_plugin.learning import batches, lifecycle
 from leco_plugin.models.leco import LecoModel
 from leco_plugin.occupancy import Occupancy
 

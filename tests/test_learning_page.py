@@ -11,7 +11,7 @@ import torch
 from PIL import Image
 
 from leco_plugin.evaluation.charts import SOURCE, fingerprint
-from leco_plugin.models.learning.history import GateHistory
+from leco_plugin.learning.history import GateHistory
 
 ROOT = Path(__file__).resolve().parent.parent
 

@@ -23,7 +23,7 @@ import trimesh
 from bare_machine import variables
 from PIL import Image
 
-from leco_plugin.models.learning.history import GateHistory
+from leco_plugin.learning.history import GateHistory
 from leco_plugin.occupancy import Occupancy
 
 pytestmark = [pytest.mark.slow, pytest.mark.xdist_group("round_trip")]

@@ -17,7 +17,7 @@ from leco_plugin.evaluation.equal_loss import MOST_ON_CPU
 from leco_plugin.evaluation.field_grids import fits_memory
 from leco_plugin.evaluation.json_file import read_object, write_json
 from leco_plugin.evaluation.machine import describe_code, describe_machine, made_by
-from leco_plugin.progress_bar import bar
+from leco_plugin.log import bar
 from leco_plugin.scenes.description import describe_scene
 from leco_plugin.scenes.input_error import InputError, require_folder
 

@@ -18,7 +18,7 @@ from leco_plugin.chart.contenders.suites import suite as suite_of
 from leco_plugin.chart.runs.processes import ProcessRunner
 from leco_plugin.chart.runs.reuse import fitting
 from leco_plugin.chart.runs.run import Chart, Runner
-from leco_plugin.progress_bar import bar, resumable
+from leco_plugin.log import bar, resumable
 from leco_plugin.scenes.input_error import InputError
 
 LEFT_BY_SYSTEMS = (".DS_Store", "Thumbs.db")

@@ -29,8 +29,10 @@ from leco_plugin.compat.whole_checkpoints import (
     previous_of,
     step_of,
 )
-from leco_plugin.models.compute.ranks import say, say_what_is_logged
-from leco_plugin.models.failures import GateCollapsed, TrainingStopped
+from leco_plugin.learning.collapse import GateCollapsed
+from leco_plugin.learning.progress import Progress
+from leco_plugin.log import say, say_what_is_logged
+from leco_plugin.models.failures import TrainingStopped
 from leco_plugin.samplers.kernels.off import VARIABLE, kernels_off
 from leco_plugin.scenes.input_error import InputError
 
@@ -194,7 +196,8 @@ class AtomicTrainer(Trainer):
         if self.training_state == "completed":
             return None  # the one before stays beside it
         progress = getattr(getattr(self.pipeline, "model", None), "progress", None)
-        return "the gate looks collapsed" if getattr(progress, "suspected_since", -1) >= 0 else None
+        doubted = isinstance(progress, Progress) and progress.looks_collapsed
+        return "the gate looks collapsed" if doubted else None
 
     def _save_whole(self, step: int) -> None:
         """Beside, because nerfstudio reads a step out of every file name in its folder.

@@ -22,7 +22,7 @@ from torch.nn.parallel import DistributedDataParallel
 from leco_plugin.compat.atomic_trainer import AtomicTrainer
 from leco_plugin.compat.moved_runs import follow_data
 from leco_plugin.compat.run_folder import claim
-from leco_plugin.models.compute.ranks import say
+from leco_plugin.log import say
 from leco_plugin.models.failures import TrainingStopped
 from leco_plugin.scenes.input_error import InputError
 

@@ -14,7 +14,7 @@ from typing import Any
 
 from leco_plugin.compat.moved_runs import checkpoints_of
 from leco_plugin.compat.whole_checkpoints import newest_whole, step_of
-from leco_plugin.models.compute.ranks import say
+from leco_plugin.log import say
 
 EVAL_UTILS = "nerfstudio.utils.eval_utils"
 

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from leco_plugin.compat.whole_checkpoints import previous_of
-from leco_plugin.models.compute.ranks import say
+from leco_plugin.log import say
 from leco_plugin.scenes.input_error import InputError
 
 

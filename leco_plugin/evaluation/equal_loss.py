@@ -29,7 +29,7 @@ from leco_plugin.evaluation.reached_volume import (
     rays_of_photographs,
     reached_volume,
 )
-from leco_plugin.models.freezing.held_out_rendering import (
+from leco_plugin.learning.held_out_rendering import (
     calibration_rays,
     dense_reference,
     evaluating,

@@ -19,9 +19,9 @@ from leco_plugin.evaluation.occupancy_picture import (
     interesting_box,
     surface_points,
 )
-from leco_plugin.models.learning.history import FILE_NAME, GateHistory
+from leco_plugin.learning.history import FILE_NAME, GateHistory
+from leco_plugin.log import bar
 from leco_plugin.occupancy import Occupancy
-from leco_plugin.progress_bar import bar
 from leco_plugin.scenes.input_error import InputError
 
 PIXELS = 300

@@ -6,8 +6,8 @@ from pathlib import Path
 from typing import Any, Literal
 
 from leco_plugin.cli_reports import check_place
+from leco_plugin.log import bar
 from leco_plugin.occupancy import Occupancy
-from leco_plugin.progress_bar import bar
 from leco_plugin.scenes.frames import moved
 
 Format = Literal["ply", "nerfacc-grid"]

@@ -9,10 +9,6 @@ import torch
 from torch import Tensor, nn
 
 
-class GateCollapsed(RuntimeError):
-    """A gate has collapsed more often than it may be healed."""
-
-
 class TrainingStopped(SystemExit, RuntimeError):
     """A run cannot go on; the message says at which step, why, and what is left of it.
 

@@ -7,9 +7,9 @@ from dataclasses import dataclass, field
 from nerfstudio.models.base_model import ModelConfig
 
 from leco_plugin.compat.earlier_configs import GrowingConfig
-from leco_plugin.models.freezing.calibration import CalibrationConfig
-from leco_plugin.models.freezing.merging import MergingConfig
-from leco_plugin.models.learning.phases import ScheduleConfig
+from leco_plugin.learning.calibration import CalibrationConfig
+from leco_plugin.learning.merging import MergingConfig
+from leco_plugin.learning.schedule import ScheduleConfig
 from leco_plugin.models.objective import GateLossConfig
 from leco_plugin.models.sizing.sizes import SMALL, Sizes
 from leco_plugin.occupancy import Precision

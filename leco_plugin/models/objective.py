@@ -90,7 +90,7 @@ def field_losses(
     opacities: Tensor | None,
     distances: Tensor | None,
     *,
-    span: Tensor,
+    span: tuple[Tensor, Tensor],
     unbounded: Tensor,
     learning: bool,
     ramped: float,
@@ -101,7 +101,7 @@ def field_losses(
         truth: [R, 3] colours.
         opacities: [R] of the pixels; None where all are opaque.
         distances: [R] to sparse points, scene units, 0 where none is known; None is no such points.
-        span: [2] near and far, scene units.
+        span: near and far, scalars, scene units.
         unbounded: scalar bool, whether a ray may go on to a sky of any colour; in a box nothing but
             darkness lies behind the scene.
         learning: whether this is the first phase.

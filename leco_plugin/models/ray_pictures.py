@@ -9,6 +9,7 @@ from __future__ import annotations
 import warnings
 
 import torch
+from nerfstudio.model_components.renderers import RGBRenderer
 from torch import Tensor
 
 from leco_plugin.models.gate import EMPTY, occupancy_from_logits
@@ -17,6 +18,15 @@ from leco_plugin.samplers.packed import accumulate_along_rays
 
 NONE = -1
 """Stands for the expert of a ray that meets nothing."""
+
+
+def over_background(shaded: Shaded, rays: Rays) -> Tensor:
+    """Colours [R, 3] over nerfstudio's background where rays are cut off: black, or a crop's."""
+    if rays.cut_off is None:
+        return shaded.rgb
+    color = RGBRenderer.get_background_color("black", shaded.rgb.shape, shaded.rgb.device)
+    through = (1.0 - shaded.accumulation).clamp(min=0.0) * rays.cut_off
+    return shaded.rgb + through[:, None] * color
 
 
 @torch.no_grad()

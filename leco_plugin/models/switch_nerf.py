@@ -20,7 +20,8 @@ from leco_plugin.compat.evaluated_runs import evaluate_whole_checkpoints
 from leco_plugin.models.compute.precision import fast_precision, keep_freed_memory
 from leco_plugin.models.failures import require_finite
 from leco_plugin.models.image_figures import image_figures
-from leco_plugin.models.ray_pictures import leading_expert, with_alpha
+from leco_plugin.models.ray_pictures import leading_expert, over_background, with_alpha
+from leco_plugin.models.region import Region, marching_rule
 from leco_plugin.models.rendering import (
     Intervals,
     Rays,
@@ -30,24 +31,16 @@ from leco_plugin.models.rendering import (
     with_backdrop,
 )
 from leco_plugin.models.scene_grid import scene_grid
-from leco_plugin.models.scene_rays import (
-    SeenBackdrops,
-    cut_to_bounds,
-    marching_rule,
-    over_background,
-    with_ends_for_all,
-    within_crop,
-)
 from leco_plugin.models.switch.config import SwitchNerfModelConfig
 from leco_plugin.models.switch.field import NEW_DENSITY, Answers, SwitchField
 from leco_plugin.models.switch.objective import switch_losses, switch_statistics
 from leco_plugin.models.switch.rendering import coarse_and_fine, kept_by, render
 from leco_plugin.occupancy import gate_precision
 from leco_plugin.samplers.grid import OccupancyGridEstimator
-from leco_plugin.scenes.bounds import SceneBounds, with_range
+from leco_plugin.scenes.bounds import SceneBounds
 from leco_plugin.scenes.input_error import InputError
-from leco_plugin.scenes.survey import announce, survey
-from leco_plugin.space import Space
+from leco_plugin.scenes.learning_data import LearningData
+from leco_plugin.scenes.survey import announce
 
 
 class SwitchNerfModel(Model):
@@ -61,9 +54,8 @@ class SwitchNerfModel(Model):
     """
 
     config: SwitchNerfModelConfig
-    bounds_known: Tensor
-    march_range: Tensor
-    aabb: Tensor
+    step: Tensor
+    cone: Tensor
     occupancy_grid: nn.Module | None
 
     def populate_modules(self) -> None:
@@ -81,13 +73,9 @@ class SwitchNerfModel(Model):
             keep_freed_memory()
         self.precision = fast_precision(device)
         self.field = SwitchField(self.config.sizes.field, self.num_train_data)
-        self.space = Space()
-        # buffers, because nerfstudio tells a model its step before it restores its state
-        self.register_buffer("bounds_known", torch.tensor(False))
-        # near, far, step and cone angle
-        self.register_buffer("march_range", torch.tensor([0.05, 4.0, 0.03, 0.0]))
-        self.register_buffer("aabb", torch.tensor([-1.0] * 3 + [1.0] * 3))
-        self.backdrops = SeenBackdrops()
+        self.region = Region()
+        self.register_buffer("step", torch.tensor(0.03))
+        self.register_buffer("cone", torch.tensor(0.0))
         self.renderer_rgb = RGBRenderer(background_color="random")
         self.occupancy_grid = None
         if self.config.sampling == "occupancy-grid":
@@ -96,12 +84,12 @@ class SwitchNerfModel(Model):
     def sample_with(self, estimator: nn.Module | None) -> None:
         """Replaces the sampling by an estimator's; None is coarse and fine."""
         if estimator is not None:
-            estimator.to(self.aabb.device).train(self.training)
+            estimator.to(self.device).train(self.training)
         self.occupancy_grid = estimator
 
     def _sample_with_grid(self, levels: int) -> None:
         resolution = self.config.sizes.grid_resolution
-        self.sample_with(scene_grid(self.space, self.aabb, resolution, levels))
+        self.sample_with(scene_grid(self.region.space, self.region.aabb, resolution, levels))
 
     def _load_from_state_dict(self, state_dict: dict[str, Any], prefix: str, *rest: Any) -> None:
         """A grid has as many levels as it was trained with, which depend on the scene."""
@@ -119,13 +107,12 @@ class SwitchNerfModel(Model):
     ) -> list[TrainingCallback]:
         """Finds the scene's bounds now, and returns what updates the estimator before each step."""
         assert training_callback_attributes.pipeline is not None
-        if not bool(self.bounds_known):
+        if not bool(self.region.known):
             manager, config = training_callback_attributes.pipeline.datamanager, self.config
-            seen = survey(manager, config.bounds, config.near, config.far)
-            self.set_bounds(seen.bounds, seen.median_length)
-            dataset: Any = manager.train_dataset
-            self.backdrops.look(dataset.cameras, self.space, self.aabb, *self.march_range[:2])
-            announce(seen)
+            data = LearningData(manager, config.bounds, config.near, config.far)
+            self.set_bounds(data.survey.bounds, data.survey.median_length)
+            self.region.look(*data.covering_rays())
+            announce(data.survey)
         before = TrainingCallbackLocation.BEFORE_TRAIN_ITERATION
         return [TrainingCallback([before], self.update_estimator)]
 
@@ -136,16 +123,12 @@ class SwitchNerfModel(Model):
         Args:
             bounds: of the scene.
             median_length: median length of rays inside the bounds, scene units.
-        Raises:
-            InputError: the configured range is empty or begins at the camera.
         """
-        bounds = with_range(bounds, self.config.near, self.config.far)
-        near, far = bounds.near, bounds.far
-        self.space.set(bounds.kind, bounds.center, bounds.half_extent)
-        self.aabb.copy_(bounds.aabb)
-        rule = marching_rule(bounds.kind, near, far, self.config.sizes.candidates, median_length)
-        self.march_range.copy_(torch.tensor([near, far, *rule]))
-        self.bounds_known.fill_(True)
+        self.region.set(bounds)
+        candidates = self.config.sizes.candidates
+        rule = marching_rule(bounds.kind, bounds.near, bounds.far, candidates, median_length)
+        self.step.fill_(rule[0])
+        self.cone.fill_(rule[1])
         if isinstance(self.occupancy_grid, OccupancyGridEstimator):
             self._sample_with_grid(1 if bounds.kind == "box" else self.config.grid_levels)
 
@@ -165,24 +148,25 @@ class SwitchNerfModel(Model):
 
         Steps that grow with distance are taken to be those at one half extent.
         """
-        _, _, step, cone_angle = self.march_range
-        return self.density_fn(positions) * step.maximum(cone_angle * self.space.half_extent)
+        step = self.step.maximum(self.cone * self.region.space.half_extent)
+        return self.density_fn(positions) * step
 
     def density_fn(self, positions: Tensor) -> Tensor:
         """Density per scene unit, without noise: scene positions [N, 3] to [N, 1]."""
         with gate_precision(self.device.type, self.precision):
-            answers = self.field(self.space.map(positions).clamp(-1.0, 1.0))
-        densities: Tensor = answers.sigmas[:, None] / self.space.half_extent
+            answers = self.field(self.region.space.map(positions).clamp(-1.0, 1.0))
+        densities: Tensor = answers.sigmas[:, None] / self.region.space.half_extent
         return densities
 
     @property
     def average_init_density(self) -> float:
         """Density of a new field, per scene unit, under the name that nerfstudio's fields have."""
-        return self.field.density_scale * NEW_DENSITY / float(self.space.half_extent)
+        return self.field.density_scale * NEW_DENSITY / float(self.region.space.half_extent)
 
     @average_init_density.setter
     def average_init_density(self, density: float) -> None:
-        self.field.density_scale = density * float(self.space.half_extent) / NEW_DENSITY
+        half_extent = float(self.region.space.half_extent)
+        self.field.density_scale = density * half_extent / NEW_DENSITY
 
     def _ask(self, mapped: Tensor) -> Answers:
         """The field, with noise and limited places while training."""
@@ -192,18 +176,19 @@ class SwitchNerfModel(Model):
         return answers
 
     def rays_of(self, bundle: RayBundle) -> Rays:
-        """The bundle's rays, cut to the scene's bounds and to a crop; those that miss end where all
-        do. In evaluation they have a backdrop only where training has seen one."""
-        near, far, step, cone_angle = self.march_range
-        rays = cut_to_bounds(bundle, self.aabb, near, far, with_images=self.training)
-        if not self.training:
-            rays = rays._replace(cut_off=~self.backdrops(rays, self.space, self.aabb))
-        rays = with_ends_for_all(rays, far, step.maximum(far * cone_angle))
-        return within_crop(rays, bundle.nears, bundle.fars)
+        """The bundle's rays, cut to the region and to a crop; see `Region.rays`."""
+        images = bundle.camera_indices if self.training else None
+        return self.region.rays(
+            bundle.origins,
+            bundle.directions,
+            None if images is None else images[:, 0],
+            self.step.maximum(self.region.far * self.cone),
+            (bundle.nears, bundle.fars),
+        )
 
     def _shade(self, rays: Rays) -> tuple[Intervals, Shaded]:
         """Samples along rays in whichever way, shaded."""
-        step, cone_angle = self.march_range[2:].tolist()
+        region, step, cone_angle = self.region, float(self.step), float(self.cone)
         config, sizes = self.config, self.config.sizes
         if self.occupancy_grid is not None:
             packed = kept_by(
@@ -216,19 +201,19 @@ class SwitchNerfModel(Model):
                 config.early_stop_eps,
             )
             intervals = with_backdrop(packed, rays, step, cone_angle)
-            answers = self._ask(mapped_middles(self.space, rays, intervals))
+            answers = self._ask(mapped_middles(region.space, rays, intervals))
         else:
             stops = backdrop_starts(rays, step, cone_angle).maximum(rays.t_mins)
             intervals, answers = coarse_and_fine(
                 self._ask,
-                self.space,
+                region.space,
                 rays,
                 stops,
                 (sizes.coarse, sizes.fine),
-                growing=self.space.kind == "contraction",
+                growing=region.space.kind == "contraction",
                 jittered=self.training,
             )
-        shaded = render(self.field.color, answers, rays, intervals, self.space.half_extent)
+        shaded = render(self.field.color, answers, rays, intervals, region.space.half_extent)
         return intervals, shaded
 
     def get_outputs(self, ray_bundle: RayBundle) -> dict[str, Any]:  # type: ignore[override]

@@ -24,7 +24,7 @@ from nerfstudio.model_components.ray_generators import RayGenerator
 from torch import Tensor
 
 from leco_plugin.compat.nerfstudio_changes import keeps_all_images
-from leco_plugin.models.compute.ranks import say
+from leco_plugin.log import say
 from leco_plugin.scenes.dataset_units import UP_IS_KNOWN
 from leco_plugin.scenes.detail import CAMERAS
 from leco_plugin.scenes.input_error import InputError

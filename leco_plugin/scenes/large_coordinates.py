@@ -23,7 +23,7 @@ from nerfstudio.data.utils import colmap_parsing_utils
 from numpy.typing import NDArray
 from torch import Tensor
 
-from leco_plugin.models.compute.ranks import say
+from leco_plugin.log import say
 from leco_plugin.scenes.frames import APPLIED, inverse, moved, parsed_frame
 
 FAR = 100.0

@@ -114,13 +114,13 @@ class MegaNerf(DataParser):
     def _read(self) -> MegaNerfScene:
         """The scene, read once, with a line that says what it is."""
         if self._scene is None:
-            from leco_plugin.progress_bar import CONSOLE, bar
+            from leco_plugin.log import bar
             from leco_plugin.scenes.mega_nerf_format.files import read_scene
 
             _check(self.config)
             with bar("Reading the scene") as progress:
                 self._scene = read_scene(self.config.data, self.config.check_axes, progress)
-            CONSOLE.log(self._scene.describe())
+            console().log(self._scene.describe())
         return self._scene
 
     def _points(self) -> Tensor | None:
@@ -178,7 +178,7 @@ class MegaNerf(DataParser):
 
     def _each(self, what: str, frames: list[Frame], make: Callable[[Frame], Any]) -> list[Any]:
         """What `make` makes of each frame, under a progress bar."""
-        from leco_plugin.progress_bar import bar
+        from leco_plugin.log import bar
 
         made = []
         with bar(what) as progress:

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from PIL import Image
 from rich.markup import escape
 
-from leco_plugin.models.compute.ranks import say
+from leco_plugin.log import say
 from leco_plugin.scenes.derived_images import DerivedImages
 from leco_plugin.scenes.input_error import InputError, one_line
 

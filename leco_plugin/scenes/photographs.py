@@ -19,7 +19,7 @@ from nerfstudio.plugins.registry_dataparser import DataParserSpecification
 from rich.markup import escape
 from torch import Tensor
 
-from leco_plugin.models.compute.ranks import say
+from leco_plugin.log import say
 from leco_plugin.scenes.dataset_units import METRES_PER_UNIT, UP_IS_KNOWN
 from leco_plugin.scenes.frames import applied_in, from_file, moved, parsed_frame
 from leco_plugin.scenes.input_error import InputError, one_line

@@ -21,8 +21,7 @@ from nerfstudio.data.dataparsers.base_dataparser import DataParserConfig, Datapa
 from rich.markup import escape
 
 from leco_plugin.compat.moved_runs import require_data
-from leco_plugin.models.compute.ranks import say
-from leco_plugin.progress_bar import bar
+from leco_plugin.log import bar, say
 from leco_plugin.scenes.derived_images import DerivedImages
 from leco_plugin.scenes.input_error import InputError, one_line
 from leco_plugin.scenes.known_folders import remedy_for

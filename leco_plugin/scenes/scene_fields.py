@@ -7,7 +7,7 @@ from typing import Any
 
 from rich.markup import escape
 
-from leco_plugin.models.compute.ranks import say
+from leco_plugin.log import say
 from leco_plugin.scenes.lenses import LENS_FIELDS
 
 READ = LENS_FIELDS | {

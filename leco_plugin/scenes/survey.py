@@ -9,7 +9,7 @@ import torch
 from nerfstudio.cameras.cameras import Cameras
 from torch import Tensor
 
-from leco_plugin.models.compute.ranks import say
+from leco_plugin.log import say
 from leco_plugin.models.rendering import Rays
 from leco_plugin.samplers.marching.rays import intersect_box
 from leco_plugin.scenes.bounds import (

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from pathlib import Path
 
-from leco_plugin.models.freezing.freezing import HARDLY_ANYTHING
+from leco_plugin.learning.freezing import HARDLY_ANYTHING
 from leco_plugin.occupancy import Occupancy
 from leco_plugin.shrink.references import LOST_DECISIONS, declared
 from leco_plugin.shrink.rungs import Bounds, Ground

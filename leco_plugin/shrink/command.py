@@ -12,8 +12,8 @@ from nerfstudio.utils.rich_utils import CONSOLE
 
 from leco_plugin.cli_reports import check_place
 from leco_plugin.evaluation.machine import describe_code, describe_machine, made_by
+from leco_plugin.log import bar
 from leco_plugin.occupancy import Occupancy
-from leco_plugin.progress_bar import bar
 from leco_plugin.scenes.pixels.held_out_pixels import held_out_sampler
 from leco_plugin.shrink.checks import (
     check_bounds,

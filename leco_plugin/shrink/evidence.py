@@ -13,7 +13,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from leco_plugin.models.freezing.calibration import near_surface
+from leco_plugin.learning.calibration import near_surface
 from leco_plugin.models.leco import LecoModel
 from leco_plugin.models.rendering import Intervals, Rays, backdrop_of
 from leco_plugin.occupancy import Occupancy

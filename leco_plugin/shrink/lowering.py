@@ -7,7 +7,7 @@ loses more than those do, so that an original which itself loses too much is ask
 
 from __future__ import annotations
 
-from leco_plugin.models.freezing.calibration import THRESHOLDS
+from leco_plugin.learning.calibration import THRESHOLDS
 from leco_plugin.occupancy import Occupancy
 from leco_plugin.shrink.evidence import loss, query_in_parts, unlikely_at
 from leco_plugin.shrink.rungs import Bounds, Ground

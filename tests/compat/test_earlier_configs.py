@@ -14,7 +14,7 @@ from nerfstudio.data.datamanagers.base_datamanager import VanillaDataManagerConf
 from leco_plugin.method_configs import leco_occupancy
 from leco_plugin.models.guided import GuidedModelConfig
 from leco_plugin.models.hosts.guided_start import OccupancyConfig
-from leco_plugin.models.learning.prior import PriorConfig
+from leco_plugin.learning.prior import PriorConfig
 from leco_plugin.models.leco_config import LecoModelConfig
 from leco_plugin.models.switch.config import SwitchNerfModelConfig
 from leco_plugin.scenes.bounds import BoundsConfig

@@ -13,7 +13,7 @@ from PIL import Image
 from leco_plugin.cli import main
 from leco_plugin.evaluation import history_picture
 from leco_plugin.evaluation.history_picture import spread_evenly
-from leco_plugin.models.learning.history import GateHistory
+from leco_plugin.learning.history import GateHistory
 
 
 @pytest.fixture

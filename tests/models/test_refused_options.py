@@ -9,9 +9,9 @@ from typing import Any
 import pytest
 import tyro
 
-from leco_plugin.models.freezing.calibration import CalibrationConfig
-from leco_plugin.models.freezing.merging import MergingConfig
-from leco_plugin.models.learning.phases import ScheduleConfig
+from leco_plugin.learning.calibration import CalibrationConfig
+from leco_plugin.learning.merging import MergingConfig
+from leco_plugin.learning.schedule import ScheduleConfig
 from leco_plugin.models.leco_config import LecoModelConfig
 from leco_plugin.models.objective import GateLossConfig
 from leco_plugin.scenes.input_error import InputError

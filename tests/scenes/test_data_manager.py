@@ -20,10 +20,10 @@ from nerfstudio.data.pixel_samplers import PixelSamplerConfig
 from nerfstudio.pipelines.base_pipeline import VanillaPipelineConfig
 from PIL import Image
 
-from leco_plugin.models.freezing.calibration import CalibrationConfig
-from leco_plugin.models.freezing.held_out_rendering import held_out_bundle
+from leco_plugin.learning.calibration import CalibrationConfig
+from leco_plugin.learning.held_out_rendering import held_out_bundle
 from leco_plugin.models.hosts.learn_first import learn_occupancy
-from leco_plugin.models.learning.phases import ScheduleConfig
+from leco_plugin.learning.schedule import ScheduleConfig
 from leco_plugin.models.leco_config import LecoModelConfig
 from leco_plugin.scenes import data_manager
 from leco_plugin.scenes.data_manager import (

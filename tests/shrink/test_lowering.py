@@ -6,7 +6,7 @@ import pytest
 import torch
 from valued_ball import ground
 
-from leco_plugin.models.freezing.calibration import THRESHOLDS
+from leco_plugin.learning.calibration import THRESHOLDS
 from leco_plugin.occupancy import Occupancy
 from leco_plugin.shrink.evidence import Evidence, loss
 from leco_plugin.shrink.lowering import facts_of, lowered

@@ -149,7 +149,7 @@ def _weights_of(model: LecoModel) -> dict[str, Any]:
 def _occupancy_of(trainer: Trainer, data: Path, folder: Path) -> dict[str, Any] | None:
     """What is known of the occupancy that a run has left, if any; its file is kept."""
     from leco_plugin.evaluation.occupancy_facts import occupancy_facts, truth_of
-    from leco_plugin.models.freezing.freezing import FILE_NAME
+    from leco_plugin.learning.freezing import FILE_NAME
     from leco_plugin.occupancy import Occupancy
     from leco_plugin.scenes.photographs import folder_of
 

@@ -6,13 +6,10 @@ is measured or drawn would not, and is taken from the first process.
 
 from __future__ import annotations
 
-import logging
 from collections.abc import Callable, Iterable
 from typing import TypeVar
 
 import torch
-from nerfstudio.utils.rich_utils import CONSOLE
-from rich.markup import escape
 from torch import Tensor, distributed, nn
 from torch.nn.parallel import DistributedDataParallel
 
@@ -29,37 +26,8 @@ def several() -> bool:
 
 
 def is_first() -> bool:
-    """Whether this is the process that decides, writes files and speaks."""
+    """Whether this is the process that decides, writes files and logs."""
     return not several() or distributed.get_rank() == 0
-
-
-def say(line: str) -> None:
-    """A line in nerfstudio's log, said once for all processes."""
-    if is_first():
-        CONSOLE.log(f"\\[leco] {line}", _stack_offset=2)
-
-
-OF_A_DEVICE = ("leco_plugin.samplers.kernels.fused", "leco_plugin.models.compute.grouped_trial")
-"""Whose warnings are of the device of one process; all others have the same everywhere."""
-
-
-class _Says(logging.Handler):
-    """Says what is logged by samplers and experts, which know nothing of nerfstudio."""
-
-    def emit(self, record: logging.LogRecord) -> None:
-        line = escape(record.getMessage())
-        if is_first():
-            say(line)
-        elif record.levelno >= logging.WARNING and record.name in OF_A_DEVICE:
-            CONSOLE.log(f"\\[leco] process {distributed.get_rank()}: {line}")
-
-
-def say_what_is_logged() -> None:
-    """From now on lines of the package's logger, also those that are no warnings, are said."""
-    log = logging.getLogger("leco_plugin")
-    if not any(isinstance(handler, _Says) for handler in log.handlers):
-        log.addHandler(_Says())
-        log.setLevel(logging.INFO)
 
 
 @torch.no_grad()

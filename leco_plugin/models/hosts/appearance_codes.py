@@ -14,8 +14,8 @@ from nerfstudio.field_components.embedding import Embedding
 from nerfstudio.models.base_model import Model
 from torch import Tensor, nn
 
+from leco_plugin.log import say
 from leco_plugin.models.color_head import APPEARANCE_SCALE
-from leco_plugin.models.compute.ranks import say
 from leco_plugin.models.hosts.seams import replace_module
 
 Codes = Literal["small", "own"]

@@ -15,6 +15,7 @@ from nerfstudio.model_components.ray_samplers import Sampler
 from nerfstudio.viewer_legacy.server.viewer_utils import IOChangeException
 from torch import Tensor, nn
 
+from leco_plugin.learning.progress import WatchState
 from leco_plugin.models.gate import Gate, GateConfig
 from leco_plugin.models.hosts.stand_ins import GuidedEstimator, GuidedProposal
 from leco_plugin.occupancy import Occupancy
@@ -27,9 +28,6 @@ from leco_plugin.samplers.registry import (
 )
 from leco_plugin.scenes.input_error import InputError, one_line
 from leco_plugin.space import Space
-
-CAREFULLY = "carefully"
-"""In `Guide.watched`: the lower threshold that a host follows for the beginning, if it does."""
 
 
 class NoOccupancyYet(RuntimeError, IOChangeException):
@@ -53,8 +51,7 @@ class Guide(nn.Module):
         dense: whether packed samplers keep every candidate for the moment, as a reference.
         cropped: whether the limits of the rays that are rendered now are those of a crop.
         kept: samples that a packed sampler kept when it was last asked in training.
-        watched: what was found of the price of skipping, and what is followed until it is; travels
-            with a checkpoint.
+        watched: what is known of the price of skipping; travels with a checkpoint.
         first_density: with which the host's field began, None for its own; see `opaque_start`.
         frame: [3, 4] takes positions of the host to those of the occupancy: a rotation times a
             scale, and a translation.
@@ -75,7 +72,7 @@ class Guide(nn.Module):
         self.version = 0
         self.dense = self.cropped = False
         self.kept: int | None = None
-        self.watched: dict[str, Any] = {}
+        self.watched = WatchState()
         self.first_density: float | None = None
         self.register_buffer("frame", torch.eye(3, 4))
         self.register_load_state_dict_post_hook(lambda guide, _: guide.changed())
@@ -134,7 +131,7 @@ class Guide(nn.Module):
         Raises:
             NoOccupancyYet: there is none yet.
         """
-        occupancy, lower = self.the_occupancy(), self.watched.get(CAREFULLY)
+        occupancy, lower = self.the_occupancy(), self.watched.lower
         return occupancy if lower is None else occupancy.with_threshold(lower)
 
     def the_occupancy_skips(self) -> bool:
@@ -205,15 +202,15 @@ class Guide(nn.Module):
             "gate": self.occupancy.gate.config.to_dict(),
             "precision": self.occupancy.precision,
             "report": self.occupancy.report,
-            "watched": self.watched,
+            "watched": dict(vars(self.watched)),
             "first_density": self.first_density,
         }
 
     def set_extra_state(self, state: dict[str, Any]) -> None:
         """Makes an occupancy of the checkpoint's shape; torch then reads its weights."""
         if state:
-            self.watched = dict(state.get("watched", {}))
-            self.first_density = state.get("first_density")
+            self.watched = WatchState(**state["watched"])
+            self.first_density = state["first_density"]
             gate = Gate(GateConfig.from_dict(state["gate"]))
             occupancy = Occupancy(gate, Space(), 0.0, state["precision"], state["report"])
             self.set_occupancy(occupancy)

@@ -11,8 +11,9 @@ from torch import Tensor, nn
 
 from leco_plugin.compat.earlier_configs import GrowingConfig
 from leco_plugin.evaluation.inspection import cameras_of
-from leco_plugin.models.compute.ranks import is_first, say
-from leco_plugin.models.freezing.freezing import FILE_NAME, leave_file
+from leco_plugin.learning.freezing import FILE_NAME, leave_file
+from leco_plugin.log import say
+from leco_plugin.models.compute.ranks import is_first
 from leco_plugin.models.hosts.guide import Guide
 from leco_plugin.models.hosts.opaque_start import begin_opaque
 from leco_plugin.models.hosts.probation import begin_carefully

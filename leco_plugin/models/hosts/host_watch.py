@@ -15,20 +15,17 @@ import torch
 from torch import Tensor
 
 from leco_plugin.compat.host_outputs import true_colours
-from leco_plugin.models.compute.ranks import from_first, is_first, mean, say
-from leco_plugin.models.freezing.calibration import (
-    THRESHOLDS,
-    CalibrationConfig,
-    Measured,
-)
-from leco_plugin.models.freezing.freezing import leave_file
-from leco_plugin.models.freezing.held_out_rendering import evaluating, held_out_bundle
-from leco_plugin.models.freezing.recheck import Evidence, rays_to_check_with, steps_until_next
+from leco_plugin.learning.calibration import THRESHOLDS, CalibrationConfig, Measured
+from leco_plugin.learning.collapse import SUSPECTED_STEPS
+from leco_plugin.learning.dense import evaluating
+from leco_plugin.learning.freezing import leave_file
+from leco_plugin.learning.price_watch import PriceWatch
+from leco_plugin.log import say
+from leco_plugin.models.compute.ranks import is_first
 from leco_plugin.models.hosts.guide import Guide
 from leco_plugin.models.hosts.probation import end_probation
-from leco_plugin.models.learning.healing import SUSPECTED_STEPS
-from leco_plugin.models.learning.progress import NO_EVIDENCE
 from leco_plugin.occupancy import CALIBRATED_AT
+from leco_plugin.scenes.learning_data import count_held_out, held_out_bundle
 
 LOWERED_TO = 0.25
 """Share of the threshold that is left when it is lowered; the next measurement, after the fewest
@@ -48,8 +45,9 @@ class HostWatch:
     ) -> None:
         self.host, self.guide, self.config = host, guide, config
         self.pipeline, self.trainer = pipeline, trainer
-        self.started, self.steps, self.seconds = 0.0, 0, 0.0
-        self.nothing_since: int | None = None
+        self.started = 0.0
+        self.ended_probation: float | None = None
+        self.watch = PriceWatch(guide.watched, self, config, guide.frame.device)
         if config.recheck_rays == 0:
             end_probation(guide)  # of an earlier run, with nothing to end it any more
 
@@ -59,52 +57,35 @@ class HostWatch:
 
     def after_step(self, step: int) -> None:
         """Measures again where that is due; skips less where it has come to cost too much."""
-        self.steps, self.seconds = self.steps + 1, self.seconds + time.monotonic() - self.started
-        guide, config = self.guide, self.config
-        if guide.kept is None or config.recheck_rays == 0:
+        seconds, guide = time.monotonic() - self.started, self.guide
+        if guide.kept is None or self.config.recheck_rays == 0:
             return
-        device, watched = guide.frame.device, guide.watched
-        nothing = self._keeps_nothing(step, device)
-        if not nothing and step < watched.setdefault("due", step + config.steps_per_recheck):
-            return
-        if not guide.the_occupancy_skips():
-            watched["due"] = step + config.steps_per_recheck
-            return
-        if nothing:
-            self._lower(step, 0.0, f"the occupancy kept nothing for {SUSPECTED_STEPS} steps")
-            return
-        began, low = time.monotonic(), end_probation(guide)
-        watched["image"] = from_first(self._measured, device)
-        watched["rechecks"] = watched.get("rechecks", 0) + 1
-        seconds, a_step = time.monotonic() - began, self.seconds / self.steps
-        wait = from_first(lambda: steps_until_next(config, seconds, a_step), device)
-        watched["due"] = step + wait
+        self.watch.state, self.ended_probation = guide.watched, None
+        kept, skips = float(guide.kept), guide.the_occupancy_skips()
+        finding = self.watch.after_step(step, seconds, kept, skips)
+        low = self.ended_probation
         if low is not None:  # the time that was measured holds the building of a sampler
-            watched["due"] = step + config.steps_per_recheck
-        if Evidence(*watched["image"]).exceeds():
+            self.watch.put_off(step)
+        if finding is None:
+            return
+        if finding.kind == "nothing kept":
+            self._lower(step, 0.0, f"the occupancy kept nothing for {SUSPECTED_STEPS} steps")
+        elif finding.kind == "beyond":
             lower = LOWERED_TO * guide.the_occupancy().threshold if low is None else low
-            why = "the image price of skipping is beyond its bound"
+            why = f"{finding.why} of skipping is beyond its bound"
             self._lower(step, lower if lower >= THRESHOLDS[-1] else 0.0, why)
         elif low is not None:
             now = f"its threshold is {guide.the_occupancy().threshold:.4f} now"
-            say(f"step {step}: skipping costs this host what it may; {now}")
-
-    def _keeps_nothing(self, step: int, device: torch.device) -> bool:
-        """Whether no process has kept a sample for `SUSPECTED_STEPS` steps; all say the same."""
-        if mean(float(self.guide.kept or 0), device) > 0.0:
-            self.nothing_since = None
-            return False
-        if self.nothing_since is None:
-            self.nothing_since = step
-        return step - self.nothing_since >= SUSPECTED_STEPS
+            say(f"step {step}: skipping is within its price bounds; {now}")
 
     @torch.no_grad()
-    def _measured(self) -> tuple[float, ...]:
-        """The evidence so far, with that of a few more rays."""
+    def excesses(self, seed: int) -> dict[str, Tensor]:
+        """See `price_watch.Renderer`; of the calibrated threshold, followed from now on."""
         guide, host, config = self.guide, self.host, self.config
-        seed = guide.watched.get("rechecks", 0) + 1
-        data = self.pipeline.datamanager
-        bundle, truth = held_out_bundle(data, config.recheck_rays, seed, "recheck")
+        self.ended_probation = end_probation(guide)
+        bundle, truth = held_out_bundle(
+            self.pipeline.datamanager, config.recheck_rays, seed, "recheck"
+        )
         bundle, truth = bundle.to(host.device), truth.to(host.device).float()
         kept = guide.kept
         try:
@@ -115,8 +96,11 @@ class HostWatch:
         finally:
             guide.dense, guide.kept = False, kept
         excess = gated - 10.0 ** (0.1 * config.image_price_db) * dense
-        before = Evidence(*guide.watched.get("image", NO_EVIDENCE))
-        return tuple(before.with_rays(excess, rays_to_check_with(data, config)))
+        return {"the image price": excess}
+
+    def count_rays(self, limit: int) -> float:
+        """See `price_watch.Renderer`."""
+        return count_held_out(self.pipeline.datamanager, limit)
 
     def _errors(self, bundle: Any, truth: Tensor) -> Tensor:
         """Squared error of rendered rays: [R]."""
@@ -129,9 +113,9 @@ class HostWatch:
         end_probation(self.guide)
         occupancy.threshold_value.fill_(threshold)
         occupancy.report = _lowered(occupancy.report, before, step, threshold)
-        self.guide.watched["image"] = NO_EVIDENCE
+        self.watch.state.evidence = {}
         # of what was wrong once it is soon asked whether it still is, however long that takes
-        self.guide.watched["due"] = step + self.config.steps_per_recheck
+        self.watch.put_off(step)
         self.guide.changed()
         now = f"lowered from {before:.4f} to {threshold:.4f}"
         nothing = "0: from now on nothing is skipped"

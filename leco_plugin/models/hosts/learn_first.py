@@ -4,21 +4,22 @@ from __future__ import annotations
 
 import math
 import time
+from collections.abc import Callable
 from typing import Any
 
 import torch
-from nerfstudio.engine.callbacks import TrainingCallbackAttributes
 from torch import nn
 
+from leco_plugin.learning.learner import Learner
+from leco_plugin.learning.progress import Progress
+from leco_plugin.learning.run import LearningOnly
+from leco_plugin.learning.schedule import MOST_EXTENSIONS, steps_of_an_extension
+from leco_plugin.log import bar
 from leco_plugin.models.compute.optimizers import RATES, FusedAdamConfig
 from leco_plugin.models.compute.ranks import averaging, mean
-from leco_plugin.models.learning.lifecycle import Lifecycle
-from leco_plugin.models.learning.phases import MOST_EXTENSIONS, steps_of_an_extension
-from leco_plugin.models.learning.progress import Progress
 from leco_plugin.models.leco import LecoModel
 from leco_plugin.models.leco_config import LecoModelConfig
 from leco_plugin.occupancy import Occupancy
-from leco_plugin.progress_bar import bar
 from leco_plugin.scenes.detail import CAMERAS
 from leco_plugin.scenes.input_error import InputError
 from leco_plugin.scenes.pixels.known_distances import sampler_here
@@ -48,7 +49,7 @@ def learn_occupancy(
         model = learn_model(config, pipeline, rays, seconds, rate)
     except InputError as error:
         raise InputError(str(error).replace(OF_LEARNER, OF_HOST)) from None
-    occupancy: Occupancy = model.occupancy()
+    occupancy: Occupancy = model.mixture.occupancy()
     return occupancy.eval()
 
 
@@ -96,15 +97,16 @@ def learn_model(
     before = sampler.num_rays_per_batch if sampler is not None else 0
     if sampler is not None:
         sampler.set_num_rays_per_batch(rays)
-    lifecycle = Lifecycle(model, TrainingCallbackAttributes(None, None, pipeline, None))
-    lifecycle.batches.rays_per_batch = rays
     groups = model.get_param_groups()
-    lifecycle.optimizers = [
-        FusedAdamConfig(lr=rate * RATES[name]).setup(p) for name, p in groups.items()
-    ]
+    run = LearningOnly(
+        [FusedAdamConfig(lr=rate * RATES[name]).setup(p) for name, p in groups.items()]
+    )
+    learner = model.learner(manager, run)
+    learner.data.rays_per_batch = rays
+    learner.begin()
     try:
         with bar("Learning the occupancy") as show:
-            _train(trained, lifecycle, manager, seconds, show)
+            _train(model, trained, learner, seconds, show)
     finally:
         if sampler is not None:
             sampler.set_num_rays_per_batch(before)
@@ -139,33 +141,39 @@ def keep_within(progress: Progress, more: float, done: int) -> None:
 
 
 def _train(
+    model: LecoModel,
     trained: nn.Module,
-    lifecycle: Lifecycle,
-    manager: Any,
+    learner: Learner,
     seconds: float | None,
-    show: Any,
+    show: Callable[[float], None],
 ) -> None:
-    model, optimizers = lifecycle.model, lifecycle.optimizers
+    """Steps until the gate is frozen.
+
+    Args:
+        trained: the model, or what averages its gradients over processes.
+    """
+    progress, manager = learner.progress, learner.data.manager
     started = time.monotonic()
     step, timed_from = 0, started
-    while not bool(model.frozen):
-        lifecycle.before_step(step)
+    while not bool(model.mixture.frozen):
+        model.plan = learner.before_step(step)
+        began = time.monotonic()
         bundle, batch = manager.next_train(step)
         losses = model.get_loss_dict(trained(bundle), batch)
-        for optimizer in optimizers:
+        for optimizer in learner.run.optimizers():
             optimizer.zero_grad(set_to_none=True)
-        torch.stack(list(losses.values())).sum().backward()
-        for optimizer in optimizers:
+        torch.stack(list(losses.values())).sum().backward()  # type: ignore[no-untyped-call]
+        for optimizer in learner.run.optimizers():
             optimizer.step()
         step += 1
         if step == FIRST_TIMED:
             timed_from = time.monotonic()
-        if seconds is not None and step >= TIMED_STEPS and lifecycle.progress.recoveries == 0:
+        if seconds is not None and step >= TIMED_STEPS and progress.recoveries == 0:
             left = mean(seconds - (time.monotonic() - started), model.device)
             if step == TIMED_STEPS:
                 a_step = mean(time.monotonic() - timed_from, model.device) / (step - FIRST_TIMED)
-                keep_within(lifecycle.progress, left / a_step, step)
+                keep_within(progress, left / a_step, step)
             elif left <= 0.0:  # steps have become slower
-                keep_within(lifecycle.progress, 0.0, step)
-        lifecycle.after_step(step - 1)
-        show(min(1.0, step / lifecycle.progress.learn_steps))
+                keep_within(progress, 0.0, step)
+        learner.after_step(step - 1, time.monotonic() - began, model.kept_per_ray)
+        show(min(1.0, step / progress.learn_steps))

@@ -12,7 +12,8 @@ import math
 
 from torch import Tensor, nn
 
-from leco_plugin.models.compute.ranks import from_first, say
+from leco_plugin.log import say
+from leco_plugin.models.compute.ranks import from_first
 from leco_plugin.models.hosts.guide import Guide
 from leco_plugin.models.hosts.stand_ins import GuidedEstimator
 

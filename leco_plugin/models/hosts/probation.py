@@ -15,9 +15,10 @@ from collections.abc import Callable
 
 from torch import nn
 
-from leco_plugin.models.compute.ranks import from_first, say
-from leco_plugin.models.freezing.calibration import THRESHOLDS
-from leco_plugin.models.hosts.guide import CAREFULLY, Guide
+from leco_plugin.learning.calibration import THRESHOLDS
+from leco_plugin.log import say
+from leco_plugin.models.compute.ranks import from_first
+from leco_plugin.models.hosts.guide import Guide
 from leco_plugin.models.hosts.stand_ins import GuidedEstimator
 from leco_plugin.occupancy import Occupancy
 
@@ -42,7 +43,7 @@ def begin_carefully(host: nn.Module, guide: Guide, skipped: Callable[[Occupancy]
     lower = from_first(lambda: _first_threshold(occupancy, skipped), guide.frame.device)
     if lower is None:
         return False
-    guide.watched[CAREFULLY] = lower
+    guide.watched.lower = lower
     guide.changed()
     say(
         f"the host begins at threshold {lower:.4f} instead of {occupancy.threshold:.4f}, until "
@@ -68,7 +69,7 @@ def _first_threshold(occupancy: Occupancy, skipped: Callable[[Occupancy], float]
 
 def end_probation(guide: Guide) -> float | None:
     """Has a host follow the calibrated threshold; returns the lower one, None where it has none."""
-    lower: float | None = guide.watched.pop(CAREFULLY, None)
+    lower, guide.watched.lower = guide.watched.lower, None
     if lower is not None:
         guide.changed()
     return lower

@@ -14,8 +14,8 @@ import torch
 from nerfstudio.model_components.ray_samplers import Sampler
 from torch import Tensor, nn
 
+from leco_plugin.models.region import within_crop
 from leco_plugin.models.rendering import Intervals, Rays, with_backdrop
-from leco_plugin.models.scene_rays import within_crop
 from leco_plugin.samplers.base import DensityFn, Estimator
 from leco_plugin.samplers.estimator import cell_centers
 from leco_plugin.samplers.marching.rays import intersect_box, usable_rays

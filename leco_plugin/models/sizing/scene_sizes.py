@@ -14,7 +14,7 @@ from typing import Any
 
 import torch
 
-from leco_plugin.models.compute.ranks import say
+from leco_plugin.log import say
 from leco_plugin.models.encodings import EncodingConfig
 from leco_plugin.models.gate import GateConfig
 from leco_plugin.models.sizing.size_limits import (

@@ -18,7 +18,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from leco_plugin.progress_bar import bar
+from leco_plugin.log import bar
 from leco_plugin.scenes.input_error import InputError
 from leco_plugin.scenes.whole_files import write_whole
 

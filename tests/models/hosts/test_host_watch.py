@@ -12,7 +12,7 @@ import torch
 from ball_occupancy import ball
 from nerfstudio.model_components.renderers import RGBRenderer
 
-from leco_plugin.models.freezing.calibration import THRESHOLDS, CalibrationConfig
+from leco_plugin.learning.calibration import THRESHOLDS, CalibrationConfig
 from leco_plugin.models.guided import _refuse_what_is_not_finite
 from leco_plugin.models.hosts import host_watch, probation
 from leco_plugin.models.hosts.guide import Guide

@@ -1,0 +1,166 @@
+"""The moment of freezing: what the gate costs and saves, its report, and the files that are left.
+
+A field that goes on guided is not trained where the gate skips, and cannot say what was lost there.
+The field that the gate was calibrated on can: it is kept, and smaller gates are held to it.
+"""
+
+from __future__ import annotations
+
+import copy
+import shutil
+from pathlib import Path
+from pickle import UnpicklingError
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from leco_plugin.learning.calibration import (
+    CalibrationConfig,
+    Measured,
+    backdrop_price,
+    calibrate,
+)
+from leco_plugin.learning.dense import dense_rendering, evaluating
+from leco_plugin.log import say
+from leco_plugin.models.mixture import Mixture
+from leco_plugin.models.rendering import Rays
+from leco_plugin.occupancy import BACKDROP_PRICE, Occupancy
+from leco_plugin.scenes.input_error import one_line
+from leco_plugin.scenes.whole_files import write_whole
+
+FILE_NAME = "occupancy.safetensors"
+FIELD_FILE = "field_at_freezing.pt"
+HARDLY_ANYTHING = 0.05
+"""Share of all candidates below which a run that skips no more is given advice, and a gate in the
+paper's form is taught otherwise."""
+
+
+@torch.no_grad()
+def price(
+    mixture: Mixture, rays: Rays, truth: Tensor, config: CalibrationConfig
+) -> tuple[Measured, dict[str, Any]]:
+    """The threshold within the bounds, and what a report says of it.
+
+    Args:
+        rays: held out, cut to the mixture's region.
+        truth: [R, 3] their colours.
+    """
+    with evaluating(mixture):
+        rendering = dense_rendering(mixture, rays, truth, config.rays_at_once)
+        measured = calibrate(*rendering, config)
+        of_backdrop = backdrop_price(*rendering)
+    march, region = mixture.march(), mixture.region
+    return measured, {
+        "params": sum(p.numel() for p in mixture.gate.parameters()),
+        **measured._asdict(),
+        BACKDROP_PRICE: round(of_backdrop, 4),
+        "calibration_rays": len(truth),
+        "near": float(region.near),
+        "far": float(region.far),
+        "step_size": march.step,
+        "cone_angle": march.cone,
+        "aabb": region.aabb.tolist(),
+    }
+
+
+def advice_on(measured: Measured, steps: int, recoveries: int) -> str | None:
+    """What to do about an occupancy that skips next to nothing; None for one that skips.
+
+    Args:
+        steps: that it was learned for, from its beginning or its last recovery.
+        recoveries: how often its gate was healed.
+    """
+    if measured.threshold == 0.0:
+        said = "no threshold keeps the price within its bounds, so nothing is skipped;"
+    elif measured.empty_fraction >= HARDLY_ANYTHING:
+        return None
+    elif recoveries:
+        said = "hardly anything is skipped;"
+    else:
+        said = "hardly anything is skipped, which is right for a scene full of fog; else"
+    if recoveries:
+        often = "once" if recoveries == 1 else f"{recoveries} times"
+        said += f" its gate collapsed {often} before;"
+    return (
+        f"{said} it learned for {steps} steps, and more usually help: schedule.learn-steps, at "
+        "--pipeline.model of leco-occupancy, in a run of twice as many, and at "
+        "--pipeline.model.occupancy.learning of guided methods"
+    )
+
+
+def leave_file(occupancy: Occupancy, folder: Path) -> None:
+    """Leaves an occupancy as `occupancy.safetensors` in a folder, made where it is missing.
+
+    A disk that is full is said in one line: the checkpoint holds the gate too.
+    """
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        occupancy.save(folder / FILE_NAME)
+    except OSError as error:
+        say(f"{folder / FILE_NAME} could not be written ({error}); a resumed run writes it anew")
+        return
+    say(f"wrote {folder / FILE_NAME}")
+
+
+def withdraw_file(folder: Path) -> None:
+    """Removes the file of a gate that learns again, so that nobody is guided by it."""
+    file = folder / FILE_NAME
+    try:
+        file.unlink(missing_ok=True)
+    except OSError as error:
+        say(f"{file} could not be withdrawn ({error}); its gate is of no use")
+
+
+def leave_field(mixture: Mixture, folder: Path) -> None:
+    """Leaves a frozen mixture's state in a folder: about a third of a checkpoint, no optimizer.
+
+    A disk that is full is said in one line; only `leco shrink` is the poorer for it.
+    """
+    try:
+        write_whole(folder / FIELD_FILE, lambda file: torch.save(mixture.state_dict(), file))
+    except (OSError, RuntimeError) as error:  # as which torch reports a disk that is full
+        say(f"{folder / FIELD_FILE} could not be written ({error}); the run goes on without it")
+
+
+def carry_over(resumed_from: Path, folder: Path) -> None:
+    """Copies the state into the folder of a run that resumes another one, if that has left any.
+
+    Args:
+        resumed_from: a checkpoint of the other run, or its folder of checkpoints.
+        folder: of the run that goes on.
+    """
+    checkpoints = resumed_from if resumed_from.is_dir() else resumed_from.parent
+    left = checkpoints.parent / FIELD_FILE
+    if not left.is_file() or (folder / FIELD_FILE).exists():
+        return
+    try:
+        with left.open("rb") as source:
+            write_whole(folder / FIELD_FILE, lambda file: shutil.copyfileobj(source, file))
+    except OSError as error:
+        say(f"{left} could not be copied ({error}); the run goes on without it")
+
+
+def field_at_freezing(mixture: Mixture, folder: Path) -> Mixture | None:
+    """The mixture as it was when its gate was frozen, as another one; None where none was left.
+
+    Args:
+        mixture: of the run as it is now; it stays as it is.
+        folder: of that run.
+    Raises:
+        ValueError: the file is damaged, or of another gate than the mixture's. One line.
+    """
+    path = folder / FIELD_FILE
+    if not path.is_file():
+        return None
+    frozen = copy.deepcopy(mixture)
+    try:
+        state: dict[str, Any] = torch.load(path, map_location=mixture.device, weights_only=True)
+        frozen.load_state_dict(state)
+    except (OSError, RuntimeError, ValueError, KeyError, EOFError, UnpicklingError) as error:
+        line = one_line(error, 200)
+        raise ValueError(f"{path} cannot be used ({line}): move it away") from None
+    gates = zip(frozen.gate.parameters(), mixture.gate.parameters(), strict=True)
+    if not all(torch.equal(one, other) for one, other in gates):
+        raise ValueError(f"{path} is of another gate than the run's last checkpoint: move it away")
+    return frozen.eval()

@@ -1,0 +1,89 @@
+"""What is measured on held-out pixels: the price of skipping, and which experts are needed.
+
+These methods return values; the mixture is left as it was.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any
+
+import torch
+from torch import Tensor
+
+from leco_plugin.learning.calibration import CalibrationConfig, Measured, calibrate, ray_prices
+from leco_plugin.learning.dense import dense_rendering, evaluating
+from leco_plugin.learning.freezing import price
+from leco_plugin.learning.merging import Merging, find_unneeded
+from leco_plugin.models.mixture import Mixture
+from leco_plugin.models.rendering import Rays
+
+if TYPE_CHECKING:
+    from leco_plugin.scenes.learning_data import LearningData
+    from leco_plugin.scenes.pixels.lattice import Share
+
+
+class HeldOut:
+    """Held-out pixels, as a mixture renders them.
+
+    Args:
+        mixture: what is rendered.
+        data: where the pixels come from.
+        config: how many, and what skipping may cost.
+        restarted: whether the field was begun anew when the gate was frozen. It has put surfaces
+            before the haze of its first weights where the gate skips: none of its surfaces is
+            asked for. That haze also makes any skipping look good, so that such a field is in
+            effect not watched.
+    """
+
+    def __init__(
+        self, mixture: Mixture, data: LearningData, config: CalibrationConfig, restarted: bool
+    ) -> None:
+        self.mixture, self.data, self.config = mixture, data, config
+        self.guided = replace(config, lost_surface_mass=1.0) if restarted else config
+
+    def rays(self, count: int, seed: int = 0, which: Share = "calibration") -> tuple[Rays, Tensor]:
+        """Rays cut to the region, and their colours [R, 3]; see `held_out_bundle`."""
+        mixture, (bundle, truth) = self.mixture, self.data.held_out(count, seed, which)
+        bundle = bundle.to(mixture.device)
+        images = bundle.camera_indices
+        assert images is not None
+        rays = mixture.rays(bundle.origins, bundle.directions, images[:, 0])
+        truth = truth.to(mixture.device).float()
+        return rays, truth if truth.shape[-1] < 4 else truth[:, :3] * truth[:, 3:]
+
+    def price(self) -> tuple[Measured, dict[str, Any]]:
+        """The threshold to freeze at, and what a report says of it."""
+        measured, report = price(self.mixture, *self.rays(self.config.rays), self.config)
+        return measured, report | self.data.facts()
+
+    @torch.no_grad()
+    def lower(self, below: float, seed: int) -> Measured:
+        """The largest threshold below another one that is within the bounds for the field now."""
+        config = self.guided
+        rays, truth = self.rays(config.rays, seed, "all")
+        with evaluating(self.mixture):
+            rendering = dense_rendering(self.mixture, rays, truth, config.rays_at_once)
+            return calibrate(*rendering, config, below=below, missed_only=True)
+
+    def excesses(self, seed: int) -> dict[str, Tensor]:
+        """See `price_watch.Renderer`. What is lost near surfaces counts where the photographs miss
+        it: where the gate skips, the field is not trained any more, and shows haze."""
+        config, mixture = self.guided, self.mixture
+        rays, truth = self.rays(config.recheck_rays, seed, "recheck")
+        with evaluating(mixture):
+            rendering = dense_rendering(mixture, rays, truth, config.rays_at_once)
+            prices = ray_prices(*rendering, float(mixture.threshold), missed_only=True)
+        return {
+            "lost surface mass": prices.surface_excess(config),
+            "the image price": prices.image_excess(config),
+        }
+
+    def count_rays(self, limit: int) -> float:
+        """See `price_watch.Renderer`."""
+        return self.data.count_held_out(limit)
+
+    def unneeded(self, count: int, bound: float) -> Merging:
+        """Scene experts without which the image loses no more than `bound` dB."""
+        rays, truth = self.rays(count)
+        return find_unneeded(self.mixture, rays, truth, bound, self.config.rays_at_once)

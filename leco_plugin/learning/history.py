@@ -1,0 +1,177 @@
+"""How a gate came to be: what it decides at fixed positions, and its weights, while it learns."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, fields
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import torch
+from safetensors import SafetensorError, safe_open
+from safetensors.torch import save
+from torch import Tensor
+
+from leco_plugin.models.compute.ranks import share
+from leco_plugin.models.gate import Gate
+from leco_plugin.models.losses import expert_shares
+from leco_plugin.models.mixture import Mixture
+from leco_plugin.models.rendering import gate_values_and_routes
+from leco_plugin.occupancy import gate_precision
+from leco_plugin.scenes.whole_files import write_whole
+
+if TYPE_CHECKING:
+    from leco_plugin.scenes.survey import Survey
+
+FILE_NAME = "occupancy_history.safetensors"
+FORMAT = "leco_plugin.history"
+PROBES = 16384
+"""Positions at which the gate's decisions are compared between two checks."""
+
+
+class Probes:
+    """A mixture at fixed positions along training rays.
+
+    Args:
+        seen: rays that cover the training images.
+    """
+
+    def __init__(self, mixture: Mixture, seen: Survey) -> None:
+        self.mixture = mixture
+        region, device = mixture.region, mixture.device
+        rays = region.cut(seen.origins.to(device), seen.directions.to(device))
+        hits = (rays.t_maxs > rays.t_mins).nonzero()[:, 0]
+        generator = torch.Generator().manual_seed(0)
+        which = hits[torch.randint(len(hits), (PROBES,), generator=generator).to(device)]
+        along = torch.rand(PROBES, generator=generator).to(device)
+        distance = torch.lerp(rays.t_mins[which], rays.t_maxs[which], along)
+        positions = rays.origins[which] + rays.directions[which] * distance[:, None]
+        self.positions = region.space.map(positions).clamp(-1.0, 1.0)
+        """[P, 3] in [-1, 1]."""
+
+    @torch.no_grad()
+    def logits(self) -> Tensor:
+        """The gate's logits [P, 1 + n], the same ones in every process."""
+        with gate_precision(self.mixture.device.type, self.mixture.precision):
+            logits: Tensor = self.mixture.gate(self.positions)
+        share([logits])
+        return logits
+
+    @torch.no_grad()
+    def routes_and_densities(self) -> tuple[Tensor, Tensor]:
+        """The expert of each position [P] int64, and densities there [P] per half extent."""
+        mixture = self.mixture
+        with gate_precision(mixture.device.type, mixture.precision):
+            gate_values, routes = gate_values_and_routes(
+                mixture.gate(self.positions), mixture.routing, mixture.field.experts.those_left()
+            )
+            sigmas, _ = mixture.field.density(self.positions, routes, gate_values)
+        return routes, sigmas
+
+
+@dataclass
+class GateHistory:
+    """Looks at a gate, one after the other."""
+
+    steps: list[int] = field(default_factory=list)
+    seconds: list[float] = field(default_factory=list)
+    """Seconds of learning until each look."""
+    shares: list[Tensor] = field(default_factory=list)
+    """[1 + n] share of the probe positions that each expert gets; 0 is the empty-space expert."""
+    densities: list[Tensor] = field(default_factory=list)
+    """[1 + n] mean density of those, per half extent of the scene; 0 where an expert gets none."""
+    weights: list[dict[str, Tensor]] = field(default_factory=list)
+    """State dicts of the gate."""
+
+    def __len__(self) -> int:
+        return len(self.steps)
+
+    def look(self, step: int, seconds: float, gate: Gate, routes: Tensor, sigmas: Tensor) -> None:
+        """Remembers the gate after a step.
+
+        Args:
+            routes: [P] int64, the expert of each probe position.
+            sigmas: [P] densities there, per half extent of the scene.
+        """
+        experts = 1 + gate.config.scene_experts
+        shares = expert_shares(routes, experts)
+        sums = torch.zeros_like(shares).index_add_(0, routes, sigmas.float())
+        self.steps.append(step)
+        self.seconds.append(seconds)
+        self.shares.append(shares.cpu())
+        self.densities.append((sums / (shares * len(routes)).clamp(min=1.0)).cpu())
+        state = gate.state_dict()
+        self.weights.append({name: value.detach().cpu().clone() for name, value in state.items()})
+
+    @classmethod
+    def gone_on_from(cls, checkpoint: Path, step: int, gate: Gate) -> GateHistory:
+        """What a run had looked at before a step; nothing where it left no history of this gate.
+
+        Args:
+            checkpoint: of that run, or its folder of checkpoints.
+            step: the next one.
+        """
+        checkpoints = checkpoint if checkpoint.is_dir() else checkpoint.parent
+        try:
+            return cls.load(checkpoints.parent / FILE_NAME, gate).until(step)
+        except (OSError, ValueError):
+            return cls()
+
+    def until(self, step: int) -> GateHistory:
+        """The looks before a step, from which on a run goes on."""
+        looks = sum(look < step for look in self.steps)
+        return GateHistory(*(getattr(self, each.name)[:looks] for each in fields(self)))
+
+    def save(self, folder: Path) -> Path:
+        """Writes `occupancy_history.safetensors` in a folder, whole or not at all.
+
+        Raises:
+            ValueError: there was no look yet.
+            OSError: the folder cannot be written to.
+        """
+        if not self.steps:
+            raise ValueError("a history without a single look cannot be written")
+        tensors = {
+            "steps": torch.tensor(self.steps),
+            "seconds": torch.tensor(self.seconds, dtype=torch.float64),
+            "shares": torch.stack(self.shares),
+            "densities": torch.stack(self.densities),
+        }
+        for name in self.weights[0]:
+            tensors[f"gate.{name}"] = torch.stack([state[name] for state in self.weights])
+        path = folder / FILE_NAME
+        content = save(tensors, metadata={"format": FORMAT})
+        write_whole(path, lambda file: file.write(content))
+        return path
+
+    @classmethod
+    def load(cls, path: Path, gate: Gate) -> GateHistory:
+        """Reads what `save` wrote.
+
+        Args:
+            gate: as it became; its weights say which shapes are expected.
+        Raises:
+            OSError: there is no such file.
+            ValueError: it is no history, or the history of a gate of another shape.
+        """
+        try:
+            with safe_open(path, framework="pt", device="cpu") as file:
+                header = file.metadata() or {}
+                tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
+        except SafetensorError as error:
+            raise ValueError(f"{path} is not a whole safetensors file: {error}") from None
+        if header.get("format") != FORMAT:
+            raise ValueError(f"{path} is not a history of leco_plugin")
+        state = gate.state_dict()
+        looks, experts = len(tensors.get("steps", ())), 1 + gate.config.scene_experts
+        expected: dict[str, tuple[int, ...]] = {name: (looks,) for name in ("steps", "seconds")}
+        expected |= {name: (looks, experts) for name in ("shares", "densities")}
+        expected |= {f"gate.{name}": (looks, *value.shape) for name, value in state.items()}
+        if {name: tuple(tensor.shape) for name, tensor in tensors.items()} != expected or not looks:
+            raise ValueError(f"{path} is the history of another gate than that of the occupancy")
+        return cls(
+            tensors["steps"].tolist(),
+            tensors["seconds"].tolist(),
+            list(tensors["shares"]),
+            list(tensors["densities"]),
+            [{name: tensors[f"gate.{name}"][look] for name in state} for look in range(looks)],
+        )

@@ -1,0 +1,389 @@
+"""Learning an occupancy, step by step: ramps, freezing, and the price watch after it.
+
+The learner knows no trainer: it is told of each step, and asks a `Run` for what is around it.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from functools import cached_property
+from typing import TYPE_CHECKING, Protocol
+
+from torch import Tensor
+
+from leco_plugin.learning.calibration import CalibrationConfig
+from leco_plugin.learning.collapse import STEPS_PER_LOOK, annealed, is_dense
+from leco_plugin.learning.freezing import advice_on, carry_over, leave_field, leave_file
+from leco_plugin.learning.held_out import HeldOut
+from leco_plugin.learning.history import GateHistory, Probes
+from leco_plugin.learning.merging import MergingConfig, line_of
+from leco_plugin.learning.price_watch import PriceWatch
+from leco_plugin.learning.progress import Progress, WatchState
+from leco_plugin.learning.recoveries import Recoveries
+from leco_plugin.learning.run import Run, keep_pace
+from leco_plugin.learning.schedule import (
+    ScheduleConfig,
+    StepPlan,
+    converged,
+    decisions_agree,
+    is_unsettled,
+    ramp,
+    steps_of_an_extension,
+)
+from leco_plugin.learning.statistics import KEPT_ABOVE
+from leco_plugin.log import say
+from leco_plugin.models.compute.ranks import from_first, mean, share
+from leco_plugin.models.gate import occupancy_from_logits
+from leco_plugin.models.mixture import Following, Mixture
+from leco_plugin.models.objective import GateLossConfig
+
+if TYPE_CHECKING:
+    from leco_plugin.scenes.learning_data import LearningData
+
+FEWEST_KEPT = 0.5
+"""Samples a ray from which, by its calibration, an occupancy keeps something in every batch: fewer
+are right where there is nothing."""
+
+
+class LearnerConfig(Protocol):
+    """What a learner reads of the settings of a method; see `LecoModelConfig`."""
+
+    schedule: ScheduleConfig
+    gate_loss: GateLossConfig
+    calibration: CalibrationConfig
+    merging: MergingConfig
+    termination: float
+    look_everywhere: float
+    likely_above: float
+    homogeneous: bool
+
+
+class Learner:
+    """Carries one run of a mixture from its first step to its last.
+
+    Args:
+        mixture: gate and field; the learner alone freezes and opens the gate.
+        data: batches, held-out pixels and the scene's place.
+        run: what is around the steps.
+        config: of the method.
+        progress: how far the run has come; changed in place, and stored in checkpoints.
+
+    Attributes:
+        over: whether a first phase that freezes nothing is over.
+    """
+
+    def __init__(
+        self,
+        mixture: Mixture,
+        data: LearningData,
+        run: Run,
+        config: LearnerConfig,
+        progress: Progress,
+    ) -> None:
+        self.mixture, self.data, self.run = mixture, data, run
+        self.config, self.progress = config, progress
+        self.history, self.over = GateHistory(), False
+        restarted = config.schedule.restart
+        self.held_out = HeldOut(mixture, data, config.calibration, restarted)
+        self.watch = PriceWatch(progress.watch, self.held_out, config.calibration, mixture.device)
+        self.recoveries = Recoveries(mixture, run, progress, config.gate_loss, config.homogeneous)
+
+    def begin(self) -> None:
+        """Before the first step of this process: learning time, bounds, and files of the run that
+        is gone on with."""
+        mixture, progress, run = self.mixture, self.progress, self.run
+        # a short run still passes through both phases, and a resumed one has steps behind it
+        if math.isfinite(run.end):
+            steps = int(run.end) - run.start
+            most = max(2, int(0.5 * steps)) + max(0, run.start - progress.since)
+            self._say_if_short(most, steps)
+        else:
+            most = self.config.schedule.learn_steps
+        if not bool(mixture.frozen):  # else other steps would take it back into the first phase
+            progress.begin(self.config.schedule.learn_steps, most)
+        mixture.routing = self.recoveries.routing()
+        if not bool(mixture.region.known):
+            found = self.data.survey
+            mixture.set_bounds(found.bounds, found.median_length)
+            mixture.region.look(*self.data.covering_rays())
+            for line in found.lines():
+                say(line)
+            self.data.say_what_is_fixed()
+        if run.resumed_from is not None and run.folder is not None:
+            self._take_along()
+
+    def _say_if_short(self, most: int, steps: int) -> None:
+        """Says so before a run of few steps that learns for fewer than are configured."""
+        configured = self.config.schedule.learn_steps
+        if most < configured != self.progress.configured:
+            say(
+                f"a run of {steps} steps learns the occupancy in "
+                f"its first half: until step {self.progress.since + most}, not for the "
+                f"{configured} steps of schedule.learn-steps"
+            )
+
+    def _take_along(self) -> None:
+        """What a resumed run leaves in its folder, which may be another one than before."""
+        folder, resumed = self.run.folder, self.run.resumed_from
+        assert folder is not None and resumed is not None
+        self.history = GateHistory.gone_on_from(resumed, self.run.start, self.mixture.gate)
+        if len(self.history):
+            self._save_history()
+        if bool(self.mixture.frozen):
+            leave_file(self.mixture.occupancy(), folder)
+            carry_over(resumed, folder)
+
+    @cached_property
+    def probes(self) -> Probes:
+        """The mixture at fixed positions, at which its decisions are compared."""
+        return Probes(self.mixture, self.data.survey)
+
+    def before_step(self, step: int) -> StepPlan:
+        """How a step samples and what it teaches: by its number alone, so that a resumed run is
+        where it was."""
+        config, progress, frozen = self.config, self.progress, bool(self.mixture.frozen)
+        never_frozen = config.homogeneous or not config.schedule.freeze
+        self.over = never_frozen and step >= progress.learn_steps
+        keep_pace(self.run.optimizers(), progress.pace)
+        learning = not (frozen or self.over)
+        self.data.prepare_batch(
+            self._guided_batch() if frozen else self._learning_batch(step),
+            distances=learning and config.termination > 0.0,
+        )
+        return plan_of(step, config, progress, learning, frozen)
+
+    def _learning_batch(self, step: int) -> float:
+        """Rays of a batch as a multiple, while the gate being learned is followed already.
+
+        The same in every process: the mean of their gradients is then that of one large batch.
+        """
+        progress = self.progress
+        if self.over or is_dense(progress, step):
+            # no longer followed; and what a gate kept that has collapsed says nothing
+            progress.learning_kept = 1.0
+        progress.learning_kept = mean(progress.learning_kept, self.mixture.device)
+        wanted = min(self.mixture.sizes.guided_batch, 1.0 / progress.learning_kept)
+        return round(8 * wanted) / 8  # of few sizes; see `steady`
+
+    def _guided_batch(self) -> float:
+        """Rays of a guided batch as a multiple: about as many samples are shaded as before."""
+        sizes = self.mixture.sizes
+        kept = 1.0 - float(self.mixture.report.get("empty_fraction", 0.0))
+        same_samples = sizes.learn_candidates / max(1.0, kept * sizes.candidates)
+        return min(sizes.guided_batch, max(0.5, same_samples))
+
+    def after_step(self, step: int, seconds: float, kept: float) -> None:
+        """Looks at the gate now and then, and freezes it when its decisions have settled; then at
+        what skipping costs.
+
+        Args:
+            seconds: that the step took.
+            kept: samples a ray that the frozen gate kept of the batch, backdrops excluded.
+        Raises:
+            GateCollapsed: the gate has collapsed more often than it may be healed.
+        """
+        if self.over or self.config.homogeneous:
+            return
+        if bool(self.mixture.frozen):
+            self._watch(step, seconds, kept)
+        else:
+            self.progress.learn_seconds += seconds
+            self._after_learning_step(step)
+        frozen = bool(self.mixture.frozen)
+        if self.config.schedule.freeze and not frozen and step + 1 >= self.run.end:
+            say(
+                f"step {step}: the run ends while its occupancy is still learned, to step "
+                f"{self.progress.learn_steps}, and nothing is frozen; go on from its checkpoint "
+                "with --load-dir"
+            )
+
+    def _after_learning_step(self, step: int) -> None:
+        schedule, progress = self.config.schedule, self.progress
+        if schedule.steps_per_record > 0 and step % schedule.steps_per_record == 0:
+            self._record(step)
+        last = step + 1 >= progress.learn_steps
+        checks = (step + 1) % schedule.steps_per_check == 0 or last
+        if not checks and (step + 1) % STEPS_PER_LOOK:
+            return
+        logits = self.probes.logits()
+        kept = occupancy_from_logits(logits) >= KEPT_ABOVE
+        if schedule.freeze and self.recoveries.after_look(step, logits, kept, last):
+            return
+        if checks and self._has_settled(step, kept, last):
+            self._freeze(step)
+
+    def _has_settled(self, step: int, kept: Tensor, last: bool) -> bool:
+        """Whether to freeze at a check; a gate that has not settled is given more steps.
+
+        Args:
+            kept: [P] bool, decisions at the probe positions.
+            last: whether this check ends the first phase.
+        """
+        schedule, progress = self.config.schedule, self.progress
+        agreement = decisions_agree(progress.decisions.to(kept.device), kept)
+        progress.decisions = kept
+        if not schedule.freeze or (progress.suspected_since >= 0 and not last):
+            return False
+        if not last and float(kept.float().mean()) > 0.95:
+            return False  # it agrees with itself only because it has found nothing empty yet
+        since, of_those = step - progress.began, schedule_since(self.config.schedule, progress)
+        unsettled = last and is_unsettled(since, agreement, of_those, progress.extensions)
+        if unsettled and self._extends(step, agreement):
+            return False
+        if not converged(since, agreement, of_those):
+            return False
+        say(
+            f"step {step}: {agreement:.1%} of {len(kept)} decisions are those of "
+            f"{schedule.steps_per_check} steps ago; freezing the gate"
+        )
+        return True
+
+    def _extends(self, step: int, agreement: float) -> bool:
+        """Gives a gate that has not settled more steps, where the run has any; returns whether."""
+        progress = self.progress
+        until = step + 1 + steps_of_an_extension(progress.phase or progress.configured)
+        until = int(min(until, self.run.end))
+        if until <= step + 1:
+            return False
+        progress.extensions += 1
+        progress.learn_steps = until
+        say(
+            f"step {step}: only {agreement:.1%} of the gate's decisions are those of the last "
+            f"check; it learns on until step {progress.learn_steps}"
+        )
+        return True
+
+    def _freeze(self, step: int) -> None:
+        """Calibrates and freezes the gate, drops scene experts that nothing needs, leaves files.
+
+        In every process of a data-parallel run the gate is that of the first one, and its price.
+        """
+        mixture, progress, schedule = self.mixture, self.progress, self.config.schedule
+        share(mixture.gate.state_dict().values())
+        measured, report = from_first(self.held_out.price, mixture.device)
+        seconds = round(progress.learn_seconds, 2)
+        report |= {"step": step, "train_seconds": seconds, "recoveries": progress.recoveries}
+        mixture.freeze(measured.threshold, report)
+        say(
+            f"occupancy learned in {progress.learn_seconds:.0f} s: threshold "
+            f"{measured.threshold:.4f} skips {measured.empty_fraction:.1%} of all candidates for "
+            f"{measured.image_price_db:+.3f} dB and {measured.lost_surface_mass:.2e} of the "
+            f"surface mass ({measured.lost_mass:.2e} of all)"
+        )
+        advice = advice_on(measured, step + 1 - progress.since, progress.recoveries)
+        if advice is not None:
+            say(advice)
+        if self.recoveries.falls_back(step, measured):
+            return
+        if self.run.folder is not None:
+            leave_file(mixture.occupancy(), self.run.folder)
+            leave_field(mixture, self.run.folder)
+        if self.run.goes_on and not schedule.restart:
+            self._merge()
+        progress.watch = self.watch.state = WatchState()
+        progress.suspected_since = -1  # of the gate as it is now
+        if schedule.steps_per_record > 0:
+            self._record(step)
+        if schedule.restart:
+            self.recoveries.restart_field()
+            say("the field starts anew, guided from its first step")
+        self.run.save(step)  # a run killed from now on stays frozen
+
+    def _merge(self) -> None:
+        """Drops the scene experts that a frozen mixture does not need, and says so.
+
+        All processes of a data-parallel run drop those that the first one finds.
+        """
+        mixture, config = self.mixture, self.config.merging
+        experts, bound = mixture.field.experts, config.image_price_db
+        if bound is not None and int(experts.left.sum()) > 1:
+            found = from_first(lambda: self.held_out.unneeded(config.rays, bound), mixture.device)
+            for trial in found.dropped:
+                experts.drop(trial.expert)
+            say(line_of(found, int(experts.left.sum())))
+        self.run.forget(mixture.parameter_groups())
+
+    def _watch(self, step: int, seconds: float, kept: float) -> None:
+        """Looks at a guided step: skips less where skipping costs too much, and opens a gate that
+        keeps nothing of what the cameras see."""
+        mixture = self.mixture
+        wanted = (1.0 - mixture.report["empty_fraction"]) * mixture.sizes.candidates
+        enough = kept if wanted >= FEWEST_KEPT else 1.0
+        finding = self.watch.after_step(step, seconds, enough, mixture.skips)
+        if finding is None:
+            return
+        if finding.kind == "nothing kept":
+            self.recoveries.reopen_useless(step)
+        elif finding.kind == "beyond":
+            self._skip_less(step, finding.why)
+            if self.run.folder is not None:
+                leave_file(mixture.occupancy(), self.run.folder)
+            self.run.save(step)
+
+    def _skip_less(self, step: int, why: str) -> None:
+        """Lowers the threshold until the prices are within their bounds; 0 where none is low
+        enough.
+
+        Args:
+            why: the prices that are beyond.
+        """
+        mixture, before = self.mixture, float(self.mixture.threshold)
+        measured = from_first(
+            lambda: self.held_out.lower(before, self.watch.state.rechecks), mixture.device
+        )
+        lowered = [*mixture.report.get("lowered", []), [step, measured.threshold]]
+        mixture.freeze(
+            measured.threshold, mixture.report | {**measured._asdict(), "lowered": lowered}
+        )
+        self.watch.state.evidence = {}
+        now = (
+            f"threshold {before:.4f} lowered to {measured.threshold:.4f}, which skips "
+            f"{measured.empty_fraction:.1%} for {measured.image_price_db:+.3f} dB and "
+            f"{measured.lost_surface_mass:.2e} of the surface mass"
+            if measured.threshold > 0.0
+            else "no threshold is low enough: from now on nothing is skipped"
+        )
+        say(f"step {step}: {why} of skipping is beyond its bound for the field as it is now; {now}")
+
+    def _record(self, step: int) -> None:
+        """One more entry in the history of the gate, which is written each time."""
+        if self.run.folder is None:
+            return
+        found = self.probes.routes_and_densities()
+        self.history.look(step, self.progress.learn_seconds, self.mixture.gate, *found)
+        self._save_history()
+
+    def _save_history(self) -> None:
+        assert self.run.folder is not None
+        try:
+            self.history.save(self.run.folder)
+        except OSError as error:
+            say(f"the history of the gate could not be written ({error})")
+
+
+def schedule_since(schedule: ScheduleConfig, progress: Progress) -> ScheduleConfig:
+    """The schedule of what has begun at `progress.began`."""
+    return replace(schedule, learn_steps=progress.learn_steps - progress.began)
+
+
+def plan_of(
+    step: int, config: LearnerConfig, progress: Progress, learning: bool, frozen: bool
+) -> StepPlan:
+    """How a step samples and what it teaches.
+
+    Args:
+        learning: whether the occupancy is still learned.
+        frozen: whether the gate is frozen.
+    """
+    ramped = ramp(step - progress.began, schedule_since(config.schedule, progress))
+    coarse = learning or ramped < 1.0
+    # a homogeneous gate is taught nothing about emptiness
+    follows = coarse and ramped > 0.0 and not is_dense(progress, step) and not config.homogeneous
+    return StepPlan(
+        step,
+        coarse,
+        ramped,
+        Following(config.likely_above, config.look_everywhere) if follows else None,
+        None if frozen else annealed(config.gate_loss, progress, step),
+    )

@@ -1,0 +1,164 @@
+"""The price of skipping, measured again in guided training: a frozen gate meets a better field.
+
+Calibration bounds the price for the field of that moment. Every so many steps the price is measured
+anew on a few held-out rays that the calibration did not use. `PriceWatch` says when it is beyond
+its bounds, or when the gate keeps nothing at all; who guides decides what to do.
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from typing import Literal, NamedTuple, Protocol
+
+import torch
+from torch import Tensor
+
+from leco_plugin.learning.calibration import CalibrationConfig
+from leco_plugin.learning.collapse import SUSPECTED_STEPS
+from leco_plugin.learning.progress import WatchState
+from leco_plugin.models.compute.ranks import from_first, mean
+
+REMEMBERED = 0.8
+"""How much the rays of a measurement count beside those of the next: the field goes on learning."""
+SURE = 2.0
+"""Standard errors by which a price must be beyond its bound. Without, a long run of measurements
+would lower the threshold of a sound gate step by step to nothing."""
+SHARE_OF_TIME = 0.01
+"""Of guided training, the largest share that measuring again may take."""
+
+
+class Evidence(NamedTuple):
+    """How far rays are beyond a bound on average, from sums in which older rays count less."""
+
+    rays: float = 0.0
+    total: float = 0.0
+    squares: float = 0.0
+
+    def with_rays(self, values: Tensor, most: float) -> Evidence:
+        """With the rays of one more measurement.
+
+        Args:
+            values: [R] excesses over a bound. Those that are not finite are no evidence.
+            most: rays that there are: however often they are measured, they are no more evidence.
+        """
+        values = values[values.isfinite()].double()
+        new = (float(len(values)), float(values.sum()), float(values.square().sum()))
+        sums = [REMEMBERED * old + more for old, more in zip(self, new)]
+        share = min(1.0, most / max(sums[0], 1e-9))
+        return Evidence(*(share * total for total in sums))
+
+    def exceeds(self) -> bool:
+        """Whether the mean is above 0 by more than `SURE` standard errors."""
+        if self.rays <= 1.0:
+            return False
+        mean = self.total / self.rays
+        variance = max(0.0, self.squares / self.rays - mean * mean)
+        return mean > 0.0 and mean > SURE * math.sqrt(variance / self.rays)
+
+
+class Renderer(Protocol):
+    """Renders held-out rays with and without skipping, and leaves what it renders as it was."""
+
+    def excesses(self, seed: int) -> dict[str, Tensor]:
+        """By how much rays [R] are beyond the bound of each price, by its name: above 0 is too
+        much."""
+
+    def count_rays(self, limit: int) -> float:
+        """How many rays there are to measure with; at least `limit` may be said as `limit`."""
+
+
+class Finding(NamedTuple):
+    """What a watch has found after a step."""
+
+    kind: Literal["nothing kept", "beyond", "within"]
+    why: str
+    """The prices that are beyond their bounds, in words."""
+
+
+class PriceWatch:
+    """Stands beside guided training.
+
+    Args:
+        state: what is known so far; changed in place.
+        renderer: of what is guided.
+        config: when to measure.
+        device: of the process.
+    """
+
+    def __init__(
+        self,
+        state: WatchState,
+        renderer: Renderer,
+        config: CalibrationConfig,
+        device: torch.device,
+    ) -> None:
+        self.state, self.renderer, self.config, self.device = state, renderer, config, device
+        self.steps, self.seconds = 0, 0.0
+
+    def after_step(self, step: int, seconds: float, kept: float, skips: bool) -> Finding | None:
+        """Looks at a step; measures again where that is due. None is nothing to act on.
+
+        Args:
+            seconds: that the step took.
+            kept: samples that the gate kept of its batch, in this process.
+            skips: whether it skips anything.
+        """
+        self.steps, self.seconds = self.steps + 1, self.seconds + seconds
+        if self._keeps_nothing(step, kept) and skips:
+            return Finding("nothing kept", "")
+        if self.config.recheck_rays == 0:
+            return None
+        if self.state.due == 0:
+            self.put_off(step)
+        if step < self.state.due:
+            return None
+        if not skips:
+            self.put_off(step)
+            return None
+        return self._measure(step)
+
+    def put_off(self, step: int) -> None:
+        """The next measurement is made after the fewest steps."""
+        self.state.due = step + self.config.steps_per_recheck
+
+    def _keeps_nothing(self, step: int, kept: float) -> bool:
+        """Whether no process has kept a sample for `SUSPECTED_STEPS` steps; all say the same."""
+        if mean(kept, self.device) > 0.0:
+            self.state.nothing_since = -1
+            return False
+        if self.state.nothing_since < 0:
+            self.state.nothing_since = step
+        return step - self.state.nothing_since >= SUSPECTED_STEPS
+
+    @torch.no_grad()
+    def _measure(self, step: int) -> Finding:
+        state, started = self.state, time.monotonic()
+        state.evidence = from_first(self._evidence, self.device)
+        state.rechecks += 1
+        seconds, a_step = time.monotonic() - started, self.seconds / self.steps
+        state.due = step + from_first(
+            lambda: steps_until_next(self.config, seconds, a_step), self.device
+        )
+        beyond = [name for name, sums in state.evidence.items() if Evidence(*sums).exceeds()]
+        return Finding("beyond" if beyond else "within", " and ".join(beyond))
+
+    def _evidence(self) -> dict[str, tuple[float, ...]]:
+        found = self.renderer.excesses(self.state.rechecks + 1)
+        most = self.renderer.count_rays(math.ceil(self.config.recheck_rays / (1.0 - REMEMBERED)))
+        before = self.state.evidence
+        return {
+            name: tuple(Evidence(*before.get(name, ())).with_rays(values, most))
+            for name, values in found.items()
+        }
+
+
+def steps_until_next(config: CalibrationConfig, seconds: float, a_step: float) -> int:
+    """Steps between two measurements.
+
+    Args:
+        seconds: that the last one took.
+        a_step: seconds of a training step.
+    """
+    within_share = math.ceil(seconds / (SHARE_OF_TIME * max(a_step, 1e-9)))
+    return max(config.steps_per_recheck, within_share)

@@ -1,0 +1,110 @@
+"""The two phases of a run: what changes while the occupancy is learned, and when that is over."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+from torch import Tensor
+
+from leco_plugin.models.mixture import Following
+from leco_plugin.models.objective import GateLossConfig
+from leco_plugin.scenes.input_error import InputError
+
+MOST_EXTENSIONS = 2
+"""How often a gate that has not settled is given more steps."""
+
+
+@dataclass(frozen=True)
+class ScheduleConfig:
+    """When the gate is frozen."""
+
+    freeze: bool = True
+    """Whether the gate is ever frozen; False is the plain HMoE, for comparison."""
+    restart: bool = False
+    """Whether the field starts anew when the gate is frozen, for comparison; else it goes on from
+    what it has learned."""
+    learn_steps: int = 200
+    """Steps after which the gate is frozen even if a few of its decisions still change."""
+    settled: float = 0.92
+    """Share of probe positions whose decision must be the same in the last two checks; else the
+    gate learns on for a quarter of `learn_steps`, at most twice."""
+    earliest: float = 0.85
+    """Share of `learn_steps` before which it is never frozen."""
+    ramp_from: float = 0.3
+    """Share of `learn_steps` at which the distortion loss begins to come in."""
+    ramp_to: float = 0.7
+    """Share of `learn_steps` from which it has its full weight."""
+    steps_per_record: int = 0
+    """Of leco-occupancy: steps between two entries of `occupancy_history.safetensors` in the run's
+    folder, from which `leco inspect` draws how the occupancy was learned; 0 writes none."""
+    steps_per_check: int = 25
+    """Steps between two looks at the gate."""
+    agreement: float = 0.99
+    """Share of probe positions whose decision must be the same in two checks running."""
+
+    def __post_init__(self) -> None:
+        for name in ("learn_steps", "steps_per_check"):
+            if getattr(self, name) < 1:
+                option = f"schedule.{name.replace('_', '-')}"
+                raise InputError(f"{option} is {getattr(self, name)}; it takes at least one step")
+
+
+def ramp(step: int, config: ScheduleConfig) -> float:
+    """How far the distortion loss has come in: 0 at first, 1 from `ramp_to` on.
+
+    At once it would press all weight onto the ends of the rays, which is a flat picture behind the
+    scene; first the views have to find the surfaces between them.
+    """
+    start, end = (share * config.learn_steps for share in (config.ramp_from, config.ramp_to))
+    return min(1.0, max(0.0, (step - start) / max(1.0, end - start)))
+
+
+def converged(step: int, agreement: float, config: ScheduleConfig) -> bool:
+    """Whether to freeze at this check.
+
+    Args:
+        step: training step.
+        agreement: share of probe decisions equal to those of the check before; 0 at the first.
+    """
+    if step + 1 >= config.learn_steps:
+        return True
+    return step + 1 >= config.earliest * config.learn_steps and agreement >= config.agreement
+
+
+def steps_of_an_extension(learn_steps: int) -> int:
+    """Steps that a gate gets beyond those of its config, each time that it has not settled."""
+    return max(1, learn_steps // 4)
+
+
+def is_unsettled(step: int, agreement: float, config: ScheduleConfig, extensions: int) -> bool:
+    """Whether a gate at its step limit should learn on.
+
+    Args:
+        step: training step.
+        agreement: share of probe decisions equal to those of the check before.
+        extensions: how often it has learned on already.
+    """
+    looked_often = step + 1 >= 4 * config.steps_per_check
+    return looked_often and agreement < config.settled and extensions < MOST_EXTENSIONS
+
+
+def decisions_agree(before: Tensor, now: Tensor) -> float:
+    """Share of equal decisions of two bool [P] tensors; 0 when there were none before."""
+    if len(before) != len(now) or len(now) == 0:
+        return 0.0
+    return float((before == now).float().mean())
+
+
+class StepPlan(NamedTuple):
+    """How one training step samples and what it teaches."""
+
+    step: int
+    coarse: bool
+    """Whether rays are marched in the coarse steps of the first phase."""
+    ramped: float
+    """How far the distortion loss has come in, in [0, 1]."""
+    following: Following | None
+    """Which candidates the gate being learned leaves out; None leaves out none."""
+    gate_loss: GateLossConfig | None
+    """What teaches the gate; None once it is frozen."""

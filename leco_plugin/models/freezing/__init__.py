@@ -1,1 +1,0 @@
-"""What skipping costs: measured when the gate is frozen, and again while it guides."""

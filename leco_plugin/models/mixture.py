@@ -1,0 +1,281 @@
+"""The mixture that learns an occupancy: gate, field and region, and how rays pass through them.
+
+It knows no schedule and no trainer. Only `freeze` and `reopen` write whether the gate is frozen,
+and its threshold.
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import torch
+from torch import Tensor, nn
+
+from leco_plugin.models.field import HMoEField
+from leco_plugin.models.front_to_back import shade_front_to_back
+from leco_plugin.models.gate import Gate
+from leco_plugin.models.region import Region, marching_rule
+from leco_plugin.models.rendering import (
+    Intervals,
+    Rays,
+    Routing,
+    Shaded,
+    mapped_middles,
+    shade,
+    with_backdrop,
+)
+from leco_plugin.models.sizing.sizes import Sizes
+from leco_plugin.models.sizing.stored_sizes import SIZES, stored_in, to_store
+from leco_plugin.occupancy import Occupancy, Precision, gate_precision
+from leco_plugin.samplers.estimator import LearnedOccupancyEstimator
+from leco_plugin.samplers.marching import march
+from leco_plugin.scenes.bounds import SceneBounds
+from leco_plugin.scenes.input_error import InputError
+
+
+class March(NamedTuple):
+    """The steps of a march."""
+
+    step: float
+    """Smallest step, scene units."""
+    cone: float
+    """Step over distance, where that is larger."""
+
+
+class Following(NamedTuple):
+    """How candidates are left out while the gate is learned."""
+
+    above: float
+    """o(x) from which a candidate is shaded."""
+    everywhere: float
+    """Share of rays that shade all their candidates."""
+
+
+class Mixture(nn.Module):
+    """Gate, field and region.
+
+    Args:
+        sizes: of gate, field and marches.
+        num_images: training images, each with an appearance code.
+        precision: of matrix products; the gate decides otherwise in another one than it was
+            taught in, so that a checkpoint restores it.
+        routing: which expert each point is sent to.
+
+    Attributes:
+        frozen: scalar bool, whether the gate is frozen.
+        threshold: scalar, o(x) from which a frozen gate keeps a candidate; at 0 all are kept.
+        report: what the frozen gate costs and saves, as its file has it.
+    """
+
+    frozen: Tensor
+    threshold: Tensor
+    steps: Tensor
+    cones: Tensor
+
+    def __init__(
+        self, sizes: Sizes, num_images: int, precision: Precision, routing: Routing
+    ) -> None:
+        super().__init__()
+        self.precision, self.routing = precision, routing
+        self._build(sizes, num_images)
+        self.region = Region()
+        self.register_buffer("frozen", torch.tensor(False))
+        self.register_buffer("threshold", torch.tensor(0.0))
+        # of the fine march and of the coarse one
+        self.register_buffer("steps", torch.tensor([0.03, 0.06]))
+        self.register_buffer("cones", torch.tensor([0.0, 0.0]))
+        self.report: dict[str, Any] = {}
+        # in a tuple: the estimator shares the gate, which must not be registered twice
+        self._estimator: tuple[LearnedOccupancyEstimator, ...] = ()
+
+    def _build(self, sizes: Sizes, num_images: int) -> None:
+        self.sizes, self.num_images = sizes, num_images
+        self.gate = Gate(sizes.gate)
+        self.field = HMoEField(sizes.field, num_images)
+
+    @property
+    def device(self) -> torch.device:
+        """Where its weights are."""
+        return self.frozen.device
+
+    @property
+    def skips(self) -> bool:
+        """Whether a frozen gate leaves out any candidate."""
+        return bool(self.frozen) and float(self.threshold) > 0.0
+
+    def set_bounds(self, bounds: SceneBounds, median_length: float) -> None:
+        """Fixes the region and the marches.
+
+        Args:
+            median_length: median length of rays inside the bounds, scene units.
+        """
+        self.region.set(bounds)
+        for number, candidates in enumerate((self.sizes.candidates, self.sizes.learn_candidates)):
+            rule = marching_rule(bounds.kind, bounds.near, bounds.far, candidates, median_length)
+            self.steps[number], self.cones[number] = rule
+
+    def march(self, coarse: bool = False) -> March:
+        """The fine march of renderings, or the coarse one of learning."""
+        return March(float(self.steps[int(coarse)]), float(self.cones[int(coarse)]))
+
+    def rays(
+        self,
+        origins: Tensor,
+        directions: Tensor,
+        images: Tensor | None,
+        crop: tuple[Tensor | None, Tensor | None] = (None, None),
+    ) -> Rays:
+        """Rays cut to the region; see `Region.rays`."""
+        return self.region.rays(origins, directions, images, self.steps.min(), crop)
+
+    def candidates(
+        self, rays: Rays, coarse: bool = False, jitter: Tensor | None = None
+    ) -> Intervals:
+        """Candidates along rays, without backdrops.
+
+        Args:
+            coarse: whether to take the march of learning.
+            jitter: [R] in [0, 1), by which share of a step each ray's march is shifted.
+        """
+        step, cone = self.march(coarse)
+        along = rays.origins, rays.directions, rays.t_mins, rays.t_maxs
+        return Intervals(*march(*along, step_size=step, cone_angle=cone, jitter=jitter))
+
+    def kept(self, rays: Rays, coarse: bool = False, jitter: Tensor | None = None) -> Intervals:
+        """Those candidates that the frozen gate keeps; all where it skips nothing."""
+        if not self.skips:
+            return self.candidates(rays, coarse, jitter)
+        along = rays.origins, rays.directions, rays.t_mins, rays.t_maxs
+        march = self.march(coarse)
+        return Intervals(*self.estimator().kept(*along, *march, jitter, t_enters=None))
+
+    @torch.no_grad()
+    def follow(self, rays: Rays, intervals: Intervals, following: Following) -> Intervals:
+        """Leaves out what the gate, as far as it has learned, calls empty; some rays keep all."""
+        mapped = mapped_middles(self.region.space, rays, intervals)
+        with gate_precision(self.device.type, self.precision):
+            likely = self.gate.occupancy(mapped) >= following.above
+        dense = torch.rand_like(rays.t_mins) < following.everywhere
+        shaded = (likely | dense.index_select(0, intervals.ray_indices)).nonzero()[:, 0]
+        return Intervals(*(part.index_select(0, shaded) for part in intervals))
+
+    def with_backdrops(self, rays: Rays, intervals: Intervals, coarse: bool = False) -> Intervals:
+        """Ends each ray in its backdrop, which no gate skips."""
+        return with_backdrop(intervals, rays, *self.march(coarse))
+
+    def shade(self, rays: Rays, intervals: Intervals) -> Shaded:
+        """Renders intervals; no gradient reaches a frozen gate."""
+        with gate_precision(self.device.type, self.precision):
+            return shade(
+                self.field,
+                self.gate,
+                self.region.space,
+                rays,
+                intervals,
+                self.routing,
+                freeze_gate=bool(self.frozen),
+            )
+
+    def shade_what_is_seen(self, rays: Rays, intervals: Intervals) -> tuple[Shaded, Intervals]:
+        """As `shade`, without gradients and without what lies behind opaque surfaces."""
+        with gate_precision(self.device.type, self.precision):
+            return shade_front_to_back(
+                self.field, self.gate, self.region.space, rays, intervals, self.routing
+            )
+
+    @torch.no_grad()
+    def freeze(self, threshold: float, report: dict[str, Any]) -> None:
+        """Freezes the gate, or gives a frozen one another threshold.
+
+        Args:
+            threshold: o(x) from which a candidate is kept; 0 keeps all.
+            report: what that costs and saves.
+        """
+        self.threshold.fill_(threshold)
+        self.frozen.fill_(True)
+        self.gate.requires_grad_(False)
+        self.report = report
+        self._estimator = ()
+
+    @torch.no_grad()
+    def reopen(self) -> None:
+        """Has a frozen gate learn again."""
+        self.threshold.fill_(0.0)
+        self.frozen.fill_(False)
+        self.gate.requires_grad_(True)
+        self.report = {}
+        self._estimator = ()
+
+    def restart_field(self) -> None:
+        """Gives the field the weights of a new one; scene experts that left stay away."""
+        fresh = HMoEField(self.field.config, self.num_images)
+        for number, left in enumerate(self.field.experts.left.tolist(), 1):
+            if not left:
+                fresh.experts.drop(number)
+        self.field.load_state_dict(fresh.state_dict())
+
+    def restart_gate(self) -> None:
+        """Gives the gate the weights of a new one."""
+        self.gate.load_state_dict(Gate(self.gate.config).state_dict())
+
+    def occupancy(self) -> Occupancy:
+        """The gate as an `Occupancy`; it shares the gate's parameters."""
+        region, threshold = self.region, float(self.threshold)
+        made = Occupancy(
+            self.gate, region.space, threshold, self.precision, self.report, region.aabb
+        )
+        return made.to(self.device)
+
+    def estimator(self) -> LearnedOccupancyEstimator:
+        """Samples where the frozen gate says so; built on first use, also after a checkpoint.
+
+        No property: nerfstudio's viewer reads all that it finds, before the first step.
+        """
+        if not self._estimator:
+            self._estimator = (LearnedOccupancyEstimator(self.occupancy()).to(self.device),)
+        return self._estimator[0]
+
+    def parameter_groups(self) -> dict[str, list[nn.Parameter]]:
+        """`encoding` (tables of both, if any), and what else there is in `field` and `gate`."""
+        tables = [*self.field.encoding.parameters(), *self.gate.encoding.parameters()]
+        known = {id(parameter) for parameter in tables}
+        groups = {
+            name: [p for p in module.parameters() if id(p) not in known]
+            for name, module in (("field", self.field), ("gate", self.gate))
+        }
+        return groups | {"encoding": tables}
+
+    def get_extra_state(self) -> dict[str, Any]:
+        """What travels with a checkpoint beside tensors, as plain values."""
+        return {
+            SIZES: to_store(self.sizes, self.num_images),
+            "precision": self.precision,
+            "routing": self.routing._asdict(),
+            "report": self.report,
+        }
+
+    def _load_from_state_dict(self, state_dict: dict[str, Any], prefix: str, *rest: Any) -> None:
+        """Gate and field are first built as they were stored, whatever the scene is now.
+
+        Raises:
+            InputError: the state is of another release.
+        """
+        extra = state_dict.get(f"{prefix}_extra_state")
+        if extra is not None:
+            now = self.sizes, self.num_images
+            try:
+                stored = stored_in(extra, now)
+            except ValueError as error:
+                raise InputError(str(error)) from None
+            if stored != now:
+                device = self.device
+                self._build(*stored)
+                self.to(device)
+        super()._load_from_state_dict(state_dict, prefix, *rest)
+
+    def set_extra_state(self, state: dict[str, Any]) -> None:
+        """Restores what `get_extra_state` gave."""
+        self.precision, self.report = state["precision"], dict(state["report"])
+        self.routing = Routing(**state["routing"])
+        self.gate.requires_grad_(not bool(self.frozen))
+        self._estimator = ()

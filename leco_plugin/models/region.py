@@ -1,0 +1,210 @@
+"""The part of space that is marched: its mapping, box and range, and the skies seen in it."""
+
+from __future__ import annotations
+
+from itertools import product
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+from leco_plugin.models.rendering import Rays
+from leco_plugin.samplers.marching.rays import intersect_box
+from leco_plugin.scenes.bounds import SceneBounds
+from leco_plugin.space import Space, SpaceKind
+
+DIRECTIONS = 16
+"""Cells a side of the grid over directions: 7 degrees each."""
+TOLERANCE = 0.02
+"""Of the z of a unit direction, 1 degree at the horizon: between the rays that cover an image."""
+SIDE = 32
+"""Rays a side that cover each training image: 12 degrees apart in a panorama."""
+
+
+class Region(nn.Module):
+    """Where a scene lies. All of it is buffers, because nerfstudio tells a model its step before it
+    restores its state.
+
+    Attributes:
+        space: the mapping of positions.
+        known: scalar bool, whether `set` was called.
+        near, far: scalars, where all rays begin and end, scene units.
+        aabb: [6] corners of the box in which rays are marched.
+        backdrops: directions in which training has seen what lies beyond.
+    """
+
+    known: Tensor
+    near: Tensor
+    far: Tensor
+    aabb: Tensor
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.space = Space()
+        self.register_buffer("known", torch.tensor(False))
+        self.register_buffer("near", torch.tensor(0.05))
+        self.register_buffer("far", torch.tensor(4.0))
+        self.register_buffer("aabb", torch.tensor([-1.0] * 3 + [1.0] * 3))
+        self.backdrops = SeenBackdrops()
+
+    @torch.no_grad()
+    def set(self, bounds: SceneBounds) -> None:
+        """Fixes mapping, box and range."""
+        self.space.set(bounds.kind, bounds.center, bounds.half_extent)
+        self.aabb.copy_(bounds.aabb)
+        self.near.fill_(bounds.near)
+        self.far.fill_(bounds.far)
+        self.known.fill_(True)
+
+    @torch.no_grad()
+    def look(self, origins: Tensor, directions: Tensor) -> None:
+        """Notes where rays [N, 3] that cover the training images leave the scene."""
+        cut = self.cut(origins.to(self.aabb), directions.to(self.aabb))
+        self.backdrops.note(cut, ~self.leaves_by_floor(cut))
+
+    def rays(
+        self,
+        origins: Tensor,
+        directions: Tensor,
+        images: Tensor | None,
+        length: Tensor,
+        crop: tuple[Tensor | None, Tensor | None] = (None, None),
+    ) -> Rays:
+        """Rays cut to the region and to a crop.
+
+        A ray that misses the box keeps a backdrop at the far end: its sky. Rays of no training
+        image have a backdrop only where training has seen one.
+
+        Args:
+            origins, directions: [R, 3], scene units and unit vectors.
+            images: [R] int64 of training images, or None.
+            length: scalar, of the sky, scene units.
+            crop: nears and fars of the rays, [R] or [R, 1], scene units; None is no crop.
+        """
+        rays = self.cut(origins, directions, images)
+        if images is None:
+            rays = rays._replace(cut_off=~self._shows_backdrop(rays))
+        return within_crop(with_ends_for_all(rays, self.far, length), *crop)
+
+    def cut(self, origins: Tensor, directions: Tensor, images: Tensor | None = None) -> Rays:
+        """Rays cut to box and range; one that misses them ends before it begins."""
+        enters, leaves = intersect_box(origins, directions, self.aabb)
+        return Rays(
+            origins,
+            directions,
+            # finite also for a ray that runs along a wall outside, so that its backdrop has a place
+            enters.clamp(min=self.near).clamp(max=self.far),
+            leaves.clamp(min=0.0).clamp(max=self.far),
+            images,
+        )
+
+    def leaves_by_floor(self, cut: Rays) -> Tensor:
+        """Whether rays leave a bounded scene through its floor, inside its cube: bool [R]."""
+        ends = torch.addcmul(cut.origins, cut.directions, cut.t_maxs[:, None])
+        at_floor = (ends[:, 2] - self.aabb[2]).abs() <= 1e-3 * (self.aabb[5] - self.aabb[2])
+        inside = self.space.map(ends).abs().amax(dim=-1) <= 1.0
+        return at_floor & inside & (cut.t_maxs > cut.t_mins)
+
+    def _shows_backdrop(self, cut: Rays) -> Tensor:
+        return self.leaves_by_floor(cut) | self.backdrops(cut)
+
+
+class SeenBackdrops(nn.Module):
+    """Directions in which training rays miss the scene, or leave it but not through its floor.
+
+    Only there has a backdrop learned its colour: a sky, or the distance. Before any ray is noted,
+    every direction counts as seen.
+    """
+
+    limits: Tensor
+    """[4, cells]: of z and of -z of the directions in each cell, the largest; first of rays that
+    meet the scene, then of those that miss it."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.register_buffer("limits", torch.full((4, DIRECTIONS**3), 2.0))
+
+    @torch.no_grad()
+    def note(self, cut: Rays, beyond: Tensor) -> None:
+        """Notes rays of training images.
+
+        Args:
+            cut: to the region.
+            beyond: bool [R], which of them show what lies beyond the scene.
+        """
+        missed, heights = cut.t_maxs <= cut.t_mins, cut.directions[:, 2]
+        cells, limits = cells_of(cut.directions), torch.full_like(self.limits, -2.0)
+        for number, (which, z) in enumerate(product((~missed, missed), (heights, -heights))):
+            noted = beyond & which
+            limits[number].scatter_reduce_(0, cells[noted], z[noted], "amax")
+        # neighbours count too, so that the cells of neighbouring rays leave no gap
+        grids = limits.view(1, 4, DIRECTIONS, DIRECTIONS, DIRECTIONS)
+        self.limits.copy_(nn.functional.max_pool3d(grids, 3, 1, 1).view_as(limits))
+
+    def forward(self, cut: Rays) -> Tensor:
+        """Whether training has seen what lies behind rays that are cut to the region: bool [R]."""
+        of_each = self.limits[:, cells_of(cut.directions)] + TOLERANCE
+        high, low = torch.where(cut.t_maxs > cut.t_mins, of_each[:2], of_each[2:])
+        heights = cut.directions[:, 2]
+        return (heights <= high) & (-heights <= low)
+
+    def _load_from_state_dict(self, state_dict: dict[str, Any], prefix: str, *rest: Any) -> None:
+        """A part of a state, without limits, changes nothing: nerfstudio loads in two parts."""
+        if f"{prefix}limits" in state_dict:
+            super()._load_from_state_dict(state_dict, prefix, *rest)
+
+
+def cells_of(directions: Tensor) -> Tensor:
+    """Cells of unit directions [R, 3] in the grid over directions: [R] int64."""
+    x, y, z = ((0.5 * directions + 0.5) * DIRECTIONS).long().clamp(0, DIRECTIONS - 1).unbind(-1)
+    return (x * DIRECTIONS + y) * DIRECTIONS + z
+
+
+def with_ends_for_all(rays: Rays, far: Tensor, length: Tensor) -> Rays:
+    """Gives rays that miss the bounds a piece as long as a backdrop at the far end: their sky.
+
+    The piece of a ray without a backdrop has no length.
+
+    Args:
+        far, length: scalars, scene units.
+    """
+    missed = ~(rays.t_maxs > rays.t_mins)
+    starts = far - length
+    starts = starts if rays.cut_off is None else torch.where(rays.cut_off, far, starts)
+    return rays._replace(
+        t_mins=torch.where(missed, starts, rays.t_mins), t_maxs=rays.t_maxs.where(~missed, far)
+    )
+
+
+def within_crop(rays: Rays, nears: Tensor | None, fars: Tensor | None) -> Rays:
+    """Rays between the nears and fars that a crop gives a bundle.
+
+    A ray that the crop ends before its own end has no backdrop.
+
+    Args:
+        nears, fars: [R] or [R, 1], scene units; None is no crop.
+    """
+    if nears is None or fars is None:
+        return rays
+    t_maxs = rays.t_maxs.minimum(fars.reshape(-1))
+    t_mins = rays.t_mins.maximum(nears.reshape(-1)).minimum(t_maxs)
+    ended = (t_maxs < rays.t_maxs) | (t_mins >= t_maxs)
+    cut_off = ended if rays.cut_off is None else rays.cut_off | ended
+    return rays._replace(t_mins=t_mins, t_maxs=t_maxs, cut_off=cut_off)
+
+
+def marching_rule(
+    kind: SpaceKind, near: float, far: float, candidates: int, median_length: float
+) -> tuple[float, float]:
+    """Step size and cone angle with which a ray has about so many candidates.
+
+    A box is marched evenly; an unbounded scene in steps that grow with distance.
+
+    Args:
+        near, far: where rays begin and end, scene units.
+        median_length: median length of rays inside the bounds, scene units.
+    """
+    if kind == "box":
+        return median_length / candidates, 0.0
+    cone_angle: float = (far / near) ** (1.0 / candidates) - 1.0
+    return near * cone_angle, cone_angle

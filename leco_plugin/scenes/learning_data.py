@@ -1,0 +1,141 @@
+"""What a nerfstudio data manager gives a learner: batches, held-out pixels, and where they lie."""
+
+from __future__ import annotations
+
+import math
+from functools import cached_property
+from typing import Any
+
+from nerfstudio.cameras.rays import RayBundle
+from torch import Tensor
+
+from leco_plugin.log import say
+from leco_plugin.models.region import SIDE
+from leco_plugin.scenes.bounds import BoundsConfig
+from leco_plugin.scenes.frames import data_frame_of, frame_of
+from leco_plugin.scenes.pixels.held_out_pixels import held_out_sampler, some_images
+from leco_plugin.scenes.pixels.known_distances import KnownDistancePixelSampler, sampler_here
+from leco_plugin.scenes.pixels.lattice import Lattice, Share
+from leco_plugin.scenes.pixels.sparse_pixels import SparsePixels, sparse_pixels
+from leco_plugin.scenes.survey import Survey, covering_rays, sparse_points, survey
+
+
+class LearningData:
+    """A data manager as a learner sees it.
+
+    Args:
+        manager: nerfstudio's, or one with its interface.
+        bounds, near, far: what of the scene's place is set by hand.
+    Raises:
+        InputError: the data manager hands out whole images, or no ray meets the scene.
+    """
+
+    def __init__(
+        self, manager: Any, bounds: BoundsConfig, near: float | None, far: float | None
+    ) -> None:
+        self.manager = manager
+        self.survey: Survey = survey(manager, bounds, near, far)
+        self.rays_per_batch = int(manager.get_train_rays_per_batch())
+
+    def covering_rays(self) -> tuple[Tensor, Tensor]:
+        """Origins and unit directions [N, 3] of rays that cover the training images."""
+        rays = covering_rays(self.manager.train_dataset.cameras, SIDE)
+        return rays[0].reshape(-1, 3), rays[1].reshape(-1, 3)
+
+    def prepare_batch(self, factor: float, distances: bool) -> None:
+        """Sets the next batch; one that is drawn elsewhere stays as it is.
+
+        Args:
+            factor: its rays as a multiple of those of the config.
+            distances: whether pixels whose distance is known are drawn too.
+        """
+        sampler = sampler_here(self.manager)
+        if isinstance(sampler, KnownDistancePixelSampler):
+            sampler.sparse = self.sparse if distances else None
+        rays = round(self.rays_per_batch * factor)
+        if sampler is not None and sampler.num_rays_per_batch != rays:
+            sampler.set_num_rays_per_batch(rays)
+
+    def say_what_is_fixed(self) -> None:
+        """Says so where another process draws the batches."""
+        if sampler_here(self.manager) is None:
+            say("unknown pixel sampler: the batch size is fixed, and depth supervision is off")
+
+    @cached_property
+    def sparse(self) -> SparsePixels | None:
+        """Where sparse points are seen; projected only once learning asks for it."""
+        dataset: Any = self.manager.train_dataset
+        points = sparse_points(dataset)
+        if points is None:
+            return None
+        sampler = held_out_sampler(self.manager)
+        lattice = Lattice() if sampler is None else sampler.lattice
+        return sparse_pixels(dataset.cameras, points, lattice)
+
+    def held_out(
+        self, count: int, seed: int = 0, share: Share = "calibration"
+    ) -> tuple[RayBundle, Tensor]:
+        """See `held_out_bundle`."""
+        return held_out_bundle(self.manager, count, seed, share)
+
+    def count_held_out(self, limit: int) -> float:
+        """How many pixels there are to check with, up to a limit; endless if none is held out."""
+        return count_held_out(self.manager, limit)
+
+    def facts(self) -> dict[str, Any]:
+        """What the report of an occupancy says of its data, as JSON values."""
+        return {
+            "held_out": held_out_sampler(self.manager) is not None,
+            "bounds": self.survey.bounds.reason,
+            "cameras": self.survey.positions.tolist(),
+            "frame": frame_of(self.manager),
+            "data_frame": data_frame_of(self.manager),
+        }
+
+
+def held_out_bundle(
+    manager: Any, count: int, seed: int = 0, share: Share = "calibration"
+) -> tuple[RayBundle, Tensor]:
+    """Rays of training pixels that are never trained on, and their true colours [R, 3 or 4].
+
+    They are of training images, whose appearance is known: an exposure that the mean of all does
+    not show would stand in every error, and hide what skipping adds to it. A data manager without
+    held-out pixels gives ordinary training rays; the report says so.
+
+    Args:
+        count: rays wanted; fewer come back where there are fewer.
+        seed: of the draw.
+        share: of the held-out pixels.
+    """
+    sampler = held_out_sampler(manager)
+    if sampler is None:
+        bundle, batch = manager.next_train(0)
+        return bundle[:count], batch["image"][:count]
+    batch = sampler.sample_held_out(_images_of(manager), count, seed, share)
+    pixels = batch["indices"]
+    bundle = manager.train_dataset.cameras.to("cpu").generate_rays(
+        camera_indices=pixels[:, :1], coords=pixels[:, 1:].float() + 0.5
+    )
+    return bundle, batch["image"]
+
+
+def count_held_out(manager: Any, limit: int) -> float:
+    """How many pixels there are to check with, up to a limit; infinity if none is held out."""
+    sampler = held_out_sampler(manager)
+    if sampler is None:
+        return math.inf
+    return float(sampler.count_held_out(_images_of(manager), limit, "recheck"))
+
+
+def on_black(image: Tensor) -> Tensor:
+    """Colours [..., 3] of pixels [..., 3 or 4], transparent ones over black."""
+    return image if image.shape[-1] < 4 else image[..., :3] * image[..., 3:]
+
+
+def _images_of(manager: Any) -> dict[str, Any]:
+    """Images to take held-out pixels from: those that are loaded, or some where none are here."""
+    loader = getattr(manager, "iter_train_image_dataloader", None)
+    if loader is None:
+        return some_images(manager.train_dataset)
+    loaded: dict[str, Any] = next(loader)
+    return loaded

@@ -1,0 +1,303 @@
+"""The threshold is the largest whose measured price is within its bounds."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from torch import Tensor
+
+from leco_plugin.learning.calibration import (
+    SURFACE_STEPS,
+    THRESHOLDS,
+    CalibrationConfig,
+    Reference,
+    backdrop_price,
+    calibrate,
+    measure,
+    near_median_depth,
+    near_surface,
+    ray_prices,
+    reference_of,
+)
+from leco_plugin.models.rendering import Intervals, Rays, Shaded
+from leco_plugin.samplers.packed import accumulate_along_rays, pack_info
+
+RAYS, SAMPLES = 20, 30
+CONFIG = CalibrationConfig()
+
+
+class Chunk:
+    """Synthetic rays with grey samples, whose pixels are their weights times their greys."""
+
+    def __init__(self, seed: int) -> None:
+        generator = torch.Generator().manual_seed(seed)
+        self.ray_indices = torch.arange(RAYS).repeat_interleave(SAMPLES)
+        starts = torch.arange(SAMPLES).float().repeat(RAYS)
+        logits = torch.randn(RAYS, SAMPLES, generator=generator) * 3
+        weights = (0.9 * logits.softmax(dim=-1)).flatten()
+        # the gate knows the weights, up to some noise
+        noise = torch.rand(len(weights), generator=generator) ** 4
+        occupancies = (weights * 10).clamp(max=1.0) * (1.0 - noise)
+        self.greys = torch.rand(len(weights), 3, generator=generator)
+        near = weights > 0.01
+        intervals = Intervals(self.ray_indices, starts, starts + 1.0)
+        self.reference = Reference(
+            intervals, weights, occupancies, near, self.render(weights), torch.zeros_like(near)
+        )
+        self.truth = self.reference.rgb + 0.05 * torch.randn(RAYS, 3, generator=generator)
+
+    def render(self, weights: Tensor) -> Tensor:
+        return accumulate_along_rays(weights, self.greys, self.ray_indices, RAYS)
+
+
+class Problem:
+    def __init__(self, seed: int) -> None:
+        self.chunks = [Chunk(seed), Chunk(seed + 1)]
+        self.references = [chunk.reference for chunk in self.chunks]
+        self.truths = [chunk.truth for chunk in self.chunks]
+
+    def render_kept(self, number: int, mask: Tensor) -> Tensor:
+        chunk = self.chunks[number]
+        return chunk.render(chunk.reference.weights * mask)
+
+    def arguments(self) -> tuple:
+        return self.references, self.truths, self.render_kept
+
+
+@settings(deadline=None, max_examples=20)
+@given(
+    seed=st.integers(0, 2**16),
+    mass=st.sampled_from([1e-4, 1e-2, 0.2]),
+    price=st.sampled_from([0.01, 0.1, 1.0]),
+)
+def test_the_threshold_is_the_largest_within_the_bounds(
+    seed: int, mass: float, price: float
+) -> None:
+    problem, config = Problem(seed), CalibrationConfig(mass, price)
+    found = calibrate(*problem.arguments(), config)
+    fitting = [t for t in THRESHOLDS if measure(*problem.arguments(), t).within(config)]
+    assert found.threshold == max(fitting, default=0.0)
+    assert found.threshold == 0.0 or found.within(config)
+
+
+def test_nothing_is_skipped_when_no_threshold_fits() -> None:
+    problem = Problem(0)
+    for reference in problem.references:
+        reference.occupancies.zero_()  # a gate that calls the whole scene empty
+    found = calibrate(*problem.arguments(), CalibrationConfig())
+    assert found == (0.0,) * len(found)
+
+
+def test_a_perfect_gate_gets_the_largest_threshold_for_nothing() -> None:
+    problem = Problem(0)
+    for chunk in problem.chunks:
+        empty = torch.rand(len(chunk.reference.weights)) < 0.5
+        chunk.reference.weights[empty] = 0.0
+        chunk.reference.rgb.copy_(chunk.render(chunk.reference.weights))
+        chunk.reference.occupancies.copy_((~empty).float())
+    found = calibrate(*problem.arguments(), CalibrationConfig(0.0, 0.0))
+    assert found.threshold == max(THRESHOLDS)
+    assert found[1:4] == (0.0, 0.0, 0.0)
+    assert 0.4 < found.empty_fraction < 0.6
+
+
+def test_prices_are_those_of_their_definitions() -> None:
+    problem, threshold = Problem(3), 0.3
+    weights = torch.cat([reference.weights for reference in problem.references]).double()
+    near = torch.cat([reference.near_surface for reference in problem.references])
+    gone = torch.cat([reference.occupancies for reference in problem.references]) < threshold
+    masks = gone.view(2, -1)
+    errors = [
+        torch.cat(
+            [(image - truth).double() ** 2 for image, truth in zip(images, problem.truths)]
+        ).mean()
+        for images in (
+            [reference.rgb for reference in problem.references],
+            [problem.render_kept(i, ~masks[i]) for i in range(2)],
+        )
+    ]
+    found = measure(*problem.arguments(), threshold)
+    assert found.lost_mass == pytest.approx(float(weights[gone].sum() / weights.sum()), rel=1e-5)
+    expected = float(weights[gone & near].sum() / weights[near].sum())
+    assert found.lost_surface_mass == pytest.approx(expected, rel=1e-5)
+    assert found.image_price_db == pytest.approx(
+        float(10 * (errors[1] / errors[0]).log10()), abs=1e-4
+    )
+    assert found.empty_fraction == pytest.approx(float(gone.float().mean()))
+
+
+def test_standard_errors_are_those_of_a_bootstrap_over_rays() -> None:
+    problem, threshold = Problem(5), 0.4
+    rays = ray_prices(*problem.arguments(), threshold)
+    found = measure(*problem.arguments(), threshold)
+    drawn = torch.randint(2 * RAYS, (4000, 2 * RAYS), generator=torch.Generator().manual_seed(0))
+    masses = rays.lost_surface[drawn].sum(dim=1) / rays.surface[drawn].sum(dim=1)
+    prices = 10.0 * torch.log10(
+        rays.gated_error[drawn].sum(dim=1) / rays.dense_error[drawn].sum(dim=1)
+    )
+    assert found.surface_error == pytest.approx(float(masses.std()), rel=0.15)
+    assert found.price_error_db == pytest.approx(float(prices.std()), rel=0.15)
+
+
+def test_one_ray_of_a_few_does_not_decide_and_many_do() -> None:
+    for scene, fits in ((Problem(0), True), (Problem(1), False)):
+        for reference in scene.references:
+            reference.occupancies.fill_(1.0)
+            of_first = reference.intervals.ray_indices == 0
+            lost = of_first if fits else torch.ones_like(of_first)
+            reference.occupancies[lost & reference.near_surface] = 0.0
+        if fits:
+            scene.references[1].occupancies.fill_(1.0)
+        found = measure(*scene.arguments(), 0.5)
+        found = found._replace(image_price_db=0.0, price_error_db=0.0)
+        config = CalibrationConfig(lost_surface_mass=5e-3)
+        assert found.lost_surface_mass > 4 * config.lost_surface_mass
+        assert found.within(config) == fits
+        ten_times_less = CalibrationConfig(lost_surface_mass=5e-4)  # whatever the error is
+        assert not found.within(ten_times_less)
+
+
+def test_a_backdrop_is_worth_what_the_image_loses_without_it() -> None:
+    problem = Problem(2)
+    assert backdrop_price(*problem.arguments()) == 0.0  # there is none
+    last = torch.arange(RAYS * SAMPLES) % SAMPLES == SAMPLES - 1
+    errors = torch.zeros(2)
+    for number, chunk in enumerate(problem.chunks):
+        chunk.reference.always_kept.copy_(last)
+        images = chunk.reference.rgb, problem.render_kept(number, ~last)
+        errors += torch.stack([(image - chunk.truth).square().sum() for image in images])
+    expected = float(10.0 * torch.log10(errors[1] / errors[0]))
+    assert expected > 0.0
+    assert backdrop_price(*problem.arguments()) == pytest.approx(expected, rel=1e-4)
+    assert backdrop_price([], [], problem.render_kept) == 0.0
+
+
+def test_without_an_image_there_is_no_image_price() -> None:
+    assert math.isnan(measure(*Problem(0).arguments(), 0.1, with_image=False).image_price_db)
+
+
+def test_no_rays_at_all_cost_nothing() -> None:
+    found = measure([], [], lambda i, mask: mask, 0.5)
+    assert found.lost_surface_mass == found.lost_mass == found.empty_fraction == 0.0
+
+
+@settings(deadline=None, max_examples=30)
+@given(seed=st.integers(0, 2**16))
+def test_near_the_median_depth_is_within_two_steps_of_it(seed: int) -> None:
+    torch.manual_seed(seed)
+    counts = torch.tensor([7, 0, 12, 1, 30])
+    ray_indices = torch.arange(5).repeat_interleave(counts)
+    starts = torch.cat([torch.arange(int(count)) * 0.5 for count in counts])
+    intervals = Intervals(ray_indices, starts, starts + 0.5)
+    weights = torch.rand(50) ** 8 / 30
+    accumulation = accumulate_along_rays(weights, None, ray_indices, 5)[:, 0]
+    none = torch.zeros(0)
+    shaded = Shaded(none, accumulation, none, weights, none, none, none, pack_info(ray_indices, 5))
+    near = near_median_depth(shaded, intervals)
+    for ray in range(5):
+        mine = (ray_indices == ray).nonzero()[:, 0].tolist()
+        total = 0.0
+        for median in mine:
+            total += float(weights[median])
+            if total >= 0.5 * float(accumulation[ray]) * (1 - 1e-6):
+                break
+        for sample in mine:
+            expected = abs(sample - median) <= SURFACE_STEPS
+            assert bool(near[sample]) == expected
+
+
+def test_before_a_backdrop_that_holds_the_median_there_is_no_surface() -> None:
+    ray_indices = torch.arange(3).repeat_interleave(4)
+    starts = torch.arange(4).repeat(3) * 0.5
+    intervals = Intervals(ray_indices, starts, starts + 0.5)
+    hazy, solid, thin = [0.0, 0.2, 0.2, 0.6], [0.0, 0.7, 0.1, 0.2], [0.5, 0.0, 0.0, 0.5]
+    weights, none = torch.tensor([*hazy, *solid, *thin]), torch.zeros(0)
+    packed = pack_info(ray_indices, 3)
+    shaded = Shaded(none, torch.ones(3), none, weights, none, none, none, packed)
+    near = near_surface(shaded, intervals, torch.tensor([False, False, False, True]).repeat(3))
+    assert near.view(3, 4).tolist() == [[False] * 4, [True] * 4, [True, True, True, False]]
+    everywhere = near_surface(shaded, intervals, torch.zeros(12, dtype=torch.bool))
+    assert torch.equal(everywhere, near_median_depth(shaded, intervals))
+
+
+def test_a_field_without_surfaces_does_not_pass_for_one_with_nothing_to_lose() -> None:
+    rays = Rays(
+        torch.zeros(50, 3), torch.ones(50, 3), torch.zeros(50), torch.full((50,), 2.0), None
+    )
+    ray_indices = torch.arange(50).repeat_interleave(4)
+    starts = torch.arange(4).repeat(50) * 0.5
+    intervals, logits = Intervals(ray_indices, starts, starts + 0.5), torch.zeros(200, 2)
+    packed, none = pack_info(ray_indices, 50), torch.zeros(0)
+    weights = torch.tensor([0.0, 0.2, 0.2, 0.6]).repeat(50)
+    for solid in (0, 1):
+        weights[1 : 4 * solid : 4] = 0.9
+        shaded = Shaded(none, torch.ones(50), none, weights, none, logits, none, packed)
+        near = reference_of(shaded, intervals, rays).near_surface
+        assert int(near.sum()) == (4 if solid else 150)
+
+
+def test_no_samples_have_no_median() -> None:
+    none, no_rays = torch.zeros(0), torch.zeros(0, dtype=torch.int64)
+    shaded = Shaded(none, torch.zeros(3), none, none, none, none, none, pack_info(no_rays, 3))
+    assert near_median_depth(shaded, Intervals(no_rays, none, none)).shape == (0,)
+    assert near_surface(shaded, Intervals(no_rays, none, none), none.bool()).shape == (0,)
+
+
+@settings(deadline=None, max_examples=30)
+@given(seed=st.integers(0, 1000), which=st.integers(0, len(THRESHOLDS) - 1))
+def test_rays_exceed_the_bounds_on_average_where_the_price_does(seed: int, which: int) -> None:
+    problem, threshold = Problem(seed), THRESHOLDS[which]
+    parts = problem.references, problem.truths, problem.render_kept
+    measured = measure(*parts, threshold, missed_only=True)
+    rays = ray_prices(*parts, threshold, missed_only=True)
+    surface, image = rays.surface_excess(CONFIG), rays.image_excess(CONFIG)
+    assert surface.shape == image.shape == (2 * RAYS,)
+    for excess, price, bound in (
+        (surface, measured.lost_surface_mass, CONFIG.lost_surface_mass),
+        (image, measured.image_price_db, CONFIG.image_price_db),
+    ):
+        if abs(price - bound) > 1e-4:
+            assert (float(excess.mean()) > 0.0) == (price > bound)
+
+
+@settings(deadline=None, max_examples=20)
+@given(seed=st.integers(0, 1000))
+def test_what_no_photograph_misses_is_not_lost(seed: int) -> None:
+    problem, threshold = Problem(seed), 0.5
+    masks = [reference.occupancies >= threshold for reference in problem.references]
+    surface = lost = 0.0
+    for number, (reference, mask) in enumerate(zip(problem.references, masks)):
+        gated, truth = problem.render_kept(number, mask), problem.truths[number]
+        for ray in range(RAYS):
+            mine = reference.intervals.ray_indices == ray
+            weights = (reference.weights * reference.near_surface)[mine]
+            surface += float(weights.sum())
+            images = gated, problem.render_kept(number, mask | reference.near_surface)
+            errors = [float((rgb[ray] - truth[ray]).norm()) for rgb in images]
+            lost += float(weights[~mask[mine]].sum()) if errors[0] > errors[1] else 0.0
+    found = measure(*problem.arguments(), threshold, missed_only=True)
+    assert found.lost_surface_mass == pytest.approx(lost / surface, rel=1e-4)
+    assert found.lost_surface_mass <= measure(*problem.arguments(), threshold).lost_surface_mass
+
+
+def test_a_dense_rendering_that_is_wrong_lowers_no_threshold() -> None:
+    problem = Problem(0)
+    haze = [reference.occupancies < 0.3 for reference in problem.references]
+    problem.truths[:] = [problem.render_kept(i, ~gone) for i, gone in enumerate(haze)]
+    config = CalibrationConfig(1e-6, 99.0)
+    trusting = calibrate(*problem.arguments(), config)
+    wary = calibrate(*problem.arguments(), config, missed_only=True)
+    assert trusting.threshold < 0.1 < 0.2 < wary.threshold < 0.3
+
+
+def test_only_lower_thresholds_are_tried_where_that_is_asked() -> None:
+    problem = Problem(0)
+    parts = problem.references, problem.truths, problem.render_kept
+    free = CalibrationConfig(lost_surface_mass=1.0, image_price_db=99.0)
+    assert calibrate(*parts, free).threshold == THRESHOLDS[0]
+    assert calibrate(*parts, free, below=THRESHOLDS[3]).threshold == THRESHOLDS[4]
+    assert calibrate(*parts, free, below=THRESHOLDS[-1]).threshold == 0.0

@@ -1,0 +1,145 @@
+"""A collapse is found within 200 steps, healed by the stated rule, three times at most."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+import torch
+
+from leco_plugin.learning.collapse import (
+    EASED,
+    MOST_RECOVERIES,
+    annealed,
+    form_of,
+    heal,
+    is_collapsed,
+    is_dense,
+    starts_anew,
+)
+from leco_plugin.learning.schedule import Collapse
+from leco_plugin.learning.progress import Progress
+from leco_plugin.models.objective import GateLossConfig
+
+SPREAD = torch.tensor([0.5, 0.25, 0.25])
+ONE = torch.tensor([0.5, 0.5, 0.0])
+
+
+def head_of(bias: list[float]) -> torch.nn.Linear:
+    head = torch.nn.Linear(4, 3)
+    with torch.no_grad():
+        head.bias.copy_(torch.tensor(bias))
+    return head
+
+
+def test_a_collapse_must_last_unless_the_first_phase_is_over() -> None:
+    progress = Progress()
+    assert is_collapsed(progress, 98, 0.0, SPREAD, last=True) is None  # too early to tell
+    assert is_collapsed(progress, 199, 0.0, SPREAD, last=False) is None
+    assert is_collapsed(progress, 298, 0.0, SPREAD, last=False) is None
+    assert is_collapsed(progress, 299, 0.0, SPREAD, last=False) is not None
+    assert is_collapsed(Progress(), 299, 1.0, SPREAD, last=True) is not None
+    assert is_collapsed(progress, 324, 0.3, SPREAD, last=False) is None
+    assert progress.suspected_since == -1
+
+
+@pytest.mark.parametrize(("kind", "pull"), [("empty", 1.0 / EASED), ("occupied", EASED)])
+def test_a_healed_gate_learns_on_dense_samples_first_and_under_less_pressure(kind, pull) -> None:
+    progress = Progress(learn_steps=200, configured=200, suspected_since=90)
+    head, losses = head_of([30.0, 0.0, 0.0]), GateLossConfig()
+    said = heal(head, progress, Collapse("a cause", kind), SPREAD, 199, losses)
+    assert not bool(head.bias.any()) and "dense samples to step 250" in said
+    assert (progress.recoveries, progress.suspected_since) == (1, -1)
+    assert (progress.learn_steps, progress.dense_until) == (300, 250)
+    assert is_dense(progress, 249) and not is_dense(progress, 250)
+
+    begins, half, ends = (annealed(losses, progress, step) for step in (199, 224, 250))
+    assert begins.contribution == begins.imbalance == begins.density == begins.agreement == 0.0
+    assert half.contribution == pytest.approx(25 / 51 * losses.contribution)
+    assert ends.contribution == losses.contribution and ends.density == losses.density
+    assert ends.imbalance == pytest.approx(pull * losses.imbalance)
+    assert ends.emphasis == pytest.approx(losses.emphasis / pull)
+    assert ends.balance == losses.balance
+
+
+def test_a_form_that_was_given_up_stays_given_up() -> None:
+    paper, progress = GateLossConfig(form="paper"), Progress(learn_steps=200)
+    heal(head_of([0] * 3), progress, Collapse("a cause", "useless"), SPREAD, 199, paper)
+    assert form_of(paper, progress) == "logit"
+    heal(head_of([0] * 3), progress, Collapse("a cause", "occupied"), SPREAD, 299, paper)
+    assert form_of(paper, progress) == "logit" and progress.pace == 0.25
+    kept_to = annealed(replace(paper, fall_back=False), Progress(pull=4.0, paper_given_up=True), 0)
+    assert kept_to.imbalance == 4.0 * paper.imbalance  # what its own recoveries have earned
+
+
+def test_points_that_are_shared_out_are_no_new_last_layer() -> None:
+    progress = Progress(learn_steps=200)
+    heal(
+        head_of([0, 9, 0]), progress, Collapse("a cause", "one expert"), ONE, 150, GateLossConfig()
+    )
+    assert not starts_anew(Collapse("a cause", "empty"), GateLossConfig(), progress)
+
+
+def test_points_of_one_expert_are_shared_out_and_the_balance_counts_more() -> None:
+    progress, head = Progress(learn_steps=200), head_of([0.0, 30.0, 0.0])
+    heal(head, progress, Collapse("a cause", "one expert"), ONE, 150, GateLossConfig())
+    assert (head.bias[1] - head.bias[2]).abs() < 1e-6
+    assert progress.learn_steps == 201 and not is_dense(progress, 151)
+    assert annealed(GateLossConfig(), progress, 151).balance == EASED * GateLossConfig().balance
+
+
+def test_a_gate_in_the_papers_form_that_less_force_does_not_heal_is_taught_in_logit_form() -> None:
+    paper, progress, head = (
+        GateLossConfig(form="paper"),
+        Progress(learn_steps=200),
+        head_of([0] * 3),
+    )
+    for number in range(2):
+        assert form_of(paper, progress) == "paper"
+        said = heal(head, progress, Collapse("a cause", "occupied"), SPREAD, 199 + number, paper)
+        assert ("logit form" in said) == (number == 1)
+    taught = annealed(paper, progress, 10_000)
+    assert taught == replace(paper, form="logit")  # nothing of what was wrong is eased or pressed
+    again = Progress.from_dict(progress.to_dict())
+    assert form_of(paper, again) == "logit" and form_of(GateLossConfig(), Progress()) == "logit"
+    assert form_of(replace(paper, fall_back=False), again) == "paper"
+    said = heal(head, progress, Collapse("a cause", "occupied"), SPREAD, 299, paper)
+    assert "gate and field start anew" in said  # what is left for one that collapses in logit form
+
+
+def test_a_gate_that_has_called_nothing_empty_yet_has_until_the_end_to_learn_it() -> None:
+    progress = Progress()
+    for step in range(49, 999, 50):
+        assert is_collapsed(progress, step, 1.0, SPREAD, last=False) is None
+    assert is_collapsed(progress, 999, 1.0, SPREAD, last=True) is not None
+
+
+def test_a_second_recovery_counts_whatever_it_is_from() -> None:
+    paper, progress = GateLossConfig(form="paper"), Progress(learn_steps=200)
+    for kind in ("empty", "one expert"):
+        said = heal(head_of([0] * 3), progress, Collapse("a cause", kind), ONE, 199, paper)
+    assert form_of(paper, progress) == "logit" and "logit form" in said
+
+
+def test_what_is_a_comparison_stays_in_the_form_that_is_asked_for() -> None:
+    losses, progress = GateLossConfig(form="paper", fall_back=False), Progress(learn_steps=200)
+    for number in range(MOST_RECOVERIES):
+        heal(head_of([0] * 3), progress, Collapse("a cause", "occupied"), SPREAD, number, losses)
+    assert form_of(losses, progress) == "paper"
+
+
+def test_a_run_that_was_never_healed_is_taught_as_configured() -> None:
+    assert annealed(GateLossConfig(), Progress(), 0) == GateLossConfig()
+
+
+def test_a_gate_that_was_opened_again_late_is_healed_as_quickly_as_an_early_one() -> None:
+    progress, head = Progress(learn_steps=20_000, configured=200), head_of([0.0, 0.0, 0.0])
+    heal(
+        head,
+        progress,
+        Collapse("the gate calls all space empty"),
+        torch.ones(3) / 3,
+        19_000,
+        GateLossConfig(),
+    )
+    assert (progress.learn_steps, progress.dense_until) == (19_101, 19_051)
