@@ -40,14 +40,7 @@ from leco_plugin.models.rendering import (
     shade,
     with_backdrop,
 )
-from leco_plugin.models.scene_rays import (
-    SeenBackdrops,
-    cut_to_bounds,
-    marching_rule,
-    over_background,
-    with_ends_for_all,
-    within_crop,
-)
+from leco_plugin.models.scene_rays import SeenBackdrops, marching_rule, over_background, rays_inside
 from leco_plugin.models.sizing.scene_sizes import complete
 from leco_plugin.models.sizing.sizes import Sizes
 from leco_plugin.models.sizing.stored_sizes import SIZES, stored_in, to_store
@@ -153,10 +146,7 @@ class LecoModel(Model):
         self.bounds_known.fill_(True)
 
     def rays_of(self, bundle: RayBundle, with_images: bool | None = None) -> Rays:
-        """The bundle's rays, cut to the scene's bounds and to a crop.
-
-        A ray that misses the bounds keeps a backdrop at the far end, as its sky. Rays of no
-        training image have a backdrop only where training has seen one.
+        """As `rays_inside`.
 
         Args:
             with_images: whether rays show the appearance of their training image, or the mean of
@@ -164,11 +154,8 @@ class LecoModel(Model):
         """
         near, far, *steps = self.march_range[:4]
         known = self.training if with_images is None else with_images
-        cut = cut_to_bounds(bundle, self.aabb, near, far, with_images=known)
-        if not known:
-            cut = cut._replace(cut_off=~self.backdrops(cut, self.space, self.aabb))
-        rays = with_ends_for_all(cut, far, torch.minimum(*steps))
-        return within_crop(rays, bundle.nears, bundle.fars)
+        bounds, length = (self.space, self.aabb, near, far), torch.minimum(*steps)
+        return rays_inside(bundle, self.backdrops, bounds, length, with_images=known)
 
     def estimator(self) -> LearnedOccupancyEstimator:
         """Samples where the frozen gate says so; built on first use, also after a checkpoint.

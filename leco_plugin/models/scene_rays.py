@@ -79,6 +79,30 @@ def within_crop(rays: Rays, nears: Tensor | None, fars: Tensor | None) -> Rays:
     return rays._replace(t_mins=t_mins, t_maxs=t_maxs, cut_off=cut_off)
 
 
+def rays_inside(
+    bundle: RayBundle,
+    backdrops: SeenBackdrops,
+    bounds: tuple[Space, Tensor, Tensor, Tensor],
+    length: Tensor,
+    with_images: bool,
+) -> Rays:
+    """A bundle's rays, cut to the scene's bounds and to a crop.
+
+    A ray that misses the bounds keeps a backdrop at the far end, as its sky. Rays without images
+    have a backdrop only where training has seen one.
+
+    Args:
+        bounds: space, box [6], and where all rays begin and end.
+        length: scalar, of such a sky, scene units.
+        with_images: whether each ray keeps the number of its training image.
+    """
+    space, aabb, near, far = bounds
+    rays = cut_to_bounds(bundle, aabb, near, far, with_images)
+    if not with_images:
+        rays = rays._replace(cut_off=~backdrops(rays, space, aabb))
+    return within_crop(with_ends_for_all(rays, far, length), bundle.nears, bundle.fars)
+
+
 def over_background(shaded: Shaded, rays: Rays) -> Tensor:
     """Colours [R, 3] over nerfstudio's background where rays are cut off: black, or a crop's."""
     if rays.cut_off is None:

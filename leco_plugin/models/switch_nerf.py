@@ -30,14 +30,7 @@ from leco_plugin.models.rendering import (
     with_backdrop,
 )
 from leco_plugin.models.scene_grid import scene_grid
-from leco_plugin.models.scene_rays import (
-    SeenBackdrops,
-    cut_to_bounds,
-    marching_rule,
-    over_background,
-    with_ends_for_all,
-    within_crop,
-)
+from leco_plugin.models.scene_rays import SeenBackdrops, marching_rule, over_background, rays_inside
 from leco_plugin.models.switch.config import SwitchNerfModelConfig
 from leco_plugin.models.switch.field import NEW_DENSITY, Answers, SwitchField
 from leco_plugin.models.switch.objective import switch_losses, switch_statistics
@@ -192,14 +185,10 @@ class SwitchNerfModel(Model):
         return answers
 
     def rays_of(self, bundle: RayBundle) -> Rays:
-        """The bundle's rays, cut to the scene's bounds and to a crop; those that miss end where all
-        do. In evaluation they have a backdrop only where training has seen one."""
+        """As `rays_inside`."""
         near, far, step, cone_angle = self.march_range
-        rays = cut_to_bounds(bundle, self.aabb, near, far, with_images=self.training)
-        if not self.training:
-            rays = rays._replace(cut_off=~self.backdrops(rays, self.space, self.aabb))
-        rays = with_ends_for_all(rays, far, step.maximum(far * cone_angle))
-        return within_crop(rays, bundle.nears, bundle.fars)
+        bounds, length = (self.space, self.aabb, near, far), step.maximum(far * cone_angle)
+        return rays_inside(bundle, self.backdrops, bounds, length, with_images=self.training)
 
     def _shade(self, rays: Rays) -> tuple[Intervals, Shaded]:
         """Samples along rays in whichever way, shaded."""
