@@ -7,16 +7,20 @@ its own.
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Callable, Mapping
-from typing import Any
+from typing import Any, cast
 
 import torch
+from nerfstudio.cameras.cameras import Cameras
+from nerfstudio.cameras.rays import RayBundle
 from nerfstudio.model_components.ray_samplers import Sampler
 from nerfstudio.viewer_legacy.server.viewer_utils import IOChangeException
 from torch import Tensor, nn
 
 from leco_plugin.models.gate import Gate, GateConfig
 from leco_plugin.models.hosts.stand_ins import GuidedEstimator, GuidedProposal
+from leco_plugin.models.scene_rays import SeenBackdrops, cut_to_bounds
 from leco_plugin.occupancy import Occupancy
 from leco_plugin.samplers.base import DensityFn, Estimator
 from leco_plugin.samplers.registry import (
@@ -28,6 +32,8 @@ from leco_plugin.samplers.registry import (
 from leco_plugin.scenes.input_error import InputError, one_line
 from leco_plugin.space import Space
 
+FARTHEST = 1e3
+"""Half extents of the occupancy after which a ray has left what it is asked about."""
 CAREFULLY = "carefully"
 """In `Guide.watched`: the lower threshold that a host follows for the beginning, if it does."""
 
@@ -58,6 +64,9 @@ class Guide(nn.Module):
         first_density: with which the host's field began, None for its own; see `opaque_start`.
         frame: [3, 4] takes positions of the host to those of the occupancy: a rotation times a
             scale, and a translation.
+        backdrops: those that training has seen, in the occupancy's coordinates.
+        without_backdrop: [R, 1], of the rays that a proposal host renders now, those whose backdrop
+            was never seen; None while it trains.
     """
 
     frame: Tensor
@@ -78,6 +87,8 @@ class Guide(nn.Module):
         self.watched: dict[str, Any] = {}
         self.first_density: float | None = None
         self.register_buffer("frame", torch.eye(3, 4))
+        self.backdrops = SeenBackdrops()
+        self.without_backdrop: Tensor | None = None
         self.register_load_state_dict_post_hook(lambda guide, _: guide.changed())
 
     @property
@@ -144,6 +155,34 @@ class Guide(nn.Module):
     def same_frame(self) -> bool:
         """Whether host and occupancy share their coordinates."""
         return torch.equal(self.frame, torch.eye(3, 4, device=self.frame.device))
+
+    def look(self, cameras: Cameras) -> None:
+        """Notes the backdrops that these training cameras see."""
+        turn, shift = self.frame.cpu().split([3, 1], dim=1)
+        poses = cameras.camera_to_worlds.cpu().float()
+        here = copy.copy(cameras.to("cpu"))
+        here.camera_to_worlds = torch.cat(
+            [turn @ poses[..., :3], turn @ poses[..., 3:] + shift], -1
+        )
+        self.backdrops.look(here, *self._bounds())
+
+    def _bounds(self) -> tuple[Space, Tensor, Tensor, Tensor]:
+        """Space and walls of the occupancy, and where rays begin and end at the latest."""
+        space, walls = self.the_occupancy().space, self.the_occupancy().walls
+        return space, walls, torch.zeros_like(space.half_extent), FARTHEST * space.half_extent
+
+    @torch.no_grad()
+    def lacks_backdrop(self, origins: Tensor, directions: Tensor) -> Tensor:
+        """Whether training has never seen the backdrop of rays: bool [R].
+
+        Args:
+            origins, directions: [R, 3] in the occupancy's coordinates, directions of any length.
+        """
+        space, walls, near, far = self._bounds()
+        unit = torch.nn.functional.normalize(directions.float(), dim=-1)
+        bundle = RayBundle(origins.float(), unit, pixel_area=unit[:, :1])
+        cut = cut_to_bounds(bundle, walls, near, far, with_images=False)
+        return ~cast(Tensor, self.backdrops(cut, space, walls))
 
     def estimator(
         self,
