@@ -138,7 +138,7 @@ def test_a_backdrop_that_no_training_ray_saw_is_black_and_one_that_some_saw_stay
     """No camera looks up; all see the distance beyond the floor."""
     model = pair.guided.model
     guide = model.leco_guide
-    monkeypatch.setitem(guide.the_occupancy().report, BACKDROP_PRICE, 1.0)
+    monkeypatch.setitem(guide.the_occupancy().report, BACKDROP_PRICE, 9.0)
     pair.guided.eval()
     photographed = pair.guided.datamanager.train_dataset.cameras[:1]
     up = copy.copy(photographed)
