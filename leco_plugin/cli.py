@@ -149,6 +149,7 @@ def swap(
     sampler: str = "learned-occupancy",
     options: Mapping[str, int | float] = MappingProxyType({}),
     codes: Literal["small", "own"] = "small",
+    other_scene: bool = False,
     json: Path | None = None,
 ) -> None:
     """Train any registered nerfstudio method with its sampler swapped for a learned occupancy.
@@ -164,12 +165,13 @@ def swap(
         options: Of that sampler, by name: --options num_candidates 512 cache_bytes 4194304.
         codes: Of the host, for the light of each photograph. small: they begin at zero and are
             scaled by 0.1. own: as the method has them, which can cost test views several dB.
+        other_scene: Train also where the occupancy is of another scene, as far as its cameras say.
         json: File for the folder of the run, as JSON.
     """
     from leco_plugin.swap import swap as train_swapped
 
     _check_json(json)
-    folder = train_swapped(method, occupancy, arguments, sampler, options, codes)
+    folder = train_swapped(method, occupancy, arguments, sampler, options, codes, other_scene)
     print(f"{method}, guided: {folder}")
     facts = {"method": method, "sampler": sampler, "options": dict(options), "codes": codes}
     _write_json(json, {"format": 1, **facts, "folder": str(folder)})

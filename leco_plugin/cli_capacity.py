@@ -28,9 +28,11 @@ def export(
 
     Args:
         file: An occupancy.safetensors, or a folder of runs: the newest in it.
-        format: ply is the surface of what is kept, coloured by o(x); nerfacc-grid is what
-            OccGridEstimator.load_state_dict takes, a cell marked where any of 27 points in it is
-            kept. A host that goes on updating such a grid replaces it by its own.
+        format: ply is the surface of what is kept as points. Their colour is o(x), how sure the
+            gate is that something is there: black at 0, purple, orange, pale yellow at 1. It is not
+            the colour of the scene. nerfacc-grid is what OccGridEstimator.load_state_dict takes, a
+            cell marked where any of 27 points in it is kept. A host that goes on updating such a
+            grid replaces it by its own.
         out: File to write.
         resolution: Cells along the longest side of the space, or along each axis of a grid.
         levels: Nested boxes of a grid, each twice as wide as the one inside it. By default one, or

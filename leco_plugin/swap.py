@@ -38,6 +38,7 @@ def swapped_config(
     sampler: str = LEARNED,
     options: Mapping[str, int | float] = NO_OPTIONS,
     codes: Codes = "small",
+    other_scene: bool = False,
 ) -> TrainerConfig:
     """The config of a registered method with its sampler swapped.
 
@@ -49,6 +50,7 @@ def swapped_config(
         sampler: name in the registry of samplers.
         options: of that sampler, by name.
         codes: of the host's photographs, as `GuidedModelConfig.codes`.
+        other_scene: as `OccupancyConfig.other_scene`.
     Raises:
         InputError: there is no such method, or it is guided or learns occupancy itself; there is no
             such sampler, or it asks another kind of gate, or has no such option; there is no such
@@ -70,7 +72,7 @@ def swapped_config(
         )
     if config.data is not None and not config.data.exists():
         raise InputError(f"there is no scene {config.data} (--data)")
-    return with_sampler_swapped(config, file, sampler, options, codes)
+    return with_sampler_swapped(config, file, sampler, options, codes, other_scene)
 
 
 def check_sampler(file: Path | None, sampler: str, options: Mapping[str, int | float]) -> None:
@@ -113,6 +115,7 @@ def with_sampler_swapped(
     sampler: str = LEARNED,
     options: Mapping[str, int | float] = NO_OPTIONS,
     codes: Codes = "small",
+    other_scene: bool = False,
 ) -> TrainerConfig:
     """The same training with its model guided by an occupancy, learned first where there is no
     file; the config given is not changed.
@@ -138,7 +141,8 @@ def with_sampler_swapped(
             f"{config.method_name} has a pipeline without a model that could be guided"
         )
     path = None if file is None else occupancy_file(file.resolve())
-    occupancy = replace(learned_first(), path=path, sampler=sampler, options=dict(options))
+    occupancy = replace(learned_first(), path=path, other_scene=other_scene, sampler=sampler)
+    occupancy.options = dict(options)
     pipeline.model = GuidedModelConfig(host=host, occupancy=occupancy, codes=codes)
     parser = getattr(getattr(pipeline, "datamanager", None), "dataparser", None)
     if isinstance(parser, DataParserConfig):
@@ -163,10 +167,11 @@ def swap(
     sampler: str = LEARNED,
     options: Mapping[str, int | float] = NO_OPTIONS,
     codes: Codes = "small",
+    other_scene: bool = False,
 ) -> Path:
     """Trains, and returns the folder of the run. Arguments and errors as for `swapped_config`."""
     from nerfstudio.scripts.train import main as train
 
-    config = swapped_config(method, file, arguments, sampler, options, codes)
+    config = swapped_config(method, file, arguments, sampler, options, codes, other_scene)
     train(config)
     return config.get_base_dir()

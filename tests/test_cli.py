@@ -284,11 +284,11 @@ def test_a_swap_hands_options_of_the_sampler_on(
     assert run("swap", "nerfacto", "--occupancy", file, *options, *arguments) == 0
     expected = {"num_candidates": 512, "tolerance": 1e-3}
     scene = ("--data", "SCENE")
-    assert given == ["nerfacto", file, scene, "learned-occupancy", expected, "small"]
+    assert given == ["nerfacto", file, scene, "learned-occupancy", expected, "small", False]
     assert json.loads(report.read_text())["options"] == expected
 
 
-def test_a_swap_can_leave_the_codes_of_a_host_as_they_are(
+def test_a_swap_can_leave_the_codes_of_a_host_and_insist_on_another_scene(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     from leco_plugin import swap
@@ -296,8 +296,8 @@ def test_a_swap_can_leave_the_codes_of_a_host_as_they_are(
     given: list[object] = []
     monkeypatch.setattr(swap, "swap", lambda *arguments: given.extend(arguments) or tmp_path)
     report = tmp_path / "swap.json"
-    assert run("swap", "nerfacto", "--codes", "own", "--json", report) == 0
-    assert given[-1] == "own" and json.loads(report.read_text())["codes"] == "own"
+    assert run("swap", "nerfacto", "--codes", "own", "--other-scene", "--json", report) == 0
+    assert given[-2:] == ["own", True] and json.loads(report.read_text())["codes"] == "own"
 
 
 def test_a_failure_ends_with_one_line_and_status_1(

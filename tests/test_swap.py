@@ -100,6 +100,12 @@ def test_an_option_that_the_sampler_does_not_have_is_said_in_a_line(file: Path) 
     assert "\n" not in str(error.value)
 
 
+def test_a_swap_may_insist_on_the_occupancy_of_another_scene(file: Path) -> None:
+    for insists in (False, True):
+        made: Any = swapped_config("nerfacto", file, other_scene=insists)
+        assert made.pipeline.model.occupancy.other_scene is insists
+
+
 def test_what_is_registered_stays_as_it_is(file: Path) -> None:
     swapped_config("nerfacto", file, ["--pipeline.model.near-plane", "0.3"])
     host: Any = all_methods["nerfacto"].pipeline.model

@@ -19,6 +19,7 @@ from nerfstudio.engine.callbacks import (
     TrainingCallbackAttributes,
     TrainingCallbackLocation,
 )
+from nerfstudio.model_components.renderers import RGBRenderer
 from nerfstudio.models.base_model import Model, ModelConfig
 
 from leco_plugin.compat.checkpoints import allow_checkpoint_globals
@@ -105,6 +106,7 @@ def set_up_guided(config: GuidedModelConfig, **arguments: Any) -> Model:
     guide.register_load_state_dict_post_hook(lambda guide, _: set_first_density(host, guide))
     _refuse_what_is_not_finite(host)
     _tell_of_crops(host, guide)
+    _hide_unseen_backdrops(host, guide)
     _begin_with_occupancy(host, guide, config.occupancy)
     return host
 
@@ -145,6 +147,26 @@ def _tell_of_crops(host: Model, guide: Guide) -> None:
             guide.cropped = False
 
     host.forward = forward  # type: ignore[method-assign]
+
+
+def _hide_unseen_backdrops(host: Model, guide: Guide) -> None:
+    """A colour of a ray's last sample is no backdrop where training has seen none: it is black."""
+
+    def behind(renderer: Any, args: Any, kwargs: Any) -> tuple[Any, Any] | None:
+        asked = kwargs.get("background_color")
+        asked = renderer.background_color if asked is None else asked
+        rgb = kwargs["rgb"] if "rgb" in kwargs else args[0]
+        unseen = guide.without_backdrop
+        if unseen is None or not isinstance(asked, str) or asked != "last_sample":
+            return None
+        if len(unseen) != len(rgb):
+            return None
+        last = torch.nan_to_num(rgb[..., -1, :])
+        return args, kwargs | {"background_color": last.masked_fill(unseen, 0.0)}
+
+    for module in host.modules():
+        if isinstance(module, RGBRenderer):
+            module.register_forward_pre_hook(behind, with_kwargs=True)
 
 
 def _begin_with_occupancy(host: Model, guide: Guide, config: OccupancyConfig) -> None:

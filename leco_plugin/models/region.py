@@ -106,7 +106,8 @@ class Region(nn.Module):
         return at_floor & inside & (cut.t_maxs > cut.t_mins)
 
     def _shows_backdrop(self, cut: Rays) -> Tensor:
-        return self.leaves_by_floor(cut) | self.backdrops(cut)
+        seen: Tensor = self.backdrops(cut)
+        return self.leaves_by_floor(cut) | seen
 
 
 class SeenBackdrops(nn.Module):

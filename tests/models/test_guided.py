@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -26,6 +27,7 @@ from leco_plugin.conformance.kit.host_scene import model_arguments
 from leco_plugin.models.guided import GuidedModelConfig
 from leco_plugin.models.hosts.guide import Guide
 from leco_plugin.models.hosts.stand_ins import GuidedEstimator
+from leco_plugin.occupancy import BACKDROP_PRICE
 from leco_plugin.samplers import estimator
 from leco_plugin.swap import with_sampler_swapped
 
@@ -127,6 +129,28 @@ def test_a_crop_that_rays_do_not_meet_leaves_the_background(pair: Pair) -> None:
         assert float(outputs["accumulation"].max()) == 0.0
         if renders_as_nerfstudio:
             torch.testing.assert_close(outputs["rgb"], MAGENTA.expand_as(outputs["rgb"]))
+    pair.guided.train()
+
+
+def test_a_backdrop_that_no_training_ray_saw_is_black_and_one_that_some_saw_stays(
+    pair: Pair, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """No camera looks up; all see the distance beyond the floor."""
+    model = pair.guided.model
+    guide = model.leco_guide
+    monkeypatch.setitem(guide.the_occupancy().report, BACKDROP_PRICE, 9.0)
+    pair.guided.eval()
+    photographed = pair.guided.datamanager.train_dataset.cameras[:1]
+    up = copy.copy(photographed)
+    up.camera_to_worlds = torch.diag(torch.tensor([1.0, -1.0, -1.0, 1.0]))[None, :3]
+    outputs = model.get_outputs_for_camera(up)
+    assert float(outputs["rgb"].max()) == float(outputs["accumulation"].max()) == 0.0
+    here = model.get_outputs_for_camera(photographed)["rgb"]
+    every = torch.full_like(guide.backdrops.limits, 2.0)
+    monkeypatch.setattr(guide.backdrops, "limits", every)
+    torch.testing.assert_close(model.get_outputs_for_camera(photographed)["rgb"], here)
+    if pair.name != "switch-nerf":  # which has seen for itself what there is
+        assert float(model.get_outputs_for_camera(up)["rgb"].max()) > 0.0
     pair.guided.train()
 
 

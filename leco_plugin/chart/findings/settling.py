@@ -72,12 +72,13 @@ def settling(lines: Sequence[Line]) -> str:
 
 
 def falls(lines: Sequence[Line]) -> str | None:
-    """In one sentence, whose runs end more than `FALL` below their own best point: the median over
-    seeds, and the least and the most. None where no run does."""
+    """In one sentence, in how many runs of whom the end lies more than `FALL` below their own best
+    point, and by how much at most. None where it does in no run."""
     fallen = []
     for line in lines:
         below = [max(psnr for _, psnr in run["curve"]) - run["curve"][-1][1] for run in line.runs]
-        if max(below) > FALL:
-            median = f"{statistics.median(below):.1f} dB"
-            fallen.append(f"{line.name} by {median} ({min(below):.2f} to {max(below):.2f})")
-    return f"Fell from their own best point: {', '.join(fallen)}." if fallen else None
+        count = sum(fall > FALL for fall in below)
+        if count:
+            of_all = f"in {count} of {len(below)} run{'s' if len(below) > 1 else ''}"
+            fallen.append(f"{line.name} {of_all}, by at most {max(below):.2f} dB")
+    return f"Fell from their own best point: {'; '.join(fallen)}." if fallen else None

@@ -11,6 +11,7 @@ from collections.abc import Callable, Mapping
 from typing import Any
 
 import torch
+from nerfstudio.cameras.cameras import Cameras
 from nerfstudio.model_components.ray_samplers import Sampler
 from nerfstudio.viewer_legacy.server.viewer_utils import IOChangeException
 from torch import Tensor, nn
@@ -18,6 +19,7 @@ from torch import Tensor, nn
 from leco_plugin.learning.progress import WatchState
 from leco_plugin.models.gate import Gate, GateConfig
 from leco_plugin.models.hosts.stand_ins import GuidedEstimator, GuidedProposal
+from leco_plugin.models.region import SIDE, Region, SeenBackdrops
 from leco_plugin.occupancy import Occupancy
 from leco_plugin.samplers.base import DensityFn, Estimator
 from leco_plugin.samplers.registry import (
@@ -26,8 +28,13 @@ from leco_plugin.samplers.registry import (
     refuse_unknown_options,
     sampler_spec,
 )
+from leco_plugin.scenes.frames import moved, turned
 from leco_plugin.scenes.input_error import InputError, one_line
+from leco_plugin.scenes.survey import covering_rays
 from leco_plugin.space import Space
+
+FARTHEST = 1e3
+"""Half extents of the occupancy after which a ray has left what it is asked about."""
 
 
 class NoOccupancyYet(RuntimeError, IOChangeException):
@@ -55,6 +62,9 @@ class Guide(nn.Module):
         first_density: with which the host's field began, None for its own; see `opaque_start`.
         frame: [3, 4] takes positions of the host to those of the occupancy: a rotation times a
             scale, and a translation.
+        backdrops: those that training has seen, in the occupancy's coordinates.
+        without_backdrop: [R, 1], of the rays that a proposal host renders now, those whose backdrop
+            was never seen; None while it trains.
     """
 
     frame: Tensor
@@ -75,6 +85,8 @@ class Guide(nn.Module):
         self.watched = WatchState()
         self.first_density: float | None = None
         self.register_buffer("frame", torch.eye(3, 4))
+        self.backdrops = SeenBackdrops()
+        self.without_backdrop: Tensor | None = None
         self.register_load_state_dict_post_hook(lambda guide, _: guide.changed())
 
     @property
@@ -141,6 +153,33 @@ class Guide(nn.Module):
     def same_frame(self) -> bool:
         """Whether host and occupancy share their coordinates."""
         return torch.equal(self.frame, torch.eye(3, 4, device=self.frame.device))
+
+    def look(self, cameras: Cameras) -> None:
+        """Notes the backdrops that these training cameras see."""
+        origins, directions = (part.reshape(-1, 3) for part in covering_rays(cameras, SIDE))
+        frame = self.frame.cpu()
+        unit = torch.nn.functional.normalize(turned(directions, frame), dim=-1)
+        self._region().look(moved(origins, frame), unit)
+
+    def _region(self) -> Region:
+        """Where the occupancy lies, with the backdrops that were seen there."""
+        occupancy, region = self.the_occupancy(), Region().to(self.frame.device)
+        region.space, region.backdrops = occupancy.space, self.backdrops
+        region.aabb.copy_(occupancy.walls)
+        region.near.zero_()
+        region.far.copy_(FARTHEST * occupancy.space.half_extent)
+        return region
+
+    @torch.no_grad()
+    def lacks_backdrop(self, origins: Tensor, directions: Tensor) -> Tensor:
+        """Whether training has never seen the backdrop of rays: bool [R].
+
+        Args:
+            origins, directions: [R, 3] in the occupancy's coordinates, directions of any length.
+        """
+        unit = torch.nn.functional.normalize(directions.float(), dim=-1)
+        region = self._region()
+        return ~region.shows_backdrop(region.cut(origins.float(), unit))
 
     def estimator(
         self,

@@ -24,12 +24,18 @@ from leco_plugin.samplers.marching.rays import intersect_box
 from leco_plugin.samplers.registry import check_gate
 from leco_plugin.scenes.frames import between, found_again, frame_of, moved, turned
 from leco_plugin.scenes.input_error import InputError
-from leco_plugin.scenes.survey import announce, covering_rays, survey
+from leco_plugin.scenes.survey import MOST_CAMERAS, covering_rays, sparse_points, survey
 
 PLACES = 128
 """Positions on each ray at which a file is asked whether it fits the cameras."""
 SAME_SCENE = 0.1
 """Share of cameras, of the fewer, that an occupancy and a run on its scene have in common."""
+ROUNDED = 10.0
+"""A reader that rounds coordinates moves cameras by less than so many times `SAME_PLACE`."""
+POINTS = 1 << 14
+"""Most sparse points that are looked at."""
+KEPT_POINTS = 0.5
+"""Share of a scene's sparse points that an occupancy of the scene keeps at least."""
 
 LEARNING = (
     "the occupancy is learned first, and is in no checkpoint until then: a run that is stopped "
@@ -48,6 +54,8 @@ class OccupancyConfig(GrowingConfig):
     path: Path | None = None
     """An occupancy.safetensors, or the folder of a run that left one. None learns the occupancy
     first, in this run."""
+    other_scene: bool = False
+    """Whether the file may be of another scene, as far as its cameras say."""
     sampler: str = "learned-occupancy"
     """Name in the registry of samplers. For comparison: `dense`, `occupancy-grid`, and `own`, which
     leaves the host as it is."""
@@ -158,6 +166,7 @@ class GuidedStart:
                 config.learning, self.pipeline, config.rays, config.seconds, config.rate
             )
             self.guide.set_occupancy(occupancy)
+        self.guide.look(self.pipeline.datamanager.train_dataset.cameras)
         watches = self.config.learning.calibration.recheck_rays > 0
         if step == 0 and watches:
             begin_carefully(self.host, self.guide, self._skipped)
@@ -186,7 +195,8 @@ class GuidedStart:
         if learned_in is not None and host is not None:
             self.guide.frame.copy_(between(host, learned_in))
             self.guide.changed()
-            warn_of_another_scene(occupancy, manager, self.guide.frame)
+            insists = self.config.other_scene or getattr(self.trainer, "_start_step", 0) > 0
+            refuse_another_scene(occupancy, manager, self.guide.frame, insists)
         along = along_rays(self.guide, occupancy, manager.train_dataset.cameras)
         share = along.share_kept(occupancy.threshold)
         if share == 0.0 and getattr(self.trainer, "_start_step", 0) == 0:
@@ -195,23 +205,29 @@ class GuidedStart:
                 "another scene, the scene has been moved since, or nothing is there"
             )
         learning = self.config.learning
-        announce(survey(manager, learning.bounds, learning.near, learning.far))
-        say(
-            f"guided by an occupancy that keeps {share:.1%} along these rays; the bounds above are "
-            "those for learning one, and do not change it"
-        )
+        seen = survey(manager, learning.bounds, learning.near, learning.far)
+        if seen.rounded:
+            say(seen.rounded)
+        say(f"guided by an occupancy that keeps {share:.1%} along the rays of these cameras")
         return along
 
 
-def warn_of_another_scene(occupancy: Occupancy, manager: Any, frame: Tensor) -> None:
+@torch.no_grad()
+def refuse_another_scene(
+    occupancy: Occupancy, manager: Any, frame: Tensor, insists: bool = False
+) -> None:
     """Says so where hardly any camera that an occupancy was learned on is among a run's.
 
     Test photographs count too, so that another split is no other scene; so do photographs that were
-    added or taken away since.
+    added or taken away since. Photographs of the same scene that share no camera are known by their
+    sparse points, which an occupancy of it keeps.
 
     Args:
         manager: nerfstudio's data manager of the run.
         frame: [3, 4] from the run's coordinates to those of the occupancy.
+        insists: whether a scene that is certainly another one is warned of too.
+    Raises:
+        InputError: it is certainly of another scene.
     """
     known = cameras_of(occupancy)
     sets = (manager.train_dataset, getattr(manager, "eval_dataset", None))
@@ -219,13 +235,33 @@ def warn_of_another_scene(occupancy: Occupancy, manager: Any, frame: Tensor) -> 
     here = moved(torch.cat(poses)[:, :3, 3], frame.cpu())
     if len(known) == 0:
         return
-    found = int(found_again(known, here, float(occupancy.space.half_extent)).sum())
-    if found < SAME_SCENE * min(len(known), len(here)):
-        say(
-            f"the occupancy seems to be of another scene: of the {len(known)} cameras that its "
-            f"file names {found} are among the {len(here)} here. It may skip what is there: give "
-            "the folder of a run on this scene, or no path to learn it first"
+    half, few = float(occupancy.space.half_extent), SAME_SCENE * min(len(known), len(here))
+    found = int(found_again(known, here, half).sum())
+    if found >= few:
+        return
+    remedy = "give the folder of a run on this scene, or no path to learn it first"
+    nearly = int(found_again(known, here, ROUNDED * half).sum())
+    if found == 0 and nearly < few and not insists and _keeps_no_points(occupancy, manager, frame):
+        raise InputError(
+            f"the occupancy is of another scene: none of the {len(known)} cameras that its file "
+            f"names is among the {len(here)} here; {remedy} (to insist: leco swap --other-scene, "
+            "or --pipeline.model.occupancy.other-scene True)"
         )
+    say(
+        f"the occupancy seems to be of another scene: of the {len(known)} cameras that its "
+        f"file names {found} are among the {len(here)} here. It may skip what is there: {remedy}"
+    )
+
+
+def _keeps_no_points(occupancy: Occupancy, manager: Any, frame: Tensor) -> bool:
+    """Whether an occupancy skips the scene's sparse points. Without points, whether its file names
+    all cameras that it was learned on; of many it names `MOST_CAMERAS`."""
+    points = sparse_points(manager.train_dataset)
+    if points is None or len(points) == 0:
+        return len(cameras_of(occupancy)) < MOST_CAMERAS
+    chosen = points[:: -(-len(points) // POINTS)].to(frame)
+    kept = occupancy.query(moved(chosen, frame)) >= occupancy.threshold
+    return float(kept.float().mean()) < KEPT_POINTS
 
 
 class AlongRays(NamedTuple):

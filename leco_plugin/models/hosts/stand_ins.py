@@ -11,6 +11,7 @@ import inspect
 from typing import TYPE_CHECKING, Any, cast
 
 import torch
+from nerfstudio.cameras.rays import RayBundle
 from nerfstudio.model_components.ray_samplers import Sampler
 from torch import Tensor, nn
 
@@ -67,6 +68,7 @@ def _ending_in_a_backdrop(
     options: dict[str, Any],
     walls: Tensor,
     crop: tuple[Tensor | None, Tensor | None],
+    cut_off: Tensor | None,
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Packed samples whose rays end in one interval that no gate skips.
 
@@ -79,6 +81,7 @@ def _ending_in_a_backdrop(
         walls: [6] of the occupancy: where a ray leaves them its backdrop begins; one that misses
             them has it at its end.
         crop: where each ray begins and ends in it, [R] each; a ray that it ends has no backdrop.
+        cut_off: bool [R], rays without a backdrop in any case; None is no ray.
     """
     options = _DEFAULTS | options
     ends = rays_o.new_full((len(rays_o),), float(options["far_plane"]))
@@ -86,7 +89,7 @@ def _ending_in_a_backdrop(
     enters, leaves = intersect_box(rays_o, rays_d, walls)
     ends = torch.where(leaves > enters.clamp(min=0.0), leaves.minimum(ends), ends)
     begins = torch.full_like(ends, float(options["near_plane"]))
-    rays = within_crop(Rays(rays_o, rays_d, begins, ends, None), *crop)
+    rays = within_crop(Rays(rays_o, rays_d, begins, ends, None, cut_off), *crop)
     ended = with_backdrop(
         Intervals(*samples), rays, options["render_step_size"], options["cone_angle"]
     )
@@ -149,8 +152,10 @@ class GuidedEstimator(_StandIn):
             guide.kept = len(samples[0])
         occupancy = guide.the_occupancy()
         if occupancy.shows_a_backdrop() and not (guide.dense and self._is_endless()):
-            walls = occupancy.walls
-            samples = _ending_in_a_backdrop(samples, rays_o, rays_d, uncropped, walls, crop)
+            cut_off = None if self.training else guide.lacks_backdrop(rays_o, rays_d)
+            samples = _ending_in_a_backdrop(
+                samples, rays_o, rays_d, uncropped, occupancy.walls, crop, cut_off
+            )
         return samples
 
     @property
@@ -235,11 +240,28 @@ class GuidedProposal(_StandIn, Sampler):
         return guide.built(build_proposal, **options)
 
     def forward(self, *args: Any, **kwargs: Any) -> Any:
-        return self.sampler(*args, **kwargs)
+        """As of the sampler behind this.
 
-    def generate_ray_samples(self, *args: Any, **kwargs: Any) -> Any:
-        """As of the sampler behind this."""
-        return self.sampler(*args, **kwargs)
+        Rendered rays that meet nothing occupied, and whose backdrop training has never seen, have
+        samples without length: the field has learned nothing there.
+        """
+        (guide,) = self._guide
+        made, guide.without_backdrop = self.sampler(*args, **kwargs), None
+        if self.training or not guide.needs_occupancy:
+            return made
+        rays: RayBundle = args[0] if args else kwargs["ray_bundle"]
+        frame = guide.frame.to(rays.origins)
+        unseen = guide.lacks_backdrop(moved(rays.origins, frame), turned(rays.directions, frame))
+        guide.without_backdrop = unseen[:, None]
+        samples, weights, _ = made
+        if len(weights) > 0:
+            nowhere = (unseen & (weights[0].sum(dim=(-2, -1)) <= 0.0))[:, None, None]
+            frustums = samples.frustums
+            frustums.ends = torch.where(nowhere, frustums.starts, frustums.ends)
+            samples.deltas = samples.deltas.masked_fill(nowhere, 0.0)
+        return made
+
+    generate_ray_samples = forward
 
     def set_anneal(self, anneal: float) -> None:
         """Called by hosts for proposal networks, of which there are none."""

@@ -2,14 +2,9 @@
 
 from __future__ import annotations
 
-import copy
-import json
-import shutil
 from dataclasses import replace
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
-from unittest.mock import Mock
 
 import pytest
 import torch
@@ -20,6 +15,7 @@ from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataPars
 from nerfstudio.engine.callbacks import TrainingCallbackAttributes
 from nerfstudio.model_components.ray_samplers import UniformSampler
 from nerfstudio.pipelines.base_pipeline import VanillaPipelineConfig
+from scene_readers import Data, Pipe, started
 from torch import Tensor, nn
 
 from leco_plugin.host_configs import leco_ngp
@@ -31,7 +27,6 @@ from leco_plugin.models.hosts.guided_start import (
     GuidedStart,
     OccupancyConfig,
     along_rays,
-    warn_of_another_scene,
 )
 from leco_plugin.models.hosts.stand_ins import GuidedEstimator
 from leco_plugin.occupancy import Occupancy
@@ -52,48 +47,6 @@ CLEAR = 1e-3
 """Decisions within this of the threshold may fall either way, by rounding alone."""
 
 
-class Data:
-    """What a data manager is asked for."""
-
-    def __init__(self, config: NerfstudioDataParserConfig) -> None:
-        manager: Any = VanillaDataManagerConfig(dataparser=config).setup(device="cpu")
-        self.train_dataset = manager.train_dataset
-        self.train_dataparser_outputs = manager.train_dataparser_outputs
-
-
-class Pipe:
-    """What a pipeline is asked for."""
-
-    def __init__(self, data: Data) -> None:
-        self.datamanager, self.device = data, "cpu"
-
-
-@pytest.fixture(scope="module")
-def tilted(tiny_scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The tiny scene without a word on its orientation: each reader turns it in its own way."""
-    folder = tmp_path_factory.mktemp("tilted") / "ball"
-    shutil.copytree(tiny_scene, folder)
-    description = folder / "transforms.json"
-    scene = json.loads(description.read_text())
-    del scene["orientation_override"]
-    description.write_text(json.dumps(scene))
-    return folder
-
-
-@pytest.fixture(scope="module")
-def readers(tilted: Path) -> dict[str, Data]:
-    """Readers of one scene, each with coordinates of its own."""
-    options: dict[str, dict[str, Any]] = {
-        "as it is": {"orientation_method": "none", "center_method": "none"},
-        "turned by pca": {"orientation_method": "pca", "scale_factor": 0.4},
-        "turned up": {"orientation_method": "up", "center_method": "focus"},
-    }
-    return {
-        name: Data(NerfstudioDataParserConfig(data=tilted, **values))
-        for name, values in options.items()
-    }
-
-
 def lopsided(data: Data) -> Occupancy:
     """Half of the space around the ball, in no symmetric shape, as if learned by this reader."""
     torch.manual_seed(3)
@@ -106,14 +59,6 @@ def lopsided(data: Data) -> Occupancy:
     made.threshold_value.fill_(float(made.query(around).median()))
     made.report = {"frame": frame.tolist()}
     return made.eval()
-
-
-def started(occupancy: Occupancy, data: Data, sampler: str = "learned-occupancy") -> Guide:
-    """A guide in the coordinates of a host that reads with `data`."""
-    guide = Guide(sampler)
-    guide.set_occupancy(occupancy)
-    GuidedStart(nn.Module(), guide, OccupancyConfig(sampler=sampler), Pipe(data))
-    return guide.eval()
 
 
 def in_other_coordinates(positions: Tensor, host: Data, learned: Data) -> Tensor:
@@ -221,80 +166,6 @@ def test_the_ball_is_found_whatever_it_was_learned_in(readers: dict[str, Data]) 
         shares.append(float(kept.sum() / met.sum()))
     assert shares == pytest.approx([shares[0]] * len(shares), rel=0.05)
     assert 0.05 < shares[0] < 0.6
-
-
-def test_an_occupancy_of_another_scene_is_refused_unless_the_run_began_with_it(
-    readers: dict[str, Data],
-) -> None:
-    elsewhere = ball_of_the_tiny_scene([[1, 0, 0, 50.0], [0, 1, 0, 50.0], [0, 0, 1, 50.0]])
-    elsewhere.report = {"frame": torch.eye(3, 4).tolist()}
-    with pytest.raises(InputError, match=r"keeps nothing .* learned on another scene") as error:
-        started(elsewhere, readers["as it is"])
-    assert "\n" not in str(error.value)
-    (guide := Guide()).set_occupancy(elsewhere)
-    (resumed := Mock())._start_step = 90
-    GuidedStart(nn.Module(), guide, OccupancyConfig(), Pipe(readers["as it is"]), resumed)
-
-
-ANOTHER = "the occupancy seems to be of another scene"
-
-
-def learned_by(data: Data, **report: Any) -> Occupancy:
-    """The ball, as a run on these cameras would leave it."""
-    occupancy = ball_of_the_tiny_scene(frame_of(data) or [])
-    places = data.train_dataset.cameras.camera_to_worlds[:, :3, 3]
-    occupancy.report |= {"cameras": places.tolist()} | report
-    return occupancy
-
-
-def test_an_occupancy_of_other_cameras_is_said_to_be_of_another_scene(
-    readers: dict[str, Data], capsys: pytest.CaptureFixture[str]
-) -> None:
-    places = readers["as it is"].train_dataset.cameras.camera_to_worlds[:, :3, 3]
-    other = learned_by(readers["as it is"], cameras=(places + 0.05).tolist())
-    started(other, readers["as it is"])
-    said = " ".join(capsys.readouterr().out.split())
-    assert ANOTHER in said and f"of the {len(places)} cameras that its file names 0" in said
-
-
-@pytest.mark.parametrize("kept", [1, 3, 9])
-def test_photographs_that_were_added_or_taken_away_are_no_other_scene(
-    kept: int, readers: dict[str, Data], capsys: pytest.CaptureFixture[str]
-) -> None:
-    """Nor is another reader."""
-    occupancy = learned_by(readers["turned by pca"])
-    occupancy.report["cameras"] = occupancy.report["cameras"][:kept]
-    started(occupancy, readers["turned up"])
-    assert ANOTHER not in " ".join(capsys.readouterr().out.split())
-
-
-def test_another_split_is_no_other_scene(
-    readers: dict[str, Data], capsys: pytest.CaptureFixture[str]
-) -> None:
-    """It was learned on what is tested on here."""
-    data = copy.copy(readers["as it is"])
-    occupancy = learned_by(data)
-    data.eval_dataset = data.train_dataset
-    data.train_dataset = SimpleNamespace(
-        cameras=copy.copy(data.eval_dataset.cameras), metadata=data.eval_dataset.metadata
-    )
-    data.train_dataset.cameras.camera_to_worlds = (
-        data.eval_dataset.cameras.camera_to_worlds + torch.tensor([0.0, 0.0, 0.0, 0.03])
-    )
-    frame = torch.eye(3, 4)
-    warn_of_another_scene(occupancy, data, frame)
-    assert ANOTHER not in capsys.readouterr().out
-    data.eval_dataset = None
-    warn_of_another_scene(occupancy, data, frame)
-    assert ANOTHER in " ".join(capsys.readouterr().out.split())
-
-
-@pytest.mark.parametrize("cameras", [None, [], "none", [[0.0]]])
-def test_a_file_that_names_no_cameras_is_not_compared(
-    cameras: Any, readers: dict[str, Data], capsys: pytest.CaptureFixture[str]
-) -> None:
-    started(learned_by(readers["as it is"], cameras=cameras), readers["as it is"])
-    assert ANOTHER not in " ".join(capsys.readouterr().out.split())
 
 
 def test_training_says_what_was_wrong_with_a_path(readers: dict[str, Data], tmp_path: Path) -> None:
@@ -415,16 +286,15 @@ def test_a_host_that_asks_no_gate_needs_no_occupancy(tiny_scene: Path) -> None:
     assert pipeline.model.leco_guide.occupancy is None
 
 
-def test_where_the_scene_lies_is_said_before_the_first_step(
+def test_with_a_file_nothing_is_said_of_bounds_for_learning_one(
     readers: dict[str, Data], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     said: list[str] = []
     for module in ("scenes.survey", "models.hosts.guided_start"):
         monkeypatch.setattr(f"leco_plugin.{module}.say", said.append)
     started(lopsided(readers["as it is"]), readers["as it is"])
-    assert any(line.startswith("near") for line in said)
-    assert "rays meet the scene" in said[-2]
-    assert "those for learning one, and do not change it" in said[-1]
+    (line,) = said
+    assert line.startswith("guided by an occupancy that keeps ")
 
 
 def test_a_range_that_no_ray_meets_is_refused_before_the_first_step(
