@@ -21,7 +21,6 @@ from gpu_scale import Scale, figure
 from torch import Tensor
 
 from leco_plugin.evaluation.peak_memory import peak_process_bytes
-from leco_plugin.models.field import HMoEField
 from leco_plugin.learning.calibration import (
     CalibrationConfig,
     Measured,
@@ -29,8 +28,9 @@ from leco_plugin.learning.calibration import (
     calibrate,
     reference_of,
 )
-from leco_plugin.models.gate import Gate
 from leco_plugin.learning.schedule import ScheduleConfig, ramp
+from leco_plugin.models.field import HMoEField
+from leco_plugin.models.gate import Gate
 from leco_plugin.models.objective import GateLossConfig, field_losses, gate_losses
 from leco_plugin.models.rendering import (
     Intervals,

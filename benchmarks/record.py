@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import argparse
 import copy
+import itertools
 import json
 import random
 import tempfile
@@ -23,6 +24,7 @@ import checkout  # noqa: F401
 import numpy as np
 import torch
 from nerfstudio.engine.trainer import Trainer
+from nerfstudio.utils import writer
 
 from leco_plugin.method_configs import leco_occupancy
 from leco_plugin.occupancy import Occupancy
@@ -48,6 +50,8 @@ def run(data: Path, seed: int, folder: Path) -> dict[str, Any]:
     model: Any = config.pipeline.model
     model.schedule = replace(model.schedule, learn_steps=STEPS // 2, earliest=1.0)
     config.set_timestamp()
+    writer.EVENT_WRITERS.clear()
+    writer.GLOBAL_BUFFER.clear()
     trainer: Trainer = config.setup(local_rank=0, world_size=1)
     trainer.setup()
     losses: dict[str, dict[str, float]] = {}
@@ -101,11 +105,10 @@ def main() -> None:
     then = json.loads(given.against.read_text()) if given.against else {}
     now: dict[str, Any] = {}
     wrong = 0
-    for data in given.data:
-        for seed in given.seeds:
+    with tempfile.TemporaryDirectory() as folder:
+        for data, seed in itertools.product(given.data, given.seeds):
             name = f"{data.name} {seed}"
-            with tempfile.TemporaryDirectory() as folder:
-                now[name] = run(data, seed, Path(folder))
+            now[name] = run(data, seed, Path(folder))
             shown = {key: round(now[name][key], 4) for key in ("psnr", "threshold", "kept")}
             print(name, shown, flush=True)
             if given.out:

@@ -11,8 +11,8 @@ from nerfstudio.data.scene_box import SceneBox
 from nerfstudio.models.instant_ngp import InstantNGPModelConfig
 from sampling_scene import rays_into
 
-from leco_plugin.compat.host_lpips import setup_with_lazy_lpips
 from leco_plugin.models.field import HMoEField
+from leco_plugin.models.hosts.classes import Host, set_up_host
 from leco_plugin.models.rendering import Intervals, Rays, Routing, shade
 from leco_plugin.models.sizing.sizes import PAPER
 from leco_plugin.occupancy import gate_precision
@@ -33,7 +33,7 @@ def ngp_like_step(estimator: LearnedOccupancyEstimator, n_rays: int = 1024) -> S
     box = torch.stack([space.center - space.half_extent, space.center + space.half_extent]).cpu()
     config = InstantNGPModelConfig(grid_resolution=8, grid_levels=1, background_color="white")
     nerfacc_cpu.install()
-    model = setup_with_lazy_lpips(config, scene_box=SceneBox(box), num_train_data=1)
+    model = set_up_host(config, Host, scene_box=SceneBox(box), num_train_data=1)
     model = model.to(estimator.device)
     model.sampler.occupancy_grid = estimator
     optimizer = torch.optim.Adam(model.get_param_groups()["fields"], lr=1e-2)

@@ -1,23 +1,18 @@
-"""Builds a nerfstudio model without a network: its LPIPS is loaded at first use, if at all.
+"""nerfstudio models without a network: their LPIPS is loaded at first use, if at all.
 
 Every built-in method makes LPIPS in `populate_modules`, and LPIPS fetches its AlexNet then.
 """
 
 from __future__ import annotations
 
-import functools
 import math
 from collections.abc import Iterator
 from contextlib import contextmanager
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
-import torch
 from torch import Tensor, nn
 
 from leco_plugin.evaluation.metrics import LPIPS_MINIMUM_SIDE, LpipsBackbone, lpips_metric
-
-if TYPE_CHECKING:
-    from nerfstudio.models.base_model import Model, ModelConfig
 
 
 class LazyLpipsNetwork(nn.Module):
@@ -55,29 +50,3 @@ def lazy_lpips() -> Iterator[None]:
         yield
     finally:
         lpip._NoTrainLpips = eager_network  # type: ignore[misc]
-
-
-def setup_with_lazy_lpips(config: ModelConfig, **arguments: Any) -> Model:
-    """`config.setup(**arguments)` for a model that builds LPIPS, without a network.
-
-    The model's `get_image_metrics_and_images` then leaves an LPIPS out that could not be computed:
-    ns-eval would write its NaN, which is no JSON.
-    """
-    with lazy_lpips():
-        model: Model = config.setup(**arguments)
-    with_every_metric = model.get_image_metrics_and_images
-
-    @functools.wraps(with_every_metric)
-    def get_image_metrics_and_images(
-        outputs: dict[str, Tensor], batch: dict[str, Tensor]
-    ) -> tuple[dict[str, float], dict[str, Tensor]]:
-        metrics, images = with_every_metric(outputs, batch)
-        kept = {
-            name: value
-            for name, value in metrics.items()
-            if "lpips" not in name or bool(torch.isfinite(torch.as_tensor(value)))
-        }
-        return kept, images
-
-    model.get_image_metrics_and_images = get_image_metrics_and_images  # type: ignore[method-assign]
-    return model

@@ -6,7 +6,6 @@ from dataclasses import dataclass, field
 
 from nerfstudio.models.base_model import ModelConfig
 
-from leco_plugin.compat.earlier_configs import GrowingConfig
 from leco_plugin.learning.calibration import CalibrationConfig
 from leco_plugin.learning.merging import MergingConfig
 from leco_plugin.learning.schedule import ScheduleConfig
@@ -24,7 +23,7 @@ def _model() -> type:
 
 
 @dataclass
-class LecoModelConfig(GrowingConfig, ModelConfig):
+class LecoModelConfig(ModelConfig):
     """Learned occupancy: learn, freeze and calibrate, go on guided"""
 
     _target: type = field(default_factory=_model)

@@ -83,7 +83,7 @@ class Region(nn.Module):
         """
         rays = self.cut(origins, directions, images)
         if images is None:
-            rays = rays._replace(cut_off=~self._shows_backdrop(rays))
+            rays = rays._replace(cut_off=~self.shows_backdrop(rays))
         return within_crop(with_ends_for_all(rays, self.far, length), *crop)
 
     def cut(self, origins: Tensor, directions: Tensor, images: Tensor | None = None) -> Rays:
@@ -105,7 +105,8 @@ class Region(nn.Module):
         inside = self.space.map(ends).abs().amax(dim=-1) <= 1.0
         return at_floor & inside & (cut.t_maxs > cut.t_mins)
 
-    def _shows_backdrop(self, cut: Rays) -> Tensor:
+    def shows_backdrop(self, cut: Rays) -> Tensor:
+        """Whether training has seen the backdrop of rays that are cut to the region: bool [R]."""
         seen: Tensor = self.backdrops(cut)
         return self.leaves_by_floor(cut) | seen
 

@@ -57,6 +57,7 @@ class Guide(nn.Module):
         occupancy: None until there is one.
         dense: whether packed samplers keep every candidate for the moment, as a reference.
         cropped: whether the limits of the rays that are rendered now are those of a crop.
+        without_proposals: whether the host's proposal networks are gone.
         kept: samples that a packed sampler kept when it was last asked in training.
         watched: what is known of the price of skipping; travels with a checkpoint.
         first_density: with which the host's field began, None for its own; see `opaque_start`.
@@ -80,7 +81,7 @@ class Guide(nn.Module):
         self.options = dict(options or {})
         self.occupancy: Occupancy | None = None
         self.version = 0
-        self.dense = self.cropped = False
+        self.dense = self.cropped = self.without_proposals = False
         self.kept: int | None = None
         self.watched = WatchState()
         self.first_density: float | None = None
@@ -178,8 +179,9 @@ class Guide(nn.Module):
             origins, directions: [R, 3] in the occupancy's coordinates, directions of any length.
         """
         unit = torch.nn.functional.normalize(directions.float(), dim=-1)
-        region = self._region()
-        return ~region.shows_backdrop(region.cut(origins.float(), unit))
+        region: Region = self._region()
+        cut = region.cut(origins.float(), unit)
+        return ~region.shows_backdrop(cut)
 
     def estimator(
         self,

@@ -9,7 +9,6 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor, nn
 
-from leco_plugin.compat.earlier_configs import GrowingConfig
 from leco_plugin.evaluation.inspection import cameras_of
 from leco_plugin.learning.freezing import FILE_NAME, leave_file
 from leco_plugin.log import say
@@ -48,7 +47,7 @@ OWN_SAMPLER = "own"
 
 
 @dataclass
-class OccupancyConfig(GrowingConfig):
+class OccupancyConfig:
     """What guides the host."""
 
     path: Path | None = None

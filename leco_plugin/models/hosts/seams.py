@@ -6,7 +6,6 @@ samples in another way brings a `HostAdapter`.
 
 from __future__ import annotations
 
-import functools
 import warnings
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
@@ -70,7 +69,6 @@ def swap_sampler(host: Model, guide: Guide) -> str:
     for name, adapter in known.items():
         if _fits(name, adapter, host):
             adapter.swap(host, guide)
-            _leave_out_what_is_not_trained(host, guide)
             return name
     looked_for = "; ".join(f"{name}: {adapter.description}" for name, adapter in known.items())
     raise InputError(
@@ -172,7 +170,7 @@ def _swap_proposal(host: Model, guide: Guide) -> None:
             ),
         )
     _remove_density_networks(host)
-    _leave_out_proposal_loss(host)
+    guide.without_proposals = True
 
 
 PROPOSAL = HostAdapter(
@@ -211,37 +209,3 @@ def _remove_density_networks(host: nn.Module) -> None:
         for network in {density.__self__ for density in densities} - {field}:
             replace_module(host, network, nn.Module())
         setattr(host, name, type(densities)([no_density] * len(densities)))
-
-
-def _leave_out_proposal_loss(host: Model) -> None:
-    """A loss that reaches no parameter, as the one of proposal networks now, is left out."""
-    with_all = host.get_loss_dict
-
-    @functools.wraps(with_all)
-    def get_loss_dict(*args: Any, **kwargs: Any) -> dict[str, Any]:
-        losses = with_all(*args, **kwargs)
-        if not host.training:
-            return losses
-        return {name: loss for name, loss in losses.items() if loss.requires_grad}
-
-    host.get_loss_dict = get_loss_dict  # type: ignore[method-assign]
-
-
-def _leave_out_what_is_not_trained(host: Model, guide: Guide) -> None:
-    """Groups of parameters are handed out without the gate, and not at all when they are empty.
-
-    An optimizer takes no empty list. A gate among its parameters would be one more of them in a run
-    that was given a file than in the same run resumed without.
-    """
-    with_all = host.get_param_groups
-
-    @functools.wraps(with_all)
-    def get_param_groups() -> dict[str, list[nn.Parameter]]:
-        frozen = {id(parameter) for parameter in guide.parameters()}
-        groups = {
-            name: [parameter for parameter in group if id(parameter) not in frozen]
-            for name, group in with_all().items()
-        }
-        return {name: group for name, group in groups.items() if group}
-
-    host.get_param_groups = get_param_groups  # type: ignore[method-assign]

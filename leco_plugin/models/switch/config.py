@@ -7,7 +7,6 @@ from typing import Literal
 
 from nerfstudio.models.base_model import ModelConfig
 
-from leco_plugin.compat.earlier_configs import GrowingConfig
 from leco_plugin.models.switch.sizes import SMALL, SwitchSizes
 from leco_plugin.scenes.bounds import BoundsConfig
 
@@ -19,7 +18,7 @@ def _model() -> type:
 
 
 @dataclass
-class SwitchNerfModelConfig(GrowingConfig, ModelConfig):
+class SwitchNerfModelConfig(ModelConfig):
     """Switch-NeRF: equal experts, a gate that learns to share the scene among them"""
 
     _target: type = field(default_factory=_model)
