@@ -13,7 +13,7 @@ from gpu_training import peak_of
 from sampling_scene import fit_occupancy, rays_into
 from torch import Tensor
 
-from leco_plugin.models.compute import grouped_trial
+from leco_plugin.models.compute import grouped as grouped_trial
 from leco_plugin.models.compute.dispatch import dispatch
 from leco_plugin.models.compute.grouped import grouped_dispatch
 from leco_plugin.models.encodings import EncodingConfig

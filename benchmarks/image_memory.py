@@ -109,8 +109,8 @@ def measure(way: Way, folder: Path, options: Options) -> dict[str, Any]:
     from nerfstudio.pipelines.base_pipeline import VanillaPipelineConfig
 
     from leco_plugin.evaluation.peak_memory import peak_process_bytes
+    from leco_plugin.hosts.learn_first import learn_occupancy
     from leco_plugin.learning.schedule import ScheduleConfig
-    from leco_plugin.models.hosts.learn_first import learn_occupancy
     from leco_plugin.models.leco_config import LecoModelConfig
     from leco_plugin.scenes.data_manager import LecoDataManagerConfig, decoded_bytes
     from leco_plugin.scenes.photographs import LecoPhotographsDataParserConfig

@@ -29,13 +29,17 @@ from typing import Any
 
 import psutil
 
-from leco_plugin.compat.checkpoints import allow_checkpoint_globals
-from leco_plugin.compat.nerfstudio_changes import iterations_until
-from leco_plugin.compat.whole_checkpoints import newest_whole, previous_of, step_of
 from leco_plugin.evaluation.json_file import write_json
 from leco_plugin.evaluation.machine import describe_machine
 from leco_plugin.occupancy import Occupancy
 from leco_plugin.scenes.input_error import InputError
+from leco_plugin.studio.checkpoints import (
+    allow_checkpoint_globals,
+    newest_whole,
+    previous_of,
+    step_of,
+)
+from leco_plugin.studio.versions import iterations_until
 
 ROOT = Path(__file__).resolve().parents[1]
 STEPS, LEARN_STEPS = 60, 24
@@ -48,7 +52,7 @@ KILLS_A_RUN = 5
 """At most: what comes between the last of them and the end of a run shows no kill."""
 PRELOADED = [
     "nerfstudio.scripts.train",
-    "leco_plugin.compat.atomic_trainer",
+    "leco_plugin.studio.trainer",
     "leco_plugin.learning.learner",
     "leco_plugin.evaluation.held_out_images",
 ]

@@ -23,7 +23,6 @@ import tyro
 from timing import interleaved, ratio
 
 from leco_plugin.cli_reports import occupancy_of
-from leco_plugin.compat.host_outputs import true_colours
 from leco_plugin.evaluation.field_queries import counted
 from leco_plugin.evaluation.json_file import read_object, write_json
 from leco_plugin.evaluation.machine import describe_code, describe_machine, made_by
@@ -31,6 +30,7 @@ from leco_plugin.models.leco import LecoModel
 from leco_plugin.samplers.estimator import LearnedOccupancyEstimator
 from leco_plugin.samplers.marching import march
 from leco_plugin.shrink.sources import find_source
+from leco_plugin.studio.host_models import true_colours
 
 IMAGES = 4
 """Test photographs, evenly chosen."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from leco_plugin.models.compute.precision import fast_precision
+from leco_plugin.models.compute.device import fast_precision
 from leco_plugin.models.gate import Gate, GateConfig
 from leco_plugin.occupancy import Occupancy, gate_precision
 from leco_plugin.space import Space

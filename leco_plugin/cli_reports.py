@@ -21,7 +21,7 @@ def occupancy_of(path: Path) -> Path:
         raise ValueError(f"there is no {path}: {give}")
     if not path.is_dir():
         return path
-    from leco_plugin.models.hosts.guided_start import occupancy_file
+    from leco_plugin.hosts.guided_start import occupancy_file
 
     file = occupancy_file(path)
     if file is None or not file.exists():

@@ -16,7 +16,6 @@ from nerfstudio.engine.trainer import Trainer, TrainerConfig
 from torch import Tensor
 
 from leco_plugin.chart.drawing.theme import LIGHT, Theme
-from leco_plugin.compat.host_outputs import true_colours
 from leco_plugin.evaluation.charts import psnr_against_seconds
 from leco_plugin.evaluation.clock import Budget
 from leco_plugin.evaluation.inspection import ViewBox
@@ -32,6 +31,7 @@ from leco_plugin.occupancy import Occupancy
 from leco_plugin.scenes.city.city import CityConfig
 from leco_plugin.scenes.city.folder import CaptureConfig, write_city
 from leco_plugin.scenes.city.truth import CityTruth
+from leco_plugin.studio.host_models import true_colours
 
 SECONDS = 130.0
 """Training time of each of the two runs; all of it then takes about six minutes on two cores."""

@@ -14,16 +14,15 @@ from nerfstudio.models.nerfacto import NerfactoModelConfig
 from nerfstudio.pipelines.base_pipeline import VanillaPipelineConfig
 from nerfstudio.plugins.types import MethodSpecification
 
-from leco_plugin.compat.data_parallel import DataParallelTrainerConfig
-from leco_plugin.compat.dynamic_batch import ClampedDynamicBatchPipelineConfig
+from leco_plugin.hosts.guided import GuidedModelConfig
 from leco_plugin.method_configs import ON_GPU, STEPS, best_device
-from leco_plugin.models.compute.optimizers import FusedAdamConfig
-from leco_plugin.models.guided import GuidedModelConfig
-from leco_plugin.models.switch.config import SwitchNerfModelConfig
-from leco_plugin.models.switch.sizes import switch_sizes_for
+from leco_plugin.models.compute.device import FusedAdamConfig
+from leco_plugin.models.switch.config import SwitchNerfModelConfig, switch_sizes_for
 from leco_plugin.scenes.data_manager import LecoDataManagerConfig
 from leco_plugin.scenes.photographs import LecoPhotographsDataParserConfig
 from leco_plugin.scenes.pixels.known_distances import KnownDistancePixelSamplerConfig
+from leco_plugin.studio.dynamic_batch import ClampedDynamicBatchPipelineConfig
+from leco_plugin.studio.processes import DataParallelTrainerConfig
 from leco_plugin.swap import learned_first, with_sampler_swapped
 
 

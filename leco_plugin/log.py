@@ -18,7 +18,7 @@ from leco_plugin.models.compute.ranks import is_first
 
 SECONDS_A_LINE = 60.0
 """Between two lines where there is no terminal to draw a bar on."""
-OF_A_DEVICE = ("leco_plugin.samplers.kernels.fused", "leco_plugin.models.compute.grouped_trial")
+OF_A_DEVICE = ("leco_plugin.samplers.kernels.fused", "leco_plugin.models.compute.grouped")
 """Whose warnings are of the device of one process; all others have the same everywhere."""
 
 

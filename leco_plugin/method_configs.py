@@ -11,14 +11,14 @@ from nerfstudio.engine.schedulers import ExponentialDecaySchedulerConfig
 from nerfstudio.pipelines.base_pipeline import VanillaPipelineConfig
 from nerfstudio.plugins.types import MethodSpecification
 
-from leco_plugin.compat.data_parallel import DataParallelTrainerConfig
 from leco_plugin.learning.schedule import ScheduleConfig
-from leco_plugin.models.compute.optimizers import RATES, FusedAdamConfig
+from leco_plugin.models.compute.device import RATES, FusedAdamConfig
 from leco_plugin.models.leco_config import LecoModelConfig
 from leco_plugin.models.sizing.sizes import PAPER, automatic, sizes_for
 from leco_plugin.scenes.data_manager import LecoDataManagerConfig
 from leco_plugin.scenes.photographs import LecoPhotographsDataParserConfig
 from leco_plugin.scenes.pixels.known_distances import KnownDistancePixelSamplerConfig
+from leco_plugin.studio.processes import DataParallelTrainerConfig
 
 
 def best_device() -> Literal["cpu", "cuda"]:

@@ -14,17 +14,17 @@ from nerfstudio.data.dataparsers.base_dataparser import DataParserConfig
 from nerfstudio.engine.trainer import Trainer, TrainerConfig
 from nerfstudio.models.base_model import ModelConfig
 
-from leco_plugin.compat.atomic_trainer import AtomicTrainer
-from leco_plugin.compat.data_parallel import DataParallelTrainerConfig
-from leco_plugin.compat.dynamic_batch import clamped
+from leco_plugin.hosts.appearance_codes import Codes
+from leco_plugin.hosts.guided import GuidedModelConfig
+from leco_plugin.hosts.guided_start import OccupancyConfig, load_occupancy, occupancy_file
 from leco_plugin.method_configs import LEARNING, ON_GPU, best_device
-from leco_plugin.models.guided import GuidedModelConfig
-from leco_plugin.models.hosts.appearance_codes import Codes
-from leco_plugin.models.hosts.guided_start import OccupancyConfig, load_occupancy, occupancy_file
 from leco_plugin.models.sizing.sizes import learning_only
 from leco_plugin.samplers.registry import check_gate, refuse_unknown_options
 from leco_plugin.scenes.input_error import InputError
 from leco_plugin.scenes.reading import with_checks
+from leco_plugin.studio.dynamic_batch import clamped
+from leco_plugin.studio.processes import DataParallelTrainerConfig
+from leco_plugin.studio.trainer import AtomicTrainer
 
 LEARNED = "learned-occupancy"
 """Name of the sampler that goes into a host unless another one is asked for."""

@@ -49,8 +49,8 @@ def prepare(data: Path, folder: Path, learn_steps: int) -> Ground:
         InputError: `data` is no folder, or what was left is not of it.
     """
     require_folder("--data", data)
+    from leco_plugin.hosts.learn_first import learn_model
     from leco_plugin.method_configs import best_device, leco_occupancy
-    from leco_plugin.models.hosts.learn_first import learn_model
 
     config: Any = copy.deepcopy(leco_occupancy.config.pipeline)
     config.datamanager.data = data

@@ -9,11 +9,11 @@ from typing import Any
 import torch
 from nerfstudio.engine.trainer import Trainer
 
-from leco_plugin.compat.host_outputs import true_colours
 from leco_plugin.evaluation.clock import Clock
 from leco_plugin.evaluation.field_queries import FieldQueries
 from leco_plugin.evaluation.metrics import image_metrics
 from leco_plugin.scenes.input_error import InputError
+from leco_plugin.studio.host_models import true_colours
 
 RAYS_AT_ONCE = 1024
 """Of pixels spread over the images: few, so that looking at a run does not set its peak memory."""

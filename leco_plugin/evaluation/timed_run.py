@@ -25,7 +25,7 @@ from leco_plugin.evaluation.grid_updates import GridUpdates
 from leco_plugin.evaluation.held_out_images import evaluate_images, psnr_on_rays
 from leco_plugin.evaluation.json_file import finite_or_null
 from leco_plugin.evaluation.peak_memory import peak_allocator_bytes, peak_process_bytes
-from leco_plugin.models.hosts.learn_first import FIRST_TIMED, TIMED_STEPS, keep_within
+from leco_plugin.hosts.learn_first import FIRST_TIMED, TIMED_STEPS, keep_within
 
 CURVE_RAYS = 8192
 """Test pixels behind each point of a curve, its end included."""

@@ -23,6 +23,7 @@ from leco_plugin.learning.progress import Progress, WatchState
 from leco_plugin.learning.recoveries import Recoveries
 from leco_plugin.learning.run import Run, keep_pace
 from leco_plugin.learning.schedule import (
+    KEPT_ABOVE,
     ScheduleConfig,
     StepPlan,
     converged,
@@ -31,7 +32,6 @@ from leco_plugin.learning.schedule import (
     ramp,
     steps_of_an_extension,
 )
-from leco_plugin.learning.statistics import KEPT_ABOVE
 from leco_plugin.log import say
 from leco_plugin.models.compute.ranks import from_first, mean, share
 from leco_plugin.models.gate import occupancy_from_logits

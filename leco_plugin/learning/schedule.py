@@ -11,6 +11,8 @@ from leco_plugin.models.mixture import Following
 from leco_plugin.models.objective import GateLossConfig
 from leco_plugin.scenes.input_error import InputError
 
+KEPT_ABOVE = 0.1
+"""o(x) from which a sample counts as kept before there is a calibrated threshold."""
 MOST_EXTENSIONS = 2
 """How often a gate that has not settled is given more steps."""
 

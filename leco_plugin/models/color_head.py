@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor, nn
 
-from leco_plugin.models.compute.steady import steadied
+from leco_plugin.models.compute.dispatch import steadied
 from leco_plugin.models.encodings import FrequencyEncoding
 
 OPPONENT = torch.tensor(

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor, nn
 
 from leco_plugin.models.color_head import ColorHead
-from leco_plugin.models.compute.steady import steadied
+from leco_plugin.models.compute.dispatch import steadied
 from leco_plugin.models.encodings import EncodingConfig, build_encoding
 from leco_plugin.models.hmoe import HMoE, HMoEConfig
 

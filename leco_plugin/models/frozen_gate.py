@@ -17,7 +17,7 @@ from weakref import WeakKeyDictionary
 import torch
 from torch import Tensor
 
-from leco_plugin.models.compute.steady import filled_size
+from leco_plugin.models.compute.dispatch import filled_size
 from leco_plugin.models.encodings import Encoding, FrequencyEncoding
 from leco_plugin.models.gate import EMPTY, Gate
 

@@ -13,7 +13,7 @@ from typing import get_args
 import torch
 from torch import Tensor, nn
 
-from leco_plugin.models.compute.steady import steadied
+from leco_plugin.models.compute.dispatch import steadied
 from leco_plugin.models.encodings import EncodingConfig, Kind, build_encoding
 
 EMPTY = 0

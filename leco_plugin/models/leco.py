@@ -17,38 +17,34 @@ from nerfstudio.model_components.renderers import RGBRenderer
 from nerfstudio.models.base_model import Model
 from torch import Tensor, nn
 
-from leco_plugin.compat.checkpoints import allow_checkpoint_globals
-from leco_plugin.compat.evaluated_runs import evaluate_whole_checkpoints
-from leco_plugin.compat.trainer_run import TrainerRun
 from leco_plugin.learning.collapse import annealed
 from leco_plugin.learning.learner import Learner
 from leco_plugin.learning.progress import Progress
 from leco_plugin.learning.run import LearningOnly, Run
-from leco_plugin.learning.schedule import StepPlan
-from leco_plugin.learning.statistics import (
-    KEPT_ABOVE,
-    gate_statistics,
-    kept_fraction,
-    prices,
-)
-from leco_plugin.models.compute.precision import fast_precision, keep_freed_memory
+from leco_plugin.learning.schedule import KEPT_ABOVE, StepPlan
+from leco_plugin.models.compute.device import fast_precision, keep_freed_memory
 from leco_plugin.models.failures import require_finite
+from leco_plugin.models.figures import (
+    before_the_backdrop,
+    gate_pictures,
+    gate_statistics,
+    image_figures,
+    kept_fraction,
+    over_background,
+    prices,
+    with_alpha,
+)
 from leco_plugin.models.front_to_back import is_no_slower
-from leco_plugin.models.image_figures import image_figures
 from leco_plugin.models.leco_config import LecoModelConfig
 from leco_plugin.models.mixture import Mixture
 from leco_plugin.models.objective import field_losses, gate_losses
-from leco_plugin.models.ray_pictures import (
-    before_the_backdrop,
-    gate_pictures,
-    over_background,
-    with_alpha,
-)
 from leco_plugin.models.rendering import Intervals, Rays, Routing, Shaded
 from leco_plugin.models.sizing.scene_sizes import complete
 from leco_plugin.scenes.input_error import InputError
 from leco_plugin.scenes.learning_data import LearningData
 from leco_plugin.scenes.pixels.known_distances import DISTANCE
+from leco_plugin.studio.checkpoints import allow_checkpoint_globals, evaluate_whole_checkpoints
+from leco_plugin.studio.trainer import TrainerRun
 
 
 class LecoModel(Model):

@@ -15,12 +15,9 @@ from nerfstudio.model_components.renderers import RGBRenderer
 from nerfstudio.models.base_model import Model
 from torch import Tensor, nn
 
-from leco_plugin.compat.checkpoints import allow_checkpoint_globals
-from leco_plugin.compat.evaluated_runs import evaluate_whole_checkpoints
-from leco_plugin.models.compute.precision import fast_precision, keep_freed_memory
+from leco_plugin.models.compute.device import fast_precision, keep_freed_memory
 from leco_plugin.models.failures import require_finite
-from leco_plugin.models.image_figures import image_figures
-from leco_plugin.models.ray_pictures import leading_expert, over_background, with_alpha
+from leco_plugin.models.figures import image_figures, leading_expert, over_background, with_alpha
 from leco_plugin.models.region import Region, marching_rule
 from leco_plugin.models.rendering import (
     Intervals,
@@ -30,17 +27,37 @@ from leco_plugin.models.rendering import (
     mapped_middles,
     with_backdrop,
 )
-from leco_plugin.models.scene_grid import scene_grid
 from leco_plugin.models.switch.config import SwitchNerfModelConfig
 from leco_plugin.models.switch.field import NEW_DENSITY, Answers, SwitchField
-from leco_plugin.models.switch.objective import switch_losses, switch_statistics
-from leco_plugin.models.switch.rendering import coarse_and_fine, kept_by, render
+from leco_plugin.models.switch.rendering import (
+    coarse_and_fine,
+    kept_by,
+    render,
+    switch_losses,
+    switch_statistics,
+)
 from leco_plugin.occupancy import gate_precision
 from leco_plugin.samplers.grid import OccupancyGridEstimator
 from leco_plugin.scenes.bounds import SceneBounds
 from leco_plugin.scenes.input_error import InputError
 from leco_plugin.scenes.learning_data import LearningData
 from leco_plugin.scenes.survey import announce
+from leco_plugin.space import Space
+from leco_plugin.studio.checkpoints import allow_checkpoint_globals, evaluate_whole_checkpoints
+
+
+def scene_grid(space: Space, aabb: Tensor, resolution: int, levels: int) -> OccupancyGridEstimator:
+    """An empty grid, whose innermost box is what the space maps without contraction.
+
+    Args:
+        aabb: [6] corners of the box in which rays are marched; the grid ends there too.
+        resolution: cells along each axis.
+        levels: nested boxes; a bounded scene needs one.
+    """
+    low, high = aabb.view(2, 3)
+    low = low.maximum(space.center - space.half_extent)
+    high = high.minimum(space.center + space.half_extent)
+    return OccupancyGridEstimator(torch.cat([low, high]), resolution, levels)
 
 
 class SwitchNerfModel(Model):

@@ -23,7 +23,6 @@ from nerfstudio.data.utils.dataloaders import (
 from nerfstudio.model_components.ray_generators import RayGenerator
 from torch import Tensor
 
-from leco_plugin.compat.nerfstudio_changes import keeps_all_images
 from leco_plugin.log import say
 from leco_plugin.scenes.dataset_units import UP_IS_KNOWN
 from leco_plugin.scenes.detail import CAMERAS
@@ -35,6 +34,7 @@ from leco_plugin.scenes.pixels.stored_pictures import picture_sizes, store_pictu
 from leco_plugin.scenes.reading import read_checked
 from leco_plugin.scenes.survey import points_in
 from leco_plugin.scenes.upright import turn_to_upright, turned
+from leco_plugin.studio.versions import keeps_all_images
 
 MOST_OF_MEMORY = 0.4
 """Share of the memory that is free which photographs in memory may take."""

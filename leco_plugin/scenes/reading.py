@@ -20,7 +20,6 @@ from nerfstudio.cameras.cameras import CameraType
 from nerfstudio.data.dataparsers.base_dataparser import DataParserConfig, DataparserOutputs
 from rich.markup import escape
 
-from leco_plugin.compat.moved_runs import require_data
 from leco_plugin.log import bar, say
 from leco_plugin.scenes.derived_images import DerivedImages
 from leco_plugin.scenes.input_error import InputError, one_line
@@ -37,6 +36,7 @@ from leco_plugin.scenes.photograph_files import (
 )
 from leco_plugin.scenes.photograph_masks import check_masked, masks_as_read
 from leco_plugin.scenes.scene_fields import say_unused
+from leco_plugin.studio.checkpoints import require_data
 
 CHECKED = "leco_checked"
 """Key of a dataparser's metadata: there where `checked` has been at its outputs."""

@@ -15,8 +15,6 @@ import torch
 from nerfstudio.cameras.rays import RayBundle
 from torch import Tensor
 
-from leco_plugin.compat.evaluated_runs import whole_of
-from leco_plugin.compat.whole_checkpoints import step_of
 from leco_plugin.evaluation.inspection import cameras_of
 from leco_plugin.learning.field_at_freezing import field_at_freezing
 from leco_plugin.models.leco import LecoModel
@@ -26,6 +24,7 @@ from leco_plugin.occupancy import Occupancy
 from leco_plugin.scenes.frames import between, found_again, frame_of, moved, turned
 from leco_plugin.scenes.input_error import InputError, one_line, require_folder
 from leco_plugin.scenes.pixels.held_out_pixels import held_out_sampler, some_images
+from leco_plugin.studio.checkpoints import step_of, whole_of
 
 CONFIG, CHECKPOINTS = "config.yml", "nerfstudio_models"
 DRAWS = 8

@@ -11,13 +11,13 @@ from typing import Any
 
 from nerfstudio.utils.rich_utils import CONSOLE
 
-from leco_plugin.compat.run_folder import alone_in
 from leco_plugin.log import bar, resumable
 from leco_plugin.scenes.input_error import InputError
 from leco_plugin.stability.cases import cases_named
 from leco_plugin.stability.contenders import samplers_named
 from leco_plugin.stability.sizes import FULL, QUICK
 from leco_plugin.stability.suite import Runner, Suite
+from leco_plugin.studio.run_folder import alone_in
 
 
 def make_table(

@@ -18,8 +18,8 @@ from nerfstudio.engine.trainer import Trainer
 from numpy.typing import NDArray
 from torch import Tensor
 
-from leco_plugin.compat.host_outputs import true_colours
 from leco_plugin.stability.scene_folder import TRUTH
+from leco_plugin.studio.host_models import true_colours
 
 NEAR = 0.03
 """A sample whose middle is within this share of the surface's distance is near it: the references

@@ -8,10 +8,10 @@ from pathlib import Path
 from typing import Any
 
 from leco_plugin.chart.runs.folder import UNFINISHED, ChartFolder, difference
-from leco_plugin.compat.run_folder import LOCK
 from leco_plugin.evaluation.json_file import read_object, write_json
 from leco_plugin.scenes.input_error import InputError
 from leco_plugin.stability.sizes import Sizes
+from leco_plugin.studio.run_folder import LOCK
 
 SIZES = "sizes.json"
 """File whose presence says that a folder is a table's, with the sizes of all runs there."""

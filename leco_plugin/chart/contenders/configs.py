@@ -11,12 +11,12 @@ from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataPars
 from nerfstudio.engine.trainer import TrainerConfig
 
 from leco_plugin.chart.contenders.contender import Contender, changed
-from leco_plugin.compat.dynamic_batch import clamped
 from leco_plugin.host_configs import guided
+from leco_plugin.hosts.guided import GuidedModelConfig
 from leco_plugin.method_configs import best_device
-from leco_plugin.models.guided import GuidedModelConfig
 from leco_plugin.models.leco_config import LecoModelConfig
 from leco_plugin.scenes.photographs import LecoPhotographsDataParserConfig
+from leco_plugin.studio.dynamic_batch import clamped
 from leco_plugin.swap import registered
 
 

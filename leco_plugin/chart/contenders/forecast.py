@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from leco_plugin.chart.contenders.contender import Contender
 from leco_plugin.chart.contenders.methods import DENSE
 from leco_plugin.chart.contenders.protocol import Protocol
-from leco_plugin.models.hosts.guided_start import OWN_SAMPLER
+from leco_plugin.hosts.guided_start import OWN_SAMPLER
 
 
 @dataclass(frozen=True)

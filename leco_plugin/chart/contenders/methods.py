@@ -12,8 +12,8 @@ from dataclasses import replace
 from typing import Any
 
 from leco_plugin.chart.contenders.contender import Contender
-from leco_plugin.models.guided import GuidedModelConfig
-from leco_plugin.models.hosts.guided_start import OWN_SAMPLER
+from leco_plugin.hosts.guided import GuidedModelConfig
+from leco_plugin.hosts.guided_start import OWN_SAMPLER
 from leco_plugin.models.leco_config import LecoModelConfig
 from leco_plugin.models.switch.config import SwitchNerfModelConfig
 from leco_plugin.samplers.registry import samplers as registered_samplers

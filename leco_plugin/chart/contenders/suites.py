@@ -11,9 +11,9 @@ from leco_plugin.chart.contenders.forecast import Cores
 from leco_plugin.chart.contenders.methods import GRID, LEARNED, NEVER_FROZEN, VARIANTS
 from leco_plugin.chart.contenders.protocol import Protocol
 from leco_plugin.evaluation.machine import usable_cores
+from leco_plugin.hosts.guided_start import OWN_SAMPLER
 from leco_plugin.method_configs import LEARNING, ON_GPU, best_device
-from leco_plugin.models.hosts.guided_start import OWN_SAMPLER
-from leco_plugin.models.switch.sizes import switch_sizes_for
+from leco_plugin.models.switch.config import switch_sizes_for
 from leco_plugin.scenes.input_error import InputError
 
 SCENE_LAYERS = LEARNING.sizes.field.experts.layers

@@ -11,9 +11,9 @@ from pathlib import Path
 from typing import Any
 
 from leco_plugin.chart.contenders.contender import Contender
-from leco_plugin.compat.run_folder import alone_in
 from leco_plugin.evaluation.json_file import read_object, write_json
 from leco_plugin.scenes.input_error import InputError
+from leco_plugin.studio.run_folder import alone_in
 
 SETTINGS, RESULTS = "settings.json", "results.json"
 RUNS, UNFINISHED, LOGS = "runs", "unfinished", "logs"

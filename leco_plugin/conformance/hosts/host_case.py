@@ -44,7 +44,7 @@ class HostCase:
     """
 
     seam: ClassVar[str] = "host"
-    imports: ClassVar[tuple[str, ...]] = ("torch", "torchmetrics", "leco_plugin.models.guided")
+    imports: ClassVar[tuple[str, ...]] = ("torch", "torchmetrics", "leco_plugin.hosts.guided")
     """Modules behind every model that take time to import."""
 
     def __init__(self, name: str) -> None:
@@ -95,7 +95,7 @@ def guided(name: str, file: Path) -> tuple[TrainerConfig, Kind]:
     Raises:
         InputError: as `HostCase`.
     """
-    from leco_plugin.models.guided import GuidedModelConfig
+    from leco_plugin.hosts.guided import GuidedModelConfig
     from leco_plugin.models.leco_config import LecoModelConfig
     from leco_plugin.swap import registered, with_sampler_swapped
 

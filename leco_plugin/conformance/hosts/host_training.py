@@ -68,7 +68,7 @@ def gradients_of_a_step(model: Model, seed: int = 0) -> dict[str, Tensor]:
 
 def nothing_superfluous_is_left(case: HostCase) -> None:
     """What the gate stands for is gone from memory, checkpoints and optimizers."""
-    from leco_plugin.models.hosts.seams import PACKED, PROPOSAL
+    from leco_plugin.hosts.seams import PACKED, PROPOSAL
 
     own, model = case.unguided(), case.shared()
     for adapter in (PACKED, PROPOSAL):

@@ -8,8 +8,65 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from leco_plugin.models.compute.rows import permute_rows
-from leco_plugin.models.compute.steady import steady_size
+SIZES_PER_OCTAVE = 16
+"""Steady sizes between a power of two and the next: on average 3% of the rows are filling."""
+
+
+def steady_size(count: int, device_type: str) -> int:
+    """How many rows to compute for `count` of them: a few more where that saves compiling."""
+    if device_type != "cpu" or not torch.is_autocast_enabled("cpu"):
+        return count
+    return filled_size(count)
+
+
+def filled_size(count: int) -> int:
+    """The least of the few sizes that is no less than `count`."""
+    step = max(1, 2 ** max(count - 1, 0).bit_length() // (2 * SIZES_PER_OCTAVE))
+    return -(-count // step) * step
+
+
+def steadied(rows: Tensor) -> Tensor:
+    """Rows [N, ...] with rows of zeros behind them, up to the steady size; to be cut off again."""
+    missing = steady_size(len(rows), rows.device.type) - len(rows)
+    if missing == 0:
+        return rows
+    return torch.cat([rows, rows.new_zeros(missing, *rows.shape[1:])])
+
+
+def permute_rows(rows: Tensor, order: Tensor, inverse: Tensor) -> Tensor:
+    """Rows [N, D] in another order; `inverse` undoes `order`, both [N] int64."""
+    moved: Tensor = _Permute.apply(rows, order, inverse)
+    return moved
+
+
+def select_rows(rows: Tensor, chosen: Tensor) -> Tensor:
+    """Rows [M, D] of [N, D]; the chosen numbers [M] int64 must differ from each other."""
+    selected: Tensor = _Select.apply(rows, chosen)
+    return selected
+
+
+class _Permute(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: Any, rows: Tensor, order: Tensor, inverse: Tensor) -> Tensor:
+        ctx.inverse = inverse
+        return rows.index_select(0, order)
+
+    @staticmethod
+    def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor, None, None]:
+        return gradient.index_select(0, ctx.inverse), None, None
+
+
+class _Select(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: Any, rows: Tensor, chosen: Tensor) -> Tensor:
+        ctx.chosen, ctx.count = chosen, len(rows)
+        return rows.index_select(0, chosen)
+
+    @staticmethod
+    def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor, None]:
+        whole = gradient.new_zeros(ctx.count, *gradient.shape[1:])
+        return whole.index_copy_(0, ctx.chosen, gradient), None
+
 
 Expert = Callable[[Tensor], Tensor]
 """Features [M, width] to [M, width]."""

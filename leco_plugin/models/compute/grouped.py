@@ -1,20 +1,133 @@
-"""All scene experts at once: points sorted by expert, one grouped product of matrices a layer.
-
-Nothing waits for the device: where an expert's points begin and end stays there. The plain twin is
-`dispatch.dispatch`, which waits once to learn the sizes and then runs expert by expert.
-"""
+"""Dispatch by grouped products of matrices, where a device has them and they are faster."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import functools
+import logging
+import statistics
+import time
+from collections.abc import Callable, Sequence
 from typing import Protocol, cast
 
 import torch
 from torch import Tensor, nn
 
-from leco_plugin.models.compute.grouped_trial import grouped_product, serves
-from leco_plugin.models.compute.rows import permute_rows
+from leco_plugin.models.compute.dispatch import permute_rows
 from leco_plugin.samplers.kernels.off import kernels_off
+
+Product = Callable[[Tensor, Tensor], Tensor]
+
+_log = logging.getLogger(__name__)
+
+ROWS, ROUNDS = 1 << 15, 5
+"""Points of the race, and how often each of the two runs in it."""
+
+
+@functools.cache
+def serves(device: torch.device, n: int, width: int) -> bool:
+    """Whether grouped products are right and faster on this device; tried once, said in one line.
+
+    Args:
+        n: number of experts.
+        width: of their layers.
+    """
+    with (
+        torch.inference_mode(False),
+        torch.enable_grad(),
+        torch.autocast(device.type, enabled=False),
+    ):
+        try:
+            if not is_right(device):
+                _log.warning("no grouped products: they are wrong on %s", device)
+                return False
+            grouped, plain = race(device, n, width)
+        except (RuntimeError, TypeError, ValueError) as error:  # running out of memory among them
+            reason = next(iter(str(error).splitlines()), "") or type(error).__name__
+            _log.warning("no grouped products, one for each expert in their place: %s", reason)
+            return False
+    _log.info(
+        "%d experts of width %d on %s: %.3f ms a layer grouped, %.3f ms one by one",
+        *(n, width, device, 1e3 * grouped, 1e3 * plain),
+    )
+    return grouped <= plain
+
+
+def is_right(device: torch.device, dtype: torch.dtype = torch.bfloat16) -> bool:
+    """Whether grouped products, forward and backward, are those of each group by itself.
+
+    The trial has what routes have: a group of an odd size, one without rows, and rows in no group.
+    """
+    sizes, width, beyond = [5, 0, 27], 16, 3
+    count, n = sum(sizes) + beyond, len(sizes)
+    rows = torch.linspace(-1.0, 1.0, count * width, device=device).view(count, width)
+    matrices = torch.linspace(1.0, -1.0, n * width**2, device=device).view(n, width, width)
+    given, ends = (rows.to(dtype), matrices.to(dtype)), _ends(sizes, device)
+
+    def answers(product_of: Product) -> list[Tensor]:
+        points, weights = (value.clone().requires_grad_() for value in given)
+        product = product_of(points, weights)[: sum(sizes)]
+        of_points, of_weights = torch.autograd.grad(product, [points, weights], given[0][:-beyond])
+        return [product, of_points[: sum(sizes)], of_weights]
+
+    return all(
+        torch.allclose(one, other, rtol=0.05, atol=0.05)
+        for one, other in zip(
+            answers(lambda points, weights: grouped_product(points, weights, ends)),
+            answers(lambda points, weights: one_by_one(points, weights, sizes)),
+            strict=True,
+        )
+    )
+
+
+def race(device: torch.device, n: int, width: int) -> tuple[float, float]:
+    """Seconds of a layer forward and backward, grouped and one by one, medians of a few rounds.
+
+    One by one is not charged for its wait: the sizes are known here.
+    """
+    sizes = [ROWS // n] * n
+    points = torch.randn(sum(sizes), width, device=device).bfloat16().requires_grad_()
+    weights = torch.randn(n, width, width, device=device).bfloat16().requires_grad_()
+
+    ends = _ends(sizes, device)
+
+    def seconds(product_of: Product) -> float:
+        _wait(device)
+        started = time.perf_counter()
+        product = product_of(points, weights)
+        torch.autograd.grad(product, [points, weights], product.detach())
+        _wait(device)
+        return time.perf_counter() - started
+
+    grouped: list[float] = []
+    plain: list[float] = []
+    for _ in range(ROUNDS + 1):
+        grouped.append(seconds(lambda points, weights: grouped_product(points, weights, ends)))
+        plain.append(seconds(lambda points, weights: one_by_one(points, weights, sizes)))
+    return statistics.median(grouped[1:]), statistics.median(plain[1:])  # the first warms up
+
+
+def grouped_product(points: Tensor, weights: Tensor, ends: Tensor) -> Tensor:
+    """Rows [N, width] times the transposed matrix [n, width, width] of their group; [N, width].
+
+    Args:
+        ends: int32 [n], where each group ends; rows beyond the last come back as anything.
+    """
+    return nn.functional.grouped_mm(points, weights.mT, offs=ends)
+
+
+def one_by_one(points: Tensor, weights: Tensor, sizes: list[int]) -> Tensor:
+    """The slow twin of `grouped_product`, without the rows beyond the last group."""
+    parts = points[: sum(sizes)].split(sizes)
+    return torch.cat([part @ one.mT for part, one in zip(parts, weights)])
+
+
+def _ends(sizes: list[int], device: torch.device) -> Tensor:
+    return torch.tensor(sizes, device=device).cumsum(0).to(torch.int32)
+
+
+def _wait(device: torch.device) -> None:
+    if device.type == "cuda":
+        torch.cuda.synchronize(device)
 
 
 class Layered(Protocol):

@@ -14,8 +14,7 @@ import torch
 from torch import Tensor, nn
 
 from leco_plugin.models.color_head import ColorHead
-from leco_plugin.models.compute.dispatch import dispatch, within_capacity
-from leco_plugin.models.compute.steady import steadied
+from leco_plugin.models.compute.dispatch import dispatch, steadied, within_capacity
 from leco_plugin.models.encodings import FrequencyEncoding
 from leco_plugin.models.gate import logits_of
 from leco_plugin.models.hmoe import Expert

@@ -9,7 +9,8 @@ import torch
 from torch import Tensor
 
 from leco_plugin.models.color_head import ColorHead
-from leco_plugin.models.compute.rows import permute_rows
+from leco_plugin.models.compute.dispatch import permute_rows
+from leco_plugin.models.losses import balance_loss, expert_shares
 from leco_plugin.models.rendering import (
     Intervals,
     Rays,
@@ -21,10 +22,66 @@ from leco_plugin.models.rendering import (
     weigh,
 )
 from leco_plugin.models.switch.field import Answers
-from leco_plugin.models.switch.sampling import draw, edges_around, spread, strata
 from leco_plugin.samplers.base import densities_of_samples
 from leco_plugin.samplers.packed import render_weight_from_density
 from leco_plugin.space import Space
+
+PADDING = 1e-5
+"""Added to the weight of each stretch, so that a ray that meets nothing is sampled all over."""
+
+
+def strata(num_rays: int, count: int, jittered: bool, device: torch.device) -> Tensor:
+    """One share in each of `count` equal parts of [0, 1), [num_rays, count] ascending.
+
+    Args:
+        jittered: at random in its part (stratified sampling), else in its middle.
+    """
+    offsets = torch.rand(num_rays, count, device=device) if jittered else 0.5
+    steps = torch.arange(count, dtype=torch.float32, device=device).expand(num_rays, count)
+    return (steps + offsets) / count
+
+
+def spread(t_mins: Tensor, t_maxs: Tensor, shares: Tensor, growing: bool) -> Tensor:
+    """Points at shares [R, S] of each ray's way from t_min to t_max, both [R] and positive.
+
+    Args:
+        growing: distances between points grow with distance, as an unbounded scene is marched.
+    """
+    starts, ends = t_mins[:, None], t_maxs[:, None]
+    if not growing:
+        return torch.lerp(starts, ends, shares)
+    return starts * (ends / starts) ** shares
+
+
+def edges_around(points: Tensor, t_mins: Tensor, t_maxs: Tensor) -> Tensor:
+    """The stretch that each point [R, S] stands for: the part of the ray that is nearest to it.
+
+    Returns:
+        [R, S + 1] edges, from t_min to t_max.
+    """
+    between = 0.5 * (points[:, :-1] + points[:, 1:])
+    return torch.cat([t_mins[:, None], between, t_maxs[:, None]], dim=-1)
+
+
+def draw(edges: Tensor, weights: Tensor, shares: Tensor) -> Tensor:
+    """Points with the distribution of weights: the inverse of its cumulative sum at given shares.
+
+    Args:
+        edges: [R, S + 1] of the stretches.
+        weights: [R, S], not negative.
+        shares: [R, F] in [0, 1], ascending.
+    Returns:
+        [R, F] ascending points between the first and the last edge.
+    """
+    weights = weights + PADDING
+    sums = torch.nn.functional.pad(weights.cumsum(dim=-1), (1, 0))
+    wanted = shares * sums[:, -1:]
+    stretches = (torch.searchsorted(sums, wanted, right=True) - 1).clamp(0, weights.shape[-1] - 1)
+    inside = (wanted - sums.gather(1, stretches)) / weights.gather(1, stretches)
+    return torch.lerp(
+        edges.gather(1, stretches), edges.gather(1, stretches + 1), inside.clamp(0.0, 1.0)
+    )
+
 
 Ask = Callable[[Tensor], Answers]
 """What a field says of mapped positions [N, 3]."""
@@ -151,3 +208,29 @@ def render(
     accumulation, depth = sum_up(met, rays, intervals)
     sigmas, _, logits, routes = answers
     return Shaded(rgb, accumulation, depth, met, sigmas, logits, routes, packed_info)
+
+
+def switch_losses(shaded: Shaded, truth: Tensor, balance: float) -> dict[str, Tensor]:
+    """Colour loss and balanced gate loss (Switch-NeRF, section 3.3).
+
+    Args:
+        truth: [R, 3] colours of the pixels.
+        balance: weight of the balanced gate loss.
+    """
+    losses = {"rgb_loss": torch.nn.functional.mse_loss(shaded.rgb, truth)}
+    if len(shaded.routes) > 0:
+        probabilities = shaded.logits.softmax(dim=-1)
+        losses["gate_loss"] = balance * balance_loss(probabilities, shaded.routes)
+    return losses
+
+
+@torch.no_grad()
+def switch_statistics(shaded: Shaded, truth: Tensor) -> dict[str, Tensor]:
+    """PSNR of the batch, its number of samples, and the share of points of each expert from 1."""
+    error = torch.nn.functional.mse_loss(shaded.rgb, truth)
+    figures = {
+        "psnr": -10.0 * torch.log10(error.clamp(min=1e-12)),
+        "num_samples_per_batch": shaded.packed_info[:, 1].sum().float(),
+    }
+    shares = expert_shares(shaded.routes, shaded.logits.shape[-1])
+    return figures | {f"share_expert_{i + 1}": share for i, share in enumerate(shares)}

@@ -16,9 +16,9 @@ from nerfstudio.model_components.ray_samplers import Sampler
 from nerfstudio.viewer_legacy.server.viewer_utils import IOChangeException
 from torch import Tensor, nn
 
+from leco_plugin.hosts.stand_ins import GuidedEstimator, GuidedProposal
 from leco_plugin.learning.progress import WatchState
 from leco_plugin.models.gate import Gate, GateConfig
-from leco_plugin.models.hosts.stand_ins import GuidedEstimator, GuidedProposal
 from leco_plugin.models.region import SIDE, Region, SeenBackdrops
 from leco_plugin.occupancy import Occupancy
 from leco_plugin.samplers.base import DensityFn, Estimator

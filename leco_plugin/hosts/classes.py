@@ -18,14 +18,14 @@ from nerfstudio.model_components.renderers import RGBRenderer
 from nerfstudio.models.base_model import Model, ModelConfig
 from torch import Tensor, nn
 
-from leco_plugin.compat.host_lpips import lazy_lpips
+from leco_plugin.hosts.first_steps import set_first_density
+from leco_plugin.hosts.guide import Guide
+from leco_plugin.hosts.guided_start import GuidedStart, OccupancyConfig
+from leco_plugin.hosts.host_watch import HostWatch
+from leco_plugin.hosts.seams import swap_sampler
 from leco_plugin.models.failures import require_finite
-from leco_plugin.models.hosts.guide import Guide
-from leco_plugin.models.hosts.guided_start import GuidedStart, OccupancyConfig
-from leco_plugin.models.hosts.host_watch import HostWatch
-from leco_plugin.models.hosts.opaque_start import set_first_density
-from leco_plugin.models.hosts.seams import swap_sampler
 from leco_plugin.scenes.input_error import InputError
+from leco_plugin.studio.host_models import lazy_lpips
 
 
 class Host(Model):

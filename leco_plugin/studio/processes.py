@@ -19,12 +19,12 @@ from torch import distributed, nn
 from torch.multiprocessing import ProcessExitedException, ProcessRaisedException
 from torch.nn.parallel import DistributedDataParallel
 
-from leco_plugin.compat.atomic_trainer import AtomicTrainer
-from leco_plugin.compat.moved_runs import follow_data
-from leco_plugin.compat.run_folder import claim
 from leco_plugin.log import say
 from leco_plugin.models.failures import TrainingStopped
 from leco_plugin.scenes.input_error import InputError
+from leco_plugin.studio.checkpoints import follow_data
+from leco_plugin.studio.run_folder import claim
+from leco_plugin.studio.trainer import AtomicTrainer
 
 LOST = ("Connection closed by peer", "Connection reset by peer", "NCCL communicator was aborted")
 """What gloo and NCCL say of a process that is gone."""

@@ -1,7 +1,4 @@
-"""nerfstudio models without a network: their LPIPS is loaded at first use, if at all.
-
-Every built-in method makes LPIPS in `populate_modules`, and LPIPS fetches its AlexNet then.
-"""
+"""nerfstudio models without a network, and the photographs that they are compared with."""
 
 from __future__ import annotations
 
@@ -50,3 +47,13 @@ def lazy_lpips() -> Iterator[None]:
         yield
     finally:
         lpip._NoTrainLpips = eager_network  # type: ignore[misc]
+
+
+def true_colours(host: Any, image: Tensor) -> Tensor:
+    """What the host should show of pixels [..., 3 or 4]: before its own background, [..., 3].
+
+    nerfstudio's models render premultiplied colours, and photographs have straight ones.
+    """
+    blend = getattr(getattr(host, "renderer_rgb", None), "blend_background", None)
+    blended: Tensor = image[..., :3] if blend is None else blend(image)
+    return blended

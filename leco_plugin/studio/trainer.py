@@ -4,8 +4,11 @@ from __future__ import annotations
 
 import os
 import shutil
+import signal
 import threading
 import time
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -14,27 +17,130 @@ from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackLocati
 from nerfstudio.engine.optimizers import Optimizers
 from nerfstudio.engine.trainer import Trainer
 from nerfstudio.utils.decorators import check_main_thread
+from torch import nn
+from torch.nn import Parameter
+from torch.optim import Optimizer
 
-from leco_plugin.compat.interrupts import heard_between_steps
-from leco_plugin.compat.nerfstudio_changes import end_of, iterations_until
-from leco_plugin.compat.optimizers import OptimizersOfThePresent
-from leco_plugin.compat.run_sizes import (
-    checkpoint_of,
-    keep_sizes,
-    with_sizes_of,
-)
-from leco_plugin.compat.whole_checkpoints import (
+from leco_plugin.learning.collapse import GateCollapsed
+from leco_plugin.learning.progress import Progress
+from leco_plugin.log import say, say_what_is_logged
+from leco_plugin.models.compute.ranks import is_first
+from leco_plugin.models.failures import TrainingStopped
+from leco_plugin.samplers.kernels.off import VARIABLE, kernels_off
+from leco_plugin.scenes.input_error import InputError
+from leco_plugin.studio.checkpoints import (
     first_not_finite,
     newest_whole,
     previous_of,
     step_of,
 )
-from leco_plugin.learning.collapse import GateCollapsed
-from leco_plugin.learning.progress import Progress
-from leco_plugin.log import say, say_what_is_logged
-from leco_plugin.models.failures import TrainingStopped
-from leco_plugin.samplers.kernels.off import VARIABLE, kernels_off
-from leco_plugin.scenes.input_error import InputError
+from leco_plugin.studio.run_folder import (
+    check_photographs,
+    checkpoint_of,
+    keep_sizes,
+    with_sizes_of,
+)
+from leco_plugin.studio.versions import end_of, iterations_until
+
+HEARD = "\nstopping after this step; Ctrl-C once more stops at once\n"
+
+
+@contextmanager
+def heard_between_steps() -> Iterator[threading.Event]:
+    """An event that the first Ctrl-C sets; the second one is a `KeyboardInterrupt` as ever.
+
+    Outside of the main thread, which alone hears signals, and where somebody else listens already,
+    nothing is changed.
+    """
+    asked = threading.Event()
+    before: Any = signal.getsignal(signal.SIGINT)
+    in_main = threading.current_thread() is threading.main_thread()
+    if not in_main or before is not signal.default_int_handler:
+        yield asked
+        return
+
+    def hear(number: int, frame: Any) -> None:
+        if asked.is_set():
+            before(number, frame)
+        asked.set()
+        os.write(2, HEARD.encode())  # nothing that might hold a lock just now
+
+    signal.signal(signal.SIGINT, hear)
+    try:
+        yield asked
+    finally:
+        signal.signal(signal.SIGINT, before)
+
+
+class OptimizersOfThePresent(Optimizers):
+    """They are made before a checkpoint is loaded, and loaded after the model.
+
+    Args:
+        config: of each parameter group.
+        pipeline: says which parameters there are.
+    """
+
+    def __init__(self, config: dict[str, Any], pipeline: Any) -> None:
+        super().__init__(config, pipeline.get_param_groups())
+        self.pipeline = pipeline
+
+    def load_optimizers(self, loaded_state: dict[str, Any]) -> None:
+        """As nerfstudio's, for the parameters that the model has now.
+
+        Raises:
+            InputError: the model came back with other photographs than the scene has.
+        """
+        check_photographs(self.pipeline)
+        forget_the_gone(self, self.pipeline.get_param_groups())
+        super().load_optimizers(loaded_state)
+
+
+def forget_the_gone(optimizers: Optimizers, groups: dict[str, list[Parameter]]) -> None:
+    """Has optimizers forget the parameters that a model no longer has, with all they remember.
+
+    Args:
+        groups: parameters that there are, by the names of the optimizers; others stay as they are.
+    """
+    for name, parameters in groups.items():
+        optimizer, there = optimizers.optimizers[name], {id(p) for p in parameters}
+        # in place: others hold on to the same groups
+        for held in (*(g["params"] for g in optimizer.param_groups), optimizers.parameters[name]):
+            held[:] = [parameter for parameter in held if id(parameter) in there]
+        for parameter in [known for known in optimizer.state if id(known) not in there]:
+            del optimizer.state[parameter]
+
+
+class TrainerRun:
+    """A run of nerfstudio's trainer.
+
+    Args:
+        trainer: set up, with its checkpoint loaded.
+    """
+
+    goes_on = True
+
+    def __init__(self, trainer: Any) -> None:
+        self.trainer = trainer
+        self.start, self.end = int(trainer._start_step), float(end_of(trainer))
+        self.folder = Path(trainer.base_dir) if is_first() else None
+        config = trainer.config
+        resumed = config.load_checkpoint or config.load_dir
+        self.resumed_from = None if resumed is None else Path(resumed)
+
+    def optimizers(self) -> list[Optimizer]:
+        """Those of all parameter groups."""
+        return list(self.trainer.optimizers.optimizers.values())
+
+    def save(self, step: int) -> None:
+        """A checkpoint, where the run saves any."""
+        if self.trainer.config.steps_per_save > 0:
+            self.trainer.save_checkpoint(step)
+
+    def forget(self, groups: dict[str, list[nn.Parameter]]) -> None:
+        """Has optimizers forget all parameters but these, by the names of their groups."""
+        filled = {name: group for name, group in groups.items() if group}
+        forget_the_gone(self.trainer.optimizers, filled)
+
 
 SECONDS_BETWEEN_SAVES = 60.0
 """A run that saves at all is saved this often, however few its steps are..."""

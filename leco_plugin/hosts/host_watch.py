@@ -14,7 +14,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from leco_plugin.compat.host_outputs import true_colours
+from leco_plugin.hosts.first_steps import end_probation
+from leco_plugin.hosts.guide import Guide
 from leco_plugin.learning.calibration import THRESHOLDS, CalibrationConfig, Measured
 from leco_plugin.learning.collapse import SUSPECTED_STEPS
 from leco_plugin.learning.dense import evaluating
@@ -22,10 +23,9 @@ from leco_plugin.learning.freezing import leave_file
 from leco_plugin.learning.price_watch import PriceWatch
 from leco_plugin.log import say
 from leco_plugin.models.compute.ranks import is_first
-from leco_plugin.models.hosts.guide import Guide
-from leco_plugin.models.hosts.probation import end_probation
 from leco_plugin.occupancy import CALIBRATED_AT
 from leco_plugin.scenes.learning_data import count_held_out, held_out_bundle
+from leco_plugin.studio.host_models import true_colours
 
 LOWERED_TO = 0.25
 """Share of the threshold that is left when it is lowered; the next measurement, after the fewest

@@ -15,16 +15,15 @@ import torch
 import tyro
 from nerfstudio.models.base_model import Model, ModelConfig
 
-from leco_plugin.compat.checkpoints import allow_checkpoint_globals
-from leco_plugin.compat.evaluated_runs import evaluate_whole_checkpoints
-from leco_plugin.compat.hash_encoding import speed_up_hash_encodings
-from leco_plugin.models.compute.precision import keep_freed_memory
-from leco_plugin.models.hosts.appearance_codes import Codes, begin_with_small_codes
-from leco_plugin.models.hosts.classes import GuidedHost, Host, set_up_host
-from leco_plugin.models.hosts.guide import Guide
-from leco_plugin.models.hosts.guided_start import OWN_SAMPLER, OccupancyConfig, load_occupancy
+from leco_plugin.hosts.appearance_codes import Codes, begin_with_small_codes
+from leco_plugin.hosts.classes import GuidedHost, Host, set_up_host
+from leco_plugin.hosts.guide import Guide
+from leco_plugin.hosts.guided_start import OWN_SAMPLER, OccupancyConfig, load_occupancy
+from leco_plugin.models.compute.device import keep_freed_memory
 from leco_plugin.samplers.nerfacc_cpu import install_for
 from leco_plugin.scenes.input_error import InputError
+from leco_plugin.studio.checkpoints import allow_checkpoint_globals, evaluate_whole_checkpoints
+from leco_plugin.studio.hash_encoding import speed_up_hash_encodings
 
 
 @dataclass

@@ -24,7 +24,7 @@ from leco_plugin.samplers.registry import build_estimator, build_proposal
 from leco_plugin.scenes.frames import box_around, inverse, moved, turned
 
 if TYPE_CHECKING:
-    from leco_plugin.models.hosts.guide import Guide
+    from leco_plugin.hosts.guide import Guide
 
 
 class _StandIn(nn.Module):

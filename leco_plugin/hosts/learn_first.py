@@ -15,7 +15,7 @@ from leco_plugin.learning.progress import Progress
 from leco_plugin.learning.run import LearningOnly
 from leco_plugin.learning.schedule import MOST_EXTENSIONS, steps_of_an_extension
 from leco_plugin.log import bar
-from leco_plugin.models.compute.optimizers import RATES, FusedAdamConfig
+from leco_plugin.models.compute.device import RATES, FusedAdamConfig
 from leco_plugin.models.compute.ranks import averaging, mean
 from leco_plugin.models.leco import LecoModel
 from leco_plugin.models.leco_config import LecoModelConfig

@@ -10,12 +10,11 @@ import torch
 from torch import Tensor, nn
 
 from leco_plugin.evaluation.inspection import cameras_of
+from leco_plugin.hosts.first_steps import begin_carefully, begin_opaque
+from leco_plugin.hosts.guide import Guide
 from leco_plugin.learning.freezing import FILE_NAME, leave_file
 from leco_plugin.log import say
 from leco_plugin.models.compute.ranks import is_first
-from leco_plugin.models.hosts.guide import Guide
-from leco_plugin.models.hosts.opaque_start import begin_opaque
-from leco_plugin.models.hosts.probation import begin_carefully
 from leco_plugin.models.leco_config import LecoModelConfig
 from leco_plugin.models.sizing.sizes import SMALL, learning_only
 from leco_plugin.occupancy import Occupancy
@@ -137,7 +136,7 @@ class GuidedStart:
         if guide.occupancy is None and config.path is not None:
             guide.set_occupancy(load_occupancy(config.path))  # says why it could not be before
         if guide.occupancy is None:
-            from leco_plugin.models.hosts.learn_first import check_budget
+            from leco_plugin.hosts.learn_first import check_budget
 
             check_budget(config.rays, config.seconds, config.rate)
         learned = guide.occupancy.gate.config if guide.occupancy is not None else None
@@ -157,7 +156,7 @@ class GuidedStart:
             return
         self.begun = True
         if self.guide.occupancy is None:
-            from leco_plugin.models.hosts.learn_first import learn_occupancy
+            from leco_plugin.hosts.learn_first import learn_occupancy
 
             say(LEARNING)
             config = self.config

@@ -1,19 +1,19 @@
-"""What is shown of rays beside their colours: what they meet, and which expert answers there.
-
-A backdrop gives a ray its colour and counts as nothing met, so that sky is transparent to whoever
-asks for opacities, and no export makes points of it.
-"""
+"""What is shown and logged of rays beside their colours."""
 
 from __future__ import annotations
 
 import warnings
+from typing import Any
 
 import torch
 from nerfstudio.model_components.renderers import RGBRenderer
 from torch import Tensor
 
+from leco_plugin.evaluation.metrics import image_metrics
 from leco_plugin.models.gate import EMPTY, occupancy_from_logits
+from leco_plugin.models.losses import expert_shares
 from leco_plugin.models.rendering import MET, Intervals, Rays, Shaded, backdrop_of, sum_up
+from leco_plugin.samplers.marching.edges import candidate_counts
 from leco_plugin.samplers.packed import accumulate_along_rays
 
 NONE = -1
@@ -99,3 +99,86 @@ def with_alpha(outputs: dict[str, Tensor], output_name: str) -> Tensor:
             stacklevel=3,
         )
     return torch.cat([outputs[output_name], accumulation], dim=-1)
+
+
+def image_figures(
+    outputs: dict[str, Tensor], truth: Tensor
+) -> tuple[dict[str, float], dict[str, Tensor]]:
+    """Figures of one image (see `image_metrics`), and pictures for the log.
+
+    Args:
+        outputs: `rgb` [H, W, 3], `accumulation` and `depth` [H, W, 1].
+        truth: [H, W, 3] behind the method's own background.
+    """
+    from nerfstudio.utils import colormaps
+
+    predicted = outputs["rgb"].clamp(0.0, 1.0)
+    pictures = {
+        "img": torch.cat([truth, predicted], dim=1),
+        "accumulation": colormaps.apply_colormap(outputs["accumulation"]),
+        "depth": colormaps.apply_depth_colormap(
+            outputs["depth"], accumulation=outputs["accumulation"]
+        ),
+    }
+    return image_metrics(predicted, truth), pictures
+
+
+PRICES = ("lost_mass", "lost_surface_mass", "image_price_db")
+"""What skipping costs, as a report has it."""
+
+
+@torch.no_grad()
+def gate_statistics(shaded: Shaded, scene_experts: int) -> dict[str, Tensor]:
+    """Samples per ray, and for each expert its share of them and their mean density.
+
+    Args:
+        shaded: one batch.
+        scene_experts: n; expert 0 is the empty-space expert.
+    Returns:
+        Float scalars; densities are per half extent of the scene.
+    """
+    num_samples = max(len(shaded.routes), 1)
+    shares = expert_shares(shaded.routes, 1 + scene_experts)
+    density = torch.zeros_like(shares).index_add_(0, shaded.routes, shaded.sigmas.float())
+    density = density / (shares * num_samples).clamp(min=1.0)
+    figures = {"samples_per_ray": shaded.packed_info[:, 1].float().mean()}
+    for expert in range(1 + scene_experts):
+        figures[f"share_expert_{expert}"] = shares[expert]
+        figures[f"density_expert_{expert}"] = density[expert]
+    return figures
+
+
+@torch.no_grad()
+def kept_fraction(
+    shaded: Shaded,
+    intervals: Intervals,
+    rays: Rays,
+    above: float,
+    step_size: float,
+    cone_angle: float,
+) -> Tensor:
+    """Share of all candidates of a batch that the gate keeps, those that were skipped included.
+
+    A backdrop counts as kept, as it does in `Measured.empty_fraction`.
+
+    Args:
+        shaded, intervals: what is left of the candidates; none is missing that has o(x) >= above.
+        above: o(x) from which a candidate is kept.
+        step_size, cone_angle: of the march.
+    Returns:
+        Float scalar in [0, 1].
+    """
+    kept = (occupancy_from_logits(shaded.logits) >= above) | backdrop_of(intervals, rays)
+    candidates = candidate_counts(rays.t_mins, rays.t_maxs, step_size, cone_angle).sum()
+    return (kept.sum() / candidates.clamp(min=1.0)).clamp(max=1.0)
+
+
+def prices(report: dict[str, Any]) -> dict[str, Tensor]:
+    """What skipping costs as it was last measured: float scalars.
+
+    Args:
+        report: of a frozen gate; of an older release it may lack some, and those of a gate that
+            was shrunk without a field are None.
+    """
+    known = {name: report.get(name) for name in PRICES}
+    return {name: torch.tensor(float(x)) for name, x in known.items() if x is not None}

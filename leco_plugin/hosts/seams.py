@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any, cast
 from torch import nn
 
 from leco_plugin.entries import foreign_entries
-from leco_plugin.models.hosts.guide import Guide
+from leco_plugin.hosts.guide import Guide
 from leco_plugin.samplers.base import DensityFn, Estimator
 from leco_plugin.samplers.nerfacc_cpu import install_for
 from leco_plugin.scenes.input_error import InputError
@@ -74,7 +74,7 @@ def swap_sampler(host: Model, guide: Guide) -> str:
     raise InputError(
         f"{type(host).__name__} has no sampler that could be swapped. Looked for: {looked_for}. "
         f"A package can bring a HostAdapter in the entry-point group {GROUP}: "
-        "see help(leco_plugin.models.hosts.seams.HostAdapter)"
+        "see help(leco_plugin.hosts.seams.HostAdapter)"
     )
 
 
