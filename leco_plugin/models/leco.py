@@ -44,7 +44,7 @@ from leco_plugin.scenes.input_error import InputError
 from leco_plugin.scenes.learning_data import LearningData
 from leco_plugin.scenes.pixels.known_distances import DISTANCE
 from leco_plugin.studio.checkpoints import allow_checkpoint_globals, evaluate_whole_checkpoints
-from leco_plugin.studio.trainer import TrainerRun
+from leco_plugin.studio.run import TrainerRun
 
 
 class LecoModel(Model):

@@ -181,9 +181,7 @@ def keep_sizes(config: Any, model: Any, asked: Any) -> Any:
     Args:
         asked: the model's config as the command gave it, which is what is stored so far.
     """
-    from leco_plugin.models.leco import LecoModel
-
-    if not isinstance(model, LecoModel) or asked.sizes == model.config.sizes:
+    if not _has_mixture(model) or asked.sizes == model.config.sizes:
         return config
     config = _with_model(config, model.config)
     path = config.get_base_dir() / CONFIG
@@ -199,10 +197,8 @@ def check_photographs(pipeline: Any) -> None:
     Raises:
         InputError: there are more or fewer; their codes would go to others.
     """
-    from leco_plugin.models.leco import LecoModel
-
     model = getattr(pipeline, "model", None)
-    if not isinstance(model, LecoModel):
+    if not _has_mixture(model):
         return
     now = len(pipeline.datamanager.train_dataset)
     if model.num_train_data != now:
@@ -210,6 +206,13 @@ def check_photographs(pipeline: Any) -> None:
             f"the run was begun with {model.num_train_data} training photographs, and the scene "
             f"has {now}: put the same ones there, or begin a new run"
         )
+
+
+def _has_mixture(model: Any) -> bool:
+    """Whether a model is `leco-occupancy`'s, whose sizes may be chosen from the scene."""
+    from leco_plugin.models.mixture import Mixture
+
+    return isinstance(getattr(model, "mixture", None), Mixture)
 
 
 def _with_model(config: Any, model: Any) -> Any:

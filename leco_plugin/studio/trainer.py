@@ -17,14 +17,10 @@ from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackLocati
 from nerfstudio.engine.optimizers import Optimizers
 from nerfstudio.engine.trainer import Trainer
 from nerfstudio.utils.decorators import check_main_thread
-from torch import nn
-from torch.nn import Parameter
-from torch.optim import Optimizer
 
 from leco_plugin.learning.collapse import GateCollapsed
 from leco_plugin.learning.progress import Progress
 from leco_plugin.log import say, say_what_is_logged
-from leco_plugin.models.compute.ranks import is_first
 from leco_plugin.models.failures import TrainingStopped
 from leco_plugin.samplers.kernels.off import VARIABLE, kernels_off
 from leco_plugin.scenes.input_error import InputError
@@ -34,13 +30,13 @@ from leco_plugin.studio.checkpoints import (
     previous_of,
     step_of,
 )
+from leco_plugin.studio.run import end_of, forget_the_gone, iterations_until
 from leco_plugin.studio.run_folder import (
     check_photographs,
     checkpoint_of,
     keep_sizes,
     with_sizes_of,
 )
-from leco_plugin.studio.versions import end_of, iterations_until
 
 HEARD = "\nstopping after this step; Ctrl-C once more stops at once\n"
 
@@ -93,53 +89,6 @@ class OptimizersOfThePresent(Optimizers):
         check_photographs(self.pipeline)
         forget_the_gone(self, self.pipeline.get_param_groups())
         super().load_optimizers(loaded_state)
-
-
-def forget_the_gone(optimizers: Optimizers, groups: dict[str, list[Parameter]]) -> None:
-    """Has optimizers forget the parameters that a model no longer has, with all they remember.
-
-    Args:
-        groups: parameters that there are, by the names of the optimizers; others stay as they are.
-    """
-    for name, parameters in groups.items():
-        optimizer, there = optimizers.optimizers[name], {id(p) for p in parameters}
-        # in place: others hold on to the same groups
-        for held in (*(g["params"] for g in optimizer.param_groups), optimizers.parameters[name]):
-            held[:] = [parameter for parameter in held if id(parameter) in there]
-        for parameter in [known for known in optimizer.state if id(known) not in there]:
-            del optimizer.state[parameter]
-
-
-class TrainerRun:
-    """A run of nerfstudio's trainer.
-
-    Args:
-        trainer: set up, with its checkpoint loaded.
-    """
-
-    goes_on = True
-
-    def __init__(self, trainer: Any) -> None:
-        self.trainer = trainer
-        self.start, self.end = int(trainer._start_step), float(end_of(trainer))
-        self.folder = Path(trainer.base_dir) if is_first() else None
-        config = trainer.config
-        resumed = config.load_checkpoint or config.load_dir
-        self.resumed_from = None if resumed is None else Path(resumed)
-
-    def optimizers(self) -> list[Optimizer]:
-        """Those of all parameter groups."""
-        return list(self.trainer.optimizers.optimizers.values())
-
-    def save(self, step: int) -> None:
-        """A checkpoint, where the run saves any."""
-        if self.trainer.config.steps_per_save > 0:
-            self.trainer.save_checkpoint(step)
-
-    def forget(self, groups: dict[str, list[nn.Parameter]]) -> None:
-        """Has optimizers forget all parameters but these, by the names of their groups."""
-        filled = {name: group for name, group in groups.items() if group}
-        forget_the_gone(self.trainer.optimizers, filled)
 
 
 SECONDS_BETWEEN_SAVES = 60.0
