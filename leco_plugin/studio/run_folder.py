@@ -197,7 +197,7 @@ def check_photographs(pipeline: Any) -> None:
     Raises:
         InputError: there are more or fewer; their codes would go to others.
     """
-    model = getattr(pipeline, "model", None)
+    model: Any = getattr(pipeline, "model", None)
     if not _has_mixture(model):
         return
     now = len(pipeline.datamanager.train_dataset)
