@@ -16,7 +16,7 @@ from torch import Tensor, nn
 
 from leco_plugin.hosts.seams import replace_module
 from leco_plugin.log import say
-from leco_plugin.models.color_head import APPEARANCE_SCALE
+from leco_plugin.models.field import APPEARANCE_SCALE
 
 Codes = Literal["small", "own"]
 """How a host's codes begin: at zero and scaled down, or as the host has them."""

@@ -8,10 +8,85 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from leco_plugin.models.color_head import ColorHead
 from leco_plugin.models.compute.dispatch import steadied
-from leco_plugin.models.encodings import EncodingConfig, build_encoding
+from leco_plugin.models.encodings import EncodingConfig, FrequencyEncoding, build_encoding
 from leco_plugin.models.hmoe import HMoE, HMoEConfig
+
+OPPONENT = torch.tensor(
+    [[1 / 3**0.5] * 3, [1 / 2**0.5, 0.0, -1 / 2**0.5], [1 / 6**0.5, -2 / 6**0.5, 1 / 6**0.5]]
+)
+"""Rows: brightness and two hues, orthonormal, in red, green and blue. The colour head answers in
+these, so that the errors in brightness, which are the larger ones, leave the weights of the hues
+alone; in red, green and blue they pull all three rows of its last layer to one grey."""
+
+
+APPEARANCE_SCALE = 0.1
+"""Adam moves a code as fast as a weight, however little there is to learn from one image; scaled
+down, codes follow slowly, and the mean code of a rendering is one that the field has met."""
+
+
+class ColorHead(nn.Module):
+    """One hidden layer over features, encoded direction and the appearance code of an image.
+
+    Args:
+        width: of the features.
+        hidden: units of the hidden layer.
+        direction_octaves: octaves of the encoding of the viewing direction.
+        appearance_dim: width of the appearance code of each training image; 0 is without.
+        num_images: number of training images.
+    """
+
+    opponent: Tensor
+
+    def __init__(
+        self, width: int, hidden: int, direction_octaves: int, appearance_dim: int, num_images: int
+    ) -> None:
+        super().__init__()
+        self.direction_encoding = FrequencyEncoding(direction_octaves)
+        self.appearance = nn.Embedding(num_images, appearance_dim) if appearance_dim else None
+        if self.appearance is not None:
+            # alike at first: what differs between images is learned, not drawn
+            nn.init.zeros_(self.appearance.weight)
+        self.of_features = nn.Linear(width, hidden)
+        self.of_ray = nn.Linear(
+            self.direction_encoding.out_dim + appearance_dim, hidden, bias=False
+        )
+        self.out = nn.Linear(hidden, 3)
+        self.register_buffer("opponent", OPPONENT.clone(), persistent=False)
+
+    def forward(
+        self,
+        features: Tensor,
+        ray_indices: Tensor,
+        directions: Tensor,
+        image_indices: Tensor | None,
+    ) -> Tensor:
+        """Colour of samples, seen along their rays.
+
+        Args:
+            features: [M, width].
+            ray_indices: [M] int64, the ray of each sample.
+            directions: [R, 3] unit vectors.
+            image_indices: [R] int64 of the training image, or None for the mean appearance.
+        Returns:
+            [M, 3] float32 in [0, 1].
+        """
+        of_rays = [self.direction_encoding(directions)]
+        if self.appearance is not None:
+            code = (
+                self.appearance(image_indices)
+                if image_indices is not None
+                else self.appearance.weight.mean(dim=0).expand(len(directions), -1)
+            )
+            of_rays.append(APPEARANCE_SCALE * code)
+        # the first layer of a concatenation is the sum of two, one of which is the same all along
+        count = len(features)
+        of_ray = self.of_ray(torch.cat(of_rays, dim=-1)).to(features.dtype)
+        hidden = self.of_features(steadied(features)) + of_ray.index_select(
+            0, steadied(ray_indices)
+        )
+        opponent = self.out(torch.relu(hidden))[:count].float()
+        return torch.sigmoid(opponent @ self.opponent)
 
 
 @dataclass(frozen=True)

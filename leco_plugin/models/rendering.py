@@ -7,9 +7,8 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from leco_plugin.models.color_head import ColorHead
 from leco_plugin.models.compute.dispatch import select_rows
-from leco_plugin.models.field import HMoEField
+from leco_plugin.models.field import ColorHead, HMoEField
 from leco_plugin.models.gate import EMPTY, Gate, route
 from leco_plugin.samplers.packed import (
     accumulate_along_rays,

@@ -13,9 +13,9 @@ from typing import NamedTuple
 import torch
 from torch import Tensor, nn
 
-from leco_plugin.models.color_head import ColorHead
 from leco_plugin.models.compute.dispatch import dispatch, steadied, within_capacity
 from leco_plugin.models.encodings import FrequencyEncoding
+from leco_plugin.models.field import ColorHead
 from leco_plugin.models.gate import logits_of
 from leco_plugin.models.hmoe import Expert
 

@@ -8,8 +8,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from leco_plugin.models.color_head import ColorHead
 from leco_plugin.models.compute.dispatch import permute_rows
+from leco_plugin.models.field import ColorHead
 from leco_plugin.models.losses import balance_loss, expert_shares
 from leco_plugin.models.rendering import (
     Intervals,
