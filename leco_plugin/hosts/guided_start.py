@@ -217,8 +217,8 @@ def refuse_another_scene(
     """Says so where hardly any camera that an occupancy was learned on is among a run's.
 
     Test photographs count too, so that another split is no other scene; so do photographs that were
-    added or taken away since. Photographs of the same scene that share no camera are known by their
-    sparse points, which an occupancy of it keeps.
+    added or taken away since. A file names `MOST_CAMERAS` at most: of so many, some photographs may
+    have none. Their sparse points then say whether it is another scene.
 
     Args:
         manager: nerfstudio's data manager of the run.
@@ -239,7 +239,9 @@ def refuse_another_scene(
         return
     remedy = "give the folder of a run on this scene, or no path to learn it first"
     nearly = int(found_again(known, here, ROUNDED * half).sum())
-    if found == 0 and nearly < few and not insists and _keeps_no_points(occupancy, manager, frame):
+    names_all = len(known) < MOST_CAMERAS
+    certain = nearly < few and (names_all or _skips_the_points(occupancy, manager, frame))
+    if found == 0 and certain and not insists:
         raise InputError(
             f"the occupancy is of another scene: none of the {len(known)} cameras that its file "
             f"names is among the {len(here)} here; {remedy} (to insist: leco swap --other-scene, "
@@ -251,12 +253,11 @@ def refuse_another_scene(
     )
 
 
-def _keeps_no_points(occupancy: Occupancy, manager: Any, frame: Tensor) -> bool:
-    """Whether an occupancy skips the scene's sparse points. Without points, whether its file names
-    all cameras that it was learned on; of many it names `MOST_CAMERAS`."""
+def _skips_the_points(occupancy: Occupancy, manager: Any, frame: Tensor) -> bool:
+    """Whether an occupancy skips most of a scene's sparse points; False where there are none."""
     points = sparse_points(manager.train_dataset)
     if points is None or len(points) == 0:
-        return len(cameras_of(occupancy)) < MOST_CAMERAS
+        return False
     chosen = points[:: -(-len(points) // POINTS)].to(frame)
     kept = occupancy.query(moved(chosen, frame)) >= occupancy.threshold
     return float(kept.float().mean()) < KEPT_POINTS

@@ -79,7 +79,10 @@ def test_an_occupancy_of_other_cameras_is_refused_in_a_line_that_names_the_way_t
 ) -> None:
     data = readers["as it is"]
     other, eye = of_other_cameras(data), torch.eye(3, 4)
-    for here in (data, with_points(data, *IN_THE_AIR)):
+    many = of_other_cameras(data, times=MOST_CAMERAS // 7 + 1)
+    with pytest.raises(InputError, match="is of another scene"):
+        refuse_another_scene(many, with_points(data, *IN_THE_AIR), eye)
+    for here in (data, with_points(data, *IN_THE_BALL)):
         with pytest.raises(InputError, match="is of another scene: none of the 7 cameras") as error:
             refuse_another_scene(other, here, eye)
         said = str(error.value)
@@ -99,12 +102,13 @@ def test_an_occupancy_of_other_cameras_is_refused_in_a_line_that_names_the_way_t
 def test_cameras_that_may_be_of_the_same_scene_are_only_warned_of(
     readers: dict[str, Data], capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """Other photographs of it, some of many photographs, and coordinates that a reader rounds."""
+    """Some of many photographs, and coordinates that a reader rounds."""
     data, eye = readers["as it is"], torch.eye(3, 4)
     rounded = of_other_cameras(data, 2e-3 * 3.0**-0.5 * float(learned_by(data).space.half_extent))
     refuse_another_scene(rounded, data, eye)
-    refuse_another_scene(of_other_cameras(data), with_points(data, *IN_THE_BALL), eye)
-    refuse_another_scene(of_other_cameras(data, times=MOST_CAMERAS // 7 + 1), data, eye)
+    many = of_other_cameras(data, times=MOST_CAMERAS // 7 + 1)
+    refuse_another_scene(many, with_points(data, *IN_THE_BALL), eye)
+    refuse_another_scene(many, data, eye)
     assert " ".join(capsys.readouterr().out.split()).count(ANOTHER) == 3
 
 

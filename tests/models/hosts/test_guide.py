@@ -5,6 +5,7 @@ from __future__ import annotations
 import pytest
 import torch
 from ball_occupancy import BOX, MARCH, ball, rays
+from nerfstudio.cameras.cameras import Cameras
 from nerfstudio.viewer_legacy.server.viewer_utils import IOChangeException
 
 from leco_plugin.models.hosts.guide import Guide
@@ -108,3 +109,34 @@ def test_an_option_with_which_nothing_can_be_built_is_said_in_a_line_before_the_
     with pytest.raises(InputError, match=f"{sampler}.* cannot be built: .*{said}") as error:
         getattr(Guide(sampler, options), kind)(**given)
     assert "\n" not in str(error.value) and str(options) in str(error.value)
+
+
+def test_seen_backdrops_do_not_depend_on_the_hosts_coordinates():
+    """Nor on how long directions are: they carry the scale."""
+    turn = 0.5 * torch.tensor([[0.6, 0.8, 0.0], [-0.8, 0.6, 0.0], [0.0, 0.0, 1.0]])
+    frame = torch.cat([turn, torch.tensor([[1.0], [2.0], [3.0]])], dim=1)
+    pose = torch.tensor([[1.0, 0.0, 0.0, 0.0], [0.0, 0.6, 0.8, 0.0], [0.0, -0.8, 0.6, 2.0]])
+    of_occupancy = Cameras(pose[None], 20.0, 20.0, 10.0, 10.0, 20, 20)
+    back = torch.linalg.inv(turn)
+    place = back @ (pose[:, 3] - frame[:, 3])
+    of_host = torch.cat([2.0 * 0.5 * 0.5 * back @ pose[:, :3], place[:, None]], dim=1)
+    here, there = Guide(), Guide()
+    for guide, cameras, its_frame in (
+        (here, of_occupancy, torch.eye(3, 4)),
+        (there, Cameras(of_host[None], 20.0, 20.0, 10.0, 10.0, 20, 20), frame),
+    ):
+        guide.set_occupancy(ball(), its_frame)
+        guide.look(cameras)
+    torch.testing.assert_close(there.backdrops.limits, here.backdrops.limits)
+    directions = torch.nn.functional.normalize(torch.randn(256, 3), dim=-1)
+    origins = torch.tensor([[1.0, 1.0, 2.0]]).expand(256, 3)
+    lacking = here.lacks_backdrop(origins, directions)
+    assert 0 < int(lacking.sum()) < 256
+    assert torch.equal(there.lacks_backdrop(origins, 0.5 * directions), lacking)
+
+
+def test_a_checkpoint_from_before_backdrops_were_noted_shows_them_all(guide: Guide):
+    state = {name: value for name, value in guide.state_dict().items() if "backdrops" not in name}
+    fresh = Guide()
+    fresh.load_state_dict(state)
+    assert bool((fresh.backdrops.limits == 2.0).all())
