@@ -26,6 +26,7 @@ from leco_plugin.hosts.seams import swap_sampler
 from leco_plugin.models.failures import require_finite
 from leco_plugin.scenes.input_error import InputError
 from leco_plugin.studio.host_models import lazy_lpips
+from leco_plugin.studio.run import run_of
 
 
 class Host(Model):
@@ -131,7 +132,7 @@ class GuidedHost(Host):
         attributes, guide = training_callback_attributes, self.leco_guide
         if not guide.needs_occupancy:
             return super().get_training_callbacks(attributes)
-        config, around = self.leco_occupancy, (attributes.pipeline, attributes.trainer)
+        config, around = self.leco_occupancy, (attributes.pipeline, run_of(attributes.trainer))
         start = GuidedStart(self, guide, config, *around)
         watch = HostWatch(self, guide, config.learning.calibration, *around)
         before = [TrainingCallbackLocation.BEFORE_TRAIN_ITERATION]

@@ -13,8 +13,8 @@ from leco_plugin.evaluation.inspection import cameras_of
 from leco_plugin.hosts.first_steps import begin_carefully, begin_opaque
 from leco_plugin.hosts.guide import Guide
 from leco_plugin.learning.freezing import FILE_NAME, leave_file
+from leco_plugin.learning.run import Run
 from leco_plugin.log import say
-from leco_plugin.models.compute.ranks import is_first
 from leco_plugin.models.leco_config import LecoModelConfig
 from leco_plugin.models.sizing.sizes import SMALL, learning_only
 from leco_plugin.occupancy import Occupancy
@@ -115,7 +115,8 @@ class GuidedStart:
         host: what is guided.
         guide: of the host; it has an occupancy already where a file or a checkpoint gave one.
         config: where else to get one.
-        pipeline, trainer: nerfstudio's; without a trainer no file is left.
+        pipeline: nerfstudio's.
+        run: what is around the steps.
     Raises:
         InputError: the file is not there or cannot be read; its occupancy keeps nothing that the
             cameras see, and this run has not begun with it; its gate is none that the sampler asks;
@@ -128,10 +129,10 @@ class GuidedStart:
         guide: Guide,
         config: OccupancyConfig,
         pipeline: Any,
-        trainer: Any = None,
+        run: Run,
     ) -> None:
         self.host, self.guide, self.config = host, guide, config
-        self.pipeline, self.trainer = pipeline, trainer
+        self.pipeline, self.run = pipeline, run
         self.begun = False
         if guide.occupancy is None and config.path is not None:
             guide.set_occupancy(load_occupancy(config.path))  # says why it could not be before
@@ -171,8 +172,8 @@ class GuidedStart:
         if step == 0 and self.config.opaque_start:
             kept = self._along_rays().kept(self.guide.followed().threshold)
             begin_opaque(self.host, self.guide, kept)
-        if self.trainer is not None and is_first():
-            leave_file(self.guide.the_occupancy(), Path(self.trainer.base_dir))
+        if self.run.folder is not None:
+            leave_file(self.guide.the_occupancy(), self.run.folder)
 
     def _along_rays(self) -> AlongRays:
         """The occupancy along the run's rays, asked once."""
@@ -193,11 +194,11 @@ class GuidedStart:
         if learned_in is not None and host is not None:
             self.guide.frame.copy_(between(host, learned_in))
             self.guide.changed()
-            insists = self.config.other_scene or getattr(self.trainer, "_start_step", 0) > 0
+            insists = self.config.other_scene or self.run.start > 0
             refuse_another_scene(occupancy, manager, self.guide.frame, insists)
         along = along_rays(self.guide, occupancy, manager.train_dataset.cameras)
         share = along.share_kept(occupancy.threshold)
-        if share == 0.0 and getattr(self.trainer, "_start_step", 0) == 0:
+        if share == 0.0 and self.run.start == 0:
             raise InputError(
                 "the occupancy keeps nothing on the rays of these cameras: it was learned on "
                 "another scene, the scene has been moved since, or nothing is there"

@@ -8,7 +8,6 @@ what is bounded. Hosts that draw a fixed number of samples skip none, and are no
 from __future__ import annotations
 
 import time
-from pathlib import Path
 from typing import Any
 
 import torch
@@ -21,8 +20,8 @@ from leco_plugin.learning.collapse import SUSPECTED_STEPS
 from leco_plugin.learning.dense import evaluating
 from leco_plugin.learning.freezing import leave_file
 from leco_plugin.learning.price_watch import PriceWatch
+from leco_plugin.learning.run import Run
 from leco_plugin.log import say
-from leco_plugin.models.compute.ranks import is_first
 from leco_plugin.occupancy import CALIBRATED_AT
 from leco_plugin.scenes.learning_data import count_held_out, held_out_bundle
 from leco_plugin.studio.host_models import true_colours
@@ -37,14 +36,15 @@ class HostWatch:
 
     Args:
         config: bounds and how often they are measured.
-        pipeline, trainer: nerfstudio's.
+        pipeline: nerfstudio's.
+        run: what is around the steps.
     """
 
     def __init__(
-        self, host: Any, guide: Guide, config: CalibrationConfig, pipeline: Any, trainer: Any
+        self, host: Any, guide: Guide, config: CalibrationConfig, pipeline: Any, run: Run
     ) -> None:
         self.host, self.guide, self.config = host, guide, config
-        self.pipeline, self.trainer = pipeline, trainer
+        self.pipeline, self.run = pipeline, run
         self.started = 0.0
         self.ended_probation: float | None = None
         self.watch = PriceWatch(guide.watched, self, config, guide.frame.device)
@@ -120,8 +120,8 @@ class HostWatch:
         now = f"lowered from {before:.4f} to {threshold:.4f}"
         nothing = "0: from now on nothing is skipped"
         say(f"step {step}: {why}; the threshold is {now if threshold > 0.0 else nothing}")
-        if self.trainer is not None and is_first():
-            leave_file(occupancy, Path(self.trainer.base_dir))
+        if self.run.folder is not None:
+            leave_file(occupancy, self.run.folder)
 
 
 def _lowered(report: dict[str, Any], before: float, step: int, threshold: float) -> dict[str, Any]:

@@ -20,7 +20,7 @@ from torch import Tensor, nn
 from leco_plugin.learning.collapse import annealed
 from leco_plugin.learning.learner import Learner
 from leco_plugin.learning.progress import Progress
-from leco_plugin.learning.run import LearningOnly, Run
+from leco_plugin.learning.run import Run
 from leco_plugin.learning.schedule import KEPT_ABOVE, StepPlan
 from leco_plugin.models.compute.device import fast_precision, keep_freed_memory
 from leco_plugin.models.failures import require_finite
@@ -44,7 +44,7 @@ from leco_plugin.scenes.input_error import InputError
 from leco_plugin.scenes.learning_data import LearningData
 from leco_plugin.scenes.pixels.known_distances import DISTANCE
 from leco_plugin.studio.checkpoints import allow_checkpoint_globals, evaluate_whole_checkpoints
-from leco_plugin.studio.run import TrainerRun
+from leco_plugin.studio.run import run_of
 
 
 class LecoModel(Model):
@@ -98,9 +98,7 @@ class LecoModel(Model):
         """Finds the scene's bounds now, and returns what runs around each step."""
         attributes = training_callback_attributes
         assert attributes.pipeline is not None
-        trainer = attributes.trainer
-        run = LearningOnly() if trainer is None else TrainerRun(trainer)
-        learner = self.learner(attributes.pipeline.datamanager, run)
+        learner = self.learner(attributes.pipeline.datamanager, run_of(attributes.trainer))
         learner.begin()
         before, after = (
             TrainingCallbackLocation.BEFORE_TRAIN_ITERATION,

@@ -19,6 +19,7 @@ from torch import nn
 from torch.nn import Parameter
 from torch.optim import Optimizer
 
+from leco_plugin.learning.run import LearningOnly, Run
 from leco_plugin.models.compute.ranks import is_first
 
 COUNTED_FROM_ZERO = re.compile(
@@ -57,6 +58,11 @@ def keeps_all_images(config: Any, photographs: int) -> bool:
     """
     some = config.train_num_images_to_sample_from
     return bool(some == -1 or some >= photographs)
+
+
+def run_of(trainer: Any) -> Run:
+    """The run of a trainer; without one, a run that leaves no file and ends at freezing."""
+    return LearningOnly() if trainer is None else TrainerRun(trainer)
 
 
 class TrainerRun:
