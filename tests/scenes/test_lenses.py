@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import math
-from pathlib import Path
 from typing import Any
 
 import pytest
 from nerfstudio.cameras.cameras import CameraType
 
 from leco_plugin.scenes.input_error import InputError
-from leco_plugin.scenes.lenses import check_kinds, lens_of
+from leco_plugin.scenes.lenses import check_together, lens_of
 from leco_plugin.scenes.scene_fields import unused_fields
 
 SCENE: dict[str, Any] = {
@@ -36,9 +35,14 @@ def test_a_frame_goes_before_its_scene() -> None:
 def test_fields_of_view_are_focal_lengths() -> None:
     angles = {"w": 40, "h": 30, "camera_angle_x": math.pi / 2, "y_fov": 90.0}
     lens = lens_of(angles, {}, "here")
-    assert lens.fx == pytest.approx(20.0) and lens.fy == pytest.approx(15.0)
+    assert lens.focal_lengths(40, 30, 1) == pytest.approx((20.0, 15.0))
+    assert lens.focal_lengths(20, 15, 2) == pytest.approx((10.0, 7.5))
     del angles["y_fov"]
-    assert lens_of(angles, {}, "here").fy == pytest.approx(20.0)
+    assert lens_of(angles, {}, "here").focal_lengths(40, 30, 1) == pytest.approx((20.0, 20.0))
+    del angles["w"], angles["h"]  # the picture's own
+    assert lens_of(angles, {}, "here").focal_lengths(50, 30, 1) == pytest.approx((25.0, 25.0))
+    frame = {"camera_angle_x": 2 * math.atan(0.5)}  # goes before its scene, also by another name
+    assert lens_of({"fl_x": 7.0}, frame, "here").focal_lengths(50, 30, 1) == pytest.approx((50, 50))
 
 
 def test_a_fisheye_of_instant_ngp_is_one() -> None:
@@ -79,14 +83,13 @@ def test_perspective_and_fisheye_may_be_mixed_and_others_not() -> None:
     def kinds(*models: str) -> list[Any]:
         return [lens_of({}, {"camera_model": model}, "here") for model in models]
 
-    check_kinds(kinds("OPENCV", "PINHOLE", "OPENCV_FISHEYE"), "here")
-    check_kinds(kinds("EQUIRECTANGULAR", "EQUIRECTANGULAR"), "here")
+    check_together(kinds("OPENCV", "PINHOLE", "OPENCV_FISHEYE"), "here")
+    check_together(kinds("EQUIRECTANGULAR", "EQUIRECTANGULAR"), "here")
     with pytest.raises(InputError, match="here mixes EQUIRECTANGULAR and PERSPECTIVE"):
-        check_kinds(kinds("OPENCV", "EQUIRECTANGULAR"), "here")
+        check_together(kinds("OPENCV", "EQUIRECTANGULAR"), "here")
 
 
 def test_fields_that_are_not_used_are_said() -> None:
     frames = [{"file_path": "a.png", "sharpness": 3.0, "driver_parameters": {"LightX": 1.0}}]
     meta = {"frames": frames, "aabb_scale": 4, "envmap": "sky.png", "sharpen": 0, "mine": [1]}
     assert unused_fields(meta) == ["driver_parameters", "envmap", "mine"]
-    assert Path("a.png") == Path(str(frames[0]["file_path"]))

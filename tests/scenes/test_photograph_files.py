@@ -11,10 +11,10 @@ from PIL import Image
 
 from leco_plugin.scenes.input_error import InputError
 from leco_plugin.scenes.photograph_files import (
-    as_it_is_there,
     check_images,
     check_kind,
     decode,
+    find_file,
     header_of,
     is_plain,
     names_what_it_cannot_read,
@@ -110,7 +110,7 @@ def test_names_as_windows_and_instant_ngp_write_them_are_found(tmp_path: Path) -
     (tmp_path / "images").mkdir()
     path = write(tmp_path / "images" / "a.png", "RGB")
     for name in ("images/a.png", "images\\a.png", "images/a", "images\\a"):
-        assert as_it_is_there(tmp_path / name) == path
+        assert find_file(tmp_path / name) == path
         check_images([{"file_path": name}], tmp_path)
     with pytest.raises(InputError, match=r"1 of 1 images.*written by Windows.*backslash"):
         check_images([{"file_path": "images\\b.png"}], tmp_path)

@@ -22,7 +22,7 @@ from scipy.spatial.transform import Rotation
 from leco_plugin.scenes.input_error import InputError
 from leco_plugin.scenes.known_folders import remedy_for
 from leco_plugin.scenes.photographs import LecoPhotographsDataParserConfig
-from leco_plugin.scenes.reading import in_one_line
+from leco_plugin.scenes.reading import in_one_line, read_checked
 
 # nerfstudio leaves images open that it has read
 pytestmark = [
@@ -83,7 +83,7 @@ OF_A_FILE = ["leco-photographs", "nerfstudio-data", "instant-ngp-data", "blender
 
 def read(config: Any, split: str = "train") -> Any:
     """A split as our data manager has it."""
-    return in_one_line(config.setup().get_dataparser_outputs, config)(split)
+    return read_checked(config.setup()).get_dataparser_outputs(split)
 
 
 def picture(path: Path) -> np.ndarray:
@@ -251,7 +251,7 @@ def test_a_lens_that_nerfstudio_lacks_is_to_be_undistorted(scene: Path) -> None:
 def test_a_folder_of_another_reader_names_it(scene: Path, tmp_path: Path) -> None:
     as_colmap(scene)
     (scene / "transforms.json").unlink()
-    command = f"`ns-train METHOD --data {scene} colmap --colmap-path sparse/0` reads it"
+    command = f"`ns-train leco-occupancy --data {scene} colmap --colmap-path sparse/0` reads it"
     with pytest.raises(InputError, match=r"holds no transforms\.json") as caught:
         read(LecoPhotographsDataParserConfig(data=scene))
     assert command in str(caught.value)
@@ -268,8 +268,8 @@ def test_a_folder_of_another_reader_names_it(scene: Path, tmp_path: Path) -> Non
         folder = tmp_path / sign.split(".")[0].replace("/", "-") / "data"
         (folder / sign).parent.mkdir(parents=True)
         (folder / sign).write_text("{}")
-        assert wanted in str(remedy_for(folder, "leco-photographs"))
-    assert remedy_for(tmp_path / "nowhere" / "at" / "all", "colmap .") is None
+        assert wanted in str(remedy_for(folder))
+    assert remedy_for(tmp_path / "nowhere" / "at" / "all") is None
 
 
 @pytest.mark.parametrize("windows", [True, False])
