@@ -229,7 +229,8 @@ def _distortion(owner: dict[str, Any], kind: CameraType | None, where: str) -> l
         return None
     if kind is not None and kind not in UNDISTORTED and any(values):
         raise InputError(
-            f"{where}: nerfstudio undoes no distortion of {kind.name}: set it to 0, or undistort"
+            f"{where}: nerfstudio cannot undo the distortion of {kind.name}: set it to 0, or "
+            "undistort"
         )
     return values
 

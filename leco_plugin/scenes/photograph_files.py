@@ -74,17 +74,16 @@ def find_file(path: Path) -> Path:
     return path
 
 
-def check_images(frames: list[dict[str, Any]], folder: Path) -> None:
+def check_images(paths: list[Path]) -> None:
     """Every image is there.
 
     Raises:
         InputError: one line.
     """
-    paths = [find_file(folder / frame["file_path"]) for frame in frames]
     missing = [path for path in paths if not path.exists()]
     if missing:
         raise InputError(
-            f"{len(missing)} of {len(frames)} images are not there, the first is "
+            f"{len(missing)} of {len(paths)} images are not there, the first is "
             f"{missing[0]}{remedy_for_missing(missing[0])}"
         )
 

@@ -55,7 +55,7 @@ class LecoPhotographs(ReadsNear, Nerfstudio):
     ) -> DataparserOutputs:
         data = self.config.data
         meta = load_json(data if data.suffix == ".json" else data / "transforms.json")
-        check_images(meta["frames"], folder_of(data))
+        check_images([find_file(folder_of(data) / each["file_path"]) for each in meta["frames"]])
         up_is_known = self._knows_up(meta)
         if up_is_known and "orientation_override" not in meta:
             # nerfstudio's "up" would take the photographs' top edges for up, and tip the scene
@@ -128,7 +128,7 @@ def check_scene(data: Path) -> dict[str, Any]:
     """
     scene = scene_file_of(LecoPhotographsDataParserConfig(data=data), "train")
     assert scene is not None
-    check_images(scene.frames, folder_of(data))
+    check_images(scene.pictures())
     return scene.meta
 
 

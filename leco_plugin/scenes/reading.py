@@ -93,6 +93,8 @@ def in_one_line(read: Callable[..., DataparserOutputs], config: Any) -> Callable
             raise
         # nerfstudio's readers assert, ask and exit
         except (Exception, SystemExit) as error:
+            for path in () if scene is None else scene.pictures():
+                _ = header_of(path) if path.is_file() else None  # one that is none goes first
             data = Path(config.data)
             raise InputError(
                 f"{data} cannot be read as a scene by {reader_name(config)}: "
@@ -156,8 +158,10 @@ def _remedy(error: BaseException, config: Any) -> str:
 
 def _lacks_its_file(error: BaseException, config: Any) -> bool:
     """Whether a reader failed because the file that it looks for is not there."""
+    if description_of(config, "train") is not None:
+        return False  # it has been read
     data, name = Path(config.data), reader_name(config)
-    if name == "colmap":
+    if hasattr(config, "colmap_path"):
         return not has_model(data / config.colmap_path)
     signs = [sign for sign, reader in READERS.items() if reader == name]
     if signs:
@@ -198,7 +202,7 @@ def checked(
     headers = [header_of(path) for path in images]
     lenses: list[Lens | None] = [None] * len(images)
     if scene is not None:
-        numbers = frames_of(images, scene, config)
+        numbers = frames_of(images, scene)
         lenses = [None if number is None else scene.lenses[number] for number in numbers]
         factors = factors_of(scene, numbers, config, cameras)
         masks = [None if n is None else scene.frames[n].get("mask_path") for n in numbers]

@@ -14,6 +14,7 @@ from nerfstudio.cameras.cameras import Cameras
 from leco_plugin.scenes.input_error import InputError, one_line
 from leco_plugin.scenes.known_folders import command_with, remedy_for
 from leco_plugin.scenes.lenses import ANGLES, PINHOLE_FIELDS, Lens, check_together, lens_of
+from leco_plugin.scenes.photograph_files import find_file
 from leco_plugin.scenes.photograph_masks import check_masked
 from leco_plugin.scenes.rotations import check_poses
 
@@ -31,15 +32,24 @@ class SceneFile:
     """All of them, those for tests included."""
     lenses: list[Lens]
     """Of each frame."""
+    folder: Path
+    """To which names of pictures are relative."""
+
+    def pictures(self) -> list[Path]:
+        """The file of each frame, where there is one."""
+        return [find_file(self.folder / frame["file_path"]) for frame in self.frames]
 
 
 def load_json(path: Path) -> Any:
-    """What a JSON file says, with or without a byte order mark; null in a frame is left out."""
+    """What a JSON file says, with or without a byte order mark.
+
+    What is null in a frame is left out, and a pose of three rows has the fourth.
+    """
     said = _parsed(path.read_bytes())
     if not isinstance(said, dict):
         return said
     lists = {name: said[name] for name in FRAMES if isinstance(said.get(name), list)}
-    return said | {name: [_without_null(frame) for frame in lists[name]] for name in lists}
+    return said | {name: [_completed(frame) for frame in lists[name]] for name in lists}
 
 
 @lru_cache(maxsize=1)
@@ -48,17 +58,22 @@ def _parsed(content: bytes) -> Any:
     return json.loads(content.decode("utf-8-sig"))
 
 
-def _without_null(frame: Any) -> Any:
+def _completed(frame: Any) -> Any:
     if not isinstance(frame, dict):
         return frame
-    return {name: value for name, value in frame.items() if value is not None}
+    frame = {name: value for name, value in frame.items() if value is not None}
+    pose = frame.get("transform_matrix")
+    if isinstance(pose, list) and len(pose) == 3:
+        frame["transform_matrix"] = [*pose, [0.0, 0.0, 0.0, 1.0]]
+    return frame
 
 
-def read_scene_file(path: Path, split: str) -> SceneFile:
+def read_scene_file(path: Path, split: str, folder: Path) -> SceneFile:
     """A transforms.json with poses and lenses that cameras have.
 
     Args:
         split: that is read; only the cameras of training need more places than one.
+        folder: to which names of pictures are relative.
     Raises:
         InputError: one line.
     """
@@ -95,7 +110,7 @@ def read_scene_file(path: Path, split: str) -> SceneFile:
     lenses = [lens_of(meta, frame, f"{path}: {frame['file_path']}") for frame in frames]
     check_together(lenses, str(path))
     check_masked(frames, path.parent)
-    return SceneFile(path, meta, frames, lenses)
+    return SceneFile(path, meta, frames, lenses, folder)
 
 
 def own_target(config: Any) -> Any:
@@ -141,7 +156,7 @@ def scene_file_of(config: Any, split: str) -> SceneFile | None:
         if file.name != "transforms.json" and beside:
             instead = f"give that split one, as a copy of {beside[0].name}"
         raise InputError(f"{data} holds no {file.relative_to(data)}; {instead}")
-    scene = read_scene_file(file, split)
+    scene = read_scene_file(file, split, data / getattr(config, "images_dir", file.parent))
     if hasattr(config, "downscale_factor"):  # nerfstudio's own format has all of these
         for frame in scene.frames:
             for name in (each for each in PINHOLE_FIELDS if each not in scene.meta | frame):
@@ -158,15 +173,12 @@ def _add(scene: SceneFile, data: Path) -> str:
     return f"; {formula}" if command is None else f"; `{command}` reads fields of view instead"
 
 
-def frames_of(images: list[Path], scene: SceneFile, config: Any) -> list[int | None]:
+def frames_of(images: list[Path], scene: SceneFile) -> list[int | None]:
     """The number of the frame of each picture, which may be a smaller one of the same name.
 
     Raises:
         InputError: one line; several frames of different folders would have one smaller picture.
     """
-    folder = scene.path.parent
-    if hasattr(config, "images_dir"):
-        folder = Path(config.data) / config.images_dir
     places = [str(frame["file_path"]).replace("\\", "/") for frame in scene.frames]
     named: dict[str, list[int]] = {}
     for number, place in enumerate(places):
@@ -174,7 +186,7 @@ def frames_of(images: list[Path], scene: SceneFile, config: Any) -> list[int | N
     found: list[int | None] = []
     for image in images:
         numbers = named.get(image.name) or named.get(image.stem) or []
-        paths = [folder / places[number] for number in numbers]
+        paths = [scene.folder / places[number] for number in numbers]
         ends = [
             number
             for number, path in zip(numbers, paths)
