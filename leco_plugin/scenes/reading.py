@@ -25,7 +25,7 @@ from leco_plugin.models.compute.ranks import say
 from leco_plugin.progress_bar import bar
 from leco_plugin.scenes.derived_images import DerivedImages
 from leco_plugin.scenes.input_error import InputError, one_line
-from leco_plugin.scenes.known_folders import READERS, has_model, remedy_for
+from leco_plugin.scenes.known_folders import READERS, command_with, has_model, remedy_for
 from leco_plugin.scenes.large_coordinates import shift_large_coordinates
 from leco_plugin.scenes.lenses import Lens, set_lenses
 from leco_plugin.scenes.photograph_files import (
@@ -138,9 +138,10 @@ def _remedy(error: BaseException, config: Any) -> str:
     if isinstance(error, EOFError | SystemExit):
         if name != "colmap":
             return "run it on a terminal once, and answer"
+        reader = f"colmap --downscale-factor 1 --colmap-path {config.colmap_path}"
         return (
             "it would make smaller copies of photographs of more than 1600 pixels: "
-            "`colmap --downscale-factor 1` takes them as they are"
+            f"`{command_with(reader, data) or reader}` takes them as they are"
         )
     if "camera model" in _reason(error).lower():
         return "undistort the photographs with `colmap image_undistorter`, and give that model"
@@ -194,7 +195,7 @@ def checked(
     if cameras.camera_to_worlds.shape != (len(images), 3, 4):
         raise InputError(  # as nerfstudio's reader of instant-ngp makes them of one photograph
             f"{data}: {reader_name(config)} makes no cameras of {len(images)} photographs of the "
-            f"split {split}: hold out more, or name another reader after the method"
+            f"split {split}: hold out more by a lower --train-split-fraction"
         )
     check_poses(
         cameras.camera_to_worlds.numpy(), [f"{data}: the pose of {path}" for path in images]

@@ -555,3 +555,30 @@ def test_pictures_of_colmap_elsewhere_are_named(scene: Path) -> None:
     (scene / "transforms.json").unlink()
     (scene / "images").rename(scene / "input")
     assert "colmap --colmap-path sparse/0 --images-path input` reads" in str(remedy_for(scene))
+
+
+def test_a_split_without_its_file_is_to_have_a_copy(scene: Path) -> None:
+    config = as_blender(scene)
+    (scene / "transforms.json").unlink()
+    with pytest.raises(
+        InputError, match=r"no transforms_val\.json; .*copy of transforms_train\.json"
+    ):
+        read(config, "val")
+
+
+def test_photographs_as_they_are_stored_have_a_way_to_be_turned(
+    scene: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    exif = Image.Exif()
+    exif[0x0112] = 6
+    with Image.open(scene / "images" / "001.png") as image:
+        image.save(scene / "images" / "001.png", exif=exif)
+    read(LecoPhotographsDataParserConfig(data=scene))
+    said = " ".join(capsys.readouterr().out.split())
+    assert "1 photographs are used as they are stored" in said and "mogrify -auto-orient" in said
+
+
+def test_a_smaller_picture_that_is_not_there_is_named_by_readers(scene: Path) -> None:
+    for kind in (LecoPhotographsDataParserConfig, NerfstudioDataParserConfig):
+        with pytest.raises(InputError, match=r"images_2/.*png is not there.*--downscale-factor 1"):
+            read(kind(data=scene, downscale_factor=2))
