@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shlex
+import sys
 from pathlib import Path
 
 COLMAP = ("colmap/sparse/0", "sparse/0", "sparse", "colmap/sparse", "0", ".")
@@ -17,6 +18,7 @@ READERS = {
     "scene.json": "dycheck-data",
     "train.npz": "minimal-parser",
 }
+PICTURES = "*.[jJpP][pPnN]*[gG]"
 CONVERTERS = {
     "keyframes": "polycam",
     "opensfm": "odm",
@@ -25,29 +27,55 @@ CONVERTERS = {
     "EXR_RGBD": "record3d",
     "*.xml": "metashape --xml FILE.xml",
     "*.csv": "realitycapture --csv FILE.csv",
-    "*.[jJ][pP]*[gG]": "images",
+    PICTURES: "images",
     "images": "images",
 }
 """What lies in a folder, and which of ns-process-data's commands makes a scene of it."""
+METHOD = "leco-occupancy"
+"""Named where none was typed."""
 
 
-def _commands_for(folder: Path) -> list[tuple[str, str]]:
-    """Readers that may read a folder, each with the command that a user types."""
-    given = f"--data {shlex.quote(str(folder))}"
-    found = [
-        (reader, f"ns-train METHOD {given} {reader}")
-        for sign, reader in READERS.items()
-        if (folder / sign).is_file()
-    ]
+def command_with(reader: str, data: Path) -> str | None:
+    """The command that was typed, with a reader of this name and its options; None where the
+    command takes no reader."""
+    program, typed = Path(sys.argv[0]).name, sys.argv[1:]
+    given = f"--data {shlex.quote(str(data))} {reader}"
+    if program == "leco":
+        if typed[:1] != ["swap"]:
+            return None
+        own = typed[: typed.index("--")] if "--" in typed else typed
+        return f"{shlex.join(['leco', *own])} -- {given}"
+    if program.startswith("ns-") and program != "ns-train":
+        return None
+    named = program == "ns-train" and typed and typed[0][:1] != "-"
+    return f"ns-train {shlex.quote(typed[0]) if named else METHOD} {given}"
+
+
+def has_model(folder: Path) -> bool:
+    """Whether a folder holds a model of COLMAP."""
+    return any((folder / f"cameras.{ending}").is_file() for ending in ("bin", "txt"))
+
+
+def _readers_for(folder: Path) -> list[str]:
+    """Readers that may read a folder, each with its options."""
+    found = [reader for sign, reader in READERS.items() if (folder / sign).is_file()]
     for place in COLMAP:
-        if any((folder / place / f"cameras.{ending}").is_file() for ending in ("bin", "txt")):
+        if has_model(folder / place):
             path = "" if place == COLMAP[0] else f" --colmap-path {place}"
-            found.append((f"colmap {place}", f"ns-train METHOD {given} colmap{path}"))
-            break
+            return [*found, f"colmap{path}{_images_option(folder)}"]
     return found
 
 
-def converter_for(data: Path) -> str | None:
+def _images_option(folder: Path) -> str:
+    """Where the pictures of a model of COLMAP are, if not in `images`."""
+    if (folder / "images").is_dir():
+        return ""
+    beside = [folder, *sorted(each for each in folder.iterdir() if each.is_dir())]
+    place = next((each for each in beside if any(each.glob(PICTURES))), None)
+    return "" if place is None else f" --images-path {shlex.quote(str(place.relative_to(folder)))}"
+
+
+def _converter_for(data: Path) -> str | None:
     """The command of ns-process-data that makes a scene of a folder; None where none is known."""
     if not data.is_dir():
         return None
@@ -56,20 +84,23 @@ def converter_for(data: Path) -> str | None:
             source = data / "images" if sign == "images" else data
             command, *options = kind.split()
             given = [command, "--data", shlex.quote(str(source)), *options]
+            for place in COLMAP:
+                if command == "images" and (data / place / "cameras.bin").is_file():
+                    model = shlex.quote(str((data / place).resolve()))
+                    given += ["--skip-colmap", "--colmap-model-path", model]
+                    break
             return " ".join(["ns-process-data", *given, "--output-dir", "SCENE"])
     return None
 
 
-def remedy_for(data: Path, used: str) -> str | None:
-    """What to do about a folder that a reader does not read; None is not known.
-
-    Args:
-        used: name of the reader; of `colmap` with its path, as `colmap sparse/0`.
-    """
-    known = [each for folder in (data, data.parent) for each in _commands_for(folder)]
-    others = [command for reader, command in known if reader != used]
-    if others:
-        doubt = ", or names what is wrong" if READERS["transforms.json"] in others[0] else ""
-        return f"`{others[0]}` reads it{doubt}"
-    converter = None if known else converter_for(data)
+def remedy_for(data: Path) -> str | None:
+    """What to do about a folder that lacks the files of the reader it was given to; None where
+    nothing is known."""
+    known = [(reader, folder) for folder in (data, data.parent) for reader in _readers_for(folder)]
+    for reader, folder in known:
+        if command := command_with(reader, folder):
+            return f"`{command}` reads it"
+    if known and "colmap" not in known[0][0]:
+        return f"it is for the reader {known[0][0]}, and this command reads a transforms.json only"
+    converter = _converter_for(data)
     return None if converter is None else f"`{converter}` makes a scene of it"

@@ -25,6 +25,7 @@ from torch import Tensor
 
 from leco_plugin.log import say
 from leco_plugin.scenes.frames import APPLIED, inverse, moved, parsed_frame
+from leco_plugin.scenes.scene_file import load_json
 
 FAR = 100.0
 """Times the cameras' spread. Nearer to the origin float32 rounds to less than 1e-5 of it."""
@@ -73,8 +74,7 @@ class ReadsNear(DataParser):
         self, split: str = "train", **kwargs: Any
     ) -> DataparserOutputs:
         read: Any = super()._generate_dataparser_outputs  # type: ignore[safe-super]
-        load = read.__globals__.get("load_from_json")
-        names = {**read.__globals__, "load_from_json": lambda path: self._near(load(path))}
+        names = {**read.__globals__, "load_from_json": lambda path: self._near(load_json(path))}
         near = FunctionType(
             read.__code__, names, read.__name__, read.__defaults__, read.__func__.__closure__
         )
@@ -147,7 +147,7 @@ class ReadsNear(DataParser):
         return points - self._in_the_data()
 
 
-def read_near(parser: Any) -> None:
+def shift_large_coordinates(parser: Any) -> None:
     """Puts `ReadsNear` before the reader that a parser's class takes its poses from, if it can."""
     kind = type(parser)
     for owner in kind.__mro__ if not isinstance(parser, ReadsNear) else ():

@@ -17,8 +17,6 @@ from leco_plugin.scenes.input_error import InputError
 
 DISTORTIONS = ("k1", "k2", "k3", "k4", "p1", "p2")
 """In the order of nerfstudio's `distortion_params`."""
-COUNTS = (len(DISTORTIONS), 12)
-"""Numbers in `distortion_params`; 12 are those of FISHEYE624."""
 PINHOLE_FIELDS = ("w", "h", "fl_x", "fl_y", "cx", "cy")
 ANGLES = ("x_fov", "y_fov", "camera_angle_x", "camera_angle_y", "fovx", "fovy")
 """Fields of view: what instant-ngp and Blender write beside or instead of focal lengths."""
@@ -31,8 +29,9 @@ LENS_FIELDS = {*DISTORTIONS, *PINHOLE_FIELDS, *ANGLES, *KINDS, *OTHER_LENSES, *O
 LENS_FIELDS |= {"distortion_params", "rolling_shutter", "fisheye_crop_radius"}
 MIXED = {CameraType.PERSPECTIVE, CameraType.FISHEYE}
 """Types that one scene may have side by side."""
-STRAIGHT = {CameraType.EQUIRECTANGULAR, CameraType.ORTHOPHOTO}
-"""Types for which nerfstudio undoes no distortion."""
+FISHEYES = {CameraType.FISHEYE, CameraType.FISHEYE624}
+UNDISTORTED = {CameraType.PERSPECTIVE, *FISHEYES}
+"""Types for whose rays nerfstudio undoes the distortion."""
 
 
 @dataclass(frozen=True)
@@ -47,6 +46,30 @@ class Lens:
     width: float | None
     height: float | None
     distortion: list[float] | None
+    angle_x: float | None = None
+    """Field of view in radians, where it is said instead of `fx`."""
+    angle_y: float | None = None
+    crop_radius: float | None = None
+    """Of the circle that a fisheye shows; None of other lenses."""
+
+    def focal_lengths(
+        self, width: float, height: float, factor: int
+    ) -> tuple[float, float] | tuple[None, None]:
+        """Both focal lengths in pixels of a picture of that size; None where nothing is said.
+
+        Args:
+            factor: by which the picture is smaller than the size that the lens is for.
+        """
+        width = width if self.width is None else self.width / factor
+        height = height if self.height is None else self.height / factor
+        fx = None if self.fx is None else self.fx / factor
+        fy = None if self.fy is None else self.fy / factor
+        if self.angle_x is not None:
+            fx = 0.5 * width / math.tan(0.5 * self.angle_x)
+        if self.angle_y is not None:
+            fy = 0.5 * height / math.tan(0.5 * self.angle_y)
+        one = fx or fy
+        return (None, None) if one is None else (fx or one, fy or one)
 
 
 def lens_of(meta: dict[str, Any], frame: dict[str, Any], where: str) -> Lens:
@@ -58,30 +81,34 @@ def lens_of(meta: dict[str, Any], frame: dict[str, Any], where: str) -> Lens:
         InputError: one line; a number is none, or the lens is not one of nerfstudio's.
     """
 
-    def said(name: str) -> float | None:
+    def said(name: str, positive: bool = True) -> float | None:
         value = frame.get(name, meta.get(name))
-        return None if value is None else _number(value, name, where)
+        return None if value is None else _number(value, name, where, positive)
 
     _refuse_other_lenses(meta, frame, where)
-    width, height = said("w"), said("h")
-    fx = said("fl_x") or _focal(said("x_fov"), said("camera_angle_x"), width)
-    fy = said("fl_y") or _focal(said("y_fov"), said("camera_angle_y"), height)
-    kind, distortion = _kind(meta, frame, where), None
-    owner = next((each for each in (frame, meta) if _distortion(each, where) is not None), None)
-    if owner is not None:
-        distortion = _distortion(owner, where)
-    if kind in STRAIGHT and any(distortion or ()):
-        raise InputError(
-            f"{where}: nerfstudio undoes no distortion of {kind.name}: set it to 0, or undistort"
-        )
-    return Lens(kind, fx or fy, fy or fx, said("cx"), said("cy"), width, height, distortion)
+    (fx, angle_x), (fy, angle_y) = (_focal(meta, frame, axis, where) for axis in "xy")
+    kind = _kind(meta, frame, where)
+    distortion = _distortion(frame, kind, where) or _distortion(meta, kind, where)
+    return Lens(
+        kind,
+        fx,
+        fy,
+        said("cx", positive=False),
+        said("cy", positive=False),
+        said("w"),
+        said("h"),
+        distortion,
+        angle_x,
+        angle_y,
+        said("fisheye_crop_radius") if kind in FISHEYES else None,
+    )
 
 
 def set_lenses(cameras: Cameras, lenses: list[Lens | None], factors: list[int]) -> None:
     """Gives each camera its lens; of None it keeps its own.
 
     Args:
-        cameras: as a reader made them; changed in place.
+        cameras: of the pictures' sizes; changed in place.
         factors: by which pictures are smaller than the sizes that lenses are for.
     """
     for name in ("fx", "fy", "cx", "cy", "camera_type", "distortion_params"):
@@ -91,30 +118,30 @@ def set_lenses(cameras: Cameras, lenses: list[Lens | None], factors: list[int]) 
     for number, (lens, factor) in enumerate(zip(lenses, factors)):
         if lens is None:
             continue
-        for name in ("fx", "fy", "cx", "cy"):
-            value = getattr(lens, name)
+        size = float(cameras.width[number]), float(cameras.height[number])
+        middle = [
+            full / 2 if place is None and full is not None else place
+            for place, full in ((lens.cx, lens.width), (lens.cy, lens.height))
+        ]
+        values = (*lens.focal_lengths(*size, factor), *(p and p / factor for p in middle))
+        for name, value in zip(("fx", "fy", "cx", "cy"), values):
             if value is not None:
-                getattr(cameras, name)[number] = value / factor
+                getattr(cameras, name)[number] = value
         if lens.kind is not None:
             cameras.camera_type[number] = lens.kind.value
         if lens.distortion is not None:
             if cameras.distortion_params is None:
                 cameras.distortion_params = torch.zeros(len(lenses), len(lens.distortion))
             cameras.distortion_params[number] = torch.tensor(lens.distortion)
+    radius = next((lens.crop_radius for lens in lenses if lens and lens.crop_radius), None)
+    if radius is not None:
+        cameras.metadata = (cameras.metadata or {}) | {"fisheye_crop_radius": radius}
+    elif cameras.metadata is not None:
+        cameras.metadata.pop("fisheye_crop_radius", None)
 
 
-def factor_of(meta: dict[str, Any], frame: dict[str, Any], width: int) -> int:
-    """By which whole number a reader made a camera smaller than its file says.
-
-    Args:
-        width: of that camera; nerfstudio's readers take the scene's before the frame's.
-    """
-    full = meta.get("w", frame.get("w"))
-    return 1 if full is None else max(1, round(float(full) / width))
-
-
-def check_kinds(lenses: list[Lens], where: str) -> None:
-    """All frames are of one type, or perspective and fisheye.
+def check_together(lenses: list[Lens], where: str) -> None:
+    """All frames are of one type, or perspective and fisheye, and fisheyes show one circle.
 
     Raises:
         InputError: one line.
@@ -123,51 +150,89 @@ def check_kinds(lenses: list[Lens], where: str) -> None:
     if len(kinds) > 1 and not kinds <= MIXED:
         names = " and ".join(sorted(kind.name for kind in kinds))
         raise InputError(f"{where} mixes {names}: make a scene of each")
+    radii = {str(lens.crop_radius) for lens in lenses if lens.kind in FISHEYES}
+    if len(radii) > 1:
+        raise InputError(
+            f"{where} gives its fisheyes a fisheye_crop_radius of {' and of '.join(sorted(radii))}:"
+            " give all the same, or none and masks (mask_path) that hide what a lens does not show"
+        )
 
 
-def _number(value: Any, name: str, where: str) -> float:
-    if type(value) not in (int, float) or not abs(value) < 1e9:
-        raise InputError(f"{where}: {name} is {str(value)[:40]!r}, and not what a camera has")
+def _number(value: Any, name: str, where: str, positive: bool = False) -> float:
+    sound = type(value) in (int, float) and abs(value) < 1e9
+    if not sound or (positive and not value >= 1e-3):
+        raise InputError(
+            f"{where}: {name} is {str(value)[:40]!r}, and not what a camera has: give a "
+            f"{'positive ' * positive}number"
+        )
     return float(value)
 
 
-def _focal(degrees: float | None, radians: float | None, size: float | None) -> float | None:
-    angle = math.radians(degrees) if degrees else radians
-    return None if not angle or size is None else 0.5 * size / math.tan(0.5 * angle)
+def _focal(
+    meta: dict[str, Any], frame: dict[str, Any], axis: str, where: str
+) -> tuple[float | None, float | None]:
+    """Focal length in pixels, or else the field of view in radians, of an axis."""
+    for owner in (frame, meta):
+        for name in (f"fl_{axis}", f"{axis}_fov", f"camera_angle_{axis}"):
+            if owner.get(name) is None:
+                continue
+            value = _number(owner[name], name, where, positive=True)
+            if name[:2] == "fl":
+                return value, None
+            angle = math.radians(value) if name[0] == axis else value
+            if angle >= math.pi:
+                raise InputError(
+                    f"{where}: {name} is {value:g}, wider than a plane can show: give fl_{axis}"
+                )
+            return None, angle
+    return None, None
 
 
 def _kind(meta: dict[str, Any], frame: dict[str, Any], where: str) -> CameraType | None:
     """The type of a frame's camera; None where nothing is said."""
-    model = frame.get("camera_model", meta.get("camera_model"))
-    if model is not None and model not in list(CAMERA_MODEL_TO_TYPE):
+    owner = meta | frame
+    model = owner.get("camera_model")
+    if "camera_model" in owner and model not in list(CAMERA_MODEL_TO_TYPE):
         known = ", ".join(CAMERA_MODEL_TO_TYPE)
         raise InputError(f"{where}: camera_model {str(model)[:40]!r} is none of {known}")
     kind = None if model is None else CAMERA_MODEL_TO_TYPE[model]
-    if not frame.get("is_fisheye", meta.get("is_fisheye", False)):
+    if not owner.get("is_fisheye"):
         return kind
-    if kind not in (None, CameraType.FISHEYE, CameraType.FISHEYE624):
+    if kind not in (None, *FISHEYES):
         raise InputError(f"{where}: camera_model is {model}, and is_fisheye is set: remove one")
     return kind or CameraType.FISHEYE
 
 
-def _distortion(owner: dict[str, Any], where: str) -> list[float] | None:
-    """In nerfstudio's order; None where a scene or a frame says nothing."""
-    named = [_number(owner.get(name, 0), name, where) for name in DISTORTIONS]
-    if "distortion_params" not in owner:
-        return named if any(name in owner for name in DISTORTIONS) else None
-    listed = owner["distortion_params"]
-    if not isinstance(listed, list):
+def _distortion(owner: dict[str, Any], kind: CameraType | None, where: str) -> list[float] | None:
+    """In nerfstudio's order; None where a scene or a frame says nothing.
+
+    Raises:
+        InputError: nerfstudio would drop it, or some of it.
+    """
+    values = [_number(owner.get(name, 0), name, where) for name in DISTORTIONS]
+    if "distortion_params" in owner:
+        listed = owner["distortion_params"]
+        if not isinstance(listed, list):
+            raise InputError(
+                f"{where}: distortion_params is {str(listed)[:40]!r}: give a list of numbers"
+            )
+        listed = [_number(value, "distortion_params", where) for value in listed]
+        wanted = "12 numbers" if kind is CameraType.FISHEYE624 else ", ".join(DISTORTIONS)
+        if len(listed) != (12 if kind is CameraType.FISHEYE624 else len(DISTORTIONS)):
+            raise InputError(f"{where}: distortion_params has {len(listed)} numbers: give {wanted}")
+        if any(values) and values != listed:
+            raise InputError(
+                f"{where}: distortion_params and {DISTORTIONS[0]}.. differ: remove one"
+            )
+        values = listed
+    elif not any(name in owner for name in DISTORTIONS):
+        return None
+    if kind is not None and kind not in UNDISTORTED and any(values):
         raise InputError(
-            f"{where}: distortion_params is {str(listed)[:40]!r}, and not a list of numbers"
+            f"{where}: nerfstudio cannot undo the distortion of {kind.name}: set it to 0, or "
+            "undistort"
         )
-    listed = [_number(value, "distortion_params", where) for value in listed]
-    if len(listed) not in COUNTS:
-        raise InputError(
-            f"{where}: distortion_params has {len(listed)} numbers: give {', '.join(DISTORTIONS)}"
-        )
-    if any(named) and named != listed:
-        raise InputError(f"{where}: distortion_params and {DISTORTIONS[0]}.. differ: remove one")
-    return listed
+    return values
 
 
 def _refuse_other_lenses(meta: dict[str, Any], frame: dict[str, Any], where: str) -> None:
@@ -183,6 +248,12 @@ def _refuse_other_lenses(meta: dict[str, Any], frame: dict[str, Any], where: str
         raise InputError(
             f"{where}: from_mitsuba says that cameras look along +z: turn the poses to OpenGL's "
             "axes, and remove it"
+        )
+    shutter = owner.get("rolling_shutter")
+    if any(shutter) if isinstance(shutter, list) else shutter:
+        raise InputError(
+            f"{where}: rolling_shutter is {str(shutter)[:60]}, and nerfstudio's cameras expose all "
+            "rows at once: correct the photographs, or remove it where cameras stood still"
         )
     still = owner.get("transform_matrix")
     if any(owner.get(f"transform_matrix_{end}", still) != still for end in ("start", "end")):

@@ -6,6 +6,7 @@ turns no photograph as its EXIF says, and a file that is cut off ends it in the 
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NamedTuple, TypeVar
@@ -18,6 +19,8 @@ READ_RIGHTLY = ("L", "RGB", "RGBA")
 """Pillow's modes of images that nerfstudio reads as they are."""
 CONVERTED = ("1", "P", "PA", "LA", "CMYK")
 """Modes that become one of these; of CMYK by Pillow's formula, without a colour profile."""
+SAVE_ANEW = "if the file is whole, save it as JPEG or PNG with 8 bits a channel, and give that name"
+"""What to do about HEIC, OpenEXR and other kinds that Pillow does not read."""
 
 Read = TypeVar("Read")
 
@@ -50,8 +53,8 @@ def header_of(path: Path) -> Header:
             return Header(image.size, image.mode, transparent, _orientation(image), several)
     except (OSError, ValueError, EOFError, SyntaxError, Image.DecompressionBombError):
         if not path.exists():
-            raise InputError(f"the image {path} is not there{slashes(path)}") from None
-        raise InputError(f"{path} cannot be read as an image: is the file whole?") from None
+            raise InputError(f"the image {path} is not there{remedy_for_missing(path)}") from None
+        raise InputError(f"{path} cannot be read as an image: {SAVE_ANEW}") from None
 
 
 def _orientation(image: Image.Image) -> int:
@@ -62,7 +65,7 @@ def _orientation(image: Image.Image) -> int:
         return 1
 
 
-def as_it_is_there(path: Path) -> Path:
+def find_file(path: Path) -> Path:
     """A file of that name, of its name with slashes, or of one of these with an ending."""
     for name in (str(path), str(path).replace("\\", "/")):
         for ending in ("", ".png", ".jpg", ".jpeg", ".JPG"):
@@ -71,26 +74,31 @@ def as_it_is_there(path: Path) -> Path:
     return path
 
 
-def check_images(frames: list[dict[str, Any]], folder: Path) -> None:
+def check_images(paths: list[Path]) -> None:
     """Every image is there.
 
     Raises:
         InputError: one line.
     """
-    paths = [as_it_is_there(folder / frame["file_path"]) for frame in frames]
     missing = [path for path in paths if not path.exists()]
     if missing:
         raise InputError(
-            f"{len(missing)} of {len(frames)} images are not there, the first is "
-            f"{missing[0]}{slashes(missing[0])}"
+            f"{len(missing)} of {len(paths)} images are not there, the first is "
+            f"{missing[0]}{remedy_for_missing(missing[0])}"
         )
 
 
-def slashes(path: Path) -> str:
-    """What to add to a line about a file that is missing, where Windows wrote its name."""
-    if "\\" not in str(path):
-        return ""
-    return ": its name was written by Windows, write / for each backslash"
+def remedy_for_missing(path: Path) -> str:
+    """What to add to a line about a file that is missing: why it may be, and what to do."""
+    if "\\" in str(path):
+        return ": its name was written by Windows, write / for each backslash"
+    smaller = re.fullmatch(r"(.+)_(\d+)", path.parent.name)
+    if smaller and (smaller[1] == "images" or path.parent.with_name(smaller[1]).is_dir()):
+        return (
+            f": make it, 1/{smaller[2]} of the width and height of its photograph in {smaller[1]}, "
+            "or give --downscale-factor 1 after the name of the reader"
+        )
+    return ": put it there, or leave its frame out"
 
 
 def check_kind(path: Path, header: Header) -> None:
@@ -102,7 +110,7 @@ def check_kind(path: Path, header: Header) -> None:
     if header.mode not in READ_RIGHTLY + CONVERTED:
         raise InputError(
             f"{path} is of Pillow's mode {header.mode!r}, which nerfstudio reads wrongly: save it "
-            "with 8 bits a channel as RGB, RGBA or grey"
+            "as JPEG or PNG with 8 bits a channel, RGB, RGBA or grey"
         )
     if header.several:
         raise InputError(f"{path} holds more pictures than one: save the one that is meant alone")

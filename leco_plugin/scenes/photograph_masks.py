@@ -25,7 +25,7 @@ COLOURED = 40
 """Difference between channels beyond what JPEG makes of a grey."""
 
 
-def masks_as_read(
+def convert_masks(
     masks: list[Path],
     images: list[Path],
     sizes: list[tuple[int, int]],

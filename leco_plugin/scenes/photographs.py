@@ -6,7 +6,6 @@ already upright as they are, and reads the sparse points without open3d.
 
 from __future__ import annotations
 
-import json
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -23,13 +22,10 @@ from leco_plugin.log import say
 from leco_plugin.scenes.dataset_units import METRES_PER_UNIT, UP_IS_KNOWN
 from leco_plugin.scenes.frames import applied_in, from_file, moved, parsed_frame
 from leco_plugin.scenes.input_error import InputError, one_line
-from leco_plugin.scenes.known_folders import remedy_for
 from leco_plugin.scenes.large_coordinates import ReadsNear
-from leco_plugin.scenes.photograph_files import as_it_is_there, check_images
-from leco_plugin.scenes.photograph_intrinsics import check_intrinsics
-from leco_plugin.scenes.photograph_masks import check_masked
-from leco_plugin.scenes.reading import checked
-from leco_plugin.scenes.rotations import distance_from_rotations
+from leco_plugin.scenes.photograph_files import check_images, find_file
+from leco_plugin.scenes.reading import read_checked
+from leco_plugin.scenes.scene_file import load_json, scene_file_of
 
 POINTS = "leco_sparse_points"
 """Key of the dataset's metadata with the sparse points [P, 3] in model coordinates."""
@@ -50,21 +46,21 @@ class LecoPhotographs(ReadsNear, Nerfstudio):
 
     config: LecoPhotographsDataParserConfig
 
+    def __init__(self, config: LecoPhotographsDataParserConfig) -> None:
+        super().__init__(config)
+        read_checked(self)  # in whatever data manager
+
     def _generate_dataparser_outputs(
         self, split: str = "train", **kwargs: Any
     ) -> DataparserOutputs:
-        meta = check_scene(self.config.data)
+        data = self.config.data
+        meta = load_json(data if data.suffix == ".json" else data / "transforms.json")
+        check_images([find_file(folder_of(data) / each["file_path"]) for each in meta["frames"]])
         up_is_known = self._knows_up(meta)
         if up_is_known and "orientation_override" not in meta:
             # nerfstudio's "up" would take the photographs' top edges for up, and tip the scene
             self.config.orientation_method = "none"
-        try:
-            outputs: DataparserOutputs = super()._generate_dataparser_outputs(split)
-        except InputError:
-            raise
-        except Exception as error:
-            reason = f"{type(error).__name__}: {one_line(error, 120)}"
-            raise InputError(f"{self.config.data} cannot be read ({reason})") from error
+        outputs: DataparserOutputs = super()._generate_dataparser_outputs(split)
         if len(outputs.image_filenames) == 0 and split == "train":
             raise InputError(f"{self.config.data}: no image is left for the split {split!r}")
         frame, applied_scale = self._frame_of_file(outputs, meta)
@@ -75,14 +71,14 @@ class LecoPhotographs(ReadsNear, Nerfstudio):
             outputs.metadata[UP_IS_KNOWN] = True
         if "metres_per_unit" in meta:
             outputs.metadata[METRES_PER_UNIT] = applied_scale * _metres(meta, self.config.data)
-        return checked(outputs, self.config, split)
+        return outputs
 
     def _get_fname(
         self, filepath: Path, data_dir: Path, downsample_folder_prefix: str = "images_"
     ) -> Path:
         """nerfstudio's choice of a file, by a name as Windows or instant-ngp write it, too; a mask
         of full size where there is no smaller one."""
-        there = as_it_is_there(data_dir / filepath)
+        there = find_file(data_dir / filepath)
         name = there.relative_to(data_dir) if there.is_relative_to(data_dir) else there
         path: Path = super()._get_fname(name, data_dir, downsample_folder_prefix)
         return there if downsample_folder_prefix == "masks_" and not path.exists() else path
@@ -130,45 +126,10 @@ def check_scene(data: Path) -> dict[str, Any]:
         InputError: one line: no such folder, no cameras or a single place, missing images, lenses
             that nerfstudio's cameras lack, poses that are not poses.
     """
-    if not data.exists():
-        raise InputError(
-            f"there is no folder {data}: put it, or a link, there, or give another with --data"
-        )
-    description = data if data.suffix == ".json" else data / "transforms.json"
-    if not description.exists():
-        instead = remedy_for(data, "leco-photographs") or (
-            "give a folder with one, or make one from photographs with ns-process-data"
-        )
-        raise InputError(f"{data} holds no transforms.json; {instead}")
-    try:
-        meta = json.loads(description.read_text())
-        frames = meta["frames"]
-        paths = [frame["file_path"] for frame in frames]
-        if not all(type(path) is str and all(ord(c) >= 32 for c in path) for path in paths):
-            raise ValueError("a file_path is no path")
-        poses = np.array([frame["transform_matrix"] for frame in frames], dtype=float)
-    except (OSError, ValueError, KeyError, TypeError, OverflowError, RecursionError) as error:
-        reason = f"{type(error).__name__}: {one_line(error, 120)}"
-        raise InputError(
-            f"{description} is not a scene in nerfstudio's format ({reason}); mend it, or make it "
-            "anew with ns-process-data"
-        ) from None
-    if len(frames) == 0:
-        raise InputError(f"{description} has no cameras: its list of frames is empty")
-    if poses.shape[1:] not in ((4, 4), (3, 4)) or not np.isfinite(poses).all():
-        raise InputError(f"{description} holds a transform_matrix that is no finite 4 x 4 matrix")
-    distortions = distance_from_rotations(poses[:, :3, :3])
-    if distortions.max() > 0.05:
-        worst = paths[int(distortions.argmax())]
-        raise InputError(f"{description}: the transform_matrix of {worst} is no rotation")
-    if np.ptp(poses[:, :3, 3], axis=0).max() == 0.0:
-        number = "one image" if len(frames) == 1 else f"{len(frames)} images from one place"
-        raise InputError(f"{description} has {number}; a scene is seen from two places at least")
-    folder = folder_of(data)
-    check_intrinsics(meta, frames, description)
-    check_images(frames, folder)
-    check_masked(frames, folder)
-    return dict(meta)
+    scene = scene_file_of(LecoPhotographsDataParserConfig(data=data), "train")
+    assert scene is not None
+    check_images(scene.pictures())
+    return scene.meta
 
 
 def read_points(meta: dict[str, Any], folder: Path) -> Tensor | None:
@@ -182,7 +143,7 @@ def read_points(meta: dict[str, Any], folder: Path) -> Tensor | None:
     name = meta.get("ply_file_path")
     if name is None:
         return None
-    path = as_it_is_there(folder / str(name))
+    path = find_file(folder / str(name))
     if not path.is_file():
         say(f"the scene names sparse points that are not there: {escape(str(path))}")
         return None

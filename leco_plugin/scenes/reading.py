@@ -6,7 +6,6 @@ what is read wrongly is looked for in what they return.
 
 from __future__ import annotations
 
-import json
 from collections import Counter
 from collections.abc import Callable
 from contextlib import nullcontext
@@ -16,17 +15,19 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from nerfstudio.cameras.cameras import CameraType
+from nerfstudio.cameras.cameras import Cameras
 from nerfstudio.data.dataparsers.base_dataparser import DataParserConfig, DataparserOutputs
+from PIL import UnidentifiedImageError
 from rich.markup import escape
 
 from leco_plugin.log import bar, say
 from leco_plugin.scenes.derived_images import DerivedImages
 from leco_plugin.scenes.input_error import InputError, one_line
-from leco_plugin.scenes.known_folders import remedy_for
-from leco_plugin.scenes.large_coordinates import read_near
-from leco_plugin.scenes.lenses import Lens, check_kinds, factor_of, lens_of, set_lenses
+from leco_plugin.scenes.known_folders import READERS, command_with, has_model, remedy_for
+from leco_plugin.scenes.large_coordinates import shift_large_coordinates
+from leco_plugin.scenes.lenses import Lens, set_lenses
 from leco_plugin.scenes.photograph_files import (
+    SAVE_ANEW,
     Header,
     check_kind,
     decode,
@@ -34,37 +35,39 @@ from leco_plugin.scenes.photograph_files import (
     is_plain,
     is_turned,
 )
-from leco_plugin.scenes.photograph_masks import check_masked, masks_as_read
+from leco_plugin.scenes.photograph_masks import convert_masks
+from leco_plugin.scenes.rotations import check_poses
 from leco_plugin.scenes.scene_fields import say_unused
+from leco_plugin.scenes.scene_file import (
+    SceneFile,
+    description_of,
+    factors_of,
+    frames_of,
+    own_target,
+    scene_file_of,
+)
 from leco_plugin.studio.checkpoints import require_data
 
-CHECKED = "leco_checked"
-"""Key of a dataparser's metadata: there where `checked` has been at its outputs."""
+SAVE_ALIKE = "save all with an alpha channel or none"
 UNWRITABLE = "make the folder of the scene writable, or convert its pictures and masks by hand"
 
 
 def read_checked(parser: Any) -> Any:
     """The reader with its outputs checked, large positions shifted, and each error in one line."""
-    read_near(parser)
-    parser.get_dataparser_outputs = in_one_line(parser.get_dataparser_outputs, parser.config)
+    if "get_dataparser_outputs" not in vars(parser):  # it is not yet
+        shift_large_coordinates(parser)
+        parser.get_dataparser_outputs = in_one_line(parser.get_dataparser_outputs, parser.config)
     return parser
 
 
 def set_up_checked(config: Any, **options: Any) -> Any:
     """What a config of `with_checks` sets up: its own reader, as of `read_checked`."""
-    return read_checked(_own_target(config)(config, **options))
+    return read_checked(own_target(config)(config, **options))
 
 
 def with_checks(config: DataParserConfig) -> DataParserConfig:
     """The config of a reader that will be checked in whatever data manager."""
     return replace(config, _target=set_up_checked)  # type: ignore[arg-type]
-
-
-def _own_target(config: Any) -> Any:
-    """The class of a config's reader."""
-    if config._target is not set_up_checked:
-        return config._target
-    return type(config)()._target
 
 
 def in_one_line(read: Callable[..., DataparserOutputs], config: Any) -> Callable[..., Any]:
@@ -75,19 +78,33 @@ def in_one_line(read: Callable[..., DataparserOutputs], config: Any) -> Callable
         config: of the reader.
     """
 
+    first: dict[bool, tuple[Path, str]] = {}
+
     def outputs_of(split: str = "train", **options: Any) -> DataparserOutputs:
         require_data(Path(config.data))
+        scene = scene_file_of(config, split)
         try:
-            return checked(read(split=split, **options), config, split)
+            outputs = checked(read(split=split, **options), config, split, scene)
+            if outputs.image_filenames and outputs.alpha_color is None:
+                path = Path(outputs.image_filenames[0])
+                first[header_of(path).transparent] = path, split
         except InputError:
             raise
         # nerfstudio's readers assert, ask and exit
         except (Exception, SystemExit) as error:
+            for path in () if scene is None else scene.pictures():
+                _ = header_of(path) if path.is_file() else None  # one that is none goes first
             data = Path(config.data)
             raise InputError(
                 f"{data} cannot be read as a scene by {reader_name(config)}: "
                 f"{_reason(error)}; {_remedy(error, config)}"
             ) from error
+        if len(first) == 2:
+            raise InputError(
+                f"{first[True][0]} of the split {first[True][1]} has transparency, and "
+                f"{first[False][0]} of {first[False][1]} has none: {SAVE_ALIKE}"
+            )
+        return outputs
 
     return outputs_of
 
@@ -110,125 +127,114 @@ def _reason(error: BaseException) -> str:
 
 
 def _remedy(error: BaseException, config: Any) -> str:
-    """What to do about an error of a reader."""
+    """What to do about an error of a reader; another reader only where this one's file is not
+    there."""
     data, name = Path(config.data), reader_name(config)
     if not data.exists():
         return "there is no such folder: put it, or a link, there, or give another with --data"
-    if isinstance(error, EOFError | SystemExit) and name == "colmap":
+    if _lacks_its_file(error, config) and (other := remedy_for(data)):
+        return other
+    if isinstance(error, EOFError | SystemExit):
+        if name != "colmap":
+            return "run it on a terminal once, and answer"
+        reader = f"colmap --downscale-factor 1 --colmap-path {config.colmap_path}"
         return (
             "it would make smaller copies of photographs of more than 1600 pixels: "
-            "`colmap --downscale-factor 1` takes them as they are"
+            f"`{command_with(reader, data) or reader}` takes them as they are"
         )
-    if name == "colmap" and "camera model" in _reason(error).lower():
+    if "camera model" in _reason(error).lower():
         return "undistort the photographs with `colmap image_undistorter`, and give that model"
     if "\\" in str(error).replace("\\\\", "\\"):
         return "its names were written by Windows: write / for each backslash"
-    used = f"{name} {getattr(config, 'colmap_path', '')}".strip()
-    return remedy_for(data, used) or "mend it, or name another reader after the method"
+    if isinstance(error, UnidentifiedImageError):
+        return SAVE_ANEW
+    if isinstance(error, FileNotFoundError | NotADirectoryError):
+        return "put that file there, or remove what names it"
+    file = description_of(config, "train") or data
+    if isinstance(error, KeyError):
+        return f"add {one_line(error, 40)} to {file}"
+    return f"mend {file}"
 
 
-def checked(outputs: DataparserOutputs, config: Any, split: str) -> DataparserOutputs:
+def _lacks_its_file(error: BaseException, config: Any) -> bool:
+    """Whether a reader failed because the file that it looks for is not there."""
+    if description_of(config, "train") is not None:
+        return False  # it has been read
+    data, name = Path(config.data), reader_name(config)
+    if hasattr(config, "colmap_path"):
+        return not has_model(data / config.colmap_path)
+    signs = [sign for sign, reader in READERS.items() if reader == name]
+    if signs:
+        return not (data / signs[0]).is_file()
+    return isinstance(error, FileNotFoundError | NotADirectoryError) or "exist" in str(error)
+
+
+def checked(
+    outputs: DataparserOutputs, config: Any, split: str, scene: SceneFile | None
+) -> DataparserOutputs:
     """What a reader returned, with every picture, mask and lens such as the files say.
 
     Pictures and masks that nerfstudio would read wrongly are converted into `leco-cache/pictures`
     beside the data, or refused.
 
+    Args:
+        scene: the file that it was read from.
     Raises:
         InputError: one line.
     """
     outputs.metadata = dict(outputs.metadata)
-    if outputs.metadata.get(CHECKED) or not outputs.image_filenames:
+    if not outputs.image_filenames:
         return outputs
     data, speak = Path(config.data), split == "train"
     derived = DerivedImages(
         (data if data.is_dir() else data.parent) / "leco-cache" / "pictures", UNWRITABLE
     )
     images = [Path(path) for path in outputs.image_filenames]
-    if outputs.cameras.camera_to_worlds.shape != (len(images), 3, 4):
+    cameras, factors = outputs.cameras, [1] * len(images)
+    if cameras.camera_to_worlds.shape != (len(images), 3, 4):
         raise InputError(  # as nerfstudio's reader of instant-ngp makes them of one photograph
             f"{data}: {reader_name(config)} makes no cameras of {len(images)} photographs of the "
-            f"split {split}: hold out more, or name another reader after the method"
+            f"split {split}: hold out more by a lower --train-split-fraction"
         )
+    check_poses(
+        cameras.camera_to_worlds.numpy(), [f"{data}: the pose of {path}" for path in images]
+    )
     headers = [header_of(path) for path in images]
-    cameras, factors = outputs.cameras, [1] * len(images)
     lenses: list[Lens | None] = [None] * len(images)
-    file = _description(config, split)
-    if file is not None:
-        meta = json.loads(file.read_text(encoding="utf-8"))
-        frames = _frames_of(images, meta, file)
-        for number, frame in enumerate(frames):
-            if frame is not None:
-                lenses[number] = lens_of(meta, frame, f"{file}: {frame['file_path']}")
-                if hasattr(config, "downscale_factor") or "w" in meta:
-                    factors[number] = factor_of(meta, frame, int(cameras.width[number]))
-        check_kinds([lens for lens in lenses if lens is not None], str(file))
-        radius = meta.get("fisheye_crop_radius")
-        if radius is not None and any(lens and lens.kind is CameraType.FISHEYE for lens in lenses):
-            cameras.metadata = (cameras.metadata or {}) | {"fisheye_crop_radius": radius}
-        check_masked(meta["frames"], file.parent)
-        masked = [frame["mask_path"] for frame in frames if frame and "mask_path" in frame]
-        if outputs.mask_filenames is None and len(masked) == len(images):
-            outputs.mask_filenames = [file.parent / path.replace("\\", "/") for path in masked]
+    if scene is not None:
+        numbers = frames_of(images, scene)
+        lenses = [None if number is None else scene.lenses[number] for number in numbers]
+        factors = factors_of(scene, numbers, config, cameras)
+        masks = [None if n is None else scene.frames[n].get("mask_path") for n in numbers]
+        unread = outputs.mask_filenames is None and not hasattr(config, "masks_dir")
+        if unread and all(masks):
+            folder = scene.path.parent
+            outputs.mask_filenames = [folder / str(path).replace("\\", "/") for path in masks]
         if speak:
-            say_unused(meta, file)
+            say_unused(scene.meta, scene.path)
     made = torch.cat([cameras.width, cameras.height], dim=-1).expand(len(images), -1).tolist()
     sizes = [_size_of(*each) for each in zip(images, headers, lenses, made, factors)]
-    set_lenses(cameras, lenses, factors)
     cameras.width, cameras.height = torch.tensor(sizes).to(cameras.width).split(1, dim=1)
+    set_lenses(cameras, lenses, factors)
+    _check_focal_lengths(cameras, images)
     outputs.image_filenames = _plain_pictures(images, headers, sizes, derived, speak)
     if outputs.mask_filenames is not None:
-        masks = [Path(path) for path in outputs.mask_filenames]
-        outputs.mask_filenames = masks_as_read(masks, images, sizes, derived, speak)
+        paths = [Path(path) for path in outputs.mask_filenames]
+        outputs.mask_filenames = convert_masks(paths, images, sizes, derived, speak)
     elif speak and getattr(config, "masks_path", False) is None and (data / "masks").is_dir():
         say(f"{escape(str(data / 'masks'))} is not used: `--masks-path masks` would")
-    outputs.metadata[CHECKED] = True
     return outputs
 
 
-def _description(config: Any, split: str) -> Path | None:
-    """The transforms.json that a reader reads; None of one that reads something else."""
-    from nerfstudio.data.dataparsers.blender_dataparser import Blender
-    from nerfstudio.data.dataparsers.dnerf_dataparser import DNeRF
-    from nerfstudio.data.dataparsers.instant_ngp_dataparser import InstantNGP
-    from nerfstudio.data.dataparsers.nerfstudio_dataparser import Nerfstudio
-
-    data = Path(config.data)
-    target = _own_target(config)
-    if issubclass(target, Nerfstudio | InstantNGP):
-        return data if data.suffix == ".json" else data / "transforms.json"
-    return data / f"transforms_{split}.json" if issubclass(target, Blender | DNeRF) else None
-
-
-def _frames_of(images: list[Path], meta: dict[str, Any], file: Path) -> list[dict[str, Any] | None]:
-    """The frame of each picture, which may be a smaller one of the same name.
-
-    Raises:
-        InputError: one line; several frames of different folders would have one smaller picture.
-    """
-    named: dict[str, list[dict[str, Any]]] = {}
-    for frame in meta["frames"]:
-        named.setdefault(_name_of(frame), []).append(frame)
-    found: list[dict[str, Any] | None] = []
-    for image in images:
-        frames = named.get(image.name) or named.get(image.stem) or []
-        ends = [frame for frame in frames if _is_at(image, frame, file.parent)]
-        places = {str(frame["file_path"]) for frame in frames}
-        if not ends and len(places) > 1:
-            raise InputError(
-                f"{image} would be the picture of {' and of '.join(sorted(places)[:2])}: "
-                "give them names of their own"
-            )
-        found.append(next(iter(ends or frames), None))
-    return found
-
-
-def _name_of(frame: dict[str, Any]) -> str:
-    return str(frame["file_path"]).replace("\\", "/").rsplit("/", 1)[-1]
-
-
-def _is_at(image: Path, frame: dict[str, Any], folder: Path) -> bool:
-    path = folder / str(frame["file_path"]).replace("\\", "/")
-    return image in (path, path.with_name(f"{path.name}{image.suffix}"))
+def _check_focal_lengths(cameras: Cameras, images: list[Path]) -> None:
+    """InputError where a reader that reads no transforms.json has made a camera that is none."""
+    for name in ("fx", "fy"):
+        for path, value in zip(images, getattr(cameras, name).flatten().tolist()):
+            if not 0.0 < value < float("inf"):
+                raise InputError(
+                    f"the camera of {path} has {name} {value:g}, which no camera has: mend the "
+                    "intrinsics in the files of the scene"
+                )
 
 
 def _size_of(
@@ -281,13 +287,14 @@ def _plain_pictures(
     if 0 < len(transparent) < len(images):
         raise InputError(
             f"{len(transparent)} of {len(images)} images have transparency, the first is "
-            f"{transparent[0]}: save all with an alpha channel or none"
+            f"{transparent[0]}: {SAVE_ALIKE}"
         )
     for what, count in converted.items() if speak else ():
         say(f"{count} photographs {what} are converted into {escape(str(derived.folder))}")
     if as_stored and speak:
         say(
             f"{len(as_stored)} photographs are used as they are stored, though EXIF turns them: "
-            f"that is what their intrinsics are for; the first is {escape(str(as_stored[0]))}"
+            f"that is what their intrinsics are for; the first is {escape(str(as_stored[0]))}. "
+            "Where renders are turned, `mogrify -auto-orient` them and make the scene anew"
         )
     return paths

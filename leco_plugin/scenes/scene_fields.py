@@ -15,11 +15,13 @@ READ = LENS_FIELDS | {
     "applied_transform",
     "file_path",
     "frames",
+    "has_mask",
     "mask_path",
     "metres_per_unit",
     "orientation_override",
     "ply_file_path",
     "test_filenames",
+    "test_frames",
     "train_filenames",
     "transform_matrix",
     "transform_matrix_end",
@@ -53,7 +55,7 @@ methods learn without depths."""
 
 def unused_fields(meta: dict[str, Any]) -> list[str]:
     """Names of fields of a scene and of its frames that are not used and say something."""
-    owners = [meta, *meta["frames"]]
+    owners = [meta, *meta["frames"], *meta.get("test_frames", [])]
     names = {
         name
         for owner in owners

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import math
-from pathlib import Path
 from typing import Any
 
 import pytest
-from nerfstudio.cameras.cameras import CameraType
+import torch
+from nerfstudio.cameras.cameras import Cameras, CameraType
 
 from leco_plugin.scenes.input_error import InputError
-from leco_plugin.scenes.lenses import check_kinds, lens_of
+from leco_plugin.scenes.lenses import UNDISTORTED, check_together, lens_of
 from leco_plugin.scenes.scene_fields import unused_fields
 
 SCENE: dict[str, Any] = {
@@ -36,9 +36,14 @@ def test_a_frame_goes_before_its_scene() -> None:
 def test_fields_of_view_are_focal_lengths() -> None:
     angles = {"w": 40, "h": 30, "camera_angle_x": math.pi / 2, "y_fov": 90.0}
     lens = lens_of(angles, {}, "here")
-    assert lens.fx == pytest.approx(20.0) and lens.fy == pytest.approx(15.0)
+    assert lens.focal_lengths(40, 30, 1) == pytest.approx((20.0, 15.0))
+    assert lens.focal_lengths(20, 15, 2) == pytest.approx((10.0, 7.5))
     del angles["y_fov"]
-    assert lens_of(angles, {}, "here").fy == pytest.approx(20.0)
+    assert lens_of(angles, {}, "here").focal_lengths(40, 30, 1) == pytest.approx((20.0, 20.0))
+    del angles["w"], angles["h"]  # the picture's own
+    assert lens_of(angles, {}, "here").focal_lengths(50, 30, 1) == pytest.approx((25.0, 25.0))
+    frame = {"camera_angle_x": 2 * math.atan(0.5)}  # goes before its scene, also by another name
+    assert lens_of({"fl_x": 7.0}, frame, "here").focal_lengths(50, 30, 1) == pytest.approx((50, 50))
 
 
 def test_a_fisheye_of_instant_ngp_is_one() -> None:
@@ -56,12 +61,31 @@ def test_a_fisheye_of_instant_ngp_is_one() -> None:
         ({"ftheta_p0": 0.1}, "ftheta_p0 describes a lens"),
         ({"equirectangular": True}, "equirectangular describes a lens"),
         ({"b1": 2.0}, "b1 describes a lens"),
-        ({"camera_model": "EQUIRECTANGULAR", "k1": 0.1}, "no distortion of EQUIRECTANGULAR"),
+        (
+            {"camera_model": "EQUIRECTANGULAR", "k1": 0.1},
+            "cannot undo the distortion of EQUIRECTANGULAR",
+        ),
         ({"distortion_params": [0.0] * 6, "k1": 0.1}, "differ: remove one"),
         ({"distortion_params": [0.01] * 4}, "has 4 numbers: give k1, k2, k3, k4, p1, p2"),
         ({"from_mitsuba": True}, "from_mitsuba"),
         ({"transform_matrix_start": [1], "transform_matrix": [2]}, "the camera moves"),
         ({"k2": "0.1"}, "k2 is '0.1'"),
+        ({"p2": float("nan")}, "p2 is 'nan'"),
+        ({"distortion_params": None}, "distortion_params is 'None'"),
+        ({"distortion_params": [0.0, float("inf")]}, "distortion_params is 'inf'"),
+        ({"camera_model": "FISHEYE624", "k1": 0.1, "distortion_params": [0] * 6}, "12 numbers"),
+        ({"distortion_params": [0.1] * 12}, "has 12 numbers: give k1"),
+        ({"camera_model": ["OPENCV"]}, "is none of"),
+        ({"fl_x": 0.0}, "fl_x is '0.0'.*give a positive number"),
+        ({"fl_y": float("nan")}, "fl_y is 'nan'"),
+        ({"w": True}, "w is 'True'"),
+        ({"h": -3}, "h is '-3'"),
+        ({"cx": "16"}, "cx is '16'"),
+        ({"camera_angle_x": 3.2}, "wider than a plane.*give fl_x"),
+        ({"y_fov": -60.0}, "y_fov is '-60.0'"),
+        ({"rolling_shutter": [0.0, 0.0, 0.1, 0.0]}, "rolling_shutter.*correct the photographs"),
+        ({"rolling_shutter": 0.1}, "rolling_shutter.*correct the photographs"),
+        ({"is_fisheye": True, "fisheye_crop_radius": 0}, "fisheye_crop_radius is '0'"),
     ],
 )
 def test_what_would_be_dropped_is_refused(more: dict[str, Any], message: str) -> None:
@@ -79,14 +103,53 @@ def test_perspective_and_fisheye_may_be_mixed_and_others_not() -> None:
     def kinds(*models: str) -> list[Any]:
         return [lens_of({}, {"camera_model": model}, "here") for model in models]
 
-    check_kinds(kinds("OPENCV", "PINHOLE", "OPENCV_FISHEYE"), "here")
-    check_kinds(kinds("EQUIRECTANGULAR", "EQUIRECTANGULAR"), "here")
+    check_together(kinds("OPENCV", "PINHOLE", "OPENCV_FISHEYE"), "here")
+    check_together(kinds("EQUIRECTANGULAR", "EQUIRECTANGULAR"), "here")
     with pytest.raises(InputError, match="here mixes EQUIRECTANGULAR and PERSPECTIVE"):
-        check_kinds(kinds("OPENCV", "EQUIRECTANGULAR"), "here")
+        check_together(kinds("OPENCV", "EQUIRECTANGULAR"), "here")
 
 
 def test_fields_that_are_not_used_are_said() -> None:
     frames = [{"file_path": "a.png", "sharpness": 3.0, "driver_parameters": {"LightX": 1.0}}]
     meta = {"frames": frames, "aabb_scale": 4, "envmap": "sky.png", "sharpen": 0, "mine": [1]}
     assert unused_fields(meta) == ["driver_parameters", "envmap", "mine"]
-    assert Path("a.png") == Path(str(frames[0]["file_path"]))
+
+
+def rays(kind: CameraType, k1: float) -> torch.Tensor:
+    """Origin and direction of a ray of a camera of a type."""
+    numbers = 12 if kind is CameraType.FISHEYE624 else 6
+    cameras = Cameras(
+        torch.eye(4)[None, :3],
+        *(torch.full((1, 1), value) for value in (30.0, 30.0, 16.0, 16.0)),
+        width=32,
+        height=32,
+        distortion_params=torch.tensor([[k1] + [0.0] * (numbers - 1)]),
+        camera_type=kind,
+    )
+    ray = cameras.generate_rays(0, coords=torch.tensor([[3.0, 5.0]]))
+    return torch.cat([ray.origins, ray.directions], dim=-1)
+
+
+def test_distortion_is_refused_where_nerfstudio_drops_it() -> None:
+    for kind in (CameraType.PERSPECTIVE, CameraType.FISHEYE, CameraType.FISHEYE624):
+        assert kind in UNDISTORTED and not torch.equal(rays(kind, 0.2), rays(kind, 0.0))
+    for kind in (CameraType.EQUIRECTANGULAR, CameraType.ORTHOPHOTO):
+        assert kind not in UNDISTORTED and torch.equal(rays(kind, 0.2), rays(kind, 0.0))
+    for model in ("ORTHOPHOTO", "VR180_L", "OMNIDIRECTIONALSTEREO_R"):
+        with pytest.raises(InputError, match=f"cannot undo the distortion of {model}"):
+            lens_of({"camera_model": model}, {"k1": 0.1}, "here")
+
+
+def test_fisheyes_show_one_circle() -> None:
+    def radii(*each: float | None) -> list[Any]:
+        fisheye = {"camera_model": "OPENCV_FISHEYE"}
+        said = [{} if radius is None else {"fisheye_crop_radius": radius} for radius in each]
+        return [lens_of({}, {"fisheye_crop_radius": 7}, "here")] + [
+            lens_of(fisheye, frame, "here") for frame in said
+        ]
+
+    check_together(radii(9, 9.0), "here")
+    check_together(radii(None, None), "here")
+    for each in ((9, 8), (9, None)):
+        with pytest.raises(InputError, match=r"here gives its fisheyes .*masks"):
+            check_together(radii(*each), "here")

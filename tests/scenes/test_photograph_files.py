@@ -11,10 +11,10 @@ from PIL import Image
 
 from leco_plugin.scenes.input_error import InputError
 from leco_plugin.scenes.photograph_files import (
-    as_it_is_there,
     check_images,
     check_kind,
     decode,
+    find_file,
     header_of,
     is_plain,
     names_what_it_cannot_read,
@@ -110,7 +110,23 @@ def test_names_as_windows_and_instant_ngp_write_them_are_found(tmp_path: Path) -
     (tmp_path / "images").mkdir()
     path = write(tmp_path / "images" / "a.png", "RGB")
     for name in ("images/a.png", "images\\a.png", "images/a", "images\\a"):
-        assert as_it_is_there(tmp_path / name) == path
-        check_images([{"file_path": name}], tmp_path)
+        assert find_file(tmp_path / name) == path
+        check_images([find_file(tmp_path / name)])
     with pytest.raises(InputError, match=r"1 of 1 images.*written by Windows.*backslash"):
-        check_images([{"file_path": "images\\b.png"}], tmp_path)
+        check_images([find_file(tmp_path / "images\\b.png")])
+
+
+def test_a_smaller_picture_that_is_missing_has_a_way_around(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=r"make it, 1/2 of .*--downscale-factor 1"):
+        header_of(tmp_path / "images_2" / "a.png")
+    with pytest.raises(InputError, match=r"flight_2/a\.png is not there: put it there") as caught:
+        header_of(tmp_path / "flight_2" / "a.png")
+    assert "downscale" not in str(caught.value)
+
+
+@pytest.mark.parametrize("start", [b"v/1\x01", b"\0\0\0\x18ftypheic", b"#?RADIANCE\n", b"II*\0"])
+def test_kinds_that_are_not_read_are_to_be_saved_as_others(start: bytes, tmp_path: Path) -> None:
+    path = tmp_path / "a.png"
+    path.write_bytes(start + bytes(100))
+    with pytest.raises(InputError, match=r"a\.png cannot be .*save it as JPEG or PNG with 8 bits"):
+        header_of(path)

@@ -11,7 +11,7 @@ from PIL import Image
 
 from leco_plugin.scenes.derived_images import DerivedImages
 from leco_plugin.scenes.input_error import InputError
-from leco_plugin.scenes.photograph_masks import masks_as_read
+from leco_plugin.scenes.photograph_masks import convert_masks
 
 SEEN = np.zeros((16, 24), dtype=bool)
 SEEN[4:12, 6:18] = True
@@ -55,7 +55,7 @@ WAYS = {
 def read(path: Path, size: tuple[int, int] = (24, 16)) -> np.ndarray:
     """What nerfstudio takes for seen of the file that it is given."""
     derived = DerivedImages(path.parent / "cache")
-    (made,) = masks_as_read([path], [Path("a.jpg")], [size], derived, speak=False)
+    (made,) = convert_masks([path], [Path("a.jpg")], [size], derived, speak=False)
     seen: np.ndarray = get_image_mask_tensor_from_path(made)[..., 0].numpy()
     return seen
 
@@ -82,7 +82,7 @@ def test_a_smaller_mask_is_made_of_the_one_of_full_size(tmp_path: Path) -> None:
     WHITE.save(tmp_path / "masks/of_one/b.jpg.png")
     for name in ("masks_2/b.png", "masks_2/of_one/b.png"):
         derived = DerivedImages(tmp_path / "cache")
-        made = masks_as_read([tmp_path / name], [Path("b.jpg")], [(12, 8)], derived, False)
+        made = convert_masks([tmp_path / name], [Path("b.jpg")], [(12, 8)], derived, False)
         seen = get_image_mask_tensor_from_path(made[0])[..., 0].numpy()
         np.testing.assert_array_equal(seen, SEEN[::2, ::2])
 

@@ -8,6 +8,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import mega_nerf_scene
 import numpy as np
 import pytest
 import torch
@@ -15,14 +16,18 @@ from nerfstudio.cameras.cameras import CameraType
 from nerfstudio.data.dataparsers.blender_dataparser import BlenderDataParserConfig
 from nerfstudio.data.dataparsers.colmap_dataparser import ColmapDataParserConfig
 from nerfstudio.data.dataparsers.instant_ngp_dataparser import InstantNGPDataParserConfig
+from nerfstudio.data.dataparsers.minimal_dataparser import MinimalDataParserConfig
 from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataParserConfig
+from nerfstudio.data.dataparsers.scannetpp_dataparser import ScanNetppDataParserConfig
+from nerfstudio.data.dataparsers.sdfstudio_dataparser import SDFStudioDataParserConfig
 from PIL import Image
 from scipy.spatial.transform import Rotation
 
 from leco_plugin.scenes.input_error import InputError
 from leco_plugin.scenes.known_folders import remedy_for
+from leco_plugin.scenes.mega_nerf import MegaNerfDataParserConfig
 from leco_plugin.scenes.photographs import LecoPhotographsDataParserConfig
-from leco_plugin.scenes.reading import in_one_line
+from leco_plugin.scenes.reading import in_one_line, read_checked
 
 # nerfstudio leaves images open that it has read
 pytestmark = [
@@ -71,19 +76,95 @@ def as_colmap(scene: Path, camera: str = "PINHOLE 32 32 32 32 16 16") -> ColmapD
     return ColmapDataParserConfig(data=scene, colmap_path=Path("sparse/0"))
 
 
+def as_scannetpp(scene: Path) -> ScanNetppDataParserConfig:
+    meta = change(scene, lambda meta: None)
+    folder = scene / "dslr"
+    (folder / "nerfstudio").mkdir(parents=True)
+    (scene / "images").rename(folder / "resized_images")
+    if (scene / "masks").is_dir():
+        (scene / "masks").rename(folder / "resized_anon_masks")
+    for frame in meta["frames"]:
+        for name in {"file_path", "mask_path"} & {*frame}:
+            frame[name] = Path(frame[name]).name
+    meta["test_frames"] = [meta["frames"].pop()]
+    (folder / "nerfstudio/transforms.json").write_text(json.dumps(meta))
+    return ScanNetppDataParserConfig(data=scene)
+
+
+def poses_of(meta: dict[str, Any]) -> np.ndarray:
+    return np.array([frame["transform_matrix"] for frame in meta["frames"]], dtype=np.float32)
+
+
+def as_sdfstudio(scene: Path) -> SDFStudioDataParserConfig:
+    meta = change(scene, lambda meta: None)
+    intrinsics = np.diag([meta["fl_x"], meta["fl_y"], 1.0, 1.0])
+    intrinsics[:2, 2] = meta["cx"], meta["cy"]
+    turned = poses_of(meta) * [1, -1, -1, 1]  # columns: OpenCV's axes
+    frames = [
+        {"rgb_path": frame["file_path"], "camtoworld": pose, "intrinsics": intrinsics.tolist()}
+        for frame, pose in zip(meta["frames"], turned.tolist())
+    ]
+    box = {"aabb": [[-1.0] * 3, [1.0] * 3]}
+    made = {"frames": frames, "scene_box": box, "height": meta["h"], "width": meta["w"]}
+    (scene / "meta_data.json").write_text(json.dumps(made))
+    return SDFStudioDataParserConfig(data=scene)
+
+
+def as_minimal(scene: Path) -> MinimalDataParserConfig:
+    meta = change(scene, lambda meta: None)
+    one = np.ones((len(meta["frames"]), 1), dtype=np.float32)
+    lens = {"fx": "fl_x", "fy": "fl_y", "cx": "cx", "cy": "cy"}
+    cameras = {name: one * meta[field] for name, field in lens.items()}
+    cameras |= {name: (one * 32).astype(int) for name in ("height", "width")}
+    cameras |= {"camera_to_worlds": poses_of(meta), "camera_type": one.astype(int)}
+    files = {"image_filenames": [frame["file_path"] for frame in meta["frames"]]}
+    if "mask_path" in meta["frames"][0]:
+        files["mask_filenames"] = [frame["mask_path"] for frame in meta["frames"]]
+    box = np.array([[-1.0] * 3, [1.0] * 3])
+    np.savez(scene / "train.npz", cameras=np.array(cameras), scene_box=box, **files)
+    return MinimalDataParserConfig(data=scene)
+
+
+def as_mega_nerf(scene: Path) -> MegaNerfDataParserConfig:
+    meta = change(scene, lambda meta: None)
+    mega_nerf_scene.write_coordinates(scene, mega_nerf_scene.COORDINATES)
+    poses = mega_nerf_scene.COORDINATES.to_file(mega_nerf_scene.poses(9))
+    for number, frame in enumerate(meta["frames"]):
+        path, split = scene / frame["file_path"], "val" if number == 4 else "train"
+        lens = (32.0, 32.0, 16.0, 16.0)
+        mega_nerf_scene.write_view(scene, split, path.stem, picture(path), poses[number], lens)
+        shutil.copy(path, scene / split / "rgbs" / path.name)
+        if "mask_path" in frame:
+            with Image.open(scene / frame["mask_path"]) as mask:
+                keep = np.asarray(mask.convert("L")) > 0
+            mega_nerf_scene.write_mask(scene / "seen", path.stem, keep)
+    names = {path.name: path.stem for path in (scene / "images").iterdir()}
+    mega_nerf_scene.write_mappings(scene, names)
+    seen = scene / "seen" if (scene / "seen").is_dir() else None
+    return MegaNerfDataParserConfig(
+        data=scene, masks=seen, train_scale_factor=1, protocol="full", check_axes=False
+    )
+
+
 READERS: dict[str, Callable[[Path], Any]] = {
     "leco-photographs": lambda scene: LecoPhotographsDataParserConfig(data=scene),
     "nerfstudio-data": lambda scene: NerfstudioDataParserConfig(data=scene),
     "instant-ngp-data": lambda scene: InstantNGPDataParserConfig(data=scene),
     "blender-data": as_blender,
+    "scannetpp-data": as_scannetpp,
     "colmap": as_colmap,
+    "sdfstudio-data": as_sdfstudio,
+    "minimal-parser": as_minimal,
+    "mega-nerf": as_mega_nerf,
 }
-OF_A_FILE = ["leco-photographs", "nerfstudio-data", "instant-ngp-data", "blender-data"]
+OF_A_FILE = [*READERS][:5]
+"""Those that read a transforms.json."""
+MASKED = [name for name in READERS if name != "sdfstudio-data"]
 
 
 def read(config: Any, split: str = "train") -> Any:
     """A split as our data manager has it."""
-    return in_one_line(config.setup().get_dataparser_outputs, config)(split)
+    return read_checked(config.setup()).get_dataparser_outputs(split)
 
 
 def picture(path: Path) -> np.ndarray:
@@ -113,7 +194,7 @@ def test_every_reader_names_a_deep_photograph(reader: str, scene: Path) -> None:
     assert "\n" not in str(caught.value)
 
 
-@pytest.mark.parametrize("reader", READERS)
+@pytest.mark.parametrize("reader", MASKED)
 def test_every_reader_reads_masks_or_takes_them_from_the_file(reader: str, scene: Path) -> None:
     (scene / "masks").mkdir()
     for number in range(9):
@@ -207,26 +288,35 @@ def test_a_photograph_is_turned_where_its_intrinsics_are_for_that(scene: Path) -
 
 
 @pytest.mark.parametrize(
-    "error",
+    ("error", "remedy"),
     [
-        AssertionError(),
-        EOFError(),
-        KeyError("w"),
-        SystemExit(1),
-        RuntimeError("two\nlines"),
-        NotImplementedError("FOV camera model is not supported yet!"),
+        (AssertionError(), "mend SCENE/transforms.json"),
+        (EOFError(), "run it on a terminal once, and answer"),
+        (KeyError("w"), "add 'w' to SCENE/transforms.json"),
+        (SystemExit(1), "run it on a terminal once, and answer"),
+        (RuntimeError("two\nlines"), "mend SCENE/transforms.json"),
+        (FileNotFoundError(2, "No", "a.dat"), "put that file there, or remove what names it"),
+        (OSError("a\\b.png"), "its names were written by Windows: write / for each backslash"),
+        (
+            NotImplementedError("FOV camera model is not supported yet!"),
+            "undistort the photographs with `colmap image_undistorter`, and give that model",
+        ),
     ],
 )
-def test_every_error_of_a_reader_is_one_line_with_a_remedy(
-    error: BaseException, scene: Path
+def test_every_error_of_a_reader_is_one_line_with_its_remedy(
+    error: BaseException, remedy: str, scene: Path
 ) -> None:
     def fail(**_: Any) -> Any:
         raise error
 
     config = NerfstudioDataParserConfig(data=scene)
-    with pytest.raises(InputError, match=f"{scene} cannot .* by nerfstudio-data: .+; .+") as caught:
+    with pytest.raises(InputError, match=f"{scene} cannot .* by nerfstudio-data: .+; ") as caught:
         in_one_line(fail, config)("train")
-    assert "\n" not in str(caught.value)
+    line = str(caught.value)
+    assert "\n" not in line and line.endswith(f"; {remedy}".replace("SCENE", str(scene)))
+    (scene / "images" / "002.png").write_bytes(b"")  # a picture that is none is the reason
+    with pytest.raises(InputError, match=r"002\.png cannot be read as an image"):
+        in_one_line(fail, config)("train")
 
 
 def test_a_question_that_nobody_answers_has_its_answer_as_an_option(
@@ -251,7 +341,7 @@ def test_a_lens_that_nerfstudio_lacks_is_to_be_undistorted(scene: Path) -> None:
 def test_a_folder_of_another_reader_names_it(scene: Path, tmp_path: Path) -> None:
     as_colmap(scene)
     (scene / "transforms.json").unlink()
-    command = f"`ns-train METHOD --data {scene} colmap --colmap-path sparse/0` reads it"
+    command = f"`ns-train leco-occupancy --data {scene} colmap --colmap-path sparse/0` reads it"
     with pytest.raises(InputError, match=r"holds no transforms\.json") as caught:
         read(LecoPhotographsDataParserConfig(data=scene))
     assert command in str(caught.value)
@@ -268,8 +358,8 @@ def test_a_folder_of_another_reader_names_it(scene: Path, tmp_path: Path) -> Non
         folder = tmp_path / sign.split(".")[0].replace("/", "-") / "data"
         (folder / sign).parent.mkdir(parents=True)
         (folder / sign).write_text("{}")
-        assert wanted in str(remedy_for(folder, "leco-photographs"))
-    assert remedy_for(tmp_path / "nowhere" / "at" / "all", "colmap .") is None
+        assert wanted in str(remedy_for(folder))
+    assert remedy_for(tmp_path / "nowhere" / "at" / "all") is None
 
 
 @pytest.mark.parametrize("windows", [True, False])
@@ -287,3 +377,206 @@ def test_names_with_backslashes_are_read_or_said(windows: bool, scene: Path) -> 
     else:
         with pytest.raises(InputError, match=r"Windows.*backslash"):
             read(NerfstudioDataParserConfig(data=scene))
+
+
+def rewrite(scene: Path, edit: Edit) -> None:
+    """Changes each transforms.json of a scene, wherever its reader has it."""
+    for path in [*scene.glob("*.json"), *scene.glob("dslr/nerfstudio/*.json")]:
+        meta = json.loads(path.read_text())
+        edit(meta)
+        path.write_text(json.dumps(meta))
+
+
+def set_pose(change_of: Callable[[np.ndarray], object]) -> Edit:
+    def edit(meta: dict[str, Any]) -> None:
+        pose = np.array(meta["frames"][3]["transform_matrix"])
+        change_of(pose)
+        meta["frames"][3]["transform_matrix"] = pose.tolist()
+
+    return edit
+
+
+NO_CAMERAS: dict[str, tuple[Edit, str]] = {
+    "mirrored": (set_pose(lambda pose: pose[:3, 0].__imul__(-1.0)), "003.* is no rotation: remove"),
+    "scaled": (set_pose(lambda pose: pose[:3, :3].__imul__(1.1)), "003.* is no rotation: remove"),
+    "sheared": (set_pose(lambda pose: pose[0, :3].__iadd__(0.2)), "003.* is no rotation: remove"),
+    "not finite": (set_pose(lambda pose: pose[0].fill(np.nan)), "003.* is no finite 4 x 4 matrix"),
+    "no focal length": (lambda meta: meta.update(fl_x=-1.0), "fl_x is '-1.0'.*positive number"),
+    "no size": (lambda meta: meta["frames"][2].update(w=0), "002.*w is '0'.*positive number"),
+    "words": (lambda meta: meta.update(h="high"), "h is 'high'"),
+    "another model": (
+        lambda meta: meta.update(camera_model="FOV"),
+        "camera_model 'FOV' is none of",
+    ),
+    "no distortion": (lambda meta: meta.update(k1=float("inf")), "k1 is 'inf'"),
+    "a shutter": (lambda meta: meta.update(rolling_shutter=[0, 0, 1, 0]), "rolling_shutter"),
+}
+
+
+@pytest.mark.parametrize("fault", NO_CAMERAS)
+@pytest.mark.parametrize("reader", OF_A_FILE)
+def test_every_reader_of_a_file_refuses_what_no_camera_has(
+    reader: str, fault: str, scene: Path
+) -> None:
+    edit, message = NO_CAMERAS[fault]
+    config = READERS[reader](scene)
+    rewrite(scene, edit)
+    with pytest.raises(InputError, match=rf"transforms.*\.json.*{message}") as caught:
+        read(config)
+    assert "\n" not in str(caught.value)
+
+
+def test_readers_of_other_files_refuse_what_no_camera_has(scene: Path, tmp_path: Path) -> None:
+    config = as_colmap(Path(shutil.copytree(scene, tmp_path / "focal")), "PINHOLE 32 32 0 32 16 16")
+    with pytest.raises(InputError, match=r"the camera of .*png has fx 0, which no camera has"):
+        read(config)
+    config = as_colmap(Path(shutil.copytree(scene, tmp_path / "long")))
+    path = config.data / "sparse/0/images.txt"
+    number, *turn = path.read_text().split(" ")
+    path.write_text(" ".join([number, *(str(2 * float(part)) for part in turn[:4]), *turn[4:]]))
+    with pytest.raises(InputError, match=r"the pose of .*png is no rotation"):
+        read(config, "val")
+    set_scaled = set_pose(lambda pose: pose[:3, :3].__imul__(1.1))
+    change(scene, set_scaled)
+    with pytest.raises(InputError, match=r"the pose of .*003\.png is no rotation"):
+        read(as_sdfstudio(scene))
+
+
+@pytest.mark.parametrize("reader", OF_A_FILE)
+def test_a_byte_order_mark_null_and_poses_of_three_rows_are_read(reader: str, scene: Path) -> None:
+    config = READERS[reader](Path(shutil.copytree(scene, scene.with_name("as-it-was"))))
+    expected = read(config).cameras.camera_to_worlds
+    config = READERS[reader](scene)
+
+    def edit(meta: dict[str, Any]) -> None:
+        for frame in meta["frames"]:
+            frame |= {"mask_path": None, "transform_matrix": frame["transform_matrix"][:3]}
+
+    rewrite(scene, edit)
+    for path in [*scene.glob("*.json"), *scene.glob("dslr/nerfstudio/*.json")]:
+        path.write_bytes(b"\xef\xbb\xbf" + path.read_bytes())
+    outputs = read(config)
+    assert torch.equal(outputs.cameras.camera_to_worlds, expected)
+    assert outputs.mask_filenames is None
+
+
+def test_a_field_of_view_of_a_frame_goes_with_the_size_of_its_picture(scene: Path) -> None:
+    config = as_blender(scene)
+
+    def edit(meta: dict[str, Any]) -> None:
+        for name in ("w", "h", "fl_x", "fl_y", "cx", "cy"):
+            del meta[name]
+        meta["frames"][1] |= {"camera_angle_x": np.pi / 2}
+        meta["frames"][2] |= {"y_fov": 60.0, "x_fov": 90.0}
+
+    path = scene / "transforms_train.json"
+    meta = json.loads(path.read_text())
+    edit(meta)
+    path.write_text(json.dumps(meta))
+    cameras = read(config).cameras
+    assert cameras.fx[:3, 0].tolist() == pytest.approx([32.0, 16.0, 16.0])
+    assert cameras.fy[:3, 0].tolist() == pytest.approx([32.0, 16.0, 16.0 * 3**0.5])
+
+
+@pytest.mark.filterwarnings("ignore:Starting with ImageIO:DeprecationWarning")
+@pytest.mark.parametrize("of_scene", [True, False])
+def test_instant_ngp_has_the_size_of_each_frame(of_scene: bool, scene: Path) -> None:
+    small = scene / "images" / "001.png"
+    with Image.open(small) as image:
+        image.resize((16, 16)).save(small)
+
+    def edit(meta: dict[str, Any]) -> None:
+        whole = {name: meta.pop(name) for name in ("w", "h", "fl_x", "fl_y")}
+        del meta["cx"], meta["cy"]
+        meta |= whole if of_scene else {"camera_angle_x": 0.9}
+        for number, frame in enumerate(meta["frames"]):
+            frame |= {name: value / (1 + (number == 1)) for name, value in whole.items()}
+
+    change(scene, edit)
+    cameras = read(InstantNGPDataParserConfig(data=scene)).cameras
+    for name in ("fx", "fy", "width", "height"):
+        assert getattr(cameras, name)[:3, 0].tolist() == [32, 16, 32]
+    assert cameras.cx[:3, 0].tolist() == cameras.cy[:3, 0].tolist() == [16, 8, 16]
+
+
+@pytest.mark.parametrize("reader", ["leco-photographs", "nerfstudio-data", "colmap"])
+def test_transparency_is_the_same_in_all_splits(reader: str, scene: Path) -> None:
+    config = READERS[reader](scene)
+    held_out = {path.name for path in read(config, "val").image_filenames}
+    for name in held_out:
+        with Image.open(scene / "images" / name) as image:
+            image.convert("RGBA").save(scene / "images" / name)
+    parser = read_checked(config.setup())
+    parser.get_dataparser_outputs("train")
+    with pytest.raises(InputError, match=r"of the split val has transparency.*of train has none"):
+        parser.get_dataparser_outputs("val")
+
+
+def test_a_circle_of_a_frame_is_read(scene: Path) -> None:
+    def edit(meta: dict[str, Any]) -> None:
+        for number, frame in enumerate(meta["frames"]):
+            if number % 2:
+                frame |= {"camera_model": "OPENCV_FISHEYE", "fisheye_crop_radius": 9}
+
+    change(scene, edit)
+    for reader in ("leco-photographs", "instant-ngp-data"):
+        assert read(READERS[reader](scene)).cameras.metadata["fisheye_crop_radius"] == 9.0
+
+
+@pytest.mark.parametrize(
+    ("typed", "wanted"),
+    [
+        ("ns-train leco-ngp --data X", "`ns-train leco-ngp --data SCENE colmap --colmap-path"),
+        ("ns-train --help", "`ns-train leco-occupancy --data SCENE colmap --colmap-path"),
+        ("python", "`ns-train leco-occupancy --data SCENE colmap --colmap-path"),
+        (
+            "leco swap nerfacto --codes own -- --data X",
+            "`leco swap nerfacto --codes own -- --data SCENE colmap --colmap-path",
+        ),
+        ("leco capacity --data X", "`ns-process-data images --data SCENE/images --output-dir"),
+        ("ns-eval --load-config X", "`ns-process-data images --data SCENE/images --output-dir"),
+    ],
+)
+def test_a_remedy_is_a_command_of_the_one_that_was_typed(
+    typed: str, wanted: str, scene: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    as_colmap(scene)
+    (scene / "transforms.json").unlink()
+    program, *arguments = typed.split()
+    monkeypatch.setattr("sys.argv", [f"/somewhere/bin/{program}", *arguments])
+    for config in (LecoPhotographsDataParserConfig, NerfstudioDataParserConfig):
+        with pytest.raises(InputError, match=r"holds no transforms\.json; ") as caught:
+            read(config(data=scene))
+        assert wanted.replace("SCENE", str(scene)) in str(caught.value)
+
+
+def test_pictures_of_colmap_elsewhere_are_named(scene: Path) -> None:
+    as_colmap(scene)
+    (scene / "transforms.json").unlink()
+    (scene / "images").rename(scene / "input")
+    assert "colmap --colmap-path sparse/0 --images-path input` reads" in str(remedy_for(scene))
+
+
+def test_a_split_without_its_file_is_to_have_a_copy(scene: Path) -> None:
+    config = as_blender(scene)
+    (scene / "transforms.json").unlink()
+    with pytest.raises(InputError, match=r"no transforms_val.json; .*copy of transforms_train"):
+        read(config, "val")
+
+
+def test_photographs_as_they_are_stored_have_a_way_to_be_turned(
+    scene: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    exif = Image.Exif()
+    exif[0x0112] = 6
+    with Image.open(scene / "images" / "001.png") as image:
+        image.save(scene / "images" / "001.png", exif=exif)
+    read(LecoPhotographsDataParserConfig(data=scene))
+    said = " ".join(capsys.readouterr().out.split())
+    assert "1 photographs are used as they are stored" in said and "mogrify -auto-orient" in said
+
+
+def test_a_smaller_picture_that_is_not_there_is_named_by_readers(scene: Path) -> None:
+    for kind in (LecoPhotographsDataParserConfig, NerfstudioDataParserConfig):
+        with pytest.raises(InputError, match=r"images_2/.*png is not there.*--downscale-factor 1"):
+            read(kind(data=scene, downscale_factor=2))

@@ -176,7 +176,7 @@ class HeldOutPixelSampler(PixelSampler):
             sizes: as of `shown`, or [P, 2] of all pictures.
             numbers: as of `shown`.
         Raises:
-            InputError: it shows next to none.
+            InputError: it shows none of those that were drawn.
         """
         pixels = draw(count)
         for _ in range(TRIES):
@@ -185,6 +185,10 @@ class HeldOutPixelSampler(PixelSampler):
             if not bool(hidden.any()):
                 return pixels
             pixels[hidden] = draw(int(hidden.sum()))
+        others = pixels[~hidden]
+        if len(others):  # of a small circle a few are left over by chance: take some that it shows
+            pixels[hidden] = others[torch.randint(len(others), (int(hidden.sum()),))]
+            return pixels
         radius = self.config.fisheye_crop_radius if self.radii is None else float(self.radii.min())
         raise InputError(
             f"a fisheye_crop_radius of {radius} pixels shows next to "

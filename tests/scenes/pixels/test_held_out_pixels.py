@@ -6,6 +6,7 @@ import pytest
 import torch
 
 from leco_plugin.scenes.input_error import InputError
+from leco_plugin.scenes.pixels import held_out_pixels
 from leco_plugin.scenes.pixels.held_out_pixels import (
     HeldOutPixelSampler,
     HeldOutPixelSamplerConfig,
@@ -209,3 +210,15 @@ def test_a_circle_that_shows_nothing_is_one_line() -> None:
         InputError, match=r"a fisheye_crop_radius of 0\.5 pixels shows next to nothing"
     ):
         made.sample(images())
+
+
+def test_a_small_circle_fills_a_batch_however_its_pixels_fall(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(held_out_pixels, "TRIES", 1)
+    made = sampler(fisheye_crop_radius=6.0)
+    made.set_num_rays_per_batch(600)
+    torch.manual_seed(0)
+    trained = made.sample(images())["image"].long()
+    assert len(trained) == 600
+    assert bool(inside_circle(trained, torch.tensor([40.0, 39.0]), 6.5).all())

@@ -1,0 +1,220 @@
+"""A transforms.json, read and checked in one way for every reader of one."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from nerfstudio.cameras.cameras import Cameras
+
+from leco_plugin.scenes.input_error import InputError, one_line
+from leco_plugin.scenes.known_folders import command_with, remedy_for
+from leco_plugin.scenes.lenses import ANGLES, PINHOLE_FIELDS, Lens, check_together, lens_of
+from leco_plugin.scenes.photograph_files import find_file
+from leco_plugin.scenes.photograph_masks import check_masked
+from leco_plugin.scenes.rotations import check_poses
+
+FRAMES = ("frames", "test_frames")
+"""Lists of frames; the second is ScanNet++'s."""
+
+
+@dataclass(frozen=True)
+class SceneFile:
+    """What a transforms.json says."""
+
+    path: Path
+    meta: dict[str, Any]
+    frames: list[dict[str, Any]]
+    """All of them, those for tests included."""
+    lenses: list[Lens]
+    """Of each frame."""
+    folder: Path
+    """To which names of pictures are relative."""
+
+    def pictures(self) -> list[Path]:
+        """The file of each frame, where there is one."""
+        return [find_file(self.folder / frame["file_path"]) for frame in self.frames]
+
+
+def load_json(path: Path) -> Any:
+    """What a JSON file says, with or without a byte order mark.
+
+    What is null in a frame is left out, and a pose of three rows has the fourth.
+    """
+    said = _parsed(path.read_bytes())
+    if not isinstance(said, dict):
+        return said
+    lists = {name: said[name] for name in FRAMES if isinstance(said.get(name), list)}
+    return said | {name: [_completed(frame) for frame in lists[name]] for name in lists}
+
+
+@lru_cache(maxsize=1)
+def _parsed(content: bytes) -> Any:
+    """Parsed once for a reader and for the checks of it."""
+    return json.loads(content.decode("utf-8-sig"))
+
+
+def _completed(frame: Any) -> Any:
+    if not isinstance(frame, dict):
+        return frame
+    frame = {name: value for name, value in frame.items() if value is not None}
+    pose = frame.get("transform_matrix")
+    if isinstance(pose, list) and len(pose) == 3:
+        frame["transform_matrix"] = [*pose, [0.0, 0.0, 0.0, 1.0]]
+    return frame
+
+
+def read_scene_file(path: Path, split: str, folder: Path) -> SceneFile:
+    """A transforms.json with poses and lenses that cameras have.
+
+    Args:
+        split: that is read; only the cameras of training need more places than one.
+        folder: to which names of pictures are relative.
+    Raises:
+        InputError: one line.
+    """
+    try:
+        meta = load_json(path)
+        frames = [frame for name in FRAMES for frame in meta.get(name, [])]
+        meta["frames"]
+        names = [frame["file_path"] for frame in frames]
+        if not all(type(name) is str and all(ord(c) >= 32 for c in name) for name in names):
+            raise ValueError("a file_path is no path")
+        poses = np.array([frame["transform_matrix"] for frame in frames], dtype=float)
+    except (
+        OSError,
+        ValueError,
+        KeyError,
+        TypeError,
+        AttributeError,
+        OverflowError,
+        RecursionError,
+    ) as error:
+        reason = f"{type(error).__name__}: {one_line(error, 120)}"
+        raise InputError(
+            f"{path} is not a scene in nerfstudio's format ({reason}); mend it, or make it "
+            "anew with ns-process-data"
+        ) from None
+    if len(frames) == 0:
+        raise InputError(
+            f"{path} has no cameras: its list of frames is empty; make it anew with ns-process-data"
+        )
+    check_poses(poses, [f"{path}: the transform_matrix of {name}" for name in names])
+    if split == "train" and np.ptp(poses[:, :3, 3], axis=0).max() == 0.0:
+        number = "one image" if len(frames) == 1 else f"{len(frames)} images from one place"
+        raise InputError(f"{path} has {number}; a scene is seen from two places at least")
+    lenses = [lens_of(meta, frame, f"{path}: {frame['file_path']}") for frame in frames]
+    check_together(lenses, str(path))
+    check_masked(frames, path.parent)
+    return SceneFile(path, meta, frames, lenses, folder)
+
+
+def own_target(config: Any) -> Any:
+    """The class of a config's reader, also where that has been replaced by a function."""
+    return config._target if isinstance(config._target, type) else type(config)()._target
+
+
+def description_of(config: Any, split: str) -> Path | None:
+    """Where a reader's transforms.json is; None of one that reads something else."""
+    from nerfstudio.data.dataparsers.blender_dataparser import Blender
+    from nerfstudio.data.dataparsers.dnerf_dataparser import DNeRF
+    from nerfstudio.data.dataparsers.instant_ngp_dataparser import InstantNGP
+    from nerfstudio.data.dataparsers.nerfstudio_dataparser import Nerfstudio
+    from nerfstudio.data.dataparsers.scannetpp_dataparser import ScanNetpp
+
+    data = Path(config.data)
+    target = own_target(config)
+    if issubclass(target, Nerfstudio | InstantNGP):
+        return data if data.suffix == ".json" else data / "transforms.json"
+    if issubclass(target, ScanNetpp):
+        return data / Path(config.transforms_path)
+    return data / f"transforms_{split}.json" if issubclass(target, Blender | DNeRF) else None
+
+
+def scene_file_of(config: Any, split: str) -> SceneFile | None:
+    """The transforms.json that a reader is about to read, checked; None where it reads others.
+
+    Raises:
+        InputError: one line; it is not there, or nerfstudio would fail at it or read it wrongly.
+    """
+    data, file = Path(config.data), description_of(config, split)
+    if file is None:
+        return None
+    if not data.exists():
+        raise InputError(
+            f"there is no folder {data}: put it, or a link, there, or give another with --data"
+        )
+    if not file.exists():
+        beside = sorted(file.parent.glob("transforms_*.json"))
+        instead = remedy_for(data) or (
+            "give a folder with one, or make one from photographs with ns-process-data"
+        )
+        if file.name != "transforms.json" and beside:
+            instead = f"give that split one, as a copy of {beside[0].name}"
+        raise InputError(f"{data} holds no {file.relative_to(data)}; {instead}")
+    scene = read_scene_file(file, split, data / getattr(config, "images_dir", file.parent))
+    if hasattr(config, "downscale_factor"):  # nerfstudio's own format has all of these
+        for frame in scene.frames:
+            for name in (each for each in PINHOLE_FIELDS if each not in scene.meta | frame):
+                raise InputError(f"{file}: {frame['file_path']} has no {name}{_add(scene, data)}")
+    return scene
+
+
+def _add(scene: SceneFile, data: Path) -> str:
+    """What to do about an intrinsic that a file lacks."""
+    if not any(angle in scene.meta for angle in ANGLES):
+        return ": add it"
+    command = command_with("instant-ngp-data", data)
+    formula = "write fl_x = w / (2 tan(camera_angle_x / 2)), and so on"
+    return f"; {formula}" if command is None else f"; `{command}` reads fields of view instead"
+
+
+def frames_of(images: list[Path], scene: SceneFile) -> list[int | None]:
+    """The number of the frame of each picture, which may be a smaller one of the same name.
+
+    Raises:
+        InputError: one line; several frames of different folders would have one smaller picture.
+    """
+    places = [str(frame["file_path"]).replace("\\", "/") for frame in scene.frames]
+    named: dict[str, list[int]] = {}
+    for number, place in enumerate(places):
+        named.setdefault(place.rsplit("/", 1)[-1], []).append(number)
+    found: list[int | None] = []
+    for image in images:
+        numbers = named.get(image.name) or named.get(image.stem) or []
+        paths = [scene.folder / places[number] for number in numbers]
+        ends = [
+            number
+            for number, path in zip(numbers, paths)
+            if image in (path, path.with_name(f"{path.name}{image.suffix}"))
+        ]
+        others = sorted({places[number] for number in numbers})
+        if not ends and len(others) > 1:
+            raise InputError(
+                f"{image} would be the picture of {' and of '.join(others[:2])}: "
+                "give them names of their own"
+            )
+        found.append(next(iter(ends or numbers), None))
+    return found
+
+
+def factors_of(
+    scene: SceneFile, numbers: list[int | None], config: Any, cameras: Cameras
+) -> list[int]:
+    """By which whole number a reader has made each camera smaller than its lens says.
+
+    nerfstudio's own has one factor for the scene; that of Blender's scenes takes the size of the
+    first picture for all, and the others take the pictures as they are.
+    """
+    known = [(row, number) for row, number in enumerate(numbers) if number is not None]
+    if not known or not (hasattr(config, "downscale_factor") or hasattr(config, "alpha_color")):
+        return [1] * len(numbers)
+    row, number = known[0]
+    full = scene.meta.get("w") if hasattr(config, "downscale_factor") else None
+    full = scene.lenses[number].width if full is None else full
+    factor = 1 if full is None else max(1, round(float(full) / int(cameras.width[row])))
+    return [factor] * len(numbers)
