@@ -6,6 +6,7 @@ northings to half a metre. The shift is part of `dataparser_transform`, which is
 
 from __future__ import annotations
 
+from dataclasses import fields
 from pathlib import Path
 from types import FunctionType
 from typing import Any
@@ -57,9 +58,8 @@ class ExactOutputs(DataparserOutputs):
 
 def with_transform(outputs: DataparserOutputs, transform: Tensor) -> DataparserOutputs:
     """The outputs with a `dataparser_transform` [3, 4] that stays float64."""
-    outputs.dataparser_transform = transform.double()
-    outputs.__class__ = ExactOutputs
-    return outputs
+    values = {each.name: getattr(outputs, each.name) for each in fields(outputs)}
+    return ExactOutputs(**values | {"dataparser_transform": transform.double()})
 
 
 class ReadsNear(DataParser):
@@ -147,15 +147,15 @@ class ReadsNear(DataParser):
         return points - self._in_the_data()
 
 
-def shift_large_coordinates(parser: Any) -> None:
-    """Puts `ReadsNear` before the reader that a parser's class takes its poses from, if it can."""
-    kind = type(parser)
-    for owner in kind.__mro__ if not isinstance(parser, ReadsNear) else ():
+def near_bases(kind: type[DataParser]) -> tuple[type[DataParser], ...]:
+    """Bases of a class like this one, with `ReadsNear` before the reader that it takes its poses
+    from; the class itself where that is not known."""
+    for owner in kind.__mro__ if not issubclass(kind, ReadsNear) else ():
         read = vars(owner).get("_generate_dataparser_outputs")
         if SEAMS & {*getattr(getattr(read, "__code__", None), "co_names", ())}:
             near = type(owner.__name__, (ReadsNear, owner), {})
-            parser.__class__ = near if owner is kind else type(kind.__name__, (kind, near), {})
-            return
+            return (near,) if owner is kind else (kind, near)
+    return (kind,)
 
 
 def rounded_by(datamanager: Any) -> str | None:

@@ -24,7 +24,7 @@ from leco_plugin.scenes.frames import applied_in, from_file, moved, parsed_frame
 from leco_plugin.scenes.input_error import InputError, one_line
 from leco_plugin.scenes.large_coordinates import ReadsNear
 from leco_plugin.scenes.photograph_files import check_images, find_file
-from leco_plugin.scenes.reading import read_checked
+from leco_plugin.scenes.reading import CheckedReader
 from leco_plugin.scenes.scene_file import load_json, scene_file_of
 
 POINTS = "leco_sparse_points"
@@ -41,14 +41,10 @@ class LecoPhotographsDataParserConfig(NerfstudioDataParserConfig):
     """target class to instantiate"""
 
 
-class LecoPhotographs(ReadsNear, Nerfstudio):
+class LecoPhotographs(CheckedReader, ReadsNear, Nerfstudio):
     """Reads transforms.json and its images."""
 
     config: LecoPhotographsDataParserConfig
-
-    def __init__(self, config: LecoPhotographsDataParserConfig) -> None:
-        super().__init__(config)
-        read_checked(self)  # in whatever data manager
 
     def _generate_dataparser_outputs(
         self, split: str = "train", **kwargs: Any

@@ -6,8 +6,8 @@ what is read wrongly is looked for in what they return.
 
 from __future__ import annotations
 
+import functools
 from collections import Counter
-from collections.abc import Callable
 from contextlib import nullcontext
 from dataclasses import replace
 from functools import partial
@@ -16,7 +16,11 @@ from typing import Any
 
 import torch
 from nerfstudio.cameras.cameras import Cameras
-from nerfstudio.data.dataparsers.base_dataparser import DataParserConfig, DataparserOutputs
+from nerfstudio.data.dataparsers.base_dataparser import (
+    DataParser,
+    DataParserConfig,
+    DataparserOutputs,
+)
 from PIL import UnidentifiedImageError
 from rich.markup import escape
 
@@ -24,7 +28,7 @@ from leco_plugin.log import bar, say
 from leco_plugin.scenes.derived_images import DerivedImages
 from leco_plugin.scenes.input_error import InputError, one_line
 from leco_plugin.scenes.known_folders import READERS, command_with, has_model, remedy_for
-from leco_plugin.scenes.large_coordinates import shift_large_coordinates
+from leco_plugin.scenes.large_coordinates import near_bases
 from leco_plugin.scenes.lenses import Lens, set_lenses
 from leco_plugin.scenes.photograph_files import (
     SAVE_ANEW,
@@ -52,42 +56,30 @@ SAVE_ALIKE = "save all with an alpha channel or none"
 UNWRITABLE = "make the folder of the scene writable, or convert its pictures and masks by hand"
 
 
-def read_checked(parser: Any) -> Any:
-    """The reader with its outputs checked, large positions shifted, and each error in one line."""
-    if "get_dataparser_outputs" not in vars(parser):  # it is not yet
-        shift_large_coordinates(parser)
-        parser.get_dataparser_outputs = in_one_line(parser.get_dataparser_outputs, parser.config)
-    return parser
+class CheckedReader(DataParser):
+    """Stands before a reader among the bases of a class: its outputs are checked, and each of its
+    errors is one line."""
 
+    def __init__(self, config: DataParserConfig) -> None:
+        super().__init__(config)
+        self._first: dict[bool, tuple[Path, str]] = {}
+        """The first picture with transparency and the first without, each with its split."""
 
-def set_up_checked(config: Any, **options: Any) -> Any:
-    """What a config of `with_checks` sets up: its own reader, as of `read_checked`."""
-    return read_checked(own_target(config)(config, **options))
+    def get_dataparser_outputs(self, split: str = "train", **options: Any) -> DataparserOutputs:
+        """As the reader's.
 
-
-def with_checks(config: DataParserConfig) -> DataParserConfig:
-    """The config of a reader that will be checked in whatever data manager."""
-    return replace(config, _target=set_up_checked)  # type: ignore[arg-type]
-
-
-def in_one_line(read: Callable[..., DataparserOutputs], config: Any) -> Callable[..., Any]:
-    """A reader of splits whose outputs are checked, and each of whose errors is one line.
-
-    Args:
-        read: its `get_dataparser_outputs`.
-        config: of the reader.
-    """
-
-    first: dict[bool, tuple[Path, str]] = {}
-
-    def outputs_of(split: str = "train", **options: Any) -> DataparserOutputs:
+        Raises:
+            InputError: one line.
+        """
+        config: Any = self.config
         require_data(Path(config.data))
         scene = scene_file_of(config, split)
         try:
-            outputs = checked(read(split=split, **options), config, split, scene)
+            read = super().get_dataparser_outputs(split=split, **options)
+            outputs = checked(read, config, split, scene)
             if outputs.image_filenames and outputs.alpha_color is None:
                 path = Path(outputs.image_filenames[0])
-                first[header_of(path).transparent] = path, split
+                self._first[header_of(path).transparent] = path, split
         except InputError:
             raise
         # nerfstudio's readers assert, ask and exit
@@ -99,14 +91,37 @@ def in_one_line(read: Callable[..., DataparserOutputs], config: Any) -> Callable
                 f"{data} cannot be read as a scene by {reader_name(config)}: "
                 f"{_reason(error)}; {_remedy(error, config)}"
             ) from error
-        if len(first) == 2:
+        if len(self._first) == 2:
             raise InputError(
-                f"{first[True][0]} of the split {first[True][1]} has transparency, and "
-                f"{first[False][0]} of {first[False][1]} has none: {SAVE_ALIKE}"
+                f"{self._first[True][0]} of the split {self._first[True][1]} has transparency, and "
+                f"{self._first[False][0]} of {self._first[False][1]} has none: {SAVE_ALIKE}"
             )
         return outputs
 
-    return outputs_of
+
+@functools.cache
+def checked_class(kind: type[DataParser]) -> type[DataParser]:
+    """A subclass of a reader that is checked, and shifts large positions where it can."""
+    if issubclass(kind, CheckedReader):
+        return kind
+    return type(kind.__name__, (CheckedReader, *near_bases(kind)), {"__module__": kind.__module__})
+
+
+def read_checked(parser: Any) -> Any:
+    """A reader like this one that is checked."""
+    of: Any = type(parser)
+    kind = checked_class(of)
+    return parser if isinstance(parser, kind) else kind(parser.config)
+
+
+def set_up_checked(config: Any, **options: Any) -> Any:
+    """What a config of `with_checks` sets up: its own reader, checked."""
+    return checked_class(own_target(config))(config, **options)
+
+
+def with_checks(config: DataParserConfig) -> DataParserConfig:
+    """The config of a reader that will be checked in whatever data manager."""
+    return replace(config, _target=set_up_checked)  # type: ignore[arg-type]
 
 
 def reader_name(config: Any) -> str:

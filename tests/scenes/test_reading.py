@@ -17,7 +17,7 @@ from nerfstudio.data.dataparsers.blender_dataparser import BlenderDataParserConf
 from nerfstudio.data.dataparsers.colmap_dataparser import ColmapDataParserConfig
 from nerfstudio.data.dataparsers.instant_ngp_dataparser import InstantNGPDataParserConfig
 from nerfstudio.data.dataparsers.minimal_dataparser import MinimalDataParserConfig
-from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataParserConfig
+from nerfstudio.data.dataparsers.nerfstudio_dataparser import Nerfstudio, NerfstudioDataParserConfig
 from nerfstudio.data.dataparsers.scannetpp_dataparser import ScanNetppDataParserConfig
 from nerfstudio.data.dataparsers.sdfstudio_dataparser import SDFStudioDataParserConfig
 from PIL import Image
@@ -27,7 +27,7 @@ from leco_plugin.scenes.input_error import InputError
 from leco_plugin.scenes.known_folders import remedy_for
 from leco_plugin.scenes.mega_nerf import MegaNerfDataParserConfig
 from leco_plugin.scenes.photographs import LecoPhotographsDataParserConfig
-from leco_plugin.scenes.reading import in_one_line, read_checked
+from leco_plugin.scenes.reading import read_checked
 
 # nerfstudio leaves images open that it has read
 pytestmark = [
@@ -306,17 +306,18 @@ def test_a_photograph_is_turned_where_its_intrinsics_are_for_that(scene: Path) -
 def test_every_error_of_a_reader_is_one_line_with_its_remedy(
     error: BaseException, remedy: str, scene: Path
 ) -> None:
-    def fail(**_: Any) -> Any:
-        raise error
+    class Failing(Nerfstudio):
+        def _generate_dataparser_outputs(self, *_: Any, **__: Any) -> Any:
+            raise error
 
-    config = NerfstudioDataParserConfig(data=scene)
+    parser = read_checked(Failing(NerfstudioDataParserConfig(data=scene)))
     with pytest.raises(InputError, match=f"{scene} cannot .* by nerfstudio-data: .+; ") as caught:
-        in_one_line(fail, config)("train")
+        parser.get_dataparser_outputs("train")
     line = str(caught.value)
     assert "\n" not in line and line.endswith(f"; {remedy}".replace("SCENE", str(scene)))
     (scene / "images" / "002.png").write_bytes(b"")  # a picture that is none is the reason
     with pytest.raises(InputError, match=r"002\.png cannot be read as an image"):
-        in_one_line(fail, config)("train")
+        parser.get_dataparser_outputs("train")
 
 
 def test_a_question_that_nobody_answers_has_its_answer_as_an_option(
