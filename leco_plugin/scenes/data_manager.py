@@ -29,7 +29,7 @@ from leco_plugin.scenes.detail import CAMERAS
 from leco_plugin.scenes.input_error import InputError
 from leco_plugin.scenes.photograph_files import names_what_it_cannot_read
 from leco_plugin.scenes.pixels.held_out_pixels import HeldOutPixelSampler
-from leco_plugin.scenes.pixels.lattice import PERIODS, Lattice, lattice_for
+from leco_plugin.scenes.pixels.lattice import Lattice, lattice_for
 from leco_plugin.scenes.pixels.stored_pictures import picture_sizes, store_pictures
 from leco_plugin.scenes.reading import read_checked
 from leco_plugin.scenes.survey import points_in
@@ -58,10 +58,6 @@ class LecoDataManagerConfig(VanillaDataManagerConfig):
     held_out_period: int | None = None
     """Of so many pixels in both directions one is never trained on, and calibrates the occupancy.
     None is what gives as many of them as are wanted: 11, in small scenes down to 5."""
-
-    def __setstate__(self, state: dict[str, Any]) -> None:
-        """Called by yaml: a run that was begun before there was a choice stays as it is."""
-        self.__dict__.update({"upright": False, "held_out_period": PERIODS[0]} | state)
 
 
 class LecoDataManager(VanillaDataManager):  # type: ignore[type-arg]
