@@ -31,7 +31,7 @@ from leco_plugin.compat.whole_checkpoints import (
 )
 from leco_plugin.models.compute.ranks import say, say_what_is_logged
 from leco_plugin.models.failures import GateCollapsed, TrainingStopped
-from leco_plugin.samplers.kernels.off import VARIABLE, kernels_off
+from leco_plugin.samplers.kernels import VARIABLE, kernels_off
 from leco_plugin.scenes.input_error import InputError
 
 SECONDS_BETWEEN_SAVES = 60.0

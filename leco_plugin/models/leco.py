@@ -52,8 +52,8 @@ from leco_plugin.models.sizing.scene_sizes import complete
 from leco_plugin.models.sizing.sizes import Sizes
 from leco_plugin.models.sizing.stored_sizes import SIZES, stored_in, to_store
 from leco_plugin.occupancy import Occupancy, gate_precision
+from leco_plugin.samplers import marching
 from leco_plugin.samplers.estimator import LearnedOccupancyEstimator
-from leco_plugin.samplers.marching import march
 from leco_plugin.scenes.bounds import SceneBounds, with_range
 from leco_plugin.scenes.pixels.known_distances import DISTANCE
 from leco_plugin.space import Space
@@ -241,12 +241,10 @@ class LecoModel(Model):
     def intervals_of(self, rays: Rays, guided: bool, learning: bool) -> Intervals:
         """Candidates along the rays; guided, only those that the occupancy keeps."""
         size, angle = self.step_and_angle(learning)
-        jitter = torch.rand_like(rays.t_mins) if self.training else None
-        along = rays.origins, rays.directions, rays.t_mins, rays.t_maxs
-        if guided:
-            samples = self.estimator().kept(*along, size, angle, jitter, t_enters=None)
-        else:
-            samples = march(*along, step_size=size, cone_angle=angle, jitter=jitter)
+        along, rule = marching.Rays(*rays[:4]), marching.March(size, angle)
+        if self.training:
+            along = along.shifted(torch.rand_like(rays.t_mins) * size)
+        samples = self.estimator().march(along, rule) if guided else marching.march(along, rule)
         intervals = Intervals(*samples)
         # a homogeneous gate is taught nothing about emptiness
         followed = self.ramped > 0.0 and not is_dense(self.progress, self.step)

@@ -12,7 +12,7 @@ from nerfstudio.model_components.renderers import RGBRenderer
 from torch import Tensor, nn
 
 from leco_plugin.models.rendering import Rays, Shaded
-from leco_plugin.samplers.marching.rays import intersect_box
+from leco_plugin.samplers.boxes import intersect_box
 from leco_plugin.scenes.survey import covering_rays
 from leco_plugin.space import Space, SpaceKind
 

@@ -14,7 +14,7 @@ from torch import Tensor, nn
 
 from leco_plugin.models.compute.grouped_trial import grouped_product, serves
 from leco_plugin.models.compute.rows import permute_rows
-from leco_plugin.samplers.kernels.off import kernels_off
+from leco_plugin.samplers.kernels import kernels_off
 
 
 class Layered(Protocol):

@@ -10,7 +10,7 @@ from torch import Tensor
 from leco_plugin.models.gate import occupancy_from_logits
 from leco_plugin.models.losses import expert_shares
 from leco_plugin.models.rendering import Intervals, Rays, Shaded, backdrop_of
-from leco_plugin.samplers.marching.edges import candidate_counts
+from leco_plugin.samplers.edges import candidate_counts
 
 KEPT_ABOVE = 0.1
 """o(x) from which a sample counts as kept before there is a calibrated threshold."""
