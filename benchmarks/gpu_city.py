@@ -11,7 +11,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from leco_plugin.samplers.marching.rays import intersect_box
+from leco_plugin.samplers.boxes import intersect_box
 from leco_plugin.scenes.city.capture import CaptureConfig, View, views_of
 from leco_plugin.scenes.city.city import City, CityConfig
 from leco_plugin.scenes.city.texture import paint_surface

@@ -4,7 +4,7 @@
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import checkout  # noqa: F401
 import torch
@@ -13,9 +13,9 @@ from gpu_scale import Scale
 from sampling_scene import rays_into
 
 from leco_plugin.samplers.cells.cache import CellCache
+from leco_plugin.samplers.edges import candidate_edges
 from leco_plugin.samplers.estimator import LearnedOccupancyEstimator
-from leco_plugin.samplers.marching import Candidates, Samples, number
-from leco_plugin.samplers.marching.edges import candidate_edges
+from leco_plugin.samplers.marching import Candidates, March, Rays, Samples, number
 
 STEPS = 32
 """Candidates of a stretch, as in `march_kernel.py`, which is not imported where Triton is not."""
@@ -42,9 +42,9 @@ class Counting(LearnedOccupancyEstimator):
 
     candidates: Candidates
 
-    def kept(self, *rays: Any) -> Samples:
-        self.candidates = number(*rays)
-        return super().kept(*rays)
+    def march(self, rays: Rays, rule: March) -> Samples:
+        self.candidates = number(rays, rule)
+        return super().march(rays, rule)
 
 
 def counted(scale: Scale) -> Counted:
@@ -67,7 +67,7 @@ def stretches(cache: CellCache, candidates: Candidates) -> tuple[int, int, int]:
         window = window.of_rays((window.counts > 0).nonzero()[:, 0])
         begun += len(window.counts)
         starts, ends = (
-            candidate_edges(window.t_mins, steps, window.step_size, window.cone_angle)
+            candidate_edges(window.t_mins, steps, *window.rule)
             for steps in (window.first, window.first + window.counts)
         )
         origins, directions = window.coordinates

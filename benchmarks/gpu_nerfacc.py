@@ -12,9 +12,10 @@ import signal
 import subprocess
 import sys
 from collections.abc import Callable
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from leco_plugin.samplers.grid import OccupancyGridEstimator
+if TYPE_CHECKING:
+    from leco_plugin.samplers.grid import OccupancyGridEstimator
 
 BUILD = "from nerfacc.cuda._backend import _C; raise SystemExit(_C is None)"
 BUILD_SECONDS = 30.0
@@ -36,7 +37,7 @@ def nerfacc_grid(ours: OccupancyGridEstimator, sample: Callable[[Any], Any]) -> 
         if ours.device.type == "cuda" and (trouble := trouble_with_kernels()):
             raise RuntimeError(trouble)  # CUDA only
         nerfacc_cpu.install()
-        box, resolution = ours.aabbs[0].cpu(), ours.sizes[0]
+        box, resolution = ours.aabbs[0].cpu(), int(ours.resolution[0])
         grid = nerfacc.OccGridEstimator(box, resolution=resolution, levels=ours.levels)
         grid = grid.to(ours.device).eval()
         grid.binaries.copy_(ours.binaries)

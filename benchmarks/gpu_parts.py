@@ -88,7 +88,7 @@ def correctness(scale: Scale, before: dict[str, Any]) -> dict[str, Any]:
 
 def gate_answers(occupancy: Occupancy, device: torch.device) -> bool:
     """Whether the fused gate answers for an occupancy; if not, figures are those of its twin."""
-    return fused.decisions(occupancy, torch.zeros(1, 3, device=device)) is not None
+    return fused.decide(occupancy, torch.zeros(1, 3, device=device)) is not None
 
 
 def decisions_differ(occupancy: Occupancy, scale: Scale) -> dict[str, float]:

@@ -8,7 +8,7 @@ values, down to the one at which as many candidates of the rays are kept as the 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import torch
 from gpu_floor import seconds
@@ -18,11 +18,14 @@ from sampling_scene import fit_occupancy, rays_into
 from torch import Tensor
 
 from leco_plugin.occupancy import Occupancy
-from leco_plugin.samplers.estimator import LearnedOccupancyEstimator, cell_centers
-from leco_plugin.samplers.grid import OccupancyGridEstimator
+from leco_plugin.samplers.boxes import cell_centers
+from leco_plugin.samplers.estimator import LearnedOccupancyEstimator
 from leco_plugin.samplers.kernels import fused
-from leco_plugin.samplers.marching import number
+from leco_plugin.samplers.marching import March, Rays
 from leco_plugin.space import Space
+
+if TYPE_CHECKING:
+    from leco_plugin.samplers.grid import OccupancyGridEstimator
 
 POINTS, AT_ONCE, HALVINGS = 4, 1 << 20, 12
 """Points of a cell at which the gate is asked, how many at once, and how often the value from which
@@ -68,8 +71,7 @@ def march_answers(learned: LearnedOccupancyEstimator) -> bool:
     points = torch.zeros(1, 3, device=learned.device), torch.ones(1, 3, device=learned.device)
     limits = torch.zeros(1, device=learned.device), torch.ones(1, device=learned.device)
     occupancy, cache = learned.occupancy, learned.cache
-    rays = *points, *limits
-    return fused.march(occupancy, cache, learned.device, lambda: number(*rays, 0.5)) is not None
+    return fused.march(occupancy, cache, Rays(*points, *limits), March(0.5)) is not None
 
 
 def scenes(scale: Scale) -> Iterator[tuple[int, Occupancy, dict[str, Any]]]:
@@ -93,7 +95,15 @@ def grids(
     wanted: int,
     scale: Scale,
 ) -> Iterator[tuple[str, Any]]:
-    """Our torch grid and nerfacc's where its kernels run, marked so that they keep as much."""
+    """Our torch grid and nerfacc's where its kernels run, marked so that they keep as much.
+
+    Ours has nerfacc's cells: where nerfacc is not installed there is neither.
+    """
+    try:
+        from leco_plugin.samplers.grid import OccupancyGridEstimator
+    except ImportError as error:
+        print(f"no comparison with grids: {error}")
+        return
     space = occupancy.space
     box = torch.cat([space.center - space.half_extent, space.center + space.half_extent]).cpu()
     ours = OccupancyGridEstimator(box, resolution=scale.grid, levels=levels).to(scale.device)

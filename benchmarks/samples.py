@@ -28,7 +28,7 @@ from leco_plugin.evaluation.json_file import read_object, write_json
 from leco_plugin.evaluation.machine import describe_code, describe_machine, made_by
 from leco_plugin.models.leco import LecoModel
 from leco_plugin.samplers.estimator import LearnedOccupancyEstimator
-from leco_plugin.samplers.marching import march
+from leco_plugin.samplers.marching import March, Rays, march
 from leco_plugin.shrink.sources import find_source
 from leco_plugin.studio.host_models import true_colours
 
@@ -88,12 +88,12 @@ def along_rays(model: LecoModel, bundles: Sequence[Any]) -> dict[str, float]:
         flat, at_once = bundle.flatten(), model.config.eval_num_rays_per_chunk
         for first in range(0, len(flat), at_once):
             rays = model.rays_of(flat[first : first + at_once])
-            along = rays.origins, rays.directions, rays.t_mins, rays.t_maxs
+            along, rule = Rays(*rays[:4]), March(size, angle)
             total += len(rays.origins)
-            sums["candidates"] += len(march(*along, step_size=size, cone_angle=angle)[0])
+            sums["candidates"] += len(march(along, rule)[0])
             estimator = model.estimator()
             with asked_along(estimator) as count, counted(model) as queries:
-                kept = estimator.kept(*along, size, angle, None, None)
+                kept = estimator.march(along, rule)
             sums["kept"] += len(kept[0])
             sums["gate"] += queries.gate
             for name, asked in count.items():

@@ -28,9 +28,9 @@ LARGEST_FILE = 64 * 2**20
 BACKDROP_PRICE = "backdrop_price_db"
 """In a report: what the image loses when rays do not end in a backdrop, dB."""
 NEEDS_A_BACKDROP = 1.0
-"""dB from which hosts of a bounded scene are given one. What shines through surfaces that brief
-learning has not made opaque is worth up to 0.6 dB, and a host that is given a backdrop for that
-loses more; 2.4% of sky is worth 11 dB. A sky that is worth less than this stays black in hosts."""
+"""dB from which hosts of a bounded scene are given a backdrop. What shines through surfaces that
+brief learning has not made opaque is worth up to 0.6 dB, and a host that is given a backdrop for
+that loses more; 2.4% of sky is worth 11 dB."""
 
 CALIBRATED_AT = "calibrated_threshold"
 """In a report: the threshold that its figures are of, where a host has lowered it since."""
@@ -42,14 +42,13 @@ class Occupancy(nn.Module):
     """Where a scene is occupied: o(x) = 1 - G_0(x), and whether o(x) reaches the threshold.
 
     Attributes:
-        gate: the gating network, shared with who gave it and left as it is: whoever freezes it says
-            so. That of a file is frozen.
+        gate: the gating network, shared and not frozen by this class. That of a file is frozen.
         space: scene positions to the gate's cube.
         precision: the type of matrix products it was trained and calibrated in; queries keep to it,
             because the same weights decide otherwise in another one (DESIGN, section 3).
         report: what was measured when it was calibrated, JSON values only.
-        walls: [6] min and max corner of the box in which the gate was taught; what lies outside was
-            never on a ray, the gate knows nothing of it, and it is empty. None is no walls.
+        walls: [6] min and max corner of the box in which the gate was taught. No ray reached what
+            lies outside: it is empty. None is no walls.
     """
 
     threshold_value: Tensor
@@ -79,7 +78,7 @@ class Occupancy(nn.Module):
         return float(self.threshold_value)
 
     def with_threshold(self, threshold: float) -> Occupancy:
-        """One that shares all of this but its threshold; the report stays as it is.
+        """An occupancy with another threshold that shares everything else, the report too.
 
         Raises:
             ValueError: it is not in [0, 1].
@@ -90,8 +89,8 @@ class Occupancy(nn.Module):
         return Occupancy(*given).to(self.walls.device).train(self.training)
 
     def shows_a_backdrop(self) -> bool:
-        """Whether pictures show something behind all that the gate was taught about: distance or a
-        sky, in an unbounded scene always, in a bounded one where calibration found it."""
+        """Whether pictures show a sky or distance behind what the gate was taught about: always in
+        an unbounded scene, in a bounded one where calibration found it."""
         price = self.report.get(BACKDROP_PRICE)
         found = isinstance(price, float) and NEEDS_A_BACKDROP < price < float("inf")
         return self.space.kind == "contraction" or found
@@ -109,13 +108,12 @@ class Occupancy(nn.Module):
             ValueError: positions are of another shape.
         """
         _check_shape(positions)
-        # one coordinate after the other: on a CPU rows of three numbers take five times as long
+        # by coordinate: on a CPU rows of three numbers take five times as long
         columns = torch.stack(positions.to(self.space.center.dtype).unbind(-1))
         mapped = self.space.map(columns.T)
         low, high = self.walls.view(2, 3, 1)
         beyond_walls = torch.maximum(columns - high, low - columns).amax(dim=0)
-        # one comparison of distances, to 0 or 1: on a CPU any other costs more than they do; of NaN
-        # it is 0
+        # 0 or 1 from one comparison of distances, the cheapest on a CPU; of NaN it is 0
         inside = torch.maximum(mapped.T.abs().amax(dim=0) - 1.0, beyond_walls).le_(0.0)
         mapped = mapped.clamp_(-1.0, 1.0).nan_to_num_()
         if mapped.device.type == "cpu":
@@ -131,7 +129,7 @@ class Occupancy(nn.Module):
         On CUDA by the fused kernel where it runs, which may differ close to the threshold.
         """
         _check_shape(positions)
-        decided = fused.decisions(self, positions)
+        decided = fused.decide(self, positions)
         return self.query(positions) >= self.threshold_value if decided is None else decided
 
     @property
@@ -142,12 +140,12 @@ class Occupancy(nn.Module):
     def save(self, path: str | Path) -> None:
         """Writes the file whole or not at all.
 
-        Tensors of the gate whose values bfloat16 holds exactly are stored in it, so that a gate
-        that was rounded to it (`leco shrink`) takes half the bytes and nothing changes in any.
+        Tensors of the gate whose values bfloat16 holds exactly are stored in it: a gate that was
+        rounded to it (`leco shrink`) takes half the bytes.
 
         Raises:
             OSError: the folder cannot be written to, or the disk is full.
-            ValueError: this is nothing that `load` would take; no file is written.
+            ValueError: `load` would refuse this occupancy; no file is written.
         """
         path = Path(path)
         header = {
@@ -158,7 +156,7 @@ class Occupancy(nn.Module):
             "report": json.dumps(self.report),
         }
         state = self.state_dict()
-        tensors = {name: _packed(name, value) for name, value in state.items()}
+        tensors = {name: _shorten(name, value) for name, value in state.items()}
         _check_values(path, tensors)
         header["sha256"] = _digest(header, tensors)
         unfinished = path.with_name(f".{path.name}.{os.getpid()}.unfinished")
@@ -239,11 +237,7 @@ def _check_shape(positions: Tensor) -> None:
 
 
 def _check_values(path: Path, tensors: dict[str, Tensor]) -> None:
-    """Whether the numbers of an occupancy can be decided with.
-
-    Raises:
-        ValueError: one line, with the path of the file.
-    """
+    """Refuse numbers that decide nothing, in one line with the path of the file."""
     for name, tensor in tensors.items():
         if tensor.is_floating_point() and not bool(tensor.isfinite().all()):
             raise ValueError(f"{path}: tensor {name} holds values that are not finite")
@@ -266,7 +260,7 @@ _UNREADABLE = (
     TypeError,
     ValueError,
 )
-"""What json and torch raise when they meet nonsense."""
+"""Errors of json and torch on a damaged header."""
 
 
 def _line(error: BaseException) -> str:
@@ -275,7 +269,7 @@ def _line(error: BaseException) -> str:
 
 
 def _digest(header: dict[str, str], tensors: dict[str, Tensor]) -> str:
-    """SHA-256 of everything in a file: a flipped bit would else be a gate that decides wrongly."""
+    """SHA-256 of everything in a file: a gate with a flipped bit would decide wrongly."""
     digest = hashlib.sha256()
     for name in sorted(header.keys() - {"sha256"}):
         digest.update(json.dumps([name, header[name]]).encode())
@@ -288,11 +282,11 @@ def _digest(header: dict[str, str], tensors: dict[str, Tensor]) -> str:
 
 _Described = tuple[tuple[int, ...], torch.dtype]
 OF_GATE = "gate."
-"""How the names of the gate's tensors begin."""
+"""Prefix of the names of the gate's tensors."""
 
 
-def _packed(name: str, value: Tensor) -> Tensor:
-    """A tensor as it is stored: of the gate's, those that lose nothing by it in bfloat16."""
+def _shorten(name: str, value: Tensor) -> Tensor:
+    """A tensor as it is stored: one of the gate's in bfloat16 where that loses nothing."""
     value = value.detach().cpu().contiguous()
     if name.startswith(OF_GATE) and value.dtype == torch.float32:
         short = value.bfloat16()
@@ -302,7 +296,7 @@ def _packed(name: str, value: Tensor) -> Tensor:
 
 
 def _fits(name: str, wanted: _Described | None, found: _Described | None) -> bool:
-    """Whether a stored tensor is the one that is wanted."""
+    """Whether a stored tensor has the shape and type that are wanted."""
     if wanted is None or found is None or not name.startswith(OF_GATE):
         return wanted == found
     return wanted[0] == found[0] and found[1] in (wanted[1], torch.bfloat16)

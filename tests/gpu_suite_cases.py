@@ -28,7 +28,7 @@ from leco_plugin.occupancy import Occupancy
 from leco_plugin.samplers import nerfacc_cpu
 from leco_plugin.samplers.estimator import LearnedOccupancyEstimator
 from leco_plugin.samplers.kernels import fused
-from leco_plugin.samplers.marching import march, number
+from leco_plugin.samplers.marching import March, Rays, march, number
 
 CPU = torch.device("cpu")
 DRY = Scale(CPU).dry()
@@ -246,35 +246,42 @@ def test_the_driver_is_what_its_tool_says(monkeypatch) -> None:
 
 def test_a_wrong_gate_ends_the_run(monkeypatch) -> None:
     def wrong(occupancy: object, positions: torch.Tensor) -> torch.Tensor | None:
-        return None if fused._switch.off else torch.ones(len(positions), dtype=torch.bool)
+        return None if fused._off else torch.ones(len(positions), dtype=torch.bool)
 
-    monkeypatch.setattr(fused, "decisions", wrong)
+    monkeypatch.setattr(fused, "decide", wrong)
     with pytest.raises(gpu_parts.Disagreement, match="the fused gate is wrong"):
         gpu_parts.correctness(DRY, {})
 
 
 def test_a_wrong_march_ends_the_run(monkeypatch) -> None:
     def wrong(*_: object) -> tuple[torch.Tensor, ...] | None:
-        return None if fused._switch.off else (torch.tensor([0]), torch.zeros(1), torch.ones(1))
+        return None if fused._off else (torch.tensor([0]), torch.zeros(1), torch.ones(1))
 
     monkeypatch.setattr(fused, "march", wrong)
     with pytest.raises(gpu_parts.Disagreement, match="the fused march is wrong"):
         gpu_parts.correctness(DRY, {})
 
 
-def test_without_nerfacc_the_torch_grid_is_compared(monkeypatch, capsys) -> None:
-    monkeypatch.setitem(sys.modules, "nerfacc", None)
-    figures = gpu_sampling.sampling(DRY, {})["figures"]
-    assert "no comparison with nerfacc" in capsys.readouterr().out
-    assert not any("nerfacc" in figure["name"] for figure in figures)
+@pytest.mark.parametrize(
+    ("missing", "named", "compared"),
+    [("nerfacc", "nerfacc", "torch grid"), ("leco_plugin.samplers.grid", "grids", None)],
+)
+def test_without_nerfacc_what_is_left_is_compared(
+    missing: str, named: str, compared: str | None, monkeypatch, capsys
+) -> None:
+    monkeypatch.setitem(sys.modules, missing, None)
+    names = [figure["name"] for figure in gpu_sampling.sampling(DRY, {})["figures"]]
+    assert f"no comparison with {named}" in capsys.readouterr().out
+    assert not any("nerfacc" in name for name in names)
+    assert any("torch grid" in name for name in names) == (compared is not None)
 
 
 def test_a_gate_that_no_kernel_takes_is_said_to_be_answered_by_torch(monkeypatch) -> None:
     def decided(occupancy: Occupancy, positions: torch.Tensor) -> torch.Tensor | None:
-        fits = occupancy.gate.config.width <= 128 and not fused._switch.off
+        fits = occupancy.gate.config.width <= 128 and not fused._off
         return occupancy.query(positions) >= occupancy.threshold_value if fits else None
 
-    monkeypatch.setattr(fused, "decisions", decided)
+    monkeypatch.setattr(fused, "decide", decided)
     running = gpu_parts.gate_throughput(DRY, {})["running"]
     assert running == {"small gate": True, "large gate": True, "paper gate": False}
 
@@ -309,8 +316,9 @@ def test_stretches_are_those_in_which_the_twin_leaves_candidates_open(cone_angle
     cache = LearnedOccupancyEstimator(occupancy, tolerance=1.0).cache
     assert cache is not None
     origins, directions = rays_into(occupancy.space, 20)
-    rays = origins, directions, torch.zeros(20), torch.linspace(0.0, 4.0, 20)
-    ray_indices, t_starts, t_ends = march(*rays, step_size=0.02, cone_angle=cone_angle)
+    rays = Rays(origins, directions, torch.zeros(20), torch.linspace(0.0, 4.0, 20))
+    rule = March(0.02, cone_angle)
+    ray_indices, t_starts, t_ends = march(rays, rule)
     middles = ((t_starts + t_ends) * 0.5)[:, None]
     _, left_open = cache.decide(origins[ray_indices] + directions[ray_indices] * middles)
     before = (
@@ -321,7 +329,7 @@ def test_stretches_are_those_in_which_the_twin_leaves_candidates_open(cone_angle
     )
     numbers = torch.arange(len(ray_indices)) - before[ray_indices]
     stretches = ray_indices * 1000 + numbers.div(gpu_counts.STEPS, rounding_mode="floor")
-    begun, near, asked = gpu_counts.stretches(cache, number(*rays, 0.02, cone_angle))
+    begun, near, asked = gpu_counts.stretches(cache, number(rays, rule))
     assert begun == len(stretches.unique()) >= near >= asked > 0
     assert asked == len(stretches[left_open].unique())
 

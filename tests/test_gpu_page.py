@@ -11,7 +11,7 @@ import pytest
 import tyro
 from nerfstudio.configs.base_config import MachineConfig
 
-from leco_plugin.samplers.kernels.off import NAMES, VARIABLE
+from leco_plugin.samplers.kernels import NAMES, VARIABLE
 
 ROOT = Path(__file__).resolve().parent.parent
 PAGE = (ROOT / "docs" / "gpu.md").read_text()
@@ -68,7 +68,7 @@ def test_kernels_that_can_be_turned_off_are_named() -> None:
         ("samplers/kernels/fused.py", "no fused gate: "),
         ("samplers/kernels/fused.py", "the fused {} does not run, torch answers in its place: "),
         ("samplers/kernels/fused.py", "compute capability {} is below 8.0"),
-        ("samplers/kernels/trials.py", "it decides otherwise about {} of {} positions"),
+        ("samplers/kernels/fused.py", "it decides otherwise about {} of {} positions"),
         ("samplers/kernels/gate_weights.py", "the kernel holds "),
         ("samplers/estimator.py", "no cell cache, sampling will be slower: "),
         ("models/compute/grouped_trial.py", "no grouped products, "),

@@ -19,7 +19,7 @@ from leco_plugin.evaluation.inspection import ViewBox
 from leco_plugin.models.leco import LecoModel
 from leco_plugin.models.rendering import gate_values_and_routes
 from leco_plugin.occupancy import gate_precision
-from leco_plugin.samplers.grid import cells_of
+from leco_plugin.samplers.boxes import cells_of
 
 FEWEST_PROBES, PROBES_ALONG = 8, 2048
 """Densities asked in each cell, at random places; the largest is the cell's score. More in coarse

@@ -18,7 +18,7 @@ from leco_plugin.log import say
 from leco_plugin.models.leco_config import LecoModelConfig
 from leco_plugin.models.sizing.sizes import SMALL, learning_only
 from leco_plugin.occupancy import Occupancy
-from leco_plugin.samplers.marching.rays import intersect_box
+from leco_plugin.samplers.boxes import intersect_box
 from leco_plugin.samplers.registry import check_gate
 from leco_plugin.scenes.frames import between, found_again, frame_of, moved, turned
 from leco_plugin.scenes.input_error import InputError

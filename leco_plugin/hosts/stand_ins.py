@@ -18,8 +18,8 @@ from torch import Tensor, nn
 from leco_plugin.models.region import within_crop
 from leco_plugin.models.rendering import Intervals, Rays, with_backdrop
 from leco_plugin.samplers.base import DensityFn, Estimator
-from leco_plugin.samplers.estimator import cell_centers
-from leco_plugin.samplers.marching.rays import intersect_box, usable_rays
+from leco_plugin.samplers.boxes import cell_centers, intersect_box
+from leco_plugin.samplers.rays import usable_rays
 from leco_plugin.samplers.registry import build_estimator, build_proposal
 from leco_plugin.scenes.frames import box_around, inverse, moved, turned
 

@@ -58,8 +58,8 @@ def price(
         "calibration_rays": len(truth),
         "near": float(region.near),
         "far": float(region.far),
-        "step_size": march.step,
-        "cone_angle": march.cone,
+        "step_size": march.step_size,
+        "cone_angle": march.cone_angle,
         "aabb": region.aabb.tolist(),
     }
 

@@ -13,7 +13,7 @@ from leco_plugin.evaluation.metrics import image_metrics
 from leco_plugin.models.gate import EMPTY, occupancy_from_logits
 from leco_plugin.models.losses import expert_shares
 from leco_plugin.models.rendering import MET, Intervals, Rays, Shaded, backdrop_of, sum_up
-from leco_plugin.samplers.marching.edges import candidate_counts
+from leco_plugin.samplers.edges import candidate_counts
 from leco_plugin.samplers.packed import accumulate_along_rays
 
 NONE = -1

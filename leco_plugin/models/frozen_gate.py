@@ -15,11 +15,12 @@ from typing import NamedTuple, cast
 from weakref import WeakKeyDictionary
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from leco_plugin.models.compute.dispatch import filled_size
 from leco_plugin.models.encodings import Encoding, FrequencyEncoding
 from leco_plugin.models.gate import EMPTY, Gate
+from leco_plugin.samplers.changes import Snapshot
 
 LARGEST_LOGIT = 80.0
 """Sums of exponentials of up to this stay finite; o is 1 in float32 long before."""
@@ -35,10 +36,8 @@ LayerFn = Callable[[Tensor, Tensor, Tensor], Tensor]
 class FrozenGate(NamedTuple):
     """A gate's weights as they are asked."""
 
-    sources: tuple[Tensor, ...]
-    """What they were made from; held, so that nothing else comes to lie at the same address."""
-    state: tuple[tuple[int, int], ...]
-    """Address and version of each source."""
+    snapshot: Snapshot
+    """What they were made from."""
     layers: list[tuple[Tensor, Tensor]]
     """Weight and bias of each hidden layer, in the type of the products."""
     head: Tensor
@@ -122,13 +121,10 @@ _found: WeakKeyDictionary[Gate, dict[torch.dtype, FrozenGate]] = WeakKeyDictiona
 
 def frozen_gate(gate: Gate, dtype: torch.dtype) -> FrozenGate:
     """The weights of a gate as they are now, made anew only where one has changed."""
-    modules = [*gate.hidden, gate.norm, gate.head]
-    sources = tuple(cast(Tensor, v) for module in modules for v in (module.weight, module.bias))
-    state = tuple((value.data_ptr(), _version(value)) for value in sources)
     found = _found.setdefault(gate, {})
-    if dtype not in found or found[dtype].state != state:
-        values = [value.to(dtype) for value in sources[: 2 * len(gate.hidden)]]
-        hidden = list(zip(values[::2], values[1::2], strict=True))
+    if dtype not in found or not found[dtype].snapshot.matches(gate):
+        hidden = [cast(nn.Linear, layer) for layer in gate.hidden]
+        layers = [(layer.weight.to(dtype), layer.bias.to(dtype)) for layer in hidden]
         weight = gate.head.weight.float()
         constant = weight @ gate.norm.bias.float() + gate.head.bias.float()
         head = _above_empty(weight * gate.norm.weight.float())
@@ -138,18 +134,14 @@ def frozen_gate(gate: Gate, dtype: torch.dtype) -> FrozenGate:
             head = torch.cat([head * length, torch.full_like(head[:1], 1.0 / length)])
         else:
             head = head / math.sqrt(gate.norm.eps)
-        held = tuple(value.detach() for value in sources)
-        found[dtype] = FrozenGate(held, state, hidden, head, _above_empty(constant[:, None]))
+        shift = _above_empty(constant[:, None])
+        found[dtype] = FrozenGate(Snapshot(gate), layers, head, shift)
     return found[dtype]
 
 
 def _above_empty(rows: Tensor) -> Tensor:
     """What a row of each expert [1 + n, ...] has more than that of emptiness, [n, ...]."""
     return rows[EMPTY + 1 :] - rows[EMPTY]
-
-
-def _version(value: Tensor) -> int:
-    return 0 if value.is_inference() else value._version
 
 
 @functools.cache

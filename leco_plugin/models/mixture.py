@@ -27,19 +27,10 @@ from leco_plugin.models.rendering import (
 from leco_plugin.models.sizing.sizes import Sizes
 from leco_plugin.models.sizing.stored_sizes import SIZES, stored_in, to_store
 from leco_plugin.occupancy import Occupancy, Precision, gate_precision
+from leco_plugin.samplers import marching
 from leco_plugin.samplers.estimator import LearnedOccupancyEstimator
-from leco_plugin.samplers.marching import march
 from leco_plugin.scenes.bounds import SceneBounds
 from leco_plugin.scenes.input_error import InputError
-
-
-class March(NamedTuple):
-    """The steps of a march."""
-
-    step: float
-    """Smallest step, scene units."""
-    cone: float
-    """Step over distance, where that is larger."""
 
 
 class Following(NamedTuple):
@@ -114,9 +105,9 @@ class Mixture(nn.Module):
             rule = marching_rule(bounds.kind, bounds.near, bounds.far, candidates, median_length)
             self.steps[number], self.cones[number] = rule
 
-    def march(self, coarse: bool = False) -> March:
+    def march(self, coarse: bool = False) -> marching.March:
         """The fine march of renderings, or the coarse one of learning."""
-        return March(float(self.steps[int(coarse)]), float(self.cones[int(coarse)]))
+        return marching.March(float(self.steps[int(coarse)]), float(self.cones[int(coarse)]))
 
     def rays(
         self,
@@ -137,17 +128,19 @@ class Mixture(nn.Module):
             coarse: whether to take the march of learning.
             jitter: [R] in [0, 1), by which share of a step each ray's march is shifted.
         """
-        step, cone = self.march(coarse)
-        along = rays.origins, rays.directions, rays.t_mins, rays.t_maxs
-        return Intervals(*march(*along, step_size=step, cone_angle=cone, jitter=jitter))
+        return Intervals(*marching.march(*self._along(rays, coarse, jitter)))
 
     def kept(self, rays: Rays, coarse: bool = False, jitter: Tensor | None = None) -> Intervals:
         """Those candidates that the frozen gate keeps; all where it skips nothing."""
         if not self.skips:
             return self.candidates(rays, coarse, jitter)
-        along = rays.origins, rays.directions, rays.t_mins, rays.t_maxs
-        march = self.march(coarse)
-        return Intervals(*self.estimator().kept(*along, *march, jitter, t_enters=None))
+        return Intervals(*self.estimator().march(*self._along(rays, coarse, jitter)))
+
+    def _along(
+        self, rays: Rays, coarse: bool, jitter: Tensor | None
+    ) -> tuple[marching.Rays, marching.March]:
+        along, rule = marching.Rays(*rays[:4]), self.march(coarse)
+        return along if jitter is None else along.shifted(jitter * rule.step_size), rule
 
     @torch.no_grad()
     def follow(self, rays: Rays, intervals: Intervals, following: Following) -> Intervals:

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor, nn
 
 from leco_plugin.models.rendering import Rays
-from leco_plugin.samplers.marching.rays import intersect_box
+from leco_plugin.samplers.boxes import intersect_box
 from leco_plugin.scenes.bounds import SceneBounds
 from leco_plugin.space import Space, SpaceKind
 

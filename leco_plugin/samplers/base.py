@@ -1,22 +1,22 @@
 """The interface that a packed host asks: two verbs, `sampling` and `update_every_n_steps`.
 
 Argument for argument that of nerfacc's `OccGridEstimator`, so that any estimator here can stand
-where a host has one. It is a plain `nn.Module` and no subclass of nerfacc's `AbstractEstimator`:
-neither nerfacc nor nerfstudio asks for that type, and a class whose ancestors depend on what is
-installed would differ between the machine that trains and the one that loads.
+where a host has one. It is a plain `nn.Module`: neither nerfacc nor nerfstudio asks for another
+type.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import torch
 from torch import Tensor, nn
 
-from leco_plugin.samplers.marching import NearFn, OccupiedFn, Samples, march, plan
-from leco_plugin.samplers.marching.rays import check_rays, intersect_box
-from leco_plugin.samplers.marching.visibility import SampleFn, front_to_back, prune
+from leco_plugin.samplers.boxes import checked_box, intersect_box
+from leco_plugin.samplers.marching import NearFn, OccupiedFn, Samples, march
+from leco_plugin.samplers.rays import March, Rays, check_rays, plan
+from leco_plugin.samplers.visibility import SampleFn, front_to_back, prune
 
 DensityFn = Callable[[Tensor], Tensor]
 """Positions [N, 3] to densities [N] or [N, 1]."""
@@ -33,8 +33,8 @@ class Estimator(nn.Module):
 
     _place: Tensor
 
-    def __init__(self) -> None:
-        super().__init__()
+    def __init__(self, *args: Any) -> None:
+        super().__init__(*args)
         self.register_buffer("_place", torch.empty(0), persistent=False)
         self.density_fn: DensityFn | None = None
         self.chunk_size: int | None = None
@@ -69,6 +69,10 @@ class Estimator(nn.Module):
     def update_every_n_steps(self, *args: Any, **kwargs: Any) -> None:
         """Called by hosts before each training step."""
         raise NotImplementedError
+
+    def march(self, rays: Rays, rule: March) -> Samples:
+        """The candidates along rays that are occupied, whether or not they can be seen."""
+        return march(rays, rule, *self.questions(), chunk_size=self.chunk_size)
 
     @torch.no_grad()
     def sampling(
@@ -109,50 +113,22 @@ class Estimator(nn.Module):
             ValueError: rays do not fit each other or this estimator's device, or have no end.
             TypeError: rays or their limits are no tensors.
         """
-        given = {"rays_o": rays_o, "rays_d": rays_d, "t_min": t_min, "t_max": t_max}
-        for name, value in given.items():
-            if not (isinstance(value, Tensor) or (value is None and name.startswith("t_"))):
-                raise TypeError(f"{name} must be a tensor, got {type(value).__name__}")
-        for name, rays in (("rays_o", rays_o), ("rays_d", rays_d)):
-            if rays.dim() != 2 or rays.shape[-1] != 3:
-                raise ValueError(f"{name} must be [n_rays, 3], got {list(rays.shape)}")
-        if rays_o.device != self.device:
-            raise ValueError(f"rays are on {rays_o.device}, the estimator on {self.device}")
-        t_mins = torch.full_like(rays_o[..., 0], near_plane)
-        t_maxs = torch.full_like(rays_o[..., 0], far_plane)
-        for name, limit in (("t_min", t_min), ("t_max", t_max)):
-            if limit is not None and limit.shape != t_mins.shape:
-                raise ValueError(f"{name} must be {list(t_mins.shape)}, got {list(limit.shape)}")
-            if limit is not None and limit.device != self.device:
-                raise ValueError(f"{name} is on {limit.device}, the estimator on {self.device}")
-        t_mins = t_mins if t_min is None else t_mins.maximum(t_min.to(t_mins))
-        t_maxs = t_maxs if t_max is None else t_maxs.minimum(t_max.to(t_maxs))
-        check_rays(rays_o, rays_d, t_mins, t_maxs)
-        jitter = torch.rand_like(t_mins) if stratified else None
-        t_enters = None
-        bounds = self.bounds()
-        if bounds is not None:
-            t_enters, t_leaves = intersect_box(rays_o, rays_d, bounds.to(rays_o))
-            t_maxs = t_maxs.minimum(t_leaves)
-
+        rays = self._rays(rays_o, rays_d, (near_plane, far_plane), (t_min, t_max))
+        rule = March(render_step_size, cone_angle)
+        if stratified:
+            rays = rays.shifted(torch.rand_like(rays.t_mins) * render_step_size)
         asked = sigma_fn is not None or alpha_fn is not None
         if self.density_fn is not None and not (self.training or asked) and early_stop_eps > 0.0:
-            occupied, near_occupied = self.questions()
-            candidates, _, longest = plan(
-                rays_o, rays_d, t_mins, t_maxs, render_step_size, cone_angle, jitter, t_enters
-            )
+            candidates, _, longest = plan(rays, rule)
             return front_to_back(
                 candidates,
                 longest,
-                occupied=occupied,
-                near_occupied=near_occupied,
+                *self.questions(),
                 sigma_fn=densities_of_samples(self.density_fn, rays_o, rays_d),
                 early_stop_eps=early_stop_eps,
                 chunk_size=self.chunk_size,
             )
-        samples = self.kept(
-            rays_o, rays_d, t_mins, t_maxs, render_step_size, cone_angle, jitter, t_enters
-        )
+        samples = self.march(rays, rule)
         if not asked or (early_stop_eps <= 0.0 and alpha_thre <= 0.0):
             return samples
         return prune(
@@ -165,32 +141,37 @@ class Estimator(nn.Module):
             alpha_cap=self.alpha_cap,
         )
 
-    def kept(
+    def _rays(
         self,
         rays_o: Tensor,
         rays_d: Tensor,
-        t_mins: Tensor,
-        t_maxs: Tensor,
-        step_size: float,
-        cone_angle: float,
-        jitter: Tensor | None,
-        t_enters: Tensor | None,
-    ) -> Samples:
-        """Candidates that this estimator's questions leave; arguments as for `march`."""
-        occupied, near_occupied = self.questions()
-        return march(
-            rays_o,
-            rays_d,
-            t_mins,
-            t_maxs,
-            step_size=step_size,
-            cone_angle=cone_angle,
-            jitter=jitter,
-            occupied=occupied,
-            near_occupied=near_occupied,
-            t_enters=t_enters,
-            chunk_size=self.chunk_size,
-        )
+        planes: tuple[float, float],
+        limits: tuple[Tensor | None, Tensor | None],
+    ) -> Rays:
+        """The rays between the narrower of planes and limits, cut to the bounds."""
+        given = {"rays_o": rays_o, "rays_d": rays_d, "t_min": limits[0], "t_max": limits[1]}
+        for name, value in given.items():
+            if not (isinstance(value, Tensor) or (value is None and name.startswith("t_"))):
+                raise TypeError(f"{name} must be a tensor, got {type(value).__name__}")
+        if rays_o.dim() != 2 or rays_o.shape[-1] != 3:
+            raise ValueError(f"rays_o must be [n_rays, 3], got {list(rays_o.shape)}")
+        if rays_o.device != self.device:
+            raise ValueError(f"rays are on {rays_o.device}, the estimator on {self.device}")
+        t_mins, t_maxs = (torch.full_like(rays_o[:, 0], plane) for plane in planes)
+        for name, limit in (("t_min", limits[0]), ("t_max", limits[1])):
+            if limit is not None and limit.shape != t_mins.shape:
+                raise ValueError(f"{name} must be {list(t_mins.shape)}, got {list(limit.shape)}")
+            if limit is not None and limit.device != self.device:
+                raise ValueError(f"{name} is on {limit.device}, the estimator on {self.device}")
+        t_mins = t_mins if limits[0] is None else t_mins.maximum(limits[0].to(t_mins))
+        t_maxs = t_maxs if limits[1] is None else t_maxs.minimum(limits[1].to(t_maxs))
+        rays = Rays(rays_o, rays_d, t_mins, t_maxs)
+        check_rays(rays)
+        bounds = self.bounds()
+        if bounds is None:
+            return rays
+        t_enters, t_leaves = intersect_box(rays_o, rays_d, bounds.to(rays_o))
+        return rays._replace(t_maxs=t_maxs.minimum(t_leaves), t_enters=t_enters)
 
 
 def densities_of_samples(density_fn: DensityFn, rays_o: Tensor, rays_d: Tensor) -> SampleFn:
@@ -202,3 +183,30 @@ def densities_of_samples(density_fn: DensityFn, rays_o: Tensor, rays_d: Tensor) 
         return density_fn(torch.addcmul(origins, directions, midpoints)).reshape(-1)
 
     return sigma_fn
+
+
+class DenseEstimator(Estimator):
+    """Keeps every candidate: the reference that skipping is measured against.
+
+    Args:
+        aabb: box (min, max) to which rays are clipped, [6]; None marches from near to far.
+
+    Raises:
+        ValueError: the box is empty or not finite.
+    """
+
+    aabbs: Tensor
+
+    def __init__(self, aabb: Sequence[float] | Tensor | None = None) -> None:
+        super().__init__()
+        boxes = torch.empty(0, 6) if aabb is None else checked_box(aabb)[None]
+        self.register_buffer("aabbs", boxes)
+
+    def questions(self) -> tuple[OccupiedFn | None, NearFn | None]:
+        return None, None
+
+    def bounds(self) -> Tensor | None:
+        return self.aabbs[-1] if len(self.aabbs) else None
+
+    def update_every_n_steps(self, *args: Any, **kwargs: Any) -> None:
+        """Nothing to learn."""

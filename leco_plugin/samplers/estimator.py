@@ -14,12 +14,13 @@ import torch
 from torch import Tensor
 
 from leco_plugin.samplers.base import Estimator
+from leco_plugin.samplers.boxes import cell_centers, checked_box, intersect_box
 from leco_plugin.samplers.cells.build import build_cache
 from leco_plugin.samplers.cells.cache import CellCache, OccupancyLike
-from leco_plugin.samplers.changes import Seen
+from leco_plugin.samplers.changes import Snapshot
 from leco_plugin.samplers.kernels import fused
-from leco_plugin.samplers.marching import NearFn, OccupiedFn, Samples, number
-from leco_plugin.samplers.marching.rays import checked_box, intersect_box
+from leco_plugin.samplers.marching import NearFn, OccupiedFn, Samples
+from leco_plugin.samplers.rays import March, Rays
 
 _log = logging.getLogger(__name__)
 
@@ -34,8 +35,8 @@ class LearnedOccupancyEstimator(Estimator):
     """Samples where a frozen gate says that there is something.
 
     Box and cells follow the occupancy: after another gate was loaded into it, its threshold was
-    changed or it was replaced, the next question has them made anew, in seconds; `Seen` says what
-    goes unnoticed. A gate that is still trained is asked without cells (`cache_bytes=0`).
+    changed or it was replaced, the next question has them made anew, in seconds; `Snapshot` says
+    what goes unnoticed. A gate that is still trained is asked without cells (`cache_bytes=0`).
 
     Args:
         occupancy: the frozen gate with its space and threshold.
@@ -51,7 +52,7 @@ class LearnedOccupancyEstimator(Estimator):
     """
 
     _box: Tensor
-    _seen: Seen
+    _snapshot: Snapshot
     _derived_from: list[Tensor]
 
     def __init__(
@@ -76,31 +77,31 @@ class LearnedOccupancyEstimator(Estimator):
         self.cache: CellCache | None = None
         self._derive()
 
-    def _follow(self) -> None:
-        """Derives box and cells anew where the occupancy is no longer what they are of."""
-        if self._seen.is_still(self.occupancy):
+    def _refresh(self) -> None:
+        """Builds box and cells anew where the occupancy has changed."""
+        if self._snapshot.matches(self.occupancy):
             return
         if self.cache_bytes > 0:
             # moved, or loaded once more
-            if _same(_decisive(self.occupancy), self._derived_from):
-                self._seen = Seen(self.occupancy)
+            if _are_equal(_state(self.occupancy), self._derived_from):
+                self._snapshot = Snapshot(self.occupancy)
                 return
             _log.info("the occupancy has changed: box and cells are made anew")
         self._derive()
 
     def _derive(self) -> None:
         """Builds what follows from the occupancy: its box and the cells."""
-        seen = Seen(self.occupancy)
+        snapshot = Snapshot(self.occupancy)
         if not self._box_is_given:
             bounded = self.occupancy.space.kind == "box"
             self._box = self._uncontracted_box() if bounded else self._box[:0]
         if self.cache_bytes > 0:
-            decisive = _decisive(self.occupancy)
-            self.cache = self._built()
-            self._derived_from = decisive
-        self._seen = seen  # last: what is stopped on the way is begun anew
+            state = _state(self.occupancy)
+            self.cache = self._build_cache()
+            self._derived_from = state
+        self._snapshot = snapshot  # last: a build that is interrupted is begun anew
 
-    def _built(self) -> CellCache | None:
+    def _build_cache(self) -> CellCache | None:
         try:
             with torch.autocast(self.device.type, enabled=False):  # whatever the host is in
                 return build_cache(
@@ -111,60 +112,45 @@ class LearnedOccupancyEstimator(Estimator):
             return None
 
     def _uncontracted_box(self) -> Tensor:
-        space = self.occupancy.space
-        return torch.cat(
-            [space.center - space.half_extent, space.center + space.half_extent]
-        ).reshape(1, 6)
+        center, half = self.occupancy.space.center, self.occupancy.space.half_extent
+        return torch.cat([center - half, center + half]).reshape(1, 6)
 
     def questions(self) -> tuple[OccupiedFn | None, NearFn | None]:
-        self._follow()
+        self._refresh()
         return self.occupied, None if self.cache is None else self.cache.near
 
-    def kept(
-        self,
-        rays_o: Tensor,
-        rays_d: Tensor,
-        t_mins: Tensor,
-        t_maxs: Tensor,
-        step_size: float,
-        cone_angle: float,
-        jitter: Tensor | None,
-        t_enters: Tensor | None,
-    ) -> Samples:
+    def march(self, rays: Rays, rule: March) -> Samples:
         """As any estimator's, by the fused march where it runs."""
-        rays = rays_o, rays_d, t_mins, t_maxs, step_size, cone_angle, jitter, t_enters
-        self._follow()
-        samples = fused.march(self.occupancy, self.cache, rays_o.device, lambda: number(*rays))
-        samples = super().kept(*rays) if samples is None else samples
+        self._refresh()
+        samples = fused.march(self.occupancy, self.cache, rays, rule)
+        samples = super().march(rays, rule) if samples is None else samples
         if self.training and not (self._warned or self._box_is_given or len(samples[0])):
-            self._warned = self._warn_of_rays_elsewhere(rays_o, rays_d, t_mins, t_maxs)
+            self._warned = self._warn_of_rays_elsewhere(rays)
         return samples
 
-    def _warn_of_rays_elsewhere(
-        self, rays_o: Tensor, rays_d: Tensor, t_mins: Tensor, t_maxs: Tensor
-    ) -> bool:
-        """Says so where no ray of a batch comes near: they are in other coordinates then."""
-        box = self.aabbs[0].to(rays_o)
-        enters, leaves = intersect_box(rays_o, rays_d, box)
-        meets = enters.maximum(t_mins) < leaves.minimum(t_maxs)
-        if len(rays_o) < RAYS_THAT_TELL or bool(meets.any()):
+    def _warn_of_rays_elsewhere(self, rays: Rays) -> bool:
+        """Warns where no ray of a batch comes near: they are in other coordinates then."""
+        box = self.aabbs[0].to(rays.origins)
+        enters, leaves = intersect_box(rays.origins, rays.directions, box)
+        meets = enters.maximum(rays.t_mins) < leaves.minimum(rays.t_maxs)
+        if len(meets) < RAYS_THAT_TELL or bool(meets.any()):
             return False
         _log.warning(
             "none of a batch of %d rays comes near what this occupancy is of, %s: rays must be in "
             "the coordinates in which it was learned (`frame` in its report leads there)",
-            len(rays_o),
+            len(meets),
             " to ".join(str([round(x, 3) for x in corner]) for corner in box.view(2, 3).tolist()),
         )
         return True
 
     def bounds(self) -> Tensor | None:
-        self._follow()
+        self._refresh()
         return self._box[0] if len(self._box) else None
 
     @torch.no_grad()
     def occupied(self, positions: Tensor) -> Tensor:
         """The gate's decision, from the cache where it is sure; positions [N, 3] to bool [N]."""
-        self._follow()
+        self._refresh()
         cache = self.cache
         if cache is None:
             return self.occupancy.occupied(positions)
@@ -180,7 +166,7 @@ class LearnedOccupancyEstimator(Estimator):
     @property
     def aabbs(self) -> Tensor:
         """Boxes as `OccGridEstimator` has them, [1, 6]; of an unbounded space the inner cube."""
-        self._follow()
+        self._refresh()
         return self._box if len(self._box) else self._uncontracted_box()
 
     @property
@@ -201,26 +187,14 @@ class LearnedOccupancyEstimator(Estimator):
         return occupied.view(1, *[ANSWER_RESOLUTION] * 3)
 
 
-def cell_centers(aabbs: Tensor, resolution: Tensor) -> Tensor:
-    """Centres of the cells of boxes [n_boxes, 6], z fastest: [n_boxes * cells, 3].
-
-    Args:
-        resolution: cells along each axis, int [3].
-    """
-    axes = [(torch.arange(cells, device=aabbs.device) + 0.5) / cells for cells in resolution]
-    units = torch.cartesian_prod(*axes)
-    low, high = aabbs[:, None, :3], aabbs[:, None, 3:]
-    return (low + units * (high - low)).view(-1, 3)
-
-
-def _decisive(occupancy: OccupancyLike) -> list[Tensor]:
+def _state(occupancy: OccupancyLike) -> list[Tensor]:
     """Copies of what an occupancy's decisions depend on, as far as its tensors hold it."""
     if not isinstance(occupancy, torch.nn.Module):
         return []
     return [value.detach().cpu().clone() for value in occupancy.state_dict().values()]
 
 
-def _same(some: list[Tensor], others: list[Tensor]) -> bool:
+def _are_equal(some: list[Tensor], others: list[Tensor]) -> bool:
     """Whether two such lists are alike in every type and value, and hold any."""
     return 0 < len(some) == len(others) and all(
         one.dtype == other.dtype and torch.equal(one, other)

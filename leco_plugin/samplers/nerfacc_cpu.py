@@ -22,10 +22,9 @@ import torch
 from torch import Tensor
 
 from leco_plugin.samplers import packed
-from leco_plugin.samplers.grid import lookup
-from leco_plugin.samplers.marching import march, number
-from leco_plugin.samplers.marching.edges import candidate_edges
-from leco_plugin.samplers.marching.rays import intersect_box
+from leco_plugin.samplers.boxes import intersect_box, lookup
+from leco_plugin.samplers.edges import candidate_edges
+from leco_plugin.samplers.marching import March, Rays, march, number
 
 if TYPE_CHECKING:
     from nerfacc import RayIntervals, RaySamples
@@ -62,13 +61,14 @@ def install() -> None:
     replacements = {name: getattr(packed, name) for name in packed.__all__}
     replacements |= {"traverse_grids": traverse_grids, "ray_aabb_intersect": ray_aabb_intersect}
     for name, replacement in replacements.items():
-        if not _takes_as_much(replacement, getattr(nerfacc, name, None)):
+        if not _has_same_arguments(replacement, getattr(nerfacc, name, None)):
             raise ImportError(
                 f"{name} of nerfacc {nerfacc.__version__} is not that of 0.5.2 or 0.5.3, for which "
                 "this is written: pip install nerfacc==0.5.2, which nerfstudio asks for too"
             )
-    originals = {name: getattr(nerfacc, name) for name in replacements}
-    _switches.extend((old, _switch(old, replacements[name])) for name, old in originals.items())
+    for name, replacement in replacements.items():
+        original = getattr(nerfacc, name)
+        _switches.append((original, _switch(original, replacement)))
     _rebind(dict(_switches))
 
 
@@ -78,7 +78,7 @@ def uninstall() -> None:
     _switches.clear()
 
 
-def _takes_as_much(replacement: Function, original: Function | None) -> bool:
+def _has_same_arguments(replacement: Function, original: Function | None) -> bool:
     """Whether arguments for a function of nerfacc mean the same to its replacement."""
     if original is None:
         return False
@@ -172,7 +172,7 @@ def traverse_grids(
     Raises:
         ValueError: a step is not positive, tensors do not fit, or `over_allocate` has no limit.
     """
-    from nerfacc import RayIntervals, RaySamples
+    from nerfacc import RaySamples
 
     limit = traverse_steps_limit or 0
     if over_allocate and limit <= 0:
@@ -188,25 +188,32 @@ def traverse_grids(
     if rays_mask is not None:
         t_leaves = t_leaves.where(rays_mask, -torch.inf)
     t_mins = torch.zeros_like(t_leaves) if near_planes is None else near_planes
+    rays, rule = Rays(rays_o, rays_d, t_mins, t_leaves, t_enters), March(step_size, cone_angle)
     ray_indices, t_starts, t_ends = march(
-        rays_o,
-        rays_d,
-        t_mins,
-        t_leaves,
-        step_size=step_size,
-        cone_angle=cone_angle,
-        occupied=lambda positions: lookup(binaries, aabbs[0], positions),
-        t_enters=t_enters,
+        rays, rule, lambda positions: lookup(binaries, aabbs[0], positions)
     )
-    steps = number(rays_o, rays_d, t_mins, t_leaves, step_size, cone_angle, t_enters=t_enters)
+    steps = number(rays, rule)
     n_steps = steps.first + steps.counts
-    left = candidate_edges(steps.t_mins, n_steps, step_size, cone_angle).where(n_steps > 0, t_mins)
+    left = candidate_edges(steps.t_mins, n_steps, *rule).where(n_steps > 0, t_mins)
     if limit > 0:
         firsts = packed.pack_info(ray_indices, len(rays_o))[:, 0]
         place = torch.arange(len(ray_indices), device=firsts.device) - firsts[ray_indices]
         left[ray_indices[place == limit - 1]] = t_ends[place == limit - 1]
         within = place < limit
         ray_indices, t_starts, t_ends = ray_indices[within], t_starts[within], t_ends[within]
+    intervals, samples = _shared_edges(ray_indices, t_starts, t_ends, len(rays_o))
+    if not hasattr(RaySamples, "is_valid"):  # 0.5.2
+        return intervals, samples
+    samples.is_valid = torch.ones_like(ray_indices, dtype=torch.bool)
+    return intervals, samples, left
+
+
+def _shared_edges(
+    ray_indices: Tensor, t_starts: Tensor, t_ends: Tensor, n_rays: int
+) -> tuple[RayIntervals, RaySamples]:
+    """Samples [n_samples] as nerfacc has them: neighbours share an edge."""
+    from nerfacc import RayIntervals, RaySamples
+
     begins = torch.ones_like(ray_indices, dtype=torch.bool)
     begins[1:] = (ray_indices[1:] != ray_indices[:-1]) | (t_starts[1:] != t_ends[:-1])
     right = torch.arange(len(begins), device=begins.device) + begins.cumsum(0)
@@ -219,17 +226,14 @@ def traverse_grids(
     is_left[right - 1], is_right[right] = True, True
     intervals = RayIntervals(
         vals=values,
-        packed_info=packed.pack_info(edge_rays, len(rays_o)),
+        packed_info=packed.pack_info(edge_rays, n_rays),
         ray_indices=edge_rays,
         is_left=is_left,
         is_right=is_right,
     )
     samples = RaySamples(
         vals=(t_starts + t_ends) * 0.5,
-        packed_info=packed.pack_info(ray_indices, len(rays_o)),
+        packed_info=packed.pack_info(ray_indices, n_rays),
         ray_indices=ray_indices,
     )
-    if not hasattr(RaySamples, "is_valid"):  # 0.5.2
-        return intervals, samples
-    samples.is_valid = torch.ones_like(ray_indices, dtype=torch.bool)
-    return intervals, samples, left
+    return intervals, samples

@@ -9,23 +9,78 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import torch
-from nerfstudio.cameras.rays import RayBundle, RaySamples
-from nerfstudio.model_components.ray_samplers import (
-    PDFSampler,
-    Sampler,
-    UniformLinDispPiecewiseSampler,
-)
-from torch import Tensor
+from torch import Tensor, nn
 
 from leco_plugin.samplers.cells.cache import OccupancyLike
 from leco_plugin.samplers.estimator import LearnedOccupancyEstimator
 
+if TYPE_CHECKING:  # built where a host of nerfstudio is, and nothing else needs it
+    from nerfstudio.cameras.rays import RayBundle, RaySamples
+    from nerfstudio.model_components.ray_samplers import Sampler
 
-def with_ends(ray_bundle: RayBundle | None) -> RayBundle:
-    """The rays, if they can be sampled.
+Answer = tuple["RaySamples", list[Tensor], list["RaySamples"]]
+"""The samples, and for each level of proposals the weights of candidates and the candidates."""
+
+
+class _ProposalSampler(nn.Module):
+    """What a host of nerfstudio calls in place of its `ProposalNetworkSampler`.
+
+    Args:
+        initial_sampler: lays the candidates; None is nerfstudio's default for proposal hosts.
+        single_jitter: shift all samples of a ray by the same random share.
+        sizes: samples and candidates of each ray, by name.
+
+    Raises:
+        ValueError: there is not even one sample or candidate.
+    """
+
+    def __init__(self, initial_sampler: Sampler | None, single_jitter: bool, **sizes: int) -> None:
+        from nerfstudio.model_components.ray_samplers import UniformLinDispPiecewiseSampler
+
+        super().__init__()
+        for name, size in sizes.items():
+            if size < 1:
+                raise ValueError(f"a ray needs at least one sample, got {name} {size}")
+            setattr(self, name, size)
+        self.initial_sampler = initial_sampler or UniformLinDispPiecewiseSampler(
+            single_jitter=single_jitter
+        )
+
+    def generate_ray_samples(
+        self,
+        ray_bundle: RayBundle | None = None,
+        density_fns: list[Callable[..., Any]] | None = None,
+    ) -> Answer:
+        """Samples for a host.
+
+        Args:
+            ray_bundle: rays with nears and fars, [n_rays].
+            density_fns: the host's proposal densities. They are not called; their number tells how
+                many levels of weights the host's losses and depth outputs expect.
+
+        Returns:
+            the samples [n_rays, n_samples], sorted and between near and far; and for each level
+            the weights of the candidates [n_rays, n_candidates, 1], and the candidates.
+
+        Raises:
+            ValueError: there are no rays to sample, or they have no nears and fars.
+        """
+        samples, weights, candidates = self._draw(_clamp_ends(ray_bundle))
+        levels = 1 if density_fns is None else len(density_fns)
+        return samples, [weights] * levels, [candidates] * levels
+
+    forward = generate_ray_samples
+
+    def _draw(self, ray_bundle: RayBundle) -> tuple[RaySamples, Tensor, RaySamples]:
+        """Samples, weights of candidates, and candidates."""
+        raise NotImplementedError
+
+
+def _clamp_ends(ray_bundle: RayBundle | None) -> RayBundle:
+    """The rays with nears and fars between which samples can be laid.
 
     A ray that ends before it begins, or at no number, has samples without length, all where it
     begins; that is its origin if it is no finite number. A ray without end is followed as far as a
@@ -42,20 +97,10 @@ def with_ends(ray_bundle: RayBundle | None) -> RayBundle:
     return replace(ray_bundle, nears=nears, fars=fars)
 
 
-def check_positive(**sizes: int) -> None:
-    """Raise ValueError, with the name, unless each of these is at least 1."""
-    for name, size in sizes.items():
-        if size < 1:
-            raise ValueError(f"a ray needs at least one sample, got {name} {size}")
-
-
-def levels_of(density_fns: list[Callable[..., Any]] | None) -> int:
-    """How many levels of weights a host's losses and depth outputs expect."""
-    return 1 if density_fns is None else len(density_fns)
-
-
-class LearnedOccupancySampler(Sampler):
+class LearnedOccupancySampler(_ProposalSampler):
     """Draws samples from the gate's distribution along each ray.
+
+    The weights of candidates sum to 1 on a ray that meets something occupied, and to 0 on others.
 
     Args:
         occupancy: the frozen gate with its space and threshold.
@@ -73,6 +118,8 @@ class LearnedOccupancySampler(Sampler):
     """
 
     frame: Tensor | None
+    num_samples: int
+    num_candidates: int
 
     def __init__(
         self,
@@ -84,18 +131,16 @@ class LearnedOccupancySampler(Sampler):
         cache_bytes: int = 1 << 20,
         frame: Tensor | None = None,
     ) -> None:
-        super().__init__()
-        check_positive(num_samples=num_samples, num_candidates=num_candidates)
+        from nerfstudio.model_components.ray_samplers import PDFSampler
+
+        super().__init__(
+            initial_sampler, single_jitter, num_samples=num_samples, num_candidates=num_candidates
+        )
         if frame is not None and frame.shape != (3, 4):
             raise ValueError(f"frame must be [3, 4], got {list(frame.shape)}")
         held = None if frame is None else frame.detach().float()
         self.register_buffer("frame", held, persistent=False)
         self.estimator = LearnedOccupancyEstimator(occupancy, cache_bytes=cache_bytes)
-        self.num_samples = num_samples
-        self.num_candidates = num_candidates
-        if initial_sampler is None:
-            initial_sampler = UniformLinDispPiecewiseSampler(single_jitter=single_jitter)
-        self.initial_sampler = initial_sampler
         # No padding: it would spend samples on empty space. A ray without any weight gets equal
         # ones, which is uniform sampling.
         self.pdf_sampler = PDFSampler(
@@ -108,33 +153,12 @@ class LearnedOccupancySampler(Sampler):
     def step_cb(self, step: int) -> None:
         """Called by hosts after a training step; nothing is scheduled here."""
 
-    def generate_ray_samples(
-        self,
-        ray_bundle: RayBundle | None = None,
-        density_fns: list[Callable[..., Any]] | None = None,
-    ) -> tuple[RaySamples, list[Tensor], list[RaySamples]]:
-        """Samples for a host.
-
-        Args:
-            ray_bundle: rays with nears and fars, [n_rays].
-            density_fns: the host's proposal densities. They are not called; their number tells how
-                many levels of weights the host's losses and depth outputs expect.
-
-        Returns:
-            the samples [n_rays, num_samples], sorted and between near and far; and for each level
-            the weights of the candidates [n_rays, num_candidates, 1], which sum to 1 on a ray that
-            meets something occupied and to 0 on others, and the candidates.
-
-        Raises:
-            ValueError: there are no rays to sample, or they have no nears and fars.
-        """
-        ray_bundle = with_ends(ray_bundle)
+    def _draw(self, ray_bundle: RayBundle) -> tuple[RaySamples, Tensor, RaySamples]:
         candidates = self.initial_sampler(ray_bundle, num_samples=self.num_candidates)
         worth = self.worth(candidates.frustums.get_positions())
         weights = worth / worth.sum(dim=-2, keepdim=True).clamp(min=1e-12)
         samples = self.pdf_sampler(ray_bundle, candidates, weights, num_samples=self.num_samples)
-        levels = levels_of(density_fns)
-        return samples, [weights] * levels, [candidates] * levels
+        return samples, weights, candidates
 
     @torch.no_grad()
     def worth(self, positions: Tensor) -> Tensor:
@@ -155,18 +179,20 @@ class LearnedOccupancySampler(Sampler):
         return worth.view(*positions.shape[:-1], 1)
 
 
-class DenseSampler(Sampler):
+class DenseSampler(_ProposalSampler):
     """As many samples as are asked for, laid along every ray as the host lays its first ones.
 
     Args:
-        num_samples: of the host, after its proposals; not looked at.
+        num_samples: of the host, after its proposals; not used.
         samples: samples of each ray.
         initial_sampler, single_jitter: as of `LearnedOccupancySampler`.
-        occupancy, frame: likewise; not looked at.
+        occupancy, frame: likewise; not used.
 
     Raises:
         ValueError: there is not even one sample.
     """
+
+    samples: int
 
     def __init__(
         self,
@@ -177,21 +203,9 @@ class DenseSampler(Sampler):
         occupancy: OccupancyLike | None = None,
         frame: Tensor | None = None,
     ) -> None:
-        super().__init__()
-        check_positive(samples=samples)
-        self.samples = samples
-        self.initial_sampler = initial_sampler or UniformLinDispPiecewiseSampler(
-            single_jitter=single_jitter
-        )
+        super().__init__(initial_sampler, single_jitter, samples=samples)
 
-    def generate_ray_samples(
-        self,
-        ray_bundle: RayBundle | None = None,
-        density_fns: list[Callable[..., Any]] | None = None,
-    ) -> tuple[RaySamples, list[Tensor], list[RaySamples]]:
-        """Samples for a host; equal weights where it expects those of its proposals."""
-        candidates = self.initial_sampler(with_ends(ray_bundle), num_samples=self.samples)
-        shape = candidates.frustums.starts.shape
-        weights = candidates.frustums.starts.new_full(shape, 1.0 / self.samples)
-        levels = levels_of(density_fns)
-        return candidates, [weights] * levels, [candidates] * levels
+    def _draw(self, ray_bundle: RayBundle) -> tuple[RaySamples, Tensor, RaySamples]:
+        candidates = self.initial_sampler(ray_bundle, num_samples=self.samples)
+        starts = candidates.frustums.starts
+        return candidates, torch.full_like(starts, 1.0 / self.samples), candidates

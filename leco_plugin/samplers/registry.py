@@ -68,14 +68,18 @@ LEARNED_OCCUPANCY = SamplerSpec(
 )
 
 
-def _on(features: str, kind: str) -> SamplerSpec:
-    description = f"learned occupancy whose gate is on {features}, for comparison"
-    return replace(LEARNED_OCCUPANCY, description=description, gate_encoding=kind)
-
-
-LEARNED_OCCUPANCY_HASH = _on("hash-grid features", "hash")
-LEARNED_OCCUPANCY_VM = _on("TensoRF's vector-matrix features", "vm")
-LEARNED_OCCUPANCY_K_PLANES = _on("K-planes features", "k-planes")
+LEARNED_OCCUPANCY_HASH, LEARNED_OCCUPANCY_VM, LEARNED_OCCUPANCY_K_PLANES = (
+    replace(
+        LEARNED_OCCUPANCY,
+        description=f"learned occupancy whose gate is on {features}, for comparison",
+        gate_encoding=kind,
+    )
+    for features, kind in (
+        ("hash-grid features", "hash"),
+        ("TensoRF's vector-matrix features", "vm"),
+        ("K-planes features", "k-planes"),
+    )
+)
 OURS = {
     "dense": DENSE,
     "dense-proposal": DENSE_PROPOSAL,
@@ -126,27 +130,23 @@ def sampler_spec(name: str) -> SamplerSpec:
 
 def _build(name: str, kind: str, options: dict[str, Any]) -> nn.Module:
     spec = sampler_spec(name)
-    builder = getattr(spec, kind)
+    builder, occupancy = getattr(spec, kind), options.get("occupancy")
     if builder is None:
         raise ValueError(f"sampler {name!r} has nothing for {HOSTS[kind]} hosts")
-    if spec.needs_occupancy and options.get("occupancy") is None:
-        raise ValueError(f"sampler {name!r} needs an occupancy")
     if spec.needs_occupancy:
-        check_gate(name, getattr(getattr(options["occupancy"], "gate", None), "config", None))
-    refuse_unknown_options(name, [each for each in options if each not in GIVEN], (kind,))
-    build = _loaded(builder)
+        if occupancy is None:
+            raise ValueError(f"sampler {name!r} needs an occupancy")
+        check_gate(name, getattr(getattr(occupancy, "gate", None), "config", None))
+    refuse_unknown_options(name, options.keys() - GIVEN, (kind,))
+    build = _load(builder)
     for needed, parameter in (_parameters(build) or {}).items():
         if parameter.default is parameter.empty and needed not in options:
             raise ValueError(f"sampler {name!r} needs {needed}")
     return build(**options)
 
 
-def _loaded(builder: Callable[..., nn.Module] | str) -> Callable[..., nn.Module]:
-    """A builder, imported where a spec says where it is.
-
-    Raises:
-        ValueError: there is nothing.
-    """
+def _load(builder: Callable[..., nn.Module] | str) -> Callable[..., nn.Module]:
+    """A builder, imported where a spec gives "module:attribute"."""
     if not isinstance(builder, str):
         return builder
     module, _, attribute = builder.partition(":")
@@ -158,7 +158,7 @@ def _loaded(builder: Callable[..., nn.Module] | str) -> Callable[..., nn.Module]
 
 
 def _parameters(builder: Callable[..., nn.Module]) -> dict[str, inspect.Parameter] | None:
-    """What a builder takes by name; None where it takes any, or nobody knows."""
+    """Parameters of a builder by name; None where it takes any, or nobody knows."""
     try:
         found = inspect.signature(builder).parameters
     except ValueError:  # a class of a compiled extension
@@ -172,9 +172,9 @@ def _parameters(builder: Callable[..., nn.Module]) -> dict[str, inspect.Paramete
 def refuse_unknown_options(
     name: str, options: Collection[str], kinds: tuple[str, ...] = tuple(HOSTS)
 ) -> None:
-    """Whether a sampler takes options of these names, in hosts that call one of these kinds.
+    """Refuse options that a sampler does not take in hosts that call one of these kinds.
 
-    Of a builder that takes any (`**options`) nothing is known, and nothing refused.
+    A builder that takes any (`**options`) is not checked.
 
     Raises:
         ValueError: there is no such sampler, or it does not take one of them.
@@ -182,24 +182,21 @@ def refuse_unknown_options(
     spec = sampler_spec(name)
     if not options:
         return
-    known: set[str] = set()
-    for builder in (getattr(spec, kind) for kind in kinds):
-        if builder is not None:
-            parameters = _parameters(_loaded(builder))
-            if parameters is None:
-                return
-            known |= parameters.keys() - GIVEN
-    unknown = next((option for option in options if option not in known), None)
-    if unknown is not None:
+    builders = [getattr(spec, kind) for kind in kinds]
+    takes = [_parameters(_load(builder)) for builder in builders if builder is not None]
+    if None in takes:
+        return
+    known = {option for parameters in takes if parameters for option in parameters} - GIVEN
+    if unknown := sorted(set(options) - known):
         here = f" in {HOSTS[kinds[0]]} hosts" if len(kinds) == 1 else ""
         there_are = ", ".join(sorted(known)) or "none"
         raise ValueError(
-            f"the sampler {name!r} has no option {unknown!r}{here}; there are {there_are}"
+            f"the sampler {name!r} has no option {unknown[0]!r}{here}; there are {there_are}"
         )
 
 
 def check_gate(name: str, config: Any) -> None:
-    """Whether a sampler can ask gates of this config (`GateConfig`; None is no gate).
+    """Refuse a sampler that cannot ask gates of this config (`GateConfig`; None is no gate).
 
     Raises:
         ValueError: there is no such sampler, or it asks gates on other features.
@@ -215,8 +212,9 @@ def check_gate(name: str, config: Any) -> None:
 
 
 def build_dense(aabb: Any = None, occupancy: Any = None, levels: int = 1) -> nn.Module:
-    """`grid.DenseEstimator` in the host's box, or in the outermost of so many nested ones."""
-    from leco_plugin.samplers.grid import DenseEstimator, nested_boxes
+    """`base.DenseEstimator` in the host's box, or in the outermost of so many nested ones."""
+    from leco_plugin.samplers.base import DenseEstimator
+    from leco_plugin.samplers.boxes import nested_boxes
 
     return DenseEstimator(aabb if aabb is None else nested_boxes(aabb, levels)[-1])
 

@@ -11,7 +11,7 @@ import torch
 from nerfstudio.cameras.cameras import Cameras
 from torch import Tensor
 
-from leco_plugin.samplers.marching.rays import intersect_box
+from leco_plugin.samplers.boxes import intersect_box
 from leco_plugin.scenes.bounds import BoundsConfig, SceneBounds, find_bounds
 from leco_plugin.scenes.input_error import InputError
 from leco_plugin.scenes.survey import chosen_cameras, covering_rays

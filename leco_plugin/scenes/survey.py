@@ -11,7 +11,7 @@ from torch import Tensor
 
 from leco_plugin.log import say
 from leco_plugin.models.rendering import Rays
-from leco_plugin.samplers.marching.rays import intersect_box
+from leco_plugin.samplers.boxes import intersect_box
 from leco_plugin.scenes.bounds import (
     BoundsConfig,
     SceneBounds,

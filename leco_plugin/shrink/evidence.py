@@ -17,7 +17,8 @@ from leco_plugin.learning.calibration import near_surface
 from leco_plugin.models.leco import LecoModel
 from leco_plugin.models.rendering import Intervals, Rays, backdrop_of
 from leco_plugin.occupancy import Occupancy
-from leco_plugin.samplers.marching import march
+from leco_plugin.samplers import marching
+from leco_plugin.samplers.marching import March, march
 from leco_plugin.shrink.sources import Seen, Source
 
 RAYS_AT_ONCE = 1024
@@ -133,16 +134,8 @@ def _by_rendering(
 def _by_decisions(occupancy: Occupancy, rays: Rays) -> Evidence:
     """Without a field: every candidate that the original keeps, weighed by o(x)."""
     report = occupancy.report
-    intervals = Intervals(
-        *march(
-            rays.origins,
-            rays.directions,
-            rays.t_mins,
-            rays.t_maxs,
-            step_size=float(report["step_size"]),
-            cone_angle=float(report.get("cone_angle", 0.0)),
-        )
-    )
+    rule = March(float(report["step_size"]), float(report.get("cone_angle", 0.0)))
+    intervals = Intervals(*march(marching.Rays(*rays[:4]), rule))
     positions = middles(rays, intervals)
     values = query_in_parts(occupancy, positions)
     kept = values >= occupancy.threshold_value

@@ -16,7 +16,7 @@ import torch
 from nerfstudio.field_components.encodings import HashEncoding
 from torch import Tensor
 
-from leco_plugin.models.encodings import PRIMES, summed_by_row
+from leco_plugin.models.encodings import PRIMES, sum_by_row
 
 if TYPE_CHECKING:
     from torch import nn
@@ -79,7 +79,7 @@ class _Interpolated(torch.autograd.Function):
         if ctx.needs_input_grad[0]:
             of_positions = _of_positions(positions, table, rows, by_level, ctx.encoding.scalings)
         if ctx.needs_input_grad[1]:
-            of_table = summed_by_row(rows, weights, by_level, len(table))
+            of_table = sum_by_row(rows, weights, by_level, len(table))
         return of_positions, of_table, None
 
 

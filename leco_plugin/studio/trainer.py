@@ -22,7 +22,7 @@ from leco_plugin.learning.collapse import GateCollapsed
 from leco_plugin.learning.progress import Progress
 from leco_plugin.log import say, say_what_is_logged
 from leco_plugin.models.failures import TrainingStopped
-from leco_plugin.samplers.kernels.off import VARIABLE, kernels_off
+from leco_plugin.samplers.kernels import VARIABLE, kernels_off
 from leco_plugin.scenes.input_error import InputError
 from leco_plugin.studio.checkpoints import (
     first_not_finite,

@@ -19,7 +19,7 @@ from leco_plugin.compat import atomic_trainer
 from leco_plugin.compat.atomic_trainer import AtomicTrainer, _say_which_kernels_are_off
 from leco_plugin.compat.whole_checkpoints import damage_of
 from leco_plugin.models.failures import TrainingStopped
-from leco_plugin.samplers.kernels.off import VARIABLE
+from leco_plugin.samplers.kernels import VARIABLE
 from leco_plugin.scenes.input_error import InputError
 
 

@@ -10,7 +10,8 @@ from ball_occupancy import CENTRE, RADIUS, ball
 
 from leco_plugin.export.nerfacc_grid import grid_buffers, innermost_box, reaching_levels, write_grid
 from leco_plugin.occupancy import Occupancy
-from leco_plugin.samplers.grid import OccupancyGridEstimator, lookup
+from leco_plugin.samplers.boxes import lookup
+from leco_plugin.samplers.grid import OccupancyGridEstimator
 from leco_plugin.space import Space
 
 

@@ -7,7 +7,8 @@ import torch
 
 from leco_plugin.learning.statistics import gate_statistics, kept_fraction, prices
 from leco_plugin.models.rendering import Intervals, Rays, Shaded, with_backdrop
-from leco_plugin.samplers.marching import march
+from leco_plugin.samplers import marching
+from leco_plugin.samplers.marching import March, march
 
 NUM_RAYS, STEP = 6, 0.05
 
@@ -45,7 +46,7 @@ def test_what_is_kept_is_a_share_of_all_candidates_also_of_those_that_were_skipp
 ) -> None:
     torch.manual_seed(0)
     rays = rays_along_x()
-    all_of_them = Intervals(*march(*rays[:4], step_size=STEP, cone_angle=cone_angle))
+    all_of_them = Intervals(*march(marching.Rays(*rays[:4]), March(STEP, cone_angle)))
     every = with_backdrop(all_of_them, rays, STEP, cone_angle)
     occupancies = torch.rand(len(every.t_starts))
     backdrop = every.t_ends >= rays.t_maxs[every.ray_indices]

@@ -18,7 +18,8 @@ from leco_plugin.models.front_to_back import (
 from leco_plugin.models.gate import Gate, GateConfig
 from leco_plugin.models.hmoe import HMoEConfig
 from leco_plugin.models.rendering import Intervals, Rays, Routing, shade, with_backdrop
-from leco_plugin.samplers.marching import march
+from leco_plugin.samplers import marching
+from leco_plugin.samplers.marching import March, march
 from leco_plugin.samplers.packed import render_transmittance_from_density
 from leco_plugin.space import Space
 
@@ -56,7 +57,7 @@ def kept_along(rays: Rays) -> Intervals:
     def occupied(positions: torch.Tensor) -> torch.Tensor:
         return (7.0 * positions).sin().sum(dim=-1) > -0.3
 
-    samples = march(*rays[:4], step_size=STEP, occupied=occupied)
+    samples = march(marching.Rays(*rays[:4]), March(STEP), occupied)
     return with_backdrop(Intervals(*samples), rays, STEP, 0.0)
 
 

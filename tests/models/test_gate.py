@@ -94,15 +94,6 @@ def test_a_configuration_survives_its_dictionary() -> None:
     assert GateConfig.from_dict(config.to_dict()) == config
 
 
-def test_a_dictionary_from_before_there_were_planes_and_a_choice_of_norms_is_read() -> None:
-    config = GateConfig(EncodingConfig("hash", levels=3))
-    values = config.to_dict()
-    for name in ("components", "plane_cells"):
-        del values["encoding"][name]  # type: ignore[attr-defined]
-    del values["normed"]
-    assert GateConfig.from_dict(values) == config
-
-
 @pytest.mark.parametrize("kind", ENCODINGS)
 def test_a_gate_on_any_features_learns_a_ball(kind) -> None:
     """To half a percent of the cube, and not beyond a twentieth of its half extent."""

@@ -9,7 +9,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from leco_plugin.models.planes import KPlanesEncoding, VectorMatrixEncoding
+from leco_plugin.models.encodings import KPlanesEncoding, VectorMatrixEncoding
 
 AXES = {"XY": (0, 1, 2), "XZ": (0, 2, 1), "YZ": (1, 2, 0)}
 """Axes along the columns and the rows of each plane, and the one that it leaves out."""

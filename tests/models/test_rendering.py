@@ -21,7 +21,8 @@ from leco_plugin.models.rendering import (
     shade,
     with_backdrop,
 )
-from leco_plugin.samplers.marching import march
+from leco_plugin.samplers import marching
+from leco_plugin.samplers.marching import March, march
 from leco_plugin.space import Space
 
 ROUTINGS = {
@@ -61,7 +62,7 @@ def some_rays(count: int) -> Rays:
 
 
 def intervals_of(rays: Rays, occupied=None) -> Intervals:
-    return Intervals(*march(*rays[:4], step_size=0.05, occupied=occupied))
+    return Intervals(*march(marching.Rays(*rays[:4]), March(0.05), occupied))
 
 
 @pytest.mark.parametrize("routing", ROUTINGS.values(), ids=ROUTINGS)

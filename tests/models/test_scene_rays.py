@@ -7,7 +7,7 @@ import torch
 from nerfstudio.cameras.rays import RayBundle
 
 from leco_plugin.models.scene_rays import cut_to_bounds, marching_rule, with_ends_for_all
-from leco_plugin.samplers.marching import march
+from leco_plugin.samplers.marching import March, Rays, march
 
 NEAR, FAR = torch.tensor(0.1), torch.tensor(5.0)
 SLAB = torch.tensor([-1e6, -1e6, -1.0, 1e6, 1e6, 1.0])
@@ -43,7 +43,7 @@ def test_a_median_ray_has_the_wanted_number_of_candidates(kind) -> None:
     step_size, cone_angle = marching_rule(kind, 0.1, 5.0, 64, length)
     one = torch.zeros(1, 3), torch.tensor([[1.0, 0.0, 0.0]])
     ends = torch.tensor([0.1]), torch.tensor([0.1 + length])
-    ray_indices, _, _ = march(*one, *ends, step_size=step_size, cone_angle=cone_angle)
+    ray_indices, _, _ = march(Rays(*one, *ends), March(step_size, cone_angle))
     assert abs(len(ray_indices) - 64) <= 1
     assert (cone_angle > 0.0) == (kind == "contraction")
 

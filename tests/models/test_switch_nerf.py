@@ -20,8 +20,9 @@ from leco_plugin.models.switch.config import SwitchNerfModelConfig
 from leco_plugin.models.switch.field import SwitchFieldConfig
 from leco_plugin.models.switch.sizes import SwitchSizes
 from leco_plugin.models.switch_nerf import SwitchNerfModel
+from leco_plugin.samplers.base import DenseEstimator
 from leco_plugin.samplers.estimator import LearnedOccupancyEstimator
-from leco_plugin.samplers.grid import DenseEstimator, OccupancyGridEstimator
+from leco_plugin.samplers.grid import OccupancyGridEstimator
 from leco_plugin.scenes.bounds import SceneBounds
 from leco_plugin.scenes.input_error import InputError
 

@@ -22,7 +22,7 @@ from leco_plugin.samplers.cells.cache import (
     CellCache,
 )
 from leco_plugin.samplers.estimator import LearnedOccupancyEstimator
-from leco_plugin.samplers.marching import march
+from leco_plugin.samplers.marching import March, Rays, march
 from leco_plugin.space import Space
 
 BUDGET = 1 << 17
@@ -149,13 +149,13 @@ def test_cubes_far_from_everything_are_clear(cache, balls):
 @pytest.mark.parametrize("step_size", [0.004, 0.01, 0.03])
 def test_asking_for_clear_runs_first_drops_no_sample(cache, balls, step_size):
     origins, directions = camera_rays(400)
-    rays = origins, directions, torch.zeros(400), torch.full((400,), 4.0)
+    rays = Rays(origins, directions, torch.zeros(400), torch.full((400,), 4.0))
 
     def occupied(positions):
         return decide(cache, balls, positions)
 
-    one = march(*rays, step_size=step_size, occupied=occupied)
-    other = march(*rays, step_size=step_size, occupied=occupied, near_occupied=cache.near)
+    one = march(rays, March(step_size), occupied)
+    other = march(rays, March(step_size), occupied, cache.near)
     assert all(a.equal(b) for a, b in zip(one, other, strict=True))
 
 

@@ -158,7 +158,7 @@ def test_cells_are_kept_while_the_gate_says_the_same(built):
 def test_to_see_that_nothing_has_changed_waits_for_no_device():
     asked = LearnedOccupancyEstimator(SLAB.occupancy(), cache_bytes=BUDGET)
     with Waits() as waits:
-        asked._follow()
+        asked._refresh()
     assert waits.seen == []
 
 

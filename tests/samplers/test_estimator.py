@@ -12,8 +12,9 @@ from hypothesis import strategies as st
 from samplers.analytic_occupancy import Balls, camera_rays, slow_march
 
 from leco_plugin.samplers import packed
+from leco_plugin.samplers.base import DenseEstimator
 from leco_plugin.samplers.estimator import LearnedOccupancyEstimator
-from leco_plugin.samplers.grid import DenseEstimator, OccupancyGridEstimator
+from leco_plugin.samplers.grid import OccupancyGridEstimator
 
 BUDGET = 1 << 16
 

@@ -17,24 +17,24 @@ from leco_plugin.models.encodings import EncodingConfig
 from leco_plugin.models.gate import Gate, GateConfig
 from leco_plugin.occupancy import Occupancy
 from leco_plugin.samplers.cells.cache import CellCache
+from leco_plugin.samplers.edges import candidate_counts, growth_table, powers_needed, switch
 from leco_plugin.samplers.estimator import LearnedOccupancyEstimator
-from leco_plugin.samplers.kernels import fused, trials
+from leco_plugin.samplers.kernels import fused
 from leco_plugin.samplers.kernels.gate_weights import GateWeights, gate_weights, why_not
-from leco_plugin.samplers.marching import (
-    Candidates,
-    Samples,
-    TooManyCandidates,
-    keep,
-)
-from leco_plugin.samplers.marching.edges import candidate_counts, switch
-from leco_plugin.samplers.marching.growth import growth_table, powers_needed
+from leco_plugin.samplers.marching import Candidates, March, Rays, Samples, keep
+from leco_plugin.samplers.rays import TooManyCandidates
 from leco_plugin.space import Space
 
 
 @pytest.fixture(autouse=True)
 def switched_on(monkeypatch) -> None:
-    monkeypatch.setattr(fused, "_switch", fused._Switch())
+    monkeypatch.setattr(fused, "_off", set())
     monkeypatch.setattr(fused, "_passed", {kind: WeakKeyDictionary() for kind in fused._passed})
+
+
+@pytest.fixture
+def on_any_device(monkeypatch) -> None:
+    monkeypatch.setattr(fused, "is_ready", lambda device, name="gate": name not in fused._off)
 
 
 def test_without_cuda_triton_is_never_imported() -> None:
@@ -52,9 +52,9 @@ def test_without_cuda_triton_is_never_imported() -> None:
     assert done.returncode == 0, done.stderr
 
 
+@pytest.mark.usefixtures("on_any_device")
 def test_a_failing_kernel_is_said_once_and_its_twin_answers(monkeypatch, caplog) -> None:
     asked = Occupancy(Gate(GateConfig()), Space(), 0.5)
-    monkeypatch.setattr(fused, "ready", lambda device: not fused._switch.off)
 
     monkeypatch.setitem(sys.modules, "leco_plugin.samplers.kernels.gate_kernel", None)
     places = torch.randn(50, 3)
@@ -67,8 +67,8 @@ def test_a_failing_kernel_is_said_once_and_its_twin_answers(monkeypatch, caplog)
     assert "\n" not in said[0]
 
 
+@pytest.mark.usefixtures("on_any_device")
 def test_a_missing_triton_is_said_once_and_torch_answers(steep, monkeypatch, caplog) -> None:
-    monkeypatch.setattr(fused, "ready", lambda device, name="gate": name not in fused._switch.off)
     monkeypatch.setitem(sys.modules, "triton", None)
     for name in ("gate_kernel", "march_kernel"):
         monkeypatch.delitem(sys.modules, f"leco_plugin.samplers.{name}", raising=False)
@@ -81,6 +81,12 @@ def test_a_missing_triton_is_said_once_and_torch_answers(steep, monkeypatch, cap
     assert all(map(torch.equal, samples[0], wanted)) and all(map(torch.equal, samples[1], wanted))
     said = [record.getMessage() for record in caplog.records]
     assert len(said) == 1 and "triton" in said[0] and "torch answers in its place" in said[0]
+
+
+def right_gate(made: LearnedOccupancyEstimator, monkeypatch) -> None:
+    """Puts a kernel that decides as its twin in the place of the gate's."""
+    gate = SimpleNamespace(gate_decisions=lambda w, x: made.occupancy.query(x) >= w.facts[10])
+    monkeypatch.setitem(sys.modules, "leco_plugin.samplers.kernels.gate_kernel", gate)
 
 
 class MarchKernel:
@@ -111,21 +117,20 @@ def steep() -> LearnedOccupancyEstimator:
     return LearnedOccupancyEstimator(ball(), cache_bytes=1 << 16, tolerance=0.02)
 
 
+@pytest.mark.usefixtures("on_any_device")
 @pytest.mark.parametrize("cone_angle", [0.0, 0.01])
 @pytest.mark.parametrize("fault", ["keeps all", "skips some", "other order", "raises"])
 def test_a_march_that_keeps_otherwise_is_never_believed(
     fault: str, cone_angle: float, steep, monkeypatch, caplog
 ) -> None:
     kernel = MarchKernel(steep, fault)
-    gate = SimpleNamespace(gate_decisions=lambda w, x: steep.occupancy.query(x) >= w.facts[10])
-    monkeypatch.setattr(fused, "ready", lambda device, name="gate": name not in fused._switch.off)
     monkeypatch.setitem(sys.modules, "leco_plugin.samplers.kernels.march_kernel", kernel)
-    monkeypatch.setitem(sys.modules, "leco_plugin.samplers.kernels.gate_kernel", gate)
+    right_gate(steep, monkeypatch)
     rays = torch.rand(9, 3), torch.randn(9, 3)
     options = {"render_step_size": 0.05, "cone_angle": cone_angle, "far_plane": 4.0}
     with caplog.at_level(logging.WARNING):
         samples = [steep.sampling(*rays, **options) for _ in range(2)]
-    assert kernel.calls == 1 and fused._switch.off == {"march"}  # the gate goes on
+    assert kernel.calls == 1 and fused._off == {"march"}  # the gate goes on
     with fused.twins_only():
         wanted = steep.sampling(*rays, **options)
     assert all(map(torch.equal, samples[0], wanted)) and all(map(torch.equal, samples[1], wanted))
@@ -133,12 +138,11 @@ def test_a_march_that_keeps_otherwise_is_never_believed(
     assert len(said) == 1 and "the fused march does not run" in said[0] and "\n" not in said[0]
 
 
+@pytest.mark.usefixtures("on_any_device")
 def test_a_march_is_compared_with_its_twin_once_for_each_kind_of_step(steep, monkeypatch) -> None:
     kernel = MarchKernel(steep, "none")
-    gate = SimpleNamespace(gate_decisions=lambda w, x: steep.occupancy.query(x) >= w.facts[10])
-    monkeypatch.setattr(fused, "ready", lambda device, name="gate": name not in fused._switch.off)
     monkeypatch.setitem(sys.modules, "leco_plugin.samplers.kernels.march_kernel", kernel)
-    monkeypatch.setitem(sys.modules, "leco_plugin.samplers.kernels.gate_kernel", gate)
+    right_gate(steep, monkeypatch)
     calls = []
     for cone_angle in (0.0, 0.0, 0.01, 0.0, 0.01):
         steep.sampling(
@@ -148,13 +152,13 @@ def test_a_march_is_compared_with_its_twin_once_for_each_kind_of_step(steep, mon
             far_plane=4.0,
         )
         calls.append(kernel.calls)
-    assert calls == [2, 3, 5, 6, 7] and not fused._switch.off
+    assert calls == [2, 3, 5, 6, 7] and not fused._off
 
 
+@pytest.mark.usefixtures("on_any_device")
 def test_a_kernel_that_decides_otherwise_is_never_believed(monkeypatch, caplog) -> None:
     asked = Occupancy(Gate(GateConfig()), Space(), 0.0)
     wrong = SimpleNamespace(gate_decisions=lambda weights, x: torch.zeros(len(x), dtype=bool))
-    monkeypatch.setattr(fused, "ready", lambda device: not fused._switch.off)
     monkeypatch.setitem(sys.modules, "leco_plugin.samplers.kernels.gate_kernel", wrong)
     with caplog.at_level(logging.WARNING):
         assert asked.occupied(torch.rand(50, 3)).all()
@@ -163,6 +167,7 @@ def test_a_kernel_that_decides_otherwise_is_never_believed(monkeypatch, caplog) 
     assert len(said) == 1 and "decides otherwise about" in said[0]
 
 
+@pytest.mark.usefixtures("on_any_device")
 def test_a_kernel_is_compared_with_its_twin_once_for_each_gate(monkeypatch) -> None:
     asked = Occupancy(Gate(GateConfig()), Space(), 0.5)
     sizes: list[int] = []
@@ -171,15 +176,14 @@ def test_a_kernel_is_compared_with_its_twin_once_for_each_gate(monkeypatch) -> N
         sizes.append(len(positions))
         return asked.query(positions) >= asked.threshold_value
 
-    monkeypatch.setattr(fused, "ready", lambda device: not fused._switch.off)
     kernel = SimpleNamespace(gate_decisions=answer)
     monkeypatch.setitem(sys.modules, "leco_plugin.samplers.kernels.gate_kernel", kernel)
     for _ in range(2):
         asked.occupied(torch.rand(50, 3))
-    assert sizes == [trials.CHECKED, 50, 50]
+    assert sizes == [fused.COMPARED, 50, 50]
     asked.threshold_value.fill_(0.25)
     asked.occupied(torch.rand(50, 3))
-    assert sizes[3:] == [trials.CHECKED, 50]
+    assert sizes[3:] == [fused.COMPARED, 50]
 
 
 def test_kernels_are_launched_where_their_tensors_are() -> None:
@@ -187,33 +191,29 @@ def test_kernels_are_launched_where_their_tensors_are() -> None:
     assert isinstance(there, torch.cuda.device) and there.idx == 1
 
 
+@pytest.mark.usefixtures("on_any_device")
 def test_positions_on_another_device_are_no_failure_of_a_kernel(steep, monkeypatch) -> None:
-    monkeypatch.setattr(fused, "ready", lambda device, name="gate": name not in fused._switch.off)
     elsewhere = torch.device("meta")
-    assert fused.decisions(steep.occupancy, torch.empty(9, 3, device=elsewhere)) is None
-
-    def plan() -> Candidates:
-        raise AssertionError("nothing is planned")
-
-    assert fused.march(steep.occupancy, steep.cache, elsewhere, plan) is None
-    assert not fused._switch.off
+    assert fused.decide(steep.occupancy, torch.empty(9, 3, device=elsewhere)) is None
+    rays = Rays(*(torch.empty(shape, device=elsewhere) for shape in ((9, 3), (9, 3), 9, 9)))
+    assert fused.march(steep.occupancy, steep.cache, rays, March(0.1)) is None
+    assert not fused._off
 
 
+@pytest.mark.usefixtures("on_any_device")
 @pytest.mark.parametrize("dtype", [torch.float64, torch.float16])
 def test_positions_that_are_not_in_float32_are_left_to_torch(dtype, steep, monkeypatch) -> None:
-    monkeypatch.setattr(fused, "ready", lambda device, name="gate": name not in fused._switch.off)
     monkeypatch.setitem(sys.modules, "leco_plugin.samplers.kernels.gate_kernel", None)
     places, occupancy = torch.rand(50, 3, dtype=dtype), steep.occupancy
     assert torch.equal(occupancy.occupied(places), occupancy.query(places) >= occupancy.threshold)
-    assert not fused._switch.off
+    assert not fused._off
 
 
+@pytest.mark.usefixtures("on_any_device")
 @pytest.mark.parametrize("cone_angle", [0.0, 0.01])
 def test_rays_in_double_are_left_to_torch(cone_angle: float, steep, monkeypatch) -> None:
     torch.manual_seed(0)
-    gate = SimpleNamespace(gate_decisions=lambda w, x: steep.occupancy.query(x) >= w.facts[10])
-    monkeypatch.setattr(fused, "ready", lambda device, name="gate": name not in fused._switch.off)
-    monkeypatch.setitem(sys.modules, "leco_plugin.samplers.kernels.gate_kernel", gate)
+    right_gate(steep, monkeypatch)
     monkeypatch.setitem(sys.modules, "leco_plugin.samplers.kernels.march_kernel", None)
     rays = torch.rand(9, 3).double(), torch.randn(9, 3).double()
     options = {"render_step_size": 0.05, "cone_angle": cone_angle, "far_plane": 4.0}
@@ -221,7 +221,7 @@ def test_rays_in_double_are_left_to_torch(cone_angle: float, steep, monkeypatch)
     with fused.twins_only():
         wanted = steep.sampling(*rays, **options)
     assert len(samples[0]) > 0 and samples[1].dtype == torch.float64
-    assert all(map(torch.equal, samples, wanted)) and not fused._switch.off
+    assert all(map(torch.equal, samples, wanted)) and not fused._off
 
 
 def test_rays_without_an_end_are_no_failure_of_a_kernel() -> None:
@@ -229,14 +229,14 @@ def test_rays_without_an_end_are_no_failure_of_a_kernel() -> None:
         raise TooManyCandidates("over 2^24 steps")
 
     with pytest.raises(ValueError, match="over 2"):
-        fused.tried("march", endless, torch.device("cpu"))
-    assert not fused._switch.off
+        fused.attempt("march", endless, torch.device("cpu"))
+    assert not fused._off
 
 
 def test_twins_only_is_over_afterwards() -> None:
     with fused.twins_only():
-        assert fused._switch.off
-    assert not fused._switch.off
+        assert fused._off
+    assert not fused._off
 
 
 @pytest.mark.gpu
@@ -245,7 +245,7 @@ def test_sampling_waits_once_for_the_device() -> None:
     rays = torch.rand(64, 3, device="cuda"), torch.randn(64, 3, device="cuda")
     options = {"render_step_size": 0.05, "far_plane": 4.0}
     made.sampling(*rays, **options)  # compiled, and tried
-    assert fused.ready(made.device, "march")
+    assert fused.is_ready(made.device, "march")
     torch.cuda.set_sync_debug_mode("warn")
     try:
         with pytest.warns(UserWarning, match="synchronizing") as said:

@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+import nerfacc
 import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from samplers.analytic_occupancy import Balls, camera_rays
 
-from leco_plugin.samplers.grid import DenseEstimator, OccupancyGridEstimator, lookup
+from leco_plugin.samplers import grid as module
+from leco_plugin.samplers.base import DenseEstimator
+from leco_plugin.samplers.boxes import lookup
+from leco_plugin.samplers.grid import OccupancyGridEstimator
 
 BOX = [-0.5, -0.4, -0.3, 0.7, 0.8, 0.5]
 
@@ -50,36 +54,28 @@ def test_levels_are_nested_boxes_of_twice_the_size():
     assert grid.bounds().equal(grid.aabbs[-1])
 
 
-def test_an_update_keeps_the_larger_of_faded_and_new_and_thresholds_at_the_mean():
-    grid = OccupancyGridEstimator(BOX, resolution=8).train()
-    grid.occs.fill_(0.5)
-    left = grid.aabbs[0, :3] + torch.tensor([0.6, 0.0, 0.0])
-    grid.update_every_n_steps(0, lambda x: (x[:, :1] < left[0]) * 0.9, occ_thre=10.0)
-    occs = grid.occs.view(8, 8, 8)
-    torch.testing.assert_close(occs[:4], torch.full((4, 8, 8), 0.9))
-    torch.testing.assert_close(occs[4:], torch.full((4, 8, 8), 0.5 * 0.95))
-    assert grid.binaries[0, :4].all()
-    assert not grid.binaries[0, 4:].any()
-    grid.update_every_n_steps(16, lambda x: x[:, 0] * 0.0, occ_thre=1e-2)
-    assert grid.binaries.all()  # the threshold is the lesser of occ_thre and the mean
-
-
-def test_after_warm_up_a_share_of_the_cells_is_asked_every_n_steps():
-    grid = OccupancyGridEstimator(BOX, resolution=8, levels=2).train()
+@pytest.mark.parametrize("shape", [(-1,), (-1, 1)])
+def test_updates_are_nerfaccs_in_parts_that_fit_memory(shape, monkeypatch):
+    monkeypatch.setattr(module, "CELLS_AT_ONCE", 100)
+    ours = OccupancyGridEstimator(BOX, resolution=8, levels=2).train()
+    theirs = nerfacc.OccGridEstimator(BOX, resolution=8, levels=2).train()
+    assert ours.state_dict().keys() == theirs.state_dict().keys()
     asked = []
 
     def occ_eval_fn(positions):
         asked.append(len(positions))
-        return torch.zeros(len(positions), 1)
+        return (positions * 7.0).sin().abs().sum(dim=-1).view(shape) * 0.01
 
-    grid.update_every_n_steps(7, occ_eval_fn)
-    assert not asked
-    grid.update_every_n_steps(16, occ_eval_fn)
-    assert asked == [512, 512]
-    grid.update_every_n_steps(256, occ_eval_fn)
-    assert asked[2:] == [128, 128]
-    with pytest.raises(RuntimeError, match="in training only"):
-        grid.eval().update_every_n_steps(0, occ_eval_fn)
+    for grid, field in ((ours, occ_eval_fn), (theirs, lambda x: occ_eval_fn(x).view(-1, 1))):
+        torch.manual_seed(0)
+        asked.clear()
+        for step in (0, 7, 16, 256, 272):
+            grid.update_every_n_steps(step, field)
+        assert (max(asked) <= 100) == (grid is ours)
+    assert all(map(torch.equal, ours.state_dict().values(), theirs.state_dict().values()))
+    assert 0 < int(ours.binaries.sum()) < ours.binaries.numel()
+    with pytest.raises(RuntimeError, match="only during training"):
+        ours.eval().update_every_n_steps(0, occ_eval_fn)
 
 
 def test_a_filled_grid_finds_the_scene():
@@ -103,14 +99,3 @@ def test_impossible_grids_are_refused():
         OccupancyGridEstimator(BOX, resolution=0)
     with pytest.raises(ValueError, match="positive sizes"):
         OccupancyGridEstimator(BOX, levels=0)
-
-
-@settings(deadline=None, max_examples=30)
-@given(seed=st.integers(0, 2**16), levels=st.integers(1, 3))
-def test_the_value_at_a_position_is_that_of_the_cell_that_answers(seed, levels):
-    torch.manual_seed(seed)
-    grid = OccupancyGridEstimator(BOX, resolution=[4, 5, 6], levels=levels)
-    grid.occs.copy_(torch.rand(levels * 120))
-    grid.binaries.copy_(grid.occs.view_as(grid.binaries) > 0.5)
-    positions = torch.randn(60, 3) * 2.0
-    assert torch.equal(grid.values(positions) > 0.5, grid.occupied(positions))

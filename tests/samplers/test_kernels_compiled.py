@@ -18,7 +18,7 @@ from leco_plugin.occupancy import Occupancy
 from leco_plugin.samplers.cells.cache import CacheReport, CellCache, Tables
 from leco_plugin.samplers.kernels import fused
 from leco_plugin.samplers.kernels.gate_weights import GateWeights, gate_weights
-from leco_plugin.samplers.marching import number
+from leco_plugin.samplers.marching import March, Rays, number
 from leco_plugin.space import Space
 
 pytestmark = pytest.mark.filterwarnings("ignore::DeprecationWarning:triton")
@@ -139,8 +139,8 @@ def compile_march(name: str, weights: GateWeights, capability: int, folder: Path
 
     gate, cone_angle, dtype = MARCHES[name]
     cache = cells(Space(GATES[gate][1]), dtype)
-    limits = torch.zeros(5), torch.ones(5)
-    candidates = number(torch.zeros(5, 3), torch.ones(5, 3), *limits, 0.1, cone_angle)
+    rays = Rays(torch.zeros(5, 3), torch.ones(5, 3), torch.zeros(5), torch.ones(5))
+    candidates = number(rays, March(0.1, cone_angle))
     with compiling(march_kernel, "_march_kernel", capability, folder) as compiled:
         march_kernel.march_kept(cache, weights, candidates)
     assert len(compiled) == 1  # nothing ran, nothing was counted, nothing is written

@@ -6,8 +6,7 @@ import pytest
 import torch
 
 from leco_plugin.models.compute import grouped
-from leco_plugin.samplers.kernels import fused
-from leco_plugin.samplers.kernels.off import NAMES, VARIABLE, kernels_off
+from leco_plugin.samplers.kernels import NAMES, VARIABLE, fused, kernels_off
 
 CUDA = torch.device("cuda")
 
@@ -40,12 +39,12 @@ def test_an_unknown_name_is_refused_with_those_that_there_are(monkeypatch) -> No
 
 def test_a_kernel_that_is_off_is_not_tried(monkeypatch) -> None:
     monkeypatch.setattr(torch.version, "cuda", "13.0")
-    monkeypatch.setattr(fused, "_switch", fused._Switch())
+    monkeypatch.setattr(fused, "_off", set())
     monkeypatch.delenv(VARIABLE, raising=False)
-    assert fused.ready(CUDA, "gate") and fused.ready(CUDA, "march")
+    assert fused.is_ready(CUDA, "gate") and fused.is_ready(CUDA, "march")
     monkeypatch.setenv(VARIABLE, "march")
-    assert fused.ready(CUDA, "gate") and not fused.ready(CUDA, "march")
-    assert not fused.ready(torch.device("cpu"))
+    assert fused.is_ready(CUDA, "gate") and not fused.is_ready(CUDA, "march")
+    assert not fused.is_ready(torch.device("cpu"))
 
 
 def test_experts_that_are_off_are_not_grouped(monkeypatch) -> None:

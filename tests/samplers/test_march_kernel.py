@@ -15,7 +15,7 @@ from leco_plugin.samplers.cells.build import build_cache
 from leco_plugin.samplers.estimator import LearnedOccupancyEstimator
 from leco_plugin.samplers.kernels.fused import twins_only
 from leco_plugin.samplers.kernels.gate_weights import gate_weights
-from leco_plugin.samplers.marching import Samples, march, number
+from leco_plugin.samplers.marching import March, Rays, Samples, march, number
 
 pytestmark = ON_KERNELS
 
@@ -34,31 +34,31 @@ def estimator(
     return made
 
 
-def rays(count: int) -> list[torch.Tensor]:
+def rays_of(count: int, t_maxs: torch.Tensor | float, near: float = 0.0) -> Rays:
     origins, directions = camera_rays(count)
-    return [origins.to(DEVICE), directions.to(DEVICE)]
+    t_mins, t_maxs = torch.full((count,), near), torch.as_tensor(t_maxs).expand(count).clone()
+    return Rays(*(tensor.to(DEVICE) for tensor in (origins, directions, t_mins, t_maxs)))
 
 
-def fused(made: LearnedOccupancyEstimator, *arguments, **options) -> Samples:
+def fused(made: LearnedOccupancyEstimator, rays: Rays, rule: March) -> Samples:
     from leco_plugin.samplers.kernels.march_kernel import march_kept
 
     assert made.cache is not None
-    return march_kept(made.cache, gate_weights(made.occupancy), number(*arguments, **options))
+    return march_kept(made.cache, gate_weights(made.occupancy), number(rays, rule))
 
 
-def twin(made: LearnedOccupancyEstimator, *arguments, **options) -> Samples:
-    occupied, near_occupied = made.questions()
+def twin(made: LearnedOccupancyEstimator, rays: Rays, rule: March) -> Samples:
     with twins_only():
-        return march(*arguments, occupied=occupied, near_occupied=near_occupied, **options)
+        return march(rays, rule, *made.questions())
 
 
 def as_set(samples: Samples) -> set[tuple[float, float, float]]:
     return set(zip(*(tensor.tolist() for tensor in samples), strict=True))
 
 
-def assert_same(made: LearnedOccupancyEstimator, *arguments, **options) -> int:
+def assert_same(made: LearnedOccupancyEstimator, rays: Rays, rule: March) -> int:
     """The two agree, but for candidates close to the threshold; how many are kept."""
-    ours, torchs = fused(made, *arguments, **options), twin(made, *arguments, **options)
+    ours, torchs = fused(made, rays, rule), twin(made, rays, rule)
     for one, other in zip(ours, torchs, strict=True):
         assert one.dtype == other.dtype and one.device == other.device
     order = ours[0].double() * 1e6 + ours[1].double()
@@ -69,7 +69,7 @@ def assert_same(made: LearnedOccupancyEstimator, *arguments, **options) -> int:
         found = torch.tensor(differing, device=DEVICE)
         middles = (found[:, 1] + found[:, 2])[:, None] / 2.0
         which = found[:, 0].long()
-        values = made.occupancy.query(arguments[0][which] + arguments[1][which] * middles)
+        values = made.occupancy.query(rays.origins[which] + rays.directions[which] * middles)
         far = (values - made.occupancy.threshold_value).abs()
         # a plane of a cell decides within its own error of the threshold
         assert far.max() < NEAR_THRESHOLD["bfloat16"] + 0.05
@@ -86,17 +86,8 @@ def assert_same(made: LearnedOccupancyEstimator, *arguments, **options) -> int:
     ],
 )
 def test_intervals_are_those_of_the_twin(kind: str, precision: str, cone_angle: float) -> None:
-    count = 6
-    near, far = torch.full((count,), 0.5), torch.linspace(0.4, 5.0, count)
-    kept = assert_same(
-        estimator(kind, precision),
-        *rays(count),
-        near.to(DEVICE),
-        far.to(DEVICE),
-        step_size=STEP,
-        cone_angle=cone_angle,
-    )
-    assert kept > 20
+    rays = rays_of(6, torch.linspace(0.4, 5.0, 6), near=0.5)
+    assert assert_same(estimator(kind, precision), rays, March(STEP, cone_angle)) > 20
 
 
 @pytest.mark.parametrize(
@@ -108,35 +99,21 @@ def test_intervals_are_those_of_the_twin(kind: str, precision: str, cone_angle: 
     ],
 )
 def test_rays_through_tables(encoding: EncodingConfig) -> None:
-    near, far = torch.zeros(3, device=DEVICE), torch.full((3,), 3.0, device=DEVICE)
     made = estimator("box", encoding=encoding)
-    assert assert_same(made, *rays(3), near, far, step_size=STEP) > 10
+    assert assert_same(made, rays_of(3, 3.0), March(STEP)) > 10
 
 
 def test_a_box_and_a_jitter_are_honoured() -> None:
-    count = 3
     generator = torch.Generator().manual_seed(2)
-    jitter = (torch.rand(count, generator=generator) * 8.0).floor() / 8.0
-    assert_same(
-        estimator("box"),
-        *rays(count),
-        torch.zeros(count, device=DEVICE),
-        torch.full((count,), 3.0, device=DEVICE),
-        step_size=STEP,
-        jitter=jitter.to(DEVICE),
-        t_enters=torch.linspace(0.0, 3.5, count, device=DEVICE),
-    )
+    jitter = (torch.rand(3, generator=generator) * 8.0).floor() / 8.0
+    rays = rays_of(3, 3.0).shifted(jitter.to(DEVICE) * STEP)
+    t_enters = torch.linspace(0.0, 3.5, 3, device=DEVICE)
+    assert_same(estimator("box"), rays._replace(t_enters=t_enters), March(STEP))
 
 
 def test_any_step_has_the_edges_of_the_twin_but_for_a_rounding() -> None:
-    made, count = estimator("box"), 2
-    arguments = (
-        *rays(count),
-        torch.zeros(count, device=DEVICE),
-        torch.full((count,), 4.0).to(DEVICE),
-    )
-    ours = fused(made, *arguments, step_size=0.07)
-    torchs = twin(made, *arguments, step_size=0.07)
+    made, rays = estimator("box"), rays_of(2, 4.0)
+    ours, torchs = fused(made, rays, March(0.07)), twin(made, rays, March(0.07))
     assert abs(len(ours[0]) - len(torchs[0])) <= 2
     if len(ours[0]) == len(torchs[0]):
         torch.testing.assert_close(ours[1], torchs[1], atol=1e-6, rtol=0.0)
@@ -144,24 +121,19 @@ def test_any_step_has_the_edges_of_the_twin_but_for_a_rounding() -> None:
 
 @pytest.mark.parametrize("count", [0, 1])
 def test_few_rays_and_rays_without_candidates(count: int) -> None:
-    made = estimator("box")
-    origins, directions = rays(count)
-    nowhere = torch.zeros(count, device=DEVICE), torch.zeros(count, device=DEVICE)
-    samples = fused(made, origins, directions, *nowhere, step_size=STEP)
+    samples = fused(estimator("box"), rays_of(count, 0.0), March(STEP))
     assert [len(tensor) for tensor in samples] == [0, 0, 0]
     assert samples[0].dtype == torch.int64 and samples[1].dtype == torch.float32
 
 
 def test_rays_that_are_no_rays_keep_nothing_and_harm_no_other() -> None:
-    made = estimator("contraction")
-    origins, directions = rays(5)
-    origins[0], origins[1, 2] = torch.nan, torch.inf
-    directions[2], origins[3] = 0.0, 1e20
-    limits = torch.zeros(5, device=DEVICE), torch.full((5,), 3.0, device=DEVICE)
-    limits[1][3] = -1.0
-    samples = fused(made, origins, directions, *limits, step_size=STEP)
+    made, rays = estimator("contraction"), rays_of(5, 3.0)
+    rays.origins[0], rays.origins[1, 2] = torch.nan, torch.inf
+    rays.directions[2], rays.origins[3] = 0.0, 1e20
+    rays.t_maxs[3] = -1.0
+    samples = fused(made, rays, March(STEP))
     assert not torch.isin(samples[0], torch.tensor([0, 1, 2, 3], device=DEVICE)).any()
-    assert as_set(samples) == as_set(twin(made, origins, directions, *limits, step_size=STEP))
+    assert as_set(samples) == as_set(twin(made, rays, March(STEP)))
 
 
 def test_rays_wait_once_for_the_device(monkeypatch) -> None:
@@ -180,16 +152,14 @@ def test_rays_wait_once_for_the_device(monkeypatch) -> None:
             return launch
 
     monkeypatch.setattr(march_kernel, "_march_kernel", Kernel())
-    limits = torch.zeros(count, device=DEVICE), torch.full((count,), 3.0, device=DEVICE)
+    rays = rays_of(count, 3.0)
     with Waits() as waits:
-        candidates = number(*rays(count), *limits, STEP, 1.0 / 64.0)
+        candidates = number(rays, March(STEP, 1.0 / 64.0))
         samples = march_kernel.march_kept(made.cache, weights, candidates)
     assert waits.seen == ["tolist"] and launches == [(count,)] * 2
     assert [len(part) for part in samples] == [3 * count] * 3
 
 
 def test_a_ray_without_an_end_is_named() -> None:
-    origins, directions = rays(2)
-    limits = torch.zeros(2, device=DEVICE), torch.tensor([1.0, 1e10], device=DEVICE)
     with pytest.raises(ValueError, match="give a far plane"):
-        fused(estimator("box"), origins, directions, *limits, step_size=STEP)
+        fused(estimator("box"), rays_of(2, torch.tensor([1.0, 1e10])), March(STEP))

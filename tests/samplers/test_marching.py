@@ -9,11 +9,20 @@ from hypothesis import strategies as st
 from samplers.analytic_occupancy import Balls, camera_rays, slow_march
 from waits import Waits
 
+from leco_plugin.samplers import marching
+from leco_plugin.samplers.boxes import intersect_box
+from leco_plugin.samplers.edges import candidate_counts, candidate_edges
 from leco_plugin.samplers.estimator import LearnedOccupancyEstimator
 from leco_plugin.samplers.grid import OccupancyGridEstimator
-from leco_plugin.samplers.marching import march, rule
-from leco_plugin.samplers.marching.columns import RUN, places_by_column
-from leco_plugin.samplers.marching.rays import intersect_box
+from leco_plugin.samplers.marching import (
+    RUN,
+    March,
+    Rays,
+    by_column,
+    march,
+    places_by_column,
+    places_by_column_in_runs,
+)
 
 finite = st.floats(-2.0, 4.0)
 
@@ -37,44 +46,19 @@ def test_marching_is_one_step_after_the_other(bounds, step_size, cone_angle, chu
     origins, directions = (rays.double() for rays in camera_rays(len(bounds)))
     t_mins, t_maxs = torch.tensor(bounds, dtype=torch.float64).reshape(-1, 2).unbind(-1)
     occupied = (lambda positions: positions[:, 0] > 0.0) if asked else None
-    samples = march(
-        origins,
-        directions,
-        t_mins,
-        t_maxs,
-        step_size=step_size,
-        cone_angle=cone_angle,
-        occupied=occupied,
-        chunk_size=chunk_size,
-    )
+    rays, rule = Rays(origins, directions, t_mins, t_maxs), March(step_size, cone_angle)
+    samples = march(rays, rule, occupied, chunk_size=chunk_size)
     expected = slow_march(origins, directions, t_mins, t_maxs, step_size, cone_angle, occupied)
     assert_marched(samples, expected)
 
 
 def test_neighbours_share_their_edge_exactly():
     origins, directions = camera_rays(20)
+    rays = Rays(origins, directions, torch.zeros(20), torch.full((20,), 3.0))
     for cone_angle in (0.0, 0.01):
-        ray_indices, t_starts, t_ends = march(
-            origins,
-            directions,
-            torch.zeros(20),
-            torch.full((20,), 3.0),
-            step_size=0.01,
-            cone_angle=cone_angle,
-            chunk_size=50,
-        )
+        ray_indices, t_starts, t_ends = march(rays, March(0.01, cone_angle), chunk_size=50)
         same_ray = ray_indices[1:] == ray_indices[:-1]
         assert t_starts[1:][same_ray].equal(t_ends[:-1][same_ray])
-
-
-def test_jitter_shifts_a_ray_by_a_share_of_a_step():
-    origins, directions = camera_rays(10)
-    bounds = torch.zeros(10), torch.full((10,), 2.0)
-    jitter = torch.rand(10)
-    shifted = march(origins, directions, *bounds, step_size=0.1, jitter=jitter)
-    by_hand = march(origins, directions, jitter * 0.1, bounds[1], step_size=0.1)
-    for one, other in zip(shifted, by_hand, strict=True):
-        assert one.equal(other)
 
 
 @pytest.mark.parametrize("cone_angle", [0.0, 0.02])
@@ -82,15 +66,8 @@ def test_entering_late_leaves_candidates_where_they_are(cone_angle):
     origins, directions = camera_rays(30)
     t_mins, t_maxs = torch.zeros(30), torch.full((30,), 3.0)
     t_enters, _ = intersect_box(origins, directions, torch.tensor([-0.5] * 3 + [0.5] * 3))
-    samples = march(
-        origins,
-        directions,
-        t_mins,
-        t_maxs,
-        step_size=0.05,
-        cone_angle=cone_angle,
-        t_enters=t_enters,
-    )
+    rays = Rays(origins, directions, t_mins, t_maxs, t_enters)
+    samples = march(rays, March(0.05, cone_angle))
     expected = slow_march(
         origins.double(), directions.double(), t_mins, t_maxs, 0.05, cone_angle, None, t_enters
     )
@@ -113,11 +90,11 @@ def test_a_coarse_question_changes_the_time_and_not_the_result(uniform):
         asked["near"] += int(answers.sum())
         return answers
 
-    bounds = (origins, directions, t_mins, t_maxs)
-    plain = march(*bounds, step_size=0.01, occupied=balls.occupied)
+    rays, rule = Rays(origins, directions, t_mins, t_maxs), March(0.01)
+    plain = march(rays, rule, balls.occupied)
     questions = balls.asked
     balls.asked = 0
-    coarse = march(*bounds, step_size=0.01, occupied=balls.occupied, near_occupied=near)
+    coarse = march(rays, rule, balls.occupied, near)
     for one, other in zip(plain, coarse, strict=True):
         assert one.equal(other)
     assert balls.asked <= asked["near"] * RUN < 0.5 * questions
@@ -126,18 +103,19 @@ def test_a_coarse_question_changes_the_time_and_not_the_result(uniform):
 def test_bad_rays_have_no_samples_and_good_ones_keep_theirs():
     origins, directions = camera_rays(8)
     t_mins, t_maxs = torch.zeros(8), torch.ones(8)
-    clean = march(origins, directions, t_mins, t_maxs, step_size=0.1)
+    rays = Rays(origins, directions, t_mins, t_maxs)
+    clean = march(rays, March(0.1))
     origins[0, 1], directions[1, 2], origins[2, 0] = torch.nan, torch.nan, torch.inf
     directions[3] = 0.0
     t_mins[4], t_maxs[5] = 2.0, torch.nan
-    ray_indices, t_starts, _ = march(origins, directions, t_mins, t_maxs, step_size=0.1)
+    ray_indices, t_starts, _ = march(rays, March(0.1))
     assert set(ray_indices.tolist()) == {6, 7}
     assert t_starts[ray_indices == 7].equal(clean[1][clean[0] == 7])
 
 
 def test_no_rays_is_no_samples():
-    nothing = torch.zeros(0, 3), torch.zeros(0, 3), torch.zeros(0), torch.zeros(0)
-    ray_indices, t_starts, t_ends = march(*nothing, step_size=0.1)
+    nothing = Rays(torch.zeros(0, 3), torch.zeros(0, 3), torch.zeros(0), torch.zeros(0))
+    ray_indices, t_starts, t_ends = march(nothing, March(0.1))
     assert ray_indices.dtype == torch.int64
     assert ray_indices.shape == t_starts.shape == t_ends.shape == (0,)
 
@@ -145,24 +123,26 @@ def test_no_rays_is_no_samples():
 def test_rays_that_cannot_be_marched_are_refused_in_one_line():
     origins, directions = camera_rays(3)
     ones, zeros = torch.ones(3), torch.zeros(3)
+    rays = Rays(origins, directions, zeros, ones)
     for far in (1e10, torch.inf):
         with pytest.raises(ValueError, match="give a far plane"):
-            march(origins, directions, zeros, ones * far, step_size=1e-3)
+            march(rays._replace(t_maxs=ones * far), March(1e-3))
     with pytest.raises(ValueError, match="begin nearer"):  # too far away to number the steps
-        march(origins, directions, zeros, ones * 3e9, step_size=1.0, t_enters=ones * 2e9)
-    missed = march(origins, directions, zeros, ones * 2e9, step_size=1.0, t_enters=ones * 3e9)
+        march(rays._replace(t_maxs=ones * 3e9, t_enters=ones * 2e9), March(1.0))
+    missed = march(rays._replace(t_maxs=ones * 2e9, t_enters=ones * 3e9), March(1.0))
     assert missed[0].numel() == 0
-    with pytest.raises(ValueError, match=r"rays_d must be \[3, 3\], got \[2, 3\]"):
-        march(origins, directions[:2], zeros, ones, step_size=0.1)
-    with pytest.raises(ValueError, match=r"t_mins must be \[3\], got \[3, 1\]"):
-        march(origins, directions, zeros[:, None], ones, step_size=0.1)
-    with pytest.raises(ValueError, match=r"t_maxs is torch\.float64"):
-        march(origins, directions, zeros, ones.double(), step_size=0.1)
-    with pytest.raises(ValueError, match=r"float32 or float64, got torch\.float16"):
-        march(origins.half(), directions.half(), zeros.half(), ones.half(), step_size=0.1)
-    for step_size, cone_angle in ((0.0, 0.0), (torch.nan, 0.0), (0.1, -1.0)):
+    halves = Rays(*(tensor.half() for tensor in rays[:4]))
+    for wrong, said in (
+        (rays._replace(directions=directions[:2]), r"rays_d must be \[3, 3\], got \[2, 3\]"),
+        (rays._replace(t_mins=zeros[:, None]), r"t_mins must be \[3\], got \[3, 1\]"),
+        (rays._replace(t_maxs=ones.double()), r"t_maxs is torch\.float64"),
+        (halves, r"float32 or float64, got torch\.float16"),
+    ):
+        with pytest.raises(ValueError, match=said):
+            march(wrong, March(0.1))
+    for rule in (March(0.0), March(torch.nan), March(0.1, -1.0)):
         with pytest.raises(ValueError, match="got"):
-            march(origins, directions, zeros, ones, step_size=step_size, cone_angle=cone_angle)
+            march(rays, rule)
 
 
 @pytest.mark.parametrize("length", [0.05, 10.0])
@@ -175,22 +155,22 @@ def test_memory_is_bounded_by_the_chunk(length):
         largest = max(largest, len(positions))
         return positions[:, 0] > 10.0
 
-    bounds = torch.zeros(100), torch.linspace(0.0, length, 100)
-    march(origins, directions, *bounds, step_size=0.01, occupied=occupied, chunk_size=500)
+    rays = Rays(origins, directions, torch.zeros(100), torch.linspace(0.0, length, 100))
+    march(rays, March(0.01), occupied, chunk_size=500)
     assert largest <= 500
 
 
 @pytest.fixture
 def as_on_a_device(monkeypatch):
     """On a CPU packing searches twice, which costs nothing there; elsewhere once."""
-    monkeypatch.setattr(rule, "places_by_column_in_runs", places_by_column)
+    monkeypatch.setattr(marching, "places_by_column_in_runs", places_by_column)
 
 
 @pytest.mark.usefixtures("as_on_a_device")
 @pytest.mark.parametrize("chunk_size", [10**6, 2000])
 def test_of_even_rays_each_chunk_is_waited_for_once(chunk_size):
     origins, directions = camera_rays(100)
-    rays = origins, directions, torch.zeros(100), torch.ones(100)
+    rays = Rays(origins, directions, torch.zeros(100), torch.ones(100))
     chunks = 0
 
     def occupied(positions):
@@ -199,7 +179,7 @@ def test_of_even_rays_each_chunk_is_waited_for_once(chunk_size):
         return positions[:, 0] > 0.0
 
     with Waits() as waits:
-        march(*rays, step_size=0.01, occupied=occupied, chunk_size=chunk_size)
+        march(rays, March(0.01), occupied, chunk_size=chunk_size)
     assert waits.seen == ["tolist"] + ["nonzero"] * chunks
     assert (chunks > 1) == (chunk_size < 10_000)
 
@@ -243,3 +223,53 @@ def test_boxes_are_entered_and_left_where_they_are_cut(seed):
         inside = ((points >= box[:3]) & (points <= box[3:])).all(dim=-1)
         by_bounds = (t >= enters[ray]) & (t <= leaves[ray])
         assert (inside != by_bounds).sum() <= 2  # rounding on the two faces
+
+
+@pytest.mark.parametrize("cone_angle", [0.0, 0.02])
+def test_float32_edges_stay_within_rounding_of_float64(cone_angle):
+    t_mins = torch.rand(50, 1) * 0.1
+    steps = torch.arange(2000.0)
+    edges = candidate_edges(t_mins, steps, 1e-3, cone_angle)
+    exact = candidate_edges(t_mins.double(), steps.double(), 1e-3, cone_angle)
+    torch.testing.assert_close(edges.double(), exact, rtol=5e-6, atol=1e-7)
+
+
+@settings(deadline=None)
+@given(seed=st.integers(0, 2**16), cone_angle=st.sampled_from([0.0, 0.003]))
+def test_the_last_candidate_is_the_last_midpoint_in_front_of_the_end(seed, cone_angle):
+    torch.manual_seed(seed)
+    t_mins = torch.rand(100)
+    t_maxs = t_mins + torch.rand(100) * 5.0
+    counts = candidate_counts(t_mins, t_maxs, 0.01, cone_angle)
+    edges = candidate_edges(t_mins[:, None], torch.arange(1003.0), 0.01, cone_angle)
+    midpoints = (edges[:, :-1] + edges[:, 1:]) * 0.5
+    assert counts.equal((midpoints < t_maxs[:, None]).sum(dim=-1).float())
+    ends = torch.stack([t_maxs, t_mins - 1.0])
+    assert candidate_counts(t_mins, ends, 0.01, cone_angle).equal(
+        torch.stack([counts, torch.zeros(100)])
+    )
+
+
+def slow_by_column(wanted) -> list[tuple[int, int]]:
+    n, m = wanted.shape
+    return [(column, row) for column in range(m) for row in range(n) if wanted[row, column]]
+
+
+@settings(deadline=None, max_examples=40)
+@given(
+    n=st.integers(1, 3 * RUN),
+    m=st.integers(0, 9),
+    share=st.sampled_from([0.0, 0.05, 0.5, 1.0]),
+    seed=st.integers(0, 2**16),
+)
+def test_true_entries_come_by_column_then_row(n, m, share, seed):
+    wanted = torch.rand(n, m, generator=torch.Generator().manual_seed(seed)) < share
+    expected = slow_by_column(wanted)
+    columns, rows = by_column(wanted)
+    assert columns.dtype == rows.dtype == torch.int64
+    assert list(zip(columns.tolist(), rows.tolist(), strict=True)) == expected
+    for function in (places_by_column, places_by_column_in_runs):
+        columns, places = function(wanted)
+        assert columns.dtype == places.dtype == torch.int64
+        assert columns.tolist() == [column for column, _ in expected]
+        assert places.tolist() == [row * m + column for column, row in expected]

@@ -11,7 +11,7 @@ from samplers.analytic_occupancy import camera_rays
 from torch import Tensor
 
 from leco_plugin.samplers import nerfacc_cpu
-from leco_plugin.samplers.marching.rays import intersect_box
+from leco_plugin.samplers.boxes import intersect_box
 
 nerfacc = pytest.importorskip("nerfacc")
 pytestmark = pytest.mark.usefixtures("installed")

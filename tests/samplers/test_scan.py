@@ -8,8 +8,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import Tensor
 
-from leco_plugin.samplers.packed import scan
-from leco_plugin.samplers.packed.scan import (
+from leco_plugin.samplers import scan
+from leco_plugin.samplers.scan import (
     exclusive_prod,
     exclusive_sum,
     inclusive_prod,

@@ -8,8 +8,8 @@ from samplers.analytic_occupancy import Balls, camera_rays
 
 from leco_plugin.samplers import packed
 from leco_plugin.samplers.base import densities_of_samples
-from leco_plugin.samplers.marching import march, plan
-from leco_plugin.samplers.marching.visibility import front_to_back, prune
+from leco_plugin.samplers.marching import March, Rays, march, plan
+from leco_plugin.samplers.visibility import front_to_back, prune
 
 N_RAYS, STEP = 150, 0.01
 BALLS = Balls()
@@ -23,7 +23,7 @@ def density(positions):
 def scene():
     origins, directions = camera_rays(N_RAYS)
     lengths = torch.rand(N_RAYS, generator=torch.Generator().manual_seed(0))
-    return origins, directions, torch.zeros(N_RAYS), lengths * 3.0 + 1.0
+    return Rays(origins, directions, torch.zeros(N_RAYS), lengths * 3.0 + 1.0)
 
 
 def render(samples, sigma_fn):
@@ -37,7 +37,7 @@ def render(samples, sigma_fn):
 
 def test_the_density_of_a_sample_is_that_of_its_middle(scene):
     origins, directions = scene[:2]
-    ray_indices, t_starts, t_ends = march(*scene, step_size=0.5)
+    ray_indices, t_starts, t_ends = march(scene, March(0.5))
     expected = []
     for ray, start, end in zip(*(t.tolist() for t in (ray_indices, t_starts, t_ends)), strict=True):
         middle = origins[ray] + directions[ray] * (0.5 * (start + end))
@@ -54,9 +54,9 @@ def test_the_density_of_a_sample_is_that_of_its_middle(scene):
 @pytest.mark.parametrize("cone_angle", [0.0, 0.01])
 def test_front_to_back_is_pruning_with_fewer_questions(scene, slab, cone_angle):
     sigma_fn = densities_of_samples(density, *scene[:2])
-    samples = march(*scene, step_size=STEP, cone_angle=cone_angle, occupied=BALLS.occupied)
+    samples = march(scene, March(STEP, cone_angle), BALLS.occupied)
     visible = prune(samples, N_RAYS, sigma_fn=sigma_fn, early_stop_eps=1e-3)
-    candidates, _, longest = plan(*scene, STEP, cone_angle)
+    candidates, _, longest = plan(scene, March(STEP, cone_angle))
     asked = 0
 
     def counting(*sample):
@@ -82,8 +82,8 @@ def test_front_to_back_is_pruning_with_fewer_questions(scene, slab, cone_angle):
 
 def test_the_image_changes_by_no_more_than_the_threshold(scene):
     sigma_fn = densities_of_samples(density, *scene[:2])
-    samples = march(*scene, step_size=STEP, occupied=BALLS.occupied)
-    candidates, _, longest = plan(*scene, STEP)
+    samples = march(scene, March(STEP), BALLS.occupied)
+    candidates, _, longest = plan(scene, March(STEP))
     visible = front_to_back(
         candidates, longest, occupied=BALLS.occupied, sigma_fn=sigma_fn, early_stop_eps=1e-4
     )
@@ -94,7 +94,7 @@ def test_the_image_changes_by_no_more_than_the_threshold(scene):
 
 def test_pruning_is_two_comparisons(scene):
     sigma_fn = densities_of_samples(density, *scene[:2])
-    samples = march(*scene, step_size=STEP)
+    samples = march(scene, March(STEP))
     ray_indices, t_starts, t_ends = samples
     sigmas = sigma_fn(t_starts, t_ends, ray_indices)
     expected = packed.render_visibility_from_density(
@@ -110,7 +110,7 @@ def test_pruning_is_two_comparisons(scene):
 
 
 def test_a_capped_threshold_never_rejects_everything(scene):
-    samples = march(*scene, step_size=STEP)
+    samples = march(scene, March(STEP))
     pruned = prune(
         samples,
         N_RAYS,
@@ -125,9 +125,9 @@ def test_nothing_to_see_is_no_samples(scene):
     def never(*_):
         raise AssertionError("the field must not be asked about nothing")
 
-    nowhere = march(*scene, step_size=STEP, occupied=lambda p: torch.zeros(len(p)).bool())
+    nowhere = march(scene, March(STEP), lambda p: torch.zeros(len(p)).bool())
     assert len(prune(nowhere, N_RAYS, sigma_fn=never)[0]) == 0
-    candidates, _, longest = plan(*scene, STEP)
+    candidates, _, longest = plan(scene, March(STEP))
     none = front_to_back(
         candidates,
         longest,
@@ -139,11 +139,11 @@ def test_nothing_to_see_is_no_samples(scene):
 
 
 def test_answers_of_another_shape_are_named(scene):
-    samples = march(*scene, step_size=STEP)
+    samples = march(scene, March(STEP))
     n = len(samples[0])
     with pytest.raises(ValueError, match=rf"must answer \[{n}\], got \[{n}, 1\]"):
         prune(samples, N_RAYS, sigma_fn=lambda *_: torch.ones(n, 1))
-    candidates, _, longest = plan(*scene, STEP)
+    candidates, _, longest = plan(scene, March(STEP))
     with pytest.raises(ValueError, match=r"early_stop_eps in \(0, 1\)"):
         front_to_back(
             candidates, longest, occupied=None, sigma_fn=lambda *s: s[0], early_stop_eps=0.0

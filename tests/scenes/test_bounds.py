@@ -7,7 +7,7 @@ import torch
 from tiny_scene import camera_to_world
 from torch import Tensor
 
-from leco_plugin.samplers.marching.rays import intersect_box
+from leco_plugin.samplers.boxes import intersect_box
 from leco_plugin.scenes.bounds import BoundsConfig, SceneBounds, find_bounds, with_range
 
 

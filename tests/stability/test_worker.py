@@ -12,7 +12,8 @@ import pytest
 from leco_plugin.chart.contenders.contender import Contender
 from leco_plugin.chart.contenders.protocol import Protocol
 from leco_plugin.samplers import registry
-from leco_plugin.samplers.grid import DenseEstimator, nested_boxes
+from leco_plugin.samplers.base import DenseEstimator
+from leco_plugin.samplers.boxes import nested_boxes
 from leco_plugin.samplers.registry import SamplerSpec
 from leco_plugin.stability.capture import Capture
 from leco_plugin.stability.contenders import DENSE_LEVELS, SAMPLERS, contender_of

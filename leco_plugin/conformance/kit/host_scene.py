@@ -13,7 +13,7 @@ from torch import Tensor
 from torch.nn.functional import normalize
 
 from leco_plugin.conformance.kit.scene import CENTRE, DISTANCE, Rays, Slab, box
-from leco_plugin.samplers.marching.rays import intersect_box
+from leco_plugin.samplers.boxes import intersect_box
 
 if TYPE_CHECKING:
     from nerfstudio.cameras.cameras import Cameras

@@ -7,7 +7,7 @@ from torch import Tensor
 
 from leco_plugin.conformance.kit.scene import STEP, Rays, box
 from leco_plugin.conformance.rule import Broken, require
-from leco_plugin.samplers.grid import DenseEstimator
+from leco_plugin.samplers.base import DenseEstimator
 from leco_plugin.samplers.marching import Samples
 
 PARTS = ("ray_indices", "t_starts", "t_ends")

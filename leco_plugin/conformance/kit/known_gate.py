@@ -15,9 +15,10 @@ from leco_plugin.models.encodings import (
     FrequencyEncoding,
     HashEncoding,
     Kind,
+    KPlanesEncoding,
+    VectorMatrixEncoding,
 )
 from leco_plugin.models.gate import Gate, GateConfig
-from leco_plugin.models.planes import KPlanesEncoding, VectorMatrixEncoding
 
 SMALLEST: dict[Kind, EncodingConfig] = {
     "frequency": EncodingConfig("frequency", octaves=1),

@@ -11,8 +11,7 @@ from torch import Tensor, nn
 
 from leco_plugin.conformance.kit.scene import box
 from leco_plugin.hosts.stand_ins import GuidedEstimator, GuidedProposal
-from leco_plugin.samplers.base import Estimator
-from leco_plugin.samplers.grid import DenseEstimator
+from leco_plugin.samplers.base import DenseEstimator, Estimator
 from leco_plugin.samplers.marching import Samples
 
 if TYPE_CHECKING:

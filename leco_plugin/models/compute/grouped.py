@@ -13,7 +13,7 @@ import torch
 from torch import Tensor, nn
 
 from leco_plugin.models.compute.dispatch import permute_rows
-from leco_plugin.samplers.kernels.off import kernels_off
+from leco_plugin.samplers.kernels import kernels_off
 
 Product = Callable[[Tensor, Tensor], Tensor]
 

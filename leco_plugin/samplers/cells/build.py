@@ -45,16 +45,16 @@ RESOLUTIONS = range(8, 65)
 PROBE = 16
 """Coarse cells along the cube at which the gate is looked at first."""
 SCOUT = 24
-"""Coarse cells along the cube from which the size of finer tables is foretold."""
+"""Coarse cells along the cube from which the size of finer tables is predicted."""
 AIM = 0.95
-"""Of the budget, by what is foretold: a look at cells that turn out too small takes a second."""
+"""Share of the budget that predicted tables may take: judging cells too fine costs a second."""
 MARGINS = (LEAST_MARGIN, 0.5, 2.0)
 CAUTIONS = (*(0.6 * 1.1**step for step in range(20)), 5.0, math.inf)
-"""What is tried, in this order; see `CacheReport`."""
+"""Margins and cautions in the order in which they are tried; see `CacheReport`."""
 ROUGH = 0.6
-"""Share of the probe's cells that the gate's boundary may cross: beyond, cells know too little."""
+"""Share of the probe's cells that the gate's boundary may cross; a rougher gate has no cache."""
 ASKED = 0.003
-"""Share of decisions that may be left to the gate; finer cells than that takes are not worth it."""
+"""Share of decisions that may be left to the gate; still finer cells are not worth their time."""
 BRICKS_AT_ONCE = 128
 
 
@@ -69,15 +69,15 @@ def build_cache(
 ) -> CellCache:
     """The finest cache of a frozen occupancy that fits a budget and keeps its decisions.
 
-    Asks the gate about 5 million positions for the default budget, most of them near its boundary.
+    It asks the gate about 5 million positions for the default budget, most near its boundary.
 
     Args:
         occupancy: the frozen gate with its space and threshold.
         budget: most bytes of its tables.
         tolerance: largest share of decisions that may differ from the gate's, at two standard
             deviations above the measured share.
-        check_points: decisions that are compared.
-        seed: of the check.
+        check_points: number of decisions that are compared.
+        seed: of the random positions that are compared.
 
     Returns:
         The cache, on the occupancy's device, with its report.
@@ -102,17 +102,17 @@ def build_cache(
         )
     surface = mixed / PROBE**2
     # A plane leaves open a share of its cell proportional to its size, 0.2 at resolution 32.
-    looked_at = 0.5 + 0.5 / max(1e-3, float((probe != EMPTY).float().mean()))
-    enough = math.sqrt(0.2 * 32 / BRICK * surface * looked_at / ASKED)
+    weight = 0.5 + 0.5 / max(1e-3, float((probe != EMPTY).float().mean()))
+    enough = math.sqrt(0.2 * 32 / BRICK * surface * weight / ASKED)
     positions, by_gate = _decisions(occupancy, probe != EMPTY, check_points, seed)
     report = None
     for margin in MARGINS:
-        # what a look at the probe's cells missed, a look everywhere finds
-        relied_on = seen if margin == LEAST_MARGIN else None
-        built = _largest_tables(occupancy, budget, enough, margin, relied_on)
-        if built is None:
+        # after a failure the gate is asked everywhere: the probe may have missed something
+        look_of_probe = seen if margin == LEAST_MARGIN else None
+        finest = _largest_tables(occupancy, budget, enough, margin, look_of_probe)
+        if finest is None:
             break
-        resolution, tables, doubts = built
+        resolution, tables, doubts = finest
         for caution in CAUTIONS:
             tables.planes[4, : len(doubts)] = (
                 (caution * doubts.clamp(min=1e-6)).ceil().clamp(max=127.0)
@@ -168,7 +168,7 @@ def _largest_tables(
 def _counts(
     occupancy: OccupancyLike, states: Tensor, corners: Tensor, margin: float
 ) -> tuple[int, float]:
-    """How many coarse cells are mixed, and about how many fine ones: some bricks are looked at."""
+    """Number of mixed coarse cells, and an estimate of mixed fine ones from some bricks."""
     mixed = (states == MIXED).nonzero()
     sample = mixed[:: max(1, len(mixed) // BRICKS_AT_ONCE)]
     planes = int((judge_fine(occupancy, corners, sample, margin)[0] == MIXED).sum())
@@ -187,9 +187,9 @@ def _bytes(resolution: int, bricks: float, planes: float) -> float:
 def _tables(
     occupancy: OccupancyLike, states: Tensor, corners: Tensor, margin: float
 ) -> tuple[Tables, Tensor]:
-    """All tables, from the coarse cells as `judge_coarse` gives them, and the planes' doubts [m].
+    """All tables from `judge_coarse`'s cells, and the planes' doubts [m].
 
-    The planes' heights of indecision are left at 0.
+    The heights up to which planes do not decide are left at 0.
     """
     device = states.device
     mixed = (states == MIXED).nonzero()
@@ -224,9 +224,9 @@ def _tables(
 
 
 def _with_open_border(tables: Tables) -> Tables:
-    """Leave to the gate what lies outside the cube: by rounding, or because tau is 0.
+    """The tables with everything outside the cube left to the gate.
 
-    (A bounded occupancy with a threshold is empty outside its box.)
+    (A bounded occupancy with a threshold above 0 is empty there and needs no such border.)
     """
     border = torch.ones_like(tables.coarse, dtype=torch.bool)
     border[1:-1, 1:-1, 1:-1] = False

@@ -1,12 +1,11 @@
 """A frozen gate's decisions on cells, so that only positions near its boundary ask the gate itself.
 
-Three levels in the mapped cube [-1, 1]^3, so that unbounded scenes are covered. A coarse cell is
-empty, occupied or mixed. A mixed one owns a brick of 4^3 fine cells, each again empty, occupied or
-mixed. A mixed fine cell holds a plane, the gate's logit to first order, with the error to expect
-of it: beside the plane it decides, on it the gate is asked. Where a
-2-bit state for each cell would leave 2% of the cube to the gate, a plane for each mixed cell of
-half the resolution leaves 0.5% in the same memory. See `judging.py` for how cells are
-judged and `build.py` for how many there are.
+The cache has three levels in the mapped cube [-1, 1]^3, so that unbounded scenes are covered. A
+coarse cell is empty, occupied or mixed. A mixed one owns a brick of 4^3 fine cells, each again
+empty, occupied or mixed. A mixed fine cell holds a plane, the gate's logit to first order, with its
+expected error: further from the plane than this it decides, nearer the gate is asked. A 2-bit state
+for each cell would leave 2% of the cube to the gate; a plane for each mixed cell of half the
+resolution leaves 0.5% in the same memory.
 """
 
 from __future__ import annotations
@@ -65,7 +64,7 @@ class OccupancyLike(Protocol):
 
 @dataclass(frozen=True)
 class CacheReport:
-    """What building a cache found; stored beside it."""
+    """Figures of a built cache."""
 
     resolution: int
     """Coarse cells along the cube; there are four times as many fine ones."""
@@ -122,7 +121,7 @@ class CellCache(nn.Module):
     """
 
     coarse: Tensor
-    judged: Tensor
+    bricks: Tensor
     first_plane: Tensor
     planes: Tensor
     clearance: Tensor
@@ -147,7 +146,7 @@ class CellCache(nn.Module):
         uniform = uniform.to(tables.fine.device).expand(UNIFORM, BRICK**3)
         derived = {
             "coarse": tables.coarse,
-            "judged": torch.cat([uniform, tables.fine]),
+            "bricks": torch.cat([uniform, tables.fine]),
             "first_plane": tables.first_plane,
             "planes": tables.planes,
             "clearance": tables.clearance,
@@ -173,7 +172,7 @@ class CellCache(nn.Module):
     def tables(self) -> Tables:
         """The tables, where they are now."""
         return Tables(
-            self.coarse, self.judged[UNIFORM:], self.first_plane, self.planes, self.clearance
+            self.coarse, self.bricks[UNIFORM:], self.first_plane, self.planes, self.clearance
         )
 
     def decide(self, positions: Tensor) -> tuple[Tensor, Tensor]:
@@ -191,7 +190,7 @@ class CellCache(nn.Module):
         coarse = _flat(corners >> BRICK_BITS, self.resolution + 2)
         brick = self.coarse.index_select(0, coarse).to(torch.int32)
         at = torch.add(_flat(corners.bitwise_and_(BRICK - 1), BRICK), brick, alpha=BRICK**3)
-        known = self.judged.view(-1).index_select(0, at.add_(UNIFORM * BRICK**3))
+        known = self.bricks.view(-1).index_select(0, at.add_(UNIFORM * BRICK**3))
         # An answer in the type of what is compared is found ten times faster on a CPU than a bool.
         occupied = torch.eq(known, FINE_OCCUPIED, out=torch.empty_like(known)).view(torch.bool)
         mixed = torch.lt(known, FINE_EMPTY, out=torch.empty_like(known)).view(torch.bool)

@@ -25,17 +25,17 @@ from leco_plugin.samplers.cells.cache import (
 POINTS_AT_ONCE = 1 << 17
 """Positions that the gate is asked about in one call."""
 TRIALS = 24
-"""Random points of a cell to which its plane is fitted, and which show where it errs."""
+"""Random points of a cell to which its plane is fitted and at which its error is measured."""
 LEAST_MARGIN = 0.1
-"""Of a cell's spread of logits: how far from the threshold it must stay to be called empty."""
+"""Distance from the threshold that a cell's logits must keep, in units of their spread."""
 PLAIN_MARGIN = 0.5
 """Margin of cells that a finer look does not ask about again."""
 CLOSE = 0.5
-"""Margin within which a fine cell that seems empty or occupied is tried at such points as well."""
+"""Margin below which an empty or occupied fine cell is also checked at random points."""
 
 
 class Look(NamedTuple):
-    """What a look at the whole cube shows, and where a finer one has to ask the gate again."""
+    """Logits of the whole cube, and where a finer look has to ask the gate again."""
 
     corners: Tensor
     """Logits above the threshold's at the points of a lattice, [m + 1]^3."""
@@ -44,7 +44,7 @@ class Look(NamedTuple):
 
 
 def look(occupancy: OccupancyLike, resolution: int) -> tuple[Tensor, Look]:
-    """States of coarse cells, judged with the smallest margin, and what finer looks may rely on."""
+    """States of coarse cells at the smallest margin, and what finer looks may interpolate."""
     states, corners = judge_coarse(occupancy, resolution, LEAST_MARGIN)
     low, high = _extremes(corners)
     unsure = (_judge(low, high, PLAIN_MARGIN) == MIXED).float()[None, None]
@@ -133,8 +133,8 @@ def judge_fine(
     low, high = values.amin(dim=-1), values.amax(dim=-1)
     states = _judge(low, high, margin)
     close = (states != MIXED) & (_judge(low, high, max(margin, CLOSE)) == MIXED)
-    tried = logits_above(occupancy, _random_points(places[close], size)[0])
-    differs = (tried.view(-1, TRIALS) >= 0.0) != (states[close] == OCCUPIED)[:, None]
+    within = logits_above(occupancy, _random_points(places[close], size)[0])
+    differs = (within.view(-1, TRIALS) >= 0.0) != (states[close] == OCCUPIED)[:, None]
     states[close] = states[close].masked_fill(differs.any(dim=1), MIXED)
     mixed = states == MIXED
     return states, values[mixed], places[mixed]

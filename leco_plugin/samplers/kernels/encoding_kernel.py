@@ -34,12 +34,12 @@ def frequencies(u, v, w, OCTAVES: tl.constexpr, COLUMNS: tl.constexpr):
     coordinates = tl.where(
         axis == 0, u[:, None], tl.where(axis == 1, v[:, None], w[:, None])
     )  # [ROWS, COLUMNS]
-    sines, cosines = _turned(coordinates * scale)
+    sines, cosines = _sines_and_cosines(coordinates * scale)
     return tl.where(turning[None, :], sines, coordinates), cosines
 
 
 @triton.jit
-def _turned(half_turns):
+def _sines_and_cosines(half_turns):
     """sin(pi y) and cos(pi y), to 1e-7."""
     shifted = half_turns + _ROUNDING
     part = half_turns - (shifted - _ROUNDING)
@@ -53,16 +53,16 @@ def _turned(half_turns):
     cosine = tl.fma(square, cosine, 4.058411352862603)
     cosine = tl.fma(square, cosine, -4.934792830619646)
     cosine = tl.fma(square, cosine, 0.9999999532476083)
-    return _signed(part * sine, odd), _signed(cosine, odd)
+    return _flip_sign(part * sine, odd), _flip_sign(cosine, odd)
 
 
 @triton.jit
-def _signed(values, sign_bits):
+def _flip_sign(values, sign_bits):
     return (values.to(tl.int32, bitcast=True) ^ sign_bits).to(tl.float32, bitcast=True)
 
 
 @triton.jit
-def looked_up(
+def look_up(
     u,
     v,
     w,
@@ -77,7 +77,7 @@ def looked_up(
     """Features of a hash grid, of vector-matrix products or of K-planes."""
     u, v, w = u[:, None], v[:, None], w[:, None]
     if KIND == _HASH:
-        return _hashed(u, v, w, tables, grids, COLUMNS, LEVELS, FEATURES, MASK)
+        return _hash_grid(u, v, w, tables, grids, COLUMNS, LEVELS, FEATURES, MASK)
     if KIND == _VM:
         return _vector_matrix(u, v, w, tables, grids, COLUMNS, FEATURES)
     return _planes(u, v, w, tables, grids, COLUMNS, LEVELS, FEATURES)
@@ -94,7 +94,7 @@ def _level(grids, COLUMNS: tl.constexpr, LEVELS: tl.constexpr, FEATURES: tl.cons
 
 
 @triton.jit
-def _hashed(
+def _hash_grid(
     u,
     v,
     w,

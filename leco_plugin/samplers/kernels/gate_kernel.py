@@ -13,7 +13,7 @@ import triton
 import triton.language as tl
 from torch import Tensor
 
-from leco_plugin.samplers.kernels.encoding_kernel import frequencies, looked_up
+from leco_plugin.samplers.kernels.encoding_kernel import frequencies, look_up
 from leco_plugin.samplers.kernels.gate_weights import FREQUENCY, GateWeights
 
 INTERPRETED = os.environ.get("TRITON_INTERPRET") == "1"
@@ -23,7 +23,7 @@ _INTERPRETED, _FREQUENCY = tl.constexpr(INTERPRETED), tl.constexpr(FREQUENCY)
 
 
 @triton.jit
-def mapped_of(x, y, z, facts, CONTRACTED: tl.constexpr):
+def map_position(x, y, z, facts, CONTRACTED: tl.constexpr):
     """`Space.map` of positions, and whether they lie in the cube and the walls."""
     half_extent = tl.load(facts + 3)
     u = tl.div_rn(x - tl.load(facts), half_extent)
@@ -61,7 +61,7 @@ def _once(values):
 
 
 @triton.jit
-def _multiplied(features, matrix, sums, HALF: tl.constexpr):
+def _multiply(features, matrix, sums, HALF: tl.constexpr):
     """sums + features matrix, with the features rounded to the type of the matrix."""
     if HALF:
         features = features.to(tl.bfloat16)
@@ -71,7 +71,7 @@ def _multiplied(features, matrix, sums, HALF: tl.constexpr):
 
 
 @triton.jit
-def _loaded(matrices, ROWS: tl.constexpr, COLUMNS: tl.constexpr):
+def _load(matrices, ROWS: tl.constexpr, COLUMNS: tl.constexpr):
     rows, columns = tl.arange(0, ROWS), tl.arange(0, COLUMNS)
     return tl.load(matrices + rows[:, None] * COLUMNS + columns[None, :])
 
@@ -113,13 +113,13 @@ def _half_layer(
 ):
     if IN == 128:
         low, high = _halves(features, ROWS, IN)
-        sums = _multiplied(low, _loaded(matrices, IN // 2, OUT), sums, HALF)
-        return _multiplied(high, _loaded(matrices + IN // 2 * OUT, IN // 2, OUT), sums, HALF)
-    return _multiplied(features, _loaded(matrices, IN, OUT), sums, HALF)
+        sums = _multiply(low, _load(matrices, IN // 2, OUT), sums, HALF)
+        return _multiply(high, _load(matrices + IN // 2 * OUT, IN // 2, OUT), sums, HALF)
+    return _multiply(features, _load(matrices, IN, OUT), sums, HALF)
 
 
 @triton.jit
-def _activated(sums, biases, WIDTH: tl.constexpr, HALF: tl.constexpr):
+def _activate(sums, biases, WIDTH: tl.constexpr, HALF: tl.constexpr):
     """Bias and ReLU; rounded where the twin's layer answers in bfloat16."""
     hidden = tl.maximum(sums + tl.load(biases + tl.arange(0, WIDTH))[None, :], 0.0)
     return hidden.to(tl.bfloat16).to(tl.float32) if HALF else hidden
@@ -152,7 +152,7 @@ def gate_keeps(
     HALF: tl.constexpr,
 ):
     """The gate's decisions about positions [ROWS]."""
-    u, v, w, inside = mapped_of(x, y, z, facts, CONTRACTED)
+    u, v, w, inside = map_position(x, y, z, facts, CONTRACTED)
     u, v, w = tl.where(inside, u, 0.0), tl.where(inside, v, 0.0), tl.where(inside, w, 0.0)
     u, v, w = _once(u), _once(v), _once(w)
 
@@ -162,16 +162,16 @@ def gate_keeps(
         sums = _layer(cosines, matrices, sums, ROWS, COLUMNS, PADDED, HALF)
         matrices += COLUMNS * PADDED
     else:
-        features = looked_up(u, v, w, tables, grids, COLUMNS, KIND, LEVELS, FEATURES, MASK)
+        features = look_up(u, v, w, tables, grids, COLUMNS, KIND, LEVELS, FEATURES, MASK)
     sums = _layer(features, matrices, sums, ROWS, COLUMNS, PADDED, HALF)
     matrices += COLUMNS * PADDED
-    hidden = _activated(sums, vectors, PADDED, HALF)
+    hidden = _activate(sums, vectors, PADDED, HALF)
     vectors += PADDED
     for _ in tl.static_range(LAYERS - 1):
         sums = tl.zeros((ROWS, PADDED), tl.float32)
         sums = _layer(hidden, matrices, sums, ROWS, PADDED, PADDED, HALF)
         matrices += PADDED * PADDED
-        hidden = _activated(sums, vectors, PADDED, HALF)
+        hidden = _activate(sums, vectors, PADDED, HALF)
         vectors += PADDED
 
     mean = tl.sum(hidden, axis=1) / WIDTH

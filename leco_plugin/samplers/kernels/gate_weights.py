@@ -93,10 +93,10 @@ def why_not(occupancy: Any, most_width: int = MOST_WIDTH) -> str | None:
 def gate_weights(occupancy: Any) -> GateWeights:
     """The weights of an occupancy for which `why_not` finds nothing, on its device."""
     with torch.autocast(occupancy.threshold_value.device.type, enabled=False):  # the host may be
-        return _packed(occupancy)
+        return _pack(occupancy)
 
 
-def _packed(occupancy: Any) -> GateWeights:
+def _pack(occupancy: Any) -> GateWeights:
     gate, space = occupancy.gate, occupancy.space
     config, half = gate.config, occupancy.precision == "bfloat16"
     width, logits, columns = config.width, 1 + config.scene_experts, power_of_two(_columns(gate))
@@ -104,10 +104,10 @@ def _packed(occupancy: Any) -> GateWeights:
     first, *others = (layer.weight.float().T for layer in gate.hidden)
     last = (gate.head.weight.float() * gate.norm.weight.float()).T
     matrices = [
-        *(_padded(matrix, columns, padded) for matrix in _of_features(first, config.encoding)),
-        *(_padded(matrix, padded, padded) for matrix in others),
+        *(_pad(matrix, columns, padded) for matrix in _of_features(first, config.encoding)),
+        *(_pad(matrix, padded, padded) for matrix in others),
     ]
-    last = _padded(last, padded, padded_logits)
+    last = _pad(last, padded, padded_logits)
     rounded = last.to(torch.bfloat16).float()
     # a bfloat16 feature times a float32 weight, as two exact products of bfloat16
     matrices += [rounded, last - rounded] if half else [last]
@@ -115,16 +115,16 @@ def _packed(occupancy: Any) -> GateWeights:
     biases = [bias.to(torch.bfloat16).float() if half else bias for bias in biases]
     constant = gate.head.weight.float() @ gate.norm.bias.float() + gate.head.bias.float()
     vectors = [
-        *(_padded(bias[None], 1, padded) for bias in biases),
+        *(_pad(bias[None], 1, padded) for bias in biases),
         last.sum(dim=0),
-        _padded(constant[None], 1, padded_logits),
+        _pad(constant[None], 1, padded_logits),
     ]
     facts = [space.center, space.half_extent, occupancy.walls, occupancy.threshold_value]
     return GateWeights(
         facts=torch.cat([fact.reshape(-1).float() for fact in facts]),
         matrices=_flat(matrices).to(torch.bfloat16 if half else torch.float32),
         vectors=_flat(vectors),
-        **_looked_up(gate, facts[0].device),
+        **_encoding_of(gate, facts[0].device),
         columns=columns,
         width=width,
         padded_width=padded,
@@ -151,7 +151,7 @@ def _of_features(first: Tensor, config: Any) -> list[Tensor]:
     return [cosines, torch.cat([sines, coordinates])]
 
 
-def _looked_up(gate: Any, device: torch.device) -> dict[str, Any]:
+def _encoding_of(gate: Any, device: torch.device) -> dict[str, Any]:
     """What the kernel is told of a gate's encoding."""
     config, encoding = gate.config.encoding, gate.encoding
     levels, features, mask = 1, 1, 0
@@ -186,7 +186,7 @@ def power_of_two(size: int) -> int:
     return max(16, 1 << (size - 1).bit_length())
 
 
-def _padded(matrix: Tensor, rows: int, columns: int) -> Tensor:
+def _pad(matrix: Tensor, rows: int, columns: int) -> Tensor:
     height, width = matrix.shape
     return torch.nn.functional.pad(matrix, (0, columns - width, 0, rows - height))
 

@@ -10,7 +10,7 @@ from leco_plugin.models.color_head import ColorHead
 from leco_plugin.models.rendering import Rays, backdrop_of, with_backdrop
 from leco_plugin.models.switch.field import Answers
 from leco_plugin.models.switch.rendering import coarse_and_fine, kept_by, render
-from leco_plugin.samplers.grid import DenseEstimator
+from leco_plugin.samplers.base import DenseEstimator
 from leco_plugin.space import Space
 
 SPACE = Space("box", half_extent=10.0)

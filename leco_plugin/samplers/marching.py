@@ -2,9 +2,10 @@
 
 The rule is that of nerfacc's `traverse_grids`: intervals of length dt(t) = max(t cone_angle,
 step_size) follow one another from t_min, and an interval is a candidate while its midpoint lies in
-front of t_max; its midpoint is the position that is asked. Edge k has a closed form (`edges.py`).
+front of t_max; its midpoint is the position that is asked.
 Steps are the rows and rays the columns of everything here: what is broadcast, a ray's origin or a
 step's number, is then read in long rows, which a CPU does five times faster than in short ones.
+Packed samples are the true entries of a matrix of answers in the order of columns.
 """
 
 from __future__ import annotations
@@ -14,16 +15,19 @@ from collections.abc import Callable, Iterator
 import torch
 from torch import Tensor
 
-from leco_plugin.samplers.marching.candidates import (
-    Candidates,
-    plan,
-)
-from leco_plugin.samplers.marching.columns import (
-    RUN,
-    by_column,
-    places_by_column,
-    places_by_column_in_runs,
-)
+from leco_plugin.samplers.rays import Candidates, March, Rays, number, plan
+
+__all__ = [
+    "Candidates",
+    "March",
+    "NearFn",
+    "OccupiedFn",
+    "Rays",
+    "Samples",
+    "march",
+    "number",
+    "plan",
+]
 
 OccupiedFn = Callable[[Tensor], Tensor]
 """Positions [N, 3] to bool [N]."""
@@ -40,69 +44,59 @@ DEVICE_CHUNK = 1 << 22
 """Positions asked at once: what fits the cache of a CPU core; elsewhere a training batch, because
 each chunk there waits for the device."""
 
+RUN_BITS = 4
+RUN = 1 << RUN_BITS
+"""Candidates of a run: long enough to work on at once, short enough to waste little."""
+
 
 @torch.no_grad()
 def march(
-    origins: Tensor,
-    directions: Tensor,
-    t_mins: Tensor,
-    t_maxs: Tensor,
-    *,
-    step_size: float,
-    cone_angle: float = 0.0,
-    jitter: Tensor | None = None,
+    rays: Rays,
+    rule: March,
     occupied: OccupiedFn | None = None,
     near_occupied: NearFn | None = None,
-    t_enters: Tensor | None = None,
+    *,
     chunk_size: int | None = None,
 ) -> Samples:
     """Candidates along rays, without those that `occupied` denies.
 
     Args:
-        origins: ray origins, world units, float32 or float64 [n_rays, 3].
-        directions: ray directions [n_rays, 3]; t counts in multiples of their length.
-        t_mins, t_maxs: where each ray is marched, [n_rays].
-        step_size: shortest step, world units, > 0.
-        cone_angle: growth of the step with distance, >= 0; 0 is a constant step.
-        jitter: in [0, 1), [n_rays]: shifts all candidates of a ray by that share of `step_size`
-            (stratified sampling); None is deterministic.
+        rays: of any number; one that is not finite, has no direction or t_min >= t_max has no
+            samples.
+        rule: the steps along them.
         occupied: which positions to keep; None keeps every candidate. Positions come with each
             coordinate contiguous (strides (1, N)): cheapest to make and to read.
         near_occupied: a coarse question, asked first and once for 16 candidates in a row; where it
             answers False, `occupied` would deny them all. It changes the time, not the result.
-        t_enters: leave out candidates whose midpoint lies in front of this, [n_rays]: where a ray
-            enters a box, without moving the candidates inside it.
         chunk_size: most positions asked at once (a run of 16 at least).
 
     Returns:
         ray_indices int64 [n_samples], t_starts [n_samples], t_ends [n_samples], sorted by ray,
-        then t. A ray that is not finite, has no direction or t_min >= t_max has no samples.
+        then t.
 
     Raises:
         ValueError: shapes, types or devices do not fit; a step is not positive; a ray would have
             more than 2^24 candidates (usually a missing far plane).
     """
-    candidates, shortest, longest = plan(
-        origins, directions, t_mins, t_maxs, step_size, cone_angle, jitter, t_enters
-    )
+    candidates, shortest, longest = plan(rays, rule)
     if chunk_size is None:
-        chunk_size = CPU_CHUNK if origins.device.type == "cpu" else DEVICE_CHUNK
+        chunk_size = CPU_CHUNK if rays.origins.device.type == "cpu" else DEVICE_CHUNK
     in_runs = near_occupied is not None or shortest < longest
     at_once = chunk_size * RUN if in_runs else chunk_size  # a run is one coarse question
     runs_at_once = max(1, chunk_size // RUN)
     kept: list[Samples] = []
     for first_ray, tile, n_steps in tiles(candidates, longest, at_once):
         if not in_runs:
-            rays, t_starts, t_ends = keep_steps(tile, n_steps, None, occupied)
-            kept.append((rays + first_ray, t_starts, t_ends))
+            of_tile, t_starts, t_ends = keep_steps(tile, n_steps, None, occupied)
+            kept.append((of_tile + first_ray, t_starts, t_ends))
             continue
-        rays, runs = cut(tile, n_steps, near_occupied)
-        rays += first_ray
-        for first_run in range(0, len(rays), runs_at_once):
+        of_runs, runs = cut(tile, n_steps, near_occupied)
+        of_runs += first_ray
+        for first_run in range(0, len(of_runs), runs_at_once):
             part = slice(first_run, first_run + runs_at_once)
             dense = near_occupied is not None
-            kept.append(keep_steps(runs.of_rays(part), RUN, rays[part], occupied, dense))
-    return join(kept, origins)
+            kept.append(keep_steps(runs.of_rays(part), RUN, of_runs[part], occupied, dense))
+    return join(kept, rays.origins)
 
 
 def tiles(
@@ -205,6 +199,43 @@ def cut(
     rays, runs = by_column(wanted)
     first = (runs * RUN).to(numbers.dtype)
     return rays, candidates.of_rays(rays).window(first, RUN)
+
+
+def by_column(wanted: Tensor) -> tuple[Tensor, Tensor]:
+    """Columns and rows of what is true in bool [n, m], int64, by column, then row.
+
+    Waits for the device.
+    """
+    n = len(wanted)
+    chosen = wanted.T.contiguous().view(-1).nonzero()[:, 0]
+    columns = chosen.div(n, rounding_mode="floor")
+    return columns, chosen - columns * n
+
+
+def places_by_column(wanted: Tensor) -> tuple[Tensor, Tensor]:
+    """Columns of what is true in bool [n, m], and its places in the flat matrix, in that order."""
+    columns, rows = by_column(wanted)
+    return columns, torch.add(columns, rows, alpha=wanted.shape[1])
+
+
+def places_by_column_in_runs(wanted: Tensor) -> tuple[Tensor, Tensor]:
+    """The same, faster on a CPU if few runs of rows are not all false.
+
+    What is kept of a ray lies together. On a CPU, where finding true entries takes longer than
+    anything else of the march, most runs of rows are passed over at once. Elsewhere each search
+    would wait for the device, so there is only one.
+    """
+    if wanted.device.type != "cpu":
+        return places_by_column(wanted)
+    n, m = wanted.shape
+    if n % RUN:
+        wanted = torch.cat([wanted, wanted.new_zeros(-n % RUN, m)])
+    some = wanted.view(torch.uint8).unflatten(0, (-1, RUN)).amax(dim=1)
+    columns, runs = by_column(some)
+    first = torch.add(columns, runs, alpha=RUN * m)
+    places = (first[:, None] + torch.arange(RUN) * m).view(-1)
+    chosen = wanted.view(-1).index_select(0, places).nonzero()[:, 0]
+    return columns.index_select(0, chosen >> RUN_BITS), places.index_select(0, chosen)
 
 
 def join(parts: list[Samples], like: Tensor) -> Samples:
