@@ -39,7 +39,7 @@ from leco_plugin.models.gate import GateConfig
 from leco_plugin.models.learning.lifecycle import Lifecycle
 from leco_plugin.models.learning.phases import ScheduleConfig
 from leco_plugin.models.sizing.sizes import sizes_for
-from leco_plugin.scenes.city.capture import CaptureConfig
+from leco_plugin.scenes.city.cameras import CaptureConfig
 from leco_plugin.scenes.city.city import City, CityConfig
 from leco_plugin.scenes.city.folder import write_city
 
