@@ -12,9 +12,9 @@ import torch
 from torch import Tensor
 
 from leco_plugin.samplers.boxes import intersect_box
-from leco_plugin.scenes.city.capture import CaptureConfig, View, views_of
+from leco_plugin.scenes.city.cameras import CaptureConfig, View, views_of
 from leco_plugin.scenes.city.city import City, CityConfig
-from leco_plugin.scenes.city.texture import paint_surface
+from leco_plugin.scenes.city.render import paint_surface
 
 SUN = (0.48, -0.36, 0.8)
 PAIRS = 1 << 24

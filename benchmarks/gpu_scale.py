@@ -8,7 +8,7 @@ from typing import Any
 import torch
 
 from leco_plugin.models.sizing.sizes import PAPER, SMALL, Sizes
-from leco_plugin.scenes.city.capture import CaptureConfig
+from leco_plugin.scenes.city.cameras import CaptureConfig
 from leco_plugin.scenes.city.city import CityConfig
 
 TINY = replace(

@@ -24,7 +24,7 @@ from typing import Any
 import torch
 import tyro
 from growth_figures import bytes_for, exponents, grid_for
-from leco_plugin.learning.held_out_rendering import calibration_rays, dense_rendering
+from leco_plugin.learning.held_out_rendering import calibration_rays
 from nerfstudio.engine.callbacks import TrainingCallbackAttributes
 
 from leco_plugin.evaluation.clock import Clock, warm_up
@@ -33,13 +33,14 @@ from leco_plugin.evaluation.inspection import whole_box
 from leco_plugin.evaluation.json_file import write_json
 from leco_plugin.evaluation.machine import describe_code, describe_machine, made_by
 from leco_plugin.learning.calibration import CalibrationConfig
+from leco_plugin.learning.dense import dense_rendering
 from leco_plugin.learning.learner import Lifecycle
 from leco_plugin.learning.schedule import ScheduleConfig
 from leco_plugin.method_configs import leco_occupancy
 from leco_plugin.models.compute.device import RATES, FusedAdamConfig
 from leco_plugin.models.gate import GateConfig
 from leco_plugin.models.sizing.sizes import sizes_for
-from leco_plugin.scenes.city.capture import CaptureConfig
+from leco_plugin.scenes.city.cameras import CaptureConfig
 from leco_plugin.scenes.city.city import City, CityConfig
 from leco_plugin.scenes.city.folder import write_city
 

@@ -30,7 +30,7 @@ from leco_plugin.models.sizing.scene_sizes import complete
 from leco_plugin.models.sizing.size_limits import values_of
 from leco_plugin.models.sizing.sizes import CHOSEN, Sizes, automatic, size_at, sizes_for, with_size
 from leco_plugin.scenes.bounds import BoundsConfig
-from leco_plugin.scenes.city.capture import CaptureConfig
+from leco_plugin.scenes.city.cameras import CaptureConfig
 from leco_plugin.scenes.city.city import CityConfig
 from leco_plugin.scenes.city.folder import write_city
 from leco_plugin.scenes.detail import CAMERAS, detail_of

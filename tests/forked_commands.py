@@ -11,9 +11,10 @@ import json
 import os
 import subprocess
 import sys
-import traceback
 from pathlib import Path
 from typing import IO
+
+from leco_plugin.scenes.input_error import show_one_line_in_ns_commands
 
 ENTRY_POINTS = {
     "ns-train": "nerfstudio.scripts.train:entrypoint",
@@ -82,13 +83,14 @@ def _run(command: list[str], log: str) -> int:
         os.dup2(printed.fileno(), sys.stdout.fileno())
         os.dup2(printed.fileno(), sys.stderr.fileno())
     sys.argv = command
+    show_one_line_in_ns_commands()
     module, _, function = ENTRY_POINTS[command[0]].partition(":")
     try:
         ended = getattr(importlib.import_module(module), function)()
     except SystemExit as end:
         ended = end.code
     except BaseException:  # noqa: BLE001  as Python itself ends
-        traceback.print_exc()
+        sys.excepthook(*sys.exc_info())
         ended = 1
     if isinstance(ended, str):
         print(ended, file=sys.stderr)

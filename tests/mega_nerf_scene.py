@@ -10,8 +10,8 @@ import numpy as np
 import torch
 
 from leco_plugin.scenes.city.cameras import look_at
-from leco_plugin.scenes.mega_nerf_format.axes import Coordinates
-from leco_plugin.scenes.mega_nerf_format.writer import (
+from leco_plugin.scenes.mega_nerf_format.files import (
+    Coordinates,
     write_coordinates,
     write_mappings,
     write_view,

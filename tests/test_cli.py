@@ -105,7 +105,7 @@ def test_city_writes_a_sky_and_far_terrain_where_that_is_asked_for(tmp_path: Pat
 @pytest.fixture
 def few_rules(monkeypatch: pytest.MonkeyPatch) -> None:
     """Of the rules, those that take no time."""
-    from leco_plugin.conformance import checking
+    from leco_plugin.conformance import cases as checking
 
     monkeypatch.setattr(checking, "RULES", checking.SAMPLER_RULES[:3])
 

@@ -9,11 +9,11 @@ import warnings
 
 import pytest
 
-from leco_plugin.conformance.rule import Broken, Case, Rule, apply
+from leco_plugin.conformance.rules import Broken, Case, Rule, apply
 
 with warnings.catch_warnings():
     warnings.simplefilter("default")  # what nerfstudio warns of at import is no error of theirs
-    from leco_plugin.conformance.checking import host_cases, pairs, sampler_cases
+    from leco_plugin.conformance.cases import host_cases, pairs, sampler_cases
 
 
 def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:

@@ -29,11 +29,8 @@ from leco_plugin.evaluation.reached_volume import (
     rays_of_photographs,
     reached_volume,
 )
-from leco_plugin.learning.held_out_rendering import (
-    calibration_rays,
-    dense_reference,
-    evaluating,
-)
+from leco_plugin.learning.dense import dense_reference, evaluating
+from leco_plugin.learning.held_out_rendering import calibration_rays
 from leco_plugin.models.gate import occupancy_from_logits
 from leco_plugin.models.leco import LecoModel
 from leco_plugin.models.rendering import Rays, mapped_middles

@@ -2,18 +2,37 @@
 
 from __future__ import annotations
 
+import sys
 from pathlib import Path
+from types import TracebackType
 
 
-class InputError(SystemExit, ValueError):
+class InputError(ValueError):
     """Something given to a command is wrong; the message names the cause and the remedy.
 
-    As a `SystemExit` it ends any `ns-*` command with its one line and status 1; as a `ValueError`
-    it is caught by whoever calls these functions as a library.
+    It ends `leco` with this one line and status 2, and `ns-*` commands with it and status 1.
     """
 
-    def __str__(self) -> str:
-        return str(self.code)
+
+def show_one_line_in_ns_commands() -> None:
+    """In a process that is an `ns-*` command, an uncaught `InputError` prints its line alone.
+
+    nerfstudio lets exceptions through to Python, which would print a traceback.
+    """
+    if not any(Path(program).name.startswith("ns-") for program in sys.argv[:1]):
+        return
+    otherwise = sys.excepthook
+
+    def show(kind: type[BaseException], error: BaseException, trace: TracebackType | None) -> None:
+        if isinstance(error, InputError):
+            print(error, file=sys.stderr)
+        else:
+            otherwise(kind, error, trace)
+
+    sys.excepthook = show
+
+
+show_one_line_in_ns_commands()
 
 
 def require(holds: bool, option: str, value: object, wanted: str) -> None:

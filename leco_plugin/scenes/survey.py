@@ -10,6 +10,7 @@ from nerfstudio.cameras.cameras import Cameras
 from torch import Tensor
 
 from leco_plugin.log import say
+from leco_plugin.models.objective import DARK
 from leco_plugin.models.rendering import Rays
 from leco_plugin.samplers.boxes import intersect_box
 from leco_plugin.scenes.bounds import (
@@ -23,7 +24,6 @@ from leco_plugin.scenes.dataset_units import ALTITUDES, DatasetUnits, units_of
 from leco_plugin.scenes.input_error import InputError
 from leco_plugin.scenes.large_coordinates import rounded_by
 from leco_plugin.scenes.photographs import POINT_KEYS
-from leco_plugin.scenes.seen_beyond import seen_beyond
 
 SIDE = 8
 """A grid of this many rays a side covers each image, its corners included."""
@@ -31,6 +31,10 @@ MOST_CAMERAS = 256
 WORTH_IT = 0.005
 """Share of all rays that must go beyond a scene photographed from above and show something there
 for its bounds to be raised."""
+
+
+MOST_PICTURES = 16
+"""Pictures that are opened to see what lies beyond: those with the most rays that miss."""
 
 
 @dataclass(frozen=True)
@@ -216,3 +220,35 @@ def covering_rays(cameras: Cameras, side: int = SIDE) -> tuple[Tensor, Tensor]:
         origins.append(bundle.origins.float())
         directions.append(bundle.directions.float())
     return torch.stack(origins), torch.stack(directions)
+
+
+def seen_beyond(dataset: Any, numbers: Tensor, misses: Tensor) -> float:
+    """Share of the rays that miss the scene and show something all the same.
+
+    Args:
+        dataset: nerfstudio's `InputDataset`.
+        numbers: [C] of the pictures that the rays cover.
+        misses: bool [C, side, side], which rays of a grid over each picture miss.
+    """
+    counts = misses.flatten(1).sum(dim=1)
+    most = counts.argsort(descending=True)[:MOST_PICTURES]
+    shown = [bright(dataset.get_data(int(numbers[i])), misses[i]) for i in most if counts[i] > 0]
+    if not shown:
+        return 0.0
+    return float(torch.cat(shown).float().mean() * misses.float().mean())
+
+
+def bright(data: dict[str, Any], chosen: Tensor) -> Tensor:
+    """Whether chosen pixels of a picture show something that no mask hides: bool [N].
+
+    Args:
+        data: of the dataset: `image` [H, W, 3 or 4] in [0, 1], and `mask` [H, W, 1] if any.
+        chosen: bool [side, side], of a grid from corner to corner.
+    """
+    image = data["image"]
+    height, width = image.shape[:2]
+    places = chosen.nonzero() / (len(chosen) - 1) * torch.tensor([height - 1, width - 1])
+    rows, columns = places.round().long().unbind(dim=-1)
+    pixels = image[rows, columns].float()
+    shown = pixels[:, :3].amax(dim=-1) * (pixels[:, 3] if pixels.shape[-1] == 4 else 1.0) > DARK
+    return shown & data["mask"][rows, columns, 0].bool() if "mask" in data else shown

@@ -6,10 +6,13 @@ import os
 import threading
 from collections.abc import Callable
 from pathlib import Path
-from typing import BinaryIO
+from typing import Any, BinaryIO
+
+from numpy.typing import NDArray
 
 PART = ".part"
 """How the names of unfinished files end."""
+PLY_TYPES = {"f4": "float", "f8": "double", "u1": "uchar"}
 
 
 def write_whole(path: Path, write: Callable[[BinaryIO], object]) -> None:
@@ -31,3 +34,21 @@ def remove_parts(folder: Path) -> None:
     """Deletes what killed processes left half written in a folder and those below it."""
     for part in folder.rglob(f".*{PART}"):
         part.unlink(missing_ok=True)
+
+
+def write_points(path: Path, rows: NDArray[Any]) -> None:
+    """Writes points as a binary PLY file.
+
+    Args:
+        rows: [N] of `xyz`, three floats, and of `rgb`, three or four bytes.
+    Raises:
+        OSError: it cannot be written there.
+    """
+    properties = []
+    for field, names in (("xyz", "x y z"), ("rgb", "red green blue alpha")):
+        kind, shape = rows.dtype[field].subdtype or (rows.dtype[field], (1,))
+        named = names.split()[: shape[0]]
+        properties += [f"property {PLY_TYPES[kind.str[1:]]} {name}" for name in named]
+    count = f"element vertex {len(rows)}"
+    head = ["ply", "format binary_little_endian 1.0", count, *properties, "end_header\n"]
+    write_whole(path, lambda file: file.write("\n".join(head).encode() + rows.tobytes()))

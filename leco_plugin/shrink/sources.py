@@ -16,7 +16,7 @@ from nerfstudio.cameras.rays import RayBundle
 from torch import Tensor
 
 from leco_plugin.evaluation.inspection import cameras_of
-from leco_plugin.learning.field_at_freezing import field_at_freezing
+from leco_plugin.learning.freezing import field_at_freezing
 from leco_plugin.models.leco import LecoModel
 from leco_plugin.models.rendering import Rays
 from leco_plugin.models.scene_rays import cut_to_bounds

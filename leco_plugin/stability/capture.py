@@ -10,8 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.random import Generator
 
-from leco_plugin.scenes.city.cameras import look_at
-from leco_plugin.scenes.city.lens import Lens
+from leco_plugin.scenes.city.cameras import Lens, look_at
 from leco_plugin.stability.matter import Array
 
 RADIUS = 5.0

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from leco_plugin.scenes.city.lens import Lens
+from leco_plugin.scenes.city.cameras import Lens
 from leco_plugin.stability.matter import Array
 
 SAME_PLACE = 0.05

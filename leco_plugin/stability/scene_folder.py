@@ -20,8 +20,9 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from leco_plugin.evaluation.json_file import read_object
-from leco_plugin.scenes.city.layouts import POINTS, TRANSFORMS, write_points
+from leco_plugin.scenes.city.layouts import POINTS, TRANSFORMS
 from leco_plugin.scenes.input_error import InputError
+from leco_plugin.scenes.whole_files import write_points
 from leco_plugin.stability.capture import Capture, Shot, shots_of
 from leco_plugin.stability.coverage import View, shown_by
 from leco_plugin.stability.matter import Array

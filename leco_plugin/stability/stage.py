@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from leco_plugin.scenes.city.lens import Lens
+from leco_plugin.scenes.city.cameras import Lens
 from leco_plugin.stability.matter import Array, Box, Paint, Shape
 
 _SUN = np.array([0.48, -0.36, 0.8])

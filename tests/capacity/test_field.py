@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from leco_plugin.capacity import field
-from leco_plugin.scenes.city.capture import CaptureConfig
+from leco_plugin.scenes.city.cameras import CaptureConfig
 from leco_plugin.scenes.city.city import CityConfig
 from leco_plugin.scenes.city.folder import write_city
 

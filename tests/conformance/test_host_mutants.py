@@ -10,9 +10,8 @@ from conformance.mutant_plugin import write_distribution
 from nerfstudio.configs.method_configs import all_methods
 from nerfstudio.plugins.registry import discover_methods
 
-from leco_plugin.conformance.checking import host_cases, pairs
-from leco_plugin.conformance.hosts.host_rules import HOST_RULES
-from leco_plugin.conformance.rule import apply
+from leco_plugin.conformance.cases import HOST_RULES, host_cases, pairs
+from leco_plugin.conformance.rules import apply
 from leco_plugin.models.hosts import seams
 from leco_plugin.samplers import registry
 

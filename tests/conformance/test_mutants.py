@@ -8,9 +8,8 @@ from conformance.estimator_mutants import MUTANTS
 from conformance.mutant_plugin import write_distribution
 from conformance.proposal_mutants import PROPOSAL_MUTANTS
 
-from leco_plugin.conformance.checking import check, pairs, sampler_cases
-from leco_plugin.conformance.rule import apply
-from leco_plugin.conformance.samplers.sampler_rules import SAMPLER_RULES
+from leco_plugin.conformance.cases import SAMPLER_RULES, check, pairs, sampler_cases
+from leco_plugin.conformance.rules import apply
 
 IN_THIS_PROCESS = tuple(rule for rule in SAMPLER_RULES if rule.name != "two-processes")
 TWO_PROCESSES = tuple(rule for rule in SAMPLER_RULES if rule.name == "two-processes")

@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import pytest
 
-from leco_plugin.conformance.checking import check, host_cases
-from leco_plugin.conformance.hosts.host_rules import HOST_RULES
-from leco_plugin.conformance.rule import apply
+from leco_plugin.conformance.cases import HOST_RULES, check, host_cases
+from leco_plugin.conformance.rules import apply
 from leco_plugin.scenes.input_error import InputError
 
 

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from leco_plugin.conformance.rule import Rule, apply, require
+from leco_plugin.conformance.rules import Rule, apply, require
 
 
 class Case:

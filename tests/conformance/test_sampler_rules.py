@@ -6,9 +6,8 @@ import nerfacc
 import pytest
 from nerfstudio.model_components.ray_samplers import ProposalNetworkSampler
 
-from leco_plugin.conformance.checking import cases_of, pairs, sampler_cases
-from leco_plugin.conformance.rule import apply
-from leco_plugin.conformance.samplers.sampler_rules import SAMPLER_RULES
+from leco_plugin.conformance.cases import SAMPLER_RULES, cases_of, pairs, sampler_cases
+from leco_plugin.conformance.rules import apply
 from leco_plugin.samplers import nerfacc_cpu, registry
 from leco_plugin.samplers.proposal import LearnedOccupancySampler
 from leco_plugin.samplers.registry import SamplerSpec

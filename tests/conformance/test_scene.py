@@ -7,7 +7,7 @@ from typing import get_args
 import pytest
 import torch
 
-from leco_plugin.conformance.kit import scene
+from leco_plugin.conformance import scene
 from leco_plugin.models.encodings import Kind
 from leco_plugin.occupancy import Occupancy
 

@@ -4,15 +4,14 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from leco_plugin.conformance.samplers.sampler_rules import SAMPLER_RULES
-from leco_plugin.conformance.table import with_table
+from leco_plugin.conformance.cases import SAMPLER_RULES, with_table
 
 PAGE = Path(__file__).resolve().parents[2] / "docs" / "conformance.md"
 
 
 def test_the_page_holds_the_rules_as_they_are():
     page = PAGE.read_text()
-    remedy = "renew it with: python -m leco_plugin.conformance.table docs/conformance.md"
+    remedy = "renew it with: python -m leco_plugin.conformance.cases docs/conformance.md"
     assert with_table(page) == page, remedy
     assert all(page.count(f"| `{rule.name}` |") == 1 for rule in SAMPLER_RULES)
 

@@ -11,7 +11,7 @@ import torch
 import trimesh
 from ball_occupancy import CENTRE, RADIUS, ball
 
-from leco_plugin.export.command import export
+from leco_plugin.export import export
 from leco_plugin.occupancy import Occupancy
 
 UTM = np.array([500_000.25, 5_200_000.5, 300.0])

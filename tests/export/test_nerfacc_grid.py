@@ -8,7 +8,7 @@ import pytest
 import torch
 from ball_occupancy import CENTRE, RADIUS, ball
 
-from leco_plugin.export.nerfacc_grid import grid_buffers, innermost_box, reaching_levels, write_grid
+from leco_plugin.export import grid_buffers, innermost_box, reaching_levels, write_grid
 from leco_plugin.occupancy import Occupancy
 from leco_plugin.samplers.boxes import lookup
 from leco_plugin.samplers.grid import OccupancyGridEstimator
@@ -69,7 +69,7 @@ def test_next_to_nothing_that_the_gate_keeps_is_lost() -> None:
 
 def test_slabs_do_not_change_the_grid(monkeypatch: pytest.MonkeyPatch) -> None:
     whole = grid_buffers(ball(), 9)
-    monkeypatch.setattr("leco_plugin.export.nerfacc_grid.POINTS_AT_ONCE", 1500)
+    monkeypatch.setattr("leco_plugin.export.POINTS_AT_ONCE", 1500)
     shares: list[float] = []
     parts = grid_buffers(ball(), 9, on_progress=shares.append)
     assert torch.equal(whole["binaries"], parts["binaries"])

@@ -10,7 +10,7 @@ import torch
 import trimesh
 from ball_occupancy import CENTRE, HALF, RADIUS, ball
 
-from leco_plugin.export.points import kept_surface, write_ply
+from leco_plugin.export import kept_surface, write_ply
 from leco_plugin.occupancy import Occupancy
 from leco_plugin.space import Space
 
@@ -57,7 +57,7 @@ def test_an_occupancy_that_keeps_nothing_is_refused_in_one_line() -> None:
 
 def test_slabs_do_not_change_the_surface(monkeypatch: pytest.MonkeyPatch) -> None:
     whole = kept_surface(ball(), 20)
-    monkeypatch.setattr("leco_plugin.export.points.CELLS_AT_ONCE", 1000)
+    monkeypatch.setattr("leco_plugin.export.CELLS_AT_ONCE", 1000)
     parts = kept_surface(ball(), 20)
     assert torch.equal(whole.positions, parts.positions)
     assert torch.equal(whole.values, parts.values)
@@ -67,6 +67,6 @@ def test_slabs_do_not_change_the_surface(monkeypatch: pytest.MonkeyPatch) -> Non
 def test_more_cells_than_memory_holds_are_refused_before_the_gate_is_asked(
     resolution: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("leco_plugin.export.points.query", None)
+    monkeypatch.setattr("leco_plugin.export.query", None)
     with pytest.raises(ValueError, match=f"^{resolution} along .* too many .* smaller --resol"):
         kept_surface(ball(), resolution)

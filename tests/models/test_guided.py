@@ -23,7 +23,7 @@ from nerfstudio.models.instant_ngp import NGPModel
 from small_hosts import SMALL, pipeline_of, small, unswapped
 from torch import Tensor, nn
 
-from leco_plugin.conformance.kit.host_scene import model_arguments
+from leco_plugin.conformance.hosts import model_arguments
 from leco_plugin.models.guided import GuidedModelConfig
 from leco_plugin.models.hosts.guide import Guide
 from leco_plugin.models.hosts.stand_ins import GuidedEstimator

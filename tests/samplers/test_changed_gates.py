@@ -10,7 +10,7 @@ from ball_occupancy import ball
 from samplers.analytic_occupancy import Balls
 from waits import Waits
 
-from leco_plugin.conformance.kit.scene import OTHER, SLAB, box, crossing
+from leco_plugin.conformance.scene import OTHER, SLAB, box, crossing
 from leco_plugin.samplers import estimator as module
 from leco_plugin.samplers.cells.build import build_cache as really_build_cache
 from leco_plugin.samplers.estimator import LearnedOccupancyEstimator

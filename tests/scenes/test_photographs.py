@@ -191,12 +191,6 @@ def test_one_empty_mask_among_images_of_one_size_is_no_error(scene: Path) -> Non
     outputs_of(scene)
 
 
-def test_an_input_error_ends_a_command_and_is_a_value_error() -> None:
-    error = InputError("a line")
-    assert isinstance(error, SystemExit) and isinstance(error, ValueError)
-    assert str(error) == error.code == "a line"
-
-
 def test_a_sound_scene_passes_as_a_folder_and_as_a_file(scene: Path) -> None:
     assert len(check_scene(scene)["frames"]) == 9
     assert check_scene(scene / "transforms.json") == check_scene(scene)

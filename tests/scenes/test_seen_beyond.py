@@ -12,8 +12,7 @@ from torch import Tensor
 
 from leco_plugin.scenes.bounds import BoundsConfig
 from leco_plugin.scenes.photographs import POINTS
-from leco_plugin.scenes.seen_beyond import bright, seen_beyond
-from leco_plugin.scenes.survey import survey
+from leco_plugin.scenes.survey import bright, seen_beyond, survey
 
 PIXELS = 32
 DOWN = (-0.55, -1.5)

@@ -10,7 +10,7 @@ from nerfstudio.cameras.cameras import Cameras
 from tiny_scene import camera_to_world
 
 from leco_plugin.scenes.bounds import BoundsConfig
-from leco_plugin.scenes.city.capture import CaptureConfig
+from leco_plugin.scenes.city.cameras import CaptureConfig
 from leco_plugin.scenes.city.city import CityConfig
 from leco_plugin.scenes.city.folder import write_city
 from leco_plugin.scenes.input_error import InputError

@@ -5,8 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from leco_plugin.scenes.city.cameras import look_at
-from leco_plugin.scenes.city.lens import Lens
+from leco_plugin.scenes.city.cameras import Lens, look_at
 from leco_plugin.stability.capture import Capture, shots_of
 from leco_plugin.stability.coverage import View, shown_by
 from leco_plugin.stability.matter import Array, Box, Paint

@@ -9,7 +9,7 @@ from leco_plugin.capacity.field import lesson_by
 from leco_plugin.capacity.measuring import gates, taught_score
 from leco_plugin.chart.contenders.contender import Contender
 from leco_plugin.evaluation.equal_loss import at_equal_loss
-from leco_plugin.learning.held_out_rendering import evaluating
+from leco_plugin.learning.dense import evaluating
 from leco_plugin.models.leco import LecoModel
 from leco_plugin.shrink.sources import Source
 

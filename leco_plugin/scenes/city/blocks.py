@@ -13,17 +13,19 @@ from itertools import pairwise
 import numpy as np
 from numpy.random import Generator
 
-from leco_plugin.scenes.city.canvas import Canvas
-from leco_plugin.scenes.city.palette import (
+from leco_plugin.scenes.city.shapes import (
     FLAT_ROOFS,
     LEAVES,
     STOREY,
     TILES,
     WALLS,
+    Canvas,
     Material,
     Palette,
+    Shapes,
+    add_roof,
+    add_turned,
 )
-from leco_plugin.scenes.city.shapes import Shapes, add_roof, add_turned
 
 GROUND_DEPTH = 4.0
 """Thickness of the ground in metres; deep enough that no sample near it passes through."""

@@ -62,11 +62,12 @@ class City:
         self.anchor = np.array(palette.anchor)
         self.pitch = np.array(palette.pitch)
 
-        self._faces, self._solids = Faces(shapes), Solids(shapes)
         direction = np.array([direction for _, direction, _ in shapes.rectangles])
         flat = np.stack([face for face, _, _ in shapes.rectangles])
         others = [*shapes.triangles, *shapes.facets]
-        self.triangles = np.concatenate([_halves(flat, direction), *(fan for fan, _ in others)])
+        fans = np.concatenate([fan for fan, _ in others])
+        self._faces, self._solids = Faces(flat, fans), Solids(shapes)
+        self.triangles = np.concatenate([_halves(flat, direction), fans])
         """All faces as triangles, counter-clockwise seen from the air, metres: [T, 3, 3]."""
         paint = [np.repeat([number for _, _, number in shapes.rectangles], 2)]
         self.paint = np.concatenate(

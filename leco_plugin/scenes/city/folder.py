@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any
 
 import leco_plugin
-from leco_plugin.scenes.city.capture import CaptureConfig, View, views_of
+from leco_plugin.scenes.city.cameras import CaptureConfig, View, views_of
 from leco_plugin.scenes.city.city import DESCRIPTION, City, CityConfig, describe, read_description
 from leco_plugin.scenes.city.layouts import (
     MAPPINGS,

@@ -7,7 +7,7 @@ depths/*.npy       float32 [h, w], millimetres along the viewing axis, 0 where n
 transforms.json    cameras and splits
 sparse_pc.ply      some visible surface points, like those of structure from motion
 
-Mega-NeRF: as `mega_nerf_writer` says.
+Mega-NeRF: as `mega_nerf_format.files` says.
 """
 
 from __future__ import annotations
@@ -21,9 +21,8 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-from leco_plugin.scenes.city.capture import View
-from leco_plugin.scenes.city.lens import Lens
-from leco_plugin.scenes.whole_files import write_whole
+from leco_plugin.scenes.city.cameras import Lens, View
+from leco_plugin.scenes.whole_files import write_points, write_whole
 
 LayoutName = Literal["nerfstudio", "mega-nerf"]
 TRANSFORMS = "transforms.json"
@@ -133,7 +132,7 @@ class MegaNerfLayout(Layout):
     """Mega-NeRF's folders; held-out pictures are its validation set."""
 
     def __init__(self, views: list[View], lens: Lens) -> None:
-        from leco_plugin.scenes.mega_nerf_format.axes import around
+        from leco_plugin.scenes.mega_nerf_format.files import around
 
         self.views, self.lens = views, lens
         self.coordinates = around(np.stack([view.pose[:, 3] for view in views]))
@@ -145,7 +144,7 @@ class MegaNerfLayout(Layout):
     def write(
         self, folder: Path, view: View, image: NDArray[np.uint8], depth: NDArray[np.float32]
     ) -> None:
-        from leco_plugin.scenes.mega_nerf_format.writer import write_view
+        from leco_plugin.scenes.mega_nerf_format.files import write_view
 
         lens = self.lens
         write_view(
@@ -158,7 +157,7 @@ class MegaNerfLayout(Layout):
         )
 
     def finish(self, folder: Path) -> None:
-        from leco_plugin.scenes.mega_nerf_format.writer import write_coordinates, write_mappings
+        from leco_plugin.scenes.mega_nerf_format.files import write_coordinates, write_mappings
 
         write_coordinates(folder, self.coordinates)
         write_mappings(folder, {f"{view.name}.png": self._stem(view) for view in self.views})
@@ -166,21 +165,6 @@ class MegaNerfLayout(Layout):
     @staticmethod
     def _stem(view: View) -> str:
         return f"{view.number:06d}"
-
-
-def write_points(path: Path, rows: NDArray[Any]) -> None:
-    """Writes rows of `xyz` (metres) and `rgb` as a binary PLY file."""
-    fields = [f"property float {axis}" for axis in "xyz"]
-    fields += [f"property uchar {name}" for name in ("red", "green", "blue")]
-    head = [
-        "ply",
-        "format binary_little_endian 1.0",
-        f"element vertex {len(rows)}",
-        *fields,
-        "end_header",
-        "",
-    ]
-    write_whole(path, lambda file: file.write("\n".join(head).encode() + rows.tobytes()))
 
 
 def with_alpha(image: NDArray[np.uint8], depth: NDArray[np.floating]) -> NDArray[np.uint8]:

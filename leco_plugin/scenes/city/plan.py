@@ -13,9 +13,16 @@ from numpy.random import Generator
 from numpy.typing import NDArray
 
 from leco_plugin.scenes.city.blocks import GROUND_DEPTH, KERB, KINDS, Block
-from leco_plugin.scenes.city.canvas import Canvas
-from leco_plugin.scenes.city.palette import CARS, Material, Palette
-from leco_plugin.scenes.city.shapes import Array, Shapes, add_prism, add_wire
+from leco_plugin.scenes.city.shapes import (
+    CARS,
+    Array,
+    Canvas,
+    Material,
+    Palette,
+    Shapes,
+    add_prism,
+    add_wire,
+)
 
 LARGE = 9
 """From so many blocks a side on, the city's outline wanders."""

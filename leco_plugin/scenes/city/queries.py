@@ -1,8 +1,8 @@
 """Exact queries on all shapes of a city at once: what holds this point, what is nearest to it.
 
-Points are halved along their longest side until few shapes can matter to a group of them; the
-group is then computed outright. There is no grid to size: memory is bounded by `_PAIRS`, and
-points that lie close together share the search.
+Points are halved along their longest side until few shapes can matter to a group of them. The group
+is then computed outright. There is no grid to size: memory is bounded by `_PAIRS`, and points that
+lie close together share the search.
 """
 
 from __future__ import annotations
@@ -12,11 +12,6 @@ from collections.abc import Callable, Iterator
 import numpy as np
 from numpy.typing import NDArray
 
-from leco_plugin.scenes.city.faces import (
-    squared_to_feet,
-    squared_to_stretches,
-    squared_to_triangles,
-)
 from leco_plugin.scenes.city.shapes import Array, Shapes
 
 Indices = NDArray[np.int64]
@@ -81,22 +76,17 @@ class Solids:
 
 
 class Faces:
-    """The surface of some shapes: rectangles, feet, stretches and triangles, in this order."""
+    """The surface of some shapes: rectangles, then triangles.
 
-    def __init__(self, shapes: Shapes) -> None:
-        rectangles = np.stack([face for face, _, _ in shapes.rectangles])
-        self.feet = np.array(shapes.feet).reshape(-1, 6)
-        self.stretches = np.array(shapes.stretches).reshape(-1, 7)
-        self.triangles = np.concatenate([fan for fan, _ in shapes.triangles])
-        x, y, _, z, _, reach = self.feet.T
-        feet = np.stack([[x - reach, y - reach, z], [x + reach, y + reach, z]])
-        x, y, _, z0, r0, z1, r1 = self.stretches.T
-        r = np.maximum(r0, r1)
-        stretches = np.stack([[x - r, y - r, z0], [x + r, y + r, z1]])
-        triangles = np.stack([self.triangles.min(1), self.triangles.max(1)], 1)
-        kinds = [rectangles, feet.transpose(2, 0, 1), stretches.transpose(2, 0, 1), triangles]
-        self.bounds = np.concatenate(kinds)
-        self.ends = np.cumsum([len(kind) for kind in kinds])
+    Args:
+        rectangles: [R, 2, 3] low and high corners of axis-aligned ones.
+        triangles: [T, 3, 3].
+    """
+
+    def __init__(self, rectangles: Array, triangles: Array) -> None:
+        self.first, self.triangles = len(rectangles), triangles
+        boxes = np.stack([triangles.min(1), triangles.max(1)], 1)
+        self.bounds = np.concatenate([rectangles, boxes])
 
     def distance(self, points: Array) -> Array:
         """Distance in metres from each of points [N, 3] to the nearest face: [N]."""
@@ -115,7 +105,7 @@ class Faces:
         bounds = self.bounds[candidates]
         least = np.maximum(np.maximum(bounds[:, 0] - middle, middle - bounds[:, 1]), 0)
         least = np.sqrt(np.einsum("fk,fk->f", least, least))
-        first = np.searchsorted(candidates, self.ends[0])
+        first = np.searchsorted(candidates, self.first)
         most = np.maximum(bounds[first:, 1] - middle, middle - bounds[first:, 0])
         reach = np.sqrt(np.einsum("fk,fk->f", most, most).min(initial=np.inf))
         reach = min(reach, least[:first].min(initial=np.inf)) + 2 * radius
@@ -132,7 +122,7 @@ class Faces:
             column, bounds = points[:, axis, None], self.bounds[candidates, :, axis]
             gap = np.maximum(bounds[:, 0] - column, column - bounds[:, 1])
             limits += np.square(np.maximum(gap, 0, out=gap), out=gap)
-        first = int(np.searchsorted(candidates, self.ends[0]))
+        first = int(np.searchsorted(candidates, self.first))
         nearest = limits[:, :first].min(1, initial=np.inf)
         if first == len(candidates):
             return nearest
@@ -147,16 +137,35 @@ class Faces:
         return nearest
 
     def _measure(self, points: Array, face: Indices) -> Array:
-        """Squared distance [M] from points [M, 3] to one face each, no rectangle: `face` [M]."""
-        squared = np.empty(len(points))
-        kinds = (
-            (squared_to_feet, self.feet),
-            (squared_to_stretches, self.stretches),
-            (squared_to_triangles, self.triangles),
-        )
-        for number, (squared_to, rows) in enumerate(kinds):
-            chosen = np.flatnonzero((face >= self.ends[number]) & (face < self.ends[number + 1]))
-            if len(chosen):
-                row = rows[face[chosen] - self.ends[number]]
-                squared[chosen] = squared_to(points[chosen], row)
-        return squared
+        """Squared distance [M] from points [M, 3] to a triangle each, numbered by `face` [M]."""
+        return squared_to_triangles(points, self.triangles[face - self.first])
+
+
+def squared_to_triangles(points: Array, triangles: Array) -> Array:
+    """Squared distances [M] from points [M, 3] to triangles [M, 3, 3].
+
+    Over a triangle's inside the height above its plane counts, elsewhere the nearest edge.
+    """
+    start, away = triangles[:, 0], points - triangles[:, 0]
+    u, v = triangles[:, 1] - start, triangles[:, 2] - start
+    uu, uv, vv = _dot(u, u), _dot(u, v), _dot(v, v)
+    pu, pv = _dot(away, u), _dot(away, v)
+    area = uu * vv - uv**2
+    b, c = (vv * pu - uv * pv) / area, (uu * pv - uv * pu) / area
+    over = (b >= 0) & (c >= 0) & (b + c <= 1)
+    height = away - b[:, None] * u - c[:, None] * v
+    squared = np.where(over, _dot(height, height), np.inf)
+    third, from_second = v - u, away - u
+    for offset, edge, along in (
+        (away, u, pu / uu),
+        (away, v, pv / vv),
+        (from_second, third, _dot(from_second, third) / _dot(third, third)),
+    ):
+        rest = offset - np.clip(along, 0, 1)[:, None] * edge
+        squared = np.minimum(squared, _dot(rest, rest))
+    return squared
+
+
+def _dot(a: Array, b: Array) -> Array:
+    """Scalar products of rows: [M, 3], [M, 3] -> [M]."""
+    return np.einsum("mk,mk->m", a, b)

@@ -1,4 +1,9 @@
-"""Photographs of the city by ray tracing: colour, and the exact depth at every pixel's middle."""
+"""Photographs of the city by ray tracing: colour, and the exact depth at every pixel's middle.
+
+Surfaces are painted with solid patterns by position, the same whatever camera looks at them.
+Photometric training needs something to grip on every surface, at every distance: noise in four
+octaves from metres to decimetres, each faded out where a pixel is larger than its waves.
+"""
 
 from __future__ import annotations
 
@@ -6,10 +11,161 @@ import numpy as np
 import trimesh
 from numpy.typing import NDArray
 
+from leco_plugin.scenes.city.cameras import Lens
 from leco_plugin.scenes.city.city import City
-from leco_plugin.scenes.city.lens import Lens
-from leco_plugin.scenes.city.shapes import Array
-from leco_plugin.scenes.city.texture import Colours, paint_surface
+from leco_plugin.scenes.city.shapes import STOREY, Array, Material
+
+Colours = NDArray[np.float32]
+_WAVES = (9.0, 2.4, 0.7, 0.22)
+"""Wavelengths of the noise, metres."""
+_TABLE = np.random.default_rng(7).random((256, 256), dtype=np.float32)
+
+
+def _noise(u: Array, v: Array) -> Colours:
+    """Smooth noise in -1..1 at places u, v [N]; one wave per unit, repeating after 256."""
+    i, j = np.floor(u), np.floor(v)
+    s, t = (u - i).astype(np.float32), (v - j).astype(np.float32)
+    s, t = s * s * (3 - 2 * s), t * t * (3 - 2 * t)
+    i0, j0 = i.astype(np.int64) & 255, j.astype(np.int64) & 255
+    i1, j1 = (i0 + 1) & 255, (j0 + 1) & 255
+    near = _TABLE[i0, j0] * (1 - t) + _TABLE[i0, j1] * t
+    far = _TABLE[i1, j0] * (1 - t) + _TABLE[i1, j1] * t
+    return 2 * (near * (1 - s) + far * s) - 1
+
+
+def _covered(position: Array, period: NDArray, width: NDArray, pixel: Array) -> Colours:
+    """Share of a pixel (metres wide) that stripes of `width` cover, repeating every `period`.
+
+    The exact integral of the stripes over the pixel, so that they blur instead of flickering.
+    """
+
+    def integral(x: Array) -> Array:
+        whole = np.floor(x / period)
+        return whole * width + np.minimum(x - whole * period, width)
+
+    pixel = np.maximum(pixel, 1e-3)
+    share = (integral(position + pixel / 2) - integral(position - pixel / 2)) / pixel
+    return share.astype(np.float32)
+
+
+def paint_surface(
+    city: City, positions: Array, normals: Array, paint: NDArray[np.int64], pixel: Array
+) -> Colours:
+    """Reflectance (RGB in 0..1) of surface points.
+
+    Args:
+        city: gives the palette.
+        positions: [N, 3] metres.
+        normals: [N, 3] unit, outward.
+        paint: [N] rows of the palette.
+        pixel: [N] width of a pixel at the point, metres.
+    Returns:
+        [N, 3] float32.
+    """
+    material = city.material[paint]
+    colour = city.colour[paint].copy()
+    local = positions - city.anchor[paint]
+    upright = np.abs(normals[:, 2]) < 0.5
+    east = np.abs(normals[:, 0]) > np.abs(normals[:, 1])
+    # The pattern lies in the plane that the face looks at most.
+    u = np.where(upright & east, positions[:, 1], positions[:, 0])
+    v = np.where(upright, positions[:, 2], positions[:, 1])
+
+    _facades(
+        colour, (material == Material.WALL) & upright, local, east, city.pitch[paint], paint, pixel
+    )
+    _streets(colour, (material == Material.STREET) & ~upright, local, city.anchor[paint, 2], pixel)
+    flagstones = material == Material.PAVEMENT
+    joints = _covered(u[flagstones], np.array(1.2), np.array(0.1), pixel[flagstones])
+    joints = np.maximum(
+        joints, _covered(v[flagstones], np.array(1.2), np.array(0.1), pixel[flagstones])
+    )
+    colour[flagstones] *= (1 - 0.4 * joints)[:, None]
+    tiled = material == Material.TILES
+    courses = _covered(positions[tiled, 2], np.array(0.35), np.array(0.1), pixel[tiled])
+    colour[tiled] *= (1 - 0.35 * courses)[:, None]
+    _hills(colour, material == Material.TERRAIN, positions[:, 2], normals[:, 2])
+
+    strength = np.array([0.16, 0.16, 0.10, 0.16, 0.16, 0.26, 0.2, 0.42, 0.08, 0.16], np.float32)[
+        material
+    ]
+    tone = np.zeros(len(colour), np.float32)
+    for octave, wave in enumerate(_WAVES):
+        seen = np.clip(wave / np.maximum(pixel, 1e-3) - 1, 0, 1).astype(np.float32)
+        tone += seen * _noise(u / wave + 31.7 * octave, v / wave + 11.3 * octave)
+    colour *= (1 + strength * tone)[:, None]
+    return np.clip(colour, 0, 1)
+
+
+def _facades(
+    colour: Colours,
+    chosen: NDArray,
+    local: Array,
+    east: NDArray,
+    pitch: Array,
+    paint: NDArray,
+    pixel: Array,
+) -> None:
+    """Windows, storey by storey, some with drawn curtains; every storey has a ledge."""
+    if not chosen.any():
+        return
+    local, pixel = local[chosen], pixel[chosen]
+    along = np.where(east[chosen], local[:, 1], local[:, 0])
+    spacing = np.where(east[chosen], pitch[chosen, 1], pitch[chosen, 0])
+    width = 0.52 * spacing
+    across = _covered(along - 0.24 * spacing, spacing, width, pixel)
+    upward = _covered(local[:, 2] - 1.0, np.array(STOREY), np.array(1.6), pixel)
+    column, storey = np.floor(along / spacing), np.floor(local[:, 2] / STOREY)
+    pane = _TABLE[
+        (column.astype(np.int64) * 7 + paint[chosen] * 13) & 255,
+        (storey.astype(np.int64) * 5 + paint[chosen]) & 255,
+    ]
+    glass = np.where(
+        pane[:, None] > 0.8,
+        np.array([0.78, 0.74, 0.62], np.float32),
+        np.array([0.13, 0.17, 0.22], np.float32),
+    )
+    glass = glass * (0.75 + 0.5 * pane[:, None])
+    share = (across * upward)[:, None]
+    wall = (
+        colour[chosen]
+        * (1 - 0.22 * _covered(local[:, 2], np.array(STOREY), np.array(0.3), pixel))[:, None]
+    )
+    colour[chosen] = wall * (1 - share) + glass * share
+
+
+def _streets(colour: Colours, chosen: NDArray, local: Array, size: Array, pixel: Array) -> None:
+    """Dashed middle lines, kerb lines and crossings; `size` is the distance of the streets."""
+    chosen = chosen & (size > 1)
+    if not chosen.any():
+        return
+    x, y, size, pixel = (
+        np.abs(local[chosen, 0]),
+        np.abs(local[chosen, 1]),
+        size[chosen],
+        pixel[chosen],
+    )
+    middle, lot = size / 2, 0.35 * size
+    far, near = np.maximum(x, y), np.minimum(x, y)
+    in_street = near < lot
+    dash = _covered(near, np.array(4.0), np.array(2.2), pixel)
+    line = np.clip((0.12 - (middle - far)) / np.maximum(pixel, 0.02) + 0.5, 0, 1) * np.minimum(
+        0.24 / pixel, 1
+    )
+    white = dash * line * (near < lot - 3.5)
+    bars = _covered(far - lot, np.array(1.0), np.array(0.5), pixel)
+    white = np.maximum(white, bars * ((near > lot - 3.0) & (near < lot - 0.6)))
+    white = (white * in_street).astype(np.float32)[:, None]
+    colour[chosen] = colour[chosen] * (1 - white) + 0.85 * white
+
+
+def _hills(colour: Colours, chosen: NDArray, height: Array, slope: Array) -> None:
+    """Rock where it is steep or high."""
+    rock = np.clip((0.93 - slope[chosen]) * 6 + height[chosen] / 150, 0, 1).astype(np.float32)[
+        :, None
+    ]
+    colour[chosen] = colour[chosen] * (1 - rock) + np.array([0.48, 0.45, 0.42], np.float32) * rock
+
 
 SUN = np.array([0.48, -0.36, 0.8])
 """Direction towards the sun, unit length."""

@@ -1,22 +1,19 @@
-"""The surfaces and solids a city is assembled from, so that both describe the same matter.
+"""What a city is assembled from: shapes, a canvas of land, and the paints on both.
 
-Everything is a flat-faced solid: columns of a height field, roofs, turned posts and trees,
-hanging wires. Each shape adds two descriptions of itself to `Shapes`: convex pieces (for "is
-this point inside?") and the outward faces that touch air (for rays and distances). Faces that
-another shape hides are left out, so the faces are exactly the boundary of the pieces.
+Everything is a flat-faced solid: columns of a height field, roofs, turned posts and trees, hanging
+wires. Each shape adds two descriptions of itself to `Shapes`: convex pieces, which say whether a
+point is inside, and the outward faces that touch air, for rays and distances. Faces that another
+shape hides are left out, so the faces are exactly the boundary of the pieces.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from enum import IntEnum
 from itertools import pairwise
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
-
-if TYPE_CHECKING:
-    from leco_plugin.scenes.city.canvas import Canvas
 
 Array = NDArray[np.float64]
 
@@ -33,12 +30,8 @@ class Shapes:
     """Axis-aligned faces: corners [2, 3], direction (+1 or -1 along the flat axis), paint."""
     triangles: list[tuple[Array, int]] = field(default_factory=list)
     """Other faces: [T, 3, 3], counter-clockwise seen from the air, and their paint."""
-    feet: list[tuple[float, ...]] = field(default_factory=list)
-    """Squares around the base of turned solids, as `squared_to_feet` takes them."""
-    stretches: list[tuple[float, ...]] = field(default_factory=list)
-    """Sides and lids of turned solids, as `squared_to_stretches` takes them."""
     facets: list[tuple[Array, int]] = field(default_factory=list)
-    """The same feet and stretches as triangles, like `triangles`."""
+    """Faces of turned solids, like `triangles`."""
 
     def add_hull(self, corners: Array, faces: list[list[int]]) -> None:
         """Adds a convex solid given by its corners [V, 3] and planar faces (any winding)."""
@@ -123,20 +116,16 @@ def add_turned(
         shapes.facets.append(
             (np.stack([lower[arc[-1]], corners[k], corners[(k + 1) % 4]])[None], foot)
         )
-    shapes.feet.append((x, y, sides, base, profile[0][0], reach))
 
     walls = [[i, (i + 1) % sides, sides + (i + 1) % sides, sides + i] for i in range(sides)]
     caps = [list(range(sides)), list(range(sides, 2 * sides))]
-    for (below, start, _), (radius, z, paint) in pairwise(profile):
+    for radius, z, paint in profile[1:]:
         upper = ring(radius, z)
         corners = np.concatenate([lower, upper])
         shapes.facets += [(_fan(corners[wall]), paint) for wall in walls]
-        shapes.stretches.append((x, y, sides, base + start, below, base + z, radius))
         shapes.add_hull(corners, [*walls, *caps])
         lower = upper
-    radius, z, paint = profile[-1]
-    shapes.facets.append((_fan(lower), paint))
-    shapes.stretches.append((x, y, sides, base + z, radius, base + z, 0.0))
+    shapes.facets.append((_fan(lower), profile[-1][2]))
 
 
 def add_wire(shapes: Shapes, path: Array, radius: float, paint: int, sides: int = 4) -> None:
@@ -182,3 +171,173 @@ def _fan(polygon: Array) -> Array:
     """A convex polygon [V, 3] as triangles [V - 2, 3, 3] of the same winding."""
     first = np.broadcast_to(polygon[0], (len(polygon) - 2, 3))
     return np.stack([first, polygon[1:-1], polygon[2:]], 1)
+
+
+@dataclass
+class Canvas:
+    """A rectangle of land whose height is painted: later strokes replace earlier ones.
+
+    The land is at height 0 along the canvas' border, so that canvases join without a wall.
+    """
+
+    bounds: tuple[float, float, float, float]
+    """x0, x1, y0, y1 in metres."""
+    paint: int
+    strokes: list[tuple[float, float, float, float, float, int, bool]] = field(default_factory=list)
+
+    def stroke(
+        self,
+        x0: float,
+        x1: float,
+        y0: float,
+        y1: float,
+        top: float,
+        paint: int,
+        covered: bool = False,
+    ) -> None:
+        """Raises or lowers a rectangle to `top` metres; `covered` leaves its top to a roof."""
+        x0, x1, y0, y1, top = (round(float(v), 2) for v in (x0, x1, y0, y1, top))
+        self.strokes.append((x0, x1, y0, y1, top, paint, covered))
+
+    def height(self, x: float, y: float) -> float:
+        """The painted height at a point, in metres."""
+        for x0, x1, y0, y1, top, _, _ in reversed(self.strokes):
+            if x0 <= x <= x1 and y0 <= y <= y1:
+                return top
+        return 0.0
+
+    def build(self, shapes: Shapes, depth: float) -> None:
+        """Turns the strokes into columns standing `depth` metres deep, their tops and walls."""
+        ends = np.array([self.bounds] + [s[:4] for s in self.strokes])
+        xs, ys = np.unique(ends[:, :2]), np.unique(ends[:, 2:])
+        height = np.zeros((len(xs) - 1, len(ys) - 1))
+        paint = np.full(height.shape, self.paint)
+        covered = np.zeros(height.shape, bool)
+        for x0, x1, y0, y1, top, number, hidden in self.strokes:
+            cells = np.s_[
+                np.searchsorted(xs, x0) : np.searchsorted(xs, x1),
+                np.searchsorted(ys, y0) : np.searchsorted(ys, y1),
+            ]
+            height[cells], paint[cells], covered[cells] = top, number, hidden
+
+        for i0, i1, j0, j1 in _equal_rectangles(height, paint, covered):
+            low, high = (
+                np.array([xs[i0], ys[j0], -depth]),
+                np.array([xs[i1], ys[j1], height[i0, j0]]),
+            )
+            shapes.boxes.append(np.stack([low, high]))
+            if not covered[i0, j0]:
+                face = np.stack([[low[0], low[1], high[2]], high])
+                shapes.rectangles.append((face, 1, int(paint[i0, j0])))
+        _walls(shapes, xs, ys, height, paint, flip=False)
+        _walls(shapes, ys, xs, height.T, paint.T, flip=True)
+        x0, x1, y0, y1 = self.bounds
+        shapes.rectangles.append((np.array([[x0, y0, -depth], [x1, y1, -depth]]), -1, self.paint))
+
+
+def _equal_rectangles(*layers: NDArray) -> list[tuple[int, int, int, int]]:
+    """Covers a grid with few rectangles of cells that agree in all layers [I, J]."""
+    _, label = np.unique(np.stack([layer.ravel() for layer in layers]), axis=1, return_inverse=True)
+    label = label.reshape(layers[0].shape)
+    done: list[tuple[int, int, int, int]] = []
+    open_runs: dict[tuple[int, int, int], int] = {}
+    for i in range(len(label) + 1):
+        runs: dict[tuple[int, int, int], int] = {}
+        if i < len(label):
+            cuts = [0, *(np.flatnonzero(np.diff(label[i])) + 1), label.shape[1]]
+            for j0, j1 in pairwise(cuts):
+                key = (int(j0), int(j1), int(label[i, j0]))
+                runs[key] = open_runs.get(key, i)
+        done += [(start, i, key[0], key[1]) for key, start in open_runs.items() if key not in runs]
+        open_runs = runs
+    return done
+
+
+def _walls(shapes: Shapes, us: Array, vs: Array, height: Array, paint: NDArray, flip: bool) -> None:
+    """Adds the walls between neighbouring cells along the first axis of `height` [U, V]."""
+    for i in range(1, len(height)):
+        before, after = height[i - 1], height[i]
+        owner = np.where(before > after, paint[i - 1], paint[i])
+        changes = (np.diff(before) != 0) | (np.diff(after) != 0) | (np.diff(owner) != 0)
+        cuts = [0, *(np.flatnonzero(changes) + 1), len(before)]
+        for j0, j1 in pairwise(cuts):
+            if before[j0] == after[j0]:
+                continue
+            bottom, top = sorted((before[j0], after[j0]))
+            low, high = np.array([us[i], vs[j0], bottom]), np.array([us[i], vs[j1], top])
+            if flip:
+                low, high = low[[1, 0, 2]], high[[1, 0, 2]]
+            direction = 1 if before[j0] > after[j0] else -1
+            shapes.rectangles.append((np.stack([low, high]), direction, int(owner[j0])))
+
+
+STOREY = 3.2
+"""Height of a storey in metres: of the walls and of the windows painted on them."""
+
+
+class Material(IntEnum):
+    """How a face is coloured; `texture` gives each its pattern."""
+
+    STREET, PAVEMENT, WALL, ROOF, TILES, GRASS, EARTH, LEAVES, METAL, TERRAIN = range(10)
+
+
+@dataclass
+class Palette:
+    """One row per painted thing: material, base colour (RGB in 0..1), anchor and window pitch."""
+
+    material: list[int] = field(default_factory=list)
+    colour: list[tuple[float, float, float]] = field(default_factory=list)
+    anchor: list[tuple[float, float, float]] = field(default_factory=list)
+    """Where the pattern starts, metres."""
+    pitch: list[tuple[float, float]] = field(default_factory=list)
+    """Spacing of the windows along x and along y, metres."""
+
+    def add(
+        self,
+        material: Material,
+        colour: tuple[float, float, float],
+        anchor: tuple[float, float, float] = (0.0, 0.0, 0.0),
+        pitch: tuple[float, float] = (3.0, 3.0),
+    ) -> int:
+        """Returns the number of the new paint."""
+        self.material.append(int(material))
+        self.colour.append(colour)
+        self.anchor.append(anchor)
+        self.pitch.append(pitch)
+        return len(self.material) - 1
+
+
+WALLS = [
+    (0.80, 0.74, 0.63),
+    (0.67, 0.37, 0.29),
+    (0.74, 0.72, 0.70),
+    (0.86, 0.80, 0.55),
+    (0.52, 0.59, 0.66),
+    (0.79, 0.56, 0.42),
+    (0.90, 0.88, 0.84),
+    (0.45, 0.33, 0.29),
+    (0.58, 0.66, 0.57),
+]
+FLAT_ROOFS = [
+    (0.55, 0.54, 0.52),
+    (0.42, 0.42, 0.44),
+    (0.66, 0.62, 0.56),
+    (0.50, 0.46, 0.42),
+    (0.47, 0.53, 0.49),
+]
+TILES = [
+    (0.66, 0.30, 0.20),
+    (0.52, 0.25, 0.20),
+    (0.37, 0.34, 0.35),
+    (0.72, 0.42, 0.28),
+    (0.30, 0.36, 0.42),
+]
+CARS = [
+    (0.75, 0.10, 0.10),
+    (0.90, 0.90, 0.92),
+    (0.12, 0.14, 0.17),
+    (0.15, 0.30, 0.62),
+    (0.60, 0.62, 0.65),
+    (0.88, 0.68, 0.10),
+]
+LEAVES = [(0.20, 0.38, 0.14), (0.30, 0.44, 0.16), (0.40, 0.46, 0.18), (0.16, 0.32, 0.18)]

@@ -1,4 +1,14 @@
-"""Reads the files of a Mega-NeRF scene and says what is wrong with them, one line a fault."""
+"""The files of a Mega-NeRF scene: their coordinates, how they are read and checked, and written.
+
+coordinates.pt                    origin_drb [3] metres, pose_scale_factor in metres
+mappings.txt                      "<original name>,<metadata file>" in each line
+train|val/rgbs/<stem>.png         the pictures
+train|val/metadata/<stem>.pt      H, W, c2w [3, 4], intrinsics [4], distortion [4]
+
+The format's world is (down, right, back), in units of `pose_scale_factor` metres around
+`origin_drb`. The model's is (right, forward, up) in the same units. Camera axes are OpenGL's in
+both.
+"""
 
 from __future__ import annotations
 
@@ -10,14 +20,100 @@ from typing import Any, Literal
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
+from PIL import Image
 
 from leco_plugin.scenes.city.shapes import Array
 from leco_plugin.scenes.derived_images import image_header
 from leco_plugin.scenes.input_error import InputError
-from leco_plugin.scenes.mega_nerf_format.axes import Coordinates, wrong_axis
-from leco_plugin.scenes.mega_nerf_format.masks import describe
-from leco_plugin.scenes.mega_nerf_format.pt_file import read_pt
+from leco_plugin.scenes.mega_nerf_format.pt_file import describe, read_pt
 from leco_plugin.scenes.rotations import distance_from_rotations
+from leco_plugin.scenes.whole_files import write_whole
+
+Split = Literal["train", "val"]
+TO_DRB = np.array([[0.0, 0.0, -1.0], [1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
+"""(right, forward, up) to (down, right, back). A rotation; its inverse is its transpose."""
+_DIRECTIONS = {
+    "down": (0, 1.0),
+    "up": (0, -1.0),
+    "right": (1, 1.0),
+    "left": (1, -1.0),
+    "back": (2, 1.0),
+    "forward": (2, -1.0),
+}
+"""What the format calls its axes and their opposites: axis and sign."""
+_UPRIGHT, _CLEARLY = 0.6, 0.9
+"""Shares of cameras that are upright: fewer is suspicious, more is clear. Street views with a roll
+and nadir strips of one heading lie in between, and pass."""
+
+
+@dataclass(frozen=True)
+class Coordinates:
+    """What `coordinates.pt` says."""
+
+    origin_drb: Array
+    """[3] metres, (down, right, back): where the scene's origin lies."""
+    metres: float
+    """Metres in a unit, `pose_scale_factor`."""
+
+    def to_model(self, poses: Array) -> Array:
+        """Poses [C, 3, 4] of the files as (right, forward, up), still in units of `metres`."""
+        return TO_DRB.T @ poses
+
+    def to_file(self, poses: Array) -> Array:
+        """Poses [C, 3, 4] in metres, (right, forward, up), as the files hold them."""
+        turned = TO_DRB @ poses
+        turned[:, :, 3] = (turned[:, :, 3] - self.origin_drb) / self.metres
+        return turned
+
+    def altitudes(self, poses: Array) -> Array:
+        """Metres above the datum, up is positive, of poses [C, 3, 4] of the files: [C]."""
+        return -(poses[:, 0, 3] * self.metres + self.origin_drb[0])
+
+    def height_of(self, down: float) -> float:
+        """The model's z of a level that lies so many metres down from the datum."""
+        return float(self.origin_drb[0] - down) / self.metres
+
+    def transform(self) -> Array:
+        """[3, 4] from metres (down, right, back) to the model's axes, before scaling."""
+        return np.column_stack([TO_DRB.T, -TO_DRB.T @ self.origin_drb])
+
+
+def around(positions: Array) -> Coordinates:
+    """Coordinates in which cameras at [C, 3] metres, (right, forward, up), lie within [-1, 1]."""
+    places = positions @ TO_DRB.T
+    origin = (places.min(0) + places.max(0)) / 2
+    return Coordinates(origin, max(float(np.abs(places - origin).max()), 1e-3))
+
+
+def wrong_axis(poses: Array) -> str | None:
+    """Why the poses [C, 3, 4] of a scene are not (down, right, back), or None if they may be.
+
+    A camera is taken to be upright: its right axis is level, it does not look far above the
+    horizon, and its top is not below. Whichever direction is down, nearly all cameras of a survey
+    agree on it.
+    """
+    rights, tops, looks = poses[:, :, 0], poses[:, :, 1], -poses[:, :, 2]
+
+    def upright(axis: int, sign: float) -> float:
+        level = np.abs(rights[:, axis]) < 0.35
+        return float(
+            np.mean(level & (sign * looks[:, axis] > -0.35) & (sign * tops[:, axis] < 0.35))
+        )
+
+    shares = {name: upright(*where) for name, where in _DIRECTIONS.items()}
+    # Of directions that fit equally well, down is the one that cameras look along.
+    downward = {name: float(s * looks[:, a].mean()) for name, (a, s) in _DIRECTIONS.items()}
+    best = max(shares, key=lambda name: (shares[name] >= _CLEARLY, downward[name]))
+    if shares["down"] > _UPRIGHT or shares[best] < _CLEARLY:
+        return None
+    if best == "up":
+        return "the first axis of its world points up and not down: nearly all cameras look up"
+    return (
+        f"the first axis of its world does not point down, as the cameras look {best}; poses "
+        "aligned to east, north, up are to be turned before they are converted"
+    )
+
 
 ENDINGS = (".jpg", ".JPG", ".png", ".PNG")
 """Of pictures, in the order in which Mega-NeRF looks for them."""
@@ -30,7 +126,7 @@ class Frame:
     """One photograph, as its metadata say."""
 
     stem: str
-    split: Literal["train", "val"]
+    split: Split
     image: Path
     mode: str
     """How Pillow names the kind of its pixels."""
@@ -150,7 +246,7 @@ def read_frame(metadata: Path, image: Path) -> Frame:
         raise InputError(
             f"{image} has {size[0]} x {size[1]} pixels, its metadata are for {width} x {height}"
         )
-    split: Literal["train", "val"] = "val" if metadata.parent.parent.name == "val" else "train"
+    split: Split = "val" if metadata.parent.parent.name == "val" else "train"
     return Frame(metadata.stem, split, image, mode, size, width, height, pose, intrinsics)
 
 
@@ -217,3 +313,45 @@ def _check_rotations(folder: Path, frames: list[Frame]) -> None:
             "(down, right, back), perhaps the first one points up"
         )
     raise InputError(f"{metadata}: c2w is no rotation and position")
+
+
+def write_coordinates(folder: Path, coordinates: Coordinates) -> None:
+    """Writes `coordinates.pt`."""
+    values = {
+        "origin_drb": torch.from_numpy(coordinates.origin_drb).float(),
+        "pose_scale_factor": float(coordinates.metres),
+    }
+    write_whole(folder / "coordinates.pt", lambda file: torch.save(values, file))
+
+
+def write_mappings(folder: Path, stems: dict[str, str]) -> None:
+    """Writes `mappings.txt` from the original names of pictures and their stems."""
+    text = "".join(f"{name},{stem}.pt\n" for name, stem in stems.items())
+    write_whole(folder / "mappings.txt", lambda file: file.write(text.encode()))
+
+
+def write_view(
+    folder: Path,
+    split: Split,
+    stem: str,
+    image: NDArray[np.uint8],
+    pose: Array,
+    intrinsics: tuple[float, float, float, float],
+) -> None:
+    """Writes a picture and then its metadata.
+
+    Args:
+        image: [H, W, 3] or, with transparency, [H, W, 4].
+        pose: [3, 4] camera to world as the file holds it: `Coordinates.to_file`.
+        intrinsics: fx, fy, cx, cy in pixels.
+    """
+    metadata: dict[str, Any] = {
+        "H": image.shape[0],
+        "W": image.shape[1],
+        "c2w": torch.from_numpy(np.ascontiguousarray(pose)).float(),
+        "intrinsics": torch.tensor(intrinsics, dtype=torch.float32),
+        "distortion": torch.zeros(4),
+    }
+    rgb, data = folder / split / "rgbs" / f"{stem}.png", folder / split / "metadata" / f"{stem}.pt"
+    write_whole(rgb, lambda file: Image.fromarray(image).save(file, format="PNG"))
+    write_whole(data, lambda file: torch.save(metadata, file))

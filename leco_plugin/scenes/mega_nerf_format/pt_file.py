@@ -1,13 +1,11 @@
-"""A file of torch.save read as data: tensors and numbers, and nothing that could run.
-
-`torch.load(weights_only=True)` runs no code, but it unpacks whatever a file claims, and not every
-version of torch compares a claimed size with what is there. So a file is looked through first, by
-Python alone, and torch is given an archive that holds only what was seen.
-"""
+"""A file of torch.save read as data: tensors and numbers, and nothing that could run."""
 
 from __future__ import annotations
 
 import io
+import pickle
+import pickletools
+import re
 import zipfile
 from pathlib import Path
 from typing import Any
@@ -15,9 +13,13 @@ from typing import Any
 import torch
 
 from leco_plugin.scenes.input_error import InputError, one_line
-from leco_plugin.scenes.mega_nerf_format.pt_pickle import Look, Refused
 
-_MOST_RECORDS = 256
+MOST_RECORDS, LONGEST_PICKLE = 256, 1 << 14
+"""Records of an archive, and bytes of its pickle: that of a picture's metadata has about 500."""
+
+
+class Refused(Exception):
+    """What is wrong with a file, without its name."""
 
 
 def read_pt(path: Path, most_bytes: int = 1 << 20) -> Any:
@@ -46,44 +48,69 @@ def read_bytes(path: Path, most_bytes: int) -> bytes:
 def load(data: bytes, name: str) -> Any:
     """What the bytes of a .pt file hold; `name` is for messages. InputError as of `read_pt`."""
     try:
-        records = _records(data)
-        Look(records).through()
-        return torch.load(_archive(records), map_location="cpu", weights_only=True)
+        _check_sizes(data)
+        value = torch.load(io.BytesIO(data), map_location="cpu", weights_only=True)
+        for tensor in value.values() if isinstance(value, dict) else [value]:
+            _check_tensor(tensor)
+        return value
     except Refused as refusal:
         raise InputError(f"{name} {refusal}") from None
+    except pickle.UnpicklingError as error:  # torch advises to trust the file
+        found = re.search(r"GLOBAL ([\w.]+)", str(error))
+        what = found[1] if found else "more than that"
+        raise InputError(f"{name} holds {what}, and only tensors and numbers are read") from None
     # Damaged archives and pickles raise whatever their readers meet; nothing of it is a new fault.
     except Exception as error:  # noqa: BLE001
         said = one_line(error, 120) or "no reason given"
         raise InputError(f"{name} is damaged: {type(error).__name__}: {said}") from None
 
 
-def _records(data: bytes) -> dict[str, bytes]:
-    """The records of an archive by their names: `data.pkl`, `data/0`, ..., `byteorder`."""
+def _check_sizes(data: bytes) -> None:
+    """Refuses an archive that would take more memory or time than its bytes are worth."""
     if not data.startswith(b"PK"):
         raise Refused("is not a file of torch.save (of torch 1.6 or newer)")
     with zipfile.ZipFile(io.BytesIO(data)) as archive:
         entries = archive.infolist()
-        roots = {e.filename[: -len("/data.pkl")] for e in entries if _is_pickle(e.filename)}
-        if len(roots) != 1 or len(entries) > _MOST_RECORDS:
+        pickles = [entry for entry in entries if entry.filename.endswith("/data.pkl")]
+        if len(pickles) != 1 or len(entries) > MOST_RECORDS:
             raise Refused("is a zip, but not one of torch.save")
         if any(entry.compress_type != zipfile.ZIP_STORED for entry in entries):
             raise Refused("holds compressed records, which torch.save does not write")
         if sum(entry.file_size for entry in entries) > len(data):
             raise Refused("claims more bytes than it has")
-        root = roots.pop() + "/"
-        wanted = [e for e in entries if e.filename.startswith((root + "data", root + "byteorder"))]
-        return {entry.filename[len(root) :]: archive.read(entry) for entry in wanted}
+        pickled = archive.read(pickles[0])
+    if len(pickled) > LONGEST_PICKLE:
+        raise Refused(f"describes its contents in {len(pickled)} bytes, far too many")
+    _check_tuples(pickled)
 
 
-def _is_pickle(name: str) -> bool:
-    return name.endswith("/data.pkl")
+def _check_tuples(pickled: bytes) -> None:
+    """Refuses tuples that are used twice: of pairs of pairs of them, a key takes years to hash."""
+    tuples, last = set(), ""
+    for opcode, argument, _ in pickletools.genops(pickled):
+        if opcode.name in ("BINPUT", "LONG_BINPUT") and "TUPLE" in last:
+            tuples.add(argument)
+        if opcode.name in ("BINGET", "LONG_BINGET") and argument in tuples:
+            raise Refused("describes its contents in a way that torch does not")
+        last = opcode.name
 
 
-def _archive(records: dict[str, bytes]) -> io.BytesIO:
-    """The records as an archive for torch."""
-    file = io.BytesIO()
-    with zipfile.ZipFile(file, "w", zipfile.ZIP_STORED) as archive:
-        for name, record in (records | {"version": b"3\n"}).items():
-            archive.writestr(f"archive/{name}", record)
-    file.seek(0)
-    return file
+def _check_tensor(value: Any) -> None:
+    """Refuses tensors of other kinds than numpy has."""
+    if isinstance(value, torch.Tensor) and (
+        type(value) is not torch.Tensor
+        or value.device.type != "cpu"
+        or value.layout != torch.strided
+        or value.is_quantized
+        or value.is_complex()
+        or value.is_nested
+    ):
+        raise Refused("holds a tensor of a kind that is not read: only plain numbers are")
+
+
+def describe(value: Any) -> str:
+    """What a value of a .pt file is, in a few words."""
+    if isinstance(value, torch.Tensor):
+        shape = " x ".join(str(n) for n in value.shape) or "a single number"
+        return f"a tensor of {str(value.dtype).removeprefix('torch.')}, {shape}"
+    return f"a value of type {type(value).__name__}"

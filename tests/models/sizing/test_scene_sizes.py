@@ -28,7 +28,7 @@ from leco_plugin.models.sizing.sizes import (
     with_size,
 )
 from leco_plugin.scenes.bounds import BoundsConfig
-from leco_plugin.scenes.city.capture import CaptureConfig
+from leco_plugin.scenes.city.cameras import CaptureConfig
 from leco_plugin.scenes.city.city import CityConfig
 from leco_plugin.scenes.city.folder import write_city
 from leco_plugin.scenes.detail import CAMERAS, SceneDetail, detail_of

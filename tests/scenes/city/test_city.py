@@ -6,8 +6,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from leco_plugin.scenes.city.city import City, CityConfig
-from leco_plugin.scenes.city.palette import Material
 from leco_plugin.scenes.city.plan import choose_blocks
+from leco_plugin.scenes.city.shapes import Material
 
 SMALL = st.builds(
     CityConfig,

@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 
 from leco_plugin.scenes.city import queries as city_queries
 from leco_plugin.scenes.city.city import City, CityConfig
-from leco_plugin.scenes.city.faces import squared_to_triangles
+from leco_plugin.scenes.city.queries import squared_to_triangles
 
 
 def distance_by_looking_at_all(city: City, points: np.ndarray) -> np.ndarray:
@@ -68,3 +68,15 @@ def test_distance_changes_no_faster_than_the_point_moves() -> None:
     step = random.normal(0, 0.5, points.shape)
     change = np.abs(city.distance(points + step) - city.distance(points))
     assert (change <= np.linalg.norm(step, axis=1) + 1e-9).all()
+
+
+def test_a_triangle_is_as_near_as_the_nearest_of_its_points() -> None:
+    random = np.random.default_rng(0)
+    triangles, points = random.normal(size=(40, 3, 3)), random.normal(0, 2, (40, 3))
+    u, v = np.meshgrid(np.linspace(0, 1, 150), np.linspace(0, 1, 150))
+    weights = np.stack([1 - u, u * (1 - v), u * v], -1).reshape(-1, 3)
+    places = np.einsum("sk,tkj->tsj", weights, triangles)
+    sampled = np.linalg.norm(places - points[:, None], axis=-1).min(1)
+    exact = np.sqrt(squared_to_triangles(points, triangles))
+    assert (exact <= sampled + 1e-12).all()
+    np.testing.assert_allclose(exact, sampled, atol=0.02)

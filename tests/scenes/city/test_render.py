@@ -3,11 +3,10 @@
 import numpy as np
 import pytest
 
-from leco_plugin.scenes.city.cameras import aerial_cameras, look_at, street_cameras
+from leco_plugin.scenes.city.cameras import Lens, aerial_cameras, look_at, street_cameras
 from leco_plugin.scenes.city.city import City, CityConfig
-from leco_plugin.scenes.city.lens import Lens
-from leco_plugin.scenes.city.palette import Material
 from leco_plugin.scenes.city.render import Tracer
+from leco_plugin.scenes.city.shapes import Material
 
 LENS = Lens(64, 48, 55.0)
 

@@ -5,7 +5,7 @@ import pytest
 from mega_nerf_scene import COORDINATES, poses
 
 from leco_plugin.scenes.city.cameras import look_at
-from leco_plugin.scenes.mega_nerf_format.axes import TO_DRB, around, wrong_axis
+from leco_plugin.scenes.mega_nerf_format.files import TO_DRB, around, wrong_axis
 
 FILES = COORDINATES.to_file(poses(24))
 

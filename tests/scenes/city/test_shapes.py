@@ -4,8 +4,7 @@ import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from leco_plugin.scenes.city.canvas import Canvas
-from leco_plugin.scenes.city.shapes import Shapes
+from leco_plugin.scenes.city.shapes import Canvas, Shapes
 
 CELL = st.integers(1, 8)
 STROKES = st.lists(st.tuples(CELL, CELL, CELL, CELL, st.integers(0, 5)), max_size=8)

@@ -1,24 +1,30 @@
-"""Which rules apply to a name, and applying them: what the command and the tests share."""
+"""Which rules apply to a name, and applying them: what the command and the tests share.
+
+`python -m leco_plugin.conformance.cases docs/conformance.md` renews the table of rules there.
+"""
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Iterator
+from pathlib import Path
 
 import torch
 
-from leco_plugin.conformance.hosts.host_case import HostCase
-from leco_plugin.conformance.hosts.host_rules import HOST_RULES
-from leco_plugin.conformance.kit.scene import SLAB
-from leco_plugin.conformance.rule import Case, Rule, Verdict, apply
-from leco_plugin.conformance.samplers.estimator_case import EstimatorCase
-from leco_plugin.conformance.samplers.proposal_case import ProposalCase
-from leco_plugin.conformance.samplers.sampler_case import SamplerCase
-from leco_plugin.conformance.samplers.sampler_rules import SAMPLER_RULES
+from leco_plugin.conformance import host_images, host_training  # noqa: F401 (checks of hosts)
+from leco_plugin.conformance.estimators import EstimatorCase
+from leco_plugin.conformance.hosts import HostCase
+from leco_plugin.conformance.proposals import ProposalCase
+from leco_plugin.conformance.rules import RULES, Case, Rule, Verdict, apply
+from leco_plugin.conformance.samplers import SamplerCase
+from leco_plugin.conformance.scene import SLAB
 from leco_plugin.entries import why_left_out
 from leco_plugin.samplers.registry import GROUP, SamplerSpec, sampler_spec, samplers
 from leco_plugin.scenes.input_error import InputError
 
-RULES = SAMPLER_RULES + HOST_RULES
+HOST_RULES = tuple(rule for rule in RULES if HostCase.seam in rule.checks)
+SAMPLER_RULES = tuple(rule for rule in RULES if rule not in HOST_RULES)
+BEGIN, END = "<!-- rules: generated -->", "<!-- end of the rules -->"
 
 
 def sampler_cases(name: str) -> list[Case]:
@@ -42,7 +48,7 @@ def sampler_cases(name: str) -> list[Case]:
 
 def _refuse_what_cannot_be_built(case: SamplerCase) -> None:
     """One line about a builder, instead of one a rule with remedies for something else."""
-    occupancy = case.occupancy_of(SLAB) if case.needs_occupancy else None
+    occupancy = SLAB.occupancy(case.gate_encoding) if case.needs_occupancy else None
     try:
         with torch.random.fork_rng(devices=[]), torch.enable_grad():
             case.build(occupancy)
@@ -102,3 +108,19 @@ def check(name: str) -> Iterator[Verdict]:
     """
     found = pairs(cases_of(name), RULES)
     return (apply(rule, case) for rule, case in found)
+
+
+def with_table(page: str) -> str:
+    """A Markdown page with the table of rules between its two marks renewed."""
+    rows = ["| rule | seams | why it matters | remedy |", "|---|---|---|---|"]
+    rows += [
+        f"| `{rule.name}` | {', '.join(rule.checks)} | {rule.reason} | {rule.remedy} |"
+        for rule in RULES
+    ]
+    before, _, rest = page.partition(BEGIN)
+    return "\n".join([f"{before}{BEGIN}", *rows, f"{END}{rest.partition(END)[2]}"])
+
+
+if __name__ == "__main__":
+    path = Path(sys.argv[1])
+    path.write_text(with_table(path.read_text()))

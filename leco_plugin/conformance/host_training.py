@@ -1,10 +1,9 @@
-"""Checks of a guided host beyond one process: config, checkpoint, resuming, data parallel."""
+"""The rules for a guided host over a run: training steps, checkpoints, resuming, two processes."""
 
 from __future__ import annotations
 
 import copy
 import functools
-import io
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Any
@@ -12,21 +11,107 @@ from typing import TYPE_CHECKING, Any
 import torch
 from torch import Tensor
 
-from leco_plugin.conformance.hosts.host_case import HostCase, build, callbacks, loss_of
-from leco_plugin.conformance.hosts.host_images import rendered
-from leco_plugin.conformance.kit.host_scene import batch, bundle
-from leco_plugin.conformance.kit.scene import SLAB
-from leco_plugin.conformance.kit.two_processes import on_two_ranks
-from leco_plugin.conformance.rule import require
+from leco_plugin.conformance.host_images import densely, rendered, shaded
+from leco_plugin.conformance.hosts import HostCase, batch, build, bundle, callbacks, loss_of
+from leco_plugin.conformance.rules import checks, require
+from leco_plugin.conformance.samplers import on_two_ranks, reloaded
+from leco_plugin.conformance.scene import SLAB
 
 if TYPE_CHECKING:
     from nerfstudio.engine.callbacks import TrainingCallbackLocation
     from nerfstudio.engine.trainer import TrainerConfig
+    from nerfstudio.models.base_model import Model
+
+GUIDE = "leco_guide."
+"""How the names of what belongs to the guide of a host begin."""
+
+
+@checks("samples-shift-in-training", "host")
+def samples_shift_in_training(case: HostCase) -> None:
+    """The field is asked at other places in each step."""
+    model = case.shared().train()
+    one, other = (_places(model, seed) for seed in (1, 2))
+    require(
+        one.shape != other.shape or not one.equal(other),
+        "two training steps ask the field at the same places",
+    )
+
+
+@torch.no_grad()
+def _places(model: Model, seed: int) -> Tensor:
+    torch.manual_seed(seed)
+    with shaded(model) as places:
+        model(bundle())
+    require(bool(places), "the field is asked about no sample at all")
+    return torch.cat(places)
+
+
+@checks("teaches-the-host-alone", "host")
+def teaches_the_host_alone(case: HostCase) -> None:
+    """A step moves the host's parameters, and never the frozen gate."""
+    model: Any = case.shared()
+    groups = model.get_param_groups()
+    handed_out = {id(parameter) for group in groups.values() for parameter in group}
+    gradients = gradients_of_a_step(model)
+    reached = [name for name, gradient in gradients.items() if bool(gradient.any())]
+    require(bool(reached), "no parameter of the host gets a gradient")
+    for name, gradient in gradients.items():
+        require(bool(gradient.isfinite().all()), f"the gradient of {name} is not finite")
+    for name, parameter in model.leco_guide.named_parameters():
+        require(not parameter.requires_grad, f"{name} of the guide is no longer frozen")
+        require(id(parameter) not in handed_out, f"{name} of the guide is handed to an optimizer")
+    touched = [name for name in gradients if name.startswith(GUIDE)]
+    require(not touched, f"{_some(touched)} of the guide get a gradient")
+
+
+def gradients_of_a_step(model: Model, seed: int = 0) -> dict[str, Tensor]:
+    """Gradients of the batch's loss by parameter, for parameters that it reaches."""
+    torch.manual_seed(seed)
+    loss = loss_of(model.train(), bundle(), batch())
+    require(loss.requires_grad, "the loss has no gradient")
+    loss.backward()  # type: ignore[no-untyped-call]
+    gradients = _gradients(model)
+    model.zero_grad(set_to_none=True)
+    return gradients
+
+
+@checks("nothing-superfluous-is-left", "host")
+def nothing_superfluous_is_left(case: HostCase) -> None:
+    """What the gate stands for is gone from memory, checkpoints and optimizers."""
+    from leco_plugin.hosts.seams import PACKED, PROPOSAL
+
+    own, model = case.unguided(), case.shared()
+    for adapter in (PACKED, PROPOSAL):
+        require(not adapter.fits(model), f"the host still holds {adapter.description}")
+    now = dict(model.named_parameters())
+    with densely(own):  # a grid that nobody has updated keeps nothing
+        before = gradients_of_a_step(own)
+    idle = before.keys() & now.keys() - gradients_of_a_step(model).keys()
+    require(
+        not idle,
+        f"{_some(sorted(idle))} are trained with the host's own sampler, and get no gradient now",
+    )
+    state = model.state_dict().keys()
+    gained = state - own.state_dict().keys()
+    more = sorted(name for name in gained if not name.startswith(GUIDE))
+    require(not more, f"the state dict has gained {_some(more)} beside the guide")
+    held = {id(parameter) for parameter in now.values()}
+    for name, group in model.get_param_groups().items():
+        require(bool(group), f"the parameter group {name!r} is empty, which no optimizer takes")
+        gone = sum(id(parameter) not in held for parameter in group)
+        require(gone == 0, f"the parameter group {name!r} holds {gone} that the host no longer has")
+
+
+def _some(names: list[str]) -> str:
+    shown = ", ".join(names[:3])
+    return shown if len(names) <= 3 else f"{shown} and {len(names) - 3} more"
+
 
 ROUNDING = 1e-3
 """Share of a step, or of a gradient, by which sums in another order may differ."""
 
 
+@checks("state-and-yaml-round-trip", "host")
 def state_and_yaml_round_trip(case: HostCase) -> None:
     """A run folder is all that it takes: its config.yml, its checkpoint, and no other file."""
     import yaml  # type: ignore[import-untyped]
@@ -41,20 +126,12 @@ def state_and_yaml_round_trip(case: HostCase) -> None:
     read: Any = yaml.load(written, Loader=yaml.Loader)
     restored = build(read.pipeline.model, seed=1)
     restored.update_to_step(1)
-    restored.load_state_dict(saved(model.state_dict()), strict=True)
+    restored.load_state_dict(reloaded(model.state_dict()), strict=True)
     for name, value in rendered(restored, bundle()).items():
         require(
             value.equal(expected[name]),
             f"the output {name!r} of a model that was restored is not that of the one it is of",
         )
-
-
-def saved(state: Any) -> Any:
-    """What is read of a checkpoint of this state."""
-    file = io.BytesIO()
-    torch.save(state, file)
-    file.seek(0)
-    return torch.load(file, map_location="cpu", weights_only=True)
 
 
 class Run:
@@ -109,11 +186,12 @@ class Run:
         return {name: p.detach().clone() for name, p in self.model.named_parameters()}
 
 
+@checks("resumes-where-it-stopped", "host")
 def resumes_where_it_stopped(case: HostCase) -> None:
     """The step after a checkpoint is the same, whether or not the run was interrupted."""
     run, resumed = Run(case.config, seed=0), Run(case.config, seed=1)
     run.step(0)
-    state, before = saved(run.state()), run.parameters()
+    state, before = reloaded(run.state()), run.parameters()
     expected = run.step(1)
     resumed.resume(state, step=0)
     found = resumed.step(1)
@@ -130,6 +208,7 @@ def resumes_where_it_stopped(case: HostCase) -> None:
         )
 
 
+@checks("two-processes-step-alike", "host")
 def two_processes_step_alike(case: HostCase) -> None:
     """Two ranks with half a batch each get the gradients of one process with all of it."""
     config = case.config.pipeline.model  # type: ignore[attr-defined]
@@ -171,5 +250,5 @@ def _half_a_batch(model: Any, rank: int, forward: Any = None) -> Tensor:
 
 
 def _gradients(model: Any) -> dict[str, Tensor]:
-    named = ((name, parameter.grad) for name, parameter in model.named_parameters())
-    return {name: gradient for name, gradient in named if gradient is not None}
+    named = model.named_parameters()
+    return {name: parameter.grad for name, parameter in named if parameter.grad is not None}

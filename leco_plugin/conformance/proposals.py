@@ -1,4 +1,4 @@
-"""Checks of what a sampler for proposal hosts returns."""
+"""Samplers at the seam of proposal hosts, called as nerfstudio's nerfacto calls its own."""
 
 from __future__ import annotations
 
@@ -7,20 +7,112 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from leco_plugin.conformance.kit.intervals import ROUNDING, check_intervals, check_order, same
-from leco_plugin.conformance.kit.scene import (
+from leco_plugin.conformance.rules import Broken, checks, require
+from leco_plugin.conformance.samplers import SamplerCase, check_gradients, devices
+from leco_plugin.conformance.scene import (
+    BACKGROUND,
     EVERYTHING,
     MOVED,
+    ROUNDING,
     SLAB,
     Field,
     Rays,
+    Slab,
+    check_intervals,
+    check_order,
     crossing,
     cut_short,
+    same,
     without_samples,
 )
-from leco_plugin.conformance.rule import Broken, require
-from leco_plugin.conformance.samplers.proposal_case import LEVELS, ProposalCase, no_density, packed
-from leco_plugin.conformance.samplers.sampler_case import devices
+from leco_plugin.occupancy import Occupancy
+from leco_plugin.samplers.marching import Samples
+from leco_plugin.samplers.registry import build_proposal
+
+LEVELS, NUM_SAMPLES = 2, 48
+"""Proposal levels and samples a ray of the host, nerfacto's defaults."""
+
+
+class ProposalCase(SamplerCase):
+    """A sampler called as (ray_bundle, density_fns=...) -> (ray_samples, weights, samples)."""
+
+    seam = "proposal"
+    imports = ("torch", "nerfstudio.model_components.ray_samplers")
+
+    def build(self, occupancy: Occupancy | None, **more: Any) -> Any:
+        from nerfstudio.model_components.ray_samplers import UniformLinDispPiecewiseSampler
+
+        return build_proposal(
+            self.name,
+            occupancy=occupancy,
+            num_samples=NUM_SAMPLES,
+            initial_sampler=UniformLinDispPiecewiseSampler(),
+            single_jitter=False,
+            **self.options,
+            **more,
+        )
+
+    def answer(
+        self, sampler: Any, rays: Rays, scene: Slab = SLAB, density: Any = None
+    ) -> tuple[Any, Any, Any]:
+        """ray_samples, weights_list and ray_samples_list, as a host gets them.
+
+        Args:
+            density: what each of the host's density_fns is; None is the density of the scene.
+        """
+        density_fns = [scene.density if density is None else density] * LEVELS
+        answer = sampler(ray_bundle(rays), density_fns=density_fns)
+        are_three = isinstance(answer, (tuple, list)) and len(answer) == 3
+        require(
+            are_three,
+            f"the call returned {type(answer).__name__} instead of ray_samples, weights_list and "
+            "ray_samples_list",
+        )
+        ray_samples, weights, candidates = answer
+        return ray_samples, weights, candidates
+
+    def sample(
+        self, sampler: Any, rays: Rays, scene: Slab = SLAB, *, seed: int = 0, **options: Any
+    ) -> Samples:
+        torch.manual_seed(seed)
+        return packed(self.answer(sampler, rays, scene, **options)[0])
+
+    def colours(self, sampler: Any, rays: Rays, field: Field) -> Tensor:
+        ray_samples, _, _ = self.answer(sampler, rays)
+        positions = ray_samples.frustums.get_positions()
+        weights = ray_samples.get_weights(field.density(positions)[..., None])
+        colours = (weights * field.colours(positions)).sum(dim=-2)
+        return colours + (1.0 - weights.sum(dim=-2)) * colours.new_tensor(BACKGROUND)
+
+
+def no_density(*_: Any, **__: Any) -> None:
+    """Stands for the proposal networks of a guided host. Always raises `Broken`."""
+    raise Broken("density_fns are called, and a guided host has no proposal networks to answer")
+
+
+def ray_bundle(rays: Rays) -> Any:
+    """Rays as nerfstudio hands them to a sampler."""
+    from nerfstudio.cameras.rays import RayBundle
+
+    return RayBundle(
+        origins=rays.origins,
+        directions=rays.directions,
+        pixel_area=torch.full_like(rays.t_min, 1e-6)[:, None],
+        nears=rays.t_min[:, None],
+        fars=rays.t_max[:, None],
+    )
+
+
+def packed(ray_samples: Any) -> Samples:
+    """The samples of all rays one after another."""
+    starts, ends = ray_samples.frustums.starts, ray_samples.frustums.ends
+    require(
+        starts.dim() == 3 and starts.shape == ends.shape,
+        f"starts are {list(starts.shape)} and ends {list(ends.shape)}; expected [n_rays, n, 1]",
+    )
+    rays = torch.arange(len(starts), device=starts.device)
+    return rays.repeat_interleave(starts.shape[1]), starts.reshape(-1), ends.reshape(-1)
+
 
 NEARBY = 0.25
 """World units beyond what is kept where a sample may lie: a histogram is as fine as its cells."""
@@ -34,6 +126,7 @@ UNEVEN = 1.5
 """In units of their mean, how far places may be from evenly spaced when everything is kept."""
 
 
+@checks("signature", "proposal")
 def signature(case: ProposalCase) -> None:
     """A module with the call and the two callbacks of nerfstudio's `ProposalNetworkSampler`."""
     sampler = case.shared(SLAB)
@@ -50,6 +143,7 @@ def signature(case: ProposalCase) -> None:
         require(isinstance(found, list), f"{name} is {type(found).__name__}; hosts append to it")
 
 
+@checks("shapes-types-devices", "proposal")
 def shapes_types_devices(case: ProposalCase) -> None:
     """As many samples on each ray; weights for the samples of each level that the host has."""
     for device in devices():
@@ -85,6 +179,7 @@ def _check_tensors(where: str, rays: Rays, *tensors: Tensor) -> None:
         require(bool(tensor.isfinite().all()), f"{where}: values are not finite")
 
 
+@checks("sorted-disjoint-inside", "proposal")
 def sorted_disjoint_inside(case: ProposalCase) -> None:
     """Along each ray, samples follow one another between its ends; so do the levels' samples."""
     rays = cut_short()
@@ -96,6 +191,7 @@ def sorted_disjoint_inside(case: ProposalCase) -> None:
     check_order(packed(case.answer(case.shared(SLAB).train(), rays)[0]))
 
 
+@checks("skips-only-what-it-may", "proposal")
 def skips_only_what_it_may(case: ProposalCase) -> None:
     """Samples gather in what is kept, from where a ray enters it to where it leaves."""
     for training in (False, True):
@@ -143,6 +239,7 @@ def chords(rays: Rays) -> tuple[Tensor, Tensor]:
     return t[first] * met, t[last] * met
 
 
+@checks("all-kept-equals-dense", "proposal")
 def all_kept_equals_dense(case: ProposalCase) -> None:
     """Where everything is occupied, a ray is sampled from end to end; evenly, if a gate decides."""
     rays = cut_short()  # which lie within the box: outside it nothing is occupied
@@ -166,6 +263,7 @@ def all_kept_equals_dense(case: ProposalCase) -> None:
     )
 
 
+@checks("zero-samples-well-formed", "proposal")
 def zero_samples_well_formed(case: ProposalCase) -> None:
     """No rays, and rays on which everything is empty, still give what a host can render."""
     sampler, without = case.shared(SLAB), without_samples()
@@ -181,11 +279,10 @@ def zero_samples_well_formed(case: ProposalCase) -> None:
             if len(rays.origins):
                 check_intervals(rays, packed(ray_samples))
             case.colours(sampler, rays, field).sum().backward()
-            gradients = [parameter.grad for parameter in field.parameters()]
-            finite = all(grad is not None and grad.isfinite().all() for grad in gradients)
-            require(finite, f"{why}: gradients are missing or not finite")
+            check_gradients(field, why)
 
 
+@checks("update-while-frozen-is-harmless", "proposal")
 def update_while_frozen_is_harmless(case: ProposalCase) -> None:
     """The callbacks of hosts that train proposal networks are accepted, and change no decision."""
     sampler, rays = case.shared(SLAB), crossing()

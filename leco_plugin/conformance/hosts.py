@@ -1,4 +1,7 @@
-"""A registered method, built guided on the scene of the kit: what the rules for hosts are for."""
+"""Registered methods, built guided on a known scene, as the rules for hosts check them.
+
+What needs nerfstudio is imported when it is called: a sampler is checked without.
+"""
 
 from __future__ import annotations
 
@@ -11,26 +14,130 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, ClassVar, cast
+from types import SimpleNamespace
+from typing import TYPE_CHECKING, Any, cast
 
 import torch
 from torch import Tensor
+from torch.nn.functional import normalize
 
-from leco_plugin.conformance.kit.host_scene import model_arguments, pipeline_of
-from leco_plugin.conformance.kit.scene import HERE, MOVED, SLAB, Slab
+from leco_plugin.conformance.rules import Case
+from leco_plugin.conformance.scene import (
+    CENTRE,
+    DISTANCE,
+    HERE,
+    MOVED,
+    SLAB,
+    Slab,
+    box,
+)
 from leco_plugin.models.encodings import Kind
 from leco_plugin.occupancy import Occupancy
+from leco_plugin.samplers.boxes import intersect_box
 from leco_plugin.samplers.registry import sampler_spec
 from leco_plugin.scenes.input_error import InputError
 
 if TYPE_CHECKING:
+    from nerfstudio.cameras.cameras import Cameras
     from nerfstudio.cameras.rays import RayBundle
     from nerfstudio.engine.callbacks import TrainingCallback
     from nerfstudio.engine.trainer import TrainerConfig
     from nerfstudio.models.base_model import Model
 
+FROM = ((1.0, 0.4, 0.5), (0.3, 1.0, 0.6), (-0.8, -0.9, -0.1), (-0.4, -0.6, -1.0))
+"""Directions in which cameras lie from the centre of the box, to both sides of the slab."""
+CAMERAS, SIDE = len(FROM), 4
+"""Cameras, and pixels along each side of their images."""
+SEEN = 0.8
+"""World units to each side of the box's centre that an image shows: all rays cross the slab."""
 
-class HostCase:
+NOTHING = Slab((0.0, 0.0, 1.0), -1.0)
+"""A scene in which all is empty."""
+
+
+def cameras() -> Cameras:
+    """Around the box, looking at its centre."""
+    from nerfstudio.cameras.cameras import Cameras
+
+    backward = normalize(torch.tensor(FROM), dim=-1)
+    upward = torch.tensor([0.0, 0.0, 1.0]).expand_as(backward)
+    right = normalize(torch.linalg.cross(upward, backward), dim=-1)
+    position = torch.tensor(CENTRE) + DISTANCE * backward
+    poses = torch.stack([right, torch.linalg.cross(backward, right), backward, position], dim=-1)
+    focal, middle = SIDE / 2.0 * DISTANCE / SEEN, SIDE / 2.0
+    return Cameras(poses, focal, focal, middle, middle, SIDE, SIDE)
+
+
+def _pixels() -> Tensor:
+    """Camera, row and column of every pixel: [CAMERAS * SIDE^2, 3]."""
+    return torch.cartesian_prod(*map(torch.arange, (CAMERAS, SIDE, SIDE)))
+
+
+def bundle() -> RayBundle:
+    """Rays through all pixels of all cameras, [CAMERAS * SIDE^2], as a data manager gives them."""
+    pixels = _pixels()
+    rays: RayBundle = cameras().generate_rays(pixels[:, :1], coords=pixels[:, 1:] + 0.5)
+    return rays
+
+
+def turned_away() -> RayBundle:
+    """The same rays in the opposite direction, where there is nothing."""
+    rays = bundle()
+    rays.directions = -rays.directions
+    return rays
+
+
+def inside_the_box() -> RayBundle:
+    """The same rays, which begin and end within the box."""
+    rays = bundle()
+    enters, leaves = intersect_box(rays.origins, rays.directions, box())
+    rays.nears, rays.fars = (enters + 0.01)[:, None], (leaves - 0.01)[:, None]
+    return rays
+
+
+def batch() -> dict[str, Tensor]:
+    """What the pixels of `bundle` show: `image` [N, 3], `depth_image` [N, 1], `indices` [N, 3]."""
+    rays = bundle()
+    return {
+        "image": 0.5 + 0.5 * torch.sin(3.0 * rays.directions),
+        "depth_image": torch.full((len(rays), 1), DISTANCE),
+        "indices": _pixels(),
+    }
+
+
+def model_arguments() -> dict[str, Any]:
+    """What nerfstudio's pipeline gives a model when it builds it."""
+    from nerfstudio.data.scene_box import SceneBox
+
+    return {
+        "scene_box": SceneBox(box().view(2, 3)),
+        "num_train_data": CAMERAS,
+        "metadata": {},
+        "device": "cpu",
+        "grad_scaler": None,
+        "seed_points": None,
+    }
+
+
+class CamerasOnly:
+    """A data set as far as models and their callbacks look at one."""
+
+    def __init__(self) -> None:
+        arguments = model_arguments()
+        self.cameras, self.scene_box = cameras(), arguments["scene_box"]
+        self.metadata: dict[str, Any] = arguments["metadata"]
+
+    def __len__(self) -> int:
+        return CAMERAS
+
+
+def pipeline_of(model: Any) -> Any:
+    """What stands where callbacks expect nerfstudio's pipeline."""
+    manager = SimpleNamespace(train_dataset=CamerasOnly())
+    return SimpleNamespace(model=model, _model=model, device=model.device, datamanager=manager)
+
+
+class HostCase(Case):
     """A method whose model is guided: as it is, or with its sampler swapped.
 
     Args:
@@ -43,9 +150,8 @@ class HostCase:
         InputError: there is no such method, or none that an occupancy could guide.
     """
 
-    seam: ClassVar[str] = "host"
-    imports: ClassVar[tuple[str, ...]] = ("torch", "torchmetrics", "leco_plugin.hosts.guided")
-    """Modules behind every model that take time to import."""
+    seam = "host"
+    imports = ("torch", "torchmetrics", "leco_plugin.models.guided")
 
     def __init__(self, name: str) -> None:
         self.name = name
@@ -58,7 +164,6 @@ class HostCase:
         self._guided_by = (SLAB, False)
 
     def forget(self) -> None:
-        """Builds the model anew from now on."""
         self._model = None
 
     def occupancy(self, scene: Slab, frame: Tensor = HERE) -> Occupancy:
@@ -161,6 +266,4 @@ def quietly() -> Iterator[None]:
         with printed:
             yield
     except SystemExit as end:
-        if isinstance(end, InputError):
-            raise
         raise RuntimeError(" ".join(printed.get().split()) or f"it ends with {end}") from end

@@ -1,18 +1,61 @@
-"""Subcommands of `leco` about how much a scene needs, and about other formats of an occupancy."""
+"""Subcommands of `leco` about an occupancy file: inspect, export and shrink."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Literal
 
 import tyro
 
-from leco_plugin.cli_reports import (
-    check_json,
-    check_picture,
-    occupancy_of,
-    write_json,
-)
+from leco_plugin.cli_reports import check_json, check_picture, occupancy_of, write_json
+
+
+def inspect(
+    file: Annotated[Path, tyro.conf.Positional],
+    picture: Path | None = None,
+    history: Path | None = None,
+    json: Path | None = None,
+) -> None:
+    """Say what an occupancy is: sizes, threshold, price and gain; and draw it.
+
+    Args:
+        file: An occupancy.safetensors, or a folder of runs: the newest in it.
+        picture: File for a picture: slices of o(x) with the cameras, and the kept points.
+        history: File for how it was learned: a .gif that moves, or a still picture. For runs of
+            leco-occupancy with --pipeline.model.schedule.steps-per-record 10, say.
+        json: File for the same as JSON.
+    """
+    check_json(json)
+    check_picture("--picture", picture)
+    check_picture("--history", history, moving=True)
+    from leco_plugin.evaluation.inspection import describe
+    from leco_plugin.occupancy import Occupancy
+
+    file = occupancy_of(file)
+    occupancy = Occupancy.load(file)
+    facts = {**describe(occupancy), "bytes": file.stat().st_size}
+    space = facts["space"]
+    print(f"{file}: {facts['params']} parameters in {facts['bytes'] / 1000:.1f} kB")
+    print(
+        f"space: {space['kind']} around {_listed(space['center'])}, {space['half_extent']:.4g} half"
+    )
+    print(f"kept where o(x) >= {facts['threshold']:.4g}, asked in {facts['precision']}")
+    print(f"kept share of its box: {facts['kept_share_of_box']:.2%}")
+    for name, value in facts["report"].items():
+        if isinstance(value, (int, float, str)) and name not in ("params", "threshold"):
+            print(f"{name.replace('_', ' ')}: {_said(value)}")
+    if picture is not None:
+        from leco_plugin.evaluation.occupancy_picture import draw
+
+        picture.parent.mkdir(parents=True, exist_ok=True)
+        print(f"drew {draw(occupancy, picture)}")
+    if history is not None:
+        from leco_plugin.evaluation.history_picture import draw_history
+
+        history.parent.mkdir(parents=True, exist_ok=True)
+        print(f"drew {draw_history(occupancy, file.parent, history)}")
+    write_json(json, facts)
 
 
 def export(
@@ -42,7 +85,7 @@ def export(
             in those of the run, for its boxes lie along the axes.
         json: File for what was written, as JSON.
     """
-    from leco_plugin.export.command import export as write
+    from leco_plugin.export import export as write
 
     check_json(json)
     facts = write(occupancy_of(file), format, out, resolution, levels, frame)
@@ -104,31 +147,11 @@ def shrink(
         print(f"drew {draw(results, picture)}")
 
 
-def capacity(
-    data: Path,
-    out: Path,
-    grids: tuple[int, ...] = (32, 64, 128, 256, 512),
-    lost_surface_mass: float = 1e-3,
-    learn_steps: int = 200,
-    json: Path | None = None,
-) -> None:
-    """Answer how much a scene needs: gates and grids of growing size, and which of them suffices.
+def _said(value: bool | float | str) -> str:
+    if isinstance(value, bool):
+        return "yes" if value else "no"
+    return str(value) if isinstance(value, str | int) else f"{value:.4g}"
 
-    One field is learned, and teaches them all. Writes capacity.png, capacity-dark.png and
-    results.json. What is finished is kept whenever this is stopped.
 
-    Args:
-        data: A scene in nerfstudio's format.
-        out: Folder of the picture.
-        grids: Cells along an axis of the occupancy grids.
-        lost_surface_mass: Share of the weight near surfaces that each may lose.
-        learn_steps: Steps in which the field is learned, at most.
-        json: Another file for the results.
-    """
-    from leco_plugin.capacity.command import capacity as measure
-
-    check_json(json)
-    results = measure(data, out, grids, lost_surface_mass, learn_steps)
-    print(results["verdict"])
-    print(f"see capacity.png and results.json in {out}")
-    write_json(json, results)
+def _listed(values: Sequence[float]) -> str:
+    return "(" + ", ".join(f"{value:.4g}" for value in values) + ")"

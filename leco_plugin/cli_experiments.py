@@ -1,0 +1,169 @@
+"""Subcommands of `leco` that measure: chart, stability, capacity and check."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+
+from leco_plugin.cli_reports import check_json, write_json
+
+
+def chart(
+    data: Path,
+    out: Path,
+    methods: tuple[str, ...] = (),
+    samplers: tuple[str, ...] = (),
+    suite: tuple[str, ...] = (),
+    seconds: float | None = None,
+    steps: int | None = None,
+    seeds: tuple[int, ...] = (0, 1, 2),
+    learn_seconds: float | None = None,
+    images: int = 2,
+    at_once: int | None = None,
+    reuse: tuple[Path, ...] = (),
+    json: Path | None = None,
+) -> None:
+    """Train methods on a scene for the same time, and draw accuracy against what it costs.
+
+    Writes chart.png, chart-dark.png, chart.html, table.md and results.json. What is finished is
+    kept whenever this is stopped; the same command goes on with what is missing.
+
+    Args:
+        data: A scene in nerfstudio's format.
+        out: Folder of the chart. More methods and seeds may be added to it later.
+        methods: As ns-train knows them, or leco-occupancy-never-frozen, -retrained, -homogeneous.
+        samplers: Of the registry, occupancy-grid-N for N cells along an axis, or own. By default
+            learned-occupancy and own where the method can have both.
+        suite: A named comparison instead of methods and samplers. Minutes that it takes on two CPU
+            cores with three seeds, by their speed: representations 12 to 30, empty-expert 14 to 34,
+            losses 9 to 22, freeze 13 to 16, enough-time 12 to 14, grid-resolution 15 to 16. Several
+            of them, or all, have a folder each in that of --out and share their runs: all take 61
+            to 108 minutes.
+        seconds: Training time of each run. Methods need it or --steps; without either, runs of a
+            suite end after 400 steps (4,000 on a GPU), or after 90 s (freeze) or 120 s where times
+            are compared.
+        steps: Training steps of each run; with both, a run ends with the first.
+        seeds: Seeds.
+        learn_seconds: Most of a run, about, that learning its occupancy may take. By default 0.4 of
+            seconds.
+        images: Whole test images that each run renders at its end.
+        at_once: Runs beside each other, which share the threads of the CPU. By default 1; suites
+            have 2 where there is no GPU.
+        reuse: Folders of other charts on this scene: runs of theirs that this one lacks are taken
+            over where time, evaluation, machine and version are the same.
+        json: Another file for the results.
+    """
+    check_json(json)
+    from leco_plugin.chart.command import Asked, make_charts
+
+    asked = Asked(seconds, steps, learn_seconds, seeds, images, at_once, reuse)
+    made = make_charts(data, out, methods, samplers, suite, asked)
+    for folder, results in made.items():
+        drawn = "chart.png, chart.html, " if results["runs"] else ""
+        print(f"see {drawn}table.md and results.json in {folder}")
+    charts = {folder.name: results for folder, results in made.items()}
+    write_json(json, {"format": 1, "charts": charts} if len(made) > 1 else made[out])
+    failures = [one for results in made.values() for one in results["failures"] if one["asked"]]
+    if failures:
+        count = len(failures) + sum(len(results["runs"]) for results in made.values())
+        raise RuntimeError(
+            f"{len(failures)} of {count} runs failed, the first "
+            f"({failures[0]['name']}, seed {failures[0]['seed']}) with: {failures[0]['reason']}"
+        )
+
+
+def stability(
+    out: Path,
+    cases: tuple[str, ...] = (),
+    samplers: tuple[str, ...] = (),
+    seeds: tuple[int, ...] = (0,),
+    seeds_beside: tuple[int, ...] = (),
+    minutes: float | None = None,
+    quick: bool = False,
+    json: Path | None = None,
+) -> None:
+    """Run samplers through scenes and disturbances in which they fail: a table of who passes.
+
+    Writes stability.json, table.md, stability.png, stability-dark.png, and for each failure a
+    picture in failures. What is finished is kept whenever this is stopped; the same command goes on
+    with what is missing. Exit 0 whatever the verdicts are; 1 says that the case that must fail did
+    not fail by its figures, so that no verdict can be believed.
+
+    Args:
+        out: Folder of the table. More cases, samplers and seeds may be added to it later.
+        cases: Names of cases, by default all; an unknown one is answered with all there are.
+        samplers: learned, grid-128, grid-256, proposal-networks, dense, dense-proposal; by default
+            all. The dense reference of a sampler's host joins by itself.
+        seeds: Seeds of each cell; the case ten-seeds has ten.
+        seeds_beside: Seeds of the samplers that learned occupancy is compared with, by default as
+            many.
+        minutes: How long this may take; the same command then goes on with what is missing.
+        quick: Tiny pictures and few steps, to see whether everything works; no verdicts.
+        json: Another file for the results.
+    """
+    from leco_plugin.stability.command import make_table
+    from leco_plugin.stability.table import blind, headline
+
+    check_json(json)
+    results = make_table(out, cases, samplers, seeds, seeds_beside, quick, minutes)
+    print(headline(results))
+    print(f"see stability.png, table.md, stability.json and failures in {out}")
+    write_json(json, results)
+    if blind(results) and not quick:
+        raise RuntimeError(blind(results)[0])
+
+
+def capacity(
+    data: Path,
+    out: Path,
+    grids: tuple[int, ...] = (32, 64, 128, 256, 512),
+    lost_surface_mass: float = 1e-3,
+    learn_steps: int = 200,
+    json: Path | None = None,
+) -> None:
+    """Answer how much a scene needs: gates and grids of growing size, and which of them suffices.
+
+    One field is learned, and teaches them all. Writes capacity.png, capacity-dark.png and
+    results.json. What is finished is kept whenever this is stopped.
+
+    Args:
+        data: A scene in nerfstudio's format.
+        out: Folder of the picture.
+        grids: Cells along an axis of the occupancy grids.
+        lost_surface_mass: Share of the weight near surfaces that each may lose.
+        learn_steps: Steps in which the field is learned, at most.
+        json: Another file for the results.
+    """
+    from leco_plugin.capacity.command import capacity as measure
+
+    check_json(json)
+    results = measure(data, out, grids, lost_surface_mass, learn_steps)
+    print(results["verdict"])
+    print(f"see capacity.png and results.json in {out}")
+    write_json(json, results)
+
+
+def check(name: Annotated[str, tyro.conf.Positional], json: Path | None = None) -> None:
+    """Hold a sampler, or a guided method, to the rules that others rely on: one line a rule.
+
+    A method that is not guided is checked with its sampler swapped, as leco swap does it.
+
+    Args:
+        name: A registered sampler or nerfstudio method, of this package or of another.
+        json: File for the verdicts as JSON.
+    """
+    check_json(json)
+    from leco_plugin.conformance.cases import check as verdicts_on
+
+    verdicts = []
+    for verdict in verdicts_on(name):
+        print(verdict.line(), flush=True)
+        verdicts.append(verdict)
+    rows = [verdict.to_dict() for verdict in verdicts]
+    write_json(json, {"format": 1, "name": name, "verdicts": rows})
+    failed = sum(not verdict.passed for verdict in verdicts)
+    if failed:
+        raise RuntimeError(f"{name} breaks {failed} of {len(verdicts)} rules")
+    print(f"{name} keeps all {len(verdicts)} rules")

@@ -1,0 +1,344 @@
+"""Samplers at the seam of packed hosts, called as nerfacc and nerfstudio call an occupancy grid."""
+
+from __future__ import annotations
+
+import inspect
+from functools import partial
+from itertools import zip_longest
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+from leco_plugin.conformance.rules import Broken, checks, require
+from leco_plugin.conformance.samplers import SamplerCase, check_gradients, devices
+from leco_plugin.conformance.scene import (
+    BACKGROUND,
+    EVERYTHING,
+    MARGIN,
+    PARTS,
+    SLAB,
+    STEP,
+    Field,
+    Rays,
+    Slab,
+    among,
+    box,
+    check_intervals,
+    check_order,
+    covered,
+    crossing,
+    cut_short,
+    dense,
+    in_order,
+    render,
+    same,
+    stretched,
+    without_samples,
+)
+from leco_plugin.occupancy import Occupancy
+from leco_plugin.samplers.base import Estimator
+from leco_plugin.samplers.marching import Samples
+from leco_plugin.samplers.packed import pack_info, render_transmittance_from_density
+from leco_plugin.samplers.registry import build_estimator
+
+TEACHING_STEPS = (0, 16)
+"""Steps at which hosts of an occupancy grid refresh it, as nerfacc has it."""
+
+
+class EstimatorCase(SamplerCase):
+    """A sampler with nerfacc's two verbs, `sampling` and `update_every_n_steps`."""
+
+    seam = "estimator"
+
+    def build(self, occupancy: Occupancy | None) -> Any:
+        return build_estimator(self.name, aabb=box(), occupancy=occupancy, **self.options)
+
+    def teach(self, sampler: Any, scene: Slab) -> None:
+        sampler.train()
+        for step in TEACHING_STEPS:
+            sampler.update_every_n_steps(step=step, occ_eval_fn=scene.density)
+
+    def sample(
+        self, sampler: Any, rays: Rays, scene: Slab = SLAB, *, seed: int = 0, **options: Any
+    ) -> Samples:
+        """ray_indices, t_starts, t_ends, as `sampling` returns them."""
+        torch.manual_seed(seed)
+        samples = sampler.sampling(
+            rays_o=rays.origins,
+            rays_d=rays.directions,
+            t_min=rays.t_min,
+            t_max=rays.t_max,
+            **{"render_step_size": STEP, "stratified": sampler.training, **options},
+        )
+        are_three = isinstance(samples, (tuple, list)) and len(samples) == 3
+        require(
+            are_three and all(isinstance(part, Tensor) for part in samples),
+            f"sampling returned {type(samples).__name__} instead of three tensors "
+            "(ray_indices, t_starts, t_ends)",
+        )
+        ray_indices, t_starts, t_ends = samples
+        return ray_indices, t_starts, t_ends
+
+    def colours(self, sampler: Any, rays: Rays, field: Field) -> Tensor:
+        def sigma_fn(t_starts: Tensor, t_ends: Tensor, ray_indices: Tensor) -> Tensor:
+            return field.density(rays.at(ray_indices, (t_starts + t_ends) / 2.0))
+
+        return render(field, rays, self.sample(sampler, rays, sigma_fn=sigma_fn))
+
+
+NEAR, FAR = 2.5, 3.4
+"""Planes that cut into some of the rays of `cut_short` at either end."""
+
+
+@checks("signature", "estimator")
+def signature(case: EstimatorCase) -> None:
+    """The two verbs take nerfacc's arguments in nerfacc's order with nerfacc's defaults."""
+    sampler = case.shared(SLAB)
+    require(isinstance(sampler, nn.Module), f"it is a {type(sampler).__name__}, no torch module")
+    for verb in ("sampling", "update_every_n_steps"):
+        require(callable(getattr(sampler, verb, None)), f"it has no method {verb}")
+    offered = list(inspect.signature(sampler.sampling).parameters.values())
+    takes_anything = {inspect.Parameter.VAR_POSITIONAL, inspect.Parameter.VAR_KEYWORD}
+    if not takes_anything <= {parameter.kind for parameter in offered}:
+        wanted = list(inspect.signature(Estimator.sampling).parameters.values())[1:]
+        for number, (given, found) in enumerate(zip_longest(wanted, offered), 1):
+            if given is None:
+                break
+            fits = found is not None and (found.name, found.default) == (given.name, given.default)
+            require(fits, f"argument {number} of sampling is {found}, hosts give '{given}'")
+    try:
+        inspect.signature(sampler.update_every_n_steps).bind(step=0, occ_eval_fn=SLAB.density)
+    except TypeError as error:
+        raise Broken(f"update_every_n_steps(step=, occ_eval_fn=): {error}") from None
+
+
+@checks("shapes-types-devices", "estimator")
+def shapes_types_devices(case: EstimatorCase) -> None:
+    """Three flat tensors of one length, of the type and on the device of the rays."""
+    for device in devices():
+        sampler, rays = case.shared(SLAB).to(device), crossing().to(device)
+        for training in (False, True):
+            samples = case.sample(sampler.train(training), rays)
+            shapes = [list(part.shape) for part in samples]
+            require(
+                len(shapes[0]) == 1 and shapes[0] == shapes[1] == shapes[2] and shapes[0][0] > 0,
+                f"ray_indices, t_starts and t_ends have shapes {shapes}; expected [n_samples] each",
+            )
+            for name, part in zip(PARTS, samples, strict=True):
+                require(part.device == rays.origins.device, f"{name} is on {part.device}")
+            for name, part in zip(PARTS[1:], samples[1:], strict=True):
+                require(
+                    part.dtype == rays.origins.dtype,
+                    f"{name} is {part.dtype}, the rays are {rays.origins.dtype}",
+                )
+                require(bool(part.isfinite().all()), f"{name} holds values that are not finite")
+        sampler.to("cpu")
+
+
+@checks("sorted-disjoint-inside", "estimator")
+def sorted_disjoint_inside(case: EstimatorCase) -> None:
+    """Along each ray, samples follow one another between its ends."""
+    sampler, rays = case.shared(SLAB), cut_short()
+    for cone_angle in (0.0, 0.02):
+        check_intervals(rays, case.sample(sampler, rays, cone_angle=cone_angle))
+    narrower = rays._replace(t_min=rays.t_min.clamp(min=NEAR), t_max=rays.t_max.clamp(max=FAR))
+    check_intervals(narrower, case.sample(sampler, rays, near_plane=NEAR, far_plane=FAR))
+    check_order(case.sample(sampler.train(), rays))
+
+
+@checks("packing-consistent", "estimator")
+def packing_consistent(case: EstimatorCase) -> None:
+    """Rays come in order, by indices that `pack_info` can turn into starts and counts."""
+    rays = crossing()
+    ray_indices = case.sample(case.shared(SLAB), rays)[0]
+    n_rays = len(rays.origins)
+    require(ray_indices.dtype == torch.int64, f"ray_indices is {ray_indices.dtype}, not int64")
+    low, high = (int(bound) for bound in ray_indices.aminmax())
+    require(
+        low >= 0 and high < n_rays, f"ray_indices go from {low} to {high}; there are {n_rays} rays"
+    )
+    require(
+        bool((ray_indices[1:] >= ray_indices[:-1]).all()),
+        "ray_indices fall somewhere: samples of a ray must lie together, rays in order",
+    )
+    counts = pack_info(ray_indices, n_rays)[:, 1]
+    unpacked = torch.arange(n_rays, device=counts.device).repeat_interleave(counts)
+    require(unpacked.equal(ray_indices), "pack_info does not give the ray indices back")
+
+
+@checks("zero-samples-well-formed", "estimator")
+def zero_samples_well_formed(case: EstimatorCase) -> None:
+    """Where there is nothing to sample, nothing is returned, and it renders as background."""
+    sampler = case.shared(SLAB)
+    asked: list[dict[str, Any]] = [{}, {"sigma_fn": lambda t_starts, *_: torch.ones_like(t_starts)}]
+    for training in (False, True):
+        for why, rays in without_samples().items():
+            field = Field()
+            sampler.train(training)
+            for options in asked:
+                samples = case.sample(sampler, rays, **options)
+                found = [(list(part.shape), part.dtype) for part in samples]
+                wanted = [([0], dtype) for dtype in (torch.int64, *[rays.origins.dtype] * 2)]
+                require(found == wanted, f"{why}: returned {found}, expected {wanted}")
+                colours = render(field, rays, samples)
+                background = colours.new_tensor(BACKGROUND).expand_as(colours)
+                shown = torch.allclose(colours, background)
+                require(shown, f"{why}: the background is not what is rendered")
+                colours.sum().backward()
+                check_gradients(field, why)
+
+
+ALLOWED_DIFFERENCE = 0.005
+"""Share of all samples that a rounding at the sides of the box may add or take away."""
+CONE_ANGLE = 0.02
+"""Growth of the steps with distance, which makes them half as long again at the far end."""
+SLACK = 1e-3
+"""Relative distance from a threshold at which a rounding does not decide."""
+LOWEST_CAP = 0.1
+"""Of the mean opacity of all samples: the least that an opacity threshold may be lowered to."""
+
+
+@checks("skips-only-what-it-may", "estimator")
+def skips_only_what_it_may(case: EstimatorCase) -> None:
+    """What is plainly kept is sampled; what is plainly skipped is not, where the gate decides."""
+    for training in (False, True):
+        for rays in (crossing(), stretched()):
+            samples = case.sample(case.shared(SLAB).train(training), rays)
+            if case.needs_occupancy:
+                _check_skipped_is_not(rays, samples)
+            _check_kept_is_sampled(rays, samples)
+
+
+def _check_skipped_is_not(rays: Rays, samples: Samples) -> None:
+    positions = rays.at(samples[0], (samples[1] + samples[2]) / 2.0)
+    outside = SLAB.depth(positions) < -MARGIN
+    require(
+        not bool(outside.any()),
+        f"{int(outside.sum())} of {len(outside)} samples lie where the occupancy is empty"
+        + _first(positions[outside]),
+    )
+
+
+def _check_kept_is_sampled(rays: Rays, samples: Samples) -> None:
+    """Raises unless every candidate that lies plainly in the slab is in a sample's interval."""
+    ray_indices, t_starts, t_ends = dense(rays)
+    middles = (t_starts + t_ends) / 2.0
+    positions = rays.at(ray_indices, middles)
+    missing = (SLAB.depth(positions) > MARGIN) & ~covered(ray_indices, middles, samples)
+    require(
+        not bool(missing.any()),
+        f"{int(missing.sum())} of {len(missing)} places are not sampled although they are occupied"
+        + _first(positions[missing]),
+    )
+
+
+def _first(positions: Tensor) -> str:
+    where = [[round(value, 2) for value in position.tolist()] for position in positions[:1]]
+    return "".join(f", the first at {position}" for position in where)
+
+
+@checks("all-kept-equals-dense", "estimator")
+def all_kept_equals_dense(case: EstimatorCase) -> None:
+    """Where everything is occupied, samples are those of the ray-marching rule without skipping."""
+    rays, sampler = crossing(), case.shared(EVERYTHING)
+    for cone_angle in (0.0, CONE_ANGLE):
+        samples = case.sample(sampler, rays, cone_angle=cone_angle)
+        expected = dense(rays, cone_angle)
+        missing = int((~among(expected, samples)).sum())
+        extra = int((~among(samples, expected)).sum())
+        require(
+            missing + extra <= ALLOWED_DIFFERENCE * len(expected[0]),
+            f"with cone_angle {cone_angle:g} {missing} of {len(expected[0])} candidates are "
+            f"missing, {extra} samples are none of them",
+        )
+
+
+@checks("visibility-pruning", "estimator")
+def visibility_pruning(case: EstimatorCase) -> None:
+    """With a density or opacity, what light does not reach and what is too faint is dropped, and
+    nothing else."""
+    rays, sampler = crossing(), case.shared(EVERYTHING)
+    for training in (False, True):
+        sampler.train(training)
+        plain = in_order(case.sample(sampler, rays, stratified=False))
+        for limits in ((0.0, 0.0), (1e-2, 0.0), (0.0, 1e-2), (1e-2, 1e-2)):
+            _check_pruned(case, sampler, rays, plain, *limits)
+
+
+def _check_pruned(
+    case: EstimatorCase,
+    sampler: Any,
+    rays: Rays,
+    plain: Samples,
+    early_stop_eps: float,
+    alpha_thre: float,
+) -> None:
+    ray_indices, t_starts, t_ends = plain
+    light, alphas = render_transmittance_from_density(
+        t_starts,
+        t_ends,
+        _wall(rays, t_starts, t_ends, ray_indices),
+        ray_indices=ray_indices,
+        n_rays=len(rays.origins),
+    )
+    visible = light >= early_stop_eps * (1.0 + SLACK)
+    visible &= alphas >= alpha_thre * (1.0 + SLACK)
+    dark = light < early_stop_eps * (1.0 - SLACK)
+    faint = alphas < min(alpha_thre, LOWEST_CAP * float(alphas.mean())) * (1.0 - SLACK)
+    limits = {"early_stop_eps": early_stop_eps, "alpha_thre": alpha_thre}
+
+    def alpha_fn(t_starts: Tensor, t_ends: Tensor, ray_indices: Tensor) -> Tensor:
+        return 1.0 - torch.exp(-_wall(rays, t_starts, t_ends, ray_indices) * (t_ends - t_starts))
+
+    for name, function in (("sigma_fn", partial(_wall, rays)), ("alpha_fn", alpha_fn)):
+        options: dict[str, Any] = {name: function, "stratified": False, **limits}
+        kept = among(plain, case.sample(sampler, rays, **options))
+        given = f"with {name}, early_stop_eps {early_stop_eps} and alpha_thre {alpha_thre}"
+        lost = int((visible & ~kept).sum())
+        require(lost == 0, f"{given}: {lost} of {int(visible.sum())} visible samples are dropped")
+        for kind, dropped in (("in the dark", dark), ("too faint to be seen", faint)):
+            left, count = int((dropped & kept).sum()), int(dropped.sum())
+            require(left == 0, f"{given}: {left} of {count} samples {kind} are kept")
+
+
+def _wall(rays: Rays, t_starts: Tensor, t_ends: Tensor, ray_indices: Tensor) -> Tensor:
+    """A thin fog with an opaque slab in it: density of samples, [N]."""
+    positions = rays.at(ray_indices, (t_starts + t_ends) / 2.0)
+    return 0.05 + SLAB.density(positions)[:, 0] / STEP
+
+
+@checks("update-while-frozen-is-harmless", "estimator")
+def update_while_frozen_is_harmless(case: EstimatorCase) -> None:
+    """Hosts go on updating what they take for a grid: every form of the call is accepted."""
+    sampler, rays = case.shared(SLAB), crossing()
+    before = case.sample(sampler, rays)
+    sampler.train()
+    answer = _nothing if case.needs_occupancy else SLAB.density
+    thresholds = {"occ_thre": 1e-2, "ema_decay": 0.95, "warmup_steps": 256, "n": 16}
+    # as nerfstudio and nerfacc's examples call it; steps in and after nerfacc's warm-up
+    forms: tuple[tuple[str, tuple[Any, ...], dict[str, Any]], ...] = (
+        ("step=, occ_eval_fn=", (), {"step": 16, "occ_eval_fn": answer}),
+        ("step, occ_eval_fn", (272, answer), {}),
+        (
+            "step=, occ_eval_fn=, occ_thre=",
+            (),
+            {"step": 288, "occ_eval_fn": answer, "occ_thre": 1e-2},
+        ),
+        ("step, occ_eval_fn and all options", (304, answer), thresholds),
+    )
+    for form, arguments, options in forms:
+        try:
+            sampler.update_every_n_steps(*arguments, **options)
+        except Exception as error:  # noqa: PERF203
+            said = f"{type(error).__name__}: {error}"
+            raise Broken(f"update_every_n_steps({form}) raises {said}") from error
+    after = case.sample(sampler.eval(), rays)
+    if case.needs_occupancy:
+        require(same(before, after), "updates with an empty field changed what is sampled")
+    else:
+        _check_kept_is_sampled(rays, after)
+
+
+def _nothing(positions: Tensor) -> Tensor:
+    return torch.zeros_like(positions[:, :1])

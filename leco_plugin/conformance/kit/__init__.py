@@ -1,1 +1,0 @@
-"""What every rule needs: scenes in which everything is known, and ways to look on."""

@@ -1,1 +1,0 @@
-"""The rules for samplers, at the seams of packed hosts and of proposal hosts."""

@@ -1,0 +1,327 @@
+"""A scene in which everything is known: a box, rays through and past it, a slab, and a field.
+
+The slab's occupancy is a real one, a gate whose weights are written down: it decides exactly, and
+is saved and loaded like any other. Samples on the rays are compared at the end of this file.
+"""
+
+from __future__ import annotations
+
+import functools
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import torch
+from torch import Tensor, nn
+
+from leco_plugin.conformance.rules import Broken, require
+from leco_plugin.models.encodings import (
+    Encoding,
+    EncodingConfig,
+    FrequencyEncoding,
+    HashEncoding,
+    Kind,
+    KPlanesEncoding,
+    VectorMatrixEncoding,
+)
+from leco_plugin.models.gate import Gate, GateConfig
+from leco_plugin.occupancy import Occupancy
+from leco_plugin.samplers.base import DenseEstimator
+from leco_plugin.samplers.marching import Samples
+from leco_plugin.samplers.packed import accumulate_along_rays, render_weight_from_density
+from leco_plugin.space import Space
+
+CENTRE, HALF = (0.5, -1.0, 2.0), 1.5
+"""The box: neither centred nor of unit size, so that a forgotten mapping is noticed."""
+DISTANCE = 2.0 * HALF
+"""From the centre of the box to every ray's origin."""
+STEP = 0.05
+MARGIN = 0.08
+"""World units. Deeper than this inside what is kept is plainly inside, farther off is plainly
+outside: wider than a cell of a grid of 128, and than what a rounding decides."""
+BACKGROUND = (0.2, 0.5, 0.8)
+HERE = torch.eye(3, 4)
+MOVED = torch.tensor([[0.0, -2.0, 0.0, 1.0], [2.0, 0.0, 0.0, -0.5], [0.0, 0.0, 2.0, 0.25]])
+"""Frames [3, 4], which take a host's coordinates to those of an occupancy: the same ones; and
+others, turned by a right angle, twice as large and shifted."""
+
+
+def box() -> Tensor:
+    """The host's box, (min, max), [6]."""
+    centre = torch.tensor(CENTRE)
+    return torch.cat([centre - HALF, centre + HALF])
+
+
+class Rays(NamedTuple):
+    """Rays of a host, world units."""
+
+    origins: Tensor
+    directions: Tensor
+    t_min: Tensor
+    t_max: Tensor
+
+    def at(self, ray_indices: Tensor, t: Tensor) -> Tensor:
+        """Positions [N, 3] at distances t [N] along rays [N]."""
+        return self.origins[ray_indices] + self.directions[ray_indices] * t[:, None]
+
+    def to(self, device: torch.device) -> Rays:
+        """The same on another device."""
+        return Rays(*(tensor.to(device) for tensor in self))
+
+
+@functools.cache
+def crossing(n_rays: int = 48) -> Rays:
+    """From all around through the box, with ends well outside it."""
+    generator = torch.Generator().manual_seed(0)
+    outward = nn.functional.normalize(torch.randn(n_rays, 3, generator=generator), dim=-1)
+    aim = 0.3 * torch.randn(n_rays, 3, generator=generator)
+    directions = nn.functional.normalize(aim - DISTANCE * outward, dim=-1)
+    t_min = 0.2 + 0.4 * torch.rand(n_rays, generator=generator)
+    t_max = 2.0 * DISTANCE - torch.rand(n_rays, generator=generator)
+    return Rays(torch.tensor(CENTRE) + DISTANCE * outward, directions, t_min, t_max)
+
+
+def cut_short() -> Rays:
+    """The same rays, which begin and end inside the box."""
+    rays = crossing()
+    spread = torch.linspace(0.0, 0.4, len(rays.t_min))
+    return rays._replace(t_min=DISTANCE - 0.8 + spread, t_max=DISTANCE + 0.8 - spread)
+
+
+def stretched() -> Rays:
+    """The rays of `crossing` with directions of length 2, as a host in other units has them."""
+    rays = crossing()
+    return Rays(rays.origins, 2.0 * rays.directions, rays.t_min / 2.0, rays.t_max / 2.0)
+
+
+def without_samples() -> dict[str, Rays]:
+    """Rays on which there is nothing to sample, by why."""
+    rays = crossing()
+    return {
+        "no rays": Rays(*(tensor[:0] for tensor in rays)),
+        "rays that miss the box": rays._replace(directions=-rays.directions),
+        "rays that end before they begin": rays._replace(t_min=rays.t_max, t_max=rays.t_min),
+    }
+
+
+@dataclass(frozen=True)
+class Slab:
+    """Occupied is what lies in the box and within a distance of a plane through its middle.
+
+    Attributes:
+        normal: of the plane, of length 1.
+        half_width: in half extents of the box.
+    """
+
+    normal: tuple[float, float, float]
+    half_width: float
+
+    def depth(self, positions: Tensor) -> Tensor:
+        """How deep positions [..., 3] lie inside, world units, [...]; negative outside."""
+        offsets = positions - positions.new_tensor(CENTRE)
+        from_plane = (offsets @ positions.new_tensor(self.normal)).abs()
+        return torch.minimum(self.half_width * HALF - from_plane, HALF - offsets.abs().amax(dim=-1))
+
+    def density(self, positions: Tensor) -> Tensor:
+        """1 inside and 0 outside: [..., 3] to [..., 1], as hosts answer."""
+        return (self.depth(positions) >= 0.0).to(positions.dtype)[..., None]
+
+    def occupancy(self, kind: Kind = "frequency", frame: Tensor = HERE) -> Occupancy:
+        """A frozen gate on features of a kind that says just this, in a frame's coordinates."""
+        turn, shift = frame[:, :3], frame[:, 3]
+        scale = float(turn.abs().max())  # turns are by right angles
+        gate = slab_gate(turn @ torch.tensor(self.normal) / scale, self.half_width, kind)
+        x, y, z = (turn @ torch.tensor(CENTRE) + shift).tolist()
+        known = Occupancy(gate, Space("box", (x, y, z), scale * HALF), threshold=0.5)
+        return known.requires_grad_(False).eval()
+
+
+SLAB = Slab((0.6, 0.64, 0.48), 0.4)
+OTHER = Slab((0.0, 0.0, 1.0), 0.25)
+EVERYTHING = Slab((0.0, 0.0, 1.0), 100.0)
+
+
+class Field(nn.Module):
+    """A fog with a colour: the least that can be learned by rendering."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.log_density = nn.Parameter(torch.tensor(-1.0))
+        self.colour = nn.Parameter(torch.tensor([0.9, 0.1, 0.4]))
+
+    def density(self, positions: Tensor) -> Tensor:
+        """Density of positions [..., 3]: [...]."""
+        return self.log_density.exp() * (1.0 + 0.1 * positions.square().sum(dim=-1))
+
+    def colours(self, positions: Tensor) -> Tensor:
+        """Colour of positions [..., 3]: [..., 3]."""
+        return self.colour.expand(positions.shape)
+
+
+def render(field: Field, rays: Rays, samples: Samples) -> Tensor:
+    """Colours of rays in front of `BACKGROUND`, as a host renders packed samples: [n_rays, 3]."""
+    ray_indices, t_starts, t_ends = samples
+    n_rays = len(rays.origins)
+    positions = rays.at(ray_indices, (t_starts + t_ends) / 2.0)
+    weights, _, _ = render_weight_from_density(
+        t_starts, t_ends, field.density(positions), ray_indices=ray_indices, n_rays=n_rays
+    )
+    colours = accumulate_along_rays(weights, field.colours(positions), ray_indices, n_rays)
+    opacity = accumulate_along_rays(weights, None, ray_indices, n_rays)
+    return colours + (1.0 - opacity) * colours.new_tensor(BACKGROUND)
+
+
+SMALLEST: dict[Kind, EncodingConfig] = {
+    "frequency": EncodingConfig("frequency", octaves=1),
+    "hash": EncodingConfig("hash", levels=1, features=1, log2_table=16, coarsest=2, finest=2),
+    "vm": EncodingConfig("vm", components=2, plane_cells=1),
+    "k-planes": EncodingConfig("k-planes", levels=1, features=2, coarsest=1, plane_cells=1),
+}
+"""The least of each kind that holds a linear function."""
+
+
+@torch.no_grad()
+def slab_gate(normal: Tensor, half_width: float, kind: Kind = "frequency") -> Gate:
+    """A gate with o(x) >= 1/2 where |normal.x| <= half_width, for mapped positions x.
+
+    The hidden layers make u = relu(|n.x| - w) and v = relu(w - |n.x|), so small that the LayerNorm
+    is nearly linear between them; the logit of o is proportional to v - u.
+    """
+    gate = Gate(GateConfig(SMALLEST[kind], width=2, layers=2, scene_experts=1))
+    for parameter in gate.parameters():
+        parameter.zero_()
+    small, steepness = 2e-3, 50.0
+    first, second = gate.hidden
+    assert isinstance(first, nn.Linear) and isinstance(second, nn.Linear)
+    signs = torch.tensor([1.0, -1.0])
+    first.weight.copy_(signs[:, None] * write_linear(gate.encoding, normal))
+    second.weight.copy_((small * signs)[:, None].expand(2, 2))
+    second.bias.copy_(-small * half_width * signs)
+    gate.norm.weight.fill_(1.0)
+    gate.head.weight[1] = -steepness * signs
+    return gate
+
+
+def write_linear(encoding: Encoding, normal: Tensor) -> Tensor:
+    """Writes into an encoding of `SMALLEST` what makes n.x a weighted sum of its features.
+
+    Returns:
+        the weights, [out_dim].
+    """
+    weights = torch.zeros(encoding.out_dim)
+    ends = torch.tensor([-1.0, 1.0])
+    across = normal[0] * ends + normal[1] * ends[:, None]  # rows are along y, columns along x
+    if isinstance(encoding, FrequencyEncoding):
+        weights[:3] = normal
+    elif isinstance(encoding, HashEncoding):
+        axis = torch.linspace(-1.0, 1.0, int(encoding.resolutions[0]) + 1)
+        corners = torch.cartesian_prod(axis, axis, axis)
+        rows = encoding.rows_and_weights(corners)[0][:, 0].long()
+        encoding.table[rows, 0] = corners @ normal
+        weights[0] = 1.0
+    elif isinstance(encoding, VectorMatrixEncoding):
+        encoding.planes[0, 0], encoding.lines[0, 0] = across, 1.0
+        encoding.planes[0, 1], encoding.lines[0, 1, :, 0] = 1.0, normal[2] * ends
+        weights[:2] = 1.0
+    elif isinstance(encoding, KPlanesEncoding):
+        (planes,) = encoding.planes
+        planes.fill_(1.0)
+        planes[0, 0], planes[1, 1] = across, normal[2] * ends[:, None]
+        weights[:2] = 1.0
+    return weights
+
+
+PARTS = ("ray_indices", "t_starts", "t_ends")
+"""Of packed samples, in this order."""
+
+ROUNDING = 1e-4
+"""World units that two ways to compute an edge may differ by."""
+
+
+def dense(rays: Rays, cone_angle: float = 0.0) -> Samples:
+    """Every candidate in the box, by the one ray-marching rule."""
+    return DenseEstimator(box()).sampling(
+        rays.origins,
+        rays.directions,
+        t_min=rays.t_min,
+        t_max=rays.t_max,
+        render_step_size=STEP,
+        cone_angle=cone_angle,
+    )
+
+
+def by_ray(samples: Samples) -> Samples:
+    """Samples with rays in order; the samples of a ray stay in theirs."""
+    order = samples[0].argsort(stable=True)
+    ray_indices, t_starts, t_ends = (part[order] for part in samples)
+    return ray_indices, t_starts, t_ends
+
+
+def in_order(samples: Samples) -> Samples:
+    """Samples sorted by ray, then by where they begin."""
+    order = _keys(samples[0], samples[1]).argsort()
+    ray_indices, t_starts, t_ends = (part[order] for part in samples)
+    return ray_indices, t_starts, t_ends
+
+
+def among(wanted: Samples, samples: Samples, tolerance: float = 1e-3 * STEP) -> Tensor:
+    """Which of the wanted samples are there, with both ends within a tolerance: bool [n_wanted]."""
+    if len(samples[0]) == 0:
+        return torch.zeros_like(wanted[0], dtype=torch.bool)
+    keys, order = _keys(samples[0], samples[1]).sort()
+    ends = samples[2][order]
+    sought = _keys(wanted[0], wanted[1])
+    at = torch.searchsorted(keys, sought - tolerance).clamp(max=len(keys) - 1)
+    return ((keys[at] - sought).abs() <= tolerance) & ((ends[at] - wanted[2]).abs() <= tolerance)
+
+
+def covered(ray_indices: Tensor, t: Tensor, samples: Samples) -> Tensor:
+    """Which points (ray, t) [N] lie in a sample's interval: bool [N]."""
+    if len(samples[0]) == 0:
+        return torch.zeros_like(ray_indices, dtype=torch.bool)
+    keys, order = _keys(samples[0], samples[1]).sort()
+    rays, ends = samples[0][order], samples[2][order]
+    at = (torch.searchsorted(keys, _keys(ray_indices, t), right=True) - 1).clamp(min=0)
+    return (rays[at] == ray_indices) & (ends[at] >= t) & (keys[at] <= _keys(ray_indices, t))
+
+
+def same(first: Samples, second: Samples) -> bool:
+    """Whether two sets of samples are equal to the last bit."""
+    return all(map(torch.equal, first, second))
+
+
+def check_intervals(rays: Rays, samples: Samples) -> None:
+    """Raises unless samples are sorted and disjoint along each ray, and inside its ends."""
+    check_order(samples)
+    check_inside(rays, samples)
+
+
+def check_order(samples: Samples) -> None:
+    """Raises unless samples follow one another along each ray."""
+    require(len(samples[0]) > 0, "there are no samples on rays that cross what is occupied")
+    _, t_starts, t_ends = samples = by_ray(samples)
+    _hold(t_ends > t_starts, samples, "does not end behind its beginning")
+    follows = torch.ones_like(t_starts, dtype=torch.bool)
+    follows[1:] = t_starts[1:] >= t_ends[:-1] - ROUNDING
+    follows[1:] |= samples[0][1:] != samples[0][:-1]
+    _hold(follows, samples, "overlaps the one before it, or lies before it")
+
+
+def check_inside(rays: Rays, samples: Samples) -> None:
+    """Raises unless samples begin and have their middles between the ends of their rays."""
+    ray_indices, t_starts, t_ends = samples
+    begins = t_starts >= rays.t_min[ray_indices] - ROUNDING
+    _hold(begins, samples, "begins before the ray's near end")
+    ends = (t_starts + t_ends) / 2.0 <= rays.t_max[ray_indices] + ROUNDING
+    _hold(ends, samples, "has its middle beyond the ray's far end")
+
+
+def _hold(holds: Tensor, samples: Samples, problem: str) -> None:
+    """Raises unless something holds for all samples; the message shows the first of the others."""
+    for at in holds.logical_not().nonzero()[:1, 0].tolist():
+        ray, start, end = (part[at].item() for part in samples)
+        raise Broken(f"ray {ray}: the sample [{start:.4f}, {end:.4f}] {problem}")
+
+
+def _keys(ray_indices: Tensor, t: Tensor) -> Tensor:
+    """One number for ray and distance that sorts by both."""
+    return ray_indices.double() * 1e3 + t.double()

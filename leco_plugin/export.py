@@ -1,0 +1,297 @@
+"""`leco export`: an occupancy in the formats of other programs.
+
+`ply` is the surface of the kept set as coloured points. `nerfacc-grid` is the buffers of nerfacc's
+`OccGridEstimator`: a cell is marked where any probed point of it is kept, so that a grid keeps more
+than the gate and loses next to nothing of what the gate keeps.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+from typing import Any, Literal, NamedTuple
+
+import numpy as np
+import torch
+from torch import Tensor
+from torch.nn.functional import max_pool3d
+
+from leco_plugin.cli_reports import check_place
+from leco_plugin.evaluation.inspection import ViewBox, exposed, numbers, query, whole_box
+from leco_plugin.log import bar
+from leco_plugin.occupancy import Occupancy
+from leco_plugin.samplers.grid import OccupancyGridEstimator
+from leco_plugin.scenes.frames import inverse, moved
+from leco_plugin.scenes.whole_files import write_points, write_whole
+
+Format = Literal["ply", "nerfacc-grid"]
+Frame = Literal["data", "run"]
+MOST_CELLS = 1 << 28
+"""Of an export: each holds some bytes until the file is written, which makes gigabytes."""
+COLOURS = "magma"
+"""Of matplotlib, for o(x) in [0, 1]: as in the picture of `leco inspect`."""
+CELLS_AT_ONCE = 1 << 20
+"""Cells whose places are known together; of the others only o(x) is."""
+STEPS = 2
+"""Steps from one corner of a grid's cell to the next: 27 probed points, those on faces shared."""
+POINTS_AT_ONCE = 1 << 20
+MOST_LEVELS = 8
+
+Progress = Callable[[float], None]
+"""Called with the share that is done."""
+
+
+def export(
+    file: Path,
+    format: Format,
+    out: Path,
+    resolution: int = 128,
+    levels: int | None = None,
+    frame: Frame | None = None,
+) -> dict[str, Any]:
+    """Writes an occupancy in another format.
+
+    Args:
+        file: an occupancy.
+        format: `ply` or `nerfacc-grid`.
+        out: of what is written.
+        resolution: cells along the longest side, or along each axis of a grid.
+        levels: of a grid.
+        frame: of points, `data` for the coordinates of the data's own files, `run` for those of the
+            run. None is `data` where the file says how. A grid is in those of the run.
+    Returns:
+        What was written, as JSON values.
+    Raises:
+        ValueError, OSError: the file is no occupancy, a size is out of range, there is nothing to
+            export, or it cannot be written there.
+    """
+    if format == "ply" and levels is not None:
+        raise ValueError("points have no levels: --levels goes with --format nerfacc-grid")
+    if format != "ply" and frame == "data":
+        raise ValueError(
+            "a grid lies along the axes of the run: --frame data goes with --format ply"
+        )
+    check_place("--out", out)
+    occupancy = Occupancy.load(file)
+    if format == "ply":
+        back = None if frame == "run" else to_the_data(occupancy)
+        if back is None and frame == "data":
+            raise ValueError(
+                f"{file} does not say how its run moved and scaled the data: give --frame run"
+            )
+        with bar(f"Asking the gate about cells of 1/{resolution}") as show:
+            surface = kept_surface(occupancy, resolution, show)
+        if back is not None:
+            surface = surface._replace(positions=moved(surface.positions.double(), back))
+        write_ply(surface, out)
+        at = "run" if back is None else "data"
+        facts: dict[str, Any] = {"points": len(surface.positions), "frame": at}
+    else:
+        with bar(f"Asking the gate about {resolution}^3 cells a level") as show:
+            buffers = grid_buffers(occupancy, resolution, levels, show)
+        write_grid(buffers, out)
+        facts = {
+            "frame": "run",
+            "levels": len(buffers["aabbs"]),
+            "aabbs": buffers["aabbs"].tolist(),
+            "kept_share_of_cells": float(buffers["binaries"].double().mean()),
+        }
+    known = {"format": 1, "written": format, "resolution": resolution}
+    return {**known, **facts, "bytes": out.stat().st_size}
+
+
+def _require_few(cells: int, said: str) -> None:
+    """Refuses more than `MOST_CELLS` cells, with a ValueError that says how they lie."""
+    if cells > MOST_CELLS:
+        raise ValueError(
+            f"{said} are too many cells: an export has at most {MOST_CELLS} in all, as "
+            f"{int(MOST_CELLS ** (1 / 3))}^3 are; give a smaller --resolution"
+        )
+
+
+class KeptSurface(NamedTuple):
+    """Middles of kept cells that touch a skipped one."""
+
+    positions: Tensor
+    """[P, 3] scene units, or float64 in coordinates of the data."""
+    values: Tensor
+    """[P] o(x)."""
+
+
+def kept_surface(
+    occupancy: Occupancy, resolution: int, on_progress: Progress = lambda share: None
+) -> KeptSurface:
+    """Where the kept set ends.
+
+    Args:
+        resolution: cells along the longest side of the space in which the gate was taught. Those of
+            an unbounded scene grow with distance, as its mapping has it.
+    Raises:
+        ValueError: the resolution is below 2 or makes too many cells, or nothing is kept.
+    """
+    if resolution < 2:
+        raise ValueError(f"a surface takes at least 2 cells along a side, not {resolution}")
+    box = _mapped_box(occupancy)
+    counts = box.cells(min(resolution, MOST_CELLS))  # which are too many along one side alone
+    _require_few(math.prod(counts), f"{resolution} along the longest side")
+    axes = [box.axis(number, count) for number, count in enumerate(counts)]
+    cells, parts = math.prod(counts), []
+    for first in range(0, cells, CELLS_AT_ONCE):
+        numbers = torch.arange(first, min(first + CELLS_AT_ONCE, cells))
+        indices = torch.unravel_index(numbers, counts)
+        places = [axis[index] for axis, index in zip(axes, indices)]
+        parts.append(query(occupancy, _positions(occupancy, places)))
+        on_progress((first + len(numbers)) / cells)
+    values = torch.cat(parts).view(*counts)
+    chosen = exposed(values >= occupancy.threshold)
+    if not bool(chosen.any()):
+        raise ValueError(
+            f"the occupancy keeps nothing in cells of 1/{resolution} of its space: there is no "
+            "surface to export"
+        )
+    places = [axis[index] for axis, index in zip(axes, chosen.nonzero(as_tuple=True))]
+    return KeptSurface(_positions(occupancy, places), values[chosen])
+
+
+def _positions(occupancy: Occupancy, mapped: Sequence[Tensor]) -> Tensor:
+    """Scene positions [..., 3] on the CPU, of their three mapped coordinates [...] each."""
+    device = occupancy.threshold_value.device
+    return occupancy.space.unmap(torch.stack(list(mapped), dim=-1).to(device)).cpu()
+
+
+def _mapped_box(occupancy: Occupancy) -> ViewBox:
+    """The part of the gate's cube in which it was taught."""
+    if occupancy.space.kind != "box":
+        return ViewBox(-torch.ones(3), torch.ones(3))
+    box = whole_box(occupancy)
+    device = occupancy.threshold_value.device
+    low, high = occupancy.space.map(torch.stack([box.low, box.high]).to(device)).cpu()
+    return ViewBox(low, high)
+
+
+def to_the_data(occupancy: Occupancy) -> Tensor | None:
+    """Takes positions of the run to those that the data's own files have: [3, 4] float64.
+
+    None where the file does not say how its run turned, moved and scaled the data.
+    """
+    frame = occupancy.report.get("data_frame") or occupancy.report.get("frame")
+    rows = [numbers(row) for row in frame] if isinstance(frame, list) else []
+    if [len(row) for row in rows] != [4, 4, 4]:
+        return None
+    known = torch.tensor(rows, dtype=torch.float64)
+    return inverse(known) if float(known[:, :3].det()) != 0.0 else None
+
+
+def write_ply(surface: KeptSurface, path: Path) -> None:
+    """Writes binary PLY of float64 with a colour for each point.
+
+    Raises:
+        OSError: it cannot be written there.
+    """
+    from matplotlib import colormaps
+
+    rows = np.empty(len(surface.values), dtype=[("xyz", "<f8", 3), ("rgb", "u1", 4)])
+    rows["xyz"] = surface.positions.numpy()
+    rows["rgb"] = colormaps[COLOURS](surface.values.clamp(0.0, 1.0).numpy(), bytes=True)
+    write_points(path, rows)
+
+
+def grid_buffers(
+    occupancy: Occupancy,
+    resolution: int = 128,
+    levels: int | None = None,
+    on_progress: Progress = lambda share: None,
+) -> dict[str, Tensor]:
+    """What `OccGridEstimator(aabb, resolution, levels).load_state_dict` takes.
+
+    Args:
+        resolution: cells along each axis of each level.
+        levels: nested boxes, each twice as wide as the one inside it. None is one for a bounded
+            scene, and as many as its rays reach, at most `MOST_LEVELS`, for an unbounded one.
+    Returns:
+        `resolution` int32 [3], `aabbs` [levels, 6] scene units, `occs` [levels * cells] with the
+        largest o(x) probed in each cell, `binaries` bool [levels, n, n, n].
+    Raises:
+        ValueError: a size is out of range, or an unbounded scene is to fit one box.
+    """
+    unbounded = occupancy.space.kind != "box"
+    if levels is None:
+        levels = reaching_levels(occupancy) if unbounded else 1
+    if resolution < 1 or levels < 1:
+        raise ValueError(
+            f"{levels} levels of {resolution}^3 cells: a grid has at least one level and one cell"
+        )
+    _require_few(levels * resolution**3, f"{levels} x {resolution}^3")
+    if unbounded and levels == 1:
+        raise ValueError(
+            "the scene is unbounded, and a grid of one level ends at its innermost box: give two "
+            "levels or more, or none to have them counted"
+        )
+    grid = OccupancyGridEstimator(innermost_box(occupancy), resolution, levels)
+    parts = []
+    slabs = sum(len(range(0, resolution, _layers(resolution))) for _ in range(levels))
+    for box in grid.aabbs:
+        for values in _largest_in_cells(occupancy, box, resolution):
+            parts.append(values)
+            on_progress(len(parts) / slabs)
+    largest = torch.cat(parts).view(levels, resolution, resolution, resolution)
+    return {
+        "resolution": grid.resolution,
+        "aabbs": grid.aabbs,
+        "occs": largest.reshape(-1).clone(),
+        "binaries": largest >= occupancy.threshold,
+    }
+
+
+def innermost_box(occupancy: Occupancy) -> Tensor:
+    """Corners [6] of the box of a bounded scene, or of the uncontracted cube of another one."""
+    center, half = occupancy.space.center.cpu(), occupancy.space.half_extent.cpu()
+    low, high = center - half, center + half
+    if occupancy.space.kind == "box":
+        walls = occupancy.walls.cpu()
+        low, high = torch.maximum(low, walls[:3]), torch.minimum(high, walls[3:])
+    return torch.cat([low, high])
+
+
+def reaching_levels(occupancy: Occupancy) -> int:
+    """Levels with which the outermost box holds the rays of all cameras, 2 to `MOST_LEVELS`."""
+    far = numbers([occupancy.report.get("far")])
+    listed = occupancy.report.get("cameras")
+    rows = [numbers(row) for row in listed] if isinstance(listed, list) else []
+    center = occupancy.space.center.tolist()
+    reach = max(
+        (abs(x - c) for row in rows if len(row) == 3 for x, c in zip(row, center)), default=0.0
+    )
+    if not far:
+        return MOST_LEVELS
+    widest = (reach + max(far[0], 0.0)) / float(occupancy.space.half_extent)
+    return min(max(1 + math.ceil(math.log2(max(widest, 1.0))), 2), MOST_LEVELS)
+
+
+def write_grid(buffers: dict[str, Tensor], path: Path) -> None:
+    """Writes the buffers as `torch.save` does; `torch.load(..., weights_only=True)` reads them.
+
+    Raises:
+        OSError: it cannot be written there.
+    """
+    write_whole(path, lambda file: torch.save(buffers, file))
+
+
+def _layers(resolution: int) -> int:
+    """Layers of cells that are asked about together."""
+    return max(1, POINTS_AT_ONCE // (STEPS * (STEPS * resolution + 1) ** 2))
+
+
+def _largest_in_cells(occupancy: Occupancy, box: Tensor, resolution: int) -> Iterator[Tensor]:
+    """The largest o(x) probed in each cell of a box, some layers [k, n, n] at a time."""
+    low, high = box[:3], box[3:]
+    shares = torch.linspace(0.0, 1.0, STEPS * resolution + 1)
+    x, y, z = (torch.lerp(low[axis], high[axis], shares) for axis in range(3))
+    layers = _layers(resolution)
+    for first in range(0, resolution, layers):
+        last = min(first + layers, resolution)
+        of_slab = x[STEPS * first : STEPS * last + 1]
+        positions = torch.stack(torch.meshgrid(of_slab, y, z, indexing="ij"), dim=-1)
+        values = query(occupancy, positions)
+        yield max_pool3d(values[None, None], STEPS + 1, STEPS)[0, 0]

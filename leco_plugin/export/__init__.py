@@ -1,1 +1,0 @@
-"""`leco export`: an occupancy in the formats of other programs."""
