@@ -19,9 +19,8 @@ from nerfstudio.engine.trainer import Trainer
 from nerfstudio.scripts import train as ns_train
 from torch import Tensor, distributed
 
+from leco_plugin.learning import batches, lifecycle, merging
 from leco_plugin.models.compute.ranks import from_first, is_first, mean, share
-from leco_plugin.learning import merging
-from leco_plugin.learning import batches, lifecycle
 from leco_plugin.models.leco import LecoModel
 from leco_plugin.occupancy import Occupancy
 

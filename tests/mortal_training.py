@@ -17,8 +17,8 @@ from nerfstudio.engine.trainer import Trainer
 from nerfstudio.scripts import train as ns_train
 
 from leco_plugin.compat.atomic_trainer import AtomicTrainer
-from leco_plugin.learning.freezing import FILE_NAME
 from leco_plugin.learning import healing
+from leco_plugin.learning.freezing import FILE_NAME
 from leco_plugin.learning.schedule import Collapse
 from leco_plugin.models.leco import LecoModel
 from leco_plugin.occupancy import Occupancy

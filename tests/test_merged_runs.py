@@ -8,15 +8,14 @@ from typing import Any
 
 import pytest
 import torch
+from leco_plugin.learning.field_at_freezing import FILE_NAME, field_at_freezing
 from nerfstudio.engine.callbacks import TrainingCallbackLocation as Where
 from tiny_run import tiny_config
 
 from leco_plugin.compat.atomic_trainer import AtomicTrainer
 from leco_plugin.compat.optimizers import forget_the_gone
-from leco_plugin.models import leco
-from leco_plugin.learning.field_at_freezing import FILE_NAME, field_at_freezing
 from leco_plugin.learning.merging import MergingConfig
-from leco_plugin.learning import learner
+from leco_plugin.models import leco
 
 pytestmark = [  # nerfstudio leaves an image open
     pytest.mark.filterwarnings("ignore:unclosed file:ResourceWarning"),

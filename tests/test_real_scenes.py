@@ -9,15 +9,15 @@ from typing import Any
 
 import pytest
 import torch
+from leco_plugin.learning.held_out_rendering import evaluating, held_out_bundle
 from nerfstudio.cameras.rays import RayBundle
 from torch import Tensor
 
 from leco_plugin.evaluation.timed_run import run_training
 from leco_plugin.host_configs import switch_nerf
-from leco_plugin.method_configs import leco_occupancy
 from leco_plugin.learning.calibration import CalibrationConfig
 from leco_plugin.learning.freezing import FILE_NAME
-from leco_plugin.learning.held_out_rendering import evaluating, held_out_bundle
+from leco_plugin.method_configs import leco_occupancy
 from leco_plugin.occupancy import Occupancy
 
 LEAST = 0.3

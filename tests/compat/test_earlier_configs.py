@@ -9,12 +9,12 @@ from typing import Any
 
 import pytest
 import yaml
+from leco_plugin.learning.prior import PriorConfig
 from nerfstudio.data.datamanagers.base_datamanager import VanillaDataManagerConfig
 
 from leco_plugin.method_configs import leco_occupancy
 from leco_plugin.models.guided import GuidedModelConfig
 from leco_plugin.models.hosts.guided_start import OccupancyConfig
-from leco_plugin.learning.prior import PriorConfig
 from leco_plugin.models.leco_config import LecoModelConfig
 from leco_plugin.models.switch.config import SwitchNerfModelConfig
 from leco_plugin.scenes.bounds import BoundsConfig

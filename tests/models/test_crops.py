@@ -8,6 +8,7 @@ from typing import Any
 
 import pytest
 import torch
+from leco_plugin.models.scene_rays import SeenBackdrops, cut_to_bounds
 from nerfstudio.cameras.cameras import Cameras
 from nerfstudio.cameras.rays import RayBundle
 from nerfstudio.data.scene_box import OrientedBox, SceneBox
@@ -16,7 +17,6 @@ from torch import nn
 
 from leco_plugin.host_configs import switch_nerf_host
 from leco_plugin.method_configs import LEARNING
-from leco_plugin.models.scene_rays import SeenBackdrops, cut_to_bounds
 from leco_plugin.models.sizing.scene_sizes import complete
 from leco_plugin.scenes.bounds import SceneBounds
 from leco_plugin.space import NO_WALL, Space

@@ -12,14 +12,14 @@ import pytest
 import torch
 from nerfstudio.engine.callbacks import TrainingCallbackAttributes, TrainingCallbackLocation
 
+from leco_plugin.learning.calibration import CalibrationConfig
+from leco_plugin.learning.freezing import FILE_NAME
+from leco_plugin.learning.schedule import ScheduleConfig
 from leco_plugin.method_configs import leco_occupancy
 from leco_plugin.models.encodings import EncodingConfig, Kind
 from leco_plugin.models.field import FieldConfig
-from leco_plugin.learning.calibration import CalibrationConfig
-from leco_plugin.learning.freezing import FILE_NAME
 from leco_plugin.models.gate import GateConfig
 from leco_plugin.models.hmoe import HMoEConfig
-from leco_plugin.learning.schedule import ScheduleConfig
 from leco_plugin.models.leco import LecoModel
 from leco_plugin.models.leco_config import LecoModelConfig
 from leco_plugin.models.sizing.sizes import Sizes

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import pytest
 import torch
+from leco_plugin.models.scene_rays import cut_to_bounds, marching_rule, with_ends_for_all
 from nerfstudio.cameras.rays import RayBundle
 
-from leco_plugin.models.scene_rays import cut_to_bounds, marching_rule, with_ends_for_all
 from leco_plugin.samplers.marching import march
 
 NEAR, FAR = torch.tensor(0.1), torch.tensor(5.0)
