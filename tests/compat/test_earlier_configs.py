@@ -9,9 +9,9 @@ from typing import Any
 
 import pytest
 import yaml
-from leco_plugin.learning.prior import PriorConfig
 from nerfstudio.data.datamanagers.base_datamanager import VanillaDataManagerConfig
 
+from leco_plugin.learning.merging import MergingConfig
 from leco_plugin.method_configs import leco_occupancy
 from leco_plugin.models.guided import GuidedModelConfig
 from leco_plugin.models.hosts.guided_start import OccupancyConfig
@@ -47,7 +47,8 @@ def test_a_guided_run_of_an_earlier_release_has_no_options() -> None:
 
 
 def test_what_is_stored_goes_before_defaults() -> None:
-    config = LecoModelConfig(bounds=BoundsConfig(altitudes=(-1.0, 2.0)), prior=PriorConfig(steps=7))
+    bounds, merging = BoundsConfig(altitudes=(-1.0, 2.0)), MergingConfig(rays=7)
+    config = LecoModelConfig(bounds=bounds, merging=merging)
     for found in (copy.deepcopy(config), pickle.loads(pickle.dumps(config))):
         assert found == config
 

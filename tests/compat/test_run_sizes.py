@@ -150,7 +150,7 @@ def test_a_resumed_run_has_the_sizes_it_was_begun_with(
     assert stored.pipeline.model.sizes == begun.pipeline.model.config.sizes
     # what is trained is what is rendered
     trained = {id(p) for o in trainer.optimizers.optimizers.values() for p in groups_of(o)}
-    assert {id(p) for p in trainer.pipeline.model.field.parameters()} <= trained
+    assert {id(p) for p in trainer.pipeline.model.mixture.field.parameters()} <= trained
 
 
 def groups_of(optimizer: torch.optim.Optimizer) -> list[torch.Tensor]:

@@ -10,7 +10,6 @@ from typing import Any
 
 import pytest
 import torch
-from leco_plugin.learning.held_out_rendering import held_out_bundle
 from nerfstudio.cameras.cameras import CameraType
 from nerfstudio.data.datamanagers.base_datamanager import VanillaDataManagerConfig
 from nerfstudio.data.datamanagers.full_images_datamanager import FullImageDatamanagerConfig
@@ -33,6 +32,7 @@ from leco_plugin.scenes.data_manager import (
     free_memory,
 )
 from leco_plugin.scenes.input_error import InputError
+from leco_plugin.scenes.learning_data import held_out_bundle
 from leco_plugin.scenes.photographs import LecoPhotographsDataParserConfig
 from leco_plugin.scenes.pixels.known_distances import KnownDistancePixelSamplerConfig, sampler_here
 from leco_plugin.scenes.pixels.lattice import Lattice, lattice_for
