@@ -114,7 +114,7 @@ class MegaNerf(DataParser):
     def _read(self) -> MegaNerfScene:
         """The scene, read once, with a line that says what it is."""
         if self._scene is None:
-            from leco_plugin.log import bar
+            from leco_plugin.log import bar, console
             from leco_plugin.scenes.mega_nerf_format.files import read_scene
 
             _check(self.config)
