@@ -44,19 +44,22 @@ def known_run(tiny_scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Pat
     outputs, gate = tmp_path_factory.mktemp("outputs"), ball_of_the_tiny_scene().gate.config
     torch.manual_seed(0)  # what a shrunk gate loses of an untrained field is anything
     trainer = tiny_trainer(tiny_scene, outputs, gate, candidates=64)
-    model, frame = trainer.pipeline.model, frame_of(trainer.pipeline.datamanager)
+    mixture, frame = trainer.pipeline.model.mixture, frame_of(trainer.pipeline.datamanager)
     assert frame is not None
     known = ball_of_the_tiny_scene(frame)
-    model.gate.load_state_dict(known.gate.state_dict())
-    model.space.load_state_dict(known.space.state_dict())
-    model.threshold.fill_(known.threshold)
-    model.frozen.fill_(True)
+    mixture.gate.load_state_dict(known.gate.state_dict())
+    mixture.region.space.load_state_dict(known.space.state_dict())
     with torch.no_grad():
-        model.field.density_head.bias.fill_(6.0)
-    near, far, step_size, cone_angle = THEIR_MARCH.values()
-    model.march_range.copy_(torch.tensor([near, far, step_size, step_size, cone_angle, cone_angle]))
-    model.report = THEIR_MARCH | {"lost_surface_mass": 1e-4}
-    model.occupancy().save(trainer.base_dir / "occupancy.safetensors")
+        mixture.field.density_head.bias.fill_(6.0)
+    march = zip(
+        (mixture.region.near, mixture.region.far, mixture.steps, mixture.cones),
+        THEIR_MARCH.values(),
+        strict=True,
+    )
+    for buffer, value in march:
+        buffer.fill_(value)
+    mixture.freeze(known.threshold, THEIR_MARCH | {"lost_surface_mass": 1e-4})
+    mixture.occupancy().save(trainer.base_dir / "occupancy.safetensors")
     trainer.save_checkpoint(0)
     return Path(trainer.base_dir)
 

@@ -19,9 +19,11 @@ from nerfstudio.engine.trainer import Trainer
 from nerfstudio.scripts import train as ns_train
 from torch import Tensor, distributed
 
+from leco_plugin.learning.held_out import HeldOut
+from leco_plugin.learning.history import Probes
+from leco_plugin.learning.learner import Learner
+from leco_plugin.learning.merging import Merging
 from leco_plugin.models.compute.ranks import from_first, is_first, mean, share
-from leco_plugin.learning import merging
-from leco_plugin.learning import batches, lifecycle
 from leco_plugin.models.leco import LecoModel
 from leco_plugin.occupancy import Occupancy
 
@@ -71,33 +73,36 @@ def lose_one(local_rank: int, world_size: int, config: Any, global_rank: int = 0
 
 def look_elsewhere() -> None:
     """Has this process look at its gate where no other does, and find fewer places kept."""
-    prepare = batches.Batches.prepare
+    own_batch, own_probes = Learner._learning_batch, Probes.__init__
 
-    def half_kept(self: batches.Batches, learning: bool) -> None:
-        self.model.progress.learning_kept = 0.5
-        prepare(self, learning)
+    def half_kept(self: Learner, step: int) -> float:
+        self.progress.learning_kept = 0.5
+        return own_batch(self, step)
 
-    batches.Batches.prepare = half_kept  # type: ignore[method-assign]
-    lifecycle.Lifecycle.probe_positions = property(  # type: ignore[assignment]
-        lambda self: torch.rand(lifecycle.PROBES, 3)
-    )
+    def elsewhere(self: Probes, *arguments: Any) -> None:
+        own_probes(self, *arguments)
+        self.positions = torch.rand_like(self.positions)
+
+    Learner._learning_batch = half_kept  # type: ignore[method-assign]
+    Probes.__init__ = elsewhere  # type: ignore[method-assign]
 
 
 def drift_before_freezing() -> None:
     """Has the gate of this process become another one by the time it is frozen."""
-    freeze = lifecycle.freeze
+    freeze = Learner._freeze
 
-    def drifted(model: LecoModel, *arguments: Any) -> Any:
+    def drifted(self: Learner, step: int) -> None:
+        bias = self.mixture.gate.head.bias
         with torch.no_grad():
-            model.gate.head.bias.add_(torch.rand_like(model.gate.head.bias))
-        return freeze(model, *arguments)
+            bias.add_(torch.rand_like(bias))
+        freeze(self, step)
 
-    lifecycle.freeze = drifted
+    Learner._freeze = drifted  # type: ignore[method-assign]
 
 
 def need_every_expert() -> None:
     """Has this process find that no scene expert may leave, if it is asked."""
-    merging.find_unneeded = lambda *_: merging.Merging([], None)  # type: ignore[assignment]
+    HeldOut.unneeded = lambda *_: Merging([], None)  # type: ignore[method-assign, assignment]
 
 
 def record(seen: dict[str, Any]) -> None:
@@ -111,7 +116,8 @@ def record(seen: dict[str, Any]) -> None:
         rays = self.pipeline.datamanager.train_pixel_sampler.num_rays_per_batch
         result = own_step(self, step)
         model = self.pipeline.model
-        phase = (getattr(model, "ramped", None), bool(getattr(model, "frozen", True)))
+        learns = isinstance(model, LecoModel)
+        phase = (model.plan.ramped, bool(model.mixture.frozen)) if learns else (None, True)
         weights = "".join(digest(model.state_dict()).values())
         seen["steps"].append((step, rays, phase, weights, float(result[0].detach())))
         return result
@@ -120,14 +126,14 @@ def record(seen: dict[str, Any]) -> None:
         seen["saved"].append(str(path))
         own_save(self, path)
 
-    own_look = lifecycle.Lifecycle._probe
+    own_look = Probes.logits
 
-    def look(self: lifecycle.Lifecycle) -> Tensor:
+    def look(self: Probes) -> Tensor:
         logits = own_look(self)
         seen["looks"].append(logits.clone())
         return logits
 
-    lifecycle.Lifecycle._probe = look  # type: ignore[method-assign]
+    Probes.logits = look  # type: ignore[method-assign]
     Trainer.train_iteration = train_iteration  # type: ignore[method-assign]
     Occupancy.save = save  # type: ignore[method-assign, assignment]
 
@@ -169,11 +175,12 @@ def set_up(config: Any, number: int, of: int) -> Any:
     pipeline = config.pipeline.setup(device="cpu", local_rank=number, world_size=of)
     model = pipeline.model
     if isinstance(model, LecoModel):
-        model.precision = "float32"
-        model.ramped = 1.0
-        model.aabb.mul_(1e3)  # all rays are of one length
-        model.frozen.fill_(config.timestamp == "guided")
-        model.threshold.fill_(0.5)
+        mixture = model.mixture
+        mixture.precision = "float32"
+        model.plan = model.plan._replace(ramped=1.0)
+        mixture.region.aabb.mul_(1e3)  # all rays are of one length
+        if config.timestamp == "guided":
+            mixture.freeze(0.5, {})
     return pipeline.train()
 
 

@@ -17,9 +17,9 @@ from nerfstudio.engine.trainer import Trainer
 from nerfstudio.scripts import train as ns_train
 
 from leco_plugin.compat.atomic_trainer import AtomicTrainer
+from leco_plugin.learning import collapse
+from leco_plugin.learning.collapse import Collapse
 from leco_plugin.learning.freezing import FILE_NAME
-from leco_plugin.learning import healing
-from leco_plugin.learning.schedule import Collapse
 from leco_plugin.models.leco import LecoModel
 from leco_plugin.occupancy import Occupancy
 from leco_plugin.samplers import estimator
@@ -75,8 +75,8 @@ def collapse_once() -> None:
     def find_collapse(kept: float, shares: torch.Tensor, at_the_end: bool) -> Collapse | None:
         return found.pop() if at_the_end and found else None
 
-    healing.FEWEST_STEPS = 0
-    healing.find_collapse = find_collapse
+    collapse.FEWEST_STEPS = 0
+    collapse.find_collapse = find_collapse
 
 
 def leave_out_the_cache() -> None:
@@ -105,7 +105,7 @@ def spoil_a_batch(step: int) -> None:
     losses = LecoModel.get_loss_dict
 
     def spoiled(self: LecoModel, outputs: Any, batch: Any, *rest: Any) -> Any:
-        if self.step == step:
+        if self.plan.step == step:
             batch["image"][3, 1] = torch.nan
         return losses(self, outputs, batch, *rest)
 

@@ -147,7 +147,9 @@ def assert_same_weights(seen: list[dict[str, Any]]) -> None:
 
 
 def occupancy_in(state: dict[str, Tensor], prefix: str = "") -> dict[str, Tensor]:
-    return {name: value for name, value in state.items() if name.startswith(f"{prefix}gate.")}
+    """What is of a gate, by its names in the gate."""
+    start = f"{prefix}gate."
+    return {name.removeprefix(start): state[name] for name in state if name.startswith(start)}
 
 
 def test_two_processes_speak_gloo_and_share_the_cores(learned: Any) -> None:
@@ -179,21 +181,21 @@ def test_the_same_gate_is_frozen_and_stays_as_it_was_frozen(learned: Any) -> Non
     occupancy = Occupancy.load(config.get_base_dir() / "occupancy.safetensors")
     for process in seen:
         state = process["state"]
-        assert state["_extra_state"]["report"] == occupancy.report
-        assert float(state["threshold"]) == occupancy.threshold
+        assert state["mixture._extra_state"]["report"] == occupancy.report
+        assert float(state["mixture.threshold"]) == occupancy.threshold
         kept = occupancy_in(occupancy.state_dict())
-        assert processes.digest(occupancy_in(state)) == processes.digest(kept)
+        assert processes.digest(occupancy_in(state, "mixture.")) == processes.digest(kept)
         assert state["_extra_state"]["progress"]["recoveries"] == 1
         assert all(
-            (gradient is None) == name.startswith("gate.")
+            (gradient is None) == name.startswith("mixture.gate.")
             for name, gradient in process["gradients"].items()
-            if name.startswith(("gate.", "field.density_head"))
+            if name.startswith(("mixture.gate.", "mixture.field.density_head"))
         )
 
 
 def test_all_processes_drop_the_experts_that_the_first_one_does_not_need(learned: Any) -> None:
     config, seen = learned
-    first, second = (process["state"]["field.experts.left"] for process in seen)
+    first, second = (process["state"]["mixture.field.experts.left"] for process in seen)
     assert torch.equal(first, second) and first.tolist().count(True) == 1
     gone = [f"experts.{number}." for number, left in enumerate(first.tolist(), 1) if not left]
     for process in seen:
@@ -221,7 +223,8 @@ def test_a_resumed_run_goes_on_in_both(learned: Any, launch: Launch) -> None:
     assert phases(first) == phases(second)
     assert [step for step, *_ in first["steps"]] == [STEPS, STEPS + 1]
     assert_same_weights([first, second])
-    assert processes.digest(occupancy_in(first["state"])) == processes.digest(occupancy_in(before))
+    gates = [processes.digest(occupancy_in(s, "mixture.")) for s in (first["state"], before)]
+    assert gates[0] == gates[1] and gates[0]
     assert first["saved"] == [str(config.get_base_dir() / "occupancy.safetensors")]
     assert second["saved"] == []
 
@@ -303,7 +306,7 @@ def test_a_step_of_two_processes_is_that_of_one_with_both_batches(
         torch.testing.assert_close(one, expected, rtol=1e-3, atol=1e-5 * largest)
         moved += bool(expected.any())
     assert moved >= 4
-    gate = first["gradients"].get("gate.head.weight")
+    gate = first["gradients"].get("mixture.gate.head.weight")
     assert (gate is not None) == (name == "learning")
 
 

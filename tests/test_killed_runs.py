@@ -39,7 +39,8 @@ TINY = [
 ]
 
 MODEL = "_model."
-GATE = f"{MODEL}gate."
+MIXTURE = f"{MODEL}mixture."
+GATE = f"{MIXTURE}gate."
 
 
 @dataclass
@@ -129,16 +130,17 @@ def assert_same(found: Any, expected: Any) -> None:
 
 def gate_of(checkpoint: dict[str, Any]) -> dict[str, torch.Tensor]:
     state = checkpoint["pipeline"]
-    return {name.removeprefix(MODEL): state[name] for name in state if name.startswith(GATE)}
+    return {name.removeprefix(MIXTURE): state[name] for name in state if name.startswith(GATE)}
 
 
 def extra_of(checkpoint: dict[str, Any]) -> dict[str, Any]:
-    extra: dict[str, Any] = checkpoint["pipeline"][f"{MODEL}_extra_state"]
-    return extra
+    """Beside tensors: of the mixture, and the progress of its run."""
+    state = checkpoint["pipeline"]
+    return state[f"{MIXTURE}_extra_state"] | state[f"{MODEL}_extra_state"]
 
 
 def is_frozen(checkpoint: dict[str, Any]) -> bool:
-    return bool(checkpoint["pipeline"][f"{MODEL}frozen"])
+    return bool(checkpoint["pipeline"][f"{MIXTURE}frozen"])
 
 
 def assert_finished(folder: Path, last: dict[str, Any], froze_at: int) -> None:
@@ -147,10 +149,10 @@ def assert_finished(folder: Path, last: dict[str, Any], froze_at: int) -> None:
     assert is_frozen(last)
     report = extra_of(last)["report"]
     assert report["step"] == froze_at
-    assert float(last["pipeline"][f"{MODEL}threshold"]) == pytest.approx(report["threshold"])
+    assert float(last["pipeline"][f"{MIXTURE}threshold"]) == pytest.approx(report["threshold"])
     occupancy = Occupancy.load(folder / "occupancy.safetensors")
     assert occupancy.report == report
-    assert occupancy.threshold == float(last["pipeline"][f"{MODEL}threshold"])
+    assert occupancy.threshold == float(last["pipeline"][f"{MIXTURE}threshold"])
     assert_same({k: v for k, v in occupancy.state_dict().items() if "gate" in k}, gate_of(last))
     assert not (folder / "nerfstudio_models.unfinished").exists()
 
@@ -195,9 +197,9 @@ def test_killed_after_freezing_it_goes_on_guided_by_the_same_gate(
     assert_finished(runs.folder("resumed"), last, FREEZES_AT)
     assert_same(gate_of(last), gate_of(checkpoint))
     for one in (last, checkpoint):  # set by each guided step that looks at its price
-        extra_of(one)["progress"].pop("recheck_due")
+        extra_of(one)["progress"]["watch"].pop("due")
     assert_same(extra_of(last), extra_of(checkpoint))
-    moved = f"{MODEL}field.density_head.weight"
+    moved = f"{MIXTURE}field.density_head.weight"
     assert not torch.equal(last["pipeline"][moved], checkpoint["pipeline"][moved])
 
 

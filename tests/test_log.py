@@ -1,31 +1,72 @@
-"""Long work shows how far it is, on a terminal and in a log."""
+"""Lines are said once for all processes; long work shows how far it is."""
 
 from __future__ import annotations
 
 import io
+import logging
 from types import SimpleNamespace
 
 import pytest
 from rich.console import Console
 
-from leco_plugin import progress_bar
+from leco_plugin import log
 
 
 def test_in_a_log_it_is_a_line_a_minute(monkeypatch: pytest.MonkeyPatch) -> None:
-    log, seconds = io.StringIO(), iter([0.0, 30.0, 61.0, 90.0, 125.0])
-    monkeypatch.setattr(progress_bar, "CONSOLE", Console(file=log, width=120))
-    monkeypatch.setattr(progress_bar, "time", SimpleNamespace(monotonic=lambda: next(seconds)))
-    with progress_bar.bar("Guided") as show:
+    written, seconds = io.StringIO(), iter([0.0, 30.0, 61.0, 90.0, 125.0])
+    monkeypatch.setattr(log, "console", lambda: Console(file=written, width=120))
+    monkeypatch.setattr(log, "time", SimpleNamespace(monotonic=lambda: next(seconds)))
+    with log.bar("Guided") as show:
         for share in (0.1, 0.25, 0.3, 0.5):
             show(share)
-    assert log.getvalue().splitlines() == ["Guided: 25% after 61 s", "Guided: 50% after 125 s"]
+    assert written.getvalue().splitlines() == ["Guided: 25% after 61 s", "Guided: 50% after 125 s"]
 
 
 def test_on_a_terminal_it_is_a_bar(monkeypatch: pytest.MonkeyPatch) -> None:
     terminal = io.StringIO()
-    monkeypatch.setattr(
-        progress_bar, "CONSOLE", Console(file=terminal, width=120, force_terminal=True)
-    )
-    with progress_bar.bar("Guided") as show:
+    drawn_on = Console(file=terminal, width=120, force_terminal=True)
+    monkeypatch.setattr(log, "console", lambda: drawn_on)
+    with log.bar("Guided") as show:
         show(0.5)
     assert "Guided" in terminal.getvalue() and "\x1b[" in terminal.getvalue()
+
+
+@pytest.mark.parametrize("first", [True, False])
+def test_only_the_first_speaks(
+    first: bool, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(log, "is_first", lambda: first)
+    log.say("hear, hear")
+    assert ("[leco] hear, hear" in capsys.readouterr().out) == first
+
+
+@pytest.fixture
+def logged(monkeypatch: pytest.MonkeyPatch) -> logging.Logger:
+    """The logger of a sampler, whose lines are said; the package's is put back afterwards."""
+    ours = logging.getLogger("leco_plugin")
+    monkeypatch.setattr(ours, "handlers", [])
+    monkeypatch.setattr(ours, "level", ours.level)
+    log.say_what_is_logged()
+    log.say_what_is_logged()
+    return logging.getLogger("leco_plugin.samplers.somewhere")
+
+
+def test_what_samplers_log_is_said_once(
+    logged: logging.Logger, capsys: pytest.CaptureFixture[str]
+) -> None:
+    logged.info("no fused gate: %s", "it is [wide]")
+    assert capsys.readouterr().out.count("[leco] no fused gate: it is [wide]") == 1
+
+
+def test_a_process_that_is_not_the_first_only_warns(
+    logged: logging.Logger, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(log, "is_first", lambda: False)
+    monkeypatch.setattr(log.distributed, "get_rank", lambda: 3)
+    of_its_card = logging.getLogger("leco_plugin.samplers.kernels.fused")
+    of_its_card.info("the fused gate answers")
+    of_its_card.warning("the fused gate does not run")
+    logged.warning("no cell cache in any process")
+    said = capsys.readouterr().out
+    assert "[leco] process 3: the fused gate does not run" in said
+    assert "answers" not in said and "cell cache" not in said

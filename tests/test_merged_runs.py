@@ -13,10 +13,10 @@ from tiny_run import tiny_config
 
 from leco_plugin.compat.atomic_trainer import AtomicTrainer
 from leco_plugin.compat.optimizers import forget_the_gone
-from leco_plugin.models import leco
-from leco_plugin.learning.field_at_freezing import FILE_NAME, field_at_freezing
+from leco_plugin.learning import history
+from leco_plugin.learning.freezing import FIELD_FILE, field_at_freezing
 from leco_plugin.learning.merging import MergingConfig
-from leco_plugin.learning import learner
+from leco_plugin.models import mixture
 
 pytestmark = [  # nerfstudio leaves an image open
     pytest.mark.filterwarnings("ignore:unclosed file:ResourceWarning"),
@@ -54,10 +54,10 @@ def take_steps(trainer: AtomicTrainer, first: int, end: int) -> None:
 def test_it_is_frozen_merged_saved_and_resumed(
     tiny_scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(lifecycle, "PROBES", 256)
-    monkeypatch.setattr(leco, "LearnedOccupancyEstimator", without_cells)
+    monkeypatch.setattr(history, "PROBES", 256)
+    monkeypatch.setattr(mixture, "LearnedOccupancyEstimator", without_cells)
     first = trainer_of(tiny_scene, tmp_path / "first")
-    model = first.pipeline.model
+    model = first.pipeline.model.mixture
     model.estimator()  # of a gate that is not frozen: nobody's afterwards
     take_steps(first, 0, 4)
     assert model.estimator().occupancy.threshold == float(model.threshold)
@@ -73,7 +73,7 @@ def test_it_is_frozen_merged_saved_and_resumed(
     take_steps(first, 4, 5)
     first.save_checkpoint(4)
     second = trainer_of(tiny_scene, tmp_path / "second", first.checkpoint_dir)
-    again = second.pipeline.model
+    again = second.pipeline.model.mixture
     assert not any(parameter.requires_grad for parameter in again.gate.parameters())
     state = again.state_dict()
     for name, value in model.state_dict().items():
@@ -82,9 +82,9 @@ def test_it_is_frozen_merged_saved_and_resumed(
     kept = [list(one.optimizers.optimizers["field"].state.values()) for one in (first, second)]
     for ours, theirs in zip(*kept, strict=True):
         assert all(torch.equal(ours[name], theirs[name]) for name in ours)
-    assert (second.base_dir / FILE_NAME).read_bytes() == (first.base_dir / FILE_NAME).read_bytes()
+    assert (second.base_dir / FIELD_FILE).read_bytes() == (first.base_dir / FIELD_FILE).read_bytes()
     take_steps(second, 5, 6)
-    forget_the_gone(second.optimizers, again.get_param_groups())  # nothing is left to forget
+    forget_the_gone(second.optimizers, again.parameter_groups())  # nothing is left to forget
     assert len(optimizer.state) == len(second.optimizers.optimizers["field"].state)
 
 

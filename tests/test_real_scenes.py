@@ -14,11 +14,12 @@ from torch import Tensor
 
 from leco_plugin.evaluation.timed_run import run_training
 from leco_plugin.host_configs import switch_nerf
-from leco_plugin.method_configs import leco_occupancy
 from leco_plugin.learning.calibration import CalibrationConfig
+from leco_plugin.learning.dense import evaluating
 from leco_plugin.learning.freezing import FILE_NAME
-from leco_plugin.learning.held_out_rendering import evaluating, held_out_bundle
+from leco_plugin.method_configs import leco_occupancy
 from leco_plugin.occupancy import Occupancy
+from leco_plugin.scenes.learning_data import held_out_bundle
 
 LEAST = 0.3
 """dB that some 20 steps of 128 rays gain on 512 pixels which are the same before and after: of 23
@@ -80,8 +81,8 @@ def test_a_scene_trains_freezes_and_renders_without_a_flag(
     untrained = psnr_on(trainer, *pixels)
     run_training(trainer)
     model = trainer.pipeline.model
-    assert bool(model.frozen)
-    assert model.space.kind == KINDS[name]
+    assert bool(model.mixture.frozen)
+    assert model.mixture.region.space.kind == KINDS[name]
     assert psnr_on(trainer, *pixels) > untrained + LEAST
     assert_renders(trainer)
     occupancy = Occupancy.load(trainer.base_dir / FILE_NAME)
@@ -112,5 +113,5 @@ def test_switch_nerf_trains_and_renders_without_a_flag(
     pixels = some_pixels(trainer)
     untrained = psnr_on(trainer, *pixels)
     run_training(trainer)
-    assert trainer.pipeline.model.space.kind == KINDS[name]
+    assert trainer.pipeline.model.region.space.kind == KINDS[name]
     assert psnr_on(trainer, *pixels) > untrained + LEAST

@@ -54,7 +54,8 @@ def test_what_is_kept_is_what_the_occupancy_keeps_of_all_candidates(
     kept = total = 0
     for bundle, _ in pictures:
         rays = model.rays_of(bundle.flatten())
-        ray_indices, t_starts, t_ends = model.intervals_of(rays, guided=False, learning=False)
+        intervals = model.mixture.with_backdrops(rays, model.mixture.candidates(rays))
+        ray_indices, t_starts, t_ends = intervals
         middles = 0.5 * (t_starts + t_ends)[:, None]
         positions = rays.origins[ray_indices] + rays.directions[ray_indices] * middles
         kept += int(occupancy.occupied(positions).sum())

@@ -26,8 +26,8 @@ GATE = GateConfig(encoding=EncodingConfig(octaves=2), layers=1, width=8)
 
 READ: dict[str, Callable[[Pipeline], Any]] = {
     "viewer": lambda pipeline: parse_object(pipeline, ViewerElement, "Custom Elements"),
-    "estimator": lambda pipeline: pipeline.model.estimator(),
-    "occupancy": lambda pipeline: pipeline.model.occupancy(),
+    "estimator": lambda pipeline: pipeline.model.mixture.estimator(),
+    "occupancy": lambda pipeline: pipeline.model.mixture.occupancy(),
 }
 """Who reads the model before it is trained; the first as `nerfstudio.viewer.viewer.Viewer` does."""
 

@@ -117,6 +117,7 @@ class Recoveries:
     def _reopen(self, collapse: Collapse, step: int) -> None:
         """Has a frozen gate learn once more, on dense samples first; its file is withdrawn."""
         self.mixture.reopen()
+        self.progress.watch.nothing_since = -1  # of a gate that is no longer frozen
         if self.run.folder is not None:
             withdraw_file(self.run.folder)
         done = self._heal(collapse, torch.zeros(self.mixture.gate.head.out_features), step)

@@ -101,7 +101,7 @@ class SwitchNerfModel(Model):
     def sample_with(self, estimator: nn.Module | None) -> None:
         """Replaces the sampling by an estimator's; None is coarse and fine."""
         if estimator is not None:
-            estimator.to(self.device).train(self.training)
+            estimator.to(self.region.aabb.device).train(self.training)
         self.occupancy_grid = estimator
 
     def _sample_with_grid(self, levels: int) -> None:

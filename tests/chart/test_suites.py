@@ -20,8 +20,8 @@ from leco_plugin.chart.contenders.suites import (
     in_order,
     suite,
 )
-from leco_plugin.method_configs import LEARNING, ON_GPU
 from leco_plugin.learning.schedule import MOST_EXTENSIONS, steps_of_an_extension
+from leco_plugin.method_configs import LEARNING, ON_GPU
 from leco_plugin.scenes.input_error import InputError
 
 NAMES = {

@@ -88,7 +88,7 @@ def run(tiny_scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     gate = replace(leco_occupancy.config.pipeline.model.sizes.gate, width=8, layers=1)
     outputs = tmp_path_factory.mktemp("outputs")
     trainer = tiny_trainer(tiny_scene, outputs, gate, candidates=32)
-    bias = trainer.pipeline.model.field.density_head.bias
+    bias = trainer.pipeline.model.mixture.field.density_head.bias
     for step, value in ((3, 3.0), (7, 7.0)):
         with torch.no_grad():
             bias.fill_(value)
@@ -115,5 +115,5 @@ def test_nerfstudios_commands_fall_back_on_the_checkpoint_before(
     assert "step-000000007.ckptisdamaged" in said and "thenewestthatiswhole" in said
     assert step == 3 and used.parent.name == "nerfstudio_models.previous"
     model: Any = pipeline.model
-    assert model.field.density_head.bias.tolist() == [3.0]
+    assert model.mixture.field.density_head.bias.tolist() == [3.0]
     assert eval_utils.eval_setup(run / "config.yml")[3] == 7

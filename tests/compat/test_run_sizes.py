@@ -15,9 +15,9 @@ import yaml
 from nerfstudio.utils.eval_utils import eval_setup
 
 from leco_plugin.compat.run_sizes import checkpoint_of
-from leco_plugin.method_configs import leco_occupancy
 from leco_plugin.learning.calibration import CalibrationConfig
 from leco_plugin.learning.schedule import ScheduleConfig
+from leco_plugin.method_configs import leco_occupancy
 from leco_plugin.models.sizing.sizes import left_open, with_size
 from leco_plugin.scenes.detail import CAMERAS
 from leco_plugin.scenes.input_error import InputError
@@ -150,7 +150,7 @@ def test_a_resumed_run_has_the_sizes_it_was_begun_with(
     assert stored.pipeline.model.sizes == begun.pipeline.model.config.sizes
     # what is trained is what is rendered
     trained = {id(p) for o in trainer.optimizers.optimizers.values() for p in groups_of(o)}
-    assert {id(p) for p in trainer.pipeline.model.field.parameters()} <= trained
+    assert {id(p) for p in trainer.pipeline.model.mixture.field.parameters()} <= trained
 
 
 def groups_of(optimizer: torch.optim.Optimizer) -> list[torch.Tensor]:

@@ -10,9 +10,9 @@ from torch import Tensor
 
 from leco_plugin.evaluation import equal_loss
 from leco_plugin.evaluation.equal_loss import at_equal_loss, kept_shares, threshold_losing
+from leco_plugin.learning.calibration import CalibrationConfig
 from leco_plugin.models.encodings import EncodingConfig
 from leco_plugin.models.field import FieldConfig
-from leco_plugin.learning.calibration import CalibrationConfig
 from leco_plugin.models.gate import GateConfig
 from leco_plugin.models.hmoe import HMoEConfig
 from leco_plugin.models.leco import LecoModel

@@ -6,11 +6,12 @@ from types import SimpleNamespace
 from typing import Any
 
 import pytest
-import torch
+from small_learner import small_learner
 
-from leco_plugin.learning import batches
-from leco_plugin.learning.batches import Batches
-from leco_plugin.learning.progress import Progress
+from leco_plugin.learning.schedule import ScheduleConfig
+from leco_plugin.scenes import learning_data
+from leco_plugin.scenes.bounds import BoundsConfig
+from leco_plugin.scenes.learning_data import LearningData
 from leco_plugin.scenes.pixels.known_distances import KnownDistancePixelSampler
 
 
@@ -26,22 +27,17 @@ class Sampler(KnownDistancePixelSampler):
 
 @pytest.fixture
 def made(monkeypatch: pytest.MonkeyPatch) -> Any:
-    """Batches of 100 rays of a model that follows a gate, with one sampler and no points."""
-    sizes = SimpleNamespace(learn_candidates=32, candidates=64, guided_batch=4.0)
-    model: Any = SimpleNamespace(
-        config=SimpleNamespace(sizes=sizes, termination=0.03),
-        device=torch.device("cpu"),
-        frozen=torch.tensor(False),
-        learned=False,
-        progress=Progress(),
-        step=0,
-        report={},
-    )
+    """A learner with batches of 100 rays, one sampler and no points."""
     sampler = Sampler(100)
-    monkeypatch.setattr(batches, "sampler_here", lambda manager: sampler)
-    monkeypatch.setattr(batches, "sparse_points", lambda dataset: None)
+    monkeypatch.setattr(learning_data, "sampler_here", lambda manager: sampler)
+    monkeypatch.setattr(learning_data, "sparse_points", lambda dataset: None)
+    monkeypatch.setattr(learning_data, "survey", lambda *_: None)
     manager = SimpleNamespace(get_train_rays_per_batch=lambda: 100, train_dataset=None)
-    return SimpleNamespace(batches=Batches(model, manager), model=model, sampler=sampler)
+    data = LearningData(manager, BoundsConfig(), None, None)
+    learner = small_learner(
+        data=data, schedule=ScheduleConfig(freeze=False, learn_steps=7), termination=0.03
+    )
+    return SimpleNamespace(learner=learner, sampler=sampler, progress=learner.progress)
 
 
 @pytest.mark.parametrize(
@@ -50,8 +46,8 @@ def made(monkeypatch: pytest.MonkeyPatch) -> Any:
 def test_a_guided_batch_has_the_samples_of_a_learning_one_within_limits(
     made: Any, empty_fraction: float, factor: float
 ) -> None:
-    made.model.frozen, made.model.report = torch.tensor(True), {"empty_fraction": empty_fraction}
-    made.batches.prepare(learning=False)
+    made.learner.mixture.freeze(0.5, {"empty_fraction": empty_fraction})
+    made.learner.before_step(0)
     assert made.sampler.num_rays_per_batch == 100 * factor
 
 
@@ -59,44 +55,43 @@ def test_a_guided_batch_has_the_samples_of_a_learning_one_within_limits(
 def test_while_learning_the_rays_follow_what_is_shaded_in_eighths(
     made: Any, kept: float, rays: int
 ) -> None:
-    made.model.progress.learning_kept = kept
-    made.batches.prepare(learning=True)
-    made.batches.prepare(learning=True)
+    made.progress.learning_kept = kept
+    made.learner.before_step(0)
+    made.learner.before_step(1)
     assert made.sampler.num_rays_per_batch == rays
     assert made.sampler.sets == int(rays != 100)  # not set again to what it is
 
 
 def test_a_healed_gate_is_not_followed_and_its_batches_are_no_longer_for_it(made: Any) -> None:
-    made.model.progress.learning_kept, made.model.progress.dense_until = 0.1, 5
-    made.batches.prepare(learning=True)
-    assert made.sampler.num_rays_per_batch == 100
-    made.model.step = 5
-    made.batches.prepare(learning=True)
-    assert made.sampler.num_rays_per_batch == 100  # until it has been seen what it keeps now
+    made.progress.learning_kept, made.progress.dense_until = 0.1, 5
+    for step in (0, 5):  # also then, until it has been seen what it keeps now
+        made.learner.before_step(step)
+        assert made.sampler.num_rays_per_batch == 100
 
 
 def test_a_gate_that_is_never_frozen_is_not_followed_once_it_has_learned(made: Any) -> None:
-    made.model.progress.learning_kept = 0.3
-    made.batches.prepare(learning=True)
+    made.progress.learning_kept = 0.3
+    made.learner.before_step(6)
     assert made.sampler.num_rays_per_batch > 300
-    made.model.learned = True
-    made.batches.prepare(learning=False)
+    plan = made.learner.before_step(7)
     assert made.sampler.num_rays_per_batch == 100
+    assert made.learner.over and plan.following is None
 
 
+@pytest.mark.parametrize(
+    ("step", "weight", "wanted"), [(0, 0.03, True), (7, 0.03, False), (0, 0.0, False)]
+)
 def test_known_distances_are_asked_for_only_while_learning_with_a_weight(
-    made: Any, monkeypatch: pytest.MonkeyPatch
+    made: Any, step: int, weight: float, wanted: bool
 ) -> None:
-    points = object()
-    made.batches.sparse = points
-    for learning, weight, wanted in ((True, 0.03, points), (False, 0.03, None), (True, 0.0, None)):
-        made.model.config.termination = weight
-        made.batches.prepare(learning)
-        assert made.sampler.sparse is wanted
+    made.learner.data.sparse = points = object()
+    made.learner.config.termination = weight
+    made.learner.before_step(step)
+    assert made.sampler.sparse is (points if wanted else None)
 
 
 def test_a_sampler_elsewhere_is_left_alone(made: Any, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(batches, "sampler_here", lambda manager: None)
-    made.model.progress.learning_kept = 0.1
-    made.batches.prepare(learning=True)
+    monkeypatch.setattr(learning_data, "sampler_here", lambda manager: None)
+    made.progress.learning_kept = 0.1
+    made.learner.before_step(0)
     assert made.sampler.num_rays_per_batch == 100

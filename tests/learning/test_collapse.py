@@ -10,15 +10,20 @@ import torch
 from leco_plugin.learning.collapse import (
     EASED,
     MOST_RECOVERIES,
+    Collapse,
     annealed,
+    find_collapse,
     form_of,
     heal,
-    is_collapsed,
     is_dense,
+    look,
+    reset_gate_head,
+    spread_scene_experts,
     starts_anew,
 )
-from leco_plugin.learning.schedule import Collapse
 from leco_plugin.learning.progress import Progress
+from leco_plugin.models.gate import occupancy_from_logits
+from leco_plugin.models.losses import expert_shares
 from leco_plugin.models.objective import GateLossConfig
 
 SPREAD = torch.tensor([0.5, 0.25, 0.25])
@@ -34,12 +39,12 @@ def head_of(bias: list[float]) -> torch.nn.Linear:
 
 def test_a_collapse_must_last_unless_the_first_phase_is_over() -> None:
     progress = Progress()
-    assert is_collapsed(progress, 98, 0.0, SPREAD, last=True) is None  # too early to tell
-    assert is_collapsed(progress, 199, 0.0, SPREAD, last=False) is None
-    assert is_collapsed(progress, 298, 0.0, SPREAD, last=False) is None
-    assert is_collapsed(progress, 299, 0.0, SPREAD, last=False) is not None
-    assert is_collapsed(Progress(), 299, 1.0, SPREAD, last=True) is not None
-    assert is_collapsed(progress, 324, 0.3, SPREAD, last=False) is None
+    assert look(progress, 98, 0.0, SPREAD, last=True) is None  # too early to tell
+    assert look(progress, 199, 0.0, SPREAD, last=False) is None
+    assert look(progress, 298, 0.0, SPREAD, last=False) is None
+    assert look(progress, 299, 0.0, SPREAD, last=False) is not None
+    assert look(Progress(), 299, 1.0, SPREAD, last=True) is not None
+    assert look(progress, 324, 0.3, SPREAD, last=False) is None
     assert progress.suspected_since == -1
 
 
@@ -81,7 +86,7 @@ def test_points_that_are_shared_out_are_no_new_last_layer() -> None:
 
 
 def test_points_of_one_expert_are_shared_out_and_the_balance_counts_more() -> None:
-    progress, head = Progress(learn_steps=200), head_of([0.0, 30.0, 0.0])
+    progress, head = Progress(learn_steps=200, configured=200), head_of([0.0, 30.0, 0.0])
     heal(head, progress, Collapse("a cause", "one expert"), ONE, 150, GateLossConfig())
     assert (head.bias[1] - head.bias[2]).abs() < 1e-6
     assert progress.learn_steps == 201 and not is_dense(progress, 151)
@@ -110,8 +115,8 @@ def test_a_gate_in_the_papers_form_that_less_force_does_not_heal_is_taught_in_lo
 def test_a_gate_that_has_called_nothing_empty_yet_has_until_the_end_to_learn_it() -> None:
     progress = Progress()
     for step in range(49, 999, 50):
-        assert is_collapsed(progress, step, 1.0, SPREAD, last=False) is None
-    assert is_collapsed(progress, 999, 1.0, SPREAD, last=True) is not None
+        assert look(progress, step, 1.0, SPREAD, last=False) is None
+    assert look(progress, 999, 1.0, SPREAD, last=True) is not None
 
 
 def test_a_second_recovery_counts_whatever_it_is_from() -> None:
@@ -143,3 +148,54 @@ def test_a_gate_that_was_opened_again_late_is_healed_as_quickly_as_an_early_one(
         GateLossConfig(),
     )
     assert (progress.learn_steps, progress.dense_until) == (19_101, 19_051)
+
+
+@pytest.mark.parametrize(
+    ("kept", "shares", "has_learned", "cause"),
+    [
+        (0.0, [1.0, 0.0, 0.0], False, "all space empty"),
+        (1.0, [0.0, 0.5, 0.5], True, "all space occupied"),
+        (0.3, [0.7, 0.0, 0.3], False, "scene expert 2 takes all points"),
+    ],
+)
+def test_a_collapse_is_named(kept: float, shares: list[float], has_learned: bool, cause) -> None:
+    collapse = find_collapse(kept, torch.tensor(shares), has_learned)
+    assert collapse is not None and cause in collapse.cause and "\n" not in collapse.cause
+
+
+@pytest.mark.parametrize(
+    ("kept", "shares", "has_learned"),
+    [
+        (0.3, [0.7, 0.2, 0.1], True),
+        (1.0, [0.0, 0.5, 0.5], False),  # it has not learned enough yet
+        (0.3, [0.7, 0.3], True),  # there is only one scene expert
+    ],
+)
+def test_a_gate_that_decides_has_not_collapsed(kept: float, shares, has_learned: bool) -> None:
+    assert find_collapse(kept, torch.tensor(shares), has_learned) is None
+
+
+def test_a_reset_gate_is_undecided_again() -> None:
+    torch.manual_seed(0)
+    head = torch.nn.Linear(64, 5)
+    torch.nn.init.constant_(head.bias, 40.0)
+    reset_gate_head(head)
+    features = torch.nn.functional.layer_norm(torch.randn(1000, 64), (64,))
+    probabilities = head(features).detach().softmax(dim=-1)
+    assert not bool(head.bias.any())
+    assert float(probabilities.mean(dim=0).min()) > 0.05
+    assert head.weight.requires_grad
+
+
+def test_sharing_out_one_experts_points_leaves_the_occupancy_as_it_was() -> None:
+    torch.manual_seed(0)
+    head = torch.nn.Linear(16, 5)
+    with torch.no_grad():
+        head.bias[3] = head.bias[0] = 20.0
+    features = torch.randn(500, 16)
+    before = occupancy_from_logits(head(features))
+    spread_scene_experts(head, 3)
+    after = head(features)
+    assert (occupancy_from_logits(after) - before).abs().mean() < 0.03
+    shares = expert_shares(after[:, 1:].argmax(dim=-1), 4)
+    assert float(shares.max()) < 0.8

@@ -1,95 +1,24 @@
-"""Claims about what the frozen gate is measured on."""
+"""Claims about the moment of freezing: the advice that it gives, and the state that it leaves."""
 
 from __future__ import annotations
 
-from types import SimpleNamespace
+from dataclasses import replace
+from pathlib import Path
 
 import pytest
 import torch
-from nerfstudio.cameras.rays import RayBundle
-from nerfstudio.data.scene_box import SceneBox
+from small_learner import SMALLEST, small_mixture
 
-from leco_plugin.models.encodings import EncodingConfig
-from leco_plugin.models.field import FieldConfig
+from leco_plugin.learning import freezing
 from leco_plugin.learning.calibration import Measured
-from leco_plugin.learning.freezing import advice_on
-from leco_plugin.learning.held_out_rendering import (
-    calibration_rays,
-    dense_rendering,
-    evaluating,
+from leco_plugin.learning.freezing import (
+    FIELD_FILE,
+    advice_on,
+    carry_over,
+    field_at_freezing,
+    leave_field,
 )
-from leco_plugin.models.gate import GateConfig
-from leco_plugin.models.leco_config import LecoModelConfig
-from leco_plugin.models.sizing.sizes import Sizes
-from leco_plugin.scenes.pixels.held_out_pixels import HeldOutPixelSampler, HeldOutPixelSamplerConfig
-
-COUNT = 50
-
-
-class Manager:
-    """A data manager that says which of its rays it gave."""
-
-    def __init__(self, keeps_pixels_back: bool) -> None:
-        image = torch.rand(2, 20, 30, 3)
-        self.images = {"image": image, "image_idx": torch.arange(2)}
-        self.train_pixel_sampler = (
-            HeldOutPixelSamplerConfig().setup(num_rays_per_batch=8) if keeps_pixels_back else None
-        )
-        self.iter_train_image_dataloader = iter([self.images])
-        self.train_dataset = SimpleNamespace(cameras=Cameras())
-
-    def next_train(self, step: int) -> tuple[Bundle, dict[str, torch.Tensor]]:
-        indices = torch.zeros(COUNT, 3, dtype=torch.int64)
-        return Bundle(indices), {"image": torch.zeros(COUNT, 3), "indices": indices}
-
-
-class Cameras:
-    """All of them at once, whose rays are pixels."""
-
-    def to(self, device: str) -> Cameras:
-        return self
-
-    def generate_rays(self, camera_indices: torch.Tensor, coords: torch.Tensor) -> Bundle:
-        return Bundle(torch.cat([camera_indices, (coords - 0.5).long()], dim=1))
-
-
-class Bundle:
-    """Rays that are the pixels they go through."""
-
-    def __init__(self, indices: torch.Tensor) -> None:
-        self.indices = indices
-
-    def __getitem__(self, which: slice) -> Bundle:
-        return Bundle(self.indices[which])
-
-    def to(self, device: torch.device) -> torch.Tensor:
-        return self.indices
-
-
-def a_model() -> SimpleNamespace:
-    return SimpleNamespace(
-        config=SimpleNamespace(calibration=SimpleNamespace(rays=COUNT)),
-        device=torch.device("cpu"),
-        rays_of=lambda indices, with_images: indices,
-    )
-
-
-def test_the_threshold_is_measured_on_pixels_that_training_never_sees() -> None:
-    manager = Manager(keeps_pixels_back=True)
-    pixels, colours = calibration_rays(a_model(), manager)
-    sampler = manager.train_pixel_sampler
-    assert isinstance(sampler, HeldOutPixelSampler) and 5 < len(pixels) <= COUNT
-    image, row, column = pixels.T
-    assert torch.equal(colours, manager.images["image"][image, row, column])
-    trained = sampler.sample(manager.images)["indices"]
-    held_out = {tuple(pixel) for pixel in pixels.tolist()}
-    assert not held_out & {tuple(pixel) for pixel in trained.tolist()}
-
-
-def test_without_held_out_pixels_it_is_measured_on_training_rays() -> None:
-    pixels, colours = calibration_rays(a_model(), Manager(keeps_pixels_back=False))
-    assert len(pixels) == len(colours) == COUNT
-    assert not colours.any()
+from leco_plugin.models.mixture import Mixture
 
 
 @pytest.mark.parametrize(
@@ -112,23 +41,95 @@ def test_what_skips_next_to_nothing_comes_with_advice(threshold, skipped, recove
         assert "--pipeline.model.occupancy.learning of guided methods" in advice
 
 
-def test_prices_are_measured_in_the_appearance_of_each_image() -> None:
+@pytest.fixture
+def mixture() -> Mixture:
     torch.manual_seed(0)
-    sizes = Sizes(
-        gate=GateConfig(EncodingConfig(octaves=1), width=8, layers=1, scene_experts=2),
-        field=FieldConfig(EncodingConfig(kind="hash", log2_table=8), appearance_dim=1),
-        learn_candidates=8,
-        candidates=16,
+    experts = replace(SMALLEST.field.experts, scene_experts=4)
+    gate = replace(SMALLEST.gate, scene_experts=4)
+    made = small_mixture(
+        replace(SMALLEST, gate=gate, field=replace(SMALLEST.field, experts=experts))
     )
-    box = SceneBox(torch.tensor([[-1.0] * 3, [1.0] * 3]))
-    model = LecoModelConfig(sizes=sizes).setup(scene_box=box, num_train_data=2)
-    model.field.color.appearance.weight.data = torch.tensor([[500.0], [-500.0]])
-    ahead = torch.tensor([[0.0, 0.0, 1.0]]).expand(2, 3)
-    bundle = RayBundle(-0.5 * ahead, ahead, torch.ones(2, 1), torch.tensor([[0], [1]]))
-    manager = SimpleNamespace(next_train=lambda step: (bundle, {"image": torch.rand(2, 3)}))
-    rays, truth = calibration_rays(model, manager)
-    with evaluating(model):
-        (reference,) = dense_rendering(model, rays, truth).references
-        of_the_mean = model.get_outputs(bundle)["rgb"]
-    assert torch.equal(of_the_mean[0], of_the_mean[1])
-    assert float((reference.rgb[0] - reference.rgb[1]).abs().max()) > 0.05
+    made.freeze(0.5, {"step": 7})
+    return made
+
+
+def densities(mixture: Mixture) -> torch.Tensor:
+    torch.manual_seed(1)
+    mapped, routes = 2.0 * torch.rand(50, 3) - 1.0, torch.randint(2, (50,))
+    with torch.no_grad():
+        return mixture.field.density(mapped, routes, torch.ones(50))[0]
+
+
+def go_on(mixture: Mixture) -> None:
+    """What guided training does to a mixture: another field, one expert fewer, the same gate."""
+    with torch.no_grad():
+        for parameter in mixture.field.parameters():
+            parameter.add_(0.1)
+    mixture.field.experts.drop(3)
+    mixture.threshold.fill_(0.25)
+
+
+def test_it_is_the_field_that_the_gate_was_calibrated_on(mixture: Mixture, tmp_path: Path) -> None:
+    before = densities(mixture)
+    leave_field(mixture, tmp_path)
+    go_on(mixture)
+    now = densities(mixture)
+    frozen = field_at_freezing(mixture, tmp_path)
+    assert frozen is not None and not frozen.training
+    assert torch.equal(densities(frozen), before) and not torch.equal(now, before)
+    assert torch.equal(densities(mixture), now) and mixture.field.experts.those_left() is not None
+    assert frozen.field.experts.those_left() is None and frozen.report == {"step": 7}
+
+
+def test_a_run_without_one_has_none(mixture: Mixture, tmp_path: Path) -> None:
+    assert field_at_freezing(mixture, tmp_path) is None
+
+
+def test_a_damaged_one_and_one_of_another_gate_are_refused_in_a_line(
+    mixture: Mixture, tmp_path: Path
+) -> None:
+    leave_field(mixture, tmp_path)
+    path = tmp_path / FIELD_FILE
+    whole = path.read_bytes()
+    for damaged in (b"", whole[: len(whole) // 2], b"no archive"):
+        path.write_bytes(damaged)
+        with pytest.raises(ValueError, match="cannot be used") as error:
+            field_at_freezing(mixture, tmp_path)
+        assert "\n" not in str(error.value)
+    path.write_bytes(whole)
+    with torch.no_grad():
+        mixture.gate.head.bias.add_(1.0)
+    with pytest.raises(ValueError, match="another gate"):
+        field_at_freezing(mixture, tmp_path)
+
+
+@pytest.mark.parametrize("what", ["checkpoint", "folder"])
+def test_a_run_that_resumes_in_a_folder_of_its_own_takes_it_along(
+    what: str, mixture: Mixture, tmp_path: Path
+) -> None:
+    first, second = tmp_path / "first", tmp_path / "second"
+    leave_field(mixture, first)
+    checkpoint = first / "nerfstudio_models" / "step-000000009.ckpt"
+    checkpoint.parent.mkdir()
+    checkpoint.write_bytes(b"")
+    carry_over(checkpoint if what == "checkpoint" else checkpoint.parent, second)
+    assert (second / FIELD_FILE).read_bytes() == (first / FIELD_FILE).read_bytes()
+    (second / FIELD_FILE).write_bytes(b"its own")
+    carry_over(checkpoint, second)
+    assert (second / FIELD_FILE).read_bytes() == b"its own"
+    carry_over(tmp_path / "none" / "step-000000009.ckpt", tmp_path / "third")
+    assert not (tmp_path / "third").exists()
+
+
+def test_a_full_disk_costs_the_file_and_not_the_run(
+    mixture: Mixture,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    def full(*_: object) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(freezing, "write_whole", full)
+    leave_field(mixture, tmp_path)
+    assert "could not be written" in " ".join(capsys.readouterr().out.split())

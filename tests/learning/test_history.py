@@ -7,9 +7,9 @@ from pathlib import Path
 import pytest
 import torch
 
+from leco_plugin.learning.history import FILE_NAME, GateHistory
 from leco_plugin.models.encodings import EncodingConfig
 from leco_plugin.models.gate import Gate, GateConfig
-from leco_plugin.learning.history import FILE_NAME, GateHistory
 from leco_plugin.occupancy import Occupancy
 from leco_plugin.space import Space
 

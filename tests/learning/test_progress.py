@@ -6,7 +6,7 @@ import io
 
 import torch
 
-from leco_plugin.learning.progress import Progress
+from leco_plugin.learning.progress import Progress, WatchState
 
 
 def test_a_new_run_learns_as_long_as_configured_unless_it_is_short() -> None:
@@ -20,7 +20,7 @@ def test_a_resumed_run_keeps_its_schedule_however_few_steps_are_left() -> None:
     progress = Progress()
     progress.begin(200, most=2000)
     progress.learn_steps = 300  # healed
-    resumed = Progress(**progress.to_dict())
+    resumed = Progress.from_dict(progress.to_dict())
     resumed.begin(200, most=10)
     assert resumed.learn_steps == 300
 
@@ -44,20 +44,16 @@ def test_a_learning_phase_is_counted_from_where_it_began() -> None:
 
 
 def test_progress_is_read_back_without_unsafe_loading() -> None:
+    watch = WatchState(800, 4, {"a price": (1.0, 2.0, 3.0)}, 7, 0.25)
     progress = Progress(
-        *(300, 200, 12.5, 1, 2),
+        *(300, 200, 150, 2, 12.5, 1, 2),
         decisions=torch.tensor([True, False]),
         suspected_since=7,
-        surface=(1.0, 2.0, 3.0),
+        watch=watch,
     )
     buffer = io.BytesIO()
     torch.save(progress.to_dict(), buffer)
     buffer.seek(0)
-    found = Progress(**torch.load(buffer, weights_only=True))
-    assert torch.equal(found.decisions, progress.decisions)
+    found = Progress.from_dict(torch.load(buffer, weights_only=True))
+    assert torch.equal(found.decisions, progress.decisions) and found.watch == watch
     assert {**found.to_dict(), "decisions": None} == {**progress.to_dict(), "decisions": None}
-
-
-def test_progress_of_an_older_release_is_read() -> None:
-    state = Progress(learn_steps=300).to_dict() | {"suspected": True}
-    assert Progress.from_dict(state).learn_steps == 300

@@ -7,7 +7,7 @@ import copy
 import pytest
 import torch
 
-from leco_plugin.learning.pace import keep_pace
+from leco_plugin.learning.run import keep_pace
 
 RATE = 0.5
 

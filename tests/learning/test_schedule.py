@@ -1,4 +1,4 @@
-"""When the first phase ends, and what counts as a collapse."""
+"""When the first phase ends."""
 
 from __future__ import annotations
 
@@ -7,18 +7,13 @@ from itertools import pairwise
 import pytest
 import torch
 
-from leco_plugin.models.gate import occupancy_from_logits
 from leco_plugin.learning.schedule import (
     ScheduleConfig,
     converged,
     decisions_agree,
-    find_collapse,
     is_unsettled,
     ramp,
-    reset_gate_head,
-    spread_scene_experts,
 )
-from leco_plugin.models.losses import expert_shares
 
 SCHEDULE = ScheduleConfig(learn_steps=1000, earliest=0.5, ramp_from=0.2, ramp_to=0.6)
 
@@ -59,54 +54,3 @@ def test_agreement_is_the_share_of_equal_decisions() -> None:
     assert decisions_agree(before, torch.tensor([True, False, False, False])) == 0.75
     assert decisions_agree(before, before) == 1.0
     assert decisions_agree(torch.zeros(0, dtype=torch.bool), before) == 0.0
-
-
-@pytest.mark.parametrize(
-    ("kept", "shares", "has_learned", "cause"),
-    [
-        (0.0, [1.0, 0.0, 0.0], False, "all space empty"),
-        (1.0, [0.0, 0.5, 0.5], True, "all space occupied"),
-        (0.3, [0.7, 0.0, 0.3], False, "scene expert 2 takes all points"),
-    ],
-)
-def test_a_collapse_is_named(kept: float, shares: list[float], has_learned: bool, cause) -> None:
-    collapse = find_collapse(kept, torch.tensor(shares), has_learned)
-    assert collapse is not None and cause in collapse.cause and "\n" not in collapse.cause
-
-
-@pytest.mark.parametrize(
-    ("kept", "shares", "has_learned"),
-    [
-        (0.3, [0.7, 0.2, 0.1], True),
-        (1.0, [0.0, 0.5, 0.5], False),  # it has not learned enough yet
-        (0.3, [0.7, 0.3], True),  # there is only one scene expert
-    ],
-)
-def test_a_gate_that_decides_has_not_collapsed(kept: float, shares, has_learned: bool) -> None:
-    assert find_collapse(kept, torch.tensor(shares), has_learned) is None
-
-
-def test_a_reset_gate_is_undecided_again() -> None:
-    torch.manual_seed(0)
-    head = torch.nn.Linear(64, 5)
-    torch.nn.init.constant_(head.bias, 40.0)
-    reset_gate_head(head)
-    features = torch.nn.functional.layer_norm(torch.randn(1000, 64), (64,))
-    probabilities = head(features).detach().softmax(dim=-1)
-    assert not bool(head.bias.any())
-    assert float(probabilities.mean(dim=0).min()) > 0.05
-    assert head.weight.requires_grad
-
-
-def test_sharing_out_one_experts_points_leaves_the_occupancy_as_it_was() -> None:
-    torch.manual_seed(0)
-    head = torch.nn.Linear(16, 5)
-    with torch.no_grad():
-        head.bias[3] = head.bias[0] = 20.0
-    features = torch.randn(500, 16)
-    before = occupancy_from_logits(head(features))
-    spread_scene_experts(head, 3)
-    after = head(features)
-    assert (occupancy_from_logits(after) - before).abs().mean() < 0.03
-    shares = expert_shares(after[:, 1:].argmax(dim=-1), 4)
-    assert float(shares.max()) < 0.8

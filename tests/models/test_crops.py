@@ -16,10 +16,11 @@ from torch import nn
 
 from leco_plugin.host_configs import switch_nerf_host
 from leco_plugin.method_configs import LEARNING
-from leco_plugin.models.scene_rays import SeenBackdrops, cut_to_bounds
+from leco_plugin.models.region import SIDE, Region
 from leco_plugin.models.sizing.scene_sizes import complete
 from leco_plugin.scenes.bounds import SceneBounds
-from leco_plugin.space import NO_WALL, Space
+from leco_plugin.scenes.survey import covering_rays
+from leco_plugin.space import NO_WALL
 
 MAGENTA = torch.tensor([1.0, 0.0, 1.0])
 BOX = SceneBox(torch.tensor([[-1.0] * 3, [1.0] * 3]))
@@ -40,8 +41,13 @@ def model_of(name: str, kind: Any) -> Any:
         config = switch_nerf_host
     model = config.setup(scene_box=BOX, num_train_data=3, metadata={}, device="cpu").eval()
     bounds = SceneBounds(kind, torch.zeros(3), 1.0, 0.1, 4.0, WALLS[kind], "")
-    model.set_bounds(bounds, 2.0)
+    part_of(model, name).set_bounds(bounds, 2.0)
     return model
+
+
+def part_of(model: Any, name: str) -> Any:
+    """What has the bounds."""
+    return model.mixture if name == "leco-occupancy" else model
 
 
 def camera() -> Cameras:
@@ -93,7 +99,6 @@ def test_without_a_crop_a_background_is_nowhere_seen() -> None:
 
 
 SLAB = torch.tensor([-NO_WALL, -NO_WALL, -1.0, NO_WALL, NO_WALL, -0.5])
-NEAR, FAR = torch.tensor(0.1), torch.tensor(3.0)
 
 
 def looking(down: float, count: int = 9) -> Cameras:
@@ -107,42 +112,48 @@ def looking(down: float, count: int = 9) -> Cameras:
     return Cameras(poses, 40.0, 40.0, 20.0, 20.0, 40, 40)
 
 
-def shows_a_backdrop(seen: SeenBackdrops, space: Space, cameras: Cameras) -> torch.Tensor:
+def see(region: Region, cameras: Cameras) -> None:
+    """Has cameras be those of the training images."""
+    origins, directions = covering_rays(cameras, SIDE)
+    region.look(origins.reshape(-1, 3), directions.reshape(-1, 3))
+
+
+def shows_a_backdrop(region: Region, cameras: Cameras) -> torch.Tensor:
     """Whether each pixel of the middle camera has one, by rows."""
     bundle: RayBundle = cameras.generate_rays(camera_indices=len(cameras) // 2).flatten()
-    cut = cut_to_bounds(bundle, SLAB, NEAR, FAR, with_images=False)
-    return seen(cut, space, SLAB).view(40, 40)
+    rays = region.rays(bundle.origins, bundle.directions, None, torch.tensor(0.5))
+    assert rays.cut_off is not None
+    return ~rays.cut_off.view(40, 40)
 
 
 def test_a_backdrop_is_shown_where_training_saw_one_and_nowhere_else() -> None:
-    space = Space("box", (0.0, 0.0, -0.75), 3.0)
+    region = Region()
+    region.set(SceneBounds("box", torch.tensor([0.0, 0.0, -0.75]), 3.0, 0.1, 3.0, SLAB, ""))
     steep, tilted = looking(80.0), looking(20.0)
-    seen = SeenBackdrops()
-    assert bool(shows_a_backdrop(seen, space, tilted).all())  # nothing is known yet
-    seen.look(steep, space, SLAB, NEAR, FAR)
-    assert bool(shows_a_backdrop(seen, space, steep).all())  # the floor
-    shown = shows_a_backdrop(seen, space, tilted)
+    assert bool(shows_a_backdrop(region, tilted).all())  # nothing is known yet
+    see(region, steep)
+    assert bool(shows_a_backdrop(region, steep).all())  # the floor
+    shown = shows_a_backdrop(region, tilted)
     assert not bool(shown[:20].any()) and bool(shown[-1].all())  # over the horizon, and the floor
-    seen.look(tilted, space, SLAB, NEAR, FAR)  # which photographs a sky
-    assert bool(shows_a_backdrop(seen, space, tilted).all())
-    assert not bool(shows_a_backdrop(seen, space, looking(-50.0)).any())  # higher than it does
+    see(region, tilted)  # which photographs a sky
+    assert bool(shows_a_backdrop(region, tilted).all())
+    assert not bool(shows_a_backdrop(region, looking(-50.0)).any())  # higher than it does
 
 
-def test_a_checkpoint_of_an_earlier_release_shows_every_backdrop() -> None:
-    model = model_of("leco-occupancy", "box")
+def test_a_checkpoint_without_seen_backdrops_shows_every_one() -> None:
+    model, loaded = (model_of("leco-occupancy", "box") for _ in range(2))
     state = model.state_dict()
-    del state["backdrops.limits"]
-    loaded = model_of("leco-occupancy", "box")
+    del state["mixture.region.backdrops.limits"]
     loaded.load_state_dict(state)
-    assert bool((loaded.backdrops.limits == 2.0).all())
+    assert bool((loaded.mixture.region.backdrops.limits == 2.0).all())
 
 
 def test_a_checkpoint_keeps_the_backdrops_that_were_seen_as_nerfstudio_loads_it() -> None:
     model, loaded = (model_of("leco-occupancy", "box") for _ in range(2))
-    model.backdrops.limits.fill_(0.5)
+    model.mixture.region.backdrops.limits.fill_(0.5)
     loaded.load_state_dict(model.state_dict())
     nn.ModuleDict({"_model": loaded}).load_state_dict({}, strict=False)  # the pipeline's own state
-    assert bool((loaded.backdrops.limits == 0.5).all())
+    assert bool((loaded.mixture.region.backdrops.limits == 0.5).all())
 
 
 @pytest.mark.parametrize("name", ["leco-occupancy", "switch-nerf"])
@@ -152,6 +163,6 @@ def test_a_ray_whose_backdrop_was_never_seen_is_black(name: str) -> None:
     up.camera_to_worlds = up.camera_to_worlds * torch.tensor([1.0, -1.0, -1.0, 1.0])[None, None]
     bundle = up.generate_rays(camera_indices=0, keep_shape=True)
     assert float(model.get_outputs_for_camera_ray_bundle(bundle)["rgb"].min()) > 0.0
-    model.backdrops.look(camera(), model.space, model.aabb, *model.march_range[:2])
+    see(part_of(model, name).region, camera())
     outputs = model.get_outputs_for_camera_ray_bundle(bundle)
     assert float(outputs["rgb"].max()) == float(outputs["accumulation"].max()) == 0.0

@@ -9,17 +9,21 @@ import pytest
 import torch
 from nerfstudio.cameras.rays import RayBundle
 from nerfstudio.data.scene_box import SceneBox
+from small_learner import small_learner
 
+from leco_plugin.learning.collapse import annealed
 from leco_plugin.models import front_to_back
 from leco_plugin.models.encodings import EncodingConfig
 from leco_plugin.models.field import FieldConfig
 from leco_plugin.models.gate import GateConfig
 from leco_plugin.models.leco import LecoModel
 from leco_plugin.models.leco_config import LecoModelConfig
+from leco_plugin.models.mixture import Following
 from leco_plugin.models.objective import GateLossConfig
 from leco_plugin.models.rendering import Intervals, Rays
 from leco_plugin.models.sizing.sizes import Sizes
 from leco_plugin.scenes.bounds import SceneBounds
+from leco_plugin.scenes.input_error import InputError
 
 NUM_RAYS = 12
 
@@ -37,7 +41,7 @@ def model() -> LecoModel:
     box = SceneBox(torch.tensor([[-1.0] * 3, [1.0] * 3]))
     made = LecoModelConfig(sizes=TINY).setup(scene_box=box, num_train_data=3)
     assert isinstance(made, LecoModel)
-    made.ramped = 0.5  # every loss takes part
+    made.plan = made.plan._replace(ramped=0.5)  # every loss takes part
     return made.train()
 
 
@@ -90,7 +94,7 @@ def test_a_ray_that_misses_a_bounded_scene_has_its_backdrop_and_a_colour(
 ) -> None:
     walls = torch.tensor([-1.0, -1.0, -1.0, 1.0, 1.0, 1.0])
     bounds = SceneBounds("box", torch.zeros(3), 1.0, 0.1, 8.0, walls, "by hand")
-    model.set_bounds(bounds, 2.0)
+    model.mixture.set_bounds(bounds, 2.0)
     ahead = torch.tensor([[0.0, 0.0, 1.0], [0.0, 0.0, 1.0], [0.0, 0.0, -1.0]])
     origins = torch.tensor([[0.0, 0.0, -3.0], [0.0, 5.0, -3.0], [0.0, 0.0, -3.0]])
     bundle = RayBundle(origins, ahead, torch.ones(3, 1), torch.zeros(3, 1, dtype=torch.int64))
@@ -100,7 +104,7 @@ def test_a_ray_that_misses_a_bounded_scene_has_its_backdrop_and_a_colour(
     backdrops = 1.0 if training else 0.0  # which losses count, and pictures do not
     assert outputs["accumulation"][1:].flatten().tolist() == pytest.approx([backdrops] * 2)
     assert training or outputs["depth"][1:].flatten().tolist() == [8.0, 8.0]
-    intervals = model.intervals_of(model.rays_of(bundle), guided=False, learning=training)
+    intervals = model.intervals_of(model.rays_of(bundle))
     ends = [intervals.t_ends[intervals.ray_indices == ray] for ray in range(3)]
     assert len(ends[0]) > 3 and float(ends[0].max()) == pytest.approx(4.0)
     for missing in ends[1:]:
@@ -109,7 +113,7 @@ def test_a_ray_that_misses_a_bounded_scene_has_its_backdrop_and_a_colour(
 
 def test_the_backdrop_gives_a_ray_its_colour_and_no_opacity(model: LecoModel) -> None:
     with torch.no_grad():
-        model.field.density_head.bias.fill_(-80.0)  # nothing anywhere
+        model.mixture.field.density_head.bias.fill_(-80.0)  # nothing anywhere
         torch.manual_seed(1)
         ends = step(model)[0]["rays"].t_maxs
         torch.manual_seed(1)
@@ -143,10 +147,11 @@ def test_the_nearness_loss_is_its_weight_at_near_and_nothing_at_far(
 ) -> None:
     """In a box it is of pixels that are nearly black: the others show something for certain."""
     outputs, batch = step(model)
-    model.space.unbounded.fill_(unbounded)
+    model.mixture.region.space.unbounded.fill_(unbounded)
     batch = batch | {"image": torch.full_like(batch["image"], brightness)}
-    for place, expected in ((0, share * model.config.nearness * model.ramped), (1, 0.0)):
-        at = model.march_range[place].expand(NUM_RAYS)
+    region, weight = model.mixture.region, model.config.nearness * model.plan.ramped
+    for place, expected in ((region.near, share * weight), (region.far, 0.0)):
+        at = place.expand(NUM_RAYS)
         placed = outputs | {"shaded": outputs["shaded"]._replace(depth=at)}
         loss = model.get_loss_dict(placed, batch)["nearness_loss"]
         assert float(loss) == pytest.approx(expected, abs=1e-6)
@@ -157,19 +162,19 @@ def test_what_the_gate_calls_empty_is_looked_at_on_some_rays_all_the_same(
     model: LecoModel, everywhere: float, shaded: float
 ) -> None:
     with torch.no_grad():
-        model.gate.head.bias[0] += 1e3  # empty everywhere
-    model.config.look_everywhere = everywhere
+        model.mixture.gate.head.bias[0] += 1e3  # empty everywhere
+    following = Following(above=model.config.likely_above, everywhere=everywhere)
     rays = 4000
     directions = torch.nn.functional.normalize(torch.randn(rays, 3), dim=-1)
     starts, ends = torch.full((rays,), 0.1), torch.full((rays,), 0.2)
     bundle = Rays(-0.5 * directions, directions, starts, ends, None)
-    kept = model._likely(Intervals(torch.arange(rays), starts, ends), bundle)
+    kept = model.mixture.follow(bundle, Intervals(torch.arange(rays), starts, ends), following)
     assert len(kept.ray_indices) / rays == pytest.approx(shaded, abs=0.03)
 
 
 def test_the_colours_of_an_image_are_learned_and_their_mean_is_rendered(model: LecoModel) -> None:
-    torch.nn.init.normal_(model.field.color.appearance.weight, std=10.0)
-    for parameter in model.field.parameters():
+    torch.nn.init.normal_(model.mixture.field.color.appearance.weight, std=10.0)
+    for parameter in model.mixture.field.parameters():
         parameter.data += 0.1 * torch.randn_like(parameter)
 
     def colours(image: int) -> torch.Tensor:
@@ -189,17 +194,17 @@ def test_the_colours_of_an_image_are_learned_and_their_mean_is_rendered(model: L
 
 
 def test_a_checkpoint_restores_report_and_progress(model: LecoModel) -> None:
-    model.report = {"step": 7, "threshold": 0.25}
+    model.mixture.report = {"step": 7, "threshold": 0.25}
     model.progress.begin(200, most=150)
     model.progress.recoveries, model.progress.learn_seconds = 2, 3.5
     model.progress.decisions = torch.tensor([True, False, True])
     buffer = io.BytesIO()
     torch.save(model.state_dict(), buffer)
-    model.report, model.progress.recoveries = {}, 0
+    model.mixture.report, model.progress.recoveries = {}, 0
     buffer.seek(0)
     restored = LecoModelConfig(sizes=TINY).setup(scene_box=model.scene_box, num_train_data=3)
     restored.load_state_dict(torch.load(buffer, weights_only=True))
-    assert restored.report == {"step": 7, "threshold": 0.25}
+    assert restored.mixture.report == {"step": 7, "threshold": 0.25}
     progress = restored.progress
     assert (progress.learn_steps, progress.configured) == (150, 200)
     assert (progress.recoveries, progress.learn_seconds) == (2, 3.5)
@@ -214,41 +219,43 @@ def test_a_gate_that_has_given_up_the_papers_form_routes_as_the_other_also_when_
         assert isinstance(made, LecoModel)
         models.append(made)
     first, resumed = models
-    assert first.routing.empty_below is None
+    assert first.mixture.routing.empty_below is None
     first.progress.paper_given_up = True
+    first.mixture.routing = small_learner(
+        progress=first.progress, gate_loss=config.gate_loss
+    ).recoveries.routing()
     resumed.load_state_dict(first.state_dict())
     for model in models:
-        assert model.routing.empty_below == config.gate_loss.empty_below
+        assert model.mixture.routing.empty_below == config.gate_loss.empty_below
+        gate_loss = annealed(config.gate_loss, model.progress, 0)
+        model.plan = model.plan._replace(gate_loss=gate_loss)
         outputs, batch = step(model.train())
         assert "contribution_loss" in model.get_loss_dict(outputs, batch)
 
 
-def test_a_checkpoint_from_before_there_was_progress_is_read(model: LecoModel) -> None:
-    state = model.state_dict()
-    state["_extra_state"] = {"report": {"step": 7}}
-    model.progress.recoveries = 2
-    model.load_state_dict(state)
-    assert model.report == {"step": 7} and model.progress.recoveries == 0
+def test_a_checkpoint_of_an_earlier_version_is_refused_in_a_line(model: LecoModel) -> None:
+    state = {name.removeprefix("mixture."): value for name, value in model.state_dict().items()}
+    with pytest.raises(InputError, match="earlier version of leco_plugin: train again") as caught:
+        model.load_state_dict(state)
+    assert "\n" not in str(caught.value)
 
 
 def test_a_gate_that_skips_nothing_is_not_taken_for_one_that_keeps_nothing(
     model: LecoModel,
 ) -> None:
     with torch.no_grad():
-        model.gate.head.bias[0] += 1e3  # empty everywhere
-    model.frozen.fill_(True)
-    model.threshold.fill_(0.5)
+        model.mixture.gate.head.bias[0] += 1e3  # empty everywhere
+    model.mixture.freeze(0.5, {})
     step(model)
-    assert model.guided_kept == 0.0
-    model.threshold.fill_(0.0)  # as measuring again does with such a gate
-    model.forget_estimator()
+    assert model.kept_per_ray == 0.0
+    model.mixture.freeze(0.0, {})  # as measuring again does with such a gate
     step(model)
-    assert model.guided_kept > 0.0
+    assert model.kept_per_ray > 0.0
 
 
 def test_front_to_back_renders_the_same_pixels_from_fewer_samples(model: LecoModel) -> None:
     with torch.no_grad():
-        model.field.density_head.bias.fill_(9.0)  # opaque everywhere
+        model.mixture.field.density_head.bias.fill_(9.0)  # opaque everywhere
     model.eval()
     rendered = []
     for model.config.front_to_back in (False, True):
@@ -265,8 +272,7 @@ def test_guided_batches_of_many_rays_are_rendered_from_the_front_by_default(
     model: LecoModel, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     with torch.no_grad():
-        model.field.density_head.bias.fill_(9.0)  # opaque everywhere
-    model.threshold.fill_(1e-3)
+        model.mixture.field.density_head.bias.fill_(9.0)  # opaque everywhere
     model.eval()
 
     def samples() -> float:
@@ -275,7 +281,7 @@ def test_guided_batches_of_many_rays_are_rendered_from_the_front_by_default(
 
     monkeypatch.setattr(front_to_back, "MANY_RAYS", NUM_RAYS)
     dense = samples()
-    model.frozen.fill_(True)
+    model.mixture.freeze(1e-3, {})
     assert samples() < 0.5 * dense
     monkeypatch.setattr(front_to_back, "MANY_RAYS", NUM_RAYS + 1)
     assert samples() == dense  # the gate keeps all

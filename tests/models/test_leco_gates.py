@@ -12,14 +12,14 @@ import pytest
 import torch
 from nerfstudio.engine.callbacks import TrainingCallbackAttributes, TrainingCallbackLocation
 
+from leco_plugin.learning.calibration import CalibrationConfig
+from leco_plugin.learning.freezing import FILE_NAME
+from leco_plugin.learning.schedule import ScheduleConfig
 from leco_plugin.method_configs import leco_occupancy
 from leco_plugin.models.encodings import EncodingConfig, Kind
 from leco_plugin.models.field import FieldConfig
-from leco_plugin.learning.calibration import CalibrationConfig
-from leco_plugin.learning.freezing import FILE_NAME
 from leco_plugin.models.gate import GateConfig
 from leco_plugin.models.hmoe import HMoEConfig
-from leco_plugin.learning.schedule import ScheduleConfig
 from leco_plugin.models.leco import LecoModel
 from leco_plugin.models.leco_config import LecoModelConfig
 from leco_plugin.models.sizing.sizes import Sizes
@@ -56,7 +56,7 @@ def test_every_parameter_is_in_one_group_and_the_tables_of_field_and_gate_in_one
     assert set(listed) == {
         id(p) for p in model.parameters() if p is not model.device_indicator_param
     }
-    tables = [*model.field.encoding.parameters(), *model.gate.encoding.parameters()]
+    tables = [*model.mixture.field.encoding.parameters(), *model.mixture.gate.encoding.parameters()]
     assert {id(p) for p in groups["encoding"]} == {id(p) for p in tables}
 
 
@@ -87,12 +87,12 @@ def test_a_gate_on_any_features_is_learned_frozen_and_saved(
 ) -> None:
     torch.manual_seed(0)
     without_cache = partial(LearnedOccupancyEstimator, cache_bytes=0)  # seconds to build
-    monkeypatch.setattr("leco_plugin.models.leco.LearnedOccupancyEstimator", without_cache)
+    monkeypatch.setattr("leco_plugin.models.mixture.LearnedOccupancyEstimator", without_cache)
     pipeline, callbacks = pipeline_of(kind, tiny_scene)
     model = pipeline.model.train()
     groups = model.get_param_groups()
     optimizer = torch.optim.Adam([{"params": group} for group in groups.values()], lr=1e-2)
-    first = [table.detach().clone() for table in model.gate.encoding.parameters()]
+    first = [table.detach().clone() for table in model.mixture.gate.encoding.parameters()]
     for step in range(LEARN_STEPS + 2):
         for call in callbacks:
             call.run_callback_at_location(step, TrainingCallbackLocation.BEFORE_TRAIN_ITERATION)
@@ -101,20 +101,20 @@ def test_a_gate_on_any_features_is_learned_frozen_and_saved(
         sum(losses.values()).backward()
         optimizer.step()
         if step == 0:
-            tables = list(model.gate.encoding.parameters())
+            tables = list(model.mixture.gate.encoding.parameters())
             assert all(bool(table.grad.any()) for table in tables)
             assert not any(torch.equal(table, before) for table, before in zip(tables, first))
         for call in callbacks:
             call.run_callback_at_location(step, TrainingCallbackLocation.AFTER_TRAIN_ITERATION)
         if step == LEARN_STEPS - 1:
-            assert bool(model.frozen)
+            assert bool(model.mixture.frozen)
             at_freezing = [table.detach().clone() for table in tables]
     assert all(torch.equal(table, before) for table, before in zip(tables, at_freezing))
-    model.occupancy().save(tmp_path / FILE_NAME)
+    model.mixture.occupancy().save(tmp_path / FILE_NAME)
     occupancy = Occupancy.load(tmp_path / FILE_NAME)
     estimator = build_estimator(f"learned-occupancy-{kind}", occupancy=occupancy, cache_bytes=0)
     positions = torch.rand(1000, 3) - 0.5
-    assert torch.equal(estimator.occupied(positions), model.occupancy().occupied(positions))
+    assert torch.equal(estimator.occupied(positions), model.mixture.occupancy().occupied(positions))
 
 
 def test_a_frozen_run_that_is_resumed_with_more_learn_steps_does_not_learn_again(
@@ -122,10 +122,10 @@ def test_a_frozen_run_that_is_resumed_with_more_learn_steps_does_not_learn_again
 ) -> None:
     pipeline, _ = pipeline_of("frequency", tiny_scene)
     model, attributes = pipeline.model, TrainingCallbackAttributes(None, None, pipeline, None)  # type: ignore[arg-type]
-    model.frozen.fill_(True)
+    model.mixture.freeze(0.5, {})
     model.config.schedule = replace(model.config.schedule, learn_steps=100 * LEARN_STEPS)
     pipeline.get_training_callbacks(attributes)
     assert model.progress.learn_steps == LEARN_STEPS  # from which it follows what is learned from
-    model.frozen.fill_(False)
+    model.mixture.reopen()
     pipeline.get_training_callbacks(attributes)
     assert model.progress.learn_steps == 100 * LEARN_STEPS

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import copy
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import ball_occupancy
 import pytest
 import torch
 import yaml
+from nerfstudio.cameras.cameras import Cameras
 from nerfstudio.cameras.rays import RayBundle
 from nerfstudio.data.scene_box import SceneBox
 from nerfstudio.engine.callbacks import TrainingCallbackAttributes
@@ -240,7 +242,7 @@ def test_a_checkpoint_brings_back_the_same_pixels(sampling, bounds, tmp_path: Pa
     if isinstance(other.occupancy_grid, OccupancyGridEstimator):
         assert other.occupancy_grid.levels == (1 if bounds is BOX else 4)
         assert bool(other.occupancy_grid.binaries.any())
-    assert bool(other.bounds_known)
+    assert bool(other.region.known)
 
 
 def test_a_density_is_that_of_the_scenes_units() -> None:
@@ -249,7 +251,7 @@ def test_a_density_is_that_of_the_scenes_units() -> None:
     model.precision = "float32"
     asked = model.field(positions / 4.0).sigmas[:, None] / 4.0
     torch.testing.assert_close(model.density_fn(positions), asked)
-    step = float(model.march_range[2])
+    step = float(model.step)
     torch.testing.assert_close(model.opacity_of_a_step(positions), asked * step)
 
 
@@ -259,10 +261,17 @@ def test_a_capacity_that_no_expert_could_have_is_refused(capacity_factor: float)
         new_model(capacity_factor=capacity_factor)
 
 
-@pytest.mark.parametrize("range_", [{"near": 0.0}, {"near": 5.0}, {"far": 0.05}])
+@pytest.mark.parametrize("range_", [{"near": 0.0}, {"near": 1e4}, {"far": 1e-4}])
 def test_an_empty_range_of_rays_is_refused(range_: dict[str, float]) -> None:
+    poses = torch.eye(4)[:3].repeat(3, 1, 1)
+    poses[:, :, 3] = torch.eye(3)
+    dataset = SimpleNamespace(cameras=Cameras(poses, 20.0, 20.0, 8.0, 8.0, 16, 16), metadata={})
+    pipeline = SimpleNamespace(datamanager=SimpleNamespace(train_dataset=dataset))
+    attributes = TrainingCallbackAttributes(None, None, pipeline, None)  # type: ignore[arg-type]
+    model = new_model(**range_)
+    model.region.known.fill_(False)
     with pytest.raises(InputError, match="0 < near < far"):
-        new_model(**range_)
+        model.get_training_callbacks(attributes)
 
 
 def test_a_loss_that_is_not_finite_names_its_cause() -> None:

@@ -24,6 +24,7 @@ from PIL import Image
 from leco_plugin.hosts.learn_first import learn_occupancy
 from leco_plugin.learning.calibration import CalibrationConfig
 from leco_plugin.learning.schedule import ScheduleConfig
+from leco_plugin.models.hosts.learn_first import learn_occupancy
 from leco_plugin.models.leco_config import LecoModelConfig
 from leco_plugin.scenes import data_manager
 from leco_plugin.scenes.data_manager import (
@@ -33,6 +34,7 @@ from leco_plugin.scenes.data_manager import (
     free_memory,
 )
 from leco_plugin.scenes.input_error import InputError
+from leco_plugin.scenes.learning_data import held_out_bundle
 from leco_plugin.scenes.photographs import LecoPhotographsDataParserConfig
 from leco_plugin.scenes.pixels.known_distances import KnownDistancePixelSamplerConfig, sampler_here
 from leco_plugin.scenes.pixels.lattice import Lattice, lattice_for

@@ -12,6 +12,7 @@ import torch
 from ball_occupancy import ball
 from nerfstudio.model_components.renderers import RGBRenderer
 
+from leco_plugin.learning import price_watch
 from leco_plugin.learning.calibration import THRESHOLDS, CalibrationConfig
 from leco_plugin.models.guided import _refuse_what_is_not_finite
 from leco_plugin.models.hosts import host_watch, probation
@@ -231,7 +232,7 @@ def test_hosts_with_samples_of_a_fixed_number_and_thresholds_of_nothing_begin_as
 def test_what_was_wrong_once_is_soon_looked_at_again_however_long_that_takes(
     watched: Watched, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(host_watch, "steps_until_next", lambda *_: 2000)
+    monkeypatch.setattr(price_watch, "steps_until_next", lambda *_: 2000)
     before = watched.guide.the_occupancy().threshold
     watched.host.price = 0.05
     watched.go(0, 201)
@@ -260,7 +261,7 @@ def test_what_was_found_travels_with_a_checkpoint(watched: Watched) -> None:
     watched.go(0, 150)
     fresh = Guide()
     fresh.load_state_dict(watched.guide.state_dict())
-    assert fresh.watched == watched.guide.watched and fresh.watched["rechecks"] == 1
+    assert fresh.watched == watched.guide.watched and fresh.watched.rechecks == 1
 
 
 @pytest.mark.parametrize("where", ["image", "loss", "weight"])
@@ -287,7 +288,7 @@ def test_all_processes_lower_the_threshold_or_none(
     watched: Watched, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     kept_elsewhere = 7.0
-    monkeypatch.setattr(host_watch, "mean", lambda here, _: 0.5 * (here + kept_elsewhere))
+    monkeypatch.setattr(price_watch, "mean", lambda here, _: 0.5 * (here + kept_elsewhere))
     watched.kept = 0
     watched.go(0, 300)
     assert watched.guide.the_occupancy().threshold > 0.0

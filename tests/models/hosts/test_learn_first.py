@@ -9,10 +9,10 @@ import tiny_scene
 from nerfstudio.data.datamanagers.base_datamanager import VanillaDataManagerConfig
 from nerfstudio.pipelines.base_pipeline import VanillaPipelineConfig
 
+from leco_plugin.learning.progress import Progress
+from leco_plugin.learning.schedule import MOST_EXTENSIONS, ScheduleConfig
 from leco_plugin.models.hosts.guided_start import OccupancyConfig
 from leco_plugin.models.hosts.learn_first import FEWEST_STEPS, keep_within, learn_occupancy
-from leco_plugin.learning.schedule import MOST_EXTENSIONS, ScheduleConfig
-from leco_plugin.learning.progress import Progress
 from leco_plugin.models.leco_config import LecoModelConfig
 from leco_plugin.models.sizing.sizes import SMALL
 from leco_plugin.occupancy import Occupancy

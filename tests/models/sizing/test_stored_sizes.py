@@ -87,7 +87,8 @@ def test_a_model_takes_the_sizes_of_its_checkpoint_and_renders_the_same() -> Non
 
 
 def with_candidates(model: LecoModel) -> LecoModel:
-    model.march_range.copy_(torch.tensor([0.05, 2.0, 0.1, 0.1, 0.0, 0.0]))
+    model.mixture.region.far.fill_(2.0)
+    model.mixture.steps.fill_(0.1)
     return model
 
 
@@ -100,19 +101,23 @@ def test_a_model_inside_another_takes_them_too() -> None:
 
 def test_the_same_sizes_leave_modules_and_config_as_they_are() -> None:
     model = model_of(TINY)
-    gate, field, config = model.gate, model.field, model.config
+    mixture, config = model.mixture, model.config
+    gate, field = mixture.gate, mixture.field
     model.load_state_dict(model_of(TINY).state_dict())
-    assert model.gate is gate and model.field is field and model.config is config
+    assert mixture.gate is gate and mixture.field is field and model.config is config
 
 
-def test_a_checkpoint_of_an_earlier_release_has_none() -> None:
+def test_a_state_without_sizes_leaves_those_of_now() -> None:
     now = (TINY, 3)
     for extra in (None, {}, {"report": {}}):
         assert stored_in(extra, now) == now
-    model = model_of(TINY)
-    state = model.state_dict()
-    del state["_extra_state"]["sizes"]
-    model.load_state_dict(state)
+
+
+def test_a_model_refuses_a_checkpoint_with_sizes_of_a_later_release() -> None:
+    state = model_of(TINY).state_dict()
+    state["mixture._extra_state"]["sizes"]["field"]["colour_octaves"] = 4
+    with pytest.raises(InputError, match="of another release"):
+        model_of(TINY).load_state_dict(state)
 
 
 def test_the_config_of_others_keeps_its_open_sizes() -> None:

@@ -1,38 +1,47 @@
-"""Rays inside a scene's bounds, and the steps in which they are marched."""
+"""Rays inside a scene's region, and the steps in which they are marched."""
 
 from __future__ import annotations
 
 import pytest
 import torch
-from nerfstudio.cameras.rays import RayBundle
 
-from leco_plugin.models.scene_rays import cut_to_bounds, marching_rule, with_ends_for_all
-from leco_plugin.samplers.marching import March, Rays, march
+from leco_plugin.models.region import Region, marching_rule
+from leco_plugin.models.rendering import Rays
+from leco_plugin.samplers.marching import march
+from leco_plugin.scenes.bounds import SceneBounds
+from leco_plugin.space import NO_WALL
 
-NEAR, FAR = torch.tensor(0.1), torch.tensor(5.0)
-SLAB = torch.tensor([-1e6, -1e6, -1.0, 1e6, 1e6, 1.0])
+SLAB = torch.tensor([-NO_WALL, -NO_WALL, -1.0, NO_WALL, NO_WALL, 1.0])
 
 
-def bundle() -> RayBundle:
+def region_of(aabb: torch.Tensor, far: float = 5.0) -> Region:
+    region = Region()
+    region.set(SceneBounds("box", torch.zeros(3), 1.0, 0.1, far, aabb, ""))
+    return region
+
+
+def rays_of(region: Region, images: torch.Tensor | None = None, cut: bool = False) -> Rays:
     """From two above a slab: straight down, level above it, and up."""
     origins = torch.tensor([[0.0, 0.0, 2.0]]).repeat(3, 1)
     directions = torch.tensor([[0.0, 0.0, -1.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
-    images = torch.arange(3)[:, None]
-    return RayBundle(origins, directions, torch.ones(3, 1), camera_indices=images)
+    if cut:
+        return region.cut(origins, directions, images)
+    return region.rays(origins, directions, images, torch.tensor(0.5))
 
 
 def test_rays_are_cut_to_the_box_and_to_near_and_far() -> None:
-    rays = cut_to_bounds(bundle(), SLAB, NEAR, FAR, with_images=True)
+    region = region_of(SLAB)
+    assert bool(region.known) and not bool(Region().known)
+    rays = rays_of(region, torch.arange(3), cut=True)
     torch.testing.assert_close(rays.t_mins[0], torch.tensor(1.0))
     torch.testing.assert_close(rays.t_maxs[0], torch.tensor(3.0))
     assert not bool((rays.t_maxs[1:] > rays.t_mins[1:]).any())
     assert rays.images is not None and rays.images.tolist() == [0, 1, 2]
-    assert cut_to_bounds(bundle(), SLAB, NEAR, FAR, with_images=False).images is None
+    assert rays_of(region, cut=True).images is None
 
 
 def test_rays_that_miss_get_a_piece_at_the_far_end() -> None:
-    cut = cut_to_bounds(bundle(), SLAB, NEAR, FAR, with_images=False)
-    rays = with_ends_for_all(cut, FAR, torch.tensor(0.5))
+    rays = rays_of(region_of(SLAB), torch.arange(3))
     torch.testing.assert_close(rays.t_mins, torch.tensor([1.0, 4.5, 4.5]))
     torch.testing.assert_close(rays.t_maxs, torch.tensor([3.0, 5.0, 5.0]))
 
@@ -43,19 +52,14 @@ def test_a_median_ray_has_the_wanted_number_of_candidates(kind) -> None:
     step_size, cone_angle = marching_rule(kind, 0.1, 5.0, 64, length)
     one = torch.zeros(1, 3), torch.tensor([[1.0, 0.0, 0.0]])
     ends = torch.tensor([0.1]), torch.tensor([0.1 + length])
-    ray_indices, _, _ = march(Rays(*one, *ends), March(step_size, cone_angle))
+    ray_indices, _, _ = march(*one, *ends, step_size=step_size, cone_angle=cone_angle)
     assert abs(len(ray_indices) - 64) <= 1
     assert (cone_angle > 0.0) == (kind == "contraction")
 
 
-def test_a_ray_along_a_wall_that_misses_the_box_stays_finite():
-    aabb = torch.tensor([-1.0, -1.0, -0.5, 1.0, 1.0, 0.5])
-    bundle = RayBundle(
-        origins=torch.tensor([[0.0, 0.0, 2.0]]),
-        directions=torch.tensor([[1.0, 0.0, 0.0]]),
-        pixel_area=torch.ones(1, 1),
-    )
-    rays = cut_to_bounds(bundle, aabb, torch.tensor(0.1), torch.tensor(3.0), with_images=False)
+def test_a_ray_along_a_wall_that_misses_the_box_stays_finite() -> None:
+    region = region_of(torch.tensor([-1.0, -1.0, -0.5, 1.0, 1.0, 0.5]), far=3.0)
+    rays = region.cut(torch.tensor([[0.0, 0.0, 2.0]]), torch.tensor([[1.0, 0.0, 0.0]]))
     assert bool(rays.t_mins.isfinite())
     assert bool(rays.t_maxs.isfinite())
     assert bool(rays.t_maxs <= rays.t_mins)

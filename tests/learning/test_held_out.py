@@ -1,0 +1,77 @@
+"""Claims about what the frozen gate is measured on."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from types import SimpleNamespace
+from typing import Any
+
+import torch
+from nerfstudio.cameras.rays import RayBundle
+from small_learner import SMALLEST, NoPixels, small_mixture
+
+from leco_plugin.learning.calibration import CalibrationConfig
+from leco_plugin.learning.dense import dense_rendering, evaluating
+from leco_plugin.learning.held_out import HeldOut
+from leco_plugin.scenes.learning_data import held_out_bundle
+from leco_plugin.scenes.pixels.held_out_pixels import HeldOutPixelSampler, HeldOutPixelSamplerConfig
+
+COUNT = 50
+
+
+class Pixels:
+    """A data manager whose rays are the pixels [R, 3] that they go through."""
+
+    def __init__(self, keeps_pixels_back: bool) -> None:
+        image = torch.rand(2, 20, 30, 3)
+        self.images = {"image": image, "image_idx": torch.arange(2)}
+        self.train_pixel_sampler = (
+            HeldOutPixelSamplerConfig().setup(num_rays_per_batch=8) if keeps_pixels_back else None
+        )
+        self.iter_train_image_dataloader = iter([self.images])
+        cameras = SimpleNamespace(to=lambda device: cameras, generate_rays=self.generate_rays)
+        self.train_dataset = SimpleNamespace(cameras=cameras)
+
+    def generate_rays(self, camera_indices: torch.Tensor, coords: torch.Tensor) -> torch.Tensor:
+        return torch.cat([camera_indices, (coords - 0.5).long()], dim=1)
+
+    def next_train(self, step: int) -> tuple[torch.Tensor, dict[str, torch.Tensor]]:
+        indices = torch.zeros(2 * COUNT, 3, dtype=torch.int64)
+        return indices, {"image": torch.zeros(2 * COUNT, 3), "indices": indices}
+
+
+def test_the_threshold_is_measured_on_pixels_that_training_never_sees() -> None:
+    manager = Pixels(keeps_pixels_back=True)
+    pixels, colours = held_out_bundle(manager, COUNT)
+    sampler = manager.train_pixel_sampler
+    assert isinstance(sampler, HeldOutPixelSampler) and 5 < len(pixels) <= COUNT
+    image, row, column = pixels.T
+    assert torch.equal(colours, manager.images["image"][image, row, column])
+    trained = sampler.sample(manager.images)["indices"]
+    held_out = {tuple(pixel) for pixel in pixels.tolist()}
+    assert not held_out & {tuple(pixel) for pixel in trained.tolist()}
+
+
+def test_without_held_out_pixels_it_is_measured_on_training_rays() -> None:
+    pixels, colours = held_out_bundle(Pixels(keeps_pixels_back=False), COUNT)
+    assert len(pixels) == len(colours) == COUNT
+    assert not colours.any()
+
+
+def test_prices_are_measured_in_the_appearance_of_each_image() -> None:
+    torch.manual_seed(0)
+    field = replace(SMALLEST.field, appearance_dim=1)
+    mixture = small_mixture(replace(SMALLEST, field=field, candidates=16))
+    mixture.field.color.appearance.weight.data = torch.tensor([[500.0], [-500.0]])
+    ahead = torch.tensor([[0.0, 0.0, 1.0]]).expand(2, 3)
+    bundle = RayBundle(-0.5 * ahead, ahead, torch.ones(2, 1), torch.tensor([[0], [1]]))
+    data: Any = NoPixels()
+    data.held_out = lambda *_: (bundle, torch.rand(2, 3))
+    rays, truth = HeldOut(mixture, data, CalibrationConfig(), False).rays(2)
+    with evaluating(mixture), torch.no_grad():
+        (reference,) = dense_rendering(mixture, rays, truth, 2).references
+        unknown = mixture.rays(bundle.origins, bundle.directions, None)
+        intervals = mixture.with_backdrops(unknown, mixture.candidates(unknown))
+        of_the_mean = mixture.shade(unknown, intervals).rgb
+    torch.testing.assert_close(of_the_mean[0], of_the_mean[1], atol=1e-6, rtol=0.0)
+    assert float((reference.rgb[0] - reference.rgb[1]).abs().max()) > 0.05
