@@ -94,7 +94,7 @@ def guide() -> Any:
     """A host's guide with the ball for its occupancy."""
     from ball_occupancy import ball
 
-    from leco_plugin.models.hosts.guide import Guide  # samplers are tested without nerfstudio, too
+    from leco_plugin.hosts.guide import Guide  # samplers are tested without nerfstudio, too
 
     made = Guide()
     made.set_occupancy(ball())

@@ -13,7 +13,7 @@ from gpu_scale import Scale
 
 from leco_plugin.learning.calibration import CalibrationConfig
 from leco_plugin.method_configs import leco_occupancy_paper
-from leco_plugin.models.compute import grouped_trial
+from leco_plugin.models.compute import grouped as grouped_trial
 from leco_plugin.models.objective import GateLossConfig
 
 CPU = torch.device("cpu")

@@ -16,13 +16,13 @@ import torch
 from nerfstudio.engine.trainer import Trainer
 from nerfstudio.scripts import train as ns_train
 
-from leco_plugin.compat.atomic_trainer import AtomicTrainer
 from leco_plugin.learning import collapse
 from leco_plugin.learning.collapse import Collapse
 from leco_plugin.learning.freezing import FILE_NAME
 from leco_plugin.models.leco import LecoModel
 from leco_plugin.occupancy import Occupancy
 from leco_plugin.samplers import estimator
+from leco_plugin.studio.trainer import AtomicTrainer
 
 FREEZES_AT = 11
 """The step at which the runs of the tests freeze their gate."""

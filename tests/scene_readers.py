@@ -8,8 +8,8 @@ from nerfstudio.data.datamanagers.base_datamanager import VanillaDataManagerConf
 from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataParserConfig
 from torch import nn
 
-from leco_plugin.models.hosts.guide import Guide
-from leco_plugin.models.hosts.guided_start import GuidedStart, OccupancyConfig
+from leco_plugin.hosts.guide import Guide
+from leco_plugin.hosts.guided_start import GuidedStart, OccupancyConfig
 from leco_plugin.occupancy import Occupancy
 
 

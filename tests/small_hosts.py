@@ -15,8 +15,8 @@ from nerfstudio.data.scene_box import SceneBox
 from nerfstudio.engine.trainer import TrainerConfig
 from nerfstudio.pipelines.base_pipeline import VanillaPipeline
 
-from leco_plugin.models.guided import GuidedModelConfig
-from leco_plugin.models.hosts.guided_start import OccupancyConfig
+from leco_plugin.hosts.guided import GuidedModelConfig
+from leco_plugin.hosts.guided_start import OccupancyConfig
 
 QUICK = ["--steps-per-eval-image=0", "--vis=tensorboard", "--logging.local-writer.enable=False"]
 RAYS = [

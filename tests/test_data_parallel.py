@@ -17,9 +17,6 @@ import torch
 from nerfstudio.scripts import train as ns_train
 from torch import Tensor
 
-from leco_plugin.compat.checkpoints import allow_checkpoint_globals
-from leco_plugin.compat.data_parallel import DataParallelTrainerConfig
-from leco_plugin.compat.whole_checkpoints import newest_whole, step_of
 from leco_plugin.host_configs import leco_ngp
 from leco_plugin.method_configs import leco_occupancy
 from leco_plugin.models.encodings import EncodingConfig
@@ -31,6 +28,8 @@ from leco_plugin.models.sizing.sizes import Sizes
 from leco_plugin.occupancy import Occupancy
 from leco_plugin.samplers import estimator
 from leco_plugin.space import Space
+from leco_plugin.studio.checkpoints import allow_checkpoint_globals, newest_whole, step_of
+from leco_plugin.studio.processes import DataParallelTrainerConfig
 
 pytestmark = [
     pytest.mark.slow,

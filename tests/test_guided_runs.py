@@ -23,10 +23,10 @@ from forked_commands import ForkedCommands
 from PIL import Image
 from small_hosts import NERFACTO, NGP, QUICK, SMALL, SWITCH_NERF, sizes
 
-from leco_plugin.compat.atomic_trainer import AtomicTrainer
-from leco_plugin.compat.checkpoints import allow_checkpoint_globals
-from leco_plugin.models.guided import GuidedModelConfig
+from leco_plugin.hosts.guided import GuidedModelConfig
 from leco_plugin.occupancy import Occupancy
+from leco_plugin.studio.checkpoints import allow_checkpoint_globals
+from leco_plugin.studio.trainer import AtomicTrainer
 
 pytestmark = [pytest.mark.slow, pytest.mark.xdist_group("guided_runs")]
 

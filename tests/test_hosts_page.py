@@ -18,10 +18,10 @@ from nerfstudio.model_components.ray_samplers import UniformSampler
 from nerfstudio.plugins.types import MethodSpecification
 from torch import nn
 
+from leco_plugin.hosts import seams
+from leco_plugin.hosts.guide import Guide
+from leco_plugin.hosts.guided import GuidedModelConfig
 from leco_plugin.method_configs import best_device
-from leco_plugin.models.guided import GuidedModelConfig
-from leco_plugin.models.hosts import seams
-from leco_plugin.models.hosts.guide import Guide
 
 PAGE = (Path(__file__).resolve().parent.parent / "docs" / "hosts.md").read_text()
 BLOCKS = dict(re.findall(r"```python\n# my_package/(\w+)\.py\n(.*?)```", PAGE, re.DOTALL))

@@ -17,8 +17,8 @@ import pytest
 import torch
 from mortal_training import FREEZES_AT, HEALED_FREEZES_AT, run
 
-from leco_plugin.compat.checkpoints import allow_checkpoint_globals
 from leco_plugin.occupancy import Occupancy
+from leco_plugin.studio.checkpoints import allow_checkpoint_globals
 
 pytestmark = [pytest.mark.slow, pytest.mark.xdist_group("killed_runs")]
 

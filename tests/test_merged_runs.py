@@ -11,12 +11,12 @@ import torch
 from nerfstudio.engine.callbacks import TrainingCallbackLocation as Where
 from tiny_run import tiny_config
 
-from leco_plugin.compat.atomic_trainer import AtomicTrainer
-from leco_plugin.compat.optimizers import forget_the_gone
 from leco_plugin.learning import history
 from leco_plugin.learning.freezing import FIELD_FILE, field_at_freezing
 from leco_plugin.learning.merging import MergingConfig
 from leco_plugin.models import mixture
+from leco_plugin.studio.run import forget_the_gone
+from leco_plugin.studio.trainer import AtomicTrainer
 
 pytestmark = [  # nerfstudio leaves an image open
     pytest.mark.filterwarnings("ignore:unclosed file:ResourceWarning"),

@@ -1,4 +1,4 @@
-"""What was recorded before the house was rebuilt still holds; `benchmarks/record.py` does the rest."""
+"""What was recorded before the house was rebuilt still holds."""
 
 from __future__ import annotations
 

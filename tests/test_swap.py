@@ -18,9 +18,9 @@ from nerfstudio.data.dataparsers.nerfstudio_dataparser import (
 )
 from PIL import Image
 
-from leco_plugin.compat.dynamic_batch import ClampedDynamicBatchPipelineConfig
-from leco_plugin.models.guided import GuidedModelConfig
+from leco_plugin.hosts.guided import GuidedModelConfig
 from leco_plugin.scenes.input_error import InputError
+from leco_plugin.studio.dynamic_batch import ClampedDynamicBatchPipelineConfig
 from leco_plugin.swap import learned_first, registered, swapped_config
 
 

@@ -28,9 +28,11 @@ from leco_plugin.scenes.input_error import InputError
 from leco_plugin.studio.host_models import lazy_lpips
 from leco_plugin.studio.run import run_of
 
+_Model = Model if TYPE_CHECKING else object
 
-class Host(Model):
-    """Any nerfstudio model, whose images can be drawn and scored without a network."""
+
+class Host(_Model):
+    """Stands before any nerfstudio model among the bases of a class, whose images can be drawn and scored without a network."""
 
     def get_outputs_for_camera_ray_bundle(self, *args: Any, **kwargs: Any) -> dict[str, Tensor]:
         """Images whose counts are floating-point numbers.
@@ -58,7 +60,7 @@ def _as_drawable(image: Tensor) -> Tensor:
 
 
 class GuidedHost(Host):
-    """A host whose sampling is guided.
+    """Stands before a model whose sampling is guided.
 
     Attributes:
         leco_guide: by no name that a host may have given something of its own.

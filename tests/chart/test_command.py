@@ -19,7 +19,7 @@ from leco_plugin.chart.contenders.suites import AT_ONCE, SUITES
 from leco_plugin.chart.runs.folder import UNFINISHED, Job
 from leco_plugin.chart.runs.processes import ProcessRunner, RunFailed
 from leco_plugin.chart.runs.run import Chart
-from leco_plugin.compat.run_folder import alone_in
+from leco_plugin.studio.run_folder import alone_in
 
 METHODS = ["--methods", "leco-occupancy", "leco-occupancy-never-frozen"]
 TIME = ["--seconds", 3]

@@ -12,8 +12,8 @@ from leco_plugin.chart.contenders.configs import config_of
 from leco_plugin.chart.contenders.contender import Contender
 from leco_plugin.chart.contenders.methods import contenders
 from leco_plugin.host_configs import leco_ngp
+from leco_plugin.hosts.guided import GuidedModelConfig
 from leco_plugin.method_configs import best_device
-from leco_plugin.models.guided import GuidedModelConfig
 from leco_plugin.scenes.photographs import LecoPhotographsDataParserConfig
 
 DATA, FOLDER = Path("scene"), Path("runs")

@@ -12,17 +12,9 @@ from hypothesis import strategies as st
 from matplotlib.figure import Figure
 from PIL import Image
 
-from leco_plugin.chart.drawing.picture import (
-    CLOSE,
-    _name_ends,
-    balanced,
-    best_so_far,
-    draw,
-    name_of_end,
-    spread,
-)
+from leco_plugin.chart.drawing.picture import CLOSE, _name_ends, balanced, draw, name_of_end, spread
 from leco_plugin.chart.drawing.theme import DARK, LIGHT, Theme
-from leco_plugin.chart.findings.summary import lines_of
+from leco_plugin.chart.findings.summary import best_so_far, lines_of
 from leco_plugin.evaluation.charts import SOURCE, fingerprint
 
 RUNS = [

@@ -24,11 +24,11 @@ from nerfstudio.pipelines.base_pipeline import VanillaPipelineConfig
 from nerfstudio.plugins.types import MethodSpecification
 from torch import Tensor, nn
 
-from leco_plugin.models.guided import GuidedModelConfig
-from leco_plugin.models.hosts.guide import Guide
-from leco_plugin.models.hosts.guided_start import OccupancyConfig
-from leco_plugin.models.hosts.seams import HostAdapter
-from leco_plugin.models.hosts.stand_ins import GuidedEstimator
+from leco_plugin.hosts.guide import Guide
+from leco_plugin.hosts.guided import GuidedModelConfig
+from leco_plugin.hosts.guided_start import OccupancyConfig
+from leco_plugin.hosts.seams import HostAdapter
+from leco_plugin.hosts.stand_ins import GuidedEstimator
 from leco_plugin.samplers import nerfacc_cpu
 from leco_plugin.samplers.marching import Samples
 from leco_plugin.samplers.registry import SamplerSpec

@@ -8,7 +8,7 @@ from conformance import host_mutants
 from conformance.estimator_mutants import MUTANTS, Sound
 from conformance.proposal_mutants import PROPOSAL_MUTANTS, SoundProposal
 
-from leco_plugin.models.hosts import seams
+from leco_plugin.hosts import seams
 from leco_plugin.samplers import registry
 
 CLASSES = [

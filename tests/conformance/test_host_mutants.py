@@ -12,7 +12,7 @@ from nerfstudio.plugins.registry import discover_methods
 
 from leco_plugin.conformance.cases import HOST_RULES, host_cases, pairs
 from leco_plugin.conformance.rules import apply
-from leco_plugin.models.hosts import seams
+from leco_plugin.hosts import seams
 from leco_plugin.samplers import registry
 
 PARALLEL = "two-processes-step-alike"

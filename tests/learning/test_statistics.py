@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 import torch
 
-from leco_plugin.learning.statistics import gate_statistics, kept_fraction, prices
+from leco_plugin.models.figures import gate_statistics, kept_fraction, prices
 from leco_plugin.models.rendering import Intervals, Rays, Shaded, with_backdrop
 from leco_plugin.samplers import marching
 from leco_plugin.samplers.marching import March, march

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 import torch
 
-from leco_plugin.models.color_head import APPEARANCE_SCALE, ColorHead
+from leco_plugin.models.field import APPEARANCE_SCALE, ColorHead
 
 
 def inputs(samples: int = 20, rays: int = 5) -> tuple[torch.Tensor, ...]:

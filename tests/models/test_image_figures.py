@@ -6,7 +6,7 @@ import math
 
 import torch
 
-from leco_plugin.models.image_figures import image_figures
+from leco_plugin.models.figures import image_figures
 
 
 def test_figures_are_floats_and_pictures_have_the_size_of_the_image() -> None:

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 from ball_occupancy import ball
 
-from leco_plugin.models.hosts.guided_start import load_occupancy, occupancy_file
+from leco_plugin.hosts.guided_start import load_occupancy, occupancy_file
 from leco_plugin.scenes.input_error import InputError
 
 NAME = "occupancy.safetensors"

@@ -6,7 +6,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from leco_plugin.models.ray_pictures import (
+from leco_plugin.models.figures import (
     NONE,
     before_the_backdrop,
     gate_pictures,

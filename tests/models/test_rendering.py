@@ -8,9 +8,9 @@ from torch import Tensor
 
 from leco_plugin.models.encodings import EncodingConfig
 from leco_plugin.models.field import FieldConfig, HMoEField
+from leco_plugin.models.figures import before_the_backdrop, gate_pictures
 from leco_plugin.models.gate import Gate, GateConfig
 from leco_plugin.models.hmoe import HMoEConfig
-from leco_plugin.models.ray_pictures import before_the_backdrop, gate_pictures
 from leco_plugin.models.rendering import (
     Intervals,
     Rays,

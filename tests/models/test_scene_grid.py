@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import torch
 
-from leco_plugin.models.scene_grid import scene_grid
+from leco_plugin.models.switch_nerf import scene_grid
 from leco_plugin.space import Space
 
 

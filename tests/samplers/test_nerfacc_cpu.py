@@ -10,8 +10,8 @@ import pytest
 import torch
 from samplers.analytic_occupancy import camera_rays, slow_march, slow_weights
 
-from leco_plugin.models.hosts.guide import Guide
-from leco_plugin.models.hosts.seams import swap_sampler
+from leco_plugin.hosts.guide import Guide
+from leco_plugin.hosts.seams import swap_sampler
 from leco_plugin.samplers import nerfacc_cpu
 from leco_plugin.samplers.grid import OccupancyGridEstimator
 from leco_plugin.scenes.input_error import InputError
@@ -237,7 +237,7 @@ def test_stock_instant_ngp_trains_and_renders():
     from nerfstudio.data.scene_box import SceneBox
     from nerfstudio.models.instant_ngp import InstantNGPModelConfig
 
-    from leco_plugin.compat.host_lpips import setup_with_lazy_lpips
+    from leco_plugin.hosts.classes import Host, set_up_host
 
     torch.manual_seed(0)
     config = InstantNGPModelConfig(
@@ -252,7 +252,7 @@ def test_stock_instant_ngp_trains_and_renders():
         eval_num_rays_per_chunk=1024,
     )
     box = SceneBox(torch.tensor([[-1.0] * 3, [1.0] * 3]))
-    model = setup_with_lazy_lpips(config, scene_box=box, num_train_data=1)
+    model = set_up_host(config, Host, scene_box=box, num_train_data=1)
     optimizer = torch.optim.Adam(model.get_param_groups()["fields"], lr=1e-2)
     losses = []
     for step in range(40):

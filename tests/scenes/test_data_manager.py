@@ -10,7 +10,6 @@ from typing import Any
 
 import pytest
 import torch
-from leco_plugin.learning.held_out_rendering import held_out_bundle
 from nerfstudio.cameras.cameras import CameraType
 from nerfstudio.data.datamanagers.base_datamanager import VanillaDataManagerConfig
 from nerfstudio.data.datamanagers.full_images_datamanager import FullImageDatamanagerConfig
@@ -24,7 +23,6 @@ from PIL import Image
 from leco_plugin.hosts.learn_first import learn_occupancy
 from leco_plugin.learning.calibration import CalibrationConfig
 from leco_plugin.learning.schedule import ScheduleConfig
-from leco_plugin.models.hosts.learn_first import learn_occupancy
 from leco_plugin.models.leco_config import LecoModelConfig
 from leco_plugin.scenes import data_manager
 from leco_plugin.scenes.data_manager import (

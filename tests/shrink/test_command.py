@@ -11,15 +11,15 @@ from pathlib import Path
 import pytest
 import torch
 from ball_occupancy import THEIR_MARCH, ball_of_the_tiny_scene
-from leco_plugin.learning.field_at_freezing import leave_field
 from PIL import Image
 from tiny_scene import camera_to_world
 
 from leco_plugin import cli
 from leco_plugin.evaluation.inspection import describe
 from leco_plugin.evaluation.machine import describe_code
-from leco_plugin.learning.statistics import prices
+from leco_plugin.learning.freezing import leave_field
 from leco_plugin.models.encodings import EncodingConfig
+from leco_plugin.models.figures import prices
 from leco_plugin.models.gate import Gate, GateConfig
 from leco_plugin.occupancy import Occupancy
 from leco_plugin.shrink import command, references, rungs, search, sources

@@ -9,8 +9,8 @@ import pytest
 from stability_runs import Runs
 
 from leco_plugin import cli
-from leco_plugin.compat.run_folder import alone_in
 from leco_plugin.stability import command, suite
+from leco_plugin.studio.run_folder import alone_in
 
 
 @pytest.fixture

@@ -12,8 +12,8 @@ from nerfstudio.model_components.ray_samplers import UniformSampler
 from nerfstudio.models.base_model import Model, ModelConfig
 from torch import nn
 
-from leco_plugin.models.hosts.guide import Guide
-from leco_plugin.models.hosts.seams import HostAdapter
+from leco_plugin.hosts.guide import Guide
+from leco_plugin.hosts.seams import HostAdapter
 from nerf_elsewhere.matter import Matter
 from nerf_elsewhere.photographic import PhotographicModel
 

@@ -7,8 +7,8 @@ import logging
 import pytest
 import torch
 
-from leco_plugin.models.compute import grouped_trial
-from leco_plugin.models.compute.grouped_trial import is_right, race, serves
+from leco_plugin.models.compute import grouped as grouped_trial
+from leco_plugin.models.compute.grouped import is_right, race, serves
 
 pytestmark = pytest.mark.skipif(
     not hasattr(torch.nn.functional, "grouped_mm"), reason="this torch has no grouped_mm"

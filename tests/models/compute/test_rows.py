@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import torch
 
-from leco_plugin.models.compute.rows import permute_rows, select_rows
+from leco_plugin.models.compute.dispatch import permute_rows, select_rows
 
 
 def test_permuting_is_indexing() -> None:

@@ -7,8 +7,8 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from leco_plugin.models.compute.precision import fast_precision
-from leco_plugin.models.compute.steady import SIZES_PER_OCTAVE, steadied, steady_size
+from leco_plugin.models.compute.device import fast_precision
+from leco_plugin.models.compute.dispatch import SIZES_PER_OCTAVE, steadied, steady_size
 from leco_plugin.models.field import FieldConfig, HMoEField
 from leco_plugin.models.gate import Gate, GateConfig
 

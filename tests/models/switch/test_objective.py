@@ -7,7 +7,7 @@ import math
 import torch
 
 from leco_plugin.models.rendering import Shaded
-from leco_plugin.models.switch.objective import switch_losses, switch_statistics
+from leco_plugin.models.switch.rendering import switch_losses, switch_statistics
 
 
 def shaded(routes: list[int], experts: int = 4) -> Shaded:

@@ -6,7 +6,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from leco_plugin.models.color_head import ColorHead
+from leco_plugin.models.field import ColorHead
 from leco_plugin.models.rendering import Rays, backdrop_of, with_backdrop
 from leco_plugin.models.switch.field import Answers
 from leco_plugin.models.switch.rendering import coarse_and_fine, kept_by, render

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 import torch
 
-from leco_plugin.models.switch.sampling import draw, edges_around, spread, strata
+from leco_plugin.models.switch.rendering import draw, edges_around, spread, strata
 
 CPU = torch.device("cpu")
 

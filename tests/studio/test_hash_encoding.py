@@ -1,4 +1,4 @@
-"""Claims about `leco_plugin.compat.hash_encoding`."""
+"""Claims about `leco_plugin.studio.hash_encoding`."""
 
 from __future__ import annotations
 
@@ -16,11 +16,11 @@ from nerfstudio.models.nerfacto import NerfactoModelConfig
 from small_hosts import what_a_model_gets
 from torch import Tensor, nn
 
-from leco_plugin.compat import hash_encoding
-from leco_plugin.compat.hash_encoding import CpuHashEncoding, speed_up_hash_encodings
-from leco_plugin.compat.host_lpips import setup_with_lazy_lpips
-from leco_plugin.models.guided import GuidedModelConfig
-from leco_plugin.models.hosts.guided_start import OWN_SAMPLER, OccupancyConfig
+from leco_plugin.hosts.classes import Host, set_up_host
+from leco_plugin.hosts.guided import GuidedModelConfig
+from leco_plugin.hosts.guided_start import OWN_SAMPLER, OccupancyConfig
+from leco_plugin.studio import hash_encoding
+from leco_plugin.studio.hash_encoding import CpuHashEncoding, speed_up_hash_encodings
 
 Sizes = dict[str, int]
 SIZES: list[Sizes] = [
@@ -156,7 +156,7 @@ def test_every_encoding_of_a_host_is_sped_up_and_keeps_its_names(
     model = config.setup(**what_a_model_gets())
     found = [module for module in model.modules() if isinstance(module, HashEncoding)]
     assert [type(module) for module in found] == encodings * [CpuHashEncoding]
-    plain = setup_with_lazy_lpips(host, **what_a_model_gets())
+    plain = set_up_host(host, Host, **what_a_model_gets())
     if sampler == OWN_SAMPLER:
         assert plain.state_dict().keys() == model.state_dict().keys()
 

@@ -9,8 +9,8 @@ from typing import Any
 import pytest
 from torch.multiprocessing import ProcessExitedException, ProcessRaisedException
 
-from leco_plugin.compat.data_parallel import _with_one_line
 from leco_plugin.models.failures import TrainingStopped
+from leco_plugin.studio.processes import _with_one_line
 
 
 def config_of(checkpoints: Path) -> Any:

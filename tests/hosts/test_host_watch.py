@@ -12,14 +12,14 @@ import torch
 from ball_occupancy import ball
 from nerfstudio.model_components.renderers import RGBRenderer
 
+from leco_plugin.hosts import first_steps, host_watch
+from leco_plugin.hosts.classes import GuidedHost
+from leco_plugin.hosts.first_steps import CAREFUL, begin_carefully
+from leco_plugin.hosts.guide import Guide
+from leco_plugin.hosts.host_watch import LOWERED_TO, HostWatch
+from leco_plugin.hosts.stand_ins import GuidedEstimator
 from leco_plugin.learning import price_watch
 from leco_plugin.learning.calibration import THRESHOLDS, CalibrationConfig
-from leco_plugin.models.guided import _refuse_what_is_not_finite
-from leco_plugin.models.hosts import host_watch, probation
-from leco_plugin.models.hosts.guide import Guide
-from leco_plugin.models.hosts.host_watch import LOWERED_TO, HostWatch
-from leco_plugin.models.hosts.probation import CAREFUL, begin_carefully
-from leco_plugin.models.hosts.stand_ins import GuidedEstimator
 from leco_plugin.occupancy import CALIBRATED_AT, Occupancy
 
 BOX = torch.tensor([-4.0, -4.0, -4.0, 4.0, 4.0, 4.0])
@@ -132,7 +132,7 @@ def a_half(occupancy: Occupancy) -> float:
 def test_all_processes_begin_with_what_the_first_one_has_found(
     watched: Watched, packed: torch.nn.Module, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(probation, "from_first", lambda make, device: 0.123)
+    monkeypatch.setattr(first_steps, "from_first", lambda make, device: 0.123)
     assert begin_carefully(packed, watched.guide, a_half)
     assert watched.guide.followed().threshold == pytest.approx(0.123)
 
@@ -266,10 +266,14 @@ def test_what_was_found_travels_with_a_checkpoint(watched: Watched) -> None:
 
 @pytest.mark.parametrize("where", ["image", "loss", "weight"])
 def test_a_host_takes_no_step_with_a_loss_that_is_not_finite(where: str) -> None:
-    host: Any = torch.nn.Linear(2, 2)
     loss = torch.ones(())
-    host.get_loss_dict = lambda outputs, batch, metrics=None: {"rgb_loss": loss}
-    _refuse_what_is_not_finite(host)
+
+    class Line(torch.nn.Linear):
+        def get_loss_dict(self, outputs: Any, batch: Any) -> dict[str, torch.Tensor]:
+            return {"rgb_loss": loss}
+
+    host: Any = type("Line", (GuidedHost, Line), {})(2, 2)
+    host.leco_guide = Guide()
     batch = {"image": torch.zeros(3)}
     assert host.get_loss_dict({}, batch) == {"rgb_loss": loss}
     loss.fill_(torch.nan)

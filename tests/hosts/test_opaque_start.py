@@ -14,12 +14,11 @@ from nerfstudio.engine.callbacks import TrainingCallbackAttributes, TrainingCall
 from small_hosts import pipeline_of, small
 from torch import nn
 
-from leco_plugin.models.hosts import opaque_start
-from leco_plugin.models.hosts.guide import Guide
-from leco_plugin.models.hosts.opaque_start import begin_opaque
-from leco_plugin.models.hosts.stand_ins import GuidedEstimator
-from leco_plugin.models.switch.config import SwitchNerfModelConfig
-from leco_plugin.models.switch.sizes import SMALL
+from leco_plugin.hosts import first_steps as opaque_start
+from leco_plugin.hosts.first_steps import begin_opaque
+from leco_plugin.hosts.guide import Guide
+from leco_plugin.hosts.stand_ins import GuidedEstimator
+from leco_plugin.models.switch.config import SMALL, SwitchNerfModelConfig
 from leco_plugin.scenes.bounds import SceneBounds
 from leco_plugin.swap import with_sampler_swapped
 

@@ -9,7 +9,8 @@ import torch
 from nerfstudio.engine.optimizers import AdamOptimizerConfig
 from torch import nn
 
-from leco_plugin.compat.optimizers import OptimizersOfThePresent, forget_the_gone
+from leco_plugin.studio.run import forget_the_gone
+from leco_plugin.studio.trainer import OptimizersOfThePresent
 
 CONFIG = {
     name: {"optimizer": AdamOptimizerConfig(lr=0.1, max_norm=1.0), "scheduler": None}

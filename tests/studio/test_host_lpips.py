@@ -1,4 +1,4 @@
-"""Claims about `leco_plugin.compat.host_lpips`."""
+"""Claims about `leco_plugin.studio.host_models`."""
 
 from __future__ import annotations
 
@@ -15,8 +15,9 @@ from nerfstudio.models.vanilla_nerf import NeRFModel, VanillaModelConfig
 from small_hosts import what_a_model_gets
 from torchmetrics.image.lpip import LearnedPerceptualImagePatchSimilarity
 
-from leco_plugin.compat.host_lpips import LazyLpipsNetwork, lazy_lpips, setup_with_lazy_lpips
 from leco_plugin.evaluation import metrics
+from leco_plugin.hosts.classes import Host, set_up_host
+from leco_plugin.studio.host_models import LazyLpipsNetwork, lazy_lpips
 
 
 @pytest.fixture(autouse=True)
@@ -43,12 +44,12 @@ def vanilla_nerf() -> ModelConfig:
 def test_a_built_in_method_needs_a_network_by_itself_and_none_here(host) -> None:
     with pytest.raises(ConnectionError):
         host().setup(**what_a_model_gets())
-    model = setup_with_lazy_lpips(host(), **what_a_model_gets())
+    model = set_up_host(host(), Host, **what_a_model_gets())
     assert not any("lpips" in name for name in model.state_dict())
 
 
 def test_a_host_without_lpips_weights_gives_metrics_that_are_json() -> None:
-    model = setup_with_lazy_lpips(nerfacto(), **what_a_model_gets())
+    model = set_up_host(nerfacto(), Host, **what_a_model_gets())
     side = 40
     outputs = {"rgb": torch.rand(side, side, 3), "accumulation": torch.rand(side, side, 1)}
     depths = ["depth", *(f"prop_depth_{level}" for level in range(2))]

@@ -7,7 +7,7 @@ import threading
 
 import pytest
 
-from leco_plugin.compat.interrupts import HEARD, heard_between_steps
+from leco_plugin.studio.trainer import HEARD, heard_between_steps
 
 
 def test_the_first_ctrl_c_is_noted_and_the_second_one_interrupts(

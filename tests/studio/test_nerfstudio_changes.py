@@ -1,4 +1,4 @@
-"""Claims about `leco_plugin.compat.nerfstudio_changes`, by stubs of what has changed."""
+"""Claims about `leco_plugin.studio.run`, by stubs of what has changed."""
 
 from __future__ import annotations
 
@@ -10,16 +10,17 @@ from typing import Any
 import pytest
 from nerfstudio.engine.trainer import Trainer, TrainerConfig
 
-from leco_plugin.compat import atomic_trainer, nerfstudio_changes
-from leco_plugin.compat.atomic_trainer import AtomicTrainer
-from leco_plugin.compat.nerfstudio_changes import (
+from leco_plugin.models.failures import TrainingStopped
+from leco_plugin.scenes.input_error import InputError
+from leco_plugin.studio import run as nerfstudio_changes
+from leco_plugin.studio import trainer as atomic_trainer
+from leco_plugin.studio.run import (
     counts_from_zero,
     end_of,
     iterations_until,
     keeps_all_images,
 )
-from leco_plugin.models.failures import TrainingStopped
-from leco_plugin.scenes.input_error import InputError
+from leco_plugin.studio.trainer import AtomicTrainer
 
 
 class Released(Trainer):

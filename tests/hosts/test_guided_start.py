@@ -19,16 +19,16 @@ from scene_readers import Data, Pipe, started
 from torch import Tensor, nn
 
 from leco_plugin.host_configs import leco_ngp
-from leco_plugin.models.encodings import EncodingConfig
-from leco_plugin.models.gate import Gate, GateConfig
-from leco_plugin.models.hosts import guided_start
-from leco_plugin.models.hosts.guide import Guide
-from leco_plugin.models.hosts.guided_start import (
+from leco_plugin.hosts import guided_start
+from leco_plugin.hosts.guide import Guide
+from leco_plugin.hosts.guided_start import (
     GuidedStart,
     OccupancyConfig,
     along_rays,
 )
-from leco_plugin.models.hosts.stand_ins import GuidedEstimator
+from leco_plugin.hosts.stand_ins import GuidedEstimator
+from leco_plugin.models.encodings import EncodingConfig
+from leco_plugin.models.gate import Gate, GateConfig
 from leco_plugin.occupancy import Occupancy
 from leco_plugin.scenes.frames import box_around, frame_of
 from leco_plugin.scenes.input_error import InputError
@@ -144,7 +144,7 @@ def test_a_sampler_with_a_box_gets_the_hosts_in_the_coordinates_that_it_is_asked
         seen.update(options)
         return torch.nn.Identity()
 
-    monkeypatch.setattr("leco_plugin.models.hosts.stand_ins.build_estimator", build)
+    monkeypatch.setattr("leco_plugin.hosts.stand_ins.build_estimator", build)
     guide = started(lopsided(readers["as it is"]), readers["turned by pca"])
     box = torch.tensor([-1.0, -1.0, -1.0, 1.0, 1.0, 1.0])
     _ = guide.estimator(box).sampler
@@ -267,8 +267,8 @@ def test_before_learning_a_run_says_that_it_starts_over_where_it_is_stopped(
         said.append("learned")
         return ball_of_the_tiny_scene()
 
-    monkeypatch.setattr("leco_plugin.models.hosts.guided_start.say", said.append)
-    monkeypatch.setattr("leco_plugin.models.hosts.learn_first.learn_occupancy", learn)
+    monkeypatch.setattr("leco_plugin.hosts.guided_start.say", said.append)
+    monkeypatch.setattr("leco_plugin.hosts.learn_first.learn_occupancy", learn)
     guide = Guide()
     GuidedStart(nn.Module(), guide, OccupancyConfig(), Pipe(readers["as it is"])).before_step(0)
     assert "in no checkpoint until then" in said[0] and said[1] == "learned"

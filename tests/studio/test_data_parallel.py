@@ -19,9 +19,9 @@ from nerfstudio.scripts import train as ns_train
 from torch import nn
 
 from leco_plugin import host_configs, method_configs
-from leco_plugin.compat.atomic_trainer import AtomicTrainer
-from leco_plugin.compat.data_parallel import DataParallelTrainerConfig, WithoutDevices, process
 from leco_plugin.scenes.input_error import InputError
+from leco_plugin.studio.processes import DataParallelTrainerConfig, WithoutDevices, process
+from leco_plugin.studio.trainer import AtomicTrainer
 from leco_plugin.swap import registered, swapped_config, with_sampler_swapped
 
 

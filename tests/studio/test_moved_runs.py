@@ -11,9 +11,9 @@ import pytest
 from nerfstudio.utils import eval_utils, writer
 from tiny_run import tiny_trainer
 
-from leco_plugin.compat.moved_runs import config_in_use, found_around
 from leco_plugin.method_configs import leco_occupancy
 from leco_plugin.scenes.input_error import InputError
+from leco_plugin.studio.checkpoints import config_in_use, found_around
 
 pytestmark = [  # nerfstudio leaves an image open
     pytest.mark.filterwarnings("ignore:unclosed file:ResourceWarning"),

@@ -6,16 +6,15 @@ from typing import Any
 
 import pytest
 import torch
-import yaml
 from nerfstudio.field_components.embedding import Embedding
 from nerfstudio.models.instant_ngp import InstantNGPModelConfig, NGPModel
 from nerfstudio.models.nerfacto import NerfactoModelConfig
 from small_hosts import what_a_model_gets
 from torch import nn
 
-from leco_plugin.models.guided import GuidedModelConfig
-from leco_plugin.models.hosts.appearance_codes import SmallCodes
-from leco_plugin.models.hosts.guided_start import OccupancyConfig
+from leco_plugin.hosts.appearance_codes import SmallCodes
+from leco_plugin.hosts.guided import GuidedModelConfig
+from leco_plugin.hosts.guided_start import OccupancyConfig
 from leco_plugin.swap import registered, swapped_config
 
 NGP = {"log2_hashmap_size": 8, "max_res": 64, "grid_resolution": 16, "grid_levels": 2}
@@ -59,14 +58,6 @@ def test_codes_part_slowly_and_their_mean_is_scaled_alike() -> None:
 def test_a_checkpoint_has_the_names_of_nerfstudio() -> None:
     host = HOSTS["instant-ngp"]
     assert built(host).state_dict().keys() == built(host, "own").state_dict().keys()
-
-
-def test_a_config_of_before_there_was_a_choice_keeps_its_codes() -> None:
-    text = yaml.dump(GuidedModelConfig(host=HOSTS["instant-ngp"]))
-    assert "codes: small\n" in text
-    assert yaml.load(text, Loader=yaml.Loader).codes == "small"
-    before = yaml.load(text.replace("codes: small\n", ""), Loader=yaml.Loader)
-    assert before.codes == "own"
 
 
 @pytest.mark.parametrize("name", ["leco-ngp", "leco-nerfacto"])

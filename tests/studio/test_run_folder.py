@@ -10,14 +10,14 @@ from pathlib import Path
 
 import pytest
 
-from leco_plugin.compat import run_folder
-from leco_plugin.compat.run_folder import claim, release
 from leco_plugin.method_configs import leco_occupancy
+from leco_plugin.studio import run_folder
+from leco_plugin.studio.run_folder import claim, release
 
 HOLD = """
 import sys
 from pathlib import Path
-from leco_plugin.compat.run_folder import claim
+from leco_plugin.studio.run_folder import claim
 folder = Path(sys.argv[1])
 print(claim(folder, folder / "checkpoints", None), flush=True)
 sys.stdin.read()
@@ -128,7 +128,7 @@ def test_the_methods_load_where_there_are_no_such_locks(folder: Path) -> None:
     script = (
         "import sys; sys.modules['fcntl'] = None\n"
         "from pathlib import Path\n"
-        "from leco_plugin.compat.run_folder import claim\n"
+        "from leco_plugin.studio.run_folder import claim\n"
         "folder = Path(sys.argv[1])\n"
         "print(claim(folder, folder / 'checkpoints', None))\n"
         "(folder / 'checkpoints').mkdir()\n"

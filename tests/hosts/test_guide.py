@@ -8,7 +8,7 @@ from ball_occupancy import BOX, MARCH, ball, rays
 from nerfstudio.cameras.cameras import Cameras
 from nerfstudio.viewer_legacy.server.viewer_utils import IOChangeException
 
-from leco_plugin.models.hosts.guide import Guide
+from leco_plugin.hosts.guide import Guide
 from leco_plugin.samplers import registry
 from leco_plugin.samplers.registry import SamplerSpec
 from leco_plugin.scenes.input_error import InputError

@@ -12,10 +12,9 @@ import torch
 from nerfstudio.utils import eval_utils
 from tiny_run import tiny_trainer
 
-from leco_plugin.compat.evaluated_runs import evaluate_whole_checkpoints, from_whole
-from leco_plugin.compat.whole_checkpoints import previous_of
 from leco_plugin.method_configs import leco_occupancy
 from leco_plugin.scenes.input_error import InputError
+from leco_plugin.studio.checkpoints import evaluate_whole_checkpoints, from_whole, previous_of
 
 pytestmark = [  # nerfstudio leaves an image open
     pytest.mark.filterwarnings("ignore:unclosed file:ResourceWarning"),

@@ -1,4 +1,4 @@
-"""Claims about `leco_plugin.compat.dynamic_batch`, on the host that uses it."""
+"""Claims about `leco_plugin.studio.dynamic_batch`, on the host that uses it."""
 
 from __future__ import annotations
 
@@ -15,18 +15,18 @@ from nerfstudio.pipelines.base_pipeline import VanillaPipelineConfig
 from nerfstudio.pipelines.dynamic_batch import DynamicBatchPipeline, DynamicBatchPipelineConfig
 from nerfstudio.utils import writer
 
-from leco_plugin.compat.dynamic_batch import (
+from leco_plugin.host_configs import leco_ngp
+from leco_plugin.models.encodings import EncodingConfig
+from leco_plugin.models.gate import Gate, GateConfig
+from leco_plugin.occupancy import Occupancy
+from leco_plugin.space import Space, SpaceKind
+from leco_plugin.studio.dynamic_batch import (
     MOST_GROWTH,
     MOST_RAYS,
     ClampedDynamicBatchPipeline,
     ClampedDynamicBatchPipelineConfig,
     clamped,
 )
-from leco_plugin.host_configs import leco_ngp
-from leco_plugin.models.encodings import EncodingConfig
-from leco_plugin.models.gate import Gate, GateConfig
-from leco_plugin.occupancy import Occupancy
-from leco_plugin.space import Space, SpaceKind
 
 pytestmark = [  # nerfstudio leaves an image open
     pytest.mark.filterwarnings("ignore:unclosed file:ResourceWarning"),

@@ -1,4 +1,4 @@
-"""Claims about `leco_plugin.compat.checkpoints`."""
+"""Claims about `leco_plugin.studio.checkpoints`."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ import torch
 from nerfstudio.engine.optimizers import AdamOptimizerConfig, Optimizers
 from nerfstudio.engine.schedulers import ExponentialDecaySchedulerConfig
 
-from leco_plugin.compat.checkpoints import allow_checkpoint_globals
+from leco_plugin.studio.checkpoints import allow_checkpoint_globals
 
 pytestmark = pytest.mark.skipif(
     torch.__version__ < "2.6", reason="this torch loads nerfstudio's checkpoints as they are"

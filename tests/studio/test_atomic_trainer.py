@@ -1,4 +1,4 @@
-"""Claims about `leco_plugin.compat.atomic_trainer`."""
+"""Claims about `leco_plugin.studio.trainer`."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ import pytest
 import torch
 from nerfstudio.engine.trainer import Trainer
 
-from leco_plugin.compat import atomic_trainer
-from leco_plugin.compat.atomic_trainer import AtomicTrainer, _say_which_kernels_are_off
-from leco_plugin.compat.whole_checkpoints import damage_of
 from leco_plugin.models.failures import TrainingStopped
 from leco_plugin.samplers.kernels import VARIABLE
 from leco_plugin.scenes.input_error import InputError
+from leco_plugin.studio import trainer as atomic_trainer
+from leco_plugin.studio.checkpoints import damage_of
+from leco_plugin.studio.trainer import AtomicTrainer, _say_which_kernels_are_off
 
 
 @pytest.fixture

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import copy
+
 import nerfacc
 import pytest
 import torch
@@ -13,9 +15,11 @@ from nerfstudio.model_components.ray_samplers import (
 )
 from torch import nn
 
-from leco_plugin.models.hosts.guide import Guide
-from leco_plugin.models.hosts.seams import no_density, swap_sampler
-from leco_plugin.models.hosts.stand_ins import GuidedEstimator, GuidedProposal
+from leco_plugin.hosts.classes import GuidedHost
+from leco_plugin.hosts.guide import Guide
+from leco_plugin.hosts.guided_start import OccupancyConfig
+from leco_plugin.hosts.seams import no_density, swap_sampler
+from leco_plugin.hosts.stand_ins import GuidedEstimator, GuidedProposal
 
 
 class Host(nn.Module):
@@ -127,11 +131,27 @@ def test_an_estimator_without_boxes_needs_an_adapter(guide: Guide):
         swap_sampler(host, guide)
 
 
+class GuidedProposals(GuidedHost, Proposal):
+    """A proposal host as it is guided."""
+
+
 def test_a_loss_that_reaches_nothing_is_left_out_in_training_only(guide: Guide):
-    host = Proposal()
-    swap_sampler(host, guide)
-    assert set(host.train().get_loss_dict()) == {"rgb"}
-    assert set(host.eval().get_loss_dict()) == {"rgb", "scouting"}
+    host = GuidedProposals()
+    host.begin_guided(guide, OccupancyConfig())
+    assert set(host.train().get_loss_dict({}, {})) == {"rgb"}
+    assert set(host.eval().get_loss_dict({}, {})) == {"rgb", "scouting"}
+
+
+def test_a_copy_of_a_guided_host_is_a_host_of_its_own(guide: Guide):
+    host = GuidedProposals()
+    host.begin_guided(guide, OccupancyConfig())
+    copied = copy.deepcopy(host)
+    assert copied.leco_guide is not guide and copied.chooser._guide[0] is copied.leco_guide
+    with torch.no_grad():
+        host.field.layer.weight.fill_(torch.nan)  # what happens to one does not reach the other
+    with pytest.raises(FloatingPointError):
+        host.get_loss_dict({}, {})
+    assert bool(copied.get_loss_dict({}, {})["rgb"].isfinite())
 
 
 def test_a_grid_has_nothing_for_a_proposal_host():

@@ -13,8 +13,8 @@ from ball_occupancy import ball_of_the_tiny_scene
 from scene_readers import Data, Pipe, started
 from torch import nn
 
-from leco_plugin.models.hosts.guide import Guide
-from leco_plugin.models.hosts.guided_start import (
+from leco_plugin.hosts.guide import Guide
+from leco_plugin.hosts.guided_start import (
     GuidedStart,
     OccupancyConfig,
     refuse_another_scene,

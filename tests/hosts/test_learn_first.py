@@ -9,10 +9,10 @@ import tiny_scene
 from nerfstudio.data.datamanagers.base_datamanager import VanillaDataManagerConfig
 from nerfstudio.pipelines.base_pipeline import VanillaPipelineConfig
 
+from leco_plugin.hosts.guided_start import OccupancyConfig
+from leco_plugin.hosts.learn_first import FEWEST_STEPS, keep_within, learn_occupancy
 from leco_plugin.learning.progress import Progress
 from leco_plugin.learning.schedule import MOST_EXTENSIONS, ScheduleConfig
-from leco_plugin.models.hosts.guided_start import OccupancyConfig
-from leco_plugin.models.hosts.learn_first import FEWEST_STEPS, keep_within, learn_occupancy
 from leco_plugin.models.leco_config import LecoModelConfig
 from leco_plugin.models.sizing.sizes import SMALL
 from leco_plugin.occupancy import Occupancy
@@ -49,7 +49,7 @@ def test_it_is_frozen_and_calibrated_and_the_batch_is_as_before(pipeline):
 
 def test_a_budget_sets_the_number_of_steps(pipeline, monkeypatch: pytest.MonkeyPatch):
     clock = iter(range(10_000))
-    monkeypatch.setattr("leco_plugin.models.hosts.learn_first.time.monotonic", lambda: next(clock))
+    monkeypatch.setattr("leco_plugin.hosts.learn_first.time.monotonic", lambda: next(clock))
     # the lifecycle asks the same clock twice a step, and the training once in front of the steps
     occupancy = learn_occupancy(config(5000), pipeline, rays=32, seconds=1.0)
     assert occupancy.report["step"] == FEWEST_STEPS - 1
@@ -71,7 +71,7 @@ def test_steps_that_become_slower_do_not_outlast_the_budget(
 
     give = pipeline.datamanager.next_train
     monkeypatch.setattr(type(pipeline.datamanager), "next_train", next_train)
-    monkeypatch.setattr("leco_plugin.models.hosts.learn_first.time.monotonic", clock)
+    monkeypatch.setattr("leco_plugin.hosts.learn_first.time.monotonic", clock)
     occupancy = learn_occupancy(config(5000), pipeline, rays=32, seconds=75.0)
     assert occupancy.report["step"] == 34  # the 35th ends at 80 s
 

@@ -14,13 +14,13 @@ import torch
 import yaml
 from nerfstudio.utils.eval_utils import eval_setup
 
-from leco_plugin.compat.run_sizes import checkpoint_of
 from leco_plugin.learning.calibration import CalibrationConfig
 from leco_plugin.learning.schedule import ScheduleConfig
 from leco_plugin.method_configs import leco_occupancy
 from leco_plugin.models.sizing.sizes import left_open, with_size
 from leco_plugin.scenes.detail import CAMERAS
 from leco_plugin.scenes.input_error import InputError
+from leco_plugin.studio.run_folder import checkpoint_of
 
 # nerfstudio leaves images open that it has read
 pytestmark = [
