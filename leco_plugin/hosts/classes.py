@@ -6,7 +6,7 @@ A subclass is made for each host, and keeps its name. A copy of a host is then a
 from __future__ import annotations
 
 import functools
-from typing import Any, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import torch
 from nerfstudio.engine.callbacks import (
@@ -28,11 +28,15 @@ from leco_plugin.scenes.input_error import InputError
 from leco_plugin.studio.host_models import lazy_lpips
 from leco_plugin.studio.run import run_of
 
-_Model = Model if TYPE_CHECKING else object
+if TYPE_CHECKING:
+    _Model = Model
+else:
+    _Model = object  # what follows it among the bases is the model
 
 
 class Host(_Model):
-    """Stands before any nerfstudio model among the bases of a class, whose images can be drawn and scored without a network."""
+    """Stands before any nerfstudio model among the bases of a class. Its images can be drawn and
+    scored without a network."""
 
     def get_outputs_for_camera_ray_bundle(self, *args: Any, **kwargs: Any) -> dict[str, Tensor]:
         """Images whose counts are floating-point numbers.
