@@ -151,7 +151,7 @@ class HostCase(Case):
     """
 
     seam = "host"
-    imports = ("torch", "torchmetrics", "leco_plugin.models.guided")
+    imports = ("torch", "torchmetrics", "leco_plugin.hosts.guided")
 
     def __init__(self, name: str) -> None:
         self.name = name

@@ -13,7 +13,7 @@ from leco_plugin.evaluation.inspection import cameras_of
 from leco_plugin.hosts.first_steps import begin_carefully, begin_opaque
 from leco_plugin.hosts.guide import Guide
 from leco_plugin.learning.freezing import FILE_NAME, leave_file
-from leco_plugin.learning.run import Run
+from leco_plugin.learning.run import LearningOnly, Run
 from leco_plugin.log import say
 from leco_plugin.models.leco_config import LecoModelConfig
 from leco_plugin.models.sizing.sizes import SMALL, learning_only
@@ -116,7 +116,7 @@ class GuidedStart:
         guide: of the host; it has an occupancy already where a file or a checkpoint gave one.
         config: where else to get one.
         pipeline: nerfstudio's.
-        run: what is around the steps.
+        run: what is around the steps; None leaves no file.
     Raises:
         InputError: the file is not there or cannot be read; its occupancy keeps nothing that the
             cameras see, and this run has not begun with it; its gate is none that the sampler asks;
@@ -129,10 +129,10 @@ class GuidedStart:
         guide: Guide,
         config: OccupancyConfig,
         pipeline: Any,
-        run: Run,
+        run: Run | None = None,
     ) -> None:
         self.host, self.guide, self.config = host, guide, config
-        self.pipeline, self.run = pipeline, run
+        self.pipeline, self.run = pipeline, run or LearningOnly()
         self.begun = False
         if guide.occupancy is None and config.path is not None:
             guide.set_occupancy(load_occupancy(config.path))  # says why it could not be before

@@ -5,7 +5,6 @@ from __future__ import annotations
 import copy
 from types import SimpleNamespace
 from typing import Any
-from unittest.mock import Mock
 
 import pytest
 import torch
@@ -19,6 +18,7 @@ from leco_plugin.hosts.guided_start import (
     OccupancyConfig,
     refuse_another_scene,
 )
+from leco_plugin.learning.run import LearningOnly
 from leco_plugin.occupancy import Occupancy
 from leco_plugin.scenes.frames import frame_of
 from leco_plugin.scenes.input_error import InputError
@@ -41,7 +41,7 @@ def test_an_occupancy_of_another_scene_is_refused_unless_the_run_began_with_it(
         started(elsewhere, readers["as it is"])
     assert "\n" not in str(error.value)
     (guide := Guide()).set_occupancy(elsewhere)
-    (resumed := Mock())._start_step = 90
+    (resumed := LearningOnly()).start = 90
     GuidedStart(nn.Module(), guide, OccupancyConfig(), Pipe(readers["as it is"]), resumed)
 
 
@@ -93,7 +93,7 @@ def test_an_occupancy_of_other_cameras_is_refused_in_a_line_that_names_the_way_t
         started(other, data)
     (guide := Guide()).set_occupancy(other)
     GuidedStart(nn.Module(), guide, OccupancyConfig(other_scene=True), Pipe(data))
-    (resumed := Mock())._start_step = 90
+    (resumed := LearningOnly()).start = 90
     GuidedStart(nn.Module(), guide, OccupancyConfig(), Pipe(data), resumed)
     said = " ".join(capsys.readouterr().out.split())
     assert said.count(ANOTHER) == 2 and "of the 7 cameras that its file names 0" in said

@@ -27,6 +27,7 @@ from leco_plugin.hosts.guided_start import (
     along_rays,
 )
 from leco_plugin.hosts.stand_ins import GuidedEstimator
+from leco_plugin.learning.run import LearningOnly
 from leco_plugin.models.encodings import EncodingConfig
 from leco_plugin.models.gate import Gate, GateConfig
 from leco_plugin.occupancy import Occupancy
@@ -215,19 +216,18 @@ def test_an_unknown_sampler_is_refused_in_a_line(tiny_scene: Path) -> None:
 def test_the_first_step_leaves_the_file_in_the_runs_folder(
     readers: dict[str, Data], tmp_path: Path
 ) -> None:
-    class Trainer:
-        base_dir, local_rank = tmp_path / "run", 0
-
+    run = LearningOnly()
+    run.folder = tmp_path / "run"
     guide = Guide()
     guide.set_occupancy(ball_of_the_tiny_scene())
-    start = GuidedStart(nn.Module(), guide, OccupancyConfig(), Pipe(readers["as it is"]), Trainer())
-    assert not Trainer.base_dir.exists()
+    start = GuidedStart(nn.Module(), guide, OccupancyConfig(), Pipe(readers["as it is"]), run)
+    assert not run.folder.exists()
     start.before_step(0)
-    left = Occupancy.load(Trainer.base_dir / NAME)
+    left = Occupancy.load(run.folder / NAME)
     assert left.report == guide.the_occupancy().report
-    (Trainer.base_dir / NAME).unlink()
+    (run.folder / NAME).unlink()
     start.before_step(1)
-    assert not (Trainer.base_dir / NAME).exists()
+    assert not (run.folder / NAME).exists()
 
 
 @pytest.mark.parametrize(
@@ -316,15 +316,14 @@ def test_a_full_disk_does_not_end_a_run_that_has_its_occupancy(
     monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
 ) -> None:
-    class Trainer:
-        base_dir, local_rank = tmp_path / "run", 0
-
     def full(*_: object) -> None:
         raise OSError(28, "No space left on device")
 
     guide = Guide()
     guide.set_occupancy(ball_of_the_tiny_scene())
-    start = GuidedStart(nn.Module(), guide, OccupancyConfig(), Pipe(readers["as it is"]), Trainer())
+    run = LearningOnly()
+    run.folder = tmp_path / "run"
+    start = GuidedStart(nn.Module(), guide, OccupancyConfig(), Pipe(readers["as it is"]), run)
     monkeypatch.setattr(Occupancy, "save", full)
     start.before_step(0)
     said = " ".join(capsys.readouterr().out.split())

@@ -20,6 +20,7 @@ from leco_plugin.hosts.host_watch import LOWERED_TO, HostWatch
 from leco_plugin.hosts.stand_ins import GuidedEstimator
 from leco_plugin.learning import price_watch
 from leco_plugin.learning.calibration import THRESHOLDS, CalibrationConfig
+from leco_plugin.learning.run import LearningOnly
 from leco_plugin.occupancy import CALIBRATED_AT, Occupancy
 
 BOX = torch.tensor([-4.0, -4.0, -4.0, 4.0, 4.0, 4.0])
@@ -80,13 +81,10 @@ def watched(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Watched:
         return truth, truth
 
     monkeypatch.setattr(host_watch, "held_out_bundle", held_out_bundle)
-    watch = HostWatch(
-        host,
-        guide,
-        CalibrationConfig(),
-        SimpleNamespace(datamanager=None),
-        SimpleNamespace(base_dir=tmp_path),
-    )
+    run = LearningOnly()
+    run.folder = tmp_path
+    pipeline = SimpleNamespace(datamanager=None)
+    watch = HostWatch(host, guide, CalibrationConfig(), pipeline, run)
     return Watched(guide=guide, host=host, watch=watch, now=now, asked=asked, kept=9, out=tmp_path)
 
 
@@ -209,7 +207,7 @@ def test_the_careful_beginning_goes_on_in_a_resumed_run(watched: Watched, packed
 def test_without_measurements_no_careful_beginning_goes_on(watched: Watched, packed: Any) -> None:
     begin_carefully(packed, watched.guide, a_half)
     never = CalibrationConfig(recheck_rays=0)
-    HostWatch(watched.host, watched.guide, never, watched.watch.pipeline, None)
+    HostWatch(watched.host, watched.guide, never, watched.watch.pipeline, LearningOnly())
     assert watched.guide.followed() is watched.guide.the_occupancy()
 
 

@@ -70,6 +70,10 @@ class Proposal(Host):
         return {"rgb": self.field.layer.weight.sum(), "scouting": constant}
 
 
+class GuidedProposals(GuidedHost, Proposal):
+    """A proposal host as it is guided."""
+
+
 def test_a_packed_host_is_found_under_any_name(guide: Guide):
     host = Packed()
     assert swap_sampler(host, guide) == "packed"
@@ -88,8 +92,8 @@ def test_a_packed_host_lends_its_density_for_rendering_front_to_back():
 
 
 def test_a_proposal_host_keeps_nothing_of_its_networks(guide: Guide):
-    host = Proposal()
-    assert swap_sampler(host, guide) == "proposal"
+    host = GuidedProposals()
+    host.begin_guided(guide, OccupancyConfig())
     assert isinstance(host.chooser, GuidedProposal)
     assert host.chooser._options["num_samples"] == 21
     assert host.chooser._options["single_jitter"] is True
@@ -97,7 +101,7 @@ def test_a_proposal_host_keeps_nothing_of_its_networks(guide: Guide):
     assert not [*host.scouts.parameters(), *host.alone.parameters()]
     assert host.opinions == [no_density] * 3
     assert set(host.get_param_groups()) == {"fields"}
-    assert {name.split(".")[0] for name in host.state_dict()} == {"field"}
+    assert {name.split(".")[0] for name in host.state_dict()} == {"field", "leco_guide"}
 
 
 class WithStages(Proposal):
@@ -129,10 +133,6 @@ def test_an_estimator_without_boxes_needs_an_adapter(guide: Guide):
     host.gatekeeper = host.walker.occupancy_grid = Boxless()
     with pytest.raises(ValueError, match="has no sampler that could be swapped"):
         swap_sampler(host, guide)
-
-
-class GuidedProposals(GuidedHost, Proposal):
-    """A proposal host as it is guided."""
 
 
 def test_a_loss_that_reaches_nothing_is_left_out_in_training_only(guide: Guide):
