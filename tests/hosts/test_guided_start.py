@@ -290,7 +290,7 @@ def test_with_a_file_nothing_is_said_of_bounds_for_learning_one(
     readers: dict[str, Data], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     said: list[str] = []
-    for module in ("scenes.survey", "models.hosts.guided_start"):
+    for module in ("scenes.survey", "hosts.guided_start"):
         monkeypatch.setattr(f"leco_plugin.{module}.say", said.append)
     started(lopsided(readers["as it is"]), readers["as it is"])
     (line,) = said
