@@ -20,7 +20,7 @@ from gpu_sampling import march_answers
 from gpu_scale import Scale, figure
 from torch import Tensor
 
-from leco_plugin.evaluation.peak_memory import peak_process_bytes
+from leco_plugin.evaluation.clock import peak_process_bytes
 from leco_plugin.models.field import HMoEField
 from leco_plugin.models.freezing.calibration import (
     CalibrationConfig,

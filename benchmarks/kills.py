@@ -32,8 +32,7 @@ import psutil
 from leco_plugin.compat.checkpoints import allow_checkpoint_globals
 from leco_plugin.compat.nerfstudio_changes import iterations_until
 from leco_plugin.compat.whole_checkpoints import newest_whole, previous_of, step_of
-from leco_plugin.evaluation.json_file import write_json
-from leco_plugin.evaluation.machine import describe_machine
+from leco_plugin.evaluation.report import describe_machine, write_json
 from leco_plugin.occupancy import Occupancy
 from leco_plugin.scenes.input_error import InputError
 
@@ -50,7 +49,7 @@ PRELOADED = [
     "nerfstudio.scripts.train",
     "leco_plugin.compat.atomic_trainer",
     "leco_plugin.models.learning.lifecycle",
-    "leco_plugin.evaluation.held_out_images",
+    "leco_plugin.evaluation.timed_run",
 ]
 """Imported once for all runs."""
 ARGUMENTS = [
@@ -81,7 +80,7 @@ def train(arguments: list[str], log: Path, end: Path) -> None:
     from nerfstudio.engine.trainer import Trainer
     from nerfstudio.scripts import train as ns_train
 
-    from leco_plugin.evaluation.held_out_images import psnr_on_rays
+    from leco_plugin.evaluation.timed_run import psnr_on_rays
 
     leave_out_the_cache()
     after = Trainer._after_train

@@ -19,7 +19,7 @@ import torch
 import tyro
 from nerfstudio.engine.callbacks import TrainingCallbackAttributes
 
-from leco_plugin.evaluation.machine import describe_code, describe_machine, made_by
+from leco_plugin.evaluation.report import describe_code, describe_machine, made_by
 from leco_plugin.method_configs import leco_occupancy
 from leco_plugin.models.compute.optimizers import RATES, FusedAdamConfig
 from leco_plugin.models.freezing.calibration import Reference

@@ -24,9 +24,14 @@ from timing import interleaved, ratio
 
 from leco_plugin.cli_reports import occupancy_of
 from leco_plugin.compat.host_outputs import true_colours
-from leco_plugin.evaluation.field_queries import counted
-from leco_plugin.evaluation.json_file import read_object, write_json
-from leco_plugin.evaluation.machine import describe_code, describe_machine, made_by
+from leco_plugin.evaluation.queries import counted
+from leco_plugin.evaluation.report import (
+    describe_code,
+    describe_machine,
+    made_by,
+    read_object,
+    write_json,
+)
 from leco_plugin.models.leco import LecoModel
 from leco_plugin.samplers.estimator import LearnedOccupancyEstimator
 from leco_plugin.samplers.marching import march

@@ -21,7 +21,7 @@ from sampling_scene import fit_occupancy, rays_into
 from timing import interleaved, machine, milliseconds, ratio
 from torch import Tensor
 
-from leco_plugin.evaluation.machine import describe_code
+from leco_plugin.evaluation.report import describe_code
 from leco_plugin.models.compute.precision import keep_freed_memory
 from leco_plugin.occupancy import Occupancy
 from leco_plugin.samplers.estimator import LearnedOccupancyEstimator
