@@ -2,17 +2,14 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import checkout  # noqa: F401
 from chart_sections import by_scene, notes
 from page_parts import size
-from suite_times import minutes_section
 
-from leco_plugin.chart.contenders.suites import SUITES
-from leco_plugin.chart.drawing.title import asks_what_was_learned, title_of
-from leco_plugin.chart.findings.fronts import COSTS, fronts_of
 from leco_plugin.chart.findings.learned import (
     Learned,
     learned_of,
@@ -20,9 +17,11 @@ from leco_plugin.chart.findings.learned import (
     ours_of,
     percent,
 )
-from leco_plugin.chart.findings.representations import representations_of
+from leco_plugin.chart.findings.representations import COSTS, fronts_of, representations_of
 from leco_plugin.chart.findings.settling import still_rising
 from leco_plugin.chart.findings.summary import RENDERING, Line, lines_of
+from leco_plugin.chart.panels import asks_what_was_learned, title_of
+from leco_plugin.chart.suites import SUITES
 
 HEAD = """## The reviewers' questions, answered
 
@@ -44,6 +43,13 @@ is missing in training with it: a fine one shows here what it costs on two cores
 it would be. Whoever gained more than 0.3 dB in the last third of the time is still rising. That
 others are not does not mean that more time would not help them: rates fall to a tenth over whatever
 time is given.
+"""
+
+TIMES = """### How long the suites take
+
+Minutes of all runs of a suite on two cores, each from the start of its process to its end, two at a
+time; together, runs that several suites share are counted once. Each was to take less than 45 and
+all of them together 240.
 """
 
 
@@ -153,3 +159,34 @@ def _answer_of(results: Mapping[str, Any]) -> str:
         return title_of(results)
     who = "all" if len(rising) == len(lines) else ", ".join(rising)
     return f"{title_of(results)}; still rising at the end: {who}"
+
+
+def minutes_section(charts: Sequence[dict[str, Any]]) -> list[str]:
+    """What each suite took on each scene, and all of a scene without runs that it shares.
+
+    Args:
+        charts: their results, one for each scene and suite.
+    """
+    times: dict[str, dict[str, str]] = {}
+    together: dict[str, float] = {}
+    for results in charts:
+        scene = results["scene"]["name"]
+        its = times.setdefault(scene, {})
+        spent = [run.get("wall_seconds") for run in results["runs"]]
+        if None in spent:
+            its[results["suite"]], together[scene] = "-", math.inf
+            continue
+        at_once = 60.0 * results["protocol"].get("at_once", 1)
+        its[results["suite"]] = f"{sum(spent) / at_once:.0f}"
+        own = [run["wall_seconds"] for run in results["runs"] if not run.get("reused")]
+        together[scene] = together.get(scene, 0.0) + sum(own) / at_once
+    lines = [
+        TIMES,
+        f"| scene | {' | '.join(SUITES)} | together |",
+        "|---" * (len(SUITES) + 2) + "|",
+    ]
+    for scene, its in times.items():
+        total = "-" if math.isinf(together[scene]) else f"{together[scene]:.0f}"
+        cells = [its.get(suite, "-") for suite in SUITES]
+        lines.append(f"| {scene} | {' | '.join(cells)} | {total} |")
+    return ["\n".join(lines) + "\n"]

@@ -13,11 +13,10 @@ import checkout  # noqa: F401
 from page_parts import noted
 from stability_page import has_lost, runs_gone_on
 
-from leco_plugin.chart.contenders.methods import NEVER_FROZEN, VARIANTS
-from leco_plugin.chart.drawing.cells import rows
 from leco_plugin.chart.findings.learned import learned_of
-from leco_plugin.chart.findings.summary import figure_in, lines_of
-from leco_plugin.chart.findings.versus import versus
+from leco_plugin.chart.findings.summary import figure_in, lines_of, versus
+from leco_plugin.chart.methods import NEVER_FROZEN, VARIANTS
+from leco_plugin.chart.table import rows
 
 EQUAL_EXPERTS = VARIANTS["leco-occupancy-homogeneous"]
 CITY, SURVEY, SURVEY_NAME = "charts/city-3", "charts/caliterra", "`caliterra`"

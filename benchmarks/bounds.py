@@ -21,8 +21,7 @@ from typing import Any
 import tyro
 
 from leco_plugin.evaluation.clock import Budget
-from leco_plugin.evaluation.json_file import write_json
-from leco_plugin.evaluation.machine import describe_code, describe_machine, made_by
+from leco_plugin.evaluation.report import describe_code, describe_machine, made_by, write_json
 from leco_plugin.evaluation.timed_run import timed_run
 from leco_plugin.learning.collapse import GateCollapsed
 from leco_plugin.method_configs import leco_occupancy

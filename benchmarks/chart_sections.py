@@ -9,8 +9,8 @@ import checkout  # noqa: F401
 from page_parts import RESULTS, machine_line, noted, picture
 from paper_rows import PAPER_ROWS
 
-from leco_plugin.chart.contenders.suites import SUITES
-from leco_plugin.chart.drawing.table import table
+from leco_plugin.chart.suites import SUITES
+from leco_plugin.chart.table import table
 
 CHARTS = RESULTS / "charts"
 

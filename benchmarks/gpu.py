@@ -28,8 +28,12 @@ from gpu_sampling import sampling
 from gpu_scale import Scale
 from gpu_training import dense, learned
 
-from leco_plugin.evaluation.json_file import write_json
-from leco_plugin.evaluation.machine import describe_code, describe_machine, digest_of_sources
+from leco_plugin.evaluation.report import (
+    describe_code,
+    describe_machine,
+    digest_of_sources,
+    write_json,
+)
 
 ROOT = Path(__file__).resolve().parent.parent
 RESULTS = ROOT / "benchmarks" / "results"

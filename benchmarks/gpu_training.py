@@ -20,7 +20,7 @@ from gpu_sampling import march_answers
 from gpu_scale import Scale, figure
 from torch import Tensor
 
-from leco_plugin.evaluation.peak_memory import peak_process_bytes
+from leco_plugin.evaluation.clock import peak_process_bytes
 from leco_plugin.learning.calibration import (
     CalibrationConfig,
     Measured,
@@ -41,10 +41,10 @@ from leco_plugin.models.rendering import (
     with_backdrop,
 )
 from leco_plugin.occupancy import Occupancy, gate_precision
-from leco_plugin.samplers import marching
 from leco_plugin.samplers.boxes import intersect_box
 from leco_plugin.samplers.estimator import LearnedOccupancyEstimator
 from leco_plugin.samplers.kernels import fused
+from leco_plugin.samplers.marching import march
 from leco_plugin.space import Space
 
 
@@ -94,13 +94,12 @@ class Run:
     def intervals_of(self, rays: Rays, candidates: int, jittered: bool) -> Intervals:
         """Candidates along rays; once guided, those that the occupancy keeps."""
         step_size = self.scene.length / candidates
-        along, rule = marching.Rays(*rays[:4]), marching.March(step_size)
-        if jittered:
-            along = along.shifted(torch.rand_like(rays.t_mins) * step_size)
+        jitter = torch.rand_like(rays.t_mins) if jittered else None
+        along = rays.origins, rays.directions, rays.t_mins, rays.t_maxs
         if self.estimator is None:
-            samples = marching.march(along, rule)
+            samples = march(*along, step_size=step_size, jitter=jitter)
         else:
-            samples = self.estimator.march(along, rule)
+            samples = self.estimator.kept(*along, step_size, 0.0, jitter, None)
         return with_backdrop(Intervals(*samples), rays, step_size, 0.0)
 
     def shaded(self, rays: Rays, intervals: Intervals) -> Shaded:
@@ -230,7 +229,7 @@ def learned(scale: Scale, before: dict[str, Any]) -> dict[str, Any]:
     assert run.estimator is not None
     place = torch.zeros(1, 3, device=scale.device)
     running = {
-        "gate": fused.decide(run.estimator.occupancy, place) is not None,
+        "gate": fused.decisions(run.estimator.occupancy, place) is not None,
         "march": march_answers(run.estimator),
     }
     return {

@@ -30,8 +30,7 @@ from nerfstudio.engine.callbacks import TrainingCallbackAttributes
 from leco_plugin.evaluation.clock import Clock, warm_up
 from leco_plugin.evaluation.equal_loss import LOST_SURFACE_MASS, at_equal_loss
 from leco_plugin.evaluation.inspection import whole_box
-from leco_plugin.evaluation.json_file import write_json
-from leco_plugin.evaluation.machine import describe_code, describe_machine, made_by
+from leco_plugin.evaluation.report import describe_code, describe_machine, made_by, write_json
 from leco_plugin.learning.calibration import CalibrationConfig
 from leco_plugin.learning.dense import dense_rendering
 from leco_plugin.learning.learner import Lifecycle

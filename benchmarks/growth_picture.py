@@ -5,8 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-from leco_plugin.chart.drawing.theme import LIGHT, Theme, plain, style, themed
-from leco_plugin.evaluation.charts import SOURCE, fingerprint
+from leco_plugin.chart.theme import LIGHT, SOURCE, Theme, fingerprint, plain, style, themed
 
 PANELS = (
     (

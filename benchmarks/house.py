@@ -1,6 +1,6 @@
 """Draws the house: every module by its lines, its room, and which room imports which.
 
-    python benchmarks/house.py        # writes docs/house.svg
+python benchmarks/house.py        # writes docs/house.svg
 """
 
 from __future__ import annotations
@@ -62,6 +62,7 @@ def depths(edges: Counter[tuple[str, str]], rooms: set[str]) -> dict[str, int]:
     order: list[str] = []
     left = set(rooms)
     while left:  # the room that imports least of what is left goes first
+
         def wanted(room: str) -> int:
             return sum(edges[room, other] for other in left if other != room)
 

@@ -108,7 +108,7 @@ def measure(way: Way, folder: Path, options: Options) -> dict[str, Any]:
     from nerfstudio.data.datamanagers.parallel_datamanager import ParallelDataManagerConfig
     from nerfstudio.pipelines.base_pipeline import VanillaPipelineConfig
 
-    from leco_plugin.evaluation.peak_memory import peak_process_bytes
+    from leco_plugin.evaluation.clock import peak_process_bytes
     from leco_plugin.hosts.learn_first import learn_occupancy
     from leco_plugin.learning.schedule import ScheduleConfig
     from leco_plugin.models.leco_config import LecoModelConfig
@@ -190,7 +190,7 @@ def main(options: Options) -> None:
         assert options.folder is not None
         print(json.dumps(measure(options.measure, options.folder, options)))
         return
-    from leco_plugin.evaluation.machine import describe_code, describe_machine, made_by
+    from leco_plugin.evaluation.report import describe_code, describe_machine, made_by
 
     rows, code = [], describe_code()  # before anything is measured
     with tempfile.TemporaryDirectory() as temporary:

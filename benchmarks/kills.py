@@ -29,8 +29,7 @@ from typing import Any
 
 import psutil
 
-from leco_plugin.evaluation.json_file import write_json
-from leco_plugin.evaluation.machine import describe_machine
+from leco_plugin.evaluation.report import describe_machine, write_json
 from leco_plugin.occupancy import Occupancy
 from leco_plugin.scenes.input_error import InputError
 from leco_plugin.studio.checkpoints import (
@@ -54,7 +53,7 @@ PRELOADED = [
     "nerfstudio.scripts.train",
     "leco_plugin.studio.trainer",
     "leco_plugin.learning.learner",
-    "leco_plugin.evaluation.held_out_images",
+    "leco_plugin.evaluation.timed_run",
 ]
 """Imported once for all runs."""
 ARGUMENTS = [
@@ -85,7 +84,7 @@ def train(arguments: list[str], log: Path, end: Path) -> None:
     from nerfstudio.engine.trainer import Trainer
     from nerfstudio.scripts import train as ns_train
 
-    from leco_plugin.evaluation.held_out_images import psnr_on_rays
+    from leco_plugin.evaluation.timed_run import psnr_on_rays
 
     leave_out_the_cache()
     after = Trainer._after_train

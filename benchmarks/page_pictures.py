@@ -16,9 +16,8 @@ from sizes_sections import CAPACITY, scene_results
 from stability_page import PICTURE as STABILITY
 
 from leco_plugin.capacity.picture import draw as draw_capacity
-from leco_plugin.chart.drawing.picture import draw
-from leco_plugin.chart.drawing.theme import DARK, LIGHT
-from leco_plugin.evaluation.charts import SOURCE, fingerprint
+from leco_plugin.chart.picture import draw
+from leco_plugin.chart.theme import DARK, LIGHT, SOURCE, fingerprint
 from leco_plugin.stability.picture import draw as draw_stability
 
 CHARTS = ROOT / "docs" / "images" / "charts"

@@ -23,12 +23,17 @@ import tyro
 from timing import interleaved, ratio
 
 from leco_plugin.cli_reports import occupancy_of
-from leco_plugin.evaluation.field_queries import counted
-from leco_plugin.evaluation.json_file import read_object, write_json
-from leco_plugin.evaluation.machine import describe_code, describe_machine, made_by
+from leco_plugin.evaluation.queries import counted
+from leco_plugin.evaluation.report import (
+    describe_code,
+    describe_machine,
+    made_by,
+    read_object,
+    write_json,
+)
 from leco_plugin.models.leco import LecoModel
 from leco_plugin.samplers.estimator import LearnedOccupancyEstimator
-from leco_plugin.samplers.marching import March, Rays, march
+from leco_plugin.samplers.marching import march
 from leco_plugin.shrink.sources import find_source
 from leco_plugin.studio.host_models import true_colours
 
@@ -88,12 +93,12 @@ def along_rays(model: LecoModel, bundles: Sequence[Any]) -> dict[str, float]:
         flat, at_once = bundle.flatten(), model.config.eval_num_rays_per_chunk
         for first in range(0, len(flat), at_once):
             rays = model.rays_of(flat[first : first + at_once])
-            along, rule = Rays(*rays[:4]), March(size, angle)
+            along = rays.origins, rays.directions, rays.t_mins, rays.t_maxs
             total += len(rays.origins)
-            sums["candidates"] += len(march(along, rule)[0])
+            sums["candidates"] += len(march(*along, step_size=size, cone_angle=angle)[0])
             estimator = model.estimator()
             with asked_along(estimator) as count, counted(model) as queries:
-                kept = estimator.march(along, rule)
+                kept = estimator.kept(*along, size, angle, None, None)
             sums["kept"] += len(kept[0])
             sums["gate"] += queries.gate
             for name, asked in count.items():

@@ -22,8 +22,7 @@ import tyro
 from sizes_figures import AUTOMATIC, bars, verdict
 
 from leco_plugin.evaluation.clock import Budget
-from leco_plugin.evaluation.json_file import write_json
-from leco_plugin.evaluation.machine import describe_code, describe_machine, made_by
+from leco_plugin.evaluation.report import describe_code, describe_machine, made_by, write_json
 from leco_plugin.evaluation.timed_run import timed_run
 from leco_plugin.method_configs import best_device, leco_occupancy
 from leco_plugin.models.sizing.scene_sizes import complete

@@ -13,7 +13,7 @@ from pathlib import Path
 import checkout  # noqa: F401
 import tyro
 
-from leco_plugin.evaluation.json_file import write_json
+from leco_plugin.evaluation.report import write_json
 from leco_plugin.stability.command import make_table
 from leco_plugin.stability.table import headline
 

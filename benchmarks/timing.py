@@ -8,7 +8,10 @@ import time
 from collections.abc import Callable
 from typing import Any
 
+import checkout  # noqa: F401
 import torch
+
+from leco_plugin.evaluation.report import processor_name
 
 Timings = dict[str, list[float]]
 
@@ -41,21 +44,13 @@ def milliseconds(timings: Timings) -> dict[str, float]:
 def machine() -> dict[str, Any]:
     """What the figures were measured on."""
     return {
-        "processor": _processor(),
+        "processor": processor_name(),
         "threads": torch.get_num_threads(),
         "accelerator": torch.cuda.get_device_name() if torch.cuda.is_available() else None,
         "amx": bool(torch.cpu._is_amx_tile_supported()),
         "torch": torch.__version__,
         "python": platform.python_version(),
     }
-
-
-def _processor() -> str:
-    try:
-        with open("/proc/cpuinfo") as lines:
-            return next(line.split(":")[1].strip() for line in lines if "model name" in line)
-    except (OSError, StopIteration):
-        return platform.processor() or platform.machine()
 
 
 def _wait() -> None:

@@ -51,7 +51,7 @@ def inspect(
         picture.parent.mkdir(parents=True, exist_ok=True)
         print(f"drew {draw(occupancy, picture)}")
     if history is not None:
-        from leco_plugin.evaluation.history_picture import draw_history
+        from leco_plugin.evaluation.occupancy_picture import draw_history
 
         history.parent.mkdir(parents=True, exist_ok=True)
         print(f"drew {draw_history(occupancy, file.parent, history)}")

@@ -1,4 +1,4 @@
-"""`leco demo`: a city learned, frozen and gone on with, and the same never frozen; equal time."""
+"""`leco demo`: a guided run on a city, and the same model never frozen, for equal time."""
 
 from __future__ import annotations
 
@@ -13,16 +13,15 @@ from typing import Any
 
 import torch
 from nerfstudio.engine.trainer import Trainer, TrainerConfig
-from torch import Tensor
 
-from leco_plugin.chart.drawing.theme import LIGHT, Theme
-from leco_plugin.evaluation.charts import psnr_against_seconds
+from leco_plugin.chart.findings.summary import Line
+from leco_plugin.chart.picture import draw_curves, name_ends
+from leco_plugin.chart.theme import LIGHT, Theme, new_figure, save_picture, style, themed
 from leco_plugin.evaluation.clock import Budget
 from leco_plugin.evaluation.inspection import ViewBox
-from leco_plugin.evaluation.json_file import write_json
-from leco_plugin.evaluation.machine import describe_code, describe_machine
 from leco_plugin.evaluation.occupancy_facts import occupancy_facts, truth_of
 from leco_plugin.evaluation.occupancy_picture import draw_slice
+from leco_plugin.evaluation.report import describe_code, describe_machine, write_json
 from leco_plugin.evaluation.timed_run import timed_run
 from leco_plugin.learning.freezing import FILE_NAME
 from leco_plugin.log import bar
@@ -34,18 +33,18 @@ from leco_plugin.scenes.city.truth import CityTruth
 from leco_plugin.studio.host_models import true_colours
 
 SECONDS = 130.0
-"""Training time of each of the two runs; all of it then takes about six minutes on two cores."""
+"""Training time of each run: about six minutes in all on two cores."""
 FULL_LEARNING = 150.0
-"""Training time from which the occupancy is learned in the method's own number of steps."""
+"""Training time from which on the occupancy learns for the method's own number of steps."""
 MOST_LEARNING = 0.5
-"""Share of the training time that learning may take; a slow machine learns for fewer steps."""
+"""Limit of learning, as a share of the training time, for slow machines."""
 AERIAL = CaptureConfig(street_per_block=0.0)
-"""A drone survey: pictures from the street, too, would let all rays begin at the lens."""
+"""A drone survey: with pictures from the street, all rays would have to begin at the lens."""
 FEWEST_LEARN_STEPS = 10
 SLICE_HEIGHT = 4.0
-"""Metres over the ground at which the occupancy is shown: through walls, poles and crowns."""
+"""Metres over the ground of the slice that is shown: through walls, poles and crowns."""
 
-GUIDED, NEVER_FROZEN = "leco-occupancy", "leco-occupancy-never-frozen"
+NEVER_FROZEN = "leco-occupancy-never-frozen"
 
 
 def run_demo(
@@ -114,18 +113,34 @@ def run_demo(
 
 
 def draw_chart(report: dict[str, Any], path: Path, theme: Theme = LIGHT) -> Path:
-    """The demo's chart from its stored report."""
-    blocks, cores = report["scene"]["blocks"], report["machine"]["cores"]
+    """Draws the demo's chart from its report: PSNR against seconds of training of both runs."""
+    runs, blocks, cores = report["runs"], report["scene"]["blocks"], report["machine"]["cores"]
     where = f"{cores} CPU cores" if report["machine"]["device"] == "cpu" else "one GPU"
-    scene = f"Procedural city of {blocks} x {blocks} blocks, {where}, one seed"
-    guided, dense = (run["psnr"] for run in report["runs"])
-    title = f"{guided - dense:+.1f} dB after the same time, by skipping what is empty"
-    labels = ["skips what it has learned is empty", "the same model, skipping nothing"]
-    return psnr_against_seconds(report["runs"], path, title, scene, labels, theme)
+    gain = runs[0]["psnr"] - runs[1]["psnr"]
+    title = f"{gain:+.1f} dB after the same time, by skipping what is empty"
+    names = ("skips what it has\nlearned is empty", "the same model,\nskipping nothing")
+    lines = [Line(name, "", run["sampler"], (run,)) for name, run in zip(names, runs)]
+    with themed(theme):
+        figure = new_figure((8, 4.4), theme.page)
+        figure.suptitle(title, fontsize=14, fontweight="bold", x=0.01, ha="left")
+        axes = figure.add_axes((0.11, 0.14, 0.55, 0.7))
+        draw_curves(axes, lines, theme)
+        scene = f"Procedural city of {blocks} x {blocks} blocks, {where}, one seed"
+        axes.set_title(scene, fontsize=11.5, loc="left")
+        axes.set_xlabel("seconds of training")
+        axes.set_ylabel("PSNR on unseen photographs, dB\n(more is better)")
+        name_ends(axes, lines, theme, apart=0.16)
+        if (frozen := runs[0]["freeze_seconds"]) is not None:
+            colour = style(0, theme)["color"]
+            axes.axvline(frozen, color=colour, linestyle="--", linewidth=1.4)
+            known = f" what is empty\n is known after {frozen:.0f} s"
+            at = (frozen, 0.06)
+            axes.annotate(known, at, xycoords=("data", "axes fraction"), color=colour, fontsize=11)
+        return save_picture(figure, path, runs, dpi=120)
 
 
 def never_frozen(config: TrainerConfig, learn_steps: int) -> TrainerConfig:
-    """The same method, of as many learning steps, its gate trained to the end, nothing skipped."""
+    """The same method with as many learning steps, never frozen: nothing is skipped."""
     config = copy.deepcopy(config)
     config.method_name = NEVER_FROZEN
     model: Any = config.pipeline.model
@@ -155,7 +170,7 @@ def _frozen_occupancy(
     """The occupancy that the run left, what is known and measured of it, and the exact city."""
     model: Any = trainer.pipeline.model
     written = trainer.base_dir / FILE_NAME
-    if not bool(model.frozen) or not written.exists():
+    if not bool(model.mixture.frozen) or not written.exists():
         raise RuntimeError(
             "the time was over before the occupancy was learned: give more with --seconds"
         )
@@ -170,7 +185,7 @@ def _frozen_occupancy(
 
 @torch.no_grad()
 def _draw_picture(trainer: Trainer, occupancy: Occupancy, truth: CityTruth, path: Path) -> None:
-    """A test image as it is photographed and as the guided model renders it, and the occupancy."""
+    """Draws a test photograph, its guided rendering, the depth, and a slice of the occupancy."""
     pipeline: Any = trainer.pipeline
     model = pipeline.model
     dataset = pipeline.datamanager.eval_dataset
@@ -184,60 +199,31 @@ def _draw_picture(trainer: Trainer, occupancy: Occupancy, truth: CityTruth, path
     met = outputs["accumulation"][..., 0] > 0.5
     depth = (outputs["depth"][..., 0] / truth.scale).where(met, torch.nan).cpu()
     samples = float(outputs["samples_per_ray"].mean())
-    draw_panels(photograph.cpu(), rgb.cpu(), samples, depth, occupancy, truth, path)
-
-
-def draw_panels(
-    photograph: Tensor,
-    rgb: Tensor,
-    samples: float,
-    depth: Tensor,
-    occupancy: Occupancy,
-    truth: CityTruth,
-    path: Path,
-) -> None:
-    """Photograph, guided rendering, its depth, and a slice of the occupancy with the true walls.
-
-    Args:
-        photograph, rgb: [H, W, 3] in [0, 1].
-        samples: a ray, mean over the image.
-        depth: [H, W] in metres, NaN where nothing is met.
-        occupancy, truth: in the same coordinates.
-        path: of the picture.
-    """
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
-
     seen = torch.nanquantile(depth, torch.tensor([0.01, 0.99])).nan_to_num().tolist()
     # letters of this size can still be read where a page shows the picture half as wide
-    figure = Figure(figsize=(11, 2.9), layout="constrained", facecolor="white")
-    FigureCanvasAgg(figure)
+    figure = new_figure((11, 2.9), layout="constrained")
     axes = figure.subplots(1, 4, gridspec_kw={"width_ratios": [4, 4, 4.5, 2.6]})
-    axes[0].imshow(photograph)
+    axes[0].imshow(photograph.cpu())
     axes[0].set_title("photograph\n(held out)")
-    axes[1].imshow(rgb)
+    axes[1].imshow(rgb.cpu())
     axes[1].set_title(f"guided rendering\n({samples:.0f} samples a ray)")
     shown = axes[2].imshow(depth, cmap="turbo_r", vmin=seen[0], vmax=seen[1])
     axes[2].set_title("its depth\n(metres)")
     figure.colorbar(shown, ax=axes[2], shrink=0.8, pad=0.01)
-    _draw_city_slice(axes[3], occupancy, truth)
+    surface = truth.visible_surface("test")
+    box = ViewBox(surface.amin(dim=0), surface.amax(dim=0))
+    at = truth.to_metres(torch.zeros(3))
+    at[2] = SLICE_HEIGHT
+    height = float(truth.to_model(at)[2])
+    draw_slice(axes[3], occupancy, box, 2, height, solid=truth.occupied)
+    axes[3].set_title(f"occupancy {SLICE_HEIGHT:.0f} m up\n(true walls white)", fontsize=12)
     for panel in axes:
         panel.set(xticks=[], yticks=[], xlabel="", ylabel="")
     figure.savefig(path, dpi=160, bbox_inches="tight")
 
 
-def _draw_city_slice(axes: Any, occupancy: Occupancy, truth: CityTruth) -> None:
-    surface = truth.visible_surface("test")
-    low, high = surface.amin(dim=0), surface.amax(dim=0)
-    ground = truth.to_metres(torch.zeros(3))
-    ground[2] = SLICE_HEIGHT
-    height = float(truth.to_model(ground)[2])
-    draw_slice(axes, occupancy, ViewBox(low, high), 2, height, solid=truth.occupied)
-    axes.set_title(f"occupancy {SLICE_HEIGHT:.0f} m up\n(true walls white)", fontsize=12)
-
-
 def summary(report: dict[str, Any]) -> list[str]:
-    """The report in a few lines, for the terminal; of an earlier release it lacks its last one."""
+    """The report in a few lines, for the terminal."""
     facts = report["occupancy"]
     guided, other = report["runs"]
     recall = facts["kept_surface_recall"]
@@ -253,6 +239,5 @@ def summary(report: dict[str, Any]) -> list[str]:
         f"{run['render_seconds_per_image']:.2f} s an image"
         for run in (guided, other)
     ]
-    if (seconds := report.get("seconds_in_all")) is not None:
-        lines.append(f"all of it took {seconds / 60:.1f} minutes")
+    lines.append(f"all of it took {report['seconds_in_all'] / 60:.1f} minutes")
     return lines

@@ -11,8 +11,8 @@ from typing import Any
 import numpy as np
 from PIL import Image
 
-from leco_plugin.chart.runs.folder import RUNS, Job
-from leco_plugin.chart.runs.processes import RunFailed
+from leco_plugin.chart.contender import Job
+from leco_plugin.chart.runner import RUNS, RunFailed
 from leco_plugin.stability.cases import cases_named
 from leco_plugin.stability.contenders import samplers_named
 from leco_plugin.stability.sizes import QUICK

@@ -4,10 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from leco_plugin.chart.contenders import forecast
-from leco_plugin.chart.contenders.forecast import Cores
-from leco_plugin.chart.contenders.protocol import Protocol
-from leco_plugin.chart.contenders.suites import SUITES
+from leco_plugin.chart.protocol import Cores, Protocol, forecast_minutes
+from leco_plugin.chart.suites import SUITES
 
 
 def minutes_together(names: Sequence[str], cores: Cores) -> float:
@@ -17,5 +15,5 @@ def minutes_together(names: Sequence[str], cores: Cores) -> float:
     for one in (SUITES[name] for name in names):
         new = [c for c in one.contenders if (c.alone().key, one.protocol) not in made]
         made |= {(contender.alone().key, one.protocol) for contender in new}
-        minutes += 3 * forecast.minutes(new, one.on_two_cores, cores)
+        minutes += 3 * forecast_minutes(new, one.on_two_cores, cores)
     return minutes

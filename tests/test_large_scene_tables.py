@@ -13,8 +13,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parent.parent / "benchmarks"))
 from growth_picture import draw
 from large_scene_tables import growth_table, memory_table, prior_table
 
-from leco_plugin.chart.drawing.theme import DARK
-from leco_plugin.evaluation.charts import SOURCE, fingerprint
+from leco_plugin.chart.theme import DARK, SOURCE, fingerprint
 
 
 def growth_report(grid_bytes: float | None = 4e6, learned: bool = True) -> dict[str, Any]:

@@ -10,7 +10,7 @@ import pytest
 import torch
 from PIL import Image
 
-from leco_plugin.evaluation.charts import SOURCE, fingerprint
+from leco_plugin.chart.theme import SOURCE, fingerprint
 from leco_plugin.learning.history import GateHistory
 
 ROOT = Path(__file__).resolve().parent.parent

@@ -9,9 +9,8 @@ from pathlib import Path
 import pytest
 from suite_minutes import minutes_together
 
-from leco_plugin.chart.contenders.forecast import FAST, SLOW
-from leco_plugin.chart.contenders.protocol import Protocol
-from leco_plugin.chart.contenders.suites import SUITES
+from leco_plugin.chart.protocol import FAST, SLOW, Protocol
+from leco_plugin.chart.suites import SUITES
 from leco_plugin.method_configs import ON_GPU
 
 DOCS = Path(__file__).resolve().parent.parent / "docs"

@@ -12,11 +12,16 @@ from leco_plugin.capacity.choice import choose, kilobytes, verdict
 from leco_plugin.capacity.field import prepare
 from leco_plugin.capacity.measuring import STEPS, Candidate, gates, grids, of_gate, of_grids
 from leco_plugin.capacity.picture import draw
-from leco_plugin.chart.drawing.theme import DARK, LIGHT
+from leco_plugin.chart.theme import DARK, LIGHT
 from leco_plugin.evaluation.equal_loss import MOST_ON_CPU
 from leco_plugin.evaluation.field_grids import fits_memory
-from leco_plugin.evaluation.json_file import read_object, write_json
-from leco_plugin.evaluation.machine import describe_code, describe_machine, made_by
+from leco_plugin.evaluation.report import (
+    describe_code,
+    describe_machine,
+    made_by,
+    read_object,
+    write_json,
+)
 from leco_plugin.log import bar
 from leco_plugin.scenes.description import describe_scene
 from leco_plugin.scenes.input_error import InputError, require_folder

@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from leco_plugin.evaluation.reached_volume import reached_volume
+from leco_plugin.evaluation.equal_loss import reached_volume
 from leco_plugin.models.leco import LecoModel
 from leco_plugin.models.losses import widen
 from leco_plugin.models.objective import GateLossConfig

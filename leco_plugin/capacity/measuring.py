@@ -13,7 +13,13 @@ import torch
 from torch import Tensor
 
 from leco_plugin.capacity.field import Ground
-from leco_plugin.evaluation.equal_loss import MOST_ON_CPU, SPARED, kept_shares, threshold_losing
+from leco_plugin.evaluation.equal_loss import (
+    MOST_ON_CPU,
+    SPARED,
+    kept_shares,
+    mapped_box,
+    threshold_losing,
+)
 from leco_plugin.evaluation.field_grids import (
     FieldGrids,
     density_of,
@@ -21,7 +27,6 @@ from leco_plugin.evaluation.field_grids import (
     looked_up,
     plain_and_dilated,
 )
-from leco_plugin.evaluation.reached_volume import mapped_box
 from leco_plugin.models.encodings import EncodingConfig
 from leco_plugin.models.gate import GateConfig, occupancy_logit
 from leco_plugin.occupancy import Precision, gate_precision

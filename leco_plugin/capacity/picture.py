@@ -9,8 +9,7 @@ from typing import Any
 
 from leco_plugin.capacity.choice import NAMES, choose, common_volume, verdict
 from leco_plugin.capacity.measuring import FAMILIES, VOLUMES
-from leco_plugin.chart.drawing.theme import LIGHT, Theme, plain, style, themed
-from leco_plugin.evaluation.charts import SOURCE, fingerprint
+from leco_plugin.chart.theme import LIGHT, SOURCE, Theme, fingerprint, plain, style, themed
 
 LEAST = 1e-5
 """Lost surface mass that is drawn for less, and for none at all."""

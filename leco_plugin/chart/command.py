@@ -11,36 +11,35 @@ from typing import Any
 
 from nerfstudio.utils.rich_utils import CONSOLE
 
-from leco_plugin.chart.contenders.methods import contenders
-from leco_plugin.chart.contenders.protocol import Protocol
-from leco_plugin.chart.contenders.suites import SUITES, in_order
-from leco_plugin.chart.contenders.suites import suite as suite_of
-from leco_plugin.chart.runs.processes import ProcessRunner
-from leco_plugin.chart.runs.reuse import fitting
-from leco_plugin.chart.runs.run import Chart, Runner
+from leco_plugin.chart.chart import Chart, unlike
+from leco_plugin.chart.methods import contenders
+from leco_plugin.chart.protocol import Protocol
+from leco_plugin.chart.runner import ProcessRunner, Runner
+from leco_plugin.chart.suites import SUITES, in_order
+from leco_plugin.chart.worker import WORKER
 from leco_plugin.log import bar, resumable
 from leco_plugin.scenes.input_error import InputError
 
 LEFT_BY_SYSTEMS = (".DS_Store", "Thumbs.db")
-"""In folders that somebody has looked into."""
+"""Files in folders that somebody has looked into."""
 
 
 @dataclass(frozen=True)
 class Asked:
-    """What is asked for beside what is compared; None where a suite has its own."""
+    """The options beside what is compared; None where a suite has its own."""
 
     seconds: float | None = None
-    """Of each run."""
+    """Training time of each run."""
     steps: int | None = None
-    """Of each run."""
+    """Training steps of each run."""
     learn_seconds: float | None = None
-    """Most of that for learning an occupancy."""
+    """Limit for learning an occupancy."""
     seeds: Sequence[int] = (0, 1, 2)
-    """Of each."""
+    """Of each contender."""
     images: int = 2
-    """Whole test images for each run."""
+    """Whole test images rendered by each run."""
     at_once: int | None = None
-    """Runs beside each other; one, or as a suite has it."""
+    """Runs at a time; None is one, or as a suite has it."""
     reuse: Sequence[Path] = ()
     """Folders of other charts on this scene, whose runs need not be made again."""
 
@@ -48,13 +47,8 @@ class Asked:
 def processes(chart: Chart) -> Runner:
     """Makes the runs of a chart in processes of their own."""
     threads = {"OMP_NUM_THREADS": str(chart.machine["threads"])}
-    return ProcessRunner(
-        chart.data,
-        chart.protocol,
-        chart.folder,
-        environment=threads if chart.protocol.at_once > 1 else None,
-        stop=chart.stop,
-    )
+    environment = threads if chart.protocol.at_once > 1 else None
+    return ProcessRunner(chart.data, chart.protocol, chart.folder, WORKER, environment, chart.stop)
 
 
 def make_charts(
@@ -70,8 +64,7 @@ def make_charts(
 
     Args:
         data: a scene in nerfstudio's format.
-        out: the chart's folder; of several suites each has one of its own in it, and takes over
-            what the others there have made.
+        out: the chart's folder; several suites have one each in it, and reuse each other's runs.
         methods, samplers: what is compared, or
         suites: names of comparisons, or `all`.
         asked: how long and how often.
@@ -88,20 +81,18 @@ def make_charts(
         if asked.reuse:
             raise InputError("several suites share their runs by themselves: --reuse is for one")
         _check_shared(out)
-        charts = [_chart_of_suite(data, out / name, name, asked, out) for name in names]
-    elif names:
-        charts = [_chart_of_suite(data, out, names[0], asked)]
+        charts = [_chart_of(data, out / name, asked, name) for name in names]
+        for chart in charts:
+            others = [out / other for other in SUITES if other != chart.suite]
+            chart.reuse = [other for other in others if not unlike(other, chart.settings)]
     else:
-        charts = [_chart_of_methods(data, out, methods, samplers, asked)]
-    return {chart.folder.path: _made(chart, runner_for) for chart in charts}
+        name = names[0] if names else None
+        charts = [_chart_of(data, out, asked, name, methods, samplers)]
+    return {chart.folder.path: _make(chart, runner_for) for chart in charts}
 
 
 def _check_shared(out: Path) -> None:
-    """Whether the suites may have their folders in one.
-
-    Raises:
-        InputError: it holds something else.
-    """
+    """Refuses a folder that holds something else than suites."""
     known = [*SUITES, *LEFT_BY_SYSTEMS]
     held = sorted(path.name for path in out.iterdir()) if out.exists() else []
     others = [name for name in held if name not in known]
@@ -112,82 +103,61 @@ def _check_shared(out: Path) -> None:
         )
 
 
-def _chart_of_suite(
-    data: Path, out: Path, name: str, asked: Asked, beside: Path | None = None
+def _chart_of(
+    data: Path,
+    out: Path,
+    asked: Asked,
+    name: str | None,
+    methods: Sequence[str] = (),
+    samplers: Sequence[str] = (),
 ) -> Chart:
-    """The chart of a suite; `beside` is where the folders of other suites may be."""
-    suite, own = suite_of(name), suite_of(name).protocol
-    by_itself = asked.seconds is None and asked.steps is None
-    protocol = Protocol(
-        own.seconds if by_itself else asked.seconds,
-        own.steps if by_itself else asked.steps,
-        own.learn_seconds if by_itself and asked.learn_seconds is None else asked.learn_seconds,
-        asked.images,
-        at_once=own.at_once if asked.at_once is None else asked.at_once,
-    )
-    chart = Chart(
-        *(data, out, suite.contenders, asked.seeds, protocol, (name, suite.question)),
-        _command(data, protocol, asked, suite=name),
-        asked.reuse,
-    )
-    if beside is not None:
-        others = [beside / other for other in SUITES if other != name]
-        chart.reuse = fitting(others, chart.settings)
-    return chart
+    """The chart of a suite of a name, or of methods and samplers."""
+    suite = SUITES[name] if name is not None else None
+    compared = suite.contenders if suite else contenders(methods, samplers)
+    at_once = asked.at_once
+    if at_once is None:
+        at_once = suite.protocol.at_once if suite else 1
+    learn_seconds, times = asked.learn_seconds, (asked.seconds, asked.steps)
+    if suite and times == (None, None):
+        times = suite.protocol.seconds, suite.protocol.steps
+        learn_seconds = suite.learn_seconds if learn_seconds is None else learn_seconds
+    protocol = Protocol(*times, learn_seconds, asked.images, at_once=at_once)
+    options = {
+        "suite": name,
+        "seconds": protocol.seconds,
+        "steps": protocol.steps,
+        "learn-seconds": learn_seconds,
+        "images": asked.images,
+        "at-once": at_once if suite or at_once > 1 else None,
+        "methods": methods,
+        "samplers": samplers,
+        "seeds": asked.seeds,
+    }
+    titled = (name, suite.question) if name is not None and suite else None
+    command = command_line(data, options)
+    return Chart(data, out, compared, asked.seeds, protocol, titled, command, asked.reuse)
 
 
-def _chart_of_methods(
-    data: Path, out: Path, methods: Sequence[str], samplers: Sequence[str], asked: Asked
-) -> Chart:
-    compared = contenders(methods, samplers)
-    protocol = Protocol(
-        *(asked.seconds, asked.steps, asked.learn_seconds, asked.images),
-        at_once=1 if asked.at_once is None else asked.at_once,
-    )
-    command = _command(data, protocol, asked, methods=methods, samplers=samplers)
-    return Chart(data, out, compared, asked.seeds, protocol, None, command, asked.reuse)
-
-
-def _made(chart: Chart, runner_for: Callable[[Chart], Runner]) -> dict[str, Any]:
-    """What is missing of a chart is made, and all of it drawn."""
+def _make(chart: Chart, runner_for: Callable[[Chart], Runner]) -> dict[str, Any]:
+    """Makes what is missing of a chart, and draws all of it; returns its results."""
     say = functools.partial(CONSOLE.print, markup=False, highlight=False)
-    suite = f"{chart.suite[0]}, " if chart.suite is not None else ""
+    suite = f"{chart.suite}, " if chart.suite is not None else ""
     title = f"{chart.scene['name']}, {suite}{chart.protocol.describe()} a run"
     with resumable(say), bar(title) as show:
         chart.make(runner_for(chart), say, show)
     return chart.draw()
 
 
-def _command(
-    data: Path,
-    protocol: Protocol,
-    asked: Asked,
-    suite: str | None = None,
-    methods: Sequence[str] = (),
-    samplers: Sequence[str] = (),
-) -> str:
-    chosen = {
-        "suite": suite,
-        "seconds": protocol.seconds,
-        "steps": protocol.steps,
-        "learn-seconds": protocol.learn_seconds,
-        "images": protocol.images,
-        "at-once": protocol.at_once if protocol.at_once > 1 or suite is not None else None,
-    }
-    return command_line(
-        data, chosen, {"methods": methods, "samplers": samplers, "seeds": asked.seeds}
-    )
+def command_line(data: Path, options: Mapping[str, object]) -> str:
+    """The command that makes the same chart elsewhere: without this machine's paths.
 
-
-def command_line(
-    data: Path, chosen: Mapping[str, object], named: Mapping[str, Sequence[object]]
-) -> str:
-    """What to type for the same chart elsewhere: without this machine's paths."""
+    Args:
+        options: values by option; those that are None or empty are left out.
+    """
     words: list[object] = ["leco", "chart", "--data", data.resolve().name]
-    for name, value in chosen.items():
-        if value is not None:
-            words += [f"--{name}", f"{value:g}" if isinstance(value, float) else value]
-    for name, values in named.items():
-        if values:
-            words += [f"--{name}", *values]
+    for name, value in options.items():
+        if value is None or value == () or value == []:
+            continue
+        values = value if isinstance(value, (list, tuple)) else [value]
+        words += [f"--{name}", *(f"{v:g}" if isinstance(v, float) else v for v in values)]
     return shlex.join([str(word) for word in words])

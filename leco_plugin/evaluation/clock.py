@@ -1,28 +1,33 @@
-"""Training time: a clock that stands still while a run is evaluated, and when a run is over."""
+"""Training time and peak memory: a clock that stops during evaluation, and the end of a run."""
 
 from __future__ import annotations
 
 import math
+import sys
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
+from pathlib import Path
 
 import torch
 
+STATUS = Path("/proc/self/status")
+
 
 class Clock:
-    """Counts from a step's start to its end, the device waited for at both."""
+    """Counts the seconds between `start` and `stop`; waits for the device at both."""
 
     def __init__(self) -> None:
         self.seconds = 0.0
         self._started: float | None = None
 
     def start(self) -> None:
+        """Goes on from here."""
         synchronize()
         self._started = time.perf_counter()
 
     def stop(self) -> float:
-        """Stands still from here; returns the seconds since the start."""
+        """Stops; returns the seconds since the start."""
         passed = self.now() - self.seconds
         self.seconds += passed
         self._started = None
@@ -43,7 +48,7 @@ def synchronize() -> None:
 
 
 def warm_up(device: torch.device | str, seconds: float = 0.2) -> None:
-    """Has the device work for a moment, so that no first step pays for threads and handles."""
+    """Keeps the device busy for a moment, so that the first step does not pay for its start-up."""
     weights = torch.zeros(64, 64, device=device, requires_grad=True)
     end = time.perf_counter() + seconds
     while time.perf_counter() < end:
@@ -61,8 +66,7 @@ class Budget:
     steps: int | None = None
     """Training steps."""
     learn_seconds: float | None = None
-    """Most of that time, about, that learning an occupancy may take; None leaves it to the method.
-    """
+    """Limit, about, for learning an occupancy; None leaves it to the method."""
 
     def __post_init__(self) -> None:
         if self.seconds is None and self.steps is None:
@@ -83,7 +87,7 @@ class Budget:
 
 
 def timed(function: Callable[..., object], clock: Clock) -> Callable[..., object]:
-    """The same function, its time counted by a clock of its own."""
+    """The same function, its time counted by a clock."""
 
     def run(*args: object, **kwargs: object) -> object:
         clock.start()
@@ -93,3 +97,26 @@ def timed(function: Callable[..., object], clock: Clock) -> Callable[..., object
             clock.stop()
 
     return run
+
+
+def peak_process_bytes() -> int:
+    """Highest resident memory of this process so far.
+
+    The kernel's own mark where there is one: `getrusage` starts with the peak of the process that
+    started this one.
+    """
+    try:
+        for line in STATUS.read_text().splitlines():
+            if line.startswith("VmHWM:"):
+                return int(line.split()[1]) * 1024
+    except OSError:
+        pass
+    import resource
+
+    unit = 1 if sys.platform == "darwin" else 1024
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * unit
+
+
+def peak_allocator_bytes() -> int | None:
+    """Highest memory that tensors on CUDA have held; None without CUDA."""
+    return int(torch.cuda.max_memory_allocated()) if torch.cuda.is_available() else None

@@ -1,7 +1,8 @@
-"""How much space an occupancy keeps when all lose equally much: representations side by side.
+"""How much space representations of an occupancy keep when all lose equally much.
 
-Each representation has a score of its own, o(x) of a gate or the largest density in a grid's cell;
-its threshold is set so that exactly the same share of the weight near surfaces is lost.
+Each has a score, o(x) of a gate or the largest density in a grid's cell; its threshold is set so
+that the same share of the weight near surfaces is lost. Only places that rays of photographs reach
+count as space: nothing teaches a gate or a grid elsewhere, and no ray asks.
 """
 
 from __future__ import annotations
@@ -12,6 +13,7 @@ from functools import partial
 from typing import Any
 
 import torch
+from nerfstudio.cameras.rays import RayBundle
 from torch import Tensor
 
 from leco_plugin.evaluation.field_grids import (
@@ -22,29 +24,28 @@ from leco_plugin.evaluation.field_grids import (
     looked_up,
     plain_and_dilated,
 )
-from leco_plugin.evaluation.inspection import ViewBox
-from leco_plugin.evaluation.reached_volume import (
-    candidates_of,
-    mapped_box,
-    rays_of_photographs,
-    reached_volume,
-)
-from leco_plugin.learning.dense import dense_reference, evaluating
-from leco_plugin.learning.held_out_rendering import calibration_rays
+from leco_plugin.evaluation.inspection import ViewBox, whole_box
+from leco_plugin.learning.calibration import CalibrationConfig
+from leco_plugin.learning.dense import dense_reference, evaluating, in_chunks
 from leco_plugin.models.gate import occupancy_from_logits
-from leco_plugin.models.leco import LecoModel
-from leco_plugin.models.rendering import Rays, mapped_middles
+from leco_plugin.models.mixture import Mixture
+from leco_plugin.models.rendering import backdrop_of, mapped_middles
 from leco_plugin.occupancy import gate_precision
+from leco_plugin.scenes.learning_data import held_out_rays
 
+CALIBRATION = CalibrationConfig()
 LOST_SURFACE_MASS = 1e-3
-"""Of the weight near surfaces."""
+"""Share of the weight near surfaces that each representation loses."""
 VOLUME_POINTS = 1 << 17
-"""In the whole box, those that no ray reaches among them."""
+"""Positions drawn in the whole box, of which rays reach some."""
 TAUGHT_RAYS = 1 << 15
+"""Rays of photographs that say what is reached, and of whose densities grids hear."""
+CELLS = 64
+"""Along an axis of the mapped cube: a cell is reached if it holds a candidate of those rays."""
 MOST_ON_CPU = 2e8
-"""Densities asked for one grid: about three minutes of two cores."""
+"""Densities evaluated for one grid: about three minutes of two cores."""
 SPARED = 0.1
-"""Of the allowed loss: cells of a coarse grid that can be had for it are empty in finer ones."""
+"""Share of the loss for which cells of a coarse grid are taken as empty in finer ones."""
 
 
 def threshold_losing(weights: Tensor, scores: Tensor, lost: float) -> float:
@@ -78,23 +79,24 @@ def kept_shares(
 
 @torch.no_grad()
 def at_equal_loss(
-    model: LecoModel,
+    mixture: Mixture,
     datamanager: Any,
     grids: Sequence[int | tuple[int, int, int]] = (),
     until_as_little: bool = False,
     others: Mapping[str, Callable[[Tensor], Tensor]] | None = None,
+    config: CalibrationConfig = CALIBRATION,
 ) -> dict[str, Any]:
-    """What the model's gate keeps at `LOST_SURFACE_MASS`, and grids made from the same field.
+    """What the mixture's gate keeps at `LOST_SURFACE_MASS`, and grids made from the same field.
 
-    Meant for the model as it was at the moment of freezing: what a gate skips is not trained from
-    then on. Only places that rays of photographs reach count as volume. Grids hear of the densities
-    along those rays, as a gate does while it learns, beside random places in their cells.
+    Meant for the mixture at the moment of freezing: later its field is trained only where the gate
+    keeps. Grids hear of the densities along rays, as a gate does, beside random places.
 
     Args:
-        model: whose gate is frozen; it is left as it was.
+        mixture: whose gate is frozen; it is left as it was.
         datamanager: with held-out training pixels.
         grids: cells along each axis of the grids, one number for all three or one for each.
-        until_as_little: whether the first grid that keeps as little as the gate is the last.
+        until_as_little: whether to end with the first grid that keeps as little as the gate.
+        config: how many rays.
         others: further representations by name, each a score of mapped positions [N, 3]: [N].
     Returns:
         `lost_surface_mass`; `reached_volume`, the share of the scene's box that rays reach;
@@ -106,87 +108,152 @@ def at_equal_loss(
     Raises:
         ValueError: held-out rays see no surface.
     """
-    with evaluating(model):
-        mapped, weights, occupancies = _measured(model, datamanager)
+    with evaluating(mixture):
+        mapped, weights, occupancies = _measured(mixture, datamanager, config)
         if not bool((weights > 0.0).any()):
             raise ValueError("no surface is seen by the held-out rays, so that none can be lost")
-        taught = candidates_of(model, rays_of_photographs(datamanager, TAUGHT_RAYS))
-        volume = reached_volume(model, taught, VOLUME_POINTS)
-        kept = kept_shares(
-            weights, occupancies, in_parts(partial(_occupancy, model), volume), LOST_SURFACE_MASS
-        )
-        beside = {}
-        for name, score in (others or {}).items():
-            of_rays, of_volume = in_parts(score, mapped), in_parts(score, volume)
-            beside[name] = _shares(kept_shares(weights, of_rays, of_volume, LOST_SURFACE_MASS))
-        rows, left_out = [], []
-        if grids:
-            box = mapped_box(model)
+        taught = candidates_of(mixture, rays_of_photographs(datamanager, TAUGHT_RAYS))
+        volume = reached_volume(mixture, taught, VOLUME_POINTS)
 
-            def floor_of(scores: Tensor) -> float:
-                of_rays = looked_up(scores, box, mapped)
-                return threshold_losing(weights, of_rays, SPARED * LOST_SURFACE_MASS)
+        def kept_by(of_rays: Tensor, of_volume: Tensor) -> dict[str, float]:
+            kept = kept_shares(weights, of_rays, of_volume, LOST_SURFACE_MASS)
+            return {"kept_reached_volume": round(kept[0], 5), "kept_candidates": round(kept[1], 5)}
 
-            known = taught, density_of(model, taught)
-            most = MOST_ON_CPU if model.device.type == "cpu" else math.inf
-            filling = FieldGrids(partial(density_of, model), box, known, floor_of, most)
-            for resolution in grids:
-                sizes = (resolution,) * 3 if isinstance(resolution, int) else resolution
-                scores = filling.fill(sizes) if fits_memory(math.prod(sizes)) else None
-                if scores is None:
-                    left_out.append(resolution)
-                    continue
-                row: dict[str, Any] = {
-                    "resolution": resolution,
-                    "bytes": math.ceil(math.prod(sizes) / 8),
-                    "update_seconds": round(filling.clock.seconds, 3),
-                }
-                rows.append(row | _better_of_dilations(scores, box, mapped, weights, volume))
-                if until_as_little and rows[-1]["kept_reached_volume"] <= round(kept[0], 5):
-                    break
+        kept = kept_by(occupancies, in_parts(partial(_occupancy, mixture), volume))
+        beside = {
+            name: kept_by(in_parts(score, mapped), in_parts(score, volume))
+            for name, score in (others or {}).items()
+        }
+        rows: list[dict[str, Any]] = []
+        left_out = []
+        filling = _grids_of(mixture, taught, mapped, weights) if grids else None
+        for resolution in grids:
+            assert filling is not None
+            sizes = (resolution,) * 3 if isinstance(resolution, int) else resolution
+            scores = filling.fill(sizes) if fits_memory(math.prod(sizes)) else None
+            if scores is None:
+                left_out.append(resolution)
+                continue
+            both = [
+                {"dilated": bool(dilated), **kept_by(*scored)}
+                for dilated, scored in enumerate(
+                    plain_and_dilated(scores, filling.box, mapped, volume)
+                )
+            ]
+            row = {
+                "resolution": resolution,
+                "bytes": math.ceil(math.prod(sizes) / 8),
+                "update_seconds": round(filling.clock.seconds, 3),
+            }
+            rows.append(row | min(both, key=lambda one: one["kept_reached_volume"]))
+            least = rows[-1]["kept_reached_volume"]
+            if until_as_little and least <= kept["kept_reached_volume"]:
+                break
     return {
         "lost_surface_mass": LOST_SURFACE_MASS,
         "reached_volume": round(len(volume) / VOLUME_POINTS, 5),
-        **_shares(kept),
+        **kept,
         **({"others": beside} if beside else {}),
         "grids": rows,
         "left_out": left_out,
     }
 
 
-def _better_of_dilations(
-    scores: Tensor, box: ViewBox, mapped: Tensor, weights: Tensor, volume: Tensor
-) -> dict[str, Any]:
-    """What a grid keeps as it is, or dilated, whichever is less."""
-    found = []
-    for dilated, (of_rays, of_volume) in enumerate(plain_and_dilated(scores, box, mapped, volume)):
-        kept = kept_shares(weights, of_rays, of_volume, LOST_SURFACE_MASS)
-        found.append({"dilated": bool(dilated), **_shares(kept)})
-    return min(found, key=lambda one: one["kept_reached_volume"])
+def _grids_of(mixture: Mixture, taught: Tensor, mapped: Tensor, weights: Tensor) -> FieldGrids:
+    """Grids of the model's field that hear of its density at the places `taught` [M, 3]."""
+    box = mapped_box(mixture)
+
+    def floor_of(scores: Tensor) -> float:
+        of_rays = looked_up(scores, box, mapped)
+        return threshold_losing(weights, of_rays, SPARED * LOST_SURFACE_MASS)
+
+    most = MOST_ON_CPU if mixture.device.type == "cpu" else math.inf
+    known = taught, density_of(mixture, taught)
+    return FieldGrids(partial(density_of, mixture), box, known, floor_of, most)
 
 
-def _shares(kept: tuple[float, float]) -> dict[str, float]:
-    return {"kept_reached_volume": round(kept[0], 5), "kept_candidates": round(kept[1], 5)}
-
-
-def _measured(model: LecoModel, datamanager: Any) -> tuple[Tensor, Tensor, Tensor]:
+def _measured(
+    mixture: Mixture, datamanager: Any, config: CalibrationConfig
+) -> tuple[Tensor, Tensor, Tensor]:
     """Candidates of held-out rays before the backdrop: mapped [M, 3], weights near surfaces [M],
     and o(x) [M]."""
-    rays, _ = calibration_rays(model, datamanager)
-    most = model.config.calibration.rays_at_once
+    rays, _ = held_out_rays(mixture, datamanager, config.rays)
     pieces = []
-    for first in range(0, len(rays.origins), most):
-        part = slice(first, first + most)
-        some = Rays._make(None if value is None else value[part] for value in rays)
-        found = dense_reference(model, some)
+    for some in in_chunks(rays, config.rays_at_once):
+        found = dense_reference(mixture, some)
         before = ~found.always_kept
-        places = mapped_middles(model.space, some, found.intervals)
+        places = mapped_middles(mixture.region.space, some, found.intervals)
         weights = found.weights * found.near_surface
         pieces.append((places[before], weights[before], found.occupancies[before]))
     places, weights, occupancies = (torch.cat(parts) for parts in zip(*pieces))
     return places, weights, occupancies
 
 
-def _occupancy(model: LecoModel, mapped: Tensor) -> Tensor:
-    with gate_precision(model.device.type, model.precision):
-        return occupancy_from_logits(model.gate(mapped))
+def _occupancy(mixture: Mixture, mapped: Tensor) -> Tensor:
+    with gate_precision(mixture.device.type, mixture.precision):
+        return occupancy_from_logits(mixture.gate(mapped))
+
+
+def mapped_box(mixture: Mixture) -> ViewBox:
+    """The scene's box in mapped coordinates; an unbounded scene fills the cube."""
+    device = mixture.device
+    if mixture.region.space.kind != "box":
+        return ViewBox(-torch.ones(3, device=device), torch.ones(3, device=device))
+    box = whole_box(mixture.occupancy())
+    low, high = mixture.region.space.map(torch.stack([box.low, box.high]).to(device)).clamp(
+        -1.0, 1.0
+    )
+    return ViewBox(low, high)
+
+
+def reached_volume(mixture: Mixture, taught: Tensor, count: int, seed: int = 0) -> Tensor:
+    """Mapped positions spread evenly over what rays reach of the scene's box: [P, 3], P <= count.
+
+    Args:
+        taught: [M, 3] mapped candidates of rays.
+        count: positions in the whole box.
+    """
+    box = whole_box(mixture.occupancy())
+    unit = torch.rand(count, 3, generator=torch.Generator().manual_seed(seed))
+    positions = torch.lerp(box.low, box.high, unit).to(mixture.device)
+    mapped = mixture.region.space.map(positions).clamp(-1.0, 1.0)
+    return mapped[reached(taught, mapped)]
+
+
+def reached(taught: Tensor, mapped: Tensor) -> Tensor:
+    """Which mapped positions [P, 3] share a cell with one of `taught` [M, 3]: bool [P]."""
+
+    def cells(places: Tensor) -> Tensor:
+        i, j, k = ((places + 1.0) * (CELLS / 2)).long().clamp(0, CELLS - 1).unbind(dim=-1)
+        return (i * CELLS + j) * CELLS + k
+
+    found = torch.zeros(CELLS**3, dtype=torch.bool, device=taught.device)
+    found[cells(taught)] = True
+    return found[cells(mapped)]
+
+
+def rays_of_photographs(datamanager: Any, count: int, seed: int = 0) -> RayBundle:
+    """Rays anywhere in the training photographs, whose pixels need not be read.
+
+    Training is not disturbed: its pixels and its random numbers are not used.
+    """
+    cameras = datamanager.train_dataset.cameras.to("cpu")
+    generator = torch.Generator().manual_seed(seed)
+    numbers = torch.randint(len(cameras), (count, 1), generator=generator)
+    sizes = torch.cat([cameras.height[numbers[:, 0]], cameras.width[numbers[:, 0]]], dim=-1)
+    coordinates = torch.rand(count, 2, generator=generator) * sizes
+    bundle: RayBundle = cameras.generate_rays(camera_indices=numbers, coords=coordinates)
+    return bundle
+
+
+@torch.no_grad()
+def candidates_of(mixture: Mixture, bundle: RayBundle, rays_at_once: int = 1024) -> Tensor:
+    """Mapped middles [M, 3] of all candidates of rays, backdrops left out."""
+    bundle = bundle.to(mixture.device)
+    rays = mixture.rays(bundle.origins, bundle.directions, None)
+    pieces = []
+    for some in in_chunks(rays, rays_at_once):
+        intervals = mixture.with_backdrops(some, mixture.candidates(some))
+        middles = mapped_middles(mixture.region.space, some, intervals)
+        pieces.append(middles[~backdrop_of(intervals, some)])
+    return torch.cat(pieces)

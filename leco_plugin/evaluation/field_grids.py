@@ -1,7 +1,7 @@
 """Occupancy grids of a trained field, each refined from one half as fine.
 
-A cell is asked only where the coarser grid, or a neighbour of its cell, has not ruled it out; so
-512^3 cells take as long as their surface asks for.
+Densities are evaluated only in cells that the coarser grid, or a neighbour there, has not ruled
+out: the time of 512^3 cells depends on the surface in them.
 """
 
 from __future__ import annotations
@@ -16,14 +16,14 @@ from torch.nn.functional import max_pool3d
 
 from leco_plugin.evaluation.clock import Clock
 from leco_plugin.evaluation.inspection import ViewBox
-from leco_plugin.models.leco import LecoModel
+from leco_plugin.models.mixture import Mixture
 from leco_plugin.models.rendering import gate_values_and_routes
 from leco_plugin.occupancy import gate_precision
 from leco_plugin.samplers.boxes import cells_of
 
 FEWEST_PROBES, PROBES_ALONG = 8, 2048
-"""Densities asked in each cell, at random places; the largest is the cell's score. More in coarse
-cells, of which a surface may fill a corner."""
+"""Densities evaluated at random places of a cell; the largest is its score. More in coarse cells,
+of which a surface may fill a corner."""
 CELLS_AT_ONCE = 1 << 18
 POINTS_AT_ONCE = 1 << 16
 BYTES_A_CELL = 16
@@ -41,11 +41,11 @@ class FieldGrids:
     Args:
         density: of the field.
         box: in mapped coordinates.
-        known: mapped positions [M, 3] and densities [M] that count beside those that are asked: a
-            surface that fills a thousandth of a cell is missed by hundreds of random places.
-        floor_of: the score below which a cell of a grid [nx, ny, nz], and all around it, are empty
-            in finer grids too.
-        most: densities that may be asked for one grid.
+        known: mapped positions [M, 3] and densities [M] that count too: hundreds of random places
+            miss a surface that fills a thousandth of a cell.
+        floor_of: gives, for the scores [nx, ny, nz] of a grid, the score below which a cell and
+            its neighbours are empty in finer grids too.
+        most: densities that may be evaluated for one grid.
     """
 
     def __init__(
@@ -61,12 +61,12 @@ class FieldGrids:
         self.scores: Tensor | None = None
         self.floor = 0.0
         self.clock = Clock()
-        """Counts what the last grid took, those that it was refined from included."""
+        """The time of the last grid, including those that it was refined from."""
 
     def fill(self, sizes: Sequence[int]) -> Tensor | None:
-        """Scores [nx, ny, nz] of the cells of a grid; None where it asks more than it may.
+        """Scores [nx, ny, nz] of the cells of a grid; None where it would ask more than `most`.
 
-        Those of the grid before serve if it is half as fine.
+        The grid filled before is refined if it is half as fine.
 
         Args:
             sizes: cells along each axis.
@@ -159,8 +159,10 @@ def filled(
 
 
 def dilate(scores: Tensor) -> Tensor:
-    """Each cell with the score of its largest neighbour: random places in a small cell miss what is
-    dense there, and a gate is taught a margin too. [nx, ny, nz]."""
+    """Each cell with the score of its largest neighbour: [nx, ny, nz].
+
+    Random places in a small cell miss what is dense there, and a gate is taught a margin too.
+    """
     return max_pool3d(scores[None, None], 3, stride=1, padding=1)[0, 0]
 
 
@@ -173,7 +175,7 @@ def looked_up(scores: Tensor, box: ViewBox, mapped: Tensor) -> Tensor:
 def plain_and_dilated(
     scores: Tensor, box: ViewBox, *places: Tensor
 ) -> Iterator[tuple[Tensor, ...]]:
-    """What a grid says of mapped positions, several [N, 3], as it is and then dilated: [N] each."""
+    """Scores [N] of several sets of mapped positions [N, 3]: of the grid as it is, then dilated."""
     for some in (scores, dilate(scores)):
         yield tuple(looked_up(some, box, mapped) for mapped in places)
 
@@ -188,15 +190,15 @@ def fits_memory(cells: int) -> bool:
 
 
 @torch.no_grad()
-def density_of(model: LecoModel, mapped: Tensor) -> Tensor:
-    """Density of a model's field at mapped positions [N, 3], per half extent: [N]."""
+def density_of(mixture: Mixture, mapped: Tensor) -> Tensor:
+    """Density of a mixture's field at mapped positions [N, 3], per half extent: [N]."""
 
     def part_of(part: Tensor) -> Tensor:
-        with gate_precision(model.device.type, model.precision):
+        with gate_precision(mixture.device.type, mixture.precision):
             values, routes = gate_values_and_routes(
-                model.gate(part), model.routing, model.field.experts.those_left()
+                mixture.gate(part), mixture.routing, mixture.field.experts.those_left()
             )
-            sigmas: Tensor = model.field.density(part, routes, values)[0]
+            sigmas: Tensor = mixture.field.density(part, routes, values)[0]
         return sigmas
 
     return in_parts(part_of, mapped)

@@ -1,32 +1,44 @@
-"""A picture of an occupancy: slices of o(x) with the cameras, and the kept points in space."""
+"""Pictures of an occupancy: slices of o(x) and the kept points, and how it was learned."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import copy
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
+from PIL import Image
 from torch import Tensor
 
+from leco_plugin.chart.theme import LIGHT, new_figure, plain
 from leco_plugin.evaluation.inspection import ViewBox, cameras_of, exposed, query, whole_box
+from leco_plugin.learning.history import FILE_NAME, GateHistory
+from leco_plugin.log import bar
 from leco_plugin.occupancy import CALIBRATED_AT, Occupancy
+from leco_plugin.scenes.input_error import InputError
 
 SEARCH_CELLS = 64
 """Along the longest side, to find where anything is kept at all."""
 CELLS = 128
 """Along the longest side, for the points in space."""
-PIXELS = 640
-"""Along the longer side of a slice."""
+PIXELS, FRAME_PIXELS = 640, 300
+"""Along the longer side of a slice: of a picture, and of a look at a history."""
 MOST_POINTS = 50_000
 HORIZONTAL = (0.12, 0.4)
 """Heights of the horizontal slices, as shares of the way from the ground to the highest roofs."""
-
-COLOURS = "magma"
-CONTOUR = "#4fd8eb"
-TRUTH = "#ffffff"
-CAMERA = "#66e08a"
+COLOURS, CONTOUR, TRUTH, CAMERA = "magma", "#4fd8eb", "#ffffff", "#66e08a"
 AXES = "xyz"
+STILL, MOST_FRAMES = 4, 12
+"""Looks in a still picture of a history, and in one that moves."""
+FRAME_COLOURS = 48
+"""Of a picture that moves, so that a page may hold it."""
+FRAME, LAST_FRAME = 250, 3000
+"""Milliseconds for which a frame is shown."""
+DPI = 80
+OPAQUE = 1e4
+"""Density, per half extent, that is drawn for more: opaque within a ten-thousandth."""
 
 
 def draw(occupancy: Occupancy, path: str | Path, cameras: Tensor | None = None) -> Path:
@@ -39,33 +51,26 @@ def draw(occupancy: Occupancy, path: str | Path, cameras: Tensor | None = None) 
     Raises:
         OSError, ValueError: the picture cannot be written there, or is of no known kind.
     """
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
-
     cameras = cameras_of(occupancy) if cameras is None else cameras.detach().cpu().float()
     box = interesting_box(occupancy, cameras)
     low, high = heights_seen_from_above(occupancy, box)
     points, normals = surface_points(occupancy, box, low)
-    figure = Figure(figsize=(15, 9.4), layout="constrained", facecolor="white")
-    FigureCanvasAgg(figure)
+    figure = new_figure((15, 9.4), layout="constrained")
     wide, tall = (box.high - box.low)[[0, 2]].tolist()
-    grid = figure.add_gridspec(
-        2, 6, height_ratios=(1.0, min(1.0, max(0.4, 1.6 * tall / wide))), hspace=0.04
-    )
-    shown = None
-    for i, share in enumerate(HORIZONTAL):
-        axes = figure.add_subplot(grid[0, 2 * i : 2 * i + 2])
-        at = low + share * (high - low)
-        shown = draw_slice(axes, occupancy, box, 2, at, cameras=cameras)
-    middle = points.median(dim=0).values if len(points) else (box.low + box.high) / 2
-    for i, normal in enumerate((1, 0)):
-        axes = figure.add_subplot(grid[1, 3 * i : 3 * i + 3])
-        draw_slice(axes, occupancy, box, normal, float(middle[normal]), cameras=cameras)
+    ratios = (1.0, min(1.0, max(0.4, 1.6 * tall / wide)))
+    grid = figure.add_gridspec(2, 6, height_ratios=ratios, hspace=0.04)
+    middle = _middle_of(points, box)
+    slices = [
+        (grid[0, 2 * i : 2 * i + 2], 2, low + t * (high - low)) for i, t in enumerate(HORIZONTAL)
+    ]
+    slices += [(grid[1, 3 * i : 3 * i + 3], a, float(middle[a])) for i, a in enumerate((1, 0))]
+    for place, normal, at in slices:
+        axes = figure.add_subplot(place)
+        shown = draw_slice(axes, occupancy, box, normal, at, cameras=cameras)
     _draw_points(figure.add_subplot(grid[0, 4:6], projection="3d"), points, normals, (low, high))
-    assert shown is not None
-    bar = figure.colorbar(shown, ax=figure.axes[2:4], shrink=0.9, pad=0.01, fraction=0.03)
-    bar.ax.axhline(occupancy.threshold, color=CONTOUR, linewidth=2)
-    bar.set_label("o(x)")
+    colour_bar = figure.colorbar(shown, ax=figure.axes[2:4], shrink=0.9, pad=0.01, fraction=0.03)
+    colour_bar.ax.axhline(occupancy.threshold, color=CONTOUR, linewidth=2)
+    colour_bar.set_label("o(x)")
     figure.suptitle(_title(occupancy, cameras), fontsize=13)
     figure.savefig(path, dpi=110)
     return Path(path)
@@ -124,6 +129,11 @@ def draw_slice(
     return shown
 
 
+def _middle_of(points: Tensor, box: ViewBox) -> Tensor:
+    """[3] the median of points [P, 3]; the middle of the box where there are none."""
+    return points.median(dim=0).values if len(points) else (box.low + box.high) / 2
+
+
 def interesting_box(occupancy: Occupancy, cameras: Tensor) -> ViewBox:
     """The box around what is kept and the cameras, inside the occupancy's whole box."""
     whole = whole_box(occupancy)
@@ -138,9 +148,9 @@ def interesting_box(occupancy: Occupancy, cameras: Tensor) -> ViewBox:
 
 
 def heights_seen_from_above(occupancy: Occupancy, box: ViewBox) -> tuple[float, float]:
-    """Heights between which nearly all of what a look straight down meets lies, scene units.
+    """Heights, scene units, between which lies nearly all that a view straight down shows.
 
-    What is kept below the ground, where no camera sees, would otherwise be taken for the scene.
+    They leave out what is kept below the ground, where no camera sees.
     """
     _, positions, kept = _kept_cells(occupancy, box, CELLS)
     heights = torch.where(kept, positions[..., 2], -torch.inf).amax(dim=-1)
@@ -205,3 +215,122 @@ def _title(occupancy: Occupancy, cameras: Tensor) -> str:
         parts.append(f"{skipped:.1%} of all candidates skipped{then}")
     parts.append("threshold blue" + (", cameras green" if len(cameras) else ""))
     return " · ".join(parts)
+
+
+def draw_history(occupancy: Occupancy, folder: Path, path: Path) -> Path:
+    """Draws how an occupancy was learned.
+
+    Args:
+        occupancy: as it became.
+        folder: of the run, with its history.
+        path: of the picture. A .gif moves; others show the first look, two between, and the last.
+    Raises:
+        InputError: the run has no history, or one of another gate.
+        OSError, ValueError: the picture cannot be written there, or is of no known kind.
+    """
+    film = _Film(occupancy, _read(occupancy, folder))
+    count = len(film.history)
+    if path.suffix.lower() != ".gif":
+        film.still(spread_evenly(count, STILL)).savefig(path, dpi=DPI)
+        return path
+    frames = []
+    shown = spread_evenly(count, MOST_FRAMES)
+    with bar("Drawing how it was learned") as progress:
+        for number, figure in enumerate(film.moving(shown)):
+            figure.canvas.draw()
+            pixels = np.asarray(figure.canvas.buffer_rgba())[..., :3]
+            # few colours without noise, which GIF cannot compress
+            few = Image.fromarray(pixels).quantize(FRAME_COLOURS, dither=Image.Dither.NONE)
+            frames.append(few)
+            progress((number + 1) / len(shown))
+    durations = [FRAME] * (len(frames) - 1) + [LAST_FRAME]
+    frames[0].save(path, save_all=True, append_images=frames[1:], duration=durations, loop=0)
+    return path
+
+
+def spread_evenly(count: int, most: int) -> list[int]:
+    """Up to `most` of the numbers below `count`, the first and the last among them."""
+    places = torch.linspace(0, count - 1, min(count, most))
+    numbers: list[int] = places.round().int().unique().tolist()
+    return numbers
+
+
+def _read(occupancy: Occupancy, folder: Path) -> GateHistory:
+    file = folder / FILE_NAME
+    try:
+        return GateHistory.load(file, occupancy.gate)
+    except FileNotFoundError:
+        raise InputError(
+            f"there is no {file}: a run of leco-occupancy leaves one with "
+            "--pipeline.model.schedule.steps-per-record 10"
+        ) from None
+    except ValueError as error:
+        raise InputError(str(error)) from None
+
+
+class _Film:
+    """Draws looks at a history: two slices each, and lines of what each expert got."""
+
+    def __init__(self, occupancy: Occupancy, history: GateHistory) -> None:
+        self.history = history
+        self.occupancy = copy.deepcopy(occupancy)
+        self.box = interesting_box(occupancy, cameras_of(occupancy))
+        low, high = heights_seen_from_above(occupancy, self.box)
+        middle = _middle_of(surface_points(occupancy, self.box, low)[0], self.box)
+        self.places = ((2, low + HORIZONTAL[0] * (high - low)), (1, float(middle[1])))
+        """The normal of each slice and its position along that."""
+        self.shares = torch.stack(history.shares).numpy()
+        self.densities = torch.stack(history.densities).clamp(max=OPAQUE).numpy()
+
+    def still(self, looks: list[int]) -> Any:
+        """A figure with a column for each of some looks, over the lines of all."""
+        figure = new_figure((4 * len(looks), 10), dpi=DPI, layout="constrained")
+        grid = figure.add_gridspec(3, 2 * len(looks), height_ratios=(1.0, 0.5, 0.8))
+        for column, look in enumerate(looks):
+            for row in range(2):
+                axes = figure.add_subplot(grid[row, 2 * column : 2 * column + 2])
+                self._draw_slice(axes, row, look)
+                if row == 0:
+                    axes.set_title(f"step {self.history.steps[look]}: " + axes.get_title())
+        half = len(looks)
+        self._draw_lines(figure.add_subplot(grid[2, :half]), figure.add_subplot(grid[2, half:]))
+        return figure
+
+    def moving(self, looks: list[int]) -> Iterator[Any]:
+        """One figure, drawn anew for each of some looks."""
+        figure = new_figure((9.6, 5.4), dpi=DPI, layout="constrained")
+        columns = figure.add_gridspec(1, 2)
+        slices = columns[0].subgridspec(2, 1, height_ratios=(3, 1))
+        curves = columns[1].subgridspec(2, 1)
+        left, right = ([figure.add_subplot(grid[i]) for i in range(2)] for grid in (slices, curves))
+        for look in looks:
+            for axes in (*left, *right):
+                axes.clear()
+            for row, axes in enumerate(left):
+                self._draw_slice(axes, row, look)
+            self._draw_lines(right[0], right[1], look)
+            figure.suptitle(f"learning what is empty: step {self.history.steps[look]}")
+            yield figure
+
+    def _draw_slice(self, axes: Any, row: int, look: int) -> None:
+        self.occupancy.gate.load_state_dict(self.history.weights[look])
+        normal, at = self.places[row]
+        draw_slice(axes, self.occupancy, self.box, normal, at, pixels=FRAME_PIXELS)
+
+    def _draw_lines(self, above: Any, below: Any, look: int | None = None) -> None:
+        """Shares of points and mean densities against steps, as far as one look, or all."""
+        steps, upto = self.history.steps, None if look is None else look + 1
+        for expert in range(self.shares.shape[1]):
+            colour = LIGHT.colours[expert % len(LIGHT.colours)]
+            style = {"color": colour, "linewidth": 2.6 if expert == 0 else 1.5}
+            label = "empty space" if expert == 0 else f"scene expert {expert}"
+            above.plot(steps[:upto], 100.0 * self.shares[:upto, expert], label=label, **style)
+            below.plot(steps[:upto], self.densities[:upto, expert], **style)
+        above.set(ylabel="share of points, %", ylim=(0, 140), yticks=range(0, 101, 20))
+        below.set_ylabel("mean density, per half extent\n(10⁴: opaque)")
+        below.set_yscale("symlog", linthresh=1.0)
+        below.set_ylim(0, 1.5 * max(1.0, float(self.densities.max())))
+        for axes in (above, below):
+            axes.set(xlim=(min(steps), max(steps) or 1), xlabel="step")
+            plain(axes, LIGHT)
+        above.legend(fontsize=8, ncols=3, loc="upper center")

@@ -1,6 +1,6 @@
-"""One training run for a fixed time or number of steps through nerfstudio's own trainer.
+"""One training run of fixed time or steps in nerfstudio's trainer, and its figures on test images.
 
-Evaluation is off the clock; learning an occupancy is on it, and told apart.
+Evaluation is off the clock; learning an occupancy is on it.
 """
 
 from __future__ import annotations
@@ -19,20 +19,28 @@ from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackLocati
 from nerfstudio.engine.trainer import Trainer, TrainerConfig
 from nerfstudio.utils import writer
 
-from leco_plugin.evaluation.clock import Budget, Clock, warm_up
-from leco_plugin.evaluation.field_queries import FieldQueries, counted
-from leco_plugin.evaluation.grid_updates import GridUpdates
-from leco_plugin.evaluation.held_out_images import evaluate_images, psnr_on_rays
-from leco_plugin.evaluation.json_file import finite_or_null
-from leco_plugin.evaluation.peak_memory import peak_allocator_bytes, peak_process_bytes
+from leco_plugin.evaluation.clock import (
+    Budget,
+    Clock,
+    peak_allocator_bytes,
+    peak_process_bytes,
+    warm_up,
+)
+from leco_plugin.evaluation.metrics import image_metrics
+from leco_plugin.evaluation.queries import FieldQueries, GridUpdates, counted
+from leco_plugin.evaluation.report import finite_or_null
 from leco_plugin.hosts.learn_first import FIRST_TIMED, TIMED_STEPS, keep_within
+from leco_plugin.scenes.input_error import InputError
+from leco_plugin.studio.host_models import true_colours
 
+RAYS_AT_ONCE = 1024
+"""Test rays rendered at a time: few, so that an evaluation does not set the peak memory."""
 CURVE_RAYS = 8192
-"""Test pixels behind each point of a curve, its end included."""
+"""Test pixels behind each point of a curve."""
 
 PRICES = ("threshold", "empty_fraction", "lost_mass", "lost_surface_mass", "image_price_db")
 ENDLESS = 10_000_000
-"""Steps that no timed run reaches; the clock ends it."""
+"""Steps that no run reaches before its time is over."""
 
 
 @dataclass
@@ -271,3 +279,77 @@ def run_training(trainer: Trainer) -> None:
     """nerfstudio's training loop, without the last checkpoint and its banner."""
     trainer._after_train = lambda: None  # type: ignore[method-assign]
     trainer.train()
+
+
+@torch.no_grad()
+def psnr_on_rays(trainer: Trainer, rays: int, seed: int = 0) -> float:
+    """PSNR over pixels spread over all test images: the same pixels at every call.
+
+    A full image of an unguided method takes minutes on a CPU; some thousand pixels say as much.
+    """
+    pipeline = trainer.pipeline
+    pipeline.eval()
+    dataset: Any = pipeline.datamanager.eval_dataset
+    if len(dataset) == 0:
+        raise InputError("the scene has no test image, on which runs could be compared")
+    generator = torch.Generator().manual_seed(seed)
+    per_image = -(-rays // len(dataset))
+    squared_error, count = 0.0, 0
+    for number in range(len(dataset)):
+        image = dataset.get_data(number)["image"]
+        rows = torch.randint(image.shape[0], (per_image,), generator=generator)
+        columns = torch.randint(image.shape[1], (per_image,), generator=generator)
+        coords = torch.stack([rows, columns], dim=-1) + 0.5
+        camera = dataset.cameras.to("cpu")
+        bundle = camera.generate_rays(camera_indices=number, coords=coords).to(pipeline.device)
+        parts = [bundle[i : i + RAYS_AT_ONCE] for i in range(0, per_image, RAYS_AT_ONCE)]
+        rgb = torch.cat([pipeline.model(part)["rgb"] for part in parts]).clamp(0.0, 1.0)
+        truth = true_colours(pipeline.model, image[rows, columns].to(rgb.device))
+        squared_error += float(((rgb - truth) ** 2).sum(dtype=torch.float64))
+        count += truth.numel()
+    pipeline.train()
+    return -10.0 * math.log10(max(squared_error / count, 1e-12))
+
+
+@torch.no_grad()
+def evaluate_images(trainer: Trainer, most_images: int, queries: FieldQueries) -> dict[str, float]:
+    """Figures over whole test images, evenly chosen; rendering alone is timed.
+
+    Args:
+        trainer: with a model that has rendered before, so that nothing is built on the way.
+        most_images: fewer where there are fewer.
+        queries: what the model's fields are asked, counted while this lasts.
+    Returns:
+        Means of `psnr`, `ssim`, `lpips` (absent without its network), `samples_per_ray`,
+        `field_queries_per_ray`, `proposal_queries_per_ray`, `gate_queries_per_ray`; the median of
+        `render_seconds_per_image`.
+    """
+    pipeline = trainer.pipeline
+    pipeline.eval()
+    dataset: Any = pipeline.datamanager.eval_dataset
+    count = min(most_images, len(dataset))
+    chosen = torch.linspace(0, len(dataset) - 1, count).round().long().tolist()
+    sums: dict[str, float] = {}
+    times = []
+    for number in chosen:
+        camera = dataset.cameras[number : number + 1].to(pipeline.device)
+        before, clock = queries.copy(), Clock()
+        clock.start()
+        outputs = pipeline.model.get_outputs_for_camera(camera)
+        times.append(clock.stop())
+        predicted = outputs["rgb"].clamp(0.0, 1.0)
+        image = dataset.get_data(number)["image"].to(predicted.device)
+        truth = true_colours(pipeline.model, image)
+        figures = image_metrics(predicted, truth)
+        asked, pixels = queries.since(before), predicted.numel() / 3
+        figures["field_queries_per_ray"] = asked.field / pixels
+        figures["proposal_queries_per_ray"] = asked.proposal / pixels
+        figures["gate_queries_per_ray"] = asked.gate / pixels
+        figures["samples_per_ray"] = figures["field_queries_per_ray"]
+        for name in ("samples_per_ray", "num_samples_per_ray"):
+            if name in outputs:
+                figures["samples_per_ray"] = float(outputs[name].float().mean())
+        for name, value in figures.items():
+            sums[name] = sums.get(name, 0.0) + value / count
+    pipeline.train()
+    return sums | {"render_seconds_per_image": statistics.median(times)}

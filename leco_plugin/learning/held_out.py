@@ -44,13 +44,7 @@ class HeldOut:
 
     def rays(self, count: int, seed: int = 0, which: Share = "calibration") -> tuple[Rays, Tensor]:
         """Rays cut to the region, and their colours [R, 3]; see `held_out_bundle`."""
-        mixture, (bundle, truth) = self.mixture, self.data.held_out(count, seed, which)
-        bundle = bundle.to(mixture.device)
-        images = bundle.camera_indices
-        assert images is not None
-        rays = mixture.rays(bundle.origins, bundle.directions, images[:, 0])
-        truth = truth.to(mixture.device).float()
-        return rays, truth if truth.shape[-1] < 4 else truth[:, :3] * truth[:, 3:]
+        return self.data.held_out(self.mixture, count, seed, which)
 
     def price(self) -> tuple[Measured, dict[str, Any]]:
         """The threshold to freeze at, and what a report says of it."""

@@ -10,7 +10,9 @@ from nerfstudio.cameras.rays import RayBundle
 from torch import Tensor
 
 from leco_plugin.log import say
+from leco_plugin.models.mixture import Mixture
 from leco_plugin.models.region import SIDE
+from leco_plugin.models.rendering import Rays
 from leco_plugin.scenes.bounds import BoundsConfig
 from leco_plugin.scenes.frames import data_frame_of, frame_of
 from leco_plugin.scenes.pixels.held_out_pixels import held_out_sampler, some_images
@@ -73,10 +75,10 @@ class LearningData:
         return sparse_pixels(dataset.cameras, points, lattice)
 
     def held_out(
-        self, count: int, seed: int = 0, share: Share = "calibration"
-    ) -> tuple[RayBundle, Tensor]:
-        """See `held_out_bundle`."""
-        return held_out_bundle(self.manager, count, seed, share)
+        self, mixture: Mixture, count: int, seed: int = 0, share: Share = "calibration"
+    ) -> tuple[Rays, Tensor]:
+        """See `held_out_rays`."""
+        return held_out_rays(mixture, self.manager, count, seed, share)
 
     def count_held_out(self, limit: int) -> float:
         """How many pixels there are to check with, up to a limit; endless if none is held out."""
@@ -117,6 +119,18 @@ def held_out_bundle(
         camera_indices=pixels[:, :1], coords=pixels[:, 1:].float() + 0.5
     )
     return bundle, batch["image"]
+
+
+def held_out_rays(
+    mixture: Mixture, manager: Any, count: int, seed: int = 0, share: Share = "calibration"
+) -> tuple[Rays, Tensor]:
+    """Held-out rays, cut to a mixture's region, and their colours [R, 3]; see `held_out_bundle`."""
+    bundle, truth = held_out_bundle(manager, count, seed, share)
+    bundle, truth = bundle.to(mixture.device), truth.to(mixture.device).float()
+    images = bundle.camera_indices
+    assert images is not None
+    rays = mixture.rays(bundle.origins, bundle.directions, images[:, 0])
+    return rays, on_black(truth)
 
 
 def count_held_out(manager: Any, limit: int) -> float:

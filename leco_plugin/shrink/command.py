@@ -11,7 +11,7 @@ import torch
 from nerfstudio.utils.rich_utils import CONSOLE
 
 from leco_plugin.cli_reports import check_place
-from leco_plugin.evaluation.machine import describe_code, describe_machine, made_by
+from leco_plugin.evaluation.report import describe_code, describe_machine, made_by
 from leco_plugin.log import bar
 from leco_plugin.occupancy import Occupancy
 from leco_plugin.scenes.pixels.held_out_pixels import held_out_sampler

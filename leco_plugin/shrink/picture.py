@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from leco_plugin.chart.drawing.theme import LIGHT, Theme, plain, themed
+from leco_plugin.chart.theme import LIGHT, Theme, plain, themed
 from leco_plugin.shrink.search import MARGIN
 
 LEAST = 1e-6

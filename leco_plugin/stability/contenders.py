@@ -10,7 +10,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Any
 
-from leco_plugin.chart.contenders.contender import Contender
+from leco_plugin.chart.contender import Contender
 from leco_plugin.hosts.guided_start import OWN_SAMPLER
 from leco_plugin.scenes.input_error import InputError
 from leco_plugin.stability.sizes import Sizes

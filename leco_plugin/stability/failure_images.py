@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from PIL import Image
 
-from leco_plugin.chart.runs.folder import RUNS
+from leco_plugin.chart.runner import RUNS
 from leco_plugin.scenes.city.layouts import TRANSFORMS
 from leco_plugin.stability.plan import Entry
 from leco_plugin.stability.table_folder import FAILURES

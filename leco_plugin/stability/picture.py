@@ -11,8 +11,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from leco_plugin.chart.drawing.theme import LIGHT, Theme
-from leco_plugin.evaluation.charts import SOURCE, fingerprint
+from leco_plugin.chart.theme import LIGHT, SOURCE, Theme, fingerprint
 from leco_plugin.stability.table import figures, headline
 
 ROW, HEAD, FOOT = 0.36, 1.0, 0.7

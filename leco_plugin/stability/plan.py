@@ -5,8 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
-from leco_plugin.chart.contenders.contender import Contender
-from leco_plugin.chart.runs.folder import Job
+from leco_plugin.chart.contender import Contender, Job
 from leco_plugin.stability.capture import Capture
 from leco_plugin.stability.cases import Case
 from leco_plugin.stability.contenders import OURS, SAMPLERS, Sampler, contender_of

@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-from leco_plugin.evaluation.json_file import read_object
+from leco_plugin.evaluation.report import read_object
 from leco_plugin.scenes.city.layouts import POINTS, TRANSFORMS
 from leco_plugin.scenes.input_error import InputError
 from leco_plugin.scenes.whole_files import write_points

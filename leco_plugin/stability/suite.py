@@ -12,11 +12,11 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-from leco_plugin.chart.contenders.protocol import Protocol, require_seeds, settings_of
-from leco_plugin.chart.runs.folder import LOGS, ChartFolder, Job
-from leco_plugin.chart.runs.processes import ProcessRunner, RunFailed
-from leco_plugin.evaluation.json_file import write_json
-from leco_plugin.evaluation.machine import describe_code, describe_machine, usable_cores
+from leco_plugin.chart.contender import Job
+from leco_plugin.chart.protocol import Protocol, require_seeds, settings_of
+from leco_plugin.chart.runner import LOGS, ProcessRunner, RunFailed
+from leco_plugin.chart.runner import RunFolder as ChartFolder
+from leco_plugin.evaluation.report import describe_code, describe_machine, usable_cores, write_json
 from leco_plugin.scenes.description import describe_scene
 from leco_plugin.stability.cases import Case
 from leco_plugin.stability.contenders import Sampler
@@ -230,7 +230,7 @@ class Suite:
 
     def draw(self) -> dict[str, Any]:
         """The results, and from them the pictures of the table and of every failure."""
-        from leco_plugin.chart.drawing.theme import DARK, LIGHT
+        from leco_plugin.chart.theme import DARK, LIGHT
         from leco_plugin.stability.failure_images import draw_failures
         from leco_plugin.stability.picture import draw
 

@@ -7,8 +7,9 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-from leco_plugin.chart.runs.folder import UNFINISHED, ChartFolder, difference
-from leco_plugin.evaluation.json_file import read_object, write_json
+from leco_plugin.chart.runner import UNFINISHED, difference
+from leco_plugin.chart.runner import RunFolder as ChartFolder
+from leco_plugin.evaluation.report import read_object, write_json
 from leco_plugin.scenes.input_error import InputError
 from leco_plugin.stability.sizes import Sizes
 from leco_plugin.studio.run_folder import LOCK

@@ -12,13 +12,13 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from leco_plugin.chart.runs.worker import main, train_job
+from leco_plugin.chart.worker import main, train_job
 
 if TYPE_CHECKING:
     from nerfstudio.engine.trainer import TrainerConfig
 
-    from leco_plugin.chart.contenders.contender import Contender
-    from leco_plugin.chart.contenders.protocol import Protocol
+    from leco_plugin.chart.contender import Contender
+    from leco_plugin.chart.protocol import Protocol
 
 
 def with_fixed_batches(config: TrainerConfig) -> TrainerConfig:
@@ -48,8 +48,8 @@ def run_cell(
 
     from PIL import Image
 
-    from leco_plugin.chart.contenders.configs import config_of
-    from leco_plugin.evaluation.json_file import finite_or_null
+    from leco_plugin.chart.contender import config_of
+    from leco_plugin.evaluation.report import finite_or_null
     from leco_plugin.stability.measure import measure
 
     began = time.process_time()

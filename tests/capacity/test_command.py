@@ -14,7 +14,7 @@ from PIL import Image
 from leco_plugin import cli
 from leco_plugin.capacity import command
 from leco_plugin.capacity.measuring import VOLUMES, Candidate
-from leco_plugin.evaluation.charts import SOURCE, fingerprint
+from leco_plugin.chart.theme import SOURCE, fingerprint
 from leco_plugin.scenes.input_error import InputError
 
 pytestmark = [  # nerfstudio leaves an image open

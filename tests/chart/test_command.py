@@ -14,11 +14,11 @@ import pytest
 
 from leco_plugin import cli
 from leco_plugin.chart import command
-from leco_plugin.chart.contenders.protocol import Protocol
-from leco_plugin.chart.contenders.suites import AT_ONCE, SUITES
-from leco_plugin.chart.runs.folder import UNFINISHED, Job
-from leco_plugin.chart.runs.processes import ProcessRunner, RunFailed
-from leco_plugin.chart.runs.run import Chart
+from leco_plugin.chart.chart import Chart
+from leco_plugin.chart.contender import Job
+from leco_plugin.chart.protocol import Protocol
+from leco_plugin.chart.runner import UNFINISHED, ProcessRunner, RunFailed
+from leco_plugin.chart.suites import AT_ONCE, SUITES
 from leco_plugin.studio.run_folder import alone_in
 
 METHODS = ["--methods", "leco-occupancy", "leco-occupancy-never-frozen"]
@@ -150,7 +150,7 @@ def test_runs_beside_each_other_share_the_threads_of_the_machine(
     tiny_scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     machine = {"cpu": "x", "cores": 8, "threads": 8, "device": "cpu"}
-    monkeypatch.setattr("leco_plugin.chart.runs.run.describe_machine", lambda: dict(machine))
+    monkeypatch.setattr("leco_plugin.chart.chart.describe_machine", lambda: dict(machine))
     threads = {}
     for at_once in (1, 2, 16):
         protocol = Protocol(1.0, at_once=at_once)

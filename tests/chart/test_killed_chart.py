@@ -12,17 +12,16 @@ from pathlib import Path
 
 import chart_results
 
-from leco_plugin.chart.contenders.contender import Contender
-from leco_plugin.chart.contenders.protocol import Protocol
-from leco_plugin.chart.runs.folder import RUNS, UNFINISHED
-from leco_plugin.chart.runs.processes import ProcessRunner
-from leco_plugin.chart.runs.run import Chart
+from leco_plugin.chart.chart import Chart
+from leco_plugin.chart.contender import Contender
+from leco_plugin.chart.protocol import Protocol
+from leco_plugin.chart.runner import RUNS, UNFINISHED, ProcessRunner
 
 NAMES = ("first", "second", "third")
 WORKER = """
 import json, sys, time
 from pathlib import Path
-from leco_plugin.chart.runs.worker import die_with_parent
+from leco_plugin.chart.runner import die_with_parent
 die_with_parent()
 work = Path(sys.argv[-1])
 name = json.loads((work / "job.json").read_text())["contender"]["name"]
@@ -54,7 +53,8 @@ def test_a_killed_chart_loses_only_the_run_that_was_under_way(
     tiny_scene: Path, tmp_path: Path
 ) -> None:
     out, here = tmp_path / "chart", Path(__file__).resolve().parent
-    paths = {**os.environ, "PYTHONPATH": f"{here}:{here.parent}"}
+    found = os.environ.get("PYTHONPATH", "")
+    paths = {**os.environ, "PYTHONPATH": f"{here}:{here.parent}:{found}"}
     parent = subprocess.Popen([sys.executable, "-c", PARENT, tiny_scene, out], env=paths)
     until = time.monotonic() + 120
     while not list(out.glob(f"{UNFINISHED}/second-*/progress")):

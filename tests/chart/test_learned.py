@@ -8,11 +8,11 @@ import pytest
 from chart_results import occupancy, results, run
 from PIL import Image
 
-from leco_plugin.chart.drawing.picture import draw
-from leco_plugin.chart.drawing.table import table
-from leco_plugin.chart.drawing.title import title_of
 from leco_plugin.chart.findings.learned import learned_headline, learned_of, level_with
 from leco_plugin.chart.findings.summary import lines_of
+from leco_plugin.chart.panels import title_of
+from leco_plugin.chart.picture import draw
+from leco_plugin.chart.table import table
 
 BY_STEPS = {"suite": "losses", "protocol": {"seconds": None, "steps": 400}}
 

@@ -7,7 +7,7 @@ from dataclasses import replace
 import pytest
 from nerfstudio.configs import method_configs
 
-from leco_plugin.chart.contenders.methods import contenders
+from leco_plugin.chart.methods import contenders
 from leco_plugin.host_configs import leco_ngp, ngp_host
 from leco_plugin.scenes.input_error import InputError
 

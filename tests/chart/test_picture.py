@@ -1,21 +1,24 @@
-"""Claims about the picture of a chart."""
+"""Claims about the picture and the page of a chart."""
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 
 import numpy as np
 import pytest
 from chart_results import occupancy, results, run
-from hypothesis import given
-from hypothesis import strategies as st
 from matplotlib.figure import Figure
 from PIL import Image
 
-from leco_plugin.chart.drawing.picture import CLOSE, _name_ends, balanced, draw, name_of_end, spread
-from leco_plugin.chart.drawing.theme import DARK, LIGHT, Theme
 from leco_plugin.chart.findings.summary import best_so_far, lines_of
-from leco_plugin.evaluation.charts import SOURCE, fingerprint
+from leco_plugin.chart.page import write_page
+from leco_plugin.chart.picture import (
+    balanced,
+    draw,
+    name_ends,
+)
+from leco_plugin.chart.theme import DARK, LIGHT, SOURCE, Theme, fingerprint
 
 RUNS = [
     run(name, seed, psnr + seed) for name, psnr in (("A", 20.0), ("B", 23.0)) for seed in (0, 1)
@@ -27,11 +30,6 @@ def share_of(colour: str, path: Path) -> float:
     pixels = np.asarray(Image.open(path).convert("RGB")).astype(int)
     wanted = np.array([int(colour[i : i + 2], 16) for i in (1, 3, 5)])
     return float((np.abs(pixels - wanted).max(axis=-1) < 8).mean())
-
-
-def test_the_end_of_a_curve_says_that_a_grid_does_not_skip_yet() -> None:
-    warm, cold = lines_of(results(run("A", warming_up=False), run("B", warming_up=True)))
-    assert (name_of_end(warm), name_of_end(cold)) == ("A  20.0", "B  20.0 (warm-up)")
 
 
 @pytest.mark.parametrize("theme", [LIGHT, DARK], ids=["light", "dark"])
@@ -60,32 +58,15 @@ def test_every_colour_can_be_read_on_its_page(theme: Theme) -> None:
         assert (high + 0.05) / (low + 0.05) >= 3.9, colour
 
 
-def test_names_at_the_ends_of_curves_keep_apart_and_in_order() -> None:
-    places = spread([0.5, 0.5, 0.51, 0.99, 0.98], 0.06)
-    assert sorted(range(5), key=lambda i: places[i]) == [0, 1, 2, 4, 3]
-    assert np.diff(sorted(places)).min() >= 0.06 - 1e-9
-    assert max(places) <= 1.0
-
-
 def test_names_at_the_ends_of_curves_give_the_mean_of_the_last_psnr_as_the_title_does() -> None:
     seeds = [run("A", seed, 20.0 + seed) for seed in (0, 1)]
     for point in seeds[1]["curve"]:
         point[0] *= 2.0  # as many steps, twice the time
     (line,) = lines_of(results(*seeds))
     axes = Figure().add_subplot()
-    _name_ends(axes, [line], LIGHT)
+    name_ends(axes, [line], LIGHT)
     assert [text.get_text() for text in axes.texts] == [f"A  {line.psnr:.1f}"] == ["A  20.5"]
     assert line.curve()[1][-1] == line.psnr  # where its name points to
-
-
-@given(st.lists(st.floats(0.0, 1.0), min_size=1, max_size=12))
-def test_names_with_room_enough_never_leave_the_panel(wanted: list[float]) -> None:
-    places = spread(wanted, CLOSE)
-    assert min(places) >= -1e-9 and max(places) <= 1.0 + 1e-9
-
-
-def test_names_that_are_far_apart_stay_where_they_are() -> None:
-    assert spread([0.9, 0.1, 0.5], 0.05) == [0.9, 0.1, 0.5]
 
 
 def test_the_front_of_the_curves_is_the_best_that_anybody_has_reached_by_then() -> None:
@@ -123,3 +104,44 @@ def test_a_title_has_as_few_lines_as_it_can_and_no_short_one() -> None:
     first, second = balanced(text).split("\n")
     assert f"{first} {second}" == text and abs(len(first) - len(second)) < 12
     assert balanced("short") == "short"
+
+
+@pytest.fixture(scope="module")
+def page(tmp_path_factory: pytest.TempPathFactory) -> str:
+    held = [
+        run("A <b>", occupancy=occupancy(50_000, 0.1)),
+        run("B", sampler="learned-occupancy-hash", occupancy=occupancy(90, 0.2)),
+    ]
+    return write_page(results(*held), tmp_path_factory.mktemp("page") / "chart.html").read_text()
+
+
+def test_the_page_asks_no_other_machine_for_anything(page: str) -> None:
+    assert not re.search(r"<(script|link|img|iframe)[^>]*\s(src|href)=", page)
+
+
+def test_every_contender_is_in_it_with_its_curve(page: str) -> None:
+    assert page.count('"name":"B"') >= 4  # a curve and a point for each cost
+    assert "seconds of training" in page and "volume kept at equal loss" in page
+
+
+def test_a_chart_without_occupancies_has_no_row_for_them(tmp_path: Path) -> None:
+    text = write_page(results(run("A"), run("B")), tmp_path / "chart.html").read_text()
+    assert "volume kept at equal loss" not in text
+
+
+def test_a_grid_without_a_learning_time_stands_where_sizes_are_compared_alone(
+    tmp_path: Path,
+) -> None:
+    grids = [{"resolution": 64, "bytes": 32768, "update_seconds": 2.0, "kept_reached_volume": 0.3}]
+    ours = run("MLP", occupancy=occupancy(50_000, 0.1, grids))
+    text = write_page(results(ours), tmp_path / "chart.html").read_text()
+    ours, of_grid = text.count('"text":["MLP"]'), text.count('"text":["grid 64')
+    assert (ours, of_grid) == (3 + 2, 1)  # three costs, size and learning time
+
+
+def test_a_suite_by_steps_shows_what_its_title_is_about(tmp_path: Path) -> None:
+    by_steps = {"suite": "losses", "protocol": {"seconds": None, "steps": 400}}
+    runs = [run(name, occupancy=occupancy(50_000, 0.1)) for name in ("A (ours)", "B")]
+    text = write_page(results(*runs, **by_steps), tmp_path / "chart.html").read_text()
+    assert "space kept at equal loss, against PSNR" in text
+    assert text.count('"legendgroup":"A (ours)"') == 1 + 3 + 1  # curve, costs, space kept

@@ -1,18 +1,37 @@
-"""Claims about how long runs are and what tells one chart from another."""
+"""Claims about how long runs are, and how long they are said to take."""
 
 from __future__ import annotations
 
+import json
 import math
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
 
 import pytest
 
-from leco_plugin.chart.contenders.protocol import LEARN_SHARE, Protocol, settings_of
+from leco_plugin.chart.contender import Contender
+from leco_plugin.chart.protocol import (
+    FAST,
+    LEARN_SHARE,
+    SLOW,
+    Cores,
+    Protocol,
+    forecast,
+    forecast_minutes,
+    run_seconds,
+    settings_of,
+)
+from leco_plugin.chart.suites import SUITES
+
+CHARTS = Path(__file__).parents[2] / "benchmarks" / "results" / "charts"
+GUIDED = Contender("guided", "leco-occupancy", "learned-occupancy")
+DENSE = Contender("dense", "leco-occupancy", "dense")
 
 
-def test_more_time_is_more_time_for_everything_but_learning() -> None:
-    once, thrice = Protocol(10.0, 50).budget(), Protocol(10.0, 50).budget(3.0)
-    assert (once.seconds, once.steps, once.learn_seconds) == (10.0, 50, LEARN_SHARE * 10.0)
-    assert (thrice.seconds, thrice.steps, thrice.learn_seconds) == (30.0, 150, LEARN_SHARE * 10.0)
+def test_learning_has_a_share_of_the_time() -> None:
+    budget = Protocol(10.0, 50).budget()
+    assert (budget.seconds, budget.steps, budget.learn_seconds) == (10.0, 50, LEARN_SHARE * 10.0)
 
 
 def test_without_a_time_learning_is_left_to_the_method() -> None:
@@ -52,3 +71,58 @@ def test_runs_beside_each_other_have_equally_many_threads_and_at_least_one() -> 
     assert Protocol(1.0).threads(6) == 6
     assert Protocol(1.0, at_once=4).threads(6) == 1
     assert Protocol(1.0, at_once=9).threads(6) == 1
+
+
+@pytest.mark.parametrize("cores", [FAST, SLOW])
+def test_a_run_takes_its_time_and_what_is_beside_it(cores: Cores) -> None:
+    protocol = Protocol(100.0)
+    guided = run_seconds(GUIDED, protocol, cores)
+    assert guided == 100.0 + cores.overhead
+    assert run_seconds(DENSE, protocol, cores) == guided + cores.unguided
+    with_grids = replace(GUIDED, grids=(64,))
+    assert run_seconds(with_grids, protocol, cores) == guided + cores.grids
+
+
+def test_a_run_ends_with_its_time_or_its_steps() -> None:
+    few, many = (Protocol(100.0, steps) for steps in (10, 10_000))
+    in_time = run_seconds(GUIDED, Protocol(100.0), FAST)
+    assert run_seconds(GUIDED, many, FAST) == in_time
+    assert run_seconds(GUIDED, few, FAST) == 10 * FAST.step + FAST.overhead
+
+
+def test_two_runs_at_a_time_take_half_as_long() -> None:
+    alone, beside = (Protocol(100.0, at_once=count) for count in (1, 2))
+    minutes = forecast_minutes([GUIDED, DENSE], alone, FAST)
+    assert minutes == pytest.approx((130.0 + 155.0) / 60.0)
+    assert forecast_minutes([GUIDED, DENSE], beside, FAST) == pytest.approx(minutes / 2)
+
+
+def test_what_is_said_holds_for_fast_cores_and_for_slow_ones() -> None:
+    runs = [GUIDED] * 12
+    protocol = Protocol(None, 400, at_once=2)
+    fast, slow = (round(forecast_minutes(runs, protocol, cores)) for cores in (FAST, SLOW))
+    said = forecast(runs, protocol)
+    assert said == f"about {fast} to {slow} minutes on two CPU cores, by their speed"
+    assert forecast([GUIDED], Protocol(20.0)) == "about 1 minute on two CPU cores"
+
+
+def of_suites() -> list[tuple[str, dict[str, Any]]]:
+    """Stored charts of suites that say how long their runs took."""
+    found = [(path.stem, json.loads(path.read_text())) for path in sorted(CHARTS.glob("*.json"))]
+    return [
+        (name, results)
+        for name, results in found
+        if results["suite"] and all(run.get("wall_seconds") for run in results["runs"])
+    ]
+
+
+@pytest.mark.parametrize(
+    ("name", "results"), [pytest.param(*one, id=one[0]) for one in of_suites()]
+)
+def test_suites_took_about_as_long_as_is_said(name: str, results: dict[str, Any]) -> None:
+    contenders = {one.name: one for one in SUITES[results["suite"]].contenders}
+    made = [contenders[run["name"]] for run in results["runs"]]
+    protocol = Protocol(**results["protocol"])
+    fast, slow = (forecast_minutes(made, protocol, cores) for cores in (FAST, SLOW))
+    took = sum(run["wall_seconds"] for run in results["runs"]) / 60.0 / protocol.at_once
+    assert 0.8 * fast <= took <= 1.1 * slow, name

@@ -8,10 +8,10 @@ import pytest
 from suite_minutes import minutes_together
 
 from leco_plugin import cli
-from leco_plugin.chart.contenders.configs import config_of
-from leco_plugin.chart.contenders.forecast import FAST, SLOW, Cores, run_seconds
-from leco_plugin.chart.contenders.methods import contenders
-from leco_plugin.chart.contenders.suites import (
+from leco_plugin.chart.contender import config_of
+from leco_plugin.chart.methods import contenders
+from leco_plugin.chart.protocol import FAST, SLOW, Cores, run_seconds
+from leco_plugin.chart.suites import (
     AT_ONCE,
     CPU_STEPS,
     STEPS,
@@ -24,21 +24,8 @@ from leco_plugin.learning.schedule import MOST_EXTENSIONS, steps_of_an_extension
 from leco_plugin.method_configs import LEARNING, ON_GPU
 from leco_plugin.scenes.input_error import InputError
 
-NAMES = {
-    "empty-expert",
-    "losses",
-    "freeze",
-    "representations",
-    "enough-time",
-    "grid-resolution",
-}
 
-
-def test_there_is_a_suite_for_every_question() -> None:
-    assert set(SUITES) == NAMES
-
-
-@pytest.mark.parametrize("name", sorted(NAMES))
+@pytest.mark.parametrize("name", SUITES)
 def test_the_contenders_of_a_suite_differ_and_can_be_configured(name: str) -> None:
     compared = SUITES[name].contenders
     assert len(compared) >= 3
@@ -49,7 +36,7 @@ def test_the_contenders_of_a_suite_differ_and_can_be_configured(name: str) -> No
 
 
 @pytest.mark.parametrize("cores", [FAST, SLOW])
-@pytest.mark.parametrize("name", sorted(NAMES))
+@pytest.mark.parametrize("name", SUITES)
 def test_three_seeds_of_a_suite_take_less_than_45_minutes_of_two_cores(
     name: str, cores: Cores
 ) -> None:
@@ -127,8 +114,3 @@ def test_guided_switch_nerf_is_that_of_charts_by_method_whose_runs_can_be_reused
     )
     assert [one.key for one in SUITES["enough-time"].contenders] == [one.key for one in named]
     assert [one.name for one in SUITES["enough-time"].contenders] == [one.name for one in named]
-
-
-def test_an_unknown_suite_is_named_beside_those_there_are() -> None:
-    with pytest.raises(InputError, match=r"'no-such'.*empty-expert"):
-        suite("no-such")

@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 from chart_results import occupancy, results, run
 
-from leco_plugin.chart.drawing.table import table, write_table
+from leco_plugin.chart.table import table
 
 FAILURE = {"name": "B", "method": "b", "sampler": "own", "seed": 1, "reason": "a | b"}
 
@@ -50,11 +48,6 @@ def test_failures_are_rows_and_cannot_break_the_table() -> None:
     assert "| B | 1 | failed: a \\| b |" in text
 
 
-def test_a_chart_without_any_run_says_why(tmp_path: Path) -> None:
-    path = write_table(results(failures=[FAILURE]), tmp_path / "table.md")
-    assert "failed: a" in path.read_text()
-
-
 def test_occupancies_have_a_table_of_their_own() -> None:
     text = table(results(run("A", occupancy=occupancy(51_000, 0.125)), run("B", sampler="own")))
     assert len(rows(text, "A")) == 3 and len(rows(text, "B")) == 2
@@ -90,31 +83,6 @@ def test_it_is_said_how_long_all_runs_took_and_which_grids_are_still_warming_up(
     text = table(results(*runs, protocol={"seconds": 10.0, "steps": None, "at_once": 2}))
     assert "All runs together took 5 min." in text
     assert "Ended in the warm-up of their grid, which asks all cells: B." in text
-
-
-def test_the_command_and_the_question_are_there() -> None:
-    text = table(results(run("A"), suite="losses", question="What do they do?"))
-    assert "What do they do?" in text and "`leco chart --data city`, 2024-02-29" in text
-
-
-def test_runs_of_other_charts_are_counted() -> None:
-    assert "other charts" not in table(results(run("A"), run("B")))
-    text = table(results(run("A"), run("B", reused=True), run("B", 1, reused=True)))
-    assert "2 of the runs were made for other charts." in text
-
-
-def test_representations_say_on_which_front_they_are_and_whether_ours_is() -> None:
-    ours = run("MLP (ours)", occupancy=occupancy(51_000, 0.125), learn_seconds=9.0)
-    other = run(
-        "hash grid",
-        sampler="learned-occupancy-hash",
-        occupancy=occupancy(4_000_000, 0.1),
-        learn_seconds=8.0,
-    )
-    text = table(results(ours, other))
-    assert rows(text, "MLP (ours)")[2] == ["MLP (ours)", "51", "9", "-", "12.5", "size"]
-    assert rows(text, "hash grid")[2][-1] == "size, learning time"
-    assert "MLP (ours) is the smallest, behind hash grid in learning time." in text
 
 
 def test_grids_that_could_not_be_made_are_named() -> None:

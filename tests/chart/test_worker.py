@@ -5,18 +5,20 @@ from __future__ import annotations
 import io
 import json
 from collections.abc import Callable
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
 import pytest
 import torch
 
-from leco_plugin.chart.contenders.contender import Contender
-from leco_plugin.chart.contenders.protocol import Protocol
-from leco_plugin.chart.runs import worker
-from leco_plugin.chart.runs.worker import FAILURE, JOB, PROGRESS, RESULT, main, run_job, train_job
-from leco_plugin.evaluation import timed_run
+from leco_plugin.chart import worker
+from leco_plugin.chart.contender import Contender
+from leco_plugin.chart.protocol import Protocol
+from leco_plugin.chart.runner import FAILURE, JOB, PROGRESS, RESULT
+from leco_plugin.chart.suites import SUITES
+from leco_plugin.chart.worker import main, run_job, train_job
+from leco_plugin.evaluation import equal_loss, timed_run
 
 pytestmark = [  # nerfstudio leaves an image open
     pytest.mark.filterwarnings("ignore:unclosed file:ResourceWarning"),
@@ -39,8 +41,8 @@ def short(monkeypatch: pytest.MonkeyPatch) -> None:
     """Nothing reads the standard input; few rays are evaluated."""
     monkeypatch.setattr(worker, "die_with_parent", lambda: None)
     monkeypatch.setattr(timed_run, "CURVE_RAYS", 64)
-    monkeypatch.setattr("leco_plugin.evaluation.equal_loss.TAUGHT_RAYS", 256)
-    monkeypatch.setattr("leco_plugin.evaluation.equal_loss.VOLUME_POINTS", 4096)
+    monkeypatch.setattr(equal_loss, "TAUGHT_RAYS", 256)
+    monkeypatch.setattr(equal_loss, "VOLUME_POINTS", 4096)
 
 
 def job(folder: Path, scene: Path, contender: Contender = ONE) -> Path:
@@ -111,8 +113,8 @@ def test_a_method_that_crashes_half_way_has_its_own_reason(
 def test_gate_and_grids_are_measured_on_the_field_of_the_moment_of_freezing(
     tiny_scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    from leco_plugin.chart.contenders.configs import config_of
-    from leco_plugin.chart.runs import beside
+
+    from leco_plugin.chart.contender import config_of
 
     asked: list[dict[str, torch.Tensor]] = []
 
@@ -122,7 +124,7 @@ def test_gate_and_grids_are_measured_on_the_field_of_the_moment_of_freezing(
         )
         return {"grids": list(grids)}
 
-    monkeypatch.setattr(beside, "at_equal_loss", at_equal_loss)
+    monkeypatch.setattr(equal_loss, "at_equal_loss", at_equal_loss)
     one = Contender("LeCO", "leco-occupancy", "learned-occupancy", SMALL, grids=(8, 16))
     config = config_of(one, tiny_scene, tmp_path / "nerfstudio")
     result, trainer = train_job(config, one, 3, tiny_scene, SHORT, tmp_path)
@@ -146,10 +148,11 @@ def test_a_whole_run_has_its_figures(tiny_scene: Path, tmp_path: Path) -> None:
 def test_small_gates_are_taught_by_the_field_as_it_was_and_stand_beside(
     tiny_scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+
     from leco_plugin.capacity import field, measuring
-    from leco_plugin.chart.contenders.configs import config_of
-    from leco_plugin.chart.runs import beside
-    from leco_plugin.evaluation.equal_loss import at_equal_loss
+    from leco_plugin.chart.contender import config_of
+
+    at_equal_loss = equal_loss.at_equal_loss
 
     monkeypatch.setattr(measuring, "STEPS", 20)
     monkeypatch.setattr(field, "TAUGHT_RAYS", 256)
@@ -163,7 +166,7 @@ def test_small_gates_are_taught_by_the_field_as_it_was_and_stand_beside(
         torch.manual_seed(7)
         return at_equal_loss(model, manager, *rest, **others)
 
-    monkeypatch.setattr(beside, "at_equal_loss", compared)
+    monkeypatch.setattr(equal_loss, "at_equal_loss", compared)
     one = Contender("LeCO", "leco-occupancy", "learned-occupancy", SMALL, taught=True)
     config = config_of(one, tiny_scene, tmp_path / "nerfstudio")
     result, trainer = train_job(config, one, 3, tiny_scene, SHORT, tmp_path)
@@ -202,3 +205,41 @@ def test_learning_time_is_held_to_whenever_it_is_over(
     record = run_job(contender, 3, tiny_scene, protocol, folder)
     assert record["freeze_seconds"] is not None
     assert record["freeze_seconds"] < record["train_seconds"]
+
+
+SMALLEST: dict[str, Any] = {
+    "sizes.learn_candidates": 8,
+    "sizes.candidates": 16,
+    "calibration.rays": 64,
+    "schedule.learn_steps": 3,
+}
+CONTENDERS = {one.alone().key: one for found in SUITES.values() for one in found.contenders}
+BY_DEFAULT = {one.alone().key for one in SUITES["losses"].contenders}
+"""The others take a minute of one core, and run only when long tests are asked for."""
+
+
+def smaller(one: Contender) -> Contender:
+    """The same comparison in sizes that train in a moment, the scene's own choices kept."""
+    small = SMALLEST
+    if one.method != "leco-occupancy":
+        small = {f"occupancy.learning.{path}": value for path, value in SMALLEST.items()}
+    changes = {**small, **one.changes}
+    if "host.sizes.grid_resolution" in changes:
+        changes["host.sizes.grid_resolution"] = 8
+    return replace(one, changes=changes, grids=(8,) if one.grids else ())
+
+
+@pytest.mark.parametrize(
+    "one",
+    [
+        pytest.param(one, id=one.name, marks=() if key in BY_DEFAULT else pytest.mark.long)
+        for key, one in CONTENDERS.items()
+    ],
+)
+def test_every_contender_of_every_suite_can_be_trained(
+    one: Contender, tiny_scene: Path, tmp_path: Path
+) -> None:
+    short = Protocol(steps=6, images=1, curve_points=1)
+    run = run_job(smaller(one), 0, tiny_scene, short, tmp_path)
+    assert run["steps"] == 6 and run["psnr"] > 0.0
+    assert (run["occupancy"] is not None) == one.sampler.startswith("learned-occupancy")

@@ -9,7 +9,7 @@ import torch
 from nerfstudio.cameras.cameras import Cameras
 from torch import Tensor
 
-from leco_plugin.evaluation.reached_volume import CELLS, rays_of_photographs, reached
+from leco_plugin.evaluation.equal_loss import CELLS, rays_of_photographs, reached
 
 
 def slow_reached(taught: Tensor, mapped: Tensor) -> list[bool]:

@@ -10,7 +10,7 @@ import torch
 from torch import nn
 
 from leco_plugin.evaluation.clock import Budget
-from leco_plugin.evaluation.field_queries import FieldQueries
+from leco_plugin.evaluation.queries import FieldQueries
 from leco_plugin.evaluation.timed_run import TimedRun, _Course
 
 RATE = 0.01

@@ -16,7 +16,7 @@ from tiny_scene import camera_to_world
 
 from leco_plugin import cli
 from leco_plugin.evaluation.inspection import describe
-from leco_plugin.evaluation.machine import describe_code
+from leco_plugin.evaluation.report import describe_code
 from leco_plugin.learning.freezing import leave_field
 from leco_plugin.models.encodings import EncodingConfig
 from leco_plugin.models.figures import prices

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from leco_plugin.chart.contenders.configs import config_of
+from leco_plugin.chart.contender import config_of
 from leco_plugin.scenes.input_error import InputError
 from leco_plugin.stability.cases import CASES, cases_named
 from leco_plugin.stability.contenders import SAMPLERS, samplers_named

@@ -9,8 +9,8 @@ from typing import Any
 
 import pytest
 
-from leco_plugin.chart.contenders.contender import Contender
-from leco_plugin.chart.contenders.protocol import Protocol
+from leco_plugin.chart.contender import Contender
+from leco_plugin.chart.protocol import Protocol
 from leco_plugin.samplers import registry
 from leco_plugin.samplers.base import DenseEstimator
 from leco_plugin.samplers.boxes import nested_boxes

@@ -1,4 +1,4 @@
-"""What occupancies were learned, contender by contender, in the seeds that froze a gate."""
+"""The occupancies that were learned, by contender, over the seeds that froze a gate."""
 
 from __future__ import annotations
 
@@ -10,11 +10,11 @@ from typing import Any
 from leco_plugin.chart.findings.summary import Line, figure_in
 
 OURS = "(ours)"
-"""In the name of the contender that a suite asks about."""
+"""Marks the contender that a suite asks about."""
 KEPT = "at_equal_loss.kept_reached_volume"
-"""Share of what rays reach that a gate keeps where all lose equally much of the surface."""
+"""Share of the volume reached by rays that a gate keeps at equal loss."""
 AT_THE_END = 0.99
-"""Of the training time: what is frozen later has guided nothing."""
+"""Share of the training time; a gate that is frozen later has guided nothing."""
 
 
 @dataclass(frozen=True)
@@ -93,9 +93,8 @@ def _learned(line: Line) -> Learned:
 
 
 def learned_headline(learned: Sequence[Learned]) -> str:
-    """How much space ours, or else the first that always froze, keeps where all lose equally much,
-    at which PSNR after equal steps, and who of the others is better in both: medians of space and
-    means of PSNR, as they are drawn."""
+    """Space kept at equal loss and PSNR of ours, or of the first that always froze, and which
+    other is better in both: medians of space and means of PSNR."""
     known = [one for one in learned if one.is_measured]
     if not known:
         return "no gate was frozen with every seed"
@@ -112,13 +111,13 @@ def learned_headline(learned: Sequence[Learned]) -> str:
     if others:
         kept = sorted(one.kept for one in others)
         shares = " to ".join(dict.fromkeys(percent(share) for share in (kept[0], kept[-1])))
-        said += f": {_standing(ours, others)}; the others keep {shares}"
+        said += f": {_standing_of(ours, others)}; the others keep {shares}"
     never = len(learned) - len(known)
     return said + (f"; {never} not always frozen" if never else "")
 
 
-def _standing(one: Learned, others: Sequence[Learned]) -> str:
-    """How one stands that no other beats in both with every seed."""
+def _standing_of(one: Learned, others: Sequence[Learned]) -> str:
+    """The standing of one that no other beats in both."""
     least = all(one.kept < other.kept for other in others)
     highest = all(one.psnr > other.psnr for other in others)
     if least and highest:

@@ -1,48 +1,51 @@
-"""Ways to hold an occupancy, side by side: what each keeps for its size and its learning time."""
+"""Ways to represent an occupancy: what each keeps for its size and learning time; the fronts."""
 
 from __future__ import annotations
 
 import statistics
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Any, NamedTuple
 
-from leco_plugin.chart.contenders.methods import LEARNED
+from leco_plugin.chart.contender import LEARNED
 from leco_plugin.chart.findings.summary import KEPT, LEARNING, Line
 
 OUR_KIND = "MLP"
-"""Of the gate that this package takes by default."""
+"""Kind of the default gate."""
 SMALL_OURS = "small MLP (ours)"
-"""The small gate of that kind: like those of other kinds, it was taught by the field of a run whose
-own gate had learned with it."""
+"""The small gate of that kind, which the trained field taught."""
 BYTES_A_NUMBER = 2
 """In bfloat16, in which gates are asked on a CPU."""
+COSTS = {"size": "size", "learning time": "learn_seconds"}
+"""The costs that fronts are of, and the figure of each in `Held`."""
+CHEAPEST = {"size": "smallest", "learning time": "soonest learned"}
+"""Words for the one that costs least."""
 
 
 class Held(NamedTuple):
     """One representation in one run."""
 
     size: float
-    """kB of what it consists of: a gate's numbers in bfloat16, a grid's cells in bits. Files have a
-    head besides, and `leco-occupancy` writes float32."""
+    """kB: a gate's numbers in bfloat16, a grid's cells in bits."""
     learn_seconds: float | None
-    """Until it is there; None for a grid, which is made from a field that learned a gate too."""
+    """Seconds until it is there; None for a grid, made from a field that learned a gate too."""
     kept: float
-    """Percent of the volume that rays reach which it keeps when all lose equally much."""
+    """Percent of the volume reached by rays that it keeps at equal loss."""
     beyond: float | None = None
-    """Seconds to make it of a field that has learned a gate; None for the gate itself."""
+    """Seconds to make it from the field; None for the gate that learned with it."""
 
 
 @dataclass(frozen=True)
 class Representation:
-    """One way to hold an occupancy, in all runs: its figures are medians over seeds."""
+    """One way to represent an occupancy, in all runs; its figures are medians over seeds."""
 
     name: str
     by_seed: Mapping[int, Held]
     ours: bool = False
-    """Whether it is the gate that this package takes by default, or a small one of its kind."""
+    """Whether it is the default gate, or a small one of its kind."""
     kind: str | None = None
-    """Of a small gate taught after: the kind, as a suite calls the large one."""
+    """Kind of a small gate: the name of the large one in a suite."""
 
     @property
     def is_grid(self) -> bool:
@@ -86,75 +89,127 @@ class Representation:
 
 
 def representations_of(lines: Sequence[Line]) -> list[Representation]:
-    """Learned occupancies, and grids made from the same field, that were measured in every run.
+    """Gates, and small gates and grids made from the same field, that every run has measured.
 
-    None where all are gates of one kind: then something else is compared.
+    Empty where all are gates of one kind: then the chart compares something else.
     """
     found: list[Representation] = []
     kinds: set[str] = set()
     for line in lines:
-        gates = {run["seed"]: _of_gate(run) for run in line.runs}
-        if any(gate is None for gate in gates.values()):
-            continue
-        measured = {seed: gate for seed, gate in gates.items() if gate is not None}
         ours = line.sampler == LEARNED
-        found.append(Representation(line.name, measured, ours))
+        gate = _in_every_run(line, _gate_of)
+        if not gate:
+            continue
+        found.append(Representation(line.name, gate, ours))
         kinds.add(line.sampler)
-        found += _taught(line, ours)
-        for resolution in resolutions_of(line.runs):
-            grids = {run["seed"]: _of_grid(run, resolution) for run in line.runs}
-            made = {seed: grid for seed, grid in grids.items() if grid is not None}
-            if len(made) == len(grids):
-                found.append(Representation(f"grid {resolution}³", made))
+        found += _taught_by(line, ours)
+        made = {str(grid["resolution"]) for run in line.runs for grid in _measured(run)["grids"]}
+        for resolution in sorted(made, key=lambda one: (len(one), one)):
+            if grids := _in_every_run(line, partial(_grid_of, resolution)):
+                found.append(Representation(f"grid {resolution}³", grids))
                 kinds.add("grid")
     return found if len(kinds) > 1 else []
 
 
+def _in_every_run(line: Line, find: Callable[[Mapping[str, Any]], Held | None]) -> dict[int, Held]:
+    """What is found in each run, by seed; empty where one run lacks it."""
+    found = {run["seed"]: held for run in line.runs if (held := find(run)) is not None}
+    return found if len(found) == len(line.runs) else {}
+
+
 def never_held_of(lines: Sequence[Line]) -> list[str]:
-    """Whose gate was not frozen and measured in every run, and is left out for that."""
-    gates = [line for line in lines if line.learned]
-    return [line.name for line in gates if any(_of_gate(run) is None for run in line.runs)]
+    """Contenders whose gate was not frozen and measured in every run, and is left out."""
+    return [line.name for line in lines if line.learned and not _in_every_run(line, _gate_of)]
 
 
-def resolutions_of(runs: Sequence[Mapping[str, Any]]) -> list[str]:
-    """Of the grids that were made in some run, from coarse to fine."""
-    made = {str(grid["resolution"]) for run in runs for grid in _grids(run)}
-    return sorted(made, key=lambda resolution: (len(resolution), resolution))
-
-
-def _grids(run: Mapping[str, Any]) -> Sequence[Mapping[str, Any]]:
-    found: Sequence[Mapping[str, Any]] = run["occupancy"]["at_equal_loss"]["grids"]
+def _measured(run: Mapping[str, Any]) -> Mapping[str, Any]:
+    found: Mapping[str, Any] = run["occupancy"]["at_equal_loss"]
     return found
 
 
-def _of_gate(run: Mapping[str, Any]) -> Held | None:
+def _gate_of(run: Mapping[str, Any]) -> Held | None:
     seconds, kept = (cost.of(run) for cost in (LEARNING, KEPT))
     if seconds is None or kept is None:
         return None
     return Held(BYTES_A_NUMBER * run["occupancy"]["params"] / 1e3, seconds, kept)
 
 
-def _taught(line: Line, ours: bool) -> list[Representation]:
-    """The small gates that the field of a line has taught in every run."""
-    by_kind: dict[str, dict[int, Held]] = {}
-    for run in line.runs:
-        for row in run["occupancy"]["at_equal_loss"].get("taught", ()):
-            seconds = run["learn_seconds"] + row["seconds"]
+def _taught_gate_of(name: str, run: Mapping[str, Any]) -> Held | None:
+    for row in _measured(run).get("taught", ()):
+        if row["name"] == name:
+            seconds = row["seconds"]
             kept = 100.0 * row["kept_reached_volume"]
-            held = Held(row["bytes"] / 1e3, seconds, kept, row["seconds"])
-            by_kind.setdefault(row["name"], {})[run["seed"]] = held
+            return Held(row["bytes"] / 1e3, run["learn_seconds"] + seconds, kept, seconds)
+    return None
+
+
+def _grid_of(resolution: str, run: Mapping[str, Any]) -> Held | None:
+    for grid in _measured(run)["grids"]:
+        if str(grid["resolution"]) == resolution:
+            kept = 100.0 * grid["kept_reached_volume"]
+            return Held(grid["bytes"] / 1e3, None, kept, grid["update_seconds"])
+    return None
+
+
+def _taught_by(line: Line, ours: bool) -> Iterator[Representation]:
+    """The small gates that the field of a line has taught in every run."""
+    kinds = (row["name"] for run in line.runs for row in _measured(run).get("taught", ()))
+    for kind in dict.fromkeys(kinds):
+        if held := _in_every_run(line, partial(_taught_gate_of, kind)):
+            is_ours = ours and kind == OUR_KIND
+            name = SMALL_OURS if is_ours else f"small {kind}"
+            yield Representation(name, held, is_ours, kind)
+
+
+def fronts_of(one: Representation, all_of_them: Sequence[Representation]) -> list[str]:
+    """The names of the `COSTS` on whose fronts, of medians, a representation is."""
     return [
-        Representation(SMALL_OURS, held, True, kind)
-        if ours and kind == OUR_KIND
-        else Representation(f"small {kind}", held, kind=kind)
-        for kind, held in by_kind.items()
-        if len(held) == len(line.runs)
+        name
+        for name, figure in COSTS.items()
+        if one.has(figure)
+        and not any(other.leads(one, figure) for other in all_of_them if other.has(figure))
     ]
 
 
-def _of_grid(run: Mapping[str, Any], resolution: str) -> Held | None:
-    for grid in _grids(run):
-        if str(grid["resolution"]) == resolution:
-            kept = 100.0 * grid["kept_reached_volume"]
-            return Held(grid["bytes"] / 1e3, None, kept, grid.get("update_seconds"))
-    return None
+def verdict(representations: Sequence[Representation]) -> str:
+    """Where each of ours stands, and what is ahead of the default gate on the other fronts."""
+    ours = [one for one in representations if one.ours]
+    if not ours:
+        return "our own gate was not frozen with every seed"
+    learned, *small = ours
+    said = [_place_of(one, representations) or f"{one.name} is on neither front" for one in small]
+    fronts = fronts_of(learned, representations)
+    behind = [
+        f"behind {_best_ahead(learned, representations, figure)} in {name}"
+        for name, figure in COSTS.items()
+        if name not in fronts
+    ]
+    place = _place_of(learned, representations)
+    if behind:
+        place = f"{place or f'{learned.name} is'}{', ' if place else ' '}{', '.join(behind)}"
+    return "; ".join([*said, place])
+
+
+def _place_of(one: Representation, all_of_them: Sequence[Representation]) -> str:
+    """What leads on the fronts that a representation is on; empty if it is on none."""
+    if one is min(all_of_them, key=lambda other: other.kept):
+        return f"{one.name} keeps least space, {one.kept:.1f}% in {one.median('size'):.0f} kB"
+    fronts = fronts_of(one, all_of_them)
+    by_cost = [name for name in fronts if _is_cheapest(one, all_of_them, COSTS[name])]
+    by_space = [name for name in fronts if name not in by_cost]
+    said = [f"the {CHEAPEST[name]}" for name in by_cost]
+    if by_space:
+        said.append("on both fronts" if len(by_space) > 1 else f"on the front of {by_space[0]}")
+    return f"{one.name} is {' and '.join(said)}" if said else ""
+
+
+def _is_cheapest(one: Representation, others: Sequence[Representation], figure: str) -> bool:
+    rest = [other for other in others if other is not one and other.has(figure)]
+    return all(other.median(figure) > one.median(figure) for other in rest)
+
+
+def _best_ahead(one: Representation, others: Sequence[Representation], figure: str) -> str:
+    """Of those that lead a representation, the one that keeps least, and whether it always does."""
+    leaders = [other for other in others if other.has(figure) and other.leads(one, figure)]
+    best = min(leaders, key=lambda other: other.kept)
+    return best.name + ("" if best.leads_always(one, figure) else " (not with every seed)")

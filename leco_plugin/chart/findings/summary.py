@@ -1,7 +1,8 @@
-"""What the runs of a chart say together: one line for each contender, and who is on the front."""
+"""What the runs of a chart say together: a line for each contender, fronts, pairs of lines."""
 
 from __future__ import annotations
 
+import math
 import statistics
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -10,12 +11,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from leco_plugin.chart.contenders.contender import shared_method, short_names
+from leco_plugin.chart.contender import shared_method, short_names
 
 LOST_SURFACE_MASS = 1e-3
-"""Of the weight near surfaces, at which `evaluation.equal_loss` compares representations."""
+"""Loss at which `evaluation.equal_loss` compares occupancies."""
 CURVE_POINTS = 60
-"""Shares of the training at which the curves of several seeds are read."""
+"""Points at which the curves of several seeds are averaged."""
 
 
 @dataclass(frozen=True)
@@ -23,7 +24,7 @@ class Cost:
     """Something that is better when it is less."""
 
     key: str
-    """In a run, with a dot into its `occupancy`."""
+    """In a run, with dots into the mappings in it."""
     title: str
     unit: str
     scale: float = 1.0
@@ -66,12 +67,12 @@ class Line:
 
     @property
     def learned(self) -> bool:
-        """Whether it asks a learned occupancy."""
+        """Whether it uses a learned occupancy."""
         return self.sampler.startswith("learned-occupancy")
 
     @property
     def psnrs(self) -> list[float]:
-        """Of each seed, dB."""
+        """PSNR of each seed, dB."""
         return [run["psnr"] for run in self.runs]
 
     @property
@@ -81,19 +82,17 @@ class Line:
 
     @property
     def warming_up(self) -> bool:
-        """Whether it ends, with some seed, while its occupancy grid is in its warm-up."""
+        """Whether its occupancy grid is still in its warm-up at the end, with some seed."""
         return any(run.get("warming_up") for run in self.runs)
 
     @property
     def kept_up(self) -> float:
-        """Share of its training in which an occupancy grid was updated, median over seeds; 0 where
-        it has none."""
+        """Share of the training time spent on updates of an occupancy grid, median over seeds; 0
+        without a grid."""
         seconds = None if self.learned else self.median(LEARNING)
-        return (
-            0.0
-            if seconds is None
-            else seconds / statistics.median(run["train_seconds"] for run in self.runs)
-        )
+        if seconds is None:
+            return 0.0
+        return seconds / statistics.median(run["train_seconds"] for run in self.runs)
 
     def mean(self, key: str) -> float | None:
         """Mean over seeds of a figure of quality; None where a seed has none."""
@@ -106,8 +105,8 @@ class Line:
         return None if None in values else statistics.median(v for v in values if v is not None)
 
     def curve(self) -> tuple[NDArray[np.float64], ...]:
-        """Mean seconds [T], and mean, lowest and highest PSNR [T], of the seeds when each has had
-        the same share of its training; the last ones are those of the ends."""
+        """Mean seconds [T], and mean, lowest and highest PSNR [T] over seeds at equal shares of
+        their training, the end included."""
         curves = [np.array(run["curve"], dtype=float) for run in self.runs]
         ends = np.array([curve[-1, 0] for curve in curves])
         begin = max(curve[0, 0] / end for curve, end in zip(curves, ends))
@@ -123,8 +122,8 @@ class Line:
 
 
 def seconds_to_pass(curve: Sequence[Sequence[float]], psnr: float) -> float | None:
-    """When a curve [[seconds, PSNR], ...] reaches a PSNR to stay above it, between its points; or
-    never. A field that begins anew has not kept what the one before it had."""
+    """When a curve [[seconds, PSNR], ...] reaches a PSNR and stays above it, interpolated; None
+    for never."""
     below = [i for i, (_, value) in enumerate(curve) if value < psnr]
     if not below:
         return float(curve[0][0])
@@ -171,8 +170,7 @@ def best_so_far(lines: Sequence[Line]) -> tuple[NDArray[np.float64], NDArray[np.
 
 def headline(results: Mapping[str, Any]) -> str:
     """What the chart shows of accuracy, in one sentence."""
-    lines = lines_of(results)
-    ranked = sorted(lines, key=lambda line: -line.psnr)
+    ranked = sorted(lines_of(results), key=lambda line: -line.psnr)
     if len(ranked) < 2:
         return f"{ranked[0].name}: {ranked[0].psnr:.1f} dB"
     best, second = ranked[:2]
@@ -184,9 +182,8 @@ def headline(results: Mapping[str, Any]) -> str:
 
 
 def ahead(one: Line, other: Line) -> bool:
-    """Whether a line is above another in each seed that both have; without any, all of it is."""
-    psnrs = {run["seed"]: run["psnr"] for run in other.runs}
-    pairs = [(run["psnr"], psnrs[run["seed"]]) for run in one.runs if run["seed"] in psnrs]
+    """Whether a line has more PSNR in each seed that both have, or in all where none is shared."""
+    pairs = [(a["psnr"], b["psnr"]) for a, b in pairs_of(one, other)]
     return all(a > b for a, b in pairs) if pairs else min(one.psnrs) > max(other.psnrs)
 
 
@@ -210,6 +207,58 @@ def circumstances(results: Mapping[str, Any]) -> str:
     return f"{what}, {' or '.join(parts)} of training on {where}, {many}"
 
 
+@dataclass(frozen=True)
+class Versus:
+    """What one contender gains over another, for each seed that both have run."""
+
+    ours: str
+    theirs: str
+    gains: tuple[float, ...]
+    """PSNR more than the other's, dB."""
+    passed: tuple[float | None, ...]
+    """Seconds of training, learning included, after which it passes the other's last PSNR."""
+    sooner: tuple[float | None, ...]
+    """The other's training time as a multiple of those seconds."""
+    faster: tuple[float, ...]
+    """The other's time to render an image as a multiple of its own."""
+
+
+def pairs_of(ours: Line, theirs: Line) -> list[tuple[dict[str, Any], dict[str, Any]]]:
+    """The runs of both for each seed that both have."""
+    others = {run["seed"]: run for run in theirs.runs}
+    return [(run, others[run["seed"]]) for run in ours.runs if run["seed"] in others]
+
+
+def versus(ours: Line, theirs: Line, seconds: float | None) -> Versus:
+    """Compares two contenders, seed by seed.
+
+    Args:
+        seconds: training time that each was given; a last step beyond it does not count.
+    """
+    pairs = pairs_of(ours, theirs)
+    most = seconds or math.inf
+    passed = tuple(seconds_to_pass(a["curve"], b["curve"][-1][1]) for a, b in pairs)
+    sooner = tuple(
+        None if after is None else min(b["curve"][-1][0], most) / after
+        for after, (_, b) in zip(passed, pairs)
+    )
+    faster = tuple(b[RENDERING.key] / a[RENDERING.key] for a, b in pairs)
+    gains = tuple(a["psnr"] - b["psnr"] for a, b in pairs)
+    return Versus(ours.name, theirs.name, gains, passed, sooner, faster)
+
+
+def rivals(lines: Sequence[Line], seconds: float | None = None) -> list[Versus]:
+    """Each learned occupancy against the other samplers of its method, where seeds are shared;
+    `seconds` as of `versus`."""
+    found = [
+        versus(ours, theirs, seconds)
+        for ours in lines
+        for theirs in lines
+        if ours.learned and not theirs.learned and ours.method == theirs.method
+    ]
+    return [one for one in found if one.gains]
+
+
 def sentence(text: str) -> str:
-    """The text as it begins a line."""
+    """The text with a capital letter."""
     return text[:1].upper() + text[1:]

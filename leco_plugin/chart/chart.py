@@ -1,0 +1,301 @@
+"""Makes the runs of a chart that are missing, and writes what all of them say."""
+
+from __future__ import annotations
+
+import copy
+import datetime
+import shutil
+import threading
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+from leco_plugin.chart.contender import Contender, Job
+from leco_plugin.chart.protocol import Protocol, forecast, require_seeds, settings_of
+from leco_plugin.chart.runner import (
+    RESULTS,
+    RUNS,
+    RunFailed,
+    RunFolder,
+    Runner,
+    difference,
+    make_jobs,
+    read_settings,
+    stored_in,
+)
+from leco_plugin.chart.table import write_table
+from leco_plugin.evaluation.report import describe_code, describe_machine, write_json
+from leco_plugin.scenes.description import describe_scene
+from leco_plugin.scenes.input_error import InputError
+
+Say = Callable[[str], None]
+
+
+def jobs_of(contenders: Sequence[Contender], seeds: Sequence[int]) -> list[Job]:
+    """All runs. Contenders take turns within a seed, and each seed begins with another one, so
+    that a machine whose speed drifts treats them alike."""
+    jobs = []
+    for turn, seed in enumerate(dict.fromkeys(seeds)):
+        first = turn % len(contenders)
+        jobs += [Job(one, seed) for one in (*contenders[first:], *contenders[:first])]
+    return jobs
+
+
+class Chart:
+    """One chart: its folder, its runs, and its results so far.
+
+    Args:
+        data: a scene in nerfstudio's format.
+        out: the chart's folder.
+        contenders: what is compared.
+        seeds: of each.
+        protocol: how long, and how it is evaluated.
+        suite: name and question of the comparison, if it has one.
+        command: what made it, for the results.
+        reuse: folders of charts, from which runs that are missing here are taken over.
+    Raises:
+        ValueError, OSError: nothing to compare, no such scene, a folder of something else.
+    """
+
+    def __init__(
+        self,
+        data: Path,
+        out: Path,
+        contenders: Sequence[Contender],
+        seeds: Sequence[int],
+        protocol: Protocol,
+        suite: tuple[str, str] | None = None,
+        command: str = "leco chart",
+        reuse: Sequence[Path] = (),
+    ) -> None:
+        if not contenders or not seeds:
+            raise ValueError("a chart needs at least one method and one seed")
+        require_seeds(seeds)
+        self.data, self.scene, self.machine = data, describe_scene(data), describe_machine()
+        self.machine["threads"] = protocol.threads(self.machine["threads"])
+        self.protocol, self.command, self.reuse = protocol, command, list(reuse)
+        self.suite = suite[0] if suite else None
+        self.question = suite[1] if suite else None
+        self.stop = threading.Event()
+        self.contenders = list(contenders)
+        self.jobs = jobs_of(contenders, seeds)
+        self.settings = settings_of(self.scene, protocol, self.suite, self.machine)
+        for source in reuse:
+            if other := unlike(source, self.settings):
+                raise InputError(f"--reuse {source}: {other}")
+        self.folder = RunFolder(out, self.settings)
+
+    def missing(self) -> list[Job]:
+        """Runs that are not stored. One that failed is missing."""
+        stored = self.folder.stored()
+        return [job for job in self.jobs if job.name not in stored]
+
+    def make(self, runner: Runner, say: Say = print, show: Callable[[float], None] = print) -> None:
+        """Makes what is missing; whenever it is stopped, what was finished is kept.
+
+        Args:
+            runner: makes one run, or raises `RunFailed`; called in several threads where there are
+                several runs at once. It ends what is under way when `stop` is set.
+            say: called with a line for each run.
+            show: called with the share of all runs that is done.
+        Raises:
+            InputError: another process makes runs in the same folder.
+        """
+
+        def make_one(job: Job, show_share: Callable[[float], None]) -> str:
+            return self._make_one(job, runner, show_share)
+
+        def note(line: str) -> None:
+            say(line)
+            self.write()
+
+        with self.folder.alone():
+            taken = take_over(self.folder, self.missing(), self.reuse)
+            if taken:
+                say(f"{_counted(len(taken), 'run')} taken over from other charts")
+            todo = self.missing()
+            if todo:
+                say(self.forecast(todo))
+            self.write()
+            done = len(self.jobs) - len(todo)
+            at_once = self.protocol.at_once
+            make_jobs(todo, make_one, note, show, stop=self.stop, at_once=at_once, done=done)
+
+    def _make_one(self, job: Job, runner: Runner, show: Callable[[float], None]) -> str:
+        """Makes a run and keeps it, or why there is none; returns a line about it."""
+        title = f"seed {job.seed}, {job.contender.name}"
+        try:
+            run = runner(job, show)
+        except RunFailed as failure:
+            if self.stop.is_set():  # its process was told to end when we were
+                raise KeyboardInterrupt from None
+            self.folder.fail(job, str(failure))
+            return f"{title}: failed: {failure}"
+        code = run.pop("code", None) or describe_code()
+        self.folder.store(job, run, made={**self._made(), **code})
+        return (
+            f"{title}: {run['psnr']:.2f} dB after {run['train_seconds']:.0f} s, "
+            f"{run['render_seconds_per_image']:.2f} s an image"
+        )
+
+    def forecast(self, todo: Sequence[Job]) -> str:
+        """How many runs are to be made, and about how long that takes."""
+        about = forecast((job.contender for job in todo), self.protocol)
+        runs = f"{_counted(len(todo), 'run')} of {self.protocol.describe()}"
+        beside = f", {self.protocol.at_once} at a time" if self.protocol.at_once > 1 else ""
+        stored = len(self.jobs) - len(todo)
+        there = f" ({stored} more are there already)" if stored else ""
+        return f"{runs}{beside}, {about}{there}"
+
+    def failures(self) -> list[dict[str, Any]]:
+        """Runs that ended without a result, by seed, and whether this call asked for them."""
+        asked = {(job.contender.name, job.seed) for job in self.jobs}
+        found = []
+        for one in self.folder.failures():
+            facts = {key: one["contender"][key] for key in ("name", "method", "sampler")}
+            known = (facts["name"], one["seed"]) in asked
+            found.append({**facts, "seed": one["seed"], "reason": one["reason"], "asked": known})
+        return sorted(found, key=lambda one: (one["seed"], one["name"]))
+
+    def results(self) -> dict[str, Any]:
+        """All finished runs in the folder, the contenders of this call first."""
+        names = {one.key: one.name for one in self.contenders}
+        order = list(names)
+        stored, runs = {}, []
+        for file, record in self.folder.stored().items():
+            made = Contender.from_dict(record["contender"])
+            # settings of an earlier version under the same name: a mean of both says nothing
+            if made.key not in names and made.name in names.values():
+                continue
+            stored[file] = record
+            code = record["made"].get("sources") or record["made"].get("commit")
+            run = {**record["run"], "name": names.get(made.key, made.name), "code": code}
+            place = order.index(made.key) if made.key in order else len(order)
+            runs.append(((place, made.key, run["seed"]), run))
+        runs.sort(key=lambda one: one[0])
+        failures = self.failures()
+        failed = {(one["name"], one["seed"]) for one in failures}
+        todo = [job for job in self.jobs if job.name not in stored]
+        occupancies = [run["occupancy"] for _, run in runs if run.get("occupancy")]
+        return {
+            "format": 1,
+            "machine": self.machine,
+            "scene": self.scene,
+            "protocol": asdict(self.protocol),
+            "suite": self.suite,
+            "question": self.question,
+            "made": self._made_of(stored),
+            "occupancy": occupancies[0] if occupancies else None,
+            "runs": [run for _, run in runs],
+            "failures": failures,
+            "missing": sum((job.contender.name, job.seed) not in failed for job in todo),
+        }
+
+    def _made(self) -> dict[str, Any]:
+        """When, how and by which code something is made now."""
+        today = datetime.date.today().isoformat()
+        return {"date": today, "command": self.command, **describe_code()}
+
+    def _made_of(self, stored: Mapping[str, Mapping[str, Any]]) -> dict[str, Any]:
+        """The same of all stored runs: the commands that made runs which this call does not ask
+        for, then this call's, and the commits of all."""
+        asked = {job.name for job in self.jobs}
+        others = [one["made"]["command"] for name, one in stored.items() if name not in asked]
+        commits = sorted(
+            {one["made"]["commit"] for one in stored.values() if one["made"]["commit"]}
+        )
+        now = self._made()
+        return {
+            **now,
+            "command": " && ".join(dict.fromkeys([*others, self.command])),
+            "commit": ", ".join(commits) or now["commit"],
+        }
+
+    def write(self) -> dict[str, Any]:
+        """Writes `results.json` and `table.md`, as far as there are runs; returns the results."""
+        results = self.results()
+        write_json(self.folder.path / RESULTS, results)
+        write_table(results, self.folder.path / "table.md")
+        return results
+
+    def draw(self) -> dict[str, Any]:
+        """Writes the results, and `chart.png`, the same on black, and `chart.html`.
+
+        Nothing is drawn when no run has succeeded.
+        """
+        from leco_plugin.chart import picture
+        from leco_plugin.chart.page import write_page
+        from leco_plugin.chart.theme import DARK, LIGHT
+
+        results = self.write()
+        if results["runs"]:
+            place = self.folder.path
+            picture.draw(results, place / "chart.png", LIGHT)
+            picture.draw(results, place / "chart-dark.png", DARK)
+            write_page(results, place / "chart.html")
+        return results
+
+
+def _counted(count: int, name: str) -> str:
+    return f"{count} {name}{'s' if count != 1 else ''}"
+
+
+def unlike(source: Path, settings: Mapping[str, Any]) -> str | None:
+    """Why runs in another folder cannot join a chart with these settings; None where they can.
+
+    Only what they were made for, a suite or none, may differ.
+
+    Raises:
+        InputError: the folder is damaged.
+    """
+    found = read_settings(source)
+    if found is None:
+        return "there is no chart in it"
+    shared = {name: value for name, value in settings.items() if name != "suite"}
+    other = difference(found, shared)
+    return other and f"its runs have another {other}"
+
+
+def take_over(folder: RunFolder, missing: Sequence[Job], sources: Sequence[Path]) -> list[Job]:
+    """Copies missing runs from other charts; returns their jobs.
+
+    Args:
+        sources: folders of charts, checked; the first that has a run gives it.
+    """
+    left, taken = list(missing), []
+    for source in sources:
+        for name, record in stored_in(source).items():
+            for job in [job for job in left if serves(record, job)]:
+                for ending in (".safetensors", ".png"):
+                    if (file := source / RUNS / f"{name}{ending}").exists():
+                        shutil.copyfile(file, folder.path / RUNS / f"{job.name}{ending}")
+                run = {**run_for(record, job), "reused": True}
+                folder.store(job, run, made=record["made"])
+                left.remove(job)
+                taken.append(job)
+    return taken
+
+
+def serves(record: Mapping[str, Any], job: Job) -> bool:
+    """Whether a stored run is the one that a job asks for.
+
+    Grids and taught gates are made from its field afterwards: a run with more of them serves too.
+    """
+    made = Contender.from_dict(record["contender"])
+    alike = made.alone().key == job.contender.alone().key
+    has_all = set(job.contender.grids) <= set(made.grids) and job.contender.taught <= made.taught
+    return alike and record["run"]["seed"] == job.seed and has_all
+
+
+def run_for(record: Mapping[str, Any], job: Job) -> dict[str, Any]:
+    """The run of a record, with only those grids and gates that the job asks for."""
+    run: dict[str, Any] = copy.deepcopy(record["run"])
+    facts = (run.get("occupancy") or {}).get("at_equal_loss")
+    if facts:
+        asked = job.contender.grids
+        facts["grids"] = [grid for grid in facts["grids"] if grid["resolution"] in asked]
+        facts["left_out"] = [size for size in facts["left_out"] if size in asked]
+        if not job.contender.taught:
+            facts.pop("taught", None)
+    return run

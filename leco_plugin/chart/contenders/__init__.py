@@ -1,1 +1,0 @@
-"""What a chart compares, as data, and how long every run of it may take."""

@@ -1,1 +1,0 @@
-"""A chart for people: picture, page and tables."""

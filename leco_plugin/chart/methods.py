@@ -1,0 +1,180 @@
+"""The contenders that the names of methods and samplers stand for.
+
+Any registered method and sampler can be charted. A host takes any sampler of its kind, a method
+that learns its occupancy itself any kind of gate.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Any
+
+from leco_plugin.chart.contender import DENSE, GRID, LEARNED, Contender
+from leco_plugin.hosts.guided import GuidedModelConfig
+from leco_plugin.hosts.guided_start import OWN_SAMPLER
+from leco_plugin.models.leco_config import LecoModelConfig
+from leco_plugin.models.switch.config import SwitchNerfModelConfig
+from leco_plugin.samplers.registry import samplers as registered_samplers
+from leco_plugin.scenes.input_error import InputError
+from leco_plugin.swap import registered
+
+SIZED_GRID = re.compile(rf"{GRID}-(\d+)")
+
+SKIPPING_NOTHING = {"schedule.freeze": False, "front_to_back": True}
+"""Never frozen; rendered front to back, as guided images are."""
+NEVER_FROZEN = Contender("LeCO, never frozen", "leco-occupancy", DENSE, SKIPPING_NOTHING)
+VARIANTS = {
+    "leco-occupancy-never-frozen": NEVER_FROZEN,
+    "leco-occupancy-retrained": Contender(
+        "LeCO, frozen, then from scratch", "leco-occupancy", LEARNED, {"schedule.restart": True}
+    ),
+    "leco-occupancy-homogeneous": Contender(
+        "LeCO, equal experts, no gate",
+        "leco-occupancy",
+        DENSE,
+        SKIPPING_NOTHING | {"homogeneous": True},
+    ),
+}
+"""Methods for the chart only: `leco-occupancy` with its phases changed."""
+
+METHOD_NAMES = {
+    "leco-occupancy": "LeCO",
+    "leco-ngp": "Instant-NGP",
+    "leco-nerfacto": "Nerfacto",
+    "leco-switch-nerf": "Switch-NeRF",
+}
+"""Names beside that of a sampler; other methods keep their own."""
+
+SAMPLER_NAMES = {
+    LEARNED: "learned occupancy",
+    "learned-occupancy-hash": "hash-grid gate",
+    "learned-occupancy-vm": "TensoRF gate",
+    "learned-occupancy-k-planes": "K-planes gate",
+    DENSE: "every sample",
+}
+
+
+def contenders(methods: Sequence[str], samplers: Sequence[str] = ()) -> list[Contender]:
+    """Each method with each sampler that it can use; without samplers, with its usual ones.
+
+    Raises:
+        InputError: a name is unknown, or fits none of the others.
+    """
+    if not methods:
+        raise InputError(
+            "nothing to chart: name methods with --methods or a comparison with --suite"
+        )
+    known = [*registered_samplers(), f"{GRID}-128", OWN_SAMPLER]
+    for sampler in samplers:
+        if sampler not in known and not SIZED_GRID.fullmatch(sampler):
+            listed = ", ".join(sorted(known))
+            raise InputError(f"there is no sampler {sampler!r}; there are {listed}")
+    found: dict[str, Contender] = {}
+    used: set[str] = set()
+    for method in dict.fromkeys(methods):
+        usual, allowed = _samplers_of(method)
+        fitting = {name: _contender_of(method, name) for name in samplers or usual}
+        made = {name: one for name, one in fitting.items() if one is not None}
+        if not made:
+            raise InputError(
+                f"{method} has none of the samplers {', '.join(samplers)}; it has {allowed}"
+            )
+        used |= set(made)
+        found |= {one.key: one for one in made.values()}
+    unused = [name for name in samplers if name not in used]
+    if unused:
+        raise InputError(f"the sampler {unused[0]!r} fits none of {', '.join(methods)}")
+    return list(found.values())
+
+
+def _samplers_of(method: str) -> tuple[list[str], str]:
+    """The usual samplers of a method, and all of them in words."""
+    if method in VARIANTS:
+        return [VARIANTS[method].sampler], VARIANTS[method].sampler
+    model = _model_of(method)
+    if isinstance(model, LecoModelConfig):
+        kinds = [name for name, spec in registered_samplers().items() if spec.needs_occupancy]
+        return [LEARNED], ", ".join([*kinds, DENSE])
+    every = ", ".join([*registered_samplers(), OWN_SAMPLER])
+    usual = [LEARNED, OWN_SAMPLER] if isinstance(model, GuidedModelConfig) else [OWN_SAMPLER]
+    return usual, every
+
+
+def _model_of(method: str) -> Any:
+    try:
+        return registered(method).pipeline.model
+    except InputError as error:
+        raise InputError(f"{error}; and for charts {', '.join(VARIANTS)}") from None
+
+
+def _contender_of(method: str, sampler: str) -> Contender | None:
+    """A method with a sampler; None where the method cannot use it."""
+    if method in VARIANTS:
+        return VARIANTS[method] if VARIANTS[method].sampler == sampler else None
+    model = _model_of(method)
+    if not isinstance(model, LecoModelConfig):
+        host = model.host if isinstance(model, GuidedModelConfig) else model
+        return contender_of_host(method, sampler, host)
+    called = METHOD_NAMES.get(method, method)
+    if sampler == DENSE:
+        return replace(NEVER_FROZEN, name=f"{called}, never frozen", method=method)
+    spec = registered_samplers().get(sampler)
+    if spec is None or not spec.needs_occupancy:
+        return None
+    name, kind = f"{called} + {SAMPLER_NAMES.get(sampler, sampler)}", spec.gate_encoding
+    return Contender(name, method, sampler, {"sizes.gate.encoding.kind": kind} if kind else {})
+
+
+def contender_of_host(method: str, sampler: str, host: Any) -> Contender | None:
+    """A host with a sampler of its kind; None for a sampler of another kind.
+
+    Args:
+        host: config of the host's model.
+    """
+    proposes = hasattr(host, "num_proposal_samples_per_ray")
+    sized = SIZED_GRID.fullmatch(sampler)
+    shown = SAMPLER_NAMES.get(sampler, sampler)
+    changes: dict[str, Any] = {"occupancy.sampler": sampler}
+    if sampler == OWN_SAMPLER:
+        shown = _own_sampling_of(host)
+    else:
+        spec = registered_samplers()[GRID if sized else sampler]
+        if (spec.proposal if proposes else spec.estimator) is None:
+            return None
+        if spec.gate_encoding is not None:
+            changes["occupancy.learning.sizes.gate.encoding.kind"] = spec.gate_encoding
+        if sized or sampler == GRID:
+            cells = int(sized[1]) if sized else _own_cells_of(host) or 128
+            shown, changes = f"grid {cells}³", _grid_changes(host, cells)
+    return Contender(f"{METHOD_NAMES.get(method, method)} + {shown}", method, sampler, changes)
+
+
+def _own_sampling_of(host: Any) -> str:
+    """How a host samples by itself, in words."""
+    if isinstance(host, SwitchNerfModelConfig) and host.sampling == "coarse-fine":
+        return "coarse and fine samples"
+    if hasattr(host, "num_proposal_samples_per_ray"):
+        return "proposal networks"
+    cells = _own_cells_of(host)
+    return "own sampling" if cells is None else f"own grid {cells}³"
+
+
+def _own_cells_of(host: Any) -> int | None:
+    """Cells along an axis of the host's own grid."""
+    owner = host.sizes if isinstance(host, SwitchNerfModelConfig) else host
+    cells = getattr(owner, "grid_resolution", None)
+    return cells if isinstance(cells, int) else None
+
+
+def _grid_changes(host: Any, cells: int) -> dict[str, Any]:
+    """Changes that give a host an occupancy grid with so many cells along an axis."""
+    if isinstance(host, SwitchNerfModelConfig):  # its grid follows the bounds that it finds
+        return {
+            "occupancy.sampler": OWN_SAMPLER,
+            "host.sampling": "occupancy-grid",
+            "host.sizes.grid_resolution": cells,
+        }
+    options = {"resolution": cells, "levels": getattr(host, "grid_levels", 1)}
+    return {"occupancy.sampler": GRID, "occupancy.options": options}

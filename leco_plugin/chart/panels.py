@@ -1,0 +1,110 @@
+"""What a chart shows, as data for its picture, its page and its table: a title, and panels."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from leco_plugin.chart.findings.learned import Learned, learned_headline, learned_of
+from leco_plugin.chart.findings.representations import (
+    Representation,
+    never_held_of,
+    representations_of,
+    verdict,
+)
+from leco_plugin.chart.findings.summary import Cost, Line, front, headline, lines_of, sentence
+
+
+def title_of(results: Mapping[str, Any]) -> str:
+    """One sentence, without a full stop, about results that hold at least one run."""
+    lines = lines_of(results)
+    held = representations_of(lines)
+    if held:
+        never = len(never_held_of(lines))
+        return sentence(verdict(held)) + (f"; {never} not always frozen" if never else "")
+    if asks_what_was_learned(results):
+        return sentence(learned_headline(learned_of(lines)))
+    return sentence(headline(results))
+
+
+def asks_what_was_learned(results: Mapping[str, Any]) -> bool:
+    """Whether the chart compares what gates learn in equal steps, not where runs end."""
+    by_steps = results["suite"] is not None and results["protocol"]["seconds"] is None
+    return by_steps and bool(learned_of(lines_of(results)))
+
+
+@dataclass(frozen=True)
+class Point:
+    """A contender, or an occupancy, in a panel."""
+
+    name: str
+    x: float
+    y: float
+    line: int | None
+    """Number of the contender whose colour and marker it has; None for a grid."""
+    seeds: tuple[tuple[float, float], ...] = ()
+    """Places of its seeds, where they are shown."""
+    ours: bool = False
+    small: bool = False
+    """Whether it is a small gate."""
+
+
+@dataclass(frozen=True)
+class Panel:
+    """Points, and the axes on which nothing beats those on the front."""
+
+    title: str
+    points: tuple[Point, ...]
+    less: bool = True
+    """Whether less of y is better, and drawn upwards."""
+    more_x: bool = False
+    """Whether more of x is better."""
+
+    def front(self) -> list[tuple[float, float]]:
+        """The points that no other one beats in both, from the best x on."""
+        places = [(one.x, one.y) for one in self.points]
+        across, up = -1.0 if self.more_x else 1.0, -1.0 if self.less else 1.0
+        return [places[i] for i in front([(across * x, up * y) for x, y in places])]
+
+
+def cost_panel(cost: Cost, lines: Sequence[Line]) -> Panel:
+    """PSNR against a cost."""
+    points = [
+        Point(line.name, value, line.psnr, i, tuple((value, psnr) for psnr in line.psnrs))
+        for i, line in enumerate(lines)
+        if (value := line.median(cost)) is not None
+    ]
+    return Panel(cost.titled, tuple(points), less=False)
+
+
+def kept_panel(
+    title: str, figure: str, held: Sequence[Representation], lines: Sequence[Line]
+) -> Panel:
+    """Space kept at equal loss against a cost of occupancies that have it.
+
+    Args:
+        figure: name of the cost in `Held`.
+    """
+    names = [line.name for line in lines]
+    points = []
+    for one in (one for one in held if one.has(figure)):
+        large = [other.name for other in held if other.name in names and one.is_small_of(other)]
+        like = one.name if one.name in names else large[0] if large else None
+        number = None if like is None else names.index(like)
+        small = like is not None and like != one.name
+        points.append(
+            Point(one.name, one.median(figure), one.kept, number, ours=one.ours, small=small)
+        )
+    return Panel(title, tuple(points))
+
+
+def learned_panel(learned: Sequence[Learned], lines: Sequence[Line]) -> Panel:
+    """Space kept at equal loss against PSNR after equal steps, of gates that always froze."""
+    numbers = {line.name: i for i, line in enumerate(lines)}
+    points = []
+    for one in (one for one in learned if one.is_measured):
+        seeds = tuple((one.psnrs[seed], kept) for seed, kept in one.kept_by_seed.items())
+        late = " (frozen at the end)" if one.guided_nothing == one.seeds else ""
+        points.append(Point(one.name + late, one.psnr, one.kept, numbers[one.name], seeds))
+    return Panel("", tuple(points), more_x=True)

@@ -1,0 +1,277 @@
+"""`chart.png`: what came out in a sentence, then panels in which better is up and to the left."""
+
+from __future__ import annotations
+
+import textwrap
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from leco_plugin.chart.findings.learned import learned_of
+from leco_plugin.chart.findings.representations import Representation, representations_of
+from leco_plugin.chart.findings.summary import (
+    COSTS,
+    LEARNING,
+    LOST_SURFACE_MASS,
+    Line,
+    best_so_far,
+    circumstances,
+    lines_of,
+)
+from leco_plugin.chart.names import name_points, spread
+from leco_plugin.chart.panels import (
+    Panel,
+    Point,
+    asks_what_was_learned,
+    cost_panel,
+    kept_panel,
+    learned_panel,
+    title_of,
+)
+from leco_plugin.chart.theme import (
+    LIGHT,
+    Theme,
+    log_axis,
+    new_figure,
+    plain,
+    save_picture,
+    style,
+    themed,
+)
+
+CLOSE = 0.056
+"""Least distance of two names at the ends of curves, as a share of the panel's height."""
+BAR = 0.032
+"""Height of a bar at the foot of a panel, as a share of the panel's."""
+WIDE_RANGE = 8.0
+"""Ratio of costs from which on their axis is logarithmic."""
+TITLE_WIDTH = 66
+CHARACTER = 0.0098
+"""Width of a letter, as a share of the figure's."""
+TOP, LINE_HEIGHT = 0.985, 0.04
+"""Top and line height of the title, as shares of the figure's height."""
+COSTS_BELOW = "What it costs. Up and left is better; nothing is better in both than the grey line."
+PSNR_BELOW = "PSNR on unseen photographs, dB, against what it costs. Up and left is better:"
+KEPT_SPACE = f"Space that must be sampled where each loses {LOST_SURFACE_MASS:.1%} of the surface"
+SIZE = "size, kB: numbers in bfloat16, cells of grids in bits"
+
+
+def draw(results: Mapping[str, Any], path: Path, theme: Theme = LIGHT) -> Path:
+    """Draws the results of a chart that has at least one run.
+
+    Args:
+        results: as in `results.json`.
+        path: of the picture.
+        theme: of the page it is meant for.
+    """
+    lines = lines_of(results)
+    held = representations_of(lines)
+    with themed(theme):
+        figure = new_figure((10, 8.4), theme.page)
+        title = balanced(title_of(results))
+        figure.text(0.015, TOP, title, va="top", fontsize=17, fontweight="bold")
+        below = TOP - 0.01 - LINE_HEIGHT * (title.count("\n") + 1)
+        figure.text(0.015, below, circumstances(results), va="top", fontsize=11.5)
+        if held or asks_what_was_learned(results):
+            _draw_occupancies(figure, below, held, lines, theme)
+        else:
+            _draw_race(figure, below - 0.08 - 0.43, lines, theme)
+        return save_picture(figure, path, results, dpi=160)
+
+
+def balanced(text: str, width: int = TITLE_WIDTH) -> str:
+    """A text in as few lines as `width` letters allow, all about as long."""
+    lines = len(textwrap.wrap(text, width))
+    narrowest = next(n for n in range(1, width + 1) if len(textwrap.wrap(text, n)) <= lines)
+    return textwrap.fill(text, narrowest)
+
+
+def _draw_race(figure: Any, height: float, lines: Sequence[Line], theme: Theme) -> None:
+    """Curves against training time above, costs below."""
+    figure.text(0.015, 0.335, COSTS_BELOW, va="top", fontsize=11.5)
+    widest = max(len(name_of_end(line)) for line in lines)
+    right = 0.93 - CHARACTER * min(widest, 40)
+    main = figure.add_axes((0.075, 0.43, right - 0.075, height))
+    draw_curves(main, lines, theme)
+    main.set_title("PSNR on unseen photographs, dB: more is better", fontsize=11.5, loc="left")
+    main.set_xlabel("seconds of training")
+    _draw_learning(main, lines, theme)
+    name_ends(main, lines, theme)
+    panels = [figure.add_axes((0.075 + 0.325 * i, 0.065, 0.255, 0.2)) for i in range(3)]
+    for axes, cost in zip(panels, COSTS):
+        draw_panel(axes, cost_panel(cost, lines), theme)
+    panels[0].set_ylabel("PSNR, dB")
+
+
+def _draw_occupancies(
+    figure: Any, top: float, held: Sequence[Representation], lines: Sequence[Line], theme: Theme
+) -> None:
+    """Space kept at equal loss above; curves and costs, small, below."""
+    figure.text(0.015, 0.335, PSNR_BELOW, va="top", fontsize=11.5)
+    better = ". Up and left is better:" if held else ", against PSNR. Up and right is better:"
+    figure.text(0.015, top - 0.035, KEPT_SPACE + better, va="top", fontsize=11.5)
+    if not held and (never := [one.name for one in learned_of(lines) if not one.is_measured]):
+        said = textwrap.fill(f"Not always frozen: {', '.join(never)}.", 100)
+        figure.text(0.015, top - 0.07, said, va="top", fontsize=11.5)
+        top -= 0.035 * (said.count("\n") + 1)
+    places = ((0.075, 0.56), (0.70, 0.28)) if held else ((0.085, 0.895),)
+    low = 0.43 if held else 0.455
+    above = [figure.add_axes((x, low, wide, top - 0.11 - low)) for x, wide in places]
+    above[0].set_ylabel("space kept, %")
+    if held:
+        by_size = kept_panel(SIZE, "size", held, lines)
+        draw_panel(above[0], by_size, theme)
+        _name(above[0], by_size.points, theme)
+        by_time = kept_panel(LEARNING.titled, "learn_seconds", held, lines)
+        draw_panel(above[1], by_time, theme)
+        seconds = [one.x for one in by_time.points]
+        above[1].set_xlim(0.9 * min(seconds), 1.06 * max(seconds))
+    else:
+        panel = learned_panel(learned_of(lines), lines)
+        draw_panel(above[0], panel, theme)
+        _name(above[0], panel.points, theme)
+        above[0].set_xlabel("PSNR on unseen photographs, dB")
+    below = [figure.add_axes((0.075 + 0.24 * i, 0.065, 0.17, 0.2)) for i in range(4)]
+    draw_curves(below[0], lines, theme, small=True)
+    below[0].set_title("training, s", fontsize=11.5, loc="left")
+    below[0].set_ylabel("PSNR, dB")
+    for axes, cost in zip(below[1:], COSTS):
+        draw_panel(axes, cost_panel(cost, lines), theme)
+
+
+def draw_panel(axes: Any, panel: Panel, theme: Theme) -> None:
+    """The points of a panel, their seeds, and the border of what they beat."""
+    for one in panel.points:
+        look = look_of(one, theme)
+        if panel.less:
+            for seed in one.seeds:
+                axes.plot(*seed, alpha=0.45, markersize=6, **look)
+        else:
+            axes.plot(*zip(*one.seeds), color=look["color"])
+        size = {"markersize": 18 if one.ours else 11, "markeredgecolor": theme.page}
+        axes.plot(one.x, one.y, zorder=3, **(size | look))
+    plain(axes, theme)
+    _scale(axes, panel)
+    axes.set_title(panel.title, fontsize=11.5, loc="left")
+    if panel.less:
+        axes.invert_yaxis()
+    _draw_front(axes, panel, theme)
+
+
+def look_of(one: Point, theme: Theme) -> dict[str, Any]:
+    """Colour and marker of a point: a cross for grids, a small gate hollow, ours a star."""
+    if one.line is None:
+        return {"marker": "x", "color": theme.ink, "markeredgecolor": theme.ink}
+    look = style(one.line, theme)
+    if not one.small:
+        return look
+    if one.ours:
+        return look | {"marker": "*"}
+    hollow = {"markerfacecolor": theme.page, "markeredgewidth": 2.0}
+    return look | hollow | {"markeredgecolor": look["color"], "linestyle": "none"}
+
+
+def _scale(axes: Any, panel: Panel) -> None:
+    """Scales the axes of a panel; those of costs are logarithmic over a wide range."""
+    axes.margins(x=0.08, y=0.18)
+    axes.locator_params(axis="y", nbins=4)
+    positive = [one.x for one in panel.points if one.x > 0.0]
+    if panel.more_x:
+        log_axis(axes, "y", (1.0, 2.0, 5.0))
+    elif positive and max(positive) > WIDE_RANGE * min(positive):
+        log_axis(axes, "x", (1.0, 3.0))
+        axes.set_xlim(0.6 * min(positive), 1.7 * max(positive))
+    elif positive:
+        axes.set_xlim(0.0, 1.15 * max(positive))
+        axes.locator_params(axis="x", nbins=4)
+
+
+def _draw_front(axes: Any, panel: Panel, theme: Theme) -> None:
+    """The border of what is beaten, as far as the panel goes."""
+    if not panel.points:
+        return
+    xs, ys = zip(*panel.front())
+    worst, farthest = axes.get_ylim()[0], axes.get_xlim()[0 if panel.more_x else 1]
+    axes.step(
+        [xs[0], *xs, farthest],
+        [worst, *ys, ys[-1]],
+        where="post",
+        color=theme.ink,
+        alpha=0.3,
+        linewidth=5,
+        zorder=1,
+        scalex=False,
+        scaley=False,
+    )
+
+
+def _name(axes: Any, points: Sequence[Point], theme: Theme) -> None:
+    if not points:
+        return
+    name_points(
+        axes,
+        [(one.x, one.y) for one in points],
+        [one.name for one in points],
+        [look_of(one, theme)["color"] for one in points],
+        [seed for one in points for seed in one.seeds],
+    )
+
+
+def draw_curves(axes: Any, lines: Sequence[Line], theme: Theme, small: bool = False) -> None:
+    """Mean PSNR of each line against seconds of training, its seeds as a band, and the best so
+    far of all."""
+    for i, line in enumerate(lines):
+        look = style(i, theme)
+        seconds, mean, low, high = line.curve()
+        dashes = "-" if line.learned else (0, (5, 2))
+        width, size = (1.6, 6) if small else (2.6, 9)
+        axes.plot(seconds, mean, linestyle=dashes, linewidth=width, color=look["color"])
+        axes.fill_between(seconds, low, high, color=look["color"], alpha=0.16, linewidth=0)
+        axes.plot(seconds[-1], mean[-1], markersize=size, **look)
+    times, best = best_so_far(lines)
+    axes.plot(times, best, color=theme.ink, alpha=0.25, linewidth=5 if small else 9, zorder=1)
+    plain(axes, theme)
+    axes.set_xlim(0.0, 1.02 * max(run["train_seconds"] for line in lines for run in line.runs))
+    axes.margins(y=0.05)
+
+
+def name_ends(axes: Any, lines: Sequence[Line], theme: Theme, apart: float = CLOSE) -> None:
+    """Names to the right of the panel, each as near to the end of its curve as there is room."""
+    low, high = axes.get_ylim()
+    ends = [tuple(float(values[-1]) for values in line.curve()[:2]) for line in lines]
+    places = spread([(psnr - low) / (high - low) for _, psnr in ends], apart)
+    for i, (line, end, place) in enumerate(zip(lines, ends, places)):
+        colour = style(i, theme)["color"]
+        arrow = {"arrowstyle": "-", "relpos": (0.0, 0.5), "shrinkA": 2.0, "shrinkB": 6.0}
+        axes.annotate(
+            name_of_end(line),
+            end,
+            xytext=(1.03, place),
+            textcoords="axes fraction",
+            va="center",
+            color=colour,
+            fontweight="bold",
+            annotation_clip=False,
+            arrowprops={**arrow, "color": colour},
+        )
+
+
+def name_of_end(line: Line) -> str:
+    """Name and PSNR at the end of a curve, and whether its grid is still in its warm-up."""
+    return f"{line.name}  {line.psnr:.1f}" + (" (warm-up)" if line.warming_up else "")
+
+
+def _draw_learning(axes: Any, lines: Sequence[Line], theme: Theme) -> None:
+    """Bars at the foot of the panel: seconds spent on learning an occupancy."""
+    bars = [(i, seconds) for i, line in enumerate(lines) if (seconds := line.median(LEARNING))]
+    if not bars:
+        return
+    low, high = axes.get_ylim()
+    share = BAR * (len(bars) + 2.2)
+    axes.set_ylim(low - share / (1.0 - share) * (high - low), high)
+    foot = axes.get_xaxis_transform()
+    heights = [BAR * (len(bars) - row - 0.2) for row in range(len(bars))]
+    colours = [style(i, theme)["color"] for i, _ in bars]
+    axes.hlines(heights, 0.0, [time for _, time in bars], colours, transform=foot, linewidth=5)
+    text = " of which learning the occupancy"
+    axes.text(0.0, BAR * (len(bars) + 0.6), text, transform=foot, fontsize=10)

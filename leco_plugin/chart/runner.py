@@ -1,0 +1,339 @@
+"""Jobs in processes of their own, with a folder that keeps every finished one.
+
+A process of its own gives each job its peak of memory, and a crash ends only one of them.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import tempfile
+import threading
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
+from contextlib import contextmanager
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any, Protocol
+
+from leco_plugin.evaluation.report import read_object, write_json
+from leco_plugin.scenes.input_error import InputError, one_line
+from leco_plugin.studio.run_folder import alone_in
+
+SETTINGS, RESULTS = "settings.json", "results.json"
+RUNS, UNFINISHED, LOGS = "runs", "unfinished", "logs"
+JOB, RESULT, FAILURE, PROGRESS = "job.json", "result.json", "failure.json", "progress"
+"""Files in the folder of a job that is under way."""
+KEPT = ("occupancy.safetensors", "view.png")
+"""Files of a job that are kept beside its record, under its name and their ending."""
+DAMAGED = "is damaged, or not of a chart; delete it, or name a new folder"
+POLL_SECONDS = 0.25
+
+
+class Job(Protocol):
+    """Something to be made once."""
+
+    @property
+    def name(self) -> str:
+        """Of its files."""
+
+    @property
+    def values(self) -> dict[str, Any]:
+        """What it is, as JSON values."""
+
+
+Runner = Callable[[Any, Callable[[float], None]], dict[str, Any]]
+"""Makes a job and returns its result as JSON values; reports the share that is done."""
+
+
+class RunFailed(RuntimeError):
+    """A job has ended without a result; the message is the reason."""
+
+
+class RunFolder:
+    """Finished jobs that share their settings: one file for each.
+
+    More jobs may join later; jobs with other settings may not.
+
+    Args:
+        path: the folder, made if there is none.
+        settings: JSON values that all jobs share.
+    Raises:
+        InputError: the folder holds something else, or jobs with other settings.
+        OSError: it cannot be written.
+    """
+
+    def __init__(self, path: Path, settings: Mapping[str, Any]) -> None:
+        self.path = path
+        found = read_settings(path)
+        if found is not None and (other := difference(found, settings)):
+            raise InputError(
+                f"{path} holds a chart with another {other}; name a new folder with --out"
+            )
+        if found is None and path.exists() and any(path.iterdir()):
+            raise InputError(f"{path} holds something else; name a new folder with --out")
+        if found is None:
+            write_json(path / SETTINGS, dict(settings))
+        for name in (RUNS, UNFINISHED, LOGS):
+            (path / name).mkdir(exist_ok=True)
+
+    @contextmanager
+    def alone(self) -> Iterator[None]:
+        """Keeps other processes from making jobs here, and deletes what killed ones left.
+
+        Raises:
+            InputError: another process makes some.
+        """
+        with alone_in(self.path, "chart"):
+            shutil.rmtree(self.path / UNFINISHED, ignore_errors=True)
+            (self.path / UNFINISHED).mkdir(exist_ok=True)
+            yield
+
+    def stored(self) -> dict[str, dict[str, Any]]:
+        """Records of finished jobs by name: the values of the job, `run` and what was noted."""
+        return stored_in(self.path)
+
+    def store(self, job: Job, run: Mapping[str, Any], **noted: Any) -> None:
+        """Keeps the result of a job, whole or not at all."""
+        record = {**job.values, "run": dict(run), **noted}
+        write_json(self.path / RUNS / f"{job.name}.json", record)
+        (self.path / LOGS / f"{job.name}.json").unlink(missing_ok=True)
+
+    def fail(self, job: Job, reason: str) -> None:
+        """Notes why a job has no result, until it is made again."""
+        write_json(self.path / LOGS / f"{job.name}.json", {**job.values, "reason": reason})
+
+    def failures(self) -> list[dict[str, Any]]:
+        """Jobs without a result: their values, and the `reason`."""
+        return [read_object(file, DAMAGED) for file in sorted((self.path / LOGS).glob("*.json"))]
+
+
+def stored_in(path: Path) -> dict[str, dict[str, Any]]:
+    """The records in a folder by the names of their jobs.
+
+    Raises:
+        InputError: one is damaged.
+    """
+    found = {}
+    for file in sorted((path / RUNS).glob("*.json")):
+        record = read_object(file, DAMAGED)
+        if not all(isinstance(record.get(part), dict) for part in ("contender", "run")):
+            raise InputError(f"{file} is no run of a chart; delete it to have it made again")
+        found[file.stem] = record
+    return found
+
+
+def read_settings(path: Path) -> dict[str, Any] | None:
+    """The settings that the jobs in a folder share; None where there are none.
+
+    Raises:
+        InputError: they cannot be read.
+    """
+    file = path / SETTINGS
+    return read_object(file, DAMAGED) if file.is_file() else None
+
+
+def difference(found: Mapping[str, Any], wanted: Mapping[str, Any]) -> str | None:
+    """The first setting that is not as wanted, in words; None where all are."""
+    for name, value in json.loads(json.dumps(wanted)).items():
+        if found.get(name) != value:
+            said = f"{_short(found.get(name))}, not {_short(value)}"
+            return f"{name.replace('_', ' ')} ({said})"
+    return None
+
+
+def _short(value: Any) -> str:
+    """A value in a line."""
+    if isinstance(value, Mapping):
+        value = ", ".join(str(part) for part in value.values())
+    text = str(value)
+    return text if len(text) < 120 else f"{text[:117]}..."
+
+
+def make_jobs(
+    jobs: Sequence[Job],
+    make_one: Callable[[Any, Callable[[float], None]], str],
+    say: Callable[[str], None],
+    show: Callable[[float], None],
+    *,
+    stop: threading.Event,
+    at_once: int = 1,
+    done: int = 0,
+) -> None:
+    """Makes jobs in their order, some at a time in threads.
+
+    Args:
+        make_one: makes a job, keeps its result, and returns a line about it.
+        say: called with that line, in this thread.
+        show: called with the share of all jobs that is done.
+        stop: set when an error or Ctrl-C ends this, to end the jobs that are under way.
+        at_once: jobs at a time.
+        done: jobs that were finished before.
+    """
+    shares = dict.fromkeys((job.name for job in jobs), 0.0)
+
+    def make(job: Job) -> str:
+        def show_share(share: float) -> None:
+            shares[job.name] = share
+            show((done + sum(shares.values())) / (done + len(shares)))
+
+        show_share(0.0)
+        said = make_one(job, show_share)
+        shares[job.name] = 1.0
+        return said
+
+    under_way: set[Future[str]] = set()
+
+    def collect() -> None:
+        finished, _ = wait(under_way, return_when=FIRST_COMPLETED)
+        under_way.difference_update(finished)
+        for future in finished:
+            say(future.result())
+
+    with ThreadPoolExecutor(at_once) as pool:
+        try:
+            for job in jobs:
+                if len(under_way) == at_once:
+                    collect()
+                under_way.add(pool.submit(make, job))
+            while under_way:
+                collect()
+        except BaseException:
+            stop.set()
+            raise
+
+
+class ProcessRunner:
+    """Makes each job in a process of its own.
+
+    Args:
+        data, protocol: the scene and a dataclass, written beside the values of the job.
+        folder: in which a job works, and a failed one leaves its log.
+        command: what is started; the folder of the job is its last argument.
+        environment: variables that the process has besides those of this one.
+        stop: ends the jobs under way when it is set.
+    """
+
+    def __init__(
+        self,
+        data: Path,
+        protocol: Any,
+        folder: RunFolder,
+        command: Sequence[str],
+        environment: Mapping[str, str] | None = None,
+        stop: threading.Event | None = None,
+    ) -> None:
+        self.shared = {"data": str(data.resolve()), "protocol": asdict(protocol)}
+        self.folder, self.command = folder, list(command)
+        self.environment = {**os.environ, **(environment or {})}
+        self.stop = stop or threading.Event()
+
+    def __call__(self, job: Job, show: Callable[[float], None]) -> dict[str, Any]:
+        """The result of a job. The files of `KEPT` are left beside the records.
+
+        Raises:
+            RunFailed: the process has failed or was killed.
+            KeyboardInterrupt: it was ended because all is to stop.
+        """
+        place = self.folder.path
+        work = Path(tempfile.mkdtemp(prefix=f"{job.name}-", dir=place / UNFINISHED))
+        write_json(work / JOB, job.values | self.shared)
+        log = place / LOGS / f"{job.name}.log"
+        status = self._wait_for(work, log, show)
+        if not (work / RESULT).exists():
+            raise RunFailed(_reason(work, status, log))
+        result: dict[str, Any] = json.loads((work / RESULT).read_text())
+        for file in (work / name for name in KEPT):
+            if file.exists():
+                file.replace(place / RUNS / f"{job.name}{file.suffix}")
+        shutil.rmtree(work)
+        log.unlink()
+        return result
+
+    def _wait_for(self, work: Path, log: Path, show: Callable[[float], None]) -> int:
+        with log.open("wb") as printed:
+            # the worker ends when its input does, and so never outlives this process
+            child = subprocess.Popen(
+                [*self.command, str(work)],
+                stdin=subprocess.PIPE,
+                stdout=printed,
+                stderr=subprocess.STDOUT,
+                env=self.environment,
+            )
+            try:
+                while child.poll() is None:
+                    time.sleep(POLL_SECONDS)
+                    if self.stop.is_set():
+                        raise KeyboardInterrupt
+                    if (work / PROGRESS).exists():
+                        show(float((work / PROGRESS).read_text() or 0.0))
+            finally:
+                child.kill()
+                child.wait()
+                if child.stdin is not None:
+                    child.stdin.close()
+        return child.returncode
+
+
+def _reason(work: Path, status: int, log: Path) -> str:
+    """Why there is no result, in one line."""
+    if (work / FAILURE).exists():
+        return str(json.loads((work / FAILURE).read_text())["reason"])
+    if status < 0:
+        name = signal.Signals(-status).name
+        memory = "; the machine may have run out of memory" if name == "SIGKILL" else ""
+        return f"the process was ended by {name}{memory}"
+    lines = log.read_text(errors="replace").split("\n")
+    last = next((line.strip() for line in reversed(lines) if line.strip()), "it said nothing")
+    return f"the process ended with status {status}: {last[:200]}"
+
+
+def work_on(folder: Path, make: Callable[..., dict[str, Any]]) -> int:
+    """Makes the job in a folder: the other side of `ProcessRunner`, called in its process.
+
+    Leaves the result in the folder, or the reason why there is none.
+
+    Args:
+        make: called with the values of the job and what reports the share that is done.
+    Returns:
+        0, or 1 on failure.
+    """
+    shown = 0.0
+
+    def show(share: float) -> None:
+        nonlocal shown
+        if share - shown >= 0.01:
+            shown = share
+            (folder / PROGRESS).write_text(f"{share:.3f}")
+
+    try:
+        write_json(folder / RESULT, make(json.loads((folder / JOB).read_text()), show))
+    # whatever a method raises is a row of the table, and the others go on
+    except BaseException as error:  # noqa: BLE001
+        import traceback
+
+        traceback.print_exc()
+        said = one_line(error)
+        reason = said if isinstance(error, ValueError) and said else None
+        write_json(folder / FAILURE, {"reason": reason or f"{type(error).__name__}: {said}"})
+        return 1
+    return 0
+
+
+def die_with_parent() -> None:
+    """Ends this process when the one that started it has gone and so closed our input.
+
+    A run that nobody waits for would slow the ones that are timed.
+    """
+
+    def wait_for_end() -> None:
+        while os.read(sys.stdin.fileno(), 1):
+            pass
+        os._exit(1)
+
+    threading.Thread(target=wait_for_end, daemon=True).start()

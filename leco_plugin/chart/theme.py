@@ -1,0 +1,103 @@
+"""How pictures look on a light page and on a dark one, and which results they are of."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+MARKERS = "osD^vPX*<>"
+SOURCE = "Source"
+"""Entry of a picture that holds the fingerprint of its results."""
+
+
+@dataclass(frozen=True)
+class Theme:
+    """Colours on one kind of page."""
+
+    page: str
+    ink: str
+    faint: str
+    colours: tuple[str, ...]
+    """Told apart also by colour-blind readers, together with the markers."""
+
+
+LIGHT = Theme(
+    "#ffffff",
+    "#1f2328",
+    "#d6dbe1",
+    (
+        *("#0969a8", "#c2410c", "#1a7f4b", "#8a3ffc", "#946200"),
+        *("#bf2a6b", "#3b7d8c", "#5c5f66", "#56771a", "#a0522d"),
+    ),
+)
+DARK = Theme(
+    "#0d1117",
+    "#e6edf3",
+    "#30363d",
+    (
+        *("#58b1ff", "#ff9a5c", "#4cd08a", "#c9a3ff", "#e6bd4a"),
+        *("#ff8ab5", "#7fd6e0", "#b6bcc4", "#b5d66b", "#e0a878"),
+    ),
+)
+
+
+def style(i: int, theme: Theme) -> dict[str, Any]:
+    """Colour and marker of the line of a number."""
+    return {"color": theme.colours[i % len(theme.colours)], "marker": MARKERS[i % len(MARKERS)]}
+
+
+def plain(axes: Any, theme: Theme) -> None:
+    """Gives axes a faint grid and no frame above and to the right."""
+    axes.grid(color=theme.faint, linewidth=0.8)
+    axes.set_axisbelow(True)
+    axes.spines[["top", "right"]].set_visible(False)
+
+
+def log_axis(axes: Any, name: str, digits: tuple[float, ...]) -> None:
+    """Makes the axis `x` or `y` logarithmic, with plain numbers at `digits` times powers of 10."""
+    from matplotlib.ticker import LogLocator, NullFormatter, StrMethodFormatter
+
+    axes.set(**{f"{name}scale": "log"})
+    axis = getattr(axes, f"{name}axis")
+    axis.set_major_locator(LogLocator(subs=digits))
+    axis.set_major_formatter(StrMethodFormatter("{x:g}"))
+    axis.set_minor_formatter(NullFormatter())
+
+
+def themed(theme: Theme, size: float = 12) -> Any:
+    """A context in which matplotlib draws with a theme's ink, in type of `size` points."""
+    from matplotlib import rc_context
+
+    parts = ("text.color", "axes.labelcolor", "axes.edgecolor", "xtick.color", "ytick.color")
+    settings: dict[Any, Any] = {"font.size": size, "axes.facecolor": theme.page}
+    return rc_context(settings | dict.fromkeys(parts, theme.ink))
+
+
+def new_figure(size: tuple[float, float], page: str = LIGHT.page, **options: Any) -> Any:
+    """A figure that needs no display.
+
+    Args:
+        size: inches.
+        page: its colour.
+        options: of matplotlib's `Figure`.
+    """
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=size, facecolor=page, **options)
+    FigureCanvasAgg(figure)
+    return figure
+
+
+def save_picture(figure: Any, path: Path, results: Any, dpi: int) -> Path:
+    """Saves a figure with the fingerprint of the results that it shows."""
+    figure.savefig(path, dpi=dpi, metadata={SOURCE: fingerprint(results)})
+    return path
+
+
+def fingerprint(values: Any) -> str:
+    """A digest that tells JSON values from others."""
+    return hashlib.sha256(json.dumps(values, sort_keys=True).encode()).hexdigest()

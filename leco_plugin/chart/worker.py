@@ -1,0 +1,204 @@
+"""One run of a chart in a process of its own: `python -m leco_plugin.chart.worker FOLDER`."""
+
+from __future__ import annotations
+
+import copy
+import math
+import shutil
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from leco_plugin.chart.runner import die_with_parent, work_on
+
+if TYPE_CHECKING:
+    from nerfstudio.engine.trainer import Trainer, TrainerConfig
+
+    from leco_plugin.chart.contender import Contender
+    from leco_plugin.chart.protocol import Protocol
+
+WORKER = (sys.executable, "-W", "ignore", "-m", "leco_plugin.chart.worker")
+SMALL_GATES = {
+    "MLP": "frequency-6-32-2",
+    "hash grid": "hash-4-10",
+    "TensoRF planes": "vm-32-4",
+    "K-planes": "k-planes-32-4-1",
+}
+"""A gate of each kind that keeps little for its bytes in `leco capacity`: 5 to 27 kB."""
+
+
+def run_job(
+    contender: Contender,
+    seed: int,
+    data: Path,
+    protocol: Protocol,
+    folder: Path,
+    on_progress: Callable[[float], None] | None = None,
+) -> dict[str, Any]:
+    """Trains, evaluates and measures; the record as JSON values. Arguments as of `train_job`."""
+    from leco_plugin.chart.contender import config_of
+
+    learn_seconds = protocol.budget().learn_seconds
+    config = config_of(contender, data, folder / "nerfstudio", learn_seconds)
+    return train_job(config, contender, seed, data, protocol, folder, on_progress)[0]
+
+
+def train_job(
+    config: TrainerConfig,
+    contender: Contender,
+    seed: int,
+    data: Path,
+    protocol: Protocol,
+    folder: Path,
+    on_progress: Callable[[float], None] | None = None,
+    *,
+    looked_at: bool = True,
+) -> tuple[dict[str, Any], Trainer]:
+    """Trains, evaluates and measures.
+
+    Args:
+        config: of the contender.
+        contender, seed: what.
+        data: the scene.
+        protocol: how long, and how it is evaluated.
+        folder: for the occupancy, if there is one, and for nerfstudio's own files.
+        on_progress: called with the share that is done.
+        looked_at: False leaves the test images, and all figures of them, to the caller.
+    Returns:
+        A run of `results.json`, with an `occupancy` of its own, as JSON values; and the trainer
+        with its model.
+    """
+    from leco_plugin.evaluation.timed_run import timed_run
+    from leco_plugin.models.leco import LecoModel
+
+    frozen: dict[str, Any] = {}
+
+    def when_frozen(trainer: Trainer) -> None:
+        model: Any = trainer.pipeline.model
+        if isinstance(model, LecoModel) and not model.config.schedule.restart:
+            frozen.update(_weights_of(model.mixture))
+
+    run, trainer = timed_run(
+        config,
+        protocol.budget(),
+        sampler=contender.sampler,
+        seed=seed,
+        curve_points=protocol.curve_points if looked_at else 0,
+        images=protocol.images if looked_at else 0,
+        on_progress=on_progress,
+        on_frozen=when_frozen,
+    )
+    if looked_at and not math.isfinite(run.psnr):
+        raise ValueError("it has diverged: the PSNR at its end is no number")
+    facts = _occupancy_of(trainer, data, folder)
+    if facts is not None:
+        facts["at_equal_loss"] = _at_freezing(trainer, frozen, contender)
+        facts["learn_seconds"] = run.learn_seconds
+    return {**run.to_dict(), "name": contender.name, "occupancy": facts}, trainer
+
+
+def _weights_of(mixture: Any) -> dict[str, Any]:
+    return {name: copy.deepcopy(getattr(mixture, name).state_dict()) for name in ("gate", "field")}
+
+
+def _at_freezing(
+    trainer: Trainer, frozen: dict[str, Any], contender: Contender
+) -> dict[str, Any] | None:
+    """What `compare_at_freezing` finds with the weights of the moment of freezing; None without.
+
+    Measured after the run, so that neither its time nor its random numbers change.
+    """
+    if not frozen:
+        return None
+    model: Any = trainer.pipeline.model
+    mixture = model.mixture
+    now = _weights_of(mixture)
+    for name, weights in frozen.items():
+        getattr(mixture, name).load_state_dict(weights)
+    try:
+        return compare_at_freezing(model, trainer.pipeline.datamanager, contender)
+    except ValueError as error:  # the run itself is whole
+        print(error)
+        return None
+    finally:
+        for name, weights in now.items():
+            getattr(mixture, name).load_state_dict(weights)
+
+
+def compare_at_freezing(model: Any, datamanager: Any, contender: Contender) -> dict[str, Any]:
+    """What the gate keeps at equal loss, beside grids and small gates made from the same field.
+
+    Returns:
+        As `at_equal_loss`. Where the contender asks for small gates, `taught` holds for each of
+        `SMALL_GATES` its `name`, its `bytes`, the `seconds` of teaching it, and what it keeps.
+    Raises:
+        ValueError: held-out rays see no surface.
+    """
+    from leco_plugin.evaluation.equal_loss import at_equal_loss
+
+    if not contender.taught:
+        return at_equal_loss(model.mixture, datamanager, contender.grids)
+    from leco_plugin.capacity.field import lesson_by
+    from leco_plugin.capacity.measuring import gates, taught_score
+    from leco_plugin.learning.dense import evaluating
+    from leco_plugin.shrink.sources import Source
+
+    known = {gate.key: gate for gate in gates()}
+    started = time.monotonic()
+    with evaluating(model):
+        lesson = lesson_by(Source(datamanager, model))
+    of_lesson = time.monotonic() - started
+    scores, rows = {}, []
+    for name, key in SMALL_GATES.items():
+        gate = known[key].gate
+        assert gate is not None
+        started = time.monotonic()
+        scores[name] = taught_score(gate, lesson, model.mixture.precision)
+        seconds = round(of_lesson + time.monotonic() - started, 2)
+        rows.append({"name": name, "bytes": known[key].bytes, "seconds": seconds})
+    found = at_equal_loss(model.mixture, datamanager, contender.grids, others=scores)
+    kept = found.pop("others")
+    return found | {"taught": [row | kept[row["name"]] for row in rows]}
+
+
+def _occupancy_of(trainer: Trainer, data: Path, folder: Path) -> dict[str, Any] | None:
+    """Facts of the occupancy that a run has left, if any; its file is kept."""
+    from leco_plugin.evaluation.occupancy_facts import occupancy_facts, truth_of
+    from leco_plugin.learning.freezing import FILE_NAME
+    from leco_plugin.occupancy import Occupancy
+    from leco_plugin.scenes.photographs import folder_of
+
+    file = trainer.base_dir / FILE_NAME
+    if not file.exists():
+        return None
+    manager = trainer.pipeline.datamanager
+    shutil.copyfile(file, folder / FILE_NAME)
+    occupancy = Occupancy.load(file, trainer.pipeline.device)
+    return occupancy_facts(occupancy, file, manager, truth_of(folder_of(data), manager))
+
+
+def main(folder: Path, run: Callable[..., dict[str, Any]] = run_job) -> int:
+    """Makes the run that a folder describes; 0, or 1 and a reason in the folder.
+
+    Args:
+        run: makes it; arguments as of `run_job`.
+    """
+    from leco_plugin.chart.contender import Contender
+    from leco_plugin.chart.protocol import Protocol
+    from leco_plugin.evaluation.report import describe_code
+
+    die_with_parent()
+    code, started = describe_code(), time.monotonic()  # as this process has loaded it
+
+    def make(job: dict[str, Any], show: Callable[[float], None]) -> dict[str, Any]:
+        contender, protocol = Contender.from_dict(job["contender"]), Protocol(**job["protocol"])
+        found = run(contender, job["seed"], Path(job["data"]), protocol, folder, show)
+        return {**found, "code": code, "wall_seconds": round(time.monotonic() - started, 1)}
+
+    return work_on(folder, make)
+
+
+if __name__ == "__main__":
+    sys.exit(main(Path(sys.argv[1])))

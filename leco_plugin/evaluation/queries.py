@@ -1,0 +1,142 @@
+"""What a run asks: positions at which fields and gates are evaluated, and updates of grids.
+
+All positions are counted, also those for pruning samples and for updating a grid; for a frozen
+gate not those of CUDA kernels. Classes are wrapped, not objects, so that a field made on the way,
+as the one that learns an occupancy for a host, is counted too.
+"""
+
+from __future__ import annotations
+
+import functools
+import inspect
+import math
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from typing import Any, Literal
+
+from nerfstudio.fields.base_field import Field
+from nerfstudio.fields.density_fields import HashMLPDensityField
+from torch import Tensor, nn
+
+from leco_plugin.evaluation.clock import Clock, timed
+from leco_plugin.models.field import HMoEField
+from leco_plugin.occupancy import Occupancy
+
+Kind = Literal["field", "proposal", "learning", "gate"]
+
+
+@dataclass
+class FieldQueries:
+    """Positions evaluated so far."""
+
+    field: int = 0
+    """By the field that is rendered."""
+    proposal: int = 0
+    """By proposal networks."""
+    learning: int = 0
+    """By another field, which learned the occupancy."""
+    gate: int = 0
+    """By a frozen gate, where its cell cache gave no answer."""
+
+    def since(self, before: FieldQueries) -> FieldQueries:
+        """The difference to an earlier count."""
+        return FieldQueries(**{k: v - getattr(before, k) for k, v in vars(self).items()})
+
+    def copy(self) -> FieldQueries:
+        """The count as it is now."""
+        return FieldQueries(**vars(self))
+
+
+@contextmanager
+def counted(model: nn.Module) -> Iterator[FieldQueries]:
+    """Counts the positions that a model's fields, and those that learn for it, evaluate meanwhile.
+
+    A model keeps its fields as `nn.Module`s: nerfstudio's are asked through `get_density`, others
+    through `density` or, without one, by being called.
+    """
+    count = FieldQueries()
+    own = getattr(model, "field", None)
+    fields: list[nn.Module] = [module for module in model.modules() if isinstance(module, Field)]
+    if isinstance(own, nn.Module) and own not in fields:
+        fields.append(own)
+    methods = [(owner, _method_of(owner)) for owner in {*map(type, fields), HMoEField}]
+    methods += [(Occupancy, "query"), (Occupancy, "occupied")]
+    of_model = {id(field) for field in fields}
+    asking = False
+
+    def kind(field: nn.Module) -> Kind:
+        if isinstance(field, Occupancy):
+            return "gate"
+        if id(field) not in of_model:
+            return "learning"
+        return "proposal" if isinstance(field, HashMLPDensityField) else "field"
+
+    def counting(method: Callable[..., Any]) -> Callable[..., Any]:
+        @functools.wraps(method)
+        def ask(field: nn.Module, positions: Any, *args: Any, **kwargs: Any) -> Any:
+            nonlocal asking
+            if asking:  # a method that calls that of its parent class
+                return method(field, positions, *args, **kwargs)
+            asking = True
+            try:
+                name = kind(field)
+                setattr(count, name, getattr(count, name) + number_of(positions))
+                return method(field, positions, *args, **kwargs)
+            finally:
+                asking = False
+
+        return ask
+
+    before = []
+    for owner, name in methods:
+        before.append((owner, name, owner.__dict__.get(name)))
+        setattr(owner, name, counting(getattr(owner, name)))
+    try:
+        yield count
+    finally:
+        for owner, name, method in before:
+            if method is None:
+                delattr(owner, name)
+            else:
+                setattr(owner, name, method)
+
+
+def _method_of(owner: type) -> str:
+    """The method that evaluates the fields of a class."""
+    return next(name for name in ("get_density", "density", "forward") if hasattr(owner, name))
+
+
+def number_of(positions: Any) -> int:
+    """How many there are: of a tensor [..., 3], or of nerfstudio's `RaySamples`."""
+    if isinstance(positions, Tensor):
+        return positions.numel() // positions.shape[-1]
+    return math.prod(positions.frustums.shape)
+
+
+class GridUpdates:
+    """Watches the occupancy grids of a model, nerfacc's or like those, from now on."""
+
+    def __init__(self, model: nn.Module) -> None:
+        self.clock = Clock()
+        """The time of all updates."""
+        self.warming_up: bool | None = None
+        """Whether the last update was in a grid's warm-up, when nerfacc asks all cells; None
+        without a grid, or for one that does not say."""
+        self.grids: list[Any] = [module for module in model.modules() if "occs" in module._buffers]
+        for grid in self.grids:
+            vars(grid)["update_every_n_steps"] = self._watched(grid.update_every_n_steps)
+
+    def _watched(self, update: Callable[..., Any]) -> Callable[..., Any]:
+        signature = inspect.signature(update)
+        counted_update = timed(update, self.clock)
+
+        def run(*args: Any, **kwargs: Any) -> Any:
+            asked = signature.bind(*args, **kwargs)
+            asked.apply_defaults()
+            step, until = (asked.arguments.get(name) for name in ("step", "warmup_steps"))
+            if step is not None and until is not None:
+                self.warming_up = step < until
+            return counted_update(*args, **kwargs)
+
+        return run

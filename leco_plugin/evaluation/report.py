@@ -1,0 +1,120 @@
+"""What every report on disk holds: strict JSON, the machine, and the code that measured."""
+
+from __future__ import annotations
+
+import datetime
+import hashlib
+import json
+import math
+import os
+import platform
+import subprocess
+from pathlib import Path
+from typing import Any
+
+from leco_plugin.scenes.input_error import InputError
+from leco_plugin.scenes.whole_files import write_whole
+
+PACKAGE = Path(__file__).resolve().parents[1]
+
+
+def write_json(path: Path, value: Any) -> None:
+    """Writes `value` to `path`, whole or not at all; parents are made.
+
+    Raises:
+        ValueError: it holds NaN or infinity, which are no JSON.
+        OSError: nothing can be written there.
+    """
+    text = json.dumps(value, indent=2, allow_nan=False) + "\n"
+    write_whole(path, lambda file: file.write(text.encode()))
+
+
+def read_object(file: Path, else_say: str) -> dict[str, Any]:
+    """The JSON object in a file.
+
+    Args:
+        else_say: what is said of a damaged file, and what to do.
+    Raises:
+        InputError: the file is damaged.
+    """
+    try:
+        found = json.loads(file.read_text())
+    except ValueError:  # no JSON, or no text
+        found = None
+    if not isinstance(found, dict):
+        raise InputError(f"{file} {else_say}")
+    return found
+
+
+def finite_or_null(values: dict[str, Any]) -> dict[str, Any]:
+    """The values with None in place of NaN and infinity, which are no JSON."""
+    return {
+        name: None if isinstance(value, float) and not math.isfinite(value) else value
+        for name, value in values.items()
+    }
+
+
+def describe_machine() -> dict[str, Any]:
+    """Processor, cores, threads, device and versions: JSON values, without names or paths."""
+    import torch
+
+    return {
+        "cpu": processor_name(),
+        "cores": usable_cores(),
+        "threads": torch.get_num_threads(),
+        "device": torch.cuda.get_device_name() if torch.cuda.is_available() else "cpu",
+        "system": platform.system(),
+        "python": platform.python_version(),
+        "torch": torch.__version__,
+    }
+
+
+def describe_code() -> dict[str, Any]:
+    """Version of this package, the commit if it is run from a checkout, and a digest of its files,
+    which shows uncommitted changes. To be called before a measurement."""
+    from leco_plugin import __version__
+
+    command = ["git", "-C", str(PACKAGE), "rev-parse", "--short=12", "HEAD"]
+    try:
+        asked = subprocess.run(command, capture_output=True, text=True, check=False)
+        # an installed package may lie inside another project's checkout
+        commit = asked.stdout.strip() if (PACKAGE.parent / ".git").exists() else ""
+    except OSError:
+        commit = ""
+    return {"version": __version__, "commit": commit or None, "sources": digest_of_sources(PACKAGE)}
+
+
+def made_by(code: dict[str, Any]) -> dict[str, Any]:
+    """What made a stored figure, and today's date.
+
+    Args:
+        code: `describe_code()`, called before anything was measured.
+    """
+    return {"code": code, "date": datetime.date.today().isoformat()}
+
+
+def digest_of_sources(*folders: Path) -> str:
+    """A digest of the names and contents of the Python files in folders."""
+    digest = hashlib.sha256()
+    for folder in folders:
+        for path in sorted(folder.rglob("*.py")):
+            digest.update(path.relative_to(folder).as_posix().encode() + path.read_bytes())
+    return digest.hexdigest()[:12]
+
+
+def usable_cores() -> int:
+    """Cores that this process may use, which in a container can be fewer than there are."""
+    if hasattr(os, "sched_getaffinity"):
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1
+
+
+def processor_name() -> str:
+    """The processor's model where the system tells it, else its architecture."""
+    try:
+        for line in Path("/proc/cpuinfo").read_text().splitlines():
+            if line.startswith("model name"):
+                return line.partition(":")[2].strip()
+    except OSError:
+        pass
+    return platform.processor() or platform.machine()

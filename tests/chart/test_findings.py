@@ -1,0 +1,208 @@
+"""Claims about what the runs of a chart say together, in pairs, and at last."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+from chart_results import results, run, slow_front
+from hypothesis import given
+from hypothesis import strategies as st
+
+from leco_plugin.chart.findings.settling import falls, last_gain, settling, still_rising
+from leco_plugin.chart.findings.summary import (
+    KEPT,
+    MEMORY,
+    RENDERING,
+    circumstances,
+    common_psnr,
+    front,
+    headline,
+    lines_of,
+    rivals,
+    seconds_to_pass,
+)
+from leco_plugin.chart.page import write_page
+from leco_plugin.chart.table import table
+
+
+@given(st.lists(st.tuples(st.integers(0, 8), st.integers(0, 8)), max_size=12))
+def test_the_front_is_what_nothing_beats(points: list[tuple[float, float]]) -> None:
+    members = front(points)
+    assert {points[i] for i in members} == slow_front(points)
+    costs = [points[i][0] for i in members]
+    assert costs == sorted(costs)
+
+
+def test_seeds_are_one_line_with_means_of_quality_and_medians_of_cost() -> None:
+    runs = [
+        run("A", seed, psnr, render_seconds_per_image=seconds)
+        for seed, (psnr, seconds) in enumerate([(20.0, 1.0), (21.0, 9.0), (22.0, 2.0)])
+    ]
+    (line,) = lines_of(results(*runs))
+    assert line.psnr == pytest.approx(21.0)
+    assert line.median(RENDERING) == 2.0
+    assert line.median(MEMORY) == pytest.approx(2.0)
+    assert line.mean("lpips") is None and line.mean("ssim") == 0.5
+    assert line.median(KEPT) is None
+
+
+def test_the_curve_is_the_mean_and_range_of_the_seeds_at_equal_shares_of_their_training() -> None:
+    one = run("A", 0, curve=[[2.0, 10.0], [8.0, 16.0]])
+    other = run("A", 1, curve=[[5.0, 10.0], [10.0, 12.0]])
+    seconds, mean, low, high = lines_of(results(one, other))[0].curve()
+    assert (seconds[0], seconds[-1]) == (4.5, 9.0)
+    assert (low[-1], mean[-1], high[-1]) == pytest.approx((12.0, 14.0, 16.0))
+    assert mean[0] == pytest.approx(11.0)  # of 12 after 4 s and 10 after 5
+
+
+def test_the_time_to_what_all_reach() -> None:
+    lines = lines_of(results(run("A", psnr=20.0), run("B", psnr=22.0)))
+    level = common_psnr(lines)
+    assert level == 20.0
+    assert lines[0].seconds_to(level) == pytest.approx(10.0)
+    assert lines[1].seconds_to(level) == pytest.approx(8.0)
+    assert lines[0].seconds_to(21.0) is None
+
+
+def test_the_time_to_a_level_is_that_of_every_seed_and_the_level_that_of_the_last_run() -> None:
+    runs = [run("A", seed, psnr) for seed, psnr in enumerate([20.0, 22.0, 23.0])]
+    lines = lines_of(results(*runs, run("B", psnr=25.0)))
+    assert common_psnr(lines) == 20.0
+    assert lines[0].seconds_to(20.0) == pytest.approx(8.0)  # 10, 8 and 7
+    assert lines[0].seconds_to(21.0) is None  # one seed never has so much
+
+
+def test_the_headline_names_the_leader_and_its_lead() -> None:
+    said = headline(results(run("NGP + a", psnr=20.0), run("NGP + b", psnr=21.5)))
+    assert said == "b is ahead: 21.5 dB, 1.5 more than a"
+    said = headline(results(run("NGP + a", psnr=20.0, warming_up=True), run("NGP + b", psnr=21.5)))
+    assert said == "b is ahead: 21.5 dB, 1.5 more than a, whose grid is still in its warm-up"
+
+
+def test_the_method_that_all_share_is_named_once_and_with_the_scene() -> None:
+    shared = results(run("NGP + a", psnr=20.0), run("NGP + b", psnr=21.5))
+    assert circumstances(shared) == "NGP on city, 10 s of training on 2 CPU cores, one seed"
+    beside = shared | {"protocol": {"seconds": None, "steps": 400, "at_once": 2}}
+    assert circumstances(beside) == (
+        "NGP on city, 400 steps of training on 2 CPU cores, 2 runs at a time, one seed"
+    )
+    mixed = results(run("NGP + a"), run("LeCO, b", 1))
+    assert circumstances(mixed) == (
+        "city, 10 s of training on 2 CPU cores, 2 seeds: means of PSNR, medians of costs"
+    )
+
+
+def test_a_lead_that_a_seed_does_not_confirm_is_none() -> None:
+    best = [run("A", seed, psnr) for seed, psnr in enumerate([20.0, 22.0])]
+    other = [run("B", seed, psnr) for seed, psnr in enumerate([20.2, 20.4])]
+    assert headline(results(*best, *other)) == "A and B are level: 21.0 and 20.3 dB"
+
+
+def test_a_lead_with_every_seed_is_one_although_seeds_differ_by_more() -> None:
+    best = [run("A", seed, psnr) for seed, psnr in enumerate([20.0, 22.0])]
+    other = [run("B", seed, psnr) for seed, psnr in enumerate([19.0, 21.0])]
+    assert headline(results(*best, *other)) == "A is ahead: 21.0 dB, 1.0 more than B"
+    apart = [run("B", 2 + seed, psnr) for seed, psnr in enumerate([19.0, 21.0])]
+    assert headline(results(*best, *apart)) == "A and B are level: 21.0 and 20.0 dB"
+
+
+CURVE = [[10.0, 18.0], [20.0, 20.0], [30.0, 19.0], [40.0, 21.0]]
+
+
+@pytest.mark.parametrize(
+    ("psnr", "seconds"), [(17.0, 10.0), (19.0, 15.0), (20.0, 35.0), (20.5, 37.5), (21.1, None)]
+)
+def test_a_curve_passes_between_its_points_to_stay_above(psnr, seconds) -> None:
+    assert seconds_to_pass(CURVE, psnr) == (None if seconds is None else pytest.approx(seconds))
+
+
+def of_seeds(sampler: str, psnrs: list[float], **figures: object) -> list[dict]:
+    return [
+        run(f"host + {sampler}", seed, psnr, sampler=sampler, **figures)
+        for seed, psnr in enumerate(psnrs)
+    ]
+
+
+def test_seeds_are_paired_and_those_that_one_lacks_are_left_out() -> None:
+    ours = of_seeds("learned-occupancy", [21.0, 22.0, 30.0], render_seconds_per_image=0.5)
+    theirs = of_seeds("own", [20.0, 19.0])
+    (found,) = rivals(lines_of(results(*ours, *theirs)))
+    assert found.gains == (1.0, 3.0)
+    assert found.passed == (9.0, 7.0)  # a decibel a second until second ten
+    assert found.sooner == pytest.approx((10 / 9, 10 / 7))
+    assert found.faster == (2.0, 2.0)
+
+
+def test_a_last_step_beyond_the_time_that_was_given_is_nobodys_gain() -> None:
+    lines = lines_of(results(*of_seeds("learned-occupancy", [21.0]), *of_seeds("own", [20.0])))
+    (found,) = rivals(lines, seconds=9.0)
+    assert found.passed == (9.0,) and found.sooner == (1.0,)
+
+
+def test_other_methods_are_no_rivals() -> None:
+    ours = of_seeds("learned-occupancy", [21.0])
+    assert not rivals(lines_of(results(*ours, run("other", method="nerfacto", sampler="own"))))
+
+
+def test_what_is_never_passed_is_a_dash() -> None:
+    runs = of_seeds("learned-occupancy", [19.0]) + of_seeds("own", [20.0])
+    text = table(results(*runs))
+    (row,) = [line for line in text.splitlines() if "learned-occupancy against own" in line]
+    assert row.split(" | ")[1:] == ["1", "-1.00", "-", "-", "1.0 |"]
+
+
+STILL = [[3.0, 18.0], [6.0, 20.0], [9.0, 20.2]]
+RISING = [[3.0, 15.0], [6.0, 18.0], [9.0, 21.0]]
+
+
+def test_the_gain_of_the_last_third_is_between_two_thirds_of_the_time_and_its_end() -> None:
+    still, rising = lines_of(results(run("A", curve=STILL), run("B", curve=RISING)))
+    assert last_gain(still) == pytest.approx(0.2)
+    assert last_gain(rising) == pytest.approx(3.0)
+    begun_late = lines_of(results(run("C", curve=[[8.0, 15.0], [9.0, 17.0]])))[0]
+    assert last_gain(begun_late) is None
+
+
+def test_who_rises_or_may_rise_is_named_and_nobody_is_said_to_have_had_enough() -> None:
+    lines = lines_of(results(run("A", curve=STILL), run("B", curve=RISING)))
+    said = settling(lines)
+    assert "A +0.2 dB, B +3.0 dB. Still rising: B; rates fall" in said
+    assert "Still rising: none;" in settling(lines[:1])
+    assert "Still rising: all of them;" in settling(lines[1:])
+    late = lines_of(results(run("A", curve=STILL), run("C", curve=[[9.0, 17.0]])))
+    assert "C unknown. Still rising: C;" in settling(late)
+
+
+def test_a_grid_that_has_skipped_nothing_yet_is_still_rising() -> None:
+    cold = run("grid", curve=STILL, warming_up=True)
+    assert still_rising(lines_of(results(run("A", curve=STILL), cold))) == ["grid"]
+
+
+def test_a_grid_that_took_the_time_of_training_is_named() -> None:
+    fine = run(
+        "fine", curve=STILL, train_seconds=9.0, learn_seconds=8.0, sampler="occupancy-grid-9"
+    )
+    gate = run("gate", curve=STILL, train_seconds=9.0, learn_seconds=8.0)
+    lines = lines_of(results(gate, fine))
+    assert still_rising(lines) == ["fine"]
+    assert "Updated its grid instead of training: fine for 89% of its time." in settling(lines)
+
+
+def test_tables_of_runs_of_equal_time_say_it_and_no_others() -> None:
+    both = [run("A", curve=STILL), run("B", curve=RISING)]
+    suite = {"suite": "freeze", "question": "Why?"}
+    steps = {"protocol": {"seconds": None, "steps": 400}}
+    assert "last third" in table(results(*both, **suite))
+    assert "last third" in table(results(*both))
+    assert "last third" not in table(results(*both, **suite, **steps))
+
+
+def test_runs_that_end_below_their_best_point_are_named_on_table_and_page(tmp_path: Path) -> None:
+    fell = run("B", curve=[[3.0, 18.0], [6.0, 20.0], [9.0, 19.6]])
+    both = results(run("A", curve=STILL), fell)
+    said = "Fell from their own best point: B by 0.4 dB (0.40 to 0.40)."
+    assert falls(lines_of(both)) == said
+    assert said in table(both) and said in write_page(both, tmp_path / "chart.html").read_text()
+    hardly = run("B", curve=[[3.0, 18.0], [6.0, 20.0], [9.0, 19.95]])
+    assert falls(lines_of(results(run("A", curve=STILL), hardly))) is None

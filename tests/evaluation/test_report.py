@@ -1,0 +1,32 @@
+"""Claims about the description of the machine, stored JSON."""
+
+from __future__ import annotations
+
+import datetime
+import json
+import platform
+from pathlib import Path
+
+import pytest
+
+from leco_plugin.evaluation.report import describe_code, describe_machine, made_by, write_json
+
+
+def test_the_machine_is_described_without_its_name() -> None:
+    text = json.dumps(describe_machine())
+    assert {"cpu", "cores", "device", "torch"} <= json.loads(text).keys()
+    assert "/" not in json.loads(text)["device"]
+    assert not platform.node() or platform.node() not in text
+
+
+def test_a_figure_says_what_made_it_and_when() -> None:
+    code = describe_code()
+    assert code == describe_code() and len(code["sources"]) == 12
+    made = made_by(code)
+    assert made["code"] == code and datetime.date.fromisoformat(made["date"])
+
+
+def test_what_is_no_json_leaves_no_file(tmp_path: Path) -> None:
+    with pytest.raises(ValueError):
+        write_json(tmp_path / "report.json", {"psnr": float("nan")})
+    assert list(tmp_path.iterdir()) == []
