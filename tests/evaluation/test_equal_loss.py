@@ -15,9 +15,8 @@ from leco_plugin.models.encodings import EncodingConfig
 from leco_plugin.models.field import FieldConfig
 from leco_plugin.models.gate import GateConfig
 from leco_plugin.models.hmoe import HMoEConfig
-from leco_plugin.models.leco import LecoModel
-from leco_plugin.models.leco_config import LecoModelConfig
-from leco_plugin.models.rendering import Rays
+from leco_plugin.models.mixture import Mixture
+from leco_plugin.models.rendering import Rays, Routing
 from leco_plugin.models.sizing.sizes import Sizes
 from leco_plugin.scenes.bounds import SceneBounds
 
@@ -60,9 +59,12 @@ BOUNDS = SceneBounds(
 )
 
 
+FEW = CalibrationConfig(rays_at_once=32)
+
+
 @pytest.fixture
-def model(monkeypatch: pytest.MonkeyPatch) -> LecoModel:
-    """A model whose field is dense, and whose gate says so, where x > 0 and nowhere else."""
+def mixture(monkeypatch: pytest.MonkeyPatch) -> Mixture:
+    """A mixture whose field is dense, and whose gate says so, where x > 0 and nowhere else."""
     sizes = Sizes(
         gate=GateConfig(EncodingConfig(octaves=1), width=4, layers=1, scene_experts=2),
         field=FieldConfig(
@@ -70,9 +72,8 @@ def model(monkeypatch: pytest.MonkeyPatch) -> LecoModel:
         ),
         candidates=64,
     )
-    config = LecoModelConfig(sizes=sizes, calibration=CalibrationConfig(rays_at_once=32))
     torch.manual_seed(0)
-    made = LecoModel(config, scene_box=None, num_train_data=1)  # type: ignore[arg-type]
+    made = Mixture(sizes, 1, "float32", Routing(0.2, homogeneous=False))
     made.set_bounds(BOUNDS, 1.0)
 
     def gate(mapped: Tensor) -> Tensor:
@@ -86,7 +87,7 @@ def model(monkeypatch: pytest.MonkeyPatch) -> LecoModel:
     monkeypatch.setattr(made.field, "density", density)
     made.report = {"aabb": BOUNDS.aabb.tolist()}
     rays = rays_along_x(50)
-    monkeypatch.setattr(equal_loss, "calibration_rays", lambda *_: (rays, torch.zeros(50, 3)))
+    monkeypatch.setattr(equal_loss, "held_out_rays", lambda *_: (rays, torch.zeros(50, 3)))
     monkeypatch.setattr(equal_loss, "rays_of_photographs", lambda *_: None)
     taught = torch.rand(200_000, 3, generator=torch.Generator().manual_seed(1))
     box = BOUNDS.aabb.view(2, 3)
@@ -105,17 +106,17 @@ def rays_along_x(count: int) -> Rays:
     return Rays(origins, directions, near, far, None)
 
 
-def test_a_perfect_gate_keeps_the_occupied_half_of_the_box(model: LecoModel) -> None:
-    found = at_equal_loss(model.train(), None)
+def test_a_perfect_gate_keeps_the_occupied_half_of_the_box(mixture: Mixture) -> None:
+    found = at_equal_loss(mixture.train(), None, config=FEW)
     assert found["lost_surface_mass"] == 1e-3 and found["grids"] == []
     assert found["kept_reached_volume"] == pytest.approx(0.5, abs=0.01)
     assert 0.3 < found["kept_candidates"] < 0.6
     assert found["reached_volume"] > 0.9
-    assert model.training
+    assert mixture.training
 
 
-def test_grids_are_measured_like_the_gate(model: LecoModel) -> None:
-    even, odd = at_equal_loss(model, None, grids=(4, 5))["grids"]
+def test_grids_are_measured_like_the_gate(mixture: Mixture) -> None:
+    even, odd = at_equal_loss(mixture, None, grids=(4, 5), config=FEW)["grids"]
     assert (even["resolution"], even["bytes"]) == (4, 8)
     assert (odd["resolution"], odd["bytes"]) == (5, 16)
     assert even["kept_reached_volume"] == pytest.approx(0.5, abs=0.01)
@@ -124,19 +125,19 @@ def test_grids_are_measured_like_the_gate(model: LecoModel) -> None:
     assert even["update_seconds"] > 0.0
 
 
-def test_a_grid_of_another_size_along_each_axis_is_measured_too(model: LecoModel) -> None:
-    (row,) = at_equal_loss(model, None, grids=((4, 3, 2),))["grids"]
+def test_a_grid_of_another_size_along_each_axis_is_measured_too(mixture: Mixture) -> None:
+    (row,) = at_equal_loss(mixture, None, grids=((4, 3, 2),))["grids"]
     assert row["bytes"] == 3 and row["kept_reached_volume"] == pytest.approx(0.5, abs=0.01)
 
 
-def test_grids_end_with_the_first_that_keeps_as_little_as_the_gate(model: LecoModel) -> None:
-    found = at_equal_loss(model, None, grids=(5, 4, 8), until_as_little=True)
+def test_grids_end_with_the_first_that_keeps_as_little_as_the_gate(mixture: Mixture) -> None:
+    found = at_equal_loss(mixture, None, grids=(5, 4, 8), until_as_little=True, config=FEW)
     assert [row["resolution"] for row in found["grids"]] == [5, 4]
     assert found["grids"][-1]["kept_reached_volume"] == found["kept_reached_volume"]
 
 
 def test_a_coarse_grid_hears_of_a_surface_that_random_places_miss(
-    model: LecoModel, monkeypatch: pytest.MonkeyPatch
+    mixture: Mixture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def film(mapped: Tensor, *_: Tensor) -> tuple[Tensor, Tensor]:
         on_film = (mapped[:, 0] - 0.2).abs() < 1e-4
@@ -144,26 +145,26 @@ def test_a_coarse_grid_hears_of_a_surface_that_random_places_miss(
 
     places = torch.tensor([0.2, 0.0, 0.0]).repeat(64, 1)
     places[:, 1:] = torch.cartesian_prod(*[torch.linspace(-0.45, 0.45, 8)] * 2)
-    everywhere = equal_loss.candidates_of(model, None)
-    monkeypatch.setattr(model.field, "density", film)
+    everywhere = equal_loss.candidates_of(mixture, None)
+    monkeypatch.setattr(mixture.field, "density", film)
     monkeypatch.setattr(equal_loss, "candidates_of", lambda *_: torch.cat([places, everywhere]))
     held_out = torch.tensor([[0.2, 0.07, 0.07], [-0.3, 0.1, 0.1]])
     weights = torch.tensor([1.0, 0.0])
     monkeypatch.setattr(
         equal_loss, "_measured", lambda *_: (held_out, weights, torch.tensor([0.9, 0.1]))
     )
-    (row,) = at_equal_loss(model, None, grids=(8,))["grids"]
+    (row,) = at_equal_loss(mixture, None, grids=(8,), config=FEW)["grids"]
     assert row["kept_reached_volume"] < 0.2  # a slab of one cell, not the whole box
 
 
 def test_space_that_no_ray_reaches_is_nobodys_volume(
-    model: LecoModel, monkeypatch: pytest.MonkeyPatch
+    mixture: Mixture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    everywhere = equal_loss.candidates_of(model, None)
+    everywhere = equal_loss.candidates_of(mixture, None)
     middles = (everywhere[:, 0] > -6 / 32) & (everywhere[:, 0] < 3 / 32)  # nine layers of cells
     seen = everywhere[middles]
     monkeypatch.setattr(equal_loss, "candidates_of", lambda *_: seen)
-    found = at_equal_loss(model, None, grids=(4,))
+    found = at_equal_loss(mixture, None, grids=(4,), config=FEW)
     assert found["reached_volume"] == pytest.approx(9 / 32, abs=0.01)
     # a third of what is reached is dense, of the box half is
     assert found["kept_reached_volume"] == pytest.approx(1 / 3, abs=0.01)
@@ -171,21 +172,21 @@ def test_space_that_no_ray_reaches_is_nobodys_volume(
 
 
 def test_rays_without_any_surface_are_refused_in_a_line(
-    model: LecoModel, monkeypatch: pytest.MonkeyPatch
+    mixture: Mixture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     nothing = torch.zeros(0, 3), torch.zeros(0), torch.zeros(0)
     monkeypatch.setattr(equal_loss, "_measured", lambda *_: nothing)
     with pytest.raises(ValueError, match="no surface"):
-        at_equal_loss(model, None)
+        at_equal_loss(mixture, None, config=FEW)
 
 
-def test_a_grid_that_does_not_fit_the_memory_is_left_out(model: LecoModel) -> None:
-    found = at_equal_loss(model, None, grids=(4, 1 << 15))
+def test_a_grid_that_does_not_fit_the_memory_is_left_out(mixture: Mixture) -> None:
+    found = at_equal_loss(mixture, None, grids=(4, 1 << 15), config=FEW)
     assert [row["resolution"] for row in found["grids"]] == [4]
     assert found["left_out"] == [1 << 15]
 
 
-def test_training_draws_the_same_random_numbers_afterwards(model: LecoModel) -> None:
+def test_training_draws_the_same_random_numbers_afterwards(mixture: Mixture) -> None:
     state = torch.random.get_rng_state()
-    at_equal_loss(model, None, grids=(4,))
+    at_equal_loss(mixture, None, grids=(4,), config=FEW)
     assert torch.equal(torch.random.get_rng_state(), state)
