@@ -4,16 +4,13 @@ from __future__ import annotations
 
 from dataclasses import replace
 from types import SimpleNamespace
-from typing import Any
 
 import torch
 from nerfstudio.cameras.rays import RayBundle
-from small_learner import SMALLEST, NoPixels, small_mixture
+from small_learner import SMALLEST, small_mixture
 
-from leco_plugin.learning.calibration import CalibrationConfig
 from leco_plugin.learning.dense import dense_rendering, evaluating
-from leco_plugin.learning.held_out import HeldOut
-from leco_plugin.scenes.learning_data import held_out_bundle
+from leco_plugin.scenes.learning_data import held_out_bundle, held_out_rays
 from leco_plugin.scenes.pixels.held_out_pixels import HeldOutPixelSampler, HeldOutPixelSamplerConfig
 
 COUNT = 50
@@ -65,9 +62,8 @@ def test_prices_are_measured_in_the_appearance_of_each_image() -> None:
     mixture.field.color.appearance.weight.data = torch.tensor([[500.0], [-500.0]])
     ahead = torch.tensor([[0.0, 0.0, 1.0]]).expand(2, 3)
     bundle = RayBundle(-0.5 * ahead, ahead, torch.ones(2, 1), torch.tensor([[0], [1]]))
-    data: Any = NoPixels()
-    data.held_out = lambda *_: (bundle, torch.rand(2, 3))
-    rays, truth = HeldOut(mixture, data, CalibrationConfig(), False).rays(2)
+    manager = SimpleNamespace(next_train=lambda step: (bundle, {"image": torch.rand(2, 3)}))
+    rays, truth = held_out_rays(mixture, manager, 2)
     with evaluating(mixture), torch.no_grad():
         (reference,) = dense_rendering(mixture, rays, truth, 2).references
         unknown = mixture.rays(bundle.origins, bundle.directions, None)

@@ -4,11 +4,9 @@ from __future__ import annotations
 
 import copy
 import io
-from typing import Any
 
 import pytest
 import torch
-from nerfstudio.cameras.rays import RayBundle
 from small_learner import ARun, NoPixels, small_learner
 
 from leco_plugin.learning.calibration import near_median_depth
@@ -130,11 +128,9 @@ def test_the_price_is_that_of_all_that_have_gone(mixture: Mixture) -> None:
 class Drawn(NoPixels):
     """Some rays of the scene, and any colours."""
 
-    def held_out(self, count: int, seed: int = 0, share: str = "") -> tuple[Any, torch.Tensor]:
-        rays = some_rays(count)
-        bundle = RayBundle(rays.origins, rays.directions, torch.ones(count, 1))
-        bundle.camera_indices = torch.zeros(count, 1, dtype=torch.int64)
-        return bundle, torch.rand(count, 3)
+    def held_out(self, mixture: Mixture, count: int, *_: object) -> tuple[Rays, torch.Tensor]:
+        rays, images = some_rays(count), torch.zeros(count, dtype=torch.int64)
+        return mixture.rays(rays.origins, rays.directions, images), torch.rand(count, 3)
 
 
 def test_what_is_empty_and_what_is_skipped_stays_so(
