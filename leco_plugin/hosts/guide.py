@@ -21,7 +21,6 @@ from leco_plugin.learning.progress import WatchState
 from leco_plugin.models.gate import Gate, GateConfig
 from leco_plugin.models.region import SIDE, Region, SeenBackdrops
 from leco_plugin.occupancy import Occupancy
-from leco_plugin.samplers.base import DensityFn, Estimator
 from leco_plugin.samplers.registry import (
     SamplerSpec,
     build_estimator,
@@ -51,7 +50,6 @@ class Guide(nn.Module):
     Args:
         sampler: name in the registry of samplers.
         options: of that sampler.
-        front_to_back: whether packed hosts render so, see `Estimator.density_fn`.
 
     Attributes:
         occupancy: None until there is one.
@@ -74,10 +72,9 @@ class Guide(nn.Module):
         self,
         sampler: str = "learned-occupancy",
         options: Mapping[str, Any] | None = None,
-        front_to_back: bool = False,
     ) -> None:
         super().__init__()
-        self.sampler, self.front_to_back = sampler, front_to_back
+        self.sampler = sampler
         self.options = dict(options or {})
         self.occupancy: Occupancy | None = None
         self.version = 0
@@ -187,23 +184,18 @@ class Guide(nn.Module):
         self,
         aabb: Tensor | None,
         outermost: Tensor | None = None,
-        density_fn: DensityFn | None = None,
     ) -> nn.Module:
         """What goes where a packed host has its estimator.
 
         Args:
             aabb: box of that estimator, [6]; None where the host cuts its rays itself.
             outermost: the box in which the host's own samples at all, [6]; None is no such box.
-            density_fn: the host's density at positions [N, 3], for rendering front to back.
         Raises:
             InputError: the sampler has no estimator, or not all of its options.
         """
         if self._spec("estimator").needs_occupancy:
-            return GuidedEstimator(self, aabb, outermost, density_fn)
-        estimator = self.built(build_estimator, aabb=aabb, occupancy=None)
-        if self.front_to_back and isinstance(estimator, Estimator):
-            estimator.density_fn = density_fn
-        return estimator
+            return GuidedEstimator(self, aabb, outermost)
+        return self.built(build_estimator, aabb=aabb, occupancy=None)
 
     def built(self, build: Callable[..., nn.Module], **given: Any) -> nn.Module:
         """The sampler that this host calls, with its options.

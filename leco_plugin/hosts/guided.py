@@ -70,7 +70,7 @@ def set_up_guided(config: GuidedModelConfig, **arguments: Any) -> Model:
     if occupancy.sampler == OWN_SAMPLER:
         host = set_up_host(host_config, Host, **arguments)  # type: ignore[type-abstract]
         return _made_fit(host, config.codes)
-    guide = Guide(occupancy.sampler, occupancy.options, occupancy.front_to_back)
+    guide = Guide(occupancy.sampler, occupancy.options)
     if guide.needs_occupancy and occupancy.path is not None:
         with suppress(InputError):  # a checkpoint brings its own; without one, training says it
             guide.set_occupancy(load_occupancy(occupancy.path))

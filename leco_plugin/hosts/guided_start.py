@@ -59,10 +59,6 @@ class OccupancyConfig:
     leaves the host as it is."""
     options: dict[str, int | float] = field(default_factory=dict)
     """Of that sampler, by name: resolution 256 levels 4."""
-    front_to_back: bool = False
-    """Packed hosts, when they render: ask densities front to back, and shade nothing behind an
-    opaque surface. The image is the same to a thousandth; it pays where shading costs much more
-    than a density."""
     opaque_start: bool = True
     """Packed hosts: begin with a density that makes what is kept of a ray opaque, where the host's
     own would not. Before a random background a transparent start may never recover."""

@@ -9,13 +9,13 @@ from __future__ import annotations
 import warnings
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, cast
+from typing import TYPE_CHECKING, Any
 
 from torch import nn
 
 from leco_plugin.entries import foreign_entries
 from leco_plugin.hosts.guide import Guide
-from leco_plugin.samplers.base import DensityFn, Estimator
+from leco_plugin.samplers.base import Estimator
 from leco_plugin.samplers.nerfacc_cpu import install_for
 from leco_plugin.scenes.input_error import InputError
 
@@ -94,7 +94,7 @@ def _sample_with(host: Any, guide: Guide) -> None:
             f"{type(host).__name__} makes a grid that fits its bounds itself: with "
             "--pipeline.model.sampling occupancy-grid of the method that is not guided"
         )
-    host.sample_with(guide.estimator(None, density_fn=getattr(host, "density_fn", None)))
+    host.sample_with(guide.estimator(None))
 
 
 SAMPLE_WITH = HostAdapter(
@@ -126,21 +126,11 @@ def _estimators(host: nn.Module) -> list[nn.Module]:
     ]
 
 
-def _density_beside(host: nn.Module, estimator: nn.Module) -> DensityFn | None:
-    """The host's density, as the sampler that holds the estimator has it."""
-    for module in host.modules():
-        if estimator in module._modules.values():
-            density_fn = getattr(module, "density_fn", None)
-            if callable(density_fn):
-                return cast(DensityFn, density_fn)
-    return None
-
-
 def _swap_packed(host: Model, guide: Guide) -> None:
     for old in _estimators(host):
         boxes: Any = old.aabbs
         # of nested boxes the first is the scene's, and nothing is sampled outside the last
-        new = guide.estimator(boxes[0].detach(), boxes[-1].detach(), _density_beside(host, old))
+        new = guide.estimator(boxes[0].detach(), boxes[-1].detach())
         replace_module(host, old, new)
 
 

@@ -17,7 +17,7 @@ from torch import Tensor, nn
 
 from leco_plugin.models.region import within_crop
 from leco_plugin.models.rendering import Intervals, Rays, with_backdrop
-from leco_plugin.samplers.base import DensityFn, Estimator
+from leco_plugin.samplers.base import Estimator
 from leco_plugin.samplers.boxes import cell_centers, intersect_box
 from leco_plugin.samplers.rays import usable_rays
 from leco_plugin.samplers.registry import build_estimator, build_proposal
@@ -107,10 +107,8 @@ class GuidedEstimator(_StandIn):
         guide: Guide,
         aabb: Tensor | None,
         outermost: Tensor | None = None,
-        density_fn: DensityFn | None = None,
     ) -> None:
         super().__init__(guide)
-        self._density_fn = density_fn
         self._aabb = None if aabb is None else aabb.detach().cpu()
         self._outermost = None if outermost is None else outermost.detach().cpu()
 
@@ -118,18 +116,7 @@ class GuidedEstimator(_StandIn):
         aabb = self._aabb
         if aabb is not None and not guide.same_frame():
             aabb = box_around(aabb, guide.frame.cpu())
-        estimator = guide.built(build_estimator, aabb=aabb, occupancy=guide.followed())
-        if guide.front_to_back and isinstance(estimator, Estimator):
-            estimator.density_fn = self._density_of(guide)
-        return estimator
-
-    def _density_of(self, guide: Guide) -> DensityFn | None:
-        """The host's density, asked at positions of the occupancy."""
-        ask = self._density_fn
-        if ask is None or guide.same_frame():
-            return ask
-        back = inverse(guide.frame)
-        return lambda positions: ask(moved(positions, back))
+        return guide.built(build_estimator, aabb=aabb, occupancy=guide.followed())
 
     @functools.wraps(Estimator.sampling)
     def sampling(self, rays_o: Tensor, rays_d: Tensor, *args: Any, **kwargs: Any) -> Any:

@@ -15,8 +15,8 @@ from torch import Tensor, nn
 
 from leco_plugin.samplers.boxes import checked_box, intersect_box
 from leco_plugin.samplers.marching import NearFn, OccupiedFn, Samples, march
-from leco_plugin.samplers.rays import March, Rays, check_rays, plan
-from leco_plugin.samplers.visibility import SampleFn, front_to_back, prune
+from leco_plugin.samplers.rays import March, Rays, check_rays
+from leco_plugin.samplers.visibility import SampleFn, prune
 
 DensityFn = Callable[[Tensor], Tensor]
 """Positions [N, 3] to densities [N] or [N, 1]."""
@@ -26,8 +26,6 @@ class Estimator(nn.Module):
     """Marches rays and keeps what a subclass calls occupied.
 
     Attributes:
-        density_fn: density of a position. When a host sets it, evaluation goes front to back and
-            hands out no sample behind an opaque surface.
         chunk_size: most candidates worked on at once; None chooses by device.
     """
 
@@ -36,14 +34,7 @@ class Estimator(nn.Module):
     def __init__(self, *args: Any) -> None:
         super().__init__(*args)
         self.register_buffer("_place", torch.empty(0), persistent=False)
-        self.density_fn: DensityFn | None = None
         self.chunk_size: int | None = None
-
-    def __setattr__(self, name: str, value: Any) -> None:
-        if name == "density_fn":  # a host's field is no part of this, nor of its checkpoints
-            object.__setattr__(self, name, value)
-        else:
-            super().__setattr__(name, value)
 
     @property
     def device(self) -> torch.device:
@@ -118,16 +109,6 @@ class Estimator(nn.Module):
         if stratified:
             rays = rays.shifted(torch.rand_like(rays.t_mins) * render_step_size)
         asked = sigma_fn is not None or alpha_fn is not None
-        if self.density_fn is not None and not (self.training or asked) and early_stop_eps > 0.0:
-            candidates, _, longest = plan(rays, rule)
-            return front_to_back(
-                candidates,
-                longest,
-                *self.questions(),
-                sigma_fn=densities_of_samples(self.density_fn, rays_o, rays_d),
-                early_stop_eps=early_stop_eps,
-                chunk_size=self.chunk_size,
-            )
         samples = self.march(rays, rule)
         if not asked or (early_stop_eps <= 0.0 and alpha_thre <= 0.0):
             return samples

@@ -121,17 +121,6 @@ def tiles(
             yield first_ray, tile, n_steps
 
 
-def keep(
-    candidates: Candidates,
-    n_steps: int,
-    occupied: OccupiedFn | None,
-    near_occupied: NearFn | None = None,
-) -> Samples:
-    """Pack those candidates that are occupied; `n_steps` is the most of any ray."""
-    rays, runs = cut(candidates, n_steps, near_occupied)
-    return keep_steps(runs, RUN, rays, occupied, near_occupied is not None)
-
-
 def keep_steps(
     candidates: Candidates,
     n_steps: int,

@@ -1,27 +1,20 @@
 """Samples that no light reaches the camera from need no shading: pruning by transmittance.
 
-Two ways to the same answer. `prune` asks the density of all samples at once, as nerfacc does.
-`front_to_back` asks it in slabs and stops a ray when its transmittance falls below the threshold,
-so that nothing behind an opaque surface is ever asked.
+The density of all samples is asked at once, as nerfacc does.
 """
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable
 
 import torch
 from torch import Tensor
 
-from leco_plugin.samplers.marching import NearFn, OccupiedFn, Samples, join, keep
+from leco_plugin.samplers.marching import Samples
 from leco_plugin.samplers.packed import (
     render_transmittance_from_alpha,
     render_transmittance_from_density,
 )
-from leco_plugin.samplers.rays import Candidates
-
-HELD_AT_ONCE = 1 << 20
-"""Candidates that `front_to_back` holds at once, if it is told nothing else."""
 
 SampleFn = Callable[[Tensor, Tensor, Tensor], Tensor]
 """t_starts [N], t_ends [N], ray_indices [N] to densities or opacities [N]."""
@@ -86,61 +79,3 @@ def _select(samples: Samples, wanted: Tensor) -> Samples:
     left = wanted.nonzero()[:, 0]
     ray_indices, t_starts, t_ends = (tensor.index_select(0, left) for tensor in samples)
     return ray_indices, t_starts, t_ends
-
-
-@torch.no_grad()
-def front_to_back(
-    candidates: Candidates,
-    n_steps: int,
-    occupied: OccupiedFn | None,
-    near_occupied: NearFn | None = None,
-    *,
-    sigma_fn: SampleFn,
-    early_stop_eps: float,
-    slab: int = 64,
-    chunk_size: int | None = None,
-) -> Samples:
-    """The samples of `march` with T >= early_stop_eps, asking densities only as far as light goes.
-
-    Args:
-        candidates, n_steps: as `plan` returns them: of which rays, and the most of any ray.
-        occupied, near_occupied: as for `march`.
-        sigma_fn: densities of samples; `ray_indices` are those of the rays in `candidates`.
-        early_stop_eps: transmittance in (0, 1) below which a ray is given up; the colour of a
-            pixel changes by no more than this.
-        slab: candidates by which each ray advances between two looks at its transmittance.
-        chunk_size: most candidates held at once (a slab of one ray at least); None is a million.
-
-    Returns:
-        Samples sorted by ray, then t.
-
-    Raises:
-        ValueError: `early_stop_eps` is not in (0, 1).
-    """
-    if not 0.0 < early_stop_eps < 1.0:
-        raise ValueError(f"front-to-back needs early_stop_eps in (0, 1), got {early_stop_eps}")
-    opaque, depths = -math.log(early_stop_eps), torch.zeros_like(candidates.t_mins)
-    kept: list[Samples] = []
-    every_ray = torch.arange(len(depths), device=depths.device)
-    for alive in every_ray.split(max(1, (chunk_size or HELD_AT_ONCE) // slab)):
-        for first_step in range(0, n_steps, slab):
-            ahead = candidates.counts.index_select(0, alive) > first_step
-            ahead &= depths.index_select(0, alive) <= opaque
-            alive = alive.index_select(0, ahead.nonzero()[:, 0])
-            if alive.numel() == 0:
-                break
-            part = candidates.of_rays(alive).window(first_step, slab)
-            of_alive, t_starts, t_ends = keep(part, slab, occupied, near_occupied)
-            if of_alive.numel() == 0:
-                continue
-            samples = alive.index_select(0, of_alive), t_starts, t_ends
-            sigmas = sigma_fn(t_starts, t_ends, samples[0])
-            trans, _ = render_transmittance_from_density(
-                t_starts, t_ends, sigmas, ray_indices=of_alive, n_rays=len(alive)
-            )
-            trans = trans * torch.exp(-depths.index_select(0, samples[0]))
-            kept.append(_select(samples, trans >= early_stop_eps))
-            depths.index_add_(0, samples[0], (sigmas * (t_ends - t_starts)).to(depths.dtype))
-    ray_indices, t_starts, t_ends = join(kept, candidates.t_mins)
-    ray_indices, order = ray_indices.sort(stable=True)
-    return ray_indices, t_starts.index_select(0, order), t_ends.index_select(0, order)

@@ -7,7 +7,6 @@ import copy
 import nerfacc
 import pytest
 import torch
-from ball_occupancy import ball
 from nerfstudio.model_components.ray_samplers import (
     ProposalNetworkSampler,
     UniformSampler,
@@ -80,15 +79,6 @@ def test_a_packed_host_is_found_under_any_name(guide: Guide):
     assert isinstance(host.gatekeeper, GuidedEstimator)
     assert host.walker.occupancy_grid is host.gatekeeper
     assert not any("occs" in name for name in host.state_dict())
-
-
-def test_a_packed_host_lends_its_density_for_rendering_front_to_back():
-    host, network = Packed(), Network()
-    host.walker.density_fn = network.density_fn
-    made = Guide(front_to_back=True)
-    made.set_occupancy(ball())
-    swap_sampler(host, made)
-    assert host.gatekeeper.sampler.density_fn == network.density_fn
 
 
 def test_a_proposal_host_keeps_nothing_of_its_networks(guide: Guide):

@@ -178,27 +178,6 @@ def wall_behind(x: float):
     return lambda positions: 1e3 * (positions[:, 2:] < x).float()
 
 
-@pytest.mark.parametrize("scale", [1.0, 2.0], ids=["same frame", "another"])
-@pytest.mark.parametrize("sampler", ["learned-occupancy", "dense"])
-def test_rendering_front_to_back_hands_out_nothing_behind_a_wall(scale: float, sampler: str):
-    made = Guide(sampler, front_to_back=True)
-    made.set_occupancy(ball(), torch.cat([scale * torch.eye(3), torch.zeros(3, 1)], dim=1))
-    middle = CENTRE[2] / scale
-    estimator = made.estimator(BOX / scale, density_fn=wall_behind(middle)).eval()
-    origins, _ = rays(1)
-    march = {name: value / scale for name, value in MARCH.items()}
-
-    def depths() -> torch.Tensor:
-        down = torch.tensor([[0.0, 0.0, -1.0]])
-        _, starts, ends = estimator.sampling(origins / scale, down, **march)
-        return origins[0, 2] / scale - 0.5 * (starts + ends)
-
-    step = march["render_step_size"]
-    assert middle - 2 * step < depths().min() < middle
-    estimator.train()
-    assert depths().min() < middle - 0.5 / scale
-
-
 def test_a_proposal_host_in_other_coordinates_samples_the_ball(guide: Guide):
     turn = torch.tensor([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
     origins, directions = rays(3)

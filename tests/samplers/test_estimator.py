@@ -151,24 +151,9 @@ def test_a_threshold_of_opacity_drops_what_is_faint(bare):
     assert kept[1].equal(plain[1][1::2])
 
 
-def test_evaluation_goes_front_to_back_once_it_knows_the_density(bare):
-    origins, directions = camera_rays(100)
-    plain = bare.eval().sampling(origins, directions, render_step_size=0.01)
-    bare.density_fn = lambda positions: torch.full((len(positions), 1), 100.0)
-    try:
-        seen = bare.sampling(origins, directions, render_step_size=0.01)
-        trained = bare.train().sampling(origins, directions, render_step_size=0.01)
-    finally:
-        bare.density_fn = None
-    assert len(trained[0]) == len(plain[0])
-    counts = packed.pack_info(plain[0], 100)[:, 1].clamp(max=10)
-    assert packed.pack_info(seen[0], 100)[:, 1].equal(counts)
-
-
 @pytest.mark.parametrize("training", [True, False])
 def test_no_more_candidates_than_a_chunk_are_worked_on_at_once(training):
     estimator, asked = LearnedOccupancyEstimator(Balls(), cache_bytes=0).train(training), []
-    estimator.density_fn = lambda positions: torch.full((len(positions), 1), 1.0)
     estimator.occupancy.occupied = lambda positions: (
         asked.append(len(positions)) or (positions[:, 0] > 0.0)
     )
@@ -293,14 +278,6 @@ def test_rays_that_do_not_fit_are_named(bare):
 def test_what_is_no_occupancy_is_refused_in_a_line():
     with pytest.raises(TypeError, match=r"^Occupancy\.load\(FILE\) gives an .*; a str is none$"):
         LearnedOccupancyEstimator("box.safetensors")
-
-
-def test_a_hosts_field_is_no_part_of_its_estimator():
-    estimator = LearnedOccupancyEstimator(ball(), cache_bytes=0)
-    before = list(estimator.state_dict())
-    estimator.density_fn = torch.nn.Linear(3, 1)
-    assert list(estimator.state_dict()) == before
-    assert not any(isinstance(module, torch.nn.Linear) for module in estimator.children())
 
 
 @pytest.mark.parametrize("kind", ["box", "contraction"])

@@ -7,6 +7,7 @@ import logging
 import subprocess
 import sys
 from types import SimpleNamespace
+from typing import Any
 from weakref import WeakKeyDictionary
 
 import pytest
@@ -21,7 +22,7 @@ from leco_plugin.samplers.edges import candidate_counts, growth_table, powers_ne
 from leco_plugin.samplers.estimator import LearnedOccupancyEstimator
 from leco_plugin.samplers.kernels import fused
 from leco_plugin.samplers.kernels.gate_weights import GateWeights, gate_weights, why_not
-from leco_plugin.samplers.marching import Candidates, March, Rays, Samples, keep
+from leco_plugin.samplers.marching import RUN, Candidates, March, Rays, Samples, cut, keep_steps
 from leco_plugin.samplers.rays import TooManyCandidates
 from leco_plugin.space import Space
 
@@ -87,6 +88,12 @@ def right_gate(made: LearnedOccupancyEstimator, monkeypatch) -> None:
     """Puts a kernel that decides as its twin in the place of the gate's."""
     gate = SimpleNamespace(gate_decisions=lambda w, x: made.occupancy.query(x) >= w.facts[10])
     monkeypatch.setitem(sys.modules, "leco_plugin.samplers.kernels.gate_kernel", gate)
+
+
+def keep(candidates: Candidates, n_steps: int, occupied: Any, near: Any = None) -> Samples:
+    """Those candidates that are occupied; `n_steps` is the most of any ray."""
+    rays, runs = cut(candidates, n_steps, near)
+    return keep_steps(runs, RUN, rays, occupied, near is not None)
 
 
 class MarchKernel:

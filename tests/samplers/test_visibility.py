@@ -8,8 +8,8 @@ from samplers.analytic_occupancy import Balls, camera_rays
 
 from leco_plugin.samplers import packed
 from leco_plugin.samplers.base import densities_of_samples
-from leco_plugin.samplers.marching import March, Rays, march, plan
-from leco_plugin.samplers.visibility import front_to_back, prune
+from leco_plugin.samplers.marching import March, Rays, march
+from leco_plugin.samplers.visibility import prune
 
 N_RAYS, STEP = 150, 0.01
 BALLS = Balls()
@@ -50,43 +50,10 @@ def test_the_density_of_a_sample_is_that_of_its_middle(scene):
         torch.testing.assert_close(sigmas, torch.tensor(expected), rtol=1e-3, atol=1e-3)
 
 
-@pytest.mark.parametrize("slab", [1, 7, 64, 1000])
-@pytest.mark.parametrize("cone_angle", [0.0, 0.01])
-def test_front_to_back_is_pruning_with_fewer_questions(scene, slab, cone_angle):
-    sigma_fn = densities_of_samples(density, *scene[:2])
-    samples = march(scene, March(STEP, cone_angle), BALLS.occupied)
-    visible = prune(samples, N_RAYS, sigma_fn=sigma_fn, early_stop_eps=1e-3)
-    candidates, _, longest = plan(scene, March(STEP, cone_angle))
-    asked = 0
-
-    def counting(*sample):
-        nonlocal asked
-        asked += len(sample[0])
-        return sigma_fn(*sample)
-
-    found = front_to_back(
-        candidates,
-        longest,
-        occupied=BALLS.occupied,
-        sigma_fn=counting,
-        early_stop_eps=1e-3,
-        slab=slab,
-        chunk_size=4096,
-    )
-    for one, other in zip(found, visible, strict=True):
-        torch.testing.assert_close(one, other, rtol=0.0, atol=1e-6)
-    assert len(visible[0]) <= asked <= len(samples[0])
-    of_one_ray = slab - 1  # it stops within the slab in which its light ends
-    assert asked <= len(visible[0]) + of_one_ray * len(visible[0].unique())
-
-
 def test_the_image_changes_by_no_more_than_the_threshold(scene):
     sigma_fn = densities_of_samples(density, *scene[:2])
     samples = march(scene, March(STEP), BALLS.occupied)
-    candidates, _, longest = plan(scene, March(STEP))
-    visible = front_to_back(
-        candidates, longest, occupied=BALLS.occupied, sigma_fn=sigma_fn, early_stop_eps=1e-4
-    )
+    visible = prune(samples, N_RAYS, sigma_fn=sigma_fn, early_stop_eps=1e-4)
     difference = (render(samples, sigma_fn) - render(visible, sigma_fn)).abs().max()
     assert len(visible[0]) < len(samples[0])
     assert difference <= 1e-3
@@ -127,15 +94,6 @@ def test_nothing_to_see_is_no_samples(scene):
 
     nowhere = march(scene, March(STEP), lambda p: torch.zeros(len(p)).bool())
     assert len(prune(nowhere, N_RAYS, sigma_fn=never)[0]) == 0
-    candidates, _, longest = plan(scene, March(STEP))
-    none = front_to_back(
-        candidates,
-        longest,
-        occupied=lambda p: torch.zeros(len(p)).bool(),
-        sigma_fn=never,
-        early_stop_eps=1e-4,
-    )
-    assert [tensor.shape for tensor in none] == [(0,)] * 3
 
 
 def test_answers_of_another_shape_are_named(scene):
@@ -143,8 +101,3 @@ def test_answers_of_another_shape_are_named(scene):
     n = len(samples[0])
     with pytest.raises(ValueError, match=rf"must answer \[{n}\], got \[{n}, 1\]"):
         prune(samples, N_RAYS, sigma_fn=lambda *_: torch.ones(n, 1))
-    candidates, _, longest = plan(scene, March(STEP))
-    with pytest.raises(ValueError, match=r"early_stop_eps in \(0, 1\)"):
-        front_to_back(
-            candidates, longest, occupied=None, sigma_fn=lambda *s: s[0], early_stop_eps=0.0
-        )
