@@ -129,8 +129,8 @@ def run(options: Options, pair: Pair | None, planes: bool, seed: int) -> dict[st
         if pair is None:
             raise
         return facts | {"range": list(pair), "psnr": None, "failed": str(error)}
-    march_range = trainer.pipeline.model.march_range.tolist()[:2]
-    facts |= {"marched": march_range, **record.to_dict()}
+    region = trainer.pipeline.model.mixture.region
+    facts |= {"marched": [float(region.near), float(region.far)], **record.to_dict()}
     plain: dict[str, Any] = json.loads(json.dumps(facts))
     return plain
 

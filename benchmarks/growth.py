@@ -24,8 +24,6 @@ from typing import Any
 import torch
 import tyro
 from growth_figures import bytes_for, exponents, grid_for
-from leco_plugin.learning.held_out_rendering import calibration_rays
-from nerfstudio.engine.callbacks import TrainingCallbackAttributes
 
 from leco_plugin.evaluation.clock import Clock, warm_up
 from leco_plugin.evaluation.equal_loss import LOST_SURFACE_MASS, at_equal_loss
@@ -33,7 +31,8 @@ from leco_plugin.evaluation.inspection import whole_box
 from leco_plugin.evaluation.report import describe_code, describe_machine, made_by, write_json
 from leco_plugin.learning.calibration import CalibrationConfig
 from leco_plugin.learning.dense import dense_rendering
-from leco_plugin.learning.learner import Lifecycle
+from leco_plugin.learning.learner import Learner
+from leco_plugin.learning.run import LearningOnly
 from leco_plugin.learning.schedule import ScheduleConfig
 from leco_plugin.method_configs import leco_occupancy
 from leco_plugin.models.compute.device import RATES, FusedAdamConfig
@@ -42,6 +41,7 @@ from leco_plugin.models.sizing.sizes import sizes_for
 from leco_plugin.scenes.city.cameras import CaptureConfig
 from leco_plugin.scenes.city.city import City, CityConfig
 from leco_plugin.scenes.city.folder import write_city
+from leco_plugin.scenes.learning_data import held_out_rays
 
 RESULTS = Path(__file__).parent / "results"
 
@@ -110,8 +110,9 @@ def learn(blocks: int, seed: int, options: Options, first: int = 0) -> dict[str,
             break
         print(f"{blocks} blocks: not in {steps} steps")
     model, manager = attempt.model, attempt.manager
-    cells = [whole_box(model.occupancy()).cells(longest) for longest in options.grids]
-    found = at_equal_loss(model, manager, cells, until_as_little=True)
+    mixture = model.mixture
+    cells = [whole_box(mixture.occupancy()).cells(longest) for longest in options.grids]
+    found = at_equal_loss(mixture, manager, cells, until_as_little=True)
     seen = City(city)
     area = float(seen.built.sum()) * city.block_size**2
     enough = grid_for(found["kept_reached_volume"], found["grids"])
@@ -122,14 +123,14 @@ def learn(blocks: int, seed: int, options: Options, first: int = 0) -> dict[str,
         "area_square_metres": area,
         "volume_cubic_metres": round(area * seen.roof),
         "photographs": len(manager.train_dataset),
-        "octaves": model.gate.config.encoding.octaves,
+        "octaves": mixture.gate.config.encoding.octaves,
         "learned": attempt.learned,
         "schedule": steps,
         "steps": attempt.step,
         "seconds": round(attempt.seconds, 2) if attempt.learned else None,
         "psnr_held_out": round(held_out_psnr(model, manager), 2),
-        "gate_bytes": bytes_of(model.gate),
-        "field_bytes": bytes_of(model.field),
+        "gate_bytes": bytes_of(mixture.gate),
+        "field_bytes": bytes_of(mixture.field),
         "grid_bytes": bytes_for(found["kept_reached_volume"], found["grids"]),
         "grid_seconds": enough["update_seconds"] if enough is not None else None,
         "looks": attempt.looks,
@@ -168,16 +169,17 @@ def learned_in(steps: int, folder: Path, blocks: int, seed: int, options: Option
     warm_up(attempt.model.device)
     clock = Clock()
     clock.start()
-    lifecycle = Lifecycle(attempt.model, TrainingCallbackAttributes(None, None, pipeline, None))
-    clock.stop()
     groups = attempt.model.get_param_groups()
     optimizers = [FusedAdamConfig(lr=RATES[name]).setup(group) for name, group in groups.items()]
+    learner = attempt.model.learner(attempt.manager, LearningOnly(optimizers))
+    learner.begin()
+    clock.stop()
     looks = look_steps(steps, options.looks)
     while not attempt.learned and attempt.step < steps:
-        _step(attempt.model, lifecycle, attempt.manager, optimizers, attempt.step, clock)
+        _step(attempt.model, learner, attempt.step, clock)
         attempt.step, attempt.seconds = attempt.step + 1, clock.seconds
         if attempt.step in looks:
-            kept = at_equal_loss(attempt.model, attempt.manager)["kept_candidates"]
+            kept = at_equal_loss(attempt.model.mixture, attempt.manager)["kept_candidates"]
             attempt.looks.append([attempt.step, round(clock.seconds, 2), kept])
             attempt.learned = kept <= options.kept
     return attempt
@@ -192,7 +194,9 @@ def look_steps(steps: int, looks: int) -> set[int]:
 def held_out_psnr(model: Any, manager: Any) -> float:
     """Of held-out training pixels, rendered without skipping: what the field is worth by then."""
     model.eval()
-    rendering = dense_rendering(model, *calibration_rays(model, manager))
+    config, mixture = model.config.calibration, model.mixture
+    rays, truth = held_out_rays(mixture, manager, config.rays)
+    rendering = dense_rendering(mixture, rays, truth, config.rays_at_once)
     squares = [
         (reference.rgb - truth).square()
         for reference, truth in zip(rendering.references, rendering.truths)
@@ -206,17 +210,15 @@ def bytes_of(module: torch.nn.Module) -> int:
     return sum(value.numel() * value.element_size() for value in module.state_dict().values())
 
 
-def _step(
-    model: Any, lifecycle: Lifecycle, manager: Any, optimizers: list[Any], step: int, clock: Clock
-) -> None:
+def _step(model: Any, learner: Learner, step: int, clock: Clock) -> None:
     clock.start()
-    lifecycle.before_step(step)
-    bundle, batch = manager.next_train(step)
+    model.plan = learner.before_step(step)
+    bundle, batch = learner.data.manager.next_train(step)
     losses = model.get_loss_dict(model(bundle), batch)
-    for optimizer in optimizers:
+    for optimizer in learner.run.optimizers():
         optimizer.zero_grad(set_to_none=True)
     torch.stack(list(losses.values())).sum().backward()
-    for optimizer in optimizers:
+    for optimizer in learner.run.optimizers():
         optimizer.step()
     clock.stop()
 

@@ -95,7 +95,7 @@ def train(arguments: list[str], log: Path, end: Path) -> None:
         figures = {
             "step": trainer.step,
             "psnr": round(psnr_on_rays(trainer, 2048), 3),
-            "frozen": bool(model.frozen),
+            "frozen": bool(model.mixture.frozen),
         }
         write_json(end, figures)
 

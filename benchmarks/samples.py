@@ -32,8 +32,8 @@ from leco_plugin.evaluation.report import (
     write_json,
 )
 from leco_plugin.models.leco import LecoModel
+from leco_plugin.samplers import marching
 from leco_plugin.samplers.estimator import LearnedOccupancyEstimator
-from leco_plugin.samplers.marching import march
 from leco_plugin.shrink.sources import find_source
 from leco_plugin.studio.host_models import true_colours
 
@@ -86,19 +86,19 @@ def bundles_of(manager: Any, device: torch.device) -> list[tuple[Any, torch.Tens
 @torch.no_grad()
 def along_rays(model: LecoModel, bundles: Sequence[Any]) -> dict[str, float]:
     """Means over rays of `candidates`, `coarse`, `formed`, `gate` and `kept`."""
-    size, angle = model.step_and_angle(learning=False)
+    mixture, rule = model.mixture, model.mixture.march()
     sums = dict.fromkeys(("candidates", "coarse", "formed", "gate", "kept"), 0.0)
     total = 0
     for bundle in bundles:
         flat, at_once = bundle.flatten(), model.config.eval_num_rays_per_chunk
         for first in range(0, len(flat), at_once):
             rays = model.rays_of(flat[first : first + at_once])
-            along = rays.origins, rays.directions, rays.t_mins, rays.t_maxs
+            along = marching.Rays(*rays[:4])
             total += len(rays.origins)
-            sums["candidates"] += len(march(*along, step_size=size, cone_angle=angle)[0])
-            estimator = model.estimator()
+            sums["candidates"] += len(marching.march(along, rule)[0])
+            estimator = mixture.estimator()
             with asked_along(estimator) as count, counted(model) as queries:
-                kept = estimator.kept(*along, size, angle, None, None)
+                kept = estimator.march(along, rule)
             sums["kept"] += len(kept[0])
             sums["gate"] += queries.gate
             for name, asked in count.items():
@@ -126,7 +126,7 @@ def row_of(run: Path, data: Path) -> dict[str, Any]:
     """The figures of one run."""
     source = find_source(occupancy_of(run), data)
     model = source.model
-    if model is None or not bool(model.frozen):
+    if model is None or not bool(model.mixture.frozen):
         raise SystemExit(f"{run} is no run of leco-occupancy that has frozen its gate")
     pictures = bundles_of(source.manager, model.device)
     every, front = (rendered(model, pictures, front) for front in (False, True))

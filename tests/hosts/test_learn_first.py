@@ -50,7 +50,7 @@ def test_it_is_frozen_and_calibrated_and_the_batch_is_as_before(pipeline):
 def test_a_budget_sets_the_number_of_steps(pipeline, monkeypatch: pytest.MonkeyPatch):
     clock = iter(range(10_000))
     monkeypatch.setattr("leco_plugin.hosts.learn_first.time.monotonic", lambda: next(clock))
-    # the lifecycle asks the same clock twice a step, and the training once in front of the steps
+    # training asks the clock twice a step, and once in front of the steps
     occupancy = learn_occupancy(config(5000), pipeline, rays=32, seconds=1.0)
     assert occupancy.report["step"] == FEWEST_STEPS - 1
 
