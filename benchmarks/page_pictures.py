@@ -15,11 +15,11 @@ from PIL import Image, PngImagePlugin
 from sizes_sections import CAPACITY, scene_results
 from stability_page import PICTURE as STABILITY
 
-from leco_plugin.capacity.picture import draw as draw_capacity
+from leco_plugin.capacity.choice import draw as draw_capacity
 from leco_plugin.chart.drawing.picture import draw
 from leco_plugin.chart.drawing.theme import DARK, LIGHT
 from leco_plugin.evaluation.charts import SOURCE, fingerprint
-from leco_plugin.stability.picture import draw as draw_stability
+from leco_plugin.stability.table import draw as draw_stability
 
 CHARTS = ROOT / "docs" / "images" / "charts"
 GROWTH, LEARNING = CHARTS / "growth.png", CHARTS / "learning.png"

@@ -22,6 +22,7 @@ import torch
 import tyro
 from timing import interleaved, ratio
 
+from leco_plugin.capacity.sources import find_source
 from leco_plugin.cli_reports import occupancy_of
 from leco_plugin.compat.host_outputs import true_colours
 from leco_plugin.evaluation.field_queries import counted
@@ -30,7 +31,6 @@ from leco_plugin.evaluation.machine import describe_code, describe_machine, made
 from leco_plugin.models.leco import LecoModel
 from leco_plugin.samplers.estimator import LearnedOccupancyEstimator
 from leco_plugin.samplers.marching import march
-from leco_plugin.shrink.sources import find_source
 
 IMAGES = 4
 """Test photographs, evenly chosen."""

@@ -146,13 +146,13 @@ def test_a_whole_run_has_its_figures(tiny_scene: Path, tmp_path: Path) -> None:
 def test_small_gates_are_taught_by_the_field_as_it_was_and_stand_beside(
     tiny_scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    from leco_plugin.capacity import field, measuring
+    from leco_plugin.capacity import measuring
     from leco_plugin.chart.contenders.configs import config_of
     from leco_plugin.chart.runs import beside
     from leco_plugin.evaluation.equal_loss import at_equal_loss
 
     monkeypatch.setattr(measuring, "STEPS", 20)
-    monkeypatch.setattr(field, "TAUGHT_RAYS", 256)
+    monkeypatch.setattr(measuring, "TAUGHT_RAYS", 256)
     alone: list[dict[str, Any]] = []
     tables: list[torch.Tensor] = []
 

@@ -10,19 +10,19 @@ from stability_runs import Runs
 
 from leco_plugin import cli
 from leco_plugin.compat.run_folder import alone_in
-from leco_plugin.stability import command, suite
+from leco_plugin.stability import suite
 
 
 @pytest.fixture
 def runs(monkeypatch: pytest.MonkeyPatch) -> Runs:
     """What stands in for the processes of all runs."""
     made = Runs()
-    with_processes = command.make_table
+    with_processes = suite.make_table
 
     def make_table(*args: Any, **kwargs: Any) -> dict[str, Any]:
         return with_processes(*args, **kwargs, runner_for=made)
 
-    monkeypatch.setattr(command, "make_table", make_table)
+    monkeypatch.setattr(suite, "make_table", make_table)
     return made
 
 

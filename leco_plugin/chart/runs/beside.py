@@ -5,13 +5,13 @@ from __future__ import annotations
 import time
 from typing import Any
 
-from leco_plugin.capacity.field import lesson_by
-from leco_plugin.capacity.measuring import gates, taught_score
+from leco_plugin.capacity.gates import gates
+from leco_plugin.capacity.measuring import lesson_by, taught_score
+from leco_plugin.capacity.sources import Source
 from leco_plugin.chart.contenders.contender import Contender
 from leco_plugin.evaluation.equal_loss import at_equal_loss
 from leco_plugin.models.freezing.held_out_rendering import evaluating
 from leco_plugin.models.leco import LecoModel
-from leco_plugin.shrink.sources import Source
 
 _GATES = {gate.key: gate for gate in gates()}
 SMALL = {

@@ -1,31 +1,34 @@
-"""What candidates along rays are worth: evidence that a smaller gate is taught by and measured on.
+"""What candidates along rays are worth, and what skipping some of them loses.
 
-Only what the original keeps has a worth: the reference is the rendering that it guides. What a
-smaller gate loses comes on top of what the original has lost already.
+With an original, only the candidates that it keeps are worth anything: the reference is the
+rendering that it guides. What a smaller gate loses then comes on top of the original's own loss.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from itertools import accumulate
 from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
+from leco_plugin.capacity.sources import Seen
 from leco_plugin.models.freezing.calibration import near_surface
 from leco_plugin.models.leco import LecoModel
 from leco_plugin.models.rendering import Intervals, Rays, backdrop_of
 from leco_plugin.occupancy import Occupancy
 from leco_plugin.samplers.marching import march
-from leco_plugin.shrink.sources import Seen, Source
 
 RAYS_AT_ONCE = 1024
 POINTS_AT_ONCE = 1 << 16
+UNLIKELY = 0.01
+"""How often the true share may lie above the declared one."""
 
 
 class Evidence(NamedTuple):
-    """Candidates of some rays, backdrops left out, on the CPU or the occupancy's device."""
+    """Candidates of some rays, without backdrops, on the CPU or the occupancy's device."""
 
     positions: Tensor
     """[M, 3] scene units."""
@@ -34,19 +37,19 @@ class Evidence(NamedTuple):
     kept: Tensor
     """[M] bool, by the original."""
     weights: Tensor
-    """[M] rendering weights under the original's guidance, or o(x) where nothing renders; zero for
-    what it skips."""
+    """[M] rendering weights under the original's guidance, zero where it skips; o(x) where there is
+    no model."""
     worth: Tensor
-    """[M] the same near surfaces, zero elsewhere: what lost surface mass is counted in."""
+    """[M] the same near surfaces, zero elsewhere: lost surface mass is counted in it."""
     rays: int
 
 
 class Rendered(NamedTuple):
-    """What it takes to render some rays again with fewer samples."""
+    """What is needed to render some rays again with fewer samples."""
 
     rays: Rays
     intervals: Intervals
-    """Kept by the original, backdrops among them."""
+    """Kept by the original, with backdrops."""
     before_backdrop: Tensor
     """[K] bool."""
     rgb: Tensor
@@ -55,47 +58,50 @@ class Rendered(NamedTuple):
     """[R, 3]."""
 
 
+class Loss(NamedTuple):
+    """What skipping costs on one set of rays."""
+
+    share: float
+    """Of the worth of all candidates."""
+    bound: float
+    """Upper bound of that share on other rays of the scene."""
+    lost_mass: float
+    """Share of all rendering weight before the backdrop, haze included."""
+
+
 @torch.no_grad()
 def gather(
-    source: Source, occupancy: Occupancy | None, seen: Seen
+    model: LecoModel | None, occupancy: Occupancy | None, seen: Seen
 ) -> tuple[Evidence, list[Rendered]]:
-    """The candidates of some rays with their worth; no renderings where there is no model.
+    """The candidates of some rays with their worth, and their renderings if there is a model.
 
     Args:
-        occupancy: the original; None keeps every candidate, for a model that was trained on all.
+        occupancy: the original; None keeps every candidate, and needs a model.
     """
     pieces, rendered = [], []
     for first in range(0, len(seen.truth), RAYS_AT_ONCE):
         part = slice(first, first + RAYS_AT_ONCE)
         rays = Rays._make(None if value is None else value[part] for value in seen.rays)
-        if source.model is None:
+        if model is None:
             assert occupancy is not None
-            piece = _by_decisions(occupancy, rays)
-        else:
-            truth = source.model.renderer_rgb.blend_background(seen.truth[part])
-            piece, again = _by_rendering(source.model, occupancy, rays, truth)
-            rendered.append(again)
+            pieces.append(_by_decisions(occupancy, rays))
+            continue
+        truth = model.renderer_rgb.blend_background(seen.truth[part])
+        piece, again = _by_rendering(model, occupancy, rays, truth)
         pieces.append(piece)
+        rendered.append(again)
     return join(pieces), rendered
 
 
 def join(pieces: Sequence[Evidence]) -> Evidence:
-    """Evidence of several batches of rays, numbered through."""
-    before, ray_indices = 0, []
-    for piece in pieces:
-        ray_indices.append(piece.ray_indices + before)
-        before += piece.rays
-    return Evidence(
-        torch.cat([piece.positions for piece in pieces]),
-        torch.cat(ray_indices),
-        torch.cat([piece.kept for piece in pieces]),
-        torch.cat([piece.weights for piece in pieces]),
-        torch.cat([piece.worth for piece in pieces]),
-        before,
-    )
+    """Several batches of rays as one, their rays numbered through."""
+    before = [0, *accumulate(piece.rays for piece in pieces)]
+    shifted = [p._replace(ray_indices=p.ray_indices + n) for p, n in zip(pieces, before)]
+    *tensors, _ = zip(*shifted)
+    return Evidence._make([*map(torch.cat, tensors), before[-1]])
 
 
-def middles(rays: Rays, intervals: Intervals) -> Tensor:
+def _middles(rays: Rays, intervals: Intervals) -> Tensor:
     """Middles of packed intervals: [M, 3] scene units."""
     ray_indices, t_starts, t_ends = intervals
     along = 0.5 * (t_starts + t_ends)
@@ -106,44 +112,32 @@ def _by_rendering(
     model: LecoModel, occupancy: Occupancy | None, rays: Rays, truth: Tensor
 ) -> tuple[Evidence, Rendered]:
     intervals = model.intervals_of(rays, guided=False, learning=False)
-    positions = middles(rays, intervals)
+    positions = _middles(rays, intervals)
     is_backdrop = backdrop_of(intervals, rays)
     kept = ~is_backdrop
     if occupancy is not None:
         kept &= occupancy.occupied(positions)
-    guided = Intervals(*(part[kept | is_backdrop] for part in intervals))
+    drawn = kept | is_backdrop
+    guided = Intervals(*(part[drawn] for part in intervals))
     shaded = model.shade(rays, guided)
     weights = torch.zeros_like(intervals.t_starts)
-    weights[kept | is_backdrop] = shaded.weights.float()
+    weights[drawn] = shaded.weights.float()
     surface = torch.zeros_like(kept)
-    surface[kept | is_backdrop] = near_surface(shaded, guided, is_backdrop[kept | is_backdrop])
-    before = ~is_backdrop
-    weights = weights[before]
-    evidence = Evidence(
-        positions[before],
-        intervals.ray_indices[before],
-        kept[before],
-        weights,
-        weights * surface[before],
-        len(rays.origins),
-    )
-    return evidence, Rendered(rays, guided, ~is_backdrop[kept | is_backdrop], shaded.rgb, truth)
+    surface[drawn] = near_surface(shaded, guided, is_backdrop[drawn])
+    per_candidate = (positions, intervals.ray_indices, kept, weights, weights * surface)
+    evidence = Evidence._make([*(x[~is_backdrop] for x in per_candidate), len(rays.origins)])
+    return evidence, Rendered(rays, guided, ~is_backdrop[drawn], shaded.rgb, truth)
 
 
 def _by_decisions(occupancy: Occupancy, rays: Rays) -> Evidence:
     """Without a field: every candidate that the original keeps, weighed by o(x)."""
     report = occupancy.report
+    ends = rays.origins, rays.directions, rays.t_mins, rays.t_maxs
+    cone_angle = float(report.get("cone_angle", 0.0))
     intervals = Intervals(
-        *march(
-            rays.origins,
-            rays.directions,
-            rays.t_mins,
-            rays.t_maxs,
-            step_size=float(report["step_size"]),
-            cone_angle=float(report.get("cone_angle", 0.0)),
-        )
+        *march(*ends, step_size=float(report["step_size"]), cone_angle=cone_angle)
     )
-    positions = middles(rays, intervals)
+    positions = _middles(rays, intervals)
     values = query_in_parts(occupancy, positions)
     kept = values >= occupancy.threshold_value
     worth = values * kept
@@ -156,24 +150,9 @@ def query_in_parts(occupancy: Occupancy, positions: Tensor) -> Tensor:
     return torch.cat([occupancy.query(part) for part in positions.split(POINTS_AT_ONCE)])
 
 
-def skipped_by(occupancy: Occupancy, evidence: Evidence) -> Tensor:
+def find_skipped(occupancy: Occupancy, evidence: Evidence) -> Tensor:
     """Which candidates an occupancy skips: bool [M]."""
     return query_in_parts(occupancy, evidence.positions) < occupancy.threshold
-
-
-class Loss(NamedTuple):
-    """What skipping costs beyond the original, on one set of rays."""
-
-    share: float
-    """Of the worth of all candidates."""
-    bound: float
-    """One that the share on other rays of the scene stays below, but for the allowed few times."""
-    lost_mass: float
-    """Share of all rendering weight before the backdrop, haze included."""
-
-
-UNLIKELY = 0.01
-"""How often what is declared may lie below the share on other rays of the scene."""
 
 
 def unlikely_at(look: int) -> float:
@@ -184,10 +163,9 @@ def unlikely_at(look: int) -> float:
 def loss(evidence: Evidence, skipped: Tensor, unlikely: float = UNLIKELY) -> Loss:
     """The share of the worth that is skipped, and Bernstein's bound of a ratio of sums over rays.
 
-    Rays count by what they are worth: n = (sum worth)^2 / sum worth^2, so that a ray of sky is no
-    evidence. A loss that no ray has seen yet has no spread: the error is reckoned as if a few more
-    rays of average worth were lost, so many that without any loss the bound is
-    log(1 / unlikely) / n, which n rays without one do exclude.
+    Rays count by their worth: n = (sum worth)^2 / sum worth^2, so that a ray of sky is no evidence.
+    A loss that no ray has seen has no spread. The error therefore includes a few more lost rays of
+    average worth: without any loss the bound is log(1 / unlikely) / n, which n rays do exclude.
 
     Args:
         skipped: bool [M].
@@ -213,17 +191,16 @@ def loss(evidence: Evidence, skipped: Tensor, unlikely: float = UNLIKELY) -> Los
     return Loss(share, bound, lost_mass)
 
 
+@torch.no_grad()
 def image_price(model: LecoModel, rendered: Sequence[Rendered], smaller: Occupancy) -> float:
     """PSNR with what the original keeps minus that with what both keep, in dB."""
     before = after = 0.0
     pixels = 0
-    with torch.no_grad():
-        for one in rendered:
-            both = smaller.occupied(middles(one.rays, one.intervals)) | ~one.before_backdrop
-            fewer = Intervals(*(part[both] for part in one.intervals))
-            rgb = model.shade(one.rays, fewer).rgb
-            before += float((one.rgb - one.truth).square().sum(dtype=torch.float64))
-            after += float((rgb - one.truth).square().sum(dtype=torch.float64))
-            pixels += one.truth.numel()
+    for one in rendered:
+        both = smaller.occupied(_middles(one.rays, one.intervals)) | ~one.before_backdrop
+        rgb = model.shade(one.rays, Intervals(*(part[both] for part in one.intervals))).rgb
+        before += float((one.rgb - one.truth).square().sum(dtype=torch.float64))
+        after += float((rgb - one.truth).square().sum(dtype=torch.float64))
+        pixels += one.truth.numel()
     floor = 1e-10 * max(pixels, 1)
     return 10.0 * math.log10((after + floor) / (before + floor))
