@@ -15,10 +15,10 @@ from PIL import Image, PngImagePlugin
 from sizes_sections import CAPACITY, scene_results
 from stability_page import PICTURE as STABILITY
 
-from leco_plugin.capacity.picture import draw as draw_capacity
+from leco_plugin.capacity.choice import draw as draw_capacity
 from leco_plugin.chart.picture import draw
 from leco_plugin.chart.theme import DARK, LIGHT, SOURCE, fingerprint
-from leco_plugin.stability.picture import draw as draw_stability
+from leco_plugin.stability.table import draw as draw_stability
 
 CHARTS = ROOT / "docs" / "images" / "charts"
 GROWTH, LEARNING = CHARTS / "growth.png", CHARTS / "learning.png"

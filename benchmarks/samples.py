@@ -22,6 +22,7 @@ import torch
 import tyro
 from timing import interleaved, ratio
 
+from leco_plugin.capacity.sources import find_source
 from leco_plugin.cli_reports import occupancy_of
 from leco_plugin.evaluation.queries import counted
 from leco_plugin.evaluation.report import (
@@ -34,7 +35,6 @@ from leco_plugin.evaluation.report import (
 from leco_plugin.models.leco import LecoModel
 from leco_plugin.samplers import marching
 from leco_plugin.samplers.estimator import LearnedOccupancyEstimator
-from leco_plugin.shrink.sources import find_source
 from leco_plugin.studio.host_models import true_colours
 
 IMAGES = 4

@@ -14,7 +14,7 @@ import checkout  # noqa: F401
 import tyro
 
 from leco_plugin.evaluation.report import write_json
-from leco_plugin.stability.command import make_table
+from leco_plugin.stability.suite import make_table
 from leco_plugin.stability.table import headline
 
 ROOT = Path(__file__).resolve().parent.parent

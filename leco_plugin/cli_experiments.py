@@ -103,7 +103,7 @@ def stability(
         quick: Tiny pictures and few steps, to see whether everything works; no verdicts.
         json: Another file for the results.
     """
-    from leco_plugin.stability.command import make_table
+    from leco_plugin.stability.suite import make_table
     from leco_plugin.stability.table import blind, headline
 
     check_json(json)

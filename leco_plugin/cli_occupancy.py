@@ -129,9 +129,9 @@ def shrink(
         json: File for the gates that were tried and the one that was chosen, as JSON; each is
             written when it was tried, so that a search that is stopped leaves those.
     """
-    from leco_plugin.shrink.command import shrink as find_smaller
-    from leco_plugin.shrink.rungs import Bounds
-    from leco_plugin.shrink.saying import summary
+    from leco_plugin.capacity.frontier import draw, summary
+    from leco_plugin.capacity.references import Bounds
+    from leco_plugin.capacity.shrink import shrink as find_smaller
 
     check_json(json)
     check_picture("--picture", picture)
@@ -142,8 +142,6 @@ def shrink(
     print("\n".join(summary(results, out)))
     write_json(json, results)
     if picture is not None:
-        from leco_plugin.shrink.picture import draw
-
         print(f"drew {draw(results, picture)}")
 
 

@@ -14,8 +14,7 @@ from PIL import Image
 from leco_plugin.chart.contender import Job
 from leco_plugin.chart.runner import RUNS, RunFailed
 from leco_plugin.stability.cases import cases_named
-from leco_plugin.stability.contenders import samplers_named
-from leco_plugin.stability.sizes import QUICK
+from leco_plugin.stability.samplers import QUICK, samplers_named
 from leco_plugin.stability.suite import Runner, Suite
 
 TINY = replace(QUICK, picture=0.25, views=0.1)

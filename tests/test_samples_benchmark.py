@@ -9,8 +9,8 @@ from types import ModuleType
 
 import pytest
 
+from leco_plugin.capacity.sources import find_source
 from leco_plugin.occupancy import Occupancy
-from leco_plugin.shrink.sources import find_source
 
 ROOT = Path(__file__).resolve().parent.parent
 

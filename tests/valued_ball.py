@@ -5,10 +5,9 @@ from __future__ import annotations
 import torch
 from ball_occupancy import ball
 
+from leco_plugin.capacity.evidence import Evidence
+from leco_plugin.capacity.references import Ground, Part, Reference
 from leco_plugin.occupancy import Occupancy
-from leco_plugin.shrink.evidence import Evidence
-from leco_plugin.shrink.references import Part, Reference
-from leco_plugin.shrink.rungs import Ground
 
 
 def original() -> Occupancy:

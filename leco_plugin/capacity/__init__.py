@@ -1,1 +1,1 @@
-"""`leco capacity`: how much does this scene need?"""
+"""`leco shrink` and `leco capacity`: how small may an occupancy be?"""

@@ -1,23 +1,31 @@
-"""Which representation a scene needs, and the sentence that says so."""
+"""Which representation a scene needs: the sentence that says so, and its picture."""
 
 from __future__ import annotations
 
 import math
+import textwrap
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
 from leco_plugin.capacity.measuring import VOLUMES
+from leco_plugin.chart.theme import LIGHT, SOURCE, Theme, fingerprint, plain, style, themed
+
+Row = Mapping[str, Any]
+"""What was measured of a representation."""
 
 TOLERANCE = 1.05
 """Kept volume that counts as no more than another's."""
 TOLD_APART = 1.2
-"""Times the kept volume from which on another certainly keeps more: all is measured with one field
-and one seed."""
+"""A representation certainly keeps more than another from this ratio of kept volumes on: all is
+measured with one field and one seed."""
 WORTH_TEN_TIMES = 2 / 3
-"""Of the kept volume: what ten times the bytes must leave at most, to be worth them. The largest
-nearly always keep a little less, and a scene would need whatever is the last to be tried."""
+"""Ten times the bytes must leave at most this share of the kept volume. The largest nearly always
+keep a little less, and a scene would otherwise need the last one that is tried."""
 USUAL_GRID = 128
-"""Cells along an axis of the grids that hosts have by default: what any of them can afford."""
+"""Cells along an axis of the grids that hosts have by default, which any of them can afford."""
+LEAST = 1e-5
+"""Lost surface mass that is drawn for less, and for none at all."""
 NAMES = {
     "frequency": "gate on frequencies",
     "hash": "gate on a hash grid",
@@ -25,39 +33,34 @@ NAMES = {
     "k-planes": "gate on K-planes",
     "grid": "occupancy grid",
 }
+"""Of the families of representations."""
 
 
-def choose(rows: Sequence[Mapping[str, Any]]) -> Mapping[str, Any]:
-    """The one beside which no other keeps so much less at the same loss that its bytes pay."""
+def choose(rows: Sequence[Row]) -> Row:
+    """The representation beside which no other keeps so much less that its bytes pay."""
     power = -math.log10(WORTH_TEN_TIMES)
     return min(rows, key=lambda row: (row["kept_volume"] * row["bytes"] ** power, row["bytes"]))
 
 
-def smallest_grid(
-    rows: Sequence[Mapping[str, Any]], chosen: Mapping[str, Any], times: float = TOLERANCE
-) -> Mapping[str, Any] | None:
-    """The smallest grid that keeps no more than so many times what was chosen; None where none
-    does."""
+def smallest_grid(rows: Sequence[Row], chosen: Row, times: float = TOLERANCE) -> Row | None:
+    """The smallest grid that keeps at most `times` the chosen volume; None where none does."""
     limit = times * chosen["kept_volume"]
     enough = [row for row in rows if row["family"] == "grid" and row["kept_volume"] <= limit]
     return min(enough, key=lambda row: row["bytes"], default=None)
 
 
-def grid_that_suffices(rows: Sequence[Mapping[str, Any]]) -> Mapping[str, Any] | None:
-    """A grid of a usual size that keeps no more than what was chosen; None where none does."""
-    grid = smallest_grid(rows, choose(rows))
+def grid_that_suffices(rows: Sequence[Row], times: float = TOLERANCE) -> Row | None:
+    """A grid of a usual size that keeps at most `times` the chosen volume; None where none does."""
+    grid = smallest_grid(rows, choose(rows), times)
     return grid if grid is not None and int(grid["size"]) <= USUAL_GRID else None
 
 
-def grid_that_nearly_suffices(rows: Sequence[Mapping[str, Any]]) -> Mapping[str, Any] | None:
+def grid_that_nearly_suffices(rows: Sequence[Row]) -> Row | None:
     """A grid of a usual size that keeps more, but not so much that one field tells them apart."""
-    if grid_that_suffices(rows) is not None:
-        return None
-    grid = smallest_grid(rows, choose(rows), TOLD_APART)
-    return grid if grid is not None and int(grid["size"]) <= USUAL_GRID else None
+    return grid_that_suffices(rows, TOLD_APART) if grid_that_suffices(rows) is None else None
 
 
-def verdict(rows: Sequence[Mapping[str, Any]]) -> str:
+def verdict(rows: Sequence[Row]) -> str:
     """What the scene needs, in a sentence or two."""
     chosen = choose(rows)
     kept = f"keeps {chosen['kept_volume']:.1%} of the volume"
@@ -65,37 +68,125 @@ def verdict(rows: Sequence[Mapping[str, Any]]) -> str:
         return f"A grid suffices: {_of_cells(chosen)}, {kept}; no gate keeps as little for less."
     gate = f"a {NAMES[chosen['family']]} {kept}"
     said = f"This scene needs {kilobytes(chosen)}: {gate}."
-    if not any(row["family"] == "grid" for row in rows):
+    sizes = [int(row["size"]) for row in rows if row["family"] == "grid"]
+    if not sizes:
         return said
-    nearly = grid_that_nearly_suffices(rows)
-    if nearly is not None:
+    if grid := grid_that_suffices(rows):
+        return f"A grid suffices: {_of_cells(grid)}. With {kilobytes(chosen)} {gate}, as little."
+    if nearly := grid_that_nearly_suffices(rows):
         return (
             f"{said} A grid of {_of_cells(nearly)}, keeps {nearly['kept_volume']:.1%}: with one "
             "field the two are not told apart, and a grid may suffice."
         )
-    grid = smallest_grid(rows, chosen)
-    if grid is None:
-        finest = max((int(row["size"]) for row in rows if row["family"] == "grid"), default=0)
-        return f"{said} No grid up to {finest}^3 keeps as little."
-    if grid_that_suffices(rows) is not None:
-        return f"A grid suffices: {_of_cells(grid)}. With {kilobytes(chosen)} {gate}, as little."
-    return (
-        f"{said} A grid that keeps as little takes {grid['size']}^3 cells, "
-        f"{grid['bytes'] / chosen['bytes']:.0f} times as many bytes."
-    )
+    if large := smallest_grid(rows, chosen):
+        return (
+            f"{said} A grid that keeps as little takes {large['size']}^3 cells, "
+            f"{large['bytes'] / chosen['bytes']:.0f} times as many bytes."
+        )
+    return f"{said} No grid up to {max(sizes)}^3 keeps as little."
 
 
-def _of_cells(grid: Mapping[str, Any]) -> str:
+def _of_cells(grid: Row) -> str:
     return f"{grid['size']}^3 cells, {kilobytes(grid)}"
 
 
-def common_volume(rows: Sequence[Mapping[str, Any]]) -> int:
+def common_volume(rows: Sequence[Row]) -> int:
     """Number of the volume of `VOLUMES` at which losses are compared: what the chosen one keeps."""
     kept = choose(rows)["kept_volume"]
     return min(range(len(VOLUMES)), key=lambda i: abs(VOLUMES[i] / kept - 1.0))
 
 
-def kilobytes(row: Mapping[str, Any]) -> str:
-    """Bytes as they are read."""
+def kilobytes(row: Row) -> str:
+    """The bytes of a representation, for people."""
     size = row["bytes"]
     return f"{size / 1000:.1f} kB" if size < 1e6 else f"{size / 1e6:.1f} MB"
+
+
+def draw(results: Mapping[str, Any], path: Path, theme: Theme = LIGHT) -> Path:
+    """Draws two panels over the bytes: volume kept at equal loss, loss at equal volume.
+
+    Args:
+        results: as in `results.json`.
+        path: of the picture.
+        theme: of the page that it is meant for.
+    """
+    from matplotlib.figure import Figure
+
+    rows = results["representations"]
+    volume = common_volume(rows)
+    kept = [100.0 * row["kept_volume"] for row in rows]
+    lost = [max(row["lost_at_volumes"][volume], LEAST) for row in rows]
+    with themed(theme):
+        figure = Figure(figsize=(11, 5.9), facecolor=theme.page)
+        title = textwrap.fill(verdict(rows), 84)
+        figure.text(0.015, 0.975, title, va="top", fontsize=15, fontweight="bold")
+        figure.text(0.015, 0.862, circumstances(results), va="top", fontsize=11)
+        panels = [figure.add_axes((0.065 + 0.485 * i, 0.2, 0.435, 0.55)) for i in range(2)]
+        share = results["lost_surface_mass"]
+        titles = (
+            f"volume kept, %, when {share:.1%} of the surface mass is lost",
+            f"surface mass lost when {VOLUMES[volume]:.1%} of the volume is kept",
+        )
+        for panel, values, heading in zip(panels, (kept, lost), titles):
+            _draw_panel(panel, rows, values, theme)
+            panel.set_title(heading, fontsize=12, loc="left")
+        handles, labels = panels[0].get_legend_handles_labels()
+        below: Any = {"loc": "lower center", "ncols": len(labels), "frameon": False, "fontsize": 10}
+        figure.legend(handles, labels, **below)
+        figure.savefig(path, dpi=150, metadata={SOURCE: fingerprint(results)})
+    return path
+
+
+def _draw_panel(panel: Any, rows: Sequence[Row], values: list[float], theme: Theme) -> None:
+    beside = {"textcoords": "offset points", "ha": "center"}
+    chosen = choose(rows)
+    for number, (family, name) in enumerate(NAMES.items()):
+        points = sorted(
+            (row["bytes"] / 1000, value, row["size"])
+            for row, value in zip(rows, values)
+            if row["family"] == family
+        )
+        if not points:
+            continue
+        sizes, heights, _ = zip(*points)
+        look = {**style(number, theme), "linestyle": (0, (4, 2)) if family == "grid" else "-"}
+        panel.plot(sizes, heights, markersize=8, linewidth=1.8, label=name, **look)
+        for kilobytes, value, cells in (points[0], points[-1]) if family == "grid" else ():
+            place = (kilobytes, value)
+            panel.annotate(f"{cells}$^3$", place, xytext=(0, 10), fontsize=10, **beside)
+    place = next((row["bytes"] / 1000, v) for row, v in zip(rows, values) if row is chosen)
+    ring = {"markerfacecolor": "none", "markeredgecolor": theme.ink, "markeredgewidth": 2}
+    panel.plot(*place, marker="o", markersize=19, **ring)
+    bold = {"fontsize": 11, "fontweight": "bold"}
+    panel.annotate("chosen", place, xytext=(0, -24), **bold, **beside)
+    panel.set(xscale="log", yscale="log", xlabel="kB")
+    _label_ticks(panel, plainly=min(values) > 2 * LEAST and max(values) > 1.0)
+    panel.margins(x=0.1, y=0.16)
+    plain(panel, theme)
+
+
+def _label_ticks(panel: Any, plainly: bool) -> None:
+    """Plain numbers along the bytes, and where asked for along the values."""
+    from matplotlib.ticker import LogLocator, NullFormatter, StrMethodFormatter
+
+    panel.xaxis.set_major_formatter(StrMethodFormatter("{x:g}"))
+    panel.xaxis.set_minor_formatter(NullFormatter())
+    if not plainly:
+        panel.yaxis.set_minor_formatter(NullFormatter())
+        return
+    panel.yaxis.set_major_formatter(StrMethodFormatter("{x:g}"))
+    panel.yaxis.set_minor_locator(LogLocator(subs=(2.0, 5.0)))
+    panel.yaxis.set_minor_formatter(StrMethodFormatter("{x:g}"))
+    panel.tick_params(axis="y", which="minor", labelsize=9)
+
+
+def circumstances(results: Mapping[str, Any]) -> str:
+    """What was measured, in a line or two."""
+    machine, scene = results["machine"], results["scene"]
+    where = f"{machine['cores']} CPU cores" if machine["device"] == "cpu" else machine["device"]
+    return (
+        f"{scene['name']}, {scene['train_images']} photographs; one field of "
+        f"{results['learn_steps']} steps teaches all; {results['rays']} held-out rays; {where}.\n"
+        "Gates in bfloat16, grids one bit a cell; down and left is better. Ten times the bytes of "
+        "the chosen save less than a third."
+    )

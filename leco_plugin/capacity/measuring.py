@@ -1,23 +1,32 @@
-"""Representations, and what each keeps and loses: on the same rays, at the same loss or volume."""
+"""One trained field teaches all representations; what each keeps and loses on the same rays."""
 
 from __future__ import annotations
 
+import copy
 import math
+import random
 import time
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import replace
 from functools import partial
-from typing import Any
+from pathlib import Path
+from pickle import UnpicklingError
+from types import SimpleNamespace
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
 
-from leco_plugin.capacity.field import Ground
+from leco_plugin.capacity.evidence import Evidence, gather
+from leco_plugin.capacity.gates import Candidate, Lesson, round_weights, teach
+from leco_plugin.capacity.search import find_threshold
+from leco_plugin.capacity.sources import Source, draw_held_out, draw_training_rays
 from leco_plugin.evaluation.equal_loss import (
     MOST_ON_CPU,
     SPARED,
     kept_shares,
     mapped_box,
+    reached_volume,
     threshold_losing,
 )
 from leco_plugin.evaluation.field_grids import (
@@ -27,101 +36,117 @@ from leco_plugin.evaluation.field_grids import (
     looked_up,
     plain_and_dilated,
 )
-from leco_plugin.models.encodings import EncodingConfig
 from leco_plugin.models.gate import GateConfig, occupancy_logit
+from leco_plugin.models.leco import LecoModel
+from leco_plugin.models.losses import widen
+from leco_plugin.models.mixture import Mixture
+from leco_plugin.models.objective import GateLossConfig
 from leco_plugin.occupancy import Precision, gate_precision
-from leco_plugin.shrink.evidence import Evidence
-from leco_plugin.shrink.ladder import values_of
-from leco_plugin.shrink.search import threshold_keeping
-from leco_plugin.shrink.teaching import Lesson, round_weights, teach
+from leco_plugin.scenes.input_error import InputError, one_line
+from leco_plugin.scenes.whole_files import write_whole
 
+FIELD = "field.pt"
+RAYS, TAUGHT_RAYS = 8192, 1 << 15
+VOLUME_POINTS = 1 << 17
 STEPS = 1000
 """With which each gate is taught. After 300 small ones still keep two to nine times what they keep
 after 1000 (docs/decisions.md)."""
 VOLUMES = (0.01, 0.015, 0.02, 0.03, 0.04, 0.06, 0.08, 0.11, 0.15, 0.2, 0.3, 0.45)
 """Kept volumes at which the loss is noted."""
-FAMILIES = ("frequency", "hash", "vm", "k-planes", "grid")
 
 
-@dataclass(frozen=True)
-class Candidate:
-    """A representation of one size."""
+class Taught(NamedTuple):
+    """What every representation is taught and measured on."""
 
-    family: str
-    size: str
-    gate: GateConfig | None = None
-    resolution: int | None = None
-
-    @property
-    def key(self) -> str:
-        """Of its file."""
-        return f"{self.family}-{self.size}".replace(" ", "-")
-
-    @property
-    def bytes(self) -> int:
-        """A gate's numbers in bfloat16, a grid's cells in bits."""
-        if self.gate is not None:
-            return 2 * values_of(self.gate)
-        assert self.resolution is not None
-        return math.ceil(self.resolution**3 / 8)
+    mixture: Mixture
+    lesson: Lesson
+    held_out: Evidence
+    """Dense candidates of pixels that nothing was trained on."""
+    mapped: Tensor
+    """[M, 3] of those candidates, in [-1, 1]."""
+    volume: Tensor
+    """[P, 3] mapped, spread evenly over the part of the scene's box that rays reach. Elsewhere
+    nothing is taught."""
 
 
-def gates() -> list[Candidate]:
-    """Gates of growing size of each kind."""
-    found = [
-        Candidate("frequency", f"{o}-{w}-{n}", GateConfig(EncodingConfig(octaves=o), w, n, 1))
-        for o, w, n in (
-            (3, 8, 1),
-            (4, 16, 1),
-            (5, 16, 2),
-            (6, 32, 2),
-            (8, 64, 2),
-            (6, 64, 3),
+def prepare(data: Path, folder: Path, learn_steps: int) -> Taught:
+    """Learns the field, or loads the one that an earlier call left, and renders rays with it.
+
+    Raises:
+        InputError: what was left is damaged or of another scene, or the field shows nothing.
+    """
+    from leco_plugin.hosts.learn_first import learn_model
+    from leco_plugin.method_configs import best_device, leco_occupancy
+
+    config: Any = copy.deepcopy(leco_occupancy.config.pipeline)
+    config.datamanager.data = data
+    config.model.schedule = replace(config.model.schedule, learn_steps=learn_steps)
+    device, stored = best_device(), folder / FIELD
+
+    def photographs() -> Any:
+        random.seed(0)  # nerfstudio caches images in an order that Python's own generator draws
+        torch.manual_seed(0)
+        return config.datamanager.setup(device=device, test_mode="val")
+
+    if not stored.exists():
+        pipeline = SimpleNamespace(datamanager=photographs(), device=torch.device(device))
+        rays = config.datamanager.train_num_rays_per_batch
+        learned = learn_model(config.model, pipeline, rays)
+        write_whole(stored, lambda file: torch.save(learned.state_dict(), file))
+    manager = photographs()  # a manager that has trained would give other rays
+    dataset = manager.train_dataset
+    model: LecoModel = config.model.setup(
+        scene_box=dataset.scene_box,
+        num_train_data=len(dataset),
+        metadata=dataset.metadata,
+        device=device,
+    ).to(device)
+    try:
+        model.load_state_dict(torch.load(stored, map_location=model.device, weights_only=True))
+    except (OSError, RuntimeError, ValueError, KeyError, EOFError, UnpicklingError) as error:
+        raise InputError(
+            f"{stored} cannot be used ({one_line(error, 200)}): name a new folder with --out, or "
+            f"delete {stored} and the points beside it"
+        ) from None
+    return _render_rays(Source(manager, model.eval()), model)
+
+
+def _render_rays(source: Source, model: LecoModel) -> Taught:
+    torch.manual_seed(1)  # the same rays also where the field was loaded
+    mixture = model.mixture
+    lesson = lesson_by(source, model.config.gate_loss)
+    rays = draw_held_out(source, mixture.occupancy().eval(), RAYS, parts=1)[0]
+    evidence, _ = gather(mixture, None, rays)
+    if not bool(evidence.worth.any()):
+        raise InputError(
+            "the field shows nothing along held-out rays, so that no loss can be measured: let one "
+            "learn longer, with a larger --learn-steps and a new folder at --out"
         )
-    ]
-    found += [
-        Candidate(
-            "hash",
-            f"{n}-{t}",
-            GateConfig(EncodingConfig("hash", levels=n, log2_table=t, finest=finest), 16, 1, 1),
-        )
-        for n, t, finest in ((4, 8, 64), (4, 10, 128), (6, 12, 256), (8, 14, 512), (8, 16, 1024))
-    ]
-    for cells, features in ((16, 2), (32, 4), (64, 8), (128, 8)):
-        found.append(
-            Candidate(
-                "vm",
-                f"{cells}-{features}",
-                GateConfig(EncodingConfig("vm", components=features, plane_cells=cells), 16, 1, 1),
-            )
-        )
-    for cells, features, levels in ((16, 2, 1), (32, 2, 1), (32, 4, 1), (64, 4, 2), (128, 2, 4)):
-        found.append(
-            Candidate(
-                "k-planes",
-                f"{cells}-{features}-{levels}",
-                GateConfig(
-                    EncodingConfig(
-                        "k-planes",
-                        levels=levels,
-                        features=features,
-                        coarsest=16 if levels > 1 else cells,
-                        plane_cells=cells,
-                    ),
-                    *(16, 1, 1),
-                ),
-            )
-        )
-    return found
+    volume = reached_volume(mixture, lesson.mapped, VOLUME_POINTS, seed=5)
+    return Taught(mixture, lesson, evidence, _map(mixture, evidence.positions), volume)
 
 
-def grids(resolutions: tuple[int, ...]) -> list[Candidate]:
-    """Grids by their cells along an axis."""
-    return [Candidate("grid", str(n), resolution=n) for n in sorted(resolutions)]
+def lesson_by(source: Source, losses: GateLossConfig) -> Lesson:
+    """What a source's field has to teach along rays that it was trained on, nothing skipped.
+
+    It is the contribution loss with the field's weights, as `leco-occupancy` teaches its gate.
+    """
+    mixture = source.mixture
+    assert mixture is not None
+    drawn = draw_training_rays(source, mixture.occupancy().eval(), TAUGHT_RAYS)
+    taught, _ = gather(mixture, None, drawn)
+    rays = taught.ray_indices  # every candidate of each
+    wide = widen(taught.weights, rays[1:] == rays[:-1])
+    target = (wide / losses.weight_at_full).clamp(max=1.0)
+    return Lesson(_map(mixture, taught.positions), losses.emphasis * target, 1.0 - target)
 
 
-def measured(evidence: Evidence, scores: Tensor, of_volume: Tensor, lost: float) -> dict[str, Any]:
-    """What a representation keeps when it loses a given share, and loses when it keeps a given one.
+def _map(mixture: Mixture, places: Tensor) -> Tensor:
+    return mixture.region.space.map(places).clamp(-1.0, 1.0)
+
+
+def measure(evidence: Evidence, scores: Tensor, of_volume: Tensor, lost: float) -> dict[str, Any]:
+    """What a representation keeps when it loses a given share, and loses at given kept volumes.
 
     Args:
         evidence: dense candidates.
@@ -132,23 +157,19 @@ def measured(evidence: Evidence, scores: Tensor, of_volume: Tensor, lost: float)
     volume, candidates = kept_shares(evidence.worth, scores, of_volume, lost)
     total = float(evidence.worth.double().sum())
     losses = [
-        float(evidence.worth[scores < threshold_keeping(of_volume, share)].double().sum()) / total
+        float(evidence.worth[scores < find_threshold(of_volume, share)].double().sum()) / total
         for share in VOLUMES
     ]
-    return {
-        "kept_volume": volume,
-        "kept_candidates": candidates,
-        "lost_at_volumes": losses,
-    }
+    return {"kept_volume": volume, "kept_candidates": candidates, "lost_at_volumes": losses}
 
 
-def of_gate(ground: Ground, candidate: Candidate, lost: float) -> dict[str, Any]:
+def measure_gate(taught: Taught, candidate: Candidate, lost: float) -> dict[str, Any]:
     """Teaches a gate and measures it, as it would be stored and asked."""
     assert candidate.gate is not None
     started = time.monotonic()
-    score = taught_score(candidate.gate, ground.lesson, ground.model.precision)
-    scores, of_volume = in_parts(score, ground.mapped), in_parts(score, ground.volume)
-    return _row(candidate, started, measured(ground.held_out, scores, of_volume, lost))
+    score = taught_score(candidate.gate, taught.lesson, taught.mixture.precision)
+    scores, of_volume = in_parts(score, taught.mapped), in_parts(score, taught.volume)
+    return _row(candidate, started, measure(taught.held_out, scores, of_volume, lost))
 
 
 def taught_score(
@@ -156,7 +177,8 @@ def taught_score(
 ) -> Callable[[Tensor], Tensor]:
     """The logit of a gate that is taught now, as it would be stored and asked: of mapped positions
     [N, 3], [N]."""
-    gate = round_weights(teach(config, lesson, STEPS, precision))
+    gate = teach(config, lesson, STEPS, precision)
+    round_weights(gate)
 
     @torch.no_grad()
     def score(mapped: Tensor) -> Tensor:
@@ -166,28 +188,28 @@ def taught_score(
     return score
 
 
-def of_grids(
-    ground: Ground, candidates: Sequence[Candidate], lost: float
+def measure_grids(
+    taught: Taught, candidates: Sequence[Candidate], lost: float
 ) -> Iterator[tuple[Candidate, dict[str, Any]]]:
     """Fills grids from the field's density, each from one half as fine; yields a row for each.
 
-    They hear of the places that gates are taught by, and of random ones, and are dilated by a cell
-    where they keep less so. Ends with the first that would ask the field more often than
-    `MOST_ON_CPU` on a CPU.
+    The field is asked at the places that gates are taught by, and at random ones. A grid is dilated
+    by a cell where it keeps less so. The first that would ask more than `MOST_ON_CPU` places on a
+    CPU is the end.
 
     Args:
         candidates: by resolution.
         lost: share of the weight near surfaces.
     """
-    density = partial(density_of, ground.model)
-    box = mapped_box(ground.model)
-    places = ground.lesson.mapped
+    density = partial(density_of, taught.mixture)
+    box = mapped_box(taught.mixture)
+    places = taught.lesson.mapped
 
     def floor_of(scores: Tensor) -> float:
-        of_rays = looked_up(scores, box, ground.mapped)
-        return threshold_losing(ground.held_out.worth, of_rays, SPARED * lost)
+        of_rays = looked_up(scores, box, taught.mapped)
+        return threshold_losing(taught.held_out.worth, of_rays, SPARED * lost)
 
-    most = MOST_ON_CPU if ground.model.device.type == "cpu" else math.inf
+    most = MOST_ON_CPU if taught.mixture.device.type == "cpu" else math.inf
     grids = FieldGrids(density, box, (places, density(places)), floor_of, most)
     for candidate in candidates:
         started = time.monotonic()
@@ -196,17 +218,13 @@ def of_grids(
         if scores is None:
             return
         both = [
-            measured(ground.held_out, of_rays, of_volume, lost)
-            for of_rays, of_volume in plain_and_dilated(scores, box, ground.mapped, ground.volume)
+            measure(taught.held_out, of_rays, of_volume, lost)
+            for of_rays, of_volume in plain_and_dilated(scores, box, taught.mapped, taught.volume)
         ]
         yield candidate, _row(candidate, started, min(both, key=lambda one: one["kept_volume"]))
 
 
 def _row(candidate: Candidate, started: float, found: dict[str, Any]) -> dict[str, Any]:
-    return {
-        "family": candidate.family,
-        "size": candidate.size,
-        "bytes": candidate.bytes,
-        "seconds": round(time.monotonic() - started, 2),
-        **found,
-    }
+    seconds = round(time.monotonic() - started, 2)
+    named = {"family": candidate.family, "size": candidate.size, "bytes": candidate.bytes}
+    return {**named, "seconds": seconds, **found}

@@ -88,15 +88,7 @@ class Region(nn.Module):
 
     def cut(self, origins: Tensor, directions: Tensor, images: Tensor | None = None) -> Rays:
         """Rays cut to box and range; one that misses them ends before it begins."""
-        enters, leaves = intersect_box(origins, directions, self.aabb)
-        return Rays(
-            origins,
-            directions,
-            # finite also for a ray that runs along a wall outside, so that its backdrop has a place
-            enters.clamp(min=self.near).clamp(max=self.far),
-            leaves.clamp(min=0.0).clamp(max=self.far),
-            images,
-        )
+        return cut_rays(origins, directions, self.aabb, self.near, self.far, images)
 
     def leaves_by_floor(self, cut: Rays) -> Tensor:
         """Whether rays leave a bounded scene through its floor, inside its cube: bool [R]."""
@@ -160,6 +152,26 @@ def cells_of(directions: Tensor) -> Tensor:
     """Cells of unit directions [R, 3] in the grid over directions: [R] int64."""
     x, y, z = ((0.5 * directions + 0.5) * DIRECTIONS).long().clamp(0, DIRECTIONS - 1).unbind(-1)
     return (x * DIRECTIONS + y) * DIRECTIONS + z
+
+
+def cut_rays(
+    origins: Tensor,
+    directions: Tensor,
+    aabb: Tensor,
+    near: Tensor,
+    far: Tensor,
+    images: Tensor | None = None,
+) -> Rays:
+    """Rays [R, 3] cut to a box [6] and a range; one that misses them ends before it begins."""
+    enters, leaves = intersect_box(origins, directions, aabb)
+    return Rays(
+        origins,
+        directions,
+        # finite also for a ray that runs along a wall outside, so that its backdrop has a place
+        enters.clamp(min=near).clamp(max=far),
+        leaves.clamp(min=0.0).clamp(max=far),
+        images,
+    )
 
 
 def with_ends_for_all(rays: Rays, far: Tensor, length: Tensor) -> Rays:

@@ -3,18 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import Any
 
 from leco_plugin.scenes.input_error import InputError
-from leco_plugin.stability.capture import Capture
-from leco_plugin.stability.contenders import DENSE, GRID, GRIDS, LEARNED
+from leco_plugin.stability.photographs import Capture
+from leco_plugin.stability.samplers import DENSE, GRID, GRIDS, LEARNED, RAYS
 
-LEARN = "occupancy.learning."
-FINE = 256
-"""Cells along an axis of the finer occupancy grid."""
 BOUNDED = (LEARNED, *(f"{GRID}-{cells}" for cells in GRIDS), DENSE)
 """Samplers whose host has bounds: Nerfacto contracts all of space, and has none."""
+SCALE = "pipeline.datamanager.dataparser.scene_scale"
 
 
 @dataclass(frozen=True)
@@ -37,8 +35,8 @@ class Case:
     grid_levels: int = 1
     """Nested boxes of occupancy grids: as many as somebody who knows the scene would take."""
     fine_grid: bool = False
-    """Whether the size of cells is the question, so that finer ones are tried too: to keep 256^3
-    cells up to date takes a core of a CPU minutes."""
+    """Whether the size of cells is the question, so that 256^3 are tried too. To keep these up to
+    date takes a core of a CPU minutes."""
     only: tuple[str, ...] = ()
     """Samplers that it has something to say about; none is all. References join by themselves."""
     seeds: int = 1
@@ -50,8 +48,8 @@ class Case:
 
     def is_about(self, sampler: str) -> bool:
         """Whether it has something to say about a sampler."""
-        fine = sampler == f"{GRID}-{FINE}"
-        return (not self.only or sampler in self.only) and (self.fine_grid or not fine)
+        is_fine = sampler == f"{GRID}-{GRIDS[-1]}"
+        return (not self.only or sampler in self.only) and (self.fine_grid or not is_fine)
 
     @property
     def scene(self) -> str:
@@ -60,25 +58,26 @@ class Case:
         return self.stage if plain else self.name
 
 
-def _learning(name: str, title: str, why: str, **changes: Any) -> Case:
-    """A case that changes how the occupancy is learned, and nothing else."""
-    paths = {LEARN + path.replace("__", "."): value for path, value in changes.items()}
-    return Case(name, title, why, changes=paths, only=(LEARNED,))
+def _learning(name: str, title: str, why: str, *, must_fail: bool = False, **changes: Any) -> Case:
+    """A case that changes how the occupancy is learned, and nothing else.
+
+    Args:
+        changes: by their paths, with two underscores for a dot.
+    """
+    prefix = "occupancy.learning."
+    paths = {prefix + path.replace("__", "."): value for path, value in changes.items()}
+    return Case(name, title, why, changes=paths, only=(LEARNED,), must_fail=must_fail)
 
 
 def _paper(name: str, title: str, why: str, **changes: Any) -> Case:
-    """The same with the losses in the paper's form, whose weights have these names."""
+    """The same with the losses in the paper's form."""
     return _learning(name, title, why, gate_loss__form="paper", **changes)
 
 
 CASES = {
     case.name: case
     for case in (
-        Case(
-            "yard",
-            "a yard",
-            "nothing is difficult: who fails here fails everywhere",
-        ),
+        Case("yard", "a yard", "nothing is difficult: who fails here fails everywhere"),
         Case(
             "poles-and-wires",
             "poles and wires",
@@ -87,12 +86,7 @@ CASES = {
             fine_grid=True,
         ),
         Case("glass", "glass", "low density that matters, before surfaces", "glass"),
-        Case(
-            "fog",
-            "fog",
-            "low density everywhere: nothing is empty, nothing is solid",
-            "fog",
-        ),
+        Case("fog", "fog", "low density everywhere: nothing is empty, nothing is solid", "fog"),
         Case(
             "all-empty",
             "nothing but sky",
@@ -127,14 +121,14 @@ CASES = {
             "bounds-too-small",
             "bounds 4 x too small",
             "bounds are guessed, and most of the scene lies outside them",
-            settings={"pipeline.datamanager.dataparser.scene_scale": 0.25},
+            settings={SCALE: 0.25},
             only=BOUNDED,
         ),
         Case(
             "bounds-too-large",
             "bounds 4 x too large",
             "bounds are guessed, and cells are four times as coarse",
-            settings={"pipeline.datamanager.dataparser.scene_scale": 4.0},
+            settings={SCALE: 4.0},
             only=BOUNDED,
             fine_grid=True,
         ),
@@ -216,7 +210,7 @@ CASES = {
             "32 rays a batch",
             "gradients of few rays, and statistics of few samples",
             changes={"occupancy.rays": 32},
-            settings={"pipeline.datamanager.train_num_rays_per_batch": 32},
+            settings={RAYS: 32},
         ),
         *(
             _learning(
@@ -240,27 +234,27 @@ CASES = {
         _learning(
             "fp16", "float16", "small gradients vanish, large ones overflow", precision="float16"
         ),
-        replace(
-            Case("ten-seeds", "ten seeds", "one seed in ten goes bad, and nobody looks"),
+        Case(
+            "ten-seeds",
+            "ten seeds",
+            "one seed in ten goes bad, and nobody looks",
             only=(LEARNED, f"{GRID}-128", DENSE),
             seeds=10,
         ),
-        replace(
-            _paper(
-                "homogeneous",
-                "equal experts (must fail)",
-                "an occupancy from equal experts, of which no density keeps one empty, not "
-                "calibrated and never checked, skips surfaces: a suite that passes it is blind",
-                gate_loss__density=0.0,
-                gate_loss__empty_ratio=None,
-                gate_loss__fall_back=False,
-                sizes__field__experts__empty_expert="mlp",
-                sizes__field__experts__empty_layers=2,
-                calibration__lost_surface_mass=1.0,
-                calibration__image_price_db=1e3,
-                calibration__recheck_rays=0,
-            ),
+        _paper(
+            "homogeneous",
+            "equal experts (must fail)",
+            "an occupancy from equal experts, of which no density keeps one empty, not "
+            "calibrated and never checked, skips surfaces: a suite that passes it is blind",
             must_fail=True,
+            gate_loss__density=0.0,
+            gate_loss__empty_ratio=None,
+            gate_loss__fall_back=False,
+            sizes__field__experts__empty_expert="mlp",
+            sizes__field__experts__empty_layers=2,
+            calibration__lost_surface_mass=1.0,
+            calibration__image_price_db=1e3,
+            calibration__recheck_rays=0,
         ),
     )
 }

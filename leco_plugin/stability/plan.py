@@ -1,17 +1,53 @@
-"""Which runs a table needs: cases by samplers by seeds, each once however many cells share it."""
+"""Which runs a table needs, each once however many cells share it, and how long they take.
+
+Before any run is made, the time comes from stored figures: seconds of one core of the server that
+made the stored table, with one thread.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 from leco_plugin.chart.contender import Contender, Job
-from leco_plugin.stability.capture import Capture
 from leco_plugin.stability.cases import Case
-from leco_plugin.stability.contenders import OURS, SAMPLERS, Sampler, contender_of
-from leco_plugin.stability.sizes import Sizes
-from leco_plugin.stability.stage import Stage
+from leco_plugin.stability.photographs import Capture
+from leco_plugin.stability.samplers import (
+    DENSE,
+    DENSE_PROPOSAL,
+    GRID,
+    LEARNED,
+    PROPOSALS,
+    RAYS,
+    Sampler,
+    Sizes,
+    contender_of,
+    with_references,
+)
+from leco_plugin.stability.scene import Stage
 from leco_plugin.stability.stages import STAGES
+
+START_SECONDS = 14.0
+"""For a process to start, to read the scene and to build the host."""
+RAY_SECONDS: Mapping[str, float] = {
+    LEARNED: 1.8e-4,
+    GRID: 5.1e-4,
+    PROPOSALS: 8.2e-4,
+    DENSE: 13.0e-4,
+    DENSE_PROPOSAL: 11.2e-4,
+}
+"""Of training, a ray of a step, where steps have two hundred."""
+STEP_SECONDS = 0.042
+"""Of a step of a guided host, however few its rays are; in the above for those that skip least."""
+RENDERED, RENDERING = 18_500, 0.45
+"""Rays that are looked at after a run in full sizes, each for this share of a ray of training."""
+LEARNED_RAY_SECONDS, FREEZE_SECONDS = 3.0e-4, 5.0
+"""A ray of a step of learning; to calibrate a gate and to build its cell cache."""
+FIRST_CELL_SECONDS, CELL_SECONDS = 1.2e-5, 3.3e-6
+"""To ask the field about a cell of an occupancy grid for the first time, and later."""
+STEPS_PER_UPDATE, FULL_UPDATES, LATER_SHARE = 16, 16, 0.3
+"""An occupancy grid asks about every cell so many times, then about so large a share of them."""
 
 
 @dataclass(frozen=True)
@@ -49,38 +85,28 @@ def entries_of(
     sizes: Sizes,
     beside: Sequence[int] = (),
 ) -> list[Entry]:
-    """All cells, case by case; a case that is about some samplers only has cells for those, and for
-    the references that they are held against.
+    """All cells, case by case, with the references that they are held against.
 
     Args:
-        beside: seeds of the samplers that learned occupancy is compared with, also where a case
-            is about seeds, of which only learned occupancy is run with more than were asked for;
-            none is as for learned occupancy.
+        seeds: of each cell. Learned occupancy has more where a case is about seeds.
+        beside: seeds of the samplers that learned occupancy is compared with; none is `seeds`.
     """
-    ours, asked = (OURS, SAMPLERS[OURS].reference), dict.fromkeys(seeds)
     entries = []
     for case in cases:
-        wanted = {one.name for one in samplers if case.is_about(one.name)}
-        wanted |= {one.reference for one in samplers if one.name in wanted and one.reference}
+        wanted = with_references({one.name for one in samplers if case.is_about(one.name)})
         for sampler in samplers:
-            if sampler.name in wanted:
-                contender = contender_of(
-                    sampler, sizes, case.changes, case.settings, case.grid_levels
-                )
-                chosen = seeds_of(case, seeds) if sampler.name == OURS else tuple(asked)
-                if beside and sampler.name not in ours:
+            if sampler in wanted:
+                levels = case.grid_levels
+                one = contender_of(sampler, sizes, case.changes, case.settings, levels)
+                chosen = tuple(dict.fromkeys(seeds))
+                if sampler.name == LEARNED:
+                    missing = case.seeds - len(chosen)
+                    more = (seed for seed in range(case.seeds) if seed not in chosen)
+                    chosen += tuple(more)[: max(missing, 0)]
+                elif beside and sampler.name != DENSE:
                     chosen = tuple(dict.fromkeys(beside))
-                entries.append(Entry(case, sampler, contender, chosen))
+                entries.append(Entry(case, sampler, one, chosen))
     return entries
-
-
-def seeds_of(case: Case, seeds: Sequence[int]) -> tuple[int, ...]:
-    """The seeds asked for, and more where a case is about them."""
-    chosen = list(dict.fromkeys(seeds))
-    more = (seed for seed in range(case.seeds + len(chosen)) if seed not in chosen)
-    while len(chosen) < case.seeds:
-        chosen.append(next(more))
-    return tuple(chosen)
 
 
 def runs_of(entries: Sequence[Entry]) -> list[Run]:
@@ -110,3 +136,44 @@ def capture_of(case: Case, sizes: Sizes) -> Capture:
         width=round(capture.width * sizes.picture),
         height=round(capture.height * sizes.picture),
     )
+
+
+def core_seconds(runs: Sequence[Run], stored: Sequence[Mapping[str, Any]], sizes: Sizes) -> float:
+    """What some runs take of one core, seconds.
+
+    Args:
+        runs: to be made.
+        stored: records of runs that were made; what they took replaces the stored figures.
+    """
+    measured: dict[str, list[float]] = {}
+    for record in stored:
+        measured.setdefault(record["sampler"], []).append(float(record["processor_seconds"]))
+    means = {name: sum(seconds) / len(seconds) for name, seconds in measured.items()}
+    return sum(means.get(run.job.contender.sampler) or expected_seconds(run, sizes) for run in runs)
+
+
+def expected_seconds(run: Run, sizes: Sizes) -> float:
+    """What a run takes before any like it was made."""
+    contender = run.job.contender
+    kind = GRID if contender.sampler.startswith(f"{GRID}-") else contender.sampler
+    rays = sizes.steps * contender.settings[RAYS] + RENDERED * sizes.picture**2 * RENDERING
+    seconds = START_SECONDS + rays * RAY_SECONDS[kind]
+    if kind == LEARNED:
+        learning = contender.changes["occupancy.rays"] * sizes.learn_steps
+        seconds += FREEZE_SECONDS + learning * LEARNED_RAY_SECONDS + sizes.steps * STEP_SECONDS
+    if kind == GRID:
+        options = contender.changes["occupancy.options"]
+        cells = options["levels"] * options["resolution"] ** 3
+        updates = -(-sizes.steps // STEPS_PER_UPDATE)
+        full = min(updates, FULL_UPDATES)
+        again = full - 1 + LATER_SHARE * (updates - full)
+        seconds += cells * (FIRST_CELL_SECONDS + again * CELL_SECONDS)
+    return float(seconds)
+
+
+def in_words(seconds: float) -> str:
+    """A time for people."""
+    minutes = seconds / 60.0
+    if minutes < 2.0:
+        return f"{seconds:.0f} s"
+    return f"{minutes:.0f} minutes" if minutes < 120.0 else f"{minutes / 60.0:.1f} hours"

@@ -9,8 +9,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from leco_plugin.stability.matter import Ball, Box, Paint, Rod, Shape
-from leco_plugin.stability.stage import Fog, Pane, Stage
+from leco_plugin.stability.scene import Ball, Box, Fog, Paint, Pane, Rod, Shape, Stage
 
 
 def grey(lightness: float, grain: float = Paint.grain, contrast: float = Paint.contrast) -> Paint:

@@ -1,40 +1,129 @@
-"""Makes the runs of a table that are missing, as many at once as there are cores."""
+"""`leco stability`: makes the runs of a table that are missing, and stores and draws it."""
 
 from __future__ import annotations
 
+import datetime
+import functools
+import json
 import math
+import shlex
+import shutil
 import sys
 import threading
 import time
 from collections.abc import Callable, Mapping, Sequence
-from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
+from concurrent.futures import ThreadPoolExecutor, as_completed
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
+from nerfstudio.utils.rich_utils import CONSOLE
+
 from leco_plugin.chart.contender import Job
 from leco_plugin.chart.protocol import Protocol, require_seeds, settings_of
-from leco_plugin.chart.runner import LOGS, ProcessRunner, RunFailed
-from leco_plugin.chart.runner import RunFolder as ChartFolder
-from leco_plugin.evaluation.report import describe_code, describe_machine, usable_cores, write_json
+from leco_plugin.chart.runner import (
+    LOGS,
+    RUNS,
+    UNFINISHED,
+    ProcessRunner,
+    RunFailed,
+    RunFolder,
+    difference,
+)
+from leco_plugin.chart.theme import DARK, LIGHT
+from leco_plugin.evaluation.report import (
+    describe_code,
+    describe_machine,
+    read_object,
+    usable_cores,
+    write_json,
+)
+from leco_plugin.log import bar, resumable
+from leco_plugin.occupancy import CALIBRATED_AT
+from leco_plugin.scenes.city.layouts import TRANSFORMS
 from leco_plugin.scenes.description import describe_scene
-from leco_plugin.stability.cases import Case
-from leco_plugin.stability.contenders import Sampler
-from leco_plugin.stability.cost import core_seconds, in_words
-from leco_plugin.stability.plan import Entry, Run, entries_of, runs_of, scenes_of
-from leco_plugin.stability.results import results_of, runs_in
-from leco_plugin.stability.scene_folder import digest_of, write_scene
-from leco_plugin.stability.sizes import Sizes
-from leco_plugin.stability.table_folder import RUNS, SCENES, finished_in, forget_unfinished, take
+from leco_plugin.scenes.input_error import InputError
+from leco_plugin.stability.cases import Case, cases_named
+from leco_plugin.stability.photographs import digest_of, write_scene
+from leco_plugin.stability.plan import (
+    Entry,
+    Run,
+    core_seconds,
+    entries_of,
+    in_words,
+    runs_of,
+    scenes_of,
+)
+from leco_plugin.stability.samplers import FULL, QUICK, Sampler, Sizes, samplers_named
+from leco_plugin.stability.table import draw, draw_side_by_side, table
+from leco_plugin.stability.verdict import judge
+from leco_plugin.studio.run_folder import LOCK, alone_in
 
 WORKER = (sys.executable, "-W", "ignore", "-m", "leco_plugin.stability.worker")
-RESULTS = "stability.json"
+SIZES = "sizes.json"
+"""File whose presence says that a folder is a table's, with the sizes of all runs there."""
+SCENES, FAILURES = "scenes", "failures"
 FAILED = ".failed"
 """Ending of the file, beside its log, with the reason why a run has no result."""
 PER_PORTION = {"cores", "threads"}
 """Facts of the machine that say how many runs are made at once, and change no run."""
+OF_OCCUPANCY = (
+    *("threshold", "lost_surface_mass", "image_price_db", "empty_fraction", "recoveries"),
+    CALIBRATED_AT,
+)
+"""What is kept of a learned occupancy."""
 Runner = Callable[[Job, Callable[[float], None]], dict[str, Any]]
 Say = Callable[[str], None]
+Key = tuple[str, str]
+"""Scene and name of a run."""
+
+
+def make_table(
+    out: Path,
+    cases: Sequence[str] = (),
+    samplers: Sequence[str] = (),
+    seeds: Sequence[int] = (0,),
+    seeds_beside: Sequence[int] = (),
+    quick: bool = False,
+    minutes: float | None = None,
+    runner_for: Callable[[str], Runner] | None = None,
+    earlier: Mapping[str, Any] | None = None,
+) -> dict[str, Any]:
+    """Makes what is missing of a table and draws it.
+
+    Args:
+        out: the table's folder.
+        cases, samplers: their names; none is all.
+        seeds, seeds_beside: of each cell, and of some samplers; see `entries_of`.
+        quick: tiny sizes, for a look at whether everything works.
+        minutes: that this may take, about; None is as many as it takes.
+        runner_for: gives what makes the runs of a scene.
+        earlier: results whose runs are kept where they would be made here just so.
+    Returns:
+        The results, as in `stability.json`.
+    Raises:
+        ValueError, OSError: a name or the folder is wrong; nothing was started.
+    """
+    if minutes is not None and not 0.0 < minutes < math.inf:
+        raise InputError(f"a table is made in a positive number of minutes, not {minutes}")
+    chosen, compared = cases_named(tuple(cases)), samplers_named(tuple(samplers))
+    say = functools.partial(CONSOLE.print, markup=False, highlight=False)
+    words: list[object] = ["leco", "stability", "--out", "DIR"]  # without this machine's paths
+    named = {"cases": cases, "samplers": samplers, "seeds": seeds, "seeds-beside": seeds_beside}
+    for name, values in named.items():
+        words += [f"--{name}", *values] if values else []
+    command = shlex.join(map(str, [*words, *(["--quick"] if quick else [])]))
+    with alone_in(out, "table"):
+        sizes = QUICK if quick else FULL
+        suite = Suite(out, chosen, compared, seeds, sizes, command, seeds_beside)
+        if earlier is not None:
+            say(f"{suite.take_over(earlier)} runs of earlier results are taken over")
+        say(suite.estimate())
+        with resumable(say), bar(f"{len(chosen)} cases") as show:
+            suite.make(say, show, runner_for, math.inf if minutes is None else 60.0 * minutes)
+        if left := len(suite.missing()):
+            say(f"{left} runs are left or have failed; the same command goes on with them")
+        return suite.draw()
 
 
 class Suite:
@@ -42,11 +131,8 @@ class Suite:
 
     Args:
         out: its folder; `scenes` holds what is photographed, `runs` what was run, by scene.
-        cases, samplers, seeds: what is compared.
-        sizes: of everything.
+        cases, samplers, seeds, sizes, beside: as of `entries_of`.
         command: what made it, for the results.
-        beside: seeds of the samplers that learned occupancy is compared with, see `entries_of`.
-
     Raises:
         ValueError, OSError: nothing to run, no seed, or a folder of something else, of other sizes
             or versions.
@@ -65,7 +151,7 @@ class Suite:
         if not cases or not samplers or not seeds:
             raise ValueError("a table needs at least one case, one sampler and one seed")
         require_seeds([*seeds, *beside])
-        take(out, sizes)
+        take_folder(out, sizes)
         self.out, self.cases, self.sizes, self.command = out, list(cases), sizes, command
         self.machine = describe_machine()
         self.made = {"cpu": self.machine["cpu"], **describe_code()}
@@ -74,6 +160,8 @@ class Suite:
         self.samplers = [one for one in samplers if one.name in shown]
         self.protocol = Protocol(steps=sizes.steps)
         self.stop = threading.Event()
+        # small tensors gain more by another run than by another thread
+        self.workers = usable_cores() if self.machine["device"] == "cpu" else 1
         scenes = scenes_of(cases, sizes)
         self.digests = {name: digest_of(*scene) for name, scene in scenes.items()}
         self.data = {
@@ -81,38 +169,28 @@ class Suite:
         }
         self.folders = {name: self._folder(name) for name in self.data}
 
-    def _folder(self, scene: str) -> ChartFolder:
+    def _folder(self, scene: str) -> RunFolder:
         described = describe_scene(self.data[scene])
         machine = {key: fact for key, fact in self.machine.items() if key not in PER_PORTION}
         settings = settings_of(described, self.protocol, None, machine)
-        return ChartFolder(self.out / RUNS / scene, settings | {"sizes": asdict(self.sizes)})
+        return RunFolder(self.out / RUNS / scene, settings | {"sizes": asdict(self.sizes)})
 
     def runner(self, scene: str) -> Runner:
         """What makes the runs of a scene, in processes with one thread each."""
-        return ProcessRunner(
-            self.data[scene],
-            self.protocol,
-            self.folders[scene],
-            WORKER,
-            {"OMP_NUM_THREADS": "1"} if self.workers > 1 else None,
-            self.stop,
-        )
+        environment = {"OMP_NUM_THREADS": "1"} if self.workers > 1 else None
+        place = self.data[scene], self.protocol, self.folders[scene]
+        return ProcessRunner(*place, WORKER, environment, self.stop)
 
-    @property
-    def workers(self) -> int:
-        """Runs at once: small tensors gain more by another run than by another thread."""
-        return usable_cores() if self.machine["device"] == "cpu" else 1
-
-    def stored(self) -> dict[tuple[str, str], dict[str, Any]]:
-        """Records of finished runs by scene and name."""
+    def stored(self) -> dict[Key, dict[str, Any]]:
+        """Records of finished runs."""
         return {
-            (scene, name): run
+            (scene, name): record["run"]
             for scene, folder in self.folders.items()
-            for name, run in finished_in(folder).items()
+            for name, record in folder.stored().items()
         }
 
-    def failures(self) -> dict[tuple[str, str], str]:
-        """Why runs have ended without a result, likewise: until they are made with one."""
+    def failures(self) -> dict[Key, str]:
+        """Why runs have ended without a result: until they are made with one."""
         return {
             (scene, file.stem): file.read_text()
             for scene, folder in self.folders.items()
@@ -120,7 +198,7 @@ class Suite:
         }
 
     def missing(self) -> list[Run]:
-        """Runs that are not stored: those that nobody tried, then those that have failed."""
+        """Runs that are not stored: first those that were never tried, then those that failed."""
         stored, failures = self.stored(), self.failures()
         runs = [run for run in runs_of(self.entries) if run.key not in stored]
         return sorted(runs, key=lambda run: run.key in failures)
@@ -151,38 +229,33 @@ class Suite:
                 is left for another time.
         """
         todo, total, stored = self.missing(), len(runs_of(self.entries)), self.stored()
-        expected = [core_seconds([run], list(stored.values()), self.sizes) for run in todo]
         make_one, ends = runner_for or self.runner, time.monotonic() + seconds
-        done = total - len(todo)
-        for folder in self.folders.values():
-            forget_unfinished(folder)
+        for folder in self.folders.values():  # left by runs that were killed
+            shutil.rmtree(folder.path / UNFINISHED, ignore_errors=True)
+            (folder.path / UNFINISHED).mkdir()
         self.write()
+
+        def make_in_time(run: Run, expected: float, is_first: bool) -> str | None:
+            is_late = time.monotonic() + expected > ends
+            return self._run(run, make_one(run.scene)) if is_first or not is_late else None
+
         with ThreadPoolExecutor(self.workers) as pool:
-            under_way: set[Future[str]] = set()
+            made = []
+            for number, run in enumerate(todo):
+                expected = core_seconds([run], list(stored.values()), self.sizes)
+                made.append(pool.submit(make_in_time, run, expected, number < self.workers))
             try:
-                for number, run in enumerate(todo):
-                    late = time.monotonic() + expected[number] > ends
-                    if late and number >= self.workers:
-                        continue
-                    under_way.add(pool.submit(self._run, run, make_one(run.scene)))
-                    if len(under_way) >= self.workers:
-                        done += self._collect(under_way, say)
+                done = total - len(todo)
+                for future in as_completed(made):
+                    if (line := future.result()) is not None:
+                        done += 1
+                        say(line)
                         show(done / total)
-                while under_way:
-                    done += self._collect(under_way, say)
-                    show(done / total)
+                        self.write()
             except BaseException:
                 self.stop.set()
+                pool.shutdown(wait=False, cancel_futures=True)
                 raise
-
-    def _collect(self, under_way: set[Future[str]], say: Say) -> int:
-        """Waits for one run, or more that end together, and takes them out; returns how many."""
-        done, rest = wait(under_way, return_when=FIRST_COMPLETED)
-        for future in done:
-            say(future.result())
-        self.write()
-        under_way &= rest
-        return len(done)
 
     def _run(self, run: Run, runner: Runner) -> str:
         """Makes a run and keeps it; returns a line about it."""
@@ -200,16 +273,59 @@ class Suite:
         return f"{title}: {psnr} after {record['processor_seconds']:.0f} s"
 
     def take_over(self, results: Mapping[str, Any]) -> int:
-        """Keeps the runs of another table that would be made here just so; returns how many."""
-        taken, stored = runs_in(results, self), self.stored()
-        runs = [run for run in runs_of(self.entries) if run.key in taken.keys() - stored.keys()]
+        """Keeps the runs of another table that would be made here just so; returns how many.
+
+        They are of the same sizes and scenes, and of the same version of this package.
+        """
+        if results["sizes"] != asdict(self.sizes):
+            return 0
+        found = {
+            (row["scene"]["name"], run["name"]): run
+            for row in results["cases"]
+            if self.digests.get(row["scene"]["name"]) == row["scene"]["digest"]
+            for cell in row["cells"].values()
+            for run in cell["runs"]
+            if run["made"]["version"] == self.made["version"]
+        }
+        new = found.keys() - self.stored().keys()
+        runs = [run for run in runs_of(self.entries) if run.key in new]
         for run in runs:
-            self.folders[run.scene].store(run.job, taken[run.key])
+            self.folders[run.scene].store(run.job, found[run.key])
         return len(runs)
 
     def results(self) -> dict[str, Any]:
-        """The table, as in `stability.json`."""
-        return results_of(self)
+        """The table, as in `stability.json`: every cell with its verdict and its runs' figures."""
+        stored, failures = self.stored(), self.failures()
+        rows = []
+        for case in self.cases:
+            facts = {name: getattr(case, name) for name in ("name", "title", "why", "must_fail")}
+            scene = {"name": case.scene, "digest": self.digests[case.scene]}
+            entries = [entry for entry in self.entries if entry.case is case]
+            cells = {one.sampler.name: self._cell(one, stored, failures) for one in entries}
+            rows.append({**facts, "scene": scene, "cells": cells})
+        made = {"date": datetime.date.today().isoformat(), "command": self.command, **self.made}
+        return {
+            "format": 1,
+            "machine": self.machine,
+            "sizes": asdict(self.sizes),
+            "made": made,
+            "samplers": [asdict(one) for one in self.samplers],
+            "cases": rows,
+        }
+
+    def _cell(
+        self, entry: Entry, stored: Mapping[Key, dict[str, Any]], failures: Mapping[Key, str]
+    ) -> dict[str, Any]:
+        failed = failures.keys() - stored.keys()
+        runs = [stored[run.key] for run in entry.runs if run.key in stored]
+        reasons = [failures[run.key] for run in entry.runs if run.key in failed]
+        reference = None
+        if entry.sampler.reference is not None:
+            others = self.reference_of(entry).runs
+            reference = [stored[run.key] for run in others if run.key in stored]
+        cell = judge(runs, reference, reasons, len(entry.runs) - len(runs) - len(reasons))
+        names = {run.job.seed: run.job.name for run in entry.runs}
+        return {**cell.to_dict(), "runs": [_figures(run, names[run["seed"]]) for run in runs]}
 
     def reference_of(self, entry: Entry) -> Entry:
         """The cell that a cell is held against."""
@@ -221,21 +337,72 @@ class Suite:
 
     def write(self) -> dict[str, Any]:
         """`stability.json` and `table.md`, as far as there are runs."""
-        from leco_plugin.stability.table import table
-
         results = self.results()
-        write_json(self.out / RESULTS, results)
+        write_json(self.out / "stability.json", results)
         (self.out / "table.md").write_text(table(results))
         return results
 
     def draw(self) -> dict[str, Any]:
         """The results, and from them the pictures of the table and of every failure."""
-        from leco_plugin.chart.theme import DARK, LIGHT
-        from leco_plugin.stability.failure_images import draw_failures
-        from leco_plugin.stability.picture import draw
-
         results = self.write()
         draw(results, self.out / "stability.png", LIGHT)
         draw(results, self.out / "stability-dark.png", DARK)
-        draw_failures(self, results)
+        for old in (self.out / FAILURES).glob("*.png"):
+            old.unlink()
+        rows = {row["name"]: row["cells"] for row in results["cases"]}
+        for entry in self.entries:
+            cell = rows[entry.case.name][entry.sampler.name]
+            if cell["verdict"] in ("fail", "degraded") and entry.sampler.reference is not None:
+                self._draw_failure(entry, cell)
         return results
+
+    def _draw_failure(self, entry: Entry, cell: Mapping[str, Any]) -> None:
+        """What is there, and what the reference and the sampler show, in the worst seed if any."""
+        data, shown = self.data[entry.case.scene], self._views(entry)
+        if not shown:
+            return
+        first = json.loads((data / TRANSFORMS).read_text())["test_filenames"][0]
+        pictures = {"what is there": data / first}
+        dense = self._views(self.reference_of(entry))
+        for name, views in (("dense", dense), (entry.sampler.title, shown)):
+            if views:
+                seed = cell["worst_seed"] if cell["worst_seed"] in views else next(iter(views))
+                pictures[f"{name}, seed {seed}"] = views[seed]
+        path = self.out / FAILURES / f"{entry.case.name}--{entry.sampler.name}.png"
+        draw_side_by_side(pictures, f"{entry.case.title}: {cell['reason']}", path)
+
+    def _views(self, entry: Entry) -> dict[int, Path]:
+        """The held-out picture that each run of a cell has rendered, by its seed."""
+        folder = self.folders[entry.case.scene].path / RUNS
+        places = {run.job.seed: folder / f"{run.job.name}.png" for run in entry.runs}
+        return {seed: place for seed, place in places.items() if place.exists()}
+
+
+def take_folder(out: Path, sizes: Sizes) -> None:
+    """Makes a folder one of tables in these sizes, if it is not one already.
+
+    Raises:
+        InputError: it holds something else, or a table in other sizes; nothing was written.
+    """
+    file = out / SIZES
+    if file.is_file():
+        damaged = "is damaged, or not of a table; delete it, or name a new folder with --out"
+        if unlike := difference(read_object(file, damaged), asdict(sizes)):
+            raise InputError(
+                f"{out} holds a table of other sizes, with --quick or without: {unlike}; "
+                "name a new folder with --out"
+            )
+    elif out.exists() and any(path.name != LOCK for path in out.iterdir()):
+        raise InputError(f"{out} holds something else; name a new folder with --out")
+    else:
+        write_json(file, asdict(sizes))
+    for name in (SCENES, RUNS, FAILURES):
+        (out / name).mkdir(exist_ok=True)
+
+
+def _figures(run: Mapping[str, Any], name: str) -> dict[str, Any]:
+    """Of a run, what a verdict needs, and what says where it comes from."""
+    kept = {key: run[key] for key in ("seed", "psnr", "processor_seconds", "measured", "made")}
+    if facts := run.get("occupancy"):
+        kept["occupancy"] = {key: facts.get(key) for key in OF_OCCUPANCY}
+    return {"name": name, "sampler": run["sampler"], **kept}

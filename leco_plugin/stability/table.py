@@ -1,32 +1,68 @@
-"""`table.md`: the verdicts with their figures, and what every failure is."""
+"""The table in words, `table.md`, and in pictures, `stability.png` and one of each failure.
+
+In a picture colour, sign and words say the same, so that no reader depends on one of them.
+"""
 
 from __future__ import annotations
 
+import textwrap
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
+from pathlib import Path
 from typing import Any
 
-from leco_plugin.stability.contenders import OURS
-from leco_plugin.stability.sizes import QUICK
+import numpy as np
+from PIL import Image
+
+from leco_plugin.chart.theme import LIGHT, SOURCE, Theme, fingerprint
+from leco_plugin.stability.samplers import LEARNED, QUICK
 
 NOTHING = "nothing has been run yet"
 QUICKLY = "made with --quick, which shows that everything runs and no more"
 NO_VERDICT = "no verdict yet: nothing has been run beside a dense run that trains"
 SIGNS = {"pass": "pass", "degraded": "degraded", "fail": "**fail**", "no reference": "-"}
+ROW, HEAD, FOOT = 0.36, 1.0, 0.7
+"""Heights in inches."""
+NAMES, COLUMN = 2.75, 2.0
+"""Widths in inches."""
+GAP = 0.03
+VIEW = 3.4
+"""Width of one picture of a failure, inches."""
+DRAWN_SIGNS = {"pass": "✓", "degraded": "~", "fail": "✗", "no reference": "-"}
+HOW_TO_READ = (
+    "Each cell: PSNR against the dense run of the same host; samples kept, surfaces lost.  "
+    "✓ within 0.2 dB and no bad seed   ~ degraded   ✗ fails   "
+    "- nothing to compare with: the dense run does not train"
+)
+ON_LIGHT = {
+    "pass": ("#d7f0df", "#0f5a2f"),
+    "degraded": ("#fbeab8", "#6b4c00"),
+    "fail": ("#f6c9c4", "#8c1d13"),
+    "no reference": ("#eceef1", "#656c76"),
+}
+"""The ground of a cell, and the ink on it."""
+ON_DARK = {
+    "pass": ("#12351f", "#86dfa6"),
+    "degraded": ("#443408", "#f2d06b"),
+    "fail": ("#551c17", "#ff9f95"),
+    "no reference": ("#1c2128", "#9198a1"),
+}
+Results = Mapping[str, Any]
+"""As in `stability.json`."""
 
 
-def table(results: Mapping[str, Any]) -> str:
+def table(results: Results) -> str:
     """The whole of `table.md`."""
     made = results["made"]
     reasons = [[row["title"], row["why"]] for row in results["cases"]]
-    parts = ["# Stability", f"{headline(results)}", verdicts(results), failures(results)]
+    parts = ["# Stability", headline(results), verdicts(results), failures(results)]
     parts.append(_rows(["case", "why it is there"], reasons))
     commit = f" at {made['commit']}" if made["commit"] else ""
     parts.append(f"`{made['command']}`, {made['date']}, leco_plugin {made['version']}{commit}.")
     return "\n\n".join(part for part in parts if part) + "\n"
 
 
-def verdicts(results: Mapping[str, Any]) -> str:
+def verdicts(results: Results) -> str:
     """A row a case, a column a sampler."""
     samplers = results["samplers"]
     rows = [
@@ -36,7 +72,7 @@ def verdicts(results: Mapping[str, Any]) -> str:
     return _rows(["case", *(one["title"] for one in samplers)], rows)
 
 
-def failures(results: Mapping[str, Any]) -> str:
+def failures(results: Results) -> str:
     """What fails or is degraded, and why; empty where nothing is."""
     broken = [
         [row["title"], one["title"], row["cells"][one["name"]]["reason"]]
@@ -47,37 +83,35 @@ def failures(results: Mapping[str, Any]) -> str:
     return _rows(["case", "sampler", "what failed"], broken) if broken else ""
 
 
-def headline(results: Mapping[str, Any]) -> str:
+def headline(results: Results) -> str:
     """What the table shows, in a sentence or two."""
-    quick = results.get("sizes") == asdict(QUICK)
-    return f"{QUICKLY}: {_counted(results)}" if quick else _counted(results)
+    counted = _count_passes(results)
+    return f"{QUICKLY}: {counted}" if results.get("sizes") == asdict(QUICK) else counted
 
 
-def _counted(results: Mapping[str, Any]) -> str:
-    said = []
-    for one in results["samplers"]:
-        if one["reference"] is None:
-            continue
-        verdicts = verdicts_of(results, one["name"])
-        held = [verdict for verdict in verdicts if verdict != "no reference"]
+def _count_passes(results: Results) -> str:
+    cells = [cell for row in results["cases"] for cell in row["cells"].values()]
+    compared = [one for one in results["samplers"] if one["reference"] is not None]
+    parts = []
+    for one in sorted(compared, key=lambda one: one["name"] != LEARNED):
+        held = [word for word in verdicts_of(results, one["name"]) if word != "no reference"]
         if held:
-            said.append((one, held.count("pass"), len(held)))
-    if not said:
-        ran = any(cell["seeds"] for row in results["cases"] for cell in row["cells"].values())
-        return NO_VERDICT if ran else NOTHING
-    said.sort(key=lambda part: part[0]["name"] != OURS)
-    first, *others = [f"{one['title']} passes {n} of {many}" for one, n, many in said]
-    if more := without_reference(results):
-        others.insert(0, f"for {more} more it has no dense run that trains")
-    missing = sum(cell["missing"] for row in results["cases"] for cell in row["cells"].values())
-    if missing:
-        others.append(f"{missing} seeds of cells are missing")
-    if unproven(results):
-        others.append("unproven: the case that must fail has not failed")
-    return f"{first} cases" + "".join(f"; {other}" for other in others)
+            parts.append(f"{one['title']} passes {held.count('pass')} of {len(held)}")
+    if not parts:
+        return NO_VERDICT if any(cell["seeds"] for cell in cells) else NOTHING
+    parts[0] += " cases"
+    ours = [row["cells"].get(LEARNED, {}) for row in results["cases"] if not row["must_fail"]]
+    apart = sum(cell.get("verdict") == "no reference" and cell["seeds"] > 0 for cell in ours)
+    if apart:
+        parts.insert(1, f"for {apart} more it has no dense run that trains")
+    if missing := sum(cell["missing"] for cell in cells):
+        parts.append(f"{missing} seeds of cells are missing")
+    if is_unproven(results):
+        parts.append("unproven: the case that must fail has not failed")
+    return "; ".join(parts)
 
 
-def verdicts_of(results: Mapping[str, Any], sampler: str) -> list[str]:
+def verdicts_of(results: Results, sampler: str) -> list[str]:
     """Verdicts of a sampler on all cases but those that must fail."""
     return [
         row["cells"][sampler]["verdict"]
@@ -86,18 +120,12 @@ def verdicts_of(results: Mapping[str, Any], sampler: str) -> list[str]:
     ]
 
 
-def without_reference(results: Mapping[str, Any]) -> int:
-    """Cases in which learned occupancy was run and is held to nothing: none that it passes."""
-    cells = [row["cells"].get(OURS, {}) for row in results["cases"] if not row["must_fail"]]
-    return sum(cell.get("verdict") == "no reference" and cell["seeds"] > 0 for cell in cells)
-
-
-def blind(results: Mapping[str, Any]) -> list[str]:
+def blind(results: Results) -> list[str]:
     """Why the suite cannot be believed, in a line each: cases that must fail, and have been run
     without failing for what is measured of them."""
     said = []
     for row in results["cases"]:
-        cell = row["cells"].get(OURS)
+        cell = row["cells"].get(LEARNED)
         if not row["must_fail"] or cell is None or cell["verdict"] == "no reference":
             continue
         if cell["verdict"] != "fail":
@@ -107,21 +135,23 @@ def blind(results: Mapping[str, Any]) -> list[str]:
     return said
 
 
-def unproven(results: Mapping[str, Any]) -> bool:
+def is_unproven(results: Results) -> bool:
     """Whether a case that must fail has not failed: nobody knows then what this table notices."""
-    cells = [row["cells"].get(OURS, {}) for row in results["cases"] if row["must_fail"]]
+    cells = [row["cells"].get(LEARNED, {}) for row in results["cases"] if row["must_fail"]]
     return bool(blind(results)) or any(cell.get("verdict") != "fail" for cell in cells)
 
 
 def figures(cell: Mapping[str, Any]) -> tuple[str, str, str]:
-    """The figures of a cell in short words: its PSNR, what it skips and how often it was healed,
+    """The figures of a cell in short words: its PSNR; what it skips and how often it was healed;
     and what its seeds say."""
     if cell["psnr"] is None:
         return "no result" if cell["verdict"] == "fail" else cell["reason"], "", ""
-    first = f"{cell['psnr']:.1f} dB" if cell["gap"] is None else f"{cell['gap']:+.2f} dB"
-    parts = [] if cell["gap"] is None else [f"kept {cell['kept_fraction']:.0%}"]
-    if cell["gap"] is not None and cell["lost_mass"] is not None:
-        parts.append(f"lost {cell['lost_mass']:.1%}")
+    first, parts = f"{cell['psnr']:.1f} dB", []
+    if cell["gap"] is not None:
+        first = f"{cell['gap']:+.2f} dB"
+        parts.append(f"kept {cell['kept_fraction']:.0%}")
+        if cell["lost_mass"] is not None:
+            parts.append(f"lost {cell['lost_mass']:.1%}")
     occupancies = [run.get("occupancy") or {} for run in cell.get("runs", ())]
     if healed := max((one.get("recoveries") or 0 for one in occupancies), default=0):
         parts.append(f"healed {healed} x")
@@ -145,3 +175,82 @@ def _rows(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
         f"| {' | '.join(str(cell).replace('|', chr(92) + '|') for cell in cells)} |"
         for cells in lines
     )
+
+
+def draw(results: Results, path: Path, theme: Theme = LIGHT) -> Path:
+    """Draws the results of a table.
+
+    Args:
+        results: as in `stability.json`.
+        path: of the picture.
+        theme: of the page it is meant for.
+    """
+    from matplotlib.figure import Figure
+
+    rows, samplers = results["cases"], results["samplers"]
+    width = max(NAMES + COLUMN * len(samplers) + 0.2, 8.5)
+    height = HEAD + ROW * len(rows) + FOOT
+    figure = Figure(figsize=(width, height), facecolor=theme.page)
+    axes: Any = figure.add_axes((0, 0, 1, 1))
+    axes.set_xlim(0, width)
+    axes.set_ylim(height, 0)
+    axes.axis("off")
+    sentence = textwrap.fill(headline(results), int(width * 8.6))
+    bold = {"fontsize": 14 if sentence.count("\n") < 2 else 11.5, "fontweight": "bold"}
+    axes.text(0.15, 0.12, sentence, va="top", color=theme.ink, **bold)
+    named = {"fontsize": 10.5, "color": theme.ink}
+    for number, one in enumerate(samplers):
+        middle = NAMES + COLUMN * (number + 0.5)
+        axes.text(middle, HEAD - 0.1, one["title"], ha="center", va="bottom", **named)
+    for number, row in enumerate(rows):
+        top = HEAD + ROW * number
+        axes.text(0.15, top + ROW / 2, row["title"], va="center", **named)
+        for column, one in enumerate(samplers):
+            cell = row["cells"].get(one["name"])
+            if cell is not None:
+                colours = (ON_LIGHT if theme is LIGHT else ON_DARK)[cell["verdict"]]
+                _draw_cell(axes, cell, NAMES + COLUMN * column, top, *colours)
+    explained = textwrap.fill(HOW_TO_READ, int(width * 13))
+    axes.text(0.15, height - FOOT + 0.12, explained, va="top", fontsize=9, color=theme.ink)
+    figure.savefig(path, dpi=140, metadata={SOURCE: fingerprint(results)})
+    return path
+
+
+def _draw_cell(
+    axes: Any, cell: Mapping[str, Any], left: float, top: float, ground: str, ink: str
+) -> None:
+    from matplotlib.patches import FancyBboxPatch
+
+    corner, style = (left + GAP, top + GAP), "round,pad=0,rounding_size=0.04"
+    size = COLUMN - 2 * GAP, ROW - 2 * GAP
+    axes.add_patch(
+        FancyBboxPatch(corner, *size, boxstyle=style, facecolor=ground, edgecolor="none")
+    )
+    first, second, seeds = figures(cell)
+    middle = top + ROW / 2
+    upper = middle - (0.065 if second else 0.0)
+    for x, y, text, size_of_type, side in (
+        (left + 0.17, middle, DRAWN_SIGNS[cell["verdict"]], 12, "center"),
+        (left + 0.33, upper, first, 9.5, "left"),
+        (left + COLUMN - 0.08, upper, seeds, 7, "right"),
+        (left + 0.33, middle + 0.085, second, 7, "left"),
+    ):
+        axes.text(x, y, text, ha=side, va="center", fontsize=size_of_type, color=ink)
+
+
+def draw_side_by_side(pictures: Mapping[str, Path], title: str, path: Path) -> None:
+    """Draws pictures in a row, each under its name."""
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(VIEW * len(pictures), 0.75 * VIEW + 0.75), facecolor="white")
+    figure.text(0.01, 0.985, title, va="top", fontsize=11, fontweight="bold")
+    for number, (name, picture) in enumerate(pictures.items()):
+        left = number / len(pictures)
+        axes = figure.add_axes((left + 0.008, 0.02, 1 / len(pictures) - 0.016, 0.78))
+        with Image.open(picture) as image:
+            pixels = np.asarray(image.convert("RGBA"), dtype=float) / 255.0
+        alpha = pixels[..., 3:]
+        axes.imshow(pixels[..., :3] * alpha + 1.0 - alpha, interpolation="nearest")
+        axes.set_title(name, fontsize=10, loc="left", pad=4)
+        axes.axis("off")
+    figure.savefig(path, dpi=110)

@@ -1,7 +1,7 @@
 """Pass, degraded or fail: what the runs of a sampler in a case say beside those of its reference.
 
 A sampler is held to what its own host reaches when nothing is skipped, with as many steps of as
-many rays; where that does not train, nobody can be held to anything.
+many rays. Where that does not train, nothing is held to anything.
 """
 
 from __future__ import annotations
@@ -9,15 +9,16 @@ from __future__ import annotations
 import math
 import statistics
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from typing import Any, Literal
 
 Verdict = Literal["pass", "degraded", "fail", "no reference"]
+Runs = Sequence[Mapping[str, Any]]
 
 
 @dataclass(frozen=True)
 class Bars:
-    """Largest shortfalls, dB."""
+    """The most that a verdict may fall short, dB; and lose."""
 
     below_reference: float
     """Of the median seed below the reference's median seed."""
@@ -25,12 +26,12 @@ class Bars:
     """Of any seed below the median seed."""
     detail: float
     """As `below_reference`, on the pixels that the case is about."""
+    lost_mass: float
+    """Share of the rays whose surface is not sampled, above the reference's. No occupancy is exact
+    to a pixel at the edges of things."""
 
 
-PASS, DEGRADED = Bars(0.2, 0.5, 0.5), Bars(1.0, 1.5, 2.0)
-LOST_MASS = 0.01, 0.05
-"""Share of the rays whose surface is not sampled, above the reference's: up to the first is a pass,
-up to the second degraded. No occupancy is exact to a pixel at the edges of things."""
+PASS, DEGRADED = Bars(0.2, 0.5, 0.5, 0.01), Bars(1.0, 1.5, 2.0, 0.05)
 TRAINED_ABOVE = 1.0
 """dB over the mean colour that a reference must reach to have trained."""
 GOOD_ANYWAY = 30.0
@@ -70,10 +71,7 @@ class Cell:
 
 
 def judge(
-    runs: Sequence[Mapping[str, Any]],
-    reference: Sequence[Mapping[str, Any]] | None,
-    failures: Sequence[str] = (),
-    missing: int = 0,
+    runs: Runs, reference: Runs | None, failures: Sequence[str] = (), missing: int = 0
 ) -> Cell:
     """The cell of a sampler in a case.
 
@@ -82,67 +80,63 @@ def judge(
         reference: those of its dense reference, of which the same seeds count; None where it is
             one itself.
         failures: reasons of its runs that have ended without a result.
-        missing: its runs that have not been made.
+        missing: number of its runs that have not been made.
     """
     if failures:
         many = len(failures) + len(runs)
         return Cell("fail", f"{len(failures)} of {many} runs ended: {failures[0]}", many, missing)
     if not runs:
         return Cell("no reference", "not run", 0, missing)
-    reference = _of_the_same_seeds(reference, runs)
-    blind = _unmeasured(runs, reference or ())
-    if blind:
-        return Cell("fail", blind, len(runs), missing)
+    if reference is not None:
+        reference = _of_the_same_seeds(reference, runs)
+    if unmeasured := _unmeasured(runs, reference or ()):
+        return Cell("fail", unmeasured, len(runs), missing)
     cell = _figures(runs, reference, missing)
-    held_to = runs if reference is None else reference
-    if not _trained(held_to):
-        reason = "the reference does not train" if held_to else "the reference has no result"
-        verdict: Verdict = "no reference"
-        if reference is None:
-            reason, verdict = "does not train", "fail"
-        elif cell.gap is not None and cell.gap < -DEGRADED.below_reference:
-            reason, verdict = (
-                f"{-cell.gap:.2f} dB below a dense run that does not train",
-                "degraded",
-            )
-        return Cell(**{**asdict(cell), "verdict": verdict, "reason": reason})
-    lost = None
-    if reference is not None and cell.lost_mass is not None:
-        lost = cell.lost_mass - (_worst(reference, "lost_mass") or 0.0)
-    for verdict, bars, most_lost in (("fail", DEGRADED, 1), ("degraded", PASS, 0)):
-        reason = _broken(cell, bars, lost, LOST_MASS[most_lost])
-        if reason:
-            return Cell(**{**asdict(cell), "verdict": verdict, "reason": reason})
+    lost = 0.0
+    if reference is None:
+        if not _is_trained(runs):
+            return replace(cell, verdict="fail", reason="does not train")
+    elif _is_trained(reference):
+        lost = (cell.lost_mass or 0.0) - max(_values(reference, "lost_mass"), default=0.0)
+    else:
+        if cell.gap is not None and cell.gap < -DEGRADED.below_reference:
+            reason = f"{-cell.gap:.2f} dB below a dense run that does not train"
+            return replace(cell, verdict="degraded", reason=reason)
+        reason = "the reference does not train" if reference else "the reference has no result"
+        return replace(cell, verdict="no reference", reason=reason)
+    if reason := _broken(cell, DEGRADED, lost):
+        return replace(cell, verdict="fail", reason=reason)
+    if reason := _broken(cell, PASS, lost):
+        return replace(cell, verdict="degraded", reason=reason)
     return cell
 
 
-def _of_the_same_seeds(
-    some: Sequence[Mapping[str, Any]] | None, others: Sequence[Mapping[str, Any]]
-) -> list[Mapping[str, Any]] | None:
-    """Those of some runs whose seeds others have too: medians of different seeds would differ by
-    more than what is compared."""
-    if some is None:
-        return None
+def _of_the_same_seeds(some: Runs, others: Runs) -> Runs:
+    """Those whose seeds others have too: medians of different seeds would differ by more than what
+    is compared."""
     seeds = {run["seed"] for run in others}
     return [run for run in some if run["seed"] in seeds]
 
 
-def _broken(cell: Cell, bars: Bars, lost: float | None, most_lost: float) -> str:
-    """The first bar that a cell is on the wrong side of, in words."""
+def _broken(cell: Cell, bars: Bars, lost: float) -> str:
+    """The first bar that a cell is on the wrong side of, in words.
+
+    Args:
+        lost: share of the surfaces lost beyond the reference's.
+    """
     if cell.gap is not None and cell.gap < -bars.below_reference:
         return f"{-cell.gap:.2f} dB below dense"
     if cell.detail_gap is not None and cell.detail_gap < -bars.detail:
         return f"{-cell.detail_gap:.1f} dB below dense where it matters"
-    if lost is not None and lost > most_lost:
+    if lost > bars.lost_mass:
         return f"{lost:.1%} of surfaces lost"
     if cell.worst is not None and cell.worst < -bars.below_median:
         return f"seed {cell.worst_seed} is {-cell.worst:.2f} dB below the median"
     return ""
 
 
-def _unmeasured(runs: Sequence[Mapping[str, Any]], reference: Sequence[Mapping[str, Any]]) -> str:
-    """The first figure that is no number although there should be one, in words: what nobody has
-    seen is not passed."""
+def _unmeasured(runs: Runs, reference: Runs) -> str:
+    """The first figure that is missing or no number, in words: what was not seen is not passed."""
     wanted = ["kept_fraction", "trivial_psnr"]
     wanted += [name for name in ("lost_mass", "detail_psnr") if _values(reference, name)]
     for run in runs:
@@ -154,17 +148,12 @@ def _unmeasured(runs: Sequence[Mapping[str, Any]], reference: Sequence[Mapping[s
     return ""
 
 
-def _figures(
-    runs: Sequence[Mapping[str, Any]],
-    reference: Sequence[Mapping[str, Any]] | None,
-    missing: int,
-) -> Cell:
-    psnrs = [float(run["psnr"]) for run in runs]
-    middle = statistics.median(psnrs)
-    at = min(range(len(runs)), key=psnrs.__getitem__)
+def _figures(runs: Runs, reference: Runs | None, missing: int) -> Cell:
+    """A pass with all figures of some runs."""
+    middle, worst = _psnr(runs), min(runs, key=lambda run: float(run["psnr"]))
     gap = detail_gap = None
-    paired = _of_the_same_seeds(runs, reference or ())
-    if reference and paired and math.isfinite(_psnr(reference)):
+    if reference and math.isfinite(_psnr(reference)):
+        paired = _of_the_same_seeds(runs, reference)
         gap = _psnr(paired) - _psnr(reference)
         ours, theirs = _median(paired, "detail_psnr"), _median(reference, "detail_psnr")
         if ours is not None and theirs is not None:
@@ -174,37 +163,30 @@ def _figures(
         "",
         len(runs),
         missing,
-        middle,
-        gap,
-        psnrs[at] - middle,
-        int(runs[at]["seed"]),
-        _worst(runs, "lost_mass"),
-        _median(runs, "kept_fraction"),
-        detail_gap,
+        psnr=middle,
+        gap=gap,
+        worst=float(worst["psnr"]) - middle,
+        worst_seed=int(worst["seed"]),
+        lost_mass=max(_values(runs, "lost_mass"), default=None),
+        kept_fraction=_median(runs, "kept_fraction"),
+        detail_gap=detail_gap,
     )
 
 
-def _trained(runs: Sequence[Mapping[str, Any]]) -> bool:
-    if not runs:
-        return False
+def _is_trained(runs: Runs) -> bool:
     trivial = _median(runs, "trivial_psnr")
     return trivial is not None and _psnr(runs) > min(trivial + TRAINED_ABOVE, GOOD_ANYWAY)
 
 
-def _psnr(runs: Sequence[Mapping[str, Any]]) -> float:
+def _psnr(runs: Runs) -> float:
     """Median over seeds, dB; what is no number is worse than any."""
     return statistics.median(-math.inf if r["psnr"] is None else float(r["psnr"]) for r in runs)
 
 
-def _values(runs: Sequence[Mapping[str, Any]], name: str) -> list[float]:
+def _values(runs: Runs, name: str) -> list[float]:
     return [run["measured"][name] for run in runs if run["measured"].get(name) is not None]
 
 
-def _median(runs: Sequence[Mapping[str, Any]], name: str) -> float | None:
+def _median(runs: Runs, name: str) -> float | None:
     values = _values(runs, name)
     return statistics.median(values) if values else None
-
-
-def _worst(runs: Sequence[Mapping[str, Any]], name: str) -> float | None:
-    """The largest: of what had better be small."""
-    return max(_values(runs, name), default=None)

@@ -13,7 +13,8 @@ from PIL import Image
 
 from leco_plugin import cli
 from leco_plugin.capacity import command
-from leco_plugin.capacity.measuring import VOLUMES, Candidate
+from leco_plugin.capacity.gates import Candidate, gates
+from leco_plugin.capacity.measuring import VOLUMES
 from leco_plugin.chart.theme import SOURCE, fingerprint
 from leco_plugin.scenes.input_error import InputError
 
@@ -58,8 +59,8 @@ def taught(monkeypatch: pytest.MonkeyPatch) -> list[str]:
     model = SimpleNamespace(num_train_data=7)
     ground = SimpleNamespace(model=model, held_out=SimpleNamespace(rays=99))
     monkeypatch.setattr(command, "prepare", lambda *arguments: ground)
-    monkeypatch.setattr(command, "of_gate", of_gate)
-    monkeypatch.setattr(command, "of_grids", of_grids)
+    monkeypatch.setattr(command, "measure_gate", of_gate)
+    monkeypatch.setattr(command, "measure_grids", of_grids)
     return done
 
 
@@ -95,7 +96,12 @@ def test_other_settings_and_bad_input_are_refused_in_one_line(
     (tmp_path / "taken").mkdir()
     (tmp_path / "taken" / "thesis.txt").write_text("")
     new = ["--out", tmp_path / "new"]
+    empty = tmp_path / "empty"
+    empty.mkdir()
+    other = tiny_scene_writer.write(tmp_path / "other" / tiny_scene.name, train=4, test=2)
     cases: dict[str, list[object]] = {
+        "empty": ["--data", empty, *new],
+        "another scene": ["--data", other, "--out", out],
         "another learn steps": ["--data", tiny_scene, "--out", out, "--learn-steps", 7],
         "holds something else": ["--data", tiny_scene, "--out", tmp_path / "taken"],
         "no such folder": ["--data", tmp_path / "none", *new],
@@ -106,6 +112,7 @@ def test_other_settings_and_bad_input_are_refused_in_one_line(
         assert run("capacity", *arguments) == 2, cause
         said = capsys.readouterr().err
         assert said.startswith("leco: ") and said.count("\n") == 1 and cause in said, said
+    assert not (tmp_path / "new").exists()
 
 
 @pytest.mark.parametrize("name", ["settings.json", "points/grid-16.json"])
@@ -144,14 +151,14 @@ def test_a_grid_that_is_asked_for_twice_is_measured_once(
 def test_one_field_teaches_gates_and_grids(
     tiny_scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    from leco_plugin.capacity import field, measuring
+    from leco_plugin.capacity import measuring
 
-    monkeypatch.setattr(field, "RAYS", 256)
-    monkeypatch.setattr(field, "TAUGHT_RAYS", 256)
-    monkeypatch.setattr(field, "VOLUME_POINTS", 2048)
+    monkeypatch.setattr(measuring, "RAYS", 256)
+    monkeypatch.setattr(measuring, "TAUGHT_RAYS", 256)
+    monkeypatch.setattr(measuring, "VOLUME_POINTS", 2048)
     monkeypatch.setattr(measuring, "STEPS", 20)
-    monkeypatch.setattr("leco_plugin.shrink.teaching.BATCH", 512)
-    some = [candidate for candidate in measuring.gates() if candidate.bytes < 5000]
+    monkeypatch.setattr("leco_plugin.capacity.gates.BATCH", 512)
+    some = [candidate for candidate in gates() if candidate.bytes < 5000]
     out = tmp_path / "out"
     for _ in range(2):  # the second time from the stored field
         results = command.capacity(tiny_scene, out, (8, 16), 0.01, 4, some)
@@ -174,9 +181,11 @@ def test_a_grid_that_would_take_too_long_is_left_out_and_said(
     capsys: pytest.CaptureFixture[str],
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    all_grids = command.of_grids
+    all_grids = command.measure_grids
     monkeypatch.setattr(command, "draw", lambda *arguments: None)
-    monkeypatch.setattr(command, "of_grids", lambda *arguments: list(all_grids(*arguments))[:2])
+    monkeypatch.setattr(
+        command, "measure_grids", lambda *arguments: list(all_grids(*arguments))[:2]
+    )
     taught += [""] * 6
     out = tmp_path / "out"
     assert run("capacity", "--data", tiny_scene, "--out", out, "--grids", 8, 16, 32) == 0
@@ -191,19 +200,3 @@ def test_a_grid_that_would_take_too_long_is_left_out_and_said(
     assert "left out, as before" in " ".join(capsys.readouterr().out.split())
     again = json.loads((out / "results.json").read_text())["representations"]
     assert again == rows
-
-
-def test_scenes_of_one_name_are_not_mixed_and_no_scene_blocks_nothing(
-    taught: list[str], tiny_scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    out, empty = tmp_path / "out", tmp_path / "empty"
-    empty.mkdir()
-    taught += [""] * 6
-    arguments = ["--out", out, "--grids", 8]
-    assert run("capacity", "--data", empty, *arguments) == 2 and not out.exists()
-    assert run("capacity", "--data", tiny_scene, *arguments) == 0
-    other = tiny_scene_writer.write(tmp_path / "other" / tiny_scene.name, train=4, test=2)
-    capsys.readouterr()
-    assert run("capacity", "--data", other, *arguments) == 2
-    said = capsys.readouterr().err
-    assert "another scene" in said and "new folder with --out" in said and said.count("\n") == 1

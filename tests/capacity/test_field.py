@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from leco_plugin.capacity import field
+from leco_plugin.capacity import measuring
 from leco_plugin.scenes.city.cameras import CaptureConfig
 from leco_plugin.scenes.city.city import CityConfig
 from leco_plugin.scenes.city.folder import write_city
@@ -26,13 +26,13 @@ def test_whoever_goes_on_is_taught_and_measured_on_the_same_rays(
     between."""
     capture = CaptureConfig(24, 18, aerial_per_block=12.0, street_per_block=0.0)
     city = write_city(CityConfig(1), tmp_path / "city", capture, progress=False)
-    monkeypatch.setattr(field, "RAYS", 128)
-    monkeypatch.setattr(field, "TAUGHT_RAYS", 256)
-    monkeypatch.setattr(field, "VOLUME_POINTS", 512)
-    first = field.prepare(city, tmp_path, learn_steps=4)
+    monkeypatch.setattr(measuring, "RAYS", 128)
+    monkeypatch.setattr(measuring, "TAUGHT_RAYS", 256)
+    monkeypatch.setattr(measuring, "VOLUME_POINTS", 512)
+    first = measuring.prepare(city, tmp_path, learn_steps=4)
     random.random()
     torch.rand(7)
-    again = field.prepare(city, tmp_path, learn_steps=4)
+    again = measuring.prepare(city, tmp_path, learn_steps=4)
     for one, other in (
         (first.lesson.mapped, again.lesson.mapped),
         (first.lesson.keep, again.lesson.keep),

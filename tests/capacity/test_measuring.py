@@ -5,9 +5,8 @@ from __future__ import annotations
 import pytest
 import torch
 
-from leco_plugin.capacity.measuring import FAMILIES, VOLUMES, gates, grids, measured
-from leco_plugin.models.gate import check_sizes
-from leco_plugin.shrink.evidence import Evidence
+from leco_plugin.capacity.evidence import Evidence
+from leco_plugin.capacity.measuring import VOLUMES, measure
 
 
 def evidence(count: int = 10_000) -> Evidence:
@@ -20,8 +19,8 @@ def evidence(count: int = 10_000) -> Evidence:
 def test_a_score_that_knows_the_worth_loses_the_least() -> None:
     known = evidence()
     volume = torch.rand(10_000)
-    good = measured(known, known.worth, volume, 0.01)
-    blind = measured(known, torch.rand(10_000), volume, 0.01)
+    good = measure(known, known.worth, volume, 0.01)
+    blind = measure(known, torch.rand(10_000), volume, 0.01)
     # of places with worth below t, the share is t and their worth t^2 / 2 of a half
     assert good["kept_volume"] == pytest.approx(1.0 - 0.01**0.5, abs=0.02)
     assert blind["kept_volume"] == pytest.approx(0.99, abs=0.01)
@@ -30,20 +29,7 @@ def test_a_score_that_knows_the_worth_loses_the_least() -> None:
 
 def test_losses_at_volumes_are_those_of_the_skipped() -> None:
     known = evidence()
-    losses = measured(known, known.worth, torch.rand(10_000), 0.01)["lost_at_volumes"]
+    losses = measure(known, known.worth, torch.rand(10_000), 0.01)["lost_at_volumes"]
     expected = [(1.0 - share) ** 2 for share in VOLUMES]
     assert losses == pytest.approx(expected, abs=0.03)
     assert losses == sorted(losses, reverse=True)
-
-
-def test_every_family_grows() -> None:
-    candidates = gates() + grids((64, 32))
-    assert {candidate.family for candidate in candidates} == set(FAMILIES)
-    assert len({candidate.key for candidate in candidates}) == len(candidates)
-    for family in FAMILIES:
-        sizes = [candidate.bytes for candidate in candidates if candidate.family == family]
-        assert sizes == sorted(sizes) and sizes[-1] > 2 * sizes[0]
-    assert grids((32,))[0].bytes == 32**3 / 8
-    for candidate in gates():
-        assert candidate.gate is not None
-        check_sizes(candidate.gate)

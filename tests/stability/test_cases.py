@@ -1,19 +1,28 @@
-"""Claims about the cases: data that can be configured, and reasons."""
+"""Claims about the cases, the runs that they need, and how long these take."""
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
+from typing import Any
 
 import pytest
 
 from leco_plugin.chart.contender import config_of
-from leco_plugin.scenes.input_error import InputError
 from leco_plugin.stability.cases import CASES, cases_named
-from leco_plugin.stability.contenders import SAMPLERS, samplers_named
-from leco_plugin.stability.plan import capture_of, entries_of, runs_of, scenes_of
-from leco_plugin.stability.sizes import FULL, QUICK
+from leco_plugin.stability.plan import (
+    Run,
+    capture_of,
+    core_seconds,
+    entries_of,
+    expected_seconds,
+    runs_of,
+    scenes_of,
+)
+from leco_plugin.stability.samplers import FULL, QUICK, SAMPLERS, samplers_named
 from leco_plugin.stability.worker import with_fixed_batches
 
+RESULTS = Path(__file__).parents[2] / "benchmarks" / "results"
 WANTED = {
     *("poles-and-wires", "glass", "fog", "all-empty", "all-full", "far-terrain", "outline"),
     *("indoors", "bounds-too-small", "bounds-too-large", "six-views", "exposure", "pose-noise"),
@@ -100,16 +109,59 @@ def test_references_join_by_themselves() -> None:
     assert [one.name for one in samplers_named(())] == list(SAMPLERS)
 
 
-def test_an_unknown_name_is_answered_with_all_there_are() -> None:
-    with pytest.raises(InputError, match=r"no case 'fogg'; there are yard, .*fog"):
-        cases_named(("fogg",))
-    with pytest.raises(InputError, match=r"no sampler 'grid'; there are learned, grid-128"):
-        samplers_named(("grid",))
-
-
 def test_cases_with_the_same_pictures_share_them() -> None:
     scenes = scenes_of(list(CASES.values()), FULL)
     for case in CASES.values():
         assert scenes[case.scene][1] == capture_of(case, FULL)
     assert capture_of(CASES["six-views"], QUICK).views == 6
     assert capture_of(CASES["yard"], QUICK).views < capture_of(CASES["yard"], FULL).views
+
+
+def runs(cases: tuple[str, ...], samplers: tuple[str, ...]) -> list[Run]:
+    return runs_of(entries_of(cases_named(cases), samplers_named(samplers), (0,), FULL))
+
+
+def stored() -> dict[tuple[str, str], dict[str, Any]]:
+    """Runs of the stored table by scene and name."""
+    rows = json.loads((RESULTS / "stability.json").read_text())["cases"]
+    return {
+        (row["scene"]["name"], run["name"]): run
+        for row in rows
+        for cell in row["cells"].values()
+        for run in cell["runs"]
+    }
+
+
+@pytest.mark.parametrize("name", SAMPLERS)
+def test_what_is_said_before_a_table_is_made_is_what_the_stored_one_took(name: str) -> None:
+    compared = list(CASES.values()), list(SAMPLERS.values())
+    made = stored()
+    entries = entries_of(*compared, (0, 1, 2), FULL, beside=(0,))
+    runs = [run for run in runs_of(entries) if run.key in made]
+    of_sampler = [run for run in runs if run.job.contender.sampler == name]
+    assert of_sampler
+    took = sum(float(made[run.key]["processor_seconds"]) for run in of_sampler)
+    assert core_seconds(of_sampler, [], FULL) == pytest.approx(took, rel=0.25)
+
+
+def test_finer_cells_and_more_levels_take_longer() -> None:
+    (coarse,), (fine,) = (
+        [run for run in runs(("poles-and-wires",), (name,)) if run.job.contender.sampler == name]
+        for name in ("grid-128", "grid-256")
+    )
+    (far,) = [
+        run
+        for run in runs(("far-terrain",), ("grid-128",))
+        if run.job.contender.sampler == "grid-128"
+    ]
+    times = [expected_seconds(run, FULL) for run in (coarse, far, fine)]
+    assert times == sorted(times) and times[2] > 3 * times[0]
+
+
+def test_what_runs_took_replaces_what_they_were_thought_to_take() -> None:
+    wanted = runs(("yard",), ("grid-128",))
+    stored = [
+        {"sampler": name, "processor_seconds": seconds}
+        for name, seconds in (("grid-128", 5.0), ("grid-128", 7.0), ("dense", 1.0))
+    ]
+    assert core_seconds(wanted, stored, FULL) == pytest.approx(7.0)

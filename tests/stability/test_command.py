@@ -9,7 +9,7 @@ import pytest
 from stability_runs import Runs
 
 from leco_plugin import cli
-from leco_plugin.stability import command, suite
+from leco_plugin.stability import suite
 from leco_plugin.studio.run_folder import alone_in
 
 
@@ -17,12 +17,12 @@ from leco_plugin.studio.run_folder import alone_in
 def runs(monkeypatch: pytest.MonkeyPatch) -> Runs:
     """What stands in for the processes of all runs."""
     made = Runs()
-    with_processes = command.make_table
+    with_processes = suite.make_table
 
     def make_table(*args: Any, **kwargs: Any) -> dict[str, Any]:
         return with_processes(*args, **kwargs, runner_for=made)
 
-    monkeypatch.setattr(command, "make_table", make_table)
+    monkeypatch.setattr(suite, "make_table", make_table)
     return made
 
 

@@ -17,17 +17,17 @@ from torch import Tensor
 
 from leco_plugin.samplers.base import Estimator
 from leco_plugin.samplers.proposal import DenseSampler
-from leco_plugin.stability.measure import (
+from leco_plugin.stability.photographs import TRUTH
+from leco_plugin.stability.worker import (
     FEWEST_VIEWS,
     NEAR,
     RASTER,
-    lost_of,
+    count_lost,
+    find_samples,
     measure,
     psnr,
     raster,
-    sampled,
 )
-from leco_plugin.stability.scene_folder import TRUTH
 
 RADIUS = 0.5
 """Of the ball around the origin that the rays meet."""
@@ -69,8 +69,8 @@ def packed(estimator: Estimator) -> Any:
 def lost(model: Any) -> tuple[float, float]:
     """Share of the rays whose surface is lost, and of the candidates that are kept."""
     rays, depth = bundle()
-    nearest, count, most = sampled(model, rays, depth, 64)
-    return float((nearest > NEAR * depth).float().mean()), int(count.sum()) / most
+    nearest, count, most = find_samples(model, rays, depth, 64)
+    return float((nearest > NEAR * depth).float().mean()), count / most
 
 
 def test_who_keeps_the_surface_loses_nothing_however_much_else_is_skipped() -> None:
@@ -85,14 +85,14 @@ def test_who_keeps_another_place_loses_every_surface() -> None:
 
 def test_a_ray_without_samples_is_lost() -> None:
     rays, depth = bundle()
-    nearest, count, _ = sampled(packed(Shell(50.0, 0.1)), rays, depth, 64)
-    assert nearest.isinf().all() and not count.any()
+    nearest, count, _ = find_samples(packed(Shell(50.0, 0.1)), rays, depth, 64)
+    assert nearest.isinf().all() and count == 0
 
 
 def test_a_ray_that_meets_nothing_is_not_asked_about() -> None:
     rays, _ = bundle(4)
     nowhere = torch.full((4,), math.inf)
-    nearest, _, _ = sampled(packed(Shell(RADIUS, 0.1)), rays, nowhere, 64)
+    nearest, _, _ = find_samples(packed(Shell(RADIUS, 0.1)), rays, nowhere, 64)
     assert not (nearest <= 1e9).any()
 
 
@@ -107,7 +107,7 @@ def test_only_surfaces_that_enough_training_pictures_show_can_be_lost() -> None:
     depth = torch.tensor([2.0, 2.0, 2.0, 2.0, math.inf])
     nearest = torch.tensor([0.01, 0.5, math.inf, 0.5, math.inf])
     shown_by = torch.tensor([9, 9, FEWEST_VIEWS, FEWEST_VIEWS - 1, 0])
-    assert lost_of(nearest, depth, shown_by) == (2, 3)
+    assert count_lost(nearest, depth, shown_by) == (2, 3)
 
 
 def test_a_raster_takes_its_share_of_every_row_and_every_column() -> None:
@@ -179,7 +179,7 @@ def test_errors_of_pictures_are_those_of_the_pixels_that_are_looked_at(tmp_path:
     pipeline = SimpleNamespace(
         datamanager=manager, model=Painter(), device="cpu", eval=lambda: None, train=lambda: None
     )
-    found, shown = measure(SimpleNamespace(pipeline=pipeline), tmp_path, 64)
+    found, shown = measure(pipeline, tmp_path, 64)
     third = DETAIL / WIDTH
     assert found.psnr == pytest.approx(-10 * math.log10(third * 0.09 + (1 - third) * 0.01))
     assert found.detail_psnr == pytest.approx(-10 * math.log10(0.09))

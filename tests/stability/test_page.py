@@ -9,7 +9,7 @@ import pytest
 from stability_runs import Runs, make, suite
 
 from leco_plugin.stability.cases import CASES
-from leco_plugin.stability.contenders import SAMPLERS
+from leco_plugin.stability.samplers import SAMPLERS
 
 PAGE = Path(__file__).parents[2] / "docs" / "stability.md"
 BEGIN, END = "<!-- cases: generated -->", "<!-- end of the cases -->"
@@ -53,37 +53,3 @@ def test_the_page_shows_the_stored_table_and_says_where_its_runs_come_from(
     assert "4 runs, 0.0 hours of one core" in shown and table["machine"]["cpu"] in shown
     assert shown.count("Not run yet.") == 1 and str(tmp_path) not in shown
     assert stability_page.page(shown, results) == shown
-
-
-def test_the_page_counts_kills_and_what_they_lost(results: Path) -> None:
-    import stability_page
-
-    def ended(psnr: float, *kills: tuple[int, int]) -> dict[str, object]:
-        found = [
-            {"seconds": 1.0, "first": -1, "before": before, "after": after}
-            for before, after in kills
-        ]
-        return {"step": 59, "psnr": psnr, "frozen": True, "kills": found}
-
-    def kill(before: int, **more: int) -> dict[str, object]:
-        return {"seconds": 1.0, "first": before, "before": before, "after": before, **more}
-
-    destroyed = {"step": -1, "kills": [kill(19) | {"before": -1, "after": -1}]}
-    damaged = {"step": 19, "kills": [kill(19, damaged=1)]}
-    stuck = {"step": 7, "kills": [kill(-1), kill(7)], "failed": "KeyError: 'gate'"}
-    unfinished = [destroyed, damaged, stuck]
-    stored = {
-        "steps": 60,
-        "undisturbed": [ended(13.0), ended(13.5)],
-        "killed": [ended(13.2, (3, 3), (7, 11)), ended(13.1, (7, 3)), ended(9.0), *unfinished],
-        "machine": {"cpu": "Some CPU"},
-    }
-    (results / "kills.json").write_text(json.dumps(stored))
-    shown = " ".join(stability_page.page(PAGE.read_text(), results).split())
-    assert "7 kills with SIGKILL at random moments of runs of 60 steps, 1 of them before" in shown
-    assert ", 3 of processes that had saved something themselves; 3 of them lost" in shown
-    assert "2 of 5 runs that were killed went on" in shown and "at 13.10 to 13.20 dB" in shown
-    assert (
-        "end at 13.00 to 13.50 dB (mean 13.25); the means differ by -0.10 dB with a standard error"
-        in shown
-    )

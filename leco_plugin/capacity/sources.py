@@ -1,7 +1,7 @@
-"""Where the rays come from that a smaller gate is measured on, and what renders them.
+"""Photographs and their rays, and the model that was trained on them.
 
-An occupancy lies in the folder of the run that learned it. The run's trained model is the natural
-reference: its rendering weights say what a dropped candidate was worth. Without one there are rays.
+An occupancy lies in the folder of the run that learned it. The rendering weights of that run's
+model say what a dropped candidate was worth.
 """
 
 from __future__ import annotations
@@ -11,6 +11,7 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import numpy as np
 import torch
 from nerfstudio.cameras.rays import RayBundle
 from torch import Tensor
@@ -18,8 +19,9 @@ from torch import Tensor
 from leco_plugin.evaluation.inspection import cameras_of
 from leco_plugin.learning.freezing import field_at_freezing
 from leco_plugin.models.leco import LecoModel
+from leco_plugin.models.mixture import Mixture
+from leco_plugin.models.region import cut_rays
 from leco_plugin.models.rendering import Rays
-from leco_plugin.models.scene_rays import cut_to_bounds
 from leco_plugin.occupancy import Occupancy
 from leco_plugin.scenes.frames import between, found_again, frame_of, moved, turned
 from leco_plugin.scenes.input_error import InputError, one_line, require_folder
@@ -28,7 +30,7 @@ from leco_plugin.studio.checkpoints import step_of, whole_of
 
 CONFIG, CHECKPOINTS = "config.yml", "nerfstudio_models"
 DRAWS = 8
-"""Of pixels, until there are as many different ones as are wanted."""
+"""Most batches that are drawn to find enough different pixels."""
 
 
 class Source(NamedTuple):
@@ -38,8 +40,13 @@ class Source(NamedTuple):
     """nerfstudio's data manager."""
     model: LecoModel | None
     """In evaluation mode."""
-    frozen: LecoModel | None = None
-    """The same model as it was when its gate was frozen."""
+    frozen: Mixture | None = None
+    """Its mixture as it was when the gate was frozen."""
+
+    @property
+    def mixture(self) -> Mixture | None:
+        """The model's, if there is a model."""
+        return None if self.model is None else self.model.mixture
 
 
 class Seen(NamedTuple):
@@ -49,7 +56,7 @@ class Seen(NamedTuple):
     truth: Tensor
     """[R, 3 or 4] colours."""
     pixels: Tensor | None = None
-    """[R, 3] int64, image, row and column; None where nobody asks which they are."""
+    """[R, 3] int64, image, row and column; None where they are not needed."""
 
 
 def find_source(file: Path, data: Path) -> Source:
@@ -60,17 +67,24 @@ def find_source(file: Path, data: Path) -> Source:
     """
     require_folder("--data", data)
     folder = file.resolve().parent
+    source = None
     if (folder / CONFIG).is_file() and any((folder / CHECKPOINTS).glob("step-*.ckpt")):
-        source = _of_run(folder, data.resolve())
-        if source is not None:
-            return source
-    return Source(_photographs(data), None)
+        source = _load_run(folder, data.resolve())
+    if source is not None:
+        return source
+    from leco_plugin.method_configs import best_device, leco_occupancy
+
+    config: Any = copy.deepcopy(leco_occupancy.config.pipeline)
+    config.datamanager.data = data
+    return Source(config.datamanager.setup(device=best_device(), test_mode="test"), None)
 
 
-def _of_run(folder: Path, data: Path) -> Source | None:
-    """The run's photographs and model; None where the model is a host's, with another field."""
+def _load_run(folder: Path, data: Path) -> Source | None:
+    """The run's photographs and model; None for the run of a host, whose field is another one."""
     import yaml
     from nerfstudio.utils.eval_utils import eval_load_checkpoint
+
+    from leco_plugin.method_configs import best_device
 
     # as ns-eval reads it
     try:
@@ -84,26 +98,26 @@ def _of_run(folder: Path, data: Path) -> Source | None:
     config.load_dir, config.load_step = path.parent, step_of(path)
     config.data = config.pipeline.datamanager.data = data
     try:
-        pipeline = config.pipeline.setup(device=_device(), test_mode="test")
+        pipeline = config.pipeline.setup(device=best_device(), test_mode="test")
         eval_load_checkpoint(config, pipeline)
     except (RuntimeError, KeyError) as error:
         raise InputError(
             f"the model of the run in {folder} cannot be loaded: {one_line(error, 200)}"
         ) from None
     model = pipeline.model.eval()
-    return Source(pipeline.datamanager, model, field_at_freezing(model, folder))
+    return Source(pipeline.datamanager, model, field_at_freezing(model.mixture, folder))
 
 
 def check_scene(source: Source, occupancy: Occupancy, data: Path) -> None:
-    """Whether the photographs are those that the occupancy was learned on, by where they are from.
+    """Compares the places of the cameras with those that the occupancy's report names.
 
     Raises:
-        InputError: fewer than half of the cameras that its report names are among theirs.
+        InputError: fewer than half of the named cameras are among the photographs' own.
     """
     known = cameras_of(occupancy)
     if len(known) == 0:
         return
-    here = source.manager.train_dataset.cameras.camera_to_worlds[:, :3, 3].cpu().float()
+    here = _camera_positions(source)
     if source.model is None and (frame := _frame_to(source, occupancy)) is not None:
         here = moved(here, frame)
     found = found_again(known, here, float(occupancy.space.half_extent))
@@ -114,37 +128,16 @@ def check_scene(source: Source, occupancy: Occupancy, data: Path) -> None:
         )
 
 
-def _frame_to(source: Source, occupancy: Occupancy) -> Tensor | None:
-    """Takes positions of these photographs to those of the occupancy; None where it is unknown."""
-    learned_in, here = occupancy.report.get("frame"), frame_of(source.manager)
-    return None if learned_in is None or here is None else between(here, learned_in)
-
-
-def _photographs(data: Path) -> Any:
-    """A data manager of `leco-occupancy` on some photographs."""
-    from leco_plugin.method_configs import leco_occupancy
-
-    config: Any = copy.deepcopy(leco_occupancy.config.pipeline)
-    config.datamanager.data = data
-    return config.datamanager.setup(device=_device(), test_mode="test")
-
-
-def _device() -> str:
-    from leco_plugin.method_configs import best_device
-
-    return best_device()
-
-
-def held_out(source: Source, occupancy: Occupancy, count: int, parts: int = 2) -> list[Seen]:
+def draw_held_out(source: Source, occupancy: Occupancy, count: int, parts: int = 2) -> list[Seen]:
     """Rays of pixels that nothing was trained on, in disjoint parts of up to `count` rays each.
 
-    A data manager that holds none back gives rays of training pixels, no pixel twice.
+    Without held-out pixels they are training pixels, none of them twice.
     """
     sampler = held_out_sampler(source.manager)
     if sampler is None:
         given: list[Seen] = []
         for _ in range(parts):
-            given.append(of_other_pixels(source, occupancy, count, given))
+            given.append(draw_other_pixels(source, occupancy, count, given))
         return given
     images = next(source.manager.iter_train_image_dataloader)
     batch = sampler.sample_held_out(images, parts * count, seed=1)
@@ -152,81 +145,54 @@ def held_out(source: Source, occupancy: Occupancy, count: int, parts: int = 2) -
     if each == 0:
         raise InputError("the photographs have no pixels that nothing was trained on")
     return [
-        _of_pixels(source, occupancy, batch["indices"][part], batch["image"][part])
+        _see_pixels(source, occupancy, batch["indices"][part], batch["image"][part])
         for part in torch.arange(each * parts).split(each)
     ]
 
 
-def trained_on(source: Source, occupancy: Occupancy, count: int) -> Seen:
+def draw_training_rays(source: Source, occupancy: Occupancy, count: int) -> Seen:
     """Rays of training pixels."""
-    bundle, batch = _batch(source, count)
-    return _seen(source, occupancy, bundle, batch["image"])
+    bundle, batch = _next_batch(source, count)
+    return _see(source, occupancy, bundle, batch["image"])
 
 
-def of_other_pixels(
+def draw_other_pixels(
     source: Source, occupancy: Occupancy, count: int, besides: Iterable[Seen]
 ) -> Seen:
-    """Rays of training pixels, each another one: evidence of its own.
+    """Rays of different training pixels.
 
     Args:
         count: wanted; fewer come back where the photographs have hardly more pixels.
         besides: rays whose pixels are not drawn again.
     """
     known = [_numbers(seen.pixels) for seen in besides if seen.pixels is not None]
-    taken = torch.cat([torch.empty(0, dtype=torch.int64), *known])
+    taken = np.concatenate([np.empty(0, np.int64), *known])
     pieces: list[tuple[Tensor, Tensor]] = []
     for _ in range(DRAWS):
-        batch = _batch(source, count)[1]
+        batch = _next_batch(source, count)[1]
         numbers = _numbers(batch["indices"])
-        new = _first_of_each(numbers) & ~torch.isin(numbers, taken)
-        taken = torch.cat([taken, numbers[new]])
-        pieces.append((batch["indices"].cpu()[new], batch["image"].cpu()[new]))
+        new = np.zeros(len(numbers), bool)
+        new[np.unique(numbers, return_index=True)[1]] = True
+        new &= ~np.isin(numbers, taken)
+        taken = np.concatenate([taken, numbers[new]])
+        chosen = torch.from_numpy(new)
+        pieces.append((batch["indices"].cpu()[chosen], batch["image"].cpu()[chosen]))
         if sum(len(pixels) for pixels, _ in pieces) >= count:
             break
     pixels, truth = (torch.cat(parts)[:count] for parts in zip(*pieces))
-    return _of_pixels(source, occupancy, pixels, truth)
+    return _see_pixels(source, occupancy, pixels, truth)
 
 
-def _batch(source: Source, count: int) -> tuple[RayBundle, dict[str, Tensor]]:
-    """So many rays of random training pixels, and the pixels."""
-    sampler = source.manager.train_pixel_sampler
-    before = sampler.num_rays_per_batch
-    sampler.set_num_rays_per_batch(count)
-    bundle, batch = source.manager.next_train(0)
-    sampler.set_num_rays_per_batch(before)
-    return bundle, batch
-
-
-def _of_pixels(source: Source, occupancy: Occupancy, pixels: Tensor, truth: Tensor) -> Seen:
-    """Rays of training pixels [R, 3]."""
-    bundle = source.manager.train_ray_generator(pixels)
-    return _seen(source, occupancy, bundle, truth)._replace(pixels=pixels)
-
-
-def _numbers(pixels: Tensor) -> Tensor:
-    """A number for each pixel [R, 3], another one for each."""
-    image, row, column = pixels.cpu().unbind(dim=1)
-    return (image << 40) + (row << 20) + column
-
-
-def _first_of_each(numbers: Tensor) -> Tensor:
-    """[R] bool: whether a number [R] stands there for the first time."""
-    values, which = numbers.unique(return_inverse=True)
-    places = torch.arange(len(numbers))
-    first = places.new_full(values.shape, len(numbers)).scatter_reduce(0, which, places, "amin")
-    return places == first[which]
-
-
-def from_between_cameras(source: Source, seen: Seen, seed: int) -> Seen:
-    """Rays that begin somewhere on the way from their camera to the nearest other one.
+def move_between_cameras(source: Source, seen: Seen, seed: int) -> Seen:
+    """The same rays, each moved by a random part of the way from its camera to the nearest one.
 
     Args:
-        seen: rays of training images; their colours are not those of the rays that come back.
+        seen: rays of training images; their colours are not those of the moved rays.
     """
-    model, rays = source.model, seen.rays
-    assert model is not None and rays.images is not None
+    rays = seen.rays
+    assert source.model is not None and rays.images is not None
     images = rays.images.cpu()
-    positions = source.manager.train_dataset.cameras.camera_to_worlds[:, :3, 3].cpu().float()
+    positions = _camera_positions(source)
     others = torch.cdist(positions, positions).fill_diagonal_(torch.inf).argmin(dim=1)
     generator = torch.Generator().manual_seed(seed)
     along = torch.rand(len(images), 1, generator=generator)
@@ -237,11 +203,11 @@ def from_between_cameras(source: Source, seen: Seen, seed: int) -> Seen:
         pixel_area=torch.ones_like(rays.t_mins)[:, None],
         camera_indices=rays.images[:, None],
     )
-    return _seen(source, None, bundle, seen.truth)._replace(pixels=seen.pixels)
+    return _see(source, None, bundle, seen.truth)._replace(pixels=seen.pixels)
 
 
-def of_test_photographs(source: Source, occupancy: Occupancy, count: int) -> Seen | None:
-    """Rays of about so many pixels of up to 16 test photographs; None where there are none."""
+def draw_test_rays(source: Source, occupancy: Occupancy, count: int) -> Seen | None:
+    """Rays of about `count` pixels of up to 16 test photographs; None where there are none."""
     dataset = source.manager.eval_dataset
     if dataset is None or len(dataset) == 0:
         return None
@@ -258,20 +224,58 @@ def of_test_photographs(source: Source, occupancy: Occupancy, count: int) -> See
     bundle = dataset.cameras.to("cpu").generate_rays(
         camera_indices=numbers, coords=places.float() + 0.5
     )
-    return _seen(source, occupancy, bundle, torch.cat(truths), of_training=False)
+    return _see(source, occupancy, bundle, torch.cat(truths), of_training=False)
 
 
-def _seen(
+def _camera_positions(source: Source) -> Tensor:
+    """Of the training photographs, in the run's coordinates: [C, 3]."""
+    cameras = source.manager.train_dataset.cameras
+    positions: Tensor = cameras.camera_to_worlds[:, :3, 3].cpu().float()
+    return positions
+
+
+def _frame_to(source: Source, occupancy: Occupancy) -> Tensor | None:
+    """[3, 4] from the photographs' coordinates to the occupancy's; None where it is unknown."""
+    learned_in, here = occupancy.report.get("frame"), frame_of(source.manager)
+    return None if learned_in is None or here is None else between(here, learned_in)
+
+
+def _next_batch(source: Source, count: int) -> tuple[RayBundle, dict[str, Tensor]]:
+    """`count` rays of random training pixels, and the pixels."""
+    sampler = source.manager.train_pixel_sampler
+    before = sampler.num_rays_per_batch
+    sampler.set_num_rays_per_batch(count)
+    bundle, batch = source.manager.next_train(0)
+    sampler.set_num_rays_per_batch(before)
+    return bundle, batch
+
+
+def _see_pixels(source: Source, occupancy: Occupancy, pixels: Tensor, truth: Tensor) -> Seen:
+    """Rays of training pixels [R, 3]."""
+    bundle = source.manager.train_ray_generator(pixels)
+    return _see(source, occupancy, bundle, truth)._replace(pixels=pixels)
+
+
+def _numbers(pixels: Tensor) -> np.ndarray:
+    """A different number for each different pixel [R, 3]: [R] int64."""
+    image, row, column = pixels.cpu().numpy().T
+    numbers: np.ndarray = (image << 40) + (row << 20) + column
+    return numbers
+
+
+def _see(
     source: Source,
     occupancy: Occupancy | None,
     bundle: Any,
     truth: Tensor,
     of_training: bool = True,
 ) -> Seen:
-    model = source.model
-    if model is not None:
-        rays = model.rays_of(bundle.to(model.device), with_images=of_training)
-        return Seen(rays, truth.to(model.device).float())
+    mixture = source.mixture
+    if mixture is not None:
+        bundle = bundle.to(mixture.device)
+        images = bundle.camera_indices[:, 0] if of_training else None
+        rays = mixture.rays(bundle.origins, bundle.directions, images)
+        return Seen(rays, truth.to(mixture.device).float())
     assert occupancy is not None
     bundle = bundle.to(occupancy.walls.device)
     if (frame := _frame_to(source, occupancy)) is not None:
@@ -280,5 +284,5 @@ def _seen(
         bundle.origins = moved(bundle.origins, frame)
         bundle.directions = directions / directions.norm(dim=-1, keepdim=True)
     near, far = (bundle.origins.new_tensor(occupancy.report[name]) for name in ("near", "far"))
-    rays = cut_to_bounds(bundle, occupancy.walls, near, far, with_images=False)
+    rays = cut_rays(bundle.origins, bundle.directions, occupancy.walls, near, far)
     return Seen(rays, truth.float())

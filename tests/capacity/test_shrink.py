@@ -7,6 +7,7 @@ import json
 import math
 import shutil
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
@@ -15,6 +16,10 @@ from PIL import Image
 from tiny_scene import camera_to_world
 
 from leco_plugin import cli
+from leco_plugin.capacity import references, search, shrink, sources
+from leco_plugin.capacity.evidence import Evidence, gather, loss, unlikely_at
+from leco_plugin.capacity.frontier import draw
+from leco_plugin.capacity.shrink import compare_queries
 from leco_plugin.evaluation.inspection import describe
 from leco_plugin.evaluation.report import describe_code
 from leco_plugin.learning.freezing import leave_field
@@ -22,10 +27,6 @@ from leco_plugin.models.encodings import EncodingConfig
 from leco_plugin.models.figures import prices
 from leco_plugin.models.gate import Gate, GateConfig
 from leco_plugin.occupancy import Occupancy
-from leco_plugin.shrink import command, references, rungs, search, sources
-from leco_plugin.shrink.evidence import Evidence, gather, loss, unlikely_at
-from leco_plugin.shrink.picture import draw
-from leco_plugin.shrink.timing import compare_queries
 
 pytestmark = [  # nerfstudio leaves an image open
     pytest.mark.filterwarnings("ignore:unclosed file:ResourceWarning"),
@@ -34,14 +35,10 @@ pytestmark = [  # nerfstudio leaves an image open
 
 
 @pytest.fixture(autouse=True)
-def quick(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(search, "STEPS", 150)
-    monkeypatch.setattr(search, "VOLUME_POINTS", 1 << 14)
-    monkeypatch.setattr(search, "TAUGHT_POINTS", 1 << 14)
-    monkeypatch.setattr(command, "RAYS", 512)
-    monkeypatch.setattr(command, "TAUGHT_RAYS", 512)
-    monkeypatch.setattr("leco_plugin.shrink.timing.TIMED_POSITIONS", 512)
-    monkeypatch.setattr("leco_plugin.shrink.teaching.BATCH", 4096)
+def few_rays(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(shrink, "RAYS", 512)
+    monkeypatch.setattr(shrink, "TAUGHT_RAYS", 512)
+    monkeypatch.setattr(shrink, "TIMED_POSITIONS", 512)
 
 
 @pytest.fixture
@@ -106,14 +103,14 @@ def test_a_search_that_is_stopped_leaves_the_gates_that_it_tried(
 ) -> None:
     smallest = [GateConfig(EncodingConfig(octaves=2), width, 1, 1) for width in (1, 2)]
     monkeypatch.setattr(search, "ladder", lambda most: smallest)
-    real = search._taught
+    real = search._teach_in_place
 
     def stopped_at_the_second(config: GateConfig, *some: object) -> Occupancy:
         if config is smallest[1]:
             raise KeyboardInterrupt
         return real(config, *some)
 
-    monkeypatch.setattr(search, "_taught", stopped_at_the_second)
+    monkeypatch.setattr(search, "_teach_in_place", stopped_at_the_second)
     out, report = tmp_path / "small", tmp_path / "small.json"
     assert run("shrink", file, "--data", tiny_scene, "--out", out, "--json", report) == 130
     known = json.loads(report.read_text())
@@ -149,43 +146,30 @@ def test_where_nothing_smaller_holds_the_same_gate_is_stored(
 def test_bad_input_ends_with_one_line_and_status_2(
     file: Path, tiny_scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    silent = ball_of_the_tiny_scene()
-    silent.save(tmp_path / "silent.safetensors")
-    aground = Occupancy.load(file)
-    aground.report["step_size"] = "small"
-    aground.save(tmp_path / "aground.safetensors")
-    idle, foggy = Occupancy.load(file), Occupancy.load(file)
-    idle.threshold_value.fill_(0.0)
-    idle.save(tmp_path / "idle.safetensors")
-    foggy.report["empty_fraction"] = 0.04
-    foggy.save(tmp_path / "foggy.safetensors")
-    elsewhere = Occupancy.load(file)
-    elsewhere.report["cameras"] = [[1.0, 0.1 * number, 0.7] for number in range(20)]
-    elsewhere.save(tmp_path / "elsewhere.safetensors")
+    def changed(name: str, threshold: float = 0.5, **report: object) -> Path:
+        occupancy = Occupancy.load(file).with_threshold(threshold)
+        occupancy.report |= report
+        occupancy.save(tmp_path / name)
+        return tmp_path / name
+
+    ball_of_the_tiny_scene().save(tmp_path / "silent")
+    cameras = [[1.0, 0.1 * number, 0.7] for number in range(20)]
     before = file.read_bytes()
-    out = ["--out", tmp_path / "out.safetensors"]
+    data, out = ["--data", tiny_scene], ["--out", tmp_path / "out.safetensors"]
     cases: dict[str, list[object]] = {
         "there is no such folder": [file, "--data", tmp_path / "none", *out],
-        "raise --lost-surface-mass": [file, "--data", tiny_scene, *out, "--lost-surface-mass", 0],
-        "how its rays are marched": [tmp_path / "silent.safetensors", "--data", tiny_scene, *out],
-        "not nan": [file, "--data", tiny_scene, *out, "--lost-surface-mass", "nan"],
-        "step_size is small": [tmp_path / "aground.safetensors", "--data", tiny_scene, *out],
-        "its threshold is 0": [tmp_path / "idle.safetensors", "--data", tiny_scene, *out],
-        "skips 4.0% of all candidates": [
-            *(tmp_path / "foggy.safetensors", "--data", tiny_scene),
-            *out,
-        ],
-        "of the 20 cameras": [tmp_path / "elsewhere.safetensors", "--data", tiny_scene, *out],
-        "is a folder": [file, "--data", tiny_scene, "--out", tmp_path],
-        "is the occupancy itself": [file, "--data", tiny_scene, "--out", file],
-        "not a folder": [file, "--data", tiny_scene, "--out", file / "new" / "small"],
-        "ends in none of": [file, "--data", tiny_scene, *out, "--picture", tmp_path / "a.doc"],
-        "give an occupancy.safetensors": [
-            tmp_path / "none.safetensors",
-            "--data",
-            tiny_scene,
-            *out,
-        ],
+        "raise --lost-surface-mass": [file, *data, *out, "--lost-surface-mass", 0],
+        "how its rays are marched": [tmp_path / "silent", *data, *out],
+        "not nan": [file, *data, *out, "--lost-surface-mass", "nan"],
+        "step_size is small": [changed("aground", step_size="small"), *data, *out],
+        "its threshold is 0": [changed("idle", threshold=0.0), *data, *out],
+        "skips 4.0% of all candidates": [changed("foggy", empty_fraction=0.04), *data, *out],
+        "of the 20 cameras": [changed("elsewhere", cameras=cameras), *data, *out],
+        "is a folder": [file, *data, "--out", tmp_path],
+        "is the occupancy itself": [file, *data, "--out", file],
+        "not a folder": [file, *data, "--out", file / "new" / "small"],
+        "ends in none of": [file, *data, *out, "--picture", tmp_path / "a.doc"],
+        "give an occupancy.safetensors": [tmp_path / "none.safetensors", *data, *out],
     }
     for cause, arguments in cases.items():
         assert run("shrink", *arguments) == 2, cause
@@ -197,7 +181,7 @@ def test_bad_input_ends_with_one_line_and_status_2(
 def test_the_speed_is_by_how_much_the_smaller_one_is_faster(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr("leco_plugin.shrink.timing.TIMED_POSITIONS", 1 << 14)
+    monkeypatch.setattr("leco_plugin.capacity.shrink.TIMED_POSITIONS", 1 << 14)
     small = ball_of_the_tiny_scene()
     large = Gate(GateConfig(EncodingConfig(octaves=8), 256, 4, 1))
     slow = Occupancy(large, small.space, 0.5).eval()
@@ -228,11 +212,11 @@ def lost_on_other_rays(file: Path, data: Path, smaller: Occupancy) -> list[float
     other pixels, and from other places between the cameras."""
     source, original = sources.find_source(file, data), Occupancy.load(file)
     torch.manual_seed(99)
-    pixels = sources.of_other_pixels(source, original, 1500, [])
-    seen = sources.from_between_cameras(source, pixels, seed=99)
-    parts = [gather(source, original, seen)[0]]
+    pixels = sources.draw_other_pixels(source, original, 1500, [])
+    seen = sources.move_between_cameras(source, pixels, seed=99)
+    parts = [gather(source.model, original, seen)[0]]
     if source.frozen is not None:
-        parts.append(gather(source._replace(model=source.frozen), None, seen)[0])
+        parts.append(gather(source.frozen, None, seen)[0])
     return [lost_of(part, smaller) for part in parts]
 
 
@@ -249,11 +233,11 @@ def test_the_file_declares_what_rays_have_lost_that_the_search_did_not_see(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
     """On the rays of the search only the safest places are worth anything, on others the least."""
-    grounds: list[rungs.Ground] = []
-    prepare = command._ground
+    grounds: list[references.Ground] = []
+    prepare = shrink.prepare
 
-    def uneven(source: sources.Source, original: Occupancy, drawn: command.Drawn) -> rungs.Ground:
-        ground = prepare(source, original, drawn)
+    def uneven(source: Any, original: Occupancy, *drawn: Any) -> references.Ground:
+        ground = prepare(source, original, *drawn)
         (reference,) = ground.references
         searched, unseen = reference.search, reference.verify
         values = original.query(searched.evidence.positions)
@@ -267,7 +251,7 @@ def test_the_file_declares_what_rays_have_lost_that_the_search_did_not_see(
         grounds.append(ground._replace(references=[known]))
         return grounds[-1]
 
-    monkeypatch.setattr(command, "_ground", uneven)
+    monkeypatch.setattr(shrink, "prepare", uneven)
     smaller_ones = [GateConfig(EncodingConfig(octaves=3), 16, 2, 1)]
     monkeypatch.setattr(search, "ladder", lambda most: smaller_ones)
     file, out, report = known_run / "occupancy.safetensors", tmp_path / "small", tmp_path / "a.json"
@@ -310,7 +294,7 @@ def test_an_original_that_is_not_within_the_bounds_is_said_and_declared(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     file = with_haze_at_freezing(known_run, tiny_scene, tmp_path / "run")
-    monkeypatch.setattr(command, "search", lambda *some, **more: pytest.fail("taught"))
+    monkeypatch.setattr(shrink, "search", lambda *some, **more: pytest.fail("taught"))
     out, report = tmp_path / "same", tmp_path / "a.json"
     assert run("shrink", file, "--data", tiny_scene, "--out", out, "--json", report) == 0
     said = " ".join(capsys.readouterr().out.split())
@@ -350,7 +334,7 @@ def test_what_is_declared_holds_against_the_field_at_the_moment_of_freezing(
     assert max(lost) <= verified == max(x["bound"] for x in against)
     assert verified <= smaller.report["lost_surface_mass"]
     source, original = sources.find_source(file, tiny_scene), Occupancy.load(file)
-    ground = command._ground(source, original, command._draw(source, original))
+    ground = shrink.prepare(source, original, *shrink.draw_rays(source, original))
     for part in (ground.references[1].search, ground.references[1].verify):
         assert part.evidence.rays == references.RAYS > sum(len(one.truth) for one in part.rendered)
 
@@ -362,7 +346,7 @@ def test_a_field_that_renders_nothing_is_no_reference(known_run: Path, tiny_scen
     with torch.no_grad():
         source.model.field.density_head.bias.fill_(-50.0)
     with pytest.raises(ValueError, match="renders nothing"):
-        command._ground(source, original, command._draw(source, original))
+        shrink.prepare(source, original, *shrink.draw_rays(source, original))
 
 
 def test_a_run_whose_model_does_not_fit_is_refused_in_one_line(

@@ -3,33 +3,34 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 
 import pytest
 import torch
 from ball_occupancy import CENTRE, HALF, RADIUS, ball
 
+from leco_plugin.capacity import search as searching
+from leco_plugin.capacity.evidence import Evidence, query_in_parts
+from leco_plugin.capacity.references import (
+    Bounds,
+    Ground,
+    Part,
+    Reference,
+    Rung,
+    declared,
+    verify,
+)
+from leco_plugin.capacity.search import Found, find_threshold, search
+from leco_plugin.capacity.shrink import check_losses
+from leco_plugin.capacity.sources import Source
 from leco_plugin.evaluation.inspection import whole_box
 from leco_plugin.models.encodings import EncodingConfig
 from leco_plugin.models.gate import GateConfig
 from leco_plugin.occupancy import Occupancy
-from leco_plugin.shrink import search as searching
-from leco_plugin.shrink.checks import check_room
-from leco_plugin.shrink.evidence import Evidence, query_in_parts
-from leco_plugin.shrink.references import Part, Reference, declared
-from leco_plugin.shrink.rungs import Bounds, Found, Ground, Rung
-from leco_plugin.shrink.search import search, threshold_keeping
-from leco_plugin.shrink.verifying import verify
 
+NOBODY, FILE = Source(None, None), Path("occupancy.safetensors")
 TOO_SMALL = GateConfig(EncodingConfig(octaves=1), 1, 1, 1)
 ENOUGH = GateConfig(EncodingConfig(octaves=2), 16, 2, 1)
-
-
-@pytest.fixture(autouse=True)
-def quick(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(searching, "STEPS", 200)
-    monkeypatch.setattr(searching, "VOLUME_POINTS", 1 << 14)
-    monkeypatch.setattr(searching, "TAUGHT_POINTS", 1 << 14)
-    monkeypatch.setattr("leco_plugin.shrink.teaching.BATCH", 4096)
 
 
 def original(**report: object) -> Occupancy:
@@ -135,10 +136,10 @@ def test_a_loss_that_the_search_has_seen_is_declared_too() -> None:
 
 def test_nothing_is_lost_beyond_what_the_original_leaves() -> None:
     with pytest.raises(ValueError, match="raise --lost-surface-mass"):
-        check_room(original(lost_surface_mass=3e-3), Bounds(1e-3))
+        check_losses(NOBODY, original(lost_surface_mass=3e-3), FILE, Bounds(1e-3))
     with pytest.raises(ValueError, match="raise --image-price"):
-        check_room(original(image_price_db=0.06), Bounds())
-    check_room(original(lost_surface_mass=4e-4, image_price_db=-0.1), Bounds())
+        check_losses(NOBODY, original(image_price_db=0.06), FILE, Bounds())
+    check_losses(NOBODY, original(lost_surface_mass=4e-4, image_price_db=-0.1), FILE, Bounds())
 
 
 def test_what_the_original_has_lost_is_declared_too() -> None:
@@ -176,7 +177,7 @@ def test_the_worst_reference_decides_and_is_declared() -> None:
 def test_a_threshold_that_keeps_a_share_keeps_it() -> None:
     scores = torch.randperm(1000).float()
     for share in (0.001, 0.1, 0.5, 1.0):
-        assert float((scores >= threshold_keeping(scores, share)).float().mean()) == pytest.approx(
+        assert float((scores >= find_threshold(scores, share)).float().mean()) == pytest.approx(
             share
         )
 
@@ -201,14 +202,14 @@ def test_a_gate_that_nearly_holds_is_taught_for_longer(monkeypatch: pytest.Monke
 
     monkeypatch.setattr(searching, "teach", teach)
     loss_of = {TOO_SMALL.width: 0.5, ENOUGH.width: 1e-3}
-    measured = searching._measured
+    measured = searching._measure
 
     def known_loss(known: Ground, gate: Occupancy, *rest: object) -> Rung:
         rung = measured(known, gate, *rest)
         lost = loss_of[gate.gate.config.width]
         return replace(rung, lost_surface_mass=lost, verdict="loses too much")
 
-    monkeypatch.setattr(searching, "_measured", known_loss)
+    monkeypatch.setattr(searching, "_measure", known_loss)
     shares: list[float] = []
     search(ground(original()), Bounds(1e-3), [TOO_SMALL, ENOUGH], on_progress=shares.append)
     steps = searching.STEPS

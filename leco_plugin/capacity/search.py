@@ -1,6 +1,6 @@
 """From small to large: teach, find a threshold, measure; the first gate that holds is the answer.
 
-The threshold gives each gate the kept volume of the original, so that what differs is the loss. It
+The threshold gives each gate the kept volume of the original, so that they differ in the loss. It
 is found on rays of its own; what is declared is measured on others.
 """
 
@@ -9,30 +9,38 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Sequence
 from itertools import pairwise
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
+from leco_plugin.capacity.evidence import Evidence, query_in_parts, unlikely_at
+from leco_plugin.capacity.gates import Lesson, ladder, name_of, round_weights, teach, values_of
+from leco_plugin.capacity.references import Bounds, Ground, Rung, verify
 from leco_plugin.evaluation.inspection import whole_box
+from leco_plugin.learning.calibration import THRESHOLDS
 from leco_plugin.models.gate import GateConfig
 from leco_plugin.occupancy import Occupancy
-from leco_plugin.shrink.evidence import Evidence, loss, query_in_parts, unlikely_at
-from leco_plugin.shrink.ladder import ladder, name_of, values_of
-from leco_plugin.shrink.rungs import Bounds, Found, Ground, Rung
-from leco_plugin.shrink.teaching import Lesson, round_weights, teach
-from leco_plugin.shrink.verifying import price_of, verify, worst
 
 STEPS, LONGER, NEARLY = 1200, 3, 3.0
-"""Of teaching; how many times as many a gate gets that nearly holds, and what that means: a loss of
-so many times what the search allows."""
+"""Steps of teaching. A gate whose loss is at most `NEARLY` times what the search allows is taught
+again, `LONGER` times as long."""
 EMPHASIS, WEIGHT_AT_FULL = 8.0, 0.05
-"""How much dearer a candidate is that carries rendering weight, and from which weight on fully."""
+"""How much more a candidate with rendering weight counts, and the weight from which on it does so
+fully."""
 MARGIN = 0.5
 """Share of the allowed loss that a gate may use on the rays of the search, so that others hold."""
 VOLUME_POINTS = 1 << 17
 TAUGHT_POINTS = 1 << 18
 VOLUMES = (1.0, 1.05)
 """Kept volumes that are tried, as shares of the original's."""
+
+
+class Found(NamedTuple):
+    """The outcome of a search: without an occupancy, nothing smaller holds."""
+
+    occupancy: Occupancy | None
+    rungs: list[Rung]
 
 
 def search(
@@ -42,7 +50,7 @@ def search(
     on_rung: Callable[[Rung], None] | None = None,
     on_progress: Callable[[float], None] | None = None,
 ) -> Found:
-    """Walks up the ladder and stops at the first gate whose price, on unseen rays, is in bounds.
+    """Walks up the ladder and stops at the first gate that is within the bounds on unseen rays.
 
     Args:
         gates: by size; those smaller than the original by default.
@@ -50,7 +58,7 @@ def search(
         on_progress: called with the share of the ladder that is done.
     """
     gates = ladder(values_of(ground.original.gate.config)) if gates is None else gates
-    volume = _places_to_count(ground.original)
+    volume = spread_positions(ground.original, VOLUME_POINTS, seed=5)
     kept = query_in_parts(ground.original, volume) >= ground.original.threshold
     lesson = lesson_of(ground.original, ground.taught)
     rungs: list[Rung] = []
@@ -59,9 +67,13 @@ def search(
     for number, config in enumerate(gates):
         started = time.monotonic()
         parts = [(number + done) / len(gates) for done in (0.0, 1.0 / (1 + LONGER), 1.0)]
-        for times, part in zip((1, LONGER), pairwise(parts)):
-            gate = _taught(config, lesson, times * STEPS, ground.original, part_of(show, *part))
-            rung = _measured(ground, gate, bounds, volume, kept, looks + 1)
+        for times, (first, last) in zip((1, LONGER), pairwise(parts)):
+
+            def show_part(share: float, first: float = first, last: float = last) -> None:
+                show(first + share * (last - first))
+
+            gate = _teach_in_place(config, lesson, times * STEPS, ground.original, show_part)
+            rung = _measure(ground, gate, bounds, volume, kept, looks + 1)
             looks = rung.look or looks
             nearly = rung.lost_surface_mass <= NEARLY * MARGIN * bounds.lost_surface_mass
             if rung.verdict == "chosen" or not nearly:
@@ -76,12 +88,7 @@ def search(
     return Found(None, rungs)
 
 
-def part_of(show: Callable[[float], None], first: float, last: float) -> Callable[[float], None]:
-    """Shows the progress of a part that goes from `first` to `last` of all."""
-    return lambda share: show(first + share * (last - first))
-
-
-def _taught(
+def _teach_in_place(
     config: GateConfig,
     lesson: Lesson,
     steps: int,
@@ -89,14 +96,15 @@ def _taught(
     on_progress: Callable[[float], None],
 ) -> Occupancy:
     """A gate in the original's place, without a threshold of its own yet."""
-    gate = round_weights(teach(config, lesson, steps, original.precision, on_progress=on_progress))
+    gate = teach(config, lesson, steps, original.precision, on_progress=on_progress)
+    round_weights(gate)
     smaller = Occupancy(gate, original.space, 0.5, original.precision, walls=original.walls)
     return smaller.to(original.threshold_value.device).eval()
 
 
 def lesson_of(original: Occupancy, taught: Evidence) -> Lesson:
-    """The original's decisions on candidates of rays, and as many places anywhere in its box."""
-    anywhere = _volume(original, TAUGHT_POINTS, seed=6)
+    """The original's decisions on candidates of rays, and on as many places anywhere in its box."""
+    anywhere = spread_positions(original, TAUGHT_POINTS, seed=6)
     decided = query_in_parts(original, anywhere) >= original.threshold
     kept = torch.cat([taught.kept, decided]).float()
     full = (taught.weights / WEIGHT_AT_FULL).clamp(max=1.0)
@@ -105,50 +113,46 @@ def lesson_of(original: Occupancy, taught: Evidence) -> Lesson:
     return Lesson(mapped, kept * (1.0 + EMPHASIS * emphasis), 1.0 - kept)
 
 
-def _measured(
+def _measure(
     ground: Ground, smaller: Occupancy, bounds: Bounds, volume: Tensor, kept: Tensor, look: int
 ) -> Rung:
-    """Gives the gate the threshold that suits it; what was found.
+    """Gives the gate its threshold; what was found with it.
 
     Args:
-        look: at the rays that verify, the how many-th it would be.
+        volume, kept: places [P, 3] in the original's box, and whether it keeps them.
+        look: number that a look at the verifying rays would have.
     """
-    scores = [
-        query_in_parts(smaller, reference.search.evidence.positions)
-        for reference in ground.references
-    ]
-    of_volume = query_in_parts(smaller, volume)
-    losses: list[float] = []
-    holds, ratio = False, 0.0
+    scores = [query_in_parts(smaller, one.search.evidence.positions) for one in ground.references]
+    of_volume, share_kept = query_in_parts(smaller, volume), kept.double().mean()
+    lost, holds, ratio = 0.0, False, 0.0
     for share in VOLUMES:
-        threshold = threshold_keeping(of_volume, share * float(kept.double().mean()))
-        beyond = [
-            loss(reference.search.evidence, found < threshold, unlikely_at(look))
+        threshold = find_threshold(of_volume, share * float(share_kept))
+        losses = [
+            reference.loss_of(reference.search, found < threshold, unlikely_at(look))
             for reference, found in zip(ground.references, scores)
         ]
-        losses = [each.lost_before + one.share for each, one in zip(ground.references, beyond)]
-        ratio = float((of_volume >= threshold).double().mean() / kept.double().mean())
+        lost = max(one.share for one in losses)
+        ratio = float((of_volume >= threshold).double().mean() / share_kept)
         # what is not within the bounds here needs no look at the rays that verify
         holds = all(
-            lost <= MARGIN * bounds.lost_surface_mass + (1.0 - MARGIN) * reference.lost_before
-            and reference.lost_before + one.bound <= bounds.lost_surface_mass
-            for reference, lost, one in zip(ground.references, losses, beyond)
+            one.bound <= bounds.lost_surface_mass
+            and one.share
+            <= MARGIN * bounds.lost_surface_mass + (1.0 - MARGIN) * reference.lost_before
+            for reference, one in zip(ground.references, losses)
         )
         if holds:
             break
     smaller.threshold_value.fill_(threshold)
     config = smaller.gate.config
     params = values_of(config)
-    rung = Rung(name_of(config), params, 2 * params, round(ratio, 4), max(losses), None, "", 0.0)
+    rung = Rung(name_of(config), params, 2 * params, round(ratio, 4), lost, None, "", 0.0)
     if not holds:
         rung.verdict = "loses too much"
         return rung
     if ratio > VOLUMES[-1] + 0.005:
         rung.verdict = "keeps too much"
         return rung
-    rung.image_price_db = worst(
-        [price_of(ground, each, each.search, smaller) for each in ground.references]
-    )
+    rung.image_price_db = ground.price(smaller, "search")
     if (rung.image_price_db or 0.0) > bounds.image_price_db:
         rung.verdict = "costs too much of the image"
         return rung
@@ -157,7 +161,38 @@ def _measured(
     return rung
 
 
-def threshold_keeping(scores: Tensor, share: float) -> float:
+def lower_threshold(ground: Ground, bounds: Bounds) -> Occupancy | None:
+    """The original at the largest lower threshold that meets what is asked of a smaller gate.
+
+    Calibration allows a loss in the mean of some thousand held-out rays, but what is declared has
+    to hold on others, too. A smaller gate loses more than the original whose decisions it is
+    taught. So an original that itself loses too much is asked to keep more.
+
+    Returns:
+        It shares the original's gate; None where the original meets that as it is, no threshold
+        does, or nothing measures.
+    """
+    original = ground.original
+    absolute = [reference for reference in ground.references if not reference.guided]
+    scores = [query_in_parts(original, one.search.evidence.positions) for one in absolute]
+
+    def meets(there: Occupancy) -> bool:
+        losses = [
+            one.loss_of(one.search, found < there.threshold, unlikely_at(1))
+            for one, found in zip(absolute, scores)
+        ]
+        share, bound = max(one.share for one in losses), max(one.bound for one in losses)
+        if share > MARGIN * bounds.lost_surface_mass or not bounds.allow(bound, None):
+            return False  # before anything is rendered
+        return bounds.allow(bound, ground.price(there, "search", absolute=True))
+
+    if not absolute or meets(original):
+        return None
+    lower = (original.with_threshold(t) for t in THRESHOLDS if t < original.threshold)
+    return next(filter(meets, lower), None)
+
+
+def find_threshold(scores: Tensor, share: float) -> float:
     """The threshold at which a share of places, with scores [M], is kept."""
     ordered = scores.double().sort(descending=True).values
     return float(ordered[min(max(round(share * len(ordered)) - 1, 0), len(ordered) - 1)])
@@ -165,15 +200,11 @@ def threshold_keeping(scores: Tensor, share: float) -> float:
 
 def kept_of_box(occupancy: Occupancy) -> float:
     """Share of an occupancy's box, or of a contracted cube, that it keeps."""
-    kept = query_in_parts(occupancy, _places_to_count(occupancy)) >= occupancy.threshold
-    return float(kept.double().mean())
+    places = spread_positions(occupancy, VOLUME_POINTS, seed=5)
+    return float((query_in_parts(occupancy, places) >= occupancy.threshold).double().mean())
 
 
-def _places_to_count(occupancy: Occupancy) -> Tensor:
-    return _volume(occupancy, VOLUME_POINTS, seed=5)
-
-
-def _volume(occupancy: Occupancy, count: int, seed: int) -> Tensor:
+def spread_positions(occupancy: Occupancy, count: int, seed: int) -> Tensor:
     """Positions [count, 3] spread evenly over the occupancy's box, or over a contracted cube."""
     unit = torch.rand(count, 3, generator=torch.Generator().manual_seed(seed))
     device = occupancy.threshold_value.device

@@ -1,18 +1,18 @@
-"""Claims about an original that loses more than the search allows."""
+"""Claims about what a gate may declare, and about an original that loses more than is allowed."""
 
 from __future__ import annotations
+
+from dataclasses import replace
 
 import pytest
 import torch
 from valued_ball import ground
 
+from leco_plugin.capacity.evidence import Evidence, loss, unlikely_at
+from leco_plugin.capacity.references import HOLDS, Bounds, Ground, Part, measure_original, verify
+from leco_plugin.capacity.search import MARGIN, kept_of_box, lower_threshold
 from leco_plugin.learning.calibration import THRESHOLDS
 from leco_plugin.occupancy import Occupancy
-from leco_plugin.shrink.evidence import Evidence, loss
-from leco_plugin.shrink.lowering import facts_of, lowered
-from leco_plugin.shrink.references import Part
-from leco_plugin.shrink.rungs import Bounds, Ground
-from leco_plugin.shrink.search import MARGIN
 
 
 def on_its_boundary() -> Ground:
@@ -42,7 +42,7 @@ def test_it_is_shrunk_at_the_largest_threshold_that_loses_no_more_than_a_smaller
     here = on_its_boundary()
     searched = here.references[1].search.evidence
     allowed = part * lost_at(here.original, searched, here.original.threshold)
-    lower = lowered(here, Bounds(allowed / MARGIN))
+    lower = lower_threshold(here, Bounds(allowed / MARGIN))
     assert lower is not None
     meeting = [
         threshold
@@ -51,19 +51,43 @@ def test_it_is_shrunk_at_the_largest_threshold_that_loses_no_more_than_a_smaller
         and lost_at(here.original, searched, threshold) <= allowed
     ]
     assert lower.threshold == pytest.approx(max(meeting))
-    facts = facts_of(here.original, lower)
-    assert facts["kept_volume"] > 1.0 and facts["from"] > facts["to"] == lower.threshold
+    assert kept_of_box(lower) > kept_of_box(here.original) > 0.0
 
 
 def test_one_that_meets_it_is_shrunk_as_it_is() -> None:
     here = ground(True, False)
     lost = lost_at(here.original, here.references[1].search.evidence, here.original.threshold)
-    assert lowered(here, Bounds(1.01 * lost / MARGIN)) is None
+    assert lower_threshold(here, Bounds(1.01 * lost / MARGIN)) is None
 
 
 def test_where_nothing_measures_the_original_it_stays_as_it_is() -> None:
-    assert lowered(ground(True), Bounds(1e-9)) is None
+    assert lower_threshold(ground(True), Bounds(1e-9)) is None
 
 
 def test_where_no_threshold_meets_it_there_is_none() -> None:
-    assert lowered(ground(True, False), Bounds(1e-9)) is None
+    assert lower_threshold(ground(True, False), Bounds(1e-9)) is None
+
+
+def test_an_original_that_guides_its_reference_loses_what_it_declares() -> None:
+    here = ground(True)
+    itself = measure_original(here, Bounds(2e-4))
+    assert not here.measures_original and itself.verdict == HOLDS
+    assert itself.lost_surface_mass == itself.bound == 1e-4
+
+
+def test_an_original_is_measured_where_all_candidates_are_rendered() -> None:
+    here = ground(True, False)
+    searched, unseen = (
+        loss(part.evidence, ~part.evidence.kept, unlikely_at(1))
+        for part in (here.references[1].search, here.references[1].verify)
+    )
+    assert here.measures_original and searched.share > 1e-2
+    itself = measure_original(here, Bounds(0.9))
+    assert itself.verdict == HOLDS and itself.bound == pytest.approx(searched.bound)
+    assert measure_original(here, Bounds(searched.share)).verdict != HOLDS
+    fourth = replace(itself)
+    for rung, look in ((itself, 1), (fourth, 4)):
+        assert verify(here, here.original, Bounds(0.9), rung, look)
+    declared = itself.verified["lost_surface_mass_bound"]
+    assert declared == pytest.approx(max(searched.bound, unseen.bound))
+    assert float(fourth.verified["lost_surface_mass_bound"] or 0.0) > float(declared or 1.0)

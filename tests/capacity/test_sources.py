@@ -11,20 +11,20 @@ import tiny_scene as tiny_scene_writer
 import torch
 from ball_occupancy import THEIR_MARCH, ball_of_the_tiny_scene
 
-from leco_plugin.occupancy import Occupancy
-from leco_plugin.scenes.input_error import InputError
-from leco_plugin.shrink.references import AT_FREEZING, BY_DECISIONS, NOW, shares_lost
-from leco_plugin.shrink.sources import (
+from leco_plugin.capacity.references import AT_FREEZING, BY_DECISIONS, NOW, measure_shares_lost
+from leco_plugin.capacity.sources import (
     CHECKPOINTS,
     CONFIG,
     check_scene,
+    draw_held_out,
+    draw_other_pixels,
+    draw_test_rays,
+    draw_training_rays,
     find_source,
-    from_between_cameras,
-    held_out,
-    of_other_pixels,
-    of_test_photographs,
-    trained_on,
+    move_between_cameras,
 )
+from leco_plugin.occupancy import Occupancy
+from leco_plugin.scenes.input_error import InputError
 
 pytestmark = [  # nerfstudio leaves an image open
     pytest.mark.filterwarnings("ignore:unclosed file:ResourceWarning"),
@@ -89,7 +89,7 @@ def test_cameras_are_compared_in_the_coordinates_of_the_occupancy(
 def test_test_photographs_say_what_a_smaller_gate_loses(known_run: Path, tiny_scene: Path) -> None:
     file = known_run / "occupancy.safetensors"
     source, original = find_source(file, tiny_scene), Occupancy.load(file)
-    seen = of_test_photographs(source, original, 300)
+    seen = draw_test_rays(source, original, 300)
     assert seen is not None and len(seen.truth) == 300
     cameras = source.manager.eval_dataset.cameras.camera_to_worlds[:, :3, 3]
     apart = torch.cdist(seen.rays.origins, cameras)
@@ -101,28 +101,28 @@ def test_test_photographs_say_what_a_smaller_gate_loses(known_run: Path, tiny_sc
     }
     nothing = copy.deepcopy(original)
     nothing.threshold_value.fill_(1.1)
-    assert shares_lost(source, original, nothing, seen) == pytest.approx({NOW: 1.0 + 1e-4})
+    assert measure_shares_lost(source, original, nothing, seen) == pytest.approx({NOW: 1.0 + 1e-4})
     # what the field at freezing says that the original loses counts, not what it declares
     both = source._replace(frozen=source.model)
-    before = shares_lost(both, original, original, seen)[AT_FREEZING]
-    assert shares_lost(both, original, nothing, seen) == pytest.approx(
+    before = measure_shares_lost(both, original, original, seen)[AT_FREEZING]
+    assert measure_shares_lost(both, original, nothing, seen) == pytest.approx(
         {NOW: 1.0 + before, AT_FREEZING: 1.0}
     )
     everything = copy.deepcopy(original)
     everything.threshold_value.fill_(0.0)
-    lost = shares_lost(both, original, everything, seen)
+    lost = measure_shares_lost(both, original, everything, seen)
     assert lost == pytest.approx({NOW: before, AT_FREEZING: 0.0})
     alone = source._replace(model=None)
     original.report |= THEIR_MARCH
-    assert shares_lost(alone, original, everything, seen) == {BY_DECISIONS: 0.0}
+    assert measure_shares_lost(alone, original, everything, seen) == {BY_DECISIONS: 0.0}
 
 
 def test_rays_of_other_pixels_have_each_another_one(known_run: Path, tiny_scene: Path) -> None:
     file = known_run / "occupancy.safetensors"
     source, original = find_source(file, tiny_scene), Occupancy.load(file)
-    seen = held_out(source, original, 200)
+    seen = draw_held_out(source, original, 200)
     for count in (700, 700, 10**4):  # more than there are
-        seen.append(of_other_pixels(source, original, count, seen))
+        seen.append(draw_other_pixels(source, original, count, seen))
     pixels = torch.cat([one.pixels for one in seen if one.pixels is not None])
     assert len(pixels) == sum(len(one.truth) for one in seen) == len(pixels.unique(dim=0))
     assert len(seen[2].truth) == len(seen[3].truth) == 700 and 3000 < len(seen[4].truth) < 10**4
@@ -135,7 +135,7 @@ def test_search_verification_and_teaching_have_no_pixel_in_common(
 ) -> None:
     file = known_run / "occupancy.safetensors"
     source, original = find_source(file, tiny_scene), Occupancy.load(file)
-    seen = [*held_out(source, original, 512), trained_on(source, original, 512)]
+    seen = [*draw_held_out(source, original, 512), draw_training_rays(source, original, 512)]
     pixels = [
         {(int(image), *map(float, ray)) for image, ray in zip(one.rays.images, one.rays.directions)}
         for one in seen
@@ -148,8 +148,8 @@ def test_search_verification_and_teaching_have_no_pixel_in_common(
 
 def test_rays_from_between_the_cameras_begin_there(known_run: Path, tiny_scene: Path) -> None:
     source = find_source(known_run / "occupancy.safetensors", tiny_scene)
-    seen, _ = held_out(source, Occupancy.load(known_run / "occupancy.safetensors"), 200)
-    moved = from_between_cameras(source, seen, seed=3)
+    seen, _ = draw_held_out(source, Occupancy.load(known_run / "occupancy.safetensors"), 200)
+    moved = move_between_cameras(source, seen, seed=3)
     cameras = source.manager.train_dataset.cameras.camera_to_worlds[:, :3, 3]
     assert seen.rays.images is not None
     for origin, direction, image, ours in zip(
@@ -170,4 +170,4 @@ def test_photographs_too_small_for_held_out_pixels_are_named(
     small = tiny_scene_writer.write(tmp_path / "small", train=1, test=1, size=4)
     source = find_source(file, small)
     with pytest.raises(InputError, match="nothing was trained on"):
-        held_out(source, Occupancy.load(file), 100)
+        draw_held_out(source, Occupancy.load(file), 100)

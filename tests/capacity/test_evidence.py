@@ -8,10 +8,10 @@ import pytest
 import torch
 from ball_occupancy import CENTRE, ball
 
+from leco_plugin.capacity.evidence import UNLIKELY, Evidence, gather, join, loss, unlikely_at
+from leco_plugin.capacity.sources import Seen
 from leco_plugin.models.rendering import Rays
 from leco_plugin.occupancy import Occupancy
-from leco_plugin.shrink.evidence import UNLIKELY, Evidence, gather, join, loss, unlikely_at
-from leco_plugin.shrink.sources import Seen, Source
 
 
 def evidence(rays: int = 50, each: int = 20) -> Evidence:
@@ -121,7 +121,7 @@ def test_without_a_field_what_is_kept_is_worth_its_occupancy() -> None:
     report = {"near": 0.0, "far": 2.0, "step_size": 0.05}
     original = Occupancy(known.gate, known.space, known.threshold, report=report).eval()
     seen = Seen(rays_down(1500), torch.rand(1500, 3))  # more than are asked about at once
-    found, rendered = gather(Source(None, None), original, seen)
+    found, rendered = gather(None, original, seen)
     assert not rendered and found.rays == 1500
     assert int(found.ray_indices.max()) == 1499
     values = original.query(found.positions)

@@ -1,1 +1,0 @@
-"""`leco shrink`: the smallest gate that decides as a frozen one does."""

@@ -1,0 +1,287 @@
+"""How a case's scene is photographed and written: a scene in nerfstudio's format, and the truth.
+
+What goes wrong touches the training pictures only: the held-out ones show what is really there.
+truth/NAME.npz holds, for each held-out picture, `depth` [h, w] in metres along the rays (inf for no
+surface), `detail` [h, w], the pixels in which something is seen that the case is about, and
+`shown_by` [h, w], how many training pictures show the same surface.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import shutil
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.random import Generator
+from numpy.typing import NDArray
+from PIL import Image
+
+from leco_plugin.scenes.city.cameras import Lens, look_at
+from leco_plugin.scenes.city.layouts import POINTS, TRANSFORMS
+from leco_plugin.scenes.input_error import InputError
+from leco_plugin.scenes.whole_files import write_points
+from leco_plugin.stability.scene import Array, Stage, photograph
+from leco_plugin.stability.stages import moving_car
+
+RADIUS = 5.0
+"""Of the circle that cameras stand on, metres."""
+STRAY_RADIUS = 9.0
+"""Of a camera that stands far off, metres."""
+SAME_PLACE = 0.05
+"""Share of the distance by which a surface in another picture may be off: pixels are wide at the
+size of these pictures."""
+DESCRIPTION, TRUTH = "stability.json", "truth"
+POINTS_PER_VIEW = 60
+
+
+@dataclass(frozen=True)
+class Capture:
+    """How a scene is photographed: two captures that are equal give the same pictures."""
+
+    views: int = 48
+    """Training pictures: so many, so wide and from so far that three of them show nearly all that
+    the held-out ones show. From 40 narrow ones nearer by, a wall was placed by chance."""
+    test_views: int = 16
+    """Held-out pictures."""
+    width: int = 64
+    """Of a picture, pixels."""
+    height: int = 48
+    """Of a picture, pixels."""
+    field_of_view: float = 60.0
+    """Horizontal opening angle, degrees."""
+    stand: str = "around"
+    """`around` the scene and above it, `low` around it with the horizon in view, or `inside`."""
+    stray: int = 0
+    """Training pictures that are taken from far outside."""
+    exposure: float = 0.0
+    """Standard deviation of the exposure, stops."""
+    shift: float = 0.0
+    """Standard deviation of each coordinate that is written of a camera's position, metres."""
+    turn: float = 0.0
+    """Standard deviation of each angle that is written of its attitude, degrees."""
+    moving: bool = False
+    """Whether a car drives through every third picture."""
+    sizes: tuple[float, ...] = (1.0,)
+    """Multiples of width and height that pictures take in turn."""
+    origin: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    """Where the scene's middle lies in the coordinates that are written, metres."""
+    seed: int = 0
+    """Another seed, other places to stand."""
+
+    def lens(self, times: float = 1.0) -> Lens:
+        """The camera of pictures of a multiple of the size."""
+        width, height = round(times * self.width), round(times * self.height)
+        return Lens(width, height, width / 2 / float(np.tan(np.deg2rad(self.field_of_view) / 2)))
+
+
+@dataclass(frozen=True)
+class Shot:
+    """One picture to be taken."""
+
+    name: str
+    pose: Array
+    """[3, 4] where the camera really is, metres, OpenGL axes."""
+    written: Array
+    """[3, 4] where the scene's description says it is."""
+    held_out: bool
+    size: float = 1.0
+    """Multiple of width and height."""
+    gain: float = 1.0
+    """Multiple of the light."""
+    moving: bool = False
+    """Whether the car is there."""
+
+    @property
+    def file(self) -> str:
+        """The picture, in the folder of the scene."""
+        return f"images/{self.name}.png"
+
+
+def shots_of(capture: Capture) -> list[Shot]:
+    """All pictures of a capture, always the same."""
+    random = np.random.default_rng([capture.seed, 21])
+    poses = [_pose(capture, random, number) for number in range(capture.views + capture.test_views)]
+    places = (np.arange(capture.test_views) + 0.5) * len(poses) / capture.test_views
+    held_out = set(places.astype(int).tolist())
+    noise = np.random.default_rng([capture.seed, 22])
+    shots: list[Shot] = []
+    for number, pose in enumerate(poses):
+        name = f"view_{number:03d}"
+        if number in held_out:
+            shots.append(Shot(name, pose, _shift(pose, capture.origin), True))
+            continue
+        trained = number - sum(other < number for other in held_out)
+        if trained < capture.stray:
+            pose = np.column_stack([pose[:, :3], pose[:, 3] * (STRAY_RADIUS / RADIUS)])
+        turned = rotation(np.deg2rad(capture.turn) * noise.standard_normal(3)) @ pose[:, :3]
+        misjudged = np.column_stack([turned, pose[:, 3]])
+        misjudged = _shift(misjudged, capture.shift * noise.standard_normal(3))
+        written = _shift(misjudged, capture.origin)
+        size = capture.sizes[trained % len(capture.sizes)]
+        gain = float(2.0 ** (capture.exposure * noise.standard_normal()))
+        moving = capture.moving and trained % 3 == 0
+        shots.append(Shot(name, pose, written, False, size, gain, moving))
+    return shots
+
+
+def _pose(capture: Capture, random: Generator, number: int) -> Array:
+    if capture.stand == "inside":
+        turn, up = random.uniform(0, 2 * np.pi), random.uniform(-0.35, 0.05)
+        x, y = random.uniform((-1.0, -2.9), (1.0, -0.9))
+        position = np.array([x, y, random.uniform(1.2, 1.8)])
+        return look_at(position, position + np.array([np.cos(turn), np.sin(turn), up]))
+    turn = 2 * np.pi * (0.618034 * number + random.uniform(-0.05, 0.05))
+    low, high = (1.0, 2.0) if capture.stand == "low" else (2.2, 4.0)
+    place = RADIUS * np.array([np.cos(turn), np.sin(turn)])
+    position = np.array([*place, random.uniform(low, high)])
+    target_height = random.uniform(0.6, 1.6) if capture.stand == "low" else random.uniform(0, 0.6)
+    return look_at(position, np.array([*random.uniform(-1.2, 1.2, 2), target_height]))
+
+
+def _shift(pose: Array, by: Sequence[float] | Array) -> Array:
+    return np.column_stack([pose[:, :3], pose[:, 3] + np.array(by)])
+
+
+def rotation(turn: Array) -> Array:
+    """The matrix [3, 3] of a turn around an axis [3] by its length in radians (Rodrigues)."""
+    angle = float(np.linalg.norm(turn))
+    x, y, z = turn / max(angle, 1e-12)
+    cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+    matrix: Array = np.eye(3) + np.sin(angle) * cross + (1.0 - np.cos(angle)) * cross @ cross
+    return matrix
+
+
+class View(NamedTuple):
+    """A picture that was taken, and how far away what it shows is."""
+
+    pose: Array
+    """[3, 4] camera to world, metres, OpenGL axes."""
+    lens: Lens
+    depth: NDArray[np.floating]
+    """[h, w] metres along the rays; inf for no surface."""
+
+    def shows(self, points: Array) -> NDArray[np.bool_]:
+        """Which points [N, 3] lie in the picture and are hidden by nothing."""
+        seen = (points - self.pose[:, 3]) @ self.pose[:, :3]
+        ahead = -seen[:, 2]
+        shown = ahead > 0
+        ahead = np.where(shown, ahead, 1.0)
+        columns = np.floor(self.lens.focal * seen[:, 0] / ahead + self.lens.width / 2)
+        rows = np.floor(self.lens.height / 2 - self.lens.focal * seen[:, 1] / ahead)
+        shown &= (columns >= 0) & (columns < self.lens.width)
+        shown &= (rows >= 0) & (rows < self.lens.height)
+        depth = np.full(len(points), np.inf)
+        depth[shown] = self.depth[rows[shown].astype(int), columns[shown].astype(int)]
+        distance = np.linalg.norm(seen, axis=-1)
+        return shown & (np.abs(depth - distance) <= SAME_PLACE * distance)
+
+
+def count_views(view: View, others: Sequence[View]) -> NDArray[np.int32]:
+    """[h, w] how many of the other pictures show what a picture shows; 0 where it shows nothing.
+
+    A surface in one picture alone has no depth that could be learned: whether it is kept is chance.
+    """
+    counts = np.zeros(view.depth.shape, dtype=np.int32)
+    there = np.isfinite(view.depth)
+    points = view.lens.points(view.pose, view.depth)[there]
+    for other in others:
+        counts[there] += other.shows(points)
+    return counts
+
+
+def write_scene(stage: Stage, capture: Capture, folder: Path) -> Path:
+    """Writes the scene, unless `folder` holds just this one; it appears only when it is complete.
+
+    Returns:
+        `folder`.
+    Raises:
+        InputError: `folder` holds no scene of ours.
+    """
+    description = folder / DESCRIPTION
+    described = {"digest": digest_of(stage, capture), "capture": asdict(capture)}
+    text = json.dumps(described, indent=1) + "\n"
+    if folder.exists():
+        if not description.is_file():
+            raise InputError(f"{folder} holds something else; delete it, or name a new --out")
+        if description.read_bytes() == text.encode():
+            return folder
+        shutil.rmtree(folder)
+    unfinished = folder.with_name(f".{folder.name}-{os.getpid()}")
+    shutil.rmtree(unfinished, ignore_errors=True)
+    for name in ("images", TRUTH):
+        (unfinished / name).mkdir(parents=True)
+    _take_pictures(stage, capture, unfinished)
+    (unfinished / DESCRIPTION).write_text(text)
+    unfinished.replace(folder)
+    return folder
+
+
+def digest_of(stage: Stage, capture: Capture) -> str:
+    """The same for the same pictures."""
+    return hashlib.sha256(repr((stage, capture)).encode()).hexdigest()[:16]
+
+
+def _take_pictures(stage: Stage, capture: Capture, folder: Path) -> None:
+    """Writes pictures, truth, sparse points and transforms."""
+    shots = shots_of(capture)
+    taken = []
+    for number, shot in enumerate(shots):
+        there = stage.with_shapes(moving_car(number)) if shot.moving else stage
+        taken.append(photograph(there, shot.pose, capture.lens(shot.size)))
+    views = [
+        View(shot.pose, capture.lens(shot.size), seen.depth) for shot, seen in zip(shots, taken)
+    ]
+    trained = [view for shot, view in zip(shots, views) if not shot.held_out]
+    clouds, frames = [], []
+    for number, (shot, seen, view) in enumerate(zip(shots, taken, views)):
+        light = seen.image[..., :3].astype(float) * shot.gain
+        image = np.dstack([np.rint(light.clip(0, 255)).astype(np.uint8), seen.image[..., 3]])
+        Image.fromarray(image).save(folder / shot.file)
+        if shot.held_out:
+            shown = count_views(view, trained)
+            truth = {"depth": seen.depth, "detail": seen.detail, "shown_by": shown}
+            np.savez(folder / TRUTH / f"{shot.name}.npz", **truth)
+        random = np.random.default_rng([capture.seed, 23, number])
+        clouds.append(_points(seen.image, view._replace(pose=shot.written), random))
+        frames.append(_frame(shot, view.lens))
+    cloud = np.concatenate(clouds)
+    if len(cloud):
+        write_points(folder / POINTS, cloud)
+    held_out = [shot.file for shot in shots if shot.held_out]
+    transforms = {
+        "camera_model": "OPENCV",
+        "orientation_override": "none",
+        **({"ply_file_path": POINTS} if len(cloud) else {}),
+        "frames": frames,
+        "train_filenames": [shot.file for shot in shots if not shot.held_out],
+        "val_filenames": held_out,
+        "test_filenames": held_out,
+    }
+    (folder / TRANSFORMS).write_text(json.dumps(transforms, indent=1) + "\n")
+
+
+def _points(image: NDArray[np.uint8], view: View, random: Generator) -> NDArray[Any]:
+    """Some surface points of a picture: [N] rows of `xyz` and `rgb`."""
+    hits = np.argwhere(np.isfinite(view.depth))
+    chosen = tuple(hits[random.permutation(len(hits))[:POINTS_PER_VIEW]].T)
+    row = np.empty(len(chosen[0]), dtype=[("xyz", "<f4", 3), ("rgb", "u1", 3)])
+    row["xyz"] = view.lens.points(view.pose, view.depth)[chosen]
+    row["rgb"] = image[chosen][:, :3]
+    return row
+
+
+def _frame(shot: Shot, lens: Lens) -> dict[str, Any]:
+    """A picture in transforms.json."""
+    matrix = [*shot.written.tolist(), [0.0, 0.0, 0.0, 1.0]]
+    return {
+        "file_path": shot.file,
+        "transform_matrix": matrix,
+        **{"w": lens.width, "h": lens.height, "cx": lens.width / 2, "cy": lens.height / 2},
+        **{"fl_x": lens.focal, "fl_y": lens.focal},
+    }
