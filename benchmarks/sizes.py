@@ -168,7 +168,7 @@ def train(data: Path, sizes: Sizes, seed: int, options: Options) -> dict[str, An
         "seed": seed,
         "sizes": {path: size_at(sizes, path) for path in CHOSEN},
         "parameters": values_of(sizes, images),
-        "empty_fraction": trainer.pipeline.model.report.get("empty_fraction"),
+        "empty_fraction": trainer.pipeline.model.mixture.report.get("empty_fraction"),
         **{key: record.to_dict()[key] for key in ("steps", "psnr", "ssim", "train_seconds")},
     }
     plain: dict[str, Any] = json.loads(json.dumps(facts))

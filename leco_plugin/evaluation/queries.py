@@ -56,7 +56,7 @@ def counted(model: nn.Module) -> Iterator[FieldQueries]:
     through `density` or, without one, by being called.
     """
     count = FieldQueries()
-    own = getattr(model, "field", None)
+    own = getattr(getattr(model, "mixture", model), "field", None)
     fields: list[nn.Module] = [module for module in model.modules() if isinstance(module, Field)]
     if isinstance(own, nn.Module) and own not in fields:
         fields.append(own)

@@ -251,8 +251,9 @@ class _Course:
         """Notes when there is an occupancy; returns whether there is one since the last look."""
         model: Any = self.trainer.pipeline.model
         guide = getattr(model, "leco_guide", None)
-        frozen = bool(getattr(model, "frozen", False))
-        learned = model if frozen else getattr(guide, "occupancy", None)
+        mixture = getattr(model, "mixture", None)
+        frozen = mixture is not None and bool(mixture.frozen)
+        learned = mixture if frozen else getattr(guide, "occupancy", None)
         if self.run.freeze_seconds is not None or learned is None:
             return False
         self.run.freeze_seconds = self.run.learn_seconds = self.clock.now()

@@ -344,7 +344,7 @@ def test_a_field_that_renders_nothing_is_no_reference(known_run: Path, tiny_scen
     source, original = sources.find_source(file, tiny_scene), Occupancy.load(file)
     assert source.model is not None
     with torch.no_grad():
-        source.model.field.density_head.bias.fill_(-50.0)
+        source.mixture.field.density_head.bias.fill_(-50.0)
     with pytest.raises(ValueError, match="renders nothing"):
         shrink.prepare(source, original, *shrink.draw_rays(source, original))
 

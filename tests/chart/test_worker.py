@@ -118,9 +118,9 @@ def test_gate_and_grids_are_measured_on_the_field_of_the_moment_of_freezing(
 
     asked: list[dict[str, torch.Tensor]] = []
 
-    def at_equal_loss(model: Any, manager: Any, grids: tuple[int, ...]) -> dict[str, Any]:
+    def at_equal_loss(mixture: Any, manager: Any, grids: tuple[int, ...]) -> dict[str, Any]:
         asked.append(
-            {k: v.clone() for k, v in model.field.state_dict().items() if "extra" not in k}
+            {k: v.clone() for k, v in mixture.field.state_dict().items() if "extra" not in k}
         )
         return {"grids": list(grids)}
 
@@ -129,7 +129,7 @@ def test_gate_and_grids_are_measured_on_the_field_of_the_moment_of_freezing(
     config = config_of(one, tiny_scene, tmp_path / "nerfstudio")
     result, trainer = train_job(config, one, 3, tiny_scene, SHORT, tmp_path)
     assert result["occupancy"]["at_equal_loss"] == {"grids": [8, 16]}
-    trained = trainer.pipeline.model.field.state_dict()
+    trained = trainer.pipeline.model.mixture.field.state_dict()
     (then,) = asked
     assert any(not torch.equal(value, trained[name]) for name, value in then.items())
     assert result["steps"] == 6 and (tmp_path / "occupancy.safetensors").exists()
@@ -149,22 +149,22 @@ def test_small_gates_are_taught_by_the_field_as_it_was_and_stand_beside(
     tiny_scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
 
-    from leco_plugin.capacity import field, measuring
+    from leco_plugin.capacity import measuring
     from leco_plugin.chart.contender import config_of
 
     at_equal_loss = equal_loss.at_equal_loss
 
     monkeypatch.setattr(measuring, "STEPS", 20)
-    monkeypatch.setattr(field, "TAUGHT_RAYS", 256)
+    monkeypatch.setattr(measuring, "TAUGHT_RAYS", 256)
     alone: list[dict[str, Any]] = []
     tables: list[torch.Tensor] = []
 
-    def compared(model: Any, manager: Any, *rest: Any, **others: Any) -> dict[str, Any]:
-        tables.append(torch.cat([p.detach().flatten() for p in model.field.parameters()]))
+    def compared(mixture: Any, manager: Any, *rest: Any, **others: Any) -> dict[str, Any]:
+        tables.append(torch.cat([p.detach().flatten() for p in mixture.field.parameters()]))
         torch.manual_seed(7)
-        alone.append(at_equal_loss(model, manager, *rest))
+        alone.append(at_equal_loss(mixture, manager, *rest))
         torch.manual_seed(7)
-        return at_equal_loss(model, manager, *rest, **others)
+        return at_equal_loss(mixture, manager, *rest, **others)
 
     monkeypatch.setattr(equal_loss, "at_equal_loss", compared)
     one = Contender("LeCO", "leco-occupancy", "learned-occupancy", SMALL, taught=True)
@@ -180,7 +180,9 @@ def test_small_gates_are_taught_by_the_field_as_it_was_and_stand_beside(
         "K-planes": 26428,
     }
     assert all(0.0 < row["kept_reached_volume"] <= 1.0 and row["seconds"] > 0.0 for row in taught)
-    now = torch.cat([p.detach().flatten() for p in trainer.pipeline.model.field.parameters()])
+    now = torch.cat(
+        [p.detach().flatten() for p in trainer.pipeline.model.mixture.field.parameters()]
+    )
     assert not torch.equal(tables[0], now)
     assert json.loads(json.dumps(result)) == result
 

@@ -53,7 +53,8 @@ def test_rates_of_a_host_that_learns_first_decay_from_its_own_first_step() -> No
 def test_rates_of_a_model_that_goes_on_with_what_it_learned_decay_over_all_of_its_time() -> None:
     model = nn.Linear(1, 1)
     course, group = course_of(model)
-    model.frozen = True
+    model.mixture = nn.Module()
+    model.mixture.frozen = True
     course.clock.seconds = 40.0
     course.begun(50)
     assert course.run.learn_seconds == pytest.approx(40.0, abs=1.0)
