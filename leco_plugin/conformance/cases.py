@@ -114,7 +114,7 @@ def with_table(page: str) -> str:
     """A Markdown page with the table of rules between its two marks renewed."""
     rows = ["| rule | seams | why it matters | remedy |", "|---|---|---|---|"]
     rows += [
-        f"| `{rule.name}` | {', '.join(rule.checks)} | {rule.reason} | {rule.remedy} |"
+        f"| `{rule.name}` | {', '.join(sorted(rule.checks))} | {rule.reason} | {rule.remedy} |"
         for rule in RULES
     ]
     before, _, rest = page.partition(BEGIN)

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor, nn
 
 from leco_plugin.conformance.rules import Broken, checks, require
-from leco_plugin.conformance.samplers import SamplerCase, check_gradients, devices
+from leco_plugin.conformance.samplers import SamplerCase, check_gradients, check_tensor, devices
 from leco_plugin.conformance.scene import (
     BACKGROUND,
     EVERYTHING,
@@ -128,11 +128,7 @@ def shapes_types_devices(case: EstimatorCase) -> None:
             for name, part in zip(PARTS, samples, strict=True):
                 require(part.device == rays.origins.device, f"{name} is on {part.device}")
             for name, part in zip(PARTS[1:], samples[1:], strict=True):
-                require(
-                    part.dtype == rays.origins.dtype,
-                    f"{name} is {part.dtype}, the rays are {rays.origins.dtype}",
-                )
-                require(bool(part.isfinite().all()), f"{name} holds values that are not finite")
+                check_tensor(name, part, rays.origins)
         sampler.to("cpu")
 
 

@@ -21,7 +21,7 @@ from leco_plugin.conformance.hosts import (
 )
 from leco_plugin.conformance.proposals import CHORD, INSIDE, NEARBY, chords
 from leco_plugin.conformance.rules import Broken, checks, require
-from leco_plugin.conformance.samplers import devices
+from leco_plugin.conformance.samplers import check_tensor, devices
 from leco_plugin.conformance.scene import DISTANCE, EVERYTHING, MARGIN, SLAB, Rays, box
 from leco_plugin.hosts.stand_ins import GuidedEstimator, GuidedProposal
 from leco_plugin.samplers.base import DenseEstimator, Estimator
@@ -60,10 +60,9 @@ def shaded(model: Model) -> Iterator[list[Tensor]]:
     with ExitStack() as stack:
         for module in model.modules():
             if isinstance(module, Field):
-                handle = module.register_forward_pre_hook(before, with_kwargs=True)
-                stack.callback(handle.remove)
+                stack.enter_context(module.register_forward_pre_hook(before, with_kwargs=True))
             elif isinstance(module, GuidedEstimator | GuidedProposal):
-                stack.enter_context(_answers_noted(module, sampled))
+                stack.enter_context(_noting(module, sampled))
         yield asked
     if not asked:
         asked.extend(sampled)
@@ -75,25 +74,19 @@ def positions_of(ray_samples: Any) -> Tensor:
     return positions.detach().reshape(-1, 3)
 
 
-@contextmanager
-def _answers_noted(seam: GuidedEstimator | GuidedProposal, sampled: list[Tensor]) -> Iterator[None]:
-    """While this lasts, notes the positions of what a seam returns."""
+def _noting(seam: GuidedEstimator | GuidedProposal, sampled: list[Tensor]) -> Any:
+    """A context in which the positions of what a seam returns are noted."""
     if isinstance(seam, GuidedProposal):
-        note = seam.register_forward_hook(lambda _, __, out: sampled.append(positions_of(out[0])))
-        with note:
-            yield
-        return
+        return seam.register_forward_hook(lambda _, __, out: sampled.append(positions_of(out[0])))
     original: Any = seam.sampling
 
     def sampling(rays_o: Tensor, rays_d: Tensor, *args: Any, **kwargs: Any) -> Samples:
-        samples: Samples = original(rays_o, rays_d, *args, **kwargs)
-        ray_indices, t_starts, t_ends = samples
+        ray_indices, t_starts, t_ends = original(rays_o, rays_d, *args, **kwargs)
         middles = ((t_starts + t_ends) / 2.0)[:, None]
         sampled.append(rays_o[ray_indices] + rays_d[ray_indices] * middles)
-        return samples
+        return ray_indices, t_starts, t_ends
 
-    with _instead(seam, "sampling", sampling):
-        yield
+    return _instead(seam, "sampling", sampling)
 
 
 @contextmanager
@@ -164,9 +157,7 @@ def _check_output(name: str, value: Any, shape: tuple[int, int], rays: Tensor) -
     require(isinstance(value, Tensor), f"there is no output {name!r}")
     found = tuple(value.shape)
     require(found == shape, f"the output {name!r} has shape {list(found)}, not {list(shape)}")
-    require(value.dtype == rays.dtype, f"the output {name!r} is {value.dtype}")
-    require(value.device == rays.device, f"the output {name!r} is on {value.device}")
-    require(bool(value.isfinite().all()), f"the output {name!r} holds values that are not finite")
+    check_tensor(f"the output {name!r}", value, rays)
 
 
 def _check_picture(name: str, image: Tensor) -> None:

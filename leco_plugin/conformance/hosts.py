@@ -119,13 +119,8 @@ def model_arguments() -> dict[str, Any]:
     }
 
 
-class CamerasOnly:
+class CamerasOnly(SimpleNamespace):
     """A data set as far as models and their callbacks look at one."""
-
-    def __init__(self) -> None:
-        arguments = model_arguments()
-        self.cameras, self.scene_box = cameras(), arguments["scene_box"]
-        self.metadata: dict[str, Any] = arguments["metadata"]
 
     def __len__(self) -> int:
         return CAMERAS
@@ -133,7 +128,8 @@ class CamerasOnly:
 
 def pipeline_of(model: Any) -> Any:
     """What stands where callbacks expect nerfstudio's pipeline."""
-    manager = SimpleNamespace(train_dataset=CamerasOnly())
+    data = CamerasOnly(cameras=cameras(), scene_box=model_arguments()["scene_box"], metadata={})
+    manager = SimpleNamespace(train_dataset=data)
     return SimpleNamespace(model=model, _model=model, device=model.device, datamanager=manager)
 
 

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor, nn
 
 from leco_plugin.conformance.rules import Broken, checks, require
-from leco_plugin.conformance.samplers import SamplerCase, check_gradients, devices
+from leco_plugin.conformance.samplers import SamplerCase, check_gradients, check_tensor, devices
 from leco_plugin.conformance.scene import (
     BACKGROUND,
     EVERYTHING,
@@ -174,9 +174,7 @@ def _check_tensors(where: str, rays: Rays, *tensors: Tensor) -> None:
         f"{where}: shapes {shapes}, expected [{len(rays.origins)}, n_samples, 1]",
     )
     for tensor in tensors:
-        require(tensor.dtype == rays.origins.dtype, f"{where}: a tensor is {tensor.dtype}")
-        require(tensor.device == rays.origins.device, f"{where}: a tensor is on {tensor.device}")
-        require(bool(tensor.isfinite().all()), f"{where}: values are not finite")
+        check_tensor(f"{where}: a tensor", tensor, rays.origins)
 
 
 @checks("sorted-disjoint-inside", "proposal")

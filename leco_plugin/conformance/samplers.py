@@ -115,6 +115,13 @@ def devices() -> list[torch.device]:
     return [torch.device(name) for name in ("cpu", *cuda)]
 
 
+def check_tensor(name: str, tensor: Tensor, rays: Tensor) -> None:
+    """Raises unless a tensor is finite, and of the type and on the device of the rays."""
+    require(tensor.dtype == rays.dtype, f"{name} is {tensor.dtype}, the rays are {rays.dtype}")
+    require(tensor.device == rays.device, f"{name} is on {tensor.device}")
+    require(bool(tensor.isfinite().all()), f"{name} holds values that are not finite")
+
+
 def check_gradients(field: Field, why: str) -> None:
     """Raises unless all parameters of a field have finite gradients."""
     gradients = [parameter.grad for parameter in field.parameters()]

@@ -108,12 +108,6 @@ class Overlapping(Answers):
         return ray_indices, t_starts, 2.0 * t_ends - t_starts
 
 
-class FarPlaneIgnored(Sound):
-    def sampling(self, rays_o: Tensor, rays_d: Tensor, *args: Any, **options: Any) -> Samples:
-        options["far_plane"] = 1e10
-        return super().sampling(rays_o, rays_d, *args, **options)
-
-
 class ShortIndices(Answers):
     def change(self, ray_indices: Tensor, t_starts: Tensor, t_ends: Tensor) -> Samples:
         return ray_indices.int(), t_starts, t_ends
@@ -134,12 +128,6 @@ class AlwaysShaking(Answers):
     def change(self, ray_indices: Tensor, t_starts: Tensor, t_ends: Tensor) -> Samples:
         shift = 1e-5 * torch.rand(()) * (not self.training)
         return ray_indices, t_starts + shift, t_ends + shift
-
-
-class NeverStratified(Sound):
-    def sampling(self, rays_o: Tensor, rays_d: Tensor, *args: Any, **options: Any) -> Samples:
-        options["stratified"] = False
-        return super().sampling(rays_o, rays_d, *args, **options)
 
 
 class ShakenOutOfBounds(Sound):
@@ -189,14 +177,6 @@ class DropsTheFirst(Answers):
         return ray_indices[kept], t_starts[kept], t_ends[kept]
 
 
-class StepsOfOneLength(Sound):
-    """Deaf to a host whose steps grow with distance."""
-
-    def sampling(self, rays_o: Tensor, rays_d: Tensor, *args: Any, **options: Any) -> Samples:
-        options["cone_angle"] = 0.0
-        return super().sampling(rays_o, rays_d, *args, **options)
-
-
 class GateThaws(Sound):
     def __init__(self, aabb: Tensor, occupancy: Occupancy) -> None:
         super().__init__(aabb, occupancy)
@@ -233,20 +213,6 @@ class StopsEarly(Sound):
     def sampling(self, rays_o: Tensor, rays_d: Tensor, *args: Any, **options: Any) -> Samples:
         if options.get("early_stop_eps", 0.0) > 0.0:
             options["early_stop_eps"] = 0.3
-        return super().sampling(rays_o, rays_d, *args, **options)
-
-
-class ShadesTheFaint(Sound):
-    """Takes no notice of the opacity below which nothing shows."""
-
-    def sampling(self, rays_o: Tensor, rays_d: Tensor, *args: Any, **options: Any) -> Samples:
-        options["alpha_thre"] = 0.0
-        return super().sampling(rays_o, rays_d, *args, **options)
-
-
-class DeafToDensities(Sound):
-    def sampling(self, rays_o: Tensor, rays_d: Tensor, *args: Any, **options: Any) -> Samples:
-        options |= {"sigma_fn": None, "alpha_fn": None}
         return super().sampling(rays_o, rays_d, *args, **options)
 
 
@@ -297,6 +263,25 @@ class ShortBuffer(Sound):
     def __init__(self, aabb: Tensor, occupancy: Occupancy) -> None:
         super().__init__(aabb, occupancy)
         self.register_buffer("cells", torch.zeros(8, dtype=torch.int16))
+
+
+def deaf_to(name: str, **always: Any) -> type[Sound]:
+    """A mutant that has options of its own, whatever the host says."""
+
+    def sampling(
+        self: Sound, rays_o: Tensor, rays_d: Tensor, *args: Any, **options: Any
+    ) -> Samples:
+        return super(made, self).sampling(rays_o, rays_d, *args, **(options | always))
+
+    made = type(name, (Sound,), {"sampling": sampling})
+    return made
+
+
+FarPlaneIgnored = deaf_to("FarPlaneIgnored", far_plane=1e10)
+NeverStratified = deaf_to("NeverStratified", stratified=False)
+StepsOfOneLength = deaf_to("StepsOfOneLength", cone_angle=0.0)
+ShadesTheFaint = deaf_to("ShadesTheFaint", alpha_thre=0.0)
+DeafToDensities = deaf_to("DeafToDensities", sigma_fn=None, alpha_fn=None)
 
 
 MUTANTS: dict[str, tuple[type, ...]] = {

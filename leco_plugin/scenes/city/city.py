@@ -5,7 +5,6 @@ Positions are in metres, +z up, the ground at z = 0, the city centred on the ori
 
 from __future__ import annotations
 
-import dataclasses
 import json
 from dataclasses import dataclass
 from functools import cached_property
@@ -121,11 +120,6 @@ def _halves(rectangles: Array, direction: NDArray[np.int64]) -> Array:
     return np.stack([np.stack([low, b, high], 1), np.stack([low, high, d], 1)], 1).reshape(-1, 3, 3)
 
 
-def describe(config: CityConfig, **more: Any) -> str:
-    """The text of a folder's `city.json`."""
-    return json.dumps({"format": 1, "city": dataclasses.asdict(config), **more}, indent=2) + "\n"
-
-
 def read_description(folder: Path) -> dict[str, Any]:
     """Reads and checks a folder's `city.json`. ValueError or OSError, in one line, if it is bad."""
     path = Path(folder) / DESCRIPTION
@@ -136,6 +130,7 @@ def read_description(folder: Path) -> dict[str, Any]:
         if description["format"] != 1:
             raise ValueError(f"format {description['format']} is not known")
         CityConfig(**description["city"])
+        dict(description["capture"], layout=description["layout"])
     except (ValueError, TypeError, KeyError) as error:
         raise ValueError(f"{path} does not describe a city: {one_line(error)}") from error
     return dict(description)

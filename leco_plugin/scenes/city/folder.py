@@ -15,14 +15,14 @@ from typing import Any
 
 import leco_plugin
 from leco_plugin.scenes.city.cameras import CaptureConfig, View, views_of
-from leco_plugin.scenes.city.city import DESCRIPTION, City, CityConfig, describe, read_description
+from leco_plugin.scenes.city.city import DESCRIPTION, City, CityConfig, read_description
 from leco_plugin.scenes.city.layouts import (
+    LAYOUTS,
     MAPPINGS,
     PARTS,
     TRANSFORMS,
     Layout,
     LayoutName,
-    layout_of,
     with_alpha,
 )
 from leco_plugin.scenes.input_error import one_line
@@ -56,12 +56,14 @@ def write_city(
         ValueError: `out_dir` holds a damaged city, and is left alone.
     """
     out_dir, capture = Path(out_dir), capture or CaptureConfig()
-    text = describe(config, capture=dataclasses.asdict(capture), layout=layout)
-    if _holds(out_dir, json.loads(text)):
+    parts = {"city": dataclasses.asdict(config), "capture": dataclasses.asdict(capture)}
+    wanted = {"format": 1, **parts, "layout": layout}
+    text = json.dumps(wanted, indent=2) + "\n"
+    if _holds(out_dir, wanted):
         return out_dir
     city = City(config)
     views = views_of(city, capture)
-    files = layout_of(layout, views, capture.lens, config.seed)
+    files = LAYOUTS[layout](views, capture.lens, config.seed)
     unfinished = _unfinished(out_dir, text)
     unfinished.mkdir(parents=True, exist_ok=True)
     try:
@@ -72,7 +74,7 @@ def write_city(
         unfinished.replace(out_dir)
     except OSError:
         # Somebody else may have finished the same city in the meantime.
-        if not _holds(out_dir, json.loads(text)):
+        if not _holds(out_dir, wanted):
             raise
         shutil.rmtree(unfinished, ignore_errors=True)
     return out_dir
@@ -120,16 +122,13 @@ def _holds(folder: Path, wanted: dict[str, Any]) -> bool:
     if not (folder / DESCRIPTION).is_file():
         raise FileExistsError(f"{folder} exists and is not a city: choose another folder")
     found = read_description(folder)
-    differences = [
-        (name, _value(found, part, name), value)
-        for part in ("city", "capture")
-        for name, value in wanted[part].items()
-    ]
-    differences.append(("layout", found.get("layout", "nerfstudio"), wanted["layout"]))
-    for name, there, value in differences:
-        if there != value:
+    there, asked = (
+        {**one["city"], **one["capture"], "layout": one["layout"]} for one in (found, wanted)
+    )
+    for name, value in asked.items():
+        if there.get(name) != value:
             raise FileExistsError(
-                f"{folder} holds another city ({name} is {there} there, not {value}): "
+                f"{folder} holds another city ({name} is {there.get(name)} there, not {value}): "
                 "choose another folder"
             )
     missing = _first_missing(folder, wanted["layout"])
@@ -138,11 +137,6 @@ def _holds(folder: Path, wanted: dict[str, Any]) -> bool:
             f"{folder} is damaged: {missing} is missing; delete the folder to write it anew"
         )
     return True
-
-
-def _value(found: dict[str, Any], part: str, name: str) -> Any:
-    values = found.get(part)
-    return values.get(name) if isinstance(values, dict) else None
 
 
 def _first_missing(folder: Path, layout: LayoutName) -> str | None:
@@ -154,18 +148,15 @@ def _first_missing(folder: Path, layout: LayoutName) -> str | None:
     if not (folder / MAPPINGS).is_file():
         return MAPPINGS
     there = {f"{path.parent.name}/{path.name}" for path in folder.glob("*/*/*")}
-    stems = [Path(line.rsplit(",", 1)[-1]).stem for line in _lines(folder / MAPPINGS)]
+    lines = (folder / MAPPINGS).read_text(errors="replace").splitlines()
+    stems = [Path(line.rsplit(",", 1)[-1]).stem for line in lines]
     paths = [f"{part}/{stem}.{ending}" for stem in stems for part, ending in PARTS]
     return next((path for path in paths if path not in there), None)
 
 
-def _lines(path: Path) -> list[str]:
-    return path.read_text(errors="replace").splitlines()
-
-
 def count_pictures(folder: Path) -> tuple[int, int]:
     """How many pictures a finished city has, and how many of them are held out."""
-    if read_description(folder).get("layout") == "mega-nerf":
+    if read_description(folder)["layout"] == "mega-nerf":
         splits = [len(list((folder / split / "rgbs").iterdir())) for split in ("train", "val")]
         return sum(splits), splits[1]
     transforms = read_transforms(folder)

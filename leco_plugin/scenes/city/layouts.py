@@ -13,17 +13,28 @@ Mega-NeRF: as `mega_nerf_format.files` says.
 from __future__ import annotations
 
 import json
-from abc import abstractmethod
+from abc import ABC, abstractmethod
+from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
-from typing import Any, Literal, Protocol
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
 from leco_plugin.scenes.city.cameras import Lens, View
+from leco_plugin.scenes.mega_nerf_format.files import (
+    Coordinates,
+    Split,
+    around,
+    write_coordinates,
+    write_mappings,
+    write_view,
+)
 from leco_plugin.scenes.whole_files import write_points, write_whole
 
+Image8 = NDArray[np.uint8]
 LayoutName = Literal["nerfstudio", "mega-nerf"]
 TRANSFORMS = "transforms.json"
 MAPPINGS = "mappings.txt"
@@ -33,17 +44,20 @@ POINTS = "sparse_pc.ply"
 _SPARSE_POINTS_PER_VIEW = 100
 
 
-class Layout(Protocol):
+@dataclass
+class Layout(ABC):
     """Writes pictures one by one, so that a city may be larger than memory, then the rest."""
+
+    views: list[View]
+    lens: Lens
+    seed: int
 
     @abstractmethod
     def files(self, view: View) -> list[str]:
         """What is there, relative to the folder, when a view is written."""
 
     @abstractmethod
-    def write(
-        self, folder: Path, view: View, image: NDArray[np.uint8], depth: NDArray[np.float32]
-    ) -> None:
+    def write(self, folder: Path, view: View, image: Image8, depth: NDArray[np.float32]) -> None:
         """Writes a view: `image` [h, w, 3 or 4], `depth` [h, w] metres along the rays."""
 
     @abstractmethod
@@ -51,25 +65,13 @@ class Layout(Protocol):
         """Writes what is about all views."""
 
 
-def layout_of(name: LayoutName, views: list[View], lens: Lens, seed: int) -> Layout:
-    """The layout of that name for these views."""
-    if name == "mega-nerf":
-        return MegaNerfLayout(views, lens)
-    return NerfstudioLayout(views, lens, seed)
-
-
 class NerfstudioLayout(Layout):
     """transforms.json, with depths and sparse points."""
-
-    def __init__(self, views: list[View], lens: Lens, seed: int) -> None:
-        self.views, self.lens, self.seed = views, lens, seed
 
     def files(self, view: View) -> list[str]:
         return [f"images/{view.name}.png", f"depths/{view.name}.npy"]
 
-    def write(
-        self, folder: Path, view: View, image: NDArray[np.uint8], depth: NDArray[np.float32]
-    ) -> None:
+    def write(self, folder: Path, view: View, image: Image8, depth: NDArray[np.float32]) -> None:
         picture, depths = self.files(view)
         write_whole(folder / picture, lambda f: Image.fromarray(image).save(f, format="PNG"))
         write_whole(folder / depths, lambda f: np.save(f, self.lens.axial(depth)))
@@ -80,15 +82,16 @@ class NerfstudioLayout(Layout):
         write_whole(folder / TRANSFORMS, lambda f: f.write(transforms.encode()))
 
     def _transforms(self) -> dict[str, Any]:
-        frames, held_out = [], []
+        frames: list[dict[str, Any]] = []
+        trained: list[str] = []
+        held_out: list[str] = []
         for view in self.views:
             picture, depths = self.files(view)
             matrix = [*view.pose.tolist(), [0.0, 0.0, 0.0, 1.0]]
             frames.append(
                 {"file_path": picture, "depth_file_path": depths, "transform_matrix": matrix}
             )
-            held_out += [picture] if view.held_out else []
-        paths = [self.files(view)[0] for view in self.views if not view.held_out]
+            (held_out if view.held_out else trained).append(picture)
         lens = self.lens
         return {
             "camera_model": "OPENCV",
@@ -102,7 +105,7 @@ class NerfstudioLayout(Layout):
             "ply_file_path": POINTS,
             "metres_per_unit": 1.0,
             "frames": frames,
-            "train_filenames": paths,
+            "train_filenames": trained,
             "val_filenames": held_out,
             "test_filenames": held_out,
         }
@@ -131,40 +134,34 @@ class NerfstudioLayout(Layout):
 class MegaNerfLayout(Layout):
     """Mega-NeRF's folders; held-out pictures are its validation set."""
 
-    def __init__(self, views: list[View], lens: Lens) -> None:
-        from leco_plugin.scenes.mega_nerf_format.files import around
-
-        self.views, self.lens = views, lens
-        self.coordinates = around(np.stack([view.pose[:, 3] for view in views]))
+    @cached_property
+    def coordinates(self) -> Coordinates:
+        return around(np.stack([view.pose[:, 3] for view in self.views]))
 
     def files(self, view: View) -> list[str]:
         split = "val" if view.held_out else "train"
         return [f"{split}/{folder}/{self._stem(view)}.{ending}" for folder, ending in PARTS]
 
-    def write(
-        self, folder: Path, view: View, image: NDArray[np.uint8], depth: NDArray[np.float32]
-    ) -> None:
-        from leco_plugin.scenes.mega_nerf_format.files import write_view
-
+    def write(self, folder: Path, view: View, image: Image8, depth: NDArray[np.float32]) -> None:
         lens = self.lens
-        write_view(
-            folder,
-            "val" if view.held_out else "train",
-            self._stem(view),
-            image,
-            self.coordinates.to_file(view.pose[None])[0],
-            (lens.focal, lens.focal, lens.width / 2, lens.height / 2),
-        )
+        split: Split = "val" if view.held_out else "train"
+        intrinsics = lens.focal, lens.focal, lens.width / 2, lens.height / 2
+        pose = self.coordinates.to_file(view.pose[None])[0]
+        write_view(folder, split, self._stem(view), image, pose, intrinsics)
 
     def finish(self, folder: Path) -> None:
-        from leco_plugin.scenes.mega_nerf_format.files import write_coordinates, write_mappings
-
         write_coordinates(folder, self.coordinates)
         write_mappings(folder, {f"{view.name}.png": self._stem(view) for view in self.views})
 
     @staticmethod
     def _stem(view: View) -> str:
         return f"{view.number:06d}"
+
+
+LAYOUTS: dict[LayoutName, type[Layout]] = {
+    "nerfstudio": NerfstudioLayout,
+    "mega-nerf": MegaNerfLayout,
+}
 
 
 def with_alpha(image: NDArray[np.uint8], depth: NDArray[np.floating]) -> NDArray[np.uint8]:

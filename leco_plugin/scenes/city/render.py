@@ -16,8 +16,13 @@ from leco_plugin.scenes.city.city import City
 from leco_plugin.scenes.city.shapes import STOREY, Array, Material
 
 Colours = NDArray[np.float32]
+Spacing = Array | float
 _WAVES = (9.0, 2.4, 0.7, 0.22)
 """Wavelengths of the noise, metres."""
+_CURTAIN = np.array([0.78, 0.74, 0.62], np.float32)
+_GLASS = np.array([0.13, 0.17, 0.22], np.float32)
+_STRENGTH = np.array([0.16, 0.16, 0.10, 0.16, 0.16, 0.26, 0.2, 0.42, 0.08, 0.16], np.float32)
+"""Of the noise on each material."""
 _TABLE = np.random.default_rng(7).random((256, 256), dtype=np.float32)
 
 
@@ -33,7 +38,7 @@ def _noise(u: Array, v: Array) -> Colours:
     return 2 * (near * (1 - s) + far * s) - 1
 
 
-def _covered(position: Array, period: NDArray, width: NDArray, pixel: Array) -> Colours:
+def _covered(position: Array, period: Spacing, width: Spacing, pixel: Array) -> Colours:
     """Share of a pixel (metres wide) that stripes of `width` cover, repeating every `period`.
 
     The exact integral of the stripes over the pixel, so that they blur instead of flickering.
@@ -71,24 +76,20 @@ def paint_surface(
     u = np.where(upright & east, positions[:, 1], positions[:, 0])
     v = np.where(upright, positions[:, 2], positions[:, 1])
 
-    _facades(
-        colour, (material == Material.WALL) & upright, local, east, city.pitch[paint], paint, pixel
-    )
+    walls = np.flatnonzero((material == Material.WALL) & upright)
+    _facades(colour, walls, local, east, city.pitch[paint], paint, pixel)
     _streets(colour, (material == Material.STREET) & ~upright, local, city.anchor[paint, 2], pixel)
     flagstones = material == Material.PAVEMENT
-    joints = _covered(u[flagstones], np.array(1.2), np.array(0.1), pixel[flagstones])
     joints = np.maximum(
-        joints, _covered(v[flagstones], np.array(1.2), np.array(0.1), pixel[flagstones])
+        *(_covered(along[flagstones], 1.2, 0.1, pixel[flagstones]) for along in (u, v))
     )
     colour[flagstones] *= (1 - 0.4 * joints)[:, None]
     tiled = material == Material.TILES
-    courses = _covered(positions[tiled, 2], np.array(0.35), np.array(0.1), pixel[tiled])
+    courses = _covered(positions[tiled, 2], 0.35, 0.1, pixel[tiled])
     colour[tiled] *= (1 - 0.35 * courses)[:, None]
     _hills(colour, material == Material.TERRAIN, positions[:, 2], normals[:, 2])
 
-    strength = np.array([0.16, 0.16, 0.10, 0.16, 0.16, 0.26, 0.2, 0.42, 0.08, 0.16], np.float32)[
-        material
-    ]
+    strength = _STRENGTH[material]
     tone = np.zeros(len(colour), np.float32)
     for octave, wave in enumerate(_WAVES):
         seen = np.clip(wave / np.maximum(pixel, 1e-3) - 1, 0, 1).astype(np.float32)
@@ -107,30 +108,22 @@ def _facades(
     pixel: Array,
 ) -> None:
     """Windows, storey by storey, some with drawn curtains; every storey has a ledge."""
-    if not chosen.any():
-        return
     local, pixel = local[chosen], pixel[chosen]
     along = np.where(east[chosen], local[:, 1], local[:, 0])
     spacing = np.where(east[chosen], pitch[chosen, 1], pitch[chosen, 0])
     width = 0.52 * spacing
     across = _covered(along - 0.24 * spacing, spacing, width, pixel)
-    upward = _covered(local[:, 2] - 1.0, np.array(STOREY), np.array(1.6), pixel)
+    upward = _covered(local[:, 2] - 1.0, STOREY, 1.6, pixel)
     column, storey = np.floor(along / spacing), np.floor(local[:, 2] / STOREY)
     pane = _TABLE[
         (column.astype(np.int64) * 7 + paint[chosen] * 13) & 255,
         (storey.astype(np.int64) * 5 + paint[chosen]) & 255,
     ]
-    glass = np.where(
-        pane[:, None] > 0.8,
-        np.array([0.78, 0.74, 0.62], np.float32),
-        np.array([0.13, 0.17, 0.22], np.float32),
-    )
+    glass = np.where(pane[:, None] > 0.8, _CURTAIN, _GLASS)
     glass = glass * (0.75 + 0.5 * pane[:, None])
     share = (across * upward)[:, None]
-    wall = (
-        colour[chosen]
-        * (1 - 0.22 * _covered(local[:, 2], np.array(STOREY), np.array(0.3), pixel))[:, None]
-    )
+    ledge = _covered(local[:, 2], STOREY, 0.3, pixel)
+    wall = colour[chosen] * (1 - 0.22 * ledge)[:, None]
     colour[chosen] = wall * (1 - share) + glass * share
 
 
@@ -139,21 +132,17 @@ def _streets(colour: Colours, chosen: NDArray, local: Array, size: Array, pixel:
     chosen = chosen & (size > 1)
     if not chosen.any():
         return
-    x, y, size, pixel = (
-        np.abs(local[chosen, 0]),
-        np.abs(local[chosen, 1]),
-        size[chosen],
-        pixel[chosen],
-    )
+    x, y = np.abs(local[chosen, :2]).T
+    size, pixel = size[chosen], pixel[chosen]
     middle, lot = size / 2, 0.35 * size
     far, near = np.maximum(x, y), np.minimum(x, y)
     in_street = near < lot
-    dash = _covered(near, np.array(4.0), np.array(2.2), pixel)
+    dash = _covered(near, 4.0, 2.2, pixel)
     line = np.clip((0.12 - (middle - far)) / np.maximum(pixel, 0.02) + 0.5, 0, 1) * np.minimum(
         0.24 / pixel, 1
     )
     white = dash * line * (near < lot - 3.5)
-    bars = _covered(far - lot, np.array(1.0), np.array(0.5), pixel)
+    bars = _covered(far - lot, 1.0, 0.5, pixel)
     white = np.maximum(white, bars * ((near > lot - 3.0) & (near < lot - 0.6)))
     white = (white * in_street).astype(np.float32)[:, None]
     colour[chosen] = colour[chosen] * (1 - white) + 0.85 * white

@@ -40,7 +40,7 @@ class CityTruth:
         """
         folder = Path(folder)
         transform = outputs.dataparser_transform.double().cpu()
-        if read_description(folder).get("layout") == "mega-nerf":
+        if read_description(folder)["layout"] == "mega-nerf":
             turn = torch.from_numpy(TO_DRB)  # that reader begins at (down, right, back)
             transform = torch.cat([transform[:, :3] @ turn, transform[:, 3:]], dim=1)
         return cls(City.from_folder(folder), folder, transform, float(outputs.dataparser_scale))

@@ -50,8 +50,8 @@ def load(data: bytes, name: str) -> Any:
     try:
         _check_sizes(data)
         value = torch.load(io.BytesIO(data), map_location="cpu", weights_only=True)
-        for tensor in value.values() if isinstance(value, dict) else [value]:
-            _check_tensor(tensor)
+        for one in value.values() if isinstance(value, dict) else [value]:
+            _check_value(one)
         return value
     except Refused as refusal:
         raise InputError(f"{name} {refusal}") from None
@@ -95,17 +95,20 @@ def _check_tuples(pickled: bytes) -> None:
         last = opcode.name
 
 
-def _check_tensor(value: Any) -> None:
-    """Refuses tensors of other kinds than numpy has."""
+def _check_value(value: Any) -> None:
+    """Refuses classes that this process lets torch read elsewhere, and tensors that numpy lacks."""
+    kind = type(value)
+    if kind.__module__ not in ("builtins", "collections", "torch"):
+        what = f"{kind.__module__}.{kind.__name__}"
+        raise Refused(f"holds a {what}, and only tensors and numbers are read")
     if isinstance(value, torch.Tensor) and (
-        type(value) is not torch.Tensor
-        or value.device.type != "cpu"
+        value.device.type != "cpu"
         or value.layout != torch.strided
         or value.is_quantized
         or value.is_complex()
         or value.is_nested
     ):
-        raise Refused("holds a tensor of a kind that is not read: only plain numbers are")
+        raise Refused(f"holds {describe(value)}, and only tensors of plain numbers are read")
 
 
 def describe(value: Any) -> str:
