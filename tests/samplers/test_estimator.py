@@ -142,15 +142,6 @@ def test_samples_are_dropped_below_the_given_opacity_and_a_tenth_of_the_mean(
         assert kept[1].equal(plain[1][expected])
 
 
-def test_a_threshold_of_opacity_drops_what_is_faint(bare):
-    origins, directions = camera_rays(20)
-    plain = bare.sampling(origins, directions, render_step_size=0.03)
-    alphas = torch.full_like(plain[1], 0.5).index_fill_(0, torch.arange(0, len(plain[1]), 2), 1e-3)
-    options = {"alpha_fn": lambda *_: alphas, "early_stop_eps": 0.0, "render_step_size": 0.03}
-    kept = bare.sampling(origins, directions, alpha_thre=0.01, **options)
-    assert kept[1].equal(plain[1][1::2])
-
-
 def test_evaluation_goes_front_to_back_once_it_knows_the_density(bare):
     origins, directions = camera_rays(100)
     plain = bare.eval().sampling(origins, directions, render_step_size=0.01)
