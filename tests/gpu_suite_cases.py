@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 import importlib.metadata
 import json
 import runpy
@@ -269,6 +270,7 @@ def test_a_wrong_march_ends_the_run(monkeypatch) -> None:
 def test_without_nerfacc_what_is_left_is_compared(
     missing: str, named: str, compared: str | None, monkeypatch, capsys
 ) -> None:
+    importlib.import_module("leco_plugin.samplers.grid")  # needs nerfacc while it is imported
     monkeypatch.setitem(sys.modules, missing, None)
     names = [figure["name"] for figure in gpu_sampling.sampling(DRY, {})["figures"]]
     assert f"no comparison with {named}" in capsys.readouterr().out

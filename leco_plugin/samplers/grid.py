@@ -83,15 +83,10 @@ class OccupancyGridEstimator(Estimator, OccGridEstimator):  # type: ignore[misc]
         warmup_steps: int = 256,
         n: int = 16,
     ) -> None:
-        """Refresh the grid from the field, every `n` steps.
+        """As nerfacc's, with the field asked about some of the cells at a time.
 
         Args:
-            step: training step.
             occ_eval_fn: positions [N, 3] to density times step size, [N] or [N, 1].
-            occ_thre: cells above min(this, mean) are occupied.
-            ema_decay: an old value fades by this factor when its cell is asked again.
-            warmup_steps: until then all cells are asked, afterwards a quarter at random and as
-                many of the occupied ones.
 
         Raises:
             RuntimeError: the estimator is in evaluation mode.

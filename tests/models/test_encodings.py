@@ -93,20 +93,6 @@ def test_hash_gradients_are_those_of_the_definition() -> None:
     torch.testing.assert_close(encoding.table.grad, table.grad, rtol=0, atol=1e-5)
 
 
-def test_interpolation_weights_sum_to_one() -> None:
-    _, weights = hash_encoding().rows_and_weights(torch.rand(100, 3) * 2 - 1)
-    torch.testing.assert_close(weights.sum(dim=-1), torch.ones_like(weights[:, 0]))
-
-
-def test_rows_stay_in_the_table_of_their_level() -> None:
-    encoding = hash_encoding()
-    rows, _ = encoding.rows_and_weights(torch.rand(100, 3) * 2 - 1)
-    size = encoding.mask + 1
-    assert torch.equal(
-        rows.view(100, 3, 4) // size, torch.arange(3).view(1, 3, 1).expand(100, 3, 4)
-    )
-
-
 def test_no_points_give_no_features_and_a_zero_gradient() -> None:
     encoding = hash_encoding()
     features = encoding(torch.zeros(0, 3))

@@ -91,17 +91,6 @@ def test_gradients_are_those_of_the_definition(kind: str) -> None:
 
 
 @kinds
-def test_gradients_are_those_of_differences(kind: str) -> None:
-    encoding, x = encoding_of(kind), points()[:5]
-    names = [name for name, _ in encoding.named_parameters()]
-
-    def features(*tables: Tensor) -> Tensor:
-        return torch.func.functional_call(encoding, dict(zip(names, tables)), (x,))
-
-    assert torch.autograd.gradcheck(features, tuple(encoding.parameters()))
-
-
-@kinds
 def test_float32_features_are_those_of_float64(kind: str) -> None:
     encoding, x = encoding_of(kind), points()
     exact = encoding(x)

@@ -76,18 +76,6 @@ def test_pruning_is_two_comparisons(scene):
         assert pruned[1].equal(t_starts[expected])
 
 
-def test_a_capped_threshold_never_rejects_everything(scene):
-    samples = march(scene, March(STEP))
-    pruned = prune(
-        samples,
-        N_RAYS,
-        sigma_fn=lambda *_: torch.full_like(samples[1], 1e-4),  # a field that knows nothing yet
-        alpha_thre=0.01,
-        alpha_cap=lambda alphas: alphas.mean() * 0.1,
-    )
-    assert len(pruned[0]) == len(samples[0])
-
-
 def test_nothing_to_see_is_no_samples(scene):
     def never(*_):
         raise AssertionError("the field must not be asked about nothing")
