@@ -128,7 +128,7 @@ def draw_chart(report: dict[str, Any], path: Path, theme: Theme = LIGHT) -> Path
         scene = f"Procedural city of {blocks} x {blocks} blocks, {where}, one seed"
         axes.set_title(scene, fontsize=11.5, loc="left")
         axes.set_xlabel("seconds of training")
-        axes.set_ylabel("PSNR on unseen photographs, dB\n(more is better)")
+        axes.set_ylabel("PSNR on unseen photographs, dB", fontsize=11)
         name_ends(axes, lines, theme, apart=0.16)
         if (frozen := runs[0]["freeze_seconds"]) is not None:
             colour = style(0, theme)["color"]
