@@ -1,4 +1,4 @@
-"""Tables of what was measured for large scenes: growth, bounds, prior and photographs on disk."""
+"""Tables of what was measured for large scenes: growth, bounds and photographs on disk."""
 
 from __future__ import annotations
 
@@ -84,23 +84,6 @@ def bounds_table(report: Report) -> str:
     return "\n".join(lines)
 
 
-def prior_table(report: Report) -> str:
-    """Seconds until no more than the allowed mass is lost for good, without and with the prior."""
-    lines = [
-        "| scene | seed | samples kept | without the prior, s | with it, s |",
-        "|---|---|---|---|---|",
-    ]
-    pairs: dict[tuple[str, int], list[Report]] = {}
-    for run in report["runs"]:
-        pairs.setdefault((run["scene"], run["seed"]), []).append(run)
-    for (scene, seed), runs in pairs.items():
-        without, with_it = sorted(runs, key=lambda run: run["prior_steps"])
-        for share, first, second in zip(report["kept"], without["seconds"], with_it["seconds"]):
-            cells = f"{_or_dash(first, '.1f')} | {_or_dash(second, '.1f')}"
-            lines.append(f"| {scene} | {seed} | {share:.0%} | {cells} |")
-    return "\n".join(lines)
-
-
 def memory_table(report: Report) -> str:
     """What photographs take in memory, for each way to hold them."""
     lines = [
@@ -135,14 +118,6 @@ def _bounds_note(report: Report) -> str:
     )
 
 
-def _prior_note(report: Report) -> str:
-    return (
-        f" Processor seconds until a gate that keeps so many of a reference's samples loses no more"
-        f" than {report['lost_surface_mass']:.1%} of its weight near surfaces for good, in "
-        f"{report['steps']} learning steps; a dash: not in these. It is off by default."
-    )
-
-
 def _memory_note(report: Report) -> str:
     images, width, height = report["photographs"]
     return (
@@ -161,11 +136,6 @@ class Shown:
     table: Callable[[Report], str]
     note: Callable[[Report], str]
     """What the reader of the table must know."""
-
-
-def _prior_command(report: Report) -> str:
-    scenes = " ".join(dict.fromkeys(run["scene"] for run in report["runs"]))
-    return f"python benchmarks/prior.py --data {scenes} --steps {report['steps']}"
 
 
 def _bounds_command(report: Report) -> str:
@@ -194,7 +164,6 @@ LARGE_SCENES = {
         bounds_table,
         _bounds_note,
     ),
-    "prior": Shown("A prior from sparse points", _prior_command, prior_table, _prior_note),
     "image-memory": Shown("Photographs on disk", _memory_command, memory_table, _memory_note),
 }
 """By the names of the stored results, in the order of the page."""

@@ -150,7 +150,7 @@ def check_gpu(results: dict[str, Any]) -> None:
 
 
 def large_scene_sections() -> list[str]:
-    """Of growth, bounds, prior and photographs, those that are stored."""
+    """Of growth, bounds and photographs, those that are stored."""
     parts = []
     for name, shown in LARGE_SCENES.items():
         if not (path := RESULTS / f"{name}.json").exists():

@@ -11,7 +11,7 @@ from PIL import Image
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent / "benchmarks"))
 
 from growth_picture import draw
-from large_scene_tables import growth_table, memory_table, prior_table
+from large_scene_tables import growth_table, memory_table
 
 from leco_plugin.chart.theme import DARK, SOURCE, fingerprint
 
@@ -77,15 +77,6 @@ def test_growth_is_drawn_with_what_it_was_drawn_from(tmp_path: Path) -> None:
     with Image.open(path) as image:
         assert image.info[SOURCE] == fingerprint(report)
         assert image.convert("RGB").getpixel((2, 2)) == (0x0D, 0x11, 0x17)
-
-
-def test_a_prior_that_does_not_get_there_has_a_dash() -> None:
-    runs = [
-        {"scene": "park", "seed": 1, "prior_steps": steps, "seconds": seconds}
-        for steps, seconds in ((60, [13.09, None]), (0, [8.7, 12.97]))
-    ]
-    lines = prior_table({"kept": [0.5, 0.3], "runs": runs}).splitlines()
-    assert lines[2:] == ["| park | 1 | 50% | 8.7 | 13.1 |", "| park | 1 | 30% | 13.0 | - |"]
 
 
 def test_memory_is_told_in_megabytes() -> None:
