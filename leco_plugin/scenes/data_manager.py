@@ -72,7 +72,7 @@ class LecoDataManager(VanillaDataManager):  # type: ignore[type-arg]
 
     @dataparser.setter
     def dataparser(self, parser: Any) -> None:
-        self._dataparser = read_checked(parser)
+        self._dataparser = parser = read_checked(parser)
         # nerfstudio sets this class as the target of configs that an earlier release stored
         if getattr(self.config, "upright", False):
             parser.get_dataparser_outputs = upright_outputs(parser.get_dataparser_outputs)

@@ -7,7 +7,8 @@ import torch
 
 from leco_plugin.models.region import Region, marching_rule
 from leco_plugin.models.rendering import Rays
-from leco_plugin.samplers.marching import march
+from leco_plugin.samplers import marching
+from leco_plugin.samplers.marching import March, march
 from leco_plugin.scenes.bounds import SceneBounds
 from leco_plugin.space import NO_WALL
 
@@ -49,12 +50,12 @@ def test_rays_that_miss_get_a_piece_at_the_far_end() -> None:
 @pytest.mark.parametrize("kind", ["box", "contraction"])
 def test_a_median_ray_has_the_wanted_number_of_candidates(kind) -> None:
     length = 3.0 if kind == "box" else 4.9
-    step_size, cone_angle = marching_rule(kind, 0.1, 5.0, 64, length)
+    rule = March(*marching_rule(kind, 0.1, 5.0, 64, length))
     one = torch.zeros(1, 3), torch.tensor([[1.0, 0.0, 0.0]])
     ends = torch.tensor([0.1]), torch.tensor([0.1 + length])
-    ray_indices, _, _ = march(*one, *ends, step_size=step_size, cone_angle=cone_angle)
+    ray_indices, _, _ = march(marching.Rays(*one, *ends), rule)
     assert abs(len(ray_indices) - 64) <= 1
-    assert (cone_angle > 0.0) == (kind == "contraction")
+    assert (rule.cone_angle > 0.0) == (kind == "contraction")
 
 
 def test_a_ray_along_a_wall_that_misses_the_box_stays_finite() -> None:

@@ -104,16 +104,6 @@ def test_what_is_held_out_is_neither_trained_on_nor_known_by_its_distance(
     assert 0 < len(held_out) <= 50
 
 
-def test_a_run_of_before_there_was_a_choice_keeps_what_it_held_out(tiny_scene: Path) -> None:
-    config = LecoDataManagerConfig(**options(tiny_scene))
-    state = {name: value for name, value in vars(config).items() if name != "held_out_period"}
-    older = LecoDataManagerConfig(**options(tiny_scene))
-    older.__setstate__(state)
-    assert older.setup(device="cpu").train_pixel_sampler.lattice == Lattice(11)
-    with pytest.raises(InputError, match="held-out-period is 2 or more"):
-        LecoDataManagerConfig(**options(tiny_scene), held_out_period=1).setup(device="cpu")
-
-
 def test_an_occupancy_is_learned_and_calibrated_from_files(
     tiny_scene: Path, tmp_path: Path
 ) -> None:
@@ -297,10 +287,11 @@ def test_beside_fisheyes_perspective_photographs_are_read_as_a_whole(
         next(manager.iter_train_image_dataloader), 500, seed=0
     )["indices"]
     drawn = torch.cat([manager.next_train(step)[1]["indices"] for step in range(80)])
+    evaluated = torch.cat([manager.next_eval(step)[1]["indices"] for step in range(20)])
     for pixels, dataset in (
         (drawn, manager.train_dataset),
         (held_out, manager.train_dataset),
-        (manager.next_eval(0)[1]["indices"], manager.eval_dataset),
+        (evaluated, manager.eval_dataset),
     ):
         cameras = dataset.cameras[pixels[:, 0]]
         middle = torch.cat([cameras.height, cameras.width], dim=-1) / 2

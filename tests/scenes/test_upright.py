@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import copy
 import json
 import shutil
 from pathlib import Path
@@ -12,7 +11,6 @@ import numpy as np
 import pytest
 import torch
 import trimesh
-import yaml
 from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataParserConfig
 from torch import Tensor
 
@@ -187,15 +185,6 @@ def test_it_is_left_on_its_side_where_that_is_asked_for(colmap_scene: Path) -> N
     parser = LecoPhotographsDataParserConfig(data=colmap_scene)
     manager: Any = LecoDataManagerConfig(dataparser=parser, upright=False).setup(device="cpu")
     assert not bool((manager.train_dataset.cameras.camera_to_worlds[:, 2, 2] > 0.9).any())
-
-
-def test_a_run_that_was_begun_before_stays_as_it_lies() -> None:
-    config = LecoDataManagerConfig()
-    assert copy.deepcopy(config).upright and yaml.load(yaml.dump(config), yaml.Loader).upright
-    stored = {name: value for name, value in vars(config).items() if name != "upright"}
-    earlier = LecoDataManagerConfig.__new__(LecoDataManagerConfig)
-    earlier.__setstate__(stored)
-    assert not earlier.upright and earlier.images == "auto"
 
 
 @pytest.mark.filterwarnings("ignore:unclosed file:ResourceWarning")
