@@ -56,8 +56,8 @@ def taught(monkeypatch: pytest.MonkeyPatch) -> list[str]:
             done.append(candidate.key)
             yield candidate, row_of(candidate)
 
-    model = SimpleNamespace(num_train_data=7)
-    ground = SimpleNamespace(model=model, held_out=SimpleNamespace(rays=99))
+    mixture = SimpleNamespace(num_images=7)
+    ground = SimpleNamespace(mixture=mixture, held_out=SimpleNamespace(rays=99))
     monkeypatch.setattr(command, "prepare", lambda *arguments: ground)
     monkeypatch.setattr(command, "measure_gate", of_gate)
     monkeypatch.setattr(command, "measure_grids", of_grids)

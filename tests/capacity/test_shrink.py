@@ -214,7 +214,7 @@ def lost_on_other_rays(file: Path, data: Path, smaller: Occupancy) -> list[float
     torch.manual_seed(99)
     pixels = sources.draw_other_pixels(source, original, 1500, [])
     seen = sources.move_between_cameras(source, pixels, seed=99)
-    parts = [gather(source.model, original, seen)[0]]
+    parts = [gather(source.mixture, original, seen)[0]]
     if source.frozen is not None:
         parts.append(gather(source.frozen, None, seen)[0])
     return [lost_of(part, smaller) for part in parts]
@@ -279,7 +279,7 @@ def with_haze_at_freezing(known_run: Path, tiny_scene: Path, folder: Path) -> Pa
     shutil.copytree(known_run, folder)
     now = sources.find_source(folder / "occupancy.safetensors", tiny_scene)
     assert now.model is not None and now.frozen is None
-    frozen = copy.deepcopy(now.model)
+    frozen = copy.deepcopy(now.model.mixture)
     with torch.no_grad():
         frozen.field.density_head.bias.fill_(0.1)
     leave_field(frozen, folder)
@@ -356,7 +356,7 @@ def test_a_run_whose_model_does_not_fit_is_refused_in_one_line(
     shutil.copytree(known_run, broken)
     for path in (broken / "nerfstudio_models").glob("*.ckpt"):
         state = torch.load(path, weights_only=True)
-        state["pipeline"]["_model.field.density_head.weight"] = torch.zeros(1, 3)
+        state["pipeline"]["_model.mixture.field.density_head.weight"] = torch.zeros(1, 3)
         torch.save(state, path)
     arguments = ["--data", tiny_scene, "--out", tmp_path / "out"]
     assert run("shrink", broken / "occupancy.safetensors", *arguments) == 2

@@ -103,7 +103,7 @@ def test_test_photographs_say_what_a_smaller_gate_loses(known_run: Path, tiny_sc
     nothing.threshold_value.fill_(1.1)
     assert measure_shares_lost(source, original, nothing, seen) == pytest.approx({NOW: 1.0 + 1e-4})
     # what the field at freezing says that the original loses counts, not what it declares
-    both = source._replace(frozen=source.model)
+    both = source._replace(frozen=source.mixture)
     before = measure_shares_lost(both, original, original, seen)[AT_FREEZING]
     assert measure_shares_lost(both, original, nothing, seen) == pytest.approx(
         {NOW: 1.0 + before, AT_FREEZING: 1.0}
