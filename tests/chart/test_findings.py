@@ -201,8 +201,10 @@ def test_tables_of_runs_of_equal_time_say_it_and_no_others() -> None:
 def test_runs_that_end_below_their_best_point_are_named_on_table_and_page(tmp_path: Path) -> None:
     fell = run("B", curve=[[3.0, 18.0], [6.0, 20.0], [9.0, 19.6]])
     both = results(run("A", curve=STILL), fell)
-    said = "Fell from their own best point: B by 0.4 dB (0.40 to 0.40)."
+    said = "Fell from their own best point: B in 1 of 1 run, by at most 0.40 dB."
     assert falls(lines_of(both)) == said
     assert said in table(both) and said in write_page(both, tmp_path / "chart.html").read_text()
+    one = results(*(run("B", seed=seed, curve=STILL) for seed in (0, 1)), fell | {"seed": 2})
+    assert falls(lines_of(one)) == said.replace("1 of 1 run", "1 of 3 runs")
     hardly = run("B", curve=[[3.0, 18.0], [6.0, 20.0], [9.0, 19.95]])
     assert falls(lines_of(results(run("A", curve=STILL), hardly))) is None
