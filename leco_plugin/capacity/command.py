@@ -22,8 +22,8 @@ from leco_plugin.evaluation.report import (
     write_json,
 )
 from leco_plugin.log import bar
-from leco_plugin.scenes.description import describe_scene
 from leco_plugin.scenes.input_error import InputError, require_folder
+from leco_plugin.scenes.photographs import describe_scene
 
 SETTINGS, POINTS, LEFT_OUT = "settings.json", "points", "left_out.json"
 TOO_MANY = f"would ask the field at more than {MOST_ON_CPU / 1e6:.0f} million places"

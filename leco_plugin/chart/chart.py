@@ -26,8 +26,8 @@ from leco_plugin.chart.runner import (
 )
 from leco_plugin.chart.table import write_table
 from leco_plugin.evaluation.report import describe_code, describe_machine, write_json
-from leco_plugin.scenes.description import describe_scene
 from leco_plugin.scenes.input_error import InputError
+from leco_plugin.scenes.photographs import describe_scene
 
 Say = Callable[[str], None]
 

@@ -6,6 +6,7 @@ already upright as they are, and reads the sparse points without open3d.
 
 from __future__ import annotations
 
+import hashlib
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -173,3 +174,16 @@ leco_photographs_dataparser = DataParserSpecification(
     config=LecoPhotographsDataParserConfig(),
     description="A scene in nerfstudio's format, checked, upright, with its sparse points.",
 )
+
+
+def describe_scene(data: Path) -> dict[str, Any]:
+    """Name, number of images, and what tells the scene from another: JSON values.
+
+    Raises:
+        InputError: it is no scene that can be read.
+    """
+    meta = check_scene(data)
+    description = data if data.suffix == ".json" else data / "transforms.json"
+    digest = hashlib.sha256(description.read_bytes()).hexdigest()
+    name = folder_of(data).resolve().name
+    return {"name": name, "images": len(meta["frames"]), "digest": digest[:16]}

@@ -11,7 +11,6 @@ from torch import Tensor
 
 from leco_plugin.log import say
 from leco_plugin.models.objective import DARK
-from leco_plugin.models.rendering import Rays
 from leco_plugin.samplers.boxes import intersect_box
 from leco_plugin.scenes.bounds import (
     BoundsConfig,
@@ -88,14 +87,6 @@ class Survey:
             f"{self.meeting:.1%} of {self.rays} rays meet the scene, half of them for {length}"
         )
         return [bounds.reason, *table, meeting, *([self.rounded] if self.rounded else [])]
-
-    def probe_rays(self, device: torch.device, aabb: Tensor, march_range: Tensor) -> Rays:
-        """The rays of the survey, cut to a model's bounds; rays that miss are left out."""
-        origins, directions = self.origins.to(device), self.directions.to(device)
-        enters, leaves = intersect_box(origins, directions, aabb)
-        t_mins, t_maxs = enters.clamp(min=march_range[0]), leaves.clamp(max=march_range[1])
-        hits = (t_maxs > t_mins).nonzero()[:, 0]
-        return Rays(origins[hits], directions[hits], t_mins[hits], t_maxs[hits], None)
 
 
 def _in(units: DatasetUnits, value: float, level: bool) -> float:

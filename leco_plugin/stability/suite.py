@@ -41,8 +41,8 @@ from leco_plugin.evaluation.report import (
 from leco_plugin.log import bar, resumable
 from leco_plugin.occupancy import CALIBRATED_AT
 from leco_plugin.scenes.city.layouts import TRANSFORMS
-from leco_plugin.scenes.description import describe_scene
 from leco_plugin.scenes.input_error import InputError
+from leco_plugin.scenes.photographs import describe_scene
 from leco_plugin.stability.cases import Case, cases_named
 from leco_plugin.stability.photographs import digest_of, write_scene
 from leco_plugin.stability.plan import (

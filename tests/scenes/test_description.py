@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from leco_plugin.scenes.description import describe_scene
+from leco_plugin.scenes.photographs import describe_scene
 
 
 def test_scenes_are_told_apart_by_what_is_in_them(tiny_scene: Path, tmp_path: Path) -> None:
