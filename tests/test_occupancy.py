@@ -113,6 +113,12 @@ def test_positions_of_another_shape_are_refused_in_a_line(shape: tuple[int, ...]
             ask(torch.zeros(shape))
 
 
+def test_a_position_exactly_at_the_threshold_is_kept() -> None:
+    made, positions = occupancy(), torch.rand(1, 3)
+    at = made.with_threshold(float(made.query(positions)))
+    assert bool(at.occupied(positions))
+
+
 @pytest.mark.parametrize("threshold", [-0.1, 1.1, float("nan")])
 def test_a_threshold_is_in_zero_to_one(threshold: float) -> None:
     with pytest.raises(ValueError, match=r"^a threshold is in \[0, 1\], not "):

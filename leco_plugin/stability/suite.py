@@ -6,7 +6,6 @@ import datetime
 import functools
 import json
 import math
-import shlex
 import shutil
 import sys
 import threading
@@ -17,9 +16,6 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-from nerfstudio.utils.rich_utils import CONSOLE
-
-from leco_plugin.chart.contender import Job
 from leco_plugin.chart.protocol import Protocol, require_seeds, settings_of
 from leco_plugin.chart.runner import (
     LOGS,
@@ -28,6 +24,7 @@ from leco_plugin.chart.runner import (
     ProcessRunner,
     RunFailed,
     RunFolder,
+    Runner,
     difference,
 )
 from leco_plugin.chart.theme import DARK, LIGHT
@@ -38,7 +35,7 @@ from leco_plugin.evaluation.report import (
     usable_cores,
     write_json,
 )
-from leco_plugin.log import bar, resumable
+from leco_plugin.log import bar, console, resumable
 from leco_plugin.occupancy import CALIBRATED_AT
 from leco_plugin.scenes.city.layouts import TRANSFORMS
 from leco_plugin.scenes.input_error import InputError
@@ -62,20 +59,16 @@ from leco_plugin.studio.run_folder import LOCK, alone_in
 WORKER = (sys.executable, "-W", "ignore", "-m", "leco_plugin.stability.worker")
 SIZES = "sizes.json"
 """File whose presence says that a folder is a table's, with the sizes of all runs there."""
-SCENES, FAILURES = "scenes", "failures"
-FAILED = ".failed"
-"""Ending of the file, beside its log, with the reason why a run has no result."""
+SCENES, FAILURES, FAILED = "scenes", "failures", ".failed"
+"""Folders of the table, and the ending of a file with the reason why a run has no result."""
 PER_PORTION = {"cores", "threads"}
 """Facts of the machine that say how many runs are made at once, and change no run."""
 OF_OCCUPANCY = (
     *("threshold", "lost_surface_mass", "image_price_db", "empty_fraction", "recoveries"),
     CALIBRATED_AT,
-)
-"""What is kept of a learned occupancy."""
-Runner = Callable[[Job, Callable[[float], None]], dict[str, Any]]
+)  # what is kept of a learned occupancy
 Say = Callable[[str], None]
-Key = tuple[str, str]
-"""Scene and name of a run."""
+Key = tuple[str, str]  # scene and name of a run
 
 
 def make_table(
@@ -107,12 +100,11 @@ def make_table(
     if minutes is not None and not 0.0 < minutes < math.inf:
         raise InputError(f"a table is made in a positive number of minutes, not {minutes}")
     chosen, compared = cases_named(tuple(cases)), samplers_named(tuple(samplers))
-    say = functools.partial(CONSOLE.print, markup=False, highlight=False)
-    words: list[object] = ["leco", "stability", "--out", "DIR"]  # without this machine's paths
+    say = functools.partial(console().print, markup=False, highlight=False)
     named = {"cases": cases, "samplers": samplers, "seeds": seeds, "seeds-beside": seeds_beside}
-    for name, values in named.items():
-        words += [f"--{name}", *values] if values else []
-    command = shlex.join(map(str, [*words, *(["--quick"] if quick else [])]))
+    words = [word for name, given in named.items() if given for word in (f"--{name}", *given)]
+    words = ["leco stability --out DIR", *words, *(["--quick"] if quick else [])]
+    command = " ".join(map(str, words))  # without this machine's paths
     with alone_in(out, "table"):
         sizes = QUICK if quick else FULL
         suite = Suite(out, chosen, compared, seeds, sizes, command, seeds_beside)
@@ -200,7 +192,7 @@ class Suite:
     def missing(self) -> list[Run]:
         """Runs that are not stored: first those that were never tried, then those that failed."""
         stored, failures = self.stored(), self.failures()
-        runs = [run for run in runs_of(self.entries) if run.key not in stored]
+        runs = (run for run in runs_of(self.entries) if run.key not in stored)
         return sorted(runs, key=lambda run: run.key in failures)
 
     def estimate(self) -> str:
