@@ -17,6 +17,8 @@ ROOT = Path(__file__).resolve().parent.parent
 PACKAGE = "leco_plugin"
 OUT = ROOT / "docs" / "house.svg"
 LINES_AN_INCH = 900.0
+GROUND = ("space", "occupancy", "log", "entries")
+"""Files beside the rooms that others stand on; the rest of them are commands and methods."""
 WIDTH, GAP = 1.75, 0.75
 """Of a room, and between two columns, inches."""
 
@@ -54,7 +56,12 @@ def imports(path: Path, known: dict[str, Path]) -> set[str]:
 def room_of(name: str) -> str:
     """The folder of a module below the package; its own files are the entrance."""
     parts = name.split(".")
-    return parts[1] if len(parts) > 2 else "entrance"
+    if len(parts) > 2:
+        return parts[1]
+    rooms = {path.name for path in (ROOT / PACKAGE).iterdir() if path.is_dir()}
+    if parts[-1] in rooms:
+        return parts[-1]
+    return "ground" if parts[-1] in GROUND else "entrance"
 
 
 def depths(edges: Counter[tuple[str, str]], rooms: set[str]) -> dict[str, int]:
@@ -98,8 +105,9 @@ def draw(out: Path = OUT) -> None:
             height = 0.32 + sum(max(lines[n] / LINES_AN_INCH, 0.045) for n in names)
             axes.add_patch(Rectangle((x, y - height), WIDTH, height, fc="#f4f1ea", ec="#555555"))
             total = sum(lines[n] for n in names)
-            label = f"{room}  {len(names)} files, {total:,} lines"
-            axes.text(x + 0.05, y - 0.17, label, fontsize=6.5, weight="bold", va="center")
+            axes.text(x + 0.05, y - 0.11, room, fontsize=7, weight="bold", va="center")
+            counts = f"{len(names)} files, {total:,} lines"
+            axes.text(x + 0.05, y - 0.23, counts, fontsize=5, va="center")
             top = y - 0.3
             for name in names:
                 size = max(lines[name] / LINES_AN_INCH, 0.045)
@@ -129,7 +137,8 @@ def draw(out: Path = OUT) -> None:
         axes.add_patch(arrow)
     axes.autoscale_view()
     axes.set_axis_off()
-    axes.set_title(f"{len(known)} modules, {sum(lines.values()):,} lines", fontsize=8)
+    said = f"{len(known)} modules, {sum(lines.values()):,} lines; red: imports against the flow"
+    axes.set_title(said, fontsize=8)
     figure.savefig(out, bbox_inches="tight")
     plt.close(figure)
 

@@ -68,6 +68,26 @@ class Problem:
         return self.references, self.truths, self.render_kept
 
 
+def test_a_backdrop_that_the_gate_calls_empty_is_neither_skipped_nor_lost() -> None:
+    problem = Problem(0)
+    last = torch.arange(RAYS * SAMPLES) % SAMPLES == SAMPLES - 1
+    problem.references = [
+        reference._replace(
+            always_kept=last, occupancies=reference.occupancies.masked_fill(last, 0.0)
+        )
+        for reference in problem.references
+    ]
+    found = measure(*problem.arguments(), threshold=1.0)
+    kept = sum(int((one.occupancies >= 1.0).sum()) for one in problem.references)
+    backdrops = 2 * RAYS
+    assert found.empty_fraction == pytest.approx(1.0 - (kept + backdrops) / (2 * RAYS * SAMPLES))
+    everything = sum(float(reference.weights.sum()) for reference in problem.references)
+    skipped = sum(
+        float(one.weights[(one.occupancies < 1.0) & ~last].sum()) for one in problem.references
+    )
+    assert found.lost_mass == pytest.approx(skipped / everything, rel=1e-5)
+
+
 @settings(deadline=None, max_examples=20)
 @given(
     seed=st.integers(0, 2**16),
