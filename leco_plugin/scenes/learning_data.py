@@ -37,7 +37,11 @@ class LearningData:
     ) -> None:
         self.manager = manager
         self.survey: Survey = survey(manager, bounds, near, far)
-        self.rays_per_batch = int(manager.get_train_rays_per_batch())
+
+    @cached_property
+    def rays_per_batch(self) -> int:
+        """Rays of a batch before any factor; may be set."""
+        return int(self.manager.get_train_rays_per_batch())
 
     def covering_rays(self) -> tuple[Tensor, Tensor]:
         """Origins and unit directions [N, 3] of rays that cover the training images."""
