@@ -18,6 +18,7 @@ from leco_plugin.models.rendering import (
     Shaded,
     backdrop_of,
     gate_values_and_routes,
+    mapped_middles,
     shade,
     with_backdrop,
 )
@@ -193,3 +194,20 @@ def test_the_backdrop_absorbs_without_changing_what_the_field_says() -> None:
     shaded = scene.shade(rays, ended, ROUTINGS["threshold"])
     assert bool(backdrop_of(ended, rays).any())
     assert float(shaded.sigmas.detach().max()) < 1e3
+
+
+def test_intervals_are_asked_in_their_middles() -> None:
+    space = Space()
+    space.set("box", torch.zeros(3), 8.0)
+    rays = Rays(
+        torch.tensor([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0]]),
+        torch.tensor([[0.0, 0.0, 1.0], [0.0, 1.0, 0.0]]),
+        torch.zeros(2),
+        torch.full((2,), 4.0),
+        None,
+    )
+    intervals = Intervals(
+        torch.tensor([0, 1, 1]), torch.tensor([0.0, 1.0, 2.0]), torch.tensor([1.0, 2.0, 4.0])
+    )
+    middles = torch.tensor([[0.0, 0.0, 0.5], [1.0, 1.5, 0.0], [1.0, 3.0, 0.0]])
+    torch.testing.assert_close(mapped_middles(space, rays, intervals), middles / 8.0)
