@@ -72,7 +72,9 @@ class _ProposalSampler(nn.Module):
         levels = 1 if density_fns is None else len(density_fns)
         return samples, [weights] * levels, [candidates] * levels
 
-    forward = generate_ray_samples
+    def forward(self, *rays: Any, **options: Any) -> Answer:
+        """As `generate_ray_samples`, by which nerfstudio's samplers are changed."""
+        return self.generate_ray_samples(*rays, **options)
 
     def _draw(self, ray_bundle: RayBundle) -> tuple[RaySamples, Tensor, RaySamples]:
         """Samples, weights of candidates, and candidates."""
