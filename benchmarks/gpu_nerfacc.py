@@ -12,10 +12,7 @@ import signal
 import subprocess
 import sys
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Any
-
-if TYPE_CHECKING:
-    from leco_plugin.samplers.grid import OccupancyGridEstimator
+from typing import Any
 
 BUILD = "from nerfacc.cuda._backend import _C; raise SystemExit(_C is None)"
 BUILD_SECONDS = 30.0
@@ -24,7 +21,7 @@ GRACE = 5.0
 """Seconds to end in, for a build that took too long: it then leaves no lock behind."""
 
 
-def nerfacc_grid(ours: OccupancyGridEstimator, sample: Callable[[Any], Any]) -> Any:
+def nerfacc_grid(ours: Any, sample: Callable[[Any], Any]) -> Any:
     """nerfacc's grid with the same cells marked, or None where it does not sample.
 
     On a CPU it samples by this package's functions in place of its kernels.

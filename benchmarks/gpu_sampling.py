@@ -8,7 +8,7 @@ values, down to the one at which as many candidates of the rays are kept as the 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import torch
 from gpu_floor import seconds
@@ -23,9 +23,6 @@ from leco_plugin.samplers.estimator import LearnedOccupancyEstimator
 from leco_plugin.samplers.kernels import fused
 from leco_plugin.samplers.marching import March, Rays
 from leco_plugin.space import Space
-
-if TYPE_CHECKING:
-    from leco_plugin.samplers.grid import OccupancyGridEstimator
 
 POINTS, AT_ONCE, HALVINGS = 4, 1 << 20, 12
 """Points of a cell at which the gate is asked, how many at once, and how often the value from which
@@ -115,7 +112,7 @@ def grids(
 
 
 @torch.no_grad()
-def highest_in_cells(occupancy: Occupancy, grid: OccupancyGridEstimator) -> Tensor:
+def highest_in_cells(occupancy: Occupancy, grid: Any) -> Tensor:
     """The highest o(x) of a few points of each cell, as `binaries` lie: [levels, n, n, n]."""
     generator = torch.Generator(grid.device).manual_seed(0)
     centres = cell_centers(grid.aabbs, grid.resolution)
@@ -130,9 +127,7 @@ def highest_in_cells(occupancy: Occupancy, grid: OccupancyGridEstimator) -> Tens
     return highest.view_as(grid.binaries)
 
 
-def mark(
-    grid: OccupancyGridEstimator, values: Tensor, sample: Callable[[Any], Any], wanted: int
-) -> None:
+def mark(grid: Any, values: Tensor, sample: Callable[[Any], Any], wanted: int) -> None:
     """Marks the cells with the highest values, so many that about as many samples are kept."""
     low, high = 0.0, 1.0
     for _ in range(HALVINGS):

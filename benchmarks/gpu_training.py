@@ -41,10 +41,10 @@ from leco_plugin.models.rendering import (
     with_backdrop,
 )
 from leco_plugin.occupancy import Occupancy, gate_precision
+from leco_plugin.samplers import marching
 from leco_plugin.samplers.boxes import intersect_box
 from leco_plugin.samplers.estimator import LearnedOccupancyEstimator
 from leco_plugin.samplers.kernels import fused
-from leco_plugin.samplers.marching import march
 from leco_plugin.space import Space
 
 
@@ -76,7 +76,8 @@ class Run:
         self.space.to(self.device)
         self.gate = Gate(sizes.gate).to(self.device)
         self.field = HMoEField(sizes.field, scene.num_images).to(self.device)
-        self.span = torch.tensor([0.0, 2.0 * half_extent], device=self.device)
+        ends = torch.tensor([0.0, 2.0 * half_extent], device=self.device)
+        self.span = ends[0], ends[1]
         self.losses = GateLossConfig()
         self.routing = Routing(None if homogeneous else self.losses.empty_below, homogeneous)
         parameters = [*self.gate.parameters(), *self.field.parameters()]
@@ -93,14 +94,12 @@ class Run:
 
     def intervals_of(self, rays: Rays, candidates: int, jittered: bool) -> Intervals:
         """Candidates along rays; once guided, those that the occupancy keeps."""
-        step_size = self.scene.length / candidates
-        jitter = torch.rand_like(rays.t_mins) if jittered else None
-        along = rays.origins, rays.directions, rays.t_mins, rays.t_maxs
-        if self.estimator is None:
-            samples = march(*along, step_size=step_size, jitter=jitter)
-        else:
-            samples = self.estimator.kept(*along, step_size, 0.0, jitter, None)
-        return with_backdrop(Intervals(*samples), rays, step_size, 0.0)
+        along, rule = marching.Rays(*rays[:4]), marching.March(self.scene.length / candidates)
+        if jittered:
+            along = along.shifted(torch.rand_like(rays.t_mins) * rule.step_size)
+        guided = self.estimator is not None
+        samples = self.estimator.march(along, rule) if guided else marching.march(along, rule)
+        return with_backdrop(Intervals(*samples), rays, *rule)
 
     def shaded(self, rays: Rays, intervals: Intervals) -> Shaded:
         """Renders intervals in bfloat16."""
@@ -229,7 +228,7 @@ def learned(scale: Scale, before: dict[str, Any]) -> dict[str, Any]:
     assert run.estimator is not None
     place = torch.zeros(1, 3, device=scale.device)
     running = {
-        "gate": fused.decisions(run.estimator.occupancy, place) is not None,
+        "gate": fused.decide(run.estimator.occupancy, place) is not None,
         "march": march_answers(run.estimator),
     }
     return {

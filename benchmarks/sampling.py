@@ -26,7 +26,7 @@ from leco_plugin.models.compute.device import keep_freed_memory
 from leco_plugin.occupancy import Occupancy
 from leco_plugin.samplers.estimator import LearnedOccupancyEstimator
 from leco_plugin.samplers.grid import OccupancyGridEstimator
-from leco_plugin.samplers.marching import march
+from leco_plugin.samplers.marching import March, Rays, march
 
 GRID_ONCE, GRID_PER_LEVEL = 32, 5
 """Bytes that nerfacc's grid holds for a cell once, and for a cell on each level."""
@@ -138,9 +138,8 @@ def compare_with_one_pass(device: str, rounds: int) -> list[Figure]:
     origins = torch.rand(n_rays, 3, device=device)
     directions = torch.nn.functional.normalize(torch.randn(n_rays, 3, device=device), dim=-1)
     bounds = torch.zeros(n_rays, device=device), torch.ones(n_rays, device=device)
-    step = 1.0 / n_steps
-    rays = (origins, directions, *bounds)
-    dense = march(*rays, step_size=step)
+    rays = Rays(origins, directions, *bounds), March(1.0 / n_steps)
+    dense = march(*rays)
     middles = ((dense[1] + dense[2]) * 0.5)[:, None]
     positions = origins[dense[0]] + directions[dense[0]] * middles
     limit = positions[:, 0].quantile(0.95).item()
@@ -156,10 +155,8 @@ def compare_with_one_pass(device: str, rounds: int) -> list[Figure]:
         "forming the positions": lambda: torch.addcmul(
             origins.index_select(0, dense[0]), directions.index_select(0, dense[0]), middles
         ),
-        "march": lambda: march(*rays, step_size=step, occupied=occupied),
-        "march with a coarse question": lambda: march(
-            *rays, step_size=step, occupied=occupied, near_occupied=near_occupied
-        ),
+        "march": lambda: march(*rays, occupied),
+        "march with a coarse question": lambda: march(*rays, occupied, near_occupied),
     }
     timings = interleaved(functions, rounds)
     medians = milliseconds(timings)

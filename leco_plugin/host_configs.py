@@ -16,7 +16,7 @@ from nerfstudio.plugins.types import MethodSpecification
 
 from leco_plugin.hosts.guided import GuidedModelConfig
 from leco_plugin.method_configs import ON_GPU, STEPS, best_device
-from leco_plugin.models.compute.device import FusedAdamConfig
+from leco_plugin.models.compute.optimizers import FusedAdamConfig
 from leco_plugin.models.switch.config import SwitchNerfModelConfig, switch_sizes_for
 from leco_plugin.scenes.data_manager import LecoDataManagerConfig
 from leco_plugin.scenes.photographs import LecoPhotographsDataParserConfig

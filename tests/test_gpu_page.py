@@ -71,8 +71,8 @@ def test_kernels_that_can_be_turned_off_are_named() -> None:
         ("samplers/kernels/fused.py", "it decides otherwise about {} of {} positions"),
         ("samplers/kernels/gate_weights.py", "the kernel holds "),
         ("samplers/estimator.py", "no cell cache, sampling will be slower: "),
-        ("models/compute/grouped_trial.py", "no grouped products, "),
-        ("models/compute/grouped_trial.py", "ms a layer grouped, "),
+        ("models/compute/grouped.py", "no grouped products, "),
+        ("models/compute/grouped.py", "ms a layer grouped, "),
     ],
 )
 def test_lines_of_the_log_are_those_that_are_logged(file: str, line: str) -> None:

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import softplus
 
-from leco_plugin.models.compute.device import RATES
+from leco_plugin.learning.schedule import RATES
 from leco_plugin.models.encodings import EncodingConfig
 from leco_plugin.models.gate import Gate, GateConfig, occupancy_logit
 from leco_plugin.occupancy import Precision, gate_precision

@@ -13,9 +13,9 @@ from torch import nn
 from leco_plugin.learning.learner import Learner
 from leco_plugin.learning.progress import Progress
 from leco_plugin.learning.run import LearningOnly
-from leco_plugin.learning.schedule import MOST_EXTENSIONS, steps_of_an_extension
+from leco_plugin.learning.schedule import MOST_EXTENSIONS, RATES, steps_of_an_extension
 from leco_plugin.log import bar
-from leco_plugin.models.compute.device import RATES, FusedAdamConfig
+from leco_plugin.models.compute.optimizers import FusedAdamConfig
 from leco_plugin.models.compute.ranks import averaging, mean
 from leco_plugin.models.leco import LecoModel
 from leco_plugin.models.leco_config import LecoModelConfig

@@ -261,8 +261,10 @@ class Learner:
         """
         mixture, progress, schedule = self.mixture, self.progress, self.config.schedule
         share(mixture.gate.state_dict().values())
-        measured, report = from_first(self.held_out.price, mixture.device)
         seconds = round(progress.learn_seconds, 2)
+        measured, report, seconds = from_first(
+            lambda: (*self.held_out.price(), seconds), mixture.device
+        )
         report |= {"step": step, "train_seconds": seconds, "recoveries": progress.recoveries}
         mixture.freeze(measured.threshold, report)
         say(

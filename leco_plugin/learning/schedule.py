@@ -16,6 +16,9 @@ KEPT_ABOVE = 0.1
 MOST_EXTENSIONS = 2
 """How often a gate that has not settled is given more steps."""
 
+RATES = {"encoding": 2e-2, "field": 1e-2, "gate": 5e-3}
+"""Learning rates of `leco-occupancy` for each of its parameter groups."""
+
 
 @dataclass(frozen=True)
 class ScheduleConfig:

@@ -1,13 +1,11 @@
-"""What a device is fastest in: precision, memory and optimizer."""
+"""What a device is fastest in: precision and memory."""
 
 from __future__ import annotations
 
 import ctypes
 import sys
-from dataclasses import dataclass
 
 import torch
-from nerfstudio.engine.optimizers import AdamOptimizerConfig
 
 from leco_plugin.occupancy import Precision
 
@@ -50,19 +48,3 @@ def keep_freed_memory() -> None:
     m_trim_threshold, m_mmap_threshold = -1, -3
     mallopt(m_mmap_threshold, 1 << 30)
     mallopt(m_trim_threshold, (1 << 31) - 1)
-
-
-RATES = {"encoding": 2e-2, "field": 1e-2, "gate": 5e-3}
-"""Learning rates of `leco-occupancy` for each of its parameter groups."""
-
-
-@dataclass
-class FusedAdamConfig(AdamOptimizerConfig):
-    """Adam, all parameters of a group in one kernel"""
-
-    lr: float = 1e-2
-    """Learning rate."""
-    eps: float = 1e-15
-    """Small, because the gradients of a hash table are (Instant-NGP, section 4)."""
-    fused: bool = True
-    """One kernel for all parameters."""

@@ -9,13 +9,12 @@ import torch
 
 from leco_plugin.models.field import HMoEField
 from leco_plugin.models.gate import LARGEST_SIZES, Gate, check_sizes
-from leco_plugin.models.sizing.sizes import Sizes
+from leco_plugin.models.sizing.sizes import CLI, Sizes
 
 BYTES_PER_VALUE = 16
 """A float32 weight, its gradient, and the two moments of Adam."""
 LARGEST_IN_FIELD = {**LARGEST_SIZES, "log2_table": 28}
 """Of the field, which no file has to hold."""
-CLI = "--pipeline.model.sizes"
 
 
 def values_of(sizes: Sizes, images: int) -> int:

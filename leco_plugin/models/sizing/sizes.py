@@ -10,6 +10,9 @@ from leco_plugin.models.field import FieldConfig
 from leco_plugin.models.gate import GateConfig
 from leco_plugin.models.hmoe import HMoEConfig
 
+CLI = "--pipeline.model.sizes"
+"""How messages name an option of these."""
+
 
 @dataclass(frozen=True)
 class Sizes:

@@ -12,8 +12,7 @@ from leco_plugin.models.encodings import EncodingConfig
 from leco_plugin.models.field import FieldConfig
 from leco_plugin.models.gate import GateConfig
 from leco_plugin.models.hmoe import HMoEConfig
-from leco_plugin.models.sizing.size_limits import CLI
-from leco_plugin.models.sizing.sizes import Sizes, left_open, size_at, with_size
+from leco_plugin.models.sizing.sizes import CLI, Sizes, left_open, size_at, with_size
 from leco_plugin.scenes.input_error import InputError
 
 SIZES = "sizes"

@@ -8,7 +8,6 @@ octaves from metres to decimetres, each faded out where a pixel is larger than i
 from __future__ import annotations
 
 import numpy as np
-import trimesh
 from numpy.typing import NDArray
 
 from leco_plugin.scenes.city.cameras import Lens
@@ -174,6 +173,8 @@ class Tracer:
     """Casts rays at a city."""
 
     def __init__(self, city: City) -> None:
+        import trimesh  # only here: the paint is also used on machines without it
+
         self.city = city
         corners = city.triangles.reshape(-1, 3)
         faces = np.arange(len(corners)).reshape(-1, 3)
