@@ -83,6 +83,14 @@ class Measured(NamedTuple):
     price_error_db: float = 0.0
     """Standard error of `image_price_db`."""
 
+    @property
+    def line(self) -> str:
+        """In the words of the log."""
+        return (
+            f"skips {self.empty_fraction:.1%} for {self.image_price_db:+.3f} dB and "
+            f"{self.lost_surface_mass:.2e} of the surface mass"
+        )
+
     def within(self, config: CalibrationConfig) -> bool:
         """Whether neither price is found to be beyond its bound, by `SURE` standard errors, nor
         beyond `MOST` times the bound at all.

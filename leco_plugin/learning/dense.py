@@ -11,7 +11,7 @@ from torch import Tensor, nn
 
 from leco_plugin.learning.calibration import Reference, reference_of
 from leco_plugin.models.mixture import Mixture
-from leco_plugin.models.rendering import Intervals, Rays
+from leco_plugin.models.rendering import Intervals, Rays, mapped_middles
 
 
 class DenseRendering(NamedTuple):
@@ -56,7 +56,11 @@ def dense_rendering(
 def dense_reference(mixture: Mixture, rays: Rays) -> Reference:
     """All candidates of some rays rendered, as the reference that skipping is measured against."""
     intervals = mixture.with_backdrops(rays, mixture.candidates(rays))
-    return reference_of(mixture.shade(rays, intervals), intervals, rays)
+    reference = reference_of(mixture.shade(rays, intervals), intervals, rays)
+    if mixture.small is None:
+        return reference
+    mapped = mapped_middles(mixture.region.space, rays, intervals)
+    return reference._replace(occupancies=mixture.occupancies(mapped))
 
 
 def in_chunks(rays: Rays, at_once: int) -> list[Rays]:

@@ -15,7 +15,9 @@ from leco_plugin.learning.calibration import CalibrationConfig, Measured, calibr
 from leco_plugin.learning.dense import dense_rendering, evaluating
 from leco_plugin.learning.freezing import price
 from leco_plugin.learning.merging import Merging, find_unneeded
+from leco_plugin.learning.sharpening import Sharpened, SharpeningConfig, sharpen
 from leco_plugin.models.mixture import Mixture
+from leco_plugin.models.objective import GateLossConfig
 from leco_plugin.models.rendering import Rays
 
 if TYPE_CHECKING:
@@ -76,6 +78,14 @@ class HeldOut:
     def count_rays(self, limit: int) -> float:
         """See `price_watch.Renderer`."""
         return self.data.count_held_out(limit)
+
+    def sharpened(
+        self, losses: GateLossConfig, config: SharpeningConfig, guided: bool
+    ) -> Sharpened:
+        """A small gate that training pixels teach and these calibrate; see `sharpen`."""
+        taught = self.data.training_rays(self.mixture, config.rays)
+        rays = self.rays(self.config.rays)
+        return sharpen(self.mixture, taught, rays, losses, self.config, config, guided)
 
     def unneeded(self, count: int, bound: float) -> Merging:
         """Scene experts without which the image loses no more than `bound` dB."""

@@ -11,6 +11,7 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import save
 from torch import Tensor
 
+from leco_plugin.log import say
 from leco_plugin.models.compute.ranks import share
 from leco_plugin.models.gate import Gate
 from leco_plugin.models.losses import expert_shares
@@ -142,6 +143,13 @@ class GateHistory:
         content = save(tensors, metadata={"format": FORMAT})
         write_whole(path, lambda file: file.write(content))
         return path
+
+    def leave(self, folder: Path) -> None:
+        """Saves it; a disk that is full is said in one line."""
+        try:
+            self.save(folder)
+        except OSError as error:
+            say(f"the history of the gate could not be written ({error})")
 
     @classmethod
     def load(cls, path: Path, gate: Gate) -> GateHistory:

@@ -6,7 +6,7 @@ The learner knows no trainer: it is told of each step, and asks a `Run` for what
 from __future__ import annotations
 
 import math
-from dataclasses import replace
+import time
 from functools import cached_property
 from typing import TYPE_CHECKING, Protocol
 
@@ -30,8 +30,10 @@ from leco_plugin.learning.schedule import (
     decisions_agree,
     is_unsettled,
     ramp,
+    schedule_since,
     steps_of_an_extension,
 )
+from leco_plugin.learning.sharpening import SharpeningConfig
 from leco_plugin.log import say
 from leco_plugin.models.compute.ranks import from_first, mean, share
 from leco_plugin.models.gate import occupancy_from_logits
@@ -53,6 +55,7 @@ class LearnerConfig(Protocol):
     gate_loss: GateLossConfig
     calibration: CalibrationConfig
     merging: MergingConfig
+    sharpening: SharpeningConfig
     termination: float
     look_everywhere: float
     likely_above: float
@@ -129,7 +132,7 @@ class Learner:
         assert folder is not None and resumed is not None
         self.history = GateHistory.gone_on_from(resumed, self.run.start, self.mixture.gate)
         if len(self.history):
-            self._save_history()
+            self.history.leave(folder)
         if bool(self.mixture.frozen):
             leave_file(self.mixture.occupancy(), folder)
             carry_over(resumed, folder)
@@ -187,6 +190,8 @@ class Learner:
             return
         if bool(self.mixture.frozen):
             self._watch(step, seconds, kept)
+            if self.config.sharpening.steps > 0 and step + 1 >= self.run.end:
+                self._sharpen(step, guided=True)
         else:
             self.progress.learn_seconds += seconds
             self._after_learning_step(step)
@@ -260,6 +265,7 @@ class Learner:
         In every process of a data-parallel run the gate is that of the first one, and its price.
         """
         mixture, progress, schedule = self.mixture, self.progress, self.config.schedule
+        config = self.config.sharpening
         share(mixture.gate.state_dict().values())
         seconds = round(progress.learn_seconds, 2)
         measured, report, seconds = from_first(
@@ -269,9 +275,7 @@ class Learner:
         mixture.freeze(measured.threshold, report)
         say(
             f"occupancy learned in {progress.learn_seconds:.0f} s: threshold "
-            f"{measured.threshold:.4f} skips {measured.empty_fraction:.1%} of all candidates for "
-            f"{measured.image_price_db:+.3f} dB and {measured.lost_surface_mass:.2e} of the "
-            f"surface mass ({measured.lost_mass:.2e} of all)"
+            f"{measured.threshold:.4f} {measured.line} ({measured.lost_mass:.2e} of all)"
         )
         advice = advice_on(measured, step + 1 - progress.since, progress.recoveries)
         if advice is not None:
@@ -283,6 +287,8 @@ class Learner:
             leave_field(mixture, self.run.folder)
         if self.run.goes_on and not schedule.restart:
             self._merge()
+            if config.steps > 0 and self.run.end - step >= config.least_left:
+                self._sharpen(step, guided=False)
         progress.watch = self.watch.state = WatchState()
         progress.suspected_since = -1  # of the gate as it is now
         if schedule.steps_per_record > 0:
@@ -291,6 +297,29 @@ class Learner:
             self.recoveries.restart_field()
             say("the field starts anew, guided from its first step")
         self.run.save(step)  # a run killed from now on stays frozen
+
+    def _sharpen(self, step: int, guided: bool) -> None:
+        """Has a small gate skip in place of the learned one where it skips more, and says so.
+
+        Args:
+            guided: whether the field has been trained guided since the gate was frozen.
+        """
+        mixture, config, started = self.mixture, self.config, time.monotonic()
+        found = from_first(
+            lambda: self.held_out.sharpened(config.gate_loss, config.sharpening, guided),
+            mixture.device,
+        )
+        seconds = time.monotonic() - started
+        say(
+            f"step {step}: a gate of {found.params:,} values, taught in {seconds:.0f} s, {found.line}"
+        )
+        if not found.pays:
+            return
+        report = found.report(mixture.report, guided) | {"sharpened": [step, round(seconds, 2)]}
+        mixture.sharpen(found.gate.to(mixture.device), found.measured.threshold, report)
+        self.watch.state.evidence = {}  # of what guided before
+        if self.run.folder is not None:
+            leave_file(mixture.occupancy(), self.run.folder)
 
     def _merge(self) -> None:
         """Drops the scene experts that a frozen mixture does not need, and says so.
@@ -340,9 +369,7 @@ class Learner:
         )
         self.watch.state.evidence = {}
         now = (
-            f"threshold {before:.4f} lowered to {measured.threshold:.4f}, which skips "
-            f"{measured.empty_fraction:.1%} for {measured.image_price_db:+.3f} dB and "
-            f"{measured.lost_surface_mass:.2e} of the surface mass"
+            f"threshold {before:.4f} lowered to {measured.threshold:.4f}, which {measured.line}"
             if measured.threshold > 0.0
             else "no threshold is low enough: from now on nothing is skipped"
         )
@@ -354,19 +381,7 @@ class Learner:
             return
         found = self.probes.routes_and_densities()
         self.history.look(step, self.progress.learn_seconds, self.mixture.gate, *found)
-        self._save_history()
-
-    def _save_history(self) -> None:
-        assert self.run.folder is not None
-        try:
-            self.history.save(self.run.folder)
-        except OSError as error:
-            say(f"the history of the gate could not be written ({error})")
-
-
-def schedule_since(schedule: ScheduleConfig, progress: Progress) -> ScheduleConfig:
-    """The schedule of what has begun at `progress.began`."""
-    return replace(schedule, learn_steps=progress.learn_steps - progress.began)
+        self.history.leave(self.run.folder)
 
 
 def plan_of(

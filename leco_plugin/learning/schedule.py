@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 from torch import Tensor
 
+from leco_plugin.learning.progress import Progress
 from leco_plugin.models.mixture import Following
 from leco_plugin.models.objective import GateLossConfig
 from leco_plugin.scenes.input_error import InputError
@@ -80,6 +81,11 @@ def converged(step: int, agreement: float, config: ScheduleConfig) -> bool:
 def steps_of_an_extension(learn_steps: int) -> int:
     """Steps that a gate gets beyond those of its config, each time that it has not settled."""
     return max(1, learn_steps // 4)
+
+
+def schedule_since(schedule: ScheduleConfig, progress: Progress) -> ScheduleConfig:
+    """The schedule of what has begun at `progress.began`."""
+    return replace(schedule, learn_steps=progress.learn_steps - progress.began)
 
 
 def is_unsettled(step: int, agreement: float, config: ScheduleConfig, extensions: int) -> bool:

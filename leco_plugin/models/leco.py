@@ -161,7 +161,7 @@ class LecoModel(Model):
             self.kept_per_ray = kept if mixture.skips else 1.0
             shaded = mixture.shade(rays, intervals)
             likely = max(KEPT_ABOVE, self.config.likely_above)
-            above = float(mixture.threshold) if bool(mixture.frozen) else likely
+            above = 0.0 if bool(mixture.frozen) else likely  # a frozen gate has left out the others
             return {
                 "rgb": shaded.rgb,
                 "depth": shaded.depth[:, None],

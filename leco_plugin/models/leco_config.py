@@ -9,6 +9,7 @@ from nerfstudio.models.base_model import ModelConfig
 from leco_plugin.learning.calibration import CalibrationConfig
 from leco_plugin.learning.merging import MergingConfig
 from leco_plugin.learning.schedule import ScheduleConfig
+from leco_plugin.learning.sharpening import SharpeningConfig
 from leco_plugin.models.objective import GateLossConfig
 from leco_plugin.models.sizing.sizes import SMALL, Sizes
 from leco_plugin.occupancy import Precision
@@ -42,6 +43,8 @@ class LecoModelConfig(ModelConfig):
     """What skipping may cost."""
     merging: MergingConfig = field(default_factory=MergingConfig)
     """Which scene experts are left when the gate is frozen."""
+    sharpening: SharpeningConfig = field(default_factory=SharpeningConfig)
+    """How a small gate is taught by the field, and skips in place of the learned one."""
     distortion: float = 0.05
     """Weight of the distortion loss, which clears haze (mip-NeRF 360, eq. 15)."""
     termination: float = 0.03

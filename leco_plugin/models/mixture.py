@@ -1,7 +1,7 @@
 """The mixture that learns an occupancy: gate, field and region, and how rays pass through them.
 
-It knows no schedule and no trainer. Only `freeze` and `reopen` write whether the gate is frozen,
-and its threshold.
+It knows no schedule and no trainer. Only `freeze`, `sharpen` and `reopen` write whether the gate is
+frozen, and its threshold.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from torch import Tensor, nn
 
 from leco_plugin.models.field import HMoEField
 from leco_plugin.models.front_to_back import shade_front_to_back
-from leco_plugin.models.gate import Gate
+from leco_plugin.models.gate import Gate, GateConfig
 from leco_plugin.models.region import Region, marching_rule
 from leco_plugin.models.rendering import (
     Intervals,
@@ -56,6 +56,7 @@ class Mixture(nn.Module):
         frozen: scalar bool, whether the gate is frozen.
         threshold: scalar, o(x) from which a frozen gate keeps a candidate; at 0 all are kept.
         report: what the frozen gate costs and saves, as its file has it.
+        small: a gate that says in place of the frozen one what is empty; None where there is none.
     """
 
     frozen: Tensor
@@ -76,6 +77,7 @@ class Mixture(nn.Module):
         self.register_buffer("steps", torch.tensor([0.03, 0.06]))
         self.register_buffer("cones", torch.tensor([0.0, 0.0]))
         self.report: dict[str, Any] = {}
+        self.small: Gate | None = None
         # in a tuple: the estimator shares the gate, which must not be registered twice
         self._estimator: tuple[LearnedOccupancyEstimator, ...] = ()
 
@@ -93,6 +95,12 @@ class Mixture(nn.Module):
     def skips(self) -> bool:
         """Whether a frozen gate leaves out any candidate."""
         return bool(self.frozen) and float(self.threshold) > 0.0
+
+    @torch.no_grad()
+    def occupancies(self, mapped: Tensor) -> Tensor:
+        """o(x) by the gate that skips: mapped positions [M, 3] in [-1, 1] to [M]."""
+        with gate_precision(self.device.type, self.precision):
+            return (self.small or self.gate).occupancy(mapped)
 
     def set_bounds(self, bounds: SceneBounds, median_length: float) -> None:
         """Fixes the region and the marches.
@@ -190,9 +198,19 @@ class Mixture(nn.Module):
         self.report = report
         self._estimator = ()
 
+    def sharpen(self, small: Gate, threshold: float, report: dict[str, Any]) -> None:
+        """Has a small gate say from now on what is empty; the frozen one goes on routing.
+
+        Args:
+            threshold, report: of the small gate, as for `freeze`.
+        """
+        self.small = small.requires_grad_(False)
+        self.freeze(threshold, report)
+
     @torch.no_grad()
     def reopen(self) -> None:
-        """Has a frozen gate learn again."""
+        """Has a frozen gate learn again; a small one leaves."""
+        self.small = None
         self.threshold.fill_(0.0)
         self.frozen.fill_(False)
         self.gate.requires_grad_(True)
@@ -212,10 +230,15 @@ class Mixture(nn.Module):
         self.gate.load_state_dict(Gate(self.gate.config).state_dict())
 
     def occupancy(self) -> Occupancy:
-        """The gate as an `Occupancy`; it shares the gate's parameters."""
+        """The gate that skips as an `Occupancy`; it shares the gate's parameters."""
         region, threshold = self.region, float(self.threshold)
         made = Occupancy(
-            self.gate, region.space, threshold, self.precision, self.report, region.aabb
+            self.small or self.gate,
+            region.space,
+            threshold,
+            self.precision,
+            self.report,
+            region.aabb,
         )
         return made.to(self.device)
 
@@ -245,6 +268,7 @@ class Mixture(nn.Module):
             "precision": self.precision,
             "routing": self.routing._asdict(),
             "report": self.report,
+            "small": None if self.small is None else self.small.config.to_dict(),
         }
 
     def _load_from_state_dict(self, state_dict: dict[str, Any], prefix: str, *rest: Any) -> None:
@@ -264,6 +288,10 @@ class Mixture(nn.Module):
                 device = self.device
                 self._build(*stored)
                 self.to(device)
+            small = extra["small"]
+            self.small = (
+                None if small is None else Gate(GateConfig.from_dict(small)).to(self.device)
+            )
         super()._load_from_state_dict(state_dict, prefix, *rest)
 
     def set_extra_state(self, state: dict[str, Any]) -> None:
@@ -271,4 +299,6 @@ class Mixture(nn.Module):
         self.precision, self.report = state["precision"], dict(state["report"])
         self.routing = Routing(**state["routing"])
         self.gate.requires_grad_(not bool(self.frozen))
+        if self.small is not None:
+            self.small.requires_grad_(False)
         self._estimator = ()

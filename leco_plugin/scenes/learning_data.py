@@ -6,6 +6,7 @@ import math
 from functools import cached_property
 from typing import Any
 
+import torch
 from nerfstudio.cameras.rays import RayBundle
 from torch import Tensor
 
@@ -83,6 +84,19 @@ class LearningData:
     ) -> tuple[Rays, Tensor]:
         """See `held_out_rays`."""
         return held_out_rays(mixture, self.manager, count, seed, share)
+
+    def training_rays(self, mixture: Mixture, count: int) -> Rays:
+        """Rays of random training pixels, cut to a mixture's region; those of whole batches."""
+        self.prepare_batch(1.0, distances=False)
+        drawn: list[Rays] = []
+        while sum(len(rays.origins) for rays in drawn) < count:
+            bundle, _ = self.manager.next_train(0)
+            bundle = bundle.to(mixture.device)
+            images = bundle.camera_indices[:, 0]
+            drawn.append(mixture.rays(bundle.origins, bundle.directions, images))
+        return Rays(
+            *(None if parts[0] is None else torch.cat(parts)[:count] for parts in zip(*drawn))
+        )
 
     def count_held_out(self, limit: int) -> float:
         """How many pixels there are to check with, up to a limit; endless if none is held out."""

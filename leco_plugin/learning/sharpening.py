@@ -1,0 +1,269 @@
+"""Sharpening: a small gate that the field teaches anew, and that skips more than the learned one.
+
+While a gate is learned, haze teaches it too, and it also has to route points to experts. Once it is
+frozen the field knows better: its rendering weights along training rays teach a fresh gate of a few
+thousand values, which only has to say what is empty. It is calibrated like the first one, and
+guides from then on where it skips more. The large gate goes on routing.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Any, NamedTuple
+
+import torch
+from torch import Tensor
+from torch.nn.functional import softplus
+
+from leco_plugin.learning.calibration import (
+    CalibrationConfig,
+    Measured,
+    Reference,
+    calibrate,
+    measure,
+    reference_of,
+)
+from leco_plugin.learning.dense import DenseRendering, evaluating, in_chunks
+from leco_plugin.learning.schedule import RATES
+from leco_plugin.models.encodings import EncodingConfig
+from leco_plugin.models.gate import Gate, GateConfig, occupancy_logit
+from leco_plugin.models.losses import widen
+from leco_plugin.models.mixture import Mixture
+from leco_plugin.models.objective import GateLossConfig
+from leco_plugin.models.rendering import Intervals, Rays, Shaded, backdrop_of, mapped_middles
+from leco_plugin.occupancy import Precision, gate_precision
+from leco_plugin.scenes.input_error import require
+
+BATCH = 1 << 14
+LAST_RATE = 0.05
+"""Of the learning rate, after a half cosine."""
+
+
+@dataclass(frozen=True)
+class SharpeningConfig:
+    """When and how a small gate is taught by the field."""
+
+    steps: int = 500
+    """Of teaching, each with 16,384 positions; 0 never sharpens."""
+    least_left: int = 1000
+    """Steps that must be left when the gate is frozen for it to be sharpened then too; at the end
+    of a run it always is."""
+    rays: int = 1 << 15
+    """Training rays that teach. With a quarter of them a gate learns the rays, not the scene."""
+    seen: float = 0.125
+    """Share of the threshold from which a candidate is rendered to teach: what lies below it counts
+    as empty, and saves half of the time."""
+    gate: GateConfig = field(
+        default_factory=lambda: GateConfig(EncodingConfig(octaves=6), 32, 2, 1, normed=False)
+    )
+    """The small gate."""
+
+    def __post_init__(self) -> None:
+        require(self.steps >= 0, "sharpening.steps", self.steps, "at least 0")
+        require(self.rays >= 1, "sharpening.rays", self.rays, "at least 1")
+        require(0.0 <= self.seen <= 1.0, "sharpening.seen", self.seen, "from 0 to 1")
+
+
+class Sharpened(NamedTuple):
+    """A small gate, and what it does on held-out rays."""
+
+    gate: Gate
+    measured: Measured
+    before: Measured
+    """The same of what has guided so far."""
+
+    @property
+    def pays(self) -> bool:
+        """Whether it skips more."""
+        return self.measured.empty_fraction > self.before.empty_fraction
+
+    @property
+    def params(self) -> int:
+        """Learned values of the gate."""
+        return sum(parameter.numel() for parameter in self.gate.parameters())
+
+    @property
+    def line(self) -> str:
+        """What it does, in the words of the log."""
+        end = "" if self.pays else "; that is no more, and the gate stays"
+        return f"{self.measured.line}, where {self.before.empty_fraction:.1%} were skipped{end}"
+
+    def report(self, before: dict[str, Any], guided: bool) -> dict[str, Any]:
+        """The report of an occupancy of this gate.
+
+        Args:
+            before: of what has guided so far; where the field was trained guided, the losses that
+                it declares are added.
+        """
+        found = self.measured._asdict()
+        if guided:
+            for name in ("lost_surface_mass", "lost_mass", "image_price_db"):
+                found[name] += max(0.0, float(before[name]))
+        return before | found | {"params": self.params}
+
+
+class Lesson(NamedTuple):
+    """How much each position speaks for being kept, and for being skipped."""
+
+    mapped: Tensor
+    """[M, 3] in [-1, 1]."""
+    keep: Tensor
+    """[M] weight of -log o(x)."""
+    skip: Tensor
+    """[M] weight of -log(1 - o(x))."""
+
+
+def sharpen(
+    mixture: Mixture,
+    taught: Rays,
+    held_out: tuple[Rays, Tensor],
+    losses: GateLossConfig,
+    calibration: CalibrationConfig,
+    config: SharpeningConfig,
+    guided: bool,
+) -> Sharpened:
+    """Teaches a small gate by a frozen mixture's field, and calibrates it; changes nothing.
+
+    Args:
+        taught: training rays, cut to the region.
+        held_out: rays that nothing was trained on, and their colours [R, 3].
+        losses: whose contribution loss teaches.
+        calibration: what skipping may cost.
+        guided: whether the field has been trained guided. It then knows only what is kept, and
+            prices are of skipping more than before; else they are of all skipping.
+    """
+    at_once = calibration.rays_at_once
+    with evaluating(mixture):
+        lesson = lesson_by(mixture, taught, losses, 1.0 if guided else config.seen, at_once)
+        gate = teach(config.gate, lesson, config.steps, mixture.precision)
+        round_weights(gate)
+        rays, truth = held_out
+        rendering = seen_rendering(mixture, rays, truth, 1.0 if guided else 0.0, at_once)
+        before = measure(*rendering, float(mixture.threshold))
+        asked = [
+            reference._replace(occupancies=answers(mixture, gate, chunk, reference.intervals))
+            for chunk, reference in zip(in_chunks(rays, at_once), rendering.references)
+        ]
+        measured = calibrate(asked, *rendering[1:], calibration)
+    return Sharpened(gate, measured, before)
+
+
+@torch.no_grad()
+def lesson_by(
+    mixture: Mixture, rays: Rays, losses: GateLossConfig, seen: float, rays_at_once: int
+) -> Lesson:
+    """What a field has to teach along rays: the targets of the contribution loss at all candidates.
+
+    Args:
+        rays: cut to the mixture's region.
+        losses: w_0 and k of the loss.
+        seen: share of the threshold from which a candidate is rendered; 0 renders all.
+    """
+    positions, targets = [], []
+    for chunk in in_chunks(rays, rays_at_once):
+        reference, mapped = _rendered(mixture, chunk, seen)
+        before = ~reference.always_kept
+        rays_of = reference.intervals.ray_indices[before]
+        wide = widen(reference.weights[before], rays_of[1:] == rays_of[:-1])
+        positions.append(mapped[before])
+        targets.append((wide / losses.weight_at_full).clamp(max=1.0))
+    target = torch.cat(targets)
+    return Lesson(torch.cat(positions), losses.emphasis * target, 1.0 - target)
+
+
+def seen_rendering(
+    mixture: Mixture, rays: Rays, truth: Tensor, seen: float, rays_at_once: int
+) -> DenseRendering:
+    """As `dense_rendering`, where candidates below a share of the threshold are not rendered and
+    have no weight. Guided training has not taught the field what is there."""
+    chunks = in_chunks(rays, rays_at_once)
+    references = [_rendered(mixture, chunk, seen)[0] for chunk in chunks]
+
+    @torch.no_grad()
+    def render_kept(number: int, mask: Tensor) -> Tensor:
+        kept = Intervals(*(part[mask] for part in references[number].intervals))
+        return mixture.shade(chunks[number], kept).rgb
+
+    return DenseRendering(references, list(truth.split(rays_at_once)), render_kept)
+
+
+@torch.no_grad()
+def _rendered(mixture: Mixture, rays: Rays, seen: float) -> tuple[Reference, Tensor]:
+    """All candidates of rays with the weights of those that are seen; and where they lie, [M, 3]
+    in [-1, 1]."""
+    intervals = mixture.with_backdrops(rays, mixture.candidates(rays))
+    mapped = mapped_middles(mixture.region.space, rays, intervals)
+    occupancies = mixture.occupancies(mapped)
+    drawn = occupancies >= seen * mixture.threshold
+    drawn |= backdrop_of(intervals, rays)
+    some = Intervals(*(part[drawn] for part in intervals))
+    shaded: Shaded = mixture.shade(rays, some)
+    small = reference_of(shaded, some, rays)
+    weights = torch.zeros_like(occupancies)
+    surface = torch.zeros_like(drawn)
+    weights[drawn], surface[drawn] = small.weights.float(), small.near_surface
+    is_backdrop = backdrop_of(intervals, rays)
+    return Reference(intervals, weights, occupancies, surface, small.rgb, is_backdrop), mapped
+
+
+@torch.no_grad()
+def answers(mixture: Mixture, gate: Gate, rays: Rays, intervals: Intervals) -> Tensor:
+    """What a gate says of packed intervals: o(x), [M]."""
+    mapped = mapped_middles(mixture.region.space, rays, intervals)
+    with gate_precision(mapped.device.type, mixture.precision):
+        return gate.occupancy(mapped)
+
+
+def teach(
+    config: GateConfig,
+    lesson: Lesson,
+    steps: int,
+    precision: Precision,
+    seed: int = 0,
+    rate: float = 2.0 * RATES["gate"],
+    on_progress: Callable[[float], None] | None = None,
+) -> Gate:
+    """A gate that was taught by a lesson, in the precision of its later queries.
+
+    Minimises mean[-keep log o - skip log(1 - o)], the contribution loss with given targets.
+
+    Args:
+        steps: of Adam, on `BATCH` positions each.
+        rate: of networks; tables learn at least as fast as those of a field.
+    """
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(seed)
+        gate = Gate(config).to(lesson.mapped.device)
+    tables = list(gate.encoding.parameters())
+    known = {id(table) for table in tables}
+    groups = [{"params": [p for p in gate.parameters() if id(p) not in known], "lr": rate}]
+    if tables:
+        groups.append({"params": tables, "lr": max(rate, RATES["encoding"])})
+    optimizer = torch.optim.Adam(groups, eps=1e-15, fused=True)
+    schedule = torch.optim.lr_scheduler.LambdaLR(
+        optimizer,
+        lambda step: LAST_RATE + (1 - LAST_RATE) * 0.5 * (1 + math.cos(math.pi * step / steps)),
+    )
+    generator = torch.Generator().manual_seed(seed)
+    for step in range(steps):
+        drawn = torch.randint(len(lesson.mapped), (BATCH,), generator=generator)
+        mapped, keep, skip = (part[drawn.to(part.device)] for part in lesson)
+        with gate_precision(mapped.device.type, precision):
+            occupied = occupancy_logit(gate(mapped))
+        value = (keep * softplus(-occupied) + skip * softplus(occupied)).mean()
+        optimizer.zero_grad(set_to_none=True)
+        value.backward()
+        optimizer.step()
+        schedule.step()
+        if on_progress is not None:
+            on_progress((step + 1) / steps)
+    return gate.requires_grad_(False).eval()
+
+
+@torch.no_grad()
+def round_weights(gate: torch.nn.Module) -> None:
+    """Rounds all numbers of a gate, or of a part of it, to bfloat16."""
+    for parameter in gate.parameters():
+        parameter.copy_(parameter.bfloat16().float())
