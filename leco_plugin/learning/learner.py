@@ -42,8 +42,10 @@ if TYPE_CHECKING:
     from leco_plugin.scenes.learning_data import LearningData
 
 FEWEST_KEPT = 0.5
-"""Samples a ray from which, by its calibration, an occupancy keeps something in every batch: fewer
-are right where there is nothing."""
+"""An occupancy that is expected to keep fewer samples a ray than this may rightly keep none in a
+batch: no alarm then."""
+NEARLY_ALL = 0.95
+"""Share of the probe positions above which a gate has found nothing empty yet."""
 
 
 class LearnerConfig(Protocol):
@@ -63,7 +65,7 @@ class Learner:
     """Carries one run of a mixture from its first step to its last.
 
     Args:
-        mixture: gate and field; the learner alone freezes and opens the gate.
+        mixture: gate and field; the learner and its recoveries alone freeze and open the gate.
         data: batches, held-out pixels and the scene's place.
         run: what is around the steps.
         config: of the method.
@@ -116,7 +118,8 @@ class Learner:
     def _say_if_short(self, most: int, steps: int) -> None:
         """Says so before a run of few steps that learns for fewer than are configured."""
         configured = self.config.schedule.learn_steps
-        if most < configured != self.progress.configured:
+        known = configured == self.progress.configured  # a resumed run has said so before
+        if most < configured and not known:
             say(
                 f"a run of {steps} steps learns the occupancy in "
                 f"its first half: until step {self.progress.since + most}, not for the "
@@ -140,8 +143,11 @@ class Learner:
         return Probes(self.mixture, self.data.survey)
 
     def before_step(self, step: int) -> StepPlan:
-        """How a step samples and what it teaches: by its number alone, so that a resumed run is
-        where it was."""
+        """Prepares the batch, and says how the step samples and what it teaches.
+
+        Both follow from the step's number, the progress and whether the gate is frozen, which
+        checkpoints hold: a resumed run is where it was.
+        """
         config, progress, frozen = self.config, self.progress, bool(self.mixture.frozen)
         never_frozen = config.homogeneous or not config.schedule.freeze
         self.over = never_frozen and step >= progress.learn_steps
@@ -164,7 +170,7 @@ class Learner:
             progress.learning_kept = 1.0
         progress.learning_kept = mean(progress.learning_kept, self.mixture.device)
         wanted = min(self.mixture.sizes.guided_batch, 1.0 / progress.learning_kept)
-        return round(8 * wanted) / 8  # of few sizes; see `steady`
+        return round(8 * wanted) / 8  # of few sizes; see `dispatch.steady_size`
 
     def _guided_batch(self) -> float:
         """Rays of a guided batch as a multiple: about as many samples are shaded as before."""
@@ -225,13 +231,13 @@ class Learner:
         progress.decisions = kept
         if not schedule.freeze or (progress.suspected_since >= 0 and not last):
             return False
-        if not last and float(kept.float().mean()) > 0.95:
+        if not last and float(kept.float().mean()) > NEARLY_ALL:
             return False  # it agrees with itself only because it has found nothing empty yet
-        since, of_those = step - progress.began, schedule_since(self.config.schedule, progress)
-        unsettled = last and is_unsettled(since, agreement, of_those, progress.extensions)
+        age, of_those = step - progress.began, schedule_since(self.config.schedule, progress)
+        unsettled = last and is_unsettled(age, agreement, of_those, progress.extensions)
         if unsettled and self._extends(step, agreement):
             return False
-        if not converged(since, agreement, of_those):
+        if not converged(age, agreement, of_those):
             return False
         say(
             f"step {step}: {agreement:.1%} of {len(kept)} decisions are those of "
@@ -310,9 +316,9 @@ class Learner:
         """Looks at a guided step: skips less where skipping costs too much, and opens a gate that
         keeps nothing of what the cameras see."""
         mixture = self.mixture
-        wanted = (1.0 - mixture.report["empty_fraction"]) * mixture.sizes.candidates
-        enough = kept if wanted >= FEWEST_KEPT else 1.0
-        finding = self.watch.after_step(step, seconds, enough, mixture.skips)
+        expected = (1.0 - mixture.report["empty_fraction"]) * mixture.sizes.candidates
+        kept_any = kept > 0.0 or expected < FEWEST_KEPT
+        finding = self.watch.after_step(step, seconds, float(kept_any), mixture.skips)
         if finding is None:
             return
         if finding.kind == "nothing kept":

@@ -46,7 +46,8 @@ class ScheduleConfig:
     steps_per_check: int = 25
     """Steps between two looks at the gate."""
     agreement: float = 0.99
-    """Share of probe positions whose decision must be the same in two checks running."""
+    """Share of probe positions whose decision is the same in two checks running, from which on the
+    gate is frozen, after `earliest`."""
 
     def __post_init__(self) -> None:
         for name in ("learn_steps", "steps_per_check"):
@@ -60,6 +61,9 @@ def ramp(step: int, config: ScheduleConfig) -> float:
 
     At once it would press all weight onto the ends of the rays, which is a flat picture behind the
     scene; first the views have to find the surfaces between them.
+
+    Args:
+        step: steps since `Progress.began`.
     """
     start, end = (share * config.learn_steps for share in (config.ramp_from, config.ramp_to))
     return min(1.0, max(0.0, (step - start) / max(1.0, end - start)))
@@ -69,7 +73,7 @@ def converged(step: int, agreement: float, config: ScheduleConfig) -> bool:
     """Whether to freeze at this check.
 
     Args:
-        step: training step.
+        step: steps since `Progress.began`.
         agreement: share of probe decisions equal to those of the check before; 0 at the first.
     """
     if step + 1 >= config.learn_steps:
@@ -86,7 +90,7 @@ def is_unsettled(step: int, agreement: float, config: ScheduleConfig, extensions
     """Whether a gate at its step limit should learn on.
 
     Args:
-        step: training step.
+        step: steps since `Progress.began`.
         agreement: share of probe decisions equal to those of the check before.
         extensions: how often it has learned on already.
     """
