@@ -86,7 +86,7 @@ def bundles_of(manager: Any, device: torch.device) -> list[tuple[Any, torch.Tens
 @torch.no_grad()
 def along_rays(model: LecoModel, bundles: Sequence[Any]) -> dict[str, float]:
     """Means over rays of `candidates`, `coarse`, `formed`, `gate` and `kept`."""
-    mixture, rule = model.mixture, model.mixture.march()
+    mixture, rule = model.mixture, model.mixture.rule()
     sums = dict.fromkeys(("candidates", "coarse", "formed", "gate", "kept"), 0.0)
     total = 0
     for bundle in bundles:

@@ -197,8 +197,7 @@ def share_of_training(occupancy: Occupancy, rounds: int) -> list[Figure]:
 def main(options: Options) -> None:
     torch.manual_seed(0)
     torch.set_num_threads(options.threads)
-    if options.device == "cpu":
-        keep_freed_memory()
+    keep_freed_memory(options.device)
     if options.occupancy is not None:
         occupancy = Occupancy.load(options.occupancy, options.device)
     else:

@@ -63,7 +63,7 @@ def run_demo(
         capture: how it is photographed.
         began: `time.monotonic()` when the command began; by default now.
     Returns:
-        The report (DESIGN, section 8).
+        The report, as `--out` has it.
     Raises:
         ValueError, OSError: the time is no positive number, or `out` cannot be used.
         RuntimeError: the time was over before the occupancy was learned.

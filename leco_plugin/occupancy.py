@@ -45,7 +45,7 @@ class Occupancy(nn.Module):
         gate: the gating network, shared and not frozen by this class. That of a file is frozen.
         space: scene positions to the gate's cube.
         precision: the type of matrix products it was trained and calibrated in; queries keep to it,
-            because the same weights decide otherwise in another one (DESIGN, section 3).
+            because the same weights decide otherwise in another one.
         report: what was measured when it was calibrated, JSON values only.
         walls: [6] min and max corner of the box in which the gate was taught. No ray reached what
             lies outside: it is empty. None is no walls.

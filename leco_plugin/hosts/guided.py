@@ -11,7 +11,6 @@ from contextlib import suppress
 from dataclasses import dataclass, field
 from typing import Any
 
-import torch
 import tyro
 from nerfstudio.models.base_model import Model, ModelConfig
 
@@ -62,8 +61,7 @@ def set_up_guided(config: GuidedModelConfig, **arguments: Any) -> Model:
     allow_checkpoint_globals()
     evaluate_whole_checkpoints()
     install_for(arguments.get("device"))
-    if torch.device(arguments.get("device", "cpu")).type == "cpu":
-        keep_freed_memory()
+    keep_freed_memory(arguments.get("device", "cpu"))
     host_config, occupancy = copy.deepcopy(config.host), config.occupancy
     if config.eval_num_rays_per_chunk is not None:
         host_config.eval_num_rays_per_chunk = config.eval_num_rays_per_chunk

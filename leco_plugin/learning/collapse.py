@@ -65,7 +65,7 @@ def find_collapse(kept_fraction: float, shares: Tensor, has_learned: bool) -> Co
     """The collapse of a gate, if it looks collapsed.
 
     Args:
-        kept_fraction: share of candidates whose o(x) is at least 0.1.
+        kept_fraction: share of the probe positions whose o(x) is at least 0.1.
         shares: [1 + n] share of points at each expert.
         has_learned: whether the gate has called something empty before, or the first phase is
             over. Until then one that keeps everything has only not learned enough yet.

@@ -50,7 +50,7 @@ def price(
         rendering = dense_rendering(mixture, rays, truth, config.rays_at_once)
         measured = calibrate(*rendering, config)
         of_backdrop = backdrop_price(*rendering)
-    march, region = mixture.march(), mixture.region
+    rule, region = mixture.rule(), mixture.region
     return measured, {
         "params": sum(p.numel() for p in mixture.gate.parameters()),
         **measured._asdict(),
@@ -58,8 +58,8 @@ def price(
         "calibration_rays": len(truth),
         "near": float(region.near),
         "far": float(region.far),
-        "step_size": march.step_size,
-        "cone_angle": march.cone_angle,
+        "step_size": rule.step_size,
+        "cone_angle": rule.cone_angle,
         "aabb": region.aabb.tolist(),
     }
 

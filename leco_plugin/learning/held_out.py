@@ -63,8 +63,11 @@ class HeldOut:
             return calibrate(*rendering, config, below=below, missed_only=True)
 
     def excesses(self, seed: int) -> dict[str, Tensor]:
-        """See `price_watch.Renderer`. What is lost near surfaces counts where the photographs miss
-        it: where the gate skips, the field is not trained any more, and shows haze."""
+        """See `price_watch.PriceSource`.
+
+        What is lost near surfaces counts where the photographs miss it: where the gate skips, the
+        field is not trained any more, and shows haze.
+        """
         config, mixture = self.guided, self.mixture
         rays, truth = self.rays(config.recheck_rays, seed, "recheck")
         with evaluating(mixture):
@@ -76,7 +79,7 @@ class HeldOut:
         }
 
     def count_rays(self, limit: int) -> float:
-        """See `price_watch.Renderer`."""
+        """See `price_watch.PriceSource`."""
         return self.data.count_held_out(limit)
 
     def sharpened(

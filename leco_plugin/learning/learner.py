@@ -8,65 +8,49 @@ from __future__ import annotations
 import math
 import time
 from functools import cached_property
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING
 
 from torch import Tensor
 
-from leco_plugin.learning.calibration import CalibrationConfig
-from leco_plugin.learning.collapse import STEPS_PER_LOOK, annealed, is_dense
+from leco_plugin.learning.collapse import STEPS_PER_LOOK, is_dense
 from leco_plugin.learning.freezing import advice_on, carry_over, leave_field, leave_file
 from leco_plugin.learning.held_out import HeldOut
 from leco_plugin.learning.history import GateHistory, Probes
-from leco_plugin.learning.merging import MergingConfig, line_of
+from leco_plugin.learning.merging import line_of
+from leco_plugin.learning.plan import LearnerConfig, StepPlan, plan_of
 from leco_plugin.learning.price_watch import PriceWatch
 from leco_plugin.learning.progress import Progress, WatchState
 from leco_plugin.learning.recoveries import Recoveries
 from leco_plugin.learning.run import Run, keep_pace
 from leco_plugin.learning.schedule import (
     KEPT_ABOVE,
-    ScheduleConfig,
     StepPlan,
     converged,
     decisions_agree,
     is_unsettled,
-    ramp,
     schedule_since,
     steps_of_an_extension,
 )
-from leco_plugin.learning.sharpening import SharpeningConfig
 from leco_plugin.log import say
 from leco_plugin.models.compute.ranks import from_first, mean, share
 from leco_plugin.models.gate import occupancy_from_logits
-from leco_plugin.models.mixture import Following, Mixture
-from leco_plugin.models.objective import GateLossConfig
+from leco_plugin.models.mixture import Mixture
 
 if TYPE_CHECKING:
     from leco_plugin.scenes.learning_data import LearningData
 
 FEWEST_KEPT = 0.5
-"""Samples a ray from which, by its calibration, an occupancy keeps something in every batch: fewer
-are right where there is nothing."""
-
-
-class LearnerConfig(Protocol):
-    """What a learner reads of the settings of a method; see `LecoModelConfig`."""
-
-    schedule: ScheduleConfig
-    gate_loss: GateLossConfig
-    calibration: CalibrationConfig
-    merging: MergingConfig
-    sharpening: SharpeningConfig
-    termination: float
-    look_everywhere: float
-    likely_above: float
-    homogeneous: bool
+"""An occupancy that is expected to keep fewer samples a ray than this may rightly keep none in a
+batch: no alarm then."""
+NEARLY_ALL = 0.95
+"""Share of the probe positions above which a gate has found nothing empty yet."""
 
 
 class Learner:
     """Carries one run of a mixture from its first step to its last.
 
     Args:
-        mixture: gate and field; the learner alone freezes and opens the gate.
+        mixture: gate and field; the learner and its recoveries alone freeze and open the gate.
         data: batches, held-out pixels and the scene's place.
         run: what is around the steps.
         config: of the method.
@@ -119,7 +103,8 @@ class Learner:
     def _say_if_short(self, most: int, steps: int) -> None:
         """Says so before a run of few steps that learns for fewer than are configured."""
         configured = self.config.schedule.learn_steps
-        if most < configured != self.progress.configured:
+        known = configured == self.progress.configured  # a resumed run has said so before
+        if most < configured and not known:
             say(
                 f"a run of {steps} steps learns the occupancy in "
                 f"its first half: until step {self.progress.since + most}, not for the "
@@ -143,8 +128,11 @@ class Learner:
         return Probes(self.mixture, self.data.survey)
 
     def before_step(self, step: int) -> StepPlan:
-        """How a step samples and what it teaches: by its number alone, so that a resumed run is
-        where it was."""
+        """Prepares the batch, and says how the step samples and what it teaches.
+
+        Both follow from the step's number, the progress and whether the gate is frozen, which
+        checkpoints hold: a resumed run is where it was.
+        """
         config, progress, frozen = self.config, self.progress, bool(self.mixture.frozen)
         never_frozen = config.homogeneous or not config.schedule.freeze
         self.over = never_frozen and step >= progress.learn_steps
@@ -167,7 +155,7 @@ class Learner:
             progress.learning_kept = 1.0
         progress.learning_kept = mean(progress.learning_kept, self.mixture.device)
         wanted = min(self.mixture.sizes.guided_batch, 1.0 / progress.learning_kept)
-        return round(8 * wanted) / 8  # of few sizes; see `steady`
+        return round(8 * wanted) / 8  # of few sizes; see `dispatch.steady_size`
 
     def _guided_batch(self) -> float:
         """Rays of a guided batch as a multiple: about as many samples are shaded as before."""
@@ -230,13 +218,13 @@ class Learner:
         progress.decisions = kept
         if not schedule.freeze or (progress.suspected_since >= 0 and not last):
             return False
-        if not last and float(kept.float().mean()) > 0.95:
+        if not last and float(kept.float().mean()) > NEARLY_ALL:
             return False  # it agrees with itself only because it has found nothing empty yet
-        since, of_those = step - progress.began, schedule_since(self.config.schedule, progress)
-        unsettled = last and is_unsettled(since, agreement, of_those, progress.extensions)
+        age, of_those = step - progress.began, schedule_since(self.config.schedule, progress)
+        unsettled = last and is_unsettled(age, agreement, of_those, progress.extensions)
         if unsettled and self._extends(step, agreement):
             return False
-        if not converged(since, agreement, of_those):
+        if not converged(age, agreement, of_those):
             return False
         say(
             f"step {step}: {agreement:.1%} of {len(kept)} decisions are those of "
@@ -311,7 +299,8 @@ class Learner:
         )
         seconds = time.monotonic() - started
         say(
-            f"step {step}: a gate of {found.params:,} values, taught in {seconds:.0f} s, {found.line}"
+            f"step {step}: a gate of {found.params:,} values, taught in {seconds:.0f} s, "
+            f"{found.line}"
         )
         if not found.pays:
             return
@@ -339,9 +328,9 @@ class Learner:
         """Looks at a guided step: skips less where skipping costs too much, and opens a gate that
         keeps nothing of what the cameras see."""
         mixture = self.mixture
-        wanted = (1.0 - mixture.report["empty_fraction"]) * mixture.sizes.candidates
-        enough = kept if wanted >= FEWEST_KEPT else 1.0
-        finding = self.watch.after_step(step, seconds, enough, mixture.skips)
+        expected = (1.0 - mixture.report["empty_fraction"]) * mixture.sizes.candidates
+        kept_any = kept > 0.0 or expected < FEWEST_KEPT
+        finding = self.watch.after_step(step, seconds, float(kept_any), mixture.skips)
         if finding is None:
             return
         if finding.kind == "nothing kept":
@@ -382,25 +371,3 @@ class Learner:
         found = self.probes.routes_and_densities()
         self.history.look(step, self.progress.learn_seconds, self.mixture.gate, *found)
         self.history.leave(self.run.folder)
-
-
-def plan_of(
-    step: int, config: LearnerConfig, progress: Progress, learning: bool, frozen: bool
-) -> StepPlan:
-    """How a step samples and what it teaches.
-
-    Args:
-        learning: whether the occupancy is still learned.
-        frozen: whether the gate is frozen.
-    """
-    ramped = ramp(step - progress.began, schedule_since(config.schedule, progress))
-    coarse = learning or ramped < 1.0
-    # a homogeneous gate is taught nothing about emptiness
-    follows = coarse and ramped > 0.0 and not is_dense(progress, step) and not config.homogeneous
-    return StepPlan(
-        step,
-        coarse,
-        ramped,
-        Following(config.likely_above, config.look_everywhere) if follows else None,
-        None if frozen else annealed(config.gate_loss, progress, step),
-    )

@@ -57,7 +57,7 @@ class Evidence(NamedTuple):
         return mean > 0.0 and mean > SURE * math.sqrt(variance / self.rays)
 
 
-class Renderer(Protocol):
+class PriceSource(Protocol):
     """Renders held-out rays with and without skipping, and leaves what it renders as it was."""
 
     def excesses(self, seed: int) -> dict[str, Tensor]:
@@ -89,11 +89,11 @@ class PriceWatch:
     def __init__(
         self,
         state: WatchState,
-        renderer: Renderer,
+        source: PriceSource,
         config: CalibrationConfig,
         device: torch.device,
     ) -> None:
-        self.state, self.renderer, self.config, self.device = state, renderer, config, device
+        self.state, self.source, self.config, self.device = state, source, config, device
         self.steps, self.seconds = 0, 0.0
 
     def after_step(self, step: int, seconds: float, kept: float, skips: bool) -> Finding | None:
@@ -101,7 +101,7 @@ class PriceWatch:
 
         Args:
             seconds: that the step took.
-            kept: samples that the gate kept of its batch, in this process.
+            kept: what the gate kept of its batch, in this process, in any unit: 0 is nothing.
             skips: whether it skips anything.
         """
         self.steps, self.seconds = self.steps + 1, self.seconds + seconds
@@ -144,8 +144,8 @@ class PriceWatch:
         return Finding("beyond" if beyond else "within", " and ".join(beyond))
 
     def _evidence(self) -> dict[str, tuple[float, ...]]:
-        found = self.renderer.excesses(self.state.rechecks + 1)
-        most = self.renderer.count_rays(math.ceil(self.config.recheck_rays / (1.0 - REMEMBERED)))
+        found = self.source.excesses(self.state.rechecks + 1)
+        most = self.source.count_rays(math.ceil(self.config.recheck_rays / (1.0 - REMEMBERED)))
         before = self.state.evidence
         return {
             name: tuple(Evidence(*before.get(name, ())).with_rays(values, most))

@@ -30,8 +30,7 @@ class Progress:
     """Travels with a checkpoint, as plain values and one tensor."""
 
     learn_steps: int = 0
-    """Steps after which the gate is frozen: those of the config, shortened for a short run and
-    lengthened by recoveries and extensions."""
+    """Step of the run at which the first phase ends, later after recoveries and extensions."""
     configured: int = 0
     """`ScheduleConfig.learn_steps` that they were made from; 0 before the first step."""
     phase: int = 0

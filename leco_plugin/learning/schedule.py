@@ -3,13 +3,10 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import NamedTuple
 
 from torch import Tensor
 
 from leco_plugin.learning.progress import Progress
-from leco_plugin.models.mixture import Following
-from leco_plugin.models.objective import GateLossConfig
 from leco_plugin.scenes.input_error import InputError
 
 KEPT_ABOVE = 0.1
@@ -47,7 +44,8 @@ class ScheduleConfig:
     steps_per_check: int = 25
     """Steps between two looks at the gate."""
     agreement: float = 0.99
-    """Share of probe positions whose decision must be the same in two checks running."""
+    """Share of probe positions whose decision is the same in two checks running, from which on the
+    gate is frozen, after `earliest`."""
 
     def __post_init__(self) -> None:
         for name in ("learn_steps", "steps_per_check"):
@@ -61,6 +59,9 @@ def ramp(step: int, config: ScheduleConfig) -> float:
 
     At once it would press all weight onto the ends of the rays, which is a flat picture behind the
     scene; first the views have to find the surfaces between them.
+
+    Args:
+        step: steps since `Progress.began`.
     """
     start, end = (share * config.learn_steps for share in (config.ramp_from, config.ramp_to))
     return min(1.0, max(0.0, (step - start) / max(1.0, end - start)))
@@ -70,7 +71,7 @@ def converged(step: int, agreement: float, config: ScheduleConfig) -> bool:
     """Whether to freeze at this check.
 
     Args:
-        step: training step.
+        step: steps since `Progress.began`.
         agreement: share of probe decisions equal to those of the check before; 0 at the first.
     """
     if step + 1 >= config.learn_steps:
@@ -92,7 +93,7 @@ def is_unsettled(step: int, agreement: float, config: ScheduleConfig, extensions
     """Whether a gate at its step limit should learn on.
 
     Args:
-        step: training step.
+        step: steps since `Progress.began`.
         agreement: share of probe decisions equal to those of the check before.
         extensions: how often it has learned on already.
     """
@@ -105,17 +106,3 @@ def decisions_agree(before: Tensor, now: Tensor) -> float:
     if len(before) != len(now) or len(now) == 0:
         return 0.0
     return float((before == now).float().mean())
-
-
-class StepPlan(NamedTuple):
-    """How one training step samples and what it teaches."""
-
-    step: int
-    coarse: bool
-    """Whether rays are marched in the coarse steps of the first phase."""
-    ramped: float
-    """How far the distortion loss has come in, in [0, 1]."""
-    following: Following | None
-    """Which candidates the gate being learned leaves out; None leaves out none."""
-    gate_loss: GateLossConfig | None
-    """What teaches the gate; None once it is frozen."""

@@ -1,1 +1,1 @@
-"""What is learned, and what it guides: gate, field, `leco-occupancy`, Switch-NeRF, guided hosts."""
+"""Gate, field, rendering, losses, and the nerfstudio models `leco-occupancy` and `switch-nerf`."""

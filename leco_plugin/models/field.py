@@ -146,7 +146,7 @@ class HMoEField(nn.Module):
         Args:
             mapped: [N, 3] in [-1, 1].
             routes: [N] int64, expert of each point.
-            gate_values: [N] float, the gate's probability of that expert.
+            gate_values: [N] float, factor of the features; see `rendering.gate_values_and_routes`.
         Returns:
             sigmas [N] float32, per half extent of the scene; features [N, width].
         """

@@ -149,6 +149,23 @@ def gate_statistics(shaded: Shaded, scene_experts: int) -> dict[str, Tensor]:
 
 
 @torch.no_grad()
+def batch_figures(outputs: dict[str, Any], truth: Tensor, experts: int) -> dict[str, Tensor]:
+    """PSNR of a batch, and in training what its gate keeps and how its experts share the points.
+
+    Args:
+        outputs: of `LecoModel.get_outputs`.
+        truth: [R, 3].
+        experts: of the scene.
+    """
+    error = torch.nn.functional.mse_loss(outputs["rgb"], truth)
+    figures = {"psnr": -10.0 * torch.log10(error.clamp(min=1e-12))}
+    if "shaded" in outputs:
+        batch_of = outputs["shaded"], outputs["intervals"], outputs["rays"]
+        figures["kept_fraction"] = kept_fraction(*batch_of, *outputs["kept_rule"])
+        figures |= gate_statistics(outputs["shaded"], experts)
+    return figures
+
+
 def kept_fraction(
     shaded: Shaded,
     intervals: Intervals,

@@ -33,17 +33,17 @@ LayerFn = Callable[[Tensor, Tensor, Tensor], Tensor]
 """Rows [N, inputs], weight [width, inputs] and bias [width] to relu(W x + b), [N, width]."""
 
 
-class FrozenGate(NamedTuple):
-    """A gate's weights as they are asked."""
+class FoldedGate(NamedTuple):
+    """A gate's weights as they are asked, its norm folded into the last layer."""
 
     snapshot: Snapshot
     """What they were made from."""
     layers: list[tuple[Tensor, Tensor]]
     """Weight and bias of each hidden layer, in the type of the products."""
     head: Tensor
-    """float32 [n + 1, width]: scene logits above the empty one, of features less their mean and
-    over the length of what is left; in the last row the mean, as a part of the features' length,
-    unless the gate has no norm."""
+    """float32 [n + 1, width], or [n, width] without a norm: scene logits above the empty one, of
+    features less their mean and over the length of what is left; in the last row the mean, as a
+    part of the features' length."""
     shift: Tensor
     """float32 [n, 1]: what is added to those logits."""
 
@@ -82,7 +82,7 @@ def _layer(features: Tensor, weight: Tensor, bias: Tensor) -> Tensor:
     return one_pass(features, weight, bias)
 
 
-def _logits(frozen: FrozenGate, features: Tensor, gate: Gate) -> Tensor:
+def _logits(frozen: FoldedGate, features: Tensor, gate: Gate) -> Tensor:
     """How far scene experts lie above emptiness: features [N, width] to float32 [n, N]."""
     count, width = features.shape
     sums = features.new_empty(len(frozen.head), count, dtype=torch.float32)
@@ -99,7 +99,7 @@ def _logits(frozen: FrozenGate, features: Tensor, gate: Gate) -> Tensor:
     return torch.addcmul(frozen.shift, above, square.rsqrt_())
 
 
-def _last_layer(frozen: FrozenGate, features: Tensor, sums: Tensor, lengths: Tensor) -> None:
+def _last_layer(frozen: FoldedGate, features: Tensor, sums: Tensor, lengths: Tensor) -> None:
     """Fill in the products of the head with features [N, width], and their lengths if asked for."""
     if lengths.numel():
         torch.mm(frozen.head, features.T, out=sums)
@@ -116,10 +116,10 @@ def _occupancy(logits: Tensor) -> Tensor:
     return odds / (odds + 1.0)
 
 
-_found: WeakKeyDictionary[Gate, dict[torch.dtype, FrozenGate]] = WeakKeyDictionary()
+_found: WeakKeyDictionary[Gate, dict[torch.dtype, FoldedGate]] = WeakKeyDictionary()
 
 
-def frozen_gate(gate: Gate, dtype: torch.dtype) -> FrozenGate:
+def frozen_gate(gate: Gate, dtype: torch.dtype) -> FoldedGate:
     """The weights of a gate as they are now, made anew only where one has changed."""
     found = _found.setdefault(gate, {})
     if dtype not in found or not found[dtype].snapshot.matches(gate):
@@ -135,7 +135,7 @@ def frozen_gate(gate: Gate, dtype: torch.dtype) -> FrozenGate:
         else:
             head = head / math.sqrt(gate.norm.eps)
         shift = _above_empty(constant[:, None])
-        found[dtype] = FrozenGate(Snapshot(gate), layers, head, shift)
+        found[dtype] = FoldedGate(Snapshot(gate), layers, head, shift)
     return found[dtype]
 
 

@@ -33,8 +33,8 @@ class GateConfig:
     scene_experts: int = 4
     """n: logits beside the one of the empty-space expert."""
     normed: bool = True
-    """Whether the last layer sees features of one length. Where it does not, their mean is still
-    taken off; that is cheaper to ask on a CPU."""
+    """Whether a layer norm gives the features of the last layer one length. False only takes their
+    mean off, by a norm of a huge epsilon: cheaper to ask on a CPU, in a file of the same format."""
 
     def to_dict(self) -> dict[str, object]:
         return asdict(self)
@@ -99,7 +99,10 @@ def check_sizes(config: GateConfig) -> None:
 
 
 class Gate(nn.Module):
-    """G(x) = softmax(W LN(MLP(gamma_g(x)))), returned as logits (DESIGN, section 3)."""
+    """G(x) = softmax(W LN(MLP(gamma_g(x)))), returned as logits.
+
+    LN leaves lengths as they are where the config has no norm.
+    """
 
     def __init__(self, config: GateConfig) -> None:
         super().__init__()

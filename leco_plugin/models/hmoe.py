@@ -136,7 +136,8 @@ class HMoE(nn.Module):
         Args:
             features: [N, width] A gamma(x).
             routes: [N] int64 in [0, n], of experts that are left.
-            gate_values: [N] G_i*(x), in the precision of the gate.
+            gate_values: [N] factor of the features, in the precision of the gate; see
+                `rendering.gate_values_and_routes`.
         Returns:
             [N, width] in the dtype of the experts' output.
         """

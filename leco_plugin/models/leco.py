@@ -19,31 +19,25 @@ from torch import Tensor, nn
 
 from leco_plugin.learning.collapse import annealed
 from leco_plugin.learning.learner import Learner
+from leco_plugin.learning.plan import StepPlan
 from leco_plugin.learning.progress import Progress
 from leco_plugin.learning.run import Run
-from leco_plugin.learning.schedule import KEPT_ABOVE, StepPlan
+from leco_plugin.learning.schedule import KEPT_ABOVE
+from leco_plugin.models import figures
 from leco_plugin.models.compute.device import fast_precision, keep_freed_memory
 from leco_plugin.models.failures import require_finite
-from leco_plugin.models.figures import (
-    before_the_backdrop,
-    gate_pictures,
-    gate_statistics,
-    image_figures,
-    kept_fraction,
-    over_background,
-    prices,
-    with_alpha,
-)
-from leco_plugin.models.front_to_back import is_no_slower
 from leco_plugin.models.leco_config import LecoModelConfig
 from leco_plugin.models.mixture import Mixture
 from leco_plugin.models.objective import field_losses, gate_losses
 from leco_plugin.models.rendering import Intervals, Rays, Routing, Shaded
 from leco_plugin.models.sizing.scene_sizes import complete
-from leco_plugin.scenes.input_error import InputError
 from leco_plugin.scenes.learning_data import LearningData
 from leco_plugin.scenes.pixels.known_distances import DISTANCE
-from leco_plugin.studio.checkpoints import allow_checkpoint_globals, evaluate_whole_checkpoints
+from leco_plugin.studio.checkpoints import (
+    allow_checkpoint_globals,
+    evaluate_whole_checkpoints,
+    refuse_earlier,
+)
 from leco_plugin.studio.run import run_of
 
 
@@ -65,8 +59,7 @@ class LecoModel(Model):
         allow_checkpoint_globals()
         evaluate_whole_checkpoints()
         config, device = self.config, self.kwargs.get("device", "cpu")
-        if torch.device(device).type == "cpu":
-            keep_freed_memory()
+        keep_freed_memory(device)
         metadata = self.kwargs.get("metadata") or {}
         sizes = complete(config.sizes, config.bounds, metadata, self.num_train_data, device)
         losses = config.gate_loss
@@ -75,6 +68,7 @@ class LecoModel(Model):
         routing = Routing(below, config.homogeneous)
         self.mixture = Mixture(sizes, self.num_train_data, precision, routing)
         self._keep_sizes()
+        # nerfstudio's name for it: photographs with alpha are blended over black
         self.renderer_rgb = RGBRenderer(background_color="random")
         self.progress = Progress()
         self.plan = StepPlan(0, True, 0.0, None, annealed(losses, self.progress, 0))
@@ -82,7 +76,7 @@ class LecoModel(Model):
         self.register_load_state_dict_post_hook(lambda model, _: model._keep_sizes())
 
     def _keep_sizes(self) -> None:
-        """The config says the mixture's sizes; others may share it, and have other scenes."""
+        """Puts the mixture's sizes into a config of its own: others may share the given one."""
         self.num_train_data = self.mixture.num_images
         if self.mixture.sizes != self.config.sizes:
             self.config = replace(self.config, sizes=self.mixture.sizes)
@@ -169,22 +163,16 @@ class LecoModel(Model):
                 "shaded": shaded,
                 "intervals": intervals,
                 "rays": rays,
-                "kept_rule": (above, *mixture.march(self.plan.coarse)),
+                "kept_rule": (above, *mixture.rule(self.plan.coarse)),
             }
-        from_the_front = self.config.front_to_back
-        if from_the_front is None:
-            from_the_front = is_no_slower(len(rays.origins), mixture.skips, mixture.device)
-        if from_the_front:
-            shaded, intervals = mixture.shade_what_is_seen(rays, intervals)
-        else:
-            shaded = mixture.shade(rays, intervals)
-        met, shown = before_the_backdrop(shaded, intervals, rays)
-        colors = over_background(shaded, rays)
-        return {"rgb": colors, **shown, **gate_pictures(met, intervals.ray_indices)}
+        shaded, intervals = mixture.show(rays, intervals, self.config.front_to_back)
+        met, shown = figures.before_the_backdrop(shaded, intervals, rays)
+        colors = figures.over_background(shaded, rays)
+        return {"rgb": colors, **shown, **figures.gate_pictures(met, intervals.ray_indices)}
 
     def get_rgba_image(self, outputs: dict[str, Tensor], output_name: str = "rgb") -> Tensor:
         """Colours with what was met before the backdrop as their alpha, [..., 4]."""
-        return with_alpha(outputs, output_name)
+        return figures.with_alpha(outputs, output_name)
 
     def get_loss_dict(
         self, outputs: dict[str, Any], batch: dict[str, Tensor], metrics_dict: Any = None
@@ -235,21 +223,15 @@ class LecoModel(Model):
         """PSNR of the batch; of the gate: kept fraction, share and density per expert; once it is
         frozen, what skipping costs."""
         truth = self.renderer_rgb.blend_background(batch["image"].to(self.device))
-        error = torch.nn.functional.mse_loss(outputs["rgb"], truth)
-        metrics = {"psnr": -10.0 * torch.log10(error.clamp(min=1e-12))}
-        if "shaded" in outputs:
-            batch_of = outputs["shaded"], outputs["intervals"], outputs["rays"]
-            metrics["kept_fraction"] = kept_fraction(*batch_of, *outputs["kept_rule"])
-            experts = self.mixture.sizes.gate.scene_experts
-            metrics |= gate_statistics(outputs["shaded"], experts)
-        return metrics | prices(self.mixture.report)
+        found = figures.batch_figures(outputs, truth, self.mixture.sizes.gate.scene_experts)
+        return found | figures.prices(self.mixture.report)
 
     def get_image_metrics_and_images(
         self, outputs: dict[str, Tensor], batch: dict[str, Tensor]
     ) -> tuple[dict[str, float], dict[str, Tensor]]:
         """Figures of one image, and pictures for the log."""
         truth = self.renderer_rgb.blend_background(batch["image"].to(outputs["rgb"].device))
-        return image_figures(outputs, truth)
+        return figures.image_figures(outputs, truth)
 
     def get_extra_state(self) -> dict[str, Any]:
         """How far the run has come travels with a checkpoint, as plain values."""
@@ -265,10 +247,5 @@ class LecoModel(Model):
         Raises:
             InputError: the checkpoint is of an earlier version of this package.
         """
-        names = [name for name in state_dict if name.startswith(prefix)]
-        if names and f"{prefix}mixture.frozen" not in names:
-            raise InputError(
-                "the checkpoint is of an earlier version of leco_plugin: train again, or install "
-                "the version that made it"
-            )
+        refuse_earlier(state_dict, prefix, "mixture.frozen")
         super()._load_from_state_dict(state_dict, prefix, *rest)

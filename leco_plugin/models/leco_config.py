@@ -58,8 +58,8 @@ class LecoModelConfig(ModelConfig):
     look_everywhere: float = 0.125
     """Share of rays that shade all candidates while the others follow the gate being learned."""
     likely_above: float = 0.05
-    """o(x) from which those others shade a candidate, at most 0.1: from there on the log counts it
-    as kept."""
+    """o(x) from which those others shade a candidate. The log counts as kept what reaches this and
+    0.1."""
     distortion_after: float = 0.04
     """Share of the distortion loss that stays when the first phase is over and detail is wanted."""
     front_to_back: bool | None = None

@@ -1,7 +1,8 @@
-"""What teaches the gate: the paper's two losses and the same two forces in logit form.
+"""All losses of gate and field; each says what it teaches.
 
-Beside them stands the distortion loss of the field. All of them run in float32, and do not grow
-with the batch: they are means over the points or rays given, or sums that the caller divides.
+The gate is taught by the paper's two losses, or by the same two forces in logit form. All run in
+float32, and do not grow with the batch: they are means over the points or rays given, or sums that
+the caller divides.
 """
 
 from __future__ import annotations
@@ -20,7 +21,7 @@ def expert_shares(routes: Tensor, num_experts: int) -> Tensor:
 
 
 def imbalanced_gate_loss(probabilities: Tensor, routes: Tensor, empty_ratio: float) -> Tensor:
-    """L_g = sum_i w_i f_i P_i with w_0 = 1 / rho and w_i = n / (1 - rho) (DESIGN, section 3).
+    """L_g = sum_i w_i f_i P_i with w_0 = 1 / rho and w_i = n / (1 - rho), P_i = mean_x G_i(x).
 
     Stationary where f_0 = rho and f_i = (1 - rho) / n, so rho is the target empty ratio;
     rho = 1 / (1 + n) gives back the balanced loss of Switch-NeRF, whose value at balance is one.
@@ -91,7 +92,7 @@ def density_loss(empty_probability: Tensor, alphas: Tensor) -> Tensor:
 
 
 def contribution_loss(
-    logits: Tensor, weights: Tensor, weight_at_full: float = 0.05, emphasis: float = 4.0
+    logits: Tensor, weights: Tensor, weight_at_full: float, emphasis: float
 ) -> Tensor:
     """Both forces in logit form: mean[-k y log(1 - G_0) - (1 - y) log G_0], y = min(w / w_0, 1).
 

@@ -1,7 +1,7 @@
 """The mixture that learns an occupancy: gate, field and region, and how rays pass through them.
 
-It knows no schedule and no trainer. Only `freeze`, `sharpen` and `reopen` write whether the gate is
-frozen, and its threshold.
+It knows no schedule and no trainer. Beside a checkpoint, only `freeze`, `sharpen` and `reopen` write
+whether the gate is frozen, and its threshold.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ import torch
 from torch import Tensor, nn
 
 from leco_plugin.models.field import HMoEField
-from leco_plugin.models.front_to_back import shade_front_to_back
+from leco_plugin.models.front_to_back import is_no_slower, shade_front_to_back
 from leco_plugin.models.gate import Gate, GateConfig
 from leco_plugin.models.region import Region, marching_rule
 from leco_plugin.models.rendering import (
@@ -57,6 +57,8 @@ class Mixture(nn.Module):
         threshold: scalar, o(x) from which a frozen gate keeps a candidate; at 0 all are kept.
         report: what the frozen gate costs and saves, as its file has it.
         small: a gate that says in place of the frozen one what is empty; None where there is none.
+        steps, cones: [2] shortest steps, scene units, and their growth with distance, of the fine
+            march and of the coarse one.
     """
 
     frozen: Tensor
@@ -73,7 +75,6 @@ class Mixture(nn.Module):
         self.region = Region()
         self.register_buffer("frozen", torch.tensor(False))
         self.register_buffer("threshold", torch.tensor(0.0))
-        # of the fine march and of the coarse one
         self.register_buffer("steps", torch.tensor([0.03, 0.06]))
         self.register_buffer("cones", torch.tensor([0.0, 0.0]))
         self.report: dict[str, Any] = {}
@@ -113,8 +114,8 @@ class Mixture(nn.Module):
             rule = marching_rule(bounds.kind, bounds.near, bounds.far, candidates, median_length)
             self.steps[number], self.cones[number] = rule
 
-    def march(self, coarse: bool = False) -> marching.March:
-        """The fine march of renderings, or the coarse one of learning."""
+    def rule(self, coarse: bool = False) -> marching.March:
+        """By which candidates follow one another: finely in renderings, coarsely while learning."""
         return marching.March(float(self.steps[int(coarse)]), float(self.cones[int(coarse)]))
 
     def rays(
@@ -147,7 +148,7 @@ class Mixture(nn.Module):
     def _along(
         self, rays: Rays, coarse: bool, jitter: Tensor | None
     ) -> tuple[marching.Rays, marching.March]:
-        along, rule = marching.Rays(*rays[:4]), self.march(coarse)
+        along, rule = marching.Rays(*rays[:4]), self.rule(coarse)
         return along if jitter is None else along.shifted(jitter * rule.step_size), rule
 
     @torch.no_grad()
@@ -162,7 +163,7 @@ class Mixture(nn.Module):
 
     def with_backdrops(self, rays: Rays, intervals: Intervals, coarse: bool = False) -> Intervals:
         """Ends each ray in its backdrop, which no gate skips."""
-        return with_backdrop(intervals, rays, *self.march(coarse))
+        return with_backdrop(intervals, rays, *self.rule(coarse))
 
     def shade(self, rays: Rays, intervals: Intervals) -> Shaded:
         """Renders intervals; no gradient reaches a frozen gate."""
@@ -177,8 +178,19 @@ class Mixture(nn.Module):
                 freeze_gate=bool(self.frozen),
             )
 
-    def shade_what_is_seen(self, rays: Rays, intervals: Intervals) -> tuple[Shaded, Intervals]:
-        """As `shade`, without gradients and without what lies behind opaque surfaces."""
+    def show(
+        self, rays: Rays, intervals: Intervals, front_to_back: bool | None
+    ) -> tuple[Shaded, Intervals]:
+        """As `shade`, with the intervals that were shaded.
+
+        Args:
+            front_to_back: whether to leave out what lies behind opaque surfaces, without gradients;
+                None does so where that was measured to be no slower.
+        """
+        if front_to_back is None:
+            front_to_back = is_no_slower(len(rays.origins), self.skips, self.device)
+        if not front_to_back:
+            return self.shade(rays, intervals), intervals
         with gate_precision(self.device.type, self.precision):
             return shade_front_to_back(
                 self.field, self.gate, self.region.space, rays, intervals, self.routing
@@ -231,15 +243,9 @@ class Mixture(nn.Module):
 
     def occupancy(self) -> Occupancy:
         """The gate that skips as an `Occupancy`; it shares the gate's parameters."""
-        region, threshold = self.region, float(self.threshold)
-        made = Occupancy(
-            self.small or self.gate,
-            region.space,
-            threshold,
-            self.precision,
-            self.report,
-            region.aabb,
-        )
+        gate, region = self.small or self.gate, self.region
+        threshold, walls = float(self.threshold), region.aabb
+        made = Occupancy(gate, region.space, threshold, self.precision, self.report, walls)
         return made.to(self.device)
 
     def estimator(self) -> LearnedOccupancyEstimator:

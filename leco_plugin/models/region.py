@@ -22,8 +22,7 @@ SIDE = 32
 
 
 class Region(nn.Module):
-    """Where a scene lies. All of it is buffers, because nerfstudio tells a model its step before it
-    restores its state.
+    """Where a scene lies: buffers, so that a checkpoint restores it.
 
     Attributes:
         space: the mapping of positions.
@@ -111,8 +110,8 @@ class SeenBackdrops(nn.Module):
     """
 
     limits: Tensor
-    """[4, cells]: of z and of -z of the directions in each cell, the largest; first of rays that
-    meet the scene, then of those that miss it."""
+    """[4, cells] of directions: rows 0 and 1 of rays that meet the scene, 2 and 3 of the
+    others; 0 and 2 the largest z in each cell, 1 and 3 the largest -z; 2 is nothing noted yet."""
 
     def __init__(self) -> None:
         super().__init__()

@@ -112,8 +112,9 @@ def _of_all_experts(logits: Tensor, routing: Routing) -> tuple[Tensor, Tensor]:
     """As above, while no expert has been dropped.
 
     The paper's factor is G_i*(x), which jumps when a sample changes from an expert to another. With
-    a threshold rule the factor is one, and only its gradient is that of the scene expert's share
-    (straight-through): a route that changes then changes the image little.
+    a threshold rule the factor is one, and its gradient that of the logarithm of the scene expert's
+    share (straight-through): a route that changes then changes the image little. In a homogeneous
+    mixture the factor is that share.
     """
     if routing.empty_below is None and not routing.homogeneous:
         routes = route(logits, None)
@@ -177,7 +178,7 @@ def backdrop_starts(rays: Rays, step_size: float, cone_angle: float) -> Tensor:
 
 
 def backdrop_of(intervals: Intervals, rays: Rays) -> Tensor:
-    """Which intervals [M] are the backdrop of a ray that meets the scene."""
+    """Which intervals [M] are backdrops; rays that are cut off or have no length have none."""
     without = rays.t_maxs <= rays.t_mins
     without = without if rays.cut_off is None else without | rays.cut_off
     ends = rays.t_maxs.masked_fill(without, torch.inf)

@@ -86,8 +86,7 @@ class SwitchNerfModel(Model):
         allow_checkpoint_globals()
         evaluate_whole_checkpoints()
         device = self.kwargs.get("device", "cpu")
-        if torch.device(device).type == "cpu":
-            keep_freed_memory()
+        keep_freed_memory(device)
         self.precision = fast_precision(device)
         self.field = SwitchField(self.config.sizes.field, self.num_train_data)
         self.region = Region()

@@ -47,6 +47,20 @@ PREVIOUS = "previous"
 """Ending of the folder, beside that of the checkpoints, with the one before the newest."""
 
 
+def refuse_earlier(state_dict: dict[str, Any], prefix: str, name: str) -> None:
+    """Refuses the state of a module of before: one that has anything, but not a name of today.
+
+    Raises:
+        InputError: that, in one line.
+    """
+    names = [key for key in state_dict if key.startswith(prefix)]
+    if names and f"{prefix}{name}" not in names:
+        raise InputError(
+            "the checkpoint is of an earlier version of leco_plugin: train again, or install the "
+            "version that made it"
+        )
+
+
 def previous_of(checkpoints: Path) -> Path:
     """The folder with the checkpoint before the newest of a folder of checkpoints."""
     return checkpoints.with_name(f"{checkpoints.name}.{PREVIOUS}")

@@ -101,7 +101,7 @@ def test_density_loss_asks_only_the_gate() -> None:
 def test_a_saturated_gate_still_learns_in_logit_form_but_not_in_the_papers() -> None:
     """It calls one point empty that carries all of its ray's weight."""
     logits = torch.tensor([[40.0, -40.0, -40.0]], requires_grad=True)
-    contribution_loss(logits, torch.ones(1), emphasis=4.0).backward()
+    contribution_loss(logits, torch.ones(1), 0.05, 4.0).backward()
     assert logits.grad is not None and float(logits.grad[0, 0]) == pytest.approx(4.0)
     logits.grad = None
     density_loss(logits.softmax(dim=-1)[:, 0], torch.ones(1)).backward()
@@ -119,8 +119,10 @@ def test_contribution_loss_is_least_at_the_emphasised_odds() -> None:
 
 def test_contribution_loss_does_not_teach_the_field() -> None:
     weights = torch.rand(5, requires_grad=True)
-    assert contribution_loss(torch.randn(5, 3, requires_grad=True), weights).requires_grad
-    contribution_loss(torch.randn(5, 3, requires_grad=True), weights).backward()
+    assert contribution_loss(
+        torch.randn(5, 3, requires_grad=True), weights, 0.05, 4.0
+    ).requires_grad
+    contribution_loss(torch.randn(5, 3, requires_grad=True), weights, 0.05, 4.0).backward()
     assert weights.grad is None
 
 
@@ -197,7 +199,7 @@ def test_a_batch_without_points_teaches_nothing() -> None:
     logits, none = torch.zeros(0, 3, requires_grad=True), torch.zeros(0)
     routes = torch.zeros(0, dtype=torch.int64)
     losses = [
-        contribution_loss(logits, none),
+        contribution_loss(logits, none, 0.05, 4.0),
         density_loss(logits.softmax(dim=-1)[:, 0], none),
         imbalanced_gate_loss(logits.softmax(dim=-1), routes, 0.9),
     ]

@@ -33,13 +33,13 @@ def _has(feature: str) -> bool:
     return bool(supported())
 
 
-def keep_freed_memory() -> None:
-    """Tells glibc to keep large freed blocks for the next training step instead of unmapping them.
+def keep_freed_memory(device: torch.device | str = "cpu") -> None:
+    """On a CPU, tells glibc to keep large freed blocks for the next step instead of unmapping them.
 
     A step allocates and frees the same few large tensors; mapping them anew costs a page fault for
     each 4 kB. Acts on this process; does nothing where the C library is not glibc.
     """
-    if not sys.platform.startswith("linux"):
+    if torch.device(device).type != "cpu" or not sys.platform.startswith("linux"):
         return
     try:
         mallopt = ctypes.CDLL("libc.so.6").mallopt

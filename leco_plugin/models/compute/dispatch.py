@@ -13,7 +13,8 @@ SIZES_PER_OCTAVE = 16
 
 
 def steady_size(count: int, device_type: str) -> int:
-    """How many rows to compute for `count` of them: a few more where that saves compiling."""
+    """How many rows to compute for `count` of them: a few more on a CPU under autocast,
+    where oneDNN compiles a product for each new number of rows."""
     if device_type != "cpu" or not torch.is_autocast_enabled("cpu"):
         return count
     return filled_size(count)

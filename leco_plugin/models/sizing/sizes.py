@@ -25,8 +25,8 @@ class Sizes:
     learn_candidates: int = 32
     """Candidates along a ray while the occupancy is learned."""
     guided_batch: float = 3.0
-    """Most rays of a guided batch, as a multiple of those before: their samples are mostly skipped,
-    and the batch grows until it shades as many as before."""
+    """Most rays of a batch, as a multiple of those of the config: where samples are skipped, while
+    learning too, the batch grows until it shades as many as before."""
     candidates: int = 128
     """Candidates along a ray once the occupancy guides, and in every rendering."""
     largest_table: int | None = None
