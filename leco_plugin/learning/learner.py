@@ -24,7 +24,6 @@ from leco_plugin.learning.recoveries import Recoveries
 from leco_plugin.learning.run import Run, keep_pace
 from leco_plugin.learning.schedule import (
     KEPT_ABOVE,
-    StepPlan,
     converged,
     decisions_agree,
     is_unsettled,

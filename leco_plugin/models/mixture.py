@@ -1,7 +1,7 @@
 """The mixture that learns an occupancy: gate, field and region, and how rays pass through them.
 
-It knows no schedule and no trainer. Beside a checkpoint, only `freeze`, `sharpen` and `reopen` write
-whether the gate is frozen, and its threshold.
+It knows no schedule and no trainer. Beside a checkpoint, only `freeze`, `sharpen` and `reopen`
+write whether the gate is frozen, and its threshold.
 """
 
 from __future__ import annotations
