@@ -20,7 +20,7 @@ from leco_plugin.chart.theme import LIGHT, SOURCE, Theme, fingerprint, plain, th
 from leco_plugin.cli_reports import occupancy_of
 from leco_plugin.evaluation.occupancy_picture import OPAQUE
 from leco_plugin.evaluation.report import describe_machine, write_json
-from leco_plugin.learning.history import FILE_NAME, GateHistory
+from leco_plugin.learning.history import FILE_NAME, GateHistory, as_learned
 from leco_plugin.occupancy import Occupancy
 
 OUT = Path(__file__).resolve().parent / "results" / "learning.json"
@@ -133,7 +133,7 @@ def main() -> None:
     file = occupancy_of(parser.parse_args().run)
     history = file.parent / FILE_NAME
     date = datetime.date.fromtimestamp(history.stat().st_mtime).isoformat()
-    found = GateHistory.load(history, Occupancy.load(file).gate)
+    found = GateHistory.load(history, as_learned(Occupancy.load(file)).gate)
     write_json(OUT, report_of(found, file.parent.parent.parent.name, date))
     print(f"wrote {OUT}")
 

@@ -23,7 +23,7 @@ import trimesh
 from bare_machine import variables
 from PIL import Image
 
-from leco_plugin.learning.history import GateHistory
+from leco_plugin.learning.history import GateHistory, as_learned
 from leco_plugin.occupancy import Occupancy
 
 pytestmark = [pytest.mark.slow, pytest.mark.xdist_group("round_trip")]
@@ -113,7 +113,9 @@ def test_training_leaves_a_config_a_checkpoint_and_the_occupancy(trained: Path) 
     occupancy = Occupancy.load(trained / "occupancy.safetensors")
     asked = occupancy.query(torch.rand(10, 3) - 0.5)
     assert ((asked >= 0) & (asked <= 1)).all()
-    history = GateHistory.load(trained / "occupancy_history.safetensors", occupancy.gate)
+    history = GateHistory.load(
+        trained / "occupancy_history.safetensors", as_learned(occupancy).gate
+    )
     assert history.steps[0] == 0 and len(history) >= 3
     for name, value in occupancy.gate.state_dict().items():
         assert torch.equal(history.weights[-1][name], value)

@@ -14,7 +14,7 @@ from torch import Tensor
 
 from leco_plugin.chart.theme import LIGHT, new_figure, plain
 from leco_plugin.evaluation.inspection import ViewBox, cameras_of, exposed, query, whole_box
-from leco_plugin.learning.history import FILE_NAME, GateHistory
+from leco_plugin.learning.history import FILE_NAME, GateHistory, as_learned
 from leco_plugin.log import bar
 from leco_plugin.occupancy import CALIBRATED_AT, Occupancy
 from leco_plugin.scenes.input_error import InputError
@@ -258,7 +258,7 @@ def spread_evenly(count: int, most: int) -> list[int]:
 def _read(occupancy: Occupancy, folder: Path) -> GateHistory:
     file = folder / FILE_NAME
     try:
-        return GateHistory.load(file, occupancy.gate)
+        return GateHistory.load(file, as_learned(occupancy).gate)
     except FileNotFoundError:
         raise InputError(
             f"there is no {file}: a run of leco-occupancy leaves one with "
@@ -273,7 +273,7 @@ class _Film:
 
     def __init__(self, occupancy: Occupancy, history: GateHistory) -> None:
         self.history = history
-        self.occupancy = copy.deepcopy(occupancy)
+        self.occupancy = copy.deepcopy(as_learned(occupancy))
         self.box = interesting_box(occupancy, cameras_of(occupancy))
         low, high = heights_seen_from_above(occupancy, self.box)
         middle = _middle_of(surface_points(occupancy, self.box, low)[0], self.box)

@@ -13,11 +13,11 @@ from torch import Tensor
 
 from leco_plugin.log import say
 from leco_plugin.models.compute.ranks import share
-from leco_plugin.models.gate import Gate
+from leco_plugin.models.gate import Gate, GateConfig
 from leco_plugin.models.losses import expert_shares
 from leco_plugin.models.mixture import Mixture
 from leco_plugin.models.rendering import gate_values_and_routes
-from leco_plugin.occupancy import gate_precision
+from leco_plugin.occupancy import Occupancy, gate_precision
 from leco_plugin.scenes.whole_files import write_whole
 
 if TYPE_CHECKING:
@@ -67,6 +67,17 @@ class Probes:
             )
             sigmas, _ = mixture.field.density(self.positions, routes, gate_values)
         return routes, sigmas
+
+
+def as_learned(occupancy: Occupancy) -> Occupancy:
+    """An occupancy with a gate and threshold as they were learned, before a smaller one was taught;
+    the weights of such a gate are those of a new one: a history holds the real ones."""
+    learned = occupancy.report.get("learned")
+    if learned is None:
+        return occupancy
+    gate = Gate(GateConfig.from_dict(learned["gate"])).requires_grad_(False)
+    given = (occupancy.space, learned["threshold"], occupancy.precision, occupancy.report)
+    return Occupancy(gate, *given, occupancy.walls).eval()
 
 
 @dataclass

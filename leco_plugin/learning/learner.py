@@ -303,7 +303,8 @@ class Learner:
         )
         if not found.pays:
             return
-        report = found.report(mixture.report, guided) | {"sharpened": [step, round(seconds, 2)]}
+        report = found.report(mixture.report, mixture.gate.config, guided)
+        report["sharpened"] = [*report.get("sharpened", []), [step, round(seconds, 2)]]
         mixture.sharpen(found.gate.to(mixture.device), found.measured.threshold, report)
         self.watch.state.evidence = {}  # of what guided before
         if self.run.folder is not None:

@@ -39,6 +39,8 @@ from leco_plugin.scenes.input_error import require
 BATCH = 1 << 14
 LAST_RATE = 0.05
 """Of the learning rate, after a half cosine."""
+LOSSES = ("lost_surface_mass", "lost_mass", "image_price_db")
+"""What a report says that skipping costs."""
 
 
 @dataclass(frozen=True)
@@ -90,18 +92,25 @@ class Sharpened(NamedTuple):
         end = "" if self.pays else "; that is no more, and the gate stays"
         return f"{self.measured.line}, where {self.before.empty_fraction:.1%} were skipped{end}"
 
-    def report(self, before: dict[str, Any], guided: bool) -> dict[str, Any]:
+    def report(self, before: dict[str, Any], learned: GateConfig, guided: bool) -> dict[str, Any]:
         """The report of an occupancy of this gate.
 
         Args:
             before: of what has guided so far; where the field was trained guided, the losses that
                 it declares are added.
+            learned: the gate that routes. It stays in the report, with what it did, as `learned`.
         """
         found = self.measured._asdict()
         if guided:
-            for name in ("lost_surface_mass", "lost_mass", "image_price_db"):
+            for name in LOSSES:
                 found[name] += max(0.0, float(before[name]))
-        return before | found | {"params": self.params}
+        kept = {name: before[name] for name in ("threshold", "params", "empty_fraction", *LOSSES)}
+        return {
+            "learned": {"gate": learned.to_dict(), **kept},
+            **before,
+            **found,
+            "params": self.params,
+        }
 
 
 class Lesson(NamedTuple):
