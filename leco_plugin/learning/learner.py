@@ -178,7 +178,7 @@ class Learner:
         if bool(self.mixture.frozen):
             self._watch(step, seconds, kept)
             if self.config.sharpening.steps > 0 and step + 1 >= self.run.end:
-                self._sharpen(step, guided=True)
+                self._sharpen(step, step - self.mixture.report["step"], guided=True)
         else:
             self.progress.learn_seconds += seconds
             self._after_learning_step(step)
@@ -252,7 +252,6 @@ class Learner:
         In every process of a data-parallel run the gate is that of the first one, and its price.
         """
         mixture, progress, schedule = self.mixture, self.progress, self.config.schedule
-        config = self.config.sharpening
         share(mixture.gate.state_dict().values())
         seconds = round(progress.learn_seconds, 2)
         measured, report, seconds = from_first(
@@ -274,8 +273,7 @@ class Learner:
             leave_field(mixture, self.run.folder)
         if self.run.goes_on and not schedule.restart:
             self._merge()
-            if config.steps > 0 and self.run.end - step >= config.least_left:
-                self._sharpen(step, guided=False)
+            self._sharpen(step, self.run.end - step - 1, guided=False)
         progress.watch = self.watch.state = WatchState()
         progress.suspected_since = -1  # of the gate as it is now
         if schedule.steps_per_record > 0:
@@ -285,13 +283,16 @@ class Learner:
             say("the field starts anew, guided from its first step")
         self.run.save(step)  # a run killed from now on stays frozen
 
-    def _sharpen(self, step: int, guided: bool) -> None:
+    def _sharpen(self, step: int, steps: float, guided: bool) -> None:
         """Has a small gate skip in place of the learned one where it skips more, and says so.
 
         Args:
+            steps: that are to pay for it.
             guided: whether the field has been trained guided since the gate was frozen.
         """
         mixture, config, started = self.mixture, self.config, time.monotonic()
+        if config.sharpening.steps == 0 or steps < config.sharpening.least_steps:
+            return
         found = from_first(
             lambda: self.held_out.sharpened(config.gate_loss, config.sharpening, guided),
             mixture.device,

@@ -49,9 +49,9 @@ class SharpeningConfig:
 
     steps: int = 500
     """Of teaching, each with 16,384 positions; 0 never sharpens."""
-    least_left: int = 1000
-    """Steps that must be left when the gate is frozen for it to be sharpened then too; at the end
-    of a run it always is."""
+    least_steps: int = 1000
+    """Guided steps that pay for it: a gate is sharpened when it is frozen if so many are left, and
+    at the end of a run that has had so many."""
     rays: int = 1 << 15
     """Training rays that teach. With a quarter of them a gate learns the rays, not the scene."""
     seen: float = 0.125
@@ -64,6 +64,7 @@ class SharpeningConfig:
 
     def __post_init__(self) -> None:
         require(self.steps >= 0, "sharpening.steps", self.steps, "at least 0")
+        require(self.least_steps >= 0, "sharpening.least-steps", self.least_steps, "at least 0")
         require(self.rays >= 1, "sharpening.rays", self.rays, "at least 1")
         require(0.0 <= self.seen <= 1.0, "sharpening.seen", self.seen, "from 0 to 1")
 

@@ -1,0 +1,237 @@
+"""Claims about the small gate that a frozen mixture's field teaches."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from small_learner import SMALLEST, ARun, small_learner, small_mixture
+from torch import Tensor
+
+from leco_plugin.learning import sharpening
+from leco_plugin.learning.calibration import CalibrationConfig, Measured
+from leco_plugin.learning.dense import dense_rendering
+from leco_plugin.learning.history import as_learned
+from leco_plugin.learning.sharpening import (
+    Sharpened,
+    SharpeningConfig,
+    lesson_by,
+    seen_rendering,
+    sharpen,
+)
+from leco_plugin.models.encodings import EncodingConfig
+from leco_plugin.models.gate import Gate, GateConfig
+from leco_plugin.models.mixture import Mixture
+from leco_plugin.models.objective import GateLossConfig
+from leco_plugin.models.rendering import Rays
+from leco_plugin.occupancy import Occupancy
+from leco_plugin.scenes.input_error import InputError
+
+GATE = GateConfig(EncodingConfig(octaves=2), 16, 1, 1, normed=False)
+LOSSES = GateLossConfig()
+WALL = 0.1
+"""Half the thickness of the wall at x = 0, in the mapped cube."""
+
+
+class WallField(torch.nn.Module):
+    """Opaque within `WALL` of x = 0, and white."""
+
+    def __init__(self, field: Any) -> None:
+        super().__init__()
+        self.experts, self.color = field.experts, lambda features, *_: torch.ones_like(features)
+        self.asked = 0
+
+    def density(self, mapped: Tensor, routes: Tensor, gate_values: Tensor) -> tuple[Tensor, Tensor]:
+        self.asked += len(mapped)
+        return 500.0 * (mapped[:, 0].abs() < WALL).float(), torch.ones(len(mapped), 3)
+
+
+class WideGate(Gate):
+    """Sure that nothing lies beyond so many walls' thickness, and that something lies within."""
+
+    walls = 4.0
+
+    def forward(self, mapped: Tensor) -> Tensor:
+        within = mapped[:, 0].abs() < self.walls * WALL
+        logit = torch.where(within, 2.0, -9.0)
+        return torch.stack([torch.zeros_like(logit), logit, logit - 1.0], dim=-1)
+
+
+def a_mixture() -> Mixture:
+    torch.manual_seed(0)
+    mixture = small_mixture(replace(SMALLEST, candidates=64))
+    mixture.region.space.set("box", torch.zeros(3), 1.0)
+    mixture.region.near.fill_(0.01)
+    mixture.region.far.fill_(4.0)
+    mixture.region.aabb.copy_(torch.tensor([-1.0] * 3 + [1.0] * 3))
+    mixture.steps.fill_(2.0 / 64)
+    mixture.field = WallField(mixture.field)  # type: ignore[assignment]
+    mixture.gate = WideGate(SMALLEST.gate)
+    mixture.freeze(0.5, {"step": 3, "params": 7, **report_of(0.6)})
+    return mixture.eval()
+
+
+def report_of(skipped: float) -> dict[str, float]:
+    return Measured(0.5, 1e-4, 2e-4, 0.01, skipped)._asdict()
+
+
+def some_rays(mixture: Mixture, count: int) -> Rays:
+    origins = torch.rand(count, 3) * torch.tensor([0.0, 1.0, 1.0]) - torch.tensor([0.99, 0.5, 0.5])
+    directions = torch.tensor([[1.0, 0.0, 0.0]]).expand(count, 3)
+    return mixture.rays(origins, directions, None)
+
+
+def test_the_lesson_is_the_widened_weight_of_every_candidate() -> None:
+    mixture = a_mixture()
+    lesson = lesson_by(mixture, some_rays(mixture, 20), LOSSES, 0.125, 8)
+    x = lesson.mapped[:, 0]
+    front = -WALL + torch.tensor([-0.04, 0.05])  # a step before the wall, and the first within
+    met = (x > front[0]) & (x < front[1])
+    torch.testing.assert_close(lesson.keep, LOSSES.emphasis * (1.0 - lesson.skip))
+    assert (lesson.skip[met] < 0.5).any() and (lesson.skip[x < front[0] - 0.05] == 1.0).all()
+    assert (lesson.skip[x > 0.5] == 1.0).all(), "what no ray reaches has nothing to say"
+    assert len(x) > 20 * 50, "candidates that are skipped teach too"
+
+
+def test_only_what_is_seen_is_rendered_and_the_lesson_is_the_same() -> None:
+    mixture = a_mixture()
+    rays = some_rays(mixture, 20)
+    every = lesson_by(mixture, rays, LOSSES, 0.0, 8)
+    asked = mixture.field.asked
+    some = lesson_by(mixture, rays, LOSSES, 0.125, 8)
+    assert mixture.field.asked - asked < 0.6 * asked
+    for one, other in zip(every, some):
+        torch.testing.assert_close(one, other)
+
+
+def test_what_is_not_seen_has_no_weight_and_is_a_candidate_still() -> None:
+    mixture = a_mixture()
+    mixture.gate.walls = 0.5  # type: ignore[assignment]
+    rays, truth = some_rays(mixture, 10), torch.ones(10, 3)
+    dense = dense_rendering(mixture, rays, truth, 10).references[0]
+    seen = seen_rendering(mixture, rays, truth, 1.0, 10).references[0]
+    assert len(seen.weights) == len(dense.weights)
+    below = seen.occupancies < 0.5
+    assert not seen.weights[below & ~seen.always_kept].any() and dense.weights[below].any()
+
+
+def test_a_small_gate_skips_what_the_large_one_keeps_of_free_space() -> None:
+    mixture = a_mixture()
+    taught, held_out = some_rays(mixture, 400), (some_rays(mixture, 100), torch.ones(100, 3))
+    config = SharpeningConfig(steps=150, gate=GATE)
+    found = sharpen(mixture, taught, held_out, LOSSES, CalibrationConfig(), config, guided=False)
+    assert found.pays and found.measured.empty_fraction > found.before.empty_fraction + 0.1
+    assert found.measured.within(CalibrationConfig()) and found.measured.threshold > 0.0
+    assert mixture.small is None, "it only says what would be"
+    assert all(torch.equal(p, p.bfloat16().float()) for p in found.gate.parameters())
+
+
+def test_guided_only_what_is_shown_now_is_taught(monkeypatch) -> None:
+    shares: list[float] = []
+    real = sharpening._rendered
+    monkeypatch.setattr(
+        sharpening, "_rendered", lambda m, rays, seen: shares.append(seen) or real(m, rays, seen)
+    )
+    mixture = a_mixture()
+    data = some_rays(mixture, 30), (some_rays(mixture, 10), torch.ones(10, 3))
+    config = SharpeningConfig(steps=1, gate=GATE, seen=0.25)
+    for guided in (False, True):
+        sharpen(mixture, *data, LOSSES, CalibrationConfig(), config, guided)
+    assert shares == [0.25, 0.0, 1.0, 1.0], "the lesson, then prices"
+
+
+class Pixels:
+    """Data of a mixture, whose pixels are white."""
+
+    def __init__(self, mixture: Mixture) -> None:
+        self.mixture = mixture
+        self.survey = None
+
+    def training_rays(self, mixture: Mixture, count: int) -> Rays:
+        return some_rays(mixture, count)
+
+    def held_out(self, mixture: Mixture, count: int, *_: Any) -> tuple[Rays, Tensor]:
+        return some_rays(mixture, 60), torch.ones(60, 3)
+
+    def prepare_batch(self, *_: Any, **__: Any) -> None:
+        """Nothing is drawn."""
+
+    def count_held_out(self, limit: int) -> float:
+        return 0.0
+
+
+@pytest.mark.parametrize(("guided_steps", "sharpened"), [(10, True), (9, False)])
+def test_it_is_sharpened_at_the_end_of_a_run_that_pays_for_it(
+    tmp_path: Path, guided_steps: int, sharpened: bool
+) -> None:
+    mixture = a_mixture()
+    run = ARun(end=3 + guided_steps + 1)
+    run.folder = tmp_path
+    options = SharpeningConfig(steps=100, least_steps=10, rays=200, gate=GATE)
+    learner = small_learner(
+        run, mixture, Pixels(mixture), sharpening=options, calibration=NEVER_AGAIN
+    )
+    last = int(run.end) - 1
+    learner.after_step(last - 1, 0.1, 5.0)
+    assert mixture.small is None
+    learner.after_step(last, 0.1, 5.0)
+    assert (mixture.small is not None) == sharpened
+    if not sharpened:
+        return
+    file = Occupancy.load(tmp_path / "occupancy.safetensors")
+    assert file.gate.config == GATE and file.threshold == float(mixture.threshold)
+    report = file.report
+    assert report["empty_fraction"] > 0.6 and report["params"] == file.num_params
+    assert report["lost_surface_mass"] >= 1e-4, "what was lost before is declared too"
+    assert report["learned"]["empty_fraction"] == 0.6 and report["learned"]["params"] == 7
+    assert report["sharpened"][0][0] == last
+    assert as_learned(file).gate.config == SMALLEST.gate and as_learned(file).threshold == 0.5
+
+
+NEVER_AGAIN = CalibrationConfig(recheck_rays=0)
+
+
+def test_what_does_not_pay_changes_nothing() -> None:
+    few = Measured(0.5, 0.0, 0.0, 0.0, 0.5)
+    found = Sharpened(Gate(GATE), few, few)
+    assert not found.pays and "the gate stays" in found.line
+
+
+def test_a_small_gate_travels_with_a_checkpoint_and_leaves_when_the_gate_learns_again() -> None:
+    one, other = small_mixture(), small_mixture()
+    one.freeze(0.4, {})
+    one.sharpen(Gate(GATE), 0.3, {"params": 1})
+    other.load_state_dict(one.state_dict())
+    assert other.small is not None and other.small.config == GATE
+    mapped = 2.0 * torch.rand(50, 3) - 1.0
+    assert torch.equal(one.occupancies(mapped), other.occupancies(mapped))
+    assert torch.equal(other.occupancies(mapped), other.small.occupancy(mapped))
+    assert other.occupancy().gate is other.small and float(other.threshold) == pytest.approx(0.3)
+    plain = small_mixture()
+    plain.freeze(0.4, {})
+    other.load_state_dict(plain.state_dict())
+    assert other.small is None
+    one.reopen()
+    assert one.small is None and one.occupancy().gate is one.gate
+
+
+def test_prices_of_a_sharpened_mixture_are_of_the_small_gate() -> None:
+    mixture = a_mixture()
+    rays = some_rays(mixture, 10)
+    small = WideGate(GATE)
+    small.walls = 1.5  # type: ignore[assignment]
+    mixture.sharpen(small, 0.5, {})
+    reference = dense_rendering(mixture, rays, torch.ones(10, 3), 10).references[0]
+    kept = (reference.occupancies >= 0.5) & ~reference.always_kept
+    assert 0.05 < float(kept.float().mean()) < 0.25
+
+
+@pytest.mark.parametrize(
+    ("option", "value"), [("steps", -1), ("rays", 0), ("seen", 1.5), ("least_steps", -1)]
+)
+def test_settings_that_make_no_sense_are_refused(option: str, value: float) -> None:
+    with pytest.raises(InputError, match=f"sharpening.{option.replace('_', '-')}"):
+        SharpeningConfig(**{option: value})
