@@ -13,7 +13,7 @@ from torch import Tensor
 
 from leco_plugin.log import say
 from leco_plugin.models.compute.ranks import share
-from leco_plugin.models.gate import Gate, GateConfig
+from leco_plugin.models.gate import Gate, GateConfig, check_sizes
 from leco_plugin.models.losses import expert_shares
 from leco_plugin.models.mixture import Mixture
 from leco_plugin.models.rendering import gate_values_and_routes
@@ -71,13 +71,22 @@ class Probes:
 
 def as_learned(occupancy: Occupancy) -> Occupancy:
     """An occupancy with a gate and threshold as they were learned, before a smaller one was taught;
-    the weights of such a gate are those of a new one: a history holds the real ones."""
+    the weights of such a gate are those of a new one: a history holds the real ones.
+
+    Raises:
+        ValueError: the report is damaged.
+    """
     learned = occupancy.report.get("learned")
     if learned is None:
         return occupancy
-    gate = Gate(GateConfig.from_dict(learned["gate"])).requires_grad_(False)
-    given = (occupancy.space, learned["threshold"], occupancy.precision, occupancy.report)
-    return Occupancy(gate, *given, occupancy.walls).eval()
+    try:
+        config, threshold = GateConfig.from_dict(learned["gate"]), float(learned["threshold"])
+        check_sizes(config)
+    except (KeyError, TypeError, ValueError) as error:
+        raise ValueError(f"the occupancy's report names no gate as `learned` ({error})") from None
+    gate = Gate(config).requires_grad_(False)
+    given = (occupancy.space, threshold, occupancy.precision, occupancy.report, occupancy.walls)
+    return Occupancy(gate, *given).eval()
 
 
 @dataclass

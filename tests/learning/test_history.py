@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
 
-from leco_plugin.learning.history import FILE_NAME, GateHistory
+from leco_plugin.learning.history import FILE_NAME, GateHistory, as_learned
 from leco_plugin.models.encodings import EncodingConfig
 from leco_plugin.models.gate import Gate, GateConfig
 from leco_plugin.occupancy import Occupancy
@@ -76,3 +77,10 @@ def test_other_files_are_refused_in_a_line(tmp_path: Path) -> None:
         GateHistory.load(tmp_path / "none", a_gate())
     with pytest.raises(ValueError, match="single look"):
         GateHistory().save(tmp_path)
+
+
+@pytest.mark.parametrize("learned", [3, {}, {"gate": 3, "threshold": 0.5}])
+def test_a_damaged_report_names_no_learned_gate(learned: Any) -> None:
+    occupancy = Occupancy(a_gate(), Space(), 0.5, report={"learned": learned})
+    with pytest.raises(ValueError, match="names no gate as `learned`"):
+        as_learned(occupancy)

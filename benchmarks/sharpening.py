@@ -1,0 +1,220 @@
+"""What sharpening brings: `python benchmarks/sharpening.py RUN=SCENE ...`.
+
+Of runs of `leco-occupancy` that were not sharpened (`--pipeline.model.sharpening.steps 0`). Two
+fields teach: the one of the moment of freezing, and the one at the end, which was trained guided.
+Small gates are taught with three seeds, each on other training rays. At the calibrated thresholds:
+candidates skipped, and what that loses on held-out pixels and on rays of test photographs, which
+nothing was calibrated on. At equal loss, of the field at freezing: volume kept, beside grids that
+the same lesson teaches. Stored in `results/sharpening.json`.
+"""
+
+from __future__ import annotations
+
+import statistics
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import checkout  # noqa: F401
+import torch
+import tyro
+from torch import Tensor
+
+from leco_plugin.capacity.evidence import Evidence, gather
+from leco_plugin.capacity.sources import (
+    Seen,
+    Source,
+    draw_held_out,
+    draw_test_rays,
+    draw_training_rays,
+    find_source,
+)
+from leco_plugin.cli_reports import occupancy_of
+from leco_plugin.evaluation.equal_loss import kept_shares, mapped_box, reached_volume
+from leco_plugin.evaluation.field_grids import dilate, in_parts, looked_up
+from leco_plugin.evaluation.report import (
+    describe_code,
+    describe_machine,
+    made_by,
+    read_object,
+    write_json,
+)
+from leco_plugin.learning.calibration import Measured, measure
+from leco_plugin.learning.dense import in_chunks
+from leco_plugin.learning.sharpening import (
+    Lesson,
+    SharpeningConfig,
+    answers,
+    lesson_by,
+    seen_rendering,
+    sharpen,
+)
+from leco_plugin.models.gate import Gate
+from leco_plugin.models.leco import LecoModel
+from leco_plugin.models.mixture import Mixture
+from leco_plugin.occupancy import gate_precision
+from leco_plugin.samplers.boxes import cells_of
+from leco_plugin.scenes.learning_data import on_black
+
+SEEDS = 3
+GRIDS = (32, 64, 96, 128, 256)
+LOST = 1e-3
+"""Share of the surface mass at which volumes are compared."""
+RAYS, PLACES = 8192, 1 << 17
+SHOWN = ("threshold", "empty_fraction", "lost_surface_mass", "image_price_db")
+
+
+@dataclass
+class Options:
+    """Settings of the benchmark."""
+
+    runs: tyro.conf.Positional[tuple[str, ...]]
+    """Folders of runs and their scenes, as RUN=SCENE."""
+    out: Path = Path(__file__).parent / "results" / "sharpening.json"
+    """Where the figures go; rows of scenes that are not named stay."""
+
+
+def shown(measured: Measured) -> dict[str, float]:
+    """Figures of a threshold, as they are stored."""
+    return {name: round(float(getattr(measured, name)), 6) for name in SHOWN}
+
+
+def on_rays(mixture: Mixture, gate: Gate, threshold: float, seen: Seen, guided: bool) -> Measured:
+    """What a gate skips and loses along some rays, of what is rendered as prices are."""
+    truth = on_black(seen.truth)
+    rendering = seen_rendering(mixture, seen.rays, truth, 1.0 if guided else 0.0, 1024)
+    asked = [
+        reference._replace(occupancies=answers(mixture, gate, chunk, reference.intervals))
+        for chunk, reference in zip(in_chunks(seen.rays, 1024), rendering.references)
+    ]
+    return measure(asked, *rendering[1:], threshold)
+
+
+def taught_by(source: Source, mixture: Mixture, guided: bool) -> tuple[dict[str, Any], list[Gate]]:
+    """Small gates of three seeds by one field, beside what guided until then; and the gates."""
+    model = source.model
+    assert model is not None
+    occupancy = mixture.occupancy().eval()
+    held_out = draw_held_out(source, occupancy, RAYS, parts=1)[0]
+    tests = draw_test_rays(source, occupancy, RAYS)
+    assert tests is not None
+    rows, gates = [], []
+    for seed in range(SEEDS):
+        torch.manual_seed(seed)
+        taught = draw_training_rays(source, occupancy, SharpeningConfig().rays).rays
+        started = time.monotonic()
+        found = sharpen(
+            mixture,
+            taught,
+            (held_out.rays, on_black(held_out.truth)),
+            model.config.gate_loss,
+            model.config.calibration,
+            SharpeningConfig(),
+            guided,
+        )
+        seconds = time.monotonic() - started
+        after = on_rays(mixture, found.gate, found.measured.threshold, tests, guided)
+        gates.append(found.gate)
+        rows.append(
+            {"seconds": round(seconds, 1), "held_out": shown(found.measured), "test": shown(after)}
+        )
+        print(f"  seed {seed}: {rows[-1]}", flush=True)
+    before = on_rays(mixture, mixture.gate, float(mixture.threshold), tests, guided)
+    return {
+        "before": {"held_out": shown(found.before), "test": shown(before)},
+        "small": rows,
+    }, gates
+
+
+def gate_score(mixture: Mixture, gate: Gate) -> Callable[[Tensor], Tensor]:
+    """o(x) of mapped positions."""
+
+    @torch.no_grad()
+    def score(mapped: Tensor) -> Tensor:
+        with gate_precision(mapped.device.type, mixture.precision):
+            return gate.occupancy(mapped)
+
+    return score
+
+
+def grid_score(
+    mixture: Mixture, lesson: Lesson, cells: int, dilated: bool
+) -> Callable[[Tensor], Tensor]:
+    """The largest target of the lesson's positions in each cell, or also in the cells around it."""
+    box = mapped_box(mixture)
+    shape = (cells,) * 3
+    index, inside = cells_of((1, *shape), torch.cat([box.low, box.high]), lesson.mapped)
+    targets = (1.0 - lesson.skip) * inside
+    filled = torch.zeros(cells**3).scatter_reduce_(0, index.long(), targets, "amax").view(shape)
+    filled = dilate(filled) if dilated else filled
+    return lambda mapped: looked_up(filled, box, mapped)
+
+
+def at_equal_loss(source: Source, mixture: Mixture, gates: list[Gate]) -> list[dict[str, Any]]:
+    """Volume that is kept where `LOST` of the surface mass is lost, on two kinds of rays."""
+    model = source.model
+    assert model is not None
+    occupancy = mixture.occupancy().eval()
+    torch.manual_seed(0)
+    taught = draw_training_rays(source, occupancy, SharpeningConfig().rays).rays
+    lesson = lesson_by(mixture, taught, model.config.gate_loss, SharpeningConfig().seen, 1024)
+    tests = draw_test_rays(source, occupancy, RAYS)
+    assert tests is not None
+    evidence: dict[str, Evidence] = {
+        "held_out": gather(mixture, None, draw_held_out(source, occupancy, RAYS, parts=1)[0])[0],
+        "test": gather(mixture, None, tests)[0],
+    }
+    places = reached_volume(mixture, lesson.mapped, PLACES, seed=5)
+    rivals = {"learned gate": (2 * occupancy.num_params, gate_score(mixture, mixture.gate))}
+    for seed, gate in enumerate(gates):
+        size = 2 * sum(p.numel() for p in gate.parameters())
+        rivals[f"small gate, seed {seed}"] = (size, gate_score(mixture, gate))
+    for n in GRIDS:
+        for dilated in (False, True):
+            name = f"grid {n}^3{', dilated' if dilated else ''}"
+            rivals[name] = (-(-(n**3) // 8), grid_score(mixture, lesson, n, dilated))
+    rows = []
+    for name, (size, score) in rivals.items():
+        of_volume, row = in_parts(score, places), {"name": name, "bytes": size}
+        for kind, rays in evidence.items():
+            mapped = mixture.region.space.map(rays.positions).clamp(-1.0, 1.0)
+            kept = kept_shares(rays.worth, in_parts(score, mapped), of_volume, LOST)
+            row[kind] = {"volume": round(kept[0], 5), "candidates": round(kept[1], 5)}
+        rows.append(row)
+        print(f"  {row}", flush=True)
+    return rows
+
+
+def row_of(run: Path, data: Path) -> dict[str, Any]:
+    """All figures of one run."""
+    file = occupancy_of(run)
+    source = find_source(file, data)
+    assert isinstance(source.model, LecoModel) and source.frozen is not None
+    at_freezing, gates = taught_by(source, source.frozen, guided=False)
+    at_end, _ = taught_by(source, source.model.mixture.eval(), guided=True)
+    return {
+        "learned_params": sum(p.numel() for p in source.frozen.gate.parameters()),
+        "at_freezing": at_freezing,
+        "at_end": at_end,
+        "at_equal_loss": at_equal_loss(source, source.frozen, gates),
+        "seconds": statistics.median(row["seconds"] for row in at_freezing["small"]),
+    }
+
+
+def main(options: Options) -> None:
+    """Measures the runs that are named, one after the other."""
+    known = read_object(options.out, "is damaged; delete it") if options.out.exists() else {}
+    rows: dict[str, Any] = known.get("scenes", {})
+    code = describe_code()
+    for pair in options.runs:
+        run, _, data = pair.partition("=")
+        if not data:
+            raise SystemExit(f"{pair} is not RUN=SCENE")
+        rows[Path(data).name] = {**row_of(Path(run), Path(data)), **made_by(code)}
+        write_json(options.out, {"format": 1, "machine": describe_machine(), "scenes": rows})
+
+
+if __name__ == "__main__":
+    main(tyro.cli(Options))
