@@ -16,8 +16,8 @@ from PIL import Image
 from rich.markup import escape
 
 from leco_plugin.log import say
-from leco_plugin.scenes.derived_images import DerivedImages
 from leco_plugin.scenes.input_error import InputError, one_line
+from leco_plugin.scenes.photograph_files import DerivedImages
 
 HALF = 128
 """From this grey on, where a mask has so light ones, a pixel is seen."""

@@ -20,8 +20,14 @@ from rich.markup import escape
 from torch import Tensor
 
 from leco_plugin.log import say
-from leco_plugin.scenes.dataset_units import METRES_PER_UNIT, UP_IS_KNOWN
-from leco_plugin.scenes.frames import applied_in, from_file, moved, parsed_frame
+from leco_plugin.scenes.frames import (
+    METRES_PER_UNIT,
+    UP_IS_KNOWN,
+    applied_in,
+    from_file,
+    moved,
+    parsed_frame,
+)
 from leco_plugin.scenes.input_error import InputError, one_line
 from leco_plugin.scenes.large_coordinates import ReadsNear
 from leco_plugin.scenes.photograph_files import check_images, find_file

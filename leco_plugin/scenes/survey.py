@@ -19,7 +19,7 @@ from leco_plugin.scenes.bounds import (
     up_to_the_cameras,
     with_range,
 )
-from leco_plugin.scenes.dataset_units import ALTITUDES, DatasetUnits, units_of
+from leco_plugin.scenes.frames import ALTITUDES, DatasetUnits, units_of
 from leco_plugin.scenes.input_error import InputError
 from leco_plugin.scenes.large_coordinates import rounded_by
 from leco_plugin.scenes.photographs import POINT_KEYS

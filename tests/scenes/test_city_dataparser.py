@@ -11,7 +11,7 @@ from nerfstudio.plugins.registry_dataparser import DataParserSpecification
 
 from leco_plugin.scenes.city.truth import CityTruth
 from leco_plugin.scenes.city_dataparser import LecoCityDataParserConfig, leco_city_dataparser
-from leco_plugin.scenes.dataset_units import METRES_PER_UNIT
+from leco_plugin.scenes.frames import METRES_PER_UNIT
 from leco_plugin.scenes.input_error import InputError
 from leco_plugin.scenes.photographs import POINTS
 

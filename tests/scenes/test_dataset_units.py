@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 import torch
 
-from leco_plugin.scenes.dataset_units import METRES_PER_UNIT, units_of
+from leco_plugin.scenes.frames import METRES_PER_UNIT, units_of
 
 
 def manager(scale: float, transform: torch.Tensor, metadata: Any = None) -> SimpleNamespace:

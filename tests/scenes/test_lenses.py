@@ -11,7 +11,7 @@ from nerfstudio.cameras.cameras import Cameras, CameraType
 
 from leco_plugin.scenes.input_error import InputError
 from leco_plugin.scenes.lenses import UNDISTORTED, check_together, lens_of
-from leco_plugin.scenes.scene_fields import unused_fields
+from leco_plugin.scenes.scene_file import unused_fields
 
 SCENE: dict[str, Any] = {
     "w": 40,

@@ -19,8 +19,7 @@ from nerfstudio.plugins.registry_dataparser import DataParserSpecification
 
 from leco_plugin.scenes.bounds import BoundsConfig
 from leco_plugin.scenes.data_manager import LecoDataManagerConfig
-from leco_plugin.scenes.dataset_units import ALTITUDES, METRES_PER_UNIT
-from leco_plugin.scenes.frames import between, frame_of
+from leco_plugin.scenes.frames import ALTITUDES, METRES_PER_UNIT, between, frame_of
 from leco_plugin.scenes.input_error import InputError
 from leco_plugin.scenes.mega_nerf import MegaNerfDataParserConfig, mega_nerf_dataparser
 from leco_plugin.scenes.photographs import POINTS

@@ -25,10 +25,10 @@ import torch
 from damaged_bytes import cut, flip, splice
 from PIL import Image
 
-from leco_plugin.scenes.derived_images import DerivedImages
 from leco_plugin.scenes.input_error import InputError
 from leco_plugin.scenes.mega_nerf_format.files import read_coordinates, read_frame
-from leco_plugin.scenes.mega_nerf_format.images import picture_of, read_mask
+from leco_plugin.scenes.mega_nerf_format.outputs import picture_of, read_mask
+from leco_plugin.scenes.photograph_files import DerivedImages
 
 SECONDS = 2.0
 MEGABYTES = 400.0

@@ -9,8 +9,8 @@ import pytest
 from nerfstudio.data.utils.data_utils import get_image_mask_tensor_from_path
 from PIL import Image
 
-from leco_plugin.scenes.derived_images import DerivedImages
 from leco_plugin.scenes.input_error import InputError
+from leco_plugin.scenes.photograph_files import DerivedImages
 from leco_plugin.scenes.photograph_masks import convert_masks
 
 SEEN = np.zeros((16, 24), dtype=bool)

@@ -14,7 +14,7 @@ import torch
 import trimesh
 from PIL import Image
 
-from leco_plugin.scenes.dataset_units import METRES_PER_UNIT
+from leco_plugin.scenes.frames import METRES_PER_UNIT
 from leco_plugin.scenes.input_error import InputError
 from leco_plugin.scenes.photographs import (
     POINTS,

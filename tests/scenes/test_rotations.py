@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from leco_plugin.scenes.rotations import distance_from_rotations
+from leco_plugin.scenes.frames import distance_from_rotations
 
 
 def test_rotations_are_at_no_distance_and_others_at_theirs() -> None:

@@ -107,12 +107,10 @@ def plan_city(
         pavement = palette.add(Material.PAVEMENT, (0.62, 0.60, 0.57), (x, y, 0))
         grass = palette.add(Material.GRASS, (0.33, 0.46, 0.20), (x, y, 0))
         half = lot / 2
-        canvas = Canvas(
-            (round(x - half, 2), round(x + half, 2), round(y - half, 2), round(y + half, 2)), street
-        )
-        canvas.stroke(
-            x - half + 0.2, x + half - 0.2, y - half + 0.2, y + half - 0.2, KERB, pavement
-        )
+        x0, x1, y0, y1 = (round(v, 2) for v in (x - half, x + half, y - half, y + half))
+        canvas = Canvas((x0, x1, y0, y1), street)
+        kerb = half - 0.2
+        canvas.stroke((x - kerb, x + kerb, y - kerb, y + kerb), KERB, pavement)
         block = Block(shapes, palette, random, x, y, lot, canvas, metal, earth, grass)
         KINDS[kinds[i, j]](block)
         _pavement(block, lamp)
@@ -186,7 +184,7 @@ def _streets(block: Block, size: float, street: int) -> None:
                 dx, dy = (length, width) if number in (0, 2) else (width, length)
                 x, y = (along, across) if number in (0, 2) else (across, along)
                 x, y = x + block.x, y + block.y
-                canvas.stroke(x - dx, x + dx, y - dy, y + dy, top, colour)
+                canvas.stroke((x - dx, x + dx, y - dy, y + dy), top, colour)
         canvas.build(block.shapes, GROUND_DEPTH)
 
 

@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from leco_plugin.scenes.derived_images import DerivedImages, open_image
 from leco_plugin.scenes.input_error import InputError
 from leco_plugin.scenes.mega_nerf_format.files import Frame, read_scene
-from leco_plugin.scenes.mega_nerf_format.images import mask_of, picture_of, scaled
+from leco_plugin.scenes.mega_nerf_format.outputs import mask_of, picture_of, scaled
+from leco_plugin.scenes.photograph_files import DerivedImages, open_image
 
 
 @pytest.fixture(scope="module")
@@ -64,7 +64,7 @@ def test_other_kinds_of_pixels_become_colours(
     for mode, channels in (("P", 3), ("LA", 4), ("CMYK", 3)):
         path = tmp_path / f"{mode}.{'jpg' if mode == 'CMYK' else 'png'}"
         whole.convert(mode).save(path)
-        other = dataclasses.replace(frame, image=path, mode=mode)
+        other = dataclasses.replace(frame, image=path)
         assert pixels(picture_of(other, 1, False, derived)).shape == (16, 24, channels)
 
 

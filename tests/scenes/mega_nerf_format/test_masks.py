@@ -11,7 +11,7 @@ import torch
 from mega_nerf_scene import pack, write_mask
 
 from leco_plugin.scenes.input_error import InputError
-from leco_plugin.scenes.mega_nerf_format.images import read_mask
+from leco_plugin.scenes.mega_nerf_format.outputs import read_mask
 
 KEEP = np.random.default_rng(0).random((6, 9)) < 0.5
 

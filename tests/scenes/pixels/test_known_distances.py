@@ -11,8 +11,8 @@ from leco_plugin.scenes.pixels.known_distances import (
     DISTANCE,
     KnownDistancePixelSampler,
     KnownDistancePixelSamplerConfig,
+    SparsePixels,
 )
-from leco_plugin.scenes.pixels.sparse_pixels import SparsePixels
 
 
 def images() -> dict[str, Any]:

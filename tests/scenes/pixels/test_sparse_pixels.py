@@ -6,8 +6,8 @@ import pytest
 import torch
 from nerfstudio.cameras.cameras import Cameras, CameraType
 
+from leco_plugin.scenes.pixels.known_distances import FEWEST_POINTS, hidden, sparse_pixels
 from leco_plugin.scenes.pixels.lattice import Lattice
-from leco_plugin.scenes.pixels.sparse_pixels import FEWEST_POINTS, hidden, sparse_pixels
 
 WIDTH, HEIGHT = 160, 120
 
