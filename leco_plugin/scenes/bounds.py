@@ -32,6 +32,8 @@ class BoundsConfig:
     the dataparser knows."""
 
 
+FEWEST_POINTS = 32
+"""Fewer sparse points say nothing of a scene."""
 OVER_CAMERAS = 0.06
 """Share of the way from the ground to the highest camera by which raised bounds end above it."""
 NEAR_CAMERAS = 0.04
@@ -71,7 +73,7 @@ def find_bounds(
     Args:
         camera_to_worlds: [C, 3, 4] OpenGL poses, scene units.
         directions: [C, K, 3] unit directions of rays that cover each image, its corners included.
-        points: [P, 3] sparse scene points, or None; fewer than 32 count as none.
+        points: [P, 3] sparse scene points, or None.
         config: what is not to be found.
     Raises:
         ValueError: there are no cameras, a pose is not finite, no camera sees a point, or the
@@ -83,10 +85,7 @@ def find_bounds(
         raise ValueError("the scene has no cameras")
     if not bool(poses.isfinite().all()):
         raise ValueError("a camera pose holds values that are not finite")
-    if points is not None:
-        points = points.detach().float().cpu()
-        points = points[points.isfinite().all(dim=-1)]
-        points = points if len(points) >= 32 else None
+    points = usable_points(points)
     if config.altitudes is not None and config.space != "contraction":
         return _between(config.altitudes, poses, directions, points)
     if points is None:
@@ -114,12 +113,19 @@ def find_bounds(
     return SceneBounds("contraction", (low + high) / 2, half, near, far, _no_walls(), reason)
 
 
-def with_range(bounds: SceneBounds, near: float | None, far: float | None) -> SceneBounds:
-    """The bounds with near and far set by hand; None leaves what was found.
+def usable_points(points: Tensor | None) -> Tensor | None:
+    """The finite ones of sparse points [P, 3], float32 on the CPU; None of fewer than
+    `FEWEST_POINTS`."""
+    if points is None:
+        return None
+    points = points.detach().float().cpu()
+    points = points[points.isfinite().all(dim=-1)]
+    return points if len(points) >= FEWEST_POINTS else None
 
-    Raises:
-        InputError: the range is empty or begins at the camera.
-    """
+
+def with_range(bounds: SceneBounds, near: float | None, far: float | None) -> SceneBounds:
+    """The bounds with near and far set by hand; None leaves what was found. InputError for an empty
+    range, or one that begins at the camera."""
     near, far = bounds.near if near is None else near, bounds.far if far is None else far
     if not 0.0 < near < far < math.inf:
         raise InputError(f"rays need 0 < near < far, got near {near:g} and far {far:g}")

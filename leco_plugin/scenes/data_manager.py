@@ -123,11 +123,7 @@ class LecoDataManager(VanillaDataManager):  # type: ignore[type-arg]
         return sampler
 
     def on_disk(self) -> bool:
-        """Whether pixels are read from files.
-
-        Raises:
-            InputError: they are to be, and cannot.
-        """
+        """Whether pixels are read from files. InputError if they are to be, and cannot."""
         config = self.config
         wanted = getattr(config, "images", "auto")
         if wanted == "memory" or not keeps_all_images(config, len(self.train_dataset)):

@@ -1,7 +1,8 @@
-"""Coordinates of two readers of one scene: how positions of one become positions of the other.
+"""The coordinates of a scene: frames of its readers, lengths and altitudes of its data, and poses.
 
-nerfstudio's readers turn, move and scale a scene, each in its own way; what was learned in the
-coordinates of one is asked in those of another.
+nerfstudio's readers turn, move and scale a scene, each in its own way. What was learned in the
+coordinates of one is asked in those of another, and what a reader says it did leads back to the
+units of the data.
 """
 
 from __future__ import annotations
@@ -145,11 +146,7 @@ def moved(positions: Tensor, frame: Tensor) -> Tensor:
 
 
 def found_again(known: Tensor, here: Tensor, half_extent: float) -> Tensor:
-    """Which of the cameras at places [K, 3] are among those at others [C, 3], one frame: bool [K].
-
-    Args:
-        half_extent: of the scene.
-    """
+    """Which cameras at places [K, 3] are among those at others [C, 3], of one frame: bool [K]."""
     return torch.cdist(known.float(), here.float()).amin(dim=1) <= SAME_PLACE * half_extent
 
 
@@ -194,10 +191,8 @@ class DatasetUnits:
 def units_of(datamanager: Any, metres_per_unit: float | None = None) -> DatasetUnits | None:
     """The units of a data manager's dataset; None where its dataparser does not say what it did.
 
-    Args:
-        metres_per_unit: of the dataset's own poses; None takes what the dataparser knows.
-    Raises:
-        ValueError: not a positive number of metres.
+    `metres_per_unit`, of the dataset's own poses, is positive, or ValueError; None takes what the
+    dataparser knows.
     """
     outputs = getattr(datamanager, "train_dataparser_outputs", None)
     scale = float(getattr(outputs, "dataparser_scale", 0.0))
@@ -233,13 +228,8 @@ def distance_from_rotations(matrices: NDArray[np.floating]) -> NDArray[np.floati
 
 
 def check_poses(poses: NDArray[np.floating], names: list[str]) -> None:
-    """Poses [C, 3, 4] or [C, 4, 4] are finite, and their first three columns rotations.
-
-    Args:
-        names: of each pose, for errors.
-    Raises:
-        InputError: one line.
-    """
+    """InputError, with its name, for one of poses [C, 3, 4] or [C, 4, 4] that is not finite or
+    whose first three columns are no rotation."""
     if poses.shape[1:] not in ((4, 4), (3, 4)):
         raise InputError(f"{names[0]} is no finite 4 x 4 matrix: give it four rows of four")
     broken = ~np.isfinite(poses).all(axis=(1, 2))

@@ -23,6 +23,7 @@ CONVERTED = ("1", "P", "PA", "LA", "CMYK")
 """Modes that become one of these; of CMYK by Pillow's formula, without a colour profile."""
 SAVE_ANEW = "if the file is whole, save it as JPEG or PNG with 8 bits a channel, and give that name"
 """What to do about HEIC, OpenEXR and other kinds that Pillow does not read."""
+ANOTHER_FOLDER = "give another folder for derived pictures with --cache"
 
 
 class Header(NamedTuple):
@@ -41,11 +42,7 @@ class Header(NamedTuple):
 
 
 def header_of(path: Path) -> Header:
-    """What a file of an image says.
-
-    Raises:
-        InputError: it is none.
-    """
+    """What a file of an image says. InputError if it is none."""
     try:
         with Image.open(path) as image:
             several = image.format != "MPO" and getattr(image, "n_frames", 1) > 1
@@ -75,11 +72,7 @@ def find_file(path: Path) -> Path:
 
 
 def check_images(paths: list[Path]) -> None:
-    """Every image is there.
-
-    Raises:
-        InputError: one line.
-    """
+    """InputError if an image is not there."""
     missing = [path for path in paths if not path.exists()]
     if missing:
         raise InputError(
@@ -102,11 +95,7 @@ def remedy_for_missing(path: Path) -> str:
 
 
 def check_kind(path: Path, header: Header) -> None:
-    """The colours of an image can be read.
-
-    Raises:
-        InputError: one line.
-    """
+    """InputError if the colours of an image cannot be read."""
     if header.mode not in READ_RIGHTLY + CONVERTED:
         raise InputError(
             f"{path} is of Pillow's mode {header.mode!r}, which nerfstudio reads wrongly: save it "
@@ -136,11 +125,7 @@ def is_turned(header: Header, size: tuple[int, int]) -> bool:
 
 
 def decode(path: Path, turn: bool) -> Image.Image:
-    """The plain colours of an image, turned as EXIF says if that is asked.
-
-    Raises:
-        InputError: it cannot be decoded.
-    """
+    """The plain colours of an image, turned as EXIF says if asked. InputError if it has none."""
     try:
         with Image.open(path) as image:
             turned = ImageOps.exif_transpose(image) if turn else image
@@ -176,18 +161,13 @@ class DerivedImages:
     of it, so that a changed source is never taken for the old one.
     """
 
-    def __init__(
-        self, folder: Path, remedy: str = "give another folder for derived pictures with --cache"
-    ) -> None:
+    def __init__(self, folder: Path, remedy: str = ANOTHER_FOLDER) -> None:
         """With what to do where nothing can be written."""
         self.folder, self.remedy = folder, remedy
 
     def get(self, source: Path, recipe: str, make: Callable[[], Image.Image]) -> Path:
-        """The file with what `make` makes of `source`; `recipe` names it.
-
-        Raises:
-            InputError: one line; the source cannot be read as a picture, or nothing can be written.
-        """
+        """The file with what `make` makes of `source`; `recipe` names it. InputError if nothing can
+        be written."""
         status = source.stat()
         known_by = f"{source.resolve()} {status.st_size} {status.st_mtime_ns} {recipe}"
         digest = hashlib.blake2b(known_by.encode(), digest_size=8).hexdigest()

@@ -29,6 +29,8 @@ from leco_plugin.scenes.photograph_masks import check_masked
 
 FRAMES = ("frames", "test_frames")
 """Lists of frames; the second is ScanNet++'s."""
+NO_SCENE = (OSError, ValueError, KeyError, TypeError, AttributeError, OverflowError, RecursionError)
+"""What a JSON file that is no scene raises."""
 
 
 @dataclass(frozen=True)
@@ -78,13 +80,11 @@ def _completed(frame: Any) -> Any:
 
 
 def read_scene_file(path: Path, split: str, folder: Path) -> SceneFile:
-    """A transforms.json with poses and lenses that cameras have.
+    """A transforms.json. InputError if its poses and lenses are none that cameras have.
 
     Args:
         split: that is read; only the cameras of training need more places than one.
         folder: to which names of pictures are relative.
-    Raises:
-        InputError: one line.
     """
     try:
         meta = load_json(path)
@@ -94,15 +94,7 @@ def read_scene_file(path: Path, split: str, folder: Path) -> SceneFile:
         if not all(type(name) is str and all(ord(c) >= 32 for c in name) for name in names):
             raise ValueError("a file_path is no path")
         poses = np.array([frame["transform_matrix"] for frame in frames], dtype=float)
-    except (
-        OSError,
-        ValueError,
-        KeyError,
-        TypeError,
-        AttributeError,
-        OverflowError,
-        RecursionError,
-    ) as error:
+    except NO_SCENE as error:
         reason = f"{type(error).__name__}: {one_line(error, 120)}"
         raise InputError(
             f"{path} is not a scene in nerfstudio's format ({reason}); mend it, or make it "
@@ -145,10 +137,9 @@ def description_of(config: Any, split: str) -> Path | None:
 
 
 def scene_file_of(config: Any, split: str) -> SceneFile | None:
-    """The transforms.json that a reader is about to read, checked; None where it reads others.
+    """The transforms.json that a reader is about to read; None where it reads others.
 
-    Raises:
-        InputError: one line; it is not there, or nerfstudio would fail at it or read it wrongly.
+    InputError if it is not there, or nerfstudio would fail at it or read it wrongly.
     """
     data, file = Path(config.data), description_of(config, split)
     if file is None:
@@ -185,8 +176,7 @@ def _add(scene: SceneFile, data: Path) -> str:
 def frames_of(images: list[Path], scene: SceneFile) -> list[int | None]:
     """The number of the frame of each picture, which may be a smaller one of the same name.
 
-    Raises:
-        InputError: one line; several frames of different folders would have one smaller picture.
+    InputError if frames of different folders would have one smaller picture.
     """
     places = [str(frame["file_path"]).replace("\\", "/") for frame in scene.frames]
     named: dict[str, list[int]] = {}

@@ -266,9 +266,7 @@ def _read(path: Path, otherwise: str) -> dict[str, Any]:
 
 def _numbers(path: Path, values: dict[str, Any], name: str, shape: tuple[int, ...]) -> Array:
     """A finite tensor of a known shape, float64."""
-    if name not in values:
-        raise InputError(f"{path} has no {name}")
-    value, wanted = values[name], " x ".join(str(n) for n in shape)
+    value, wanted = _value(path, values, name), " x ".join(str(n) for n in shape)
     if not isinstance(value, torch.Tensor) or tuple(value.shape) != shape:
         raise InputError(f"{path}: {name} is {describe(value)}, and not {wanted} numbers")
     numbers: Array = value.detach().double().numpy().copy()
@@ -277,10 +275,14 @@ def _numbers(path: Path, values: dict[str, Any], name: str, shape: tuple[int, ..
     return numbers
 
 
-def _number(path: Path, values: dict[str, Any], name: str) -> float:
+def _value(path: Path, values: dict[str, Any], name: str) -> Any:
     if name not in values:
         raise InputError(f"{path} has no {name}")
-    value = values[name]
+    return values[name]
+
+
+def _number(path: Path, values: dict[str, Any], name: str) -> float:
+    value = _value(path, values, name)
     if isinstance(value, torch.Tensor) and value.numel() != 1:
         raise InputError(f"{path}: {name} is {describe(value)}, and not a number")
     try:

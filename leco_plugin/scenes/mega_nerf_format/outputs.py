@@ -46,11 +46,8 @@ if TYPE_CHECKING:
 
 
 def read(config: MegaNerfDataParserConfig) -> MegaNerfScene:
-    """The scene without its pixels, and a line in the log that says what it is.
-
-    Raises:
-        InputError: an option or a file is wrong.
-    """
+    """The scene without its pixels, and a line in the log that says what it is. InputError if an
+    option or a file is wrong."""
     if min(config.train_scale_factor, config.val_scale_factor) < 1:
         raise InputError("train_scale_factor and val_scale_factor are whole numbers from 1 on")
     if config.ray_altitude_range is not None:
@@ -73,8 +70,7 @@ def outputs_of(
 ) -> DataparserOutputs:
     """The pictures that are trained on, or those that are scored, as nerfstudio takes them.
 
-    Raises:
-        InputError: a picture, a mask or the file of points is wrong.
+    InputError if a picture, a mask or the file of points is wrong.
     """
     half = config.protocol == "half"
     frames = [
@@ -177,11 +173,8 @@ _MORE = 1 << 16
 
 
 def scaled(frame: Frame, factor: int) -> tuple[int, int]:
-    """Width and height of a picture divided by a factor.
-
-    Raises:
-        InputError: the factor does not divide them, or the file is smaller than that.
-    """
+    """Width and height of a picture divided by a factor. InputError if it does not divide them, or
+    the file is smaller than that."""
     if frame.width % factor or frame.height % factor:
         raise InputError(
             f"{frame.image} has metadata for {frame.width} x {frame.height} pixels, "
@@ -254,11 +247,8 @@ def _cut(mask: Image.Image, left_half: bool) -> Image.Image:
 
 
 def read_mask(path: Path, width: int, height: int) -> NDArray[np.bool_]:
-    """Which pixels of a picture to keep: bool [height, width].
-
-    Raises:
-        InputError: one line; there is no such file, it is no mask, or one of another size.
-    """
+    """Which pixels of a picture to keep: bool [height, width]. InputError if there is no such file,
+    or no mask of that size in it."""
     most = width * height + _MORE
     mask = load(_unpack(path, read_bytes(path, most), most), str(path))
     if not isinstance(mask, torch.Tensor) or mask.dtype != torch.bool or mask.dim() != 2:
