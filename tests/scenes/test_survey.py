@@ -7,13 +7,13 @@ from types import SimpleNamespace
 import pytest
 import torch
 from nerfstudio.cameras.cameras import Cameras
+from scene_files import leaves_images_open, refused, write_ply
 from tiny_scene import camera_to_world
 
 from leco_plugin.scenes.bounds import BoundsConfig
 from leco_plugin.scenes.city.cameras import CaptureConfig
 from leco_plugin.scenes.city.city import CityConfig
 from leco_plugin.scenes.city.folder import write_city
-from leco_plugin.scenes.input_error import InputError
 from leco_plugin.scenes.mega_nerf import MegaNerfDataParserConfig
 from leco_plugin.scenes.photographs import POINTS, LecoPhotographsDataParserConfig
 from leco_plugin.scenes.survey import (
@@ -54,7 +54,7 @@ def test_a_ring_of_cameras_sees_its_scene() -> None:
 
 
 def test_no_cameras_are_refused() -> None:
-    with pytest.raises(InputError, match="no training cameras"):
+    with refused("no training cameras"):
         survey(datamanager(ring()[torch.zeros(8, dtype=torch.bool)]))
 
 
@@ -63,9 +63,8 @@ def test_rays_that_never_meet_the_scene_are_refused_in_one_line() -> None:
     behind = torch.rand(200, 3, generator=torch.Generator().manual_seed(0)) + torch.tensor(
         [0, 0, 99]
     )
-    with pytest.raises(InputError, match=r"no (camera sees|ray of any camera)") as caught:
+    with refused(r"no (camera sees|ray of any camera)"):
         survey(datamanager(ring(), behind))
-    assert "\n" not in str(caught.value)
 
 
 def drone(count: int = 12) -> Cameras:
@@ -128,12 +127,9 @@ def test_more_cameras_than_are_looked_at_still_have_bounds() -> None:
 def test_a_range_by_hand_is_what_rays_are_counted_in() -> None:
     data = datamanager(drone(), ground())
     assert survey(data, near=1.0, far=12.0).bounds.far == 12.0
-    with pytest.raises(
-        InputError, match=r"^0% of the rays meet the scene .*leave them out"
-    ) as caught:
+    with refused(r"^0% of the rays meet the scene .*leave them out"):
         survey(data, near=0.5, far=2.0)
-    assert "\n" not in str(caught.value)
-    with pytest.raises(InputError, match="0 < near < far"):
+    with refused("0 < near < far"):
         survey(data, near=3.0, far=2.0)
 
 
@@ -161,10 +157,7 @@ def cities(tmp_path_factory: pytest.TempPathFactory) -> dict[str, SimpleNamespac
     transform, scale = upright.dataparser_transform, upright.dataparser_scale
     in_metres = (upright.metadata[POINTS] / scale - transform[:, 3]) @ transform[:, :3]
     drb = torch.stack([-in_metres[:, 2], in_metres[:, 0], -in_metres[:, 1]], dim=-1)
-    rows = "".join(" ".join(f"{value:.4f}" for value in point) + "\n" for point in drb.tolist())
-    head = "ply\nformat ascii 1.0\nelement vertex {}\n{}end_header\n"
-    axes = "".join(f"property float {axis}\n" for axis in "xyz")
-    (mega / "points.ply").write_text(head.format(len(drb), axes) + rows)
+    write_ply(mega / "points.ply", drb.numpy())
     config = MegaNerfDataParserConfig(data=mega, val_scale_factor=1, protocol="full")
     outputs = {"plain": upright, "mega": config.setup().get_dataparser_outputs("train")}
     return {
@@ -176,8 +169,7 @@ def cities(tmp_path_factory: pytest.TempPathFactory) -> dict[str, SimpleNamespac
     }
 
 
-@pytest.mark.filterwarnings("ignore:unclosed file:ResourceWarning")
-@pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
+@leaves_images_open
 def test_one_city_in_two_formats_has_the_same_bounds_in_metres(
     cities: dict[str, SimpleNamespace],
 ) -> None:

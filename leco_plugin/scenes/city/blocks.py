@@ -27,6 +27,7 @@ from leco_plugin.scenes.city.shapes import (
     Shapes,
     add_roof,
     add_turned,
+    square,
 )
 
 GROUND_DEPTH = 4.0
@@ -128,15 +129,10 @@ def _inset(area: Rectangle, by: float) -> Rectangle:
     return x0 + by, x1 - by, y0 + by, y1 - by
 
 
-def _square(half: float) -> Rectangle:
-    """The middle of a block, of twice that side."""
-    return -half, half, -half, half
-
-
 def _towers(block: Block) -> None:
     """Four parcels of tall, often stepped, buildings."""
     r, gap = block.reach, 1.5
-    block.paint(_square(r), KERB, block.palette.add(Material.PAVEMENT, (0.60, 0.56, 0.52)))
+    block.paint(square(r), KERB, block.palette.add(Material.PAVEMENT, (0.60, 0.56, 0.52)))
     for sx in (-1, 1):
         for sy in (-1, 1):
             x0, x1 = sorted((sx * gap, sx * (r - block.random.uniform(0, 1.2))))
@@ -155,7 +151,7 @@ def _towers(block: Block) -> None:
 def _houses(block: Block) -> None:
     """Two rows of houses with pitched roofs in gardens."""
     r = block.reach
-    block.paint(_square(r), KERB + 0.05, block.grass)
+    block.paint(square(r), KERB + 0.05, block.grass)
     columns = max(2, int(2 * r // 7.5))
     width = 2 * r / columns
     for row in (-1, 1):
@@ -181,10 +177,10 @@ def _court(block: Block) -> None:
     """A closed row of flats around a garden, with one gateway."""
     r, depth = block.reach, block.random.uniform(4.5, 5.5)
     top = STOREY * block.random.integers(3, 6)
-    wall = block.box(_square(r), top)
+    wall = block.box(square(r), top)
     inner = r - depth
-    block.paint(_square(inner + 0.35), top + 0.5, wall)
-    block.paint(_square(inner), KERB, block.grass)
+    block.paint(square(inner + 0.35), top + 0.5, wall)
+    block.paint(square(inner), KERB, block.grass)
     gate = block.random.uniform(-inner + 2, inner - 2)
     paving = block.palette.add(Material.PAVEMENT, (0.55, 0.5, 0.46))
     block.paint((gate - 1.8, gate + 1.8, -r, -inner), KERB, paving)
@@ -198,10 +194,10 @@ def _park(block: Block) -> None:
     """Lawn, crossing paths, trees, and a slender monument."""
     r = block.reach
     path = block.palette.add(Material.EARTH, (0.66, 0.58, 0.45))
-    block.paint(_square(r), KERB + 0.05, block.grass)
-    for area in ((-r, r, -1.0, 1.0), (-1.0, 1.0, -r, r), _square(2.6)):
+    block.paint(square(r), KERB + 0.05, block.grass)
+    for area in ((-r, r, -1.0, 1.0), (-1.0, 1.0, -r, r), square(2.6)):
         block.paint(area, KERB, path)
-    block.paint(_square(1.4), 0.7, block.palette.add(Material.PAVEMENT, (0.62, 0.60, 0.58)))
+    block.paint(square(1.4), 0.7, block.palette.add(Material.PAVEMENT, (0.62, 0.60, 0.58)))
     stone = block.palette.add(Material.ROOF, (0.80, 0.77, 0.70))
     block.turned(0, 0, [(0.55, 0.0, stone), (0.4, 8.5, stone), (0.05, 9.6, stone)], stone, sides=4)
     for i in np.linspace(-0.82, 0.82, 4):
@@ -216,7 +212,7 @@ def _works(block: Block) -> None:
     """A hall under saw-tooth roofs, a round tank and a tall chimney."""
     r = block.reach
     yard = block.palette.add(Material.STREET, (0.47, 0.46, 0.45), (1e3, 1e3, 0))
-    block.paint(_square(r), KERB, yard)
+    block.paint(square(r), KERB, yard)
     x0, x1, top = -r + 0.5, 0.25 * r, block.random.uniform(5.5, 8.0)
     hall = (x0, x1, -r + 0.5, r - 0.5)
     wall = block.box(hall, top)

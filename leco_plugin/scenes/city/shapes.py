@@ -23,6 +23,17 @@ Colour = tuple[float, float, float]
 """RGB in 0..1."""
 
 
+def square(half: float, x: float = 0.0, y: float = 0.0) -> Rectangle:
+    """A square of twice that side around a place."""
+    return x - half, x + half, y - half, y + half
+
+
+def rounded(bounds: Rectangle) -> Rectangle:
+    """A rectangle in whole centimetres, so that edges that meet are the same numbers."""
+    x0, x1, y0, y1 = (round(float(value), 2) for value in bounds)
+    return x0, x1, y0, y1
+
+
 @dataclass
 class Shapes:
     """What has been built so far, in metres, +z up. `paint` numbers index the city's palette."""
@@ -87,7 +98,7 @@ def add_roof(
 
     `hip` is how far (metres) the ridge's ends stand back: 0 gives upright gables, painted `gable`.
     """
-    x0, x1, y0, y1 = (round(float(v), 2) for v in bounds)
+    x0, x1, y0, y1 = rounded(bounds)
     along_x = x1 - x0 >= y1 - y0
     base, top = round(float(base), 2), round(float(base + rise), 2)
     if along_x:
@@ -124,8 +135,8 @@ def add_turned(
     reach = round(profile[0][0] + 0.12, 2)
     x, y = round(float(x), 2), round(float(y), 2)
     base = round(canvas.height(x, y) + 0.12, 2)
-    x0, x1, y0, y1 = (round(v, 2) for v in (x - reach, x + reach, y - reach, y + reach))
-    canvas.stroke((x0, x1, y0, y1), base, foot, covered=True)
+    x0, x1, y0, y1 = area = rounded(square(reach, x, y))
+    canvas.stroke(area, base, foot, covered=True)
     turn = 2 * np.pi * np.arange(sides) / sides
     circle = np.column_stack([np.cos(turn), np.sin(turn), np.zeros(sides)])
     rings = [np.array([x, y, base + z]) + radius * circle for radius, z, _ in profile]
@@ -192,10 +203,12 @@ class Canvas:
     paint: int
     strokes: list[Stroke] = field(default_factory=list)
 
+    def __post_init__(self) -> None:
+        self.bounds = rounded(self.bounds)
+
     def stroke(self, bounds: Rectangle, top: float, paint: int, covered: bool = False) -> None:
         """Raises or lowers a rectangle; arguments as of `Stroke`."""
-        x0, x1, y0, y1, top = (round(float(v), 2) for v in (*bounds, top))
-        self.strokes.append(Stroke((x0, x1, y0, y1), top, paint, covered))
+        self.strokes.append(Stroke(rounded(bounds), round(float(top), 2), paint, covered))
 
     def height(self, x: float, y: float) -> float:
         """The painted height at a point, in metres."""

@@ -12,8 +12,8 @@ import numpy as np
 import pytest
 import torch
 from PIL import Image
+from scene_files import refused
 
-from leco_plugin.scenes.input_error import InputError
 from leco_plugin.scenes.mega_nerf_format.files import read_scene
 
 
@@ -130,9 +130,8 @@ BAD: dict[str, tuple[Callable[[Path], object], str]] = {
 def test_bad_input_gets_one_line_that_names_the_file(name: str, scene: Path) -> None:
     spoil, message = BAD[name]
     spoil(scene)
-    with pytest.raises(InputError, match=message) as caught:
+    with refused(message):
         read_scene(scene)
-    assert "\n" not in str(caught.value)
 
 
 def test_a_scene_is_read_in_the_order_of_names_across_splits(scene: Path) -> None:
