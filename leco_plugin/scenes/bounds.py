@@ -76,21 +76,21 @@ def find_bounds(
         points: [P, 3] sparse scene points, or None.
         config: what is not to be found.
     Raises:
-        ValueError: there are no cameras, a pose is not finite, no camera sees a point, or the
+        InputError: there are no cameras, a pose is not finite, no camera sees a point, or the
             configured altitudes are no range that rays go down to.
     """
     config = config or BoundsConfig()
     poses, directions = (part.detach().float().cpu() for part in (camera_to_worlds, directions))
     if len(poses) == 0:
-        raise ValueError("the scene has no cameras")
+        raise InputError("the scene has no cameras")
     if not bool(poses.isfinite().all()):
-        raise ValueError("a camera pose holds values that are not finite")
+        raise InputError("a camera pose holds values that are not finite")
     points = usable_points(points)
     if config.altitudes is not None and config.space != "contraction":
         return _between(config.altitudes, poses, directions, points)
     if points is None:
         if config.space == "box":
-            raise ValueError(
+            raise InputError(
                 "a bounded scene without sparse points needs its altitudes: give bounds.altitudes "
                 "with the z of its ground and of its top"
             )
@@ -169,11 +169,11 @@ def _between(
     """A bounded scene between two levels that somebody knows, with points or without."""
     ground, top = altitudes
     if not -math.inf < ground < top < math.inf:
-        raise ValueError(f"bounds.altitudes are ground < top, got {ground:g} and {top:g}")
+        raise InputError(f"bounds.altitudes are ground < top, got {ground:g} and {top:g}")
     heights = poses[:, None, 2, 3]
     down = (directions[..., 2] < -0.05) & (heights > ground)
     if not bool(down.any()):
-        raise ValueError(
+        raise InputError(
             f"no ray of any camera goes down to the ground at z = {ground:g}: bounds.altitudes are "
             "in scene units, +z up"
         )
@@ -261,7 +261,7 @@ def _depths(poses: Tensor, directions: Tensor, points: Tensor) -> Tensor:
         found.append(distances[offsets @ ahead > (rays @ ahead).min() * distances])
     depths = torch.cat(found)
     if len(depths) == 0:
-        raise ValueError("no camera sees a sparse point: the poses or the points are in other axes")
+        raise InputError("no camera sees a sparse point: the poses or the points are in other axes")
     return depths
 
 

@@ -57,10 +57,7 @@ def detail_of(
     chosen = chosen_cameras(len(cameras))
     poses = cameras.camera_to_worlds[chosen].float()
     origins, directions = covering_rays(cameras)
-    try:
-        bounds = find_bounds(poses, directions, points, config)
-    except ValueError as error:
-        raise InputError(str(error)) from None
+    bounds = find_bounds(poses, directions, points, config)
     places = _places(points, origins, directions, bounds)
     density = torch.zeros(len(places))
     for pose, rays, width in zip(poses, directions, cameras.width[chosen].flatten().tolist()):

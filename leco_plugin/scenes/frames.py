@@ -191,7 +191,7 @@ class DatasetUnits:
 def units_of(datamanager: Any, metres_per_unit: float | None = None) -> DatasetUnits | None:
     """The units of a data manager's dataset; None where its dataparser does not say what it did.
 
-    `metres_per_unit`, of the dataset's own poses, is positive, or ValueError; None takes what the
+    `metres_per_unit`, of the dataset's own poses, is positive, or InputError; None takes what the
     dataparser knows.
     """
     outputs = getattr(datamanager, "train_dataparser_outputs", None)
@@ -202,7 +202,7 @@ def units_of(datamanager: Any, metres_per_unit: float | None = None) -> DatasetU
     if known is None:
         known = (outputs.metadata or {}).get(METRES_PER_UNIT)
     if known is not None and not 0.0 < float(known) < math.inf:
-        raise ValueError(f"a unit of the dataset is a positive number of metres, not {known}")
+        raise InputError(f"a unit of the dataset is a positive number of metres, not {known}")
     metres = 1.0 if known is None else float(known)
     frame = parsed_frame(outputs)
     up = frame[2, :3] / scale
@@ -214,7 +214,7 @@ def units_of(datamanager: Any, metres_per_unit: float | None = None) -> DatasetU
     )
 
 
-MOST = 0.05
+SKEW = 0.05
 """Distance from a rotation that a pose may have."""
 
 
@@ -238,7 +238,7 @@ def check_poses(poses: NDArray[np.floating], names: list[str]) -> None:
         raise InputError(f"{worst} is no finite 4 x 4 matrix: mend it, or leave its image out")
     with np.errstate(over="ignore", invalid="ignore"):
         distances = np.nan_to_num(distance_from_rotations(poses[:, :3, :3]), nan=np.inf)
-    if distances.max() > MOST:
+    if distances.max() > SKEW:
         worst = names[int(distances.argmax())]
         raise InputError(
             f"{worst} is no rotation: remove its scale, shear or mirroring, or leave its image out"

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from scene_files import refused
 
 from leco_plugin.scenes.frames import (
     METRES_PER_UNIT,
@@ -159,7 +160,7 @@ def test_a_reader_that_does_not_say_what_it_did_has_no_units() -> None:
 
 @pytest.mark.parametrize("metres", [0.0, -1.0, float("nan"), float("inf")])
 def test_no_positive_number_of_metres_is_refused(metres: float) -> None:
-    with pytest.raises(ValueError, match="positive number of metres"):
+    with refused("positive number of metres"):
         units_of(manager(1.0, torch.eye(3, 4)), metres)
 
 

@@ -101,11 +101,8 @@ def test_photographs_of_other_things_stay_as_they_are() -> None:
     at_eye_level = around(24, 0.05), ground(0.4)
     wall = SIDEWAYS @ flight(3, 1), ground() @ SIDEWAYS.T
     few_steps = wall[0].clone()
-    few_steps[:, :, 3] -= (
-        0.8
-        * (few_steps[:, :, 3] - few_steps[:, :, 3].mean(dim=0))
-        * (torch.tensor([1.0, 0.0, 1.0]))
-    )
+    places = few_steps[:, :, 3] - few_steps[:, :, 3].mean(dim=0)
+    few_steps[:, :, 3] -= 0.8 * places * torch.tensor([1.0, 0.0, 1.0])
     street = torch.stack([flight(89, 8)[n] for n in range(25)]), ground(0.02)
     for poses, points in (at_eye_level, (few_steps, wall[1]), street):
         assert turn_to_upright(poses, points) is None

@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from leco_plugin.scenes.city.shapes import Array
-from leco_plugin.scenes.frames import distance_from_rotations
+from leco_plugin.scenes.frames import SKEW, distance_from_rotations
 from leco_plugin.scenes.input_error import InputError
 from leco_plugin.scenes.mega_nerf_format.pt_file import describe, read_pt
 from leco_plugin.scenes.photograph_files import open_image
@@ -303,7 +303,7 @@ def _check_rotations(folder: Path, frames: list[Frame]) -> None:
     rotations = np.stack([frame.pose[:, :3] for frame in frames])
     errors = distance_from_rotations(rotations)
     worst = int(errors.argmax())
-    if errors[worst] <= 0.05:
+    if errors[worst] <= SKEW:
         return
     frame = frames[worst]
     metadata = folder / frame.split / "metadata" / f"{frame.stem}.pt"

@@ -42,9 +42,6 @@ def test_a_covered_stroke_leaves_its_top_to_a_roof() -> None:
     assert canvas.height(3, 3) == 3.0
     assert canvas.height(8, 8) == 0.0
     canvas.build(shapes, depth=1.0)
-    tops = [
-        face
-        for face, direction, _ in shapes.rectangles
-        if np.ptp(face[:, 2]) == 0 and direction > 0
-    ]
-    assert sum(np.prod(np.ptp(face, axis=0)[:2]) for face in tops) == 100 - 12
+    upward = (face for face, direction, _ in shapes.rectangles if direction > 0)
+    tops = (np.ptp(face, axis=0) for face in upward)
+    assert sum(np.prod(size[:2]) for size in tops if size[2] == 0) == 100 - 12

@@ -192,9 +192,8 @@ def test_nothing_is_drawn_outside_of_what_a_fisheye_shows(kind: str) -> None:
     made.set_num_rays_per_batch(6000)
     torch.manual_seed(0)
     trained = made.sample(dict(batch))["image"].long()
-    assert bool(
-        inside_circle(trained, sizes, 12.5).all()
-    )  # nerfstudio's middle is half a pixel off
+    # nerfstudio's middle is half a pixel off
+    assert bool(inside_circle(trained, sizes, 12.5).all())
     assert not bool(THIN.holds_out(trained).any())
     seen = batch["mask"][..., 0].long() if "mask" in batch else torch.ones(3, 40, 39).long()
     area = 3.14159 * 12.0**2 * 3 * float(seen.float().mean())

@@ -64,9 +64,8 @@ def test_held_out_pixels_have_no_distance() -> None:
 def test_a_point_behind_a_roof_is_not_seen() -> None:
     roof = ground(400) / 4 + torch.tensor([0.0, 0.0, 4.0])
     found = sparse_pixels(cameras(), torch.cat([ground(), roof]), Lattice())
-    middle = (found.indices[:, 0] == 0) & (
-        (found.indices[:, 1:] - torch.tensor([61, 79])).abs().amax(dim=-1) < 15
-    )
+    offsets = (found.indices[:, 1:] - torch.tensor([61, 79])).abs()
+    middle = (found.indices[:, 0] == 0) & (offsets.amax(dim=-1) < 15)
     assert bool(middle.any())
     assert float(found.distances[middle].max()) < 7.0
 
@@ -92,10 +91,7 @@ def test_large_clouds_are_thinned_the_same_way_each_time(monkeypatch) -> None:
 
     monkeypatch.setattr(module, "MOST_POINTS", 200)
     monkeypatch.setattr(module, "MOST_PIXELS", 60)
-    first, second = (
-        sparse_pixels(cameras(), ground(), Lattice()),
-        sparse_pixels(cameras(), ground(), Lattice()),
-    )
+    first, second = (sparse_pixels(cameras(), ground(), Lattice()) for _ in range(2))
     assert len(first.distances) == 60
     assert torch.equal(first.indices, second.indices)
 

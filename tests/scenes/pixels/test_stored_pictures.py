@@ -33,9 +33,8 @@ def write(folder: Path, masked: bool = False, channels: int = 3) -> InputDataset
     images, masks = [], []
     for number, (height, width) in enumerate(SIZES):
         path = folder / f"{number}.png"
-        Image.fromarray(random.integers(0, 256, (height, width, channels), dtype=np.uint8)).save(
-            path
-        )
+        noise = random.integers(0, 256, (height, width, channels), dtype=np.uint8)
+        Image.fromarray(noise).save(path)
         images.append(path)
         mask = np.zeros((height, width), dtype=np.uint8)
         mask[:, : width // 2] = 255
@@ -153,13 +152,3 @@ def test_a_file_cut_off_while_a_run_goes_on_is_one_line(tmp_path: Path) -> None:
     assert stored.read(torch.tensor([0]), torch.tensor([[29, 39]])).shape == (1, 3)
     with refused("is cut off"):
         stored.read(torch.tensor([1]), last)
-
-
-def test_many_pixels_in_any_order_are_read_in_that_order(tmp_path: Path) -> None:
-    dataset = write(tmp_path)
-    stored = store_pictures(dataset, tmp_path / "pixels")["image"]
-    drawn = stored.draw(500)
-    found = stored.read(drawn[:, 0], drawn[:, 1:])
-    images = [dataset.get_image_float32(number) for number in range(len(SIZES))]
-    wanted = torch.stack([images[n][row, column] for n, row, column in drawn.tolist()])
-    torch.testing.assert_close(found, wanted)
