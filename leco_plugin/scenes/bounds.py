@@ -32,6 +32,8 @@ class BoundsConfig:
     the dataparser knows."""
 
 
+Span = tuple[float, float]
+"""The lesser of two lengths, and the greater."""
 FEWEST_POINTS = 32
 """Fewer sparse points say nothing of a scene."""
 OVER_CAMERAS = 0.06
@@ -103,7 +105,8 @@ def find_bounds(
         # far below, so that a flat picture on the lower plane is plainly wrong from two places
         ground = float(low[2]) - max(0.5 * relief, 0.2 * far)
         top = float(high[2]) + 0.3 * relief
-        found = _slab(poses, directions, ground, top, near, far, f"{FROM_ABOVE} ({seen}): bounded")
+        why = f"{FROM_ABOVE} ({seen}): bounded"
+        found = _slab(poses, directions, (ground, top), (near, far), why)
         return replace(found, from_above=True)
     if config.space == "box":
         return _room(poses, low, high, near, far)
@@ -158,20 +161,20 @@ def up_to_the_cameras(bounds: SceneBounds, heights: Tensor, seen: float) -> Scen
     )
 
 
-def _range(depths: Tensor) -> tuple[float, float]:
+def _range(depths: Tensor) -> Span:
     """Near and far of distances [D] to what is seen, with margins."""
     return 0.75 * float(_quantiles(depths, 0.01)), 1.25 * float(_quantiles(depths, 0.999))
 
 
 def _between(
-    altitudes: tuple[float, float], poses: Tensor, directions: Tensor, points: Tensor | None
+    altitudes: Span, poses: Tensor, directions: Tensor, points: Tensor | None
 ) -> SceneBounds:
     """A bounded scene between two levels that somebody knows, with points or without."""
     ground, top = altitudes
     if not -math.inf < ground < top < math.inf:
         raise InputError(f"bounds.altitudes are ground < top, got {ground:g} and {top:g}")
     heights = poses[:, None, 2, 3]
-    down = (directions[..., 2] < -0.05) & (heights > ground)
+    down = _go_down(directions) & (heights > ground)
     if not bool(down.any()):
         raise InputError(
             f"no ray of any camera goes down to the ground at z = {ground:g}: bounds.altitudes are "
@@ -185,36 +188,25 @@ def _between(
         )
         far = 1.05 * float(_quantiles(reaches, 0.999))
         near = max(0.75 * float(_quantiles(begins, 0.01)), 1e-3 * far)
-    return _slab(poses, directions, ground, top, near, far, "altitudes as configured: bounded")
+    return _slab(poses, directions, altitudes, (near, far), "altitudes as configured: bounded")
 
 
 def _slab(
-    poses: Tensor,
-    directions: Tensor,
-    ground: float,
-    top: float,
-    near: float,
-    far: float,
-    why: str,
+    poses: Tensor, directions: Tensor, levels: Span, distances: Span, why: str
 ) -> SceneBounds:
-    """A bounded scene between two levels, as wide as the rays reach in it."""
-    down = directions[..., 2] < -0.05
+    """A bounded scene between two levels, as wide as the rays reach in it from near to far."""
+    (ground, top), (near, far) = levels, distances
+    down = _go_down(directions)
     reach = ((ground - poses[:, None, 2, 3]) / directions[..., 2]).clamp(0.0, far)[down]
     origins = poses[:, None, :, 3].expand_as(directions)[down]
     hits = (origins + directions[down] * reach[:, None])[:, :2]
     sides = torch.stack([hits.amin(dim=0), hits.amax(dim=0)])
     center = torch.tensor([*sides.mean(dim=0).tolist(), (ground + top) / 2])
     half = 1.02 * max(float((sides[1] - sides[0]).max()), top - ground) / 2
-    wall = NO_WALL
-    return SceneBounds(
-        "box",
-        center,
-        half,
-        near,
-        far,
-        torch.tensor([-wall, -wall, ground, wall, wall, top]),
-        f"{why}, rays cut at z = {ground:.3f} and {top:.3f}",
-    )
+    aabb = _no_walls()
+    aabb[2], aabb[5] = ground, top
+    reason = f"{why}, rays cut at z = {ground:.3f} and {top:.3f}"
+    return SceneBounds("box", center, half, near, far, aabb, reason)
 
 
 def _room(poses: Tensor, low: Tensor, high: Tensor, near: float, far: float) -> SceneBounds:
@@ -234,10 +226,15 @@ def _without_points(poses: Tensor, directions: Tensor) -> SceneBounds:
     low, high = positions.amin(dim=0), positions.amax(dim=0)
     half = max(float((high - low).max()) / 2, 1e-3)
     reason = f"no sparse points: contracted outside {half:.3f} around the cameras"
-    if float((directions[..., 2] < -0.05).float().mean()) >= MOSTLY_DOWN:
+    if float(_go_down(directions).float().mean()) >= MOSTLY_DOWN:
         reason += "; all look down: give bounds.altitudes with the z of ground and top"
     center = (low + high) / 2
     return SceneBounds("contraction", center, half, 0.05 * half, 100 * half, _no_walls(), reason)
+
+
+def _go_down(directions: Tensor) -> Tensor:
+    """Whether unit vectors [..., 3] go down clearly: bool [...]."""
+    return directions[..., 2] < -0.05
 
 
 def _no_walls() -> Tensor:
@@ -274,6 +271,6 @@ def _seen_from_above(poses: Tensor, directions: Tensor, points: Tensor) -> tuple
     and the two shares in words.
     """
     above = float((poses[:, 2, 3] > _quantiles(points[:, 2], 0.95)).float().mean())
-    down = float((directions[..., 2] < -0.05).float().mean())
+    down = float(_go_down(directions).float().mean())
     words = f"{down:.0%} of rays go down, {above:.0%} of cameras are above the points"
     return above >= MOSTLY_ABOVE and down >= MOSTLY_DOWN, words

@@ -107,7 +107,7 @@ class Lens:
         return pose[:, 3] + np.asarray(depth)[..., None] * (self.directions() @ pose[:, :3].T)
 
     def axial(self, depth: NDArray[np.floating]) -> NDArray[np.float32]:
-        """Depth files from ray depths (metres, inf for nothing): see `city.layouts`."""
+        """Depth files from ray depths (metres, inf for nothing): see `city.folder`."""
         axial = np.where(np.isfinite(depth), depth, 0) * -self.directions()[..., 2]
         return (1e3 * axial).astype(np.float32)
 
