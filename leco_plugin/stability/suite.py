@@ -37,7 +37,7 @@ from leco_plugin.evaluation.report import (
 )
 from leco_plugin.log import bar, console, resumable
 from leco_plugin.occupancy import CALIBRATED_AT
-from leco_plugin.scenes.city.layouts import TRANSFORMS
+from leco_plugin.scenes.city.folder import TRANSFORMS
 from leco_plugin.scenes.input_error import InputError
 from leco_plugin.scenes.photographs import describe_scene
 from leco_plugin.stability.cases import Case, cases_named

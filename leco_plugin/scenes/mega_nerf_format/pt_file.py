@@ -25,9 +25,8 @@ class Refused(Exception):
 def read_pt(path: Path, most_bytes: int = 1 << 20) -> Any:
     """What a .pt file holds.
 
-    Raises:
-        InputError: one line; it cannot be read, is damaged, is larger than `most_bytes`, or holds
-            anything but tensors, numbers, strings and containers of them.
+    InputError if it cannot be read, is damaged, is larger than `most_bytes`, or holds anything but
+    tensors, numbers, strings and containers of them.
     """
     return load(read_bytes(path, most_bytes), str(path))
 
