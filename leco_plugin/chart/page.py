@@ -7,7 +7,6 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from leco_plugin.chart.findings.learned import learned_of
 from leco_plugin.chart.findings.representations import COSTS as COSTS_OF_HELD
 from leco_plugin.chart.findings.representations import representations_of
 from leco_plugin.chart.findings.settling import falls
@@ -21,7 +20,6 @@ from leco_plugin.chart.findings.summary import (
 )
 from leco_plugin.chart.panels import (
     Panel,
-    Point,
     asks_what_was_learned,
     cost_panel,
     kept_panel,
@@ -82,31 +80,25 @@ def _panels_of(results: Mapping[str, Any], lines: Sequence[Line]) -> list[Panel]
         costs = COSTS_OF_HELD.items()
         panels += [kept_panel(TITLES[name], figure, held, lines) for name, figure in costs]
     elif asks_what_was_learned(results):
-        panel = learned_panel(learned_of(lines), lines)
-        title = "space kept at equal loss, against PSNR, dB"
-        panels.append(Panel(title, panel.points, panel.less, panel.more_x))
+        panels.append(learned_panel("space kept at equal loss, against PSNR, dB", lines))
     return panels
 
 
 def _add_curves(figure: Any, lines: Sequence[Line]) -> None:
     """The curve of each run, and the best so far of all."""
-    import plotly.graph_objects as go
-
     for i, line in enumerate(lines):
         for run in line.runs:
             seconds, psnrs = zip(*run["curve"])
             dash = "solid" if line.learned else "dash"
-            figure.add_trace(
-                go.Scatter(
-                    x=seconds,
-                    y=psnrs,
-                    name=line.name,
-                    legendgroup=line.name,
-                    showlegend=run is line.runs[0],
-                    mode="lines+markers",
-                    line={"color": style(i, LIGHT)["color"], "dash": dash},
-                    hovertemplate=f"%{{x:.1f}} s, %{{y:.2f}} dB, seed {run['seed']}",
-                ),
+            figure.add_scatter(
+                x=seconds,
+                y=psnrs,
+                name=line.name,
+                legendgroup=line.name,
+                showlegend=run is line.runs[0],
+                mode="lines+markers",
+                line={"color": style(i, LIGHT)["color"], "dash": dash},
+                hovertemplate=f"%{{x:.1f}} s, %{{y:.2f}} dB, seed {run['seed']}",
                 row=1,
                 col=1,
             )
@@ -116,45 +108,38 @@ def _add_curves(figure: Any, lines: Sequence[Line]) -> None:
 
 def _add_panel(figure: Any, panel: Panel, row: int, column: int) -> None:
     """The points of a panel and its front; less of y is up where less is better."""
+    named = panel.less and not panel.more_x
     for one in panel.points:
-        figure.add_trace(_trace_of(one, panel), row=row, col=column)
+        look = {"color": LIGHT.ink, "symbol": "x"}
+        if one.line is not None:
+            symbol = SYMBOLS[one.line % len(SYMBOLS)] + ("-open" if one.small else "")
+            look = {"color": style(one.line, LIGHT)["color"], "symbol": symbol}
+        psnrs = [psnr for _, psnr in one.seeds] or [one.y]
+        spread = {"array": [max(psnrs) - one.y], "arrayminus": [one.y - min(psnrs)]}
+        figure.add_scatter(
+            x=[one.x],
+            y=[one.y],
+            text=[one.name],
+            error_y=None if panel.less else {**spread, "symmetric": False},
+            name=one.name,
+            legendgroup=one.name,
+            showlegend=False,
+            mode="markers+text" if named else "markers",
+            textposition="top center",
+            marker={"size": 16 if one.ours else 12, **look},
+            hovertemplate="%{text}: %{x:.3g}, %{y:.2f}<extra></extra>",
+            row=row,
+            col=column,
+        )
     _add_front(figure, panel.front(), "hv", row, column)
     if panel.less:
         scale = "log" if panel.more_x else "linear"
         figure.update_yaxes(type=scale, autorange="reversed", row=row, col=column)
 
 
-def _trace_of(one: Point, panel: Panel) -> Any:
-    import plotly.graph_objects as go
-
-    look = {"color": LIGHT.ink, "symbol": "x"}
-    if one.line is not None:
-        symbol = SYMBOLS[one.line % len(SYMBOLS)] + ("-open" if one.small else "")
-        look = {"color": style(one.line, LIGHT)["color"], "symbol": symbol}
-    named = panel.less and not panel.more_x
-    psnrs = [psnr for _, psnr in one.seeds] or [one.y]
-    spread = {"array": [max(psnrs) - one.y], "arrayminus": [one.y - min(psnrs)]}
-    return go.Scatter(
-        x=[one.x],
-        y=[one.y],
-        text=[one.name],
-        error_y=None if panel.less else {**spread, "symmetric": False},
-        name=one.name,
-        legendgroup=one.name,
-        showlegend=False,
-        mode="markers+text" if named else "markers",
-        textposition="top center",
-        marker={"size": 16 if one.ours else 12, **look},
-        hovertemplate="%{text}: %{x:.3g}, %{y:.2f}<extra></extra>",
-    )
-
-
 def _add_front(
     figure: Any, points: Sequence[tuple[float, float]], shape: str, row: int, column: int
 ) -> None:
-    import plotly.graph_objects as go
-
     xs, ys = zip(*points) if points else ((), ())
-    line = FRONT | {"shape": shape}
-    trace = go.Scatter(x=xs, y=ys, mode="lines", line=line, showlegend=False, hoverinfo="skip")
-    figure.add_trace(trace, row=row, col=column)
+    options = {"mode": "lines", "showlegend": False, "hoverinfo": "skip", "row": row, "col": column}
+    figure.add_scatter(x=xs, y=ys, line=FRONT | {"shape": shape}, **options)

@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from leco_plugin.chart.findings.learned import Learned, learned_headline, learned_of
+from leco_plugin.chart.findings.learned import learned_headline, learned_of
 from leco_plugin.chart.findings.representations import (
     Representation,
     never_held_of,
@@ -99,12 +99,12 @@ def kept_panel(
     return Panel(title, tuple(points))
 
 
-def learned_panel(learned: Sequence[Learned], lines: Sequence[Line]) -> Panel:
+def learned_panel(title: str, lines: Sequence[Line]) -> Panel:
     """Space kept at equal loss against PSNR after equal steps, of gates that always froze."""
     numbers = {line.name: i for i, line in enumerate(lines)}
     points = []
-    for one in (one for one in learned if one.is_measured):
-        seeds = tuple((one.psnrs[seed], kept) for seed, kept in one.kept_by_seed.items())
+    for one in (one for one in learned_of(lines) if one.is_measured):
+        seeds = tuple((one.psnr_by_seed[seed], kept) for seed, kept in one.kept_by_seed.items())
         late = " (frozen at the end)" if one.guided_nothing == one.seeds else ""
         points.append(Point(one.name + late, one.psnr, one.kept, numbers[one.name], seeds))
-    return Panel("", tuple(points), more_x=True)
+    return Panel(title, tuple(points), more_x=True)

@@ -127,7 +127,7 @@ def _draw_occupancies(
         seconds = [one.x for one in by_time.points]
         above[1].set_xlim(0.9 * min(seconds), 1.06 * max(seconds))
     else:
-        panel = learned_panel(learned_of(lines), lines)
+        panel = learned_panel("", lines)
         draw_panel(above[0], panel, theme)
         _name(above[0], panel.points, theme)
         above[0].set_xlabel("PSNR on unseen photographs, dB")

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import statistics
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -46,6 +46,14 @@ def figure_in(values: Any, key: str) -> float | None:
     for name in key.split("."):
         values = values.get(name) if isinstance(values, Mapping) else None
     return None if values is None else float(values)
+
+
+def middle_of(
+    values: Sequence[float | None], middle: Callable[[Sequence[float]], float] = statistics.median
+) -> float | None:
+    """Median, or another middle, of values of several seeds; None where a seed has none."""
+    known = [value for value in values if value is not None]
+    return middle(known) if len(known) == len(values) else None
 
 
 RENDERING = Cost("render_seconds_per_image", "rendering an image", "s")
@@ -96,13 +104,11 @@ class Line:
 
     def mean(self, key: str) -> float | None:
         """Mean over seeds of a figure of quality; None where a seed has none."""
-        values = [run.get(key) for run in self.runs]
-        return None if None in values else statistics.fmean(v for v in values if v is not None)
+        return middle_of([run.get(key) for run in self.runs], statistics.fmean)
 
     def median(self, cost: Cost) -> float | None:
         """Median over seeds of a cost; None where a seed has none."""
-        values = [cost.of(run) for run in self.runs]
-        return None if None in values else statistics.median(v for v in values if v is not None)
+        return middle_of([cost.of(run) for run in self.runs])
 
     def curve(self) -> tuple[NDArray[np.float64], ...]:
         """Mean seconds [T], and mean, lowest and highest PSNR [T] over seeds at equal shares of
@@ -117,8 +123,7 @@ class Line:
 
     def seconds_to(self, psnr: float) -> float | None:
         """When its runs reach a PSNR to stay, median over seeds; None if one of them does not."""
-        found = [seconds_to_pass(run["curve"], psnr) for run in self.runs]
-        return None if None in found else statistics.median(s for s in found if s is not None)
+        return middle_of([seconds_to_pass(run["curve"], psnr) for run in self.runs])
 
 
 def seconds_to_pass(curve: Sequence[Sequence[float]], psnr: float) -> float | None:
