@@ -5,7 +5,7 @@ from __future__ import annotations
 import functools
 import shlex
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -91,6 +91,24 @@ def make_charts(
     return {chart.folder.path: _make(chart, runner_for) for chart in charts}
 
 
+def refuse_failures(made: Sequence[Mapping[str, Any]]) -> None:
+    """Tells of the runs that were asked for and have failed.
+
+    Args:
+        made: results of charts.
+    Raises:
+        RuntimeError: there are some.
+    """
+    failures = [one for results in made for one in results["failures"] if one["asked"]]
+    if failures:
+        count = len(failures) + sum(len(results["runs"]) for results in made)
+        first = f"({failures[0]['name']}, seed {failures[0]['seed']})"
+        raise RuntimeError(
+            f"{len(failures)} of {count} runs failed, the first {first} with: "
+            f"{failures[0]['reason']}"
+        )
+
+
 def _check_shared(out: Path) -> None:
     """Refuses a folder that holds something else than suites."""
     known = [*SUITES, *LEFT_BY_SYSTEMS]
@@ -122,19 +140,12 @@ def _chart_of(
         times = suite.protocol.seconds, suite.protocol.steps
         learn_seconds = suite.learn_seconds if learn_seconds is None else learn_seconds
     protocol = Protocol(*times, learn_seconds, asked.images, at_once=at_once)
-    options = {
-        "suite": name,
-        "seconds": protocol.seconds,
-        "steps": protocol.steps,
-        "learn-seconds": learn_seconds,
-        "images": asked.images,
-        "at-once": at_once if suite or at_once > 1 else None,
-        "methods": methods,
-        "samplers": samplers,
-        "seeds": asked.seeds,
-    }
+    options = {"suite": name, **asdict(protocol), "methods": methods, "samplers": samplers}
+    del options["curve_points"]
+    if not suite and at_once == 1:
+        del options["at_once"]
+    command = command_line(data, {**options, "seeds": asked.seeds})
     titled = (name, suite.question) if name is not None and suite else None
-    command = command_line(data, options)
     return Chart(data, out, compared, asked.seeds, protocol, titled, command, asked.reuse)
 
 
@@ -159,5 +170,8 @@ def command_line(data: Path, options: Mapping[str, object]) -> str:
         if value is None or value == () or value == []:
             continue
         values = value if isinstance(value, (list, tuple)) else [value]
-        words += [f"--{name}", *(f"{v:g}" if isinstance(v, float) else v for v in values)]
+        words += [
+            f"--{name.replace('_', '-')}",
+            *(f"{v:g}" if isinstance(v, float) else v for v in values),
+        ]
     return shlex.join([str(word) for word in words])

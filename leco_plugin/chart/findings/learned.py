@@ -43,10 +43,9 @@ class Learned(Line):
 
     @property
     def healed(self) -> int | None:
-        """How often a collapsed gate was, in all seeds together; None where runs did not note it."""
-        counts = [
-            run.get("recoveries", figure_in(run, "occupancy.recoveries")) for run in self.runs
-        ]
+        """How often a collapsed gate was, in all seeds; None where runs did not note it."""
+        stored = "occupancy.recoveries"
+        counts = [run.get("recoveries", figure_in(run, stored)) for run in self.runs]
         total = middle_of(counts, sum)
         return None if total is None else int(total)
 

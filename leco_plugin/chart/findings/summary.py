@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from leco_plugin.chart.contender import shared_method, short_names
+from leco_plugin.chart.protocol import Protocol
 
 LOST_SURFACE_MASS = 1e-3
 """Loss at which `evaluation.equal_loss` compares occupancies."""
@@ -198,18 +199,14 @@ def circumstances(results: Mapping[str, Any]) -> str:
     where = (
         f"{machine['cores']} CPU cores" if machine["device"] == "cpu" else str(machine["device"])
     )
-    parts = []
-    if protocol["seconds"] is not None:
-        parts.append(f"{protocol['seconds']:g} s")
-    if protocol["steps"] is not None:
-        parts.append(f"{protocol['steps']} steps")
+    length = Protocol(protocol["seconds"], protocol["steps"]).describe()
     if (at_once := protocol.get("at_once", 1)) > 1:
         where += f", {at_once} runs at a time"
     seeds = len({run["seed"] for run in results["runs"]})
     many = "one seed" if seeds == 1 else f"{seeds} seeds: means of PSNR, medians of costs"
     method = shared_method(list(dict.fromkeys(run["name"] for run in results["runs"])))
     what = f"{method} on {results['scene']['name']}" if method else results["scene"]["name"]
-    return f"{what}, {' or '.join(parts)} of training on {where}, {many}"
+    return f"{what}, {length} of training on {where}, {many}"
 
 
 @dataclass(frozen=True)
