@@ -170,8 +170,6 @@ def command_line(data: Path, options: Mapping[str, object]) -> str:
         if value is None or value == () or value == []:
             continue
         values = value if isinstance(value, (list, tuple)) else [value]
-        words += [
-            f"--{name.replace('_', '-')}",
-            *(f"{v:g}" if isinstance(v, float) else v for v in values),
-        ]
+        words += ["--" + name.replace("_", "-")]
+        words += [f"{one:g}" if isinstance(one, float) else one for one in values]
     return shlex.join([str(word) for word in words])
