@@ -7,29 +7,12 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from leco_plugin.chart.findings.representations import COSTS as COSTS_OF_HELD
-from leco_plugin.chart.findings.representations import representations_of
 from leco_plugin.chart.findings.settling import falls
-from leco_plugin.chart.findings.summary import (
-    COSTS,
-    LEARNING,
-    Line,
-    best_so_far,
-    circumstances,
-    lines_of,
-)
-from leco_plugin.chart.panels import (
-    Panel,
-    asks_what_was_learned,
-    cost_panel,
-    kept_panel,
-    learned_panel,
-    title_of,
-)
+from leco_plugin.chart.findings.summary import Line, best_so_far, circumstances
+from leco_plugin.chart.panels import Panel, shown_of, title_of
 from leco_plugin.chart.theme import LIGHT, style
 
 SYMBOLS = ("circle", "square", "diamond", "triangle-up", "triangle-down", "cross", "x", "star")
-TITLES = {"size": "size of the occupancy, kB", "learning time": LEARNING.titled}
 FRONT = {"color": "rgba(120,120,120,0.45)", "width": 5}
 
 
@@ -40,8 +23,8 @@ def write_page(results: Mapping[str, Any], path: Path) -> Path:
     """
     from plotly.subplots import make_subplots
 
-    lines = lines_of(results)
-    panels = _panels_of(results, lines)
+    shown = shown_of(results)
+    panels = shown.costs + shown.space
     rows = 1 + (len(panels) + 2) // 3
     figure = make_subplots(
         rows=rows,
@@ -50,38 +33,27 @@ def write_page(results: Mapping[str, Any], path: Path) -> Path:
         subplot_titles=["", *(panel.title for panel in panels)],
         vertical_spacing=0.13,
     )
-    _add_curves(figure, lines)
+    _add_curves(figure, shown.lines)
     for number, panel in enumerate(panels):
         _add_panel(figure, panel, 2 + number // 3, 1 + number % 3)
     figure.update_xaxes(title_text="seconds of training", row=1, col=1)
     figure.update_yaxes(title_text="PSNR on test images, dB", row=1, col=1)
     figure.update_yaxes(title_text="PSNR, dB", row=2, col=1)
-    if rows > 2:
-        is_by_size = not panels[len(COSTS)].more_x
+    if shown.space:
+        is_by_size = not shown.space[0].more_x
         figure.update_xaxes(type="log" if is_by_size else "linear", row=3, col=1)
         figure.update_yaxes(title_text="volume kept at equal loss, %", row=3, col=1)
     title = html.escape(title_of(results))
-    below = html.escape(". ".join(filter(None, [circumstances(results), falls(lines)])))
+    below = html.escape(". ".join(filter(None, [circumstances(results), falls(shown.lines)])))
     figure.update_layout(
         title={"text": f"<b>{title}</b><br><sub>{below}</sub>"},
         template="plotly_white",
-        height=1100 if rows > 2 else 820,
+        height=1100 if shown.space else 820,
         legend={"orientation": "h", "y": -0.08},
         margin={"t": 110},
     )
     figure.write_html(path, include_plotlyjs=True, full_html=True)
     return path
-
-
-def _panels_of(results: Mapping[str, Any], lines: Sequence[Line]) -> list[Panel]:
-    """Costs, and in a third row what occupancies keep, where the chart is about that."""
-    panels = [cost_panel(cost, lines) for cost in COSTS]
-    if held := representations_of(lines):
-        costs = COSTS_OF_HELD.items()
-        panels += [kept_panel(TITLES[name], figure, held, lines) for name, figure in costs]
-    elif asks_what_was_learned(results):
-        panels.append(learned_panel("space kept at equal loss, against PSNR, dB", lines))
-    return panels
 
 
 def _add_curves(figure: Any, lines: Sequence[Line]) -> None:

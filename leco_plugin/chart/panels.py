@@ -7,13 +7,25 @@ from dataclasses import dataclass
 from typing import Any
 
 from leco_plugin.chart.findings.learned import learned_headline, learned_of
+from leco_plugin.chart.findings.representations import COSTS as COSTS_OF_HELD
 from leco_plugin.chart.findings.representations import (
     Representation,
     never_held_of,
     representations_of,
     verdict,
 )
-from leco_plugin.chart.findings.summary import Cost, Line, front, headline, lines_of, sentence
+from leco_plugin.chart.findings.summary import (
+    COSTS,
+    LEARNING,
+    Cost,
+    Line,
+    front,
+    headline,
+    lines_of,
+    sentence,
+)
+
+TITLES = {"size": "size of the occupancy, kB", "learning time": LEARNING.titled}
 
 
 def title_of(results: Mapping[str, Any]) -> str:
@@ -68,6 +80,31 @@ class Panel:
         return [places[i] for i in front([(across * x, up * y) for x, y in places])]
 
 
+@dataclass(frozen=True)
+class Shown:
+    """What picture and page show of results."""
+
+    lines: list[Line]
+    costs: list[Panel]
+    """PSNR against each cost."""
+    space: list[Panel]
+    """Space kept at equal loss, where the chart is about that: against size and learning time, or
+    against PSNR."""
+
+
+def shown_of(results: Mapping[str, Any]) -> Shown:
+    """Of results that hold at least one run."""
+    lines = lines_of(results)
+    space = []
+    if held := representations_of(lines):
+        space = [
+            kept_panel(TITLES[name], cost, held, lines) for name, cost in COSTS_OF_HELD.items()
+        ]
+    elif asks_what_was_learned(results):
+        space = [learned_panel(lines)]
+    return Shown(lines, [cost_panel(cost, lines) for cost in COSTS], space)
+
+
 def cost_panel(cost: Cost, lines: Sequence[Line]) -> Panel:
     """PSNR against a cost."""
     points = [
@@ -99,7 +136,7 @@ def kept_panel(
     return Panel(title, tuple(points))
 
 
-def learned_panel(title: str, lines: Sequence[Line]) -> Panel:
+def learned_panel(lines: Sequence[Line]) -> Panel:
     """Space kept at equal loss against PSNR after equal steps, of gates that always froze."""
     numbers = {line.name: i for i, line in enumerate(lines)}
     points = []
@@ -107,4 +144,4 @@ def learned_panel(title: str, lines: Sequence[Line]) -> Panel:
         seeds = tuple((one.psnr_by_seed[seed], kept) for seed, kept in one.kept_by_seed.items())
         late = " (frozen at the end)" if one.guided_nothing == one.seeds else ""
         points.append(Point(one.name + late, one.psnr, one.kept, numbers[one.name], seeds))
-    return Panel(title, tuple(points), more_x=True)
+    return Panel("space kept at equal loss, against PSNR, dB", tuple(points), more_x=True)

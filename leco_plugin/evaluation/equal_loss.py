@@ -255,12 +255,12 @@ def rays_of_photographs(datamanager: Any, count: int, seed: int = 0) -> RayBundl
 
 
 @torch.no_grad()
-def candidates_of(mixture: Mixture, bundle: RayBundle, rays_at_once: int = 1024) -> Tensor:
+def candidates_of(mixture: Mixture, bundle: RayBundle) -> Tensor:
     """Mapped middles [M, 3] of all candidates of rays, backdrops left out."""
     bundle = bundle.to(mixture.device)
     rays = mixture.rays(bundle.origins, bundle.directions, None)
     pieces = []
-    for some in in_chunks(rays, rays_at_once):
+    for some in in_chunks(rays, CALIBRATION.rays_at_once):
         intervals = mixture.with_backdrops(some, mixture.candidates(some))
         middles = mapped_middles(mixture.region.space, some, intervals)
         pieces.append(middles[~backdrop_of(intervals, some)])
