@@ -7,7 +7,6 @@ from dataclasses import dataclass
 from typing import Any
 
 from leco_plugin.chart.findings.learned import learned_headline, learned_of
-from leco_plugin.chart.findings.representations import COSTS as COSTS_OF_HELD
 from leco_plugin.chart.findings.representations import (
     Representation,
     never_held_of,
@@ -25,7 +24,8 @@ from leco_plugin.chart.findings.summary import (
     sentence,
 )
 
-TITLES = {"size": "size of the occupancy, kB", "learning time": LEARNING.titled}
+HELD_COSTS = {"size": "size of the occupancy, kB", "learn_seconds": LEARNING.titled}
+"""Names in `Held` of what an occupancy costs, and their titles."""
 
 
 def title_of(results: Mapping[str, Any]) -> str:
@@ -97,9 +97,7 @@ def shown_of(results: Mapping[str, Any]) -> Shown:
     lines = lines_of(results)
     space = []
     if held := representations_of(lines):
-        space = [
-            kept_panel(TITLES[name], cost, held, lines) for name, cost in COSTS_OF_HELD.items()
-        ]
+        space = [kept_panel(figure, held, lines) for figure in HELD_COSTS]
     elif asks_what_was_learned(results):
         space = [learned_panel(lines)]
     return Shown(lines, [cost_panel(cost, lines) for cost in COSTS], space)
@@ -115,14 +113,8 @@ def cost_panel(cost: Cost, lines: Sequence[Line]) -> Panel:
     return Panel(cost.titled, tuple(points), less=False)
 
 
-def kept_panel(
-    title: str, figure: str, held: Sequence[Representation], lines: Sequence[Line]
-) -> Panel:
-    """Space kept at equal loss against a cost of occupancies that have it.
-
-    Args:
-        figure: name of the cost in `Held`.
-    """
+def kept_panel(figure: str, held: Sequence[Representation], lines: Sequence[Line]) -> Panel:
+    """Space kept at equal loss against one of `HELD_COSTS`, of occupancies that have it."""
     names = [line.name for line in lines]
     points = []
     for one in (one for one in held if one.has(figure)):
@@ -133,7 +125,7 @@ def kept_panel(
         points.append(
             Point(one.name, one.median(figure), one.kept, number, ours=one.ours, small=small)
         )
-    return Panel(title, tuple(points))
+    return Panel(HELD_COSTS[figure], tuple(points))
 
 
 def learned_panel(lines: Sequence[Line]) -> Panel:
