@@ -16,7 +16,6 @@ from leco_plugin.evaluation.clock import (
     Clock,
     peak_allocator_bytes,
     peak_process_bytes,
-    warm_up,
 )
 
 
@@ -85,10 +84,6 @@ def test_what_is_no_time_is_refused(wrong: float) -> None:
         Budget(1.0, learn_seconds=wrong)
     with pytest.raises(ValueError, match="--seconds or --steps"):
         Budget()
-
-
-def test_warming_up_ends() -> None:
-    warm_up("cpu", seconds=0.001)
 
 
 HELD = 200 * 2**20
