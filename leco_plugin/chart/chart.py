@@ -47,11 +47,6 @@ class Chart:
     """One chart: its folder, its runs, and its results so far.
 
     Args:
-        data: a scene in nerfstudio's format.
-        out: the chart's folder.
-        contenders: what is compared.
-        seeds: of each.
-        protocol: how long, and how it is evaluated.
         suite: name and question of the comparison, if it has one.
         command: what made it, for the results.
         reuse: folders of charts, from which runs that are missing here are taken over.
@@ -225,8 +220,7 @@ class Chart:
 
         Nothing is drawn when no run has succeeded.
         """
-        from leco_plugin.chart import picture
-        from leco_plugin.chart.page import write_page
+        from leco_plugin.chart import page, picture
         from leco_plugin.chart.theme import DARK, LIGHT
 
         results = self.write()
@@ -234,7 +228,7 @@ class Chart:
             place = self.folder.path
             picture.draw(results, place / "chart.png", LIGHT)
             picture.draw(results, place / "chart-dark.png", DARK)
-            write_page(results, place / "chart.html")
+            page.write_page(results, place / "chart.html")
         return results
 
 
@@ -259,11 +253,8 @@ def unlike(source: Path, settings: Mapping[str, Any]) -> str | None:
 
 
 def take_over(folder: RunFolder, missing: Sequence[Job], sources: Sequence[Path]) -> list[Job]:
-    """Copies missing runs from other charts; returns their jobs.
-
-    Args:
-        sources: folders of charts, checked; the first that has a run gives it.
-    """
+    """Copies missing runs from the folders of other charts that have passed `unlike`, each from the
+    first that has it; returns their jobs."""
     left, taken = list(missing), []
     for source in sources:
         for name, record in stored_in(source).items():

@@ -63,11 +63,8 @@ def make_charts(
     """Makes what is missing of one chart, or of those of several suites, and draws it.
 
     Args:
-        data: a scene in nerfstudio's format.
         out: the chart's folder; several suites have one each in it, and reuse each other's runs.
-        methods, samplers: what is compared, or
-        suites: names of comparisons, or `all`.
-        asked: how long and how often.
+        suites: names of comparisons, or `all`; in place of methods and samplers.
         runner_for: gives what makes the runs of a chart.
     Returns:
         The results by folder, as in `results.json`.
@@ -92,13 +89,7 @@ def make_charts(
 
 
 def refuse_failures(made: Sequence[Mapping[str, Any]]) -> None:
-    """Tells of the runs that were asked for and have failed.
-
-    Args:
-        made: results of charts.
-    Raises:
-        RuntimeError: there are some.
-    """
+    """Raises `RuntimeError` where runs that were asked for have failed in some of the results."""
     failures = [one for results in made for one in results["failures"] if one["asked"]]
     if failures:
         count = len(failures) + sum(len(results["runs"]) for results in made)

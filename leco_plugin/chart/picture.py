@@ -47,13 +47,7 @@ SIZE = "size, kB: numbers in bfloat16, cells of grids in bits"
 
 
 def draw(results: Mapping[str, Any], path: Path, theme: Theme = LIGHT) -> Path:
-    """Draws the results of a chart that has at least one run.
-
-    Args:
-        results: as in `results.json`.
-        path: of the picture.
-        theme: of the page it is meant for.
-    """
+    """Draws the results of a chart that has at least one run, for a page of a theme."""
     shown = shown_of(results)
     with themed(theme):
         figure = new_figure((10, 8.4), theme.page)

@@ -40,9 +40,7 @@ def occupancy_facts(
     """Sizes, calibration, and the comparison with the exact scene: JSON values.
 
     Args:
-        occupancy: in the coordinates of `manager`.
-        file: that holds it.
-        manager: nerfstudio's data manager of the scene.
+        occupancy: in the coordinates of `manager`, from `file`.
         truth: the exact scene; without one its figures are None.
     """
     report = occupancy.report
