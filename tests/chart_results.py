@@ -54,12 +54,12 @@ def occupancy(size: int, kept: float, grids: list[dict[str, Any]] | None = None)
     }
 
 
-def grid(resolution: int, kept: float, seconds: float = 2.0) -> dict[str, Any]:
+def grid(resolution: int, kept: float) -> dict[str, Any]:
     """What is stored of an occupancy grid made from a field."""
     return {
         "resolution": resolution,
         "bytes": resolution**3 // 8,
-        "update_seconds": seconds,
+        "update_seconds": 2.0,
         "kept_reached_volume": kept,
     }
 

@@ -266,10 +266,9 @@ def provenance(results: Mapping[str, Any]) -> str:
         )
     if reused := sum(bool(run.get("reused")) for run in runs):
         said += f" {reused} of the runs were made for other charts."
-    by_code: dict[str, list[str]] = {}
+    by_code: dict[str, dict[str, None]] = {}  # its names, each once and in order
     for run in runs:
-        names = by_code.setdefault(str(run.get("code")), [])
-        names += [run["name"]] if run["name"] not in names else []
+        by_code.setdefault(str(run.get("code")), {})[run["name"]] = None
     if len(by_code) > 1:
         of_each = "; ".join(f"{code}: {', '.join(names)}" for code, names in by_code.items())
         said += f" Not all of them are of the same code, nor made in turns ({of_each})."
