@@ -95,9 +95,7 @@ def at_equal_loss(
     Args:
         mixture: whose gate is frozen; it is left as it was.
         datamanager: with held-out training pixels.
-        grids: resolutions of grids.
         until_as_little: whether to end with the first grid that keeps as little as the gate.
-        config: how many rays.
         others: further representations by name, each a score of mapped positions [N, 3]: [N].
     Returns:
         `lost_surface_mass`; `reached_volume`, the share of the scene's box that rays reach;
