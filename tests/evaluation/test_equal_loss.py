@@ -6,7 +6,7 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from small_learner import small_mixture
+from small_learner import SMALLEST, small_mixture
 from torch import Tensor
 
 from leco_plugin.evaluation import equal_loss
@@ -69,7 +69,8 @@ def mixture(monkeypatch: pytest.MonkeyPatch) -> Mixture:
         return torch.stack([10.0 - occupied, torch.zeros_like(occupied), occupied - 10.0], dim=-1)
 
     def density(mapped: Tensor, *_: Tensor) -> tuple[Tensor, Tensor]:
-        return 30.0 * (mapped[:, 0] > 0.0), torch.zeros(len(mapped), 4)
+        features = torch.zeros(len(mapped), SMALLEST.field.experts.width)
+        return 30.0 * (mapped[:, 0] > 0.0), features
 
     monkeypatch.setattr(made.gate, "forward", gate)
     monkeypatch.setattr(made.field, "density", density)
