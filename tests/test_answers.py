@@ -8,7 +8,7 @@ from types import ModuleType
 from typing import Any
 
 import pytest
-from chart_results import occupancy, results, run
+from chart_results import grid, occupancy, results, run
 from stored_charts import reading
 
 STEPS = {"protocol": {"seconds": None, "steps": 400}}
@@ -37,8 +37,7 @@ def representations(other_seconds: float, grid_kept: tuple[float, ...] = (0.3,))
     """Runs of our gate, grids from its field, and of a larger gate, for each seed."""
     runs = []
     for seed, kept in enumerate(grid_kept):
-        grid = {"resolution": 64, "bytes": 32768, "update_seconds": 2.0}
-        held = occupancy(50_000, 0.125, [{**grid, "kept_reached_volume": kept}])
+        held = occupancy(50_000, 0.125, [grid(64, kept)])
         runs.append(run("MLP (ours)", seed, occupancy=held, learn_seconds=9.0))
         larger = {"occupancy": occupancy(4_000_000, 0.1), "learn_seconds": other_seconds}
         runs.append(run("hash grid", seed, sampler="learned-occupancy-hash", **larger))
@@ -99,8 +98,8 @@ def test_gates_are_compared_by_what_they_keep_and_runs_of_equal_time_by_their_en
     frozen, not_frozen = occupancy(50_000, 0.1), {"freeze_seconds": None}
     store("losses", "fox", run("A", occupancy=frozen), run("B", **not_frozen), **STEPS)
     store("freeze", "fox", run("A", psnr=21.0), run("B"))
-    grid = {"sampler": "occupancy-grid-64", "train_seconds": 10.0, "learn_seconds": 5.0}
-    store("grid-resolution", "fox", run("A"), run("B", **grid))
+    of_grid = {"sampler": "occupancy-grid-64", "train_seconds": 10.0, "learn_seconds": 5.0}
+    store("grid-resolution", "fox", run("A"), run("B", **of_grid))
     text = text_of(answers)
     assert "| 20.0 dB, 1 s | 20.0 dB, 1 s (50% of the time for its grid) |" in text
     assert "| 10%, 20.0 dB | not frozen, 20.0 dB |" in text

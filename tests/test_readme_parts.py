@@ -8,7 +8,7 @@ from types import ModuleType
 from typing import Any
 
 import pytest
-from chart_results import occupancy, results, run
+from chart_results import grid, occupancy, results, run
 from stored_charts import reading
 
 
@@ -34,11 +34,7 @@ def test_scenes_of_which_one_suite_is_missing_have_no_row(
 def test_ours_and_the_rivals_that_keep_least_stand_beside_equal_time(
     parts: ModuleType, tmp_path: Path
 ) -> None:
-    grids = [
-        {"resolution": cells, "bytes": size, "kept_reached_volume": kept, "update_seconds": 1.0}
-        for cells, size, kept in ((64, 32768, 0.3), (128, 262144, 0.25), (256, 2097152, 0.28))
-    ]
-    facts = occupancy(23_000, 0.2, grids)
+    facts = occupancy(23_000, 0.2, [grid(64, 0.3), grid(128, 0.25), grid(256, 0.28)])
     small = {"bytes": 4932, "seconds": 9.0, "kept_reached_volume": 0.1, "name": "MLP"}
     facts["at_equal_loss"]["taught"] = [small]
     planes = run("K-planes", sampler="learned-occupancy-k-planes", occupancy=occupancy(10**6, 0.3))
