@@ -122,6 +122,32 @@ def test_photographs_with_alpha_are_compared_as_the_host_renders_them(watched: W
     assert not watched.watch._errors(None, truth).any()
 
 
+@pytest.mark.parametrize("price", [0.0, 0.05])
+def test_probation_ends_in_every_process_though_the_first_one_alone_measures(
+    watched: Watched, packed: torch.nn.Module, monkeypatch: pytest.MonkeyPatch, price: float
+) -> None:
+    """The second process gets what the first one has found, and calls nothing itself."""
+    found: list[Any] = []
+    guides = watched.guide, copy.deepcopy(watched.guide)
+    ends = []
+    for rank, guide in enumerate(guides):
+
+        def from_first(make: Any, device: Any, rank: int = rank) -> Any:
+            if rank == 0:
+                found.append(make())
+                return copy.deepcopy(found[-1])
+            return found.pop(0)
+
+        monkeypatch.setattr(price_watch, "from_first", from_first)
+        guide.watched.lower = guide.the_occupancy().threshold / 16
+        host = Host(guide)
+        host.price = price
+        watch = HostWatch(host, guide, CalibrationConfig(), watched.watch.pipeline, LearningOnly())
+        Watched(guide=guide, watch=watch, now=watched.now, kept=9).go(0, 250)
+        ends.append((guide.followed().threshold, guide.watched.due, guide.watched.lower))
+    assert ends[0] == ends[1] and not found
+
+
 def a_half(occupancy: Occupancy) -> float:
     """What is skipped, where the threshold does not matter."""
     return 0.5
