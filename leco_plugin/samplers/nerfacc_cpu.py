@@ -169,8 +169,6 @@ def traverse_grids(
     Raises:
         ValueError: a step is not positive, tensors do not fit, or `over_allocate` has no limit.
     """
-    from nerfacc import RaySamples
-
     limit = traverse_steps_limit or 0
     if over_allocate and limit <= 0:
         raise ValueError("over_allocate needs a positive traverse_steps_limit")
@@ -187,7 +185,7 @@ def traverse_grids(
     occupied = functools.partial(lookup, binaries, aabbs[0])
     samples, left = _first_samples(rays, March(step_size, cone_angle), occupied, limit)
     intervals, middles = _shared_edges(*samples, len(rays_o))
-    if not hasattr(RaySamples, "is_valid"):  # 0.5.2
+    if not hasattr(middles, "is_valid"):  # 0.5.2
         return intervals, middles
     middles.is_valid = torch.ones_like(middles.ray_indices, dtype=torch.bool)
     return intervals, middles, left

@@ -73,7 +73,7 @@ class GateWeights(NamedTuple):
         return self[:READ]
 
     @property
-    def sizes(self) -> dict[str, int | bool]:
+    def sizes(self) -> dict[str, Any]:
         """The constants that a kernel is compiled for, by name."""
         return {name.upper(): size for name, size in zip(self._fields[READ:], self[READ:])}
 
