@@ -187,7 +187,6 @@ def traverse_grids(
     intervals, middles = _shared_edges(*samples, len(rays_o))
     if not hasattr(middles, "is_valid"):  # 0.5.2
         return intervals, middles
-    middles.is_valid = torch.ones_like(middles.ray_indices, dtype=torch.bool)
     return intervals, middles, left
 
 
@@ -230,7 +229,7 @@ def _shared_edges(
     edge_rays[right - 1], edge_rays[right] = ray_indices, ray_indices
     is_left[right - 1], is_right[right] = True, True
     of_edges, of_samples = (packed.pack_info(rays, n_rays) for rays in (edge_rays, ray_indices))
-    return (
-        RayIntervals(values, of_edges, edge_rays, is_left, is_right),
-        RaySamples((t_starts + t_ends) * 0.5, of_samples, ray_indices),
-    )
+    samples = RaySamples((t_starts + t_ends) * 0.5, of_samples, ray_indices)
+    if hasattr(samples, "is_valid"):  # from 0.5.3 on
+        samples.is_valid = torch.ones_like(begins)
+    return RayIntervals(values, of_edges, edge_rays, is_left, is_right), samples
