@@ -50,6 +50,10 @@ STEPS_PER_UPDATE, FULL_UPDATES, LATER_SHARE = 16, 16, 0.3
 """An occupancy grid asks about every cell so many times, then about so large a share of them."""
 
 
+Key = tuple[str, str]
+"""Scene and name of a run."""
+
+
 @dataclass(frozen=True)
 class Run:
     """One run, on the scene of a name."""
@@ -58,7 +62,7 @@ class Run:
     job: Job
 
     @property
-    def key(self) -> tuple[str, str]:
+    def key(self) -> Key:
         """The same for what is run once however many cells share it."""
         return self.scene, self.job.name
 
@@ -112,7 +116,7 @@ def entries_of(
 def runs_of(entries: Sequence[Entry]) -> list[Run]:
     """All runs, each once: all cells get their first seed before any gets its second."""
     most = max((len(entry.seeds) for entry in entries), default=0)
-    found: dict[tuple[str, str], Run] = {}
+    found: dict[Key, Run] = {}
     for number in range(most):
         for entry in entries:
             for run in entry.runs[number : number + 1]:
