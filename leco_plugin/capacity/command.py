@@ -109,12 +109,12 @@ def _measure_missing(
     """A row for each gate, and for each grid up to the first that would take too long."""
     rows = {one.key: row for one in candidates if (row := _stored(out, one)) is not None}
     of_cells = [one for one in candidates if one.gate is None]
-    if not all(one.key in rows for one in of_cells):  # each is refined from the one before
-        for one in of_cells:
-            rows.pop(one.key, None)
+    if all(one.key in rows for one in of_cells):
+        of_cells = []
+    for one in of_cells:  # all of them: each is refined from the one before
+        rows.pop(one.key, None)
     todo = [one for one in candidates if one.key not in rows]
-    grids_to_fill = [one for one in todo if one.gate is None]
-    filling = iter(measure_grids(taught, grids_to_fill, lost_surface_mass))
+    filling = iter(measure_grids(taught, of_cells, lost_surface_mass))
 
     def measure_one(candidate: Candidate, show: Callable[[float], None]) -> str:
         if candidate.gate is not None:

@@ -8,7 +8,7 @@ from typing import Any
 
 from leco_plugin.capacity.references import HOLDS, LOST_DECISIONS, Rung
 from leco_plugin.capacity.search import MARGIN
-from leco_plugin.chart.theme import LIGHT, Theme, plain, themed
+from leco_plugin.chart.theme import LIGHT, Theme, log_axis, new_figure, plain, themed
 
 LEAST = 1e-6
 """Lost surface mass that is drawn for none at all."""
@@ -95,14 +95,11 @@ def draw(results: Mapping[str, Any], path: Path, theme: Theme = LIGHT) -> Path:
     Raises:
         OSError, ValueError: it cannot be written there, or is of no known kind.
     """
-    from matplotlib.figure import Figure
-    from matplotlib.ticker import NullFormatter, StrMethodFormatter
-
     rungs = results["rungs"]
     sizes = [rung["bytes"] / 1000 for rung in rungs]
     losses = [max(rung["lost_surface_mass"], LEAST) for rung in rungs]
     with themed(theme):
-        figure = Figure(figsize=(8.5, 5), facecolor=theme.page, layout="constrained")
+        figure = new_figure((8.5, 5), theme.page, layout="constrained")
         axes: Any = figure.subplots()
         axes.plot(sizes, losses, color=theme.faint, linewidth=2, zorder=1)
         beside = {"textcoords": "offset points", "fontsize": 9.5}
@@ -122,10 +119,9 @@ def draw(results: Mapping[str, Any], path: Path, theme: Theme = LIGHT) -> Path:
         axes.set_xlim(0.7 * min(sizes, default=1.0), 4.0 * max(sizes, default=1.0))
         unknown = results["to"].get("lost_surface_mass") is None
         of_what = "lost decisions" if unknown else "lost surface mass"
-        axes.set(xscale="log", yscale="log", xlabel="kB of weights", ylabel=of_what)
+        axes.set(yscale="log", xlabel="kB of weights", ylabel=of_what)
         axes.set_ylim(min([*losses, allowed]) / 3.0, 30.0 * max([*losses, allowed]))
-        axes.xaxis.set_major_formatter(StrMethodFormatter("{x:g}"))
-        axes.xaxis.set_minor_formatter(NullFormatter())
+        log_axis(axes, "x", (1.0,))
         plain(axes, theme)
         axes.set_title(headline(results), loc="left", fontsize=13, fontweight="bold")
         path.parent.mkdir(parents=True, exist_ok=True)
