@@ -64,7 +64,7 @@ def shrink(
     data: Path,
     out: Path,
     bounds: Bounds,
-    keep: Callable[[dict[str, Any]], None] | None = None,
+    keep: Callable[[dict[str, Any]], None] = lambda results: None,
 ) -> dict[str, Any]:
     """Finds the smallest gate that decides as a frozen one does, and writes it.
 
@@ -82,21 +82,21 @@ def shrink(
     code = describe_code()
     source, original = _open(file, data, out, bounds)
     ground, itself, lowered = _meet_bounds(source, original, file, bounds)
-    known = {
+    results: dict[str, Any] = {
         "format": 1,
         "machine": describe_machine(),
         **made_by(code),
         "from": {"params": ground.original.num_params, "bytes": file.stat().st_size},
         "bounds": asdict(bounds),
         "lowered": lowered,
+        "original": asdict(itself),
+        "rungs": [],
     }
-    rungs: list[dict[str, Any]] = []
 
     def tell(rung: Rung) -> None:
         _say(line_of(rung))
-        rungs.append(asdict(rung))
-        if keep is not None:
-            keep({**known, "original": asdict(itself), "rungs": rungs})
+        results["rungs"].append(asdict(rung))
+        keep(results)
 
     found = Found(None, [])
     if itself.verdict == HOLDS:
@@ -110,15 +110,13 @@ def shrink(
     smaller.save(out)
     speedup, times = compare_queries(ground.original, smaller)
     reported = {name: value for name, value in smaller.report.items() if name not in COPIED}
-    return {
-        **known,
-        "original": asdict(itself),
+    return results | {
+        "original": asdict(itself),  # with what is declared of it
         "to": {"params": smaller.num_params, "bytes": out.stat().st_size, **reported},
         "query_speedup": speedup,
         "query_milliseconds": times,
         "queried_positions": TIMED_POSITIONS,
         "checked": checked,
-        "rungs": rungs,
     }
 
 
