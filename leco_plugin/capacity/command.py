@@ -36,7 +36,6 @@ def capacity(
     resolutions: Sequence[int] = (32, 64, 128, 256, 512),
     lost_surface_mass: float = 1e-3,
     learn_steps: int = 200,
-    gate_candidates: Sequence[Candidate] | None = None,
 ) -> dict[str, Any]:
     """Teaches and measures what is missing in a folder, and draws all of it.
 
@@ -47,7 +46,6 @@ def capacity(
             that would take long.
         lost_surface_mass: at which kept volumes are compared.
         learn_steps: of the field.
-        gate_candidates: `gates()` by default.
     Returns:
         The results, as in `results.json`.
     Raises:
@@ -64,8 +62,7 @@ def capacity(
     _take_folder(out, {"scene": scene, **settings}, data)
     say = functools.partial(console().print, markup=False, highlight=False)
     known = _left_out(out) if machine["device"] == "cpu" else []
-    candidates = list(gates() if gate_candidates is None else gate_candidates)
-    candidates += _grids_to_fill(resolutions, known, say)
+    candidates = [*gates(), *_grids_to_fill(resolutions, known, say)]
     taught = prepare(data, out, learn_steps)
     rows = _measure_missing(out, taught, candidates, lost_surface_mass, code, say)
     # what is left of the candidates are grids that would take too long: no later call tries them
@@ -114,7 +111,7 @@ def _measure_missing(
     for one in of_cells:  # all of them: each is refined from the one before
         rows.pop(one.key, None)
     todo = [one for one in candidates if one.key not in rows]
-    filling = iter(measure_grids(taught, of_cells, lost_surface_mass))
+    filling = measure_grids(taught, of_cells, lost_surface_mass)
 
     def measure_one(candidate: Candidate, show: Callable[[float], None]) -> str:
         if candidate.gate is not None:

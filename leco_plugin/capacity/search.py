@@ -131,7 +131,7 @@ def _measure(
         threshold = find_threshold(of_volume, share * kept)
         losses = losses_at(threshold, look)
         lost = max(one.share for one in losses)
-        ratio = float((of_volume >= threshold).double().mean()) / kept
+        ratio = float((of_volume >= threshold).double().mean()) / max(kept, 1e-12)
         # what is not within the bounds here needs no look at the rays that verify
         holds = all(
             one.bound <= bounds.lost_surface_mass

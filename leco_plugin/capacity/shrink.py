@@ -98,11 +98,7 @@ def shrink(
         results["rungs"].append(asdict(rung))
         keep(results)
 
-    found = Found(None, [])
-    if itself.verdict == HOLDS:
-        with bar("Teaching smaller gates") as show:
-            found = search(ground, bounds, on_rung=tell, on_progress=show)
-    smaller = found.occupancy or _round_original(ground, bounds, itself, found.rungs)
+    found, smaller = _find_smaller(ground, bounds, itself, tell)
     checked = _check_on_test_photographs(source, ground.original, smaller)
     is_untrained = held_out_sampler(source.manager) is not None
     smaller.report = _report_of(ground, found, itself, is_untrained, lowered, checked)
@@ -163,21 +159,26 @@ def _meet_bounds(
     return ground, itself, lowered
 
 
-def _round_original(
-    ground: Ground, bounds: Bounds, itself: Rung, tried: Sequence[Rung]
-) -> Occupancy:
-    """The original, which is stored again where nothing smaller holds.
+def _find_smaller(
+    ground: Ground, bounds: Bounds, itself: Rung, tell: Callable[[Rung], None]
+) -> tuple[Found, Occupancy]:
+    """The gates that were tried, and what is stored: the original again where none of them holds.
 
     Its weights are rounded where autocast rounds them anyway: not a decision changes. Where a
     reference measures it, `itself` gets what is to be declared.
     """
-    original = ground.original
+    found, original = Found(None, []), ground.original
+    if itself.verdict == HOLDS:
+        with bar("Teaching smaller gates") as show:
+            found = search(ground, bounds, on_rung=tell, on_progress=show)
+    if found.occupancy is not None:
+        return found, found.occupancy
     if ground.measures_original:
-        looks = max((rung.look or 0 for rung in tried), default=0)
+        looks = max((rung.look or 0 for rung in found.rungs), default=0)
         verify(ground, original, bounds, itself, looks + 1)
     if original.precision == "bfloat16":
         round_weights(original.gate.hidden)
-    return original
+    return found, original
 
 
 def draw_rays(source: Source, original: Occupancy) -> tuple[Sequence[tuple[Seen, Seen]], Seen]:

@@ -26,7 +26,7 @@ from leco_plugin.stability.samplers import (
     with_references,
 )
 from leco_plugin.stability.scene import Stage
-from leco_plugin.stability.stages import STAGES
+from leco_plugin.stability.stages import STAGES, YARD
 
 START_SECONDS = 14.0
 """For a process to start, to read the scene and to build the host."""
@@ -126,13 +126,14 @@ def runs_of(entries: Sequence[Entry]) -> list[Run]:
 
 def scenes_of(cases: Sequence[Case], sizes: Sizes) -> dict[str, tuple[Stage, Capture]]:
     """The scenes of the cases by name."""
-    return {case.scene: (STAGES[case.stage], capture_of(case, sizes)) for case in cases}
+    return {case.scene: (STAGES.get(case.name, YARD), capture_of(case, sizes)) for case in cases}
 
 
 def capture_of(case: Case, sizes: Sizes) -> Capture:
     """A case's capture in pictures of the suite's size."""
     capture = case.capture
-    views = capture.views if case.fixed_views else round(capture.views * sizes.views)
+    is_fixed = capture.views != Capture.views
+    views = capture.views if is_fixed else round(capture.views * sizes.views)
     return replace(
         capture,
         views=max(4, views),

@@ -76,7 +76,6 @@ def make_table(
     seeds_beside: Sequence[int] = (),
     quick: bool = False,
     minutes: float | None = None,
-    runner_for: Callable[[str], Runner] | None = None,
     earlier: Mapping[str, Any] | None = None,
 ) -> dict[str, Any]:
     """Makes what is missing of a table and draws it.
@@ -87,7 +86,6 @@ def make_table(
         seeds, seeds_beside: of each cell, and of some samplers; see `entries_of`.
         quick: tiny sizes, for a look at whether everything works.
         minutes: that this may take, about; None is as many as it takes.
-        runner_for: gives what makes the runs of a scene.
         earlier: results whose runs are kept where they would be made here just so.
     Returns:
         The results, as in `stability.json`.
@@ -109,7 +107,7 @@ def make_table(
             say(f"{suite.take_over(earlier)} runs of earlier results are taken over")
         say(suite.estimate())
         with resumable(say), bar(f"{len(chosen)} cases") as show:
-            suite.make(say, show, runner_for, math.inf if minutes is None else 60.0 * minutes)
+            suite.make(say, show, math.inf if minutes is None else 60.0 * minutes)
         if left := len(suite.missing()):
             say(f"{left} runs are left or have failed; the same command goes on with them")
         return suite.draw()
@@ -204,31 +202,20 @@ class Suite:
             f"time: about {in_words(seconds)}"
         )
 
-    def make(
-        self,
-        say: Say,
-        show: Callable[[float], None],
-        runner_for: Callable[[str], Runner] | None = None,
-        seconds: float = math.inf,
-    ) -> None:
+    def make(self, say: Say, show: Callable[[float], None], seconds: float = math.inf) -> None:
         """Makes what is missing; whenever this is stopped, what was finished is kept.
 
         Args:
-            say: called with a line for each run.
-            show: called with the share of all runs that is done.
-            runner_for: gives what makes the runs of a scene, instead of processes.
+            say, show: as of `make_jobs`.
             seconds: after which no run is to go on; but for the first ones, what would take longer
                 is left for another time.
         """
         todo, stored = self.missing(), list(self.stored().values())
-        runner_of, ends = runner_for or self.runner, time.monotonic() + seconds
+        ends = time.monotonic() + seconds
 
         def is_in_time(run: Run) -> bool:
             expected = core_seconds([run], stored, self.sizes)
             return run in todo[: self.workers] or time.monotonic() + expected <= ends
-
-        def make_one(run: Run, show_share: Callable[[float], None]) -> str:
-            return self._make_one(run, runner_of(run.scene), show_share)
 
         def note(line: str) -> None:
             say(line)
@@ -239,7 +226,7 @@ class Suite:
         self.write()
         make_jobs(
             todo,
-            make_one,
+            self._make_one,
             note,
             show,
             stop=self.stop,
@@ -248,12 +235,12 @@ class Suite:
             is_wanted=is_in_time,
         )
 
-    def _make_one(self, run: Run, runner: Runner, show: Callable[[float], None]) -> str:
+    def _make_one(self, run: Run, show: Callable[[float], None]) -> str:
         """Makes a run and keeps it, or why there is none; returns a line about it."""
         title = f"{run.scene}, {run.job.contender.name}, seed {run.job.seed}"
         folder = self.folders[run.scene]
         try:
-            record = runner(run.job, show)
+            record = self.runner(run.scene)(run.job, show)
         except RunFailed as error:
             folder.fail(run.job, str(error))
             return f"{title}: failed: {error}"
