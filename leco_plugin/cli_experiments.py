@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import tyro
 
@@ -65,12 +65,18 @@ def chart(
         print(f"see {drawn}table.md and results.json in {folder}")
     charts = {folder.name: results for folder, results in made.items()}
     write_json(json, {"format": 1, "charts": charts} if len(made) > 1 else made[out])
-    failures = [one for results in made.values() for one in results["failures"] if one["asked"]]
+    _require_all_runs(list(made.values()))
+
+
+def _require_all_runs(charts: list[dict[str, Any]]) -> None:
+    """Raises a RuntimeError about the first of the runs asked for that failed."""
+    failures = [one for results in charts for one in results["failures"] if one["asked"]]
     if failures:
-        count = len(failures) + sum(len(results["runs"]) for results in made.values())
+        count = len(failures) + sum(len(results["runs"]) for results in charts)
+        first = failures[0]
         raise RuntimeError(
             f"{len(failures)} of {count} runs failed, the first "
-            f"({failures[0]['name']}, seed {failures[0]['seed']}) with: {failures[0]['reason']}"
+            f"({first['name']}, seed {first['seed']}) with: {first['reason']}"
         )
 
 
