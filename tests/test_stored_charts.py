@@ -12,6 +12,7 @@ import chart_sections as sections
 import pytest
 import readme_parts as parts
 from chart_results import occupancy, results, run
+from results_page import sampling_section
 
 STEPS = {"protocol": {"seconds": None, "steps": 400}}
 
@@ -235,3 +236,13 @@ def test_the_papers_rows_stand_once_and_beside_the_first_chart(store: Store) -> 
     text = "\n".join(sections.suite_sections())
     assert text.count("| grid 256³ | 25.86, 0.764, 0.409 | 46.0 | 12.5 |") == 1
     assert text.index("25.86") < text.index("on fox")
+
+
+def test_a_sampling_section_says_when_and_of_which_code_it_is() -> None:
+    report = {"machine": {"processor": "a processor"}, "figures": []}
+    title, line, _ = sampling_section(report)
+    assert title == "## Sampling: a processor\n" and line.endswith("Ratios within one run.\n")
+    report |= {"date": "2026-11-23", "code": {"version": "0.1.0", "commit": "0123456789ab"}}
+    title, line, _ = sampling_section(report)
+    assert title == "## Sampling: a processor, 2026-11-23\n"
+    assert line.endswith("within one run. leco_plugin 0.1.0 at 0123456789ab.\n")
