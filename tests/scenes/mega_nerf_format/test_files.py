@@ -17,6 +17,7 @@ from scene_files import refused
 
 from leco_plugin.scenes.city.cameras import look_at
 from leco_plugin.scenes.mega_nerf_format.files import TO_DRB, around, read_scene, wrong_axis
+from leco_plugin.studio.checkpoints import allow_checkpoint_globals
 
 
 @pytest.fixture
@@ -134,6 +135,18 @@ def test_bad_input_gets_one_line_that_names_the_file(name: str, scene: Path) -> 
     spoil(scene)
     with refused(message):
         read_scene(scene)
+
+
+def test_a_numpy_number_is_named_also_where_checkpoints_of_nerfstudio_are_read(scene: Path) -> None:
+    put(H=np.int64(3))(scene)
+    before = torch.serialization.get_safe_globals()
+    allow_checkpoint_globals()
+    try:
+        with refused(r"000003\.pt holds numpy.* only tensors and numbers"):
+            read_scene(scene)
+    finally:
+        torch.serialization.clear_safe_globals()
+        torch.serialization.add_safe_globals(before)
 
 
 def test_a_scene_is_read_in_the_order_of_names_across_splits(scene: Path) -> None:
