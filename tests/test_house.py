@@ -26,7 +26,7 @@ KNOWN: list[tuple[str, str]] = []
 MOST_LINES, MOST_LINES_OF_A_FUNCTION = 400, 60
 
 LONG_FUNCTIONS = {"_march_kernel"}
-"""A kernel, whose loop cannot be split. The list may only shrink."""
+"""Triton takes a kernel as one function. The list may only shrink."""
 
 
 @cache
