@@ -8,7 +8,7 @@ from typing import Any
 
 import checkout  # noqa: F401
 from chart_sections import by_scene, notes
-from page_parts import size
+from page_parts import size, table
 
 from leco_plugin.chart.findings.learned import (
     Learned,
@@ -69,13 +69,13 @@ def _answer(charts: Sequence[tuple[str, dict[str, Any]]]) -> list[str]:
     figures, cells_of = next((kind for kind in kinds if kind[0] == KEPT), kinds[0])
     cells = [cells_of(lines_of(results)) for _, results in charts]
     columns = list(dict.fromkeys(column for row in cells for column in row))
-    rows = [f"| scene | {' | '.join(columns)} | |", f"|---|{'---|' * len(columns)}---|"]
+    rows = []
     for (name, results), row in zip(charts, cells):
-        shown = " | ".join(row.get(column, "-") for column in columns)
-        mark = " (*)" if name in noted else ""
-        rows.append(f"| {_link(results)}{mark} | {shown} | {_answer_of(results)} |")
+        scene = _link(results) + (" (*)" if name in noted else "")
+        shown = [row.get(column, "-") for column in columns]
+        rows.append([scene, *shown, _answer_of(results)])
     counted = [_fronts([results for _, results in charts])] if figures == KEPT else []
-    return [figures, *rows, "", *counted]
+    return [figures, *table(f"scene | {' | '.join(columns)} |", rows), "", *counted]
 
 
 def _link(results: Mapping[str, Any]) -> str:
@@ -180,13 +180,9 @@ def minutes_section(charts: Sequence[dict[str, Any]]) -> list[str]:
         its[results["suite"]] = f"{sum(spent) / at_once:.0f}"
         own = [run["wall_seconds"] for run in results["runs"] if not run.get("reused")]
         together[scene] = together.get(scene, 0.0) + sum(own) / at_once
-    lines = [
-        TIMES,
-        f"| scene | {' | '.join(SUITES)} | together |",
-        "|---" * (len(SUITES) + 2) + "|",
-    ]
+    rows = []
     for scene, its in times.items():
         total = "-" if math.isinf(together[scene]) else f"{together[scene]:.0f}"
-        cells = [its.get(suite, "-") for suite in SUITES]
-        lines.append(f"| {scene} | {' | '.join(cells)} | {total} |")
-    return ["\n".join(lines) + "\n"]
+        rows.append([scene, *(its.get(suite, "-") for suite in SUITES), total])
+    lines = table(f"scene | {' | '.join(SUITES)} | together", rows)
+    return ["\n".join([TIMES, *lines]) + "\n"]

@@ -7,13 +7,15 @@ from typing import Any
 
 import torch
 
+from leco_plugin.models.encodings import EncodingConfig
 from leco_plugin.models.sizing.sizes import PAPER, SMALL, Sizes
 from leco_plugin.scenes.city.cameras import CaptureConfig
 from leco_plugin.scenes.city.city import CityConfig
 
 TINY = replace(
     SMALL,
-    gate=replace(SMALL.gate, width=16, layers=1),
+    gate=replace(SMALL.gate, encoding=EncodingConfig(octaves=2), width=16, layers=1),
+    field=replace(SMALL.field, encoding=replace(SMALL.field.encoding, log2_table=10)),
     learn_candidates=16,
     candidates=16,
 )

@@ -62,6 +62,12 @@ def picture(name: str) -> str:
     )
 
 
+def table(header: str, rows: Iterable[Iterable[str]]) -> list[str]:
+    """The lines of a table in Markdown, of titles with bars between them, and rows of cells."""
+    lines = [f"| {' | '.join(cells)} |" for cells in rows]
+    return [f"| {header} |", "|" + "---|" * (header.count("|") + 1), *lines]
+
+
 def section(
     title: str, command: str, report: dict[str, Any], table: str, note: str = ""
 ) -> list[str]:

@@ -8,7 +8,7 @@ from typing import Any
 
 import checkout  # noqa: F401
 from chart_sections import by_scene, notes
-from page_parts import RESULTS, between, size
+from page_parts import RESULTS, between, size, table
 
 from leco_plugin.chart.findings.representations import Representation, representations_of
 from leco_plugin.chart.findings.summary import Line, ahead, lines_of
@@ -27,15 +27,16 @@ def readme(text: str) -> str:
 
 def demo_table(report: dict[str, Any]) -> str:
     """The two runs of a demo, side by side."""
-    lines = [
-        "| run | PSNR | SSIM | steps | samples a ray | seconds to render an image |",
-        "|---|---|---|---|---|---|",
-    ]
-    lines += [
-        f"| {run['method']} | {run['psnr']:.2f} dB | {run['ssim']:.3f} | {run['steps']} "
-        f"| {run['samples_per_ray']:.1f} | {run['render_seconds_per_image']:.2f} |"
-        for run in report["runs"]
-    ]
+    lines = table(
+        "run | PSNR | SSIM | steps | samples a ray | seconds to render an image",
+        [
+            [
+                *(run["method"], f"{run['psnr']:.2f} dB", f"{run['ssim']:.3f}", str(run["steps"])),
+                *(f"{run['samples_per_ray']:.1f}", f"{run['render_seconds_per_image']:.2f}"),
+            ]
+            for run in report["runs"]
+        ],
+    )
     facts = report["occupancy"]
     lines += [
         "",
@@ -66,9 +67,8 @@ def rivals_table() -> str:
     if not rows:
         return "Not measured yet."
     columns = list(dict.fromkeys(column for row in rows.values() for column in row))
-    lines = [f"| scene | {' | '.join(columns)} |", f"|---|{'---|' * len(columns)}"]
-    for scene, row in rows.items():
-        lines.append(f"| {scene} | {' | '.join(row.get(name, '-') for name in columns)} |")
+    cells = [[scene, *(row.get(name, "-") for name in columns)] for scene, row in rows.items()]
+    lines = table(f"scene | {' | '.join(columns)}", cells)
     timed = [lines_of(times[scene][1]) for scene in scenes]
     return "\n".join([*lines, "", _standing(list(best.values()), timed)])
 

@@ -17,7 +17,7 @@ from bars import bars_section
 from chart_sections import chart_sections, suite_sections
 from large_scene_tables import LARGE_SCENES
 from learning import sentence as learning_sentence
-from page_parts import RESULTS, ROOT, machine_line, made_line, picture, section
+from page_parts import RESULTS, ROOT, machine_line, made_line, picture, section, table
 from page_pictures import GROWTH, LEARNING, draw_pictures, is_stale, pictures
 from readme_parts import demo_table, readme
 from sizes_sections import sizes_sections
@@ -74,14 +74,14 @@ short](results.md#the-reviewers-questions-answered).
 
 def sampling_table(report: dict[str, Any]) -> str:
     """The bars of the sampling benchmark, reached or not."""
-    rows = ["| figure | measured | bar | reached |", "|---|---|---|---|"]
-    for figure in report["figures"]:
-        sign = "<=" if figure["at_most"] else ">="
-        reached = "yes" if figure["reached"] else "**no**"
-        rows.append(
-            f"| {figure['name']} | {figure['value']:.3g} | {sign} {figure['bar']:g} | {reached} |"
-        )
-    return "\n".join(rows)
+    return "\n".join(table("figure | measured | bar | reached", map(_bar, report["figures"])))
+
+
+def _bar(figure: dict[str, Any]) -> list[str]:
+    """A figure, its value, its bar, and whether it is reached."""
+    bar = f"{'<=' if figure['at_most'] else '>='} {figure['bar']:g}"
+    reached = "yes" if figure["reached"] else "**no**"
+    return [figure["name"], f"{figure['value']:.3g}", bar, reached]
 
 
 def sampling_section(report: dict[str, Any]) -> list[str]:
@@ -101,14 +101,11 @@ def code_of(report: dict[str, Any]) -> str:
 
 def gpu_table(results: dict[str, Any]) -> str:
     """The bars of the GPU suite, with the milliseconds behind them, floors among them."""
-    rows = ["| figure | measured | bar | reached | milliseconds |", "|---|---|---|---|---|"]
+    cells = []
     for figure in (f for part in results["parts"].values() for f in part.get("figures", [])):
-        sign = "<=" if figure["at_most"] else ">="
         times = ", ".join(f"{name} {time:.3g}" for name, time in figure["milliseconds"].items())
-        rows.append(
-            f"| {figure['name']} | {figure['value']:.3g} | {sign} {figure['bar']:g} "
-            f"| {'yes' if figure['reached'] else '**no**'} | {times} |"
-        )
+        cells.append([*_bar(figure), times])
+    rows = table("figure | measured | bar | reached | milliseconds", cells)
     for name, part in results["parts"].items():
         if missing := [kernel for kernel, runs in part.get("running", {}).items() if not runs]:
             rows += ["", f"Part {name}: torch answered in place of the fused {'; '.join(missing)}."]
@@ -122,8 +119,7 @@ def trained_lines(parts: dict[str, Any]) -> list[str]:
     learned, dense = parts.get("learned", {}), parts.get("dense", {})
     if "psnr" not in learned or "psnr" not in dense:
         return []
-    rows = ["", "| run | seconds | steps | ms a step | peak memory, GiB | PSNR, dB |"]
-    rows.append("|---|---|---|---|---|---|")
+    rows = []
     seconds, steps = learned["seconds"], learned["steps"]
     after = steps["all"] - steps["learning"]
     for name, took, count, step, psnr in (
@@ -131,11 +127,9 @@ def trained_lines(parts: dict[str, Any]) -> list[str]:
         ("guided", seconds["guided"], after, learned["guided_step"], f"{learned['psnr']:.2f}"),
         ("dense", dense["seconds"], dense["steps"], dense["step"], f"{dense['psnr']:.2f}"),
     ):
-        milliseconds, gibibytes = 1e3 * step["seconds"], step["peak_bytes"] / 2**30
-        rows.append(
-            f"| {name} | {took:.0f} | {count} | {milliseconds:.1f} | {gibibytes:.2f} | {psnr} |"
-        )
-    return rows
+        costs = f"{1e3 * step['seconds']:.1f}", f"{step['peak_bytes'] / 2**30:.2f}"
+        rows.append([name, f"{took:.0f}", str(count), *costs, psnr])
+    return ["", *table("run | seconds | steps | ms a step | peak memory, GiB | PSNR, dB", rows)]
 
 
 def check_gpu(results: dict[str, Any]) -> None:

@@ -100,7 +100,7 @@ def along_rays(model: LecoModel, bundles: Sequence[Any]) -> dict[str, float]:
             with asked_along(estimator) as count, counted(model) as queries:
                 kept = estimator.march(along, rule)
             sums["kept"] += len(kept[0])
-            sums["gate"] += queries.gate
+            sums["gate"] += queries["gate"]
             for name, asked in count.items():
                 sums[name] += asked
     return {name: value / max(total, 1) for name, value in sums.items()}
@@ -119,7 +119,7 @@ def rendered(
             truth = true_colours(model, image.to(rgb.device))
             squares += float((rgb - truth).square().sum(dtype=torch.float64))
             values, rays = values + truth.numel(), rays + rgb.shape[0] * rgb.shape[1]
-    return -10.0 * math.log10(max(squares / values, 1e-12)), queries.field / rays
+    return -10.0 * math.log10(max(squares / values, 1e-12)), queries["field"] / rays
 
 
 def row_of(run: Path, data: Path) -> dict[str, Any]:

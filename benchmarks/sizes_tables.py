@@ -6,6 +6,7 @@ import statistics
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+from page_parts import table
 from sizes_figures import MAY_LOSE, bars, verdict
 
 from leco_plugin.capacity.choice import (
@@ -86,11 +87,7 @@ def shrink_table(reports: Mapping[str, Report]) -> str:
     Args:
         reports: as `leco shrink --json` writes them, by the name of the scene.
     """
-    lines = [
-        "| scene | original lowered | values | file, kB | skipped, % | declared lost surface mass "
-        "| lost on test photographs | image price, dB | gates tried | queries faster by |",
-        "|" + "---|" * 10,
-    ]
+    rows = []
     for scene, report in reports.items():
         before, after = report["from"], report["to"]
         declared = after.get("lost_surface_mass")
@@ -111,8 +108,12 @@ def shrink_table(reports: Mapping[str, Report]) -> str:
             f"{len(report['rungs'])}",
             _flagged(f"{speed:.2f} x", speed >= SHRUNK_SPEEDUP),
         )
-        lines.append(f"| {scene} | {' | '.join(cells)} |")
-    return "\n".join(lines)
+        rows.append((scene, *cells))
+    header = (
+        "scene | original lowered | values | file, kB | skipped, % | declared lost surface mass "
+        "| lost on test photographs | image price, dB | gates tried | queries faster by"
+    )
+    return "\n".join(table(header, rows))
 
 
 def _lowered(facts: Report | None) -> str:
@@ -129,23 +130,22 @@ def samples_table(rows: Mapping[str, Report]) -> str:
     Args:
         rows: as `samples.py` stores them, by the name of the scene.
     """
-    lines = [
-        "| scene | candidates a ray | coarse questions | looked up in cells | left to the gate "
-        "| kept | shaded, from the front | PSNR, all of them shaded | from the front "
-        "| time of that |",
-        "|" + "---|" * 10,
-    ]
-    for scene, row in rows.items():
-        counts = (f"{row[name]:.1f}" for name in ("candidates", "coarse", "formed", "gate", "kept"))
-        cells = (
-            *counts,
-            f"{row['shaded_from_the_front']:.1f}",
+    counts = ("candidates", "coarse", "formed", "gate", "kept", "shaded_from_the_front")
+    cells = [
+        (
+            scene,
+            *(f"{row[name]:.1f}" for name in counts),
             f"{row['psnr']:.3f} dB",
             f"{row['psnr_from_the_front']:.3f} dB",
             f"{row['time_from_the_front']:.2f} x",
         )
-        lines.append(f"| {scene} | {' | '.join(cells)} |")
-    return "\n".join(lines)
+        for scene, row in rows.items()
+    ]
+    header = (
+        "scene | candidates a ray | coarse questions | looked up in cells | left to the gate "
+        "| kept | shaded, from the front | PSNR, all of them shaded | from the front | time of that"
+    )
+    return "\n".join(table(header, cells))
 
 
 def capacity_table(reports: Mapping[str, Report]) -> str:
@@ -154,26 +154,25 @@ def capacity_table(reports: Mapping[str, Report]) -> str:
     Args:
         reports: as `leco capacity` writes them, by the name of the scene.
     """
-    lines = [
-        "| scene | photographs | chosen | kB | keeps, % | smallest grid that keeps as little "
-        f"| best grid up to {FINE_GRID}^3 keeps, % | gate of 1/100 of the bytes of {FINE_GRID}^3 "
-        "keeps, % | no more |",
-        "|" + "---|" * 9,
-    ]
+    cells = []
     for scene, report in reports.items():
         rows = report["representations"]
         chosen = choose(rows)
         grid, gate = beside_fine_grid(rows)
-        cells = (
+        figures = (
             f"{report['scene']['train_images']}",
             f"{chosen['family']} {chosen['size']}",
             f"{chosen['bytes'] / 1000:.1f}",
             f"{100 * chosen['kept_volume']:.2f}",
             _smallest_grid(rows, chosen),
-            *_beside(grid, gate),
         )
-        lines.append(f"| {scene} | {' | '.join(cells)} |")
-    return "\n".join([*lines, "", where_it_pays(reports)])
+        cells.append((scene, *figures, *_beside(grid, gate)))
+    header = (
+        "scene | photographs | chosen | kB | keeps, % | smallest grid that keeps as little "
+        f"| best grid up to {FINE_GRID}^3 keeps, % | gate of 1/100 of the bytes of {FINE_GRID}^3 "
+        "keeps, % | no more"
+    )
+    return "\n".join([*table(header, cells), "", where_it_pays(reports)])
 
 
 def where_it_pays(reports: Mapping[str, Report]) -> str:

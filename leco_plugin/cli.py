@@ -111,10 +111,14 @@ def swap(
         other_scene: Train also where the occupancy is of another scene, as far as its cameras say.
         json: File for the folder of the run, as JSON.
     """
-    from leco_plugin.swap import swap as train_swapped
+    from nerfstudio.scripts.train import main as train
+
+    from leco_plugin.swap import swapped_config
 
     check_json(json)
-    folder = train_swapped(method, occupancy, arguments, sampler, options, codes, other_scene)
+    config = swapped_config(method, occupancy, arguments, sampler, options, codes, other_scene)
+    train(config)
+    folder = config.get_base_dir()
     print(f"{method}, guided: {folder}")
     facts = {"method": method, "sampler": sampler, "options": dict(options), "codes": codes}
     write_json(json, {"format": 1, **facts, "folder": str(folder)})
@@ -144,16 +148,11 @@ def demo(out: Path = Path("runs/demo"), seconds: float = 130.0, json: Path | Non
 
 
 COMMANDS: dict[str, Callable[..., None]] = {
-    "city": city,
-    "inspect": inspect,
-    "export": export,
-    "shrink": shrink,
-    "capacity": capacity,
-    "swap": swap,
-    "demo": demo,
-    "chart": chart,
-    "stability": stability,
-    "check": check,
+    command.__name__: command
+    for command in (
+        *(city, inspect, export, shrink, capacity),
+        *(swap, demo, chart, stability, check),
+    )
 }
 
 
@@ -184,6 +183,5 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _complain(error: BaseException, status: int) -> int:
-    message = one_line(error) or type(error).__name__
-    print(f"leco: {message}", file=sys.stderr)
+    print(f"leco: {one_line(error) or type(error).__name__}", file=sys.stderr)
     return status

@@ -56,7 +56,7 @@ def chart(
         json: Another file for the results.
     """
     check_json(json)
-    from leco_plugin.chart.command import Asked, make_charts
+    from leco_plugin.chart.command import Asked, make_charts, refuse_failures
 
     asked = Asked(seconds, steps, learn_seconds, seeds, images, at_once, reuse)
     made = make_charts(data, out, methods, samplers, suite, asked)
@@ -65,13 +65,7 @@ def chart(
         print(f"see {drawn}table.md and results.json in {folder}")
     charts = {folder.name: results for folder, results in made.items()}
     write_json(json, {"format": 1, "charts": charts} if len(made) > 1 else made[out])
-    failures = [one for results in made.values() for one in results["failures"] if one["asked"]]
-    if failures:
-        count = len(failures) + sum(len(results["runs"]) for results in made.values())
-        raise RuntimeError(
-            f"{len(failures)} of {count} runs failed, the first "
-            f"({failures[0]['name']}, seed {failures[0]['seed']}) with: {failures[0]['reason']}"
-        )
+    refuse_failures(list(made.values()))
 
 
 def stability(

@@ -38,7 +38,7 @@ FULL_LEARNING = 150.0
 """Training time from which on the occupancy learns for the method's own number of steps."""
 MOST_LEARNING = 0.5
 """Limit of learning, as a share of the training time, for slow machines."""
-AERIAL = CaptureConfig(street_per_block=0.0)
+CITY, AERIAL = CityConfig(), CaptureConfig(street_per_block=0.0)
 """A drone survey: with pictures from the street, all rays would have to begin at the lens."""
 FEWEST_LEARN_STEPS = 10
 SLICE_HEIGHT = 4.0
@@ -50,8 +50,8 @@ NEVER_FROZEN = "leco-occupancy-never-frozen"
 def run_demo(
     out: Path,
     seconds: float = SECONDS,
-    city: CityConfig | None = None,
-    capture: CaptureConfig | None = None,
+    city: CityConfig = CITY,
+    capture: CaptureConfig = AERIAL,
     began: float | None = None,
 ) -> dict[str, Any]:
     """Writes `report.json`, `chart.png`, `picture.png`, the occupancy, the city and both runs.
@@ -59,8 +59,6 @@ def run_demo(
     Args:
         out: folder; an earlier demo's city in it is used again, its results are replaced.
         seconds: training time of each run.
-        city: 3 x 3 blocks by default.
-        capture: how it is photographed.
         began: `time.monotonic()` when the command began; by default now.
     Returns:
         The report, as `--out` has it.
@@ -72,7 +70,6 @@ def run_demo(
         raise ValueError(f"the training time is a positive number of seconds, not {seconds}")
     began = time.monotonic() if began is None else began
     code = describe_code()  # before anything is measured
-    city, capture = city or CityConfig(), capture or AERIAL
     folder = write_city(city, out / "city", capture)
 
     guided = _config(folder, out, seconds)
@@ -89,20 +86,11 @@ def run_demo(
 
     with bar("The same, never frozen") as show:
         other_run, trainer = timed_run(other, Budget(seconds), sampler="dense", on_progress=show)
-    manager: Any = trainer.pipeline.datamanager
     report = {
         "format": 1,
         "machine": describe_machine(),
         "made": {"date": datetime.date.today().isoformat(), "command": "leco demo", **code},
-        "scene": {
-            "name": "city",
-            "blocks": city.blocks,
-            "seed": city.seed,
-            "width": capture.width,
-            "height": capture.height,
-            "train_images": len(manager.train_dataset),
-            "test_images": len(manager.eval_dataset),
-        },
+        "scene": _scene_facts(city, capture, trainer.pipeline.datamanager),
         "occupancy": facts,
         "runs": [run.to_dict() for run in (guided_run, other_run)],
     }
@@ -110,6 +98,18 @@ def run_demo(
     report["seconds_in_all"] = round(time.monotonic() - began, 1)
     write_json(out / "report.json", report)
     return report
+
+
+def _scene_facts(city: CityConfig, capture: CaptureConfig, manager: Any) -> dict[str, Any]:
+    return {
+        "name": "city",
+        "blocks": city.blocks,
+        "seed": city.seed,
+        "width": capture.width,
+        "height": capture.height,
+        "train_images": len(manager.train_dataset),
+        "test_images": len(manager.eval_dataset),
+    }
 
 
 def draw_chart(report: dict[str, Any], path: Path, theme: Theme = LIGHT) -> Path:

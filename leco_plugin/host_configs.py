@@ -5,8 +5,6 @@ from __future__ import annotations
 from dataclasses import replace
 
 from nerfstudio.cameras.camera_optimizers import CameraOptimizerConfig
-from nerfstudio.configs.base_config import MachineConfig, ViewerConfig
-from nerfstudio.engine.schedulers import ExponentialDecaySchedulerConfig
 from nerfstudio.engine.trainer import TrainerConfig
 from nerfstudio.models.base_model import ModelConfig
 from nerfstudio.models.instant_ngp import InstantNGPModelConfig
@@ -15,14 +13,9 @@ from nerfstudio.pipelines.base_pipeline import VanillaPipelineConfig
 from nerfstudio.plugins.types import MethodSpecification
 
 from leco_plugin.hosts.guided import GuidedModelConfig
-from leco_plugin.method_configs import ON_GPU, STEPS, best_device
-from leco_plugin.models.compute.optimizers import FusedAdamConfig
+from leco_plugin.method_configs import ON_GPU, STEPS, best_device, photographs, trainer
 from leco_plugin.models.switch.config import SwitchNerfModelConfig, switch_sizes_for
-from leco_plugin.scenes.data_manager import LecoDataManagerConfig
-from leco_plugin.scenes.photographs import LecoPhotographsDataParserConfig
-from leco_plugin.scenes.pixels.known_distances import KnownDistancePixelSamplerConfig
 from leco_plugin.studio.dynamic_batch import ClampedDynamicBatchPipelineConfig
-from leco_plugin.studio.processes import DataParallelTrainerConfig
 from leco_plugin.swap import learned_first, with_sampler_swapped
 
 
@@ -41,46 +34,6 @@ def learning_first(config: TrainerConfig, name: str) -> TrainerConfig:
     made = with_sampler_swapped(config, None)
     machine = replace(made.machine, device_type=best_device())
     return replace(made, method_name=name, machine=machine)
-
-
-def photographs(rays: int) -> LecoDataManagerConfig:
-    """The reader of `leco-occupancy`, whose coordinates the occupancy is in."""
-    return LecoDataManagerConfig(
-        dataparser=LecoPhotographsDataParserConfig(),
-        train_num_rays_per_batch=rays,
-        eval_num_rays_per_batch=1024,
-        pixel_sampler=KnownDistancePixelSamplerConfig(),
-    )
-
-
-def trainer(
-    name: str,
-    pipeline: VanillaPipelineConfig,
-    rates: dict[str, float],
-    steps: int = STEPS,
-    mixed_precision: bool = ON_GPU,
-) -> DataParallelTrainerConfig:
-    """A method: Adam at these rates, decayed to a tenth over its steps."""
-    return DataParallelTrainerConfig(
-        method_name=name,
-        machine=MachineConfig(device_type=best_device()),
-        max_num_iterations=steps,
-        steps_per_save=500,
-        steps_per_eval_batch=0,
-        steps_per_eval_image=500,
-        steps_per_eval_all_images=0,
-        mixed_precision=mixed_precision,
-        pipeline=pipeline,
-        optimizers={
-            group: {
-                "optimizer": FusedAdamConfig(lr=rate),
-                "scheduler": ExponentialDecaySchedulerConfig(lr_final=rate / 10.0, max_steps=steps),
-            }
-            for group, rate in rates.items()
-        },
-        viewer=ViewerConfig(num_rays_per_chunk=1 << 12, quit_on_train_completion=True),
-        vis="viewer+tensorboard",
-    )
 
 
 def ngp_host() -> InstantNGPModelConfig:
@@ -123,6 +76,7 @@ leco_ngp = MethodSpecification(
             max_num_samples_per_ray=1024 if ON_GPU else 32,
         ),
         {"fields": 1e-2},
+        mixed_precision=ON_GPU,
     ),
     description="Instant-NGP, guided by learned occupancy instead of its occupancy grid.",
 )
@@ -135,19 +89,19 @@ leco_nerfacto = MethodSpecification(
             model=guided(nerfacto_host()),
         ),
         {"fields": 1e-2, "proposal_networks": 1e-2, "camera_opt": 1e-3},
+        mixed_precision=ON_GPU,
     ),
     description="Nerfacto, guided by learned occupancy instead of its proposal networks.",
 )
 
 
-def _switch_nerf(name: str, model: ModelConfig) -> DataParallelTrainerConfig:
-    """Switch-NeRF's batches, rates and steps; it chooses its precision itself."""
+def _switch_nerf(name: str, model: ModelConfig) -> TrainerConfig:
+    """Switch-NeRF's batches, rates and steps."""
     return trainer(
         name,
         VanillaPipelineConfig(datamanager=photographs(1024 if ON_GPU else 512), model=model),
         {"fields": 5e-4 if ON_GPU else 5e-3},
         steps=500_000 if ON_GPU else STEPS,
-        mixed_precision=False,
     )
 
 

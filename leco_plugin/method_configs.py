@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Literal, cast
+from typing import Literal
 
 import torch
 from nerfstudio.configs.base_config import MachineConfig, ViewerConfig
@@ -26,17 +26,6 @@ def best_device() -> Literal["cpu", "cuda"]:
     return "cuda" if torch.cuda.is_available() else "cpu"
 
 
-def _optimizers(steps: int, rates: dict[str, float]) -> dict[str, object]:
-    """Adam for each parameter group, decayed to a tenth over the run."""
-    return {
-        name: {
-            "optimizer": FusedAdamConfig(lr=rate),
-            "scheduler": ExponentialDecaySchedulerConfig(lr_final=rate / 10.0, max_steps=steps),
-        }
-        for name, rate in rates.items()
-    }
-
-
 ON_GPU = best_device() == "cuda"
 STEPS = 30_000 if ON_GPU else 4_000
 
@@ -47,52 +36,72 @@ LEARNING = LecoModelConfig(
 )
 """The HMoE in sizes of this device, smaller where the scene is."""
 
-_leco_occupancy = DataParallelTrainerConfig(
-    method_name="leco-occupancy",
-    machine=MachineConfig(device_type=best_device()),
-    max_num_iterations=STEPS,
-    steps_per_save=500,
-    steps_per_eval_batch=0,
-    steps_per_eval_image=500,
-    steps_per_eval_all_images=0,
-    mixed_precision=False,  # the model chooses its precision itself, on CPU and CUDA alike
-    pipeline=VanillaPipelineConfig(
-        datamanager=LecoDataManagerConfig(
-            dataparser=LecoPhotographsDataParserConfig(),
-            train_num_rays_per_batch=4096 if ON_GPU else 1024,
-            eval_num_rays_per_batch=1024,
-            pixel_sampler=KnownDistancePixelSamplerConfig(),
-        ),
-        model=LEARNING,
-    ),
-    optimizers=_optimizers(STEPS, RATES),
-    viewer=ViewerConfig(num_rays_per_chunk=1 << 12, quit_on_train_completion=True),
-    vis="viewer+tensorboard",
-)
+
+def photographs(rays: int) -> LecoDataManagerConfig:
+    """The reader of `leco-occupancy`, whose coordinates the occupancy is in."""
+    return LecoDataManagerConfig(
+        dataparser=LecoPhotographsDataParserConfig(),
+        train_num_rays_per_batch=rays,
+        eval_num_rays_per_batch=1024,
+        pixel_sampler=KnownDistancePixelSamplerConfig(),
+    )
+
+
+def trainer(
+    name: str,
+    pipeline: VanillaPipelineConfig,
+    rates: dict[str, float],
+    steps: int = STEPS,
+    mixed_precision: bool = False,
+) -> DataParallelTrainerConfig:
+    """A method: Adam at these rates, decayed to a tenth over its steps.
+
+    Our own models choose their precision themselves, on CPU and CUDA alike.
+    """
+    return DataParallelTrainerConfig(
+        method_name=name,
+        machine=MachineConfig(device_type=best_device()),
+        max_num_iterations=steps,
+        steps_per_save=500,
+        steps_per_eval_batch=0,
+        steps_per_eval_image=500,
+        steps_per_eval_all_images=0,
+        mixed_precision=mixed_precision,
+        pipeline=pipeline,
+        optimizers={
+            group: {
+                "optimizer": FusedAdamConfig(lr=rate),
+                "scheduler": ExponentialDecaySchedulerConfig(lr_final=rate / 10.0, max_steps=steps),
+            }
+            for group, rate in rates.items()
+        },
+        viewer=ViewerConfig(num_rays_per_chunk=1 << 12, quit_on_train_completion=True),
+        vis="viewer+tensorboard",
+    )
+
 
 leco_occupancy = MethodSpecification(
-    config=_leco_occupancy,
+    config=trainer(
+        "leco-occupancy",
+        VanillaPipelineConfig(datamanager=photographs(4096 if ON_GPU else 1024), model=LEARNING),
+        RATES,
+    ),
     description="Learned occupancy: learn it, freeze and calibrate it, go on guided by it.",
 )
 
 leco_occupancy_paper = MethodSpecification(
-    config=replace(
-        _leco_occupancy,
-        method_name="leco-occupancy-paper",
-        max_num_iterations=540_000,
-        pipeline=replace(
-            _leco_occupancy.pipeline,
-            datamanager=replace(
-                cast(LecoDataManagerConfig, _leco_occupancy.pipeline.datamanager),
-                train_num_rays_per_batch=1024,
-            ),
+    config=trainer(
+        "leco-occupancy-paper",
+        VanillaPipelineConfig(
+            datamanager=photographs(1024),
             model=replace(
-                cast(LecoModelConfig, _leco_occupancy.pipeline.model),
+                LEARNING,
                 sizes=PAPER,
                 schedule=ScheduleConfig(learn_steps=40_000, steps_per_check=500),
             ),
         ),
-        optimizers=_optimizers(540_000, dict.fromkeys(RATES, 5e-4)),
+        dict.fromkeys(RATES, 5e-4),
+        steps=540_000,
     ),
     description="The same in the sizes of the paper (8 experts of 7 x 256, 257 samples); for its "
     "losses too, --pipeline.model.gate-loss.form paper.",

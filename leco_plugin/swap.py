@@ -158,20 +158,3 @@ def learned_first() -> OccupancyConfig:
     """How an occupancy is learned where a host is given none, on the device that is here."""
     learning = LEARNING if ON_GPU else replace(LEARNING, sizes=learning_only(LEARNING.sizes))
     return OccupancyConfig(learning=learning, rays=4096 if ON_GPU else 1024)
-
-
-def swap(
-    method: str,
-    file: Path | None,
-    arguments: Sequence[str] = (),
-    sampler: str = LEARNED,
-    options: Mapping[str, int | float] = NO_OPTIONS,
-    codes: Codes = "small",
-    other_scene: bool = False,
-) -> Path:
-    """Trains, and returns the folder of the run. Arguments and errors as for `swapped_config`."""
-    from nerfstudio.scripts.train import main as train
-
-    config = swapped_config(method, file, arguments, sampler, options, codes, other_scene)
-    train(config)
-    return config.get_base_dir()

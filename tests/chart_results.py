@@ -54,6 +54,16 @@ def occupancy(size: int, kept: float, grids: list[dict[str, Any]] | None = None)
     }
 
 
+def grid(resolution: int, kept: float) -> dict[str, Any]:
+    """What is stored of an occupancy grid made from a field."""
+    return {
+        "resolution": resolution,
+        "bytes": resolution**3 // 8,
+        "update_seconds": 2.0,
+        "kept_reached_volume": kept,
+    }
+
+
 def results(*runs: dict[str, Any], **changes: Any) -> dict[str, Any]:
     """Results around runs."""
     values: dict[str, Any] = {

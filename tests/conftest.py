@@ -6,6 +6,7 @@ import os
 import shutil
 import subprocess
 import sys
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -99,6 +100,26 @@ def guide() -> Any:
     made = Guide()
     made.set_occupancy(ball())
     return made
+
+
+@pytest.fixture
+def run_script(tmp_path: Path) -> Callable[..., str]:
+    """Runs a script of `benchmarks` to its end, in a folder of the test; returns what it said."""
+    root = Path(__file__).resolve().parent.parent
+
+    def run(name: str, *arguments: object) -> str:
+        script = ["-W", "ignore", str(root / "benchmarks" / name), *map(str, arguments)]
+        done = subprocess.run(
+            [sys.executable, *script],
+            env=os.environ | {"PYTHONPATH": str(root)},
+            cwd=tmp_path,
+            capture_output=True,
+            text=True,
+        )
+        assert done.returncode == 0, done.stderr
+        return done.stdout
+
+    return run
 
 
 @pytest.fixture(scope="session")

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import io
 import zipfile
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -69,8 +71,30 @@ def write_mask(folder: Path, stem: str, keep: np.ndarray) -> None:
 
 def pack(path: Path, value: object, name: str = "a.pt", **options: int) -> Path:
     """Writes a zip that holds a value under a name, as masks are held; returns `path`."""
-    inside = io.BytesIO()
-    torch.save(value, inside)
-    with zipfile.ZipFile(path, "w", **options) as archive:
-        archive.writestr(name, inside.getvalue())
+    path.write_bytes(zipped(saved(value), name, **options))
     return path
+
+
+def saved(value: object, **options: Any) -> bytes:
+    """What torch.save writes of a value."""
+    file = io.BytesIO()
+    torch.save(value, file, **options)
+    return file.getvalue()
+
+
+def zipped(data: bytes, name: str, compression: int = zipfile.ZIP_STORED) -> bytes:
+    """A zip of one file."""
+    file = io.BytesIO()
+    with zipfile.ZipFile(file, "w", compression) as archive:
+        archive.writestr(name, data)
+    return file.getvalue()
+
+
+def rebuilt(data: bytes, change: Callable[[bytes], bytes], part: str = "data.pkl") -> bytes:
+    """An archive with one of its records changed, and right in all else."""
+    file = io.BytesIO()
+    with zipfile.ZipFile(io.BytesIO(data)) as source, zipfile.ZipFile(file, "w") as target:
+        for entry in source.infolist():
+            record, changed = source.read(entry), entry.filename.endswith(part)
+            target.writestr(entry.filename, change(record) if changed else record)
+    return file.getvalue()

@@ -12,10 +12,10 @@ import numpy as np
 from PIL import Image
 
 from leco_plugin.chart.contender import Job
-from leco_plugin.chart.runner import RUNS, RunFailed
+from leco_plugin.chart.runner import RUNS, RunFailed, Runner
 from leco_plugin.stability.cases import cases_named
 from leco_plugin.stability.samplers import QUICK, samplers_named
-from leco_plugin.stability.suite import Runner, Suite
+from leco_plugin.stability.suite import Suite
 
 TINY = replace(QUICK, picture=0.25, views=0.1)
 MEASURED = {
@@ -75,5 +75,6 @@ class Runs:
 
 
 def make(made: Suite, runs: Runs) -> dict[str, Any]:
-    made.make(lambda line: None, lambda share: None, runs)
+    made.runner = runs  # type: ignore[method-assign]
+    made.make(lambda line: None, lambda share: None)
     return made.results()

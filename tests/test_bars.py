@@ -2,22 +2,15 @@
 
 from __future__ import annotations
 
-import importlib
 import json
 from pathlib import Path
-from types import ModuleType
 from typing import Any
 
+import bars
 import pytest
 from chart_results import occupancy, results, run
 
 ROOT = Path(__file__).resolve().parent.parent
-
-
-@pytest.fixture
-def bars(monkeypatch: pytest.MonkeyPatch) -> ModuleType:
-    monkeypatch.syspath_prepend(str(ROOT / "benchmarks"))
-    return importlib.import_module("bars")
 
 
 def store(folder: Path, name: str, made: dict[str, Any]) -> None:
@@ -39,15 +32,15 @@ def chart(recalls: list[float], **others: Any) -> dict[str, Any]:
     return results(*runs)
 
 
-def table(bars: ModuleType, folder: Path) -> list[list[str]]:
+def table(folder: Path) -> list[list[str]]:
     """Cells of the rows: bar, measured, reached, stored in."""
     lines = bars.bars_section(folder)[-1].splitlines()[2:]
     return [line.strip("| \n").split(" | ") for line in lines]
 
 
-def row(bars: ModuleType, folder: Path, asked: str) -> list[str]:
+def row(folder: Path, asked: str) -> list[str]:
     """Measured, reached and stored in, of the one bar that begins so."""
-    (found,) = (cells for cells in table(bars, folder) if cells[0].startswith(asked))
+    (found,) = (cells for cells in table(folder) if cells[0].startswith(asked))
     return found[1:]
 
 
@@ -61,14 +54,14 @@ def row(bars: ModuleType, folder: Path, asked: str) -> list[str]:
     ],
 )
 def test_a_bar_is_reached_by_every_seed_or_in_the_median_or_not(
-    bars: ModuleType, tmp_path: Path, recalls: list[float], measured: str, reached: str
+    tmp_path: Path, recalls: list[float], measured: str, reached: str
 ) -> None:
     store(tmp_path, "charts/city-3", chart(recalls))
-    found = row(bars, tmp_path, "City: visible surface kept, at least 99.5%")
+    found = row(tmp_path, "City: visible surface kept, at least 99.5%")
     assert found == [measured, reached, "`charts/city-3`"]
 
 
-def test_a_bar_from_above_is_reached_by_less(bars: ModuleType, tmp_path: Path) -> None:
+def test_a_bar_from_above_is_reached_by_less(tmp_path: Path) -> None:
     made = chart([0.9])
     store(tmp_path, "charts/city-3", made)
     for asked, measured in (
@@ -76,20 +69,20 @@ def test_a_bar_from_above_is_reached_by_less(bars: ModuleType, tmp_path: Path) -
         ("City: image price, at most 0.05 dB", "0.000 dB (one seed)"),
         ("City: the gate's file, at most 200 kB", "51.0 kB (one seed)"),
     ):
-        assert row(bars, tmp_path, asked)[:2] == [measured, "yes"]
+        assert row(tmp_path, asked)[:2] == [measured, "yes"]
     made["runs"][0]["occupancy"]["lost_surface_mass"] = 2e-3
     store(tmp_path, "charts/city-3", made)
-    assert row(bars, tmp_path, "City: lost")[:2] == ["0.200% (one seed)", "**no**"]
+    assert row(tmp_path, "City: lost")[:2] == ["0.200% (one seed)", "**no**"]
 
 
-def test_rivals_are_compared_seed_by_seed(bars: ModuleType, tmp_path: Path) -> None:
+def test_rivals_are_compared_seed_by_seed(tmp_path: Path) -> None:
     store(tmp_path, "charts/caliterra", chart([0.9, 0.9]))
     for asked, measured, reached in (
         ("sooner at", "1.25 x (1.25 to 1.25, 2 seeds)", "**no**"),
         ("PSNR at the end", "+2.00 dB (+2.00 to +2.00, 2 seeds)", "yes"),
         ("renders faster", "4.0 x (4.0 to 4.0, 2 seeds)", "yes"),
     ):
-        assert row(bars, tmp_path, f"`caliterra`: {asked}")[:2] == [measured, reached]
+        assert row(tmp_path, f"`caliterra`: {asked}")[:2] == [measured, reached]
 
 
 @pytest.mark.parametrize(
@@ -97,28 +90,28 @@ def test_rivals_are_compared_seed_by_seed(bars: ModuleType, tmp_path: Path) -> N
     [("visible surface kept", {"freeze_seconds": None}), ("sooner at", {"curve": [[10.0, 1.0]]})],
 )
 def test_a_seed_that_never_comes_so_far_reaches_no_bar(
-    bars: ModuleType, tmp_path: Path, asked: str, why: dict[str, Any]
+    tmp_path: Path, asked: str, why: dict[str, Any]
 ) -> None:
     made = chart([0.999, 0.999])
     made["runs"][0] |= why
     store(tmp_path, "charts/city-3", made)
-    assert row(bars, tmp_path, f"City: {asked}")[:2] == ["never with 1 of 2 seeds", "**no**"]
+    assert row(tmp_path, f"City: {asked}")[:2] == ["never with 1 of 2 seeds", "**no**"]
 
 
-def test_what_is_not_stored_says_so_and_reaches_nothing(bars: ModuleType, tmp_path: Path) -> None:
-    for asked, measured, *others in table(bars, tmp_path):
+def test_what_is_not_stored_says_so_and_reaches_nothing(tmp_path: Path) -> None:
+    for asked, measured, *others in table(tmp_path):
         assert measured.startswith(("not stored", "not measured")), asked
         assert others == ["-", "-"]
 
 
-def test_the_demo_of_an_earlier_release_has_no_minutes(bars: ModuleType, tmp_path: Path) -> None:
+def test_the_demo_of_an_earlier_release_has_no_minutes(tmp_path: Path) -> None:
     demo = {"runs": [{"freeze_seconds": 40.0, "train_seconds": 130.0}]}
     store(tmp_path, "demo", demo)
-    assert row(bars, tmp_path, "Demo: all of it")[0] == "not stored"
-    share = row(bars, tmp_path, "Demo: learning's share of training")
+    assert row(tmp_path, "Demo: all of it")[0] == "not stored"
+    share = row(tmp_path, "Demo: learning's share of training")
     assert share == ["30.8% (one seed)", "**no**", "`demo`"]
     store(tmp_path, "demo", demo | {"seconds_in_all": 366.0})
-    assert row(bars, tmp_path, "Demo: all")[:2] == ["6.1 minutes (one seed)", "**no**"]
+    assert row(tmp_path, "Demo: all")[:2] == ["6.1 minutes (one seed)", "**no**"]
 
 
 @pytest.mark.parametrize(
@@ -130,36 +123,32 @@ def test_the_demo_of_an_earlier_release_has_no_minutes(bars: ModuleType, tmp_pat
     ],
 )
 def test_kills_reach_their_bar_where_nothing_is_lost_and_all_end_alike(
-    bars: ModuleType, tmp_path: Path, after: int, frozen: bool, measured: str, reached: str
+    tmp_path: Path, after: int, frozen: bool, measured: str, reached: str
 ) -> None:
     kill = {"first": 3, "before": 4, "after": after}
     killed = [{"step": 9, "frozen": frozen, "kills": [kill]}, {"step": 9, "kills": []}]
     store(tmp_path, "kills", {"steps": 10, "killed": killed})
-    assert row(bars, tmp_path, "Killed at any step") == [measured, reached, "`kills`"]
+    assert row(tmp_path, "Killed at any step") == [measured, reached, "`kills`"]
 
 
-def test_a_card_reaches_its_bar_when_a_run_on_it_came_to_its_end(
-    bars: ModuleType, tmp_path: Path
-) -> None:
+def test_a_card_reaches_its_bar_when_a_run_on_it_came_to_its_end(tmp_path: Path) -> None:
     store(tmp_path, "gpu-a", {"parts": {"learned": {}}})
-    assert row(bars, tmp_path, "On CUDA") == ["no run came to its end", "**no**", "`gpu-a`"]
+    assert row(tmp_path, "On CUDA") == ["no run came to its end", "**no**", "`gpu-a`"]
     store(tmp_path, "gpu-b", {"parts": {"learned": {"psnr": 25.0}}})
-    assert row(bars, tmp_path, "On CUDA") == ["25.00 dB", "yes", "`gpu-b`"]
+    assert row(tmp_path, "On CUDA") == ["25.00 dB", "yes", "`gpu-b`"]
 
 
-def test_the_page_begins_with_the_bars_of_what_is_stored(bars: ModuleType) -> None:
+def test_the_page_begins_with_the_bars_of_what_is_stored() -> None:
     page = (ROOT / "docs" / "results.md").read_text()
     generated = bars.bars_section(ROOT / "benchmarks" / "results")[-1]
     assert generated in page and page.index(generated) < page.index("## The demo")
 
 
-def test_every_file_that_claims_a_bar_is_there(bars: ModuleType) -> None:
+def test_every_file_that_claims_a_bar_is_there() -> None:
     assert all((ROOT / "tests" / file).exists() for file in bars.CLAIMED.values())
 
 
-def test_a_bar_of_a_chart_that_was_made_before_a_mend_is_marked(
-    bars: ModuleType, tmp_path: Path
-) -> None:
+def test_a_bar_of_a_chart_that_was_made_before_a_mend_is_marked(tmp_path: Path) -> None:
     store(tmp_path, "charts/city-3", chart([0.996]))
     (tmp_path / "notes.json").write_text('{"city-3": "Made before."}')
-    assert row(bars, tmp_path, "City: visible surface kept")[-1] == "`charts/city-3` (*)"
+    assert row(tmp_path, "City: visible surface kept")[-1] == "`charts/city-3` (*)"

@@ -7,6 +7,7 @@ import os
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
 import pytest
 from ball_occupancy import ball
@@ -266,38 +267,28 @@ def test_a_swap_whose_arguments_are_not_set_apart_says_how(
     assert last.startswith("leco: ") and "--occupancy FILE -- --data SCENE" in last
 
 
-def test_a_swap_hands_options_of_the_sampler_on(
+def test_a_swap_trains_with_what_is_asked_of_the_sampler_the_codes_and_the_scene(
     file: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    from leco_plugin import swap
+    from nerfstudio.scripts import train
 
-    given: list[object] = []
-
-    def train(*arguments: object) -> Path:
-        given.extend(arguments)
-        return tmp_path
-
-    monkeypatch.setattr(swap, "swap", train)
-    options = ["--options", "num_candidates", 512, "tolerance", 1e-3]
-    report = tmp_path / "swap.json"
-    arguments = ["--json", report, "--", "--data", "SCENE"]
-    assert run("swap", "nerfacto", "--occupancy", file, *options, *arguments) == 0
-    expected = {"num_candidates": 512, "tolerance": 1e-3}
-    scene = ("--data", "SCENE")
-    assert given == ["nerfacto", file, scene, "learned-occupancy", expected, "small", False]
-    assert json.loads(report.read_text())["options"] == expected
-
-
-def test_a_swap_can_leave_the_codes_of_a_host_and_insist_on_another_scene(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    from leco_plugin import swap
-
-    given: list[object] = []
-    monkeypatch.setattr(swap, "swap", lambda *arguments: given.extend(arguments) or tmp_path)
-    report = tmp_path / "swap.json"
-    assert run("swap", "nerfacto", "--codes", "own", "--other-scene", "--json", report) == 0
-    assert given[-2:] == ["own", True] and json.loads(report.read_text())["codes"] == "own"
+    trained: list[Any] = []
+    monkeypatch.setattr(train, "main", trained.append)
+    options, report = {"num_candidates": 512, "tolerance": 1e-3}, tmp_path / "swap.json"
+    arguments = ["--codes", "own", "--other-scene", "--json", report, "--", "--data", tmp_path]
+    given = [word for option in options.items() for word in option]
+    assert run("swap", "nerfacto", "--occupancy", file, "--options", *given, *arguments) == 0
+    (config,) = trained
+    guided = config.pipeline.model
+    assert config.method_name == "nerfacto" and config.data == tmp_path
+    assert guided.occupancy.path == file and guided.occupancy.sampler == "learned-occupancy"
+    assert guided.occupancy.options == options
+    assert guided.codes == "own" and guided.occupancy.other_scene
+    written = json.loads(report.read_text())
+    assert written["options"] == options and written["codes"] == "own"
+    assert run("swap", "nerfacto", "--occupancy", file) == 0
+    usual = trained[-1].pipeline.model
+    assert usual.codes == "small" and not usual.occupancy.other_scene
 
 
 def test_a_failure_ends_with_one_line_and_status_1(

@@ -15,6 +15,7 @@ import data_parallel_training as processes
 import pytest
 import torch
 from nerfstudio.scripts import train as ns_train
+from open_images import OPEN_IMAGES
 from torch import Tensor
 
 from leco_plugin.host_configs import leco_ngp
@@ -31,12 +32,7 @@ from leco_plugin.space import Space
 from leco_plugin.studio.checkpoints import allow_checkpoint_globals, newest_whole, step_of
 from leco_plugin.studio.processes import DataParallelTrainerConfig
 
-pytestmark = [
-    pytest.mark.slow,
-    pytest.mark.xdist_group("data_parallel"),
-    pytest.mark.filterwarnings("ignore:unclosed file:ResourceWarning"),  # by nerfstudio
-    pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning"),
-]
+pytestmark = [pytest.mark.slow, pytest.mark.xdist_group("data_parallel"), OPEN_IMAGES]
 
 STEPS, LEARN = 24, 12
 HEALED_FREEZES_AT = 17

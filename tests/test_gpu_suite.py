@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib
 import json
 import os
 import resource
@@ -12,10 +11,14 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from types import ModuleType
 
+import gpu_floor
+import gpu_paper
+import gpu_scale
+import gpu_twin
 import pytest
 import torch
+from results_page import RESULTS, check_gpu, gpu_table
 from torch.utils.flop_counter import FlopCounterMode
 
 from leco_plugin.models.encodings import EncodingConfig
@@ -48,15 +51,6 @@ runpy.run_path("gpu.py", run_name="__main__")
 """
 """Torch and numpy are there, what torch itself requires, this package, and nothing else."""
 A_MINUTE = 60.0
-
-
-@pytest.fixture
-def benchmarks(monkeypatch) -> None:
-    monkeypatch.syspath_prepend(str(BENCHMARKS))
-
-
-def load(name: str) -> ModuleType:
-    return importlib.import_module(name)
 
 
 def environment() -> dict[str, str]:
@@ -107,63 +101,57 @@ def test_a_killed_run_on_a_bare_machine_goes_on_where_it_stopped(tmp_path: Path)
     assert seconds_of_ended_processes() - used < A_MINUTE
 
 
-def test_operations_on_paper_are_those_of_the_products(benchmarks) -> None:
-    paper, sizes = load("gpu_paper"), load("gpu_scale").PAPER
+def test_operations_on_paper_are_those_of_the_products() -> None:
+    sizes = gpu_scale.PAPER
     with FlopCounterMode(display=False) as counted, torch.device("meta"):
         field = HMoEField(sizes.field, 1)
         features = field.projection(torch.empty(10, field.encoding.out_dim))
         field.density_head(field.experts.experts[1](features))
-    assert counted.get_total_flops() == 10 * paper.field_operations(sizes)
-    dense = paper.step_of(sizes, 10, 0, guided=False)
+    assert counted.get_total_flops() == 10 * gpu_paper.field_operations(sizes)
+    dense = gpu_paper.step_of(sizes, 10, 0, guided=False)
     assert dense.operations == 30 * (
-        paper.field_operations(sizes) + paper.operations_per_position(sizes.gate)
+        gpu_paper.field_operations(sizes) + gpu_paper.operations_per_position(sizes.gate)
     )
 
 
-def test_bytes_of_the_twin_are_those_of_its_operations(benchmarks) -> None:
-    twin = load("gpu_twin")
+def test_bytes_of_the_twin_are_those_of_its_operations() -> None:
     values = torch.zeros(10, 4)
-    with twin.Traffic() as traffic:
+    with gpu_twin.Traffic() as traffic:
         values.T.relu()
     assert traffic.bytes == 2 * 10 * 4 * 4
     sizes = [GateConfig(EncodingConfig(octaves=1), width, 1, 1) for width in (8, 16)]
-    narrow, wide = (twin.bytes_of_twin(config) for config in sizes)
+    narrow, wide = (gpu_twin.bytes_of_twin(config) for config in sizes)
     product, rectified, cast, normed, head = 2, 4, 6, 8, 4
     assert wide - narrow == 8 * (product + rectified + cast + normed + head)
 
 
-def test_stored_results_are_of_cards_that_somebody_ran_on(benchmarks) -> None:
-    page = load("results_page")
-    for path in page.RESULTS.glob("gpu-*.json"):
-        page.check_gpu(json.loads(path.read_text()))
+def test_stored_results_are_of_cards_that_somebody_ran_on() -> None:
+    for path in RESULTS.glob("gpu-*.json"):
+        check_gpu(json.loads(path.read_text()))
     measured = {"dry": False, "machine": {"device": "NVIDIA H100", "driver": "570.86"}}
-    page.check_gpu(measured)
+    check_gpu(measured)
     for fault in (
         {"dry": True},
         {"machine": {"device": "cpu", "driver": "570.86"}},
         {"machine": {"device": "NVIDIA H100", "driver": None}},
     ):
         with pytest.raises(ValueError, match="nobody ran on"):
-            page.check_gpu({**measured, **fault})
+            check_gpu({**measured, **fault})
 
 
-def test_a_figure_is_shown_with_its_floor_beside_it(benchmarks) -> None:
-    figure = load("gpu_scale").figure(
-        "gate: floor / fused", 0.6, 0.5, False, fused=2e-3, floor=1e-3
-    )
-    row = (
-        load("results_page").gpu_table({"parts": {"gate": {"figures": [figure]}}}).splitlines()[-1]
-    )
+def test_a_figure_is_shown_with_its_floor_beside_it() -> None:
+    figure = gpu_scale.figure("gate: floor / fused", 0.6, 0.5, False, fused=2e-3, floor=1e-3)
+    row = gpu_table({"parts": {"gate": {"figures": [figure]}}}).splitlines()[-1]
     assert row == "| gate: floor / fused | 0.6 | >= 0.5 | yes | fused 2, floor 1 |"
 
 
-def test_figures_of_a_twin_are_shown_as_its_own(benchmarks) -> None:
+def test_figures_of_a_twin_are_shown_as_its_own() -> None:
     parts = {"gate": {"running": {"gate": True, "march": False}, "figures": []}}
-    table = load("results_page").gpu_table({"parts": parts})
+    table = gpu_table({"parts": parts})
     assert table.endswith("Part gate: torch answered in place of the fused march.")
 
 
-def test_the_trained_runs_are_shown_side_by_side(benchmarks) -> None:
+def test_the_trained_runs_are_shown_side_by_side() -> None:
     step = {"seconds": 0.01, "peak_bytes": 1 << 30}
     parts = {
         "learned": {
@@ -175,14 +163,13 @@ def test_the_trained_runs_are_shown_side_by_side(benchmarks) -> None:
         },
         "dense": {"seconds": 122.0, "steps": 70, "step": step, "psnr": 20.25},
     }
-    page = load("results_page")
-    assert page.gpu_table({"parts": parts}).splitlines()[-3:] == [
+    assert gpu_table({"parts": parts}).splitlines()[-3:] == [
         "| learning | 60 | 100 | 10.0 | 1.00 | - |",
         "| guided | 60 | 250 | 10.0 | 1.00 | 21.50 |",
         "| dense | 122 | 70 | 10.0 | 1.00 | 20.25 |",
     ]
     parts["dense"] = {"left_out": "out of memory"}
-    assert page.gpu_table({"parts": parts}).endswith("Part dense was left out: out of memory")
+    assert gpu_table({"parts": parts}).endswith("Part dense was left out: out of memory")
 
 
 def test_the_checkout_is_measured_and_not_what_is_installed(tmp_path: Path) -> None:
@@ -200,11 +187,10 @@ def test_the_checkout_is_measured_and_not_what_is_installed(tmp_path: Path) -> N
     assert Path(done.stdout.strip()).parent == BENCHMARKS.parent / "leco_plugin"
 
 
-def test_the_floor_is_the_larger_of_bytes_and_operations(benchmarks) -> None:
-    module = load("gpu_floor")
+def test_the_floor_is_the_larger_of_bytes_and_operations() -> None:
     config = GateConfig(EncodingConfig(octaves=6), width=64, layers=3, scene_experts=4)
-    assert module.operations_per_position(config) == 2 * (39 * 64 + 2 * 64 * 64 + 64 * 5)
-    slow_memory = module.floor_seconds(config, 10, module.Ceilings(13.0, 1e12))
+    assert gpu_floor.operations_per_position(config) == 2 * (39 * 64 + 2 * 64 * 64 + 64 * 5)
+    slow_memory = gpu_floor.floor_seconds(config, 10, gpu_floor.Ceilings(13.0, 1e12))
     assert slow_memory["floor"] == slow_memory["bytes"] == 10.0
-    slow_products = module.floor_seconds(config, 10, module.Ceilings(1e12, 22016.0))
+    slow_products = gpu_floor.floor_seconds(config, 10, gpu_floor.Ceilings(1e12, 22016.0))
     assert slow_products["floor"] == slow_products["operations"] == pytest.approx(10.0)

@@ -1,4 +1,4 @@
-"""Who imports whom in the package: no circle, and no trainer below the seam of methods."""
+"""No circle of imports, no trainer below the seam of methods, no long file, no long function."""
 
 from __future__ import annotations
 
@@ -22,6 +22,11 @@ WITHOUT_NERFSTUDIO = (
 
 KNOWN: list[tuple[str, str]] = []
 """Imports, (who, whom), that are in a circle or reach nerfstudio today. It may only shrink."""
+
+MOST_LINES, MOST_LINES_OF_A_FUNCTION = 400, 60
+
+LONG_FUNCTIONS = {"_march_kernel"}
+"""Triton takes a kernel as one function. The list may only shrink."""
 
 
 @cache
@@ -150,3 +155,24 @@ def test_the_core_imports_nothing_of_nerfstudio(name: str) -> None:
 def test_what_is_known_is_still_so(known: tuple[str, str]) -> None:
     """What is in order again leaves the list."""
     assert faults([one for one in KNOWN if one != known])
+
+
+def long_functions() -> set[str]:
+    """Names of the package's functions above the limit."""
+    nodes = [node for path in modules().values() for node in ast.walk(ast.parse(path.read_text()))]
+    return {
+        node.name
+        for node in nodes
+        if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef)
+        and node.end_lineno - node.lineno >= MOST_LINES_OF_A_FUNCTION
+    }
+
+
+def test_no_file_is_long() -> None:
+    lengths = {name: len(path.read_text().splitlines()) for name, path in modules().items()}
+    assert {name: lines for name, lines in lengths.items() if lines > MOST_LINES} == {}
+
+
+def test_no_function_is_long_but_those_that_are_named() -> None:
+    """What is short again leaves the list."""
+    assert long_functions() == LONG_FUNCTIONS

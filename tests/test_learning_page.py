@@ -2,24 +2,15 @@
 
 from __future__ import annotations
 
-import importlib
 from pathlib import Path
-from types import ModuleType
 
+import learning
 import pytest
 import torch
 from PIL import Image
 
 from leco_plugin.chart.theme import SOURCE, fingerprint
 from leco_plugin.learning.history import GateHistory
-
-ROOT = Path(__file__).resolve().parent.parent
-
-
-@pytest.fixture
-def learning(monkeypatch: pytest.MonkeyPatch) -> ModuleType:
-    monkeypatch.syspath_prepend(str(ROOT / "benchmarks"))
-    return importlib.import_module("learning")
 
 
 def history() -> GateHistory:
@@ -33,7 +24,7 @@ def history() -> GateHistory:
     return looks
 
 
-def test_the_sentence_is_of_the_later_looks_and_opaque_is_opaque(learning: ModuleType) -> None:
+def test_the_sentence_is_of_the_later_looks_and_opaque_is_opaque() -> None:
     report = learning.report_of(history(), "city", "2024-02-29")
     share, empty, scene = learning.late_means(report)
     assert share == pytest.approx(0.625) and empty == pytest.approx(3.0)
@@ -43,13 +34,13 @@ def test_the_sentence_is_of_the_later_looks_and_opaque_is_opaque(learning: Modul
     )
 
 
-def test_an_expert_without_points_has_no_density(learning: ModuleType) -> None:
+def test_an_expert_without_points_has_no_density() -> None:
     report = learning.report_of(history(), "city", "2024-02-29")
     known = torch.tensor(learning.without_none(report)).isfinite().tolist()
     assert known == [[share > 0.0 for share in row] for row in report["shares"]]
 
 
-def test_the_picture_remembers_of_which_figures_it_is(learning: ModuleType, tmp_path: Path) -> None:
+def test_the_picture_remembers_of_which_figures_it_is(tmp_path: Path) -> None:
     report = learning.report_of(history(), "city", "2024-02-29")
     with Image.open(learning.draw(tmp_path / "learning.png", report)) as image:
         assert image.info[SOURCE] == fingerprint(report)

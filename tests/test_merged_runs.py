@@ -9,6 +9,7 @@ from typing import Any
 import pytest
 import torch
 from nerfstudio.engine.callbacks import TrainingCallbackLocation as Where
+from open_images import OPEN_IMAGES
 from tiny_run import tiny_config
 
 from leco_plugin.learning import history
@@ -18,10 +19,7 @@ from leco_plugin.models import mixture
 from leco_plugin.studio.run import forget_the_gone
 from leco_plugin.studio.trainer import AtomicTrainer
 
-pytestmark = [  # nerfstudio leaves an image open
-    pytest.mark.filterwarnings("ignore:unclosed file:ResourceWarning"),
-    pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning"),
-]
+pytestmark = OPEN_IMAGES
 
 
 def trainer_of(scene: Path, folder: Path, load_from: Path | None = None) -> AtomicTrainer:

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import copy
 import math
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import pytest
 import torch
 from nerfstudio.cameras.rays import RayBundle
+from open_images import OPEN_IMAGES
 from torch import Tensor
 
 from leco_plugin.evaluation.timed_run import run_training
@@ -21,17 +23,14 @@ from leco_plugin.method_configs import leco_occupancy
 from leco_plugin.occupancy import Occupancy
 from leco_plugin.scenes.learning_data import held_out_bundle
 
+pytestmark = [pytest.mark.scenes, pytest.mark.slow, OPEN_IMAGES]
+
 LEAST = 0.3
 """dB that some 20 steps of 128 rays gain on 512 pixels which are the same before and after: of 23
 runs, each with a seed of its own, the least was 0.9 (`banana`, which begins at 18.5 dB)."""
 KINDS = {"brighton_beach": "box", "caliterra": "box", "banana": "box", "fox": "contraction"}
 
 OUTPUTS = {"rgb", "depth", "accumulation", "occupancy", "expert", "samples_per_ray"}
-
-
-def some_pixels(trainer: Any) -> tuple[RayBundle, Tensor]:
-    """Rays of the scene's training images, always the same, and their colours."""
-    return held_out_bundle(trainer.pipeline.datamanager, 512)
 
 
 @torch.no_grad()
@@ -58,32 +57,37 @@ def assert_renders(trainer: Any) -> None:
     assert float(outputs["samples_per_ray"].mean()) >= 1.0
 
 
-# nerfstudio leaves the images open whose size it has read
-@pytest.mark.filterwarnings("ignore:unclosed file:ResourceWarning")
-@pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
-@pytest.mark.scenes
-@pytest.mark.slow
-@pytest.mark.parametrize("name", KINDS)
-def test_a_scene_trains_freezes_and_renders_without_a_flag(
-    name: str, scenes: Path, tmp_path: Path
-) -> None:
-    config = copy.deepcopy(leco_occupancy.config)
-    config.pipeline.datamanager.data = scenes / name
+def trained(method: Any, scene: Path, outputs: Path, steps: int, **options: Any) -> Any:
+    """The trainer of a short run of a method without a flag of the scene, which it has learned.
+
+    Args:
+        options: of the model.
+    """
+    config = copy.deepcopy(method.config)
+    config.pipeline.datamanager.data = scene
     config.pipeline.datamanager.train_num_rays_per_batch = 128
-    config.pipeline.model.calibration = CalibrationConfig(rays=64)
-    config.output_dir, config.vis, config.max_num_iterations = tmp_path, "tensorboard", 24
+    config.pipeline.model = replace(config.pipeline.model, **options)
+    config.output_dir, config.vis, config.max_num_iterations = outputs, "tensorboard", steps
     config.steps_per_eval_image = 0
     config.logging.local_writer.enable = False
     config.set_timestamp()
     trainer = config.setup(local_rank=0, world_size=1)
     trainer.setup()
-    pixels = some_pixels(trainer)
+    pixels = held_out_bundle(trainer.pipeline.datamanager, 512)
     untrained = psnr_on(trainer, *pixels)
     run_training(trainer)
-    model = trainer.pipeline.model
-    assert bool(model.mixture.frozen)
-    assert model.mixture.region.space.kind == KINDS[name]
     assert psnr_on(trainer, *pixels) > untrained + LEAST
+    return trainer
+
+
+@pytest.mark.parametrize("name", KINDS)
+def test_a_scene_trains_freezes_and_renders_without_a_flag(
+    name: str, scenes: Path, tmp_path: Path
+) -> None:
+    options = {"calibration": CalibrationConfig(rays=64)}
+    trainer = trained(leco_occupancy, scenes / name, tmp_path, 24, **options)
+    mixture = trainer.pipeline.model.mixture
+    assert bool(mixture.frozen) and mixture.region.space.kind == KINDS[name]
     assert_renders(trainer)
     occupancy = Occupancy.load(trainer.base_dir / FILE_NAME)
     assert occupancy.report["held_out"]
@@ -91,27 +95,10 @@ def test_a_scene_trains_freezes_and_renders_without_a_flag(
     assert bool(((values >= 0) & (values <= 1)).all())
 
 
-@pytest.mark.filterwarnings("ignore:unclosed file:ResourceWarning")
-@pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
-@pytest.mark.scenes
-@pytest.mark.slow
 @pytest.mark.parametrize("sampling", ["coarse-fine", "occupancy-grid"])
 @pytest.mark.parametrize("name", KINDS)
 def test_switch_nerf_trains_and_renders_without_a_flag(
     name: str, sampling: str, scenes: Path, tmp_path: Path
 ) -> None:
-    config = copy.deepcopy(switch_nerf.config)
-    config.pipeline.datamanager.data = scenes / name
-    config.pipeline.datamanager.train_num_rays_per_batch = 128
-    config.pipeline.model.sampling = sampling
-    config.output_dir, config.vis, config.max_num_iterations = tmp_path, "tensorboard", 20
-    config.steps_per_eval_image = 0
-    config.logging.local_writer.enable = False
-    config.set_timestamp()
-    trainer = config.setup(local_rank=0, world_size=1)
-    trainer.setup()
-    pixels = some_pixels(trainer)
-    untrained = psnr_on(trainer, *pixels)
-    run_training(trainer)
+    trainer = trained(switch_nerf, scenes / name, tmp_path, 20, sampling=sampling)
     assert trainer.pipeline.model.region.space.kind == KINDS[name]
-    assert psnr_on(trainer, *pixels) > untrained + LEAST

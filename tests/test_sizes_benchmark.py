@@ -1,31 +1,30 @@
-"""The benchmark of automatic sizes: its arithmetic, its tables, and that it passes and goes on."""
+"""The benchmarks of automatic sizes, shrunk gates and samples: arithmetic, tables, dry runs."""
 
 from __future__ import annotations
 
 import json
-import os
-import subprocess
-import sys
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import pytest
-
-ROOT = Path(__file__).resolve().parent.parent
-sys.path.insert(0, str(ROOT / "benchmarks"))
-
-import sizes_sections  # noqa: E402
-from page_parts import made_line  # noqa: E402
-from sizes import TABLE, Options, dry, larger, stored_rows, sweep  # noqa: E402
-from sizes_figures import ahead, bars, points_of, verdict  # noqa: E402
-from sizes_tables import (  # noqa: E402
+import samples
+import sizes_sections
+from open_images import OPEN_IMAGES
+from page_parts import made_line
+from sizes import TABLE, Options, dry, larger, stored_rows, sweep
+from sizes_figures import ahead, bars, points_of, verdict
+from sizes_tables import (
     beside_fine_grid,
     capacity_table,
+    samples_table,
     shrink_table,
     sizes_table,
 )
 
-from leco_plugin.models.sizing.sizes import SMALL, size_at, with_size  # noqa: E402
+from leco_plugin.capacity.sources import find_source
+from leco_plugin.models.sizing.sizes import SMALL, size_at, with_size
+from leco_plugin.occupancy import Occupancy
 
 MEASURED = {"automatic": [20.0, 20.2], "table x 4": [20.1, 20.2], "table x 0.25": [19.0, 19.4]}
 PARAMETERS = {"automatic": 200, "table x 4": 800, "table x 0.25": 90}
@@ -232,18 +231,67 @@ def test_what_is_stored_is_shown_city_after_city(
 
 @pytest.mark.slow
 @pytest.mark.long
-def test_a_dry_run_passes_and_is_not_done_twice(tmp_path: Path) -> None:
-    command = [sys.executable, "-W", "ignore", str(ROOT / "benchmarks" / "sizes.py"), "--dry-run"]
-    command += ["--folder", str(tmp_path)]
-    environment = os.environ | {"PYTHONPATH": str(ROOT)}
-    done = subprocess.run(
-        command, env=environment, cwd=tmp_path, capture_output=True, text=True, check=False
-    )
-    assert done.returncode == 0, done.stderr
+def test_a_dry_run_passes_and_is_not_done_twice(
+    run_script: Callable[..., str], tmp_path: Path
+) -> None:
+    command = ["sizes.py", "--dry-run", "--folder", tmp_path]
+    run_script(*command)
     report = json.loads((tmp_path / "dry" / "sizes.json").read_text())
     assert {row["scene"] for row in report["runs"]} == {"city-1", "city-2"}
     assert len(report["bars"]) == 3 and "parameters of city-1" in sizes_table(report)
-    again = subprocess.run(
-        command, env=environment, cwd=tmp_path, capture_output=True, text=True, check=True
-    )
-    assert f"0 of {len(report['runs'])} runs to do" in again.stdout
+    assert f"0 of {len(report['runs'])} runs to do" in run_script(*command)
+
+
+@OPEN_IMAGES
+def test_less_is_left_of_a_ray_after_each_question(
+    known_run: Path, tiny_scene: Path, tmp_path: Path
+) -> None:
+    out = tmp_path / "samples.json"
+    samples.main(samples.Options((f"{known_run}={tiny_scene}",), out))
+    ((scene, row),) = json.loads(out.read_text())["scenes"].items()
+    assert scene == tiny_scene.name and row["code"]["version"]
+    # a ray's last run of 16 is asked whole
+    assert row["candidates"] + 16 > row["formed"] > row["gate"] > 0.0
+    assert row["candidates"] / 16 <= row["coarse"] < row["candidates"]
+    assert row["formed"] >= row["kept"] > 0.0
+    # an opaque ball: what lies behind its surface is kept, and not shaded from the front
+    assert row["shaded_from_the_front"] < row["shaded"]
+    assert row["psnr_from_the_front"] == pytest.approx(row["psnr"], abs=1e-2)
+
+
+@OPEN_IMAGES
+def test_what_is_kept_is_what_the_occupancy_keeps_of_all_candidates(
+    known_run: Path, tiny_scene: Path
+) -> None:
+    source = find_source(known_run / "occupancy.safetensors", tiny_scene)
+    model = source.model
+    assert model is not None
+    pictures = samples.bundles_of(source.manager, model.device)
+    counts = samples.along_rays(model, [bundle for bundle, _ in pictures])
+    occupancy = Occupancy.load(known_run / "occupancy.safetensors")
+    kept = total = 0
+    for bundle, _ in pictures:
+        rays = model.rays_of(bundle.flatten())
+        intervals = model.mixture.with_backdrops(rays, model.mixture.candidates(rays))
+        ray_indices, t_starts, t_ends = intervals
+        middles = 0.5 * (t_starts + t_ends)[:, None]
+        positions = rays.origins[ray_indices] + rays.directions[ray_indices] * middles
+        kept += int(occupancy.occupied(positions).sum())
+        total += len(rays.origins)
+    assert counts["kept"] == pytest.approx(kept / total, rel=0.02)
+
+
+def test_a_scene_without_its_run_is_named(tmp_path: Path) -> None:
+    with pytest.raises(SystemExit, match="is not RUN=SCENE"):
+        samples.main(samples.Options(("runs/city",), tmp_path / "samples.json"))
+
+
+def test_the_table_of_samples_has_a_row_a_scene() -> None:
+    row = {
+        **{"candidates": 150.8, "coarse": 11.3, "formed": 71.9, "gate": 1.2, "kept": 23.9},
+        **{"shaded_from_the_front": 20.3, "psnr": 21.757, "psnr_from_the_front": 21.757},
+        "time_from_the_front": 0.914,
+    }
+    said = samples_table({"city-3": row}).splitlines()[-1]
+    counts = "150.8 | 11.3 | 71.9 | 1.2 | 23.9 | 20.3"
+    assert said == f"| city-3 | {counts} | 21.757 dB | 21.757 dB | 0.91 x |"

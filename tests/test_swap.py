@@ -16,6 +16,7 @@ from nerfstudio.data.dataparsers.nerfstudio_dataparser import (
     Nerfstudio,
     NerfstudioDataParserConfig,
 )
+from open_images import OPEN_IMAGES
 from PIL import Image
 
 from leco_plugin.hosts.guided import GuidedModelConfig
@@ -43,9 +44,7 @@ def test_only_sampler_batches_and_trainer_are_others(file: Path) -> None:
     assert guided.occupancy.path == file and guided.occupancy.sampler == "learned-occupancy"
 
 
-# nerfstudio leaves the images open whose size it has read
-@pytest.mark.filterwarnings("ignore:unclosed file:ResourceWarning")
-@pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
+@OPEN_IMAGES
 def test_pictures_of_a_swapped_method_are_checked_by_its_own_reader_too(
     file: Path, tiny_scene: Path, tmp_path: Path
 ) -> None:
@@ -87,19 +86,6 @@ def test_a_sampler_that_asks_no_occupancy_is_given_none() -> None:
     assert occupancy.options == options
 
 
-def test_a_gate_that_would_not_be_learned_is_said_in_a_line() -> None:
-    with pytest.raises(InputError, match="asks a gate on hash features") as error:
-        swapped_config("nerfacto", None, [], "learned-occupancy-hash")
-    assert "\n" not in str(error.value)
-
-
-def test_an_option_that_the_sampler_does_not_have_is_said_in_a_line(file: Path) -> None:
-    message = "'occupancy-grid' has no option 'cells'; there are levels, resolution"
-    with pytest.raises(InputError, match=message) as error:
-        swapped_config("instant-ngp", file, [], "occupancy-grid", {"levels": 2, "cells": 64})
-    assert "\n" not in str(error.value)
-
-
 def test_a_swap_may_insist_on_the_occupancy_of_another_scene(file: Path) -> None:
     for insists in (False, True):
         made: Any = swapped_config("nerfacto", file, other_scene=insists)
@@ -121,34 +107,38 @@ def test_a_relative_file_is_stored_as_an_absolute_one(
         assert made.pipeline.model.occupancy.path == file
 
 
-REFUSED: dict[str, tuple[str, list[str], str, str]] = {
-    "an unknown method": ("nerfato", [], "learned-occupancy", "no method 'nerfato'; there are"),
-    "a method without its package": ("kplanes", [], "learned-occupancy", "not installed"),
+REFUSED: dict[str, tuple[dict[str, Any], str]] = {
+    "an unknown method": ({"method": "nerfato"}, "no method 'nerfato'; there are"),
+    "a method without its package": ({"method": "kplanes"}, "not installed"),
     "a guided method": (
-        *("leco-ngp", [], "learned-occupancy"),
+        {"method": "leco-ngp"},
         "ns-train leco-ngp --pipeline.model.occupancy.path .*occupancy.safetensors",
     ),
-    "the method that learns": ("leco-occupancy", [], "learned-occupancy", "is no host"),
-    "an unknown sampler": ("nerfacto", [], "learnt", "no sampler 'learnt'; there are"),
-    "another kind of gate": ("nerfacto", [], "learned-occupancy-hash", "asks a gate on hash"),
+    "the method that learns": ({"method": "leco-occupancy"}, "is no host"),
+    "an unknown sampler": ({"sampler": "learnt"}, "no sampler 'learnt'; there are"),
+    "another kind of gate": ({"sampler": "learned-occupancy-hash"}, "asks a gate on hash"),
+    "a gate that would not be learned": (
+        {"file": None, "sampler": "learned-occupancy-hash"},
+        "asks a gate on hash features",
+    ),
+    "an option that there is not": (
+        {"sampler": "occupancy-grid", "options": {"levels": 2, "cells": 64}},
+        "'occupancy-grid' has no option 'cells'; there are levels, resolution",
+    ),
     "another run's config": (
-        *("nerfacto", ["--load-config", "config.yml"], "learned-occupancy"),
+        {"arguments": ["--load-config", "config.yml"]},
         "--load-config would train what that file says",
     ),
+    "a file that is not there": ({"file": Path("none.safetensors")}, "there is no occupancy"),
 }
 
 
 @pytest.mark.parametrize("what", REFUSED)
 def test_what_cannot_be_swapped_is_said_in_a_line(what: str, file: Path) -> None:
-    method, arguments, sampler, message = REFUSED[what]
+    given, message = REFUSED[what]
     with pytest.raises(InputError, match=message) as error:
-        swapped_config(method, file, arguments, sampler)
+        swapped_config(**({"method": "nerfacto", "file": file} | given))
     assert "\n" not in str(error.value)
-
-
-def test_a_file_that_is_not_there_is_said_before_anything_is_read(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match="there is no occupancy"):
-        swapped_config("nerfacto", tmp_path / "none.safetensors")
 
 
 def test_a_scene_that_is_not_there_is_said_before_the_run_has_a_folder(

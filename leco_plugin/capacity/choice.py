@@ -9,7 +9,16 @@ from pathlib import Path
 from typing import Any
 
 from leco_plugin.capacity.measuring import VOLUMES
-from leco_plugin.chart.theme import LIGHT, SOURCE, Theme, fingerprint, plain, style, themed
+from leco_plugin.chart.theme import (
+    LIGHT,
+    Theme,
+    log_axis,
+    new_figure,
+    plain,
+    save_picture,
+    style,
+    themed,
+)
 
 Row = Mapping[str, Any]
 """What was measured of a representation."""
@@ -110,14 +119,12 @@ def draw(results: Mapping[str, Any], path: Path, theme: Theme = LIGHT) -> Path:
         path: of the picture.
         theme: of the page that it is meant for.
     """
-    from matplotlib.figure import Figure
-
     rows = results["representations"]
     volume = common_volume(rows)
     kept = [100.0 * row["kept_volume"] for row in rows]
     lost = [max(row["lost_at_volumes"][volume], LEAST) for row in rows]
     with themed(theme):
-        figure = Figure(figsize=(11, 5.9), facecolor=theme.page)
+        figure = new_figure((11, 5.9), theme.page)
         title = textwrap.fill(verdict(rows), 84)
         figure.text(0.015, 0.975, title, va="top", fontsize=15, fontweight="bold")
         figure.text(0.015, 0.862, circumstances(results), va="top", fontsize=11)
@@ -133,8 +140,7 @@ def draw(results: Mapping[str, Any], path: Path, theme: Theme = LIGHT) -> Path:
         handles, labels = panels[0].get_legend_handles_labels()
         below: Any = {"loc": "lower center", "ncols": len(labels), "frameon": False, "fontsize": 10}
         figure.legend(handles, labels, **below)
-        figure.savefig(path, dpi=150, metadata={SOURCE: fingerprint(results)})
-    return path
+        return save_picture(figure, path, results, dpi=150)
 
 
 def _draw_panel(panel: Any, rows: Sequence[Row], values: list[float], theme: Theme) -> None:
@@ -159,25 +165,13 @@ def _draw_panel(panel: Any, rows: Sequence[Row], values: list[float], theme: The
     panel.plot(*place, marker="o", markersize=19, **ring)
     bold = {"fontsize": 11, "fontweight": "bold"}
     panel.annotate("chosen", place, xytext=(0, -24), **bold, **beside)
-    panel.set(xscale="log", yscale="log", xlabel="kB")
-    _label_ticks(panel, plainly=min(values) > 2 * LEAST and max(values) > 1.0)
+    panel.set(yscale="log", xlabel="kB")
+    log_axis(panel, "x", (1.0,))
+    if min(values) > 2 * LEAST and max(values) > 1.0:
+        log_axis(panel, "y", (1.0, 2.0, 5.0))
+    panel.tick_params(axis="y", which="minor", labelleft=False)
     panel.margins(x=0.1, y=0.16)
     plain(panel, theme)
-
-
-def _label_ticks(panel: Any, plainly: bool) -> None:
-    """Plain numbers along the bytes, and where asked for along the values."""
-    from matplotlib.ticker import LogLocator, NullFormatter, StrMethodFormatter
-
-    panel.xaxis.set_major_formatter(StrMethodFormatter("{x:g}"))
-    panel.xaxis.set_minor_formatter(NullFormatter())
-    if not plainly:
-        panel.yaxis.set_minor_formatter(NullFormatter())
-        return
-    panel.yaxis.set_major_formatter(StrMethodFormatter("{x:g}"))
-    panel.yaxis.set_minor_locator(LogLocator(subs=(2.0, 5.0)))
-    panel.yaxis.set_minor_formatter(StrMethodFormatter("{x:g}"))
-    panel.tick_params(axis="y", which="minor", labelsize=9)
 
 
 def circumstances(results: Mapping[str, Any]) -> str:

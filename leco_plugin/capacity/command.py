@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import functools
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
-
-from nerfstudio.utils.rich_utils import CONSOLE
 
 from leco_plugin.capacity.choice import choose, draw, kilobytes, verdict
 from leco_plugin.capacity.gates import Candidate, gates, grids
 from leco_plugin.capacity.measuring import STEPS, Taught, measure_gate, measure_grids, prepare
+from leco_plugin.chart.runner import SETTINGS, make_jobs, take_folder
 from leco_plugin.chart.theme import DARK, LIGHT
 from leco_plugin.evaluation.equal_loss import MOST_ON_CPU
 from leco_plugin.evaluation.field_grids import fits_memory
@@ -21,11 +21,11 @@ from leco_plugin.evaluation.report import (
     read_object,
     write_json,
 )
-from leco_plugin.log import bar
+from leco_plugin.log import bar, console
 from leco_plugin.scenes.input_error import InputError, require_folder
 from leco_plugin.scenes.photographs import describe_scene
 
-SETTINGS, POINTS, LEFT_OUT = "settings.json", "points", "left_out.json"
+POINTS, LEFT_OUT = "points", "left_out.json"
 TOO_MANY = f"would ask the field at more than {MOST_ON_CPU / 1e6:.0f} million places"
 DAMAGED = "is damaged; delete it, or name a new folder with --out"
 
@@ -36,7 +36,6 @@ def capacity(
     resolutions: Sequence[int] = (32, 64, 128, 256, 512),
     lost_surface_mass: float = 1e-3,
     learn_steps: int = 200,
-    gate_candidates: Sequence[Candidate] | None = None,
 ) -> dict[str, Any]:
     """Teaches and measures what is missing in a folder, and draws all of it.
 
@@ -47,7 +46,6 @@ def capacity(
             that would take long.
         lost_surface_mass: at which kept volumes are compared.
         learn_steps: of the field.
-        gate_candidates: `gates()` by default.
     Returns:
         The results, as in `results.json`.
     Raises:
@@ -62,12 +60,14 @@ def capacity(
         "teach_steps": STEPS,
     }
     _take_folder(out, {"scene": scene, **settings}, data)
-    wanted = list(gates() if gate_candidates is None else gate_candidates)
+    say = functools.partial(console().print, markup=False, highlight=False)
     known = _left_out(out) if machine["device"] == "cpu" else []
-    of_cells = _grids_to_fill(resolutions, known)
+    candidates = [*gates(), *_grids_to_fill(resolutions, known, say)]
     taught = prepare(data, out, learn_steps)
-    rows = _measure_missing(out, taught, wanted, of_cells, lost_surface_mass, code)
-    _leave_out(out, [one.size for one in of_cells[len(rows) - len(wanted) :]], known)
+    rows = _measure_missing(out, taught, candidates, lost_surface_mass, code, say)
+    # what is left of the candidates are grids that would take too long: no later call tries them
+    if left := [candidate.size for candidate in candidates[len(rows) :]]:
+        write_json(out / LEFT_OUT, {"places": MOST_ON_CPU, "grids": [*known, *left]})
     results = {
         "format": 1,
         "machine": machine,
@@ -98,70 +98,57 @@ def _check_options(resolutions: Sequence[int], lost_surface_mass: float, learn_s
 def _measure_missing(
     out: Path,
     taught: Taught,
-    wanted: Sequence[Candidate],
-    of_cells: Sequence[Candidate],
+    candidates: Sequence[Candidate],
     lost_surface_mass: float,
     code: dict[str, Any],
+    say: Callable[[str], None],
 ) -> list[dict[str, Any]]:
     """A row for each gate, and for each grid up to the first that would take too long."""
-    rows: list[dict[str, Any]] = []
+    rows = {one.key: row for one in candidates if (row := _stored(out, one)) is not None}
+    of_cells = [one for one in candidates if one.gate is None]
+    if all(one.key in rows for one in of_cells):
+        of_cells = []
+    for one in of_cells:  # all of them: each is refined from the one before
+        rows.pop(one.key, None)
+    todo = [one for one in candidates if one.key not in rows]
+    filling = measure_grids(taught, of_cells, lost_surface_mass)
+
+    def measure_one(candidate: Candidate, show: Callable[[float], None]) -> str:
+        if candidate.gate is not None:
+            row = measure_gate(taught, candidate, lost_surface_mass)
+        elif (filled := next(filling, None)) is not None:
+            row = filled[1]
+        else:
+            return f"{_in_words(candidate)} {TOO_MANY}; it is left out"
+        rows[candidate.key] = row | made_by(code)
+        write_json(out / POINTS / f"{candidate.key}.json", rows[candidate.key])
+        return line_of(row)
+
     with bar("Teaching representations") as show:
-
-        def add(row: dict[str, Any], new: Candidate | None = None) -> None:
-            if new is not None:
-                row |= made_by(code)
-                write_json(out / POINTS / f"{new.key}.json", row)
-                CONSOLE.print(line_of(row), markup=False, highlight=False)
-            rows.append(row)
-            show(len(rows) / (len(wanted) + len(of_cells)))
-
-        for candidate in wanted:
-            row = _stored(out, candidate)
-            if row is not None:
-                add(row)
-            else:
-                add(measure_gate(taught, candidate, lost_surface_mass), candidate)
-        stored = [row for one in of_cells if (row := _stored(out, one)) is not None]
-        if len(stored) == len(of_cells):
-            return rows + stored
-        for candidate, row in measure_grids(taught, of_cells, lost_surface_mass):
-            add(row, candidate)  # all of them: each is refined from the one before
-    return rows
+        make_jobs(todo, measure_one, say, show, done=len(rows))
+    return [rows[one.key] for one in candidates if one.key in rows]
 
 
 def _take_folder(out: Path, settings: dict[str, Any], data: Path) -> None:
-    """Makes a folder one of points of these settings, if it is not one already.
-
-    Raises:
-        InputError: it holds something else, or points of another scene or of other settings.
-    """
+    """As `take_folder`; of another scene only its folder is said."""
     file = out / SETTINGS
-    if not file.exists():
-        if out.exists() and (not out.is_dir() or any(out.iterdir())):
-            raise InputError(f"{out} holds something else; name a new folder with --out")
-        return write_json(file, settings)
-    found = read_object(file, DAMAGED)
-    if found.get("scene") != settings["scene"]:
+    if file.is_file() and read_object(file, DAMAGED).get("scene") != settings["scene"]:
         raise InputError(
             f"{out} holds points of another scene than {data}; name a new folder with --out"
         )
-    for name, value in settings.items():
-        if found.get(name) != value:
-            raise InputError(
-                f"{out} holds points with another {name.replace('_', ' ')} "
-                f"({found.get(name)}, not {value}); name a new folder with --out"
-            )
+    take_folder(file, settings, "points with another", DAMAGED)
 
 
-def _grids_to_fill(resolutions: Sequence[int], known: Sequence[str]) -> list[Candidate]:
+def _grids_to_fill(
+    resolutions: Sequence[int], known: Sequence[str], say: Callable[[str], None]
+) -> list[Candidate]:
     """The grids that fit the memory and are not known to take too long; says which are left out."""
     found = []
     for candidate in grids(tuple(dict.fromkeys(resolutions))):
-        named = f"a grid of {candidate.size}^3 cells"
         if not fits_memory(int(candidate.size) ** 3):
-            CONSOLE.print(f"{named} does not fit the free memory; it is left out")
+            say(f"{_in_words(candidate)} does not fit the free memory; it is left out")
         elif candidate.size in known:
-            CONSOLE.print(f"{named} {TOO_MANY}; left out, as before")
+            say(f"{_in_words(candidate)} {TOO_MANY}; left out, as before")
         else:
             found.append(candidate)
     return found
@@ -172,14 +159,6 @@ def _left_out(out: Path) -> list[str]:
     file = out / LEFT_OUT
     found = read_object(file, DAMAGED) if file.exists() else {}
     return list(found["grids"]) if found.get("places") == MOST_ON_CPU else []
-
-
-def _leave_out(out: Path, sizes: Sequence[str], known: Sequence[str]) -> None:
-    """Says and notes which grids would take too long, so that no later call tries them."""
-    for size in sizes:
-        CONSOLE.print(f"a grid of {size}^3 cells {TOO_MANY}; it is left out")
-    if sizes:
-        write_json(out / LEFT_OUT, {"places": MOST_ON_CPU, "grids": [*known, *sizes]})
 
 
 def _stored(out: Path, candidate: Candidate) -> dict[str, Any] | None:
@@ -199,3 +178,7 @@ def line_of(row: dict[str, Any]) -> str:
         f"{row['family']:<10} {row['size']:<10} {kilobytes(row):>10}  keeps "
         f"{row['kept_volume']:>6.2%} of the volume"
     )
+
+
+def _in_words(grid: Candidate) -> str:
+    return f"a grid of {grid.size}^3 cells"

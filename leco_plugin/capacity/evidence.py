@@ -15,7 +15,9 @@ import torch
 from torch import Tensor
 
 from leco_plugin.capacity.sources import Seen
+from leco_plugin.evaluation.field_grids import in_parts
 from leco_plugin.learning.calibration import near_surface
+from leco_plugin.learning.dense import in_chunks
 from leco_plugin.models.mixture import Mixture
 from leco_plugin.models.rendering import Intervals, Rays, backdrop_of
 from leco_plugin.occupancy import Occupancy
@@ -23,7 +25,6 @@ from leco_plugin.samplers import marching
 from leco_plugin.scenes.learning_data import on_black
 
 RAYS_AT_ONCE = 1024
-POINTS_AT_ONCE = 1 << 16
 UNLIKELY = 0.01
 """How often the true share may lie above the declared one."""
 
@@ -80,15 +81,13 @@ def gather(
         occupancy: the original; None keeps every candidate, and needs a model.
     """
     pieces, rendered = [], []
-    for first in range(0, len(seen.truth), RAYS_AT_ONCE):
-        part = slice(first, first + RAYS_AT_ONCE)
-        rays = Rays._make(None if value is None else value[part] for value in seen.rays)
+    parts = in_chunks(seen.rays, RAYS_AT_ONCE), seen.truth.split(RAYS_AT_ONCE)
+    for rays, truth in zip(*parts):
         if mixture is None:
             assert occupancy is not None
             pieces.append(_by_decisions(occupancy, rays))
             continue
-        truth = on_black(seen.truth[part])
-        piece, again = _by_rendering(mixture, occupancy, rays, truth)
+        piece, again = _by_rendering(mixture, occupancy, rays, on_black(truth))
         pieces.append(piece)
         rendered.append(again)
     return join(pieces), rendered
@@ -136,21 +135,15 @@ def _by_decisions(occupancy: Occupancy, rays: Rays) -> Evidence:
     rule = marching.March(float(report["step_size"]), float(report.get("cone_angle", 0.0)))
     intervals = Intervals(*marching.march(marching.Rays(*rays[:4]), rule))
     positions = _middles(rays, intervals)
-    values = query_in_parts(occupancy, positions)
+    values = in_parts(occupancy.query, positions)
     kept = values >= occupancy.threshold_value
     worth = values * kept
     return Evidence(positions, intervals.ray_indices, kept, worth, worth, len(rays.origins))
 
 
-@torch.no_grad()
-def query_in_parts(occupancy: Occupancy, positions: Tensor) -> Tensor:
-    """o(x) of positions [M, 3], some at a time: [M]."""
-    return torch.cat([occupancy.query(part) for part in positions.split(POINTS_AT_ONCE)])
-
-
 def find_skipped(occupancy: Occupancy, evidence: Evidence) -> Tensor:
     """Which candidates an occupancy skips: bool [M]."""
-    return query_in_parts(occupancy, evidence.positions) < occupancy.threshold
+    return in_parts(occupancy.query, evidence.positions) < occupancy.threshold
 
 
 def unlikely_at(look: int) -> float:

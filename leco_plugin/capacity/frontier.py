@@ -8,7 +8,7 @@ from typing import Any
 
 from leco_plugin.capacity.references import HOLDS, LOST_DECISIONS, Rung
 from leco_plugin.capacity.search import MARGIN
-from leco_plugin.chart.theme import LIGHT, Theme, plain, themed
+from leco_plugin.chart.theme import LIGHT, log_axis, new_figure, plain, themed
 
 LEAST = 1e-6
 """Lost surface mass that is drawn for none at all."""
@@ -85,30 +85,26 @@ def summary(results: Mapping[str, Any], out: Path) -> list[str]:
     return lines
 
 
-def draw(results: Mapping[str, Any], path: Path, theme: Theme = LIGHT) -> Path:
+def draw(results: Mapping[str, Any], path: Path) -> Path:
     """Draws the gates that were tried.
 
     Args:
         results: as `leco shrink --json` writes them.
         path: of the picture; the ending chooses its kind.
-        theme: of the page that it is meant for.
     Raises:
         OSError, ValueError: it cannot be written there, or is of no known kind.
     """
-    from matplotlib.figure import Figure
-    from matplotlib.ticker import NullFormatter, StrMethodFormatter
-
     rungs = results["rungs"]
     sizes = [rung["bytes"] / 1000 for rung in rungs]
     losses = [max(rung["lost_surface_mass"], LEAST) for rung in rungs]
-    with themed(theme):
-        figure = Figure(figsize=(8.5, 5), facecolor=theme.page, layout="constrained")
+    with themed(LIGHT):
+        figure = new_figure((8.5, 5), layout="constrained")
         axes: Any = figure.subplots()
-        axes.plot(sizes, losses, color=theme.faint, linewidth=2, zorder=1)
+        axes.plot(sizes, losses, color=LIGHT.faint, linewidth=2, zorder=1)
         beside = {"textcoords": "offset points", "fontsize": 9.5}
         for rung, place in zip(rungs, zip(sizes, losses)):
             marker, size, colour = ("*", 18, 2) if rung["verdict"] == "chosen" else ("o", 8, 1)
-            axes.plot(*place, marker, markersize=size, color=theme.colours[colour])
+            axes.plot(*place, marker, markersize=size, color=LIGHT.colours[colour])
             is_plain = rung["verdict"] == "loses too much"
             text = rung["name"] if is_plain else f"{rung['name']}: {rung['verdict']}"
             # turned, so that those of neighbours stand beside one another
@@ -116,17 +112,16 @@ def draw(results: Mapping[str, Any], path: Path, theme: Theme = LIGHT) -> Path:
             axes.annotate(text, place, xytext=(7, 7), **turned, **beside)
         allowed = results["bounds"]["lost_surface_mass"]
         for share, said in ((1.0, "may be declared"), (MARGIN, "may be lost in the search")):
-            axes.axhline(share * allowed, color=theme.ink, linestyle="--", linewidth=1)
+            axes.axhline(share * allowed, color=LIGHT.ink, linestyle="--", linewidth=1)
             at_right = {"xycoords": ("axes fraction", "data"), "xytext": (-4, 4), "ha": "right"}
             axes.annotate(said, (1.0, share * allowed), **at_right, **beside)
         axes.set_xlim(0.7 * min(sizes, default=1.0), 4.0 * max(sizes, default=1.0))
         unknown = results["to"].get("lost_surface_mass") is None
         of_what = "lost decisions" if unknown else "lost surface mass"
-        axes.set(xscale="log", yscale="log", xlabel="kB of weights", ylabel=of_what)
+        axes.set(yscale="log", xlabel="kB of weights", ylabel=of_what)
         axes.set_ylim(min([*losses, allowed]) / 3.0, 30.0 * max([*losses, allowed]))
-        axes.xaxis.set_major_formatter(StrMethodFormatter("{x:g}"))
-        axes.xaxis.set_minor_formatter(NullFormatter())
-        plain(axes, theme)
+        log_axis(axes, "x", (1.0,))
+        plain(axes, LIGHT)
         axes.set_title(headline(results), loc="left", fontsize=13, fontweight="bold")
         path.parent.mkdir(parents=True, exist_ok=True)
         figure.savefig(path, dpi=140)

@@ -17,8 +17,9 @@ from leco_plugin.models.gate import Gate, GateConfig, occupancy_logit
 from leco_plugin.occupancy import Precision, gate_precision
 
 BATCH = 1 << 14
-LAST_RATE = 0.05
-"""Of the learning rate, after a half cosine."""
+RATE, LAST_RATE = 2.0 * RATES["gate"], 0.05
+"""Learning rate of networks, and the share of it that is left after a half cosine. Tables learn at
+least as fast as those of a field."""
 FREQUENCY_SIZES = ((3, 8, 1), (4, 16, 1), (5, 16, 2), (6, 32, 2), (8, 64, 2), (6, 64, 3))
 """Octaves, width and layers of the gates that `leco capacity` compares."""
 HASH_SIZES = ((4, 8, 64), (4, 10, 128), (6, 12, 256), (8, 14, 512), (8, 16, 1024))
@@ -150,8 +151,6 @@ def teach(
     lesson: Lesson,
     steps: int,
     precision: Precision,
-    seed: int = 0,
-    rate: float = 2.0 * RATES["gate"],
     on_progress: Callable[[float], None] | None = None,
 ) -> Gate:
     """A gate that was taught by a lesson, in the precision of its later queries.
@@ -160,22 +159,21 @@ def teach(
 
     Args:
         steps: of Adam, on `BATCH` positions each.
-        rate: of networks; tables learn at least as fast as those of a field.
     """
     with torch.random.fork_rng(devices=[]):
-        torch.manual_seed(seed)
+        torch.manual_seed(0)
         gate = Gate(config).to(lesson.mapped.device)
     tables = list(gate.encoding.parameters())
     known = {id(table) for table in tables}
-    groups = [{"params": [p for p in gate.parameters() if id(p) not in known], "lr": rate}]
+    groups = [{"params": [p for p in gate.parameters() if id(p) not in known], "lr": RATE}]
     if tables:
-        groups.append({"params": tables, "lr": max(rate, RATES["encoding"])})
+        groups.append({"params": tables, "lr": max(RATE, RATES["encoding"])})
     optimizer = torch.optim.Adam(groups, eps=1e-15, fused=True)
     schedule = torch.optim.lr_scheduler.LambdaLR(
         optimizer,
         lambda step: LAST_RATE + (1 - LAST_RATE) * 0.5 * (1 + math.cos(math.pi * step / steps)),
     )
-    generator = torch.Generator().manual_seed(seed)
+    generator = torch.Generator().manual_seed(0)
     for step in range(steps):
         drawn = torch.randint(len(lesson.mapped), (BATCH,), generator=generator)
         mapped, keep, skip = (part[drawn.to(part.device)] for part in lesson)

@@ -29,13 +29,8 @@ from leco_plugin.evaluation.equal_loss import (
     reached_volume,
     threshold_losing,
 )
-from leco_plugin.evaluation.field_grids import (
-    FieldGrids,
-    density_of,
-    in_parts,
-    looked_up,
-    plain_and_dilated,
-)
+from leco_plugin.evaluation.field_grids import FieldGrids, density_of, looked_up, plain_and_dilated
+from leco_plugin.evaluation.inspection import in_parts
 from leco_plugin.models.gate import GateConfig, occupancy_logit
 from leco_plugin.models.leco import LecoModel
 from leco_plugin.models.losses import widen

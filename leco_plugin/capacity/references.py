@@ -71,12 +71,11 @@ class Reference(NamedTuple):
     guided: bool = True
     """Whether the original guides the rendering, so that it loses nothing more in it."""
 
-    def loss_of(self, part: Part, skipped: Tensor, unlikely: float) -> Loss:
-        """What is lost in all where candidates [M] of a part are skipped."""
-        return self._with_original(loss(part.evidence, skipped, unlikely))
-
-    def _with_original(self, beyond: Loss) -> Loss:
-        share, bound, lost_mass = beyond
+    def loss_of(self, part: Part, skipped: Tensor | None, unlikely: float) -> Loss:
+        """What is lost in all where candidates [M] of a part are skipped; None is none of them."""
+        share = bound = lost_mass = 0.0
+        if skipped is not None:
+            share, bound, lost_mass = loss(part.evidence, skipped, unlikely)
         lost = self.lost_before
         return Loss(lost + share, lost + bound, self.mass_before + lost_mass)
 
@@ -103,10 +102,9 @@ class Ground(NamedTuple):
         found = []
         for one in self.references:
             part: Part = getattr(one, side)
-            if gate is self.original and one.guided:  # exactly what it declares
-                found.append(one._with_original(Loss(0.0, 0.0, 0.0)))
-            else:
-                found.append(one.loss_of(part, find_skipped(gate, part.evidence), unlikely))
+            guides = gate is self.original and one.guided  # it loses exactly what it declares
+            skipped = None if guides else find_skipped(gate, part.evidence)
+            found.append(one.loss_of(part, skipped, unlikely))
         return found
 
     def price(self, gate: Occupancy, side: str, absolute: bool = False) -> float | None:

@@ -14,9 +14,10 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from leco_plugin.capacity.evidence import Evidence, query_in_parts, unlikely_at
+from leco_plugin.capacity.evidence import Evidence, Loss, unlikely_at
 from leco_plugin.capacity.gates import Lesson, ladder, name_of, round_weights, teach, values_of
-from leco_plugin.capacity.references import Bounds, Ground, Rung, verify
+from leco_plugin.capacity.references import Bounds, Ground, Reference, Rung, verify
+from leco_plugin.evaluation.field_grids import in_parts
 from leco_plugin.evaluation.inspection import whole_box
 from leco_plugin.learning.calibration import THRESHOLDS
 from leco_plugin.models.gate import GateConfig
@@ -59,7 +60,7 @@ def search(
     """
     gates = ladder(values_of(ground.original.gate.config)) if gates is None else gates
     volume = spread_positions(ground.original, VOLUME_POINTS, seed=5)
-    kept = query_in_parts(ground.original, volume) >= ground.original.threshold
+    kept = kept_of_box(ground.original)
     lesson = lesson_of(ground.original, ground.taught)
     rungs: list[Rung] = []
     looks = 0
@@ -105,7 +106,7 @@ def _teach_in_place(
 def lesson_of(original: Occupancy, taught: Evidence) -> Lesson:
     """The original's decisions on candidates of rays, and on as many places anywhere in its box."""
     anywhere = spread_positions(original, TAUGHT_POINTS, seed=6)
-    decided = query_in_parts(original, anywhere) >= original.threshold
+    decided = in_parts(original.query, anywhere) >= original.threshold
     kept = torch.cat([taught.kept, decided]).float()
     full = (taught.weights / WEIGHT_AT_FULL).clamp(max=1.0)
     emphasis = torch.cat([full, torch.zeros_like(decided, dtype=full.dtype)])
@@ -114,25 +115,23 @@ def lesson_of(original: Occupancy, taught: Evidence) -> Lesson:
 
 
 def _measure(
-    ground: Ground, smaller: Occupancy, bounds: Bounds, volume: Tensor, kept: Tensor, look: int
+    ground: Ground, smaller: Occupancy, bounds: Bounds, volume: Tensor, kept: float, look: int
 ) -> Rung:
     """Gives the gate its threshold; what was found with it.
 
     Args:
-        volume, kept: places [P, 3] in the original's box, and whether it keeps them.
+        volume: [P, 3] places in the original's box.
+        kept: share of them that the original keeps.
         look: number that a look at the verifying rays would have.
     """
-    scores = [query_in_parts(smaller, one.search.evidence.positions) for one in ground.references]
-    of_volume, share_kept = query_in_parts(smaller, volume), kept.double().mean()
+    losses_at = _losses_of(smaller, ground.references)
+    of_volume = in_parts(smaller.query, volume)
     lost, holds, ratio = 0.0, False, 0.0
     for share in VOLUMES:
-        threshold = find_threshold(of_volume, share * float(share_kept))
-        losses = [
-            reference.loss_of(reference.search, found < threshold, unlikely_at(look))
-            for reference, found in zip(ground.references, scores)
-        ]
+        threshold = find_threshold(of_volume, share * kept)
+        losses = losses_at(threshold, look)
         lost = max(one.share for one in losses)
-        ratio = float((of_volume >= threshold).double().mean() / share_kept)
+        ratio = float((of_volume >= threshold).double().mean()) / max(kept, 1e-12)
         # what is not within the bounds here needs no look at the rays that verify
         holds = all(
             one.bound <= bounds.lost_surface_mass
@@ -148,17 +147,31 @@ def _measure(
     rung = Rung(name_of(config), params, 2 * params, round(ratio, 4), lost, None, "", 0.0)
     if not holds:
         rung.verdict = "loses too much"
-        return rung
-    if ratio > VOLUMES[-1] + 0.005:
+    elif ratio > VOLUMES[-1] + 0.005:
         rung.verdict = "keeps too much"
-        return rung
-    rung.image_price_db = ground.price(smaller, "search")
-    if (rung.image_price_db or 0.0) > bounds.image_price_db:
-        rung.verdict = "costs too much of the image"
-        return rung
-    holds = verify(ground, smaller, bounds, rung, look)
-    rung.verdict = "chosen" if holds else "fails on unseen rays"
+    else:
+        rung.image_price_db = ground.price(smaller, "search")
+        if (rung.image_price_db or 0.0) > bounds.image_price_db:
+            rung.verdict = "costs too much of the image"
+        else:
+            holds = verify(ground, smaller, bounds, rung, look)
+            rung.verdict = "chosen" if holds else "fails on unseen rays"
     return rung
+
+
+def _losses_of(
+    gate: Occupancy, references: Sequence[Reference]
+) -> Callable[[float, int], list[Loss]]:
+    """What a gate loses on the rays of the search, by each reference, at a threshold and a look."""
+    scores = [in_parts(gate.query, one.search.evidence.positions) for one in references]
+
+    def losses_at(threshold: float, look: int) -> list[Loss]:
+        return [
+            one.loss_of(one.search, found < threshold, unlikely_at(look))
+            for one, found in zip(references, scores)
+        ]
+
+    return losses_at
 
 
 def lower_threshold(ground: Ground, bounds: Bounds) -> Occupancy | None:
@@ -174,13 +187,10 @@ def lower_threshold(ground: Ground, bounds: Bounds) -> Occupancy | None:
     """
     original = ground.original
     absolute = [reference for reference in ground.references if not reference.guided]
-    scores = [query_in_parts(original, one.search.evidence.positions) for one in absolute]
+    losses_at = _losses_of(original, absolute)
 
     def meets(there: Occupancy) -> bool:
-        losses = [
-            one.loss_of(one.search, found < there.threshold, unlikely_at(1))
-            for one, found in zip(absolute, scores)
-        ]
+        losses = losses_at(there.threshold, 1)
         share, bound = max(one.share for one in losses), max(one.bound for one in losses)
         if share > MARGIN * bounds.lost_surface_mass or not bounds.allow(bound, None):
             return False  # before anything is rendered
@@ -201,7 +211,7 @@ def find_threshold(scores: Tensor, share: float) -> float:
 def kept_of_box(occupancy: Occupancy) -> float:
     """Share of an occupancy's box, or of a contracted cube, that it keeps."""
     places = spread_positions(occupancy, VOLUME_POINTS, seed=5)
-    return float((query_in_parts(occupancy, places) >= occupancy.threshold).double().mean())
+    return float((in_parts(occupancy.query, places) >= occupancy.threshold).double().mean())
 
 
 def spread_positions(occupancy: Occupancy, count: int, seed: int) -> Tensor:

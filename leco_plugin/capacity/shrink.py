@@ -64,7 +64,7 @@ def shrink(
     data: Path,
     out: Path,
     bounds: Bounds,
-    keep: Callable[[dict[str, Any]], None] | None = None,
+    keep: Callable[[dict[str, Any]], None] = lambda results: None,
 ) -> dict[str, Any]:
     """Finds the smallest gate that decides as a frozen one does, and writes it.
 
@@ -82,27 +82,23 @@ def shrink(
     code = describe_code()
     source, original = _open(file, data, out, bounds)
     ground, itself, lowered = _meet_bounds(source, original, file, bounds)
-    known = {
+    results: dict[str, Any] = {
         "format": 1,
         "machine": describe_machine(),
         **made_by(code),
         "from": {"params": ground.original.num_params, "bytes": file.stat().st_size},
         "bounds": asdict(bounds),
         "lowered": lowered,
+        "original": asdict(itself),
+        "rungs": [],
     }
-    rungs: list[dict[str, Any]] = []
 
     def tell(rung: Rung) -> None:
         _say(line_of(rung))
-        rungs.append(asdict(rung))
-        if keep is not None:
-            keep({**known, "original": asdict(itself), "rungs": rungs})
+        results["rungs"].append(asdict(rung))
+        keep(results)
 
-    found = Found(None, [])
-    if itself.verdict == HOLDS:
-        with bar("Teaching smaller gates") as show:
-            found = search(ground, bounds, on_rung=tell, on_progress=show)
-    smaller = found.occupancy or _round_original(ground, bounds, itself, found.rungs)
+    found, smaller = _find_smaller(ground, bounds, itself, tell)
     checked = _check_on_test_photographs(source, ground.original, smaller)
     is_untrained = held_out_sampler(source.manager) is not None
     smaller.report = _report_of(ground, found, itself, is_untrained, lowered, checked)
@@ -110,15 +106,13 @@ def shrink(
     smaller.save(out)
     speedup, times = compare_queries(ground.original, smaller)
     reported = {name: value for name, value in smaller.report.items() if name not in COPIED}
-    return {
-        **known,
-        "original": asdict(itself),
+    return results | {
+        "original": asdict(itself),  # with what is declared of it
         "to": {"params": smaller.num_params, "bytes": out.stat().st_size, **reported},
         "query_speedup": speedup,
         "query_milliseconds": times,
         "queried_positions": TIMED_POSITIONS,
         "checked": checked,
-        "rungs": rungs,
     }
 
 
@@ -165,21 +159,26 @@ def _meet_bounds(
     return ground, itself, lowered
 
 
-def _round_original(
-    ground: Ground, bounds: Bounds, itself: Rung, tried: Sequence[Rung]
-) -> Occupancy:
-    """The original, which is stored again where nothing smaller holds.
+def _find_smaller(
+    ground: Ground, bounds: Bounds, itself: Rung, tell: Callable[[Rung], None]
+) -> tuple[Found, Occupancy]:
+    """The gates that were tried, and what is stored: the original again where none of them holds.
 
     Its weights are rounded where autocast rounds them anyway: not a decision changes. Where a
     reference measures it, `itself` gets what is to be declared.
     """
-    original = ground.original
+    found, original = Found(None, []), ground.original
+    if itself.verdict == HOLDS:
+        with bar("Teaching smaller gates") as show:
+            found = search(ground, bounds, on_rung=tell, on_progress=show)
+    if found.occupancy is not None:
+        return found, found.occupancy
     if ground.measures_original:
-        looks = max((rung.look or 0 for rung in tried), default=0)
+        looks = max((rung.look or 0 for rung in found.rungs), default=0)
         verify(ground, original, bounds, itself, looks + 1)
     if original.precision == "bfloat16":
         round_weights(original.gate.hidden)
-    return original
+    return found, original
 
 
 def draw_rays(source: Source, original: Occupancy) -> tuple[Sequence[tuple[Seen, Seen]], Seen]:

@@ -8,6 +8,7 @@ import shutil
 import threading
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -46,11 +47,6 @@ class Chart:
     """One chart: its folder, its runs, and its results so far.
 
     Args:
-        data: a scene in nerfstudio's format.
-        out: the chart's folder.
-        contenders: what is compared.
-        seeds: of each.
-        protocol: how long, and how it is evaluated.
         suite: name and question of the comparison, if it has one.
         command: what made it, for the results.
         reuse: folders of charts, from which runs that are missing here are taken over.
@@ -103,9 +99,6 @@ class Chart:
             InputError: another process makes runs in the same folder.
         """
 
-        def make_one(job: Job, show_share: Callable[[float], None]) -> str:
-            return self._make_one(job, runner, show_share)
-
         def note(line: str) -> None:
             say(line)
             self.write()
@@ -120,9 +113,10 @@ class Chart:
             self.write()
             done = len(self.jobs) - len(todo)
             at_once = self.protocol.at_once
+            make_one = partial(self._make_one, runner)
             make_jobs(todo, make_one, note, show, stop=self.stop, at_once=at_once, done=done)
 
-    def _make_one(self, job: Job, runner: Runner, show: Callable[[float], None]) -> str:
+    def _make_one(self, runner: Runner, job: Job, show: Callable[[float], None]) -> str:
         """Makes a run and keeps it, or why there is none; returns a line about it."""
         title = f"seed {job.seed}, {job.contender.name}"
         try:
@@ -151,17 +145,20 @@ class Chart:
     def failures(self) -> list[dict[str, Any]]:
         """Runs that ended without a result, by seed, and whether this call asked for them."""
         asked = {(job.contender.name, job.seed) for job in self.jobs}
-        found = []
-        for one in self.folder.failures():
-            facts = {key: one["contender"][key] for key in ("name", "method", "sampler")}
-            known = (facts["name"], one["seed"]) in asked
-            found.append({**facts, "seed": one["seed"], "reason": one["reason"], "asked": known})
+        found = [
+            {
+                **{key: one["contender"][key] for key in ("name", "method", "sampler")},
+                **{key: one[key] for key in ("seed", "reason")},
+                "asked": (one["contender"]["name"], one["seed"]) in asked,
+            }
+            for one in self.folder.failures()
+        ]
         return sorted(found, key=lambda one: (one["seed"], one["name"]))
 
     def results(self) -> dict[str, Any]:
         """All finished runs in the folder, the contenders of this call first."""
         names = {one.key: one.name for one in self.contenders}
-        order = list(names)
+        places = {key: place for place, key in enumerate(names)}
         stored, runs = {}, []
         for file, record in self.folder.stored().items():
             made = Contender.from_dict(record["contender"])
@@ -171,13 +168,12 @@ class Chart:
             stored[file] = record
             code = record["made"].get("sources") or record["made"].get("commit")
             run = {**record["run"], "name": names.get(made.key, made.name), "code": code}
-            place = order.index(made.key) if made.key in order else len(order)
-            runs.append(((place, made.key, run["seed"]), run))
-        runs.sort(key=lambda one: one[0])
+            runs.append(((places.get(made.key, len(places)), made.key, run["seed"]), run))
+        in_order = [run for _, run in sorted(runs, key=lambda one: one[0])]
         failures = self.failures()
         failed = {(one["name"], one["seed"]) for one in failures}
         todo = [job for job in self.jobs if job.name not in stored]
-        occupancies = [run["occupancy"] for _, run in runs if run.get("occupancy")]
+        occupancies = [run["occupancy"] for run in in_order if run.get("occupancy")]
         return {
             "format": 1,
             "machine": self.machine,
@@ -187,7 +183,7 @@ class Chart:
             "question": self.question,
             "made": self._made_of(stored),
             "occupancy": occupancies[0] if occupancies else None,
-            "runs": [run for _, run in runs],
+            "runs": in_order,
             "failures": failures,
             "missing": sum((job.contender.name, job.seed) not in failed for job in todo),
         }
@@ -224,8 +220,7 @@ class Chart:
 
         Nothing is drawn when no run has succeeded.
         """
-        from leco_plugin.chart import picture
-        from leco_plugin.chart.page import write_page
+        from leco_plugin.chart import page, picture
         from leco_plugin.chart.theme import DARK, LIGHT
 
         results = self.write()
@@ -233,7 +228,7 @@ class Chart:
             place = self.folder.path
             picture.draw(results, place / "chart.png", LIGHT)
             picture.draw(results, place / "chart-dark.png", DARK)
-            write_page(results, place / "chart.html")
+            page.write_page(results, place / "chart.html")
         return results
 
 
@@ -258,11 +253,8 @@ def unlike(source: Path, settings: Mapping[str, Any]) -> str | None:
 
 
 def take_over(folder: RunFolder, missing: Sequence[Job], sources: Sequence[Path]) -> list[Job]:
-    """Copies missing runs from other charts; returns their jobs.
-
-    Args:
-        sources: folders of charts, checked; the first that has a run gives it.
-    """
+    """Copies missing runs from the folders of other charts that have passed `unlike`, each from the
+    first that has it; returns their jobs."""
     left, taken = list(missing), []
     for source in sources:
         for name, record in stored_in(source).items():

@@ -5,7 +5,7 @@ from __future__ import annotations
 import functools
 import shlex
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -63,11 +63,8 @@ def make_charts(
     """Makes what is missing of one chart, or of those of several suites, and draws it.
 
     Args:
-        data: a scene in nerfstudio's format.
         out: the chart's folder; several suites have one each in it, and reuse each other's runs.
-        methods, samplers: what is compared, or
-        suites: names of comparisons, or `all`.
-        asked: how long and how often.
+        suites: names of comparisons, or `all`; in place of methods and samplers.
         runner_for: gives what makes the runs of a chart.
     Returns:
         The results by folder, as in `results.json`.
@@ -89,6 +86,18 @@ def make_charts(
         name = names[0] if names else None
         charts = [_chart_of(data, out, asked, name, methods, samplers)]
     return {chart.folder.path: _make(chart, runner_for) for chart in charts}
+
+
+def refuse_failures(made: Sequence[Mapping[str, Any]]) -> None:
+    """Raises `RuntimeError` where runs that were asked for have failed in some of the results."""
+    failures = [one for results in made for one in results["failures"] if one["asked"]]
+    if failures:
+        count = len(failures) + sum(len(results["runs"]) for results in made)
+        first = f"({failures[0]['name']}, seed {failures[0]['seed']})"
+        raise RuntimeError(
+            f"{len(failures)} of {count} runs failed, the first {first} with: "
+            f"{failures[0]['reason']}"
+        )
 
 
 def _check_shared(out: Path) -> None:
@@ -122,19 +131,12 @@ def _chart_of(
         times = suite.protocol.seconds, suite.protocol.steps
         learn_seconds = suite.learn_seconds if learn_seconds is None else learn_seconds
     protocol = Protocol(*times, learn_seconds, asked.images, at_once=at_once)
-    options = {
-        "suite": name,
-        "seconds": protocol.seconds,
-        "steps": protocol.steps,
-        "learn-seconds": learn_seconds,
-        "images": asked.images,
-        "at-once": at_once if suite or at_once > 1 else None,
-        "methods": methods,
-        "samplers": samplers,
-        "seeds": asked.seeds,
-    }
+    options = {"suite": name, **asdict(protocol), "methods": methods, "samplers": samplers}
+    del options["curve_points"]
+    if not suite and at_once == 1:
+        del options["at_once"]
+    command = command_line(data, {**options, "seeds": asked.seeds})
     titled = (name, suite.question) if name is not None and suite else None
-    command = command_line(data, options)
     return Chart(data, out, compared, asked.seeds, protocol, titled, command, asked.reuse)
 
 
@@ -159,5 +161,6 @@ def command_line(data: Path, options: Mapping[str, object]) -> str:
         if value is None or value == () or value == []:
             continue
         values = value if isinstance(value, (list, tuple)) else [value]
-        words += [f"--{name}", *(f"{v:g}" if isinstance(v, float) else v for v in values)]
+        words += ["--" + name.replace("_", "-")]
+        words += [f"{one:g}" if isinstance(one, float) else one for one in values]
     return shlex.join([str(word) for word in words])

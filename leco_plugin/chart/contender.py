@@ -103,7 +103,6 @@ def config_of(
     All contenders read the scene with our parser, so that they render the same test pixels.
 
     Args:
-        data: a scene in nerfstudio's format.
         folder: for what the run leaves.
         learn_seconds: limit for a host that learns its occupancy first.
     Raises:

@@ -7,31 +7,12 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from leco_plugin.chart.findings.learned import learned_of
-from leco_plugin.chart.findings.representations import COSTS as COSTS_OF_HELD
-from leco_plugin.chart.findings.representations import representations_of
 from leco_plugin.chart.findings.settling import falls
-from leco_plugin.chart.findings.summary import (
-    COSTS,
-    LEARNING,
-    Line,
-    best_so_far,
-    circumstances,
-    lines_of,
-)
-from leco_plugin.chart.panels import (
-    Panel,
-    Point,
-    asks_what_was_learned,
-    cost_panel,
-    kept_panel,
-    learned_panel,
-    title_of,
-)
+from leco_plugin.chart.findings.summary import Line, best_so_far, circumstances
+from leco_plugin.chart.panels import Panel, shown_of, title_of
 from leco_plugin.chart.theme import LIGHT, style
 
 SYMBOLS = ("circle", "square", "diamond", "triangle-up", "triangle-down", "cross", "x", "star")
-TITLES = {"size": "size of the occupancy, kB", "learning time": LEARNING.titled}
 FRONT = {"color": "rgba(120,120,120,0.45)", "width": 5}
 
 
@@ -42,8 +23,8 @@ def write_page(results: Mapping[str, Any], path: Path) -> Path:
     """
     from plotly.subplots import make_subplots
 
-    lines = lines_of(results)
-    panels = _panels_of(results, lines)
+    shown = shown_of(results)
+    panels = shown.costs + shown.space
     rows = 1 + (len(panels) + 2) // 3
     figure = make_subplots(
         rows=rows,
@@ -52,22 +33,22 @@ def write_page(results: Mapping[str, Any], path: Path) -> Path:
         subplot_titles=["", *(panel.title for panel in panels)],
         vertical_spacing=0.13,
     )
-    _add_curves(figure, lines)
+    _add_curves(figure, shown.lines)
     for number, panel in enumerate(panels):
         _add_panel(figure, panel, 2 + number // 3, 1 + number % 3)
     figure.update_xaxes(title_text="seconds of training", row=1, col=1)
     figure.update_yaxes(title_text="PSNR on test images, dB", row=1, col=1)
     figure.update_yaxes(title_text="PSNR, dB", row=2, col=1)
-    if rows > 2:
-        is_by_size = not panels[len(COSTS)].more_x
+    if shown.space:
+        is_by_size = not shown.space[0].more_x
         figure.update_xaxes(type="log" if is_by_size else "linear", row=3, col=1)
         figure.update_yaxes(title_text="volume kept at equal loss, %", row=3, col=1)
     title = html.escape(title_of(results))
-    below = html.escape(". ".join(filter(None, [circumstances(results), falls(lines)])))
+    below = html.escape(". ".join(filter(None, [circumstances(results), falls(shown.lines)])))
     figure.update_layout(
         title={"text": f"<b>{title}</b><br><sub>{below}</sub>"},
         template="plotly_white",
-        height=1100 if rows > 2 else 820,
+        height=1100 if shown.space else 820,
         legend={"orientation": "h", "y": -0.08},
         margin={"t": 110},
     )
@@ -75,38 +56,21 @@ def write_page(results: Mapping[str, Any], path: Path) -> Path:
     return path
 
 
-def _panels_of(results: Mapping[str, Any], lines: Sequence[Line]) -> list[Panel]:
-    """Costs, and in a third row what occupancies keep, where the chart is about that."""
-    panels = [cost_panel(cost, lines) for cost in COSTS]
-    if held := representations_of(lines):
-        costs = COSTS_OF_HELD.items()
-        panels += [kept_panel(TITLES[name], figure, held, lines) for name, figure in costs]
-    elif asks_what_was_learned(results):
-        panel = learned_panel(learned_of(lines), lines)
-        title = "space kept at equal loss, against PSNR, dB"
-        panels.append(Panel(title, panel.points, panel.less, panel.more_x))
-    return panels
-
-
 def _add_curves(figure: Any, lines: Sequence[Line]) -> None:
     """The curve of each run, and the best so far of all."""
-    import plotly.graph_objects as go
-
     for i, line in enumerate(lines):
         for run in line.runs:
             seconds, psnrs = zip(*run["curve"])
             dash = "solid" if line.learned else "dash"
-            figure.add_trace(
-                go.Scatter(
-                    x=seconds,
-                    y=psnrs,
-                    name=line.name,
-                    legendgroup=line.name,
-                    showlegend=run is line.runs[0],
-                    mode="lines+markers",
-                    line={"color": style(i, LIGHT)["color"], "dash": dash},
-                    hovertemplate=f"%{{x:.1f}} s, %{{y:.2f}} dB, seed {run['seed']}",
-                ),
+            figure.add_scatter(
+                x=seconds,
+                y=psnrs,
+                name=line.name,
+                legendgroup=line.name,
+                showlegend=run is line.runs[0],
+                mode="lines+markers",
+                line={"color": style(i, LIGHT)["color"], "dash": dash},
+                hovertemplate=f"%{{x:.1f}} s, %{{y:.2f}} dB, seed {run['seed']}",
                 row=1,
                 col=1,
             )
@@ -116,45 +80,38 @@ def _add_curves(figure: Any, lines: Sequence[Line]) -> None:
 
 def _add_panel(figure: Any, panel: Panel, row: int, column: int) -> None:
     """The points of a panel and its front; less of y is up where less is better."""
+    named = panel.less and not panel.more_x
     for one in panel.points:
-        figure.add_trace(_trace_of(one, panel), row=row, col=column)
+        look = {"color": LIGHT.ink, "symbol": "x"}
+        if one.line is not None:
+            symbol = SYMBOLS[one.line % len(SYMBOLS)] + ("-open" if one.small else "")
+            look = {"color": style(one.line, LIGHT)["color"], "symbol": symbol}
+        psnrs = [psnr for _, psnr in one.seeds] or [one.y]
+        spread = {"array": [max(psnrs) - one.y], "arrayminus": [one.y - min(psnrs)]}
+        figure.add_scatter(
+            x=[one.x],
+            y=[one.y],
+            text=[one.name],
+            error_y=None if panel.less else {**spread, "symmetric": False},
+            name=one.name,
+            legendgroup=one.name,
+            showlegend=False,
+            mode="markers+text" if named else "markers",
+            textposition="top center",
+            marker={"size": 16 if one.ours else 12, **look},
+            hovertemplate="%{text}: %{x:.3g}, %{y:.2f}<extra></extra>",
+            row=row,
+            col=column,
+        )
     _add_front(figure, panel.front(), "hv", row, column)
     if panel.less:
         scale = "log" if panel.more_x else "linear"
         figure.update_yaxes(type=scale, autorange="reversed", row=row, col=column)
 
 
-def _trace_of(one: Point, panel: Panel) -> Any:
-    import plotly.graph_objects as go
-
-    look = {"color": LIGHT.ink, "symbol": "x"}
-    if one.line is not None:
-        symbol = SYMBOLS[one.line % len(SYMBOLS)] + ("-open" if one.small else "")
-        look = {"color": style(one.line, LIGHT)["color"], "symbol": symbol}
-    named = panel.less and not panel.more_x
-    psnrs = [psnr for _, psnr in one.seeds] or [one.y]
-    spread = {"array": [max(psnrs) - one.y], "arrayminus": [one.y - min(psnrs)]}
-    return go.Scatter(
-        x=[one.x],
-        y=[one.y],
-        text=[one.name],
-        error_y=None if panel.less else {**spread, "symmetric": False},
-        name=one.name,
-        legendgroup=one.name,
-        showlegend=False,
-        mode="markers+text" if named else "markers",
-        textposition="top center",
-        marker={"size": 16 if one.ours else 12, **look},
-        hovertemplate="%{text}: %{x:.3g}, %{y:.2f}<extra></extra>",
-    )
-
-
 def _add_front(
     figure: Any, points: Sequence[tuple[float, float]], shape: str, row: int, column: int
 ) -> None:
-    import plotly.graph_objects as go
-
     xs, ys = zip(*points) if points else ((), ())
-    line = FRONT | {"shape": shape}
-    trace = go.Scatter(x=xs, y=ys, mode="lines", line=line, showlegend=False, hoverinfo="skip")
-    figure.add_trace(trace, row=row, col=column)
+    options = {"mode": "lines", "showlegend": False, "hoverinfo": "skip", "row": row, "col": column}
+    figure.add_scatter(x=xs, y=ys, line=FRONT | {"shape": shape}, **options)

@@ -6,14 +6,26 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from leco_plugin.chart.findings.learned import Learned, learned_headline, learned_of
+from leco_plugin.chart.findings.learned import learned_headline, learned_of
 from leco_plugin.chart.findings.representations import (
     Representation,
     never_held_of,
     representations_of,
     verdict,
 )
-from leco_plugin.chart.findings.summary import Cost, Line, front, headline, lines_of, sentence
+from leco_plugin.chart.findings.summary import (
+    COSTS,
+    LEARNING,
+    Cost,
+    Line,
+    front,
+    headline,
+    lines_of,
+    sentence,
+)
+
+HELD_COSTS = {"size": "size of the occupancy, kB", "learn_seconds": LEARNING.titled}
+"""Names in `Held` of what an occupancy costs, and their titles."""
 
 
 def title_of(results: Mapping[str, Any]) -> str:
@@ -68,6 +80,29 @@ class Panel:
         return [places[i] for i in front([(across * x, up * y) for x, y in places])]
 
 
+@dataclass(frozen=True)
+class Shown:
+    """What picture and page show of results."""
+
+    lines: list[Line]
+    costs: list[Panel]
+    """PSNR against each cost."""
+    space: list[Panel]
+    """Space kept at equal loss, where the chart is about that: against size and learning time, or
+    against PSNR."""
+
+
+def shown_of(results: Mapping[str, Any]) -> Shown:
+    """Of results that hold at least one run."""
+    lines = lines_of(results)
+    space = []
+    if held := representations_of(lines):
+        space = [kept_panel(figure, held, lines) for figure in HELD_COSTS]
+    elif asks_what_was_learned(results):
+        space = [learned_panel(lines)]
+    return Shown(lines, [cost_panel(cost, lines) for cost in COSTS], space)
+
+
 def cost_panel(cost: Cost, lines: Sequence[Line]) -> Panel:
     """PSNR against a cost."""
     points = [
@@ -78,14 +113,8 @@ def cost_panel(cost: Cost, lines: Sequence[Line]) -> Panel:
     return Panel(cost.titled, tuple(points), less=False)
 
 
-def kept_panel(
-    title: str, figure: str, held: Sequence[Representation], lines: Sequence[Line]
-) -> Panel:
-    """Space kept at equal loss against a cost of occupancies that have it.
-
-    Args:
-        figure: name of the cost in `Held`.
-    """
+def kept_panel(figure: str, held: Sequence[Representation], lines: Sequence[Line]) -> Panel:
+    """Space kept at equal loss against one of `HELD_COSTS`, of occupancies that have it."""
     names = [line.name for line in lines]
     points = []
     for one in (one for one in held if one.has(figure)):
@@ -96,15 +125,15 @@ def kept_panel(
         points.append(
             Point(one.name, one.median(figure), one.kept, number, ours=one.ours, small=small)
         )
-    return Panel(title, tuple(points))
+    return Panel(HELD_COSTS[figure], tuple(points))
 
 
-def learned_panel(learned: Sequence[Learned], lines: Sequence[Line]) -> Panel:
+def learned_panel(lines: Sequence[Line]) -> Panel:
     """Space kept at equal loss against PSNR after equal steps, of gates that always froze."""
     numbers = {line.name: i for i, line in enumerate(lines)}
     points = []
-    for one in (one for one in learned if one.is_measured):
-        seeds = tuple((one.psnrs[seed], kept) for seed, kept in one.kept_by_seed.items())
+    for one in (one for one in learned_of(lines) if one.is_measured):
+        seeds = tuple((one.psnr_by_seed[seed], kept) for seed, kept in one.kept_by_seed.items())
         late = " (frozen at the end)" if one.guided_nothing == one.seeds else ""
         points.append(Point(one.name + late, one.psnr, one.kept, numbers[one.name], seeds))
-    return Panel("", tuple(points), more_x=True)
+    return Panel("space kept at equal loss, against PSNR, dB", tuple(points), more_x=True)

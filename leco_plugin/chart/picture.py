@@ -4,30 +4,20 @@ from __future__ import annotations
 
 import textwrap
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 from leco_plugin.chart.findings.learned import learned_of
-from leco_plugin.chart.findings.representations import Representation, representations_of
 from leco_plugin.chart.findings.summary import (
-    COSTS,
     LEARNING,
     LOST_SURFACE_MASS,
     Line,
     best_so_far,
     circumstances,
-    lines_of,
 )
 from leco_plugin.chart.names import name_points, spread
-from leco_plugin.chart.panels import (
-    Panel,
-    Point,
-    asks_what_was_learned,
-    cost_panel,
-    kept_panel,
-    learned_panel,
-    title_of,
-)
+from leco_plugin.chart.panels import Panel, Point, Shown, shown_of, title_of
 from leco_plugin.chart.theme import (
     LIGHT,
     Theme,
@@ -57,25 +47,18 @@ SIZE = "size, kB: numbers in bfloat16, cells of grids in bits"
 
 
 def draw(results: Mapping[str, Any], path: Path, theme: Theme = LIGHT) -> Path:
-    """Draws the results of a chart that has at least one run.
-
-    Args:
-        results: as in `results.json`.
-        path: of the picture.
-        theme: of the page it is meant for.
-    """
-    lines = lines_of(results)
-    held = representations_of(lines)
+    """Draws the results of a chart that has at least one run, for a page of a theme."""
+    shown = shown_of(results)
     with themed(theme):
         figure = new_figure((10, 8.4), theme.page)
         title = balanced(title_of(results))
         figure.text(0.015, TOP, title, va="top", fontsize=17, fontweight="bold")
         below = TOP - 0.01 - LINE_HEIGHT * (title.count("\n") + 1)
         figure.text(0.015, below, circumstances(results), va="top", fontsize=11.5)
-        if held or asks_what_was_learned(results):
-            _draw_occupancies(figure, below, held, lines, theme)
+        if shown.space:
+            _draw_occupancies(figure, below, shown, theme)
         else:
-            _draw_race(figure, below - 0.08 - 0.43, lines, theme)
+            _draw_race(figure, below - 0.08 - 0.43, shown, theme)
         return save_picture(figure, path, results, dpi=160)
 
 
@@ -86,8 +69,9 @@ def balanced(text: str, width: int = TITLE_WIDTH) -> str:
     return textwrap.fill(text, narrowest)
 
 
-def _draw_race(figure: Any, height: float, lines: Sequence[Line], theme: Theme) -> None:
+def _draw_race(figure: Any, height: float, shown: Shown, theme: Theme) -> None:
     """Curves against training time above, costs below."""
+    lines = shown.lines
     figure.text(0.015, 0.335, COSTS_BELOW, va="top", fontsize=11.5)
     widest = max(len(name_of_end(line)) for line in lines)
     right = 0.93 - CHARACTER * min(widest, 40)
@@ -98,45 +82,40 @@ def _draw_race(figure: Any, height: float, lines: Sequence[Line], theme: Theme) 
     _draw_learning(main, lines, theme)
     name_ends(main, lines, theme)
     panels = [figure.add_axes((0.075 + 0.325 * i, 0.065, 0.255, 0.2)) for i in range(3)]
-    for axes, cost in zip(panels, COSTS):
-        draw_panel(axes, cost_panel(cost, lines), theme)
+    for axes, panel in zip(panels, shown.costs):
+        draw_panel(axes, panel, theme)
     panels[0].set_ylabel("PSNR, dB")
 
 
-def _draw_occupancies(
-    figure: Any, top: float, held: Sequence[Representation], lines: Sequence[Line], theme: Theme
-) -> None:
+def _draw_occupancies(figure: Any, top: float, shown: Shown, theme: Theme) -> None:
     """Space kept at equal loss above; curves and costs, small, below."""
+    lines, (first, *others) = shown.lines, shown.space
     figure.text(0.015, 0.335, PSNR_BELOW, va="top", fontsize=11.5)
-    better = ". Up and left is better:" if held else ", against PSNR. Up and right is better:"
+    by_psnr = first.more_x
+    better = ", against PSNR. Up and right is better:" if by_psnr else ". Up and left is better:"
     figure.text(0.015, top - 0.035, KEPT_SPACE + better, va="top", fontsize=11.5)
-    if not held and (never := [one.name for one in learned_of(lines) if not one.is_measured]):
+    if by_psnr and (never := [one.name for one in learned_of(lines) if not one.is_measured]):
         said = textwrap.fill(f"Not always frozen: {', '.join(never)}.", 100)
         figure.text(0.015, top - 0.07, said, va="top", fontsize=11.5)
         top -= 0.035 * (said.count("\n") + 1)
-    places = ((0.075, 0.56), (0.70, 0.28)) if held else ((0.085, 0.895),)
-    low = 0.43 if held else 0.455
+    places = ((0.085, 0.895),) if by_psnr else ((0.075, 0.56), (0.70, 0.28))
+    low = 0.455 if by_psnr else 0.43
     above = [figure.add_axes((x, low, wide, top - 0.11 - low)) for x, wide in places]
     above[0].set_ylabel("space kept, %")
-    if held:
-        by_size = kept_panel(SIZE, "size", held, lines)
-        draw_panel(above[0], by_size, theme)
-        _name(above[0], by_size.points, theme)
-        by_time = kept_panel(LEARNING.titled, "learn_seconds", held, lines)
-        draw_panel(above[1], by_time, theme)
-        seconds = [one.x for one in by_time.points]
-        above[1].set_xlim(0.9 * min(seconds), 1.06 * max(seconds))
-    else:
-        panel = learned_panel(learned_of(lines), lines)
-        draw_panel(above[0], panel, theme)
-        _name(above[0], panel.points, theme)
+    draw_panel(above[0], replace(first, title="" if by_psnr else SIZE), theme)
+    _name(above[0], first.points, theme)
+    if by_psnr:
         above[0].set_xlabel("PSNR on unseen photographs, dB")
+    for axes, by_time in zip(above[1:], others):
+        draw_panel(axes, by_time, theme)
+        seconds = [one.x for one in by_time.points]
+        axes.set_xlim(0.9 * min(seconds), 1.06 * max(seconds))
     below = [figure.add_axes((0.075 + 0.24 * i, 0.065, 0.17, 0.2)) for i in range(4)]
     draw_curves(below[0], lines, theme, small=True)
     below[0].set_title("training, s", fontsize=11.5, loc="left")
     below[0].set_ylabel("PSNR, dB")
-    for axes, cost in zip(below[1:], COSTS):
-        draw_panel(axes, cost_panel(cost, lines), theme)
+    for axes, panel in zip(below[1:], shown.costs):
+        draw_panel(axes, panel, theme)
 
 
 def draw_panel(axes: Any, panel: Panel, theme: Theme) -> None:

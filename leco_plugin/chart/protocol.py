@@ -67,12 +67,9 @@ class Protocol:
 
     def describe(self) -> str:
         """Time and steps in a few words."""
-        parts = []
-        if self.seconds is not None:
-            parts.append(f"{self.seconds:g} s")
-        if self.steps is not None:
-            parts.append(f"{self.steps} steps")
-        return " or ".join(parts)
+        seconds = [] if self.seconds is None else [f"{self.seconds:g} s"]
+        steps = [] if self.steps is None else [f"{self.steps} steps"]
+        return " or ".join(seconds + steps)
 
 
 def require_seeds(seeds: Iterable[int]) -> None:

@@ -23,7 +23,7 @@ from typing import Any, Protocol
 
 from leco_plugin.evaluation.report import read_object, write_json
 from leco_plugin.scenes.input_error import InputError, one_line
-from leco_plugin.studio.run_folder import alone_in
+from leco_plugin.studio.run_folder import LOCK, alone_in
 
 SETTINGS, RESULTS = "settings.json", "results.json"
 RUNS, UNFINISHED, LOGS = "runs", "unfinished", "logs"
@@ -70,15 +70,7 @@ class RunFolder:
 
     def __init__(self, path: Path, settings: Mapping[str, Any]) -> None:
         self.path = path
-        found = read_settings(path)
-        if found is not None and (other := difference(found, settings)):
-            raise InputError(
-                f"{path} holds a chart with another {other}; name a new folder with --out"
-            )
-        if found is None and path.exists() and any(path.iterdir()):
-            raise InputError(f"{path} holds something else; name a new folder with --out")
-        if found is None:
-            write_json(path / SETTINGS, dict(settings))
+        take_folder(path / SETTINGS, settings)
         for name in (RUNS, UNFINISHED, LOGS):
             (path / name).mkdir(exist_ok=True)
 
@@ -90,9 +82,13 @@ class RunFolder:
             InputError: another process makes some.
         """
         with alone_in(self.path, "chart"):
-            shutil.rmtree(self.path / UNFINISHED, ignore_errors=True)
-            (self.path / UNFINISHED).mkdir(exist_ok=True)
+            self.clear()
             yield
+
+    def clear(self) -> None:
+        """Deletes what killed processes left; for whoever alone makes jobs here."""
+        shutil.rmtree(self.path / UNFINISHED, ignore_errors=True)
+        (self.path / UNFINISHED).mkdir(exist_ok=True)
 
     def stored(self) -> dict[str, dict[str, Any]]:
         """Records of finished jobs by name: the values of the job, `run` and what was noted."""
@@ -109,8 +105,9 @@ class RunFolder:
         write_json(self.path / LOGS / f"{job.name}.json", {**job.values, "reason": reason})
 
     def failures(self) -> list[dict[str, Any]]:
-        """Jobs without a result: their values, and the `reason`."""
-        return [read_object(file, DAMAGED) for file in sorted((self.path / LOGS).glob("*.json"))]
+        """Jobs without a result: their values, the `reason`, and the name of the `job`."""
+        files = sorted((self.path / LOGS).glob("*.json"))
+        return [{**read_object(file, DAMAGED), "job": file.stem} for file in files]
 
 
 def stored_in(path: Path) -> dict[str, dict[str, Any]]:
@@ -126,6 +123,31 @@ def stored_in(path: Path) -> dict[str, dict[str, Any]]:
             raise InputError(f"{file} is no run of a chart; delete it to have it made again")
         found[file.stem] = record
     return found
+
+
+def take_folder(
+    file: Path,
+    settings: Mapping[str, Any],
+    holds: str = "a chart with another",
+    damaged: str = DAMAGED,
+) -> None:
+    """Makes a folder one of these settings, if it is not one already.
+
+    Args:
+        file: in the folder, which holds them.
+        holds: what is said of a folder before the first setting that is not as wanted.
+        damaged: what is said of a damaged file.
+    Raises:
+        InputError: it holds something else, or has other settings; nothing was written.
+    """
+    folder = file.parent
+    if file.is_file():
+        if other := difference(read_object(file, damaged), settings):
+            raise InputError(f"{folder} holds {holds} {other}; name a new folder with --out")
+    elif folder.exists() and (not folder.is_dir() or set(os.listdir(folder)) - {LOCK}):
+        raise InputError(f"{folder} holds something else; name a new folder with --out")
+    else:
+        write_json(file, dict(settings))
 
 
 def read_settings(path: Path) -> dict[str, Any] | None:
@@ -156,16 +178,17 @@ def _short(value: Any) -> str:
 
 
 def make_jobs(
-    jobs: Sequence[Job],
+    jobs: Sequence[Any],
     make_one: Callable[[Any, Callable[[float], None]], str],
     say: Callable[[str], None],
     show: Callable[[float], None],
     *,
-    stop: threading.Event,
+    stop: threading.Event | None = None,
     at_once: int = 1,
     done: int = 0,
+    is_wanted: Callable[[Any], bool] = lambda job: True,
 ) -> None:
-    """Makes jobs in their order, some at a time in threads.
+    """Makes jobs in their order: in this thread, or several at a time in threads of their own.
 
     Args:
         make_one: makes a job, keeps its result, and returns a line about it.
@@ -174,19 +197,25 @@ def make_jobs(
         stop: set when an error or Ctrl-C ends this, to end the jobs that are under way.
         at_once: jobs at a time.
         done: jobs that were finished before.
+        is_wanted: asked when a job's turn comes; one that is not is left out.
     """
-    shares = dict.fromkeys((job.name for job in jobs), 0.0)
+    shares = [0.0] * len(jobs)
 
-    def make(job: Job) -> str:
+    def make(number: int) -> str:
         def show_share(share: float) -> None:
-            shares[job.name] = share
-            show((done + sum(shares.values())) / (done + len(shares)))
+            shares[number] = share
+            show((done + sum(shares)) / (done + len(shares)))
 
         show_share(0.0)
-        said = make_one(job, show_share)
-        shares[job.name] = 1.0
+        said = make_one(jobs[number], show_share)
+        show_share(1.0)
         return said
 
+    wanted = (number for number, job in enumerate(jobs) if is_wanted(job))
+    if at_once == 1:
+        for number in wanted:
+            say(make(number))
+        return
     under_way: set[Future[str]] = set()
 
     def collect() -> None:
@@ -197,14 +226,15 @@ def make_jobs(
 
     with ThreadPoolExecutor(at_once) as pool:
         try:
-            for job in jobs:
+            for number in wanted:
+                under_way.add(pool.submit(make, number))
                 if len(under_way) == at_once:
                     collect()
-                under_way.add(pool.submit(make, job))
             while under_way:
                 collect()
         except BaseException:
-            stop.set()
+            if stop is not None:
+                stop.set()
             raise
 
 
@@ -246,6 +276,8 @@ class ProcessRunner:
         log = place / LOGS / f"{job.name}.log"
         status = self._wait_for(work, log, show)
         if not (work / RESULT).exists():
+            if self.stop.is_set():  # the process was told to end when this one was
+                raise KeyboardInterrupt
             raise RunFailed(_reason(work, status, log))
         result: dict[str, Any] = json.loads((work / RESULT).read_text())
         for file in (work / name for name in KEPT):

@@ -155,17 +155,6 @@ SUITES = {
 """Ordered so that each can reuse most runs of those before it."""
 
 
-def suite(name: str) -> Suite:
-    """The suite of a name.
-
-    Raises:
-        InputError: there is none.
-    """
-    if name not in SUITES:
-        raise InputError(f"there is no suite {name!r}; there are {', '.join(SUITES)}, and {ALL}")
-    return SUITES[name]
-
-
 def in_order(names: Sequence[str]) -> list[str]:
     """Names of suites, `all` among them or not, in the order of `SUITES`.
 
@@ -173,6 +162,7 @@ def in_order(names: Sequence[str]) -> list[str]:
         InputError: there is no such suite.
     """
     for name in names:
-        if name != ALL:
-            suite(name)
+        if name not in SUITES and name != ALL:
+            listed = ", ".join(SUITES)
+            raise InputError(f"there is no suite {name!r}; there are {listed}, and {ALL}")
     return [name for name in SUITES if name in names or ALL in names]

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import statistics
 from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 from leco_plugin.chart.findings.learned import Learned, learned_of
 from leco_plugin.chart.findings.representations import (
@@ -28,9 +29,14 @@ from leco_plugin.chart.findings.summary import (
 )
 from leco_plugin.chart.panels import cost_panel, title_of
 
-STEPS = Cost("steps", "steps", "")
-TRAINED = Cost("train_seconds", "trained", "s")
-STEP_SECONDS = Cost("step_seconds", "a step", "ms", 1e3)
+T = TypeVar("T")
+
+SPENT = {
+    "steps": Cost("steps", "steps", ""),
+    "trained, s": Cost("train_seconds", "trained", "s"),
+    "of which learning, s": LEARNING,
+    "ms a step": Cost("step_seconds", "a step", "ms", 1e3),
+}
 ASKED = (
     Cost("field_queries_per_ray", "field, a ray", ""),
     Cost("proposal_queries_per_ray", "proposals, a ray", ""),
@@ -60,6 +66,11 @@ def rows(header: Sequence[str], cells: Sequence[Sequence[str]]) -> str:
     """A table in Markdown."""
     lines = [header, ["---"] * len(header), *cells]
     return "\n".join(f"| {' | '.join(line)} |" for line in lines)
+
+
+def table_of(things: Sequence[T], columns: Mapping[str, Callable[[T], str]]) -> str:
+    """A row for each thing, with a cell by each column."""
+    return rows(list(columns), [[cell(one) for cell in columns.values()] for one in things])
 
 
 def number(value: float | None, scale: float = 1.0) -> str:
@@ -131,100 +142,100 @@ def table(results: Mapping[str, Any]) -> str:
 def runs_table(lines: Sequence[Line]) -> str:
     """Means of quality and medians of cost over seeds; bold is on the front of its column."""
     level = common_psnr(lines)
-    header = [
-        *("method", "seeds", "PSNR, dB", "SSIM", "LPIPS", f"s to {level:.1f} dB", "steps"),
-        *("trained, s", "of which learning, s", "ms a step"),
-        *(cost.titled for cost in COSTS),
-    ]
     fronts = {cost: cost_panel(cost, lines).front() for cost in COSTS}
-    cells = []
-    for line in lines:
-        costs = []
-        for cost in COSTS:
-            shown = number(line.median(cost))
-            costs.append(
-                f"**{shown}**" if (line.median(cost), line.psnr) in fronts[cost] else shown
-            )
-        cells.append(
-            [
-                line.name,
-                str(len(line.runs)),
-                spread(line.psnrs, ".2f", statistics.fmean),
-                *(spread([line.mean(name)], ".3f") for name in ("ssim", "lpips")),
-                number(line.seconds_to(level)),
-                *(number(line.median(one)) for one in (STEPS, TRAINED, LEARNING, STEP_SECONDS)),
-                *costs,
-            ]
-        )
-    return rows(header, cells)
+
+    def with_front(cost: Cost, line: Line) -> str:
+        is_on_front = (line.median(cost), line.psnr) in fronts[cost]
+        return f"**{_median(cost, line)}**" if is_on_front else _median(cost, line)
+
+    return table_of(
+        lines,
+        {
+            "method": lambda line: line.name,
+            "seeds": lambda line: str(len(line.runs)),
+            "PSNR, dB": lambda line: spread(line.psnrs, ".2f", statistics.fmean),
+            "SSIM": lambda line: spread([line.mean("ssim")], ".3f"),
+            "LPIPS": lambda line: spread([line.mean("lpips")], ".3f"),
+            f"s to {level:.1f} dB": lambda line: number(line.seconds_to(level)),
+            **{title: partial(_median, cost) for title, cost in SPENT.items()},
+            **{cost.titled: partial(with_front, cost) for cost in COSTS},
+        },
+    )
+
+
+def _median(cost: Cost, line: Line) -> str:
+    return number(line.median(cost))
 
 
 def versus_table(duels: Sequence[Versus]) -> str:
     """What learned occupancies gain: means of PSNR over seeds, medians of times and of ratios, and
     the least and the most."""
-    header = [
-        *("against", "seeds", "PSNR, dB", "passes its last PSNR after, s"),
-        *("sooner by, x", "renders faster by, x"),
-    ]
-    cells = [
-        [
-            f"{duel.ours} against {duel.theirs}",
-            str(len(duel.gains)),
-            spread(duel.gains, "+.2f", statistics.fmean),
-            spread(duel.passed, ".0f"),
-            spread(duel.sooner, ".2f"),
-            spread(duel.faster, ".1f"),
-        ]
-        for duel in duels
-    ]
-    return rows(header, cells)
+    return table_of(
+        duels,
+        {
+            "against": lambda duel: f"{duel.ours} against {duel.theirs}",
+            "seeds": lambda duel: str(len(duel.gains)),
+            "PSNR, dB": lambda duel: spread(duel.gains, "+.2f", statistics.fmean),
+            "passes its last PSNR after, s": lambda duel: spread(duel.passed, ".0f"),
+            "sooner by, x": lambda duel: spread(duel.sooner, ".2f"),
+            "renders faster by, x": lambda duel: spread(duel.faster, ".1f"),
+        },
+    )
 
 
 def queries_table(lines: Sequence[Line]) -> str:
     """How often which network was asked, in rendering and in all of the training: medians."""
     shown = [cost for cost in ASKED if any(line.median(cost) for line in lines)]
-    cells = [[line.name, *(number(line.median(cost)) for cost in shown)] for line in lines]
-    return rows(["positions asked of", *(cost.titled for cost in shown)], cells)
+    figures = {cost.titled: partial(_median, cost) for cost in shown}
+    return table_of(lines, {"positions asked of": lambda line: line.name, **figures})
 
 
 def failures_table(failures: Sequence[Mapping[str, Any]]) -> str:
     """Runs that ended without a result."""
-    reasons = [one["reason"].replace("|", "\\|") for one in failures]
-    cells = [
-        [one["name"], str(one["seed"]), f"failed: {reason}"]
-        for one, reason in zip(failures, reasons)
-    ]
-    return rows(["method", "seed", "reason"], cells)
+    return table_of(
+        failures,
+        {
+            "method": lambda one: one["name"],
+            "seed": lambda one: str(one["seed"]),
+            "reason": lambda one: "failed: " + one["reason"].replace("|", "\\|"),
+        },
+    )
 
 
 def occupancy_table(learned: Sequence[Learned]) -> str:
     """Occupancies: medians over the seeds in which a gate was frozen."""
-    header = ["occupancy of", "frozen", "healed", *(title for _, title, _ in OCCUPANCY)]
-    cells = []
-    for one in learned:
+
+    def frozen(one: Learned) -> str:
         late = f", {one.guided_nothing} at the end" if one.guided_nothing else ""
-        healed = "-" if one.healed is None else str(one.healed)
-        figures = [number(one.median(name), scale) for name, _, scale in OCCUPANCY]
-        cells.append([one.name, f"{len(one.facts)} of {one.seeds}{late}", healed, *figures])
-    return rows(header, cells)
+        return f"{len(one.facts)} of {one.seeds}{late}"
+
+    def median(name: str, scale: float, one: Learned) -> str:
+        return number(one.figure(name), scale)
+
+    return table_of(
+        learned,
+        {
+            "occupancy of": lambda one: one.name,
+            "frozen": frozen,
+            "healed": lambda one: "-" if one.healed is None else str(one.healed),
+            **{title: partial(median, name, scale) for name, title, scale in OCCUPANCY},
+        },
+    )
 
 
 def representations_table(held: Sequence[Representation]) -> str:
     """What each keeps for its size and its learning time, and the fronts that it is on."""
-    header = ["representation", "kB", "learned in, s", "of which beyond the field, s"]
-    header += ["volume kept at equal loss, %", "on the front of"]
-    cells = [
-        [
-            one.name,
-            number(one.median("size")),
-            spread(one.of_seeds("learn_seconds"), ".0f"),
-            spread(one.of_seeds("beyond"), ".0f"),
-            spread(one.of_seeds("kept"), ".1f"),
-            ", ".join(fronts_of(one, held)) or "-",
-        ]
-        for one in held
-    ]
-    return rows(header, cells)
+    return table_of(
+        held,
+        {
+            "representation": lambda one: one.name,
+            "kB": lambda one: number(one.median("size")),
+            "learned in, s": lambda one: spread(one.of_seeds("learn_seconds"), ".0f"),
+            "of which beyond the field, s": lambda one: spread(one.of_seeds("beyond"), ".0f"),
+            "volume kept at equal loss, %": lambda one: spread(one.of_seeds("kept"), ".1f"),
+            "on the front of": lambda one: ", ".join(fronts_of(one, held)) or "-",
+        },
+    )
 
 
 def left_out(lines: Sequence[Line]) -> list[str]:
@@ -255,10 +266,9 @@ def provenance(results: Mapping[str, Any]) -> str:
         )
     if reused := sum(bool(run.get("reused")) for run in runs):
         said += f" {reused} of the runs were made for other charts."
-    by_code: dict[str, list[str]] = {}
+    by_code: dict[str, dict[str, None]] = {}  # its names, each once and in order
     for run in runs:
-        names = by_code.setdefault(str(run.get("code")), [])
-        names += [run["name"]] if run["name"] not in names else []
+        by_code.setdefault(str(run.get("code")), {})[run["name"]] = None
     if len(by_code) > 1:
         of_each = "; ".join(f"{code}: {', '.join(names)}" for code, names in by_code.items())
         said += f" Not all of them are of the same code, nor made in turns ({of_each})."

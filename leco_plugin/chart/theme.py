@@ -77,13 +77,7 @@ def themed(theme: Theme, size: float = 12) -> Any:
 
 
 def new_figure(size: tuple[float, float], page: str = LIGHT.page, **options: Any) -> Any:
-    """A figure that needs no display.
-
-    Args:
-        size: inches.
-        page: its colour.
-        options: of matplotlib's `Figure`.
-    """
+    """A figure of a size in inches that needs no display; `options` are those of `Figure`."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 

@@ -60,9 +60,6 @@ def train_job(
 
     Args:
         config: of the contender.
-        contender, seed: what.
-        data: the scene.
-        protocol: how long, and how it is evaluated.
         folder: for the occupancy, if there is one, and for nerfstudio's own files.
         on_progress: called with the share that is done.
         looked_at: False leaves the test images, and all figures of them, to the caller.

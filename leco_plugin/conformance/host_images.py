@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from typing import TYPE_CHECKING, Any
+from unittest.mock import patch
 
 import torch
 from torch import Tensor, nn
@@ -68,6 +69,15 @@ def shaded(model: Model) -> Iterator[list[Tensor]]:
         asked.extend(sampled)
 
 
+@torch.no_grad()
+def places_asked(model: Model) -> Tensor:
+    """Positions [N, 3] at which the host asks its field about the rays of `bundle`."""
+    with shaded(model) as places:
+        model(bundle())
+    require(bool(places), "the field is asked about no sample at all")
+    return torch.cat(places)
+
+
 def positions_of(ray_samples: Any) -> Tensor:
     """Middles of nerfstudio's samples, [N, 3]."""
     positions: Tensor = ray_samples.frustums.get_positions()
@@ -86,7 +96,7 @@ def _noting(seam: GuidedEstimator | GuidedProposal, sampled: list[Tensor]) -> An
         sampled.append(rays_o[ray_indices] + rays_d[ray_indices] * middles)
         return ray_indices, t_starts, t_ends
 
-    return _instead(seam, "sampling", sampling)
+    return patch.object(seam, "sampling", sampling)
 
 
 @contextmanager
@@ -100,9 +110,11 @@ def densely(model: Model) -> Iterator[None]:
     with ExitStack() as stack:
         for module in model.modules():
             if isinstance(module, GuidedEstimator | AbstractEstimator | Estimator):
-                stack.enter_context(_instead(module, "sampling", DenseEstimator(box()).sampling))
+                stack.enter_context(
+                    patch.object(module, "sampling", DenseEstimator(box()).sampling)
+                )
             elif isinstance(module, GuidedProposal):
-                stack.enter_context(_instead(module, "forward", _all_of_each_ray))
+                stack.enter_context(patch.object(module, "forward", _all_of_each_ray))
         yield
 
 
@@ -116,16 +128,6 @@ def _all_of_each_ray(
     weights = torch.full_like(samples.frustums.starts, 1.0 / DENSE)
     levels = 1 if density_fns is None else len(density_fns)
     return samples, [weights] * levels, [samples] * levels
-
-
-@contextmanager
-def _instead(module: nn.Module, name: str, method: Any) -> Iterator[None]:
-    """While this lasts, a module has another method."""
-    setattr(module, name, method)
-    try:
-        yield
-    finally:
-        delattr(module, name)
 
 
 CHANNELS = {"rgb": 3, "depth": 1, "accumulation": 1}
@@ -248,10 +250,7 @@ def shades_only_what_is_kept(case: HostCase) -> None:
     require(bool((leaves - enters > CHORD).all()), "the kit's rays do not all cross its slab")
     for training, moved in ((False, False), (True, False), (False, True)):
         model = case.shared(SLAB, moved).train(training)
-        with torch.no_grad(), shaded(model) as places:
-            model(bundle())
-        require(bool(places), "the field is asked about no sample at all")
-        positions = torch.cat(places)
+        positions = places_asked(model)
         depths = SLAB.depth(positions)
         met = _rays_through(positions[depths > 0.0], rays.origins, rays.directions)
         bare = int((~met).sum())

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import torch
 from torch import Tensor
 
-from leco_plugin.conformance.host_images import densely, rendered, shaded
+from leco_plugin.conformance.host_images import densely, places_asked, rendered
 from leco_plugin.conformance.hosts import HostCase, batch, build, bundle, callbacks, loss_of
 from leco_plugin.conformance.rules import checks, require
 from leco_plugin.conformance.samplers import on_two_ranks, reloaded
@@ -30,20 +30,15 @@ GUIDE = "leco_guide."
 def samples_shift_in_training(case: HostCase) -> None:
     """The field is asked at other places in each step."""
     model = case.shared().train()
-    one, other = (_places(model, seed) for seed in (1, 2))
+    places = []
+    for seed in (1, 2):
+        torch.manual_seed(seed)
+        places.append(places_asked(model))
+    one, other = places
     require(
         one.shape != other.shape or not one.equal(other),
         "two training steps ask the field at the same places",
     )
-
-
-@torch.no_grad()
-def _places(model: Model, seed: int) -> Tensor:
-    torch.manual_seed(seed)
-    with shaded(model) as places:
-        model(bundle())
-    require(bool(places), "the field is asked about no sample at all")
-    return torch.cat(places)
 
 
 @checks("teaches-the-host-alone", "host")

@@ -5,7 +5,8 @@ from __future__ import annotations
 import math
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -32,6 +33,15 @@ class Clock:
         self.seconds += passed
         self._started = None
         return passed
+
+    @contextmanager
+    def running(self) -> Iterator[None]:
+        """Counts what is done meanwhile, also if it fails."""
+        self.start()
+        try:
+            yield
+        finally:
+            self.stop()
 
     def now(self) -> float:
         """Seconds so far, the step under way included."""
@@ -84,19 +94,6 @@ class Budget:
         if self.steps is not None:
             used = max(used, steps / self.steps)
         return min(1.0, used)
-
-
-def timed(function: Callable[..., object], clock: Clock) -> Callable[..., object]:
-    """The same function, its time counted by a clock."""
-
-    def run(*args: object, **kwargs: object) -> object:
-        clock.start()
-        try:
-            return function(*args, **kwargs)
-        finally:
-            clock.stop()
-
-    return run
 
 
 def peak_process_bytes() -> int:

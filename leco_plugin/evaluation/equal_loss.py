@@ -8,7 +8,7 @@ count as space: nothing teaches a gate or a grid elsewhere, and no ray asks.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import partial
 from typing import Any
 
@@ -20,11 +20,10 @@ from leco_plugin.evaluation.field_grids import (
     FieldGrids,
     density_of,
     fits_memory,
-    in_parts,
     looked_up,
     plain_and_dilated,
 )
-from leco_plugin.evaluation.inspection import ViewBox, whole_box
+from leco_plugin.evaluation.inspection import ViewBox, in_parts, whole_box
 from leco_plugin.learning.calibration import CalibrationConfig
 from leco_plugin.learning.dense import dense_reference, evaluating, in_chunks
 from leco_plugin.models.gate import occupancy_from_logits
@@ -44,6 +43,8 @@ CELLS = 64
 """Along an axis of the mapped cube: a cell is reached if it holds a candidate of those rays."""
 MOST_ON_CPU = 2e8
 """Densities evaluated for one grid: about three minutes of two cores."""
+Resolution = int | tuple[int, int, int]
+"""Cells of a grid along all axes, or along each."""
 SPARED = 0.1
 """Share of the loss for which cells of a coarse grid are taken as empty in finer ones."""
 
@@ -81,7 +82,7 @@ def kept_shares(
 def at_equal_loss(
     mixture: Mixture,
     datamanager: Any,
-    grids: Sequence[int | tuple[int, int, int]] = (),
+    grids: Sequence[Resolution] = (),
     until_as_little: bool = False,
     others: Mapping[str, Callable[[Tensor], Tensor]] | None = None,
     config: CalibrationConfig = CALIBRATION,
@@ -94,9 +95,7 @@ def at_equal_loss(
     Args:
         mixture: whose gate is frozen; it is left as it was.
         datamanager: with held-out training pixels.
-        grids: cells along each axis of the grids, one number for all three or one for each.
         until_as_little: whether to end with the first grid that keeps as little as the gate.
-        config: how many rays.
         others: further representations by name, each a score of mapped positions [N, 3]: [N].
     Returns:
         `lost_surface_mass`; `reached_volume`, the share of the scene's box that rays reach;
@@ -114,40 +113,22 @@ def at_equal_loss(
             raise ValueError("no surface is seen by the held-out rays, so that none can be lost")
         taught = candidates_of(mixture, rays_of_photographs(datamanager, TAUGHT_RAYS))
         volume = reached_volume(mixture, taught, VOLUME_POINTS)
-
-        def kept_by(of_rays: Tensor, of_volume: Tensor) -> dict[str, float]:
-            kept = kept_shares(weights, of_rays, of_volume, LOST_SURFACE_MASS)
-            return {"kept_reached_volume": round(kept[0], 5), "kept_candidates": round(kept[1], 5)}
-
+        kept_by = partial(_kept_by, weights)
         kept = kept_by(occupancies, in_parts(partial(_occupancy, mixture), volume))
         beside = {
             name: kept_by(in_parts(score, mapped), in_parts(score, volume))
             for name, score in (others or {}).items()
         }
-        rows: list[dict[str, Any]] = []
-        left_out = []
-        filling = _grids_of(mixture, taught, mapped, weights) if grids else None
-        for resolution in grids:
-            assert filling is not None
-            sizes = (resolution,) * 3 if isinstance(resolution, int) else resolution
-            scores = filling.fill(sizes) if fits_memory(math.prod(sizes)) else None
+        rows, left_out = [], []
+        for row, scores in _grids_of(mixture, grids, taught, mapped, weights):
             if scores is None:
-                left_out.append(resolution)
+                left_out.append(row["resolution"])
                 continue
-            both = [
-                {"dilated": bool(dilated), **kept_by(*scored)}
-                for dilated, scored in enumerate(
-                    plain_and_dilated(scores, filling.box, mapped, volume)
-                )
-            ]
-            row = {
-                "resolution": resolution,
-                "bytes": math.ceil(math.prod(sizes) / 8),
-                "update_seconds": round(filling.clock.seconds, 3),
-            }
-            rows.append(row | min(both, key=lambda one: one["kept_reached_volume"]))
-            least = rows[-1]["kept_reached_volume"]
-            if until_as_little and least <= kept["kept_reached_volume"]:
+            pairs = plain_and_dilated(scores, mapped_box(mixture), mapped, volume)
+            both = [{"dilated": bool(i), **kept_by(*pair)} for i, pair in enumerate(pairs)]
+            least = min(both, key=lambda one: one["kept_reached_volume"])
+            rows.append(row | least)
+            if until_as_little and least["kept_reached_volume"] <= kept["kept_reached_volume"]:
                 break
     return {
         "lost_surface_mass": LOST_SURFACE_MASS,
@@ -159,8 +140,22 @@ def at_equal_loss(
     }
 
 
-def _grids_of(mixture: Mixture, taught: Tensor, mapped: Tensor, weights: Tensor) -> FieldGrids:
-    """Grids of the model's field that hear of its density at the places `taught` [M, 3]."""
+def _kept_by(weights: Tensor, of_rays: Tensor, of_volume: Tensor) -> dict[str, float]:
+    volume, candidates = kept_shares(weights, of_rays, of_volume, LOST_SURFACE_MASS)
+    return {"kept_reached_volume": round(volume, 5), "kept_candidates": round(candidates, 5)}
+
+
+def _grids_of(
+    mixture: Mixture,
+    resolutions: Sequence[Resolution],
+    taught: Tensor,
+    mapped: Tensor,
+    weights: Tensor,
+) -> Iterator[tuple[dict[str, Any], Tensor | None]]:
+    """Facts and scores of grids of the mixture's field, which hear of its density at the places
+    `taught` [M, 3]; without scores where there is no memory or no time for them."""
+    if not resolutions:
+        return
     box = mapped_box(mixture)
 
     def floor_of(scores: Tensor) -> float:
@@ -169,7 +164,18 @@ def _grids_of(mixture: Mixture, taught: Tensor, mapped: Tensor, weights: Tensor)
 
     most = MOST_ON_CPU if mixture.device.type == "cpu" else math.inf
     known = taught, density_of(mixture, taught)
-    return FieldGrids(partial(density_of, mixture), box, known, floor_of, most)
+    filling = FieldGrids(partial(density_of, mixture), box, known, floor_of, most)
+    for resolution in resolutions:
+        sizes = (resolution,) * 3 if isinstance(resolution, int) else resolution
+        scores = filling.fill(sizes) if fits_memory(math.prod(sizes)) else None
+        yield (
+            {
+                "resolution": resolution,
+                "bytes": math.ceil(math.prod(sizes) / 8),
+                "update_seconds": round(filling.clock.seconds, 3),
+            },
+            scores,
+        )
 
 
 def _measured(
@@ -247,12 +253,12 @@ def rays_of_photographs(datamanager: Any, count: int, seed: int = 0) -> RayBundl
 
 
 @torch.no_grad()
-def candidates_of(mixture: Mixture, bundle: RayBundle, rays_at_once: int = 1024) -> Tensor:
+def candidates_of(mixture: Mixture, bundle: RayBundle) -> Tensor:
     """Mapped middles [M, 3] of all candidates of rays, backdrops left out."""
     bundle = bundle.to(mixture.device)
     rays = mixture.rays(bundle.origins, bundle.directions, None)
     pieces = []
-    for some in in_chunks(rays, rays_at_once):
+    for some in in_chunks(rays, CALIBRATION.rays_at_once):
         intervals = mixture.with_backdrops(some, mixture.candidates(some))
         middles = mapped_middles(mixture.region.space, some, intervals)
         pieces.append(middles[~backdrop_of(intervals, some)])

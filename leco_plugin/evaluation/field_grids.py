@@ -15,7 +15,7 @@ from torch import Tensor
 from torch.nn.functional import max_pool3d
 
 from leco_plugin.evaluation.clock import Clock
-from leco_plugin.evaluation.inspection import ViewBox
+from leco_plugin.evaluation.inspection import ViewBox, in_parts
 from leco_plugin.models.mixture import Mixture
 from leco_plugin.models.rendering import gate_values_and_routes
 from leco_plugin.occupancy import gate_precision
@@ -25,7 +25,6 @@ FEWEST_PROBES, PROBES_ALONG = 8, 2048
 """Densities evaluated at random places of a cell; the largest is its score. More in coarse cells,
 of which a surface may fill a corner."""
 CELLS_AT_ONCE = 1 << 18
-POINTS_AT_ONCE = 1 << 16
 BYTES_A_CELL = 16
 """Of memory while a grid is filled, about."""
 ASK_ALL = 64
@@ -130,7 +129,6 @@ def filled(
     density: Density,
     box: ViewBox,
     asked: Tensor,
-    seed: int = 0,
     known: tuple[Tensor, Tensor] | None = None,
 ) -> Tensor:
     """Scores of the cells of a grid: [nx, ny, nz]; zero where they are neither asked nor known.
@@ -144,7 +142,7 @@ def filled(
     device = box.low.device
     scores = torch.zeros(asked.shape, device=device)
     counts = torch.tensor(asked.shape, device=device)
-    generator = torch.Generator(device).manual_seed(seed)
+    generator = torch.Generator(device).manual_seed(0)
     for cells in asked.nonzero().split(CELLS_AT_ONCE):
         best = torch.zeros(len(cells), device=device)
         for _ in range(probes_in_a_cell(asked.shape)):
@@ -202,8 +200,3 @@ def density_of(mixture: Mixture, mapped: Tensor) -> Tensor:
         return sigmas
 
     return in_parts(part_of, mapped)
-
-
-def in_parts(function: Density, mapped: Tensor) -> Tensor:
-    """A function of positions [N, 3], some at a time: [N]."""
-    return torch.cat([function(part) for part in mapped.split(POINTS_AT_ONCE)])

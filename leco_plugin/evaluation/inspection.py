@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -11,8 +12,7 @@ from torch import Tensor
 
 from leco_plugin.occupancy import Occupancy
 
-WALL = 1e5
-"""A side of the report's `aabb` beyond this is no wall."""
+POINTS_AT_ONCE = 1 << 16
 
 
 @dataclass(frozen=True)
@@ -94,10 +94,13 @@ def numbers(value: Any) -> list[float]:
 def query(occupancy: Occupancy, positions: Tensor) -> Tensor:
     """o(x) of positions [..., 3] in pieces: [...] float32 on the CPU."""
     device = occupancy.threshold_value.device
-    parts = [
-        occupancy.query(part.to(device)).cpu() for part in positions.reshape(-1, 3).split(1 << 16)
-    ]
-    return torch.cat(parts).reshape(positions.shape[:-1])
+    values = in_parts(lambda part: occupancy.query(part.to(device)).cpu(), positions.reshape(-1, 3))
+    return values.reshape(positions.shape[:-1])
+
+
+def in_parts(function: Callable[[Tensor], Tensor], positions: Tensor) -> Tensor:
+    """A function of positions [N, 3], some at a time: [N]."""
+    return torch.cat([function(part) for part in positions.split(POINTS_AT_ONCE)])
 
 
 def exposed(kept: Tensor, beyond: bool = False) -> Tensor:
@@ -107,10 +110,5 @@ def exposed(kept: Tensor, beyond: bool = False) -> Tensor:
         beyond: whether what lies beyond the cells counts as kept.
     """
     skipped = torch.nn.functional.pad(~kept, (1, 1) * 3, value=not beyond)
-    found = torch.zeros_like(kept)
-    for axis in range(3):
-        for side in (0, 2):
-            window = [slice(1, -1)] * 3
-            window[axis] = slice(side, side - 2 or None)
-            found |= skipped[tuple(window)]
-    return kept & found
+    shifts = [skipped.roll(step, axis) for axis in range(3) for step in (-1, 1)]
+    return kept & torch.stack(shifts).any(dim=0)[1:-1, 1:-1, 1:-1]

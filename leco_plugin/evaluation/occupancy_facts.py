@@ -8,6 +8,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from leco_plugin.evaluation.inspection import in_parts
 from leco_plugin.evaluation.report import finite_or_null
 from leco_plugin.occupancy import CALIBRATED_AT, Occupancy
 from leco_plugin.scenes.city.city import DESCRIPTION
@@ -39,9 +40,7 @@ def occupancy_facts(
     """Sizes, calibration, and the comparison with the exact scene: JSON values.
 
     Args:
-        occupancy: in the coordinates of `manager`.
-        file: that holds it.
-        manager: nerfstudio's data manager of the scene.
+        occupancy: in the coordinates of `manager`, from `file`.
         truth: the exact scene; without one its figures are None.
     """
     report = occupancy.report
@@ -105,8 +104,7 @@ def free_points(
 def kept(occupancy: Occupancy, points: Tensor) -> Tensor:
     """Whether each of the positions [N, 3] is kept: bool [N] on the CPU."""
     device = occupancy.threshold_value.device
-    parts = [occupancy.occupied(part.to(device)).cpu() for part in points.split(1 << 16)]
-    return torch.cat(parts) if parts else torch.zeros(0, dtype=torch.bool)
+    return in_parts(lambda part: occupancy.occupied(part.to(device)).cpu(), points)
 
 
 def _share(mask: Tensor) -> float | None:

@@ -45,8 +45,7 @@ def draw(occupancy: Occupancy, path: str | Path, cameras: Tensor | None = None) 
     """Draws two horizontal and two vertical slices of o(x), and the kept points.
 
     Args:
-        occupancy: on any device.
-        path: of the picture; the ending chooses its kind.
+        path: its ending chooses the kind of the picture.
         cameras: [C, 3] camera centres, scene units; those of the report by default.
     Raises:
         OSError, ValueError: the picture cannot be written there, or is of no known kind.
@@ -218,11 +217,9 @@ def _title(occupancy: Occupancy, cameras: Tensor) -> str:
 
 
 def draw_history(occupancy: Occupancy, folder: Path, path: Path) -> Path:
-    """Draws how an occupancy was learned.
+    """Draws how an occupancy was learned, from the history in the folder of its run.
 
     Args:
-        occupancy: as it became.
-        folder: of the run, with its history.
         path: of the picture. A .gif moves; others show the first look, two between, and the last.
     Raises:
         InputError: the run has no history, or one of another gate.

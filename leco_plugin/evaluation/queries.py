@@ -10,52 +10,33 @@ from __future__ import annotations
 import functools
 import inspect
 import math
+from collections import Counter
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Any
 
 from nerfstudio.fields.base_field import Field
 from nerfstudio.fields.density_fields import HashMLPDensityField
 from torch import Tensor, nn
 
-from leco_plugin.evaluation.clock import Clock, timed
+from leco_plugin.evaluation.clock import Clock
 from leco_plugin.models.field import HMoEField
 from leco_plugin.occupancy import Occupancy
 
-Kind = Literal["field", "proposal", "learning", "gate"]
-
-
-@dataclass
-class FieldQueries:
-    """Positions evaluated so far."""
-
-    field: int = 0
-    """By the field that is rendered."""
-    proposal: int = 0
-    """By proposal networks."""
-    learning: int = 0
-    """By another field, which learned the occupancy."""
-    gate: int = 0
-    """By a frozen gate, where its cell cache gave no answer."""
-
-    def since(self, before: FieldQueries) -> FieldQueries:
-        """The difference to an earlier count."""
-        return FieldQueries(**{k: v - getattr(before, k) for k, v in vars(self).items()})
-
-    def copy(self) -> FieldQueries:
-        """The count as it is now."""
-        return FieldQueries(**vars(self))
+KINDS = ("field", "proposal", "learning", "gate")
+"""Who is asked: the field that is rendered; proposal networks; another field, which learned the
+occupancy; a frozen gate, where its cell cache gave no answer."""
 
 
 @contextmanager
-def counted(model: nn.Module) -> Iterator[FieldQueries]:
-    """Counts the positions that a model's fields, and those that learn for it, evaluate meanwhile.
+def counted(model: nn.Module) -> Iterator[Counter[str]]:
+    """Counts by `KINDS` the positions that a model's fields, and those that learn for it, evaluate
+    meanwhile.
 
     A model keeps its fields as `nn.Module`s: nerfstudio's are asked through `get_density`, others
     through `density` or, without one, by being called.
     """
-    count = FieldQueries()
+    count = Counter(dict.fromkeys(KINDS, 0))
     own = getattr(getattr(model, "mixture", model), "field", None)
     fields: list[nn.Module] = [module for module in model.modules() if isinstance(module, Field)]
     if isinstance(own, nn.Module) and own not in fields:
@@ -65,7 +46,7 @@ def counted(model: nn.Module) -> Iterator[FieldQueries]:
     of_model = {id(field) for field in fields}
     asking = False
 
-    def kind(field: nn.Module) -> Kind:
+    def kind(field: nn.Module) -> str:
         if isinstance(field, Occupancy):
             return "gate"
         if id(field) not in of_model:
@@ -80,8 +61,7 @@ def counted(model: nn.Module) -> Iterator[FieldQueries]:
                 return method(field, positions, *args, **kwargs)
             asking = True
             try:
-                name = kind(field)
-                setattr(count, name, getattr(count, name) + number_of(positions))
+                count[kind(field)] += number_of(positions)
                 return method(field, positions, *args, **kwargs)
             finally:
                 asking = False
@@ -129,7 +109,6 @@ class GridUpdates:
 
     def _watched(self, update: Callable[..., Any]) -> Callable[..., Any]:
         signature = inspect.signature(update)
-        counted_update = timed(update, self.clock)
 
         def run(*args: Any, **kwargs: Any) -> Any:
             asked = signature.bind(*args, **kwargs)
@@ -137,6 +116,7 @@ class GridUpdates:
             step, until = (asked.arguments.get(name) for name in ("step", "warmup_steps"))
             if step is not None and until is not None:
                 self.warming_up = step < until
-            return counted_update(*args, **kwargs)
+            with self.clock.running():
+                return update(*args, **kwargs)
 
         return run

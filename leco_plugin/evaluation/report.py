@@ -32,10 +32,8 @@ def write_json(path: Path, value: Any) -> None:
 def read_object(file: Path, else_say: str) -> dict[str, Any]:
     """The JSON object in a file.
 
-    Args:
-        else_say: what is said of a damaged file, and what to do.
     Raises:
-        InputError: the file is damaged.
+        InputError: the file is damaged: its name, and `else_say`.
     """
     try:
         found = json.loads(file.read_text())
@@ -85,11 +83,7 @@ def describe_code() -> dict[str, Any]:
 
 
 def made_by(code: dict[str, Any]) -> dict[str, Any]:
-    """What made a stored figure, and today's date.
-
-    Args:
-        code: `describe_code()`, called before anything was measured.
-    """
+    """What made a stored figure, and today's date. `code` is from before the measurement."""
     return {"code": code, "date": datetime.date.today().isoformat()}
 
 

@@ -58,7 +58,7 @@ class Guide(nn.Module):
         without_proposals: whether the host's proposal networks are gone.
         kept: samples that a packed sampler kept when it was last asked in training.
         watched: what is known of the price of skipping; travels with a checkpoint.
-        first_density: with which the host's field began, None for its own; see `opaque_start`.
+        first_density: with which the host's field began, None for its own; see `first_steps`.
         frame: [3, 4] takes positions of the host to those of the occupancy: a rotation times a
             scale, and a translation.
         backdrops: those that training has seen, in the occupancy's coordinates.

@@ -78,11 +78,14 @@ class HostWatch:
             now = f"its threshold is {guide.the_occupancy().threshold:.4f} now"
             say(f"step {step}: skipping is within its price bounds; {now}")
 
+    def prepare(self) -> None:
+        """See `price_watch.PriceSource`: the calibrated threshold is followed from now on."""
+        self.ended_probation = end_probation(self.guide)
+
     @torch.no_grad()
     def excesses(self, seed: int) -> dict[str, Tensor]:
-        """See `price_watch.Renderer`; of the calibrated threshold, followed from now on."""
+        """See `price_watch.PriceSource`."""
         guide, host, config = self.guide, self.host, self.config
-        self.ended_probation = end_probation(guide)
         bundle, truth = held_out_bundle(
             self.pipeline.datamanager, config.recheck_rays, seed, "recheck"
         )
@@ -99,7 +102,7 @@ class HostWatch:
         return {"the image price": excess}
 
     def count_rays(self, limit: int) -> float:
-        """See `price_watch.Renderer`."""
+        """See `price_watch.PriceSource`."""
         return count_held_out(self.pipeline.datamanager, limit)
 
     def _errors(self, bundle: Any, truth: Tensor) -> Tensor:

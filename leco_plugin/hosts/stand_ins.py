@@ -36,6 +36,11 @@ class _StandIn(nn.Module):
         self._guide = (guide,)
         self._built: tuple[Any, tuple[nn.Module, ...]] = (None, ())
 
+    @property
+    def guide(self) -> Guide:
+        """Of the host."""
+        return self._guide[0]
+
     def _build(self, guide: Guide) -> nn.Module:
         raise NotImplementedError
 
@@ -48,7 +53,7 @@ class _StandIn(nn.Module):
     @property
     def sampler(self) -> nn.Module:
         """The sampler behind this; its mode follows the host's."""
-        (guide,) = self._guide
+        guide = self.guide
         key = (guide.version, guide.frame.device)
         if self._built[0] != key:
             self._built = (key, (self._build(guide).to(guide.frame.device),))
@@ -56,8 +61,7 @@ class _StandIn(nn.Module):
 
 
 _SAMPLING = inspect.signature(Estimator.sampling)
-
-
+_RAYS = ("self", "rays_o", "rays_d")
 _DEFAULTS = {name: parameter.default for name, parameter in _SAMPLING.parameters.items()}
 
 
@@ -120,11 +124,10 @@ class GuidedEstimator(_StandIn):
 
     @functools.wraps(Estimator.sampling)
     def sampling(self, rays_o: Tensor, rays_d: Tensor, *args: Any, **kwargs: Any) -> Any:
-        (guide,) = self._guide
+        guide = self.guide
         estimator: Any = self.dense if guide.dense else self.sampler
-        given = dict(_SAMPLING.bind(self, rays_o, rays_d, *args, **kwargs).arguments)
-        for name in ("self", "rays_o", "rays_d"):
-            del given[name]
+        bound = _SAMPLING.bind(self, rays_o, rays_d, *args, **kwargs).arguments
+        given = {name: value for name, value in bound.items() if name not in _RAYS}
         options = uncropped = self._with_an_end(rays_o, rays_d, given)
         crop: tuple[Tensor | None, Tensor | None] = (None, None)
         if guide.cropped:
@@ -148,9 +151,8 @@ class GuidedEstimator(_StandIn):
     @property
     def dense(self) -> nn.Module:
         """Keeps every candidate that the sampler behind this asks about."""
-        (guide,) = self._guide
         box = self.sampler.bounds() if isinstance(self.sampler, Estimator) else None
-        return build_estimator("dense", aabb=box).to(guide.frame.device).train(self.training)
+        return build_estimator("dense", aabb=box).to(self.guide.frame.device).train(self.training)
 
     def _with_an_end(self, rays_o: Tensor, rays_d: Tensor, given: dict[str, Any]) -> dict[str, Any]:
         """The options of `sampling`; rays that would go on for ever end at the host's box.
@@ -166,8 +168,7 @@ class GuidedEstimator(_StandIn):
 
     def _is_endless(self) -> bool:
         """Whether the occupancy goes on into the distance."""
-        (guide,) = self._guide
-        return guide.the_occupancy().space.kind == "contraction"
+        return self.guide.the_occupancy().space.kind == "contraction"
 
     def update_every_n_steps(self, *args: Any, **kwargs: Any) -> None:
         """Called by hosts before each training step; a frozen gate has nothing to update."""
@@ -177,18 +178,16 @@ class GuidedEstimator(_StandIn):
     @property
     def aabbs(self) -> Tensor:
         """Boxes of the sampler behind this, in the host's coordinates, [n_boxes, 6]."""
-        (guide,) = self._guide
         boxes: Tensor = cast(Any, self.sampler).aabbs
-        if guide.same_frame():
+        if self.guide.same_frame():
             return boxes
-        back = inverse(guide.frame)
+        back = inverse(self.guide.frame)
         return torch.stack([box_around(box, back) for box in boxes])
 
     @property
     def occs(self) -> Tensor:
         """o at the centres of the cells of `aabbs`, [n_boxes * cells]."""
-        (guide,) = self._guide
-        sampler: Any = self.sampler
+        guide, sampler = self.guide, cast(Any, self.sampler)
         if guide.same_frame():
             return cast(Tensor, sampler.occs)
         cells = cell_centers(self.aabbs, sampler.resolution)
@@ -198,11 +197,10 @@ class GuidedEstimator(_StandIn):
     @property
     def binaries(self) -> Tensor:
         """Decisions at the centres of the cells of `aabbs`, bool [n_boxes, n, n, n]."""
-        (guide,) = self._guide
         sampler: Any = self.sampler
-        if guide.same_frame():
+        if self.guide.same_frame():
             return cast(Tensor, sampler.binaries)
-        occupied = self.occs >= guide.followed().threshold
+        occupied = self.occs >= self.guide.followed().threshold
         return occupied.view(-1, *sampler.resolution.tolist())
 
     def __getattr__(self, name: str) -> Any:
@@ -232,7 +230,7 @@ class GuidedProposal(_StandIn, Sampler):
         Rendered rays that meet nothing occupied, and whose backdrop training has never seen, have
         samples without length: the field has learned nothing there.
         """
-        (guide,) = self._guide
+        guide = self.guide
         made, guide.without_backdrop = self.sampler(*args, **kwargs), None
         if self.training or not guide.needs_occupancy:
             return made

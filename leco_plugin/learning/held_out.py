@@ -62,6 +62,9 @@ class HeldOut:
             rendering = dense_rendering(self.mixture, rays, truth, config.rays_at_once)
             return calibrate(*rendering, config, below=below, missed_only=True)
 
+    def prepare(self) -> None:
+        """See `price_watch.PriceSource`."""
+
     def excesses(self, seed: int) -> dict[str, Tensor]:
         """See `price_watch.PriceSource`.
 

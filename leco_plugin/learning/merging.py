@@ -82,20 +82,22 @@ def find_unneeded(
         out: list[tuple[int, torch.nn.Module]] = []
         dropped: list[Trial] = []
         refused = None
-        while int(experts.left.sum()) > 1 and refused is None:
-            held = shares[1:].masked_fill(~experts.left.cpu(), torch.inf)
-            expert = int(held.argmin()) + 1
-            share = float(shares[expert])
-            out.append((expert, experts.drop(expert)))
-            shares_without, error = _surface_and_error(mixture, kept, truths)
-            price = price_db(float(error), float(before), EXACT)
-            if price <= bound:
-                dropped.append(Trial(expert, share, price))
-                shares = shares_without
-            else:
-                refused = Trial(expert, share, price)
-        for expert, module in out:
-            experts.put_back(expert, module)
+        try:
+            while int(experts.left.sum()) > 1 and refused is None:
+                held = shares[1:].masked_fill(~experts.left.cpu(), torch.inf)
+                expert = int(held.argmin()) + 1
+                share = float(shares[expert])
+                out.append((expert, experts.drop(expert)))
+                shares_without, error = _surface_and_error(mixture, kept, truths)
+                price = price_db(float(error), float(before), EXACT)
+                if price <= bound:
+                    dropped.append(Trial(expert, share, price))
+                    shares = shares_without
+                else:
+                    refused = Trial(expert, share, price)
+        finally:
+            for expert, module in out:
+                experts.put_back(expert, module)
     return Merging(dropped, refused)
 
 

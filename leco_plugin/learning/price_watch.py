@@ -60,6 +60,9 @@ class Evidence(NamedTuple):
 class PriceSource(Protocol):
     """Renders held-out rays with and without skipping, and leaves what it renders as it was."""
 
+    def prepare(self) -> None:
+        """Called before a measurement in every process; only the first one measures."""
+
     def excesses(self, seed: int) -> dict[str, Tensor]:
         """By how much rays [R] are beyond the bound of each price, by its name: above 0 is too
         much."""
@@ -81,7 +84,7 @@ class PriceWatch:
 
     Args:
         state: what is known so far; changed in place.
-        renderer: of what is guided.
+        source: renders what is guided.
         config: when to measure.
         device: of the process.
     """
@@ -134,6 +137,7 @@ class PriceWatch:
     @torch.no_grad()
     def _measure(self, step: int) -> Finding:
         state, started = self.state, time.monotonic()
+        self.source.prepare()
         state.evidence = from_first(self._evidence, self.device)
         state.rechecks += 1
         seconds, a_step = time.monotonic() - started, self.seconds / self.steps

@@ -15,8 +15,14 @@ from torch import Tensor, nn
 
 from leco_plugin.samplers.boxes import checked_box, intersect_box
 from leco_plugin.samplers.marching import NearFn, OccupiedFn, Samples, march
+from leco_plugin.samplers.packed import (
+    render_transmittance_from_alpha,
+    render_transmittance_from_density,
+)
 from leco_plugin.samplers.rays import March, Rays, check_rays
-from leco_plugin.samplers.visibility import SampleFn, prune
+
+SampleFn = Callable[[Tensor, Tensor, Tensor], Tensor]
+"""t_starts [N], t_ends [N], ray_indices [N] to densities or opacities [N]."""
 
 DensityFn = Callable[[Tensor], Tensor]
 """Positions [N, 3] to densities [N] or [N, 1]."""
@@ -108,19 +114,11 @@ class Estimator(nn.Module):
         rule = March(render_step_size, cone_angle)
         if stratified:
             rays = rays.shifted(torch.rand_like(rays.t_mins) * render_step_size)
-        asked = sigma_fn is not None or alpha_fn is not None
         samples = self.march(rays, rule)
-        if not asked or (early_stop_eps <= 0.0 and alpha_thre <= 0.0):
+        if early_stop_eps <= 0.0 and alpha_thre <= 0.0:
             return samples
-        return prune(
-            samples,
-            len(rays_o),
-            sigma_fn=sigma_fn,
-            alpha_fn=alpha_fn,
-            early_stop_eps=early_stop_eps,
-            alpha_thre=alpha_thre,
-            alpha_cap=self.alpha_cap,
-        )
+        limits = (early_stop_eps, alpha_thre, self.alpha_cap)
+        return prune(samples, len(rays_o), sigma_fn, alpha_fn, *limits)
 
     def _rays(
         self,
@@ -153,6 +151,55 @@ class Estimator(nn.Module):
             return rays
         t_enters, t_leaves = intersect_box(rays_o, rays_d, bounds.to(rays_o))
         return rays._replace(t_maxs=t_maxs.minimum(t_leaves), t_enters=t_enters)
+
+
+@torch.no_grad()
+def prune(
+    samples: Samples,
+    n_rays: int,
+    sigma_fn: SampleFn | None = None,
+    alpha_fn: SampleFn | None = None,
+    early_stop_eps: float = 1e-4,
+    alpha_thre: float = 0.0,
+    alpha_cap: Callable[[Tensor], Tensor] | None = None,
+) -> Samples:
+    """Samples with T >= early_stop_eps and alpha >= alpha_thre, in the same order.
+
+    All are asked at once, as nerfacc does; without a function to ask, all are kept.
+
+    Args:
+        samples: as `march` returns them.
+        sigma_fn, alpha_fn: as of `Estimator.sampling`.
+        alpha_cap: keeps `alpha_thre` from rejecting everything, see `Estimator.alpha_cap`.
+
+    Raises:
+        ValueError: a function's answer is not one number for each sample.
+    """
+    ray_indices, t_starts, t_ends = samples
+    query = alpha_fn if sigma_fn is None else sigma_fn
+    if query is None or ray_indices.numel() == 0:
+        return samples
+    answers = query(t_starts, t_ends, ray_indices)
+    if answers.shape != t_starts.shape:
+        raise ValueError(
+            f"sigma_fn or alpha_fn must answer {list(t_starts.shape)}, got {list(answers.shape)}"
+        )
+    if sigma_fn is None:
+        trans = render_transmittance_from_alpha(answers, ray_indices=ray_indices, n_rays=n_rays)
+        alphas = answers
+    else:
+        trans, alphas = render_transmittance_from_density(
+            t_starts, t_ends, answers, ray_indices=ray_indices, n_rays=n_rays
+        )
+    visible = trans >= early_stop_eps
+    if alpha_thre > 0.0:
+        threshold = alphas.new_tensor(alpha_thre)
+        if alpha_cap is not None:
+            threshold = threshold.minimum(alpha_cap(alphas).to(threshold))
+        visible &= alphas >= threshold
+    left = visible.nonzero()[:, 0]
+    ray_indices, t_starts, t_ends = (tensor.index_select(0, left) for tensor in samples)
+    return ray_indices, t_starts, t_ends
 
 
 def densities_of_samples(density_fn: DensityFn, rays_o: Tensor, rays_d: Tensor) -> SampleFn:

@@ -24,7 +24,7 @@ from torch import Tensor
 from leco_plugin.samplers import packed
 from leco_plugin.samplers.boxes import intersect_box, lookup
 from leco_plugin.samplers.edges import candidate_edges
-from leco_plugin.samplers.marching import March, Rays, march, number
+from leco_plugin.samplers.marching import March, OccupiedFn, Rays, Samples, march, number
 
 if TYPE_CHECKING:
     from nerfacc import RayIntervals, RaySamples
@@ -146,17 +146,14 @@ def traverse_grids(
 ) -> tuple[RayIntervals, RaySamples] | tuple[RayIntervals, RaySamples, Tensor]:
     """March rays through nested grids (nerfacc's function of that name).
 
-    With a constant step the samples are nerfacc's. With a cone angle nerfacc keeps the step it had
-    on entering an empty cell until it leaves it, so that samples behind empty space depend on the
-    grid; here the step always grows with distance, as in the rule that nerfacc documents.
+    With a constant step the samples are nerfacc's. With a cone angle nerfacc does not let the step
+    grow within an empty cell; here it always grows, as in the rule that nerfacc documents.
 
     Args:
         rays_o, rays_d: [n_rays, 3].
         binaries: bool [levels, nx, ny, nz].
         aabbs: boxes of the levels, each twice as wide as the one before, [levels, 6].
         near_planes, far_planes: where rays begin and end, [n_rays].
-        step_size: shortest step, > 0.
-        cone_angle: growth of the step with distance.
         traverse_steps_limit: most samples of a ray, its first ones; None or 0 for all.
         over_allocate: needs a limit, as in nerfacc, and changes nothing: no padding is made.
         rays_mask: rays to march, bool [n_rays]. nerfacc obeys it with `over_allocate` only.
@@ -166,46 +163,54 @@ def traverse_grids(
 
     Returns:
         the intervals, neighbours sharing an edge, and the samples at their midpoints. From nerfacc
-        0.5.3 on also where each ray was left, [n_rays]: the end of its last step, kept or not, or
-        of its last sample where it met the limit; its near plane if it was not marched.
+        0.5.3 on also where each ray was left, [n_rays]: the end of its last step, or of its last
+        sample where it met the limit; its near plane if it was not marched.
 
     Raises:
         ValueError: a step is not positive, tensors do not fit, or `over_allocate` has no limit.
     """
-    from nerfacc import RaySamples
-
     limit = traverse_steps_limit or 0
     if over_allocate and limit <= 0:
         raise ValueError("over_allocate needs a positive traverse_steps_limit")
     if t_sorted is None or t_indices is None or hits is None:
         t_enters, t_leaves = intersect_box(rays_o, rays_d, aabbs[-1])
     else:
-        crossed = hits.gather(1, t_indices % len(aabbs))
-        t_enters = t_sorted.where(crossed, torch.inf).amin(dim=1)
-        t_leaves = t_sorted.where(crossed, -torch.inf).amax(dim=1)
+        t_enters, t_leaves = _first_and_last(t_sorted, hits.gather(1, t_indices % len(aabbs)))
     if far_planes is not None:
         t_leaves = t_leaves.minimum(far_planes)
     if rays_mask is not None:
         t_leaves = t_leaves.where(rays_mask, -torch.inf)
     t_mins = torch.zeros_like(t_leaves) if near_planes is None else near_planes
-    rays, rule = Rays(rays_o, rays_d, t_mins, t_leaves, t_enters), March(step_size, cone_angle)
-    ray_indices, t_starts, t_ends = march(
-        rays, rule, lambda positions: lookup(binaries, aabbs[0], positions)
-    )
+    rays = Rays(rays_o, rays_d, t_mins, t_leaves, t_enters)
+    occupied = functools.partial(lookup, binaries, aabbs[0])
+    samples, left = _first_samples(rays, March(step_size, cone_angle), occupied, limit)
+    intervals, middles = _shared_edges(*samples, len(rays_o))
+    if not hasattr(middles, "is_valid"):  # 0.5.2
+        return intervals, middles
+    return intervals, middles, left
+
+
+def _first_and_last(t_sorted: Tensor, crossed: Tensor) -> tuple[Tensor, Tensor]:
+    """The first and the last crossing of each ray, [n_rays]; (inf, -inf) where it crosses none."""
+    first, last = t_sorted.where(crossed, torch.inf), t_sorted.where(crossed, -torch.inf)
+    return first.amin(dim=1), last.amax(dim=1)
+
+
+def _first_samples(
+    rays: Rays, rule: March, occupied: OccupiedFn, limit: int
+) -> tuple[Samples, Tensor]:
+    """The first `limit` samples of each ray, 0 for all, and where each ray was left, [n_rays]."""
+    ray_indices, t_starts, t_ends = march(rays, rule, occupied)
     steps = number(rays, rule)
     n_steps = steps.first + steps.counts
-    left = candidate_edges(steps.t_mins, n_steps, *rule).where(n_steps > 0, t_mins)
-    if limit > 0:
-        firsts = packed.pack_info(ray_indices, len(rays_o))[:, 0]
-        place = torch.arange(len(ray_indices), device=firsts.device) - firsts[ray_indices]
-        left[ray_indices[place == limit - 1]] = t_ends[place == limit - 1]
-        within = place < limit
-        ray_indices, t_starts, t_ends = ray_indices[within], t_starts[within], t_ends[within]
-    intervals, samples = _shared_edges(ray_indices, t_starts, t_ends, len(rays_o))
-    if not hasattr(RaySamples, "is_valid"):  # 0.5.2
-        return intervals, samples
-    samples.is_valid = torch.ones_like(ray_indices, dtype=torch.bool)
-    return intervals, samples, left
+    left = candidate_edges(steps.t_mins, n_steps, *rule).where(n_steps > 0, rays.t_mins)
+    if limit <= 0:
+        return (ray_indices, t_starts, t_ends), left
+    firsts = packed.pack_info(ray_indices, len(left))[:, 0]
+    place = torch.arange(len(ray_indices), device=firsts.device) - firsts[ray_indices]
+    left[ray_indices[place == limit - 1]] = t_ends[place == limit - 1]
+    within = place < limit
+    return (ray_indices[within], t_starts[within], t_ends[within]), left
 
 
 def _shared_edges(
@@ -219,21 +224,12 @@ def _shared_edges(
     right = torch.arange(len(begins), device=begins.device) + begins.cumsum(0)
     n_edges = int(right[-1]) + 1 if len(right) else 0
     values, edge_rays = t_starts.new_empty(n_edges), ray_indices.new_empty(n_edges)
-    is_left = torch.zeros(n_edges, dtype=torch.bool, device=begins.device)
-    is_right = is_left.clone()
+    is_left, is_right = torch.zeros(2, n_edges, dtype=torch.bool, device=begins.device)
     values[right - 1], values[right] = t_starts, t_ends
     edge_rays[right - 1], edge_rays[right] = ray_indices, ray_indices
     is_left[right - 1], is_right[right] = True, True
-    intervals = RayIntervals(
-        vals=values,
-        packed_info=packed.pack_info(edge_rays, n_rays),
-        ray_indices=edge_rays,
-        is_left=is_left,
-        is_right=is_right,
-    )
-    samples = RaySamples(
-        vals=(t_starts + t_ends) * 0.5,
-        packed_info=packed.pack_info(ray_indices, n_rays),
-        ray_indices=ray_indices,
-    )
-    return intervals, samples
+    of_edges, of_samples = (packed.pack_info(rays, n_rays) for rays in (edge_rays, ray_indices))
+    samples = RaySamples((t_starts + t_ends) * 0.5, of_samples, ray_indices)
+    if hasattr(samples, "is_valid"):  # from 0.5.3 on
+        samples.is_valid = torch.ones_like(begins)
+    return RayIntervals(values, of_edges, edge_rays, is_left, is_right), samples

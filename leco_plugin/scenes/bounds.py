@@ -32,6 +32,10 @@ class BoundsConfig:
     the dataparser knows."""
 
 
+Span = tuple[float, float]
+"""The lesser of two lengths, and the greater."""
+FEWEST_POINTS = 32
+"""Fewer sparse points say nothing of a scene."""
 OVER_CAMERAS = 0.06
 """Share of the way from the ground to the highest camera by which raised bounds end above it."""
 NEAR_CAMERAS = 0.04
@@ -71,27 +75,24 @@ def find_bounds(
     Args:
         camera_to_worlds: [C, 3, 4] OpenGL poses, scene units.
         directions: [C, K, 3] unit directions of rays that cover each image, its corners included.
-        points: [P, 3] sparse scene points, or None; fewer than 32 count as none.
+        points: [P, 3] sparse scene points, or None.
         config: what is not to be found.
     Raises:
-        ValueError: there are no cameras, a pose is not finite, no camera sees a point, or the
+        InputError: there are no cameras, a pose is not finite, no camera sees a point, or the
             configured altitudes are no range that rays go down to.
     """
     config = config or BoundsConfig()
     poses, directions = (part.detach().float().cpu() for part in (camera_to_worlds, directions))
     if len(poses) == 0:
-        raise ValueError("the scene has no cameras")
+        raise InputError("the scene has no cameras")
     if not bool(poses.isfinite().all()):
-        raise ValueError("a camera pose holds values that are not finite")
-    if points is not None:
-        points = points.detach().float().cpu()
-        points = points[points.isfinite().all(dim=-1)]
-        points = points if len(points) >= 32 else None
+        raise InputError("a camera pose holds values that are not finite")
+    points = usable_points(points)
     if config.altitudes is not None and config.space != "contraction":
         return _between(config.altitudes, poses, directions, points)
     if points is None:
         if config.space == "box":
-            raise ValueError(
+            raise InputError(
                 "a bounded scene without sparse points needs its altitudes: give bounds.altitudes "
                 "with the z of its ground and of its top"
             )
@@ -104,7 +105,8 @@ def find_bounds(
         # far below, so that a flat picture on the lower plane is plainly wrong from two places
         ground = float(low[2]) - max(0.5 * relief, 0.2 * far)
         top = float(high[2]) + 0.3 * relief
-        found = _slab(poses, directions, ground, top, near, far, f"{FROM_ABOVE} ({seen}): bounded")
+        why = f"{FROM_ABOVE} ({seen}): bounded"
+        found = _slab(poses, directions, (ground, top), (near, far), why)
         return replace(found, from_above=True)
     if config.space == "box":
         return _room(poses, low, high, near, far)
@@ -114,12 +116,19 @@ def find_bounds(
     return SceneBounds("contraction", (low + high) / 2, half, near, far, _no_walls(), reason)
 
 
-def with_range(bounds: SceneBounds, near: float | None, far: float | None) -> SceneBounds:
-    """The bounds with near and far set by hand; None leaves what was found.
+def usable_points(points: Tensor | None) -> Tensor | None:
+    """The finite ones of sparse points [P, 3], float32 on the CPU; None of fewer than
+    `FEWEST_POINTS`."""
+    if points is None:
+        return None
+    points = points.detach().float().cpu()
+    points = points[points.isfinite().all(dim=-1)]
+    return points if len(points) >= FEWEST_POINTS else None
 
-    Raises:
-        InputError: the range is empty or begins at the camera.
-    """
+
+def with_range(bounds: SceneBounds, near: float | None, far: float | None) -> SceneBounds:
+    """The bounds with near and far set by hand; None leaves what was found. InputError for an empty
+    range, or one that begins at the camera."""
     near, far = bounds.near if near is None else near, bounds.far if far is None else far
     if not 0.0 < near < far < math.inf:
         raise InputError(f"rays need 0 < near < far, got near {near:g} and far {far:g}")
@@ -152,22 +161,22 @@ def up_to_the_cameras(bounds: SceneBounds, heights: Tensor, seen: float) -> Scen
     )
 
 
-def _range(depths: Tensor) -> tuple[float, float]:
+def _range(depths: Tensor) -> Span:
     """Near and far of distances [D] to what is seen, with margins."""
     return 0.75 * float(_quantiles(depths, 0.01)), 1.25 * float(_quantiles(depths, 0.999))
 
 
 def _between(
-    altitudes: tuple[float, float], poses: Tensor, directions: Tensor, points: Tensor | None
+    altitudes: Span, poses: Tensor, directions: Tensor, points: Tensor | None
 ) -> SceneBounds:
     """A bounded scene between two levels that somebody knows, with points or without."""
     ground, top = altitudes
     if not -math.inf < ground < top < math.inf:
-        raise ValueError(f"bounds.altitudes are ground < top, got {ground:g} and {top:g}")
+        raise InputError(f"bounds.altitudes are ground < top, got {ground:g} and {top:g}")
     heights = poses[:, None, 2, 3]
-    down = (directions[..., 2] < -0.05) & (heights > ground)
+    down = _go_down(directions) & (heights > ground)
     if not bool(down.any()):
-        raise ValueError(
+        raise InputError(
             f"no ray of any camera goes down to the ground at z = {ground:g}: bounds.altitudes are "
             "in scene units, +z up"
         )
@@ -179,36 +188,25 @@ def _between(
         )
         far = 1.05 * float(_quantiles(reaches, 0.999))
         near = max(0.75 * float(_quantiles(begins, 0.01)), 1e-3 * far)
-    return _slab(poses, directions, ground, top, near, far, "altitudes as configured: bounded")
+    return _slab(poses, directions, altitudes, (near, far), "altitudes as configured: bounded")
 
 
 def _slab(
-    poses: Tensor,
-    directions: Tensor,
-    ground: float,
-    top: float,
-    near: float,
-    far: float,
-    why: str,
+    poses: Tensor, directions: Tensor, levels: Span, distances: Span, why: str
 ) -> SceneBounds:
-    """A bounded scene between two levels, as wide as the rays reach in it."""
-    down = directions[..., 2] < -0.05
+    """A bounded scene between two levels, as wide as the rays reach in it from near to far."""
+    (ground, top), (near, far) = levels, distances
+    down = _go_down(directions)
     reach = ((ground - poses[:, None, 2, 3]) / directions[..., 2]).clamp(0.0, far)[down]
     origins = poses[:, None, :, 3].expand_as(directions)[down]
     hits = (origins + directions[down] * reach[:, None])[:, :2]
     sides = torch.stack([hits.amin(dim=0), hits.amax(dim=0)])
     center = torch.tensor([*sides.mean(dim=0).tolist(), (ground + top) / 2])
     half = 1.02 * max(float((sides[1] - sides[0]).max()), top - ground) / 2
-    wall = NO_WALL
-    return SceneBounds(
-        "box",
-        center,
-        half,
-        near,
-        far,
-        torch.tensor([-wall, -wall, ground, wall, wall, top]),
-        f"{why}, rays cut at z = {ground:.3f} and {top:.3f}",
-    )
+    aabb = _no_walls()
+    aabb[2], aabb[5] = ground, top
+    reason = f"{why}, rays cut at z = {ground:.3f} and {top:.3f}"
+    return SceneBounds("box", center, half, near, far, aabb, reason)
 
 
 def _room(poses: Tensor, low: Tensor, high: Tensor, near: float, far: float) -> SceneBounds:
@@ -228,10 +226,15 @@ def _without_points(poses: Tensor, directions: Tensor) -> SceneBounds:
     low, high = positions.amin(dim=0), positions.amax(dim=0)
     half = max(float((high - low).max()) / 2, 1e-3)
     reason = f"no sparse points: contracted outside {half:.3f} around the cameras"
-    if float((directions[..., 2] < -0.05).float().mean()) >= MOSTLY_DOWN:
+    if float(_go_down(directions).float().mean()) >= MOSTLY_DOWN:
         reason += "; all look down: give bounds.altitudes with the z of ground and top"
     center = (low + high) / 2
     return SceneBounds("contraction", center, half, 0.05 * half, 100 * half, _no_walls(), reason)
+
+
+def _go_down(directions: Tensor) -> Tensor:
+    """Whether unit vectors [..., 3] go down clearly: bool [...]."""
+    return directions[..., 2] < -0.05
 
 
 def _no_walls() -> Tensor:
@@ -255,7 +258,7 @@ def _depths(poses: Tensor, directions: Tensor, points: Tensor) -> Tensor:
         found.append(distances[offsets @ ahead > (rays @ ahead).min() * distances])
     depths = torch.cat(found)
     if len(depths) == 0:
-        raise ValueError("no camera sees a sparse point: the poses or the points are in other axes")
+        raise InputError("no camera sees a sparse point: the poses or the points are in other axes")
     return depths
 
 
@@ -268,6 +271,6 @@ def _seen_from_above(poses: Tensor, directions: Tensor, points: Tensor) -> tuple
     and the two shares in words.
     """
     above = float((poses[:, 2, 3] > _quantiles(points[:, 2], 0.95)).float().mean())
-    down = float((directions[..., 2] < -0.05).float().mean())
+    down = float(_go_down(directions).float().mean())
     words = f"{down:.0%} of rays go down, {above:.0%} of cameras are above the points"
     return above >= MOSTLY_ABOVE and down >= MOSTLY_DOWN, words

@@ -71,9 +71,8 @@ class LecoCity(Nerfstudio):
     def _generate_dataparser_outputs(
         self, split: str = "train", **kwargs: Any
     ) -> DataparserOutputs:
-        from leco_plugin.scenes.city.layouts import POINTS as FILE
-        from leco_plugin.scenes.dataset_units import METRES_PER_UNIT, UP_IS_KNOWN
-        from leco_plugin.scenes.frames import moved, parsed_frame
+        from leco_plugin.scenes.city.folder import POINTS as FILE
+        from leco_plugin.scenes.frames import METRES_PER_UNIT, UP_IS_KNOWN, moved, parsed_frame
         from leco_plugin.scenes.photographs import POINTS, read_ply
 
         outputs: DataparserOutputs = super()._generate_dataparser_outputs(split)

@@ -24,8 +24,8 @@ from nerfstudio.model_components.ray_generators import RayGenerator
 from torch import Tensor
 
 from leco_plugin.log import say
-from leco_plugin.scenes.dataset_units import UP_IS_KNOWN
 from leco_plugin.scenes.detail import CAMERAS
+from leco_plugin.scenes.frames import UP_IS_KNOWN
 from leco_plugin.scenes.input_error import InputError
 from leco_plugin.scenes.photograph_files import names_what_it_cannot_read
 from leco_plugin.scenes.pixels.held_out_pixels import HeldOutPixelSampler
@@ -123,11 +123,7 @@ class LecoDataManager(VanillaDataManager):  # type: ignore[type-arg]
         return sampler
 
     def on_disk(self) -> bool:
-        """Whether pixels are read from files.
-
-        Raises:
-            InputError: they are to be, and cannot.
-        """
+        """Whether pixels are read from files. InputError if they are to be, and cannot."""
         config = self.config
         wanted = getattr(config, "images", "auto")
         if wanted == "memory" or not keeps_all_images(config, len(self.train_dataset)):

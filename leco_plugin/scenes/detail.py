@@ -12,7 +12,7 @@ from nerfstudio.cameras.cameras import Cameras
 from torch import Tensor
 
 from leco_plugin.samplers.boxes import intersect_box
-from leco_plugin.scenes.bounds import BoundsConfig, SceneBounds, find_bounds
+from leco_plugin.scenes.bounds import BoundsConfig, SceneBounds, find_bounds, usable_points
 from leco_plugin.scenes.input_error import InputError
 from leco_plugin.scenes.survey import chosen_cameras, covering_rays
 
@@ -20,8 +20,6 @@ CAMERAS = "leco_cameras"
 """Key of the metadata that a data manager hands to a model: the training cameras."""
 MOST_POINTS = 1 << 14
 """Sparse points that are looked up in every camera."""
-FEWEST_POINTS = 32
-"""With fewer, the places that rays reach stand for the points, as in `find_bounds`."""
 NEIGHBOURS = 8
 """Points in the cells by which the surface is measured: with fewer, there are holes between."""
 
@@ -59,10 +57,7 @@ def detail_of(
     chosen = chosen_cameras(len(cameras))
     poses = cameras.camera_to_worlds[chosen].float()
     origins, directions = covering_rays(cameras)
-    try:
-        bounds = find_bounds(poses, directions, points, config)
-    except ValueError as error:
-        raise InputError(str(error)) from None
+    bounds = find_bounds(poses, directions, points, config)
     places = _places(points, origins, directions, bounds)
     density = torch.zeros(len(places))
     for pose, rays, width in zip(poses, directions, cameras.width[chosen].flatten().tolist()):
@@ -129,10 +124,8 @@ def _places(
     points: Tensor | None, origins: Tensor, directions: Tensor, bounds: SceneBounds
 ) -> Tensor:
     """Up to `MOST_POINTS` places [P, 3] of the scene: of its sparse points, or where rays end."""
-    if points is not None:
-        points = points.detach().float().cpu()
-        points = points[points.isfinite().all(dim=-1)]
-    if points is None or len(points) < FEWEST_POINTS:
+    points = usable_points(points)
+    if points is None:
         origins, directions = origins.reshape(-1, 3), directions.reshape(-1, 3)
         reach = torch.full((len(origins),), bounds.half_extent)
         if bounds.kind == "box":

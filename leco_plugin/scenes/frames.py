@@ -1,16 +1,23 @@
-"""Coordinates of two readers of one scene: how positions of one become positions of the other.
+"""The coordinates of a scene: frames of its readers, lengths and altitudes of its data, and poses.
 
-nerfstudio's readers turn, move and scale a scene, each in its own way; what was learned in the
-coordinates of one is asked in those of another.
+nerfstudio's readers turn, move and scale a scene, each in its own way. What was learned in the
+coordinates of one is asked in those of another, and what a reader says it did leads back to the
+units of the data.
 """
 
 from __future__ import annotations
 
+import math
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
+
+from leco_plugin.scenes.input_error import InputError
 
 
 def frame_of(datamanager: Any) -> list[list[float]] | None:
@@ -139,11 +146,7 @@ def moved(positions: Tensor, frame: Tensor) -> Tensor:
 
 
 def found_again(known: Tensor, here: Tensor, half_extent: float) -> Tensor:
-    """Which of the cameras at places [K, 3] are among those at others [C, 3], one frame: bool [K].
-
-    Args:
-        half_extent: of the scene.
-    """
+    """Which cameras at places [K, 3] are among those at others [C, 3], of one frame: bool [K]."""
     return torch.cdist(known.float(), here.float()).amin(dim=1) <= SAME_PLACE * half_extent
 
 
@@ -151,3 +154,92 @@ def box_around(box: Tensor, frame: Tensor) -> Tensor:
     """The smallest box along the axes of a frame that holds a box of the host: [6] from [6]."""
     corners = moved(torch.cartesian_prod(*box.view(2, 3).T), frame)
     return torch.cat([corners.amin(dim=0), corners.amax(dim=0)])
+
+
+METRES_PER_UNIT = "leco_metres_per_unit"
+"""Key of a dataparser's metadata: metres in a unit of the dataset's own poses, float."""
+ALTITUDES = "leco_altitudes"
+"""Key of a dataparser's metadata: z of the ground and of the top, scene units, two floats."""
+UP_IS_KNOWN = "leco_up_is_known"
+"""Key of a dataparser's metadata: there where z is up in the dataset already."""
+UPRIGHT = 0.94
+"""Cosine of 20 degrees. An axis of the dataset that is this near to the model's z is up there."""
+
+
+@dataclass(frozen=True)
+class DatasetUnits:
+    """What a scene unit and the scene's z = 0 are in the dataset's own coordinates."""
+
+    per_scene_unit: float
+    """Metres, or units of the dataset's poses, in a scene unit."""
+    zero: float
+    """Altitude of the scene's origin in the same units: along the dataset's own axis where one is
+    up, for a tilt of a hundredth of a degree is a kilometre in coordinates of UTM; else along the
+    model's z."""
+    metric: bool
+    """Whether these units are metres."""
+
+    def altitude(self, z: float) -> float:
+        """Altitude of a scene coordinate z."""
+        return self.per_scene_unit * z + self.zero
+
+    @property
+    def name(self) -> str:
+        return "metres" if self.metric else "data units"
+
+
+def units_of(datamanager: Any, metres_per_unit: float | None = None) -> DatasetUnits | None:
+    """The units of a data manager's dataset; None where its dataparser does not say what it did.
+
+    `metres_per_unit`, of the dataset's own poses, is positive, or InputError; None takes what the
+    dataparser knows.
+    """
+    outputs = getattr(datamanager, "train_dataparser_outputs", None)
+    scale = float(getattr(outputs, "dataparser_scale", 0.0))
+    if outputs is None or not 0.0 < scale < math.inf:
+        return None
+    known = metres_per_unit
+    if known is None:
+        known = (outputs.metadata or {}).get(METRES_PER_UNIT)
+    if known is not None and not 0.0 < float(known) < math.inf:
+        raise InputError(f"a unit of the dataset is a positive number of metres, not {known}")
+    metres = 1.0 if known is None else float(known)
+    frame = parsed_frame(outputs)
+    up = frame[2, :3] / scale
+    near = up.abs().argmax()
+    if float(up[near].abs()) > UPRIGHT:
+        up = torch.zeros_like(up).index_fill_(0, near, up[near].sign())
+    return DatasetUnits(
+        metres / scale, metres * float(up @ inverse(frame)[:, 3]), known is not None
+    )
+
+
+SKEW = 0.05
+"""Distance from a rotation that a pose may have."""
+
+
+def distance_from_rotations(matrices: NDArray[np.floating]) -> NDArray[np.floating]:
+    """How far [C, 3, 3] are from rotations: the largest error of R R^T = 1 and of det R = 1, [C].
+
+    A mirrored rotation has 2. The matrices are finite.
+    """
+    errors = np.abs(matrices @ matrices.swapaxes(1, 2) - np.eye(3)).max(axis=(1, 2))
+    return np.maximum(errors, np.abs(np.linalg.det(matrices) - 1.0))
+
+
+def check_poses(poses: NDArray[np.floating], names: list[str]) -> None:
+    """InputError, with its name, for one of poses [C, 3, 4] or [C, 4, 4] that is not finite or
+    whose first three columns are no rotation."""
+    if poses.shape[1:] not in ((4, 4), (3, 4)):
+        raise InputError(f"{names[0]} is no finite 4 x 4 matrix: give it four rows of four")
+    broken = ~np.isfinite(poses).all(axis=(1, 2))
+    if broken.any():
+        worst = names[int(broken.argmax())]
+        raise InputError(f"{worst} is no finite 4 x 4 matrix: mend it, or leave its image out")
+    with np.errstate(over="ignore", invalid="ignore"):
+        distances = np.nan_to_num(distance_from_rotations(poses[:, :3, :3]), nan=np.inf)
+    if distances.max() > SKEW:
+        worst = names[int(distances.argmax())]
+        raise InputError(
+            f"{worst} is no rotation: remove its scale, shear or mirroring, or leave its image out"
+        )

@@ -36,27 +36,19 @@ show_one_line_in_ns_commands()
 
 
 def require(holds: bool, option: str, value: object, wanted: str) -> None:
-    """Refuses the value of an option.
+    """InputError if the value of an option will not do.
 
     Args:
-        holds: whether the value will do.
+        holds: whether it will.
         option: as it is given, without the dashes before it.
         wanted: the values that will do, as `at least 1`.
-    Raises:
-        InputError: it will not.
     """
     if not holds:
         raise InputError(f"{option} is {value}; it must be {wanted}")
 
 
 def require_folder(option: str, path: Path) -> None:
-    """Refuses a path that is no folder.
-
-    Args:
-        option: as it is given, with the dashes before it.
-    Raises:
-        InputError: there is none, or a file.
-    """
+    """InputError if a path is no folder. The option is as it is given, with its dashes."""
     if not path.is_dir():
         instead = ", but a file" if path.exists() else ""
         raise InputError(f"{option} {path}: there is no such folder{instead}")

@@ -17,9 +17,13 @@ from leco_plugin.models.rendering import Rays
 from leco_plugin.scenes.bounds import BoundsConfig
 from leco_plugin.scenes.frames import data_frame_of, frame_of
 from leco_plugin.scenes.pixels.held_out_pixels import held_out_sampler, some_images
-from leco_plugin.scenes.pixels.known_distances import KnownDistancePixelSampler, sampler_here
+from leco_plugin.scenes.pixels.known_distances import (
+    KnownDistancePixelSampler,
+    SparsePixels,
+    sampler_here,
+    sparse_pixels,
+)
 from leco_plugin.scenes.pixels.lattice import Lattice, Share
-from leco_plugin.scenes.pixels.sparse_pixels import SparsePixels, sparse_pixels
 from leco_plugin.scenes.survey import Survey, covering_rays, sparse_points, survey
 
 

@@ -75,10 +75,7 @@ class Lens:
 def lens_of(meta: dict[str, Any], frame: dict[str, Any], where: str) -> Lens:
     """The lens of a frame. What the frame says goes before what the scene says.
 
-    Args:
-        where: the file and the frame, for errors.
-    Raises:
-        InputError: one line; a number is none, or the lens is not one of nerfstudio's.
+    InputError, with `where` that is, if a number is none or the lens is not one of nerfstudio's.
     """
 
     def said(name: str, positive: bool = True) -> float | None:
@@ -141,11 +138,8 @@ def set_lenses(cameras: Cameras, lenses: list[Lens | None], factors: list[int]) 
 
 
 def check_together(lenses: list[Lens], where: str) -> None:
-    """All frames are of one type, or perspective and fisheye, and fisheyes show one circle.
-
-    Raises:
-        InputError: one line.
-    """
+    """InputError if frames are neither of one type nor perspective and fisheye, or if fisheyes
+    show several circles."""
     kinds = {lens.kind or CameraType.PERSPECTIVE for lens in lenses}
     if len(kinds) > 1 and not kinds <= MIXED:
         names = " and ".join(sorted(kind.name for kind in kinds))
@@ -204,11 +198,8 @@ def _kind(meta: dict[str, Any], frame: dict[str, Any], where: str) -> CameraType
 
 
 def _distortion(owner: dict[str, Any], kind: CameraType | None, where: str) -> list[float] | None:
-    """In nerfstudio's order; None where a scene or a frame says nothing.
-
-    Raises:
-        InputError: nerfstudio would drop it, or some of it.
-    """
+    """In nerfstudio's order; None where a scene or a frame says nothing. InputError if nerfstudio
+    would drop some of it."""
     values = [_number(owner.get(name, 0), name, where) for name in DISTORTIONS]
     if "distortion_params" in owner:
         listed = owner["distortion_params"]

@@ -6,14 +6,16 @@ turns no photograph as its EXIF says, and a file that is cut off ends it in the 
 
 from __future__ import annotations
 
+import hashlib
 import re
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any, NamedTuple, TypeVar
+from typing import Any, NamedTuple
 
 from PIL import ExifTags, Image, ImageOps
 
 from leco_plugin.scenes.input_error import InputError, one_line
+from leco_plugin.scenes.whole_files import write_whole
 
 READ_RIGHTLY = ("L", "RGB", "RGBA")
 """Pillow's modes of images that nerfstudio reads as they are."""
@@ -21,8 +23,7 @@ CONVERTED = ("1", "P", "PA", "LA", "CMYK")
 """Modes that become one of these; of CMYK by Pillow's formula, without a colour profile."""
 SAVE_ANEW = "if the file is whole, save it as JPEG or PNG with 8 bits a channel, and give that name"
 """What to do about HEIC, OpenEXR and other kinds that Pillow does not read."""
-
-Read = TypeVar("Read")
+ANOTHER_FOLDER = "give another folder for derived pictures with --cache"
 
 
 class Header(NamedTuple):
@@ -41,11 +42,7 @@ class Header(NamedTuple):
 
 
 def header_of(path: Path) -> Header:
-    """What a file of an image says.
-
-    Raises:
-        InputError: it is none.
-    """
+    """What a file of an image says. InputError if it is none."""
     try:
         with Image.open(path) as image:
             several = image.format != "MPO" and getattr(image, "n_frames", 1) > 1
@@ -75,11 +72,7 @@ def find_file(path: Path) -> Path:
 
 
 def check_images(paths: list[Path]) -> None:
-    """Every image is there.
-
-    Raises:
-        InputError: one line.
-    """
+    """InputError if an image is not there."""
     missing = [path for path in paths if not path.exists()]
     if missing:
         raise InputError(
@@ -102,11 +95,7 @@ def remedy_for_missing(path: Path) -> str:
 
 
 def check_kind(path: Path, header: Header) -> None:
-    """The colours of an image can be read.
-
-    Raises:
-        InputError: one line.
-    """
+    """InputError if the colours of an image cannot be read."""
     if header.mode not in READ_RIGHTLY + CONVERTED:
         raise InputError(
             f"{path} is of Pillow's mode {header.mode!r}, which nerfstudio reads wrongly: save it "
@@ -136,11 +125,7 @@ def is_turned(header: Header, size: tuple[int, int]) -> bool:
 
 
 def decode(path: Path, turn: bool) -> Image.Image:
-    """The plain colours of an image, turned as EXIF says if that is asked.
-
-    Raises:
-        InputError: it cannot be decoded.
-    """
+    """The plain colours of an image, turned as EXIF says if asked. InputError if it has none."""
     try:
         with Image.open(path) as image:
             turned = ImageOps.exif_transpose(image) if turn else image
@@ -153,12 +138,9 @@ def decode(path: Path, turn: bool) -> Image.Image:
 def names_what_it_cannot_read(dataset: Any) -> Any:
     """A dataset of nerfstudio's which says in one line which of its images, or what comes with it,
     cannot be read."""
-    dataset.get_data = _naming(dataset.get_data, dataset.image_filenames)
-    return dataset
+    read, paths = dataset.get_data, dataset.image_filenames
 
-
-def _naming(read: Callable[..., Read], paths: list[Path]) -> Callable[..., Read]:
-    def read_or_name(image_idx: int, *arguments: Any, **options: Any) -> Read:
+    def read_or_name(image_idx: int, *arguments: Any, **options: Any) -> Any:
         try:
             return read(image_idx, *arguments, **options)
         except InputError:
@@ -168,4 +150,49 @@ def _naming(read: Callable[..., Read], paths: list[Path]) -> Callable[..., Read]
         # out here, because that error holds the file that nerfstudio has left open
         raise InputError(f"{paths[image_idx]} cannot be read ({reason}): is the file whole?")
 
-    return read_or_name
+    dataset.get_data = read_or_name
+    return dataset
+
+
+class DerivedImages:
+    """A folder of PNG files that are made when they are first asked for.
+
+    A file's name depends on its source (path, size, time of its last change) and on what was made
+    of it, so that a changed source is never taken for the old one.
+    """
+
+    def __init__(self, folder: Path, remedy: str = ANOTHER_FOLDER) -> None:
+        """With what to do where nothing can be written."""
+        self.folder, self.remedy = folder, remedy
+
+    def get(self, source: Path, recipe: str, make: Callable[[], Image.Image]) -> Path:
+        """The file with what `make` makes of `source`; `recipe` names it. InputError if nothing can
+        be written."""
+        status = source.stat()
+        known_by = f"{source.resolve()} {status.st_size} {status.st_mtime_ns} {recipe}"
+        digest = hashlib.blake2b(known_by.encode(), digest_size=8).hexdigest()
+        path = self.folder / f"{source.stem}-{digest}.png"
+        if not path.exists():
+            self.put(path, make())
+        return path
+
+    def put(self, path: Path, image: Image.Image) -> None:
+        """Writes an image under its name. InputError if that cannot be done."""
+        try:
+            write_whole(path, lambda file: image.save(file, format="PNG"))
+        except OSError as error:
+            raise InputError(
+                f"{path} cannot be written ({error.strerror or error}); {self.remedy}"
+            ) from None
+
+
+def open_image(path: Path, pixels: bool = True) -> Image.Image:
+    """A JPEG or PNG, with or without its pixels. InputError, in one line, if it is none."""
+    try:
+        # by content, whatever the name: Pillow hands some other kinds of files to other programs
+        with Image.open(path, formats=("JPEG", "PNG")) as image:
+            if pixels:
+                image.load()
+            return image
+    except Exception as error:  # noqa: BLE001  decoders raise whatever they meet
+        raise InputError(f"{path} cannot be read as a picture: {one_line(error, 120)}") from None

@@ -16,8 +16,8 @@ from PIL import Image
 from rich.markup import escape
 
 from leco_plugin.log import say
-from leco_plugin.scenes.derived_images import DerivedImages
 from leco_plugin.scenes.input_error import InputError, one_line
+from leco_plugin.scenes.photograph_files import DerivedImages
 
 HALF = 128
 """From this grey on, where a mask has so light ones, a pixel is seen."""
@@ -74,11 +74,7 @@ def convert_masks(
 
 
 def check_masked(frames: list[dict[str, Any]], folder: Path) -> None:
-    """Every frame or none has a mask.
-
-    Raises:
-        InputError: one line.
-    """
+    """InputError if some frames have a mask, and some have none."""
     masked = sum("mask_path" in frame for frame in frames)
     if 0 < masked < len(frames):
         raise InputError(
@@ -102,11 +98,8 @@ def _found(path: Path, image: Path) -> Path:
 
 
 def _values(path: Path) -> NDArray[np.uint8]:
-    """How light each pixel of a mask is: [H, W] from 0 to 255, transparent ones 0.
-
-    Raises:
-        InputError: it cannot be read, or has colours.
-    """
+    """How light each pixel of a mask is: [H, W] from 0 to 255, transparent ones 0. InputError if it
+    cannot be read, or has colours."""
     try:
         with Image.open(path) as image:
             if image.mode in ("1", "L") and "transparency" not in image.info:
@@ -134,11 +127,8 @@ def _is_grey(path: Path) -> bool:
 
 
 def _fit(seen: NDArray[np.bool_], size: tuple[int, int], path: Path) -> NDArray[np.bool_]:
-    """The pixels of a mask of its image's size, or of a whole number of times that.
-
-    Raises:
-        InputError: it has another size.
-    """
+    """The pixels of a mask of its image's size, or of a whole number of times that. InputError if
+    it has another size."""
     high, wide = seen.shape
     if (wide, high) == size:
         return seen

@@ -20,8 +20,14 @@ from rich.markup import escape
 from torch import Tensor
 
 from leco_plugin.log import say
-from leco_plugin.scenes.dataset_units import METRES_PER_UNIT, UP_IS_KNOWN
-from leco_plugin.scenes.frames import applied_in, from_file, moved, parsed_frame
+from leco_plugin.scenes.frames import (
+    METRES_PER_UNIT,
+    UP_IS_KNOWN,
+    applied_in,
+    from_file,
+    moved,
+    parsed_frame,
+)
 from leco_plugin.scenes.input_error import InputError, one_line
 from leco_plugin.scenes.large_coordinates import ReadsNear
 from leco_plugin.scenes.photograph_files import check_images, find_file
@@ -117,11 +123,10 @@ def taken_from_above(poses: np.ndarray) -> bool:
 
 
 def check_scene(data: Path) -> dict[str, Any]:
-    """Reads the description of a scene and says what is wrong with it, if anything is.
+    """The description of a scene.
 
-    Raises:
-        InputError: one line: no such folder, no cameras or a single place, missing images, lenses
-            that nerfstudio's cameras lack, poses that are not poses.
+    InputError: no such folder, no cameras or a single place, missing images, lenses that
+    nerfstudio's cameras lack, poses that are not poses.
     """
     scene = scene_file_of(LecoPhotographsDataParserConfig(data=data), "train")
     assert scene is not None
@@ -132,10 +137,8 @@ def check_scene(data: Path) -> dict[str, Any]:
 def read_points(meta: dict[str, Any], folder: Path) -> Tensor | None:
     """Sparse points [P, 3] float64 in the coordinates of the file, or None when there are none.
 
-    A file that is named and not there is said, for learning without points is slower.
-
-    Raises:
-        InputError: a file is named, but cannot be read as points.
+    A file that is named and not there is said, for learning without points is slower. InputError
+    if it cannot be read.
     """
     name = meta.get("ply_file_path")
     if name is None:
@@ -148,14 +151,8 @@ def read_points(meta: dict[str, Any], folder: Path) -> Tensor | None:
 
 
 def read_ply(path: Path, dtype: torch.dtype = torch.float32) -> Tensor:
-    """The vertices [P, 3] of a file.
-
-    Args:
-        dtype: of the vertices. Coordinates as large as UTM's need float64.
-
-    Raises:
-        InputError: it cannot be read as points.
-    """
+    """The vertices [P, 3] of a file; coordinates as large as UTM's need float64. InputError if it
+    cannot be read as points."""
     import trimesh
 
     try:
@@ -177,11 +174,8 @@ leco_photographs_dataparser = DataParserSpecification(
 
 
 def describe_scene(data: Path) -> dict[str, Any]:
-    """Name, number of images, and what tells the scene from another: JSON values.
-
-    Raises:
-        InputError: it is no scene that can be read.
-    """
+    """Name, number of images, and what tells the scene from another: JSON values. InputError if it
+    cannot be read."""
     meta = check_scene(data)
     description = data if data.suffix == ".json" else data / "transforms.json"
     digest = hashlib.sha256(description.read_bytes()).hexdigest()

@@ -25,13 +25,14 @@ from PIL import UnidentifiedImageError
 from rich.markup import escape
 
 from leco_plugin.log import bar, say
-from leco_plugin.scenes.derived_images import DerivedImages
+from leco_plugin.scenes.frames import check_poses
 from leco_plugin.scenes.input_error import InputError, one_line
 from leco_plugin.scenes.known_folders import READERS, command_with, has_model, remedy_for
 from leco_plugin.scenes.large_coordinates import near_bases
 from leco_plugin.scenes.lenses import Lens, set_lenses
 from leco_plugin.scenes.photograph_files import (
     SAVE_ANEW,
+    DerivedImages,
     Header,
     check_kind,
     decode,
@@ -40,14 +41,13 @@ from leco_plugin.scenes.photograph_files import (
     is_turned,
 )
 from leco_plugin.scenes.photograph_masks import convert_masks
-from leco_plugin.scenes.rotations import check_poses
-from leco_plugin.scenes.scene_fields import say_unused
 from leco_plugin.scenes.scene_file import (
     SceneFile,
     description_of,
     factors_of,
     frames_of,
     own_target,
+    say_unused,
     scene_file_of,
 )
 from leco_plugin.studio.checkpoints import require_data

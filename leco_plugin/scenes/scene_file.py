@@ -10,16 +10,27 @@ from typing import Any
 
 import numpy as np
 from nerfstudio.cameras.cameras import Cameras
+from rich.markup import escape
 
+from leco_plugin.log import say
+from leco_plugin.scenes.frames import check_poses
 from leco_plugin.scenes.input_error import InputError, one_line
 from leco_plugin.scenes.known_folders import command_with, remedy_for
-from leco_plugin.scenes.lenses import ANGLES, PINHOLE_FIELDS, Lens, check_together, lens_of
+from leco_plugin.scenes.lenses import (
+    ANGLES,
+    LENS_FIELDS,
+    PINHOLE_FIELDS,
+    Lens,
+    check_together,
+    lens_of,
+)
 from leco_plugin.scenes.photograph_files import find_file
 from leco_plugin.scenes.photograph_masks import check_masked
-from leco_plugin.scenes.rotations import check_poses
 
 FRAMES = ("frames", "test_frames")
 """Lists of frames; the second is ScanNet++'s."""
+NO_SCENE = (OSError, ValueError, KeyError, TypeError, AttributeError, OverflowError, RecursionError)
+"""What a JSON file that is no scene raises."""
 
 
 @dataclass(frozen=True)
@@ -69,13 +80,11 @@ def _completed(frame: Any) -> Any:
 
 
 def read_scene_file(path: Path, split: str, folder: Path) -> SceneFile:
-    """A transforms.json with poses and lenses that cameras have.
+    """A transforms.json. InputError if its poses and lenses are none that cameras have.
 
     Args:
         split: that is read; only the cameras of training need more places than one.
         folder: to which names of pictures are relative.
-    Raises:
-        InputError: one line.
     """
     try:
         meta = load_json(path)
@@ -85,15 +94,7 @@ def read_scene_file(path: Path, split: str, folder: Path) -> SceneFile:
         if not all(type(name) is str and all(ord(c) >= 32 for c in name) for name in names):
             raise ValueError("a file_path is no path")
         poses = np.array([frame["transform_matrix"] for frame in frames], dtype=float)
-    except (
-        OSError,
-        ValueError,
-        KeyError,
-        TypeError,
-        AttributeError,
-        OverflowError,
-        RecursionError,
-    ) as error:
+    except NO_SCENE as error:
         reason = f"{type(error).__name__}: {one_line(error, 120)}"
         raise InputError(
             f"{path} is not a scene in nerfstudio's format ({reason}); mend it, or make it "
@@ -136,10 +137,9 @@ def description_of(config: Any, split: str) -> Path | None:
 
 
 def scene_file_of(config: Any, split: str) -> SceneFile | None:
-    """The transforms.json that a reader is about to read, checked; None where it reads others.
+    """The transforms.json that a reader is about to read; None where it reads others.
 
-    Raises:
-        InputError: one line; it is not there, or nerfstudio would fail at it or read it wrongly.
+    InputError if it is not there, or nerfstudio would fail at it or read it wrongly.
     """
     data, file = Path(config.data), description_of(config, split)
     if file is None:
@@ -176,8 +176,7 @@ def _add(scene: SceneFile, data: Path) -> str:
 def frames_of(images: list[Path], scene: SceneFile) -> list[int | None]:
     """The number of the frame of each picture, which may be a smaller one of the same name.
 
-    Raises:
-        InputError: one line; several frames of different folders would have one smaller picture.
+    InputError if frames of different folders would have one smaller picture.
     """
     places = [str(frame["file_path"]).replace("\\", "/") for frame in scene.frames]
     named: dict[str, list[int]] = {}
@@ -218,3 +217,68 @@ def factors_of(
     full = scene.lenses[number].width if full is None else full
     factor = 1 if full is None else max(1, round(float(full) / int(cameras.width[row])))
     return [factor] * len(numbers)
+
+
+READ = LENS_FIELDS | {
+    "applied_scale",
+    "applied_transform",
+    "file_path",
+    "frames",
+    "has_mask",
+    "mask_path",
+    "metres_per_unit",
+    "orientation_override",
+    "ply_file_path",
+    "test_filenames",
+    "test_frames",
+    "train_filenames",
+    "transform_matrix",
+    "transform_matrix_end",
+    "transform_matrix_start",
+    "val_filenames",
+}
+"""By leco's own reader, or held against what another reader has made of them."""
+NEEDLESS = {
+    "aabb",
+    "aabb_scale",
+    "blur_score",
+    "colmap_im_id",
+    "colmap_image_id",
+    "depth_file_path",
+    "depth_path",
+    "depth_unit_scale_factor",
+    "enable_depth_loading",
+    "enable_ray_loading",
+    "importance_sampling",
+    "integer_depth_scale",
+    "n_extra_learnable_dims",
+    "offset",
+    "render_aabb",
+    "scale",
+    "sharpness",
+    "timestamp",
+}
+"""Neither geometry nor colour depends on them: our bounds come from cameras and points, and our
+methods learn without depths."""
+
+
+def unused_fields(meta: dict[str, Any]) -> list[str]:
+    """Names of fields of a scene and of its frames that are not used and say something."""
+    owners = [meta, *meta["frames"], *meta.get("test_frames", [])]
+    names = {
+        name
+        for owner in owners
+        for name, value in owner.items()
+        if value not in (None, False, 0, "", [], {})
+    }
+    return sorted(names - READ - NEEDLESS)
+
+
+def say_unused(meta: dict[str, Any], file: Path) -> None:
+    """One line in the log for what a scene says, or has beside it, that is not used."""
+    unused = unused_fields(meta)
+    folder = (file.parent / str(meta["frames"][0]["file_path"])).parent
+    beside = ("dynamic_mask_*", "rays_*.dat", "*.alpha.*")
+    unused += [kind for kind in beside if any(folder.glob(kind))]
+    if unused:
+        say(f"{escape(str(file))}: not used: {escape(', '.join(unused)[:300])}")

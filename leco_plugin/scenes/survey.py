@@ -19,7 +19,7 @@ from leco_plugin.scenes.bounds import (
     up_to_the_cameras,
     with_range,
 )
-from leco_plugin.scenes.dataset_units import ALTITUDES, DatasetUnits, units_of
+from leco_plugin.scenes.frames import ALTITUDES, DatasetUnits, units_of
 from leco_plugin.scenes.input_error import InputError
 from leco_plugin.scenes.large_coordinates import rounded_by
 from leco_plugin.scenes.photographs import POINT_KEYS
@@ -141,17 +141,14 @@ def survey(
     chosen = chosen_cameras(len(cameras))
     poses = cameras.camera_to_worlds[chosen]
     flat_origins, flat_directions = origins.reshape(-1, 3), directions.reshape(-1, 3)
-    try:
-        found = find_bounds(poses, directions, sparse_points(dataset), config)
-        if found.from_above:
-            missing = lengths_inside(found, flat_origins, flat_directions) <= 0.0
-            seen = seen_beyond(dataset, chosen, missing.view(-1, SIDE, SIDE))
-            if seen >= WORTH_IT:
-                found = up_to_the_cameras(found, poses[:, 2, 3], seen)
-        bounds = with_range(found, near, far)
-        units = units_of(datamanager, config.metres_per_unit)
-    except ValueError as error:
-        raise InputError(str(error)) from None
+    found = find_bounds(poses, directions, sparse_points(dataset), config)
+    if found.from_above:
+        missing = lengths_inside(found, flat_origins, flat_directions) <= 0.0
+        seen = seen_beyond(dataset, chosen, missing.view(-1, SIDE, SIDE))
+        if seen >= WORTH_IT:
+            found = up_to_the_cameras(found, poses[:, 2, 3], seen)
+    bounds = with_range(found, near, far)
+    units = units_of(datamanager, config.metres_per_unit)
     lengths = lengths_inside(bounds, flat_origins, flat_directions)
     hits = lengths > 0.0
     if not bool(hits.any()):

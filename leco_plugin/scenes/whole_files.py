@@ -37,13 +37,8 @@ def remove_parts(folder: Path) -> None:
 
 
 def write_points(path: Path, rows: NDArray[Any]) -> None:
-    """Writes points as a binary PLY file.
-
-    Args:
-        rows: [N] of `xyz`, three floats, and of `rgb`, three or four bytes.
-    Raises:
-        OSError: it cannot be written there.
-    """
+    """Writes points as a binary PLY file: rows [N] of `xyz`, three floats, and of `rgb`, three or
+    four bytes. OSError if it cannot be written there."""
     properties = []
     for field, names in (("xyz", "x y z"), ("rgb", "red green blue alpha")):
         kind, shape = rows.dtype[field].subdtype or (rows.dtype[field], (1,))

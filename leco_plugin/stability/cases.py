@@ -9,6 +9,7 @@ from typing import Any
 from leco_plugin.scenes.input_error import InputError
 from leco_plugin.stability.photographs import Capture
 from leco_plugin.stability.samplers import DENSE, GRID, GRIDS, LEARNED, RAYS
+from leco_plugin.stability.stages import STAGES
 
 BOUNDED = (LEARNED, *(f"{GRID}-{cells}" for cells in GRIDS), DENSE)
 """Samplers whose host has bounds: Nerfacto contracts all of space, and has none."""
@@ -20,12 +21,11 @@ class Case:
     """One row of the table."""
 
     name: str
+    """A stage of the same name is what is there; else it is the yard."""
     title: str
     """In the table."""
     why: str
     """What it is for, in a sentence."""
-    stage: str = "yard"
-    """What is there, by its name in `stages`."""
     capture: Capture = field(default_factory=Capture)
     """How it is photographed."""
     changes: Mapping[str, Any] = field(default_factory=dict)
@@ -43,8 +43,6 @@ class Case:
     """Fewest seeds."""
     must_fail: bool = False
     """Whether it shows that the suite can tell a failure: learned occupancy has to fail in it."""
-    fixed_views: bool = False
-    """Whether the number of pictures is the point."""
 
     def is_about(self, sampler: str) -> bool:
         """Whether it has something to say about a sampler."""
@@ -54,8 +52,8 @@ class Case:
     @property
     def scene(self) -> str:
         """Name of its scene's folder: cases with equal pictures share one."""
-        plain = self.capture == Capture(stand=self.capture.stand)
-        return self.stage if plain else self.name
+        has_own = self.name in STAGES or self.capture != Capture()
+        return self.name if has_own else "yard"
 
 
 def _learning(name: str, title: str, why: str, *, must_fail: bool = False, **changes: Any) -> Case:
@@ -82,24 +80,21 @@ CASES = {
             "poles-and-wires",
             "poles and wires",
             "a wire is thinner than a cell, and costs no PSNR when it disappears",
-            "poles-and-wires",
             fine_grid=True,
         ),
-        Case("glass", "glass", "low density that matters, before surfaces", "glass"),
-        Case("fog", "fog", "low density everywhere: nothing is empty, nothing is solid", "fog"),
+        Case("glass", "glass", "low density that matters, before surfaces"),
+        Case("fog", "fog", "low density everywhere: nothing is empty, nothing is solid"),
         Case(
             "all-empty",
             "nothing but sky",
             "a gate may call all of it empty, and must not collapse over it",
-            "all-empty",
             Capture(stand="low"),
         ),
-        Case("all-full", "matter everywhere", "nothing may be skipped", "all-full"),
+        Case("all-full", "matter everywhere", "nothing may be skipped"),
         Case(
             "far-terrain",
             "sky and far terrain",
             "half of every picture lies outside any box that fits the scene",
-            "far-terrain",
             Capture(stand="low"),
             grid_levels=2,
         ),
@@ -107,14 +102,12 @@ CASES = {
             "outline",
             "irregular outline",
             "no box fits the scene, and one camera stands far outside",
-            "outline",
             Capture(stray=1),
         ),
         Case(
             "indoors",
             "inside a building",
             "cameras inside the matter that they see: what is empty is around them",
-            "indoors",
             Capture(stand="inside"),
         ),
         Case(
@@ -137,38 +130,37 @@ CASES = {
             "six views only",
             "over a third of the places are in two pictures at most: haze explains those as well "
             "as surfaces",
-            capture=Capture(views=6),
-            fixed_views=True,
+            Capture(views=6),
         ),
         Case(
             "exposure",
             "changing exposure",
             "no density explains what differs between pictures, and haze tries",
-            capture=Capture(exposure=0.35),
+            Capture(exposure=0.35),
         ),
         Case(
             "pose-noise",
             "noisy poses",
             "surfaces do not meet, and a sharp occupancy cuts off the half that is elsewhere",
-            capture=Capture(shift=0.03, turn=0.3),
+            Capture(shift=0.03, turn=0.3),
         ),
         Case(
             "moving",
             "moving objects",
             "what is there in a third of the pictures only must not take the floor along",
-            capture=Capture(moving=True),
+            Capture(moving=True),
         ),
         Case(
             "resolutions",
             "three resolutions",
             "batches mix pictures of different sizes",
-            capture=Capture(sizes=(1.0, 0.5, 1.5)),
+            Capture(sizes=(1.0, 0.5, 1.5)),
         ),
         Case(
             "far-origin",
             "origin 10 km away",
             "metric coordinates leave float32 a millimetre",
-            capture=Capture(origin=(10_000.0, -14_000.0, 300.0)),
+            Capture(origin=(10_000.0, -14_000.0, 300.0)),
         ),
         _paper(
             "ratio-too-low",

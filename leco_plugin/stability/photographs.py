@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from leco_plugin.scenes.city.cameras import Lens, look_at
-from leco_plugin.scenes.city.layouts import POINTS, TRANSFORMS
+from leco_plugin.scenes.city.folder import POINTS, TRANSFORMS
 from leco_plugin.scenes.input_error import InputError
 from leco_plugin.scenes.whole_files import write_points
 from leco_plugin.stability.scene import Array, Stage, photograph

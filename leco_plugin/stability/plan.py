@@ -26,7 +26,7 @@ from leco_plugin.stability.samplers import (
     with_references,
 )
 from leco_plugin.stability.scene import Stage
-from leco_plugin.stability.stages import STAGES
+from leco_plugin.stability.stages import STAGES, YARD
 
 START_SECONDS = 14.0
 """For a process to start, to read the scene and to build the host."""
@@ -50,6 +50,10 @@ STEPS_PER_UPDATE, FULL_UPDATES, LATER_SHARE = 16, 16, 0.3
 """An occupancy grid asks about every cell so many times, then about so large a share of them."""
 
 
+Key = tuple[str, str]
+"""Scene and name of a run."""
+
+
 @dataclass(frozen=True)
 class Run:
     """One run, on the scene of a name."""
@@ -58,7 +62,7 @@ class Run:
     job: Job
 
     @property
-    def key(self) -> tuple[str, str]:
+    def key(self) -> Key:
         """The same for what is run once however many cells share it."""
         return self.scene, self.job.name
 
@@ -112,7 +116,7 @@ def entries_of(
 def runs_of(entries: Sequence[Entry]) -> list[Run]:
     """All runs, each once: all cells get their first seed before any gets its second."""
     most = max((len(entry.seeds) for entry in entries), default=0)
-    found: dict[tuple[str, str], Run] = {}
+    found: dict[Key, Run] = {}
     for number in range(most):
         for entry in entries:
             for run in entry.runs[number : number + 1]:
@@ -122,13 +126,14 @@ def runs_of(entries: Sequence[Entry]) -> list[Run]:
 
 def scenes_of(cases: Sequence[Case], sizes: Sizes) -> dict[str, tuple[Stage, Capture]]:
     """The scenes of the cases by name."""
-    return {case.scene: (STAGES[case.stage], capture_of(case, sizes)) for case in cases}
+    return {case.scene: (STAGES.get(case.name, YARD), capture_of(case, sizes)) for case in cases}
 
 
 def capture_of(case: Case, sizes: Sizes) -> Capture:
     """A case's capture in pictures of the suite's size."""
     capture = case.capture
-    views = capture.views if case.fixed_views else round(capture.views * sizes.views)
+    is_fixed = capture.views != Capture.views
+    views = capture.views if is_fixed else round(capture.views * sizes.views)
     return replace(
         capture,
         views=max(4, views),

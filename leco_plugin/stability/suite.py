@@ -6,44 +6,41 @@ import datetime
 import functools
 import json
 import math
-import shutil
 import sys
 import threading
 import time
 from collections.abc import Callable, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor, as_completed
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
 from leco_plugin.chart.protocol import Protocol, require_seeds, settings_of
 from leco_plugin.chart.runner import (
-    LOGS,
     RUNS,
-    UNFINISHED,
     ProcessRunner,
     RunFailed,
     RunFolder,
     Runner,
-    difference,
+    make_jobs,
+    take_folder,
 )
 from leco_plugin.chart.theme import DARK, LIGHT
 from leco_plugin.evaluation.report import (
     describe_code,
     describe_machine,
-    read_object,
     usable_cores,
     write_json,
 )
 from leco_plugin.log import bar, console, resumable
 from leco_plugin.occupancy import CALIBRATED_AT
-from leco_plugin.scenes.city.layouts import TRANSFORMS
+from leco_plugin.scenes.city.folder import TRANSFORMS
 from leco_plugin.scenes.input_error import InputError
 from leco_plugin.scenes.photographs import describe_scene
 from leco_plugin.stability.cases import Case, cases_named
 from leco_plugin.stability.photographs import digest_of, write_scene
 from leco_plugin.stability.plan import (
     Entry,
+    Key,
     Run,
     core_seconds,
     entries_of,
@@ -54,13 +51,14 @@ from leco_plugin.stability.plan import (
 from leco_plugin.stability.samplers import FULL, QUICK, Sampler, Sizes, samplers_named
 from leco_plugin.stability.table import draw, draw_side_by_side, table
 from leco_plugin.stability.verdict import judge
-from leco_plugin.studio.run_folder import LOCK, alone_in
+from leco_plugin.studio.run_folder import alone_in
 
 WORKER = (sys.executable, "-W", "ignore", "-m", "leco_plugin.stability.worker")
 SIZES = "sizes.json"
 """File whose presence says that a folder is a table's, with the sizes of all runs there."""
-SCENES, FAILURES, FAILED = "scenes", "failures", ".failed"
-"""Folders of the table, and the ending of a file with the reason why a run has no result."""
+DAMAGED = "is damaged, or not of a table; delete it, or name a new folder with --out"
+SCENES, FAILURES = "scenes", "failures"
+"""Folders of the table."""
 PER_PORTION = {"cores", "threads"}
 """Facts of the machine that say how many runs are made at once, and change no run."""
 OF_OCCUPANCY = (
@@ -68,7 +66,6 @@ OF_OCCUPANCY = (
     CALIBRATED_AT,
 )  # what is kept of a learned occupancy
 Say = Callable[[str], None]
-Key = tuple[str, str]  # scene and name of a run
 
 
 def make_table(
@@ -79,7 +76,6 @@ def make_table(
     seeds_beside: Sequence[int] = (),
     quick: bool = False,
     minutes: float | None = None,
-    runner_for: Callable[[str], Runner] | None = None,
     earlier: Mapping[str, Any] | None = None,
 ) -> dict[str, Any]:
     """Makes what is missing of a table and draws it.
@@ -90,7 +86,6 @@ def make_table(
         seeds, seeds_beside: of each cell, and of some samplers; see `entries_of`.
         quick: tiny sizes, for a look at whether everything works.
         minutes: that this may take, about; None is as many as it takes.
-        runner_for: gives what makes the runs of a scene.
         earlier: results whose runs are kept where they would be made here just so.
     Returns:
         The results, as in `stability.json`.
@@ -112,7 +107,7 @@ def make_table(
             say(f"{suite.take_over(earlier)} runs of earlier results are taken over")
         say(suite.estimate())
         with resumable(say), bar(f"{len(chosen)} cases") as show:
-            suite.make(say, show, runner_for, math.inf if minutes is None else 60.0 * minutes)
+            suite.make(say, show, math.inf if minutes is None else 60.0 * minutes)
         if left := len(suite.missing()):
             say(f"{left} runs are left or have failed; the same command goes on with them")
         return suite.draw()
@@ -143,7 +138,10 @@ class Suite:
         if not cases or not samplers or not seeds:
             raise ValueError("a table needs at least one case, one sampler and one seed")
         require_seeds([*seeds, *beside])
-        take_folder(out, sizes)
+        other_sizes = "a table of other sizes, with --quick or without:"
+        take_folder(out / SIZES, asdict(sizes), other_sizes, DAMAGED)
+        for name in (SCENES, RUNS, FAILURES):
+            (out / name).mkdir(exist_ok=True)
         self.out, self.cases, self.sizes, self.command = out, list(cases), sizes, command
         self.machine = describe_machine()
         self.made = {"cpu": self.machine["cpu"], **describe_code()}
@@ -184,15 +182,15 @@ class Suite:
     def failures(self) -> dict[Key, str]:
         """Why runs have ended without a result: until they are made with one."""
         return {
-            (scene, file.stem): file.read_text()
+            (scene, one["job"]): one["reason"]
             for scene, folder in self.folders.items()
-            for file in (folder.path / LOGS).glob(f"*{FAILED}")
+            for one in folder.failures()
         }
 
     def missing(self) -> list[Run]:
         """Runs that are not stored: first those that were never tried, then those that failed."""
         stored, failures = self.stored(), self.failures()
-        runs = (run for run in runs_of(self.entries) if run.key not in stored)
+        runs = [run for run in runs_of(self.entries) if run.key not in stored]
         return sorted(runs, key=lambda run: run.key in failures)
 
     def estimate(self) -> str:
@@ -204,63 +202,49 @@ class Suite:
             f"time: about {in_words(seconds)}"
         )
 
-    def make(
-        self,
-        say: Say,
-        show: Callable[[float], None],
-        runner_for: Callable[[str], Runner] | None = None,
-        seconds: float = math.inf,
-    ) -> None:
+    def make(self, say: Say, show: Callable[[float], None], seconds: float = math.inf) -> None:
         """Makes what is missing; whenever this is stopped, what was finished is kept.
 
         Args:
-            say: called with a line for each run.
-            show: called with the share of all runs that is done.
-            runner_for: gives what makes the runs of a scene, instead of processes.
+            say, show: as of `make_jobs`.
             seconds: after which no run is to go on; but for the first ones, what would take longer
                 is left for another time.
         """
-        todo, total, stored = self.missing(), len(runs_of(self.entries)), self.stored()
-        make_one, ends = runner_for or self.runner, time.monotonic() + seconds
-        for folder in self.folders.values():  # left by runs that were killed
-            shutil.rmtree(folder.path / UNFINISHED, ignore_errors=True)
-            (folder.path / UNFINISHED).mkdir()
+        todo, stored = self.missing(), list(self.stored().values())
+        ends = time.monotonic() + seconds
+
+        def is_in_time(run: Run) -> bool:
+            expected = core_seconds([run], stored, self.sizes)
+            return run in todo[: self.workers] or time.monotonic() + expected <= ends
+
+        def note(line: str) -> None:
+            say(line)
+            self.write()
+
+        for folder in self.folders.values():
+            folder.clear()
         self.write()
+        make_jobs(
+            todo,
+            self._make_one,
+            note,
+            show,
+            stop=self.stop,
+            at_once=self.workers,
+            done=len(runs_of(self.entries)) - len(todo),
+            is_wanted=is_in_time,
+        )
 
-        def make_in_time(run: Run, expected: float, is_first: bool) -> str | None:
-            is_late = time.monotonic() + expected > ends
-            return self._run(run, make_one(run.scene)) if is_first or not is_late else None
-
-        with ThreadPoolExecutor(self.workers) as pool:
-            made = []
-            for number, run in enumerate(todo):
-                expected = core_seconds([run], list(stored.values()), self.sizes)
-                made.append(pool.submit(make_in_time, run, expected, number < self.workers))
-            try:
-                done = total - len(todo)
-                for future in as_completed(made):
-                    if (line := future.result()) is not None:
-                        done += 1
-                        say(line)
-                        show(done / total)
-                        self.write()
-            except BaseException:
-                self.stop.set()
-                pool.shutdown(wait=False, cancel_futures=True)
-                raise
-
-    def _run(self, run: Run, runner: Runner) -> str:
-        """Makes a run and keeps it; returns a line about it."""
+    def _make_one(self, run: Run, show: Callable[[float], None]) -> str:
+        """Makes a run and keeps it, or why there is none; returns a line about it."""
         title = f"{run.scene}, {run.job.contender.name}, seed {run.job.seed}"
         folder = self.folders[run.scene]
-        failure = folder.path / LOGS / f"{run.job.name}{FAILED}"
         try:
-            record = runner(run.job, lambda share: None)
+            record = self.runner(run.scene)(run.job, show)
         except RunFailed as error:
-            failure.write_text(str(error))
+            folder.fail(run.job, str(error))
             return f"{title}: failed: {error}"
         folder.store(run.job, record | {"made": self.made})
-        failure.unlink(missing_ok=True)
         psnr = "no PSNR" if record["psnr"] is None else f"{record['psnr']:.2f} dB"
         return f"{title}: {psnr} after {record['processor_seconds']:.0f} s"
 
@@ -368,28 +352,6 @@ class Suite:
         folder = self.folders[entry.case.scene].path / RUNS
         places = {run.job.seed: folder / f"{run.job.name}.png" for run in entry.runs}
         return {seed: place for seed, place in places.items() if place.exists()}
-
-
-def take_folder(out: Path, sizes: Sizes) -> None:
-    """Makes a folder one of tables in these sizes, if it is not one already.
-
-    Raises:
-        InputError: it holds something else, or a table in other sizes; nothing was written.
-    """
-    file = out / SIZES
-    if file.is_file():
-        damaged = "is damaged, or not of a table; delete it, or name a new folder with --out"
-        if unlike := difference(read_object(file, damaged), asdict(sizes)):
-            raise InputError(
-                f"{out} holds a table of other sizes, with --quick or without: {unlike}; "
-                "name a new folder with --out"
-            )
-    elif out.exists() and any(path.name != LOCK for path in out.iterdir()):
-        raise InputError(f"{out} holds something else; name a new folder with --out")
-    else:
-        write_json(file, asdict(sizes))
-    for name in (SCENES, RUNS, FAILURES):
-        (out / name).mkdir(exist_ok=True)
 
 
 def _figures(run: Mapping[str, Any], name: str) -> dict[str, Any]:

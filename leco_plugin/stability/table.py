@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from PIL import Image
 
-from leco_plugin.chart.theme import LIGHT, SOURCE, Theme, fingerprint
+from leco_plugin.chart.theme import LIGHT, Theme, new_figure, save_picture
 from leco_plugin.stability.samplers import LEARNED, QUICK
 
 NOTHING = "nothing has been run yet"
@@ -185,12 +185,10 @@ def draw(results: Results, path: Path, theme: Theme = LIGHT) -> Path:
         path: of the picture.
         theme: of the page it is meant for.
     """
-    from matplotlib.figure import Figure
-
     rows, samplers = results["cases"], results["samplers"]
     width = max(NAMES + COLUMN * len(samplers) + 0.2, 8.5)
     height = HEAD + ROW * len(rows) + FOOT
-    figure = Figure(figsize=(width, height), facecolor=theme.page)
+    figure = new_figure((width, height), theme.page)
     axes: Any = figure.add_axes((0, 0, 1, 1))
     axes.set_xlim(0, width)
     axes.set_ylim(height, 0)
@@ -212,8 +210,7 @@ def draw(results: Results, path: Path, theme: Theme = LIGHT) -> Path:
                 _draw_cell(axes, cell, NAMES + COLUMN * column, top, *colours)
     explained = textwrap.fill(HOW_TO_READ, int(width * 13))
     axes.text(0.15, height - FOOT + 0.12, explained, va="top", fontsize=9, color=theme.ink)
-    figure.savefig(path, dpi=140, metadata={SOURCE: fingerprint(results)})
-    return path
+    return save_picture(figure, path, results, dpi=140)
 
 
 def _draw_cell(
@@ -240,9 +237,7 @@ def _draw_cell(
 
 def draw_side_by_side(pictures: Mapping[str, Path], title: str, path: Path) -> None:
     """Draws pictures in a row, each under its name."""
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(VIEW * len(pictures), 0.75 * VIEW + 0.75), facecolor="white")
+    figure = new_figure((VIEW * len(pictures), 0.75 * VIEW + 0.75))
     figure.text(0.01, 0.985, title, va="top", fontsize=11, fontweight="bold")
     for number, (name, picture) in enumerate(pictures.items()):
         left = number / len(pictures)

@@ -12,6 +12,7 @@ import sys
 import time
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -180,10 +181,11 @@ def psnr(squared_errors: Tensor) -> float:
 
 def render(model: Any, bundle: RayBundle) -> Tensor:
     """Colours [N, 3] of rays, in [0, 1]."""
-    parts = [bundle[i : i + RAYS_AT_ONCE] for i in range(0, len(bundle), RAYS_AT_ONCE)]
-    if not parts:
-        return torch.zeros(0, 3, device=bundle.origins.device)
-    return torch.cat([model(part)["rgb"] for part in parts]).clamp(0.0, 1.0)
+    return torch.cat([model(bundle[part])["rgb"] for part in _parts(bundle)]).clamp(0.0, 1.0)
+
+
+def _parts(bundle: RayBundle) -> list[slice]:
+    return [slice(i, i + RAYS_AT_ONCE) for i in range(0, len(bundle), RAYS_AT_ONCE)]
 
 
 def find_samples(
@@ -200,26 +202,22 @@ def find_samples(
         [N] distance of the surface from the middle of the nearest sample, inf without one; number
         of samples; and number of candidates of the dense reference.
     """
-    nearest, samples, candidates = [torch.zeros(0)], 0, 0
-    for first in range(0, len(bundle), RAYS_AT_ONCE):
-        part = slice(first, first + RAYS_AT_ONCE)
-        if hasattr(model, "proposal_sampler"):
-            near, kept, most = _sample_proposals(model, bundle[part], depth[part])
-            most = dense_samples * most
-        else:
-            near, kept, most = _sample_packed(model, bundle[part], depth[part])
-        nearest.append(near)
-        samples, candidates = samples + kept, candidates + most
-    return torch.cat(nearest), samples, candidates
+    is_packed = not hasattr(model, "proposal_sampler")
+    sample = _sample_packed if is_packed else partial(_sample_proposals, dense_samples)
+    found = [sample(model, bundle[part], depth[part]) for part in _parts(bundle)]
+    nearest, samples, candidates = zip(*found)
+    return torch.cat(nearest), sum(samples), sum(candidates)
 
 
-def _sample_proposals(model: Any, bundle: RayBundle, depth: Tensor) -> tuple[Tensor, int, int]:
-    """As of `find_samples`, with the number of rays in place of that of candidates."""
+def _sample_proposals(
+    dense_samples: int, model: Any, bundle: RayBundle, depth: Tensor
+) -> tuple[Tensor, int, int]:
+    """As of `find_samples`."""
     bundle = model.collider(bundle) if model.collider is not None else bundle
     samples, _, _ = model.proposal_sampler(bundle, density_fns=model.density_fns)
     middles = ((samples.frustums.starts + samples.frustums.ends) / 2)[..., 0].cpu()
     away = (middles - depth[:, None]).abs().amin(dim=1)
-    return away, middles.numel(), len(bundle)
+    return away, middles.numel(), dense_samples * len(bundle)
 
 
 def _sample_packed(model: Any, bundle: RayBundle, depth: Tensor) -> tuple[Tensor, int, int]:

@@ -250,9 +250,11 @@ def from_whole(load: Callable[..., tuple[Path, int]]) -> Callable[..., tuple[Pat
     return loading
 
 
-def whole_of(checkpoints: Path) -> Path:
+def whole_of(checkpoints: Path, then: str = "{} is loaded instead") -> Path:
     """The newest whole checkpoint of a run, with a line about each newer one that is damaged.
 
+    Args:
+        then: what becomes of it, where there is a damaged one.
     Raises:
         InputError: there is none.
     """
@@ -260,5 +262,5 @@ def whole_of(checkpoints: Path) -> Path:
     for line in damaged:
         say(line)
     if damaged:
-        say(f"{path} is loaded instead, the newest that is whole")
+        say(f"{then.format(path)}, the newest that is whole")
     return path

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import functools
 import sys
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 from types import SimpleNamespace
 from typing import Any
@@ -50,13 +51,12 @@ class DataParallelTrainerConfig(TrainerConfig):
                 there is no step to take, or a folder is not there.
         """
         super().set_timestamp()
-        machine = self.machine
         self._require_what_is_named()
-        require_startable(machine)
-        if machine.num_devices * machine.num_machines > 1:
+        require_startable(self.machine)
+        if self.machine.num_devices * self.machine.num_machines > 1:
             name_the_lost()
-        if machine.device_type == "cpu" and machine.num_devices * machine.num_machines > 1:
-            launch_on_cpu()
+            if self.machine.device_type == "cpu":
+                launch_on_cpu()
 
     def _require_what_is_named(self) -> None:
         """Before anything of a run is written.
@@ -116,21 +116,24 @@ def require_startable(machine: MachineConfig) -> None:
         )
 
 
-def launch_on_cpu() -> None:
-    """Has nerfstudio's launcher, where it is loaded, start `process` and not its own function."""
+def _launchers() -> Iterator[Any]:
+    """Where nerfstudio's launcher is loaded."""
     for name in ("nerfstudio.scripts.train", "__main__"):
-        launcher: Any = sys.modules.get(name)
+        yield sys.modules.get(name)
+
+
+def launch_on_cpu() -> None:
+    """Has nerfstudio's launcher start `process` and not its own function."""
+    for launcher in _launchers():
         if hasattr(launcher, "_distributed_worker"):
             launcher._distributed_worker = process
 
 
 def name_the_lost() -> None:
-    """Has nerfstudio's launcher, where it is loaded, end in one line when a process is lost."""
-    for name in ("nerfstudio.scripts.train", "__main__"):
-        launcher: Any = sys.modules.get(name)
-        if not hasattr(launcher, "launch") or hasattr(launcher.launch, "__wrapped__"):
-            continue
-        launcher.launch = _with_one_line(launcher.launch)
+    """Has nerfstudio's launcher end in one line when a process is lost."""
+    for launcher in _launchers():
+        if hasattr(launcher, "launch") and not hasattr(launcher.launch, "__wrapped__"):
+            launcher.launch = _with_one_line(launcher.launch)
 
 
 def _with_one_line(launch: Any) -> Any:
@@ -160,14 +163,10 @@ def _stop(which: str, how: str, config: Any) -> None:
     """
     folder = config.get_checkpoint_dir()
     saved = any(folder.glob("*.ckpt"))
+    left = f"nothing that was saved is lost: go on with --load-dir {folder}"
     raise TrainingStopped(
         f"{which} of {config.machine.num_devices} processes here was lost ({how}), and the others "
-        "have stopped; "
-        + (
-            f"nothing that was saved is lost: go on with --load-dir {folder}"
-            if saved
-            else "no checkpoint was saved yet: begin anew"
-        )
+        f"have stopped; {left if saved else 'no checkpoint was saved yet: begin anew'}"
     ) from None
 
 

@@ -24,12 +24,7 @@ from leco_plugin.log import say, say_what_is_logged
 from leco_plugin.models.failures import TrainingStopped
 from leco_plugin.samplers.kernels import VARIABLE, kernels_off
 from leco_plugin.scenes.input_error import InputError
-from leco_plugin.studio.checkpoints import (
-    first_not_finite,
-    newest_whole,
-    previous_of,
-    step_of,
-)
+from leco_plugin.studio.checkpoints import first_not_finite, previous_of, step_of, whole_of
 from leco_plugin.studio.run import end_of, forget_the_gone, iterations_until
 from leco_plugin.studio.run_folder import (
     check_photographs,
@@ -161,8 +156,7 @@ class AtomicTrainer(Trainer):
         if self.config.steps_per_save > 0:
             self.save_checkpoint(step)
         parts = [f"step {step}: stopped by Ctrl-C", self._what_is_left()]
-        saved = sorted(self.checkpoint_dir.glob("*.ckpt"))
-        if saved:  # a step that is in doubt is not saved: it goes on from the one before
+        if saved := self._saved():  # a step in doubt is not saved: it goes on from the one before
             done, end = step_of(saved[-1]) + 1, end_of(self)
             steps = f"--max-num-iterations {iterations_until(end, done)}"
             resume = f"--load-dir {self.checkpoint_dir} {steps} goes on from there"
@@ -191,12 +185,15 @@ class AtomicTrainer(Trainer):
         except GateCollapsed as error:
             raise TrainingStopped(f"{error} Kept: {self._what_is_left()}") from None
 
+    def _saved(self) -> list[Path]:
+        """The checkpoints in the run's folder, the newest last."""
+        return sorted(self.checkpoint_dir.glob("*.ckpt"))
+
     def _what_is_left(self) -> str:
         """For the last line of a run that ends before its time."""
-        saved = sorted(self.checkpoint_dir.glob("*.ckpt"))
-        return (
-            f"the last good checkpoint is {saved[-1]}" if saved else "no checkpoint was saved yet"
-        )
+        if saved := self._saved():
+            return f"the last good checkpoint is {saved[-1]}"
+        return "no checkpoint was saved yet"
 
     def _load_checkpoint(self) -> None:
         """As nerfstudio's, from the newest checkpoint of a folder that is whole.
@@ -208,11 +205,7 @@ class AtomicTrainer(Trainer):
         if folder is None or config.load_step is not None:
             super()._load_checkpoint()
             return
-        path, damaged = newest_whole(folder)
-        for line in damaged:
-            say(line)
-        if damaged:
-            say(f"going on from {path}, the newest that is whole")
+        path = whole_of(folder, "going on from {}")
         self.config = replace(config, load_dir=None, load_checkpoint=path)
         try:
             super()._load_checkpoint()
@@ -274,7 +267,7 @@ class AtomicTrainer(Trainer):
             self.checkpoint_dir = checkpoints
             shutil.rmtree(beside, ignore_errors=True)  # also what a killed process has left there
         if self.config.save_only_latest_checkpoint:
-            self._put_aside([path for path in checkpoints.glob("*.ckpt") if path != finished])
+            self._put_aside([path for path in self._saved() if path != finished])
 
     def _put_aside(self, older: list[Path]) -> None:
         """Keeps the newest of these as the one before the newest of the run, and no other."""
@@ -282,7 +275,7 @@ class AtomicTrainer(Trainer):
             return
         aside = previous_of(self.checkpoint_dir)
         aside.mkdir(exist_ok=True)
-        *others, newest = sorted(older)
+        *others, newest = older
         kept = newest.replace(aside / newest.name)
         for path in [*others, *aside.glob("*.ckpt")]:
             if path != kept:

@@ -2,9 +2,24 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import pytest
 
 from leco_plugin.capacity import gates, references, search
+from leco_plugin.capacity.sources import Source, find_source
+from leco_plugin.occupancy import Occupancy
+
+LEFT_OPEN = (
+    "ignore:unclosed file:ResourceWarning",
+    "ignore::pytest.PytestUnraisableExceptionWarning",
+)
+"""nerfstudio leaves an image open."""
+
+
+def pytest_itemcollected(item: pytest.Item) -> None:
+    for warning in LEFT_OPEN:
+        item.add_marker(pytest.mark.filterwarnings(warning))
 
 
 @pytest.fixture(autouse=True)
@@ -15,3 +30,15 @@ def quick(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(search, "VOLUME_POINTS", 1 << 14)
     monkeypatch.setattr(search, "TAUGHT_POINTS", 1 << 14)
     monkeypatch.setattr(gates, "BATCH", 4096)
+
+
+@pytest.fixture
+def file(known_run: Path) -> Path:
+    """What a known run has left."""
+    return known_run / "occupancy.safetensors"
+
+
+@pytest.fixture
+def known(file: Path, tiny_scene: Path) -> tuple[Source, Occupancy]:
+    """Its photographs with its model, and its occupancy."""
+    return find_source(file, tiny_scene), Occupancy.load(file)

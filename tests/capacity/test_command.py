@@ -18,11 +18,6 @@ from leco_plugin.capacity.measuring import VOLUMES
 from leco_plugin.chart.theme import SOURCE, fingerprint
 from leco_plugin.scenes.input_error import InputError
 
-pytestmark = [  # nerfstudio leaves an image open
-    pytest.mark.filterwarnings("ignore:unclosed file:ResourceWarning"),
-    pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning"),
-]
-
 
 def run(*arguments: object) -> int:
     return cli.main([str(argument) for argument in arguments])
@@ -40,19 +35,30 @@ def row_of(candidate: Candidate) -> dict[str, Any]:
     }
 
 
+class Taught(list[str]):
+    """Keys of what would have been taught."""
+
+    stops_at: int | None = None
+    """Number of the gate at which somebody presses Ctrl-C."""
+    most_cells: int | None = None
+    """Along an axis of the largest grid that does not take too long."""
+
+
 @pytest.fixture
-def taught(monkeypatch: pytest.MonkeyPatch) -> list[str]:
-    """Nothing is learned; the keys of what would have been."""
-    done: list[str] = []
+def taught(monkeypatch: pytest.MonkeyPatch) -> Taught:
+    """Nothing is learned."""
+    done = Taught()
 
     def of_gate(ground: Any, candidate: Candidate, lost: float) -> dict[str, Any]:
-        if len(done) == 5:
+        if len(done) == done.stops_at:
             raise KeyboardInterrupt
         done.append(candidate.key)
         return row_of(candidate)
 
     def of_grids(ground: Any, candidates: list[Candidate], lost: float) -> Any:
         for candidate in candidates:
+            if done.most_cells is not None and int(candidate.size) > done.most_cells:
+                return
             done.append(candidate.key)
             yield candidate, row_of(candidate)
 
@@ -64,18 +70,24 @@ def taught(monkeypatch: pytest.MonkeyPatch) -> list[str]:
     return done
 
 
+@pytest.fixture
+def undrawn(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(command, "draw", lambda *arguments: None)
+
+
 def test_what_was_finished_is_kept(
-    taught: list[str], tiny_scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    taught: Taught, tiny_scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     out = tmp_path / "capacity"
     arguments = ["capacity", "--data", tiny_scene, "--out", out, "--grids", 16, 32]
-    assert run(*arguments) == 130  # stopped at the sixth
+    taught.stops_at = 5
+    assert run(*arguments) == 130
     assert len(list((out / "points").iterdir())) == len(taught) == 5
-    taught.append("so that it is not stopped again")
+    taught.stops_at = None
     assert run(*arguments) == 0
     assert len(set(taught)) == len(taught)
     results = json.loads((out / "results.json").read_text())
-    assert len(results["representations"]) == len(taught) - 1
+    assert len(results["representations"]) == len(taught)
     assert all(row["code"]["sources"] and row["date"] for row in results["representations"])
     assert results["verdict"] in capsys.readouterr().out
     for name in ("capacity.png", "capacity-dark.png"):
@@ -86,11 +98,11 @@ def test_what_was_finished_is_kept(
     assert run(*arguments) == 0 and len(taught) == before
 
 
+@pytest.mark.usefixtures("taught")
 def test_other_settings_and_bad_input_are_refused_in_one_line(
-    taught: list[str], tiny_scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    tiny_scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     out = tmp_path / "capacity"
-    taught += [""] * 6
     assert run("capacity", "--data", tiny_scene, "--out", out, "--grids", 16) == 0
     capsys.readouterr()
     (tmp_path / "taken").mkdir()
@@ -115,19 +127,12 @@ def test_other_settings_and_bad_input_are_refused_in_one_line(
     assert not (tmp_path / "new").exists()
 
 
+@pytest.mark.usefixtures("taught", "undrawn")
 @pytest.mark.parametrize("name", ["settings.json", "points/grid-16.json"])
 @pytest.mark.parametrize("text", ["{", "[]", '{"data": 1}'])
 def test_a_damaged_file_is_named(
-    taught: list[str],
-    tiny_scene: Path,
-    tmp_path: Path,
-    capsys: pytest.CaptureFixture[str],
-    monkeypatch: pytest.MonkeyPatch,
-    name: str,
-    text: str,
+    tiny_scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], name: str, text: str
 ) -> None:
-    monkeypatch.setattr(command, "draw", lambda *arguments: None)
-    taught += [""] * 6
     arguments = ["capacity", "--data", tiny_scene, "--out", tmp_path / "out", "--grids", 16]
     assert run(*arguments) == 0
     capsys.readouterr()
@@ -137,11 +142,10 @@ def test_a_damaged_file_is_named(
     assert said.startswith("leco: ") and said.count("\n") == 1
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_a_grid_that_is_asked_for_twice_is_measured_once(
-    taught: list[str], tiny_scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    taught: Taught, tiny_scene: Path, tmp_path: Path
 ) -> None:
-    monkeypatch.setattr(command, "draw", lambda *arguments: None)
-    taught += [""] * 6
     arguments = ["capacity", "--data", tiny_scene, "--out", tmp_path / "out"]
     assert run(*arguments, "--grids", 16, 16) == 0
     assert taught.count("grid-16") == 1
@@ -159,43 +163,36 @@ def test_one_field_teaches_gates_and_grids(
     monkeypatch.setattr(measuring, "STEPS", 20)
     monkeypatch.setattr("leco_plugin.capacity.gates.BATCH", 512)
     some = [candidate for candidate in gates() if candidate.bytes < 5000]
+    monkeypatch.setattr(command, "gates", lambda: some)
     out = tmp_path / "out"
     for _ in range(2):  # the second time from the stored field
-        results = command.capacity(tiny_scene, out, (8, 16), 0.01, 4, some)
+        results = command.capacity(tiny_scene, out, (8, 16), 0.01, 4)
         assert len(results["representations"]) == len(some) + 2
         for file in (out / "points").glob("grid*"):
             file.unlink()
     other = tiny_scene_writer.write(tmp_path / "other" / tiny_scene.name, train=4, test=2)
     with pytest.raises(InputError, match="another scene"):
-        command.capacity(other, out, (8, 16), 0.01, 4, some)
+        command.capacity(other, out, (8, 16), 0.01, 4)
     (out / "field.pt").write_bytes(b"no field")
     with pytest.raises(InputError, match=r"field\.pt cannot be used"):
-        command.capacity(tiny_scene, out, (8, 16), 0.01, 4, some)
+        command.capacity(tiny_scene, out, (8, 16), 0.01, 4)
     assert all(0.0 < row["kept_volume"] <= 1.0 for row in results["representations"])
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_a_grid_that_would_take_too_long_is_left_out_and_said(
-    taught: list[str],
-    tiny_scene: Path,
-    tmp_path: Path,
-    capsys: pytest.CaptureFixture[str],
-    monkeypatch: pytest.MonkeyPatch,
+    taught: Taught, tiny_scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    all_grids = command.measure_grids
-    monkeypatch.setattr(command, "draw", lambda *arguments: None)
-    monkeypatch.setattr(
-        command, "measure_grids", lambda *arguments: list(all_grids(*arguments))[:2]
-    )
-    taught += [""] * 6
-    out = tmp_path / "out"
-    assert run("capacity", "--data", tiny_scene, "--out", out, "--grids", 8, 16, 32) == 0
+    taught.most_cells, out = 16, tmp_path / "out"
+    arguments = ["capacity", "--data", tiny_scene, "--out", out, "--grids", 8, 16, 32]
+    assert run(*arguments) == 0
     assert "32^3 cells would ask the field at more than 200 million" in " ".join(
         capsys.readouterr().out.split()
     )
     rows = json.loads((out / "results.json").read_text())["representations"]
     assert [row["size"] for row in rows if row["family"] == "grid"] == ["8", "16"]
     before = len(taught)
-    assert run("capacity", "--data", tiny_scene, "--out", out, "--grids", 8, 16, 32) == 0
+    assert run(*arguments) == 0
     assert len(taught) == before  # none is filled again for the sake of the one left out
     assert "left out, as before" in " ".join(capsys.readouterr().out.split())
     again = json.loads((out / "results.json").read_text())["representations"]

@@ -13,11 +13,6 @@ from leco_plugin.scenes.city.cameras import CaptureConfig
 from leco_plugin.scenes.city.city import CityConfig
 from leco_plugin.scenes.city.folder import write_city
 
-pytestmark = [  # nerfstudio leaves an image open
-    pytest.mark.filterwarnings("ignore:unclosed file:ResourceWarning"),
-    pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning"),
-]
-
 
 def test_whoever_goes_on_is_taught_and_measured_on_the_same_rays(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch

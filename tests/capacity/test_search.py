@@ -10,7 +10,7 @@ import torch
 from ball_occupancy import CENTRE, HALF, RADIUS, ball
 
 from leco_plugin.capacity import search as searching
-from leco_plugin.capacity.evidence import Evidence, query_in_parts
+from leco_plugin.capacity.evidence import Evidence
 from leco_plugin.capacity.references import (
     Bounds,
     Ground,
@@ -23,6 +23,7 @@ from leco_plugin.capacity.references import (
 from leco_plugin.capacity.search import Found, find_threshold, search
 from leco_plugin.capacity.shrink import check_losses
 from leco_plugin.capacity.sources import Source
+from leco_plugin.evaluation.field_grids import in_parts
 from leco_plugin.evaluation.inspection import whole_box
 from leco_plugin.models.encodings import EncodingConfig
 from leco_plugin.models.gate import GateConfig
@@ -186,7 +187,7 @@ def test_places_anywhere_are_taught_too() -> None:
     known = original()
     lesson = searching.lesson_of(known, known_worth(known, 0))
     assert len(lesson.mapped) == 20_000 + (1 << 14)
-    inside = query_in_parts(known, known.space.unmap(lesson.mapped)) >= known.threshold
+    inside = in_parts(known.query, known.space.unmap(lesson.mapped)) >= known.threshold
     assert float((inside == (lesson.keep > 0)).float().mean()) > 0.999
     assert float(lesson.keep.max()) > 1.5 and whole_box(known).low.tolist() == [-1.0, 0.0, -1.5]
 

@@ -6,8 +6,9 @@ import copy
 import json
 import math
 import shutil
+from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import pytest
 import torch
@@ -28,10 +29,8 @@ from leco_plugin.models.figures import prices
 from leco_plugin.models.gate import Gate, GateConfig
 from leco_plugin.occupancy import Occupancy
 
-pytestmark = [  # nerfstudio leaves an image open
-    pytest.mark.filterwarnings("ignore:unclosed file:ResourceWarning"),
-    pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning"),
-]
+DEEPER = GateConfig(EncodingConfig(octaves=3), 16, 2, 1)
+WIDE_BOUNDS = ("--lost-surface-mass", 0.99, "--image-price", 50)
 
 
 @pytest.fixture(autouse=True)
@@ -42,7 +41,7 @@ def few_rays(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.fixture
-def file(tmp_path: Path) -> Path:
+def ball(tmp_path: Path) -> Path:
     """The ball, and how its rays are marched; no run lies beside it."""
     occupancy = ball_of_the_tiny_scene()
     turns = [2 * math.pi * index / 9 for index in range(9)]
@@ -56,28 +55,52 @@ def run(*arguments: object) -> int:
     return cli.main([str(argument) for argument in arguments])
 
 
-def test_without_a_run_it_keeps_to_the_decisions_and_says_so(
-    file: Path,
+class Shrunk(NamedTuple):
+    """What a call of `leco shrink` has left."""
+
+    results: dict[str, Any]
+    smaller: Occupancy
+    out: Path
+    said: str
+
+
+Shrinks = Callable[..., Shrunk]
+
+
+@pytest.fixture
+def shrunk(
     tiny_scene: Path,
     tmp_path: Path,
     capsys: pytest.CaptureFixture[str],
     monkeypatch: pytest.MonkeyPatch,
+) -> Shrinks:
+    """Shrinks a file of the tiny scene, with gates of this size if any are given."""
+
+    def shrink_it(file: Path, gates: list[GateConfig] | None, *options: object) -> Shrunk:
+        if gates is not None:
+            monkeypatch.setattr(search, "ladder", lambda most: gates)
+        out = tmp_path / "new" / f"{file.stem}-small"
+        arguments = ["--data", tiny_scene, "--out", out, "--json", tmp_path / "new" / "small.json"]
+        assert run("shrink", file, *arguments, *options) == 0
+        results = json.loads((tmp_path / "new" / "small.json").read_text())
+        return Shrunk(results, Occupancy.load(out), out, " ".join(capsys.readouterr().out.split()))
+
+    return shrink_it
+
+
+def test_without_a_run_it_keeps_to_the_decisions_and_says_so(
+    ball: Path, tmp_path: Path, shrunk: Shrinks, capsys: pytest.CaptureFixture[str]
 ) -> None:
     smallest = [GateConfig(EncodingConfig(octaves=2), width, 1, 1) for width in (1, 12, 24)]
-    monkeypatch.setattr(search, "ladder", lambda most: smallest)
-    out, report, picture = (tmp_path / "new" / name for name in ("small", "small.json", "a.png"))
-    options = ["--lost-surface-mass", 0.2, "--json", report, "--picture", picture]
-    assert run("shrink", file, "--data", tiny_scene, "--out", out, *options) == 0
-    said = capsys.readouterr().out
-    assert "the original's keep decisions, weighed by o(x)" in " ".join(said.split())
-    results = json.loads(report.read_text())
+    picture, bound = tmp_path / "new" / "a.png", ("--lost-surface-mass", 0.2)
+    results, smaller, out, said = shrunk(ball, smallest, *bound, "--picture", picture)
+    assert "the original's keep decisions, weighed by o(x)" in said
     assert results["code"] == describe_code() and results["date"] > "2026"
     checked = results["checked"]
     assert checked["rays"] == 512 and checked["lost_surface_mass"] is None
-    assert f"test photographs lose {checked['lost_decisions']:.2e}" in " ".join(said.split())
-    assert "neither surface mass nor image price was measured" in " ".join(said.split())
-    smaller = Occupancy.load(out)
-    assert out.stat().st_size == results["to"]["bytes"] < file.stat().st_size
+    assert f"test photographs lose {checked['lost_decisions']:.2e}" in said
+    assert "neither surface mass nor image price was measured" in said
+    assert out.stat().st_size == results["to"]["bytes"] < ball.stat().st_size
     assert [rung["verdict"] for rung in results["rungs"]][-1] == "chosen"
     assert smaller.report["cameras"][1] == [0.766, 0.6428, 0.7]
     beyond = results["rungs"][-1]["verified"]["lost_surface_mass_bound"]
@@ -86,12 +109,10 @@ def test_without_a_run_it_keeps_to_the_decisions_and_says_so(
     assert [smaller.report[name] for name in unknown] == [None] * 3
     assert prices(smaller.report) == {}
     assert run("inspect", out) == 0 and "lost decisions: " in capsys.readouterr().out
-    monkeypatch.setattr(search, "ladder", lambda most: [])
-    again = ["--out", tmp_path / "again", *options[:2]]
-    assert run("shrink", out, "--data", tiny_scene, *again) == 0
-    assert Occupancy.load(tmp_path / "again").report["lost_decisions"] == pytest.approx(beyond)
+    again = shrunk(out, [], *bound).smaller
+    assert again.report["lost_decisions"] == pytest.approx(beyond)
     assert describe(smaller)["kept_share_of_box"] == pytest.approx(
-        describe(Occupancy.load(file))["kept_share_of_box"], rel=0.1
+        describe(Occupancy.load(ball))["kept_share_of_box"], rel=0.1
     )
     with Image.open(picture) as image:
         assert image.size[0] > 500
@@ -99,7 +120,7 @@ def test_without_a_run_it_keeps_to_the_decisions_and_says_so(
 
 
 def test_a_search_that_is_stopped_leaves_the_gates_that_it_tried(
-    file: Path, tiny_scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    ball: Path, tiny_scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     smallest = [GateConfig(EncodingConfig(octaves=2), width, 1, 1) for width in (1, 2)]
     monkeypatch.setattr(search, "ladder", lambda most: smallest)
@@ -112,70 +133,62 @@ def test_a_search_that_is_stopped_leaves_the_gates_that_it_tried(
 
     monkeypatch.setattr(search, "_teach_in_place", stopped_at_the_second)
     out, report = tmp_path / "small", tmp_path / "small.json"
-    assert run("shrink", file, "--data", tiny_scene, "--out", out, "--json", report) == 130
+    assert run("shrink", ball, "--data", tiny_scene, "--out", out, "--json", report) == 130
     known = json.loads(report.read_text())
     assert len(known["rungs"]) == 1 and known["original"]["verdict"] == "holds"
     assert "to" not in known and not out.exists()
 
 
 def test_where_nothing_smaller_holds_the_same_gate_is_stored(
-    file: Path,
-    tiny_scene: Path,
-    tmp_path: Path,
-    capsys: pytest.CaptureFixture[str],
-    monkeypatch: pytest.MonkeyPatch,
+    ball: Path, tmp_path: Path, shrunk: Shrinks
 ) -> None:
-    original = Occupancy.load(file)
+    original = Occupancy.load(ball)
     original.precision = "bfloat16"
-    original.save(file)
-    out = tmp_path / "same.safetensors"
-    monkeypatch.setattr(search, "ladder", lambda most: [])
-    assert run("shrink", file, "--data", tiny_scene, "--out", out) == 0
-    assert "this is the same gate" in capsys.readouterr().out
-    same, report = Occupancy.load(out), tmp_path / "again.json"
-    again = ["--out", tmp_path / "again", "--json", report, "--picture", tmp_path / "again.png"]
-    assert run("shrink", out, "--data", tiny_scene, *again) == 0  # and once more
-    assert "this is the same gate" in capsys.readouterr().out and (tmp_path / "again.png").exists()
-    assert json.loads(report.read_text())["checked"] is None
+    original.save(ball)
+    _, same, out, said = shrunk(ball, [])
+    assert "this is the same gate" in said
+    again = shrunk(out, [], "--picture", tmp_path / "again.png")  # and once more
+    assert "this is the same gate" in again.said and (tmp_path / "again.png").exists()
+    assert again.results["checked"] is None
     positions = torch.rand(5000, 3) - 0.5
     assert torch.equal(same.query(positions), original.query(positions))
-    assert out.stat().st_size < 0.8 * file.stat().st_size
+    assert out.stat().st_size < 0.8 * ball.stat().st_size
     assert same.report["lost_surface_mass"] == 1e-4
 
 
 def test_bad_input_ends_with_one_line_and_status_2(
-    file: Path, tiny_scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    ball: Path, tiny_scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     def changed(name: str, threshold: float = 0.5, **report: object) -> Path:
-        occupancy = Occupancy.load(file).with_threshold(threshold)
+        occupancy = Occupancy.load(ball).with_threshold(threshold)
         occupancy.report |= report
         occupancy.save(tmp_path / name)
         return tmp_path / name
 
     ball_of_the_tiny_scene().save(tmp_path / "silent")
     cameras = [[1.0, 0.1 * number, 0.7] for number in range(20)]
-    before = file.read_bytes()
+    before = ball.read_bytes()
     data, out = ["--data", tiny_scene], ["--out", tmp_path / "out.safetensors"]
     cases: dict[str, list[object]] = {
-        "there is no such folder": [file, "--data", tmp_path / "none", *out],
-        "raise --lost-surface-mass": [file, *data, *out, "--lost-surface-mass", 0],
+        "there is no such folder": [ball, "--data", tmp_path / "none", *out],
+        "raise --lost-surface-mass": [ball, *data, *out, "--lost-surface-mass", 0],
         "how its rays are marched": [tmp_path / "silent", *data, *out],
-        "not nan": [file, *data, *out, "--lost-surface-mass", "nan"],
+        "not nan": [ball, *data, *out, "--lost-surface-mass", "nan"],
         "step_size is small": [changed("aground", step_size="small"), *data, *out],
         "its threshold is 0": [changed("idle", threshold=0.0), *data, *out],
         "skips 4.0% of all candidates": [changed("foggy", empty_fraction=0.04), *data, *out],
         "of the 20 cameras": [changed("elsewhere", cameras=cameras), *data, *out],
-        "is a folder": [file, *data, "--out", tmp_path],
-        "is the occupancy itself": [file, *data, "--out", file],
-        "not a folder": [file, *data, "--out", file / "new" / "small"],
-        "ends in none of": [file, *data, *out, "--picture", tmp_path / "a.doc"],
+        "is a folder": [ball, *data, "--out", tmp_path],
+        "is the occupancy itself": [ball, *data, "--out", ball],
+        "not a folder": [ball, *data, "--out", ball / "new" / "small"],
+        "ends in none of": [ball, *data, *out, "--picture", tmp_path / "a.doc"],
         "give an occupancy.safetensors": [tmp_path / "none.safetensors", *data, *out],
     }
     for cause, arguments in cases.items():
         assert run("shrink", *arguments) == 2, cause
         said = capsys.readouterr().err
         assert said.startswith("leco: ") and said.count("\n") == 1 and cause in said, said
-    assert not (tmp_path / "out.safetensors").exists() and file.read_bytes() == before
+    assert not (tmp_path / "out.safetensors").exists() and ball.read_bytes() == before
 
 
 def test_the_speed_is_by_how_much_the_smaller_one_is_faster(
@@ -191,15 +204,12 @@ def test_the_speed_is_by_how_much_the_smaller_one_is_faster(
 
 
 def test_the_model_of_the_run_says_what_is_lost(
-    known_run: Path, tiny_scene: Path, tmp_path: Path
+    file: Path, tiny_scene: Path, shrunk: Shrinks
 ) -> None:
-    out, report = tmp_path / "small.safetensors", tmp_path / "small.json"
-    bounds = ["--lost-surface-mass", 0.25, "--image-price", 0.5, "--json", report]
-    original = Occupancy.load(known_run / "occupancy.safetensors")
+    original = Occupancy.load(file)
     assert original.threshold > 0.0
-    file = known_run / "occupancy.safetensors"
-    assert run("shrink", file, "--data", tiny_scene, "--out", out, *bounds) == 0
-    results, smaller = json.loads(report.read_text()), Occupancy.load(out)
+    bounds = ("--lost-surface-mass", 0.25, "--image-price", 0.5)
+    results, smaller, _, _ = shrunk(file, None, *bounds)
     assert results["to"]["loss_measured_against"] == references.NOW
     assert smaller.num_params < original.num_params
     assert isinstance(smaller.report["image_price_db"], float)
@@ -226,11 +236,7 @@ def lost_of(part: Evidence, smaller: Occupancy) -> float:
 
 
 def test_the_file_declares_what_rays_have_lost_that_the_search_did_not_see(
-    known_run: Path,
-    tiny_scene: Path,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
+    file: Path, monkeypatch: pytest.MonkeyPatch, shrunk: Shrinks
 ) -> None:
     """On the rays of the search only the safest places are worth anything, on others the least."""
     grounds: list[references.Ground] = []
@@ -252,12 +258,8 @@ def test_the_file_declares_what_rays_have_lost_that_the_search_did_not_see(
         return grounds[-1]
 
     monkeypatch.setattr(shrink, "prepare", uneven)
-    smaller_ones = [GateConfig(EncodingConfig(octaves=3), 16, 2, 1)]
-    monkeypatch.setattr(search, "ladder", lambda most: smaller_ones)
-    file, out, report = known_run / "occupancy.safetensors", tmp_path / "small", tmp_path / "a.json"
-    bounds = ["--lost-surface-mass", 0.99, "--image-price", 50, "--json", report]
-    assert run("shrink", file, "--data", tiny_scene, "--out", out, *bounds) == 0
-    smaller, rung = Occupancy.load(out), json.loads(report.read_text())["rungs"][-1]
+    results, smaller, _, said = shrunk(file, [DEEPER], *WIDE_BOUNDS)
+    rung = results["rungs"][-1]
     lost = lost_of(grounds[0].references[0].verify.evidence, smaller)
     assert lost > 0.0 and rung["lost_surface_mass"] == pytest.approx(1e-4)  # of the original
     assert rung["verified"]["lost_surface_mass"] == pytest.approx(lost + 1e-4, rel=1e-3)
@@ -271,12 +273,14 @@ def test_the_file_declares_what_rays_have_lost_that_the_search_did_not_see(
     assert unseen > seen
     tested = smaller.report["lost_on_test_photographs"]
     assert smaller.report["lost_surface_mass"] == max(verified, tested)
-    assert ("WARNING: that is more than" in capsys.readouterr().out) == (tested > verified)
+    assert ("WARNING: that is more than" in said) == (tested > verified)
 
 
-def with_haze_at_freezing(known_run: Path, tiny_scene: Path, folder: Path) -> Path:
-    """A copy of the run whose field at freezing has matter where the original skips."""
-    shutil.copytree(known_run, folder)
+@pytest.fixture
+def hazy(known_run: Path, tiny_scene: Path, tmp_path: Path) -> Path:
+    """What a copy of the run has left whose field at freezing has matter where the original skips:
+    haze that is densest about the ball."""
+    folder = shutil.copytree(known_run, tmp_path / "run")
     now = sources.find_source(folder / "occupancy.safetensors", tiny_scene)
     assert now.model is not None and now.frozen is None
     frozen = copy.deepcopy(now.model.mixture)
@@ -287,61 +291,43 @@ def with_haze_at_freezing(known_run: Path, tiny_scene: Path, folder: Path) -> Pa
 
 
 def test_an_original_that_is_not_within_the_bounds_is_said_and_declared(
-    known_run: Path,
-    tiny_scene: Path,
-    tmp_path: Path,
-    capsys: pytest.CaptureFixture[str],
-    monkeypatch: pytest.MonkeyPatch,
+    hazy: Path, monkeypatch: pytest.MonkeyPatch, shrunk: Shrinks
 ) -> None:
-    file = with_haze_at_freezing(known_run, tiny_scene, tmp_path / "run")
     monkeypatch.setattr(shrink, "search", lambda *some, **more: pytest.fail("taught"))
-    out, report = tmp_path / "same", tmp_path / "a.json"
-    assert run("shrink", file, "--data", tiny_scene, "--out", out, "--json", report) == 0
-    said = " ".join(capsys.readouterr().out.split())
+    results, same, _, said = shrunk(hazy, None)
     assert "it is not within the bounds by this measure" in said
     assert "no threshold is within them, and no smaller gate is looked for" in said
-    results, same = json.loads(report.read_text()), Occupancy.load(out)
     assert results["rungs"] == [] and results["original"]["bound"] > 1e-3
     declared = same.report["lost_surface_mass"]
     assert declared == results["original"]["verified"]["lost_surface_mass_bound"] > 1e-3
     assert list(results["checked"]["against"]) == [references.AT_FREEZING]
     assert 0.0 < results["checked"]["lost_surface_mass"] < declared
     positions = torch.rand(5000, 3) - 0.5
-    assert torch.equal(same.query(positions), Occupancy.load(file).query(positions))
+    assert torch.equal(same.query(positions), Occupancy.load(hazy).query(positions))
 
 
 def test_what_is_declared_holds_against_the_field_at_the_moment_of_freezing(
-    known_run: Path, tiny_scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    hazy: Path, tiny_scene: Path, monkeypatch: pytest.MonkeyPatch, shrunk: Shrinks
 ) -> None:
-    """That field has matter where the original skips: haze that is densest about the ball."""
     monkeypatch.setattr(search, "MARGIN", 1.0)
-    gates = [GateConfig(EncodingConfig(octaves=3), 16, 2, 1)]
-    monkeypatch.setattr(search, "ladder", lambda most: gates)
-    file = with_haze_at_freezing(known_run, tiny_scene, tmp_path / "run")
-    out, report = tmp_path / "small", tmp_path / "a.json"
-    bounds = ["--lost-surface-mass", 0.99, "--image-price", 50, "--json", report]
-    assert run("shrink", file, "--data", tiny_scene, "--out", out, *bounds) == 0
-    smaller = Occupancy.load(out)
-    results = json.loads(report.read_text())
+    results, smaller, _, _ = shrunk(hazy, [DEEPER], *WIDE_BOUNDS)
     against = results["rungs"][-1]["verified_against"]
-    assert [one["reference"] for one in against] == [
-        references.NOW,
-        references.AT_FREEZING,
-    ]
-    lost = lost_on_other_rays(file, tiny_scene, smaller)
+    assert [one["reference"] for one in against] == [references.NOW, references.AT_FREEZING]
+    lost = lost_on_other_rays(hazy, tiny_scene, smaller)
     assert lost[1] > lost[0] + 0.01  # what the original skips counts
     verified = smaller.report["verified_lost_surface_mass"]
     assert max(lost) <= verified == max(x["bound"] for x in against)
     assert verified <= smaller.report["lost_surface_mass"]
-    source, original = sources.find_source(file, tiny_scene), Occupancy.load(file)
+    source, original = sources.find_source(hazy, tiny_scene), Occupancy.load(hazy)
     ground = shrink.prepare(source, original, *shrink.draw_rays(source, original))
     for part in (ground.references[1].search, ground.references[1].verify):
         assert part.evidence.rays == references.RAYS > sum(len(one.truth) for one in part.rendered)
 
 
-def test_a_field_that_renders_nothing_is_no_reference(known_run: Path, tiny_scene: Path) -> None:
-    file = known_run / "occupancy.safetensors"
-    source, original = sources.find_source(file, tiny_scene), Occupancy.load(file)
+def test_a_field_that_renders_nothing_is_no_reference(
+    known: tuple[sources.Source, Occupancy],
+) -> None:
+    source, original = known
     assert source.model is not None
     with torch.no_grad():
         source.mixture.field.density_head.bias.fill_(-50.0)
@@ -352,8 +338,7 @@ def test_a_field_that_renders_nothing_is_no_reference(known_run: Path, tiny_scen
 def test_a_run_whose_model_does_not_fit_is_refused_in_one_line(
     known_run: Path, tiny_scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    broken = tmp_path / "run"
-    shutil.copytree(known_run, broken)
+    broken = shutil.copytree(known_run, tmp_path / "run")
     for path in (broken / "nerfstudio_models").glob("*.ckpt"):
         state = torch.load(path, weights_only=True)
         state["pipeline"]["_model.mixture.field.density_head.weight"] = torch.zeros(1, 3)

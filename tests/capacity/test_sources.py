@@ -15,6 +15,7 @@ from leco_plugin.capacity.references import AT_FREEZING, BY_DECISIONS, NOW, meas
 from leco_plugin.capacity.sources import (
     CHECKPOINTS,
     CONFIG,
+    Source,
     check_scene,
     draw_held_out,
     draw_other_pixels,
@@ -26,10 +27,7 @@ from leco_plugin.capacity.sources import (
 from leco_plugin.occupancy import Occupancy
 from leco_plugin.scenes.input_error import InputError
 
-pytestmark = [  # nerfstudio leaves an image open
-    pytest.mark.filterwarnings("ignore:unclosed file:ResourceWarning"),
-    pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning"),
-]
+Known = tuple[Source, Occupancy]
 
 
 def test_of_a_guided_hosts_run_only_the_decisions_are_asked(
@@ -58,12 +56,10 @@ def test_a_damaged_config_is_named(tiny_scene: Path, tmp_path: Path, text: str) 
 
 
 def test_another_scene_than_the_runs_is_refused(
-    known_run: Path, tiny_scene: Path, tmp_path: Path
+    file: Path, known: Known, tiny_scene: Path, tmp_path: Path
 ) -> None:
     """Its photographs would be in the model's coordinates, but show something else there."""
-    file = known_run / "occupancy.safetensors"
-    original = Occupancy.load(file)
-    source = find_source(file, tiny_scene)
+    source, original = known
     cameras = source.manager.train_dataset.cameras.camera_to_worlds[:, :3, 3]
     original.report["cameras"] = cameras.tolist()
     check_scene(source, original, tiny_scene)
@@ -86,9 +82,8 @@ def test_cameras_are_compared_in_the_coordinates_of_the_occupancy(
         check_scene(source, known, tiny_scene)
 
 
-def test_test_photographs_say_what_a_smaller_gate_loses(known_run: Path, tiny_scene: Path) -> None:
-    file = known_run / "occupancy.safetensors"
-    source, original = find_source(file, tiny_scene), Occupancy.load(file)
+def test_test_photographs_say_what_a_smaller_gate_loses(known: Known) -> None:
+    source, original = known
     seen = draw_test_rays(source, original, 300)
     assert seen is not None and len(seen.truth) == 300
     cameras = source.manager.eval_dataset.cameras.camera_to_worlds[:, :3, 3]
@@ -117,9 +112,8 @@ def test_test_photographs_say_what_a_smaller_gate_loses(known_run: Path, tiny_sc
     assert measure_shares_lost(alone, original, everything, seen) == {BY_DECISIONS: 0.0}
 
 
-def test_rays_of_other_pixels_have_each_another_one(known_run: Path, tiny_scene: Path) -> None:
-    file = known_run / "occupancy.safetensors"
-    source, original = find_source(file, tiny_scene), Occupancy.load(file)
+def test_rays_of_other_pixels_have_each_another_one(known: Known) -> None:
+    source, original = known
     seen = draw_held_out(source, original, 200)
     for count in (700, 700, 10**4):  # more than there are
         seen.append(draw_other_pixels(source, original, count, seen))
@@ -130,11 +124,8 @@ def test_rays_of_other_pixels_have_each_another_one(known_run: Path, tiny_scene:
     assert torch.equal(seen[3].truth[5].cpu(), picture[tuple(seen[3].pixels[5, 1:])])
 
 
-def test_search_verification_and_teaching_have_no_pixel_in_common(
-    known_run: Path, tiny_scene: Path
-) -> None:
-    file = known_run / "occupancy.safetensors"
-    source, original = find_source(file, tiny_scene), Occupancy.load(file)
+def test_search_verification_and_teaching_have_no_pixel_in_common(known: Known) -> None:
+    source, original = known
     seen = [*draw_held_out(source, original, 512), draw_training_rays(source, original, 512)]
     pixels = [
         {(int(image), *map(float, ray)) for image, ray in zip(one.rays.images, one.rays.directions)}
@@ -146,9 +137,9 @@ def test_search_verification_and_teaching_have_no_pixel_in_common(
     assert not searched & verified and not (searched | verified) & taught
 
 
-def test_rays_from_between_the_cameras_begin_there(known_run: Path, tiny_scene: Path) -> None:
-    source = find_source(known_run / "occupancy.safetensors", tiny_scene)
-    seen, _ = draw_held_out(source, Occupancy.load(known_run / "occupancy.safetensors"), 200)
+def test_rays_from_between_the_cameras_begin_there(known: Known) -> None:
+    source, original = known
+    seen, _ = draw_held_out(source, original, 200)
     moved = move_between_cameras(source, seen, seed=3)
     cameras = source.manager.train_dataset.cameras.camera_to_worlds[:, :3, 3]
     assert seen.rays.images is not None
@@ -163,10 +154,7 @@ def test_rays_from_between_the_cameras_begin_there(known_run: Path, tiny_scene: 
         torch.testing.assert_close(origin, torch.lerp(here, nearest, along), atol=1e-5, rtol=1e-4)
 
 
-def test_photographs_too_small_for_held_out_pixels_are_named(
-    known_run: Path, tmp_path: Path
-) -> None:
-    file = known_run / "occupancy.safetensors"
+def test_photographs_too_small_for_held_out_pixels_are_named(file: Path, tmp_path: Path) -> None:
     small = tiny_scene_writer.write(tmp_path / "small", train=1, test=1, size=4)
     source = find_source(file, small)
     with pytest.raises(InputError, match="nothing was trained on"):

@@ -26,7 +26,7 @@ IN_TURNS = [("a", 0), ("b", 0), ("c", 0), ("b", 1), ("c", 1), ("a", 1)]
 
 
 class Runner:
-    """Makes runs at once, and remembers them."""
+    """Makes runs at once, with the occupancy and grids that are asked for, and remembers them."""
 
     def __init__(self, stops_at: int | None = None, broken: str | None = None) -> None:
         self.made: list[tuple[str, int]] = []
@@ -35,11 +35,13 @@ class Runner:
     def __call__(self, job: Job, show: Callable[[float], None]) -> dict[str, Any]:
         if len(self.made) == self.stops_at:
             raise KeyboardInterrupt
-        name = job.contender.name
+        name, sampler, grids = job.contender.name, job.contender.sampler, job.contender.grids
         self.made.append((name, job.seed))
         if name == self.broken:
             raise RunFailed(f"{name} is broken")
-        return chart_results.run(name, job.seed, sampler="own", occupancy=None)
+        made = [chart_results.grid(resolution, 0.5) for resolution in grids]
+        held = None if sampler == "own" else chart_results.occupancy(50_000, 0.1, made)
+        return chart_results.run(name, job.seed, sampler=sampler, occupancy=held)
 
 
 def chart(scene: Path, out: Path, **changes: Any) -> Chart:
@@ -146,14 +148,6 @@ def test_methods_and_seeds_may_join_later_and_all_are_shown(
     assert [(run["name"], run["seed"]) for run in results["runs"]] == [("b", 0), ("b", 5), ("a", 0)]
 
 
-def test_another_run_in_the_folder_is_refused(tiny_scene: Path, tmp_path: Path) -> None:
-    make(chart(tiny_scene, tmp_path), Runner())
-    with pytest.raises(ValueError, match="another seconds"):
-        chart(tiny_scene, tmp_path, protocol=Protocol(11.0))
-    with pytest.raises(ValueError, match="another suite"):
-        chart(tiny_scene, tmp_path, suite=("losses", "What?"))
-
-
 def test_results_have_the_agreed_form(tiny_scene: Path, tmp_path: Path) -> None:
     made = chart(tiny_scene, tmp_path, command="leco chart --data ball")
     results = make(made, Runner())
@@ -229,35 +223,13 @@ WITH_GRIDS = replace(PLAIN, name="ours", grids=(64, 128))
 OTHER = Contender("other", "leco-occupancy", "dense")
 
 
-class Learner:
-    """Makes runs at once, with an occupancy and the grids that are asked for."""
-
-    def __init__(self) -> None:
-        self.made: list[tuple[str, int]] = []
-
-    def __call__(self, job: Job, show: Callable[[float], None]) -> dict[str, Any]:
-        self.made.append((job.contender.name, job.seed))
-        grids = [
-            {
-                "resolution": n,
-                "bytes": n**3 // 8,
-                "update_seconds": 1.0,
-                "kept_reached_volume": 0.5,
-            }
-            for n in job.contender.grids
-        ]
-        held = chart_results.occupancy(50_000, 0.1, grids)
-        return chart_results.run(job.contender.name, job.seed, occupancy=held)
-
-
 def made(
-    scene: Path, out: Path, *compared: Contender, seeds: tuple[int, ...] = (0, 1), **changes: Any
-) -> tuple[dict[str, Any], Learner, list[str]]:
-    values = {"protocol": Protocol(10.0)} | changes
-    runner, said = Learner(), []
-    chart = Chart(scene, out, compared, seeds, **values)
-    chart.make(runner, say=said.append, show=lambda share: None)
-    return chart.results(), runner, said
+    scene: Path, out: Path, *compared: Contender, **changes: Any
+) -> tuple[dict[str, Any], Runner, list[str]]:
+    runner, said = Runner(), []
+    one = chart(scene, out, contenders=compared, **changes)
+    one.make(runner, say=said.append, show=lambda share: None)
+    return one.results(), runner, said
 
 
 def test_what_another_chart_has_is_not_made_again_and_bears_the_name_it_has_here(

@@ -115,8 +115,3 @@ def test_a_setting_that_the_method_has_not_is_named() -> None:
     wrong = replace(contenders(["leco-occupancy"])[0], changes={"sizes.gates": 1})
     with pytest.raises(ValueError, match="'gates'"):
         config_of(wrong, DATA, FOLDER)
-
-
-def test_an_unknown_method_is_named() -> None:
-    with pytest.raises(ValueError, match="no-such"):
-        config_of(Contender("x", "no-such", "own"), DATA, FOLDER)

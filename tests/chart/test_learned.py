@@ -30,9 +30,9 @@ def skipping(name: str, *shares: float | None) -> list[dict]:
 def test_figures_are_of_the_seeds_that_froze_a_gate() -> None:
     (one,) = learned_of(lines_of(results(*skipping("A", 0.5, None, 0.7))))
     assert (len(one.facts), one.seeds, one.is_measured) == (2, 3, False)
-    assert one.median("empty_fraction") == pytest.approx(0.6)
-    assert one.median("at_equal_loss.kept_reached_volume") == 0.1
-    assert one.median("kept_surface_recall") is None and one.healed is None
+    assert one.figure("empty_fraction") == pytest.approx(0.6)
+    assert one.figure("at_equal_loss.kept_reached_volume") == 0.1
+    assert one.figure("kept_surface_recall") is None and one.healed is None
 
 
 def test_an_occupancy_that_is_left_of_a_gate_that_was_opened_again_is_none() -> None:

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from chart_results import occupancy, results, run
+from chart_results import grid, occupancy, results, run
 from matplotlib.figure import Figure
 from PIL import Image
 
@@ -86,8 +86,7 @@ def test_one_run_with_one_point_is_drawn(tmp_path: Path) -> None:
 
 
 def test_representations_and_grids_are_drawn(tmp_path: Path) -> None:
-    grids = [{"resolution": 64, "bytes": 32768, "update_seconds": 2.0, "kept_reached_volume": 0.3}]
-    ours = run("MLP", occupancy=occupancy(50_000, 0.1, grids))
+    ours = run("MLP", occupancy=occupancy(50_000, 0.1, [grid(64, 0.3)]))
     other = run("hash grid", sampler="learned-occupancy-hash", occupancy=occupancy(4_000_000, 0.2))
     path = draw(results(ours, other), tmp_path / "chart.png")
     assert all(share_of(colour, path) > 1e-3 for colour in LIGHT.colours[:2])
@@ -132,8 +131,7 @@ def test_a_chart_without_occupancies_has_no_row_for_them(tmp_path: Path) -> None
 def test_a_grid_without_a_learning_time_stands_where_sizes_are_compared_alone(
     tmp_path: Path,
 ) -> None:
-    grids = [{"resolution": 64, "bytes": 32768, "update_seconds": 2.0, "kept_reached_volume": 0.3}]
-    ours = run("MLP", occupancy=occupancy(50_000, 0.1, grids))
+    ours = run("MLP", occupancy=occupancy(50_000, 0.1, [grid(64, 0.3)]))
     text = write_page(results(ours), tmp_path / "chart.html").read_text()
     ours, of_grid = text.count('"text":["MLP"]'), text.count('"text":["grid 64')
     assert (ours, of_grid) == (3 + 2, 1)  # three costs, size and learning time

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import pytest
-from chart_results import occupancy, results, run, slow_front
+from chart_results import grid, occupancy, results, run, slow_front
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -19,10 +19,7 @@ from leco_plugin.chart.findings.summary import lines_of
 from leco_plugin.chart.panels import title_of
 from leco_plugin.chart.table import table
 
-GRIDS = [
-    {"resolution": 64, "bytes": 32768, "update_seconds": 2.0, "kept_reached_volume": 0.3},
-    {"resolution": 128, "bytes": 262144, "update_seconds": 4.0, "kept_reached_volume": 0.2},
-]
+GRIDS = [grid(64, 0.3), grid(128, 0.2)]
 
 
 def gates(*found: tuple[str, str, int, float, float]) -> list[Representation]:

@@ -18,7 +18,6 @@ from leco_plugin.chart.suites import (
     SUITES,
     SWITCH_CELLS,
     in_order,
-    suite,
 )
 from leco_plugin.learning.schedule import MOST_EXTENSIONS, steps_of_an_extension
 from leco_plugin.method_configs import LEARNING, ON_GPU
@@ -65,7 +64,7 @@ def test_forecasts_are_for_as_many_steps_as_a_run_has() -> None:
 def test_what_suites_share_is_counted_once() -> None:
     apart = SUITES["enough-time"].minutes(FAST) + SUITES["grid-resolution"].minutes(FAST)
     shared = [
-        c for c in SUITES["grid-resolution"].contenders if c in suite("enough-time").contenders
+        c for c in SUITES["grid-resolution"].contenders if c in SUITES["enough-time"].contenders
     ]
     protocol = SUITES["enough-time"].on_two_cores
     saved = 3 * sum(run_seconds(one, protocol, FAST) for one in shared) / 2 / 60

@@ -13,7 +13,7 @@ import pytest
 import torch
 
 from leco_plugin.chart import worker
-from leco_plugin.chart.contender import Contender
+from leco_plugin.chart.contender import Contender, config_of
 from leco_plugin.chart.protocol import Protocol
 from leco_plugin.chart.runner import FAILURE, JOB, PROGRESS, RESULT
 from leco_plugin.chart.suites import SUITES
@@ -113,9 +113,6 @@ def test_a_method_that_crashes_half_way_has_its_own_reason(
 def test_gate_and_grids_are_measured_on_the_field_of_the_moment_of_freezing(
     tiny_scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-
-    from leco_plugin.chart.contender import config_of
-
     asked: list[dict[str, torch.Tensor]] = []
 
     def at_equal_loss(mixture: Any, manager: Any, grids: tuple[int, ...]) -> dict[str, Any]:
@@ -125,7 +122,7 @@ def test_gate_and_grids_are_measured_on_the_field_of_the_moment_of_freezing(
         return {"grids": list(grids)}
 
     monkeypatch.setattr(equal_loss, "at_equal_loss", at_equal_loss)
-    one = Contender("LeCO", "leco-occupancy", "learned-occupancy", SMALL, grids=(8, 16))
+    one = replace(ONE, grids=(8, 16))
     config = config_of(one, tiny_scene, tmp_path / "nerfstudio")
     result, trainer = train_job(config, one, 3, tiny_scene, SHORT, tmp_path)
     assert result["occupancy"]["at_equal_loss"] == {"grids": [8, 16]}
@@ -137,7 +134,7 @@ def test_gate_and_grids_are_measured_on_the_field_of_the_moment_of_freezing(
 
 def test_a_whole_run_has_its_figures(tiny_scene: Path, tmp_path: Path) -> None:
     shares: list[float] = []
-    one = Contender("LeCO", "leco-occupancy", "learned-occupancy", SMALL, grids=(8,))
+    one = replace(ONE, grids=(8,))
     found = run_job(one, 0, tiny_scene, SHORT, tmp_path, shares.append)
     assert json.loads(json.dumps(found)) == found and shares[-1] == 1.0
     kept = found["occupancy"]["at_equal_loss"]
@@ -148,9 +145,7 @@ def test_a_whole_run_has_its_figures(tiny_scene: Path, tmp_path: Path) -> None:
 def test_small_gates_are_taught_by_the_field_as_it_was_and_stand_beside(
     tiny_scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-
     from leco_plugin.capacity import measuring
-    from leco_plugin.chart.contender import config_of
 
     at_equal_loss = equal_loss.at_equal_loss
 
@@ -167,7 +162,7 @@ def test_small_gates_are_taught_by_the_field_as_it_was_and_stand_beside(
         return at_equal_loss(mixture, manager, *rest, **others)
 
     monkeypatch.setattr(equal_loss, "at_equal_loss", compared)
-    one = Contender("LeCO", "leco-occupancy", "learned-occupancy", SMALL, taught=True)
+    one = replace(ONE, taught=True)
     config = config_of(one, tiny_scene, tmp_path / "nerfstudio")
     result, trainer = train_job(config, one, 3, tiny_scene, SHORT, tmp_path)
     found = result["occupancy"]["at_equal_loss"]
@@ -190,8 +185,7 @@ def test_small_gates_are_taught_by_the_field_as_it_was_and_stand_beside(
 def test_a_run_that_starts_anew_when_frozen_has_no_field_to_measure(
     tiny_scene: Path, tmp_path: Path
 ) -> None:
-    changes = {**SMALL, "schedule.restart": True}
-    one = Contender("LeCO", "leco-occupancy", "learned-occupancy", changes)
+    one = replace(ONE, changes={**SMALL, "schedule.restart": True})
     found = run_job(one, 0, tiny_scene, SHORT, tmp_path)
     assert found["occupancy"]["at_equal_loss"] is None and found["steps"] == 6
 
@@ -200,11 +194,9 @@ def test_learning_time_is_held_to_whenever_it_is_over(
     tiny_scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(timed_run, "TIMED_STEPS", 10**6)  # no forecast from the first steps
-    changes = {**SMALL, "schedule.learn_steps": 200}
-    contender = Contender("LeCO", "leco-occupancy", "learned-occupancy", changes)
+    one = replace(ONE, changes={**SMALL, "schedule.learn_steps": 200})
     protocol = Protocol(steps=30, images=1, curve_points=2, learn_seconds=0.01)
-    folder = job(tmp_path, tiny_scene)
-    record = run_job(contender, 3, tiny_scene, protocol, folder)
+    record = run_job(one, 3, tiny_scene, protocol, tmp_path)
     assert record["freeze_seconds"] is not None
     assert record["freeze_seconds"] < record["train_seconds"]
 

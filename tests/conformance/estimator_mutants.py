@@ -53,12 +53,9 @@ class NoTorchModule:
 
     def __init__(self, aabb: Tensor, occupancy: Occupancy) -> None:
         self.inner = Sound(aabb, occupancy)
-        self.sampling = self.inner.sampling
-        self.update_every_n_steps = self.inner.update_every_n_steps
 
-    @property
-    def training(self) -> bool:
-        return self.inner.training
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self.inner, name)
 
     def train(self, mode: bool = True) -> NoTorchModule:
         self.inner.train(mode)
@@ -70,12 +67,6 @@ class NoTorchModule:
     def to(self, device: Any) -> NoTorchModule:
         self.inner.to(device)
         return self
-
-    def state_dict(self) -> dict[str, Any]:
-        return self.inner.state_dict()
-
-    def load_state_dict(self, state: dict[str, Any]) -> None:
-        self.inner.load_state_dict(state)
 
 
 class Answers(Sound):

@@ -1,66 +1,86 @@
-"""The kit fails every sampler that breaks a rule, for that rule and by that name."""
+"""The kit fails every sampler and guided method that breaks a rule, for that rule, by that name."""
 
 from __future__ import annotations
+
+import functools
+from collections.abc import Iterator
+from typing import Any
 
 import pytest
 from conformance import estimator_mutants, proposal_mutants
 from conformance.estimator_mutants import MUTANTS
+from conformance.host_mutants import HOST_MUTANTS, METHODS, SOUND
 from conformance.mutant_plugin import write_distribution
 from conformance.proposal_mutants import PROPOSAL_MUTANTS
+from nerfstudio.configs.method_configs import all_methods
+from nerfstudio.plugins.registry import discover_methods
 
-from leco_plugin.conformance.cases import SAMPLER_RULES, check, pairs, sampler_cases
-from leco_plugin.conformance.rules import apply
+from leco_plugin.conformance.cases import RULES, cases_of, check, pairs
+from leco_plugin.conformance.rules import Rule, apply
+from leco_plugin.hosts import seams
+from leco_plugin.samplers import registry
 
-IN_THIS_PROCESS = tuple(rule for rule in SAMPLER_RULES if rule.name != "two-processes")
-TWO_PROCESSES = tuple(rule for rule in SAMPLER_RULES if rule.name == "two-processes")
-ALSO = {**estimator_mutants.ALSO, **proposal_mutants.ALSO}
+PARALLEL = ("two-processes", "two-processes-step-alike")
+IN_THIS_PROCESS = tuple(rule for rule in RULES if rule.name not in PARALLEL)
+TWO_PROCESSES = tuple(rule for rule in RULES if rule.name in PARALLEL)
+BY_SEAM: dict[str, Any] = {
+    "estimator": MUTANTS,
+    "proposal": PROPOSAL_MUTANTS,
+    "host": HOST_MUTANTS,
+}
+ALSO = estimator_mutants.ALSO | proposal_mutants.ALSO
 ALL = [
-    pytest.param(mutant, rule, id=f"{rule}-{mutant.__name__}")
-    for mutants in (MUTANTS, PROPOSAL_MUTANTS)
-    for rule, family in mutants.items()
-    for mutant in family
+    pytest.param(getattr(mutant, "__name__", mutant), {rule} | ALSO.get(mutant, set()), id=rule)
+    for by_rule in BY_SEAM.values()
+    for rule, mutants in by_rule.items()
+    for mutant in mutants
 ]
-PARALLEL = [mutant for mutant in ALL if "two-processes" in str(mutant.id)]
-OTHERS = [mutant for mutant in ALL if "two-processes" not in str(mutant.id)]
 
 
 @pytest.fixture(autouse=True, scope="module")
-def plugin(tmp_path_factory):
+def plugin(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
     """The mutants are installed."""
     with pytest.MonkeyPatch.context() as patch:
         patch.syspath_prepend(write_distribution(tmp_path_factory.mktemp("mutants")))
+        found, _ = discover_methods()
+        for name in METHODS:  # nerfstudio looks for methods once a process
+            patch.setitem(all_methods, name, found[name])
+        for module in (registry, seams):  # nobody is installed any more, and each look takes 30 ms
+            patch.setattr(module, "foreign_entries", functools.cache(module.foreign_entries))
         yield
 
 
-def failing(name: str, rules) -> dict[str, str]:
-    """Names of the rules that a sampler breaks, and what was found."""
-    verdicts = [apply(rule, case) for rule, case in pairs(sampler_cases(name), rules)]
+def failing(name: str, rules: tuple[Rule, ...]) -> dict[str, str]:
+    """Names of the rules that a sampler or a method breaks, and what was found."""
+    verdicts = [apply(rule, case) for rule, case in pairs(cases_of(name), rules)]
     return {verdict.rule.name: verdict.problem for verdict in verdicts if not verdict.passed}
 
 
-@pytest.mark.parametrize("name", ["Sound", "SoundProposal"])
-def test_what_mutants_are_made_of_keeps_all_rules(name):
+@pytest.mark.parametrize("name", ["Sound", "SoundProposal", *SOUND])
+def test_what_mutants_are_made_of_keeps_all_rules(name: str) -> None:
     assert failing(name, IN_THIS_PROCESS) == {}
 
 
-@pytest.mark.parametrize(("mutant", "rule"), OTHERS)
-def test_a_mutant_fails_its_rule_and_no_other(mutant, rule):
-    problems = failing(mutant.__name__, IN_THIS_PROCESS)
-    assert set(problems) == {rule} | ALSO.get(mutant, set()), problems
+@pytest.mark.parametrize(("mutant", "broken"), [one for one in ALL if one.id not in PARALLEL])
+def test_a_mutant_fails_its_rule_and_no_other(mutant: str, broken: set[str]) -> None:
+    problems = failing(mutant, IN_THIS_PROCESS)
+    assert set(problems) == broken, problems
 
 
-@pytest.mark.parametrize(("mutant", "rule"), PARALLEL)
-def test_a_mutant_that_only_two_processes_show_fails_there(mutant, rule):
-    assert set(failing(mutant.__name__, TWO_PROCESSES)) == {rule}
-    assert failing(mutant.__name__, IN_THIS_PROCESS) == {}
+@pytest.mark.parametrize(("mutant", "broken"), [one for one in ALL if one.id in PARALLEL])
+def test_a_mutant_that_only_two_processes_show_fails_there(mutant: str, broken: set[str]) -> None:
+    problems = failing(mutant, TWO_PROCESSES)
+    assert set(problems) == broken
+    assert mutant not in METHODS or "field." in problems["two-processes-step-alike"]
+    assert failing(mutant, IN_THIS_PROCESS) == {}
 
 
-def test_every_rule_has_a_mutant_at_every_seam():
-    for seam, mutants in (("estimator", MUTANTS), ("proposal", PROPOSAL_MUTANTS)):
-        assert set(mutants) == {rule.name for rule in SAMPLER_RULES if seam in rule.checks}
+@pytest.mark.parametrize("seam", BY_SEAM)
+def test_every_rule_has_a_mutant_at_every_seam(seam: str) -> None:
+    assert list(BY_SEAM[seam]) == [rule.name for rule in RULES if seam in rule.checks]
 
 
-def test_a_verdict_says_what_was_found_why_it_matters_and_what_to_do():
+def test_a_verdict_says_what_was_found_why_it_matters_and_what_to_do() -> None:
     verdict = next(v for v in check("KeepsAll") if not v.passed)
     line = verdict.line()
     assert line.startswith("FAIL  estimator  skips-only-what-it-may: ")

@@ -6,18 +6,14 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from small_learner import SMALLEST, small_mixture
 from torch import Tensor
 
 from leco_plugin.evaluation import equal_loss
 from leco_plugin.evaluation.equal_loss import at_equal_loss, kept_shares, threshold_losing
 from leco_plugin.learning.calibration import CalibrationConfig
-from leco_plugin.models.encodings import EncodingConfig
-from leco_plugin.models.field import FieldConfig
-from leco_plugin.models.gate import GateConfig
-from leco_plugin.models.hmoe import HMoEConfig
 from leco_plugin.models.mixture import Mixture
-from leco_plugin.models.rendering import Rays, Routing
-from leco_plugin.models.sizing.sizes import Sizes
+from leco_plugin.models.rendering import Rays
 from leco_plugin.scenes.bounds import SceneBounds
 
 
@@ -65,15 +61,7 @@ FEW = CalibrationConfig(rays_at_once=32)
 @pytest.fixture
 def mixture(monkeypatch: pytest.MonkeyPatch) -> Mixture:
     """A mixture whose field is dense, and whose gate says so, where x > 0 and nowhere else."""
-    sizes = Sizes(
-        gate=GateConfig(EncodingConfig(octaves=1), width=4, layers=1, scene_experts=2),
-        field=FieldConfig(
-            EncodingConfig("hash", levels=1, log2_table=4), HMoEConfig(2, width=4, layers=1)
-        ),
-        candidates=64,
-    )
-    torch.manual_seed(0)
-    made = Mixture(sizes, 1, "float32", Routing(0.2, homogeneous=False))
+    made = small_mixture()
     made.set_bounds(BOUNDS, 1.0)
 
     def gate(mapped: Tensor) -> Tensor:
@@ -81,7 +69,8 @@ def mixture(monkeypatch: pytest.MonkeyPatch) -> Mixture:
         return torch.stack([10.0 - occupied, torch.zeros_like(occupied), occupied - 10.0], dim=-1)
 
     def density(mapped: Tensor, *_: Tensor) -> tuple[Tensor, Tensor]:
-        return 30.0 * (mapped[:, 0] > 0.0), torch.zeros(len(mapped), 4)
+        features = torch.zeros(len(mapped), SMALLEST.field.experts.width)
+        return 30.0 * (mapped[:, 0] > 0.0), features
 
     monkeypatch.setattr(made.gate, "forward", gate)
     monkeypatch.setattr(made.field, "density", density)

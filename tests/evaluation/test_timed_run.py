@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from types import SimpleNamespace
 from typing import Any
 
@@ -10,7 +11,6 @@ import torch
 from torch import nn
 
 from leco_plugin.evaluation.clock import Budget
-from leco_plugin.evaluation.queries import FieldQueries
 from leco_plugin.evaluation.timed_run import TimedRun, _Course
 
 RATE = 0.01
@@ -25,7 +25,7 @@ def course_of(model: Any) -> tuple[_Course, Any]:
         callbacks=[],
     )
     run = TimedRun("method", "sampler", 0)
-    course = _Course(trainer, Budget(100.0), run, FieldQueries(), 0, None, None)
+    course = _Course(trainer, Budget(100.0), run, Counter(), 0, None, None)
     return course, optimizer.param_groups[0]
 
 

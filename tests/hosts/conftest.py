@@ -36,3 +36,9 @@ def readers(tilted: Path) -> dict[str, Data]:
         name: Data(NerfstudioDataParserConfig(data=tilted, **values))
         for name, values in options.items()
     }
+
+
+@pytest.fixture
+def data(readers: dict[str, Data]) -> Data:
+    """The scene in its own coordinates."""
+    return readers["as it is"]

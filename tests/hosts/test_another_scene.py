@@ -10,6 +10,7 @@ import pytest
 import torch
 from ball_occupancy import ball_of_the_tiny_scene
 from scene_readers import Data, Pipe, started
+from tiny_scene import IMAGES_LEFT_OPEN
 from torch import nn
 
 from leco_plugin.hosts.guide import Guide
@@ -24,25 +25,18 @@ from leco_plugin.scenes.frames import frame_of
 from leco_plugin.scenes.input_error import InputError
 from leco_plugin.scenes.survey import MOST_CAMERAS
 
-pytestmark = [
-    pytest.mark.usefixtures("without_cache"),
-    # nerfstudio leaves the images open whose size it has read
-    pytest.mark.filterwarnings("ignore:unclosed file:ResourceWarning"),
-    pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning"),
-]
+pytestmark = [pytest.mark.usefixtures("without_cache"), *IMAGES_LEFT_OPEN]
 
 
-def test_an_occupancy_of_another_scene_is_refused_unless_the_run_began_with_it(
-    readers: dict[str, Data],
-) -> None:
+def test_an_occupancy_of_another_scene_is_refused_unless_the_run_began_with_it(data: Data) -> None:
     elsewhere = ball_of_the_tiny_scene([[1, 0, 0, 50.0], [0, 1, 0, 50.0], [0, 0, 1, 50.0]])
     elsewhere.report = {"frame": torch.eye(3, 4).tolist()}
     with pytest.raises(InputError, match=r"keeps nothing .* learned on another scene") as error:
-        started(elsewhere, readers["as it is"])
+        started(elsewhere, data)
     assert "\n" not in str(error.value)
     (guide := Guide()).set_occupancy(elsewhere)
     (resumed := LearningOnly()).start = 90
-    GuidedStart(nn.Module(), guide, OccupancyConfig(), Pipe(readers["as it is"]), resumed)
+    GuidedStart(nn.Module(), guide, OccupancyConfig(), Pipe(data), resumed)
 
 
 ANOTHER = "the occupancy seems to be of another scene"
@@ -75,9 +69,8 @@ IN_THE_BALL, IN_THE_AIR = (0.0, 0.0, 0.3), (0.9, 0.9, 0.3)
 
 
 def test_an_occupancy_of_other_cameras_is_refused_in_a_line_that_names_the_way_to_insist(
-    readers: dict[str, Data], capsys: pytest.CaptureFixture[str]
+    data: Data, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    data = readers["as it is"]
     other, eye = of_other_cameras(data), torch.eye(3, 4)
     many = of_other_cameras(data, times=MOST_CAMERAS // 7 + 1)
     with pytest.raises(InputError, match="is of another scene"):
@@ -100,10 +93,10 @@ def test_an_occupancy_of_other_cameras_is_refused_in_a_line_that_names_the_way_t
 
 
 def test_cameras_that_may_be_of_the_same_scene_are_only_warned_of(
-    readers: dict[str, Data], capsys: pytest.CaptureFixture[str]
+    data: Data, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """Some of many photographs, and coordinates that a reader rounds."""
-    data, eye = readers["as it is"], torch.eye(3, 4)
+    eye = torch.eye(3, 4)
     rounded = of_other_cameras(data, 2e-3 * 3.0**-0.5 * float(learned_by(data).space.half_extent))
     refuse_another_scene(rounded, data, eye)
     many = of_other_cameras(data, times=MOST_CAMERAS // 7 + 1)
@@ -123,11 +116,9 @@ def test_photographs_that_were_added_or_taken_away_are_no_other_scene(
     assert ANOTHER not in " ".join(capsys.readouterr().out.split())
 
 
-def test_another_split_is_no_other_scene(
-    readers: dict[str, Data], capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_another_split_is_no_other_scene(data: Data, capsys: pytest.CaptureFixture[str]) -> None:
     """It was learned on what is tested on here."""
-    data = copy.copy(readers["as it is"])
+    data = copy.copy(data)
     occupancy = learned_by(data)
     data.eval_dataset = data.train_dataset
     data.train_dataset = SimpleNamespace(
@@ -146,7 +137,7 @@ def test_another_split_is_no_other_scene(
 
 @pytest.mark.parametrize("cameras", [None, [], "none", [[0.0]]])
 def test_a_file_that_names_no_cameras_is_not_compared(
-    cameras: Any, readers: dict[str, Data], capsys: pytest.CaptureFixture[str]
+    cameras: Any, data: Data, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    started(learned_by(readers["as it is"], cameras=cameras), readers["as it is"])
+    started(learned_by(data, cameras=cameras), data)
     assert ANOTHER not in " ".join(capsys.readouterr().out.split())

@@ -26,11 +26,6 @@ def test_before_there_is_an_occupancy_the_viewer_has_no_picture_and_goes_on():
         Guide().proposal(num_samples=3)(None)
 
 
-def test_an_unknown_sampler_is_named():
-    with pytest.raises(ValueError, match="no-such"):
-        _ = Guide("no-such").needs_occupancy
-
-
 def test_a_sampler_without_a_gate_is_built_in_the_hosts_box():
     grid = Guide("occupancy-grid").estimator(BOX)
     torch.testing.assert_close(grid.aabbs[0], BOX)

@@ -16,6 +16,7 @@ from nerfstudio.engine.callbacks import TrainingCallbackAttributes
 from nerfstudio.model_components.ray_samplers import UniformSampler
 from nerfstudio.pipelines.base_pipeline import VanillaPipelineConfig
 from scene_readers import Data, Pipe, started
+from tiny_scene import IMAGES_LEFT_OPEN
 from torch import Tensor, nn
 
 from leco_plugin.host_configs import leco_ngp
@@ -35,17 +36,34 @@ from leco_plugin.scenes.frames import box_around, frame_of
 from leco_plugin.scenes.input_error import InputError
 from leco_plugin.space import Space
 
-pytestmark = [
-    pytest.mark.usefixtures("without_cache"),
-    # nerfstudio leaves the images open whose size it has read
-    pytest.mark.filterwarnings("ignore:unclosed file:ResourceWarning"),
-    pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning"),
-]
+pytestmark = [pytest.mark.usefixtures("without_cache"), *IMAGES_LEFT_OPEN]
 
 NAME = "occupancy.safetensors"
 STEP = 0.02
 CLEAR = 1e-3
 """Decisions within this of the threshold may fall either way, by rounding alone."""
+
+
+@pytest.fixture
+def balls_guide() -> Guide:
+    """With the ball for its occupancy."""
+    guide = Guide()
+    guide.set_occupancy(ball_of_the_tiny_scene())
+    return guide
+
+
+@pytest.fixture
+def run(tmp_path: Path) -> LearningOnly:
+    """With a folder."""
+    run = LearningOnly()
+    run.folder = tmp_path / "run"
+    return run
+
+
+def start(
+    data: Data, guide: Guide, config: OccupancyConfig | None = None, run: LearningOnly | None = None
+) -> GuidedStart:
+    return GuidedStart(nn.Module(), guide, config or OccupancyConfig(), Pipe(data), run)
 
 
 def lopsided(data: Data) -> Occupancy:
@@ -169,64 +187,56 @@ def test_the_ball_is_found_whatever_it_was_learned_in(readers: dict[str, Data]) 
     assert 0.05 < shares[0] < 0.6
 
 
-def test_training_says_what_was_wrong_with_a_path(readers: dict[str, Data], tmp_path: Path) -> None:
+def test_training_says_what_was_wrong_with_a_path(data: Data, tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"there is no occupancy .*none: train leco-occupancy"):
-        config = OccupancyConfig(tmp_path / "none")
-        GuidedStart(nn.Module(), Guide(), config, Pipe(readers["as it is"]))
+        start(data, Guide(), OccupancyConfig(tmp_path / "none"))
 
 
-def test_a_checkpoint_needs_no_file(readers: dict[str, Data]) -> None:
-    guide = Guide()
-    guide.set_occupancy(ball_of_the_tiny_scene())
-    GuidedStart(
-        nn.Module(), guide, OccupancyConfig(Path("deleted") / NAME), Pipe(readers["as it is"])
-    )
-    assert guide.occupancy is not None
+def test_a_checkpoint_needs_no_file(data: Data, balls_guide: Guide) -> None:
+    start(data, balls_guide, OccupancyConfig(Path("deleted") / NAME))
+    assert balls_guide.occupancy is not None
 
 
-def test_a_sampler_and_a_gate_that_do_not_fit_are_refused_before_learning(
-    readers: dict[str, Data],
-) -> None:
-    data, name = readers["as it is"], "learned-occupancy-hash"
+def test_a_sampler_and_a_gate_that_do_not_fit_are_refused_before_learning(data: Data) -> None:
+    name = "learned-occupancy-hash"
     with pytest.raises(InputError, match=f"{name}.* asks a gate on hash features"):
         started(ball_of_the_tiny_scene(), data, name)
     learning = "--pipeline.model.occupancy.learning"
     with pytest.raises(InputError, match=f"{name}.* asks a gate on hash features.*{learning}$"):
-        GuidedStart(nn.Module(), Guide(name), OccupancyConfig(sampler=name), Pipe(data))
+        start(data, Guide(name), OccupancyConfig(sampler=name))
 
 
 def test_a_budget_in_which_nothing_can_be_learned_is_refused_before_the_first_step(
-    readers: dict[str, Data],
+    data: Data,
 ) -> None:
     for config in (OccupancyConfig(seconds=0.0), OccupancyConfig(rays=0)):
         with pytest.raises(InputError, match="an occupancy is learned"):
-            GuidedStart(nn.Module(), Guide(), config, Pipe(readers["as it is"]))
+            start(data, Guide(), config)
+
+
+def leco_ngp_with(occupancy: OccupancyConfig, scene: Path) -> Any:
+    """The pipeline of a method of ours."""
+    config: Any = leco_ngp.config.pipeline
+    data = VanillaDataManagerConfig(dataparser=NerfstudioDataParserConfig(data=scene))
+    model = type(config.model)(host=config.model.host, occupancy=occupancy)
+    return VanillaPipelineConfig(datamanager=data, model=model).setup(device="cpu")
 
 
 def test_an_unknown_sampler_is_refused_in_a_line(tiny_scene: Path) -> None:
-    config: Any = leco_ngp.config.pipeline
-    data = VanillaDataManagerConfig(dataparser=NerfstudioDataParserConfig(data=tiny_scene))
-    occupancy = OccupancyConfig(sampler="lerned-occupancy")
-    model = type(config.model)(host=config.model.host, occupancy=occupancy)
-    pipeline = VanillaPipelineConfig(datamanager=data, model=model)
     with pytest.raises(InputError, match="no sampler 'lerned-occupancy'; there are dense"):
-        pipeline.setup(device="cpu")
+        leco_ngp_with(OccupancyConfig(sampler="lerned-occupancy"), tiny_scene)
 
 
 def test_the_first_step_leaves_the_file_in_the_runs_folder(
-    readers: dict[str, Data], tmp_path: Path
+    data: Data, balls_guide: Guide, run: LearningOnly
 ) -> None:
-    run = LearningOnly()
-    run.folder = tmp_path / "run"
-    guide = Guide()
-    guide.set_occupancy(ball_of_the_tiny_scene())
-    start = GuidedStart(nn.Module(), guide, OccupancyConfig(), Pipe(readers["as it is"]), run)
+    begun = start(data, balls_guide, run=run)
     assert not run.folder.exists()
-    start.before_step(0)
+    begun.before_step(0)
     left = Occupancy.load(run.folder / NAME)
-    assert left.report == guide.the_occupancy().report
+    assert left.report == balls_guide.the_occupancy().report
     (run.folder / NAME).unlink()
-    start.before_step(1)
+    begun.before_step(1)
     assert not (run.folder / NAME).exists()
 
 
@@ -234,10 +244,14 @@ def test_the_first_step_leaves_the_file_in_the_runs_folder(
     ("step", "rays", "careful"), [(0, 512, True), (7, 512, False), (0, 0, False)]
 )
 def test_a_packed_host_begins_carefully_and_is_opaque_by_what_it_then_keeps(
-    readers: dict[str, Data], monkeypatch: pytest.MonkeyPatch, step: int, rays: int, careful: bool
+    data: Data,
+    balls_guide: Guide,
+    monkeypatch: pytest.MonkeyPatch,
+    step: int,
+    rays: int,
+    careful: bool,
 ) -> None:
-    guide, config = Guide(), OccupancyConfig()
-    guide.set_occupancy(ball_of_the_tiny_scene())
+    guide, config = balls_guide, OccupancyConfig()
     calibration = config.learning.calibration
     config.learning.calibration = replace(calibration, recheck_rays=rays)
     host = nn.ModuleList([GuidedEstimator(guide, None)])
@@ -245,7 +259,6 @@ def test_a_packed_host_begins_carefully_and_is_opaque_by_what_it_then_keeps(
     monkeypatch.setattr(
         guided_start, "begin_opaque", lambda host, guide, kept: lengths.append(kept)
     )
-    data = readers["as it is"]
     GuidedStart(host, guide, config, Pipe(data)).before_step(step)
     calibrated = guide.the_occupancy().threshold
     assert (guide.followed().threshold < calibrated) == careful
@@ -259,7 +272,7 @@ def test_a_packed_host_begins_carefully_and_is_opaque_by_what_it_then_keeps(
 
 
 def test_before_learning_a_run_says_that_it_starts_over_where_it_is_stopped(
-    readers: dict[str, Data], monkeypatch: pytest.MonkeyPatch
+    data: Data, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     said: list[str] = []
 
@@ -270,61 +283,52 @@ def test_before_learning_a_run_says_that_it_starts_over_where_it_is_stopped(
     monkeypatch.setattr("leco_plugin.hosts.guided_start.say", said.append)
     monkeypatch.setattr("leco_plugin.hosts.learn_first.learn_occupancy", learn)
     guide = Guide()
-    GuidedStart(nn.Module(), guide, OccupancyConfig(), Pipe(readers["as it is"])).before_step(0)
+    start(data, guide).before_step(0)
     assert "in no checkpoint until then" in said[0] and said[1] == "learned"
     assert guide.occupancy is not None
 
 
 def test_a_host_that_asks_no_gate_needs_no_occupancy(tiny_scene: Path) -> None:
-    config: Any = leco_ngp.config.pipeline
-    data = VanillaDataManagerConfig(dataparser=NerfstudioDataParserConfig(data=tiny_scene))
     occupancy = OccupancyConfig(Path("no") / "file", sampler="dense")
-    model = type(config.model)(host=config.model.host, occupancy=occupancy)
-    pipeline: Any = VanillaPipelineConfig(datamanager=data, model=model).setup(device="cpu")
+    pipeline = leco_ngp_with(occupancy, tiny_scene)
     attributes = TrainingCallbackAttributes(None, None, pipeline, None)  # type: ignore[arg-type]
     pipeline.get_training_callbacks(attributes)
     assert pipeline.model.leco_guide.occupancy is None
 
 
 def test_with_a_file_nothing_is_said_of_bounds_for_learning_one(
-    readers: dict[str, Data], monkeypatch: pytest.MonkeyPatch
+    data: Data, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     said: list[str] = []
     for module in ("scenes.survey", "hosts.guided_start"):
         monkeypatch.setattr(f"leco_plugin.{module}.say", said.append)
-    started(lopsided(readers["as it is"]), readers["as it is"])
+    started(lopsided(data), data)
     (line,) = said
     assert line.startswith("guided by an occupancy that keeps ")
 
 
-def test_a_range_that_no_ray_meets_is_refused_before_the_first_step(
-    readers: dict[str, Data],
-) -> None:
-    data = readers["as it is"]
+def test_a_range_that_no_ray_meets_is_refused_before_the_first_step(data: Data) -> None:
     config = OccupancyConfig()
     config.learning.bounds.altitudes = (-9.0, -8.0)
     config.learning.near, config.learning.far = 1e-3, 2e-3
     guide = Guide("learned-occupancy")
     guide.set_occupancy(lopsided(data))
     with pytest.raises(InputError, match=r"^0% of the rays meet the scene"):
-        GuidedStart(nn.Module(), guide, config, Pipe(data))
+        start(data, guide, config)
 
 
 def test_a_full_disk_does_not_end_a_run_that_has_its_occupancy(
-    readers: dict[str, Data],
-    tmp_path: Path,
+    data: Data,
+    balls_guide: Guide,
+    run: LearningOnly,
     monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
 ) -> None:
     def full(*_: object) -> None:
         raise OSError(28, "No space left on device")
 
-    guide = Guide()
-    guide.set_occupancy(ball_of_the_tiny_scene())
-    run = LearningOnly()
-    run.folder = tmp_path / "run"
-    start = GuidedStart(nn.Module(), guide, OccupancyConfig(), Pipe(readers["as it is"]), run)
+    begun = start(data, balls_guide, run=run)
     monkeypatch.setattr(Occupancy, "save", full)
-    start.before_step(0)
+    begun.before_step(0)
     said = " ".join(capsys.readouterr().out.split())
     assert "could not be written" in said and "No space left on device" in said

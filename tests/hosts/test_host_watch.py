@@ -57,6 +57,11 @@ def packed(watched: Watched) -> torch.nn.Module:
 
 
 class Watched(SimpleNamespace):
+    @property
+    def threshold(self) -> float:
+        """As files and checkpoints say."""
+        return self.guide.the_occupancy().threshold
+
     def go(self, first: int, last: int) -> None:
         for step in range(first, last):
             self.watch.before_step(step)
@@ -89,9 +94,9 @@ def watched(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Watched:
 
 
 def test_a_price_beyond_its_bound_lowers_the_threshold_until_it_is_not(watched: Watched) -> None:
-    before, version = watched.guide.the_occupancy().threshold, watched.guide.version
+    before, version = watched.threshold, watched.guide.version
     watched.go(0, 250)
-    assert watched.asked == [1, 2] and watched.guide.the_occupancy().threshold == before
+    assert watched.asked == [1, 2] and watched.threshold == before
     watched.host.price = 0.05
     watched.go(250, 301)
     after = watched.guide.the_occupancy()
@@ -102,7 +107,7 @@ def test_a_price_beyond_its_bound_lowers_the_threshold_until_it_is_not(watched: 
     assert left.threshold == after.threshold and left.report["lowered"] == [[300, after.threshold]]
     assert left.report[CALIBRATED_AT] == before and left.report["empty_fraction"] == 0.8
     watched.go(301, 3000)
-    assert watched.guide.the_occupancy().threshold == 0.0
+    assert watched.threshold == 0.0
     nothing = watched.guide.the_occupancy().report
     assert nothing["empty_fraction"] == nothing["image_price_db"] == 0.0
     assert CALIBRATED_AT not in nothing and nothing["params"] == 5
@@ -122,6 +127,32 @@ def test_photographs_with_alpha_are_compared_as_the_host_renders_them(watched: W
     assert not watched.watch._errors(None, truth).any()
 
 
+@pytest.mark.parametrize("price", [0.0, 0.05])
+def test_probation_ends_in_every_process_though_the_first_one_alone_measures(
+    watched: Watched, packed: torch.nn.Module, monkeypatch: pytest.MonkeyPatch, price: float
+) -> None:
+    """The second process gets what the first one has found, and calls nothing itself."""
+    found: list[Any] = []
+    guides = watched.guide, copy.deepcopy(watched.guide)
+    ends = []
+    for rank, guide in enumerate(guides):
+
+        def from_first(make: Any, device: Any, rank: int = rank) -> Any:
+            if rank == 0:
+                found.append(make())
+                return copy.deepcopy(found[-1])
+            return found.pop(0)
+
+        monkeypatch.setattr(price_watch, "from_first", from_first)
+        guide.watched.lower = guide.the_occupancy().threshold / 16
+        host = Host(guide)
+        host.price = price
+        watch = HostWatch(host, guide, CalibrationConfig(), watched.watch.pipeline, LearningOnly())
+        Watched(guide=guide, watch=watch, now=watched.now, kept=9).go(0, 250)
+        ends.append((guide.followed().threshold, guide.watched.due, guide.watched.lower))
+    assert ends[0] == ends[1] and not found
+
+
 def a_half(occupancy: Occupancy) -> float:
     """What is skipped, where the threshold does not matter."""
     return 0.5
@@ -138,7 +169,7 @@ def test_all_processes_begin_with_what_the_first_one_has_found(
 def test_what_skips_too_little_is_no_beginning(watched: Watched, packed: Any) -> None:
     """The threshold is doubled until 40% as much is skipped as by the calibrated one, of what is
     within the bounds: here 40% of the rays are not."""
-    calibrated = watched.guide.the_occupancy().threshold
+    calibrated = watched.threshold
 
     def from_a_fifth_on(occupancy: Occupancy) -> float:
         within = 0.8 if occupancy.threshold > 0.2 * calibrated else 0.3
@@ -151,7 +182,7 @@ def test_what_skips_too_little_is_no_beginning(watched: Watched, packed: Any) ->
 def test_where_only_the_calibrated_threshold_skips_it_is_followed_at_once(
     watched: Watched, packed: Any
 ) -> None:
-    calibrated = watched.guide.the_occupancy().threshold
+    calibrated = watched.threshold
 
     def all_or_nothing(occupancy: Occupancy) -> float:
         return 0.8 if occupancy.threshold >= calibrated else 0.0
@@ -163,11 +194,11 @@ def test_where_only_the_calibrated_threshold_skips_it_is_followed_at_once(
 def test_a_host_that_can_afford_it_follows_the_calibrated_threshold_after_a_while(
     watched: Watched, packed: Any, capsys: Any
 ) -> None:
-    calibrated, version = watched.guide.the_occupancy().threshold, watched.guide.version
+    calibrated, version = watched.threshold, watched.guide.version
     assert begin_carefully(packed, watched.guide, a_half) and watched.guide.version > version
     watched.go(0, 100)
     assert watched.guide.followed().threshold == pytest.approx(CAREFUL * calibrated)
-    assert watched.guide.the_occupancy().threshold == calibrated  # as files and checkpoints say
+    assert watched.threshold == calibrated  # as files and checkpoints say
     version = watched.guide.version
     watched.go(100, 201)
     assert watched.guide.followed() is watched.guide.the_occupancy()
@@ -180,7 +211,7 @@ def test_a_host_that_can_afford_it_follows_the_calibrated_threshold_after_a_whil
 def test_a_host_that_cannot_afford_it_stays_with_the_lower_threshold(
     watched: Watched, packed: Any
 ) -> None:
-    calibrated = watched.guide.the_occupancy().threshold
+    calibrated = watched.threshold
     begin_carefully(packed, watched.guide, a_half)
     watched.host.price = 0.05
     watched.go(0, 101)
@@ -195,7 +226,7 @@ def test_a_host_that_cannot_afford_it_stays_with_the_lower_threshold(
 
 
 def test_the_careful_beginning_goes_on_in_a_resumed_run(watched: Watched, packed: Any) -> None:
-    calibrated = watched.guide.the_occupancy().threshold
+    calibrated = watched.threshold
     begin_carefully(packed, watched.guide, a_half)
     watched.go(0, 50)
     fresh = Guide()
@@ -231,13 +262,13 @@ def test_what_was_wrong_once_is_soon_looked_at_again_however_long_that_takes(
     watched: Watched, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(price_watch, "steps_until_next", lambda *_: 2000)
-    before = watched.guide.the_occupancy().threshold
+    before = watched.threshold
     watched.host.price = 0.05
     watched.go(0, 201)
-    assert watched.guide.the_occupancy().threshold == pytest.approx(LOWERED_TO**2 * before)
+    assert watched.threshold == pytest.approx(LOWERED_TO**2 * before)
     watched.host.price = 0.0
     watched.go(201, 1000)
-    assert watched.guide.the_occupancy().threshold == pytest.approx(LOWERED_TO**2 * before)
+    assert watched.threshold == pytest.approx(LOWERED_TO**2 * before)
     assert len(watched.asked) == 3  # nothing was found again, and the next look is far away
 
 
@@ -248,9 +279,9 @@ def test_an_occupancy_that_keeps_nothing_is_not_followed(watched: Watched, capsy
     watched.go(60, 70)
     watched.kept = 0
     watched.go(70, 170)
-    assert watched.guide.the_occupancy().threshold > 0.0
+    assert watched.threshold > 0.0
     watched.go(170, 171)
-    assert watched.guide.the_occupancy().threshold == 0.0
+    assert watched.threshold == 0.0
     said = " ".join(capsys.readouterr().out.split())
     assert "step 170: the occupancy kept nothing for 100 steps" in said
 
@@ -293,4 +324,4 @@ def test_all_processes_lower_the_threshold_or_none(
     monkeypatch.setattr(price_watch, "mean", lambda here, _: 0.5 * (here + kept_elsewhere))
     watched.kept = 0
     watched.go(0, 300)
-    assert watched.guide.the_occupancy().threshold > 0.0
+    assert watched.threshold > 0.0

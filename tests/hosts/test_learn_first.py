@@ -19,10 +19,7 @@ from leco_plugin.occupancy import Occupancy
 from leco_plugin.scenes.input_error import InputError
 from leco_plugin.scenes.photographs import LecoPhotographsDataParserConfig
 
-pytestmark = [  # nerfstudio leaves an image open
-    pytest.mark.filterwarnings("ignore:unclosed file:ResourceWarning"),
-    pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning"),
-]
+pytestmark = tiny_scene.IMAGES_LEFT_OPEN
 
 
 @pytest.fixture(scope="module")

@@ -79,11 +79,16 @@ def test_boxes_and_cells_are_answered_in_the_hosts_coordinates(guide: Guide):
     assert 0.01 < decisions.float().mean() < 0.5
 
 
-def test_steps_that_do_not_grow_end_at_the_hosts_box():
-    """An unbounded occupancy has no end of its own, and nerfstudio's sampler gives none."""
+def an_unbounded_guide(threshold: float) -> Guide:
     guide = Guide()
     space = Space("contraction", (0.0, 0.0, 0.0), 1.0)
-    guide.set_occupancy(Occupancy(ball().gate, space, 1e-9))
+    guide.set_occupancy(Occupancy(ball().gate, space, threshold))
+    return guide
+
+
+def test_steps_that_do_not_grow_end_at_the_hosts_box():
+    """An unbounded occupancy has no end of its own, and nerfstudio's sampler gives none."""
+    guide = an_unbounded_guide(1e-9)
     inner, outer = torch.tensor([-1.0] * 3 + [1.0] * 3), torch.tensor([-2.0] * 3 + [2.0] * 3)
     origins = torch.tensor([[-3.0, 0.0, 0.0], [0.0, 1.5, 0.0], [0.0, 3.0, 0.0]])
     directions = torch.tensor([[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [1.0, 0.0, 0.0]])
@@ -99,38 +104,32 @@ def test_steps_that_do_not_grow_end_at_the_hosts_box():
     assert float(t_ends.max()) > 40.0
 
 
-def an_unbounded_guide(threshold: float) -> Guide:
-    guide = Guide()
-    space = Space("contraction", (0.0, 0.0, 0.0), 1.0)
-    guide.set_occupancy(Occupancy(ball().gate, space, threshold))
-    return guide
+TO_THE_SKY: dict[str, Any] = {"cone_angle": 0.125, "far_plane": 40.0, "render_step_size": 0.1}
 
 
 def test_rays_of_an_unbounded_occupancy_end_in_a_place_for_the_sky():
     guide = an_unbounded_guide(2.0)  # which keeps nothing
     origins = torch.tensor([[0.0, 0.0, 0.0], [5.0, 0.0, 0.0], [0.0, torch.nan, 0.0]])
     directions = torch.tensor([[0.0, 0.0, 1.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]])
-    march: dict[str, Any] = {"cone_angle": 0.125, "far_plane": 40.0, "render_step_size": 0.1}
     guided: Any = guide.estimator(BOX).eval()
-    indices, t_starts, t_ends = guided.sampling(origins, directions, **march)
+    indices, t_starts, t_ends = guided.sampling(origins, directions, **TO_THE_SKY)
     assert indices.tolist() == [0, 1]
     assert t_starts.tolist() == [35.0, 35.0] and t_ends.tolist() == [40.0, 40.0]
     sooner = torch.tensor([8.0, 40.0, 40.0])
-    _, t_starts, t_ends = guided.sampling(origins, directions, t_max=sooner, **march)
+    _, t_starts, t_ends = guided.sampling(origins, directions, t_max=sooner, **TO_THE_SKY)
     assert t_starts.tolist() == [7.0, 35.0] and t_ends.tolist() == [8.0, 40.0]
 
 
 def test_a_ray_that_a_crop_ends_has_no_place_for_the_sky():
     guide = an_unbounded_guide(2.0)  # which keeps nothing
     origins, directions = torch.zeros(4, 3), torch.tensor([[0.0, 0.0, 1.0]]).expand(4, 3)
-    march: dict[str, Any] = {"cone_angle": 0.125, "far_plane": 40.0, "render_step_size": 0.1}
     guided: Any = guide.estimator(BOX).eval()
     # cut off, around the sky and more, beyond everything, and as nerfstudio says that a ray misses
     limits = torch.tensor([[0.0, 8.0], [1.0, 90.0], [50.0, 60.0], [1e10, 1e10]])
     guide.cropped = True
     nears, fars = limits.T
     indices, t_starts, t_ends = guided.sampling(
-        origins, directions, t_min=nears, t_max=fars, **march
+        origins, directions, t_min=nears, t_max=fars, **TO_THE_SKY
     )
     assert indices.tolist() == [1]
     assert t_starts.tolist() == [35.0] and t_ends.tolist() == [40.0]
@@ -171,11 +170,6 @@ def test_what_an_unbounded_occupancy_keeps_comes_before_the_backdrop_in_order():
     assert bool(((found[1].diff() > 0) | (found[0].diff() > 0)).all())
     for ours, theirs in zip(found, (indices, t_starts, t_ends)):
         assert torch.equal(ours[~is_last], theirs[before])
-
-
-def wall_behind(x: float):
-    """A host's density: opaque beyond the plane z < x of the occupancy's coordinates."""
-    return lambda positions: 1e3 * (positions[:, 2:] < x).float()
 
 
 def test_a_proposal_host_in_other_coordinates_samples_the_ball(guide: Guide):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import io
+from typing import Any
 
 import pytest
 import torch
@@ -110,6 +111,21 @@ def test_looking_changes_nothing(mixture: Mixture) -> None:
     after = mixture.state_dict()
     assert list(after) == list(before)
     assert mixture.field.experts.those_left() is None
+
+
+def test_a_failure_half_way_leaves_all_experts(mixture: Mixture, monkeypatch) -> None:
+    left, shade, calls = mixture.field.experts.left.tolist(), mixture.shade, []
+
+    def fails(*given: Any) -> Any:
+        calls.append(given)
+        if len(calls) == 2:
+            raise RuntimeError("out of memory")
+        return shade(*given)
+
+    monkeypatch.setattr(mixture, "shade", fails)
+    with pytest.raises(RuntimeError, match="out of memory"):
+        unneeded(mixture, image(make()))
+    assert mixture.field.experts.left.tolist() == left
 
 
 def test_the_price_is_that_of_all_that_have_gone(mixture: Mixture) -> None:

@@ -62,14 +62,6 @@ def test_the_cache_changes_almost_no_sample(learned):
     assert len(kept[0] ^ kept[1]) <= 1e-4 * learned.occupancy.asked
 
 
-def test_every_sample_is_occupied_when_asked_again(bare):
-    origins, directions = camera_rays(200)
-    ray_indices, t_starts, t_ends = bare.sampling(origins, directions, render_step_size=0.01)
-    middles = (t_starts + t_ends)[:, None] / 2.0
-    positions = origins[ray_indices] + directions[ray_indices] * middles
-    assert bare.occupancy.occupied(positions).float().mean() > 0.999  # but for rounding
-
-
 def test_stratified_sampling_shifts_by_less_than_a_step(bare):
     origins, directions = camera_rays(50)
     options = {"render_step_size": 0.1, "near_plane": 1.0, "far_plane": 3.0}
@@ -142,15 +134,6 @@ def test_samples_are_dropped_below_the_given_opacity_and_a_tenth_of_the_mean(
         assert kept[1].equal(plain[1][expected])
 
 
-def test_a_threshold_of_opacity_drops_what_is_faint(bare):
-    origins, directions = camera_rays(20)
-    plain = bare.sampling(origins, directions, render_step_size=0.03)
-    alphas = torch.full_like(plain[1], 0.5).index_fill_(0, torch.arange(0, len(plain[1]), 2), 1e-3)
-    options = {"alpha_fn": lambda *_: alphas, "early_stop_eps": 0.0, "render_step_size": 0.03}
-    kept = bare.sampling(origins, directions, alpha_thre=0.01, **options)
-    assert kept[1].equal(plain[1][1::2])
-
-
 @pytest.mark.parametrize("training", [True, False])
 def test_no_more_candidates_than_a_chunk_are_worked_on_at_once(training):
     estimator, asked = LearnedOccupancyEstimator(Balls(), cache_bytes=0).train(training), []
@@ -213,14 +196,6 @@ def test_what_is_no_box_is_refused_in_a_line(aabb):
     ):
         with pytest.raises(ValueError, match=r"^aabb must be a finite box \(min, max\), got "):
             build(aabb)
-
-
-def test_an_impossible_cache_is_done_without_and_said(caplog):
-    balls = Balls()
-    balls.query = lambda positions: (positions[:, 0] * 3000.0).sin() * 0.5 + 0.5
-    estimator = LearnedOccupancyEstimator(balls, cache_bytes=1 << 15)
-    assert estimator.cache is None
-    assert "no cell cache, sampling will be slower" in caplog.text
 
 
 @settings(deadline=None, max_examples=30)

@@ -17,33 +17,30 @@ HERE = Path(__file__).parent
 NAMES = ["test_gate_kernel.py", "test_march_kernel.py"]
 
 
-@pytest.mark.parametrize("name", NAMES)
-def test_kernels_agree_with_their_twins(name: str) -> None:
-    pytest.importorskip("triton")
+def run(*arguments: str, **variables: str) -> str:
+    """What pytest says in a process of its own, with these variables alone on interpreting."""
+    without = {name: value for name, value in os.environ.items() if name != "TRITON_INTERPRET"}
     finished = subprocess.run(
-        [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", str(HERE / name)],
-        env={**os.environ, "TRITON_INTERPRET": "1", "OMP_NUM_THREADS": "1"},
+        [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", *arguments],
+        env={**without, **variables},
         cwd=HERE.parent.parent,
         capture_output=True,
         text=True,
         timeout=280,
     )
     assert finished.returncode == 0, finished.stdout[-4000:] + finished.stderr[-1000:]
-    assert " passed" in finished.stdout and "skipped" not in finished.stdout
+    return finished.stdout
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_kernels_agree_with_their_twins(name: str) -> None:
+    pytest.importorskip("triton")
+    said = run(str(HERE / name), TRITON_INTERPRET="1", OMP_NUM_THREADS="1")
+    assert " passed" in said and "skipped" not in said
 
 
 @pytest.mark.skipif(torch.cuda.is_available(), reason="they run, compiled")
 def test_they_are_those_that_a_gpu_is_asked_for() -> None:
-    finished = subprocess.run(
-        [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", "-m", "gpu", "-rs"]
-        + [str(HERE / name) for name in NAMES],
-        env={name: value for name, value in os.environ.items() if name != "TRITON_INTERPRET"},
-        cwd=HERE.parent.parent,
-        capture_output=True,
-        text=True,
-        timeout=280,
-    )
-    assert finished.returncode == 0, finished.stdout[-4000:] + finished.stderr[-1000:]
-    said = finished.stdout.splitlines()
+    said = run("-m", "gpu", "-rs", *(str(HERE / name) for name in NAMES)).splitlines()
     assert int(said[-1].split(" skipped")[0]) > 80 and "passed" not in said[-1]
     assert any("there is no CUDA device" in line for line in said)

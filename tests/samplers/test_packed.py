@@ -13,6 +13,7 @@ from leco_plugin.samplers import packed
 
 N_RAYS = 6
 RAYS = torch.tensor([0, 0, 0, 2, 2, 3, 3, 3, 3, 5])
+BY_RAY = {"ray_indices": RAYS, "n_rays": N_RAYS}
 
 
 def random_samples(seed: int = 0) -> tuple[Tensor, Tensor, Tensor]:
@@ -28,13 +29,12 @@ def test_weights_follow_the_definition(seed):
     t_starts, t_ends, sigmas = random_samples(seed)
     expected = slow_weights(sigmas * (t_ends - t_starts), RAYS)
     info = packed.pack_info(RAYS, N_RAYS)
-    by_indices = {"ray_indices": RAYS, "n_rays": N_RAYS}
-    for rays in (by_indices, {"packed_info": info}):
+    for rays in (BY_RAY, {"packed_info": info}):
         outputs = packed.render_weight_from_density(t_starts, t_ends, sigmas, **rays)
         for output, slow in zip(outputs, expected, strict=True):
             assert output.tolist() == pytest.approx(slow, abs=1e-12)
     alphas = torch.tensor(expected[2], dtype=torch.float64)
-    outputs = packed.render_weight_from_alpha(alphas, **by_indices)
+    outputs = packed.render_weight_from_alpha(alphas, **BY_RAY)
     for output, slow in zip(outputs, expected[:2], strict=True):
         assert output.tolist() == pytest.approx(slow, abs=1e-12)
 
@@ -63,7 +63,7 @@ def test_batched_samples_render_like_packed_ones():
 def test_weights_have_exact_gradients(batched):
     t_starts, t_ends, sigmas = random_samples()
     shape = (2, 5) if batched else (10,)
-    rays = {} if batched else {"ray_indices": RAYS, "n_rays": N_RAYS}
+    rays = {} if batched else BY_RAY
     inputs = [tensor.view(shape).requires_grad_() for tensor in (t_starts, t_ends, sigmas)]
     for outputs in ([0], [1], [2], [0, 1, 2]):
         assert torch.autograd.gradcheck(
@@ -78,7 +78,7 @@ def test_weights_have_exact_gradients(batched):
 def test_weights_and_sums_have_exact_second_gradients(batched):
     t_starts, t_ends, sigmas = random_samples()
     shape = (2, 5) if batched else (10,)
-    rays = {} if batched else {"ray_indices": RAYS, "n_rays": N_RAYS}
+    rays = {} if batched else BY_RAY
     inputs = [tensor.view(shape).requires_grad_() for tensor in (t_starts, t_ends, sigmas)]
     assert torch.autograd.gradgradcheck(
         lambda *samples: packed.render_weight_from_density(*samples, **rays), inputs
@@ -92,7 +92,7 @@ def test_weights_and_sums_have_exact_second_gradients(batched):
 
 def test_a_packed_product_says_that_it_has_no_second_gradient():
     alphas = torch.rand(10, requires_grad=True)
-    trans = packed.render_transmittance_from_alpha(alphas, ray_indices=RAYS, n_rays=N_RAYS)
+    trans = packed.render_transmittance_from_alpha(alphas, **BY_RAY)
     (gradient,) = torch.autograd.grad(trans.square().sum(), alphas, create_graph=True)
     with pytest.raises(RuntimeError, match="once_differentiable"):
         gradient.sum().backward()
@@ -103,7 +103,7 @@ def test_alpha_weights_have_exact_gradients_at_opaque_samples():
     alphas[[1, 5, 7, 9]] = 1.0
     alphas.requires_grad_()
     assert torch.autograd.gradcheck(
-        lambda a: packed.render_weight_from_alpha(a, ray_indices=RAYS, n_rays=N_RAYS),
+        lambda a: packed.render_weight_from_alpha(a, **BY_RAY),
         alphas,
         eps=1e-7,
     )
@@ -141,10 +141,9 @@ def test_ten_million_float32_weights_are_as_good_as_their_inputs():
 @pytest.mark.parametrize("bad", [torch.nan, torch.inf])
 def test_a_bad_density_does_not_leave_its_ray(bad):
     t_starts, t_ends, sigmas = (tensor.float() for tensor in random_samples())
-    rays = {"ray_indices": RAYS, "n_rays": N_RAYS}
-    clean = packed.render_weight_from_density(t_starts, t_ends, sigmas, **rays)[0]
+    clean = packed.render_weight_from_density(t_starts, t_ends, sigmas, **BY_RAY)[0]
     sigmas[4] = bad
-    weights = packed.render_weight_from_density(t_starts, t_ends, sigmas, **rays)[0]
+    weights = packed.render_weight_from_density(t_starts, t_ends, sigmas, **BY_RAY)[0]
     torch.testing.assert_close(weights[RAYS != 2], clean[RAYS != 2])
     assert weights[4].isnan() == (bad != bad)
 
@@ -153,7 +152,7 @@ def test_a_bad_density_does_not_leave_its_ray(bad):
 @pytest.mark.parametrize("by", ["density", "alpha"])
 def test_what_a_bad_sample_does_to_gradients_stays_on_its_ray(by, bad):
     t_starts, t_ends, sigmas = random_samples()
-    alphas, rays = sigmas / 4.0, {"ray_indices": RAYS, "n_rays": N_RAYS}
+    alphas = sigmas / 4.0
 
     def gradients(value: float | None) -> Tensor:
         inputs = (sigmas if by == "density" else alphas).clone()
@@ -161,9 +160,9 @@ def test_what_a_bad_sample_does_to_gradients_stays_on_its_ray(by, bad):
             inputs[4] = value
         inputs.requires_grad_()
         if by == "density":
-            outputs = packed.render_weight_from_density(t_starts, t_ends, inputs, **rays)
+            outputs = packed.render_weight_from_density(t_starts, t_ends, inputs, **BY_RAY)
         else:
-            outputs = packed.render_weight_from_alpha(inputs, **rays)
+            outputs = packed.render_weight_from_alpha(inputs, **BY_RAY)
         sum((output * t_ends).sum() for output in outputs).backward()
         return inputs.grad
 
@@ -174,11 +173,10 @@ def test_what_a_bad_sample_does_to_gradients_stays_on_its_ray(by, bad):
 
 def test_prefix_transmittance_scales_weights():
     t_starts, t_ends, sigmas = random_samples()
-    rays = {"ray_indices": RAYS, "n_rays": N_RAYS}
     prefix = torch.rand(10, dtype=torch.float64)
-    plain = packed.render_weight_from_density(t_starts, t_ends, sigmas, **rays)
+    plain = packed.render_weight_from_density(t_starts, t_ends, sigmas, **BY_RAY)
     scaled = packed.render_weight_from_density(
-        t_starts, t_ends, sigmas, **rays, prefix_trans=prefix
+        t_starts, t_ends, sigmas, **BY_RAY, prefix_trans=prefix
     )
     torch.testing.assert_close(scaled[0], plain[0] * prefix)
     torch.testing.assert_close(scaled[1], plain[1] * prefix)
@@ -186,27 +184,25 @@ def test_prefix_transmittance_scales_weights():
 
 def test_visibility_is_two_comparisons():
     t_starts, t_ends, sigmas = random_samples()
-    rays = {"ray_indices": RAYS, "n_rays": N_RAYS}
-    _, trans, alphas = packed.render_weight_from_density(t_starts, t_ends, sigmas, **rays)
+    _, trans, alphas = packed.render_weight_from_density(t_starts, t_ends, sigmas, **BY_RAY)
     expected = (trans >= 0.5) & (alphas >= 0.4)
     limits = {"early_stop_eps": 0.5, "alpha_thre": 0.4}
-    by_density = packed.render_visibility_from_density(t_starts, t_ends, sigmas, **rays, **limits)
+    by_density = packed.render_visibility_from_density(t_starts, t_ends, sigmas, **BY_RAY, **limits)
     assert by_density.equal(expected)
-    assert packed.render_visibility_from_alpha(alphas, **rays, **limits).equal(expected)
+    assert packed.render_visibility_from_alpha(alphas, **BY_RAY, **limits).equal(expected)
 
 
 @pytest.mark.parametrize("dtype", [torch.bfloat16, torch.float16])
 def test_half_precision_is_taken_to_float32(dtype):
     t_starts, t_ends, sigmas = random_samples()
-    rays = {"ray_indices": RAYS, "n_rays": N_RAYS}
     with torch.autocast("cpu", dtype=torch.bfloat16):
         weights = packed.render_weight_from_density(
-            t_starts.float(), t_ends.float(), sigmas.to(dtype), **rays
+            t_starts.float(), t_ends.float(), sigmas.to(dtype), **BY_RAY
         )[0]
-        colors = packed.accumulate_along_rays(weights, torch.rand(10, 3).to(dtype), **rays)
-    exact = packed.render_weight_from_density(t_starts, t_ends, sigmas.to(dtype).double(), **rays)[
-        0
-    ]
+        colors = packed.accumulate_along_rays(weights, torch.rand(10, 3).to(dtype), **BY_RAY)
+    exact = packed.render_weight_from_density(
+        t_starts, t_ends, sigmas.to(dtype).double(), **BY_RAY
+    )[0]
     assert weights.dtype == colors.dtype == torch.float32
     torch.testing.assert_close(weights.double(), exact, rtol=1e-5, atol=1e-6)
 

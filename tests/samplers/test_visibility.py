@@ -7,9 +7,8 @@ import torch
 from samplers.analytic_occupancy import Balls, camera_rays
 
 from leco_plugin.samplers import packed
-from leco_plugin.samplers.base import densities_of_samples
+from leco_plugin.samplers.base import densities_of_samples, prune
 from leco_plugin.samplers.marching import March, Rays, march
-from leco_plugin.samplers.visibility import prune
 
 N_RAYS, STEP = 150, 0.01
 BALLS = Balls()

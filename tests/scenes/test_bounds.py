@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import pytest
 import torch
+from scene_files import refused
 from tiny_scene import camera_to_world
 from torch import Tensor
 
@@ -106,15 +107,15 @@ def test_one_camera_without_points_still_has_bounds() -> None:
 
 def test_no_cameras_and_broken_poses_are_refused() -> None:
     poses, directions, points = around()
-    with pytest.raises(ValueError, match="no cameras"):
+    with refused("no cameras"):
         find_bounds(poses[:0], directions[:0], points)
-    with pytest.raises(ValueError, match="not finite"):
+    with refused("not finite"):
         find_bounds(poses * float("nan"), directions, points)
 
 
 def test_points_that_no_camera_sees_are_refused() -> None:
     poses, directions, points = around()
-    with pytest.raises(ValueError, match="no camera sees"):
+    with refused("no camera sees"):
         find_bounds(poses, directions, points + torch.tensor([0.0, 0.0, 500.0]))
 
 
@@ -163,14 +164,13 @@ def test_altitudes_by_hand_cut_the_rays_with_points_and_without(with_points: boo
 def test_altitudes_that_are_no_range_of_these_cameras_are_refused(
     config: BoundsConfig, message: str
 ) -> None:
-    with pytest.raises(ValueError, match=message) as caught:
+    with refused(message):
         find_bounds(*from_above(), config)
-    assert "\n" not in str(caught.value)
 
 
 def test_a_box_without_points_asks_for_its_altitudes() -> None:
     poses, directions, _ = from_above()
-    with pytest.raises(ValueError, match=r"give bounds\.altitudes"):
+    with refused(r"give bounds\.altitudes"):
         find_bounds(poses, directions, None, BoundsConfig(space="box"))
     assert "give bounds.altitudes" in find_bounds(poses, directions, None).reason
 
@@ -184,5 +184,5 @@ def test_a_range_by_hand_replaces_what_was_found() -> None:
 
 @pytest.mark.parametrize(("near", "far"), [(0.0, 1.0), (2.0, 2.0), (1.0, float("inf"))])
 def test_a_range_by_hand_that_is_none_is_refused(near: float, far: float) -> None:
-    with pytest.raises(ValueError, match="0 < near < far"):
+    with refused("0 < near < far"):
         with_range(find_bounds(*from_above()), near, far)

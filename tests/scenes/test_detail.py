@@ -5,11 +5,11 @@ from __future__ import annotations
 import pytest
 import torch
 from nerfstudio.cameras.cameras import Cameras, CameraType
+from scene_files import refused
 from torch import Tensor
 
 from leco_plugin.scenes.bounds import BoundsConfig
 from leco_plugin.scenes.detail import detail_of
-from leco_plugin.scenes.input_error import InputError
 
 HEIGHT, SIDE, FOCAL = 2.0, 32, 32.0
 """Of the survey: a pixel's footprint is 1/16, an image's 2 x 2."""
@@ -105,9 +105,8 @@ def test_a_fisheye_is_looked_through_too() -> None:
 
 
 def test_what_nobody_sees_has_no_size() -> None:
-    with pytest.raises(InputError, match="no training cameras"):
+    with refused("no training cameras"):
         detail_of(survey(2.0)[torch.zeros(4, dtype=torch.bool)])
     behind = ground(2.0) + torch.tensor([0.0, 0.0, 10.0])
-    with pytest.raises(InputError, match="no camera sees") as caught:
+    with refused("no camera sees"):
         detail_of(survey(2.0), behind)
-    assert "\n" not in str(caught.value)

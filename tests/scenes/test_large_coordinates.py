@@ -35,7 +35,7 @@ from nerfstudio.data.utils.colmap_parsing_utils import (
     write_images_binary,
     write_points3D_binary,
 )
-from scipy.spatial.transform import Rotation
+from scene_files import IMAGES_STAY_OPEN, change, described, write_colmap, write_ply
 
 from leco_plugin.scenes.data_manager import LecoDataManagerConfig
 from leco_plugin.scenes.frames import data_frame_of, frame_of, inverse, moved
@@ -44,11 +44,7 @@ from leco_plugin.scenes.mega_nerf_format.files import Coordinates
 from leco_plugin.scenes.photographs import POINTS, LecoPhotographsDataParserConfig
 from leco_plugin.scenes.survey import points_in, survey
 
-# nerfstudio leaves images open that it has read
-pytestmark = [
-    pytest.mark.filterwarnings("ignore:unclosed file:ResourceWarning"),
-    pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning"),
-]
+pytestmark = IMAGES_STAY_OPEN
 
 UTM = np.array([500_000.25, 5_200_000.5, 300.0])
 SCALE = 20.0
@@ -56,34 +52,24 @@ APPLIED = np.array([[0.0, 1.0, 0.0, 3.0], [1.0, 0.0, 0.0, -2.0], [0.0, 0.0, -1.0
 SPARSE = np.random.default_rng(0).uniform([-1.5, -1.5, 0.0], [1.5, 1.5, 0.6], (60, 3))
 
 
-def description(scene: Path) -> dict[str, Any]:
-    meta: dict[str, Any] = json.loads((scene / "transforms.json").read_text())
-    return meta
-
-
-def write_ply(path: Path, points: np.ndarray) -> None:
-    axes = "".join(f"property double {axis}\n" for axis in "xyz")
-    rows = "".join(" ".join(f"{value:.9f}" for value in row) + "\n" for row in points)
-    path.write_text(
-        f"ply\nformat ascii 1.0\nelement vertex {len(points)}\n{axes}end_header\n{rows}"
-    )
-
-
 def as_nerfstudio(scene: Path, folder: Path, offset: np.ndarray) -> None:
     """The tiny scene in units of 1 / `SCALE`, moved, with sparse points."""
     shutil.copytree(scene, folder)
-    meta = description(scene)
-    for frame in meta["frames"]:
-        pose = np.array(frame["transform_matrix"])
-        pose[:3, 3] = SCALE * pose[:3, 3] + offset
-        frame["transform_matrix"] = pose.tolist()
     write_ply(folder / "points.ply", SCALE * SPARSE + offset)
-    (folder / "transforms.json").write_text(json.dumps(meta | {"ply_file_path": "points.ply"}))
+
+    def move(meta: dict[str, Any]) -> None:
+        meta["ply_file_path"] = "points.ply"
+        for frame in meta["frames"]:
+            pose = np.array(frame["transform_matrix"])
+            pose[:3, 3] = SCALE * pose[:3, 3] + offset
+            frame["transform_matrix"] = pose.tolist()
+
+    change(folder, move)
 
 
 def as_blender(scene: Path, folder: Path, offset: np.ndarray) -> None:
     as_nerfstudio(scene, folder, offset)
-    meta = description(folder)
+    meta = described(folder)
     for split in ("train", "val", "test"):
         names = meta[f"{split}_filenames"]
         frames = [frame for frame in meta["frames"] if frame["file_path"] in names]
@@ -94,22 +80,8 @@ def as_blender(scene: Path, folder: Path, offset: np.ndarray) -> None:
 
 def as_colmap(scene: Path, folder: Path, offset: np.ndarray) -> None:
     as_nerfstudio(scene, folder, offset)
-    model = folder / "sparse"
-    model.mkdir()
-    (model / "cameras.txt").write_text("1 PINHOLE 32 32 32 32 16 16\n")
-    lines = []
-    for number, frame in enumerate(description(folder)["frames"]):
-        pose = np.array(frame["transform_matrix"])[:3]
-        turn = (pose[:, :3] * [1.0, -1.0, -1.0]).T
-        x, y, z, w = Rotation.from_matrix(turn).as_quat()
-        values = " ".join(f"{value:.17g}" for value in (w, x, y, z, *(-turn @ pose[:, 3])))
-        lines.append(f"{number + 1} {values} 1 {Path(frame['file_path']).name}\n\n")
-    (model / "images.txt").write_text("".join(lines))
-    points = [
-        f"{number + 1} {' '.join(f'{value:.9f}' for value in point)} 9 9 9 0.5 1 0\n"
-        for number, point in enumerate(SCALE * SPARSE + offset)
-    ]
-    (model / "points3D.txt").write_text("".join(points))
+    lens = "PINHOLE 32 32 32 32 16 16"
+    write_colmap(folder, folder / "sparse", lens, SCALE * SPARSE + offset)
 
 
 def as_binary_colmap(scene: Path, folder: Path, offset: np.ndarray) -> None:
@@ -172,14 +144,23 @@ def exact(folder: Path) -> dict[str, np.ndarray]:
     """Positions of cameras by the names of their photographs, as the file has them."""
     return {
         Path(frame["file_path"]).stem: np.array(frame["transform_matrix"])[:3, 3]
-        for frame in description(folder)["frames"]
+        for frame in described(folder)["frames"]
     }
 
 
-def places_in_the_data(manager: Any, outputs: DataparserOutputs) -> tuple[np.ndarray, list[str]]:
+def in_the_data(manager: Any, positions: torch.Tensor) -> np.ndarray:
+    """Positions of a model as the data's own files have them."""
     back = inverse(torch.tensor(data_frame_of(manager), dtype=torch.float64))
-    places = outputs.cameras.camera_to_worlds[:, :3, 3].double()
-    return moved(places, back).numpy(), [path.stem for path in outputs.image_filenames]
+    return moved(positions.double(), back).numpy()
+
+
+def check_places(manager: Any, outputs: DataparserOutputs, folder: Path) -> np.ndarray:
+    """The cameras lead back to where the file has them, which is returned."""
+    known = exact(folder)
+    expected = np.array([known[path.stem] for path in outputs.image_filenames])
+    found = in_the_data(manager, outputs.cameras.camera_to_worlds[:, :3, 3])
+    np.testing.assert_allclose(found, expected, atol=2e-4, rtol=0)
+    return expected
 
 
 @pytest.mark.parametrize("reader", READERS)
@@ -188,20 +169,16 @@ def test_cameras_lead_back_to_the_data_in_every_split(
 ) -> None:
     """In float32 northings would be half a metre apart."""
     manager = managed(reader, tiny_scene, tmp_path / "far", UTM)
-    known = exact(tmp_path / "far")
     assert capsys.readouterr().out.count("coordinates are large") == 1
     for outputs in (
         manager.train_dataparser_outputs,
         manager.dataparser.get_dataparser_outputs(split="test"),
     ):
-        found, names = places_in_the_data(manager, outputs)
-        expected = np.array([known[name] for name in names])
-        np.testing.assert_allclose(found, expected, atol=2e-4, rtol=0)
+        check_places(manager, outputs, tmp_path / "far")
         assert float(outputs.cameras.camera_to_worlds[:, :3, 3].abs().max()) < 10 * SCALE
     points = points_in(manager.train_dataparser_outputs.metadata)
     if points is not None:
-        back = inverse(torch.tensor(data_frame_of(manager), dtype=torch.float64))
-        found = moved(points.double(), back).numpy()
+        found = in_the_data(manager, points)
         np.testing.assert_allclose(found, SCALE * SPARSE + UTM, atol=2e-4, rtol=0)
     assert (points is not None) == reader.startswith(("leco", "colmap"))
 
@@ -240,18 +217,13 @@ def test_a_scene_near_its_origin_is_read_as_nerfstudio_reads_it(
 def test_what_was_applied_to_a_file_is_undone_in_one_frame_and_kept_in_the_other(
     reader: str, scale: float, tiny_scene: Path, tmp_path: Path
 ) -> None:
-    def moved_and_said(scene: Path, folder: Path, offset: np.ndarray) -> None:
-        as_nerfstudio(scene, folder, offset)
-        said = {"applied_transform": APPLIED.tolist(), "applied_scale": scale}
-        (folder / "transforms.json").write_text(json.dumps(description(folder) | said))
-
     _, config, options = READERS[reader]
-    moved_and_said(tiny_scene, tmp_path / "far", UTM)
+    as_nerfstudio(tiny_scene, tmp_path / "far", UTM)
+    said = {"applied_transform": APPLIED.tolist(), "applied_scale": scale}
+    change(tmp_path / "far", lambda meta: meta.update(said))
     parser = config(data=tmp_path / "far", **options)
     manager: Any = LecoDataManagerConfig(dataparser=parser, images="memory").setup(device="cpu")
-    found, names = places_in_the_data(manager, manager.train_dataparser_outputs)
-    of_file = np.array([exact(tmp_path / "far")[name] for name in names])
-    np.testing.assert_allclose(found, of_file, atol=2e-4, rtol=0)
+    of_file = check_places(manager, manager.train_dataparser_outputs, tmp_path / "far")
     # as nerfstudio's own frame has it: the scale outside, the transform inside
     frame = np.array(frame_of(manager))
     places = manager.train_dataparser_outputs.cameras.camera_to_worlds[:, :3, 3].double().numpy()
@@ -293,9 +265,8 @@ def test_points_that_nerfstudio_reads_by_open3d_are_exact_too(
     if reader == "blender-data":
         more = {"ply_path": Path("points.ply"), "scale_factor": 0.25}
     manager = managed(reader, tiny_scene, tmp_path / "far", UTM, **more)
-    points = manager.train_dataparser_outputs.metadata["points3D_xyz"].double()
-    back = inverse(torch.tensor(data_frame_of(manager), dtype=torch.float64))
-    np.testing.assert_allclose(moved(points, back).numpy(), cloud.points, atol=2e-4, rtol=0)
+    points = in_the_data(manager, manager.train_dataparser_outputs.metadata["points3D_xyz"])
+    np.testing.assert_allclose(points, cloud.points, atol=2e-4, rtol=0)
 
 
 @pytest.mark.parametrize("reader", ["leco-photographs", "colmap"])
@@ -312,7 +283,7 @@ class Unhelped(DataParser):
     """A reader of another package that reads the file by itself, and says what it did."""
 
     def _generate_dataparser_outputs(self, split: str = "train", **kwargs: Any) -> Any:
-        frames = description(self.config.data)["frames"]
+        frames = described(self.config.data)["frames"]
         poses = np.array([frame["transform_matrix"] for frame in frames])[:, :3]
         cameras = torch.from_numpy(poses.astype(np.float32))
         middle = cameras[:, :, 3].mean(dim=0)
@@ -347,9 +318,7 @@ def test_our_reader_does_not_round_in_whatever_data_manager(
     as_nerfstudio(tiny_scene, tmp_path / "scene", UTM)
     parser = LecoPhotographsDataParserConfig(data=tmp_path / "scene")
     manager: Any = VanillaDataManagerConfig(dataparser=parser).setup(device="cpu")
-    found, names = places_in_the_data(manager, manager.train_dataparser_outputs)
-    expected = np.array([exact(tmp_path / "scene")[name] for name in names])
-    np.testing.assert_allclose(found, expected, atol=2e-4, rtol=0)
+    check_places(manager, manager.train_dataparser_outputs, tmp_path / "scene")
     assert not any("rounds" in line for line in survey(manager).lines())
 
 
@@ -372,7 +341,5 @@ def test_points_and_frame_of_mega_nerfs_format_keep_their_metres(
     places = outputs.cameras.camera_to_worlds[:, :, 3]
     torch.testing.assert_close(outputs.metadata[POINTS][trained], places, atol=1e-5, rtol=0)
     manager = SimpleNamespace(train_dataparser_outputs=outputs)
-    back = inverse(torch.tensor(data_frame_of(manager), dtype=torch.float64))
-    np.testing.assert_allclose(
-        moved(places.double(), back).numpy(), cameras[trained], atol=1e-3, rtol=0
-    )
+    found = in_the_data(manager, places)
+    np.testing.assert_allclose(found, cameras[trained], atol=1e-3, rtol=0)

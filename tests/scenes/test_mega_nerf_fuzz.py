@@ -14,7 +14,7 @@ import struct
 import sys
 import time
 import zipfile
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -23,12 +23,13 @@ import numpy as np
 import pytest
 import torch
 from damaged_bytes import cut, flip, splice
+from mega_nerf_scene import rebuilt, saved, zipped
 from PIL import Image
 
-from leco_plugin.scenes.derived_images import DerivedImages
 from leco_plugin.scenes.input_error import InputError
 from leco_plugin.scenes.mega_nerf_format.files import read_coordinates, read_frame
-from leco_plugin.scenes.mega_nerf_format.images import picture_of, read_mask
+from leco_plugin.scenes.mega_nerf_format.outputs import picture_of, read_mask
+from leco_plugin.scenes.photograph_files import DerivedImages
 
 SECONDS = 2.0
 MEGABYTES = 400.0
@@ -105,30 +106,9 @@ def test_flipped_cut_and_spliced_files(kind: str, scene: Path, reader: Reader) -
     assert reader.refused > 200
 
 
-def inside(data: bytes, change: Callable[[bytes], bytes], part: str = "data.pkl") -> bytes:
-    """The archive with one of its records changed, and right in all else."""
-    file = io.BytesIO()
-    with zipfile.ZipFile(io.BytesIO(data)) as source, zipfile.ZipFile(file, "w") as target:
-        for entry in source.infolist():
-            record = source.read(entry)
-            target.writestr(
-                entry.filename, change(record) if entry.filename.endswith(part) else record
-            )
-    return file.getvalue()
-
-
 def packed(data: bytes) -> bytes:
     """A .pt in a mask's zip."""
-    file = io.BytesIO()
-    with zipfile.ZipFile(file, "w", zipfile.ZIP_DEFLATED) as archive:
-        archive.writestr("000003.pt", data)
-    return file.getvalue()
-
-
-def saved(value: object, **options: Any) -> bytes:
-    file = io.BytesIO()
-    torch.save(value, file, **options)
-    return file.getvalue()
+    return zipped(data, "000003.pt", zipfile.ZIP_DEFLATED)
 
 
 def test_archives_that_are_whole_with_pickles_that_are_not(scene: Path, reader: Reader) -> None:
@@ -142,17 +122,13 @@ def test_archives_that_are_whole_with_pickles_that_are_not(scene: Path, reader: 
         if random.random() < 0.4:  # a number of one byte becomes a large one of four
             places = [i for i in range(len(pickled) - 1) if pickled[i : i + 1] == b"K"]
             place = places[random.integers(len(places))]
-            return (
-                pickled[:place]
-                + b"J"
-                + numbers[random.integers(len(numbers))]
-                + pickled[place + 2 :]
-            )
+            large = b"J" + numbers[random.integers(len(numbers))]
+            return pickled[:place] + large + pickled[place + 2 :]
         return way(pickled, random)
 
     for number in range(450):
         kind = ("coordinates", "metadata", "mask")[number % 3]
-        data = inside(mask if kind == "mask" else files[kind], spoil)
+        data = rebuilt(mask if kind == "mask" else files[kind], spoil)
         reader(kind, packed(data) if kind == "mask" else data)
     assert reader.refused > 400
 
@@ -260,9 +236,9 @@ def wrapped(gadget: Gadget) -> Iterator[tuple[str, bytes]]:
             yield from (("mask", packed(data)), ("mask", data))
         whole = saved({"H": 1})
         yield "metadata", bare
-        yield "metadata", inside(whole, lambda _, bare=bare: bare)
-        yield "metadata", inside(whole, lambda old, bare=bare: old[:-1] + bare)
-        yield "metadata", inside(whole, lambda _, bare=bare: bare, "version")
+        yield "metadata", rebuilt(whole, lambda _, bare=bare: bare)
+        yield "metadata", rebuilt(whole, lambda old, bare=bare: old[:-1] + bare)
+        yield "metadata", rebuilt(whole, lambda _, bare=bare: bare, "version")
         yield "mask", packed(bare)
     yield "metadata", saved({"H": gadget}, _use_new_zipfile_serialization=False)
 
@@ -284,24 +260,19 @@ def test_nothing_that_a_file_brings_is_run(reader: Reader, tmp_path: Path) -> No
             runs += 1
     by_hand = f"(S'touch {marker}'\nios\nsystem\n.", f"cos\nsystem\n(S'touch {marker}'\ntR."
     for text in by_hand:
-        reader("metadata", inside(saved({"H": 1}), lambda _, text=text: text.encode()))
+        reader("metadata", rebuilt(saved({"H": 1}), lambda _, text=text: text.encode()))
     assert not marker.exists()
     assert runs == 4 and files > 300
     assert reader.read == 0
 
 
 def test_bombs_and_vast_claims(scene: Path, reader: Reader) -> None:
-    def bomb(name: str, compression: int, megabytes: int) -> bytes:
-        file = io.BytesIO()
-        with zipfile.ZipFile(file, "w", compression) as archive:
-            archive.writestr(name, bytes(megabytes << 20))
-        return file.getvalue()
-
     for way, size in ((zipfile.ZIP_DEFLATED, 80), (zipfile.ZIP_BZIP2, 2), (zipfile.ZIP_LZMA, 2)):
-        reader("mask", bomb("000003.pt", way, size))
+        reader("mask", zipped(bytes(size << 20), "000003.pt", way))
         for name in ("archive/data.pkl", "archive/data/0"):
-            reader("metadata", bomb(name, way, size))
-            reader("mask", packed(bomb(name, way, size)))
+            bomb = zipped(bytes(size << 20), name, way)
+            reader("metadata", bomb)
+            reader("mask", packed(bomb))
     many = io.BytesIO()
     with zipfile.ZipFile(many, "w") as archive:
         for number in range(5000):

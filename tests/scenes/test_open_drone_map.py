@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 from nerfstudio.process_data.odm_utils import cameras2nerfds
+from scene_files import change, leaves_images_open
 
 from leco_plugin.scenes.city.cameras import look_at
 from leco_plugin.scenes.data_manager import LecoDataManagerConfig
@@ -58,12 +59,9 @@ def scene(tiny_scene: Path, tmp_path: Path) -> Path:
     return out
 
 
-# nerfstudio leaves images open that it has read
-@pytest.mark.filterwarnings("ignore:unclosed file:ResourceWarning")
-@pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
+@leaves_images_open
 def test_a_project_is_a_bounded_survey_in_metres(scene: Path) -> None:
-    described = json.loads((scene / "transforms.json").read_text())
-    (scene / "transforms.json").write_text(json.dumps(described | {"metres_per_unit": 1}))
+    change(scene, lambda meta: meta.update(metres_per_unit=1))
     parser = LecoPhotographsDataParserConfig(data=scene, train_split_fraction=0.7)
     manager: Any = LecoDataManagerConfig(dataparser=parser).setup(device="cpu")
     assert bool((manager.train_dataset.cameras.camera_to_worlds[:, 2, 2] > 0.9).all())

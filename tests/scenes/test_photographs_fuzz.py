@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import shutil
 import struct
 import time
 from collections.abc import Callable
@@ -34,11 +33,6 @@ def read(path: Path, data: bytes, reader: Callable[[Path], Any]) -> bool:
         accepted = False
     assert time.thread_time() - began < SECONDS, data[:2000]
     return accepted
-
-
-@pytest.fixture
-def scene(tiny_scene: Path, tmp_path: Path) -> Path:
-    return shutil.copytree(tiny_scene, tmp_path / "scene")
 
 
 def test_flipped_cut_and_spliced_descriptions(scene: Path) -> None:

@@ -2,16 +2,14 @@
 
 from __future__ import annotations
 
-import json
-import shutil
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 import torch
-import trimesh
 from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataParserConfig
+from scene_files import change, described, leaves_images_open, write_ply
 from torch import Tensor
 
 from leco_plugin.scenes.city.cameras import look_at
@@ -103,11 +101,8 @@ def test_photographs_of_other_things_stay_as_they_are() -> None:
     at_eye_level = around(24, 0.05), ground(0.4)
     wall = SIDEWAYS @ flight(3, 1), ground() @ SIDEWAYS.T
     few_steps = wall[0].clone()
-    few_steps[:, :, 3] -= (
-        0.8
-        * (few_steps[:, :, 3] - few_steps[:, :, 3].mean(dim=0))
-        * (torch.tensor([1.0, 0.0, 1.0]))
-    )
+    places = few_steps[:, :, 3] - few_steps[:, :, 3].mean(dim=0)
+    few_steps[:, :, 3] -= 0.8 * places * torch.tensor([1.0, 0.0, 1.0])
     street = torch.stack([flight(89, 8)[n] for n in range(25)]), ground(0.02)
     for poses, points in (at_eye_level, (few_steps, wall[1]), street):
         assert turn_to_upright(poses, points) is None
@@ -117,7 +112,7 @@ def test_photographs_of_other_things_stay_as_they_are() -> None:
 @pytest.mark.scenes
 @pytest.mark.parametrize("name", ["brighton_beach", "caliterra", "banana", "fox"])
 def test_real_surveys_are_set_upright_and_a_statue_is_not(name: str, scenes: Path) -> None:
-    meta = json.loads((scenes / name / "transforms.json").read_text())
+    meta = described(scenes / name)
     poses = torch.tensor([frame["transform_matrix"] for frame in meta["frames"]])[:, :3]
     points = read_ply(scenes / name / meta["ply_file_path"])
     assert turn_to_upright(poses, points) is None
@@ -128,17 +123,17 @@ def test_real_surveys_are_set_upright_and_a_statue_is_not(name: str, scenes: Pat
 
 
 @pytest.fixture
-def colmap_scene(tiny_scene: Path, tmp_path: Path) -> Path:
+def colmap_scene(scene: Path) -> Path:
     """A survey in the coordinates that structure from motion and nerfstudio leave it in."""
-    scene = shutil.copytree(tiny_scene, tmp_path / "scene")
-    meta = json.loads((scene / "transforms.json").read_text())
-    poses = SIDEWAYS @ flight(3, 2, rows=3)
-    for frame, pose in zip(meta["frames"], poses):
-        frame["transform_matrix"] = [*pose.tolist(), [0.0, 0.0, 0.0, 1.0]]
-    meta.pop("orientation_override", None)
-    meta["ply_file_path"] = "points.ply"
-    trimesh.PointCloud((ground() @ SIDEWAYS.T).numpy()).export(scene / "points.ply")
-    (scene / "transforms.json").write_text(json.dumps(meta))
+
+    def lay_down(meta: dict[str, Any]) -> None:
+        for frame, pose in zip(meta["frames"], SIDEWAYS @ flight(3, 2, rows=3)):
+            frame["transform_matrix"] = [*pose.tolist(), [0.0, 0.0, 0.0, 1.0]]
+        meta.pop("orientation_override", None)
+        meta["ply_file_path"] = "points.ply"
+
+    change(scene, lay_down)
+    write_ply(scene / "points.ply", (ground() @ SIDEWAYS.T).numpy())
     return scene
 
 
@@ -148,8 +143,7 @@ READERS: dict[str, Any] = {
 }
 
 
-@pytest.mark.filterwarnings("ignore:unclosed file:ResourceWarning")
-@pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
+@leaves_images_open
 @pytest.mark.parametrize("reader", READERS)
 def test_a_survey_from_structure_from_motion_is_bounded_whatever_reads_it(
     reader: str, colmap_scene: Path
@@ -168,8 +162,7 @@ def test_a_survey_from_structure_from_motion_is_bounded_whatever_reads_it(
 
 def _leads_back(outputs: Any, scene: Path) -> None:
     """What the outputs say they did takes the file's cameras to the model's."""
-    meta = json.loads((scene / "transforms.json").read_text())
-    frames = {frame["file_path"]: frame["transform_matrix"] for frame in meta["frames"]}
+    frames = {f["file_path"]: f["transform_matrix"] for f in described(scene)["frames"]}
     transform, scale = outputs.dataparser_transform.double(), outputs.dataparser_scale
     for path, camera in zip(outputs.image_filenames, outputs.cameras.camera_to_worlds):
         pose = torch.tensor(frames[f"images/{path.name}"], dtype=torch.float64)
@@ -179,16 +172,14 @@ def _leads_back(outputs: Any, scene: Path) -> None:
         torch.testing.assert_close(turned, camera[:, :3], atol=1e-5, rtol=0)
 
 
-@pytest.mark.filterwarnings("ignore:unclosed file:ResourceWarning")
-@pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
+@leaves_images_open
 def test_it_is_left_on_its_side_where_that_is_asked_for(colmap_scene: Path) -> None:
     parser = LecoPhotographsDataParserConfig(data=colmap_scene)
     manager: Any = LecoDataManagerConfig(dataparser=parser, upright=False).setup(device="cpu")
     assert not bool((manager.train_dataset.cameras.camera_to_worlds[:, 2, 2] > 0.9).any())
 
 
-@pytest.mark.filterwarnings("ignore:unclosed file:ResourceWarning")
-@pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
+@leaves_images_open
 def test_all_splits_are_turned_by_the_training_cameras(colmap_scene: Path) -> None:
     parser = LecoPhotographsDataParserConfig(data=colmap_scene).setup()
     read = upright_outputs(parser.get_dataparser_outputs)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
 
 import pytest
 from stability_runs import Runs
@@ -17,12 +16,7 @@ from leco_plugin.studio.run_folder import alone_in
 def runs(monkeypatch: pytest.MonkeyPatch) -> Runs:
     """What stands in for the processes of all runs."""
     made = Runs()
-    with_processes = suite.make_table
-
-    def make_table(*args: Any, **kwargs: Any) -> dict[str, Any]:
-        return with_processes(*args, **kwargs, runner_for=made)
-
-    monkeypatch.setattr(suite, "make_table", make_table)
+    monkeypatch.setattr(suite.Suite, "runner", lambda self, scene: made(scene))
     return made
 
 

@@ -11,8 +11,8 @@ import pytest
 from PIL import Image
 
 from leco_plugin.scenes.city.cameras import Lens, look_at
+from leco_plugin.scenes.frames import distance_from_rotations
 from leco_plugin.scenes.photographs import check_scene, read_points
-from leco_plugin.scenes.rotations import distance_from_rotations
 from leco_plugin.stability.photographs import (
     TRUTH,
     Capture,

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -14,6 +13,7 @@ import yaml
 from nerfstudio.pipelines.base_pipeline import VanillaPipelineConfig
 from nerfstudio.pipelines.dynamic_batch import DynamicBatchPipeline, DynamicBatchPipelineConfig
 from nerfstudio.utils import writer
+from tiny_scene import IMAGES_LEFT_OPEN
 
 from leco_plugin.host_configs import leco_ngp
 from leco_plugin.models.encodings import EncodingConfig
@@ -28,26 +28,17 @@ from leco_plugin.studio.dynamic_batch import (
     clamped,
 )
 
-pytestmark = [  # nerfstudio leaves an image open
-    pytest.mark.filterwarnings("ignore:unclosed file:ResourceWarning"),
-    pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning"),
-]
+pytestmark = IMAGES_LEFT_OPEN
 
 TARGET, MOST_PER_RAY = 2048, 32
 FIRST = TARGET // MOST_PER_RAY
 
 
 @pytest.fixture(autouse=True)
-def _alone(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
-    """Without a cell cache, which takes seconds, and without what other trainers have to write."""
-
-    def refuse(*_: object, **__: object) -> None:
-        raise ValueError("no cache in this test")
-
-    monkeypatch.setattr("leco_plugin.samplers.estimator.build_cache", refuse)
+def _alone(without_cache: None, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Without what other trainers have to write."""
     monkeypatch.setattr(writer, "GLOBAL_BUFFER", {})
     monkeypatch.setattr(writer, "EVENT_WRITERS", [])
-    yield
 
 
 def occupancy(threshold: float, kind: SpaceKind = "contraction") -> Occupancy:
@@ -97,29 +88,24 @@ def rays_after(pipeline: ClampedDynamicBatchPipeline, rays: int, samples: int) -
     return pipeline.dynamic_num_rays_per_batch
 
 
-def test_the_batch_follows_the_samples_that_rays_have(
-    pipeline: ClampedDynamicBatchPipeline,
+@pytest.mark.parametrize(
+    ("rays", "samples", "then"),
+    [
+        pytest.param(100, TARGET, 100, id="as many samples as wanted"),
+        pytest.param(100, 4 * TARGET, 25, id="too many"),
+        pytest.param(100, round(TARGET / 1.5), 150, id="too few"),
+        pytest.param(100, 2, 200, id="at most doubled"),
+        pytest.param(100, TARGET // 3, 200, id="at most doubled, of more"),
+        pytest.param(400, 2, 512, id="not above the upper bound"),
+        pytest.param(100, 100 * TARGET, 16, id="not below the lower bound"),
+        pytest.param(100, 0, 100, id="no samples say nothing"),
+        pytest.param(100, 1, 100, id="nor does the one of an empty batch"),
+    ],
+)
+def test_the_batch_follows_the_samples_that_rays_have_within_bounds(
+    pipeline: ClampedDynamicBatchPipeline, rays: int, samples: int, then: int
 ) -> None:
-    assert rays_after(pipeline, 100, TARGET) == 100
-    assert rays_after(pipeline, 100, 4 * TARGET) == 25
-    assert rays_after(pipeline, 100, round(TARGET / 1.5)) == 150
-
-
-def test_it_never_more_than_doubles(pipeline: ClampedDynamicBatchPipeline) -> None:
-    assert rays_after(pipeline, 100, 2) == 200
-    assert rays_after(pipeline, 100, TARGET // 3) == 200
-
-
-def test_it_stays_within_its_bounds(pipeline: ClampedDynamicBatchPipeline) -> None:
-    assert rays_after(pipeline, 400, 2) == 512
-    assert rays_after(pipeline, 100, 100 * TARGET) == 16
-
-
-@pytest.mark.parametrize("samples", [0, 1])
-def test_a_batch_without_samples_changes_nothing(
-    pipeline: ClampedDynamicBatchPipeline, samples: int
-) -> None:
-    assert rays_after(pipeline, 100, samples) == 100
+    assert rays_after(pipeline, rays, samples) == then
 
 
 def test_a_first_batch_beyond_the_bounds_is_brought_within(

@@ -10,15 +10,13 @@ from typing import Any
 import pytest
 from nerfstudio.utils import eval_utils, writer
 from tiny_run import tiny_trainer
+from tiny_scene import IMAGES_LEFT_OPEN
 
 from leco_plugin.method_configs import leco_occupancy
 from leco_plugin.scenes.input_error import InputError
 from leco_plugin.studio.checkpoints import config_in_use, found_around
 
-pytestmark = [  # nerfstudio leaves an image open
-    pytest.mark.filterwarnings("ignore:unclosed file:ResourceWarning"),
-    pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning"),
-]
+pytestmark = IMAGES_LEFT_OPEN
 
 
 @pytest.fixture(scope="module")

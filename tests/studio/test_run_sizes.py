@@ -13,6 +13,7 @@ import pytest
 import torch
 import yaml
 from nerfstudio.utils.eval_utils import eval_setup
+from tiny_scene import IMAGES_LEFT_OPEN
 
 from leco_plugin.learning.calibration import CalibrationConfig
 from leco_plugin.learning.schedule import ScheduleConfig
@@ -22,11 +23,7 @@ from leco_plugin.scenes.detail import CAMERAS
 from leco_plugin.scenes.input_error import InputError
 from leco_plugin.studio.run_folder import checkpoint_of
 
-# nerfstudio leaves images open that it has read
-pytestmark = [
-    pytest.mark.filterwarnings("ignore:unclosed file:ResourceWarning"),
-    pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning"),
-]
+pytestmark = IMAGES_LEFT_OPEN
 
 STEPS = 2
 

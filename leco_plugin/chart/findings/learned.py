@@ -3,47 +3,66 @@
 from __future__ import annotations
 
 import statistics
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Sequence
+from functools import cached_property
 from typing import Any
 
-from leco_plugin.chart.findings.summary import Line, figure_in
+from leco_plugin.chart.findings.summary import Line, figure_in, middle_of
 
 OURS = "(ours)"
 """Marks the contender that a suite asks about."""
-KEPT = "at_equal_loss.kept_reached_volume"
+KEPT_WHEN_FROZEN = "at_equal_loss.kept_reached_volume"
 """Share of the volume reached by rays that a gate keeps at equal loss."""
 AT_THE_END = 0.99
 """Share of the training time; a gate that is frozen later has guided nothing."""
 
 
-@dataclass(frozen=True)
-class Learned:
-    """The occupancies of one contender."""
+class Learned(Line):
+    """A contender that learns an occupancy with a gate."""
 
-    name: str
-    facts: tuple[Mapping[str, Any], ...]
-    """Of each seed with a frozen gate, as it was frozen: as a run's `occupancy`, and its `seed`."""
-    seeds: int
-    psnrs: Mapping[int, float]
-    """Of each seed, dB."""
-    healed: int | None
-    """How often a collapsed gate was, in all seeds together; None where runs did not note it."""
+    @cached_property
+    def facts(self) -> list[dict[str, Any]]:
+        """Of each seed with a frozen gate, as it was frozen: as a run's `occupancy`, its `seed`,
+        and whether training ended then."""
+        return [
+            {
+                **run["occupancy"],
+                **(run.get("at_freezing") or {}),
+                "at_end": run["occupancy"],
+                "seed": run["seed"],
+                "at_the_end": run["freeze_seconds"] >= AT_THE_END * run["train_seconds"],
+            }
+            for run in self.runs
+            if run.get("occupancy") and run.get("freeze_seconds") is not None
+        ]
 
-    def median(self, name: str) -> float | None:
-        """A figure over the seeds that have one, a dot into their facts; None where none has."""
+    @property
+    def seeds(self) -> int:
+        """How many there are, with a frozen gate or without."""
+        return len(self.runs)
+
+    @property
+    def healed(self) -> int | None:
+        """How often a collapsed gate was, in all seeds; None where runs did not note it."""
+        stored = "occupancy.recoveries"
+        counts = [run.get("recoveries", figure_in(run, stored)) for run in self.runs]
+        total = middle_of(counts, sum)
+        return None if total is None else int(total)
+
+    def figure(self, name: str) -> float | None:
+        """Median over the seeds that have it, a dot into their facts; None where none has."""
         values = [value for facts in self.facts if (value := figure_in(facts, name)) is not None]
         return statistics.median(values) if values else None
 
-    @property
-    def psnr(self) -> float:
-        """Mean over seeds, dB."""
-        return statistics.fmean(self.psnrs.values())
+    @cached_property
+    def psnr_by_seed(self) -> dict[int, float]:
+        """dB."""
+        return {run["seed"]: run["psnr"] for run in self.runs}
 
-    @property
+    @cached_property
     def kept_by_seed(self) -> dict[int, float]:
         """Percent of the space, of each seed of which it was measured."""
-        found = {facts["seed"]: figure_in(facts, KEPT) for facts in self.facts}
+        found = {facts["seed"]: figure_in(facts, KEPT_WHEN_FROZEN) for facts in self.facts}
         return {seed: 100.0 * share for seed, share in found.items() if share is not None}
 
     @property
@@ -65,31 +84,10 @@ class Learned:
 def learned_of(lines: Sequence[Line]) -> list[Learned]:
     """Of each contender that learns an occupancy with a gate, whether it was ever frozen or not;
     none where nothing was."""
-    found = [_learned(line) for line in lines if line.learned]
-    return found if any(one.facts for one in found) else []
-
-
-def _learned(line: Line) -> Learned:
-    facts = [
-        {
-            **run["occupancy"],
-            **(run.get("at_freezing") or {}),
-            "at_end": run["occupancy"],
-            "seed": run["seed"],
-            "at_the_end": run["freeze_seconds"] >= AT_THE_END * run["train_seconds"],
-        }
-        for run in line.runs
-        if run.get("occupancy") and run.get("freeze_seconds") is not None
+    found = [
+        Learned(line.name, line.method, line.sampler, line.runs) for line in lines if line.learned
     ]
-    healed = [run.get("recoveries", figure_in(run, "occupancy.recoveries")) for run in line.runs]
-    known = [int(count) for count in healed if count is not None]
-    return Learned(
-        line.name,
-        tuple(facts),
-        len(line.runs),
-        {run["seed"]: run["psnr"] for run in line.runs},
-        sum(known) if len(known) == len(line.runs) else None,
-    )
+    return found if any(one.facts for one in found) else []
 
 
 def learned_headline(learned: Sequence[Learned]) -> str:
@@ -140,7 +138,7 @@ def level_with(one: Learned, others: Sequence[Learned]) -> list[Learned]:
 
 
 def _is_level(one: Learned, other: Learned) -> bool:
-    pairs = (one.kept_by_seed, other.kept_by_seed), (one.psnrs, other.psnrs)
+    pairs = (one.kept_by_seed, other.kept_by_seed), (one.psnr_by_seed, other.psnr_by_seed)
     return all(
         min(mine.values()) <= max(theirs.values()) and min(theirs.values()) <= max(mine.values())
         for mine, theirs in pairs
@@ -151,7 +149,7 @@ def _is_better(one: Learned, other: Learned) -> bool:
     """Whether one keeps less space at more PSNR with every seed."""
     theirs = other.kept_by_seed
     return all(
-        kept < theirs.get(seed, 0.0) and one.psnrs[seed] > other.psnrs[seed]
+        kept < theirs.get(seed, 0.0) and one.psnr_by_seed[seed] > other.psnr_by_seed[seed]
         for seed, kept in one.kept_by_seed.items()
     )
 

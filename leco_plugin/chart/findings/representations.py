@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import statistics
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from functools import partial
 from typing import Any, NamedTuple
 
 from leco_plugin.chart.contender import LEARNED
@@ -21,6 +20,10 @@ COSTS = {"size": "size", "learning time": "learn_seconds"}
 """The costs that fronts are of, and the figure of each in `Held`."""
 CHEAPEST = {"size": "smallest", "learning time": "soonest learned"}
 """Words for the one that costs least."""
+
+
+_What = tuple[str, bool, str | None]
+"""Name, whether it is ours, and kind of a representation."""
 
 
 class Held(NamedTuple):
@@ -76,16 +79,20 @@ class Representation:
     def leads(self, other: Representation, figure: str) -> bool:
         """Whether it keeps no more at no more cost, and is better in one of the two: medians."""
         mine, theirs = ((one.median(figure), one.kept) for one in (self, other))
-        return mine != theirs and all(a <= b for a, b in zip(mine, theirs))
+        return _is_ahead([(mine, theirs)])
 
     def leads_always(self, other: Representation, figure: str) -> bool:
         """Whether the same holds in each seed that both have."""
-        shared = [
-            (held, other.by_seed[s]) for s, held in self.by_seed.items() if s in other.by_seed
-        ]
-        pairs = [((getattr(a, figure), a.kept), (getattr(b, figure), b.kept)) for a, b in shared]
-        never_worse = all(a <= b for mine, theirs in pairs for a, b in zip(mine, theirs))
-        return never_worse and any(mine != theirs for mine, theirs in pairs)
+        shared = [(self.by_seed[s], other.by_seed[s]) for s in self.by_seed if s in other.by_seed]
+        return _is_ahead(
+            [((getattr(a, figure), a.kept), (getattr(b, figure), b.kept)) for a, b in shared]
+        )
+
+
+def _is_ahead(pairs: Sequence[tuple[tuple[float, float], tuple[float, float]]]) -> bool:
+    """Whether the first of each pair of costs is never above the second, and once below it."""
+    never_worse = all(a <= b for mine, theirs in pairs for a, b in zip(mine, theirs))
+    return never_worse and any(mine != theirs for mine, theirs in pairs)
 
 
 def representations_of(lines: Sequence[Line]) -> list[Representation]:
@@ -94,71 +101,49 @@ def representations_of(lines: Sequence[Line]) -> list[Representation]:
     Empty where all are gates of one kind: then the chart compares something else.
     """
     found: list[Representation] = []
-    kinds: set[str] = set()
+    gates: set[str] = set()
     for line in lines:
-        ours = line.sampler == LEARNED
-        gate = _in_every_run(line, _gate_of)
-        if not gate:
-            continue
-        found.append(Representation(line.name, gate, ours))
-        kinds.add(line.sampler)
-        found += _taught_by(line, ours)
-        made = {str(grid["resolution"]) for run in line.runs for grid in _measured(run)["grids"]}
-        for resolution in sorted(made, key=lambda one: (len(one), one)):
-            if grids := _in_every_run(line, partial(_grid_of, resolution)):
-                found.append(Representation(f"grid {resolution}³", grids))
-                kinds.add("grid")
-    return found if len(kinds) > 1 else []
-
-
-def _in_every_run(line: Line, find: Callable[[Mapping[str, Any]], Held | None]) -> dict[int, Held]:
-    """What is found in each run, by seed; empty where one run lacks it."""
-    found = {run["seed"]: held for run in line.runs if (held := find(run)) is not None}
-    return found if len(found) == len(line.runs) else {}
+        runs = {run["seed"]: _held_in(run, line) for run in line.runs}
+        for name, ours, kind in next(iter(runs.values())):
+            what = name, ours, kind
+            if all(what in held for held in runs.values()):
+                by_seed = {seed: held[what] for seed, held in runs.items()}
+                found.append(Representation(name, by_seed, ours, kind))
+                gates.add(line.sampler)
+    return found if len(gates) > 1 or any(one.is_grid for one in found) else []
 
 
 def never_held_of(lines: Sequence[Line]) -> list[str]:
     """Contenders whose gate was not frozen and measured in every run, and is left out."""
-    return [line.name for line in lines if line.learned and not _in_every_run(line, _gate_of)]
+    return [
+        line.name
+        for line in lines
+        if line.learned and not all(_held_in(run, line) for run in line.runs)
+    ]
 
 
-def _measured(run: Mapping[str, Any]) -> Mapping[str, Any]:
-    found: Mapping[str, Any] = run["occupancy"]["at_equal_loss"]
+def _held_in(run: Mapping[str, Any], line: Line) -> dict[_What, Held]:
+    """Its gate, small gates that its field has taught, and grids by size; nothing where its gate
+    was not measured."""
+    seconds, kept = (cost.of(run) for cost in (LEARNING, KEPT))
+    if seconds is None or kept is None:
+        return {}
+    ours, occupancy = line.sampler == LEARNED, run["occupancy"]
+    size = BYTES_A_NUMBER * occupancy["params"] / 1e3
+    found: dict[_What, Held] = {(line.name, ours, None): Held(size, seconds, kept)}
+    for row in occupancy["at_equal_loss"].get("taught", ()):
+        is_ours = ours and row["name"] == OUR_KIND
+        name = SMALL_OURS if is_ours else f"small {row['name']}"
+        learned_in = seconds + row["seconds"]
+        found[name, is_ours, row["name"]] = _made_of_field(row, row["seconds"], learned_in)
+    for row in sorted(occupancy["at_equal_loss"]["grids"], key=lambda row: row["resolution"]):
+        name = f"grid {row['resolution']}³"
+        found[name, False, None] = _made_of_field(row, row["update_seconds"], None)
     return found
 
 
-def _gate_of(run: Mapping[str, Any]) -> Held | None:
-    seconds, kept = (cost.of(run) for cost in (LEARNING, KEPT))
-    if seconds is None or kept is None:
-        return None
-    return Held(BYTES_A_NUMBER * run["occupancy"]["params"] / 1e3, seconds, kept)
-
-
-def _taught_gate_of(name: str, run: Mapping[str, Any]) -> Held | None:
-    for row in _measured(run).get("taught", ()):
-        if row["name"] == name:
-            seconds = row["seconds"]
-            kept = 100.0 * row["kept_reached_volume"]
-            return Held(row["bytes"] / 1e3, run["learn_seconds"] + seconds, kept, seconds)
-    return None
-
-
-def _grid_of(resolution: str, run: Mapping[str, Any]) -> Held | None:
-    for grid in _measured(run)["grids"]:
-        if str(grid["resolution"]) == resolution:
-            kept = 100.0 * grid["kept_reached_volume"]
-            return Held(grid["bytes"] / 1e3, None, kept, grid["update_seconds"])
-    return None
-
-
-def _taught_by(line: Line, ours: bool) -> Iterator[Representation]:
-    """The small gates that the field of a line has taught in every run."""
-    kinds = (row["name"] for run in line.runs for row in _measured(run).get("taught", ()))
-    for kind in dict.fromkeys(kinds):
-        if held := _in_every_run(line, partial(_taught_gate_of, kind)):
-            is_ours = ours and kind == OUR_KIND
-            name = SMALL_OURS if is_ours else f"small {kind}"
-            yield Representation(name, held, is_ours, kind)
+def _made_of_field(row: Mapping[str, Any], beyond: float, learned_in: float | None) -> Held:
+    return Held(row["bytes"] / 1e3, learned_in, 100.0 * row["kept_reached_volume"], beyond)
 
 
 def fronts_of(one: Representation, all_of_them: Sequence[Representation]) -> list[str]:

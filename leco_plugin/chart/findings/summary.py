@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import statistics
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from leco_plugin.chart.contender import shared_method, short_names
+from leco_plugin.chart.protocol import Protocol
 
 LOST_SURFACE_MASS = 1e-3
 """Loss at which `evaluation.equal_loss` compares occupancies."""
@@ -46,6 +47,14 @@ def figure_in(values: Any, key: str) -> float | None:
     for name in key.split("."):
         values = values.get(name) if isinstance(values, Mapping) else None
     return None if values is None else float(values)
+
+
+def middle_of(
+    values: Sequence[float | None], middle: Callable[[Sequence[float]], float] = statistics.median
+) -> float | None:
+    """Median, or another middle, of values of several seeds; None where a seed has none."""
+    known = [value for value in values if value is not None]
+    return middle(known) if len(known) == len(values) else None
 
 
 RENDERING = Cost("render_seconds_per_image", "rendering an image", "s")
@@ -96,13 +105,11 @@ class Line:
 
     def mean(self, key: str) -> float | None:
         """Mean over seeds of a figure of quality; None where a seed has none."""
-        values = [run.get(key) for run in self.runs]
-        return None if None in values else statistics.fmean(v for v in values if v is not None)
+        return middle_of([run.get(key) for run in self.runs], statistics.fmean)
 
     def median(self, cost: Cost) -> float | None:
         """Median over seeds of a cost; None where a seed has none."""
-        values = [cost.of(run) for run in self.runs]
-        return None if None in values else statistics.median(v for v in values if v is not None)
+        return middle_of([cost.of(run) for run in self.runs])
 
     def curve(self) -> tuple[NDArray[np.float64], ...]:
         """Mean seconds [T], and mean, lowest and highest PSNR [T] over seeds at equal shares of
@@ -117,8 +124,7 @@ class Line:
 
     def seconds_to(self, psnr: float) -> float | None:
         """When its runs reach a PSNR to stay, median over seeds; None if one of them does not."""
-        found = [seconds_to_pass(run["curve"], psnr) for run in self.runs]
-        return None if None in found else statistics.median(s for s in found if s is not None)
+        return middle_of([seconds_to_pass(run["curve"], psnr) for run in self.runs])
 
 
 def seconds_to_pass(curve: Sequence[Sequence[float]], psnr: float) -> float | None:
@@ -193,18 +199,14 @@ def circumstances(results: Mapping[str, Any]) -> str:
     where = (
         f"{machine['cores']} CPU cores" if machine["device"] == "cpu" else str(machine["device"])
     )
-    parts = []
-    if protocol["seconds"] is not None:
-        parts.append(f"{protocol['seconds']:g} s")
-    if protocol["steps"] is not None:
-        parts.append(f"{protocol['steps']} steps")
+    length = Protocol(protocol["seconds"], protocol["steps"]).describe()
     if (at_once := protocol.get("at_once", 1)) > 1:
         where += f", {at_once} runs at a time"
     seeds = len({run["seed"] for run in results["runs"]})
     many = "one seed" if seeds == 1 else f"{seeds} seeds: means of PSNR, medians of costs"
     method = shared_method(list(dict.fromkeys(run["name"] for run in results["runs"])))
     what = f"{method} on {results['scene']['name']}" if method else results["scene"]["name"]
-    return f"{what}, {' or '.join(parts)} of training on {where}, {many}"
+    return f"{what}, {length} of training on {where}, {many}"
 
 
 @dataclass(frozen=True)

@@ -84,7 +84,7 @@ class SwitchField(nn.Module):
     """Density and colour of mapped positions, each from the expert that the gate chose.
 
     Attributes:
-        density_scale: factor of the density, 1 in the paper; see `opaque_start`.
+        density_scale: factor of the density, 1 in the paper; see `hosts/first_steps.py`.
     """
 
     def __init__(self, config: SwitchFieldConfig, num_images: int) -> None:

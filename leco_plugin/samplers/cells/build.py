@@ -10,6 +10,7 @@ from __future__ import annotations
 import copy
 import dataclasses
 import math
+from collections.abc import Iterator
 
 import torch
 from torch import Tensor
@@ -94,17 +95,8 @@ def build_cache(
         )
         return CellCache(cache.tables().to(device), occupancy.space, cache.report)
     probe, seen = look(occupancy, PROBE)
-    mixed = int((probe == MIXED).sum())
-    if mixed > ROUGH * PROBE**3:
-        raise ValueError(
-            f"the gate's boundary crosses {mixed / PROBE**3:.0%} of the cells of 1/{PROBE} of the "
-            "cube: it is too rough to be held in cells"
-        )
-    surface = mixed / PROBE**2
-    # A plane leaves open a share of its cell proportional to its size, 0.2 at resolution 32.
-    weight = 0.5 + 0.5 / max(1e-3, float((probe != EMPTY).float().mean()))
-    enough = math.sqrt(0.2 * 32 / BRICK * surface * weight / ASKED)
-    positions, by_gate = _decisions(occupancy, probe != EMPTY, check_points, seed)
+    enough = _finest_of_use(probe)
+    compared = _decisions(occupancy, probe != EMPTY, check_points, seed)
     report = None
     for margin in MARGINS:
         # after a failure the gate is asked everywhere: the probe may have missed something
@@ -112,16 +104,8 @@ def build_cache(
         finest = _largest_tables(occupancy, budget, enough, margin, look_of_probe)
         if finest is None:
             break
-        resolution, tables, doubts = finest
-        for caution in CAUTIONS:
-            tables.planes[4, : len(doubts)] = (
-                (caution * doubts.clamp(min=1e-6)).ceil().clamp(max=127.0)
-            )
-            if math.isinf(caution):
-                tables.planes[:4] = 0  # planes that never decide
-            report = CacheReport(resolution, tables.bytes, 1.0, 1.0, 0, 1.0, margin, caution)
-            cache = CellCache(tables, occupancy.space, report)
-            report = cache.report = _check(cache, positions, by_gate)
+        for cache in _more_and_more_cautious(occupancy, *finest, margin):
+            report = cache.report = _check(cache, *compared)
             if report.differing_bound <= tolerance:
                 return cache
     if report is None:
@@ -131,6 +115,37 @@ def build_cache(
         f"that fit {budget} bytes: {report.differing:.2g} of the decisions differ, "
         f"{tolerance:g} may"
     )
+
+
+def _finest_of_use(probe: Tensor) -> float:
+    """The resolution beyond which cells are not worth their time, from the states of a probe.
+
+    Raises:
+        ValueError: the gate's boundary crosses too many of its cells.
+    """
+    mixed = int((probe == MIXED).sum())
+    if mixed > ROUGH * PROBE**3:
+        raise ValueError(
+            f"the gate's boundary crosses {mixed / PROBE**3:.0%} of the cells of 1/{PROBE} of the "
+            "cube: it is too rough to be held in cells"
+        )
+    surface = mixed / PROBE**2
+    # A plane leaves open a share of its cell proportional to its size, 0.2 at resolution 32.
+    weight = 0.5 + 0.5 / max(1e-3, float((probe != EMPTY).float().mean()))
+    return math.sqrt(0.2 * 32 / BRICK * surface * weight / ASKED)
+
+
+def _more_and_more_cautious(
+    occupancy: OccupancyLike, resolution: int, tables: Tables, doubts: Tensor, margin: float
+) -> Iterator[CellCache]:
+    """Caches of these tables, whose planes decide less and less; unchecked. Each ends the last."""
+    for caution in CAUTIONS:
+        heights = (caution * doubts.clamp(min=1e-6)).ceil().clamp(max=127.0)
+        tables.planes[4, : len(doubts)] = heights
+        if math.isinf(caution):
+            tables.planes[:4] = 0  # planes that never decide
+        report = CacheReport(resolution, tables.bytes, 1.0, 1.0, 0, 1.0, margin, caution)
+        yield CellCache(tables, occupancy.space, report)
 
 
 def _largest_tables(

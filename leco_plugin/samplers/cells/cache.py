@@ -12,12 +12,12 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Literal, NamedTuple, Protocol
+from typing import NamedTuple, Protocol
 
 import torch
 from torch import Tensor, nn
 
-from leco_plugin.space import contract
+from leco_plugin.space import Space, contract
 
 EMPTY, OCCUPIED, MIXED = 0, 1, 2
 
@@ -38,24 +38,11 @@ FARTHEST = 15
 """Largest clearance that is stored, in half coarse cells: what four bits hold."""
 
 
-class SpaceLike(Protocol):
-    """What the cache asks of a space mapping."""
-
-    @property
-    def kind(self) -> Literal["box", "contraction"]: ...
-    @property
-    def center(self) -> Tensor: ...
-    @property
-    def half_extent(self) -> Tensor: ...
-    def map(self, positions: Tensor) -> Tensor: ...
-    def unmap(self, mapped: Tensor) -> Tensor: ...
-
-
 class OccupancyLike(Protocol):
     """What the samplers ask of a frozen occupancy; outside a bounded space o is 0."""
 
     @property
-    def space(self) -> SpaceLike: ...
+    def space(self) -> Space: ...
     @property
     def threshold(self) -> float: ...
     def query(self, positions: Tensor) -> Tensor: ...
@@ -130,7 +117,7 @@ class CellCache(nn.Module):
     center: Tensor
     half_extent: Tensor
 
-    def __init__(self, tables: Tables, space: SpaceLike, report: CacheReport) -> None:
+    def __init__(self, tables: Tables, space: Space, report: CacheReport) -> None:
         super().__init__()
         self.report = report
         self.resolution = report.resolution

@@ -87,7 +87,7 @@ def _extremes(corners: Tensor) -> tuple[Tensor, Tensor]:
 def _lattice(intervals: int, device: torch.device) -> Tensor:
     """Points of a lattice over the mapped cube, [(intervals + 1)^3, 3]."""
     axis = torch.linspace(-1.0, 1.0, intervals + 1, dtype=torch.float32, device=device)
-    return torch.stack(torch.meshgrid(axis, axis, axis, indexing="ij"), dim=-1).view(-1, 3)
+    return torch.cartesian_prod(axis, axis, axis)
 
 
 def logits_above(occupancy: OccupancyLike, mapped: Tensor) -> Tensor:
@@ -124,11 +124,11 @@ def judge_fine(
     n, device = len(cells), corners.device
     size = 2.0 / (len(corners) - 1)
     steps = torch.arange(BRICK, device=device)
-    within = torch.stack(torch.meshgrid(steps, steps, steps, indexing="ij"), dim=-1).view(-1, 3)
-    places = (cells[:, None, :] * BRICK + within).float() * size - 1.0
+    lowest = cells[:, None, :] * BRICK + torch.cartesian_prod(steps, steps, steps)
+    places = lowest.float() * size - 1.0
     centres = logits_above(occupancy, (places + 0.5 * size).reshape(-1, 3)).view(n, BRICK**3, 1)
     eight = corners.unfold(0, 2, 1).unfold(1, 2, 1).unfold(2, 2, 1)
-    x, y, z = (cells[:, None, :] * BRICK + within).unbind(-1)
+    x, y, z = lowest.unbind(-1)
     values = torch.cat([eight[x, y, z].flatten(2), centres], dim=-1)
     low, high = values.amin(dim=-1), values.amax(dim=-1)
     states = _judge(low, high, margin)

@@ -126,6 +126,15 @@ def _activate(sums, biases, WIDTH: tl.constexpr, HALF: tl.constexpr):
 
 
 @triton.jit
+def _norm(hidden, epsilon, WIDTH: tl.constexpr, PADDED_WIDTH: tl.constexpr):
+    """Means of the layer norm, and the reciprocals of its deviations."""
+    mean = tl.sum(hidden, axis=1) / WIDTH
+    real = (tl.arange(0, PADDED_WIDTH) < WIDTH)[None, :]
+    centred = tl.where(real, hidden - mean[:, None], 0.0)
+    return mean, tl.rsqrt(tl.sum(centred * centred, axis=1) / WIDTH + epsilon)
+
+
+@triton.jit
 def gate_keeps(
     x,
     y,
@@ -144,7 +153,7 @@ def gate_keeps(
     MASK: tl.constexpr,
     COLUMNS: tl.constexpr,
     WIDTH: tl.constexpr,
-    PADDED: tl.constexpr,
+    PADDED_WIDTH: tl.constexpr,
     LAYERS: tl.constexpr,
     LOGITS: tl.constexpr,
     PADDED_LOGITS: tl.constexpr,
@@ -156,34 +165,30 @@ def gate_keeps(
     u, v, w = tl.where(inside, u, 0.0), tl.where(inside, v, 0.0), tl.where(inside, w, 0.0)
     u, v, w = _once(u), _once(v), _once(w)
 
-    sums = tl.zeros((ROWS, PADDED), tl.float32)
+    sums = tl.zeros((ROWS, PADDED_WIDTH), tl.float32)
     if KIND == _FREQUENCY:
         features, cosines = frequencies(u, v, w, OCTAVES, COLUMNS)
-        sums = _layer(cosines, matrices, sums, ROWS, COLUMNS, PADDED, HALF)
-        matrices += COLUMNS * PADDED
+        sums = _layer(cosines, matrices, sums, ROWS, COLUMNS, PADDED_WIDTH, HALF)
+        matrices += COLUMNS * PADDED_WIDTH
     else:
         features = look_up(u, v, w, tables, grids, COLUMNS, KIND, LEVELS, FEATURES, MASK)
-    sums = _layer(features, matrices, sums, ROWS, COLUMNS, PADDED, HALF)
-    matrices += COLUMNS * PADDED
-    hidden = _activate(sums, vectors, PADDED, HALF)
-    vectors += PADDED
+    sums = _layer(features, matrices, sums, ROWS, COLUMNS, PADDED_WIDTH, HALF)
+    matrices += COLUMNS * PADDED_WIDTH
+    hidden = _activate(sums, vectors, PADDED_WIDTH, HALF)
+    vectors += PADDED_WIDTH
     for _ in tl.static_range(LAYERS - 1):
-        sums = tl.zeros((ROWS, PADDED), tl.float32)
-        sums = _layer(hidden, matrices, sums, ROWS, PADDED, PADDED, HALF)
-        matrices += PADDED * PADDED
-        hidden = _activate(sums, vectors, PADDED, HALF)
-        vectors += PADDED
+        sums = tl.zeros((ROWS, PADDED_WIDTH), tl.float32)
+        sums = _layer(hidden, matrices, sums, ROWS, PADDED_WIDTH, PADDED_WIDTH, HALF)
+        matrices += PADDED_WIDTH * PADDED_WIDTH
+        hidden = _activate(sums, vectors, PADDED_WIDTH, HALF)
+        vectors += PADDED_WIDTH
 
-    mean = tl.sum(hidden, axis=1) / WIDTH
-    real = (tl.arange(0, PADDED) < WIDTH)[None, :]
-    centred = tl.where(real, hidden - mean[:, None], 0.0)
-    spread = tl.rsqrt(tl.sum(centred * centred, axis=1) / WIDTH + epsilon)
-
+    mean, spread = _norm(hidden, epsilon, WIDTH, PADDED_WIDTH)
     sums = tl.zeros((ROWS, PADDED_LOGITS), tl.float32)
-    sums = _layer(hidden, matrices, sums, ROWS, PADDED, PADDED_LOGITS, HALF)
+    sums = _layer(hidden, matrices, sums, ROWS, PADDED_WIDTH, PADDED_LOGITS, HALF)
     if HALF:
-        matrices += PADDED * PADDED_LOGITS
-        sums = _layer(hidden, matrices, sums, ROWS, PADDED, PADDED_LOGITS, HALF)
+        matrices += PADDED_WIDTH * PADDED_LOGITS
+        sums = _layer(hidden, matrices, sums, ROWS, PADDED_WIDTH, PADDED_LOGITS, HALF)
     number = tl.arange(0, PADDED_LOGITS)
     totals = tl.load(vectors + number)[None, :]
     constants = tl.load(vectors + PADDED_LOGITS + number)[None, :]
@@ -225,7 +230,7 @@ def _gate_kernel(
     MASK: tl.constexpr,
     COLUMNS: tl.constexpr,
     WIDTH: tl.constexpr,
-    PADDED: tl.constexpr,
+    PADDED_WIDTH: tl.constexpr,
     LAYERS: tl.constexpr,
     LOGITS: tl.constexpr,
     PADDED_LOGITS: tl.constexpr,
@@ -257,7 +262,7 @@ def _gate_kernel(
         MASK,
         COLUMNS,
         WIDTH,
-        PADDED,
+        PADDED_WIDTH,
         LAYERS,
         LOGITS,
         PADDED_LOGITS,
@@ -265,25 +270,6 @@ def _gate_kernel(
         HALF,
     )
     tl.store(kept + rows, keep.to(tl.uint8), mask=there)
-
-
-def sizes_of(weights: GateWeights) -> dict[str, int | bool]:
-    """The constants that a kernel with this gate is compiled for."""
-    return {
-        "KIND": weights.kind,
-        "OCTAVES": weights.octaves,
-        "LEVELS": weights.levels,
-        "FEATURES": weights.features,
-        "MASK": weights.mask,
-        "COLUMNS": weights.columns,
-        "WIDTH": weights.width,
-        "PADDED": weights.padded_width,
-        "LAYERS": weights.layers,
-        "LOGITS": weights.logits,
-        "PADDED_LOGITS": weights.padded_logits,
-        "CONTRACTED": weights.contracted,
-        "HALF": weights.half,
-    }
 
 
 def gate_decisions(weights: GateWeights, positions: Tensor) -> Tensor:
@@ -305,14 +291,9 @@ def gate_decisions(weights: GateWeights, positions: Tensor) -> Tensor:
             kept,
             len(positions),
             *positions.stride(),
-            weights.facts,
-            weights.matrices,
-            weights.vectors,
-            weights.tables,
-            weights.grids,
-            weights.epsilon,
+            *weights.values,
             ROWS=rows,
-            **sizes_of(weights),
+            **weights.sizes,
             num_warps=8 if many_warps else 4,
             enable_fp_fusion=False,
         )

@@ -24,6 +24,8 @@ MOST_WIDTH_FLOAT32 = 64
 """Float32 products are no matrix instructions: compiled, a wider gate takes minutes and spills."""
 MOST_LAYERS = 8
 MOST_LOGITS = 64
+READ = 6
+"""Fields of `GateWeights` that a kernel reads; it is compiled for the others."""
 
 
 class GateWeights(NamedTuple):
@@ -45,6 +47,8 @@ class GateWeights(NamedTuple):
     """float32, flat: the learned values of the encoding; anything for frequencies."""
     grids: Tensor
     """int32, flat: cells along the cube (points, of planes) and place in the tables, by level."""
+    epsilon: float
+    """Of the layer norm."""
     kind: int
     octaves: int
     levels: int
@@ -62,8 +66,16 @@ class GateWeights(NamedTuple):
     contracted: bool
     half: bool
     """Whether it multiplies in bfloat16."""
-    epsilon: float
-    """Of the layer norm."""
+
+    @property
+    def values(self) -> tuple[Tensor | float, ...]:
+        """What a kernel reads, in the order of its parameters."""
+        return self[:READ]
+
+    @property
+    def sizes(self) -> dict[str, Any]:
+        """The constants that a kernel is compiled for, by name."""
+        return {name.upper(): size for name, size in zip(self._fields[READ:], self[READ:])}
 
 
 def why_not(occupancy: Any, most_width: int = MOST_WIDTH) -> str | None:

@@ -22,7 +22,7 @@ from leco_plugin.samplers.cells.cache import (
     CellCache,
 )
 from leco_plugin.samplers.edges import MAX_CANDIDATES_PER_RAY, growth_table, switch
-from leco_plugin.samplers.kernels.gate_kernel import gate_keeps, largest_of, map_position, sizes_of
+from leco_plugin.samplers.kernels.gate_kernel import gate_keeps, largest_of, map_position
 from leco_plugin.samplers.kernels.gate_weights import GateWeights
 from leco_plugin.samplers.marching import Samples
 from leco_plugin.samplers.rays import Candidates, check_longest
@@ -144,6 +144,12 @@ def _edge(step, t_min, step_size, n_linear, t_switch, growth, CONED: tl.constexp
     return linear
 
 
+@triton.jit
+def _three_rows(rows, n_rays, ray):
+    """A ray's numbers in three rows, one behind the other."""
+    return tl.load(rows + ray), tl.load(rows + n_rays + ray), tl.load(rows + 2 * n_rays + ray)
+
+
 @triton.jit(do_not_specialize=["n_rays", "n_planes"])
 def _march_kernel(
     rays,
@@ -180,7 +186,7 @@ def _march_kernel(
     MASK: tl.constexpr,
     COLUMNS: tl.constexpr,
     WIDTH: tl.constexpr,
-    PADDED: tl.constexpr,
+    PADDED_WIDTH: tl.constexpr,
     LAYERS: tl.constexpr,
     LOGITS: tl.constexpr,
     PADDED_LOGITS: tl.constexpr,
@@ -189,21 +195,10 @@ def _march_kernel(
 ):
     ray = tl.program_id(0)
     n_rays = n_rays.to(tl.int64)  # six rows of them are read
-    ox, oy, oz = (
-        tl.load(rays + ray),
-        tl.load(rays + n_rays + ray),
-        tl.load(rays + 2 * n_rays + ray),
-    )
-    rays += 3 * n_rays
-    dx, dy, dz = (
-        tl.load(rays + ray),
-        tl.load(rays + n_rays + ray),
-        tl.load(rays + 2 * n_rays + ray),
-    )
+    ox, oy, oz = _three_rows(rays, n_rays, ray)
+    dx, dy, dz = _three_rows(rays + 3 * n_rays, n_rays, ray)
     speed = tl.sqrt(dx * dx + dy * dy + dz * dz)
-    t_min = tl.load(numbers + ray)
-    first = tl.load(numbers + n_rays + ray)
-    counted = tl.load(numbers + 2 * n_rays + ray)
+    t_min, first, counted = _three_rows(numbers, n_rays, ray)
     n_linear = tl.load(numbers + 3 * n_rays + ray)
     t_switch = tl.load(numbers + 4 * n_rays + ray)
     place = tl.load(starts + ray)
@@ -217,18 +212,9 @@ def _march_kernel(
         finish = begin + size.to(tl.float32)
         t_finish = _edge(finish, t_min, step_size, n_linear, t_switch, growth, CONED)
         middle = (t_begin + t_finish) * 0.5
-        near = cells_near(
-            tl.fma(dx, middle, ox),
-            tl.fma(dy, middle, oy),
-            tl.fma(dz, middle, oz),
-            (t_finish - t_begin) * (0.5 * speed),
-            facts,
-            frame,
-            clearance,
-            RESOLUTION,
-            CONTRACTED,
-        )
-        if near:
+        u, v, w = tl.fma(dx, middle, ox), tl.fma(dy, middle, oy), tl.fma(dz, middle, oz)
+        radius = (t_finish - t_begin) * (0.5 * speed)
+        if cells_near(u, v, w, radius, facts, frame, clearance, RESOLUTION, CONTRACTED):
             steps = tl.arange(0, STEPS)
             wanted = steps < size
             # a step too far would read beyond the table of growth
@@ -272,7 +258,7 @@ def _march_kernel(
                     MASK,
                     COLUMNS,
                     WIDTH,
-                    PADDED,
+                    PADDED_WIDTH,
                     LAYERS,
                     LOGITS,
                     PADDED_LOGITS,
@@ -313,39 +299,23 @@ def march_kept(cache: CellCache, weights: GateWeights, candidates: Candidates) -
     switches = switch(t_mins, step_size, cone_angle) if coned else (t_mins, t_mins)
     numbers = torch.stack([t_mins, first.expand_as(counts), counts, *switches])
     growth = growth_table(step_size, cone_angle, device) if coned else numbers
-    tables = cache.tables()
+    coarse, fine, first_plane, planes, clearance = cache.tables()
     frame = torch.cat([cache.scale.view(-1), cache.shift.view(-1)])
+    cells = (coarse, fine, first_plane, planes, planes.shape[1], clearance, frame)
     found = torch.zeros(n_rays, dtype=torch.int64, device=device)
     nowhere = torch.zeros_like(found)
 
     def launch(starts: Tensor, ends: Tensor, samples: Samples) -> None:
+        marched = (coordinates, n_rays, numbers, growth, step_size, starts, ends, found)
         _march_kernel[(n_rays,)](
-            coordinates,
-            n_rays,
-            numbers,
-            growth,
-            step_size,
-            starts,
-            ends,
-            found,
+            *marched,
             *samples,
-            tables.coarse,
-            tables.fine,
-            tables.first_plane,
-            tables.planes,
-            tables.planes.shape[1],
-            tables.clearance,
-            frame,
-            weights.facts,
-            weights.matrices,
-            weights.vectors,
-            weights.tables,
-            weights.grids,
-            weights.epsilon,
+            *cells,
+            *weights.values,
             STEPS=STEPS,
             CONED=coned,
             RESOLUTION=cache.resolution,
-            **sizes_of(weights),
+            **weights.sizes,
             num_warps=max(1, weights.padded_width // 32),
             enable_fp_fusion=False,
         )

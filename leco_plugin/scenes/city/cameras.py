@@ -38,13 +38,10 @@ def aerial_cameras(city: City, count: int, seed: int) -> Array:
     random = np.random.default_rng([seed, 11])
     blocks = city.centres[city.built]
     size = city.config.block_size
-    order = np.concatenate(
-        [random.permutation(len(blocks)) for _ in range(count // len(blocks) + 1)]
-    )
+    rounds = [random.permutation(len(blocks)) for _ in range(count // len(blocks) + 1)]
     poses: list[Array] = []
-    while len(poses) < count:
-        number = len(poses)
-        middle = blocks[order[number]]
+    for number, block in enumerate(np.concatenate(rounds)[:count]):
+        middle = blocks[block]
         # Aimed a little inwards, so that the pictures at the rim show more city than void.
         place = middle * (1 - 0.5 / len(city.built)) + random.uniform(-0.35, 0.35, 2) * size
         target = np.array([*place, random.uniform(0, 8)])
@@ -53,7 +50,7 @@ def aerial_cameras(city: City, count: int, seed: int) -> Array:
         tilt = np.deg2rad(random.uniform(3, 12) if number % 3 == 0 else random.uniform(38, 50))
         away = (height - target[2]) * np.tan(tilt) * np.array([np.cos(turn), np.sin(turn)])
         poses.append(look_at(np.array([*(target[:2] + away), height]), target))
-    return np.stack(poses) if poses else np.zeros((0, 3, 4))
+    return np.reshape(poses, (-1, 3, 4))
 
 
 def street_cameras(city: City, count: int, seed: int) -> Array:
@@ -66,7 +63,7 @@ def street_cameras(city: City, count: int, seed: int) -> Array:
         # Some streets lead out of the city; a picture of nothing teaches nothing.
         fit = city.on_block((places + ahead)[:, :2]) & ~city.occupied(places)
         poses += list(batch[fit & (city.distance(places) > _CLEARANCE)])
-    return np.stack(poses[:count]) if count else np.zeros((0, 3, 4))
+    return np.reshape(poses[:count], (-1, 3, 4))
 
 
 def _street_pose(city: City, random: Generator) -> Array:
@@ -110,7 +107,7 @@ class Lens:
         return pose[:, 3] + np.asarray(depth)[..., None] * (self.directions() @ pose[:, :3].T)
 
     def axial(self, depth: NDArray[np.floating]) -> NDArray[np.float32]:
-        """Depth files from ray depths (metres, inf for nothing): see `city.layouts`."""
+        """Depth files from ray depths (metres, inf for nothing): see `city.folder`."""
         axial = np.where(np.isfinite(depth), depth, 0) * -self.directions()[..., 2]
         return (1e3 * axial).astype(np.float32)
 
@@ -156,11 +153,8 @@ class CaptureConfig:
     @property
     def lens(self) -> Lens:
         """The camera they are taken with."""
-        return Lens(
-            self.width,
-            self.height,
-            self.width / 2 / float(np.tan(np.deg2rad(self.field_of_view) / 2)),
-        )
+        half_angle = np.deg2rad(self.field_of_view) / 2
+        return Lens(self.width, self.height, self.width / 2 / float(np.tan(half_angle)))
 
 
 @dataclass(frozen=True)
@@ -177,11 +171,7 @@ class View:
 
 
 def views_of(city: City, capture: CaptureConfig) -> list[View]:
-    """All views of a city, always the same for one configuration.
-
-    Raises:
-        ValueError: there is not one to train on and one to hold out.
-    """
+    """All views of a city, always the same for one configuration. ValueError for fewer than two."""
     blocks, seed = int(city.built.sum()), city.config.seed
     aerial = aerial_cameras(city, round(capture.aerial_per_block * blocks), seed)
     street = street_cameras(city, round(capture.street_per_block * blocks), seed)

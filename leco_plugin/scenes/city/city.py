@@ -56,22 +56,17 @@ class City:
         self.centres = centres(self.built, config.block_size)
         """Centres of all cells, metres: [blocks, blocks, 2]."""
         shapes, palette = plan_city(self.built, config.block_size, config.seed, config.far_terrain)
-        self.material = np.array(palette.material)
-        self.colour = np.array(palette.colour, dtype=np.float32)
-        self.anchor = np.array(palette.anchor)
-        self.pitch = np.array(palette.pitch)
-
+        self.material, colour, self.anchor, self.pitch = map(np.array, zip(*palette))
+        self.colour = colour.astype(np.float32)
         direction = np.array([direction for _, direction, _ in shapes.rectangles])
         flat = np.stack([face for face, _, _ in shapes.rectangles])
-        others = [*shapes.triangles, *shapes.facets]
-        fans = np.concatenate([fan for fan, _ in others])
+        fans = np.concatenate([fan for fan, _ in shapes.triangles])
         self._faces, self._solids = Faces(flat, fans), Solids(shapes)
         self.triangles = np.concatenate([_halves(flat, direction), fans])
         """All faces as triangles, counter-clockwise seen from the air, metres: [T, 3, 3]."""
-        paint = [np.repeat([number for _, _, number in shapes.rectangles], 2)]
-        self.paint = np.concatenate(
-            [*paint, *(np.full(len(fan), number) for fan, number in others)]
-        )
+        of_halves = np.repeat([number for _, _, number in shapes.rectangles], 2)
+        of_fans = [np.full(len(fan), number) for fan, number in shapes.triangles]
+        self.paint = np.concatenate([of_halves, *of_fans])
         """Row of each triangle in `material`, `colour`, `anchor`, `pitch`: int [T]."""
 
     @classmethod

@@ -1,7 +1,15 @@
 """The city as a scene on disk: written once, never seen half done, and taken up again when killed.
 
-How the pictures lie there is the business of `layouts`; beside them
 city.json          the configuration, from which the exact geometry is built again
+
+As a nerfstudio scene, beside it:
+images/*.png       the pictures
+depths/*.npy       float32 [h, w], millimetres along the viewing axis, 0 where nothing is met:
+                   what nerfstudio's depth methods read by default
+transforms.json    cameras and splits
+sparse_pc.ply      some visible surface points, like those of structure from motion
+
+As a Mega-NeRF scene: see `mega_nerf_format.files`.
 """
 
 from __future__ import annotations
@@ -10,25 +18,164 @@ import dataclasses
 import hashlib
 import json
 import shutil
+from abc import ABC, abstractmethod
+from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image
 
 import leco_plugin
-from leco_plugin.scenes.city.cameras import CaptureConfig, View, views_of
+from leco_plugin.scenes.city.cameras import CaptureConfig, Lens, View, views_of
 from leco_plugin.scenes.city.city import DESCRIPTION, City, CityConfig, read_description
-from leco_plugin.scenes.city.layouts import (
-    LAYOUTS,
-    MAPPINGS,
-    PARTS,
-    TRANSFORMS,
-    Layout,
-    LayoutName,
-    with_alpha,
-)
 from leco_plugin.scenes.input_error import one_line
-from leco_plugin.scenes.whole_files import remove_parts, write_whole
+from leco_plugin.scenes.mega_nerf_format.files import (
+    Coordinates,
+    Split,
+    around,
+    write_coordinates,
+    write_mappings,
+    write_view,
+)
+from leco_plugin.scenes.whole_files import remove_parts, write_points, write_whole
 
-__all__ = ["CaptureConfig", "count_pictures", "read_transforms", "write_city"]
+Image8 = NDArray[np.uint8]
+LayoutName = Literal["nerfstudio", "mega-nerf"]
+TRANSFORMS = "transforms.json"
+MAPPINGS = "mappings.txt"
+PARTS = (("rgbs", "png"), ("metadata", "pt"))
+"""Of a view in Mega-NeRF's format: the folders, and how the names in them end."""
+POINTS = "sparse_pc.ply"
+FILE_FIELDS = ("file_path", "depth_file_path")
+"""Of a frame of transforms.json."""
+_SPARSE_POINTS_PER_VIEW = 100
+
+
+@dataclass
+class Layout(ABC):
+    """Writes pictures one by one, so that a city may be larger than memory, then the rest."""
+
+    views: list[View]
+    lens: Lens
+    seed: int
+
+    @abstractmethod
+    def files(self, view: View) -> list[str]:
+        """What is there, relative to the folder, when a view is written."""
+
+    @abstractmethod
+    def write(self, folder: Path, view: View, image: Image8, depth: NDArray[np.float32]) -> None:
+        """Writes a view: `image` [h, w, 3 or 4], `depth` [h, w] metres along the rays."""
+
+    @abstractmethod
+    def finish(self, folder: Path) -> None:
+        """Writes what is about all views."""
+
+
+class NerfstudioLayout(Layout):
+    """transforms.json, with depths and sparse points."""
+
+    def files(self, view: View) -> list[str]:
+        return [f"images/{view.name}.png", f"depths/{view.name}.npy"]
+
+    def write(self, folder: Path, view: View, image: Image8, depth: NDArray[np.float32]) -> None:
+        picture, depths = self.files(view)
+        write_whole(folder / picture, lambda f: Image.fromarray(image).save(f, format="PNG"))
+        write_whole(folder / depths, lambda f: np.save(f, self.lens.axial(depth)))
+
+    def finish(self, folder: Path) -> None:
+        write_points(folder / POINTS, self._points(folder))
+        transforms = json.dumps(self._transforms(), indent=1) + "\n"
+        write_whole(folder / TRANSFORMS, lambda f: f.write(transforms.encode()))
+
+    def _transforms(self) -> dict[str, Any]:
+        frames: list[dict[str, Any]] = []
+        names: dict[bool, list[str]] = {False: [], True: []}
+        for view in self.views:
+            frame: dict[str, Any] = dict(zip(FILE_FIELDS, self.files(view)))
+            matrix = [*view.pose.tolist(), [0.0, 0.0, 0.0, 1.0]]
+            frames.append(frame | {"transform_matrix": matrix})
+            names[view.held_out].append(frame["file_path"])
+        lens = self.lens
+        return {
+            "camera_model": "OPENCV",
+            "w": lens.width,
+            "h": lens.height,
+            "fl_x": lens.focal,
+            "fl_y": lens.focal,
+            "cx": lens.width / 2,
+            "cy": lens.height / 2,
+            "orientation_override": "none",
+            "ply_file_path": POINTS,
+            "metres_per_unit": 1.0,
+            "frames": frames,
+            "train_filenames": names[False],
+            "val_filenames": names[True],
+            "test_filenames": names[True],
+        }
+
+    def _points(self, folder: Path) -> NDArray[Any]:
+        """Some surface points of each view, [N] rows of `xyz` (metres) and `rgb`.
+
+        They are read back from its files, so that what a killed run wrote counts too.
+        """
+        random = np.random.default_rng([self.seed, 13])
+        rows = []
+        for view in self.views:
+            picture, depths = self.files(view)
+            depth = self.lens.along_ray(np.load(folder / depths, allow_pickle=False))
+            seen = np.argwhere(np.isfinite(depth))
+            chosen = tuple(seen[random.permutation(len(seen))[:_SPARSE_POINTS_PER_VIEW]].T)
+            row = np.empty(len(chosen[0]), dtype=[("xyz", "<f4", 3), ("rgb", "u1", 3)])
+            row["xyz"] = self.lens.points(view.pose, depth)[chosen]
+            with Image.open(folder / picture) as image:
+                row["rgb"] = np.asarray(image)[chosen][:, :3]
+            rows.append(row)
+        return np.concatenate(rows)
+
+
+class MegaNerfLayout(Layout):
+    """Mega-NeRF's folders; held-out pictures are its validation set."""
+
+    @cached_property
+    def coordinates(self) -> Coordinates:
+        return around(np.stack([view.pose[:, 3] for view in self.views]))
+
+    def files(self, view: View) -> list[str]:
+        return [f"{_split(view)}/{part}/{_stem(view)}.{ending}" for part, ending in PARTS]
+
+    def write(self, folder: Path, view: View, image: Image8, depth: NDArray[np.float32]) -> None:
+        lens = self.lens
+        intrinsics = lens.focal, lens.focal, lens.width / 2, lens.height / 2
+        pose = self.coordinates.to_file(view.pose[None])[0]
+        write_view(folder, _split(view), _stem(view), image, pose, intrinsics)
+
+    def finish(self, folder: Path) -> None:
+        write_coordinates(folder, self.coordinates)
+        write_mappings(folder, {f"{view.name}.png": _stem(view) for view in self.views})
+
+
+def _split(view: View) -> Split:
+    return "val" if view.held_out else "train"
+
+
+def _stem(view: View) -> str:
+    return f"{view.number:06d}"
+
+
+LAYOUTS: dict[LayoutName, type[Layout]] = {
+    "nerfstudio": NerfstudioLayout,
+    "mega-nerf": MegaNerfLayout,
+}
+
+
+def with_alpha(image: Image8, depth: NDArray[np.floating]) -> Image8:
+    """[h, w, 4]: transparent where a ray meets nothing, so that no method has to model the void."""
+    alpha = np.where(np.isfinite(depth), 255, 0).astype(np.uint8)
+    return np.concatenate([image, alpha[..., None]], axis=-1)
 
 
 def write_city(
@@ -44,13 +191,9 @@ def write_city(
     hidden folder beside it; a run that was killed is taken up there, and several may work on it.
 
     Args:
-        config: the city.
-        out_dir: the folder to write; its parents are made.
+        out_dir: the folder to write, which is returned; its parents are made.
         capture: how it is photographed, by default about 60 small aerial pictures for 3 blocks.
         progress: whether to show a bar.
-        layout: in which format.
-    Returns:
-        `out_dir`.
     Raises:
         FileExistsError: `out_dir` holds something else, and is left alone.
         ValueError: `out_dir` holds a damaged city, and is left alone.
@@ -62,12 +205,11 @@ def write_city(
     if _holds(out_dir, wanted):
         return out_dir
     city = City(config)
-    views = views_of(city, capture)
-    files = LAYOUTS[layout](views, capture.lens, config.seed)
+    files = LAYOUTS[layout](views_of(city, capture), capture.lens, config.seed)
     unfinished = _unfinished(out_dir, text)
     unfinished.mkdir(parents=True, exist_ok=True)
     try:
-        _photograph(city, views, files, unfinished, capture, progress)
+        _photograph(city, files, unfinished, progress)
         files.finish(unfinished)
         write_whole(unfinished / DESCRIPTION, lambda file: file.write(text.encode()))
         remove_parts(unfinished)
@@ -87,14 +229,7 @@ def _unfinished(out_dir: Path, description: str) -> Path:
     return out_dir.parent / f".{out_dir.name}-unfinished-{digest}"
 
 
-def _photograph(
-    city: City,
-    views: list[View],
-    layout: Layout,
-    folder: Path,
-    capture: CaptureConfig,
-    progress: bool,
-) -> None:
+def _photograph(city: City, layout: Layout, folder: Path, progress: bool) -> None:
     """Takes the pictures that are not there yet, one by one."""
     from rich.progress import track
 
@@ -103,14 +238,15 @@ def _photograph(
     def missing(view: View) -> bool:
         return not all((folder / path).is_file() for path in layout.files(view))
 
-    wanted = [view for view in views if missing(view)]
+    wanted = [view for view in layout.views if missing(view)]
     if not wanted:
         return
-    tracer, there = Tracer(city), len(views) - len(wanted)
-    what = "Photographing the city" + (f" ({there} of {len(views)} are there)" if there else "")
+    tracer, count = Tracer(city), len(layout.views)
+    there = f" ({count - len(wanted)} of {count} are there)" if len(wanted) < count else ""
+    what = f"Photographing the city{there}"
     for view in track(wanted, what, transient=True, disable=not progress):
         if missing(view):  # another process may work on the same city
-            image, depth = tracer.photograph(view.pose, capture.lens)
+            image, depth = tracer.photograph(view.pose, layout.lens)
             image = image if city.config.sky else with_alpha(image, depth)
             layout.write(folder, view, image, depth)
 
@@ -131,8 +267,7 @@ def _holds(folder: Path, wanted: dict[str, Any]) -> bool:
                 f"{folder} holds another city ({name} is {there.get(name)} there, not {value}): "
                 "choose another folder"
             )
-    missing = _first_missing(folder, wanted["layout"])
-    if missing is not None:
+    if missing := _first_missing(folder, wanted["layout"]):
         raise ValueError(
             f"{folder} is damaged: {missing} is missing; delete the folder to write it anew"
         )
@@ -143,7 +278,7 @@ def _first_missing(folder: Path, layout: LayoutName) -> str | None:
     """A file that a finished city names and does not hold."""
     if layout == "nerfstudio":
         frames = read_transforms(folder)["frames"]
-        paths = [str(frame[key]) for frame in frames for key in ("file_path", "depth_file_path")]
+        paths = [str(frame[key]) for frame in frames for key in FILE_FIELDS]
         return next((path for path in paths if not (folder / path).is_file()), None)
     if not (folder / MAPPINGS).is_file():
         return MAPPINGS
@@ -167,7 +302,7 @@ def read_transforms(folder: Path) -> dict[str, Any]:
     """A city's `transforms.json`. ValueError, in one line, if it is incomplete."""
     try:
         transforms = json.loads((folder / TRANSFORMS).read_text())
-        needed = {"file_path", "depth_file_path", "transform_matrix"}
+        needed = {*FILE_FIELDS, "transform_matrix"}
         if not all(needed <= set(frame) for frame in transforms["frames"]):
             raise ValueError("a frame is incomplete")
     except (OSError, ValueError, KeyError, TypeError) as error:

@@ -22,6 +22,7 @@ from leco_plugin.scenes.city.shapes import (
     Shapes,
     add_prism,
     add_wire,
+    square,
 )
 
 LARGE = 9
@@ -72,12 +73,9 @@ def _around_the_middle(cells: NDArray[np.bool_]) -> NDArray[np.bool_]:
     found = np.zeros_like(cells)
     found[len(cells) // 2, len(cells) // 2] = True
     while True:
-        wider = found.copy()
-        wider[1:] |= found[:-1]
-        wider[:-1] |= found[1:]
-        wider[:, 1:] |= found[:, :-1]
-        wider[:, :-1] |= found[:, 1:]
-        wider &= cells
+        padded = np.pad(found, 1)
+        beside = padded[:-2, 1:-1] | padded[2:, 1:-1] | padded[1:-1, :-2] | padded[1:-1, 2:]
+        wider = cells & (found | beside)
         if np.array_equal(wider, found):
             return found
         found = wider
@@ -106,13 +104,8 @@ def plan_city(
         street = palette.add(Material.STREET, (0.29, 0.29, 0.31), (x, y, size))
         pavement = palette.add(Material.PAVEMENT, (0.62, 0.60, 0.57), (x, y, 0))
         grass = palette.add(Material.GRASS, (0.33, 0.46, 0.20), (x, y, 0))
-        half = lot / 2
-        canvas = Canvas(
-            (round(x - half, 2), round(x + half, 2), round(y - half, 2), round(y + half, 2)), street
-        )
-        canvas.stroke(
-            x - half + 0.2, x + half - 0.2, y - half + 0.2, y + half - 0.2, KERB, pavement
-        )
+        canvas = Canvas(square(lot / 2, x, y), street)
+        canvas.stroke(square(lot / 2 - 0.2, x, y), KERB, pavement)
         block = Block(shapes, palette, random, x, y, lot, canvas, metal, earth, grass)
         KINDS[kinds[i, j]](block)
         _pavement(block, lamp)
@@ -167,11 +160,8 @@ def _streets(block: Block, size: float, street: int) -> None:
     """The four half-streets around the lot, turned around it like a windmill, and parked cars."""
     h, e = block.lot / 2, size / 2
     strips = [(-e, h, -e, -h), (h, e, -e, h), (-h, e, h, e), (-e, -h, -h, e)]
-    for number, (x0, x1, y0, y1) in enumerate(strips):
-        x0, x1, y0, y1 = (
-            round(v, 2) for v in (block.x + x0, block.x + x1, block.y + y0, block.y + y1)
-        )
-        canvas = Canvas((x0, x1, y0, y1), street)
+    for number, strip in enumerate(strips):
+        canvas = Canvas(block.placed(strip), street)
         for along in np.arange(-0.35, 0.36, 0.175) * block.lot:
             if block.random.random() > 0.55:
                 continue
@@ -186,7 +176,7 @@ def _streets(block: Block, size: float, street: int) -> None:
                 dx, dy = (length, width) if number in (0, 2) else (width, length)
                 x, y = (along, across) if number in (0, 2) else (across, along)
                 x, y = x + block.x, y + block.y
-                canvas.stroke(x - dx, x + dx, y - dy, y + dy, top, colour)
+                canvas.stroke((x - dx, x + dx, y - dy, y + dy), top, colour)
         canvas.build(block.shapes, GROUND_DEPTH)
 
 

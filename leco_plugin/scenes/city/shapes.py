@@ -11,11 +11,27 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from enum import IntEnum
 from itertools import pairwise
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
+Rectangle = tuple[float, float, float, float]
+"""x0, x1, y0, y1 in metres."""
+Colour = tuple[float, float, float]
+"""RGB in 0..1."""
+
+
+def square(half: float, x: float = 0.0, y: float = 0.0) -> Rectangle:
+    """A square of twice that side around a place."""
+    return x - half, x + half, y - half, y + half
+
+
+def rounded(bounds: Rectangle) -> Rectangle:
+    """A rectangle in whole centimetres, so that edges that meet are the same numbers."""
+    x0, x1, y0, y1 = (round(float(value), 2) for value in bounds)
+    return x0, x1, y0, y1
 
 
 @dataclass
@@ -30,8 +46,6 @@ class Shapes:
     """Axis-aligned faces: corners [2, 3], direction (+1 or -1 along the flat axis), paint."""
     triangles: list[tuple[Array, int]] = field(default_factory=list)
     """Other faces: [T, 3, 3], counter-clockwise seen from the air, and their paint."""
-    facets: list[tuple[Array, int]] = field(default_factory=list)
-    """Faces of turned solids, like `triangles`."""
 
     def add_hull(self, corners: Array, faces: list[list[int]]) -> None:
         """Adds a convex solid given by its corners [V, 3] and planar faces (any winding)."""
@@ -44,23 +58,47 @@ class Shapes:
 
     def add_polygon(self, polygon: Array, paint: int) -> None:
         """Adds a convex planar face [V, 3], counter-clockwise seen from the air."""
-        self.triangles.append((_fan(polygon), paint))
+        first = np.broadcast_to(polygon[0], (len(polygon) - 2, 3))
+        self.triangles.append((np.stack([first, polygon[1:-1], polygon[2:]], 1), paint))
+
+    def add_between(
+        self,
+        first: Array,
+        second: Array,
+        paint: int,
+        open_sides: list[bool] | None = None,
+        shared: int = 0,
+    ) -> None:
+        """Adds the convex solid between two rings [V, 3], and its sides.
+
+        Args:
+            first, second: counter-clockwise where the first is seen from outside.
+            open_sides: whether the side from corner i to i + 1 touches air; None: all do.
+            shared: corner of a side that both of its triangles have, counted from the first ring.
+        """
+        count = len(first)
+        corners = np.concatenate([first, second])
+        sides = [[i, count + i, count + (i + 1) % count, (i + 1) % count] for i in range(count)]
+        for side, is_open in zip(sides, open_sides or count * [True]):
+            if is_open:
+                self.add_polygon(corners[np.roll(side, -shared)], paint)
+        self.add_hull(corners, [*sides, list(range(count)), list(range(count, 2 * count))])
 
 
 def add_roof(
     shapes: Shapes,
-    bounds: tuple[float, float, float, float],
+    bounds: Rectangle,
     base: float,
     rise: float,
     hip: float,
     paint: int,
     gable: int,
 ) -> None:
-    """Adds a pitched roof on the rectangle x0, x1, y0, y1; the ridge follows its longer side.
+    """Adds a pitched roof on a rectangle; the ridge follows its longer side.
 
     `hip` is how far (metres) the ridge's ends stand back: 0 gives upright gables, painted `gable`.
     """
-    x0, x1, y0, y1 = (round(float(v), 2) for v in bounds)
+    x0, x1, y0, y1 = rounded(bounds)
     along_x = x1 - x0 >= y1 - y0
     base, top = round(float(base), 2), round(float(base + rise), 2)
     if along_x:
@@ -97,35 +135,22 @@ def add_turned(
     reach = round(profile[0][0] + 0.12, 2)
     x, y = round(float(x), 2), round(float(y), 2)
     base = round(canvas.height(x, y) + 0.12, 2)
-    canvas.stroke(x - reach, x + reach, y - reach, y + reach, base, foot, covered=True)
+    x0, x1, y0, y1 = area = rounded(square(reach, x, y))
+    canvas.stroke(area, base, foot, covered=True)
     turn = 2 * np.pi * np.arange(sides) / sides
-    circle = np.stack([np.cos(turn), np.sin(turn)], 1)
-
-    def ring(radius: float, z: float) -> Array:
-        return np.column_stack(
-            [x + radius * circle[:, 0], y + radius * circle[:, 1], np.full(sides, base + z)]
-        )
-
-    x0, x1, y0, y1 = (round(v, 2) for v in (x - reach, x + reach, y - reach, y + reach))
+    circle = np.column_stack([np.cos(turn), np.sin(turn), np.zeros(sides)])
+    rings = [np.array([x, y, base + z]) + radius * circle for radius, z, _ in profile]
     corners = np.array([[x1, y1, base], [x0, y1, base], [x0, y0, base], [x1, y0, base]])
-    lower, quarter = ring(profile[0][0], profile[0][1]), sides // 4
-    for k in range(4):
-        arc = np.arange(k * quarter, (k + 1) * quarter + 1) % sides
+    for corner, following, arc in zip(
+        corners, np.roll(corners, -1, 0), np.arange(sides).reshape(4, -1)
+    ):
+        arc = [*arc, (arc[-1] + 1) % sides]
         for a, b in pairwise(arc):
-            shapes.facets.append((np.stack([lower[b], lower[a], corners[k]])[None], foot))
-        shapes.facets.append(
-            (np.stack([lower[arc[-1]], corners[k], corners[(k + 1) % 4]])[None], foot)
-        )
-
-    walls = [[i, (i + 1) % sides, sides + (i + 1) % sides, sides + i] for i in range(sides)]
-    caps = [list(range(sides)), list(range(sides, 2 * sides))]
-    for radius, z, paint in profile[1:]:
-        upper = ring(radius, z)
-        corners = np.concatenate([lower, upper])
-        shapes.facets += [(_fan(corners[wall]), paint) for wall in walls]
-        shapes.add_hull(corners, [*walls, *caps])
-        lower = upper
-    shapes.facets.append((_fan(lower), profile[-1][2]))
+            shapes.add_polygon(np.stack([rings[0][b], rings[0][a], corner]), foot)
+        shapes.add_polygon(np.stack([rings[0][arc[-1]], corner, following]), foot)
+    for (lower, upper), (_, _, paint) in zip(pairwise(rings), profile[1:]):
+        shapes.add_between(upper, lower, paint, shared=1)
+    shapes.add_polygon(rings[-1], profile[-1][2])
 
 
 def add_wire(shapes: Shapes, path: Array, radius: float, paint: int, sides: int = 4) -> None:
@@ -137,14 +162,9 @@ def add_wire(shapes: Shapes, path: Array, radius: float, paint: int, sides: int 
     across = np.cross(along / np.linalg.norm(along), [0.0, 0.0, 1.0])
     turn = 2 * np.pi * np.arange(sides) / sides
     ring = radius * (np.cos(turn)[:, None] * across + np.sin(turn)[:, None] * [0.0, 0.0, 1.0])
-    faces = [[i, sides + i, sides + (i + 1) % sides, (i + 1) % sides] for i in range(sides)]
-    caps = [list(range(sides)), list(range(sides, 2 * sides))]
     for a, b in pairwise(path):
-        corners = np.concatenate([a + ring, b + ring])
-        for face in faces:
-            shapes.add_polygon(corners[face], paint)
-        shapes.add_hull(corners, [*faces, *caps])
-    shapes.add_polygon((path[0] + ring), paint)
+        shapes.add_between(a + ring, b + ring, paint)
+    shapes.add_polygon(path[0] + ring, paint)
     shapes.add_polygon((path[-1] + ring)[::-1], paint)
 
 
@@ -153,24 +173,23 @@ def add_prism(
 ) -> None:
     """Adds a solid under a convex polygon [V, 3] (counter-clockwise from above) down to z = bottom.
 
-    `open_sides[i]` says whether the wall from corner i to i + 1 touches air (painted `side`).
+    `open_sides` is as of `Shapes.add_between`; those walls are painted `side`.
     """
-    count = len(top)
-    below = np.column_stack([top[:, :2], np.full(count, bottom)])
-    corners = np.concatenate([top, below])
-    walls = [[i, count + i, count + (i + 1) % count, (i + 1) % count] for i in range(count)]
+    below = np.column_stack([top[:, :2], np.full(len(top), bottom)])
     shapes.add_polygon(top, paint)
     shapes.add_polygon(below[::-1], side)
-    for wall, is_open in zip(walls, open_sides):
-        if is_open:
-            shapes.add_polygon(corners[wall], side)
-    shapes.add_hull(corners, [*walls, list(range(count)), list(range(count, 2 * count))])
+    shapes.add_between(top, below, side, open_sides)
 
 
-def _fan(polygon: Array) -> Array:
-    """A convex polygon [V, 3] as triangles [V - 2, 3, 3] of the same winding."""
-    first = np.broadcast_to(polygon[0], (len(polygon) - 2, 3))
-    return np.stack([first, polygon[1:-1], polygon[2:]], 1)
+class Stroke(NamedTuple):
+    """A rectangle of land at one height."""
+
+    bounds: Rectangle
+    top: float
+    """Metres."""
+    paint: int
+    covered: bool
+    """Whether its top is left to a roof."""
 
 
 @dataclass
@@ -180,55 +199,43 @@ class Canvas:
     The land is at height 0 along the canvas' border, so that canvases join without a wall.
     """
 
-    bounds: tuple[float, float, float, float]
-    """x0, x1, y0, y1 in metres."""
+    bounds: Rectangle
     paint: int
-    strokes: list[tuple[float, float, float, float, float, int, bool]] = field(default_factory=list)
+    strokes: list[Stroke] = field(default_factory=list)
 
-    def stroke(
-        self,
-        x0: float,
-        x1: float,
-        y0: float,
-        y1: float,
-        top: float,
-        paint: int,
-        covered: bool = False,
-    ) -> None:
-        """Raises or lowers a rectangle to `top` metres; `covered` leaves its top to a roof."""
-        x0, x1, y0, y1, top = (round(float(v), 2) for v in (x0, x1, y0, y1, top))
-        self.strokes.append((x0, x1, y0, y1, top, paint, covered))
+    def __post_init__(self) -> None:
+        self.bounds = rounded(self.bounds)
+
+    def stroke(self, bounds: Rectangle, top: float, paint: int, covered: bool = False) -> None:
+        """Raises or lowers a rectangle; arguments as of `Stroke`."""
+        self.strokes.append(Stroke(rounded(bounds), round(float(top), 2), paint, covered))
 
     def height(self, x: float, y: float) -> float:
         """The painted height at a point, in metres."""
-        for x0, x1, y0, y1, top, _, _ in reversed(self.strokes):
+        for (x0, x1, y0, y1), top, _, _ in reversed(self.strokes):
             if x0 <= x <= x1 and y0 <= y <= y1:
                 return top
         return 0.0
 
     def build(self, shapes: Shapes, depth: float) -> None:
         """Turns the strokes into columns standing `depth` metres deep, their tops and walls."""
-        ends = np.array([self.bounds] + [s[:4] for s in self.strokes])
+        ends = np.array([self.bounds, *(stroke.bounds for stroke in self.strokes)])
         xs, ys = np.unique(ends[:, :2]), np.unique(ends[:, 2:])
         height = np.zeros((len(xs) - 1, len(ys) - 1))
         paint = np.full(height.shape, self.paint)
         covered = np.zeros(height.shape, bool)
-        for x0, x1, y0, y1, top, number, hidden in self.strokes:
-            cells = np.s_[
-                np.searchsorted(xs, x0) : np.searchsorted(xs, x1),
-                np.searchsorted(ys, y0) : np.searchsorted(ys, y1),
-            ]
+        for (x0, x1, y0, y1), top, number, hidden in self.strokes:
+            i0, i1 = np.searchsorted(xs, [x0, x1])
+            j0, j1 = np.searchsorted(ys, [y0, y1])
+            cells = np.s_[i0:i1, j0:j1]
             height[cells], paint[cells], covered[cells] = top, number, hidden
 
         for i0, i1, j0, j1 in _equal_rectangles(height, paint, covered):
-            low, high = (
-                np.array([xs[i0], ys[j0], -depth]),
-                np.array([xs[i1], ys[j1], height[i0, j0]]),
-            )
-            shapes.boxes.append(np.stack([low, high]))
+            top = height[i0, j0]
+            low, high = [xs[i0], ys[j0]], [xs[i1], ys[j1], top]
+            shapes.boxes.append(np.array([[*low, -depth], high]))
             if not covered[i0, j0]:
-                face = np.stack([[low[0], low[1], high[2]], high])
-                shapes.rectangles.append((face, 1, int(paint[i0, j0])))
+                shapes.rectangles.append((np.array([[*low, top], high]), 1, int(paint[i0, j0])))
         _walls(shapes, xs, ys, height, paint, flip=False)
         _walls(shapes, ys, xs, height.T, paint.T, flip=True)
         x0, x1, y0, y1 = self.bounds
@@ -276,35 +283,29 @@ STOREY = 3.2
 
 
 class Material(IntEnum):
-    """How a face is coloured; `texture` gives each its pattern."""
+    """How a face is coloured; `render.paint_surface` gives each its pattern."""
 
     STREET, PAVEMENT, WALL, ROOF, TILES, GRASS, EARTH, LEAVES, METAL, TERRAIN = range(10)
 
 
-@dataclass
-class Palette:
-    """One row per painted thing: material, base colour (RGB in 0..1), anchor and window pitch."""
-
-    material: list[int] = field(default_factory=list)
-    colour: list[tuple[float, float, float]] = field(default_factory=list)
-    anchor: list[tuple[float, float, float]] = field(default_factory=list)
-    """Where the pattern starts, metres."""
-    pitch: list[tuple[float, float]] = field(default_factory=list)
-    """Spacing of the windows along x and along y, metres."""
+class Palette(list[tuple[Material, Colour, Colour, tuple[float, float]]]):
+    """The paints of a city, each with its material, base colour, anchor and window pitch."""
 
     def add(
         self,
         material: Material,
-        colour: tuple[float, float, float],
+        colour: Colour,
         anchor: tuple[float, float, float] = (0.0, 0.0, 0.0),
         pitch: tuple[float, float] = (3.0, 3.0),
     ) -> int:
-        """Returns the number of the new paint."""
-        self.material.append(int(material))
-        self.colour.append(colour)
-        self.anchor.append(anchor)
-        self.pitch.append(pitch)
-        return len(self.material) - 1
+        """Returns the number of the new paint.
+
+        Args:
+            anchor: where its pattern starts, metres.
+            pitch: spacing of the windows along x and along y, metres.
+        """
+        self.append((material, colour, anchor, pitch))
+        return len(self) - 1
 
 
 WALLS = [

@@ -6,6 +6,7 @@ nerfstudio moves and shrinks a scene before a model sees it: x_model = scale * (
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
@@ -33,11 +34,8 @@ class CityTruth:
 
     @classmethod
     def from_dataparser(cls, folder: Path | str, outputs: Any) -> CityTruth:
-        """From a city's folder and nerfstudio's `DataparserOutputs` for it.
-
-        Raises:
-            ValueError, OSError: the folder holds no city.
-        """
+        """From a city's folder and nerfstudio's `DataparserOutputs` for it. ValueError or OSError
+        if the folder holds no city."""
         folder = Path(folder)
         transform = outputs.dataparser_transform.double().cpu()
         if read_description(folder)["layout"] == "mega-nerf":
@@ -59,18 +57,20 @@ class CityTruth:
 
     def occupied(self, positions: Tensor) -> Tensor:
         """Whether model positions [..., 3] lie inside solid matter: bool [...]."""
-        metres = self.to_metres(positions)
-        inside = self.city.occupied(metres.reshape(-1, 3)).reshape(metres.shape[:-1])
-        return torch.from_numpy(inside).to(positions.device)
+        return self._ask(self.city.occupied, positions)
 
     def distance(self, positions: Tensor) -> Tensor:
         """Distance from model positions [..., 3] to the nearest surface, in metres: float32 [...].
 
         Times `scale`, it is in model units.
         """
+        return self._ask(self.city.distance, positions).float()
+
+    def _ask(self, question: Callable[[NDArray[Any]], NDArray[Any]], positions: Tensor) -> Tensor:
+        """What the city answers at model positions [..., 3]: [...]."""
         metres = self.to_metres(positions)
-        nearest = self.city.distance(metres.reshape(-1, 3)).reshape(metres.shape[:-1])
-        return torch.from_numpy(nearest).float().to(positions.device)
+        answers = question(metres.reshape(-1, 3)).reshape(metres.shape[:-1])
+        return torch.from_numpy(answers).to(positions.device)
 
     def visible_surface(self, split: Literal["train", "val", "test"] = "test") -> Tensor:
         """The surface point at the middle of each pixel of a split's pictures, where there is one.

@@ -24,10 +24,10 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from leco_plugin.scenes.city.shapes import Array
-from leco_plugin.scenes.derived_images import image_header
+from leco_plugin.scenes.frames import SKEW, distance_from_rotations
 from leco_plugin.scenes.input_error import InputError
 from leco_plugin.scenes.mega_nerf_format.pt_file import describe, read_pt
-from leco_plugin.scenes.rotations import distance_from_rotations
+from leco_plugin.scenes.photograph_files import open_image
 from leco_plugin.scenes.whole_files import write_whole
 
 Split = Literal["train", "val"]
@@ -128,8 +128,6 @@ class Frame:
     stem: str
     split: Split
     image: Path
-    mode: str
-    """How Pillow names the kind of its pixels."""
     image_size: tuple[int, int]
     """Width and height of the file; Mega-NeRF resizes it to `width` x `height`."""
     width: int
@@ -241,13 +239,13 @@ def read_frame(metadata: Path, image: Path) -> Frame:
     intrinsics = _numbers(metadata, values, "intrinsics", (4,))
     if intrinsics[:2].min() <= 0:
         raise InputError(f"{metadata}: a focal length in intrinsics is not above 0")
-    size, mode = image_header(image)
+    size = open_image(image, pixels=False).size
     if abs(size[0] * height - size[1] * width) > max(width, height):
         raise InputError(
             f"{image} has {size[0]} x {size[1]} pixels, its metadata are for {width} x {height}"
         )
     split: Split = "val" if metadata.parent.parent.name == "val" else "train"
-    return Frame(metadata.stem, split, image, mode, size, width, height, pose, intrinsics)
+    return Frame(metadata.stem, split, image, size, width, height, pose, intrinsics)
 
 
 def _read(path: Path, otherwise: str) -> dict[str, Any]:
@@ -268,9 +266,7 @@ def _read(path: Path, otherwise: str) -> dict[str, Any]:
 
 def _numbers(path: Path, values: dict[str, Any], name: str, shape: tuple[int, ...]) -> Array:
     """A finite tensor of a known shape, float64."""
-    if name not in values:
-        raise InputError(f"{path} has no {name}")
-    value, wanted = values[name], " x ".join(str(n) for n in shape)
+    value, wanted = _value(path, values, name), " x ".join(str(n) for n in shape)
     if not isinstance(value, torch.Tensor) or tuple(value.shape) != shape:
         raise InputError(f"{path}: {name} is {describe(value)}, and not {wanted} numbers")
     numbers: Array = value.detach().double().numpy().copy()
@@ -279,10 +275,14 @@ def _numbers(path: Path, values: dict[str, Any], name: str, shape: tuple[int, ..
     return numbers
 
 
-def _number(path: Path, values: dict[str, Any], name: str) -> float:
+def _value(path: Path, values: dict[str, Any], name: str) -> Any:
     if name not in values:
         raise InputError(f"{path} has no {name}")
-    value = values[name]
+    return values[name]
+
+
+def _number(path: Path, values: dict[str, Any], name: str) -> float:
+    value = _value(path, values, name)
     if isinstance(value, torch.Tensor) and value.numel() != 1:
         raise InputError(f"{path}: {name} is {describe(value)}, and not a number")
     try:
@@ -303,7 +303,7 @@ def _check_rotations(folder: Path, frames: list[Frame]) -> None:
     rotations = np.stack([frame.pose[:, :3] for frame in frames])
     errors = distance_from_rotations(rotations)
     worst = int(errors.argmax())
-    if errors[worst] <= 0.05:
+    if errors[worst] <= SKEW:
         return
     frame = frames[worst]
     metadata = folder / frame.split / "metadata" / f"{frame.stem}.pt"

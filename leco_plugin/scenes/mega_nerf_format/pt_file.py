@@ -25,9 +25,8 @@ class Refused(Exception):
 def read_pt(path: Path, most_bytes: int = 1 << 20) -> Any:
     """What a .pt file holds.
 
-    Raises:
-        InputError: one line; it cannot be read, is damaged, is larger than `most_bytes`, or holds
-            anything but tensors, numbers, strings and containers of them.
+    InputError if it cannot be read, is damaged, is larger than `most_bytes`, or holds anything but
+    tensors, numbers, strings and containers of them.
     """
     return load(read_bytes(path, most_bytes), str(path))
 
@@ -56,8 +55,8 @@ def load(data: bytes, name: str) -> Any:
     except Refused as refusal:
         raise InputError(f"{name} {refusal}") from None
     except pickle.UnpicklingError as error:  # torch advises to trust the file
-        found = re.search(r"GLOBAL ([\w.]+)", str(error))
-        what = found[1] if found else "more than that"
+        found = re.search(r"GLOBAL ([\w.]+)|<class '([\w.]+)'>", str(error))
+        what = found[found.lastindex or 0] if found else "more than that"
         raise InputError(f"{name} holds {what}, and only tensors and numbers are read") from None
     # Damaged archives and pickles raise whatever their readers meet; nothing of it is a new fault.
     except Exception as error:  # noqa: BLE001

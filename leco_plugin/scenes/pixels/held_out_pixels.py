@@ -50,11 +50,7 @@ def sizes_of(pictures: Any) -> Tensor:
 
 
 def some_images(dataset: Any, most: int = 16) -> dict[str, Any]:
-    """A batch of up to so many images, spread evenly, decoded for the occasion.
-
-    Args:
-        dataset: nerfstudio's `InputDataset`.
-    """
+    """A batch of up to so many images of nerfstudio's `InputDataset`, spread evenly."""
     chosen = torch.linspace(0, len(dataset) - 1, min(most, len(dataset))).long().unique()
     read = [dataset.get_data(number) for number in chosen.tolist()]
     images = {key: [data[key] for data in read] for key in ("image", "mask") if key in read[0]}
@@ -120,10 +116,7 @@ class HeldOutPixelSampler(PixelSampler):
         device: torch.device | str,
     ) -> Tensor:
         """Pixels [N, 3] int64 of a mask [P, H, W, 1]; nerfstudio's own cannot sample one image.
-
-        Raises:
-            InputError: the mask leaves no pixel.
-        """
+        InputError if the mask leaves none."""
         seen = mask.reshape(num_images, image_height, image_width).bool()
         sizes = torch.tensor([num_images, image_height, image_width], device=device)
         indices = (torch.rand((num_samples, 3), device=device) * sizes).long()

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
+from nerfstudio.cameras.cameras import Cameras, CameraType
+from torch import Tensor
 
 from leco_plugin.scenes.pixels.held_out_pixels import (
     HeldOutPixelSampler,
@@ -13,7 +16,110 @@ from leco_plugin.scenes.pixels.held_out_pixels import (
     look_up,
     sizes_of,
 )
-from leco_plugin.scenes.pixels.sparse_pixels import SparsePixels
+from leco_plugin.scenes.pixels.lattice import Lattice
+
+NEARER = 0.9
+"""A point hides its neighbours in the image that are farther than it by more than this factor."""
+POINTS_PER_CELL = 2.0
+"""Points that share a cell of the coarse depth map, on average."""
+FEWEST_POINTS = 32
+MOST_POINTS = 50_000
+"""Of a larger cloud so many points are drawn: 5 ms for each image."""
+MOST_PIXELS = 4_000_000
+"""Of all images together: about 110 MB."""
+
+
+class SparsePixels(NamedTuple):
+    """Pixels with known distances, sorted by image."""
+
+    indices: Tensor
+    """[K, 3] int64: image, row, column."""
+    distances: Tensor
+    """[K] float32 along the unit ray, scene units."""
+
+
+def sparse_pixels(cameras: Cameras, points: Tensor, lattice: Lattice) -> SparsePixels:
+    """Projects sparse points into the cameras and keeps what is seen; held-out pixels are left out.
+
+    Args:
+        cameras: of the training images, poses in scene units. Only perspective cameras are used.
+        points: [P, 3] in the same coordinates.
+        lattice: of the held-out pixels.
+    """
+    cameras = cameras.to("cpu")
+    points = _at_most(MOST_POINTS, points.detach().float().cpu())
+    for_each_image = MOST_PIXELS // max(len(cameras), 1)
+    indices, distances = [torch.zeros(0, 3, dtype=torch.long)], [torch.zeros(0)]
+    for number in range(len(cameras) if len(points) >= FEWEST_POINTS else 0):
+        if int(cameras.camera_type[number]) != CameraType.PERSPECTIVE.value:
+            continue
+        pixels, lengths = project(cameras, number, points)
+        height, width = int(cameras.height[number]), int(cameras.width[number])
+        inside = (pixels >= 0).all(dim=-1) & (lengths > 0)
+        inside &= (pixels[:, 0] < height) & (pixels[:, 1] < width)
+        pixels, lengths = pixels[inside].long(), lengths[inside]
+        seen = ~hidden(pixels, lengths, height, width)
+        found = torch.cat([torch.full((len(pixels), 1), number), pixels], dim=-1)
+        seen &= ~lattice.holds_out(found)
+        chosen = _at_most(for_each_image, seen.nonzero()[:, 0])
+        indices.append(found[chosen])
+        distances.append(lengths[chosen])
+    return SparsePixels(torch.cat(indices), torch.cat(distances))
+
+
+def _at_most(most: int, rows: Tensor) -> Tensor:
+    """The rows, or so many of them, drawn evenly and always the same."""
+    if len(rows) <= most:
+        return rows
+    return rows[torch.randperm(len(rows), generator=torch.Generator().manual_seed(0))[:most]]
+
+
+def project(cameras: Cameras, number: int, points: Tensor) -> tuple[Tensor, Tensor]:
+    """Image places of points [P, 2] (row, column; whole numbers are the upper left corners of
+    pixels), and their distances [P], scene units, negative behind the camera.
+    """
+    pose = cameras.camera_to_worlds[number]
+    local = (points - pose[:, 3]) @ pose[:, :3]
+    ahead = -local[:, 2]
+    x, y = (local[:, :2] / ahead.clamp(min=1e-9)[:, None]).unbind(dim=-1)
+    y = -y
+    if cameras.distortion_params is not None:
+        x, y = distort(x, y, cameras.distortion_params[number])
+    rows = cameras.cy[number] + cameras.fy[number] * y
+    columns = cameras.cx[number] + cameras.fx[number] * x
+    lengths = local.norm(dim=-1)
+    return torch.stack([rows, columns], dim=-1), torch.where(ahead > 0, lengths, -lengths)
+
+
+def distort(x: Tensor, y: Tensor, params: Tensor) -> tuple[Tensor, Tensor]:
+    """Radial and tangential distortion of normalised image places (OpenCV: k1 k2 k3 k4 p1 p2).
+
+    The polynomial is meant for the field of view only; far outside of it places are left unbent.
+    """
+    k1, k2, k3, k4, p1, p2 = params.tolist()
+    r = x * x + y * y
+    radial = 1.0 + r * (k1 + r * (k2 + r * (k3 + r * k4)))
+    bent_x = x * radial + 2.0 * p1 * x * y + p2 * (r + 2.0 * x * x)
+    bent_y = y * radial + 2.0 * p2 * x * y + p1 * (r + 2.0 * y * y)
+    near = r < 4.0
+    return torch.where(near, bent_x, x), torch.where(near, bent_y, y)
+
+
+def hidden(pixels: Tensor, lengths: Tensor, height: int, width: int) -> Tensor:
+    """Which points of one image lie plainly behind a neighbour there: bool [P].
+
+    Args:
+        pixels: [P, 2] int64, row and column.
+        lengths: [P] distances.
+    """
+    cell = max(1, round(math.sqrt(POINTS_PER_CELL * height * width / max(len(pixels), 1))))
+    rows, columns = -(-height // cell), -(-width // cell)
+    places = pixels[:, 0] // cell * columns + pixels[:, 1] // cell
+    nearest = torch.full((rows * columns,), torch.inf)
+    nearest.scatter_reduce_(0, places, lengths, "amin")
+    around = -torch.nn.functional.max_pool2d(-nearest.view(1, 1, rows, columns), 3, 1, 1)
+    return around.flatten()[places] < NEARER * lengths
+
 
 DISTANCE = "known_distance"
 """Key of a batch: [N] float32 along the unit ray, scene units, 0 where it is not known."""

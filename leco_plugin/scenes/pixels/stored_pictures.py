@@ -9,13 +9,13 @@ from __future__ import annotations
 import hashlib
 import os
 from collections.abc import Iterable
-from functools import partial
 from itertools import groupby
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from leco_plugin.log import bar
@@ -58,14 +58,8 @@ class StoredPictures:
         return torch.stack([which, rows, columns], dim=-1)
 
     def read(self, which: Tensor, places: Tensor) -> Tensor:
-        """Values of pixels: [K, C] float32 in [0, 1].
-
-        Args:
-            which: [K] int64 pictures.
-            places: [K, 2] int64 rows and columns.
-        Raises:
-            InputError: a file is shorter than its picture.
-        """
+        """Values [K, C] float32 in [0, 1] of pixels of pictures [K] at places [K, 2] (row, column),
+        int64. InputError if a file is shorter than its picture."""
         offsets = (places[:, 0] * self.sizes[which, 1] + places[:, 1]) * self.channels
         found = np.empty((len(which), self.channels), dtype=np.uint8)
         order = which.argsort(stable=True).tolist()
@@ -137,19 +131,17 @@ def _decode(dataset: Any, number: int, size: list[int], files: dict[str, list[Pa
         )
     for kind, made in files.items():
         values = data[kind].numpy()
-        bytes_of = (values > 0).astype(np.uint8) * 255 if kind == "mask" else values
-        raw = np.ascontiguousarray(bytes_of).tobytes()
-        try:
-            write_whole(made[number], partial(_write, raw))
-        except OSError as error:
-            raise InputError(
-                f"decoded photographs cannot be written to {made[number].parent} "
-                f"({error.strerror}); give another folder with --pipeline.datamanager.pixels"
-            ) from None
+        _write(made[number], (values > 0).astype(np.uint8) * 255 if kind == "mask" else values)
 
 
-def _write(raw: bytes, file: BinaryIO) -> None:
-    file.write(raw)
+def _write(path: Path, values: NDArray[np.uint8]) -> None:
+    try:
+        write_whole(path, lambda file: file.write(values.tobytes()))
+    except OSError as error:
+        raise InputError(
+            f"decoded photographs cannot be written to {path.parent} "
+            f"({error.strerror}); give another folder with --pipeline.datamanager.pixels"
+        ) from None
 
 
 def _channels(files: list[Path], pixels: list[int]) -> int:

@@ -18,8 +18,7 @@ import trimesh
 from PIL import Image
 
 from leco_plugin.scenes.city.city import City, CityConfig
-from leco_plugin.scenes.city.folder import CaptureConfig, count_pictures, write_city
-from leco_plugin.scenes.city.layouts import LayoutName
+from leco_plugin.scenes.city.folder import CaptureConfig, LayoutName, count_pictures, write_city
 from leco_plugin.scenes.city.render import Tracer
 
 CITY = CityConfig(blocks=1, seed=3, sky=True)

@@ -12,16 +12,8 @@ from leco_plugin.scenes.city.queries import squared_to_triangles
 
 def distance_by_looking_at_all(city: City, points: np.ndarray) -> np.ndarray:
     """The slow twin: each of points [N, 3] against every triangle the rays are cast at."""
-    return np.array(
-        [
-            np.sqrt(
-                squared_to_triangles(
-                    np.broadcast_to(p, (len(city.triangles), 3)), city.triangles
-                ).min()
-            )
-            for p in points
-        ]
-    )
+    repeated = (np.broadcast_to(point, (len(city.triangles), 3)) for point in points)
+    return np.sqrt([squared_to_triangles(each, city.triangles).min() for each in repeated])
 
 
 @settings(max_examples=8, deadline=None)

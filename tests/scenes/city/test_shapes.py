@@ -15,7 +15,7 @@ def painted(strokes: list[tuple[int, int, int, int, int]]) -> tuple[Shapes, np.n
     canvas, heights = Canvas((0, 10, 0, 10), paint=0), np.zeros((10, 10))
     for number, (a, b, c, d, top) in enumerate(strokes):
         x0, x1, y0, y1 = min(a, b), max(a, b) + 1, min(c, d), max(c, d) + 1
-        canvas.stroke(x0, x1, y0, y1, top, number + 1)
+        canvas.stroke((x0, x1, y0, y1), top, number + 1)
         heights[x0:x1, y0:y1] = top
     shapes = Shapes()
     canvas.build(shapes, depth=2.0)
@@ -38,13 +38,10 @@ def test_columns_tops_and_walls_add_up_to_the_height_field(strokes: list) -> Non
 
 def test_a_covered_stroke_leaves_its_top_to_a_roof() -> None:
     canvas, shapes = Canvas((0, 10, 0, 10), paint=0), Shapes()
-    canvas.stroke(2, 5, 2, 6, 3.0, paint=1, covered=True)
+    canvas.stroke((2, 5, 2, 6), 3.0, paint=1, covered=True)
     assert canvas.height(3, 3) == 3.0
     assert canvas.height(8, 8) == 0.0
     canvas.build(shapes, depth=1.0)
-    tops = [
-        face
-        for face, direction, _ in shapes.rectangles
-        if np.ptp(face[:, 2]) == 0 and direction > 0
-    ]
-    assert sum(np.prod(np.ptp(face, axis=0)[:2]) for face in tops) == 100 - 12
+    upward = (face for face, direction, _ in shapes.rectangles if direction > 0)
+    tops = (np.ptp(face, axis=0) for face in upward)
+    assert sum(np.prod(size[:2]) for size in tops if size[2] == 0) == 100 - 12

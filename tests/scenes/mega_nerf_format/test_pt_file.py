@@ -14,6 +14,8 @@ from pathlib import Path, PosixPath
 import numpy as np
 import pytest
 import torch
+from mega_nerf_scene import rebuilt, saved, zipped
+from scene_files import refused
 
 from leco_plugin.scenes.input_error import InputError
 from leco_plugin.scenes.mega_nerf_format.pt_file import load, read_pt
@@ -28,25 +30,6 @@ VALUES = {
     "scale": 0.5,
     "flag": True,
 }
-
-
-def saved(value: object, **options: object) -> bytes:
-    file = io.BytesIO()
-    torch.save(value, file, **options)
-    return file.getvalue()
-
-
-def rebuilt(data: bytes, old: bytes, new: bytes) -> bytes:
-    """The same archive with something replaced in its pickle."""
-    file = io.BytesIO()
-    with zipfile.ZipFile(io.BytesIO(data)) as source, zipfile.ZipFile(file, "w") as target:
-        for entry in source.infolist():
-            record = source.read(entry)
-            if entry.filename.endswith("data.pkl"):
-                assert old in record
-                record = record.replace(old, new)
-            target.writestr(entry.filename, record)
-    return file.getvalue()
 
 
 def refusal(data: bytes) -> str:
@@ -137,7 +120,11 @@ MAPPING = b"ccollections\nOrderedDict\n"
     ],
 )
 def test_a_tensor_is_believed_only_as_far_as_its_bytes(old: bytes, new: bytes) -> None:
-    assert "is damaged" in refusal(rebuilt(saved(torch.zeros(12)), old, new))
+    def replace(pickled: bytes) -> bytes:
+        assert old in pickled
+        return pickled.replace(old, new)
+
+    assert "is damaged" in refusal(rebuilt(saved(torch.zeros(12)), replace))
 
 
 SLOW_KEY = b"}K\x01\x85q\x00" + b"h\x00h\x00\x86q\x00" * 60
@@ -160,11 +147,9 @@ SLOW_KEY = b"}K\x01\x85q\x00" + b"h\x00h\x00\x86q\x00" * 60
     ids=map(str, range(9)),
 )
 def test_a_strange_pickle_is_refused_at_once(pickled: bytes, reason: str) -> None:
-    whole = saved({"H": 1})
-    with zipfile.ZipFile(io.BytesIO(whole)) as archive:
-        old = archive.read("archive/data.pkl")
+    data = rebuilt(saved({"H": 1}), lambda _: pickled)
     began = time.thread_time()
-    assert re.search(reason, refusal(rebuilt(whole, old, pickled)))
+    assert re.search(reason, refusal(data))
     assert time.thread_time() - began < 2
 
 
@@ -178,10 +163,7 @@ def test_a_compressed_archive_is_refused_before_it_is_unpacked() -> None:
 
 
 def test_a_zip_of_something_else_is_named() -> None:
-    file = io.BytesIO()
-    with zipfile.ZipFile(file, "w") as archive:
-        archive.writestr("holiday.txt", "sun")
-    assert "is a zip, but not one of torch.save" in refusal(file.getvalue())
+    assert "is a zip, but not one of torch.save" in refusal(zipped(b"sun", "holiday.txt"))
 
 
 def test_files_that_cannot_be_read_are_named(tmp_path: Path) -> None:
@@ -193,5 +175,5 @@ def test_files_that_cannot_be_read_are_named(tmp_path: Path) -> None:
         ("pipe.pt", "no file"),
         (".", "no file"),
     ):
-        with pytest.raises(InputError, match=reason):
+        with refused(reason):
             read_pt(tmp_path / name, 1000)

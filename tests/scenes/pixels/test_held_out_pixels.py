@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import pytest
 import torch
+from scene_files import refused
 
-from leco_plugin.scenes.input_error import InputError
 from leco_plugin.scenes.pixels import held_out_pixels
 from leco_plugin.scenes.pixels.held_out_pixels import (
     HeldOutPixelSampler,
@@ -174,7 +174,7 @@ def test_a_mask_is_sampled_evenly() -> None:
 
 
 def test_a_mask_without_a_pixel_is_an_input_error() -> None:
-    with pytest.raises(InputError, match="leave no pixel"):
+    with refused("leave no pixel"):
         sampler().rejection_sample_mask(torch.zeros(1, 4, 4, 1), 3, 1, 4, 4, "cpu")
 
 
@@ -192,9 +192,8 @@ def test_nothing_is_drawn_outside_of_what_a_fisheye_shows(kind: str) -> None:
     made.set_num_rays_per_batch(6000)
     torch.manual_seed(0)
     trained = made.sample(dict(batch))["image"].long()
-    assert bool(
-        inside_circle(trained, sizes, 12.5).all()
-    )  # nerfstudio's middle is half a pixel off
+    # nerfstudio's middle is half a pixel off
+    assert bool(inside_circle(trained, sizes, 12.5).all())
     assert not bool(THIN.holds_out(trained).any())
     seen = batch["mask"][..., 0].long() if "mask" in batch else torch.ones(3, 40, 39).long()
     area = 3.14159 * 12.0**2 * 3 * float(seen.float().mean())
@@ -206,9 +205,7 @@ def test_nothing_is_drawn_outside_of_what_a_fisheye_shows(kind: str) -> None:
 
 def test_a_circle_that_shows_nothing_is_one_line() -> None:
     made = sampler(fisheye_crop_radius=0.5)
-    with pytest.raises(
-        InputError, match=r"a fisheye_crop_radius of 0\.5 pixels shows next to nothing"
-    ):
+    with refused(r"a fisheye_crop_radius of 0\.5 pixels shows next to nothing"):
         made.sample(images())
 
 

@@ -12,8 +12,8 @@ from nerfstudio.cameras.cameras import Cameras
 from nerfstudio.data.dataparsers.base_dataparser import DataparserOutputs
 from nerfstudio.data.datasets.base_dataset import InputDataset
 from PIL import Image
+from scene_files import IMAGES_STAY_OPEN, refused
 
-from leco_plugin.scenes.input_error import InputError
 from leco_plugin.scenes.pixels.held_out_pixels import (
     HeldOutPixelSampler,
     HeldOutPixelSamplerConfig,
@@ -24,11 +24,7 @@ from leco_plugin.scenes.pixels.stored_pictures import store_pictures
 
 SIZES = [(30, 40), (24, 36), (50, 20)]
 
-# nerfstudio leaves images open that it has read
-pytestmark = [
-    pytest.mark.filterwarnings("ignore:unclosed file:ResourceWarning"),
-    pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning"),
-]
+pytestmark = IMAGES_STAY_OPEN
 
 
 def write(folder: Path, masked: bool = False, channels: int = 3) -> InputDataset:
@@ -37,9 +33,8 @@ def write(folder: Path, masked: bool = False, channels: int = 3) -> InputDataset
     images, masks = [], []
     for number, (height, width) in enumerate(SIZES):
         path = folder / f"{number}.png"
-        Image.fromarray(random.integers(0, 256, (height, width, channels), dtype=np.uint8)).save(
-            path
-        )
+        noise = random.integers(0, 256, (height, width, channels), dtype=np.uint8)
+        Image.fromarray(noise).save(path)
         images.append(path)
         mask = np.zeros((height, width), dtype=np.uint8)
         mask[:, : width // 2] = 255
@@ -135,11 +130,10 @@ def test_a_photograph_is_decoded_once_and_again_when_it_has_changed(tmp_path: Pa
 def test_what_cannot_be_stored_is_said_in_one_line(tmp_path: Path) -> None:
     dataset = write(tmp_path)
     (tmp_path / "file").write_text("")
-    with pytest.raises(InputError, match=r"--pipeline\.datamanager\.pixels") as caught:
+    with refused(r"--pipeline\.datamanager\.pixels"):
         store_pictures(dataset, tmp_path / "file" / "pixels")
-    assert "\n" not in str(caught.value)
     dataset.cameras.width[1] += 1
-    with pytest.raises(InputError, match=r"1\.png has 36 x 24 pixels, its camera 37 x 24"):
+    with refused(r"1\.png has 36 x 24 pixels, its camera 37 x 24"):
         store_pictures(dataset, tmp_path / "pixels")
 
 
@@ -147,7 +141,7 @@ def test_a_damaged_file_is_noticed(tmp_path: Path) -> None:
     dataset = write(tmp_path)
     stored = store_pictures(dataset, tmp_path / "pixels")["image"]
     stored.files[0].write_bytes(b"short")
-    with pytest.raises(InputError, match="damaged"):
+    with refused("damaged"):
         store_pictures(dataset, tmp_path / "pixels")
 
 
@@ -156,15 +150,5 @@ def test_a_file_cut_off_while_a_run_goes_on_is_one_line(tmp_path: Path) -> None:
     stored.files[1].write_bytes(stored.files[1].read_bytes()[:-2])
     last = torch.tensor([[23, 35]])
     assert stored.read(torch.tensor([0]), torch.tensor([[29, 39]])).shape == (1, 3)
-    with pytest.raises(InputError, match="is cut off"):
+    with refused("is cut off"):
         stored.read(torch.tensor([1]), last)
-
-
-def test_many_pixels_in_any_order_are_read_in_that_order(tmp_path: Path) -> None:
-    dataset = write(tmp_path)
-    stored = store_pictures(dataset, tmp_path / "pixels")["image"]
-    drawn = stored.draw(500)
-    found = stored.read(drawn[:, 0], drawn[:, 1:])
-    images = [dataset.get_image_float32(number) for number in range(len(SIZES))]
-    wanted = torch.stack([images[n][row, column] for n, row, column in drawn.tolist()])
-    torch.testing.assert_close(found, wanted)

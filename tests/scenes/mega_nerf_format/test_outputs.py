@@ -1,19 +1,22 @@
-"""Pictures and masks in the size and the part that the protocol asks for."""
+"""Pictures and masks in the size and the part that the protocol asks for, or refused by name."""
 
 from __future__ import annotations
 
 import dataclasses
+import zipfile
 from pathlib import Path
 
 import mega_nerf_scene
 import numpy as np
 import pytest
+import torch
+from mega_nerf_scene import pack, write_mask, zipped
 from PIL import Image
+from scene_files import refused
 
-from leco_plugin.scenes.derived_images import DerivedImages, open_image
-from leco_plugin.scenes.input_error import InputError
 from leco_plugin.scenes.mega_nerf_format.files import Frame, read_scene
-from leco_plugin.scenes.mega_nerf_format.images import mask_of, picture_of, scaled
+from leco_plugin.scenes.mega_nerf_format.outputs import mask_of, picture_of, read_mask, scaled
+from leco_plugin.scenes.photograph_files import DerivedImages, open_image
 
 
 @pytest.fixture(scope="module")
@@ -64,16 +67,16 @@ def test_other_kinds_of_pixels_become_colours(
     for mode, channels in (("P", 3), ("LA", 4), ("CMYK", 3)):
         path = tmp_path / f"{mode}.{'jpg' if mode == 'CMYK' else 'png'}"
         whole.convert(mode).save(path)
-        other = dataclasses.replace(frame, image=path, mode=mode)
+        other = dataclasses.replace(frame, image=path)
         assert pixels(picture_of(other, 1, False, derived)).shape == (16, 24, channels)
 
 
 def test_factors_that_do_not_divide_or_enlarge_are_refused(frame: Frame) -> None:
-    with pytest.raises(InputError, match="scale factor of 5 does not divide"):
+    with refused("scale factor of 5 does not divide"):
         scaled(frame, 5)
     small = dataclasses.replace(frame, image_size=(6, 4))
     assert scaled(small, 4) == (6, 4)
-    with pytest.raises(InputError, match=r"fewer than the 12 x 8 .* larger scale factor"):
+    with refused(r"fewer than the 12 x 8 .* larger scale factor"):
         scaled(small, 2)
 
 
@@ -103,5 +106,64 @@ def test_a_mask_that_keeps_nothing_is_none(scene: Path, derived: DerivedImages) 
 
 
 def test_a_missing_mask_is_named(frame: Frame, derived: DerivedImages, tmp_path: Path) -> None:
-    with pytest.raises(InputError, match=r"000002\.pt: each picture needs a mask"):
+    with refused(r"000002\.pt: each picture needs a mask"):
         mask_of(frame, 1, False, tmp_path, derived)
+
+
+KEEP = np.random.default_rng(0).random((6, 9)) < 0.5
+
+
+def test_a_mask_comes_back_as_it_was_written(tmp_path: Path) -> None:
+    write_mask(tmp_path, "a", KEEP)
+    np.testing.assert_array_equal(read_mask(tmp_path / "a.pt", 9, 6), KEEP)
+
+
+def test_a_mask_of_another_size_is_named(tmp_path: Path) -> None:
+    write_mask(tmp_path, "a", KEEP)
+    with refused(r"a\.pt is a mask of 9 x 6 pixels, its picture has 6 x 9"):
+        read_mask(tmp_path / "a.pt", 6, 9)
+
+
+@pytest.mark.parametrize(
+    ("value", "reason"),
+    [
+        (torch.ones(6, 9), "a tensor of float32, 6 x 9"),
+        (torch.ones(6, 9, 1, dtype=torch.bool), "a tensor of bool, 6 x 9 x 1"),
+        ({"mask": torch.ones(6, 9, dtype=torch.bool)}, "a value of type dict"),
+    ],
+)
+def test_what_is_no_mask_is_named(value: object, reason: str, tmp_path: Path) -> None:
+    with refused(reason):
+        read_mask(pack(tmp_path / "a.pt", value), 9, 6)
+
+
+def test_a_zip_without_the_mask_and_a_bare_pt_are_named(tmp_path: Path) -> None:
+    pack(tmp_path / "a.pt", torch.from_numpy(KEEP), "b.pt")
+    torch.save(torch.from_numpy(KEEP), tmp_path / "c.pt")
+    for name in "ac":
+        with refused(f"is a zip without {name}.pt"):
+            read_mask(tmp_path / f"{name}.pt", 9, 6)
+
+
+def test_a_zip_bomb_is_not_unpacked(tmp_path: Path) -> None:
+    (tmp_path / "a.pt").write_bytes(zipped(bytes(60_000_000), "a.pt", zipfile.ZIP_DEFLATED))
+    assert (tmp_path / "a.pt").stat().st_size < 100_000
+    with refused(r"a\.pt unpacks to more than"):
+        read_mask(tmp_path / "a.pt", 300, 200)
+
+
+def test_other_compressions_and_large_files_are_refused(tmp_path: Path) -> None:
+    pack(tmp_path / "a.pt", torch.from_numpy(KEEP), compression=zipfile.ZIP_BZIP2)
+    with refused("does not use"):
+        read_mask(tmp_path / "a.pt", 9, 6)
+    (tmp_path / "a.pt").write_bytes(bytes(1 << 20))
+    with refused("needs no more than"):
+        read_mask(tmp_path / "a.pt", 9, 6)
+
+
+def test_no_mask_and_a_damaged_one_are_named(tmp_path: Path) -> None:
+    with refused("no file"):
+        read_mask(tmp_path / "a.pt", 9, 6)
+    (tmp_path / "a.pt").write_bytes(b"PK\x03\x04")
+    with refused("is not a zip with a mask"):
+        read_mask(tmp_path / "a.pt", 9, 6)

@@ -1,4 +1,4 @@
-"""Our samplers keep the rules that we ask of others'."""
+"""Our samplers and guided methods keep the rules that we ask of others', in the sizes in use."""
 
 from __future__ import annotations
 
@@ -6,35 +6,45 @@ import nerfacc
 import pytest
 from nerfstudio.model_components.ray_samplers import ProposalNetworkSampler
 
-from leco_plugin.conformance.cases import SAMPLER_RULES, cases_of, pairs, sampler_cases
-from leco_plugin.conformance.rules import apply
+from leco_plugin.conformance.cases import (
+    HOST_RULES,
+    SAMPLER_RULES,
+    cases_of,
+    check,
+    host_cases,
+    pairs,
+    sampler_cases,
+)
+from leco_plugin.conformance.rules import Case, Rule, Verdict, apply
 from leco_plugin.samplers import nerfacc_cpu, registry
 from leco_plugin.samplers.proposal import LearnedOccupancySampler
 from leco_plugin.samplers.registry import SamplerSpec
+from leco_plugin.scenes.input_error import InputError
+
+
+def kept(cases: list[Case], rules: tuple[Rule, ...] = SAMPLER_RULES) -> list[Verdict]:
+    """The verdicts on cases, which keep all rules."""
+    verdicts = [apply(rule, case) for rule, case in pairs(cases, rules)]
+    assert [verdict.line() for verdict in verdicts if not verdict.passed] == []
+    return verdicts
 
 
 @pytest.mark.slow  # `learned-occupancy` builds cell caches, also in two processes
-@pytest.mark.parametrize("seam", ["estimator", "proposal"])
-def test_the_learned_occupancy_keeps_every_rule(seam):
+@pytest.mark.parametrize(("seam", "rules"), [("estimator", 14), ("proposal", 12)])
+def test_the_learned_occupancy_keeps_every_rule(seam, rules):
     cases = [case for case in sampler_cases("learned-occupancy") if case.seam == seam]
-    verdicts = [apply(rule, case) for rule, case in pairs(cases, SAMPLER_RULES)]
-    assert [verdict.line() for verdict in verdicts if not verdict.passed] == []
-    assert len(verdicts) == {"estimator": 14, "proposal": 12}[seam]
+    assert len(kept(cases)) == rules
 
 
 @pytest.mark.parametrize("name", ["dense", "occupancy-grid"])
 def test_the_baselines_keep_every_rule(name):
-    found = pairs(sampler_cases(name), SAMPLER_RULES)
-    verdicts = [apply(rule, case) for rule, case in found]
-    assert [verdict.line() for verdict in verdicts if not verdict.passed] == []
-    assert {verdict.seam for verdict in verdicts} == {"estimator"}
+    assert {verdict.seam for verdict in kept(sampler_cases(name))} == {"estimator"}
 
 
 @pytest.mark.parametrize("features", ["hash", "vm", "k-planes"])
 def test_a_gate_on_other_features_is_known_too(features):
     (case, _) = sampler_cases(f"learned-occupancy-{features}")
-    rules = [rule for rule in SAMPLER_RULES if rule.name == "skips-only-what-it-may"]
-    assert [apply(rule, case).problem for rule in rules] == [""]
+    kept([case], tuple(rule for rule in SAMPLER_RULES if rule.name == "skips-only-what-it-may"))
 
 
 def nerfaccs_grid(aabb, occupancy):
@@ -57,9 +67,10 @@ def nerfstudios_proposals(**_):
 def test_those_whose_places_are_taken_keep_the_rules_too(spec, monkeypatch):
     monkeypatch.setitem(registry.OURS, "stock", spec)
     rules = tuple(rule for rule in SAMPLER_RULES if rule.name != "two-processes")
-    verdicts = [apply(rule, case) for rule, case in pairs(sampler_cases("stock"), rules)]
-    nerfacc_cpu.uninstall()
-    assert [verdict.line() for verdict in verdicts if not verdict.passed] == []
+    try:
+        kept(sampler_cases("stock"), rules)
+    finally:
+        nerfacc_cpu.uninstall()
 
 
 def test_rules_have_names_of_their_own_and_say_why_and_what_to_do():
@@ -99,3 +110,29 @@ def test_a_sampler_that_serves_no_seam_is_refused(monkeypatch):
         sampler_cases("hollow")
     with pytest.raises(ValueError, match="no sampler 'hollov'"):
         sampler_cases("hollov")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["leco-ngp", "leco-nerfacto", "leco-switch-nerf", "switch-nerf"])
+def test_our_hosts_keep_every_rule(name: str) -> None:
+    verdicts = list(check(name))
+    assert [verdict.line() for verdict in verdicts if not verdict.passed] == []
+    assert [verdict.rule for verdict in verdicts] == list(HOST_RULES)
+
+
+def test_what_learns_the_occupancy_is_no_host() -> None:
+    with pytest.raises(InputError, match=r"leco-occupancy is no host: .* Check a guided method"):
+        host_cases("leco-occupancy")
+
+
+def test_a_method_without_a_seam_is_told_what_was_looked_for() -> None:
+    with pytest.raises(InputError, match=r"no sampler that could be swapped.*HostAdapter"):
+        host_cases("vanilla-nerf")
+
+
+def test_a_case_goes_back_to_its_own_coordinates() -> None:
+    (case,) = host_cases("leco-switch-nerf")
+    (rule,) = (rule for rule in HOST_RULES if rule.name == "shades-only-what-is-kept")
+    assert apply(rule, case).problem == ""
+    assert not case.shared(moved=True).leco_guide.same_frame()
+    assert case.shared().leco_guide.same_frame()

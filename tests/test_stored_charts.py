@@ -1,0 +1,248 @@
+"""What pages show of stored charts: sections, answers, the README's tables; of results made up."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import answers
+import chart_sections as sections
+import pytest
+import readme_parts as parts
+from chart_results import occupancy, results, run
+from results_page import sampling_section
+
+STEPS = {"protocol": {"seconds": None, "steps": 400}}
+
+Store = Callable[..., None]
+
+
+@pytest.fixture(autouse=True)
+def store(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Store:
+    """Stores results of a suite on a scene, where before there are none."""
+    monkeypatch.setattr(sections, "RESULTS", tmp_path)
+    monkeypatch.setattr(sections, "CHARTS", tmp_path / "charts")
+    (tmp_path / "charts.json").write_text("{}")
+    (tmp_path / "charts").mkdir()
+
+    def write(suite: str | None, scene: str, *runs: dict[str, Any], **changes: Any) -> None:
+        made = results(*runs, suite=suite, scene={"name": scene}, **changes)
+        name = f"{scene}-{suite}" if suite else scene
+        (tmp_path / "charts" / f"{name}.json").write_text(json.dumps(made))
+
+    return write
+
+
+def answered() -> str:
+    return "\n".join(answers.answers_section())
+
+
+def representations(other_seconds: float, grid_kept: tuple[float, ...] = (0.3,)) -> list[Any]:
+    """Runs of our gate, grids from its field, and of a larger gate, for each seed."""
+    runs = []
+    for seed, kept in enumerate(grid_kept):
+        grid = {"resolution": 64, "bytes": 32768, "update_seconds": 2.0}
+        held = occupancy(50_000, 0.125, [{**grid, "kept_reached_volume": kept}])
+        runs.append(run("MLP (ours)", seed, occupancy=held, learn_seconds=9.0))
+        larger = {"occupancy": occupancy(4_000_000, 0.1), "learn_seconds": other_seconds}
+        runs.append(run("hash grid", seed, sampler="learned-occupancy-hash", **larger))
+    return runs
+
+
+def test_without_suites_there_are_no_answers() -> None:
+    assert answers.answers_section() == []
+
+
+def test_it_is_said_for_every_scene_whether_ours_is_on_the_fronts(store: Store) -> None:
+    store("representations", "city", *representations(other_seconds=10.0))
+    store("representations", "fox", *representations(other_seconds=8.0))
+    text = answered()
+    assert "Of 2 scenes, MLP (ours) is on the front of size on 2 and of learning time on 1." in text
+    link = "suites.md#suite-representations-on-city"
+    kept = "| 12.5%, 50 kB | 30.0%, 33 kB | 10.0%, 4.0 MB |"
+    assert (
+        f"| [city]({link}) {kept} MLP (ours) is the soonest learned and on the front of size"
+        in text
+    )
+    assert "MLP (ours) is on the front of size, behind hash grid in learning time" in text
+
+
+def test_a_grid_that_is_smaller_and_keeps_less_is_named(store: Store) -> None:
+    store("representations", "city", *representations(10.0, grid_kept=(0.05,)), **STEPS)
+    text = answered()
+    assert "on the front of size on 0" in text and "behind grid 64³ in size |" in text
+
+
+def test_one_that_keeps_less_with_most_seeds_only_is_named_too(store: Store) -> None:
+    store("representations", "city", *representations(10.0, grid_kept=(0.05, 0.05, 0.3)), **STEPS)
+    text = answered()
+    assert "of size on 0 and of learning time on 1." in text
+    assert "behind grid 64³ (not with every seed) in size |" in text
+
+
+def test_minutes_are_those_of_runs_two_at_a_time_and_shared_ones_count_once(store: Store) -> None:
+    two = {"protocol": {"seconds": 60.0, "at_once": 2}}
+    shared = run("A", wall_seconds=120.0)
+    store("enough-time", "fox", shared, run("B", wall_seconds=240.0), **two)
+    store("grid-resolution", "fox", {**shared, "reused": True}, run("C", wall_seconds=60.0), **two)
+    store("freeze", "city", run("A", wall_seconds=60.0), run("B"), **two)
+    text = answered()
+    assert "| fox | - | - | - | - | 3 | 2 | 4 |" in text  # 1.5 of the last: 3.0 and 0.5 of its own
+    assert "| city | - | - | - | - | - | - | - |" in text
+
+
+def test_gates_compare_by_what_they_keep_and_runs_of_equal_time_by_their_ends(
+    store: Store,
+) -> None:
+    frozen, not_frozen = occupancy(50_000, 0.1), {"freeze_seconds": None}
+    store("losses", "fox", run("A", occupancy=frozen), run("B", **not_frozen), **STEPS)
+    store("freeze", "fox", run("A", psnr=21.0), run("B"))
+    grid = {"sampler": "occupancy-grid-64", "train_seconds": 10.0, "learn_seconds": 5.0}
+    store("grid-resolution", "fox", run("A"), run("B", **grid))
+    text = answered()
+    assert "| 20.0 dB, 1 s | 20.0 dB, 1 s (50% of the time for its grid) |" in text
+    assert "| 10%, 20.0 dB | not frozen, 20.0 dB |" in text
+    said = "A is ahead: 21.0 dB, 1.0 more than B; still rising at the end: all"
+    assert f"| 21.0 dB, 1 s | 20.0 dB, 1 s | {said} |" in text
+
+
+def test_a_gate_that_is_not_frozen_with_every_seed_says_with_how_many(store: Store) -> None:
+    runs = [run("A", 0, occupancy=occupancy(5, 0.1)), run("A", 1, freeze_seconds=None)]
+    store("losses", "fox", *runs, protocol={"seconds": None, "steps": 400})
+    assert "| 1 of 2 frozen, 20.0 dB |" in answered()
+
+
+def test_a_gate_that_was_frozen_with_the_last_step_is_told_apart(store: Store) -> None:
+    runs = [run("A", 0, occupancy=occupancy(5, 0.03)), run("A", 1, occupancy=occupancy(5, 0.03))]
+    runs[1]["freeze_seconds"] = runs[1]["train_seconds"]
+    store("losses", "fox", *runs, protocol={"seconds": None, "steps": 400})
+    assert "| 3.0% (1 of 2 frozen at the end), 20.0 dB |" in answered()
+
+
+def test_a_scene_where_ours_has_no_figures_leaves_the_table_of_others(
+    store: Store,
+) -> None:
+    store("representations", "city", run("MLP (ours)", freeze_seconds=None), **STEPS)
+    store("representations", "fox", *representations(other_seconds=10.0), **STEPS)
+    text = answered()
+    assert "| 12.5%, 50 kB |" in text and "Of 2 scenes, MLP (ours)" in text
+
+
+def test_a_contender_that_a_scene_lacks_has_no_figure_there(store: Store) -> None:
+    store("freeze", "city", run("A"))
+    store("freeze", "fox", run("A"), run("B"))
+    assert "| 20.0 dB, 1 s | - | A: 20.0 dB; still rising at the end: all |" in answered()
+
+
+def test_a_chart_with_a_note_is_marked(store: Store, tmp_path: Path) -> None:
+    store("freeze", "city", run("A"))
+    (tmp_path / "notes.json").write_text('{"city-freeze": "Made before."}')
+    assert "[city](suites.md#suite-freeze-on-city) (*) |" in answered()
+
+
+def test_scenes_of_which_one_suite_is_missing_have_no_row(store: Store) -> None:
+    assert parts.rivals_table() == "Not measured yet."
+    store("enough-time", "city", run("Switch-NeRF + learned occupancy"))
+    assert parts.rivals_table() == "Not measured yet."
+
+
+def test_ours_and_the_rivals_that_keep_least_stand_beside_equal_time(store: Store) -> None:
+    grids = [
+        {"resolution": cells, "bytes": size, "kept_reached_volume": kept, "update_seconds": 1.0}
+        for cells, size, kept in ((64, 32768, 0.3), (128, 262144, 0.25), (256, 2097152, 0.28))
+    ]
+    facts = occupancy(23_000, 0.2, grids)
+    small = {"bytes": 4932, "seconds": 9.0, "kept_reached_volume": 0.1, "name": "MLP"}
+    facts["at_equal_loss"]["taught"] = [small]
+    planes = run("K-planes", sampler="learned-occupancy-k-planes", occupancy=occupancy(10**6, 0.3))
+    store("representations", "city", run("MLP (ours)", occupancy=facts), planes)
+    own = run("Switch-NeRF + coarse and fine samples", psnr=17.25)
+    ours = run("Switch-NeRF + learned occupancy", psnr=19.0)
+    store("enough-time", "city", ours, own)
+    head, _, row, _, said = parts.rivals_table().splitlines()
+    assert said == (
+        "Of 1 scenes, `leco-occupancy` keeps less than the best other gate on 1 and less than the "
+        "best grid on 1, a small MLP less than the best grid on 1; a learned occupancy has the "
+        "highest PSNR with every seed on 1."
+    )
+    assert head.endswith(
+        "| PSNR after 10 s: learned occupancy | PSNR after 10 s: coarse and fine samples |"
+    )
+    assert row == (
+        "| city | 20.0%, 23 kB | 10.0%, 5 kB | 30.0%, 1.0 MB (K-planes) | 25.0%, 262 kB (128³) "
+        "| 19.0 (19.0 to 19.0) | 17.2 (17.2 to 17.2) |"
+    )
+
+
+def test_columns_are_those_of_all_scenes_and_old_charts_are_marked(
+    store: Store, tmp_path: Path
+) -> None:
+    for scene in ("city", "fox"):
+        runs = [run("MLP (ours)", occupancy=occupancy(23_000, 0.2))]
+        hashed = occupancy(10**6, 0.3)
+        runs.append(run("hash grid", sampler="learned-occupancy-hash", occupancy=hashed))
+        store("representations", scene, *(runs if scene == "city" else runs[1:]))
+        names = ["a", "b"] if scene == "city" else ["b"]
+        store("enough-time", scene, *(run(f"Host + {name}") for name in names))
+    (tmp_path / "notes.json").write_text('{"fox-enough-time": "Made before."}')
+    head, _, city, fox, _, said = parts.rivals_table().splitlines()
+    assert said.startswith("Of 2 scenes, ") and "other gate on 1 and" in said
+    assert head.count("|") == city.count("|") == fox.count("|")
+    assert city.startswith("| city |") and fox.startswith("| fox (*) | - |")
+
+
+def test_what_is_around_the_tables_is_left_as_it_is(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(parts, "demo_table", lambda report: "demo")
+    (before, after), (begin, end) = parts.DEMO, parts.RIVALS
+    text = f"A\n{before}\nstale\n{after}\nB\n{begin}\n{end}\nC\n"
+    expected = f"A\n{before}\ndemo\n{after}\nB\n{begin}\nNot measured yet.\n{end}\nC\n"
+    assert parts.readme(text) == expected
+
+
+def test_a_suite_is_shown_with_its_question_picture_figures_command_and_machine(
+    store: Store,
+) -> None:
+    command = "leco chart --data fox --suite losses"
+    made = {"date": "2024-02-29", "command": command, "version": "0.1.0", "commit": "1b"}
+    store("losses", "fox", run("A", psnr=21.0), run("B"), question="Why?", made=made)
+    text = "\n".join(sections.suite_sections())
+    assert "## Suite `losses` on fox" in text and "Why?" in text
+    assert "images/charts/fox-losses-dark.png" in text and "| A | 1 | 21.00 |" in text
+    assert "`leco chart --data fox --suite losses`, 2024-02-29, leco_plugin 0.1.0 at 1b." in text
+    assert "cores: 2, device: cpu." in text
+
+
+def test_charts_with_a_title_come_first_and_suites_in_their_order(
+    store: Store, tmp_path: Path
+) -> None:
+    for scene, suite in (("a", "losses"), ("b", "representations"), ("c", "losses"), ("z", None)):
+        store(suite, scene, run("A"))
+    (tmp_path / "charts.json").write_text('{"z": "Z"}')
+    assert list(sections.titles()) == ["z", "b-representations", "a-losses", "c-losses"]
+    assert sections.titles()["z"] == "Z"
+
+
+def test_a_chart_that_belongs_to_no_suite_is_on_the_other_page(store: Store) -> None:
+    store(None, "z", run("A"))
+    assert "## z" in "\n".join(sections.chart_sections())
+    assert sections.suite_sections() == []
+
+
+def test_the_papers_rows_stand_once_and_beside_the_first_chart(store: Store) -> None:
+    for scene in ("city", "fox"):
+        store("grid-resolution", scene, run("A"), question="Why?")
+    text = "\n".join(sections.suite_sections())
+    assert text.count("| grid 256³ | 25.86, 0.764, 0.409 | 46.0 | 12.5 |") == 1
+    assert text.index("25.86") < text.index("on fox")
+
+
+def test_a_sampling_section_says_when_and_of_which_code_it_is() -> None:
+    report = {"machine": {"processor": "a processor"}, "figures": []}
+    title, line, _ = sampling_section(report)
+    assert title == "## Sampling: a processor\n" and line.endswith("Ratios within one run.\n")
+    report |= {"date": "2026-11-23", "code": {"version": "0.1.0", "commit": "0123456789ab"}}
+    title, line, _ = sampling_section(report)
+    assert title == "## Sampling: a processor, 2026-11-23\n"
+    assert line.endswith("within one run. leco_plugin 0.1.0 at 0123456789ab.\n")
