@@ -17,8 +17,8 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from leco_plugin.capacity.evidence import Evidence, gather
-from leco_plugin.capacity.gates import Candidate, Lesson, round_weights, teach
+from leco_plugin.capacity.evidence import RAYS_AT_ONCE, Evidence, gather
+from leco_plugin.capacity.gates import Candidate
 from leco_plugin.capacity.search import find_threshold
 from leco_plugin.capacity.sources import Source, draw_held_out, draw_training_rays
 from leco_plugin.evaluation.equal_loss import (
@@ -31,9 +31,10 @@ from leco_plugin.evaluation.equal_loss import (
 )
 from leco_plugin.evaluation.field_grids import FieldGrids, density_of, looked_up, plain_and_dilated
 from leco_plugin.evaluation.inspection import in_parts
+from leco_plugin.learning.lesson import Lesson, round_weights, teach
+from leco_plugin.learning.sharpening import lesson_by
 from leco_plugin.models.gate import GateConfig, occupancy_logit
 from leco_plugin.models.leco import LecoModel
-from leco_plugin.models.losses import widen
 from leco_plugin.models.mixture import Mixture
 from leco_plugin.models.objective import GateLossConfig
 from leco_plugin.occupancy import Precision, gate_precision
@@ -109,7 +110,7 @@ def prepare(data: Path, folder: Path, learn_steps: int) -> Taught:
 def _render_rays(source: Source, model: LecoModel) -> Taught:
     torch.manual_seed(1)  # the same rays also where the field was loaded
     mixture = model.mixture
-    lesson = lesson_by(source, model.config.gate_loss)
+    lesson = lesson_of(source, model.config.gate_loss)
     rays = draw_held_out(source, mixture.occupancy().eval(), RAYS, parts=1)[0]
     evidence, _ = gather(mixture, None, rays)
     if not bool(evidence.worth.any()):
@@ -121,19 +122,12 @@ def _render_rays(source: Source, model: LecoModel) -> Taught:
     return Taught(mixture, lesson, evidence, _map(mixture, evidence.positions), volume)
 
 
-def lesson_by(source: Source, losses: GateLossConfig) -> Lesson:
-    """What a source's field has to teach along rays that it was trained on, nothing skipped.
-
-    It is the contribution loss with the field's weights, as `leco-occupancy` teaches its gate.
-    """
+def lesson_of(source: Source, losses: GateLossConfig) -> Lesson:
+    """What a source's field has to teach along rays that it was trained on, nothing skipped."""
     mixture = source.mixture
     assert mixture is not None
-    drawn = draw_training_rays(source, mixture.occupancy().eval(), TAUGHT_RAYS)
-    taught, _ = gather(mixture, None, drawn)
-    rays = taught.ray_indices  # every candidate of each
-    wide = widen(taught.weights, rays[1:] == rays[:-1])
-    target = (wide / losses.weight_at_full).clamp(max=1.0)
-    return Lesson(_map(mixture, taught.positions), losses.emphasis * target, 1.0 - target)
+    taught = draw_training_rays(source, mixture.occupancy().eval(), TAUGHT_RAYS).rays
+    return lesson_by(mixture, taught, losses, seen=0.0, rays_at_once=RAYS_AT_ONCE)
 
 
 def _map(mixture: Mixture, places: Tensor) -> Tensor:

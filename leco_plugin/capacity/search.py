@@ -15,11 +15,12 @@ import torch
 from torch import Tensor
 
 from leco_plugin.capacity.evidence import Evidence, Loss, unlikely_at
-from leco_plugin.capacity.gates import Lesson, ladder, name_of, round_weights, teach, values_of
+from leco_plugin.capacity.gates import ladder, name_of, values_of
 from leco_plugin.capacity.references import Bounds, Ground, Reference, Rung, verify
 from leco_plugin.evaluation.field_grids import in_parts
 from leco_plugin.evaluation.inspection import whole_box
 from leco_plugin.learning.calibration import THRESHOLDS
+from leco_plugin.learning.lesson import Lesson, round_weights, teach
 from leco_plugin.models.gate import GateConfig
 from leco_plugin.occupancy import Occupancy
 

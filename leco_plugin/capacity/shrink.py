@@ -16,7 +16,6 @@ from nerfstudio.utils.rich_utils import CONSOLE
 
 from leco_plugin.capacity.evidence import gather
 from leco_plugin.capacity.frontier import line_of, line_of_lowered, line_of_original
-from leco_plugin.capacity.gates import round_weights
 from leco_plugin.capacity.references import (
     HOLDS,
     LOST_DECISIONS,
@@ -45,6 +44,7 @@ from leco_plugin.evaluation.clock import synchronize
 from leco_plugin.evaluation.inspection import whole_box
 from leco_plugin.evaluation.report import describe_code, describe_machine, made_by
 from leco_plugin.learning.freezing import HARDLY_ANYTHING
+from leco_plugin.learning.lesson import round_weights
 from leco_plugin.log import bar
 from leco_plugin.occupancy import BACKDROP_PRICE, Occupancy
 from leco_plugin.scenes.pixels.held_out_pixels import held_out_sampler

@@ -138,14 +138,14 @@ def compare_at_freezing(model: Any, datamanager: Any, contender: Contender) -> d
     if not contender.taught:
         return at_equal_loss(model.mixture, datamanager, contender.grids)
     from leco_plugin.capacity.gates import gates
-    from leco_plugin.capacity.measuring import lesson_by, taught_score
+    from leco_plugin.capacity.measuring import lesson_of, taught_score
     from leco_plugin.capacity.sources import Source
     from leco_plugin.learning.dense import evaluating
 
     known = {gate.key: gate for gate in gates()}
     started = time.monotonic()
     with evaluating(model):
-        lesson = lesson_by(Source(datamanager, model), model.config.gate_loss)
+        lesson = lesson_of(Source(datamanager, model), model.config.gate_loss)
     of_lesson = time.monotonic() - started
     scores, rows = {}, []
     for name, key in SMALL_GATES.items():

@@ -98,9 +98,8 @@ class LearningData:
             bundle = bundle.to(mixture.device)
             images = bundle.camera_indices[:, 0]
             drawn.append(mixture.rays(bundle.origins, bundle.directions, images))
-        return Rays(
-            *(None if parts[0] is None else torch.cat(parts)[:count] for parts in zip(*drawn))
-        )
+        joined: Any = [None if p[0] is None else torch.cat(p)[:count] for p in zip(*drawn)]
+        return Rays(*joined)
 
     def count_held_out(self, limit: int) -> float:
         """How many pixels there are to check with, up to a limit; endless if none is held out."""

@@ -161,7 +161,7 @@ def test_one_field_teaches_gates_and_grids(
     monkeypatch.setattr(measuring, "TAUGHT_RAYS", 256)
     monkeypatch.setattr(measuring, "VOLUME_POINTS", 2048)
     monkeypatch.setattr(measuring, "STEPS", 20)
-    monkeypatch.setattr("leco_plugin.capacity.gates.BATCH", 512)
+    monkeypatch.setattr("leco_plugin.learning.lesson.BATCH", 512)
     some = [candidate for candidate in gates() if candidate.bytes < 5000]
     monkeypatch.setattr(command, "gates", lambda: some)
     out = tmp_path / "out"

@@ -1,0 +1,60 @@
+"""Claims about teaching a gate alone."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from ball_occupancy import ENCODINGS
+
+from leco_plugin.learning.lesson import Lesson, round_weights, teach
+from leco_plugin.models.encodings import EncodingConfig
+from leco_plugin.models.gate import Gate, GateConfig, occupancy_logit
+from leco_plugin.models.losses import contribution_loss
+
+
+def ball_lesson(count: int = 40_000) -> Lesson:
+    mapped = 2.0 * torch.rand(count, 3, generator=torch.Generator().manual_seed(0)) - 1.0
+    inside = (mapped.norm(dim=-1) < 0.6).float()
+    return Lesson(mapped, inside, 1.0 - inside)
+
+
+@pytest.mark.parametrize("kind", ENCODINGS)
+def test_every_kind_of_gate_learns_a_ball(kind: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("leco_plugin.learning.lesson.BATCH", 2048)
+    lesson = ball_lesson()
+    shares: list[float] = []
+    config = GateConfig(ENCODINGS[kind], 16, 1, 1)
+    gate = teach(config, lesson, 120, "float32", on_progress=shares.append)
+    kept = occupancy_logit(gate(lesson.mapped)) >= 0.0
+    assert float((kept == (lesson.keep > 0)).float().mean()) > 0.96
+    assert len(shares) == 120 and shares[-1] == 1.0
+    assert not any(parameter.requires_grad for parameter in gate.parameters())
+
+
+def test_the_loss_is_the_contribution_loss() -> None:
+    """What `teach` minimises, with the targets of `leco-occupancy`, is its gate's own loss."""
+    torch.manual_seed(0)
+    logits, weights = torch.randn(100, 2), 0.3 * torch.rand(100)
+    target = (weights / 0.15).clamp(max=1.0)
+    occupied = occupancy_logit(logits)
+    keep, skip = 8.0 * target, 1.0 - target
+    softplus = torch.nn.functional.softplus
+    found = (keep * softplus(-occupied) + skip * softplus(occupied)).mean()
+    torch.testing.assert_close(found, contribution_loss(logits, weights, 0.15, 8.0))
+
+
+def test_the_same_seed_gives_the_same_gate_and_leaves_other_dice_alone() -> None:
+    config = GateConfig(EncodingConfig(octaves=2), 8, 1, 1)
+    torch.manual_seed(3)
+    before = torch.get_rng_state()
+    first = teach(config, ball_lesson(1000), 3, "float32")
+    assert torch.equal(torch.get_rng_state(), before)
+    second = teach(config, ball_lesson(1000), 3, "float32")
+    for a, b in zip(first.parameters(), second.parameters()):
+        assert torch.equal(a, b)
+
+
+def test_rounded_weights_are_held_by_bfloat16() -> None:
+    gate = Gate(GateConfig()).requires_grad_(False)
+    round_weights(gate)
+    assert all(torch.equal(p, p.bfloat16().float()) for p in gate.parameters())
