@@ -23,6 +23,7 @@ import tyro
 from torch import Tensor
 
 from leco_plugin.capacity.evidence import Evidence, gather
+from leco_plugin.capacity.measuring import taught_grid
 from leco_plugin.capacity.sources import (
     Seen,
     Source,
@@ -33,7 +34,8 @@ from leco_plugin.capacity.sources import (
 )
 from leco_plugin.cli_reports import occupancy_of
 from leco_plugin.evaluation.equal_loss import kept_shares, mapped_box, reached_volume
-from leco_plugin.evaluation.field_grids import dilate, in_parts, looked_up
+from leco_plugin.evaluation.field_grids import dilate, looked_up
+from leco_plugin.evaluation.inspection import in_parts
 from leco_plugin.evaluation.report import (
     describe_code,
     describe_machine,
@@ -43,8 +45,8 @@ from leco_plugin.evaluation.report import (
 )
 from leco_plugin.learning.calibration import Measured, measure
 from leco_plugin.learning.dense import in_chunks
+from leco_plugin.learning.lesson import Lesson
 from leco_plugin.learning.sharpening import (
-    Lesson,
     SharpeningConfig,
     answers,
     lesson_by,
@@ -55,7 +57,6 @@ from leco_plugin.models.gate import Gate
 from leco_plugin.models.leco import LecoModel
 from leco_plugin.models.mixture import Mixture
 from leco_plugin.occupancy import gate_precision
-from leco_plugin.samplers.boxes import cells_of
 from leco_plugin.scenes.learning_data import on_black
 
 SEEDS = 3
@@ -142,12 +143,9 @@ def gate_score(mixture: Mixture, gate: Gate) -> Callable[[Tensor], Tensor]:
 def grid_score(
     mixture: Mixture, lesson: Lesson, cells: int, dilated: bool
 ) -> Callable[[Tensor], Tensor]:
-    """The largest target of the lesson's positions in each cell, or also in the cells around it."""
+    """What `leco capacity` makes of a grid: as it is, or dilated by a cell."""
     box = mapped_box(mixture)
-    shape = (cells,) * 3
-    index, inside = cells_of((1, *shape), torch.cat([box.low, box.high]), lesson.mapped)
-    targets = (1.0 - lesson.skip) * inside
-    filled = torch.zeros(cells**3).scatter_reduce_(0, index.long(), targets, "amax").view(shape)
+    filled = taught_grid(lesson, box, cells)
     filled = dilate(filled) if dilated else filled
     return lambda mapped: looked_up(filled, box, mapped)
 

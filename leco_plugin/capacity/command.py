@@ -9,10 +9,9 @@ from typing import Any
 
 from leco_plugin.capacity.choice import choose, draw, kilobytes, verdict
 from leco_plugin.capacity.gates import Candidate, gates, grids
-from leco_plugin.capacity.measuring import STEPS, Taught, measure_gate, measure_grids, prepare
+from leco_plugin.capacity.measuring import STEPS, Taught, measure_gate, measure_grid, prepare
 from leco_plugin.chart.runner import SETTINGS, make_jobs, take_folder
 from leco_plugin.chart.theme import DARK, LIGHT
-from leco_plugin.evaluation.equal_loss import MOST_ON_CPU
 from leco_plugin.evaluation.field_grids import fits_memory
 from leco_plugin.evaluation.report import (
     describe_code,
@@ -25,8 +24,7 @@ from leco_plugin.log import bar, console
 from leco_plugin.scenes.input_error import InputError, require_folder
 from leco_plugin.scenes.photographs import describe_scene
 
-POINTS, LEFT_OUT = "points", "left_out.json"
-TOO_MANY = f"would ask the field at more than {MOST_ON_CPU / 1e6:.0f} million places"
+POINTS = "points"
 DAMAGED = "is damaged; delete it, or name a new folder with --out"
 
 
@@ -42,8 +40,7 @@ def capacity(
     Args:
         data: the scene in nerfstudio's format.
         out: the folder; what is finished stays there whenever this is stopped.
-        resolutions: of grids; those that do not fit the memory are left out, and on a CPU those
-            that would take long.
+        resolutions: of grids; those that do not fit the memory are left out.
         lost_surface_mass: at which kept volumes are compared.
         learn_steps: of the field.
     Returns:
@@ -58,16 +55,13 @@ def capacity(
         "lost_surface_mass": lost_surface_mass,
         "learn_steps": learn_steps,
         "teach_steps": STEPS,
+        "grids": "by the lesson of the gates",
     }
     _take_folder(out, {"scene": scene, **settings}, data)
     say = functools.partial(console().print, markup=False, highlight=False)
-    known = _left_out(out) if machine["device"] == "cpu" else []
-    candidates = [*gates(), *_grids_to_fill(resolutions, known, say)]
+    candidates = [*gates(), *_grids_that_fit(resolutions, say)]
     taught = prepare(data, out, learn_steps)
     rows = _measure_missing(out, taught, candidates, lost_surface_mass, code, say)
-    # what is left of the candidates are grids that would take too long: no later call tries them
-    if left := [candidate.size for candidate in candidates[len(rows) :]]:
-        write_json(out / LEFT_OUT, {"places": MOST_ON_CPU, "grids": [*known, *left]})
     results = {
         "format": 1,
         "machine": machine,
@@ -103,30 +97,18 @@ def _measure_missing(
     code: dict[str, Any],
     say: Callable[[str], None],
 ) -> list[dict[str, Any]]:
-    """A row for each gate, and for each grid up to the first that would take too long."""
     rows = {one.key: row for one in candidates if (row := _stored(out, one)) is not None}
-    of_cells = [one for one in candidates if one.gate is None]
-    if all(one.key in rows for one in of_cells):
-        of_cells = []
-    for one in of_cells:  # all of them: each is refined from the one before
-        rows.pop(one.key, None)
     todo = [one for one in candidates if one.key not in rows]
-    filling = measure_grids(taught, of_cells, lost_surface_mass)
 
     def measure_one(candidate: Candidate, show: Callable[[float], None]) -> str:
-        if candidate.gate is not None:
-            row = measure_gate(taught, candidate, lost_surface_mass)
-        elif (filled := next(filling, None)) is not None:
-            row = filled[1]
-        else:
-            return f"{_in_words(candidate)} {TOO_MANY}; it is left out"
-        rows[candidate.key] = row | made_by(code)
-        write_json(out / POINTS / f"{candidate.key}.json", rows[candidate.key])
+        measured = measure_grid if candidate.gate is None else measure_gate
+        row = rows[candidate.key] = measured(taught, candidate, lost_surface_mass) | made_by(code)
+        write_json(out / POINTS / f"{candidate.key}.json", row)
         return line_of(row)
 
     with bar("Teaching representations") as show:
         make_jobs(todo, measure_one, say, show, done=len(rows))
-    return [rows[one.key] for one in candidates if one.key in rows]
+    return [rows[one.key] for one in candidates]
 
 
 def _take_folder(out: Path, settings: dict[str, Any], data: Path) -> None:
@@ -139,26 +121,13 @@ def _take_folder(out: Path, settings: dict[str, Any], data: Path) -> None:
     take_folder(file, settings, "points with another", DAMAGED)
 
 
-def _grids_to_fill(
-    resolutions: Sequence[int], known: Sequence[str], say: Callable[[str], None]
-) -> list[Candidate]:
-    """The grids that fit the memory and are not known to take too long; says which are left out."""
-    found = []
-    for candidate in grids(tuple(dict.fromkeys(resolutions))):
+def _grids_that_fit(resolutions: Sequence[int], say: Callable[[str], None]) -> list[Candidate]:
+    """The grids that fit the memory; says which do not."""
+    found = grids(tuple(dict.fromkeys(resolutions)))
+    for candidate in found:
         if not fits_memory(int(candidate.size) ** 3):
-            say(f"{_in_words(candidate)} does not fit the free memory; it is left out")
-        elif candidate.size in known:
-            say(f"{_in_words(candidate)} {TOO_MANY}; left out, as before")
-        else:
-            found.append(candidate)
-    return found
-
-
-def _left_out(out: Path) -> list[str]:
-    """Sizes of the grids that an earlier call on a CPU found to take too long."""
-    file = out / LEFT_OUT
-    found = read_object(file, DAMAGED) if file.exists() else {}
-    return list(found["grids"]) if found.get("places") == MOST_ON_CPU else []
+            say(f"a grid of {candidate.size}^3 cells does not fit the free memory; it is left out")
+    return [one for one in found if fits_memory(int(one.size) ** 3)]
 
 
 def _stored(out: Path, candidate: Candidate) -> dict[str, Any] | None:
@@ -178,7 +147,3 @@ def line_of(row: dict[str, Any]) -> str:
         f"{row['family']:<10} {row['size']:<10} {kilobytes(row):>10}  keeps "
         f"{row['kept_volume']:>6.2%} of the volume"
     )
-
-
-def _in_words(grid: Candidate) -> str:
-    return f"a grid of {grid.size}^3 cells"

@@ -3,12 +3,10 @@
 from __future__ import annotations
 
 import copy
-import math
 import random
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
 from pickle import UnpicklingError
 from types import SimpleNamespace
@@ -22,15 +20,12 @@ from leco_plugin.capacity.gates import Candidate
 from leco_plugin.capacity.search import find_threshold
 from leco_plugin.capacity.sources import Source, draw_held_out, draw_training_rays
 from leco_plugin.evaluation.equal_loss import (
-    MOST_ON_CPU,
-    SPARED,
     kept_shares,
     mapped_box,
     reached_volume,
-    threshold_losing,
 )
-from leco_plugin.evaluation.field_grids import FieldGrids, density_of, looked_up, plain_and_dilated
-from leco_plugin.evaluation.inspection import in_parts
+from leco_plugin.evaluation.field_grids import largest_in_cells, plain_and_dilated
+from leco_plugin.evaluation.inspection import ViewBox, in_parts
 from leco_plugin.learning.lesson import Lesson, round_weights, teach
 from leco_plugin.learning.sharpening import lesson_by
 from leco_plugin.models.gate import GateConfig, occupancy_logit
@@ -177,40 +172,23 @@ def taught_score(
     return score
 
 
-def measure_grids(
-    taught: Taught, candidates: Sequence[Candidate], lost: float
-) -> Iterator[tuple[Candidate, dict[str, Any]]]:
-    """Fills grids from the field's density, each from one half as fine; yields a row for each.
+def measure_grid(taught: Taught, candidate: Candidate, lost: float) -> dict[str, Any]:
+    """Teaches a grid and measures it, dilated by a cell where it keeps less so."""
+    assert candidate.resolution is not None
+    started, box = time.monotonic(), mapped_box(taught.mixture)
+    scores = taught_grid(taught.lesson, box, candidate.resolution)
+    both = [
+        measure(taught.held_out, of_rays, of_volume, lost)
+        for of_rays, of_volume in plain_and_dilated(scores, box, taught.mapped, taught.volume)
+    ]
+    return _row(candidate, started, min(both, key=lambda one: one["kept_volume"]))
 
-    The field is asked at the places that gates are taught by, and at random ones. A grid is dilated
-    by a cell where it keeps less so. The first that would ask more than `MOST_ON_CPU` places on a
-    CPU is the end.
 
-    Args:
-        candidates: by resolution.
-        lost: share of the weight near surfaces.
-    """
-    density = partial(density_of, taught.mixture)
-    box = mapped_box(taught.mixture)
-    places = taught.lesson.mapped
-
-    def floor_of(scores: Tensor) -> float:
-        of_rays = looked_up(scores, box, taught.mapped)
-        return threshold_losing(taught.held_out.worth, of_rays, SPARED * lost)
-
-    most = MOST_ON_CPU if taught.mixture.device.type == "cpu" else math.inf
-    grids = FieldGrids(density, box, (places, density(places)), floor_of, most)
-    for candidate in candidates:
-        started = time.monotonic()
-        assert candidate.resolution is not None
-        scores = grids.fill((candidate.resolution,) * 3)
-        if scores is None:
-            return
-        both = [
-            measure(taught.held_out, of_rays, of_volume, lost)
-            for of_rays, of_volume in plain_and_dilated(scores, box, taught.mapped, taught.volume)
-        ]
-        yield candidate, _row(candidate, started, min(both, key=lambda one: one["kept_volume"]))
+def taught_grid(lesson: Lesson, box: ViewBox, cells: int) -> Tensor:
+    """Scores [n, n, n] of a grid that the lesson of the gates teaches: a cell has the largest
+    target in it."""
+    scores = torch.zeros((cells,) * 3, device=lesson.mapped.device)
+    return largest_in_cells(scores, box, lesson.mapped, 1.0 - lesson.skip)
 
 
 def _row(candidate: Candidate, started: float, found: dict[str, Any]) -> dict[str, Any]:

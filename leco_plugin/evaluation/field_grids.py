@@ -150,9 +150,14 @@ def filled(
             places = torch.lerp(box.low, box.high, units / counts)
             best = torch.maximum(best, density(places).float())
         scores[tuple(cells.T)] = best
-    if known is not None:
-        index, inside = _cells(scores, box, known[0])
-        scores.view(-1).scatter_reduce_(0, index.long(), known[1].float() * inside, "amax")
+    return scores if known is None else largest_in_cells(scores, box, *known)
+
+
+def largest_in_cells(scores: Tensor, box: ViewBox, mapped: Tensor, values: Tensor) -> Tensor:
+    """Raises the scores [nx, ny, nz] of cells to the largest value [M] of the mapped positions
+    [M, 3] in them; returns them."""
+    index, inside = _cells(scores, box, mapped)
+    scores.view(-1).scatter_reduce_(0, index.long(), values.float() * inside, "amax")
     return scores
 
 

@@ -6,7 +6,9 @@ import pytest
 import torch
 
 from leco_plugin.capacity.evidence import Evidence
-from leco_plugin.capacity.measuring import VOLUMES, measure
+from leco_plugin.capacity.measuring import VOLUMES, measure, taught_grid
+from leco_plugin.evaluation.inspection import ViewBox
+from leco_plugin.learning.lesson import Lesson
 
 
 def evidence(count: int = 10_000) -> Evidence:
@@ -33,3 +35,13 @@ def test_losses_at_volumes_are_those_of_the_skipped() -> None:
     expected = [(1.0 - share) ** 2 for share in VOLUMES]
     assert losses == pytest.approx(expected, abs=0.03)
     assert losses == sorted(losses, reverse=True)
+
+
+def test_a_cell_of_a_grid_has_the_largest_target_of_the_lesson_in_it() -> None:
+    mapped = torch.tensor([[-0.5, 0.5, 0.5], [-0.4, 0.6, 0.5], [0.5, -0.5, -0.5], [3.0, 0.0, 0.0]])
+    targets = torch.tensor([0.2, 0.7, 0.4, 1.0])
+    box = ViewBox(-torch.ones(3), torch.ones(3))
+    scores = taught_grid(Lesson(mapped, 8.0 * targets, 1.0 - targets), box, 2)
+    expected = torch.zeros(2, 2, 2)
+    expected[0, 1, 1], expected[1, 0, 0] = 0.7, 0.4
+    torch.testing.assert_close(scores, expected)
