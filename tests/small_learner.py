@@ -12,6 +12,7 @@ from torch import Tensor
 from leco_plugin.learning.learner import Learner
 from leco_plugin.learning.progress import Progress
 from leco_plugin.learning.run import LearningOnly
+from leco_plugin.learning.sharpening import SharpeningConfig
 from leco_plugin.models.encodings import EncodingConfig
 from leco_plugin.models.field import FieldConfig
 from leco_plugin.models.gate import GateConfig
@@ -74,6 +75,10 @@ class ARun(LearningOnly):
         self.start, self.end = start, end
         self.saved: list[int] = []
 
+    def left(self, step: int) -> float:
+        """Those up to the last one."""
+        return self.end - step - 1
+
     def save(self, step: int) -> None:
         """Notes the step."""
         self.saved.append(step)
@@ -90,9 +95,9 @@ def small_learner(
 
     Args:
         run: `LearningOnly` by default.
-        options: of `LecoModelConfig`.
+        options: of `LecoModelConfig`; nothing is sharpened by default.
     """
-    config = LecoModelConfig(**options)
+    config = LecoModelConfig(**{"sharpening": SharpeningConfig(steps=0), **options})
     steps = config.schedule.learn_steps
     return Learner(
         small_mixture() if mixture is None else mixture,

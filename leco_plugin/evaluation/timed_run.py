@@ -11,7 +11,7 @@ import random
 import statistics
 from collections import Counter
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -147,6 +147,10 @@ def _set_up(config: TrainerConfig, budget: Budget, seed: int) -> Trainer:
     config = copy.deepcopy(config)
     config.machine.seed = seed
     config.max_num_iterations = budget.steps or ENDLESS
+    model: Any = config.pipeline.model
+    if budget.steps is None and hasattr(model, "sharpening"):
+        # whether it pays follows from the steps that are left, which nobody knows
+        model.sharpening = replace(model.sharpening, steps=0)
     config.vis = "tensorboard"
     config.steps_per_save = config.steps_per_eval_image = config.steps_per_eval_batch = 0
     config.steps_per_eval_all_images = 0

@@ -37,6 +37,7 @@ def learn_occupancy(
     rays: int,
     seconds: float | None = None,
     rate: float = 1.0,
+    guides: float = 0.0,
 ) -> Occupancy:
     """Trains an HMoE on the pipeline's data until its gate is frozen and calibrated.
 
@@ -46,7 +47,7 @@ def learn_occupancy(
         The occupancy, in the coordinates of the pipeline's model.
     """
     try:
-        model = learn_model(config, pipeline, rays, seconds, rate)
+        model = learn_model(config, pipeline, rays, seconds, rate, guides)
     except InputError as error:
         raise InputError(str(error).replace(OF_LEARNER, OF_HOST)) from None
     occupancy: Occupancy = model.mixture.occupancy()
@@ -59,6 +60,7 @@ def learn_model(
     rays: int,
     seconds: float | None = None,
     rate: float = 1.0,
+    guides: float = 0.0,
 ) -> LecoModel:
     """Trains an HMoE on the pipeline's data until its gate is frozen, field and all.
 
@@ -71,6 +73,7 @@ def learn_model(
         rays: of a batch.
         seconds: how long this may take at most, about; None takes the config's learning steps.
         rate: multiple of the learning rates.
+        guides: steps that the occupancy will guide; its gate is sharpened where they pay for it.
     Returns:
         The model as it is at the moment of freezing.
     Raises:
@@ -99,7 +102,7 @@ def learn_model(
         sampler.set_num_rays_per_batch(rays)
     groups = model.get_param_groups()
     run = LearningOnly(
-        [FusedAdamConfig(lr=rate * RATES[name]).setup(p) for name, p in groups.items()]
+        [FusedAdamConfig(lr=rate * RATES[name]).setup(p) for name, p in groups.items()], guides
     )
     learner = model.learner(manager, run)
     learner.data.rays_per_batch = rays

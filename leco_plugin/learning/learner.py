@@ -271,9 +271,10 @@ class Learner:
         if self.run.folder is not None:
             leave_file(mixture.occupancy(), self.run.folder)
             leave_field(mixture, self.run.folder)
-        if self.run.goes_on and not schedule.restart:
-            self._merge()
-            self._sharpen(step, self.run.end - step - 1, guided=False)
+        if not schedule.restart:
+            if self.run.goes_on:
+                self._merge()
+            self._sharpen(step, self.run.left(step), guided=False)
         progress.watch = self.watch.state = WatchState()
         progress.suspected_since = -1  # of the gate as it is now
         if schedule.steps_per_record > 0:
