@@ -69,8 +69,7 @@ class HMoE(nn.Module):
     """h(x) = G_i*(x) E_i*(x): each point through the one expert it is routed to.
 
     Attributes:
-        left: bool [n], which scene experts have not been dropped; a state dict says so too, and
-            whoever loads it has the same ones afterwards.
+        left: bool [n], which scene experts remain. Saved in the state dict.
     """
 
     left: Tensor
