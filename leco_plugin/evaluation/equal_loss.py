@@ -20,7 +20,7 @@ from leco_plugin.evaluation.field_grids import (
     FieldGrids,
     density_of,
     fits_memory,
-    looked_up,
+    look_up_scores,
     plain_and_dilated,
 )
 from leco_plugin.evaluation.inspection import ViewBox, in_parts, whole_box
@@ -159,7 +159,7 @@ def _grids_of(
     box = mapped_box(mixture)
 
     def floor_of(scores: Tensor) -> float:
-        of_rays = looked_up(scores, box, mapped)
+        of_rays = look_up_scores(scores, box, mapped)
         return threshold_losing(weights, of_rays, SPARED * LOST_SURFACE_MASS)
 
     most = MOST_ON_CPU if mixture.device.type == "cpu" else math.inf

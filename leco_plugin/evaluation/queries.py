@@ -29,7 +29,7 @@ occupancy; a frozen gate, where its cell cache gave no answer."""
 
 
 @contextmanager
-def counted(model: nn.Module) -> Iterator[Counter[str]]:
+def count_queries(model: nn.Module) -> Iterator[Counter[str]]:
     """Counts by `KINDS` the positions that a model's fields, and those that learn for it, evaluate
     meanwhile.
 

@@ -140,7 +140,7 @@ def heal(
         config: what the gate is taught by.
         room: steps that the run has left.
     """
-    anew = starts_anew(collapse, config, progress)
+    anew = is_restart_due(collapse, config, progress)
     progress.recoveries += 1
     progress.suspected_since = -1
     form_fails = progress.recoveries > 1 or collapse.kind == "useless"
@@ -204,8 +204,8 @@ def is_enough(room: float) -> bool:
     return room >= FEWEST_STEPS
 
 
-def starts_anew(collapse: Collapse, config: GateLossConfig, progress: Progress) -> bool:
-    """Whether gate and field begin anew, more slowly.
+def is_restart_due(collapse: Collapse, config: GateLossConfig, progress: Progress) -> bool:
+    """Whether gate and field restart, at lower learning rates.
 
     So it is where a new last layer has collapsed as well. In logit form the forces on a gate are
     bounded; what is left as a cause is steps that overshoot, and hidden layers, of gate and field,

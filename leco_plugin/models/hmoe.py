@@ -106,7 +106,7 @@ class HMoE(nn.Module):
         self.experts[number] = expert
         self.left[number - 1] = True
 
-    def those_left(self) -> Tensor | None:
+    def remaining_experts(self) -> Tensor | None:
         """`left`, or None while no expert has been dropped; nothing waits for the device."""
         return self.left if any(expert is None for expert in self.experts) else None
 

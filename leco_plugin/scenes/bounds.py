@@ -135,8 +135,8 @@ def with_range(bounds: SceneBounds, near: float | None, far: float | None) -> Sc
     return replace(bounds, near=near, far=far)
 
 
-def up_to_the_cameras(bounds: SceneBounds, heights: Tensor, seen: float) -> SceneBounds:
-    """The bounds of a scene from above with all the air up to its cameras in them.
+def raise_to_cameras(bounds: SceneBounds, heights: Tensor, seen: float) -> SceneBounds:
+    """The bounds of a scene from above, raised to its cameras.
 
     For pictures that show something where rays miss what the sparse points bound: fog, which has no
     points, or a sky, which a cube with walls at its sides holds before its backdrop.

@@ -60,7 +60,7 @@ def sizes_in(checkpoint: Path) -> dict[str, Any] | None:
     return next((values for values in found if values is not None), None)
 
 
-def going_on(wanted: Sizes, stored: dict[str, Any]) -> Sizes:
+def sizes_to_resume(wanted: Sizes, stored: dict[str, Any]) -> Sizes:
     """The sizes with which a run is gone on with: its own, and those set by hand are the same.
 
     Raises:
