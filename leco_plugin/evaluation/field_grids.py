@@ -1,7 +1,7 @@
 """Occupancy grids of a trained field, each refined from one half as fine.
 
 Densities are evaluated only in cells that the coarser grid, or a neighbour there, has not ruled
-out: the time of 512^3 cells depends on the surface in them.
+out. The time for 512^3 cells therefore depends on how much surface they hold.
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
-"""What a run asks: positions at which fields and gates are evaluated, and updates of grids.
+"""Counts the positions at which fields and gates are evaluated, and the updates of grids.
 
-All positions are counted, also those for pruning samples and for updating a grid; for a frozen
-gate not those of CUDA kernels. Classes are wrapped, not objects, so that a field made on the way,
-as the one that learns an occupancy for a host, is counted too.
+Positions for pruning samples and for updating a grid count too. A frozen gate's queries in CUDA
+kernels do not. Classes are wrapped instead of objects, so that a field created during the run is
+counted, such as the one that learns an occupancy for a host.
 """
 
 from __future__ import annotations

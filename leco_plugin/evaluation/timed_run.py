@@ -1,6 +1,6 @@
 """One training run of fixed time or steps in nerfstudio's trainer, and its figures on test images.
 
-Evaluation is off the clock; learning an occupancy is on it.
+Learning an occupancy counts as training time; evaluation does not.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """The threshold: the largest one whose price, measured on held-out rays, is within its bounds.
 
-A dense rendering is the reference. Skipping every sample with o(x) < tau loses weight near surfaces
-(lost surface mass) and changes the image (image price); both are measured, not hoped for.
+The reference is a dense rendering. Skipping every sample with o(x) < tau loses weight near surfaces
+(lost surface mass) and changes the image (image price). Both are measured.
 """
 
 from __future__ import annotations

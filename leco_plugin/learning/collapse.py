@@ -1,16 +1,16 @@
-"""What is done about a collapsed gate, as a stated rule.
+"""The rule for a collapsed gate.
 
 A gate that looks collapsed for `SUSPECTED_STEPS` steps, or at the look that ends the first phase,
 is healed, `MOST_RECOVERIES` times at most:
 
-- Its last layer starts anew. Learning goes on for half as long again: first on dense samples, while
-  what teaches the gate comes in from nothing; then with the force that led to the collapse `EASED`
-  times weaker.
-- Where one scene expert took all points, they are shared out anew. The balance loss counts `EASED`
-  times as much, and at least a quarter of the phase is left to learn from them.
-- A gate in logit form that collapses again begins anew altogether, and the field with it, at rates
-  `EASED` times smaller.
-- A gate in the paper's form that collapses again, or by which hardly anything can be skipped, is
+- Its last layer is reset. Learning goes on for half as long again. At first samples are dense and
+  the gate's losses ramp up from zero. Then the loss that led to the collapse is `EASED` times
+  weaker.
+- If one scene expert took all points, they are redistributed. The balance loss counts `EASED` times
+  as much, and at least a quarter of the phase is left to learn.
+- If a gate in logit form collapses again, gate and field restart at `EASED` times smaller learning
+  rates.
+- If a gate in the paper's form collapses again, or if hardly anything can be skipped by it, it is
   taught in logit form, unless `fall_back` is off.
 
 A run with fewer than `FEWEST_STEPS` steps left heals nothing: calibration makes any gate safe.

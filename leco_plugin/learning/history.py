@@ -1,4 +1,4 @@
-"""How a gate came to be: what it decides at fixed positions, and its weights, while it learns."""
+"""The history of a gate: its decisions at fixed positions, and its weights, while it learns."""
 
 from __future__ import annotations
 

@@ -1,6 +1,6 @@
 """Learning an occupancy, step by step: ramps, freezing, and the price watch after it.
 
-The learner knows no trainer: it is told of each step, and asks a `Run` for what is around it.
+The learner knows no trainer. The training loop calls it at each step; a `Run` stands for the loop.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Performs what the rule of `collapse` says of a gate that has collapsed."""
+"""Heals a collapsed gate by the rule in `collapse`."""
 
 from __future__ import annotations
 

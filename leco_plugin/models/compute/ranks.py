@@ -1,7 +1,7 @@
-"""What the processes of a data-parallel run must agree on; where there is one process, nothing.
+"""Agreement between the processes of a data-parallel run; a run of one process needs none.
 
-Each process trains on rays of its own. Gradients are averaged, so that weights stay the same; what
-is measured or drawn would not, and is taken from the first process.
+Each process trains on its own rays. Gradients are averaged, so that all weights stay the same.
+Measurements and random draws would differ, so all processes use those of the first one.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""What sizes cannot be: counts that contradict one another, and more than the device holds."""
+"""Checks of sizes: contradictory counts, and more memory than the device has."""
 
 from __future__ import annotations
 

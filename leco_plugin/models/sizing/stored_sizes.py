@@ -1,4 +1,4 @@
-"""Sizes of a run that was begun: from its checkpoint, whatever its scene has become since."""
+"""Sizes of a resumed run: those of its checkpoint, even if its scene has changed since."""
 
 from __future__ import annotations
 
