@@ -131,7 +131,7 @@ def fill_cells(
     asked: Tensor,
     known: tuple[Tensor, Tensor] | None = None,
 ) -> Tensor:
-    """Scores of the cells of a grid: [nx, ny, nz]; zero where they are neither asked nor known.
+    """Scores [nx, ny, nz] of the cells of a grid; zero where they are neither asked nor known.
 
     Args:
         density: of the field.

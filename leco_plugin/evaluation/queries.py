@@ -30,11 +30,10 @@ occupancy; a frozen gate, where its cell cache gave no answer."""
 
 @contextmanager
 def count_queries(model: nn.Module) -> Iterator[Counter[str]]:
-    """Counts by `KINDS` the positions that a model's fields, and those that learn for it, evaluate
-    meanwhile.
+    """Counts, by `KINDS`, the positions at which a model's fields are evaluated in this context.
 
-    A model keeps its fields as `nn.Module`s: nerfstudio's are asked through `get_density`, others
-    through `density` or, without one, by being called.
+    Fields that learn an occupancy for the model are counted too. All fields are `nn.Module`s.
+    nerfstudio's are called by `get_density`, others by `density` or, without it, directly.
     """
     count = Counter(dict.fromkeys(KINDS, 0))
     own = getattr(getattr(model, "mixture", model), "field", None)

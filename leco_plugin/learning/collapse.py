@@ -231,9 +231,9 @@ def is_dense(progress: Progress, step: int) -> bool:
 
 
 def annealed(config: GateLossConfig, progress: Progress, step: int) -> GateLossConfig:
-    """What teaches the gate at a step, after the recoveries so far.
+    """The gate's loss settings at a step, after the recoveries so far.
 
-    While samples are dense all of it comes in again from nothing. The pull towards empty space is
+    While samples are dense all weights ramp up from zero again. The pull towards empty space is
     lambda_g in the paper's form, and 1 / k in logit form.
     """
     weight, form = 1.0, form_of(config, progress)

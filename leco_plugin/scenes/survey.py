@@ -211,7 +211,7 @@ def covering_rays(cameras: Cameras, side: int = SIDE) -> tuple[Tensor, Tensor]:
 
 
 def seen_beyond(dataset: Any, numbers: Tensor, misses: Tensor) -> float:
-    """Share of the rays that miss the scene and show something all the same.
+    """Share of the rays that miss the scene but still show something.
 
     Args:
         dataset: nerfstudio's `InputDataset`.

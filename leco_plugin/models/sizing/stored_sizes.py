@@ -61,7 +61,7 @@ def sizes_in(checkpoint: Path) -> dict[str, Any] | None:
 
 
 def sizes_to_resume(wanted: Sizes, stored: dict[str, Any]) -> Sizes:
-    """The sizes with which a run is gone on with: its own, and those set by hand are the same.
+    """The sizes of a resumed run: those it was begun with.
 
     Raises:
         InputError: a size set by hand is another one.
