@@ -29,7 +29,12 @@ from leco_plugin.evaluation.equal_loss import (
     reached_volume,
     threshold_losing,
 )
-from leco_plugin.evaluation.field_grids import FieldGrids, density_of, looked_up, plain_and_dilated
+from leco_plugin.evaluation.field_grids import (
+    FieldGrids,
+    density_of,
+    look_up_scores,
+    plain_and_dilated,
+)
 from leco_plugin.evaluation.inspection import in_parts
 from leco_plugin.models.gate import GateConfig, occupancy_logit
 from leco_plugin.models.leco import LecoModel
@@ -201,7 +206,7 @@ def measure_grids(
     places = taught.lesson.mapped
 
     def floor_of(scores: Tensor) -> float:
-        of_rays = looked_up(scores, box, taught.mapped)
+        of_rays = look_up_scores(scores, box, taught.mapped)
         return threshold_losing(taught.held_out.worth, of_rays, SPARED * lost)
 
     most = MOST_ON_CPU if taught.mixture.device.type == "cpu" else math.inf

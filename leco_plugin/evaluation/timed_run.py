@@ -1,6 +1,6 @@
 """One training run of fixed time or steps in nerfstudio's trainer, and its figures on test images.
 
-Evaluation is off the clock; learning an occupancy is on it.
+Learning an occupancy counts as training time; evaluation does not.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ from leco_plugin.evaluation.clock import (
     warm_up,
 )
 from leco_plugin.evaluation.metrics import image_metrics
-from leco_plugin.evaluation.queries import GridUpdates, counted
+from leco_plugin.evaluation.queries import GridUpdates, count_queries
 from leco_plugin.evaluation.report import finite_or_null
 from leco_plugin.hosts.learn_first import FIRST_TIMED, TIMED_STEPS, keep_within
 from leco_plugin.scenes.input_error import InputError
@@ -127,7 +127,7 @@ def timed_run(
     trainer = _set_up(config, budget, seed)
     run = TimedRun(config.method_name or "", sampler, seed)
     model = trainer.pipeline.model
-    with counted(model) as queries:
+    with count_queries(model) as queries:
         course = _Course(trainer, budget, run, queries, curve_points, on_progress, on_frozen)
         run_training(trainer)
         course.end()

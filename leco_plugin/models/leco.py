@@ -47,7 +47,8 @@ class LecoModel(Model):
         mixture: gate, field and region.
         progress: how far its run has come.
         plan: what the next training step does.
-        kept_per_ray: samples that the frozen gate kept of the last batch, backdrops excluded.
+        kept_per_ray: mean kept samples per ray in the last batch, backdrop excluded; 1 while
+            nothing is skipped.
     """
 
     config: LecoModelConfig

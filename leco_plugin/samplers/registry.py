@@ -158,7 +158,7 @@ def _load(builder: Callable[..., nn.Module] | str) -> Callable[..., nn.Module]:
 
 
 def _parameters(builder: Callable[..., nn.Module]) -> dict[str, inspect.Parameter] | None:
-    """Parameters of a builder by name; None where it takes any, or nobody knows."""
+    """Parameters of a builder by name; None if it takes any, or they are unknown."""
     try:
         found = inspect.signature(builder).parameters
     except ValueError:  # a class of a compiled extension
