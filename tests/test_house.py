@@ -16,7 +16,7 @@ PACKAGE = "leco_plugin"
 WITHOUT_NERFSTUDIO = (
     "learning",
     *("models.mixture", "models.region", "models.gate", "models.field", "models.losses"),
-    *("models.objective", "models.rendering", "space", "occupancy", "log"),
+    *("models.objective", "models.rendering", "samplers", "space", "occupancy", "log"),
 )
 """Modules and packages that nothing of nerfstudio is imported with."""
 
