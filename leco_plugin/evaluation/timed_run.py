@@ -33,6 +33,7 @@ from leco_plugin.evaluation.report import finite_or_null
 from leco_plugin.hosts.learn_first import FIRST_TIMED, TIMED_STEPS, keep_within
 from leco_plugin.scenes.input_error import InputError
 from leco_plugin.studio.host_models import true_colours
+from leco_plugin.studio.internals import leave_out_the_end
 
 RAYS_AT_ONCE = 1024
 """Test rays rendered at a time: few, so that an evaluation does not set the peak memory."""
@@ -277,7 +278,7 @@ class _Course:
 
 def run_training(trainer: Trainer) -> None:
     """nerfstudio's training loop, without the last checkpoint and its banner."""
-    trainer._after_train = lambda: None  # type: ignore[method-assign]
+    leave_out_the_end(trainer)
     trainer.train()
 
 
