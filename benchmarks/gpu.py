@@ -26,7 +26,7 @@ import torch
 from gpu_parts import Disagreement, correctness, experts, gate_throughput
 from gpu_sampling import sampling
 from gpu_scale import Scale
-from gpu_training import dense, learned
+from gpu_training import train_dense, train_guided
 
 from leco_plugin.evaluation.report import (
     describe_code,
@@ -55,8 +55,8 @@ PARTS = {
     "gate": Part(gate_throughput, 40.0),
     "sampling": Part(sampling, 70.0),
     "experts": Part(experts, 20.0),
-    "learned": Part(learned, 170.0),
-    "dense": Part(dense, 170.0),
+    "learned": Part(train_guided, 170.0),
+    "dense": Part(train_dense, 170.0),
 }
 """In the order in which they run."""
 
@@ -188,7 +188,7 @@ def main(arguments: list[str] | None = None) -> int:
         device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
         if options.out is not None and options.out.resolve().is_relative_to(RESULTS):
             parser.error("a dry run leaves nothing among the results: give another --out")
-        return finished(Scale(device).dry(), options.out, dry=True)
+        return run_suite(Scale(device).dry(), options.out, dry=True)
     if not torch.cuda.is_available():
         print(
             f"no CUDA device here for torch {torch.__version__}: nothing is measured; --dry-run "
@@ -203,10 +203,10 @@ def main(arguments: list[str] | None = None) -> int:
             file=sys.stderr,
         )
         return 2
-    return finished(Scale(torch.device("cuda")), options.out or results_path(), dry=False)
+    return run_suite(Scale(torch.device("cuda")), options.out or results_path(), dry=False)
 
 
-def finished(scale: Scale, out: Path | None, dry: bool) -> int:
+def run_suite(scale: Scale, out: Path | None, dry: bool) -> int:
     """Runs the suite, and says where its results are and what becomes of them."""
     try:
         results = run(scale, out, dry)

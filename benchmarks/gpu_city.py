@@ -53,7 +53,9 @@ class Photographed(NamedTuple):
     """Median length of the rays inside the box, metres."""
 
 
-def photographed(config: CityConfig, capture: CaptureConfig, device: torch.device) -> Photographed:
+def take_photographs(
+    config: CityConfig, capture: CaptureConfig, device: torch.device
+) -> Photographed:
     """Builds a city and takes its pictures."""
     city = City(config)
     views = views_of(city, capture)

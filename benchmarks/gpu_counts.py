@@ -47,7 +47,7 @@ class Counting(LearnedOccupancyEstimator):
         return super().march(rays, rule)
 
 
-def counted(scale: Scale) -> Counted:
+def count_work(scale: Scale) -> Counted:
     """Counts the last, unbounded scene of the suite."""
     *_, (_, occupancy, options) = scenes(scale)
     made = Counting(occupancy, cache_bytes=scale.cache_bytes, tolerance=scale.tolerance)
@@ -87,4 +87,4 @@ def stretches(cache: CellCache, candidates: Candidates) -> tuple[int, int, int]:
 
 
 if __name__ == "__main__":
-    print(counted(Scale(torch.device("cpu"))))
+    print(count_work(Scale(torch.device("cpu"))))

@@ -192,7 +192,7 @@ def experts(scale: Scale, before: dict[str, Any]) -> dict[str, Any]:
     title = f"{n} experts of {config.layers} x {config.width}, {count} points"
     ratio = taken["one by one"] / taken["grouped"]
     figures = [figure(f"{title}: one by one / grouped", ratio, 1.0, False, **taken)]
-    chosen = grouped_trial.serves(device, n, config.width)
+    chosen = grouped_trial.is_grouping_faster(device, n, config.width)
     return {**measured, "grouped is chosen": chosen, "figures": figures}
 
 

@@ -14,7 +14,7 @@ from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import torch
-from gpu_city import Photographed, Pixels, photographed
+from gpu_city import Photographed, Pixels, take_photographs
 from gpu_floor import seconds
 from gpu_sampling import march_answers
 from gpu_scale import Scale, figure
@@ -211,9 +211,9 @@ class Run:
         return float(-10.0 * torch.cat(errors).mean().log10())
 
 
-def learned(scale: Scale, before: dict[str, Any]) -> dict[str, Any]:
+def train_guided(scale: Scale, before: dict[str, Any]) -> dict[str, Any]:
     """Learns the occupancy, freezes it, and goes on guided by it."""
-    scene = photographed(scale.city, scale.capture, scale.device)
+    scene = take_photographs(scale.city, scale.capture, scale.device)
     run, sizes = Run(scene, scale, homogeneous=False), scale.sizes
     started = time.perf_counter()
     run.train(scale.learning, sizes.learn_candidates)
@@ -242,12 +242,12 @@ def learned(scale: Scale, before: dict[str, Any]) -> dict[str, Any]:
     }
 
 
-def dense(scale: Scale, before: dict[str, Any]) -> dict[str, Any]:
+def train_dense(scale: Scale, before: dict[str, Any]) -> dict[str, Any]:
     """The dense host for as long as the guided run took, learning included, beside that run."""
     guided = before["learned"]
     if "guided_step" not in guided:
         return {"left_out": "there is no guided run to compare with"}
-    scene = photographed(scale.city, scale.capture, scale.device)
+    scene = take_photographs(scale.city, scale.capture, scale.device)
     run = Run(scene, scale, homogeneous=True)
     first = guided["seconds"]["learning"]
     took = run.train(first, scale.sizes.candidates)

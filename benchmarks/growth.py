@@ -105,7 +105,7 @@ def learn(blocks: int, seed: int, options: Options, first: int = 0) -> dict[str,
     city = CityConfig(blocks, seed)
     folder = write_city(city, options.cities / f"{blocks}-blocks-{seed}", options.capture)
     for steps in options.schedules[first:]:
-        attempt = learned_in(steps, folder, blocks, seed, options)
+        attempt = learn_gate(steps, folder, blocks, seed, options)
         if attempt.learned:
             break
         print(f"{blocks} blocks: not in {steps} steps")
@@ -151,7 +151,7 @@ class Attempt:
     """Step, seconds and kept share of the candidates, of each look."""
 
 
-def learned_in(steps: int, folder: Path, blocks: int, seed: int, options: Options) -> Attempt:
+def learn_gate(steps: int, folder: Path, blocks: int, seed: int, options: Options) -> Attempt:
     """A gate that learns by a schedule of so many steps, until it keeps little enough."""
     config: Any = copy.deepcopy(leco_occupancy.config.pipeline)
     config.datamanager.data = folder

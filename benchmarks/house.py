@@ -1,10 +1,11 @@
-"""Draws the house: every module by its lines, its room, and which room imports which.
+"""Draws the package: each module by its lines, each folder (a room), and the imports between rooms.
 
-python benchmarks/house.py        # writes docs/house.svg
+python benchmarks/house.py [--out FILE]        # docs/house.svg by default
 """
 
 from __future__ import annotations
 
+import argparse
 import ast
 from collections import Counter
 from pathlib import Path
@@ -19,6 +20,8 @@ OUT = ROOT / "docs" / "house.svg"
 LINES_AN_INCH = 900.0
 GROUND = ("space", "occupancy", "log", "entries")
 """Files beside the rooms that others stand on; the rest of them are commands and methods."""
+STYLE = {"svg.hashsalt": PACKAGE}
+"""Makes the identifiers in the file the same in every drawing."""
 WIDTH, GAP = 1.75, 0.75
 """Of a room, and between two columns, inches."""
 
@@ -83,7 +86,11 @@ def depths(edges: Counter[tuple[str, str]], rooms: set[str]) -> dict[str, int]:
 
 
 def draw(out: Path = OUT) -> None:
-    """The rooms in columns from what imports nothing to the entrance, arrows to what is used."""
+    """Writes the picture as SVG; the same package gives the same bytes.
+
+    Rooms stand in columns, from those that import nothing to the entrance. An arrow leads from the
+    importing room to the imported one.
+    """
     known = modules()
     lines = {name: len(path.read_text().splitlines()) for name, path in known.items()}
     edges: Counter[tuple[str, str]] = Counter()
@@ -96,7 +103,8 @@ def draw(out: Path = OUT) -> None:
     columns: dict[int, list[str]] = {}
     for room in sorted(rooms):
         columns.setdefault(depth[room], []).append(room)
-    figure, axes = plt.subplots(figsize=(len(columns) * (WIDTH + GAP), 9.0))
+    figure, axes = plt.subplots()
+    lowest = 0.0
     places: dict[str, tuple[float, float]] = {}
     for column, (_, inside) in enumerate(sorted(columns.items())):
         x, y = column * (WIDTH + GAP), 0.0
@@ -105,9 +113,9 @@ def draw(out: Path = OUT) -> None:
             height = 0.32 + sum(max(lines[n] / LINES_AN_INCH, 0.045) for n in names)
             axes.add_patch(Rectangle((x, y - height), WIDTH, height, fc="#f4f1ea", ec="#555555"))
             total = sum(lines[n] for n in names)
-            axes.text(x + 0.05, y - 0.11, room, fontsize=7, weight="bold", va="center")
+            axes.text(x + 0.05, y - 0.11, room, fontsize=9, weight="bold", va="center")
             counts = f"{len(names)} files, {total:,} lines"
-            axes.text(x + 0.05, y - 0.23, counts, fontsize=5, va="center")
+            axes.text(x + 0.05, y - 0.23, counts, fontsize=6.5, va="center")
             top = y - 0.3
             for name in names:
                 size = max(lines[name] / LINES_AN_INCH, 0.045)
@@ -116,11 +124,12 @@ def draw(out: Path = OUT) -> None:
                 axes.add_patch(box)
                 if size > 0.11:
                     short = name.rsplit(".", 1)[-1]
-                    axes.text(x + 0.1, top - size / 2, short, fontsize=5, va="center")
+                    axes.text(x + 0.1, top - size / 2, short, fontsize=7, va="center")
                 top -= size
             places[room] = (x, y - height / 2)
+            lowest = min(lowest, y - height)
             y -= height + 0.35
-    for (user, used), count in edges.items():
+    for (user, used), count in sorted(edges.items()):
         (x, y), (to_x, to_y) = places[user], places[used]
         against = depth[user] <= depth[used]
         start, end = (x, y), (to_x + WIDTH, to_y)
@@ -135,14 +144,28 @@ def draw(out: Path = OUT) -> None:
             alpha=0.9 if against else 0.45,
         )
         axes.add_patch(arrow)
-    axes.autoscale_view()
+    right = len(columns) * (WIDTH + GAP)
+    axes.set(xlim=(-GAP / 2, right - GAP / 2), ylim=(lowest - 0.1, 0.5))  # inches, as all above
+    figure.set_size_inches(right, 0.6 - lowest)
+    figure.subplots_adjust(0.0, 0.0, 1.0, 1.0)
     axes.set_axis_off()
     said = f"{len(known)} modules, {sum(lines.values()):,} lines; red: imports against the flow"
-    axes.set_title(said, fontsize=8)
-    figure.savefig(out, bbox_inches="tight")
+    axes.set_title(said, fontsize=14)
+    with plt.rc_context(STYLE):
+        figure.savefig(out, bbox_inches="tight", metadata={"Date": None})
     plt.close(figure)
 
 
+def main(args: list[str] | None = None) -> None:
+    """Draws the picture to `--out`."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
+    parser.add_argument("--out", type=Path, default=OUT, help="an SVG file (default: %(default)s)")
+    out = parser.parse_args(args).out
+    if out.suffix != ".svg":
+        parser.error(f"--out {out}: the name must end in .svg")
+    draw(out)
+    print(f"wrote {out}")
+
+
 if __name__ == "__main__":
-    draw()
-    print(f"wrote {OUT}")
+    main()

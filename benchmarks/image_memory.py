@@ -152,7 +152,7 @@ def measure(way: Way, folder: Path, options: Options) -> dict[str, Any]:
     }
 
 
-def in_its_own_process(way: Way, folder: Path, options: Options) -> dict[str, Any] | None:
+def measure_in_process(way: Way, folder: Path, options: Options) -> dict[str, Any] | None:
     """What `measure` says in a new process; None where the allowance was not enough."""
     command = [sys.executable, "-W", "ignore", __file__, "--measure", way]
     command += ["--folder", str(folder), "--steps", str(options.steps)]
@@ -175,10 +175,10 @@ def in_its_own_process(way: Way, folder: Path, options: Options) -> dict[str, An
 
 def compared(way: Way, folder: Path, small: Path, options: Options) -> dict[str, Any]:
     """A row of the results: what a way takes, and how much of it is the photographs."""
-    row = in_its_own_process(way, folder, options)
+    row = measure_in_process(way, folder, options)
     if row is None:
         return {"way": way, "within_allowance": False}
-    without = in_its_own_process(way, small, options)
+    without = measure_in_process(way, small, options)
     assert without is not None, "a tenth of the size takes more than the whole"
     row["within_allowance"] = True
     row["added_on_a_tenth_bytes"] = without["added_bytes"]

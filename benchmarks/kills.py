@@ -175,7 +175,7 @@ class Runs:
         return float(found["seconds"])
 
 
-def undisturbed(runs: Runs, seed: int) -> dict[str, Any]:
+def train_undisturbed(runs: Runs, seed: int) -> dict[str, Any]:
     """A run that nobody kills, and the processor seconds that it takes, until training begins and
     in all."""
     name = f"undisturbed-{seed}"
@@ -201,7 +201,7 @@ def wait_for(process: Any, most: float = math.inf) -> float:
     return spent
 
 
-def killed(
+def train_with_kills(
     runs: Runs, number: int, kills: int, begun: float, seconds: float, dice: random.Random
 ) -> Any:
     """A run that is killed up to so often, until it ends by itself.
@@ -255,13 +255,15 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as folder:
         runs = Runs(Path(folder) / "runs")
         for _ in range(max(1, UNDISTURBED - len(result["undisturbed"]))):
-            result["undisturbed"].append(undisturbed(runs, len(result["undisturbed"])))
+            result["undisturbed"].append(train_undisturbed(runs, len(result["undisturbed"])))
             write_json(arguments.out, result)
         last = result["undisturbed"][-1]
         while (left := arguments.kills - total(result)) > 0 and time.monotonic() < ends:
             number = len(result["killed"])
             dice = random.Random(number)
-            run = killed(runs, number, min(KILLS_A_RUN, left), last["begun"], last["seconds"], dice)
+            run = train_with_kills(
+                runs, number, min(KILLS_A_RUN, left), last["begun"], last["seconds"], dice
+            )
             result["killed"].append(run)
             write_json(arguments.out, result | {"kills": total(result)})
             print(f"{total(result)} of {arguments.kills} kills", flush=True)

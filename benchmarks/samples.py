@@ -20,11 +20,11 @@ from unittest.mock import patch
 import checkout  # noqa: F401
 import torch
 import tyro
-from timing import interleaved, ratio
+from timing import ratio, time_interleaved
 
 from leco_plugin.capacity.sources import find_source
 from leco_plugin.cli_reports import occupancy_of
-from leco_plugin.evaluation.queries import counted
+from leco_plugin.evaluation.queries import count_queries
 from leco_plugin.evaluation.report import (
     describe_code,
     describe_machine,
@@ -97,7 +97,7 @@ def along_rays(model: LecoModel, bundles: Sequence[Any]) -> dict[str, float]:
             total += len(rays.origins)
             sums["candidates"] += len(marching.march(along, rule)[0])
             estimator = mixture.estimator()
-            with asked_along(estimator) as count, counted(model) as queries:
+            with asked_along(estimator) as count, count_queries(model) as queries:
                 kept = estimator.march(along, rule)
             sums["kept"] += len(kept[0])
             sums["gate"] += queries["gate"]
@@ -113,7 +113,7 @@ def rendered(
     """PSNR of test photographs, and how many samples a ray of them are shaded."""
     model.config.front_to_back = front
     squares, values, rays = 0.0, 0, 0
-    with counted(model) as queries:
+    with count_queries(model) as queries:
         for bundle, image in pictures:
             rgb = model.get_outputs_for_camera_ray_bundle(bundle)["rgb"].clamp(0.0, 1.0)
             truth = true_colours(model, image.to(rgb.device))
@@ -130,7 +130,7 @@ def row_of(run: Path, data: Path) -> dict[str, Any]:
         raise SystemExit(f"{run} is no run of leco-occupancy that has frozen its gate")
     pictures = bundles_of(source.manager, model.device)
     every, front = (rendered(model, pictures, front) for front in (False, True))
-    timings = interleaved(
+    timings = time_interleaved(
         {
             "all": lambda: rendered(model, pictures[:1], False),
             "front": lambda: rendered(model, pictures[:1], True),

@@ -18,7 +18,7 @@ import torch
 import tyro
 from sampling_hosts import ngp_like_step, switch_nerf_like_step
 from sampling_scene import fit_occupancy, rays_into
-from timing import interleaved, machine, milliseconds, ratio
+from timing import machine, milliseconds, ratio, time_interleaved
 from torch import Tensor
 
 from leco_plugin.evaluation.report import describe_code
@@ -80,7 +80,7 @@ def compare_with_grid(occupancy: Occupancy, n_rays: int, rounds: int) -> list[Fi
     options: dict[str, Any] = {"render_step_size": float(space.half_extent) / 200.0}
     if levels > 1:
         options |= {"cone_angle": 0.004, "far_plane": float(space.half_extent) * 8.0}
-    timings = interleaved(
+    timings = time_interleaved(
         {
             "gate with cache": lambda: learned.sampling(origins, directions, **options),
             "occupancy grid 128^3": lambda: grid.sampling(origins, directions, **options),
@@ -122,7 +122,7 @@ def compare_with_matrix_products(occupancy: Occupancy, rounds: int) -> Figure:
         "matrix products": products,
         "gate": lambda: occupancy.occupied(positions),
     }
-    timings = interleaved(functions, rounds)
+    timings = time_interleaved(functions, rounds)
     value = ratio(timings, "matrix products", "gate")
     name = f"throughput: gate without cache / its matrix products ({occupancy.precision})"
     return Figure(name, value, 0.5, False, milliseconds(timings))
@@ -158,7 +158,7 @@ def compare_with_one_pass(device: str, rounds: int) -> list[Figure]:
         "march": lambda: march(*rays, occupied),
         "march with a coarse question": lambda: march(*rays, occupied, near_occupied),
     }
-    timings = interleaved(functions, rounds)
+    timings = time_interleaved(functions, rounds)
     medians = milliseconds(timings)
     base = "one pass over the positions"
     return [
@@ -186,7 +186,7 @@ def share_of_training(occupancy: Occupancy, rounds: int) -> list[Figure]:
     figures = []
     for name, build in (("NGP-like", ngp_like_step), ("Switch-NeRF-like", switch_nerf_like_step)):
         sample, step = build(LearnedOccupancyEstimator(occupancy))
-        timings = interleaved({"sampling": sample, "training step": step}, max(3, rounds // 3))
+        timings = time_interleaved({"sampling": sample, "training step": step}, max(3, rounds // 3))
         value = ratio(timings, "sampling", "training step")
         figures.append(
             Figure(f"sampling / training step, {name}", value, 0.15, True, milliseconds(timings))

@@ -34,7 +34,7 @@ from leco_plugin.capacity.sources import (
 )
 from leco_plugin.cli_reports import occupancy_of
 from leco_plugin.evaluation.equal_loss import kept_shares, mapped_box, reached_volume
-from leco_plugin.evaluation.field_grids import dilate, looked_up
+from leco_plugin.evaluation.field_grids import dilate, look_up_scores
 from leco_plugin.evaluation.inspection import in_parts
 from leco_plugin.evaluation.report import (
     describe_code,
@@ -147,7 +147,7 @@ def grid_score(
     box = mapped_box(mixture)
     filled = taught_grid(lesson, box, cells)
     filled = dilate(filled) if dilated else filled
-    return lambda mapped: looked_up(filled, box, mapped)
+    return lambda mapped: look_up_scores(filled, box, mapped)
 
 
 def at_equal_loss(source: Source, mixture: Mixture, gates: list[Gate]) -> list[dict[str, Any]]:

@@ -16,7 +16,7 @@ from leco_plugin.evaluation.report import processor_name
 Timings = dict[str, list[float]]
 
 
-def interleaved(functions: dict[str, Callable[[], Any]], rounds: int) -> Timings:
+def time_interleaved(functions: dict[str, Callable[[], Any]], rounds: int) -> Timings:
     """Seconds of each function in each round, after one round that warms up."""
     seconds: Timings = {name: [] for name in functions}
     for round_number in range(rounds + 1):

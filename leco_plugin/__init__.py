@@ -8,9 +8,9 @@ from typing import TYPE_CHECKING, Any
 __version__ = "0.1.0"
 
 if TYPE_CHECKING:
+    from leco_plugin.hosts.proposal import LearnedOccupancySampler
     from leco_plugin.occupancy import Occupancy
     from leco_plugin.samplers.estimator import LearnedOccupancyEstimator
-    from leco_plugin.samplers.proposal import LearnedOccupancySampler
 
 __all__ = [
     "LearnedOccupancyEstimator",
@@ -23,7 +23,7 @@ __all__ = [
 # here before somebody asks for it.
 _HOMES = {
     "LearnedOccupancyEstimator": "leco_plugin.samplers.estimator",
-    "LearnedOccupancySampler": "leco_plugin.samplers.proposal",
+    "LearnedOccupancySampler": "leco_plugin.hosts.proposal",
     "Occupancy": "leco_plugin.occupancy",
 }
 

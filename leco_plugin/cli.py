@@ -159,8 +159,14 @@ COMMANDS: dict[str, Callable[..., None]] = {
 def main(arguments: Sequence[str] | None = None) -> int:
     """Runs `leco`: 0, or one line on stderr and 2 for bad input, 1 for a failure."""
     given = list(sys.argv[1:] if arguments is None else arguments)
-    # what nerfstudio and torch think of each other is nothing that a user can act on
-    warnings.filterwarnings("ignore", module=r"nerfstudio|torch")
+    with warnings.catch_warnings():
+        # what nerfstudio and torch think of each other is nothing that a user can act on
+        warnings.filterwarnings("ignore", module=r"nerfstudio|torch")
+        return _run(given)
+
+
+def _run(given: list[str]) -> int:
+    """As `main`."""
     try:
         tyro.extras.subcommand_cli_from_dict(
             COMMANDS,

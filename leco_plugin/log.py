@@ -91,7 +91,7 @@ def _lines(what: str) -> Callable[[float], None]:
 
 @contextmanager
 def resumable(say: Callable[[str], None]) -> Iterator[None]:
-    """Around work of which every finished part is kept: says so when somebody stops it."""
+    """A context for resumable work: Ctrl-C logs that finished parts are kept."""
     try:
         yield
     except KeyboardInterrupt:

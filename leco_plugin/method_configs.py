@@ -18,7 +18,10 @@ from leco_plugin.models.sizing.sizes import PAPER, automatic, sizes_for
 from leco_plugin.scenes.data_manager import LecoDataManagerConfig
 from leco_plugin.scenes.photographs import LecoPhotographsDataParserConfig
 from leco_plugin.scenes.pixels.known_distances import KnownDistancePixelSamplerConfig
+from leco_plugin.studio.commands import show_one_line_in_ns_commands
 from leco_plugin.studio.processes import DataParallelTrainerConfig
+
+show_one_line_in_ns_commands()
 
 
 def best_device() -> Literal["cpu", "cuda"]:

@@ -77,15 +77,18 @@ class Occupancy(nn.Module):
         """tau: positions with o(x) >= tau are kept."""
         return float(self.threshold_value)
 
-    def with_threshold(self, threshold: float) -> Occupancy:
-        """An occupancy with another threshold that shares everything else, the report too.
+    def with_threshold(self, threshold: float, report: dict[str, Any] | None = None) -> Occupancy:
+        """An occupancy with another threshold that shares everything else.
 
+        Args:
+            report: of that threshold; None is this one's.
         Raises:
             ValueError: it is not in [0, 1].
         """
         if not 0.0 <= threshold <= 1.0:
             raise ValueError(f"a threshold is in [0, 1], not {threshold}")
-        given = (self.gate, self.space, threshold, self.precision, self.report, self.walls)
+        said = self.report if report is None else report
+        given = (self.gate, self.space, threshold, self.precision, said, self.walls)
         return Occupancy(*given).to(self.walls.device).train(self.training)
 
     def shows_a_backdrop(self) -> bool:

@@ -14,7 +14,7 @@ import sys
 from pathlib import Path
 from typing import IO
 
-from leco_plugin.scenes.input_error import show_one_line_in_ns_commands
+from leco_plugin.studio.commands import show_one_line_in_ns_commands
 
 ENTRY_POINTS = {
     "ns-train": "nerfstudio.scripts.train:entrypoint",

@@ -137,7 +137,7 @@ def test_a_dry_run_gives_no_verdicts(quick: list[str], capsys) -> None:
 
 def test_the_end_says_where_the_results_are(quick: list[str], tmp_path: Path, capsys) -> None:
     out = tmp_path / "gpu.json"
-    assert gpu.finished(DRY, out, dry=False) == 0
+    assert gpu.run_suite(DRY, out, dry=False) == 0
     assert f"all parts are measured; they are in {out}" in capsys.readouterr().out
     stored = json.loads(out.read_text())
     assert set(stored["parts"]["one"]) == {"figures", "running", "wall_seconds"}
@@ -156,7 +156,7 @@ def test_a_part_that_does_not_fit_a_card_is_left_out(
     assert quick == ["two"]
     assert results["parts"]["one"]["left_out"] == "CUDA out of memory. Tried to allocate 2 GiB."
     assert "one: LEFT OUT, CUDA out of memory" in capsys.readouterr().out
-    assert "left_out" in gpu_training.dense(DRY, {"learned": results["parts"]["one"]})
+    assert "left_out" in gpu_training.train_dense(DRY, {"learned": results["parts"]["one"]})
 
 
 def test_a_small_card_decides_about_fewer_positions(monkeypatch) -> None:
@@ -289,7 +289,7 @@ def test_a_gate_that_no_kernel_takes_is_said_to_be_answered_by_torch(monkeypatch
 
 
 def test_a_guided_run_skips(stored: Path) -> None:
-    scene = gpu_training.photographed(DRY.city, DRY.capture, CPU)
+    scene = gpu_training.take_photographs(DRY.city, DRY.capture, CPU)
     run = gpu_training.Run(scene, DRY, homogeneous=False)
     rays = run.rays_of(scene.test)
     everything = run.intervals_of(rays, 16, jittered=False)

@@ -72,14 +72,14 @@ def test_the_dense_host_ends_learning_when_the_guided_one_did(monkeypatch) -> No
     step = {"seconds": 1.0, "peak_bytes": 1}
     seconds = {"learning": 3.0, "freezing": 0.5, "guided": 2.0}
     learned = {"seconds": seconds, "guided_step": step, "psnr": 10.0}
-    assert gpu_training.dense(DRY, {"learned": learned})["seconds"] == 5.5
+    assert gpu_training.train_dense(DRY, {"learned": learned})["seconds"] == 5.5
     assert trained == [(3.0, True), (2.5, False)]
 
 
 def test_a_frozen_run_has_ended_learning_and_says_what_answers() -> None:
-    measured = gpu_training.learned(DRY, {})
+    measured = gpu_training.train_guided(DRY, {})
     assert measured["running"] == {"gate": False, "march": False}
-    scene = gpu_training.photographed(DRY.city, DRY.capture, CPU)
+    scene = gpu_training.take_photographs(DRY.city, DRY.capture, CPU)
     run = gpu_training.Run(scene, DRY, homogeneous=False)
     assert run.learning
     run.freeze()

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import ast
+import re
 from collections.abc import Iterator
 from functools import cache
 from graphlib import CycleError, TopologicalSorter
+from importlib.util import find_spec
 from pathlib import Path
 
 import pytest
@@ -16,7 +18,7 @@ PACKAGE = "leco_plugin"
 WITHOUT_NERFSTUDIO = (
     "learning",
     *("models.mixture", "models.region", "models.gate", "models.field", "models.losses"),
-    *("models.objective", "models.rendering", "space", "occupancy", "log"),
+    *("models.objective", "models.rendering", "samplers", "space", "occupancy", "log"),
 )
 """Modules and packages that nothing of nerfstudio is imported with."""
 
@@ -149,6 +151,27 @@ def test_no_module_imports_itself_by_way_of_others() -> None:
 @pytest.mark.parametrize("name", below_the_seam())
 def test_the_core_imports_nothing_of_nerfstudio(name: str) -> None:
     assert " -> ".join(way_to_nerfstudio(name, KNOWN)) == ""
+
+
+def private_names_of_nerfstudio() -> set[str]:
+    """What its objects keep to themselves, but for what configs are documented to have."""
+    (folder,) = find_spec("nerfstudio").submodule_search_locations
+    texts = [path.read_text(encoding="utf8") for path in Path(folder).rglob("*.py")]
+    return {name for text in texts for name in re.findall(r"self\.(_[a-z]\w*)", text)} - {"_target"}
+
+
+def test_what_nerfstudio_keeps_to_itself_is_read_in_studio_alone() -> None:
+    """What a subclass overrides, or asks its parent class for, is no such thing."""
+    names, found = private_names_of_nerfstudio(), set()
+    for module, path in modules().items():
+        text = path.read_text()
+        for node in ast.walk(ast.parse(text)) if "._" in text else ():
+            if isinstance(node, ast.Attribute) and node.attr in names:
+                holder = ast.unparse(node.value)
+                if holder not in ("self", "cls", "super()"):
+                    found.add((module, f"{holder}.{node.attr}"))
+    assert {"trainer._start_step", "trainer._after_train"} <= {text for _, text in found}
+    assert {each for each in found if not each[0].startswith(f"{PACKAGE}.studio.")} == set()
 
 
 @pytest.mark.parametrize("known", KNOWN, ids=str)

@@ -34,7 +34,7 @@ class StandIn:
 
 
 def made(runs: StandIn) -> Any:
-    return kills.killed(runs, 0, 1, 0.0, 0.0, random.Random(0))
+    return kills.train_with_kills(runs, 0, 1, 0.0, 0.0, random.Random(0))
 
 
 def test_what_a_process_destroys_of_its_own_is_lost(tmp_path: Path) -> None:

@@ -16,7 +16,7 @@ from leco_plugin.learning import history
 from leco_plugin.learning.freezing import FIELD_FILE, field_at_freezing
 from leco_plugin.learning.merging import MergingConfig
 from leco_plugin.models import mixture
-from leco_plugin.studio.run import forget_the_gone
+from leco_plugin.studio.run import drop_missing_parameters
 from leco_plugin.studio.trainer import AtomicTrainer
 
 pytestmark = OPEN_IMAGES
@@ -82,7 +82,9 @@ def test_it_is_frozen_merged_saved_and_resumed(
         assert all(torch.equal(ours[name], theirs[name]) for name in ours)
     assert (second.base_dir / FIELD_FILE).read_bytes() == (first.base_dir / FIELD_FILE).read_bytes()
     take_steps(second, 5, 6)
-    forget_the_gone(second.optimizers, again.parameter_groups())  # nothing is left to forget
+    drop_missing_parameters(
+        second.optimizers, again.parameter_groups()
+    )  # nothing is left to forget
     assert len(optimizer.state) == len(second.optimizers.optimizers["field"].state)
 
 

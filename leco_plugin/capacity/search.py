@@ -75,7 +75,7 @@ def search(
                 show(first + share * (last - first))
 
             gate = _teach_in_place(config, lesson, times * STEPS, ground.original, show_part)
-            rung = _measure(ground, gate, bounds, volume, kept, looks + 1)
+            rung, gate = _measure(ground, gate, bounds, volume, kept, looks + 1)
             looks = rung.look or looks
             nearly = rung.lost_surface_mass <= NEARLY * MARGIN * bounds.lost_surface_mass
             if rung.verdict == "chosen" or not nearly:
@@ -117,8 +117,8 @@ def lesson_of(original: Occupancy, taught: Evidence) -> Lesson:
 
 def _measure(
     ground: Ground, smaller: Occupancy, bounds: Bounds, volume: Tensor, kept: float, look: int
-) -> Rung:
-    """Gives the gate its threshold; what was found with it.
+) -> tuple[Rung, Occupancy]:
+    """What is found of a gate, and the gate with the threshold that it was found with.
 
     Args:
         volume: [P, 3] places in the original's box.
@@ -142,7 +142,7 @@ def _measure(
         )
         if holds:
             break
-    smaller.threshold_value.fill_(threshold)
+    smaller = smaller.with_threshold(threshold)
     config = smaller.gate.config
     params = values_of(config)
     rung = Rung(name_of(config), params, 2 * params, round(ratio, 4), lost, None, "", 0.0)
@@ -157,7 +157,7 @@ def _measure(
         else:
             holds = verify(ground, smaller, bounds, rung, look)
             rung.verdict = "chosen" if holds else "fails on unseen rays"
-    return rung
+    return rung, smaller
 
 
 def _losses_of(

@@ -78,7 +78,7 @@ class Chart:
         self.jobs = jobs_of(contenders, seeds)
         self.settings = settings_of(self.scene, protocol, self.suite, self.machine)
         for source in reuse:
-            if other := unlike(source, self.settings):
+            if other := why_not_shared(source, self.settings):
                 raise InputError(f"--reuse {source}: {other}")
         self.folder = RunFolder(out, self.settings)
 
@@ -236,8 +236,8 @@ def _counted(count: int, name: str) -> str:
     return f"{count} {name}{'s' if count != 1 else ''}"
 
 
-def unlike(source: Path, settings: Mapping[str, Any]) -> str | None:
-    """Why runs in another folder cannot join a chart with these settings; None where they can.
+def why_not_shared(source: Path, settings: Mapping[str, Any]) -> str | None:
+    """Why a chart with these settings cannot use the runs of another folder; None if it can.
 
     Only what they were made for, a suite or none, may differ.
 
@@ -258,7 +258,7 @@ def take_over(folder: RunFolder, missing: Sequence[Job], sources: Sequence[Path]
     left, taken = list(missing), []
     for source in sources:
         for name, record in stored_in(source).items():
-            for job in [job for job in left if serves(record, job)]:
+            for job in [job for job in left if is_run_of(record, job)]:
                 for ending in (".safetensors", ".png"):
                     if (file := source / RUNS / f"{name}{ending}").exists():
                         shutil.copyfile(file, folder.path / RUNS / f"{job.name}{ending}")
@@ -269,8 +269,8 @@ def take_over(folder: RunFolder, missing: Sequence[Job], sources: Sequence[Path]
     return taken
 
 
-def serves(record: Mapping[str, Any], job: Job) -> bool:
-    """Whether a stored run is the one that a job asks for.
+def is_run_of(record: Mapping[str, Any], job: Job) -> bool:
+    """Whether a stored run is the run of a job.
 
     Grids and taught gates are made from its field afterwards: a run with more of them serves too.
     """

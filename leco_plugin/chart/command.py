@@ -11,7 +11,7 @@ from typing import Any
 
 from nerfstudio.utils.rich_utils import CONSOLE
 
-from leco_plugin.chart.chart import Chart, unlike
+from leco_plugin.chart.chart import Chart, why_not_shared
 from leco_plugin.chart.methods import contenders
 from leco_plugin.chart.protocol import Protocol
 from leco_plugin.chart.runner import ProcessRunner, Runner
@@ -81,7 +81,7 @@ def make_charts(
         charts = [_chart_of(data, out / name, asked, name) for name in names]
         for chart in charts:
             others = [out / other for other in SUITES if other != chart.suite]
-            chart.reuse = [other for other in others if not unlike(other, chart.settings)]
+            chart.reuse = [other for other in others if not why_not_shared(other, chart.settings)]
     else:
         name = names[0] if names else None
         charts = [_chart_of(data, out, asked, name, methods, samplers)]

@@ -86,7 +86,7 @@ class RunFolder:
             yield
 
     def clear(self) -> None:
-        """Deletes what killed processes left; for whoever alone makes jobs here."""
+        """Deletes what killed processes left. Only for the process that alone makes jobs here."""
         shutil.rmtree(self.path / UNFINISHED, ignore_errors=True)
         (self.path / UNFINISHED).mkdir(exist_ok=True)
 

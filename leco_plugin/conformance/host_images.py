@@ -100,7 +100,7 @@ def _noting(seam: GuidedEstimator | GuidedProposal, sampled: list[Tensor]) -> An
 
 
 @contextmanager
-def densely(model: Model) -> Iterator[None]:
+def sample_densely(model: Model) -> Iterator[None]:
     """While this lasts, a guided host samples all of the box, or all of each ray.
 
     So does a packed host with its own estimator.
@@ -276,7 +276,7 @@ def guided_by_everything_is_dense(case: HostCase) -> None:
     """Where everything is occupied, an image is the one without guidance, but for the sampling."""
     model = case.shared(EVERYTHING)
     found = rendered(model, inside_the_box())
-    with densely(model):
+    with sample_densely(model):
         expected = rendered(model, inside_the_box())
     tolerance = TOLERANCE[is_packed(model)]
     for name in CHANNELS:

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import torch
 from torch import Tensor
 
-from leco_plugin.conformance.host_images import densely, places_asked, rendered
+from leco_plugin.conformance.host_images import places_asked, rendered, sample_densely
 from leco_plugin.conformance.hosts import HostCase, batch, build, bundle, callbacks, loss_of
 from leco_plugin.conformance.rules import checks, require
 from leco_plugin.conformance.samplers import on_two_ranks, reloaded
@@ -79,7 +79,7 @@ def nothing_superfluous_is_left(case: HostCase) -> None:
     for adapter in (PACKED, PROPOSAL):
         require(not adapter.fits(model), f"the host still holds {adapter.description}")
     now = dict(model.named_parameters())
-    with densely(own):  # a grid that nobody has updated keeps nothing
+    with sample_densely(own):  # a grid that nobody has updated keeps nothing
         before = gradients_of_a_step(own)
     idle = before.keys() & now.keys() - gradients_of_a_step(model).keys()
     require(

@@ -1,8 +1,8 @@
-"""How much space representations of an occupancy keep when all lose equally much.
+"""Kept volume of occupancy representations at equal lost surface mass.
 
-Each has a score, o(x) of a gate or the largest density in a grid's cell; its threshold is set so
-that the same share of the weight near surfaces is lost. Only places that rays of photographs reach
-count as space: nothing teaches a gate or a grid elsewhere, and no ray asks.
+Each representation has a score: o(x) for a gate, the largest density in a cell for a grid. Its
+threshold is set so that all lose the same share of the weight near surfaces. Only space that rays
+of photographs reach is counted: elsewhere gates and grids are neither taught nor queried.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from leco_plugin.evaluation.field_grids import (
     FieldGrids,
     density_of,
     fits_memory,
-    looked_up,
+    look_up_scores,
     plain_and_dilated,
 )
 from leco_plugin.evaluation.inspection import ViewBox, in_parts, whole_box
@@ -159,7 +159,7 @@ def _grids_of(
     box = mapped_box(mixture)
 
     def floor_of(scores: Tensor) -> float:
-        of_rays = looked_up(scores, box, mapped)
+        of_rays = look_up_scores(scores, box, mapped)
         return threshold_losing(weights, of_rays, SPARED * LOST_SURFACE_MASS)
 
     most = MOST_ON_CPU if mixture.device.type == "cpu" else math.inf

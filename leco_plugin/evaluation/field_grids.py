@@ -1,7 +1,7 @@
 """Occupancy grids of a trained field, each refined from one half as fine.
 
 Densities are evaluated only in cells that the coarser grid, or a neighbour there, has not ruled
-out: the time of 512^3 cells depends on the surface in them.
+out. The time for 512^3 cells therefore depends on how much surface they hold.
 """
 
 from __future__ import annotations
@@ -79,7 +79,7 @@ class FieldGrids:
             if int(asked.sum()) * probes_in_a_cell(step) > self.most:
                 self.clock.stop()
                 return None
-            self.scores = filled(self.density, self.box, asked, known=self.known)
+            self.scores = fill_cells(self.density, self.box, asked, known=self.known)
             self.floor = self.floor_of(self.scores)
         self.clock.stop()
         return self.scores
@@ -125,13 +125,13 @@ def probes_in_a_cell(sizes: Sequence[int]) -> int:
     return max(FEWEST_PROBES, PROBES_ALONG // max(sizes))
 
 
-def filled(
+def fill_cells(
     density: Density,
     box: ViewBox,
     asked: Tensor,
     known: tuple[Tensor, Tensor] | None = None,
 ) -> Tensor:
-    """Scores of the cells of a grid: [nx, ny, nz]; zero where they are neither asked nor known.
+    """Scores [nx, ny, nz] of the cells of a grid; zero where they are neither asked nor known.
 
     Args:
         density: of the field.
@@ -169,7 +169,7 @@ def dilate(scores: Tensor) -> Tensor:
     return max_pool3d(scores[None, None], 3, stride=1, padding=1)[0, 0]
 
 
-def looked_up(scores: Tensor, box: ViewBox, mapped: Tensor) -> Tensor:
+def look_up_scores(scores: Tensor, box: ViewBox, mapped: Tensor) -> Tensor:
     """Scores of the cells that hold mapped positions [N, 3]; zero outside: [N]."""
     index, inside = _cells(scores, box, mapped)
     return scores.view(-1).index_select(0, index) * inside
@@ -180,7 +180,7 @@ def plain_and_dilated(
 ) -> Iterator[tuple[Tensor, ...]]:
     """Scores [N] of several sets of mapped positions [N, 3]: of the grid as it is, then dilated."""
     for some in (scores, dilate(scores)):
-        yield tuple(looked_up(some, box, mapped) for mapped in places)
+        yield tuple(look_up_scores(some, box, mapped) for mapped in places)
 
 
 def _cells(scores: Tensor, box: ViewBox, mapped: Tensor) -> tuple[Tensor, Tensor]:
@@ -199,7 +199,7 @@ def density_of(mixture: Mixture, mapped: Tensor) -> Tensor:
     def part_of(part: Tensor) -> Tensor:
         with gate_precision(mixture.device.type, mixture.precision):
             values, routes = gate_values_and_routes(
-                mixture.gate(part), mixture.routing, mixture.field.experts.those_left()
+                mixture.gate(part), mixture.routing, mixture.field.experts.remaining_experts()
             )
             sigmas: Tensor = mixture.field.density(part, routes, values)[0]
         return sigmas

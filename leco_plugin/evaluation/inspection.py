@@ -104,7 +104,7 @@ def in_parts(function: Callable[[Tensor], Tensor], positions: Tensor) -> Tensor:
 
 
 def exposed(kept: Tensor, beyond: bool = False) -> Tensor:
-    """Kept cells of which one of the six neighbours is not; bool [X, Y, Z], and of that shape.
+    """Kept cells with at least one skipped neighbour of six: bool [X, Y, Z], as `kept`.
 
     Args:
         beyond: whether what lies beyond the cells counts as kept.

@@ -1,4 +1,4 @@
-"""The `occupancy` of reports: facts of one that a run left, measured against the exact city."""
+"""The `occupancy` of reports: figures of a run's occupancy, measured against the exact city."""
 
 from __future__ import annotations
 

@@ -1,8 +1,8 @@
-"""What a run asks: positions at which fields and gates are evaluated, and updates of grids.
+"""Counts the positions at which fields and gates are evaluated, and the updates of grids.
 
-All positions are counted, also those for pruning samples and for updating a grid; for a frozen
-gate not those of CUDA kernels. Classes are wrapped, not objects, so that a field made on the way,
-as the one that learns an occupancy for a host, is counted too.
+Positions for pruning samples and for updating a grid count too. A frozen gate's queries in CUDA
+kernels do not. Classes are wrapped instead of objects, so that a field created during the run is
+counted, such as the one that learns an occupancy for a host.
 """
 
 from __future__ import annotations
@@ -29,12 +29,11 @@ occupancy; a frozen gate, where its cell cache gave no answer."""
 
 
 @contextmanager
-def counted(model: nn.Module) -> Iterator[Counter[str]]:
-    """Counts by `KINDS` the positions that a model's fields, and those that learn for it, evaluate
-    meanwhile.
+def count_queries(model: nn.Module) -> Iterator[Counter[str]]:
+    """Counts, by `KINDS`, the positions at which a model's fields are evaluated in this context.
 
-    A model keeps its fields as `nn.Module`s: nerfstudio's are asked through `get_density`, others
-    through `density` or, without one, by being called.
+    Fields that learn an occupancy for the model are counted too. All fields are `nn.Module`s.
+    nerfstudio's are called by `get_density`, others by `density` or, without it, directly.
     """
     count = Counter(dict.fromkeys(KINDS, 0))
     own = getattr(getattr(model, "mixture", model), "field", None)

@@ -1,4 +1,4 @@
-"""What every report on disk holds: strict JSON, the machine, and the code that measured."""
+"""Reports on disk: strict JSON with the machine and the code that measured."""
 
 from __future__ import annotations
 

@@ -1,6 +1,6 @@
 """One training run of fixed time or steps in nerfstudio's trainer, and its figures on test images.
 
-Evaluation is off the clock; learning an occupancy is on it.
+Learning an occupancy counts as training time; evaluation does not.
 """
 
 from __future__ import annotations
@@ -28,11 +28,12 @@ from leco_plugin.evaluation.clock import (
     warm_up,
 )
 from leco_plugin.evaluation.metrics import image_metrics
-from leco_plugin.evaluation.queries import GridUpdates, counted
+from leco_plugin.evaluation.queries import GridUpdates, count_queries
 from leco_plugin.evaluation.report import finite_or_null
 from leco_plugin.hosts.learn_first import FIRST_TIMED, TIMED_STEPS, keep_within
 from leco_plugin.scenes.input_error import InputError
 from leco_plugin.studio.host_models import true_colours
+from leco_plugin.studio.internals import leave_out_the_end
 
 RAYS_AT_ONCE = 1024
 """Test rays rendered at a time: few, so that an evaluation does not set the peak memory."""
@@ -127,7 +128,7 @@ def timed_run(
     trainer = _set_up(config, budget, seed)
     run = TimedRun(config.method_name or "", sampler, seed)
     model = trainer.pipeline.model
-    with counted(model) as queries:
+    with count_queries(model) as queries:
         course = _Course(trainer, budget, run, queries, curve_points, on_progress, on_frozen)
         run_training(trainer)
         course.end()
@@ -281,7 +282,7 @@ class _Course:
 
 def run_training(trainer: Trainer) -> None:
     """nerfstudio's training loop, without the last checkpoint and its banner."""
-    trainer._after_train = lambda: None  # type: ignore[method-assign]
+    leave_out_the_end(trainer)
     trainer.train()
 
 

@@ -28,12 +28,21 @@ from leco_plugin.samplers.registry import (
     sampler_spec,
 )
 from leco_plugin.scenes.frames import moved, turned
-from leco_plugin.scenes.input_error import InputError, one_line
+from leco_plugin.scenes.input_error import (
+    InputError,
+    one_line,
+    require_keys,
+    state_of_this_version,
+)
 from leco_plugin.scenes.survey import covering_rays
 from leco_plugin.space import Space
 
 FARTHEST = 1e3
 """Half extents of the occupancy after which a ray has left what it is asked about."""
+
+
+STATE = ("gate", "precision", "report", "watched", "first_density")
+"""What a checkpoint holds of a guide with an occupancy, beside tensors."""
 
 
 class NoOccupancyYet(RuntimeError, IOChangeException):
@@ -240,10 +249,18 @@ class Guide(nn.Module):
         }
 
     def set_extra_state(self, state: dict[str, Any]) -> None:
-        """Makes an occupancy of the checkpoint's shape; torch then reads its weights."""
-        if state:
-            self.watched = WatchState(**state["watched"])
-            self.first_density = state["first_density"]
-            gate = Gate(GateConfig.from_dict(state["gate"]))
-            occupancy = Occupancy(gate, Space(), 0.0, state["precision"], state["report"])
-            self.set_occupancy(occupancy)
+        """Makes an occupancy of the checkpoint's shape; torch then reads its weights.
+
+        Raises:
+            InputError: the state is of another version of this package.
+        """
+        if state == {}:
+            return
+        with state_of_this_version():
+            require_keys(state, STATE)
+            watched = WatchState.from_dict(state["watched"])
+            config = GateConfig.from_dict(state["gate"])
+        self.watched, self.first_density = watched, state["first_density"]
+        self.set_occupancy(
+            Occupancy(Gate(config), Space(), 0.0, state["precision"], state["report"])
+        )

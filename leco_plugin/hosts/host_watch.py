@@ -114,12 +114,12 @@ class HostWatch:
         occupancy = self.guide.the_occupancy()
         before = occupancy.threshold
         end_probation(self.guide)
-        occupancy.threshold_value.fill_(threshold)
-        occupancy.report = _lowered(occupancy.report, before, step, threshold)
+        report = _lowered(occupancy.report, before, step, threshold)
+        occupancy = occupancy.with_threshold(threshold, report)
+        self.guide.set_occupancy(occupancy)
         self.watch.state.evidence = {}
         # of what was wrong once it is soon asked whether it still is, however long that takes
         self.watch.put_off(step)
-        self.guide.changed()
         now = f"lowered from {before:.4f} to {threshold:.4f}"
         nothing = "0: from now on nothing is skipped"
         say(f"step {step}: {why}; the threshold is {now if threshold > 0.0 else nothing}")

@@ -1,7 +1,7 @@
 """The threshold: the largest one whose price, measured on held-out rays, is within its bounds.
 
-A dense rendering is the reference. Skipping every sample with o(x) < tau loses weight near surfaces
-(lost surface mass) and changes the image (image price); both are measured, not hoped for.
+The reference is a dense rendering. Skipping every sample with o(x) < tau loses weight near surfaces
+(lost surface mass) and changes the image (image price). Both are measured.
 """
 
 from __future__ import annotations
@@ -329,10 +329,9 @@ def is_missed(
 ) -> Tensor:
     """Which samples lie on rays whose pixel is better rendered with what is lost near surfaces.
 
-    A field that has been trained guided shows haze where the gate skips, which nothing has
-    corrected since the gate was frozen; only the photographs can tell it from matter that is
-    missed. What the field has repainted on the things behind it they do not miss: a true loss is
-    found soon after freezing or not at all.
+    Guided training never corrects the field where the gate skips, so haze may stand there. Only
+    the photographs can tell that haze from a surface that is missing. A loss that the field has
+    since painted over no longer shows in the error: it is found soon after freezing or not at all.
 
     Args:
         number: of the chunk of rays.

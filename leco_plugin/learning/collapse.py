@@ -1,16 +1,16 @@
-"""What is done about a collapsed gate, as a stated rule.
+"""The rule for a collapsed gate.
 
 A gate that looks collapsed for `SUSPECTED_STEPS` steps, or at the look that ends the first phase,
 is healed, `MOST_RECOVERIES` times at most:
 
-- Its last layer starts anew. Learning goes on for half as long again: first on dense samples, while
-  what teaches the gate comes in from nothing; then with the force that led to the collapse `EASED`
-  times weaker.
-- Where one scene expert took all points, they are shared out anew. The balance loss counts `EASED`
-  times as much, and at least a quarter of the phase is left to learn from them.
-- A gate in logit form that collapses again begins anew altogether, and the field with it, at rates
-  `EASED` times smaller.
-- A gate in the paper's form that collapses again, or by which hardly anything can be skipped, is
+- Its last layer is reset. Learning goes on for half as long again. At first samples are dense and
+  the gate's losses ramp up from zero. Then the loss that led to the collapse is `EASED` times
+  weaker.
+- If one scene expert took all points, they are redistributed. The balance loss counts `EASED` times
+  as much, and at least a quarter of the phase is left to learn.
+- If a gate in logit form collapses again, gate and field restart at `EASED` times smaller learning
+  rates.
+- If a gate in the paper's form collapses again, or if hardly anything can be skipped by it, it is
   taught in logit form, unless `fall_back` is off.
 
 A run with fewer than `FEWEST_STEPS` steps left heals nothing: calibration makes any gate safe.
@@ -140,7 +140,7 @@ def heal(
         config: what the gate is taught by.
         room: steps that the run has left.
     """
-    anew = starts_anew(collapse, config, progress)
+    anew = is_restart_due(collapse, config, progress)
     progress.recoveries += 1
     progress.suspected_since = -1
     form_fails = progress.recoveries > 1 or collapse.kind == "useless"
@@ -204,8 +204,8 @@ def is_enough(room: float) -> bool:
     return room >= FEWEST_STEPS
 
 
-def starts_anew(collapse: Collapse, config: GateLossConfig, progress: Progress) -> bool:
-    """Whether gate and field begin anew, more slowly.
+def is_restart_due(collapse: Collapse, config: GateLossConfig, progress: Progress) -> bool:
+    """Whether gate and field restart, at lower learning rates.
 
     So it is where a new last layer has collapsed as well. In logit form the forces on a gate are
     bounded; what is left as a cause is steps that overshoot, and hidden layers, of gate and field,
@@ -231,9 +231,9 @@ def is_dense(progress: Progress, step: int) -> bool:
 
 
 def annealed(config: GateLossConfig, progress: Progress, step: int) -> GateLossConfig:
-    """What teaches the gate at a step, after the recoveries so far.
+    """The gate's loss settings at a step, after the recoveries so far.
 
-    While samples are dense all of it comes in again from nothing. The pull towards empty space is
+    While samples are dense all weights ramp up from zero again. The pull towards empty space is
     lambda_g in the paper's form, and 1 / k in logit form.
     """
     weight, form = 1.0, form_of(config, progress)

@@ -1,4 +1,4 @@
-"""Held-out rays with all their candidates rendered: what each price of skipping is measured on."""
+"""Held-out rays rendered with all their candidates: the reference for each price of skipping."""
 
 from __future__ import annotations
 

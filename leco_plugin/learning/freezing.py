@@ -1,7 +1,7 @@
-"""The moment of freezing: what the gate costs and saves, its report, and the files that are left.
+"""Freezing: what the gate costs and saves, its report, and the files that a run writes then.
 
-A field that goes on guided is not trained where the gate skips, and cannot say what was lost there.
-The field that the gate was calibrated on can: it is kept, and smaller gates are held to it.
+A guided field is not trained where the gate skips, so it cannot show what was lost there. The field
+that the gate was calibrated on can. It is saved, and smaller gates are measured against it.
 """
 
 from __future__ import annotations

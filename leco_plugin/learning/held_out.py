@@ -1,6 +1,6 @@
-"""What is measured on held-out pixels: the price of skipping, and which experts are needed.
+"""Measurements on held-out pixels: the price of skipping, and which experts are needed.
 
-These methods return values; the mixture is left as it was.
+The methods return values and do not change the mixture.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""How a gate came to be: what it decides at fixed positions, and its weights, while it learns."""
+"""The history of a gate: its decisions at fixed positions, and its weights, while it learns."""
 
 from __future__ import annotations
 
@@ -63,7 +63,9 @@ class Probes:
         mixture = self.mixture
         with gate_precision(mixture.device.type, mixture.precision):
             gate_values, routes = gate_values_and_routes(
-                mixture.gate(self.positions), mixture.routing, mixture.field.experts.those_left()
+                mixture.gate(self.positions),
+                mixture.routing,
+                mixture.field.experts.remaining_experts(),
             )
             sigmas, _ = mixture.field.density(self.positions, routes, gate_values)
         return routes, sigmas
@@ -124,8 +126,8 @@ class GateHistory:
         self.weights.append({name: value.detach().cpu().clone() for name, value in state.items()})
 
     @classmethod
-    def gone_on_from(cls, checkpoint: Path, step: int, gate: Gate) -> GateHistory:
-        """What a run had looked at before a step; nothing where it left no history of this gate.
+    def load_before(cls, checkpoint: Path, step: int, gate: Gate) -> GateHistory:
+        """The history of a run before a step; empty if it stored none of this gate.
 
         Args:
             checkpoint: of that run, or its folder of checkpoints.
@@ -138,7 +140,7 @@ class GateHistory:
             return cls()
 
     def until(self, step: int) -> GateHistory:
-        """The looks before a step, from which on a run goes on."""
+        """The looks before a step, at which a run resumes."""
         looks = sum(look < step for look in self.steps)
         return GateHistory(*(getattr(self, each.name)[:looks] for each in fields(self)))
 

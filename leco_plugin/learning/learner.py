@@ -1,6 +1,6 @@
 """Learning an occupancy, step by step: ramps, freezing, and the price watch after it.
 
-The learner knows no trainer: it is told of each step, and asks a `Run` for what is around it.
+The learner knows no trainer. The training loop calls it at each step; a `Run` stands for the loop.
 """
 
 from __future__ import annotations
@@ -114,7 +114,7 @@ class Learner:
         """What a resumed run leaves in its folder, which may be another one than before."""
         folder, resumed = self.run.folder, self.run.resumed_from
         assert folder is not None and resumed is not None
-        self.history = GateHistory.gone_on_from(resumed, self.run.start, self.mixture.gate)
+        self.history = GateHistory.load_before(resumed, self.run.start, self.mixture.gate)
         if len(self.history):
             self.history.leave(folder)
         if bool(self.mixture.frozen):
@@ -200,7 +200,7 @@ class Learner:
             return
         logits = self.probes.logits()
         kept = occupancy_from_logits(logits) >= KEPT_ABOVE
-        if schedule.freeze and self.recoveries.after_look(step, logits, kept, last):
+        if schedule.freeze and self.recoveries.heal_if_collapsed(step, logits, kept, last):
             return
         if checks and self._has_settled(step, kept, last):
             self._freeze(step)
@@ -266,7 +266,7 @@ class Learner:
         advice = advice_on(measured, step + 1 - progress.since, progress.recoveries)
         if advice is not None:
             say(advice)
-        if self.recoveries.falls_back(step, measured):
+        if self.recoveries.fall_back(step, measured):
             return
         if self.run.folder is not None:
             leave_file(mixture.occupancy(), self.run.folder)

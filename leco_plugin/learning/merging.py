@@ -1,9 +1,9 @@
-"""Scene experts that no region needs leave the field when the gate is frozen.
+"""Drops scene experts that no region needs, when the gate is frozen.
 
-The expert with the least surface mass is tried first: its points go to the best expert that is
-left, and held-out rays are rendered again. While the image price of all that have gone is within
-its bound the next one is tried; at the first failure, or at the last expert, it is over. The gate
-stays as it is, and with it o(x) and everything that is skipped.
+The expert with the least surface mass is tried first. Its points go to the best remaining expert,
+and held-out rays are rendered again. If the image price of all dropped experts is within its bound,
+the next expert is tried. The first failure, or the last expert, ends this. The gate does not
+change, so o(x) and the skipped space stay the same.
 """
 
 from __future__ import annotations

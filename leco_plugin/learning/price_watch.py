@@ -1,8 +1,8 @@
-"""The price of skipping, measured again in guided training: a frozen gate meets a better field.
+"""The price of skipping, measured again during guided training, as the field improves.
 
-Calibration bounds the price for the field of that moment. Every so many steps the price is measured
-anew on a few held-out rays that the calibration did not use. `PriceWatch` says when it is beyond
-its bounds, or when the gate keeps nothing at all; who guides decides what to do.
+Calibration bounds the price for the field at that moment. Afterwards the price is measured at
+intervals, on a few held-out rays that calibration did not use. `PriceWatch` reports when it exceeds
+its bounds, or when the gate keeps nothing at all. The caller decides what to do.
 """
 
 from __future__ import annotations

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from typing import Any
 
 import torch
 from torch import Tensor
+
+from leco_plugin.scenes.input_error import require_keys
 
 
 @dataclass
@@ -23,6 +25,12 @@ class WatchState:
     """Step since which batches hold no kept sample; -1 where they do."""
     lower: float | None = None
     """Of hosts: a lower threshold, if one is followed until the first measurement."""
+
+    @classmethod
+    def from_dict(cls, state: dict[str, Any]) -> WatchState:
+        """What a checkpoint holds; KeyError where that is not of the present fields."""
+        require_keys(state, (each.name for each in fields(cls)))
+        return cls(**state)
 
 
 @dataclass
@@ -93,8 +101,9 @@ class Progress:
 
     @classmethod
     def from_dict(cls, state: dict[str, Any]) -> Progress:
-        """What `to_dict` gave."""
-        return cls(**{**state, "watch": WatchState(**state["watch"])}) if state else cls()
+        """What `to_dict` gave; KeyError where that is not of the present fields."""
+        require_keys(state, (each.name for each in fields(cls)))
+        return cls(**{**state, "watch": WatchState.from_dict(state["watch"])})
 
     def to_dict(self) -> dict[str, Any]:
         """What a checkpoint holds."""

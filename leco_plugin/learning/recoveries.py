@@ -1,4 +1,4 @@
-"""Performs what the rule of `collapse` says of a gate that has collapsed."""
+"""Heals a collapsed gate by the rule in `collapse`."""
 
 from __future__ import annotations
 
@@ -15,9 +15,9 @@ from leco_plugin.learning.collapse import (
     form_of,
     heal,
     is_enough,
+    is_restart_due,
     look,
     may_fall_back,
-    starts_anew,
 )
 from leco_plugin.learning.freezing import HARDLY_ANYTHING, withdraw_file
 from leco_plugin.learning.progress import Progress
@@ -55,8 +55,8 @@ class Recoveries:
         logit = form_of(self.losses, self.progress) == "logit"
         return Routing(self.losses.empty_below if logit else None, self.homogeneous)
 
-    def after_look(self, step: int, logits: Tensor, kept: Tensor, last: bool) -> bool:
-        """Heals a gate that has collapsed for a while; returns whether it has.
+    def heal_if_collapsed(self, step: int, logits: Tensor, kept: Tensor, last: bool) -> bool:
+        """Heals a gate that has stayed collapsed; returns whether it did so.
 
         Args:
             logits: [P, 1 + n] of the gate at the probe positions.
@@ -83,9 +83,12 @@ class Recoveries:
             say(f"{cause}, after {MOST_RECOVERIES} recoveries; it is left as it is")
         return action == "heal"
 
-    def falls_back(self, step: int, measured: Measured) -> bool:
-        """Opens a gate by which hardly anything can be skipped, to be taught in logit form, where
-        it was not, and there is time for it; returns whether it has."""
+    def fall_back(self, step: int, measured: Measured) -> bool:
+        """Restarts a useless gate in logit form; returns whether it did so.
+
+        A gate is useless if hardly anything can be skipped by it. Does nothing if the gate was
+        already taught in logit form, or if too few steps are left.
+        """
         if not may_fall_back(self.losses) or self.progress.paper_given_up:
             return False
         if measured.empty_fraction >= HARDLY_ANYTHING or not is_enough(self._room(step)):
@@ -126,7 +129,7 @@ class Recoveries:
     def _heal(self, collapse: Collapse, shares: Tensor, step: int) -> str:
         """Does what the rule says; returns what that is, in words."""
         mixture, progress = self.mixture, self.progress
-        if starts_anew(collapse, self.losses, progress):
+        if is_restart_due(collapse, self.losses, progress):
             mixture.restart_gate()
             share(mixture.gate.parameters())
             self.restart_field()

@@ -1,4 +1,4 @@
-"""The training run that a learner is in: what it may ask of the loop around it."""
+"""The interface between a learner and the training loop around it."""
 
 from __future__ import annotations
 

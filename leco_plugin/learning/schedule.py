@@ -1,4 +1,4 @@
-"""The two phases of a run: what changes while the occupancy is learned, and when that is over."""
+"""The two phases of a run: the schedules during learning, and the test for its end."""
 
 from __future__ import annotations
 

@@ -93,7 +93,7 @@ PRIMES = (1, 2654435761 - 2**32, 805459861)
 
 
 def sum_by_row(rows: Tensor, weights: Tensor, gradient: Tensor, size: int) -> Tensor:
-    """Gradient [size, features] of a table of which weighted rows were summed, on a CPU.
+    """Gradient [size, features] of a table after weighted sums of its rows, on a CPU.
 
     Args:
         rows: [M, K] int32, of the table.

@@ -9,14 +9,12 @@ import torch
 from torch import Tensor, nn
 
 
-class TrainingStopped(SystemExit, RuntimeError):
+class TrainingStopped(RuntimeError):
     """A run cannot go on; the message says at which step, why, and what is left of it.
 
-    As a `SystemExit` it ends any `ns-*` command with its one line and status 1.
+    `AtomicTrainer` and nerfstudio's launcher raise it. A loop of one's own can catch it; `ns-*`
+    commands end with its one line and status 1, see `studio.commands`.
     """
-
-    def __str__(self) -> str:
-        return str(self.code)
 
 
 def first_non_finite(losses: dict[str, Tensor]) -> str | None:

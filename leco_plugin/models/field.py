@@ -8,7 +8,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from leco_plugin.models.compute.dispatch import steadied
+from leco_plugin.models.compute.dispatch import pad_to_steady_size
 from leco_plugin.models.encodings import EncodingConfig, FrequencyEncoding, build_encoding
 from leco_plugin.models.hmoe import HMoE, HMoEConfig
 
@@ -82,8 +82,8 @@ class ColorHead(nn.Module):
         # the first layer of a concatenation is the sum of two, one of which is the same all along
         count = len(features)
         of_ray = self.of_ray(torch.cat(of_rays, dim=-1)).to(features.dtype)
-        hidden = self.of_features(steadied(features)) + of_ray.index_select(
-            0, steadied(ray_indices)
+        hidden = self.of_features(pad_to_steady_size(features)) + of_ray.index_select(
+            0, pad_to_steady_size(ray_indices)
         )
         opponent = self.out(torch.relu(hidden))[:count].float()
         return torch.sigmoid(opponent @ self.opponent)
@@ -151,8 +151,10 @@ class HMoEField(nn.Module):
             sigmas [N] float32, per half extent of the scene; features [N, width].
         """
         count = len(mapped)
-        projected = self.projection(self.encoding(steadied(mapped)))
-        hidden = self.experts(projected, steadied(routes), steadied(gate_values))
+        projected = self.projection(self.encoding(pad_to_steady_size(mapped)))
+        hidden = self.experts(
+            projected, pad_to_steady_size(routes), pad_to_steady_size(gate_values)
+        )
         raw = self.density_head(hidden)[:count, 0].float()
         sigmas = _TruncatedExponential.apply(raw - 1.0)
         if self.config.experts.empty_expert == "none":

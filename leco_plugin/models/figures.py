@@ -1,4 +1,4 @@
-"""What is shown and logged of rays beside their colours."""
+"""Pictures and logged figures of rays, other than their colours."""
 
 from __future__ import annotations
 

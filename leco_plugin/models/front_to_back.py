@@ -1,8 +1,7 @@
-"""Rendering that asks nothing of what lies behind opaque surfaces.
+"""Rendering that evaluates no samples behind opaque surfaces.
 
-The samples that a gate keeps are asked about a few of each ray at a time, from the front. A ray
-through which no light comes any more is given up. Its twin is `rendering.shade`, which asks about
-all of them.
+The kept samples of each ray are evaluated from the front, a few at a time. A ray stops when no
+light is left. The slow twin is `rendering.shade`, which evaluates all of them.
 """
 
 from __future__ import annotations

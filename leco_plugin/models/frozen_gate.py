@@ -1,9 +1,9 @@
-"""A gate asked on a CPU without gradients: the answers of `Gate` in fewer passes over memory.
+"""Inference of a gate on a CPU: the answers of `Gate` in fewer passes over memory.
 
-More work lies between a gate's products than in them: types change, biases are added, negative
-units cut off, rows normed. Here weights change their type once, a layer is one pass where oneDNN
-has it, and the norm is folded into the last layer, which is asked for no more than decides: how far
-each scene expert's logit lies above that of emptiness.
+On a CPU a gate spends more time between its matrix products than in them: on casts, biases, ReLU
+and the layer norm. Here weights are cast once, a layer is one pass where oneDNN supports it, and
+the norm is folded into the last layer. That layer returns only what decides: how far each scene
+expert's logit lies above the empty-space logit.
 """
 
 from __future__ import annotations

@@ -13,7 +13,7 @@ from typing import get_args
 import torch
 from torch import Tensor, nn
 
-from leco_plugin.models.compute.dispatch import steadied
+from leco_plugin.models.compute.dispatch import pad_to_steady_size
 from leco_plugin.models.encodings import EncodingConfig, Kind, build_encoding
 
 EMPTY = 0
@@ -117,7 +117,7 @@ class Gate(nn.Module):
 
     def forward(self, mapped: Tensor) -> Tensor:
         """Mapped positions [N, 3] in [-1, 1] to logits [N, 1 + n] float32; 0 is emptiness."""
-        features = self.encoding(steadied(mapped))
+        features = self.encoding(pad_to_steady_size(mapped))
         for layer in self.hidden:
             features = torch.relu(layer(features))
         return logits_of(features, self.norm, self.head)[: len(mapped)]

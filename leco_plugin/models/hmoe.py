@@ -69,8 +69,7 @@ class HMoE(nn.Module):
     """h(x) = G_i*(x) E_i*(x): each point through the one expert it is routed to.
 
     Attributes:
-        left: bool [n], which scene experts have not been dropped; a state dict says so too, and
-            whoever loads it has the same ones afterwards.
+        left: bool [n], which scene experts remain. Saved in the state dict.
     """
 
     left: Tensor
@@ -107,7 +106,7 @@ class HMoE(nn.Module):
         self.experts[number] = expert
         self.left[number - 1] = True
 
-    def those_left(self) -> Tensor | None:
+    def remaining_experts(self) -> Tensor | None:
         """`left`, or None while no expert has been dropped; nothing waits for the device."""
         return self.left if any(expert is None for expert in self.experts) else None
 

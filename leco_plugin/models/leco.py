@@ -31,6 +31,7 @@ from leco_plugin.models.mixture import Mixture
 from leco_plugin.models.objective import field_losses, gate_losses
 from leco_plugin.models.rendering import Intervals, Rays, Routing, Shaded
 from leco_plugin.models.sizing.scene_sizes import complete
+from leco_plugin.scenes.input_error import state_of_this_version
 from leco_plugin.scenes.learning_data import LearningData
 from leco_plugin.scenes.pixels.known_distances import DISTANCE
 from leco_plugin.studio.checkpoints import (
@@ -48,7 +49,8 @@ class LecoModel(Model):
         mixture: gate, field and region.
         progress: how far its run has come.
         plan: what the next training step does.
-        kept_per_ray: samples that the frozen gate kept of the last batch, backdrops excluded.
+        kept_per_ray: mean kept samples per ray in the last batch, backdrop excluded; 1 while
+            nothing is skipped.
     """
 
     config: LecoModelConfig
@@ -238,8 +240,13 @@ class LecoModel(Model):
         return {"progress": self.progress.to_dict()}
 
     def set_extra_state(self, state: dict[str, Any]) -> None:
-        """Restores what `get_extra_state` gave."""
-        self.progress = Progress.from_dict(state["progress"])
+        """Restores what `get_extra_state` gave.
+
+        Raises:
+            InputError: the state is of another version of this package.
+        """
+        with state_of_this_version():
+            self.progress = Progress.from_dict(state["progress"])
 
     def _load_from_state_dict(self, state_dict: dict[str, Any], prefix: str, *rest: Any) -> None:
         """As torch's.

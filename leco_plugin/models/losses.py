@@ -1,8 +1,8 @@
 """All losses of gate and field; each says what it teaches.
 
-The gate is taught by the paper's two losses, or by the same two forces in logit form. All run in
-float32, and do not grow with the batch: they are means over the points or rays given, or sums that
-the caller divides.
+The gate is taught by the paper's two losses, or by the same two in logit form. All are computed in
+float32 and do not grow with the batch: they are means over points or rays, or sums that the caller
+divides.
 """
 
 from __future__ import annotations

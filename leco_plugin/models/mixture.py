@@ -30,7 +30,7 @@ from leco_plugin.occupancy import Occupancy, Precision, gate_precision
 from leco_plugin.samplers import marching
 from leco_plugin.samplers.estimator import LearnedOccupancyEstimator
 from leco_plugin.scenes.bounds import SceneBounds
-from leco_plugin.scenes.input_error import InputError
+from leco_plugin.scenes.input_error import InputError, require_keys, state_of_this_version
 
 
 class Following(NamedTuple):
@@ -301,9 +301,15 @@ class Mixture(nn.Module):
         super()._load_from_state_dict(state_dict, prefix, *rest)
 
     def set_extra_state(self, state: dict[str, Any]) -> None:
-        """Restores what `get_extra_state` gave."""
-        self.precision, self.report = state["precision"], dict(state["report"])
-        self.routing = Routing(**state["routing"])
+        """Restores what `get_extra_state` gave.
+
+        Raises:
+            InputError: the state is of another version of this package.
+        """
+        with state_of_this_version():
+            require_keys(state, (SIZES, "precision", "routing", "report"))
+            self.precision, self.report = state["precision"], dict(state["report"])
+            self.routing = Routing(**state["routing"])
         self.gate.requires_grad_(not bool(self.frozen))
         if self.small is not None:
             self.small.requires_grad_(False)

@@ -1,4 +1,4 @@
-"""What teaches field and gate, put together: which losses, which weights, on which samples."""
+"""The objective of field and gate: which losses, with which weights, on which samples."""
 
 from __future__ import annotations
 

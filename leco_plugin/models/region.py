@@ -1,4 +1,4 @@
-"""The part of space that is marched: its mapping, box and range, and the skies seen in it."""
+"""The marched part of space: its mapping, box and range, and the directions that show a sky."""
 
 from __future__ import annotations
 

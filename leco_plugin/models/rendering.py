@@ -240,7 +240,9 @@ def ask(
     mapped = mapped_middles(space, rays, intervals)
     with torch.set_grad_enabled(torch.is_grad_enabled() and not freeze_gate):
         logits = gate(mapped)
-        gate_values, routes = gate_values_and_routes(logits, routing, field.experts.those_left())
+        gate_values, routes = gate_values_and_routes(
+            logits, routing, field.experts.remaining_experts()
+        )
     sigmas, features = field.density(mapped, routes, gate_values)
     return Answers(sigmas, features, logits, routes)
 

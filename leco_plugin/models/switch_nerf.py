@@ -31,7 +31,7 @@ from leco_plugin.models.switch.config import SwitchNerfModelConfig
 from leco_plugin.models.switch.field import NEW_DENSITY, Answers, SwitchField
 from leco_plugin.models.switch.rendering import (
     coarse_and_fine,
-    kept_by,
+    keep_candidates,
     render,
     switch_losses,
     switch_statistics,
@@ -207,7 +207,7 @@ class SwitchNerfModel(Model):
         region, step, cone_angle = self.region, float(self.step), float(self.cone)
         config, sizes = self.config, self.config.sizes
         if self.occupancy_grid is not None:
-            packed = kept_by(
+            packed = keep_candidates(
                 self.occupancy_grid,
                 rays,
                 step,

@@ -1,8 +1,7 @@
-"""The interface that a packed host asks: two verbs, `sampling` and `update_every_n_steps`.
+"""The interface that a packed host calls: `sampling` and `update_every_n_steps`.
 
-Argument for argument that of nerfacc's `OccGridEstimator`, so that any estimator here can stand
-where a host has one. It is a plain `nn.Module`: neither nerfacc nor nerfstudio asks for another
-type.
+The arguments are those of nerfacc's `OccGridEstimator`, so any estimator here can replace one. It
+is a plain `nn.Module`: neither nerfacc nor nerfstudio requires another type.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
-"""The frozen gate in the place of an occupancy grid.
+"""The frozen gate as an estimator, in the place of an occupancy grid.
 
-A host calls it as it calls nerfacc's `OccGridEstimator`; there is nothing to update, no box to
-guess, and the cells of a cache answer for the gate wherever they are sure.
+A host calls it like nerfacc's `OccGridEstimator`. It needs no updates and no box. A cell cache
+answers in place of the gate wherever it is sure.
 """
 
 from __future__ import annotations

@@ -2,10 +2,11 @@
 
 The rule is that of nerfacc's `traverse_grids`: intervals of length dt(t) = max(t cone_angle,
 step_size) follow one another from t_min, and an interval is a candidate while its midpoint lies in
-front of t_max; its midpoint is the position that is asked.
-Steps are the rows and rays the columns of everything here: what is broadcast, a ray's origin or a
-step's number, is then read in long rows, which a CPU does five times faster than in short ones.
-Packed samples are the true entries of a matrix of answers in the order of columns.
+front of t_max. The midpoint is the position that is queried.
+
+In all matrices here steps are rows and rays are columns. Broadcast values, such as ray origins and
+step numbers, are then read in long rows, which a CPU does five times faster than in short ones.
+Packed samples are the true entries of a matrix of answers, in column order.
 """
 
 from __future__ import annotations

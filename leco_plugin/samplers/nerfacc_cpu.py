@@ -5,8 +5,8 @@ nerfstudio's `instant-ngp` cannot run anywhere else. `install` puts a switch in 
 these functions: CUDA tensors go to nerfacc's kernels as before, all others to the functions here.
 A model that is built for another device than CUDA calls `install_for`; no import installs anything.
 
-What a module imported by name before (`from nerfacc import pack_info`) is replaced there too. A
-function that was put elsewhere, in a class, a partial or a default argument, stays nerfacc's own.
+Names that a module imported earlier (`from nerfacc import pack_info`) are replaced too. Functions
+stored in a class, a partial or a default argument stay nerfacc's own.
 """
 
 from __future__ import annotations

@@ -48,7 +48,7 @@ class March(NamedTuple):
 
 
 class Candidates(NamedTuple):
-    """The candidates of a batch of rays, of which only the numbers are held."""
+    """The candidates of a batch of rays; only their numbers are stored."""
 
     coordinates: Tensor
     """Origins and directions, [2, 3, n_rays]: a CPU reads one coordinate at a time fastest."""

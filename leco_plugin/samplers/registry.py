@@ -52,7 +52,7 @@ DENSE = SamplerSpec(
 )
 DENSE_PROPOSAL = SamplerSpec(
     description="samples spread as a host spreads its first ones: the reference; option samples",
-    proposal="leco_plugin.samplers.proposal:DenseSampler",
+    proposal="leco_plugin.hosts.proposal:DenseSampler",
 )
 OCCUPANCY_GRID = SamplerSpec(
     description="Instant-NGP's occupancy grid as in nerfacc; options resolution, levels",
@@ -62,7 +62,7 @@ LEARNED_OCCUPANCY = SamplerSpec(
     description="a frozen gate with a cell cache; options cache_bytes, for packed hosts tolerance, "
     "for proposal hosts num_candidates",
     estimator="leco_plugin.samplers.registry:build_learned",
-    proposal="leco_plugin.samplers.proposal:LearnedOccupancySampler",
+    proposal="leco_plugin.hosts.proposal:LearnedOccupancySampler",
     needs_occupancy=True,
     check_options={"cache_bytes": 1 << 16},
 )
@@ -158,7 +158,7 @@ def _load(builder: Callable[..., nn.Module] | str) -> Callable[..., nn.Module]:
 
 
 def _parameters(builder: Callable[..., nn.Module]) -> dict[str, inspect.Parameter] | None:
-    """Parameters of a builder by name; None where it takes any, or nobody knows."""
+    """Parameters of a builder by name; None if it takes any, or they are unknown."""
     try:
         found = inspect.signature(builder).parameters
     except ValueError:  # a class of a compiled extension

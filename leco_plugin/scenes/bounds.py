@@ -135,8 +135,8 @@ def with_range(bounds: SceneBounds, near: float | None, far: float | None) -> Sc
     return replace(bounds, near=near, far=far)
 
 
-def up_to_the_cameras(bounds: SceneBounds, heights: Tensor, seen: float) -> SceneBounds:
-    """The bounds of a scene from above with all the air up to its cameras in them.
+def raise_to_cameras(bounds: SceneBounds, heights: Tensor, seen: float) -> SceneBounds:
+    """The bounds of a scene from above, raised to its cameras.
 
     For pictures that show something where rays miss what the sparse points bound: fog, which has no
     points, or a sky, which a cube with walls at its sides holds before its backdrop.
@@ -169,7 +169,7 @@ def _range(depths: Tensor) -> Span:
 def _between(
     altitudes: Span, poses: Tensor, directions: Tensor, points: Tensor | None
 ) -> SceneBounds:
-    """A bounded scene between two levels that somebody knows, with points or without."""
+    """A bounded scene between two given levels, with or without points."""
     ground, top = altitudes
     if not -math.inf < ground < top < math.inf:
         raise InputError(f"bounds.altitudes are ground < top, got {ground:g} and {top:g}")
@@ -267,8 +267,9 @@ MOSTLY_ABOVE, MOSTLY_DOWN = 0.75, 0.9
 
 
 def _seen_from_above(poses: Tensor, directions: Tensor, points: Tensor) -> tuple[bool, str]:
-    """Whether nearly all rays go down, from cameras of which most are above nearly all points;
-    and the two shares in words.
+    """Whether a scene is seen from above, and its two shares in words.
+
+    It is if nearly all rays go down and most cameras are above nearly all points.
     """
     above = float((poses[:, 2, 3] > _quantiles(points[:, 2], 0.95)).float().mean())
     down = float(_go_down(directions).float().mean())

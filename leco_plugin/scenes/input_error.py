@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-import sys
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
-from types import TracebackType
 
 
 class InputError(ValueError):
@@ -14,25 +14,29 @@ class InputError(ValueError):
     """
 
 
-def show_one_line_in_ns_commands() -> None:
-    """In a process that is an `ns-*` command, an uncaught `InputError` prints its line alone.
+ANOTHER_VERSION = (
+    "is of another version of leco_plugin: train again, or install the version that made it"
+)
+"""After what is a run's file."""
 
-    nerfstudio lets exceptions through to Python, which would print a traceback.
+
+@contextmanager
+def state_of_this_version() -> Iterator[None]:
+    """While the state of a checkpoint is read: one that lacks or has other keys is refused.
+
+    Raises:
+        InputError: that, in one line.
     """
-    if not any(Path(program).name.startswith("ns-") for program in sys.argv[:1]):
-        return
-    otherwise = sys.excepthook
-
-    def show(kind: type[BaseException], error: BaseException, trace: TracebackType | None) -> None:
-        if isinstance(error, InputError):
-            print(error, file=sys.stderr)
-        else:
-            otherwise(kind, error, trace)
-
-    sys.excepthook = show
+    try:
+        yield
+    except (KeyError, TypeError, AttributeError) as error:
+        raise InputError(f"the checkpoint {ANOTHER_VERSION}") from error
 
 
-show_one_line_in_ns_commands()
+def require_keys(values: Mapping[str, object], wanted: Iterable[str]) -> None:
+    """KeyError unless a state has these keys and no others."""
+    if different := values.keys() ^ set(wanted):
+        raise KeyError(*sorted(different))
 
 
 def require(holds: bool, option: str, value: object, wanted: str) -> None:

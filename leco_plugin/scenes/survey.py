@@ -16,7 +16,7 @@ from leco_plugin.scenes.bounds import (
     BoundsConfig,
     SceneBounds,
     find_bounds,
-    up_to_the_cameras,
+    raise_to_cameras,
     with_range,
 )
 from leco_plugin.scenes.frames import ALTITUDES, DatasetUnits, units_of
@@ -146,7 +146,7 @@ def survey(
         missing = lengths_inside(found, flat_origins, flat_directions) <= 0.0
         seen = seen_beyond(dataset, chosen, missing.view(-1, SIDE, SIDE))
         if seen >= WORTH_IT:
-            found = up_to_the_cameras(found, poses[:, 2, 3], seen)
+            found = raise_to_cameras(found, poses[:, 2, 3], seen)
     bounds = with_range(found, near, far)
     units = units_of(datamanager, config.metres_per_unit)
     lengths = lengths_inside(bounds, flat_origins, flat_directions)
@@ -211,7 +211,7 @@ def covering_rays(cameras: Cameras, side: int = SIDE) -> tuple[Tensor, Tensor]:
 
 
 def seen_beyond(dataset: Any, numbers: Tensor, misses: Tensor) -> float:
-    """Share of the rays that miss the scene and show something all the same.
+    """Share of the rays that miss the scene but still show something.
 
     Args:
         dataset: nerfstudio's `InputDataset`.

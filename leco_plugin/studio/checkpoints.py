@@ -17,7 +17,7 @@ import torch
 from torch import nn
 
 from leco_plugin.log import say
-from leco_plugin.scenes.input_error import InputError
+from leco_plugin.scenes.input_error import ANOTHER_VERSION, InputError
 
 # The function that pickle calls to build a numpy scalar; it has no public name.
 _numpy_scalar = np.float64(0).__reduce__()[0]
@@ -55,10 +55,7 @@ def refuse_earlier(state_dict: dict[str, Any], prefix: str, name: str) -> None:
     """
     names = [key for key in state_dict if key.startswith(prefix)]
     if names and f"{prefix}{name}" not in names:
-        raise InputError(
-            "the checkpoint is of an earlier version of leco_plugin: train again, or install the "
-            "version that made it"
-        )
+        raise InputError(f"the checkpoint {ANOTHER_VERSION}")
 
 
 def previous_of(checkpoints: Path) -> Path:

@@ -27,10 +27,17 @@ int32, which wraps around without a word."""
 
 
 def speed_up_hash_encodings(model: nn.Module) -> None:
-    """Has every hash encoding of a model that nerfstudio computes in torch computed this way."""
-    for module in model.modules():
-        if type(module) is HashEncoding and module.tcnn_encoding is None:
-            module.__class__ = CpuHashEncoding
+    """Puts a `CpuHashEncoding` wherever a model holds one that nerfstudio computes in torch.
+
+    Names in the state dict stay. What else still holds the old one shares its table and its hooks.
+    """
+    made: dict[nn.Module, CpuHashEncoding] = {}
+    for parent in list(model.modules()):
+        for name, child in list(parent._modules.items()):
+            if type(child) is HashEncoding and child.tcnn_encoding is None:
+                fast = made.setdefault(child, CpuHashEncoding.__new__(CpuHashEncoding))
+                vars(fast).update(vars(child))
+                setattr(parent, name, fast)
 
 
 class CpuHashEncoding(HashEncoding):

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import functools
 import sys
-from collections.abc import Iterator
 from dataclasses import dataclass, field
 from types import SimpleNamespace
 from typing import Any
@@ -54,9 +53,7 @@ class DataParallelTrainerConfig(TrainerConfig):
         self._require_what_is_named()
         require_startable(self.machine)
         if self.machine.num_devices * self.machine.num_machines > 1:
-            name_the_lost()
-            if self.machine.device_type == "cpu":
-                launch_on_cpu()
+            prepare_launcher(on_cpu=self.machine.device_type == "cpu")
 
     def _require_what_is_named(self) -> None:
         """Before anything of a run is written.
@@ -116,24 +113,36 @@ def require_startable(machine: MachineConfig) -> None:
         )
 
 
-def _launchers() -> Iterator[Any]:
-    """Where nerfstudio's launcher is loaded."""
+def prepare_launcher(on_cpu: bool) -> None:
+    """Has nerfstudio's next launch of processes end in one line when one is lost.
+
+    After it, or an error in it, the launcher is nerfstudio's own again.
+
+    Args:
+        on_cpu: whether `process` is started in place of nerfstudio's own function.
+    """
     for name in ("nerfstudio.scripts.train", "__main__"):
-        yield sys.modules.get(name)
+        launcher: Any = sys.modules.get(name)
+        if hasattr(launcher, "launch") and hasattr(launcher, "_distributed_worker"):
+            own = getattr(launcher.launch, "of_nerfstudio", launcher.launch)
+            launcher.launch = _launching_once(launcher, own, on_cpu)
 
 
-def launch_on_cpu() -> None:
-    """Has nerfstudio's launcher start `process` and not its own function."""
-    for launcher in _launchers():
-        if hasattr(launcher, "_distributed_worker"):
-            launcher._distributed_worker = process
+def _launching_once(launcher: Any, launch: Any, on_cpu: bool) -> Any:
+    """What stands for `launch` of a module until it has been called."""
+    with_one_line = _with_one_line(launch)
 
+    @functools.wraps(launch)
+    def launching(*arguments: Any, **options: Any) -> Any:
+        launcher.launch, own = launch, launcher._distributed_worker
+        launcher._distributed_worker = process if on_cpu else own
+        try:
+            return with_one_line(*arguments, **options)
+        finally:
+            launcher._distributed_worker = own
 
-def name_the_lost() -> None:
-    """Has nerfstudio's launcher end in one line when a process is lost."""
-    for launcher in _launchers():
-        if hasattr(launcher, "launch") and not hasattr(launcher.launch, "__wrapped__"):
-            launcher.launch = _with_one_line(launcher.launch)
+    launching.of_nerfstudio = launch  # type: ignore[attr-defined]
+    return launching
 
 
 def _with_one_line(launch: Any) -> Any:

@@ -98,14 +98,14 @@ class TrainerRun:
     def forget(self, groups: dict[str, list[nn.Parameter]]) -> None:
         """Has optimizers forget all parameters but these, by the names of their groups."""
         filled = {name: group for name, group in groups.items() if group}
-        forget_the_gone(self.trainer.optimizers, filled)
+        drop_missing_parameters(self.trainer.optimizers, filled)
 
 
-def forget_the_gone(optimizers: Optimizers, groups: dict[str, list[Parameter]]) -> None:
-    """Has optimizers forget the parameters that a model no longer has, with all they remember.
+def drop_missing_parameters(optimizers: Optimizers, groups: dict[str, list[Parameter]]) -> None:
+    """Drops the parameters that a model no longer has from its optimizers, with their state.
 
     Args:
-        groups: parameters that there are, by the names of the optimizers; others stay as they are.
+        groups: the model's parameters by optimizer name; optimizers of other names do not change.
     """
     for name, parameters in groups.items():
         optimizer, there = optimizers.optimizers[name], {id(p) for p in parameters}

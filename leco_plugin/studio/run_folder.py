@@ -13,7 +13,7 @@ from typing import Any
 import yaml
 
 from leco_plugin.models.compute.ranks import is_first
-from leco_plugin.models.sizing.stored_sizes import going_on, sizes_in
+from leco_plugin.models.sizing.stored_sizes import sizes_in, sizes_to_resume
 from leco_plugin.scenes.input_error import InputError
 from leco_plugin.scenes.whole_files import write_whole
 from leco_plugin.studio.checkpoints import allow_checkpoint_globals, newest_whole, step_of
@@ -172,7 +172,7 @@ def with_sizes_of(config: Any, checkpoint: Path | None) -> Any:
     stored = sizes_in(checkpoint)
     if stored is None:
         return config
-    return _with_model(config, replace(model, sizes=going_on(model.sizes, stored)))
+    return _with_model(config, replace(model, sizes=sizes_to_resume(model.sizes, stored)))
 
 
 def keep_sizes(config: Any, model: Any, asked: Any) -> Any:

@@ -25,7 +25,7 @@ from leco_plugin.models.failures import TrainingStopped
 from leco_plugin.samplers.kernels import VARIABLE, kernels_off
 from leco_plugin.scenes.input_error import InputError
 from leco_plugin.studio.checkpoints import first_not_finite, previous_of, step_of, whole_of
-from leco_plugin.studio.run import end_of, forget_the_gone, iterations_until
+from leco_plugin.studio.run import drop_missing_parameters, end_of, iterations_until
 from leco_plugin.studio.run_folder import (
     check_photographs,
     checkpoint_of,
@@ -37,11 +37,10 @@ HEARD = "\nstopping after this step; Ctrl-C once more stops at once\n"
 
 
 @contextmanager
-def heard_between_steps() -> Iterator[threading.Event]:
-    """An event that the first Ctrl-C sets; the second one is a `KeyboardInterrupt` as ever.
+def catch_first_interrupt() -> Iterator[threading.Event]:
+    """An event that the first Ctrl-C sets; the second raises `KeyboardInterrupt` as usual.
 
-    Outside of the main thread, which alone hears signals, and where somebody else listens already,
-    nothing is changed.
+    Changes nothing outside of the main thread, or where another handler is already installed.
     """
     asked = threading.Event()
     before: Any = signal.getsignal(signal.SIGINT)
@@ -63,8 +62,8 @@ def heard_between_steps() -> Iterator[threading.Event]:
         signal.signal(signal.SIGINT, before)
 
 
-class OptimizersOfThePresent(Optimizers):
-    """They are made before a checkpoint is loaded, and loaded after the model.
+class PrunedOptimizers(Optimizers):
+    """Optimizers without the parameters that a loaded model has dropped.
 
     Args:
         config: of each parameter group.
@@ -82,7 +81,7 @@ class OptimizersOfThePresent(Optimizers):
             InputError: the model came back with other photographs than the scene has.
         """
         check_photographs(self.pipeline)
-        forget_the_gone(self, self.pipeline.get_param_groups())
+        drop_missing_parameters(self, self.pipeline.get_param_groups())
         super().load_optimizers(loaded_state)
 
 
@@ -133,7 +132,7 @@ class AtomicTrainer(Trainer):
 
     def setup_optimizers(self) -> Optimizers:
         """nerfstudio's, which resume with the parameters that a checkpoint has left the model."""
-        return OptimizersOfThePresent(self.config.optimizers.copy(), self.pipeline)
+        return PrunedOptimizers(self.config.optimizers.copy(), self.pipeline)
 
     def save_by_the_clock(self, step: int) -> None:
         """Saves if the last time is long ago; nothing where a run is to save nothing, or keeps all
@@ -173,7 +172,7 @@ class AtomicTrainer(Trainer):
         if self.world_size > 1:  # its processes would not stop after the same step
             self._train()
             return
-        with heard_between_steps() as self.asked_to_stop:
+        with catch_first_interrupt() as self.asked_to_stop:
             self._train()
 
     def _train(self) -> None:

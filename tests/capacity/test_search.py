@@ -205,10 +205,11 @@ def test_a_gate_that_nearly_holds_is_taught_for_longer(monkeypatch: pytest.Monke
     loss_of = {TOO_SMALL.width: 0.5, ENOUGH.width: 1e-3}
     measured = searching._measure
 
-    def known_loss(known: Ground, gate: Occupancy, *rest: object) -> Rung:
-        rung = measured(known, gate, *rest)
+    def known_loss(known: Ground, gate: Occupancy, *rest: object) -> tuple[Rung, Occupancy]:
+        rung, placed = measured(known, gate, *rest)
+        assert placed.gate is gate.gate and gate.threshold == 0.5  # which it is given by nobody
         lost = loss_of[gate.gate.config.width]
-        return replace(rung, lost_surface_mass=lost, verdict="loses too much")
+        return replace(rung, lost_surface_mass=lost, verdict="loses too much"), placed
 
     monkeypatch.setattr(searching, "_measure", known_loss)
     shares: list[float] = []

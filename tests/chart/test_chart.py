@@ -13,7 +13,7 @@ import chart_results
 import pytest
 
 from leco_plugin.chart import picture
-from leco_plugin.chart.chart import Chart, unlike
+from leco_plugin.chart.chart import Chart, why_not_shared
 from leco_plugin.chart.contender import Contender, Job
 from leco_plugin.chart.protocol import Protocol
 from leco_plugin.chart.runner import RUNS, RunFailed
@@ -306,4 +306,4 @@ def test_charts_that_fit_are_found_among_folders_that_may_hold_none(
         tiny_scene, tmp_path / "b", [PLAIN], (0,), Protocol(10.0), suite=("losses", "What?")
     )
     folders = [tmp_path / name for name in ("long", "no-such", "a", "beside")]
-    assert [one for one in folders if not unlike(one, suite.settings)] == [tmp_path / "a"]
+    assert [one for one in folders if not why_not_shared(one, suite.settings)] == [tmp_path / "a"]

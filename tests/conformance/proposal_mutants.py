@@ -8,8 +8,8 @@ import torch
 from conformance.estimator_mutants import rank
 from torch import Tensor
 
+from leco_plugin.hosts.proposal import LearnedOccupancySampler
 from leco_plugin.occupancy import Occupancy
-from leco_plugin.samplers.proposal import LearnedOccupancySampler
 from leco_plugin.samplers.registry import SamplerSpec
 
 

@@ -16,8 +16,8 @@ from leco_plugin.conformance.cases import (
     sampler_cases,
 )
 from leco_plugin.conformance.rules import Case, Rule, Verdict, apply
+from leco_plugin.hosts.proposal import LearnedOccupancySampler
 from leco_plugin.samplers import nerfacc_cpu, registry
-from leco_plugin.samplers.proposal import LearnedOccupancySampler
 from leco_plugin.samplers.registry import SamplerSpec
 from leco_plugin.scenes.input_error import InputError
 

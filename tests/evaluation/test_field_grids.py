@@ -12,10 +12,10 @@ from torch import Tensor
 from leco_plugin.evaluation.field_grids import (
     FieldGrids,
     cells_to_ask,
-    filled,
+    fill_cells,
     fits_memory,
     halvings,
-    looked_up,
+    look_up_scores,
 )
 from leco_plugin.evaluation.inspection import ViewBox
 
@@ -28,9 +28,9 @@ def ball(mapped: Tensor) -> Tensor:
 
 
 def test_a_cell_has_the_density_of_the_place() -> None:
-    scores = filled(ball, BOX, cells_to_ask(CUBE))
+    scores = fill_cells(ball, BOX, cells_to_ask(CUBE))
     mapped = torch.lerp(BOX.low, BOX.high, torch.rand(5000, 3))
-    found = looked_up(scores, BOX, mapped)
+    found = look_up_scores(scores, BOX, mapped)
     distances = mapped.norm(dim=-1)
     diagonal = ((BOX.high - BOX.low) / 16).norm()
     assert bool((found[distances < 0.4 - diagonal] == 1.0).all())
@@ -39,7 +39,9 @@ def test_a_cell_has_the_density_of_the_place() -> None:
 
 def test_outside_the_box_there_is_nothing() -> None:
     scores = torch.ones(4, 4, 4)
-    assert looked_up(scores, BOX, torch.tensor([[0.0, 0.0, 0.6], [0.0, 0.0, 0.4]])).tolist() == [
+    assert look_up_scores(
+        scores, BOX, torch.tensor([[0.0, 0.0, 0.6], [0.0, 0.0, 0.4]])
+    ).tolist() == [
         0,
         1,
     ]
@@ -52,9 +54,9 @@ def test_refining_finds_what_asking_every_cell_finds_with_fewer_questions() -> N
         asked[0] += len(mapped)
         return ball(mapped)
 
-    coarse = filled(ball, BOX, cells_to_ask(CUBE))
-    refined = filled(counted, BOX, cells_to_ask(FINE, coarse, floor=0.5))
-    whole = filled(ball, BOX, cells_to_ask(FINE))
+    coarse = fill_cells(ball, BOX, cells_to_ask(CUBE))
+    refined = fill_cells(counted, BOX, cells_to_ask(FINE, coarse, floor=0.5))
+    whole = fill_cells(ball, BOX, cells_to_ask(FINE))
     assert float((refined == whole).float().mean()) > 0.98  # other places in the cells were asked
     middles = torch.stack(
         torch.meshgrid(*[(torch.arange(32) + 0.5) / 32] * 3, indexing="ij"), dim=-1
@@ -70,10 +72,10 @@ def test_a_known_surface_is_never_missed_by_a_coarse_cell() -> None:
 
     seen = torch.tensor([[0.3, 0.3, 0.061], [0.3, 0.3, 0.7]])  # the second lies outside
     known = seen, torch.tensor([1.0, 5.0])
-    scores = filled(film, BOX, cells_to_ask((8, 8, 8)), known=known)
-    assert float(looked_up(scores, BOX, seen[:1])) == 1.0
+    scores = fill_cells(film, BOX, cells_to_ask((8, 8, 8)), known=known)
+    assert float(look_up_scores(scores, BOX, seen[:1])) == 1.0
     assert float(scores.sum()) == 1.0
-    assert float(filled(film, BOX, cells_to_ask((8, 8, 8))).sum()) == 0.0
+    assert float(fill_cells(film, BOX, cells_to_ask((8, 8, 8))).sum()) == 0.0
 
 
 def test_memory_is_looked_at_before_a_grid_is_filled() -> None:
@@ -97,7 +99,9 @@ def test_a_cell_is_asked_where_the_coarser_grid_has_not_ruled_it_out(seed: int) 
     sizes = (12, 16, 8)
     cells = torch.rand(sizes, generator=generator)  # the same density anywhere in a cell
     coarse = torch.rand(6, 8, 4, generator=generator)
-    found = filled(partial(looked_up, cells, BOX), BOX, cells_to_ask(sizes, coarse, floor=0.98))
+    found = fill_cells(
+        partial(look_up_scores, cells, BOX), BOX, cells_to_ask(sizes, coarse, floor=0.98)
+    )
     expected = slow_refined(coarse, 0.98, cells)
     assert 0 < int((found > 0).sum()) < found.numel()
     assert torch.equal(found > 0, expected > 0)
@@ -109,7 +113,7 @@ def test_known_places_count_like_a_loop_over_them() -> None:
     places = torch.rand(200, 3, generator=generator) * 2.4 - 1.2
     densities = torch.rand(200, generator=generator)
     nobody = torch.zeros(4, 3, 2, dtype=torch.bool)
-    found = filled(ball, BOX, nobody, known=(places, densities))
+    found = fill_cells(ball, BOX, nobody, known=(places, densities))
     expected = torch.zeros(4, 3, 2)
     for place, density in zip(places, densities):
         shares = (place - BOX.low) / (BOX.high - BOX.low)

@@ -12,7 +12,7 @@ from nerfstudio.fields.base_field import Field
 from nerfstudio.fields.density_fields import HashMLPDensityField
 from torch import Tensor, nn
 
-from leco_plugin.evaluation.queries import GridUpdates, counted
+from leco_plugin.evaluation.queries import GridUpdates, count_queries
 from leco_plugin.models.encodings import EncodingConfig
 from leco_plugin.models.field import FieldConfig, HMoEField
 from leco_plugin.occupancy import Occupancy
@@ -77,7 +77,7 @@ def ask(field: HMoEField, count: int) -> None:
 
 def test_shading_pruning_and_updating_are_all_counted() -> None:
     host = Host(Fog())
-    with counted(host) as queries:
+    with count_queries(host) as queries:
         host.field(samples(5, 7))
         host.field.density_fn(torch.zeros(11, 3))
         host.field.get_density(samples(2, 3))
@@ -86,7 +86,7 @@ def test_shading_pruning_and_updating_are_all_counted() -> None:
 
 def test_proposal_networks_are_counted_apart() -> None:
     host = Host(Fog(), proposals=2)
-    with counted(host) as queries:
+    with count_queries(host) as queries:
         host.field(samples(5, 7))
         for density_fn in host.density_fns:
             density_fn(torch.zeros(4, 6, 3))
@@ -96,21 +96,21 @@ def test_proposal_networks_are_counted_apart() -> None:
 def test_a_field_that_asks_its_parent_class_is_asked_once() -> None:
     host = Host(ThickFog())
     host.other = Fog()  # type: ignore[assignment]
-    with counted(host) as queries:
+    with count_queries(host) as queries:
         host.field.density_fn(torch.zeros(9, 3))
     assert queries["field"] == 9
 
 
 def test_a_field_that_is_called_is_counted() -> None:
     host = Host(Plain())
-    with counted(host) as queries:
+    with count_queries(host) as queries:
         host.field(torch.zeros(13, 3), noise=1.0)
     assert queries["field"] == 13
 
 
 def test_a_field_that_learns_for_a_host_is_counted_apart() -> None:
     own = hmoe()
-    with counted(Host(own)) as queries:
+    with count_queries(Host(own)) as queries:
         ask(own, 3)
         ask(hmoe(), 4)
     assert queries == {"field": 3, "proposal": 0, "learning": 4, "gate": 0}
@@ -118,7 +118,7 @@ def test_a_field_that_learns_for_a_host_is_counted_apart() -> None:
 
 def test_a_frozen_gate_is_counted_once_whatever_is_asked_of_it() -> None:
     occupancy = ball()
-    with counted(Host(Plain())) as queries:
+    with count_queries(Host(Plain())) as queries:
         occupancy.query(torch.zeros(3, 3))
         occupancy.occupied(torch.zeros(4, 3))
     assert queries == {"field": 0, "proposal": 0, "learning": 0, "gate": 7}
@@ -127,7 +127,7 @@ def test_a_frozen_gate_is_counted_once_whatever_is_asked_of_it() -> None:
 def test_afterwards_nothing_is_counted_and_the_classes_are_as_they_were() -> None:
     own = {owner: dict(vars(owner)) for owner in (Fog, ThickFog, Plain, HMoEField, Occupancy)}
     host = Host(ThickFog())
-    with pytest.raises(RuntimeError), counted(host) as queries:
+    with pytest.raises(RuntimeError), count_queries(host) as queries:
         raise RuntimeError
     host.field(samples(5, 7))
     ask(hmoe(), 4)

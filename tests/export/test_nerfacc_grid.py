@@ -42,6 +42,20 @@ def test_nerfacc_loads_it_and_sees_the_same_cells(tmp_path: Path) -> None:
     assert torch.equal(density > 0.5, ours.occupied(positions))
 
 
+def test_no_table_of_indices_is_made_for_an_export(monkeypatch: pytest.MonkeyPatch) -> None:
+    """nerfacc's takes 32 bytes a cell, all else 5."""
+    from nerfacc.estimators import occ_grid
+
+    made, mesh = [], occ_grid._meshgrid3d
+    monkeypatch.setattr(
+        occ_grid, "_meshgrid3d", lambda *a, **o: made.append(mesh(*a, **o)) or made[-1]
+    )
+    buffers = grid_buffers(walled(), 16)
+    assert buffers["resolution"].tolist() == [16, 16, 16]
+    assert sum(len(part.view(-1, 3)) for part in made) <= 1
+    assert sum(value.untyped_storage().nbytes() for value in buffers.values()) < 5.1 * 16**3
+
+
 @pytest.mark.parametrize("levels", [1, 3])
 def test_a_cell_is_kept_where_any_probed_point_is(levels: int) -> None:
     occupancy = walled() if levels == 1 else unbounded()

@@ -63,6 +63,21 @@ def test_a_checkpoint_brings_its_own_occupancy(guide: Guide, already: bool):
         assert torch.equal(stand_in.sampling(*rays(), **MARCH)[1], expected[1])
 
 
+@pytest.mark.parametrize("below", [False, True], ids=["guide", "watched"])
+@pytest.mark.parametrize("more", [False, True], ids=["lacks", "has"])
+def test_a_state_of_another_version_is_refused_in_a_line(guide: Guide, below: bool, more: bool):
+    extra = guide.get_extra_state()
+    held = extra["watched"] if below else extra
+    if more:
+        held["of_old"] = 3
+    else:
+        del held[next(reversed(held))]
+    fresh = Guide()
+    with pytest.raises(InputError, match="another version of leco_plugin: train again") as caught:
+        fresh.load_state_dict({**guide.state_dict(), "_extra_state": extra})
+    assert "\n" not in str(caught.value) and fresh.occupancy is None
+
+
 def test_the_state_of_a_host_holds_the_gate_once(guide: Guide):
     host = torch.nn.Module()
     host.guide, host.grid = guide, guide.estimator(BOX)

@@ -93,6 +93,14 @@ def watched(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Watched:
     return Watched(guide=guide, host=host, watch=watch, now=now, asked=asked, kept=9, out=tmp_path)
 
 
+def test_an_occupancy_that_others_hold_keeps_its_threshold(watched: Watched) -> None:
+    held = watched.guide.the_occupancy()
+    before, report = held.threshold, copy.deepcopy(held.report)
+    watched.watch._lower(5, 0.5 * before, "a reason")
+    assert (held.threshold, held.report) == (before, report)
+    assert watched.threshold == 0.5 * before and watched.guide.the_occupancy().gate is held.gate
+
+
 def test_a_price_beyond_its_bound_lowers_the_threshold_until_it_is_not(watched: Watched) -> None:
     before, version = watched.threshold, watched.guide.version
     watched.go(0, 250)

@@ -16,10 +16,10 @@ from leco_plugin.learning.collapse import (
     form_of,
     heal,
     is_dense,
+    is_restart_due,
     look,
     reset_gate_head,
     spread_scene_experts,
-    starts_anew,
 )
 from leco_plugin.learning.progress import Progress
 from leco_plugin.models.gate import occupancy_from_logits
@@ -82,7 +82,7 @@ def test_points_that_are_shared_out_are_no_new_last_layer() -> None:
     heal(
         head_of([0, 9, 0]), progress, Collapse("a cause", "one expert"), ONE, 150, GateLossConfig()
     )
-    assert not starts_anew(Collapse("a cause", "empty"), GateLossConfig(), progress)
+    assert not is_restart_due(Collapse("a cause", "empty"), GateLossConfig(), progress)
 
 
 def test_points_of_one_expert_are_shared_out_and_the_balance_counts_more() -> None:

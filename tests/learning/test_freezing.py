@@ -77,8 +77,11 @@ def test_it_is_the_field_that_the_gate_was_calibrated_on(mixture: Mixture, tmp_p
     frozen = field_at_freezing(mixture, tmp_path)
     assert frozen is not None and not frozen.training
     assert torch.equal(densities(frozen), before) and not torch.equal(now, before)
-    assert torch.equal(densities(mixture), now) and mixture.field.experts.those_left() is not None
-    assert frozen.field.experts.those_left() is None and frozen.report == {"step": 7}
+    assert (
+        torch.equal(densities(mixture), now)
+        and mixture.field.experts.remaining_experts() is not None
+    )
+    assert frozen.field.experts.remaining_experts() is None and frozen.report == {"step": 7}
 
 
 def test_a_run_without_one_has_none(mixture: Mixture, tmp_path: Path) -> None:

@@ -54,12 +54,12 @@ def test_a_resumed_run_goes_on_with_the_looks_before_its_first_step(tmp_path: Pa
     folder = tmp_path / "nerfstudio_models"
     folder.mkdir()
     for checkpoint in (folder, folder / "step-000000015.ckpt"):
-        found = GateHistory.gone_on_from(checkpoint, 16, gate)
+        found = GateHistory.load_before(checkpoint, 16, gate)
         assert found.steps == [0, 10] and len(found.weights) == len(found.shares) == 2
         found.look(16, 1.0, gate, torch.tensor([0]), torch.tensor([0.0]))
         assert GateHistory.load(found.save(folder), gate).steps == [0, 10, 16]
-    assert len(GateHistory.gone_on_from(folder, 16, a_gate(width=12))) == 0
-    assert len(GateHistory.gone_on_from(tmp_path / "a" / "b" / "none.ckpt", 16, gate)) == 0
+    assert len(GateHistory.load_before(folder, 16, a_gate(width=12))) == 0
+    assert len(GateHistory.load_before(tmp_path / "a" / "b" / "none.ckpt", 16, gate)) == 0
 
 
 def test_other_files_are_refused_in_a_line(tmp_path: Path) -> None:

@@ -110,7 +110,7 @@ def test_looking_changes_nothing(mixture: Mixture) -> None:
     assert mixture.training and torch.equal(image(mixture), pixels)
     after = mixture.state_dict()
     assert list(after) == list(before)
-    assert mixture.field.experts.those_left() is None
+    assert mixture.field.experts.remaining_experts() is None
 
 
 def test_a_failure_half_way_leaves_all_experts(mixture: Mixture, monkeypatch) -> None:

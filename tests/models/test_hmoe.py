@@ -127,13 +127,13 @@ def test_a_dropped_expert_takes_its_parameters_along() -> None:
     hmoe = mixture(scene_experts=4)
     each = sum(parameter.numel() for parameter in hmoe.experts[1].parameters())
     before = sum(parameter.numel() for parameter in hmoe.parameters())
-    assert hmoe.those_left() is None
+    assert hmoe.remaining_experts() is None
     gone = hmoe.drop(3)
     assert sum(parameter.numel() for parameter in hmoe.parameters()) == before - each
     assert not any(name.startswith("experts.3.") for name in hmoe.state_dict())
     hmoe.put_back(3, gone)
     assert sum(parameter.numel() for parameter in hmoe.parameters()) == before
-    assert hmoe.those_left() is None and bool(hmoe.left.all())
+    assert hmoe.remaining_experts() is None and bool(hmoe.left.all())
 
 
 def test_who_loads_a_state_dict_has_the_experts_that_are_left_in_it() -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import io
 from typing import Any
 
@@ -235,8 +236,26 @@ def test_a_gate_that_has_given_up_the_papers_form_routes_as_the_other_also_when_
 
 def test_a_checkpoint_of_an_earlier_version_is_refused_in_a_line(model: LecoModel) -> None:
     state = {name.removeprefix("mixture."): value for name, value in model.state_dict().items()}
-    with pytest.raises(InputError, match="earlier version of leco_plugin: train again") as caught:
+    with pytest.raises(InputError, match="another version of leco_plugin: train again") as caught:
         model.load_state_dict(state)
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("change", ["lacks", "has", "lacks below"])
+@pytest.mark.parametrize("place", ["", "mixture."])
+def test_an_extra_state_of_another_version_is_refused_in_a_line(
+    model: LecoModel, place: str, change: str
+) -> None:
+    state = model.state_dict()
+    extra = copy.deepcopy(state[f"{place}_extra_state"])
+    below = extra["progress"]["watch"] if place == "" else extra["routing"]
+    if change == "has":
+        below["of_old"] = 3
+    else:
+        held = extra if change == "lacks" else below
+        del held[next(reversed(held))]
+    with pytest.raises(InputError, match="another version of leco_plugin: train again") as caught:
+        model.load_state_dict({**state, f"{place}_extra_state": extra})
     assert "\n" not in str(caught.value)
 
 

@@ -48,7 +48,7 @@ def test_a_kernel_that_is_off_is_not_tried(monkeypatch) -> None:
 
 
 def test_experts_that_are_off_are_not_grouped(monkeypatch) -> None:
-    monkeypatch.setattr(grouped, "serves", lambda *_: True)
+    monkeypatch.setattr(grouped, "is_grouping_faster", lambda *_: True)
     monkeypatch.setattr(torch.nn.functional, "grouped_mm", None, raising=False)
     monkeypatch.setattr(torch, "get_autocast_dtype", lambda _: torch.bfloat16)
 

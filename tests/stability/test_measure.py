@@ -15,8 +15,8 @@ from nerfstudio.cameras.rays import RayBundle
 from nerfstudio.model_components.ray_samplers import UniformSampler
 from torch import Tensor
 
+from leco_plugin.hosts.proposal import DenseSampler
 from leco_plugin.samplers.base import Estimator
-from leco_plugin.samplers.proposal import DenseSampler
 from leco_plugin.stability.photographs import TRUTH
 from leco_plugin.stability.worker import (
     FEWEST_VIEWS,

@@ -143,7 +143,9 @@ def test_a_loss_that_is_not_finite_ends_the_run_in_one_line(
     with pytest.raises(TrainingStopped, match=r"step 20: rgb_loss is not .* no checkpoint was"):
         trainer.train()
     trainer.save_checkpoint(10)
-    with pytest.raises(SystemExit, match=r"a reason.*last good checkpoint is .*step-000000010"):
+    with pytest.raises(
+        TrainingStopped, match=r"a reason.*last good checkpoint is .*step-000000010"
+    ):
         trainer.train()
 
 

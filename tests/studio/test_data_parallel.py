@@ -30,7 +30,18 @@ def own(monkeypatch: pytest.MonkeyPatch) -> list[Any]:
     """Puts something else where nerfstudio has its own function; what that is called with."""
     calls: list[Any] = []
     monkeypatch.setattr(ns_train, "_distributed_worker", lambda *given: calls.append(given))
+    monkeypatch.setattr(ns_train, "launch", lambda **_: ns_train._distributed_worker)
     return calls
+
+
+def started(made: DataParallelTrainerConfig) -> Any:
+    """What a launch starts; after it nerfstudio's launcher is as it was."""
+    before = ns_train.launch, ns_train._distributed_worker
+    made.set_timestamp()
+    assert ns_train._distributed_worker is before[1]
+    found = ns_train.launch(config=made)
+    assert (ns_train.launch, ns_train._distributed_worker) == before
+    return found
 
 
 def config(device: str, devices: int) -> DataParallelTrainerConfig:
@@ -42,17 +53,14 @@ def config(device: str, devices: int) -> DataParallelTrainerConfig:
 
 def test_several_processes_on_a_cpu_are_ours() -> None:
     made = config("cpu", 2)
-    assert ns_train._distributed_worker is not process
-    made.set_timestamp()
-    assert ns_train._distributed_worker is process
+    assert started(made) is process
     assert made.timestamp != "{timestamp}"
 
 
 def test_so_are_those_of_several_machines() -> None:
     made = config("cpu", 1)
     made.machine.num_machines, made.machine.dist_url = 2, "tcp://host:1"
-    made.set_timestamp()
-    assert ns_train._distributed_worker is process
+    assert started(made) is process
 
 
 @pytest.mark.parametrize(("device", "devices"), [("cpu", 1), ("cuda", 1), ("cuda", 2)])
@@ -60,15 +68,29 @@ def test_all_others_are_left_to_nerfstudio(
     device: str, devices: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(torch.cuda, "device_count", lambda: 2)
-    config(device, devices).set_timestamp()
-    assert ns_train._distributed_worker is not process
+    assert started(config(device, devices)) is ns_train._distributed_worker
 
 
 def test_a_launcher_that_is_run_as_a_script_is_found(monkeypatch: pytest.MonkeyPatch) -> None:
     script = SimpleNamespace(_distributed_worker=None)
+    script.launch = own = lambda: script._distributed_worker
     monkeypatch.setitem(sys.modules, "__main__", script)
     config("cpu", 2).set_timestamp()
-    assert script._distributed_worker is process
+    assert script.launch() is process
+    assert script.launch is own and script._distributed_worker is None
+
+
+def test_a_launch_that_fails_leaves_nerfstudio_as_it_was(monkeypatch: pytest.MonkeyPatch) -> None:
+    def fails(**_: Any) -> None:
+        raise KeyError(3)
+
+    monkeypatch.setattr(ns_train, "launch", fails)
+    worker, made = ns_train._distributed_worker, config("cpu", 2)
+    made.set_timestamp()
+    made.set_timestamp()
+    with pytest.raises(KeyError):
+        ns_train.launch(config=made)
+    assert ns_train.launch is fails and ns_train._distributed_worker is worker
 
 
 def test_a_later_run_on_cuda_is_nerfstudios_again(own: list[Any]) -> None:

@@ -127,6 +127,20 @@ def test_other_types_are_left_to_nerfstudio() -> None:
     torch.testing.assert_close(fast(positions), twin(positions))
 
 
+def test_an_encoding_is_replaced_wherever_it_is_held_and_itself_stays_as_it_was() -> None:
+    plain = HashEncoding(implementation="torch", **SIZES[0])
+    other = HashEncoding(implementation="torch", **SIZES[0])
+    module = nn.ModuleDict({"first": plain, "shared": nn.Sequential(plain), "other": other})
+    names = list(module.state_dict())
+    speed_up_hash_encodings(module)
+    assert type(plain) is HashEncoding and type(module["first"]) is CpuHashEncoding
+    assert module["first"] is module["shared"][0] is not module["other"]
+    assert list(module.state_dict()) == names
+    with torch.no_grad():
+        module["first"].hash_table.mul_(2.0)
+    torch.testing.assert_close(plain(points((9,))), module["first"](points((9,))))
+
+
 def test_an_encoding_of_another_kind_stays_what_it_is() -> None:
     class Other(HashEncoding):
         pass

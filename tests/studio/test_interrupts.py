@@ -7,13 +7,13 @@ import threading
 
 import pytest
 
-from leco_plugin.studio.trainer import HEARD, heard_between_steps
+from leco_plugin.studio.trainer import HEARD, catch_first_interrupt
 
 
 def test_the_first_ctrl_c_is_noted_and_the_second_one_interrupts(
     capfd: pytest.CaptureFixture[str],
 ) -> None:
-    with pytest.raises(KeyboardInterrupt), heard_between_steps() as asked:
+    with pytest.raises(KeyboardInterrupt), catch_first_interrupt() as asked:
         assert not asked.is_set()
         signal.raise_signal(signal.SIGINT)
         assert asked.is_set()
@@ -26,7 +26,7 @@ def test_whoever_listens_already_goes_on_listening() -> None:
     heard: list[str] = []
     before = signal.signal(signal.SIGINT, lambda *_: heard.append("theirs"))
     try:
-        with heard_between_steps() as asked:
+        with catch_first_interrupt() as asked:
             signal.raise_signal(signal.SIGINT)
         assert heard == ["theirs"] and not asked.is_set()
     finally:
@@ -37,7 +37,7 @@ def test_a_thread_that_hears_no_signals_runs_all_the_same() -> None:
     seen = []
 
     def work() -> None:
-        with heard_between_steps() as asked:
+        with catch_first_interrupt() as asked:
             seen.append(asked.is_set())
 
     thread = threading.Thread(target=work)

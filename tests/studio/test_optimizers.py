@@ -9,8 +9,8 @@ import torch
 from nerfstudio.engine.optimizers import AdamOptimizerConfig
 from torch import nn
 
-from leco_plugin.studio.run import forget_the_gone
-from leco_plugin.studio.trainer import OptimizersOfThePresent
+from leco_plugin.studio.run import drop_missing_parameters
+from leco_plugin.studio.trainer import PrunedOptimizers
 
 CONFIG = {
     name: {"optimizer": AdamOptimizerConfig(lr=0.1, max_norm=1.0), "scheduler": None}
@@ -31,19 +31,19 @@ class Pipeline(nn.Module):
         return {"field": list(self.parts.parameters()), "gate": list(self.gate.parameters())}
 
 
-def step(pipeline: Pipeline, optimizers: OptimizersOfThePresent) -> None:
+def step(pipeline: Pipeline, optimizers: PrunedOptimizers) -> None:
     optimizers.zero_grad_all()
     sum((parameter**2).sum() for parameter in pipeline.parameters()).backward()
     optimizers.optimizer_step_all()
 
 
-def reduced() -> tuple[Pipeline, OptimizersOfThePresent]:
+def reduced() -> tuple[Pipeline, PrunedOptimizers]:
     """After a step, without the first part, and after another step."""
     pipeline = Pipeline()
-    optimizers = OptimizersOfThePresent(CONFIG, pipeline)
+    optimizers = PrunedOptimizers(CONFIG, pipeline)
     step(pipeline, optimizers)
     pipeline.parts[0] = None
-    forget_the_gone(optimizers, pipeline.get_param_groups())
+    drop_missing_parameters(optimizers, pipeline.get_param_groups())
     step(pipeline, optimizers)
     return pipeline, optimizers
 
@@ -51,7 +51,7 @@ def reduced() -> tuple[Pipeline, OptimizersOfThePresent]:
 def test_what_has_gone_is_forgotten_and_the_rest_goes_on() -> None:
     pipeline, optimizers = reduced()
     whole = Pipeline()
-    others = OptimizersOfThePresent(CONFIG, whole)
+    others = PrunedOptimizers(CONFIG, whole)
     step(whole, others)
     step(whole, others)
     optimizer: Any = optimizers.optimizers["field"]
@@ -68,7 +68,7 @@ def test_a_resumed_run_has_the_optimizer_of_what_is_left() -> None:
     pipeline, optimizers = reduced()
     saved = copy.deepcopy({k: one.state_dict() for k, one in optimizers.optimizers.items()})
     again = Pipeline()
-    resumed = OptimizersOfThePresent(CONFIG, again)  # made before the checkpoint is read
+    resumed = PrunedOptimizers(CONFIG, again)  # made before the checkpoint is read
     again.parts[0] = None
     again.load_state_dict(pipeline.state_dict())
     resumed.load_optimizers(saved)

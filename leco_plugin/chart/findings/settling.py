@@ -35,8 +35,11 @@ def last_gain(line: Line) -> float | None:
 
 
 def still_rising(lines: Sequence[Line]) -> list[str]:
-    """Who gained more than `ENOUGH` at last, as far as a gain is shown, or is not known to gain
-    less, or whose grid has not skipped anything yet or has taken the time of training."""
+    """Names of the lines that have not had enough time.
+
+    These gained more than `ENOUGH` in the last third, or their gain is unknown, or their grid has
+    skipped nothing yet or has taken the time of training.
+    """
     gains = [(line, last_gain(line)) for line in lines]
     return [
         line.name
@@ -49,8 +52,7 @@ def still_rising(lines: Sequence[Line]) -> list[str]:
 
 
 def settling(lines: Sequence[Line]) -> str:
-    """In two sentences, what all gained at last, and who is still rising; and whose grid has taken
-    the time of training."""
+    """The last gain of each line, which lines still rise, and whose grid took the training time."""
     listed = ", ".join(
         f"{line.name} {'unknown' if gain is None else f'{gain:+.1f} dB'}"
         for line in lines
@@ -72,8 +74,10 @@ def settling(lines: Sequence[Line]) -> str:
 
 
 def falls(lines: Sequence[Line]) -> str | None:
-    """In one sentence, in how many runs of whom the end lies more than `FALL` below their own best
-    point, and by how much at most. None where it does in no run."""
+    """A sentence on runs that end more than `FALL` below their own best point; None without any.
+
+    It gives the number of such runs for each line, and the largest fall.
+    """
     fallen = []
     for line in lines:
         below = [max(psnr for _, psnr in run["curve"]) - run["curve"][-1][1] for run in line.runs]

@@ -1,1 +1,1 @@
-"""How points and products of matrices are moved on a machine, and among its processes."""
+"""Dispatch to experts, matrix products and processes on one machine."""

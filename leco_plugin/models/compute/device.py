@@ -1,4 +1,4 @@
-"""What a device is fastest in: precision and memory."""
+"""The fastest precision and memory settings of a device."""
 
 from __future__ import annotations
 

@@ -26,8 +26,8 @@ def filled_size(count: int) -> int:
     return -(-count // step) * step
 
 
-def steadied(rows: Tensor) -> Tensor:
-    """Rows [N, ...] with rows of zeros behind them, up to the steady size; to be cut off again."""
+def pad_to_steady_size(rows: Tensor) -> Tensor:
+    """Rows [N, ...] padded with zeros to the steady size; the caller cuts them off again."""
     missing = steady_size(len(rows), rows.device.type) - len(rows)
     if missing == 0:
         return rows

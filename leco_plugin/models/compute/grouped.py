@@ -24,7 +24,7 @@ ROWS, ROUNDS = 1 << 15, 5
 
 
 @functools.cache
-def serves(device: torch.device, n: int, width: int) -> bool:
+def is_grouping_faster(device: torch.device, n: int, width: int) -> bool:
     """Whether grouped products are right and faster on this device; tried once, said in one line.
 
     Args:
@@ -193,5 +193,5 @@ def may_group(features: Tensor, n: int, width: int) -> bool:
         and "experts" not in kernels_off()
         and torch.get_autocast_dtype(device) == torch.bfloat16
         and (features.dtype == torch.bfloat16 or torch.is_autocast_enabled(device))
-        and serves(features.device, n, width)
+        and is_grouping_faster(features.device, n, width)
     )

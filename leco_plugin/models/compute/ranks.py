@@ -1,7 +1,7 @@
-"""What the processes of a data-parallel run must agree on; where there is one process, nothing.
+"""Agreement between the processes of a data-parallel run; a run of one process needs none.
 
-Each process trains on rays of its own. Gradients are averaged, so that weights stay the same; what
-is measured or drawn would not, and is taken from the first process.
+Each process trains on its own rays. Gradients are averaged, so that all weights stay the same.
+Measurements and random draws would differ, so all processes use those of the first one.
 """
 
 from __future__ import annotations
@@ -16,8 +16,8 @@ from torch.nn.parallel import DistributedDataParallel
 T = TypeVar("T")
 
 
-def several() -> bool:
-    """Whether this is one of several processes."""
+def is_distributed() -> bool:
+    """Whether the run has several processes."""
     return (
         distributed.is_available()
         and distributed.is_initialized()
@@ -27,7 +27,7 @@ def several() -> bool:
 
 def is_first() -> bool:
     """Whether this is the process that decides, writes files and logs."""
-    return not several() or distributed.get_rank() == 0
+    return not is_distributed() or distributed.get_rank() == 0
 
 
 @torch.no_grad()
@@ -37,7 +37,7 @@ def share(tensors: Iterable[Tensor]) -> None:
     Args:
         tensors: of any types, equally shaped everywhere; with NCCL on the device of the process.
     """
-    if not several():
+    if not is_distributed():
         return
     for tensor in tensors:
         values = tensor.detach().contiguous()
@@ -53,7 +53,7 @@ def from_first(make: Callable[[], T], device: torch.device) -> T:
     Args:
         device: of the process.
     """
-    if not several():
+    if not is_distributed():
         return make()
     made = [make() if is_first() else None]
     distributed.broadcast_object_list(made, src=0, device=device)
@@ -66,7 +66,7 @@ def mean(value: float, device: torch.device) -> float:
     Args:
         device: of the process.
     """
-    if not several():
+    if not is_distributed():
         return value
     total = torch.tensor(value, dtype=torch.float64, device=device)
     distributed.all_reduce(total)
@@ -80,7 +80,7 @@ def averaging(model: nn.Module, device: torch.device) -> nn.Module:
     Args:
         device: of the process, where the model is.
     """
-    if not several():
+    if not is_distributed():
         return model
     numbers = None if device.type == "cpu" else [device.index]
     return DistributedDataParallel(model, device_ids=numbers, find_unused_parameters=True)

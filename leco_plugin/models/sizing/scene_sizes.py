@@ -1,9 +1,8 @@
 """Sizes chosen from how much there is to see in a scene, before training: `leco-occupancy`'s own.
 
-What is counted is the footprint of a pixel at the scene's distance, a texel. A scene twice as wide
-has four times as many, and gets four times the experts and the table, up to the sizes of the
-device. A size that is set by hand stays as it is, and what follows from it follows from
-that.
+The measure is the texel: the footprint of a pixel at the scene's distance. A scene twice as wide
+has four times as many, so it gets four times the experts and the table, up to the sizes of the
+device. A size set by hand is kept, and sizes that depend on it follow it.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""What sizes cannot be: counts that contradict one another, and more than the device holds."""
+"""Checks of sizes: contradictory counts, and more memory than the device has."""
 
 from __future__ import annotations
 
@@ -91,7 +91,7 @@ def _check_field(sizes: Sizes) -> None:
 
 
 def memory_of(device: torch.device | str, group: Path = Path("/sys/fs/cgroup")) -> int | None:
-    """Bytes of memory of a device, whoever uses them; of a CPU within a container's limit.
+    """Total bytes of a device's memory, used or free; on a CPU within a container's limit.
 
     None where it is not known.
     """

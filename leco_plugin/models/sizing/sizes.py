@@ -1,4 +1,4 @@
-"""Sizes of gate, field and batches: the most that each device is given, and those of the paper."""
+"""Sizes of gate, field and batches: the largest for each device, and those of the paper."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Sizes of a run that was begun: from its checkpoint, whatever its scene has become since."""
+"""Sizes of a resumed run: those of its checkpoint, even if its scene has changed since."""
 
 from __future__ import annotations
 
@@ -60,8 +60,8 @@ def sizes_in(checkpoint: Path) -> dict[str, Any] | None:
     return next((values for values in found if values is not None), None)
 
 
-def going_on(wanted: Sizes, stored: dict[str, Any]) -> Sizes:
-    """The sizes with which a run is gone on with: its own, and those set by hand are the same.
+def sizes_to_resume(wanted: Sizes, stored: dict[str, Any]) -> Sizes:
+    """The sizes of a resumed run: those it was begun with.
 
     Raises:
         InputError: a size set by hand is another one.

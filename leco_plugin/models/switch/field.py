@@ -13,7 +13,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor, nn
 
-from leco_plugin.models.compute.dispatch import dispatch, steadied, within_capacity
+from leco_plugin.models.compute.dispatch import dispatch, pad_to_steady_size, within_capacity
 from leco_plugin.models.encodings import FrequencyEncoding
 from leco_plugin.models.field import ColorHead
 from leco_plugin.models.gate import logits_of
@@ -118,11 +118,11 @@ class SwitchField(nn.Module):
                 a point without a place has zero features. None is dropless.
         """
         count = len(mapped)
-        projected = self.projection(self.encoding(steadied(mapped)))
+        projected = self.projection(self.encoding(pad_to_steady_size(mapped)))
         logits = self.gate(projected)[:count]
         gate_values, routes = logits.softmax(dim=-1).max(dim=-1)
         features = self._mixture(projected[:count], routes, gate_values, capacity_factor)
-        raw = self.density_head(steadied(features))[:count, 0].float()
+        raw = self.density_head(pad_to_steady_size(features))[:count, 0].float()
         if noise > 0.0:
             raw = raw + noise * torch.randn_like(raw)
         sigmas = self.density_scale * nn.functional.softplus(raw + SHIFT)

@@ -147,7 +147,7 @@ def _in_order(first: Answers, second: Answers, order: Tensor, num_first: int) ->
     )
 
 
-def kept_by(
+def keep_candidates(
     estimator: Any,
     rays: Rays,
     step_size: float,
@@ -156,7 +156,7 @@ def kept_by(
     density_fn: Callable[[Tensor], Tensor] | None,
     early_stop_eps: float,
 ) -> Intervals:
-    """What an estimator keeps of the candidates along rays.
+    """The candidates along rays that an estimator keeps.
 
     Args:
         estimator: anything with nerfacc's `sampling`.

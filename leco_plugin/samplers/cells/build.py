@@ -1,8 +1,8 @@
 """Building a cell cache: the finest cells that fit a budget, checked against the gate.
 
-Random decisions are compared with the gate's own, half of them anywhere in the mapped cube, half
-where it is not empty, because rays look at surfaces. While too many differ, the caution with which
-planes decide grows, then the margin with which cells are judged (`judging.py`).
+The cache is compared with the gate at random positions: half of them anywhere in the mapped cube,
+half where it is not empty, because rays look at surfaces. While too many decisions differ, planes
+decide more cautiously, and then cells are judged with a larger margin (`judging.py`).
 """
 
 from __future__ import annotations

@@ -1,11 +1,11 @@
-"""A frozen gate's decisions on cells, so that only positions near its boundary ask the gate itself.
+"""A frozen gate's decisions on cells: only positions near its boundary need the gate itself.
 
 The cache has three levels in the mapped cube [-1, 1]^3, so that unbounded scenes are covered. A
 coarse cell is empty, occupied or mixed. A mixed one owns a brick of 4^3 fine cells, each again
 empty, occupied or mixed. A mixed fine cell holds a plane, the gate's logit to first order, with its
-expected error: further from the plane than this it decides, nearer the gate is asked. A 2-bit state
-for each cell would leave 2% of the cube to the gate; a plane for each mixed cell of half the
-resolution leaves 0.5% in the same memory.
+expected error. Farther from the plane than this error, the plane decides; nearer, the gate is
+queried. A 2-bit state for each cell would leave 2% of the cube to the gate. A plane for each mixed
+cell of half the resolution leaves 0.5% in the same memory.
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
-"""How cells are judged by a frozen gate: from its logits at their corners, centres and within.
+"""Judges cells by a frozen gate: from its logits at their corners, centres and points inside.
 
-A cell is called empty or occupied when all logits seen in it lie on one side of the threshold by
-a margin proportional to their spread; fine ones that are close to it are looked at in more places.
-A fine cell that is neither gets a plane.
+A cell is empty or occupied if all its logits lie on one side of the threshold, by a margin that is
+proportional to their spread. Fine cells close to the threshold are probed at more points. A fine
+cell that is neither gets a plane.
 """
 
 from __future__ import annotations

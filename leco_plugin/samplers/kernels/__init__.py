@@ -1,4 +1,4 @@
-"""Fused kernels for CUDA: which are on, and (`fused`) when one answers for its torch twin.
+"""Fused kernels for CUDA: which are on, and (`fused`) when one replaces its torch twin.
 
 Modules named `*_kernel` import Triton and are imported by `fused` alone.
 """

@@ -1,8 +1,8 @@
 """Whether a fused kernel answers instead of its torch twin; the one place that imports kernels.
 
-They run where Triton and CUDA are. Before a kernel answers it is compared with its twin, once for a
-gate, a threshold and its cells, on positions and rays drawn at random. A kernel that is missing,
-fails or decides otherwise is reported in one line of the log, and the twin answers from then on.
+Kernels need Triton and CUDA. Before its first answer a kernel is compared with its twin on random
+positions and rays, once for each gate, threshold and cell cache. If a kernel is missing, fails or
+decides otherwise, one line of the log says so, and the twin answers from then on.
 """
 
 from __future__ import annotations

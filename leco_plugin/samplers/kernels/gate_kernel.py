@@ -51,8 +51,10 @@ def largest_of(u, v, w):
 
 @triton.jit
 def _once(values):
-    """The same, of which the compiler does not know that it could compute them again: every thread
-    that needs a position would map it for itself, with seven divisions."""
+    """The same values, hidden from the compiler so that it does not compute them again.
+
+    Otherwise every thread that needs a position would map it for itself, with seven divisions.
+    """
     if _INTERPRETED:
         return values
     return tl.inline_asm_elementwise(

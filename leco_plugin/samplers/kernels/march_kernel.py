@@ -2,9 +2,9 @@
 
 Its torch twin is `marching.march` with the questions of `LearnedOccupancyEstimator`: the same
 edges to the last bit, `CellCache.near` and `CellCache.decide` for each candidate, the gate for
-those that cells leave open. A program walks one ray, `STEPS` candidates at a time, and asks the
-gate about such a stretch only if some of it is open. The first launch counts what each ray keeps,
-the second writes it; that they are one kernel is what makes the second decide like the first.
+those that cells leave open. A program walks one ray, `STEPS` candidates at a time, and queries the
+gate only if some of these are open. The first launch counts what each ray keeps, and the second
+writes it. Both are the same kernel, so that they decide alike.
 """
 
 from __future__ import annotations

@@ -21,6 +21,7 @@ from torch import Tensor
 from leco_plugin.log import bar
 from leco_plugin.scenes.input_error import InputError
 from leco_plugin.scenes.whole_files import write_whole
+from leco_plugin.studio.internals import outputs_of
 
 
 class StoredPictures:
@@ -86,7 +87,7 @@ def store_pictures(dataset: Any, folder: Path, what: str = "photographs") -> dic
         InputError: nothing can be written there, or the pictures have no common form.
     """
     sizes = picture_sizes(dataset)
-    masked = dataset._dataparser_outputs.mask_filenames is not None
+    masked = outputs_of(dataset).mask_filenames is not None
     names = [_name(dataset, number) for number in range(len(dataset))]
     files = {"image": [folder / f"{name}.pixels" for name in names]}
     if masked:
@@ -111,7 +112,7 @@ def picture_sizes(dataset: Any) -> Tensor:
 
 def _name(dataset: Any, number: int) -> str:
     """Another picture, or the same one read otherwise, has another name."""
-    outputs = dataset._dataparser_outputs
+    outputs = outputs_of(dataset)
     paths: Iterable[Path] = [outputs.image_filenames[number]]
     if outputs.mask_filenames is not None:
         paths = [*paths, outputs.mask_filenames[number]]

@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from leco_plugin.models.compute import grouped as grouped_trial
-from leco_plugin.models.compute.grouped import is_right, race, serves
+from leco_plugin.models.compute.grouped import is_grouping_faster, is_right, race
 
 pytestmark = pytest.mark.skipif(
     not hasattr(torch.nn.functional, "grouped_mm"), reason="this torch has no grouped_mm"
@@ -18,7 +18,7 @@ CPU = torch.device("cpu")
 
 @pytest.fixture(autouse=True)
 def untried() -> None:
-    serves.cache_clear()
+    is_grouping_faster.cache_clear()
 
 
 class Wrong(torch.autograd.Function):
@@ -47,7 +47,7 @@ def test_products_that_are_wrong_are_found_out(fault: str, monkeypatch, caplog) 
     monkeypatch.setattr(torch.nn.functional, "grouped_mm", grouped_mm)
     assert not is_right(CPU)
     with caplog.at_level(logging.WARNING):
-        assert not serves(CPU, 4, 16) and not serves(CPU, 4, 16)
+        assert not is_grouping_faster(CPU, 4, 16) and not is_grouping_faster(CPU, 4, 16)
     assert [record.getMessage() for record in caplog.records] == [
         "no grouped products: they are wrong on cpu"
     ]
@@ -60,7 +60,7 @@ def test_a_trial_that_fails_is_said_in_one_line(error, monkeypatch, caplog) -> N
 
     monkeypatch.setattr(torch.nn.functional, "grouped_mm", grouped_mm)
     with caplog.at_level(logging.WARNING):
-        assert not serves(CPU, 4, 16) and not serves(CPU, 4, 16)
+        assert not is_grouping_faster(CPU, 4, 16) and not is_grouping_faster(CPU, 4, 16)
     assert [record.getMessage() for record in caplog.records] == [
         "no grouped products, one for each expert in their place: CUDA out of memory."
     ]
@@ -70,7 +70,7 @@ def test_a_trial_that_fails_is_said_in_one_line(error, monkeypatch, caplog) -> N
 def test_the_faster_of_the_two_is_taken(faster: bool, monkeypatch, caplog) -> None:
     monkeypatch.setattr(grouped_trial, "race", lambda *_: (1e-3, 2e-3) if faster else (2e-3, 1e-3))
     with caplog.at_level(logging.INFO):
-        assert serves(CPU, 4, 16) == faster
+        assert is_grouping_faster(CPU, 4, 16) == faster
     assert "ms a layer grouped" in caplog.text
 
 

@@ -11,7 +11,7 @@ CPU = torch.device("cpu")
 
 
 def test_one_process_decides_alone() -> None:
-    assert not ranks.several() and ranks.is_first()
+    assert not ranks.is_distributed() and ranks.is_first()
     assert ranks.mean(1.5, CPU) == 1.5
     assert ranks.from_first(lambda: {"rays": 3}, CPU) == {"rays": 3}
 

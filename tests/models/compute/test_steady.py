@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from leco_plugin.models.compute.device import fast_precision
-from leco_plugin.models.compute.dispatch import SIZES_PER_OCTAVE, steadied, steady_size
+from leco_plugin.models.compute.dispatch import SIZES_PER_OCTAVE, pad_to_steady_size, steady_size
 from leco_plugin.models.field import FieldConfig, HMoEField
 from leco_plugin.models.gate import Gate, GateConfig
 
@@ -38,7 +38,7 @@ def test_nothing_is_filled_where_nothing_is_compiled(device: str) -> None:
 def test_rows_are_followed_by_zeros() -> None:
     rows = torch.rand(1001, 3)
     with torch.autocast("cpu", dtype=HALF):
-        filled = steadied(rows)
+        filled = pad_to_steady_size(rows)
     assert torch.equal(filled[:1001], rows)
     assert len(filled) > 1001
     assert not filled[1001:].any()

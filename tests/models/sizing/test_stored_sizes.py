@@ -20,8 +20,8 @@ from leco_plugin.models.leco_config import LecoModelConfig
 from leco_plugin.models.sizing.sizes import LARGE, PAPER, SMALL, Sizes, automatic, with_size
 from leco_plugin.models.sizing.stored_sizes import (
     from_stored,
-    going_on,
     sizes_in,
+    sizes_to_resume,
     stored_in,
     to_store,
 )
@@ -138,11 +138,11 @@ def test_a_checkpoint_says_its_sizes(tmp_path: Path) -> None:
 def test_going_on_fills_what_is_open_and_refuses_another_size() -> None:
     stored = to_store(TINY, 3)
     wanted = replace(automatic(TINY), candidates=99)
-    assert going_on(wanted, stored) == replace(TINY, candidates=99)
-    assert going_on(TINY, stored) == TINY
+    assert sizes_to_resume(wanted, stored) == replace(TINY, candidates=99)
+    assert sizes_to_resume(TINY, stored) == TINY
     other = with_size(wanted, "field.encoding.log2_table", 11)
     with pytest.raises(InputError, match=r"log2-table is 11, and the run .* has 8") as caught:
-        going_on(other, stored)
+        sizes_to_resume(other, stored)
     assert "\n" not in str(caught.value)
     with pytest.raises(InputError, match=r"gate\.layers is 3, and the run .* has 1"):
-        going_on(automatic(SMALL), stored)
+        sizes_to_resume(automatic(SMALL), stored)

@@ -9,7 +9,7 @@ from torch import Tensor
 from leco_plugin.models.field import ColorHead
 from leco_plugin.models.rendering import Rays, backdrop_of, with_backdrop
 from leco_plugin.models.switch.field import Answers
-from leco_plugin.models.switch.rendering import coarse_and_fine, kept_by, render
+from leco_plugin.models.switch.rendering import coarse_and_fine, keep_candidates, render
 from leco_plugin.samplers.base import DenseEstimator
 from leco_plugin.space import Space
 
@@ -82,7 +82,7 @@ def test_the_backdrop_gives_its_colour_and_is_nothing_met() -> None:
 
 def test_packed_samples_of_all_candidates_render_what_coarse_and_fine_do() -> None:
     color, rays = ColorHead(3, 8, 1, 0, 1), some_rays()
-    packed = kept_by(DenseEstimator(), rays, 0.02, 0.0, False, None, 1e-4)
+    packed = keep_candidates(DenseEstimator(), rays, 0.02, 0.0, False, None, 1e-4)
     intervals = with_backdrop(packed, rays, 0.02, 0.0)
     places = rays.origins[intervals.ray_indices] + rays.directions[intervals.ray_indices] * (
         0.5 * (intervals.t_starts + intervals.t_ends)
@@ -100,8 +100,8 @@ def test_pruning_leaves_out_what_lies_behind_an_opaque_place() -> None:
     def density_fn(positions: Tensor) -> Tensor:
         return ball(positions / 10.0).sigmas[:, None] / 10.0
 
-    everything = kept_by(DenseEstimator(), rays, 0.05, 0.0, False, None, 1e-4)
-    seen = kept_by(DenseEstimator(), rays, 0.05, 0.0, False, density_fn, 1e-4)
+    everything = keep_candidates(DenseEstimator(), rays, 0.05, 0.0, False, None, 1e-4)
+    seen = keep_candidates(DenseEstimator(), rays, 0.05, 0.0, False, density_fn, 1e-4)
     assert 3.0 < float(seen.t_ends.max()) < 5.0 < float(everything.t_ends.max())
 
 

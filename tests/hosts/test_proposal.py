@@ -18,7 +18,7 @@ from nerfstudio.model_components.losses import distortion_loss, interlevel_loss
 from nerfstudio.model_components.ray_samplers import UniformSampler
 from nerfstudio.model_components.renderers import DepthRenderer
 
-from leco_plugin.samplers.proposal import DenseSampler, LearnedOccupancySampler
+from leco_plugin.hosts.proposal import DenseSampler, LearnedOccupancySampler
 
 NEAR, FAR = 0.5, 4.0
 

@@ -9,19 +9,21 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import torch
+from nerfstudio.cameras.rays import RayBundle, RaySamples
+from nerfstudio.model_components.ray_samplers import (
+    PDFSampler,
+    Sampler,
+    UniformLinDispPiecewiseSampler,
+)
 from torch import Tensor, nn
 
 from leco_plugin.samplers.cells.cache import OccupancyLike
 from leco_plugin.samplers.estimator import LearnedOccupancyEstimator
 
-if TYPE_CHECKING:  # built where a host of nerfstudio is, and nothing else needs it
-    from nerfstudio.cameras.rays import RayBundle, RaySamples
-    from nerfstudio.model_components.ray_samplers import Sampler
-
-Answer = tuple["RaySamples", list[Tensor], list["RaySamples"]]
+Answer = tuple[RaySamples, list[Tensor], list[RaySamples]]
 """The samples, and for each level of proposals the weights of candidates and the candidates."""
 
 
@@ -38,8 +40,6 @@ class _ProposalSampler(nn.Module):
     """
 
     def __init__(self, initial_sampler: Sampler | None, single_jitter: bool, **sizes: int) -> None:
-        from nerfstudio.model_components.ray_samplers import UniformLinDispPiecewiseSampler
-
         super().__init__()
         for name, size in sizes.items():
             if size < 1:
@@ -133,8 +133,6 @@ class LearnedOccupancySampler(_ProposalSampler):
         cache_bytes: int = 1 << 20,
         frame: Tensor | None = None,
     ) -> None:
-        from nerfstudio.model_components.ray_samplers import PDFSampler
-
         super().__init__(
             initial_sampler, single_jitter, num_samples=num_samples, num_candidates=num_candidates
         )

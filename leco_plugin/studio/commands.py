@@ -1,0 +1,95 @@
+"""How nerfstudio's commands end: in one line where the user can act on what happened.
+
+nerfstudio lets exceptions through to Python, which prints a traceback. The methods that it imports
+when a command starts therefore set `sys.excepthook`, in processes of its commands alone.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import sys
+from collections.abc import Iterator
+from itertools import pairwise
+from pathlib import Path
+from types import FrameType, TracebackType
+from typing import Any
+
+from leco_plugin.models.failures import TrainingStopped
+from leco_plugin.scenes.input_error import ANOTHER_VERSION, InputError
+
+PACKAGE = "leco_plugin"
+
+
+def is_ns_command(program: str) -> bool:
+    """Whether a program, `sys.argv[0]`, is a command of nerfstudio.
+
+    It is `ns-train` and the like, or, with `python -m`, a file of `nerfstudio/scripts`.
+    """
+    path = Path(program)
+    folders = path.parts[:-1]
+    return path.name.startswith("ns-") or ("nerfstudio", "scripts") in pairwise(folders)
+
+
+def show_one_line_in_ns_commands() -> None:
+    """In a process of such a command, an uncaught error that a user can act on is its line alone.
+
+    Calling it again changes nothing.
+    """
+    otherwise = sys.excepthook
+    if hasattr(otherwise, "of_leco_plugin") or not any(map(is_ns_command, sys.argv[:1])):
+        return
+
+    def show(kind: type[BaseException], error: BaseException, trace: TracebackType | None) -> None:
+        line = line_of(error)
+        if line is None:
+            otherwise(kind, error, trace)
+        else:
+            print(line, file=sys.stderr)
+
+    show.of_leco_plugin = True  # type: ignore[attr-defined]
+    sys.excepthook = show
+
+
+def line_of(error: BaseException) -> str | None:
+    """What a command says of an error; None where only a traceback explains it."""
+    if isinstance(error, InputError | TrainingStopped):
+        return str(error)
+    frames = list(_frames(error.__traceback__))
+    if not (_names_what_is_gone(error, frames) or _lacks_a_field(error)):
+        return None
+    named = next(filter(None, map(_config_read_in, frames)), None)
+    return f"the run {named} {ANOTHER_VERSION}" if named else None
+
+
+def _frames(trace: TracebackType | None) -> Iterator[FrameType]:
+    """Outermost first."""
+    while trace is not None:
+        yield trace.tb_frame
+        trace = trace.tb_next
+
+
+def _config_read_in(frame: FrameType) -> Path | None:
+    """The config.yml that a function of nerfstudio reads: of `eval_setup`, or of `ns-train`."""
+    path = frame.f_locals.get("config_path")
+    path = path or getattr(frame.f_locals.get("config"), "load_config", None)
+    is_theirs = str(frame.f_globals.get("__file__", "")).endswith(("eval_utils.py", "train.py"))
+    return path if is_theirs and isinstance(path, Path) else None
+
+
+def _names_what_is_gone(error: BaseException, frames: list[FrameType]) -> bool:
+    """Whether yaml failed to make something of this package, but for a library that is missing."""
+    of_yaml = [frame for frame in frames if frame.f_globals.get("__name__") == "yaml.constructor"]
+    made = [frame.f_locals.get("suffix", frame.f_locals.get("name")) for frame in of_yaml]
+    innermost = next((name for name in reversed(made) if isinstance(name, str)), "")
+    missing = str(error).partition("No module named ")[2]
+    library = bool(missing) and not missing.startswith(f"'{PACKAGE}")
+    return f"{innermost}.".startswith(f"{PACKAGE}.") and not library
+
+
+def _lacks_a_field(error: BaseException) -> bool:
+    """Whether a config of this package was read that has not all of today's fields."""
+    held: Any = getattr(error, "obj", None)
+    if not (isinstance(error, AttributeError) and dataclasses.is_dataclass(held)):
+        return False
+    ours = f"{type(held).__module__}.".startswith(f"{PACKAGE}.")
+    return ours and error.name in {field.name for field in dataclasses.fields(held)}

@@ -1,0 +1,142 @@
+"""nerfstudio's commands end in one line where the user can act on what happened."""
+
+from __future__ import annotations
+
+import copy
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import pytest
+import yaml
+from nerfstudio.scripts import train
+from nerfstudio.utils.eval_utils import eval_setup
+
+from leco_plugin.method_configs import leco_occupancy
+from leco_plugin.models.failures import TrainingStopped
+from leco_plugin.scenes.input_error import InputError
+from leco_plugin.studio.commands import is_ns_command, line_of
+
+RAISING = "leco_plugin.scenes.input_error import InputError; import leco_plugin.method_configs\n"
+
+
+def line_from(call: Any, *arguments: Any) -> str | None:
+    """What a command would say of the error that a call ends in."""
+    try:
+        call(*arguments)
+    except Exception as error:  # noqa: BLE001 (whichever it is)
+        return line_of(error)
+    raise AssertionError("nothing was raised")
+
+
+def written(folder: Path, old: str, new: str) -> Path:
+    """The config of a run that some other version has made."""
+    text = yaml.dump(leco_occupancy.config)
+    assert old in text
+    path = folder / "config.yml"
+    path.write_text(text.replace(old, new))
+    return path
+
+
+@pytest.mark.parametrize(
+    ("program", "theirs"),
+    [
+        ("/usr/bin/ns-train", True),
+        ("/lib/site-packages/nerfstudio/scripts/train.py", True),
+        ("/lib/nerfstudio/scripts/viewer/run_viewer.py", True),
+        ("/home/nerfstudio/my/scripts/train.py", False),
+        ("notebook", False),
+        ("", False),
+    ],
+)
+def test_programs_of_nerfstudio_are_known(program: str, theirs: bool) -> None:
+    assert is_ns_command(program) == theirs
+
+
+@pytest.mark.parametrize(
+    ("program", "error", "said"),
+    [
+        ("ns-train", "InputError('a line')", "a line\n"),
+        ("nerfstudio/scripts/train.py", "InputError('a line')", "a line\n"),
+        ("ns-train", "ValueError('a line')", "Traceback"),
+        ("notebook", "InputError('a line')", "Traceback"),
+    ],
+)
+def test_a_command_prints_the_line_alone(
+    program: str, error: str, said: str, tmp_path: Path
+) -> None:
+    script = tmp_path / program
+    script.parent.mkdir(parents=True, exist_ok=True)
+    script.write_text(f"from {RAISING}raise {error}\n")
+    done = subprocess.run([sys.executable, script], capture_output=True, text=True)
+    assert done.returncode == 1
+    assert done.stderr.endswith(said) if said != "Traceback" else said in done.stderr
+    assert ("Traceback" in done.stderr) == (said == "Traceback")
+
+
+def test_a_stopped_run_is_a_runtime_error_and_a_line() -> None:
+    assert issubclass(TrainingStopped, RuntimeError)
+    assert not issubclass(TrainingStopped, SystemExit)
+    assert line_of(TrainingStopped("step 3: a reason")) == "step 3: a reason"
+    assert line_of(InputError("a line")) == "a line"
+
+
+@pytest.mark.parametrize(
+    ("old", "new"),
+    [
+        ("leco_plugin.models.leco_config.Leco", "leco_plugin.models.configs_of_old.Leco"),
+        ("leco_plugin.models.leco_config.Leco", "leco_plugin.gone.leco_config.Leco"),
+        ("leco_plugin.models.leco_config.Leco", "leco_plugin.models.leco_config.Old"),
+        ("name:leco_plugin.models.leco.Leco", "name:leco_plugin.models.leco.Old"),
+    ],
+    ids=["module", "package", "class", "target"],
+)
+def test_a_run_of_another_version_is_one_line(old: str, new: str, tmp_path: Path) -> None:
+    path = written(tmp_path, old, new)
+    said = f"the run {path} is of another version of leco_plugin: train again, or install the "
+    found = line_from(eval_setup, path)
+    assert found is not None and found.startswith(said) and "\n" not in found
+    config = copy.deepcopy(leco_occupancy.config)
+    config.load_config = path
+    assert line_from(train.main, config) == found
+
+
+def test_a_config_that_lacks_a_field_of_today_is_of_another_version(tmp_path: Path) -> None:
+    config = copy.deepcopy(leco_occupancy.config)
+    del config.pipeline.datamanager.__dict__["pixel_sampler"]
+    path = tmp_path / "config.yml"
+    path.write_text(yaml.dump(config))
+
+    def eval_setup_later() -> None:
+        eval_setup(path, update_config_callback=lambda c: c.pipeline.datamanager.pixel_sampler)
+
+    found = line_from(eval_setup_later)
+    assert found is not None and f"{path} is of another version" in found
+
+
+@pytest.mark.parametrize(
+    ("old", "new"),
+    [
+        ("nerfstudio.configs.base_config.ViewerConfig", "nerfstudio.configs.base_config.Old"),
+        ("leco_plugin.models.leco_config.Leco", "leco_plugin.samplers.lacks_a_library.Leco"),
+    ],
+    ids=["nerfstudio's", "a library"],
+)
+def test_what_is_missing_elsewhere_keeps_its_traceback(
+    old: str, new: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "lacks_a_library.py").write_text("import a_library_that_is_not_here\n")
+    from leco_plugin import samplers
+
+    monkeypatch.setattr(samplers, "__path__", [*samplers.__path__, str(tmp_path)])
+    assert line_from(eval_setup, written(tmp_path, old, new)) is None
+
+
+def test_a_module_of_nerfstudio_that_is_run_ends_in_the_line_too(tmp_path: Path) -> None:
+    path = written(tmp_path, "leco_plugin.models.leco_config.Leco", "leco_plugin.gone.Leco")
+    command = [sys.executable, "-m", "nerfstudio.scripts.eval", "--load-config", str(path)]
+    done = subprocess.run(command, capture_output=True, text=True)
+    last = done.stderr.strip().splitlines()[-1]
+    assert done.returncode == 1 and last.startswith(f"the run {path} is of another version")
+    assert "Traceback" not in done.stderr
