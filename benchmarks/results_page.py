@@ -20,6 +20,7 @@ from learning import sentence as learning_sentence
 from page_parts import RESULTS, ROOT, machine_line, made_line, picture, section, table
 from page_pictures import GROWTH, LEARNING, draw_pictures, is_stale, pictures
 from readme_parts import demo_table, readme
+from sharpening import sharpening_sections
 from sizes_sections import sizes_sections
 from stability_page import PAGE as STABILITY_PAGE
 from stability_page import page as stability_page
@@ -170,6 +171,8 @@ def page() -> str:
     parts += answers_section() + chart_sections()
     if (learning := RESULTS / "learning.json").exists():
         parts += learning_section(json.loads(learning.read_text()))
+    if (sharpened := RESULTS / "sharpening.json").exists():
+        parts += sharpening_sections(json.loads(sharpened.read_text()))
     parts += sizes_sections()
     parts += large_scene_sections()
     for sampling in sorted(RESULTS.glob("sampling*.json")):

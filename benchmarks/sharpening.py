@@ -20,6 +20,7 @@ from typing import Any
 import checkout  # noqa: F401
 import torch
 import tyro
+from page_parts import machine_line, made_line, size, table
 from torch import Tensor
 
 from leco_plugin.capacity.evidence import Evidence, gather
@@ -199,6 +200,77 @@ def row_of(run: Path, data: Path) -> dict[str, Any]:
         "at_equal_loss": at_equal_loss(source, source.frozen, gates),
         "seconds": statistics.median(row["seconds"] for row in at_freezing["small"]),
     }
+
+
+def sharpening_sections(report: dict[str, Any]) -> list[str]:
+    """The stored figures as a part of `docs/results.md`."""
+    scenes = report["scenes"].items()
+    guided = table(
+        "scene | field | skipped by the learned gate | by small gates | surface lost on test rays: "
+        "learned gate | small gates | s",
+        [row for scene, found in scenes for row in _guided_rows(scene, found)],
+    )
+    equal = table(
+        "scene | learned gate | small gate | best grid up to 256³, taught alike",
+        [_equal_row(scene, found) for scene, found in scenes],
+    )
+    return [
+        "## Sharpened occupancies\n",
+        "`python benchmarks/sharpening.py RUN=SCENE ...`, of runs of `ns-train leco-occupancy "
+        "--max-num-iterations 700 --pipeline.model.sharpening.steps 0`; "
+        f"{machine_line(report)}. Rows {made_line(report['scenes'].values())}.\n",
+        "The field teaches small gates, each of three on other training rays. Shares are of "
+        "candidates on held-out rays, at the calibrated thresholds; at the end of a run, losses "
+        "are of what the gate kept until then. Seconds are of teaching and calibrating.\n",
+        *guided,
+        f"\nAt {LOST:g} of the surface lost *on test rays*: volume kept of what rays reach, by "
+        "the field at freezing. Grids are as they are or dilated, whichever keeps less.\n",
+        *equal,
+        "",
+    ]
+
+
+def _guided_rows(scene: str, found: dict[str, Any]) -> list[list[str]]:
+    rows = []
+    for key, name in (("at_freezing", "at freezing"), ("at_end", "at the end")):
+        before, small = found[key]["before"], found[key]["small"]
+        skipped = [row["held_out"]["empty_fraction"] for row in small]
+        lost = [row["test"]["lost_surface_mass"] for row in small]
+        rows.append(
+            [
+                scene,
+                name,
+                f"{before['held_out']['empty_fraction']:.1%}",
+                spread(skipped, "{:.1%}"),
+                f"{before['test']['lost_surface_mass']:.1e}",
+                spread(lost, "{:.1e}"),
+                spread([row["seconds"] for row in small], "{:.0f}"),
+            ]
+        )
+    return rows
+
+
+def _equal_row(scene: str, found: dict[str, Any]) -> list[str]:
+    rows = {row["name"]: row for row in found["at_equal_loss"]}
+    small = [row for name, row in rows.items() if name.startswith("small gate")]
+    best = min(
+        (row for name, row in rows.items() if name.startswith("grid")),
+        key=lambda row: row["test"]["volume"],
+    )
+    learned = rows["learned gate"]
+    return [
+        scene,
+        f"{learned['test']['volume']:.1%}, {size(learned['bytes'] / 1e3)}",
+        f"{spread([row['test']['volume'] for row in small], '{:.1%}')}, "
+        f"{size(small[0]['bytes'] / 1e3)}",
+        f"{best['test']['volume']:.1%}, {size(best['bytes'] / 1e3)} ({best['name'][5:]})",
+    ]
+
+
+def spread(values: list[float], form: str) -> str:
+    """Median, least and most."""
+    middle, least, most = statistics.median(values), min(values), max(values)
+    return f"{form.format(middle)} ({form.format(least)} to {form.format(most)})"
 
 
 def main(options: Options) -> None:
