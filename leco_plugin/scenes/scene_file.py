@@ -249,6 +249,7 @@ NEEDLESS = {
     "depth_unit_scale_factor",
     "enable_depth_loading",
     "enable_ray_loading",
+    "geographic_origin",
     "importance_sampling",
     "integer_depth_scale",
     "n_extra_learnable_dims",

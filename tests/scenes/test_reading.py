@@ -323,7 +323,7 @@ def test_a_folder_of_another_reader_names_it(scene: Path, tmp_path: Path) -> Non
         ("coordinates.pt", "mega-nerf"),
         ("opensfm/reconstruction.json", "ns-process-data odm"),
         ("keyframes/one.json", "ns-process-data polycam"),
-        ("one.JPG", "ns-process-data images"),
+        ("one.JPG", "leco poses"),
     ):
         folder = tmp_path / sign.split(".")[0].replace("/", "-") / "data"
         (folder / sign).parent.mkdir(parents=True)
