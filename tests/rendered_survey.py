@@ -91,6 +91,9 @@ def grid(columns: int, rows: int, step: float = 14.0, height: float = 60.0) -> l
     ]
 
 
+PLACES = grid(4, 3)
+
+
 def write_survey(
     folder: Path, places: Sequence[Sequence[float]], seed: int = 0, gps: bool = True
 ) -> list[Path]:

@@ -183,7 +183,11 @@ class Reconstructor:
             options = pycolmap.BundleAdjustmentOptions()
             options.print_summary = False
             options.ceres.solver_options.num_threads = self.threads
-            pycolmap.bundle_adjustment(model, options)
+            moved = pycolmap.BundleAdjustmentConfig()
+            for number in model.reg_image_ids():
+                moved.add_image(number)
+            moved.fix_gauge(pycolmap.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
+            pycolmap.create_default_bundle_adjuster(options, moved, model).solve()
         model.update_point_3d_errors()
 
 

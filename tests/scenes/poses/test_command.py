@@ -15,6 +15,7 @@ from rendered_survey import (
     HEIGHT,
     METRES_A_DEGREE,
     ORIGIN,
+    PLACES,
     WIDTH,
     exif_of,
     grid,
@@ -26,40 +27,7 @@ from leco_plugin.scenes.input_error import InputError
 from leco_plugin.scenes.photographs import LecoPhotographsDataParserConfig, read_ply
 from leco_plugin.scenes.poses.command import make_scene, summary
 
-PLACES = grid(4, 3)
-
-
-@pytest.fixture(scope="module")
-def pycolmap() -> Any:
-    return pytest.importorskip("pycolmap")
-
-
-@pytest.fixture(scope="module")
-def photos(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Twelve photographs: one turned by EXIF, one a grey PNG, one cut to another size."""
-    folder = tmp_path_factory.mktemp("photos")
-    paths = write_survey(folder, PLACES)
-    with Image.open(paths[2]) as image:
-        exif = exif_of(PLACES[2], 4)
-        exif[0x0112] = 8
-        turned = image.rotate(-90, expand=True)
-    turned.save(paths[2], quality=95, exif=exif)
-    with Image.open(paths[5]) as image:
-        image.convert("L").save(paths[5].with_suffix(".png"), exif=exif_of(PLACES[5], 10))
-    paths[5].unlink()
-    with Image.open(paths[7]) as image:
-        cut = image.crop((20, 20, WIDTH - 20, HEIGHT - 20))
-    cut.save(paths[7], quality=95)  # without EXIF, too
-    return folder
-
-
-@pytest.fixture(scope="module")
-def made(pycolmap: Any, photos: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The scene of these photographs, and its report in report.json."""
-    out = tmp_path_factory.mktemp("made") / "scene"
-    asked = ["poses", photos, "--out", out, "--threads", 1, "--json", out.with_suffix(".json")]
-    assert cli.main([str(each) for each in asked]) == 0
-    return out
+pytestmark = pytest.mark.xdist_group("poses")
 
 
 def meta_of(scene: Path) -> dict[str, Any]:
@@ -84,7 +52,8 @@ def test_photographs_of_all_kinds_are_placed_where_they_were_taken(made: Path) -
     east = METRES_A_DEGREE[1] * (origin["longitude"] - ORIGIN[1])
     for number, place in enumerate(PLACES):
         there = found[f"IMG_0{number:03}"] + [east, north, 0.0]
-        np.testing.assert_allclose(there, place, atol=0.3)
+        known = number != 7  # nothing says the focal length of this one
+        np.testing.assert_allclose(there, place, atol=0.3 if known else 1.5)
     report = json.loads((made / "poses.json").read_text())
     assert report == json.loads(made.with_suffix(".json").read_text())
     assert report["placed"] == 12 and report["not_placed"] == []
@@ -181,18 +150,6 @@ def test_of_two_blocks_the_largest_is_written_and_wrong_gps_is_not_used(
     meta = meta_of(out)
     assert not {"metres_per_unit", "geographic_origin"} & {*meta}
     assert min(frame["transform_matrix"][2][2] for frame in meta["frames"]) > 0.9
-
-
-@pytest.mark.slow
-def test_photographs_that_do_not_overlap_end_in_one_line(
-    pycolmap: Any, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    for seed in range(4):
-        write_survey(tmp_path / "photos", [(0.0, 0.0, 40.0)], seed=10 * (seed + 1))
-    out = tmp_path / "out"
-    assert cli.main(["poses", str(tmp_path / "photos"), "--out", str(out), "--threads", "1"]) == 2
-    said = capsys.readouterr().err
-    assert "no three of the 4 photographs were found to overlap: " in said and said.count("\n") == 1
 
 
 def test_a_folder_with_something_else_is_refused_before_any_work(
