@@ -85,7 +85,7 @@ def _take_up(
 
     InputError if the folder holds something else.
     """
-    known = [(each.name, str(each.path), each.path.stat().st_size) for each in photographs]
+    known = [(each.name, each.path.stat().st_size) for each in photographs]
     digest = hashlib.blake2b(json.dumps(known).encode(), digest_size=8).hexdigest()
     wanted = {"format": 1, "photographs": len(photographs), "digest": digest, **asked}
     if out.exists() and (not out.is_dir() or any(out.iterdir())):
