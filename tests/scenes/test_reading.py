@@ -323,7 +323,7 @@ def test_a_folder_of_another_reader_names_it(scene: Path, tmp_path: Path) -> Non
         ("coordinates.pt", "mega-nerf"),
         ("opensfm/reconstruction.json", "ns-process-data odm"),
         ("keyframes/one.json", "ns-process-data polycam"),
-        ("one.JPG", "ns-process-data images"),
+        ("one.JPG", "leco poses"),
     ):
         folder = tmp_path / sign.split(".")[0].replace("/", "-") / "data"
         (folder / sign).parent.mkdir(parents=True)
@@ -499,8 +499,8 @@ def test_a_circle_of_a_frame_is_read(scene: Path) -> None:
             "leco swap nerfacto --codes own -- --data X",
             "`leco swap nerfacto --codes own -- --data SCENE colmap --colmap-path",
         ),
-        ("leco capacity --data X", "`ns-process-data images --data SCENE/images --output-dir"),
-        ("ns-eval --load-config X", "`ns-process-data images --data SCENE/images --output-dir"),
+        ("leco capacity --data X", "`leco poses SCENE/images --out"),
+        ("ns-eval --load-config X", "`leco poses SCENE/images --out"),
     ],
 )
 def test_a_remedy_is_a_command_of_the_one_that_was_typed(
