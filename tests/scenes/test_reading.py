@@ -21,14 +21,13 @@ from nerfstudio.data.dataparsers.nerfstudio_dataparser import Nerfstudio, Nerfst
 from nerfstudio.data.dataparsers.scannetpp_dataparser import ScanNetppDataParserConfig
 from nerfstudio.data.dataparsers.sdfstudio_dataparser import SDFStudioDataParserConfig
 from PIL import Image
-from scene_files import IMAGES_STAY_OPEN, change, described, refused, write_colmap
+from scene_files import change, described, refused, write_colmap
 
 from leco_plugin.scenes.known_folders import remedy_for
 from leco_plugin.scenes.mega_nerf import MegaNerfDataParserConfig
 from leco_plugin.scenes.photographs import LecoPhotographsDataParserConfig
 from leco_plugin.scenes.reading import read_checked
 
-pytestmark = IMAGES_STAY_OPEN
 Edit = Callable[[dict[str, Any]], object]
 
 

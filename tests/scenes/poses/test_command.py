@@ -9,7 +9,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from open_images import OPEN_IMAGES
 from PIL import Image
 from rendered_survey import (
     HEIGHT,
@@ -71,7 +70,6 @@ def test_pictures_are_upright_and_lenses_are_those_of_their_sizes(made: Path) ->
 
 
 @pytest.mark.slow
-@OPEN_IMAGES
 def test_the_scene_is_upright_in_metres_with_points_in_its_coordinates(made: Path) -> None:
     meta = meta_of(made)
     assert meta["metres_per_unit"] == 1.0

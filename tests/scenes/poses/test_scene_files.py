@@ -9,7 +9,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from open_images import OPEN_IMAGES
 from PIL import Image
 
 from leco_plugin.scenes.photographs import LecoPhotographsDataParserConfig, read_ply
@@ -109,7 +108,6 @@ def test_lens_models_of_colmap_have_nerfstudios_names(
     assert intrinsics(camera) == {"w": 8, "h": 6, **wanted}
 
 
-@OPEN_IMAGES
 def test_what_is_written_is_read(tmp_path: Path) -> None:
     for number in range(3):
         (tmp_path / "images").mkdir(exist_ok=True)
