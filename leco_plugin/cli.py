@@ -85,6 +85,37 @@ def city(
     write_json(json, facts)
 
 
+def poses(
+    photos: Annotated[Path, tyro.conf.Positional],
+    out: Path,
+    lens: Literal["perspective", "fisheye"] = "perspective",
+    size: int = 1600,
+    threads: int = 0,
+    json: Path | None = None,
+) -> None:
+    """Find where photographs were taken, and write them as a scene to train on.
+
+    Runs COLMAP on the CPU, by `pip install 'leco_plugin[poses]'`. The scene is upright, and in
+    metres where EXIF has GPS. A run that was killed goes on when the same is asked for again.
+
+    Args:
+        photos: Folder of the photographs, with those below it. They are only read.
+        out: Folder of the scene: copies of the photographs, transforms.json, sparse points, and
+            poses.json, which says which photographs were placed.
+        lens: Kind of all lenses.
+        size: Longest side in pixels at which features are looked for.
+        threads: Of the CPU. 0 takes all.
+        json: Another file for poses.json.
+    """
+    check_json(json)
+    from leco_plugin.scenes.poses.command import make_scene, summary
+
+    report = make_scene(photos, out, lens, size, threads)
+    print("\n".join(summary(report)))
+    print(f"train on it with: ns-train leco-occupancy --data {out}")
+    write_json(json, report)
+
+
 def swap(
     method: Annotated[str, tyro.conf.Positional],
     occupancy: Path | None = None,
@@ -150,7 +181,7 @@ def demo(out: Path = Path("runs/demo"), seconds: float = 130.0, json: Path | Non
 COMMANDS: dict[str, Callable[..., None]] = {
     command.__name__: command
     for command in (
-        *(city, inspect, export, shrink, capacity),
+        *(city, poses, inspect, export, shrink, capacity),
         *(swap, demo, chart, stability, check),
     )
 }

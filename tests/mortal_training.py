@@ -22,6 +22,7 @@ from leco_plugin.learning.freezing import FILE_NAME
 from leco_plugin.models.leco import LecoModel
 from leco_plugin.occupancy import Occupancy
 from leco_plugin.samplers import estimator
+from leco_plugin.studio.commands import show_one_line_in_ns_commands
 from leco_plugin.studio.trainer import AtomicTrainer
 
 FREEZES_AT = 11
@@ -158,4 +159,9 @@ def run(
     if interrupted is not None:
         press_ctrl_c(interrupted)
     sys.argv = ["ns-train", *arguments]
-    ns_train.entrypoint()
+    show_one_line_in_ns_commands()
+    try:
+        ns_train.entrypoint()
+    except Exception:  # noqa: BLE001  as Python itself ends, which a fork does otherwise
+        sys.excepthook(*sys.exc_info())
+        sys.exit(1)

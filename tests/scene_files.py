@@ -14,19 +14,6 @@ from scipy.spatial.transform import Rotation
 
 from leco_plugin.scenes.input_error import InputError
 
-IMAGES_STAY_OPEN = [
-    pytest.mark.filterwarnings("ignore:unclosed file:ResourceWarning"),
-    pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning"),
-]
-"""nerfstudio leaves images open that it has read."""
-
-
-def leaves_images_open(test: Any) -> Any:
-    """The test with `IMAGES_STAY_OPEN`."""
-    for mark in IMAGES_STAY_OPEN:
-        test = mark(test)
-    return test
-
 
 @contextmanager
 def refused(message: str) -> Iterator[pytest.ExceptionInfo[InputError]]:

@@ -15,7 +15,6 @@ import data_parallel_training as processes
 import pytest
 import torch
 from nerfstudio.scripts import train as ns_train
-from open_images import OPEN_IMAGES
 from torch import Tensor
 
 from leco_plugin.host_configs import leco_ngp
@@ -32,7 +31,7 @@ from leco_plugin.space import Space
 from leco_plugin.studio.checkpoints import allow_checkpoint_globals, newest_whole, step_of
 from leco_plugin.studio.processes import DataParallelTrainerConfig
 
-pytestmark = [pytest.mark.slow, pytest.mark.xdist_group("data_parallel"), OPEN_IMAGES]
+pytestmark = pytest.mark.slow, pytest.mark.xdist_group("data_parallel")
 
 STEPS, LEARN = 24, 12
 HEALED_FREEZES_AT = 17

@@ -9,7 +9,6 @@ from typing import Any
 import pytest
 import torch
 from nerfstudio.engine.callbacks import TrainingCallbackLocation as Where
-from open_images import OPEN_IMAGES
 from tiny_run import tiny_config
 
 from leco_plugin.learning import history
@@ -18,8 +17,6 @@ from leco_plugin.learning.merging import MergingConfig
 from leco_plugin.models import mixture
 from leco_plugin.studio.run import drop_missing_parameters
 from leco_plugin.studio.trainer import AtomicTrainer
-
-pytestmark = OPEN_IMAGES
 
 
 def trainer_of(scene: Path, folder: Path, load_from: Path | None = None) -> AtomicTrainer:

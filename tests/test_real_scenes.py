@@ -11,7 +11,6 @@ from typing import Any
 import pytest
 import torch
 from nerfstudio.cameras.rays import RayBundle
-from open_images import OPEN_IMAGES
 from torch import Tensor
 
 from leco_plugin.evaluation.timed_run import run_training
@@ -23,7 +22,7 @@ from leco_plugin.method_configs import leco_occupancy
 from leco_plugin.occupancy import Occupancy
 from leco_plugin.scenes.learning_data import held_out_bundle
 
-pytestmark = [pytest.mark.scenes, pytest.mark.slow, OPEN_IMAGES]
+pytestmark = pytest.mark.scenes, pytest.mark.slow
 
 LEAST = 0.3
 """dB that some 20 steps of 128 rays gain on 512 pixels which are the same before and after: of 23

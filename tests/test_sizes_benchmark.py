@@ -10,7 +10,6 @@ from typing import Any
 import pytest
 import samples
 import sizes_sections
-from open_images import OPEN_IMAGES
 from page_parts import made_line
 from sizes import TABLE, Options, dry, larger, stored_rows, sweep
 from sizes_figures import ahead, bars, points_of, verdict
@@ -242,7 +241,6 @@ def test_a_dry_run_passes_and_is_not_done_twice(
     assert f"0 of {len(report['runs'])} runs to do" in run_script(*command)
 
 
-@OPEN_IMAGES
 def test_less_is_left_of_a_ray_after_each_question(
     known_run: Path, tiny_scene: Path, tmp_path: Path
 ) -> None:
@@ -259,7 +257,6 @@ def test_less_is_left_of_a_ray_after_each_question(
     assert row["psnr_from_the_front"] == pytest.approx(row["psnr"], abs=1e-2)
 
 
-@OPEN_IMAGES
 def test_what_is_kept_is_what_the_occupancy_keeps_of_all_candidates(
     known_run: Path, tiny_scene: Path
 ) -> None:

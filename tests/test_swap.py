@@ -16,7 +16,6 @@ from nerfstudio.data.dataparsers.nerfstudio_dataparser import (
     Nerfstudio,
     NerfstudioDataParserConfig,
 )
-from open_images import OPEN_IMAGES
 from PIL import Image
 
 from leco_plugin.hosts.guided import GuidedModelConfig
@@ -44,7 +43,6 @@ def test_only_sampler_batches_and_trainer_are_others(file: Path) -> None:
     assert guided.occupancy.path == file and guided.occupancy.sampler == "learned-occupancy"
 
 
-@OPEN_IMAGES
 def test_pictures_of_a_swapped_method_are_checked_by_its_own_reader_too(
     file: Path, tiny_scene: Path, tmp_path: Path
 ) -> None:

@@ -12,13 +12,10 @@ import torch
 from nerfstudio.pipelines.base_pipeline import Pipeline
 from nerfstudio.viewer.utils import parse_object
 from nerfstudio.viewer.viewer_elements import ViewerElement
-from open_images import OPEN_IMAGES
 from tiny_run import tiny_trainer
 
 from leco_plugin.models.encodings import EncodingConfig
 from leco_plugin.models.gate import GateConfig
-
-pytestmark = OPEN_IMAGES
 
 GATE = GateConfig(encoding=EncodingConfig(octaves=2), layers=1, width=8)
 

@@ -6,14 +6,7 @@ import json
 from pathlib import Path
 
 import numpy as np
-import pytest
 from PIL import Image
-
-IMAGES_LEFT_OPEN = [
-    pytest.mark.filterwarnings("ignore:unclosed file:ResourceWarning"),
-    pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning"),
-]
-"""Marks of tests in which nerfstudio leaves the images open whose size it has read."""
 
 BALL_CENTRE = np.array([0.0, 0.0, 0.3])
 BALL_RADIUS = 0.3

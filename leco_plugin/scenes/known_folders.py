@@ -30,7 +30,7 @@ CONVERTERS = {
     PICTURES: "images",
     "images": "images",
 }
-"""What lies in a folder, and which of ns-process-data's commands makes a scene of it."""
+"""What lies in a folder, and which of ns-process-data's commands is for it."""
 METHOD = "leco-occupancy"
 """Named where none was typed."""
 
@@ -76,19 +76,20 @@ def _images_option(folder: Path) -> str:
 
 
 def _converter_for(data: Path) -> str | None:
-    """The command of ns-process-data that makes a scene of a folder; None where none is known."""
+    """The command that makes a scene of a folder; None where none is known."""
     if not data.is_dir():
         return None
     for sign, kind in CONVERTERS.items():
         if any(data.glob(sign)):
             source = data / "images" if sign == "images" else data
             command, *options = kind.split()
+            place = next((each for each in COLMAP if (data / each / "cameras.bin").is_file()), None)
+            if command == "images" and place is None:
+                return f"leco poses {shlex.quote(str(source))} --out SCENE"
             given = [command, "--data", shlex.quote(str(source)), *options]
-            for place in COLMAP:
-                if command == "images" and (data / place / "cameras.bin").is_file():
-                    model = shlex.quote(str((data / place).resolve()))
-                    given += ["--skip-colmap", "--colmap-model-path", model]
-                    break
+            if command == "images" and place is not None:
+                model = shlex.quote(str((data / place).resolve()))
+                given += ["--skip-colmap", "--colmap-model-path", model]
             return " ".join(["ns-process-data", *given, "--output-dir", "SCENE"])
     return None
 

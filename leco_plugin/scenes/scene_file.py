@@ -151,7 +151,7 @@ def scene_file_of(config: Any, split: str) -> SceneFile | None:
     if not file.exists():
         beside = sorted(file.parent.glob("transforms_*.json"))
         instead = remedy_for(data) or (
-            "give a folder with one, or make one from photographs with ns-process-data"
+            "give a folder with one, or make one from photographs with leco poses"
         )
         if file.name != "transforms.json" and beside:
             instead = f"give that split one, as a copy of {beside[0].name}"
@@ -249,6 +249,7 @@ NEEDLESS = {
     "depth_unit_scale_factor",
     "enable_depth_loading",
     "enable_ray_loading",
+    "geographic_origin",
     "importance_sampling",
     "integer_depth_scale",
     "n_extra_learnable_dims",

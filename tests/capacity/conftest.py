@@ -11,17 +11,6 @@ from leco_plugin.capacity.sources import Source, find_source
 from leco_plugin.learning import lesson
 from leco_plugin.occupancy import Occupancy
 
-LEFT_OPEN = (
-    "ignore:unclosed file:ResourceWarning",
-    "ignore::pytest.PytestUnraisableExceptionWarning",
-)
-"""nerfstudio leaves an image open."""
-
-
-def pytest_itemcollected(item: pytest.Item) -> None:
-    for warning in LEFT_OPEN:
-        item.add_marker(pytest.mark.filterwarnings(warning))
-
 
 @pytest.fixture(autouse=True)
 def quick(monkeypatch: pytest.MonkeyPatch) -> None:

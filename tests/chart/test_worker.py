@@ -20,11 +20,6 @@ from leco_plugin.chart.suites import SUITES
 from leco_plugin.chart.worker import main, run_job, train_job
 from leco_plugin.evaluation import equal_loss, timed_run
 
-pytestmark = [  # nerfstudio leaves an image open
-    pytest.mark.filterwarnings("ignore:unclosed file:ResourceWarning"),
-    pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning"),
-]
-
 SMALL = {
     "sizes.field.encoding.levels": 2,
     "sizes.field.encoding.log2_table": 8,

@@ -10,7 +10,6 @@ import pytest
 import torch
 from ball_occupancy import ball_of_the_tiny_scene
 from scene_readers import Data, Pipe, started
-from tiny_scene import IMAGES_LEFT_OPEN
 from torch import nn
 
 from leco_plugin.hosts.guide import Guide
@@ -25,7 +24,7 @@ from leco_plugin.scenes.frames import frame_of
 from leco_plugin.scenes.input_error import InputError
 from leco_plugin.scenes.survey import MOST_CAMERAS
 
-pytestmark = [pytest.mark.usefixtures("without_cache"), *IMAGES_LEFT_OPEN]
+pytestmark = pytest.mark.usefixtures("without_cache")
 
 
 def test_an_occupancy_of_another_scene_is_refused_unless_the_run_began_with_it(data: Data) -> None:

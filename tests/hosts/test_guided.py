@@ -21,7 +21,6 @@ from nerfstudio.model_components.renderers import background_color_override_cont
 from nerfstudio.models.base_model import Model
 from nerfstudio.models.instant_ngp import NGPModel
 from small_hosts import SMALL, pipeline_of, small, unswapped
-from tiny_scene import IMAGES_LEFT_OPEN
 from torch import Tensor, nn
 
 from leco_plugin.conformance.hosts import model_arguments
@@ -31,8 +30,6 @@ from leco_plugin.hosts.stand_ins import GuidedEstimator
 from leco_plugin.occupancy import BACKDROP_PRICE
 from leco_plugin.samplers import estimator
 from leco_plugin.swap import with_sampler_swapped
-
-pytestmark = IMAGES_LEFT_OPEN
 
 SUPERFLUOUS = {
     "instant-ngp": ("occupancy_grid.", "sampler.occupancy_grid."),

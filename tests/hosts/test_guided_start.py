@@ -16,7 +16,6 @@ from nerfstudio.engine.callbacks import TrainingCallbackAttributes
 from nerfstudio.model_components.ray_samplers import UniformSampler
 from nerfstudio.pipelines.base_pipeline import VanillaPipelineConfig
 from scene_readers import Data, Pipe, started
-from tiny_scene import IMAGES_LEFT_OPEN
 from torch import Tensor, nn
 
 from leco_plugin.host_configs import leco_ngp
@@ -36,7 +35,7 @@ from leco_plugin.scenes.frames import box_around, frame_of
 from leco_plugin.scenes.input_error import InputError
 from leco_plugin.space import Space
 
-pytestmark = [pytest.mark.usefixtures("without_cache"), *IMAGES_LEFT_OPEN]
+pytestmark = pytest.mark.usefixtures("without_cache")
 
 NAME = "occupancy.safetensors"
 STEP = 0.02

@@ -23,8 +23,6 @@ from leco_plugin.occupancy import Occupancy
 from leco_plugin.scenes.input_error import InputError
 from leco_plugin.scenes.photographs import LecoPhotographsDataParserConfig
 
-pytestmark = tiny_scene.IMAGES_LEFT_OPEN
-
 
 @pytest.fixture(scope="module")
 def pipeline(tmp_path_factory: pytest.TempPathFactory):

@@ -12,7 +12,6 @@ from ball_occupancy import ball_of_the_tiny_scene
 from nerfstudio.data.scene_box import SceneBox
 from nerfstudio.engine.callbacks import TrainingCallbackAttributes, TrainingCallbackLocation
 from small_hosts import pipeline_of, small
-from tiny_scene import IMAGES_LEFT_OPEN
 from torch import nn
 
 from leco_plugin.hosts import first_steps as opaque_start
@@ -22,8 +21,6 @@ from leco_plugin.hosts.stand_ins import GuidedEstimator
 from leco_plugin.models.switch.config import SMALL, SwitchNerfModelConfig
 from leco_plugin.scenes.bounds import SceneBounds
 from leco_plugin.swap import with_sampler_swapped
-
-pytestmark = IMAGES_LEFT_OPEN
 
 
 class Host(nn.Module):

@@ -294,9 +294,6 @@ def test_the_method_survives_yaml() -> None:
     assert config.method_name == "switch-nerf"
 
 
-# nerfstudio leaves the images open whose size it has read
-@pytest.mark.filterwarnings("ignore:unclosed file:ResourceWarning")
-@pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
 @pytest.mark.parametrize("sampling", SAMPLINGS)
 def test_the_method_learns_saves_and_is_evaluated(sampling, tiny_scene: Path, tmp_path) -> None:
     config = copy.deepcopy(switch_nerf.config)

@@ -17,7 +17,7 @@ from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataPars
 from nerfstudio.data.pixel_samplers import PixelSamplerConfig
 from nerfstudio.pipelines.base_pipeline import VanillaPipelineConfig
 from PIL import Image
-from scene_files import IMAGES_STAY_OPEN, change, refused
+from scene_files import change, refused
 
 from leco_plugin.hosts.learn_first import learn_occupancy
 from leco_plugin.learning.calibration import CalibrationConfig
@@ -36,8 +36,6 @@ from leco_plugin.scenes.pixels.known_distances import KnownDistancePixelSamplerC
 from leco_plugin.scenes.pixels.lattice import Lattice, lattice_for
 from leco_plugin.scenes.pixels.stored_pictures import StoredPictures, picture_sizes
 from leco_plugin.scenes.survey import survey
-
-pytestmark = IMAGES_STAY_OPEN
 
 
 def options(scene: Path) -> dict[str, Any]:

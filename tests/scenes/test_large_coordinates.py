@@ -35,7 +35,7 @@ from nerfstudio.data.utils.colmap_parsing_utils import (
     write_images_binary,
     write_points3D_binary,
 )
-from scene_files import IMAGES_STAY_OPEN, change, described, write_colmap, write_ply
+from scene_files import change, described, write_colmap, write_ply
 
 from leco_plugin.scenes.data_manager import LecoDataManagerConfig
 from leco_plugin.scenes.frames import data_frame_of, frame_of, inverse, moved
@@ -43,8 +43,6 @@ from leco_plugin.scenes.mega_nerf import MegaNerfDataParserConfig
 from leco_plugin.scenes.mega_nerf_format.files import Coordinates
 from leco_plugin.scenes.photographs import POINTS, LecoPhotographsDataParserConfig
 from leco_plugin.scenes.survey import points_in, survey
-
-pytestmark = IMAGES_STAY_OPEN
 
 UTM = np.array([500_000.25, 5_200_000.5, 300.0])
 SCALE = 20.0

@@ -16,7 +16,7 @@ import tyro
 from nerfstudio.data.datamanagers.base_datamanager import VanillaDataManagerConfig
 from nerfstudio.data.datasets.base_dataset import InputDataset
 from nerfstudio.plugins.registry_dataparser import DataParserSpecification
-from scene_files import IMAGES_STAY_OPEN, refused, write_ply
+from scene_files import refused, write_ply
 
 from leco_plugin.scenes.bounds import BoundsConfig
 from leco_plugin.scenes.data_manager import LecoDataManagerConfig
@@ -24,8 +24,6 @@ from leco_plugin.scenes.frames import ALTITUDES, METRES_PER_UNIT, between, frame
 from leco_plugin.scenes.mega_nerf import MegaNerfDataParserConfig, mega_nerf_dataparser
 from leco_plugin.scenes.photographs import POINTS
 from leco_plugin.scenes.survey import survey
-
-pytestmark = IMAGES_STAY_OPEN
 
 
 @pytest.fixture(scope="module")

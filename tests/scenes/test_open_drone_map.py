@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 from nerfstudio.process_data.odm_utils import cameras2nerfds
-from scene_files import change, leaves_images_open
+from scene_files import change
 
 from leco_plugin.scenes.city.cameras import look_at
 from leco_plugin.scenes.data_manager import LecoDataManagerConfig
@@ -59,7 +59,6 @@ def scene(tiny_scene: Path, tmp_path: Path) -> Path:
     return out
 
 
-@leaves_images_open
 def test_a_project_is_a_bounded_survey_in_metres(scene: Path) -> None:
     change(scene, lambda meta: meta.update(metres_per_unit=1))
     parser = LecoPhotographsDataParserConfig(data=scene, train_split_fraction=0.7)

@@ -60,8 +60,6 @@ def read(path: Path, size: tuple[int, int] = (24, 16)) -> np.ndarray:
     return seen
 
 
-@pytest.mark.filterwarnings("ignore::ResourceWarning")
-@pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
 @pytest.mark.parametrize("way", WAYS)
 def test_the_same_pixels_are_seen(way: str, tmp_path: Path) -> None:
     image, ending = WAYS[way]
@@ -71,8 +69,6 @@ def test_the_same_pixels_are_seen(way: str, tmp_path: Path) -> None:
     assert (tmp_path / "cache").exists() is (way not in ("grey", "of 0 and 1"))
 
 
-@pytest.mark.filterwarnings("ignore::ResourceWarning")
-@pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
 def test_a_smaller_mask_is_made_of_the_one_of_full_size(tmp_path: Path) -> None:
     for place in ("masks", "masks_3/of_one"):
         (tmp_path / place).mkdir(parents=True)

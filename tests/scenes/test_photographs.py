@@ -12,7 +12,7 @@ import pytest
 import torch
 import trimesh
 from PIL import Image
-from scene_files import IMAGES_STAY_OPEN, change, refused
+from scene_files import change, refused
 
 from leco_plugin.scenes.frames import METRES_PER_UNIT
 from leco_plugin.scenes.photographs import (
@@ -23,8 +23,6 @@ from leco_plugin.scenes.photographs import (
     read_points,
     taken_from_above,
 )
-
-pytestmark = IMAGES_STAY_OPEN
 
 
 def set_pose(value: Any) -> Callable[[dict[str, Any]], None]:

@@ -21,14 +21,13 @@ from nerfstudio.data.dataparsers.nerfstudio_dataparser import Nerfstudio, Nerfst
 from nerfstudio.data.dataparsers.scannetpp_dataparser import ScanNetppDataParserConfig
 from nerfstudio.data.dataparsers.sdfstudio_dataparser import SDFStudioDataParserConfig
 from PIL import Image
-from scene_files import IMAGES_STAY_OPEN, change, described, refused, write_colmap
+from scene_files import change, described, refused, write_colmap
 
 from leco_plugin.scenes.known_folders import remedy_for
 from leco_plugin.scenes.mega_nerf import MegaNerfDataParserConfig
 from leco_plugin.scenes.photographs import LecoPhotographsDataParserConfig
 from leco_plugin.scenes.reading import read_checked
 
-pytestmark = IMAGES_STAY_OPEN
 Edit = Callable[[dict[str, Any]], object]
 
 
@@ -323,7 +322,7 @@ def test_a_folder_of_another_reader_names_it(scene: Path, tmp_path: Path) -> Non
         ("coordinates.pt", "mega-nerf"),
         ("opensfm/reconstruction.json", "ns-process-data odm"),
         ("keyframes/one.json", "ns-process-data polycam"),
-        ("one.JPG", "ns-process-data images"),
+        ("one.JPG", "leco poses"),
     ):
         folder = tmp_path / sign.split(".")[0].replace("/", "-") / "data"
         (folder / sign).parent.mkdir(parents=True)
@@ -499,8 +498,8 @@ def test_a_circle_of_a_frame_is_read(scene: Path) -> None:
             "leco swap nerfacto --codes own -- --data X",
             "`leco swap nerfacto --codes own -- --data SCENE colmap --colmap-path",
         ),
-        ("leco capacity --data X", "`ns-process-data images --data SCENE/images --output-dir"),
-        ("ns-eval --load-config X", "`ns-process-data images --data SCENE/images --output-dir"),
+        ("leco capacity --data X", "`leco poses SCENE/images --out"),
+        ("ns-eval --load-config X", "`leco poses SCENE/images --out"),
     ],
 )
 def test_a_remedy_is_a_command_of_the_one_that_was_typed(

@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 import torch
 from nerfstudio.cameras.cameras import Cameras
-from scene_files import leaves_images_open, refused, write_ply
+from scene_files import refused, write_ply
 from tiny_scene import camera_to_world
 from torch import Tensor
 
@@ -172,7 +172,6 @@ def cities(tmp_path_factory: pytest.TempPathFactory) -> dict[str, SimpleNamespac
     }
 
 
-@leaves_images_open
 def test_one_city_in_two_formats_has_the_same_bounds_in_metres(
     cities: dict[str, SimpleNamespace],
 ) -> None:

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import torch
 from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataParserConfig
-from scene_files import change, described, leaves_images_open, write_ply
+from scene_files import change, described, write_ply
 from torch import Tensor
 
 from leco_plugin.scenes.city.cameras import look_at
@@ -143,7 +143,6 @@ READERS: dict[str, Any] = {
 }
 
 
-@leaves_images_open
 @pytest.mark.parametrize("reader", READERS)
 def test_a_survey_from_structure_from_motion_is_bounded_whatever_reads_it(
     reader: str, colmap_scene: Path
@@ -172,14 +171,12 @@ def _leads_back(outputs: Any, scene: Path) -> None:
         torch.testing.assert_close(turned, camera[:, :3], atol=1e-5, rtol=0)
 
 
-@leaves_images_open
 def test_it_is_left_on_its_side_where_that_is_asked_for(colmap_scene: Path) -> None:
     parser = LecoPhotographsDataParserConfig(data=colmap_scene)
     manager: Any = LecoDataManagerConfig(dataparser=parser, upright=False).setup(device="cpu")
     assert not bool((manager.train_dataset.cameras.camera_to_worlds[:, 2, 2] > 0.9).any())
 
 
-@leaves_images_open
 def test_all_splits_are_turned_by_the_training_cameras(colmap_scene: Path) -> None:
     parser = LecoPhotographsDataParserConfig(data=colmap_scene).setup()
     read = upright_outputs(parser.get_dataparser_outputs)

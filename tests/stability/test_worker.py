@@ -21,12 +21,6 @@ from leco_plugin.stability.stages import YARD
 from leco_plugin.stability.verdict import judge
 from leco_plugin.stability.worker import run_cell
 
-# nerfstudio leaves the images open whose size it has read
-pytestmark = [
-    pytest.mark.filterwarnings("ignore:unclosed file:ResourceWarning"),
-    pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning"),
-]
-
 # where a host samples does not depend on what its field has learned
 MICRO = Sizes(steps=3, rays=64, learn_rays=64, learn_steps=20, dense_samples=24, table=8)
 # steps short enough that no surface lies between two middles and near neither

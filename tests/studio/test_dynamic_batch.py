@@ -13,7 +13,6 @@ import yaml
 from nerfstudio.pipelines.base_pipeline import VanillaPipelineConfig
 from nerfstudio.pipelines.dynamic_batch import DynamicBatchPipeline, DynamicBatchPipelineConfig
 from nerfstudio.utils import writer
-from tiny_scene import IMAGES_LEFT_OPEN
 
 from leco_plugin.host_configs import leco_ngp
 from leco_plugin.models.encodings import EncodingConfig
@@ -27,8 +26,6 @@ from leco_plugin.studio.dynamic_batch import (
     ClampedDynamicBatchPipelineConfig,
     clamped,
 )
-
-pytestmark = IMAGES_LEFT_OPEN
 
 TARGET, MOST_PER_RAY = 2048, 32
 FIRST = TARGET // MOST_PER_RAY

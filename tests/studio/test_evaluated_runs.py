@@ -11,13 +11,10 @@ import pytest
 import torch
 from nerfstudio.utils import eval_utils
 from tiny_run import tiny_trainer
-from tiny_scene import IMAGES_LEFT_OPEN
 
 from leco_plugin.method_configs import leco_occupancy
 from leco_plugin.scenes.input_error import InputError
 from leco_plugin.studio.checkpoints import evaluate_whole_checkpoints, from_whole, previous_of
-
-pytestmark = IMAGES_LEFT_OPEN
 
 
 @pytest.fixture(autouse=True)

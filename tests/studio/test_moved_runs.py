@@ -10,13 +10,10 @@ from typing import Any
 import pytest
 from nerfstudio.utils import eval_utils, writer
 from tiny_run import tiny_trainer
-from tiny_scene import IMAGES_LEFT_OPEN
 
 from leco_plugin.method_configs import leco_occupancy
 from leco_plugin.scenes.input_error import InputError
 from leco_plugin.studio.checkpoints import config_in_use, found_around
-
-pytestmark = IMAGES_LEFT_OPEN
 
 
 @pytest.fixture(scope="module")

@@ -13,7 +13,6 @@ import pytest
 import torch
 import yaml
 from nerfstudio.utils.eval_utils import eval_setup
-from tiny_scene import IMAGES_LEFT_OPEN
 
 from leco_plugin.learning.calibration import CalibrationConfig
 from leco_plugin.learning.schedule import ScheduleConfig
@@ -22,8 +21,6 @@ from leco_plugin.models.sizing.sizes import left_open, with_size
 from leco_plugin.scenes.detail import CAMERAS
 from leco_plugin.scenes.input_error import InputError
 from leco_plugin.studio.run_folder import checkpoint_of
-
-pytestmark = IMAGES_LEFT_OPEN
 
 STEPS = 2
 

@@ -12,7 +12,7 @@ from nerfstudio.cameras.cameras import Cameras
 from nerfstudio.data.dataparsers.base_dataparser import DataparserOutputs
 from nerfstudio.data.datasets.base_dataset import InputDataset
 from PIL import Image
-from scene_files import IMAGES_STAY_OPEN, refused
+from scene_files import refused
 
 from leco_plugin.scenes.pixels.held_out_pixels import (
     HeldOutPixelSampler,
@@ -23,8 +23,6 @@ from leco_plugin.scenes.pixels.lattice import Lattice
 from leco_plugin.scenes.pixels.stored_pictures import store_pictures
 
 SIZES = [(30, 40), (24, 36), (50, 20)]
-
-pytestmark = IMAGES_STAY_OPEN
 
 
 def write(folder: Path, masked: bool = False, channels: int = 3) -> InputDataset:

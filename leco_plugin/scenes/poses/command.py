@@ -1,0 +1,170 @@
+"""`leco poses`: from a folder of photographs to a scene with poses, points and metres."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from leco_plugin.log import bar, resumable
+from leco_plugin.scenes.input_error import InputError, require
+from leco_plugin.scenes.poses.georeference import Placement, local_places, place, upright
+from leco_plugin.scenes.poses.originals import Photograph, copy_photographs, find_photographs
+from leco_plugin.scenes.poses.pairs import choose_pairs
+from leco_plugin.scenes.poses.reconstruction import (
+    Lens,
+    Reconstructor,
+    available_threads,
+    load_pycolmap,
+)
+from leco_plugin.scenes.poses.scene_files import points_of, poses_of, transforms_of, write_scene
+from leco_plugin.scenes.whole_files import remove_parts, write_whole
+
+ASKED, REPORT = "colmap/asked.json", "poses.json"
+"""What was asked for, before the work, and what came of it, in the folder of the scene."""
+NAMED = 5
+"""Photographs that are named in a line; the report names all."""
+
+
+def make_scene(
+    folder: Path, out: Path, lens: Lens = "perspective", size: int = 1600, threads: int = 0
+) -> dict[str, Any]:
+    """Makes a scene of photographs, unless `out` already holds it; returns the report.
+
+    A run that was killed goes on where it ended when the same is asked for again.
+
+    Args:
+        folder: of the photographs, which are only read.
+        out: folder of the scene.
+        lens: kind of all lenses.
+        size: longest side in pixels at which features are looked for.
+        threads: of the CPU; 0 takes all.
+    Raises:
+        InputError: `out` holds something else, or the photographs cannot be used.
+        ImportError: pycolmap is missing.
+    """
+    require(size >= 100, "size", size, "100 pixels or more")
+    require(threads >= 0, "threads", threads, "0 for all, or a number of them")
+    pycolmap = load_pycolmap()
+    out, began = out.absolute(), time.monotonic()
+    photographs = find_photographs(folder.absolute(), out)
+    if finished := _take_up(out, photographs, {"lens": lens, "size": size}):
+        print(f"{out} already holds this scene: nothing is done")
+        return finished
+    with resumable(print):
+        with bar("copying photographs") as show:
+            copy_photographs(photographs, out / "images", show)
+        exifs = [each.exif for each in photographs]
+        origin, places = local_places(pycolmap, [exif.position for exif in exifs])
+        chosen = choose_pairs([each.name for each in photographs], exifs, places)
+        work = Reconstructor(out, photographs, threads or available_threads())
+        work.extract(lens, size)
+        work.match(chosen)
+        models = work.map()
+        work.refine(models[0], lens)
+    gps = {each.name: gps for each, gps in zip(photographs, places)}
+    placement = _put_in_the_world(pycolmap, models[0], gps)
+    sources = {each.name: str(each.path.relative_to(folder.absolute())) for each in photographs}
+    report = _report(models, sources, placement) | {
+        "pairs": len(chosen.pairs),
+        "pairs_by": chosen.reason,
+        "seconds": round(time.monotonic() - began, 1),
+    }
+    write_scene(out, models[0], transforms_of(models[0], placement, origin), report, REPORT)
+    return report
+
+
+def _take_up(
+    out: Path, photographs: list[Photograph], asked: dict[str, Any]
+) -> dict[str, Any] | None:
+    """Begins a scene or goes on with it; returns the report of one that is finished.
+
+    InputError if the folder holds something else.
+    """
+    known = [(each.name, each.path.stat().st_size) for each in photographs]
+    digest = hashlib.blake2b(json.dumps(known).encode(), digest_size=8).hexdigest()
+    wanted = {"format": 1, "photographs": len(photographs), "digest": digest, **asked}
+    if out.exists() and (not out.is_dir() or any(out.iterdir())):
+        if not (out / ASKED).is_file():
+            raise InputError(f"--out {out} holds something else: give another folder")
+        found = json.loads((out / ASKED).read_text())
+        if found != wanted:
+            other = [name for name in wanted if found.get(name) != wanted[name]]
+            what = " and ".join(sorted({"photographs" if n == "digest" else n for n in other}))
+            raise InputError(
+                f"--out {out} was begun with other {what}: give another folder, or delete it"
+            )
+    write_whole(out / ASKED, lambda file: file.write(json.dumps(wanted).encode()))
+    remove_parts(out)
+    if not (out / "transforms.json").is_file():
+        return None
+    report: dict[str, Any] = json.loads((out / REPORT).read_text())
+    return report
+
+
+def _put_in_the_world(pycolmap: Any, model: Any, gps: dict[str, Any]) -> Placement:
+    """Moves a model upright, and to metres where GPS allows it."""
+    names, poses = poses_of(model)
+    up = upright(poses, points_of(model)[0])
+    placement = place(pycolmap, poses[:, :, 3], np.array([gps[name] for name in names]), up)
+    rotation = pycolmap.Rotation3d(placement.turn)
+    model.transform(pycolmap.Sim3d(placement.scale, rotation, placement.shift))
+    return placement
+
+
+def _report(models: list[Any], sources: dict[str, str], placement: Placement) -> dict[str, Any]:
+    """What came of the photographs: JSON values."""
+    blocks = [{sources[name] for name in poses_of(model)[0]} for model in models]
+    lost = sorted({*sources.values()} - blocks[0])
+    residuals = placement.residuals
+    known = [] if residuals is None else residuals[np.isfinite(residuals)]
+    gps: dict[str, Any] = {"used": residuals is not None, "reason": placement.reason}
+    if len(known):
+        gps |= {"photographs": len(known), "median_metres": round(float(np.median(known)), 3)}
+        gps |= {"most_metres": round(float(np.max(known)), 3)}
+    return {
+        "format": 1,
+        "photographs": len(sources),
+        "placed": len(blocks[0]),
+        "not_placed": lost,
+        "other_blocks": [sorted(block - blocks[0]) for block in blocks[1:] if block - blocks[0]],
+        "points": models[0].num_points3D(),
+        "reprojection_error": round(models[0].compute_mean_reprojection_error(), 3),
+        "gps": gps,
+    }
+
+
+def summary(report: dict[str, Any]) -> list[str]:
+    """Lines that say what came of the photographs, and what to do."""
+    count, placed = report["photographs"], report["placed"]
+    lines = [
+        f"{placed} of {count} photographs are placed, with {report['points']} points "
+        f"({report['reprojection_error']:.2f} pixels mean error)"
+    ]
+    if lost := report["not_placed"]:
+        lines.append(f"not placed: {_some(lost)}")
+    if blocks := report["other_blocks"]:
+        lines.append(
+            f"{sum(map(len, blocks))} of these are placed among themselves, and share too little "
+            f"with the rest: {'; '.join(_some(block) for block in blocks[:NAMED])}"
+        )
+    if 2 * placed < count:
+        lines.append("more overlap between neighbours places more photographs")
+    gps = report["gps"]
+    if gps["used"]:
+        lines.append(
+            f"in metres by the GPS of {gps['photographs']} photographs: they are off by "
+            f"{gps['median_metres']:.2f} m (median) and {gps['most_metres']:.2f} m at most"
+        )
+    else:
+        lines.append(f"no metres: {gps['reason']}")
+    return lines
+
+
+def _some(names: list[str]) -> str:
+    more = f" and {len(names) - NAMED} more" if len(names) > NAMED else ""
+    return ", ".join(names[:NAMED]) + more

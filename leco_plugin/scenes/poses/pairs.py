@@ -1,0 +1,103 @@
+"""Which photographs are compared with which: near ones by GPS, next ones in order, or all."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable, Sequence
+from itertools import combinations
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from leco_plugin.scenes.poses.exif import Exif
+
+FEW = 40
+"""Up to so many photographs are all compared: 780 pairs, two minutes of one core."""
+NEIGHBOURS = 16
+"""Nearest photographs by position that each is compared with."""
+WIDE = 20.0
+"""Metres from their middle, root mean square, from which on positions tell who sees the same."""
+NEXT = 10
+"""Photographs in order that each is compared with, and one at each power of two beyond."""
+ANCHORS = 100
+"""Of an ordered survey, so many photographs, evenly spread, are all compared: they close loops."""
+
+
+class Pairs(NamedTuple):
+    """Pairs of photographs that are compared, by number, and why those."""
+
+    pairs: list[tuple[int, int]]
+    reason: str
+
+
+def choose_pairs(names: Sequence[str], exifs: Sequence[Exif], places: NDArray[np.float64]) -> Pairs:
+    """The pairs to compare.
+
+    Args:
+        names: of the photographs, which may count them.
+        exifs: what EXIF says of each.
+        places: [N, 3] metres, nan where EXIF has no position.
+    """
+    count = len(names)
+    everything = list(combinations(range(count), 2))
+    if count <= FEW:
+        return Pairs(everything, "all pairs")
+    order = capture_order(names, exifs)
+    steps = {*range(1, NEXT + 1), *(2**power for power in range(count.bit_length()))}
+    known = np.isfinite(places[:, 0])
+    spread = _spread(places[known, :2]) if known.any() else 0.0
+    if known.mean() >= 0.5 and spread >= WIDE:
+        found = _near(places[:, :2], known) | _in_order(order or [], (1, 2))
+        lost = [number for number in range(count) if not known[number]]
+        around = _in_order(order, steps) if order else set(everything)
+        found |= {pair for pair in around if {*pair} & {*lost}}
+        return Pairs(sorted(found), f"{NEIGHBOURS} nearest by GPS")
+    if order is None or count <= ANCHORS:
+        return Pairs(everything, "all pairs")
+    anchors = order[:: -(-count // ANCHORS)]
+    loops = {(min(pair), max(pair)) for pair in combinations(anchors, 2)}
+    return Pairs(sorted(_in_order(order, steps) | loops), f"{NEXT} next in order, and loops")
+
+
+def capture_order(names: Sequence[str], exifs: Sequence[Exif]) -> list[int] | None:
+    """Numbers of the photographs as they were taken: by EXIF's time, or as names count them.
+
+    None where neither tells.
+    """
+    times = [each.time for each in exifs if each.time is not None]
+    if len(times) == len(names) and 2 * len(set(times)) > len(names):
+        return sorted(range(len(names)), key=lambda number: (exifs[number].time, names[number]))
+    counted = [re.findall(r"\d+", name.rsplit(".", 1)[0]) for name in names]
+    if not all(counted) or len({parts[-1] for parts in counted}) * 2 <= len(names):
+        return None
+    return sorted(range(len(names)), key=lambda number: _by_number(names[number]))
+
+
+def _by_number(name: str) -> list[tuple[int, str]]:
+    """For sorting: digits by their value."""
+    parts = re.split(r"(\d+)", name)
+    return [(int(part), "") if part.isdecimal() else (-1, part) for part in parts]
+
+
+def _spread(places: NDArray[np.float64]) -> float:
+    return float(np.sqrt(((places - np.median(places, axis=0)) ** 2).sum(axis=1).mean()))
+
+
+def _near(places: NDArray[np.float64], known: NDArray[np.bool_]) -> set[tuple[int, int]]:
+    """Pairs of each photograph whose place [N, 2] is known with its nearest ones."""
+    numbers = known.nonzero()[0]
+    there, most = places[numbers], min(NEIGHBOURS + 1, len(numbers))
+    found = set()
+    for row, number in enumerate(numbers):
+        distances = ((there - there[row]) ** 2).sum(axis=1)
+        for other in numbers[np.argsort(distances, kind="stable")[:most]]:
+            if other != number:
+                found.add((int(min(number, other)), int(max(number, other))))
+    return found
+
+
+def _in_order(order: Sequence[int], steps: Iterable[int]) -> set[tuple[int, int]]:
+    """Pairs of photographs that are so many steps apart in an order."""
+    pairs = ((order[at], order[at + step]) for step in steps for at in range(len(order) - step))
+    return {(min(pair), max(pair)) for pair in pairs}

@@ -1,0 +1,196 @@
+"""Structure from motion by pycolmap: features, matches and models, each kept once it is made.
+
+All of it runs on the CPU. The database keeps features and matches, so that a run that was killed
+goes on with what is missing; only the last part, the mapping, begins anew.
+"""
+
+from __future__ import annotations
+
+import os
+import shutil
+from collections.abc import Sequence
+from importlib import import_module
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+
+from leco_plugin.log import bar
+from leco_plugin.scenes.input_error import InputError
+from leco_plugin.scenes.poses.originals import FEWEST, Photograph
+from leco_plugin.scenes.poses.pairs import Pairs
+
+Lens = Literal["perspective", "fisheye"]
+SIMPLE: dict[Lens, str] = {"perspective": "SIMPLE_RADIAL", "fisheye": "SIMPLE_RADIAL_FISHEYE"}
+"""COLMAP's lens models while it maps: one focal length, one coefficient of distortion."""
+FULL: dict[Lens, str] = {"perspective": "OPENCV", "fisheye": "OPENCV_FISHEYE"}
+"""Lens models of lenses with enough photographs, and those that nerfstudio reads."""
+ENOUGH = 20
+"""Photographs from which on a lens gets its full model: fewer would let it bend the scene."""
+CHUNK, PAIRS_A_CHUNK = 4, 100
+"""Photographs and pairs for each thread between two looks at the progress bar."""
+EXTRA = "pip install 'leco_plugin[poses]'"
+
+
+def load_pycolmap() -> Any:
+    """The module pycolmap, quiet. ImportError, in one line, where it is not installed."""
+    try:
+        pycolmap = import_module("pycolmap")
+    except ImportError as error:
+        raise ImportError(f"leco poses needs pycolmap ({error}): {EXTRA}") from None
+    if not hasattr(pycolmap, "match_image_pairs"):  # before version 4
+        raise ImportError(f"this pycolmap is too old for leco poses: {EXTRA}")
+    pycolmap.logging.minloglevel = 3  # what it warns of is counted in the report
+    return pycolmap
+
+
+class Reconstructor:
+    """pycolmap on the photographs of a scene."""
+
+    def __init__(self, scene: Path, photographs: Sequence[Photograph], threads: int) -> None:
+        """With the folder of the scene, whose `images` has all copies."""
+        self.pycolmap = load_pycolmap()
+        self.images, self.folder = scene / "images", scene / "colmap"
+        self.database = self.folder / "database.db"
+        self.photographs, self.threads = photographs, threads
+
+    def extract(self, lens: Lens, size: int) -> None:
+        """Finds features in the photographs that have none in the database.
+
+        Args:
+            lens: kind of all lenses.
+            size: longest side in pixels to which a photograph is made smaller for it.
+        """
+        pycolmap = self.pycolmap
+        self._enter(lens)
+        options = pycolmap.FeatureExtractionOptions()
+        options.max_image_size, options.num_threads, options.use_gpu = size, self.threads, False
+        with pycolmap.Database.open(self.database) as database:
+            done = {
+                image.name
+                for image in database.read_all_images()
+                if database.exists_descriptors(image.image_id)
+            }
+        names = [each.name for each in self.photographs if each.name not in done]
+        chunk, count = CHUNK * self.threads, len(self.photographs)
+        with bar("finding features") as show:
+            for at in range(0, len(names), chunk):
+                pycolmap.extract_features(
+                    self.database,
+                    self.images,
+                    names[at : at + chunk],
+                    extraction_options=options,
+                    device=pycolmap.Device.cpu,
+                )
+                show((count - len(names) + at) / count)
+
+    def _enter(self, lens: Lens) -> None:
+        """Enters photographs and lenses into the database, all or none of them."""
+        pycolmap, whole = self.pycolmap, self.folder / "entered"
+        if whole.exists():
+            return
+        self.database.unlink(missing_ok=True)
+        options = pycolmap.ImageReaderOptions()
+        options.camera_model = SIMPLE[lens]
+        groups: dict[Any, list[Photograph]] = {}
+        for each in self.photographs:
+            groups.setdefault(each.lens, []).append(each)
+        pycolmap.Database.open(self.database).close()
+        for group in groups.values():
+            names = [each.name for each in group]
+            mode = pycolmap.CameraMode.SINGLE
+            pycolmap.import_images(self.database, self.images, mode, names, options)
+        with pycolmap.Database.open(self.database) as database:
+            for each in (group[0] for group in groups.values()):
+                image = database.read_image_with_name(each.name)
+                camera = database.read_camera(image.camera_id)
+                if each.exif.focal is not None:  # pycolmap takes that of the picture as taken
+                    camera.focal_length = each.exif.focal * max(each.size)
+                    camera.has_prior_focal_length = True
+                    database.update_camera(camera)
+        whole.touch()
+
+    def match(self, chosen: Pairs) -> None:
+        """Compares chosen pairs of photographs, those left out that were compared before."""
+        pycolmap = self.pycolmap
+        options = pycolmap.FeatureMatchingOptions()
+        options.num_threads, options.use_gpu = self.threads, False
+        chunk, count = PAIRS_A_CHUNK * self.threads, len(chosen.pairs)
+        pairing = pycolmap.ImportedPairingOptions()
+        pairing.match_list_path = self.folder / "pairs.txt"
+        names = [each.name for each in self.photographs]
+        with bar(f"comparing {count} pairs ({chosen.reason})") as show:
+            for at in range(0, count, chunk):
+                some = chosen.pairs[at : at + chunk]
+                lines = "".join(f"{names[one]} {names[other]}\n" for one, other in some)
+                pairing.match_list_path.write_text(lines)
+                pycolmap.match_image_pairs(
+                    self.database, options, pairing, device=pycolmap.Device.cpu
+                )
+                show(at / count)
+
+    def map(self) -> list[Any]:
+        """COLMAP's models, the one with the most photographs first.
+
+        InputError if no photographs overlap.
+        """
+        pycolmap, folder = self.pycolmap, self.folder / "models"
+        whole = folder / "all"
+        if not whole.exists():
+            shutil.rmtree(folder, ignore_errors=True)  # of a run that was killed
+            folder.mkdir()
+            options = pycolmap.IncrementalPipelineOptions()
+            options.num_threads, options.random_seed = self.threads, 0
+            options.min_model_size = FEWEST
+            placed = 0
+
+            def count(more: int) -> None:
+                nonlocal placed
+                placed += more
+                show(min(1.0, placed / len(self.photographs)))
+
+            with bar("placing photographs") as show:
+                pycolmap.incremental_mapping(
+                    self.database,
+                    self.images,
+                    folder,
+                    options,
+                    initial_image_pair_callback=lambda: count(2),
+                    next_image_callback=lambda: count(1),
+                )
+            whole.touch()
+        paths = [path for path in folder.iterdir() if path.is_dir()]
+        models = [pycolmap.Reconstruction(path) for path in paths]
+        models = [model for model in models if model.num_reg_images() >= FEWEST]
+        if not models:
+            raise InputError(
+                f"no three of the {len(self.photographs)} photographs were found to overlap: "
+                "neighbours should share two thirds of what they show, from different places"
+            )
+        return sorted(models, key=lambda model: (-model.num_reg_images(), -model.num_points3D()))
+
+    def refine(self, model: Any, lens: Lens) -> None:
+        """Gives each lens with enough photographs its full model, and adjusts all once more."""
+        pycolmap = self.pycolmap
+        used = [model.images[number].camera_id for number in model.reg_image_ids()]
+        frequent = [number for number in model.cameras if used.count(number) >= ENOUGH]
+        for number in frequent:
+            camera = model.cameras[number]
+            focal, x, y, distortion = camera.params
+            camera.model = getattr(pycolmap.CameraModelId, FULL[lens])
+            camera.params = np.array([focal, focal, x, y, distortion, 0.0, 0.0, 0.0])
+        if frequent:
+            options = pycolmap.BundleAdjustmentOptions()
+            options.print_summary = False
+            options.ceres.solver_options.num_threads = self.threads
+            moved = pycolmap.BundleAdjustmentConfig()
+            for number in model.reg_image_ids():
+                moved.add_image(number)
+            moved.fix_gauge(pycolmap.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
+            pycolmap.create_default_bundle_adjuster(options, moved, model).solve()
+        model.update_point_3d_errors()
+
+
+def available_threads() -> int:
+    """Processor cores that this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1

@@ -1,0 +1,194 @@
+"""Claims about `leco poses`: from rendered photographs to a scene, and what is said on the way."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from PIL import Image
+from rendered_survey import (
+    HEIGHT,
+    METRES_A_DEGREE,
+    ORIGIN,
+    PLACES,
+    WIDTH,
+    exif_of,
+    grid,
+    write_survey,
+)
+
+from leco_plugin import cli
+from leco_plugin.scenes.input_error import InputError
+from leco_plugin.scenes.photographs import LecoPhotographsDataParserConfig, read_ply
+from leco_plugin.scenes.poses.command import make_scene, summary
+
+pytestmark = pytest.mark.xdist_group("poses")
+
+
+def meta_of(scene: Path) -> dict[str, Any]:
+    found: dict[str, Any] = json.loads((scene / "transforms.json").read_text())
+    return found
+
+
+def places_of(scene: Path) -> dict[str, np.ndarray]:
+    """Where each photograph was taken, by its name without an ending."""
+    return {
+        Path(frame["file_path"]).stem: np.array(frame["transform_matrix"])[:3, 3]
+        for frame in meta_of(scene)["frames"]
+    }
+
+
+@pytest.mark.slow
+def test_photographs_of_all_kinds_are_placed_where_they_were_taken(made: Path) -> None:
+    found = places_of(made)
+    assert len(found) == 12
+    origin = meta_of(made)["geographic_origin"]
+    north = METRES_A_DEGREE[0] * (origin["latitude"] - ORIGIN[0])
+    east = METRES_A_DEGREE[1] * (origin["longitude"] - ORIGIN[1])
+    for number, place in enumerate(PLACES):
+        there = found[f"IMG_0{number:03}"] + [east, north, 0.0]
+        known = number != 7  # nothing says the focal length of this one
+        np.testing.assert_allclose(there, place, atol=0.3 if known else 1.5)
+    report = json.loads((made / "poses.json").read_text())
+    assert report == json.loads(made.with_suffix(".json").read_text())
+    assert report["placed"] == 12 and report["not_placed"] == []
+    assert report["gps"]["photographs"] == 11 and report["gps"]["most_metres"] < 0.3
+
+
+@pytest.mark.slow
+def test_pictures_are_upright_and_lenses_are_those_of_their_sizes(made: Path) -> None:
+    lenses = {Path(frame["file_path"]).stem: frame for frame in meta_of(made)["frames"]}
+    for name, lens in lenses.items():
+        size = (WIDTH - 40, HEIGHT - 40) if name == "IMG_0007" else (WIDTH, HEIGHT)
+        with Image.open(made / lens["file_path"]) as image:
+            assert image.size == (lens["w"], lens["h"]) == size
+        assert lens["fl_x"] == pytest.approx(256.0, rel=0.03)
+
+
+@pytest.mark.slow
+def test_the_scene_is_upright_in_metres_with_points_in_its_coordinates(made: Path) -> None:
+    meta = meta_of(made)
+    assert meta["metres_per_unit"] == 1.0
+    assert meta["geographic_origin"]["latitude"] == pytest.approx(41.5, abs=1e-3)
+    points = read_ply(made / meta["ply_file_path"])
+    heights = points[:, 2]
+    assert float(((heights > -0.5) & (heights < 10.5)).float().mean()) > 0.9
+    outputs = LecoPhotographsDataParserConfig(data=made).setup().get_dataparser_outputs("train")
+    assert bool((outputs.cameras.camera_to_worlds[:, 2, 2] > 0.95).all())
+
+
+@pytest.mark.slow
+def test_colmaps_own_model_has_the_same_coordinates(made: Path, pycolmap: Any) -> None:
+    model = pycolmap.Reconstruction(made / "colmap/sparse/0")
+    found = places_of(made)
+    for image in model.images.values():
+        np.testing.assert_allclose(
+            image.projection_center(), found[Path(image.name).stem], atol=1e-6
+        )
+
+
+@pytest.mark.slow
+def test_a_finished_scene_is_left_as_it_is(
+    made: Path, photos: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    before = (made / "transforms.json").stat().st_mtime_ns
+    assert make_scene(photos, made)["placed"] == 12
+    assert "already holds this scene: nothing is done" in capsys.readouterr().out
+    assert (made / "transforms.json").stat().st_mtime_ns == before
+    with pytest.raises(InputError, match="was begun with other lens and size: give another folder"):
+        make_scene(photos, made, "fisheye", 800)
+
+
+@pytest.mark.slow
+def test_a_run_that_was_killed_goes_on_with_what_is_missing(
+    made: Path, photos: Path, tmp_path: Path, pycolmap: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Of a run that was killed while it mapped: features and matches are not made again."""
+    killed = tmp_path / "killed"
+    shutil.copytree(made, killed)
+    for name in ("transforms.json", "poses.json", "colmap/models/all"):
+        (killed / name).unlink()
+    (killed / "images" / "IMG_0000.jpg").unlink()
+    (killed / "images" / ".IMG_0001.jpg.7-7.part").touch()
+    monkeypatch.setattr(pycolmap, "extract_features", None)
+    matched = pycolmap.Database.open(killed / "colmap/database.db").num_matched_image_pairs()
+    assert make_scene(photos, killed, threads=1)["placed"] == 12
+    assert (
+        pycolmap.Database.open(killed / "colmap/database.db").num_matched_image_pairs() == matched
+    )
+    assert not [*killed.rglob("*.part")]
+
+
+@pytest.mark.slow
+def test_of_two_blocks_the_largest_is_written_and_wrong_gps_is_not_used(
+    pycolmap: Any, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    folder = tmp_path / "blocks"
+    large, small = grid(3, 2), grid(2, 2)
+    write_survey(folder, large, seed=1)
+    write_survey(folder, small, seed=2)
+    order = np.random.default_rng(1).permutation(6)
+    for path, wrong in zip(sorted(folder.glob("IMG_1*")), order):
+        with Image.open(path) as image:
+            image.save(path, quality=95, exif=exif_of(large[wrong]))
+    out = tmp_path / "out"
+    assert cli.main(["poses", str(folder), "--out", str(out), "--threads", "1"]) == 0
+    report = json.loads((out / "poses.json").read_text())
+    others = [f"IMG_2{number:03}.jpg" for number in range(4)]
+    assert report["placed"] == 6 and report["not_placed"] == others
+    assert report["other_blocks"] == [others]
+    said = capsys.readouterr().out
+    assert "6 of 10 photographs are placed" in said
+    assert "4 of these are placed among themselves, and share too little" in said
+    assert "no metres: GPS contradicts the poses: " in said
+    meta = meta_of(out)
+    assert not {"metres_per_unit", "geographic_origin"} & {*meta}
+    assert min(frame["transform_matrix"][2][2] for frame in meta["frames"]) > 0.9
+
+
+def test_a_folder_with_something_else_is_refused_before_any_work(
+    pycolmap: Any, photos: Path, tiny_scene: Path
+) -> None:
+    with pytest.raises(InputError, match="holds something else: give another folder"):
+        make_scene(photos, tiny_scene)
+
+
+def test_without_pycolmap_one_line_says_how_to_install_it(
+    photos: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    monkeypatch.setitem(__import__("sys").modules, "pycolmap", None)
+    assert cli.main(["poses", str(photos), "--out", str(tmp_path / "out")]) == 1
+    said = capsys.readouterr().err
+    assert "pip install 'leco_plugin[poses]'" in said and said.count("\n") == 1
+    assert not (tmp_path / "out").exists()
+
+
+def test_bad_options_are_refused(pycolmap: Any, photos: Path, tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="size is 10; it must be 100 pixels or more"):
+        make_scene(photos, tmp_path / "out", size=10)
+    with pytest.raises(InputError, match="threads is -1"):
+        make_scene(photos, tmp_path / "out", threads=-1)
+    with pytest.raises(InputError, match="there is no folder"):
+        make_scene(tmp_path / "nowhere", tmp_path / "out")
+
+
+def test_the_summary_names_some_and_counts_the_rest() -> None:
+    report = {
+        **{"photographs": 20, "placed": 8, "points": 9, "reprojection_error": 0.5},
+        "not_placed": [f"{number}.jpg" for number in range(12)],
+        "other_blocks": [],
+        "gps": {"used": True, "photographs": 8, "median_metres": 1.234, "most_metres": 5.0},
+    }
+    assert summary(report) == [
+        "8 of 20 photographs are placed, with 9 points (0.50 pixels mean error)",
+        "not placed: 0.jpg, 1.jpg, 2.jpg, 3.jpg, 4.jpg and 7 more",
+        "more overlap between neighbours places more photographs",
+        "in metres by the GPS of 8 photographs: they are off by 1.23 m (median) and 5.00 m at most",
+    ]

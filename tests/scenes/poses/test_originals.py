@@ -1,0 +1,153 @@
+"""Claims about which photographs are used, and what their copies are."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+from rendered_survey import exif_of
+
+from leco_plugin.scenes.input_error import InputError
+from leco_plugin.scenes.poses.originals import copy_photographs, find_photographs
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    """Three small photographs that differ."""
+    made = tmp_path / "photos"
+    made.mkdir()
+    for number in range(3):
+        noise = np.random.default_rng(number).integers(0, 255, (24, 32, 3), dtype=np.uint8)
+        Image.fromarray(noise).save(made / f"IMG_{number}.jpg", exif=exif_of((number, 0.0, 9.0)))
+    return made
+
+
+def copies(folder: Path, out: Path) -> dict[str, Image.Image]:
+    copy_photographs(find_photographs(folder, out), out / "images", lambda share: None)
+    opened = {}
+    for path in (out / "images").iterdir():
+        with Image.open(path) as image:
+            image.load()
+            opened[path.name] = image
+    return opened
+
+
+def test_plain_photographs_are_copied_byte_by_byte(folder: Path, tmp_path: Path) -> None:
+    copies(folder, tmp_path / "out")
+    for path in folder.iterdir():
+        copy = tmp_path / "out" / "images" / path.name
+        assert copy.read_bytes() == path.read_bytes() and not copy.samefile(path)
+
+
+def test_a_turned_photograph_is_copied_upright_with_its_exif(folder: Path, tmp_path: Path) -> None:
+    exif = exif_of((1.0, 2.0, 3.0))
+    exif[0x0112] = 6
+    with Image.open(folder / "IMG_1.jpg") as image:
+        image.rotate(90, expand=True).save(folder / "IMG_3.jpg", quality=95, exif=exif)
+        upright = np.asarray(image, dtype=float)
+    found = {each.path.name: each for each in find_photographs(folder, tmp_path / "out")}
+    assert found["IMG_3.jpg"].size == (32, 24)
+    copy = copies(folder, tmp_path / "out")["IMG_3.jpg"]
+    assert copy.size == (32, 24) and copy.getexif()[0x0112] == 1
+    assert np.abs(np.asarray(copy, dtype=float) - upright).mean() < 20.0
+    again = find_photographs(tmp_path / "out" / "images", tmp_path / "x")
+    assert [each.exif.position for each in again][3] == found["IMG_3.jpg"].exif.position
+
+
+@pytest.mark.parametrize("mode", ["L", "LA", "P", "1", "CMYK"])
+def test_other_colours_become_those_that_nerfstudio_reads(
+    mode: str, folder: Path, tmp_path: Path
+) -> None:
+    for path in [*folder.iterdir()]:
+        with Image.open(path) as image:
+            ending = ".tif" if mode == "CMYK" else ".png"
+            image.convert("L" if mode == "LA" else "RGB").convert(mode).save(
+                path.with_suffix(ending)
+            )
+        path.unlink()
+    assert {image.mode for image in copies(folder, tmp_path / "out").values()} <= (
+        {"RGBA"} if mode == "LA" else {"L", "RGB"}
+    )
+
+
+def test_photographs_of_other_folders_and_names_do_not_collide(
+    folder: Path, tmp_path: Path
+) -> None:
+    for place in ("a/b.jpg", "a_b.jpg", "more of it/IMG 0.JPG"):
+        (folder / place).parent.mkdir(exist_ok=True)
+        (folder / place).write_bytes((folder / "IMG_0.jpg").read_bytes())
+    names = [each.name for each in find_photographs(folder, tmp_path / "out")]
+    assert len({name.lower() for name in names}) == 6
+    assert not any(" " in name or "/" in name for name in names)
+    assert "more_of_it_IMG_0.JPG" in names
+
+
+def test_a_scene_inside_the_folder_is_left_aside(folder: Path) -> None:
+    copies(folder, folder / "scene")
+    assert len(find_photographs(folder, folder / "scene")) == 3
+
+
+def test_photographs_of_one_lens_and_size_share_it(folder: Path, tmp_path: Path) -> None:
+    with Image.open(folder / "IMG_0.jpg") as image:
+        image.crop((0, 0, 20, 20)).save(folder / "IMG_3.jpg")
+    lenses = [each.lens for each in find_photographs(folder, tmp_path / "out")]
+    assert lenses[0] == lenses[1] == lenses[2] != lenses[3]
+
+
+def test_what_cannot_be_used_is_named_with_a_remedy(folder: Path, tmp_path: Path) -> None:
+    def refused(match: str) -> None:
+        with pytest.raises(InputError, match=match) as caught:
+            copies(folder, tmp_path / "out")
+        assert "\n" not in str(caught.value)
+
+    whole = (folder / "IMG_0.jpg").read_bytes()
+    (folder / "IMG_0.jpg").write_bytes(whole[:-100])
+    refused(r"IMG_0.jpg cannot be read .*: is the file whole")
+    (folder / "IMG_0.jpg").write_bytes(b"no image")
+    refused(r"IMG_0.jpg cannot be read as an image: .*save it as JPEG")
+    (folder / "IMG_0.jpg").write_bytes(whole)
+    deep = np.zeros((24, 32), dtype=np.uint16)
+    Image.fromarray(deep).save(folder / "deep.png")
+    refused(r"deep.png .*8 bits a channel")
+    (folder / "deep.png").unlink()
+    Image.new("RGBA", (32, 24)).save(folder / "clear.png")
+    refused(r"1 of 4 photographs have an alpha channel, .*clear.png: give it to all")
+    (folder / "clear.png").unlink()
+    (folder / "IMG_0.jpg").unlink()
+    refused("has 2 photographs, and 3 or more are needed")
+
+
+def test_damaged_exif_is_no_reason_to_refuse(folder: Path, tmp_path: Path) -> None:
+    damaged = b"Exif\0\0MM\0*\0\0\0\x08\xff\xff" + 9 * b"\xfe"
+    with Image.open(folder / "IMG_0.jpg") as image:
+        image.save(folder / "IMG_3.jpg", exif=damaged)
+    found = find_photographs(folder, tmp_path / "out")
+    assert [each.exif.position is None for each in found] == [False, False, False, True]
+
+
+def test_a_folder_of_raw_files_says_what_to_do(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="there is no folder"):
+        find_photographs(tmp_path / "nowhere", tmp_path / "out")
+    (tmp_path / "DJI_0001.DNG").write_bytes(b"raw")
+    with pytest.raises(InputError, match=r"no photographs, .*1 raw files are not read, save them"):
+        find_photographs(tmp_path, tmp_path / "out")
+
+
+def test_heic_without_its_reader_names_the_package(
+    folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (folder / "IMG_9.HEIC").write_bytes(b"....ftypheic")
+    monkeypatch.setitem(__import__("sys").modules, "pillow_heif", None)
+    with pytest.raises(InputError, match=r"1 photographs are HEIC, .*pip install pillow-heif"):
+        find_photographs(folder, tmp_path / "out")
+
+
+def test_heic_is_copied_as_jpeg(folder: Path, tmp_path: Path) -> None:
+    pillow_heif = pytest.importorskip("pillow_heif")
+    pillow_heif.register_heif_opener()
+    with Image.open(folder / "IMG_0.jpg") as image:
+        image.save(folder / "IMG_3.HEIC", exif=image.getexif())
+    copy = copies(folder, tmp_path / "out")["IMG_3.HEIC.jpg"]
+    assert copy.format == "JPEG" and copy.getexif().get_ifd(0x8825)

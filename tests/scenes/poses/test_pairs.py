@@ -1,0 +1,77 @@
+"""Claims about which photographs are compared."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from rendered_survey import grid
+
+from leco_plugin.scenes.poses.exif import Exif
+from leco_plugin.scenes.poses.pairs import (
+    ANCHORS,
+    FEW,
+    NEIGHBOURS,
+    NEXT,
+    capture_order,
+    choose_pairs,
+)
+
+NOWHERE = np.full(3, np.nan)
+
+
+def names(count: int, pattern: str = "IMG_{}.jpg") -> list[str]:
+    return [pattern.format(number) for number in range(count)]
+
+
+def nothing(count: int) -> np.ndarray:
+    return np.tile(NOWHERE, (count, 1))
+
+
+def test_few_photographs_are_all_compared() -> None:
+    found = choose_pairs(names(FEW), [Exif()] * FEW, nothing(FEW))
+    assert len(found.pairs) == FEW * (FEW - 1) // 2
+
+
+def test_near_photographs_are_compared_by_gps_and_far_ones_are_not() -> None:
+    places = np.array(grid(30, 20, step=20.0))
+    found = choose_pairs(names(600), [Exif()] * 600, places)
+    assert found.reason == f"{NEIGHBOURS} nearest by GPS"
+    assert 600 * NEIGHBOURS / 2 <= len(found.pairs) <= 600 * (NEIGHBOURS + 2)
+    assert len({*found.pairs}) == len(found.pairs)
+    by_place = [pair for pair in found.pairs if pair[1] - pair[0] > 2]
+    apart = [float(np.linalg.norm(places[one] - places[other])) for one, other in by_place]
+    assert max(apart) < 120.0
+    assert all(one < other for one, other in found.pairs)
+
+
+def test_photographs_without_gps_are_compared_with_what_is_next_to_them() -> None:
+    places = np.array(grid(20, 10, step=20.0))
+    places[77] = NOWHERE
+    found = choose_pairs(names(200), [Exif()] * 200, places)
+    assert {(76, 77), (77, 78), (67, 77)} <= {*found.pairs}
+    unordered = choose_pairs(["a.jpg"] * 200, [Exif()] * 200, places)
+    assert sum(77 in pair for pair in unordered.pairs) == 199
+
+
+@pytest.mark.parametrize("spread", [0.5, 200.0])
+def test_gps_decides_only_where_it_is_finer_than_the_survey(spread: float) -> None:
+    places = spread * np.random.default_rng(0).normal(size=(90, 3))
+    found = choose_pairs(names(90), [Exif()] * 90, places)
+    assert (found.reason == "all pairs") == (spread < 1.0)
+
+
+def test_an_ordered_survey_without_gps_grows_with_its_length() -> None:
+    count = 2000
+    found = choose_pairs(names(count), [Exif()] * count, nothing(count))
+    assert len(found.pairs) < count * (NEXT + 11) + ANCHORS**2 / 2
+    assert {(0, 1), (5, 15), (5, 5 + 1024), (0, 1980)} <= {*found.pairs}
+    unordered = choose_pairs(["a.jpg"] * 200, [Exif()] * 200, nothing(200))
+    assert len(unordered.pairs) == 200 * 199 // 2
+
+
+def test_time_goes_before_names_and_numbers_count_by_value() -> None:
+    assert capture_order(["IMG_10.jpg", "IMG_9.jpg"], [Exif()] * 2) == [1, 0]
+    timed = [Exif(time=2.0), Exif(time=1.0)]
+    assert capture_order(["IMG_1.jpg", "IMG_2.jpg"], timed) == [1, 0]
+    assert capture_order(["b.jpg", "a.jpg"], [Exif()] * 2) is None
+    assert capture_order(["b7.jpg", "a7.jpg"], [Exif()] * 2) is None
