@@ -191,6 +191,8 @@ def row_of(run: Path, data: Path) -> dict[str, Any]:
     file = occupancy_of(run)
     source = find_source(file, data)
     assert isinstance(source.model, LecoModel) and source.frozen is not None
+    if source.model.mixture.small is not None:
+        raise SystemExit(f"{run} is sharpened already: train with --pipeline.model.sharpening.steps 0")
     at_freezing, gates = taught_by(source, source.frozen, guided=False)
     at_end, _ = taught_by(source, source.model.mixture.eval(), guided=True)
     return {
