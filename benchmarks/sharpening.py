@@ -106,7 +106,7 @@ def taught_by(source: Source, mixture: Mixture, guided: bool) -> tuple[dict[str,
     for seed in range(SEEDS):
         torch.manual_seed(seed)
         taught = draw_training_rays(source, occupancy, SharpeningConfig().rays).rays
-        started = time.monotonic()
+        started = time.process_time()
         found = sharpen(
             mixture,
             taught,
@@ -116,7 +116,7 @@ def taught_by(source: Source, mixture: Mixture, guided: bool) -> tuple[dict[str,
             SharpeningConfig(),
             guided,
         )
-        seconds = time.monotonic() - started
+        seconds = time.process_time() - started
         after = on_rays(mixture, found.gate, found.measured.threshold, tests, guided)
         gates.append(found.gate)
         rows.append(
@@ -192,7 +192,9 @@ def row_of(run: Path, data: Path) -> dict[str, Any]:
     source = find_source(file, data)
     assert isinstance(source.model, LecoModel) and source.frozen is not None
     if source.model.mixture.small is not None:
-        raise SystemExit(f"{run} is sharpened already: train with --pipeline.model.sharpening.steps 0")
+        raise SystemExit(
+            f"{run} is sharpened already: train with --pipeline.model.sharpening.steps 0"
+        )
     at_freezing, gates = taught_by(source, source.frozen, guided=False)
     at_end, _ = taught_by(source, source.model.mixture.eval(), guided=True)
     return {
@@ -223,7 +225,7 @@ def sharpening_sections(report: dict[str, Any]) -> list[str]:
         f"{machine_line(report)}. Rows {made_line(report['scenes'].values())}.\n",
         "The field teaches small gates, each of three on other training rays. Shares are of "
         "candidates on held-out rays, at the calibrated thresholds; at the end of a run, losses "
-        "are of what the gate kept until then. Seconds are of teaching and calibrating.\n",
+        "are of what the gate kept until then. Seconds are of one core, for teaching and calibrating.\n",
         *guided,
         f"\nAt {LOST:g} of the surface lost *on test rays*: volume kept of what rays reach, by "
         "the field at freezing. Grids are as they are or dilated, whichever keeps less.\n",

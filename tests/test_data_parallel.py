@@ -31,7 +31,7 @@ from leco_plugin.space import Space
 from leco_plugin.studio.checkpoints import allow_checkpoint_globals, newest_whole, step_of
 from leco_plugin.studio.processes import DataParallelTrainerConfig
 
-pytestmark = pytest.mark.slow, pytest.mark.xdist_group("data_parallel")
+pytestmark = [pytest.mark.slow, pytest.mark.xdist_group("data_parallel")]
 
 STEPS, LEARN = 24, 12
 HEALED_FREEZES_AT = 17

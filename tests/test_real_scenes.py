@@ -22,7 +22,7 @@ from leco_plugin.method_configs import leco_occupancy
 from leco_plugin.occupancy import Occupancy
 from leco_plugin.scenes.learning_data import held_out_bundle
 
-pytestmark = pytest.mark.scenes, pytest.mark.slow
+pytestmark = [pytest.mark.scenes, pytest.mark.slow]
 
 LEAST = 0.3
 """dB that some 20 steps of 128 rays gain on 512 pixels which are the same before and after: of 23

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from typing import Any
 
 import torch
@@ -96,25 +97,33 @@ def learn_model(
     ).to(pipeline.device)
     model.train()
     trained = averaging(model, model.device)
-    sampler = sampler_here(manager)
-    before = sampler.num_rays_per_batch if sampler is not None else 0
-    if sampler is not None:
-        sampler.set_num_rays_per_batch(rays)
     groups = model.get_param_groups()
     run = LearningOnly(
         [FusedAdamConfig(lr=rate * RATES[name]).setup(p) for name, p in groups.items()], guides
     )
-    learner = model.learner(manager, run)
-    learner.data.rays_per_batch = rays
-    learner.begin()
-    try:
+    with _batches_of(rays, manager):
+        learner = model.learner(manager, run)
+        learner.data.rays_per_batch = rays
+        learner.begin()
         with bar("Learning the occupancy") as show:
             _train(model, trained, learner, seconds, show)
-    finally:
-        if sampler is not None:
-            sampler.set_num_rays_per_batch(before)
     learned: LecoModel = model
     return learned
+
+
+@contextmanager
+def _batches_of(rays: int, manager: Any) -> Iterator[None]:
+    """A data manager's batches have so many rays meanwhile, where it has them drawn here."""
+    sampler = sampler_here(manager)
+    if sampler is None:
+        yield
+        return
+    before = sampler.num_rays_per_batch
+    sampler.set_num_rays_per_batch(rays)
+    try:
+        yield
+    finally:
+        sampler.set_num_rays_per_batch(before)
 
 
 def check_budget(rays: int, seconds: float | None, rate: float) -> None:

@@ -294,10 +294,10 @@ class Mixture(nn.Module):
                 device = self.device
                 self._build(*stored)
                 self.to(device)
-            small = extra["small"]
-            self.small = (
-                None if small is None else Gate(GateConfig.from_dict(small)).to(self.device)
-            )
+            with state_of_this_version():
+                small = extra["small"]
+                gate = None if small is None else Gate(GateConfig.from_dict(small))
+            self.small = None if gate is None else gate.to(self.device)
         super()._load_from_state_dict(state_dict, prefix, *rest)
 
     def set_extra_state(self, state: dict[str, Any]) -> None:
@@ -307,7 +307,7 @@ class Mixture(nn.Module):
             InputError: the state is of another version of this package.
         """
         with state_of_this_version():
-            require_keys(state, (SIZES, "precision", "routing", "report"))
+            require_keys(state, (SIZES, "precision", "routing", "report", "small"))
             self.precision, self.report = state["precision"], dict(state["report"])
             self.routing = Routing(**state["routing"])
         self.gate.requires_grad_(not bool(self.frozen))
