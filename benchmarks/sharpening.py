@@ -116,6 +116,7 @@ def taught_by(source: Source, mixture: Mixture, guided: bool) -> tuple[dict[str,
             SharpeningConfig(),
             guided,
         )
+        assert found is not None
         seconds = time.process_time() - started
         after = on_rays(mixture, found.gate, found.measured.threshold, tests, guided)
         gates.append(found.gate)
@@ -225,7 +226,8 @@ def sharpening_sections(report: dict[str, Any]) -> list[str]:
         f"{machine_line(report)}. Rows {made_line(report['scenes'].values())}.\n",
         "The field teaches small gates, each of three on other training rays. Shares are of "
         "candidates on held-out rays, at the calibrated thresholds; at the end of a run, losses "
-        "are of what the gate kept until then. Seconds are of one core, for teaching and calibrating.\n",
+        "are of what the gate kept until then. Seconds of one core are for teaching and "
+        "calibrating.\n",
         *guided,
         f"\nAt {LOST:g} of the surface lost *on test rays*: volume kept of what rays reach, by "
         "the field at freezing. Grids are as they are or dilated, whichever keeps less.\n",

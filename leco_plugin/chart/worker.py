@@ -111,7 +111,8 @@ def _at_freezing(
         return None
     model: Any = trainer.pipeline.model
     mixture = model.mixture
-    now = _weights_of(mixture)
+    now, small = _weights_of(mixture), mixture.small
+    mixture.small = None
     for name, weights in frozen.items():
         getattr(mixture, name).load_state_dict(weights)
     try:
@@ -122,6 +123,7 @@ def _at_freezing(
     finally:
         for name, weights in now.items():
             getattr(mixture, name).load_state_dict(weights)
+        mixture.small = small
 
 
 def compare_at_freezing(model: Any, datamanager: Any, contender: Contender) -> dict[str, Any]:

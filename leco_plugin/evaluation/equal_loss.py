@@ -26,10 +26,8 @@ from leco_plugin.evaluation.field_grids import (
 from leco_plugin.evaluation.inspection import ViewBox, in_parts, whole_box
 from leco_plugin.learning.calibration import CalibrationConfig
 from leco_plugin.learning.dense import dense_reference, evaluating, in_chunks
-from leco_plugin.models.gate import occupancy_from_logits
 from leco_plugin.models.mixture import Mixture
 from leco_plugin.models.rendering import backdrop_of, mapped_middles
-from leco_plugin.occupancy import gate_precision
 from leco_plugin.scenes.learning_data import held_out_rays
 
 CALIBRATION = CalibrationConfig()
@@ -114,7 +112,7 @@ def at_equal_loss(
         taught = candidates_of(mixture, rays_of_photographs(datamanager, TAUGHT_RAYS))
         volume = reached_volume(mixture, taught, VOLUME_POINTS)
         kept_by = partial(_kept_by, weights)
-        kept = kept_by(occupancies, in_parts(partial(_occupancy, mixture), volume))
+        kept = kept_by(occupancies, in_parts(mixture.occupancies, volume))
         beside = {
             name: kept_by(in_parts(score, mapped), in_parts(score, volume))
             for name, score in (others or {}).items()
@@ -193,11 +191,6 @@ def _measured(
         pieces.append((places[before], weights[before], found.occupancies[before]))
     places, weights, occupancies = (torch.cat(parts) for parts in zip(*pieces))
     return places, weights, occupancies
-
-
-def _occupancy(mixture: Mixture, mapped: Tensor) -> Tensor:
-    with gate_precision(mixture.device.type, mixture.precision):
-        return occupancy_from_logits(mixture.gate(mapped))
 
 
 def mapped_box(mixture: Mixture) -> ViewBox:

@@ -148,10 +148,8 @@ def _set_up(config: TrainerConfig, budget: Budget, seed: int) -> Trainer:
     config = copy.deepcopy(config)
     config.machine.seed = seed
     config.max_num_iterations = budget.steps or ENDLESS
-    model: Any = config.pipeline.model
-    if budget.steps is None and hasattr(model, "sharpening"):
-        # whether it pays follows from the steps that are left, which nobody knows
-        model.sharpening = replace(model.sharpening, steps=0)
+    if budget.steps is None:
+        _never_sharpen(config.pipeline.model)
     config.vis = "tensorboard"
     config.steps_per_save = config.steps_per_eval_image = config.steps_per_eval_batch = 0
     config.steps_per_eval_all_images = 0
@@ -165,6 +163,18 @@ def _set_up(config: TrainerConfig, budget: Budget, seed: int) -> Trainer:
     trainer.setup()
     warm_up(trainer.device)
     return trainer
+
+
+def _never_sharpen(model: Any) -> None:
+    """Whether sharpening pays follows from the steps that are left, which nobody knows here.
+
+    Args:
+        model: config of a model that learns an occupancy itself, or of one that is guided, or of
+            neither; it is changed.
+    """
+    learner = getattr(getattr(model, "occupancy", None), "learning", model)
+    if hasattr(learner, "sharpening"):
+        learner.sharpening = replace(learner.sharpening, steps=0)
 
 
 class _Course:

@@ -87,7 +87,7 @@ class HeldOut:
 
     def sharpened(
         self, losses: GateLossConfig, config: SharpeningConfig, guided: bool
-    ) -> Sharpened:
+    ) -> Sharpened | None:
         """A small gate that training pixels teach and these calibrate; see `sharpen`."""
         taught = self.data.training_rays(self.mixture, config.rays)
         rays = self.rays(self.config.rays)

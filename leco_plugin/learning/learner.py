@@ -177,8 +177,10 @@ class Learner:
             return
         if bool(self.mixture.frozen):
             self._watch(step, seconds, kept)
-            if self.config.sharpening.steps > 0 and step + 1 >= self.run.end:
-                self._sharpen(step, step - self.mixture.report["step"], guided=True)
+            if step + 1 >= self.run.end and bool(self.mixture.frozen):
+                last, _ = self.mixture.report.get("sharpened", [[0, 0.0]])[-1]
+                began = max(last, self.mixture.report["step"])
+                self._sharpen(step, step - began, guided=True)
         else:
             self.progress.learn_seconds += seconds
             self._after_learning_step(step)
@@ -294,10 +296,15 @@ class Learner:
         mixture, config, started = self.mixture, self.config, time.monotonic()
         if config.sharpening.steps == 0 or steps < config.sharpening.least_steps:
             return
+        kind = config.sharpening.gate.encoding.kind
+        if mixture.gate.config.encoding.kind != kind:
+            return  # samplers are made for the kind that was asked for
         found = from_first(
             lambda: self.held_out.sharpened(config.gate_loss, config.sharpening, guided),
             mixture.device,
         )
+        if found is None:
+            return
         seconds = time.monotonic() - started
         say(
             f"step {step}: a gate of {found.params:,} values, taught in {seconds:.0f} s, "

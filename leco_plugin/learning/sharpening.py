@@ -8,6 +8,7 @@ guides from then on where it skips more. The large gate goes on routing.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
@@ -35,6 +36,8 @@ from leco_plugin.scenes.input_error import require
 
 LOSSES = ("lost_surface_mass", "lost_mass", "image_price_db")
 """What a report says that skipping costs."""
+ERRORS = ("surface_error", "price_error_db")
+"""Standard errors of those."""
 
 
 @dataclass(frozen=True)
@@ -73,7 +76,7 @@ class Sharpened(NamedTuple):
 
     @property
     def pays(self) -> bool:
-        """Whether it skips more."""
+        """Whether it skips more, within the same bounds."""
         return self.measured.empty_fraction > self.before.empty_fraction
 
     @property
@@ -98,7 +101,9 @@ class Sharpened(NamedTuple):
         found = self.measured._asdict()
         if guided:
             for name in LOSSES:
-                found[name] += max(0.0, float(before[name]))
+                found[name] = max(0.0, found[name]) + max(0.0, float(before[name]))
+            for name in ERRORS:
+                found[name] = math.hypot(found[name], float(before.get(name, 0.0)))
         kept = {name: before[name] for name in ("threshold", "params", "empty_fraction", *LOSSES)}
         return {
             "learned": {"gate": learned.to_dict(), **kept},
@@ -116,8 +121,9 @@ def sharpen(
     calibration: CalibrationConfig,
     config: SharpeningConfig,
     guided: bool,
-) -> Sharpened:
+) -> Sharpened | None:
     """Teaches a small gate by a frozen mixture's field, and calibrates it; changes nothing.
+    None where no ray has a candidate to teach with.
 
     Args:
         taught: training rays, cut to the region.
@@ -130,6 +136,8 @@ def sharpen(
     at_once = calibration.rays_at_once
     with evaluating(mixture):
         lesson = lesson_by(mixture, taught, losses, 1.0 if guided else config.seen, at_once)
+        if not len(lesson.mapped):
+            return None
         gate = teach(config.gate, lesson, config.steps, mixture.precision)
         round_weights(gate)
         rays, truth = held_out

@@ -11,7 +11,9 @@ import torch
 from torch import nn
 
 from leco_plugin.evaluation.clock import Budget
-from leco_plugin.evaluation.timed_run import TimedRun, _Course
+from leco_plugin.evaluation.timed_run import TimedRun, _Course, _never_sharpen
+from leco_plugin.hosts.guided_start import OccupancyConfig
+from leco_plugin.models.leco_config import LecoModelConfig
 
 RATE = 0.01
 
@@ -59,3 +61,11 @@ def test_rates_of_a_model_that_goes_on_with_what_it_learned_decay_over_all_of_it
     course.begun(50)
     assert course.run.learn_seconds == pytest.approx(40.0, abs=1.0)
     assert rate_at(course, group, 50.0, 51) == pytest.approx(RATE * 0.1**0.5)
+
+
+def test_whoever_learns_an_occupancy_is_not_sharpened_in_a_time() -> None:
+    own, guided = LecoModelConfig(), SimpleNamespace(occupancy=OccupancyConfig())
+    for model in (own, guided, SimpleNamespace()):
+        _never_sharpen(model)
+    assert own.sharpening.steps == guided.occupancy.learning.sharpening.steps == 0
+    assert LecoModelConfig().sharpening.steps > 0

@@ -50,13 +50,13 @@ def test_it_is_frozen_and_calibrated_and_the_batch_is_as_before(pipeline):
 def test_the_gate_is_sharpened_where_it_guides_enough_steps(
     pipeline, guides: float, sharpened: bool, monkeypatch: pytest.MonkeyPatch
 ):
-    no_gain = Measured(0.5, 0.0, 0.0, 0.0, 0.5)
-    found = Sharpened(Gate(GateConfig()), no_gain, no_gain)
-    asked: list[object] = []
-    monkeypatch.setattr(HeldOut, "sharpened", lambda *_: asked.append(_) or found)
+    less, more = (Measured(0.5, 0.0, 0.0, 0.0, skipped) for skipped in (0.5, 0.6))
+    small = Gate(GateConfig(width=8, scene_experts=1))
+    monkeypatch.setattr(HeldOut, "sharpened", lambda *_: Sharpened(small, more, less))
     options = replace(config(8), sharpening=SharpeningConfig(least_steps=30))
-    learn_occupancy(options, pipeline, rays=64, guides=guides)
-    assert bool(asked) == sharpened
+    occupancy = learn_occupancy(options, pipeline, rays=64, guides=guides)
+    assert (occupancy.gate.config == small.config) == sharpened
+    assert (occupancy.report["empty_fraction"] == 0.6) == sharpened
 
 
 def test_a_budget_sets_the_number_of_steps(pipeline, monkeypatch: pytest.MonkeyPatch):

@@ -15,6 +15,7 @@ from leco_plugin.learning import sharpening
 from leco_plugin.learning.calibration import CalibrationConfig, Measured
 from leco_plugin.learning.dense import dense_rendering
 from leco_plugin.learning.history import as_learned
+from leco_plugin.learning.lesson import Lesson
 from leco_plugin.learning.sharpening import (
     Sharpened,
     SharpeningConfig,
@@ -192,6 +193,62 @@ def test_it_is_sharpened_at_the_end_of_a_run_that_pays_for_it(
 
 
 NEVER_AGAIN = CalibrationConfig(recheck_rays=0)
+
+
+def test_a_gate_that_learns_again_at_the_last_step_is_not_sharpened() -> None:
+    mixture, run = a_mixture(), ARun(end=21)
+    options = SharpeningConfig(steps=5, least_steps=10, rays=50, gate=GATE)
+    learner = small_learner(run, mixture, Pixels(mixture), sharpening=options)
+    learner._watch = lambda *_: mixture.reopen()  # type: ignore[method-assign]
+    learner.after_step(20, 0.1, 0.0)
+    assert mixture.small is None and not bool(mixture.frozen)
+
+
+def test_steps_that_pay_are_counted_from_the_last_time() -> None:
+    mixture, run = a_mixture(), ARun(end=31)
+    options = SharpeningConfig(steps=5, least_steps=20, rays=50, gate=GATE)
+    mixture.report["sharpened"] = [[15, 1.0]]
+    learner = small_learner(
+        run, mixture, Pixels(mixture), sharpening=options, calibration=NEVER_AGAIN
+    )
+    learner.after_step(30, 0.1, 5.0)
+    assert mixture.small is None and len(mixture.report["sharpened"]) == 1
+
+
+def test_a_gate_of_a_kind_that_was_asked_for_stays() -> None:
+    mixture, run = a_mixture(), ARun(end=31)
+    hash_gate = GateConfig(EncodingConfig("hash", levels=2, log2_table=6), 8, 1, 1)
+    options = SharpeningConfig(steps=5, least_steps=10, rays=50, gate=hash_gate)
+    learner = small_learner(
+        run, mixture, Pixels(mixture), sharpening=options, calibration=NEVER_AGAIN
+    )
+    learner.after_step(30, 0.1, 5.0)
+    assert mixture.small is None
+
+
+def test_prices_of_guided_sharpening_are_sums_of_costs() -> None:
+    before = Measured(0.5, 1e-4, 1e-4, 0.03, 0.6, 3e-5, 0.003)
+    found = Measured(0.4, 2e-4, 2e-4, -0.05, 0.7, 4e-5, 0.004)
+    report = Sharpened(Gate(GATE), found, before).report(
+        {"params": 7, **before._asdict()}, SMALLEST.gate, guided=True
+    )
+    assert report["image_price_db"] == 0.03 and report["price_error_db"] == pytest.approx(0.005)
+    assert report["lost_surface_mass"] == pytest.approx(3e-4)
+    assert report["surface_error"] == pytest.approx(5e-5)
+
+
+def test_without_a_position_to_teach_with_nothing_is_sharpened(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    empty = Lesson(torch.empty(0, 3), torch.empty(0), torch.empty(0))
+    monkeypatch.setattr(sharpening, "lesson_by", lambda *_: empty)
+    mixture, run = a_mixture(), ARun(end=31)
+    options = SharpeningConfig(steps=5, least_steps=10, rays=50, gate=GATE)
+    learner = small_learner(
+        run, mixture, Pixels(mixture), sharpening=options, calibration=NEVER_AGAIN
+    )
+    learner.after_step(30, 0.1, 5.0)
+    assert mixture.small is None
 
 
 def test_what_does_not_pay_changes_nothing() -> None:

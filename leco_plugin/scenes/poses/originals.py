@@ -9,7 +9,6 @@ from __future__ import annotations
 import re
 import shutil
 import warnings
-from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -67,6 +66,8 @@ def find_photographs(folder: Path, out: Path) -> list[Photograph]:
     """
     if not folder.is_dir():
         raise InputError(f"there is no folder {folder}: give the one with the photographs")
+    if folder.is_relative_to(out):
+        raise InputError(f"--out {out} holds the photographs: give a folder beside them")
     files = [path for path in sorted(folder.rglob("*")) if path.is_file()]
     files = [path for path in files if not path.is_relative_to(out) and path.name[0] != "."]
     found = [path for path in files if path.suffix.lower() in KINDS]
@@ -78,9 +79,11 @@ def find_photographs(folder: Path, out: Path) -> list[Photograph]:
     _allow_heic([path for path in found if path.suffix.lower() in HEIC])
     photographs = [_read(path, folder) for path in found]
     _refuse_mixed_alpha(photographs)
-    named = Counter(photograph.name.lower() for photograph in photographs)
+    if len({photograph.name.lower() for photograph in photographs}) == len(photographs):
+        return photographs
+    digits = len(str(len(photographs)))
     return [
-        each if named[each.name.lower()] == 1 else replace(each, name=f"{number}_{each.name}")
+        replace(each, name=f"{number:0{digits}}_{each.name}")
         for number, each in enumerate(photographs)
     ]
 

@@ -35,6 +35,7 @@ EXTRA = "pip install 'leco_plugin[poses]'"
 def load_pycolmap() -> Any:
     """The module pycolmap, quiet. ImportError, in one line, where it is not installed."""
     try:
+        import_module("PIL.Image")  # after pycolmap, its PNG writer was seen to abort
         pycolmap = import_module("pycolmap")
     except ImportError as error:
         raise ImportError(f"leco poses needs pycolmap ({error}): {EXTRA}") from None

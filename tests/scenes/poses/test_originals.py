@@ -81,7 +81,20 @@ def test_photographs_of_other_folders_and_names_do_not_collide(
     names = [each.name for each in find_photographs(folder, tmp_path / "out")]
     assert len({name.lower() for name in names}) == 6
     assert not any(" " in name or "/" in name for name in names)
-    assert "more_of_it_IMG_0.JPG" in names
+    assert sum(name.endswith("more_of_it_IMG_0.JPG") for name in names) == 1
+
+
+def test_a_number_that_tells_two_apart_is_nobody_elses_name(tmp_path: Path) -> None:
+    for number, name in enumerate(("1_x_y.jpg", "x y.jpg", "x_y.jpg")):
+        Image.new("RGB", (20, 20), (60 * number, 0, 0)).save(tmp_path / name)
+    names = [each.name for each in find_photographs(tmp_path, tmp_path / "out")]
+    assert len(set(names)) == 3
+
+
+def test_a_scene_that_would_hold_the_photographs_is_refused(folder: Path) -> None:
+    for out in (folder, folder.parent):
+        with pytest.raises(InputError, match="holds the photographs"):
+            find_photographs(folder, out)
 
 
 def test_a_scene_inside_the_folder_is_left_aside(folder: Path) -> None:
