@@ -12,26 +12,18 @@ import math
 import statistics
 from collections.abc import Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 from unittest.mock import patch
 
 import checkout  # noqa: F401
 import torch
-import tyro
+from measured_runs import main
 from timing import ratio, time_interleaved
 
 from leco_plugin.capacity.sources import find_source
 from leco_plugin.cli_reports import occupancy_of
 from leco_plugin.evaluation.queries import count_queries
-from leco_plugin.evaluation.report import (
-    describe_code,
-    describe_machine,
-    made_by,
-    read_object,
-    write_json,
-)
 from leco_plugin.models.leco import LecoModel
 from leco_plugin.samplers import marching
 from leco_plugin.samplers.estimator import LearnedOccupancyEstimator
@@ -40,16 +32,6 @@ from leco_plugin.studio.host_models import true_colours
 IMAGES = 4
 """Test photographs, evenly chosen."""
 ROUNDS = 3
-
-
-@dataclass
-class Options:
-    """Settings of the benchmark."""
-
-    runs: tyro.conf.Positional[tuple[str, ...]]
-    """Folders of runs and their scenes, as RUN=SCENE."""
-    out: Path = Path(__file__).parent / "results" / "samples.json"
-    """Where the figures go; rows of scenes that are not named stay."""
 
 
 @contextmanager
@@ -148,19 +130,5 @@ def row_of(run: Path, data: Path) -> dict[str, Any]:
     }
 
 
-def main(options: Options) -> None:
-    """Measures the runs that are named, one after the other."""
-    known = read_object(options.out, "is damaged; delete it") if options.out.exists() else {}
-    rows: dict[str, Any] = known.get("scenes", {})
-    code = describe_code()
-    for pair in options.runs:
-        run, _, data = pair.partition("=")
-        if not data:
-            raise SystemExit(f"{pair} is not RUN=SCENE")
-        rows[Path(data).name] = {**row_of(Path(run), Path(data)), **made_by(code)}
-        print(Path(data).name, rows[Path(data).name], flush=True)
-        write_json(options.out, {"format": 1, "machine": describe_machine(), "scenes": rows})
-
-
 if __name__ == "__main__":
-    main(tyro.cli(Options))
+    main(row_of, "samples")

@@ -13,13 +13,13 @@ from __future__ import annotations
 import statistics
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import checkout  # noqa: F401
 import torch
-import tyro
+from measured_runs import main
 from page_parts import machine_line, made_line, size, table
 from torch import Tensor
 
@@ -33,23 +33,17 @@ from leco_plugin.capacity.sources import (
     draw_training_rays,
     find_source,
 )
+from leco_plugin.chart.table import spread
 from leco_plugin.cli_reports import occupancy_of
 from leco_plugin.evaluation.equal_loss import kept_shares, mapped_box, reached_volume
 from leco_plugin.evaluation.field_grids import dilate, look_up_scores
 from leco_plugin.evaluation.inspection import in_parts
-from leco_plugin.evaluation.report import (
-    describe_code,
-    describe_machine,
-    made_by,
-    read_object,
-    write_json,
-)
 from leco_plugin.learning.calibration import Measured, measure
 from leco_plugin.learning.dense import in_chunks
 from leco_plugin.learning.lesson import Lesson
 from leco_plugin.learning.sharpening import (
     SharpeningConfig,
-    answers,
+    asked_by,
     lesson_by,
     seen_rendering,
     sharpen,
@@ -57,7 +51,6 @@ from leco_plugin.learning.sharpening import (
 from leco_plugin.models.gate import Gate
 from leco_plugin.models.leco import LecoModel
 from leco_plugin.models.mixture import Mixture
-from leco_plugin.occupancy import gate_precision
 from leco_plugin.scenes.learning_data import on_black
 
 SEEDS = 3
@@ -66,16 +59,6 @@ LOST = 1e-3
 """Share of the surface mass at which volumes are compared."""
 RAYS, PLACES = 8192, 1 << 17
 SHOWN = ("threshold", "empty_fraction", "lost_surface_mass", "image_price_db")
-
-
-@dataclass
-class Options:
-    """Settings of the benchmark."""
-
-    runs: tyro.conf.Positional[tuple[str, ...]]
-    """Folders of runs and their scenes, as RUN=SCENE."""
-    out: Path = Path(__file__).parent / "results" / "sharpening.json"
-    """Where the figures go; rows of scenes that are not named stay."""
 
 
 def shown(measured: Measured) -> dict[str, float]:
@@ -87,11 +70,8 @@ def on_rays(mixture: Mixture, gate: Gate, threshold: float, seen: Seen, guided: 
     """What a gate skips and loses along some rays, of what is rendered as prices are."""
     truth = on_black(seen.truth)
     rendering = seen_rendering(mixture, seen.rays, truth, 1.0 if guided else 0.0, 1024)
-    asked = [
-        reference._replace(occupancies=answers(mixture, gate, chunk, reference.intervals))
-        for chunk, reference in zip(in_chunks(seen.rays, 1024), rendering.references)
-    ]
-    return measure(asked, *rendering[1:], threshold)
+    asked = asked_by(mixture, gate, in_chunks(seen.rays, 1024), rendering)
+    return measure(*asked, threshold)
 
 
 def taught_by(source: Source, mixture: Mixture, guided: bool) -> tuple[dict[str, Any], list[Gate]]:
@@ -131,17 +111,6 @@ def taught_by(source: Source, mixture: Mixture, guided: bool) -> tuple[dict[str,
     }, gates
 
 
-def gate_score(mixture: Mixture, gate: Gate) -> Callable[[Tensor], Tensor]:
-    """o(x) of mapped positions."""
-
-    @torch.no_grad()
-    def score(mapped: Tensor) -> Tensor:
-        with gate_precision(mapped.device.type, mixture.precision):
-            return gate.occupancy(mapped)
-
-    return score
-
-
 def grid_score(
     mixture: Mixture, lesson: Lesson, cells: int, dilated: bool
 ) -> Callable[[Tensor], Tensor]:
@@ -167,10 +136,12 @@ def at_equal_loss(source: Source, mixture: Mixture, gates: list[Gate]) -> list[d
         "test": gather(mixture, None, tests)[0],
     }
     places = reached_volume(mixture, lesson.mapped, PLACES, seed=5)
-    rivals = {"learned gate": (2 * occupancy.num_params, gate_score(mixture, mixture.gate))}
+    rivals = {
+        "learned gate": (2 * occupancy.num_params, partial(mixture.occupancies, gate=mixture.gate))
+    }
     for seed, gate in enumerate(gates):
         size = 2 * sum(p.numel() for p in gate.parameters())
-        rivals[f"small gate, seed {seed}"] = (size, gate_score(mixture, gate))
+        rivals[f"small gate, seed {seed}"] = (size, partial(mixture.occupancies, gate=gate))
     for n in GRIDS:
         for dilated in (False, True):
             name = f"grid {n}^3{', dilated' if dilated else ''}"
@@ -247,10 +218,10 @@ def _guided_rows(scene: str, found: dict[str, Any]) -> list[list[str]]:
                 scene,
                 name,
                 f"{before['held_out']['empty_fraction']:.1%}",
-                spread(skipped, "{:.1%}"),
+                spread(skipped, ".1%"),
                 f"{before['test']['lost_surface_mass']:.1e}",
-                spread(lost, "{:.1e}"),
-                spread([row["seconds"] for row in small], "{:.0f}"),
+                spread(lost, ".1e"),
+                spread([row["seconds"] for row in small], ".0f"),
             ]
         )
     return rows
@@ -267,30 +238,11 @@ def _equal_row(scene: str, found: dict[str, Any]) -> list[str]:
     return [
         scene,
         f"{learned['test']['volume']:.1%}, {size(learned['bytes'] / 1e3)}",
-        f"{spread([row['test']['volume'] for row in small], '{:.1%}')}, "
+        f"{spread([row['test']['volume'] for row in small], '.1%')}, "
         f"{size(small[0]['bytes'] / 1e3)}",
         f"{best['test']['volume']:.1%}, {size(best['bytes'] / 1e3)} ({best['name'][5:]})",
     ]
 
 
-def spread(values: list[float], form: str) -> str:
-    """Median, least and most."""
-    middle, least, most = statistics.median(values), min(values), max(values)
-    return f"{form.format(middle)} ({form.format(least)} to {form.format(most)})"
-
-
-def main(options: Options) -> None:
-    """Measures the runs that are named, one after the other."""
-    known = read_object(options.out, "is damaged; delete it") if options.out.exists() else {}
-    rows: dict[str, Any] = known.get("scenes", {})
-    code = describe_code()
-    for pair in options.runs:
-        run, _, data = pair.partition("=")
-        if not data:
-            raise SystemExit(f"{pair} is not RUN=SCENE")
-        rows[Path(data).name] = {**row_of(Path(run), Path(data)), **made_by(code)}
-        write_json(options.out, {"format": 1, "machine": describe_machine(), "scenes": rows})
-
-
 if __name__ == "__main__":
-    main(tyro.cli(Options))
+    main(row_of, "sharpening")

@@ -7,6 +7,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import measured_runs
 import pytest
 import samples
 import sizes_sections
@@ -245,7 +246,7 @@ def test_less_is_left_of_a_ray_after_each_question(
     known_run: Path, tiny_scene: Path, tmp_path: Path
 ) -> None:
     out = tmp_path / "samples.json"
-    samples.main(samples.Options((f"{known_run}={tiny_scene}",), out))
+    measured_runs.main(samples.row_of, "samples", [f"{known_run}={tiny_scene}", "--out", str(out)])
     ((scene, row),) = json.loads(out.read_text())["scenes"].items()
     assert scene == tiny_scene.name and row["code"]["version"]
     # a ray's last run of 16 is asked whole
@@ -280,7 +281,9 @@ def test_what_is_kept_is_what_the_occupancy_keeps_of_all_candidates(
 
 def test_a_scene_without_its_run_is_named(tmp_path: Path) -> None:
     with pytest.raises(SystemExit, match="is not RUN=SCENE"):
-        samples.main(samples.Options(("runs/city",), tmp_path / "samples.json"))
+        measured_runs.main(
+            samples.row_of, "samples", ["runs/city", "--out", str(tmp_path / "samples.json")]
+        )
 
 
 def test_the_table_of_samples_has_a_row_a_scene() -> None:

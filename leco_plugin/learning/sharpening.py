@@ -31,7 +31,6 @@ from leco_plugin.models.losses import widen
 from leco_plugin.models.mixture import Mixture
 from leco_plugin.models.objective import GateLossConfig
 from leco_plugin.models.rendering import Intervals, Rays, Shaded, backdrop_of, mapped_middles
-from leco_plugin.occupancy import gate_precision
 from leco_plugin.scenes.input_error import require
 
 LOSSES = ("lost_surface_mass", "lost_mass", "image_price_db")
@@ -143,11 +142,8 @@ def sharpen(
         rays, truth = held_out
         rendering = seen_rendering(mixture, rays, truth, 1.0 if guided else 0.0, at_once)
         before = measure(*rendering, float(mixture.threshold))
-        asked = [
-            reference._replace(occupancies=answers(mixture, gate, chunk, reference.intervals))
-            for chunk, reference in zip(in_chunks(rays, at_once), rendering.references)
-        ]
-        measured = calibrate(asked, *rendering[1:], calibration)
+        asked = asked_by(mixture, gate, in_chunks(rays, at_once), rendering)
+        measured = calibrate(*asked, calibration)
     return Sharpened(gate, measured, before)
 
 
@@ -209,9 +205,16 @@ def _rendered(mixture: Mixture, rays: Rays, seen: float) -> tuple[Reference, Ten
     return Reference(intervals, weights, occupancies, surface, small.rgb, is_backdrop), mapped
 
 
-@torch.no_grad()
-def answers(mixture: Mixture, gate: Gate, rays: Rays, intervals: Intervals) -> Tensor:
-    """What a gate says of packed intervals: o(x), [M]."""
-    mapped = mapped_middles(mixture.region.space, rays, intervals)
-    with gate_precision(mapped.device.type, mixture.precision):
-        return gate.occupancy(mapped)
+def asked_by(
+    mixture: Mixture, gate: Gate, chunks: list[Rays], rendering: DenseRendering
+) -> DenseRendering:
+    """The same rendering of rays, with what another gate says of their candidates."""
+    places = (
+        mapped_middles(mixture.region.space, rays, reference.intervals)
+        for rays, reference in zip(chunks, rendering.references, strict=True)
+    )
+    references = [
+        reference._replace(occupancies=mixture.occupancies(mapped, gate))
+        for reference, mapped in zip(rendering.references, places)
+    ]
+    return rendering._replace(references=references)

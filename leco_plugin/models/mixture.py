@@ -98,10 +98,11 @@ class Mixture(nn.Module):
         return bool(self.frozen) and float(self.threshold) > 0.0
 
     @torch.no_grad()
-    def occupancies(self, mapped: Tensor) -> Tensor:
-        """o(x) by the gate that skips: mapped positions [M, 3] in [-1, 1] to [M]."""
+    def occupancies(self, mapped: Tensor, gate: Gate | None = None) -> Tensor:
+        """o(x) by the gate that skips, or by another one: mapped positions [M, 3] in [-1, 1] to
+        [M]."""
         with gate_precision(self.device.type, self.precision):
-            return (self.small or self.gate).occupancy(mapped)
+            return (gate or self.small or self.gate).occupancy(mapped)
 
     def set_bounds(self, bounds: SceneBounds, median_length: float) -> None:
         """Fixes the region and the marches.

@@ -20,6 +20,15 @@ from torch import Tensor
 from leco_plugin.scenes.input_error import InputError
 
 
+def rotation(turn: NDArray[np.floating]) -> NDArray[np.float64]:
+    """The matrix [3, 3] of a turn around an axis [3] by its length in radians (Rodrigues)."""
+    angle = float(np.linalg.norm(turn))
+    x, y, z = turn / max(angle, 1e-12)
+    cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+    matrix = np.eye(3) + np.sin(angle) * cross + (1.0 - np.cos(angle)) * cross @ cross
+    return np.asarray(matrix)
+
+
 def frame_of(datamanager: Any) -> list[list[float]] | None:
     """What took the scene's coordinates to the model's: [3, 4], JSON values; None is not known.
 

@@ -24,6 +24,7 @@ from PIL import Image
 
 from leco_plugin.scenes.city.cameras import Lens, look_at
 from leco_plugin.scenes.city.folder import POINTS, TRANSFORMS
+from leco_plugin.scenes.frames import rotation
 from leco_plugin.scenes.input_error import InputError
 from leco_plugin.scenes.whole_files import write_points
 from leco_plugin.stability.scene import Array, Stage, photograph
@@ -146,15 +147,6 @@ def _pose(capture: Capture, random: Generator, number: int) -> Array:
 
 def _shift(pose: Array, by: Sequence[float] | Array) -> Array:
     return np.column_stack([pose[:, :3], pose[:, 3] + np.array(by)])
-
-
-def rotation(turn: Array) -> Array:
-    """The matrix [3, 3] of a turn around an axis [3] by its length in radians (Rodrigues)."""
-    angle = float(np.linalg.norm(turn))
-    x, y, z = turn / max(angle, 1e-12)
-    cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
-    matrix: Array = np.eye(3) + np.sin(angle) * cross + (1.0 - np.cos(angle)) * cross @ cross
-    return matrix
 
 
 class View(NamedTuple):

@@ -164,6 +164,14 @@ class Pixels:
         return 0.0
 
 
+def end_a_run(mixture: Mixture, options: SharpeningConfig) -> None:
+    """The last step, number 30, of a run whose gate was frozen at step 3."""
+    learner = small_learner(
+        ARun(end=31), mixture, Pixels(mixture), sharpening=options, calibration=NEVER_AGAIN
+    )
+    learner.after_step(30, 0.1, 5.0)
+
+
 @pytest.mark.parametrize(("guided_steps", "sharpened"), [(10, True), (9, False)])
 def test_it_is_sharpened_at_the_end_of_a_run_that_pays_for_it(
     tmp_path: Path, guided_steps: int, sharpened: bool
@@ -205,24 +213,18 @@ def test_a_gate_that_learns_again_at_the_last_step_is_not_sharpened() -> None:
 
 
 def test_steps_that_pay_are_counted_from_the_last_time() -> None:
-    mixture, run = a_mixture(), ARun(end=31)
+    mixture = a_mixture()
     options = SharpeningConfig(steps=5, least_steps=20, rays=50, gate=GATE)
     mixture.report["sharpened"] = [[15, 1.0]]
-    learner = small_learner(
-        run, mixture, Pixels(mixture), sharpening=options, calibration=NEVER_AGAIN
-    )
-    learner.after_step(30, 0.1, 5.0)
+    end_a_run(mixture, options)
     assert mixture.small is None and len(mixture.report["sharpened"]) == 1
 
 
 def test_a_gate_of_a_kind_that_was_asked_for_stays() -> None:
-    mixture, run = a_mixture(), ARun(end=31)
+    mixture = a_mixture()
     hash_gate = GateConfig(EncodingConfig("hash", levels=2, log2_table=6), 8, 1, 1)
     options = SharpeningConfig(steps=5, least_steps=10, rays=50, gate=hash_gate)
-    learner = small_learner(
-        run, mixture, Pixels(mixture), sharpening=options, calibration=NEVER_AGAIN
-    )
-    learner.after_step(30, 0.1, 5.0)
+    end_a_run(mixture, options)
     assert mixture.small is None
 
 
@@ -242,12 +244,9 @@ def test_without_a_position_to_teach_with_nothing_is_sharpened(
 ) -> None:
     empty = Lesson(torch.empty(0, 3), torch.empty(0), torch.empty(0))
     monkeypatch.setattr(sharpening, "lesson_by", lambda *_: empty)
-    mixture, run = a_mixture(), ARun(end=31)
+    mixture = a_mixture()
     options = SharpeningConfig(steps=5, least_steps=10, rays=50, gate=GATE)
-    learner = small_learner(
-        run, mixture, Pixels(mixture), sharpening=options, calibration=NEVER_AGAIN
-    )
-    learner.after_step(30, 0.1, 5.0)
+    end_a_run(mixture, options)
     assert mixture.small is None
 
 

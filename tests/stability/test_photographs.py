@@ -11,7 +11,7 @@ import pytest
 from PIL import Image
 
 from leco_plugin.scenes.city.cameras import Lens, look_at
-from leco_plugin.scenes.frames import distance_from_rotations
+from leco_plugin.scenes.frames import distance_from_rotations, rotation
 from leco_plugin.scenes.photographs import check_scene, read_points
 from leco_plugin.stability.photographs import (
     TRUTH,
@@ -20,7 +20,6 @@ from leco_plugin.stability.photographs import (
     View,
     count_views,
     digest_of,
-    rotation,
     shots_of,
     write_scene,
 )

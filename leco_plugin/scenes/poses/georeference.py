@@ -10,6 +10,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from leco_plugin.scenes.frames import rotation
 from leco_plugin.scenes.upright import turn_to_upright
 
 Array = NDArray[np.float64]
@@ -143,7 +144,7 @@ def roll_upright(turn: Array, places: Array, up: Array, width: float) -> Array:
     if min(np.linalg.norm(wanted), np.linalg.norm(is_up)) < WANDERING:
         return turn
     angle = np.arctan2(line @ np.cross(is_up, wanted), is_up @ wanted)
-    return _about(line, float(angle)) @ turn
+    return rotation(angle * line) @ turn
 
 
 def _by_direction(up: Array, reason: str) -> Placement:
@@ -151,11 +152,4 @@ def _by_direction(up: Array, reason: str) -> Placement:
     axis = np.cross(up, [0.0, 0.0, 1.0])
     angle = np.arctan2(np.linalg.norm(axis), up[2])
     axis = axis / np.linalg.norm(axis) if np.linalg.norm(axis) > 1e-9 else np.eye(3)[0]
-    return Placement(1.0, _about(axis, float(angle)), np.zeros(3), reason=reason)
-
-
-def _about(axis: Array, angle: float) -> Array:
-    """The rotation [3, 3] about a unit axis [3], by Rodrigues' formula."""
-    x, y, z = axis
-    cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
-    return np.eye(3) + np.sin(angle) * cross + (1.0 - np.cos(angle)) * cross @ cross
+    return Placement(1.0, rotation(angle * axis), np.zeros(3), reason=reason)
