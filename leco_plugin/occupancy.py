@@ -18,10 +18,15 @@ from torch import Tensor, nn
 from leco_plugin.models.frozen_gate import occupancy_of
 from leco_plugin.models.gate import Gate, GateConfig, check_sizes
 from leco_plugin.samplers.kernels import fused
+from leco_plugin.seen import SeenSpace, cells_from_bytes
 from leco_plugin.space import NO_WALL, Space
 
 FORMAT = "leco-occupancy"
-VERSION = 1
+VERSION, WITHOUT_SEEN = "2", "1"
+"""Of files. One without the tensor `seen`, where all space counts as seen, is of version 1, and any
+release reads it."""
+SEEN, SEEN_CELLS = "seen", "seen.cells"
+"""Names of that tensor in a file, and of what it holds in a module."""
 LARGEST_FILE = 64 * 2**20
 """Bytes; a thousand times a usual gate. A larger file is another thing by mistake."""
 
@@ -49,6 +54,7 @@ class Occupancy(nn.Module):
         report: what was measured when it was calibrated, JSON values only.
         walls: [6] min and max corner of the box in which the gate was taught. No ray reached what
             lies outside: it is empty. None is no walls.
+        seen: the space that training rays cross. The rest is empty. None is all space.
     """
 
     threshold_value: Tensor
@@ -62,6 +68,7 @@ class Occupancy(nn.Module):
         precision: Precision = "float32",
         report: dict[str, Any] | None = None,
         walls: Tensor | None = None,
+        seen: SeenSpace | None = None,
     ) -> None:
         super().__init__()
         self.gate = gate
@@ -69,6 +76,7 @@ class Occupancy(nn.Module):
         self.precision: Precision = precision
         self.report = dict(report or {})
         self.register_buffer("threshold_value", torch.tensor(float(threshold)))
+        self.seen = SeenSpace() if seen is None else seen
         everywhere = torch.tensor([-NO_WALL] * 3 + [NO_WALL] * 3)
         self.register_buffer("walls", everywhere if walls is None else walls.detach().clone())
 
@@ -88,7 +96,7 @@ class Occupancy(nn.Module):
         if not 0.0 <= threshold <= 1.0:
             raise ValueError(f"a threshold is in [0, 1], not {threshold}")
         said = self.report if report is None else report
-        given = (self.gate, self.space, threshold, self.precision, said, self.walls)
+        given = (self.gate, self.space, threshold, self.precision, said, self.walls, self.seen)
         return Occupancy(*given).to(self.walls.device).train(self.training)
 
     def shows_a_backdrop(self) -> bool:
@@ -105,8 +113,8 @@ class Occupancy(nn.Module):
         Args:
             positions: [N, 3] of any floating type, scene units, on the module's device.
         Returns:
-            [N] float32 in [0, 1]; 0 outside a bounded space or the walls, and where a position is
-            not finite.
+            [N] float32 in [0, 1]; 0 outside a bounded space or the walls, in space that no training
+            ray crosses, and where a position is not finite.
         Raises:
             ValueError: positions are of another shape.
         """
@@ -124,7 +132,7 @@ class Occupancy(nn.Module):
         else:
             with gate_precision(mapped.device.type, self.precision):
                 values = self.gate.occupancy(mapped)
-        return values * inside
+        return values.mul_(inside).mul_(self.seen(mapped))
 
     def occupied(self, positions: Tensor) -> Tensor:
         """Whether scene positions [N, 3] are kept: bool [N]; errors as of `query`.
@@ -153,14 +161,17 @@ class Occupancy(nn.Module):
         path = Path(path)
         header = {
             "format": FORMAT,
-            "version": str(VERSION),
+            "version": WITHOUT_SEEN if self.seen.everywhere else VERSION,
             "gate": json.dumps(self.gate.config.to_dict()),
             "precision": self.precision,
             "report": json.dumps(self.report),
         }
         state = self.state_dict()
+        del state[SEEN_CELLS]
         tensors = {name: _shorten(name, value) for name, value in state.items()}
         _check_values(path, tensors)
+        if not self.seen.everywhere:
+            tensors[SEEN] = self.seen.to_bytes()
         header["sha256"] = _digest(header, tensors)
         unfinished = path.with_name(f".{path.name}.{os.getpid()}.unfinished")
         try:
@@ -206,9 +217,14 @@ class Occupancy(nn.Module):
     def _checked(cls, path: Path, header: dict[str, str], tensors: dict[str, Tensor]) -> Occupancy:
         if header.get("format") != FORMAT:
             raise ValueError(f"{path} is a safetensors file, but not an occupancy of leco_plugin")
-        if header.get("version") != str(VERSION):
-            version = header.get("version")
-            raise ValueError(f"{path} has format version {version!r}; this reads {VERSION}")
+        version = header.get("version")
+        if version not in (WITHOUT_SEEN, VERSION):
+            raise ValueError(
+                f"{path} has format version {version!r}; this reads {WITHOUT_SEEN} and {VERSION}"
+            )
+        seen = tensors.pop(SEEN, None)
+        if (seen is None) != (version == WITHOUT_SEEN):
+            raise ValueError(f"{path} of version {version} and the tensor {SEEN!r} do not fit")
         precision = header.get("precision")
         if precision not in get_args(Precision):
             raise ValueError(f"{path} names an unknown precision {precision!r}")
@@ -226,11 +242,19 @@ class Occupancy(nn.Module):
                     f"the header asks for {expected.get(name)}"
                 )
         _check_values(path, tensors)
-        if header.get("sha256") != _digest(header, tensors):
+        try:
+            cells = None if seen is None else cells_from_bytes(seen)
+        except ValueError as error:
+            raise ValueError(f"{path}: tensor {SEEN!r} is damaged: {_line(error)}") from None
+        if header.get("sha256") != _digest(
+            header, tensors if seen is None else tensors | {SEEN: seen}
+        ):
             raise ValueError(f"{path} is damaged: its contents do not match its checksum")
         report = report if isinstance(report, dict) else {}
         occupancy = cls(Gate(config), Space(), 0.0, cast(Precision, precision), report).float()
-        occupancy.load_state_dict(tensors)
+        occupancy.load_state_dict(tensors)  # which without cells leaves all space seen
+        if cells is not None:
+            occupancy.seen.cells.copy_(cells)
         return occupancy.requires_grad_(False).eval()
 
 
@@ -310,7 +334,9 @@ def _expected_shapes(config: GateConfig) -> dict[str, _Described]:
     check_sizes(config)
     with torch.device("meta"):
         module = Occupancy(Gate(config), Space(), 0.0).float()  # whatever torch's default is
-    return {name: (tuple(value.shape), value.dtype) for name, value in module.state_dict().items()}
+    state = module.state_dict()
+    del state[SEEN_CELLS]
+    return {name: (tuple(value.shape), value.dtype) for name, value in state.items()}
 
 
 def gate_precision(device_type: str, precision: Precision) -> torch.autocast:

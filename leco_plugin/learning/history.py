@@ -87,8 +87,9 @@ def as_learned(occupancy: Occupancy) -> Occupancy:
     except (KeyError, TypeError, ValueError) as error:
         raise ValueError(f"the occupancy's report names no gate as `learned` ({error})") from None
     gate = Gate(config).requires_grad_(False)
-    given = (occupancy.space, threshold, occupancy.precision, occupancy.report, occupancy.walls)
-    return Occupancy(gate, *given).eval()
+    place = {"walls": occupancy.walls, "seen": occupancy.seen}
+    given = (occupancy.space, threshold, occupancy.precision, occupancy.report)
+    return Occupancy(gate, *given, **place).eval()
 
 
 @dataclass

@@ -93,6 +93,7 @@ class Learner:
             found = self.data.survey
             mixture.set_bounds(found.bounds, found.median_length)
             mixture.region.look(*self.data.covering_rays())
+            mixture.region.see(*self.data.rays_of_all_images())
             for line in found.lines():
                 say(line)
             self.data.say_what_is_fixed()

@@ -141,6 +141,8 @@ class LecoModel(Model):
             share = len(likely.t_starts) / max(len(intervals.t_starts), 1)
             self.progress.learning_kept = 0.9 * self.progress.learning_kept + 0.1 * share
             intervals = likely
+        if not self.training:
+            intervals = mixture.seen(rays, intervals)
         return mixture.with_backdrops(rays, intervals, coarse)
 
     def get_outputs(self, ray_bundle: RayBundle) -> dict[str, Any]:  # type: ignore[override]

@@ -162,6 +162,12 @@ class Mixture(nn.Module):
         shaded = (likely | dense.index_select(0, intervals.ray_indices)).nonzero()[:, 0]
         return Intervals(*(part.index_select(0, shaded) for part in intervals))
 
+    def seen(self, rays: Rays, intervals: Intervals) -> Intervals:
+        """Leaves out what lies in space that no training ray crosses."""
+        mapped = mapped_middles(self.region.space, rays, intervals)
+        chosen = self.region.seen(mapped).nonzero()[:, 0]
+        return Intervals(*(part.index_select(0, chosen) for part in intervals))
+
     def with_backdrops(self, rays: Rays, intervals: Intervals, coarse: bool = False) -> Intervals:
         """Ends each ray in its backdrop, which no gate skips."""
         return with_backdrop(intervals, rays, *self.rule(coarse))
@@ -246,7 +252,8 @@ class Mixture(nn.Module):
         """The gate that skips as an `Occupancy`; it shares the gate's parameters."""
         gate, region = self.small or self.gate, self.region
         threshold, walls = float(self.threshold), region.aabb
-        made = Occupancy(gate, region.space, threshold, self.precision, self.report, walls)
+        said = self.precision, self.report
+        made = Occupancy(gate, region.space, threshold, *said, walls, region.seen)
         return made.to(self.device)
 
     def estimator(self) -> LearnedOccupancyEstimator:

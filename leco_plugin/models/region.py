@@ -9,8 +9,10 @@ import torch
 from torch import Tensor, nn
 
 from leco_plugin.models.rendering import Rays
+from leco_plugin.samplers import marching
 from leco_plugin.samplers.boxes import intersect_box
 from leco_plugin.scenes.bounds import SceneBounds
+from leco_plugin.seen import SeenSpace
 from leco_plugin.space import Space, SpaceKind
 
 DIRECTIONS = 16
@@ -30,6 +32,7 @@ class Region(nn.Module):
         near, far: scalars, where all rays begin and end, scene units.
         aabb: [6] corners of the box in which rays are marched.
         backdrops: directions in which training has seen what lies beyond.
+        seen: the space that training rays cross.
     """
 
     known: Tensor
@@ -45,6 +48,7 @@ class Region(nn.Module):
         self.register_buffer("far", torch.tensor(4.0))
         self.register_buffer("aabb", torch.tensor([-1.0] * 3 + [1.0] * 3))
         self.backdrops = SeenBackdrops()
+        self.seen = SeenSpace()
 
     @torch.no_grad()
     def set(self, bounds: SceneBounds) -> None:
@@ -60,6 +64,12 @@ class Region(nn.Module):
         """Notes where rays [N, 3] that cover the training images leave the scene."""
         cut = self.cut(origins.to(self.aabb), directions.to(self.aabb))
         self.backdrops.note(cut, ~self.leaves_by_floor(cut))
+
+    @torch.no_grad()
+    def see(self, origins: Tensor, directions: Tensor) -> None:
+        """Notes the space that rays [N, 3] cross, which cover all training images."""
+        cut = self.cut(origins.to(self.aabb), directions.to(self.aabb))
+        self.seen.note(self.space, marching.Rays(*cut[:4]))
 
     def rays(
         self,

@@ -25,6 +25,7 @@ from leco_plugin.scenes.pixels.known_distances import (
 )
 from leco_plugin.scenes.pixels.lattice import Lattice, Share
 from leco_plugin.scenes.survey import Survey, covering_rays, sparse_points, survey
+from leco_plugin.seen import rays_a_side
 
 
 class LearningData:
@@ -51,6 +52,12 @@ class LearningData:
     def covering_rays(self) -> tuple[Tensor, Tensor]:
         """Origins and unit directions [N, 3] of rays that cover the training images."""
         rays = covering_rays(self.manager.train_dataset.cameras, SIDE)
+        return rays[0].reshape(-1, 3), rays[1].reshape(-1, 3)
+
+    def rays_of_all_images(self) -> tuple[Tensor, Tensor]:
+        """As `covering_rays`, fewer of an image where there are many, but of each."""
+        cameras = self.manager.train_dataset.cameras
+        rays = covering_rays(cameras, rays_a_side(len(cameras)), len(cameras))
         return rays[0].reshape(-1, 3), rays[1].reshape(-1, 3)
 
     def prepare_batch(self, factor: float, distances: bool) -> None:

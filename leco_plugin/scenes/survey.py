@@ -184,13 +184,15 @@ def announce(found: Survey) -> None:
         say(line)
 
 
-def chosen_cameras(count: int) -> Tensor:
-    """Numbers of up to `MOST_CAMERAS` of so many cameras, spread evenly."""
-    return torch.linspace(0, count - 1, min(count, MOST_CAMERAS)).long().unique()
+def chosen_cameras(count: int, most: int = MOST_CAMERAS) -> Tensor:
+    """Numbers of up to `most` of so many cameras, spread evenly."""
+    return torch.linspace(0, count - 1, min(count, most)).long().unique()
 
 
-def covering_rays(cameras: Cameras, side: int = SIDE) -> tuple[Tensor, Tensor]:
-    """Rays that cover the images of up to `MOST_CAMERAS` cameras.
+def covering_rays(
+    cameras: Cameras, side: int = SIDE, most: int = MOST_CAMERAS
+) -> tuple[Tensor, Tensor]:
+    """Rays that cover the images of up to `most` cameras.
 
     Args:
         side: rays along each side of an image.
@@ -198,16 +200,16 @@ def covering_rays(cameras: Cameras, side: int = SIDE) -> tuple[Tensor, Tensor]:
         origins and unit directions, [C, side * side, 3] float32 on the CPU.
     """
     cameras = cameras.to("cpu")
-    origins, directions = [], []
-    for number in chosen_cameras(len(cameras)).tolist():
-        height, width = float(cameras.height[number]), float(cameras.width[number])
-        rows = torch.linspace(0.5, height - 0.5, side)
-        columns = torch.linspace(0.5, width - 0.5, side)
-        coords = torch.stack(torch.meshgrid(rows, columns, indexing="ij"), dim=-1).view(-1, 2)
-        bundle = cameras.generate_rays(camera_indices=number, coords=coords)
-        origins.append(bundle.origins.float())
-        directions.append(bundle.directions.float())
-    return torch.stack(origins), torch.stack(directions)
+    chosen = chosen_cameras(len(cameras), most)
+    sizes = torch.cat([cameras.height, cameras.width], dim=1)[chosen].float() - 1.0
+    shares = torch.linspace(0.0, 1.0, side)
+    grid = torch.cartesian_prod(shares, shares)
+    coords = 0.5 + sizes[:, None] * grid
+    bundle = cameras.generate_rays(
+        camera_indices=chosen.repeat_interleave(side * side)[:, None], coords=coords.view(-1, 2)
+    )
+    shape = len(chosen), side * side, 3
+    return bundle.origins.float().view(shape), bundle.directions.float().view(shape)
 
 
 def seen_beyond(dataset: Any, numbers: Tensor, misses: Tensor) -> float:

@@ -42,8 +42,13 @@ def occupancy(
     encoding: EncodingConfig | None = None,
     seed: int = 0,
     walls: list[float] | None = None,
+    unseen: bool = False,
 ) -> Occupancy:
-    """A gate of random weights, twice the usual size, whose threshold halves what is inside."""
+    """A gate of random weights, twice the usual size, whose threshold halves what is inside.
+
+    Args:
+        unseen: whether no ray has crossed half of its cells.
+    """
     torch.manual_seed(seed)
     encoding = encoding or EncodingConfig(octaves=octaves)
     gate = Gate(GateConfig(encoding, width, layers, experts))
@@ -58,6 +63,8 @@ def occupancy(
     made = Occupancy(
         gate, space, 0.0, precision, walls=None if walls is None else torch.tensor(walls)
     )
+    if unseen:
+        made.seen.cells.bernoulli_(0.5)
     made = made.to(DEVICE).eval()
     values = made.query(positions(2000))
     made.threshold_value.copy_(values[values > 0.0].median())

@@ -336,7 +336,7 @@ def logits_by_hand(weights: GateWeights, features: torch.Tensor) -> torch.Tensor
     last = last.view(1 + weights.half, -1, weights.padded_logits).sum(dim=0)
     totals, constants = weights.vectors[-2 * weights.padded_logits :].view(2, -1)
     mean = features.mean(dim=1, keepdim=True)
-    spread = (features.var(dim=1, unbiased=False, keepdim=True) + weights.epsilon).rsqrt()
+    spread = (features.var(dim=1, unbiased=False, keepdim=True) + weights.facts[11]).rsqrt()
     padded = torch.nn.functional.pad(features, (0, weights.padded_width - weights.width))
     return ((padded @ last - mean * totals) * spread + constants)[:, : weights.logits]
 

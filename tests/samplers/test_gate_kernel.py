@@ -61,6 +61,15 @@ def test_every_depth_in_both_spaces(layers: int, kind: str) -> None:
     assert_agreement(occupancy(kind, layers=layers), positions(300))
 
 
+@pytest.mark.parametrize("kind", ["box", "contraction"])
+def test_unseen_space_is_skipped(kind: str) -> None:
+    asked, places = occupancy(kind, unseen=True), positions(300)
+    mapped = asked.space.map(places)
+    unseen = ~asked.seen(mapped.clamp(-1.0, 1.0)) & (mapped.abs() <= 1.0).all(dim=-1)
+    assert_agreement(asked, places)
+    assert unseen.sum() > 30 and not fused(asked, places)[unseen].any()
+
+
 @pytest.mark.parametrize("precision", ["float32", "bfloat16"])
 @pytest.mark.parametrize("octaves", [1, 4, 6, 8, 10, 12])
 def test_every_number_of_octaves(octaves: int, precision: str) -> None:

@@ -15,11 +15,13 @@ from torch import Tensor
 
 from leco_plugin.samplers.kernels.encoding_kernel import frequencies, look_up
 from leco_plugin.samplers.kernels.gate_weights import FREQUENCY, GateWeights
+from leco_plugin.seen import CELLS
 
 INTERPRETED = os.environ.get("TRITON_INTERPRET") == "1"
 """Whether kernels run in Triton's interpreter; decided when Triton was imported."""
 
 _INTERPRETED, _FREQUENCY = tl.constexpr(INTERPRETED), tl.constexpr(FREQUENCY)
+_CELLS = tl.constexpr(CELLS)
 
 
 @triton.jit
@@ -47,6 +49,16 @@ def map_position(x, y, z, facts, CONTRACTED: tl.constexpr):
 def largest_of(u, v, w):
     """Maximum norm."""
     return tl.maximum(tl.maximum(tl.abs(u), tl.abs(v)), tl.abs(w))
+
+
+@triton.jit
+def _seen_at(u, v, w, seen):
+    """`SeenSpace.forward` of mapped positions in the cube."""
+    last: tl.constexpr = _CELLS - 1.0
+    i = tl.minimum((u + 1.0) * (0.5 * _CELLS), last).to(tl.int32)
+    j = tl.minimum((v + 1.0) * (0.5 * _CELLS), last).to(tl.int32)
+    k = tl.minimum((w + 1.0) * (0.5 * _CELLS), last).to(tl.int32)
+    return tl.load(seen + (i * _CELLS + j) * _CELLS + k) != 0
 
 
 @triton.jit
@@ -146,7 +158,7 @@ def gate_keeps(
     vectors,
     tables,
     grids,
-    epsilon,
+    seen,
     ROWS: tl.constexpr,
     KIND: tl.constexpr,
     OCTAVES: tl.constexpr,
@@ -166,6 +178,7 @@ def gate_keeps(
     u, v, w, inside = map_position(x, y, z, facts, CONTRACTED)
     u, v, w = tl.where(inside, u, 0.0), tl.where(inside, v, 0.0), tl.where(inside, w, 0.0)
     u, v, w = _once(u), _once(v), _once(w)
+    inside &= _seen_at(u, v, w, seen)
 
     sums = tl.zeros((ROWS, PADDED_WIDTH), tl.float32)
     if KIND == _FREQUENCY:
@@ -185,7 +198,7 @@ def gate_keeps(
         hidden = _activate(sums, vectors, PADDED_WIDTH, HALF)
         vectors += PADDED_WIDTH
 
-    mean, spread = _norm(hidden, epsilon, WIDTH, PADDED_WIDTH)
+    mean, spread = _norm(hidden, tl.load(facts + 11), WIDTH, PADDED_WIDTH)
     sums = tl.zeros((ROWS, PADDED_LOGITS), tl.float32)
     sums = _layer(hidden, matrices, sums, ROWS, PADDED_WIDTH, PADDED_LOGITS, HALF)
     if HALF:
@@ -195,8 +208,7 @@ def gate_keeps(
     totals = tl.load(vectors + number)[None, :]
     constants = tl.load(vectors + PADDED_LOGITS + number)[None, :]
     logits = (sums - mean[:, None] * totals) * spread[:, None] + constants
-    occupancy = tl.where(inside, _occupancy(logits, number[None, :], LOGITS), 0.0)
-    return occupancy >= tl.load(facts + 10)
+    return tl.where(inside, _occupancy(logits, number[None, :], LOGITS), 0.0) >= tl.load(facts + 10)
 
 
 @triton.jit
@@ -223,7 +235,7 @@ def _gate_kernel(
     vectors,
     tables,
     grids,
-    epsilon,
+    seen,
     ROWS: tl.constexpr,
     KIND: tl.constexpr,
     OCTAVES: tl.constexpr,
@@ -255,7 +267,7 @@ def _gate_kernel(
         vectors,
         tables,
         grids,
-        epsilon,
+        seen,
         ROWS,
         KIND,
         OCTAVES,

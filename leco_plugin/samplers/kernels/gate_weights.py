@@ -35,7 +35,7 @@ class GateWeights(NamedTuple):
     """
 
     facts: Tensor
-    """float32 [11]: centre, half extent, walls (min, max), threshold."""
+    """float32 [12]: centre, half extent, walls (min, max), threshold, epsilon of the layer norm."""
     matrices: Tensor
     """bfloat16 or float32, flat: the first layer (of frequencies for cosines, then for sines and
     coordinates), the other hidden layers, the last layer, and in bfloat16 what its rounding left
@@ -47,8 +47,8 @@ class GateWeights(NamedTuple):
     """float32, flat: the learned values of the encoding; anything for frequencies."""
     grids: Tensor
     """int32, flat: cells along the cube (points, of planes) and place in the tables, by level."""
-    epsilon: float
-    """Of the layer norm."""
+    seen: Tensor
+    """uint8, flat: whether training rays cross each cell of `SeenSpace`."""
     kind: int
     octaves: int
     levels: int
@@ -68,7 +68,7 @@ class GateWeights(NamedTuple):
     """Whether it multiplies in bfloat16."""
 
     @property
-    def values(self) -> tuple[Tensor | float, ...]:
+    def values(self) -> tuple[Tensor, ...]:
         """What a kernel reads, in the order of its parameters."""
         return self[:READ]
 
@@ -132,11 +132,13 @@ def _pack(occupancy: Any) -> GateWeights:
         _pad(constant[None], 1, padded_logits),
     ]
     facts = [space.center, space.half_extent, occupancy.walls, occupancy.threshold_value]
+    facts.append(torch.full_like(space.half_extent, gate.norm.eps))
     return GateWeights(
         facts=torch.cat([fact.reshape(-1).float() for fact in facts]),
         matrices=_flat(matrices).to(torch.bfloat16 if half else torch.float32),
         vectors=_flat(vectors),
         **_encoding_of(gate, facts[0].device),
+        seen=occupancy.seen.cells.reshape(-1).view(torch.uint8),
         columns=columns,
         width=width,
         padded_width=padded,
@@ -145,7 +147,6 @@ def _pack(occupancy: Any) -> GateWeights:
         padded_logits=padded_logits,
         contracted=space.kind == "contraction",
         half=half,
-        epsilon=gate.norm.eps,
     )
 
 

@@ -1,0 +1,117 @@
+"""Space that training rays cross: cells of the mapped cube, one bit each in a file.
+
+No photograph says anything about the rest. It is empty for all who ask an occupancy.
+"""
+
+from __future__ import annotations
+
+import math
+import zlib
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+from torch.nn.functional import max_pool3d
+
+from leco_plugin.samplers import marching
+from leco_plugin.space import Space
+
+CELLS = 64
+"""Along each axis of the mapped cube."""
+BYTES = CELLS**3 // 8
+"""Of all cells as bits, before they are compressed."""
+RAYS_AT_ONCE = 1 << 14
+
+
+class SeenSpace(nn.Module):
+    """Which cells of the mapped cube [-1, 1]^3 training rays cross, or come near.
+
+    Before any ray is noted, all space counts as seen.
+
+    Attributes:
+        cells: bool [n, n, n], n = `CELLS`.
+    """
+
+    cells: Tensor
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.register_buffer("cells", torch.ones(CELLS, CELLS, CELLS, dtype=torch.bool))
+
+    @property
+    def everywhere(self) -> bool:
+        """Whether all space counts as seen."""
+        return bool(self.cells.all())
+
+    @torch.no_grad()
+    def note(self, space: Space, rays: marching.Rays) -> None:
+        """Notes the rays that cover all training images, in place of those noted before.
+
+        A cell beside a crossed one counts as seen: rays are lines, and pixels have a width.
+
+        Args:
+            space: the mapping, on the device of the rays.
+            rays: from where they enter the scene to where they leave it.
+        """
+        cell = 2.0 / CELLS
+        # beyond the inner cube mapped steps shrink at least as fast as distance grows
+        growth = cell if space.kind == "contraction" else 0.0
+        rule = marching.March(cell * float(space.half_extent), growth)
+        crossed = torch.zeros(CELLS**3, dtype=torch.bool, device=self.cells.device)
+        for first in range(0, len(rays.origins), RAYS_AT_ONCE):
+            part = marching.Rays(*(each[first : first + RAYS_AT_ONCE] for each in rays[:4]))
+            of_ray, starts, ends = marching.march(part, rule)
+            middles = (0.5 * (starts + ends))[:, None]
+            positions = torch.addcmul(part.origins[of_ray], part.directions[of_ray], middles)
+            mapped = space.map(positions)
+            inside = mapped.abs().amax(dim=-1) <= 1.0
+            crossed[cells_at(mapped[inside])] = True
+        grid = crossed.view(1, 1, *self.cells.shape).float()
+        self.cells.copy_(max_pool3d(grid, 3, stride=1, padding=1)[0, 0] > 0.0)
+
+    def forward(self, mapped: Tensor) -> Tensor:
+        """Whether mapped positions [N, 3] in [-1, 1] lie in seen cells: bool [N]."""
+        return self.cells.view(-1).index_select(0, cells_at(mapped))
+
+    def to_bytes(self) -> Tensor:
+        """The cells as bits, compressed: uint8 [K]."""
+        bits = np.packbits(self.cells.cpu().numpy()).tobytes()
+        return torch.tensor(list(zlib.compress(bits, 9)), dtype=torch.uint8)
+
+    def _load_from_state_dict(self, state_dict: dict[str, Any], prefix: str, *rest: Any) -> None:
+        """A state without cells changes nothing: older ones have none, and nerfstudio loads in two
+        parts."""
+        if f"{prefix}cells" in state_dict:
+            super()._load_from_state_dict(state_dict, prefix, *rest)
+
+
+def cells_at(mapped: Tensor) -> Tensor:
+    """Flat numbers of the cells at mapped positions [N, 3] in [-1, 1]: int32 [N]."""
+    # by coordinate, as `Occupancy.query` has them: rows of three numbers are slow on a CPU
+    places = mapped.T.add(1.0).mul_(0.5 * CELLS).clamp_(0.0, CELLS - 1.0).to(torch.int32)
+    return places[0].mul_(CELLS).add_(places[1]).mul_(CELLS).add_(places[2])
+
+
+def cells_from_bytes(data: Tensor) -> Tensor:
+    """The cells that `SeenSpace.to_bytes` compressed: bool [n, n, n].
+
+    Raises:
+        ValueError: it is something else.
+    """
+    if data.dtype != torch.uint8 or data.dim() != 1 or len(data) > 2 * BYTES:
+        raise ValueError(f"cells are at most {2 * BYTES} bytes in a row")
+    reader = zlib.decompressobj()
+    try:
+        bits = reader.decompress(data.numpy().tobytes(), BYTES + 1)
+    except zlib.error as error:
+        raise ValueError(str(error)) from None
+    if len(bits) != BYTES or not reader.eof or reader.unused_data:
+        raise ValueError(f"they are {len(bits)} bytes and should be {BYTES}")
+    cells = np.unpackbits(np.frombuffer(bits, np.uint8)).astype(bool)
+    return torch.from_numpy(cells).view(CELLS, CELLS, CELLS)
+
+
+def rays_a_side(cameras: int, most_rays: int = 1 << 17, fewest: int = 8, most: int = 32) -> int:
+    """Rays along each side of an image with which so many cameras are noted."""
+    return min(most, max(fewest, math.isqrt(most_rays // max(cameras, 1))))
