@@ -42,6 +42,7 @@ def inspect(
     )
     print(f"kept where o(x) >= {facts['threshold']:.4g}, asked in {facts['precision']}")
     print(f"kept share of its box: {facts['kept_share_of_box']:.2%}")
+    print(f"share of its box that photographs show: {facts['seen_share_of_box']:.2%}")
     for name, value in facts["report"].items():
         if isinstance(value, (int, float, str)) and name not in ("params", "threshold"):
             print(f"{name.replace('_', ' ')}: {_said(value)}")

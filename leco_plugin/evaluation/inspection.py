@@ -10,7 +10,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from leco_plugin.occupancy import Occupancy
+from leco_plugin.occupancy import SEEN_CELLS, Occupancy
 
 POINTS_AT_ONCE = 1 << 16
 
@@ -45,7 +45,9 @@ def describe(occupancy: Occupancy) -> dict[str, Any]:
         "format": 1,
         "params": occupancy.num_params,
         "bytes_of_weights": sum(
-            value.numel() * value.element_size() for value in occupancy.state_dict().values()
+            value.numel() * value.element_size()
+            for name, value in occupancy.state_dict().items()
+            if name != SEEN_CELLS
         ),
         "threshold": occupancy.threshold,
         "precision": occupancy.precision,
@@ -55,6 +57,9 @@ def describe(occupancy: Occupancy) -> dict[str, Any]:
             "half_extent": float(occupancy.space.half_extent),
         },
         "box": [*box.low.tolist(), *box.high.tolist()],
+        "seen_share_of_box": float(
+            seen_at(occupancy, torch.lerp(box.low, box.high, points)).double().mean()
+        ),
         "kept_share_of_box": float((values >= occupancy.threshold).double().mean()),
         "gate": occupancy.gate.config.to_dict(),
         "report": occupancy.report,
@@ -96,6 +101,19 @@ def query(occupancy: Occupancy, positions: Tensor) -> Tensor:
     device = occupancy.threshold_value.device
     values = in_parts(lambda part: occupancy.query(part.to(device)).cpu(), positions.reshape(-1, 3))
     return values.reshape(positions.shape[:-1])
+
+
+@torch.no_grad()
+def seen_at(occupancy: Occupancy, positions: Tensor) -> Tensor:
+    """Whether any training ray comes near positions [..., 3]: bool [...] on the CPU."""
+    device = occupancy.threshold_value.device
+
+    def seen(part: Tensor) -> Tensor:
+        mapped = occupancy.space.map(part.to(device))
+        inside = mapped.abs().amax(dim=-1) <= 1.0
+        return (occupancy.seen(mapped.clamp(-1.0, 1.0)) & inside).cpu()
+
+    return in_parts(seen, positions.reshape(-1, 3)).reshape(positions.shape[:-1])
 
 
 def in_parts(function: Callable[[Tensor], Tensor], positions: Tensor) -> Tensor:

@@ -13,7 +13,14 @@ from PIL import Image
 from torch import Tensor
 
 from leco_plugin.chart.theme import LIGHT, new_figure, plain
-from leco_plugin.evaluation.inspection import ViewBox, cameras_of, exposed, query, whole_box
+from leco_plugin.evaluation.inspection import (
+    ViewBox,
+    cameras_of,
+    exposed,
+    query,
+    seen_at,
+    whole_box,
+)
 from leco_plugin.learning.history import FILE_NAME, GateHistory, as_learned
 from leco_plugin.log import bar
 from leco_plugin.occupancy import CALIBRATED_AT, Occupancy
@@ -27,7 +34,13 @@ PIXELS, FRAME_PIXELS = 640, 300
 """Along the longer side of a slice: of a picture, and of a look at a history."""
 MOST_POINTS = 50_000
 HORIZONTAL = (0.12, 0.4)
-"""Heights of the horizontal slices, as shares of the way from the ground to the highest roofs."""
+"""Heights of the horizontal slices, as shares of the way from the ground to the highest roofs:
+those of a history, and of a picture where no two heights differ."""
+LAYERS, LAYER_CELLS = 24, 96
+"""Heights that are compared for the slices of a picture, and cells along the longest side."""
+FLAT = 0.25
+"""Height of a slice, in widths, below which heights are drawn longer, up to this."""
+UNSEEN = "#8a8f98"
 COLOURS, CONTOUR, TRUTH, CAMERA = "magma", "#4fd8eb", "#ffffff", "#66e08a"
 AXES = "xyz"
 STILL, MOST_FRAMES = 4, 12
@@ -56,11 +69,12 @@ def draw(occupancy: Occupancy, path: str | Path, cameras: Tensor | None = None) 
     points, normals = surface_points(occupancy, box, low)
     figure = new_figure((15, 9.4), layout="constrained")
     wide, tall = (box.high - box.low)[[0, 2]].tolist()
-    ratios = (1.0, min(1.0, max(0.4, 1.6 * tall / wide)))
+    ratios = (1.0, min(1.0, max(0.5, 1.6 * tall / wide)))
     grid = figure.add_gridspec(2, 6, height_ratios=ratios, hspace=0.04)
     middle = _middle_of(points, box)
     slices = [
-        (grid[0, 2 * i : 2 * i + 2], 2, low + t * (high - low)) for i, t in enumerate(HORIZONTAL)
+        (grid[0, 2 * i : 2 * i + 2], 2, height)
+        for i, height in enumerate(differing_heights(occupancy, box, low, high))
     ]
     slices += [(grid[1, 3 * i : 3 * i + 3], a, float(middle[a])) for i, a in enumerate((1, 0))]
     for place, normal, at in slices:
@@ -97,7 +111,7 @@ def draw_slice(
     """
     across, up = (a for a in range(3) if a != normal)
     sides = (box.high - box.low)[[across, up]]
-    counts = (sides / sides.max() * pixels).round().clamp(min=2).int().tolist()
+    counts = (sides / sides.max() * pixels).round().clamp(min=64).int().tolist()
     u, v = box.axis(across, counts[0]), box.axis(up, counts[1])
     positions = torch.empty(len(v), len(u), 3)
     positions[..., normal], positions[..., across] = at, u
@@ -105,9 +119,14 @@ def draw_slice(
     values = query(occupancy, positions)
     low, high = box.low.tolist(), box.high.tolist()
     extent = (low[across], high[across], low[up], high[up])
-    shown = axes.imshow(
-        values.numpy(), origin="lower", extent=extent, cmap=COLOURS, vmin=0, vmax=1, aspect="equal"
-    )
+    longer = FLAT * float(sides[0] / sides[1])
+    longer = longer if longer > 1.0 else 1.0
+    style = {"cmap": COLOURS, "vmin": 0, "vmax": 1, "aspect": longer}
+    shown = axes.imshow(values.numpy(), origin="lower", extent=extent, **style)
+    unseen = ~seen_at(occupancy, positions).numpy()
+    if unseen.any():
+        marked = {"colors": "none", "hatches": ["//"], "levels": [0.5, 1.5]}
+        axes.contourf(u, v, unseen.astype(float), **marked).set_edgecolor(UNSEEN)
     if values.min() < occupancy.threshold <= values.max():
         lines = [occupancy.threshold]
         axes.contour(u, v, values, levels=lines, colors=CONTOUR, linewidths=0.7)
@@ -121,7 +140,8 @@ def draw_slice(
         axes.scatter(x, y, s=9, c=CAMERA, edgecolors="black", linewidths=0.3, label="cameras")
         axes.set_xlim(extent[:2])
         axes.set_ylim(extent[2:])
-    axes.set_title(f"o(x) at {AXES[normal]} = {at:.3g}", fontsize=10)
+    drawn = f", {AXES[up]} drawn {longer:.1f} times as long" if longer > 1.0 else ""
+    axes.set_title(f"o(x) at {AXES[normal]} = {at:.4g}{drawn}", fontsize=10)
     axes.set_xlabel(AXES[across])
     axes.set_ylabel(AXES[up])
     axes.tick_params(labelsize=8)
@@ -159,6 +179,30 @@ def heights_seen_from_above(occupancy: Occupancy, box: ViewBox) -> tuple[float, 
     low, high = float(heights[len(heights) // 20]), float(heights[-1 - len(heights) // 200])
     around = 2.0 * float(box.high[2] - box.low[2]) / kept.shape[2] if low == high else 0.0
     return low - around, high + around
+
+
+def differing_heights(
+    occupancy: Occupancy, box: ViewBox, low: float, high: float
+) -> tuple[float, float]:
+    """Two heights between `low` and `high`, scene units, in whose layers most decisions differ.
+
+    Those of `HORIZONTAL` where fewer than two layers both keep and skip.
+    """
+    heights = torch.linspace(low, high, LAYERS)
+    x, y = (box.axis(a, count) for a, count in enumerate(box.cells(LAYER_CELLS)[:2]))
+    positions = torch.stack(torch.meshgrid(heights, x, y, indexing="ij"), dim=-1)[..., [1, 2, 0]]
+    kept = (query(occupancy, positions) >= occupancy.threshold).flatten(1).float()
+    shares = kept.mean(dim=1)
+    mixed = ((shares > 0.005) & (shares < 0.995)).nonzero()[:, 0]
+    if len(mixed) < 2:
+        lower, upper = (low + share * (high - low) for share in HORIZONTAL)
+        return lower, upper
+    layers = kept[mixed]
+    both = layers @ layers.T
+    differing = both.diagonal()[:, None] + both.diagonal() - 2.0 * both
+    pair = divmod(int(differing.argmax()), len(mixed))
+    lower, upper = sorted(float(heights[mixed[number]]) for number in pair)
+    return lower, upper
 
 
 def surface_points(occupancy: Occupancy, box: ViewBox, lowest: float) -> tuple[Tensor, Tensor]:
@@ -213,6 +257,8 @@ def _title(occupancy: Occupancy, cameras: Tensor) -> str:
         then = f" at {before:.3g}, before a host lowered it" if isinstance(before, float) else ""
         parts.append(f"{skipped:.1%} of all candidates skipped{then}")
     parts.append("threshold blue" + (", cameras green" if len(cameras) else ""))
+    if not occupancy.seen.everywhere:
+        parts.append("hatched: no photograph shows it")
     return " · ".join(parts)
 
 

@@ -22,6 +22,8 @@ from leco_plugin.samplers.cells.cache import (
     OccupancyLike,
 )
 
+LEAST_O = 1e-7
+"""Of o and of 1 - o, where they are taken to logits."""
 POINTS_AT_ONCE = 1 << 17
 """Positions that the gate is asked about in one call."""
 TRIALS = 24
@@ -95,9 +97,9 @@ def logits_above(occupancy: OccupancyLike, mapped: Tensor) -> Tensor:
 
     Finite: float32 says o = 1 from a logit of 17 on.
     """
-    threshold = mapped.new_tensor(occupancy.threshold).logit(eps=1e-7)
+    threshold = mapped.new_tensor(occupancy.threshold).logit(eps=LEAST_O)
     values = [
-        occupancy.query(occupancy.space.unmap(part)).float().logit(eps=1e-7) - threshold
+        occupancy.query(occupancy.space.unmap(part)).float().logit(eps=LEAST_O) - threshold
         for part in mapped.split(POINTS_AT_ONCE)
     ]
     return torch.cat(values)
@@ -184,7 +186,11 @@ def fit_planes(
     planes = (planes / unit).round()
 
     residuals = (design @ planes[:, :, None])[..., 0] - values / unit
-    return planes, (weights * residuals.abs()).amax(dim=1)
+    doubts = (weights * residuals.abs()).amax(dim=1)
+    # where space ends or is unseen o falls to 0 at once: a plane that never decides
+    threshold = values.new_tensor(occupancy.threshold).logit(eps=LEAST_O)
+    falls = values.amin(dim=1) <= values.new_tensor(0.0).logit(eps=LEAST_O) - threshold
+    return planes.masked_fill(falls[:, None], 0.0), doubts.masked_fill(falls, 0.0)
 
 
 def clearance_of(states: Tensor, mixed: Tensor, fine_states: Tensor) -> Tensor:
