@@ -61,22 +61,26 @@ def inspect(
 
 def export(
     file: Annotated[Path, tyro.conf.Positional],
-    format: Literal["ply", "nerfacc-grid"],
+    format: Literal["ply", "splat-init", "npz", "nerfacc-grid"],
     out: Path,
     resolution: int = 128,
     levels: int | None = None,
     frame: Literal["data", "run"] | None = None,
+    data: Path | None = None,
     json: Path | None = None,
 ) -> None:
-    """Write an occupancy for other programs: kept points, or an occupancy grid of nerfacc.
+    """Write an occupancy for other programs: points, a start for splats, a volume, or a grid.
 
     Args:
         file: An occupancy.safetensors, or a folder of runs: the newest in it.
-        format: ply is the surface of what is kept as points. Their colour is o(x), how sure the
-            gate is that something is there: black at 0, purple, orange, pale yellow at 1. It is not
-            the colour of the scene. nerfacc-grid is what OccGridEstimator.load_state_dict takes, a
-            cell marked where any of 27 points in it is kept. A host that goes on updating such a
-            grid replaces it by its own.
+        format: ply is the surface of what is kept as points, in the colours of the sparse points
+            nearby; its head has the geographic origin where transforms.json has one. Without
+            coloured sparse points, colours are o(x): black at 0, purple, orange, pale yellow at 1.
+            splat-init is a copy of transforms.json beside the scene's own, with these points and
+            the kept sparse points as its start: ns-train splatfacto --data OUT. npz is o(x) in the
+            cells of the box. nerfacc-grid is what OccGridEstimator.load_state_dict takes, a cell
+            marked where any of 27 points in it is kept. A host that goes on updating such a grid
+            replaces it by its own.
         out: File to write.
         resolution: Cells along the longest side of the space, or along each axis of a grid.
         levels: Nested boxes of a grid, each twice as wide as the one inside it. By default one, or
@@ -84,16 +88,26 @@ def export(
         frame: Coordinates of points. data, the default, are those of the poses and sparse points in
             the data's own files, as of UTM; run are those in which the run works. A grid is always
             in those of the run, for its boxes lie along the axes.
+        data: The scene that it was learned on. By default that of the run it lies in.
         json: File for what was written, as JSON.
     """
     from leco_plugin.export import export as write
 
     check_json(json)
-    facts = write(occupancy_of(file), format, out, resolution, levels, frame)
-    if format == "ply":
+    facts = write(occupancy_of(file), format, out, resolution, levels, frame, data)
+    if format in ("ply", "splat-init"):
         print(f"{out}: {facts['points']} points in the coordinates of the {facts['frame']}")
+        if not facts["photograph_colours"]:
+            shown = "o(x)" if format == "ply" else "grey"
+            print(f"their colour is {shown}: no sparse points with colours; --data names a scene")
+        if "geographic_origin" in facts:
+            print(f"its origin on earth: {facts['geographic_origin']}")
+        if format == "splat-init":
+            print(f"start from it with: ns-train splatfacto --data {out}")
         if frame != facts["frame"] == "run":
             print("the file does not say how its run moved the data: older runs did not record it")
+    elif format == "npz":
+        print(f"{out}: {facts['shape']} cells, {facts['kept_share_of_cells']:.2%} of them kept")
     else:
         print(
             f"{out}: {facts['levels']} x {resolution}^3 cells, {facts['kept_share_of_cells']:.2%} "

@@ -1,6 +1,7 @@
 """`leco export`: an occupancy in the formats of other programs.
 
-`ply` is the surface of the kept set as coloured points. `nerfacc-grid` is the buffers of nerfacc's
+`ply` is the surface of the kept set as coloured points; `export_scene` writes `splat-init` and
+`npz`. `nerfacc-grid` is the buffers of nerfacc's
 `OccGridEstimator`: a cell is marked where any probed point of it is kept, so that a grid keeps more
 than the gate and loses next to nothing of what the gate keeps.
 """
@@ -19,13 +20,20 @@ from torch.nn.functional import max_pool3d
 
 from leco_plugin.cli_reports import check_place
 from leco_plugin.evaluation.inspection import ViewBox, exposed, numbers, query, whole_box
+from leco_plugin.export_scene import (
+    comments_of,
+    photograph_colours,
+    write_splat_init,
+    write_volume,
+)
 from leco_plugin.log import bar
 from leco_plugin.occupancy import Occupancy
 from leco_plugin.samplers.grid import OccupancyGridEstimator
+from leco_plugin.scenes.coloured_points import data_of_run, description_in, georeference
 from leco_plugin.scenes.frames import inverse, moved
 from leco_plugin.scenes.whole_files import write_points, write_whole
 
-Format = Literal["ply", "nerfacc-grid"]
+Format = Literal["ply", "splat-init", "npz", "nerfacc-grid"]
 Frame = Literal["data", "run"]
 MOST_CELLS = 1 << 28
 """Of an export: each holds some bytes until the file is written, which makes gigabytes."""
@@ -49,56 +57,118 @@ def export(
     resolution: int = 128,
     levels: int | None = None,
     frame: Frame | None = None,
+    data: Path | None = None,
 ) -> dict[str, Any]:
     """Writes an occupancy in another format.
 
     Args:
         file: an occupancy.
-        format: `ply` or `nerfacc-grid`.
+        format: `ply`, `splat-init`, `npz` or `nerfacc-grid`.
         out: of what is written.
         resolution: cells along the longest side, or along each axis of a grid.
         levels: of a grid.
         frame: of points, `data` for the coordinates of the data's own files, `run` for those of the
-            run. None is `data` where the file says how. A grid is in those of the run.
+            run. None is `data` where the file says how. Grid and volume are in those of the run, a
+            start for splats in those of the data.
+        data: the scene that it was learned on; None is that of the run in whose folder `file` lies.
     Returns:
         What was written, as JSON values.
     Raises:
         ValueError, OSError: the file is no occupancy, a size is out of range, there is nothing to
             export, or it cannot be written there.
     """
-    if format == "ply" and levels is not None:
+    _check_options(format, levels, frame)
+    check_place("--out", out)
+    occupancy = Occupancy.load(file)
+    back = None if frame == "run" else to_the_data(occupancy)
+    if back is None and (frame == "data" or format == "splat-init"):
+        raise ValueError(
+            f"{file} does not say how its run moved and scaled the data: "
+            + ("learn it anew" if format == "splat-init" else "give --frame run")
+        )
+    if format == "nerfacc-grid":
+        facts = _export_grid(occupancy, out, resolution, levels)
+    elif format == "npz":
+        if resolution < 2:
+            raise ValueError(f"a volume takes at least 2 cells along a side, not {resolution}")
+        counts = whole_box(occupancy).cells(min(resolution, MOST_CELLS))
+        _require_few(math.prod(counts), f"{resolution} along the longest side")
+        with bar(f"Asking the gate about cells of 1/{resolution}") as show:
+            facts = write_volume(occupancy, resolution, back, out, show)
+        facts["frame"] = "run"
+    else:
+        given = data or data_of_run(file)
+        description = (
+            None
+            if given is None or (data is None and not _describes(given))
+            else (description_in(given))
+        )
+        facts = _export_points(occupancy, format, out, resolution, back, description)
+    known = {"format": 1, "written": format, "resolution": resolution}
+    return {**known, **facts, "bytes": out.stat().st_size}
+
+
+def _describes(data: Path) -> bool:
+    """Whether the data of a run is a scene in nerfstudio's format."""
+    return data.suffix == ".json" or (data / "transforms.json").is_file()
+
+
+def _check_options(format: Format, levels: int | None, frame: Frame | None) -> None:
+    """ValueError for options that do not go with a format."""
+    if format != "nerfacc-grid" and levels is not None:
         raise ValueError("points have no levels: --levels goes with --format nerfacc-grid")
-    if format != "ply" and frame == "data":
+    if format in ("nerfacc-grid", "npz") and frame == "data":
         raise ValueError(
             "a grid lies along the axes of the run: --frame data goes with --format ply"
         )
-    check_place("--out", out)
-    occupancy = Occupancy.load(file)
-    if format == "ply":
-        back = None if frame == "run" else to_the_data(occupancy)
-        if back is None and frame == "data":
-            raise ValueError(
-                f"{file} does not say how its run moved and scaled the data: give --frame run"
-            )
-        with bar(f"Asking the gate about cells of 1/{resolution}") as show:
-            surface = kept_surface(occupancy, resolution, show)
-        if back is not None:
-            surface = surface._replace(positions=moved(surface.positions.double(), back))
-        write_ply(surface, out)
-        at = "run" if back is None else "data"
-        facts: dict[str, Any] = {"points": len(surface.positions), "frame": at}
-    else:
-        with bar(f"Asking the gate about {resolution}^3 cells a level") as show:
-            buffers = grid_buffers(occupancy, resolution, levels, show)
-        write_grid(buffers, out)
-        facts = {
-            "frame": "run",
-            "levels": len(buffers["aabbs"]),
-            "aabbs": buffers["aabbs"].tolist(),
-            "kept_share_of_cells": float(buffers["binaries"].double().mean()),
-        }
-    known = {"format": 1, "written": format, "resolution": resolution}
-    return {**known, **facts, "bytes": out.stat().st_size}
+    if format == "splat-init" and frame == "run":
+        raise ValueError("a start for splats lies in the data: --frame run goes with --format ply")
+
+
+def _export_points(
+    occupancy: Occupancy,
+    format: Format,
+    out: Path,
+    resolution: int,
+    back: Tensor | None,
+    description: Path | None,
+) -> dict[str, Any]:
+    """Writes the kept surface as `ply` or `splat-init`."""
+    with bar(f"Asking the gate about cells of 1/{resolution}") as show:
+        surface = kept_surface(occupancy, resolution, show)
+    if back is not None:
+        surface = surface._replace(positions=moved(surface.positions.double(), back))
+    if format == "splat-init":
+        if description is None:
+            raise ValueError("a start for splats copies transforms.json: give --data SCENE")
+        assert back is not None
+        facts = write_splat_init(occupancy, surface.positions, back, description, out)
+        return facts | {"frame": "data"}
+    colours = None
+    if back is not None:
+        colours = photograph_colours(description, surface.positions.numpy())
+    write_ply(surface, out, colours, comments_of(description) if back is not None else [])
+    return {
+        "points": len(surface.positions),
+        "frame": "run" if back is None else "data",
+        "photograph_colours": colours is not None,
+        **({} if back is None or description is None else georeference(description)),
+    }
+
+
+def _export_grid(
+    occupancy: Occupancy, out: Path, resolution: int, levels: int | None
+) -> dict[str, Any]:
+    """Writes an occupancy grid of nerfacc."""
+    with bar(f"Asking the gate about {resolution}^3 cells a level") as show:
+        buffers = grid_buffers(occupancy, resolution, levels, show)
+    write_grid(buffers, out)
+    return {
+        "frame": "run",
+        "levels": len(buffers["aabbs"]),
+        "aabbs": buffers["aabbs"].tolist(),
+        "kept_share_of_cells": float(buffers["binaries"].double().mean()),
+    }
 
 
 def _require_few(cells: int, said: str) -> None:
@@ -183,9 +253,17 @@ def to_the_data(occupancy: Occupancy) -> Tensor | None:
     return inverse(known) if float(known[:, :3].det()) != 0.0 else None
 
 
-def write_ply(surface: KeptSurface, path: Path) -> None:
+def write_ply(
+    surface: KeptSurface,
+    path: Path,
+    colours: np.ndarray | None = None,
+    comments: Sequence[str] = (),
+) -> None:
     """Writes binary PLY of float64 with a colour for each point.
 
+    Args:
+        colours: [P, 3] uint8; None colours by o(x).
+        comments: lines for its head.
     Raises:
         OSError: it cannot be written there.
     """
@@ -193,8 +271,11 @@ def write_ply(surface: KeptSurface, path: Path) -> None:
 
     rows = np.empty(len(surface.values), dtype=[("xyz", "<f8", 3), ("rgb", "u1", 4)])
     rows["xyz"] = surface.positions.numpy()
-    rows["rgb"] = colormaps[COLOURS](surface.values.clamp(0.0, 1.0).numpy(), bytes=True)
-    write_points(path, rows)
+    if colours is None:
+        rows["rgb"] = colormaps[COLOURS](surface.values.clamp(0.0, 1.0).numpy(), bytes=True)
+    else:
+        rows["rgb"] = np.pad(colours, ((0, 0), (0, 1)), constant_values=255)
+    write_points(path, rows, comments)
 
 
 def grid_buffers(

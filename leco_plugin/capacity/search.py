@@ -100,8 +100,8 @@ def _teach_in_place(
     """A gate in the original's place, without a threshold of its own yet."""
     gate = teach(config, lesson, steps, original.precision, on_progress=on_progress)
     round_weights(gate)
-    place = {"walls": original.walls, "seen": original.seen}
-    smaller = Occupancy(gate, original.space, 0.5, original.precision, **place)
+    said = (0.5, original.precision, None)
+    smaller = Occupancy(gate, original.space, *said, original.walls, original.seen)
     return smaller.to(original.threshold_value.device).eval()
 
 

@@ -87,9 +87,8 @@ def as_learned(occupancy: Occupancy) -> Occupancy:
     except (KeyError, TypeError, ValueError) as error:
         raise ValueError(f"the occupancy's report names no gate as `learned` ({error})") from None
     gate = Gate(config).requires_grad_(False)
-    place = {"walls": occupancy.walls, "seen": occupancy.seen}
-    given = (occupancy.space, threshold, occupancy.precision, occupancy.report)
-    return Occupancy(gate, *given, **place).eval()
+    said = (threshold, occupancy.precision, occupancy.report)
+    return Occupancy(gate, occupancy.space, *said, occupancy.walls, occupancy.seen).eval()
 
 
 @dataclass

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -36,14 +36,16 @@ def remove_parts(folder: Path) -> None:
         part.unlink(missing_ok=True)
 
 
-def write_points(path: Path, rows: NDArray[Any]) -> None:
+def write_points(path: Path, rows: NDArray[Any], comments: Sequence[str] = ()) -> None:
     """Writes points as a binary PLY file: rows [N] of `xyz`, three floats, and of `rgb`, three or
-    four bytes. OSError if it cannot be written there."""
+    four bytes, after lines of comment. OSError if it cannot be written there."""
     properties = []
     for field, names in (("xyz", "x y z"), ("rgb", "red green blue alpha")):
         kind, shape = rows.dtype[field].subdtype or (rows.dtype[field], (1,))
         named = names.split()[: shape[0]]
         properties += [f"property {PLY_TYPES[kind.str[1:]]} {name}" for name in named]
     count = f"element vertex {len(rows)}"
-    head = ["ply", "format binary_little_endian 1.0", count, *properties, "end_header\n"]
+    said = [f"comment {comment}" for comment in comments]
+    encoding = "format binary_little_endian 1.0"
+    head = ["ply", encoding, *said, count, *properties, "end_header\n"]
     write_whole(path, lambda file: file.write("\n".join(head).encode() + rows.tobytes()))

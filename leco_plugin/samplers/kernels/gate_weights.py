@@ -68,7 +68,7 @@ class GateWeights(NamedTuple):
     """Whether it multiplies in bfloat16."""
 
     @property
-    def values(self) -> tuple[Tensor, ...]:
+    def values(self) -> tuple[Tensor | int, ...]:
         """What a kernel reads, in the order of its parameters."""
         return self[:READ]
 

@@ -1,0 +1,97 @@
+"""Sparse points of a scene with the colours of its photographs, and the colours near other places.
+
+All in the coordinates of the scene's own files.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from leco_plugin.scenes.input_error import InputError, one_line
+from leco_plugin.scenes.scene_file import load_json
+
+CONFIG = "config.yml"
+NEAREST = 3
+"""Points whose colours are averaged."""
+GREY = 128
+
+
+class ColouredPoints(NamedTuple):
+    """Points in the coordinates of the data."""
+
+    positions: NDArray[np.float64]
+    """[P, 3]."""
+    colours: NDArray[np.uint8]
+    """[P, 3]."""
+
+
+def data_of_run(file: Path) -> Path | None:
+    """The data of the run in whose folder a file lies; None where there is no run, or no data."""
+    import yaml
+
+    config = file.resolve().parent / CONFIG
+    if not config.is_file():
+        return None
+    try:
+        read = yaml.load(config.read_text(), Loader=yaml.Loader)  # as ns-eval reads it
+        data = read.pipeline.datamanager.data or read.pipeline.datamanager.dataparser.data
+    except (yaml.YAMLError, ImportError, AttributeError, TypeError, ValueError):
+        return None
+    return data if isinstance(data, Path) and data.exists() else None
+
+
+def description_in(data: Path) -> Path:
+    """The transforms.json that `data` means: itself, or that in the folder.
+
+    Raises:
+        InputError: there is none.
+    """
+    file = data if data.suffix == ".json" else data / "transforms.json"
+    if not file.is_file():
+        raise InputError(f"--data {data}: there is no transforms.json; give a nerfstudio scene")
+    return file
+
+
+def coloured_points(description: Path) -> ColouredPoints | None:
+    """Sparse points with colours that a transforms.json names; None where it names none.
+
+    Raises:
+        InputError: the file of the points cannot be read.
+    """
+    import trimesh
+
+    name = load_json(description).get("ply_file_path")
+    path = description.parent / str(name)
+    if name is None or not path.is_file():
+        return None
+    try:
+        with path.open("rb") as file:  # nothing else is read that it may point to
+            loaded: Any = trimesh.load(file, file_type="ply")
+        positions = np.asarray(loaded.vertices, dtype=np.float64).reshape(-1, 3)
+        colours = np.asarray(getattr(loaded, "colors", ()), dtype=np.uint8)
+    except Exception as error:  # noqa: BLE001  trimesh raises whatever its parsers meet
+        raise InputError(f"{path} cannot be read as points: {one_line(error, 120)}") from None
+    if len(colours) != len(positions) or not len(positions):
+        return None
+    sound = np.isfinite(positions).all(axis=1)
+    return ColouredPoints(positions[sound], colours[sound, :3])
+
+
+def colours_near(known: ColouredPoints, positions: NDArray[np.float64]) -> NDArray[np.uint8]:
+    """Mean colours [N, 3] of the `NEAREST` known points of each position [N, 3]."""
+    from scipy.spatial import KDTree
+
+    count = min(NEAREST, len(known.positions))
+    _, numbers = KDTree(known.positions).query(positions, k=count)
+    found = known.colours[np.asarray(numbers).reshape(len(positions), count)]
+    return np.asarray(found.mean(axis=1).round().astype(np.uint8))
+
+
+def georeference(description: Path) -> dict[str, Any]:
+    """`geographic_origin` and `metres_per_unit` of a transforms.json, where it has them."""
+    meta = load_json(description)
+    return {name: meta[name] for name in ("geographic_origin", "metres_per_unit") if name in meta}

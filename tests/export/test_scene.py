@@ -1,0 +1,107 @@
+"""Exports with a scene at hand: colours of sparse points, a start for splats, a dense volume."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import trimesh
+from ball_occupancy import CENTRE, RADIUS, ball
+
+from leco_plugin.export import export
+from leco_plugin.occupancy import Occupancy
+from leco_plugin.scenes.whole_files import write_points
+
+ORIGIN = {"latitude": 42.0, "longitude": -76.0, "altitude": 0.0, "axes": "east, north, up"}
+FRAME = [[0.5, 0.0, 0.0, 0.0], [0.0, 0.5, 0.0, 0.0], [0.0, 0.0, 0.5, 0.0]]
+"""The run has half the size of the data."""
+
+
+@pytest.fixture
+def file(tmp_path: Path) -> Path:
+    known = ball()
+    report = known.report | {"data_frame": FRAME}
+    Occupancy(known.gate, known.space, known.threshold, report=report).save(tmp_path / "o.st")
+    return tmp_path / "o.st"
+
+
+@pytest.fixture
+def scene(tmp_path: Path) -> Path:
+    """Red points west of the ball's middle, blue ones east of it, and one far from the ball."""
+    folder = tmp_path / "scene"
+    generator = np.random.default_rng(0)
+    offsets = generator.normal(size=(500, 3))
+    offsets *= 0.9 * RADIUS / np.linalg.norm(offsets, axis=1, keepdims=True)
+    places = 2.0 * (np.array(CENTRE) + offsets)
+    rows = np.zeros(501, dtype=[("xyz", "<f4", 3), ("rgb", "u1", 3)])
+    rows["xyz"][:500], rows["xyz"][500] = places, 500.0
+    west = offsets[:, 0] < 0.0
+    rows["rgb"][:500] = np.where(west[:, None], (255, 0, 0), (0, 0, 255))
+    write_points(folder / "points.ply", rows)
+    meta: dict[str, Any] = {"ply_file_path": "points.ply", "fl_x": 10.0}
+    meta |= {"geographic_origin": ORIGIN, "metres_per_unit": 1.0}
+    meta |= {"train_filenames": ["images/a.png"]}
+    meta["frames"] = [{"file_path": "images/a.png", "transform_matrix": np.eye(4).tolist()}]
+    (folder / "transforms.json").write_text(json.dumps(meta))
+    return folder
+
+
+def test_points_have_photograph_colours_and_say_where_on_earth_they_lie(
+    file: Path, scene: Path, tmp_path: Path
+) -> None:
+    facts = export(file, "ply", tmp_path / "k.ply", 32, data=scene)
+    assert facts["photograph_colours"] and facts["geographic_origin"] == ORIGIN
+    assert b"comment geographic_origin" in (tmp_path / "k.ply").read_bytes()[:300]
+    cloud = trimesh.load(tmp_path / "k.ply")
+    offsets = np.asarray(cloud.vertices) - 2.0 * np.array(CENTRE)
+    clear = np.abs(offsets[:, 0]) > 0.5 * RADIUS
+    red = cloud.colors[clear, 0] > cloud.colors[clear, 2]
+    assert (red == (offsets[clear, 0] < 0.0)).mean() > 0.98
+    assert not export(file, "ply", tmp_path / "k.ply", 32)["photograph_colours"]
+
+
+def test_a_start_for_splats_is_a_copy_of_the_scene_with_kept_points(
+    file: Path, scene: Path, tmp_path: Path
+) -> None:
+    out = scene / "splats.json"
+    facts = export(file, "splat-init", out, 32, data=scene)
+    made, known = json.loads(out.read_text()), json.loads((scene / "transforms.json").read_text())
+    assert made == known | {"ply_file_path": "splats.ply"}
+    points = np.asarray(trimesh.load(scene / "splats.ply").vertices)
+    assert facts["points"] == len(points) > facts["sparse_points"] > 400
+    assert np.linalg.norm(points - 2.0 * np.array(CENTRE), axis=1).max() < 2.6 * RADIUS
+    export(file, "splat-init", tmp_path / "else" / "t.json", 32, data=scene)
+    made = json.loads((tmp_path / "else" / "t.json").read_text())
+    photograph = str((scene / "images/a.png").resolve())
+    assert made["frames"][0]["file_path"] == made["train_filenames"][0] == photograph
+
+
+def test_a_volume_is_what_the_occupancy_says_in_its_box(file: Path, tmp_path: Path) -> None:
+    facts = export(file, "npz", tmp_path / "v.npz", 24)
+    with np.load(tmp_path / "v.npz") as volume:
+        assert list(volume["o"].shape) == facts["shape"] and volume["seen"].all()
+        assert np.array_equal(volume["kept"], volume["o"] >= volume["threshold"])
+        assert np.allclose(volume["to_data"], 2.0 * np.eye(3, 4))
+        shares = (np.argwhere(volume["kept"]).mean(axis=0) + 0.5) / volume["o"].shape
+        middle = volume["low"] + shares * (volume["high"] - volume["low"])
+    assert np.abs(middle - np.array(CENTRE)).max() < 0.1
+
+
+def test_what_does_not_go_together_is_refused_in_one_line(
+    file: Path, scene: Path, tmp_path: Path
+) -> None:
+    own = scene / "transforms.json"
+    for options, said in (
+        (("splat-init", own, 24, None, None, scene), "the scene's own file"),
+        (("splat-init", tmp_path / "t.ply", 24, None, None, scene), "end it so"),
+        (("splat-init", tmp_path / "t.json", 24), "give --data"),
+        (("splat-init", tmp_path / "t.json", 24, None, "run", scene), "lies in the data"),
+        (("npz", tmp_path / "v.npz", 1), "at least 2 cells"),
+        (("ply", tmp_path / "k.ply", 24, None, None, tmp_path), "no transforms.json"),
+    ):
+        with pytest.raises(ValueError, match=said) as error:
+            export(file, *options)
+        assert "\n" not in str(error.value)
