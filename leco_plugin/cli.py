@@ -116,6 +116,36 @@ def poses(
     write_json(json, report)
 
 
+def points(
+    data: Annotated[Path, tyro.conf.Positional],
+    size: int = 1600,
+    threads: int = 0,
+    json: Path | None = None,
+) -> None:
+    """Give a scene that has poses and no sparse points some, which say where its surfaces lie.
+
+    Runs COLMAP on the CPU, by `pip install 'leco_plugin[poses]'`, from the poses and lenses of the
+    scene, which stay as they are. Writes leco_points.ply into the scene and names it in
+    transforms.json. The file as it was stays beside it as transforms.before_points.json.
+
+    Args:
+        data: Scene in nerfstudio's format. Its photographs are only read; those for tests are not.
+        size: Longest side in pixels at which features are looked for.
+        threads: Of the CPU. 0 takes all.
+        json: File for what was found, as JSON.
+    """
+    check_json(json)
+    from leco_plugin.scenes.poses.points import find_points
+
+    report = find_points(data, size, threads)
+    if report["done"]:
+        print(f"{report['points']} points of {report['photographs']} photographs: {report['file']}")
+        print(f"train on it with: ns-train leco-occupancy --data {data}")
+    else:
+        print(f"{data} has {report['points']} sparse points already: nothing is done")
+    write_json(json, report)
+
+
 def swap(
     method: Annotated[str, tyro.conf.Positional],
     occupancy: Path | None = None,
@@ -181,7 +211,7 @@ def demo(out: Path = Path("runs/demo"), seconds: float = 130.0, json: Path | Non
 COMMANDS: dict[str, Callable[..., None]] = {
     command.__name__: command
     for command in (
-        *(city, poses, inspect, export, shrink, capacity),
+        *(city, poses, points, inspect, export, shrink, capacity),
         *(swap, demo, chart, stability, check),
     )
 }

@@ -60,6 +60,26 @@ def choose_pairs(names: Sequence[str], exifs: Sequence[Exif], places: NDArray[np
     return Pairs(sorted(_in_order(order, steps) | loops), f"{NEXT} next in order, and loops")
 
 
+def choose_posed_pairs(poses: NDArray[np.float64]) -> Pairs:
+    """The pairs to compare of photographs whose poses are known.
+
+    Args:
+        poses: [N, 3, 4] OpenGL camera to world.
+    """
+    count = len(poses)
+    if count <= FEW:
+        return Pairs(list(combinations(range(count), 2)), "all pairs")
+    places, ahead = poses[:, :, 3], -poses[:, :, 2]
+    ranks = np.array(sorted({*range(NEIGHBOURS // 2), *(2**power for power in range(3, 7))}))
+    found = set()
+    for row in range(count):
+        distances = ((places - places[row]) ** 2).sum(axis=1)
+        distances[(ahead @ ahead[row] <= 0.0) | (np.arange(count) == row)] = np.inf
+        order = np.argsort(distances, kind="stable")[ranks[ranks < count]]
+        found |= {(min(row, o), max(row, o)) for o in order.tolist() if distances[o] < np.inf}
+    return Pairs(sorted(found), "near ones by pose that look the same way")
+
+
 def capture_order(names: Sequence[str], exifs: Sequence[Exif]) -> list[int] | None:
     """Numbers of the photographs as they were taken: by EXIF's time, or as names count them.
 

@@ -38,7 +38,7 @@ def load_pycolmap() -> Any:
         import_module("PIL.Image")  # after pycolmap, its PNG writer was seen to abort
         pycolmap = import_module("pycolmap")
     except ImportError as error:
-        raise ImportError(f"leco poses needs pycolmap ({error}): {EXTRA}") from None
+        raise ImportError(f"leco poses and leco points need pycolmap ({error}): {EXTRA}") from None
     if not hasattr(pycolmap, "match_image_pairs"):  # before version 4
         raise ImportError(f"this pycolmap is too old for leco poses: {EXTRA}")
     pycolmap.logging.minloglevel = 3  # what it warns of is counted in the report

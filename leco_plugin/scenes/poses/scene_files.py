@@ -13,6 +13,8 @@ from leco_plugin.scenes.poses.georeference import Placement
 from leco_plugin.scenes.whole_files import write_points, write_whole
 
 Array = NDArray[np.float64]
+LARGE = 1e4
+"""Coordinates, as of UTM, from which on points are written in float64."""
 POINTS, MODEL = "sparse_pc.ply", "colmap/sparse/0"
 """In the folder of the scene, under the names that ns-process-data has for them."""
 PARAMETERS = {
@@ -87,10 +89,15 @@ def write_scene(
     folder = scene / MODEL
     folder.mkdir(parents=True, exist_ok=True)
     model.write(folder)
-    places, colours = points_of(model)
-    rows = np.zeros(len(places), dtype=[("xyz", "<f4", 3), ("rgb", "u1", 3)])
-    rows["xyz"], rows["rgb"] = places, colours
-    write_points(scene / POINTS, rows)
+    write_sparse_points(scene / POINTS, *points_of(model))
     for name, said in ((report_name, report), ("transforms.json", meta)):
         text = json.dumps(said, indent=1).encode()
         write_whole(scene / name, lambda file, text=text: file.write(text))  # type: ignore[misc]
+
+
+def write_sparse_points(path: Path, places: Array, colours: NDArray[np.uint8]) -> None:
+    """Writes sparse points [P, 3] with their colours [P, 3] as a PLY file."""
+    kind = "<f8" if np.abs(places).max(initial=0.0) > LARGE else "<f4"
+    rows = np.zeros(len(places), dtype=[("xyz", kind, 3), ("rgb", "u1", 3)])
+    rows["xyz"], rows["rgb"] = places, colours
+    write_points(path, rows)

@@ -1,0 +1,231 @@
+"""`leco points`: sparse points for a scene that has poses and no points.
+
+The poses and lenses stay as the scene gives them. Features are matched between photographs, and
+triangulated from those poses.
+"""
+
+from __future__ import annotations
+
+import json
+import tempfile
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from nerfstudio.cameras.cameras import CameraType
+from numpy.typing import NDArray
+from PIL import Image
+
+from leco_plugin.log import bar
+from leco_plugin.scenes.bounds import FEWEST_POINTS
+from leco_plugin.scenes.input_error import InputError, require
+from leco_plugin.scenes.lenses import DISTORTIONS, Lens
+from leco_plugin.scenes.photograph_files import check_images, decode, header_of, is_turned
+from leco_plugin.scenes.photographs import LecoPhotographsDataParserConfig, folder_of, read_points
+from leco_plugin.scenes.poses.exif import Exif
+from leco_plugin.scenes.poses.originals import FEWEST, Photograph
+from leco_plugin.scenes.poses.pairs import choose_posed_pairs
+from leco_plugin.scenes.poses.reconstruction import (
+    Reconstructor,
+    available_threads,
+    load_pycolmap,
+)
+from leco_plugin.scenes.poses.scene_files import points_of, write_sparse_points
+from leco_plugin.scenes.scene_file import SceneFile, scene_file_of
+from leco_plugin.scenes.whole_files import write_whole
+
+Array = NDArray[np.float64]
+FILE, BEFORE = "leco_points.ply", "transforms.before_points.json"
+"""The points, and transforms.json as it was, in the folder of the scene."""
+CONTRADICTED = 0.5
+"""Share of the matched features that must agree with the poses: 94% do in a scene of nine
+photographs, 15% where their poses are shuffled."""
+
+
+def find_points(data: Path, size: int = 1600, threads: int = 0) -> dict[str, Any]:
+    """Gives a scene sparse points, unless it has some; returns the report.
+
+    Test photographs are left out where the scene lists those for training.
+
+    Args:
+        data: folder of the scene, or the json file in it.
+        size: longest side in pixels at which features are looked for.
+        threads: of the CPU; 0 takes all.
+    Returns:
+        `points`, `photographs`, `file` and `done`: False for a scene that had points.
+    Raises:
+        InputError: the scene cannot be read, or no points are found.
+        ImportError: pycolmap is missing.
+    """
+    require(size >= 100, "size", size, "100 pixels or more")
+    require(threads >= 0, "threads", threads, "0 for all, or a number of them")
+    scene = scene_file_of(LecoPhotographsDataParserConfig(data=data), "train")
+    assert scene is not None
+    check_images(scene.pictures())
+    chosen = training_frames(scene)
+    report: dict[str, Any] = {"format": 1, "photographs": len(chosen)}
+    known = read_points(scene.meta, folder_of(data))
+    if known is not None and len(known) >= FEWEST_POINTS:
+        file = str(scene.folder / scene.meta["ply_file_path"])
+        return report | {"points": len(known), "file": file, "done": False}
+    if len(chosen) < FEWEST:
+        raise InputError(f"{scene.path} has {len(chosen)} photographs; {FEWEST} or more are needed")
+    load_pycolmap()
+    poses = np.array([scene.frames[number]["transform_matrix"] for number in chosen])[:, :3]
+    centre = poses[:, :, 3].mean(axis=0)  # pycolmap loses digits of coordinates like UTM's
+    poses[:, :, 3] -= centre
+    with tempfile.TemporaryDirectory() as work:
+        photographs, cameras = _copies(scene, chosen, Path(work) / "images", size)
+        reconstructor = Reconstructor(Path(work), photographs, threads or available_threads())
+        reconstructor.folder.mkdir()
+        reconstructor.extract("perspective", size)
+        model = _triangulate(reconstructor, cameras, poses)
+        _refuse_few(model, matched_features(reconstructor), scene.path)
+    places, colours = points_of(model)
+    write_sparse_points(scene.path.with_name(FILE), places + centre, colours)
+    _name_points(scene.path)
+    file = str(scene.path.with_name(FILE))
+    return report | {"points": len(places), "file": file, "done": True}
+
+
+def training_frames(scene: SceneFile) -> list[int]:
+    """Numbers of the frames that a scene trains on: all where it does not say."""
+    listed = scene.meta.get("train_filenames")
+    every = range(len(scene.meta["frames"]))  # ScanNet++ lists its test frames after these
+    if not listed:
+        return list(every)
+    wanted = {str(name) for name in listed}
+    return [number for number in every if scene.frames[number]["file_path"] in wanted]
+
+
+def _triangulate(reconstructor: Reconstructor, cameras: Sequence[Any], poses: Array) -> Any:
+    """A model of pycolmap with points, in the coordinates of given poses.
+
+    Args:
+        reconstructor: that has found features.
+        cameras: [C] of its photographs.
+        poses: [C, 3, 4] of them, OpenGL camera to world.
+    """
+    pycolmap, work = reconstructor.pycolmap, reconstructor.folder / "triangulated"
+    given = pycolmap.Reconstruction()
+    with pycolmap.Database.open(reconstructor.database) as database:
+        for photograph, camera, pose in zip(reconstructor.photographs, cameras, poses):
+            image = database.read_image_with_name(photograph.name)
+            camera.camera_id = image.camera_id
+            if image.camera_id not in given.cameras:
+                database.update_camera(camera)
+                given.add_camera_with_trivial_rig(camera)
+            to_camera = pycolmap.Rigid3d(pose * [1.0, -1.0, -1.0, 1.0]).inverse()
+            placed = pycolmap.Image(image.name, image_id=image.image_id, camera_id=image.camera_id)
+            given.add_image_with_trivial_frame(placed, to_camera)
+    reconstructor.match(choose_posed_pairs(poses))
+    options = pycolmap.IncrementalPipelineOptions()
+    options.num_threads, options.random_seed = reconstructor.threads, 0
+    # nine photographs have few points that three of them show
+    options.triangulation.ignore_two_view_tracks = False
+    work.mkdir()
+    return pycolmap.triangulate_points(
+        given, reconstructor.database, reconstructor.images, work, options=options
+    )
+
+
+def matched_features(reconstructor: Reconstructor) -> int:
+    """Features of all photographs that have a match in another one."""
+    with reconstructor.pycolmap.Database.open(reconstructor.database) as database:
+        pairs, geometries = database.read_two_view_geometries()
+    found: set[tuple[int, int]] = set()
+    for pair, geometry in zip(pairs, geometries):
+        for number, column in zip(reconstructor.pycolmap.pair_id_to_image_pair(pair), (0, 1)):
+            found |= {(number, index) for index in geometry.inlier_matches[:, column].tolist()}
+    return len(found)
+
+
+def _refuse_few(model: Any, matched: int, path: Path) -> None:
+    """InputError, with the cause, where there are too few points to be of use."""
+    points, agreeing = model.num_points3D(), model.compute_num_observations()
+    if points >= FEWEST_POINTS and agreeing >= CONTRADICTED * matched:
+        return
+    photographs = model.num_reg_images()
+    if matched < 4 * FEWEST_POINTS:
+        raise InputError(
+            f"the {photographs} photographs of {path} share {matched} features, too few for "
+            "points: add photographs between them"
+        )
+    raise InputError(
+        f"only {agreeing} of {matched} features that the photographs share agree with the poses "
+        f"in {path}: those are of other photographs, or their lenses are; `leco poses` makes both"
+    )
+
+
+def _copies(
+    scene: SceneFile, chosen: Sequence[int], folder: Path, size: int
+) -> tuple[list[Photograph], list[Any]]:
+    """Photographs as their lenses mean them, made smaller, in a folder; and their cameras.
+
+    Args:
+        size: longest side in pixels of a copy.
+    """
+    folder.mkdir()
+    photographs, cameras = [], []
+    pictures = scene.pictures()
+    with bar("reading photographs") as show:
+        for count, number in enumerate(chosen):
+            path, lens = pictures[number], scene.lenses[number]
+            header = header_of(path)
+            full = (int(lens.width or header.size[0]), int(lens.height or header.size[1]))
+            with decode(path, is_turned(header, full)) as image:
+                copy = image.convert("RGB")
+            copy.thumbnail((size, size), Image.Resampling.LANCZOS)
+            name = f"{number:06d}.png"
+            copy.save(folder / name, compress_level=1)
+            camera = camera_of(lens, full, copy.size, str(path))
+            lens_name = str(sorted(camera.todict().items(), key=str))  # shared by equal ones
+            header = header_of(folder / name)
+            photographs.append(Photograph(folder / name, name, header, Exif(camera=lens_name)))
+            cameras.append(camera)
+            show((count + 1) / len(chosen))
+    return photographs, cameras
+
+
+def camera_of(lens: Lens, full: tuple[int, int], size: tuple[int, int], where: str) -> Any:
+    """A camera of pycolmap.
+
+    Args:
+        lens: in pixels of its full size.
+        full: width and height of that.
+        size: width and height in pixels of the copy, to which the camera is scaled.
+        where: of the photograph, for the error.
+    Raises:
+        InputError: the lens is neither a perspective nor a fisheye one, or has no focal length.
+    """
+    kinds = {None, CameraType.PERSPECTIVE, CameraType.FISHEYE}
+    focal = lens.focal_lengths(*full, factor=1)
+    if lens.kind not in kinds or focal[0] is None or focal[1] is None:
+        raise InputError(
+            f"{where}: leco points needs a perspective or fisheye lens with a focal length; give "
+            "bounds.altitudes, or near and far, in place of points"
+        )
+    said = dict(zip(DISTORTIONS, lens.distortion or [0.0] * len(DISTORTIONS)))
+    fisheye = lens.kind is CameraType.FISHEYE
+    names = ("k1", "k2", "k3", "k4") if fisheye else ("k1", "k2", "p1", "p2", "k3")
+    across, down = size[0] / full[0], size[1] / full[1]
+    middle = [at if at is not None else side / 2 for at, side in zip((lens.cx, lens.cy), full)]
+    pinhole = [focal[0] * across, focal[1] * down, middle[0] * across, middle[1] * down]
+    rational = [] if fisheye else [0.0] * 3  # terms that nerfstudio's lenses lack
+    return load_pycolmap().Camera(
+        model="OPENCV_FISHEYE" if fisheye else "FULL_OPENCV",
+        width=size[0],
+        height=size[1],
+        params=[*pinhole, *(float(said[name]) for name in names), *rational],
+        has_prior_focal_length=True,
+    )
+
+
+def _name_points(path: Path) -> None:
+    """Has a transforms.json name the points; the file as it was stays beside it."""
+    before = path.read_bytes()
+    if not path.with_name(BEFORE).exists():
+        write_whole(path.with_name(BEFORE), lambda file: file.write(before))
+    meta = json.loads(before.decode("utf-8-sig")) | {"ply_file_path": FILE}
+    write_whole(path, lambda file: file.write(json.dumps(meta, indent=1).encode()))

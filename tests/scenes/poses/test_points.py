@@ -1,0 +1,113 @@
+"""Claims about sparse points for a scene that has poses."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from nerfstudio.cameras.cameras import CameraType
+from rendered_survey import BLOCKS
+
+from leco_plugin import cli
+from leco_plugin.scenes.input_error import InputError
+from leco_plugin.scenes.lenses import lens_of
+from leco_plugin.scenes.photographs import read_ply
+from leco_plugin.scenes.poses.pairs import FEW, choose_posed_pairs
+from leco_plugin.scenes.poses.points import BEFORE, FILE, camera_of, find_points, training_frames
+
+FAR_AWAY = np.array([500_000.0, 4_600_000.0, 0.0])
+"""Metres, as UTM has them."""
+
+
+@pytest.fixture
+def bare(made: Path, tmp_path: Path) -> Path:
+    """The scene that `leco poses` made, far from its origin and without its points."""
+    scene = tmp_path / "bare"
+    shutil.copytree(made / "images", scene / "images")
+    meta = json.loads((made / "transforms.json").read_text())
+    del meta["ply_file_path"]
+    for frame in meta["frames"]:
+        for row, shift in zip(frame["transform_matrix"], FAR_AWAY):
+            row[3] += float(shift)
+    (scene / "transforms.json").write_text(json.dumps(meta))
+    return scene
+
+
+def shuffle_poses(scene: Path) -> None:
+    """Gives each photograph the pose of another one."""
+    meta = json.loads((scene / "transforms.json").read_text())
+    poses = [frame["transform_matrix"] for frame in meta["frames"]]
+    for frame, other in zip(meta["frames"], np.random.default_rng(0).permutation(len(poses))):
+        frame["transform_matrix"] = poses[other]
+    (scene / "transforms.json").write_text(json.dumps(meta))
+
+
+def test_points_lie_where_mapping_finds_them_and_nothing_else_changes(
+    bare: Path, made: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    before = (bare / "transforms.json").read_bytes()
+    assert cli.main(["points", str(bare), "--threads", "1"]) == 0
+    known = read_ply(made / "sparse_pc.ply", torch.float64)
+    found = read_ply(bare / FILE, torch.float64) - torch.from_numpy(FAR_AWAY)
+    assert len(found) >= len(known)
+    levels = torch.tensor([[0.0], *([block[-1]] for block in BLOCKS)], dtype=torch.float64)
+    off = (found[:, 2] - levels).abs().amin(dim=0)  # metres
+    assert off.median() < 0.1 and off.quantile(0.9) < 0.5
+    assert torch.cdist(known, found).amin(dim=1).median() < 0.1
+    assert (bare / BEFORE).read_bytes() == before
+    meta = json.loads((bare / "transforms.json").read_text())
+    assert meta.pop("ply_file_path") == FILE and meta == json.loads(before)
+    assert cli.main(["points", str(bare)]) == 0
+    assert "has" in (said := capsys.readouterr().out) and "nothing is done" in said
+
+
+def test_poses_of_other_photographs_are_refused_and_nothing_is_written(bare: Path) -> None:
+    shuffle_poses(bare)
+    before = sorted(bare.iterdir()), (bare / "transforms.json").read_bytes()
+    with pytest.raises(InputError, match="agree with the poses in .*`leco poses` makes both"):
+        find_points(bare, threads=1)
+    assert (sorted(bare.iterdir()), (bare / "transforms.json").read_bytes()) == before
+
+
+def test_photographs_that_share_too_little_are_refused(pycolmap: Any, tiny_scene: Path) -> None:
+    with pytest.raises(InputError, match="too few for points: add photographs between them"):
+        find_points(tiny_scene, threads=1)
+
+
+def test_photographs_for_tests_are_left_out() -> None:
+    frames = [{"file_path": f"{number}.jpg"} for number in range(4)]
+    scene: Any = SimpleNamespace(meta={"frames": frames[:3]}, frames=frames)
+    assert training_frames(scene) == [0, 1, 2]  # the last is one of ScanNet++'s test frames
+    scene.meta["train_filenames"] = ["2.jpg", "0.jpg"]
+    assert training_frames(scene) == [0, 2]
+
+
+def test_a_camera_is_scaled_with_its_copy(pycolmap: Any) -> None:
+    meta = {"w": 800, "h": 600, "fl_x": 500, "fl_y": 510, "cx": 390, "cy": 310, "k1": 0.1}
+    meta |= {"p2": 0.02, "camera_model": "OPENCV"}
+    camera = camera_of(lens_of(meta, {}, "a.jpg"), (800, 600), (400, 300), "a.jpg")
+    assert camera.params[:8].tolist() == [250, 255, 195, 155, 0.1, 0, 0, 0.02]
+    fisheye = camera_of(
+        lens_of(meta | {"camera_model": "OPENCV_FISHEYE"}, {}, "a.jpg"), (800, 600), (800, 600), ""
+    )
+    assert fisheye.model.name == "OPENCV_FISHEYE" and fisheye.params[4] == 0.1
+    panorama = lens_of({"w": 800, "h": 400, "camera_model": "EQUIRECTANGULAR"}, {}, "a.jpg")
+    assert panorama.kind is CameraType.EQUIRECTANGULAR
+    with pytest.raises(InputError, match="a.jpg: leco points needs a perspective or fisheye lens"):
+        camera_of(panorama, (800, 400), (800, 400), "a.jpg")
+
+
+def test_pairs_by_pose_are_near_ones_that_look_the_same_way() -> None:
+    poses = np.tile(np.eye(3, 4), (3 * FEW, 1, 1))
+    poses[:, 0, 3] = np.arange(3 * FEW)
+    poses[::2, :, 2] *= -1.0  # every other one looks back
+    pairs = choose_posed_pairs(poses).pairs
+    assert all(one < other and (other - one) % 2 == 0 for one, other in pairs)
+    assert (10, 12) in pairs and len(pairs) < 12 * len(poses)
+    assert len(choose_posed_pairs(poses[:FEW]).pairs) == FEW * (FEW - 1) // 2
