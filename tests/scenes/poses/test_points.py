@@ -70,7 +70,7 @@ def test_points_lie_where_mapping_finds_them_and_nothing_else_changes(
 def test_poses_of_other_photographs_are_refused_and_nothing_is_written(bare: Path) -> None:
     shuffle_poses(bare)
     before = sorted(bare.iterdir()), (bare / "transforms.json").read_bytes()
-    with pytest.raises(InputError, match="agree with the poses in .*`leco poses` makes both"):
+    with pytest.raises(InputError, match=r"agree with the poses in .*`leco poses` makes both"):
         find_points(bare, threads=1)
     assert (sorted(bare.iterdir()), (bare / "transforms.json").read_bytes()) == before
 
@@ -99,7 +99,9 @@ def test_a_camera_is_scaled_with_its_copy(pycolmap: Any) -> None:
     assert fisheye.model.name == "OPENCV_FISHEYE" and fisheye.params[4] == 0.1
     panorama = lens_of({"w": 800, "h": 400, "camera_model": "EQUIRECTANGULAR"}, {}, "a.jpg")
     assert panorama.kind is CameraType.EQUIRECTANGULAR
-    with pytest.raises(InputError, match="a.jpg: leco points needs a perspective or fisheye lens"):
+    with pytest.raises(
+        InputError, match=r"a\.jpg: leco points needs a perspective or fisheye lens"
+    ):
         camera_of(panorama, (800, 400), (800, 400), "a.jpg")
 
 
