@@ -17,8 +17,8 @@ from leco_plugin.scenes.learning_data import held_out_bundle
 from leco_plugin.scenes.pixels.held_out_pixels import held_out_sampler
 from leco_plugin.studio.host_models import true_colours
 
-FIRST_AFTER = 8.0
-"""Seconds after which PSNR is measured first."""
+FIRST_AFTER, BETWEEN = 8.0, 10.0
+"""Seconds before PSNR is measured first, and the fewest between two measurements."""
 SHARE_OF_TIME = 0.01
 """Of the time so far that all measurements may have taken; the first and the last may exceed it."""
 RAYS, FEWEST_LAST, MOST_LAST = 256, 1024, 8192
@@ -43,10 +43,15 @@ class HeldOutPsnr:
 
     def __init__(self, model: Any, manager: Any) -> None:
         self.model, self.manager = model, manager
-        self.began = time.monotonic()
         self.spent = self.cost = 0.0
+        self.begin()
         self.latest: float | None = None
         self.pixels: tuple[RayBundle, Tensor] | None = None
+
+    def begin(self) -> None:
+        """The time that counts begins now."""
+        self.began = time.monotonic()
+        self.due = self.began + FIRST_AFTER
 
     @cached_property
     def has_pixels(self) -> bool:
@@ -55,9 +60,9 @@ class HeldOutPsnr:
 
     def look(self) -> None:
         """Measures where that is due."""
-        elapsed = time.monotonic() - self.began
-        affordable = self.spent + self.cost <= SHARE_OF_TIME * elapsed
-        if elapsed >= FIRST_AFTER and self.has_pixels and (affordable or self.latest is None):
+        now = time.monotonic()
+        affordable = self.spent + self.cost <= SHARE_OF_TIME * (now - self.began)
+        if now >= self.due and self.has_pixels and (affordable or self.latest is None):
             self._measure(RAYS)
 
     def look_last(self) -> int:
@@ -70,7 +75,7 @@ class HeldOutPsnr:
         return self._measure(count)
 
     def _drawn(self, count: int) -> tuple[RayBundle, Tensor]:
-        """Rays and their true colours [R, 3 or 4]; those that are looked at often are drawn once."""
+        """Rays and their true colours [R, 3 or 4]; the same are drawn once."""
         if self.pixels is None or count != RAYS:
             self.pixels = held_out_bundle(self.manager, count, share="all")
         return self.pixels
@@ -93,6 +98,7 @@ class HeldOutPsnr:
         now = time.monotonic()
         self.cost = now - started
         self.spent += now - began
+        self.due = now + BETWEEN
         note(f"{self.words()}, measured in {self.cost:.2f} s; {self.spent:.2f} s in all")
         return len(truth)
 

@@ -110,8 +110,8 @@ def learn_model(
         with bar("Learning the occupancy") as show:
 
             def look(share: float) -> None:
-                if psnr is not None:
-                    psnr.look()
+                if psnr is not None and not bool(model.mixture.frozen):
+                    psnr.look()  # not of a frozen gate, whose sampler would have to be built
                 show(share, "" if psnr is None else psnr.words())
 
             _train(model, trained, learner, seconds, look)

@@ -14,7 +14,7 @@ from torch import Tensor, nn
 
 from leco_plugin.evaluation.held_out_psnr import OF, HeldOutPsnr
 from leco_plugin.learning.freezing import FILE_NAME
-from leco_plugin.log import bar, on_screen, say, spell
+from leco_plugin.log import Show, bar, on_screen, say, spell
 from leco_plugin.studio.run_folder import CONFIG
 from leco_plugin.studio.screen import LOG
 
@@ -43,7 +43,7 @@ class RunProgress:
         self._say_where()
 
     def __enter__(self) -> RunProgress:
-        self.began = self.psnr.began = time.monotonic()
+        self.began = time.monotonic()
         return self
 
     def __exit__(self, *_: Any) -> None:
@@ -62,6 +62,7 @@ class RunProgress:
         """
         self.steps += 1
         if self._show is None:
+            self.psnr.begin()
             self._show = self._bar.enter_context(bar("Training"))
         self.psnr.look()
         figures = [f"step {step + 1} of {self.end}", self._words(), _phase(self.trainer)]
