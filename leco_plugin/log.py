@@ -1,29 +1,58 @@
-"""What is said while something runs: lines and progress bars, once for all processes."""
+"""What is said while something runs: lines and progress bars, once for all processes.
+
+A run with a log file has a short screen: `say` writes to both, `note` to the file alone.
+"""
 
 from __future__ import annotations
 
 import logging
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from functools import cache
+from typing import Protocol, TextIO
 
 from rich.console import Console
 from rich.markup import escape
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+from rich.text import Text
 from torch import distributed
 
 from leco_plugin.models.compute.ranks import is_first
 
-SECONDS_A_LINE = 60.0
-"""Between two lines where there is no terminal to draw a bar on."""
+SECONDS_TO_FIRST, SECONDS_A_LINE, SHARE_A_LINE = 10.0, 60.0, 0.05
+"""Before the first line where there is no terminal to draw a bar on; between two lines, seconds and
+share of the work."""
 OF_A_DEVICE = ("leco_plugin.samplers.kernels.fused", "leco_plugin.models.compute.grouped")
 """Whose warnings are of the device of one process; all others have the same everywhere."""
 
 
+_details: TextIO | None = None
+"""The log file of the run that goes on."""
+
+
+@contextmanager
+def details_in(file: TextIO) -> Iterator[None]:
+    """While this lasts, details go to a log file, and the screen has only what `say` is given."""
+    global _details
+    before, _details = _details, file
+    try:
+        yield
+    finally:
+        _details = before
+
+
+def on_screen() -> bool:
+    """Whether a run with a log file goes on, whose user watches a short screen."""
+    return _details is not None
+
+
 def console() -> Console:
-    """nerfstudio's console where that is loaded, else one as wide."""
+    """The short screen of a run with a log file; else nerfstudio's console where that is loaded,
+    else one as wide."""
+    if _details is not None:
+        return _screen()
     nerfstudio = sys.modules.get("nerfstudio.utils.rich_utils")
     return _own_console() if nerfstudio is None else nerfstudio.CONSOLE
 
@@ -33,20 +62,58 @@ def _own_console() -> Console:
     return Console(width=120)
 
 
+@cache
+def _screen() -> Console:
+    return Console(highlight=False)
+
+
 def say(line: str) -> None:
-    """A line in the log, said once for all processes."""
-    if is_first():
+    """A line on the screen, said once for all processes; also in the run's log file.
+
+    Args:
+        line: with rich's markup.
+    """
+    if not is_first():
+        return
+    if _details is None:
         console().log(f"\\[leco] {line}", _stack_offset=2)
+    else:
+        console().print(line, soft_wrap=True)
+        _write(line)
+
+
+def note(line: str) -> None:
+    """A detail: a line in the run's log file; where there is none, as `say`."""
+    if not is_first():
+        return
+    if _details is None:
+        console().log(f"\\[leco] {line}", _stack_offset=2)
+    else:
+        _write(line)
+
+
+def summarize(summary: Iterable[str], details: Iterable[str]) -> None:
+    """Notes details, of which a short screen shows a summary instead."""
+    for line in details:
+        note(line)
+    for line in summary if on_screen() else ():
+        say(line)
+
+
+def _write(line: str) -> None:
+    assert _details is not None
+    print(time.strftime("%H:%M:%S"), Text.from_markup(line).plain, file=_details, flush=True)
 
 
 class _Says(logging.Handler):
-    """Says what samplers and experts log."""
+    """Says what samplers and experts warn of, and notes what else they log."""
 
     def emit(self, record: logging.LogRecord) -> None:
         line = escape(record.getMessage())
+        warns = record.levelno >= logging.WARNING
         if is_first():
-            say(line)
-        elif record.levelno >= logging.WARNING and record.name in OF_A_DEVICE:
+            (say if warns else note)(line)
+        elif warns and record.name in OF_A_DEVICE:
             console().log(f"\\[leco] process {distributed.get_rank()}: {line}")
 
 
@@ -58,35 +125,74 @@ def say_what_is_logged() -> None:
         log.setLevel(logging.INFO)
 
 
+class Show(Protocol):
+    """Shows how far some work is."""
+
+    def __call__(self, share: float, figures: str = "") -> None:
+        """The share done, and in a few words what has been reached."""
+
+
 @contextmanager
-def bar(what: str) -> Iterator[Callable[[float], None]]:
+def bar(what: str) -> Iterator[Show]:
     """Shows a bar while it lasts, once for all processes; yields what takes the share done.
 
-    In a file or a pipe, where no bar can be drawn, it is a line a minute.
+    In a file or a pipe, where no bar can be drawn, it is a line after ten seconds, then one for
+    each twentieth of the work, at most one a minute. So it is in the run's log file.
     """
+    if not is_first():
+        yield lambda share, figures="": None
+        return
     if not (console().is_terminal or console().is_jupyter):
-        yield _lines(what) if is_first() else lambda share: None
+        yield _Lines(what, _print)
         return
     columns = (TextColumn("{task.description}", markup=False), BarColumn(), TimeElapsedColumn())
-    with Progress(
-        *columns, TimeRemainingColumn(), console=console(), transient=True, disable=not is_first()
-    ) as progress:
+    in_file = _Lines(what, lambda line: None if _details is None else _write(escape(line)))
+    with Progress(*columns, TimeRemainingColumn(), console=console(), transient=True) as progress:
         task = progress.add_task(what, total=1.0)
-        yield lambda share: progress.update(task, completed=share)
+
+        def show(share: float, figures: str = "") -> None:
+            words = f"{what}: {figures}" if figures else what
+            progress.update(task, completed=share, description=words)
+            in_file(share, figures)
+
+        yield show
 
 
-def _lines(what: str) -> Callable[[float], None]:
-    began = said = time.monotonic()
+class _Lines:
+    """A bar as lines, which are few."""
 
-    def show(share: float) -> None:
-        nonlocal said
+    def __init__(self, what: str, put: Callable[[str], None]) -> None:
+        self.what, self.put = what, put
+        self.began = time.monotonic()
+        self.due, self.next_share = self.began + SECONDS_TO_FIRST, 0.0
+        self.share_before: float | None = None
+
+    def __call__(self, share: float, figures: str = "") -> None:
         now = time.monotonic()
-        if now - said >= SECONDS_A_LINE:
-            said = now
-            said_now = f"{what}: {share:.0%} after {now - began:.0f} s"
-            console().print(said_now, markup=False, highlight=False)
+        if self.share_before is None:
+            self.share_before = share
+        if now < self.due or share < self.next_share:
+            return
+        self.due, self.next_share = now + SECONDS_A_LINE, share + SHARE_A_LINE
+        done, elapsed = share - self.share_before, now - self.began
+        left = f"about {spell(elapsed / done * (1.0 - share))} left" if done > 0.0 else ""
+        reached = f"{share:.0%} after {spell(elapsed)}"
+        self.put(f"{self.what}: " + ", ".join(filter(None, [reached, figures, left])))
 
-    return show
+
+def _print(line: str) -> None:
+    console().print(line, markup=False, highlight=False, soft_wrap=True)
+    if _details is not None:
+        _write(escape(line))
+
+
+def spell(seconds: float) -> str:
+    """A duration in words: 45 s, 12 min, 3 h 20 min."""
+    if seconds < 90.0:
+        return f"{seconds:.0f} s"
+    minutes = round(seconds / 60.0)
+    hours, rest = divmod(minutes, 60)
+    return f"{hours} h {rest} min" if hours else f"{minutes} min"
 
 
 @contextmanager

@@ -12,14 +12,33 @@ from rich.console import Console
 from leco_plugin import log
 
 
-def test_in_a_log_it_is_a_line_a_minute(monkeypatch: pytest.MonkeyPatch) -> None:
-    written, seconds = io.StringIO(), iter([0.0, 30.0, 61.0, 90.0, 125.0])
+def test_in_a_log_it_is_a_line_early_then_one_a_minute_and_a_twentieth(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    written, seconds = io.StringIO(), iter([0.0, 5.0, 12.0, 60.0, 71.0, 80.0, 150.0])
     monkeypatch.setattr(log, "console", lambda: Console(file=written, width=120))
     monkeypatch.setattr(log, "time", SimpleNamespace(monotonic=lambda: next(seconds)))
     with log.bar("Guided") as show:
-        for share in (0.1, 0.25, 0.3, 0.5):
-            show(share)
-    assert written.getvalue().splitlines() == ["Guided: 25% after 61 s", "Guided: 50% after 125 s"]
+        for share in (0.0, 0.25, 0.26, 0.5, 0.29, 0.5):
+            show(share, "9.9 dB")
+    assert written.getvalue().splitlines() == [
+        "Guided: 25% after 12 s, 9.9 dB, about 36 s left",
+        "Guided: 50% after 2 min, 9.9 dB, about 2 min left",
+    ]
+
+
+def test_details_go_to_the_file_and_the_rest_to_both(capsys: pytest.CaptureFixture[str]) -> None:
+    file = io.StringIO()
+    with log.details_in(file):
+        log.note("a table of \\[wide] things")
+        log.say("a result")
+        log.summarize(["in short"], ["at length"])
+    log.note("afterwards")
+    on_screen, in_file = capsys.readouterr().out, file.getvalue()
+    assert on_screen.splitlines()[:2] == ["a result", "in short"] and "afterwards" in on_screen
+    assert [line[9:] for line in in_file.splitlines()] == [
+        *("a table of [wide] things", "a result", "at length", "in short")
+    ]
 
 
 def test_on_a_terminal_it_is_a_bar(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -10,7 +10,7 @@ from torch import Tensor, nn
 from leco_plugin.hosts.guide import Guide
 from leco_plugin.hosts.stand_ins import GuidedEstimator
 from leco_plugin.learning.calibration import THRESHOLDS
-from leco_plugin.log import say
+from leco_plugin.log import note
 from leco_plugin.models.compute.ranks import from_first
 from leco_plugin.occupancy import Occupancy
 
@@ -37,7 +37,7 @@ def begin_opaque(host: nn.Module, guide: Guide, kept_lengths: Tensor) -> None:
         return
     guide.first_density = wanted
     set_first_density(host, guide)
-    say(
+    note(
         f"the host begins with a density of {wanted:.3g} instead of {min(scales):.3g}, with which "
         f"the {length:.3g} scene units that are kept of a ray are opaque"
     )
@@ -80,7 +80,7 @@ def begin_carefully(host: nn.Module, guide: Guide, skipped: Callable[[Occupancy]
         return False
     guide.watched.lower = lower
     guide.changed()
-    say(
+    note(
         f"the host begins at threshold {lower:.4f} instead of {occupancy.threshold:.4f}, until "
         "skipping has shown in it what it costs"
     )

@@ -21,7 +21,7 @@ from leco_plugin.learning.dense import evaluating
 from leco_plugin.learning.freezing import leave_file
 from leco_plugin.learning.price_watch import PriceWatch
 from leco_plugin.learning.run import Run
-from leco_plugin.log import say
+from leco_plugin.log import note, say
 from leco_plugin.occupancy import CALIBRATED_AT
 from leco_plugin.scenes.learning_data import count_held_out, held_out_bundle
 from leco_plugin.studio.host_models import true_colours
@@ -76,7 +76,7 @@ class HostWatch:
             self._lower(step, lower if lower >= THRESHOLDS[-1] else 0.0, why)
         elif low is not None:
             now = f"its threshold is {guide.the_occupancy().threshold:.4f} now"
-            say(f"step {step}: skipping is within its price bounds; {now}")
+            note(f"step {step}: skipping is within its price bounds; {now}")
 
     def prepare(self) -> None:
         """See `price_watch.PriceSource`: the calibrated threshold is followed from now on."""

@@ -11,13 +11,14 @@ from typing import Any
 import torch
 from torch import nn
 
+from leco_plugin.evaluation.held_out_psnr import HeldOutPsnr
 from leco_plugin.learning.learner import Learner
 from leco_plugin.learning.progress import Progress
 from leco_plugin.learning.run import LearningOnly
 from leco_plugin.learning.schedule import MOST_EXTENSIONS, RATES, steps_of_an_extension
-from leco_plugin.log import bar
+from leco_plugin.log import bar, on_screen
 from leco_plugin.models.compute.optimizers import FusedAdamConfig
-from leco_plugin.models.compute.ranks import averaging, mean
+from leco_plugin.models.compute.ranks import averaging, is_first, mean
 from leco_plugin.models.leco import LecoModel
 from leco_plugin.models.leco_config import LecoModelConfig
 from leco_plugin.occupancy import Occupancy
@@ -105,8 +106,15 @@ def learn_model(
         learner = model.learner(manager, run)
         learner.data.rays_per_batch = rays
         learner.begin()
+        psnr = HeldOutPsnr(model, manager) if on_screen() and is_first() else None
         with bar("Learning the occupancy") as show:
-            _train(model, trained, learner, seconds, show)
+
+            def look(share: float) -> None:
+                if psnr is not None and not bool(model.mixture.frozen):
+                    psnr.look()  # not of a frozen gate, whose sampler would have to be built
+                show(share, "" if psnr is None else psnr.words())
+
+            _train(model, trained, learner, seconds, look)
     learned: LecoModel = model
     return learned
 

@@ -22,7 +22,7 @@ from leco_plugin.learning.calibration import (
     calibrate,
 )
 from leco_plugin.learning.dense import dense_rendering, evaluating
-from leco_plugin.log import say
+from leco_plugin.log import note, say
 from leco_plugin.models.mixture import Mixture
 from leco_plugin.models.rendering import Rays
 from leco_plugin.occupancy import BACKDROP_PRICE, Occupancy
@@ -100,7 +100,7 @@ def leave_file(occupancy: Occupancy, folder: Path) -> None:
     except OSError as error:
         say(f"{folder / FILE_NAME} could not be written ({error}); a resumed run writes it anew")
         return
-    say(f"wrote {folder / FILE_NAME}")
+    note(f"wrote {folder / FILE_NAME}")
 
 
 def withdraw_file(folder: Path) -> None:

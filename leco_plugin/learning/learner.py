@@ -30,7 +30,7 @@ from leco_plugin.learning.schedule import (
     schedule_since,
     steps_of_an_extension,
 )
-from leco_plugin.log import say
+from leco_plugin.log import note, say, summarize
 from leco_plugin.models.compute.ranks import from_first, mean, share
 from leco_plugin.models.gate import occupancy_from_logits
 from leco_plugin.models.mixture import Mixture
@@ -94,8 +94,7 @@ class Learner:
             mixture.set_bounds(found.bounds, found.median_length)
             mixture.region.look(*self.data.covering_rays())
             mixture.region.see(*self.data.rays_of_all_images())
-            for line in found.lines():
-                say(line)
+            summarize(found.summary(), found.lines())
             self.data.say_what_is_fixed()
         if run.resumed_from is not None and run.folder is not None:
             self._take_along()
@@ -228,7 +227,7 @@ class Learner:
             return False
         if not converged(age, agreement, of_those):
             return False
-        say(
+        note(
             f"step {step}: {agreement:.1%} of {len(kept)} decisions are those of "
             f"{schedule.steps_per_check} steps ago; freezing the gate"
         )
@@ -331,7 +330,7 @@ class Learner:
             found = from_first(lambda: self.held_out.unneeded(config.rays, bound), mixture.device)
             for trial in found.dropped:
                 experts.drop(trial.expert)
-            say(line_of(found, int(experts.left.sum())))
+            note(line_of(found, int(experts.left.sum())))
         self.run.forget(mixture.parameter_groups())
 
     def _watch(self, step: int, seconds: float, kept: float) -> None:

@@ -13,6 +13,10 @@ from nerfstudio.data.dataparsers.base_dataparser import DataparserOutputs
 from nerfstudio.data.dataparsers.nerfstudio_dataparser import Nerfstudio, NerfstudioDataParserConfig
 from nerfstudio.plugins.registry_dataparser import DataParserSpecification
 
+from leco_plugin.studio.commands import quiet_imports_of_our_methods
+
+quiet_imports_of_our_methods()
+
 CACHE = Path("data/leco-city")
 
 

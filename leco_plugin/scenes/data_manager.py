@@ -21,6 +21,7 @@ from nerfstudio.data.utils.dataloaders import (
     RandIndicesEvalDataloader,
 )
 from nerfstudio.model_components.ray_generators import RayGenerator
+from rich.markup import escape
 from torch import Tensor
 
 from leco_plugin.log import say
@@ -86,6 +87,8 @@ class LecoDataManager(VanillaDataManager):  # type: ignore[type-arg]
     def create_eval_dataset(self) -> Any:
         """The test photographs; there may be none."""
         dataset = names_what_it_cannot_read(super().create_eval_dataset())
+        if self.test_mode == "val":
+            say(read_in_words(self.get_datapath(), self.train_dataset, len(dataset)))
         if len(dataset) == 0:
             if self.test_mode == "val":
                 count = len(self.train_dataset)
@@ -224,6 +227,25 @@ def _turn_of(outputs: DataparserOutputs) -> Tensor | None:
             "--pipeline.datamanager.upright False leaves it as it is"
         )
     return turn
+
+
+def read_in_words(data: Path, training: Any, tests: int) -> str:
+    """What was read of a scene, in one line.
+
+    Args:
+        data: its folder or file.
+        training: the dataset of training photographs.
+        tests: how many test photographs there are.
+    """
+    sizes = picture_sizes(training)
+    height, width = sizes.amax(dim=0).tolist()
+    size = f"{'' if bool((sizes == sizes[0]).all()) else 'up to '}{width} x {height}"
+    points = points_in(training.metadata)
+    found = "no sparse points" if points is None else f"{len(points):,} sparse points"
+    name = escape((data if data.is_dir() else data.parent).resolve().name)
+    return (
+        f"{name}: {len(training)} photographs to learn from, {tests} to test with, {size}; {found}"
+    )
 
 
 def decoded_bytes(dataset: Any) -> int:

@@ -9,7 +9,7 @@ import torch
 from nerfstudio.cameras.cameras import Cameras
 from torch import Tensor
 
-from leco_plugin.log import say
+from leco_plugin.log import summarize
 from leco_plugin.models.objective import DARK
 from leco_plugin.samplers.boxes import intersect_box
 from leco_plugin.scenes.bounds import (
@@ -87,6 +87,16 @@ class Survey:
             f"{self.meeting:.1%} of {self.rays} rays meet the scene, half of them for {length}"
         )
         return [bounds.reason, *table, meeting, *([self.rounded] if self.rounded else [])]
+
+    def summary(self) -> list[str]:
+        """The same for a short screen: two lines, and a third of what was rounded."""
+        bounds, units = self.bounds, self.units
+        span = f"{bounds.near:.3g} to {bounds.far:.3g} scene units"
+        if units is not None:
+            near, far = (_in(units, each, False) for each in (bounds.near, bounds.far))
+            span += f" ({near:.3g} to {far:.3g} {units.name})"
+        rays = f"rays from {span}; {self.meeting:.1%} of {self.rays} meet the scene"
+        return [f"bounds: {bounds.reason}", f"  {rays}", *([self.rounded] if self.rounded else [])]
 
 
 def _in(units: DatasetUnits, value: float, level: bool) -> float:
@@ -180,8 +190,7 @@ def lengths_inside(bounds: SceneBounds, origins: Tensor, directions: Tensor) -> 
 
 def announce(found: Survey) -> None:
     """Says in the log where the scene lies."""
-    for line in found.lines():
-        say(line)
+    summarize(found.summary(), found.lines())
 
 
 def chosen_cameras(count: int, most: int = MOST_CAMERAS) -> Tensor:

@@ -7,6 +7,10 @@ changes for a whole process, beside random seeds of `leco shrink`, `leco capacit
 |---|---|---|---|
 | `sys.excepthook`, in nerfstudio's commands | `commands`, for `method_configs` | nerfstudio shows a
   traceback for what a user can mend | the process ends |
+| a filter of warnings, in `ns-train` of a method of ours | `commands`, for `scenes.city_dataparser`
+  | torch has renamed what nerfstudio decorates its activations with | the process ends |
+| the file of nerfstudio's console and of rich's, filters of warnings | `screen`, for `trainer` and
+  `processes` | what nobody acts on goes to a run's log file | a run is set up, trained, or over |
 | `torch.serialization.add_safe_globals` | `checkpoints` | torch 2.6 refuses the numpy scalars in
   nerfstudio's checkpoints | the process ends: nerfstudio may load again at any time |
 | `eval_load_checkpoint` of nerfstudio | `checkpoints` | damaged checkpoints, moved runs | the
@@ -25,7 +29,8 @@ changes for a whole process, beside random seeds of `leco shrink`, `leco capacit
   | `nerfacc_cpu.uninstall()`, which nothing here calls: models go on using them |
 | `mallopt` of glibc, for models on a CPU | `models.compute.device` | page faults at each step | the
   process ends: the blocks are those of all steps |
-| filters of warnings | `cli` | nerfstudio's and torch's are of no use to a user | `main` returns |
+| filters of warnings, in `leco` | `cli` | nerfstudio's and torch's are of no use to a user |
+  `main` returns |
 | methods of field classes | `evaluation.queries` | counts queries | the count is over |
 | torch's threads, `GLOO_SOCKET_IFNAME` | `conformance.samplers` | two ranks on one machine | the
   process ends, which was started for one rule |

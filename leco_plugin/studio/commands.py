@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import dataclasses
 import sys
+import warnings
 from collections.abc import Iterator
 from itertools import pairwise
 from pathlib import Path
@@ -48,6 +49,23 @@ def show_one_line_in_ns_commands() -> None:
 
     show.of_leco_plugin = True  # type: ignore[attr-defined]
     sys.excepthook = show
+
+
+OURS = ("leco-ngp", "leco-nerfacto", "leco-occupancy", "leco-occupancy-paper", "leco-switch-nerf")
+"""Methods of `ns-train` whose screen is short from its first line."""
+
+
+def quiet_imports_of_our_methods() -> None:
+    """In `ns-train` of a method of ours, nerfstudio's activations are imported without two warnings
+    of torch, which has renamed what they are decorated with.
+
+    Called by the first module of this package that nerfstudio imports, its readers, before its
+    models. What it warns of earlier cannot be kept from the screen.
+    """
+    if is_ns_command(sys.argv[0]) and sys.argv[1:2] and sys.argv[1] in OURS:
+        warnings.filterwarnings(
+            "ignore", r"`torch\.cuda\.amp\.custom_(fwd|bwd)", FutureWarning, r"nerfstudio"
+        )
 
 
 def line_of(error: BaseException) -> str | None:

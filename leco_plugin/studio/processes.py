@@ -24,6 +24,7 @@ from leco_plugin.models.failures import TrainingStopped
 from leco_plugin.scenes.input_error import InputError
 from leco_plugin.studio.checkpoints import follow_data
 from leco_plugin.studio.run_folder import claim
+from leco_plugin.studio.screen import is_short, short_screen
 from leco_plugin.studio.trainer import AtomicTrainer
 
 LOST = ("Connection closed by peer", "Connection reset by peer", "NCCL communicator was aborted")
@@ -36,6 +37,10 @@ class DataParallelTrainerConfig(TrainerConfig):
 
     _target: type = field(default_factory=lambda: AtomicTrainer)
     """target class to instantiate"""
+    verbose: bool = False
+    """Whether all details are on the screen, and nerfstudio's own lines. Else they go to the file
+    train.log in the run's folder. Without --logging.local-writer.enable nothing is measured for the
+    screen, and nothing is kept from it."""
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         """Called by yaml: data that were moved with their run are found before they are read."""
@@ -74,6 +79,11 @@ class DataParallelTrainerConfig(TrainerConfig):
             if path is not None and not path.exists():
                 raise InputError(f"--{option} {path}: there is no such folder or file")
 
+    def print_to_terminal(self) -> None:
+        """Nothing where the screen is short: the config is in its file."""
+        if not is_short(self):
+            super().print_to_terminal()
+
     def save_config(self) -> None:
         """Takes the run's folder; one that another run has, or has left, gives way to a new one."""
         wanted, reasons = self.timestamp, []
@@ -83,7 +93,8 @@ class DataParallelTrainerConfig(TrainerConfig):
             self.timestamp = f"{wanted}-{len(reasons) + 1}"
         if reasons:
             say(f"{reasons[0]}; this run goes to {self.get_base_dir()}")
-        super().save_config()
+        with short_screen(self):
+            super().save_config()
 
 
 def require_startable(machine: MachineConfig) -> None:

@@ -8,7 +8,7 @@ import signal
 import threading
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -21,6 +21,7 @@ from nerfstudio.utils.decorators import check_main_thread
 from leco_plugin.learning.collapse import GateCollapsed
 from leco_plugin.learning.progress import Progress
 from leco_plugin.log import say, say_what_is_logged
+from leco_plugin.models.compute.ranks import is_first
 from leco_plugin.models.failures import TrainingStopped
 from leco_plugin.samplers.kernels import VARIABLE, kernels_off
 from leco_plugin.scenes.input_error import InputError
@@ -32,6 +33,8 @@ from leco_plugin.studio.run_folder import (
     keep_sizes,
     with_sizes_of,
 )
+from leco_plugin.studio.run_progress import RunProgress
+from leco_plugin.studio.screen import short_screen, without_tables
 
 HEARD = "\nstopping after this step; Ctrl-C once more stops at once\n"
 
@@ -104,6 +107,12 @@ class AtomicTrainer(Trainer):
     """What it took."""
     asked_to_stop: threading.Event | None = None
     """Set by Ctrl-C while it trains alone."""
+    progress: RunProgress | None = None
+    """What the screen says of the run; None where it says nothing."""
+
+    def __init__(self, config: Any, *arguments: Any, **options: Any) -> None:
+        with short_screen(config):
+            super().__init__(config, *arguments, **options)
 
     def setup(self, *arguments: Any, **options: Any) -> None:
         """As nerfstudio's, in the sizes of the run that is gone on with; then checkpoints are also
@@ -114,11 +123,20 @@ class AtomicTrainer(Trainer):
                 not those that are set by hand, the scene has other photographs now, or there is no
                 kernel of a name that is to be off.
         """
+        with short_screen(self.config):
+            self._setup(*arguments, **options)
+
+    def _setup(self, *arguments: Any, **options: Any) -> None:
         say_what_is_logged()
         _say_which_kernels_are_off()
         asked = self.config.pipeline.model
-        self.config = with_sizes_of(self.config, checkpoint_of(self.config))
-        super().setup(*arguments, **options)
+        self.config = config = with_sizes_of(self.config, checkpoint_of(self.config))
+        if config.logging.local_writer.enable:
+            self.config = without_tables(config)
+        try:
+            super().setup(*arguments, **options)
+        finally:
+            self.config = config
         if self._start_step >= end_of(self):
             raise InputError(
                 f"the checkpoint has {self._start_step} steps already: this nerfstudio counts them "
@@ -129,10 +147,19 @@ class AtomicTrainer(Trainer):
         where = [TrainingCallbackLocation.AFTER_TRAIN_ITERATION]
         self.callbacks.append(TrainingCallback(where, self.save_by_the_clock))
         self.callbacks.append(TrainingCallback(where, self.stop_if_asked))
+        if self.config.logging.local_writer.enable and is_first():
+            self.progress = RunProgress(self, end_of(self))
 
     def setup_optimizers(self) -> Optimizers:
         """nerfstudio's, which resume with the parameters that a checkpoint has left the model."""
         return PrunedOptimizers(self.config.optimizers.copy(), self.pipeline)
+
+    def train_iteration(self, step: int) -> Any:
+        """As nerfstudio's; the PSNR of its batch is kept for the screen."""
+        outputs = super().train_iteration(step)
+        if self.progress is not None:
+            self.progress.note_batch(outputs[2])
+        return outputs
 
     def save_by_the_clock(self, step: int) -> None:
         """Saves if the last time is long ago; nothing where a run is to save nothing, or keeps all
@@ -169,11 +196,12 @@ class AtomicTrainer(Trainer):
             TrainingStopped: a loss is not finite, and the step was not taken; the gate has
                 collapsed more often than it may; or somebody has pressed Ctrl-C.
         """
-        if self.world_size > 1:  # its processes would not stop after the same step
-            self._train()
-            return
-        with catch_first_interrupt() as self.asked_to_stop:
-            self._train()
+        with short_screen(self.config), self.progress or nullcontext():
+            if self.world_size > 1:  # its processes would not stop after the same step
+                self._train()
+                return
+            with catch_first_interrupt() as self.asked_to_stop:
+                self._train()
 
     def _train(self) -> None:
         try:

@@ -13,7 +13,7 @@ from typing import Any
 
 import torch
 
-from leco_plugin.log import say
+from leco_plugin.log import summarize
 from leco_plugin.models.encodings import EncodingConfig
 from leco_plugin.models.gate import GateConfig
 from leco_plugin.models.sizing.size_limits import (
@@ -82,9 +82,18 @@ def complete(
         made = choose(wanted, most, detail, images, memory_of(device))
     except ValueError as error:
         raise InputError(str(error)) from None
-    for line in made.lines:
-        say(line)
+    summarize([summary(made.sizes, images)] if made.lines else [], made.lines)
     return made.sizes
+
+
+def summary(sizes: Sizes, images: int) -> str:
+    """Complete sizes in one line, for a short screen."""
+    encoding, experts, gate = sizes.field.encoding, sizes.field.experts, sizes.gate
+    return (
+        f"sizes: field {values_of(sizes, images):,} parameters, {encoding.levels} levels of "
+        f"2^{encoding.log2_table} up to {encoding.finest} cells, {experts.scene_experts} experts "
+        f"{experts.width} wide; gate {gate.encoding.octaves} octaves, {gate.width} wide"
+    )
 
 
 def choose(

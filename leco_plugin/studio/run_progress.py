@@ -1,0 +1,130 @@
+"""What the screen says while a run of nerfstudio's trainer goes on, and when it is over."""
+
+from __future__ import annotations
+
+import shlex
+import time
+from contextlib import ExitStack
+from pathlib import Path
+from typing import Any
+
+from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackLocation
+from rich.markup import escape
+from torch import Tensor, nn
+
+from leco_plugin.evaluation.held_out_psnr import OF, HeldOutPsnr
+from leco_plugin.learning.freezing import FILE_NAME
+from leco_plugin.log import Show, bar, on_screen, say, spell
+from leco_plugin.studio.run_folder import CONFIG
+from leco_plugin.studio.screen import LOG
+
+OF_TRAINING = "on training pixels"
+"""Of what PSNR is where a data manager holds out none."""
+
+
+class RunProgress:
+    """Stands around the steps of a run: a bar with PSNR, and in the end where everything lies.
+
+    Args:
+        trainer: set up.
+        end: steps of the run when it ends.
+    """
+
+    def __init__(self, trainer: Any, end: int) -> None:
+        self.trainer, self.end = trainer, end
+        self.psnr = HeldOutPsnr(trainer.pipeline.model, trainer.pipeline.datamanager)
+        self.of_batch: Any = None
+        self.began, self.steps = time.monotonic(), 0
+        self._bar = ExitStack()
+        self._show: Show | None = None
+        where = TrainingCallbackLocation
+        trainer.callbacks.append(TrainingCallback([where.AFTER_TRAIN_ITERATION], self.after_step))
+        trainer.callbacks.append(TrainingCallback([where.AFTER_TRAIN], self.finish))
+        self._say_where()
+
+    def __enter__(self) -> RunProgress:
+        self.began = time.monotonic()
+        return self
+
+    def __exit__(self, *_: Any) -> None:
+        self._bar.close()
+
+    def _say_where(self) -> None:
+        folder, viewer = self.trainer.base_dir, self.trainer.viewer_state
+        say(f"run: {escape(str(folder))}" + (f", details in {LOG}" if on_screen() else ""))
+        for line in getattr(viewer, "viewer_info", None) or ():
+            say(escape(line))
+
+    def after_step(self, step: int) -> None:
+        """Measures where that is due, and shows how far the run is.
+
+        The bar begins after the first step: before it, what learns first has one of its own.
+        """
+        self.steps += 1
+        if self._show is None:
+            self.psnr.begin()
+            self._show = self._bar.enter_context(bar("Training"))
+        self.psnr.look()
+        figures = [f"step {step + 1} of {self.end}", self._words(), _phase(self.trainer)]
+        self._show((step + 1) / self.end, ", ".join(filter(None, figures)))
+
+    def note_batch(self, metrics: dict[str, Any]) -> None:
+        """Keeps the PSNR of a training batch, if the model computes one."""
+        found = metrics.get("psnr")
+        self.of_batch = found.detach() if isinstance(found, Tensor) else found
+
+    def _words(self) -> str:
+        if self.psnr.has_pixels or self.of_batch is None:
+            return self.psnr.words()
+        return f"{float(self.of_batch):.1f} dB {OF_TRAINING}"
+
+    def finish(self, step: int) -> None:
+        """Measures once more, and says what was reached, where it lies, and what to do next."""
+        self._bar.close()
+        seconds, pixels = time.monotonic() - self.began, self.psnr.look_last()
+        reached = self._words().replace(OF, f"on {pixels:,} held-out pixels")
+        line = f"finished: {self.steps} steps in {spell(seconds)}"
+        say(f"{line}, {reached}" if reached else line)
+        folder = Path(self.trainer.base_dir)
+        occupancy = folder / FILE_NAME
+        say(f"  run        {escape(str(folder))}")
+        if occupancy.exists():
+            say(f"  occupancy  {escape(str(occupancy))}, {occupancy.stat().st_size / 1e3:.0f} kB")
+        say("next:")
+        for command in next_commands(folder, occupancy.exists(), _has_tests(self.trainer)):
+            say(f"  {escape(command)}")
+
+
+def next_commands(folder: Path, occupancy: bool, tests: bool) -> list[str]:
+    """What to run after a run: to look at it, to measure it, and to see its occupancy.
+
+    Args:
+        folder: of the run.
+        occupancy: whether it has left one.
+        tests: whether there are photographs to measure it by.
+    """
+    config = shlex.quote(str(folder / CONFIG))
+
+    def out(name: str) -> str:
+        return shlex.quote(str(folder / name))
+
+    viewer = f"ns-viewer --load-config {config}"
+    evaluate = f"ns-eval --load-config {config} --output-path {out('eval.json')}"
+    render = f"ns-render interpolate --load-config {config} --output-path {out('path.mp4')}"
+    inspect = f"leco inspect {out(FILE_NAME)} --picture {out('occupancy.png')}"
+    if not tests:
+        evaluate = f"{render} --pose-source train"
+    return [viewer, evaluate, *([inspect] if occupancy else [])]
+
+
+def _phase(trainer: Any) -> str:
+    """What a model is doing; nothing of one that has no occupancy."""
+    model: nn.Module = trainer.pipeline.model
+    frozen = getattr(getattr(model, "mixture", None), "frozen", None)
+    if frozen is None:
+        return "guided" if hasattr(model, "leco_guide") else ""
+    return "guided" if bool(frozen) else "learning the occupancy"
+
+
+def _has_tests(trainer: Any) -> bool:
+    return bool(trainer.pipeline.datamanager.eval_dataset)

@@ -1,0 +1,133 @@
+"""The screen of a run is short and says what matters; the details are in its log file."""
+
+from __future__ import annotations
+
+import copy
+import re
+import sys
+import warnings
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+import rich
+import torch
+from nerfstudio.scripts.train import main
+from nerfstudio.utils import profiler, writer
+from nerfstudio.utils.rich_utils import CONSOLE
+from tiny_run import tiny_config
+
+from leco_plugin.evaluation import held_out_psnr
+from leco_plugin.host_configs import leco_ngp
+from leco_plugin.studio.run_progress import next_commands
+from leco_plugin.studio.screen import LOG, short_screen
+
+MOST_LINES = 40
+
+
+def watched(scene: Path, outputs: Path) -> Any:
+    """The config of a short run whose screen somebody watches."""
+    config = tiny_config(scene, outputs, candidates=32)
+    config.logging.local_writer.enable = True
+    config.max_num_iterations = 12
+    return config
+
+
+@pytest.fixture(autouse=True)
+def nothing_left_over(monkeypatch: pytest.MonkeyPatch) -> None:
+    """nerfstudio keeps writers and profilers of a process for ever."""
+    monkeypatch.setattr(writer, "EVENT_WRITERS", [])
+    monkeypatch.setattr(profiler, "PROFILER", [])
+    monkeypatch.setattr(held_out_psnr, "FIRST_AFTER", 0.0)
+
+
+def run(config: Any, capsys: pytest.CaptureFixture[str]) -> tuple[list[str], str, Path]:
+    """Trains as `ns-train` does: lines on the screen, the log file, and the run's folder."""
+    main(config)
+    out, err = capsys.readouterr()
+    folder = config.get_base_dir()
+    return [*out.splitlines(), *err.splitlines()], (folder / LOG).read_text(), folder
+
+
+def test_the_screen_fits_and_ends_with_what_to_do_next(
+    tiny_scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    lines, log, folder = run(watched(tiny_scene, tmp_path), capsys)
+    screen = "\n".join(lines)
+    assert len(lines) <= MOST_LINES
+    assert re.search(r"photographs to learn from, \d+ to test with, 32 x 32; ", screen)
+    assert "sizes: " in screen and "bounds: " in screen and "occupancy learned in" in screen
+    assert re.search(r"finished: 12 steps in .*, \d+\.\d dB on [\d,]+ held-out pixels", screen)
+    assert [line.split()[0] for line in lines[-3:]] == ["ns-viewer", "ns-eval", "leco"]
+    assert str(folder / "occupancy.safetensors") in screen
+    for detail in ("DataParallelTrainerConfig(", "Caching all", "hash table", "scene units  "):
+        assert detail not in screen
+    for detail in ("Caching all", "hash table", "Training Finished", "wrote ", "measured in"):
+        assert detail in log
+    assert "\x1b" not in log
+
+
+def test_a_guided_host_shows_psnr_while_it_learns_and_after(
+    tiny_scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    learned = watched(tiny_scene, tmp_path)
+    config = copy.deepcopy(leco_ngp.config)
+    for name in ("output_dir", "experiment_name", "timestamp", "vis", "data", "logging"):
+        setattr(config, name, getattr(learned, name))
+    config.max_num_iterations = 3
+    config.pipeline.datamanager.data = tiny_scene
+    learning = config.pipeline.model.occupancy.learning
+    learning.schedule = replace(learning.schedule, learn_steps=20)
+    learning.sizes = learned.pipeline.model.sizes
+    lines, log, _ = run(config, capsys)
+    assert len(lines) <= MOST_LINES
+    assert re.search(r"finished: 3 steps in .*, \d+\.\d dB on [\d,]+ held-out pixels", lines[-7])
+    learning, _, training = log.partition("occupancy learned in")
+    assert "measured in" in learning and "measured in" in training
+
+
+def test_verbose_keeps_nothing_from_the_screen(
+    tiny_scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    config = watched(tiny_scene, tmp_path)
+    config.verbose = True
+    main(config)
+    screen = capsys.readouterr().out
+    for detail in ("DataParallelTrainerConfig(", "Caching all", "hash table", "held-out pixels"):
+        assert detail in screen
+    assert not (config.get_base_dir() / LOG).exists()
+
+
+def test_consoles_and_warnings_are_as_before_when_it_is_over(tmp_path: Path) -> None:
+    config = watched(tmp_path, tmp_path)
+    before = warnings.filters[:]
+    with pytest.raises(KeyboardInterrupt), short_screen(config):
+        assert CONSOLE.file is not sys.stdout and warnings.filters != before
+        raise KeyboardInterrupt
+    assert CONSOLE.file is rich.get_console().file is sys.stdout
+    assert warnings.filters == before
+
+
+def test_what_is_measured_changes_no_weight(
+    tiny_scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(held_out_psnr, "BETWEEN", 0.0)
+    monkeypatch.setattr(held_out_psnr, "SHARE_OF_TIME", 1.0)
+    weights = []
+    for shown in (True, False):
+        config = watched(tiny_scene, tmp_path / str(shown))
+        config.logging.local_writer.enable = shown
+        main(config)
+        (path,) = (config.get_checkpoint_dir()).glob("*.ckpt")
+        weights.append(torch.load(path)["pipeline"])
+    tensors = [{k: v for k, v in each.items() if isinstance(v, torch.Tensor)} for each in weights]
+    assert [key for key in tensors[0] if not torch.equal(tensors[0][key], tensors[1][key])] == []
+
+
+def test_commands_are_of_what_there_is() -> None:
+    viewer, evaluate, inspect = next_commands(Path("a run"), occupancy=True, tests=True)
+    assert viewer == "ns-viewer --load-config 'a run/config.yml'"
+    assert evaluate.startswith("ns-eval ") and inspect.startswith("leco inspect 'a run/occ")
+    _, render = next_commands(Path("run"), occupancy=False, tests=False)
+    assert render.startswith("ns-render interpolate ") and render.endswith("--pose-source train")
