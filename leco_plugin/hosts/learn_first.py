@@ -16,7 +16,7 @@ from leco_plugin.learning.learner import Learner
 from leco_plugin.learning.progress import Progress
 from leco_plugin.learning.run import LearningOnly
 from leco_plugin.learning.schedule import MOST_EXTENSIONS, RATES, steps_of_an_extension
-from leco_plugin.log import bar, on_screen
+from leco_plugin.log import Show, bar, on_screen
 from leco_plugin.models.compute.optimizers import FusedAdamConfig
 from leco_plugin.models.compute.ranks import averaging, is_first, mean
 from leco_plugin.models.leco import LecoModel
@@ -106,17 +106,24 @@ def learn_model(
         learner = model.learner(manager, run)
         learner.data.rays_per_batch = rays
         learner.begin()
-        psnr = HeldOutPsnr(model, manager) if on_screen() and is_first() else None
         with bar("Learning the occupancy") as show:
-
-            def look(share: float) -> None:
-                if psnr is not None and not bool(model.mixture.frozen):
-                    psnr.look()  # not of a frozen gate, whose sampler would have to be built
-                show(share, "" if psnr is None else psnr.words())
-
-            _train(model, trained, learner, seconds, look)
+            _train(model, trained, learner, seconds, _with_psnr(model, manager, show))
     learned: LecoModel = model
     return learned
+
+
+def _with_psnr(model: LecoModel, manager: Any, show: Show) -> Callable[[float], None]:
+    """What shows how far learning is, with PSNR where somebody watches."""
+    if not (on_screen() and is_first()):
+        return show
+    psnr = HeldOutPsnr(model, manager)
+
+    def look(share: float) -> None:
+        if not bool(model.mixture.frozen):  # of a frozen gate a sampler would have to be built
+            psnr.look()
+        show(share, psnr.words())
+
+    return look
 
 
 @contextmanager
