@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 from functools import cached_property
 from typing import Any
@@ -12,6 +13,7 @@ from torch import Tensor
 
 from leco_plugin.evaluation.metrics import psnr
 from leco_plugin.learning.dense import evaluating
+from leco_plugin.learning.quality import doubts_of_field, psnr_of_one_colour
 from leco_plugin.log import note
 from leco_plugin.scenes.learning_data import held_out_bundle
 from leco_plugin.scenes.pixels.held_out_pixels import held_out_sampler
@@ -38,6 +40,7 @@ class HeldOutPsnr:
 
     Attributes:
         latest: dB, None until it was measured.
+        of_one_colour: dB of their mean colour on the same pixels.
         spent: seconds that measuring has taken.
     """
 
@@ -46,6 +49,7 @@ class HeldOutPsnr:
         self.spent = self.cost = 0.0
         self.begin()
         self.latest: float | None = None
+        self.of_one_colour = math.inf
         self.pixels: tuple[RayBundle, Tensor] | None = None
 
     def begin(self) -> None:
@@ -95,6 +99,7 @@ class HeldOutPsnr:
             rgb = torch.cat([self.model(chunk)["rgb"][:, :3].float() for chunk in chunks])
             colours = true_colours(self.model, truth.to(device).float())
             self.latest = psnr(rgb.clamp(0.0, 1.0), colours)
+            self.of_one_colour = psnr_of_one_colour(colours)
         now = time.monotonic()
         self.cost = now - started
         self.spent += now - began
@@ -105,3 +110,7 @@ class HeldOutPsnr:
     def words(self) -> str:
         """The latest figure in words; nothing where there is none."""
         return "" if self.latest is None else f"{self.latest:.1f} dB {OF}"
+
+    def doubts(self) -> list[str]:
+        """Two lines where the latest figure is hardly above that of one colour for all pixels."""
+        return [] if self.latest is None else doubts_of_field(self.latest, self.of_one_colour)

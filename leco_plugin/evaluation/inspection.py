@@ -10,6 +10,12 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from leco_plugin.learning.quality import (
+    FIELD,
+    ONE_COLOUR,
+    doubts_of_field,
+    doubts_of_occupancy,
+)
 from leco_plugin.occupancy import SEEN_CELLS, Occupancy
 
 POINTS_AT_ONCE = 1 << 16
@@ -64,6 +70,20 @@ def describe(occupancy: Occupancy) -> dict[str, Any]:
         "gate": occupancy.gate.config.to_dict(),
         "report": occupancy.report,
     }
+
+
+def doubts(facts: dict[str, Any]) -> list[str]:
+    """What was said when the occupancy was frozen, if it or its field are of no use.
+
+    Args:
+        facts: of `describe`.
+    """
+    field, one_colour = (facts["report"].get(name) for name in (FIELD, ONE_COLOUR))
+    found: list[str] = []
+    if isinstance(field, float) and isinstance(one_colour, float):
+        found = doubts_of_field(field, one_colour)
+    kept = facts["kept_share_of_box"] / max(facts["seen_share_of_box"], 1e-12)
+    return found or doubts_of_occupancy(kept)
 
 
 def whole_box(occupancy: Occupancy) -> ViewBox:

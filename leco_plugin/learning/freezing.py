@@ -7,6 +7,7 @@ that the gate was calibrated on can. It is saved, and smaller gates are measured
 from __future__ import annotations
 
 import copy
+import math
 import shutil
 from pathlib import Path
 from pickle import UnpicklingError
@@ -22,6 +23,7 @@ from leco_plugin.learning.calibration import (
     calibrate,
 )
 from leco_plugin.learning.dense import dense_rendering, evaluating
+from leco_plugin.learning.quality import FIELD, ONE_COLOUR, psnr_of_one_colour
 from leco_plugin.log import note, say
 from leco_plugin.models.mixture import Mixture
 from leco_plugin.models.rendering import Rays
@@ -50,11 +52,15 @@ def price(
         rendering = dense_rendering(mixture, rays, truth, config.rays_at_once)
         measured = calibrate(*rendering, config)
         of_backdrop = backdrop_price(*rendering)
+        rendered = torch.cat([reference.rgb for reference in rendering.references])
+        error = float((rendered.clamp(0.0, 1.0) - truth).double().square().mean())
     rule, region = mixture.rule(), mixture.region
     return measured, {
         "params": sum(p.numel() for p in mixture.gate.parameters()),
         **measured._asdict(),
         BACKDROP_PRICE: round(of_backdrop, 4),
+        FIELD: round(-10.0 * math.log10(max(error, 1e-12)), 3),
+        ONE_COLOUR: round(min(psnr_of_one_colour(truth), 120.0), 3),
         "calibration_rays": len(truth),
         "near": float(region.near),
         "far": float(region.far),

@@ -10,6 +10,7 @@ import time
 from functools import cached_property
 from typing import TYPE_CHECKING
 
+from rich.markup import escape
 from torch import Tensor
 
 from leco_plugin.learning.collapse import STEPS_PER_LOOK, is_dense
@@ -20,6 +21,13 @@ from leco_plugin.learning.merging import line_of
 from leco_plugin.learning.plan import LearnerConfig, StepPlan, plan_of
 from leco_plugin.learning.price_watch import PriceWatch
 from leco_plugin.learning.progress import Progress, WatchState
+from leco_plugin.learning.quality import (
+    FIELD,
+    ONE_COLOUR,
+    doubts_of_field,
+    doubts_of_occupancy,
+    kept_of_seen,
+)
 from leco_plugin.learning.recoveries import Recoveries
 from leco_plugin.learning.run import Run, keep_pace
 from leco_plugin.learning.schedule import (
@@ -95,6 +103,8 @@ class Learner:
             mixture.region.look(*self.data.covering_rays())
             mixture.region.see(*self.data.rays_of_all_images())
             summarize(found.summary(), found.lines())
+            for line in self.data.doubts():
+                say(escape(line))
             self.data.say_what_is_fixed()
         if run.resumed_from is not None and run.folder is not None:
             self._take_along()
@@ -277,6 +287,7 @@ class Learner:
             if self.run.goes_on:
                 self._merge()
             self._sharpen(step, self.run.left(step), guided=False)
+        self._say_doubts()
         progress.watch = self.watch.state = WatchState()
         progress.suspected_since = -1  # of the gate as it is now
         if schedule.steps_per_record > 0:
@@ -285,6 +296,13 @@ class Learner:
             self.recoveries.restart_field()
             say("the field starts anew, guided from its first step")
         self.run.save(step)  # a run killed from now on stays frozen
+
+    def _say_doubts(self) -> None:
+        """Says what is wrong with a field or an occupancy that are of no use."""
+        report = self.mixture.report
+        found = doubts_of_field(report.get(FIELD, math.inf), report.get(ONE_COLOUR, math.inf))
+        for line in found or doubts_of_occupancy(kept_of_seen(self.mixture)):
+            say(escape(line))
 
     def _sharpen(self, step: int, steps: float, guided: bool) -> None:
         """Has a small gate skip in place of the learned one where it skips more, and says so.

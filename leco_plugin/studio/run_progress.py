@@ -85,6 +85,8 @@ class RunProgress:
         reached = self._words().replace(OF, f"on {pixels:,} held-out pixels")
         line = f"finished: {self.steps} steps in {spell(seconds)}"
         say(f"{line}, {reached}" if reached else line)
+        for doubt in self.psnr.doubts():
+            say(escape(doubt))
         folder = Path(self.trainer.base_dir)
         occupancy = folder / FILE_NAME
         say(f"  run        {escape(str(folder))}")

@@ -1,0 +1,72 @@
+"""Whether what was learned is worth anything: two lines say so where it is not."""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from torch import Tensor
+
+from leco_plugin.models.mixture import Mixture
+
+MOST_KEPT = 0.8
+"""Share of the space that photographs show which an occupancy of use keeps at most."""
+LEAST_GAIN_DB = 1.0
+"""PSNR by which a field that has learned something is above one colour for all pixels."""
+FIELD, ONE_COLOUR = "field_psnr_db", "one_colour_psnr_db"
+"""Names in a report: PSNR on the calibration rays, of the field and of their mean colour."""
+PLACES = 1 << 14
+
+
+def psnr_of_one_colour(truth: Tensor) -> float:
+    """PSNR of the mean colour of pixels [R, 3] against them, dB; infinite where all are alike."""
+    error = (
+        float((truth.double() - truth.double().mean(dim=0)).square().mean()) if len(truth) else 0.0
+    )
+    return -10.0 * math.log10(error) if error > 0.0 else math.inf
+
+
+@torch.no_grad()
+def kept_of_seen(mixture: Mixture) -> float:
+    """Share of the space that training rays cross which a frozen mixture keeps; 0 where they cross
+    none."""
+    generator = torch.Generator().manual_seed(0)
+    mapped = torch.rand(PLACES, 3, generator=generator).to(mixture.device) * 2.0 - 1.0
+    mapped = mapped[mixture.region.seen(mapped)]
+    if len(mapped) == 0:
+        return 0.0
+    kept = mixture.occupancies(mapped) >= mixture.threshold
+    return float(kept.double().mean())
+
+
+def doubts_of_field(field: float, one_colour: float) -> list[str]:
+    """Two lines on a field that shows hardly more than one colour; none on a good one.
+
+    Args:
+        field, one_colour: PSNR on the same held-out pixels, dB.
+    """
+    if not (math.isfinite(field) and math.isfinite(one_colour)):
+        return []
+    if field >= one_colour + LEAST_GAIN_DB:
+        return []
+    return [
+        f"this scene was not learned: {field:.1f} dB on held-out pixels, where one colour for all "
+        f"has {one_colour:.1f} dB",
+        "what helps: more photographs, sparse points (`leco points SCENE`), or poses that fit them "
+        "(`leco poses PHOTOS --out SCENE`)",
+    ]
+
+
+def doubts_of_occupancy(kept: float) -> list[str]:
+    """Two lines on an occupancy that keeps nearly everything; none on one of use.
+
+    Args:
+        kept: share of what photographs show.
+    """
+    if kept <= MOST_KEPT:
+        return []
+    return [
+        f"this occupancy is of little use: it keeps {kept:.0%} of the space that photographs show",
+        "what helps: sparse points (`leco points SCENE`), more photographs, or more steps of "
+        "learning (schedule.learn-steps)",
+    ]

@@ -1,0 +1,45 @@
+"""A field that shows one colour, or an occupancy that keeps everything, is said to be of no use."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+import torch
+
+from leco_plugin.evaluation.inspection import doubts
+from leco_plugin.learning.quality import (
+    FIELD,
+    ONE_COLOUR,
+    doubts_of_field,
+    doubts_of_occupancy,
+    psnr_of_one_colour,
+)
+
+
+def test_one_colour_is_scored_as_the_mean_of_all_pixels() -> None:
+    truth = torch.tensor([[0.0, 0.0, 0.0], [0.2, 0.2, 0.2]])
+    assert psnr_of_one_colour(truth) == pytest.approx(20.0, abs=1e-4)
+    assert psnr_of_one_colour(torch.full((4, 3), 0.3)) == math.inf
+
+
+@pytest.mark.parametrize(("field", "said"), [(7.0, True), (11.3, True), (11.5, False)])
+def test_a_field_within_one_db_of_one_colour_is_doubted(field: float, said: bool) -> None:
+    lines = doubts_of_field(field, 10.4)
+    assert len(lines) == (2 if said else 0)
+    assert not said or ("10.4 dB" in lines[0] and "leco points" in lines[1])
+
+
+def test_an_occupancy_that_keeps_most_of_what_is_seen_is_doubted() -> None:
+    assert doubts_of_occupancy(0.79) == []
+    assert "93%" in doubts_of_occupancy(0.93)[0]
+
+
+def test_inspection_repeats_what_was_said() -> None:
+    facts = {"report": {}, "kept_share_of_box": 0.3, "seen_share_of_box": 0.33}
+    assert "91%" in doubts(facts)[0]
+    facts["report"] = {FIELD: 7.0, ONE_COLOUR: 10.4}
+    assert "7.0 dB" in doubts(facts)[0]
+    facts = {"report": {FIELD: 20.0, ONE_COLOUR: 10.4}, **{k: 0.1 for k in facts if "share" in k}}
+    facts["seen_share_of_box"] = 0.5
+    assert doubts(facts) == []
