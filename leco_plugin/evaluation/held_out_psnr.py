@@ -26,6 +26,8 @@ SHARE_OF_TIME = 0.01
 RAYS, FEWEST_LAST, MOST_LAST = 256, 1024, 8192
 """Rays of a measurement; of the last one, the fewest and the most."""
 OF = "on held-out pixels"
+TEST_PHOTOGRAPHS = 8
+"""That are looked at when a run is over."""
 
 
 class HeldOutPsnr:
@@ -90,16 +92,10 @@ class HeldOutPsnr:
         began = time.monotonic()
         bundle, truth = self._drawn(count)
         started = time.monotonic()
-        device = self.model.device
-        cards = [device] if torch.device(device).type == "cuda" else []
-        with torch.random.fork_rng(cards), evaluating(self.model):
-            chunks = [
-                bundle[at : at + FEWEST_LAST].to(device) for at in range(0, len(truth), FEWEST_LAST)
-            ]
-            rgb = torch.cat([self.model(chunk)["rgb"][:, :3].float() for chunk in chunks])
-            colours = true_colours(self.model, truth.to(device).float())
-            self.latest = psnr(rgb.clamp(0.0, 1.0), colours)
-            self.of_one_colour = psnr_of_one_colour(colours)
+        at = range(0, len(truth), FEWEST_LAST)
+        self.latest = self._psnr_of(
+            [(bundle[i : i + FEWEST_LAST], truth[i : i + FEWEST_LAST]) for i in at]
+        )
         now = time.monotonic()
         self.cost = now - started
         self.spent += now - began
@@ -107,10 +103,46 @@ class HeldOutPsnr:
         note(f"{self.words()}, measured in {self.cost:.2f} s; {self.spent:.2f} s in all")
         return len(truth)
 
+    @torch.no_grad()
+    def _psnr_of(self, pixels: list[tuple[RayBundle, Tensor]]) -> float:
+        """PSNR of rendered rays, by chunks with their true colours [R, 3 or 4]; notes that of their
+        mean colour."""
+        device = self.model.device
+        cards = [device] if torch.device(device).type == "cuda" else []
+        with torch.random.fork_rng(cards), evaluating(self.model):
+            rgb = torch.cat(
+                [self.model(rays.to(device))["rgb"][:, :3].float() for rays, _ in pixels]
+            )
+            truth = torch.cat([truth for _, truth in pixels]).to(device).float()
+            colours = true_colours(self.model, truth)
+        self.of_one_colour = psnr_of_one_colour(colours)
+        return psnr(rgb.clamp(0.0, 1.0), colours)
+
     def words(self) -> str:
         """The latest figure in words; nothing where there is none."""
         return "" if self.latest is None else f"{self.latest:.1f} dB {OF}"
 
-    def doubts(self) -> list[str]:
-        """Two lines where the latest figure is hardly above that of one colour for all pixels."""
-        return [] if self.latest is None else doubts_of_field(self.latest, self.of_one_colour)
+    def look_at_tests(self) -> float | None:
+        """PSNR on pixels of up to `TEST_PHOTOGRAPHS` test photographs; None where there are none.
+
+        They are new views: a field can be good on pixels of photographs that it was trained on, and
+        fail there. From now on they are those that `of_one_colour` is of.
+        """
+        dataset: Any = getattr(self.manager, "eval_dataset", None)
+        if dataset is None or len(dataset) == 0:
+            return None
+        count = min(TEST_PHOTOGRAPHS, len(dataset))
+        generator, cameras = torch.Generator().manual_seed(0), dataset.cameras.to("cpu")
+        found: list[tuple[RayBundle, Tensor]] = []
+        for number in torch.linspace(0, len(dataset) - 1, count).round().long().tolist():
+            image = dataset.get_data(number)["image"]
+            places = torch.rand(FEWEST_LAST // count, 2, generator=generator)
+            rows, columns = (places * torch.tensor(image.shape[:2])).long().unbind(-1)
+            coords = torch.stack([rows, columns], dim=-1) + 0.5
+            rays = cameras.generate_rays(camera_indices=number, coords=coords)
+            found.append((rays, image[rows, columns]))
+        return self._psnr_of(found)
+
+    def doubts(self, reached: float | None) -> list[str]:
+        """Two lines where a PSNR is hardly above that of one colour for all of its pixels."""
+        return [] if reached is None else doubts_of_field(reached, self.of_one_colour)

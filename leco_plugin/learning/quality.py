@@ -32,6 +32,8 @@ def kept_of_seen(mixture: Mixture) -> float:
     none."""
     generator = torch.Generator().manual_seed(0)
     mapped = torch.rand(PLACES, 3, generator=generator).to(mixture.device) * 2.0 - 1.0
+    if mixture.region.space.kind == "contraction":
+        mapped *= 0.5  # the inner cube: beyond it, little is seen of much
     mapped = mapped[mixture.region.seen(mapped)]
     if len(mapped) == 0:
         return 0.0
@@ -50,8 +52,8 @@ def doubts_of_field(field: float, one_colour: float) -> list[str]:
     if field >= one_colour + LEAST_GAIN_DB:
         return []
     return [
-        f"this scene was not learned: {field:.1f} dB on held-out pixels, where one colour for all "
-        f"has {one_colour:.1f} dB",
+        f"this scene was not learned: {field:.1f} dB on pixels that were held out, where one colour "
+        f"for all has {one_colour:.1f} dB",
         "what helps: more photographs, sparse points (`leco points SCENE`), or poses that fit them "
         "(`leco poses PHOTOS --out SCENE`)",
     ]

@@ -84,8 +84,10 @@ class RunProgress:
         seconds, pixels = time.monotonic() - self.began, self.psnr.look_last()
         reached = self._words().replace(OF, f"on {pixels:,} held-out pixels")
         line = f"finished: {self.steps} steps in {spell(seconds)}"
-        say(f"{line}, {reached}" if reached else line)
-        for doubt in self.psnr.doubts():
+        tested = self.psnr.look_at_tests()
+        of_tests = "" if tested is None else f"{tested:.1f} dB on test photographs"
+        say(", ".join(filter(None, [line, reached, of_tests])))
+        for doubt in self.psnr.doubts(self.psnr.latest if tested is None else tested):
             say(escape(doubt))
         folder = Path(self.trainer.base_dir)
         occupancy = folder / FILE_NAME
