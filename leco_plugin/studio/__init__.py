@@ -29,7 +29,8 @@ changes for a whole process, beside random seeds of `leco shrink`, `leco capacit
   | `nerfacc_cpu.uninstall()`, which nothing here calls: models go on using them |
 | `mallopt` of glibc, for models on a CPU | `models.compute.device` | page faults at each step | the
   process ends: the blocks are those of all steps |
-| filters of warnings, in `leco` | `cli` | nerfstudio's and torch's are of no use to a user | `main` returns |
+| filters of warnings, in `leco` | `cli` | nerfstudio's and torch's are of no use to a user |
+  `main` returns |
 | methods of field classes | `evaluation.queries` | counts queries | the count is over |
 | torch's threads, `GLOO_SOCKET_IFNAME` | `conformance.samplers` | two ranks on one machine | the
   process ends, which was started for one rule |
