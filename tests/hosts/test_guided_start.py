@@ -299,8 +299,8 @@ def test_with_a_file_nothing_is_said_of_bounds_for_learning_one(
     data: Data, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     said: list[str] = []
-    for module in ("scenes.survey", "hosts.guided_start"):
-        monkeypatch.setattr(f"leco_plugin.{module}.say", said.append)
+    for name in ("log.note", "hosts.guided_start.say"):
+        monkeypatch.setattr(f"leco_plugin.{name}", said.append)
     started(lopsided(data), data)
     (line,) = said
     assert line.startswith("guided by an occupancy that keeps ")

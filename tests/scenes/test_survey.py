@@ -186,7 +186,7 @@ def test_one_city_in_two_formats_has_the_same_bounds_in_metres(
 
 def test_every_line_reaches_the_log(monkeypatch: pytest.MonkeyPatch) -> None:
     said: list[str] = []
-    monkeypatch.setattr("leco_plugin.scenes.survey.say", said.append)
+    monkeypatch.setattr("leco_plugin.log.note", said.append)
     found = survey(datamanager(drone(), ground()))
     announce(found)
     assert said == found.lines()

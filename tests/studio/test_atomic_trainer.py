@@ -31,7 +31,9 @@ def trainer(tmp_path: Path) -> AtomicTrainer:
     trainer.pipeline = torch.nn.Linear(2, 2)
     trainer.optimizers = SimpleNamespace(optimizers={}, schedulers={})
     trainer.grad_scaler = SimpleNamespace(state_dict=dict)
-    trainer.config = SimpleNamespace(save_only_latest_checkpoint=True, steps_per_save=500)
+    trainer.config = SimpleNamespace(
+        save_only_latest_checkpoint=True, steps_per_save=500, verbose=True
+    )
     trainer.training_state, trainer.step, trainer.world_size = "training", 20, 1
     return trainer
 

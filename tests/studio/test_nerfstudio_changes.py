@@ -60,6 +60,7 @@ def installed(theirs: type[Trainer], monkeypatch: pytest.MonkeyPatch) -> Iterato
 def resumed(kind: type[Trainer], asked: int, start: int = 30) -> Any:
     trainer = object.__new__(kind)
     trainer.config = TrainerConfig(max_num_iterations=asked)
+    trainer.config.logging.local_writer.enable = False
     trainer._start_step = start
     return trainer
 
