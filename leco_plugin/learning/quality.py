@@ -52,7 +52,7 @@ def doubts_of_field(field: float, one_colour: float) -> list[str]:
     if field >= one_colour + LEAST_GAIN_DB:
         return []
     return [
-        f"this scene was not learned: {field:.1f} dB on pixels that were held out, where one colour "
+        f"this scene was not learned: {field:.1f} dB on unseen pixels, where one colour "
         f"for all has {one_colour:.1f} dB",
         "what helps: more photographs, sparse points (`leco points SCENE`), or poses that fit them "
         "(`leco poses PHOTOS --out SCENE`)",
