@@ -29,7 +29,7 @@ from leco_plugin.export_scene import (
 from leco_plugin.log import bar
 from leco_plugin.occupancy import Occupancy
 from leco_plugin.samplers.grid import OccupancyGridEstimator
-from leco_plugin.scenes.coloured_points import data_of_run, description_in, georeference
+from leco_plugin.scenes.coloured_points import description_in, description_of_run, georeference
 from leco_plugin.scenes.frames import inverse, moved
 from leco_plugin.scenes.whole_files import write_points, write_whole
 
@@ -97,20 +97,10 @@ def export(
             facts = write_volume(occupancy, resolution, back, out, show)
         facts["frame"] = "run"
     else:
-        given = data or data_of_run(file)
-        description = (
-            None
-            if given is None or (data is None and not _describes(given))
-            else (description_in(given))
-        )
+        description = description_of_run(file) if data is None else description_in(data)
         facts = _export_points(occupancy, format, out, resolution, back, description)
     known = {"format": 1, "written": format, "resolution": resolution}
     return {**known, **facts, "bytes": out.stat().st_size}
-
-
-def _describes(data: Path) -> bool:
-    """Whether the data of a run is a scene in nerfstudio's format."""
-    return data.suffix == ".json" or (data / "transforms.json").is_file()
 
 
 def _check_options(format: Format, levels: int | None, frame: Frame | None) -> None:

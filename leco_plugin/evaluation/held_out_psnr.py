@@ -86,7 +86,6 @@ class HeldOutPsnr:
             self.pixels = held_out_bundle(self.manager, count, share="all")
         return self.pixels
 
-    @torch.no_grad()
     def _measure(self, count: int) -> int:
         """Measures on so many pixels, or as many as there are; returns how many."""
         began = time.monotonic()

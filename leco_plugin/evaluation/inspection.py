@@ -46,7 +46,8 @@ def describe(occupancy: Occupancy) -> dict[str, Any]:
     """Sizes, space, threshold, kept share of its box, report of calibration: JSON values."""
     box = whole_box(occupancy)
     points = torch.rand(1 << 16, 3, generator=torch.Generator().manual_seed(0))
-    values = query(occupancy, torch.lerp(box.low, box.high, points))
+    positions = torch.lerp(box.low, box.high, points)
+    values = query(occupancy, positions)
     return {
         "format": 1,
         "params": occupancy.num_params,
@@ -63,9 +64,7 @@ def describe(occupancy: Occupancy) -> dict[str, Any]:
             "half_extent": float(occupancy.space.half_extent),
         },
         "box": [*box.low.tolist(), *box.high.tolist()],
-        "seen_share_of_box": float(
-            seen_at(occupancy, torch.lerp(box.low, box.high, points)).double().mean()
-        ),
+        "seen_share_of_box": float(seen_at(occupancy, positions).double().mean()),
         "kept_share_of_box": float((values >= occupancy.threshold).double().mean()),
         "gate": occupancy.gate.config.to_dict(),
         "report": occupancy.report,

@@ -7,7 +7,6 @@ that the gate was calibrated on can. It is saved, and smaller gates are measured
 from __future__ import annotations
 
 import copy
-import math
 import shutil
 from pathlib import Path
 from pickle import UnpicklingError
@@ -16,6 +15,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from leco_plugin.evaluation.metrics import psnr
 from leco_plugin.learning.calibration import (
     CalibrationConfig,
     Measured,
@@ -37,6 +37,9 @@ HARDLY_ANYTHING = 0.05
 """Share of all candidates below which a run that skips no more is given advice, and a gate in the
 paper's form is taught otherwise."""
 
+BEST_PSNR = 120.0
+"""dB, in a report: infinity is no JSON."""
+
 
 @torch.no_grad()
 def price(
@@ -52,15 +55,14 @@ def price(
         rendering = dense_rendering(mixture, rays, truth, config.rays_at_once)
         measured = calibrate(*rendering, config)
         of_backdrop = backdrop_price(*rendering)
-        rendered = torch.cat([reference.rgb for reference in rendering.references])
-        error = float((rendered.clamp(0.0, 1.0) - truth).double().square().mean())
+        rendered = torch.cat([reference.rgb for reference in rendering.references]).clamp(0.0, 1.0)
     rule, region = mixture.rule(), mixture.region
     return measured, {
         "params": sum(p.numel() for p in mixture.gate.parameters()),
         **measured._asdict(),
         BACKDROP_PRICE: round(of_backdrop, 4),
-        FIELD: round(-10.0 * math.log10(max(error, 1e-12)), 3),
-        ONE_COLOUR: round(min(psnr_of_one_colour(truth), 120.0), 3),
+        FIELD: round(min(psnr(rendered, truth), BEST_PSNR), 3),
+        ONE_COLOUR: round(min(psnr_of_one_colour(truth), BEST_PSNR), 3),
         "calibration_rays": len(truth),
         "near": float(region.near),
         "far": float(region.far),

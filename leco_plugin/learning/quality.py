@@ -3,11 +3,15 @@
 from __future__ import annotations
 
 import math
+from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor
 
-from leco_plugin.models.mixture import Mixture
+from leco_plugin.evaluation.metrics import psnr
+
+if TYPE_CHECKING:
+    from leco_plugin.models.mixture import Mixture
 
 MOST_KEPT = 0.8
 """Share of the space that photographs show which an occupancy of use keeps at most."""
@@ -20,10 +24,7 @@ PLACES = 1 << 14
 
 def psnr_of_one_colour(truth: Tensor) -> float:
     """PSNR of the mean colour of pixels [R, 3] against them, dB; infinite where all are alike."""
-    error = (
-        float((truth.double() - truth.double().mean(dim=0)).square().mean()) if len(truth) else 0.0
-    )
-    return -10.0 * math.log10(error) if error > 0.0 else math.inf
+    return psnr(truth.mean(dim=0), truth)
 
 
 @torch.no_grad()

@@ -29,8 +29,9 @@ class ColouredPoints(NamedTuple):
     """[P, 3]."""
 
 
-def data_of_run(file: Path) -> Path | None:
-    """The data of the run in whose folder a file lies; None where there is no run, or no data."""
+def description_of_run(file: Path) -> Path | None:
+    """The transforms.json of the run in whose folder a file lies; None where there is no run, or
+    its data are no scene in nerfstudio's format."""
     import yaml
 
     config = file.resolve().parent / CONFIG
@@ -41,7 +42,8 @@ def data_of_run(file: Path) -> Path | None:
         data = read.pipeline.datamanager.data or read.pipeline.datamanager.dataparser.data
     except (yaml.YAMLError, ImportError, AttributeError, TypeError, ValueError):
         return None
-    return data if isinstance(data, Path) and data.exists() else None
+    found = _file_in(data) if isinstance(data, Path) else None
+    return found if found is not None and found.is_file() else None
 
 
 def description_in(data: Path) -> Path:
@@ -50,10 +52,14 @@ def description_in(data: Path) -> Path:
     Raises:
         InputError: there is none.
     """
-    file = data if data.suffix == ".json" else data / "transforms.json"
+    file = _file_in(data)
     if not file.is_file():
         raise InputError(f"--data {data}: there is no transforms.json; give a nerfstudio scene")
     return file
+
+
+def _file_in(data: Path) -> Path:
+    return data if data.suffix == ".json" else data / "transforms.json"
 
 
 def coloured_points(description: Path) -> ColouredPoints | None:
