@@ -21,13 +21,8 @@ from gpu_scale import Scale, figure
 from torch import Tensor
 
 from leco_plugin.evaluation.clock import peak_process_bytes
-from leco_plugin.learning.calibration import (
-    CalibrationConfig,
-    Measured,
-    Reference,
-    calibrate,
-    reference_of,
-)
+from leco_plugin.learning.calibration import CalibrationConfig, Measured, calibrate
+from leco_plugin.learning.dense import Reference, reference_of
 from leco_plugin.learning.schedule import ScheduleConfig, ramp
 from leco_plugin.models.field import HMoEField
 from leco_plugin.models.gate import Gate

@@ -30,6 +30,7 @@ def inspect(
     check_picture("--picture", picture)
     check_picture("--history", history, moving=True)
     from leco_plugin.evaluation.inspection import describe, doubts
+    from leco_plugin.learning.quality import views_in_words
     from leco_plugin.occupancy import Occupancy
 
     file = occupancy_of(file)
@@ -43,7 +44,7 @@ def inspect(
     print(f"kept where o(x) >= {facts['threshold']:.4g}, asked in {facts['precision']}")
     print(f"kept share of its box: {facts['kept_share_of_box']:.2%}")
     print(f"share of its box that photographs show: {facts['seen_share_of_box']:.2%}")
-    for line in doubts(facts):
+    for line in [views_in_words(facts["report"]), *doubts(facts)]:
         print(line)
     for name, value in facts["report"].items():
         if isinstance(value, (int, float, str)) and name not in ("params", "threshold"):

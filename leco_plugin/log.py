@@ -82,6 +82,12 @@ def say(line: str) -> None:
         _write(line)
 
 
+def say_all(lines: Iterable[str]) -> None:
+    """Says lines that hold no markup."""
+    for line in lines:
+        say(escape(line))
+
+
 def note(line: str) -> None:
     """A detail: a line in the run's log file; where there is none, as `say`."""
     if not is_first():

@@ -37,6 +37,9 @@ NEEDS_A_BACKDROP = 1.0
 brief learning has not made opaque is worth up to 0.6 dB, and a host that is given a backdrop for
 that loses more; 2.4% of sky is worth 11 dB."""
 
+CAMERAS_THAT_VOUCH = "cameras_that_vouch"
+"""In a report: what whole photographs lose that taught it nothing, see `calibration.promise`."""
+
 CALIBRATED_AT = "calibrated_threshold"
 """In a report: the threshold that its figures are of, where a host has lowered it since."""
 

@@ -49,12 +49,16 @@ class NoPixels:
         directions = torch.tensor([[1.0, 0.0, 0.0]]).expand(9, 3)
         self.survey: Any = SimpleNamespace(origins=origins, directions=directions)
 
-    def prepare_batch(self, factor: float, distances: bool) -> None:
+    def prepare_batch(self, factor: float, distances: bool, set_aside: int = 0) -> None:
         """Nothing is drawn."""
 
     def held_out(self, count: int, seed: int = 0, share: str = "") -> tuple[Any, Tensor]:
         """Pixels were asked for."""
         raise AssertionError("pixels were asked for")
+
+    def of_vouching(self, *_: Any) -> list[Any]:
+        """No photograph."""
+        return []
 
     def count_held_out(self, limit: int) -> float:
         """As if none were held out."""

@@ -16,8 +16,7 @@ from torch import Tensor
 
 from leco_plugin.capacity.sources import Seen
 from leco_plugin.evaluation.field_grids import in_parts
-from leco_plugin.learning.calibration import near_surface
-from leco_plugin.learning.dense import in_chunks
+from leco_plugin.learning.dense import in_chunks, near_surface
 from leco_plugin.models.mixture import Mixture
 from leco_plugin.models.rendering import Intervals, Rays, backdrop_of
 from leco_plugin.occupancy import Occupancy

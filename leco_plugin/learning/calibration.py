@@ -7,32 +7,27 @@ The reference is a dense rendering. Skipping every sample with o(x) < tau loses 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
 
-from leco_plugin.models.gate import occupancy_from_logits
-from leco_plugin.models.rendering import Intervals, Rays, Shaded, backdrop_of
-from leco_plugin.samplers.packed import accumulate_along_rays, inclusive_sum
+from leco_plugin.learning.dense import Reference
+from leco_plugin.samplers.packed import accumulate_along_rays
 from leco_plugin.scenes.input_error import require
 
 THRESHOLDS = tuple(0.75 * 0.8**i for i in range(32))
 """Tried from the largest down, to 0.0007; below that a gate that fails is kept out of use (0)."""
 
-SURFACE_STEPS = 2.0
-"""Weight within this many steps of a ray's median depth counts as surface, the rest as haze. Of a
-ray whose median depth lies in the backdrop, all of it is haze."""
-FEWEST_SURFACES = 0.02
-"""Share of the rays that meet a surface by that rule; with fewer, haze counts too, so that a field
-that has not found its surfaces yet does not pass for one that has nothing to lose."""
-
 SURE = 1.0
 """Standard errors by which a price must be beyond its bound to count as beyond it."""
 MOST = 10.0
 """Times its bound that a price may be measured, however large its standard error is."""
+LEFT = 0.9
+"""Share of what is skipped that is left at least when photographs that vouch lower a threshold. To
+views that no other photograph resembles no threshold does justice: how much they lose is said."""
 EXACT = 1e-10
 """Mean squared error, 100 dB, below which two renderings are both exact."""
 
@@ -46,6 +41,14 @@ class CalibrationConfig:
     error of what is measured."""
     image_price_db: float = 0.04
     """Largest loss of PSNR on the calibration rays, in dB, likewise."""
+    camera_surface_mass: float = 2e-3
+    """Largest share of the weight near surfaces that any photograph may lose that vouches."""
+    cameras: int = 9
+    """Training photographs that teach an occupancy nothing, and vouch for it: what none of so many
+    loses, another view loses with a chance of one in one more. Their pixels train the field once it
+    is frozen. 0 is none; nor are there any where they would be more than a quarter."""
+    camera_rays: int = 512
+    """Rays of each to measure with."""
     rays: int = 8192
     """Held-out training rays to measure with, or as many as there are."""
     rays_at_once: int = 1024
@@ -58,12 +61,13 @@ class CalibrationConfig:
     more where they take over 1% of the time."""
 
     def __post_init__(self) -> None:
-        fewest = {"rays": 1, "rays_at_once": 1, "recheck_rays": 0, "steps_per_recheck": 1}
+        at_least_one = ("camera_rays", "rays", "rays_at_once", "steps_per_recheck")
+        fewest = dict.fromkeys(at_least_one, 1) | {"cameras": 0, "recheck_rays": 0}
         for name, least in fewest.items():
             value = getattr(self, name)
             option = f"calibration.{name.replace('_', '-')}"
             require(value >= least, option, value, f"at least {least}")
-        for name in ("lost_surface_mass", "image_price_db"):
+        for name in ("lost_surface_mass", "image_price_db", "camera_surface_mass"):
             value = getattr(self, name)
             option = f"calibration.{name.replace('_', '-')}"
             require(0.0 <= value < math.inf, option, value, "a number, at least 0")
@@ -106,86 +110,37 @@ class Measured(NamedTuple):
         )
 
 
-class Reference(NamedTuple):
-    """A dense rendering of some rays, and what the gate says about its samples."""
-
-    intervals: Intervals
-    weights: Tensor
-    """[M] rendering weights."""
-    occupancies: Tensor
-    """[M] o(x)."""
-    near_surface: Tensor
-    """[M] bool: within `SURFACE_STEPS` steps of the ray's median depth, on rays that meet a
-    surface."""
-    rgb: Tensor
-    """[R, 3] rendered."""
-    always_kept: Tensor
-    """[M] bool: the backdrop, which no threshold skips."""
-
-
-def reference_of(shaded: Shaded, intervals: Intervals, rays: Rays) -> Reference:
-    """The reference that a rendering of all candidates of some rays is."""
-    is_backdrop = backdrop_of(intervals, rays)
-    return Reference(
-        intervals,
-        shaded.weights,
-        occupancy_from_logits(shaded.logits),
-        near_surface(shaded, intervals, is_backdrop),
-        shaded.rgb,
-        is_backdrop,
-    )
-
-
-def near_surface(shaded: Shaded, intervals: Intervals, is_backdrop: Tensor) -> Tensor:
-    """Which samples lie within `SURFACE_STEPS` steps of their ray's surface.
-
-    A ray whose median depth lies in the backdrop meets none, unless hardly any ray of them all
-    meets one. What is thin and before the sky has less than half of its ray's weight: it is guarded
-    by the image price alone.
+def worst_loss(cameras: Sequence[Reference], threshold: float) -> float:
+    """The largest share of its weight near surfaces that any of some photographs loses by skipping
+    below `threshold`; 0 of none. It never falls as the threshold rises.
 
     Args:
-        is_backdrop: [M] bool.
-    Returns:
-        [M] bool.
+        cameras: a dense rendering of rays of each.
     """
-    if len(is_backdrop) == 0:
-        return is_backdrop
-    medians = _medians(shaded, intervals)
-    meets = ~is_backdrop[medians] & (shaded.packed_info[:, 1] > 0)
-    if int(meets.sum()) < FEWEST_SURFACES * len(meets):
-        meets = torch.ones_like(meets)
-    return _near(medians, intervals) & meets[intervals.ray_indices]
+    losses = [0.0]
+    for reference in cameras:
+        on_surface = reference.weights * reference.near_surface
+        gone = (reference.occupancies < threshold) & ~reference.always_kept
+        losses.append(float((on_surface * gone).sum()) / max(float(on_surface.sum()), 1e-12))
+    return max(losses)
 
 
-def near_median_depth(shaded: Shaded, intervals: Intervals) -> Tensor:
-    """Which samples lie within `SURFACE_STEPS` steps of the depth that halves their ray's weight.
+def promise(cameras: Sequence[Reference], measured: Measured, config: CalibrationConfig) -> Any:
+    """What a report says of photographs that vouch, as JSON values; None where none does.
 
-    Returns:
-        [M] bool.
+    Were photographs drawn at random, another one would lose more than the worst of K with a chance
+    of 1 in K + 1 at most, because a loss never falls as the threshold rises: split conformal
+    prediction, as in Angelopoulos et al., "Conformal Risk Control", 2022.
     """
-    return _near(_medians(shaded, intervals), intervals)
-
-
-def _near(medians: Tensor, intervals: Intervals) -> Tensor:
-    median = medians[intervals.ray_indices]
-    middles = 0.5 * (intervals.t_starts + intervals.t_ends)
-    steps = (intervals.t_ends - intervals.t_starts)[median]
-    return (middles - middles[median]).abs() <= SURFACE_STEPS * steps * 1.001
-
-
-def _medians(shaded: Shaded, intervals: Intervals) -> Tensor:
-    """The sample of each ray that halves its weight: [R], any for a ray without samples."""
-    num_rays = len(shaded.packed_info)
-    below_half = (
-        inclusive_sum(shaded.weights, packed_info=shaded.packed_info)
-        < 0.5 * shaded.accumulation[intervals.ray_indices]
-    )
-    ahead = accumulate_along_rays(below_half.float(), None, intervals.ray_indices, num_rays)[
-        :, 0
-    ].long()
-    starts, counts = shaded.packed_info.unbind(dim=-1)
-    median = starts + torch.minimum(ahead, (counts - 1).clamp(min=0))
-    return median.clamp(max=max(len(shaded.weights) - 1, 0))
+    if not cameras:
+        return None
+    worst = worst_loss(cameras, measured.threshold)
+    return {
+        "count": len(cameras),
+        "worst_surface_mass": worst,
+        "bound": max(worst, config.camera_surface_mass),
+        "confidence": round(len(cameras) / (len(cameras) + 1), 3),
+    }
 
 
 class RayPrices(NamedTuple):
@@ -354,19 +309,32 @@ def calibrate(
     config: CalibrationConfig,
     below: float = 1.0,
     missed_only: bool = False,
+    cameras: Sequence[Reference] = (),
 ) -> Measured:
     """The largest threshold of `THRESHOLDS` within the bounds, with what it costs.
 
     Arguments as for `measure`; only thresholds below `below` are tried. When none is within the
     bounds, the threshold is 0: everything is kept, which is slow and never wrong.
+
+    Args:
+        cameras: dense renderings of photographs that vouch. By the threshold none of them loses
+            too much, see `worst_loss`, where that leaves `LEFT` of what is skipped.
     """
-    parts = references, truths, render_kept
+    parts, best = (references, truths, render_kept), None
     for threshold in (tried for tried in THRESHOLDS if tried < below):
+        beyond = worst_loss(cameras, threshold) > config.camera_surface_mass
+        if best is not None and beyond:
+            continue
         if not missed_only:
             cheap = measure(*parts, threshold, with_image=False)
             if not cheap._replace(image_price_db=0.0, price_error_db=0.0).within(config):
                 continue
         measured = measure(*parts, threshold, missed_only=missed_only)
-        if measured.within(config):
-            return measured
-    return measure(references, truths, render_kept, 0.0)
+        if not measured.within(config):
+            continue
+        if not beyond:
+            if best is None or measured.empty_fraction >= LEFT * best.empty_fraction:
+                return measured
+            return best
+        best = measured
+    return measure(references, truths, render_kept, 0.0) if best is None else best

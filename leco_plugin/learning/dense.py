@@ -9,9 +9,99 @@ from typing import NamedTuple
 import torch
 from torch import Tensor, nn
 
-from leco_plugin.learning.calibration import Reference, reference_of
+from leco_plugin.models.gate import occupancy_from_logits
 from leco_plugin.models.mixture import Mixture
-from leco_plugin.models.rendering import Intervals, Rays, mapped_middles
+from leco_plugin.models.rendering import Intervals, Rays, Shaded, backdrop_of, mapped_middles
+from leco_plugin.samplers.packed import accumulate_along_rays, inclusive_sum
+
+SURFACE_STEPS = 2.0
+"""Weight within this many steps of a ray's median depth counts as surface, the rest as haze. Of a
+ray whose median depth lies in the backdrop, all of it is haze."""
+FEWEST_SURFACES = 0.02
+"""Share of the rays that meet a surface by that rule; with fewer, haze counts too, so that a field
+that has not found its surfaces yet does not pass for one that has nothing to lose."""
+
+
+class Reference(NamedTuple):
+    """A dense rendering of some rays, and what the gate says about its samples."""
+
+    intervals: Intervals
+    weights: Tensor
+    """[M] rendering weights."""
+    occupancies: Tensor
+    """[M] o(x)."""
+    near_surface: Tensor
+    """[M] bool: within `SURFACE_STEPS` steps of the ray's median depth, on rays that meet a
+    surface."""
+    rgb: Tensor
+    """[R, 3] rendered."""
+    always_kept: Tensor
+    """[M] bool: the backdrop, which no threshold skips."""
+
+
+def reference_of(shaded: Shaded, intervals: Intervals, rays: Rays) -> Reference:
+    """The reference that a rendering of all candidates of some rays is."""
+    is_backdrop = backdrop_of(intervals, rays)
+    return Reference(
+        intervals,
+        shaded.weights,
+        occupancy_from_logits(shaded.logits),
+        near_surface(shaded, intervals, is_backdrop),
+        shaded.rgb,
+        is_backdrop,
+    )
+
+
+def near_surface(shaded: Shaded, intervals: Intervals, is_backdrop: Tensor) -> Tensor:
+    """Which samples lie within `SURFACE_STEPS` steps of their ray's surface.
+
+    A ray whose median depth lies in the backdrop meets none, unless hardly any ray of them all
+    meets one. What is thin and before the sky has less than half of its ray's weight: it is guarded
+    by the image price alone.
+
+    Args:
+        is_backdrop: [M] bool.
+    Returns:
+        [M] bool.
+    """
+    if len(is_backdrop) == 0:
+        return is_backdrop
+    medians = _medians(shaded, intervals)
+    meets = ~is_backdrop[medians] & (shaded.packed_info[:, 1] > 0)
+    if int(meets.sum()) < FEWEST_SURFACES * len(meets):
+        meets = torch.ones_like(meets)
+    return _near(medians, intervals) & meets[intervals.ray_indices]
+
+
+def near_median_depth(shaded: Shaded, intervals: Intervals) -> Tensor:
+    """Which samples lie within `SURFACE_STEPS` steps of the depth that halves their ray's weight.
+
+    Returns:
+        [M] bool.
+    """
+    return _near(_medians(shaded, intervals), intervals)
+
+
+def _near(medians: Tensor, intervals: Intervals) -> Tensor:
+    median = medians[intervals.ray_indices]
+    middles = 0.5 * (intervals.t_starts + intervals.t_ends)
+    steps = (intervals.t_ends - intervals.t_starts)[median]
+    return (middles - middles[median]).abs() <= SURFACE_STEPS * steps * 1.001
+
+
+def _medians(shaded: Shaded, intervals: Intervals) -> Tensor:
+    """The sample of each ray that halves its weight: [R], any for a ray without samples."""
+    num_rays = len(shaded.packed_info)
+    below_half = (
+        inclusive_sum(shaded.weights, packed_info=shaded.packed_info)
+        < 0.5 * shaded.accumulation[intervals.ray_indices]
+    )
+    ahead = accumulate_along_rays(below_half.float(), None, intervals.ray_indices, num_rays)[
+        :, 0
+    ].long()
+    starts, counts = shaded.packed_info.unbind(dim=-1)
+    median = starts + torch.minimum(ahead, (counts - 1).clamp(min=0))
+    return median.clamp(max=max(len(shaded.weights) - 1, 0))
 
 
 class DenseRendering(NamedTuple):

@@ -21,13 +21,14 @@ from leco_plugin.learning.calibration import (
     Measured,
     backdrop_price,
     calibrate,
+    promise,
 )
-from leco_plugin.learning.dense import dense_rendering, evaluating
+from leco_plugin.learning.dense import dense_reference, dense_rendering, evaluating
 from leco_plugin.learning.quality import FIELD, ONE_COLOUR, psnr_of_one_colour
 from leco_plugin.log import note, say
 from leco_plugin.models.mixture import Mixture
 from leco_plugin.models.rendering import Rays
-from leco_plugin.occupancy import BACKDROP_PRICE, Occupancy
+from leco_plugin.occupancy import BACKDROP_PRICE, CAMERAS_THAT_VOUCH, Occupancy
 from leco_plugin.scenes.input_error import one_line
 from leco_plugin.scenes.whole_files import write_whole
 
@@ -43,17 +44,23 @@ BEST_PSNR = 120.0
 
 @torch.no_grad()
 def price(
-    mixture: Mixture, rays: Rays, truth: Tensor, config: CalibrationConfig
+    mixture: Mixture,
+    rays: Rays,
+    truth: Tensor,
+    cameras: list[tuple[Rays, Tensor]],
+    config: CalibrationConfig,
 ) -> tuple[Measured, dict[str, Any]]:
     """The threshold within the bounds, and what a report says of it.
 
     Args:
         rays: held out, cut to the mixture's region.
         truth: [R, 3] their colours.
+        cameras: the same of each photograph that vouches.
     """
     with evaluating(mixture):
         rendering = dense_rendering(mixture, rays, truth, config.rays_at_once)
-        measured = calibrate(*rendering, config)
+        of_cameras = [dense_reference(mixture, of_one) for of_one, _ in cameras]
+        measured = calibrate(*rendering, config, cameras=of_cameras)
         of_backdrop = backdrop_price(*rendering)
         rendered = torch.cat([reference.rgb for reference in rendering.references]).clamp(0.0, 1.0)
     rule, region = mixture.rule(), mixture.region
@@ -64,6 +71,7 @@ def price(
         FIELD: round(min(psnr(rendered, truth), BEST_PSNR), 3),
         ONE_COLOUR: round(min(psnr_of_one_colour(truth), BEST_PSNR), 3),
         "calibration_rays": len(truth),
+        CAMERAS_THAT_VOUCH: promise(of_cameras, measured, config),
         "near": float(region.near),
         "far": float(region.far),
         "step_size": rule.step_size,

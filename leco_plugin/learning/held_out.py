@@ -48,9 +48,14 @@ class HeldOut:
         """Rays cut to the region, and their colours [R, 3]; see `held_out_bundle`."""
         return self.data.held_out(self.mixture, count, seed, which)
 
+    def cameras(self) -> list[tuple[Rays, Tensor]]:
+        """Rays of each photograph that vouches, and their colours."""
+        return self.data.of_vouching(self.mixture, self.config.cameras, self.config.camera_rays)
+
     def price(self) -> tuple[Measured, dict[str, Any]]:
         """The threshold to freeze at, and what a report says of it."""
-        measured, report = price(self.mixture, *self.rays(self.config.rays), self.config)
+        rays, cameras = self.rays(self.config.rays), self.cameras()
+        measured, report = price(self.mixture, *rays, cameras, self.config)
         return measured, report | self.data.facts()
 
     @torch.no_grad()
@@ -89,9 +94,9 @@ class HeldOut:
         self, losses: GateLossConfig, config: SharpeningConfig, guided: bool
     ) -> Sharpened | None:
         """A small gate that training pixels teach and these calibrate; see `sharpen`."""
-        taught = self.data.training_rays(self.mixture, config.rays)
-        rays = self.rays(self.config.rays)
-        return sharpen(self.mixture, taught, rays, losses, self.config, config, guided)
+        taught = self.data.training_rays(self.mixture, config.rays, self.config.cameras)
+        rays, cameras = self.rays(self.config.rays), self.cameras()
+        return sharpen(self.mixture, taught, rays, cameras, losses, self.config, config, guided)
 
     def unneeded(self, count: int, bound: float) -> Merging:
         """Scene experts without which the image loses no more than `bound` dB."""

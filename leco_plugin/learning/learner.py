@@ -10,7 +10,6 @@ import time
 from functools import cached_property
 from typing import TYPE_CHECKING
 
-from rich.markup import escape
 from torch import Tensor
 
 from leco_plugin.learning.collapse import STEPS_PER_LOOK, is_dense
@@ -27,6 +26,7 @@ from leco_plugin.learning.quality import (
     doubts_of_field,
     doubts_of_occupancy,
     kept_of_seen,
+    views_in_words,
 )
 from leco_plugin.learning.recoveries import Recoveries
 from leco_plugin.learning.run import Run, keep_pace
@@ -38,7 +38,7 @@ from leco_plugin.learning.schedule import (
     schedule_since,
     steps_of_an_extension,
 )
-from leco_plugin.log import note, say, summarize
+from leco_plugin.log import note, say, say_all, summarize
 from leco_plugin.models.compute.ranks import from_first, mean, share
 from leco_plugin.models.gate import occupancy_from_logits
 from leco_plugin.models.mixture import Mixture
@@ -103,8 +103,7 @@ class Learner:
             mixture.region.look(*self.data.covering_rays())
             mixture.region.see(*self.data.rays_of_all_images())
             summarize(found.summary(), found.lines())
-            for line in self.data.doubts():
-                say(escape(line))
+            say_all(self.data.doubts())
             self.data.say_what_is_fixed()
         if run.resumed_from is not None and run.folder is not None:
             self._take_along()
@@ -150,6 +149,7 @@ class Learner:
         self.data.prepare_batch(
             self._guided_batch() if frozen else self._learning_batch(step),
             distances=learning and config.termination > 0.0,
+            set_aside=config.calibration.cameras if learning and not never_frozen else 0,
         )
         return plan_of(step, config, progress, learning, frozen)
 
@@ -194,8 +194,8 @@ class Learner:
         else:
             self.progress.learn_seconds += seconds
             self._after_learning_step(step)
-        frozen = bool(self.mixture.frozen)
-        if self.config.schedule.freeze and not frozen and step + 1 >= self.run.end:
+        ends_unfrozen = step + 1 >= self.run.end and not bool(self.mixture.frozen)
+        if self.config.schedule.freeze and ends_unfrozen:
             say(
                 f"step {step}: the run ends while its occupancy is still learned, to step "
                 f"{self.progress.learn_steps}, and nothing is frozen; go on from its checkpoint "
@@ -266,9 +266,8 @@ class Learner:
         mixture, progress, schedule = self.mixture, self.progress, self.config.schedule
         share(mixture.gate.state_dict().values())
         seconds = round(progress.learn_seconds, 2)
-        measured, report, seconds = from_first(
-            lambda: (*self.held_out.price(), seconds), mixture.device
-        )
+        found = from_first(lambda: (*self.held_out.price(), seconds), mixture.device)
+        measured, report, seconds = found
         report |= {"step": step, "train_seconds": seconds, "recoveries": progress.recoveries}
         mixture.freeze(measured.threshold, report)
         say(
@@ -288,6 +287,7 @@ class Learner:
                 self._merge()
             self._sharpen(step, self.run.left(step), guided=False)
         self._say_doubts()
+        self.data.prepare_batch(1.0, distances=False)  # from now on all photographs train
         progress.watch = self.watch.state = WatchState()
         progress.suspected_since = -1  # of the gate as it is now
         if schedule.steps_per_record > 0:
@@ -298,11 +298,11 @@ class Learner:
         self.run.save(step)  # a run killed from now on stays frozen
 
     def _say_doubts(self) -> None:
-        """Says what is wrong with a field or an occupancy that are of no use."""
+        """Says what new views may lose, and what is wrong with what is of no use."""
         report = self.mixture.report
+        say(views_in_words(report))
         found = doubts_of_field(report.get(FIELD, math.inf), report.get(ONE_COLOUR, math.inf))
-        for line in found or doubts_of_occupancy(kept_of_seen(self.mixture)):
-            say(escape(line))
+        say_all(found or doubts_of_occupancy(kept_of_seen(self.mixture)))
 
     def _sharpen(self, step: int, steps: float, guided: bool) -> None:
         """Has a small gate skip in place of the learned one where it skips more, and says so.
@@ -380,9 +380,8 @@ class Learner:
             lambda: self.held_out.lower(before, self.watch.state.rechecks), mixture.device
         )
         lowered = [*mixture.report.get("lowered", []), [step, measured.threshold]]
-        mixture.freeze(
-            measured.threshold, mixture.report | {**measured._asdict(), "lowered": lowered}
-        )
+        report = mixture.report | {**measured._asdict(), "lowered": lowered}
+        mixture.freeze(measured.threshold, report)
         self.watch.state.evidence = {}
         now = (
             f"threshold {before:.4f} lowered to {measured.threshold:.4f}, which {measured.line}"

@@ -16,8 +16,8 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from leco_plugin.learning.calibration import EXACT, near_median_depth, price_db
-from leco_plugin.learning.dense import evaluating, in_chunks
+from leco_plugin.learning.calibration import EXACT, price_db
+from leco_plugin.learning.dense import evaluating, in_chunks, near_median_depth
 from leco_plugin.models.mixture import Mixture
 from leco_plugin.models.rendering import Intervals, Rays
 from leco_plugin.scenes.input_error import require

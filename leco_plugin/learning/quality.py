@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import torch
 from torch import Tensor
 
 from leco_plugin.evaluation.metrics import psnr
+from leco_plugin.occupancy import CAMERAS_THAT_VOUCH
 
 if TYPE_CHECKING:
     from leco_plugin.models.mixture import Mixture
@@ -40,6 +41,18 @@ def kept_of_seen(mixture: Mixture) -> float:
         return 0.0
     kept = mixture.occupancies(mapped) >= mixture.threshold
     return float(kept.double().mean())
+
+
+def views_in_words(report: dict[str, Any]) -> str:
+    """What an occupancy's report says of views that taught it nothing: a line."""
+    said = report.get(CAMERAS_THAT_VOUCH)
+    if not isinstance(said, dict):
+        return "calibrated on pixels of training photographs alone: new views may lose more"
+    return (
+        f"{said['count']} photographs that taught it nothing lose at most "
+        f"{said['worst_surface_mass']:.2%} of their surfaces: a new view loses at most "
+        f"{said['bound']:.2%}, with {said['confidence']:.0%} confidence"
+    )
 
 
 def doubts_of_field(field: float, one_colour: float) -> list[str]:

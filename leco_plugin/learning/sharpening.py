@@ -18,12 +18,17 @@ from torch import Tensor
 from leco_plugin.learning.calibration import (
     CalibrationConfig,
     Measured,
-    Reference,
     calibrate,
     measure,
+    promise,
+)
+from leco_plugin.learning.dense import (
+    DenseRendering,
+    Reference,
+    evaluating,
+    in_chunks,
     reference_of,
 )
-from leco_plugin.learning.dense import DenseRendering, evaluating, in_chunks
 from leco_plugin.learning.lesson import Lesson, round_weights, teach
 from leco_plugin.models.encodings import EncodingConfig
 from leco_plugin.models.gate import Gate, GateConfig
@@ -31,6 +36,7 @@ from leco_plugin.models.losses import widen
 from leco_plugin.models.mixture import Mixture
 from leco_plugin.models.objective import GateLossConfig
 from leco_plugin.models.rendering import Intervals, Rays, Shaded, backdrop_of, mapped_middles
+from leco_plugin.occupancy import CAMERAS_THAT_VOUCH
 from leco_plugin.scenes.input_error import require
 
 LOSSES = ("lost_surface_mass", "lost_mass", "image_price_db")
@@ -72,6 +78,8 @@ class Sharpened(NamedTuple):
     measured: Measured
     before: Measured
     """The same of what has guided so far."""
+    promised: dict[str, Any] | None
+    """What photographs that vouch say of it, see `calibration.promise`."""
 
     @property
     def pays(self) -> bool:
@@ -103,6 +111,11 @@ class Sharpened(NamedTuple):
                 found[name] = max(0.0, found[name]) + max(0.0, float(before[name]))
             for name in ERRORS:
                 found[name] = math.hypot(found[name], float(before.get(name, 0.0)))
+        if self.promised is not None:
+            found[CAMERAS_THAT_VOUCH] = dict(self.promised)
+            if guided and (earlier := before.get(CAMERAS_THAT_VOUCH)) is not None:
+                for name in ("worst_surface_mass", "bound"):
+                    found[CAMERAS_THAT_VOUCH][name] += earlier["worst_surface_mass"]
         kept = {name: before[name] for name in ("threshold", "params", "empty_fraction", *LOSSES)}
         return {
             "learned": {"gate": learned.to_dict(), **kept},
@@ -116,6 +129,7 @@ def sharpen(
     mixture: Mixture,
     taught: Rays,
     held_out: tuple[Rays, Tensor],
+    cameras: list[tuple[Rays, Tensor]],
     losses: GateLossConfig,
     calibration: CalibrationConfig,
     config: SharpeningConfig,
@@ -127,6 +141,7 @@ def sharpen(
     Args:
         taught: training rays, cut to the region.
         held_out: rays that nothing was trained on, and their colours [R, 3].
+        cameras: the same of each photograph that vouches.
         losses: whose contribution loss teaches.
         calibration: what skipping may cost.
         guided: whether the field has been trained guided. It then knows only what is kept, and
@@ -143,8 +158,12 @@ def sharpen(
         rendering = seen_rendering(mixture, rays, truth, 1.0 if guided else 0.0, at_once)
         before = measure(*rendering, float(mixture.threshold))
         asked = asked_by(mixture, gate, in_chunks(rays, at_once), rendering)
-        measured = calibrate(*asked, calibration)
-    return Sharpened(gate, measured, before)
+        of_cameras = [
+            _rendered(mixture, of_one, 1.0 if guided else 0.0, gate)[0] for of_one, _ in cameras
+        ]
+        measured = calibrate(*asked, calibration, cameras=of_cameras)
+        promised = promise(of_cameras, measured, calibration)
+    return Sharpened(gate, measured, before, promised)
 
 
 @torch.no_grad()
@@ -187,9 +206,11 @@ def seen_rendering(
 
 
 @torch.no_grad()
-def _rendered(mixture: Mixture, rays: Rays, seen: float) -> tuple[Reference, Tensor]:
+def _rendered(
+    mixture: Mixture, rays: Rays, seen: float, gate: Gate | None = None
+) -> tuple[Reference, Tensor]:
     """All candidates of rays with the weights of those that are seen; and where they lie, [M, 3]
-    in [-1, 1]."""
+    in [-1, 1]. With another gate, what that says of them."""
     intervals = mixture.with_backdrops(rays, mixture.candidates(rays))
     mapped = mapped_middles(mixture.region.space, rays, intervals)
     occupancies = mixture.occupancies(mapped)
@@ -202,6 +223,8 @@ def _rendered(mixture: Mixture, rays: Rays, seen: float) -> tuple[Reference, Ten
     surface = torch.zeros_like(drawn)
     weights[drawn], surface[drawn] = small.weights.float(), small.near_surface
     is_backdrop = backdrop_of(intervals, rays)
+    if gate is not None:
+        occupancies = mixture.occupancies(mapped, gate)
     return Reference(intervals, weights, occupancies, surface, small.rgb, is_backdrop), mapped
 
 

@@ -16,7 +16,11 @@ from leco_plugin.models.region import SIDE
 from leco_plugin.models.rendering import Rays
 from leco_plugin.scenes.bounds import BoundsConfig
 from leco_plugin.scenes.frames import data_frame_of, frame_of
-from leco_plugin.scenes.pixels.held_out_pixels import held_out_sampler, some_images
+from leco_plugin.scenes.pixels.held_out_pixels import (
+    HeldOutPixelSampler,
+    held_out_sampler,
+    some_images,
+)
 from leco_plugin.scenes.pixels.known_distances import (
     KnownDistancePixelSampler,
     SparsePixels,
@@ -29,6 +33,10 @@ from leco_plugin.seen import rays_a_side
 
 FEW_PHOTOGRAPHS = 16
 """Below so many a scene often fails: nine of `fox`, without points, had 15 dB."""
+
+
+SHARE_THAT_VOUCHES = 4
+"""At most one photograph of so many is kept from teaching, to vouch for what the others taught."""
 
 
 class LearningData:
@@ -45,6 +53,7 @@ class LearningData:
         self, manager: Any, bounds: BoundsConfig, near: float | None, far: float | None
     ) -> None:
         self.manager = manager
+        self._vouching: dict[int, Tensor] = {}
         self.survey: Survey = survey(manager, bounds, near, far)
 
     @cached_property
@@ -63,14 +72,20 @@ class LearningData:
         rays = covering_rays(cameras, rays_a_side(len(cameras)), len(cameras))
         return rays[0].reshape(-1, 3), rays[1].reshape(-1, 3)
 
-    def prepare_batch(self, factor: float, distances: bool) -> None:
+    def prepare_batch(self, factor: float, distances: bool, set_aside: int = 0) -> None:
         """Sets the next batch; one that is drawn elsewhere stays as it is.
 
         Args:
             factor: its rays as a multiple of those of the config.
             distances: whether pixels whose distance is known are drawn too.
+            set_aside: of how many photographs nothing is drawn, see `vouching`.
         """
         sampler = sampler_here(self.manager)
+        if isinstance(sampler, HeldOutPixelSampler):
+            sampler.set_aside = None
+            if set_aside > 0 and len(chosen := self.vouching(set_aside)):
+                sampler.set_aside = torch.zeros(len(self.manager.train_dataset), dtype=torch.bool)
+                sampler.set_aside[chosen] = True
         if isinstance(sampler, KnownDistancePixelSampler):
             sampler.sparse = self.sparse if distances else None
         rays = round(self.rays_per_batch * factor)
@@ -93,21 +108,55 @@ class LearningData:
         lattice = Lattice() if sampler is None else sampler.lattice
         return sparse_pixels(dataset.cameras, points, lattice)
 
+    def vouching(self, count: int) -> Tensor:
+        """Numbers of the training photographs that can vouch for what is learned from the others,
+        evenly spread: [count]. None [0] where they would be more than a quarter, or where batches
+        cannot do without them: drawn elsewhere, of some pictures at a time or one by one."""
+        if count not in self._vouching:
+            photographs = len(self.manager.train_dataset)
+            can = 0 < SHARE_THAT_VOUCHES * count <= photographs and self._draws_of_all(photographs)
+            numbers = (torch.arange(count) + 0.5) * (photographs / max(count, 1))
+            self._vouching[count] = numbers.long() if can else torch.zeros(0, dtype=torch.int64)
+        return self._vouching[count]
+
+    def _draws_of_all(self, photographs: int) -> bool:
+        """Whether batches are drawn here, and of all pictures at once."""
+        if not isinstance(sampler_here(self.manager), HeldOutPixelSampler):
+            return False
+        pictures = _images_of(self.manager)["image"]
+        return not isinstance(pictures, list) and len(pictures) == photographs
+
+    def of_vouching(self, mixture: Mixture, count: int, of_each: int) -> list[tuple[Rays, Tensor]]:
+        """Rays of each photograph that vouches, and their colours; see `held_out_rays`."""
+        sampler, chosen = held_out_sampler(self.manager), self.vouching(count)
+        if sampler is None or not len(chosen):
+            return []
+        batch = sampler.sample_pictures(_images_of(self.manager), chosen, of_each, seed=0)
+        rays, truth = _as_rays(mixture, *_bundle_of(self.manager, batch))
+        of_pictures = batch["indices"][:, 0] == chosen[:, None]
+        return [
+            (Rays._make(None if part is None else part[own] for part in rays), truth[own])
+            for own in of_pictures.to(mixture.device)
+            if bool(own.any())
+        ]
+
     def held_out(
         self, mixture: Mixture, count: int, seed: int = 0, share: Share = "calibration"
     ) -> tuple[Rays, Tensor]:
         """See `held_out_rays`."""
         return held_out_rays(mixture, self.manager, count, seed, share)
 
-    def training_rays(self, mixture: Mixture, count: int) -> Rays:
-        """Rays of random training pixels, cut to a mixture's region; those of whole batches."""
-        self.prepare_batch(1.0, distances=False)
+    def training_rays(self, mixture: Mixture, count: int, set_aside: int = 0) -> Rays:
+        """Rays of random training pixels, cut to a mixture's region; those of whole batches.
+        `set_aside` as of `prepare_batch`, and for this draw only."""
+        self.prepare_batch(1.0, distances=False, set_aside=set_aside)
         drawn: list[Rays] = []
         while sum(len(rays.origins) for rays in drawn) < count:
             bundle, _ = self.manager.next_train(0)
             bundle = bundle.to(mixture.device)
             images = bundle.camera_indices[:, 0]
             drawn.append(mixture.rays(bundle.origins, bundle.directions, images))
+        self.prepare_batch(1.0, distances=False)
         joined: Any = [None if p[0] is None else torch.cat(p)[:count] for p in zip(*drawn)]
         return Rays(*joined)
 
@@ -160,6 +209,11 @@ def held_out_bundle(
         bundle, batch = manager.next_train(0)
         return bundle[:count], batch["image"][:count]
     batch = sampler.sample_held_out(_images_of(manager), count, seed, share)
+    return _bundle_of(manager, batch)
+
+
+def _bundle_of(manager: Any, batch: dict[str, Tensor]) -> tuple[RayBundle, Tensor]:
+    """The rays of a batch of pixels, and their colours."""
     pixels = batch["indices"]
     bundle = manager.train_dataset.cameras.to("cpu").generate_rays(
         camera_indices=pixels[:, :1], coords=pixels[:, 1:].float() + 0.5
@@ -171,7 +225,11 @@ def held_out_rays(
     mixture: Mixture, manager: Any, count: int, seed: int = 0, share: Share = "calibration"
 ) -> tuple[Rays, Tensor]:
     """Held-out rays, cut to a mixture's region, and their colours [R, 3]; see `held_out_bundle`."""
-    bundle, truth = held_out_bundle(manager, count, seed, share)
+    return _as_rays(mixture, *held_out_bundle(manager, count, seed, share))
+
+
+def _as_rays(mixture: Mixture, bundle: RayBundle, truth: Tensor) -> tuple[Rays, Tensor]:
+    """Rays as a mixture takes them, and their colours [R, 3]."""
     bundle, truth = bundle.to(mixture.device), truth.to(mixture.device).float()
     images = bundle.camera_indices
     assert images is not None

@@ -14,7 +14,7 @@ from torch import Tensor, nn
 
 from leco_plugin.evaluation.held_out_psnr import OF, HeldOutPsnr
 from leco_plugin.learning.freezing import FILE_NAME
-from leco_plugin.log import Show, bar, on_screen, say, spell
+from leco_plugin.log import Show, bar, on_screen, say, say_all, spell
 from leco_plugin.studio.run_folder import CONFIG
 from leco_plugin.studio.screen import LOG
 
@@ -52,8 +52,7 @@ class RunProgress:
     def _say_where(self) -> None:
         folder, viewer = self.trainer.base_dir, self.trainer.viewer_state
         say(f"run: {escape(str(folder))}" + (f", details in {LOG}" if on_screen() else ""))
-        for line in getattr(viewer, "viewer_info", None) or ():
-            say(escape(line))
+        say_all(getattr(viewer, "viewer_info", None) or ())
 
     def after_step(self, step: int) -> None:
         """Measures where that is due, and shows how far the run is.
@@ -87,8 +86,7 @@ class RunProgress:
         tested = self.psnr.look_at_tests()
         of_tests = "" if tested is None else f"{tested:.1f} dB on test photographs"
         say(", ".join(filter(None, [line, reached, of_tests])))
-        for doubt in self.psnr.doubts(self.psnr.latest if tested is None else tested):
-            say(escape(doubt))
+        say_all(self.psnr.doubts(self.psnr.latest if tested is None else tested))
         folder = Path(self.trainer.base_dir)
         occupancy = folder / FILE_NAME
         say(f"  run        {escape(str(folder))}")

@@ -52,7 +52,7 @@ def test_the_gate_is_sharpened_where_it_guides_enough_steps(
 ):
     less, more = (Measured(0.5, 0.0, 0.0, 0.0, skipped) for skipped in (0.5, 0.6))
     small = Gate(GateConfig(width=8, scene_experts=1))
-    monkeypatch.setattr(HeldOut, "sharpened", lambda *_: Sharpened(small, more, less))
+    monkeypatch.setattr(HeldOut, "sharpened", lambda *_: Sharpened(small, more, less, None))
     options = replace(config(8), sharpening=SharpeningConfig(least_steps=30))
     occupancy = learn_occupancy(options, pipeline, rays=64, guides=guides)
     assert (occupancy.gate.config == small.config) == sharpened

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import pytest
 import torch
@@ -11,16 +12,20 @@ from hypothesis import strategies as st
 from torch import Tensor
 
 from leco_plugin.learning.calibration import (
-    SURFACE_STEPS,
     THRESHOLDS,
     CalibrationConfig,
-    Reference,
     backdrop_price,
     calibrate,
     measure,
+    promise,
+    ray_prices,
+    worst_loss,
+)
+from leco_plugin.learning.dense import (
+    SURFACE_STEPS,
+    Reference,
     near_median_depth,
     near_surface,
-    ray_prices,
     reference_of,
 )
 from leco_plugin.models.rendering import Intervals, Rays, Shaded
@@ -102,6 +107,36 @@ def test_the_threshold_is_the_largest_within_the_bounds(
     fitting = [t for t in THRESHOLDS if measure(*problem.arguments(), t).within(config)]
     assert found.threshold == max(fitting, default=0.0)
     assert found.threshold == 0.0 or found.within(config)
+
+
+def test_no_photograph_that_vouches_loses_more_than_its_bound() -> None:
+    problem, config = Problem(0), CalibrationConfig(0.05, 1.0)
+    cameras = [Chunk(seed).reference for seed in (12, 13, 17, 25, 36, 39, 42, 43, 44)]
+    alone = calibrate(*problem.arguments(), config)
+    lower = THRESHOLDS[THRESHOLDS.index(alone.threshold) + 1]
+    bound = worst_loss(cameras, lower)
+    assert worst_loss(cameras, alone.threshold) > bound > config.camera_surface_mass
+    config = replace(config, camera_surface_mass=bound)
+    found = calibrate(*problem.arguments(), config, cameras=cameras)
+    assert found == measure(*problem.arguments(), lower)
+    promised = promise(cameras, found, config)
+    assert promised["worst_surface_mass"] == promised["bound"] == bound
+    assert (promised["count"], promised["confidence"]) == (9, 0.9)
+
+
+def test_a_view_that_no_threshold_does_justice_to_lowers_nothing_and_is_said() -> None:
+    problem, config = Problem(0), CalibrationConfig(0.05, 1.0, camera_surface_mass=0.01)
+    strange = Chunk(10).reference
+    strange = strange._replace(occupancies=torch.zeros_like(strange.occupancies))
+    alone = calibrate(*problem.arguments(), config)
+    assert calibrate(*problem.arguments(), config, cameras=[strange]) == alone
+    assert promise([strange], alone, config)["bound"] == pytest.approx(1.0)
+    assert promise([], alone, config) is None
+
+
+def test_what_a_photograph_loses_never_falls_as_the_threshold_rises() -> None:
+    losses = [worst_loss([Chunk(3).reference], threshold) for threshold in reversed(THRESHOLDS)]
+    assert losses == sorted(losses) and losses[0] < losses[-1] < 1.0
 
 
 def test_nothing_is_skipped_when_no_threshold_fits() -> None:

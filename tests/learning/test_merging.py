@@ -10,8 +10,7 @@ import pytest
 import torch
 from small_learner import ARun, NoPixels, small_learner
 
-from leco_plugin.learning.calibration import near_median_depth
-from leco_plugin.learning.dense import evaluating
+from leco_plugin.learning.dense import evaluating, near_median_depth
 from leco_plugin.learning.merging import Merging, MergingConfig, find_unneeded, line_of
 from leco_plugin.models.encodings import EncodingConfig
 from leco_plugin.models.field import FieldConfig

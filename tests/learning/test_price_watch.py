@@ -13,9 +13,9 @@ import torch
 from small_learner import ARun, NoPixels, small_learner, small_mixture
 
 from leco_plugin.learning import held_out
-from leco_plugin.learning.calibration import CalibrationConfig, Measured, RayPrices, Reference
+from leco_plugin.learning.calibration import CalibrationConfig, Measured, RayPrices
 from leco_plugin.learning.collapse import GateCollapsed
-from leco_plugin.learning.dense import DenseRendering
+from leco_plugin.learning.dense import DenseRendering, Reference
 from leco_plugin.learning.freezing import FILE_NAME
 from leco_plugin.learning.held_out import HeldOut
 from leco_plugin.learning.learner import Learner

@@ -28,7 +28,7 @@ from leco_plugin.models.gate import Gate, GateConfig
 from leco_plugin.models.mixture import Mixture
 from leco_plugin.models.objective import GateLossConfig
 from leco_plugin.models.rendering import Rays
-from leco_plugin.occupancy import Occupancy
+from leco_plugin.occupancy import CAMERAS_THAT_VOUCH, Occupancy
 from leco_plugin.scenes.input_error import InputError
 
 GATE = GateConfig(EncodingConfig(octaves=2), 16, 1, 1, normed=False)
@@ -79,6 +79,10 @@ def report_of(skipped: float) -> dict[str, float]:
     return Measured(0.5, 1e-4, 2e-4, 0.01, skipped)._asdict()
 
 
+def vouched(worst: float, bound: float) -> dict[str, float]:
+    return {"count": 9, "worst_surface_mass": worst, "bound": bound, "confidence": 0.9}
+
+
 def some_rays(mixture: Mixture, count: int) -> Rays:
     origins = torch.rand(count, 3) * torch.tensor([0.0, 1.0, 1.0]) - torch.tensor([0.99, 0.5, 0.5])
     directions = torch.tensor([[1.0, 0.0, 0.0]]).expand(count, 3)
@@ -123,7 +127,9 @@ def test_a_small_gate_skips_what_the_large_one_keeps_of_free_space() -> None:
     mixture = a_mixture()
     taught, held_out = some_rays(mixture, 400), (some_rays(mixture, 100), torch.ones(100, 3))
     config = SharpeningConfig(steps=150, gate=GATE)
-    found = sharpen(mixture, taught, held_out, LOSSES, CalibrationConfig(), config, guided=False)
+    found = sharpen(
+        mixture, taught, held_out, [], LOSSES, CalibrationConfig(), config, guided=False
+    )
     assert found.pays and found.measured.empty_fraction > found.before.empty_fraction + 0.1
     assert found.measured.within(CalibrationConfig()) and found.measured.threshold > 0.0
     assert mixture.small is None, "it only says what would be"
@@ -134,13 +140,15 @@ def test_guided_only_what_is_shown_now_is_taught(monkeypatch) -> None:
     shares: list[float] = []
     real = sharpening._rendered
     monkeypatch.setattr(
-        sharpening, "_rendered", lambda m, rays, seen: shares.append(seen) or real(m, rays, seen)
+        sharpening,
+        "_rendered",
+        lambda m, rays, seen, *of: shares.append(seen) or real(m, rays, seen, *of),
     )
     mixture = a_mixture()
     data = some_rays(mixture, 30), (some_rays(mixture, 10), torch.ones(10, 3))
     config = SharpeningConfig(steps=1, gate=GATE, seen=0.25)
     for guided in (False, True):
-        sharpen(mixture, *data, LOSSES, CalibrationConfig(), config, guided)
+        sharpen(mixture, *data, [], LOSSES, CalibrationConfig(), config, guided)
     assert shares == [0.25, 0.0, 1.0, 1.0], "the lesson, then prices"
 
 
@@ -151,11 +159,14 @@ class Pixels:
         self.mixture = mixture
         self.survey = None
 
-    def training_rays(self, mixture: Mixture, count: int) -> Rays:
+    def training_rays(self, mixture: Mixture, count: int, set_aside: int) -> Rays:
         return some_rays(mixture, count)
 
     def held_out(self, mixture: Mixture, count: int, *_: Any) -> tuple[Rays, Tensor]:
         return some_rays(mixture, 60), torch.ones(60, 3)
+
+    def of_vouching(self, *_: Any) -> list[Any]:
+        return []
 
     def prepare_batch(self, *_: Any, **__: Any) -> None:
         """Nothing is drawn."""
@@ -231,8 +242,10 @@ def test_a_gate_of_a_kind_that_was_asked_for_stays() -> None:
 def test_prices_of_guided_sharpening_are_sums_of_costs() -> None:
     before = Measured(0.5, 1e-4, 1e-4, 0.03, 0.6, 3e-5, 0.003)
     found = Measured(0.4, 2e-4, 2e-4, -0.05, 0.7, 4e-5, 0.004)
-    report = Sharpened(Gate(GATE), found, before).report(
-        {"params": 7, **before._asdict()}, SMALLEST.gate, guided=True
+    report = Sharpened(Gate(GATE), found, before, vouched(3e-4, 2e-3)).report(
+        {"params": 7, **before._asdict(), CAMERAS_THAT_VOUCH: vouched(1e-4, 2e-3)},
+        SMALLEST.gate,
+        guided=True,
     )
     assert report["image_price_db"] == 0.03 and report["price_error_db"] == pytest.approx(0.005)
     assert report["lost_surface_mass"] == pytest.approx(3e-4)
@@ -252,7 +265,7 @@ def test_without_a_position_to_teach_with_nothing_is_sharpened(
 
 def test_what_does_not_pay_changes_nothing() -> None:
     few = Measured(0.5, 0.0, 0.0, 0.0, 0.5)
-    found = Sharpened(Gate(GATE), few, few)
+    found = Sharpened(Gate(GATE), few, few, None)
     assert not found.pays and "the gate stays" in found.line
 
 

@@ -99,6 +99,8 @@ class HeldOutPixelSampler(PixelSampler):
     radii: Tensor | None = None
     """[P] in place of the one `fisheye_crop_radius`, by the dataset's number of a picture; infinite
     where its camera is no fisheye."""
+    set_aside: Tensor | None = None
+    """[P] bool, by the dataset's number of a picture: those of which nothing is drawn for now."""
     numbers = torch.zeros(0, dtype=torch.int64)
     """Numbers in the dataset of the batch's pictures that are still to be drawn of."""
 
@@ -156,6 +158,17 @@ class HeldOutPixelSampler(PixelSampler):
         corners = pixels[:, 1:] - torch.div(sizes, 2, rounding_mode="floor")
         return corners.abs().maximum((corners + 1).abs()).square().sum(dim=-1) <= radius**2
 
+    def _may_be_drawn(self, pixels: Tensor, sizes: Tensor, numbers: Tensor | None) -> Tensor:
+        """Whether pixels are shown, and of pictures that are not set aside; as `shown`. Where all
+        pictures that can be drawn of are set aside, that does not count."""
+        shown = self.shown(pixels, sizes, numbers)
+        if self.set_aside is None:
+            return shown
+        aside = self.set_aside if numbers is None else self.set_aside[numbers]
+        if bool(aside.all()):
+            return shown
+        return shown & ~aside[pixels[:, 0].cpu()].to(shown.device)
+
     def _through_the_lens(
         self,
         draw: Callable[[int], Tensor],
@@ -163,7 +176,8 @@ class HeldOutPixelSampler(PixelSampler):
         sizes: Tensor,
         numbers: Tensor | None = None,
     ) -> Tensor:
-        """Drawn pixels [count, 3], those drawn anew that a fisheye does not show.
+        """Drawn pixels [count, 3], those drawn anew that a fisheye does not show, or whose pictures
+        are set aside.
 
         Args:
             sizes: as of `shown`, or [P, 2] of all pictures.
@@ -174,7 +188,7 @@ class HeldOutPixelSampler(PixelSampler):
         pixels = draw(count)
         for _ in range(TRIES):
             each = sizes if sizes.dim() == 1 else sizes[pixels[:, 0]]
-            hidden = ~self.shown(pixels, each, numbers)
+            hidden = ~self._may_be_drawn(pixels, each, numbers)
             if not bool(hidden.any()):
                 return pixels
             pixels[hidden] = draw(int(hidden.sum()))
@@ -249,6 +263,39 @@ class HeldOutPixelSampler(PixelSampler):
             "indices": torch.cat([numbers[:, None], within], dim=-1),
         }
 
+    def sample_pictures(
+        self, images: dict[str, Any], chosen: Tensor, count: int, seed: int
+    ) -> dict[str, Tensor]:
+        """A batch of random pixels of chosen pictures, as of `sample_held_out`, in their order.
+
+        Args:
+            chosen: [K] numbers in the dataset; all are in the batch of images.
+            count: pixels of each; fewer come back where masks leave fewer.
+        """
+        numbers, sizes = torch.as_tensor(images["image_idx"]).cpu(), sizes_of(images["image"])
+        generator = torch.Generator().manual_seed(seed)
+        found = []
+        for picture in (numbers[None] == chosen[:, None]).int().argmax(dim=1).tolist():
+            drawn = torch.rand(DRAWN * count, 2, generator=generator) * sizes[picture]
+            places = torch.nn.functional.pad(drawn.long(), (1, 0), value=picture)
+            found.append(self._visible(images, places, sizes, numbers)[:count])
+        places = torch.cat(found)
+        return {
+            "image": look_up(images["image"], places[:, 0], places[:, 1:]),
+            "indices": torch.cat([numbers[places[:, :1]], places[:, 1:]], dim=-1),
+        }
+
+    def _visible(
+        self, images: dict[str, Any], places: Tensor, sizes: Tensor, numbers: Tensor
+    ) -> Tensor:
+        """Those of pixels [N, 3] (place in the batch, row, column) that no lens and no mask
+        hides."""
+        places = places[self.shown(places, sizes[places[:, 0]], numbers)]
+        if "mask" in images:
+            seen = look_up(images["mask"], places[:, 0], places[:, 1:]).flatten(1).all(dim=1)
+            places = places[seen.cpu()]
+        return places
+
     def count_held_out(self, images: dict[str, Any], most: int, share: Share) -> int:
         """How many pixels of a share there are, up to `most`; arguments as of `sample_held_out`."""
         return len(self._held_out(images, most, 0, share)[0])
@@ -260,10 +307,7 @@ class HeldOutPixelSampler(PixelSampler):
         sizes = sizes_of(images["image"])
         places = self.lattice.draw(sizes, DRAWN * count, torch.Generator().manual_seed(seed))
         numbers = torch.as_tensor(images["image_idx"]).cpu()
-        places = places[self.shown(places, sizes[places[:, 0]], numbers)]
-        if "mask" in images:
-            seen = look_up(images["mask"], places[:, 0], places[:, 1:]).flatten(1).all(dim=1)
-            places = places[seen.cpu()]
+        places = self._visible(images, places, sizes, numbers)
         of_share = self.lattice.is_of(places, share)
         places = places[of_share] if bool(of_share.any()) else places
         return places[:count, 0], places[:count, 1:]

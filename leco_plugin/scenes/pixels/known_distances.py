@@ -172,6 +172,8 @@ class KnownDistancePixelSampler(HeldOutPixelSampler):
         place_of[numbers] = torch.arange(len(numbers))
         places = place_of[pixels[:, 0]]
         loaded = places >= 0
+        if self.set_aside is not None:
+            loaded &= ~self.set_aside[pixels[:, 0]]
         drawn, pixels, places = drawn[loaded], pixels[loaded], places[loaded]
         inside = self.shown(pixels, sizes_of(images["image"])[places])
         drawn, pixels, places = drawn[inside], pixels[inside], places[inside]

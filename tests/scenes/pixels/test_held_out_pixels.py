@@ -126,6 +126,38 @@ def test_of_many_held_out_pixels_other_seeds_give_others_from_everywhere(share: 
     assert float(larger.amax()) > 0.95 and float(larger.amin()) < 0.05
 
 
+@pytest.mark.parametrize("masked", [False, True])
+def test_of_pictures_that_are_set_aside_nothing_is_drawn_until_they_are_no_more(
+    masked: bool,
+) -> None:
+    torch.manual_seed(0)
+    made, batch = sampler(), images(masked)
+    made.set_aside = torch.arange(10) == 8
+    assert set(made.sample(dict(batch))["indices"][:, 0].tolist()) == {7, 9}
+    made.set_aside = None
+    assert set(made.sample(dict(batch))["indices"][:, 0].tolist()) == {7, 8, 9}
+
+
+def test_where_every_picture_is_set_aside_all_are_drawn_of() -> None:
+    made = sampler()
+    made.set_aside = torch.ones(10, dtype=torch.bool)
+    assert len(made.sample(images())["indices"]) == 5000
+
+
+@pytest.mark.parametrize("masked", [False, True])
+def test_pixels_of_chosen_pictures_are_theirs_and_seen(masked: bool) -> None:
+    batch = images(masked)
+    found = sampler().sample_pictures(batch, torch.tensor([9, 7]), 100, seed=0)
+    assert found["indices"][:, 0].tolist() == [9] * 100 + [7] * 100
+    places = found["image"].long()
+    assert torch.equal(batch["image_idx"][places[:, 0]], found["indices"][:, 0])
+    assert torch.equal(places[:, 1:], found["indices"][:, 1:])
+    if masked:
+        assert bool(batch["mask"][tuple(places.unbind(dim=-1))].all())
+    again = sampler().sample_pictures(batch, torch.tensor([9, 7]), 100, seed=0)
+    assert torch.equal(found["indices"], again["indices"])
+
+
 def test_images_of_many_sizes_are_sampled_as_a_list() -> None:
     pictures = [torch.rand(20, 30, 3), torch.rand(50, 12, 3)]
     batch = {"image": pictures, "image_idx": torch.tensor([0, 1])}

@@ -1,0 +1,62 @@
+"""Photographs that teach an occupancy nothing, and vouch for it."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+import torch
+
+from leco_plugin.learning.quality import views_in_words
+from leco_plugin.occupancy import CAMERAS_THAT_VOUCH
+from leco_plugin.scenes import learning_data
+from leco_plugin.scenes.bounds import BoundsConfig
+from leco_plugin.scenes.learning_data import LearningData
+from leco_plugin.scenes.pixels.held_out_pixels import HeldOutPixelSampler, HeldOutPixelSamplerConfig
+
+
+@pytest.fixture
+def data(monkeypatch: pytest.MonkeyPatch) -> LearningData:
+    """Forty photographs in memory."""
+    monkeypatch.setattr(learning_data, "survey", lambda *_: None)
+    sampler = HeldOutPixelSampler(HeldOutPixelSamplerConfig(num_rays_per_batch=50))
+    images = {"image": torch.zeros(40, 6, 7, 3), "image_idx": torch.arange(40)}
+    manager: Any = SimpleNamespace(
+        train_dataset=range(40),
+        train_pixel_sampler=sampler,
+        get_train_rays_per_batch=lambda: 50,
+        iter_train_image_dataloader=iter(lambda: images, None),
+        images=images,
+    )
+    return LearningData(manager, BoundsConfig(), None, None)
+
+
+def test_they_are_spread_evenly_and_at_most_a_quarter(data: LearningData) -> None:
+    assert data.vouching(10).tolist() == list(range(2, 40, 4))
+    assert len(data.vouching(11)) == 0 and len(data.vouching(0)) == 0
+
+
+def test_nothing_is_drawn_of_them_until_all_train(data: LearningData) -> None:
+    sampler = data.manager.train_pixel_sampler
+    data.prepare_batch(40.0, distances=False, set_aside=4)
+    drawn = sampler.sample(dict(data.manager.images))["indices"][:, 0]
+    assert not set(drawn.tolist()) & {5, 15, 25, 35} and len(drawn.unique()) == 36
+    data.prepare_batch(40.0, distances=False)
+    drawn = sampler.sample(dict(data.manager.images))["indices"][:, 0]
+    assert {5, 15, 25, 35} <= set(drawn.tolist())
+
+
+@pytest.mark.parametrize("images", [[torch.zeros(6, 7, 3)] * 40, torch.zeros(16, 6, 7, 3)])
+def test_batches_of_single_or_of_some_pictures_cannot_do_without_any(
+    data: LearningData, images: Any
+) -> None:
+    data.manager.images["image"] = images
+    assert len(data.vouching(4)) == 0
+
+
+def test_what_views_may_lose_is_said_in_a_line() -> None:
+    said = {"count": 9, "worst_surface_mass": 0.00123, "bound": 0.002, "confidence": 0.9}
+    line = views_in_words({CAMERAS_THAT_VOUCH: said})
+    assert "0.12%" in line and "0.20%, with 90%" in line
+    assert "may lose more" in views_in_words({}) == views_in_words({CAMERAS_THAT_VOUCH: None})
