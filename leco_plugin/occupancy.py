@@ -130,12 +130,14 @@ class Occupancy(nn.Module):
         # 0 or 1 from one comparison of distances, the cheapest on a CPU; of NaN it is 0
         inside = torch.maximum(mapped.T.abs().amax(dim=0) - 1.0, beyond_walls).le_(0.0)
         mapped = mapped.clamp_(-1.0, 1.0).nan_to_num_()
+        return self.of_mapped(mapped).mul_(inside).mul_(self.seen(mapped))
+
+    def of_mapped(self, mapped: Tensor) -> Tensor:
+        """The gate's answers at mapped positions [N, 3] in [-1, 1], wherever they lie: [N]."""
         if mapped.device.type == "cpu":
-            values = occupancy_of(self.gate, mapped, getattr(torch, self.precision))
-        else:
-            with gate_precision(mapped.device.type, self.precision):
-                values = self.gate.occupancy(mapped)
-        return values.mul_(inside).mul_(self.seen(mapped))
+            return occupancy_of(self.gate, mapped, getattr(torch, self.precision))
+        with gate_precision(mapped.device.type, self.precision):
+            return self.gate.occupancy(mapped)
 
     def occupied(self, positions: Tensor) -> Tensor:
         """Whether scene positions [N, 3] are kept: bool [N]; errors as of `query`.

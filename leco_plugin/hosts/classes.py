@@ -18,6 +18,7 @@ from nerfstudio.model_components.renderers import RGBRenderer
 from nerfstudio.models.base_model import Model, ModelConfig
 from torch import Tensor, nn
 
+from leco_plugin.hosts.along import Along
 from leco_plugin.hosts.first_steps import set_first_density
 from leco_plugin.hosts.guide import Guide
 from leco_plugin.hosts.guided_start import GuidedStart, OccupancyConfig
@@ -139,7 +140,8 @@ class GuidedHost(Host):
         if not guide.needs_occupancy:
             return super().get_training_callbacks(attributes)
         config, around = self.leco_occupancy, (attributes.pipeline, run_of(attributes.trainer))
-        start = GuidedStart(self, guide, config, *around)
+        along = Along(self, guide, config.learning, *around) if config.learned == "along" else None
+        start = GuidedStart(self, guide, config, *around, along)
         watch = HostWatch(self, guide, config.learning.calibration, *around)
         before = [TrainingCallbackLocation.BEFORE_TRAIN_ITERATION]
         after = [TrainingCallbackLocation.AFTER_TRAIN_ITERATION]
@@ -148,6 +150,7 @@ class GuidedHost(Host):
             *super().get_training_callbacks(attributes),
             TrainingCallback(before, watch.before_step),
             TrainingCallback(after, watch.after_step),
+            *([] if along is None else [TrainingCallback(after, along.after_step)]),
         ]
 
 

@@ -65,6 +65,8 @@ class Guide(nn.Module):
         dense: whether packed samplers keep every candidate for the moment, as a reference.
         cropped: whether the limits of the rays that are rendered now are those of a crop.
         without_proposals: whether the host's proposal networks are gone.
+        listener: what answers packed samplers for the moment, in place of what they build; called
+            with origins and directions [R, 3] in the occupancy's coordinates, and the options.
         kept: samples that a packed sampler kept when it was last asked in training.
         watched: what is known of the price of skipping; travels with a checkpoint.
         first_density: with which the host's field began, None for its own; see `first_steps`.
@@ -89,6 +91,7 @@ class Guide(nn.Module):
         self.version = 0
         self.dense = self.cropped = self.without_proposals = False
         self.kept: int | None = None
+        self.listener: Callable[[Tensor, Tensor, dict[str, Any]], Any] | None = None
         self.watched = WatchState()
         self.first_density: float | None = None
         self.register_buffer("frame", torch.eye(3, 4))

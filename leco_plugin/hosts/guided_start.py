@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 import torch
 from torch import Tensor, nn
@@ -23,6 +23,9 @@ from leco_plugin.samplers.registry import check_gate
 from leco_plugin.scenes.frames import between, found_again, frame_of, moved, turned
 from leco_plugin.scenes.input_error import InputError
 from leco_plugin.scenes.survey import MOST_CAMERAS, covering_rays, sparse_points, survey
+
+if TYPE_CHECKING:
+    from leco_plugin.hosts.along import Along
 
 PLACES = 128
 """Positions on each ray at which a file is asked whether it fits the cameras."""
@@ -62,6 +65,10 @@ class OccupancyConfig:
     opaque_start: bool = True
     """Packed hosts: begin with a density that makes what is kept of a ray opaque, where the host's
     own would not. Before a random background a transparent start may never recover."""
+    learned: Literal["first", "along"] = "first"
+    """first: without a path, an HMoE learns the occupancy before the host's first step. along: the
+    host trains at once, within the scene's bounds, and its own rendering weights teach a small gate
+    now and then; for packed hosts, in one process."""
     seconds: float | None = None
     """Without a path: about how long learning may take at most; None is until it has settled."""
     rays: int = 1024
@@ -113,6 +120,7 @@ class GuidedStart:
         config: where else to get one.
         pipeline: nerfstudio's.
         run: what is around the steps; None leaves no file.
+        teacher: of a host that teaches its own gate; it leaves the file.
     Raises:
         InputError: the file is not there or cannot be read; its occupancy keeps nothing that the
             cameras see, and this run has not begun with it; its gate is none that the sampler asks;
@@ -126,8 +134,9 @@ class GuidedStart:
         config: OccupancyConfig,
         pipeline: Any,
         run: Run | None = None,
+        teacher: Along | None = None,
     ) -> None:
-        self.host, self.guide, self.config = host, guide, config
+        self.host, self.guide, self.config, self.teacher = host, guide, config, teacher
         self.pipeline, self.run = pipeline, run or LearningOnly()
         self.begun = False
         if guide.occupancy is None and config.path is not None:
@@ -137,8 +146,9 @@ class GuidedStart:
 
             check_budget(config.rays, config.seconds, config.rate)
         learned = guide.occupancy.gate.config if guide.occupancy is not None else None
+        own, small = config.learning.sizes.gate, config.learning.sharpening.gate
         try:
-            check_gate(guide.sampler, learned or config.learning.sizes.gate)
+            check_gate(guide.sampler, learned or (small if config.learned == "along" else own))
         except ValueError as error:
             here = "; or here, with that option at --pipeline.model.occupancy.learning"
             raise InputError(f"{error}{'' if learned else here}") from None
@@ -152,6 +162,8 @@ class GuidedStart:
         if self.begun:
             return
         self.begun = True
+        if self.teacher is not None:
+            self.teacher.begin()
         if self.guide.occupancy is None:
             from leco_plugin.hosts.learn_first import learn_occupancy
 
@@ -170,7 +182,7 @@ class GuidedStart:
         if step == 0 and self.config.opaque_start:
             kept = self._along_rays().kept(self.guide.followed().threshold)
             begin_opaque(self.host, self.guide, kept)
-        if self.run.folder is not None:
+        if self.run.folder is not None and self.teacher is None:
             leave_file(self.guide.the_occupancy(), self.run.folder)
 
     def _along_rays(self) -> AlongRays:

@@ -125,7 +125,6 @@ class GuidedEstimator(_StandIn):
     @functools.wraps(Estimator.sampling)
     def sampling(self, rays_o: Tensor, rays_d: Tensor, *args: Any, **kwargs: Any) -> Any:
         guide = self.guide
-        estimator: Any = self.dense if guide.dense else self.sampler
         bound = _SAMPLING.bind(self, rays_o, rays_d, *args, **kwargs).arguments
         given = {name: value for name, value in bound.items() if name not in _RAYS}
         options = uncropped = self._with_an_end(rays_o, rays_d, given)
@@ -137,7 +136,11 @@ class GuidedEstimator(_StandIn):
             # a direction carries the scale, so that distances along the ray stay the host's
             frame = guide.frame.to(rays_o)
             rays_o, rays_d = moved(rays_o, frame), turned(rays_d, frame)
-        samples = estimator.sampling(rays_o, rays_d, **options)
+        if guide.listener is not None:
+            samples = guide.listener(rays_o, rays_d, options)
+        else:
+            estimator: Any = self.dense if guide.dense else self.sampler
+            samples = estimator.sampling(rays_o, rays_d, **options)
         if self.training:
             guide.kept = len(samples[0])
         occupancy = guide.the_occupancy()

@@ -25,9 +25,9 @@ SURE = 1.0
 """Standard errors by which a price must be beyond its bound to count as beyond it."""
 MOST = 10.0
 """Times its bound that a price may be measured, however large its standard error is."""
-LEFT = 0.9
-"""Share of what is skipped that is left at least when photographs that vouch lower a threshold. To
-views that no other photograph resembles no threshold does justice: how much they lose is said."""
+MORE_KEPT = 1.25
+"""Times as many candidates that photographs which vouch may have kept at most. To a view that no
+other photograph resembles no threshold does justice: how much it loses is said."""
 EXACT = 1e-10
 """Mean squared error, 100 dB, below which two renderings are both exact."""
 
@@ -318,7 +318,7 @@ def calibrate(
 
     Args:
         cameras: dense renderings of photographs that vouch. By the threshold none of them loses
-            too much, see `worst_loss`, where that leaves `LEFT` of what is skipped.
+            too much, see `worst_loss`, where that keeps no more than `MORE_KEPT` times as much.
     """
     parts, best = (references, truths, render_kept), None
     for threshold in (tried for tried in THRESHOLDS if tried < below):
@@ -333,7 +333,9 @@ def calibrate(
         if not measured.within(config):
             continue
         if not beyond:
-            if best is None or measured.empty_fraction >= LEFT * best.empty_fraction:
+            if best is None or 1.0 - measured.empty_fraction <= MORE_KEPT * (
+                1.0 - best.empty_fraction
+            ):
                 return measured
             return best
         best = measured

@@ -64,10 +64,22 @@ def near_surface(shaded: Shaded, intervals: Intervals, is_backdrop: Tensor) -> T
     Returns:
         [M] bool.
     """
+    weighed = shaded.weights, shaded.accumulation, shaded.packed_info
+    return near_surface_by(*weighed, intervals, is_backdrop)
+
+
+def near_surface_by(
+    weights: Tensor,
+    accumulation: Tensor,
+    packed_info: Tensor,
+    intervals: Intervals,
+    is_backdrop: Tensor,
+) -> Tensor:
+    """`near_surface` from rendering weights [M], their sums [R], and start and count [R, 2]."""
     if len(is_backdrop) == 0:
         return is_backdrop
-    medians = _medians(shaded, intervals)
-    meets = ~is_backdrop[medians] & (shaded.packed_info[:, 1] > 0)
+    medians = _medians(weights, accumulation, packed_info, intervals)
+    meets = ~is_backdrop[medians] & (packed_info[:, 1] > 0)
     if int(meets.sum()) < FEWEST_SURFACES * len(meets):
         meets = torch.ones_like(meets)
     return _near(medians, intervals) & meets[intervals.ray_indices]
@@ -79,7 +91,8 @@ def near_median_depth(shaded: Shaded, intervals: Intervals) -> Tensor:
     Returns:
         [M] bool.
     """
-    return _near(_medians(shaded, intervals), intervals)
+    weighed = shaded.weights, shaded.accumulation, shaded.packed_info
+    return _near(_medians(*weighed, intervals), intervals)
 
 
 def _near(medians: Tensor, intervals: Intervals) -> Tensor:
@@ -89,19 +102,19 @@ def _near(medians: Tensor, intervals: Intervals) -> Tensor:
     return (middles - middles[median]).abs() <= SURFACE_STEPS * steps * 1.001
 
 
-def _medians(shaded: Shaded, intervals: Intervals) -> Tensor:
+def _medians(
+    weights: Tensor, accumulation: Tensor, packed_info: Tensor, intervals: Intervals
+) -> Tensor:
     """The sample of each ray that halves its weight: [R], any for a ray without samples."""
-    num_rays = len(shaded.packed_info)
     below_half = (
-        inclusive_sum(shaded.weights, packed_info=shaded.packed_info)
-        < 0.5 * shaded.accumulation[intervals.ray_indices]
+        inclusive_sum(weights, packed_info=packed_info) < 0.5 * accumulation[intervals.ray_indices]
     )
-    ahead = accumulate_along_rays(below_half.float(), None, intervals.ray_indices, num_rays)[
-        :, 0
-    ].long()
-    starts, counts = shaded.packed_info.unbind(dim=-1)
+    ahead = accumulate_along_rays(
+        below_half.float(), None, intervals.ray_indices, len(packed_info)
+    )[:, 0].long()
+    starts, counts = packed_info.unbind(dim=-1)
     median = starts + torch.minimum(ahead, (counts - 1).clamp(min=0))
-    return median.clamp(max=max(len(shaded.weights) - 1, 0))
+    return median.clamp(max=max(len(weights) - 1, 0))
 
 
 class DenseRendering(NamedTuple):

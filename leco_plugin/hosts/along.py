@@ -1,0 +1,323 @@
+"""A host that teaches its own gate while it trains, in place of an HMoE that learns before it.
+
+It begins within the scene's bounds, where it keeps whatever a training ray can reach. From time to
+time its own rendering weights teach a small gate, as a frozen field does in `learning.sharpening`.
+The gate is calibrated on held-out rays, and guides from then on if it skips more within the same
+bounds. Weights are read at the seam of packed hosts, which ask for densities while they train.
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Any, NamedTuple
+
+import torch
+from torch import Tensor
+
+from leco_plugin.hosts.guide import Guide
+from leco_plugin.hosts.stand_ins import GuidedEstimator
+from leco_plugin.learning.calibration import THRESHOLDS, CalibrationConfig, Measured, measure
+from leco_plugin.learning.dense import Reference, near_surface_by
+from leco_plugin.learning.freezing import leave_file
+from leco_plugin.learning.lesson import Lesson, round_weights, teach
+from leco_plugin.learning.run import Run
+from leco_plugin.learning.sharpening import ERRORS, LOSSES, SharpeningConfig
+from leco_plugin.log import note, say
+from leco_plugin.models.compute.device import fast_precision
+from leco_plugin.models.gate import Gate
+from leco_plugin.models.leco_config import LecoModelConfig
+from leco_plugin.models.losses import widen
+from leco_plugin.models.objective import GateLossConfig
+from leco_plugin.models.region import Region
+from leco_plugin.models.rendering import Intervals
+from leco_plugin.occupancy import Occupancy
+from leco_plugin.samplers.base import prune
+from leco_plugin.samplers.estimator import LearnedOccupancyEstimator
+from leco_plugin.samplers.packed import accumulate_along_rays, pack_info, render_weight_from_density
+from leco_plugin.scenes.input_error import InputError
+from leco_plugin.scenes.learning_data import LearningData, held_out_bundle
+from leco_plugin.studio.host_models import true_colours
+
+OPEN = 1e-4
+"""Threshold of bounds alone, below all that calibration tries."""
+FIRST = 250
+"""Steps of a host before it teaches for the first time."""
+SHARE_OF_TIME = 0.1
+"""Of training, about the most that teaching takes after that."""
+HELD_OUT_RAYS = 2048
+"""Rays on which a gate is calibrated; each threshold that is tried renders them."""
+LOWER = 3
+"""Steps of `THRESHOLDS` from one that costs too much to the next that is tried."""
+
+
+def open_occupancy(data: LearningData, config: SharpeningConfig) -> Occupancy:
+    """Bounds alone: walls, and the space that training rays cross, in which nothing is skipped."""
+    region = Region()
+    region.set(data.survey.bounds)
+    region.look(*data.covering_rays())
+    region.see(*data.rays_of_all_images())
+    report = {"aabb": region.aabb.tolist(), "empty_fraction": 0.0, **data.facts()}
+    report |= dict.fromkeys((*LOSSES, *ERRORS), 0.0)
+    precision, walls = fast_precision(region.aabb.device), region.aabb
+    made = Occupancy(Gate(config.gate), region.space, OPEN, precision, report, walls, region.seen)
+    return bounds_of(made)
+
+
+def bounds_of(occupancy: Occupancy) -> Occupancy:
+    """The bounds of an occupancy, within which nothing is skipped."""
+    gate = Gate(occupancy.gate.config)
+    for parameter in gate.parameters():
+        parameter.data.zero_()  # o(x) is one half everywhere, of which cells are sure
+    given = occupancy.space, OPEN, occupancy.precision, occupancy.report
+    made = Occupancy(gate, *given, occupancy.walls, occupancy.seen)
+    return made.to(occupancy.walls.device).eval()
+
+
+class Heard(NamedTuple):
+    """What a host's field says along some rays."""
+
+    mapped: Tensor
+    """[M, 3] middles of all candidates within the bounds, in [-1, 1]."""
+    intervals: Intervals
+    weights: Tensor
+    """[M] rendering weights; 0 where the present occupancy skips."""
+    kept: Tensor
+    """[M] bool, by that."""
+    rays: int
+
+    def lesson(self, losses: GateLossConfig) -> Lesson:
+        """The targets of the contribution loss at all candidates."""
+        of_ray = self.intervals.ray_indices
+        wide = widen(self.weights, of_ray[1:] == of_ray[:-1])
+        target = (wide / losses.weight_at_full).clamp(max=1.0)
+        return Lesson(self.mapped, losses.emphasis * target, 1.0 - target)
+
+    def reference(self, occupancies: Tensor) -> Reference:
+        """As `measure` takes it, without an image."""
+        nothing = torch.zeros_like(self.kept)
+        of_ray = self.intervals.ray_indices
+        accumulation = accumulate_along_rays(self.weights, None, of_ray, self.rays)[:, 0]
+        packed_info = pack_info(of_ray, self.rays)
+        near = near_surface_by(self.weights, accumulation, packed_info, self.intervals, nothing)
+        rgb = self.weights.new_zeros(self.rays, 3)
+        return Reference(self.intervals, self.weights, occupancies, near, rgb, nothing)
+
+
+class Along:
+    """Stands around the steps of a packed host that teaches its own gate.
+
+    Args:
+        host: what trains.
+        guide: of the host.
+        config: how a gate is taught and calibrated; its field is not built.
+        pipeline: nerfstudio's.
+        run: what is around the steps.
+    Raises:
+        InputError: the host draws a fixed number of samples, or several processes train it.
+    """
+
+    def __init__(
+        self, host: Any, guide: Guide, config: LecoModelConfig, pipeline: Any, run: Run
+    ) -> None:
+        instead = "leave --pipeline.model.occupancy.learned at first"
+        if not any(isinstance(module, GuidedEstimator) for module in host.modules()):
+            raise InputError(f"this host asks for no densities along rays to teach with: {instead}")
+        if getattr(pipeline, "world_size", 1) > 1:
+            raise InputError(f"a host that teaches its own gate trains in one process: {instead}")
+        self.host, self.guide, self.config, self.run = host, guide, config, run
+        self.manager = pipeline.datamanager
+        self.data = LearningData(self.manager, config.bounds, config.near, config.far)
+        self.steps, self.began, self.spent = 0, time.monotonic(), 0.0
+
+    def begin(self) -> None:
+        """Guides the host by bounds alone, where it has no occupancy yet."""
+        if self.guide.occupancy is None:
+            self.guide.set_occupancy(open_occupancy(self.data, self.config.sharpening))
+            say("the host begins within the scene's bounds and teaches its gate while it trains")
+
+    def after_step(self, step: int) -> None:
+        """Teaches where that is due: first after `FIRST` steps, then as often as `SHARE_OF_TIME`
+        allows, and at the end of a run."""
+        self.steps += 1
+        last = step + 1 >= self.run.end
+        passed = time.monotonic() - self.began
+        due = self.steps == FIRST if self.spent == 0.0 else self.spent < SHARE_OF_TIME * passed
+        if due or (last and self.steps > FIRST):
+            started = time.monotonic()
+            self._teach(step)
+            self.spent += time.monotonic() - started
+
+    def _teach(self, step: int) -> None:
+        """Teaches and calibrates a gate; follows it where it skips more."""
+        config, before, started = self.config, self.guide.the_occupancy(), time.monotonic()
+        precision = before.precision
+        with torch.random.fork_rng(devices=[]):  # batches are those of a run that teaches nothing
+            torch.manual_seed(step)
+            taught = self._hear(self._training_bundles(config.sharpening.rays))
+            bundle, truth = held_out_bundle(self.manager, HELD_OUT_RAYS, step, "calibration")
+            held_out = self._hear([bundle])
+            gate = teach(
+                config.sharpening.gate,
+                taught.lesson(config.gate_loss),
+                config.sharpening.steps,
+                precision,
+                seed=step,
+            )
+            round_weights(gate)
+            found = self._calibrated(gate, held_out, bundle, truth)
+        seconds = time.monotonic() - started
+        skipped = 1.0 - float(held_out.kept.float().mean())
+        what = f"step {step}: a gate taught by the host in {seconds:.0f} s"
+        if found is None or found.empty_fraction <= skipped:
+            note(f"{what} skips no more within its bounds than the {skipped:.1%} that are skipped")
+            return
+        say(f"{what} {found.line}, where {skipped:.1%} were skipped")
+        report = {**before.report, **found._asdict(), "step": step, "learned": "along"}
+        for name in LOSSES:
+            report[name] = max(0.0, report[name]) + float(before.report.get(name, 0.0))
+        for name in ERRORS:
+            report[name] = math.hypot(report[name], float(before.report.get(name, 0.0)))
+        report |= {"params": sum(p.numel() for p in gate.parameters())}
+        report |= {"train_seconds": round(self.spent + seconds, 2), "calibration_rays": len(truth)}
+        made = self._with_gate(gate, found.threshold, report)
+        self.guide.set_occupancy(made)
+        self.guide.watched.evidence = {}
+        if self.run.folder is not None:
+            leave_file(made, self.run.folder)
+
+    def _with_gate(self, gate: Gate, threshold: float, report: dict[str, Any]) -> Occupancy:
+        """The present occupancy with another gate."""
+        now = self.guide.the_occupancy()
+        made = Occupancy(gate, now.space, threshold, now.precision, report, now.walls, now.seen)
+        return made.to(now.walls.device).eval()
+
+    def _training_bundles(self, count: int) -> Iterator[Any]:
+        """Batches of training rays, as many as are wanted."""
+        drawn = 0
+        while drawn < count:
+            bundle, _ = self.manager.next_train(0)
+            drawn += len(bundle)
+            yield bundle
+
+    def _hear(self, bundles: Any) -> Heard:
+        """The host's weights along rays, rendered as it renders in training."""
+        heard: list[Heard] = []
+        with self._listening(heard), torch.no_grad():
+            for bundle in bundles:
+                self.host(bundle.to(self.host.device))
+        first = torch.tensor([0, *(one.rays for one in heard)]).cumsum(0).tolist()
+        intervals = zip(*(one.intervals for one in heard))
+        of_rays, *ends = ([*parts] for parts in intervals)
+        of_rays = [indices + number for indices, number in zip(of_rays, first)]
+        return Heard(
+            torch.cat([one.mapped for one in heard]),
+            Intervals(torch.cat(of_rays), *(torch.cat(parts) for parts in ends)),
+            torch.cat([one.weights for one in heard]),
+            torch.cat([one.kept for one in heard]),
+            first[-1],
+        )
+
+    @contextmanager
+    def _listening(self, heard: list[Heard]) -> Iterator[None]:
+        """Meanwhile what the host's field says along rays is noted."""
+        guide, occupancy = self.guide, self.guide.the_occupancy()
+        every = LearnedOccupancyEstimator(bounds_of(occupancy)).to(guide.frame.device)
+
+        def hear(rays_o: Tensor, rays_d: Tensor, options: dict[str, Any]) -> Any:
+            limits = {"early_stop_eps": 0.0, "alpha_thre": 0.0}
+            samples = every.sampling(rays_o, rays_d, **{**options, **limits})
+            one = _heard_of(occupancy, samples, rays_o, rays_d, options)
+            heard.append(one)
+            of_rays, starts, ends = (part[one.kept] for part in samples)
+            names = ("sigma_fn", "alpha_fn", "early_stop_eps", "alpha_thre")
+            return prune(
+                (of_rays, starts, ends),
+                len(rays_o),
+                **{n: options[n] for n in names if n in options},
+            )
+
+        was_training = self.host.training
+        self.host.train()  # only then a host asks for densities
+        kept, guide.listener = guide.kept, hear
+        try:
+            yield
+        finally:
+            guide.listener, guide.kept = None, kept
+            self.host.train(was_training)
+
+    def _calibrated(self, gate: Gate, heard: Heard, bundle: Any, truth: Tensor) -> Measured | None:
+        """The largest threshold within the bounds, and what it costs; None where none is."""
+        config: CalibrationConfig = self.config.calibration
+        before = self.guide.the_occupancy()
+        asked = self._with_gate(gate, THRESHOLDS[0], {})
+        with torch.no_grad():
+            reference = heard.reference(asked.of_mapped(heard.mapped))
+        nothing = [truth.new_zeros(heard.rays, 3)]
+        errors = self._errors(bundle, truth)
+        number = 0
+        try:
+            while number < len(THRESHOLDS):
+                threshold = THRESHOLDS[number]
+                found = measure([reference], nothing, _no_image, threshold, with_image=False)
+                if not found._replace(image_price_db=0.0, price_error_db=0.0).within(config):
+                    number += 1
+                    continue
+                self.guide.set_occupancy(asked.with_threshold(threshold))
+                price, error = price_of(self._errors(bundle, truth), errors)
+                found = found._replace(image_price_db=price, price_error_db=error)
+                if found.within(config):
+                    return found
+                number += LOWER
+        finally:
+            self.guide.set_occupancy(before)
+        return None
+
+    @torch.no_grad()
+    def _errors(self, bundle: Any, truth: Tensor) -> Tensor:
+        """Squared error of rendered rays: [R]."""
+        was_training = self.host.training
+        self.host.eval()
+        try:
+            rgb = self.host(bundle.to(self.host.device))["rgb"][:, :3].float()
+        finally:
+            self.host.train(was_training)
+        return ((rgb - true_colours(self.host, truth.to(rgb))) ** 2).sum(dim=-1)
+
+
+def price_of(gated: Tensor, dense: Tensor) -> tuple[float, float]:
+    """By how many dB squared errors [R] are worse than others of the same rays, and its standard
+    error."""
+    after, before = float(gated.sum()) + 1e-12, float(dense.sum()) + 1e-12
+    apart = (gated / after - dense / before).double()
+    decibel = 10.0 / math.log(10.0)
+    return decibel * math.log(after / before), decibel * float(apart.square().sum().sqrt())
+
+
+def _heard_of(
+    occupancy: Occupancy, samples: Any, rays_o: Tensor, rays_d: Tensor, options: dict[str, Any]
+) -> Heard:
+    """What a field says at candidates: it is asked where the occupancy keeps them."""
+    of_rays, starts, ends = samples
+    middles = torch.addcmul(rays_o[of_rays], rays_d[of_rays], ((starts + ends) * 0.5)[:, None])
+    kept = occupancy.occupied(middles)
+    density = options.get("sigma_fn")
+    if density is None:
+        raise InputError(
+            "this host asks for no densities along rays to teach with: leave "
+            "--pipeline.model.occupancy.learned at first"
+        )
+    asked = [part[kept] for part in (starts, ends, of_rays)]
+    weights = torch.zeros_like(starts)
+    rays = len(rays_o)
+    weights[kept] = render_weight_from_density(
+        asked[0], asked[1], density(*asked).reshape(-1), ray_indices=asked[2], n_rays=rays
+    )[0].to(weights)
+    mapped = occupancy.space.map(middles).clamp(-1.0, 1.0)
+    return Heard(mapped, Intervals(of_rays, starts, ends), weights, kept, rays)
+
+
+def _no_image(number: int, mask: Tensor) -> Tensor:
+    raise AssertionError("nothing is rendered without an image")
