@@ -1,0 +1,169 @@
+"""A packed host teaches its own gate: the ball of the tiny scene, whose density is known."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+import torch
+from scene_readers import Data
+from tiny_scene import BALL_CENTRE, BALL_RADIUS
+from torch import Tensor, nn
+
+from leco_plugin.hosts import along
+from leco_plugin.hosts.along import OPEN, Along, bounds_of, price_of
+from leco_plugin.hosts.guide import Guide
+from leco_plugin.learning.run import LearningOnly
+from leco_plugin.learning.sharpening import SharpeningConfig
+from leco_plugin.models.encodings import EncodingConfig
+from leco_plugin.models.gate import GateConfig
+from leco_plugin.models.leco_config import LecoModelConfig
+from leco_plugin.occupancy import Occupancy
+from leco_plugin.samplers.packed import accumulate_along_rays, render_weight_from_density
+from leco_plugin.scenes.input_error import InputError
+
+SMALL = SharpeningConfig(
+    steps=200, rays=2000, gate=GateConfig(EncodingConfig(octaves=2), 16, 1, 1, normed=False)
+)
+CONFIG = LecoModelConfig(sharpening=SMALL)
+MARCH = {"render_step_size": 0.04, "near_plane": 0.05, "far_plane": 4.0}
+
+
+class BallHost(nn.Module):
+    """White and opaque in the ball, and nothing elsewhere."""
+
+    device = torch.device("cpu")
+    price = 0.0
+    """By how much its pixels are off where something is skipped."""
+
+    def __init__(self, guide: Guide) -> None:
+        super().__init__()
+        self.guide = (guide,)
+        self.sampler = guide.estimator(None)
+
+    def forward(self, bundle: Any) -> dict[str, Tensor]:
+        origins, directions = bundle.origins, bundle.directions
+
+        def density(starts: Tensor, ends: Tensor, of_rays: Tensor) -> Tensor:
+            middles = origins[of_rays] + directions[of_rays] * (0.5 * (starts + ends))[:, None]
+            apart = (middles - torch.tensor(BALL_CENTRE)).norm(dim=-1)
+            return 300.0 * (apart < BALL_RADIUS)
+
+        asked = density if self.training else None
+        of_rays, starts, ends = self.sampler.sampling(origins, directions, asked, **MARCH)
+        sigmas, rays = density(starts, ends, of_rays), len(origins)
+        weights = render_weight_from_density(
+            starts, ends, sigmas, ray_indices=of_rays, n_rays=rays
+        )[0]
+        white = accumulate_along_rays(weights, None, of_rays, rays).expand(-1, 3)
+        skips = self.guide[0].the_occupancy().threshold > OPEN
+        return {"rgb": white + (self.price if skips else 0.0)}
+
+
+@pytest.fixture
+def made(data: Data, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> SimpleNamespace:
+    """A host that teaches after its second step, and its run."""
+    monkeypatch.setattr(along, "FIRST", 2)
+    torch.manual_seed(0)
+    guide, run = Guide(), LearningOnly()
+    host, run.folder = BallHost(guide), tmp_path
+    cameras = data.train_dataset.cameras
+
+    def next_train(step: int) -> Any:
+        image = int(torch.randint(len(cameras), ()))
+        bundle = cameras.generate_rays(image).flatten()
+        bundle = bundle[torch.randperm(len(bundle))[:500]]
+        open_guide = Guide()
+        open_guide.set_occupancy(bounds_of(guide.the_occupancy()))
+        return bundle, {"image": BallHost(open_guide).eval()(bundle)["rgb"]}
+
+    monkeypatch.setattr(data, "next_train", next_train, raising=False)
+    monkeypatch.setattr(data, "get_train_rays_per_batch", lambda: 500, raising=False)
+    pipeline = SimpleNamespace(datamanager=data, device="cpu", world_size=1)
+    teacher = Along(host, guide, CONFIG, pipeline, run)
+    teacher.begin()
+    return SimpleNamespace(guide=guide, host=host, teacher=teacher, out=tmp_path, pipe=pipeline)
+
+
+def within_bounds(guide: Guide) -> Tensor:
+    """Positions that training rays reach."""
+    occupancy = guide.the_occupancy()
+    centre, half = occupancy.space.center, occupancy.space.half_extent
+    places = centre + half * (2.0 * torch.rand(4000, 3) - 1.0)
+    return places[bounds_of(occupancy).occupied(places)]
+
+
+def test_it_begins_within_the_bounds_and_keeps_all_that_lies_there(made: Any) -> None:
+    occupancy = made.guide.the_occupancy()
+    assert occupancy.threshold == pytest.approx(OPEN)
+    places = within_bounds(made.guide)
+    assert len(places) > 1000 and bool(occupancy.occupied(places).all())
+    assert not occupancy.occupied(torch.full((1, 3), 1e3)).any()
+    assert not list(made.out.iterdir()), "bounds alone are no file to give to others"
+
+
+def test_its_weights_teach_a_gate_that_keeps_the_ball_and_skips_the_air(made: Any) -> None:
+    made.teacher.after_step(0)
+    assert made.guide.the_occupancy().threshold == pytest.approx(OPEN)
+    made.teacher.after_step(1)
+    occupancy = made.guide.the_occupancy()
+    left = Occupancy.load(made.out / "occupancy.safetensors")
+    assert left.threshold == occupancy.threshold > OPEN
+    assert left.report["learned"] == "along" and left.report["empty_fraction"] > 0.3
+    on_it = torch.nn.functional.normalize(torch.randn(500, 3), dim=-1) * BALL_RADIUS * 0.97
+    on_it = on_it[on_it[:, 2] > 0.0] + torch.tensor(BALL_CENTRE)
+    assert float(occupancy.occupied(on_it).float().mean()) > 0.98
+    places = within_bounds(made.guide)
+    assert float(occupancy.occupied(places).float().mean()) < 0.7
+    assert made.host.training and made.guide.listener is None
+
+
+def test_what_costs_too_much_in_the_image_is_not_followed(made: Any) -> None:
+    made.host.price = 0.1
+    made.teacher.after_step(0)
+    made.teacher.after_step(1)
+    assert made.guide.the_occupancy().threshold == pytest.approx(OPEN)
+    assert not list(made.out.iterdir())
+
+
+def test_teaching_takes_its_share_of_the_time(made: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    now, taught = [0.0], []
+    monkeypatch.setattr(along.time, "monotonic", lambda: now[0])
+    made.teacher.began = 0.0
+
+    def teach(step: int) -> None:
+        taught.append(step)
+        now[0] += 3.0
+
+    monkeypatch.setattr(made.teacher, "_teach", teach)
+    for step in range(100):
+        now[0] += 1.0
+        made.teacher.after_step(step)
+    assert taught[0] == 1 and 3 <= len(taught) <= 4, "a tenth of the time"
+
+
+@pytest.mark.parametrize("why", ["no densities", "one process"])
+def test_who_cannot_teach_is_told_what_to_do(made: Any, why: str) -> None:
+    host: nn.Module = made.host
+    pipeline = SimpleNamespace(**{**vars(made.pipe), "world_size": 2})
+    if why == "no densities":
+        host, pipeline = nn.Linear(1, 1), made.pipe
+    with pytest.raises(InputError, match=f"{why}.*learned at first"):
+        Along(host, made.guide, CONFIG, pipeline, LearningOnly())
+
+
+def test_a_price_is_that_of_the_same_rays() -> None:
+    dense = torch.rand(4000) + 0.1
+    price, error = price_of(1.01 * dense, dense)
+    assert price == pytest.approx(0.0432, abs=1e-4) and error == pytest.approx(0.0, abs=1e-4)
+    noisy, error = price_of(dense[torch.randperm(4000)], dense)
+    assert abs(noisy) < 1e-4 < error
+
+
+def test_bounds_outlive_the_gate_that_was_taught(made: Any) -> None:
+    places = within_bounds(made.guide)
+    for step in range(2):
+        made.teacher.after_step(step)
+    assert bool(bounds_of(made.guide.the_occupancy()).occupied(places).all())
