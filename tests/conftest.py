@@ -38,6 +38,16 @@ def tiny_scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return tiny_scene_writer.write(tmp_path_factory.mktemp("tiny_scene") / "ball")
 
 
+@pytest.fixture
+def scene(tiny_scene: Path, tmp_path: Path) -> Path:
+    """The tiny scene, for one test to change.
+
+    Not in `tests/scenes`: pytest 9.1 forgets fixtures of a folder when a file of `tests` is named
+    between two of its files (pytest-dev/pytest#14971).
+    """
+    return Path(shutil.copytree(tiny_scene, tmp_path / "scene"))
+
+
 @pytest.fixture(scope="session")
 def known_run(tiny_scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Folder of a run of `leco-occupancy`: its frozen gate is the ball, its field is opaque."""

@@ -21,7 +21,7 @@ from leco_plugin.studio.commands import is_ns_command, line_of
 
 FORKS = """
 import json, os, sys
-import nerfstudio.scripts.train  # ten seconds, in which the package has no part
+import nerfstudio.engine.trainer, nerfstudio.pipelines.base_pipeline  # most of the seconds
 assert "leco_plugin.method_configs" not in sys.modules
 log, programs = sys.argv[1], json.loads(sys.argv[2])
 for number, (program, error) in enumerate(programs):
