@@ -37,7 +37,7 @@ def file(tmp_path: Path) -> Path:
     report: dict[str, Any] = {"near": 0.5, "far": 4.0, "step_size": 0.02, "cone_angle": 0.01}
     report["frame"] = frame.tolist()
     small = GateConfig(EncodingConfig(octaves=2), width=16, layers=1)  # its cells are cached
-    occupancy = Occupancy(Gate(small), Space(), threshold=0.5, report=report)
+    occupancy = Occupancy(Gate(small), Space(), threshold=0.7, report=report)
     occupancy.save(tmp_path / "occupancy.safetensors")
     return tmp_path / "occupancy.safetensors"
 
