@@ -12,6 +12,7 @@ NERFACC := nerfacc==0.5.3
 PYTEST ?=
 DEMO ?=
 
+# Tests start processes that import the package: its bytecode is kept, whatever the environment says.
 # One torch thread a worker: small tensors gain nothing by more, and two workers fill two cores.
 WORKERS ?= 2
 
@@ -21,7 +22,7 @@ demo: $(READY)
 	$(BIN)/leco demo $(DEMO)
 
 test: $(READY)
-	OMP_NUM_THREADS=1 $(BIN)/python -m pytest --numprocesses $(WORKERS) --dist loadgroup --durations 40 $(PYTEST)
+	OMP_NUM_THREADS=1 PYTHONDONTWRITEBYTECODE= $(BIN)/python -m pytest --numprocesses $(WORKERS) --dist loadgroup --durations 40 $(PYTEST)
 
 lint: $(READY)
 	$(BIN)/ruff format --check .

@@ -2,17 +2,21 @@
 
 from __future__ import annotations
 
+import multiprocessing.forkserver
 import os
 import shutil
 import subprocess
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import pytest
 import tiny_scene as tiny_scene_writer
 import torch
+
+if TYPE_CHECKING:
+    from forked_commands import ForkedCommands
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
@@ -32,6 +36,16 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 def tiny_scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Folder of a scene of nine 32 x 32 images in nerfstudio's format."""
     return tiny_scene_writer.write(tmp_path_factory.mktemp("tiny_scene") / "ball")
+
+
+@pytest.fixture
+def scene(tiny_scene: Path, tmp_path: Path) -> Path:
+    """The tiny scene, for one test to change.
+
+    Not in `tests/scenes`: pytest 9.1 forgets fixtures of a folder when a file of `tests` is named
+    between two of its files (pytest-dev/pytest#14971).
+    """
+    return Path(shutil.copytree(tiny_scene, tmp_path / "scene"))
 
 
 @pytest.fixture(scope="session")
@@ -78,6 +92,59 @@ def elsewhere(tmp_path_factory: pytest.TempPathFactory) -> Path:
     )
     assert done.returncode == 0, done.stderr
     return site
+
+
+@pytest.fixture(scope="session")
+def command(elsewhere: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[ForkedCommands]:
+    """Commands on a machine that has just been set up, and on which `elsewhere` is installed.
+
+    Tests that use it share the group `commands`, so that one process imports nerfstudio for all.
+    """
+    from bare_machine import variables
+    from forked_commands import ForkedCommands
+
+    environment = variables(tmp_path_factory.mktemp("environment"))
+    paths = [str(elsewhere), *filter(None, [environment.get("PYTHONPATH")])]
+    environment["PYTHONPATH"] = os.pathsep.join(paths)
+    with ForkedCommands(environment, tmp_path_factory.mktemp("working_directory")) as command:
+        yield command
+
+
+@pytest.fixture(scope="session")
+def forks() -> None:
+    """The server of `multiprocessing` whose forks find all imported that they run.
+
+    A process has only one, with the modules that its first user names. Tests that use it share the
+    group `forks`, so that nerfstudio is imported once for all. A fork has two threads.
+    """
+    ours = ["mortal_training", "data_parallel_training"]
+    context = multiprocessing.get_context("forkserver")
+    context.set_forkserver_preload([*ours, "leco_plugin.conformance.cases"])
+    paths = [str(Path(__file__).parent), *filter(None, [os.environ.get("PYTHONPATH")])]
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("PYTHONPATH", os.pathsep.join(paths))
+        patch.setenv("PYTHONWARNINGS", "ignore")
+        patch.setenv("OMP_NUM_THREADS", "2")
+        multiprocessing.forkserver.ensure_running()
+
+
+@pytest.fixture(scope="session", autouse=True)
+def small_cells() -> Iterator[None]:
+    """Cell caches of the default size, which take seconds to build, are a sixteenth of it.
+
+    What is tested of cells names a size of its own, and a command has those of its user.
+    """
+    from leco_plugin.samplers import estimator
+
+    def build(occupancy: Any, budget: int, **options: Any) -> Any:
+        if budget == 1 << 20:
+            budget, options = 1 << 16, {"check_points": 1 << 16, **options}
+        return build_cache(occupancy, budget=budget, **options)
+
+    build_cache = estimator.build_cache
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(estimator, "build_cache", build)
+        yield
 
 
 @pytest.fixture

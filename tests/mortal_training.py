@@ -147,6 +147,7 @@ def run(
     with log.open("wb") as printed:
         os.dup2(printed.fileno(), sys.stdout.fileno())
         os.dup2(printed.fileno(), sys.stderr.fileno())
+    torch.set_num_threads(1)
     leave_out_the_cache()
     if moment is not None:
         die_after(*MOMENTS[moment])

@@ -31,7 +31,7 @@ from leco_plugin.space import Space
 from leco_plugin.studio.checkpoints import allow_checkpoint_globals, newest_whole, step_of
 from leco_plugin.studio.processes import DataParallelTrainerConfig
 
-pytestmark = [pytest.mark.slow, pytest.mark.xdist_group("data_parallel")]
+pytestmark = [pytest.mark.slow, pytest.mark.xdist_group("forks")]
 
 STEPS, LEARN = 24, 12
 HEALED_FREEZES_AT = 17
@@ -46,14 +46,11 @@ Launch = Callable[..., list[dict[str, Any]]]
 
 
 @pytest.fixture(scope="module")
-def launch() -> Iterator[Launch]:
+def launch(forks: None) -> Iterator[Launch]:
     """Runs a function of `data_parallel_training` as two processes; returns what each one left."""
     allow_checkpoint_globals()
     with pytest.MonkeyPatch.context() as patch:
-        patch.setenv("OMP_NUM_THREADS", "2")
         patch.setattr(ns_train, "_distributed_worker", ns_train._distributed_worker)
-        forks = ns_train.mp.get_context("forkserver")
-        forks.set_forkserver_preload(["nerfstudio.scripts.train"])
         started: list[Any] = []
 
         def start_forks(*arguments: Any, **options: Any) -> Any:

@@ -13,7 +13,7 @@ from PIL import Image
 
 from leco_plugin.occupancy import Occupancy
 
-SECONDS = 8.0
+SECONDS = 3.0
 OCCUPANCY = {
     *("params", "bytes", "train_seconds", "empty_fraction", "lost_mass", "threshold"),
     *("lost_surface_mass", "image_price_db", "kept_surface_recall", "calibrated_threshold"),

@@ -18,7 +18,6 @@ import torch
 import trimesh
 import yaml
 from ball_occupancy import ball_of_the_tiny_scene
-from bare_machine import variables
 from forked_commands import ForkedCommands
 from PIL import Image
 from small_hosts import NERFACTO, NGP, QUICK, SMALL, SWITCH_NERF, sizes
@@ -28,11 +27,14 @@ from leco_plugin.occupancy import Occupancy
 from leco_plugin.studio.checkpoints import allow_checkpoint_globals
 from leco_plugin.studio.trainer import AtomicTrainer
 
-pytestmark = [pytest.mark.slow, pytest.mark.xdist_group("guided_runs")]
+pytestmark = [pytest.mark.slow, pytest.mark.xdist_group("commands")]
 
 NAME = "occupancy.safetensors"
 STEPS = 6
-HOSTS = ["elsewhere-packed", "elsewhere-proposal", "instant-ngp", "nerfacto", "switch-nerf"]
+HOSTS = ["elsewhere-packed", "nerfacto", "switch-nerf", "instant-ngp", "elsewhere-proposal"]
+A_SEAM_AND_OURS = pytest.mark.parametrize("swapped", HOSTS[:3], indirect=True)
+"""One host of each seam, and the one of this package; pytest needs the first of `HOSTS`, in order,
+to share their runs."""
 LEARNING = [
     "calibration.rays=256",
     "sizes.candidates=32",
@@ -93,14 +95,13 @@ def refuse(constant: str) -> None:
 
 @pytest.fixture(scope="module")
 def runs(
-    elsewhere: Path, tiny_scene: Path, tmp_path_factory: pytest.TempPathFactory
+    command: ForkedCommands,
+    elsewhere: Path,
+    tiny_scene: Path,
+    tmp_path_factory: pytest.TempPathFactory,
 ) -> Iterator[Runs]:
     allow_checkpoint_globals()
-    environment = variables(tmp_path_factory.mktemp("environment"))
-    paths = [str(elsewhere), *filter(None, [environment.get("PYTHONPATH")])]
-    environment["PYTHONPATH"] = ":".join(paths)
-    folder = tmp_path_factory.mktemp("working_directory")
-    with pytest.MonkeyPatch.context() as patch, ForkedCommands(environment, folder) as command:
+    with pytest.MonkeyPatch.context() as patch:
         patch.syspath_prepend(elsewhere)
         yield Runs(command, tiny_scene, tmp_path_factory.mktemp("outputs"))
 
@@ -170,6 +171,7 @@ def test_ns_eval_opens_it(swapped: Path, runs: Runs) -> None:
     assert not any("lpips" in name for name in figures)
 
 
+@A_SEAM_AND_OURS
 def test_ns_render_draws_every_output(swapped: Path, runs: Runs, tmp_path: Path) -> None:
     config = swapped / "config.yml"
     runs.command("ns-render", "dataset", "--load-config", config, "--output-path", tmp_path)
@@ -181,6 +183,7 @@ def test_ns_render_draws_every_output(swapped: Path, runs: Runs, tmp_path: Path)
             assert image.size == (32, 32)
 
 
+@A_SEAM_AND_OURS
 def test_it_is_resumed_from_its_checkpoint_alone(swapped: Path, runs: Runs, tmp_path: Path) -> None:
     config = yaml.load((swapped / "config.yml").read_text(), Loader=yaml.Loader)
     config.load_dir, config.timestamp = swapped / "nerfstudio_models", "resumed"

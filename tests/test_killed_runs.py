@@ -20,7 +20,7 @@ from mortal_training import FREEZES_AT, HEALED_FREEZES_AT, run
 from leco_plugin.occupancy import Occupancy
 from leco_plugin.studio.checkpoints import allow_checkpoint_globals
 
-pytestmark = [pytest.mark.slow, pytest.mark.xdist_group("killed_runs")]
+pytestmark = [pytest.mark.slow, pytest.mark.xdist_group("forks")]
 
 STEPS = 24
 TINY = [
@@ -93,11 +93,9 @@ class Runs:
 
 
 @pytest.fixture
-def runs(tiny_scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Runs:
+def runs(forks: None, tiny_scene: Path, tmp_path: Path) -> Runs:
     """An empty folder, and processes that compute on one core."""
     allow_checkpoint_globals()
-    monkeypatch.setenv("OMP_NUM_THREADS", "1")
-    multiprocessing.get_context("forkserver").set_forkserver_preload(["nerfstudio.scripts.train"])
     return Runs(tiny_scene, tmp_path)
 
 

@@ -28,6 +28,8 @@ LEAST = 0.3
 """dB that some 20 steps of 128 rays gain on 512 pixels which are the same before and after: of 23
 runs, each with a seed of its own, the least was 0.9 (`banana`, which begins at 18.5 dB)."""
 KINDS = {"brighton_beach": "box", "caliterra": "box", "banana": "box", "fox": "contraction"}
+MORE = ("brighton_beach", "banana")
+"""Boxes as `caliterra`; the test of `leco-occupancy` reads them by default."""
 
 OUTPUTS = {"rgb", "depth", "accumulation", "occupancy", "expert", "samples_per_ray"}
 
@@ -95,7 +97,9 @@ def test_a_scene_trains_freezes_and_renders_without_a_flag(
 
 
 @pytest.mark.parametrize("sampling", ["coarse-fine", "occupancy-grid"])
-@pytest.mark.parametrize("name", KINDS)
+@pytest.mark.parametrize(
+    "name", ["caliterra", "fox", *(pytest.param(n, marks=pytest.mark.long) for n in MORE)]
+)
 def test_switch_nerf_trains_and_renders_without_a_flag(
     name: str, sampling: str, scenes: Path, tmp_path: Path
 ) -> None:

@@ -1,7 +1,8 @@
 """The whole way through nerfstudio's own commands: train, resume, evaluate, render, export, view.
 
-Real processes that can reach no network and find no LPIPS weights, as on a machine that has just
-been set up. Each takes some six seconds to import nerfstudio.
+They can reach no network and find no LPIPS weights, as on a machine that has just been set up. The
+first and the last one are processes of their own; the others are forks, for each process takes some
+six seconds to import nerfstudio.
 """
 
 from __future__ import annotations
@@ -21,12 +22,13 @@ import pytest
 import torch
 import trimesh
 from bare_machine import variables
+from forked_commands import ForkedCommands
 from PIL import Image
 
 from leco_plugin.learning.history import GateHistory, as_learned
 from leco_plugin.occupancy import Occupancy
 
-pytestmark = [pytest.mark.slow, pytest.mark.xdist_group("round_trip")]
+pytestmark = [pytest.mark.slow, pytest.mark.xdist_group("commands")]
 
 METHOD = "leco-occupancy"
 
@@ -58,19 +60,19 @@ def environment(tmp_path_factory: pytest.TempPathFactory) -> dict[str, str]:
     return variables(tmp_path_factory.mktemp("environment"))
 
 
-def command(name: str) -> str:
+def path_of(name: str) -> str:
     """Path of one of nerfstudio's commands in the environment that runs the tests."""
     return str(Path(sys.executable).with_name(name))
 
 
 @pytest.fixture(scope="module")
-def run(environment: dict[str, str], tmp_path_factory: pytest.TempPathFactory) -> Runner:
-    """Runs a command to its end, and returns what it printed."""
+def alone(environment: dict[str, str], tmp_path_factory: pytest.TempPathFactory) -> Runner:
+    """Runs a command of its own to its end, and returns what it printed."""
     folder = tmp_path_factory.mktemp("working_directory")
 
     def run(name: str, *arguments: object) -> str:
         finished = subprocess.run(
-            [command(name), *map(str, arguments)],
+            [path_of(name), *map(str, arguments)],
             env=environment,
             cwd=folder,
             stdout=subprocess.PIPE,
@@ -80,6 +82,18 @@ def run(environment: dict[str, str], tmp_path_factory: pytest.TempPathFactory) -
         )
         printed = finished.stdout
         assert finished.returncode == 0, f"{name} failed:\n{printed[-4000:]}"
+        assert "Downloading" not in printed
+        return printed
+
+    return run
+
+
+@pytest.fixture(scope="module")
+def run(command: ForkedCommands) -> Runner:
+    """Runs a command in a fork to its end, and returns what it printed."""
+
+    def run(name: str, *arguments: object) -> str:
+        printed = command(name, *arguments)
         assert "Downloading" not in printed
         return printed
 
@@ -100,10 +114,10 @@ def checkpoints(folder: Path) -> list[int]:
 
 
 @pytest.fixture(scope="module")
-def trained(run: Runner, tiny_scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def trained(alone: Runner, tiny_scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Folder of a finished run."""
     output = tmp_path_factory.mktemp("outputs")
-    train(run, output, tiny_scene)
+    train(alone, output, tiny_scene)
     return output / "tiny" / METHOD / "run"
 
 
@@ -190,7 +204,7 @@ def test_ns_viewer_loads_the_run_and_answers(
     direct = urllib.request.build_opener(urllib.request.ProxyHandler({}))
     with log.open("w") as output:
         viewer = subprocess.Popen(
-            [command("ns-viewer"), *arguments],
+            [path_of("ns-viewer"), *arguments],
             env=environment,
             cwd=tmp_path,
             stdout=output,

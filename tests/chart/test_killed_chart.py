@@ -21,12 +21,13 @@ NAMES = ("first", "second", "third")
 WORKER = """
 import json, sys, time
 from pathlib import Path
-from leco_plugin.chart.runner import die_with_parent
-die_with_parent()
 work = Path(sys.argv[-1])
 name = json.loads((work / "job.json").read_text())["contender"]["name"]
-(work / "progress").write_text("0.5")
-time.sleep(60 if name == "second" and sys.argv[1] == "slow" else 0)
+if name == "second" and sys.argv[1] == "slow":
+    from leco_plugin.chart.runner import die_with_parent
+    die_with_parent()
+    (work / "progress").write_text("0.5")
+    time.sleep(60)
 run = json.loads(sys.argv[2])
 (work / "result.json").write_text(json.dumps({**run, "name": name}))
 """

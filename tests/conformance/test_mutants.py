@@ -67,6 +67,8 @@ def test_a_mutant_fails_its_rule_and_no_other(mutant: str, broken: set[str]) -> 
     assert set(problems) == broken, problems
 
 
+@pytest.mark.xdist_group("forks")
+@pytest.mark.usefixtures("forks")
 @pytest.mark.parametrize(("mutant", "broken"), [one for one in ALL if one.id in PARALLEL])
 def test_a_mutant_that_only_two_processes_show_fails_there(mutant: str, broken: set[str]) -> None:
     problems = failing(mutant, TWO_PROCESSES)

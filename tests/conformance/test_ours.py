@@ -22,6 +22,11 @@ from leco_plugin.samplers.registry import SamplerSpec
 from leco_plugin.scenes.input_error import InputError
 
 
+def in_forks(test):
+    """Marks a test whose rules start two processes."""
+    return pytest.mark.xdist_group("forks")(pytest.mark.usefixtures("forks")(test))
+
+
 def kept(cases: list[Case], rules: tuple[Rule, ...] = SAMPLER_RULES) -> list[Verdict]:
     """The verdicts on cases, which keep all rules."""
     verdicts = [apply(rule, case) for rule, case in pairs(cases, rules)]
@@ -29,6 +34,7 @@ def kept(cases: list[Case], rules: tuple[Rule, ...] = SAMPLER_RULES) -> list[Ver
     return verdicts
 
 
+@in_forks
 @pytest.mark.slow  # `learned-occupancy` builds cell caches, also in two processes
 @pytest.mark.parametrize(("seam", "rules"), [("estimator", 14), ("proposal", 12)])
 def test_the_learned_occupancy_keeps_every_rule(seam, rules):
@@ -36,6 +42,7 @@ def test_the_learned_occupancy_keeps_every_rule(seam, rules):
     assert len(kept(cases)) == rules
 
 
+@in_forks
 @pytest.mark.parametrize("name", ["dense", "occupancy-grid"])
 def test_the_baselines_keep_every_rule(name):
     assert {verdict.seam for verdict in kept(sampler_cases(name))} == {"estimator"}
@@ -112,6 +119,7 @@ def test_a_sampler_that_serves_no_seam_is_refused(monkeypatch):
         sampler_cases("hollov")
 
 
+@in_forks
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["leco-ngp", "leco-nerfacto", "leco-switch-nerf", "switch-nerf"])
 def test_our_hosts_keep_every_rule(name: str) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import re
 import subprocess
@@ -24,57 +25,77 @@ def folder(tmp_path_factory) -> Path:
     return write_distribution(tmp_path_factory.mktemp("installed"), section)
 
 
-def run(folder: Path, work: Path, *arguments: str) -> tuple[int, str]:
-    """Exit status and output of pytest in a folder of its own, where warnings are errors."""
+def run(folder: Path, work: Path, *asked: tuple[str, ...]) -> list[tuple[int, str]]:
+    """Exit status and output of each of these runs of pytest, one after another in one process.
+
+    Warnings are errors, and the working directory is a folder of its own.
+    """
     path = os.pathsep.join([str(folder), str(ROOT / "tests"), str(ROOT)])
     strict = ["-W", "error", "-p", "no:dash", "-p", "no:cacheprovider", "-v"]
+    runs = [[*strict, *arguments] for arguments in asked]
     done = subprocess.run(
-        [sys.executable, "-m", "pytest", *strict, *arguments],
+        [sys.executable, "-c", SEVERAL_RUNS, json.dumps(runs)],
         cwd=work,
         env={**os.environ, "PYTHONPATH": path, "OMP_NUM_THREADS": "1"},
-        capture_output=True,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
         text=True,
     )
-    return done.returncode, done.stdout + done.stderr
+    assert done.returncode == 0, done.stdout
+    parts = re.split(r"^ended with (\d+)\n", done.stdout, flags=re.MULTILINE)
+    return [(int(status), said) for said, status in zip(parts[::2], parts[1::2])]
 
 
+SEVERAL_RUNS = """
+import json, sys, pytest
+for arguments in json.loads(sys.argv[1]):
+    status = pytest.main(arguments)
+    print(f"ended with {int(status)}", flush=True)
+"""
 PYARGS = ("--pyargs", "leco_plugin.conformance")
+CHECKED = (
+    *("--leco-sampler", "SoundProposal", "--leco-sampler", "KeepsAll"),
+    *("--leco-method", "SoundHost", "--leco-method", "FlatAccumulation"),
+    *("-k", "signature or skips or drawn"),
+)
+REFUSED = {
+    (): "name what to check: --leco-sampler NAME",
+    ("--leco-sampler", "grit"): "there is no sampler 'grit'; there are",
+    ("--leco-method", "ngp"): "there is no method 'ngp'; there are",
+}
 
 
-def test_one_test_a_rule_and_seam(folder, tmp_path):
-    names = ("--leco-sampler", "SoundProposal", "--leco-sampler", "KeepsAll")
-    status, said = run(folder, tmp_path, *PYARGS, *names, "-k", "signature or skips")
-    assert status == 1
+@pytest.fixture(scope="module")
+def answers(folder, tmp_path_factory) -> dict[tuple[str, ...], tuple[int, str]]:
+    """Exit status and output by options; in one process, for each would import nerfstudio."""
+    asked = [CHECKED, *REFUSED]
+    work = tmp_path_factory.mktemp("work")
+    return dict(zip(asked, run(folder, work, *((*PYARGS, *options) for options in asked))))
+
+
+def test_one_test_a_rule_and_seam(answers):
+    status, said = answers[CHECKED]
+    assert status == 1, said
     assert "test_rule[SoundProposal-proposal-signature] PASSED" in said
     assert "test_rule[SoundProposal-proposal-skips-only-what-it-may] PASSED" in said
     assert "test_rule[KeepsAll-estimator-signature] PASSED" in said
     assert "test_rule[KeepsAll-estimator-skips-only-what-it-may] FAILED" in said
     assert "Remedy: decide by Occupancy.occupied" in said
-    assert "1 failed, 3 passed" in said
+    assert "2 failed, 4 passed" in said
 
 
-def test_one_test_a_rule_of_a_method(folder, tmp_path):
-    names = ("--leco-method", "SoundHost", "--leco-method", "FlatAccumulation")
-    status, said = run(folder, tmp_path, *PYARGS, *names, "-k", "drawn")
-    assert status == 1, said
+def test_one_test_a_rule_of_a_method(answers):
+    _, said = answers[CHECKED]
     assert "test_rule[SoundHost-host-outputs-can-be-drawn] PASSED" in said
     assert "test_rule[FlatAccumulation-host-outputs-can-be-drawn] FAILED" in said
     assert "Remedy: return rgb [n_rays, 3]" in said
-    assert "1 failed, 1 passed" in said
 
 
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        ((), "name what to check: --leco-sampler NAME"),
-        (("--leco-sampler", "grit"), "there is no sampler 'grit'; there are"),
-        (("--leco-method", "ngp"), "there is no method 'ngp'; there are"),
-    ],
-)
-def test_what_cannot_be_checked_is_an_error_in_one_line(folder, tmp_path, options, message):
-    status, said = run(folder, tmp_path, *PYARGS, *options)
+@pytest.mark.parametrize("options", REFUSED)
+def test_what_cannot_be_checked_is_an_error_in_one_line(answers, options):
+    status, said = answers[options]
     assert status == 2
-    assert message in said and "Traceback" not in said
+    assert REFUSED[options] in said and "Traceback" not in said
 
 
 def test_other_runs_of_pytest_are_left_alone(folder, tmp_path):
@@ -86,5 +107,5 @@ def test_other_runs_of_pytest_are_left_alone(folder, tmp_path):
         "                    'leco_plugin.conformance.pytest_plugin'}\n"
         "    assert not {'torch', 'nerfstudio'} & set(sys.modules)\n"
     )
-    status, said = run(folder, tmp_path)
+    ((status, said),) = run(folder, tmp_path, ())
     assert status == 0 and "1 passed" in said, said

@@ -27,6 +27,9 @@ ON_KERNELS = (
 )
 """The mark of a file whose tests need kernels."""
 
+PLACES = 160 if INTERPRETED else 300
+"""Two blocks of a kernel, the second one ragged; the interpreter takes milliseconds for each."""
+
 NEAR_THRESHOLD = {"float32": 2e-4, "bfloat16": 2e-2}
 """How far from the threshold o may lie where a kernel decides otherwise than its twin."""
 

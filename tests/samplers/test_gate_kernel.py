@@ -6,8 +6,10 @@ import pytest
 import torch
 from samplers.kernel_cases import (
     DEVICE,
+    INTERPRETED,
     NEAR_THRESHOLD,
     ON_KERNELS,
+    PLACES,
     left_to_torch,
     occupancy,
     positions,
@@ -19,6 +21,10 @@ from leco_plugin.samplers.kernels.fused import twins_only
 from leco_plugin.samplers.kernels.gate_weights import gate_weights
 
 pytestmark = ON_KERNELS
+
+WIDTHS = [16, 24, 100, 256] if INTERPRETED else [16, 24, 32, 64, 100, 128, 256]
+OCTAVES = [1, 6, 12] if INTERPRETED else [1, 4, 6, 8, 10, 12]
+"""Of what is padded alike, the interpreter gets one; all other tests have width 32, 4 octaves."""
 
 
 def fused(asked: Occupancy, places: torch.Tensor) -> torch.Tensor:
@@ -50,31 +56,31 @@ def assert_agreement(asked: Occupancy, places: torch.Tensor) -> None:
 
 
 @pytest.mark.parametrize("precision", ["float32", "bfloat16"])
-@pytest.mark.parametrize("width", [16, 24, 32, 64, 100, 128, 256])
+@pytest.mark.parametrize("width", WIDTHS)
 def test_every_width(width: int, precision: str) -> None:
-    assert_agreement(occupancy(precision=precision, width=width), positions(300))
+    assert_agreement(occupancy(precision=precision, width=width), positions(PLACES))
 
 
 @pytest.mark.parametrize("kind", ["box", "contraction"])
 @pytest.mark.parametrize("layers", [1, 2, 3, 5])
 def test_every_depth_in_both_spaces(layers: int, kind: str) -> None:
-    assert_agreement(occupancy(kind, layers=layers), positions(300))
+    assert_agreement(occupancy(kind, layers=layers), positions(PLACES))
 
 
 @pytest.mark.parametrize("kind", ["box", "contraction"])
 def test_unseen_space_is_skipped(kind: str) -> None:
-    asked, places = occupancy(kind, unseen=True), positions(300)
+    asked, places = occupancy(kind, unseen=True), positions(PLACES)
     mapped = asked.space.map(places)
     unseen = ~asked.seen(mapped.clamp(-1.0, 1.0)) & (mapped.abs() <= 1.0).all(dim=-1)
     assert_agreement(asked, places)
-    assert unseen.sum() > 30 and not fused(asked, places)[unseen].any()
+    assert unseen.sum() > PLACES // 10 and not fused(asked, places)[unseen].any()
 
 
 @pytest.mark.parametrize("precision", ["float32", "bfloat16"])
-@pytest.mark.parametrize("octaves", [1, 4, 6, 8, 10, 12])
+@pytest.mark.parametrize("octaves", OCTAVES)
 def test_every_number_of_octaves(octaves: int, precision: str) -> None:
     asked = occupancy("contraction", precision, octaves=octaves)
-    assert_agreement(asked, positions(300))
+    assert_agreement(asked, positions(PLACES))
 
 
 TABLES = {
@@ -92,7 +98,7 @@ TABLES = {
 @pytest.mark.parametrize("name", TABLES)
 def test_every_table(name: str, precision: str) -> None:
     kind = "contraction" if precision == "float32" else "box"
-    assert_agreement(occupancy(kind, precision, encoding=TABLES[name]), positions(300))
+    assert_agreement(occupancy(kind, precision, encoding=TABLES[name]), positions(PLACES))
 
 
 @pytest.mark.parametrize("name", TABLES)
@@ -105,7 +111,7 @@ def test_tables_end_at_the_walls_of_the_cube(name: str) -> None:
 
 @pytest.mark.parametrize("experts", [1, 8, 15, 20])
 def test_every_number_of_experts(experts: int) -> None:
-    assert_agreement(occupancy(experts=experts), positions(300))
+    assert_agreement(occupancy(experts=experts), positions(PLACES))
 
 
 @pytest.mark.parametrize("count", [0, 1, 2, 127, 128, 129, 300])
@@ -125,7 +131,7 @@ def test_places_that_no_scene_has(kind: str) -> None:
 
 def test_what_lies_beyond_the_walls_is_skipped() -> None:
     asked = occupancy(precision="float32", walls=[-1.0, -1.0, -1.0, 0.5, 0.5, 0.5])
-    places = positions(300, 1.0)
+    places = positions(PLACES, 1.0)
     beyond = (places > 0.5).any(dim=-1)
     assert not fused(asked, places)[beyond].any()
     assert torch.equal(fused(asked, places), twin(asked, places))
@@ -135,16 +141,16 @@ def test_what_lies_beyond_the_walls_is_skipped() -> None:
 def test_the_ends_of_the_threshold(threshold: float) -> None:
     asked = occupancy(precision="float32")
     asked.threshold_value.fill_(threshold)
-    places = torch.cat([positions(300), torch.full((1, 3), torch.nan, device=DEVICE)])
+    places = torch.cat([positions(PLACES), torch.full((1, 3), torch.nan, device=DEVICE)])
     assert torch.equal(fused(asked, places), twin(asked, places))
     assert bool(fused(asked, places).all()) == (threshold == 0.0)
 
 
 def test_positions_may_have_any_strides() -> None:
     asked = occupancy(precision="float32")
-    places = positions(300)
+    places = positions(PLACES)
     column_by_column = places.T.contiguous().T
-    assert column_by_column.stride() == (1, 300)
+    assert column_by_column.stride() == (1, PLACES)
     assert torch.equal(fused(asked, column_by_column), fused(asked, places))
     assert torch.equal(fused(asked, places[::3]), fused(asked, places)[::3])
 
@@ -154,4 +160,4 @@ def test_saturated_gates_overflow_nothing() -> None:
     with torch.no_grad():
         asked.gate.head.weight.mul_(1e4)
     asked.threshold_value.fill_(0.5)
-    assert torch.equal(fused(asked, positions(300)), twin(asked, positions(300)))
+    assert torch.equal(fused(asked, positions(PLACES)), twin(asked, positions(PLACES)))

@@ -58,26 +58,28 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return tmp_path_factory.mktemp("compiled")
 
 
-def on_each_card(names: Iterable[str], quick: set[tuple[str, int]]) -> list[Any]:
-    """Names with capabilities; those that are not quick take seconds each, and are marked so."""
+def on_each_card(names: Iterable[str], on_one: dict[str, int]) -> list[Any]:
+    """Names with capabilities. Each takes seconds: some are compiled for one card by default."""
     return [
-        pytest.param(name, card, marks=[] if (name, card) in quick else pytest.mark.slow)
+        pytest.param(name, card, marks=[pytest.mark.long] if on_one.get(name, card) != card else [])
         for name in names
         for card in CAPABILITIES
     ]
 
 
-QUICK = {
-    ("small", 80),
-    ("small", 90),
-    ("width 128", 80),
-    ("hash", 90),
-    ("vm", 80),
-    ("k-planes", 90),
+ON_ONE = {
+    "large": 90,
+    "width 16": 80,
+    "width 128": 80,
+    "paper": 90,
+    "hash": 90,
+    "vm": 80,
+    "k-planes": 90,
+    "float32": 80,
 }
 
 
-@pytest.mark.parametrize(("name", "capability"), on_each_card(GATES, QUICK))
+@pytest.mark.parametrize(("name", "capability"), on_each_card(GATES, ON_ONE))
 def test_the_gate_compiles(name: str, capability: int, folder: Path, monkeypatch) -> None:
     from leco_plugin.samplers.kernels import gate_kernel
 
@@ -126,7 +128,7 @@ def cells(space: Space, dtype: torch.dtype, resolution: int = 32) -> CellCache:
 
 
 @pytest.mark.parametrize(
-    ("name", "capability"), on_each_card(MARCHES, {("small", 80), ("large", 90)})
+    ("name", "capability"), on_each_card(MARCHES, {"small": 80, "hash": 80, "width 128": 90})
 )
 def test_the_march_compiles(name: str, capability: int, folder: Path, monkeypatch) -> None:
     weights = weights_of(MARCHES[name][0], capability, monkeypatch)
@@ -147,7 +149,7 @@ def compile_march(name: str, weights: GateWeights, capability: int, folder: Path
     assert_it_fits(compiled[0], capability)
 
 
-@pytest.mark.slow
+@pytest.mark.long  # `large` is compiled for other cards by default
 @pytest.mark.parametrize("capability", AT_HOME)
 def test_the_automatic_sizes_compile_for_cards_at_home(
     capability: int, folder: Path, monkeypatch

@@ -38,7 +38,7 @@ def environment(tmp_path_factory: pytest.TempPathFactory) -> dict[str, str]:
 
 
 @pytest.fixture
-def command(environment: dict[str, str], tmp_path: Path) -> Iterator[ForkedCommands]:
+def command_there(environment: dict[str, str], tmp_path: Path) -> Iterator[ForkedCommands]:
     with ForkedCommands(environment, tmp_path) as command:
         yield command
 
@@ -58,10 +58,11 @@ def test_what_is_claimed_of_nerfacc_holds_there(environment: dict[str, str]) -> 
     assert done.stdout.startswith("0.5.3") and "older than 0.5.3" not in done.stdout
 
 
+@pytest.mark.long  # the tests above ask the same functions of it
 def test_leco_ngp_trains_and_is_evaluated_there(
-    command: ForkedCommands, tiny_scene: Path, tmp_path: Path
+    command_there: ForkedCommands, tiny_scene: Path, tmp_path: Path
 ) -> None:
-    command(
+    command_there(
         *("ns-train", "leco-ngp", "--data", tiny_scene, *QUICK, *RAYS, "--max-num-iterations=6"),
         *("--output-dir", tmp_path, "--experiment-name", "tiny", "--timestamp", "run"),
         *sizes(NGP, "pipeline.model.host"),
@@ -69,5 +70,5 @@ def test_leco_ngp_trains_and_is_evaluated_there(
         *("--pipeline.model.occupancy.rays=128", "--pipeline.model.occupancy.seconds=1"),
     )
     run, result = tmp_path / "tiny" / "leco-ngp" / "run", tmp_path / "eval.json"
-    command("ns-eval", "--load-config", run / "config.yml", "--output-path", result)
+    command_there("ns-eval", "--load-config", run / "config.yml", "--output-path", result)
     assert json.loads(result.read_text())["results"]["psnr"] > 3.0

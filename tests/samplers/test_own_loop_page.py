@@ -11,6 +11,7 @@ import pytest
 import torch
 from samplers.analytic_occupancy import camera_rays
 
+from leco_plugin.models.encodings import EncodingConfig
 from leco_plugin.models.gate import Gate, GateConfig
 from leco_plugin.occupancy import Occupancy
 from leco_plugin.samplers.registry import OURS
@@ -35,7 +36,8 @@ def file(tmp_path: Path) -> Path:
     frame = torch.cat([turn, torch.tensor([[0.1], [0.2], [0.3]])], dim=1)
     report: dict[str, Any] = {"near": 0.5, "far": 4.0, "step_size": 0.02, "cone_angle": 0.01}
     report["frame"] = frame.tolist()
-    occupancy = Occupancy(Gate(GateConfig()), Space(), threshold=0.5, report=report)
+    small = GateConfig(EncodingConfig(octaves=2), width=16, layers=1)  # its cells are cached
+    occupancy = Occupancy(Gate(small), Space(), threshold=0.7, report=report)
     occupancy.save(tmp_path / "occupancy.safetensors")
     return tmp_path / "occupancy.safetensors"
 

@@ -9,6 +9,7 @@ from pathlib import Path
 import pytest
 import torch
 
+from leco_plugin.models.encodings import EncodingConfig
 from leco_plugin.models.gate import Gate, GateConfig
 from leco_plugin.occupancy import Occupancy
 from leco_plugin.space import Space
@@ -24,7 +25,8 @@ def test_the_example_trains_in_thirty_lines_without_nerfstudio(kind, tmp_path):
     assert "nerfstudio" not in "".join(lines)
     torch.manual_seed(0)
     report = {"near": 0.05, "far": 3.0}
-    occupancy = Occupancy(Gate(GateConfig()), Space(kind), threshold=0.5, report=report)
+    small = GateConfig(EncodingConfig(octaves=2), width=16, layers=1)  # its cells are cached
+    occupancy = Occupancy(Gate(small), Space(kind), threshold=0.7, report=report)
     occupancy.save(tmp_path / "occupancy.safetensors")
     command = [sys.executable, str(SCRIPT), str(tmp_path / "occupancy.safetensors"), "30"]
     result = subprocess.run(command, capture_output=True, text=True, check=False)

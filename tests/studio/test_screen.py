@@ -20,6 +20,8 @@ from tiny_run import tiny_config
 
 from leco_plugin.evaluation import held_out_psnr
 from leco_plugin.host_configs import leco_ngp
+from leco_plugin.models.encodings import EncodingConfig
+from leco_plugin.models.gate import GateConfig
 from leco_plugin.studio.run_progress import next_commands
 from leco_plugin.studio.screen import LOG, short_screen
 
@@ -29,6 +31,8 @@ MOST_LINES = 40
 def watched(scene: Path, outputs: Path) -> Any:
     """The config of a short run whose screen somebody watches."""
     config = tiny_config(scene, outputs, candidates=32)
+    gate = GateConfig(EncodingConfig(octaves=2), width=8, layers=1)
+    config.pipeline.model.sizes = replace(config.pipeline.model.sizes, gate=gate)
     config.logging.local_writer.enable = True
     config.max_num_iterations = 12
     return config

@@ -252,11 +252,11 @@ def test_a_wrong_size_ends_a_command_with_one_line() -> None:
 
 def city(folder: Path, blocks: int) -> tuple[SceneDetail, int]:
     """Detail of a drone survey of a city, and its number of photographs."""
-    capture = CaptureConfig(24, 18, street_per_block=0.0)
+    capture = CaptureConfig(12, 9, street_per_block=0.0)
     write_city(CityConfig(blocks), folder, capture, progress=False)
     parser = LecoPhotographsDataParserConfig(data=folder, downscale_factor=1)
     outputs = parser.setup().get_dataparser_outputs("train")
-    outputs.cameras.rescale_output_resolution(160 / 24)  # the poses are the same at every size
+    outputs.cameras.rescale_output_resolution(160 / 12)  # the poses are the same at every size
     found = detail_of(outputs.cameras, points_in(outputs.metadata))
     return found, len(outputs.image_filenames)
 
