@@ -116,7 +116,8 @@ class Along:
         pipeline: nerfstudio's.
         run: what is around the steps.
     Raises:
-        InputError: the host draws a fixed number of samples, or several processes train it.
+        InputError: the host draws a fixed number of samples, several processes train it, or
+            sharpening is off.
     """
 
     def __init__(
@@ -125,6 +126,8 @@ class Along:
         instead = "leave --pipeline.model.occupancy.learned at first"
         if not any(isinstance(module, GuidedEstimator) for module in host.modules()):
             raise InputError(f"this host asks for no densities along rays to teach with: {instead}")
+        if config.sharpening.steps == 0:
+            raise InputError(f"with sharpening.steps 0 a host teaches its gate nothing: {instead}")
         if getattr(pipeline, "world_size", 1) > 1:
             raise InputError(f"a host that teaches its own gate trains in one process: {instead}")
         self.host, self.guide, self.config, self.run = host, guide, config, run

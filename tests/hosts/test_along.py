@@ -144,14 +144,15 @@ def test_teaching_takes_its_share_of_the_time(made: Any, monkeypatch: pytest.Mon
     assert taught[0] == 1 and 3 <= len(taught) <= 4, "a tenth of the time"
 
 
-@pytest.mark.parametrize("why", ["no densities", "one process"])
+@pytest.mark.parametrize("why", ["no densities", "one process", "sharpening.steps 0"])
 def test_who_cannot_teach_is_told_what_to_do(made: Any, why: str) -> None:
-    host: nn.Module = made.host
-    pipeline = SimpleNamespace(**{**vars(made.pipe), "world_size": 2})
-    if why == "no densities":
-        host, pipeline = nn.Linear(1, 1), made.pipe
+    host: nn.Module = nn.Linear(1, 1) if why == "no densities" else made.host
+    many = SimpleNamespace(**{**vars(made.pipe), "world_size": 2})
+    pipeline = many if why == "one process" else made.pipe
+    off = LecoModelConfig(sharpening=SharpeningConfig(steps=0))
+    config = off if why == "sharpening.steps 0" else CONFIG
     with pytest.raises(InputError, match=f"{why}.*learned at first"):
-        Along(host, made.guide, CONFIG, pipeline, LearningOnly())
+        Along(host, made.guide, config, pipeline, LearningOnly())
 
 
 def test_a_price_is_that_of_the_same_rays() -> None:
