@@ -9,6 +9,7 @@ from typing import Any
 
 from leco_plugin.chart.findings.settling import falls
 from leco_plugin.chart.findings.summary import Line, best_so_far, circumstances
+from leco_plugin.chart.page_file import write_page_file
 from leco_plugin.chart.panels import Panel, shown_of, title_of
 from leco_plugin.chart.theme import LIGHT, style
 
@@ -52,8 +53,7 @@ def write_page(results: Mapping[str, Any], path: Path) -> Path:
         legend={"orientation": "h", "y": -0.08},
         margin={"t": 110},
     )
-    figure.write_html(path, include_plotlyjs=True, full_html=True)
-    return path
+    return write_page_file(figure, path, title)
 
 
 def _add_curves(figure: Any, lines: Sequence[Line]) -> None:

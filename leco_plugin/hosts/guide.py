@@ -219,9 +219,9 @@ class Guide(nn.Module):
         """
         # cells would be made anew for each threshold that the viewer shows
         without_cells = SHOWN.get() is not None and self.sampler in OURS
-        options = self.options | ({"cache_bytes": 0} if without_cells else {})
+        uncached = {"cache_bytes": 0} if without_cells else {}
         try:
-            return build(self.sampler, **{**given, **options})
+            return build(self.sampler, **{**given, **self.options, **uncached})
         except (ValueError, TypeError, OverflowError, RuntimeError) as error:
             options = f" (its options: {self.options})" if self.options else ""
             why = one_line(error) or type(error).__name__
