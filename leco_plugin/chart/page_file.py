@@ -10,7 +10,10 @@ from typing import Any
 
 PAGE = """<!DOCTYPE html>
 <html><head><meta charset="utf-8"><title>{title}</title>
-<style>body {{ margin: 0 }} #figure {{ width: 100%; min-height: 100vh }}</style></head>
+<style>
+body {{ margin: 0; overflow-x: hidden }}
+#figure {{ width: 100%; min-height: 100vh }}
+</style></head>
 <body><div id="figure"></div>
 <script type="text/plain" id="library">{library}</script>
 <script type="text/plain" id="shown">{shown}</script>
