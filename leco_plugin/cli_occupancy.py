@@ -4,26 +4,33 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
 
 from leco_plugin.cli_reports import check_json, check_picture, occupancy_of, write_json
+
+if TYPE_CHECKING:
+    from leco_plugin.occupancy import Occupancy
 
 
 def inspect(
     file: Annotated[Path, tyro.conf.Positional],
     picture: Path | None = None,
     history: Path | None = None,
+    data: Path | None = None,
     json: Path | None = None,
 ) -> None:
     """Say what an occupancy is: sizes, threshold, price and gain; and draw it.
 
     Args:
         file: An occupancy.safetensors, or a folder of runs: the newest in it.
-        picture: File for a picture: slices of o(x) with the cameras, and the kept points.
+        picture: File for a picture: slices of o(x) with the cameras, and the kept points. A page to
+            look around in the kept volume, for any browser, is written beside it, as .html.
         history: File for how it was learned: a .gif that moves, or a still picture. For runs of
             leco-occupancy with --pipeline.model.schedule.steps-per-record 10, say.
+        data: The scene that it was learned on, for the colours of its sparse points in picture and
+            page. By default that of the run it lies in.
         json: File for the same as JSON.
     """
     check_json(json)
@@ -32,6 +39,7 @@ def inspect(
     from leco_plugin.evaluation.inspection import describe, doubts
     from leco_plugin.learning.quality import views_in_words
     from leco_plugin.occupancy import Occupancy
+    from leco_plugin.scenes.coloured_points import description_in, description_of_run
 
     file = occupancy_of(file)
     occupancy = Occupancy.load(file)
@@ -50,12 +58,11 @@ def inspect(
         if isinstance(value, (int, float, str)) and name not in ("params", "threshold"):
             print(f"{name.replace('_', ' ')}: {_said(value)}")
     if picture is not None:
-        from leco_plugin.evaluation.occupancy_picture import draw
-
-        picture.parent.mkdir(parents=True, exist_ok=True)
-        print(f"drew {draw(occupancy, picture)}")
+        _draw(
+            occupancy, picture, description_of_run(file) if data is None else description_in(data)
+        )
     if history is not None:
-        from leco_plugin.evaluation.occupancy_picture import draw_history
+        from leco_plugin.evaluation.history_picture import draw_history
 
         history.parent.mkdir(parents=True, exist_ok=True)
         print(f"drew {draw_history(occupancy, file.parent, history)}")
@@ -161,6 +168,23 @@ def shrink(
     write_json(json, results)
     if picture is not None:
         print(f"drew {draw(results, picture)}")
+
+
+def _draw(occupancy: Occupancy, picture: Path, description: Path | None) -> None:
+    """Draws an occupancy as a picture and as a page."""
+    from leco_plugin.evaluation.occupancy_page import write_page
+    from leco_plugin.evaluation.occupancy_picture import draw
+    from leco_plugin.evaluation.scene_colours import scene_colours
+
+    colours = scene_colours(occupancy, description)
+    picture.parent.mkdir(parents=True, exist_ok=True)
+    print(f"drew {draw(occupancy, picture, colours=colours)}")
+    page = write_page(occupancy, picture.with_suffix(".html"), colours)
+    print(f"drew {page}, to look around in with a browser")
+    if colours is None:
+        print(
+            "without the colours of photographs: no coloured sparse points are known (--data SCENE)"
+        )
 
 
 def _said(value: bool | float | str) -> str:

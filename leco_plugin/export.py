@@ -19,7 +19,14 @@ from torch import Tensor
 from torch.nn.functional import max_pool3d
 
 from leco_plugin.cli_reports import check_place
-from leco_plugin.evaluation.inspection import ViewBox, exposed, numbers, query, whole_box
+from leco_plugin.evaluation.inspection import (
+    ViewBox,
+    exposed,
+    numbers,
+    query,
+    to_the_data,
+    whole_box,
+)
 from leco_plugin.export_scene import (
     comments_of,
     photograph_colours,
@@ -30,7 +37,7 @@ from leco_plugin.log import bar
 from leco_plugin.occupancy import Occupancy
 from leco_plugin.samplers.grid import OccupancyGridEstimator
 from leco_plugin.scenes.coloured_points import description_in, description_of_run, georeference
-from leco_plugin.scenes.frames import inverse, moved
+from leco_plugin.scenes.frames import moved
 from leco_plugin.scenes.whole_files import write_points, write_whole
 
 Format = Literal["ply", "splat-init", "npz", "nerfacc-grid"]
@@ -228,19 +235,6 @@ def _mapped_box(occupancy: Occupancy) -> ViewBox:
     device = occupancy.threshold_value.device
     low, high = occupancy.space.map(torch.stack([box.low, box.high]).to(device)).cpu()
     return ViewBox(low, high)
-
-
-def to_the_data(occupancy: Occupancy) -> Tensor | None:
-    """Takes positions of the run to those that the data's own files have: [3, 4] float64.
-
-    None where the file does not say how its run turned, moved and scaled the data.
-    """
-    frame = occupancy.report.get("data_frame") or occupancy.report.get("frame")
-    rows = [numbers(row) for row in frame] if isinstance(frame, list) else []
-    if [len(row) for row in rows] != [4, 4, 4]:
-        return None
-    known = torch.tensor(rows, dtype=torch.float64)
-    return inverse(known) if float(known[:, :3].det()) != 0.0 else None
 
 
 def write_ply(

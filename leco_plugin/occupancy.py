@@ -9,6 +9,7 @@ from __future__ import annotations
 import hashlib
 import json
 import os
+from contextvars import ContextVar
 from pathlib import Path
 from typing import Any, Literal, cast, get_args
 
@@ -42,6 +43,10 @@ CAMERAS_THAT_VOUCH = "cameras_that_vouch"
 
 CALIBRATED_AT = "calibrated_threshold"
 """In a report: the threshold that its figures are of, where a host has lowered it since."""
+
+SHOWN: ContextVar[float | None] = ContextVar("SHOWN", default=None)
+"""Threshold with which the current thread renders, for the slider of nerfstudio's viewer; None is
+the run's own. A thread has its own value, so that training beside the viewer never sees it."""
 
 Precision = Literal["float32", "bfloat16", "float16"]
 

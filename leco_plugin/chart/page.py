@@ -9,6 +9,7 @@ from typing import Any
 
 from leco_plugin.chart.findings.settling import falls
 from leco_plugin.chart.findings.summary import Line, best_so_far, circumstances
+from leco_plugin.chart.page_file import write_page_file
 from leco_plugin.chart.panels import Panel, shown_of, title_of
 from leco_plugin.chart.theme import LIGHT, style
 
@@ -44,7 +45,8 @@ def write_page(results: Mapping[str, Any], path: Path) -> Path:
         figure.update_xaxes(type="log" if is_by_size else "linear", row=3, col=1)
         figure.update_yaxes(title_text="volume kept at equal loss, %", row=3, col=1)
     title = html.escape(title_of(results))
-    below = html.escape(". ".join(filter(None, [circumstances(results), falls(shown.lines)])))
+    lines = filter(None, [circumstances(results), falls(shown.lines)])
+    below = "<br>".join(html.escape(line) for line in lines)  # one line would be cut off
     figure.update_layout(
         title={"text": f"<b>{title}</b><br><sub>{below}</sub>"},
         template="plotly_white",
@@ -52,8 +54,7 @@ def write_page(results: Mapping[str, Any], path: Path) -> Path:
         legend={"orientation": "h", "y": -0.08},
         margin={"t": 110},
     )
-    figure.write_html(path, include_plotlyjs=True, full_html=True)
-    return path
+    return write_page_file(figure, path, title_of(results))
 
 
 def _add_curves(figure: Any, lines: Sequence[Line]) -> None:

@@ -17,6 +17,7 @@ from leco_plugin.learning.quality import (
     doubts_of_occupancy,
 )
 from leco_plugin.occupancy import SEEN_CELLS, Occupancy
+from leco_plugin.scenes.frames import inverse
 
 POINTS_AT_ONCE = 1 << 16
 
@@ -104,6 +105,19 @@ def cameras_of(occupancy: Occupancy) -> Tensor:
     listed = occupancy.report.get("cameras")
     rows = [numbers(row) for row in listed] if isinstance(listed, list) else []
     return torch.tensor([row for row in rows if len(row) == 3]).reshape(-1, 3)
+
+
+def to_the_data(occupancy: Occupancy) -> Tensor | None:
+    """Takes positions of the run to those that the data's own files have: [3, 4] float64.
+
+    None where the file does not say how its run turned, moved and scaled the data.
+    """
+    frame = occupancy.report.get("data_frame") or occupancy.report.get("frame")
+    rows = [numbers(row) for row in frame] if isinstance(frame, list) else []
+    if [len(row) for row in rows] != [4, 4, 4]:
+        return None
+    known = torch.tensor(rows, dtype=torch.float64)
+    return inverse(known) if float(known[:, :3].det()) != 0.0 else None
 
 
 def numbers(value: Any) -> list[float]:

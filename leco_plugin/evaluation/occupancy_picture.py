@@ -1,18 +1,17 @@
-"""Pictures of an occupancy: slices of o(x) and the kept points, and how it was learned."""
+"""Pictures of an occupancy: slices of o(x) and the kept points."""
 
 from __future__ import annotations
 
-import copy
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
-from PIL import Image
+from numpy.typing import NDArray
 from torch import Tensor
 
-from leco_plugin.chart.theme import LIGHT, new_figure, plain
+from leco_plugin.chart.theme import new_figure
 from leco_plugin.evaluation.inspection import (
     ViewBox,
     cameras_of,
@@ -21,17 +20,17 @@ from leco_plugin.evaluation.inspection import (
     seen_at,
     whole_box,
 )
-from leco_plugin.learning.history import FILE_NAME, GateHistory, as_learned
-from leco_plugin.log import bar
+from leco_plugin.evaluation.scene_colours import SceneColours
 from leco_plugin.occupancy import CALIBRATED_AT, Occupancy
-from leco_plugin.scenes.input_error import InputError
+
+Array = NDArray[Any]
 
 SEARCH_CELLS = 64
 """Along the longest side, to find where anything is kept at all."""
 CELLS = 128
 """Along the longest side, for the points in space."""
-PIXELS, FRAME_PIXELS = 640, 300
-"""Along the longer side of a slice: of a picture, and of a look at a history."""
+PIXELS = 640
+"""Along the longer side of a slice."""
 MOST_POINTS = 50_000
 HORIZONTAL = (0.12, 0.4)
 """Heights of the horizontal slices, as shares of the way from the ground to the highest roofs:
@@ -43,23 +42,22 @@ FLAT = 0.25
 UNSEEN = "#8a8f98"
 COLOURS, CONTOUR, TRUTH, CAMERA = "magma", "#4fd8eb", "#ffffff", "#66e08a"
 AXES = "xyz"
-STILL, MOST_FRAMES = 4, 12
-"""Looks in a still picture of a history, and in one that moves."""
-FRAME_COLOURS = 48
-"""Of a picture that moves, so that a page may hold it."""
-FRAME, LAST_FRAME = 250, 3000
-"""Milliseconds for which a frame is shown."""
-DPI = 80
-OPAQUE = 1e4
-"""Density, per half extent, that is drawn for more: opaque within a ten-thousandth."""
+SOLID = 0.75
+"""o(x) from which a slice hides the photographs' colours under it."""
 
 
-def draw(occupancy: Occupancy, path: str | Path, cameras: Tensor | None = None) -> Path:
+def draw(
+    occupancy: Occupancy,
+    path: str | Path,
+    cameras: Tensor | None = None,
+    colours: SceneColours | None = None,
+) -> Path:
     """Draws two horizontal and two vertical slices of o(x), and the kept points.
 
     Args:
         path: its ending chooses the kind of the picture.
         cameras: [C, 3] camera centres, scene units; those of the report by default.
+        colours: of the scene, drawn under the horizontal slices; None leaves them out.
     Raises:
         OSError, ValueError: the picture cannot be written there, or is of no known kind.
     """
@@ -67,11 +65,12 @@ def draw(occupancy: Occupancy, path: str | Path, cameras: Tensor | None = None) 
     box = interesting_box(occupancy, cameras)
     low, high = heights_seen_from_above(occupancy, box)
     points, normals = surface_points(occupancy, box, low)
+    ground = None if colours is None else seen_from_above(occupancy, box, colours)
     figure = new_figure((15, 9.4), layout="constrained")
     wide, tall = (box.high - box.low)[[0, 2]].tolist()
     ratios = (1.0, min(1.0, max(0.5, 1.6 * tall / wide)))
     grid = figure.add_gridspec(2, 6, height_ratios=ratios, hspace=0.04)
-    middle = _middle_of(points, box)
+    middle = middle_of(points, box)
     slices = [
         (grid[0, 2 * i : 2 * i + 2], 2, height)
         for i, height in enumerate(differing_heights(occupancy, box, low, high))
@@ -79,12 +78,14 @@ def draw(occupancy: Occupancy, path: str | Path, cameras: Tensor | None = None) 
     slices += [(grid[1, 3 * i : 3 * i + 3], a, float(middle[a])) for i, a in enumerate((1, 0))]
     for place, normal, at in slices:
         axes = figure.add_subplot(place)
-        shown = draw_slice(axes, occupancy, box, normal, at, cameras=cameras)
+        under = ground if normal == 2 else None
+        shown = draw_slice(axes, occupancy, box, normal, at, cameras=cameras, under=under)
     _draw_points(figure.add_subplot(grid[0, 4:6], projection="3d"), points, normals, (low, high))
     colour_bar = figure.colorbar(shown, ax=figure.axes[2:4], shrink=0.9, pad=0.01, fraction=0.03)
     colour_bar.ax.axhline(occupancy.threshold, color=CONTOUR, linewidth=2)
     colour_bar.set_label("o(x)")
-    figure.suptitle(_title(occupancy, cameras), fontsize=13)
+    lines = title_of(occupancy), _legend(occupancy, cameras, ground is not None)
+    figure.suptitle("\n".join(" · ".join(parts) for parts in lines), fontsize=12)
     figure.savefig(path, dpi=110)
     return Path(path)
 
@@ -98,6 +99,7 @@ def draw_slice(
     cameras: Tensor | None = None,
     solid: Callable[[Tensor], Tensor] | None = None,
     pixels: int = PIXELS,
+    under: Array | None = None,
 ) -> Any:
     """One slice of o(x) with the contour of the threshold; returns what a colour bar needs.
 
@@ -108,6 +110,7 @@ def draw_slice(
         cameras: [C, 3] centres to mark.
         solid: the truth, if known: positions [N, 3] to bool [N], as white lines edged in black.
         pixels: along the longer side.
+        under: [H, W, 4] picture of the same place, shown where o(x) is small.
     """
     across, up = (a for a in range(3) if a != normal)
     sides = (box.high - box.low)[[across, up]]
@@ -122,7 +125,11 @@ def draw_slice(
     longer = FLAT * float(sides[0] / sides[1])
     longer = longer if longer > 1.0 else 1.0
     style = {"cmap": COLOURS, "vmin": 0, "vmax": 1, "aspect": longer}
-    shown = axes.imshow(values.numpy(), origin="lower", extent=extent, **style)
+    place = {"origin": "lower", "extent": extent}
+    if under is not None:
+        axes.imshow(under, **place, aspect=longer)
+        style["alpha"] = (values / SOLID).clamp(max=1.0).numpy()
+    shown = axes.imshow(values.numpy(), **place, **style)
     unseen = ~seen_at(occupancy, positions).numpy()
     if unseen.any():
         marked = {"colors": "none", "hatches": ["//"], "levels": [0.5, 1.5]}
@@ -131,10 +138,7 @@ def draw_slice(
         lines = [occupancy.threshold]
         axes.contour(u, v, values, levels=lines, colors=CONTOUR, linewidths=0.7)
     if solid is not None:
-        inside = solid(positions.reshape(-1, 3)).cpu().reshape(values.shape).float()
-        if inside.min() < inside.max():
-            for colour, width in (("black", 1.8), (TRUTH, 0.8)):  # seen on light and on dark
-                axes.contour(u, v, inside, levels=[0.5], colors=colour, linewidths=width)
+        _draw_truth(axes, u, v, solid(positions.reshape(-1, 3)).cpu().reshape(values.shape))
     if cameras is not None and len(cameras):
         x, y = cameras[:, across], cameras[:, up]
         axes.scatter(x, y, s=9, c=CAMERA, edgecolors="black", linewidths=0.3, label="cameras")
@@ -148,7 +152,14 @@ def draw_slice(
     return shown
 
 
-def _middle_of(points: Tensor, box: ViewBox) -> Tensor:
+def _draw_truth(axes: Any, u: Tensor, v: Tensor, inside: Tensor) -> None:
+    """Lines around what is solid in a slice, bool [V, U], at coordinates u [U] and v [V]."""
+    if bool(inside.any()) and not bool(inside.all()):
+        for colour, width in (("black", 1.8), (TRUTH, 0.8)):  # seen on light and on dark
+            axes.contour(u, v, inside.float(), levels=[0.5], colors=colour, linewidths=width)
+
+
+def middle_of(points: Tensor, box: ViewBox) -> Tensor:
     """[3] the median of points [P, 3]; the middle of the box where there are none."""
     return points.median(dim=0).values if len(points) else (box.low + box.high) / 2
 
@@ -205,6 +216,19 @@ def differing_heights(
     return lower, upper
 
 
+def seen_from_above(occupancy: Occupancy, box: ViewBox, colours: SceneColours) -> Array:
+    """Colours of the highest kept place above each place: [Y, X, 4] uint8, clear where none is."""
+    _, positions, kept = _kept_cells(occupancy, box, CELLS)
+    layers = torch.arange(kept.shape[2]).expand_as(kept).where(kept, -1).amax(dim=2)
+    columns = (layers >= 0).nonzero(as_tuple=True)
+    seen = np.zeros((*kept.shape[:2], 4), np.uint8)
+    if len(columns[0]):
+        x, y = columns
+        found = colours.at(positions[x, y, layers[x, y]])
+        seen[x.numpy(), y.numpy()] = np.pad(found, ((0, 0), (0, 1)), constant_values=255)
+    return seen.transpose(1, 0, 2)
+
+
 def surface_points(occupancy: Occupancy, box: ViewBox, lowest: float) -> tuple[Tensor, Tensor]:
     """Kept positions next to skipped ones, and the directions [P, 3] in which o(x) falls there."""
     values, positions, kept = _kept_cells(occupancy, box, CELLS)
@@ -247,8 +271,8 @@ def _draw_points(axes: Any, points: Tensor, normals: Tensor, heights: tuple[floa
     axes.view_init(elev=38, azim=-58)
 
 
-def _title(occupancy: Occupancy, cameras: Tensor) -> str:
-    """What one should know beside the picture."""
+def title_of(occupancy: Occupancy) -> list[str]:
+    """What one should know beside a picture."""
     parts = [f"occupancy with {occupancy.num_params} parameters"]
     parts.append(f"kept where o(x) ≥ {occupancy.threshold:.3g}")
     skipped = occupancy.report.get("empty_fraction")
@@ -256,124 +280,12 @@ def _title(occupancy: Occupancy, cameras: Tensor) -> str:
         before = occupancy.report.get(CALIBRATED_AT)
         then = f" at {before:.3g}, before a host lowered it" if isinstance(before, float) else ""
         parts.append(f"{skipped:.1%} of all candidates skipped{then}")
-    parts.append("threshold blue" + (", cameras green" if len(cameras) else ""))
-    if not occupancy.seen.everywhere:
-        parts.append("hatched: no photograph shows it")
-    return " · ".join(parts)
+    return parts
 
 
-def draw_history(occupancy: Occupancy, folder: Path, path: Path) -> Path:
-    """Draws how an occupancy was learned, from the history in the folder of its run.
-
-    Args:
-        path: of the picture. A .gif moves; others show the first look, two between, and the last.
-    Raises:
-        InputError: the run has no history, or one of another gate.
-        OSError, ValueError: the picture cannot be written there, or is of no known kind.
-    """
-    film = _Film(occupancy, _read(occupancy, folder))
-    count = len(film.history)
-    if path.suffix.lower() != ".gif":
-        film.still(spread_evenly(count, STILL)).savefig(path, dpi=DPI)
-        return path
-    frames = []
-    shown = spread_evenly(count, MOST_FRAMES)
-    with bar("Drawing how it was learned") as progress:
-        for number, figure in enumerate(film.moving(shown)):
-            figure.canvas.draw()
-            pixels = np.asarray(figure.canvas.buffer_rgba())[..., :3]
-            # few colours without noise, which GIF cannot compress
-            few = Image.fromarray(pixels).quantize(FRAME_COLOURS, dither=Image.Dither.NONE)
-            frames.append(few)
-            progress((number + 1) / len(shown))
-    durations = [FRAME] * (len(frames) - 1) + [LAST_FRAME]
-    frames[0].save(path, save_all=True, append_images=frames[1:], duration=durations, loop=0)
-    return path
-
-
-def spread_evenly(count: int, most: int) -> list[int]:
-    """Up to `most` of the numbers below `count`, the first and the last among them."""
-    places = torch.linspace(0, count - 1, min(count, most))
-    numbers: list[int] = places.round().int().unique().tolist()
-    return numbers
-
-
-def _read(occupancy: Occupancy, folder: Path) -> GateHistory:
-    file = folder / FILE_NAME
-    try:
-        return GateHistory.load(file, as_learned(occupancy).gate)
-    except FileNotFoundError:
-        raise InputError(
-            f"there is no {file}: a run of leco-occupancy leaves one with "
-            "--pipeline.model.schedule.steps-per-record 10"
-        ) from None
-    except ValueError as error:
-        raise InputError(str(error)) from None
-
-
-class _Film:
-    """Draws looks at a history: two slices each, and lines of what each expert got."""
-
-    def __init__(self, occupancy: Occupancy, history: GateHistory) -> None:
-        self.history = history
-        self.occupancy = copy.deepcopy(as_learned(occupancy))
-        self.box = interesting_box(occupancy, cameras_of(occupancy))
-        low, high = heights_seen_from_above(occupancy, self.box)
-        middle = _middle_of(surface_points(occupancy, self.box, low)[0], self.box)
-        self.places = ((2, low + HORIZONTAL[0] * (high - low)), (1, float(middle[1])))
-        """The normal of each slice and its position along that."""
-        self.shares = torch.stack(history.shares).numpy()
-        self.densities = torch.stack(history.densities).clamp(max=OPAQUE).numpy()
-
-    def still(self, looks: list[int]) -> Any:
-        """A figure with a column for each of some looks, over the lines of all."""
-        figure = new_figure((4 * len(looks), 10), dpi=DPI, layout="constrained")
-        grid = figure.add_gridspec(3, 2 * len(looks), height_ratios=(1.0, 0.5, 0.8))
-        for column, look in enumerate(looks):
-            for row in range(2):
-                axes = figure.add_subplot(grid[row, 2 * column : 2 * column + 2])
-                self._draw_slice(axes, row, look)
-                if row == 0:
-                    axes.set_title(f"step {self.history.steps[look]}: " + axes.get_title())
-        half = len(looks)
-        self._draw_lines(figure.add_subplot(grid[2, :half]), figure.add_subplot(grid[2, half:]))
-        return figure
-
-    def moving(self, looks: list[int]) -> Iterator[Any]:
-        """One figure, drawn anew for each of some looks."""
-        figure = new_figure((9.6, 5.4), dpi=DPI, layout="constrained")
-        columns = figure.add_gridspec(1, 2)
-        slices = columns[0].subgridspec(2, 1, height_ratios=(3, 1))
-        curves = columns[1].subgridspec(2, 1)
-        left, right = ([figure.add_subplot(grid[i]) for i in range(2)] for grid in (slices, curves))
-        for look in looks:
-            for axes in (*left, *right):
-                axes.clear()
-            for row, axes in enumerate(left):
-                self._draw_slice(axes, row, look)
-            self._draw_lines(right[0], right[1], look)
-            figure.suptitle(f"learning what is empty: step {self.history.steps[look]}")
-            yield figure
-
-    def _draw_slice(self, axes: Any, row: int, look: int) -> None:
-        self.occupancy.gate.load_state_dict(self.history.weights[look])
-        normal, at = self.places[row]
-        draw_slice(axes, self.occupancy, self.box, normal, at, pixels=FRAME_PIXELS)
-
-    def _draw_lines(self, above: Any, below: Any, look: int | None = None) -> None:
-        """Shares of points and mean densities against steps, as far as one look, or all."""
-        steps, upto = self.history.steps, None if look is None else look + 1
-        for expert in range(self.shares.shape[1]):
-            colour = LIGHT.colours[expert % len(LIGHT.colours)]
-            style = {"color": colour, "linewidth": 2.6 if expert == 0 else 1.5}
-            label = "empty space" if expert == 0 else f"scene expert {expert}"
-            above.plot(steps[:upto], 100.0 * self.shares[:upto, expert], label=label, **style)
-            below.plot(steps[:upto], self.densities[:upto, expert], **style)
-        above.set(ylabel="share of points, %", ylim=(0, 140), yticks=range(0, 101, 20))
-        below.set_ylabel("mean density, per half extent\n(10⁴: opaque)")
-        below.set_yscale("symlog", linthresh=1.0)
-        below.set_ylim(0, 1.5 * max(1.0, float(self.densities.max())))
-        for axes in (above, below):
-            axes.set(xlim=(min(steps), max(steps) or 1), xlabel="step")
-            plain(axes, LIGHT)
-        above.legend(fontsize=8, ncols=3, loc="upper center")
+def _legend(occupancy: Occupancy, cameras: Tensor, ground: bool) -> list[str]:
+    """What marks in a picture mean."""
+    parts = ["threshold blue" + (", cameras green" if len(cameras) else "")]
+    parts += ["under o(x): the photographs' colours seen from above"] if ground else []
+    parts += [] if occupancy.seen.everywhere else ["hatched: no photograph shows it"]
+    return parts

@@ -172,8 +172,10 @@ def _never_sharpen(model: Any) -> None:
         model: config of a model that learns an occupancy itself, or of one that is guided, or of
             neither; it is changed.
     """
-    learner = getattr(getattr(model, "occupancy", None), "learning", model)
-    if hasattr(learner, "sharpening"):
+    occupancy = getattr(model, "occupancy", None)
+    learner = getattr(occupancy, "learning", model)
+    teaches = getattr(occupancy, "learned", "first") == "along"  # of which it is a part
+    if hasattr(learner, "sharpening") and not teaches:
         learner.sharpening = replace(learner.sharpening, steps=0)
 
 

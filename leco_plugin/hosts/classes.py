@@ -27,6 +27,7 @@ from leco_plugin.hosts.seams import swap_sampler
 from leco_plugin.models.failures import require_finite
 from leco_plugin.scenes.input_error import InputError
 from leco_plugin.studio.host_models import lazy_lpips
+from leco_plugin.studio.occupancy_view import Drawn, DrawnInViewer, OccupancyView
 from leco_plugin.studio.run import run_of
 
 if TYPE_CHECKING:
@@ -64,7 +65,7 @@ def _as_drawable(image: Tensor) -> Tensor:
     return image.float() if counts else image
 
 
-class GuidedHost(Host):
+class GuidedHost(DrawnInViewer, Host):
     """Stands before a model whose sampling is guided.
 
     Attributes:
@@ -82,6 +83,8 @@ class GuidedHost(Host):
             InputError: the host has no seam that is known, or the sampler does not fit it.
         """
         self.leco_guide, self.leco_occupancy = guide, config
+        if guide.needs_occupancy:
+            self.leco_view = OccupancyView()
         swap_sampler(self, guide)
         self.register_load_state_dict_post_hook(
             lambda host, _: set_first_density(host, host.leco_guide)
@@ -90,6 +93,11 @@ class GuidedHost(Host):
             if isinstance(module, RGBRenderer):
                 hide = functools.partial(hide_unseen_backdrop, guide)
                 module.register_forward_pre_hook(hide, with_kwargs=True)
+
+    def leco_drawn(self) -> Drawn | None:
+        """See `DrawnInViewer`."""
+        guide = self.leco_guide
+        return None if guide.occupancy is None else Drawn(guide.followed(), guide.frame)
 
     def forward(self, ray_bundle: Any) -> dict[str, Any]:
         """As the host's. The guide learns whether rays come with limits of their own, before a

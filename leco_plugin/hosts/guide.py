@@ -20,8 +20,9 @@ from leco_plugin.hosts.stand_ins import GuidedEstimator, GuidedProposal
 from leco_plugin.learning.progress import WatchState
 from leco_plugin.models.gate import Gate, GateConfig
 from leco_plugin.models.region import SIDE, Region, SeenBackdrops
-from leco_plugin.occupancy import Occupancy
+from leco_plugin.occupancy import SHOWN, Occupancy
 from leco_plugin.samplers.registry import (
+    OURS,
     SamplerSpec,
     build_estimator,
     refuse_unknown_options,
@@ -148,13 +149,14 @@ class Guide(nn.Module):
         return self.occupancy
 
     def followed(self) -> Occupancy:
-        """The occupancy with the threshold that packed samplers follow for now.
+        """The occupancy with the threshold that samplers follow for now.
 
         Raises:
             NoOccupancyYet: there is none yet.
         """
-        occupancy, lower = self.the_occupancy(), self.watched.lower
-        return occupancy if lower is None else occupancy.with_threshold(lower)
+        occupancy, shown = self.the_occupancy(), SHOWN.get()
+        threshold = self.watched.lower if shown is None else shown
+        return occupancy if threshold is None else occupancy.with_threshold(threshold)
 
     def the_occupancy_skips(self) -> bool:
         """Whether it skips anything; at threshold 0 it does not, and need not be asked."""
@@ -218,8 +220,11 @@ class Guide(nn.Module):
         Raises:
             InputError: it cannot be built so.
         """
+        # cells would be made anew for each threshold that the viewer shows
+        without_cells = SHOWN.get() is not None and self.sampler in OURS
+        uncached = {"cache_bytes": 0} if without_cells else {}
         try:
-            return build(self.sampler, **{**given, **self.options})
+            return build(self.sampler, **{**given, **self.options, **uncached})
         except (ValueError, TypeError, OverflowError, RuntimeError) as error:
             options = f" (its options: {self.options})" if self.options else ""
             why = one_line(error) or type(error).__name__

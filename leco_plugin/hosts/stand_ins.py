@@ -17,6 +17,7 @@ from torch import Tensor, nn
 
 from leco_plugin.models.region import within_crop
 from leco_plugin.models.rendering import Intervals, Rays, with_backdrop
+from leco_plugin.occupancy import SHOWN
 from leco_plugin.samplers.base import Estimator
 from leco_plugin.samplers.boxes import cell_centers, intersect_box
 from leco_plugin.samplers.rays import usable_rays
@@ -32,9 +33,9 @@ class _StandIn(nn.Module):
 
     def __init__(self, guide: Guide) -> None:
         super().__init__()
-        # in tuples: neither the guide nor the sampler is a part of this module's state
+        # in a tuple and a dict: neither guide nor samplers are a part of this module's state
         self._guide = (guide,)
-        self._built: tuple[Any, tuple[nn.Module, ...]] = (None, ())
+        self._built: dict[bool, tuple[Any, nn.Module]] = {}
 
     @property
     def guide(self) -> Guide:
@@ -53,11 +54,11 @@ class _StandIn(nn.Module):
     @property
     def sampler(self) -> nn.Module:
         """The sampler behind this; its mode follows the host's."""
-        guide = self.guide
-        key = (guide.version, guide.frame.device)
-        if self._built[0] != key:
-            self._built = (key, (self._build(guide).to(guide.frame.device),))
-        return self._built[1][0].train(self.training)
+        guide, shown = self.guide, SHOWN.get()
+        key, is_own = (guide.version, guide.frame.device, shown), shown is None
+        if is_own not in self._built or self._built[is_own][0] != key:
+            self._built[is_own] = (key, self._build(guide).to(guide.frame.device))
+        return self._built[is_own][1].train(self.training)
 
 
 _SAMPLING = inspect.signature(Estimator.sampling)
@@ -222,7 +223,8 @@ class GuidedProposal(_StandIn, Sampler):
     def _build(self, guide: Guide) -> nn.Module:
         options = {**self._options, "occupancy": None}
         if guide.needs_occupancy:
-            options["occupancy"] = guide.the_occupancy()
+            shown = SHOWN.get() is not None
+            options["occupancy"] = guide.followed() if shown else guide.the_occupancy()
             if not guide.same_frame():
                 options["frame"] = guide.frame
         return guide.built(build_proposal, **options)

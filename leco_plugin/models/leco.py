@@ -39,10 +39,11 @@ from leco_plugin.studio.checkpoints import (
     evaluate_whole_checkpoints,
     refuse_earlier,
 )
+from leco_plugin.studio.occupancy_view import Drawn, DrawnInViewer, OccupancyView
 from leco_plugin.studio.run import run_of
 
 
-class LecoModel(Model):
+class LecoModel(DrawnInViewer, Model):
     """A mixture behind nerfstudio's model interface.
 
     Attributes:
@@ -70,6 +71,7 @@ class LecoModel(Model):
         routing = Routing(below, config.homogeneous)
         self.mixture = Mixture(sizes, self.num_train_data, precision, routing)
         self._keep_sizes()
+        self.leco_view = OccupancyView()
         # nerfstudio's name for it: photographs with alpha are blended over black
         self.renderer_rgb = RGBRenderer(background_color="random")
         self.progress = Progress()
@@ -117,6 +119,10 @@ class LecoModel(Model):
         config = self.config
         data = LearningData(manager, config.bounds, config.near, config.far)
         return Learner(self.mixture, data, run, config, self.progress)
+
+    def leco_drawn(self) -> Drawn | None:
+        """See `DrawnInViewer`."""
+        return Drawn(self.mixture.occupancy(), None) if bool(self.mixture.frozen) else None
 
     def rays_of(self, bundle: RayBundle) -> Rays:
         """The bundle's rays, cut to the region and to a crop; see `Region.rays`."""

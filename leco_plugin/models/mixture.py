@@ -26,7 +26,7 @@ from leco_plugin.models.rendering import (
 )
 from leco_plugin.models.sizing.sizes import Sizes
 from leco_plugin.models.sizing.stored_sizes import SIZES, stored_in, to_store
-from leco_plugin.occupancy import Occupancy, Precision, gate_precision
+from leco_plugin.occupancy import SHOWN, Occupancy, Precision, gate_precision
 from leco_plugin.samplers import marching
 from leco_plugin.samplers.estimator import LearnedOccupancyEstimator
 from leco_plugin.scenes.bounds import SceneBounds
@@ -95,7 +95,8 @@ class Mixture(nn.Module):
     @property
     def skips(self) -> bool:
         """Whether a frozen gate leaves out any candidate."""
-        return bool(self.frozen) and float(self.threshold) > 0.0
+        shown = SHOWN.get()
+        return bool(self.frozen) and (float(self.threshold) if shown is None else shown) > 0.0
 
     @torch.no_grad()
     def occupancies(self, mapped: Tensor, gate: Gate | None = None) -> Tensor:
@@ -261,6 +262,9 @@ class Mixture(nn.Module):
 
         No property: nerfstudio's viewer reads all that it finds, before the first step.
         """
+        shown = SHOWN.get()
+        if shown is not None:  # cells would be made anew for each threshold
+            return LearnedOccupancyEstimator(self.occupancy().with_threshold(shown), cache_bytes=0)
         if not self._estimator:
             self._estimator = (LearnedOccupancyEstimator(self.occupancy()).to(self.device),)
         return self._estimator[0]

@@ -35,6 +35,7 @@ from leco_plugin.studio.run_folder import (
 )
 from leco_plugin.studio.run_progress import RunProgress
 from leco_plugin.studio.screen import short_screen, without_tables
+from leco_plugin.studio.viewer import stay_open
 
 HEARD = "\nstopping after this step; Ctrl-C once more stops at once\n"
 
@@ -190,7 +191,7 @@ class AtomicTrainer(Trainer):
         raise TrainingStopped("; ".join(parts))
 
     def train(self) -> None:
-        """Trains to the last step.
+        """Trains to the last step, and then stays while somebody looks into the viewer.
 
         Raises:
             TrainingStopped: a loss is not finite, and the step was not taken; the gate has
@@ -202,6 +203,7 @@ class AtomicTrainer(Trainer):
                 return
             with catch_first_interrupt() as self.asked_to_stop:
                 self._train()
+            stay_open(self.viewer_state)
 
     def _train(self) -> None:
         try:

@@ -11,8 +11,8 @@ from ball_occupancy import ball
 from PIL import Image
 
 from leco_plugin.cli import main
-from leco_plugin.evaluation import occupancy_picture
-from leco_plugin.evaluation.occupancy_picture import spread_evenly
+from leco_plugin.evaluation import history_picture
+from leco_plugin.evaluation.history_picture import spread_evenly
 from leco_plugin.learning.history import GateHistory
 
 
@@ -20,7 +20,7 @@ from leco_plugin.learning.history import GateHistory
 def run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """The folder of a run whose gate grew into the ball."""
     for name, value in {"FRAME_PIXELS": 24, "DPI": 20}.items():
-        monkeypatch.setattr(occupancy_picture, name, value)
+        monkeypatch.setattr(history_picture, name, value)
     history, gate = GateHistory(), ball().gate
     learned = {name: value.clone() for name, value in gate.state_dict().items()}
     for look in range(3):
@@ -52,13 +52,13 @@ def test_a_long_history_is_shown_from_its_first_look_to_its_last(
     assert (shown[0], shown[-1], len(shown)) == (0, 199, 16)
     steps = [b - a for a, b in pairwise(shown)]
     assert max(steps) - min(steps) <= 1
-    monkeypatch.setattr(occupancy_picture, "MOST_FRAMES", 2)
-    with Image.open(occupancy_picture.draw_history(ball(), run, run / "short.gif")) as film:
+    monkeypatch.setattr(history_picture, "MOST_FRAMES", 2)
+    with Image.open(history_picture.draw_history(ball(), run, run / "short.gif")) as film:
         assert film.n_frames == 2
 
 
 def test_a_still_picture_is_drawn_too(run: Path) -> None:
-    path = occupancy_picture.draw_history(ball(), run, run / "learned.png")
+    path = history_picture.draw_history(ball(), run, run / "learned.png")
     with Image.open(path) as picture:
         assert picture.width > 100
 

@@ -226,4 +226,4 @@ def test_the_viewer_does_not_ask_a_gate_when_it_looks_for_its_elements(guide: Gu
     host = torch.nn.Module()
     host.guide, host.grid = guide, guide.estimator(BOX)
     parse_object(host, ViewerElement, "Custom Elements")
-    assert host.grid._built[0] is None
+    assert host.grid._built == {}

@@ -1,0 +1,156 @@
+"""Pictures of how an occupancy was learned, from the history in the folder of its run."""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from PIL import Image
+
+from leco_plugin.chart.theme import LIGHT, new_figure, plain
+from leco_plugin.evaluation.inspection import cameras_of
+from leco_plugin.evaluation.occupancy_picture import (
+    HORIZONTAL,
+    draw_slice,
+    heights_seen_from_above,
+    interesting_box,
+    middle_of,
+    surface_points,
+)
+from leco_plugin.learning.history import FILE_NAME, GateHistory, as_learned
+from leco_plugin.log import bar
+from leco_plugin.occupancy import Occupancy
+from leco_plugin.scenes.input_error import InputError
+
+STILL, MOST_FRAMES = 4, 12
+"""Looks in a still picture of a history, and in one that moves."""
+FRAME_PIXELS = 300
+"""Along the longer side of a slice."""
+FRAME_COLOURS = 48
+"""Of a picture that moves, so that a page may hold it."""
+FRAME, LAST_FRAME = 250, 3000
+"""Milliseconds for which a frame is shown."""
+DPI = 80
+OPAQUE = 1e4
+"""Density, per half extent, that is drawn for more: opaque within a ten-thousandth."""
+
+
+def draw_history(occupancy: Occupancy, folder: Path, path: Path) -> Path:
+    """Draws how an occupancy was learned, from the history in the folder of its run.
+
+    Args:
+        path: of the picture. A .gif moves; others show the first look, two between, and the last.
+    Raises:
+        InputError: the run has no history, or one of another gate.
+        OSError, ValueError: the picture cannot be written there, or is of no known kind.
+    """
+    film = _Film(occupancy, _read(occupancy, folder))
+    count = len(film.history)
+    if path.suffix.lower() != ".gif":
+        film.still(spread_evenly(count, STILL)).savefig(path, dpi=DPI)
+        return path
+    frames = []
+    shown = spread_evenly(count, MOST_FRAMES)
+    with bar("Drawing how it was learned") as progress:
+        for number, figure in enumerate(film.moving(shown)):
+            figure.canvas.draw()
+            pixels = np.asarray(figure.canvas.buffer_rgba())[..., :3]
+            # few colours without noise, which GIF cannot compress
+            few = Image.fromarray(pixels).quantize(FRAME_COLOURS, dither=Image.Dither.NONE)
+            frames.append(few)
+            progress((number + 1) / len(shown))
+    durations = [FRAME] * (len(frames) - 1) + [LAST_FRAME]
+    frames[0].save(path, save_all=True, append_images=frames[1:], duration=durations, loop=0)
+    return path
+
+
+def spread_evenly(count: int, most: int) -> list[int]:
+    """Up to `most` of the numbers below `count`, the first and the last among them."""
+    places = torch.linspace(0, count - 1, min(count, most))
+    numbers: list[int] = places.round().int().unique().tolist()
+    return numbers
+
+
+def _read(occupancy: Occupancy, folder: Path) -> GateHistory:
+    file = folder / FILE_NAME
+    try:
+        return GateHistory.load(file, as_learned(occupancy).gate)
+    except FileNotFoundError:
+        raise InputError(
+            f"there is no {file}: a run of leco-occupancy leaves one with "
+            "--pipeline.model.schedule.steps-per-record 10"
+        ) from None
+    except ValueError as error:
+        raise InputError(str(error)) from None
+
+
+class _Film:
+    """Draws looks at a history: two slices each, and lines of what each expert got."""
+
+    def __init__(self, occupancy: Occupancy, history: GateHistory) -> None:
+        self.history = history
+        self.occupancy = copy.deepcopy(as_learned(occupancy))
+        self.box = interesting_box(occupancy, cameras_of(occupancy))
+        low, high = heights_seen_from_above(occupancy, self.box)
+        middle = middle_of(surface_points(occupancy, self.box, low)[0], self.box)
+        self.places = ((2, low + HORIZONTAL[0] * (high - low)), (1, float(middle[1])))
+        """The normal of each slice and its position along that."""
+        self.shares = torch.stack(history.shares).numpy()
+        self.densities = torch.stack(history.densities).clamp(max=OPAQUE).numpy()
+
+    def still(self, looks: list[int]) -> Any:
+        """A figure with a column for each of some looks, over the lines of all."""
+        figure = new_figure((4 * len(looks), 10), dpi=DPI, layout="constrained")
+        grid = figure.add_gridspec(3, 2 * len(looks), height_ratios=(1.0, 0.5, 0.8))
+        for column, look in enumerate(looks):
+            for row in range(2):
+                axes = figure.add_subplot(grid[row, 2 * column : 2 * column + 2])
+                self._draw_slice(axes, row, look)
+                if row == 0:
+                    axes.set_title(f"step {self.history.steps[look]}: " + axes.get_title())
+        half = len(looks)
+        self._draw_lines(figure.add_subplot(grid[2, :half]), figure.add_subplot(grid[2, half:]))
+        return figure
+
+    def moving(self, looks: list[int]) -> Iterator[Any]:
+        """One figure, drawn anew for each of some looks."""
+        figure = new_figure((9.6, 5.4), dpi=DPI, layout="constrained")
+        columns = figure.add_gridspec(1, 2)
+        slices = columns[0].subgridspec(2, 1, height_ratios=(3, 1))
+        curves = columns[1].subgridspec(2, 1)
+        left, right = ([figure.add_subplot(grid[i]) for i in range(2)] for grid in (slices, curves))
+        for look in looks:
+            for axes in (*left, *right):
+                axes.clear()
+            for row, axes in enumerate(left):
+                self._draw_slice(axes, row, look)
+            self._draw_lines(right[0], right[1], look)
+            figure.suptitle(f"learning what is empty: step {self.history.steps[look]}")
+            yield figure
+
+    def _draw_slice(self, axes: Any, row: int, look: int) -> None:
+        self.occupancy.gate.load_state_dict(self.history.weights[look])
+        normal, at = self.places[row]
+        draw_slice(axes, self.occupancy, self.box, normal, at, pixels=FRAME_PIXELS)
+
+    def _draw_lines(self, above: Any, below: Any, look: int | None = None) -> None:
+        """Shares of points and mean densities against steps, as far as one look, or all."""
+        steps, upto = self.history.steps, None if look is None else look + 1
+        for expert in range(self.shares.shape[1]):
+            colour = LIGHT.colours[expert % len(LIGHT.colours)]
+            style = {"color": colour, "linewidth": 2.6 if expert == 0 else 1.5}
+            label = "empty space" if expert == 0 else f"scene expert {expert}"
+            above.plot(steps[:upto], 100.0 * self.shares[:upto, expert], label=label, **style)
+            below.plot(steps[:upto], self.densities[:upto, expert], **style)
+        above.set(ylabel="share of points, %", ylim=(0, 140), yticks=range(0, 101, 20))
+        below.set_ylabel("mean density, per half extent\n(10⁴: opaque)")
+        below.set_yscale("symlog", linthresh=1.0)
+        below.set_ylim(0, 1.5 * max(1.0, float(self.densities.max())))
+        for axes in (above, below):
+            axes.set(xlim=(min(steps), max(steps) or 1), xlabel="step")
+            plain(axes, LIGHT)
+        above.legend(fontsize=8, ncols=3, loc="upper center")

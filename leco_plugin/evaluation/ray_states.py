@@ -1,0 +1,55 @@
+"""What an occupancy says along rays: something is kept, all is skipped, or unseen."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from leco_plugin.evaluation.inspection import whole_box
+from leco_plugin.models.region import cut_rays, marching_rule, within_crop
+from leco_plugin.occupancy import Occupancy
+from leco_plugin.samplers import marching
+
+SKIPPED, KEPT, UNSEEN = 0, 1, 2
+CANDIDATES = 192
+"""Of a ray that crosses the scene."""
+NEAREST, FARTHEST = 0.02, 100.0
+"""Where rays begin and end, half extents of the space."""
+
+
+@torch.no_grad()
+def ray_states(
+    occupancy: Occupancy,
+    origins: Tensor,
+    directions: Tensor,
+    crop: tuple[Tensor | None, Tensor | None] = (None, None),
+) -> Tensor:
+    """The state of each ray: `KEPT` where any candidate is kept; else `UNSEEN` where any lies in
+    space that no training ray crosses; else `SKIPPED`.
+
+    Args:
+        origins, directions: [R, 3] in the occupancy's coordinates, unit vectors.
+        crop: nears and fars of the rays, [R] or [R, 1], scene units; None is no crop.
+    Returns:
+        [R] int64.
+    """
+    space, half = occupancy.space, float(occupancy.space.half_extent)
+    near, far = NEAREST * half, FARTHEST * half
+    box = occupancy.walls
+    if space.kind == "box":
+        inner = whole_box(occupancy)
+        box = torch.cat([inner.low, inner.high]).to(box)
+    rays = within_crop(
+        cut_rays(origins, directions, box, box.new_tensor(near), box.new_tensor(far)), *crop
+    )
+    rule = marching.March(*marching_rule(space.kind, near, far, CANDIDATES, 2.0 * half))
+    of_ray, starts, ends = marching.march(marching.Rays(*rays[:4]), rule)
+    middles = (0.5 * (starts + ends))[:, None]
+    positions = torch.addcmul(origins[of_ray], directions[of_ray], middles)
+    mapped = space.map(positions)
+    inside = mapped.abs().amax(dim=-1) <= 1.0
+    unseen = inside & ~occupancy.seen(mapped.clamp(-1.0, 1.0))
+    states = torch.full((len(origins),), SKIPPED, device=origins.device)
+    states[of_ray[unseen]] = UNSEEN
+    states[of_ray[occupancy.query(positions) >= occupancy.threshold_value]] = KEPT
+    return states
