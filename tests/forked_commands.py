@@ -14,7 +14,10 @@ import sys
 from pathlib import Path
 from typing import IO
 
-from leco_plugin.studio.commands import show_one_line_in_ns_commands
+from leco_plugin.studio.commands import (
+    render_images_without_ffmpeg,
+    show_one_line_in_ns_commands,
+)
 
 ENTRY_POINTS = {
     "ns-train": "nerfstudio.scripts.train:entrypoint",
@@ -84,6 +87,7 @@ def _run(command: list[str], log: str) -> int:
         os.dup2(printed.fileno(), sys.stderr.fileno())
     sys.argv = command
     show_one_line_in_ns_commands()
+    render_images_without_ffmpeg()
     module, _, function = ENTRY_POINTS[command[0]].partition(":")
     try:
         ended = getattr(importlib.import_module(module), function)()

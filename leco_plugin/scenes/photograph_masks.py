@@ -46,9 +46,8 @@ def convert_masks(
     for wanted, image, size in zip(masks, images, sizes):
         path = _found(wanted, image)
         values = _values(path)
-        top = values.max()
-        seen = values >= HALF if top >= HALF else values > 0
-        if bool(((values > 0) & (values < HALF)).any()) and top >= HALF:
+        seen = _is_seen(values)
+        if bool(((values > 0) & ~seen).any()):
             grey.append(path)
         fitting = _fit(seen, size, path)
         as_it_is = fitting is seen and bool((seen == (values > 0)).all()) and _is_grey(path)
@@ -71,6 +70,16 @@ def convert_masks(
             f"are seen; the first is {escape(str(grey[0]))}"
         )
     return found
+
+
+def seen_pixels(mask: Path, image: Path, size: tuple[int, int]) -> NDArray[np.bool_]:
+    """The pixels [H, W] of an image that its mask shows. InputError, one line, about the mask.
+
+    Args:
+        size: width and height of the image.
+    """
+    path = _found(mask, image)
+    return _fit(_is_seen(_values(path)), size, path)
 
 
 def check_masked(frames: list[dict[str, Any]], folder: Path) -> None:
@@ -119,6 +128,11 @@ def _values(path: Path) -> NDArray[np.uint8]:
             )
         return (lightest * rgba[..., 3] // 255).astype(np.uint8)
     raise InputError(f"the mask {path} cannot be read as an image ({reason}): is the file whole?")
+
+
+def _is_seen(values: NDArray[np.uint8]) -> NDArray[np.bool_]:
+    """Which greys [H, W] of a mask are of pixels that are seen."""
+    return np.asarray(values >= HALF if values.max() >= HALF else values > 0)
 
 
 def _is_grey(path: Path) -> bool:

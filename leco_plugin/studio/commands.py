@@ -7,6 +7,8 @@ when a command starts therefore set `sys.excepthook`, in processes of its comman
 from __future__ import annotations
 
 import dataclasses
+import re
+import shutil
 import sys
 import warnings
 from collections.abc import Iterator
@@ -49,6 +51,28 @@ def show_one_line_in_ns_commands() -> None:
 
     show.of_leco_plugin = True  # type: ignore[attr-defined]
     sys.excepthook = show
+
+
+def render_images_without_ffmpeg() -> None:
+    """In `ns-render`, only a film needs ffmpeg. nerfstudio asks for it before images, too.
+
+    Where a film is asked for and ffmpeg is missing, an InputError says so.
+    """
+    program = Path(*sys.argv[:1])
+    if not is_ns_command(str(program)) or program.stem not in ("ns-render", "render"):
+        return
+    from nerfstudio.utils import install_checks
+
+    def check() -> None:
+        if re.search(r"--output[-_]format[ =]images\b", " ".join(sys.argv)):
+            return
+        if shutil.which("ffmpeg") is None:
+            raise InputError(
+                "ns-render makes a film by ffmpeg, which is not installed: add "
+                "--output-format images, or install ffmpeg"
+            )
+
+    install_checks.check_ffmpeg_installed = check
 
 
 OURS = ("leco-ngp", "leco-nerfacto", "leco-occupancy", "leco-occupancy-paper", "leco-switch-nerf")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shlex
+import shutil
 import time
 from contextlib import ExitStack
 from pathlib import Path
@@ -112,7 +113,8 @@ def next_commands(folder: Path, occupancy: bool, tests: bool) -> list[str]:
 
     viewer = f"ns-viewer --load-config {config}"
     evaluate = f"ns-eval --load-config {config} --output-path {out('eval.json')}"
-    render = f"ns-render interpolate --load-config {config} --output-path {out('path.mp4')}"
+    path = out("path.mp4") if shutil.which("ffmpeg") else f"{out('path')} --output-format images"
+    render = f"ns-render interpolate --load-config {config} --output-path {path}"
     inspect = f"leco inspect {out(FILE_NAME)} --picture {out('occupancy.png')}"
     if not tests:
         evaluate = f"{render} --pose-source train"

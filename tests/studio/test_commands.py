@@ -12,12 +12,13 @@ from typing import Any
 import pytest
 import yaml
 from nerfstudio.scripts import train
+from nerfstudio.utils import install_checks
 from nerfstudio.utils.eval_utils import eval_setup
 
 from leco_plugin.method_configs import leco_occupancy
 from leco_plugin.models.failures import TrainingStopped
 from leco_plugin.scenes.input_error import InputError
-from leco_plugin.studio.commands import is_ns_command, line_of
+from leco_plugin.studio.commands import is_ns_command, line_of, render_images_without_ffmpeg
 
 FORKS = """
 import json, os, sys
@@ -152,3 +153,18 @@ def test_a_module_of_nerfstudio_that_is_run_ends_in_the_line_too(tmp_path: Path)
     last = done.stderr.strip().splitlines()[-1]
     assert done.returncode == 1 and last.startswith(f"the run {path} is of another version")
     assert "Traceback" not in done.stderr
+
+
+def test_only_a_film_needs_ffmpeg(monkeypatch: pytest.MonkeyPatch) -> None:
+    theirs = install_checks.check_ffmpeg_installed
+    monkeypatch.setattr(install_checks, "check_ffmpeg_installed", theirs)
+    monkeypatch.setenv("PATH", "")
+    monkeypatch.setattr(sys, "argv", ["ns-process-data", "images"])
+    render_images_without_ffmpeg()
+    assert install_checks.check_ffmpeg_installed is theirs
+    monkeypatch.setattr(sys, "argv", ["ns-render", "interpolate", "--output-format", "images"])
+    render_images_without_ffmpeg()
+    install_checks.check_ffmpeg_installed()
+    sys.argv.pop()
+    with pytest.raises(InputError, match="ffmpeg, which is not installed: add --output-format"):
+        install_checks.check_ffmpeg_installed()

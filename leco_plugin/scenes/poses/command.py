@@ -150,7 +150,8 @@ def summary(report: dict[str, Any]) -> list[str]:
     if blocks := report["other_blocks"]:
         lines.append(
             f"{sum(map(len, blocks))} of these are placed among themselves, and share too little "
-            f"with the rest: {'; '.join(_some(block) for block in blocks[:NAMED])}"
+            f"with the rest: {'; '.join(_some(block) for block in blocks[:NAMED])}; their models "
+            "stay in colmap/models, and leco poses on a block alone makes it a scene"
         )
     if 2 * placed < count:
         lines.append("more overlap between neighbours places more photographs")

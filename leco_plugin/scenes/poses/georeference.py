@@ -117,7 +117,7 @@ def place(pycolmap: Any, centres: Array, gps: Array, up: Array) -> Placement:
         return _by_direction(
             up,
             f"GPS contradicts the poses: {agreeing} of {known.sum()} positions agree within "
-            f"{options.max_error:.1f} m",
+            f"{options.max_error:.1f} m; mend EXIF, or set metres_per_unit in transforms.json",
         )
     matrix, inlier = found["tgt_from_src"].matrix(), np.asarray(found["inlier_mask"], dtype=bool)
     scale = float(np.linalg.det(matrix[:, :3])) ** (1.0 / 3.0)

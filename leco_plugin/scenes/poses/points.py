@@ -22,11 +22,13 @@ from leco_plugin.scenes.bounds import FEWEST_POINTS
 from leco_plugin.scenes.input_error import InputError, require
 from leco_plugin.scenes.lenses import DISTORTIONS, Lens
 from leco_plugin.scenes.photograph_files import check_images, decode, header_of, is_turned
+from leco_plugin.scenes.photograph_masks import seen_pixels
 from leco_plugin.scenes.photographs import LecoPhotographsDataParserConfig, folder_of, read_points
 from leco_plugin.scenes.poses.exif import Exif
 from leco_plugin.scenes.poses.originals import FEWEST, Photograph
 from leco_plugin.scenes.poses.pairs import choose_posed_pairs
 from leco_plugin.scenes.poses.reconstruction import (
+    MASKS,
     Reconstructor,
     available_threads,
     load_pycolmap,
@@ -38,9 +40,11 @@ from leco_plugin.scenes.whole_files import write_whole
 Array = NDArray[np.float64]
 FILE, BEFORE = "leco_points.ply", "transforms.before_points.json"
 """The points, and transforms.json as it was, in the folder of the scene."""
+TOLERANCE = 0.01
+"""Share of a picture's longest side by which a feature may miss its point; COLMAP has 4 pixels."""
 CONTRADICTED = 0.5
 """Share of the matched features that must agree with the poses: 94% do in a scene of nine
-photographs, 15% where their poses are shuffled."""
+photographs, 12 to 15% where their poses are shuffled."""
 
 
 def find_points(data: Path, size: int = 1600, threads: int = 0) -> dict[str, Any]:
@@ -122,8 +126,14 @@ def _triangulate(reconstructor: Reconstructor, cameras: Sequence[Any], poses: Ar
     reconstructor.match(choose_posed_pairs(poses))
     options = pycolmap.IncrementalPipelineOptions()
     options.num_threads, options.random_seed = reconstructor.threads, 0
+    triangulation = options.triangulation
+    longest = max(max(each.size) for each in reconstructor.photographs)
     # nine photographs have few points that three of them show
-    options.triangulation.ignore_two_view_tracks = False
+    triangulation.ignore_two_view_tracks = False
+    # poses are off by an angle: that is more pixels of a larger picture
+    tolerance = max(options.mapper.filter_max_reproj_error, TOLERANCE * longest)
+    options.mapper.filter_max_reproj_error = tolerance
+    triangulation.complete_max_reproj_error = triangulation.merge_max_reproj_error = tolerance
     work.mkdir()
     return pycolmap.triangulate_points(
         given, reconstructor.database, reconstructor.images, work, options=options
@@ -163,9 +173,12 @@ def _copies(
 ) -> tuple[list[Photograph], list[Any]]:
     """Photographs as their lenses mean them, made smaller, in a folder; and their cameras.
 
+    What masks and opacity hide goes to the folder MASKS beside that one.
+
     Args:
         size: longest side in pixels of a copy.
     """
+    masks = folder.with_name(MASKS)
     folder.mkdir()
     photographs, cameras = [], []
     pictures = scene.pictures()
@@ -175,10 +188,13 @@ def _copies(
             header = header_of(path)
             full = (int(lens.width or header.size[0]), int(lens.height or header.size[1]))
             with decode(path, is_turned(header, full)) as image:
-                copy = image.convert("RGB")
+                copy, seen = image.convert("RGB"), _seen(scene, number, path, image)
             copy.thumbnail((size, size), Image.Resampling.LANCZOS)
             name = f"{number:06d}.png"
             copy.save(folder / name, compress_level=1)
+            if seen is not None:
+                masks.mkdir(exist_ok=True)
+                seen.resize(copy.size).save(masks / f"{name}.png")
             camera = camera_of(lens, full, copy.size, str(path))
             lens_name = str(sorted(camera.todict().items(), key=str))  # shared by equal ones
             header = header_of(folder / name)
@@ -186,6 +202,18 @@ def _copies(
             cameras.append(camera)
             show((count + 1) / len(chosen))
     return photographs, cameras
+
+
+def _seen(scene: SceneFile, number: int, path: Path, image: Image.Image) -> Image.Image | None:
+    """White where a photograph is seen, by its mask or its opacity; None where all of it is."""
+    if mask := scene.frames[number].get("mask_path"):
+        place = scene.path.parent / str(mask).replace("\\", "/")
+        shown = seen_pixels(place, path, image.size)
+    elif header_of(path).transparent:
+        shown = np.asarray(image.convert("RGBA"))[..., 3] > 0
+    else:
+        return None
+    return Image.fromarray(shown).convert("L")
 
 
 def camera_of(lens: Lens, full: tuple[int, int], size: tuple[int, int], where: str) -> Any:

@@ -29,6 +29,8 @@ ENOUGH = 20
 """Photographs from which on a lens gets its full model: fewer would let it bend the scene."""
 CHUNK, PAIRS_A_CHUNK = 4, 100
 """Photographs and pairs for each thread between two looks at the progress bar."""
+MASKS = "masks"
+"""Folder of masks, named NAME.png for a photograph NAME; what is black in one has no features."""
 EXTRA = "pip install 'leco_plugin[poses]'"
 
 
@@ -49,8 +51,8 @@ class Reconstructor:
     """pycolmap on the photographs of a scene."""
 
     def __init__(self, scene: Path, photographs: Sequence[Photograph], threads: int) -> None:
-        """With the folder of the scene, whose `images` has all copies."""
-        self.pycolmap = load_pycolmap()
+        """With the folder of the scene, whose `images` has all copies, and MASKS some masks."""
+        self.pycolmap, self.masks = load_pycolmap(), scene / MASKS
         self.images, self.folder = scene / "images", scene / "colmap"
         self.database = self.folder / "database.db"
         self.photographs, self.threads = photographs, threads
@@ -66,6 +68,9 @@ class Reconstructor:
         self._enter(lens)
         options = pycolmap.FeatureExtractionOptions()
         options.max_image_size, options.num_threads, options.use_gpu = size, self.threads, False
+        reader = pycolmap.ImageReaderOptions()
+        if self.masks.is_dir():
+            reader.mask_path = self.masks
         with pycolmap.Database.open(self.database) as database:
             done = {
                 image.name
@@ -80,6 +85,7 @@ class Reconstructor:
                     self.database,
                     self.images,
                     names[at : at + chunk],
+                    reader_options=reader,
                     extraction_options=options,
                     device=pycolmap.Device.cpu,
                 )

@@ -144,7 +144,10 @@ def test_of_two_blocks_the_largest_is_written_and_wrong_gps_is_not_used(
     said = capsys.readouterr().out
     assert "6 of 10 photographs are placed" in said
     assert "4 of these are placed among themselves, and share too little" in said
-    assert "no metres: GPS contradicts the poses: " in said
+    assert "leco poses on a block alone makes it a scene" in said
+    kept = [pycolmap.Reconstruction(each) for each in (out / "colmap/models").glob("[0-9]*")]
+    assert sorted(each.num_reg_images() for each in kept) == [4, 6]
+    assert "no metres: GPS contradicts the poses: " in said and "mend EXIF" in said
     meta = meta_of(out)
     assert not {"metres_per_unit", "geographic_origin"} & {*meta}
     assert min(frame["transform_matrix"][2][2] for frame in meta["frames"]) > 0.9

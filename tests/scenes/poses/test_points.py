@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 import torch
 from nerfstudio.cameras.cameras import CameraType
+from PIL import Image
 from rendered_survey import BLOCKS
 
 from leco_plugin import cli
@@ -65,6 +66,35 @@ def test_points_lie_where_mapping_finds_them_and_nothing_else_changes(
     assert meta.pop("ply_file_path") == FILE and meta == json.loads(before)
     assert cli.main(["points", str(bare)]) == 0
     assert "has" in (said := capsys.readouterr().out) and "nothing is done" in said
+
+
+@pytest.mark.parametrize("hidden_by", ["masks", "opacity"])
+def test_what_is_hidden_gets_no_points(bare: Path, hidden_by: str) -> None:
+    """The left third of each photograph is hidden; no point is there in all that see it."""
+    meta = json.loads((bare / "transforms.json").read_text())
+    for number, frame in enumerate(meta["frames"]):
+        with Image.open(bare / frame["file_path"]) as image:
+            shown = Image.new("L", image.size, 255)
+            shown.paste(0, (0, 0, image.width // 3, image.height))
+            if hidden_by == "masks":
+                frame["mask_path"] = f"{number}.png"
+                shown.save(bare / frame["mask_path"])
+            else:
+                image.putalpha(shown)
+                frame["file_path"] = f"{number}.png"
+                image.save(bare / frame["file_path"])
+    (bare / "transforms.json").write_text(json.dumps(meta))
+    find_points(bare, threads=1)
+    points = (read_ply(bare / FILE, torch.float64) - torch.from_numpy(FAR_AWAY)).numpy()
+    seen = np.zeros(len(points), dtype=int)
+    for frame in meta["frames"]:
+        pose = np.array(frame["transform_matrix"])
+        right, up, back = ((points - pose[:3, 3] + FAR_AWAY) @ pose[:3, :3]).T
+        column = frame["cx"] - right / back * frame["fl_x"]
+        row = frame["cy"] + up / back * frame["fl_y"]
+        inside = (column > frame["w"] / 3 - 5) & (column < frame["w"])
+        seen += inside & (row > 0) & (row < frame["h"])
+    assert len(points) > 100 and (seen >= 2).all()
 
 
 def test_poses_of_other_photographs_are_refused_and_nothing_is_written(bare: Path) -> None:
