@@ -156,7 +156,8 @@ def scene_file_of(config: Any, split: str) -> SceneFile | None:
         if file.name != "transforms.json" and beside:
             instead = f"give that split one, as a copy of {beside[0].name}"
         raise InputError(f"{data} holds no {file.relative_to(data)}; {instead}")
-    scene = read_scene_file(file, split, data / getattr(config, "images_dir", file.parent))
+    own = getattr(config, "images_dir", None)
+    scene = read_scene_file(file, split, file.parent if own is None else data / own)
     if hasattr(config, "downscale_factor"):  # nerfstudio's own format has all of these
         for frame in scene.frames:
             for name in (each for each in PINHOLE_FIELDS if each not in scene.meta | frame):

@@ -50,10 +50,11 @@ def shuffle_poses(scene: Path) -> None:
 
 
 def test_points_lie_where_mapping_finds_them_and_nothing_else_changes(
-    bare: Path, made: Path, capsys: pytest.CaptureFixture[str]
+    bare: Path, made: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     before = (bare / "transforms.json").read_bytes()
-    assert cli.main(["points", str(bare), "--threads", "1"]) == 0
+    monkeypatch.chdir(bare.parent)
+    assert cli.main(["points", bare.name, "--threads", "1"]) == 0  # a relative path, as typed
     known = read_ply(made / "sparse_pc.ply", torch.float64)
     found = read_ply(bare / FILE, torch.float64) - torch.from_numpy(FAR_AWAY)
     assert len(found) >= len(known)
