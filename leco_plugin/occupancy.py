@@ -103,8 +103,11 @@ class Occupancy(nn.Module):
         """
         if not 0.0 <= threshold <= 1.0:
             raise ValueError(f"a threshold is in [0, 1], not {threshold}")
-        said = self.report if report is None else report
-        given = (self.gate, self.space, threshold, self.precision, said, self.walls, self.seen)
+        return self.with_gate(self.gate, threshold, self.report if report is None else report)
+
+    def with_gate(self, gate: Gate, threshold: float, report: dict[str, Any]) -> Occupancy:
+        """An occupancy of another gate in the same space, with the same walls and seen cells."""
+        given = (gate, self.space, threshold, self.precision, report, self.walls, self.seen)
         return Occupancy(*given).to(self.walls.device).train(self.training)
 
     def shows_a_backdrop(self) -> bool:

@@ -42,6 +42,11 @@ class ViewBox:
         shares = (torch.arange(count) + 0.5) / count
         return torch.lerp(self.low[number], self.high[number], shares)
 
+    def middles(self, longest: int) -> Tensor:
+        """Middles of nearly cubic cells, `longest` along the longest side: [X, Y, Z, 3]."""
+        axes = [self.axis(number, count) for number, count in enumerate(self.cells(longest))]
+        return torch.stack(torch.meshgrid(*axes, indexing="ij"), dim=-1)
+
 
 def describe(occupancy: Occupancy) -> dict[str, Any]:
     """Sizes, space, threshold, kept share of its box, report of calibration: JSON values."""

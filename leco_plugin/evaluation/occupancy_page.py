@@ -62,7 +62,7 @@ def write_page(occupancy: Occupancy, path: Path, colours: SceneColours | None = 
         _add_lines(figure, cameras, "cameras", mode="markers", marker=look)
     whole = whole_box(occupancy)
     _add_lines(figure, _edges(whole), "bounds", line={"color": "#8a8f98", "width": 2})
-    seen = seen_at(occupancy, _middles(whole, SEEN_CELLS))
+    seen = seen_at(occupancy, whole.middles(SEEN_CELLS))
     unseen = faces_of(~seen, whole, beyond=False)
     if len(unseen):
         look = {"color": "#8a8f98", "opacity": 0.25, "visible": "legendonly"}
@@ -103,7 +103,7 @@ def _kept_faces(occupancy: Occupancy, box: ViewBox, lowest: float) -> Tensor:
     """Faces [F, 4, 3] of kept cells, without what is below the ground, in cells as small as
     `MOST_FACES` allows."""
     for cells in CELLS:
-        positions = _middles(box, cells)
+        positions = box.middles(cells)
         kept = query(occupancy, positions) >= occupancy.threshold
         faces = faces_of(kept, box, beyond=True)
         margin = 2.0 * float((box.high - box.low).max()) / cells
@@ -111,12 +111,6 @@ def _kept_faces(occupancy: Occupancy, box: ViewBox, lowest: float) -> Tensor:
         if len(faces) <= MOST_FACES:
             break
     return faces
-
-
-def _middles(box: ViewBox, longest: int) -> Tensor:
-    """Middles of the cells of a box, [X, Y, Z, 3]."""
-    axes = [box.axis(number, count) for number, count in enumerate(box.cells(longest))]
-    return torch.stack(torch.meshgrid(*axes, indexing="ij"), dim=-1)
 
 
 def _mesh(faces: Tensor) -> dict[str, Any]:

@@ -243,8 +243,7 @@ def surface_points(occupancy: Occupancy, box: ViewBox, lowest: float) -> tuple[T
 
 def _kept_cells(occupancy: Occupancy, box: ViewBox, longest: int) -> tuple[Tensor, Tensor, Tensor]:
     """o(x) at the middles of cells [X, Y, Z], those positions [X, Y, Z, 3], and which are kept."""
-    axes = [box.axis(number, count) for number, count in enumerate(box.cells(longest))]
-    positions = torch.stack(torch.meshgrid(*axes, indexing="ij"), dim=-1)
+    positions = box.middles(longest)
     values = query(occupancy, positions)
     return values, positions, values >= occupancy.threshold
 

@@ -8,29 +8,34 @@ bounds. Weights are read at the seam of packed hosts, which ask for densities wh
 
 from __future__ import annotations
 
-import math
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
+from functools import cached_property
 from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
 
 from leco_plugin.hosts.guide import Guide
+from leco_plugin.hosts.host_watch import squared_errors
 from leco_plugin.hosts.stand_ins import GuidedEstimator
-from leco_plugin.learning.calibration import THRESHOLDS, CalibrationConfig, Measured, measure
-from leco_plugin.learning.dense import Reference, near_surface_by
+from leco_plugin.learning.calibration import (
+    THRESHOLDS,
+    CalibrationConfig,
+    Measured,
+    image_price,
+    measure,
+)
+from leco_plugin.learning.dense import Reference, evaluating, near_surface_by
 from leco_plugin.learning.freezing import leave_file
-from leco_plugin.learning.lesson import Lesson, round_weights, teach
+from leco_plugin.learning.lesson import lesson_of, round_weights, teach
 from leco_plugin.learning.run import Run
-from leco_plugin.learning.sharpening import ERRORS, LOSSES, SharpeningConfig
+from leco_plugin.learning.sharpening import ERRORS, LOSSES, SharpeningConfig, added_costs
 from leco_plugin.log import note, say
 from leco_plugin.models.compute.device import fast_precision
 from leco_plugin.models.gate import Gate
 from leco_plugin.models.leco_config import LecoModelConfig
-from leco_plugin.models.losses import widen
-from leco_plugin.models.objective import GateLossConfig
 from leco_plugin.models.region import Region
 from leco_plugin.models.rendering import Intervals
 from leco_plugin.occupancy import Occupancy
@@ -38,8 +43,7 @@ from leco_plugin.samplers.base import prune
 from leco_plugin.samplers.estimator import LearnedOccupancyEstimator
 from leco_plugin.samplers.packed import accumulate_along_rays, pack_info, render_weight_from_density
 from leco_plugin.scenes.input_error import InputError
-from leco_plugin.scenes.learning_data import LearningData, held_out_bundle
-from leco_plugin.studio.host_models import true_colours
+from leco_plugin.scenes.learning_data import LearningData, held_out_bundle, training_bundles
 
 OPEN = 1e-4
 """Threshold of bounds alone, below all that calibration tries."""
@@ -49,21 +53,25 @@ SHARE_OF_TIME = 0.1
 """Of training, about the most that teaching takes after that."""
 HELD_OUT_RAYS = 2048
 """Rays on which a gate is calibrated; each threshold that is tried renders them."""
+NO_ERROR = 1e-12
+"""Summed squared error of rays that is as good as none."""
 LOWER = 3
 """Steps of `THRESHOLDS` from one that costs too much to the next that is tried."""
+
+INSTEAD = "leave --pipeline.model.occupancy.learned at first"
+NO_DENSITIES = f"this host asks for no densities along rays to teach with: {INSTEAD}"
 
 
 def open_occupancy(data: LearningData, config: SharpeningConfig) -> Occupancy:
     """Bounds alone: walls, and the space that training rays cross, in which nothing is skipped."""
     region = Region()
     region.set(data.survey.bounds)
-    region.look(*data.covering_rays())
-    region.see(*data.rays_of_all_images())
+    data.note_views(region)
     report = {"aabb": region.aabb.tolist(), "empty_fraction": 0.0, **data.facts()}
     report |= dict.fromkeys((*LOSSES, *ERRORS), 0.0)
     precision, walls = fast_precision(region.aabb.device), region.aabb
     made = Occupancy(Gate(config.gate), region.space, OPEN, precision, report, walls, region.seen)
-    return bounds_of(made)
+    return bounds_of(made.eval())
 
 
 def bounds_of(occupancy: Occupancy) -> Occupancy:
@@ -71,9 +79,7 @@ def bounds_of(occupancy: Occupancy) -> Occupancy:
     gate = Gate(occupancy.gate.config)
     for parameter in gate.parameters():
         parameter.data.zero_()  # o(x) is one half everywhere, of which cells are sure
-    given = occupancy.space, OPEN, occupancy.precision, occupancy.report
-    made = Occupancy(gate, *given, occupancy.walls, occupancy.seen)
-    return made.to(occupancy.walls.device).eval()
+    return occupancy.with_gate(gate, OPEN, occupancy.report)
 
 
 class Heard(NamedTuple):
@@ -87,13 +93,6 @@ class Heard(NamedTuple):
     kept: Tensor
     """[M] bool, by that."""
     rays: int
-
-    def lesson(self, losses: GateLossConfig) -> Lesson:
-        """The targets of the contribution loss at all candidates."""
-        of_ray = self.intervals.ray_indices
-        wide = widen(self.weights, of_ray[1:] == of_ray[:-1])
-        target = (wide / losses.weight_at_full).clamp(max=1.0)
-        return Lesson(self.mapped, losses.emphasis * target, 1.0 - target)
 
     def reference(self, occupancies: Tensor) -> Reference:
         """As `measure` takes it, without an image."""
@@ -123,22 +122,22 @@ class Along:
     def __init__(
         self, host: Any, guide: Guide, config: LecoModelConfig, pipeline: Any, run: Run
     ) -> None:
-        instead = "leave --pipeline.model.occupancy.learned at first"
         if not any(isinstance(module, GuidedEstimator) for module in host.modules()):
-            raise InputError(f"this host asks for no densities along rays to teach with: {instead}")
+            raise InputError(NO_DENSITIES)
         if config.sharpening.steps == 0:
-            raise InputError(f"with sharpening.steps 0 a host teaches its gate nothing: {instead}")
+            raise InputError(f"with sharpening.steps 0 a host teaches its gate nothing: {INSTEAD}")
         if getattr(pipeline, "world_size", 1) > 1:
-            raise InputError(f"a host that teaches its own gate trains in one process: {instead}")
+            raise InputError(f"a host that teaches its own gate trains in one process: {INSTEAD}")
         self.host, self.guide, self.config, self.run = host, guide, config, run
         self.manager = pipeline.datamanager
-        self.data = LearningData(self.manager, config.bounds, config.near, config.far)
         self.steps, self.began, self.spent = 0, time.monotonic(), 0.0
 
     def begin(self) -> None:
         """Guides the host by bounds alone, where it has no occupancy yet."""
         if self.guide.occupancy is None:
-            self.guide.set_occupancy(open_occupancy(self.data, self.config.sharpening))
+            config = self.config
+            data = LearningData(self.manager, config.bounds, config.near, config.far)
+            self.guide.set_occupancy(open_occupancy(data, config.sharpening))
             say("the host begins within the scene's bounds and teaches its gate while it trains")
 
     def after_step(self, step: int) -> None:
@@ -156,17 +155,18 @@ class Along:
     def _teach(self, step: int) -> None:
         """Teaches and calibrates a gate; follows it where it skips more."""
         config, before, started = self.config, self.guide.the_occupancy(), time.monotonic()
-        precision = before.precision
         with torch.random.fork_rng(devices=[]):  # batches are those of a run that teaches nothing
             torch.manual_seed(step)
-            taught = self._hear(self._training_bundles(config.sharpening.rays))
+            taught = self._hear(training_bundles(self.manager, config.sharpening.rays))
             bundle, truth = held_out_bundle(self.manager, HELD_OUT_RAYS, step, "calibration")
             held_out = self._hear([bundle])
             gate = teach(
                 config.sharpening.gate,
-                taught.lesson(config.gate_loss),
+                lesson_of(
+                    taught.mapped, taught.weights, taught.intervals.ray_indices, config.gate_loss
+                ),
                 config.sharpening.steps,
-                precision,
+                before.precision,
                 seed=step,
             )
             round_weights(gate)
@@ -178,32 +178,15 @@ class Along:
             note(f"{what} skips no more within its bounds than the {skipped:.1%} that are skipped")
             return
         say(f"{what} {found.line}, where {skipped:.1%} were skipped")
-        report = {**before.report, **found._asdict(), "step": step, "learned": "along"}
-        for name in LOSSES:
-            report[name] = max(0.0, report[name]) + float(before.report.get(name, 0.0))
-        for name in ERRORS:
-            report[name] = math.hypot(report[name], float(before.report.get(name, 0.0)))
+        costs = found._asdict() | added_costs(found._asdict(), before.report)
+        report = {**before.report, **costs, "step": step, "learned": "along"}
         report |= {"params": sum(p.numel() for p in gate.parameters())}
         report |= {"train_seconds": round(self.spent + seconds, 2), "calibration_rays": len(truth)}
-        made = self._with_gate(gate, found.threshold, report)
+        made = before.with_gate(gate, found.threshold, report)
         self.guide.set_occupancy(made)
         self.guide.watched.evidence = {}
         if self.run.folder is not None:
             leave_file(made, self.run.folder)
-
-    def _with_gate(self, gate: Gate, threshold: float, report: dict[str, Any]) -> Occupancy:
-        """The present occupancy with another gate."""
-        now = self.guide.the_occupancy()
-        made = Occupancy(gate, now.space, threshold, now.precision, report, now.walls, now.seen)
-        return made.to(now.walls.device).eval()
-
-    def _training_bundles(self, count: int) -> Iterator[Any]:
-        """Batches of training rays, as many as are wanted."""
-        drawn = 0
-        while drawn < count:
-            bundle, _ = self.manager.next_train(0)
-            drawn += len(bundle)
-            yield bundle
 
     def _hear(self, bundles: Any) -> Heard:
         """The host's weights along rays, rendered as it renders in training."""
@@ -223,15 +206,20 @@ class Along:
             first[-1],
         )
 
+    @cached_property
+    def _bounds(self) -> LearnedOccupancyEstimator:
+        """Keeps all candidates within the bounds, which stay as they are."""
+        bounds = bounds_of(self.guide.the_occupancy())
+        return LearnedOccupancyEstimator(bounds).to(self.guide.frame.device)
+
     @contextmanager
     def _listening(self, heard: list[Heard]) -> Iterator[None]:
         """Meanwhile what the host's field says along rays is noted."""
-        guide, occupancy = self.guide, self.guide.the_occupancy()
-        every = LearnedOccupancyEstimator(bounds_of(occupancy)).to(guide.frame.device)
+        guide, occupancy, bounds = self.guide, self.guide.the_occupancy(), self._bounds
 
         def hear(rays_o: Tensor, rays_d: Tensor, options: dict[str, Any]) -> Any:
             limits = {"early_stop_eps": 0.0, "alpha_thre": 0.0}
-            samples = every.sampling(rays_o, rays_d, **{**options, **limits})
+            samples = bounds.sampling(rays_o, rays_d, **{**options, **limits})
             one = _heard_of(occupancy, samples, rays_o, rays_d, options)
             heard.append(one)
             of_rays, starts, ends = (part[one.kept] for part in samples)
@@ -255,7 +243,7 @@ class Along:
         """The largest threshold within the bounds, and what it costs; None where none is."""
         config: CalibrationConfig = self.config.calibration
         before = self.guide.the_occupancy()
-        asked = self._with_gate(gate, THRESHOLDS[0], {})
+        asked = before.with_gate(gate, THRESHOLDS[0], {})
         with torch.no_grad():
             reference = heard.reference(asked.of_mapped(heard.mapped))
         nothing = [truth.new_zeros(heard.rays, 3)]
@@ -269,7 +257,7 @@ class Along:
                     number += 1
                     continue
                 self.guide.set_occupancy(asked.with_threshold(threshold))
-                price, error = price_of(self._errors(bundle, truth), errors)
+                price, error = image_price(self._errors(bundle, truth), errors, NO_ERROR)
                 found = found._replace(image_price_db=price, price_error_db=error)
                 if found.within(config):
                     return found
@@ -281,22 +269,9 @@ class Along:
     @torch.no_grad()
     def _errors(self, bundle: Any, truth: Tensor) -> Tensor:
         """Squared error of rendered rays: [R]."""
-        was_training = self.host.training
-        self.host.eval()
-        try:
-            rgb = self.host(bundle.to(self.host.device))["rgb"][:, :3].float()
-        finally:
-            self.host.train(was_training)
-        return ((rgb - true_colours(self.host, truth.to(rgb))) ** 2).sum(dim=-1)
-
-
-def price_of(gated: Tensor, dense: Tensor) -> tuple[float, float]:
-    """By how many dB squared errors [R] are worse than others of the same rays, and its standard
-    error."""
-    after, before = float(gated.sum()) + 1e-12, float(dense.sum()) + 1e-12
-    apart = (gated / after - dense / before).double()
-    decibel = 10.0 / math.log(10.0)
-    return decibel * math.log(after / before), decibel * float(apart.square().sum().sqrt())
+        device = self.host.device
+        with evaluating(self.host):
+            return squared_errors(self.host, bundle.to(device), truth.to(device).float())
 
 
 def _heard_of(
@@ -308,10 +283,7 @@ def _heard_of(
     kept = occupancy.occupied(middles)
     density = options.get("sigma_fn")
     if density is None:
-        raise InputError(
-            "this host asks for no densities along rays to teach with: leave "
-            "--pipeline.model.occupancy.learned at first"
-        )
+        raise InputError(NO_DENSITIES)
     asked = [part[kept] for part in (starts, ends, of_rays)]
     weights = torch.zeros_like(starts)
     rays = len(rays_o)

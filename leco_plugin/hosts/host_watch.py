@@ -93,9 +93,9 @@ class HostWatch:
         kept = guide.kept
         try:
             with evaluating(host):
-                gated = self._errors(bundle, truth)
+                gated = squared_errors(host, bundle, truth)
                 guide.dense = True
-                dense = self._errors(bundle, truth)
+                dense = squared_errors(host, bundle, truth)
         finally:
             guide.dense, guide.kept = False, kept
         excess = gated - 10.0 ** (0.1 * config.image_price_db) * dense
@@ -104,11 +104,6 @@ class HostWatch:
     def count_rays(self, limit: int) -> float:
         """See `price_watch.PriceSource`."""
         return count_held_out(self.pipeline.datamanager, limit)
-
-    def _errors(self, bundle: Any, truth: Tensor) -> Tensor:
-        """Squared error of rendered rays: [R]."""
-        rgb = self.host(bundle)["rgb"][:, :3].float()
-        return ((rgb - true_colours(self.host, truth)) ** 2).sum(dim=-1)
 
     def _lower(self, step: int, threshold: float, why: str) -> None:
         occupancy = self.guide.the_occupancy()
@@ -125,6 +120,12 @@ class HostWatch:
         say(f"step {step}: {why}; the threshold is {now if threshold > 0.0 else nothing}")
         if self.run.folder is not None:
             leave_file(occupancy, self.run.folder)
+
+
+def squared_errors(host: Any, bundle: Any, truth: Tensor) -> Tensor:
+    """Squared error [R] of rays that a host renders, on its device."""
+    rgb = host(bundle)["rgb"][:, :3].float()
+    return ((rgb - true_colours(host, truth)) ** 2).sum(dim=-1)
 
 
 def _lowered(report: dict[str, Any], before: float, step: int, threshold: float) -> dict[str, Any]:

@@ -231,11 +231,9 @@ def measure(
     lost_surface = float(rays.lost_surface.sum()) / surface
     price = price_error = float("nan")
     if with_image and len(rays.weight):
-        dense, gated = (float(e.sum()) for e in (rays.dense_error, rays.gated_error))
-        floor = EXACT * sum(truth.numel() for truth in truths)
-        price = price_db(gated, dense, floor)
-        apart = rays.gated_error / (gated + floor) - rays.dense_error / (dense + floor)
-        price_error = 10.0 / math.log(10.0) * float(apart.square().sum().sqrt())
+        price, price_error = image_price(
+            rays.gated_error, rays.dense_error, EXACT * sum(truth.numel() for truth in truths)
+        )
     return Measured(
         threshold,
         lost_surface,
@@ -263,6 +261,20 @@ def backdrop_price(
         without += float((rgb - truth).square().sum(dtype=torch.float64))
         floor += EXACT * truth.numel()
     return price_db(without, dense, floor) if floor else 0.0
+
+
+def image_price(gated: Tensor, dense: Tensor, floor: float) -> tuple[float, float]:
+    """By how many dB of PSNR an image is worse than the dense one, and the standard error of that.
+
+    Args:
+        gated, dense: [R] squared errors of the same rays.
+        floor: sum of them that is as good as none.
+    """
+    gated, dense = gated.double(), dense.double()
+    after, before = float(gated.sum()), float(dense.sum())
+    apart = gated / (after + floor) - dense / (before + floor)
+    error = 10.0 / math.log(10.0) * float(apart.square().sum().sqrt())
+    return price_db(after, before, floor), error
 
 
 def price_db(error: float, of_dense: float, floor: float) -> float:

@@ -100,8 +100,7 @@ class Learner:
         if not bool(mixture.region.known):
             found = self.data.survey
             mixture.set_bounds(found.bounds, found.median_length)
-            mixture.region.look(*self.data.covering_rays())
-            mixture.region.see(*self.data.rays_of_all_images())
+            self.data.note_views(mixture.region)
             summarize(found.summary(), found.lines())
             say_all(self.data.doubts())
             self.data.say_what_is_fixed()

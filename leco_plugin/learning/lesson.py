@@ -12,6 +12,8 @@ from torch.nn.functional import softplus
 
 from leco_plugin.learning.schedule import RATES
 from leco_plugin.models.gate import Gate, GateConfig, occupancy_logit
+from leco_plugin.models.losses import widen
+from leco_plugin.models.objective import GateLossConfig
 from leco_plugin.occupancy import Precision, gate_precision
 
 BATCH = 1 << 14
@@ -28,6 +30,20 @@ class Lesson(NamedTuple):
     """[M] weight of -log o(x)."""
     skip: Tensor
     """[M] weight of -log(1 - o(x))."""
+
+
+def lesson_of(mapped: Tensor, weights: Tensor, of_rays: Tensor, losses: GateLossConfig) -> Lesson:
+    """The targets of the contribution loss at samples along rays.
+
+    Args:
+        mapped: [M, 3] in [-1, 1], in the order of rays, then distance.
+        weights: [M] rendering weights.
+        of_rays: [M] int64, the ray of each.
+        losses: w_0 and k of the loss.
+    """
+    wide = widen(weights, of_rays[1:] == of_rays[:-1])
+    target = (wide / losses.weight_at_full).clamp(max=1.0)
+    return Lesson(mapped, losses.emphasis * target, 1.0 - target)
 
 
 def teach(

@@ -29,10 +29,9 @@ from leco_plugin.learning.dense import (
     in_chunks,
     reference_of,
 )
-from leco_plugin.learning.lesson import Lesson, round_weights, teach
+from leco_plugin.learning.lesson import Lesson, lesson_of, round_weights, teach
 from leco_plugin.models.encodings import EncodingConfig
 from leco_plugin.models.gate import Gate, GateConfig
-from leco_plugin.models.losses import widen
 from leco_plugin.models.mixture import Mixture
 from leco_plugin.models.objective import GateLossConfig
 from leco_plugin.models.rendering import Intervals, Rays, Shaded, backdrop_of, mapped_middles
@@ -71,6 +70,15 @@ class SharpeningConfig:
         require(0.0 <= self.seen <= 1.0, "sharpening.seen", self.seen, "from 0 to 1")
 
 
+def added_costs(found: dict[str, Any], before: dict[str, Any]) -> dict[str, float]:
+    """What skipping costs on top of what earlier skipping has cost, and standard errors."""
+    costs = {
+        name: max(0.0, found[name]) + max(0.0, float(before.get(name, 0.0))) for name in LOSSES
+    }
+    errors = {name: math.hypot(found[name], float(before.get(name, 0.0))) for name in ERRORS}
+    return costs | errors
+
+
 class Sharpened(NamedTuple):
     """A small gate, and what it does on held-out rays."""
 
@@ -107,10 +115,7 @@ class Sharpened(NamedTuple):
         """
         found = self.measured._asdict()
         if guided:
-            for name in LOSSES:
-                found[name] = max(0.0, found[name]) + max(0.0, float(before[name]))
-            for name in ERRORS:
-                found[name] = math.hypot(found[name], float(before.get(name, 0.0)))
+            found |= added_costs(found, before)
         if self.promised is not None:
             found[CAMERAS_THAT_VOUCH] = dict(self.promised)
             if guided and (earlier := before.get(CAMERAS_THAT_VOUCH)) is not None:
@@ -177,16 +182,13 @@ def lesson_by(
         losses: w_0 and k of the loss.
         seen: share of the threshold from which a candidate is rendered; 0 renders all.
     """
-    positions, targets = [], []
+    lessons = []
     for chunk in in_chunks(rays, rays_at_once):
         reference, mapped = _rendered(mixture, chunk, seen)
         before = ~reference.always_kept
-        rays_of = reference.intervals.ray_indices[before]
-        wide = widen(reference.weights[before], rays_of[1:] == rays_of[:-1])
-        positions.append(mapped[before])
-        targets.append((wide / losses.weight_at_full).clamp(max=1.0))
-    target = torch.cat(targets)
-    return Lesson(torch.cat(positions), losses.emphasis * target, 1.0 - target)
+        of_rays = reference.intervals.ray_indices[before]
+        lessons.append(lesson_of(mapped[before], reference.weights[before], of_rays, losses))
+    return Lesson(*(torch.cat(parts) for parts in zip(*lessons)))
 
 
 def seen_rendering(

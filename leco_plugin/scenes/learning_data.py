@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 from functools import cached_property
 from typing import Any
 
@@ -12,7 +13,7 @@ from torch import Tensor
 
 from leco_plugin.log import say
 from leco_plugin.models.mixture import Mixture
-from leco_plugin.models.region import SIDE
+from leco_plugin.models.region import SIDE, Region
 from leco_plugin.models.rendering import Rays
 from leco_plugin.scenes.bounds import BoundsConfig
 from leco_plugin.scenes.frames import data_frame_of, frame_of
@@ -65,6 +66,11 @@ class LearningData:
         """Origins and unit directions [N, 3] of rays that cover the training images."""
         rays = covering_rays(self.manager.train_dataset.cameras, SIDE)
         return rays[0].reshape(-1, 3), rays[1].reshape(-1, 3)
+
+    def note_views(self, region: Region) -> None:
+        """Tells a region what the training images see of it."""
+        region.look(*self.covering_rays())
+        region.see(*self.rays_of_all_images())
 
     def rays_of_all_images(self) -> tuple[Tensor, Tensor]:
         """As `covering_rays`, fewer of an image where there are many, but of each."""
@@ -151,8 +157,7 @@ class LearningData:
         `set_aside` as of `prepare_batch`, and for this draw only."""
         self.prepare_batch(1.0, distances=False, set_aside=set_aside)
         drawn: list[Rays] = []
-        while sum(len(rays.origins) for rays in drawn) < count:
-            bundle, _ = self.manager.next_train(0)
+        for bundle in training_bundles(self.manager, count):
             bundle = bundle.to(mixture.device)
             images = bundle.camera_indices[:, 0]
             drawn.append(mixture.rays(bundle.origins, bundle.directions, images))
@@ -188,6 +193,15 @@ class LearningData:
             "frame": frame_of(self.manager),
             "data_frame": data_frame_of(self.manager),
         }
+
+
+def training_bundles(manager: Any, count: int) -> Iterator[Any]:
+    """The rays of training batches, at least so many."""
+    drawn = 0
+    while drawn < count:
+        bundle, _ = manager.next_train(0)
+        drawn += len(bundle)
+        yield bundle
 
 
 def held_out_bundle(

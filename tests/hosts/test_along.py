@@ -13,8 +13,9 @@ from tiny_scene import BALL_CENTRE, BALL_RADIUS
 from torch import Tensor, nn
 
 from leco_plugin.hosts import along
-from leco_plugin.hosts.along import OPEN, Along, bounds_of, price_of
+from leco_plugin.hosts.along import OPEN, Along, bounds_of
 from leco_plugin.hosts.guide import Guide
+from leco_plugin.learning.calibration import image_price
 from leco_plugin.learning.run import LearningOnly
 from leco_plugin.learning.sharpening import SharpeningConfig
 from leco_plugin.models.encodings import EncodingConfig
@@ -157,9 +158,9 @@ def test_who_cannot_teach_is_told_what_to_do(made: Any, why: str) -> None:
 
 def test_a_price_is_that_of_the_same_rays() -> None:
     dense = torch.rand(4000) + 0.1
-    price, error = price_of(1.01 * dense, dense)
+    price, error = image_price(1.01 * dense, dense, 0.0)
     assert price == pytest.approx(0.0432, abs=1e-4) and error == pytest.approx(0.0, abs=1e-4)
-    noisy, error = price_of(dense[torch.randperm(4000)], dense)
+    noisy, error = image_price(dense[torch.randperm(4000)], dense, 0.0)
     assert abs(noisy) < 1e-4 < error
 
 

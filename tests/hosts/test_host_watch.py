@@ -16,7 +16,7 @@ from leco_plugin.hosts import first_steps, host_watch
 from leco_plugin.hosts.classes import GuidedHost
 from leco_plugin.hosts.first_steps import CAREFUL, begin_carefully
 from leco_plugin.hosts.guide import Guide
-from leco_plugin.hosts.host_watch import LOWERED_TO, HostWatch
+from leco_plugin.hosts.host_watch import LOWERED_TO, HostWatch, squared_errors
 from leco_plugin.hosts.stand_ins import GuidedEstimator
 from leco_plugin.learning import price_watch
 from leco_plugin.learning.calibration import THRESHOLDS, CalibrationConfig
@@ -132,7 +132,7 @@ def test_photographs_with_alpha_are_compared_as_the_host_renders_them(watched: W
     truth = torch.cat([1.0 - alpha.expand(-1, 3), alpha], dim=-1)
     host = watched.host
     host.__class__ = type("Black", (Host,), {"__call__": lambda self, _: {"rgb": seen}})
-    assert not watched.watch._errors(None, truth).any()
+    assert not squared_errors(host, None, truth).any()
 
 
 @pytest.mark.parametrize("price", [0.0, 0.05])
