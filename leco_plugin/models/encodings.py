@@ -1,4 +1,4 @@
-"""Encodings gamma(x) of mapped positions, in plain torch, for the gate and for the field."""
+"""Encodings gamma(x) of mapped positions, for the gate and for the field."""
 
 from __future__ import annotations
 
@@ -8,6 +8,8 @@ from typing import Any, Literal, Protocol
 
 import torch
 from torch import Tensor, nn
+
+from leco_plugin.models.compute.native import has_native, hash_gradients, hash_sums, suits
 
 Kind = Literal["frequency", "hash", "vm", "k-planes"]
 
@@ -143,6 +145,21 @@ class _InterpolateTable(torch.autograd.Function):
         )
 
 
+class _NativeSums(torch.autograd.Function):
+    """The same by `native.c`, an eighth of the time, from positions [N, 3] in [0, 1]."""
+
+    @staticmethod
+    def forward(ctx: Any, unit: Tensor, resolutions: Tensor, table: Tensor) -> Tensor:
+        ctx.save_for_backward(unit, resolutions)
+        ctx.rows = len(table)
+        return hash_sums(unit, resolutions, table, corners=4)
+
+    @staticmethod
+    def backward(ctx: Any, gradient: Tensor) -> tuple[None, None, Tensor]:  # type: ignore[override]
+        unit, resolutions = ctx.saved_tensors
+        return None, None, hash_gradients(unit, resolutions, gradient, ctx.rows, corners=4)
+
+
 class HashEncoding(nn.Module):
     """Multi-resolution hash grid (Instant-NGP, eq. 3 and 4). Positions receive no gradient.
 
@@ -205,6 +222,10 @@ class HashEncoding(nn.Module):
 
     def forward(self, mapped: Tensor) -> Tensor:
         """[N, 3] in [-1, 1] to [N, levels * features] float32."""
+        if suits(mapped, self.table) and has_native():
+            unit = mapped.detach() * 0.5 + 0.5
+            features: Tensor = _NativeSums.apply(unit, self.resolutions, self.table)
+            return features
         rows, weights = self.rows_and_weights(mapped)
         with torch.autocast(mapped.device.type, enabled=False):
             return _InterpolateTable.apply(rows, weights, self.table).view(

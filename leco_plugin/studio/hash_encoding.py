@@ -1,10 +1,11 @@
 """nerfstudio's hash encoding on a CPU: the same function of the same table, in fewer passes.
 
 Where tiny-cuda-nn is not installed, nerfstudio computes its hash grids in plain torch, point by
-point through all levels; that is most of a CPU's training step. Here the levels follow one another,
-so that the part of the table that is looked up fits a cache, corners are hashed in int32 and
-summed by one call, and the table's gradient is a histogram. Names of parameters, their values, and
-what comes out stay as they are, up to the order of sums.
+point through all levels; that is most of a CPU's training step. Here `native.c` computes them where there
+is a C compiler. Elsewhere the levels follow one another, so that the part of the table that is
+looked up fits a cache, corners are hashed in int32 and summed by one call, and the table's gradient
+is a histogram. Names of parameters, their values, and what comes out stay as they are, up to the
+order of sums.
 """
 
 from __future__ import annotations
@@ -16,6 +17,7 @@ import torch
 from nerfstudio.field_components.encodings import HashEncoding
 from torch import Tensor
 
+from leco_plugin.models.compute.native import has_native, hash_gradients, hash_sums
 from leco_plugin.models.encodings import PRIMES, sum_by_row
 
 if TYPE_CHECKING:
@@ -65,8 +67,11 @@ class _Interpolated(torch.autograd.Function):
 
     @staticmethod
     def forward(ctx: Any, positions: Tensor, table: Tensor, encoding: CpuHashEncoding) -> Tensor:
-        rows, weights = _rows_and_weights(positions, encoding)
         ctx.encoding = encoding
+        if has_native():
+            ctx.save_for_backward(positions, table)
+            return hash_sums(positions, encoding.scalings, table, corners=8)
+        rows, weights = _rows_and_weights(positions, encoding)
         ctx.save_for_backward(positions, table, rows, weights)
         summed = torch.nn.functional.embedding_bag(
             rows, table, per_sample_weights=weights, mode="sum"
@@ -77,15 +82,21 @@ class _Interpolated(torch.autograd.Function):
     def backward(  # type: ignore[override]
         ctx: Any, gradient: Tensor
     ) -> tuple[Tensor | None, Tensor | None, None]:
-        positions, table, rows, weights = ctx.saved_tensors
+        positions, table, *looked_up = ctx.saved_tensors
         if torch.is_grad_enabled():  # somebody wants to differentiate the gradient
             encoded = ctx.encoding.by_nerfstudio(positions)
             return _gradients(encoded, positions, table, gradient)
-        by_level = _by_level(gradient, ctx.encoding)
         of_positions = of_table = None
+        if not looked_up and ctx.needs_input_grad[1]:
+            scalings = ctx.encoding.scalings
+            of_table = hash_gradients(positions, scalings, gradient, len(table), corners=8)
+            if not ctx.needs_input_grad[0]:
+                return None, of_table, None
+        rows, weights = looked_up or _rows_and_weights(positions, ctx.encoding)
+        by_level = _by_level(gradient, ctx.encoding)
         if ctx.needs_input_grad[0]:
             of_positions = _of_positions(positions, table, rows, by_level, ctx.encoding.scalings)
-        if ctx.needs_input_grad[1]:
+        if ctx.needs_input_grad[1] and of_table is None:
             of_table = sum_by_row(rows, weights, by_level, len(table))
         return of_positions, of_table, None
 

@@ -33,7 +33,9 @@ def test_none_is_off_by_itself(monkeypatch) -> None:
 
 def test_an_unknown_name_is_refused_with_those_that_there_are(monkeypatch) -> None:
     monkeypatch.setenv(VARIABLE, "gates")
-    with pytest.raises(ValueError, match="names gates; it takes experts, gate, march, or all"):
+    with pytest.raises(
+        ValueError, match="names gates; it takes experts, gate, march, native, or all"
+    ):
         kernels_off()
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import copy
 import pickle
 import time
+from typing import Any
 from unittest.mock import patch
 
 import pytest
@@ -19,6 +20,8 @@ from torch import Tensor, nn
 from leco_plugin.hosts.classes import Host, set_up_host
 from leco_plugin.hosts.guided import GuidedModelConfig
 from leco_plugin.hosts.guided_start import OWN_SAMPLER, OccupancyConfig
+from leco_plugin.models.compute.native import has_native
+from leco_plugin.samplers.kernels import VARIABLE
 from leco_plugin.studio import hash_encoding
 from leco_plugin.studio.hash_encoding import CpuHashEncoding, speed_up_hash_encodings
 
@@ -51,6 +54,16 @@ def points(shape: tuple[int, ...], seed: int = 0) -> Tensor:
     return 0.001 + 0.998 * torch.rand(*shape, 3, generator=torch.Generator().manual_seed(seed))
 
 
+@pytest.fixture(autouse=True, params=["native", "torch"])
+def by(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> str:
+    """Everything holds of the routines in C and of torch."""
+    if request.param == "torch":
+        monkeypatch.setenv(VARIABLE, "native")
+    elif not has_native():
+        pytest.skip("no C compiler")
+    return str(request.param)
+
+
 @pytest.mark.parametrize("sizes", SIZES)
 @pytest.mark.parametrize("shape", [(200,), (5, 7), (0,), ()])
 def test_it_is_nerfstudios_function_with_its_slopes(sizes: Sizes, shape: tuple[int, ...]) -> None:
@@ -69,14 +82,15 @@ def test_corners_sides_and_places_outside_are_looked_up_as_nerfstudio_does() -> 
     torch.testing.assert_close(fast(positions), twin(positions))
 
 
-def test_many_points_are_taken_in_parts(monkeypatch: pytest.MonkeyPatch) -> None:
-    own, taken = hash_encoding._rows_and_weights, []
+def test_many_points_are_taken_in_parts(by: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    name = "hash_sums" if by == "native" else "_rows_and_weights"
+    own, taken = getattr(hash_encoding, name), []
 
-    def counted(positions: Tensor, encoding: HashEncoding) -> tuple[Tensor, Tensor]:
+    def counted(positions: Tensor, *rest: Any, **named: Any) -> Any:
         taken.append(len(positions))
-        return own(positions, encoding)
+        return own(positions, *rest, **named)
 
-    monkeypatch.setattr(hash_encoding, "_rows_and_weights", counted)
+    monkeypatch.setattr(hash_encoding, name, counted)
     monkeypatch.setattr(hash_encoding, "POINTS_AT_ONCE", 16)
     twin, fast = pair_of(SIZES[0])
     positions, worth = points((4, 10)), torch.randn(4, 10, twin.get_out_dim())

@@ -1,4 +1,4 @@
-"""Fused kernels for CUDA: which are on, and (`fused`) when one replaces its torch twin.
+"""Fused kernels: which are on, and (`fused`) when one for CUDA replaces its torch twin.
 
 Modules named `*_kernel` import Triton and are imported by `fused` alone.
 """
@@ -10,8 +10,8 @@ import os
 VARIABLE = "LECO_KERNELS_OFF"
 """The environment variable that turns kernels off, for a comparison or on a suspicion. Unlike an
 option it reaches every process that a command starts, and loops that know no options of ours."""
-NAMES = frozenset({"gate", "march", "experts"})
-"""What it may name. The march holds the gate, and is off with it."""
+NAMES = frozenset({"gate", "march", "experts", "native"})
+"""What it may name. The march holds the gate, and is off with it; `native` is C on a CPU."""
 
 
 def kernels_off() -> frozenset[str]:
