@@ -9,7 +9,7 @@ from typing import Any, Literal, Protocol
 import torch
 from torch import Tensor, nn
 
-from leco_plugin.models.compute.native import has_native, hash_gradients, hash_sums, suits
+from leco_plugin.models.compute.native import hash_gradients, hash_sums, suits
 
 Kind = Literal["frequency", "hash", "vm", "k-planes"]
 
@@ -146,7 +146,7 @@ class _InterpolateTable(torch.autograd.Function):
 
 
 class _NativeSums(torch.autograd.Function):
-    """The same by `native.c`, an eighth of the time, from positions [N, 3] in [0, 1]."""
+    """The same by `hash_grids.c`, an eighth of the time, from positions [N, 3] in [0, 1]."""
 
     @staticmethod
     def forward(ctx: Any, unit: Tensor, resolutions: Tensor, table: Tensor) -> Tensor:
@@ -222,7 +222,7 @@ class HashEncoding(nn.Module):
 
     def forward(self, mapped: Tensor) -> Tensor:
         """[N, 3] in [-1, 1] to [N, levels * features] float32."""
-        if suits(mapped, self.table) and has_native():
+        if suits(mapped, self.table):
             unit = mapped.detach() * 0.5 + 0.5
             features: Tensor = _NativeSums.apply(unit, self.resolutions, self.table)
             return features

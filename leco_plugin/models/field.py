@@ -8,6 +8,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
+from leco_plugin.models.compute import native
 from leco_plugin.models.compute.dispatch import pad_to_steady_size
 from leco_plugin.models.encodings import EncodingConfig, FrequencyEncoding, build_encoding
 from leco_plugin.models.hmoe import HMoE, HMoEConfig
@@ -150,13 +151,37 @@ class HMoEField(nn.Module):
         Returns:
             sigmas [N] float32, per half extent of the scene; features [N, width].
         """
+        if native.answers_without_graph(mapped, self.projection.weight) and self._suits_native():
+            hidden, raw = self._native_densities(mapped, routes, gate_values)
+            return self._sigmas(raw, routes), hidden
         count = len(mapped)
         projected = self.projection(self.encoding(pad_to_steady_size(mapped)))
         hidden = self.experts(
             projected, pad_to_steady_size(routes), pad_to_steady_size(gate_values)
         )
         raw = self.density_head(hidden)[:count, 0].float()
-        sigmas = _TruncatedExponential.apply(raw - 1.0)
-        if self.config.experts.empty_expert == "none":
-            sigmas = sigmas * (routes > 0)
-        return sigmas, hidden[:count]
+        return self._sigmas(raw, routes), hidden[:count]
+
+    def _sigmas(self, raw: Tensor, routes: Tensor) -> Tensor:
+        sigmas: Tensor = _TruncatedExponential.apply(raw - 1.0)
+        return sigmas * (routes > 0) if self.config.experts.empty_expert == "none" else sigmas
+
+    def _suits_native(self) -> bool:
+        """Whether `networks.c` knows the experts: residual, without a skip, beside the identity."""
+        experts = self.config.experts
+        plain = experts.residual and experts.skip is None and experts.empty_expert == "identity"
+        return plain and max(experts.width, self.encoding.out_dim) <= native.WIDEST
+
+    def _native_densities(
+        self, mapped: Tensor, routes: Tensor, gate_values: Tensor
+    ) -> tuple[Tensor, Tensor]:
+        layers = self.config.experts.layers
+        parts: list[Tensor | None] = [
+            *self.projection.parameters(),
+            *self.density_head.parameters(),
+        ]
+        for expert in self.experts.experts:
+            own = [] if expert is None else list(expert.parameters())
+            parts += own or [None] * (2 * layers)
+        features = self.encoding(mapped)
+        return native.field_densities(features, routes, gate_values.float(), parts, layers)

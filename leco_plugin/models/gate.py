@@ -13,8 +13,15 @@ from typing import get_args
 import torch
 from torch import Tensor, nn
 
+from leco_plugin.models.compute import native
 from leco_plugin.models.compute.dispatch import pad_to_steady_size
-from leco_plugin.models.encodings import EncodingConfig, Kind, build_encoding
+from leco_plugin.models.encodings import (
+    FRESH,
+    EncodingConfig,
+    FrequencyEncoding,
+    Kind,
+    build_encoding,
+)
 
 EMPTY = 0
 """Index of the empty-space expert in logits, probabilities and routes."""
@@ -117,10 +124,23 @@ class Gate(nn.Module):
 
     def forward(self, mapped: Tensor) -> Tensor:
         """Mapped positions [N, 3] in [-1, 1] to logits [N, 1 + n] float32; 0 is emptiness."""
+        if self._answers_natively(mapped):
+            return self._native_logits(mapped)
         features = self.encoding(pad_to_steady_size(mapped))
         for layer in self.hidden:
             features = torch.relu(layer(features))
         return logits_of(features, self.norm, self.head)[: len(mapped)]
+
+    def _answers_natively(self, mapped: Tensor) -> bool:
+        widest = max(self.encoding.out_dim, self.config.width, 1 + self.config.scene_experts)
+        known = isinstance(self.encoding, FrequencyEncoding) and widest <= native.WIDEST
+        return known and native.answers_without_graph(mapped, self.head.weight)
+
+    def _native_logits(self, mapped: Tensor) -> Tensor:
+        parts = [part for layer in self.hidden for part in layer.parameters()]
+        parts += [*self.norm.parameters(), *self.head.parameters()]
+        scales: Tensor = self.encoding.scales  # type: ignore[union-attr, assignment]
+        return native.gate_logits(mapped, scales, FRESH[torch.float32], parts, self.norm.eps)
 
     def occupancy(self, mapped: Tensor) -> Tensor:
         """o(x) = 1 - G_0(x): mapped positions [N, 3] to [N] float32 in [0, 1]."""

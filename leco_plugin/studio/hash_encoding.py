@@ -1,11 +1,11 @@
 """nerfstudio's hash encoding on a CPU: the same function of the same table, in fewer passes.
 
 Where tiny-cuda-nn is not installed, nerfstudio computes its hash grids in plain torch, point by
-point through all levels; that is most of a CPU's training step. Here `native.c` computes them where there
-is a C compiler. Elsewhere the levels follow one another, so that the part of the table that is
-looked up fits a cache, corners are hashed in int32 and summed by one call, and the table's gradient
-is a histogram. Names of parameters, their values, and what comes out stay as they are, up to the
-order of sums.
+point through all levels; that is most of a CPU's training step. Here `hash_grids.c` computes them
+where there is a C compiler. Elsewhere the levels follow one another, so that the part of the table
+that is looked up fits a cache, corners are hashed in int32 and summed by one call, and the table's
+gradient is a histogram. Names of parameters, their values, and what comes out stay as they are, up
+to the order of sums.
 """
 
 from __future__ import annotations

@@ -9,7 +9,11 @@ import torch
 from torch import Tensor
 
 from leco_plugin.models.compute import native
-from leco_plugin.models.encodings import HashEncoding
+from leco_plugin.models.encodings import EncodingConfig, HashEncoding
+from leco_plugin.models.field import FieldConfig, HMoEField
+from leco_plugin.models.frozen_gate import occupancy_of
+from leco_plugin.models.gate import Gate, GateConfig
+from leco_plugin.models.hmoe import HMoEConfig
 from leco_plugin.samplers.kernels import VARIABLE
 
 needs_compiler = pytest.mark.skipif(not native.has_native(), reason="no C compiler")
@@ -37,6 +41,61 @@ def test_a_hash_grid_is_that_of_torch(
     theirs = features_and_gradient(encoding, positions)
     torch.testing.assert_close(ours[0], theirs[0], rtol=1e-6, atol=1e-10)
     torch.testing.assert_close(ours[1], theirs[1], rtol=1e-4, atol=1e-5)
+
+
+@needs_compiler
+@pytest.mark.parametrize(("width", "layers", "octaves"), [(64, 3, 6), (17, 1, 9)])
+@pytest.mark.parametrize("normed", [True, False])
+def test_a_gate_answers_as_torch_does(
+    width: int, layers: int, octaves: int, normed: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    torch.manual_seed(0)
+    encoding = EncodingConfig(octaves=octaves)
+    gate = Gate(GateConfig(encoding, width, layers, scene_experts=3, normed=normed))
+    gate.norm.bias.data.normal_()
+    mapped = (torch.rand(3, 157) * 2 - 1).t()  # the strides of the march
+    with torch.no_grad():
+        ours, occupancy = gate(mapped), occupancy_of(gate, mapped, torch.float32)
+        assert gate(mapped[:0]).shape == (0, 4)
+        monkeypatch.setenv(VARIABLE, "native")
+        theirs = gate(mapped)
+        torch.testing.assert_close(occupancy, gate.occupancy(mapped), rtol=1e-4, atol=1e-5)
+    torch.testing.assert_close(ours, theirs, rtol=1e-4, atol=1e-4)
+
+
+@needs_compiler
+def test_sines_of_large_angles_are_those_of_torch(monkeypatch: pytest.MonkeyPatch) -> None:
+    encoding = EncodingConfig(octaves=10)
+    gate = Gate(GateConfig(encoding, width=63, layers=1, scene_experts=62))
+    gate.hidden[0].weight.data.copy_(torch.eye(63))
+    gate.hidden[0].bias.data.fill_(2.0)  # no feature is cut off
+    gate.head.weight.data.copy_(torch.eye(63))
+    gate.norm.eps = 0.0
+    mapped = torch.rand(500, 3) * 2 - 1
+    with torch.no_grad():
+        ours = gate(mapped)
+        monkeypatch.setenv(VARIABLE, "native")
+        torch.testing.assert_close(ours, gate(mapped), rtol=0, atol=3e-4)
+
+
+@needs_compiler
+def test_a_field_answers_as_torch_does(monkeypatch: pytest.MonkeyPatch) -> None:
+    torch.manual_seed(0)
+    hash_grid = EncodingConfig("hash", levels=3, log2_table=6, coarsest=4, finest=20)
+    field = HMoEField(FieldConfig(hash_grid, HMoEConfig(scene_experts=3, width=18, layers=3)), 1)
+    for parameter in field.parameters():
+        parameter.data.normal_(0.0, 0.3)
+    field.experts.drop(2)
+    mapped, routes = torch.rand(333, 3) * 2 - 1, torch.tensor([0, 1, 3]).repeat(111)
+    factors = torch.rand(333) + 0.5
+    monkeypatch.setattr(native, "FEWEST", 1)
+    monkeypatch.setattr(torch, "get_num_threads", lambda: 2)
+    with torch.no_grad():
+        ours = field.density(mapped, routes, factors)
+    theirs = field.density(mapped, routes, factors)
+    assert theirs[0].requires_grad and not ours[0].requires_grad
+    for one, other in zip(ours, theirs, strict=True):
+        torch.testing.assert_close(one, other.detach(), rtol=1e-4, atol=1e-4)
 
 
 @needs_compiler

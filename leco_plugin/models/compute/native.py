@@ -1,4 +1,4 @@
-"""Routines in C for a CPU (`native.c`), compiled when first wanted.
+"""Routines in C for a CPU (`hash_grids.c`, `networks.c`), compiled when first wanted.
 
 A C compiler, where there is one, takes less than a second for them. Where there is none, and where
 `LECO_KERNELS_OFF` names `native`, torch does the same work.
@@ -14,7 +14,7 @@ import shutil
 import subprocess
 import tempfile
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from itertools import pairwise
 from pathlib import Path
 
@@ -23,12 +23,14 @@ from torch import Tensor
 
 from leco_plugin.samplers.kernels import kernels_off
 
-SOURCE = Path(__file__).with_suffix(".c")
+SOURCES = sorted(Path(__file__).parent.glob("*.c"))
 FLAGS = ("-O3", "-march=native", "-fno-math-errno", "-fno-trapping-math", "-shared", "-fPIC")
 COMPILERS = ("cc", "gcc", "clang")
 """Tried in this order, after the one that the environment variable CC names."""
 SECONDS = 60
 """That a compiler may take."""
+WIDEST = 512
+"""Features of a layer, at most: `networks.c` has room for so many."""
 FEWEST = 2048
 """Points that a thread of its own is worth."""
 
@@ -46,24 +48,31 @@ def _library() -> ctypes.CDLL | None:
     named = os.environ.get("CC", "").split()[:1]
     compiler = next(filter(None, map(shutil.which, (*named, *COMPILERS))), None)
     if compiler is None:
-        _log.info("no C compiler: torch computes hash grids, some five times as slowly")
+        _log.info("no C compiler: torch does all the work, some twice as slowly")
         return None
     with tempfile.TemporaryDirectory() as folder:
         made = Path(folder, "native.so")
-        command = [compiler, *FLAGS, str(SOURCE), "-o", str(made), "-lm"]
+        command = [compiler, *FLAGS, *map(str, SOURCES), "-o", str(made), "-lm"]
         try:
             subprocess.run(command, check=True, capture_output=True, timeout=SECONDS)
             return ctypes.CDLL(str(made))
         except (OSError, subprocess.SubprocessError) as error:
             said = getattr(error, "stderr", None) or str(error).encode()
             why = (said.decode(errors="replace").strip().splitlines() or [type(error).__name__])[0]
-            _log.info("%s cannot compile native.c, torch answers in its place: %s", compiler, why)
+            _log.info("%s fails, torch answers in place of routines in C: %s", compiler, why)
             return None
 
 
 def suits(*tensors: Tensor) -> bool:
-    """Whether the routines can take these: float32 on a CPU."""
-    return all(one.device.type == "cpu" and one.dtype == torch.float32 for one in tensors)
+    """Whether the routines can take these, and are there: float32 on a CPU."""
+    known = all(one.device.type == "cpu" and one.dtype == torch.float32 for one in tensors)
+    return known and has_native()
+
+
+def answers_without_graph(*tensors: Tensor) -> bool:
+    """Whether networks may be asked in C: nobody wants a gradient, or the products in halves."""
+    asked = torch.is_grad_enabled() or torch.is_autocast_enabled("cpu")
+    return not asked and suits(*tensors)
 
 
 def hash_sums(positions: Tensor, resolutions: Tensor, table: Tensor, corners: int) -> Tensor:
@@ -114,6 +123,70 @@ def hash_gradients(
 
     _in_threads(work, levels, len(positions) // FEWEST)
     return table
+
+
+def gate_logits(
+    mapped: Tensor, scales: Tensor, fresh: int, parts: Sequence[Tensor], epsilon: float
+) -> Tensor:
+    """Logits [N, 1 + n] of a gate on frequencies, without a graph.
+
+    Args:
+        mapped: [N, 3] float32 in [-1, 1], in any strides.
+        scales: [octaves] float32, what positions are multiplied by.
+        fresh: each so many octaves, sines are computed anew rather than doubled.
+        parts: weights and biases of the hidden layers, scale and shift of the norm, weights and
+            biases of the last layer.
+        epsilon: of the norm.
+    """
+    width, outputs = len(parts[0]), len(parts[-1])
+    layers = len(parts) // 2 - 2
+    logits = mapped.new_empty(len(mapped), outputs)
+    routine, addresses = _routine("gate_logits"), _addresses(parts)
+    pointers = _pointers(mapped, scales)
+    strides = ctypes.c_int64(mapped.stride(1)), ctypes.c_int64(mapped.stride(0))
+    sizes = (len(scales), fresh, layers, width, outputs, ctypes.c_float(epsilon))
+
+    def work(begin: int, end: int) -> None:
+        part = ctypes.c_int64(begin), ctypes.c_int64(end)
+        routine(*pointers, addresses, *_pointers(logits), *part, *strides, *sizes)
+
+    _in_threads(work, len(mapped), len(mapped) // FEWEST)
+    return logits
+
+
+def field_densities(
+    features: Tensor, routes: Tensor, factors: Tensor, parts: list[Tensor | None], layers: int
+) -> tuple[Tensor, Tensor]:
+    """Hidden features [N, width] and raw densities [N] of a field of experts, without a graph.
+
+    Args:
+        features: [N, inputs] float32 of the encoding.
+        routes: [N] int64, the expert of each point.
+        factors: [N] float32 of the hidden features.
+        parts: weights and biases of the projection and of the density, then those of each expert's
+            layers; None for those of an expert that adds nothing.
+        layers: of an expert.
+    """
+    width = len(parts[1])  # type: ignore[arg-type]
+    hidden, raw = features.new_empty(len(features), width), features.new_empty(len(features))
+    routine, addresses = _routine("field_densities"), _addresses(parts)
+    order, features, factors = routes.argsort(), features.contiguous(), factors.contiguous()
+    pointers = _pointers(features, order, routes, factors)
+
+    def work(begin: int, end: int) -> None:
+        part = ctypes.c_int64(begin), ctypes.c_int64(end)
+        sizes = features.shape[1], width, layers
+        routine(*pointers, addresses, *_pointers(hidden, raw), *part, *sizes)
+
+    _in_threads(work, len(features), len(features) // FEWEST)
+    return hidden, raw
+
+
+def _addresses(parts: Sequence[Tensor | None]) -> ctypes.Array[ctypes.c_void_p]:
+    """Of contiguous tensors, which the caller keeps alive."""
+    return (ctypes.c_void_p * len(parts))(
+        *(None if one is None else one.data_ptr() for one in parts)
+    )
 
 
 def _routine(name: str) -> Callable[..., None]:
