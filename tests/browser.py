@@ -101,7 +101,9 @@ def open_page(url: str, profile: Path, size: tuple[int, int] = (1280, 800)) -> I
             port = active.read_text().split()[0]
             with urllib.request.urlopen(f"http://127.0.0.1:{port}/json") as answer:
                 target = next(t for t in json.load(answer) if t["type"] == "page")
-            with connect(target["webSocketDebuggerUrl"], max_size=None) as socket:
+            with connect(
+                target["webSocketDebuggerUrl"], max_size=None, ping_interval=None
+            ) as socket:
                 page = Page(socket)
                 page.call("Page.navigate", url=url)
                 yield page
