@@ -10,7 +10,7 @@ import torch
 import viser
 from nerfstudio.cameras.cameras import Cameras
 
-from leco_plugin.studio.viewer import View, first_view, middle_view, stay_open
+from leco_plugin.studio.viewer import View, first_view, middle_view, stay_open, upright_look
 
 
 def looking(directions: list[list[float]], places: list[list[float]]) -> torch.Tensor:
@@ -46,6 +46,19 @@ def test_a_view_straight_down_keeps_its_heading_and_turns_about_the_ground() -> 
     assert look[1] > 0.0 and abs(float(look[0])) < 1e-6  # a little to the top of the photograph
     # beyond the picture that the viewer draws before the camera
     assert 0.005 < 1.0 - float(view.position[2]) < 0.1
+
+
+@pytest.mark.parametrize("tilt", [[0.2, 0.0], [-0.2, 0.0], [0.0, -0.2], [0.0, 0.5]])
+def test_a_tilted_photograph_of_the_ground_keeps_its_top(tilt: list[float]) -> None:
+    (pose,) = looking([[*tilt, -1.0]], [[0.0, 0.0, 1.0]])  # its top is +y
+    look = upright_look(pose)
+    assert abs(float(look[0])) < 1e-6 and float(look[1]) > 0.0  # z kept upright, +y is the top
+    assert float(look @ -pose[:, 2]) > 0.95
+
+
+def test_a_level_view_is_looked_along_as_it_is() -> None:
+    (pose,) = looking([[0.3, 1.0, -0.2]], [[0.0, 0.0, 1.0]])
+    torch.testing.assert_close(upright_look(pose), -pose[:, 2])
 
 
 @pytest.mark.parametrize(("aspect", "tangent"), [(1.0, 0.5), (2.0, 0.5), (4.0, 0.25)])
