@@ -17,7 +17,6 @@ import torch
 import viser
 from browser import Page, needs_chromium, open_page
 from nerfstudio.pipelines.base_pipeline import Pipeline
-from nerfstudio.viewer.render_state_machine import RenderStateMachine
 from nerfstudio.viewer.utils import parse_object
 from nerfstudio.viewer.viewer import VISER_NERFSTUDIO_SCALE_RATIO, Viewer
 from nerfstudio.viewer.viewer_elements import ViewerElement
@@ -26,6 +25,7 @@ from tiny_run import tiny_trainer
 
 from leco_plugin.models.encodings import EncodingConfig
 from leco_plugin.models.gate import GateConfig
+from leco_plugin.studio.viewer import stop_drawing
 
 GATE = GateConfig(encoding=EncodingConfig(octaves=2), layers=1, width=8)
 
@@ -76,10 +76,7 @@ def shown(page: Page, folder: Path) -> np.ndarray:
 
 def stop(server: viser.ViserServer) -> None:
     """Stops a server with its threads, which outlive it by themselves."""
-    for thread in threading.enumerate():
-        if isinstance(thread, RenderStateMachine):
-            thread.running = False
-            thread.join(10.0)
+    stop_drawing()
     loop = server._websock_server._broadcast_buffer.event_loop
     server.stop()
     loop.call_soon_threadsafe(loop.stop)

@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 import math
+import threading
 import time
+from contextlib import suppress
 from typing import Any, NamedTuple
 
 import numpy as np
 import torch
 import viser
 from nerfstudio.cameras.cameras import Cameras, CameraType
+from nerfstudio.viewer.render_state_machine import RenderStateMachine
 from nerfstudio.viewer.viewer_elements import ViewerControl
 from torch import Tensor
 
@@ -30,6 +33,10 @@ WITHOUT_POINTS = 1.0
 BEYOND_PICTURE = 1.2
 """The view begins so many times as far from the camera as the photograph in its frustum, which
 would hide the scene."""
+
+LOOKING = "somebody is looking: the viewer stays open until its last page is closed, or Ctrl-C"
+LONGEST_CHUNK = 30.0
+"""Seconds for which a picture that is to end is waited for."""
 
 
 class View(NamedTuple):
@@ -157,11 +164,24 @@ def stay_open(viewer: Any) -> None:
         viewer: nerfstudio's; None, or that of an old version, is none that stays.
     """
     server = getattr(viewer, "viser_server", None)
-    if not isinstance(server, viser.ViserServer) or not server.get_clients():
+    if not isinstance(server, viser.ViserServer):
         return
-    say("somebody is looking: the viewer stays open until its last page is closed, or Ctrl-C")
     try:
-        while server.get_clients():
-            time.sleep(0.2)
+        if server.get_clients():
+            say(LOOKING)
+            with suppress(KeyError):  # of a page that closes or opens just now
+                viewer._trigger_rerender()  # what has been trained since the last picture
+            while server.get_clients():
+                time.sleep(0.2)
     except KeyboardInterrupt:
         say("the viewer is closed")
+    stop_drawing()
+
+
+def stop_drawing() -> None:
+    """Ends the threads in which nerfstudio's viewers draw: Python ends in an abort where one is in
+    the middle of a picture."""
+    for thread in threading.enumerate():
+        if isinstance(thread, RenderStateMachine):
+            thread.running = False
+            thread.join(LONGEST_CHUNK)

@@ -24,6 +24,7 @@ from leco_plugin.models.gate import GateConfig
 from leco_plugin.occupancy import SHOWN, Occupancy
 from leco_plugin.studio import occupancy_view
 from leco_plugin.studio.occupancy_view import COLOURS, NOT_YET, OccupancyView
+from leco_plugin.studio.viewer import stop_drawing
 
 GATE = GateConfig(encoding=EncodingConfig(octaves=2), layers=1, width=8)
 
@@ -106,17 +107,17 @@ def test_no_picture_is_finished_for_a_closed_page(host: Any) -> None:
     class Page(RenderStateMachine):
         def __init__(self) -> None:
             threading.Thread.__init__(self)
-            self.running = False
+            self.running = True
 
         def run(self) -> None:
             try:
-                host(bundle_of(*rays()))
+                while True:
+                    host(bundle_of(*rays()))
             except IOChangeException as error:
                 raised.append(error)
 
-    page = Page()
-    page.start()
-    page.join()
+    Page().start()
+    stop_drawing()
     assert len(raised) == 1
 
 
