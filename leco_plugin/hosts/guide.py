@@ -173,7 +173,6 @@ class Guide(nn.Module):
         """Where the occupancy lies, with the backdrops that were seen there."""
         occupancy, region = self.the_occupancy(), Region().to(self.frame.device)
         region.space, region.backdrops = occupancy.space, self.backdrops
-        region.seen = occupancy.seen
         region.aabb.copy_(occupancy.walls)
         region.near.zero_()
         region.far.copy_(FARTHEST * occupancy.space.half_extent)

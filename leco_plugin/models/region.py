@@ -110,21 +110,22 @@ class Region(nn.Module):
 
     def shows_backdrop(self, cut: Rays) -> Tensor:
         """Whether training has seen the backdrop of rays that are cut to the region: bool [R]."""
-        ends = torch.addcmul(cut.origins, cut.directions, cut.t_maxs[:, None])
-        mapped = self.space.map(ends).clamp(-1.0, 1.0).nan_to_num()
-        return torch.where(self.leaves_by_floor(cut), self.seen(mapped), self.backdrops(cut))
+        seen: Tensor = self.backdrops(cut)
+        return self.leaves_by_floor(cut) | seen
 
     def down_to_the_floor(self, rays: Rays) -> Rays:
         """Cut rays, of which those that reach the floor beyond `far` end there: whoever looks from
-        above all cameras sees the ground."""
+        above all cameras sees the ground, where a photograph shows it."""
         end = self.far.new_tensor(FARTHEST) * self.space.half_extent
         whole = cut_rays(rays.origins, rays.directions, self.aabb, self.near, end)
         beyond = self.leaves_by_floor(whole) & (whole.t_maxs > self.far)
+        ends = torch.addcmul(whole.origins, whole.directions, whole.t_maxs[:, None])
+        seen = self.seen(self.space.map(ends).clamp(-1.0, 1.0).nan_to_num())
         cut_off = torch.zeros_like(beyond) if rays.cut_off is None else rays.cut_off
         return rays._replace(
             t_mins=torch.where(beyond, whole.t_mins, rays.t_mins),
             t_maxs=torch.where(beyond, whole.t_maxs, rays.t_maxs),
-            cut_off=torch.where(beyond, ~self.shows_backdrop(whole), cut_off),
+            cut_off=torch.where(beyond, ~seen, cut_off),
         )
 
 
