@@ -140,6 +140,15 @@ class Occupancy(nn.Module):
         mapped = mapped.clamp_(-1.0, 1.0).nan_to_num_()
         return self.of_mapped(mapped).mul_(inside).mul_(self.seen(mapped))
 
+    @torch.no_grad()
+    def unseen(self, positions: Tensor) -> Tensor:
+        """Whether scene positions [N, 3] lie in the space, but where no training ray crosses it:
+        bool [N]; errors as of `query`."""
+        _check_shape(positions)
+        mapped = self.space.map(positions.to(self.space.center.dtype))
+        inside = mapped.abs().amax(dim=-1) <= 1.0  # of NaN it is not
+        return inside & ~self.seen(mapped.clamp(-1.0, 1.0).nan_to_num())
+
     def of_mapped(self, mapped: Tensor) -> Tensor:
         """The gate's answers at mapped positions [N, 3] in [-1, 1], wherever they lie: [N]."""
         if mapped.device.type == "cpu":

@@ -50,7 +50,7 @@ class Page:
         number = next(self._numbers)
         self._socket.send(json.dumps({"id": number, "method": method, "params": parameters}))
         while True:
-            said = json.loads(self._socket.recv(timeout=300))
+            said = json.loads(self._socket.recv(timeout=60))
             if said.get("method") == "Runtime.exceptionThrown":
                 self.errors.append(json.dumps(said["params"]["exceptionDetails"])[:500])
             if said.get("method") == "Network.requestWillBeSent":
@@ -94,16 +94,18 @@ def open_page(url: str, profile: Path, size: tuple[int, int] = (1280, 800)) -> I
     with subprocess.Popen([CHROMIUM, *FLAGS, *where], **silent) as browser:  # type: ignore[call-overload]
         try:
             active = profile / "DevToolsActivePort"
-            deadline = time.monotonic() + 300.0
+            deadline = time.monotonic() + 60.0
             while not active.exists() or not active.read_text().strip():
                 assert browser.poll() is None and time.monotonic() < deadline
                 time.sleep(0.1)
             port = active.read_text().split()[0]
-            with urllib.request.urlopen(f"http://127.0.0.1:{port}/json") as answer:
+            with urllib.request.urlopen(f"http://127.0.0.1:{port}/json", timeout=60) as answer:
                 target = next(t for t in json.load(answer) if t["type"] == "page")
-            with connect(target["webSocketDebuggerUrl"], max_size=None) as socket:
+            with connect(
+                target["webSocketDebuggerUrl"], max_size=None, ping_interval=None
+            ) as socket:
                 page = Page(socket)
                 page.call("Page.navigate", url=url)
                 yield page
         finally:
-            browser.terminate()
+            browser.kill()  # a page that draws does not hear SIGTERM in time

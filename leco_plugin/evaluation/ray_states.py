@@ -46,10 +46,7 @@ def ray_states(
     of_ray, starts, ends = marching.march(marching.Rays(*rays[:4]), rule)
     middles = (0.5 * (starts + ends))[:, None]
     positions = torch.addcmul(origins[of_ray], directions[of_ray], middles)
-    mapped = space.map(positions)
-    inside = mapped.abs().amax(dim=-1) <= 1.0
-    unseen = inside & ~occupancy.seen(mapped.clamp(-1.0, 1.0))
     states = torch.full((len(origins),), SKIPPED, device=origins.device)
-    states[of_ray[unseen]] = UNSEEN
+    states[of_ray[occupancy.unseen(positions)]] = UNSEEN
     states[of_ray[occupancy.query(positions) >= occupancy.threshold_value]] = KEPT
     return states

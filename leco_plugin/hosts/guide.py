@@ -19,7 +19,7 @@ from torch import Tensor, nn
 from leco_plugin.hosts.stand_ins import GuidedEstimator, GuidedProposal
 from leco_plugin.learning.progress import WatchState
 from leco_plugin.models.gate import Gate, GateConfig
-from leco_plugin.models.region import SIDE, Region, SeenBackdrops
+from leco_plugin.models.region import FARTHEST, SIDE, Region, SeenBackdrops
 from leco_plugin.occupancy import SHOWN, Occupancy
 from leco_plugin.samplers.registry import (
     OURS,
@@ -37,10 +37,6 @@ from leco_plugin.scenes.input_error import (
 )
 from leco_plugin.scenes.survey import covering_rays
 from leco_plugin.space import Space
-
-FARTHEST = 1e3
-"""Half extents of the occupancy after which a ray has left what it is asked about."""
-
 
 STATE = ("gate", "precision", "report", "watched", "first_density")
 """What a checkpoint holds of a guide with an occupancy, beside tensors."""

@@ -22,6 +22,7 @@ from torch import Tensor, nn
 
 from leco_plugin.samplers.cells.cache import OccupancyLike
 from leco_plugin.samplers.estimator import LearnedOccupancyEstimator
+from leco_plugin.scenes.frames import moved
 
 Answer = tuple[RaySamples, list[Tensor], list[RaySamples]]
 """The samples, and for each level of proposals the weights of candidates and the candidates."""
@@ -103,6 +104,8 @@ class LearnedOccupancySampler(_ProposalSampler):
     """Draws samples from the gate's distribution along each ray.
 
     The weights of candidates sum to 1 on a ray that meets something occupied, and to 0 on others.
+    A sample whose middle lies in space that no training ray crosses has a delta of 0, and with it
+    no rendering weight, whatever density a host gives it.
 
     Args:
         occupancy: the frozen gate with its space and threshold.
@@ -158,7 +161,26 @@ class LearnedOccupancySampler(_ProposalSampler):
         worth = self.worth(candidates.frustums.get_positions())
         weights = worth / worth.sum(dim=-2, keepdim=True).clamp(min=1e-12)
         samples = self.pdf_sampler(ray_bundle, candidates, weights, num_samples=self.num_samples)
+        samples.deltas = samples.deltas.masked_fill(self._unseen(samples), 0.0)
         return samples, weights, candidates
+
+    def _unseen(self, samples: RaySamples) -> Tensor:
+        """Which samples [n_rays, n_samples, 1] have their middle where no training ray crosses
+        the scene; none where an occupancy does not know."""
+        middles = samples.frustums.get_positions()
+        answer = getattr(self.estimator.occupancy, "unseen", None)
+        if answer is None:
+            return torch.zeros_like(middles[..., :1], dtype=torch.bool)
+        found: Tensor = answer(self._in_its_frame(middles))
+        return found.view(*middles.shape[:-1], 1)
+
+    def _in_its_frame(self, positions: Tensor) -> Tensor:
+        """Positions [..., 3] of a host in the occupancy's coordinates: [N, 3] float32."""
+        flat = positions.reshape(-1, 3).float()  # a host may be in half or double precision
+        if self.frame is None:
+            return flat
+        with torch.autocast(flat.device.type, enabled=False):
+            return moved(flat, self.frame.float())
 
     @torch.no_grad()
     def worth(self, positions: Tensor) -> Tensor:
@@ -166,11 +188,7 @@ class LearnedOccupancySampler(_ProposalSampler):
 
         The cache decides first, so that the gate is asked only where it lets something through.
         """
-        flat = positions.reshape(-1, 3).float()  # a host may be in half or double precision
-        if self.frame is not None:
-            with torch.autocast(flat.device.type, enabled=False):
-                turn, shift = self.frame.float().split([3, 1], dim=1)
-                flat = flat @ turn.T + shift[:, 0]
+        flat = self._in_its_frame(positions)
         kept = self.estimator.occupied(flat).nonzero()[:, 0]
         worth = positions.new_zeros(len(flat))
         if kept.numel():

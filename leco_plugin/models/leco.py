@@ -39,7 +39,12 @@ from leco_plugin.studio.checkpoints import (
     evaluate_whole_checkpoints,
     refuse_earlier,
 )
-from leco_plugin.studio.occupancy_view import Drawn, DrawnInViewer, OccupancyView
+from leco_plugin.studio.occupancy_view import (
+    Drawn,
+    DrawnInViewer,
+    OccupancyView,
+    is_viewer_drawing,
+)
 from leco_plugin.studio.run import run_of
 
 
@@ -125,14 +130,17 @@ class LecoModel(DrawnInViewer, Model):
         return Drawn(self.mixture.occupancy(), None) if bool(self.mixture.frozen) else None
 
     def rays_of(self, bundle: RayBundle) -> Rays:
-        """The bundle's rays, cut to the region and to a crop; see `Region.rays`."""
+        """The bundle's rays, cut to the region and to a crop; see `Region.rays`. In the viewer they
+        reach the ground from wherever somebody looks."""
         images = bundle.camera_indices if self.training else None
-        return self.mixture.rays(
+        rays = self.mixture.rays(
             bundle.origins,
             bundle.directions,
             None if images is None else images[:, 0],
             (bundle.nears, bundle.fars),
         )
+        whole = is_viewer_drawing() and bundle.nears is None
+        return self.mixture.region.down_to_the_floor(rays) if whole else rays
 
     def intervals_of(self, rays: Rays) -> Intervals:
         """What is shaded along rays: candidates, or those that the gate lets through."""
@@ -142,10 +150,11 @@ class LecoModel(DrawnInViewer, Model):
         if mixture.skips:
             return mixture.with_backdrops(rays, mixture.kept(rays, coarse, jitter), coarse)
         intervals = mixture.candidates(rays, coarse, jitter)
-        if self.training and plan.following is not None:
+        if plan.following is not None and (self.training or is_viewer_drawing()):
             likely = mixture.follow(rays, intervals, plan.following)
-            share = len(likely.t_starts) / max(len(intervals.t_starts), 1)
-            self.progress.learning_kept = 0.9 * self.progress.learning_kept + 0.1 * share
+            if self.training:
+                share = len(likely.t_starts) / max(len(intervals.t_starts), 1)
+                self.progress.learning_kept = 0.9 * self.progress.learning_kept + 0.1 * share
             intervals = likely
         if not self.training:
             intervals = mixture.seen(rays, intervals)

@@ -19,6 +19,8 @@ DIRECTIONS = 16
 """Cells a side of the grid over directions: 7 degrees each."""
 TOLERANCE = 0.02
 """Of the z of a unit direction, 1 degree at the horizon: between the rays that cover an image."""
+FARTHEST = 1e3
+"""Half extents of the space after which a ray has left it."""
 SIDE = 32
 """Rays a side that cover each training image: 12 degrees apart in a panorama."""
 
@@ -110,6 +112,21 @@ class Region(nn.Module):
         """Whether training has seen the backdrop of rays that are cut to the region: bool [R]."""
         seen: Tensor = self.backdrops(cut)
         return self.leaves_by_floor(cut) | seen
+
+    def down_to_the_floor(self, rays: Rays) -> Rays:
+        """Cut rays, of which those that reach the floor beyond `far` end there: whoever looks from
+        above all cameras sees the ground, where a photograph shows it."""
+        end = self.far.new_tensor(FARTHEST) * self.space.half_extent
+        whole = cut_rays(rays.origins, rays.directions, self.aabb, self.near, end)
+        beyond = self.leaves_by_floor(whole) & (whole.t_maxs > self.far)
+        ends = torch.addcmul(whole.origins, whole.directions, whole.t_maxs[:, None])
+        seen = self.seen(self.space.map(ends).clamp(-1.0, 1.0).nan_to_num())
+        cut_off = torch.zeros_like(beyond) if rays.cut_off is None else rays.cut_off
+        return rays._replace(
+            t_mins=torch.where(beyond, whole.t_mins, rays.t_mins),
+            t_maxs=torch.where(beyond, whole.t_maxs, rays.t_maxs),
+            cut_off=torch.where(beyond, ~seen, cut_off),
+        )
 
 
 class SeenBackdrops(nn.Module):

@@ -16,6 +16,7 @@ import torch
 from nerfstudio.models.base_model import Model
 from nerfstudio.viewer.render_state_machine import RenderStateMachine
 from nerfstudio.viewer.viewer_elements import ViewerCheckbox, ViewerSlider, ViewerText
+from nerfstudio.viewer_legacy.server.viewer_utils import IOChangeException
 from torch import Tensor, nn
 
 from leco_plugin.evaluation.ray_states import ray_states
@@ -49,6 +50,18 @@ class Drawn(NamedTuple):
 def is_viewer_drawing() -> bool:
     """Whether the current thread draws for nerfstudio's viewer."""
     return isinstance(threading.current_thread(), RenderStateMachine)
+
+
+def stop_drawing_for_nobody() -> None:
+    """Ends a picture of the viewer whose page is closed. nerfstudio finishes it, and no step of
+    training is taken meanwhile.
+
+    Raises:
+        IOChangeException: to the viewer, which expects it.
+    """
+    thread = threading.current_thread()
+    if isinstance(thread, RenderStateMachine) and not thread.running:
+        raise IOChangeException
 
 
 class OccupancyView(nn.Module):
@@ -135,6 +148,7 @@ class DrawnInViewer(_Model):
 
     def forward(self, ray_bundle: Any) -> dict[str, Any]:
         """As the model's; in the viewer, as its controls have it."""
+        stop_drawing_for_nobody()
         if "leco_view" in self._modules and is_viewer_drawing():
             SHOWN.set(None)  # whatever a picture that was interrupted has left
             drawn = self.leco_drawn()

@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 import math
+import threading
 import time
+from contextlib import suppress
 from typing import Any, NamedTuple
 
 import numpy as np
 import torch
 import viser
 from nerfstudio.cameras.cameras import Cameras, CameraType
+from nerfstudio.viewer.render_state_machine import RenderStateMachine
 from nerfstudio.viewer.viewer_elements import ViewerControl
 from torch import Tensor
 
@@ -23,11 +26,17 @@ within 11 degrees of straight down."""
 UPRIGHT = 0.05
 """Least part of a look that is level: straight down, controls that keep z upright lose the heading.
 Three degrees."""
+DOWNWARD = -0.7
+"""Height of a look, a unit vector, below which it shows the ground rather than the horizon."""
 WITHOUT_POINTS = 1.0
 """How far before the camera the middle of the scene is, scene units, where nothing is known."""
 BEYOND_PICTURE = 1.2
 """The view begins so many times as far from the camera as the photograph in its frustum, which
 would hide the scene."""
+
+LOOKING = "somebody is looking: the viewer stays open until its last page is closed, or Ctrl-C"
+LONGEST_CHUNK = 30.0
+"""Seconds for which a picture that is to end is waited for."""
 
 
 class View(NamedTuple):
@@ -74,9 +83,6 @@ def first_view(cameras: Cameras, points: Tensor | None, frustum: float) -> View:
     number = middle_view(poses)
     pose = poses[number]
     look, place = -pose[:, 2], pose[:, 3]
-    level = pose[:, 1] * pose.new_tensor([1.0, 1.0, 0.0])
-    if float(look[:2].norm()) < UPRIGHT and float(level.norm()) > 0.0:
-        look = torch.nn.functional.normalize(look + UPRIGHT * level / level.norm(), dim=0)
     ahead = WITHOUT_POINTS
     if points is not None and len(points):
         depths = (points.cpu().float() - place) @ look
@@ -93,7 +99,23 @@ def first_view(cameras: Cameras, points: Tensor | None, frustum: float) -> View:
         # the pyramid is scaled to that volume, whatever its shape
         start = BEYOND_PICTURE * frustum / (across * up / 3.0) ** (1.0 / 3.0)
     start = min(start, 0.5 * ahead)
-    return View(place + start * look, place + ahead * look, half_size)
+    middle = place + ahead * look
+    return View(middle - (ahead - start) * upright_look(pose), middle, half_size)
+
+
+def upright_look(pose: Tensor) -> Tensor:
+    """The look [3] of a camera, or one close to it that shows the ground with the same top, for
+    controls that keep z upright.
+
+    Args:
+        pose: [3, 4] OpenGL camera to world, z up.
+    """
+    look, level = -pose[:, 2], pose[:2, 1]
+    if look[2] > DOWNWARD or float(level.norm()) == 0.0:
+        return look
+    top = level / level.norm()
+    ahead = (look[:2] @ top).clamp(min=UPRIGHT)
+    return torch.nn.functional.normalize(torch.cat([ahead * top, look[2:]]), dim=0)
 
 
 class FirstView(ViewerControl):
@@ -113,13 +135,21 @@ class FirstView(ViewerControl):
         view = first_view(dataset.cameras, sparse_points(dataset), frustum)
 
         def open_on_view(client: viser.ClientHandle) -> None:
+            camera, fitted = client.camera, 0.0
+
+            def fit(_: Any) -> None:
+                # a new page has no panels yet, so that its picture is wider than it will be
+                nonlocal fitted
+                fov = view.field_of_view(camera.aspect)
+                if fov is not None and camera.aspect != fitted:
+                    camera.fov, fitted = fov, camera.aspect
+
             with client.atomic():
-                client.camera.up_direction = np.array([0.0, 0.0, 1.0])
-                client.camera.position = SCALE * view.position.double().numpy()
-                client.camera.look_at = SCALE * view.look_at.double().numpy()
-                fov = view.field_of_view(client.camera.aspect)
-                if fov is not None:
-                    client.camera.fov = fov
+                camera.up_direction = np.array([0.0, 0.0, 1.0])
+                camera.position = SCALE * view.position.double().numpy()
+                camera.look_at = SCALE * view.look_at.double().numpy()
+                fit(camera)
+            camera.on_update(fit)
 
         viewer.viser_server.on_client_connect(open_on_view)
 
@@ -134,11 +164,24 @@ def stay_open(viewer: Any) -> None:
         viewer: nerfstudio's; None, or that of an old version, is none that stays.
     """
     server = getattr(viewer, "viser_server", None)
-    if not isinstance(server, viser.ViserServer) or not server.get_clients():
+    if not isinstance(server, viser.ViserServer):
         return
-    say("somebody is looking: the viewer stays open until its last page is closed, or Ctrl-C")
     try:
-        while server.get_clients():
-            time.sleep(0.2)
+        if server.get_clients():
+            say(LOOKING)
+            with suppress(KeyError):  # of a page that closes or opens just now
+                viewer._trigger_rerender()  # what has been trained since the last picture
+            while server.get_clients():
+                time.sleep(0.2)
     except KeyboardInterrupt:
         say("the viewer is closed")
+    stop_drawing()
+
+
+def stop_drawing() -> None:
+    """Ends the threads in which nerfstudio's viewers draw: Python ends in an abort where one is in
+    the middle of a picture."""
+    for thread in threading.enumerate():
+        if isinstance(thread, RenderStateMachine):
+            thread.running = False
+            thread.join(LONGEST_CHUNK)

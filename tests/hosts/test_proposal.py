@@ -6,7 +6,7 @@ import copy
 
 import pytest
 import torch
-from ball_occupancy import ball
+from ball_occupancy import CENTRE, HALF, ball
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from samplers.analytic_occupancy import Balls, camera_rays
@@ -16,9 +16,10 @@ pytest.importorskip("nerfstudio")
 from nerfstudio.cameras.rays import RayBundle
 from nerfstudio.model_components.losses import distortion_loss, interlevel_loss
 from nerfstudio.model_components.ray_samplers import UniformSampler
-from nerfstudio.model_components.renderers import DepthRenderer
+from nerfstudio.model_components.renderers import DepthRenderer, RGBRenderer
 
 from leco_plugin.hosts.proposal import DenseSampler, LearnedOccupancySampler
+from leco_plugin.occupancy import Occupancy
 
 NEAR, FAR = 0.5, 4.0
 
@@ -102,6 +103,36 @@ def test_an_empty_ray_is_sampled_uniformly(sampler):
     assert weights[0].sum() == 0.0
     widths = samples.deltas[..., 0]
     torch.testing.assert_close(widths, widths.mean().expand_as(widths), rtol=1e-2, atol=1e-3)
+
+
+def along_y(x: float) -> RayBundle:
+    """A ray through the ball's space at its centre's height, and at this x from its centre."""
+    place, end = torch.tensor(CENTRE), torch.full((1, 1), 2.0 * HALF)
+    origins = (place + torch.tensor([x, -HALF, 0.0]))[None]
+    ahead = torch.tensor([[0.0, 1.0, 0.0]])
+    return RayBundle(origins, ahead, torch.ones(1, 1), nears=torch.zeros(1, 1), fars=end)
+
+
+@pytest.mark.parametrize(("x", "shown"), [(0.0, True), (1.5, False)])
+def test_what_no_photograph_shows_has_no_weight_however_dense_a_host_calls_it(x, shown):
+    known = ball()
+    half_seen = Occupancy(known.gate, known.space, 0.5)
+    half_seen.seen.cells[:, 26:38] = False  # a slab amid the ball, across the first ray
+    if not shown:
+        half_seen.seen.cells[48:] = False  # all that the second ray meets
+    sampler = LearnedOccupancySampler(half_seen, 16, 64, UniformSampler(), cache_bytes=0).eval()
+    samples, weights, candidates = sampler(along_y(x))
+    unseen = half_seen.unseen(samples.frustums.get_positions()[0])
+    assert bool(unseen.any()) and bool(unseen.all()) is not shown
+    densities = torch.ones(1, 16, 1, requires_grad=True)
+    found = samples.get_weights(densities)
+    loss = interlevel_loss([*weights, found], [*candidates, samples])
+    loss = loss + distortion_loss([found], [samples])
+    rgb = RGBRenderer("white")(torch.zeros(1, 16, 3), found)
+    (loss + rgb.sum()).backward()
+    assert bool(loss.isfinite()) and bool(densities.grad.isfinite().all())
+    assert not bool(found[0, unseen].any()) and not bool(densities.grad[0, unseen].any())
+    assert bool((rgb < 0.9).all()) if shown else bool((rgb == 1.0).all())
 
 
 def test_the_hosts_losses_and_depths_keep_working(sampler):

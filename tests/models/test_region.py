@@ -47,6 +47,18 @@ def test_rays_that_miss_get_a_piece_at_the_far_end() -> None:
     torch.testing.assert_close(rays.t_maxs, torch.tensor([3.0, 5.0, 5.0]))
 
 
+def test_ground_beyond_far_is_reached_where_a_photograph_shows_it() -> None:
+    region = region_of(SLAB, far=2.5)
+    region.seen.cells[:32] = False  # where x is negative
+    origins = torch.tensor([[0.5, 0.0, 9.0], [-0.5, 0.0, 9.0], [0.5, 0.0, 9.0]])
+    directions = torch.tensor([[0.0, 0.0, -1.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]])
+    cut = region.rays(origins, directions, None, torch.tensor(0.5))
+    whole = region.down_to_the_floor(cut)
+    torch.testing.assert_close(whole.t_mins, torch.tensor([8.0, 8.0, 2.0]))
+    torch.testing.assert_close(whole.t_maxs, torch.tensor([10.0, 10.0, 2.5]))
+    assert whole.cut_off is not None and whole.cut_off.tolist() == [False, True, False]
+
+
 @pytest.mark.parametrize("kind", ["box", "contraction"])
 def test_a_median_ray_has_the_wanted_number_of_candidates(kind) -> None:
     length = 3.0 if kind == "box" else 4.9

@@ -11,6 +11,8 @@ import pytest
 import torch
 from ball_occupancy import CENTRE, MARCH, ball, rays
 from nerfstudio.cameras.rays import RayBundle
+from nerfstudio.viewer.render_state_machine import RenderStateMachine
+from nerfstudio.viewer_legacy.server.viewer_utils import IOChangeException
 from tiny_run import tiny_trainer
 from torch import nn
 
@@ -22,6 +24,7 @@ from leco_plugin.models.gate import GateConfig
 from leco_plugin.occupancy import SHOWN, Occupancy
 from leco_plugin.studio import occupancy_view
 from leco_plugin.studio.occupancy_view import COLOURS, NOT_YET, OccupancyView
+from leco_plugin.studio.viewer import stop_drawing
 
 GATE = GateConfig(encoding=EncodingConfig(octaves=2), layers=1, width=8)
 
@@ -96,6 +99,26 @@ def test_what_an_interrupted_picture_leaves_reaches_no_other_thread() -> None:
     thread.join()
     SHOWN.set(None)
     assert seen == [None]
+
+
+def test_no_picture_is_finished_for_a_closed_page(host: Any) -> None:
+    raised: list[Exception] = []
+
+    class Page(RenderStateMachine):
+        def __init__(self) -> None:
+            threading.Thread.__init__(self)
+            self.running = True
+
+        def run(self) -> None:
+            try:
+                while True:
+                    host(bundle_of(*rays()))
+            except IOChangeException as error:
+                raised.append(error)
+
+    Page().start()
+    stop_drawing()
+    assert len(raised) == 1
 
 
 def test_a_slider_that_nobody_has_moved_follows_the_run() -> None:

@@ -10,7 +10,7 @@ import torch
 import viser
 from nerfstudio.cameras.cameras import Cameras
 
-from leco_plugin.studio.viewer import View, first_view, middle_view, stay_open
+from leco_plugin.studio.viewer import View, first_view, middle_view, stay_open, upright_look
 
 
 def looking(directions: list[list[float]], places: list[list[float]]) -> torch.Tensor:
@@ -48,6 +48,19 @@ def test_a_view_straight_down_keeps_its_heading_and_turns_about_the_ground() -> 
     assert 0.005 < 1.0 - float(view.position[2]) < 0.1
 
 
+@pytest.mark.parametrize("tilt", [[0.2, 0.0], [-0.2, 0.0], [0.0, -0.2], [0.0, 0.5]])
+def test_a_tilted_photograph_of_the_ground_keeps_its_top(tilt: list[float]) -> None:
+    (pose,) = looking([[*tilt, -1.0]], [[0.0, 0.0, 1.0]])  # its top is +y
+    look = upright_look(pose)
+    assert abs(float(look[0])) < 1e-6 and float(look[1]) > 0.0  # z kept upright, +y is the top
+    assert float(look @ -pose[:, 2]) > 0.95
+
+
+def test_a_level_view_is_looked_along_as_it_is() -> None:
+    (pose,) = looking([[0.3, 1.0, -0.2]], [[0.0, 0.0, 1.0]])
+    torch.testing.assert_close(upright_look(pose), -pose[:, 2])
+
+
 @pytest.mark.parametrize(("aspect", "tangent"), [(1.0, 0.5), (2.0, 0.5), (4.0, 0.25)])
 def test_no_window_shows_more_than_the_photograph(aspect: float, tangent: float) -> None:
     view = View(torch.zeros(3), torch.ones(3), (1.0, 0.5))
@@ -67,6 +80,10 @@ class Server(viser.ViserServer):
 class Viewer:
     def __init__(self, *pages: int) -> None:
         self.viser_server = Server([dict.fromkeys(range(count)) for count in pages])
+        self.drawn = 0
+
+    def _trigger_rerender(self) -> None:
+        self.drawn += 1
 
 
 def test_a_viewer_stays_open_as_long_as_somebody_is_looking(
@@ -74,7 +91,8 @@ def test_a_viewer_stays_open_as_long_as_somebody_is_looking(
 ) -> None:
     viewer = Viewer(2, 1, 1, 0)
     stay_open(viewer)
-    assert viewer.viser_server.pages == [] and "stays open" in capsys.readouterr().out
+    assert viewer.viser_server.pages == [] and viewer.drawn == 1
+    assert "stays open" in capsys.readouterr().out
 
 
 def test_a_viewer_closes_at_once_where_nobody_is(capsys: pytest.CaptureFixture[str]) -> None:

@@ -1,0 +1,60 @@
+"""The PSNR on the screen is a young one, and measuring it takes little of a run."""
+
+from __future__ import annotations
+
+from itertools import pairwise
+from typing import Any
+
+import pytest
+import torch
+from torch import nn
+
+from leco_plugin.evaluation import held_out_psnr
+from leco_plugin.evaluation.held_out_psnr import HeldOutPsnr
+
+
+class Clock:
+    now = 0.0
+
+    def monotonic(self) -> float:
+        return self.now
+
+
+class Host(nn.Module):
+    """Takes a while for each ray, and long for the first after its occupancy has changed."""
+
+    device = "cpu"
+
+    def __init__(self, clock: Clock, seconds: float) -> None:
+        super().__init__()
+        self.clock, self.seconds, self.changed = clock, seconds, True
+        self.rays = 0
+
+    def forward(self, rays: torch.Tensor) -> dict[str, Any]:
+        self.clock.now += 3.0 * self.changed + self.seconds * len(rays) / held_out_psnr.RAYS
+        self.changed = False
+        return {"rgb": torch.zeros(len(rays), 3)}
+
+
+@pytest.mark.parametrize(("seconds", "oldest"), [(0.1, 16.0), (0.7, 36.0), (2.0, 250.0)])
+def test_psnr_is_young_however_long_a_sampler_takes_to_build(
+    monkeypatch: pytest.MonkeyPatch, seconds: float, oldest: float
+) -> None:
+    clock = Clock()
+    monkeypatch.setattr(held_out_psnr, "time", clock)
+    monkeypatch.setattr(held_out_psnr, "true_colours", lambda model, truth: truth)
+    host = Host(clock, seconds)
+    psnr = HeldOutPsnr(host, None)
+    psnr.__dict__["has_pixels"] = True
+    psnr.pixels = (torch.zeros(held_out_psnr.RAYS, 3), torch.rand(held_out_psnr.RAYS, 3))
+    measured = [0.0]
+    while clock.now < 300.0:
+        clock.now += 1.0
+        host.changed = host.changed or int(clock.now) in range(100, 104)
+        before = psnr.spent
+        psnr.look()
+        if psnr.spent > before:
+            measured.append(clock.now)
+    ages = [later - sooner for sooner, later in pairwise(measured)]
+    assert max(ages) < oldest
+    assert psnr.spent < 0.035 * clock.now
