@@ -87,8 +87,8 @@ def export(
             nearby; its head has the geographic origin where transforms.json has one. Without
             coloured sparse points, colours are o(x): black at 0, purple, orange, pale yellow at 1.
             splat-init is a copy of transforms.json beside the scene's own, with these points and
-            the kept sparse points as its start: ns-train splatfacto --data OUT. npz is o(x) in the
-            cells of the box. nerfacc-grid is what OccGridEstimator.load_state_dict takes, a cell
+            the kept sparse points as its start: ns-train splatfacto --data OUT leco-photographs,
+            whose reader needs no open3d. npz is o(x) in the cells of the box. nerfacc-grid is what OccGridEstimator.load_state_dict takes, a cell
             marked where any of 27 points in it is kept. A host that goes on updating such a grid
             replaces it by its own.
         out: File to write.
@@ -113,7 +113,7 @@ def export(
         if "geographic_origin" in facts:
             print(f"its origin on earth: {facts['geographic_origin']}")
         if format == "splat-init":
-            print(f"start from it with: ns-train splatfacto --data {out}")
+            print(f"start from it with: ns-train splatfacto --data {out} leco-photographs")
         if frame != facts["frame"] == "run":
             print("the file does not say how its run moved the data: older runs did not record it")
     elif format == "npz":
