@@ -97,10 +97,26 @@ def line_of(error: BaseException) -> str | None:
     if isinstance(error, InputError | TrainingStopped):
         return str(error)
     frames = list(_frames(error.__traceback__))
+    if (views := _too_few_views(frames)) is not None:
+        return (
+            "ns-render interpolate flies from one photograph to the next, and there are "
+            f"{views} to test with: add --pose-source train"
+        )
     if not (_names_what_is_gone(error, frames) or _lacks_a_field(error)):
         return None
     named = next(filter(None, map(_config_read_in, frames)), None)
     return f"the run {named} {ANOTHER_VERSION}" if named else None
+
+
+def _too_few_views(frames: list[FrameType]) -> int | None:
+    """How many views nerfstudio failed to make a path of, if it did for want of a second one."""
+    for frame in frames:
+        if (
+            frame.f_code.co_name == "get_interpolated_poses_many"
+            and len(frame.f_locals["poses"]) < 2
+        ):
+            return len(frame.f_locals["poses"])
+    return None
 
 
 def _frames(trace: TracebackType | None) -> Iterator[FrameType]:

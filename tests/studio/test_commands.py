@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+import torch
 import yaml
 from nerfstudio.scripts import train
 from nerfstudio.utils import install_checks
@@ -168,3 +169,13 @@ def test_only_a_film_needs_ffmpeg(monkeypatch: pytest.MonkeyPatch) -> None:
     sys.argv.pop()
     with pytest.raises(InputError, match="ffmpeg, which is not installed: add --output-format"):
         install_checks.check_ffmpeg_installed()
+
+
+@pytest.mark.parametrize("views", [0, 1])
+def test_a_path_through_one_photograph_is_a_line(views: int) -> None:
+    from nerfstudio.cameras.camera_utils import get_interpolated_poses_many
+
+    with pytest.raises(ValueError) as error:
+        get_interpolated_poses_many(torch.eye(3, 4).expand(views, 3, 4), torch.eye(3)[None])
+    said = line_of(error.value)
+    assert said is not None and f"there are {views} " in said and "--pose-source train" in said
