@@ -6,6 +6,7 @@ import copy
 import json
 import subprocess
 import sys
+import warnings
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +20,12 @@ from nerfstudio.utils.eval_utils import eval_setup
 from leco_plugin.method_configs import leco_occupancy
 from leco_plugin.models.failures import TrainingStopped
 from leco_plugin.scenes.input_error import InputError
-from leco_plugin.studio.commands import is_ns_command, line_of, render_images_without_ffmpeg
+from leco_plugin.studio.commands import (
+    is_ns_command,
+    line_of,
+    quiet_imports_of_our_methods,
+    render_images_without_ffmpeg,
+)
 
 FORKS = """
 import json, os, sys
@@ -179,3 +185,25 @@ def test_a_path_through_one_photograph_is_a_line(views: int) -> None:
         get_interpolated_poses_many(torch.eye(3, 4).expand(views, 3, 4), torch.eye(3)[None])
     said = line_of(error.value)
     assert said is not None and f"there are {views} " in said and "--pose-source train" in said
+
+
+@pytest.mark.parametrize(
+    ("arguments", "hidden"),
+    [
+        (["ns-eval"], True),
+        (["nerfstudio/scripts/render.py", "interpolate"], True),
+        (["ns-train", "leco-ngp"], True),
+        (["ns-train", "nerfacto"], False),
+        (["notebook"], False),
+    ],
+)
+def test_warnings_of_no_use_are_hidden_but_where_another_method_trains(
+    arguments: list[str], hidden: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(sys, "argv", arguments)
+    with warnings.catch_warnings(record=True) as shown:
+        warnings.simplefilter("always")
+        quiet_imports_of_our_methods()
+        said = "Using a non-tuple sequence for multidimensional indexing is deprecated"
+        warnings.warn_explicit(said, UserWarning, "cameras.py", 601, "nerfstudio.cameras.cameras")
+    assert (not shown) == hidden
