@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import tyro
 
@@ -71,28 +71,31 @@ def inspect(
 
 def export(
     file: Annotated[Path, tyro.conf.Positional],
-    format: Literal["ply", "splat-init", "npz", "nerfacc-grid"],
     out: Path,
-    resolution: int = 128,
+    format: Literal["ply", "splat-init", "npz", "nerfacc-grid"] | None = None,
+    resolution: int | None = None,
     levels: int | None = None,
     frame: Literal["data", "run"] | None = None,
     data: Path | None = None,
     json: Path | None = None,
 ) -> None:
-    """Write an occupancy for other programs: points, a start for splats, a volume, or a grid.
+    """Write an occupancy for other programs: into a folder all that they take, or one file.
 
     Args:
         file: An occupancy.safetensors, or a folder of runs: the newest in it.
-        format: ply is the surface of what is kept as points, in the colours of the sparse points
+        out: Folder to write pictures, points, a start for splats and a volume into; with --format,
+            the file to write.
+        format: Without it, all but the grid. ply is what the photographs show of the kept volume,
+            as points on it where their rays first meet matter, in the colours of the sparse points
             nearby; its head has the geographic origin where transforms.json has one. Without
             coloured sparse points, colours are o(x): black at 0, purple, orange, pale yellow at 1.
             splat-init is a copy of transforms.json beside the scene's own, with these points and
-            the kept sparse points as its start: ns-train splatfacto --data OUT. npz is o(x) in the
-            cells of the box. nerfacc-grid is what OccGridEstimator.load_state_dict takes, a cell
-            marked where any of 27 points in it is kept. A host that goes on updating such a grid
-            replaces it by its own.
-        out: File to write.
-        resolution: Cells along the longest side of the space, or along each axis of a grid.
+            the kept sparse points as its start: ns-train splatfacto --data OUT leco-photographs.
+            npz is o(x) in the cells of the box. nerfacc-grid is what
+            OccGridEstimator.load_state_dict takes, a cell marked where any of 27 points in it is
+            kept. A host that goes on updating such a grid replaces it by its own.
+        resolution: Cells along the longest side of the space, or along each axis of a grid. By
+            default 128, and along a flat space so many that it has as many cells as a cube.
         levels: Nested boxes of a grid, each twice as wide as the one inside it. By default one, or
             as many as the rays of an unbounded scene reach.
         frame: Coordinates of points. data, the default, are those of the poses and sparse points in
@@ -102,29 +105,51 @@ def export(
         json: File for what was written, as JSON.
     """
     from leco_plugin.export import export as write
+    from leco_plugin.export_folder import export_folder, in_words
 
     check_json(json)
-    facts = write(occupancy_of(file), format, out, resolution, levels, frame, data)
-    if format in ("ply", "splat-init"):
-        print(f"{out}: {facts['points']} points in the coordinates of the {facts['frame']}")
-        if not facts["photograph_colours"]:
-            shown = "o(x)" if format == "ply" else "grey"
-            print(f"their colour is {shown}: no sparse points with colours; --data names a scene")
-        if "geographic_origin" in facts:
-            print(f"its origin on earth: {facts['geographic_origin']}")
-        if format == "splat-init":
-            print(f"start from it with: ns-train splatfacto --data {out}")
-        if frame != facts["frame"] == "run":
-            print("the file does not say how its run moved the data: older runs did not record it")
-    elif format == "npz":
-        print(f"{out}: {facts['shape']} cells, {facts['kept_share_of_cells']:.2%} of them kept")
-    else:
-        print(
-            f"{out}: {facts['levels']} x {resolution}^3 cells, {facts['kept_share_of_cells']:.2%} "
-            "of them kept"
+    file = occupancy_of(file)
+    if format is not None:
+        facts = write(file, format, out, resolution, levels, frame, data)
+        print("\n".join(_export_in_words(out, facts, frame)))
+        write_json(json, facts)
+        return
+    if levels is not None or frame is not None:
+        raise ValueError("--levels and --frame go with --format: give one, or leave them out")
+    parts, doubted = export_folder(file, out, resolution, data)
+    print("\n".join(in_words(out, parts, doubted)))
+    write_json(json, {"format": 1, "parts": {part.name: part.facts for part in parts}})
+
+
+def _export_in_words(out: Path, facts: dict[str, Any], frame: str | None) -> list[str]:
+    """What was written, a line each.
+
+    Args:
+        frame: of points that was asked for.
+    """
+    if facts["written"] == "npz":
+        return [f"{out}: {facts['shape']} cells, {facts['kept_share_of_cells']:.2%} of them kept"]
+    if facts["written"] == "nerfacc-grid":
+        levels, cells = facts["levels"], facts["resolution"]
+        kept = f"{facts['kept_share_of_cells']:.2%} of them kept"
+        return [
+            f"{out}: {levels} x {cells}^3 cells, {kept}",
+            f"for OccGridEstimator({facts['aabbs'][0]}, {cells}, {levels})",
+        ]
+    lines = [f"{out}: {facts['points']} points in the coordinates of the {facts['frame']}"]
+    splats = facts["written"] == "splat-init"
+    if not facts["photograph_colours"]:
+        shown = "grey" if splats else "o(x)"
+        lines.append(
+            f"their colour is {shown}: no sparse points with colours; --data names a scene"
         )
-        print(f"for OccGridEstimator({facts['aabbs'][0]}, {resolution}, {facts['levels']})")
-    write_json(json, facts)
+    if "geographic_origin" in facts:
+        lines.append(f"its origin on earth: {facts['geographic_origin']}")
+    if splats:
+        lines.append(f"start from it with: ns-train splatfacto --data {out} leco-photographs")
+    if frame != facts["frame"] == "run":
+        lines.append("the file does not say how its run moved the data: learn it anew to know")
+    return lines
 
 
 def shrink(

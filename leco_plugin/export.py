@@ -1,67 +1,59 @@
 """`leco export`: an occupancy in the formats of other programs.
 
-`ply` is the surface of the kept set as coloured points; `export_scene` writes `splat-init` and
-`npz`. `nerfacc-grid` is the buffers of nerfacc's
-`OccGridEstimator`: a cell is marked where any probed point of it is kept, so that a grid keeps more
-than the gate and loses next to nothing of what the gate keeps.
+`export_surface` writes `ply`, `export_scene` `splat-init` and `npz`. `nerfacc-grid` is the buffers
+of nerfacc's `OccGridEstimator`: a cell is marked where any probed point of it is kept, so that a
+grid keeps more than the gate and loses next to nothing of what the gate keeps.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator
 from pathlib import Path
-from typing import Any, Literal, NamedTuple
+from typing import Any, Literal
 
-import numpy as np
 import torch
 from torch import Tensor
 from torch.nn.functional import max_pool3d
 
 from leco_plugin.cli_reports import check_place
-from leco_plugin.evaluation.inspection import (
-    ViewBox,
-    exposed,
-    numbers,
-    query,
-    to_the_data,
-    whole_box,
-)
+from leco_plugin.evaluation.inspection import numbers, query, to_the_data, whole_box
 from leco_plugin.export_scene import (
     comments_of,
     photograph_colours,
     write_splat_init,
     write_volume,
 )
+from leco_plugin.export_surface import (
+    CELLS,
+    MOST_CELLS,
+    Progress,
+    finest,
+    kept_surface,
+    mapped_box,
+    require_few,
+    write_ply,
+)
 from leco_plugin.log import bar
 from leco_plugin.occupancy import Occupancy
 from leco_plugin.samplers.grid import OccupancyGridEstimator
 from leco_plugin.scenes.coloured_points import description_in, description_of_run, georeference
 from leco_plugin.scenes.frames import moved
-from leco_plugin.scenes.whole_files import write_points, write_whole
+from leco_plugin.scenes.whole_files import write_whole
 
 Format = Literal["ply", "splat-init", "npz", "nerfacc-grid"]
 Frame = Literal["data", "run"]
-MOST_CELLS = 1 << 28
-"""Of an export: each holds some bytes until the file is written, which makes gigabytes."""
-COLOURS = "magma"
-"""Of matplotlib, for o(x) in [0, 1]: as in the picture of `leco inspect`."""
-CELLS_AT_ONCE = 1 << 20
-"""Cells whose places are known together; of the others only o(x) is."""
 STEPS = 2
 """Steps from one corner of a grid's cell to the next: 27 probed points, those on faces shared."""
 POINTS_AT_ONCE = 1 << 20
 MOST_LEVELS = 8
-
-Progress = Callable[[float], None]
-"""Called with the share that is done."""
 
 
 def export(
     file: Path,
     format: Format,
     out: Path,
-    resolution: int = 128,
+    resolution: int | None = None,
     levels: int | None = None,
     frame: Frame | None = None,
     data: Path | None = None,
@@ -72,7 +64,8 @@ def export(
         file: an occupancy.
         format: `ply`, `splat-init`, `npz` or `nerfacc-grid`.
         out: of what is written.
-        resolution: cells along the longest side, or along each axis of a grid.
+        resolution: cells along the longest side, or along each axis of a grid. None is `CELLS` of a
+            cube, and of a flat box as many as make as many in all.
         levels: of a grid.
         frame: of points, `data` for the coordinates of the data's own files, `run` for those of the
             run. None is `data` where the file says how. Grid and volume are in those of the run, a
@@ -93,13 +86,17 @@ def export(
             f"{file} does not say how its run moved and scaled the data: "
             + ("learn it anew" if format == "splat-init" else "give --frame run")
         )
+    if resolution is None:
+        flat = format != "nerfacc-grid"
+        box = whole_box(occupancy) if format == "npz" else mapped_box(occupancy)
+        resolution = finest(box) if flat else CELLS
     if format == "nerfacc-grid":
         facts = _export_grid(occupancy, out, resolution, levels)
     elif format == "npz":
         if resolution < 2:
             raise ValueError(f"a volume takes at least 2 cells along a side, not {resolution}")
         counts = whole_box(occupancy).cells(min(resolution, MOST_CELLS))
-        _require_few(math.prod(counts), f"{resolution} along the longest side")
+        require_few(math.prod(counts), f"{resolution} along the longest side")
         with bar(f"Asking the gate about cells of 1/{resolution}") as show:
             facts = write_volume(occupancy, resolution, back, out, show)
         facts["frame"] = "run"
@@ -168,100 +165,6 @@ def _export_grid(
     }
 
 
-def _require_few(cells: int, said: str) -> None:
-    """Refuses more than `MOST_CELLS` cells, with a ValueError that says how they lie."""
-    if cells > MOST_CELLS:
-        raise ValueError(
-            f"{said} are too many cells: an export has at most {MOST_CELLS} in all, as "
-            f"{int(MOST_CELLS ** (1 / 3))}^3 are; give a smaller --resolution"
-        )
-
-
-class KeptSurface(NamedTuple):
-    """Middles of kept cells that touch a skipped one."""
-
-    positions: Tensor
-    """[P, 3] scene units, or float64 in coordinates of the data."""
-    values: Tensor
-    """[P] o(x)."""
-
-
-def kept_surface(
-    occupancy: Occupancy, resolution: int, on_progress: Progress = lambda share: None
-) -> KeptSurface:
-    """Where the kept set ends.
-
-    Args:
-        resolution: cells along the longest side of the space in which the gate was taught. Those of
-            an unbounded scene grow with distance, as its mapping has it.
-    Raises:
-        ValueError: the resolution is below 2 or makes too many cells, or nothing is kept.
-    """
-    if resolution < 2:
-        raise ValueError(f"a surface takes at least 2 cells along a side, not {resolution}")
-    box = _mapped_box(occupancy)
-    counts = box.cells(min(resolution, MOST_CELLS))  # which are too many along one side alone
-    _require_few(math.prod(counts), f"{resolution} along the longest side")
-    axes = [box.axis(number, count) for number, count in enumerate(counts)]
-    cells, parts = math.prod(counts), []
-    for first in range(0, cells, CELLS_AT_ONCE):
-        numbers = torch.arange(first, min(first + CELLS_AT_ONCE, cells))
-        indices = torch.unravel_index(numbers, counts)
-        places = [axis[index] for axis, index in zip(axes, indices)]
-        parts.append(query(occupancy, _positions(occupancy, places)))
-        on_progress((first + len(numbers)) / cells)
-    values = torch.cat(parts).view(*counts)
-    chosen = exposed(values >= occupancy.threshold)
-    if not bool(chosen.any()):
-        raise ValueError(
-            f"the occupancy keeps nothing in cells of 1/{resolution} of its space: there is no "
-            "surface to export"
-        )
-    places = [axis[index] for axis, index in zip(axes, chosen.nonzero(as_tuple=True))]
-    return KeptSurface(_positions(occupancy, places), values[chosen])
-
-
-def _positions(occupancy: Occupancy, mapped: Sequence[Tensor]) -> Tensor:
-    """Scene positions [..., 3] on the CPU, of their three mapped coordinates [...] each."""
-    device = occupancy.threshold_value.device
-    return occupancy.space.unmap(torch.stack(list(mapped), dim=-1).to(device)).cpu()
-
-
-def _mapped_box(occupancy: Occupancy) -> ViewBox:
-    """The part of the gate's cube in which it was taught."""
-    if occupancy.space.kind != "box":
-        return ViewBox(-torch.ones(3), torch.ones(3))
-    box = whole_box(occupancy)
-    device = occupancy.threshold_value.device
-    low, high = occupancy.space.map(torch.stack([box.low, box.high]).to(device)).cpu()
-    return ViewBox(low, high)
-
-
-def write_ply(
-    surface: KeptSurface,
-    path: Path,
-    colours: np.ndarray | None = None,
-    comments: Sequence[str] = (),
-) -> None:
-    """Writes binary PLY of float64 with a colour for each point.
-
-    Args:
-        colours: [P, 3] uint8; None colours by o(x).
-        comments: lines for its head.
-    Raises:
-        OSError: it cannot be written there.
-    """
-    from matplotlib import colormaps
-
-    rows = np.empty(len(surface.values), dtype=[("xyz", "<f8", 3), ("rgb", "u1", 4)])
-    rows["xyz"] = surface.positions.numpy()
-    if colours is None:
-        rows["rgb"] = colormaps[COLOURS](surface.values.clamp(0.0, 1.0).numpy(), bytes=True)
-    else:
-        rows["rgb"] = np.pad(colours, ((0, 0), (0, 1)), constant_values=255)
-    write_points(path, rows, comments)
-
-
 def grid_buffers(
     occupancy: Occupancy,
     resolution: int = 128,
@@ -289,7 +192,7 @@ def grid_buffers(
         raise ValueError(
             f"{levels} levels of {resolution}^3 cells: a grid has at least one level and one cell"
         )
-    _require_few(levels * resolution**3, f"{levels} x {resolution}^3")
+    require_few(levels * resolution**3, f"{levels} x {resolution}^3")
     if unbounded and levels == 1:
         raise ValueError(
             "the scene is unbounded, and a grid of one level ends at its innermost box: give two "

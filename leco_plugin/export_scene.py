@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import os
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -23,6 +24,7 @@ from leco_plugin.scenes.coloured_points import (
 )
 from leco_plugin.scenes.frames import inverse, moved
 from leco_plugin.scenes.input_error import InputError
+from leco_plugin.scenes.photograph_files import find_file
 from leco_plugin.scenes.scene_file import load_json
 from leco_plugin.scenes.whole_files import write_points, write_whole
 
@@ -88,17 +90,22 @@ def write_splat_init(
 
 def _from_elsewhere(meta: dict[str, Any], scene: Path, folder: Path) -> dict[str, Any]:
     """A scene's description for another folder: its photographs stay where they are."""
-    if folder.resolve() == scene.resolve():
+    home = folder.resolve()
+    if home == scene.resolve():
         return meta
 
-    def absolute(name: str) -> str:
-        return str((scene / name).resolve())
+    def from_there(name: str) -> str:
+        path = find_file(scene / name).resolve()
+        try:
+            return Path(os.path.relpath(path, home)).as_posix()
+        except ValueError:  # on another drive of Windows
+            return str(path)
 
     frames = [
-        {key: absolute(value) if key in PATHS else value for key, value in frame.items()}
+        {key: from_there(value) if key in PATHS else value for key, value in frame.items()}
         for frame in meta["frames"]
     ]
-    splits = {key: [absolute(x) for x in meta[key]] for key in meta if key.endswith("_filenames")}
+    splits = {key: [from_there(x) for x in meta[key]] for key in meta if key.endswith("_filenames")}
     return meta | splits | {"frames": frames}
 
 

@@ -76,12 +76,13 @@ class LecoCity(Nerfstudio):
         self, split: str = "train", **kwargs: Any
     ) -> DataparserOutputs:
         from leco_plugin.scenes.city.folder import POINTS as FILE
-        from leco_plugin.scenes.frames import METRES_PER_UNIT, UP_IS_KNOWN, moved, parsed_frame
-        from leco_plugin.scenes.photographs import POINTS, read_ply
+        from leco_plugin.scenes.coloured_points import read_cloud
+        from leco_plugin.scenes.frames import METRES_PER_UNIT, UP_IS_KNOWN, parsed_frame
+        from leco_plugin.scenes.photographs import points_in_model
 
         outputs: DataparserOutputs = super()._generate_dataparser_outputs(split)
-        points = read_ply(self.config.data / FILE)
-        outputs.metadata[POINTS] = moved(points, parsed_frame(outputs).float())
+        points = read_cloud(self.config.data / FILE)
+        outputs.metadata |= points_in_model(points, parsed_frame(outputs))
         outputs.metadata |= {METRES_PER_UNIT: 1.0, UP_IS_KNOWN: True}
         return outputs
 

@@ -29,6 +29,15 @@ class ColouredPoints(NamedTuple):
     """[P, 3]."""
 
 
+class CloudFile(NamedTuple):
+    """What a file of points says."""
+
+    positions: NDArray[np.float64]
+    """[P, 3], all finite."""
+    colours: NDArray[np.uint8] | None
+    """[P, 3]; None where it has none."""
+
+
 def description_of_run(file: Path) -> Path | None:
     """The transforms.json of the run in whose folder a file lies; None where there is no run, or
     its data are no scene in nerfstudio's format."""
@@ -62,29 +71,41 @@ def _file_in(data: Path) -> Path:
     return data if data.suffix == ".json" else data / "transforms.json"
 
 
+def read_cloud(path: Path) -> CloudFile:
+    """The vertices of a .ply, without those that are not finite.
+
+    Raises:
+        InputError: the file cannot be read as points.
+    """
+    import trimesh
+
+    try:
+        # as a file and not by its name: nothing else is read that it may point to
+        with path.open("rb") as file:
+            loaded: Any = trimesh.load(file, file_type="ply")
+        positions = np.asarray(loaded.vertices, dtype=np.float64).reshape(-1, 3)
+        colours = np.asarray(getattr(loaded, "colors", ()), dtype=np.uint8)
+    except Exception as error:  # noqa: BLE001  trimesh raises whatever its parsers meet
+        raise InputError(
+            f"{path} cannot be read as sparse points: {one_line(error, 120)}"
+        ) from None
+    sound = np.isfinite(positions).all(axis=1)
+    known = len(colours) == len(positions) > 0
+    return CloudFile(positions[sound], colours[sound, :3] if known else None)
+
+
 def coloured_points(description: Path) -> ColouredPoints | None:
     """Sparse points with colours that a transforms.json names; None where it names none.
 
     Raises:
         InputError: the file of the points cannot be read.
     """
-    import trimesh
-
     name = load_json(description).get("ply_file_path")
     path = description.parent / str(name)
     if name is None or not path.is_file():
         return None
-    try:
-        with path.open("rb") as file:  # nothing else is read that it may point to
-            loaded: Any = trimesh.load(file, file_type="ply")
-        positions = np.asarray(loaded.vertices, dtype=np.float64).reshape(-1, 3)
-        colours = np.asarray(getattr(loaded, "colors", ()), dtype=np.uint8)
-    except Exception as error:  # noqa: BLE001  trimesh raises whatever its parsers meet
-        raise InputError(f"{path} cannot be read as points: {one_line(error, 120)}") from None
-    if len(colours) != len(positions) or not len(positions):
-        return None
-    sound = np.isfinite(positions).all(axis=1)
-    return ColouredPoints(positions[sound], colours[sound, :3])
+    positions, colours = read_cloud(path)
+    return None if colours is None or not len(positions) else ColouredPoints(positions, colours)
 
 
 def colours_near(known: ColouredPoints, positions: NDArray[np.float64]) -> NDArray[np.uint8]:

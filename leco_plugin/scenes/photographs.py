@@ -20,6 +20,7 @@ from rich.markup import escape
 from torch import Tensor
 
 from leco_plugin.log import say
+from leco_plugin.scenes.coloured_points import GREY, CloudFile, read_cloud
 from leco_plugin.scenes.frames import (
     METRES_PER_UNIT,
     UP_IS_KNOWN,
@@ -34,10 +35,11 @@ from leco_plugin.scenes.photograph_files import check_images, find_file
 from leco_plugin.scenes.reading import CheckedReader
 from leco_plugin.scenes.scene_file import load_json, scene_file_of
 
-POINTS = "leco_sparse_points"
-"""Key of the dataset's metadata with the sparse points [P, 3] in model coordinates."""
-POINT_KEYS = (POINTS, "points3D_xyz")
-"""Ours, and that of nerfstudio's own readers."""
+POINTS = "points3D_xyz"
+"""Key of the dataset's metadata with the sparse points [P, 3] in model coordinates, as nerfstudio's
+own readers have it."""
+COLOURS = "points3D_rgb"
+"""That of their colours, uint8 [P, 3]. nerfstudio's pipelines want both or neither."""
 
 
 @dataclass
@@ -67,9 +69,9 @@ class LecoPhotographs(CheckedReader, ReadsNear, Nerfstudio):
         if len(outputs.image_filenames) == 0 and split == "train":
             raise InputError(f"{self.config.data}: no image is left for the split {split!r}")
         frame, applied_scale = self._frame_of_file(outputs, meta)
-        points = read_points(meta, folder_of(self.config.data))
+        points = points_of(meta, folder_of(self.config.data))
         if points is not None:
-            outputs.metadata[POINTS] = moved(points, frame).float()
+            outputs.metadata |= points_in_model(points, frame)
         if up_is_known:
             outputs.metadata[UP_IS_KNOWN] = True
         if "metres_per_unit" in meta:
@@ -85,6 +87,9 @@ class LecoPhotographs(CheckedReader, ReadsNear, Nerfstudio):
         name = there.relative_to(data_dir) if there.is_relative_to(data_dir) else there
         path: Path = super()._get_fname(name, data_dir, downsample_folder_prefix)
         return there if downsample_folder_prefix == "masks_" and not path.exists() else path
+
+    def _load_3D_points(self, *_: Any) -> None:
+        """Nothing: nerfstudio reads a .ply by open3d, which needs system libraries."""
 
     def _frame_of_file(
         self, outputs: DataparserOutputs, meta: dict[str, Any]
@@ -134,8 +139,8 @@ def check_scene(data: Path) -> dict[str, Any]:
     return scene.meta
 
 
-def read_points(meta: dict[str, Any], folder: Path) -> Tensor | None:
-    """Sparse points [P, 3] float64 in the coordinates of the file, or None when there are none.
+def points_of(meta: dict[str, Any], folder: Path) -> CloudFile | None:
+    """Sparse points in the coordinates of the file, or None when there are none.
 
     A file that is named and not there is said, for learning without points is slower. InputError
     if it cannot be read.
@@ -147,24 +152,33 @@ def read_points(meta: dict[str, Any], folder: Path) -> Tensor | None:
     if not path.is_file():
         say(f"the scene names sparse points that are not there: {escape(str(path))}")
         return None
-    return read_ply(path, torch.float64)
+    return read_cloud(path)
+
+
+def points_in_model(points: CloudFile, frame: Tensor) -> dict[str, Tensor]:
+    """Sparse points and their colours as nerfstudio's own readers return them: splatfacto starts
+    there, from grey ones where the file has no colours.
+
+    Args:
+        frame: [3, 4] takes them to model coordinates.
+    """
+    colours = points.colours
+    if colours is None:
+        colours = np.full(points.positions.shape, GREY, np.uint8)
+    positions = torch.from_numpy(points.positions)
+    return {POINTS: moved(positions, frame.double()).float(), COLOURS: torch.from_numpy(colours)}
+
+
+def read_points(meta: dict[str, Any], folder: Path) -> Tensor | None:
+    """Those of `points_of` without colours [P, 3] float64, or None."""
+    points = points_of(meta, folder)
+    return None if points is None else torch.from_numpy(points.positions)
 
 
 def read_ply(path: Path, dtype: torch.dtype = torch.float32) -> Tensor:
     """The vertices [P, 3] of a file; coordinates as large as UTM's need float64. InputError if it
     cannot be read as points."""
-    import trimesh
-
-    try:
-        # as a file and not by its name: nothing else is read that it may point to
-        with path.open("rb") as file:
-            loaded: Any = trimesh.load(file, file_type="ply")
-        vertices = np.asarray(loaded.vertices, dtype=np.float64).reshape(-1, 3)
-    except Exception as error:  # noqa: BLE001  trimesh raises whatever its parsers meet
-        raise InputError(
-            f"{path} cannot be read as sparse points: {one_line(error, 120)}"
-        ) from None
-    return torch.from_numpy(vertices[np.isfinite(vertices).all(axis=1)].copy()).to(dtype)
+    return torch.from_numpy(read_cloud(path).positions).to(dtype)
 
 
 leco_photographs_dataparser = DataParserSpecification(

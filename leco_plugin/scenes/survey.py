@@ -22,7 +22,7 @@ from leco_plugin.scenes.bounds import (
 from leco_plugin.scenes.frames import ALTITUDES, DatasetUnits, units_of
 from leco_plugin.scenes.input_error import InputError
 from leco_plugin.scenes.large_coordinates import rounded_by
-from leco_plugin.scenes.photographs import POINT_KEYS
+from leco_plugin.scenes.photographs import POINTS
 
 SIDE = 8
 """A grid of this many rays a side covers each image, its corners included."""
@@ -111,8 +111,7 @@ def sparse_points(dataset: Any) -> Tensor | None:
 
 def points_in(metadata: dict[str, Any]) -> Tensor | None:
     """Sparse points [P, 3] in model coordinates in what a reader says of a dataset, or None."""
-    found = (metadata.get(key) for key in POINT_KEYS)
-    points = next((points for points in found if points is not None), None)
+    points = metadata.get(POINTS)
     return None if points is None else torch.as_tensor(points)
 
 

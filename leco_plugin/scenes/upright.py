@@ -11,7 +11,7 @@ from nerfstudio.cameras.camera_utils import rotation_matrix_between
 from nerfstudio.data.dataparsers.base_dataparser import DataparserOutputs
 from torch import Tensor
 
-from leco_plugin.scenes.photographs import POINT_KEYS
+from leco_plugin.scenes.photographs import POINTS
 
 FEWEST_CAMERAS, FEWEST_POINTS = 4, 32
 UPRIGHT = 0.94
@@ -72,10 +72,9 @@ def turned(outputs: DataparserOutputs, turn: Tensor) -> DataparserOutputs:
     outputs.dataparser_transform = (
         turn.to(outputs.dataparser_transform) @ (outputs.dataparser_transform[:3])
     )
-    for key in POINT_KEYS:
-        if outputs.metadata.get(key) is not None:
-            points = torch.as_tensor(outputs.metadata[key])
-            outputs.metadata[key] = points @ turn.to(points).T
+    if outputs.metadata.get(POINTS) is not None:
+        points = torch.as_tensor(outputs.metadata[POINTS])
+        outputs.metadata[POINTS] = points @ turn.to(points).T
     return outputs
 
 

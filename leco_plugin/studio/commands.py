@@ -75,21 +75,45 @@ def render_images_without_ffmpeg() -> None:
     install_checks.check_ffmpeg_installed = check
 
 
+NO_USE: tuple[tuple[str, type[Warning], str], ...] = (
+    # torch has renamed what nerfstudio's activations are decorated with
+    (r"`torch\.cuda\.amp\.custom_(fwd|bwd)", FutureWarning, r"nerfstudio"),
+    # nerfstudio's trainer makes its scaler by the old name
+    (r"`torch\.cuda\.amp\.GradScaler", FutureWarning, r"nerfstudio"),
+    # nerfstudio indexes cameras with lists of tensors; torch still reads them as tuples
+    (r"Using a non-tuple sequence for multidimensional indexing", UserWarning, r"nerfstudio"),
+    # nerfstudio logs losses without detaching them
+    (r"Converting a tensor with requires_grad=True", UserWarning, r"nerfstudio"),
+    # nerfstudio asks for four workers to cache images, however few cores there are
+    (r"This DataLoader will create 4 worker processes", UserWarning, r"torch"),
+    # torchmetrics warns of an import that nerfstudio's models cause in it
+    (r"Importing `spectral_angle_mapper`", FutureWarning, r""),
+    # viser 0.2.7, which nerfstudio pins, uses addresses that websockets has renamed
+    (r"websockets\.(legacy is|connection was)", DeprecationWarning, r""),
+)
+"""Message, kind and module of warnings that a user can do nothing about."""
+
 OURS = ("leco-ngp", "leco-nerfacto", "leco-occupancy", "leco-occupancy-paper", "leco-switch-nerf")
 """Methods of `ns-train` whose screen is short from its first line."""
 
 
 def quiet_imports_of_our_methods() -> None:
-    """In `ns-train` of a method of ours, nerfstudio's activations are imported without two warnings
-    of torch, which has renamed what they are decorated with.
+    """Hides warnings that a user can do nothing about, in every command of nerfstudio but
+    `ns-train` of a method that is not ours.
 
     Called by the first module of this package that nerfstudio imports, its readers, before its
     models. What it warns of earlier cannot be kept from the screen.
     """
-    if is_ns_command(sys.argv[0]) and sys.argv[1:2] and sys.argv[1] in OURS:
-        warnings.filterwarnings(
-            "ignore", r"`torch\.cuda\.amp\.custom_(fwd|bwd)", FutureWarning, r"nerfstudio"
-        )
+    program = Path(*sys.argv[:1]).name
+    trains = program.startswith(("ns-train", "train"))
+    if is_ns_command(*sys.argv[:1]) and (not trains or (sys.argv[1:2] and sys.argv[1] in OURS)):
+        hide_warnings_of_no_use()
+
+
+def hide_warnings_of_no_use() -> None:
+    """Adds a filter for each of `NO_USE`."""
+    for message, kind, module in NO_USE:
+        warnings.filterwarnings("ignore", message, kind, module)
 
 
 def line_of(error: BaseException) -> str | None:
@@ -97,10 +121,26 @@ def line_of(error: BaseException) -> str | None:
     if isinstance(error, InputError | TrainingStopped):
         return str(error)
     frames = list(_frames(error.__traceback__))
+    if (views := _too_few_views(frames)) is not None:
+        return (
+            "ns-render interpolate flies from one photograph to the next, and there are "
+            f"{views} to test with: add --pose-source train"
+        )
     if not (_names_what_is_gone(error, frames) or _lacks_a_field(error)):
         return None
     named = next(filter(None, map(_config_read_in, frames)), None)
     return f"the run {named} {ANOTHER_VERSION}" if named else None
+
+
+def _too_few_views(frames: list[FrameType]) -> int | None:
+    """How many views nerfstudio failed to make a path of, if it did for want of a second one."""
+    for frame in frames:
+        if (
+            frame.f_code.co_name == "get_interpolated_poses_many"
+            and len(frame.f_locals["poses"]) < 2
+        ):
+            return len(frame.f_locals["poses"])
+    return None
 
 
 def _frames(trace: TracebackType | None) -> Iterator[FrameType]:

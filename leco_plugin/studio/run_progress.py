@@ -99,7 +99,7 @@ class RunProgress:
 
 
 def next_commands(folder: Path, occupancy: bool, tests: bool) -> list[str]:
-    """What to run after a run: to look at it, to measure it, and to see its occupancy.
+    """What to run after a run: to look at it, to measure it, and to take its occupancy elsewhere.
 
     Args:
         folder: of the run.
@@ -115,10 +115,10 @@ def next_commands(folder: Path, occupancy: bool, tests: bool) -> list[str]:
     evaluate = f"ns-eval --load-config {config} --output-path {out('eval.json')}"
     path = out("path.mp4") if shutil.which("ffmpeg") else f"{out('path')} --output-format images"
     render = f"ns-render interpolate --load-config {config} --output-path {path}"
-    inspect = f"leco inspect {out(FILE_NAME)} --picture {out('occupancy.png')}"
+    export = f"leco export {out(FILE_NAME)} --out {out('export')}"
     if not tests:
         evaluate = f"{render} --pose-source train"
-    return [viewer, evaluate, *([inspect] if occupancy else [])]
+    return [viewer, evaluate, *([export] if occupancy else [])]
 
 
 def _phase(trainer: Any) -> str:

@@ -28,26 +28,12 @@ import rich
 from nerfstudio.utils.rich_utils import CONSOLE
 from rich.console import Console
 
+from leco_plugin.evaluation.metrics import LpipsUnavailable
 from leco_plugin.log import details_in
+from leco_plugin.studio.commands import hide_warnings_of_no_use
 
 LOG = "train.log"
 """File in a run's folder with all that the screen leaves out."""
-
-NO_USE: tuple[tuple[str, type[Warning], str], ...] = (
-    # nerfstudio's trainer makes its scaler by the old name
-    (r"`torch\.cuda\.amp\.GradScaler", FutureWarning, r"nerfstudio"),
-    # nerfstudio indexes cameras with lists of tensors; torch still reads them as tuples
-    (r"Using a non-tuple sequence for multidimensional indexing", UserWarning, r"nerfstudio"),
-    # nerfstudio logs losses without detaching them
-    (r"Converting a tensor with requires_grad=True", UserWarning, r"nerfstudio"),
-    # nerfstudio asks for four workers to cache images, however few cores there are
-    (r"This DataLoader will create 4 worker processes", UserWarning, r"torch"),
-    # torchmetrics warns of an import that nerfstudio's models cause in it
-    (r"Importing `spectral_angle_mapper`", FutureWarning, r""),
-    # viser 0.2.7, which nerfstudio pins, uses addresses that websockets has renamed
-    (r"websockets\.(legacy is|connection was)", DeprecationWarning, r""),
-)
-"""Message, kind and module of warnings that a user can do nothing about."""
 
 ESCAPES = re.compile(r"\x1b\[[0-9;?]*[A-Za-z]")
 
@@ -75,8 +61,9 @@ def _short(path: Path) -> Iterator[None]:
         for console in (CONSOLE, rich.get_console()):
             stack.enter_context(_printing_to(console, plain))
         stack.enter_context(warnings.catch_warnings())
-        for message, kind, module in NO_USE:
-            warnings.filterwarnings("ignore", message, kind, module)
+        hide_warnings_of_no_use()
+        # of the images that nerfstudio measures now and then; ns-eval says it
+        warnings.filterwarnings("ignore", category=LpipsUnavailable)
         stack.enter_context(details_in(plain))
         yield
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 
 import numpy as np
@@ -10,20 +11,38 @@ import torch
 import trimesh
 from ball_occupancy import CENTRE, HALF, RADIUS, ball
 
-from leco_plugin.export import kept_surface, write_ply
+from leco_plugin.export_surface import finest, kept_surface, mapped_box, write_ply
 from leco_plugin.occupancy import Occupancy
 from leco_plugin.space import Space
 
 
-def test_points_lie_on_the_ball() -> None:
-    surface = kept_surface(ball(), 64)
-    distances = (surface.positions - torch.tensor(CENTRE)).norm(dim=-1)
+@pytest.mark.parametrize("threshold", [0.5, 0.02])
+def test_points_lie_on_the_ball_however_much_air_is_kept_around_it(threshold: float) -> None:
+    known = ball()
+    occupancy = Occupancy(known.gate, known.space, threshold, report=known.report).eval()
+    surface = kept_surface(occupancy, 64)
+    offsets = surface.positions - torch.tensor(CENTRE)
     cell = 2 * HALF / 64
-    assert len(surface.positions) > 1000
+    assert len(surface.positions) > 600
     # within a cell's diagonal of the kept set's end, which is itself some hundredths off the ball
-    assert float((distances - RADIUS).abs().quantile(0.95)) < 3**0.5 * cell + 0.1
-    assert bool(ball().occupied(surface.positions).all())
-    assert torch.equal(surface.values, ball().query(surface.positions))
+    assert float((offsets.norm(dim=-1) - RADIUS).abs().quantile(0.95)) < 3**0.5 * cell + 0.1
+    assert float(offsets[:, 2].quantile(0.01)) > -0.5 * RADIUS  # no camera is below it
+    assert bool(occupancy.occupied(surface.positions).all())
+    assert torch.equal(surface.values, occupancy.query(surface.positions))
+
+
+def test_without_cameras_points_are_where_the_kept_set_ends() -> None:
+    known = ball()
+    surface = kept_surface(Occupancy(known.gate, known.space, 0.5).eval(), 64)
+    offsets = surface.positions - torch.tensor(CENTRE)
+    assert len(surface.positions) > 1000 and float(offsets[:, 2].min()) < -0.9 * RADIUS
+
+
+def test_a_flat_box_has_as_many_cells_as_a_cube() -> None:
+    box = mapped_box(ball())
+    flat = box.__class__(box.low, torch.lerp(box.low, box.high, torch.tensor([1.0, 1.0, 0.1])))
+    assert finest(box.__class__(-torch.ones(3), torch.ones(3))) == 128
+    assert finest(flat) > 200 and math.prod(flat.cells(finest(flat))) < 1.1 * 128**3
 
 
 def test_other_programs_read_places_and_colours(tmp_path: Path) -> None:
@@ -57,7 +76,7 @@ def test_an_occupancy_that_keeps_nothing_is_refused_in_one_line() -> None:
 
 def test_slabs_do_not_change_the_surface(monkeypatch: pytest.MonkeyPatch) -> None:
     whole = kept_surface(ball(), 20)
-    monkeypatch.setattr("leco_plugin.export.CELLS_AT_ONCE", 1000)
+    monkeypatch.setattr("leco_plugin.export_surface.CELLS_AT_ONCE", 1000)
     parts = kept_surface(ball(), 20)
     assert torch.equal(whole.positions, parts.positions)
     assert torch.equal(whole.values, parts.values)
@@ -67,6 +86,6 @@ def test_slabs_do_not_change_the_surface(monkeypatch: pytest.MonkeyPatch) -> Non
 def test_more_cells_than_memory_holds_are_refused_before_the_gate_is_asked(
     resolution: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("leco_plugin.export.query", None)
+    monkeypatch.setattr("leco_plugin.export_surface.query", None)
     with pytest.raises(ValueError, match=f"^{resolution} along .* too many .* smaller --resol"):
         kept_surface(ball(), resolution)

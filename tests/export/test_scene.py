@@ -12,6 +12,7 @@ import trimesh
 from ball_occupancy import CENTRE, RADIUS, ball
 
 from leco_plugin.export import export
+from leco_plugin.export_folder import export_folder, in_words
 from leco_plugin.occupancy import Occupancy
 from leco_plugin.scenes.whole_files import write_points
 
@@ -75,7 +76,7 @@ def test_a_start_for_splats_is_a_copy_of_the_scene_with_kept_points(
     assert np.linalg.norm(points - 2.0 * np.array(CENTRE), axis=1).max() < 2.6 * RADIUS
     export(file, "splat-init", tmp_path / "else" / "t.json", 32, data=scene)
     made = json.loads((tmp_path / "else" / "t.json").read_text())
-    photograph = str((scene / "images/a.png").resolve())
+    photograph = "../scene/images/a.png"
     assert made["frames"][0]["file_path"] == made["train_filenames"][0] == photograph
 
 
@@ -105,3 +106,33 @@ def test_what_does_not_go_together_is_refused_in_one_line(
         with pytest.raises(ValueError, match=said) as error:
             export(file, *options)
         assert "\n" not in str(error.value)
+
+
+def test_a_folder_has_everything_and_says_what_each_part_is_for(
+    file: Path, scene: Path, tmp_path: Path
+) -> None:
+    folder = tmp_path / "new" / "all"
+    parts, doubted = export_folder(file, folder, 32, scene)
+    names = ["occupancy.png", "occupancy.html", "kept.ply", "splats.json", "volume.npz"]
+    assert [part.name for part in parts if part.facts] == names and not doubted
+    assert {path.name for path in folder.iterdir()} == {*names, "splats.ply"}
+    said = "\n".join(in_words(folder, parts, doubted))
+    for words in ("colours: of the photographs", "origin on earth", "leco-photographs"):
+        assert words in said
+    assert "not written" not in said
+
+
+def test_a_part_that_cannot_be_made_is_one_line_and_the_others_are_written(
+    file: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for name in ("draw", "write_page"):  # seconds, and the test before has drawn
+        monkeypatch.setattr(f"leco_plugin.export_folder.{name}", lambda *_, **__: None)
+    parts, _ = export_folder(file, tmp_path / "all", 32)
+    lines = in_words(tmp_path / "all", parts, [])
+    assert len(lines) == 6 and sum("colours: o(x)" in line for line in lines) == 1
+    assert lines[-1].startswith("not written: splats.json: ") and "--data" in lines[-1]
+    assert not (tmp_path / "all" / "splats.json").exists()
+    with pytest.raises(ValueError, match="is a file"):
+        export_folder(file, file, 32)
+    with pytest.raises(ValueError, match="no transforms"):
+        export_folder(file, tmp_path / "all", 32, tmp_path)

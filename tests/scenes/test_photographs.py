@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import shutil
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +15,7 @@ import trimesh
 from PIL import Image
 from scene_files import change, refused
 
-from leco_plugin.scenes.frames import METRES_PER_UNIT
+from leco_plugin.scenes.frames import METRES_PER_UNIT, moved, parsed_frame
 from leco_plugin.scenes.photographs import (
     POINTS,
     LecoPhotographsDataParserConfig,
@@ -23,6 +24,7 @@ from leco_plugin.scenes.photographs import (
     read_points,
     taken_from_above,
 )
+from leco_plugin.scenes.whole_files import write_points
 
 
 def set_pose(value: Any) -> Callable[[dict[str, Any]], None]:
@@ -238,3 +240,26 @@ def test_scenes_are_told_apart_by_what_is_in_them(tiny_scene: Path, tmp_path: Pa
     text = (tiny_scene / "transforms.json").read_text()
     (moved / "transforms.json").write_text(text.replace('"fl_x": 32.0', '"fl_x": 33.0'))
     assert describe_scene(moved)["digest"] != seen["digest"]
+
+
+def test_splatfacto_starts_from_the_sparse_points_and_their_colours(scene: Path) -> None:
+    """In its own data manager, in the model's coordinates; open3d is not asked."""
+    from nerfstudio.configs.method_configs import method_configs
+
+    rows = np.zeros(40, dtype=[("xyz", "<f8", 3), ("rgb", "u1", 3)])
+    xyz = np.random.default_rng(0).normal(size=(40, 3))
+    rows["xyz"], rows["rgb"] = xyz, (250, 128, 3)
+    write_points(scene / "points.ply", rows)
+    change(scene, lambda meta: meta.update(ply_file_path="points.ply"))
+    config = replace(
+        method_configs["splatfacto"].pipeline.datamanager,
+        dataparser=LecoPhotographsDataParserConfig(data=scene, load_3D_points=True),
+        cache_images="gpu",  # which is where the model is: on the CPU here
+    )
+    manager: Any = config.setup(device="cpu", test_mode="val", world_size=1, local_rank=0)
+    outputs = manager.train_dataparser_outputs
+    places, colours = (outputs.metadata[f"points3D_{name}"] for name in ("xyz", "rgb"))
+    expected = moved(torch.from_numpy(xyz), parsed_frame(outputs).double())
+    assert torch.allclose(places, expected.float(), atol=1e-5)
+    assert colours.dtype == torch.uint8 and colours.tolist() == rows["rgb"].tolist()
+    assert manager.next_train(0)[1]["image"].shape == (32, 32, 3)

@@ -6,10 +6,12 @@ import copy
 import json
 import subprocess
 import sys
+import warnings
 from pathlib import Path
 from typing import Any
 
 import pytest
+import torch
 import yaml
 from nerfstudio.scripts import train
 from nerfstudio.utils import install_checks
@@ -18,7 +20,12 @@ from nerfstudio.utils.eval_utils import eval_setup
 from leco_plugin.method_configs import leco_occupancy
 from leco_plugin.models.failures import TrainingStopped
 from leco_plugin.scenes.input_error import InputError
-from leco_plugin.studio.commands import is_ns_command, line_of, render_images_without_ffmpeg
+from leco_plugin.studio.commands import (
+    is_ns_command,
+    line_of,
+    quiet_imports_of_our_methods,
+    render_images_without_ffmpeg,
+)
 
 FORKS = """
 import json, os, sys
@@ -168,3 +175,35 @@ def test_only_a_film_needs_ffmpeg(monkeypatch: pytest.MonkeyPatch) -> None:
     sys.argv.pop()
     with pytest.raises(InputError, match="ffmpeg, which is not installed: add --output-format"):
         install_checks.check_ffmpeg_installed()
+
+
+@pytest.mark.parametrize("views", [0, 1])
+def test_a_path_through_one_photograph_is_a_line(views: int) -> None:
+    from nerfstudio.cameras.camera_utils import get_interpolated_poses_many
+
+    with pytest.raises(ValueError) as error:
+        get_interpolated_poses_many(torch.eye(3, 4).expand(views, 3, 4), torch.eye(3)[None])
+    said = line_of(error.value)
+    assert said is not None and f"there are {views} " in said and "--pose-source train" in said
+
+
+@pytest.mark.parametrize(
+    ("arguments", "hidden"),
+    [
+        (["ns-eval"], True),
+        (["nerfstudio/scripts/render.py", "interpolate"], True),
+        (["ns-train", "leco-ngp"], True),
+        (["ns-train", "nerfacto"], False),
+        (["notebook"], False),
+    ],
+)
+def test_warnings_of_no_use_are_hidden_but_where_another_method_trains(
+    arguments: list[str], hidden: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(sys, "argv", arguments)
+    with warnings.catch_warnings(record=True) as shown:
+        warnings.simplefilter("always")
+        quiet_imports_of_our_methods()
+        said = "Using a non-tuple sequence for multidimensional indexing is deprecated"
+        warnings.warn_explicit(said, UserWarning, "cameras.py", 601, "nerfstudio.cameras.cameras")
+    assert (not shown) == hidden

@@ -131,8 +131,8 @@ def test_what_is_measured_changes_no_weight(
 
 
 def test_commands_are_of_what_there_is() -> None:
-    viewer, evaluate, inspect = next_commands(Path("a run"), occupancy=True, tests=True)
+    viewer, evaluate, export = next_commands(Path("a run"), occupancy=True, tests=True)
     assert viewer == "ns-viewer --load-config 'a run/config.yml'"
-    assert evaluate.startswith("ns-eval ") and inspect.startswith("leco inspect 'a run/occ")
+    assert evaluate.startswith("ns-eval ") and export.startswith("leco export 'a run/occ")
     _, render = next_commands(Path("run"), occupancy=False, tests=False)
     assert render.startswith("ns-render interpolate ") and render.endswith("--pose-source train")

@@ -23,10 +23,10 @@ from nerfstudio.cameras.cameras import Cameras, CameraType
 from nerfstudio.data.dataparsers.base_dataparser import DataparserOutputs
 from numpy.typing import NDArray
 from PIL import Image
-from torch import Tensor
 
 from leco_plugin.log import bar, console
-from leco_plugin.scenes.frames import ALTITUDES, METRES_PER_UNIT, UP_IS_KNOWN, moved
+from leco_plugin.scenes.coloured_points import CloudFile, read_cloud
+from leco_plugin.scenes.frames import ALTITUDES, METRES_PER_UNIT, UP_IS_KNOWN
 from leco_plugin.scenes.input_error import InputError, one_line
 from leco_plugin.scenes.large_coordinates import far_origin, with_transform
 from leco_plugin.scenes.mega_nerf_format.files import Frame, MegaNerfScene, read_scene
@@ -39,7 +39,7 @@ from leco_plugin.scenes.photograph_files import (
     open_image,
     plain,
 )
-from leco_plugin.scenes.photographs import POINTS, read_ply
+from leco_plugin.scenes.photographs import points_in_model
 
 if TYPE_CHECKING:
     from leco_plugin.scenes.mega_nerf import MegaNerfDataParserConfig
@@ -96,7 +96,7 @@ def outputs_of(
         metadata[ALTITUDES] = coordinates.height_of(ground), coordinates.height_of(top)
     points = _points(config)
     if points is not None:
-        metadata[POINTS] = (moved(points, transform) / coordinates.metres).float()
+        metadata |= points_in_model(points, transform / coordinates.metres)
     outputs = DataparserOutputs(
         image_filenames=images,
         cameras=_cameras(scene, frames, factor, right),
@@ -139,11 +139,11 @@ def _for_each(what: str, frames: list[Frame], make: Callable[[Frame], Any]) -> l
     return made
 
 
-def _points(config: MegaNerfDataParserConfig) -> Tensor | None:
-    """Sparse points [P, 3] as the file has them, if there is one."""
+def _points(config: MegaNerfDataParserConfig) -> CloudFile | None:
+    """Sparse points as the file has them, if there is one."""
     path = config.points or config.data / "points.ply"
     if path.is_file():
-        return read_ply(path, torch.float64)
+        return read_cloud(path)
     if config.points is not None:
         raise InputError(f"there is no file {path} with sparse points")
     return None

@@ -74,8 +74,13 @@ def find_photographs(folder: Path, out: Path) -> list[Photograph]:
     if len(found) < FEWEST:
         number = f"{len(found) or 'no'} photograph{'' if len(found) == 1 else 's'}"
         raw = sum(path.suffix.lower() in RAW for path in files)
-        instead = f"; {raw} raw files are not read, save them as JPEG" if raw else ""
-        raise InputError(f"{folder} has {number}, and {FEWEST} or more are needed{instead}")
+        remedy = "take more, from different places, whose pictures overlap by two thirds"
+        if raw:
+            remedy = f"{raw} raw files are not read, save them as JPEG"
+        elif not found:
+            kinds = ", ".join(sorted(KINDS))
+            remedy = f"give the folder that holds them; files that end in {kinds} are read"
+        raise InputError(f"{folder} has {number}, and {FEWEST} or more are needed: {remedy}")
     _allow_heic([path for path in found if path.suffix.lower() in HEIC])
     photographs = [_read(path, folder) for path in found]
     _refuse_mixed_alpha(photographs)

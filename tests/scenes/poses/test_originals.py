@@ -129,7 +129,7 @@ def test_what_cannot_be_used_is_named_with_a_remedy(folder: Path, tmp_path: Path
     refused(r"1 of 4 photographs have an alpha channel, .*clear.png: give it to all")
     (folder / "clear.png").unlink()
     (folder / "IMG_0.jpg").unlink()
-    refused("has 2 photographs, and 3 or more are needed")
+    refused("has 2 photographs, and 3 or more are needed: take more")
 
 
 def test_damaged_exif_is_no_reason_to_refuse(folder: Path, tmp_path: Path) -> None:
@@ -143,6 +143,8 @@ def test_damaged_exif_is_no_reason_to_refuse(folder: Path, tmp_path: Path) -> No
 def test_a_folder_of_raw_files_says_what_to_do(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="there is no folder"):
         find_photographs(tmp_path / "nowhere", tmp_path / "out")
+    with pytest.raises(InputError, match=r"no photographs, .*give the folder .*\.jpg"):
+        find_photographs(tmp_path, tmp_path / "out")
     (tmp_path / "DJI_0001.DNG").write_bytes(b"raw")
     with pytest.raises(InputError, match=r"no photographs, .*1 raw files are not read, save them"):
         find_photographs(tmp_path, tmp_path / "out")
