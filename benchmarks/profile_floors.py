@@ -57,9 +57,9 @@ def of_data(result: Any, *_: Any, **__: Any) -> Work:
     return Work(bytes=len(bundle) * (3 + 3 * POSITION))
 
 
-def of_rays(result: Any, bundle: Any, *_: Any, **__: Any) -> Work:
-    """A model's `forward`, which is a part of nothing."""
-    return Work(rays=len(bundle))
+def of_rays(result: Any, *bundle: Any, **named: Any) -> Work:
+    """A model's `forward` of a bundle, which nerfstudio gives by its name or without."""
+    return Work(rays=sum(len(each) for each in (*bundle, *named.values())))
 
 
 def of_samples(result: Any, *_: Any, **__: Any) -> Work:

@@ -12,6 +12,8 @@ PARTS = (
     *("weights", "loss", "optimizer", "rest"),
 )
 """In the order of a step."""
+BUSY = 0.5
+"""Mean processes that ran when it began, from which on figures are not to be trusted."""
 VIEW = 480 * 360
 """Pixels of the view that rendering is told of."""
 
@@ -26,7 +28,8 @@ def profile_sections(report: dict[str, Any]) -> list[str]:
         "Milliseconds of a training step, forward + backward, and of a rendered view of 480 x 360. "
         "A backward operation belongs to the part whose forward has made its node. The *floor* is "
         "what a part's bytes and operations take at the speed at which this machine copies and "
-        "multiplies matrices, each value moved once: a part far above its floor has room.\n",
+        "multiplies matrices, each value moved once: a part far above its floor has room. "
+        "What fits a cache may be faster.\n",
     ]
     for scene, methods in report["scenes"].items():
         for method, row in methods.items():
@@ -46,12 +49,15 @@ def _sentence(row: dict[str, Any]) -> str:
     share = (taken[first] + taken[second]) / guided["ms"]
     back = sum(each["backward"] for each in guided["parts"].values()) / guided["ms"]
     speed = row["ceilings"]
+    busy = ""
+    if row["load"] >= BUSY:
+        busy = f" **Other processes ran meanwhile (load {row['load']}): times are too long.**"
     return (
         f"{first.capitalize()} and {second} take {share:.0%} of a guided step, the backward pass "
         f"{back:.0%}. A test view is rendered at {row['rendering']['rays_a_second']:,} rays a "
         f"second: {VIEW / row['rendering']['rays_a_second']:.3g} s for 480 x 360. The machine "
-        f"copies {speed['bytes_per_second'] / 1e9:.3g} GB and multiplies "
-        f"{speed['operations_per_second'] / 1e9:.3g} billion operations a second."
+        f"copies at {speed['bytes_per_second'] / 1e9:.3g} GB/s and multiplies matrices at "
+        f"{speed['operations_per_second'] / 1e9:.3g} GFLOP/s.{busy}"
     )
 
 

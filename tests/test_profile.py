@@ -98,10 +98,11 @@ def test_the_page_says_what_takes_most() -> None:
     small = dict(forward=1.0, backward=0.0, forward_floor=0.0, backward_floor=0.0)
     phase = {"rays": 10, "samples": 100, "ms": 10.0, "parts": {"field": part, "rest": small}}
     row = {"guided": phase | {"unprofiled_ms": 9.0}, "rendering": phase | {"rays_a_second": 100}}
-    row |= {"ceilings": {"bytes_per_second": 1e9, "operations_per_second": 1e9}}
+    row |= {"load": 2.0, "ceilings": {"bytes_per_second": 1e9, "operations_per_second": 1e9}}
     text = "\n".join(profile_sections({"machine": {}, "scenes": {"city": {"leco-ngp": row}}}))
     assert "Field and rest take 100% of a guided step, the backward pass 60%" in text
     assert "| field | 3.00 + 6.00 | 0.50 + 1.00 |" in text and "| learning" not in text
+    assert "Other processes ran meanwhile (load 2.0)" in text
 
 
 def test_the_standard_library_keeps_its_profile() -> None:
