@@ -69,15 +69,23 @@ def by_events(function: Callable[[], Any]) -> float:
     return begin.elapsed_time(end) / 1e3  # CUDA only
 
 
-def measure_ceilings(device: torch.device, size: int, rounds: int) -> Ceilings:
-    """Copy bandwidth (read and written bytes) and rate of a square bf16 matrix product.
+def measure_ceilings(
+    device: torch.device,
+    size: int,
+    rounds: int,
+    dtype: torch.dtype = torch.bfloat16,
+    values: int | None = None,
+) -> Ceilings:
+    """Copy bandwidth (read and written bytes) and rate of a square matrix product.
 
     Args:
-        size: side of the matrices; the copy moves four bytes for each of their elements.
+        size: side of the matrices.
+        dtype: of the matrices.
+        values: float32 that are copied, more than caches hold; as many as a matrix has by default.
     """
-    source = torch.zeros(size, size, device=device)
+    source = torch.zeros(values or size**2, device=device)
     target = torch.empty_like(source)
     copied = seconds(lambda: target.copy_(source), device, rounds)
-    left = torch.randn(size, size, device=device).to(torch.bfloat16)
+    left = torch.randn(size, size, device=device).to(dtype)
     multiplied = seconds(lambda: left @ left, device, rounds)
     return Ceilings(2.0 * source.numel() * 4 / copied, 2.0 * size**3 / multiplied)

@@ -21,6 +21,7 @@ from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
+import checkout  # noqa: F401
 import torch
 import tyro
 from growth_figures import bytes_for, exponents, grid_for

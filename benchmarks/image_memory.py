@@ -19,6 +19,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
 
+import checkout  # noqa: F401
 import numpy as np
 import tyro
 from PIL import Image

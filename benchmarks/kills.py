@@ -27,6 +27,7 @@ import time
 from pathlib import Path
 from typing import Any
 
+import checkout  # noqa: F401
 import psutil
 
 from leco_plugin.evaluation.report import describe_machine, write_json

@@ -19,6 +19,7 @@ from large_scene_tables import LARGE_SCENES
 from learning import sentence as learning_sentence
 from page_parts import RESULTS, ROOT, machine_line, made_line, picture, section, table
 from page_pictures import GROWTH, LEARNING, draw_pictures, is_stale, pictures
+from profile_page import profile_sections
 from readme_parts import demo_table, readme
 from sharpening import sharpening_sections
 from sizes_sections import sizes_sections
@@ -173,6 +174,8 @@ def page() -> str:
         parts += learning_section(json.loads(learning.read_text()))
     if (sharpened := RESULTS / "sharpening.json").exists():
         parts += sharpening_sections(json.loads(sharpened.read_text()))
+    if (profiled := RESULTS / "profile.json").exists():
+        parts += profile_sections(json.loads(profiled.read_text()))
     parts += sizes_sections()
     parts += large_scene_sections()
     for sampling in sorted(RESULTS.glob("sampling*.json")):

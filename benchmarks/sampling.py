@@ -14,6 +14,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import checkout  # noqa: F401
 import torch
 import tyro
 from sampling_hosts import ngp_like_step, switch_nerf_like_step

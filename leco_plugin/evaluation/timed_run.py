@@ -125,7 +125,7 @@ def timed_run(
     Returns:
         The record, and the trainer with its model.
     """
-    trainer = _set_up(config, budget, seed)
+    trainer = set_up(config, budget, seed)
     run = TimedRun(config.method_name or "", sampler, seed)
     model = trainer.pipeline.model
     with count_queries(model) as queries:
@@ -141,7 +141,7 @@ def timed_run(
     return run, trainer
 
 
-def _set_up(config: TrainerConfig, budget: Budget, seed: int) -> Trainer:
+def set_up(config: TrainerConfig, budget: Budget, seed: int) -> Trainer:
     """A trainer that logs, saves and evaluates nothing by itself."""
     for sow in (random.seed, np.random.seed, torch.manual_seed):
         sow(seed)
