@@ -170,6 +170,7 @@ class HMoEField(nn.Module):
         """Whether `networks.c` knows the experts: residual, without a skip, beside the identity."""
         experts = self.config.experts
         plain = experts.residual and experts.skip is None and experts.empty_expert == "identity"
+        plain = plain and experts.layers > 1
         return plain and max(experts.width, self.encoding.out_dim) <= native.WIDEST
 
     def _native_densities(

@@ -99,6 +99,37 @@ def test_a_field_answers_as_torch_does(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @needs_compiler
+def test_a_gate_that_does_not_learn_answers_alike_with_and_without_gradients() -> None:
+    gate = Gate(GateConfig(width=16, layers=1)).requires_grad_(False)
+    mapped = torch.rand(99, 3)
+    with torch.no_grad():
+        ours = gate(mapped)
+    assert torch.equal(gate(mapped), ours)
+    assert gate(mapped.requires_grad_()).requires_grad
+
+
+@needs_compiler
+def test_a_gate_does_not_hide_what_is_no_number() -> None:
+    gate = Gate(GateConfig(width=16, layers=1)).requires_grad_(False)
+    gate.hidden[0].bias[3] = torch.nan
+    assert bool(gate(torch.rand(5, 3)).isnan().all())
+
+
+@needs_compiler
+def test_experts_of_one_layer_answer_as_they_learn() -> None:
+    torch.manual_seed(0)
+    grid = EncodingConfig("hash", levels=2, log2_table=6, coarsest=4, finest=9)
+    field = HMoEField(FieldConfig(grid, HMoEConfig(scene_experts=2, width=9, layers=1)), 1)
+    for parameter in field.parameters():
+        parameter.data.normal_(0.0, 0.3)
+    mapped, routes, factors = torch.rand(30, 3), torch.arange(30) % 3, torch.ones(30)
+    with torch.no_grad():
+        ours = field.density(mapped, routes, factors)
+    for one, other in zip(ours, field.density(mapped, routes, factors), strict=True):
+        torch.testing.assert_close(one, other.detach(), rtol=1e-4, atol=1e-5)
+
+
+@needs_compiler
 def test_positions_in_other_strides_are_read_as_they_are() -> None:
     encoding = HashEncoding(levels=2, features=2, log2_table=6, coarsest=4, finest=9)
     columns = torch.rand(3, 50) * 2 - 1

@@ -10,6 +10,7 @@ import ctypes
 import functools
 import logging
 import os
+import shlex
 import shutil
 import subprocess
 import tempfile
@@ -45,21 +46,22 @@ def has_native() -> bool:
 @functools.cache
 def _library() -> ctypes.CDLL | None:
     """The routines, or None with one line in the log that says why."""
-    named = os.environ.get("CC", "").split()[:1]
-    compiler = next(filter(None, map(shutil.which, (*named, *COMPILERS))), None)
+    named = shlex.split(os.environ.get("CC", ""))
+    known = ([name] for name in COMPILERS if shutil.which(name))
+    compiler = named if named and shutil.which(named[0]) else next(known, None)
     if compiler is None:
         _log.info("no C compiler: torch does all the work, some twice as slowly")
         return None
-    with tempfile.TemporaryDirectory() as folder:
+    with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as folder:
         made = Path(folder, "native.so")
-        command = [compiler, *FLAGS, *map(str, SOURCES), "-o", str(made), "-lm"]
+        command = [*compiler, *FLAGS, *map(str, SOURCES), "-o", str(made), "-lm"]
         try:
             subprocess.run(command, check=True, capture_output=True, timeout=SECONDS)
             return ctypes.CDLL(str(made))
         except (OSError, subprocess.SubprocessError) as error:
             said = getattr(error, "stderr", None) or str(error).encode()
             why = (said.decode(errors="replace").strip().splitlines() or [type(error).__name__])[0]
-            _log.info("%s fails, torch answers in place of routines in C: %s", compiler, why)
+            _log.info("%s fails, torch answers in place of routines in C: %s", compiler[0], why)
             return None
 
 
@@ -71,8 +73,8 @@ def suits(*tensors: Tensor) -> bool:
 
 def answers_without_graph(*tensors: Tensor) -> bool:
     """Whether networks may be asked in C: nobody wants a gradient, or the products in halves."""
-    asked = torch.is_grad_enabled() or torch.is_autocast_enabled("cpu")
-    return not asked and suits(*tensors)
+    graph = torch.is_grad_enabled() and any(one.requires_grad for one in tensors)
+    return not graph and not torch.is_autocast_enabled("cpu") and suits(*tensors)
 
 
 def hash_sums(positions: Tensor, resolutions: Tensor, table: Tensor, corners: int) -> Tensor:
@@ -170,6 +172,7 @@ def field_densities(
     width = len(parts[1])  # type: ignore[arg-type]
     hidden, raw = features.new_empty(len(features), width), features.new_empty(len(features))
     routine, addresses = _routine("field_densities"), _addresses(parts)
+    routes = routes.long().contiguous()
     order, features, factors = routes.argsort(), features.contiguous(), factors.contiguous()
     pointers = _pointers(features, order, routes, factors)
 
@@ -214,8 +217,12 @@ def _in_threads(work: Callable[[int, int], None], count: int, most: int) -> None
     threads = max(1, min(torch.get_num_threads(), most, count))
     cuts = [count * i // threads for i in range(threads + 1)]
     others = [threading.Thread(target=work, args=part) for part in pairwise(cuts[1:])]
-    for other in others:
-        other.start()
-    work(cuts[0], cuts[1])
-    for other in others:
-        other.join()
+    started = []
+    try:
+        for other in others:
+            other.start()
+            started.append(other)
+        work(cuts[0], cuts[1])
+    finally:  # nothing is freed that a thread still writes
+        for other in started:
+            other.join()

@@ -46,7 +46,7 @@ outputs_of(const float *weights, const float *biases, int inputs, const float (*
             for (int v = 0; v < 3; v++) {
                 Lanes *place = (Lanes *)&out[r][b] + v, value = sums[r][v];
                 if (then == RELU)
-                    value = (Lanes)((Ints)value & (value > 0));
+                    value = (Lanes)((Ints)value & ~(value <= 0)); /* keeps NaN */
                 *place = then == ADDED ? *place + value : value;
             }
     }
