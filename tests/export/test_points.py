@@ -28,8 +28,9 @@ def test_points_lie_on_the_ball_however_much_air_is_kept_around_it(threshold: fl
     assert float((offsets.norm(dim=-1) - RADIUS).abs().quantile(0.95)) < 3**0.5 * cell + 0.1
     assert float(offsets[:, 2].quantile(0.01)) > -0.5 * RADIUS  # no camera is below it
     assert bool(occupancy.occupied(surface.positions).all())
-    with torch.no_grad():  # as the export asks
-        assert torch.equal(surface.values, occupancy.query(surface.positions))
+    # alike but for the last digit, in which a batch's end may round otherwise
+    again = occupancy.query(surface.positions)
+    torch.testing.assert_close(surface.values, again, rtol=1e-6, atol=1e-8)
 
 
 def test_without_cameras_points_are_where_the_kept_set_ends() -> None:
