@@ -17,7 +17,6 @@ from weakref import WeakKeyDictionary
 import torch
 from torch import Tensor, nn
 
-from leco_plugin.models.compute import native
 from leco_plugin.models.compute.dispatch import filled_size
 from leco_plugin.models.encodings import Encoding, FrequencyEncoding
 from leco_plugin.models.gate import EMPTY, Gate
@@ -58,8 +57,8 @@ def occupancy_of(gate: Gate, mapped: Tensor, dtype: torch.dtype) -> Tensor:
     Returns:
         [N] float32 in [0, 1].
     """
-    if dtype == torch.float32 and native.has_native():
-        with torch.no_grad(), torch.autocast("cpu", enabled=False):
+    with torch.no_grad(), torch.autocast("cpu", enabled=False):
+        if dtype == torch.float32 and gate.answers_natively(mapped):
             return gate.occupancy(mapped)
     count = len(mapped)
     filling = filled_size(count) - count

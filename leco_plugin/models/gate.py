@@ -124,14 +124,15 @@ class Gate(nn.Module):
 
     def forward(self, mapped: Tensor) -> Tensor:
         """Mapped positions [N, 3] in [-1, 1] to logits [N, 1 + n] float32; 0 is emptiness."""
-        if self._answers_natively(mapped):
+        if self.answers_natively(mapped):
             return self._native_logits(mapped)
         features = self.encoding(pad_to_steady_size(mapped))
         for layer in self.hidden:
             features = torch.relu(layer(features))
         return logits_of(features, self.norm, self.head)[: len(mapped)]
 
-    def _answers_natively(self, mapped: Tensor) -> bool:
+    def answers_natively(self, mapped: Tensor) -> bool:
+        """Whether `networks.c` is asked about these positions now."""
         widest = max(self.encoding.out_dim, self.config.width, 1 + self.config.scene_experts)
         known = isinstance(self.encoding, FrequencyEncoding) and widest <= native.WIDEST
         return known and native.answers_without_graph(mapped, self.head.weight)
