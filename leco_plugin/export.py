@@ -27,6 +27,7 @@ from leco_plugin.export_scene import (
 from leco_plugin.export_surface import (
     CELLS,
     MOST_CELLS,
+    KeptSurface,
     Progress,
     finest,
     kept_surface,
@@ -57,6 +58,7 @@ def export(
     levels: int | None = None,
     frame: Frame | None = None,
     data: Path | None = None,
+    surface: KeptSurface | None = None,
 ) -> dict[str, Any]:
     """Writes an occupancy in another format.
 
@@ -71,6 +73,7 @@ def export(
             run. None is `data` where the file says how. Grid and volume are in those of the run, a
             start for splats in those of the data.
         data: the scene that it was learned on; None is that of the run in whose folder `file` lies.
+        surface: what `surface_of` finds at this resolution, where it is known already.
     Returns:
         What was written, as JSON values.
     Raises:
@@ -102,7 +105,10 @@ def export(
         facts["frame"] = "run"
     else:
         description = description_of_run(file) if data is None else description_in(data)
-        facts = _export_points(occupancy, format, out, resolution, back, description)
+        if format == "splat-init" and description is None:
+            raise ValueError("a start for splats copies transforms.json: give --data SCENE")
+        surface = surface or surface_of(occupancy, resolution)
+        facts = _export_points(occupancy, surface, format, out, back, description)
     known = {"format": 1, "written": format, "resolution": resolution}
     return {**known, **facts, "bytes": out.stat().st_size}
 
@@ -121,21 +127,17 @@ def _check_options(format: Format, levels: int | None, frame: Frame | None) -> N
 
 def _export_points(
     occupancy: Occupancy,
+    surface: KeptSurface,
     format: Format,
     out: Path,
-    resolution: int,
     back: Tensor | None,
     description: Path | None,
 ) -> dict[str, Any]:
     """Writes the kept surface as `ply` or `splat-init`."""
-    with bar(f"Asking the gate about cells of 1/{resolution}") as show:
-        surface = kept_surface(occupancy, resolution, show)
     if back is not None:
         surface = surface._replace(positions=moved(surface.positions.double(), back))
     if format == "splat-init":
-        if description is None:
-            raise ValueError("a start for splats copies transforms.json: give --data SCENE")
-        assert back is not None
+        assert back is not None and description is not None
         facts = write_splat_init(occupancy, surface.positions, back, description, out)
         return facts | {"frame": "data"}
     colours = None
@@ -148,6 +150,13 @@ def _export_points(
         "photograph_colours": colours is not None,
         **({} if back is None or description is None else georeference(description)),
     }
+
+
+def surface_of(occupancy: Occupancy, resolution: int | None = None) -> KeptSurface:
+    """`kept_surface` with a progress bar, at the resolution that `export` would choose for None."""
+    resolution = finest(mapped_box(occupancy)) if resolution is None else resolution
+    with bar(f"Asking the gate about cells of 1/{resolution}") as show:
+        return kept_surface(occupancy, resolution, show)
 
 
 def _export_grid(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -11,7 +12,7 @@ from leco_plugin.evaluation.inspection import describe, doubts
 from leco_plugin.evaluation.occupancy_page import write_page
 from leco_plugin.evaluation.occupancy_picture import draw
 from leco_plugin.evaluation.scene_colours import scene_colours
-from leco_plugin.export import Format, export
+from leco_plugin.export import Format, export, surface_of
 from leco_plugin.occupancy import Occupancy
 from leco_plugin.scenes.coloured_points import description_in, description_of_run
 
@@ -35,7 +36,8 @@ def export_folder(
 
     Args:
         file: an occupancy.
-        folder: made where it is missing; files of these names are replaced.
+        folder: made where it is missing; files of these names are replaced, and those of parts that
+            cannot be made are said to be old.
         resolution: cells along the longest side; None as `export` has it.
         data: the scene that it was learned on; None is that of the run in whose folder `file` lies.
     Returns:
@@ -50,8 +52,11 @@ def export_folder(
     description = description_of_run(file) if data is None else description_in(data)
     folder.mkdir(parents=True, exist_ok=True)
 
+    surface = functools.cache(lambda: surface_of(occupancy, resolution))
+
     def exported(format: Format, name: str) -> Facts:
-        return export(file, format, folder / name, resolution, data=data)
+        known = None if format == "npz" else surface()
+        return export(file, format, folder / name, resolution, data=data, surface=known)
 
     def drawn() -> Facts:
         colours = scene_colours(occupancy, description)
@@ -59,19 +64,19 @@ def export_folder(
         write_page(occupancy, folder / "occupancy.html", colours)
         return {"photograph_colours": colours is not None}
 
-    splats = folder / "splats.json"
+    splats, part = folder / "splats.json", functools.partial(_part, folder)
     parts = [
-        _part("occupancy.png", drawn, lambda facts: "slices of o(x), and the kept points"),
-        _part("kept.ply", lambda: exported("ply", "kept.ply"), _points_in_words),
-        _part(
+        part("occupancy.png", drawn, lambda facts: "slices of o(x), and the kept points"),
+        part("kept.ply", lambda: exported("ply", "kept.ply"), _points_in_words),
+        part(
             splats.name,
             lambda: exported("splat-init", splats.name),
             lambda facts: (
-                f"{facts['points']:,} points to start splats from: "
+                f"{facts['points']:,} points in splats.ply, to start splats from: "
                 f"ns-train splatfacto --data {splats} leco-photographs"
             ),
         ),
-        _part(
+        part(
             "volume.npz",
             lambda: exported("npz", "volume.npz"),
             lambda facts: f"o(x) in {' x '.join(map(str, facts['shape']))} cells, for NumPy",
@@ -85,12 +90,13 @@ def export_folder(
     return parts, doubts(describe(occupancy))
 
 
-def _part(name: str, write: Callable[[], Facts], use: Callable[[Facts], str]) -> Part:
+def _part(folder: Path, name: str, write: Callable[[], Facts], use: Callable[[Facts], str]) -> Part:
     """A part as it was written, or the line that says why it cannot be."""
     try:
         facts = write()
-    except ValueError as error:
-        return Part(name, None, str(error))
+    except (ValueError, OSError) as error:
+        older = "; the older one is left" if (folder / name).exists() else ""
+        return Part(name, None, f"{error}{older}")
     return Part(name, facts, use(facts))
 
 

@@ -63,12 +63,17 @@ def write_splat_init(
         description: the scene's transforms.json.
         out: the copy, beside the scene's own or elsewhere; the points lie beside it.
     Raises:
-        InputError: the copy would replace the scene's own, or its name does not end in .json.
+        InputError: the copy or its points would replace the scene's own, or the copy's name does
+            not end in .json.
     """
     if out.suffix != ".json":
         raise InputError(f"--out {out}: a start for splats is a copy of transforms.json; end it so")
     if out.resolve() == description.resolve():
         raise InputError(f"--out {out} is the scene's own file: give another name beside it")
+    points, meta = out.with_suffix(".ply"), load_json(description)
+    own = meta.get("ply_file_path")
+    if isinstance(own, str) and points.resolve() == (description.parent / own).resolve():
+        raise InputError(f"--out {out}: {points} holds the scene's own points; give another name")
     places, known = surface.double().numpy(), coloured_points(description)
     if known is None:
         colours = np.full((len(places), 3), GREY, np.uint8)
@@ -78,12 +83,11 @@ def write_splat_init(
         kept = (query(occupancy, of_run) >= occupancy.threshold).numpy()
         colours = np.concatenate([known.colours[kept], colours_near(known, places)])
         places, sparse = np.concatenate([known.positions[kept], places]), int(kept.sum())
-    points = out.with_suffix(".ply")
     rows = np.zeros(len(places), dtype=[("xyz", "<f8", 3), ("rgb", "u1", 3)])
     rows["xyz"], rows["rgb"] = places, colours
     write_points(points, rows, comments_of(description))
-    meta = _from_elsewhere(load_json(description), description.parent, out.parent)
-    text = json.dumps(meta | {"ply_file_path": points.name}, indent=1).encode()
+    copy = _from_elsewhere(meta, description.parent, out.parent)
+    text = json.dumps(copy | {"ply_file_path": points.name}, indent=1).encode()
     write_whole(out, lambda file: file.write(text))
     return {"points": len(places), "sparse_points": sparse, "photograph_colours": known is not None}
 

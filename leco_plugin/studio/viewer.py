@@ -175,7 +175,8 @@ def stay_open(viewer: Any) -> None:
                 time.sleep(0.2)
     except KeyboardInterrupt:
         say("the viewer is closed")
-    stop_drawing()
+    with suppress(KeyboardInterrupt):  # of somebody who presses Ctrl-C twice
+        stop_drawing()
 
 
 def stop_drawing() -> None:

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import errno
 import json
+from collections.abc import Callable
+from contextlib import nullcontext
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +22,13 @@ from leco_plugin.scenes.whole_files import write_points
 ORIGIN = {"latitude": 42.0, "longitude": -76.0, "altitude": 0.0, "axes": "east, north, up"}
 FRAME = [[0.5, 0.0, 0.0, 0.0], [0.0, 0.5, 0.0, 0.0], [0.0, 0.0, 0.5, 0.0]]
 """The run has half the size of the data."""
+
+
+def raises(error: OSError) -> Callable[..., None]:
+    def refuse(*_: Any, **__: Any) -> None:
+        raise error
+
+    return refuse
 
 
 @pytest.fixture
@@ -97,6 +107,7 @@ def test_what_does_not_go_together_is_refused_in_one_line(
     own = scene / "transforms.json"
     for options, said in (
         (("splat-init", own, 24, None, None, scene), "the scene's own file"),
+        (("splat-init", scene / "points.json", 24, None, None, scene), "the scene's own points"),
         (("splat-init", tmp_path / "t.ply", 24, None, None, scene), "end it so"),
         (("splat-init", tmp_path / "t.json", 24), "give --data"),
         (("splat-init", tmp_path / "t.json", 24, None, "run", scene), "lies in the data"),
@@ -106,13 +117,22 @@ def test_what_does_not_go_together_is_refused_in_one_line(
         with pytest.raises(ValueError, match=said) as error:
             export(file, *options)
         assert "\n" not in str(error.value)
+    assert len(trimesh.load(scene / "points.ply").vertices) == 501
 
 
 def test_a_folder_has_everything_and_says_what_each_part_is_for(
-    file: Path, scene: Path, tmp_path: Path
+    file: Path, scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     folder = tmp_path / "new" / "all"
+    asked: list[str] = []
+
+    def noted(said: str) -> nullcontext[Callable[[float], None]]:
+        asked.append(said)
+        return nullcontext(lambda share: None)
+
+    monkeypatch.setattr("leco_plugin.export.bar", noted)
     parts, doubted = export_folder(file, folder, 32, scene)
+    assert len(asked) == 2  # the surface once, for points and splats, and the volume
     names = ["occupancy.png", "occupancy.html", "kept.ply", "splats.json", "volume.npz"]
     assert [part.name for part in parts if part.facts] == names and not doubted
     assert {path.name for path in folder.iterdir()} == {*names, "splats.ply"}
@@ -132,6 +152,12 @@ def test_a_part_that_cannot_be_made_is_one_line_and_the_others_are_written(
     assert len(lines) == 6 and sum("colours: o(x)" in line for line in lines) == 1
     assert lines[-1].startswith("not written: splats.json: ") and "--data" in lines[-1]
     assert not (tmp_path / "all" / "splats.json").exists()
+    full = OSError(errno.ENOSPC, "No space left on device")
+    monkeypatch.setattr("leco_plugin.export.write_ply", raises(full))
+    lines = in_words(tmp_path / "all", export_folder(file, tmp_path / "all", 32)[0], [])
+    assert (
+        "not written: kept.ply: [Errno 28] No space left on device; the older one is left" in lines
+    )
     with pytest.raises(ValueError, match="is a file"):
         export_folder(file, file, 32)
     with pytest.raises(ValueError, match="no transforms"):
