@@ -96,13 +96,7 @@ def export(
     if format == "nerfacc-grid":
         facts = _export_grid(occupancy, out, resolution, levels)
     elif format == "npz":
-        if resolution < 2:
-            raise ValueError(f"a volume takes at least 2 cells along a side, not {resolution}")
-        counts = whole_box(occupancy).cells(min(resolution, MOST_CELLS))
-        require_few(math.prod(counts), f"{resolution} along the longest side")
-        with bar(f"Asking the gate about cells of 1/{resolution}") as show:
-            facts = write_volume(occupancy, resolution, back, out, show)
-        facts["frame"] = "run"
+        facts = _export_volume(occupancy, out, resolution, back)
     else:
         description = description_of_run(file) if data is None else description_in(data)
         if format == "splat-init" and description is None:
@@ -157,6 +151,19 @@ def surface_of(occupancy: Occupancy, resolution: int | None = None) -> KeptSurfa
     resolution = finest(mapped_box(occupancy)) if resolution is None else resolution
     with bar(f"Asking the gate about cells of 1/{resolution}") as show:
         return kept_surface(occupancy, resolution, show)
+
+
+def _export_volume(
+    occupancy: Occupancy, out: Path, resolution: int, back: Tensor | None
+) -> dict[str, Any]:
+    """Writes o(x) in cells."""
+    if resolution < 2:
+        raise ValueError(f"a volume takes at least 2 cells along a side, not {resolution}")
+    counts = whole_box(occupancy).cells(min(resolution, MOST_CELLS))
+    require_few(math.prod(counts), f"{resolution} along the longest side")
+    with bar(f"Asking the gate about cells of 1/{resolution}") as show:
+        facts = write_volume(occupancy, resolution, back, out, show)
+    return facts | {"frame": "run"}
 
 
 def _export_grid(

@@ -6,6 +6,7 @@ import math
 import subprocess
 import sys
 from pathlib import Path
+from time import sleep
 
 import pytest
 import torch
@@ -20,11 +21,12 @@ from leco_plugin.evaluation.clock import (
 
 
 class Time:
-    """Stands for `time.perf_counter`."""
+    """Stands for the clocks of module `time`."""
 
     def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
         self.now = 100.0
-        monkeypatch.setattr(clock_module.time, "perf_counter", lambda: self.now)
+        for clock in ("perf_counter", "process_time"):
+            monkeypatch.setattr(clock_module.time, clock, lambda: self.now)
 
 
 @pytest.fixture
@@ -50,6 +52,18 @@ def test_a_look_at_a_running_clock_does_not_stop_it(time: Time) -> None:
     time.now += 2.0
     clock.stop()
     assert clock.seconds == 4.0
+
+
+@pytest.mark.skipif(torch.cuda.is_available(), reason="a GPU works outside of the process")
+@pytest.mark.parametrize("threads", [1, 2])
+def test_one_thread_does_not_count_what_others_do(
+    threads: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(torch, "get_num_threads", lambda: threads)
+    clock = Clock()
+    with clock.running():
+        sleep(0.05)  # as when another process has the core
+    assert (clock.seconds > 0.04) == (threads == 2)
 
 
 def test_what_fails_is_counted_too(time: Time) -> None:
