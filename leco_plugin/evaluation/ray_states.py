@@ -33,6 +33,30 @@ def ray_states(
     Returns:
         [R] int64.
     """
+    of_ray, starts, ends = candidates(occupancy, origins, directions, crop)
+    middles = (0.5 * (starts + ends))[:, None]
+    positions = torch.addcmul(origins[of_ray], directions[of_ray], middles)
+    states = torch.full((len(origins),), SKIPPED, device=origins.device)
+    states[of_ray[occupancy.unseen(positions)]] = UNSEEN
+    states[of_ray[occupancy.query(positions) >= occupancy.threshold_value]] = KEPT
+    return states
+
+
+def candidates(
+    occupancy: Occupancy,
+    origins: Tensor,
+    directions: Tensor,
+    crop: tuple[Tensor | None, Tensor | None] = (None, None),
+    most: int = CANDIDATES,
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Intervals in whose middles an occupancy is asked along rays, the nearest of each ray first.
+
+    Args:
+        origins, directions, crop: as of `ray_states`.
+        most: on a ray that crosses the scene.
+    Returns:
+        The ray [M] int64 of each; starts and ends [M], scene units.
+    """
     space, half = occupancy.space, float(occupancy.space.half_extent)
     near, far = NEAREST * half, FARTHEST * half
     box = occupancy.walls
@@ -42,11 +66,5 @@ def ray_states(
     rays = within_crop(
         cut_rays(origins, directions, box, box.new_tensor(near), box.new_tensor(far)), *crop
     )
-    rule = marching.March(*marching_rule(space.kind, near, far, CANDIDATES, 2.0 * half))
-    of_ray, starts, ends = marching.march(marching.Rays(*rays[:4]), rule)
-    middles = (0.5 * (starts + ends))[:, None]
-    positions = torch.addcmul(origins[of_ray], directions[of_ray], middles)
-    states = torch.full((len(origins),), SKIPPED, device=origins.device)
-    states[of_ray[occupancy.unseen(positions)]] = UNSEEN
-    states[of_ray[occupancy.query(positions) >= occupancy.threshold_value]] = KEPT
-    return states
+    rule = marching.March(*marching_rule(space.kind, near, far, most, 2.0 * half))
+    return marching.march(marching.Rays(*rays[:4]), rule)
