@@ -1,4 +1,5 @@
-"""Draws a flight past a trained scene that moves: photograph, rendering, what is kept, samples a ray.
+"""Draws a flight past a trained scene as a film: photograph, rendering, what is kept, samples.
+
 
 python benchmarks/tour.py outputs/SCENE/leco-occupancy --out docs/images/tour.gif
 """
@@ -6,6 +7,7 @@ python benchmarks/tour.py outputs/SCENE/leco-occupancy --out docs/images/tour.gi
 from __future__ import annotations
 
 import argparse
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -47,7 +49,7 @@ def flight(cameras: Cameras, first: int, photographs: int, width: int) -> tuple[
 
     numbers = range(first, first + photographs)
     poses, nearest = [], []
-    for one, other in zip(numbers, numbers[1:]):
+    for one, other in pairwise(numbers):
         between = get_interpolated_poses(
             *(cameras.camera_to_worlds[i].numpy() for i in (one, other)), steps=STEPS + 1
         )
