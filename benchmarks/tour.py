@@ -1,6 +1,5 @@
 """Draws a flight past a trained scene as a film: photograph, rendering, what is kept, samples.
 
-
 python benchmarks/tour.py outputs/SCENE/leco-occupancy --out docs/images/tour.gif
 """
 
