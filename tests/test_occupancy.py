@@ -304,7 +304,11 @@ def test_tensors_that_do_not_fit_the_header_are_refused(sound: bytes, tmp_path: 
 UNSOUND = {
     "a threshold below 0": ("threshold_value", -0.1, "threshold"),
     "a threshold above 1": ("threshold_value", 1.1, "threshold"),
-    "a gate of NaN": ("gate.head.bias", float("nan"), "gate.head.bias holds values"),
+    "a gate with a NaN": (
+        "gate.head.bias",
+        torch.tensor([0.0, float("nan"), 0.0]),
+        "gate.head.bias holds values",
+    ),
     "a space without extent": ("space.half_extent", 0.0, "half extent"),
     "inverted walls": ("walls", torch.tensor([0.0, 0.0, 0.5, 1.0, 1.0, -0.5]), "walls"),
 }
