@@ -345,20 +345,20 @@ def test_a_seed_decides_all_random_numbers_of_a_run(
         drawn.extend((random.random(), np.random.rand(), float(torch.rand(()))))  # noqa: NPY002
 
     monkeypatch.setattr(module, "warm_up", lambda device: None)
-    trainer = SimpleNamespace(setup=draw, device="cpu")
-    config: Any = SimpleNamespace(
+
+    class Config(SimpleNamespace):
+        def setup(self, **_: Any) -> Any:
+            return SimpleNamespace(setup=draw, device="cpu", config=self)
+
+    config: Any = Config(
         machine=SimpleNamespace(seed=42),
         logging=SimpleNamespace(local_writer=SimpleNamespace()),
         pipeline=SimpleNamespace(model=None),
         optimizers={},
         set_timestamp=lambda: None,
     )
-
-    def setup(**_: Any) -> Any:
-        return trainer
-
-    config.setup = setup
-    assert set_up(config, Budget(1.0), seed) is trainer
+    made = set_up(config, Budget(1.0), seed)
+    assert (made.config.machine.seed, config.machine.seed) == (seed, 42)
     generator = torch.Generator().manual_seed(seed)
     expected = [random.Random(seed).random(), np.random.RandomState(seed).rand()]
     assert drawn == [*expected, float(torch.rand((), generator=generator))]
