@@ -304,7 +304,11 @@ def test_tensors_that_do_not_fit_the_header_are_refused(sound: bytes, tmp_path: 
 UNSOUND = {
     "a threshold below 0": ("threshold_value", -0.1, "threshold"),
     "a threshold above 1": ("threshold_value", 1.1, "threshold"),
-    "a gate of NaN": ("gate.head.bias", float("nan"), "gate.head.bias holds values"),
+    "a gate with a NaN": (
+        "gate.head.bias",
+        torch.tensor([0.0, float("nan"), 0.0]),
+        "gate.head.bias holds values",
+    ),
     "a space without extent": ("space.half_extent", 0.0, "half extent"),
     "inverted walls": ("walls", torch.tensor([0.0, 0.0, 0.5, 1.0, 1.0, -0.5]), "walls"),
 }
@@ -333,9 +337,14 @@ def test_what_lies_outside_the_walls_is_empty_also_after_a_round_trip(tmp_path: 
     occupancy = Occupancy(Gate(GateConfig()), Space(), 1e-6, walls=walls)
     occupancy.save(tmp_path / "occupancy.safetensors")
     positions = torch.rand(2000, 3) * 2 - 1
-    kept = Occupancy.load(tmp_path / "occupancy.safetensors").occupied(positions)
+    loaded = Occupancy.load(tmp_path / "occupancy.safetensors")
     between = (positions[:, 2] >= -0.2) & (positions[:, 2] <= 0.3)
-    assert torch.equal(kept, between)
+    for same_place in (
+        loaded,
+        loaded.with_threshold(2e-6),
+        loaded.with_gate(Gate(GateConfig()), 1e-6, {}),
+    ):
+        assert torch.equal(same_place.occupied(positions), between)
 
 
 def test_a_wall_is_where_it_is_said_to_be_though_there_is_none_on_the_other_side() -> None:

@@ -68,6 +68,9 @@ def test_unseen_space_is_empty_whatever_the_gate_says(kind: SpaceKind) -> None:
     inside = seen(space.map(positions))
     assert torch.equal(asked.occupied(positions), inside)
     assert not bool(asked.query(positions)[~inside].any())
+    assert torch.equal(asked.unseen(positions), ~inside)
+    outside = torch.tensor([[1e4, 0.0, 0.0], [float("nan"), 0.0, 0.0]])
+    assert asked.unseen(outside).tolist() == [space.kind != "box", False]
     for cache_bytes in (0, 1 << 18):
         estimator = LearnedOccupancyEstimator(asked, cache_bytes=cache_bytes)
         differing = (estimator.occupied(positions) != inside).float().mean()

@@ -291,6 +291,9 @@ def test_a_chart_with_other_settings_gives_no_runs(tiny_scene: Path, tmp_path: P
     ):
         with pytest.raises(InputError, match=said):
             made(tiny_scene, tmp_path / "b", PLAIN, protocol=protocol, reuse=[tmp_path / "a"])
+    elsewhere = chart(tiny_scene, tmp_path / "c").settings
+    elsewhere["machine"] = {**elsewhere["machine"], "cpu": "another"}
+    assert "another machine" in str(why_not_shared(tmp_path / "a", elsewhere))
     with pytest.raises(InputError, match="there is no chart"):
         made(tiny_scene, tmp_path / "b", PLAIN, reuse=[tmp_path])
     assert not (tmp_path / "b").exists()

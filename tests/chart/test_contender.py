@@ -61,6 +61,8 @@ def test_the_name_is_no_part_of_what_a_contender_is() -> None:
         {"sampler": "x"},
         {"changes": {"inner.depth": 4}},
         {"grids": ()},
+        {"taught": True},
+        {"settings": {"steps_per_save": 3}},
     ],
 )
 def test_everything_else_is(change: dict[str, object]) -> None:

@@ -108,6 +108,14 @@ def test_a_lead_with_every_seed_is_one_although_seeds_differ_by_more() -> None:
     assert headline(results(*best, *apart)) == "A and B are level: 21.0 and 20.0 dB"
 
 
+def test_a_lead_is_more_than_a_rounding_and_more_with_every_seed() -> None:
+    best = [run("A", seed, psnr) for seed, psnr in enumerate([20.04, 21.04])]
+    hardly = [run("B", seed, psnr) for seed, psnr in enumerate([20.0, 21.0])]
+    assert "A and B are level" in headline(results(*best, *hardly))
+    once_equal = [run("B", seed, psnr) for seed, psnr in enumerate([20.04, 20.0])]
+    assert "A and B are level" in headline(results(*best, *once_equal))
+
+
 CURVE = [[10.0, 18.0], [20.0, 20.0], [30.0, 19.0], [40.0, 21.0]]
 
 
@@ -161,6 +169,8 @@ def test_the_gain_of_the_last_third_is_between_two_thirds_of_the_time_and_its_en
     still, rising = lines_of(results(run("A", curve=STILL), run("B", curve=RISING)))
     assert last_gain(still) == pytest.approx(0.2)
     assert last_gain(rising) == pytest.approx(3.0)
+    (both,) = lines_of(results(run("A", curve=STILL), run("A", 1, curve=RISING)))
+    assert last_gain(both) == pytest.approx(1.6)  # the mean over seeds
     begun_late = lines_of(results(run("C", curve=[[8.0, 15.0], [9.0, 17.0]])))[0]
     assert last_gain(begun_late) is None
 
@@ -208,5 +218,7 @@ def test_runs_that_end_below_their_best_point_are_named_on_table_and_page(tmp_pa
     assert said in table(both) and said in figure_text(page)
     one = results(*(run("B", seed=seed, curve=STILL) for seed in (0, 1)), fell | {"seed": 2})
     assert falls(lines_of(one)) == said.replace("1 of 1 run", "1 of 3 runs")
+    early = run("B", curve=[[3.0, 21.0], [6.0, 19.0], [9.0, 19.6]])
+    assert "by at most 1.40 dB" in str(falls(lines_of(results(early))))
     hardly = run("B", curve=[[3.0, 18.0], [6.0, 20.0], [9.0, 19.95]])
     assert falls(lines_of(results(run("A", curve=STILL), hardly))) is None

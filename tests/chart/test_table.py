@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from chart_results import occupancy, results, run
 
-from leco_plugin.chart.table import table
+from leco_plugin.chart.table import spread, table
 
 FAILURE = {"name": "B", "method": "b", "sampler": "own", "seed": 1, "reason": "a | b"}
 
@@ -23,6 +23,11 @@ def test_every_contender_has_a_row_with_its_figures() -> None:
     assert cells[1:3] == ["2", "20.50 (20.00 to 21.00)"]
     assert rows(text, "B")[0][2] == "19.00"
     assert "-" in cells  # no LPIPS
+
+
+def test_a_figure_that_a_seed_lacks_is_a_dash() -> None:
+    assert spread([1.0, 4.0, 1.0], ".1f") == "1.0 (1.0 to 4.0)"
+    assert spread([1.0, None], ".1f") == spread([], ".1f") == "-"
 
 
 def test_the_front_of_a_column_is_bold() -> None:

@@ -127,6 +127,17 @@ def test_gate_and_grids_are_measured_on_the_field_of_the_moment_of_freezing(
     assert result["steps"] == 6 and (tmp_path / "occupancy.safetensors").exists()
 
 
+def test_the_seed_of_a_job_is_that_of_its_run(
+    tiny_scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def started(*_: Any, seed: int, **__: Any) -> None:
+        raise RuntimeError(f"seed {seed}")
+
+    monkeypatch.setattr(timed_run, "timed_run", started)
+    with pytest.raises(RuntimeError, match="seed 7"):
+        run_job(ONE, 7, tiny_scene, SHORT, tmp_path)
+
+
 def test_a_whole_run_has_its_figures(tiny_scene: Path, tmp_path: Path) -> None:
     shares: list[float] = []
     one = replace(ONE, grids=(8,))

@@ -12,8 +12,9 @@ from torch import Tensor
 from leco_plugin.evaluation import equal_loss
 from leco_plugin.evaluation.equal_loss import at_equal_loss, kept_shares, threshold_losing
 from leco_plugin.learning.calibration import CalibrationConfig
+from leco_plugin.learning.dense import Reference
 from leco_plugin.models.mixture import Mixture
-from leco_plugin.models.rendering import Rays
+from leco_plugin.models.rendering import Intervals, Rays
 from leco_plugin.scenes.bounds import SceneBounds
 
 
@@ -158,6 +159,19 @@ def test_space_that_no_ray_reaches_is_nobodys_volume(
     # a third of what is reached is dense, of the box half is
     assert found["kept_reached_volume"] == pytest.approx(1 / 3, abs=0.01)
     assert found["grids"][0]["kept_reached_volume"] == pytest.approx(1 / 3, abs=0.01)
+
+
+def test_what_is_measured_is_the_weight_near_surfaces_before_the_backdrop(
+    mixture: Mixture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    intervals = Intervals(torch.zeros(3).long(), torch.arange(3.0), torch.arange(1.0, 4.0))
+    near, backdrop = torch.tensor([False, True, True]), torch.tensor([False, False, True])
+    weights, occupancies = torch.tensor([0.2, 0.3, 0.5]), torch.tensor([0.1, 0.6, 0.9])
+    planted = Reference(intervals, weights, occupancies, near, torch.zeros(1, 3), backdrop)
+    monkeypatch.setattr(equal_loss, "dense_reference", lambda *_: planted)
+    places, *found = equal_loss._measured(mixture, None, CalibrationConfig())
+    assert len(places) == 2
+    torch.testing.assert_close(found, [torch.tensor([0.0, 0.3]), torch.tensor([0.1, 0.6])])
 
 
 def test_rays_without_any_surface_are_refused_in_a_line(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from itertools import pairwise
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -58,3 +59,34 @@ def test_psnr_is_young_however_long_a_sampler_takes_to_build(
     ages = [later - sooner for sooner, later in pairwise(measured)]
     assert max(ages) < oldest
     assert psnr.spent < 0.035 * clock.now
+
+
+class OneColour(nn.Module):
+    """Ten photographs, the Nth of colour N/10 throughout, and a host that shows 0.1 more."""
+
+    device = "cpu"
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.cameras = SimpleNamespace(to=lambda device: self)
+
+    def __len__(self) -> int:
+        return 10
+
+    def get_data(self, number: int) -> dict[str, torch.Tensor]:
+        return {"image": torch.full((5, 4, 3), number / 10)}
+
+    def generate_rays(self, camera_indices: int, coords: torch.Tensor) -> torch.Tensor:
+        return torch.full((len(coords), 3), camera_indices / 10)
+
+    def forward(self, rays: torch.Tensor) -> dict[str, torch.Tensor]:
+        assert not self.training
+        return {"rgb": rays + 0.1}
+
+
+def test_at_the_end_test_photographs_are_looked_at() -> None:
+    host = OneColour()
+    psnr = HeldOutPsnr(host, SimpleNamespace(eval_dataset=host, train_dataset=None))
+    assert psnr.look_at_tests() == pytest.approx(20.0, abs=1e-4)  # 0.9 + 0.1 is not above white
+    assert host.training and psnr.of_one_colour == pytest.approx(10.6, abs=0.3)
+    assert HeldOutPsnr(host, SimpleNamespace(train_dataset=host)).look_at_tests() is None

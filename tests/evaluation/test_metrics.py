@@ -11,6 +11,7 @@ from pathlib import Path
 import pytest
 import torch
 import torchvision
+from torchmetrics.functional.image import structural_similarity_index_measure
 from torchmetrics.image import PeakSignalNoiseRatio
 
 from leco_plugin.evaluation import metrics
@@ -63,6 +64,15 @@ def test_ssim_is_one_for_equal_images_and_less_for_others() -> None:
     assert metrics.ssim(predicted, truth) < 0.999
 
 
+def test_ssim_is_that_of_nerfstudio_whatever_the_images_range_is() -> None:
+    predicted, truth = (0.3 + 0.2 * image for image in images())
+    expected = structural_similarity_index_measure(  # as nerfstudio's models call it
+        predicted.permute(2, 0, 1)[None], truth.permute(2, 0, 1)[None]
+    )
+    assert metrics.ssim(predicted, truth) == pytest.approx(float(expected), abs=1e-6)
+    assert metrics.ssim(predicted, truth) < 0.98
+
+
 def test_lpips_is_that_of_torchmetrics(backbone: Path) -> None:
     predicted, truth = images()
     metric = metrics.lpips_metric("alex")
@@ -71,6 +81,9 @@ def test_lpips_is_that_of_torchmetrics(backbone: Path) -> None:
         predicted.permute(2, 0, 1)[None], truth.permute(2, 0, 1)[None]
     )
     assert metrics.lpips(predicted, truth) == pytest.approx(float(expected), rel=1e-5)
+    outside = 3.0 * predicted - 1.0
+    assert metrics.lpips(outside, truth) == metrics.lpips(outside.clamp(0, 1), truth)
+    assert metrics.lpips(truth, outside) == metrics.lpips(truth, outside.clamp(0, 1))
     assert metrics.image_metrics(predicted, truth).keys() == {"psnr", "ssim", "lpips"}
 
 

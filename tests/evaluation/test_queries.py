@@ -105,7 +105,8 @@ def test_a_field_that_is_called_is_counted() -> None:
     host = Host(Plain())
     with count_queries(host) as queries:
         host.field(torch.zeros(13, 3), noise=1.0)
-    assert queries["field"] == 13
+        host.field(torch.zeros(4, 6, 3))
+    assert queries["field"] == 13 + 24
 
 
 def test_a_field_that_learns_for_a_host_is_counted_apart() -> None:

@@ -1,17 +1,34 @@
-"""Claims about learning rates of a run that is given a time."""
+"""Claims about a run that is given a time: its rates, its clock, and what it is scored on."""
 
 from __future__ import annotations
 
+import math
+import random
+import statistics
 from collections import Counter
+from collections.abc import Callable
 from types import SimpleNamespace
 from typing import Any
 
+import numpy as np
 import pytest
 import torch
-from torch import nn
+from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackLocation
+from torch import Tensor, nn
 
+from leco_plugin.evaluation import clock as clock_module
+from leco_plugin.evaluation import timed_run as module
 from leco_plugin.evaluation.clock import Budget
-from leco_plugin.evaluation.timed_run import TimedRun, _Course, _never_sharpen
+from leco_plugin.evaluation.metrics import psnr
+from leco_plugin.evaluation.timed_run import (
+    TimedRun,
+    _Course,
+    _never_sharpen,
+    evaluate_images,
+    psnr_on_rays,
+    set_up,
+    timed_run,
+)
 from leco_plugin.hosts.guided_start import OccupancyConfig
 from leco_plugin.models.leco_config import LecoModelConfig
 
@@ -69,3 +86,279 @@ def test_whoever_learns_an_occupancy_is_not_sharpened_in_a_time() -> None:
         _never_sharpen(model)
     assert own.sharpening.steps == guided.occupancy.learning.sharpening.steps == 0
     assert LecoModelConfig().sharpening.steps > 0
+
+
+class Time:
+    """The seconds that a run counts."""
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        self.now = 100.0
+        monkeypatch.setattr(clock_module, "seconds_now", lambda: self.now)
+
+
+@pytest.fixture
+def time(monkeypatch: pytest.MonkeyPatch) -> Time:
+    return Time(monkeypatch)
+
+
+class Cameras:
+    """Of test pictures: a ray is its picture, row and column."""
+
+    def __getitem__(self, chosen: slice) -> Any:
+        return SimpleNamespace(to=lambda device: chosen.start)
+
+    def to(self, device: str) -> Cameras:
+        return self
+
+    def generate_rays(self, camera_indices: int, coords: Tensor) -> Tensor:
+        return nn.functional.pad(coords, (1, 0), value=camera_indices)
+
+
+class Pictures:
+    """Three test pictures, with pixels that are white."""
+
+    def __init__(self) -> None:
+        self.cameras = Cameras()
+        self.images = [0.1 + 0.5 * torch.rand(*size, 3) for size in ((6, 8), (8, 6), (7, 9))]
+        for image in self.images:
+            image[:2] = 1.0
+
+    def __len__(self) -> int:
+        return len(self.images)
+
+    def get_data(self, number: int) -> dict[str, Tensor]:
+        return {"image": self.images[number]}
+
+
+class Renderer(nn.Module):
+    """Renders pictures, each with an error and in a time of its own; what is white, whiter than
+    white. A ray takes seven questions to the field."""
+
+    errors, seconds, samples = (0.1, 0.2, 0.3), (1.0, 9.0, 2.0), (4.0, 5.0, 9.0)
+
+    def __init__(self, time: Time) -> None:
+        super().__init__()
+        self.time, self.pictures, self.queries = time, Pictures(), Counter({"field": 11})
+        self.rays: list[tuple[int, int, int]] = []
+        self.rendered: list[int] = []
+
+    def forward(self, rays: Tensor) -> dict[str, Tensor]:
+        assert not self.training
+        assert bool((rays[:, 1:] % 1.0 == 0.5).all())  # the middles of pixels
+        asked = [(int(number), int(row), int(column)) for number, row, column in rays.tolist()]
+        self.rays += asked
+        whole = [self.picture(number) for number in range(3)]
+        return {"rgb": torch.stack([whole[number][row, column] for number, row, column in asked])}
+
+    def get_outputs_for_camera(self, number: int) -> dict[str, Tensor]:
+        assert not self.training
+        self.rendered.append(number)
+        self.time.now += self.seconds[number]
+        rgb = self.picture(number)
+        self.queries["field"] += 7 * rgb[..., 0].numel()
+        samples = torch.full((*rgb.shape[:2], 1), self.samples[number])
+        return {"rgb": rgb, "num_samples_per_ray": samples}
+
+    def picture(self, number: int) -> Tensor:
+        return self.pictures.images[number] + self.errors[number]
+
+    def trainer(self) -> Any:
+        manager = SimpleNamespace(eval_dataset=self.pictures, train_dataset=None)
+        pipeline = SimpleNamespace(model=self, device="cpu", datamanager=manager)
+        pipeline.eval, pipeline.train = self.eval, self.train
+        return SimpleNamespace(pipeline=pipeline)
+
+    def squared_error(self, number: int, row: int, column: int) -> float:
+        """Mean over the colours of a pixel, by a loop."""
+        truth = self.pictures.images[number][row, column].tolist()
+        shown = [min(value + self.errors[number], 1.0) for value in truth]
+        return sum((one - other) ** 2 for one, other in zip(shown, truth)) / 3
+
+
+def test_pixels_of_all_test_pictures_are_scored_and_always_the_same(time: Time) -> None:
+    model = Renderer(time)
+    found = psnr_on_rays(model.trainer(), 100)
+    errors = [model.squared_error(*ray) for ray in model.rays]
+    assert found == pytest.approx(-10.0 * math.log10(statistics.fmean(errors)), abs=1e-4)
+    assert Counter(number for number, _, _ in model.rays) == {0: 34, 1: 34, 2: 34}
+    assert len(set(model.rays)) > 60 and model.training
+    torch.manual_seed(1)
+    assert psnr_on_rays(model.trainer(), 100) == found
+    assert model.rays[102:] == model.rays[:102]
+
+
+@pytest.mark.parametrize(("most", "chosen"), [(9, [0, 1, 2]), (2, [0, 2])])
+def test_figures_are_means_over_test_pictures_and_only_rendering_is_timed(
+    most: int, chosen: list[int], time: Time, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def figures(predicted: Tensor, truth: Tensor) -> dict[str, float]:
+        time.now += 100.0
+        return {"psnr": psnr(predicted, truth)}
+
+    monkeypatch.setattr(module, "image_metrics", figures)
+    model = Renderer(time)
+    found = evaluate_images(model.trainer(), most, model.queries)
+    of_each = []
+    for number in chosen:
+        rows, columns, _ = model.pictures.images[number].shape
+        places = [(row, column) for row in range(rows) for column in range(columns)]
+        error = statistics.fmean(model.squared_error(number, *place) for place in places)
+        of_each.append(-10.0 * math.log10(error))
+    assert model.rendered == chosen and model.training
+    assert found["psnr"] == pytest.approx(statistics.fmean(of_each), abs=1e-4)
+    samples = statistics.fmean(model.samples[number] for number in chosen)
+    assert found["samples_per_ray"] == pytest.approx(samples)
+    assert found["field_queries_per_ray"] == pytest.approx(7.0)
+    middle = statistics.median(model.seconds[number] for number in chosen)
+    assert found["render_seconds_per_image"] == middle
+
+
+class Fog(nn.Module):
+    """A field that is simply called."""
+
+    def forward(self, positions: Tensor) -> Tensor:
+        return positions[..., 0]
+
+
+class Grid(nn.Module):
+    """An occupancy grid whose update takes two seconds."""
+
+    def __init__(self, time: Time) -> None:
+        super().__init__()
+        self.time = time
+        self.register_buffer("occs", torch.zeros(1))
+
+    def update_every_n_steps(self, step: int, warmup_steps: int = 2) -> None:
+        self.time.now += 2.0
+
+
+class Run:
+    """A run of a model whose steps take known times; PSNR falls, and looking at it takes long.
+
+    Args:
+        seconds: of each step, beside those of `begins` and `ends`, the model's callbacks.
+    """
+
+    def __init__(
+        self, time: Time, model: Any, seconds: list[float], monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        self.time, self.model, self.seconds = time, model, seconds
+        self.begins: Callable[[int], None] = lambda step: None
+        self.ends: Callable[[int], None] = lambda step: None
+        self.psnrs = iter((20.0, 18.0))
+        model.field = Fog()
+        monkeypatch.setattr(module, "set_up", lambda *_: self.trainer)
+        monkeypatch.setattr(module, "run_training", self.train)
+        monkeypatch.setattr(module, "psnr_on_rays", self.look)
+        where = TrainingCallbackLocation
+        self.trainer: Any = SimpleNamespace(
+            pipeline=SimpleNamespace(model=model),
+            optimizers=SimpleNamespace(optimizers={}),
+            callbacks=[
+                TrainingCallback([where.BEFORE_TRAIN_ITERATION], lambda step: self.begins(step)),
+                TrainingCallback([where.AFTER_TRAIN_ITERATION], lambda step: self.ends(step)),
+            ],
+            stop_training=False,
+        )
+
+    def train(self, trainer: Any) -> None:
+        for step, seconds in enumerate(self.seconds):
+            for where in TrainingCallbackLocation:
+                if where is TrainingCallbackLocation.AFTER_TRAIN_ITERATION:
+                    self.time.now += seconds
+                    self.model.field(torch.zeros(5, 3))
+                for callback in trainer.callbacks:
+                    callback.run_callback_at_location(step, where)
+            self.time.now += 1000.0  # saving, and whatever else is not training
+            if trainer.stop_training:
+                return
+        raise AssertionError("the run does not end")
+
+    def look(self, trainer: Any, rays: int) -> float:
+        self.time.now += 1000.0
+        self.model.field(torch.zeros(rays, 3))
+        return next(self.psnrs)
+
+    def record(self) -> TimedRun:
+        config: Any = SimpleNamespace(method_name="method")
+        budget = Budget(40.0)
+        return timed_run(config, budget, sampler="s", curve_points=2, images=0)[0]
+
+
+def test_learning_an_occupancy_is_training_time_and_looking_is_not(
+    time: Time, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    host = nn.Module()
+    host.leco_guide = nn.Module()
+    host.leco_guide.occupancy = None
+    run = Run(time, host, [1.0, 1.0, 1.0, 1.0, 5.0, 1.0, 1.0], monkeypatch)
+
+    def learn_first(step: int) -> None:
+        if step == 0:
+            time.now += 30.0
+            host.leco_guide.occupancy = SimpleNamespace(report={"threshold": 0.4})
+
+    run.begins = learn_first
+    record = run.record()
+    assert (record.steps, record.train_seconds, record.step_seconds) == (6, 40.0, 1.0)
+    assert record.learn_seconds == record.freeze_seconds == 30.0
+    assert record.at_freezing is not None and record.at_freezing["threshold"] == 0.4
+    assert record.curve == [(31.0, 20.0), (40.0, 18.0)] and record.psnr == 18.0
+    assert record.train_queries["field"] == 6 * 5
+
+
+def test_a_step_is_timed_once_there_is_an_occupancy(
+    time: Time, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    model = nn.Module()
+    model.mixture = nn.Module()
+    model.mixture.field, model.mixture.frozen = Fog(), False
+    run = Run(time, model, [9.0, 9.0, 9.0, 9.0, 2.0, 1.0, 1.0], monkeypatch)
+
+    def freeze(step: int) -> None:
+        model.mixture.frozen = step >= 3
+
+    run.ends = freeze
+    record = run.record()
+    assert (record.freeze_seconds, record.step_seconds, record.steps) == (36.0, 1.0, 7)
+
+
+def test_updates_of_a_grid_are_its_learning_time(
+    time: Time, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    host = nn.Module()
+    host.grid = Grid(time)
+    run = Run(time, host, [18.0, 18.0], monkeypatch)
+    run.begins = lambda step: host.grid.update_every_n_steps(step=step)
+    record = run.record()
+    assert (record.train_seconds, record.learn_seconds) == (40.0, 4.0)
+    assert record.warming_up is True and record.freeze_seconds is None
+
+
+@pytest.mark.parametrize("seed", [0, 3])
+def test_a_seed_decides_all_random_numbers_of_a_run(
+    seed: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    drawn: list[float] = []
+
+    def draw() -> None:
+        drawn.extend((random.random(), np.random.rand(), float(torch.rand(()))))  # noqa: NPY002
+
+    monkeypatch.setattr(module, "warm_up", lambda device: None)
+
+    class Config(SimpleNamespace):
+        def setup(self, **_: Any) -> Any:
+            return SimpleNamespace(setup=draw, device="cpu", config=self)
+
+    config: Any = Config(
+        machine=SimpleNamespace(seed=42),
+        logging=SimpleNamespace(local_writer=SimpleNamespace()),
+        pipeline=SimpleNamespace(model=None),
+        optimizers={},
+        set_timestamp=lambda: None,
+    )
+    made = set_up(config, Budget(1.0), seed)
+    assert (made.config.machine.seed, config.machine.seed) == (seed, 42)
+    generator = torch.Generator().manual_seed(seed)
+    expected = [random.Random(seed).random(), np.random.RandomState(seed).rand()]
+    assert drawn == [*expected, float(torch.rand((), generator=generator))]

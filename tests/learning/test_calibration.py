@@ -134,6 +134,31 @@ def test_a_view_that_no_threshold_does_justice_to_lowers_nothing_and_is_said() -
     assert promise([], alone, config) is None
 
 
+@pytest.mark.parametrize(("more", "followed"), [(24, True), (26, False)])
+def test_photographs_that_vouch_may_keep_a_quarter_more_candidates(
+    more: int, followed: bool
+) -> None:
+    """A hundred candidates are kept for the held-out ray, and some more for the photograph."""
+    occupancies = torch.tensor([1.0] * 100 + [0.2] * more + [0.0] * 300)
+    ray_indices = torch.zeros(len(occupancies), dtype=torch.int64)
+    starts, grey, never = (
+        torch.arange(len(occupancies)) * 1.0,
+        torch.full((1, 3), 0.5),
+        occupancies < 0,
+    )
+
+    def seen_at(occupancy: float) -> Reference:
+        there = occupancies == occupancy
+        intervals = Intervals(ray_indices, starts, starts + 1.0)
+        return Reference(intervals, there.float() / there.sum(), occupancies, there, grey, never)
+
+    ray, photograph = seen_at(1.0), seen_at(0.2)
+    parts = [ray], [grey], lambda number, mask: grey
+    found = calibrate(*parts, CONFIG, cameras=[photograph])
+    assert (found.threshold <= 0.2) == followed
+    assert followed or found == calibrate(*parts, CONFIG)
+
+
 def test_what_a_photograph_loses_never_falls_as_the_threshold_rises() -> None:
     losses = [worst_loss([Chunk(3).reference], threshold) for threshold in reversed(THRESHOLDS)]
     assert losses == sorted(losses) and losses[0] < losses[-1] < 1.0

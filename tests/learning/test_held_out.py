@@ -2,15 +2,21 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 from types import SimpleNamespace
+from typing import Any
 
+import pytest
 import torch
 from nerfstudio.cameras.rays import RayBundle
-from small_learner import SMALLEST, small_mixture
+from small_learner import SMALLEST, NoPixels, small_mixture
 
+from leco_plugin.learning.calibration import CalibrationConfig
 from leco_plugin.learning.dense import dense_rendering, evaluating
-from leco_plugin.scenes.learning_data import held_out_bundle, held_out_rays
+from leco_plugin.learning.held_out import HeldOut
+from leco_plugin.scenes import learning_data
+from leco_plugin.scenes.learning_data import count_held_out, held_out_bundle, held_out_rays
 from leco_plugin.scenes.pixels.held_out_pixels import HeldOutPixelSampler, HeldOutPixelSamplerConfig
 
 COUNT = 50
@@ -47,6 +53,46 @@ def test_the_threshold_is_measured_on_pixels_that_training_never_sees() -> None:
     trained = sampler.sample(manager.images)["indices"]
     held_out = {tuple(pixel) for pixel in pixels.tolist()}
     assert not held_out & {tuple(pixel) for pixel in trained.tolist()}
+
+
+def test_what_calibrates_is_not_what_checks() -> None:
+    manager = Pixels(keeps_pixels_back=True)
+    lattice = manager.train_pixel_sampler.lattice
+    calibrates, _ = held_out_bundle(manager, COUNT)
+    checks, _ = held_out_bundle(Pixels(keeps_pixels_back=True), COUNT, share="recheck")
+    assert bool(lattice.is_of(calibrates, "calibration").all())
+    assert len(calibrates) > len(checks) > 0 and bool(lattice.is_of(checks, "recheck").all())
+    assert count_held_out(Pixels(keeps_pixels_back=True), COUNT) == len(checks)
+
+
+class Asked(Exception):
+    """For which pixels."""
+
+
+CONFIG = CalibrationConfig(rays=70, recheck_rays=7)
+ASKED: dict[str, tuple[Callable[[HeldOut], Any], tuple[Any, ...]]] = {
+    "freezing": (lambda pixels: pixels.price(), (70, 0, "calibration")),
+    "dropping experts": (lambda pixels: pixels.unneeded(9, 0.1), (9, 0, "calibration")),
+    "checking": (lambda pixels: pixels.excesses(5), (7, 5, "recheck")),
+    "lowering": (lambda pixels: pixels.lower(0.3, 4), (70, 4, "all")),
+}
+
+
+@pytest.mark.parametrize("why", ASKED)
+def test_each_measurement_has_pixels_of_its_own(why: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    def asked(manager: Any, *which: Any) -> None:
+        raise Asked(which)
+
+    measure, expected = ASKED[why]
+    data: Any = NoPixels()
+    data.held_out = lambda mixture, *which: held_out_rays(mixture, None, *which)
+    monkeypatch.setattr(learning_data, "held_out_bundle", asked)
+    with pytest.raises(Asked) as found:
+        measure(HeldOut(small_mixture(), data, CONFIG, restarted=False))
+    assert found.value.args == (expected,)
+    with pytest.raises(Asked) as found:
+        held_out_rays(small_mixture(), None, 3)
+    assert found.value.args == ((3, 0, "calibration"),)
 
 
 def test_without_held_out_pixels_it_is_measured_on_training_rays() -> None:

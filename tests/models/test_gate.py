@@ -61,6 +61,10 @@ def test_with_a_threshold_exactly_the_points_below_it_are_empty(seed: int, below
     assert torch.equal(routes[on_scene], logits[on_scene, 1:].argmax(dim=-1) + 1)
 
 
+def test_a_point_exactly_at_the_threshold_is_not_empty() -> None:
+    assert route(torch.zeros(1, 2), 0.5).tolist() == [1]  # o is exactly a half
+
+
 def test_a_norm_that_is_neither_there_nor_not_is_refused() -> None:
     with pytest.raises(ValueError, match="neither true nor false"):
         check_sizes(replace(GateConfig(), normed="no"))  # type: ignore[arg-type]

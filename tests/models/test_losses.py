@@ -167,6 +167,14 @@ def test_termination_is_least_where_all_weight_lies_at_the_known_distance() -> N
     assert termination_loss(elsewhere, two_rays(), distances) > best + 3.0
 
 
+def test_termination_counts_the_weight_within_one_step() -> None:
+    for sample, counts in ((0, False), (1, False), (2, True), (3, True)):
+        weights = torch.eye(8)[sample]
+        found = termination_loss(weights, two_rays(), torch.tensor([2.8, 0.0]))
+        expected = -math.log(1.03 if counts else 0.03)
+        assert float(found) == pytest.approx(expected, rel=1e-5), sample
+
+
 def test_termination_lets_go_of_a_ray_that_plainly_ends_before() -> None:
     def pull(weight_there: float) -> float:
         weights = torch.tensor([0.0, 0.0, 0.0, weight_there, 0.0, 0.0, 0.0, 0.0])

@@ -17,9 +17,11 @@ from leco_plugin.models.rendering import (
     Routing,
     Shaded,
     backdrop_of,
+    composite,
     gate_values_and_routes,
     mapped_middles,
     shade,
+    sum_up,
     with_backdrop,
 )
 from leco_plugin.samplers import marching
@@ -179,6 +181,33 @@ def test_the_backdrop_is_the_same_whatever_was_skipped_before_it() -> None:
         mask = backdrop_of(ended, rays)
         ends.append(torch.stack([ended.t_starts[mask], ended.t_ends[mask]]))
     assert torch.equal(*ends)
+
+
+def test_an_interval_gives_way_to_the_backdrop_that_holds_its_middle() -> None:
+    rays = some_rays(1)  # ends at 3.0, in a backdrop from 2.9 on
+    given = Intervals(torch.zeros(3).long(), *torch.tensor([[2.7, 2.8, 2.88], [2.8, 2.95, 3.0]]))
+    ended = with_backdrop(given, rays, 0.1, 0.0)
+    torch.testing.assert_close(ended.t_starts, torch.tensor([2.7, 2.8, 2.9]))
+    torch.testing.assert_close(ended.t_ends, torch.tensor([2.8, 2.95, 3.0]))
+
+
+def test_what_is_too_faint_to_be_coloured_changes_a_pixel_by_a_fortieth_of_a_step() -> None:
+    def white(features: Tensor, *_: object) -> Tensor:
+        return torch.ones(len(features), 3)
+
+    weights = torch.logspace(-6, -1, 50)
+    given = Intervals(torch.arange(50), torch.ones(50), torch.full((50,), 2.0))
+    rgb = composite(white, torch.zeros(50, 2), weights, some_rays(50), given)  # type: ignore[arg-type]
+    assert float((rgb - weights[:, None]).abs().max()) < 1.05 / 40.0 / 255.0
+    assert bool((rgb == 0.0).any())
+
+
+def test_a_ray_meets_something_from_half_opacity_on() -> None:
+    rays = some_rays(2)
+    given = Intervals(torch.arange(2), torch.ones(2), torch.full((2,), 2.0))
+    accumulation, depth = sum_up(torch.tensor([0.49, 0.51]), rays, given)
+    torch.testing.assert_close(accumulation, torch.tensor([0.49, 0.51]))
+    torch.testing.assert_close(depth, torch.tensor([3.0, 1.5]))
 
 
 def test_a_ray_that_misses_the_scene_stays_transparent() -> None:

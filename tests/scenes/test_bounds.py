@@ -84,6 +84,34 @@ def test_points_lie_between_near_and_far_of_the_cameras(scene) -> None:
     assert float(within[visible].float().mean()) > 0.98
 
 
+def test_near_and_far_are_quantiles_of_the_distances_to_what_is_seen() -> None:
+    """Against a loop over cameras and points."""
+    poses, directions, points = from_above()
+    cameras, rays, places = (one.double().numpy() for one in (poses, directions, points))
+    seen = []
+    for pose, of_camera in zip(cameras, rays):
+        widest = (of_camera @ -pose[:, 2]).min()
+        offsets = places - pose[:, 3]
+        lengths = (offsets**2).sum(axis=1) ** 0.5
+        seen += [t for t, along in zip(lengths, offsets @ -pose[:, 2]) if along > widest * t]
+    seen.sort()
+    bounds = find_bounds(poses, directions, points)
+    assert bounds.near == pytest.approx(0.75 * seen[round(0.01 * (len(seen) - 1))], rel=1e-5)
+    assert bounds.far == pytest.approx(1.25 * seen[round(0.999 * (len(seen) - 1))], rel=1e-5)
+
+
+def test_without_points_near_and_far_are_quantiles_of_where_rays_meet_the_altitudes() -> None:
+    poses, directions, _ = from_above()
+    poses[0, 2, 3] = 30.0  # one camera in 16 is far above the others
+    bounds = find_bounds(poses, directions, None, BoundsConfig(altitudes=(-0.5, 2.0)))
+    heights = poses[:, 2, 3, None].expand(directions.shape[:2])
+    begins, ends = (
+        sorted(((z - heights) / directions[..., 2]).flatten().tolist()) for z in (2.0, -0.5)
+    )
+    assert bounds.near == pytest.approx(0.75 * begins[round(0.01 * (len(begins) - 1))], rel=1e-5)
+    assert bounds.far == pytest.approx(1.05 * ends[round(0.999 * (len(ends) - 1))], rel=1e-5)
+
+
 def test_bounds_grow_with_the_scene() -> None:
     one, ten = find_bounds(*from_above()), find_bounds(*from_above(10.0))
     assert ten.half_extent == pytest.approx(10.0 * one.half_extent, rel=1e-3)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +17,7 @@ from leco_plugin.scenes.city.cameras import look_at
 from leco_plugin.scenes.data_manager import LecoDataManagerConfig, upright_outputs
 from leco_plugin.scenes.photographs import LecoPhotographsDataParserConfig, read_ply
 from leco_plugin.scenes.survey import survey
-from leco_plugin.scenes.upright import turn_to_upright
+from leco_plugin.scenes.upright import _vertical_of, turn_to_upright
 
 UP = torch.tensor([0.0, 0.0, 1.0])
 
@@ -84,6 +85,17 @@ def test_a_survey_is_set_upright_from_any_side(tilt: float, headings: int, turn:
 def test_without_points_cameras_of_several_headings_show_what_is_up() -> None:
     found = turn_to_upright(SIDEWAYS @ flight(10, 4), None)
     assert found is not None and float((found @ SIDEWAYS @ UP)[2]) > np.cos(np.deg2rad(3))
+
+
+@pytest.mark.parametrize(("roll", "known"), [(5.0, True), (20.0, False)])
+def test_right_axes_show_the_vertical_where_they_are_level(roll: float, known: bool) -> None:
+    """Of cameras that turn, and lean to the left and to the right in turns."""
+    lean = torch.deg2rad(torch.tensor([roll, -roll])).repeat(12)
+    angles = torch.arange(24) * math.tau / 24
+    along = torch.stack([angles.cos(), angles.sin(), lean.tan()], dim=-1)
+    found = _vertical_of(torch.nn.functional.normalize(along, dim=-1).double())
+    assert (found is not None) == known
+    assert found is None or float(found[2].abs()) > 0.99
 
 
 def test_without_points_cameras_that_are_held_alike_may_stand_before_a_wall() -> None:
