@@ -5,6 +5,7 @@ from __future__ import annotations
 import subprocess
 import sys
 from importlib.metadata import entry_points, version
+from pathlib import Path
 
 import pytest
 
@@ -47,3 +48,9 @@ def test_every_entry_point_loads(group: str) -> None:
     assert ours
     for entry in ours:
         entry.load()
+
+
+def test_the_citation_and_the_changelog_name_this_version() -> None:
+    root = Path(__file__).resolve().parents[1]
+    assert f"version: {leco_plugin.__version__}\n" in (root / "CITATION.cff").read_text()
+    assert f"## [{leco_plugin.__version__}]" in (root / "CHANGELOG.md").read_text()
