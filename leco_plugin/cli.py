@@ -198,7 +198,7 @@ def demo(
 
     Args:
         out: Folder for everything. By default runs/demo, or runs/demo-quick.
-        seconds: Training time of each of the two runs. By default 130, or 5 if quick.
+        seconds: Training time of each of the two runs. By default 130, or 15 if quick.
         quick: One block in small pictures: shows that an installation works. Its figures mean
             nothing.
         json: Another file for the report.

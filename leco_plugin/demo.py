@@ -40,7 +40,7 @@ MOST_LEARNING = 0.5
 """Limit of learning, as a share of the training time, for slow machines."""
 CITY, AERIAL = CityConfig(), CaptureConfig(street_per_block=0.0)
 """A drone survey: with pictures from the street, all rays would have to begin at the lens."""
-QUICK_SECONDS = 5.0
+QUICK_SECONDS = 15.0
 QUICK = CityConfig(blocks=1), CaptureConfig(48, 36, aerial_per_block=24.0, street_per_block=0.0)
 """Shows that everything works, and nothing else."""
 FEWEST_LEARN_STEPS = 10
@@ -77,7 +77,7 @@ def run_demo(
     code = describe_code()  # before anything is measured
     folder = write_city(city, out / "city", capture)
 
-    guided = _config(folder, out, seconds)
+    guided = _config(folder, out, FULL_LEARNING if quick else seconds)
     budget = Budget(seconds, learn_seconds=MOST_LEARNING * seconds)
     with bar("Guided: learns, freezes, goes on") as show:
         guided_run, trainer = timed_run(
