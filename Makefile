@@ -16,7 +16,7 @@ DEMO ?=
 # One torch thread a worker: small tensors gain nothing by more, and two workers fill two cores.
 WORKERS ?= 2
 
-.PHONY: demo test lint format env clean
+.PHONY: demo test lint format env dist clean
 
 demo: $(READY)
 	$(BIN)/leco demo $(DEMO)
@@ -34,6 +34,12 @@ format: $(READY)
 	$(BIN)/ruff check --fix .
 
 env: $(READY)
+
+# The wheel is built from the sdist, then installed and tried in an environment of its own.
+dist: $(READY)
+	rm -rf dist
+	$(BIN)/python -m build
+	PYTHON=$(BIN)/python .ci/clean-install "$$($(BIN)/python -c 'import sysconfig; print(sysconfig.get_path("purelib"))')"
 
 # Entry points and requirements stand in pyproject.toml, so the installation is as old as it is.
 $(READY): pyproject.toml

@@ -1,6 +1,7 @@
-"""Writes `docs/results.md`, `docs/suites.md`, the tables of `docs/stability.md` and the README's
-table and chart from stored results, or with `--check` says which of them are of other results.
-Charts are drawn where their results have changed; with `--redraw`, all of them.
+"""Writes `docs/results.md`, `docs/suites.md`, the tables of `docs/stability.md` and
+`docs/upstream/leco_nerf.md` and the README's table and chart from stored results, or with `--check`
+says which of them are of other results. Charts are drawn where their results have changed; with
+`--redraw`, all of them.
 
 python benchmarks/results_page.py
 """
@@ -25,6 +26,8 @@ from sharpening import sharpening_sections
 from sizes_sections import sizes_sections
 from stability_page import PAGE as STABILITY_PAGE
 from stability_page import page as stability_page
+from upstream_page import PAGE as UPSTREAM_PAGE
+from upstream_page import page as upstream_page
 
 PAGE = ROOT / "docs" / "results.md"
 SUITES_PAGE = ROOT / "docs" / "suites.md"
@@ -216,6 +219,7 @@ def main() -> int:
     """Writes all, or with --check says whether they are as they should be."""
     wanted = {PAGE: page(), SUITES_PAGE: suites_page(), README: readme(README.read_text())}
     wanted[STABILITY_PAGE] = stability_page(STABILITY_PAGE.read_text(), RESULTS)
+    wanted[UPSTREAM_PAGE] = upstream_page(UPSTREAM_PAGE.read_text())
     if "--check" in sys.argv[1:]:
         stale = [path.name for path, text in wanted.items() if path.read_text() != text]
         stale += [path.name for path, results in pictures().items() if is_stale(path, results)]

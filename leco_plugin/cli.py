@@ -185,15 +185,22 @@ def swap(
     write_json(json, {"format": 1, **facts, "folder": str(folder)})
 
 
-def demo(out: Path = Path("runs/demo"), seconds: float = 130.0, json: Path | None = None) -> None:
+def demo(
+    out: Path | None = None,
+    seconds: float | None = None,
+    quick: bool = False,
+    json: Path | None = None,
+) -> None:
     """Learn the occupancy of a small city, go on guided, and compare with never freezing.
 
     Writes report.json, chart.png, picture.png and occupancy.safetensors. About six minutes on two
     CPU cores.
 
     Args:
-        out: Folder for everything.
-        seconds: Training time of each of the two runs.
+        out: Folder for everything. By default runs/demo, or runs/demo-quick.
+        seconds: Training time of each of the two runs. By default 130, or 15 if quick.
+        quick: One block in small pictures: shows that an installation works. Its figures mean
+            nothing.
         json: Another file for the report.
     """
     import time
@@ -202,7 +209,8 @@ def demo(out: Path = Path("runs/demo"), seconds: float = 130.0, json: Path | Non
     from leco_plugin.demo import run_demo, summary
 
     check_json(json)
-    report = run_demo(out, seconds, began=began)
+    out = out or Path("runs/demo-quick" if quick else "runs/demo")
+    report = run_demo(out, seconds, quick, began)
     print("\n".join(summary(report)))
     print(f"see report.json, chart.png and picture.png in {out}")
     write_json(json, report)

@@ -40,6 +40,9 @@ MOST_LEARNING = 0.5
 """Limit of learning, as a share of the training time, for slow machines."""
 CITY, AERIAL = CityConfig(), CaptureConfig(street_per_block=0.0)
 """A drone survey: with pictures from the street, all rays would have to begin at the lens."""
+QUICK_SECONDS = 15.0
+QUICK = CityConfig(blocks=1), CaptureConfig(48, 36, aerial_per_block=24.0, street_per_block=0.0)
+"""Shows that everything works, and nothing else."""
 FEWEST_LEARN_STEPS = 10
 SLICE_HEIGHT = 4.0
 """Metres over the ground of the slice that is shown: through walls, poles and crowns."""
@@ -49,16 +52,16 @@ NEVER_FROZEN = "leco-occupancy-never-frozen"
 
 def run_demo(
     out: Path,
-    seconds: float = SECONDS,
-    city: CityConfig = CITY,
-    capture: CaptureConfig = AERIAL,
+    seconds: float | None = None,
+    quick: bool = False,
     began: float | None = None,
 ) -> dict[str, Any]:
     """Writes `report.json`, `chart.png`, `picture.png`, the occupancy, the city and both runs.
 
     Args:
         out: folder; an earlier demo's city in it is used again, its results are replaced.
-        seconds: training time of each run.
+        seconds: training time of each run; by default `SECONDS`, or `QUICK_SECONDS`.
+        quick: a city of one block in small pictures.
         began: `time.monotonic()` when the command began; by default now.
     Returns:
         The report, as `--out` has it.
@@ -66,13 +69,15 @@ def run_demo(
         ValueError, OSError: the time is no positive number, or `out` cannot be used.
         RuntimeError: the time was over before the occupancy was learned.
     """
+    seconds = (QUICK_SECONDS if quick else SECONDS) if seconds is None else seconds
+    city, capture = QUICK if quick else (CITY, AERIAL)
     if not 0.0 < seconds < math.inf:
         raise ValueError(f"the training time is a positive number of seconds, not {seconds}")
     began = time.monotonic() if began is None else began
     code = describe_code()  # before anything is measured
     folder = write_city(city, out / "city", capture)
 
-    guided = _config(folder, out, seconds)
+    guided = _config(folder, out, FULL_LEARNING if quick else seconds)
     budget = Budget(seconds, learn_seconds=MOST_LEARNING * seconds)
     with bar("Guided: learns, freezes, goes on") as show:
         guided_run, trainer = timed_run(
@@ -86,10 +91,11 @@ def run_demo(
 
     with bar("The same, never frozen") as show:
         other_run, trainer = timed_run(other, Budget(seconds), sampler="dense", on_progress=show)
+    command = "leco demo --quick" if quick else "leco demo"
     report = {
         "format": 1,
         "machine": describe_machine(),
-        "made": {"date": datetime.date.today().isoformat(), "command": "leco demo", **code},
+        "made": {"date": datetime.date.today().isoformat(), "command": command, **code},
         "scene": _scene_facts(city, capture, trainer.pipeline.datamanager),
         "occupancy": facts,
         "runs": [run.to_dict() for run in (guided_run, other_run)],

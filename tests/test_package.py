@@ -2,13 +2,18 @@
 
 from __future__ import annotations
 
+import re
 import subprocess
 import sys
 from importlib.metadata import entry_points, version
+from pathlib import Path
 
 import pytest
+import yaml
 
 import leco_plugin
+
+ROOT = Path(__file__).resolve().parents[1]
 
 
 def modules_after(statement: str) -> set[str]:
@@ -47,3 +52,14 @@ def test_every_entry_point_loads(group: str) -> None:
     assert ours
     for entry in ours:
         entry.load()
+
+
+def test_the_citation_and_the_changelog_name_this_version() -> None:
+    assert f"version: {leco_plugin.__version__}\n" in (ROOT / "CITATION.cff").read_text()
+    assert f"## [{leco_plugin.__version__}]" in (ROOT / "CHANGELOG.md").read_text()
+
+
+def test_every_python_that_is_declared_is_tried_before_a_release() -> None:
+    declared = re.findall(r"Python :: (3\.\d+)", (ROOT / "pyproject.toml").read_text())
+    jobs = yaml.safe_load((ROOT / ".github" / "workflows" / "release.yml").read_text())["jobs"]
+    assert declared and jobs["try"]["strategy"]["matrix"]["python"] == declared

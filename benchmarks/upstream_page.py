@@ -1,0 +1,52 @@
+"""The results of `docs/upstream/leco_nerf.md`, the page for nerfstudio's own docs."""
+
+from __future__ import annotations
+
+import json
+import statistics
+
+import checkout  # noqa: F401
+from page_parts import RESULTS, ROOT, between, noted, table
+
+from leco_plugin.chart.findings.summary import MEMORY, RENDERING, Line, lines_of
+
+PAGE = ROOT / "docs" / "upstream" / "leco_nerf.md"
+MARKS = "<!-- results: generated -->", "<!-- end of the results -->"
+CHARTS = {
+    "leco-occupancy": "caliterra",
+    "leco-ngp": "caliterra-ngp",
+    "leco-nerfacto": "caliterra-nerfacto",
+    "leco-switch-nerf": "caliterra-enough-time",
+}
+"""Which stored chart shows a method on a survey by drone."""
+HEAD = "Method | Trained for | Sampling | Memory | PSNR | Rendering an image"
+BELOW = r"""
+75 drone photographs of a building site (OpenDroneMap's `odm_data_caliterra`, 480 x 360), on two CPU
+cores. Memory is the most that the process held, a median. PSNR is of test photographs: the mean of
+{seeds} seeds, with the least and the most. A method marked (\*) has a chart that was made before a
+later change."""
+
+
+def page(text: str) -> str:
+    """The page with its table renewed."""
+    rows, seeds = [], set()
+    for method, name in CHARTS.items():
+        results = json.loads((RESULTS / "charts" / f"{name}.json").read_text())
+        lines = [line for line in lines_of(results) if line.method == method]
+        guided = next(line for line in lines if line.learned)
+        other = next(line for line in lines if not line.learned)
+        mark = r" (\*)" if name in noted(RESULTS) else ""
+        for line in (guided, other):
+            rows.append([f"`{method}`{mark}", *_cells(line)])
+            seeds.add(len(line.runs))
+    (count,) = seeds
+    return between(text, MARKS, "\n".join([*table(HEAD, rows), BELOW.format(seeds=count)]))
+
+
+def _cells(line: Line) -> list[str]:
+    """Training time, sampling, memory, PSNR and rendering of a line."""
+    seconds = statistics.median(run["train_seconds"] for run in line.runs)
+    memory, rendering = line.median(MEMORY), line.median(RENDERING)
+    assert memory is not None and rendering is not None
+    psnr = f"{line.psnr:.1f} ({min(line.psnrs):.1f} to {max(line.psnrs):.1f})"
+    return [f"{seconds:.0f} s", line.name, f"{memory:.1f} GB", psnr, f"{rendering:.1f} s"]
