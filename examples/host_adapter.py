@@ -33,7 +33,7 @@ class Guided(nn.Module):
 
 
 def swap(host: MyModel, guide: Guide) -> None:
-    """Puts the guide's sampler in place of the host's; remove what it makes superfluous here too."""
+    """Puts the guide's sampler in the host's place; also remove what it makes superfluous."""
     # guide.proposal: a fixed number of samples on each ray, drawn where the occupancy is;
     # guide.estimator(aabb): packed samples, called as nerfacc's OccGridEstimator
     host.my_sampler = Guided(guide.proposal(num_samples=64, initial_sampler=UniformSampler()))
