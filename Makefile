@@ -16,7 +16,7 @@ DEMO ?=
 # One torch thread a worker: small tensors gain nothing by more, and two workers fill two cores.
 WORKERS ?= 2
 
-.PHONY: demo test lint format env clean
+.PHONY: demo test lint format docs env clean
 
 demo: $(READY)
 	$(BIN)/leco demo $(DEMO)
@@ -33,6 +33,11 @@ format: $(READY)
 	$(BIN)/ruff format .
 	$(BIN)/ruff check --fix .
 
+# The pages of docs/ as a site in site/, which opens without a server. A broken link is an error.
+docs: $(READY)
+	NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs build --quiet --strict
+	@echo "open site/index.html"
+
 env: $(READY)
 
 # Entry points and requirements stand in pyproject.toml, so the installation is as old as it is.
@@ -48,4 +53,4 @@ $(READY): pyproject.toml
 	@touch $@
 
 clean:
-	rm -rf $(VENV)
+	rm -rf $(VENV) site
