@@ -16,7 +16,7 @@ DEMO ?=
 # One torch thread a worker: small tensors gain nothing by more, and two workers fill two cores.
 WORKERS ?= 2
 
-.PHONY: demo test lint format env dist clean
+.PHONY: demo test lint format docs env dist clean
 
 demo: $(READY)
 	$(BIN)/leco demo $(DEMO)
@@ -32,6 +32,11 @@ lint: $(READY)
 format: $(READY)
 	$(BIN)/ruff format .
 	$(BIN)/ruff check --fix .
+
+# The pages of docs/ as a site in site/, which opens without a server. A broken link is an error.
+docs: $(READY)
+	NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs build --quiet --strict
+	@echo "open site/index.html"
 
 env: $(READY)
 
@@ -54,4 +59,4 @@ $(READY): pyproject.toml
 	@touch $@
 
 clean:
-	rm -rf $(VENV)
+	rm -rf $(VENV) site

@@ -9,6 +9,7 @@ from __future__ import annotations
 import importlib
 import json
 import os
+import runpy
 import subprocess
 import sys
 from pathlib import Path
@@ -25,9 +26,10 @@ ENTRY_POINTS = {
     "ns-render": "nerfstudio.scripts.render:entrypoint",
     "leco": "leco_plugin.cli:main",
     "ns-export": "nerfstudio.scripts.exporter:entrypoint",
+    "python": "forked_commands:run_script",
 }
-NOT_EVERYWHERE = ("ns-export",)
-"""Imported only when they are run: not all machines have open3d, which this one needs."""
+NOT_EVERYWHERE = ("ns-export", "python")
+"""Imported only when they are run: not all machines have open3d, which the first one needs."""
 
 
 class ForkedCommands:
@@ -78,6 +80,12 @@ class ForkedCommands:
 def _pipe(pipe: IO[str] | None) -> IO[str]:
     assert pipe is not None
     return pipe
+
+
+def run_script() -> None:
+    """The script that the first argument names, with the others."""
+    del sys.argv[0]
+    runpy.run_path(sys.argv[0], run_name="__main__")
 
 
 def _run(command: list[str], log: str) -> int:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib
+import os
 import re
 import shlex
 import subprocess
@@ -13,6 +14,7 @@ from typing import Any
 import gpu
 import gpu_paper
 import pytest
+import reference_pages
 import tyro
 from nerfstudio.configs.base_config import MachineConfig
 from suite_minutes import minutes_together
@@ -192,3 +194,26 @@ def test_the_published_tables_are_those_of_the_stored_results() -> None:
     command = [sys.executable, str(ROOT / "benchmarks" / "results_page.py"), "--check"]
     done = subprocess.run(command, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
+
+
+@pytest.mark.skipif(ON_GPU, reason="defaults on the page are those of a CPU")
+def test_pages_of_commands_and_options_are_those_of_the_code() -> None:
+    assert TEXTS["commands"] == reference_pages.commands_page()
+    assert TEXTS["options"] == reference_pages.options_page()
+
+
+def test_the_site_builds_without_a_warning_and_fetches_nothing(tmp_path: Path) -> None:
+    """Every link and heading of the site is there; nothing that a page loads is elsewhere."""
+    pytest.importorskip("mkdocs")
+    command = [sys.executable, "-m", "mkdocs", "build", "--strict", "--site-dir", str(tmp_path)]
+    quiet = {**os.environ, "NO_MKDOCS_2_WARNING": "1"}
+    done = subprocess.run(command, cwd=ROOT, env=quiet, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    site = {path.name: path.read_text() for path in tmp_path.glob("*.html")}
+    assert site.keys() >= {"index.html", "tutorial.html"} and "decisions.html" not in site
+    assert "Occupancy.load" in site["python.html"] or "load(path" in site["python.html"]
+    loaded = re.compile(
+        r"<(?:script|link|img|source|iframe)\b[^>]*(?:src|href|srcset)=\"?([^\s\">]+)"
+    )
+    found = [name for page in site.values() for name in loaded.findall(page)]
+    assert len(found) > 100 and [name for name in found if "//" in name] == []

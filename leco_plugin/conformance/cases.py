@@ -83,7 +83,7 @@ def cases_of(name: str) -> list[Case]:
         ValueError: as `sampler_cases` and `host_cases`, or the name is neither.
     """
     known = samplers()
-    if name in known or why_left_out(GROUP, SamplerSpec, name) is not None:
+    if ":" in name or name in known or why_left_out(GROUP, SamplerSpec, name) is not None:
         return sampler_cases(name)
     from nerfstudio.configs.method_configs import all_methods
 

@@ -112,11 +112,16 @@ def build_proposal(name: str, **options: Any) -> nn.Module:
 
 
 def sampler_spec(name: str) -> SamplerSpec:
-    """The sampler of that name.
+    """The sampler of that name, or the spec at "module:attribute", registered or not.
 
     Raises:
         ValueError: there is none, or what is registered under it is of no use.
     """
+    if ":" in name:
+        found: object = _load(name)
+        if not isinstance(found, SamplerSpec):
+            raise ValueError(f"{name} is a {type(found).__name__}, not a SamplerSpec")
+        return found
     if name in OURS:  # to look for others is to read what every installed package says of itself
         return OURS[name]
     known = samplers()
@@ -153,7 +158,7 @@ def _load(builder: Callable[..., nn.Module] | str) -> Callable[..., nn.Module]:
     try:
         made: Callable[..., nn.Module] = getattr(importlib.import_module(module), attribute)
     except (ImportError, AttributeError) as error:
-        raise ValueError(f"the builder {builder} cannot be imported: {error}") from None
+        raise ValueError(f"{builder} cannot be imported: {error}") from None
     return made
 
 
