@@ -13,9 +13,9 @@ from leco_plugin.chart.findings.summary import MEMORY, RENDERING, Line, lines_of
 PAGE = ROOT / "docs" / "upstream" / "leco_nerf.md"
 MARKS = "<!-- results: generated -->", "<!-- end of the results -->"
 CHARTS = {
-    "leco-occupancy": "caliterra",
-    "leco-ngp": "caliterra-ngp",
-    "leco-nerfacto": "caliterra-nerfacto",
+    "leco-occupancy": "caliterra-hosts",
+    "leco-ngp": "caliterra-hosts",
+    "leco-nerfacto": "caliterra-hosts",
     "leco-switch-nerf": "caliterra-enough-time",
 }
 """Which stored chart shows a method on a survey by drone."""
