@@ -170,9 +170,7 @@ def shade_natively(
     return Shaded(totals["rgb"], accumulation, depth, **of, packed_info=packed_info), seen
 
 
-def scene_of(
-    field: HMoEField, gate: Gate, space: Space, routing: Routing
-) -> dict[str, native.Value]:
+def scene_of(field: HMoEField, gate: Gate, space: Space, routing: Routing) -> native.Values:
     """Gate, field and space as `front_to_back.c: Scene` has them."""
     encoding, waves = field.encoding, gate.encoding
     assert isinstance(encoding, HashEncoding) and isinstance(waves, FrequencyEncoding)

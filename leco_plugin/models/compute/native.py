@@ -39,8 +39,8 @@ FEWEST = 2048
 RAYS_AT_ONCE = 512
 """Rays that a thread renders before it takes others: some take longer than others."""
 
-Value = Tensor | Sequence[Tensor | None] | int | float
-"""Of a structure in C: a pointer, an array of pointers, an int, a float."""
+Values = dict[str, Tensor | Sequence[Tensor | None] | int | float | None]
+"""Of a structure in C: pointers, arrays of pointers, ints, floats; None is a null pointer."""
 
 _log = logging.getLogger(__name__)
 
@@ -192,38 +192,56 @@ def field_densities(
     return hidden, raw
 
 
-def front_to_back(scene: dict[str, Value], batch: dict[str, Value]) -> list[slice]:
+def front_to_back(scene: Values, batch: Values) -> list[slice]:
     """Renders rays from the front into the tensors of a batch.
 
     Args:
-        scene, batch: values of the structures `Scene` and `Batch` of `front_to_back.c`, in the same
-            order; all tensors contiguous.
+        scene, batch: what the structures `Scene` and `Batch` of `front_to_back.c` hold, in the same
+            order; tensors are contiguous.
     Returns:
-        where in the tensors of samples those lie that were asked, in the order of the rays.
+        Where in the tensors of samples those lie that were asked, in the order of the rays.
     """
-    starts = batch["starts"]
-    assert isinstance(starts, Tensor)
-    routine = _routine("front_to_back")
+    return _of_rays("front_to_back", (scene, batch), batch["starts"])
+
+
+def march_cells(march: Values) -> list[slice]:
+    """Packs candidates that cells keep or leave open into the tensors of a march.
+
+    Args:
+        march: what the structure `March` of `march.c` holds, in the same order.
+    Returns:
+        Where in the tensors of samples they lie, in the order of the rays.
+    """
+    return _of_rays("march_cells", (march,), march["rooms"])
+
+
+def _of_rays(name: str, given: Sequence[Values], rooms: Any) -> list[slice]:
+    """Calls a routine on parts of a batch of rays.
+
+    Args:
+        rooms: [R] int64, where the samples of each ray have room.
+    """
+    routine = _routine(name)
     routine.restype = ctypes.c_int64  # type: ignore[attr-defined]
-    given = ctypes.byref(_structure(scene)), ctypes.byref(_structure(batch))
-    asked: dict[int, int] = {}
+    structures = [_structure(values) for values in given]
+    pointers, found = [ctypes.byref(one) for one in structures], {}
 
     def work(begin: int, end: int) -> None:
-        asked[begin] = routine(*given, ctypes.c_int64(begin), ctypes.c_int64(end))
+        found[begin] = routine(*pointers, ctypes.c_int64(begin), ctypes.c_int64(end))
 
-    _in_threads(work, len(starts), len(starts) // RAYS_AT_ONCE, RAYS_AT_ONCE)
-    if min(asked.values(), default=0) < 0:
+    _in_threads(work, len(rooms), len(rooms) // RAYS_AT_ONCE, RAYS_AT_ONCE)
+    if min(found.values()) < 0:
         raise MemoryError("no memory for a batch of rays")
-    firsts = starts[sorted(asked)].tolist()
-    return [slice(first, first + asked[ray]) for first, ray in zip(firsts, sorted(asked))]
+    firsts = rooms[sorted(found)].tolist()
+    return [slice(first, first + found[ray]) for first, ray in zip(firsts, sorted(found))]
 
 
-def _structure(values: dict[str, Value]) -> ctypes.Structure:
+def _structure(values: Values) -> ctypes.Structure:
     """In C, of values that the caller keeps alive."""
     made: dict[str, tuple[Any, Any]] = {}
     for name, value in values.items():
-        if isinstance(value, Tensor):
-            made[name] = ctypes.c_void_p, value.data_ptr()
+        if value is None or isinstance(value, Tensor):
+            made[name] = ctypes.c_void_p, None if value is None else value.data_ptr()
         elif isinstance(value, Sequence):
             made[name] = ctypes.POINTER(ctypes.c_void_p), _addresses(value)
         else:
