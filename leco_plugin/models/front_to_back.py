@@ -44,7 +44,7 @@ MANY_RAYS = 2048
 
 
 def is_no_slower(num_rays: int, guided: bool, device: torch.device) -> bool:
-    """Whether shading from the front was measured to take no longer than shading everything.
+    """Whether shading from the front in torch was measured to take no longer than shading all.
 
     Args:
         num_rays: in the batch.
@@ -68,7 +68,7 @@ def shade_front_to_back(
     Returns:
         The rendering, and the intervals that were asked about, to which it belongs.
     """
-    if suits_native(field, gate, rays, intervals, routing):
+    if suits_native(field, gate, space, rays, intervals, routing):
         return shade_natively(field, gate, space, rays, intervals, routing)
     starts, counts = pack_info(intervals.ray_indices, len(rays.origins)).unbind(dim=-1)
     longest = int(counts.max()) if len(counts) else 0
@@ -107,7 +107,12 @@ def samples_of(starts: Tensor, counts: Tensor, most: int) -> Tensor:
 
 
 def suits_native(
-    field: HMoEField, gate: Gate, rays: Rays, intervals: Intervals, routing: Routing
+    field: HMoEField,
+    gate: Gate,
+    space: Space,
+    rays: Rays,
+    intervals: Intervals,
+    routing: Routing,
 ) -> bool:
     """Whether `front_to_back.c` serves."""
     by_threshold = routing.empty_below is not None and not routing.homogeneous
