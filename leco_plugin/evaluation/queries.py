@@ -20,6 +20,7 @@ from nerfstudio.fields.density_fields import HashMLPDensityField
 from torch import Tensor, nn
 
 from leco_plugin.evaluation.clock import Clock
+from leco_plugin.models import front_to_back
 from leco_plugin.models.field import HMoEField
 from leco_plugin.occupancy import Occupancy
 
@@ -33,6 +34,7 @@ def count_queries(model: nn.Module) -> Iterator[Counter[str]]:
     """Counts, by `KINDS`, the positions at which a model's fields are evaluated in this context.
 
     Fields that learn an occupancy for the model are counted too. All fields are `nn.Module`s.
+    What a routine in C asks of a field along rays is counted by its answer.
     nerfstudio's are called by `get_density`, others by `density` or, without it, directly.
     """
     count = Counter(dict.fromkeys(KINDS, 0))
@@ -67,10 +69,22 @@ def count_queries(model: nn.Module) -> Iterator[Counter[str]]:
 
         return ask
 
-    before = []
+    def counting_rays(shade: Callable[..., Any]) -> Callable[..., Any]:
+        @functools.wraps(shade)
+        def ask(field: nn.Module, *args: Any) -> Any:
+            shaded, seen = shade(field, *args)
+            count[kind(field)] += len(seen.t_starts)
+            return shaded, seen
+
+        return ask
+
+    before: list[tuple[Any, str, Any]] = []
     for owner, name in methods:
         before.append((owner, name, owner.__dict__.get(name)))
         setattr(owner, name, counting(getattr(owner, name)))
+    in_c = front_to_back, "shade_natively", front_to_back.shade_natively
+    before.append(in_c)
+    setattr(*in_c[:2], counting_rays(in_c[2]))
     try:
         yield count
     finally:

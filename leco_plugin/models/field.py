@@ -72,6 +72,19 @@ class ColorHead(nn.Module):
         Returns:
             [M, 3] float32 in [0, 1].
         """
+        count = len(features)
+        of_ray = self.hidden_of_rays(directions, image_indices).to(features.dtype)
+        hidden = self.of_features(pad_to_steady_size(features)) + of_ray.index_select(
+            0, pad_to_steady_size(ray_indices)
+        )
+        opponent = self.out(torch.relu(hidden))[:count].float()
+        return torch.sigmoid(opponent @ self.opponent)
+
+    def hidden_of_rays(self, directions: Tensor, image_indices: Tensor | None) -> Tensor:
+        """What direction and code of rays add to the hidden layer: [R, hidden].
+
+        The first layer of a concatenation is the sum of two, one of which is the same all along.
+        """
         of_rays = [self.direction_encoding(directions)]
         if self.appearance is not None:
             code = (
@@ -80,14 +93,12 @@ class ColorHead(nn.Module):
                 else self.appearance.weight.mean(dim=0).expand(len(directions), -1)
             )
             of_rays.append(APPEARANCE_SCALE * code)
-        # the first layer of a concatenation is the sum of two, one of which is the same all along
-        count = len(features)
-        of_ray = self.of_ray(torch.cat(of_rays, dim=-1)).to(features.dtype)
-        hidden = self.of_features(pad_to_steady_size(features)) + of_ray.index_select(
-            0, pad_to_steady_size(ray_indices)
-        )
-        opponent = self.out(torch.relu(hidden))[:count].float()
-        return torch.sigmoid(opponent @ self.opponent)
+        return self.of_ray(torch.cat(of_rays, dim=-1))
+
+    def native_parts(self) -> list[Tensor]:
+        """Weights and biases of both layers, the last one's for red, green and blue."""
+        out = self.out.weight, self.out.bias
+        return [*self.of_features.parameters(), *(self.opponent.T @ each for each in out)]
 
 
 @dataclass(frozen=True)
@@ -151,7 +162,7 @@ class HMoEField(nn.Module):
         Returns:
             sigmas [N] float32, per half extent of the scene; features [N, width].
         """
-        if native.answers_without_graph(mapped, self.projection.weight) and self._suits_native():
+        if native.answers_without_graph(mapped, self.projection.weight) and self.suits_native():
             hidden, raw = self._native_densities(mapped, routes, gate_values)
             return self._sigmas(raw, routes), hidden
         count = len(mapped)
@@ -166,16 +177,23 @@ class HMoEField(nn.Module):
         sigmas: Tensor = _TruncatedExponential.apply(raw - 1.0)
         return sigmas * (routes > 0) if self.config.experts.empty_expert == "none" else sigmas
 
-    def _suits_native(self) -> bool:
+    def suits_native(self) -> bool:
         """Whether `networks.c` knows the experts: residual, without a skip, beside the identity."""
         experts = self.config.experts
         plain = experts.residual and experts.skip is None and experts.empty_expert == "identity"
         plain = plain and experts.layers > 1
-        return plain and max(experts.width, self.encoding.out_dim) <= native.WIDEST
+        widest = max(experts.width, self.encoding.out_dim, self.config.color_width)
+        return plain and widest <= native.WIDEST
 
     def _native_densities(
         self, mapped: Tensor, routes: Tensor, gate_values: Tensor
     ) -> tuple[Tensor, Tensor]:
+        features, layers = self.encoding(mapped), self.config.experts.layers
+        parts = self.native_parts()
+        return native.field_densities(features, routes, gate_values.float(), parts, layers)
+
+    def native_parts(self) -> list[Tensor | None]:
+        """Weights and biases as `networks.c` takes them; None for those of an expert that left."""
         layers = self.config.experts.layers
         parts: list[Tensor | None] = [
             *self.projection.parameters(),
@@ -184,5 +202,4 @@ class HMoEField(nn.Module):
         for expert in self.experts.experts:
             own = [] if expert is None else list(expert.parameters())
             parts += own or [None] * (2 * layers)
-        features = self.encoding(mapped)
-        return native.field_densities(features, routes, gate_values.float(), parts, layers)
+        return parts

@@ -1,7 +1,8 @@
 """Rendering that evaluates no samples behind opaque surfaces.
 
 The kept samples of each ray are evaluated from the front, a few at a time. A ray stops when no
-light is left. The slow twin is `rendering.shade`, which evaluates all of them.
+light is left. The slow twin is `rendering.shade`, which evaluates all of them. On a CPU all of it is
+one routine in C, `compute/front_to_back.c`, where that knows gate and field.
 """
 
 from __future__ import annotations
@@ -11,15 +12,21 @@ import math
 import torch
 from torch import Tensor
 
+from leco_plugin.models.compute import native
+from leco_plugin.models.encodings import FRESH, FrequencyEncoding, HashEncoding
 from leco_plugin.models.field import HMoEField
 from leco_plugin.models.gate import Gate
 from leco_plugin.models.rendering import (
+    OPAQUE,
+    VISIBLE,
     Answers,
     Intervals,
     Rays,
     Routing,
     Shaded,
     ask,
+    backdrop_ends,
+    mean_distance,
     render,
 )
 from leco_plugin.samplers.packed import pack_info
@@ -33,11 +40,11 @@ FEWEST_AT_ONCE, MOST_LOOKS = 8, 16
 """Samples of a ray between two looks at its transmittance, and looks at the longest ray."""
 
 MANY_RAYS = 2048
-"""In a batch from which on a CPU is no slower for looking; see `docs/decisions.md`."""
+"""In a batch from which on torch on a CPU is no slower for looking; see `docs/decisions.md`."""
 
 
 def is_no_slower(num_rays: int, guided: bool, device: torch.device) -> bool:
-    """Whether shading from the front was measured to take no longer than shading everything.
+    """Whether shading from the front in torch was measured to take no longer than shading all.
 
     Args:
         num_rays: in the batch.
@@ -61,6 +68,8 @@ def shade_front_to_back(
     Returns:
         The rendering, and the intervals that were asked about, to which it belongs.
     """
+    if suits_native(field, gate, space, rays, intervals, routing):
+        return shade_natively(field, gate, space, rays, intervals, routing)
     starts, counts = pack_info(intervals.ray_indices, len(rays.origins)).unbind(dim=-1)
     longest = int(counts.max()) if len(counts) else 0
     at_once = max(FEWEST_AT_ONCE, -(-longest // MOST_LOOKS))
@@ -95,3 +104,106 @@ def samples_of(starts: Tensor, counts: Tensor, most: int) -> Tensor:
     """
     steps = torch.arange(most, device=starts.device)
     return (starts[:, None] + steps)[steps < counts[:, None]]
+
+
+def suits_native(
+    field: HMoEField,
+    gate: Gate,
+    space: Space,
+    rays: Rays,
+    intervals: Intervals,
+    routing: Routing,
+) -> bool:
+    """Whether `front_to_back.c` serves."""
+    by_threshold = routing.empty_below is not None and not routing.homogeneous
+    known = by_threshold and len(rays.origins) > 0 and isinstance(field.encoding, HashEncoding) and field.suits_native()
+    return known and gate.answers_natively(rays.origins) and native.suits(*rays[:4], *intervals[1:])
+
+
+def shade_natively(
+    field: HMoEField,
+    gate: Gate,
+    space: Space,
+    rays: Rays,
+    intervals: Intervals,
+    routing: Routing,
+) -> tuple[Shaded, Intervals]:
+    """`shade_front_to_back` in C; `evaluation/queries.py` counts what it asks."""
+    ray_indices, t_starts, t_ends = intervals
+    count, outputs = len(rays.origins), gate.head.out_features
+    starts, counts = pack_info(ray_indices, count).T.contiguous()
+    totals = {
+        "rgb": rays.origins.new_zeros(count, 3),
+        "accumulation": rays.origins.new_zeros(count),
+        "distance": rays.origins.new_zeros(count),
+        "asked": torch.zeros_like(counts),
+    }
+    samples = {
+        "ray_indices": torch.empty_like(ray_indices),
+        "routes": torch.empty_like(ray_indices),
+        "t_starts": torch.empty_like(t_starts),
+        "t_ends": torch.empty_like(t_starts),
+        "weights": torch.empty_like(t_starts),
+        "sigmas": torch.empty_like(t_starts),
+        "logits": t_starts.new_empty(len(t_starts), outputs),
+    }
+    asked = native.front_to_back(
+        scene_of(field, gate, space, routing),
+        {
+            "origins": rays.origins.contiguous(),
+            "directions": rays.directions.contiguous(),
+            "of_rays": field.color.hidden_of_rays(rays.directions, rays.images).contiguous(),
+            "ends": backdrop_ends(rays).contiguous(),
+            "starts": starts,
+            "counts": counts,
+            "given_starts": t_starts.contiguous(),
+            "given_ends": t_ends.contiguous(),
+            **totals,
+            **samples,
+            "least_light": LEAST_LIGHT,
+            "visible": VISIBLE,
+            "opaque": OPAQUE,
+            "at_once": FEWEST_AT_ONCE,
+        },
+    )
+    of = {name: torch.cat([values[part] for part in asked]) for name, values in samples.items()}
+    seen = Intervals(of.pop("ray_indices"), of.pop("t_starts"), of.pop("t_ends"))
+    ends = totals["asked"].cumsum(0)
+    packed_info = torch.stack([ends - totals["asked"], totals["asked"]], dim=-1)
+    accumulation = totals["accumulation"]
+    depth = mean_distance(accumulation, totals["distance"], rays)
+    return Shaded(totals["rgb"], accumulation, depth, **of, packed_info=packed_info), seen
+
+
+def scene_of(field: HMoEField, gate: Gate, space: Space, routing: Routing) -> native.Values:
+    """Gate, field and space as `front_to_back.c: Scene` has them."""
+    encoding, waves = field.encoding, gate.encoding
+    assert isinstance(encoding, HashEncoding) and isinstance(waves, FrequencyEncoding)
+    empty_below = routing.empty_below or 0.0
+    levels = len(encoding.resolutions)
+    rows, features = encoding.table.shape
+    return {
+        "scales": waves.scales,
+        "resolutions": encoding.resolutions,
+        "table": encoding.table,
+        "center": space.center,
+        "gate": gate.native_parts(),
+        "field": field.native_parts(),
+        "color": field.color.native_parts(),
+        "left": field.experts.left,
+        "epsilon": float(gate.norm.eps),
+        "half_extent": float(space.half_extent),
+        "empty_odds": empty_below / (1.0 - empty_below) if empty_below < 1.0 else math.inf,
+        "octaves": len(waves.scales),
+        "fresh": FRESH[torch.float32],
+        "gate_layers": len(gate.hidden),
+        "gate_width": gate.config.width,
+        "outputs": gate.head.out_features,
+        "levels": levels,
+        "log2": (rows // levels).bit_length() - 1,
+        "features": features,
+        "width": field.config.experts.width,
+        "layers": field.config.experts.layers,
+        "units": field.config.color_width,
+        "unbounded": int(space.unbounded),
+    }

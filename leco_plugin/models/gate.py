@@ -138,10 +138,14 @@ class Gate(nn.Module):
         return known and native.answers_without_graph(mapped, self.head.weight)
 
     def _native_logits(self, mapped: Tensor) -> Tensor:
-        parts = [part for layer in self.hidden for part in layer.parameters()]
-        parts += [*self.norm.parameters(), *self.head.parameters()]
         scales: Tensor = self.encoding.scales  # type: ignore[union-attr, assignment]
+        parts = self.native_parts()
         return native.gate_logits(mapped, scales, FRESH[torch.float32], parts, self.norm.eps)
+
+    def native_parts(self) -> list[Tensor]:
+        """Weights and biases as `networks.c` takes them."""
+        parts = [part for layer in self.hidden for part in layer.parameters()]
+        return [*parts, *self.norm.parameters(), *self.head.parameters()]
 
     def occupancy(self, mapped: Tensor) -> Tensor:
         """o(x) = 1 - G_0(x): mapped positions [N, 3] to [N] float32 in [0, 1]."""

@@ -12,7 +12,7 @@ import torch
 from torch import Tensor, nn
 
 from leco_plugin.models.field import HMoEField
-from leco_plugin.models.front_to_back import is_no_slower, shade_front_to_back
+from leco_plugin.models.front_to_back import is_no_slower, shade_front_to_back, suits_native
 from leco_plugin.models.gate import Gate, GateConfig
 from leco_plugin.models.region import Region, marching_rule
 from leco_plugin.models.rendering import (
@@ -195,14 +195,15 @@ class Mixture(nn.Module):
             front_to_back: whether to leave out what lies behind opaque surfaces, without gradients;
                 None does so where that was measured to be no slower.
         """
-        if front_to_back is None:
-            front_to_back = is_no_slower(len(rays.origins), self.skips, self.device)
-        if not front_to_back:
-            return self.shade(rays, intervals), intervals
+        parts = self.field, self.gate, self.region.space, rays, intervals, self.routing
         with gate_precision(self.device.type, self.precision):
-            return shade_front_to_back(
-                self.field, self.gate, self.region.space, rays, intervals, self.routing
-            )
+            if front_to_back is None:
+                front_to_back = suits_native(*parts) or is_no_slower(
+                    len(rays.origins), self.skips, self.device
+                )
+            if front_to_back:
+                return shade_front_to_back(*parts)
+        return self.shade(rays, intervals), intervals
 
     @torch.no_grad()
     def freeze(self, threshold: float, report: dict[str, Any]) -> None:

@@ -179,10 +179,14 @@ def backdrop_starts(rays: Rays, step_size: float, cone_angle: float) -> Tensor:
 
 def backdrop_of(intervals: Intervals, rays: Rays) -> Tensor:
     """Which intervals [M] are backdrops; rays that are cut off or have no length have none."""
+    return intervals.t_ends >= backdrop_ends(rays).index_select(0, intervals.ray_indices)
+
+
+def backdrop_ends(rays: Rays) -> Tensor:
+    """Where the backdrop of each ray ends [R]; infinity where it has none."""
     without = rays.t_maxs <= rays.t_mins
     without = without if rays.cut_off is None else without | rays.cut_off
-    ends = rays.t_maxs.masked_fill(without, torch.inf)
-    return intervals.t_ends >= ends.index_select(0, intervals.ray_indices)
+    return rays.t_maxs.masked_fill(without, torch.inf)
 
 
 def mapped_middles(space: Space, rays: Rays, intervals: Intervals) -> Tensor:
@@ -310,6 +314,10 @@ def sum_up(weights: Tensor, rays: Rays, intervals: Intervals) -> tuple[Tensor, T
         intervals.ray_indices,
         len(rays.origins),
     )
-    accumulation = sums[:, 0]
-    depth = torch.where(accumulation >= MET, sums[:, 1] / accumulation.clamp(min=MET), rays.t_maxs)
-    return accumulation, depth
+    accumulation, distance = sums.unbind(dim=-1)
+    return accumulation, mean_distance(accumulation, distance, rays)
+
+
+def mean_distance(accumulation: Tensor, distance: Tensor, rays: Rays) -> Tensor:
+    """Expected depth [R] from sums of weights and of weighted distances, both [R]."""
+    return torch.where(accumulation >= MET, distance / accumulation.clamp(min=MET), rays.t_maxs)

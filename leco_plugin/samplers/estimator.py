@@ -18,7 +18,7 @@ from leco_plugin.samplers.boxes import cell_centers, checked_box, intersect_box
 from leco_plugin.samplers.cells.build import build_cache
 from leco_plugin.samplers.cells.cache import CellCache, OccupancyLike
 from leco_plugin.samplers.changes import Snapshot
-from leco_plugin.samplers.kernels import fused
+from leco_plugin.samplers.kernels import fused, native_march
 from leco_plugin.samplers.marching import NearFn, OccupiedFn, Samples
 from leco_plugin.samplers.rays import March, Rays
 
@@ -120,9 +120,11 @@ class LearnedOccupancyEstimator(Estimator):
         return self.occupied, None if self.cache is None else self.cache.near
 
     def march(self, rays: Rays, rule: March) -> Samples:
-        """As any estimator's, by the fused march where it runs."""
+        """As any estimator's, by the fused march or in C where those run."""
         self._refresh()
         samples = fused.march(self.occupancy, self.cache, rays, rule)
+        if samples is None:
+            samples = native_march.march(self.occupancy.occupied, self.cache, rays, rule)
         samples = super().march(rays, rule) if samples is None else samples
         if self.training and not (self._warned or self._box_is_given or len(samples[0])):
             self._warned = self._warn_of_rays_elsewhere(rays)

@@ -13,8 +13,10 @@ from nerfstudio.fields.density_fields import HashMLPDensityField
 from torch import Tensor, nn
 
 from leco_plugin.evaluation.queries import GridUpdates, count_queries
+from leco_plugin.models import front_to_back
 from leco_plugin.models.encodings import EncodingConfig
 from leco_plugin.models.field import FieldConfig, HMoEField
+from leco_plugin.models.rendering import Intervals
 from leco_plugin.occupancy import Occupancy
 from leco_plugin.samplers.grid import OccupancyGridEstimator
 
@@ -180,3 +182,13 @@ def test_a_grid_that_does_not_say_when_it_is_warm_is_updated_all_the_same() -> N
     updates = GridUpdates(host)
     host.grid.update_every_n_steps(3, ball_density)
     assert calls == [3] and updates.warming_up is None
+
+
+def test_what_c_asks_of_a_field_is_counted_by_its_answer(monkeypatch: pytest.MonkeyPatch) -> None:
+    field, seen = hmoe(), Intervals(torch.zeros(7).long(), torch.zeros(7), torch.ones(7))
+    monkeypatch.setattr(front_to_back, "shade_natively", lambda *_: (None, seen))
+    shade = front_to_back.shade_natively
+    with count_queries(Host(field)) as queries:
+        front_to_back.shade_natively(field, None)  # type: ignore[call-arg, arg-type]
+    assert queries["field"] == 7
+    assert front_to_back.shade_natively is shade

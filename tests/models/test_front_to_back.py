@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+from typing import Literal
+
 import pytest
 import torch
 
+from leco_plugin.models.compute import native
 from leco_plugin.models.encodings import EncodingConfig
 from leco_plugin.models.field import FieldConfig, HMoEField
 from leco_plugin.models.front_to_back import (
@@ -14,11 +17,20 @@ from leco_plugin.models.front_to_back import (
     is_no_slower,
     samples_of,
     shade_front_to_back,
+    suits_native,
 )
 from leco_plugin.models.gate import Gate, GateConfig
 from leco_plugin.models.hmoe import HMoEConfig
-from leco_plugin.models.rendering import Intervals, Rays, Routing, shade, with_backdrop
+from leco_plugin.models.rendering import (
+    Intervals,
+    Rays,
+    Routing,
+    mapped_middles,
+    shade,
+    with_backdrop,
+)
 from leco_plugin.samplers import marching
+from leco_plugin.samplers.kernels import VARIABLE
 from leco_plugin.samplers.marching import March, march
 from leco_plugin.samplers.packed import render_transmittance_from_density
 from leco_plugin.space import Space
@@ -27,6 +39,15 @@ ROUTING = Routing(0.2, False)
 STEP = 0.02
 HARDLY = 1.0 / 255.0 / 30.0
 """A thirtieth of a step of an 8-bit image."""
+
+needs_compiler = pytest.mark.skipif(not native.has_native(), reason="no C compiler")
+
+
+@pytest.fixture(params=[pytest.param("native", marks=needs_compiler), "torch"])
+def by(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Tests with it run in C and in torch."""
+    if request.param == "torch":
+        monkeypatch.setenv(VARIABLE, "native")
 
 
 class Scene:
@@ -63,6 +84,7 @@ def kept_along(rays: Rays) -> Intervals:
     return with_backdrop(Intervals(*samples), rays, STEP, 0.0)
 
 
+@pytest.mark.usefixtures("by")
 @pytest.mark.parametrize("density", [0.01, 1.0, 30.0, 3000.0])
 @pytest.mark.parametrize("count", [0, 1, 150])
 def test_it_renders_what_asking_about_everything_renders(count: int, density: float) -> None:
@@ -77,6 +99,7 @@ def test_it_renders_what_asking_about_everything_renders(count: int, density: fl
     torch.testing.assert_close(seen.depth, whole.depth, atol=2.5 * HARDLY, rtol=0.0)
 
 
+@pytest.mark.usefixtures("by")
 @pytest.mark.parametrize("density", [0.01, 30.0, 3000.0])
 def test_it_asks_from_the_front_and_hardly_further_than_light_goes(density: float) -> None:
     scene, rays = Scene(density), some_rays(150)
@@ -108,12 +131,48 @@ def test_it_asks_from_the_front_and_hardly_further_than_light_goes(density: floa
         assert bool(was_asked.all())
 
 
+@needs_compiler
+@pytest.mark.parametrize("density", [1.0, 30.0])
+@pytest.mark.parametrize("kind", ["contraction", "box"])
+def test_c_asks_and_answers_as_torch_does(
+    kind: Literal["contraction", "box"], density: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    scene = Scene(density)
+    scene.space.set(kind, torch.tensor([0.1, 0.0, -0.2]), 0.7)
+    scene.field.experts.drop(2)
+    for parameter in scene.field.experts.parameters():
+        parameter.data.normal_(0.0, 0.3)
+    rays = some_rays(150)._replace(images=torch.arange(150) % 3, cut_off=torch.arange(150) % 4 == 0)
+    everything = kept_along(rays)
+    for parameter in scene.gate.parameters():
+        parameter.data.normal_()
+    likely = scene.gate.occupancy(mapped_middles(scene.space, rays, everything))
+    given = *scene.parts(), rays, everything, Routing(float(likely.median()), False)
+    monkeypatch.setattr(native, "RAYS_AT_ONCE", 40)
+    monkeypatch.setattr(torch, "get_num_threads", lambda: 2)
+    assert not suits_native(*given)  # where gradients are wanted
+    ours, asked = shade_front_to_back(*given)
+    monkeypatch.setenv(VARIABLE, "native")
+    theirs, expected = shade_front_to_back(*given)
+    assert set(ours.routes.tolist()) == {0, 1, 3}
+    for one, other in zip((*asked, *ours), (*expected, *theirs), strict=True):
+        torch.testing.assert_close(one, other, rtol=1e-5, atol=1e-6)
+
+
+@needs_compiler
+def test_c_does_not_hide_what_is_no_number() -> None:
+    scene, rays = Scene(1.0), some_rays(20)
+    scene.gate.hidden[0].bias.data[0] = torch.nan
+    shaded, _ = shade_front_to_back(*scene.parts(), rays, kept_along(rays), ROUTING)
+    assert bool(shaded.accumulation.isnan().all())
+
+
 def test_samples_of_some_rays_are_counted_out() -> None:
     found = samples_of(torch.tensor([3, 10, 20]), torch.tensor([2, 0, 3]), 4)
     assert found.tolist() == [3, 4, 20, 21, 22]
 
 
-def test_where_it_was_not_measured_to_be_no_slower_everything_is_shaded() -> None:
+def test_where_torch_was_not_measured_to_be_no_slower_it_shades_everything() -> None:
     cpu = torch.device("cpu")
     assert is_no_slower(MANY_RAYS, True, cpu)
     assert not is_no_slower(MANY_RAYS - 1, True, cpu)

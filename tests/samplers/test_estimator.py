@@ -11,12 +11,16 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from samplers.analytic_occupancy import Balls, camera_rays, slow_march
 
+from leco_plugin.models.compute import native
 from leco_plugin.samplers import packed
 from leco_plugin.samplers.base import DenseEstimator
 from leco_plugin.samplers.estimator import LearnedOccupancyEstimator
 from leco_plugin.samplers.grid import OccupancyGridEstimator
+from leco_plugin.samplers.kernels import VARIABLE, native_march
 
 BUDGET = 1 << 16
+
+needs_compiler = pytest.mark.skipif(not native.has_native(), reason="no C compiler")
 
 
 @pytest.fixture(scope="module", params=["box", "contraction"])
@@ -60,6 +64,24 @@ def test_the_cache_changes_almost_no_sample(learned):
     without = bare.sampling(origins, directions, **options)
     kept = [set(zip(s[0].tolist(), s[1].tolist(), strict=True)) for s in (with_cache, without)]
     assert len(kept[0] ^ kept[1]) <= 1e-4 * learned.occupancy.asked
+
+
+@needs_compiler
+@pytest.mark.parametrize("cone_angle", [0.0, 0.01])
+def test_the_march_in_c_is_that_of_torch(learned, cone_angle, monkeypatch):
+    monkeypatch.setattr(native, "RAYS_AT_ONCE", 70)
+    monkeypatch.setattr(native_march, "CANDIDATES_AT_ONCE", 100_000)  # a batch in parts
+    origins, directions = camera_rays(500)
+    directions[7] = torch.nan
+    options = {"render_step_size": 0.01, "near_plane": 0.1, "far_plane": 6.0}
+    learned.occupancy.asked = 0
+    ours = learned.sampling(origins, directions, cone_angle=cone_angle, **options)
+    asked, learned.occupancy.asked = learned.occupancy.asked, 0
+    monkeypatch.setenv(VARIABLE, "native")
+    theirs = learned.sampling(origins, directions, cone_angle=cone_angle, **options)
+    assert 0 < asked == learned.occupancy.asked < len(ours[0])
+    for one, other in zip(ours, theirs, strict=True):
+        torch.testing.assert_close(one, other)
 
 
 def test_stratified_sampling_shifts_by_less_than_a_step(bare):

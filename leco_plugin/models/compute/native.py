@@ -1,4 +1,5 @@
-"""Routines in C for a CPU (`hash_grids.c`, `networks.c`), compiled when first wanted.
+"""Routines in C for a CPU (`hash_grids.c`, `networks.c`, `front_to_back.c`), compiled when first
+wanted.
 
 A C compiler, where there is one, takes less than a second for them. Where there is none, and where
 `LECO_KERNELS_OFF` names `native`, torch does the same work.
@@ -18,6 +19,7 @@ import threading
 from collections.abc import Callable, Sequence
 from itertools import pairwise
 from pathlib import Path
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -34,6 +36,11 @@ WIDEST = 512
 """Features of a layer, at most: `networks.c` has room for so many."""
 FEWEST = 2048
 """Points that a thread of its own is worth."""
+RAYS_AT_ONCE = 512
+"""Rays that a thread renders before it takes others: some take longer than others."""
+
+Values = dict[str, Tensor | Sequence[Tensor | None] | int | float | None]
+"""Of a structure in C: pointers, arrays of pointers, ints, floats; None is a null pointer."""
 
 _log = logging.getLogger(__name__)
 
@@ -185,6 +192,65 @@ def field_densities(
     return hidden, raw
 
 
+def front_to_back(scene: Values, batch: Values) -> list[slice]:
+    """Renders rays from the front into the tensors of a batch.
+
+    Args:
+        scene, batch: what the structures `Scene` and `Batch` of `front_to_back.c` hold, in the same
+            order; tensors are contiguous.
+    Returns:
+        Where in the tensors of samples those lie that were asked, in the order of the rays.
+    """
+    return _of_rays("front_to_back", (scene, batch), batch["starts"])
+
+
+def march_cells(march: Values) -> list[slice]:
+    """Packs candidates that cells keep or leave open into the tensors of a march.
+
+    Args:
+        march: what the structure `March` of `march.c` holds, in the same order.
+    Returns:
+        Where in the tensors of samples they lie, in the order of the rays.
+    """
+    return _of_rays("march_cells", (march,), march["rooms"])
+
+
+def _of_rays(name: str, given: Sequence[Values], rooms: Any) -> list[slice]:
+    """Calls a routine on parts of a batch of rays.
+
+    Args:
+        rooms: [R] int64, where the samples of each ray have room.
+    """
+    routine = _routine(name)
+    routine.restype = ctypes.c_int64  # type: ignore[attr-defined]
+    structures = [_structure(values) for values in given]
+    pointers, found = [ctypes.byref(one) for one in structures], {}
+
+    def work(begin: int, end: int) -> None:
+        found[begin] = routine(*pointers, ctypes.c_int64(begin), ctypes.c_int64(end))
+
+    _in_threads(work, len(rooms), len(rooms) // RAYS_AT_ONCE, RAYS_AT_ONCE)
+    if min(found.values()) < 0:
+        raise MemoryError("no memory for a batch of rays")
+    firsts = rooms[sorted(found)].tolist()
+    return [slice(first, first + found[ray]) for first, ray in zip(firsts, sorted(found))]
+
+
+def _structure(values: Values) -> ctypes.Structure:
+    """In C, of values that the caller keeps alive."""
+    made: dict[str, tuple[Any, Any]] = {}
+    for name, value in values.items():
+        if value is None or isinstance(value, Tensor):
+            made[name] = ctypes.c_void_p, None if value is None else value.data_ptr()
+        elif isinstance(value, Sequence):
+            made[name] = ctypes.POINTER(ctypes.c_void_p), _addresses(value)
+        else:
+            made[name] = ctypes.c_int if isinstance(value, int) else ctypes.c_float, value
+    fields = [(name, kind) for name, (kind, _) in made.items()]
+    structure = type("Values", (ctypes.Structure,), {"_fields_": fields})
+    return structure(**{name: value for name, (_, value) in made.items()})
+
+
 def _addresses(parts: Sequence[Tensor | None]) -> ctypes.Array[ctypes.c_void_p]:
     """Of contiguous tensors, which the caller keeps alive."""
     return (ctypes.c_void_p * len(parts))(
@@ -208,21 +274,31 @@ def _log2(size: int) -> int:
     return size.bit_length() - 1
 
 
-def _in_threads(work: Callable[[int, int], None], count: int, most: int) -> None:
+def _in_threads(
+    work: Callable[[int, int], None], count: int, most: int, at_once: int | None = None
+) -> None:
     """Calls `work` on consecutive parts of range(count), in as many threads as torch has.
 
     Args:
         most: threads that the work is worth.
+        at_once: size of a part; None is one part for each thread.
     """
     threads = max(1, min(torch.get_num_threads(), most, count))
-    cuts = [count * i // threads for i in range(threads + 1)]
-    others = [threading.Thread(target=work, args=part) for part in pairwise(cuts[1:])]
+    parts = threads if at_once is None else max(1, -(-count // at_once))
+    cuts = [count * i // parts for i in range(parts + 1)]
+    left = iter(list(pairwise(cuts)))
+
+    def take() -> None:
+        for part in left:
+            work(*part)
+
+    others = [threading.Thread(target=take) for _ in range(threads - 1)]
     started = []
     try:
         for other in others:
             other.start()
             started.append(other)
-        work(cuts[0], cuts[1])
+        take()
     finally:  # nothing is freed that a thread still writes
         for other in started:
             other.join()

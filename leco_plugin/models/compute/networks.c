@@ -6,8 +6,9 @@
  * matrices are as torch has them: [outputs, inputs].
  */
 #include <math.h>
-#include <stdint.h>
 #include <string.h>
+
+#include "routines.h"
 
 #define BLOCK 48
 #define LANES 8
@@ -17,7 +18,7 @@ typedef float Lanes __attribute__((vector_size(4 * LANES)));
 typedef int Ints __attribute__((vector_size(4 * LANES)));
 typedef float Block[WIDEST][BLOCK] __attribute__((aligned(64)));
 
-enum { AS_IT_IS, RELU, ADDED };
+enum { AS_IT_IS, RELU, ADDED }; /* ADDED | RELU is both, in that order */
 
 static inline __attribute__((always_inline)) void
 outputs_of(const float *weights, const float *biases, int inputs, const float (*in)[BLOCK],
@@ -45,14 +46,16 @@ outputs_of(const float *weights, const float *biases, int inputs, const float (*
 #pragma GCC unroll 3
             for (int v = 0; v < 3; v++) {
                 Lanes *place = (Lanes *)&out[r][b] + v, value = sums[r][v];
-                if (then == RELU)
+                if (then & ADDED)
+                    value += *place;
+                if (then & RELU)
                     value = (Lanes)((Ints)value & ~(value <= 0)); /* keeps NaN */
-                *place = then == ADDED ? *place + value : value;
+                *place = value;
             }
     }
 }
 
-/* A linear layer; its outputs are kept, cut off below zero, or added to what is there. */
+/* A linear layer; its outputs are added to what is there, cut off below zero, or kept. */
 static void linear(const float *weights, const float *biases, int inputs, int outputs,
                    const float (*in)[BLOCK], float (*out)[BLOCK], int then)
 {
@@ -206,5 +209,33 @@ void field_densities(const float *features, const int64_t *order, const int64_t 
         for (int b = 0; b < count; b++)
             raw[order[first + b]] = third[0][b];
         first += count;
+    }
+}
+
+/* Adds to rgb[rays, 3] the colours of `count` samples, whose numbers are `chosen`, by weight.
+ *
+ * hidden: [samples, width]. rays: [samples]. of_rays: [rays, units], the ray's share of the hidden
+ * layer. parts: weights and biases of the hidden layer and of the last, before the sigmoid. */
+void add_colors(const float *hidden, const float *weights, const int64_t *rays, const int *chosen,
+                int count, const float *of_rays, const float *const *parts, float *rgb, int width,
+                int units)
+{
+    Block one, other;
+    memset(one, 0, sizeof one), memset(other, 0, sizeof other);
+    for (int first = 0; first < count; first += BLOCK) {
+        const int *block = chosen + first, size = in_block(first, count);
+        for (int b = 0; b < size; b++) {
+            const float *features = hidden + (int64_t)block[b] * width;
+            const float *of_ray = of_rays + rays[block[b]] * units;
+            for (int k = 0; k < width; k++)
+                one[k][b] = features[k];
+            for (int k = 0; k < units; k++)
+                other[k][b] = of_ray[k];
+        }
+        linear(parts[0], parts[1], width, units, one, other, ADDED | RELU);
+        linear(parts[2], parts[3], units, 3, other, one, AS_IT_IS);
+        for (int b = 0; b < size; b++)
+            for (int c = 0; c < 3; c++)
+                rgb[3 * rays[block[b]] + c] += weights[block[b]] / (1.0f + expf(-one[c][b]));
     }
 }

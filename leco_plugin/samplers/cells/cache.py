@@ -156,6 +156,12 @@ class CellCache(nn.Module):
             setattr(self, name, fn(getattr(self, name)))
         return self
 
+    @property
+    def frame(self) -> Tensor:
+        """Scale and shift [3] to coarse cells, centre [3] and half extent of the space: [8]."""
+        given = self.scale, self.shift, self.center, self.half_extent
+        return torch.cat([part.view(-1) for part in given])
+
     def tables(self) -> Tables:
         """The tables, where they are now."""
         return Tables(

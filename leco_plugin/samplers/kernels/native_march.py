@@ -1,0 +1,94 @@
+"""The march of an estimator's rays in C, on a CPU; its torch twin is `marching.march`.
+
+Cells decide in C. What they leave open is packed too, and the gate is then asked about all of it.
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from leco_plugin.models.compute import native
+from leco_plugin.samplers.cells.cache import CellCache
+from leco_plugin.samplers.edges import MOST_POWERS, growth_table, powers_needed, switch
+from leco_plugin.samplers.marching import OccupiedFn, Samples, join
+from leco_plugin.samplers.rays import Candidates, March, Rays, plan
+
+CANDIDATES_AT_ONCE = 1 << 22
+"""That room is made for: 17 bytes each, of which only what is kept is touched."""
+
+
+@torch.no_grad()
+def march(occupied: OccupiedFn, cache: CellCache | None, rays: Rays, rule: March) -> Samples | None:
+    """The candidates that a frozen gate keeps; None: ask the torch twin.
+
+    Args:
+        occupied: the gate's decisions.
+        cache: cells of them.
+
+    Raises:
+        ValueError: as `marching.march`.
+    """
+    growing = rule.cone_angle > 0.0
+    if cache is None or not native.suits(rays.origins, cache.frame):
+        return None
+    if growing and powers_needed(*rule) > MOST_POWERS:
+        return None
+    candidates, _, longest = plan(rays, rule)
+    at_once = max(1, CANDIDATES_AT_ONCE // max(longest, 1))
+    parts = []
+    for first in range(0, len(candidates.counts), at_once):
+        part = candidates.of_rays(slice(first, first + at_once))
+        (ray_indices, t_starts, t_ends), left_open = _march(cache, part)
+        parts.append((ray_indices.add_(first), t_starts, t_ends, left_open))
+    if not parts:
+        return join([], rays.origins)
+    ray_indices, t_starts, t_ends, left_open = map(torch.cat, zip(*parts))
+    asked = left_open.nonzero()[:, 0]
+    if not len(asked):
+        return ray_indices, t_starts, t_ends
+    of_ray = ray_indices.index_select(0, asked)
+    middles = (t_starts.index_select(0, asked) + t_ends.index_select(0, asked)) * 0.5
+    origins, directions = candidates.coordinates.index_select(2, of_ray)
+    answers = occupied(torch.addcmul(origins, directions, middles).T)
+    kept = torch.ones_like(left_open).index_copy_(0, asked, answers).nonzero()[:, 0]
+    return tuple(values.index_select(0, kept) for values in (ray_indices, t_starts, t_ends))
+
+
+def _march(cache: CellCache, candidates: Candidates) -> tuple[Samples, Tensor]:
+    """What cells keep or leave open, and which of it they leave open: bool [n_samples]."""
+    coordinates, t_mins, first, counts, (step_size, cone_angle) = candidates
+    growing, room = cone_angle > 0.0, counts.long()
+    total = int(room.sum())
+    switches = switch(t_mins, step_size, cone_angle) if growing else (t_mins, t_mins)
+    samples = {
+        "ray_indices": torch.empty(total, dtype=torch.int64),
+        "t_starts": torch.empty(total),
+        "t_ends": torch.empty(total),
+        "open": torch.empty(total, dtype=torch.bool),
+    }
+    coarse, _, first_plane, planes, clearance = cache.tables()
+    found = native.march_cells(
+        {
+            "coordinates": coordinates.contiguous(),
+            "numbers": torch.stack([t_mins, first.expand_as(counts), counts, *switches]),
+            "powers": growth_table(step_size, cone_angle, t_mins.device) if growing else None,
+            "rooms": room.cumsum(0) - room,
+            "coarse": coarse,
+            "first_plane": first_plane,
+            "bricks": cache.bricks,
+            "clearance": clearance,
+            "planes": planes.contiguous(),
+            "frame": cache.frame,
+            **samples,
+            "step_size": step_size,
+            "rays": len(counts),
+            "all_planes": planes.shape[1],
+            "resolution": cache.resolution,
+            "contracted": int(cache.contracted),
+            "wide": int(coarse.dtype == torch.int32),
+        }
+    )
+    *kept, left_open = (torch.cat([each[part] for part in found]) for each in samples.values())
+    ray_indices, t_starts, t_ends = kept
+    return (ray_indices, t_starts, t_ends), left_open
