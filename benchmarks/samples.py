@@ -9,6 +9,7 @@ surfaces; with PSNR and time of either rendering, in turns. Stored in `results/s
 from __future__ import annotations
 
 import math
+import os
 import statistics
 from collections.abc import Sequence
 from contextlib import contextmanager
@@ -27,6 +28,7 @@ from leco_plugin.evaluation.queries import count_queries
 from leco_plugin.models.leco import LecoModel
 from leco_plugin.samplers import marching
 from leco_plugin.samplers.estimator import LearnedOccupancyEstimator
+from leco_plugin.samplers.kernels import VARIABLE
 from leco_plugin.studio.host_models import true_colours
 
 IMAGES = 4
@@ -79,7 +81,8 @@ def along_rays(model: LecoModel, bundles: Sequence[Any]) -> dict[str, float]:
             total += len(rays.origins)
             sums["candidates"] += len(marching.march(along, rule)[0])
             estimator = mixture.estimator()
-            with asked_along(estimator) as count, count_queries(model) as queries:
+            in_torch = patch.dict(os.environ, {VARIABLE: "native"})  # C asks the same, uncounted
+            with in_torch, asked_along(estimator) as count, count_queries(model) as queries:
                 kept = estimator.march(along, rule)
             sums["kept"] += len(kept[0])
             sums["gate"] += queries["gate"]

@@ -78,21 +78,26 @@ def count_queries(model: nn.Module) -> Iterator[Counter[str]]:
 
         return ask
 
-    before: list[tuple[Any, str, Any]] = []
-    for owner, name in methods:
-        before.append((owner, name, owner.__dict__.get(name)))
-        setattr(owner, name, counting(getattr(owner, name)))
-    in_c = front_to_back, "shade_natively", front_to_back.shade_natively
-    before.append(in_c)
-    setattr(*in_c[:2], counting_rays(in_c[2]))
-    try:
+    asked = [(owner, name, counting(getattr(owner, name))) for owner, name in methods]
+    in_c = counting_rays(front_to_back.shade_natively)
+    with _replaced([*asked, (front_to_back, "shade_natively", in_c)]):
         yield count
+
+
+@contextmanager
+def _replaced(methods: list[tuple[Any, str, Callable[..., Any]]]) -> Iterator[None]:
+    """Puts methods and functions, by owner and name, in the place of others in this context."""
+    before = [(owner, name, vars(owner).get(name)) for owner, name, _ in methods]
+    for owner, name, method in methods:
+        setattr(owner, name, method)
+    try:
+        yield
     finally:
-        for owner, name, method in before:
-            if method is None:
+        for owner, name, known in before:
+            if known is None:
                 delattr(owner, name)
             else:
-                setattr(owner, name, method)
+                setattr(owner, name, known)
 
 
 def _method_of(owner: type) -> str:

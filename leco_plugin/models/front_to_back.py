@@ -1,8 +1,8 @@
 """Rendering that evaluates no samples behind opaque surfaces.
 
 The kept samples of each ray are evaluated from the front, a few at a time. A ray stops when no
-light is left. The slow twin is `rendering.shade`, which evaluates all of them. On a CPU all of it is
-one routine in C, `compute/front_to_back.c`, where that knows gate and field.
+light is left. The slow twin is `rendering.shade`, which evaluates all of them. On a CPU all of it
+is one routine in C, `compute/front_to_back.c`, where that knows gate and field.
 """
 
 from __future__ import annotations
@@ -116,7 +116,12 @@ def suits_native(
 ) -> bool:
     """Whether `front_to_back.c` serves."""
     by_threshold = routing.empty_below is not None and not routing.homogeneous
-    known = by_threshold and len(rays.origins) > 0 and isinstance(field.encoding, HashEncoding) and field.suits_native()
+    known = (
+        by_threshold
+        and len(rays.origins) > 0
+        and isinstance(field.encoding, HashEncoding)
+        and field.suits_native()
+    )
     return known and gate.answers_natively(rays.origins) and native.suits(*rays[:4], *intervals[1:])
 
 

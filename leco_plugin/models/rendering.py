@@ -314,7 +314,7 @@ def sum_up(weights: Tensor, rays: Rays, intervals: Intervals) -> tuple[Tensor, T
         intervals.ray_indices,
         len(rays.origins),
     )
-    accumulation, distance = sums.unbind(dim=-1)
+    accumulation, distance = sums[:, 0], sums[:, 1]
     return accumulation, mean_distance(accumulation, distance, rays)
 
 

@@ -224,7 +224,8 @@ def _of_rays(name: str, given: Sequence[Values], rooms: Any) -> list[slice]:
     routine = _routine(name)
     routine.restype = ctypes.c_int64  # type: ignore[attr-defined]
     structures = [_structure(values) for values in given]
-    pointers, found = [ctypes.byref(one) for one in structures], {}
+    pointers = [ctypes.byref(one) for one in structures]
+    found: dict[int, Any] = {}
 
     def work(begin: int, end: int) -> None:
         found[begin] = routine(*pointers, ctypes.c_int64(begin), ctypes.c_int64(end))

@@ -52,7 +52,10 @@ def march(occupied: OccupiedFn, cache: CellCache | None, rays: Rays, rule: March
     origins, directions = candidates.coordinates.index_select(2, of_ray)
     answers = occupied(torch.addcmul(origins, directions, middles).T)
     kept = torch.ones_like(left_open).index_copy_(0, asked, answers).nonzero()[:, 0]
-    return tuple(values.index_select(0, kept) for values in (ray_indices, t_starts, t_ends))
+    ray_indices, t_starts, t_ends = (
+        values.index_select(0, kept) for values in (ray_indices, t_starts, t_ends)
+    )
+    return ray_indices, t_starts, t_ends
 
 
 def _march(cache: CellCache, candidates: Candidates) -> tuple[Samples, Tensor]:
