@@ -147,7 +147,8 @@ def test_c_asks_and_answers_as_torch_does(
     for parameter in scene.gate.parameters():
         parameter.data.normal_()
     likely = scene.gate.occupancy(mapped_middles(scene.space, rays, everything))
-    given = *scene.parts(), rays, everything, Routing(float(likely.detach().median()), False)
+    middle = likely.detach().sort().values[len(likely) // 2 :][:2].mean()  # between two: no tie
+    given = *scene.parts(), rays, everything, Routing(float(middle), False)
     monkeypatch.setattr(native, "RAYS_AT_ONCE", 40)
     monkeypatch.setattr(torch, "get_num_threads", lambda: 2)
     assert not suits_native(*given)  # where gradients are wanted
@@ -156,7 +157,7 @@ def test_c_asks_and_answers_as_torch_does(
     theirs, expected = shade_front_to_back(*given)
     assert {0, 1} <= set(ours.routes.tolist()) <= {0, 1, 3}
     for one, other in zip((*asked, *ours), (*expected, *theirs), strict=True):
-        torch.testing.assert_close(one, other, rtol=1e-4, atol=1e-4)
+        torch.testing.assert_close(one, other, rtol=1e-4, atol=1e-5)
 
 
 @needs_compiler
