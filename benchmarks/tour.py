@@ -19,6 +19,7 @@ from PIL import Image, ImageDraw
 from torch import Tensor
 
 from leco_plugin.cli_reports import occupancy_of
+from leco_plugin.evaluation.history_picture import write_film
 from leco_plugin.evaluation.ray_states import candidates
 from leco_plugin.log import bar
 from leco_plugin.occupancy import Occupancy
@@ -93,7 +94,7 @@ def first_kept(occupancy: Occupancy, origins: Tensor, directions: Tensor) -> Ten
 
     def is_kept(of_ray: Tensor, distances: Tensor) -> Tensor:
         places = torch.addcmul(origins[of_ray], directions[of_ray], distances[:, None])
-        return occupancy.query(places) >= occupancy.threshold_value
+        return occupancy.occupied(places)
 
     of_ray, starts, ends = candidates(occupancy, origins, directions, most=CANDIDATES)
     kept = is_kept(of_ray, 0.5 * (starts + ends))
@@ -161,17 +162,7 @@ def draw(run: Path, out: Path, first: int, photographs: int) -> None:
             titles = ["photograph", "rendering", "what is kept"]
             frames.append(framed(panels, [*titles, f"{float(samples.mean()):.0f} samples a ray"]))
             show((number + 1) / len(nearest))
-    save(frames + frames[-2:0:-1], out)
-
-
-def save(frames: list[Image.Image], out: Path) -> None:
-    """Writes a film that begins anew at its end; all frames have the same colours."""
-    tall = Image.new("RGB", (frames[0].width, 4 * frames[0].height))
-    for number in range(4):
-        tall.paste(frames[number * (len(frames) - 1) // 3], (0, number * frames[0].height))
-    palette = tall.quantize(COLOURS, dither=Image.Dither.NONE)
-    few = [frame.quantize(palette=palette, dither=Image.Dither.NONE) for frame in frames]
-    few[0].save(out, save_all=True, append_images=few[1:], duration=FRAME, loop=0, optimize=True)
+    write_film(frames + frames[-2:0:-1], out, FRAME, COLOURS)
 
 
 if __name__ == "__main__":

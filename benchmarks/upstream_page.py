@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-import json
 import statistics
 
 import checkout  # noqa: F401
-from page_parts import RESULTS, ROOT, between, noted, table
+from chart_sections import notes, stored
+from page_parts import ROOT, between, table
 
 from leco_plugin.chart.findings.summary import MEMORY, RENDERING, Line, lines_of
 
@@ -31,11 +31,10 @@ def page(text: str) -> str:
     """The page with its table renewed."""
     rows, seeds = [], set()
     for method, name in CHARTS.items():
-        results = json.loads((RESULTS / "charts" / f"{name}.json").read_text())
-        lines = [line for line in lines_of(results) if line.method == method]
+        lines = [line for line in lines_of(stored(name)) if line.method == method]
         guided = next(line for line in lines if line.learned)
         other = next(line for line in lines if not line.learned)
-        mark = r" (\*)" if name in noted(RESULTS) else ""
+        mark = r" (\*)" if name in notes() else ""
         for line in (guided, other):
             rows.append([f"`{method}`{mark}", *_cells(line)])
             seeds.add(len(line.runs))

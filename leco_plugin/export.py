@@ -90,9 +90,7 @@ def export(
             + ("learn it anew" if format == "splat-init" else "give --frame run")
         )
     if resolution is None:
-        flat = format != "nerfacc-grid"
-        box = whole_box(occupancy) if format == "npz" else mapped_box(occupancy)
-        resolution = finest(box) if flat else CELLS
+        resolution = default_resolution(occupancy, format)
     if format == "nerfacc-grid":
         facts = _export_grid(occupancy, out, resolution, levels)
     elif format == "npz":
@@ -146,9 +144,15 @@ def _export_points(
     }
 
 
-def surface_of(occupancy: Occupancy, resolution: int | None = None) -> KeptSurface:
-    """`kept_surface` with a progress bar, at the resolution that `export` would choose for None."""
-    resolution = finest(mapped_box(occupancy)) if resolution is None else resolution
+def default_resolution(occupancy: Occupancy, format: Format) -> int:
+    """Cells along the longest side where nobody names a number."""
+    if format == "nerfacc-grid":
+        return CELLS
+    return finest(whole_box(occupancy) if format == "npz" else mapped_box(occupancy))
+
+
+def surface_of(occupancy: Occupancy, resolution: int) -> KeptSurface:
+    """`kept_surface` with a progress bar."""
     with bar(f"Asking the gate about cells of 1/{resolution}") as show:
         return kept_surface(occupancy, resolution, show)
 

@@ -12,7 +12,7 @@ from leco_plugin.evaluation.inspection import describe, doubts
 from leco_plugin.evaluation.occupancy_page import write_page
 from leco_plugin.evaluation.occupancy_picture import draw
 from leco_plugin.evaluation.scene_colours import scene_colours
-from leco_plugin.export import Format, export, surface_of
+from leco_plugin.export import Format, default_resolution, export, surface_of
 from leco_plugin.occupancy import Occupancy
 from leco_plugin.scenes.coloured_points import description_in, description_of_run
 
@@ -52,7 +52,8 @@ def export_folder(
     description = description_of_run(file) if data is None else description_in(data)
     folder.mkdir(parents=True, exist_ok=True)
 
-    surface = functools.cache(lambda: surface_of(occupancy, resolution))
+    cells = default_resolution(occupancy, "ply") if resolution is None else resolution
+    surface = functools.cache(lambda: surface_of(occupancy, cells))
 
     def exported(format: Format, name: str) -> Facts:
         known = None if format == "npz" else surface()

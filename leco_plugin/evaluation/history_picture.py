@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -59,13 +59,23 @@ def draw_history(occupancy: Occupancy, folder: Path, path: Path) -> Path:
         for number, figure in enumerate(film.moving(shown)):
             figure.canvas.draw()
             pixels = np.asarray(figure.canvas.buffer_rgba())[..., :3]
-            # few colours without noise, which GIF cannot compress
-            few = Image.fromarray(pixels).quantize(FRAME_COLOURS, dither=Image.Dither.NONE)
-            frames.append(few)
+            frames.append(Image.fromarray(pixels))
             progress((number + 1) / len(shown))
-    durations = [FRAME] * (len(frames) - 1) + [LAST_FRAME]
-    frames[0].save(path, save_all=True, append_images=frames[1:], duration=durations, loop=0)
+    write_film(frames, path, [FRAME] * (len(frames) - 1) + [LAST_FRAME], FRAME_COLOURS)
     return path
+
+
+def write_film(
+    frames: Sequence[Image.Image], path: Path, durations: int | list[int], colours: int
+) -> None:
+    """Writes a GIF that begins anew at its end.
+
+    Args:
+        durations: milliseconds for which each frame is shown, or all of them.
+        colours: of a frame: few without noise, which GIF cannot compress.
+    """
+    few = [frame.quantize(colours, dither=Image.Dither.NONE) for frame in frames]
+    few[0].save(path, save_all=True, append_images=few[1:], duration=durations, loop=0)
 
 
 def spread_evenly(count: int, most: int) -> list[int]:

@@ -40,7 +40,7 @@ FEWEST_AT_ONCE, MOST_LOOKS = 8, 16
 """Samples of a ray between two looks at its transmittance, and looks at the longest ray."""
 
 MANY_RAYS = 2048
-"""In a batch from which on torch on a CPU is no slower for looking; see `docs/decisions.md`."""
+"""In a batch from which on a CPU torch is no slower for looking; see `docs/decisions.md`."""
 
 
 def is_no_slower(num_rays: int, guided: bool, device: torch.device) -> bool:
@@ -205,7 +205,7 @@ def scene_of(field: HMoEField, gate: Gate, space: Space, routing: Routing) -> na
         "gate_width": gate.config.width,
         "outputs": gate.head.out_features,
         "levels": levels,
-        "log2": (rows // levels).bit_length() - 1,
+        "log2": native.log2_of(rows // levels),
         "features": features,
         "width": field.config.experts.width,
         "layers": field.config.experts.layers,

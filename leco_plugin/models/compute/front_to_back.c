@@ -13,7 +13,7 @@
 #define CHUNK 2048   /* samples that are asked together; what is said of them stays in the cache */
 #define MOST_ROUTES 512
 
-/* As `native.py: Scene` has it. */
+/* As `front_to_back.py: scene_of` fills it. */
 typedef struct {
     const float *scales, *resolutions, *table, *center;
     const float *const *gate, *const *field, *const *color;
@@ -23,7 +23,7 @@ typedef struct {
     int levels, log2, features, width, layers, units, unbounded;
 } Scene;
 
-/* As `native.py: Batch` has it. */
+/* As `front_to_back.py: shade_natively` fills it. */
 typedef struct {
     const float *origins, *directions, *of_rays, *ends; /* [rays, ...] */
     const int64_t *starts, *counts;                     /* [rays], of samples */

@@ -100,7 +100,7 @@ def hash_sums(positions: Tensor, resolutions: Tensor, table: Tensor, corners: in
     routine = _routine("hash_sums")
     positions, resolutions = positions.contiguous(), resolutions.float().contiguous()
     pointers = _pointers(positions, resolutions, table, out)
-    sizes = (levels, _log2(rows // levels), features, corners)
+    sizes = (levels, log2_of(rows // levels), features, corners)
 
     def work(begin: int, end: int) -> None:
         routine(*pointers, ctypes.c_int64(begin), ctypes.c_int64(end), *sizes)
@@ -125,7 +125,7 @@ def hash_gradients(
     positions, resolutions = positions.contiguous(), resolutions.float().contiguous()
     gradient = gradient.contiguous()
     pointers = _pointers(positions, resolutions, gradient, table)
-    points, sizes = ctypes.c_int64(len(positions)), (levels, _log2(rows // levels))
+    points, sizes = ctypes.c_int64(len(positions)), (levels, log2_of(rows // levels))
 
     def work(begin: int, end: int) -> None:
         routine(*pointers, points, begin, end, *sizes, features, corners)
@@ -271,7 +271,8 @@ def _pointers(*tensors: Tensor) -> list[ctypes.c_void_p]:
     return [ctypes.c_void_p(one.data_ptr()) for one in tensors]
 
 
-def _log2(size: int) -> int:
+def log2_of(size: int) -> int:
+    """Of a power of two, as a level of a hash table has rows."""
     return size.bit_length() - 1
 
 

@@ -30,7 +30,7 @@ def march(occupied: OccupiedFn, cache: CellCache | None, rays: Rays, rule: March
         ValueError: as `marching.march`.
     """
     growing = rule.cone_angle > 0.0
-    if cache is None or not native.suits(rays.origins, cache.frame):
+    if cache is None or not native.suits(rays.origins, cache.scale):
         return None
     if growing and powers_needed(*rule) > MOST_POWERS:
         return None
