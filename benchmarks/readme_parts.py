@@ -1,28 +1,31 @@
-"""What the README shows of stored results: the demo, and ours beside its rivals on each scene."""
+"""What the README shows of stored results: what a learned occupancy gains, and the demo."""
 
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
+import statistics
+from collections.abc import Mapping
 from typing import Any
 
 import checkout  # noqa: F401
-from chart_sections import by_scene, notes
-from page_parts import RESULTS, between, size, table
+from page_parts import RESULTS, between, noted, table
 
-from leco_plugin.chart.findings.representations import Representation, representations_of
-from leco_plugin.chart.findings.summary import Line, ahead, lines_of
+from leco_plugin.chart.findings.summary import Line, lines_of
 
 DEMO = "<!-- demo table: generated -->", "<!-- end of the demo table -->"
-OURS = "kept, less is better: `leco-occupancy`"
-SMALL, OTHER_GATE, GRID = "small MLP of ours", "best other gate", "best grid"
-RIVALS = "<!-- rivals: generated -->", "<!-- end of the rivals -->"
+GAIN = "<!-- gain: generated -->", "<!-- end of the gain -->"
+GAIN_CHART = "caliterra-hosts"
+"""Each host with its own sampling and with a learned occupancy, in benchmarks/results/charts."""
+OURS = "leco-occupancy"
 
 
 def readme(text: str) -> str:
     """The README with its tables renewed."""
     text = between(text, DEMO, demo_table(json.loads((RESULTS / "demo.json").read_text())))
-    return between(text, RIVALS, rivals_table())
+    chart = json.loads((RESULTS / "charts" / f"{GAIN_CHART}.json").read_text())
+    if GAIN_CHART in noted(RESULTS):
+        raise ValueError(f"{GAIN_CHART} was made before a mend: make it again for the README")
+    return between(text, GAIN, gain_table(chart))
 
 
 def demo_table(report: dict[str, Any]) -> str:
@@ -51,80 +54,41 @@ def demo_table(report: dict[str, Any]) -> str:
     return "\n".join(lines)
 
 
-def rivals_table() -> str:
-    """A row for each scene of which both suites are stored: what must be sampled, and accuracy
-    after equal time, with the least and the most of all seeds."""
-    space, times = by_scene("representations"), by_scene("enough-time")
-    scenes = sorted(space.keys() & times.keys())
-    best = {scene: _grouped(representations_of(lines_of(space[scene][1]))) for scene in scenes}
-    rows = {
-        _marked(scene, [space[scene][0], times[scene][0]]): {
-            **_kept(best[scene]),
-            **_reached(times[scene][1]),
-        }
-        for scene in scenes
-    }
-    if not rows:
-        return "Not measured yet."
-    columns = list(dict.fromkeys(column for row in rows.values() for column in row))
-    cells = [[scene, *(row.get(name, "-") for name in columns)] for scene, row in rows.items()]
-    lines = table(f"scene | {' | '.join(columns)}", cells)
-    timed = [lines_of(times[scene][1]) for scene in scenes]
-    return "\n".join([*lines, "", _standing(list(best.values()), timed)])
-
-
-def _standing(best: Sequence[dict[str, Representation]], timed: Sequence[list[Line]]) -> str:
-    """On how many scenes ours is ahead of its rivals, in a sentence."""
-    many = len(timed)
-    gates, grids = (sum(_less(of, OURS, one) for of in best) for one in (OTHER_GATE, GRID))
-    small = sum(_less(of, SMALL, GRID) for of in best)
-    ours = [next((line for line in lines if line.learned), None) for lines in timed]
-    ahead_of_all = sum(
-        one is not None and all(ahead(one, other) for other in lines if other is not one)
-        for one, lines in zip(ours, timed)
+def gain_table(results: Mapping[str, Any]) -> str:
+    """Accuracy, rendering and queries of each contender, and a sentence: ours against the best host
+    that samples in its own way."""
+    lines = lines_of(results)
+    seconds, seeds = results["protocol"]["seconds"], {run["seed"] for run in results["runs"]}
+    scene, cores = results["scene"]["name"], results["machine"]["threads"]
+    head = f"`{scene}`, {seconds:g} s on {cores} CPU core{'s' * (cores > 1)}, {len(seeds)} seed{'s' * (len(seeds) > 1)}"
+    rows = [
+        [
+            f"**{line.name}**" if line.learned else line.name,
+            f"{line.psnr:.1f} dB ({min(line.psnrs):.1f} to {max(line.psnrs):.1f})",
+            f"{_median(line, 'render_seconds_per_image'):.1f} s",
+            f"{_queries(line):.0f}",
+        ]
+        for line in lines
+    ]
+    ours = next(line for line in lines if line.method == OURS and line.learned)
+    rival = max((line for line in lines if line.sampler == "own"), key=lambda line: line.psnr)
+    lead = ours.psnr - rival.psnr
+    times, queries = (
+        of(rival) / of(ours)
+        for of in (lambda line: _median(line, "render_seconds_per_image"), _queries)
     )
-    return (
-        f"Of {many} scenes, `leco-occupancy` keeps less than the best other gate on {gates} and "
-        f"less than the best grid on {grids}, a small MLP less than the best grid on {small}; a "
-        f"learned occupancy has the highest PSNR with every seed on {ahead_of_all}."
+    said = (
+        f"Beside {rival.name}, the best host with its own sampling, `{OURS}` gains {lead:+.1f} dB, "
+        f"renders {times:.1f} times as fast, and asks networks {queries:.0f} times less."
     )
+    columns = f"{head} | PSNR | to render an image | queries a ray"
+    return "\n".join([*table(columns, rows), "", said])
 
 
-def _less(best: dict[str, Representation], one: str, rival: str) -> bool:
-    return one in best and rival in best and best[one].kept < best[rival].kept
+def _queries(line: Line) -> float:
+    """Of field, proposal networks and gate, a rendered ray."""
+    return sum(_median(line, f"{part}_queries_per_ray") for part in ("field", "proposal", "gate"))
 
 
-def _marked(scene: str, charts: list[str]) -> str:
-    """A scene, marked where one of its charts was made before a mend."""
-    return f"{scene} (*)" if notes().keys() & set(charts) else scene
-
-
-def _grouped(held: list[Representation]) -> dict[str, Representation]:
-    """Each of ours, and those that keep least of the grids and of the other gates."""
-    groups = {
-        OURS: [one for one in held if one.ours and one.kind is None],
-        SMALL: [one for one in held if one.ours and one.kind is not None],
-        OTHER_GATE: [one for one in held if not one.ours and not one.is_grid],
-        GRID: [one for one in held if one.is_grid],
-    }
-    return {title: min(some, key=lambda one: one.kept) for title, some in groups.items() if some}
-
-
-def _kept(best: dict[str, Representation]) -> dict[str, str]:
-    """What they keep, and their sizes."""
-    return {
-        title: f"{one.kept:.1f}%, {size(one.median('size'))}"
-        + ("" if one.ours else f" ({one.name.removeprefix('grid ')})")
-        for title, one in best.items()
-    }
-
-
-def _reached(results: dict[str, Any]) -> dict[str, str]:
-    """PSNR of each contender at the end."""
-    seconds = results["protocol"]["seconds"]
-    return {
-        f"PSNR after {seconds:g} s: {line.name.split(' + ')[-1]}": (
-            f"{line.psnr:.1f} ({min(line.psnrs):.1f} to {max(line.psnrs):.1f})"
-        )
-        for line in lines_of(results)
-    }
+def _median(line: Line, name: str) -> float:
+    return statistics.median(run[name] for run in line.runs)

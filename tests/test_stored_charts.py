@@ -142,62 +142,54 @@ def test_a_chart_with_a_note_is_marked(store: Store, tmp_path: Path) -> None:
     assert "[city](suites.md#suite-freeze-on-city) (*) |" in answered()
 
 
-def test_scenes_of_which_one_suite_is_missing_have_no_row(store: Store) -> None:
-    assert parts.rivals_table() == "Not measured yet."
-    store("enough-time", "city", run("Switch-NeRF + learned occupancy"))
-    assert parts.rivals_table() == "Not measured yet."
+def test_the_gain_is_that_over_the_best_host_with_its_own_sampling() -> None:
+    def of(method: str, sampler: str, psnr: float, queries: tuple[float, float, float]) -> Any:
+        names = ("field", "proposal", "gate")
+        asked = {f"{one}_queries_per_ray": many for one, many in zip(names, queries)}
+        render = {"render_seconds_per_image": 0.1 * sum(queries)}
+        name = f"{method} + {sampler}"
+        return run(name, psnr=psnr, method=method, sampler=sampler, **asked, **render)
 
-
-def test_ours_and_the_rivals_that_keep_least_stand_beside_equal_time(store: Store) -> None:
-    grids = [
-        {"resolution": cells, "bytes": size, "kept_reached_volume": kept, "update_seconds": 1.0}
-        for cells, size, kept in ((64, 32768, 0.3), (128, 262144, 0.25), (256, 2097152, 0.28))
+    runs = [
+        of("leco-occupancy", "learned-occupancy", 28.0, (15.0, 0.0, 5.0)),
+        of("leco-occupancy", "dense", 29.0, (40.0, 0.0, 0.0)),
+        of("leco-ngp", "own", 24.0, (50.0, 0.0, 0.0)),
+        of("leco-nerfacto", "own", 25.0, (32.0, 48.0, 0.0)),
     ]
-    facts = occupancy(23_000, 0.2, grids)
-    small = {"bytes": 4932, "seconds": 9.0, "kept_reached_volume": 0.1, "name": "MLP"}
-    facts["at_equal_loss"]["taught"] = [small]
-    planes = run("K-planes", sampler="learned-occupancy-k-planes", occupancy=occupancy(10**6, 0.3))
-    store("representations", "city", run("MLP (ours)", occupancy=facts), planes)
-    own = run("Switch-NeRF + coarse and fine samples", psnr=17.25)
-    ours = run("Switch-NeRF + learned occupancy", psnr=19.0)
-    store("enough-time", "city", ours, own)
-    head, _, row, _, said = parts.rivals_table().splitlines()
+    chart = {
+        "runs": runs,
+        "protocol": {"seconds": 120.0},
+        "scene": {"name": "fox"},
+        "machine": {"threads": 1},
+    }
+    head, _, ours, *_, said = parts.gain_table(chart).splitlines()
+    assert head == (
+        "| `fox`, 120 s on 1 CPU core, 1 seed | PSNR | to render an image | queries a ray |"
+    )
+    assert ours == (
+        "| **leco-occupancy + learned-occupancy** | 28.0 dB (28.0 to 28.0) | 2.0 s | 20 |"
+    )
     assert said == (
-        "Of 1 scenes, `leco-occupancy` keeps less than the best other gate on 1 and less than the "
-        "best grid on 1, a small MLP less than the best grid on 1; a learned occupancy has the "
-        "highest PSNR with every seed on 1."
-    )
-    assert head.endswith(
-        "| PSNR after 10 s: learned occupancy | PSNR after 10 s: coarse and fine samples |"
-    )
-    assert row == (
-        "| city | 20.0%, 23 kB | 10.0%, 5 kB | 30.0%, 1.0 MB (K-planes) | 25.0%, 262 kB (128³) "
-        "| 19.0 (19.0 to 19.0) | 17.2 (17.2 to 17.2) |"
+        "Beside leco-nerfacto + own, the best host with its own sampling, `leco-occupancy` gains "
+        "+3.0 dB, renders 4.0 times as fast, and asks networks 4 times less."
     )
 
 
-def test_columns_are_those_of_all_scenes_and_old_charts_are_marked(
-    store: Store, tmp_path: Path
+def test_the_readme_shows_no_chart_of_before_a_mend(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    for scene in ("city", "fox"):
-        runs = [run("MLP (ours)", occupancy=occupancy(23_000, 0.2))]
-        hashed = occupancy(10**6, 0.3)
-        runs.append(run("hash grid", sampler="learned-occupancy-hash", occupancy=hashed))
-        store("representations", scene, *(runs if scene == "city" else runs[1:]))
-        names = ["a", "b"] if scene == "city" else ["b"]
-        store("enough-time", scene, *(run(f"Host + {name}") for name in names))
-    (tmp_path / "notes.json").write_text('{"fox-enough-time": "Made before."}')
-    head, _, city, fox, _, said = parts.rivals_table().splitlines()
-    assert said.startswith("Of 2 scenes, ") and "other gate on 1 and" in said
-    assert head.count("|") == city.count("|") == fox.count("|")
-    assert city.startswith("| city |") and fox.startswith("| fox (*) | - |")
+    monkeypatch.setattr(parts, "noted", lambda folder: {parts.GAIN_CHART: "Made before."})
+    text = (Path(__file__).parent.parent / "README.md").read_text()
+    with pytest.raises(ValueError, match="make it again"):
+        parts.readme(text)
 
 
 def test_what_is_around_the_tables_is_left_as_it_is(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(parts, "demo_table", lambda report: "demo")
-    (before, after), (begin, end) = parts.DEMO, parts.RIVALS
+    monkeypatch.setattr(parts, "gain_table", lambda chart: "gain")
+    (before, after), (begin, end) = parts.DEMO, parts.GAIN
     text = f"A\n{before}\nstale\n{after}\nB\n{begin}\n{end}\nC\n"
-    expected = f"A\n{before}\ndemo\n{after}\nB\n{begin}\nNot measured yet.\n{end}\nC\n"
+    expected = f"A\n{before}\ndemo\n{after}\nB\n{begin}\ngain\n{end}\nC\n"
     assert parts.readme(text) == expected
 
 
