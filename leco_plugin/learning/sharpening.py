@@ -160,11 +160,13 @@ def sharpen(
         gate = teach(config.gate, lesson, config.steps, mixture.precision)
         round_weights(gate)
         rays, truth = held_out
-        rendering = seen_rendering(mixture, rays, truth, 1.0 if guided else 0.0, at_once)
+        seen = 1.0 if guided else 0.0
+        rendering = seen_rendering(mixture, rays, truth, seen, at_once)
         before = measure(*rendering, float(mixture.threshold))
         asked = asked_by(mixture, gate, in_chunks(rays, at_once), rendering)
         of_cameras = [
-            _rendered(mixture, of_one, 1.0 if guided else 0.0, gate)[0] for of_one, _ in cameras
+            _said_by(mixture, gate, of_one, _rendered(mixture, of_one, seen)[0])
+            for of_one, _ in cameras
         ]
         measured = calibrate(*asked, calibration, cameras=of_cameras)
         promised = promise(of_cameras, measured, calibration)
@@ -208,25 +210,20 @@ def seen_rendering(
 
 
 @torch.no_grad()
-def _rendered(
-    mixture: Mixture, rays: Rays, seen: float, gate: Gate | None = None
-) -> tuple[Reference, Tensor]:
+def _rendered(mixture: Mixture, rays: Rays, seen: float) -> tuple[Reference, Tensor]:
     """All candidates of rays with the weights of those that are seen; and where they lie, [M, 3]
-    in [-1, 1]. With another gate, what that says of them."""
+    in [-1, 1]."""
     intervals = mixture.with_backdrops(rays, mixture.candidates(rays))
     mapped = mapped_middles(mixture.region.space, rays, intervals)
     occupancies = mixture.occupancies(mapped)
-    drawn = occupancies >= seen * mixture.threshold
-    drawn |= backdrop_of(intervals, rays)
+    is_backdrop = backdrop_of(intervals, rays)
+    drawn = (occupancies >= seen * mixture.threshold) | is_backdrop
     some = Intervals(*(part[drawn] for part in intervals))
     shaded: Shaded = mixture.shade(rays, some)
     small = reference_of(shaded, some, rays)
     weights = torch.zeros_like(occupancies)
     surface = torch.zeros_like(drawn)
     weights[drawn], surface[drawn] = small.weights.float(), small.near_surface
-    is_backdrop = backdrop_of(intervals, rays)
-    if gate is not None:
-        occupancies = mixture.occupancies(mapped, gate)
     return Reference(intervals, weights, occupancies, surface, small.rgb, is_backdrop), mapped
 
 
@@ -234,12 +231,10 @@ def asked_by(
     mixture: Mixture, gate: Gate, chunks: list[Rays], rendering: DenseRendering
 ) -> DenseRendering:
     """The same rendering of rays, with what another gate says of their candidates."""
-    places = (
-        mapped_middles(mixture.region.space, rays, reference.intervals)
-        for rays, reference in zip(chunks, rendering.references, strict=True)
-    )
-    references = [
-        reference._replace(occupancies=mixture.occupancies(mapped, gate))
-        for reference, mapped in zip(rendering.references, places)
-    ]
-    return rendering._replace(references=references)
+    pairs = zip(chunks, rendering.references, strict=True)
+    return rendering._replace(references=[_said_by(mixture, gate, *pair) for pair in pairs])
+
+
+def _said_by(mixture: Mixture, gate: Gate, rays: Rays, reference: Reference) -> Reference:
+    mapped = mapped_middles(mixture.region.space, rays, reference.intervals)
+    return reference._replace(occupancies=mixture.occupancies(mapped, gate))
