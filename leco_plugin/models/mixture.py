@@ -25,8 +25,7 @@ from leco_plugin.models.rendering import (
     shade,
     with_backdrop,
 )
-from leco_plugin.models.sizing.sizes import Sizes
-from leco_plugin.models.sizing.stored_sizes import SIZES, stored_in, to_store
+from leco_plugin.models.sizing.sizes import SIZES, Sizes, stored_in, to_store
 from leco_plugin.occupancy import SHOWN, Occupancy, Precision, gate_precision
 from leco_plugin.samplers import marching
 from leco_plugin.samplers.estimator import LearnedOccupancyEstimator

@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from leco_plugin.scenes.poses.exif import Exif
+from leco_plugin.scenes.poses.originals import Exif
 
 FEW = 40
 """Up to so many photographs are all compared: 780 pairs, two minutes of one core."""
