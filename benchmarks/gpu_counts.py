@@ -13,9 +13,9 @@ from gpu_scale import Scale
 from sampling_scene import rays_into
 
 from leco_plugin.samplers.cells.cache import CellCache
-from leco_plugin.samplers.edges import candidate_edges
 from leco_plugin.samplers.estimator import LearnedOccupancyEstimator
 from leco_plugin.samplers.marching import Candidates, March, Rays, Samples, number
+from leco_plugin.samplers.rays import candidate_edges
 
 STEPS = 32
 """Candidates of a stretch, as in `march_kernel.py`, which is not imported where Triton is not."""

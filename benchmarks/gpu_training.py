@@ -31,6 +31,7 @@ from leco_plugin.models.rendering import (
     Intervals,
     Rays,
     Routing,
+    Scene,
     Shaded,
     shade,
     with_backdrop,
@@ -100,7 +101,8 @@ class Run:
         """Renders intervals in bfloat16."""
         frozen = self.estimator is not None
         with gate_precision(self.device.type, "bfloat16"):
-            return shade(self.field, self.gate, self.space, rays, intervals, self.routing, frozen)
+            whole = Scene(self.field, self.gate, self.space, self.routing)
+            return shade(whole, rays, intervals, frozen)
 
     def step(self, candidates: int) -> None:
         """One training step on random pixels."""

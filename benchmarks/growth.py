@@ -36,8 +36,8 @@ from leco_plugin.learning.learner import Learner
 from leco_plugin.learning.run import LearningOnly
 from leco_plugin.learning.schedule import RATES, ScheduleConfig
 from leco_plugin.method_configs import leco_occupancy
-from leco_plugin.models.compute.optimizers import FusedAdamConfig
 from leco_plugin.models.gate import GateConfig
+from leco_plugin.models.leco_config import FusedAdamConfig
 from leco_plugin.models.sizing.sizes import sizes_for
 from leco_plugin.scenes.city.cameras import CaptureConfig
 from leco_plugin.scenes.city.city import City, CityConfig

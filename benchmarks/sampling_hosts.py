@@ -13,7 +13,7 @@ from sampling_scene import rays_into
 
 from leco_plugin.hosts.classes import Host, set_up_host
 from leco_plugin.models.field import HMoEField
-from leco_plugin.models.rendering import Intervals, Rays, Routing, shade
+from leco_plugin.models.rendering import Intervals, Rays, Routing, Scene, shade
 from leco_plugin.models.sizing.sizes import PAPER
 from leco_plugin.occupancy import gate_precision
 from leco_plugin.samplers import nerfacc_cpu
@@ -82,9 +82,9 @@ def switch_nerf_like_step(estimator: LearnedOccupancyEstimator, n_rays: int = 25
 
     def step() -> None:
         intervals = Intervals(*sample())
-        routing = Routing(None, homogeneous=True)
+        scene = Scene(field, occupancy.gate, space, Routing(None, homogeneous=True))
         with gate_precision(estimator.device.type, occupancy.precision):
-            shaded = shade(field, occupancy.gate, space, rays, intervals, routing, freeze_gate=True)
+            shaded = shade(scene, rays, intervals, freeze_gate=True)
         loss = (shaded.rgb - image).square().mean()
         optimizer.zero_grad()
         loss.backward()

@@ -40,8 +40,8 @@ from leco_plugin.evaluation.field_grids import dilate, look_up_scores
 from leco_plugin.evaluation.inspection import in_parts
 from leco_plugin.learning.calibration import Measured, measure
 from leco_plugin.learning.dense import in_chunks
-from leco_plugin.learning.lesson import Lesson
 from leco_plugin.learning.sharpening import (
+    Lesson,
     SharpeningConfig,
     asked_by,
     lesson_by,

@@ -26,14 +26,20 @@ from leco_plugin.evaluation.report import describe_code, describe_machine, made_
 from leco_plugin.evaluation.timed_run import timed_run
 from leco_plugin.method_configs import best_device, leco_occupancy
 from leco_plugin.models.sizing.scene_sizes import complete
-from leco_plugin.models.sizing.size_limits import values_of
-from leco_plugin.models.sizing.sizes import CHOSEN, Sizes, automatic, size_at, sizes_for, with_size
+from leco_plugin.models.sizing.sizes import (
+    CHOSEN,
+    Sizes,
+    automatic,
+    size_at,
+    sizes_for,
+    values_of,
+    with_size,
+)
 from leco_plugin.scenes.bounds import BoundsConfig
 from leco_plugin.scenes.city.cameras import CaptureConfig
 from leco_plugin.scenes.city.city import CityConfig
 from leco_plugin.scenes.city.folder import write_city
-from leco_plugin.scenes.detail import CAMERAS, detail_of
-from leco_plugin.scenes.survey import points_in
+from leco_plugin.scenes.survey import CAMERAS, detail_of, points_in
 
 DEVICE = "the device's"
 FEWEST = 40

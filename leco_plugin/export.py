@@ -18,22 +18,20 @@ from torch.nn.functional import max_pool3d
 
 from leco_plugin.cli_reports import check_place
 from leco_plugin.evaluation.inspection import numbers, query, to_the_data, whole_box
-from leco_plugin.export_scene import (
-    comments_of,
-    photograph_colours,
-    write_splat_init,
-    write_volume,
-)
 from leco_plugin.export_surface import (
     CELLS,
     MOST_CELLS,
     KeptSurface,
     Progress,
+    comments_of,
     finest,
     kept_surface,
     mapped_box,
+    photograph_colours,
     require_few,
     write_ply,
+    write_splat_init,
+    write_volume,
 )
 from leco_plugin.log import bar
 from leco_plugin.occupancy import Occupancy

@@ -14,7 +14,7 @@ from nerfstudio.plugins.types import MethodSpecification
 
 from leco_plugin.hosts.guided import GuidedModelConfig
 from leco_plugin.method_configs import ON_GPU, STEPS, best_device, photographs, trainer
-from leco_plugin.models.switch.config import SwitchNerfModelConfig, switch_sizes_for
+from leco_plugin.models.switch.field import SwitchNerfModelConfig, switch_sizes_for
 from leco_plugin.studio.dynamic_batch import ClampedDynamicBatchPipelineConfig
 from leco_plugin.swap import learned_first, with_sampler_swapped
 

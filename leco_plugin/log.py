@@ -73,13 +73,9 @@ def say(line: str) -> None:
     Args:
         line: with rich's markup.
     """
-    if not is_first():
-        return
-    if _details is None:
-        console().log(f"\\[leco] {line}", _stack_offset=2)
-    else:
+    if is_first() and _details is not None:
         console().print(line, soft_wrap=True)
-        _write(line)
+    note(line, offset=3)
 
 
 def say_all(lines: Iterable[str]) -> None:
@@ -88,12 +84,16 @@ def say_all(lines: Iterable[str]) -> None:
         say(escape(line))
 
 
-def note(line: str) -> None:
-    """A detail: a line in the run's log file; where there is none, as `say`."""
+def note(line: str, offset: int = 2) -> None:
+    """A detail: a line in the run's log file; where there is none, as `say`.
+
+    Args:
+        offset: calls up to the one whose place in the code rich names.
+    """
     if not is_first():
         return
     if _details is None:
-        console().log(f"\\[leco] {line}", _stack_offset=2)
+        console().log(f"\\[leco] {line}", _stack_offset=offset)
     else:
         _write(line)
 

@@ -12,8 +12,7 @@ from nerfstudio.pipelines.base_pipeline import VanillaPipelineConfig
 from nerfstudio.plugins.types import MethodSpecification
 
 from leco_plugin.learning.schedule import RATES, ScheduleConfig
-from leco_plugin.models.compute.optimizers import FusedAdamConfig
-from leco_plugin.models.leco_config import LecoModelConfig
+from leco_plugin.models.leco_config import FusedAdamConfig, LecoModelConfig
 from leco_plugin.models.sizing.sizes import PAPER, automatic, sizes_for
 from leco_plugin.scenes.data_manager import LecoDataManagerConfig
 from leco_plugin.scenes.photographs import LecoPhotographsDataParserConfig

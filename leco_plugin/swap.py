@@ -14,8 +14,7 @@ from nerfstudio.data.dataparsers.base_dataparser import DataParserConfig
 from nerfstudio.engine.trainer import Trainer, TrainerConfig
 from nerfstudio.models.base_model import ModelConfig
 
-from leco_plugin.hosts.appearance_codes import Codes
-from leco_plugin.hosts.guided import GuidedModelConfig
+from leco_plugin.hosts.guided import Codes, GuidedModelConfig
 from leco_plugin.hosts.guided_start import OccupancyConfig, load_occupancy, occupancy_file
 from leco_plugin.method_configs import LEARNING, ON_GPU, best_device
 from leco_plugin.models.sizing.sizes import learning_only

@@ -10,8 +10,7 @@ import torch
 from torch import Tensor
 
 from leco_plugin.learning.learner import Learner
-from leco_plugin.learning.progress import Progress
-from leco_plugin.learning.run import LearningOnly
+from leco_plugin.learning.run import LearningOnly, Progress
 from leco_plugin.learning.sharpening import SharpeningConfig
 from leco_plugin.models.encodings import EncodingConfig
 from leco_plugin.models.field import FieldConfig

@@ -8,8 +8,8 @@ from pathlib import Path
 from typing import Any
 
 from leco_plugin.capacity.choice import choose, draw, kilobytes, verdict
-from leco_plugin.capacity.gates import Candidate, gates, grids
 from leco_plugin.capacity.measuring import STEPS, Taught, measure_gate, measure_grid, prepare
+from leco_plugin.capacity.search import Candidate, gates, grids
 from leco_plugin.chart.runner import SETTINGS, make_jobs, take_folder
 from leco_plugin.chart.theme import DARK, LIGHT
 from leco_plugin.evaluation.field_grids import fits_memory

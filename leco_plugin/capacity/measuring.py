@@ -16,8 +16,7 @@ import torch
 from torch import Tensor
 
 from leco_plugin.capacity.evidence import RAYS_AT_ONCE, Evidence, gather
-from leco_plugin.capacity.gates import Candidate
-from leco_plugin.capacity.search import find_threshold
+from leco_plugin.capacity.search import Candidate, find_threshold
 from leco_plugin.capacity.sources import Source, draw_held_out, draw_training_rays
 from leco_plugin.evaluation.equal_loss import (
     kept_shares,
@@ -26,8 +25,7 @@ from leco_plugin.evaluation.equal_loss import (
 )
 from leco_plugin.evaluation.field_grids import largest_in_cells, plain_and_dilated
 from leco_plugin.evaluation.inspection import ViewBox, in_parts
-from leco_plugin.learning.lesson import Lesson, round_weights, teach
-from leco_plugin.learning.sharpening import lesson_by
+from leco_plugin.learning.sharpening import Lesson, lesson_by, round_weights, teach
 from leco_plugin.models.gate import GateConfig, occupancy_logit
 from leco_plugin.models.leco import LecoModel
 from leco_plugin.models.mixture import Mixture

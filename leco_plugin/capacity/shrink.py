@@ -44,7 +44,7 @@ from leco_plugin.evaluation.clock import synchronize
 from leco_plugin.evaluation.inspection import whole_box
 from leco_plugin.evaluation.report import describe_code, describe_machine, made_by
 from leco_plugin.learning.freezing import HARDLY_ANYTHING
-from leco_plugin.learning.lesson import round_weights
+from leco_plugin.learning.sharpening import round_weights
 from leco_plugin.log import bar
 from leco_plugin.occupancy import BACKDROP_PRICE, Occupancy
 from leco_plugin.scenes.pixels.held_out_pixels import held_out_sampler

@@ -15,7 +15,7 @@ from leco_plugin.chart.contender import DENSE, GRID, LEARNED, Contender
 from leco_plugin.hosts.guided import GuidedModelConfig
 from leco_plugin.hosts.guided_start import OWN_SAMPLER
 from leco_plugin.models.leco_config import LecoModelConfig
-from leco_plugin.models.switch.config import SwitchNerfModelConfig
+from leco_plugin.models.switch.field import SwitchNerfModelConfig
 from leco_plugin.samplers.registry import samplers as registered_samplers
 from leco_plugin.scenes.input_error import InputError
 from leco_plugin.swap import registered

@@ -139,8 +139,8 @@ def compare_at_freezing(model: Any, datamanager: Any, contender: Contender) -> d
 
     if not contender.taught:
         return at_equal_loss(model.mixture, datamanager, contender.grids)
-    from leco_plugin.capacity.gates import gates
     from leco_plugin.capacity.measuring import lesson_of, taught_score
+    from leco_plugin.capacity.search import gates
     from leco_plugin.capacity.sources import Source
     from leco_plugin.learning.dense import evaluating
 

@@ -22,6 +22,7 @@ from torch import Tensor, nn
 from leco_plugin.evaluation.clock import Clock
 from leco_plugin.models import front_to_back
 from leco_plugin.models.field import HMoEField
+from leco_plugin.models.rendering import Scene
 from leco_plugin.occupancy import Occupancy
 
 KINDS = ("field", "proposal", "learning", "gate")
@@ -71,9 +72,9 @@ def count_queries(model: nn.Module) -> Iterator[Counter[str]]:
 
     def counting_rays(shade: Callable[..., Any]) -> Callable[..., Any]:
         @functools.wraps(shade)
-        def ask(field: nn.Module, *args: Any) -> Any:
-            shaded, seen = shade(field, *args)
-            count[kind(field)] += len(seen.t_starts)
+        def ask(scene: Scene, *args: Any) -> Any:
+            shaded, seen = shade(scene, *args)
+            count[kind(scene.field)] += len(seen.t_starts)
             return shaded, seen
 
         return ask

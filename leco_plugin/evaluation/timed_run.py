@@ -32,8 +32,7 @@ from leco_plugin.evaluation.queries import GridUpdates, count_queries
 from leco_plugin.evaluation.report import finite_or_null
 from leco_plugin.hosts.learn_first import FIRST_TIMED, TIMED_STEPS, keep_within
 from leco_plugin.scenes.input_error import InputError
-from leco_plugin.studio.host_models import true_colours
-from leco_plugin.studio.internals import leave_out_the_end
+from leco_plugin.studio.host_models import leave_out_the_end, true_colours
 
 RAYS_AT_ONCE = 1024
 """Test rays rendered at a time: few, so that an evaluation does not set the peak memory."""

@@ -29,9 +29,16 @@ from leco_plugin.learning.calibration import (
 )
 from leco_plugin.learning.dense import Reference, evaluating, near_surface_by
 from leco_plugin.learning.freezing import leave_file
-from leco_plugin.learning.lesson import lesson_of, round_weights, teach
 from leco_plugin.learning.run import Run
-from leco_plugin.learning.sharpening import ERRORS, LOSSES, SharpeningConfig, added_costs
+from leco_plugin.learning.sharpening import (
+    ERRORS,
+    LOSSES,
+    SharpeningConfig,
+    added_costs,
+    lesson_of,
+    round_weights,
+    teach,
+)
 from leco_plugin.log import note, say
 from leco_plugin.models.compute.device import fast_precision
 from leco_plugin.models.gate import Gate

@@ -19,10 +19,9 @@ from nerfstudio.models.base_model import Model, ModelConfig
 from torch import Tensor, nn
 
 from leco_plugin.hosts.along import Along
-from leco_plugin.hosts.first_steps import set_first_density
 from leco_plugin.hosts.guide import Guide
 from leco_plugin.hosts.guided_start import GuidedStart, OccupancyConfig
-from leco_plugin.hosts.host_watch import HostWatch
+from leco_plugin.hosts.host_watch import HostWatch, set_first_density
 from leco_plugin.hosts.seams import swap_sampler
 from leco_plugin.models.failures import require_finite
 from leco_plugin.scenes.input_error import InputError

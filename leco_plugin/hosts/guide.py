@@ -17,7 +17,7 @@ from nerfstudio.viewer_legacy.server.viewer_utils import IOChangeException
 from torch import Tensor, nn
 
 from leco_plugin.hosts.stand_ins import GuidedEstimator, GuidedProposal
-from leco_plugin.learning.progress import WatchState
+from leco_plugin.learning.run import WatchState
 from leco_plugin.models.gate import Gate, GateConfig
 from leco_plugin.models.region import FARTHEST, SIDE, Region, SeenBackdrops
 from leco_plugin.occupancy import SHOWN, Occupancy

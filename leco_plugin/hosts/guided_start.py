@@ -10,8 +10,8 @@ import torch
 from torch import Tensor, nn
 
 from leco_plugin.evaluation.inspection import cameras_of
-from leco_plugin.hosts.first_steps import begin_carefully, begin_opaque
 from leco_plugin.hosts.guide import Guide
+from leco_plugin.hosts.host_watch import begin_carefully, begin_opaque
 from leco_plugin.learning.freezing import FILE_NAME, leave_file
 from leco_plugin.learning.run import LearningOnly, Run
 from leco_plugin.log import say

@@ -13,18 +13,16 @@ from torch import nn
 
 from leco_plugin.evaluation.held_out_psnr import HeldOutPsnr
 from leco_plugin.learning.learner import Learner
-from leco_plugin.learning.progress import Progress
-from leco_plugin.learning.run import LearningOnly
+from leco_plugin.learning.run import LearningOnly, Progress
 from leco_plugin.learning.schedule import MOST_EXTENSIONS, RATES, steps_of_an_extension
 from leco_plugin.log import Show, bar, on_screen
-from leco_plugin.models.compute.optimizers import FusedAdamConfig
 from leco_plugin.models.compute.ranks import averaging, is_first, mean
 from leco_plugin.models.leco import LecoModel
-from leco_plugin.models.leco_config import LecoModelConfig
+from leco_plugin.models.leco_config import FusedAdamConfig, LecoModelConfig
 from leco_plugin.occupancy import Occupancy
-from leco_plugin.scenes.detail import CAMERAS
 from leco_plugin.scenes.input_error import InputError
 from leco_plugin.scenes.pixels.known_distances import sampler_here
+from leco_plugin.scenes.survey import CAMERAS
 
 FIRST_TIMED, TIMED_STEPS = 5, 15
 """Steps between which a step is timed, to keep to a budget; the first ones are slow."""

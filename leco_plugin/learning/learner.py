@@ -12,14 +12,12 @@ from typing import TYPE_CHECKING
 
 from torch import Tensor
 
-from leco_plugin.learning.collapse import STEPS_PER_LOOK, is_dense
+from leco_plugin.learning.collapse import STEPS_PER_LOOK, LearnerConfig, StepPlan, is_dense, plan_of
 from leco_plugin.learning.freezing import advice_on, carry_over, leave_field, leave_file
 from leco_plugin.learning.held_out import HeldOut
 from leco_plugin.learning.history import GateHistory, Probes
 from leco_plugin.learning.merging import line_of
-from leco_plugin.learning.plan import LearnerConfig, StepPlan, plan_of
 from leco_plugin.learning.price_watch import PriceWatch
-from leco_plugin.learning.progress import Progress, WatchState
 from leco_plugin.learning.quality import (
     FIELD,
     ONE_COLOUR,
@@ -29,7 +27,7 @@ from leco_plugin.learning.quality import (
     views_in_words,
 )
 from leco_plugin.learning.recoveries import Recoveries
-from leco_plugin.learning.run import Run, keep_pace
+from leco_plugin.learning.run import Progress, Run, WatchState, keep_pace
 from leco_plugin.learning.schedule import (
     KEPT_ABOVE,
     converged,

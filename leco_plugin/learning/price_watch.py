@@ -16,7 +16,7 @@ from torch import Tensor
 
 from leco_plugin.learning.calibration import CalibrationConfig
 from leco_plugin.learning.collapse import SUSPECTED_STEPS
-from leco_plugin.learning.progress import WatchState
+from leco_plugin.learning.run import WatchState
 from leco_plugin.models.compute.ranks import from_first, mean
 
 REMEMBERED = 0.8

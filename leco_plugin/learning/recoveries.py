@@ -20,8 +20,7 @@ from leco_plugin.learning.collapse import (
     may_fall_back,
 )
 from leco_plugin.learning.freezing import HARDLY_ANYTHING, withdraw_file
-from leco_plugin.learning.progress import Progress
-from leco_plugin.learning.run import Run
+from leco_plugin.learning.run import Progress, Run
 from leco_plugin.log import say
 from leco_plugin.models.compute.ranks import share
 from leco_plugin.models.gate import route

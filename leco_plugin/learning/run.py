@@ -1,14 +1,18 @@
-"""The interface between a learner and the training loop around it."""
+"""A run: the training loop around a learner, and how far it has come, which a checkpoint keeps."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Iterable
+from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import Any, Protocol
 
-from torch import nn
+import torch
+from torch import Tensor, nn
 from torch.optim import Optimizer
+
+from leco_plugin.scenes.input_error import require_keys
 
 PACE = "leco_pace"
 """Attribute of an optimizer: the multiple of its learning rates that it steps with."""
@@ -96,3 +100,102 @@ def _slow_down(optimizer: Optimizer, *_: Any) -> None:
 def _restore(optimizer: Optimizer, *_: Any) -> None:
     for group in optimizer.param_groups:
         group["lr"] /= getattr(optimizer, PACE)
+
+
+@dataclass
+class WatchState:
+    """What is known of the price of skipping; travels with a checkpoint."""
+
+    due: int = 0
+    """Step after which the price is measured next; 0 is not known yet."""
+    rechecks: int = 0
+    """How often it was measured."""
+    evidence: dict[str, tuple[float, ...]] = field(default_factory=dict)
+    """`Evidence` of each price since the threshold was last changed, by the price's name."""
+    nothing_since: int = -1
+    """Step since which batches hold no kept sample; -1 where they do."""
+    lower: float | None = None
+    """Of hosts: a lower threshold, if one is followed until the first measurement."""
+
+    @classmethod
+    def from_dict(cls, state: dict[str, Any]) -> WatchState:
+        """What a checkpoint holds; KeyError where that is not of the present fields."""
+        require_keys(state, (each.name for each in fields(cls)))
+        return cls(**state)
+
+
+@dataclass
+class Progress:
+    """Travels with a checkpoint, as plain values and one tensor."""
+
+    learn_steps: int = 0
+    """Step of the run at which the first phase ends, later after recoveries and extensions."""
+    configured: int = 0
+    """`ScheduleConfig.learn_steps` that they were made from; 0 before the first step."""
+    phase: int = 0
+    """Those of the config as far as this run has room for them; 0 before the first step."""
+    began: int = 0
+    """Step at which what is learned now began: after 0 where gate and field have begun anew."""
+    learn_seconds: float = 0.0
+    """Time spent in the first phase."""
+    extensions: int = 0
+    """How often a gate that had not settled has been given more steps."""
+    recoveries: int = 0
+    """How often a collapsed gate has been healed."""
+    suspected_since: int = -1
+    """Step since which the gate looks collapsed; -1 where it does not."""
+    fewest_kept: float = 1.0
+    """Smallest share of the probe positions that the gate has kept at any look since it began."""
+    healed_at: int = -1
+    """Step of the last recovery that began on dense samples; -1 is none."""
+    dense_until: int = 0
+    """Step before which a healed gate is not followed."""
+    pull: float = 1.0
+    """Factor, after recoveries, of what pulls the gate towards empty space."""
+    balance: float = 1.0
+    """Factor, after recoveries, of the balance among scene experts."""
+    pace: float = 1.0
+    """Factor, after recoveries, of all learning rates."""
+    paper_given_up: bool = False
+    """Whether the gate, after recoveries, is taught in logit form although the paper's is asked."""
+    learning_kept: float = 1.0
+    """Share of candidates that are shaded while the gate is learned, a running mean."""
+    left_occupied: bool = False
+    """Whether a gate that calls everything occupied after all its recoveries is left so."""
+    decisions: Tensor = field(default_factory=lambda: torch.zeros(0, dtype=torch.bool))
+    """[P] bool, what the gate decided of the probe positions at the last check."""
+
+    watch: WatchState = field(default_factory=WatchState)
+    """What is known of the price of skipping since the gate was frozen."""
+
+    @property
+    def since(self) -> int:
+        """Step from which the first phase is counted: its beginning, or the last recovery's."""
+        return max(self.began, self.healed_at + 1)
+
+    @property
+    def looks_collapsed(self) -> bool:
+        """Whether the gate is suspected of having stopped to decide."""
+        return self.suspected_since >= 0 or self.watch.nothing_since >= 0
+
+    def begin(self, configured: int, most: int) -> None:
+        """Sets `learn_steps`, unless a checkpoint did so under the same config.
+
+        Args:
+            configured: of the config; a resumed run may have been given another one.
+            most: steps from `since` on that this process leaves for the first phase.
+        """
+        if configured != self.configured:
+            self.phase = min(configured, most)
+            self.learn_steps = self.since + self.phase
+            self.configured = configured
+
+    @classmethod
+    def from_dict(cls, state: dict[str, Any]) -> Progress:
+        """What `to_dict` gave; KeyError where that is not of the present fields."""
+        require_keys(state, (each.name for each in fields(cls)))
+        return cls(**{**state, "watch": WatchState.from_dict(state["watch"])})
+
+    def to_dict(self) -> dict[str, Any]:
+        """What a checkpoint holds."""
+        return {**vars(self), "watch": dict(vars(self.watch))}

@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 
 from torch import Tensor
 
-from leco_plugin.learning.progress import Progress
+from leco_plugin.learning.run import Progress
 from leco_plugin.scenes.input_error import InputError
 
 KEPT_ABOVE = 0.1

@@ -3,17 +3,20 @@
 While a gate is learned, haze teaches it too, and it also has to route points to experts. Once it is
 frozen the field knows better: its rendering weights along training rays teach a fresh gate of a few
 thousand values, which only has to say what is empty. It is calibrated like the first one, and
-guides from then on where it skips more. The large gate goes on routing.
+guides from then on where it skips more. The large gate goes on routing. A `Lesson` says where a
+gate should keep and skip; a gate alone is taught by it, in seconds.
 """
 
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
+from torch.nn.functional import softplus
 
 from leco_plugin.learning.calibration import (
     CalibrationConfig,
@@ -29,14 +32,98 @@ from leco_plugin.learning.dense import (
     in_chunks,
     reference_of,
 )
-from leco_plugin.learning.lesson import Lesson, lesson_of, round_weights, teach
+from leco_plugin.learning.schedule import RATES
 from leco_plugin.models.encodings import EncodingConfig
-from leco_plugin.models.gate import Gate, GateConfig
+from leco_plugin.models.gate import Gate, GateConfig, occupancy_logit
+from leco_plugin.models.losses import widen
 from leco_plugin.models.mixture import Mixture
 from leco_plugin.models.objective import GateLossConfig
 from leco_plugin.models.rendering import Intervals, Rays, Shaded, backdrop_of, mapped_middles
-from leco_plugin.occupancy import CAMERAS_THAT_VOUCH
+from leco_plugin.occupancy import CAMERAS_THAT_VOUCH, Precision, gate_precision
 from leco_plugin.scenes.input_error import require
+
+BATCH = 1 << 14
+LAST_RATE = 0.05
+"""Of the learning rate, after a half cosine."""
+
+
+class Lesson(NamedTuple):
+    """How much each position speaks for being kept, and for being skipped."""
+
+    mapped: Tensor
+    """[M, 3] in [-1, 1]."""
+    keep: Tensor
+    """[M] weight of -log o(x)."""
+    skip: Tensor
+    """[M] weight of -log(1 - o(x))."""
+
+
+def lesson_of(mapped: Tensor, weights: Tensor, of_rays: Tensor, losses: GateLossConfig) -> Lesson:
+    """The targets of the contribution loss at samples along rays.
+
+    Args:
+        mapped: [M, 3] in [-1, 1], in the order of rays, then distance.
+        weights: [M] rendering weights.
+        of_rays: [M] int64, the ray of each.
+        losses: w_0 and k of the loss.
+    """
+    wide = widen(weights, of_rays[1:] == of_rays[:-1])
+    target = (wide / losses.weight_at_full).clamp(max=1.0)
+    return Lesson(mapped, losses.emphasis * target, 1.0 - target)
+
+
+def teach(
+    config: GateConfig,
+    lesson: Lesson,
+    steps: int,
+    precision: Precision,
+    seed: int = 0,
+    rate: float = 2.0 * RATES["gate"],
+    on_progress: Callable[[float], None] | None = None,
+) -> Gate:
+    """A gate that was taught by a lesson, in the precision of its later queries.
+
+    Minimises mean[-keep log o - skip log(1 - o)], the contribution loss with given targets.
+
+    Args:
+        steps: of Adam, on `BATCH` positions each.
+        rate: of networks; tables learn at least as fast as those of a field.
+    """
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(seed)
+        gate = Gate(config).to(lesson.mapped.device)
+    tables = list(gate.encoding.parameters())
+    known = {id(table) for table in tables}
+    groups = [{"params": [p for p in gate.parameters() if id(p) not in known], "lr": rate}]
+    if tables:
+        groups.append({"params": tables, "lr": max(rate, RATES["encoding"])})
+    optimizer = torch.optim.Adam(groups, eps=1e-15, fused=True)
+    schedule = torch.optim.lr_scheduler.LambdaLR(
+        optimizer,
+        lambda step: LAST_RATE + (1 - LAST_RATE) * 0.5 * (1 + math.cos(math.pi * step / steps)),
+    )
+    generator = torch.Generator().manual_seed(seed)
+    for step in range(steps):
+        drawn = torch.randint(len(lesson.mapped), (BATCH,), generator=generator)
+        mapped, keep, skip = (part[drawn.to(part.device)] for part in lesson)
+        with gate_precision(mapped.device.type, precision):
+            occupied = occupancy_logit(gate(mapped))
+        value = (keep * softplus(-occupied) + skip * softplus(occupied)).mean()
+        optimizer.zero_grad(set_to_none=True)
+        value.backward()
+        optimizer.step()
+        schedule.step()
+        if on_progress is not None:
+            on_progress((step + 1) / steps)
+    return gate.requires_grad_(False).eval()
+
+
+@torch.no_grad()
+def round_weights(gate: torch.nn.Module) -> None:
+    """Rounds all numbers of a gate, or of a part of it, to bfloat16."""
+    for parameter in gate.parameters():
+        parameter.copy_(parameter.bfloat16().float())
+
 
 LOSSES = ("lost_surface_mass", "lost_mass", "image_price_db")
 """What a report says that skipping costs."""
@@ -160,11 +247,13 @@ def sharpen(
         gate = teach(config.gate, lesson, config.steps, mixture.precision)
         round_weights(gate)
         rays, truth = held_out
-        rendering = seen_rendering(mixture, rays, truth, 1.0 if guided else 0.0, at_once)
+        seen = 1.0 if guided else 0.0
+        rendering = seen_rendering(mixture, rays, truth, seen, at_once)
         before = measure(*rendering, float(mixture.threshold))
         asked = asked_by(mixture, gate, in_chunks(rays, at_once), rendering)
         of_cameras = [
-            _rendered(mixture, of_one, 1.0 if guided else 0.0, gate)[0] for of_one, _ in cameras
+            _said_by(mixture, gate, of_one, _rendered(mixture, of_one, seen)[0])
+            for of_one, _ in cameras
         ]
         measured = calibrate(*asked, calibration, cameras=of_cameras)
         promised = promise(of_cameras, measured, calibration)
@@ -208,25 +297,20 @@ def seen_rendering(
 
 
 @torch.no_grad()
-def _rendered(
-    mixture: Mixture, rays: Rays, seen: float, gate: Gate | None = None
-) -> tuple[Reference, Tensor]:
+def _rendered(mixture: Mixture, rays: Rays, seen: float) -> tuple[Reference, Tensor]:
     """All candidates of rays with the weights of those that are seen; and where they lie, [M, 3]
-    in [-1, 1]. With another gate, what that says of them."""
+    in [-1, 1]."""
     intervals = mixture.with_backdrops(rays, mixture.candidates(rays))
     mapped = mapped_middles(mixture.region.space, rays, intervals)
     occupancies = mixture.occupancies(mapped)
-    drawn = occupancies >= seen * mixture.threshold
-    drawn |= backdrop_of(intervals, rays)
+    is_backdrop = backdrop_of(intervals, rays)
+    drawn = (occupancies >= seen * mixture.threshold) | is_backdrop
     some = Intervals(*(part[drawn] for part in intervals))
     shaded: Shaded = mixture.shade(rays, some)
     small = reference_of(shaded, some, rays)
     weights = torch.zeros_like(occupancies)
     surface = torch.zeros_like(drawn)
     weights[drawn], surface[drawn] = small.weights.float(), small.near_surface
-    is_backdrop = backdrop_of(intervals, rays)
-    if gate is not None:
-        occupancies = mixture.occupancies(mapped, gate)
     return Reference(intervals, weights, occupancies, surface, small.rgb, is_backdrop), mapped
 
 
@@ -234,12 +318,10 @@ def asked_by(
     mixture: Mixture, gate: Gate, chunks: list[Rays], rendering: DenseRendering
 ) -> DenseRendering:
     """The same rendering of rays, with what another gate says of their candidates."""
-    places = (
-        mapped_middles(mixture.region.space, rays, reference.intervals)
-        for rays, reference in zip(chunks, rendering.references, strict=True)
-    )
-    references = [
-        reference._replace(occupancies=mixture.occupancies(mapped, gate))
-        for reference, mapped in zip(rendering.references, places)
-    ]
-    return rendering._replace(references=references)
+    pairs = zip(chunks, rendering.references, strict=True)
+    return rendering._replace(references=[_said_by(mixture, gate, *pair) for pair in pairs])
+
+
+def _said_by(mixture: Mixture, gate: Gate, rays: Rays, reference: Reference) -> Reference:
+    mapped = mapped_middles(mixture.region.space, rays, reference.intervals)
+    return reference._replace(occupancies=mixture.occupancies(mapped, gate))

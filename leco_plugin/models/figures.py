@@ -13,8 +13,8 @@ from leco_plugin.evaluation.metrics import image_metrics
 from leco_plugin.models.gate import EMPTY, occupancy_from_logits
 from leco_plugin.models.losses import expert_shares
 from leco_plugin.models.rendering import MET, Intervals, Rays, Shaded, backdrop_of, sum_up
-from leco_plugin.samplers.edges import candidate_counts
 from leco_plugin.samplers.packed import accumulate_along_rays
+from leco_plugin.samplers.rays import candidate_counts
 
 NONE = -1
 """Stands for the expert of a ray that meets nothing."""

@@ -14,15 +14,13 @@ from torch import Tensor
 
 from leco_plugin.models.compute import native
 from leco_plugin.models.encodings import FRESH, FrequencyEncoding, HashEncoding
-from leco_plugin.models.field import HMoEField
-from leco_plugin.models.gate import Gate
 from leco_plugin.models.rendering import (
     OPAQUE,
     VISIBLE,
     Answers,
     Intervals,
     Rays,
-    Routing,
+    Scene,
     Shaded,
     ask,
     backdrop_ends,
@@ -30,7 +28,6 @@ from leco_plugin.models.rendering import (
     render,
 )
 from leco_plugin.samplers.packed import pack_info
-from leco_plugin.space import Space
 
 LEAST_LIGHT = 1e-4
 """Transmittance below which a ray is given up: what lies behind changes a pixel by less than a
@@ -54,22 +51,35 @@ def is_no_slower(num_rays: int, guided: bool, device: torch.device) -> bool:
     return guided and device.type == "cpu" and num_rays >= MANY_RAYS
 
 
+def shade_where_faster(
+    scene: Scene, rays: Rays, intervals: Intervals, guided: bool
+) -> tuple[Shaded, Intervals] | None:
+    """`shade_front_to_back`, or None where it was not measured to take no longer than shading all.
+
+    Args:
+        guided: whether only what an occupancy keeps is shaded.
+    """
+    if suits_native(scene, rays, intervals):
+        return shade_natively(scene, rays, intervals)
+    if is_no_slower(len(rays.origins), guided, rays.origins.device):
+        return shade_in_torch(scene, rays, intervals)
+    return None
+
+
 @torch.no_grad()
-def shade_front_to_back(
-    field: HMoEField,
-    gate: Gate,
-    space: Space,
-    rays: Rays,
-    intervals: Intervals,
-    routing: Routing,
-) -> tuple[Shaded, Intervals]:
+def shade_front_to_back(scene: Scene, rays: Rays, intervals: Intervals) -> tuple[Shaded, Intervals]:
     """Renders packed intervals; arguments as for `rendering.shade`, without gradients.
 
     Returns:
         The rendering, and the intervals that were asked about, to which it belongs.
     """
-    if suits_native(field, gate, space, rays, intervals, routing):
-        return shade_natively(field, gate, space, rays, intervals, routing)
+    native = suits_native(scene, rays, intervals)
+    return (shade_natively if native else shade_in_torch)(scene, rays, intervals)
+
+
+@torch.no_grad()
+def shade_in_torch(scene: Scene, rays: Rays, intervals: Intervals) -> tuple[Shaded, Intervals]:
+    """`shade_front_to_back` on any device."""
     starts, counts = pack_info(intervals.ray_indices, len(rays.origins)).unbind(dim=-1)
     longest = int(counts.max()) if len(counts) else 0
     at_once = max(FEWEST_AT_ONCE, -(-longest // MOST_LOOKS))
@@ -85,15 +95,15 @@ def shade_front_to_back(
             starts[alive] + first, (counts[alive] - first).clamp(max=at_once), at_once
         )
         some = Intervals(*(values.index_select(0, part) for values in intervals))
-        answers = ask(field, gate, space, rays, some, routing, freeze_gate=True)
-        lengths = (some.t_ends - some.t_starts) / space.half_extent
+        answers = ask(scene, rays, some, freeze_gate=True)
+        lengths = (some.t_ends - some.t_starts) / scene.space.half_extent
         depths.index_add_(0, some.ray_indices, (answers.sigmas * lengths).to(depths.dtype))
         asked.append(part)
         heard.append(answers)
     together, order = torch.cat(asked).sort()
     answers = Answers(*(torch.cat(values).index_select(0, order) for values in zip(*heard)))
     seen = Intervals(*(values.index_select(0, together) for values in intervals))
-    return render(field, space, rays, seen, answers), seen
+    return render(scene, rays, seen, answers), seen
 
 
 def samples_of(starts: Tensor, counts: Tensor, most: int) -> Tensor:
@@ -106,15 +116,9 @@ def samples_of(starts: Tensor, counts: Tensor, most: int) -> Tensor:
     return (starts[:, None] + steps)[steps < counts[:, None]]
 
 
-def suits_native(
-    field: HMoEField,
-    gate: Gate,
-    space: Space,
-    rays: Rays,
-    intervals: Intervals,
-    routing: Routing,
-) -> bool:
+def suits_native(scene: Scene, rays: Rays, intervals: Intervals) -> bool:
     """Whether `front_to_back.c` serves."""
+    field, gate, _, routing = scene
     by_threshold = routing.empty_below is not None and not routing.homogeneous
     known = (
         by_threshold
@@ -125,17 +129,12 @@ def suits_native(
     return known and gate.answers_natively(rays.origins) and native.suits(*rays[:4], *intervals[1:])
 
 
-def shade_natively(
-    field: HMoEField,
-    gate: Gate,
-    space: Space,
-    rays: Rays,
-    intervals: Intervals,
-    routing: Routing,
-) -> tuple[Shaded, Intervals]:
+@torch.no_grad()
+def shade_natively(scene: Scene, rays: Rays, intervals: Intervals) -> tuple[Shaded, Intervals]:
     """`shade_front_to_back` in C; `evaluation/queries.py` counts what it asks."""
+    color = scene.field.color
     ray_indices, t_starts, t_ends = intervals
-    count, outputs = len(rays.origins), gate.head.out_features
+    count, outputs = len(rays.origins), scene.gate.head.out_features
     starts, counts = pack_info(ray_indices, count).T.contiguous()
     totals = {
         "rgb": rays.origins.new_zeros(count, 3),
@@ -153,11 +152,11 @@ def shade_natively(
         "logits": t_starts.new_empty(len(t_starts), outputs),
     }
     asked = native.front_to_back(
-        scene_of(field, gate, space, routing),
+        in_c(scene),
         {
             "origins": rays.origins.contiguous(),
             "directions": rays.directions.contiguous(),
-            "of_rays": field.color.hidden_of_rays(rays.directions, rays.images).contiguous(),
+            "of_rays": color.hidden_of_rays(rays.directions, rays.images).contiguous(),
             "ends": backdrop_ends(rays).contiguous(),
             "starts": starts,
             "counts": counts,
@@ -180,8 +179,9 @@ def shade_natively(
     return Shaded(totals["rgb"], accumulation, depth, **of, packed_info=packed_info), seen
 
 
-def scene_of(field: HMoEField, gate: Gate, space: Space, routing: Routing) -> native.Values:
-    """Gate, field and space as `front_to_back.c: Scene` has them."""
+def in_c(scene: Scene) -> native.Values:
+    """As `front_to_back.c: Scene` has it."""
+    field, gate, space, routing = scene
     encoding, waves = field.encoding, gate.encoding
     assert isinstance(encoding, HashEncoding) and isinstance(waves, FrequencyEncoding)
     empty_below = routing.empty_below or 0.0

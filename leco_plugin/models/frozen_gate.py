@@ -20,7 +20,7 @@ from torch import Tensor, nn
 from leco_plugin.models.compute.dispatch import filled_size
 from leco_plugin.models.encodings import Encoding, FrequencyEncoding
 from leco_plugin.models.gate import EMPTY, Gate
-from leco_plugin.samplers.changes import Snapshot
+from leco_plugin.samplers.base import Snapshot
 
 LARGEST_LOGIT = 80.0
 """Sums of exponentials of up to this stay finite; o is 1 in float32 long before."""

@@ -17,11 +17,9 @@ from nerfstudio.model_components.renderers import RGBRenderer
 from nerfstudio.models.base_model import Model
 from torch import Tensor, nn
 
-from leco_plugin.learning.collapse import annealed
+from leco_plugin.learning.collapse import StepPlan, annealed
 from leco_plugin.learning.learner import Learner
-from leco_plugin.learning.plan import StepPlan
-from leco_plugin.learning.progress import Progress
-from leco_plugin.learning.run import Run
+from leco_plugin.learning.run import Progress, Run
 from leco_plugin.learning.schedule import KEPT_ABOVE
 from leco_plugin.models import figures
 from leco_plugin.models.compute.device import fast_precision, keep_freed_memory

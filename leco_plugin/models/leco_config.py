@@ -1,9 +1,10 @@
-"""Settings of `leco-occupancy`'s model."""
+"""Settings of `leco-occupancy`'s model, and its optimizer."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, field
 
+from nerfstudio.engine.optimizers import AdamOptimizerConfig
 from nerfstudio.models.base_model import ModelConfig
 
 from leco_plugin.learning.calibration import CalibrationConfig
@@ -15,6 +16,18 @@ from leco_plugin.models.sizing.sizes import SMALL, Sizes
 from leco_plugin.occupancy import Precision
 from leco_plugin.scenes.bounds import BoundsConfig
 from leco_plugin.scenes.input_error import require
+
+
+@dataclass
+class FusedAdamConfig(AdamOptimizerConfig):
+    """Adam, all parameters of a group in one kernel"""
+
+    lr: float = 1e-2
+    """Learning rate."""
+    eps: float = 1e-15
+    """Small, because the gradients of a hash table are (Instant-NGP, section 4)."""
+    fused: bool = True
+    """One kernel for all parameters."""
 
 
 def _model() -> type:

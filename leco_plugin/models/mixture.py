@@ -12,20 +12,20 @@ import torch
 from torch import Tensor, nn
 
 from leco_plugin.models.field import HMoEField
-from leco_plugin.models.front_to_back import is_no_slower, shade_front_to_back, suits_native
+from leco_plugin.models.front_to_back import shade_front_to_back, shade_where_faster
 from leco_plugin.models.gate import Gate, GateConfig
 from leco_plugin.models.region import Region, marching_rule
 from leco_plugin.models.rendering import (
     Intervals,
     Rays,
     Routing,
+    Scene,
     Shaded,
     mapped_middles,
     shade,
     with_backdrop,
 )
-from leco_plugin.models.sizing.sizes import Sizes
-from leco_plugin.models.sizing.stored_sizes import SIZES, stored_in, to_store
+from leco_plugin.models.sizing.sizes import SIZES, Sizes, stored_in, to_store
 from leco_plugin.occupancy import SHOWN, Occupancy, Precision, gate_precision
 from leco_plugin.samplers import marching
 from leco_plugin.samplers.estimator import LearnedOccupancyEstimator
@@ -176,15 +176,11 @@ class Mixture(nn.Module):
     def shade(self, rays: Rays, intervals: Intervals) -> Shaded:
         """Renders intervals; no gradient reaches a frozen gate."""
         with gate_precision(self.device.type, self.precision):
-            return shade(
-                self.field,
-                self.gate,
-                self.region.space,
-                rays,
-                intervals,
-                self.routing,
-                freeze_gate=bool(self.frozen),
-            )
+            return shade(self.scene(), rays, intervals, freeze_gate=bool(self.frozen))
+
+    def scene(self) -> Scene:
+        """Whom renderings ask."""
+        return Scene(self.field, self.gate, self.region.space, self.routing)
 
     def show(
         self, rays: Rays, intervals: Intervals, front_to_back: bool | None
@@ -195,14 +191,13 @@ class Mixture(nn.Module):
             front_to_back: whether to leave out what lies behind opaque surfaces, without gradients;
                 None does so where that was measured to be no slower.
         """
-        parts = self.field, self.gate, self.region.space, rays, intervals, self.routing
+        given = self.scene(), rays, intervals
         with gate_precision(self.device.type, self.precision):
-            if front_to_back is None:
-                front_to_back = suits_native(*parts) or is_no_slower(
-                    len(rays.origins), self.skips, self.device
-                )
             if front_to_back:
-                return shade_front_to_back(*parts)
+                return shade_front_to_back(*given)
+            found = shade_where_faster(*given, self.skips) if front_to_back is None else None
+        if found is not None:
+            return found
         return self.shade(rays, intervals), intervals
 
     @torch.no_grad()

@@ -88,6 +88,16 @@ class Routing(NamedTuple):
     """No empty-space expert at all: the gate chooses among the scene experts."""
 
 
+class Scene(NamedTuple):
+    """Whom to ask at a place, and how."""
+
+    field: HMoEField
+    gate: Gate
+    space: Space
+    """How positions are mapped for both."""
+    routing: Routing
+
+
 def gate_values_and_routes(
     logits: Tensor, routing: Routing, left: Tensor | None = None
 ) -> tuple[Tensor, Tensor]:
@@ -200,22 +210,13 @@ def mapped_middles(space: Space, rays: Rays, intervals: Intervals) -> Tensor:
     return space.map(positions).clamp(-1.0, 1.0)
 
 
-def shade(
-    field: HMoEField,
-    gate: Gate,
-    space: Space,
-    rays: Rays,
-    intervals: Intervals,
-    routing: Routing,
-    freeze_gate: bool,
-) -> Shaded:
+def shade(scene: Scene, rays: Rays, intervals: Intervals, freeze_gate: bool) -> Shaded:
     """Renders packed intervals; only visible samples are coloured.
 
     Args:
         freeze_gate: no gradient reaches the gate.
     """
-    answers = ask(field, gate, space, rays, intervals, routing, freeze_gate)
-    return render(field, space, rays, intervals, answers)
+    return render(scene, rays, intervals, ask(scene, rays, intervals, freeze_gate))
 
 
 class Answers(NamedTuple):
@@ -231,35 +232,23 @@ class Answers(NamedTuple):
     """[M] int64, the expert of each sample."""
 
 
-def ask(
-    field: HMoEField,
-    gate: Gate,
-    space: Space,
-    rays: Rays,
-    intervals: Intervals,
-    routing: Routing,
-    freeze_gate: bool,
-) -> Answers:
+def ask(scene: Scene, rays: Rays, intervals: Intervals, freeze_gate: bool) -> Answers:
     """Asks gate and field at the middles of intervals; arguments as for `shade`."""
-    mapped = mapped_middles(space, rays, intervals)
+    mapped = mapped_middles(scene.space, rays, intervals)
     with torch.set_grad_enabled(torch.is_grad_enabled() and not freeze_gate):
-        logits = gate(mapped)
-        gate_values, routes = gate_values_and_routes(
-            logits, routing, field.experts.remaining_experts()
-        )
-    sigmas, features = field.density(mapped, routes, gate_values)
+        logits = scene.gate(mapped)
+        left = scene.field.experts.remaining_experts()
+        gate_values, routes = gate_values_and_routes(logits, scene.routing, left)
+    sigmas, features = scene.field.density(mapped, routes, gate_values)
     return Answers(sigmas, features, logits, routes)
 
 
-def render(
-    field: HMoEField, space: Space, rays: Rays, intervals: Intervals, answers: Answers
-) -> Shaded:
+def render(scene: Scene, rays: Rays, intervals: Intervals, answers: Answers) -> Shaded:
     """Pixels from what was said of packed intervals."""
     sigmas, features, logits, routes = answers
-    weights, packed_info = weigh(
-        sigmas, backdrop_of(intervals, rays), intervals, space.half_extent, len(rays.origins)
-    )
-    rgb = composite(field.color, features, weights, rays, intervals)
+    is_backdrop, half_extent = backdrop_of(intervals, rays), scene.space.half_extent
+    weights, packed_info = weigh(sigmas, is_backdrop, intervals, half_extent, len(rays.origins))
+    rgb = composite(scene.field.color, features, weights, rays, intervals)
     accumulation, depth = sum_up(weights, rays, intervals)
     return Shaded(rgb, accumulation, depth, weights, sigmas, logits, routes, packed_info)
 

@@ -27,8 +27,7 @@ from leco_plugin.models.rendering import (
     mapped_middles,
     with_backdrop,
 )
-from leco_plugin.models.switch.config import SwitchNerfModelConfig
-from leco_plugin.models.switch.field import NEW_DENSITY, Answers, SwitchField
+from leco_plugin.models.switch.field import NEW_DENSITY, Answers, SwitchField, SwitchNerfModelConfig
 from leco_plugin.models.switch.rendering import (
     coarse_and_fine,
     keep_candidates,

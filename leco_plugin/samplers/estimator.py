@@ -13,11 +13,10 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from leco_plugin.samplers.base import Estimator
+from leco_plugin.samplers.base import Estimator, Snapshot
 from leco_plugin.samplers.boxes import cell_centers, checked_box, intersect_box
 from leco_plugin.samplers.cells.build import build_cache
 from leco_plugin.samplers.cells.cache import CellCache, OccupancyLike
-from leco_plugin.samplers.changes import Snapshot
 from leco_plugin.samplers.kernels import fused, native_march
 from leco_plugin.samplers.marching import NearFn, OccupiedFn, Samples
 from leco_plugin.samplers.rays import March, Rays

@@ -23,8 +23,8 @@ from torch import Tensor
 
 from leco_plugin.samplers import packed
 from leco_plugin.samplers.boxes import intersect_box, lookup
-from leco_plugin.samplers.edges import candidate_edges
 from leco_plugin.samplers.marching import March, OccupiedFn, Rays, Samples, march, number
+from leco_plugin.samplers.rays import candidate_edges
 
 if TYPE_CHECKING:
     from nerfacc import RayIntervals, RaySamples

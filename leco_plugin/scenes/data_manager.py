@@ -25,7 +25,6 @@ from rich.markup import escape
 from torch import Tensor
 
 from leco_plugin.log import say
-from leco_plugin.scenes.detail import CAMERAS
 from leco_plugin.scenes.frames import UP_IS_KNOWN
 from leco_plugin.scenes.input_error import InputError
 from leco_plugin.scenes.photograph_files import names_what_it_cannot_read
@@ -33,7 +32,7 @@ from leco_plugin.scenes.pixels.held_out_pixels import HeldOutPixelSampler
 from leco_plugin.scenes.pixels.lattice import Lattice, lattice_for
 from leco_plugin.scenes.pixels.stored_pictures import picture_sizes, store_pictures
 from leco_plugin.scenes.reading import read_checked
-from leco_plugin.scenes.survey import points_in
+from leco_plugin.scenes.survey import CAMERAS, points_in
 from leco_plugin.scenes.upright import turn_to_upright, turned
 from leco_plugin.studio.run import keeps_all_images
 

@@ -35,12 +35,12 @@ from leco_plugin.scenes.photograph_files import (
     DerivedImages,
     Header,
     check_kind,
+    convert_masks,
     decode,
     header_of,
     is_plain,
     is_turned,
 )
-from leco_plugin.scenes.photograph_masks import convert_masks
 from leco_plugin.scenes.scene_file import (
     SceneFile,
     description_of,

@@ -24,8 +24,7 @@ from leco_plugin.scenes.lenses import (
     check_together,
     lens_of,
 )
-from leco_plugin.scenes.photograph_files import find_file
-from leco_plugin.scenes.photograph_masks import check_masked
+from leco_plugin.scenes.photograph_files import check_masked, find_file
 
 FRAMES = ("frames", "test_frames")
 """Lists of frames; the second is ScanNet++'s."""

@@ -7,9 +7,8 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from leco_plugin.scenes.input_error import InputError
-from leco_plugin.stability.photographs import Capture
+from leco_plugin.stability.photographs import STAGES, Capture
 from leco_plugin.stability.samplers import DENSE, GRID, GRIDS, LEARNED, RAYS
-from leco_plugin.stability.stages import STAGES
 
 BOUNDED = (LEARNED, *(f"{GRID}-{cells}" for cells in GRIDS), DENSE)
 """Samplers whose host has bounds: Nerfacto contracts all of space, and has none."""

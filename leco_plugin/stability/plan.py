@@ -12,7 +12,7 @@ from typing import Any
 
 from leco_plugin.chart.contender import Contender, Job
 from leco_plugin.stability.cases import Case
-from leco_plugin.stability.photographs import Capture
+from leco_plugin.stability.photographs import STAGES, YARD, Capture
 from leco_plugin.stability.samplers import (
     DENSE,
     DENSE_PROPOSAL,
@@ -26,7 +26,6 @@ from leco_plugin.stability.samplers import (
     with_references,
 )
 from leco_plugin.stability.scene import Stage
-from leco_plugin.stability.stages import STAGES, YARD
 
 START_SECONDS = 14.0
 """For a process to start, to read the scene and to build the host."""

@@ -93,9 +93,6 @@ NO_USE: tuple[tuple[str, type[Warning], str], ...] = (
 )
 """Message, kind and module of warnings that a user can do nothing about."""
 
-OURS = ("leco-ngp", "leco-nerfacto", "leco-occupancy", "leco-occupancy-paper", "leco-switch-nerf")
-"""Methods of `ns-train` whose screen is short from its first line."""
-
 
 def quiet_imports_of_our_methods() -> None:
     """Hides warnings that a user can do nothing about, in every command of nerfstudio but
@@ -106,7 +103,8 @@ def quiet_imports_of_our_methods() -> None:
     """
     program = Path(*sys.argv[:1]).name
     trains = program.startswith(("ns-train", "train"))
-    if is_ns_command(*sys.argv[:1]) and (not trains or (sys.argv[1:2] and sys.argv[1] in OURS)):
+    ours = "".join(sys.argv[1:2]).startswith("leco-")
+    if is_ns_command(*sys.argv[:1]) and (not trains or ours):
         hide_warnings_of_no_use()
 
 

@@ -1,4 +1,5 @@
-"""nerfstudio models without a network, and the photographs that they are compared with."""
+"""What nerfstudio 1.1.5 keeps to itself; its models without a network for LPIPS, and the
+photographs that they are compared with."""
 
 from __future__ import annotations
 
@@ -57,3 +58,19 @@ def true_colours(host: Any, image: Tensor) -> Tensor:
     blend = getattr(getattr(host, "renderer_rgb", None), "blend_background", None)
     blended: Tensor = image[..., :3] if blend is None else blend(image)
     return blended
+
+
+def outputs_of(dataset: Any) -> Any:
+    """The `DataparserOutputs` that an `InputDataset` was made of.
+
+    Its masks and its alpha colour stand nowhere else; its data manager's are of the training split.
+    """
+    return dataset._dataparser_outputs
+
+
+def leave_out_the_end(trainer: Any) -> None:
+    """Has a trainer end after its last step, without a last checkpoint, a banner and a viewer.
+
+    No option of `TrainerConfig` turns them off together.
+    """
+    trainer._after_train = lambda: None

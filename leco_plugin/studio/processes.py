@@ -24,7 +24,7 @@ from leco_plugin.models.failures import TrainingStopped
 from leco_plugin.scenes.input_error import InputError
 from leco_plugin.studio.checkpoints import follow_data
 from leco_plugin.studio.run_folder import claim
-from leco_plugin.studio.screen import is_short, short_screen
+from leco_plugin.studio.run_progress import is_short, short_screen
 from leco_plugin.studio.trainer import AtomicTrainer
 
 LOST = ("Connection closed by peer", "Connection reset by peer", "NCCL communicator was aborted")

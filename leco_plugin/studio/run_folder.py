@@ -13,7 +13,7 @@ from typing import Any
 import yaml
 
 from leco_plugin.models.compute.ranks import is_first
-from leco_plugin.models.sizing.stored_sizes import sizes_in, sizes_to_resume
+from leco_plugin.models.sizing.sizes import sizes_in, sizes_to_resume
 from leco_plugin.scenes.input_error import InputError
 from leco_plugin.scenes.whole_files import write_whole
 from leco_plugin.studio.checkpoints import allow_checkpoint_globals, newest_whole, step_of

@@ -19,7 +19,7 @@ from nerfstudio.engine.trainer import Trainer
 from nerfstudio.utils.decorators import check_main_thread
 
 from leco_plugin.learning.collapse import GateCollapsed
-from leco_plugin.learning.progress import Progress
+from leco_plugin.learning.run import Progress
 from leco_plugin.log import say, say_what_is_logged
 from leco_plugin.models.compute.ranks import is_first
 from leco_plugin.models.failures import TrainingStopped
@@ -33,8 +33,7 @@ from leco_plugin.studio.run_folder import (
     keep_sizes,
     with_sizes_of,
 )
-from leco_plugin.studio.run_progress import RunProgress
-from leco_plugin.studio.screen import short_screen, without_tables
+from leco_plugin.studio.run_progress import RunProgress, short_screen, without_tables
 from leco_plugin.studio.viewer import stay_open
 
 HEARD = "\nstopping after this step; Ctrl-C once more stops at once\n"

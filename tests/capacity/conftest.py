@@ -8,7 +8,7 @@ import pytest
 
 from leco_plugin.capacity import references, search
 from leco_plugin.capacity.sources import Source, find_source
-from leco_plugin.learning import lesson
+from leco_plugin.learning import sharpening
 from leco_plugin.occupancy import Occupancy
 
 
@@ -19,7 +19,7 @@ def quick(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(search, "STEPS", 200)
     monkeypatch.setattr(search, "VOLUME_POINTS", 1 << 14)
     monkeypatch.setattr(search, "TAUGHT_POINTS", 1 << 14)
-    monkeypatch.setattr(lesson, "BATCH", 4096)
+    monkeypatch.setattr(sharpening, "BATCH", 4096)
 
 
 @pytest.fixture

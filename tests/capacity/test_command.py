@@ -13,8 +13,8 @@ from PIL import Image
 
 from leco_plugin import cli
 from leco_plugin.capacity import command
-from leco_plugin.capacity.gates import Candidate, gates
 from leco_plugin.capacity.measuring import VOLUMES
+from leco_plugin.capacity.search import Candidate, gates
 from leco_plugin.chart.theme import SOURCE, fingerprint
 from leco_plugin.scenes.input_error import InputError
 
@@ -152,7 +152,7 @@ def test_one_field_teaches_gates_and_grids(
     monkeypatch.setattr(measuring, "TAUGHT_RAYS", 256)
     monkeypatch.setattr(measuring, "VOLUME_POINTS", 2048)
     monkeypatch.setattr(measuring, "STEPS", 20)
-    monkeypatch.setattr("leco_plugin.learning.lesson.BATCH", 512)
+    monkeypatch.setattr("leco_plugin.learning.sharpening.BATCH", 512)
     some = [candidate for candidate in gates() if candidate.bytes < 5000]
     monkeypatch.setattr(command, "gates", lambda: some)
     out = tmp_path / "out"

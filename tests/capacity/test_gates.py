@@ -3,13 +3,7 @@
 from __future__ import annotations
 
 from leco_plugin.capacity.choice import NAMES
-from leco_plugin.capacity.gates import (
-    gates,
-    grids,
-    ladder,
-    name_of,
-    values_of,
-)
+from leco_plugin.capacity.search import gates, grids, ladder, name_of, values_of
 from leco_plugin.models.gate import Gate, GateConfig, check_sizes
 
 

@@ -8,7 +8,7 @@ import torch
 from leco_plugin.capacity.evidence import Evidence
 from leco_plugin.capacity.measuring import VOLUMES, measure, taught_grid
 from leco_plugin.evaluation.inspection import ViewBox
-from leco_plugin.learning.lesson import Lesson
+from leco_plugin.learning.sharpening import Lesson
 
 
 def evidence(count: int = 10_000) -> Evidence:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -189,6 +190,6 @@ def test_what_c_asks_of_a_field_is_counted_by_its_answer(monkeypatch: pytest.Mon
     monkeypatch.setattr(front_to_back, "shade_natively", lambda *_: (None, seen))
     shade = front_to_back.shade_natively
     with count_queries(Host(field)) as queries:
-        front_to_back.shade_natively(field, None)  # type: ignore[call-arg, arg-type]
+        front_to_back.shade_natively(SimpleNamespace(field=field))  # type: ignore[call-arg, arg-type]
     assert queries["field"] == 7
     assert front_to_back.shade_natively is shade

@@ -12,8 +12,7 @@ from nerfstudio.models.nerfacto import NerfactoModelConfig
 from small_hosts import what_a_model_gets
 from torch import nn
 
-from leco_plugin.hosts.appearance_codes import SmallCodes
-from leco_plugin.hosts.guided import GuidedModelConfig
+from leco_plugin.hosts.guided import GuidedModelConfig, SmallCodes
 from leco_plugin.hosts.guided_start import OccupancyConfig
 from leco_plugin.swap import registered, swapped_config
 

@@ -12,11 +12,16 @@ import torch
 from ball_occupancy import ball
 from nerfstudio.model_components.renderers import RGBRenderer
 
-from leco_plugin.hosts import first_steps, host_watch
+from leco_plugin.hosts import host_watch
 from leco_plugin.hosts.classes import GuidedHost
-from leco_plugin.hosts.first_steps import CAREFUL, begin_carefully
 from leco_plugin.hosts.guide import Guide
-from leco_plugin.hosts.host_watch import LOWERED_TO, HostWatch, squared_errors
+from leco_plugin.hosts.host_watch import (
+    CAREFUL,
+    LOWERED_TO,
+    HostWatch,
+    begin_carefully,
+    squared_errors,
+)
 from leco_plugin.hosts.stand_ins import GuidedEstimator
 from leco_plugin.learning import price_watch
 from leco_plugin.learning.calibration import THRESHOLDS, CalibrationConfig
@@ -169,7 +174,7 @@ def a_half(occupancy: Occupancy) -> float:
 def test_all_processes_begin_with_what_the_first_one_has_found(
     watched: Watched, packed: torch.nn.Module, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(first_steps, "from_first", lambda make, device: 0.123)
+    monkeypatch.setattr(host_watch, "from_first", lambda make, device: 0.123)
     assert begin_carefully(packed, watched.guide, a_half)
     assert watched.guide.followed().threshold == pytest.approx(0.123)
 

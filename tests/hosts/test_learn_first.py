@@ -13,7 +13,7 @@ from leco_plugin.hosts.guided_start import OccupancyConfig
 from leco_plugin.hosts.learn_first import FEWEST_STEPS, keep_within, learn_occupancy
 from leco_plugin.learning.calibration import Measured
 from leco_plugin.learning.held_out import HeldOut
-from leco_plugin.learning.progress import Progress
+from leco_plugin.learning.run import Progress
 from leco_plugin.learning.schedule import MOST_EXTENSIONS, ScheduleConfig
 from leco_plugin.learning.sharpening import Sharpened, SharpeningConfig
 from leco_plugin.models.gate import Gate, GateConfig

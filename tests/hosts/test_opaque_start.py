@@ -14,11 +14,11 @@ from nerfstudio.engine.callbacks import TrainingCallbackAttributes, TrainingCall
 from small_hosts import pipeline_of, small
 from torch import nn
 
-from leco_plugin.hosts import first_steps as opaque_start
-from leco_plugin.hosts.first_steps import begin_opaque
+from leco_plugin.hosts import host_watch as opaque_start
 from leco_plugin.hosts.guide import Guide
+from leco_plugin.hosts.host_watch import begin_opaque
 from leco_plugin.hosts.stand_ins import GuidedEstimator
-from leco_plugin.models.switch.config import SMALL, SwitchNerfModelConfig
+from leco_plugin.models.switch.field import SMALL, SwitchNerfModelConfig
 from leco_plugin.scenes.bounds import SceneBounds
 from leco_plugin.swap import with_sampler_swapped
 

@@ -13,8 +13,8 @@ from nerfstudio.cameras.rays import RayBundle
 from nerfstudio.viewer.utils import parse_object
 from nerfstudio.viewer.viewer_elements import ViewerElement
 
-from leco_plugin.hosts.first_steps import begin_carefully, end_probation
 from leco_plugin.hosts.guide import Guide
+from leco_plugin.hosts.host_watch import begin_carefully, end_probation
 from leco_plugin.occupancy import BACKDROP_PRICE, Occupancy
 from leco_plugin.samplers.base import Estimator
 from leco_plugin.samplers.estimator import LearnedOccupancyEstimator

@@ -21,7 +21,7 @@ from leco_plugin.learning.collapse import (
     reset_gate_head,
     spread_scene_experts,
 )
-from leco_plugin.learning.progress import Progress
+from leco_plugin.learning.run import Progress
 from leco_plugin.models.gate import occupancy_from_logits
 from leco_plugin.models.losses import expert_shares
 from leco_plugin.models.objective import GateLossConfig

@@ -12,7 +12,7 @@ from leco_plugin.learning import history
 from leco_plugin.learning import learner as learner_module
 from leco_plugin.learning.history import GateHistory
 from leco_plugin.learning.learner import Learner
-from leco_plugin.learning.progress import Progress
+from leco_plugin.learning.run import Progress
 from leco_plugin.learning.schedule import ScheduleConfig
 
 PROBES = 500

@@ -6,7 +6,7 @@ import pytest
 import torch
 from ball_occupancy import ENCODINGS
 
-from leco_plugin.learning.lesson import Lesson, round_weights, teach
+from leco_plugin.learning.sharpening import Lesson, round_weights, teach
 from leco_plugin.models.encodings import EncodingConfig
 from leco_plugin.models.gate import Gate, GateConfig, occupancy_logit
 from leco_plugin.models.losses import contribution_loss
@@ -20,7 +20,7 @@ def ball_lesson(count: int = 40_000) -> Lesson:
 
 @pytest.mark.parametrize("kind", ENCODINGS)
 def test_every_kind_of_gate_learns_a_ball(kind: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("leco_plugin.learning.lesson.BATCH", 2048)
+    monkeypatch.setattr("leco_plugin.learning.sharpening.BATCH", 2048)
     lesson = ball_lesson()
     shares: list[float] = []
     config = GateConfig(ENCODINGS[kind], 16, 1, 1)

@@ -25,7 +25,7 @@ from leco_plugin.learning.price_watch import (
     PriceWatch,
     steps_until_next,
 )
-from leco_plugin.learning.progress import Progress, WatchState
+from leco_plugin.learning.run import Progress, WatchState
 from leco_plugin.learning.schedule import ScheduleConfig
 from leco_plugin.models.rendering import Intervals
 from leco_plugin.occupancy import Occupancy

@@ -6,7 +6,7 @@ import io
 
 import torch
 
-from leco_plugin.learning.progress import Progress, WatchState
+from leco_plugin.learning.run import Progress, WatchState
 
 
 def test_a_new_run_learns_as_long_as_configured_unless_it_is_short() -> None:

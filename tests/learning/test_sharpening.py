@@ -15,8 +15,8 @@ from leco_plugin.learning import sharpening
 from leco_plugin.learning.calibration import CalibrationConfig, Measured
 from leco_plugin.learning.dense import dense_rendering
 from leco_plugin.learning.history import as_learned
-from leco_plugin.learning.lesson import Lesson
 from leco_plugin.learning.sharpening import (
+    Lesson,
     Sharpened,
     SharpeningConfig,
     lesson_by,

@@ -25,6 +25,7 @@ from leco_plugin.models.rendering import (
     Intervals,
     Rays,
     Routing,
+    Scene,
     mapped_middles,
     shade,
     with_backdrop,
@@ -35,7 +36,6 @@ from leco_plugin.samplers.marching import March, march
 from leco_plugin.samplers.packed import render_transmittance_from_density
 from leco_plugin.space import Space
 
-ROUTING = Routing(0.2, False)
 STEP = 0.02
 HARDLY = 1.0 / 255.0 / 30.0
 """A thirtieth of a step of an 8-bit image."""
@@ -50,22 +50,17 @@ def by(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
         monkeypatch.setenv(VARIABLE, "native")
 
 
-class Scene:
-    """A gate and a field; `density` is about how dense it is everywhere, per half extent."""
-
-    def __init__(self, density: float) -> None:
-        torch.manual_seed(0)
-        encoding = EncodingConfig("hash", levels=2, log2_table=6, coarsest=4, finest=16)
-        config = FieldConfig(encoding, HMoEConfig(scene_experts=3, width=16), appearance_dim=4)
-        self.field = HMoEField(config, num_images=3)
-        torch.nn.init.normal_(self.field.encoding.table, std=2.0)
-        with torch.no_grad():
-            self.field.density_head.bias.fill_(1.0 + torch.tensor(density).log())
-        self.gate = Gate(GateConfig(EncodingConfig(octaves=2), width=8, scene_experts=3))
-        self.space = Space("contraction", half_extent=0.5)
-
-    def parts(self) -> tuple[HMoEField, Gate, Space]:
-        return self.field, self.gate, self.space
+def scene_of(density: float) -> Scene:
+    """About so dense everywhere, per half extent."""
+    torch.manual_seed(0)
+    encoding = EncodingConfig("hash", levels=2, log2_table=6, coarsest=4, finest=16)
+    config = FieldConfig(encoding, HMoEConfig(scene_experts=3, width=16), appearance_dim=4)
+    field = HMoEField(config, num_images=3)
+    torch.nn.init.normal_(field.encoding.table, std=2.0)
+    with torch.no_grad():
+        field.density_head.bias.fill_(1.0 + torch.tensor(density).log())
+    gate = Gate(GateConfig(EncodingConfig(octaves=2), width=8, scene_experts=3))
+    return Scene(field, gate, Space("contraction", half_extent=0.5), Routing(0.2, False))
 
 
 def some_rays(count: int) -> Rays:
@@ -88,11 +83,11 @@ def kept_along(rays: Rays) -> Intervals:
 @pytest.mark.parametrize("density", [0.01, 1.0, 30.0, 3000.0])
 @pytest.mark.parametrize("count", [0, 1, 150])
 def test_it_renders_what_asking_about_everything_renders(count: int, density: float) -> None:
-    scene, rays = Scene(density), some_rays(count)
+    scene, rays = scene_of(density), some_rays(count)
     everything = kept_along(rays)
     with torch.no_grad():
-        whole = shade(*scene.parts(), rays, everything, ROUTING, freeze_gate=True)
-    seen, asked = shade_front_to_back(*scene.parts(), rays, everything, ROUTING)
+        whole = shade(scene, rays, everything, freeze_gate=True)
+    seen, asked = shade_front_to_back(scene, rays, everything)
     assert len(asked.t_starts) == len(seen.weights) == len(seen.logits) == len(seen.routes)
     torch.testing.assert_close(seen.rgb, whole.rgb, atol=HARDLY, rtol=0.0)
     torch.testing.assert_close(seen.accumulation, whole.accumulation, atol=HARDLY, rtol=0.0)
@@ -102,17 +97,17 @@ def test_it_renders_what_asking_about_everything_renders(count: int, density: fl
 @pytest.mark.usefixtures("by")
 @pytest.mark.parametrize("density", [0.01, 30.0, 3000.0])
 def test_it_asks_from_the_front_and_hardly_further_than_light_goes(density: float) -> None:
-    scene, rays = Scene(density), some_rays(150)
+    scene, rays = scene_of(density), some_rays(150)
     everything = kept_along(rays)
     with torch.no_grad():
-        whole = shade(*scene.parts(), rays, everything, ROUTING, freeze_gate=True)
+        whole = shade(scene, rays, everything, freeze_gate=True)
     trans, _ = render_transmittance_from_density(
         everything.t_starts / 0.5,
         everything.t_ends / 0.5,
         whole.sigmas,
         packed_info=whole.packed_info,
     )
-    _, asked = shade_front_to_back(*scene.parts(), rays, everything, ROUTING)
+    _, asked = shade_front_to_back(scene, rays, everything)
     at = {
         (int(ray), float(start)): number
         for number, (ray, start) in enumerate(zip(everything.ray_indices, everything.t_starts))
@@ -137,7 +132,7 @@ def test_it_asks_from_the_front_and_hardly_further_than_light_goes(density: floa
 def test_c_asks_and_answers_as_torch_does(
     kind: Literal["contraction", "box"], density: float, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    scene = Scene(density)
+    scene = scene_of(density)
     scene.space.set(kind, torch.tensor([0.1, 0.0, -0.2]), 0.7)
     scene.field.experts.drop(2)
     for parameter in scene.field.experts.parameters():
@@ -148,7 +143,7 @@ def test_c_asks_and_answers_as_torch_does(
         parameter.data.normal_()
     likely = scene.gate.occupancy(mapped_middles(scene.space, rays, everything))
     middle = likely.detach().sort().values[len(likely) // 2 :][:2].mean()  # between two: no tie
-    given = *scene.parts(), rays, everything, Routing(float(middle), False)
+    given = scene._replace(routing=Routing(float(middle), False)), rays, everything
     monkeypatch.setattr(native, "RAYS_AT_ONCE", 40)
     monkeypatch.setattr(torch, "get_num_threads", lambda: 2)
     assert not suits_native(*given)  # where gradients are wanted
@@ -162,9 +157,9 @@ def test_c_asks_and_answers_as_torch_does(
 
 @needs_compiler
 def test_c_does_not_hide_what_is_no_number() -> None:
-    scene, rays = Scene(1.0), some_rays(20)
+    scene, rays = scene_of(1.0), some_rays(20)
     scene.gate.hidden[0].bias.data[0] = torch.nan
-    shaded, _ = shade_front_to_back(*scene.parts(), rays, kept_along(rays), ROUTING)
+    shaded, _ = shade_front_to_back(scene, rays, kept_along(rays))
     assert bool(shaded.accumulation.isnan().all())
 
 

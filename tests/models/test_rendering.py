@@ -6,6 +6,7 @@ import pytest
 import torch
 from torch import Tensor
 
+from leco_plugin.models import rendering
 from leco_plugin.models.encodings import EncodingConfig
 from leco_plugin.models.field import FieldConfig, HMoEField
 from leco_plugin.models.figures import before_the_backdrop, gate_pictures
@@ -47,7 +48,8 @@ class Scene:
         self.space = Space("contraction", half_extent=0.5)
 
     def shade(self, rays: Rays, intervals: Intervals, routing: Routing, freeze=False) -> Shaded:
-        return shade(self.field, self.gate, self.space, rays, intervals, routing, freeze)
+        scene = rendering.Scene(self.field, self.gate, self.space, routing)
+        return shade(scene, rays, intervals, freeze)
 
     def parameters(self) -> list[Tensor]:
         return [*self.field.parameters(), *self.gate.parameters()]

@@ -18,8 +18,7 @@ from nerfstudio.engine.callbacks import TrainingCallbackAttributes
 from torch import Tensor
 
 from leco_plugin.host_configs import switch_nerf
-from leco_plugin.models.switch.config import SwitchNerfModelConfig, SwitchSizes
-from leco_plugin.models.switch.field import SwitchFieldConfig
+from leco_plugin.models.switch.field import SwitchFieldConfig, SwitchNerfModelConfig, SwitchSizes
 from leco_plugin.models.switch_nerf import SwitchNerfModel
 from leco_plugin.samplers.base import DenseEstimator
 from leco_plugin.samplers.estimator import LearnedOccupancyEstimator

@@ -18,12 +18,17 @@ from leco_plugin.models.encodings import EncodingConfig
 from leco_plugin.models.gate import Gate, GateConfig
 from leco_plugin.occupancy import Occupancy
 from leco_plugin.samplers.cells.cache import CellCache
-from leco_plugin.samplers.edges import candidate_counts, growth_table, powers_needed, switch
 from leco_plugin.samplers.estimator import LearnedOccupancyEstimator
 from leco_plugin.samplers.kernels import fused
 from leco_plugin.samplers.kernels.gate_weights import GateWeights, gate_weights, why_not
 from leco_plugin.samplers.marching import RUN, Candidates, March, Rays, Samples, cut, keep_steps
-from leco_plugin.samplers.rays import TooManyCandidates
+from leco_plugin.samplers.rays import (
+    TooManyCandidates,
+    candidate_counts,
+    growth_table,
+    powers_needed,
+    switch,
+)
 from leco_plugin.space import Space
 
 

@@ -11,7 +11,6 @@ from waits import Waits
 
 from leco_plugin.samplers import marching
 from leco_plugin.samplers.boxes import intersect_box
-from leco_plugin.samplers.edges import candidate_counts, candidate_edges
 from leco_plugin.samplers.estimator import LearnedOccupancyEstimator
 from leco_plugin.samplers.grid import OccupancyGridEstimator
 from leco_plugin.samplers.kernels import VARIABLE
@@ -24,6 +23,7 @@ from leco_plugin.samplers.marching import (
     places_by_column,
     places_by_column_in_runs,
 )
+from leco_plugin.samplers.rays import candidate_counts, candidate_edges
 
 finite = st.floats(-2.0, 4.0)
 

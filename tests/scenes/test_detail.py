@@ -9,7 +9,7 @@ from scene_files import refused
 from torch import Tensor
 
 from leco_plugin.scenes.bounds import BoundsConfig
-from leco_plugin.scenes.detail import detail_of
+from leco_plugin.scenes.survey import detail_of
 
 HEIGHT, SIDE, FOCAL = 2.0, 32, 32.0
 """Of the survey: a pixel's footprint is 1/16, an image's 2 x 2."""

@@ -10,8 +10,7 @@ from nerfstudio.data.utils.data_utils import get_image_mask_tensor_from_path
 from PIL import Image
 from scene_files import refused
 
-from leco_plugin.scenes.photograph_files import DerivedImages
-from leco_plugin.scenes.photograph_masks import convert_masks
+from leco_plugin.scenes.photograph_files import DerivedImages, convert_masks
 
 SEEN = np.zeros((16, 24), dtype=bool)
 SEEN[4:12, 6:18] = True

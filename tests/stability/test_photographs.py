@@ -14,7 +14,9 @@ from leco_plugin.scenes.city.cameras import Lens, look_at
 from leco_plugin.scenes.frames import distance_from_rotations, rotation
 from leco_plugin.scenes.photographs import check_scene, read_points
 from leco_plugin.stability.photographs import (
+    STAGES,
     TRUTH,
+    YARD,
     Capture,
     Shot,
     View,
@@ -24,7 +26,6 @@ from leco_plugin.stability.photographs import (
     write_scene,
 )
 from leco_plugin.stability.scene import Array, Box, Paint, Stage, photograph
-from leco_plugin.stability.stages import STAGES, YARD
 from leco_plugin.stability.worker import FEWEST_VIEWS
 
 PLAIN = Capture()

@@ -18,8 +18,8 @@ from leco_plugin.learning.calibration import CalibrationConfig
 from leco_plugin.learning.schedule import ScheduleConfig
 from leco_plugin.method_configs import leco_occupancy
 from leco_plugin.models.sizing.sizes import left_open, with_size
-from leco_plugin.scenes.detail import CAMERAS
 from leco_plugin.scenes.input_error import InputError
+from leco_plugin.scenes.survey import CAMERAS
 from leco_plugin.studio.run_folder import checkpoint_of
 
 STEPS = 2

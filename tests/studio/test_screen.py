@@ -22,8 +22,7 @@ from leco_plugin.evaluation import held_out_psnr
 from leco_plugin.host_configs import leco_ngp
 from leco_plugin.models.encodings import EncodingConfig
 from leco_plugin.models.gate import GateConfig
-from leco_plugin.studio.run_progress import next_commands
-from leco_plugin.studio.screen import LOG, short_screen
+from leco_plugin.studio.run_progress import LOG, next_commands, short_screen
 
 MOST_LINES = 40
 

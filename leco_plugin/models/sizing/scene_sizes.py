@@ -16,18 +16,27 @@ import torch
 from leco_plugin.log import summarize
 from leco_plugin.models.encodings import EncodingConfig
 from leco_plugin.models.gate import GateConfig
-from leco_plugin.models.sizing.size_limits import (
+from leco_plugin.models.sizing.sizes import (
+    Sizes,
     check,
     check_memory,
+    left_open,
     memory_of,
+    size_at,
+    sizes_for,
     state_bytes,
     values_of,
+    with_size,
 )
-from leco_plugin.models.sizing.sizes import Sizes, left_open, size_at, sizes_for, with_size
 from leco_plugin.scenes.bounds import BoundsConfig
-from leco_plugin.scenes.detail import CAMERAS, SceneDetail, detail_of
 from leco_plugin.scenes.input_error import InputError
-from leco_plugin.scenes.survey import points_in, with_known_altitudes
+from leco_plugin.scenes.survey import (
+    CAMERAS,
+    SceneDetail,
+    detail_of,
+    points_in,
+    with_known_altitudes,
+)
 
 ENTRIES_PER_TEXEL = 2.5
 """Entries of a level of the hash table for each texel of the surface: a layer of cells has two

@@ -1,14 +1,20 @@
-"""Sizes of gate, field and batches: the largest for each device, and those of the paper."""
+"""Sizes of gate, field and batches: those of a device, of the paper, and of a resumed run; and what
+cannot be built or trained."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import asdict, dataclass, field, replace
+from pathlib import Path
 from typing import Any
 
+import psutil
+import torch
+
 from leco_plugin.models.encodings import EncodingConfig
-from leco_plugin.models.field import FieldConfig
-from leco_plugin.models.gate import GateConfig
+from leco_plugin.models.field import FieldConfig, HMoEField
+from leco_plugin.models.gate import LARGEST_SIZES, Gate, GateConfig, check_sizes
 from leco_plugin.models.hmoe import HMoEConfig
+from leco_plugin.scenes.input_error import InputError
 
 CLI = "--pipeline.model.sizes"
 """How messages name an option of these."""
@@ -122,3 +128,182 @@ def learning_only(sizes: Sizes) -> Sizes:
 def left_open(sizes: Sizes) -> list[str]:
     """Paths of the sizes that are automatic."""
     return [path for path in CHOSEN if size_at(sizes, path) == AUTOMATIC]
+
+
+SIZES = "sizes"
+"""Key in the extra state of a model."""
+
+
+def to_store(sizes: Sizes, images: int) -> dict[str, Any]:
+    """What gate and field are built from, as plain values."""
+    return {"gate": asdict(sizes.gate), "field": asdict(sizes.field), "images": images}
+
+
+def from_stored(values: dict[str, Any], sizes: Sizes) -> tuple[Sizes, int]:
+    """Inverse of `to_store`; what is not of gate and field is that of `sizes`.
+
+    Raises:
+        ValueError: there is a size in it that this release does not know.
+    """
+    try:
+        field = dict(values["field"])
+        field["encoding"] = EncodingConfig(**field["encoding"])
+        field["experts"] = HMoEConfig(**field["experts"])
+        gate = GateConfig.from_dict(values["gate"])
+        return replace(sizes, gate=gate, field=FieldConfig(**field)), int(values["images"])
+    except (KeyError, TypeError) as error:
+        raise ValueError(
+            f"the checkpoint's sizes are of another release of this package ({error})"
+        ) from None
+
+
+def stored_in(extra: Any, now: tuple[Sizes, int]) -> tuple[Sizes, int]:
+    """Sizes and number of images in the extra state of a model, or those that it has now.
+
+    Raises:
+        ValueError: there is a size in it that this release does not know.
+    """
+    values = extra.get(SIZES) if isinstance(extra, dict) else None
+    return now if values is None else from_stored(values, now[0])
+
+
+def sizes_in(checkpoint: Path) -> dict[str, Any] | None:
+    """What `to_store` gave the model of a checkpoint of nerfstudio; None in those without."""
+    state = torch.load(checkpoint, map_location="cpu", mmap=True, weights_only=True)["pipeline"]
+    extras = (value for key, value in state.items() if key.endswith("_extra_state"))
+    found = (extra.get(SIZES) for extra in extras if isinstance(extra, dict))
+    return next((values for values in found if values is not None), None)
+
+
+def sizes_to_resume(wanted: Sizes, stored: dict[str, Any]) -> Sizes:
+    """The sizes of a resumed run: those it was begun with.
+
+    Raises:
+        InputError: a size set by hand is another one.
+    """
+    try:
+        sizes, _ = from_stored(stored, wanted)
+    except ValueError as error:
+        raise InputError(str(error)) from None
+    filled = wanted
+    for path in left_open(wanted):
+        filled = with_size(filled, path, size_at(sizes, path))
+    if filled == sizes:
+        return sizes
+    differing = next(
+        path for path in _paths(sizes) if size_at(filled, path) != size_at(sizes, path)
+    )
+    raise InputError(
+        f"{CLI}.{differing.replace('_', '-')} is {size_at(filled, differing)}, and the run that is "
+        f"gone on with has {size_at(sizes, differing)}: leave it out, or begin a new run"
+    )
+
+
+def _paths(sizes: Sizes) -> list[str]:
+    """Dotted paths of everything that gate and field are built from."""
+
+    def below(values: dict[str, Any], path: str) -> list[str]:
+        found: list[str] = []
+        for name, value in values.items():
+            at = f"{path}.{name}"
+            found += below(value, at) if isinstance(value, dict) else [at]
+        return found
+
+    stored = to_store(sizes, 0)
+    return below(stored["gate"], "gate") + below(stored["field"], "field")
+
+
+BYTES_PER_VALUE = 16
+"""A float32 weight, its gradient, and the two moments of Adam."""
+LARGEST_IN_FIELD = {**LARGEST_SIZES, "log2_table": 28}
+"""Of the field, which no file has to hold."""
+
+
+def values_of(sizes: Sizes, images: int) -> int:
+    """Learned values of gate and field together.
+
+    Args:
+        images: training photographs, which have codes of their own.
+    """
+    with torch.device("meta"):
+        modules = Gate(sizes.gate), HMoEField(sizes.field, images)
+    return sum(p.numel() for module in modules for p in module.parameters())
+
+
+def state_bytes(sizes: Sizes, images: int) -> int:
+    """What training gate and field takes for weights and optimizer."""
+    return BYTES_PER_VALUE * values_of(sizes, images)
+
+
+def check(sizes: Sizes) -> None:
+    """Refuses what cannot be built, before anything of it is allocated.
+
+    Raises:
+        ValueError: in one line, what does not go together and what to change.
+    """
+    check_sizes(sizes.gate)
+    _check_field(sizes)
+    for name in ("candidates", "learn_candidates"):
+        if getattr(sizes, name) < 1:
+            raise ValueError(f"{CLI}.{name.replace('_', '-')} is {getattr(sizes, name)}, below 1")
+    if sizes.gate.scene_experts > sizes.field.experts.scene_experts:
+        raise ValueError(
+            f"the gate sends points to {sizes.gate.scene_experts} scene experts and the field has "
+            f"{sizes.field.experts.scene_experts}: set {CLI}.gate.scene-experts and "
+            f"{CLI}.field.experts.scene-experts alike, or only one of them"
+        )
+
+
+def check_memory(sizes: Sizes, images: int, memory: int) -> None:
+    """Refuses what cannot be trained, before anything of it is allocated.
+
+    Args:
+        images: training photographs.
+        memory: bytes of the device.
+    Raises:
+        ValueError: in one line, what is needed and what there is.
+    """
+    needed = state_bytes(sizes, images)
+    if needed > memory:
+        raise ValueError(
+            f"training gate and field of these sizes takes {needed / 1e9:.1f} GB for weights and "
+            f"optimizer alone, and the device has {memory / 1e9:.1f}: lower "
+            f"{CLI}.field.encoding.log2-table"
+        )
+
+
+def _check_field(sizes: Sizes) -> None:
+    encoding, experts = sizes.field.encoding, sizes.field.experts
+    parts = {**vars(encoding), **{k: getattr(experts, k) for k in ("width", "layers")}}
+    parts["scene_experts"] = experts.scene_experts
+    for name, largest in LARGEST_IN_FIELD.items():
+        if type(parts[name]) is not int or not 0 < parts[name] <= largest:
+            raise ValueError(f"the field's {name} is {parts[name]!r}, not in 1 to {largest}")
+    if encoding.kind == "hash":
+        if encoding.finest < encoding.coarsest:
+            raise ValueError(
+                f"the field's finest level has {encoding.finest} cells and its coarsest "
+                f"{encoding.coarsest}: raise {CLI}.field.encoding.finest"
+            )
+        if encoding.levels << encoding.log2_table >= 2**31:
+            raise ValueError(
+                f"{encoding.levels} levels of 2^{encoding.log2_table} entries are more than rows "
+                f"can be numbered: lower {CLI}.field.encoding.log2-table"
+            )
+
+
+def memory_of(device: torch.device | str, group: Path = Path("/sys/fs/cgroup")) -> int | None:
+    """Total bytes of a device's memory, used or free; on a CPU within a container's limit.
+
+    None where it is not known.
+    """
+    device = torch.device(device)
+    if device.type == "cuda":
+        return int(torch.cuda.get_device_properties(device).total_memory)
+    if device.type != "cpu":
+        return None
+    memory = int(psutil.virtual_memory().total)
+    try:
+        return min(memory, int((group / "memory.max").read_text()))
+    except (OSError, ValueError):  # no container, or one without a limit
+        return memory

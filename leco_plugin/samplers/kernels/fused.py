@@ -18,9 +18,8 @@ import torch
 from torch import Tensor, nn
 
 from leco_plugin.samplers import marching
+from leco_plugin.samplers.base import Snapshot
 from leco_plugin.samplers.cells.cache import CellCache
-from leco_plugin.samplers.changes import Snapshot
-from leco_plugin.samplers.edges import MOST_POWERS, powers_needed
 from leco_plugin.samplers.kernels import kernels_off
 from leco_plugin.samplers.kernels.gate_weights import (
     MOST_WIDTH,
@@ -31,7 +30,15 @@ from leco_plugin.samplers.kernels.gate_weights import (
     why_not,
 )
 from leco_plugin.samplers.marching import Samples
-from leco_plugin.samplers.rays import Candidates, March, Rays, TooManyCandidates, number
+from leco_plugin.samplers.rays import (
+    MOST_POWERS,
+    Candidates,
+    March,
+    Rays,
+    TooManyCandidates,
+    number,
+    powers_needed,
+)
 
 _log = logging.getLogger(__name__)
 

@@ -21,11 +21,16 @@ from leco_plugin.samplers.cells.cache import (
     FINE_OCCUPIED,
     CellCache,
 )
-from leco_plugin.samplers.edges import MAX_CANDIDATES_PER_RAY, growth_table, switch
 from leco_plugin.samplers.kernels.gate_kernel import gate_keeps, largest_of, map_position
 from leco_plugin.samplers.kernels.gate_weights import GateWeights
 from leco_plugin.samplers.marching import Samples
-from leco_plugin.samplers.rays import Candidates, check_longest
+from leco_plugin.samplers.rays import (
+    MAX_CANDIDATES_PER_RAY,
+    Candidates,
+    check_longest,
+    growth_table,
+    switch,
+)
 
 STEPS = 32
 """Candidates that a program works on at once: one coarse question for all of them, and the gate's
@@ -136,7 +141,7 @@ def cells_decide(
 
 @triton.jit
 def _edge(step, t_min, step_size, n_linear, t_switch, growth, CONED: tl.constexpr):
-    """`edges.candidate_edges`, with the powers of the growing step from a table."""
+    """`rays.candidate_edges`, with the powers of the growing step from a table."""
     linear = tl.fma(step, step_size, t_min)
     if CONED:
         power = tl.load(growth + tl.maximum(step - n_linear, 0.0).to(tl.int32))

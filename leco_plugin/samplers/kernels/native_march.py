@@ -10,9 +10,17 @@ from torch import Tensor
 
 from leco_plugin.models.compute import native
 from leco_plugin.samplers.cells.cache import CellCache
-from leco_plugin.samplers.edges import MOST_POWERS, growth_table, powers_needed, switch
 from leco_plugin.samplers.marching import OccupiedFn, Samples, join
-from leco_plugin.samplers.rays import Candidates, March, Rays, plan
+from leco_plugin.samplers.rays import (
+    MOST_POWERS,
+    Candidates,
+    March,
+    Rays,
+    growth_table,
+    plan,
+    powers_needed,
+    switch,
+)
 
 CANDIDATES_AT_ONCE = 1 << 22
 """That room is made for: 17 bytes each, of which only what is kept is touched."""

@@ -21,7 +21,7 @@ from torch import Tensor
 from leco_plugin.log import bar
 from leco_plugin.scenes.input_error import InputError
 from leco_plugin.scenes.whole_files import write_whole
-from leco_plugin.studio.internals import outputs_of
+from leco_plugin.studio.host_models import outputs_of
 
 
 class StoredPictures:

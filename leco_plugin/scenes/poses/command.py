@@ -20,8 +20,11 @@ from leco_plugin.scenes.poses.reconstruction import (
     Reconstructor,
     available_threads,
     load_pycolmap,
+    points_of,
+    poses_of,
+    transforms_of,
+    write_scene,
 )
-from leco_plugin.scenes.poses.scene_files import points_of, poses_of, transforms_of, write_scene
 from leco_plugin.scenes.whole_files import remove_parts, write_whole
 
 ASKED, REPORT = "colmap/asked.json", "poses.json"

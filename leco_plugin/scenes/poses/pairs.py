@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from leco_plugin.scenes.poses.exif import Exif
+from leco_plugin.scenes.poses.originals import Exif
 
 FEW = 40
 """Up to so many photographs are all compared: 780 pairs, two minutes of one core."""
@@ -48,7 +48,10 @@ def choose_pairs(names: Sequence[str], exifs: Sequence[Exif], places: NDArray[np
     known = np.isfinite(places[:, 0])
     spread = _spread(places[known, :2]) if known.any() else 0.0
     if known.mean() >= 0.5 and spread >= WIDE:
-        found = _near(places[:, :2], known) | _in_order(order or [], (1, 2))
+        numbers = known.nonzero()[0]
+        near = _near(places[numbers, :2], np.arange(NEIGHBOURS))
+        found = {(int(numbers[one]), int(numbers[other])) for one, other in near}
+        found |= _in_order(order or [], (1, 2))
         lost = [number for number in range(count) if not known[number]]
         around = _in_order(order, steps) if order else set(everything)
         found |= {pair for pair in around if {*pair} & {*lost}}
@@ -71,12 +74,7 @@ def choose_posed_pairs(poses: NDArray[np.float64]) -> Pairs:
         return Pairs(list(combinations(range(count), 2)), "all pairs")
     places, ahead = poses[:, :, 3], -poses[:, :, 2]
     ranks = np.array(sorted({*range(NEIGHBOURS // 2), *(2**power for power in range(3, 7))}))
-    found = set()
-    for row in range(count):
-        distances = ((places - places[row]) ** 2).sum(axis=1)
-        distances[(ahead @ ahead[row] <= 0.0) | (np.arange(count) == row)] = np.inf
-        order = np.argsort(distances, kind="stable")[ranks[ranks < count]]
-        found |= {(min(row, o), max(row, o)) for o in order.tolist() if distances[o] < np.inf}
+    found = _near(places, ranks, ahead)
     return Pairs(sorted(found), "near ones by pose that look the same way")
 
 
@@ -104,16 +102,23 @@ def _spread(places: NDArray[np.float64]) -> float:
     return float(np.sqrt(((places - np.median(places, axis=0)) ** 2).sum(axis=1).mean()))
 
 
-def _near(places: NDArray[np.float64], known: NDArray[np.bool_]) -> set[tuple[int, int]]:
-    """Pairs of each photograph whose place [N, 2] is known with its nearest ones."""
-    numbers = known.nonzero()[0]
-    there, most = places[numbers], min(NEIGHBOURS + 1, len(numbers))
+def _near(
+    places: NDArray[np.float64], ranks: NDArray[np.int64], ahead: NDArray[np.float64] | None = None
+) -> set[tuple[int, int]]:
+    """Pairs of each photograph with others near to its place [N, 2 or 3].
+
+    Args:
+        ranks: which of the others, ordered by distance.
+        ahead: [N, 3] where each looks; those that look another way are left out.
+    """
     found = set()
-    for row, number in enumerate(numbers):
-        distances = ((there - there[row]) ** 2).sum(axis=1)
-        for other in numbers[np.argsort(distances, kind="stable")[:most]]:
-            if other != number:
-                found.add((int(min(number, other)), int(max(number, other))))
+    for row in range(len(places)):
+        distances = ((places - places[row]) ** 2).sum(axis=1)
+        if ahead is not None:
+            distances[ahead @ ahead[row] <= 0.0] = np.inf
+        distances[row] = np.inf
+        order = np.argsort(distances, kind="stable")[ranks[ranks < len(places)]]
+        found |= {(min(row, o), max(row, o)) for o in order.tolist() if distances[o] < np.inf}
     return found
 
 

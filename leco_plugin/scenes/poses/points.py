@@ -21,19 +21,24 @@ from leco_plugin.log import bar
 from leco_plugin.scenes.bounds import FEWEST_POINTS
 from leco_plugin.scenes.input_error import InputError, require
 from leco_plugin.scenes.lenses import DISTORTIONS, Lens
-from leco_plugin.scenes.photograph_files import check_images, decode, header_of, is_turned
-from leco_plugin.scenes.photograph_masks import seen_pixels
+from leco_plugin.scenes.photograph_files import (
+    check_images,
+    decode,
+    header_of,
+    is_turned,
+    seen_pixels,
+)
 from leco_plugin.scenes.photographs import LecoPhotographsDataParserConfig, folder_of, read_points
-from leco_plugin.scenes.poses.exif import Exif
-from leco_plugin.scenes.poses.originals import FEWEST, Photograph
+from leco_plugin.scenes.poses.originals import FEWEST, Exif, Photograph
 from leco_plugin.scenes.poses.pairs import choose_posed_pairs
 from leco_plugin.scenes.poses.reconstruction import (
     MASKS,
     Reconstructor,
     available_threads,
     load_pycolmap,
+    points_of,
+    write_sparse_points,
 )
-from leco_plugin.scenes.poses.scene_files import points_of, write_sparse_points
 from leco_plugin.scenes.scene_file import SceneFile, scene_file_of
 from leco_plugin.scenes.whole_files import write_whole
 

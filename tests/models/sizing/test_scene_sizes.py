@@ -12,9 +12,9 @@ from hypothesis import strategies as st
 
 from leco_plugin.models.sizing import scene_sizes
 from leco_plugin.models.sizing.scene_sizes import choose, complete
-from leco_plugin.models.sizing.size_limits import BYTES_PER_VALUE, values_of
 from leco_plugin.models.sizing.sizes import (
     AUTOMATIC,
+    BYTES_PER_VALUE,
     CHOSEN,
     FIRST_TABLE,
     LARGE,
@@ -25,16 +25,16 @@ from leco_plugin.models.sizing.sizes import (
     learning_only,
     left_open,
     size_at,
+    values_of,
     with_size,
 )
 from leco_plugin.scenes.bounds import BoundsConfig
 from leco_plugin.scenes.city.cameras import CaptureConfig
 from leco_plugin.scenes.city.city import CityConfig
 from leco_plugin.scenes.city.folder import write_city
-from leco_plugin.scenes.detail import CAMERAS, SceneDetail, detail_of
 from leco_plugin.scenes.input_error import InputError
 from leco_plugin.scenes.photographs import LecoPhotographsDataParserConfig
-from leco_plugin.scenes.survey import points_in
+from leco_plugin.scenes.survey import CAMERAS, SceneDetail, detail_of, points_in
 
 IMAGES = 20
 TABLE = "field.encoding.log2_table"

@@ -17,13 +17,18 @@ from leco_plugin.models.gate import GateConfig
 from leco_plugin.models.hmoe import HMoEConfig
 from leco_plugin.models.leco import LecoModel
 from leco_plugin.models.leco_config import LecoModelConfig
-from leco_plugin.models.sizing.sizes import LARGE, PAPER, SMALL, Sizes, automatic, with_size
-from leco_plugin.models.sizing.stored_sizes import (
+from leco_plugin.models.sizing.sizes import (
+    LARGE,
+    PAPER,
+    SMALL,
+    Sizes,
+    automatic,
     from_stored,
     sizes_in,
     sizes_to_resume,
     stored_in,
     to_store,
+    with_size,
 )
 from leco_plugin.scenes.input_error import InputError
 

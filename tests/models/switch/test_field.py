@@ -7,8 +7,13 @@ import torch
 from torch import Tensor
 
 from leco_plugin.models.compute.dispatch import within_capacity
-from leco_plugin.models.switch.config import PAPER, SMALL, switch_sizes_for
-from leco_plugin.models.switch.field import SwitchField, SwitchFieldConfig
+from leco_plugin.models.switch.field import (
+    PAPER,
+    SMALL,
+    SwitchField,
+    SwitchFieldConfig,
+    switch_sizes_for,
+)
 
 TINY = SwitchFieldConfig(
     octaves=2, experts=3, width=8, layers=4, skip=2, color_width=8, appearance_dim=4

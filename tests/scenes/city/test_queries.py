@@ -5,9 +5,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from leco_plugin.scenes.city import queries as city_queries
-from leco_plugin.scenes.city.city import City, CityConfig
-from leco_plugin.scenes.city.queries import squared_to_triangles
+from leco_plugin.scenes.city import city as city_queries
+from leco_plugin.scenes.city.city import City, CityConfig, squared_to_triangles
 
 
 def distance_by_looking_at_all(city: City, points: np.ndarray) -> np.ndarray:

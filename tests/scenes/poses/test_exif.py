@@ -9,7 +9,7 @@ import pytest
 from PIL import Image
 from rendered_survey import FOCAL, ORIGIN, exif_of
 
-from leco_plugin.scenes.poses.exif import Exif, focal_length, read_exif
+from leco_plugin.scenes.poses.originals import Exif, focal_length, read_exif
 
 
 def read(exif: Image.Exif, size: tuple[int, int] = (320, 240)) -> Exif:

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from rendered_survey import grid
 
-from leco_plugin.scenes.poses.exif import Exif
+from leco_plugin.scenes.poses.originals import Exif
 from leco_plugin.scenes.poses.pairs import (
     ANCHORS,
     FEW,
