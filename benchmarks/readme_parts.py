@@ -58,9 +58,10 @@ def gain_table(results: Mapping[str, Any]) -> str:
     """Accuracy, rendering and queries of each contender, and a sentence: ours against the best host
     that samples in its own way."""
     lines = lines_of(results)
-    seconds, seeds = results["protocol"]["seconds"], {run["seed"] for run in results["runs"]}
-    scene, cores = results["scene"]["name"], results["machine"]["threads"]
-    head = f"`{scene}`, {seconds:g} s on {cores} CPU core{'s' * (cores > 1)}, {len(seeds)} seed{'s' * (len(seeds) > 1)}"
+    seconds, scene = results["protocol"]["seconds"], results["scene"]["name"]
+    cores, seeds = results["machine"]["threads"], len({run["seed"] for run in results["runs"]})
+    head = f"`{scene}`, {seconds:g} s on {cores} CPU core{'s' * (cores > 1)}"
+    head += f", {seeds} seed{'s' * (seeds > 1)}"
     rows = [
         [
             f"**{line.name}**" if line.learned else line.name,

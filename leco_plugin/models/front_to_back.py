@@ -36,6 +36,9 @@ thirtieth of a step of an 8-bit image."""
 FEWEST_AT_ONCE, MOST_LOOKS = 8, 16
 """Samples of a ray between two looks at its transmittance, and looks at the longest ray."""
 
+in_float32 = torch.autocast("cpu", enabled=False)
+"""What C computes in, whatever torch's products have: it is faster than torch in bfloat16."""
+
 MANY_RAYS = 2048
 """In a batch from which on a CPU torch is no slower for looking; see `docs/decisions.md`."""
 
@@ -116,6 +119,7 @@ def samples_of(starts: Tensor, counts: Tensor, most: int) -> Tensor:
     return (starts[:, None] + steps)[steps < counts[:, None]]
 
 
+@in_float32
 def suits_native(scene: Scene, rays: Rays, intervals: Intervals) -> bool:
     """Whether `front_to_back.c` serves."""
     field, gate, _, routing = scene
@@ -129,6 +133,7 @@ def suits_native(scene: Scene, rays: Rays, intervals: Intervals) -> bool:
     return known and gate.answers_natively(rays.origins) and native.suits(*rays[:4], *intervals[1:])
 
 
+@in_float32
 @torch.no_grad()
 def shade_natively(scene: Scene, rays: Rays, intervals: Intervals) -> tuple[Shaded, Intervals]:
     """`shade_front_to_back` in C; `evaluation/queries.py` counts what it asks."""
