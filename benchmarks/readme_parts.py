@@ -80,7 +80,7 @@ def gain_table(results: Mapping[str, Any]) -> str:
     )
     said = (
         f"Beside {rival.name}, the best host with its own sampling, `{OURS}` gains {lead:+.1f} dB, "
-        f"renders {times:.1f} times as fast, and asks networks {queries:.0f} times less."
+        f"renders {times:.1f} times as fast, with {queries:.0f} times fewer queries."
     )
     columns = f"{head} | PSNR | to render an image | queries a ray"
     return "\n".join([*table(columns, rows), "", said])

@@ -30,7 +30,7 @@ STEPS = 8
 """Frames from one photograph to the next."""
 FRAME = 140
 """Milliseconds."""
-COLOURS = 96
+COLOURS = 64
 """Of a frame, so that a page may hold the film."""
 CANDIDATES, BISECTIONS = 384, 6
 """Of a ray, and halvings of the way from one to the next."""
@@ -170,6 +170,6 @@ if __name__ == "__main__":
     parser.add_argument("run", type=Path, help="folder of a run, or of runs: the newest in it")
     parser.add_argument("--out", type=Path, required=True, help="a .gif")
     parser.add_argument("--first", type=int, default=0, help="number of the first photograph")
-    parser.add_argument("--photographs", type=int, default=4)
+    parser.add_argument("--photographs", type=int, default=3)
     asked = parser.parse_args()
     draw(occupancy_of(asked.run).parent, asked.out, asked.first, asked.photographs)

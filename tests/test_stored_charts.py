@@ -171,7 +171,7 @@ def test_the_gain_is_that_over_the_best_host_with_its_own_sampling() -> None:
     )
     assert said == (
         "Beside leco-nerfacto + own, the best host with its own sampling, `leco-occupancy` gains "
-        "+3.0 dB, renders 4.0 times as fast, and asks networks 4 times less."
+        "+3.0 dB, renders 4.0 times as fast, with 4 times fewer queries."
     )
 
 
