@@ -83,7 +83,7 @@ class LecoModelConfig(ModelConfig):
     """A mixture of scene experts only, for comparison: no empty-space expert, nothing to freeze."""
     precision: Precision | None = None
     """Of matrix products, while learning and wherever the gate is asked; None is what the device is
-    fastest in."""
+    fastest in. What C renders on a CPU is in float32."""
     near: float | None = None
     """Where rays begin, scene units; None is found from the data."""
     far: float | None = None

@@ -163,6 +163,18 @@ def test_c_does_not_hide_what_is_no_number() -> None:
     assert bool(shaded.accumulation.isnan().all())
 
 
+@needs_compiler
+@torch.no_grad()
+def test_c_renders_in_float32_whatever_torch_multiplies_in() -> None:
+    scene, rays = scene_of(3.0), some_rays(40)
+    given = scene._replace(routing=Routing(0.2, False)), rays, kept_along(rays)
+    exact, _ = shade_front_to_back(*given)
+    with torch.autocast("cpu", dtype=torch.bfloat16):
+        shown, _ = shade_front_to_back(*given)
+    assert suits_native(*given)
+    assert torch.equal(shown.rgb, exact.rgb) and torch.equal(shown.logits, exact.logits)
+
+
 def test_samples_of_some_rays_are_counted_out() -> None:
     found = samples_of(torch.tensor([3, 10, 20]), torch.tensor([2, 0, 3]), 4)
     assert found.tolist() == [3, 4, 20, 21, 22]
