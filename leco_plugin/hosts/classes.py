@@ -19,6 +19,7 @@ from nerfstudio.models.base_model import Model, ModelConfig
 from torch import Tensor, nn
 
 from leco_plugin.hosts.along import Along
+from leco_plugin.hosts.appearance import show_from
 from leco_plugin.hosts.guide import Guide
 from leco_plugin.hosts.guided_start import GuidedStart, OccupancyConfig
 from leco_plugin.hosts.host_watch import HostWatch, set_first_density
@@ -38,6 +39,12 @@ else:
 class Host(_Model):
     """Stands before any nerfstudio model among the bases of a class. Its images can be drawn and
     scored without a network."""
+
+    def forward(self, ray_bundle: Any) -> dict[str, Any]:
+        """As the model's; its codes are those of the photographs near the view."""
+        show_from(self, None if self.training else ray_bundle.origins)
+        outputs: dict[str, Any] = super().forward(ray_bundle)
+        return outputs
 
     def get_outputs_for_camera_ray_bundle(self, *args: Any, **kwargs: Any) -> dict[str, Tensor]:
         """Images whose counts are floating-point numbers.

@@ -26,6 +26,31 @@ APPEARANCE_SCALE = 0.1
 down, codes follow slowly, and the mean code of a rendering is one that the field has met."""
 
 
+NEARBY = 1.5
+"""Of the median distance from a photograph to the next: how far its light reaches."""
+
+
+def codes_nearby(codes: Tensor, places: Tensor, origins: Tensor) -> Tensor:
+    """Codes of views from those of the photographs nearby: exposure drifts along a flight.
+
+    Weights fall with the square of the distance, as a bell; far from all photographs the nearest
+    one counts.
+
+    Args:
+        codes: [N, D] of photographs.
+        places: [N, 3] where they were taken.
+        origins: [R, 3] of rays.
+    Returns:
+        [R, D].
+    """
+    views, of_view = origins.unique(dim=0, return_inverse=True)
+    between = torch.cdist(places, places).fill_diagonal_(torch.inf)
+    spacing = between.amin(dim=1).nanmedian() if len(places) > 1 else places.new_ones(())
+    reach = NEARBY * spacing.clamp(min=1e-6)
+    weights = torch.softmax(-(torch.cdist(views, places) / reach).square(), dim=1)
+    return (weights @ codes).index_select(0, of_view)
+
+
 class ColorHead(nn.Module):
     """One hidden layer over features, encoded direction and the appearance code of an image.
 
@@ -38,6 +63,8 @@ class ColorHead(nn.Module):
     """
 
     opponent: Tensor
+    places: Tensor
+    """[num_images, 3] where the photographs were taken; empty where that is unknown."""
 
     def __init__(
         self, width: int, hidden: int, direction_octaves: int, appearance_dim: int, num_images: int
@@ -54,6 +81,7 @@ class ColorHead(nn.Module):
         )
         self.out = nn.Linear(hidden, 3)
         self.register_buffer("opponent", OPPONENT.clone(), persistent=False)
+        self.register_buffer("places", torch.empty(0, 3), persistent=False)
 
     def forward(
         self,
@@ -61,6 +89,7 @@ class ColorHead(nn.Module):
         ray_indices: Tensor,
         directions: Tensor,
         image_indices: Tensor | None,
+        origins: Tensor | None = None,
     ) -> Tensor:
         """Colour of samples, seen along their rays.
 
@@ -68,30 +97,36 @@ class ColorHead(nn.Module):
             features: [M, width].
             ray_indices: [M] int64, the ray of each sample.
             directions: [R, 3] unit vectors.
-            image_indices: [R] int64 of the training image, or None for the mean appearance.
+            image_indices: [R] int64 of the training image, or None for that of the photographs
+                nearby.
+            origins: [R, 3] of the rays; without, None above is the mean of all photographs.
         Returns:
             [M, 3] float32 in [0, 1].
         """
         count = len(features)
-        of_ray = self.hidden_of_rays(directions, image_indices).to(features.dtype)
+        of_ray = self.hidden_of_rays(directions, image_indices, origins).to(features.dtype)
         hidden = self.of_features(pad_to_steady_size(features)) + of_ray.index_select(
             0, pad_to_steady_size(ray_indices)
         )
         opponent = self.out(torch.relu(hidden))[:count].float()
         return torch.sigmoid(opponent @ self.opponent)
 
-    def hidden_of_rays(self, directions: Tensor, image_indices: Tensor | None) -> Tensor:
+    def hidden_of_rays(
+        self, directions: Tensor, image_indices: Tensor | None, origins: Tensor | None
+    ) -> Tensor:
         """What direction and code of rays add to the hidden layer: [R, hidden].
 
         The first layer of a concatenation is the sum of two, one of which is the same all along.
         """
         of_rays = [self.direction_encoding(directions)]
         if self.appearance is not None:
-            code = (
-                self.appearance(image_indices)
-                if image_indices is not None
-                else self.appearance.weight.mean(dim=0).expand(len(directions), -1)
-            )
+            codes = self.appearance.weight
+            if image_indices is not None:
+                code = self.appearance(image_indices)
+            elif origins is not None and len(self.places) == len(codes):
+                code = codes_nearby(codes, self.places, origins)
+            else:
+                code = codes.mean(dim=0).expand(len(directions), -1)
             of_rays.append(APPEARANCE_SCALE * code)
         return self.of_ray(torch.cat(of_rays, dim=-1))
 

@@ -161,7 +161,9 @@ def shade_natively(scene: Scene, rays: Rays, intervals: Intervals) -> tuple[Shad
         {
             "origins": rays.origins.contiguous(),
             "directions": rays.directions.contiguous(),
-            "of_rays": color.hidden_of_rays(rays.directions, rays.images).contiguous(),
+            "of_rays": color.hidden_of_rays(
+                rays.directions, rays.images, rays.origins
+            ).contiguous(),
             "ends": backdrop_ends(rays).contiguous(),
             "starts": starts,
             "counts": counts,

@@ -32,6 +32,7 @@ from leco_plugin.models.sizing.scene_sizes import complete
 from leco_plugin.scenes.input_error import state_of_this_version
 from leco_plugin.scenes.learning_data import LearningData
 from leco_plugin.scenes.pixels.known_distances import DISTANCE
+from leco_plugin.scenes.survey import places_of
 from leco_plugin.studio.checkpoints import (
     allow_checkpoint_globals,
     evaluate_whole_checkpoints,
@@ -72,7 +73,8 @@ class LecoModel(DrawnInViewer, Model):
         below = losses.empty_below if losses.form == "logit" else None
         precision = config.precision or fast_precision(device)
         routing = Routing(below, config.homogeneous)
-        self.mixture = Mixture(sizes, self.num_train_data, precision, routing)
+        places = places_of(metadata)
+        self.mixture = Mixture(sizes, self.num_train_data, precision, routing, places)
         self._keep_sizes()
         self.leco_view = OccupancyView()
         # nerfstudio's name for it: photographs with alpha are blended over black

@@ -48,6 +48,7 @@ class Mixture(nn.Module):
     Args:
         sizes: of gate, field and marches.
         num_images: training images, each with an appearance code.
+        places: [num_images, 3] where they were taken, if that is known.
         precision: of matrix products; the gate decides otherwise in another one than it was
             taught in, so that a checkpoint restores it.
         routing: which expert each point is sent to.
@@ -67,9 +68,15 @@ class Mixture(nn.Module):
     cones: Tensor
 
     def __init__(
-        self, sizes: Sizes, num_images: int, precision: Precision, routing: Routing
+        self,
+        sizes: Sizes,
+        num_images: int,
+        precision: Precision,
+        routing: Routing,
+        places: Tensor | None = None,
     ) -> None:
         super().__init__()
+        self.places = torch.empty(0, 3) if places is None else places
         self.precision, self.routing = precision, routing
         self._build(sizes, num_images)
         self.region = Region()
@@ -86,6 +93,7 @@ class Mixture(nn.Module):
         self.sizes, self.num_images = sizes, num_images
         self.gate = Gate(sizes.gate)
         self.field = HMoEField(sizes.field, num_images)
+        self.field.color.places = self.places
 
     @property
     def device(self) -> torch.device:

@@ -285,7 +285,9 @@ def composite(
     """Colours of rays [R, 3], without background; only visible samples are coloured."""
     visible = (weights.detach() > VISIBLE).nonzero()[:, 0]
     rays_seen = intervals.ray_indices.index_select(0, visible)
-    colors = color(select_rows(features, visible), rays_seen, rays.directions, rays.images)
+    colors = color(
+        select_rows(features, visible), rays_seen, rays.directions, rays.images, rays.origins
+    )
     return accumulate_along_rays(
         select_rows(weights, visible), colors, rays_seen, len(rays.origins)
     )

@@ -40,7 +40,7 @@ from leco_plugin.samplers.grid import OccupancyGridEstimator
 from leco_plugin.scenes.bounds import SceneBounds
 from leco_plugin.scenes.input_error import InputError
 from leco_plugin.scenes.learning_data import LearningData
-from leco_plugin.scenes.survey import announce
+from leco_plugin.scenes.survey import announce, places_of
 from leco_plugin.space import Space
 from leco_plugin.studio.checkpoints import allow_checkpoint_globals, evaluate_whole_checkpoints
 
@@ -88,6 +88,8 @@ class SwitchNerfModel(Model):
         keep_freed_memory(device)
         self.precision = fast_precision(device)
         self.field = SwitchField(self.config.sizes.field, self.num_train_data)
+        if (places := places_of(self.kwargs.get("metadata") or {})) is not None:
+            self.field.color.places = places
         self.region = Region()
         self.register_buffer("step", torch.tensor(0.03))
         self.register_buffer("cone", torch.tensor(0.0))

@@ -111,6 +111,12 @@ def sparse_points(dataset: Any) -> Tensor | None:
     return points_in(getattr(dataset, "metadata", {}) or {})
 
 
+def places_of(metadata: dict[str, Any]) -> Tensor | None:
+    """[N, 3] scene units, where the photographs of a dataset were taken, if that is known."""
+    cameras = metadata.get(CAMERAS)
+    return None if cameras is None else cameras.camera_to_worlds[:, :3, 3].float()
+
+
 def points_in(metadata: dict[str, Any]) -> Tensor | None:
     """Sparse points [P, 3] in model coordinates in what a reader says of a dataset, or None."""
     points = metadata.get(POINTS)

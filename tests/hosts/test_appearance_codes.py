@@ -2,18 +2,23 @@
 
 from __future__ import annotations
 
+from contextlib import suppress
 from typing import Any
 
 import pytest
 import torch
+from nerfstudio.cameras.cameras import Cameras
 from nerfstudio.field_components.embedding import Embedding
 from nerfstudio.models.instant_ngp import InstantNGPModelConfig, NGPModel
 from nerfstudio.models.nerfacto import NerfactoModelConfig
 from small_hosts import what_a_model_gets
 from torch import nn
 
-from leco_plugin.hosts.guided import GuidedModelConfig, SmallCodes
+from leco_plugin.hosts.appearance import SmallCodes
+from leco_plugin.hosts.guided import GuidedModelConfig
 from leco_plugin.hosts.guided_start import OccupancyConfig
+from leco_plugin.models.field import codes_nearby
+from leco_plugin.scenes.survey import CAMERAS
 from leco_plugin.swap import registered, swapped_config
 
 NGP = {"log2_hashmap_size": 8, "max_res": 64, "grid_resolution": 16, "grid_levels": 2}
@@ -25,9 +30,9 @@ HOSTS = {
 }
 
 
-def built(host: Any, codes: Any = "small", sampler: str = "own") -> Any:
+def built(host: Any, codes: Any = "small", sampler: str = "own", **given: Any) -> Any:
     config = GuidedModelConfig(host=host, occupancy=OccupancyConfig(sampler=sampler), codes=codes)
-    return config.setup(**what_a_model_gets())
+    return config.setup(**what_a_model_gets() | given)
 
 
 @pytest.mark.parametrize("name", HOSTS)
@@ -52,6 +57,27 @@ def test_codes_part_slowly_and_their_mean_is_scaled_alike() -> None:
     nn.init.normal_(small.embedding.weight, mean=3.0)
     codes, raw = small(torch.arange(4)), small.embedding.weight
     assert torch.allclose(codes, 0.1 * raw) and torch.allclose(small.mean(), codes.mean(dim=0))
+
+
+@pytest.mark.parametrize("name", HOSTS)
+@torch.no_grad()
+def test_a_view_is_shown_in_the_light_of_the_photographs_nearby(name: str) -> None:
+    cameras = Cameras(torch.eye(4)[:3].repeat(2, 1, 1), 10.0, 10.0, 2.0, 2.0)
+    cameras.camera_to_worlds[1, 0, 3] = 9.0
+    host = built(HOSTS[name], metadata={CAMERAS: cameras}).eval()
+    codes = host.field.embedding_appearance
+    nn.init.normal_(codes.embedding.weight, std=30.0)
+    table = codes.embedding.weight
+    for one in (0, 1):
+        host.get_outputs_for_camera(cameras[one : one + 1])
+        expected = codes_nearby(table, cameras.camera_to_worlds[:, :, 3], codes.origin)[0]
+        assert torch.equal(codes.origin, cameras.camera_to_worlds[one : one + 1, :, 3])
+        torch.testing.assert_close(codes.mean(), 0.1 * expected)
+        assert not torch.allclose(codes.mean(), 0.1 * table.mean(dim=0), atol=0.1)
+    assert host.field.use_average_appearance_embedding  # or nobody would ask for `mean`
+    with suppress(AssertionError):  # nerfstudio's, of a field that is asked nothing
+        host.train()(cameras[0].generate_rays(0).flatten()[:4])
+    assert codes.origin is None  # each ray of training has a photograph
 
 
 def test_a_checkpoint_has_the_names_of_nerfstudio() -> None:

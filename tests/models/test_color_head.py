@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 import torch
 
-from leco_plugin.models.field import APPEARANCE_SCALE, ColorHead
+from leco_plugin.models.field import APPEARANCE_SCALE, ColorHead, codes_nearby
 
 
 def inputs(samples: int = 20, rays: int = 5) -> tuple[torch.Tensor, ...]:
@@ -49,3 +49,39 @@ def test_the_image_decides_the_colour_and_rendering_takes_the_mean_code() -> Non
     torch.testing.assert_close(
         color(features, ray_indices, directions, torch.zeros(5, dtype=torch.int64)), mean
     )
+
+
+def test_a_view_takes_the_codes_of_the_photographs_nearby() -> None:
+    places = torch.tensor([[0.0, 0, 0], [1, 0, 0], [2, 0, 0], [3, 0, 0]], dtype=torch.float32)
+    codes = torch.eye(4)
+    at, between, away = codes_nearby(
+        codes, places, torch.tensor([[0.0, 0, 0], [1.5, 0, 0], [90, 0, 0]])
+    )
+    assert at.argmax() == 0 and torch.allclose(
+        at, torch.softmax(-((torch.arange(4) / 1.5) ** 2), 0)
+    )
+    torch.testing.assert_close(between, between.flip(0))
+    torch.testing.assert_close(away, codes[3])
+    moved = codes_nearby(codes, 100.0 * places, torch.tensor([[150.0, 0, 0]]))[0]
+    torch.testing.assert_close(moved, between)  # whatever the units are
+
+
+@pytest.mark.parametrize("count", [1, 3])
+def test_photographs_from_one_place_count_alike(count: int) -> None:
+    codes = torch.randn(count, 4)
+    found = codes_nearby(codes, torch.ones(count, 3), torch.randn(2, 3))
+    torch.testing.assert_close(found, codes.mean(dim=0).expand(2, -1))
+
+
+def test_rays_of_one_batch_have_the_codes_of_their_own_places() -> None:
+    color, (features, ray_indices, directions) = head(), inputs()
+    color.places = 5.0 * torch.eye(3)
+    origins = color.places[[2, 0, 1, 1, 2]]
+    found = color(features, ray_indices, directions, None, origins)
+    for ray in range(5):
+        mine = ray_indices == ray
+        alone = color(
+            features[mine], ray_indices[mine], directions, None, origins[ray].repeat(5, 1)
+        )
+        torch.testing.assert_close(found[mine], alone)
+    assert not torch.allclose(found, color(features, ray_indices, directions, None), atol=1e-3)
