@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
@@ -146,7 +147,8 @@ def _export_in_words(out: Path, facts: dict[str, Any], frame: str | None) -> lis
     if "geographic_origin" in facts:
         lines.append(f"its origin on earth: {facts['geographic_origin']}")
     if splats:
-        lines.append(f"start from it with: ns-train splatfacto --data {out} leco-photographs")
+        data = shlex.quote(str(out))
+        lines.append(f"start from it with: ns-train splatfacto --data {data} leco-photographs")
     if frame != facts["frame"] == "run":
         lines.append("the file does not say how its run moved the data: learn it anew to know")
     return lines

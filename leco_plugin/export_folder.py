@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import shlex
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -74,7 +75,7 @@ def export_folder(
             lambda: exported("splat-init", splats.name),
             lambda facts: (
                 f"{facts['points']:,} points in splats.ply, to start splats from: "
-                f"ns-train splatfacto --data {splats} leco-photographs"
+                f"ns-train splatfacto --data {shlex.quote(str(splats))} leco-photographs"
             ),
         ),
         part(
