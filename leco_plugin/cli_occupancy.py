@@ -37,10 +37,9 @@ def inspect(
     check_json(json)
     check_picture("--picture", picture)
     check_picture("--history", history, moving=True)
-    from leco_plugin.evaluation.inspection import describe, doubts
+    from leco_plugin.evaluation.inspection import describe, doubts, scene_of
     from leco_plugin.learning.quality import views_in_words
     from leco_plugin.occupancy import Occupancy
-    from leco_plugin.scenes.coloured_points import description_in, description_of_run
 
     file = occupancy_of(file)
     occupancy = Occupancy.load(file)
@@ -59,9 +58,7 @@ def inspect(
         if isinstance(value, (int, float, str)) and name not in ("params", "threshold"):
             print(f"{name.replace('_', ' ')}: {_said(value)}")
     if picture is not None:
-        _draw(
-            occupancy, picture, description_of_run(file) if data is None else description_in(data)
-        )
+        _draw(occupancy, picture, scene_of(occupancy, file, data))
     if history is not None:
         from leco_plugin.evaluation.history_picture import draw_history
 
