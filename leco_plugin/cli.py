@@ -5,6 +5,7 @@ Each subcommand imports what it needs inside, so that help comes at once.
 
 from __future__ import annotations
 
+import shlex
 import sys
 import warnings
 from collections.abc import Callable, Mapping, Sequence
@@ -76,11 +77,11 @@ def city(
     print(f"{folder}: {images} pictures, {test_images} of them for testing")
     if images - test_images < FEW_PICTURES:
         print("those are few: with --aerial-per-block 40, PSNR differs less from seed to seed")
-    command = f"ns-train leco-occupancy --data {folder}"
+    command = _training(folder)
     if format == "mega-nerf":  # which has no sparse points to say where the ground is
         roof = City(config).roof
         levels = f"--ray-altitude-range {-1.3 * roof:.0f} {0.5 * roof:.0f}"
-        command = f"ns-train leco-occupancy mega-nerf --data {folder} {levels}"
+        command = f"{_training(folder, 'mega-nerf')} {levels}"
     print(f"train on it with: {command}")
     write_json(json, facts)
 
@@ -112,7 +113,7 @@ def poses(
 
     report = make_scene(photos, out, lens, size, threads)
     print("\n".join(summary(report)))
-    print(f"train on it with: ns-train leco-occupancy --data {out}")
+    print(f"train on it with: {_training(out)}")
     write_json(json, report)
 
 
@@ -140,7 +141,7 @@ def points(
     report = find_points(data, size, threads)
     if report["done"]:
         print(f"{report['points']} points of {report['photographs']} photographs: {report['file']}")
-        print(f"train on it with: ns-train leco-occupancy --data {data}")
+        print(f"train on it with: {_training(data)}")
     else:
         print(f"{data} has {report['points']} sparse points already: nothing is done")
     write_json(json, report)
@@ -214,6 +215,11 @@ def demo(
     print("\n".join(summary(report)))
     print(f"see report.json, chart.png and picture.png in {out}")
     write_json(json, report)
+
+
+def _training(data: Path, *reader: str) -> str:
+    """The command that trains on a scene."""
+    return shlex.join(["ns-train", "leco-occupancy", *reader, "--data", str(data)])
 
 
 COMMANDS: dict[str, Callable[..., None]] = {

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
@@ -36,10 +37,9 @@ def inspect(
     check_json(json)
     check_picture("--picture", picture)
     check_picture("--history", history, moving=True)
-    from leco_plugin.evaluation.inspection import describe, doubts
+    from leco_plugin.evaluation.inspection import describe, doubts, scene_of
     from leco_plugin.learning.quality import views_in_words
     from leco_plugin.occupancy import Occupancy
-    from leco_plugin.scenes.coloured_points import description_in, description_of_run
 
     file = occupancy_of(file)
     occupancy = Occupancy.load(file)
@@ -58,9 +58,7 @@ def inspect(
         if isinstance(value, (int, float, str)) and name not in ("params", "threshold"):
             print(f"{name.replace('_', ' ')}: {_said(value)}")
     if picture is not None:
-        _draw(
-            occupancy, picture, description_of_run(file) if data is None else description_in(data)
-        )
+        _draw(occupancy, picture, scene_of(occupancy, file, data))
     if history is not None:
         from leco_plugin.evaluation.history_picture import draw_history
 
@@ -146,7 +144,8 @@ def _export_in_words(out: Path, facts: dict[str, Any], frame: str | None) -> lis
     if "geographic_origin" in facts:
         lines.append(f"its origin on earth: {facts['geographic_origin']}")
     if splats:
-        lines.append(f"start from it with: ns-train splatfacto --data {out} leco-photographs")
+        data = shlex.quote(str(out))
+        lines.append(f"start from it with: ns-train splatfacto --data {data} leco-photographs")
     if frame != facts["frame"] == "run":
         lines.append("the file does not say how its run moved the data: learn it anew to know")
     return lines

@@ -17,7 +17,7 @@ from torch import Tensor
 from torch.nn.functional import max_pool3d
 
 from leco_plugin.cli_reports import check_place
-from leco_plugin.evaluation.inspection import numbers, query, to_the_data, whole_box
+from leco_plugin.evaluation.inspection import numbers, query, scene_of, to_the_data, whole_box
 from leco_plugin.export_surface import (
     CELLS,
     MOST_CELLS,
@@ -36,7 +36,7 @@ from leco_plugin.export_surface import (
 from leco_plugin.log import bar
 from leco_plugin.occupancy import Occupancy
 from leco_plugin.samplers.grid import OccupancyGridEstimator
-from leco_plugin.scenes.coloured_points import description_in, description_of_run, georeference
+from leco_plugin.scenes.coloured_points import georeference
 from leco_plugin.scenes.frames import moved
 from leco_plugin.scenes.whole_files import write_whole
 
@@ -94,7 +94,7 @@ def export(
     elif format == "npz":
         facts = _export_volume(occupancy, out, resolution, back)
     else:
-        description = description_of_run(file) if data is None else description_in(data)
+        description = scene_of(occupancy, file, data)
         if format == "splat-init" and description is None:
             raise ValueError("a start for splats copies transforms.json: give --data SCENE")
         surface = surface or surface_of(occupancy, resolution)

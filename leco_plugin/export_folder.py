@@ -3,18 +3,18 @@
 from __future__ import annotations
 
 import functools
+import shlex
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NamedTuple
 
 from leco_plugin.cli_reports import check_place
-from leco_plugin.evaluation.inspection import describe, doubts
+from leco_plugin.evaluation.inspection import describe, doubts, scene_of
 from leco_plugin.evaluation.occupancy_page import write_page
 from leco_plugin.evaluation.occupancy_picture import draw
 from leco_plugin.evaluation.scene_colours import scene_colours
 from leco_plugin.export import Format, default_resolution, export, surface_of
 from leco_plugin.occupancy import Occupancy
-from leco_plugin.scenes.coloured_points import description_in, description_of_run
 
 Facts = dict[str, Any]
 
@@ -49,7 +49,7 @@ def export_folder(
         raise ValueError(f"--out {folder} is a file; without --format give a folder")
     check_place("--out", folder / "kept.ply")
     occupancy = Occupancy.load(file)
-    description = description_of_run(file) if data is None else description_in(data)
+    description = scene_of(occupancy, file, data)
     folder.mkdir(parents=True, exist_ok=True)
 
     cells = default_resolution(occupancy, "ply") if resolution is None else resolution
@@ -74,7 +74,7 @@ def export_folder(
             lambda: exported("splat-init", splats.name),
             lambda facts: (
                 f"{facts['points']:,} points in splats.ply, to start splats from: "
-                f"ns-train splatfacto --data {splats} leco-photographs"
+                f"ns-train splatfacto --data {shlex.quote(str(splats))} leco-photographs"
             ),
         ),
         part(

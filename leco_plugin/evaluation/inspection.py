@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import torch
@@ -17,7 +18,9 @@ from leco_plugin.learning.quality import (
     doubts_of_occupancy,
 )
 from leco_plugin.occupancy import SEEN_CELLS, Occupancy
-from leco_plugin.scenes.frames import inverse
+from leco_plugin.scenes.coloured_points import camera_places, description_in, description_of_run
+from leco_plugin.scenes.frames import found_again, inverse, moved
+from leco_plugin.scenes.input_error import InputError
 
 POINTS_AT_ONCE = 1 << 16
 
@@ -110,6 +113,38 @@ def cameras_of(occupancy: Occupancy) -> Tensor:
     listed = occupancy.report.get("cameras")
     rows = [numbers(row) for row in listed] if isinstance(listed, list) else []
     return torch.tensor([row for row in rows if len(row) == 3]).reshape(-1, 3)
+
+
+def scene_of(occupancy: Occupancy, file: Path, data: Path | None) -> Path | None:
+    """The transforms.json of the scene that an occupancy was learned on; None where it is unknown.
+
+    Args:
+        file: of the occupancy, perhaps in the folder of its run.
+        data: the scene; None is that of the run, unless it has other cameras by now.
+    Raises:
+        InputError: `data` is no scene, or fewer than half of the occupancy's cameras are in it.
+    """
+    description = description_of_run(file) if data is None else description_in(data)
+    known, back = cameras_of(occupancy), to_the_data(occupancy)
+    if (
+        description is None
+        or back is None
+        or not len(known)
+        or "data_frame" not in occupancy.report
+    ):
+        return description
+    here = moved(torch.from_numpy(camera_places(description)), inverse(back))
+    found = 0
+    if len(here):
+        found = int(found_again(known, here, float(occupancy.space.half_extent)).sum())
+    if 2 * found >= len(known):
+        return description
+    if data is None:
+        return None
+    raise InputError(
+        f"--data {data}: {found} of the {len(known)} cameras that the occupancy names are in it; "
+        "give the scene that it was learned on"
+    )
 
 
 def to_the_data(occupancy: Occupancy) -> Tensor | None:

@@ -39,20 +39,43 @@ class CloudFile(NamedTuple):
 
 
 def description_of_run(file: Path) -> Path | None:
-    """The transforms.json of the run in whose folder a file lies; None where there is no run, or
-    its data are no scene in nerfstudio's format."""
-    import yaml
+    """The transforms.json of the run in whose folder a file lies, also of one that was moved with
+    it; None where there is no run, or its data are no scene in nerfstudio's format."""
+    from leco_plugin.studio.checkpoints import found_around
 
     config = file.resolve().parent / CONFIG
-    if not config.is_file():
+    data = _data_named_in(config)
+    if data is None:
         return None
+    found = _file_in(data)
+    if not found.is_file():
+        there = found_around(data, config.parent)
+        found = found if there is None else _file_in(there)
+    return found if found.is_file() else None
+
+
+def _data_named_in(config: Path) -> Path | None:
+    """The data that a run's config.yml names; None where it cannot be read.
+
+    Nothing in it is executed, and classes that this version lacks do not matter.
+    """
+    import yaml
+
+    class Plain(yaml.SafeLoader):
+        """Takes every object for its attributes, and a path for its parts."""
+
+    def attributes(loader: Any, tag: str, node: yaml.Node) -> Any:
+        if isinstance(node, yaml.MappingNode):
+            return loader.construct_mapping(node, deep=True)
+        is_list = isinstance(node, yaml.SequenceNode)
+        return loader.construct_sequence(node, deep=True) if is_list else None
+
+    Plain.add_multi_constructor("tag:yaml.org,2002:python/", attributes)
     try:
-        read = yaml.load(config.read_text(), Loader=yaml.Loader)  # as ns-eval reads it
-        data = read.pipeline.datamanager.data or read.pipeline.datamanager.dataparser.data
-    except (yaml.YAMLError, ImportError, AttributeError, TypeError, ValueError):
+        manager = yaml.load(config.read_text(), Loader=Plain)["pipeline"]["datamanager"]
+        return Path(*(manager.get("data") or manager["dataparser"]["data"]))
+    except (OSError, yaml.YAMLError, AttributeError, KeyError, TypeError, ValueError):
         return None
-    found = _file_in(data) if isinstance(data, Path) else None
-    return found if found is not None and found.is_file() else None
 
 
 def description_in(data: Path) -> Path:
@@ -116,6 +139,16 @@ def colours_near(known: ColouredPoints, positions: NDArray[np.float64]) -> NDArr
     _, numbers = KDTree(known.positions).query(positions, k=count)
     found = known.colours[np.asarray(numbers).reshape(len(positions), count)]
     return np.asarray(found.mean(axis=1).round().astype(np.uint8))
+
+
+def camera_places(description: Path) -> NDArray[np.float64]:
+    """Places [C, 3] of the cameras in a transforms.json; [0, 3] where they are no poses."""
+    try:
+        frames = load_json(description)["frames"]
+        poses = np.array([frame["transform_matrix"] for frame in frames], dtype=np.float64)
+        return poses.reshape(-1, 4, 4)[:, :3, 3]
+    except (KeyError, TypeError, ValueError):
+        return np.zeros((0, 3))
 
 
 def georeference(description: Path) -> dict[str, Any]:

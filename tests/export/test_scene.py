@@ -17,6 +17,7 @@ from ball_occupancy import CENTRE, RADIUS, ball
 from leco_plugin.export import export
 from leco_plugin.export_folder import export_folder, in_words
 from leco_plugin.occupancy import Occupancy
+from leco_plugin.scenes.coloured_points import description_of_run
 from leco_plugin.scenes.whole_files import write_points
 
 ORIGIN = {"latitude": 42.0, "longitude": -76.0, "altitude": 0.0, "axes": "east, north, up"}
@@ -55,7 +56,11 @@ def scene(tmp_path: Path) -> Path:
     meta: dict[str, Any] = {"ply_file_path": "points.ply", "fl_x": 10.0}
     meta |= {"geographic_origin": ORIGIN, "metres_per_unit": 1.0}
     meta |= {"train_filenames": ["images/a.png"]}
-    meta["frames"] = [{"file_path": "images/a.png", "transform_matrix": np.eye(4).tolist()}]
+    meta["frames"] = []
+    for name, place in zip("abc", np.array(ball().report["cameras"])):
+        pose = np.eye(4)
+        pose[:3, 3] = 2.0 * place
+        meta["frames"] += [{"file_path": f"images/{name}.png", "transform_matrix": pose.tolist()}]
     (folder / "transforms.json").write_text(json.dumps(meta))
     return folder
 
@@ -162,3 +167,43 @@ def test_a_part_that_cannot_be_made_is_one_line_and_the_others_are_written(
         export_folder(file, file, 32)
     with pytest.raises(ValueError, match="no transforms"):
         export_folder(file, tmp_path / "all", 32, tmp_path)
+
+
+def run_config(file: Path, data: Path) -> None:
+    """Writes the config of a run beside its occupancy, as another version of the package did."""
+    parts = "".join(f"    - {part}\n" for part in data.parts[1:])
+    file.with_name("config.yml").write_text(
+        "!!python/object:leco_plugin.trainer_of_old.Config\n"
+        "optimizer: !!python/object/apply:os.mkdir\n- executed\n"
+        "pipeline: !!python/object:leco_plugin.pipeline_of_old.Config\n"
+        "  datamanager: !!python/object:leco_plugin.manager_of_old.Config\n"
+        f"    data: !!python/object/apply:pathlib.PosixPath\n    - /\n{parts}"
+    )
+
+
+def test_the_scene_of_a_run_is_known_where_it_lay_or_was_moved_to(
+    file: Path, scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    run_config(file, scene)
+    assert description_of_run(file) == scene / "transforms.json"
+    assert not (tmp_path / "executed").exists()
+    run_config(file, Path("/gone/before") / scene.name)
+    assert description_of_run(file) == scene / "transforms.json"
+    run_config(file, Path("/gone/before/other"))
+    assert description_of_run(file) is None
+
+
+def test_another_scene_gives_no_colours_and_no_start_for_splats(
+    file: Path, scene: Path, tmp_path: Path
+) -> None:
+    run_config(file, scene)
+    assert export(file, "ply", tmp_path / "k.ply", 16)["photograph_colours"]
+    meta = json.loads((scene / "transforms.json").read_text())
+    for frame in meta["frames"]:
+        frame["transform_matrix"][0][3] += 7.0
+    (scene / "transforms.json").write_text(json.dumps(meta))
+    for format, out in (("ply", "k.ply"), ("splat-init", "s.json")):
+        with pytest.raises(ValueError, match="0 of the 3 cameras that the occupancy names are in"):
+            export(file, format, tmp_path / out, 16, data=scene)
+    assert not export(file, "ply", tmp_path / "k.ply", 16)["photograph_colours"]

@@ -16,6 +16,10 @@ from leco_plugin.scenes.upright import turn_to_upright
 Array = NDArray[np.float64]
 TOLERANCE, TOLERATED = 10.0, 0.1
 """How far a position by GPS may be from its pose: metres, and share of the survey's spread."""
+RECEIVER, LEAST_TOLD = 5.0, 0.3
+"""How far a position of an ordinary receiver may always be: metres, and share of the spread. Of
+shuffled positions one survey in fifty agrees by this, and of right ones within 25 m nearly all do,
+where half do by `TOLERATED`."""
 FEWEST = 4
 """Photographs with GPS for which a similarity, of seven numbers, can be doubted."""
 AGREEING, ALWAYS = 0.5, 3
@@ -110,15 +114,22 @@ def place(pycolmap: Any, centres: Array, gps: Array, up: Array) -> Placement:
         )
     spread = float(np.sqrt(((gps[known] - gps[known].mean(axis=0)) ** 2).sum(axis=1).mean()))
     options = pycolmap.RANSACOptions()
-    options.max_error, options.random_seed = min(TOLERANCE, TOLERATED * spread), 0
-    found = pycolmap.estimate_sim3d_robust(centres[known], gps[known], options)
+    options.max_error, options.random_seed = tolerance(spread), 0
+    found: Any = None
+    if options.max_error > 0.0:  # else all positions are the same
+        found = pycolmap.estimate_sim3d_robust(centres[known], gps[known], options)
     agreeing = 0 if found is None else int(np.sum(found["inlier_mask"]))
     if agreeing - ALWAYS < AGREEING * (known.sum() - ALWAYS):
-        return _by_direction(
-            up,
+        reason = (
             f"GPS contradicts the poses: {agreeing} of {known.sum()} positions agree within "
-            f"{options.max_error:.1f} m; mend EXIF, or set metres_per_unit in transforms.json",
+            f"{options.max_error:.1f} m; mend EXIF, or set metres_per_unit in transforms.json"
         )
+        if spread < TOLERANCE:
+            reason = (
+                f"the positions by GPS lie {spread:.1f} m apart, too near for what GPS is off by; "
+                "set metres_per_unit in transforms.json"
+            )
+        return _by_direction(up, reason)
     matrix, inlier = found["tgt_from_src"].matrix(), np.asarray(found["inlier_mask"], dtype=bool)
     scale = float(np.linalg.det(matrix[:, :3])) ** (1.0 / 3.0)
     turn = roll_upright(matrix[:, :3] / scale, gps[known][inlier], up, options.max_error)
@@ -126,6 +137,11 @@ def place(pycolmap: Any, centres: Array, gps: Array, up: Array) -> Placement:
     placed = Placement(scale, turn, middles[0] - scale * turn @ middles[1])
     residuals = np.linalg.norm(placed.apply(centres) - gps, axis=1)
     return Placement(scale, turn, placed.shift, residuals)
+
+
+def tolerance(spread: float) -> float:
+    """How far a position may be from its pose, metres, of positions with that spread in metres."""
+    return min(TOLERANCE, max(TOLERATED * spread, min(RECEIVER, LEAST_TOLD * spread)))
 
 
 def roll_upright(turn: Array, places: Array, up: Array, width: float) -> Array:

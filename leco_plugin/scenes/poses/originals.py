@@ -171,7 +171,11 @@ def find_photographs(folder: Path, out: Path) -> list[Photograph]:
     if folder.is_relative_to(out):
         raise InputError(f"--out {out} holds the photographs: give a folder beside them")
     files = [path for path in sorted(folder.rglob("*")) if path.is_file()]
-    files = [path for path in files if not path.is_relative_to(out) and path.name[0] != "."]
+    files = [path for path in files if not path.is_relative_to(out)]
+    # thumbnails and previews of other programs lie in hidden folders
+    files = [
+        path for path in files if all(part[0] != "." for part in path.relative_to(folder).parts)
+    ]
     found = [path for path in files if path.suffix.lower() in KINDS]
     if len(found) < FEWEST:
         number = f"{len(found) or 'no'} photograph{'' if len(found) == 1 else 's'}"

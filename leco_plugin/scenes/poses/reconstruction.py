@@ -34,6 +34,9 @@ ENOUGH = 20
 """Photographs from which on a lens gets its full model: fewer would let it bend the scene."""
 CHUNK, PAIRS_A_CHUNK = 4, 100
 """Photographs and pairs for each thread between two looks at the progress bar."""
+DATABASE, ENTERED = "colmap/database.db", "colmap/entered"
+"""In the folder of the scene: features and matches, and a file that says all photographs are known
+there."""
 MASKS = "masks"
 """Folder of masks, named NAME.png for a photograph NAME; what is black in one has no features."""
 EXTRA = "pip install 'leco_plugin[poses]'"
@@ -59,7 +62,7 @@ class Reconstructor:
         """With the folder of the scene, whose `images` has all copies, and MASKS some masks."""
         self.pycolmap, self.masks = load_pycolmap(), scene / MASKS
         self.images, self.folder = scene / "images", scene / "colmap"
-        self.database = self.folder / "database.db"
+        self.database = scene / DATABASE
         self.photographs, self.threads = photographs, threads
 
     def extract(self, lens: Lens, size: int) -> None:
@@ -98,10 +101,11 @@ class Reconstructor:
 
     def _enter(self, lens: Lens) -> None:
         """Enters photographs and lenses into the database, all or none of them."""
-        pycolmap, whole = self.pycolmap, self.folder / "entered"
+        pycolmap, whole = self.pycolmap, self.folder / Path(ENTERED).name
         if whole.exists():
             return
-        self.database.unlink(missing_ok=True)
+        for part in self.folder.glob(f"{self.database.name}*"):
+            part.unlink()  # with the journal of a run that was killed
         options = pycolmap.ImageReaderOptions()
         options.camera_model = SIMPLE[lens]
         groups: dict[Any, list[Photograph]] = {}

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import shutil
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -195,3 +196,36 @@ def test_the_summary_names_some_and_counts_the_rest() -> None:
         "more overlap between neighbours places more photographs",
         "in metres by the GPS of 8 photographs: they are off by 1.23 m (median) and 5.00 m at most",
     ]
+
+
+def test_commands_to_copy_hold_names_with_blanks_together() -> None:
+    from leco_plugin.cli import _training
+
+    assert _training(Path("my scene")) == "ns-train leco-occupancy --data 'my scene'"
+
+
+def test_a_photograph_that_is_mended_before_features_are_sought_begins_anew(
+    pycolmap: Any, photos: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folder, out = tmp_path / "photos", tmp_path / "out"
+    shutil.copytree(photos, folder)
+    last = sorted(folder.iterdir())[-1]
+    whole = last.read_bytes()
+    last.write_bytes(whole[:-200])
+    with pytest.raises(InputError, match="is the file whole"):
+        make_scene(folder, out)
+    last.write_bytes(whole)
+    stopped = InputError("at the features")
+    monkeypatch.setattr(pycolmap, "import_images", lambda *_: (_ for _ in ()).throw(stopped))
+    with pytest.raises(InputError, match="at the features"):
+        make_scene(folder, out)
+    assert (out / "images" / last.name).read_bytes() == whole
+
+
+def test_a_disk_that_is_too_full_is_said_before_the_work(
+    pycolmap: Any, photos: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    full = SimpleNamespace(free=3e6)
+    monkeypatch.setattr("leco_plugin.scenes.poses.command.shutil.disk_usage", lambda _: full)
+    with pytest.raises(InputError, match="3 MB are free on its disk, and 13 are needed: free some"):
+        make_scene(photos, tmp_path / "out")

@@ -15,6 +15,7 @@ from leco_plugin.scenes.poses.georeference import (
     local_places,
     place,
     roll_upright,
+    tolerance,
     upright,
 )
 
@@ -122,13 +123,46 @@ def test_a_line_of_gps_gives_metres_by_what_is_up() -> None:
     np.testing.assert_allclose(placed.turn @ up, [0.0, 0.0, 1.0], atol=0.1)
 
 
-@pytest.mark.parametrize("kind", ["shuffled", "in one place"])
+def small_survey(off_by: float) -> tuple[Array, Array, Array]:
+    """Centres, what is up, and positions within 25 m that are off by a receiver's error, metres."""
+    places = survey(1)[0][:, :, 3]
+    places = places * 18.0 / np.sqrt(places.var(axis=0).sum())
+    gps = places + off_by * np.random.default_rng(2).normal(size=places.shape)
+    return *away(places), gps
+
+
+def test_the_error_of_an_ordinary_receiver_is_no_contradiction_in_a_small_survey() -> None:
+    pycolmap = pytest.importorskip("pycolmap")
+    centres, up, gps = small_survey(1.6)
+    placed = place(pycolmap, centres, gps, up)
+    assert placed.residuals is not None, placed.reason
+    assert placed.scale == pytest.approx(25.0, rel=0.1)
+    shuffled = np.random.default_rng(4).permutation(gps)
+    assert place(pycolmap, centres, shuffled, up).reason.startswith("GPS contradicts the poses: ")
+
+
+def test_the_tolerance_grows_with_the_survey_and_ends() -> None:
+    assert [tolerance(spread) for spread in (0.0, 10.0, 25.0, 80.0, 1000.0)] == pytest.approx(
+        [0.0, 3.0, 5.0, 8.0, 10.0]
+    )
+
+
+@pytest.mark.parametrize("spread", [0.0, 2.0], ids=["one position for all", "a few metres"])
+def test_positions_too_near_one_another_are_said_to_be_so(spread: float) -> None:
+    pycolmap = pytest.importorskip("pycolmap")
+    centres, up, gps = small_survey(0.0)
+    gps = spread * np.random.default_rng(4).normal(size=gps.shape)
+    placed = place(pycolmap, centres, gps, up)
+    assert placed.residuals is None and "too near for what GPS is off by" in placed.reason
+
+
+@pytest.mark.parametrize("kind", ["shuffled", "far from all"])
 def test_gps_that_contradicts_the_poses_is_not_used(kind: str) -> None:
     pycolmap = pytest.importorskip("pycolmap")
     places = survey(1)[0][:, :, 3]
     centres, up = away(places)
     rng = np.random.default_rng(4)
-    gps = rng.permutation(places) if kind == "shuffled" else rng.normal(size=places.shape)
+    gps = rng.permutation(places) if kind == "shuffled" else 40.0 * rng.normal(size=places.shape)
     placed = place(pycolmap, centres, gps, up)
     assert placed.residuals is None and placed.reason.startswith("GPS contradicts the poses: ")
     np.testing.assert_allclose(placed.turn @ up, [0.0, 0.0, 1.0], atol=1e-9)
@@ -173,4 +207,4 @@ def estimates(found: Any) -> Any:
 def test_no_estimate_is_a_contradiction() -> None:
     gps = survey(0)[0][:, :, 3]
     placed = place(estimates(None), gps, gps, np.array([0.0, 0.0, 1.0]))
-    assert placed.residuals is None and ": 0 of 24 positions agree within 4." in placed.reason
+    assert placed.residuals is None and ": 0 of 24 positions agree within 5.0 m" in placed.reason

@@ -102,6 +102,14 @@ def test_a_scene_inside_the_folder_is_left_aside(folder: Path) -> None:
     assert len(find_photographs(folder, folder / "scene")) == 3
 
 
+def test_thumbnails_in_hidden_folders_are_left_aside(folder: Path, tmp_path: Path) -> None:
+    hidden = folder / ".thumbnails" / "normal"
+    hidden.mkdir(parents=True)
+    (hidden / "IMG_0.jpg").write_bytes((folder / "IMG_0.jpg").read_bytes())
+    (folder / "._IMG_0.jpg").write_bytes(b"of another system")
+    assert len(find_photographs(folder, tmp_path / "out")) == 3
+
+
 def test_photographs_of_one_lens_and_size_share_it(folder: Path, tmp_path: Path) -> None:
     with Image.open(folder / "IMG_0.jpg") as image:
         image.crop((0, 0, 20, 20)).save(folder / "IMG_3.jpg")
