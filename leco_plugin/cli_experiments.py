@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 import tyro
 
@@ -23,6 +23,7 @@ def chart(
     images: int = 2,
     at_once: int | None = None,
     reuse: tuple[Path, ...] = (),
+    held_out: Literal["spread", "stretch"] = "spread",
     json: Path | None = None,
 ) -> None:
     """Train methods on a scene for the same time, and draw accuracy against what it costs.
@@ -53,12 +54,14 @@ def chart(
             have 2 where there is no GPU.
         reuse: Folders of other charts on this scene: runs of theirs that this one lacks are taken
             over where time, evaluation, machine and version are the same.
+        held_out: Photographs that are tested. spread takes some all over the scene, as its file
+            says; stretch a whole flight line or arc, whose neighbours are not trained on either.
         json: Another file for the results.
     """
     check_json(json)
     from leco_plugin.chart.command import Asked, make_charts, refuse_failures
 
-    asked = Asked(seconds, steps, learn_seconds, seeds, images, at_once, reuse)
+    asked = Asked(seconds, steps, learn_seconds, seeds, images, at_once, reuse, held_out)
     made = make_charts(data, out, methods, samplers, suite, asked)
     for folder, results in made.items():
         drawn = "chart.png, chart.html, " if results["runs"] else ""
