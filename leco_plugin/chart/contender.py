@@ -18,6 +18,8 @@ if TYPE_CHECKING:
 
 LEARNED, GRID, DENSE = "learned-occupancy", "occupancy-grid", "dense"
 """Samplers of the registry."""
+LONG_STEPS, WITHOUT_GIFTS = "long-steps", "learned-occupancy-without-gifts"
+"""Samplers of charts alone: rivals with as little as possible."""
 
 
 @dataclass(frozen=True)
