@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 import tyro
 
@@ -23,6 +23,7 @@ def chart(
     images: int = 2,
     at_once: int | None = None,
     reuse: tuple[Path, ...] = (),
+    held_out: Literal["spread", "stretch"] = "spread",
     json: Path | None = None,
 ) -> None:
     """Train methods on a scene for the same time, and draw accuracy against what it costs.
@@ -34,13 +35,15 @@ def chart(
         data: A scene in nerfstudio's format.
         out: Folder of the chart. More methods and seeds may be added to it later.
         methods: As ns-train knows them, or leco-occupancy-never-frozen, -retrained, -homogeneous.
-        samplers: Of the registry, occupancy-grid-N for N cells along an axis, or own. By default
-            learned-occupancy and own where the method can have both.
+        samplers: Of the registry; occupancy-grid-N for N cells along an axis; own; long-steps, four
+            times as long, of which none is skipped; learned-occupancy-without-gifts, with neither
+            sparse points nor an opaque start. By default learned-occupancy, own and long-steps
+            where the method can have them.
         suite: A named comparison instead of methods and samplers. Minutes that it takes on two CPU
             cores with three seeds, by their speed: representations 12 to 30, empty-expert 14 to 34,
-            losses 9 to 22, freeze 13 to 16, enough-time 12 to 14, grid-resolution 15 to 16. Several
-            of them, or all, have a folder each in that of --out and share their runs: all take 61
-            to 108 minutes.
+            losses 9 to 22, freeze 13 to 16, enough-time 16 to 18, grid-resolution 19 to 21. Several
+            of them, or all, have a folder each in that of --out and share their runs: all take 65
+            to 112 minutes.
         seconds: Training time of each run. Methods need it or --steps; without either, runs of a
             suite end after 400 steps (4,000 on a GPU), or after 90 s (freeze) or 120 s where times
             are compared.
@@ -53,12 +56,14 @@ def chart(
             have 2 where there is no GPU.
         reuse: Folders of other charts on this scene: runs of theirs that this one lacks are taken
             over where time, evaluation, machine and version are the same.
+        held_out: Photographs that are tested. spread takes some all over the scene, as its file
+            says; stretch a whole flight line or arc, whose neighbours are not trained on either.
         json: Another file for the results.
     """
     check_json(json)
     from leco_plugin.chart.command import Asked, make_charts, refuse_failures
 
-    asked = Asked(seconds, steps, learn_seconds, seeds, images, at_once, reuse)
+    asked = Asked(seconds, steps, learn_seconds, seeds, images, at_once, reuse, held_out)
     made = make_charts(data, out, methods, samplers, suite, asked)
     for folder, results in made.items():
         drawn = "chart.png, chart.html, " if results["runs"] else ""

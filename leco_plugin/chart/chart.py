@@ -28,7 +28,7 @@ from leco_plugin.chart.runner import (
 from leco_plugin.chart.table import write_table
 from leco_plugin.evaluation.report import describe_code, describe_machine, write_json
 from leco_plugin.scenes.input_error import InputError
-from leco_plugin.scenes.photographs import describe_scene
+from leco_plugin.scenes.photographs import describe_held_out, describe_scene
 
 Say = Callable[[str], None]
 
@@ -69,6 +69,7 @@ class Chart:
             raise ValueError("a chart needs at least one method and one seed")
         require_seeds(seeds)
         self.data, self.scene, self.machine = data, describe_scene(data), describe_machine()
+        self.held_out = describe_held_out(data, protocol.held_out)
         self.machine["threads"] = protocol.threads(self.machine["threads"])
         self.protocol, self.command, self.reuse = protocol, command, list(reuse)
         self.suite = suite[0] if suite else None
@@ -178,6 +179,7 @@ class Chart:
             "format": 1,
             "machine": self.machine,
             "scene": self.scene,
+            "held_out": self.held_out,
             "protocol": asdict(self.protocol),
             "suite": self.suite,
             "question": self.question,

@@ -19,6 +19,7 @@ from leco_plugin.chart.suites import SUITES, in_order
 from leco_plugin.chart.worker import WORKER
 from leco_plugin.log import bar, resumable
 from leco_plugin.scenes.input_error import InputError
+from leco_plugin.scenes.photographs import HeldOut
 
 LEFT_BY_SYSTEMS = (".DS_Store", "Thumbs.db")
 """Files in folders that somebody has looked into."""
@@ -42,6 +43,8 @@ class Asked:
     """Runs at a time; None is one, or as a suite has it."""
     reuse: Sequence[Path] = ()
     """Folders of other charts on this scene, whose runs need not be made again."""
+    held_out: HeldOut = "spread"
+    """Which photographs are tested."""
 
 
 def processes(chart: Chart) -> Runner:
@@ -130,9 +133,13 @@ def _chart_of(
     if suite and times == (None, None):
         times = suite.protocol.seconds, suite.protocol.steps
         learn_seconds = suite.learn_seconds if learn_seconds is None else learn_seconds
-    protocol = Protocol(*times, learn_seconds, asked.images, at_once=at_once)
+    protocol = Protocol(
+        *times, learn_seconds, asked.images, at_once=at_once, held_out=asked.held_out
+    )
     options = {"suite": name, **asdict(protocol), "methods": methods, "samplers": samplers}
     del options["curve_points"]
+    if asked.held_out == "spread":
+        del options["held_out"]
     if not suite and at_once == 1:
         del options["at_once"]
     command = command_line(data, {**options, "seeds": asked.seeds})

@@ -14,8 +14,12 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from nerfstudio.engine.trainer import TrainerConfig
 
+    from leco_plugin.scenes.photographs import HeldOut
+
 LEARNED, GRID, DENSE = "learned-occupancy", "occupancy-grid", "dense"
 """Samplers of the registry."""
+LONG_STEPS, WITHOUT_GIFTS = "long-steps", "learned-occupancy-without-gifts"
+"""Samplers of charts alone: rivals with as little as possible."""
 
 
 @dataclass(frozen=True)
@@ -96,7 +100,11 @@ def changed(config: Any, path: str, value: Any) -> Any:
 
 
 def config_of(
-    contender: Contender, data: Path, folder: Path, learn_seconds: float | None = None
+    contender: Contender,
+    data: Path,
+    folder: Path,
+    learn_seconds: float | None = None,
+    held_out: HeldOut = "spread",
 ) -> TrainerConfig:
     """The config of a contender's training run.
 
@@ -105,8 +113,9 @@ def config_of(
     Args:
         folder: for what the run leaves.
         learn_seconds: limit for a host that learns its occupancy first.
+        held_out: which photographs are tested.
     Raises:
-        InputError: there is no such method.
+        InputError: there is no such method, or its reader cannot hold out a stretch.
         ValueError: it has no such setting.
     """
     from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataParserConfig
@@ -115,6 +124,7 @@ def config_of(
     from leco_plugin.hosts.guided import GuidedModelConfig
     from leco_plugin.method_configs import best_device
     from leco_plugin.models.leco_config import LecoModelConfig
+    from leco_plugin.scenes.input_error import InputError
     from leco_plugin.scenes.photographs import LecoPhotographsDataParserConfig
     from leco_plugin.studio.dynamic_batch import clamped
     from leco_plugin.swap import registered
@@ -126,6 +136,10 @@ def config_of(
     pipeline.datamanager.data = data
     if type(pipeline.datamanager.dataparser) is NerfstudioDataParserConfig:
         pipeline.datamanager.dataparser = LecoPhotographsDataParserConfig()
+    if isinstance(pipeline.datamanager.dataparser, LecoPhotographsDataParserConfig):
+        pipeline.datamanager.dataparser.held_out = held_out
+    elif held_out != "spread":
+        raise InputError(f"{contender.method} has a reader of its own, which holds out no stretch")
     if not isinstance(pipeline.model, GuidedModelConfig | LecoModelConfig):
         pipeline.model = guided(pipeline.model)
     changes = dict(contender.changes)

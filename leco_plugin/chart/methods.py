@@ -6,12 +6,20 @@ that learns its occupancy itself any kind of gate.
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
 
-from leco_plugin.chart.contender import DENSE, GRID, LEARNED, Contender
+from leco_plugin.chart.contender import (
+    DENSE,
+    GRID,
+    LEARNED,
+    LONG_STEPS,
+    WITHOUT_GIFTS,
+    Contender,
+)
 from leco_plugin.hosts.guided import GuidedModelConfig
 from leco_plugin.hosts.guided_start import OWN_SAMPLER
 from leco_plugin.models.leco_config import LecoModelConfig
@@ -22,6 +30,12 @@ from leco_plugin.swap import registered
 
 SIZED_GRID = re.compile(rf"{GRID}-(\d+)")
 
+LONGER = 4
+"""Times as long as a host's own steps are long steps."""
+NGP_STEP = 2.0 * math.sqrt(3.0) / 1000.0
+"""What nerfstudio's Instant-NGP has for a step of None, in the box of nerfstudio's readers."""
+NO_GIFTS = {"occupancy.opaque_start": False, "occupancy.learning.termination": 0.0}
+"""What takes from a learned occupancy the start and the sparse points that no grid is given."""
 SKIPPING_NOTHING = {"schedule.freeze": False, "front_to_back": True}
 """Never frozen; rendered front to back, as guided images are."""
 NEVER_FROZEN = Contender("LeCO, never frozen", "leco-occupancy", DENSE, SKIPPING_NOTHING)
@@ -53,6 +67,8 @@ SAMPLER_NAMES = {
     "learned-occupancy-vm": "TensoRF gate",
     "learned-occupancy-k-planes": "K-planes gate",
     DENSE: "every sample",
+    LONG_STEPS: "long steps, no skipping",
+    WITHOUT_GIFTS: "learned occupancy without gifts",
 }
 
 
@@ -66,7 +82,7 @@ def contenders(methods: Sequence[str], samplers: Sequence[str] = ()) -> list[Con
         raise InputError(
             "nothing to chart: name methods with --methods or a comparison with --suite"
         )
-    known = [*registered_samplers(), f"{GRID}-128", OWN_SAMPLER]
+    known = [*registered_samplers(), f"{GRID}-128", OWN_SAMPLER, LONG_STEPS, WITHOUT_GIFTS]
     for sampler in samplers:
         if sampler not in known and not SIZED_GRID.fullmatch(sampler):
             listed = ", ".join(sorted(known))
@@ -97,8 +113,12 @@ def _samplers_of(method: str) -> tuple[list[str], str]:
     if isinstance(model, LecoModelConfig):
         kinds = [name for name, spec in registered_samplers().items() if spec.needs_occupancy]
         return [LEARNED], ", ".join([*kinds, DENSE])
-    every = ", ".join([*registered_samplers(), OWN_SAMPLER])
-    usual = [LEARNED, OWN_SAMPLER] if isinstance(model, GuidedModelConfig) else [OWN_SAMPLER]
+    every = ", ".join([*registered_samplers(), OWN_SAMPLER, LONG_STEPS, WITHOUT_GIFTS])
+    usual = (
+        [LEARNED, OWN_SAMPLER, LONG_STEPS]
+        if isinstance(model, GuidedModelConfig)
+        else [OWN_SAMPLER]
+    )
     return usual, every
 
 
@@ -140,7 +160,13 @@ def contender_of_host(method: str, sampler: str, host: Any) -> Contender | None:
     if sampler == OWN_SAMPLER:
         shown = _own_sampling_of(host)
     else:
-        spec = registered_samplers()[GRID if sized else sampler]
+        if sampler == LONG_STEPS:
+            longer = _long_steps(host)
+            name = f"{METHOD_NAMES.get(method, method)} + {shown}"
+            return None if longer is None else Contender(name, method, sampler, longer)
+        if sampler == WITHOUT_GIFTS:
+            changes = {"occupancy.sampler": LEARNED, **NO_GIFTS}
+        spec = registered_samplers()[GRID if sized else changes["occupancy.sampler"]]
         if (spec.proposal if proposes else spec.estimator) is None:
             return None
         if spec.gate_encoding is not None:
@@ -149,6 +175,25 @@ def contender_of_host(method: str, sampler: str, host: Any) -> Contender | None:
             cells = int(sized[1]) if sized else _own_cells_of(host) or 128
             shown, changes = f"grid {cells}³", _grid_changes(host, cells)
     return Contender(f"{METHOD_NAMES.get(method, method)} + {shown}", method, sampler, changes)
+
+
+def _long_steps(host: Any) -> dict[str, Any] | None:
+    """Changes that give a host steps `LONGER` times as long, of which it skips none; None of a host
+    with another rule for its steps."""
+    if isinstance(host, SwitchNerfModelConfig):
+        candidates = max(1, host.sizes.candidates // LONGER)
+        return {"occupancy.sampler": DENSE, "host.sizes.candidates": candidates}
+    if hasattr(host, "num_proposal_samples_per_ray"):
+        samples = max(1, host.num_proposal_samples_per_ray[0] // LONGER)
+        return {"occupancy.sampler": "dense-proposal", "occupancy.options": {"samples": samples}}
+    if not hasattr(host, "render_step_size") or not hasattr(host, "cone_angle"):
+        return None
+    return {
+        "occupancy.sampler": DENSE,
+        "occupancy.options": {"levels": getattr(host, "grid_levels", 1)},
+        "host.render_step_size": LONGER * (host.render_step_size or NGP_STEP),
+        "host.cone_angle": LONGER * host.cone_angle,
+    }
 
 
 def _own_sampling_of(host: Any) -> str:

@@ -10,6 +10,7 @@ from leco_plugin.chart.contender import DENSE, Contender
 from leco_plugin.evaluation.clock import Budget
 from leco_plugin.hosts.guided_start import OWN_SAMPLER
 from leco_plugin.scenes.input_error import InputError
+from leco_plugin.scenes.photographs import HeldOut
 
 LEARN_SHARE = 0.4
 """Most of the training time for learning an occupancy; short runs need most of that."""
@@ -33,6 +34,8 @@ class Protocol:
     """Evaluations on test pixels while training, off the clock."""
     at_once: int = 1
     """Runs at a time, which share the threads of the machine."""
+    held_out: HeldOut = "spread"
+    """Which photographs are tested."""
 
     def __post_init__(self) -> None:
         self.budget()

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
-from leco_plugin.chart.contender import GRID, LEARNED, Contender
+from leco_plugin.chart.contender import GRID, LEARNED, LONG_STEPS, Contender
 from leco_plugin.chart.methods import NEVER_FROZEN, VARIANTS, contender_of_host
 from leco_plugin.chart.protocol import Cores, Protocol, forecast_minutes
 from leco_plugin.evaluation.report import usable_cores
@@ -143,12 +143,12 @@ SUITES = {
     ),
     "enough-time": Suite(
         "Does it still pay with enough training time? (review 5)",
-        tuple(map(_switch, (LEARNED, OWN_SAMPLER, f"{GRID}-{SWITCH_CELLS}"))),
+        tuple(map(_switch, (LEARNED, OWN_SAMPLER, f"{GRID}-{SWITCH_CELLS}", LONG_STEPS))),
         seconds=120.0,
     ),
     "grid-resolution": Suite(
         "Is a finer occupancy grid as good? (review 1)",
-        tuple(map(_switch, (LEARNED, *(f"{GRID}-{cells}" for cells in GRIDS)))),
+        tuple(map(_switch, (LEARNED, *(f"{GRID}-{cells}" for cells in GRIDS), LONG_STEPS))),
         seconds=120.0,
     ),
 }

@@ -41,7 +41,8 @@ def run_job(
     from leco_plugin.chart.contender import config_of
 
     learn_seconds = protocol.budget().learn_seconds
-    config = config_of(contender, data, folder / "nerfstudio", learn_seconds)
+    nerfstudio = folder / "nerfstudio"
+    config = config_of(contender, data, nerfstudio, learn_seconds, protocol.held_out)
     return train_job(config, contender, seed, data, protocol, folder, on_progress)[0]
 
 

@@ -113,10 +113,20 @@ def number_of(positions: Any) -> int:
     return math.prod(positions.frustums.shape)
 
 
-class GridUpdates:
-    """Watches the occupancy grids of a model, nerfacc's or like those, from now on."""
+WARM_UP = 1 / 16
+"""Most of a run that the warm-up of a grid lasts: nerfacc's 256 steps are half of a short run."""
 
-    def __init__(self, model: nn.Module) -> None:
+
+class GridUpdates:
+    """Watches the occupancy grids of a model, nerfacc's or like those, from now on.
+
+    Args:
+        share_at: the share of the run that is over at a step. A warm-up ends with `WARM_UP` of it,
+            if not sooner. None leaves it as it is.
+    """
+
+    def __init__(self, model: nn.Module, share_at: Callable[[int], float] | None = None) -> None:
+        self.share_at = share_at
         self.clock = Clock()
         """The time of all updates."""
         self.warming_up: bool | None = None
@@ -134,8 +144,10 @@ class GridUpdates:
             asked.apply_defaults()
             step, until = (asked.arguments.get(name) for name in ("step", "warmup_steps"))
             if step is not None and until is not None:
+                if self.share_at is not None and self.share_at(step) >= WARM_UP:
+                    asked.arguments["warmup_steps"] = until = min(until, step)
                 self.warming_up = step < until
             with self.clock.running():
-                return update(*args, **kwargs)
+                return update(*asked.args, **asked.kwargs)
 
         return run

@@ -203,7 +203,9 @@ class _Course:
             for optimizer in trainer.optimizers.optimizers.values()
             for group in optimizer.param_groups
         ]
-        self.updates = GridUpdates(trainer.pipeline.model)
+        self.updates = GridUpdates(
+            trainer.pipeline.model, lambda step: budget.share(self.clock.now(), step)
+        )
         where = TrainingCallbackLocation
         trainer.callbacks.insert(0, TrainingCallback([where.BEFORE_TRAIN_ITERATION], self.before))
         trainer.callbacks.append(TrainingCallback([where.BEFORE_TRAIN_ITERATION], self.begun))

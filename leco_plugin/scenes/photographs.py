@@ -9,7 +9,7 @@ from __future__ import annotations
 import hashlib
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import torch
@@ -34,12 +34,15 @@ from leco_plugin.scenes.large_coordinates import ReadsNear
 from leco_plugin.scenes.photograph_files import check_images, find_file
 from leco_plugin.scenes.reading import CheckedReader
 from leco_plugin.scenes.scene_file import load_json, scene_file_of
+from leco_plugin.scenes.stretch import stretch_of
 
 POINTS = "points3D_xyz"
 """Key of the dataset's metadata with the sparse points [P, 3] in model coordinates, as nerfstudio's
 own readers have it."""
 COLOURS = "points3D_rgb"
 """That of their colours, uint8 [P, 3]. nerfstudio's pipelines want both or neither."""
+HeldOut = Literal["spread", "stretch"]
+"""Which photographs are tested: some all over the scene, or a whole line or arc of them."""
 
 
 @dataclass
@@ -48,6 +51,9 @@ class LecoPhotographsDataParserConfig(NerfstudioDataParserConfig):
 
     _target: type = field(default_factory=lambda: LecoPhotographs)
     """target class to instantiate"""
+    held_out: HeldOut = "spread"
+    """Photographs for testing. spread: those that the file lists, or nerfstudio's share of all.
+    stretch: a flight line or an arc near the middle, whose neighbours are not trained on either."""
 
 
 class LecoPhotographs(CheckedReader, ReadsNear, Nerfstudio):
@@ -77,6 +83,15 @@ class LecoPhotographs(CheckedReader, ReadsNear, Nerfstudio):
         if "metres_per_unit" in meta:
             outputs.metadata[METRES_PER_UNIT] = applied_scale * _metres(meta, self.config.data)
         return outputs
+
+    def _near(self, meta: dict[str, Any]) -> dict[str, Any]:
+        """What the file says, with the split that was asked for."""
+        meta = super()._near(meta)
+        if self.config.held_out == "spread":
+            return meta
+        names = stretch_of(meta, str(self.config.data))
+        tested = dict.fromkeys(("val_filenames", "test_filenames"), names["test"])
+        return meta | {"train_filenames": names["train"]} | tested
 
     def _get_fname(
         self, filepath: Path, data_dir: Path, downsample_folder_prefix: str = "images_"
@@ -185,6 +200,13 @@ leco_photographs_dataparser = DataParserSpecification(
     config=LecoPhotographsDataParserConfig(),
     description="A scene in nerfstudio's format, checked, upright, with its sparse points.",
 )
+
+
+def describe_held_out(data: Path, kind: HeldOut) -> dict[str, Any]:
+    """Which photographs of a scene are tested, as JSON values: the `kind`, and of a stretch the
+    names of those of `test` and of those `beside` it. InputError if none can be held out."""
+    names = stretch_of(check_scene(data), str(data)) if kind == "stretch" else {}
+    return {"kind": kind} | {part: names[part] for part in names if part != "train"}
 
 
 def describe_scene(data: Path) -> dict[str, Any]:

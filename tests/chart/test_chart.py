@@ -152,6 +152,7 @@ def test_results_have_the_agreed_form(tiny_scene: Path, tmp_path: Path) -> None:
     made = chart(tiny_scene, tmp_path, command="leco chart --data ball")
     results = make(made, Runner())
     assert results["format"] == 1 and results["scene"]["name"] == tiny_scene.name
+    assert results["held_out"] == {"kind": "spread"}
     assert {"machine", "scene", "occupancy", "runs", "failures", "made"} <= results.keys()
     assert results["made"]["command"] == "leco chart --data ball"
     assert {"date", "commit", "version"} <= results["made"].keys()
@@ -292,6 +293,8 @@ def test_a_chart_with_other_settings_gives_no_runs(tiny_scene: Path, tmp_path: P
         with pytest.raises(InputError, match=said):
             made(tiny_scene, tmp_path / "b", PLAIN, protocol=protocol, reuse=[tmp_path / "a"])
     elsewhere = chart(tiny_scene, tmp_path / "c").settings
+    stretch = {**elsewhere, "held_out": "stretch"}
+    assert "another held out" in str(why_not_shared(tmp_path / "a", stretch))
     elsewhere["machine"] = {**elsewhere["machine"], "cpu": "another"}
     assert "another machine" in str(why_not_shared(tmp_path / "a", elsewhere))
     with pytest.raises(InputError, match="there is no chart"):

@@ -193,6 +193,7 @@ BAD = {
     "there is no chart in it": [*METHODS, *TIME, "--reuse", "no-such"],
     "at least one of the images": [*METHODS, *TIME, "--images", 0],
     "at least one of the runs at once": [*METHODS, *TIME, "--at-once", 0],
+    "9 cameras, and a stretch is held out of": [*METHODS, *TIME, "--held-out", "stretch"],
     "share their runs by themselves": ["--suite", "losses", "freeze", "--reuse", "no-such"],
 }
 

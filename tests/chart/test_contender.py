@@ -8,12 +8,15 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from nerfstudio.configs import method_configs
+from nerfstudio.data.dataparsers.blender_dataparser import BlenderDataParserConfig
 
 from leco_plugin.chart.contender import Contender, changed, config_of, short_names
 from leco_plugin.chart.methods import contenders
 from leco_plugin.host_configs import leco_ngp
 from leco_plugin.hosts.guided import GuidedModelConfig
 from leco_plugin.method_configs import best_device
+from leco_plugin.scenes.input_error import InputError
 from leco_plugin.scenes.photographs import LecoPhotographsDataParserConfig
 
 DATA, FOLDER = Path("scene"), Path("runs")
@@ -106,6 +109,29 @@ def test_a_method_of_nerfstudio_reads_the_scene_as_ours_do_and_can_be_guided() -
     assert type(config.pipeline.datamanager.dataparser) is LecoPhotographsDataParserConfig
     model: Any = config.pipeline.model
     assert isinstance(model, GuidedModelConfig) and model.occupancy.sampler == "own"
+
+
+def test_every_contender_is_tested_on_the_photographs_that_are_asked_for() -> None:
+    for one in contenders(["leco-occupancy", "nerfacto"]):
+        reader = config_of(one, DATA, FOLDER, held_out="stretch").pipeline.datamanager.dataparser
+        assert reader.held_out == "stretch"
+        reader = config_of(one, DATA, FOLDER).pipeline.datamanager.dataparser
+        assert reader.held_out == "spread"
+
+
+def test_a_method_with_a_reader_of_its_own_holds_out_no_stretch(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    data = replace(leco_ngp.config.pipeline.datamanager, dataparser=BlenderDataParserConfig())
+    config = replace(
+        leco_ngp.config,
+        method_name="third",
+        pipeline=replace(leco_ngp.config.pipeline, datamanager=data),
+    )
+    monkeypatch.setitem(method_configs.all_methods, "third", config)
+    (one,) = contenders(["third"], ["own"])
+    with pytest.raises(InputError, match="third has a reader of its own"):
+        config_of(one, DATA, FOLDER, held_out="stretch")
 
 
 def test_a_host_keeps_to_the_time_for_learning() -> None:

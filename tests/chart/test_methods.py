@@ -3,12 +3,19 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
+from typing import Any
 
 import pytest
+import torch
 from nerfstudio.configs import method_configs
+from nerfstudio.data.scene_box import SceneBox
 
-from leco_plugin.chart.methods import contenders
+from leco_plugin.chart.contender import config_of
+from leco_plugin.chart.methods import contender_of_host, contenders
 from leco_plugin.host_configs import leco_ngp, ngp_host
+from leco_plugin.samplers.base import DenseEstimator
+from leco_plugin.scenes.bounds import find_bounds
 from leco_plugin.scenes.input_error import InputError
 
 
@@ -16,13 +23,22 @@ def found(*methods: str, samplers: tuple[str, ...] = ()) -> list[tuple[str, str]
     return [(one.method, one.sampler) for one in contenders(methods, samplers)]
 
 
-def test_a_host_is_charted_guided_and_as_it_is() -> None:
+def test_a_host_is_charted_guided_as_it_is_and_with_long_steps() -> None:
     assert found("leco-ngp", "leco-nerfacto") == [
         ("leco-ngp", "learned-occupancy"),
         ("leco-ngp", "own"),
+        ("leco-ngp", "long-steps"),
         ("leco-nerfacto", "learned-occupancy"),
         ("leco-nerfacto", "own"),
+        ("leco-nerfacto", "long-steps"),
     ]
+
+
+def test_a_learned_occupancy_without_gifts_has_neither_sparse_points_nor_an_opaque_start() -> None:
+    (one,) = contenders(["leco-ngp"], ["learned-occupancy-without-gifts"])
+    occupancy: Any = config_of(one, Path("scene"), Path("runs")).pipeline.model.occupancy
+    assert occupancy.sampler == "learned-occupancy" and not occupancy.opaque_start
+    assert occupancy.learning.termination == 0.0
 
 
 def test_a_method_that_learns_itself_is_charted_as_it_is() -> None:
@@ -72,6 +88,39 @@ def test_names_say_what_a_host_does_by_itself() -> None:
         "Nerfacto + proposal networks",
         "Switch-NeRF + coarse and fine samples",
     ]
+
+
+@pytest.mark.parametrize("method", ["leco-ngp", "leco-nerfacto", "leco-switch-nerf"])
+def test_long_steps_are_four_times_as_long_and_none_is_skipped(method: str) -> None:
+    box = SceneBox(torch.tensor([[-1.0] * 3, [1.0] * 3]))
+    made, own = (
+        config_of(one, Path("scene"), Path("runs")).pipeline.model.setup(
+            scene_box=box, num_train_data=2, metadata={}, device="cpu"
+        )
+        for one in contenders([method], ["long-steps", "own"])
+    )
+    if method == "leco-ngp":
+        assert made.config.cone_angle == 4 * own.config.cone_angle
+        assert made.config.render_step_size == pytest.approx(4 * own.config.render_step_size)
+        assert torch.equal(made.occupancy_grid.bounds(), own.occupancy_grid.aabbs[-1])
+        samples = made.occupancy_grid.sampling(torch.zeros(1, 3), torch.eye(3)[:1], far_plane=5.0)
+        assert (samples[2] - samples[1]).sum() == pytest.approx(5.0, abs=0.01)
+    elif method == "leco-nerfacto":
+        assert (
+            4 * made.proposal_sampler.sampler.samples == own.config.num_proposal_samples_per_ray[0]
+        )
+    else:
+        poses = torch.eye(4)[None, :3].repeat(2, 1, 1)
+        poses[1, 0, 3] = 1.0
+        bounds = find_bounds(poses, -torch.eye(3)[None, 2:].repeat(2, 1, 1), None)
+        made.set_bounds(bounds, 1.0)
+        own.set_bounds(bounds, 1.0)
+        assert float(made.step) == pytest.approx(4 * float(own.step), rel=0.1)
+        assert isinstance(made.occupancy_grid, DenseEstimator)
+
+
+def test_a_host_without_a_rule_for_its_steps_has_no_long_ones() -> None:
+    assert contender_of_host("third", "long-steps", object()) is None
 
 
 def test_the_phases_of_learning_are_methods_of_the_chart() -> None:

@@ -93,6 +93,12 @@ def test_suites_that_ask_what_was_learned_train_for_equal_steps_and_the_others_f
     assert by_steps == {"representations", "empty-expert", "losses"}
 
 
+def test_who_trains_for_time_meets_the_host_with_long_steps() -> None:
+    for found in SUITES.values():
+        if found.contenders[0].method == "leco-switch-nerf":
+            assert "long-steps" in {one.sampler for one in found.contenders}
+
+
 @pytest.mark.gpu
 @pytest.mark.skipif(not ON_GPU, reason="needs a CUDA device")
 def test_runs_have_a_gpu_to_themselves() -> None:
@@ -108,8 +114,7 @@ def test_suites_are_made_in_the_order_in_which_they_share_most() -> None:
 
 
 def test_guided_switch_nerf_is_that_of_charts_by_method_whose_runs_can_be_reused() -> None:
-    named = contenders(
-        ["leco-switch-nerf"], ["learned-occupancy", "own", f"occupancy-grid-{SWITCH_CELLS}"]
-    )
+    grid = f"occupancy-grid-{SWITCH_CELLS}"
+    named = contenders(["leco-switch-nerf"], ["learned-occupancy", "own", grid, "long-steps"])
     assert [one.key for one in SUITES["enough-time"].contenders] == [one.key for one in named]
     assert [one.name for one in SUITES["enough-time"].contenders] == [one.name for one in named]

@@ -97,3 +97,10 @@ def test_grids_that_could_not_be_made_are_named() -> None:
     ours["occupancy"]["at_equal_loss"]["left_out"] = [512, 1024]
     said = "Left out, for want of memory or time in some run: grid 512³, 1024³."
     assert said in table(results(ours, other))
+
+
+def test_a_test_on_a_stretch_of_cameras_is_said() -> None:
+    said = "tested on a whole stretch of 3 cameras"
+    assert said not in table(results(run("A")))
+    held_out = {"kind": "stretch", "test": ["a", "b", "c"], "beside": ["d"]}
+    assert said in table(results(run("A"), held_out=held_out))

@@ -163,6 +163,21 @@ def test_the_warm_up_is_what_the_host_says_and_else_that_of_the_grid(
     assert updates.warming_up is warming_up
 
 
+@pytest.mark.parametrize(("share", "asked_cells"), [(0.05, 512), (0.07, 256)])
+def test_a_warm_up_ends_with_a_sixteenth_of_the_run(share: float, asked_cells: int) -> None:
+    host, asked = GridHost(), []
+
+    def nothing(positions: torch.Tensor) -> torch.Tensor:
+        asked.append(len(positions))
+        return torch.zeros(len(positions))
+
+    updates = GridUpdates(host, {0: 0.0, 32: share}.__getitem__)
+    for step in (0, 32):
+        host.grid.update_every_n_steps(step=step, occ_eval_fn=nothing)
+    assert asked[0] == 512 and asked[1] <= asked_cells
+    assert updates.warming_up is (asked[1] == 512) is (asked_cells == 512)
+
+
 def test_updates_are_made_and_their_time_is_counted() -> None:
     host = GridHost()
     updates = GridUpdates(host)

@@ -206,7 +206,9 @@ def circumstances(results: Mapping[str, Any]) -> str:
     many = "one seed" if seeds == 1 else f"{seeds} seeds: means of PSNR, medians of costs"
     method = shared_method(list(dict.fromkeys(run["name"] for run in results["runs"])))
     what = f"{method} on {results['scene']['name']}" if method else results["scene"]["name"]
-    return f"{what}, {length} of training on {where}, {many}"
+    said = f"{what}, {length} of training on {where}, {many}"
+    tested = results.get("held_out", {}).get("test")
+    return said if tested is None else f"{said}, tested on a whole stretch of {len(tested)} cameras"
 
 
 @dataclass(frozen=True)
