@@ -26,6 +26,7 @@ from leco_plugin.chart.findings.summary import (
     common_psnr,
     lines_of,
     rivals,
+    sentence,
 )
 from leco_plugin.chart.panels import cost_panel, title_of
 
@@ -133,7 +134,7 @@ def table(results: Mapping[str, Any]) -> str:
     if len(lines) > 1 and results["protocol"]["seconds"] is not None:
         parts.append(settling(lines))
     if fallen := falls(lines):
-        parts.append(fallen)
+        parts.append(f"{sentence(fallen)}.")
     if results["failures"]:
         parts.append(failures_table(results["failures"]))
     if learned := learned_of(lines):
@@ -189,14 +190,13 @@ def _median(cost: Cost, line: Line) -> str:
 
 
 def versus_table(duels: Sequence[Versus]) -> str:
-    """What learned occupancies gain: means of PSNR over seeds, medians of times and of ratios, and
-    the least and the most."""
+    """What learned occupancies gain: the verdict on PSNR, medians of times and of ratios, and the
+    least and the most."""
     return table_of(
         duels,
         {
             "against": lambda duel: f"{duel.ours} against {duel.theirs}",
-            "seeds": lambda duel: str(len(duel.gains)),
-            "PSNR, dB": lambda duel: spread(duel.gains, "+.2f", statistics.fmean),
+            "PSNR": lambda duel: duel.psnr.said(),
             "passes its last PSNR after, s": lambda duel: spread(duel.passed, ".0f"),
             "sooner by, x": lambda duel: spread(duel.sooner, ".2f"),
             "renders faster by, x": lambda duel: spread(duel.faster, ".1f"),
