@@ -79,7 +79,7 @@ def gain_table(results: Mapping[str, Any]) -> str:
         for of in (lambda line: _median(line, "render_seconds_per_image"), _queries)
     )
     said = (
-        f"`{OURS}` beside {rival.name}, the best host with its own sampling: "
+        f"Beside {rival.name}, the best host with its own sampling, `{OURS}` is "
         f"{compare(ours.psnrs, rival.psnrs).said(form='.1f')}. It "
         f"renders {times:.1f} times as fast, with {queries:.0f} times fewer queries."
     )

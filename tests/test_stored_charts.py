@@ -181,7 +181,7 @@ def test_the_gain_is_that_over_the_best_host_with_its_own_sampling() -> None:
         "| **leco-occupancy + learned-occupancy** | 28.0 dB (28.0 to 28.0) | 2.0 s | 20 |"
     )
     assert said == (
-        "`leco-occupancy` beside leco-nerfacto + own, the best host with its own sampling: +3.0 "
+        "Beside leco-nerfacto + own, the best host with its own sampling, `leco-occupancy` is +3.0 "
         "dB, one seed: no verdict. It renders 4.0 times as fast, with 4 times fewer queries."
     )
 
