@@ -18,7 +18,7 @@ from leco_plugin.chart.findings.learned import (
     percent,
 )
 from leco_plugin.chart.findings.representations import COSTS, fronts_of, representations_of
-from leco_plugin.chart.findings.settling import still_rising
+from leco_plugin.chart.findings.settling import falls, still_rising
 from leco_plugin.chart.findings.summary import RENDERING, Line, lines_of
 from leco_plugin.chart.panels import asks_what_was_learned, title_of
 from leco_plugin.chart.suites import SUITES
@@ -40,9 +40,9 @@ PSNR after equally many steps. A gate that was frozen with the last of them has 
 """
 TIMED = """PSNR after equal time, and seconds to render a test image. What keeping a grid up takes
 is missing in training with it: a fine one shows here what it costs on two cores, and not how good
-it would be. Whoever gained more than 0.3 dB in the last third of the time is still rising. That
-others are not does not mean that more time would not help them: rates fall to a tenth over whatever
-time is given.
+it would be. Whoever gained more than 0.3 dB in the last third of the time is still rising; whoever
+ended more than 0.3 dB below its own best point fell. That others did neither does not mean that
+more time would not help them: rates fall to a tenth over whatever time is given.
 """
 
 TIMES = """### How long the suites take
@@ -141,24 +141,26 @@ def _fronts(charts: Sequence[Mapping[str, Any]]) -> str:
 
 
 def _level(learned: Sequence[Learned]) -> str:
-    """Whose seeds overlap with those of ours, in space kept and in PSNR."""
+    """Who is level with ours in space kept and in PSNR."""
     ours = ours_of(learned)
     if ours is None or not ours.is_measured:
         return ""
     names = [one.name for one in level_with(ours, learned)]
-    return f"; no difference beyond that of seeds to: {', '.join(names)}" if names else ""
+    return f"; level with it: {', '.join(names)}" if names else ""
 
 
 def _answer_of(results: Mapping[str, Any]) -> str:
-    """The title of a chart, and who is level with ours or still rising."""
+    """The title of a chart, and who is level with ours, still rising, or has fallen."""
     lines = lines_of(results)
     if asks_what_was_learned(results) and not representations_of(lines):
         return title_of(results) + _level(learned_of(lines))
-    rising = still_rising(lines) if results["protocol"]["seconds"] is not None else []
-    if not rising:
-        return title_of(results)
-    who = "all" if len(rising) == len(lines) else ", ".join(rising)
-    return f"{title_of(results)}; still rising at the end: {who}"
+    said = [title_of(results)]
+    if results["protocol"]["seconds"] is not None:
+        rising = still_rising(lines)
+        who = "all" if len(rising) == len(lines) else ", ".join(rising)
+        said += [f"still rising at the end: {who}"] if rising else []
+        said += filter(None, [falls(lines)])
+    return "; ".join(said)
 
 
 def minutes_section(charts: Sequence[dict[str, Any]]) -> list[str]:

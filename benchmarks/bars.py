@@ -15,6 +15,7 @@ from stability_page import has_lost, runs_gone_on
 
 from leco_plugin.chart.findings.learned import learned_of
 from leco_plugin.chart.findings.summary import figure_in, lines_of, versus
+from leco_plugin.chart.findings.verdicts import Verdict
 from leco_plugin.chart.methods import NEVER_FROZEN, VARIANTS
 from leco_plugin.chart.table import rows
 
@@ -27,7 +28,8 @@ Values = Sequence[float | None]
 
 HEAD = """What `leco-occupancy` was to reach on two CPU cores, set before it was built. Each figure
 is read from the stored result named beside it: the median over seeds, with the least and the most.
-*Yes* is with every seed, *in the median* not with all of them. A chart marked (*) was made before a
+*Yes* is with every seed, *in the median* not with all of them. PSNR beside a rival is a difference
+of means with its 95% interval: ahead, level or behind. A chart marked (*) was made before a
 mend that is named with it."""
 
 
@@ -43,8 +45,8 @@ class Bar:
     """Of a value, as `format` takes it."""
     stored: str
     """File of the results that hold it, in their folder."""
-    read: Callable[[Results], Values | None]
-    """Its values in those results; None where they do not say."""
+    read: Callable[[Results], Values | Verdict | None]
+    """Its values in those results, or a verdict on a rival; None where they do not say."""
 
     def cells(self, folder: Path) -> list[str]:
         """Its row: bar, measured, reached, stored in."""
@@ -54,7 +56,12 @@ class Bar:
         if not values:
             return [asked, "not stored", "-", "-"]
         mark = " (*)" if Path(self.stored).name in noted(folder) else ""
-        return [asked, self.measured(values), self.reached(values), f"`{self.stored}`{mark}"]
+        if isinstance(values, Verdict):
+            reached = {"ahead": "yes", "level": "level", "behind": "**no**", None: "no verdict"}
+            found = [values.said(), reached[values.word]]
+        else:
+            found = [self.measured(values), self.reached(values)]
+        return [asked, *found, f"`{self.stored}`{mark}"]
 
     def measured(self, values: Values) -> str:
         """The values of some seeds, in words."""
@@ -94,14 +101,16 @@ def of_occupancy(key: str, scale: float = 1.0) -> Callable[[Results], Values]:
     return read
 
 
-def against(rival: str, what: str) -> Callable[[Results], Values]:
+def against(rival: str, what: str) -> Callable[[Results], Values | Verdict]:
     """Reads what the learned occupancy of a chart gains over a rival, as `Versus` has it."""
 
-    def read(results: Results) -> Values:
+    def read(results: Results) -> Values | Verdict:
         lines = lines_of(results)
         (ours,) = (line for line in lines if line.learned)
         (theirs,) = (line for line in lines if line.runs[0]["name"] == rival)
-        values: Values = getattr(versus(ours, theirs, results["protocol"]["seconds"]), what)
+        values: Values | Verdict = getattr(
+            versus(ours, theirs, results["protocol"]["seconds"]), what
+        )
         return values
 
     return read
@@ -138,7 +147,7 @@ def at_equal_time(scene: str, stored: str) -> list[Bar]:
         ),
         Bar(
             f"{scene}: PSNR at the end, beyond that of never frozen",
-            *(0.0, False, " dB", "+.2f", stored, against(same, "gains")),
+            *(0.0, False, " dB", "+.2f", stored, against(same, "psnr")),
         ),
         Bar(
             f"{scene}: renders faster than never frozen",

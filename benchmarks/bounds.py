@@ -21,6 +21,7 @@ from typing import Any
 import checkout  # noqa: F401
 import tyro
 
+from leco_plugin.chart.findings.verdicts import compare
 from leco_plugin.evaluation.clock import Budget
 from leco_plugin.evaluation.report import describe_code, describe_machine, made_by, write_json
 from leco_plugin.evaluation.timed_run import timed_run
@@ -54,11 +55,11 @@ class Options:
     """Where the figures go."""
 
 
-def verdict(rows: Sequence[dict[str, Any]]) -> dict[str, dict[str, float | bool | None]]:
+def verdict(rows: Sequence[dict[str, Any]]) -> dict[str, dict[str, float | bool | str | None]]:
     """Mean PSNR with automatic bounds, of the best pair, and whether the one is near the other.
 
-    The best of several means is above its own expectation; `against_best_elsewhere` is the mean
-    over seeds of what automatic bounds gain on the pair that was best on the other seeds.
+    The best of several means is above its own expectation; `against_best_elsewhere` holds automatic
+    bounds against what each seed gave with the pair that was best on the other seeds.
 
     Returns:
         Without planes and with them, as far as there are runs: see `ways_of`.
@@ -90,12 +91,12 @@ def _by_seed(rows: Iterable[dict[str, Any]]) -> dict[str, dict[int, float]]:
 
 def _against(
     automatic: dict[int, float], by_hand: dict[str, dict[int, float]]
-) -> dict[str, float | bool | None]:
+) -> dict[str, float | bool | str | None]:
     mean, best = (
         statistics.fmean(automatic.values()),
         max(statistics.fmean(values.values()) for values in by_hand.values()),
     )
-    gains = []
+    held: list[float] = []
     for seed in automatic:
         elsewhere = {
             name: statistics.fmean(value for other, value in values.items() if other != seed)
@@ -103,12 +104,12 @@ def _against(
             if seed in values and len(values) > 1
         }
         if elsewhere:
-            gains.append(automatic[seed] - by_hand[max(elsewhere, key=elsewhere.__getitem__)][seed])
+            held.append(by_hand[max(elsewhere, key=elsewhere.__getitem__)][seed])
     return {
         "automatic": mean,
         "best_by_hand": best,
         "reached": mean >= best - MAY_LOSE,
-        "against_best_elsewhere": statistics.fmean(gains) if gains else None,
+        "against_best_elsewhere": compare([*automatic.values()], held).said() if held else None,
     }
 
 

@@ -79,7 +79,7 @@ def bounds_table(report: Report) -> str:
         lines.append(
             f"| {name} | {found['best_by_hand']:.2f} dB | {found['automatic']:.2f} dB "
             f"| {'yes' if found['reached'] else '**no**'} "
-            f"| {_or_dash(found['against_best_elsewhere'], '+.2f')} dB |"
+            f"| {found['against_best_elsewhere'] or '-'} |"
         )
     return "\n".join(lines)
 

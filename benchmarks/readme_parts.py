@@ -11,6 +11,7 @@ import checkout  # noqa: F401
 from page_parts import RESULTS, between, noted, table
 
 from leco_plugin.chart.findings.summary import Line, lines_of
+from leco_plugin.chart.findings.verdicts import compare
 
 DEMO = "<!-- demo table: generated -->", "<!-- end of the demo table -->"
 GAIN = "<!-- gain: generated -->", "<!-- end of the gain -->"
@@ -73,13 +74,13 @@ def gain_table(results: Mapping[str, Any]) -> str:
     ]
     ours = next(line for line in lines if line.method == OURS and line.learned)
     rival = max((line for line in lines if line.sampler == "own"), key=lambda line: line.psnr)
-    lead = ours.psnr - rival.psnr
     times, queries = (
         of(rival) / of(ours)
         for of in (lambda line: _median(line, "render_seconds_per_image"), _queries)
     )
     said = (
-        f"Beside {rival.name}, the best host with its own sampling, `{OURS}` gains {lead:+.1f} dB, "
+        f"Beside {rival.name}, the best host with its own sampling, `{OURS}` is "
+        f"{compare(ours.psnrs, rival.psnrs).said(form='.1f')}. It "
         f"renders {times:.1f} times as fast, with {queries:.0f} times fewer queries."
     )
     columns = f"{head} | PSNR | to render an image | queries a ray"

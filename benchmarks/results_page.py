@@ -49,14 +49,20 @@ experts, no gate* has as many scene experts, none for empty space, as Switch-NeR
 
 ## How to read a table
 
-- **PSNR** is of 8,192 pixels spread over all test images; SSIM, LPIPS and the seconds to render are
-  of one whole test image or two. Qualities are means over seeds, with the least and the most;
-  costs, ratios, and figures of occupancies are medians.
+- **PSNR** is of 8,192 pixels spread over all test images, all together; **mean PSNR of images** is
+  the mean of each image's own on the same pixels, as `ns-eval` averages. SSIM, FLIP, LPIPS and the
+  seconds to render are of one whole test image or two. FLIP and LPIPS are better when they are
+  less. Qualities are means over seeds, with the least and the most; costs, ratios, and figures of
+  occupancies are medians.
+- **Ahead**, **level**, **behind**: by the difference of means and its 95% interval over seeds
+  (Welch's t). Level is where the interval holds zero; with one seed there is no verdict. Each
+  comparison stands alone: of twenty between equals, one is expected to differ.
+- **Fell**: a run ended more than 0.3 dB below the best point of its own curve.
 - **s to X dB**: after how many seconds of training each method reached what every run reached at
   last, to stay above it. **Trained**: seconds until the last step had ended, which may be more
   than was given.
 - **Bold**: on the front of its column, so that nothing has more PSNR for less of it. **-**: not
-  measured, or not there, as LPIPS where its weights could not be had.
+  measured. Figures of quality that no run of a chart has are named below its table.
 - A *candidate* is a place on a ray at which a model that skips nothing would ask its network.
   **Candidates skipped**, **price** and **lost surface mass** are of held-out pixels at the moment
   of freezing (in charts of before 24 November 2026 at the end, which differs where a threshold was

@@ -151,6 +151,10 @@ def sizes_of(facts: dict[str, Any]) -> Sizes:
     return sizes
 
 
+STORED = ("steps", "psnr", "image_psnr", "ssim", "flip", "train_seconds")
+"""Figures of a run that are kept."""
+
+
 def train(data: Path, sizes: Sizes, seed: int, options: Options) -> dict[str, Any]:
     """One training run."""
     config: Any = copy.deepcopy(leco_occupancy.config)
@@ -175,7 +179,7 @@ def train(data: Path, sizes: Sizes, seed: int, options: Options) -> dict[str, An
         "sizes": {path: size_at(sizes, path) for path in CHOSEN},
         "parameters": values_of(sizes, images),
         "empty_fraction": trainer.pipeline.model.mixture.report.get("empty_fraction"),
-        **{key: record.to_dict()[key] for key in ("steps", "psnr", "ssim", "train_seconds")},
+        **{key: record.to_dict()[key] for key in STORED},
     }
     plain: dict[str, Any] = json.loads(json.dumps(facts))
     return plain

@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
-import math
 import statistics
 from collections.abc import Mapping, Sequence
 from typing import Any
+
+import checkout  # noqa: F401
+
+from leco_plugin.chart.findings.verdicts import Verdict, compare
 
 MAY_LOSE, MAY_HAVE, SMALL_AGAINST_LARGE = 0.1, 1.25, 0.25
 """dB below the best of the sweep and below a larger model, parameters of the best times this, and
 parameters of the smallest city against those of the largest: the bars."""
 AS_GOOD = 0.05
-"""dB below the highest mean of a sweep that count as none, as does the error of the difference."""
+"""dB below the highest mean of a sweep that count as none."""
 AUTOMATIC = "automatic"
 
 Run = Mapping[str, Any]
@@ -32,25 +35,16 @@ def mean_psnr(runs: Mapping[int, Run]) -> float:
     return statistics.fmean(run["psnr"] for run in runs.values())
 
 
-def ahead(of: Mapping[int, Run], others: Mapping[int, Run]) -> tuple[float, float | None]:
-    """By how many dB runs are ahead of others with the same seeds, and the mean's standard error.
-
-    The error is None where there is one seed.
-    """
-    gains = [run["psnr"] - others[seed]["psnr"] for seed, run in of.items()]
-    error = statistics.stdev(gains) / math.sqrt(len(gains)) if len(gains) > 1 else None
-    return statistics.fmean(gains), error
+def against(of: Mapping[int, Run], others: Mapping[int, Run]) -> Verdict:
+    """Whether runs are ahead of others in PSNR."""
+    return compare(*([run["psnr"] for run in runs.values()] for runs in (of, others)))
 
 
 def best_of(points: Mapping[str, dict[int, Run]]) -> str:
     """The smallest point that is as good as the highest mean."""
-    highest = max(points, key=lambda name: mean_psnr(points[name]))
-
-    def is_as_good(name: str) -> bool:
-        behind, error = ahead(points[highest], points[name])
-        return behind <= max(AS_GOOD, error or 0.0)
-
-    return min(filter(is_as_good, points), key=lambda name: _parameters(points[name]))
+    highest = max(map(mean_psnr, points.values()))
+    as_good = [name for name in points if mean_psnr(points[name]) >= highest - AS_GOOD]
+    return min(as_good, key=lambda name: _parameters(points[name]))
 
 
 def verdict(rows: Sequence[Run]) -> dict[str, dict[str, Any]]:
@@ -66,18 +60,18 @@ def verdict(rows: Sequence[Run]) -> dict[str, dict[str, Any]]:
             continue
         ours = points[AUTOMATIC]
         best = best_of(points)
-        behind, error = ahead(points[best], ours)
+        behind = against(points[best], ours)
         parameters, its = (_parameters(points[name]) for name in (AUTOMATIC, best))
         found[scene] = {
             "psnr": mean_psnr(ours),
             "best": best,
             "best_psnr": mean_psnr(points[best]),
-            "behind": behind,
-            "error": error,
+            "behind": behind.difference,
+            "margin": behind.margin,
             "seeds": len(ours),
             "parameters": parameters,
             "best_parameters": its,
-            "reached": behind <= MAY_LOSE and parameters <= MAY_HAVE * its,
+            "reached": behind.difference <= MAY_LOSE and parameters <= MAY_HAVE * its,
         }
     return found
 
@@ -102,7 +96,7 @@ def bars(scenes: Sequence[Mapping[str, Any]], rows: Sequence[Run]) -> list[dict[
         {
             "name": f"parameters of {small['scene']} against {large['scene']}",
             "value": share,
-            "error": None,
+            "margin": None,
             "seeds": None,
             "bar": SMALL_AGAINST_LARGE,
             "reached": share <= SMALL_AGAINST_LARGE,
@@ -114,15 +108,15 @@ def bars(scenes: Sequence[Mapping[str, Any]], rows: Sequence[Run]) -> list[dict[
         larger = [p for p in points.values() if _parameters(p) > city["parameters"]]
         if not ours or not larger:
             continue
-        behind, error = max((ahead(runs, ours) for runs in larger), key=lambda pair: pair[0])
+        behind = max((against(runs, ours) for runs in larger), key=lambda one: one.difference)
         found.append(
             {
                 "name": f"{city['scene']}: best larger model ahead by, dB",
-                "value": behind,
-                "error": error,
+                "value": behind.difference,
+                "margin": behind.margin,
                 "seeds": len(ours),
                 "bar": MAY_LOSE,
-                "reached": behind <= MAY_LOSE,
+                "reached": behind.difference <= MAY_LOSE,
             }
         )
     return found

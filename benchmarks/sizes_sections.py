@@ -21,9 +21,9 @@ def sizes_sections() -> list[str]:
         report = json.loads(sizes.read_text())
         steps, learn = report["settings"]["steps"], report["settings"]["learn_steps"]
         note = (
-            f" {steps} steps each, {learn} of them learning; PSNR of test pixels, differences in "
-            "pairs of one seed. Best is the smallest that lies within the error, or within "
-            f"{AS_GOOD:g} dB, of the highest mean. Runs {made_line(report['runs'])}."
+            f" {steps} steps each, {learn} of them learning; PSNR of test pixels. Best is the "
+            f"smallest that lies within {AS_GOOD:g} dB of the highest mean. Runs "
+            f"{made_line(report['runs'])}."
         )
         named = [scene["scene"] for scene in report["scenes"] if "blocks" not in scene]
         command = " ".join(["python benchmarks/sizes.py", *named])

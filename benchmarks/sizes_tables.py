@@ -59,7 +59,7 @@ def sizes_table(report: Report) -> str:
         )
     lines += [
         "",
-        "| scene | seeds | automatic | best of the sweep | behind it by (standard error) "
+        "| scene | seeds | automatic | best of the sweep | behind it by (95% interval) "
         "| within bounds |",
         "|" + "---|" * 6,
     ]
@@ -67,15 +67,15 @@ def sizes_table(report: Report) -> str:
         lines.append(
             f"| {scene} | {found['seeds']} | {found['psnr']:.2f} dB, {found['parameters']:,} "
             f"| {found['best']}: {found['best_psnr']:.2f} dB, {found['best_parameters']:,} "
-            f"| {_with_error(found['behind'], found['error'])} dB "
+            f"| {_with_margin(found['behind'], found['margin'])} dB "
             f"| {_told_apart(found, found['behind'] - MAY_LOSE)} |"
         )
     measured = bars(report["scenes"], report["runs"])
     if measured:
-        lines += ["", "| figure | measured (standard error) | at most | reached |"]
+        lines += ["", "| figure | measured (95% interval) | at most | reached |"]
         lines.append("|---|---|---|---|")
     for bar in measured:
-        value = _with_error(bar["value"], bar["error"])
+        value = _with_margin(bar["value"], bar["margin"])
         reached = _told_apart(bar, bar["value"] - bar["bar"])
         lines.append(f"| {bar['name']} | {value} | {bar['bar']:g} | {reached} |")
     return "\n".join(lines)
@@ -229,8 +229,8 @@ def _smallest_grid(rows: Sequence[Report], chosen: Report) -> str:
     return "none" if grid is None else f"{grid['size']}^3, {kilobytes(grid)}"
 
 
-def _with_error(value: float, error: float | None) -> str:
-    return f"{value:.2f}" if error is None else f"{value:.2f} ({error:.2f})"
+def _with_margin(value: float, margin: float | None) -> str:
+    return f"{value:.2f}" if margin is None else f"{value:.2f} ± {margin:.2f}"
 
 
 def _yes(reached: bool) -> str:
@@ -238,16 +238,16 @@ def _yes(reached: bool) -> str:
 
 
 def _told_apart(found: Report, beyond: float) -> str:
-    """Whether a bar is reached, and whether its error leaves that open or is not known.
+    """Whether a bar is reached, and whether its interval leaves that open or is not known.
 
     Args:
-        found: `reached`, the standard `error` of a figure, and of how many `seeds` it is.
+        found: `reached`, the `margin` of a figure, and of how many `seeds` it is.
         beyond: how far it lies above its bar.
     """
-    said, error = _yes(found["reached"]), found["error"]
+    said, margin = _yes(found["reached"]), found["margin"]
     if found["seeds"] == 1:
         return f"{said}, one seed"
-    return f"{said}, within the error" if error is not None and abs(beyond) < error else said
+    return f"{said}, within the interval" if margin and abs(beyond) < margin else said
 
 
 def _flagged(value: str, reached: bool) -> str:

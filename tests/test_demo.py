@@ -20,6 +20,7 @@ OCCUPANCY = {
 }
 RUN = {
     *("method", "sampler", "seed", "steps", "train_seconds", "psnr", "ssim", "lpips"),
+    *("image_psnr", "flip"),
     *("samples_per_ray", "field_queries_per_ray", "render_seconds_per_image"),
     *("peak_memory_bytes", "curve"),
 }

@@ -13,7 +13,7 @@ import samples
 import sizes_sections
 from page_parts import made_line
 from sizes import TABLE, Options, dry, larger, stored_rows, sweep
-from sizes_figures import ahead, bars, points_of, verdict
+from sizes_figures import bars, verdict
 from sizes_tables import (
     beside_fine_grid,
     capacity_table,
@@ -44,14 +44,6 @@ def runs(scene: str, measured: dict[str, list[float]] = MEASURED) -> list[dict[s
     ]
 
 
-def test_the_gain_is_that_of_pairs_of_one_seed() -> None:
-    points = points_of(runs("a"), "a")
-    gain, error = ahead(points["table x 4"], points["automatic"])
-    assert gain == pytest.approx(0.05) and error == pytest.approx(0.05)
-    (alone,) = points_of(runs("a", {"automatic": [20.0]}), "a").values()
-    assert ahead(alone, alone) == (0.0, None)
-
-
 def test_automatic_must_be_near_the_best_and_hardly_larger() -> None:
     better = MEASURED | {"table x 4": [20.07, 20.28]}
     found = verdict(runs("a", better))["a"]
@@ -69,8 +61,9 @@ def test_the_best_is_the_smallest_that_is_as_good_as_the_highest() -> None:
     tiny = small | {"table x 0.25": [20.0, 20.15]}
     found = verdict(runs("a", tiny))["a"]
     assert found["best"] == "table x 0.25" and not found["reached"]  # 200 beside 90
-    noisy = small | {"table x 0.25": [19.5, 20.5]}  # behind by 0.1 with an error of 0.4
-    assert verdict(runs("a", noisy | {"automatic": [20.1, 20.1]}))["a"]["best"] == "table x 0.25"
+    noisy = small | {"table x 0.25": [19.5, 20.5]}  # behind by 0.1, however wide its interval
+    found = verdict(runs("a", noisy | {"automatic": [20.1, 20.1]}))["a"]
+    assert found["best"] == "automatic" and (found["behind"], found["margin"]) == (0.0, 0.0)
 
 
 def test_points_without_all_their_seeds_are_not_counted() -> None:
@@ -149,7 +142,7 @@ def test_the_table_has_a_row_for_each_scene_point_and_bar() -> None:
     report = {"scenes": [scene | {"blocks": 1}, large], "runs": scattered}
     *_, few, _, eight = sizes_table(report).splitlines()
     assert few == "| parameters of city-1 against city-8 | 1.00 | 0.25 | **no** |"
-    assert eight.endswith(" | 0.05 (0.45) | 0.1 | yes, within the error |")
+    assert eight.endswith(" | 0.05 ± 3.35 | 0.1 | yes, within the interval |")
     alone = [run for run in scattered if run["seed"] == 0]
     assert sizes_table({**report, "runs": alone}).splitlines()[-1].endswith("one seed |")
 

@@ -72,14 +72,17 @@ def test_it_is_said_for_every_scene_whether_ours_is_on_the_fronts(store: Store) 
 def test_a_grid_that_is_smaller_and_keeps_less_is_named(store: Store) -> None:
     store("representations", "city", *representations(10.0, grid_kept=(0.05,)), **STEPS)
     text = answered()
-    assert "on the front of size on 0" in text and "behind grid 64³ in size |" in text
+    assert (
+        "on the front of size on 0" in text
+        and "behind grid 64³ in size (one seed: no verdict) |" in text
+    )
 
 
-def test_one_that_keeps_less_with_most_seeds_only_is_named_too(store: Store) -> None:
+def test_one_that_keeps_less_in_the_median_only_is_named_as_level(store: Store) -> None:
     store("representations", "city", *representations(10.0, grid_kept=(0.05, 0.05, 0.3)), **STEPS)
     text = answered()
     assert "of size on 0 and of learning time on 1." in text
-    assert "behind grid 64³ (not with every seed) in size |" in text
+    assert "behind grid 64³ (level in space) in size (3 seeds) |" in text
 
 
 def test_minutes_are_those_of_runs_two_at_a_time_and_shared_ones_count_once(store: Store) -> None:
@@ -104,8 +107,16 @@ def test_gates_compare_by_what_they_keep_and_runs_of_equal_time_by_their_ends(
     text = answered()
     assert "| 20.0 dB, 1 s | 20.0 dB, 1 s (50% of the time for its grid) |" in text
     assert "| 10%, 20.0 dB | not frozen, 20.0 dB |" in text
-    said = "A is ahead: 21.0 dB, 1.0 more than B; still rising at the end: all"
+    said = "A 21.0 dB, B 20.0 dB (one seed: no verdict); still rising at the end: all"
     assert f"| 21.0 dB, 1 s | 20.0 dB, 1 s | {said} |" in text
+
+
+def test_a_run_that_ended_below_its_best_is_named_and_nobody_is_said_to_rise(store: Store) -> None:
+    fell = run("A", curve=[[5.0, 20.0], [10.0, 18.0]])
+    store("enough-time", "fox", fell, run("B", curve=[[5.0, 20.0], [10.0, 20.0]]))
+    text = answered()
+    assert "(one seed: no verdict); A fell by 2.0 dB from its best |" in text
+    assert "still rising at the end" not in text
 
 
 def test_a_gate_that_is_not_frozen_with_every_seed_says_with_how_many(store: Store) -> None:
@@ -170,8 +181,8 @@ def test_the_gain_is_that_over_the_best_host_with_its_own_sampling() -> None:
         "| **leco-occupancy + learned-occupancy** | 28.0 dB (28.0 to 28.0) | 2.0 s | 20 |"
     )
     assert said == (
-        "Beside leco-nerfacto + own, the best host with its own sampling, `leco-occupancy` gains "
-        "+3.0 dB, renders 4.0 times as fast, with 4 times fewer queries."
+        "Beside leco-nerfacto + own, the best host with its own sampling, `leco-occupancy` is +3.0 "
+        "dB, one seed: no verdict. It renders 4.0 times as fast, with 4 times fewer queries."
     )
 
 

@@ -26,6 +26,7 @@ from leco_plugin.chart.findings.summary import (
     common_psnr,
     lines_of,
     rivals,
+    sentence,
 )
 from leco_plugin.chart.panels import cost_panel, title_of
 
@@ -37,6 +38,13 @@ SPENT = {
     "of which learning, s": LEARNING,
     "ms a step": Cost("step_seconds", "a step", "ms", 1e3),
 }
+QUALITIES = {
+    "mean PSNR of images": ("image_psnr", ".2f"),
+    "SSIM": ("ssim", ".3f"),
+    "FLIP": ("flip", ".3f"),
+    "LPIPS": ("lpips", ".3f"),
+}
+"""Title, key in a run and form of figures that are left out where no run has them."""
 ASKED = (
     Cost("field_queries_per_ray", "field, a ray", ""),
     Cost("proposal_queries_per_ray", "proposals, a ray", ""),
@@ -126,7 +134,7 @@ def table(results: Mapping[str, Any]) -> str:
     if len(lines) > 1 and results["protocol"]["seconds"] is not None:
         parts.append(settling(lines))
     if fallen := falls(lines):
-        parts.append(fallen)
+        parts.append(f"{sentence(fallen)}.")
     if results["failures"]:
         parts.append(failures_table(results["failures"]))
     if learned := learned_of(lines):
@@ -140,27 +148,41 @@ def table(results: Mapping[str, Any]) -> str:
 
 
 def runs_table(lines: Sequence[Line]) -> str:
-    """Means of quality and medians of cost over seeds; bold is on the front of its column."""
+    """Means of quality and medians of cost over seeds; bold is on the front of its column.
+
+    Below it a line on figures of quality that no run has.
+    """
     level = common_psnr(lines)
+    runs = [run for line in lines for run in line.runs]
+    measured, missing = {}, []
+    for title, (key, form) in QUALITIES.items():
+        if any(run.get(key) is not None for run in runs):
+            measured[title] = partial(_quality, key, form)
+        else:
+            missing.append(title)
     fronts = {cost: cost_panel(cost, lines).front() for cost in COSTS}
 
     def with_front(cost: Cost, line: Line) -> str:
         is_on_front = (line.median(cost), line.psnr) in fronts[cost]
         return f"**{_median(cost, line)}**" if is_on_front else _median(cost, line)
 
-    return table_of(
+    found = table_of(
         lines,
         {
             "method": lambda line: line.name,
             "seeds": lambda line: str(len(line.runs)),
             "PSNR, dB": lambda line: spread(line.psnrs, ".2f", statistics.fmean),
-            "SSIM": lambda line: spread([line.mean("ssim")], ".3f"),
-            "LPIPS": lambda line: spread([line.mean("lpips")], ".3f"),
+            **measured,
             f"s to {level:.1f} dB": lambda line: number(line.seconds_to(level)),
             **{title: partial(_median, cost) for title, cost in SPENT.items()},
             **{cost.titled: partial(with_front, cost) for cost in COSTS},
         },
     )
+    return f"{found}\n\nNot measured: {', '.join(missing)}." if missing else found
+
+
+def _quality(key: str, form: str, line: Line) -> str:
+    return spread([line.mean(key)], form)
 
 
 def _median(cost: Cost, line: Line) -> str:
@@ -168,14 +190,13 @@ def _median(cost: Cost, line: Line) -> str:
 
 
 def versus_table(duels: Sequence[Versus]) -> str:
-    """What learned occupancies gain: means of PSNR over seeds, medians of times and of ratios, and
-    the least and the most."""
+    """What learned occupancies gain: the verdict on PSNR, medians of times and of ratios, and the
+    least and the most."""
     return table_of(
         duels,
         {
             "against": lambda duel: f"{duel.ours} against {duel.theirs}",
-            "seeds": lambda duel: str(len(duel.gains)),
-            "PSNR, dB": lambda duel: spread(duel.gains, "+.2f", statistics.fmean),
+            "PSNR": lambda duel: duel.psnr.said(),
             "passes its last PSNR after, s": lambda duel: spread(duel.passed, ".0f"),
             "sooner by, x": lambda duel: spread(duel.sooner, ".2f"),
             "renders faster by, x": lambda duel: spread(duel.faster, ".1f"),

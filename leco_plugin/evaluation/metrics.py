@@ -1,7 +1,7 @@
-"""PSNR, SSIM and LPIPS of one rendered image.
+"""PSNR, SSIM, FLIP and LPIPS of one rendered image.
 
-LPIPS is loaded at its first use and is never fetched: on a machine without its weights it is
-left out, with one warning that says what to put where.
+FLIP and LPIPS are loaded at their first use and are never fetched: on a machine without the package
+of the one or the weights of the other it is left out, with one warning that says what to do.
 """
 
 from __future__ import annotations
@@ -9,8 +9,9 @@ from __future__ import annotations
 import functools
 import math
 import warnings
+from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import torch
 from torch import Tensor
@@ -26,8 +27,8 @@ _TORCHVISION_NAMES = {"alex": "alexnet", "vgg": "vgg16", "squeeze": "squeezenet1
 LPIPS_MINIMUM_SIDE = 31
 
 
-class LpipsUnavailable(UserWarning):
-    """LPIPS was asked for, and its network cannot be loaded on this machine."""
+class FigureUnavailable(UserWarning):
+    """FLIP or LPIPS was asked for, and cannot be loaded on this machine."""
 
 
 def image_metrics(predicted: Tensor, truth: Tensor) -> dict[str, float]:
@@ -37,15 +38,13 @@ def image_metrics(predicted: Tensor, truth: Tensor) -> dict[str, float]:
         predicted: [H, W, 3] float, colours in 0..1.
         truth: [H, W, 3] float, colours in 0..1, on the same device.
     Returns:
-        `psnr` (dB), `ssim`, and `lpips` where its network is at hand. The key is absent
+        `psnr` (dB), `ssim`, and `flip` and `lpips` where they are at hand. The key is absent
         otherwise, because nerfstudio turns every value into a float and a NaN is no JSON; a
         report of ours writes null in its place.
     """
     metrics = {"psnr": psnr(predicted, truth), "ssim": ssim(predicted, truth)}
-    distance = lpips(predicted, truth)
-    if distance is not None:
-        metrics["lpips"] = distance
-    return metrics
+    distances = {"flip": flip(predicted, truth), "lpips": lpips(predicted, truth)}
+    return metrics | {name: value for name, value in distances.items() if value is not None}
 
 
 def psnr(predicted: Tensor, truth: Tensor) -> float:
@@ -65,6 +64,38 @@ def ssim(predicted: Tensor, truth: Tensor) -> float:
     similarity = structural_similarity_index_measure(_batched(predicted), _batched(truth))
     assert isinstance(similarity, Tensor)  # a tuple only if further images are asked for
     return float(similarity)
+
+
+def flip(predicted: Tensor, truth: Tensor) -> float | None:
+    """Mean FLIP of two [H, W, 3] images in 0..1: how much a viewer sees change between them.
+
+    At its own default of 67 pixels per degree of the visual field.
+
+    Returns:
+        0 for equal images, at most 1; None without the package `flip-evaluator`.
+    """
+    evaluate = flip_evaluator()
+    if evaluate is None:
+        return None
+    reference, test = (
+        image.detach().float().clamp(0, 1).cpu().contiguous().numpy()
+        for image in (truth, predicted)
+    )
+    _, mean, _ = evaluate(reference, test, "LDR", applyMagma=False)
+    return float(mean)
+
+
+@functools.cache
+def flip_evaluator() -> Callable[..., Any] | None:
+    """FLIP of two arrays, or None after one `FigureUnavailable` warning."""
+    try:
+        from flip_evaluator import evaluate
+    except ImportError as error:
+        told = f"FLIP is left out: {error}; pip install flip-evaluator"
+        warnings.warn(told, FigureUnavailable, stacklevel=3)
+        return None
+    found: Callable[..., Any] = evaluate
+    return found
 
 
 def lpips(predicted: Tensor, truth: Tensor) -> float | None:
@@ -91,7 +122,7 @@ def lpips_metric(backbone: LpipsBackbone) -> LearnedPerceptualImagePatchSimilari
     """Loads LPIPS from the files on this machine, once a process.
 
     Returns:
-        torchmetrics' metric, or None after one `LpipsUnavailable` warning.
+        torchmetrics' metric, or None after one `FigureUnavailable` warning.
     """
     try:
         import torchvision
@@ -107,7 +138,7 @@ def lpips_metric(backbone: LpipsBackbone) -> LearnedPerceptualImagePatchSimilari
     except Exception as error:  # noqa: BLE001
         first_line = (str(error).strip() or "no reason given").splitlines()[0]
         reason = f"{type(error).__name__}: {first_line}"
-    warnings.warn(f"LPIPS is left out: {reason}", LpipsUnavailable, stacklevel=3)
+    warnings.warn(f"LPIPS is left out: {reason}", FigureUnavailable, stacklevel=3)
     return None
 
 

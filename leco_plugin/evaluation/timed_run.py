@@ -66,7 +66,11 @@ class TimedRun:
     warming_up: bool | None = None
     """Whether the run ended in the warm-up of an occupancy grid, in which all cells are asked."""
     psnr: float = math.nan
+    """Of the pixels of all test images together, as the last point of the curve."""
+    image_psnr: float | None = None
+    """Mean over test images of the PSNR of each, as ns-eval averages it, on the same pixels."""
     ssim: float = math.nan
+    flip: float | None = None
     lpips: float | None = None
     samples_per_ray: float = 0.0
     field_queries_per_ray: float = 0.0
@@ -117,8 +121,8 @@ def timed_run(
         sampler: what to call the sampler in the record.
         curve_points: evaluations, evenly spaced over the budget, the last at its end; 0 leaves
             the PSNR to the caller.
-        images: whole test images rendered at the end, for SSIM, LPIPS and the rendering time;
-            none leaves those out.
+        images: whole test images rendered at the end, for SSIM, FLIP, LPIPS and the rendering
+            time; none leaves those out.
         on_progress: called with the share of the budget that is used, after each step.
         on_frozen: called off the clock when a model that learns its occupancy itself has frozen it.
     Returns:
@@ -132,8 +136,10 @@ def timed_run(
         run_training(trainer)
         course.end()
         if curve_points:
-            run.curve.append((run.train_seconds, psnr_on_rays(trainer, CURVE_RAYS)))
-            run.psnr = run.curve[-1][1]
+            errors = errors_on_rays(trainer, CURVE_RAYS)
+            run.psnr = decibels(statistics.fmean(errors))
+            run.image_psnr = statistics.fmean(map(decibels, errors))
+            run.curve.append((run.train_seconds, run.psnr))
         figures = evaluate_images(trainer, images, queries) if images else {}
     for name in figures.keys() - {"psnr"}:
         setattr(run, name, figures[name])
@@ -299,11 +305,24 @@ def run_training(trainer: Trainer) -> None:
     trainer.train()
 
 
-@torch.no_grad()
 def psnr_on_rays(trainer: Trainer, rays: int) -> float:
-    """PSNR over pixels spread over all test images: the same pixels at every call.
+    """PSNR in dB of the pixels of `errors_on_rays`, all together."""
+    return decibels(statistics.fmean(errors_on_rays(trainer, rays)))
+
+
+def decibels(squared_error: float) -> float:
+    """The PSNR of a mean squared error of colours in 0..1."""
+    return -10.0 * math.log10(max(squared_error, 1e-12))
+
+
+@torch.no_grad()
+def errors_on_rays(trainer: Trainer, rays: int) -> list[float]:
+    """Mean squared error of each test image on its share of some pixels: the same at every call.
 
     A full image of an unguided method takes minutes on a CPU; some thousand pixels say as much.
+
+    Args:
+        rays: pixels of all images together; each image has equally many.
     """
     pipeline = trainer.pipeline
     pipeline.eval()
@@ -312,7 +331,7 @@ def psnr_on_rays(trainer: Trainer, rays: int) -> float:
         raise InputError("the scene has no test image, on which runs could be compared")
     generator = torch.Generator().manual_seed(0)
     per_image = -(-rays // len(dataset))
-    squared_error, count = 0.0, 0
+    errors = []
     for number in range(len(dataset)):
         image = dataset.get_data(number)["image"]
         rows = torch.randint(image.shape[0], (per_image,), generator=generator)
@@ -323,10 +342,9 @@ def psnr_on_rays(trainer: Trainer, rays: int) -> float:
         parts = [bundle[i : i + RAYS_AT_ONCE] for i in range(0, per_image, RAYS_AT_ONCE)]
         rgb = torch.cat([pipeline.model(part)["rgb"] for part in parts]).clamp(0.0, 1.0)
         truth = true_colours(pipeline.model, image[rows, columns].to(rgb.device))
-        squared_error += float(((rgb - truth) ** 2).sum(dtype=torch.float64))
-        count += truth.numel()
+        errors.append(float(((rgb - truth) ** 2).mean(dtype=torch.float64)))
     pipeline.train()
-    return -10.0 * math.log10(max(squared_error / count, 1e-12))
+    return errors
 
 
 @torch.no_grad()
@@ -338,9 +356,9 @@ def evaluate_images(trainer: Trainer, most_images: int, queries: Counter[str]) -
         most_images: fewer where there are fewer.
         queries: what the model's fields are asked, counted while this lasts.
     Returns:
-        Means of `psnr`, `ssim`, `lpips` (absent without its network), `samples_per_ray`,
-        `field_queries_per_ray`, `proposal_queries_per_ray`, `gate_queries_per_ray`; the median of
-        `render_seconds_per_image`.
+        Means of `psnr`, `ssim`, `flip` and `lpips` (as `image_metrics` has them),
+        `samples_per_ray`, `field_queries_per_ray`, `proposal_queries_per_ray`,
+        `gate_queries_per_ray`; the median of `render_seconds_per_image`.
     """
     pipeline = trainer.pipeline
     pipeline.eval()

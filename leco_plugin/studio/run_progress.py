@@ -33,7 +33,7 @@ from rich.markup import escape
 from torch import Tensor, nn
 
 from leco_plugin.evaluation.held_out_psnr import OF, HeldOutPsnr
-from leco_plugin.evaluation.metrics import LpipsUnavailable
+from leco_plugin.evaluation.metrics import FigureUnavailable
 from leco_plugin.learning.freezing import FILE_NAME
 from leco_plugin.log import Show, bar, details_in, on_screen, say, say_all, spell
 from leco_plugin.studio.commands import hide_warnings_of_no_use
@@ -70,7 +70,7 @@ def _short(path: Path) -> Iterator[None]:
         stack.enter_context(warnings.catch_warnings())
         hide_warnings_of_no_use()
         # of the images that nerfstudio measures now and then; ns-eval says it
-        warnings.filterwarnings("ignore", category=LpipsUnavailable)
+        warnings.filterwarnings("ignore", category=FigureUnavailable)
         stack.enter_context(details_in(plain))
         yield
 

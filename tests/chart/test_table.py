@@ -22,7 +22,17 @@ def test_every_contender_has_a_row_with_its_figures() -> None:
     assert asked[1] == "31"
     assert cells[1:3] == ["2", "20.50 (20.00 to 21.00)"]
     assert rows(text, "B")[0][2] == "19.00"
-    assert "-" in cells  # no LPIPS
+
+
+def test_figures_that_no_run_has_are_a_line_and_those_that_one_lacks_are_a_dash() -> None:
+    text = table(results(run("A", flip=0.25, image_psnr=20.5), run("B", psnr=19.0)))
+    header = rows(text, "method")[0]
+    assert header[2:6] == ["PSNR, dB", "mean PSNR of images", "SSIM", "FLIP"]
+    assert rows(text, "A")[0][3:6] == ["20.50", "0.500", "0.250"]
+    assert rows(text, "B")[0][3:6] == ["-", "0.500", "-"]
+    assert "\n\nNot measured: LPIPS.\n" in text
+    of_before = table(results(run("A")))
+    assert "Not measured: mean PSNR of images, FLIP, LPIPS." in of_before
 
 
 def test_a_figure_that_a_seed_lacks_is_a_dash() -> None:

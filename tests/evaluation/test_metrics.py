@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import sys
 import warnings
 from collections.abc import Iterator
 from pathlib import Path
@@ -15,7 +16,7 @@ from torchmetrics.functional.image import structural_similarity_index_measure
 from torchmetrics.image import PeakSignalNoiseRatio
 
 from leco_plugin.evaluation import metrics
-from leco_plugin.evaluation.metrics import LPIPS_MINIMUM_SIDE, LpipsUnavailable
+from leco_plugin.evaluation.metrics import LPIPS_MINIMUM_SIDE, FigureUnavailable
 
 
 @pytest.fixture(autouse=True)
@@ -73,6 +74,31 @@ def test_ssim_is_that_of_nerfstudio_whatever_the_images_range_is() -> None:
     assert metrics.ssim(predicted, truth) < 0.98
 
 
+def test_flip_is_that_of_its_package_and_grows_with_the_error() -> None:
+    evaluate = pytest.importorskip("flip_evaluator").evaluate
+    predicted, truth = images()
+    found = metrics.flip(predicted, truth)
+    each_pixel, *_ = evaluate(truth.numpy(), predicted.numpy(), "LDR", applyMagma=False)
+    assert found == pytest.approx(each_pixel.mean(), rel=1e-4)
+    assert metrics.flip(truth, truth) == 0.0 < found < metrics.flip(1.0 - truth, truth)
+    assert metrics.flip(3.0 * predicted - 1.0, truth) == metrics.flip(
+        (3.0 * predicted - 1.0).clamp(0, 1), truth
+    )
+
+
+def test_without_its_package_flip_is_left_out_with_one_warning(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setitem(sys.modules, "flip_evaluator", None)
+    metrics.flip_evaluator.cache_clear()
+    try:
+        with pytest.warns(FigureUnavailable, match="pip install flip-evaluator") as caught:
+            found = [metrics.image_metrics(*images(LPIPS_MINIMUM_SIDE - 1)) for _ in range(2)]
+    finally:
+        metrics.flip_evaluator.cache_clear()
+    assert len(caught) == 1 and all(one.keys() == {"psnr", "ssim"} for one in found)
+
+
 def test_lpips_is_that_of_torchmetrics(backbone: Path) -> None:
     predicted, truth = images()
     metric = metrics.lpips_metric("alex")
@@ -84,23 +110,23 @@ def test_lpips_is_that_of_torchmetrics(backbone: Path) -> None:
     outside = 3.0 * predicted - 1.0
     assert metrics.lpips(outside, truth) == metrics.lpips(outside.clamp(0, 1), truth)
     assert metrics.lpips(truth, outside) == metrics.lpips(truth, outside.clamp(0, 1))
-    assert metrics.image_metrics(predicted, truth).keys() == {"psnr", "ssim", "lpips"}
+    assert metrics.image_metrics(predicted, truth).keys() == {"psnr", "ssim", "flip", "lpips"}
 
 
 def test_without_its_weights_lpips_is_left_out_with_one_warning_that_names_the_file() -> None:
     predicted, truth = images()
-    with pytest.warns(LpipsUnavailable, match=r"put .*alexnet.* at .*checkpoints") as caught:
+    with pytest.warns(FigureUnavailable, match=r"put .*alexnet.* at .*checkpoints") as caught:
         first = metrics.image_metrics(predicted, truth)
         second = metrics.image_metrics(predicted, truth)
     assert len(caught) == 1
-    assert first.keys() == second.keys() == {"psnr", "ssim"}
+    assert first.keys() == second.keys() == {"psnr", "ssim", "flip"}
     json.dumps(first, allow_nan=False)
 
 
 def test_a_truncated_backbone_is_a_missing_one(backbone: Path) -> None:
     backbone.write_bytes(backbone.read_bytes()[:1000])
     predicted, truth = images()
-    with pytest.warns(LpipsUnavailable, match="LPIPS is left out"):
+    with pytest.warns(FigureUnavailable, match="LPIPS is left out"):
         assert metrics.lpips(predicted, truth) is None
 
 

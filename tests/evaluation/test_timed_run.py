@@ -24,6 +24,7 @@ from leco_plugin.evaluation.timed_run import (
     TimedRun,
     _Course,
     _never_sharpen,
+    errors_on_rays,
     evaluate_images,
     psnr_on_rays,
     set_up,
@@ -180,6 +181,9 @@ def test_pixels_of_all_test_pictures_are_scored_and_always_the_same(time: Time) 
     found = psnr_on_rays(model.trainer(), 100)
     errors = [model.squared_error(*ray) for ray in model.rays]
     assert found == pytest.approx(-10.0 * math.log10(statistics.fmean(errors)), abs=1e-4)
+    of_images = [statistics.fmean(errors[at : at + 34]) for at in (0, 34, 68)]
+    assert errors_on_rays(model.trainer(), 100) == pytest.approx(of_images, rel=1e-4)
+    model.rays = model.rays[:102]
     assert Counter(number for number, _, _ in model.rays) == {0: 34, 1: 34, 2: 34}
     assert len(set(model.rays)) > 60 and model.training
     torch.manual_seed(1)
@@ -249,7 +253,7 @@ class Run:
         model.field = Fog()
         monkeypatch.setattr(module, "set_up", lambda *_: self.trainer)
         monkeypatch.setattr(module, "run_training", self.train)
-        monkeypatch.setattr(module, "psnr_on_rays", self.look)
+        monkeypatch.setattr(module, "errors_on_rays", self.look)
         where = TrainingCallbackLocation
         self.trainer: Any = SimpleNamespace(
             pipeline=SimpleNamespace(model=model),
@@ -274,10 +278,11 @@ class Run:
                 return
         raise AssertionError("the run does not end")
 
-    def look(self, trainer: Any, rays: int) -> float:
+    def look(self, trainer: Any, rays: int) -> list[float]:
+        """Errors of two images; of one that is black in both there is hardly any."""
         self.time.now += 1000.0
         self.model.field(torch.zeros(rays, 3))
-        return next(self.psnrs)
+        return [2.0 * 10.0 ** (-next(self.psnrs) / 10.0), 1e-13]
 
     def record(self) -> TimedRun:
         config: Any = SimpleNamespace(method_name="method")
@@ -303,7 +308,10 @@ def test_learning_an_occupancy_is_training_time_and_looking_is_not(
     assert (record.steps, record.train_seconds, record.step_seconds) == (6, 40.0, 1.0)
     assert record.learn_seconds == record.freeze_seconds == 30.0
     assert record.at_freezing is not None and record.at_freezing["threshold"] == 0.4
-    assert record.curve == [(31.0, 20.0), (40.0, 18.0)] and record.psnr == 18.0
+    seconds, psnrs = zip(*record.curve)
+    assert seconds == (31.0, 40.0) and psnrs == pytest.approx((20.0, 18.0))
+    assert record.psnr == psnrs[-1]
+    assert record.image_psnr == pytest.approx((18.0 - 10.0 * math.log10(2.0) + 120.0) / 2)
     assert record.train_queries["field"] == 6 * 5
 
 

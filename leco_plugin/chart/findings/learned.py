@@ -8,6 +8,7 @@ from functools import cached_property
 from typing import Any
 
 from leco_plugin.chart.findings.summary import Line, figure_in, middle_of
+from leco_plugin.chart.findings.verdicts import compare
 
 OURS = "(ours)"
 """Marks the contender that a suite asks about."""
@@ -101,10 +102,10 @@ def learned_headline(learned: Sequence[Learned]) -> str:
             return "ours was not frozen with every seed"
         ours = known[0]
     others = [one for one in known if one is not ours]
-    if better := [one for one in others if one.kept < ours.kept and one.psnr > ours.psnr]:
+    if better := [one for one in others if _words(one, ours) == {"ahead"}]:
         best = min(better, key=lambda one: one.kept)
-        level = "" if _is_better(best, ours) else ", level by seeds"
-        return f"{best.name} keeps {_figures(best)}, {ours.name} {_figures(ours)}{level}"
+        by = compare(best.psnrs, ours.psnrs).by
+        return f"{best.name} keeps {_figures(best)}, {ours.name} {_figures(ours)} ({by})"
     said = f"{ours.name} keeps {_figures(ours)}"
     if others:
         kept = sorted(one.kept for one in others)
@@ -116,11 +117,19 @@ def learned_headline(learned: Sequence[Learned]) -> str:
 
 def _standing_of(one: Learned, others: Sequence[Learned]) -> str:
     """The standing of one that no other beats in both."""
-    least = all(one.kept < other.kept for other in others)
-    highest = all(one.psnr > other.psnr for other in others)
-    if least and highest:
-        return "the least, at the highest PSNR"
-    return "none is better in both"
+    found = [_words(one, other) for other in others]
+    fewest = min(others, key=lambda other: other.seeds)
+    by = compare(one.psnrs, fewest.psnrs).by
+    if any(None in words for words in found):
+        return by
+    best = all(words == {"ahead"} for words in found)
+    return f"{'the least, at the highest PSNR' if best else 'none is better in both'} ({by})"
+
+
+def _words(one: Learned, other: Learned) -> set[str | None]:
+    """The verdicts on space, of which less is better, and on PSNR: one where they agree."""
+    mine, theirs = (list(some.kept_by_seed.values()) for some in (one, other))
+    return {compare(theirs, mine).word, compare(one.psnrs, other.psnrs).word}
 
 
 def ours_of(learned: Sequence[Learned]) -> Learned | None:
@@ -129,29 +138,12 @@ def ours_of(learned: Sequence[Learned]) -> Learned | None:
 
 
 def level_with(one: Learned, others: Sequence[Learned]) -> list[Learned]:
-    """Those whose seeds overlap with those of one, in the space that they keep and in PSNR."""
+    """Those that are level with one in the space that they keep and in PSNR."""
     return [
         other
         for other in others
-        if other is not one and other.is_measured and _is_level(one, other)
+        if other is not one and other.is_measured and _words(one, other) == {"level"}
     ]
-
-
-def _is_level(one: Learned, other: Learned) -> bool:
-    pairs = (one.kept_by_seed, other.kept_by_seed), (one.psnr_by_seed, other.psnr_by_seed)
-    return all(
-        min(mine.values()) <= max(theirs.values()) and min(theirs.values()) <= max(mine.values())
-        for mine, theirs in pairs
-    )
-
-
-def _is_better(one: Learned, other: Learned) -> bool:
-    """Whether one keeps less space at more PSNR with every seed."""
-    theirs = other.kept_by_seed
-    return all(
-        kept < theirs.get(seed, 0.0) and one.psnr_by_seed[seed] > other.psnr_by_seed[seed]
-        for seed, kept in one.kept_by_seed.items()
-    )
 
 
 def _figures(one: Learned) -> str:

@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 
 from leco_plugin.chart.contender import LEARNED
 from leco_plugin.chart.findings.summary import KEPT, LEARNING, Line
+from leco_plugin.chart.findings.verdicts import Verdict, compare
 
 OUR_KIND = "MLP"
 """Kind of the default gate."""
@@ -76,23 +77,14 @@ class Representation:
         """Median of what it keeps, percent."""
         return self.median("kept")
 
+    def against(self, other: Representation, figure: str) -> Verdict:
+        """Whether it is ahead in a figure of `Held`, of which less is better; both have it."""
+        return compare(other.of_seeds(figure), self.of_seeds(figure))
+
     def leads(self, other: Representation, figure: str) -> bool:
         """Whether it keeps no more at no more cost, and is better in one of the two: medians."""
         mine, theirs = ((one.median(figure), one.kept) for one in (self, other))
-        return _is_ahead([(mine, theirs)])
-
-    def leads_always(self, other: Representation, figure: str) -> bool:
-        """Whether the same holds in each seed that both have."""
-        shared = [(self.by_seed[s], other.by_seed[s]) for s in self.by_seed if s in other.by_seed]
-        return _is_ahead(
-            [((getattr(a, figure), a.kept), (getattr(b, figure), b.kept)) for a, b in shared]
-        )
-
-
-def _is_ahead(pairs: Sequence[tuple[tuple[float, float], tuple[float, float]]]) -> bool:
-    """Whether the first of each pair of costs is never above the second, and once below it."""
-    never_worse = all(a <= b for mine, theirs in pairs for a, b in zip(mine, theirs))
-    return never_worse and any(mine != theirs for mine, theirs in pairs)
+        return mine[0] <= theirs[0] and mine[1] <= theirs[1] and mine != theirs
 
 
 def representations_of(lines: Sequence[Line]) -> list[Representation]:
@@ -157,7 +149,10 @@ def fronts_of(one: Representation, all_of_them: Sequence[Representation]) -> lis
 
 
 def verdict(representations: Sequence[Representation]) -> str:
-    """Where each of ours stands, and what is ahead of the default gate on the other fronts."""
+    """Where each of ours stands, and what is ahead of the default gate on the other fronts.
+
+    Fronts are of medians; what the seeds do not tell apart is said to be level.
+    """
     ours = [one for one in representations if one.ours]
     if not ours:
         return "our own gate was not frozen with every seed"
@@ -172,29 +167,38 @@ def verdict(representations: Sequence[Representation]) -> str:
     place = _place_of(learned, representations)
     if behind:
         place = f"{place or f'{learned.name} is'}{', ' if place else ' '}{', '.join(behind)}"
-    return "; ".join([*said, place])
+    return f"{'; '.join([*said, place])} ({learned.against(learned, 'kept').by})"
 
 
 def _place_of(one: Representation, all_of_them: Sequence[Representation]) -> str:
     """What leads on the fronts that a representation is on; empty if it is on none."""
-    if one is min(all_of_them, key=lambda other: other.kept):
-        return f"{one.name} keeps least space, {one.kept:.1f}% in {one.median('size'):.0f} kB"
+    others = [other for other in all_of_them if other is not one]
+    if all(one.kept <= other.kept for other in others):
+        said = f"{one.name} keeps least space, {one.kept:.1f}% in {one.median('size'):.0f} kB"
+        level = [other.name for other in others if one.against(other, "kept").word == "level"]
+        return f"{said}, level with {' and '.join(level)}" if level else said
     fronts = fronts_of(one, all_of_them)
-    by_cost = [name for name in fronts if _is_cheapest(one, all_of_them, COSTS[name])]
+    by_cost = [name for name in fronts if _is_cheapest(one, others, COSTS[name])]
     by_space = [name for name in fronts if name not in by_cost]
-    said = [f"the {CHEAPEST[name]}" for name in by_cost]
+    said_of = [f"the {CHEAPEST[name]}" for name in by_cost]
     if by_space:
-        said.append("on both fronts" if len(by_space) > 1 else f"on the front of {by_space[0]}")
-    return f"{one.name} is {' and '.join(said)}" if said else ""
+        said_of.append("on both fronts" if len(by_space) > 1 else f"on the front of {by_space[0]}")
+    return f"{one.name} is {' and '.join(said_of)}" if said_of else ""
 
 
 def _is_cheapest(one: Representation, others: Sequence[Representation], figure: str) -> bool:
-    rest = [other for other in others if other is not one and other.has(figure)]
-    return all(other.median(figure) > one.median(figure) for other in rest)
+    return all(
+        other.median(figure) > one.median(figure) and one.against(other, figure).word != "level"
+        for other in others
+        if other.has(figure)
+    )
 
 
 def _best_ahead(one: Representation, others: Sequence[Representation], figure: str) -> str:
-    """Of those that lead a representation, the one that keeps least, and whether it always does."""
+    """Of those that lead a representation, the one that keeps least, and what is level."""
     leaders = [other for other in others if other.has(figure) and other.leads(one, figure)]
     best = min(leaders, key=lambda other: other.kept)
-    return best.name + ("" if best.leads_always(one, figure) else " (not with every seed)")
+    if best.against(one, "kept").word != "level":
+        return best.name
+    is_cheaper = best.against(one, figure).word != "level"
+    return f"{best.name} (level in space)" if is_cheaper else f"{best.name} (level)"

@@ -17,7 +17,7 @@ ENOUGH = 0.3
 """dB in the last third of a run's time: who gains more is still rising."""
 HARDLY_TRAINED = 0.4
 """Share of its time from which on a run that kept its grid up has hardly trained."""
-FALL = 0.1
+FALL = 0.3
 """dB below the best point of a run's own curve from which on its end is said to have fallen."""
 
 
@@ -60,7 +60,7 @@ def settling(lines: Sequence[Line]) -> str:
     )
     rising = still_rising(lines)
     who = "all of them" if len(rising) == len(lines) else " and ".join(rising)
-    said = f"Still rising: {who or 'none'}"
+    said = f"Still rising: {who}; rates" if rising else "Rates"
     hardly = [
         f"{line.name} for {line.kept_up:.0%} of its time"
         for line in lines
@@ -68,21 +68,19 @@ def settling(lines: Sequence[Line]) -> str:
     ]
     kept_up = f" Updated its grid instead of training: {', '.join(hardly)}." if hardly else ""
     return (
-        f"Gained in the last third of the time: {listed}. {said}; rates fall to a tenth over the "
-        f"time that is given, so that others may gain by more of it too.{kept_up}"
+        f"Gained in the last third of the time: {listed}. {said} fall to a tenth over the time "
+        f"that is given, so that all may gain by more of it.{kept_up}"
     )
 
 
 def falls(lines: Sequence[Line]) -> str | None:
-    """A sentence on runs that end more than `FALL` below their own best point; None without any.
-
-    It gives the number of such runs for each line, and the largest fall.
-    """
+    """Which lines have runs that end more than `FALL` below their own best point, in how many runs,
+    and by how much at most; None without any."""
     fallen = []
     for line in lines:
         below = [max(psnr for _, psnr in run["curve"]) - run["curve"][-1][1] for run in line.runs]
-        count = sum(fall > FALL for fall in below)
-        if count:
-            of_all = f"in {count} of {len(below)} run{'s' if len(below) > 1 else ''}"
-            fallen.append(f"{line.name} {of_all}, by at most {max(below):.2f} dB")
-    return f"Fell from their own best point: {'; '.join(fallen)}." if fallen else None
+        if count := sum(fall > FALL for fall in below):
+            by = f"{'up to ' if count > 1 else ''}{max(below):.1f} dB"
+            of_all = f" in {count} of {len(below)} runs" if len(below) > 1 else ""
+            fallen.append(f"{line.name} fell by {by} from its best{of_all}")
+    return "; ".join(fallen) or None

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from leco_plugin.chart.contender import shared_method, short_names
+from leco_plugin.chart.findings.verdicts import Verdict, compare
 from leco_plugin.chart.protocol import Protocol
 
 LOST_SURFACE_MASS = 1e-3
@@ -180,17 +181,15 @@ def headline(results: Mapping[str, Any]) -> str:
     if len(ranked) < 2:
         return f"{ranked[0].name}: {ranked[0].psnr:.1f} dB"
     best, second = ranked[:2]
-    lead = best.psnr - second.psnr
-    if lead < 0.05 or not ahead(best, second):
-        return f"{best.name} and {second.name} are level: {best.psnr:.1f} and {second.psnr:.1f} dB"
-    said = f"{best.name} is ahead: {best.psnr:.1f} dB, {lead:.1f} more than {second.name}"
+    found = compare(best.psnrs, second.psnrs)
+    figures = f"{best.psnr:.1f} and {second.psnr:.1f} dB"
+    if found.margin is None:
+        return f"{best.name} {best.psnr:.1f} dB, {second.name} {second.psnr:.1f} dB ({found.by})"
+    apart = f"{found.difference:.2f} ± {found.margin:.2f}"
+    if found.word == "level":
+        return f"{best.name} and {second.name} are level: {figures}, {apart} apart ({found.by})"
+    said = f"{best.name} is ahead: {best.psnr:.1f} dB, {apart} more than {second.name} ({found.by})"
     return f"{said}, whose grid is still in its warm-up" if second.warming_up else said
-
-
-def ahead(one: Line, other: Line) -> bool:
-    """Whether a line has more PSNR in each seed that both have, or in all where none is shared."""
-    pairs = [(a["psnr"], b["psnr"]) for a, b in pairs_of(one, other)]
-    return all(a > b for a, b in pairs) if pairs else min(one.psnrs) > max(other.psnrs)
 
 
 def circumstances(results: Mapping[str, Any]) -> str:
@@ -213,54 +212,45 @@ def circumstances(results: Mapping[str, Any]) -> str:
 
 @dataclass(frozen=True)
 class Versus:
-    """What one contender gains over another, for each seed that both have run."""
+    """What one contender gains over another. Tuples are of its own runs, one for each seed."""
 
     ours: str
     theirs: str
-    gains: tuple[float, ...]
-    """PSNR more than the other's, dB."""
+    psnr: Verdict
     passed: tuple[float | None, ...]
-    """Seconds of training, learning included, after which it passes the other's last PSNR."""
+    """Seconds of training, learning included, after which it passes the other's mean last PSNR."""
     sooner: tuple[float | None, ...]
-    """The other's training time as a multiple of those seconds."""
+    """The other's median training time as a multiple of those seconds."""
     faster: tuple[float, ...]
-    """The other's time to render an image as a multiple of its own."""
-
-
-def pairs_of(ours: Line, theirs: Line) -> list[tuple[dict[str, Any], dict[str, Any]]]:
-    """The runs of both for each seed that both have."""
-    others = {run["seed"]: run for run in theirs.runs}
-    return [(run, others[run["seed"]]) for run in ours.runs if run["seed"] in others]
+    """The other's median time to render an image as a multiple of its own."""
 
 
 def versus(ours: Line, theirs: Line, seconds: float | None) -> Versus:
-    """Compares two contenders, seed by seed.
+    """Compares the runs of two contenders.
 
     Args:
         seconds: training time that each was given; a last step beyond it does not count.
     """
-    pairs = pairs_of(ours, theirs)
     most = seconds or math.inf
-    passed = tuple(seconds_to_pass(a["curve"], b["curve"][-1][1]) for a, b in pairs)
-    sooner = tuple(
-        None if after is None else min(b["curve"][-1][0], most) / after
-        for after, (_, b) in zip(passed, pairs)
-    )
-    faster = tuple(b[RENDERING.key] / a[RENDERING.key] for a, b in pairs)
-    gains = tuple(a["psnr"] - b["psnr"] for a, b in pairs)
-    return Versus(ours.name, theirs.name, gains, passed, sooner, faster)
+    curves = [run["curve"] for run in theirs.runs]
+    last = statistics.fmean(curve[-1][1] for curve in curves)
+    ended = statistics.median(min(curve[-1][0], most) for curve in curves)
+    rendered = statistics.median(run[RENDERING.key] for run in theirs.runs)
+    passed = tuple(seconds_to_pass(run["curve"], last) for run in ours.runs)
+    sooner = tuple(None if after is None else ended / after for after in passed)
+    faster = tuple(rendered / run[RENDERING.key] for run in ours.runs)
+    psnr = compare(ours.psnrs, theirs.psnrs)
+    return Versus(ours.name, theirs.name, psnr, passed, sooner, faster)
 
 
 def rivals(lines: Sequence[Line], seconds: float | None = None) -> list[Versus]:
-    """Each learned occupancy against the other samplers of its method, where seeds are shared;
-    `seconds` as of `versus`."""
-    found = [
+    """Each learned occupancy against the other samplers of its method; `seconds` as of `versus`."""
+    return [
         versus(ours, theirs, seconds)
         for ours in lines
         for theirs in lines
         if ours.learned and not theirs.learned and ours.method == theirs.method
     ]
-    return [one for one in found if one.gains]
 
 
 def sentence(text: str) -> str:
