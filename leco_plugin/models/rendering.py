@@ -42,7 +42,7 @@ class Rays(NamedTuple):
     t_maxs: Tensor
     """[R] where each ray ends."""
     images: Tensor | None
-    """[R] int64 of the training image whose appearance is shown, or None for the mean of all."""
+    """[R] int64 of the training image whose appearance is shown, or None for those nearby."""
     cut_off: Tensor | None = None
     """[R] bool, rays without a backdrop, behind which the background shows; None is no ray."""
 
