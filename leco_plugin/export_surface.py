@@ -7,6 +7,7 @@ air around every surface.
 
 from __future__ import annotations
 
+import io
 import json
 import math
 import os
@@ -318,6 +319,8 @@ def write_volume(
     }
     if back is not None:
         arrays["to_data"] = back.numpy()
-    write_whole(out, lambda file: np.savez_compressed(file, **arrays))
+    packed = io.BytesIO()  # a zip file that fails half-way complains when it is forgotten
+    np.savez_compressed(packed, **arrays)
+    write_whole(out, lambda file: file.write(packed.getbuffer()))
     share = float(kept.double().mean())
     return {"shape": list(counts), "cells": math.prod(counts), "kept_share_of_cells": share}

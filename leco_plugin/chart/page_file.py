@@ -8,6 +8,8 @@ import html
 from pathlib import Path
 from typing import Any
 
+from leco_plugin.scenes.whole_files import write_whole
+
 PAGE = """<!DOCTYPE html>
 <html><head><meta charset="utf-8"><title>{title}</title>
 <style>
@@ -42,7 +44,8 @@ def write_page_file(figure: Any, path: Path, title: str) -> Path:
 
     parts = {"library": get_plotlyjs(), "shown": figure.to_json()}
     packed = {name: _packed(text) for name, text in parts.items()}
-    path.write_text(PAGE.format(title=html.escape(title), **packed))
+    page = PAGE.format(title=html.escape(title), **packed).encode()
+    write_whole(path, lambda file: file.write(page))
     return path
 
 

@@ -22,6 +22,7 @@ from leco_plugin.evaluation.inspection import (
 )
 from leco_plugin.evaluation.scene_colours import SceneColours
 from leco_plugin.occupancy import CALIBRATED_AT, Occupancy
+from leco_plugin.scenes.whole_files import write_whole
 
 Array = NDArray[Any]
 
@@ -86,7 +87,8 @@ def draw(
     colour_bar.set_label("o(x)")
     lines = title_of(occupancy), _legend(occupancy, cameras, ground is not None)
     figure.suptitle("\n".join(" · ".join(parts) for parts in lines), fontsize=12)
-    figure.savefig(path, dpi=110)
+    kind = Path(path).suffix[1:].lower()
+    write_whole(Path(path), lambda file: figure.savefig(file, format=kind or None, dpi=110))
     return Path(path)
 
 

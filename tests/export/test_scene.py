@@ -14,6 +14,7 @@ import pytest
 import trimesh
 from ball_occupancy import CENTRE, RADIUS, ball
 
+from leco_plugin.evaluation.occupancy_picture import draw
 from leco_plugin.export import export
 from leco_plugin.export_folder import export_folder, in_words
 from leco_plugin.occupancy import Occupancy
@@ -207,3 +208,20 @@ def test_another_scene_gives_no_colours_and_no_start_for_splats(
         with pytest.raises(ValueError, match="0 of the 3 cameras that the occupancy names are in"):
             export(file, format, tmp_path / out, 16, data=scene)
     assert not export(file, "ply", tmp_path / "k.ply", 16)["photograph_colours"]
+
+
+def test_a_picture_that_a_full_disk_cuts_off_replaces_no_older_one(
+    file: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def cut_off(_: Any, target: Any, **__: Any) -> None:
+        with nullcontext(target) if hasattr(target, "write") else Path(target).open("wb") as out:
+            out.write(b"half")
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    picture = tmp_path / "out" / "occupancy.png"
+    picture.parent.mkdir()
+    picture.write_bytes(b"older")
+    monkeypatch.setattr("matplotlib.figure.Figure.savefig", cut_off)
+    with pytest.raises(OSError, match="No space left"):
+        draw(Occupancy.load(file), picture)
+    assert picture.read_bytes() == b"older" and [*picture.parent.iterdir()] == [picture]

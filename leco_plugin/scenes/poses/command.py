@@ -109,12 +109,12 @@ def _take_up(
             raise InputError(
                 f"--out {out} was begun with other {what}: give another folder, or delete it"
             )
+    if (out / "transforms.json").is_file():
+        report: dict[str, Any] = json.loads((out / REPORT).read_text())
+        return report
     write_whole(out / ASKED, lambda file: file.write(json.dumps(wanted).encode()))
     remove_parts(out)
-    if not (out / "transforms.json").is_file():
-        return None
-    report: dict[str, Any] = json.loads((out / REPORT).read_text())
-    return report
+    return None
 
 
 def _require_disk(out: Path, photographs: list[Photograph]) -> None:

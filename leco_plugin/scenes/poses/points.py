@@ -17,6 +17,7 @@ from nerfstudio.cameras.cameras import CameraType
 from numpy.typing import NDArray
 from PIL import Image
 
+from leco_plugin.cli_reports import check_place
 from leco_plugin.log import bar
 from leco_plugin.scenes.bounds import FEWEST_POINTS
 from leco_plugin.scenes.input_error import InputError, require
@@ -81,6 +82,7 @@ def find_points(data: Path, size: int = 1600, threads: int = 0) -> dict[str, Any
     if len(chosen) < FEWEST:
         raise InputError(f"{scene.path} has {len(chosen)} photographs; {FEWEST} or more are needed")
     load_pycolmap()
+    check_place("--data", scene.path.with_name(FILE))
     poses = np.array([scene.frames[number]["transform_matrix"] for number in chosen])[:, :3]
     centre = poses[:, :, 3].mean(axis=0)  # pycolmap loses digits of coordinates like UTM's
     poses[:, :, 3] -= centre

@@ -144,3 +144,12 @@ def test_pairs_by_pose_are_near_ones_that_look_the_same_way() -> None:
     assert all(one < other and (other - one) % 2 == 0 for one, other in pairs)
     assert (10, 12) in pairs and len(pairs) < 12 * len(poses)
     assert len(choose_posed_pairs(poses[:FEW]).pairs) == FEW * (FEW - 1) // 2
+
+
+def test_a_scene_that_cannot_be_written_to_is_refused_before_the_work(
+    bare: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("leco_plugin.cli_reports.os.access", lambda *_: False)
+    monkeypatch.setattr("leco_plugin.scenes.poses.points._copies", None)
+    with pytest.raises(ValueError, match="cannot be written to"):
+        find_points(bare)
