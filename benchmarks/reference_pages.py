@@ -1,4 +1,4 @@
-"""Writes `docs/commands.md` and `docs/options.md` from the commands and configs themselves.
+"""Writes `docs/commands.md`, `docs/options.md` and `docs/gifts.md` from the code itself.
 
 python benchmarks/reference_pages.py
 """
@@ -15,6 +15,7 @@ from collections.abc import Callable, Collection, Iterator
 from typing import Annotated, Any, Literal, get_args, get_origin, get_type_hints
 
 import checkout  # noqa: F401
+import gifts_page
 import tyro
 from page_parts import ROOT, table
 
@@ -179,4 +180,5 @@ def _line(text: str) -> str:
 if __name__ == "__main__":
     COMMANDS_PAGE.write_text(commands_page())
     OPTIONS_PAGE.write_text(options_page())
+    gifts_page.PAGE.write_text(gifts_page.page())
     sys.exit(0)

@@ -8,9 +8,11 @@ import re
 import shlex
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import gifts_page
 import gpu
 import gpu_paper
 import pytest
@@ -19,6 +21,8 @@ import tyro
 from nerfstudio.configs.base_config import MachineConfig
 from suite_minutes import minutes_together
 
+from leco_plugin.chart.contender import Contender
+from leco_plugin.chart.methods import contenders
 from leco_plugin.chart.protocol import FAST, SLOW, Protocol
 from leco_plugin.chart.suites import SUITES
 from leco_plugin.method_configs import ON_GPU
@@ -200,6 +204,34 @@ def test_the_published_tables_are_those_of_the_stored_results() -> None:
 def test_pages_of_commands_and_options_are_those_of_the_code() -> None:
     assert TEXTS["commands"] == reference_pages.commands_page()
     assert TEXTS["options"] == reference_pages.options_page()
+    assert TEXTS["gifts"] == gifts_page.page()
+
+
+def test_a_contender_that_lacks_a_gift_is_named_on_the_page_of_gifts() -> None:
+    whole, grid = contenders(["leco-ngp"], ["learned-occupancy", "occupancy-grid-64"])
+    lacking = {
+        "Opaque start": {"occupancy.opaque_start": False},
+        "Distances": {"occupancy.learning.termination": 0.0},
+        "Careful start": {"occupancy.learning.calibration.recheck_rays": 0},
+        "Codes": {"codes": "own"},
+    }
+    for gift, change in lacking.items():
+        other = replace(whole, name="Instant-NGP + poor", changes={**whole.changes, **change})
+        (line,) = _lines_of(gift, [whole, whole, other])
+        assert "poor" in line and "a learned row without it stands beside" in line
+        assert not _lines_of(gift, [whole, replace(whole, name="Instant-NGP + rich")])
+    rates = {"optimizers.fields.optimizer.lr": 0.5}
+    (line,) = _lines_of("Rates", [whole, replace(grid, settings=rates)])
+    assert "0.5" in line and "no learned row stands beside" in line
+
+
+def _lines_of(gift: str, rows: list[Contender]) -> list[str]:
+    """What the page says of a gift that not all rows have."""
+    return [
+        line
+        for line in gifts_page.page(rows).split("\n")
+        if line.startswith(f"- **{gift}**: ") and line not in gifts_page.HEAD
+    ]
 
 
 def test_the_site_builds_without_a_warning_and_fetches_nothing(tmp_path: Path) -> None:

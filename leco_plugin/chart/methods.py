@@ -34,8 +34,13 @@ LONGER = 4
 """Times as long as a host's own steps are long steps."""
 NGP_STEP = 2.0 * math.sqrt(3.0) / 1000.0
 """What nerfstudio's Instant-NGP has for a step of None, in the box of nerfstudio's readers."""
-NO_GIFTS = {"occupancy.opaque_start": False, "occupancy.learning.termination": 0.0}
-"""What takes from a learned occupancy the start and the sparse points that no grid is given."""
+NO_GIFTS = {
+    "occupancy.opaque_start": False,
+    "occupancy.learning.termination": 0.0,
+    "occupancy.learning.calibration.recheck_rays": 0,
+}
+"""Take from a learned occupancy what no grid is given: the opaque and the careful start, and the
+distances of sparse points."""
 SKIPPING_NOTHING = {"schedule.freeze": False, "front_to_back": True}
 """Never frozen; rendered front to back, as guided images are."""
 NEVER_FROZEN = Contender("LeCO, never frozen", "leco-occupancy", DENSE, SKIPPING_NOTHING)
@@ -169,6 +174,8 @@ def contender_of_host(method: str, sampler: str, host: Any) -> Contender | None:
         spec = registered_samplers()[GRID if sized else changes["occupancy.sampler"]]
         if (spec.proposal if proposes else spec.estimator) is None:
             return None
+        if sampler == DENSE and hasattr(host, "cone_angle"):  # as far as its own grid goes
+            changes["occupancy.options"] = {"levels": getattr(host, "grid_levels", 1)}
         if spec.gate_encoding is not None:
             changes["occupancy.learning.sizes.gate.encoding.kind"] = spec.gate_encoding
         if sized or sampler == GRID:

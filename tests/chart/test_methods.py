@@ -38,7 +38,7 @@ def test_a_learned_occupancy_without_gifts_has_neither_sparse_points_nor_an_opaq
     (one,) = contenders(["leco-ngp"], ["learned-occupancy-without-gifts"])
     occupancy: Any = config_of(one, Path("scene"), Path("runs")).pipeline.model.occupancy
     assert occupancy.sampler == "learned-occupancy" and not occupancy.opaque_start
-    assert occupancy.learning.termination == 0.0
+    assert occupancy.learning.termination == occupancy.learning.calibration.recheck_rays == 0
 
 
 def test_a_method_that_learns_itself_is_charted_as_it_is() -> None:
@@ -70,6 +70,11 @@ def test_an_occupancy_grid_has_the_cells_that_its_name_says_and_the_levels_of_th
     options = {"resolution": 96, "levels": ngp_host().grid_levels}
     assert one.changes == {"occupancy.sampler": "occupancy-grid", "occupancy.options": options}
     assert one.name == "Instant-NGP + grid 96³"
+
+
+def test_a_host_that_asks_every_sample_goes_as_far_as_its_own_grid() -> None:
+    (one,) = contenders(["leco-ngp"], ["dense"])
+    assert one.changes["occupancy.options"] == {"levels": ngp_host().grid_levels}
 
 
 def test_switch_nerf_uses_the_grid_that_it_fits_to_its_bounds() -> None:

@@ -1,0 +1,153 @@
+"""`docs/gifts.md`: what each contender of a chart is given, read from the configs of its runs."""
+
+from __future__ import annotations
+
+import inspect
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import checkout  # noqa: F401
+from nerfacc import OccGridEstimator
+from page_parts import ROOT, table
+
+from leco_plugin.chart.contender import (
+    DENSE,
+    GRID,
+    LEARNED,
+    LONG_STEPS,
+    WITHOUT_GIFTS,
+    Contender,
+    config_of,
+    short_names,
+)
+from leco_plugin.chart.methods import contenders
+from leco_plugin.evaluation.queries import WARM_UP
+from leco_plugin.hosts.guided import GuidedModelConfig
+from leco_plugin.hosts.guided_start import OWN_SAMPLER
+from leco_plugin.models.switch.field import SwitchNerfModelConfig
+from leco_plugin.samplers.registry import sampler_spec
+from leco_plugin.scenes.pixels.known_distances import KnownDistancePixelSamplerConfig
+
+PAGE = ROOT / "docs" / "gifts.md"
+WORDS = {"yes": "given", "-": "not"}
+HOSTS = ["leco-ngp", "leco-nerfacto", "leco-switch-nerf"]
+HEAD = f"""# Who gets what
+
+Each row of a chart trains for the same time on the same photographs. This page says what else each
+is given. What not all rows of a method have is named below its table, and whether a learned row
+without it stands beside, to show what the gift is worth.
+
+- **Distances**: while an occupancy is learned, rays end at the sparse points that they lead to.
+- **Bounds**: the scene's walls are found from sparse points.
+- **Opaque start**: the field begins with a density that makes what is kept of a ray opaque.
+- **Careful start**: skipping begins at a lower threshold, and its price is watched.
+- **Warm-up**: a grid asks all of its cells at first, for at most 1/{1 / WARM_UP:.0f} of a run.
+- **Rates** and **batch**: learning rates of the host, and what it shades in a step.
+- **Codes**: small ones begin at zero. Those of nerfstudio cost test views several dB.
+- **Front to back**: images leave out what lies behind opaque surfaces. *guided*: where that is
+  faster.
+
+This page is generated: `python benchmarks/reference_pages.py`.
+"""
+
+
+def compared() -> list[Contender]:
+    """The rows of charts by method, in every way that a method can be sampled."""
+    rows = contenders(["leco-occupancy", "leco-occupancy-never-frozen"])
+    rows += contenders(["leco-occupancy-homogeneous"])
+    samplers = [LEARNED, WITHOUT_GIFTS, OWN_SAMPLER, f"{GRID}-64", DENSE, LONG_STEPS]
+    return rows + contenders(HOSTS, samplers)
+
+
+def page(rows: Sequence[Contender] | None = None) -> str:
+    """The whole of `docs/gifts.md`, of these contenders or of all."""
+    parts, groups = [HEAD], dict[str, list[Contender]]()
+    for one in compared() if rows is None else rows:
+        groups.setdefault(one.method, []).append(one)
+    for method, group in groups.items():
+        names = short_names([one.name for one in group])
+        given = {name: gifts_of(one) for name, one in zip(names, group)}
+        cells = [[name, *gifts.values()] for name, gifts in given.items()]
+        head = " | ".join(["row", *next(iter(given.values()))])
+        learned = [name for name, one in zip(names, group) if one.sampler.startswith(LEARNED)]
+        parts += [f"## `{method}`\n", *table(head, cells), "", *missing(given, learned)]
+    return "\n".join(parts).rstrip() + "\n"
+
+
+def missing(given: dict[str, dict[str, str]], learned: Sequence[str]) -> list[str]:
+    """A line for each gift that not all rows have alike.
+
+    Args:
+        given: gifts of each row.
+        learned: the rows with a learned occupancy.
+    """
+    lines = []
+    for gift in next(iter(given.values())):
+        by_cell: dict[str, list[str]] = {}
+        for name, gifts in given.items():
+            by_cell.setdefault(gifts[gift], []).append(name)
+        if gift == "warm-up" or len(by_cell) < 2:
+            continue  # a warm-up is no gift to a row without a grid
+        most = max(by_cell, key=lambda cell: len(by_cell[cell]))
+        parts = [
+            f"{WORDS.get(cell, cell)} for {' and '.join(names)}"
+            for cell, names in by_cell.items()
+            if cell != most
+        ]
+        others = f"{WORDS.get(most, most)} for the others"
+        without = [name for name in learned if given[name][gift] != given[learned[0]][gift]]
+        beside = (
+            "a learned row without it stands beside" if without else "no learned row stands beside"
+        )
+        lines.append(f"- **{gift.capitalize()}**: {'; '.join([*parts, others])}; {beside}.")
+    return [*(lines or ["- All rows have the same."]), ""]
+
+
+def gifts_of(contender: Contender) -> dict[str, str]:
+    """What a contender is given, by the config of its run; a dash is nothing."""
+    config = config_of(contender, Path("scene"), Path("runs"))
+    pipeline: Any = config.pipeline
+    model, manager = pipeline.model, pipeline.datamanager
+    guided = isinstance(model, GuidedModelConfig)
+    host = model.host if guided else model
+    learner = model
+    if guided:
+        own = model.occupancy.sampler == OWN_SAMPLER
+        learns = not own and sampler_spec(model.occupancy.sampler).needs_occupancy
+        learner = model.occupancy.learning if learns else None
+    packed = guided and not hasattr(host, "num_proposal_samples_per_ray")
+    measured = isinstance(manager.pixel_sampler, KnownDistancePixelSamplerConfig)
+    rates = (f"{name} {group['optimizer'].lr:g}" for name, group in config.optimizers.items())
+    gifts: dict[str, bool] = {
+        "distances": learner is not None and measured and learner.termination > 0.0,
+        "bounds": learner is not None or hasattr(host, "bounds"),
+        "opaque start": packed and learner is not None and model.occupancy.opaque_start,
+        "careful start": packed and learner is not None and learner.calibration.recheck_rays > 0,
+    }
+    return {name: "yes" if given else "-" for name, given in gifts.items()} | {
+        "warm-up": _warm_up(model, host) if guided else "-",
+        "rates": ", ".join(rates),
+        "batch": _batch(pipeline),
+        "codes": model.codes if guided else "small",
+        "front to back": {True: "yes", None: "guided"}.get(getattr(model, "front_to_back", 0), "-"),
+    }
+
+
+def _batch(pipeline: Any) -> str:
+    """Samples or rays of a training step."""
+    samples = getattr(pipeline, "target_num_samples", None)
+    rays = pipeline.datamanager.train_num_rays_per_batch
+    return f"{rays} rays" if samples is None else f"{samples} samples"
+
+
+def _warm_up(model: GuidedModelConfig, host: Any) -> str:
+    """Steps of a grid's warm-up in a long run."""
+    sampler = model.occupancy.sampler
+    if isinstance(host, SwitchNerfModelConfig):
+        gridded = sampler == OWN_SAMPLER and host.sampling == "occupancy-grid"
+        return f"{host.sizes.grid_warmup_steps} steps" if gridded else "-"
+    gridded = sampler == GRID or (sampler == OWN_SAMPLER and hasattr(host, "grid_resolution"))
+    update: Callable[..., Any] = OccGridEstimator.update_every_n_steps
+    steps = inspect.signature(update).parameters["warmup_steps"].default
+    return f"{steps} steps" if gridded else "-"
