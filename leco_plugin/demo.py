@@ -131,7 +131,7 @@ def draw_chart(report: dict[str, Any], path: Path, theme: Theme = LIGHT) -> Path
         figure.suptitle(title, fontsize=14, fontweight="bold", x=0.01, ha="left")
         axes = figure.add_axes((0.11, 0.14, 0.55, 0.7))
         draw_curves(axes, lines, theme)
-        scene = f"Procedural city of {blocks} x {blocks} blocks, {where}, one seed"
+        scene = f"Procedural city of {blocks} x {blocks} blocks, {where}, one seed: no verdict"
         axes.set_title(scene, fontsize=11.5, loc="left")
         axes.set_xlabel("seconds of training")
         axes.set_ylabel("PSNR on unseen photographs, dB", fontsize=11)
