@@ -265,17 +265,12 @@ def write_grid(buffers: dict[str, Tensor], path: Path) -> None:
     write_whole(path, lambda file: torch.save(buffers, file))
 
 
-def _layers(resolution: int) -> int:
-    """Layers of cells that are asked about together."""
-    return max(1, POINTS_AT_ONCE // (STEPS * (STEPS * resolution + 1) ** 2))
-
-
 def _largest_in_cells(occupancy: Occupancy, box: Tensor, resolution: int) -> Iterator[Tensor]:
     """The largest o(x) probed in each cell of a box, some layers [k, n, n] at a time."""
     low, high = box[:3], box[3:]
     shares = torch.linspace(0.0, 1.0, STEPS * resolution + 1)
     x, y, z = (torch.lerp(low[axis], high[axis], shares) for axis in range(3))
-    layers = _layers(resolution)
+    layers = max(1, POINTS_AT_ONCE // (STEPS * (STEPS * resolution + 1) ** 2))
     for first in range(0, resolution, layers):
         last = min(first + layers, resolution)
         of_slab = x[STEPS * first : STEPS * last + 1]

@@ -112,7 +112,8 @@ def _render_rays(source: Source, model: LecoModel) -> Taught:
             "learn longer, with a larger --learn-steps and a new folder at --out"
         )
     volume = reached_volume(mixture, lesson.mapped, VOLUME_POINTS, seed=5)
-    return Taught(mixture, lesson, evidence, _map(mixture, evidence.positions), volume)
+    mapped = mixture.region.space.map(evidence.positions).clamp(-1.0, 1.0)
+    return Taught(mixture, lesson, evidence, mapped, volume)
 
 
 def lesson_of(source: Source, losses: GateLossConfig) -> Lesson:
@@ -121,10 +122,6 @@ def lesson_of(source: Source, losses: GateLossConfig) -> Lesson:
     assert mixture is not None
     taught = draw_training_rays(source, mixture.occupancy().eval(), TAUGHT_RAYS).rays
     return lesson_by(mixture, taught, losses, seen=0.0, rays_at_once=RAYS_AT_ONCE)
-
-
-def _map(mixture: Mixture, places: Tensor) -> Tensor:
-    return mixture.region.space.map(places).clamp(-1.0, 1.0)
 
 
 def measure(evidence: Evidence, scores: Tensor, of_volume: Tensor, lost: float) -> dict[str, Any]:

@@ -53,7 +53,10 @@ class Host(_Model):
         per ray of nerfstudio's own `instant-ngp`.
         """
         images = super().get_outputs_for_camera_ray_bundle(*args, **kwargs)
-        return {name: _as_drawable(image) for name, image in images.items()}
+        return {
+            name: image if image.is_floating_point() or image.dtype == torch.bool else image.float()
+            for name, image in images.items()
+        }
 
     def get_image_metrics_and_images(self, *args: Any, **kwargs: Any) -> Any:
         """Without an LPIPS that could not be computed: ns-eval would write its NaN, no JSON."""
@@ -64,11 +67,6 @@ class Host(_Model):
             if "lpips" not in name or bool(torch.isfinite(torch.as_tensor(value)))
         }
         return kept, images
-
-
-def _as_drawable(image: Tensor) -> Tensor:
-    counts = not image.is_floating_point() and image.dtype != torch.bool
-    return image.float() if counts else image
 
 
 class GuidedHost(DrawnInViewer, Host):

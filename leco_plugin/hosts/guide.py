@@ -154,10 +154,6 @@ class Guide(nn.Module):
         threshold = self.watched.lower if shown is None else shown
         return occupancy if threshold is None else occupancy.with_threshold(threshold)
 
-    def the_occupancy_skips(self) -> bool:
-        """Whether it skips anything; at threshold 0 it does not, and need not be asked."""
-        return not self.needs_occupancy or self.the_occupancy().threshold > 0.0
-
     def same_frame(self) -> bool:
         """Whether host and occupancy share their coordinates."""
         return torch.equal(self.frame, torch.eye(3, 4, device=self.frame.device))

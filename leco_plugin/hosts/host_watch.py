@@ -160,8 +160,8 @@ class HostWatch:
         if guide.kept is None or self.config.recheck_rays == 0:
             return
         self.watch.state, self.ended_probation = guide.watched, None
-        kept, skips = float(guide.kept), guide.the_occupancy_skips()
-        finding = self.watch.after_step(step, seconds, kept, skips)
+        skips = not guide.needs_occupancy or guide.the_occupancy().threshold > 0.0
+        finding = self.watch.after_step(step, seconds, float(guide.kept), skips)
         low = self.ended_probation
         if low is not None:  # the time that was measured holds the building of a sampler
             self.watch.put_off(step)

@@ -198,7 +198,9 @@ class HMoEField(nn.Module):
             sigmas [N] float32, per half extent of the scene; features [N, width].
         """
         if native.answers_without_graph(mapped, self.projection.weight) and self.suits_native():
-            hidden, raw = self._native_densities(mapped, routes, gate_values)
+            features, layers = self.encoding(mapped), self.config.experts.layers
+            factors, parts = gate_values.float(), self.native_parts()
+            hidden, raw = native.field_densities(features, routes, factors, parts, layers)
             return self._sigmas(raw, routes), hidden
         count = len(mapped)
         projected = self.projection(self.encoding(pad_to_steady_size(mapped)))
@@ -219,13 +221,6 @@ class HMoEField(nn.Module):
         plain = plain and experts.layers > 1
         widest = max(experts.width, self.encoding.out_dim, self.config.color_width)
         return plain and widest <= native.WIDEST
-
-    def _native_densities(
-        self, mapped: Tensor, routes: Tensor, gate_values: Tensor
-    ) -> tuple[Tensor, Tensor]:
-        features, layers = self.encoding(mapped), self.config.experts.layers
-        parts = self.native_parts()
-        return native.field_densities(features, routes, gate_values.float(), parts, layers)
 
     def native_parts(self) -> list[Tensor | None]:
         """Weights and biases as `networks.c` takes them; None for those of an expert that left."""

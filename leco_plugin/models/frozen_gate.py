@@ -18,7 +18,7 @@ import torch
 from torch import Tensor, nn
 
 from leco_plugin.models.compute.dispatch import filled_size
-from leco_plugin.models.encodings import Encoding, FrequencyEncoding
+from leco_plugin.models.encodings import FrequencyEncoding
 from leco_plugin.models.gate import EMPTY, Gate
 from leco_plugin.samplers.base import Snapshot
 
@@ -66,16 +66,12 @@ def occupancy_of(gate: Gate, mapped: Tensor, dtype: torch.dtype) -> Tensor:
         mapped = torch.nn.functional.pad(mapped.T, (0, filling)).T
     with torch.no_grad(), torch.autocast("cpu", enabled=False):
         frozen = frozen_gate(gate, dtype)
-        features = _encoded(gate.encoding, mapped, dtype)
+        encoding = gate.encoding
+        is_known = isinstance(encoding, FrequencyEncoding)
+        features = encoding(mapped, dtype) if is_known else encoding(mapped).to(dtype)
         for weight, bias in frozen.layers:
             features = _layer(features, weight, bias)
         return _occupancy(_logits(frozen, features, gate))[:count]
-
-
-def _encoded(encoding: Encoding, mapped: Tensor, dtype: torch.dtype) -> Tensor:
-    if isinstance(encoding, FrequencyEncoding):
-        return encoding(mapped, dtype)
-    return encoding(mapped).to(dtype)
 
 
 def _layer(features: Tensor, weight: Tensor, bias: Tensor) -> Tensor:

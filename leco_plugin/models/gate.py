@@ -125,7 +125,9 @@ class Gate(nn.Module):
     def forward(self, mapped: Tensor) -> Tensor:
         """Mapped positions [N, 3] in [-1, 1] to logits [N, 1 + n] float32; 0 is emptiness."""
         if self.answers_natively(mapped):
-            return self._native_logits(mapped)
+            scales: Tensor = self.encoding.scales  # type: ignore[union-attr, assignment]
+            parts = self.native_parts()
+            return native.gate_logits(mapped, scales, FRESH[torch.float32], parts, self.norm.eps)
         features = self.encoding(pad_to_steady_size(mapped))
         for layer in self.hidden:
             features = torch.relu(layer(features))
@@ -136,11 +138,6 @@ class Gate(nn.Module):
         widest = max(self.encoding.out_dim, self.config.width, 1 + self.config.scene_experts)
         known = isinstance(self.encoding, FrequencyEncoding) and widest <= native.WIDEST
         return known and native.answers_without_graph(mapped, self.head.weight)
-
-    def _native_logits(self, mapped: Tensor) -> Tensor:
-        scales: Tensor = self.encoding.scales  # type: ignore[union-attr, assignment]
-        parts = self.native_parts()
-        return native.gate_logits(mapped, scales, FRESH[torch.float32], parts, self.norm.eps)
 
     def native_parts(self) -> list[Tensor]:
         """Weights and biases as `networks.c` takes them."""

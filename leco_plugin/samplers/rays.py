@@ -1,8 +1,8 @@
 """Rays, the rule by which they are marched, and their candidates.
 
 Nothing is stored for a candidate: its edges follow from its number. Edge k has a closed form,
-linear while the step is constant, geometric after, so that no candidate depends on another, and
-neighbours share their edge exactly.
+linear while the step is constant, geometric after. No candidate depends on another, and neighbours
+share their edge exactly.
 """
 
 from __future__ import annotations

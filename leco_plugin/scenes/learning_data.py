@@ -70,13 +70,9 @@ class LearningData:
     def note_views(self, region: Region) -> None:
         """Tells a region what the training images see of it."""
         region.look(*self.covering_rays())
-        region.see(*self.rays_of_all_images())
-
-    def rays_of_all_images(self) -> tuple[Tensor, Tensor]:
-        """As `covering_rays`, fewer of an image where there are many, but of each."""
         cameras = self.manager.train_dataset.cameras
-        rays = covering_rays(cameras, rays_a_side(len(cameras)), len(cameras))
-        return rays[0].reshape(-1, 3), rays[1].reshape(-1, 3)
+        rays = covering_rays(cameras, rays_a_side(len(cameras)), len(cameras))  # of each image some
+        region.see(rays[0].reshape(-1, 3), rays[1].reshape(-1, 3))
 
     def prepare_batch(self, factor: float, distances: bool, set_aside: int = 0) -> None:
         """Sets the next batch; one that is drawn elsewhere stays as it is.

@@ -235,7 +235,9 @@ def convert_masks(
         if bool(((values > 0) & ~seen).any()):
             grey.append(path)
         fitting = _fit(seen, size, path)
-        as_it_is = fitting is seen and bool((seen == (values > 0)).all()) and _is_grey(path)
+        header = header_of(path)
+        is_grey = header.mode == "L" and not header.transparent
+        as_it_is = fitting is seen and bool((seen == (values > 0)).all()) and is_grey
         made = partial(Image.fromarray, fitting.astype(np.uint8) * 255)
         found.append(path if as_it_is else derived.get(path, f"mask {size}", made))
         shown.append(bool(fitting.any()))
@@ -318,11 +320,6 @@ def _values(path: Path) -> NDArray[np.uint8]:
 def _is_seen(values: NDArray[np.uint8]) -> NDArray[np.bool_]:
     """Which greys [H, W] of a mask are of pixels that are seen."""
     return np.asarray(values >= HALF if values.max() >= HALF else values > 0)
-
-
-def _is_grey(path: Path) -> bool:
-    with Image.open(path) as image:
-        return image.mode == "L" and "transparency" not in image.info
 
 
 def _fit(seen: NDArray[np.bool_], size: tuple[int, int], path: Path) -> NDArray[np.bool_]:

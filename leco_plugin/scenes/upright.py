@@ -58,7 +58,8 @@ def turn_to_upright(poses: Tensor, points: Tensor | None) -> Tensor | None:
         for found in candidates
         if found is not None
     ]
-    ups = [up for up in ups if _look_down(looks, up) and _fly_over(poses, points, up)]
+    ups = [up for up in ups if float((looks @ up < DOWN).double().mean()) >= MOSTLY]
+    ups = [up for up in ups if _fly_over(poses, points, up)]
     if not ups or any(float(up[2]) > UPRIGHT for up in ups):
         return None
     return rotation_matrix_between(ups[0].float(), torch.tensor([0.0, 0.0, 1.0]))
@@ -76,10 +77,6 @@ def turned(outputs: DataparserOutputs, turn: Tensor) -> DataparserOutputs:
         points = torch.as_tensor(outputs.metadata[POINTS])
         outputs.metadata[POINTS] = points @ turn.to(points).T
     return outputs
-
-
-def _look_down(looks: Tensor, up: Tensor) -> bool:
-    return float((looks @ up < DOWN).double().mean()) >= MOSTLY
 
 
 def _fly_over(poses: Tensor, points: Tensor | None, up: Tensor) -> bool:

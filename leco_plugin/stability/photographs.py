@@ -17,7 +17,7 @@ import json
 import os
 import shutil
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -120,12 +120,6 @@ STAGES: dict[str, Stage] = {
     "outline": Stage((*_irregular_floor(), Box((-2.6, -0.6, 0.0), (-1.4, 0.6, 1.2), BRICK))),
     "indoors": Stage(_room()),
 }
-
-
-def moving_car(number: int) -> Shape:
-    """What drives through some pictures, and is never twice in the same place."""
-    x = -3.0 + (1.7 * number) % 6.0
-    return Box((x - 0.5, -0.35, 0.0), (x + 0.5, 0.25, 0.55), CAR)
 
 
 RADIUS = 5.0
@@ -322,7 +316,11 @@ def _take_pictures(stage: Stage, capture: Capture, folder: Path) -> None:
     shots = shots_of(capture)
     taken = []
     for number, shot in enumerate(shots):
-        there = stage.with_shapes(moving_car(number)) if shot.moving else stage
+        there = stage
+        if shot.moving:  # a car, never twice in the same place
+            x = -3.0 + (1.7 * number) % 6.0
+            car = Box((x - 0.5, -0.35, 0.0), (x + 0.5, 0.25, 0.55), CAR)
+            there = replace(stage, shapes=(*stage.shapes, car))
         taken.append(photograph(there, shot.pose, capture.lens(shot.size)))
     views = [
         View(shot.pose, capture.lens(shot.size), seen.depth) for shot, seen in zip(shots, taken)

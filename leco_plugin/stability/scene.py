@@ -7,7 +7,7 @@ behind it, so that both are as exact as a picture of eight bits can show. Positi
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -168,10 +168,6 @@ class Stage:
     fog: Fog | None = None
     sky: bool = False
     """Whether a sky is behind everything; without one, rays that meet nothing are transparent."""
-
-    def with_shapes(self, *more: Shape) -> Stage:
-        """The same with more shapes in it."""
-        return replace(self, shapes=(*self.shapes, *more))
 
 
 class Seen(NamedTuple):

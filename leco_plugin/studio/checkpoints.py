@@ -180,14 +180,10 @@ def found_around(named: Path, folder: Path) -> Path | None:
             if not os.path.exists(found) or found.resolve() in around:
                 continue
             elsewhere = found.is_file() and parts[first:] == parts[-1:] and place != folder
-            if not elsewhere and not holds_runs(found):
+            of_runs = any(found.glob("*/*/config.yml"))  # nerfstudio names it as the data
+            if not elsewhere and not of_runs:
                 return found
     return None
-
-
-def holds_runs(folder: Path) -> bool:
-    """Whether this is nerfstudio's folder of the runs on some data, which has the data's name."""
-    return any(folder.glob("*/*/config.yml"))
 
 
 def checkpoints_of(config: Any) -> Path:

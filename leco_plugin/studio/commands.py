@@ -11,9 +11,9 @@ import re
 import shutil
 import sys
 import warnings
-from collections.abc import Iterator
 from itertools import pairwise
 from pathlib import Path
+from traceback import walk_tb
 from types import FrameType, TracebackType
 from typing import Any
 
@@ -118,7 +118,7 @@ def line_of(error: BaseException) -> str | None:
     """What a command says of an error; None where only a traceback explains it."""
     if isinstance(error, InputError | TrainingStopped):
         return str(error)
-    frames = list(_frames(error.__traceback__))
+    frames = [frame for frame, _ in walk_tb(error.__traceback__)]
     if (views := _too_few_views(frames)) is not None:
         return (
             "ns-render interpolate flies from one photograph to the next, and there are "
@@ -139,13 +139,6 @@ def _too_few_views(frames: list[FrameType]) -> int | None:
         ):
             return len(frame.f_locals["poses"])
     return None
-
-
-def _frames(trace: TracebackType | None) -> Iterator[FrameType]:
-    """Outermost first."""
-    while trace is not None:
-        yield trace.tb_frame
-        trace = trace.tb_next
 
 
 def _config_read_in(frame: FrameType) -> Path | None:

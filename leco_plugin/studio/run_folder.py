@@ -51,7 +51,8 @@ def claim(folder: Path, checkpoints: Path, load_from: Path | None) -> str | None
             atexit.register(_release_all, os.getpid())
         _held[place] = held
     theirs = [path for path in checkpoints.glob("*.ckpt") if step_of(path) >= 0]
-    if theirs and (load_from is None or not _goes_on(load_from, checkpoints)):
+    source = None if load_from is None else load_from.resolve()
+    if theirs and (source is None or checkpoints.resolve() not in (source, source.parent)):
         release(folder)
         return f"{folder} holds an earlier run, with which this one does not go on"
     return None
@@ -130,12 +131,6 @@ def _unlock(folder: Path, held: int) -> None:
         if fcntl is not None and _lies_in(folder, held):
             (folder / LOCK).unlink()
     os.close(held)
-
-
-def _goes_on(load_from: Path, checkpoints: Path) -> bool:
-    """Whether what a run resumes from is the folder in which it saves, or lies there."""
-    source = load_from.resolve()
-    return checkpoints.resolve() in (source, source.parent)
 
 
 CONFIG = "config.yml"

@@ -141,7 +141,9 @@ class RunProgress:
         where = TrainingCallbackLocation
         trainer.callbacks.append(TrainingCallback([where.AFTER_TRAIN_ITERATION], self.after_step))
         trainer.callbacks.append(TrainingCallback([where.AFTER_TRAIN], self.finish))
-        self._say_where()
+        folder, viewer = trainer.base_dir, trainer.viewer_state
+        say(f"run: {escape(str(folder))}" + (f", details in {LOG}" if on_screen() else ""))
+        say_all(getattr(viewer, "viewer_info", None) or ())
 
     def __enter__(self) -> RunProgress:
         self.began = time.monotonic()
@@ -149,11 +151,6 @@ class RunProgress:
 
     def __exit__(self, *_: Any) -> None:
         self._bar.close()
-
-    def _say_where(self) -> None:
-        folder, viewer = self.trainer.base_dir, self.trainer.viewer_state
-        say(f"run: {escape(str(folder))}" + (f", details in {LOG}" if on_screen() else ""))
-        say_all(getattr(viewer, "viewer_info", None) or ())
 
     def after_step(self, step: int) -> None:
         """Measures where that is due, and shows how far the run is.
@@ -194,7 +191,8 @@ class RunProgress:
         if occupancy.exists():
             say(f"  occupancy  {escape(str(occupancy))}, {occupancy.stat().st_size / 1e3:.0f} kB")
         say("next:")
-        for command in next_commands(folder, occupancy.exists(), _has_tests(self.trainer)):
+        tested = bool(self.trainer.pipeline.datamanager.eval_dataset)
+        for command in next_commands(folder, occupancy.exists(), tested):
             say(f"  {escape(command)}")
 
 
@@ -228,7 +226,3 @@ def _phase(trainer: Any) -> str:
     if frozen is None:
         return "guided" if hasattr(model, "leco_guide") else ""
     return "guided" if bool(frozen) else "learning the occupancy"
-
-
-def _has_tests(trainer: Any) -> bool:
-    return bool(trainer.pipeline.datamanager.eval_dataset)

@@ -206,7 +206,9 @@ def write_city(
         return out_dir
     city = City(config)
     files = LAYOUTS[layout](views_of(city, capture), capture.lens, config.seed)
-    unfinished = _unfinished(out_dir, text)
+    drawn = f"{leco_plugin.__version__} {text}".encode()  # another version may draw it otherwise
+    digest = hashlib.blake2b(drawn, digest_size=4).hexdigest()
+    unfinished = out_dir.parent / f".{out_dir.name}-unfinished-{digest}"
     unfinished.mkdir(parents=True, exist_ok=True)
     try:
         _photograph(city, files, unfinished, progress)
@@ -220,13 +222,6 @@ def write_city(
             raise
         shutil.rmtree(unfinished, ignore_errors=True)
     return out_dir
-
-
-def _unfinished(out_dir: Path, description: str) -> Path:
-    """Where a city of this description waits to be completed, if this version has drawn it."""
-    drawn = f"{leco_plugin.__version__} {description}".encode()
-    digest = hashlib.blake2b(drawn, digest_size=4).hexdigest()
-    return out_dir.parent / f".{out_dir.name}-unfinished-{digest}"
 
 
 def _photograph(city: City, layout: Layout, folder: Path, progress: bool) -> None:

@@ -46,8 +46,8 @@ def choose_pairs(names: Sequence[str], exifs: Sequence[Exif], places: NDArray[np
     order = capture_order(names, exifs)
     steps = {*range(1, NEXT + 1), *(2**power for power in range(count.bit_length()))}
     known = np.isfinite(places[:, 0])
-    spread = _spread(places[known, :2]) if known.any() else 0.0
-    if known.mean() >= 0.5 and spread >= WIDE:
+    apart = places[known, :2] - np.median(places[known, :2], axis=0) if known.any() else 0.0
+    if known.mean() >= 0.5 and np.sqrt(2.0 * np.mean(np.square(apart))) >= WIDE:
         numbers = known.nonzero()[0]
         near = _near(places[numbers, :2], np.arange(NEIGHBOURS))
         found = {(int(numbers[one]), int(numbers[other])) for one, other in near}
@@ -89,17 +89,12 @@ def capture_order(names: Sequence[str], exifs: Sequence[Exif]) -> list[int] | No
     counted = [re.findall(r"\d+", name.rsplit(".", 1)[0]) for name in names]
     if not all(counted) or len({parts[-1] for parts in counted}) * 2 <= len(names):
         return None
-    return sorted(range(len(names)), key=lambda number: _by_number(names[number]))
 
+    def by_value(number: int) -> list[tuple[int, str]]:
+        parts = re.split(r"(\d+)", names[number])
+        return [(int(part), "") if part.isdecimal() else (-1, part) for part in parts]
 
-def _by_number(name: str) -> list[tuple[int, str]]:
-    """For sorting: digits by their value."""
-    parts = re.split(r"(\d+)", name)
-    return [(int(part), "") if part.isdecimal() else (-1, part) for part in parts]
-
-
-def _spread(places: NDArray[np.float64]) -> float:
-    return float(np.sqrt(((places - np.median(places, axis=0)) ** 2).sum(axis=1).mean()))
+    return sorted(range(len(names)), key=by_value)
 
 
 def _near(
