@@ -182,7 +182,8 @@ def test_the_gain_is_that_over_the_best_host_without_one() -> None:
     )
     assert said == (
         "Beside leco-nerfacto + own, the best host without a learned occupancy, `leco-occupancy` "
-        "is +3.0 dB, one seed: no verdict. It renders 4.0 times as fast, with 4 times fewer queries."
+        "is +3.0 dB, one seed: no verdict. It renders 4.0 times as fast, with 4 times fewer "
+        "queries."
     )
 
 
