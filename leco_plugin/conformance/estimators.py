@@ -11,21 +11,29 @@ import torch
 from torch import Tensor, nn
 
 from leco_plugin.conformance.rules import Broken, checks, require
-from leco_plugin.conformance.samplers import SamplerCase, check_gradients, check_tensor, devices
+from leco_plugin.conformance.samplers import (
+    SamplerCase,
+    check_gradients,
+    check_shifts,
+    check_tensor,
+    devices,
+)
 from leco_plugin.conformance.scene import (
     BACKGROUND,
     EVERYTHING,
+    LONG_STEP,
+    MANY,
     MARGIN,
     PARTS,
     SLAB,
     STEP,
+    TWO,
     Field,
     Rays,
     Slab,
     among,
     box,
     check_intervals,
-    check_order,
     covered,
     crossing,
     cut_short,
@@ -138,16 +146,18 @@ def sorted_disjoint_inside(case: EstimatorCase) -> None:
     sampler, rays = case.shared(SLAB), cut_short()
     for cone_angle in (0.0, 0.02):
         check_intervals(rays, case.sample(sampler, rays, cone_angle=cone_angle))
-    narrower = rays._replace(t_min=rays.t_min.clamp(min=NEAR), t_max=rays.t_max.clamp(max=FAR))
-    check_intervals(narrower, case.sample(sampler, rays, near_plane=NEAR, far_plane=FAR))
-    check_order(case.sample(sampler.train(), rays))
+    many = cut_short(MANY)
+    narrower = many._replace(t_min=many.t_min.clamp(min=NEAR), t_max=many.t_max.clamp(max=FAR))
+    planes: dict[str, Any] = {"near_plane": NEAR, "far_plane": FAR, "render_step_size": LONG_STEP}
+    for training in (False, True):
+        check_intervals(narrower, case.sample(sampler.train(training), many, **planes))
 
 
 @checks("packing-consistent", "estimator")
 def packing_consistent(case: EstimatorCase) -> None:
     """Rays come in order, by indices that `pack_info` can turn into starts and counts."""
-    rays = crossing()
-    ray_indices = case.sample(case.shared(SLAB), rays)[0]
+    rays = crossing(MANY)
+    ray_indices = case.sample(case.shared(SLAB), rays, render_step_size=LONG_STEP)[0]
     n_rays = len(rays.origins)
     require(ray_indices.dtype == torch.int64, f"ray_indices is {ray_indices.dtype}, not int64")
     low, high = (int(bound) for bound in ray_indices.aminmax())
@@ -161,6 +171,34 @@ def packing_consistent(case: EstimatorCase) -> None:
     counts = pack_info(ray_indices, n_rays)[:, 1]
     unpacked = torch.arange(n_rays, device=counts.device).repeat_interleave(counts)
     require(unpacked.equal(ray_indices), "pack_info does not give the ray indices back")
+
+
+@checks("stratified-in-training", "estimator")
+def stratified_in_training(case: EstimatorCase) -> None:
+    """Samples shift by a share of a step in training, which is uniform over the rays."""
+    check_shifts(case)
+    sampler, rays = case.shared(EVERYTHING).train(), crossing(MANY)
+    ray_indices, t_starts, _ = in_order(case.sample(sampler, rays, render_step_size=LONG_STEP))
+    shares = ((t_starts - rays.t_min[ray_indices]) / LONG_STEP).remainder(1.0)
+    first = torch.searchsorted(ray_indices, ray_indices.unique())
+    _check_uniform(shares[first])
+
+
+def _check_uniform(shares: Tensor) -> None:
+    """Raises unless numbers [N] are spread over [0, 1) as uniform random numbers are.
+
+    By the statistic of Kolmogorov and Smirnov, which for these exceeds 4 / sqrt(N) once in 10^13.
+    """
+    n = len(shares)
+    even = torch.arange(n + 1) / n
+    found = shares.cpu().sort().values
+    apart = float(torch.maximum(found - even[:-1], even[1:] - found).max())
+    bound = 4.0 / n**0.5
+    require(
+        apart <= bound,
+        f"the shifts of {n} rays, in steps, are {apart:.2g} away from uniform random numbers, "
+        f"which are {bound:.2g} away at most",
+    )
 
 
 @checks("zero-samples-well-formed", "estimator")
@@ -199,16 +237,21 @@ LOWEST_CAP = 0.1
 def skips_only_what_it_may(case: EstimatorCase) -> None:
     """What is plainly kept is sampled; what is plainly skipped is not, where the gate decides."""
     for training in (False, True):
-        for rays in (crossing(), stretched()):
-            samples = case.sample(case.shared(SLAB).train(training), rays)
+        for scene, step, rays in (
+            (SLAB, STEP, crossing()),
+            (SLAB, STEP, stretched()),
+            (TWO, LONG_STEP, crossing(MANY)),
+        ):
+            sampler = case.shared(scene).train(training)
+            samples = case.sample(sampler, rays, render_step_size=step)
             if case.needs_occupancy:
-                _check_skipped_is_not(rays, samples)
-            _check_kept_is_sampled(rays, samples)
+                _check_skipped_is_not(rays, samples, scene)
+            _check_kept_is_sampled(rays, samples, scene, step, training)
 
 
-def _check_skipped_is_not(rays: Rays, samples: Samples) -> None:
+def _check_skipped_is_not(rays: Rays, samples: Samples, scene: Slab) -> None:
     positions = rays.at(samples[0], (samples[1] + samples[2]) / 2.0)
-    outside = SLAB.depth(positions) < -MARGIN
+    outside = scene.depth(positions) < -MARGIN
     require(
         not bool(outside.any()),
         f"{int(outside.sum())} of {len(outside)} samples lie where the occupancy is empty"
@@ -216,16 +259,26 @@ def _check_skipped_is_not(rays: Rays, samples: Samples) -> None:
     )
 
 
-def _check_kept_is_sampled(rays: Rays, samples: Samples) -> None:
-    """Raises unless every candidate that lies plainly in the slab is in a sample's interval."""
-    ray_indices, t_starts, t_ends = dense(rays)
+def _check_kept_is_sampled(
+    rays: Rays, samples: Samples, scene: Slab = SLAB, step: float = STEP, shifted: bool = False
+) -> None:
+    """Raises unless every candidate that lies plainly in a slab is in a sample's interval.
+
+    Args:
+        shifted: whether the samples are: their middles are half a step away then, and the first
+            and last steps of a ray may have none.
+    """
+    ray_indices, t_starts, t_ends = dense(rays, step=step)
     middles = (t_starts + t_ends) / 2.0
     positions = rays.at(ray_indices, middles)
-    missing = (SLAB.depth(positions) > MARGIN) & ~covered(ray_indices, middles, samples)
+    from_ends = torch.minimum(middles - rays.t_min[ray_indices], rays.t_max[ray_indices] - middles)
+    sought = scene.depth(positions) > MARGIN + shifted * step / 2.0
+    sought &= from_ends > shifted * step
+    missing = ~covered(ray_indices[sought], middles[sought], samples)
     require(
         not bool(missing.any()),
         f"{int(missing.sum())} of {len(missing)} places are not sampled although they are occupied"
-        + _first(positions[missing]),
+        + _first(positions[sought][missing]),
     )
 
 

@@ -148,13 +148,17 @@ class Run:
         self.model.train()
         self._call(step, Location.BEFORE_TRAIN_ITERATION)
         self.optimizers.zero_grad_all()
-        loss = loss_of(self.model, bundle(), batch())
+        loss = self.loss(step)
         loss.backward()  # type: ignore[no-untyped-call]
         self.optimizers.optimizer_step_all()
         for scheduler in self.optimizers.schedulers.values():
             scheduler.step()
         self._call(step, Location.AFTER_TRAIN_ITERATION)
         return float(loss.detach())
+
+    def loss(self, step: int) -> Tensor:
+        """The loss of a step."""
+        return loss_of(self.model, bundle(), batch())
 
     def _call(self, step: int, location: TrainingCallbackLocation) -> None:
         for callback in self.callbacks:

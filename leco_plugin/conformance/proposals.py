@@ -8,7 +8,13 @@ import torch
 from torch import Tensor, nn
 
 from leco_plugin.conformance.rules import Broken, checks, require
-from leco_plugin.conformance.samplers import SamplerCase, check_gradients, check_tensor, devices
+from leco_plugin.conformance.samplers import (
+    SamplerCase,
+    check_gradients,
+    check_shifts,
+    check_tensor,
+    devices,
+)
 from leco_plugin.conformance.scene import (
     BACKGROUND,
     EVERYTHING,
@@ -235,6 +241,12 @@ def chords(rays: Rays) -> tuple[Tensor, Tensor]:
     first, last = inside.int().argmax(dim=1), len(t) - 1 - inside.flip(1).int().argmax(dim=1)
     met = inside.any(dim=1)
     return t[first] * met, t[last] * met
+
+
+@checks("stratified-in-training", "proposal")
+def stratified_in_training(case: ProposalCase) -> None:
+    """Samples shift in training."""
+    check_shifts(case)
 
 
 @checks("all-kept-equals-dense", "proposal")

@@ -174,8 +174,9 @@ RULES = (
     Rule(
         "stratified-in-training",
         "a field that is always asked at the same places learns bands between them.",
-        "shift each ray's samples by a random share of a step when stratified is set "
-        "(estimator) or self.training is (proposal), and keep them between near and far.",
+        "shift each ray's samples by a random share of a step of its own, uniform in [0, 1), when "
+        "stratified is set (estimator) or self.training is (proposal), and keep them between near "
+        "and far.",
     ),
     Rule(
         "skips-only-what-it-may",
@@ -297,6 +298,12 @@ RULES = (
         "calibration has measured that.",
         "let the sampler leave candidates out and move none, hand out all that it keeps, "
         "and cover each ray from its near to its far end where everything is occupied.",
+    ),
+    Rule(
+        "held-out-images-teach-nothing",
+        "a figure on test images says nothing if they were trained on.",
+        "have next_train draw from train_dataset alone, read eval_dataset in no training step or "
+        "callback, and let the data parser give no image to both splits.",
     ),
     Rule(
         "resumes-where-it-stopped",

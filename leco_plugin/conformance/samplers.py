@@ -137,9 +137,8 @@ def deterministic_in_eval(case: SamplerCase) -> None:
     require(same(one, other), "two calls in evaluation mode return different samples")
 
 
-@checks("stratified-in-training", *BOTH)
-def stratified_in_training(case: SamplerCase) -> None:
-    """Samples shift at random in training, and stay between the ends of each ray."""
+def check_shifts(case: SamplerCase) -> None:
+    """Raises unless samples shift in training, and stay between the ends of each ray."""
     sampler, rays = case.shared(SLAB).train(), cut_short()
     one, other = (case.sample(sampler, rays, seed=seed) for seed in (1, 2))
     require(not same(one, other), "two calls in training return the same samples")

@@ -7,8 +7,9 @@ is saved and loaded like any other. Samples on the rays are compared at the end 
 from __future__ import annotations
 
 import functools
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import NamedTuple, cast
 
 import torch
 from torch import Tensor, nn
@@ -34,7 +35,10 @@ CENTRE, HALF = (0.5, -1.0, 2.0), 1.5
 """The box: neither centred nor of unit size, so that a forgotten mapping is noticed."""
 DISTANCE = 2.0 * HALF
 """From the centre of the box to every ray's origin."""
-STEP = 0.05
+STEP, LONG_STEP = 0.05, 0.25
+"""World units. With long steps a ray has one or two samples in each part of `TWO`."""
+MANY = 20_000
+"""Rays of a batch as a host on a GPU has it: what goes wrong on few rays, or in pieces, shows."""
 MARGIN = 0.08
 """World units. Deeper than this inside what is kept is plainly inside, farther off is plainly
 outside: wider than a cell of a grid of 128, and than what a rounding decides."""
@@ -80,9 +84,9 @@ def crossing(n_rays: int = 48) -> Rays:
     return Rays(torch.tensor(CENTRE) + DISTANCE * outward, directions, t_min, t_max)
 
 
-def cut_short() -> Rays:
+def cut_short(n_rays: int = 48) -> Rays:
     """The same rays, which begin and end inside the box."""
-    rays = crossing()
+    rays = crossing(n_rays)
     spread = torch.linspace(0.0, 0.4, len(rays.t_min))
     return rays._replace(t_min=DISTANCE - 0.8 + spread, t_max=DISTANCE + 0.8 - spread)
 
@@ -105,20 +109,23 @@ def without_samples() -> dict[str, Rays]:
 
 @dataclass(frozen=True)
 class Slab:
-    """Occupied is what lies in the box and within a distance of a plane through its middle.
+    """Occupied is what lies in the box and within a distance of one of two parallel planes.
 
     Attributes:
-        normal: of the plane, of length 1.
+        normal: of the planes, of length 1.
         half_width: in half extents of the box.
+        offset: of each plane from the middle of the box, in half extents; 0 is one plane.
     """
 
     normal: tuple[float, float, float]
     half_width: float
+    offset: float = 0.0
 
     def depth(self, positions: Tensor) -> Tensor:
         """How deep positions [..., 3] lie inside, world units, [...]; negative outside."""
         offsets = positions - positions.new_tensor(CENTRE)
-        from_plane = (offsets @ positions.new_tensor(self.normal)).abs()
+        from_middle = (offsets @ positions.new_tensor(self.normal)).abs()
+        from_plane = (from_middle - self.offset * HALF).abs()
         return torch.minimum(self.half_width * HALF - from_plane, HALF - offsets.abs().amax(dim=-1))
 
     def density(self, positions: Tensor) -> Tensor:
@@ -129,7 +136,8 @@ class Slab:
         """A frozen gate on features of a kind that says just this, in a frame's coordinates."""
         turn, shift = frame[:, :3], frame[:, 3]
         scale = float(turn.abs().max())  # turns are by right angles
-        gate = slab_gate(turn @ torch.tensor(self.normal) / scale, self.half_width, kind)
+        normal = turn @ torch.tensor(self.normal) / scale
+        gate = slab_gate(normal, self.half_width, self.offset, kind)
         x, y, z = (turn @ torch.tensor(CENTRE) + shift).tolist()
         known = Occupancy(gate, Space("box", (x, y, z), scale * HALF), threshold=0.5)
         return known.requires_grad_(False).eval()
@@ -138,6 +146,8 @@ class Slab:
 SLAB = Slab((0.6, 0.64, 0.48), 0.4)
 OTHER = Slab((0.0, 0.0, 1.0), 0.25)
 EVERYTHING = Slab((0.0, 0.0, 1.0), 100.0)
+TWO = Slab((0.48, 0.6, 0.64), 0.15, offset=0.4)
+"""Two thin slabs, with a gap between them."""
 
 
 class Field(nn.Module):
@@ -180,22 +190,22 @@ SMALLEST: dict[Kind, EncodingConfig] = {
 
 
 @torch.no_grad()
-def slab_gate(normal: Tensor, half_width: float, kind: Kind = "frequency") -> Gate:
-    """A gate with o(x) >= 1/2 where |normal.x| <= half_width, for mapped positions x.
+def slab_gate(normal: Tensor, half_width: float, offset: float, kind: Kind) -> Gate:
+    """A gate with o(x) >= 1/2 where d = ||normal.x| - offset| <= half_width, for mapped x.
 
-    The hidden layers make u = relu(|n.x| - w) and v = relu(w - |n.x|), so small that the LayerNorm
-    is nearly linear between them; the logit of o is proportional to v - u.
+    The hidden layers make |n.x|, d, and of it u = relu(d - w) and v = relu(w - d), so small that
+    the LayerNorm is nearly linear between them; the logit of o is proportional to v - u.
     """
-    gate = Gate(GateConfig(SMALLEST[kind], width=2, layers=2, scene_experts=1))
+    gate = Gate(GateConfig(SMALLEST[kind], width=2, layers=3, scene_experts=1))
     for parameter in gate.parameters():
         parameter.zero_()
     small, steepness = 2e-3, 50.0
-    first, second = gate.hidden
-    assert isinstance(first, nn.Linear) and isinstance(second, nn.Linear)
+    first, *others = cast(Sequence[nn.Linear], gate.hidden)
     signs = torch.tensor([1.0, -1.0])
     first.weight.copy_(signs[:, None] * write_linear(gate.encoding, normal))
-    second.weight.copy_((small * signs)[:, None].expand(2, 2))
-    second.bias.copy_(-small * half_width * signs)
+    for layer, scale, bound in zip(others, (1.0, small), (offset, half_width), strict=True):
+        layer.weight.copy_((scale * signs)[:, None].expand(2, 2))
+        layer.bias.copy_(-scale * bound * signs)
     gate.norm.weight.fill_(1.0)
     gate.head.weight[1] = -steepness * signs
     return gate
@@ -237,14 +247,14 @@ ROUNDING = 1e-4
 """World units that two ways to compute an edge may differ by."""
 
 
-def dense(rays: Rays, cone_angle: float = 0.0) -> Samples:
+def dense(rays: Rays, cone_angle: float = 0.0, step: float = STEP) -> Samples:
     """Every candidate in the box, by the one ray-marching rule."""
     return DenseEstimator(box()).sampling(
         rays.origins,
         rays.directions,
         t_min=rays.t_min,
         t_max=rays.t_max,
-        render_step_size=STEP,
+        render_step_size=step,
         cone_angle=cone_angle,
     )
 

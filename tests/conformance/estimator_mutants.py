@@ -293,10 +293,11 @@ MUTANTS: dict[str, tuple[type, ...]] = {
 }
 """By the rule that must fail."""
 
+SKIPS = "skips-only-what-it-may"
 ALSO: dict[type, set[str]] = {
-    Overlapping: {"all-kept-equals-dense", "stratified-in-training", "visibility-pruning"},
-    ShakenOutOfBounds: {"skips-only-what-it-may"},
-    DropsTheFirst: {"visibility-pruning"},
+    Overlapping: {SKIPS, "all-kept-equals-dense", "stratified-in-training", "visibility-pruning"},
+    ShakenOutOfBounds: {SKIPS, "sorted-disjoint-inside"},
+    DropsTheFirst: {SKIPS, "visibility-pruning"},
 }
 """What else cannot hold for a mutant."""
 

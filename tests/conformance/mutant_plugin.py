@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from conformance import host_mutants
+from conformance import batch_mutants, host_mutants
 from conformance.estimator_mutants import MUTANTS, Sound
 from conformance.proposal_mutants import PROPOSAL_MUTANTS, SoundProposal
 
@@ -15,6 +15,7 @@ CLASSES = [
     Sound,
     SoundProposal,
     *(mutant for family in MUTANTS.values() for mutant in family),
+    *(mutant for family in batch_mutants.MUTANTS.values() for mutant in family),
     *(mutant for family in PROPOSAL_MUTANTS.values() for mutant in family),
 ]
 HOSTS = host_mutants.__name__

@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from typing import Any
 
 import pytest
-from conformance import estimator_mutants, proposal_mutants
+from conformance import batch_mutants, estimator_mutants, proposal_mutants
 from conformance.estimator_mutants import MUTANTS
 from conformance.host_mutants import HOST_MUTANTS, METHODS, SOUND
 from conformance.mutant_plugin import write_distribution
@@ -24,11 +24,13 @@ PARALLEL = ("two-processes", "two-processes-step-alike")
 IN_THIS_PROCESS = tuple(rule for rule in RULES if rule.name not in PARALLEL)
 TWO_PROCESSES = tuple(rule for rule in RULES if rule.name in PARALLEL)
 BY_SEAM: dict[str, Any] = {
-    "estimator": MUTANTS,
+    "estimator": {
+        rule: family + batch_mutants.MUTANTS.get(rule, ()) for rule, family in MUTANTS.items()
+    },
     "proposal": PROPOSAL_MUTANTS,
     "host": HOST_MUTANTS,
 }
-ALSO = estimator_mutants.ALSO | proposal_mutants.ALSO
+ALSO = estimator_mutants.ALSO | batch_mutants.ALSO | proposal_mutants.ALSO
 ALL = [
     pytest.param(getattr(mutant, "__name__", mutant), {rule} | ALSO.get(mutant, set()), id=rule)
     for by_rule in BY_SEAM.values()

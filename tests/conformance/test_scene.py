@@ -11,7 +11,7 @@ from leco_plugin.conformance import scene
 from leco_plugin.models.encodings import Kind
 from leco_plugin.occupancy import Occupancy
 
-SLABS = [scene.SLAB, scene.OTHER, scene.EVERYTHING]
+SLABS = [scene.SLAB, scene.OTHER, scene.EVERYTHING, scene.TWO]
 
 
 @pytest.mark.parametrize("kind", get_args(Kind))
@@ -19,7 +19,8 @@ SLABS = [scene.SLAB, scene.OTHER, scene.EVERYTHING]
 def test_the_gate_decides_as_the_slab_is_defined(slab, kind):
     offsets = (torch.rand(100_000, 3) - 0.5) * 2.4 * scene.HALF
     positions = torch.tensor(scene.CENTRE) + offsets
-    from_plane = (offsets @ torch.tensor(slab.normal)).abs()
+    from_middle = (offsets @ torch.tensor(slab.normal)).abs()
+    from_plane = (from_middle - slab.offset * scene.HALF).abs()
     expected = (offsets.abs().amax(dim=-1) <= scene.HALF) & (
         from_plane <= slab.half_width * scene.HALF
     )

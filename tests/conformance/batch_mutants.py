@@ -1,0 +1,141 @@
+"""Estimators that are broken only in large batches, in training, or between slabs."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+from conformance.estimator_mutants import SKIPS, Answers, Sound
+from torch import Tensor
+
+from leco_plugin.samplers.marching import Samples
+from leco_plugin.samplers.registry import SamplerSpec
+
+
+class ReversedOnce(Answers):
+    """One interval on one ray in 10,000 ends before it begins."""
+
+    def change(self, ray_indices: Tensor, t_starts: Tensor, t_ends: Tensor) -> Samples:
+        last = (ray_indices % 10_000 == 9_999).nonzero()[:1, 0]
+        starts, ends = t_starts.clone(), t_ends.clone()
+        starts[last], ends[last] = t_ends[last], t_starts[last]
+        return ray_indices, starts, ends
+
+
+class WithoutNearPlaneInTraining(Sound):
+    """The shift begins at t_min again."""
+
+    def sampling(self, rays_o: Tensor, rays_d: Tensor, *args: Any, **options: Any) -> Samples:
+        near = options.pop("near_plane", 0.0) * (not options.get("stratified", False))
+        return super().sampling(rays_o, rays_d, *args, near_plane=near, **options)
+
+
+class WithoutFarPlaneInTraining(Sound):
+    def sampling(self, rays_o: Tensor, rays_d: Tensor, *args: Any, **options: Any) -> Samples:
+        far = 1e10 if options.get("stratified", False) else options.pop("far_plane", 1e10)
+        return super().sampling(rays_o, rays_d, *args, **(options | {"far_plane": far}))
+
+
+class OffsetForgotten(Answers):
+    """Takes 1,000 rays at a time, and each piece counts them from 0."""
+
+    def change(self, ray_indices: Tensor, t_starts: Tensor, t_ends: Tensor) -> Samples:
+        return ray_indices % 1_000, t_starts, t_ends
+
+
+class PiecesOfTheFirst(Sound):
+    """Takes 1,000 rays at a time: each piece is sampled where the first one is."""
+
+    def sampling(self, rays_o: Tensor, rays_d: Tensor, *args: Any, **options: Any) -> Samples:
+        of_first = torch.arange(len(rays_o)) % 1_000
+        limits = {name: options[name][of_first] for name in ("t_min", "t_max")}
+        rays = rays_o[of_first], rays_d[of_first]
+        return super().sampling(*rays, *args, **(options | limits))
+
+
+class ShortRunsDropped(Answers):
+    """What is kept for fewer than three steps is taken for noise."""
+
+    def change(self, ray_indices: Tensor, t_starts: Tensor, t_ends: Tensor) -> Samples:
+        begins = torch.ones_like(ray_indices, dtype=torch.bool)
+        begins[1:] = ray_indices[1:] != ray_indices[:-1]
+        begins[1:] |= t_starts[1:] > t_ends[:-1] + 1e-4
+        runs = begins.cumsum(0) - 1
+        kept = runs.bincount()[runs] >= 3
+        return ray_indices[kept], t_starts[kept], t_ends[kept]
+
+
+class FirstRunOnly(Answers):
+    """A ray ends with the first thing that it meets."""
+
+    def change(self, ray_indices: Tensor, t_starts: Tensor, t_ends: Tensor) -> Samples:
+        gaps = torch.zeros_like(ray_indices)
+        follows = ray_indices[1:] == ray_indices[:-1]
+        gaps[1:] = (follows & (t_starts[1:] > t_ends[:-1] + 1e-4)).long()
+        before = gaps.cumsum(0)
+        first = torch.searchsorted(ray_indices, ray_indices)
+        kept = before == before[first]
+        return ray_indices[kept], t_starts[kept], t_ends[kept]
+
+
+class Jittered(Sound):
+    """Shifts rays by shares of a step, [n_rays], of its own."""
+
+    def sampling(self, rays_o: Tensor, rays_d: Tensor, *args: Any, **options: Any) -> Samples:
+        if options.get("stratified", False):
+            options["stratified"] = False
+            shift = options["render_step_size"] * self.shares(len(rays_o))
+            options["t_min"] = options["t_min"].clamp(min=options.get("near_plane", 0.0)) + shift
+        return super().sampling(rays_o, rays_d, *args, **options)
+
+    def shares(self, n_rays: int) -> Tensor:
+        raise NotImplementedError
+
+
+class OneJitter(Jittered):
+    """All rays are shifted alike."""
+
+    def shares(self, n_rays: int) -> Tensor:
+        return torch.rand(()).expand(n_rays)
+
+
+class HalfAStep(Jittered):
+    """What lies in the second half of a step is never where a sample begins."""
+
+    def shares(self, n_rays: int) -> Tensor:
+        return 0.5 * torch.rand(n_rays)
+
+
+class NearerByPreference(Jittered):
+    """Shifts are more often small than large."""
+
+    def shares(self, n_rays: int) -> Tensor:
+        return torch.rand(n_rays) ** 1.2
+
+
+MUTANTS: dict[str, tuple[type, ...]] = {
+    "sorted-disjoint-inside": (
+        ReversedOnce,
+        WithoutNearPlaneInTraining,
+        WithoutFarPlaneInTraining,
+    ),
+    "packing-consistent": (OffsetForgotten,),
+    "stratified-in-training": (OneJitter, HalfAStep, NearerByPreference),
+    SKIPS: (PiecesOfTheFirst, ShortRunsDropped, FirstRunOnly),
+}
+"""By the rule that must fail."""
+
+ALSO: dict[type, set[str]] = {
+    ReversedOnce: {SKIPS},
+    OffsetForgotten: {SKIPS, "sorted-disjoint-inside"},
+    PiecesOfTheFirst: {"sorted-disjoint-inside"},
+}
+"""What else cannot hold for a mutant."""
+
+
+def __getattr__(name: str) -> SamplerSpec:
+    """Entry points name a class in lower case: its specification."""
+    for mutant in (mutant for family in MUTANTS.values() for mutant in family):
+        if mutant.__name__.lower() == name:
+            return SamplerSpec(mutant.__name__, estimator=mutant, needs_occupancy=True)
+    raise AttributeError(name)
