@@ -23,6 +23,7 @@ from leco_plugin.models.mixture import Following
 from leco_plugin.models.objective import GateLossConfig
 from leco_plugin.models.rendering import Intervals, Rays
 from leco_plugin.models.sizing.sizes import Sizes
+from leco_plugin.samplers.kernels import VARIABLE
 from leco_plugin.scenes.bounds import SceneBounds
 from leco_plugin.scenes.input_error import InputError
 
@@ -273,6 +274,7 @@ def test_a_gate_that_skips_nothing_is_not_taken_for_one_that_keeps_nothing(
 
 
 def test_front_to_back_renders_the_same_pixels_from_fewer_samples(model: LecoModel) -> None:
+    model.mixture.precision = "float32"  # C renders in no other
     with torch.no_grad():
         model.mixture.field.density_head.bias.fill_(9.0)  # opaque everywhere
     model.eval()
@@ -290,6 +292,7 @@ def test_front_to_back_renders_the_same_pixels_from_fewer_samples(model: LecoMod
 def test_guided_batches_of_many_rays_are_rendered_from_the_front_by_default(
     model: LecoModel, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    monkeypatch.setenv(VARIABLE, "native")  # C always renders from the front
     with torch.no_grad():
         model.mixture.field.density_head.bias.fill_(9.0)  # opaque everywhere
     model.eval()
