@@ -7,7 +7,6 @@ from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
-import psutil
 import torch
 
 from leco_plugin.models.encodings import EncodingConfig
@@ -302,6 +301,8 @@ def memory_of(device: torch.device | str, group: Path = Path("/sys/fs/cgroup")) 
         return int(torch.cuda.get_device_properties(device).total_memory)
     if device.type != "cpu":
         return None
+    import psutil  # absent where only the GPU suite runs
+
     memory = int(psutil.virtual_memory().total)
     try:
         return min(memory, int((group / "memory.max").read_text()))
