@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import copy
 import json
+import random
 from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
+import numpy as np
 import torch
 from PIL import Image
 from torch import Tensor
@@ -29,7 +31,7 @@ class RunOnImages(Run):
         from nerfstudio.engine.callbacks import TrainingCallbackAttributes
         from nerfstudio.engine.optimizers import Optimizers
 
-        torch.manual_seed(0)
+        self._seed(0)
         with quietly():
             self.pipeline = config.pipeline.setup(device="cpu", test_mode="val")
             self.pipeline.train()
@@ -38,6 +40,21 @@ class RunOnImages(Run):
             self.optimizers = Optimizers(copy.deepcopy(config.optimizers), groups)
             attributes = TrainingCallbackAttributes(self.optimizers, None, self.pipeline, None)
             self.callbacks = self.pipeline.get_training_callbacks(attributes)
+
+    @staticmethod
+    def _seed(seed: int) -> None:
+        """nerfstudio draws pixels with numbers of all three."""
+        random.seed(seed)
+        np.random.seed(seed)  # noqa: NPY002
+        torch.manual_seed(seed)
+
+    def learned(self) -> dict[str, Tensor]:
+        """Parameters after a few steps."""
+        self._seed(0)
+        with quietly():
+            for step in range(STEPS):
+                self.step(step)
+        return self.parameters()
 
     def loss(self, step: int) -> Tensor:
         _, losses, _ = self.pipeline.get_train_loss_dict(step)
@@ -51,28 +68,24 @@ class RunOnImages(Run):
 
 @checks("held-out-images-teach-nothing", "host")
 def held_out_images_teach_nothing(case: HostCase) -> None:
-    """After other held-out images the parameters are the same."""
-    with TemporaryDirectory() as folder:
-        write_images(Path(folder))
-        config = reading(case.config, Path(folder))
-        learned = []
-        for brightness in (0, 255):
-            run = RunOnImages(config)
-            held_out = run.files("eval")
-            both = held_out & run.files("train")
-            require(not both, f"{len(both)} of {len(held_out)} held-out images are trained on")
-            if not learned:  # the first run's own loader may have read them already
-                _paint(held_out, brightness)
-                run = RunOnImages(config)
-            for step in range(STEPS):
-                run.step(step)
-            learned.append(run.parameters())
-            _paint(held_out, 255)
-    for name, value in learned[0].items():
-        require(
-            value.equal(learned[1][name]),
-            f"other held-out images, and {STEPS} training steps leave another {name}",
-        )
+    """With other held-out images, training steps lead to the same parameters. A method whose data
+    manager reads no files is not asked."""
+    if not hasattr(case.config.pipeline.datamanager, "dataparser"):
+        return
+    with TemporaryDirectory() as name:
+        folder = Path(name)
+        write_images(folder)
+        config = reading(case.config, folder)
+        run = RunOnImages(config)
+        held_out, trained = run.files("eval"), run.files("train")
+        both = len(held_out & trained)
+        require(both == 0, f"{both} of {len(held_out)} held-out images are trained on")
+        expected = run.learned()
+        for file in held_out:
+            Image.new("RGB", (PIXELS, PIXELS), "white").save(file)
+        found = RunOnImages(config).learned()
+    for name, value in expected.items():
+        require(value.equal(found[name]), f"what {name} learns depends on held-out images")
 
 
 def reading(config: Any, folder: Path) -> Any:
@@ -109,8 +122,3 @@ def write_images(folder: Path) -> None:
     lens = {"fl_x": focal, "fl_y": focal, "cx": PIXELS / 2, "cy": PIXELS / 2}
     scene = {**lens, "w": PIXELS, "h": PIXELS, "frames": frames}
     (folder / "transforms.json").write_text(json.dumps(scene))
-
-
-def _paint(files: set[Path], brightness: int) -> None:
-    for file in files:
-        Image.new("RGB", (PIXELS, PIXELS), (brightness,) * 3).save(file)

@@ -14,6 +14,10 @@ import torch
 from conformance.estimator_mutants import Answers, rank
 from conformance.proposal_mutants import SoundProposal
 from nerfstudio.cameras.rays import RayBundle, RaySamples
+from nerfstudio.data.datamanagers.base_datamanager import (
+    DataManagerConfig,
+    VanillaDataManagerConfig,
+)
 from nerfstudio.engine.optimizers import AdamOptimizerConfig
 from nerfstudio.engine.schedulers import ExponentialDecaySchedulerConfig
 from nerfstudio.engine.trainer import TrainerConfig
@@ -211,6 +215,22 @@ class CountsSteps(NerfactoModel):
         return {name: self.steps * loss for name, loss in losses.items()}
 
 
+class PeeksAtHeldOut(NerfactoModel):
+    """Weighs its losses by the first held-out image."""
+
+    weight: Any = 1.0
+
+    def get_training_callbacks(self, training_callback_attributes: Any) -> Any:
+        manager = getattr(training_callback_attributes.pipeline, "datamanager", None)
+        if getattr(manager, "eval_dataset", None) is not None:
+            self.weight = 1.0 + manager.eval_dataset[0]["image"].mean()
+        return super().get_training_callbacks(training_callback_attributes)
+
+    def get_loss_dict(self, *args: Any, **options: Any) -> dict[str, Tensor]:
+        losses = super().get_loss_dict(*args, **options)
+        return {name: self.weight * loss for name, loss in losses.items()}
+
+
 class LearnsOnFirstRank(NGPModel):
     def get_loss_dict(self, *args: Any, **options: Any) -> dict[str, Tensor]:
         losses = super().get_loss_dict(*args, **options)
@@ -254,6 +274,7 @@ HOST_MUTANTS: dict[str, dict[str, GuidedModelConfig]] = {
         "EverySecondHost": packed(sampler="EverySecond"),
         "NearHalfHost": proposal(sampler="NearHalf"),
     },
+    "held-out-images-teach-nothing": {"PeeksAtHeldOut": proposal(PeeksAtHeldOut)},
     "resumes-where-it-stopped": {"CountsSteps": proposal(CountsSteps)},
     "two-processes-step-alike": {"LearnsOnFirstRank": packed(LearnsOnFirstRank)},
 }
@@ -315,9 +336,11 @@ def _method(name: str, model: ModelConfig) -> MethodSpecification:
         "optimizer": AdamOptimizerConfig(lr=1e-2),
         "scheduler": ExponentialDecaySchedulerConfig(lr_final=1e-3, max_steps=100),
     }
+    # others read no files, which takes a second each
+    data = VanillaDataManagerConfig() if name == "PeeksAtHeldOut" else DataManagerConfig()
     config = TrainerConfig(
         method_name=name,
-        pipeline=VanillaPipelineConfig(model=model),
+        pipeline=VanillaPipelineConfig(model=model, datamanager=data),
         optimizers={group: rate for group in ("fields", "proposal_networks", "camera_opt")},
     )
     return MethodSpecification(config, name)
