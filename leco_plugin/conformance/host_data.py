@@ -55,7 +55,7 @@ def held_out_images_teach_nothing(case: HostCase) -> None:
     with TemporaryDirectory() as folder:
         write_images(Path(folder))
         config = reading(case.config, Path(folder))
-        learned = []
+        learned: list[dict[str, Tensor]] = []
         for brightness in (0, 255):
             run = RunOnImages(config)
             held_out = run.files("eval")
