@@ -39,7 +39,7 @@ from leco_plugin.studio.checkpoints import (
     previous_of,
     step_of,
 )
-from leco_plugin.studio.run import iterations_until
+from leco_plugin.studio.run_folder import iterations_until
 
 ROOT = Path(__file__).resolve().parents[1]
 STEPS, LEARN_STEPS = 60, 24

@@ -102,20 +102,19 @@ def export(
         data: The scene that it was learned on. By default that of the run it lies in.
         json: File for what was written, as JSON.
     """
-    from leco_plugin.export import export as write
-    from leco_plugin.export_folder import export_folder, in_words
+    from leco_plugin import export as made
 
     check_json(json)
     file = occupancy_of(file)
     if format is not None:
-        facts = write(file, format, out, resolution, levels, frame, data)
+        facts = made.export(file, format, out, resolution, levels, frame, data)
         print("\n".join(_export_in_words(out, facts, frame)))
         write_json(json, facts)
         return
     if levels is not None or frame is not None:
         raise ValueError("--levels and --frame go with --format: give one, or leave them out")
-    parts, doubted = export_folder(file, out, resolution, data)
-    print("\n".join(in_words(out, parts, doubted)))
+    parts, doubted = made.export_folder(file, out, resolution, data)
+    print("\n".join(made.in_words(out, parts, doubted)))
     write_json(json, {"format": 1, "parts": {part.name: part.facts for part in parts}})
 
 

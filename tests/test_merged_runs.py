@@ -15,7 +15,7 @@ from leco_plugin.learning import history
 from leco_plugin.learning.freezing import FIELD_FILE, field_at_freezing
 from leco_plugin.learning.merging import MergingConfig
 from leco_plugin.models import mixture
-from leco_plugin.studio.run import drop_missing_parameters
+from leco_plugin.studio.run_folder import drop_missing_parameters
 from leco_plugin.studio.trainer import AtomicTrainer
 
 

@@ -28,7 +28,7 @@ from leco_plugin.models.failures import require_finite
 from leco_plugin.scenes.input_error import InputError
 from leco_plugin.studio.host_models import lazy_lpips
 from leco_plugin.studio.occupancy_view import Drawn, DrawnInViewer, OccupancyView
-from leco_plugin.studio.run import run_of
+from leco_plugin.studio.run_folder import run_of
 
 if TYPE_CHECKING:
     _Model = Model

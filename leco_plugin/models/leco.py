@@ -44,7 +44,7 @@ from leco_plugin.studio.occupancy_view import (
     OccupancyView,
     is_viewer_drawing,
 )
-from leco_plugin.studio.run import run_of
+from leco_plugin.studio.run_folder import run_of
 
 
 class LecoModel(DrawnInViewer, Model):

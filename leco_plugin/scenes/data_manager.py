@@ -34,7 +34,7 @@ from leco_plugin.scenes.pixels.stored_pictures import picture_sizes, store_pictu
 from leco_plugin.scenes.reading import read_checked
 from leco_plugin.scenes.survey import CAMERAS, points_in
 from leco_plugin.scenes.upright import turn_to_upright, turned
-from leco_plugin.studio.run import keeps_all_images
+from leco_plugin.studio.run_folder import keeps_all_images
 
 MOST_OF_MEMORY = 0.4
 """Share of the memory that is free which photographs in memory may take."""

@@ -26,10 +26,12 @@ from leco_plugin.models.failures import TrainingStopped
 from leco_plugin.samplers.kernels import VARIABLE, kernels_off
 from leco_plugin.scenes.input_error import InputError
 from leco_plugin.studio.checkpoints import first_not_finite, previous_of, step_of, whole_of
-from leco_plugin.studio.run import drop_missing_parameters, end_of, iterations_until
 from leco_plugin.studio.run_folder import (
     check_photographs,
     checkpoint_of,
+    drop_missing_parameters,
+    end_of,
+    iterations_until,
     keep_sizes,
     with_sizes_of,
 )

@@ -15,8 +15,7 @@ import trimesh
 from ball_occupancy import CENTRE, RADIUS, ball
 
 from leco_plugin.evaluation.occupancy_picture import draw
-from leco_plugin.export import export
-from leco_plugin.export_folder import export_folder, in_words
+from leco_plugin.export import export, export_folder, in_words
 from leco_plugin.occupancy import Occupancy
 from leco_plugin.scenes.coloured_points import description_of_run
 from leco_plugin.scenes.whole_files import write_points
@@ -152,7 +151,7 @@ def test_a_part_that_cannot_be_made_is_one_line_and_the_others_are_written(
     file: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     for name in ("draw", "write_page"):  # seconds, and the test before has drawn
-        monkeypatch.setattr(f"leco_plugin.export_folder.{name}", lambda *_, **__: None)
+        monkeypatch.setattr(f"leco_plugin.export.{name}", lambda *_, **__: None)
     parts, _ = export_folder(file, tmp_path / "all", 32)
     lines = in_words(tmp_path / "all", parts, [])
     assert len(lines) == 6 and sum("colours: o(x)" in line for line in lines) == 1

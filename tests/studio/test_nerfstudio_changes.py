@@ -1,4 +1,4 @@
-"""Claims about `leco_plugin.studio.run`, by stubs of what has changed."""
+"""Claims about `leco_plugin.studio.run_folder`, by stubs of what has changed."""
 
 from __future__ import annotations
 
@@ -12,9 +12,9 @@ from nerfstudio.engine.trainer import Trainer, TrainerConfig
 
 from leco_plugin.models.failures import TrainingStopped
 from leco_plugin.scenes.input_error import InputError
-from leco_plugin.studio import run as nerfstudio_changes
+from leco_plugin.studio import run_folder as nerfstudio_changes
 from leco_plugin.studio import trainer as atomic_trainer
-from leco_plugin.studio.run import (
+from leco_plugin.studio.run_folder import (
     counts_from_zero,
     end_of,
     iterations_until,

@@ -9,7 +9,7 @@ import torch
 from nerfstudio.engine.optimizers import AdamOptimizerConfig
 from torch import nn
 
-from leco_plugin.studio.run import drop_missing_parameters
+from leco_plugin.studio.run_folder import drop_missing_parameters
 from leco_plugin.studio.trainer import PrunedOptimizers
 
 CONFIG = {
