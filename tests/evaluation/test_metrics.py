@@ -60,7 +60,8 @@ def test_grey_images_and_painted_over_lines_have_errors_of_one() -> None:
     truth = ground.repeat(20, 30, 1)
     truth[10] = torch.tensor([0.9, 0.1, 0.1])
     grey = truth.mean(dim=-1, keepdim=True).expand_as(truth)
-    painted_over = ground.expand_as(truth)
+    painted_over = ground.repeat(20, 30, 1)
+    painted_over[:5] = 0.0  # no thin line is there
     assert metrics.hue_and_thin_errors(truth, truth) == (0.0, 0.0)
     assert metrics.hue_and_thin_errors(grey, truth)[0] == pytest.approx(1.0)
     assert metrics.hue_and_thin_errors(truth + 0.05, truth)[0] == pytest.approx(0.0, abs=1e-5)
