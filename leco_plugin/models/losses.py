@@ -57,6 +57,19 @@ def balance_loss(probabilities: Tensor, routes: Tensor) -> Tensor:
     return num_experts * (expert_shares(routes, num_experts) * probabilities.mean(dim=0)).sum()
 
 
+HUE_WEIGHT = 8.0
+"""Of squared errors in hue, beside those in brightness. Brightness varies far more in photographs:
+with equal weights its errors drown what hue teaches the features (docs/decisions.md)."""
+
+
+def color_loss(rgb: Tensor, truth: Tensor) -> Tensor:
+    """Mean squared error of colours, both [R, 3]; its part in hue, a colour less its grey, has a
+    weight. Any weight leaves the mean of the seen colours the best one."""
+    errors = rgb - truth
+    in_hue = errors - errors.mean(dim=-1, keepdim=True)
+    return errors.square().mean() + (HUE_WEIGHT - 1.0) * in_hue.square().mean()
+
+
 def adjoining(intervals: Intervals) -> Tensor:
     """Whether each sample but the first follows the one before it on a ray, with no other left out
     between them: bool [M - 1]."""

@@ -14,6 +14,7 @@ from leco_plugin.models.losses import (
     adjoining,
     agreement_loss,
     balance_loss,
+    color_loss,
     contribution_loss,
     density_loss,
     distortion_loss,
@@ -107,7 +108,7 @@ def field_losses(
         learning: whether this is the first phase.
         ramped: how far the distortion loss has come in, in [0, 1]; nearness comes in with it.
     """
-    losses = {"rgb_loss": torch.nn.functional.mse_loss(shaded.rgb, truth)}
+    losses = {"rgb_loss": color_loss(shaded.rgb, truth)}
     near, far = span
     if weights.transparency > 0.0 and opacities is not None:
         losses["transparency_loss"] = weights.transparency * transparency_loss(

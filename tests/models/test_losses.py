@@ -10,9 +10,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from leco_plugin.models.losses import (
+    HUE_WEIGHT,
     adjoining,
     agreement_loss,
     balance_loss,
+    color_loss,
     contribution_loss,
     density_loss,
     distortion_loss,
@@ -24,6 +26,16 @@ from leco_plugin.models.losses import (
 )
 from leco_plugin.models.rendering import Intervals
 from leco_plugin.samplers.packed import pack_info
+
+
+def test_errors_in_hue_weigh_more_and_the_mean_is_still_the_best_colour() -> None:
+    seen = torch.rand(50, 3, dtype=torch.float64)
+    brightness, hue = torch.tensor([[0.1, 0.1, 0.1], [0.1, -0.1, 0.0]], dtype=torch.float64)
+    assert float(color_loss(seen + brightness, seen)) == pytest.approx(0.01)
+    assert float(color_loss(seen + hue, seen)) == pytest.approx(HUE_WEIGHT * 0.02 / 3.0)
+    color = seen.mean(dim=0).requires_grad_()
+    color_loss(color.expand_as(seen), seen).backward()
+    torch.testing.assert_close(color.grad, torch.zeros_like(color))
 
 
 def routes_with_shares(counts: list[int]) -> torch.Tensor:
