@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from leco_plugin.chart.protocol import Cores, Protocol, forecast_minutes
-from leco_plugin.chart.suites import SUITES
+from leco_plugin.chart.contender import Cores, Protocol, forecast_minutes
+from leco_plugin.chart.methods import SUITES
 
 
 def minutes_together(names: Sequence[str], cores: Cores) -> float:

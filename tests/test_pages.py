@@ -21,10 +21,8 @@ import tyro
 from nerfstudio.configs.base_config import MachineConfig
 from suite_minutes import minutes_together
 
-from leco_plugin.chart.contender import Contender
-from leco_plugin.chart.methods import contenders
-from leco_plugin.chart.protocol import FAST, SLOW, Protocol
-from leco_plugin.chart.suites import SUITES
+from leco_plugin.chart.contender import FAST, SLOW, Contender, Protocol
+from leco_plugin.chart.methods import SUITES, contenders
 from leco_plugin.method_configs import ON_GPU
 from leco_plugin.samplers.kernels import NAMES, VARIABLE
 

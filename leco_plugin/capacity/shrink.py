@@ -14,8 +14,8 @@ from typing import Any
 import torch
 from nerfstudio.utils.rich_utils import CONSOLE
 
+from leco_plugin.capacity.choice import line_of, line_of_lowered, line_of_original
 from leco_plugin.capacity.evidence import gather
-from leco_plugin.capacity.frontier import line_of, line_of_lowered, line_of_original
 from leco_plugin.capacity.references import (
     HOLDS,
     LOST_DECISIONS,

@@ -12,8 +12,14 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from leco_plugin.chart.contender import Contender, Job
-from leco_plugin.chart.protocol import Protocol, forecast, require_seeds, settings_of
+from leco_plugin.chart.contender import (
+    Contender,
+    Job,
+    Protocol,
+    forecast,
+    require_seeds,
+    settings_of,
+)
 from leco_plugin.chart.runner import (
     RESULTS,
     RUNS,

@@ -12,10 +12,9 @@ from typing import Any
 from nerfstudio.utils.rich_utils import CONSOLE
 
 from leco_plugin.chart.chart import Chart, why_not_shared
-from leco_plugin.chart.methods import contenders
-from leco_plugin.chart.protocol import Protocol
+from leco_plugin.chart.contender import Protocol
+from leco_plugin.chart.methods import SUITES, contenders, in_order
 from leco_plugin.chart.runner import ProcessRunner, Runner
-from leco_plugin.chart.suites import SUITES, in_order
 from leco_plugin.chart.worker import WORKER
 from leco_plugin.log import bar, resumable
 from leco_plugin.scenes.input_error import InputError

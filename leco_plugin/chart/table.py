@@ -8,14 +8,13 @@ from functools import partial
 from pathlib import Path
 from typing import Any, TypeVar
 
-from leco_plugin.chart.findings.learned import Learned, learned_of
+from leco_plugin.chart.findings.learned import Learned, falls, learned_of, settling
 from leco_plugin.chart.findings.representations import (
     Representation,
     fronts_of,
     never_held_of,
     representations_of,
 )
-from leco_plugin.chart.findings.settling import falls, settling
 from leco_plugin.chart.findings.summary import (
     COSTS,
     LEARNING,

@@ -16,8 +16,7 @@ from leco_plugin.chart.runner import die_with_parent, work_on
 if TYPE_CHECKING:
     from nerfstudio.engine.trainer import Trainer, TrainerConfig
 
-    from leco_plugin.chart.contender import Contender
-    from leco_plugin.chart.protocol import Protocol
+    from leco_plugin.chart.contender import Contender, Protocol
 
 WORKER = (sys.executable, "-W", "ignore", "-m", "leco_plugin.chart.worker")
 SMALL_GATES = {
@@ -185,8 +184,7 @@ def main(folder: Path, run: Callable[..., dict[str, Any]] = run_job) -> int:
     Args:
         run: makes it; arguments as of `run_job`.
     """
-    from leco_plugin.chart.contender import Contender
-    from leco_plugin.chart.protocol import Protocol
+    from leco_plugin.chart.contender import Contender, Protocol
     from leco_plugin.evaluation.report import describe_code
 
     die_with_parent()

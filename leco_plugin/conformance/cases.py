@@ -11,7 +11,7 @@ from pathlib import Path
 
 import torch
 
-from leco_plugin.conformance import host_data, host_images, host_training  # noqa: F401 (checks of hosts)
+from leco_plugin.conformance import host_images, host_training  # noqa: F401 (checks of hosts)
 from leco_plugin.conformance.estimators import EstimatorCase
 from leco_plugin.conformance.hosts import HostCase
 from leco_plugin.conformance.proposals import ProposalCase

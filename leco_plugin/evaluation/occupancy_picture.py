@@ -13,6 +13,7 @@ from torch import Tensor
 
 from leco_plugin.chart.theme import new_figure
 from leco_plugin.evaluation.inspection import (
+    SceneColours,
     ViewBox,
     cameras_of,
     exposed,
@@ -20,7 +21,6 @@ from leco_plugin.evaluation.inspection import (
     seen_at,
     whole_box,
 )
-from leco_plugin.evaluation.scene_colours import SceneColours
 from leco_plugin.occupancy import CALIBRATED_AT, Occupancy
 from leco_plugin.scenes.whole_files import write_whole
 

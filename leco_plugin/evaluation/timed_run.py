@@ -23,12 +23,13 @@ from nerfstudio.utils import writer
 from leco_plugin.evaluation.clock import (
     Budget,
     Clock,
+    GridUpdates,
+    count_queries,
     peak_allocator_bytes,
     peak_process_bytes,
     warm_up,
 )
 from leco_plugin.evaluation.metrics import image_metrics
-from leco_plugin.evaluation.queries import GridUpdates, count_queries
 from leco_plugin.evaluation.report import finite_or_null
 from leco_plugin.hosts.learn_first import FIRST_TIMED, TIMED_STEPS, keep_within
 from leco_plugin.scenes.input_error import InputError

@@ -8,7 +8,7 @@ from typing import Any
 
 from leco_plugin.scenes.input_error import InputError
 from leco_plugin.stability.photographs import STAGES, Capture
-from leco_plugin.stability.samplers import DENSE, GRID, GRIDS, LEARNED, RAYS
+from leco_plugin.stability.plan import DENSE, GRID, GRIDS, LEARNED, RAYS
 
 BOUNDED = (LEARNED, *(f"{GRID}-{cells}" for cells in GRIDS), DENSE)
 """Samplers whose host has bounds: Nerfacto contracts all of space, and has none."""

@@ -14,7 +14,7 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-from leco_plugin.chart.protocol import Protocol, require_seeds, settings_of
+from leco_plugin.chart.contender import Protocol, require_seeds, settings_of
 from leco_plugin.chart.runner import (
     RUNS,
     ProcessRunner,
@@ -39,16 +39,20 @@ from leco_plugin.scenes.photographs import describe_scene
 from leco_plugin.stability.cases import Case, cases_named
 from leco_plugin.stability.photographs import digest_of, write_scene
 from leco_plugin.stability.plan import (
+    FULL,
+    QUICK,
     Entry,
     Key,
     Run,
+    Sampler,
+    Sizes,
     core_seconds,
     entries_of,
     in_words,
     runs_of,
+    samplers_named,
     scenes_of,
 )
-from leco_plugin.stability.samplers import FULL, QUICK, Sampler, Sizes, samplers_named
 from leco_plugin.stability.table import draw, draw_side_by_side, table
 from leco_plugin.stability.verdict import judge
 from leco_plugin.studio.run_folder import alone_in

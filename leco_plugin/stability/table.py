@@ -15,7 +15,7 @@ import numpy as np
 from PIL import Image
 
 from leco_plugin.chart.theme import LIGHT, Theme, new_figure, save_picture
-from leco_plugin.stability.samplers import LEARNED, QUICK
+from leco_plugin.stability.plan import LEARNED, QUICK
 
 NOTHING = "nothing has been run yet"
 QUICKLY = "made with --quick, which shows that everything runs and no more"

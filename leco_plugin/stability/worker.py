@@ -26,13 +26,12 @@ from numpy.typing import NDArray
 from PIL import Image
 from torch import Tensor
 
-from leco_plugin.chart.contender import Contender, config_of
-from leco_plugin.chart.protocol import Protocol
+from leco_plugin.chart.contender import Contender, Protocol, config_of
 from leco_plugin.chart.worker import main, train_job
 from leco_plugin.evaluation.report import finite_or_null
 from leco_plugin.samplers.registry import build_estimator
 from leco_plugin.stability.photographs import TRUTH
-from leco_plugin.stability.samplers import DENSE_LEVELS
+from leco_plugin.stability.plan import DENSE_LEVELS
 from leco_plugin.studio.host_models import true_colours
 
 NEAR = 0.03

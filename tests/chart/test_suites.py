@@ -8,15 +8,14 @@ import pytest
 from suite_minutes import minutes_together
 
 from leco_plugin import cli
-from leco_plugin.chart.contender import config_of
-from leco_plugin.chart.methods import contenders
-from leco_plugin.chart.protocol import FAST, SLOW, Cores, run_seconds
-from leco_plugin.chart.suites import (
+from leco_plugin.chart.contender import FAST, SLOW, Cores, config_of, run_seconds
+from leco_plugin.chart.methods import (
     AT_ONCE,
     CPU_STEPS,
     STEPS,
     SUITES,
     SWITCH_CELLS,
+    contenders,
     in_order,
 )
 from leco_plugin.learning.schedule import MOST_EXTENSIONS, steps_of_an_extension

@@ -9,14 +9,13 @@ from typing import Any
 
 import pytest
 
-from leco_plugin.chart.contender import Contender
-from leco_plugin.chart.protocol import Protocol
+from leco_plugin.chart.contender import Contender, Protocol
 from leco_plugin.samplers import registry
 from leco_plugin.samplers.base import DenseEstimator
 from leco_plugin.samplers.boxes import nested_boxes
 from leco_plugin.samplers.registry import SamplerSpec
 from leco_plugin.stability.photographs import YARD, Capture, write_scene
-from leco_plugin.stability.samplers import DENSE_LEVELS, SAMPLERS, Sizes, contender_of
+from leco_plugin.stability.plan import DENSE_LEVELS, SAMPLERS, Sizes, contender_of
 from leco_plugin.stability.verdict import judge
 from leco_plugin.stability.worker import run_cell
 
