@@ -22,7 +22,7 @@ from leco_plugin.chart.contender import (
     short_names,
 )
 from leco_plugin.chart.methods import contenders
-from leco_plugin.evaluation.clock import WARM_UP
+from leco_plugin.evaluation.queries import WARM_UP
 from leco_plugin.hosts.guided import GuidedModelConfig
 from leco_plugin.hosts.guided_start import OWN_SAMPLER
 from leco_plugin.models.switch.field import SwitchNerfModelConfig

@@ -26,7 +26,7 @@ from gpu_floor import Ceilings
 from profile_parts import Work
 from torch import Tensor, nn
 
-from leco_plugin.evaluation.clock import number_of
+from leco_plugin.evaluation.queries import number_of
 from leco_plugin.models.encodings import HashEncoding
 
 REAL = 4

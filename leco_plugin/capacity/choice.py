@@ -115,13 +115,7 @@ def kilobytes(row: Row) -> str:
 
 
 def draw(results: Mapping[str, Any], path: Path, theme: Theme = LIGHT) -> Path:
-    """Draws two panels over the bytes: volume kept at equal loss, loss at equal volume.
-
-    Args:
-        results: as in `results.json`.
-        path: of the picture.
-        theme: of the page that it is meant for.
-    """
+    """Draws two panels over the bytes: volume kept at equal loss, loss at equal volume."""
     rows = results["representations"]
     volume = common_volume(rows)
     kept = [100.0 * row["kept_volume"] for row in rows]
@@ -266,14 +260,7 @@ def summary(results: Mapping[str, Any], out: Path) -> list[str]:
 
 
 def draw_gates(results: Mapping[str, Any], path: Path) -> Path:
-    """Draws the gates that were tried.
-
-    Args:
-        results: as `leco shrink --json` writes them.
-        path: of the picture; the ending chooses its kind.
-    Raises:
-        OSError, ValueError: it cannot be written there, or is of no known kind.
-    """
+    """Draws the gates that were tried; an ending of no known kind raises `ValueError`."""
     rungs = results["rungs"]
     sizes = [rung["bytes"] / 1000 for rung in rungs]
     losses = [max(rung["lost_surface_mass"], LEAST_OF_A_GATE) for rung in rungs]

@@ -139,8 +139,7 @@ def measure(evidence: Evidence, scores: Tensor, of_volume: Tensor, lost: float) 
     """What a representation keeps when it loses a given share, and loses at given kept volumes.
 
     Args:
-        evidence: dense candidates.
-        scores: [M] of those candidates.
+        scores: [M] of dense candidates.
         of_volume: [P] of places spread evenly over what rays reach of the scene's box.
         lost: share of the weight near surfaces.
     """
@@ -216,9 +215,9 @@ def capacity(
 ) -> dict[str, Any]:
     """Teaches and measures what is missing in a folder, and draws all of it.
 
+    What is finished stays there whenever this is stopped.
+
     Args:
-        data: the scene in nerfstudio's format.
-        out: the folder; what is finished stays there whenever this is stopped.
         resolutions: of grids; those that do not fit the memory are left out.
         lost_surface_mass: at which kept volumes are compared.
         learn_steps: of the field.
@@ -302,11 +301,13 @@ def _take_folder(out: Path, settings: dict[str, Any], data: Path) -> None:
 
 def _grids_that_fit(resolutions: Sequence[int], say: Callable[[str], None]) -> list[Candidate]:
     """The grids that fit the memory; says which do not."""
-    found = grids(tuple(dict.fromkeys(resolutions)))
-    for candidate in found:
-        if not fits_memory(int(candidate.size) ** 3):
-            say(f"a grid of {candidate.size}^3 cells does not fit the free memory; it is left out")
-    return [one for one in found if fits_memory(int(one.size) ** 3)]
+    found = []
+    for one in grids(tuple(set(resolutions))):
+        if fits_memory(int(one.size) ** 3):
+            found.append(one)
+        else:
+            say(f"a grid of {one.size}^3 cells does not fit the free memory; it is left out")
+    return found
 
 
 def _stored(out: Path, candidate: Candidate) -> dict[str, Any] | None:

@@ -86,13 +86,10 @@ class Job:
 
 
 def changed(config: Any, path: str, value: Any) -> Any:
-    """A copy of a config with one setting changed.
+    """A copy of a config, of dataclasses and dictionaries, with one setting changed.
 
-    Args:
-        config: a dataclass of dataclasses and dictionaries.
-        path: names of fields, and keys, with dots between them.
     Raises:
-        ValueError: there is no such field or key.
+        ValueError: there are no such fields and keys, with dots between them in the path.
     """
     name, _, rest = path.partition(".")
     if isinstance(config, dict):
@@ -113,12 +110,9 @@ def config_of(
 ) -> TrainerConfig:
     """The config of a contender's training run.
 
-    All contenders read the scene with our parser, so that they render the same test pixels.
+    All contenders read the scene with our parser, so that they render the same test pixels. A host
+    that learns its occupancy first may do so for `learn_seconds`.
 
-    Args:
-        folder: for what the run leaves.
-        learn_seconds: limit for a host that learns its occupancy first.
-        held_out: which photographs are tested.
     Raises:
         InputError: there is no such method, or its reader cannot hold out a stretch.
         ValueError: it has no such setting.
@@ -208,21 +202,13 @@ class Protocol:
                 f"learning an occupancy may take {self.learn_seconds:g} s of a run of "
                 f"{self.seconds:g} s, which leaves nothing to be guided: give less"
             )
-        counts = {
-            "images": self.images,
-            "curve points": self.curve_points,
-            "runs at once": self.at_once,
-        }
-        for name, count in counts.items():
+        counts = self.images, self.curve_points, self.at_once
+        for name, count in zip(("images", "curve points", "runs at once"), counts):
             if count < 1:
                 raise ValueError(f"at least one of the {name} is needed, not {count}")
 
     def budget(self) -> Budget:
-        """When a run is over.
-
-        Raises:
-            ValueError: a time or a number of steps is missing or not positive.
-        """
+        """When a run is over; a time or a number of steps that is no such raises `ValueError`."""
         learning = self.learn_seconds
         if learning is None and self.seconds is not None:
             learning = LEARN_SHARE * self.seconds
@@ -240,11 +226,7 @@ class Protocol:
 
 
 def require_seeds(seeds: Iterable[int]) -> None:
-    """Refuses what numpy does not take as a seed.
-
-    Raises:
-        InputError: one is no such number.
-    """
+    """Raises `InputError` for what numpy does not take as a seed."""
     for seed in seeds:
         if not 0 <= seed < SEEDS:
             raise InputError(f"a seed is a whole number from 0 to {SEEDS - 1}, not {seed}")
@@ -288,12 +270,8 @@ SLOW = Cores(step=0.45, overhead=45.0, unguided=60.0, grids=280.0)
 
 def run_seconds(contender: Contender, protocol: Protocol, cores: Cores) -> float:
     """Forecast of one run, from the start of its process to the end."""
-    ends = []
-    if protocol.seconds is not None:
-        ends.append(protocol.seconds)
-    if protocol.steps is not None:
-        ends.append(protocol.steps * cores.step)
-    seconds = min(ends) + cores.overhead
+    steps = None if protocol.steps is None else protocol.steps * cores.step
+    seconds = min(end for end in (protocol.seconds, steps) if end is not None) + cores.overhead
     if contender.sampler in (DENSE, OWN_SAMPLER):
         seconds += cores.unguided
     return seconds + (cores.grids if contender.grids else 0.0)

@@ -126,12 +126,8 @@ def _samplers_of(method: str) -> tuple[list[str], str]:
         kinds = [name for name, spec in registered_samplers().items() if spec.needs_occupancy]
         return [LEARNED], ", ".join([*kinds, DENSE])
     every = ", ".join([*registered_samplers(), OWN_SAMPLER, LONG_STEPS, WITHOUT_GIFTS])
-    usual = (
-        [LEARNED, OWN_SAMPLER, LONG_STEPS]
-        if isinstance(model, GuidedModelConfig)
-        else [OWN_SAMPLER]
-    )
-    return usual, every
+    is_guided = isinstance(model, GuidedModelConfig)
+    return [LEARNED, OWN_SAMPLER, LONG_STEPS] if is_guided else [OWN_SAMPLER], every
 
 
 def _model_of(method: str) -> Any:
@@ -160,11 +156,7 @@ def _contender_of(method: str, sampler: str) -> Contender | None:
 
 
 def contender_of_host(method: str, sampler: str, host: Any) -> Contender | None:
-    """A host with a sampler of its kind; None for a sampler of another kind.
-
-    Args:
-        host: config of the host's model.
-    """
+    """A host, by its model's config, with a sampler of its kind; None for one of another kind."""
     proposes = hasattr(host, "num_proposal_samples_per_ray")
     sized = SIZED_GRID.fullmatch(sampler)
     shown = SAMPLER_NAMES.get(sampler, sampler)
@@ -299,10 +291,8 @@ def _paper(name: str, **changes: object) -> Contender:
 
 def _empty_mlp(layers: int) -> dict[str, object]:
     """Changes that make the empty-space expert an MLP as wide as a scene expert."""
-    return {
-        "sizes__field__experts__empty_expert": "mlp",
-        "sizes__field__experts__empty_layers": layers,
-    }
+    experts = "sizes__field__experts__"
+    return {f"{experts}empty_expert": "mlp", f"{experts}empty_layers": layers}
 
 
 def _switch(sampler: str) -> Contender:
@@ -349,9 +339,7 @@ SUITES = {
             _paper("paper: imbalance and density"),
             _paper("paper without density loss", gate_loss__density=0.0),
             _paper(
-                "balanced as in Switch-NeRF",
-                gate_loss__density=0.0,
-                gate_loss__empty_ratio=None,
+                "balanced as in Switch-NeRF", gate_loss__density=0.0, gate_loss__empty_ratio=None
             ),
         ),
     ),
@@ -381,11 +369,8 @@ SUITES = {
 
 
 def in_order(names: Sequence[str]) -> list[str]:
-    """Names of suites, `all` among them or not, in the order of `SUITES`.
-
-    Raises:
-        InputError: there is no such suite.
-    """
+    """Names of suites, `all` among them or not, in the order of `SUITES`; an `InputError` for one
+    that there is not."""
     for name in names:
         if name not in SUITES and name != ALL:
             listed = ", ".join(SUITES)

@@ -65,11 +65,10 @@ def draw(results: Mapping[str, Any], path: Path, theme: Theme = LIGHT) -> Path:
         return save_picture(figure, path, results, dpi=160)
 
 
-def balanced(text: str, width: int = TITLE_WIDTH) -> str:
-    """A text in as few lines as `width` letters allow, all about as long."""
-    lines = len(textwrap.wrap(text, width))
-    narrowest = next(n for n in range(1, width + 1) if len(textwrap.wrap(text, n)) <= lines)
-    return textwrap.fill(text, narrowest)
+def balanced(text: str) -> str:
+    """A text in as few lines as `TITLE_WIDTH` allows, all about as long."""
+    lines, widths = len(textwrap.wrap(text, TITLE_WIDTH)), range(1, TITLE_WIDTH + 1)
+    return textwrap.fill(text, next(n for n in widths if len(textwrap.wrap(text, n)) <= lines))
 
 
 def _draw_race(figure: Any, height: float, shown: Shown, theme: Theme) -> None:
@@ -106,7 +105,11 @@ def _draw_occupancies(figure: Any, top: float, shown: Shown, theme: Theme) -> No
     above = [figure.add_axes((x, low, wide, top - 0.11 - low)) for x, wide in places]
     above[0].set_ylabel("space kept, %")
     draw_panel(above[0], replace(first, title="" if by_psnr else SIZE), theme)
-    _name(above[0], first.points, theme)
+    if first.points:
+        places, names = zip(*(((one.x, one.y), one.name) for one in first.points))
+        colours = [look_of(one, theme)["color"] for one in first.points]
+        seeds = [seed for one in first.points for seed in one.seeds]
+        name_points(above[0], places, names, colours, seeds)
     if by_psnr:
         above[0].set_xlabel("PSNR on unseen photographs, dB")
     for axes, by_time in zip(above[1:], others):
@@ -174,29 +177,9 @@ def _draw_front(axes: Any, panel: Panel, theme: Theme) -> None:
         return
     xs, ys = zip(*panel.front())
     worst, farthest = axes.get_ylim()[0], axes.get_xlim()[0 if panel.more_x else 1]
-    axes.step(
-        [xs[0], *xs, farthest],
-        [worst, *ys, ys[-1]],
-        where="post",
-        color=theme.ink,
-        alpha=0.3,
-        linewidth=5,
-        zorder=1,
-        scalex=False,
-        scaley=False,
-    )
-
-
-def _name(axes: Any, points: Sequence[Point], theme: Theme) -> None:
-    if not points:
-        return
-    name_points(
-        axes,
-        [(one.x, one.y) for one in points],
-        [one.name for one in points],
-        [look_of(one, theme)["color"] for one in points],
-        [seed for one in points for seed in one.seeds],
-    )
+    look = {"color": theme.ink, "alpha": 0.3, "linewidth": 5, "zorder": 1}
+    fixed = {"scalex": False, "scaley": False}
+    axes.step([xs[0], *xs, farthest], [worst, *ys, ys[-1]], where="post", **look, **fixed)
 
 
 def draw_curves(axes: Any, lines: Sequence[Line], theme: Theme, small: bool = False) -> None:
@@ -225,17 +208,9 @@ def name_ends(axes: Any, lines: Sequence[Line], theme: Theme, apart: float = CLO
     for i, (line, end, place) in enumerate(zip(lines, ends, places)):
         colour = style(i, theme)["color"]
         arrow = {"arrowstyle": "-", "relpos": (0.0, 0.5), "shrinkA": 2.0, "shrinkB": 6.0}
-        axes.annotate(
-            name_of_end(line),
-            end,
-            xytext=(1.03, place),
-            textcoords="axes fraction",
-            va="center",
-            color=colour,
-            fontweight="bold",
-            annotation_clip=False,
-            arrowprops={**arrow, "color": colour},
-        )
+        beside = {"xytext": (1.03, place), "textcoords": "axes fraction", "va": "center"}
+        look = {"color": colour, "fontweight": "bold", "arrowprops": {**arrow, "color": colour}}
+        axes.annotate(name_of_end(line), end, annotation_clip=False, **beside, **look)
 
 
 def name_of_end(line: Line) -> str:
@@ -282,11 +257,8 @@ def name_points(
     colours: Sequence[str],
     others: Sequence[tuple[float, float]] = (),
 ) -> None:
-    """Writes names beside points, each where it and the line to it cover least.
-
-    Args:
-        others: further points that are not to be covered.
-    """
+    """Writes names beside points, each where it and the line to it cover least: not others
+    either."""
     to_panel = axes.transData + axes.transAxes.inverted()
     taken = boxes_around(to_panel.transform([*places, *others]), *POINT)
     written = np.zeros((0, 4))
@@ -299,17 +271,9 @@ def name_points(
         end = _end_of(best[0], point)
         is_right = bool(best[0][0] > point[0])
         line = {"arrowstyle": "-", "color": colour, "relpos": (0.0 if is_right else 1.0, 0.5)}
-        axes.annotate(
-            name,
-            point,
-            xycoords="axes fraction",
-            xytext=end,
-            ha="left" if is_right else "right",
-            va="center",
-            color=colour,
-            fontweight="bold",
-            arrowprops=line if len(best) > 1 else None,
-        )
+        place = {"xycoords": "axes fraction", "xytext": end, "va": "center"}
+        look = {"color": colour, "fontweight": "bold", "ha": "left" if is_right else "right"}
+        axes.annotate(name, point, **place, **look, arrowprops=line if len(best) > 1 else None)
 
 
 def size_of(axes: Any, name: str) -> tuple[float, float]:

@@ -134,12 +134,10 @@ def write_page_file(figure: Any, path: Path, title: str) -> Path:
     """Writes a figure of plotly as a page: 2 MB for the library, which take 5 MB as they are."""
     from plotly.offline import get_plotlyjs
 
-    parts = {"library": get_plotlyjs(), "shown": figure.to_json()}
-    packed = {name: _packed(text) for name, text in parts.items()}
-    page = PAGE.format(title=html.escape(title), **packed).encode()
+    def packed(text: str) -> str:
+        return base64.b64encode(gzip.compress(text.encode(), 9, mtime=0)).decode()
+
+    parts = {"library": packed(get_plotlyjs()), "shown": packed(figure.to_json())}
+    page = PAGE.format(title=html.escape(title), **parts).encode()
     write_whole(path, lambda file: file.write(page))
     return path
-
-
-def _packed(text: str) -> str:
-    return base64.b64encode(gzip.compress(text.encode(), 9, mtime=0)).decode()

@@ -56,10 +56,9 @@ def train_job(
     *,
     looked_at: bool = True,
 ) -> tuple[dict[str, Any], Trainer]:
-    """Trains, evaluates and measures.
+    """Trains by the contender's config, evaluates and measures.
 
     Args:
-        config: of the contender.
         folder: for the occupancy, if there is one, and for nerfstudio's own files.
         on_progress: called with the share that is done.
         looked_at: False leaves the test images, and all figures of them, to the caller.
@@ -179,11 +178,8 @@ def _occupancy_of(trainer: Trainer, data: Path, folder: Path) -> dict[str, Any] 
 
 
 def main(folder: Path, run: Callable[..., dict[str, Any]] = run_job) -> int:
-    """Makes the run that a folder describes; 0, or 1 and a reason in the folder.
-
-    Args:
-        run: makes it; arguments as of `run_job`.
-    """
+    """Makes the run that a folder describes, by a function as `run_job`; 0, or 1 and a reason in
+    the folder."""
     from leco_plugin.chart.contender import Contender, Protocol
     from leco_plugin.evaluation.report import describe_code
 

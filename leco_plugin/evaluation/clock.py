@@ -1,28 +1,16 @@
-"""What runs cost: training time, peak memory, queries of fields and gates, updates of grids."""
+"""Training time and peak memory: a clock that stops during evaluation, and the end of a run."""
 
 from __future__ import annotations
 
-import functools
-import inspect
 import math
 import sys
 import time
-from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import torch
-from nerfstudio.fields.base_field import Field
-from nerfstudio.fields.density_fields import HashMLPDensityField
-from torch import Tensor, nn
-
-from leco_plugin.models import front_to_back
-from leco_plugin.models.field import HMoEField
-from leco_plugin.models.rendering import Scene
-from leco_plugin.occupancy import Occupancy
 
 STATUS = Path("/proc/self/status")
 
@@ -42,7 +30,6 @@ class Clock:
         self._started: float | None = None
 
     def start(self) -> None:
-        """Goes on from here."""
         synchronize()
         self._started = seconds_now()
 
@@ -76,10 +63,10 @@ def synchronize() -> None:
         torch.cuda.synchronize()
 
 
-def warm_up(device: torch.device | str, seconds: float = 0.2) -> None:
+def warm_up(device: torch.device | str) -> None:
     """Keeps the device busy for a moment, so that the first step does not pay for its start-up."""
     weights = torch.zeros(64, 64, device=device, requires_grad=True)
-    end = time.perf_counter() + seconds
+    end = time.perf_counter() + 0.2
     while time.perf_counter() < end:
         product = torch.ones(4096, 64, device=device) @ weights
         product.relu().sum().backward()
@@ -107,12 +94,8 @@ class Budget:
 
     def share(self, seconds: float, steps: int) -> float:
         """How much of the budget is used, in [0, 1]; at 1 the run is over."""
-        used = 0.0
-        if self.seconds is not None:
-            used = seconds / self.seconds
-        if self.steps is not None:
-            used = max(used, steps / self.steps)
-        return min(1.0, used)
+        of = ((seconds, self.seconds), (steps, self.steps))
+        return min(1.0, max(used / limit for used, limit in of if limit is not None))
 
 
 def peak_process_bytes() -> int:
@@ -136,131 +119,3 @@ def peak_process_bytes() -> int:
 def peak_allocator_bytes() -> int | None:
     """Highest memory that tensors on CUDA have held; None without CUDA."""
     return int(torch.cuda.max_memory_allocated()) if torch.cuda.is_available() else None
-
-
-KINDS = ("field", "proposal", "learning", "gate")
-"""Who is asked: the field that is rendered; proposal networks; another field, which learned the
-occupancy; a frozen gate, where its cell cache gave no answer."""
-
-
-@contextmanager
-def count_queries(model: nn.Module) -> Iterator[Counter[str]]:
-    """Counts, by `KINDS`, the positions at which a model's fields are evaluated in this context.
-
-    Fields that learn an occupancy for the model are counted too. All fields are `nn.Module`s.
-    What a routine in C asks of a field along rays is counted by its answer.
-    nerfstudio's are called by `get_density`, others by `density` or, without it, directly.
-    """
-    count = Counter(dict.fromkeys(KINDS, 0))
-    own = getattr(getattr(model, "mixture", model), "field", None)
-    fields: list[nn.Module] = [module for module in model.modules() if isinstance(module, Field)]
-    if isinstance(own, nn.Module) and own not in fields:
-        fields.append(own)
-    methods = [(owner, _method_of(owner)) for owner in {*map(type, fields), HMoEField}]
-    methods += [(Occupancy, "query"), (Occupancy, "occupied")]
-    of_model = {id(field) for field in fields}
-    asking = False
-
-    def kind(field: nn.Module) -> str:
-        if isinstance(field, Occupancy):
-            return "gate"
-        if id(field) not in of_model:
-            return "learning"
-        return "proposal" if isinstance(field, HashMLPDensityField) else "field"
-
-    def counting(method: Callable[..., Any]) -> Callable[..., Any]:
-        @functools.wraps(method)
-        def ask(field: nn.Module, positions: Any, *args: Any, **kwargs: Any) -> Any:
-            nonlocal asking
-            if asking:  # a method that calls that of its parent class
-                return method(field, positions, *args, **kwargs)
-            asking = True
-            try:
-                count[kind(field)] += number_of(positions)
-                return method(field, positions, *args, **kwargs)
-            finally:
-                asking = False
-
-        return ask
-
-    def counting_rays(shade: Callable[..., Any]) -> Callable[..., Any]:
-        @functools.wraps(shade)
-        def ask(scene: Scene, *args: Any) -> Any:
-            shaded, seen = shade(scene, *args)
-            count[kind(scene.field)] += len(seen.t_starts)
-            return shaded, seen
-
-        return ask
-
-    asked = [(owner, name, counting(getattr(owner, name))) for owner, name in methods]
-    in_c = counting_rays(front_to_back.shade_natively)
-    with _replaced([*asked, (front_to_back, "shade_natively", in_c)]):
-        yield count
-
-
-@contextmanager
-def _replaced(methods: list[tuple[Any, str, Callable[..., Any]]]) -> Iterator[None]:
-    """Puts methods and functions, by owner and name, in the place of others in this context."""
-    before = [(owner, name, vars(owner).get(name)) for owner, name, _ in methods]
-    for owner, name, method in methods:
-        setattr(owner, name, method)
-    try:
-        yield
-    finally:
-        for owner, name, known in before:
-            if known is None:
-                delattr(owner, name)
-            else:
-                setattr(owner, name, known)
-
-
-def _method_of(owner: type) -> str:
-    """The method that evaluates the fields of a class."""
-    return next(name for name in ("get_density", "density", "forward") if hasattr(owner, name))
-
-
-def number_of(positions: Any) -> int:
-    """How many there are: of a tensor [..., 3], or of nerfstudio's `RaySamples`."""
-    if isinstance(positions, Tensor):
-        return positions.numel() // positions.shape[-1]
-    return math.prod(positions.frustums.shape)
-
-
-WARM_UP = 1 / 16
-"""Most of a run that the warm-up of a grid lasts: nerfacc's 256 steps are half of a short run."""
-
-
-class GridUpdates:
-    """Watches the occupancy grids of a model, nerfacc's or like those, from now on.
-
-    Args:
-        share_at: the share of the run that is over at a step. A warm-up ends with `WARM_UP` of it,
-            if not sooner. None leaves it as it is.
-    """
-
-    def __init__(self, model: nn.Module, share_at: Callable[[int], float] | None = None) -> None:
-        self.share_at = share_at
-        self.clock = Clock()
-        """The time of all updates."""
-        self.warming_up: bool | None = None
-        """Whether the last update was in a grid's warm-up, when nerfacc asks all cells; None
-        without a grid, or for one that does not say."""
-        self.grids: list[Any] = [module for module in model.modules() if "occs" in module._buffers]
-        for grid in self.grids:
-            vars(grid)["update_every_n_steps"] = self._watched(grid.update_every_n_steps)
-
-    def _watched(self, update: Callable[..., Any]) -> Callable[..., Any]:
-        signature = inspect.signature(update)
-
-        def run(*args: Any, **kwargs: Any) -> Any:
-            asked = signature.bind(*args, **kwargs)
-            asked.apply_defaults()
-            step, until = (asked.arguments.get(name) for name in ("step", "warmup_steps"))
-            if step is not None and until is not None:
-                if self.share_at is not None and self.share_at(step) >= WARM_UP:
-                    asked.arguments["warmup_steps"] = until = min(until, step)
-                self.warming_up = step < until
-            with self.clock.running():
-                return update(*asked.args, **asked.kwargs)
-
-        return run

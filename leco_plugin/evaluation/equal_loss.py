@@ -48,12 +48,7 @@ SPARED = 0.1
 
 
 def threshold_losing(weights: Tensor, scores: Tensor, lost: float) -> float:
-    """The largest score below which samples hold at most a share `lost` of all weight.
-
-    Args:
-        weights: [M] non-negative.
-        scores: [M]; what is below the threshold is skipped.
-    """
+    """The largest score below which samples hold at most a share `lost` of all weight [M] >= 0."""
     ordered, order = scores.double().sort()
     skipped = weights.double()[order].cumsum(0)
     first_too_many = int((skipped <= lost * skipped[-1]).sum())
@@ -195,26 +190,20 @@ def _measured(
 
 def mapped_box(mixture: Mixture) -> ViewBox:
     """The scene's box in mapped coordinates; an unbounded scene fills the cube."""
-    device = mixture.device
-    if mixture.region.space.kind != "box":
-        return ViewBox(-torch.ones(3, device=device), torch.ones(3, device=device))
-    box = whole_box(mixture.occupancy())
-    low, high = mixture.region.space.map(torch.stack([box.low, box.high]).to(device)).clamp(
-        -1.0, 1.0
-    )
-    return ViewBox(low, high)
+    corners = torch.tensor([[-1.0] * 3, [1.0] * 3], device=mixture.device)
+    if mixture.region.space.kind == "box":
+        box = whole_box(mixture.occupancy())
+        ends = torch.stack([box.low, box.high]).to(mixture.device)
+        corners = mixture.region.space.map(ends).clamp(-1.0, 1.0)
+    return ViewBox(*corners)
 
 
 def reached_volume(mixture: Mixture, taught: Tensor, count: int, seed: int = 0) -> Tensor:
     """Mapped positions spread evenly over what rays reach of the scene's box: [P, 3], P <= count.
 
-    Args:
-        taught: [M, 3] mapped candidates of rays.
-        count: positions in the whole box.
+    Rays reach the cells of their mapped candidates `taught` [M, 3].
     """
-    box = whole_box(mixture.occupancy())
-    unit = torch.rand(count, 3, generator=torch.Generator().manual_seed(seed))
-    positions = torch.lerp(box.low, box.high, unit).to(mixture.device)
+    positions = whole_box(mixture.occupancy()).draw(count, seed).to(mixture.device)
     mapped = mixture.region.space.map(positions).clamp(-1.0, 1.0)
     return mapped[reached(taught, mapped)]
 
@@ -232,10 +221,8 @@ def reached(taught: Tensor, mapped: Tensor) -> Tensor:
 
 
 def rays_of_photographs(datamanager: Any, count: int, seed: int = 0) -> RayBundle:
-    """Rays anywhere in the training photographs, whose pixels need not be read.
-
-    Training is not disturbed: its pixels and its random numbers are not used.
-    """
+    """Rays anywhere in the training photographs; pixels and random numbers of training are not
+    touched."""
     cameras = datamanager.train_dataset.cameras.to("cpu")
     generator = torch.Generator().manual_seed(seed)
     numbers = torch.randint(len(cameras), (count, 1), generator=generator)

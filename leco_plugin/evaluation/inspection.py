@@ -45,6 +45,11 @@ class ViewBox:
     high: Tensor
     """[3] scene units."""
 
+    def draw(self, count: int, seed: int = 0) -> Tensor:
+        """Positions spread evenly over the box, the same for a seed: [count, 3] on the CPU."""
+        unit = torch.rand(count, 3, generator=torch.Generator().manual_seed(seed))
+        return torch.lerp(self.low, self.high, unit)
+
     def cells(self, longest: int) -> tuple[int, int, int]:
         """Numbers of nearly cubic cells, `longest` along the longest side."""
         sides = self.high - self.low
@@ -65,8 +70,7 @@ class ViewBox:
 def describe(occupancy: Occupancy) -> dict[str, Any]:
     """Sizes, space, threshold, kept share of its box, report of calibration: JSON values."""
     box = whole_box(occupancy)
-    points = torch.rand(1 << 16, 3, generator=torch.Generator().manual_seed(0))
-    positions = torch.lerp(box.low, box.high, points)
+    positions = box.draw(1 << 16)
     values = query(occupancy, positions)
     return {
         "format": 1,
@@ -92,11 +96,8 @@ def describe(occupancy: Occupancy) -> dict[str, Any]:
 
 
 def doubts(facts: dict[str, Any]) -> list[str]:
-    """What was said when the occupancy was frozen, if it or its field are of no use.
-
-    Args:
-        facts: of `describe`.
-    """
+    """What was said when the occupancy was frozen, if it or its field are of no use; `facts` are of
+    `describe`."""
     field, one_colour = (facts["report"].get(name) for name in (FIELD, ONE_COLOUR))
     found: list[str] = []
     if isinstance(field, float) and isinstance(one_colour, float):
@@ -137,17 +138,12 @@ def scene_of(occupancy: Occupancy, file: Path, data: Path | None) -> Path | None
     """
     description = description_of_run(file) if data is None else description_in(data)
     known, back = cameras_of(occupancy), to_the_data(occupancy)
-    if (
-        description is None
-        or back is None
-        or not len(known)
-        or "data_frame" not in occupancy.report
-    ):
+    says_where = len(known) > 0 and "data_frame" in occupancy.report
+    if description is None or back is None or not says_where:
         return description
     here = moved(torch.from_numpy(camera_places(description)), inverse(back))
-    found = 0
-    if len(here):
-        found = int(found_again(known, here, float(occupancy.space.half_extent)).sum())
+    reach = float(occupancy.space.half_extent)
+    found = int(found_again(known, here, reach).sum()) if len(here) else 0
     if 2 * found >= len(known):
         return description
     if data is None:
@@ -229,10 +225,8 @@ class SceneColours(NamedTuple):
 
 
 def scene_colours(occupancy: Occupancy, description: Path | None) -> SceneColours | None:
-    """Colours for an occupancy of a scene; None where points, colours or coordinates are not known.
+    """Colours by a scene's transforms.json; None where points, colours or coordinates are unknown.
 
-    Args:
-        description: the scene's transforms.json.
     Raises:
         InputError: the file of the points cannot be read.
     """

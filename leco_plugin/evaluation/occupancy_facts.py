@@ -15,12 +15,8 @@ from leco_plugin.scenes.city.city import DESCRIPTION
 from leco_plugin.scenes.city.truth import CityTruth
 
 FROM_REPORT = (
-    "train_seconds",
-    "empty_fraction",
-    "lost_mass",
-    "threshold",
-    "lost_surface_mass",
-    "image_price_db",
+    *("train_seconds", "empty_fraction", "lost_mass"),
+    *("threshold", "lost_surface_mass", "image_price_db"),
 )
 MOST_SURFACE_POINTS = 100_000
 AIR_POINTS = 50_000
@@ -37,11 +33,9 @@ def truth_of(folder: Path, manager: Any) -> CityTruth | None:
 def occupancy_facts(
     occupancy: Occupancy, file: Path, manager: Any, truth: CityTruth | None
 ) -> dict[str, Any]:
-    """Sizes, calibration, and the comparison with the exact scene: JSON values.
+    """Sizes, calibration, and the comparison with the exact scene: JSON values, None without one.
 
-    Args:
-        occupancy: in the coordinates of `manager`, from `file`.
-        truth: the exact scene; without one its figures are None.
+    The occupancy, of a file, and the truth are in the coordinates of the data manager.
     """
     report = occupancy.report
     measured: dict[str, Any] = {"kept_surface_recall": None, "free_space_skipped": None}

@@ -7,9 +7,11 @@ proposal networks.
 
 from __future__ import annotations
 
+from collections import defaultdict
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any
+from itertools import zip_longest
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 from leco_plugin.chart.contender import Contender, Job
 from leco_plugin.hosts.guided_start import OWN_SAMPLER
@@ -104,11 +106,8 @@ SAMPLERS = {
 
 
 def samplers_named(names: tuple[str, ...]) -> list[Sampler]:
-    """The samplers of these names and the references they are held against, in the table's order.
-
-    Raises:
-        InputError: there is no sampler of a name.
-    """
+    """The samplers of these names and the references they are held against, in the table's order;
+    an `InputError` for a name that there is not."""
     unknown = [name for name in names if name not in SAMPLERS]
     if unknown:
         raise InputError(f"there is no sampler {unknown[0]!r}; there are {', '.join(SAMPLERS)}")
@@ -130,10 +129,7 @@ def contender_of(
 ) -> Contender:
     """The sampler in its host under the conditions of a case.
 
-    Args:
-        changes: settings of the model; those of learning are left out where nothing is learned.
-        settings: settings of the whole method.
-        grid_levels: nested boxes of occupancy grids.
+    Changes of the model that are about learning are left out where nothing is learned.
     """
     name = sampler.name
     in_nerfacto = name in (PROPOSALS, DENSE_PROPOSAL)
@@ -195,8 +191,7 @@ Key = tuple[str, str]
 """Scene and name of a run."""
 
 
-@dataclass(frozen=True)
-class Run:
+class Run(NamedTuple):
     """One run, on the scene of a name."""
 
     scene: str
@@ -210,7 +205,7 @@ class Run:
 
 @dataclass(frozen=True)
 class Entry:
-    """One cell of the table before anything is known of it."""
+    """One cell of the table before anything is known of it, and the runs that it is made of."""
 
     case: Case
     sampler: Sampler
@@ -219,7 +214,6 @@ class Entry:
 
     @property
     def runs(self) -> list[Run]:
-        """Those that it is made of."""
         return [Run(self.case.scene, Job(self.contender, seed)) for seed in self.seeds]
 
 
@@ -245,9 +239,8 @@ def entries_of(
                 one = contender_of(sampler, sizes, case.changes, case.settings, levels)
                 chosen = tuple(dict.fromkeys(seeds))
                 if sampler.name == LEARNED:
-                    missing = case.seeds - len(chosen)
-                    more = (seed for seed in range(case.seeds) if seed not in chosen)
-                    chosen += tuple(more)[: max(missing, 0)]
+                    more = [seed for seed in range(case.seeds) if seed not in chosen]
+                    chosen += tuple(more[: max(case.seeds - len(chosen), 0)])
                 elif beside and sampler.name != DENSE:
                     chosen = tuple(dict.fromkeys(beside))
                 entries.append(Entry(case, sampler, one, chosen))
@@ -256,13 +249,9 @@ def entries_of(
 
 def runs_of(entries: Sequence[Entry]) -> list[Run]:
     """All runs, each once: all cells get their first seed before any gets its second."""
-    most = max((len(entry.seeds) for entry in entries), default=0)
-    found: dict[Key, Run] = {}
-    for number in range(most):
-        for entry in entries:
-            for run in entry.runs[number : number + 1]:
-                found.setdefault(run.key, run)
-    return list(found.values())
+    in_turn = zip_longest(*(entry.runs for entry in entries))
+    runs = (run for one_of_each in in_turn for run in one_of_each if run is not None)
+    return list({run.key: run for run in runs}.values())
 
 
 def scenes_of(cases: Sequence[Case], sizes: Sizes) -> dict[str, tuple[Stage, Capture]]:
@@ -273,8 +262,9 @@ def scenes_of(cases: Sequence[Case], sizes: Sizes) -> dict[str, tuple[Stage, Cap
 def capture_of(case: Case, sizes: Sizes) -> Capture:
     """A case's capture in pictures of the suite's size."""
     capture = case.capture
-    is_fixed = capture.views != Capture.views
-    views = capture.views if is_fixed else round(capture.views * sizes.views)
+    views = capture.views
+    if views == Capture.views:
+        views = round(views * sizes.views)
     return replace(
         capture,
         views=max(4, views),
@@ -285,15 +275,10 @@ def capture_of(case: Case, sizes: Sizes) -> Capture:
 
 
 def core_seconds(runs: Sequence[Run], stored: Sequence[Mapping[str, Any]], sizes: Sizes) -> float:
-    """What some runs take of one core, seconds.
-
-    Args:
-        runs: to be made.
-        stored: records of runs that were made; what they took replaces the stored figures.
-    """
-    measured: dict[str, list[float]] = {}
+    """What runs to be made take of one core, seconds: as long as stored ones of their samplers."""
+    measured: defaultdict[str, list[float]] = defaultdict(list)
     for record in stored:
-        measured.setdefault(record["sampler"], []).append(float(record["processor_seconds"]))
+        measured[record["sampler"]].append(float(record["processor_seconds"]))
     means = {name: sum(seconds) / len(seconds) for name, seconds in measured.items()}
     return sum(means.get(run.job.contender.sampler) or expected_seconds(run, sizes) for run in runs)
 

@@ -13,7 +13,7 @@ from nerfstudio.fields.base_field import Field
 from nerfstudio.fields.density_fields import HashMLPDensityField
 from torch import Tensor, nn
 
-from leco_plugin.evaluation.clock import GridUpdates, count_queries
+from leco_plugin.evaluation.queries import GridUpdates, count_queries
 from leco_plugin.models import front_to_back
 from leco_plugin.models.encodings import EncodingConfig
 from leco_plugin.models.field import FieldConfig, HMoEField

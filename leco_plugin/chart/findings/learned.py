@@ -86,9 +86,7 @@ class Learned(Line):
 def learned_of(lines: Sequence[Line]) -> list[Learned]:
     """Of each contender that learns an occupancy with a gate, whether it was ever frozen or not;
     none where nothing was."""
-    found = [
-        Learned(line.name, line.method, line.sampler, line.runs) for line in lines if line.learned
-    ]
+    found = [Learned(**vars(line)) for line in lines if line.learned]
     return found if any(one.facts for one in found) else []
 
 
@@ -183,15 +181,13 @@ def still_rising(lines: Sequence[Line]) -> list[str]:
     These gained more than `ENOUGH` in the last third, or their gain is unknown, or their grid has
     skipped nothing yet or has taken the time of training.
     """
-    gains = [(line, last_gain(line)) for line in lines]
-    return [
-        line.name
-        for line, gain in gains
-        if gain is None
-        or round(gain, 1) > ENOUGH
-        or line.warming_up
-        or line.kept_up > HARDLY_TRAINED
-    ]
+
+    def rises(line: Line) -> bool:
+        gain = last_gain(line)
+        gained = gain is None or round(gain, 1) > ENOUGH
+        return gained or line.warming_up or line.kept_up > HARDLY_TRAINED
+
+    return [line.name for line in lines if rises(line)]
 
 
 def settling(lines: Sequence[Line]) -> str:
@@ -204,11 +200,8 @@ def settling(lines: Sequence[Line]) -> str:
     rising = still_rising(lines)
     who = "all of them" if len(rising) == len(lines) else " and ".join(rising)
     said = f"Still rising: {who}; rates" if rising else "Rates"
-    hardly = [
-        f"{line.name} for {line.kept_up:.0%} of its time"
-        for line in lines
-        if line.kept_up > HARDLY_TRAINED
-    ]
+    took = [line for line in lines if line.kept_up > HARDLY_TRAINED]
+    hardly = [f"{line.name} for {line.kept_up:.0%} of its time" for line in took]
     kept_up = f" Updated its grid instead of training: {', '.join(hardly)}." if hardly else ""
     return (
         f"Gained in the last third of the time: {listed}. {said} fall to a tenth over the time "

@@ -45,18 +45,11 @@ class Verdict:
 
 
 def compare(ours: Sequence[float], theirs: Sequence[float]) -> Verdict:
-    """Compares a figure of two contenders by the 95% interval of Welch's t around the difference of
-    their means: level where that holds zero.
+    """Compares a figure of each run of two contenders by the 95% interval of Welch's t around the
+    difference of their means: level where that holds zero. Swap the two for a cost.
 
     Runs with the same seed share nothing but its number, so that they are no pairs, and two
-    contenders need not scatter alike.
-
-    Args:
-        ours: the figure in each run, one for a seed. Less is better for a cost: then swap the two.
-        theirs: the same of the other contender.
-
-    Raises:
-        ValueError: one of them has no run.
+    contenders need not scatter alike. `ValueError` where one of them has no run.
     """
     if not ours or not theirs:
         raise ValueError(f"{len(ours)} runs cannot be compared with {len(theirs)}")
@@ -70,9 +63,8 @@ def compare(ours: Sequence[float], theirs: Sequence[float]) -> Verdict:
     if squared > 0.0:
         freedom = squared**2 / sum(e**2 / (n - 1) for e, n in zip(errors, counts))
         margin = float(stdtrit(freedom, 0.5 + CONFIDENCE / 2)) * math.sqrt(squared)
-    if abs(difference) <= margin:
-        return Verdict("level", difference, margin, counts)
-    return Verdict("ahead" if difference > 0.0 else "behind", difference, margin, counts)
+    word: Any = "ahead" if difference > 0.0 else "behind"
+    return Verdict("level" if abs(difference) <= margin else word, difference, margin, counts)
 
 
 LOST_SURFACE_MASS = 1e-3
@@ -218,9 +210,8 @@ def common_psnr(lines: Sequence[Line]) -> float:
 
 def front(points: Sequence[tuple[float, float]]) -> list[int]:
     """Which points (cost, gain) no other one beats in both: their numbers, by rising cost."""
-    order = sorted(range(len(points)), key=lambda i: (points[i][0], -points[i][1]))
     found: list[int] = []
-    for i in order:
+    for i in sorted(range(len(points)), key=lambda i: (points[i][0], -points[i][1])):
         if not found or points[i][1] > points[found[-1]][1]:
             found.append(i)
     return found
@@ -242,11 +233,11 @@ def headline(results: Mapping[str, Any]) -> str:
         return f"{ranked[0].name}: {ranked[0].psnr:.1f} dB"
     best, second = ranked[:2]
     found = compare(best.psnrs, second.psnrs)
-    figures = f"{best.psnr:.1f} and {second.psnr:.1f} dB"
     if found.margin is None:
         return f"{best.name} {best.psnr:.1f} dB, {second.name} {second.psnr:.1f} dB ({found.by})"
     apart = f"{found.difference:.2f} ± {found.margin:.2f}"
     if found.word == "level":
+        figures = f"{best.psnr:.1f} and {second.psnr:.1f} dB"
         return f"{best.name} and {second.name} are level: {figures}, {apart} apart ({found.by})"
     said = f"{best.name} is ahead: {best.psnr:.1f} dB, {apart} more than {second.name} ({found.by})"
     return f"{said}, whose grid is still in its warm-up" if second.warming_up else said
@@ -286,11 +277,7 @@ class Versus:
 
 
 def versus(ours: Line, theirs: Line, seconds: float | None) -> Versus:
-    """Compares the runs of two contenders.
-
-    Args:
-        seconds: training time that each was given; a last step beyond it does not count.
-    """
+    """Compares the runs of two contenders; a last step beyond `seconds` of each does not count."""
     most = seconds or math.inf
     curves = [run["curve"] for run in theirs.runs]
     last = statistics.fmean(curve[-1][1] for curve in curves)
