@@ -22,11 +22,7 @@ from leco_plugin.capacity.search import Candidate, find_threshold, gates, grids
 from leco_plugin.capacity.sources import Source, draw_held_out, draw_training_rays
 from leco_plugin.chart.runner import SETTINGS, make_jobs, take_folder
 from leco_plugin.chart.theme import DARK, LIGHT
-from leco_plugin.evaluation.equal_loss import (
-    kept_shares,
-    mapped_box,
-    reached_volume,
-)
+from leco_plugin.evaluation.equal_loss import kept_shares, mapped_box, reached_volume
 from leco_plugin.evaluation.field_grids import fits_memory, largest_in_cells, plain_and_dilated
 from leco_plugin.evaluation.inspection import ViewBox, in_parts
 from leco_plugin.evaluation.report import (

@@ -147,7 +147,7 @@ def _chart_of(
 def _make(chart: Chart, runner_for: Callable[[Chart], Runner]) -> dict[str, Any]:
     """Makes what is missing of a chart, and draws all of it; returns its results."""
     say = functools.partial(CONSOLE.print, markup=False, highlight=False)
-    suite = f"{chart.suite}, " if chart.suite is not None else ""
+    suite = f"{chart.suite}, " if chart.suite else ""
     title = f"{chart.scene['name']}, {suite}{chart.protocol.describe()} a run"
     with resumable(say), bar(title) as show:
         chart.make(runner_for(chart), say, show)

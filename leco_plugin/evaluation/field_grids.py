@@ -115,10 +115,7 @@ def probes_in_a_cell(sizes: Sequence[int]) -> int:
 
 
 def fill_cells(
-    density: Density,
-    box: ViewBox,
-    asked: Tensor,
-    known: tuple[Tensor, Tensor] | None = None,
+    density: Density, box: ViewBox, asked: Tensor, known: tuple[Tensor, Tensor] | None = None
 ) -> Tensor:
     """Scores [nx, ny, nz] of cells, zero where they are neither asked, bool [nx, ny, nz], nor
     known: mapped positions [M, 3] and densities [M]."""

@@ -13,12 +13,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from leco_plugin.learning.quality import (
-    FIELD,
-    ONE_COLOUR,
-    doubts_of_field,
-    doubts_of_occupancy,
-)
+from leco_plugin.learning.quality import FIELD, ONE_COLOUR, doubts_of_field, doubts_of_occupancy
 from leco_plugin.models.region import cut_rays, marching_rule, within_crop
 from leco_plugin.occupancy import SEEN_CELLS, Occupancy
 from leco_plugin.samplers import marching

@@ -10,8 +10,9 @@ import inspect
 import math
 from collections import Counter
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from typing import Any
+from unittest.mock import patch
 
 from nerfstudio.fields.base_field import Field
 from nerfstudio.fields.density_fields import HashMLPDensityField
@@ -77,26 +78,14 @@ def count_queries(model: nn.Module) -> Iterator[Counter[str]]:
 
         return ask
 
-    asked = [(owner, name, counting(getattr(owner, name))) for owner, name in methods]
+    asked: list[tuple[Any, str, Callable[..., Any]]] = [
+        (owner, name, counting(getattr(owner, name))) for owner, name in methods
+    ]
     in_c = counting_rays(front_to_back.shade_natively)
-    with _replaced([*asked, (front_to_back, "shade_natively", in_c)]):
+    with ExitStack() as stack:
+        for owner, name, method in [*asked, (front_to_back, "shade_natively", in_c)]:
+            stack.enter_context(patch.object(owner, name, method))
         yield count
-
-
-@contextmanager
-def _replaced(methods: list[tuple[Any, str, Callable[..., Any]]]) -> Iterator[None]:
-    """Puts methods and functions, by owner and name, in the place of others in this context."""
-    before = [(owner, name, vars(owner).get(name)) for owner, name, _ in methods]
-    for owner, name, method in methods:
-        setattr(owner, name, method)
-    try:
-        yield
-    finally:
-        for owner, name, known in before:
-            if known is None:
-                delattr(owner, name)
-            else:
-                setattr(owner, name, known)
 
 
 def _method_of(owner: type) -> str:

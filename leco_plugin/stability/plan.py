@@ -51,26 +51,13 @@ class Sizes:
     table: int = 15
     """Binary logarithm of the entries of the hosts' hash tables."""
 
-    @property
-    def ngp(self) -> dict[str, Any]:
-        """Instant-NGP: rays end well beyond the scene, with steps that grow with the distance."""
-        return {
-            "host.log2_hashmap_size": self.table,
-            "host.max_res": 512,
-            "host.grid_levels": 1,
-            "host.cone_angle": 1 / 32,
-            "host.far_plane": 20.0,
-        }
-
-    @property
-    def nerfacto(self) -> dict[str, Any]:
-        """Nerfacto in the same sizes."""
-        return {
-            "host.log2_hashmap_size": self.table,
-            "host.max_res": 512,
-            "host.far_plane": 20.0,
-            "host.use_appearance_embedding": False,
-        }
+    def host(self, in_nerfacto: bool) -> dict[str, Any]:
+        """Nerfacto, or Instant-NGP with steps that grow with the distance: rays end well beyond the
+        scene."""
+        sizes = {"host.log2_hashmap_size": self.table, "host.max_res": 512, "host.far_plane": 20.0}
+        if in_nerfacto:
+            return {**sizes, "host.use_appearance_embedding": False}
+        return {**sizes, "host.grid_levels": 1, "host.cone_angle": 1 / 32}
 
 
 FULL = Sizes(steps=720, rays=96, learn_rays=384, learn_steps=200)
@@ -150,19 +137,11 @@ def contender_of(
         cells = int(name.removeprefix(f"{GRID}-"))
         options = {"resolution": cells, "levels": grid_levels}
         own = {"occupancy.sampler": "occupancy-grid", "occupancy.options": options}
-    asked = {
-        path: value
-        for path, value in changes.items()
-        if name == LEARNED or not path.startswith("occupancy.")
-    }
-    host = sizes.nerfacto if in_nerfacto else sizes.ngp
-    return Contender(
-        sampler.title,
-        "leco-nerfacto" if in_nerfacto else "leco-ngp",
-        name,
-        changes={**host, **own, **asked},
-        settings={RAYS: sizes.rays, **settings},
-    )
+    left_out = () if name == LEARNED else ("occupancy.",)
+    asked = {path: value for path, value in changes.items() if not path.startswith(left_out)}
+    host = "leco-nerfacto" if in_nerfacto else "leco-ngp"
+    changes = {**sizes.host(in_nerfacto), **own, **asked}
+    return Contender(sampler.title, host, name, changes, settings={RAYS: sizes.rays, **settings})
 
 
 START_SECONDS = 14.0

@@ -25,12 +25,7 @@ from leco_plugin.chart.runner import (
     take_folder,
 )
 from leco_plugin.chart.theme import DARK, LIGHT
-from leco_plugin.evaluation.report import (
-    describe_code,
-    describe_machine,
-    usable_cores,
-    write_json,
-)
+from leco_plugin.evaluation.report import describe_code, describe_machine, usable_cores, write_json
 from leco_plugin.log import bar, console, resumable
 from leco_plugin.occupancy import CALIBRATED_AT
 from leco_plugin.scenes.city.folder import TRANSFORMS

@@ -22,7 +22,12 @@ from leco_plugin.stability.worker import run_cell
 # where a host samples does not depend on what its field has learned
 MICRO = Sizes(steps=3, rays=64, learn_rays=64, learn_steps=20, dense_samples=24, table=8)
 # steps short enough that no surface lies between two middles and near neither
-SMALL = {**MICRO.ngp, "host.cone_angle": 1 / 20, "host.max_res": 32, "host.far_plane": 8.0}
+SMALL = {
+    **MICRO.host(in_nerfacto=False),
+    "host.cone_angle": 1 / 20,
+    "host.max_res": 32,
+    "host.far_plane": 8.0,
+}
 
 
 class SkipsHalf(DenseEstimator):
