@@ -158,9 +158,7 @@ def loss(evidence: Evidence, skipped: Tensor, unlikely: float = UNLIKELY) -> Los
     lost_all, all_weight = (float((evidence.weights * m).sum()) for m in (skipped, 1.0))
     lost_mass = lost_all / max(all_weight, 1e-12)
     lost, worth = (
-        torch.zeros(evidence.rays, dtype=torch.float64, device=evidence.worth.device).index_add_(
-            0, evidence.ray_indices, values.double()
-        )
+        torch.bincount(evidence.ray_indices, values.double(), evidence.rays)
         for values in (evidence.worth * skipped, evidence.worth)
     )
     total = float(worth.sum())

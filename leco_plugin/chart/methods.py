@@ -20,9 +20,7 @@ from leco_plugin.chart.contender import (
     LONG_STEPS,
     WITHOUT_GIFTS,
     Contender,
-    Cores,
     Protocol,
-    forecast_minutes,
 )
 from leco_plugin.evaluation.report import usable_cores
 from leco_plugin.host_configs import switch_nerf_host
@@ -241,8 +239,6 @@ MADE_GRIDS = (64, 128, 256, 512)
 STEPS = 2 * LEARNING.schedule.learn_steps
 """Of suites that ask what was learned: half for learning, and a quarter more for a gate that has
 not settled."""
-CPU_STEPS = 400
-"""The same on a CPU, for forecasts."""
 AT_ONCE = 1 if ON_GPU else min(2, usable_cores())
 """Runs at a time: on a CPU, small tensors gain more by another run than by another thread."""
 ALL = "all"
@@ -263,20 +259,8 @@ class Suite:
     @property
     def protocol(self) -> Protocol:
         """The default protocol. Suites with the same one share runs."""
-        return self._protocol(STEPS, AT_ONCE)
-
-    @property
-    def on_two_cores(self) -> Protocol:
-        """The protocol on two CPU cores, for forecasts on any machine."""
-        return self._protocol(CPU_STEPS, 2)
-
-    def _protocol(self, steps: int, at_once: int) -> Protocol:
-        few = steps if self.seconds is None else None
-        return Protocol(self.seconds, few, self.learn_seconds, at_once=at_once)
-
-    def minutes(self, cores: Cores, seeds: int = 3) -> float:
-        """Forecast of all its runs on two CPU cores."""
-        return seeds * forecast_minutes(self.contenders, self.on_two_cores, cores)
+        steps = STEPS if self.seconds is None else None
+        return Protocol(self.seconds, steps, self.learn_seconds, at_once=AT_ONCE)
 
 
 def _leco(name: str, **changes: object) -> Contender:

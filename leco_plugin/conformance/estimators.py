@@ -188,10 +188,10 @@ def _check_uniform(shares: Tensor) -> None:
 
     By the statistic of Kolmogorov and Smirnov, which for these exceeds 4 / sqrt(N) once in 10^13.
     """
+    from scipy.stats import ks_1samp, uniform
+
     n = len(shares)
-    even = torch.arange(n + 1) / n
-    found = shares.cpu().sort().values
-    apart = float(torch.maximum(found - even[:-1], even[1:] - found).max())
+    apart = float(ks_1samp(shares.cpu().numpy(), uniform.cdf, method="asymp").statistic)
     bound = 4.0 / n**0.5
     require(
         apart <= bound,
