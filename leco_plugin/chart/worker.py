@@ -163,7 +163,7 @@ def compare_at_freezing(model: Any, datamanager: Any, contender: Contender) -> d
 
 def _occupancy_of(trainer: Trainer, data: Path, folder: Path) -> dict[str, Any] | None:
     """Facts of the occupancy that a run has left, if any; its file is kept."""
-    from leco_plugin.evaluation.occupancy_facts import occupancy_facts, truth_of
+    from leco_plugin.evaluation.equal_loss import occupancy_facts, truth_of
     from leco_plugin.learning.freezing import FILE_NAME
     from leco_plugin.occupancy import Occupancy
     from leco_plugin.scenes.photographs import folder_of
