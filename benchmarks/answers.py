@@ -12,16 +12,17 @@ from page_parts import size, table
 
 from leco_plugin.chart.findings.learned import (
     Learned,
+    falls,
     learned_of,
     level_with,
     ours_of,
     percent,
+    still_rising,
 )
 from leco_plugin.chart.findings.representations import COSTS, fronts_of, representations_of
-from leco_plugin.chart.findings.settling import falls, still_rising
 from leco_plugin.chart.findings.summary import RENDERING, Line, lines_of
+from leco_plugin.chart.methods import SUITES
 from leco_plugin.chart.panels import asks_what_was_learned, title_of
-from leco_plugin.chart.suites import SUITES
 
 HEAD = """## The reviewers' questions, answered
 

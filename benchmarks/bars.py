@@ -14,8 +14,7 @@ from page_parts import noted
 from stability_page import has_lost, runs_gone_on
 
 from leco_plugin.chart.findings.learned import learned_of
-from leco_plugin.chart.findings.summary import figure_in, lines_of, versus
-from leco_plugin.chart.findings.verdicts import Verdict
+from leco_plugin.chart.findings.summary import Verdict, figure_in, lines_of, versus
 from leco_plugin.chart.methods import NEVER_FROZEN, VARIANTS
 from leco_plugin.chart.table import rows
 

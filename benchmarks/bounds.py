@@ -21,7 +21,7 @@ from typing import Any
 import checkout  # noqa: F401
 import tyro
 
-from leco_plugin.chart.findings.verdicts import compare
+from leco_plugin.chart.findings.summary import compare
 from leco_plugin.evaluation.clock import Budget
 from leco_plugin.evaluation.report import describe_code, describe_machine, made_by, write_json
 from leco_plugin.evaluation.timed_run import timed_run

@@ -9,7 +9,7 @@ import checkout  # noqa: F401
 from page_parts import RESULTS, machine_line, noted, picture
 from paper_rows import PAPER_ROWS
 
-from leco_plugin.chart.suites import SUITES
+from leco_plugin.chart.methods import SUITES
 from leco_plugin.chart.table import table
 
 CHARTS = RESULTS / "charts"

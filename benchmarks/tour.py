@@ -20,7 +20,7 @@ from torch import Tensor
 
 from leco_plugin.cli_reports import occupancy_of
 from leco_plugin.evaluation.history_picture import write_film
-from leco_plugin.evaluation.ray_states import candidates
+from leco_plugin.evaluation.inspection import candidates
 from leco_plugin.log import bar
 from leco_plugin.occupancy import Occupancy
 

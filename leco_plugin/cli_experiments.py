@@ -134,7 +134,7 @@ def capacity(
         learn_steps: Steps in which the field is learned, at most.
         json: Another file for the results.
     """
-    from leco_plugin.capacity.command import capacity as measure
+    from leco_plugin.capacity.measuring import capacity as measure
 
     check_json(json)
     results = measure(data, out, grids, lost_surface_mass, learn_steps)

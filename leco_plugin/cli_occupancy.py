@@ -177,7 +177,7 @@ def shrink(
         json: File for the gates that were tried and the one that was chosen, as JSON; each is
             written when it was tried, so that a search that is stopped leaves those.
     """
-    from leco_plugin.capacity.frontier import draw, summary
+    from leco_plugin.capacity.choice import draw_gates, summary
     from leco_plugin.capacity.references import Bounds
     from leco_plugin.capacity.shrink import shrink as find_smaller
 
@@ -190,14 +190,14 @@ def shrink(
     print("\n".join(summary(results, out)))
     write_json(json, results)
     if picture is not None:
-        print(f"drew {draw(results, picture)}")
+        print(f"drew {draw_gates(results, picture)}")
 
 
 def _draw(occupancy: Occupancy, picture: Path, description: Path | None) -> None:
     """Draws an occupancy as a picture and as a page."""
+    from leco_plugin.evaluation.inspection import scene_colours
     from leco_plugin.evaluation.occupancy_page import write_page
     from leco_plugin.evaluation.occupancy_picture import draw
-    from leco_plugin.evaluation.scene_colours import scene_colours
 
     colours = scene_colours(occupancy, description)
     picture.parent.mkdir(parents=True, exist_ok=True)

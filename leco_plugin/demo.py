@@ -18,8 +18,8 @@ from leco_plugin.chart.findings.summary import Line
 from leco_plugin.chart.picture import draw_curves, name_ends
 from leco_plugin.chart.theme import LIGHT, Theme, new_figure, save_picture, style, themed
 from leco_plugin.evaluation.clock import Budget
+from leco_plugin.evaluation.equal_loss import occupancy_facts, truth_of
 from leco_plugin.evaluation.inspection import ViewBox
-from leco_plugin.evaluation.occupancy_facts import occupancy_facts, truth_of
 from leco_plugin.evaluation.occupancy_picture import draw_slice
 from leco_plugin.evaluation.report import describe_code, describe_machine, write_json
 from leco_plugin.evaluation.timed_run import timed_run

@@ -24,13 +24,13 @@ from leco_plugin.evaluation.inspection import (
     doubts,
     numbers,
     query,
+    scene_colours,
     scene_of,
     to_the_data,
     whole_box,
 )
 from leco_plugin.evaluation.occupancy_page import write_page
 from leco_plugin.evaluation.occupancy_picture import draw
-from leco_plugin.evaluation.scene_colours import scene_colours
 from leco_plugin.export_surface import (
     CELLS,
     MOST_CELLS,

@@ -14,7 +14,7 @@ from PIL import Image
 from leco_plugin.chart.contender import Job
 from leco_plugin.chart.runner import RUNS, RunFailed, Runner
 from leco_plugin.stability.cases import cases_named
-from leco_plugin.stability.samplers import QUICK, samplers_named
+from leco_plugin.stability.plan import QUICK, samplers_named
 from leco_plugin.stability.suite import Suite
 
 TINY = replace(QUICK, picture=0.25, views=0.1)

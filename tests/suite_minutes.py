@@ -1,11 +1,26 @@
-"""How long suites take together, by the forecasts of `leco chart` for what is left to do."""
+"""How long suites take on two CPU cores, by the forecasts of `leco chart`."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
-from leco_plugin.chart.protocol import Cores, Protocol, forecast_minutes
-from leco_plugin.chart.suites import SUITES
+from leco_plugin.chart.contender import Cores, Protocol, forecast_minutes
+from leco_plugin.chart.methods import SUITES, Suite
+
+CPU_STEPS = 400
+"""Of a run on a CPU, in suites that ask what was learned."""
+
+
+def on_two_cores(suite: Suite) -> Protocol:
+    """The protocol of a suite on two CPU cores, for forecasts on any machine."""
+    steps = CPU_STEPS if suite.seconds is None else None
+    return replace(suite.protocol, steps=steps, at_once=2)
+
+
+def minutes_of(suite: Suite, cores: Cores, seeds: int = 3) -> float:
+    """Forecast of all its runs."""
+    return seeds * forecast_minutes(suite.contenders, on_two_cores(suite), cores)
 
 
 def minutes_together(names: Sequence[str], cores: Cores) -> float:
@@ -15,5 +30,5 @@ def minutes_together(names: Sequence[str], cores: Cores) -> float:
     for one in (SUITES[name] for name in names):
         new = [c for c in one.contenders if (c.alone().key, one.protocol) not in made]
         made |= {(contender.alone().key, one.protocol) for contender in new}
-        minutes += 3 * forecast_minutes(new, one.on_two_cores, cores)
+        minutes += 3 * forecast_minutes(new, on_two_cores(one), cores)
     return minutes

@@ -19,12 +19,10 @@ import pytest
 import reference_pages
 import tyro
 from nerfstudio.configs.base_config import MachineConfig
-from suite_minutes import minutes_together
+from suite_minutes import minutes_of, minutes_together
 
-from leco_plugin.chart.contender import Contender
-from leco_plugin.chart.methods import contenders
-from leco_plugin.chart.protocol import FAST, SLOW, Protocol
-from leco_plugin.chart.suites import SUITES
+from leco_plugin.chart.contender import FAST, SLOW, Contender, Protocol
+from leco_plugin.chart.methods import SUITES, contenders
 from leco_plugin.method_configs import ON_GPU
 from leco_plugin.samplers.kernels import NAMES, VARIABLE
 
@@ -124,7 +122,7 @@ def test_the_table_of_suites_says_how_many_runs_they_have_and_how_long_they_take
         wanted = {(contender.alone().key, one.protocol) for contender in one.contenders}
         count, shared, _, minutes = rows[name]
         assert int(count) == len(wanted) and int(shared.replace("-", "0")) == len(wanted & made)
-        assert minutes == f"{one.minutes(FAST):.0f} to {one.minutes(SLOW):.0f}"
+        assert minutes == f"{minutes_of(one, FAST):.0f} to {minutes_of(one, SLOW):.0f}"
         made |= wanted
     assert int(rows["all"][0]) == len(made)
     fast, slow = (minutes_together(list(SUITES), cores) for cores in (FAST, SLOW))

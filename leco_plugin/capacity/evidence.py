@@ -74,11 +74,8 @@ class Loss(NamedTuple):
 def gather(
     mixture: Mixture | None, occupancy: Occupancy | None, seen: Seen
 ) -> tuple[Evidence, list[Rendered]]:
-    """The candidates of some rays with their worth, and their renderings if there is a model.
-
-    Args:
-        occupancy: the original; None keeps every candidate, and needs a model.
-    """
+    """The candidates of some rays with their worth, all kept where there is no original; and
+    their renderings if there is a model."""
     pieces, rendered = [], []
     parts = in_chunks(seen.rays, RAYS_AT_ONCE), seen.truth.split(RAYS_AT_ONCE)
     for rays, truth in zip(*parts):
@@ -155,18 +152,13 @@ def loss(evidence: Evidence, skipped: Tensor, unlikely: float = UNLIKELY) -> Los
 
     Rays count by their worth: n = (sum worth)^2 / sum worth^2, so that a ray of sky is no evidence.
     A loss that no ray has seen has no spread. The error therefore includes a few more lost rays of
-    average worth: without any loss the bound is log(1 / unlikely) / n, which n rays do exclude.
-
-    Args:
-        skipped: bool [M].
-        unlikely: how often the bound may be wrong.
+    average worth: without any loss the bound is log(1 / unlikely) / n, which n rays do exclude. It
+    may be wrong as often as is `unlikely`.
     """
     lost_all, all_weight = (float((evidence.weights * m).sum()) for m in (skipped, 1.0))
     lost_mass = lost_all / max(all_weight, 1e-12)
     lost, worth = (
-        torch.zeros(evidence.rays, dtype=torch.float64, device=evidence.worth.device).index_add_(
-            0, evidence.ray_indices, values.double()
-        )
+        torch.bincount(evidence.ray_indices, values.double(), evidence.rays)
         for values in (evidence.worth * skipped, evidence.worth)
     )
     total = float(worth.sum())
@@ -184,8 +176,7 @@ def loss(evidence: Evidence, skipped: Tensor, unlikely: float = UNLIKELY) -> Los
 @torch.no_grad()
 def image_price(mixture: Mixture, rendered: Sequence[Rendered], smaller: Occupancy) -> float:
     """PSNR with what the original keeps minus that with what both keep, in dB."""
-    before = after = 0.0
-    pixels = 0
+    before, after, pixels = 0.0, 0.0, 0
     for one in rendered:
         both = smaller.occupied(_middles(one.rays, one.intervals)) | ~one.before_backdrop
         rgb = mixture.shade(one.rays, Intervals(*(part[both] for part in one.intervals))).rgb

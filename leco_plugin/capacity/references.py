@@ -93,12 +93,8 @@ class Ground(NamedTuple):
         return not all(reference.guided for reference in self.references)
 
     def losses(self, gate: Occupancy, side: str, unlikely: float) -> list[Loss]:
-        """What a gate loses in all, by each reference.
-
-        Args:
-            side: `search` or `verify`.
-            unlikely: how often the bound may be wrong.
-        """
+        """What a gate loses in all, by each reference, on its side `search` or `verify`; the bounds
+        may be wrong as often as is `unlikely`."""
         found = []
         for one in self.references:
             part: Part = getattr(one, side)
@@ -108,11 +104,8 @@ class Ground(NamedTuple):
         return found
 
     def price(self, gate: Occupancy, side: str, absolute: bool = False) -> float | None:
-        """The worst image price of a gate by any reference, dB; None where nothing is rendered.
-
-        Args:
-            absolute: whether only references count that measure the original itself.
-        """
+        """The worst image price of a gate by any reference, dB, or where absolute by those that
+        measure the original itself; None where nothing is rendered."""
         prices = []
         for one in self.references:
             part: Part = getattr(one, side)
@@ -181,11 +174,7 @@ def pair_sides(
 def find_references(
     source: Source, original: Occupancy, sides: Sequence[tuple[Seen, Seen]]
 ) -> list[Reference]:
-    """All references that there are.
-
-    Args:
-        sides: rays to search on, and to verify on.
-    """
+    """All references that there are, with rays to search on and to verify on."""
 
     def parts(mixture: Mixture | None, occupancy: Occupancy | None) -> tuple[Part, Part]:
         found = []
@@ -239,11 +228,8 @@ def verify(ground: Ground, smaller: Occupancy, bounds: Bounds, rung: Rung, look:
     """Whether the bounds hold on rays that the search did not see.
 
     The rung gets what is to be declared. Losses on the rays of the search count where they are
-    larger: most of a loss lies on few rays, and they may all be among those. Each look may accept a
-    gate by chance, so that later looks are allowed less of it.
-
-    Args:
-        look: number of the look at these rays, from 1 on.
+    larger: most of a loss lies on few rays, and they may all be among those. Each look at these
+    rays, by its number from 1 on, may accept a gate by chance, so that later ones are allowed less.
     """
     unlikely = unlikely_at(look)
     searched = ground.losses(smaller, "search", unlikely)

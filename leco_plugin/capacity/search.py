@@ -12,7 +12,7 @@ import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -107,10 +107,9 @@ def ladder(most_values: int) -> list[GateConfig]:
         grid = EncodingConfig("hash", levels=4, log2_table=table, finest=64)
         found.append(GateConfig(grid, 16, 1, 1))
     for cells, features in PLANES:
-        products = EncodingConfig(
-            "vm", components=features, plane_cells=cells, levels=1, coarsest=cells
-        )
-        found += [_on_planes(cells, features, 1), GateConfig(products, 16, 1, 1)]
+        sizes: Any = {"components": features, "plane_cells": cells, "levels": 1, "coarsest": cells}
+        products = GateConfig(EncodingConfig("vm", **sizes), 16, 1, 1)
+        found += [_on_planes(cells, features, 1), products]
     counted = sorted((values_of(gate), i) for i, gate in enumerate(found))
     return [found[i] for values, i in counted if values < most_values]
 
@@ -239,10 +238,8 @@ def _measure(
 ) -> tuple[Rung, Occupancy]:
     """What is found of a gate, and the gate with the threshold that it was found with.
 
-    Args:
-        volume: [P, 3] places in the original's box.
-        kept: share of them that the original keeps.
-        look: number that a look at the verifying rays would have.
+    The original keeps a share of places [P, 3] in its box. A look at the verifying rays would have
+    the number `look`.
     """
     losses_at = _losses_of(smaller, ground.references)
     of_volume = in_parts(smaller.query, volume)
@@ -301,9 +298,8 @@ def lower_threshold(ground: Ground, bounds: Bounds) -> Occupancy | None:
     to hold on others, too. A smaller gate loses more than the original whose decisions it is
     taught. So an original that itself loses too much is asked to keep more.
 
-    Returns:
-        It shares the original's gate; None where the original meets that as it is, no threshold
-        does, or nothing measures.
+    It shares the original's gate; None where the original meets that as it is, no threshold does,
+    or nothing measures.
     """
     original = ground.original
     absolute = [reference for reference in ground.references if not reference.guided]
@@ -336,9 +332,8 @@ def kept_of_box(occupancy: Occupancy) -> float:
 
 def spread_positions(occupancy: Occupancy, count: int, seed: int) -> Tensor:
     """Positions [count, 3] spread evenly over the occupancy's box, or over a contracted cube."""
-    unit = torch.rand(count, 3, generator=torch.Generator().manual_seed(seed))
     device = occupancy.threshold_value.device
     if occupancy.space.kind == "contraction":
+        unit = torch.rand(count, 3, generator=torch.Generator().manual_seed(seed))
         return occupancy.space.unmap(2.0 * unit.to(device) - 1.0)
-    box = whole_box(occupancy)
-    return torch.lerp(box.low, box.high, unit).to(device)
+    return whole_box(occupancy).draw(count, seed).to(device)

@@ -14,8 +14,8 @@ from typing import Any
 import torch
 from nerfstudio.utils.rich_utils import CONSOLE
 
+from leco_plugin.capacity.choice import line_of, line_of_lowered, line_of_original
 from leco_plugin.capacity.evidence import gather
-from leco_plugin.capacity.frontier import line_of, line_of_lowered, line_of_original
 from leco_plugin.capacity.references import (
     HOLDS,
     LOST_DECISIONS,
@@ -70,7 +70,6 @@ def shrink(
 
     Args:
         file: an occupancy, in the folder of its run if its trained model is to be the reference.
-        data: the scene in nerfstudio's format.
         out: file of the smaller occupancy.
         bounds: what it may declare.
         keep: called with the results so far, JSON values, after each gate that was tried.
@@ -190,11 +189,7 @@ def draw_rays(source: Source, original: Occupancy) -> tuple[Sequence[tuple[Seen,
 def prepare(
     source: Source, original: Occupancy, sides: Sequence[tuple[Seen, Seen]], taught_on: Seen
 ) -> Ground:
-    """What gates are taught and measured on.
-
-    Raises:
-        ValueError: nothing along these rays is worth anything.
-    """
+    """What gates are taught and measured on; `ValueError` where nothing there is worth anything."""
     references = find_references(source, original, sides)
     parts = [part.evidence for one in references for part in (one.search, one.verify)]
     if not all(bool(part.kept.any()) for part in parts[:2]):
@@ -215,12 +210,7 @@ def prepare(
 
 
 def _check_original(original: Occupancy, file: Path, bounds: Bounds) -> None:
-    """Refuses what can be refused before the photographs are read.
-
-    Raises:
-        ValueError: a bound is out of range; the occupancy does not say how its rays are marched, or
-            skips next to nothing.
-    """
+    """Raises `ValueError` for what can be refused before the photographs are read."""
     if not 0.0 <= bounds.lost_surface_mass < 1.0 or not math.isfinite(bounds.image_price_db):
         raise ValueError(
             f"--lost-surface-mass is from 0 to 1 and --image-price a number of dB, not "
@@ -243,13 +233,8 @@ def _check_original(original: Occupancy, file: Path, bounds: Bounds) -> None:
 
 
 def check_losses(source: Source, original: Occupancy, file: Path, bounds: Bounds) -> None:
-    """Refuses an original whose own losses are unknown, or leave nothing of the bounds.
-
-    With the field at freezing the threshold can be lowered, so that any loss will do.
-
-    Raises:
-        ValueError: the original is refused.
-    """
+    """Raises `ValueError` for an original whose own losses are unknown, or leave nothing of the
+    bounds. With the field at freezing the threshold can be lowered, so that any loss will do."""
     if source.model is not None and LOST_DECISIONS in original.report:
         raise ValueError(
             f"{file} was shrunk without its run, so that nobody knows what it has lost of the "
@@ -275,13 +260,8 @@ def check_losses(source: Source, original: Occupancy, file: Path, bounds: Bounds
 def _check_on_test_photographs(
     source: Source, original: Occupancy, smaller: Occupancy
 ) -> dict[str, Any] | None:
-    """What the smaller gate loses on rays of test photographs, which decided nothing here.
-
-    Returns:
-        `rays`; the worst `lost_surface_mass` of any reference, or `lost_decisions` without a field;
-        and that of each (`against`). None without such photographs, and for the original where
-        nothing measures it.
-    """
+    """What the smaller gate loses on rays of test photographs, which decided nothing here: worst of
+    all references, and by each. None without such photographs, or where nothing measures it."""
     seen = draw_test_rays(source, original, RAYS)
     shares = {} if seen is None else measure_shares_lost(source, original, smaller, seen)
     if seen is None or not shares:
@@ -300,14 +280,13 @@ def _report_of(
 ) -> dict[str, Any]:
     """What the stored occupancy declares: the original's loss and, on top, its own.
 
-    It declares no less than rays of test photographs have lost. They chose nothing, and what holds
-    without them stays beside it.
+    It declares no less than rays of test photographs have lost (`checked`). They chose nothing, and
+    what holds without them stays beside it.
 
     Args:
         itself: the original, which is stored again where nothing smaller holds.
         is_untrained: whether nothing was trained on the pixels of the ground's rays.
         lowered: how far the original's threshold was lowered.
-        checked: what rays of test photographs have lost, None where there are none.
     """
     original = ground.original
     report = {name: original.report[name] for name in COPIED if name in original.report}
@@ -357,13 +336,9 @@ def _named_loss(alone: bool, share: float | None) -> dict[str, float | None]:
 
 
 def compare_queries(original: Occupancy, smaller: Occupancy) -> tuple[float, list[float]]:
-    """How many times faster the smaller gate answers, and the median milliseconds of each.
-
-    The ratio is the median over interleaved pairs.
-    """
-    box = whole_box(original)
-    unit = torch.rand(TIMED_POSITIONS, 3, generator=torch.Generator().manual_seed(0))
-    positions = torch.lerp(box.low, box.high, unit).to(original.threshold_value.device)
+    """How many times faster the smaller gate answers, in the median of interleaved pairs, and the
+    median milliseconds of each."""
+    positions = whole_box(original).draw(TIMED_POSITIONS).to(original.threshold_value.device)
 
     def seconds(occupancy: Occupancy) -> float:
         synchronize()

@@ -67,10 +67,8 @@ def find_source(file: Path, data: Path) -> Source:
     """
     require_folder("--data", data)
     folder = file.resolve().parent
-    source = None
-    if (folder / CONFIG).is_file() and any((folder / CHECKPOINTS).glob("step-*.ckpt")):
-        source = _load_run(folder, data.resolve())
-    if source is not None:
+    is_run = (folder / CONFIG).is_file() and any((folder / CHECKPOINTS).glob("step-*.ckpt"))
+    if is_run and (source := _load_run(folder, data.resolve())) is not None:
         return source
     from leco_plugin.method_configs import best_device, leco_occupancy
 
@@ -109,11 +107,8 @@ def _load_run(folder: Path, data: Path) -> Source | None:
 
 
 def check_scene(source: Source, occupancy: Occupancy, data: Path) -> None:
-    """Compares the places of the cameras with those that the occupancy's report names.
-
-    Raises:
-        InputError: fewer than half of the named cameras are among the photographs' own.
-    """
+    """Raises `InputError` where fewer than half of the cameras that an occupancy's report names
+    took the photographs."""
     known = cameras_of(occupancy)
     if len(known) == 0:
         return
@@ -159,12 +154,8 @@ def draw_training_rays(source: Source, occupancy: Occupancy, count: int) -> Seen
 def draw_other_pixels(
     source: Source, occupancy: Occupancy, count: int, besides: Iterable[Seen]
 ) -> Seen:
-    """Rays of different training pixels.
-
-    Args:
-        count: wanted; fewer come back where the photographs have hardly more pixels.
-        besides: rays whose pixels are not drawn again.
-    """
+    """Rays of different training pixels, besides those of other rays; fewer than `count` where the
+    photographs have hardly more pixels."""
     known = [_numbers(seen.pixels) for seen in besides if seen.pixels is not None]
     taken = np.concatenate([np.empty(0, np.int64), *known])
     pieces: list[tuple[Tensor, Tensor]] = []
@@ -184,11 +175,8 @@ def draw_other_pixels(
 
 
 def move_between_cameras(source: Source, seen: Seen, seed: int) -> Seen:
-    """The same rays, each moved by a random part of the way from its camera to the nearest one.
-
-    Args:
-        seen: rays of training images; their colours are not those of the moved rays.
-    """
+    """The same rays of training images, each moved by a random part of the way from its camera to
+    the nearest one. The colours are not those of the moved rays."""
     rays = seen.rays
     assert source.model is not None and rays.images is not None
     images = rays.images.cpu()
@@ -230,8 +218,7 @@ def draw_test_rays(source: Source, occupancy: Occupancy, count: int) -> Seen | N
 def _camera_positions(source: Source) -> Tensor:
     """Of the training photographs, in the run's coordinates: [C, 3]."""
     cameras = source.manager.train_dataset.cameras
-    positions: Tensor = cameras.camera_to_worlds[:, :3, 3].cpu().float()
-    return positions
+    return cameras.camera_to_worlds[:, :3, 3].cpu().float()
 
 
 def _frame_to(source: Source, occupancy: Occupancy) -> Tensor | None:
@@ -259,8 +246,7 @@ def _see_pixels(source: Source, occupancy: Occupancy, pixels: Tensor, truth: Ten
 def _numbers(pixels: Tensor) -> np.ndarray:
     """A different number for each different pixel [R, 3]: [R] int64."""
     image, row, column = pixels.cpu().numpy().T
-    numbers: np.ndarray = (image << 40) + (row << 20) + column
-    return numbers
+    return (image << 40) + (row << 20) + column
 
 
 def _see(

@@ -12,8 +12,14 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from leco_plugin.chart.contender import Contender, Job
-from leco_plugin.chart.protocol import Protocol, forecast, require_seeds, settings_of
+from leco_plugin.chart.contender import (
+    Contender,
+    Job,
+    Protocol,
+    forecast,
+    require_seeds,
+    settings_of,
+)
 from leco_plugin.chart.runner import (
     RESULTS,
     RUNS,
@@ -25,7 +31,7 @@ from leco_plugin.chart.runner import (
     read_settings,
     stored_in,
 )
-from leco_plugin.chart.table import write_table
+from leco_plugin.chart.table import table
 from leco_plugin.evaluation.report import describe_code, describe_machine, write_json
 from leco_plugin.scenes.input_error import InputError
 from leco_plugin.scenes.photographs import describe_held_out, describe_scene
@@ -48,7 +54,6 @@ class Chart:
 
     Args:
         suite: name and question of the comparison, if it has one.
-        command: what made it, for the results.
         reuse: folders of charts, from which runs that are missing here are taken over.
     Raises:
         ValueError, OSError: nothing to compare, no such scene, a folder of something else.
@@ -61,7 +66,7 @@ class Chart:
         contenders: Sequence[Contender],
         seeds: Sequence[int],
         protocol: Protocol,
-        suite: tuple[str, str] | None = None,
+        suite: tuple[str | None, str | None] = (None, None),
         command: str = "leco chart",
         reuse: Sequence[Path] = (),
     ) -> None:
@@ -72,8 +77,7 @@ class Chart:
         self.held_out = describe_held_out(data, protocol.held_out)
         self.machine["threads"] = protocol.threads(self.machine["threads"])
         self.protocol, self.command, self.reuse = protocol, command, list(reuse)
-        self.suite = suite[0] if suite else None
-        self.question = suite[1] if suite else None
+        self.suite, self.question = suite
         self.stop = threading.Event()
         self.contenders = list(contenders)
         self.jobs = jobs_of(contenders, seeds)
@@ -92,10 +96,9 @@ class Chart:
         """Makes what is missing; whenever it is stopped, what was finished is kept.
 
         Args:
-            runner: makes one run, or raises `RunFailed`; called in several threads where there are
-                several runs at once. It ends what is under way when `stop` is set.
-            say: called with a line for each run.
-            show: called with the share of all runs that is done.
+            runner: called in several threads where there are several runs at once. It ends what is
+                under way when `stop` is set.
+            say, show: as of `make_jobs`.
         Raises:
             InputError: another process makes runs in the same folder.
         """
@@ -112,9 +115,8 @@ class Chart:
             if todo:
                 say(self.forecast(todo))
             self.write()
-            done = len(self.jobs) - len(todo)
+            make_one, done = partial(self._make_one, runner), len(self.jobs) - len(todo)
             at_once = self.protocol.at_once
-            make_one = partial(self._make_one, runner)
             make_jobs(todo, make_one, note, show, stop=self.stop, at_once=at_once, done=done)
 
     def _make_one(self, runner: Runner, job: Job, show: Callable[[float], None]) -> str:
@@ -145,15 +147,11 @@ class Chart:
 
     def failures(self) -> list[dict[str, Any]]:
         """Runs that ended without a result, by seed, and whether this call asked for them."""
-        asked = {(job.contender.name, job.seed) for job in self.jobs}
-        found = [
-            {
-                **{key: one["contender"][key] for key in ("name", "method", "sampler")},
-                **{key: one[key] for key in ("seed", "reason")},
-                "asked": (one["contender"]["name"], one["seed"]) in asked,
-            }
-            for one in self.folder.failures()
-        ]
+        asked, found = {(job.contender.name, job.seed) for job in self.jobs}, []
+        for one in self.folder.failures():
+            row = {key: one["contender"][key] for key in ("name", "method", "sampler")}
+            row |= {key: one[key] for key in ("seed", "reason")}
+            found.append({**row, "asked": (row["name"], row["seed"]) in asked})
         return sorted(found, key=lambda one: (one["seed"], one["name"]))
 
     def results(self) -> dict[str, Any]:
@@ -200,28 +198,21 @@ class Chart:
         for, then this call's, and the commits of all."""
         asked = {job.name for job in self.jobs}
         others = [one["made"]["command"] for name, one in stored.items() if name not in asked]
-        commits = sorted(
-            {one["made"]["commit"] for one in stored.values() if one["made"]["commit"]}
-        )
+        commits = {one["made"]["commit"] for one in stored.values()} - {None}
         now = self._made()
-        return {
-            **now,
-            "command": " && ".join(dict.fromkeys([*others, self.command])),
-            "commit": ", ".join(commits) or now["commit"],
-        }
+        command = " && ".join(dict.fromkeys([*others, self.command]))
+        return {**now, "command": command, "commit": ", ".join(sorted(commits)) or now["commit"]}
 
     def write(self) -> dict[str, Any]:
         """Writes `results.json` and `table.md`, as far as there are runs; returns the results."""
         results = self.results()
         write_json(self.folder.path / RESULTS, results)
-        write_table(results, self.folder.path / "table.md")
+        (self.folder.path / "table.md").write_text(table(results))
         return results
 
     def draw(self) -> dict[str, Any]:
-        """Writes the results, and `chart.png`, the same on black, and `chart.html`.
-
-        Nothing is drawn when no run has succeeded.
-        """
+        """Writes the results, and where a run has succeeded `chart.png`, light and dark, and
+        `chart.html`."""
         from leco_plugin.chart import page, picture
         from leco_plugin.chart.theme import DARK, LIGHT
 
@@ -241,10 +232,7 @@ def _counted(count: int, name: str) -> str:
 def why_not_shared(source: Path, settings: Mapping[str, Any]) -> str | None:
     """Why a chart with these settings cannot use the runs of another folder; None if it can.
 
-    Only what they were made for, a suite or none, may differ.
-
-    Raises:
-        InputError: the folder is damaged.
+    Only what they were made for, a suite or none, may differ. A damaged folder is an `InputError`.
     """
     found = read_settings(source)
     if found is None:

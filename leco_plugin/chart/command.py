@@ -12,10 +12,9 @@ from typing import Any
 from nerfstudio.utils.rich_utils import CONSOLE
 
 from leco_plugin.chart.chart import Chart, why_not_shared
-from leco_plugin.chart.methods import contenders
-from leco_plugin.chart.protocol import Protocol
+from leco_plugin.chart.contender import Protocol
+from leco_plugin.chart.methods import SUITES, contenders, in_order
 from leco_plugin.chart.runner import ProcessRunner, Runner
-from leco_plugin.chart.suites import SUITES, in_order
 from leco_plugin.chart.worker import WORKER
 from leco_plugin.log import bar, resumable
 from leco_plugin.scenes.input_error import InputError
@@ -49,9 +48,8 @@ class Asked:
 
 def processes(chart: Chart) -> Runner:
     """Makes the runs of a chart in processes of their own."""
-    threads = {"OMP_NUM_THREADS": str(chart.machine["threads"])}
-    environment = threads if chart.protocol.at_once > 1 else None
-    return ProcessRunner(chart.data, chart.protocol, chart.folder, WORKER, environment, chart.stop)
+    threads = chart.machine["threads"] if chart.protocol.at_once > 1 else None
+    return ProcessRunner(chart.data, chart.protocol, chart.folder, WORKER, threads, chart.stop)
 
 
 def make_charts(
@@ -126,9 +124,8 @@ def _chart_of(
     """The chart of a suite of a name, or of methods and samplers."""
     suite = SUITES[name] if name is not None else None
     compared = suite.contenders if suite else contenders(methods, samplers)
-    at_once = asked.at_once
-    if at_once is None:
-        at_once = suite.protocol.at_once if suite else 1
+    usual = suite.protocol.at_once if suite else 1
+    at_once = usual if asked.at_once is None else asked.at_once
     learn_seconds, times = asked.learn_seconds, (asked.seconds, asked.steps)
     if suite and times == (None, None):
         times = suite.protocol.seconds, suite.protocol.steps
@@ -143,14 +140,14 @@ def _chart_of(
     if not suite and at_once == 1:
         del options["at_once"]
     command = command_line(data, {**options, "seeds": asked.seeds})
-    titled = (name, suite.question) if name is not None and suite else None
+    titled = name, suite.question if suite else None
     return Chart(data, out, compared, asked.seeds, protocol, titled, command, asked.reuse)
 
 
 def _make(chart: Chart, runner_for: Callable[[Chart], Runner]) -> dict[str, Any]:
     """Makes what is missing of a chart, and draws all of it; returns its results."""
     say = functools.partial(CONSOLE.print, markup=False, highlight=False)
-    suite = f"{chart.suite}, " if chart.suite is not None else ""
+    suite = f"{chart.suite}, " if chart.suite else ""
     title = f"{chart.scene['name']}, {suite}{chart.protocol.describe()} a run"
     with resumable(say), bar(title) as show:
         chart.make(runner_for(chart), say, show)
@@ -165,9 +162,8 @@ def command_line(data: Path, options: Mapping[str, object]) -> str:
     """
     words: list[object] = ["leco", "chart", "--data", data.resolve().name]
     for name, value in options.items():
-        if value is None or value == () or value == []:
-            continue
         values = value if isinstance(value, (list, tuple)) else [value]
-        words += ["--" + name.replace("_", "-")]
-        words += [f"{one:g}" if isinstance(one, float) else one for one in values]
-    return shlex.join([str(word) for word in words])
+        if value is not None and values:
+            words += ["--" + name.replace("_", "-")]
+            words += [f"{one:g}" if isinstance(one, float) else one for one in values]
+    return shlex.join(map(str, words))

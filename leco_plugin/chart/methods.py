@@ -1,7 +1,8 @@
-"""The contenders that the names of methods and samplers stand for.
+"""The contenders that names of methods, samplers and suites stand for.
 
 Any registered method and sampler can be charted. A host takes any sampler of its kind, a method
-that learns its occupancy itself any kind of gate.
+that learns its occupancy itself any kind of gate. Suites are the comparisons that the reviewers of
+the paper asked for.
 """
 
 from __future__ import annotations
@@ -9,7 +10,7 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 from leco_plugin.chart.contender import (
@@ -19,9 +20,13 @@ from leco_plugin.chart.contender import (
     LONG_STEPS,
     WITHOUT_GIFTS,
     Contender,
+    Protocol,
 )
+from leco_plugin.evaluation.report import usable_cores
+from leco_plugin.host_configs import switch_nerf_host
 from leco_plugin.hosts.guided import GuidedModelConfig
 from leco_plugin.hosts.guided_start import OWN_SAMPLER
+from leco_plugin.method_configs import LEARNING, ON_GPU
 from leco_plugin.models.leco_config import LecoModelConfig
 from leco_plugin.models.switch.field import SwitchNerfModelConfig
 from leco_plugin.samplers.registry import samplers as registered_samplers
@@ -119,12 +124,8 @@ def _samplers_of(method: str) -> tuple[list[str], str]:
         kinds = [name for name, spec in registered_samplers().items() if spec.needs_occupancy]
         return [LEARNED], ", ".join([*kinds, DENSE])
     every = ", ".join([*registered_samplers(), OWN_SAMPLER, LONG_STEPS, WITHOUT_GIFTS])
-    usual = (
-        [LEARNED, OWN_SAMPLER, LONG_STEPS]
-        if isinstance(model, GuidedModelConfig)
-        else [OWN_SAMPLER]
-    )
-    return usual, every
+    is_guided = isinstance(model, GuidedModelConfig)
+    return [LEARNED, OWN_SAMPLER, LONG_STEPS] if is_guided else [OWN_SAMPLER], every
 
 
 def _model_of(method: str) -> Any:
@@ -153,11 +154,7 @@ def _contender_of(method: str, sampler: str) -> Contender | None:
 
 
 def contender_of_host(method: str, sampler: str, host: Any) -> Contender | None:
-    """A host with a sampler of its kind; None for a sampler of another kind.
-
-    Args:
-        host: config of the host's model.
-    """
+    """A host, by its model's config, with a sampler of its kind; None for one of another kind."""
     proposes = hasattr(host, "num_proposal_samples_per_ray")
     sized = SIZED_GRID.fullmatch(sampler)
     shown = SAMPLER_NAMES.get(sampler, sampler)
@@ -230,3 +227,136 @@ def _grid_changes(host: Any, cells: int) -> dict[str, Any]:
         }
     options = {"resolution": cells, "levels": getattr(host, "grid_levels", 1)}
     return {"occupancy.sampler": GRID, "occupancy.options": options}
+
+
+SCENE_LAYERS = LEARNING.sizes.field.experts.layers
+SWITCH_CELLS = switch_nerf_host.sizes.grid_resolution
+"""Cells of Switch-NeRF's own grid."""
+GRIDS = (128, 256, 512) if ON_GPU else (64, 128, 256)
+"""Cells along an axis, updated while the host trains; 512^3 takes two CPU cores all of a run."""
+MADE_GRIDS = (64, 128, 256, 512)
+"""Made from one field, each from the one before, which costs less than updates in training."""
+STEPS = 2 * LEARNING.schedule.learn_steps
+"""Of suites that ask what was learned: half for learning, and a quarter more for a gate that has
+not settled."""
+AT_ONCE = 1 if ON_GPU else min(2, usable_cores())
+"""Runs at a time: on a CPU, small tensors gain more by another run than by another thread."""
+ALL = "all"
+
+
+@dataclass(frozen=True)
+class Suite:
+    """A named comparison."""
+
+    question: str
+    """What it answers, and who asked."""
+    contenders: tuple[Contender, ...]
+    seconds: float | None = None
+    """Training time of a run; None trains for `STEPS`."""
+    learn_seconds: float | None = None
+    """Limit for learning an occupancy; None is the usual share."""
+
+    @property
+    def protocol(self) -> Protocol:
+        """The default protocol. Suites with the same one share runs."""
+        steps = STEPS if self.seconds is None else None
+        return Protocol(self.seconds, steps, self.learn_seconds, at_once=AT_ONCE)
+
+
+def _leco(name: str, **changes: object) -> Contender:
+    """`leco-occupancy` with settings changed; `__` stands for the dots of their paths."""
+    paths = {path.replace("__", "."): value for path, value in changes.items()}
+    return Contender(name, "leco-occupancy", LEARNED, paths)
+
+
+def _paper(name: str, **changes: object) -> Contender:
+    return _leco(name, gate_loss__form="paper", gate_loss__fall_back=False, **changes)
+
+
+def _empty_mlp(layers: int) -> dict[str, object]:
+    """Changes that make the empty-space expert an MLP as wide as a scene expert."""
+    experts = "sizes__field__experts__"
+    return {f"{experts}empty_expert": "mlp", f"{experts}empty_layers": layers}
+
+
+def _switch(sampler: str) -> Contender:
+    """`leco-switch-nerf` with a sampler, as `--methods` and `--samplers` give it."""
+    found = contender_of_host("leco-switch-nerf", sampler, switch_nerf_host)
+    assert found is not None
+    return found
+
+
+SCENE_SIZED = _empty_mlp(SCENE_LAYERS)
+
+SUITES = {
+    "representations": Suite(
+        "Is a small MLP the best place for an occupancy? (reviews 1 and 2)",
+        (
+            replace(_leco("MLP on frequencies (ours)"), grids=MADE_GRIDS, taught=True),
+            *(
+                Contender(
+                    name, "leco-occupancy", f"{LEARNED}-{kind}", {"sizes.gate.encoding.kind": kind}
+                )
+                for kind, name in (
+                    ("hash", "hash grid"),
+                    ("vm", "TensoRF planes"),
+                    ("k-planes", "K-planes"),
+                )
+            ),
+        ),
+    ),
+    "empty-expert": Suite(
+        "How small must the empty-space expert be, and what if there is none? (reviews 3 and 6)",
+        (
+            _leco("identity (ours)"),
+            _leco("MLP of one layer", **_empty_mlp(1)),
+            _leco("as large as a scene expert", **SCENE_SIZED),
+            _leco("none: density is zero", sizes__field__experts__empty_expert="none"),
+            _paper("imbalance loss alone, identity", gate_loss__density=0.0),
+            _paper("imbalance loss alone, large", gate_loss__density=0.0, **SCENE_SIZED),
+        ),
+    ),
+    "losses": Suite(
+        "What do the losses of the gate do?",
+        (
+            _leco("contribution (ours)"),
+            _paper("paper: imbalance and density"),
+            _paper("paper without density loss", gate_loss__density=0.0),
+            _paper(
+                "balanced as in Switch-NeRF", gate_loss__density=0.0, gate_loss__empty_ratio=None
+            ),
+        ),
+    ),
+    "freeze": Suite(
+        "Why freeze and train again, instead of going on with the same network? (review 4)",
+        (
+            _leco("learn, freeze, go on"),
+            replace(VARIANTS["leco-occupancy-retrained"], name="learn, freeze, from scratch"),
+            replace(NEVER_FROZEN, name="never frozen"),
+            replace(VARIANTS["leco-occupancy-homogeneous"], name="equal experts, no gate"),
+        ),
+        seconds=90.0,
+        learn_seconds=45.0,
+    ),
+    "enough-time": Suite(
+        "Does it still pay with enough training time? (review 5)",
+        tuple(map(_switch, (LEARNED, OWN_SAMPLER, f"{GRID}-{SWITCH_CELLS}", LONG_STEPS))),
+        seconds=120.0,
+    ),
+    "grid-resolution": Suite(
+        "Is a finer occupancy grid as good? (review 1)",
+        tuple(map(_switch, (LEARNED, *(f"{GRID}-{cells}" for cells in GRIDS), LONG_STEPS))),
+        seconds=120.0,
+    ),
+}
+"""Ordered so that each can reuse most runs of those before it."""
+
+
+def in_order(names: Sequence[str]) -> list[str]:
+    """Names of suites, `all` among them or not, in the order of `SUITES`; an `InputError` for one
+    that there is not."""
+    for name in names:
+        if name not in SUITES and name != ALL:
+            listed = ", ".join(SUITES)
+            raise InputError(f"there is no suite {name!r}; there are {listed}, and {ALL}")
+    return [name for name in SUITES if name in names or ALL in names]

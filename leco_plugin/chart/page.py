@@ -7,11 +7,10 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from leco_plugin.chart.findings.settling import falls
+from leco_plugin.chart.findings.learned import falls
 from leco_plugin.chart.findings.summary import Line, best_so_far, circumstances
-from leco_plugin.chart.page_file import write_page_file
 from leco_plugin.chart.panels import Panel, shown_of, title_of
-from leco_plugin.chart.theme import LIGHT, style
+from leco_plugin.chart.theme import LIGHT, style, write_page_file
 
 SYMBOLS = ("circle", "square", "diamond", "triangle-up", "triangle-down", "cross", "x", "star")
 FRONT = {"color": "rgba(120,120,120,0.45)", "width": 5}

@@ -5,8 +5,12 @@ from __future__ import annotations
 import textwrap
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from itertools import product
 from pathlib import Path
 from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
 
 from leco_plugin.chart.findings.learned import learned_of
 from leco_plugin.chart.findings.summary import (
@@ -16,7 +20,6 @@ from leco_plugin.chart.findings.summary import (
     best_so_far,
     circumstances,
 )
-from leco_plugin.chart.names import name_points, spread
 from leco_plugin.chart.panels import Panel, Point, Shown, shown_of, title_of
 from leco_plugin.chart.theme import (
     LIGHT,
@@ -62,11 +65,10 @@ def draw(results: Mapping[str, Any], path: Path, theme: Theme = LIGHT) -> Path:
         return save_picture(figure, path, results, dpi=160)
 
 
-def balanced(text: str, width: int = TITLE_WIDTH) -> str:
-    """A text in as few lines as `width` letters allow, all about as long."""
-    lines = len(textwrap.wrap(text, width))
-    narrowest = next(n for n in range(1, width + 1) if len(textwrap.wrap(text, n)) <= lines)
-    return textwrap.fill(text, narrowest)
+def balanced(text: str) -> str:
+    """A text in as few lines as `TITLE_WIDTH` allows, all about as long."""
+    lines, widths = len(textwrap.wrap(text, TITLE_WIDTH)), range(1, TITLE_WIDTH + 1)
+    return textwrap.fill(text, next(n for n in widths if len(textwrap.wrap(text, n)) <= lines))
 
 
 def _draw_race(figure: Any, height: float, shown: Shown, theme: Theme) -> None:
@@ -103,7 +105,11 @@ def _draw_occupancies(figure: Any, top: float, shown: Shown, theme: Theme) -> No
     above = [figure.add_axes((x, low, wide, top - 0.11 - low)) for x, wide in places]
     above[0].set_ylabel("space kept, %")
     draw_panel(above[0], replace(first, title="" if by_psnr else SIZE), theme)
-    _name(above[0], first.points, theme)
+    if first.points:
+        places, names = zip(*(((one.x, one.y), one.name) for one in first.points))
+        colours = [look_of(one, theme)["color"] for one in first.points]
+        seeds = [seed for one in first.points for seed in one.seeds]
+        name_points(above[0], places, names, colours, seeds)
     if by_psnr:
         above[0].set_xlabel("PSNR on unseen photographs, dB")
     for axes, by_time in zip(above[1:], others):
@@ -171,29 +177,9 @@ def _draw_front(axes: Any, panel: Panel, theme: Theme) -> None:
         return
     xs, ys = zip(*panel.front())
     worst, farthest = axes.get_ylim()[0], axes.get_xlim()[0 if panel.more_x else 1]
-    axes.step(
-        [xs[0], *xs, farthest],
-        [worst, *ys, ys[-1]],
-        where="post",
-        color=theme.ink,
-        alpha=0.3,
-        linewidth=5,
-        zorder=1,
-        scalex=False,
-        scaley=False,
-    )
-
-
-def _name(axes: Any, points: Sequence[Point], theme: Theme) -> None:
-    if not points:
-        return
-    name_points(
-        axes,
-        [(one.x, one.y) for one in points],
-        [one.name for one in points],
-        [look_of(one, theme)["color"] for one in points],
-        [seed for one in points for seed in one.seeds],
-    )
+    look = {"color": theme.ink, "alpha": 0.3, "linewidth": 5, "zorder": 1}
+    fixed = {"scalex": False, "scaley": False}
+    axes.step([xs[0], *xs, farthest], [worst, *ys, ys[-1]], where="post", **look, **fixed)
 
 
 def draw_curves(axes: Any, lines: Sequence[Line], theme: Theme, small: bool = False) -> None:
@@ -222,17 +208,9 @@ def name_ends(axes: Any, lines: Sequence[Line], theme: Theme, apart: float = CLO
     for i, (line, end, place) in enumerate(zip(lines, ends, places)):
         colour = style(i, theme)["color"]
         arrow = {"arrowstyle": "-", "relpos": (0.0, 0.5), "shrinkA": 2.0, "shrinkB": 6.0}
-        axes.annotate(
-            name_of_end(line),
-            end,
-            xytext=(1.03, place),
-            textcoords="axes fraction",
-            va="center",
-            color=colour,
-            fontweight="bold",
-            annotation_clip=False,
-            arrowprops={**arrow, "color": colour},
-        )
+        beside = {"xytext": (1.03, place), "textcoords": "axes fraction", "va": "center"}
+        look = {"color": colour, "fontweight": "bold", "arrowprops": {**arrow, "color": colour}}
+        axes.annotate(name_of_end(line), end, annotation_clip=False, **beside, **look)
 
 
 def name_of_end(line: Line) -> str:
@@ -254,3 +232,101 @@ def _draw_learning(axes: Any, lines: Sequence[Line], theme: Theme) -> None:
     axes.hlines(heights, 0.0, [time for _, time in bars], colours, transform=foot, linewidth=5)
     text = " of which learning the occupancy"
     axes.text(0.0, BAR * (len(bars) + 0.6), text, transform=foot, fontsize=10)
+
+
+Boxes = NDArray[np.float64]
+"""[N, 4] left, low, right, high in a panel that goes from 0 to 1."""
+
+FAR = 0.1
+"""Share of the panel's size from which on a line leads from a point to its name."""
+ACROSS = (0.022, 0.07, 0.12, 0.17, 0.22)
+UP = (0.06, 0.0, 0.13, 0.2, 0.27, 0.34, 0.41)
+"""Distances that are tried, from near to far, as shares of the panel's width and height."""
+MARGIN = 1.15
+"""Height that is left free for a name, as a multiple of its own."""
+POINT = (0.012, 0.03)
+"""Half the width and height that a point takes up."""
+ALONG = np.arange(2, 7)[:, None] / 7
+"""[5, 1] shares of the line to a name at which it is to cross nothing."""
+
+
+def name_points(
+    axes: Any,
+    places: Sequence[tuple[float, float]],
+    names: Sequence[str],
+    colours: Sequence[str],
+    others: Sequence[tuple[float, float]] = (),
+) -> None:
+    """Writes names beside points, each where it and the line to it cover least: not others
+    either."""
+    to_panel = axes.transData + axes.transAxes.inverted()
+    taken = boxes_around(to_panel.transform([*places, *others]), *POINT)
+    written = np.zeros((0, 4))
+    for point, name, colour in zip(to_panel.transform(places), names, colours):
+        found = _places_beside(point, *size_of(axes, name))
+        inside = [box for box in found if box[:2].min() >= 0.0 and box[2:].max() <= 1.0]
+        boxes = [np.vstack([box, _line_to(box, point)]) for box in inside or found]
+        best = min(boxes, key=lambda one: (covered(one[:1], written), covered(one, taken)))
+        taken, written = np.vstack([taken, best]), np.vstack([written, best[:1]])
+        end = _end_of(best[0], point)
+        is_right = bool(best[0][0] > point[0])
+        line = {"arrowstyle": "-", "color": colour, "relpos": (0.0 if is_right else 1.0, 0.5)}
+        place = {"xycoords": "axes fraction", "xytext": end, "va": "center"}
+        look = {"color": colour, "fontweight": "bold", "ha": "left" if is_right else "right"}
+        axes.annotate(name, point, **place, **look, arrowprops=line if len(best) > 1 else None)
+
+
+def size_of(axes: Any, name: str) -> tuple[float, float]:
+    """Width and height of a name, as shares of the panel's."""
+    text = axes.text(0.0, 0.0, name, fontweight="bold")
+    extent = text.get_window_extent().transformed(axes.transAxes.inverted())
+    text.remove()
+    return extent.width, extent.height
+
+
+def boxes_around(points: Any, across: float, up: float) -> Boxes:
+    """Boxes [N, 4] around points [N, 2]."""
+    size = np.array([across, up])
+    return np.hstack([points - size, points + size])
+
+
+def covered(some: Boxes, others: Boxes) -> float:
+    """The area that boxes [N, 4] share with others [M, 4]."""
+    low = np.maximum(some[:, None, :2], others[None, :, :2])
+    high = np.minimum(some[:, None, 2:], others[None, :, 2:])
+    return float((high - low).clip(min=0.0).prod(axis=-1).sum())
+
+
+def _places_beside(point: Any, width: float, height: float) -> list[Any]:
+    """Boxes in which the name of a point may stand, the best first."""
+    (x, y), half = point, MARGIN * height / 2.0
+    return [
+        np.array([left, middle - half, left + width, middle + half])
+        for across, up in product(ACROSS, UP)
+        for middle in dict.fromkeys((y + up, y - up))
+        for left in (x + across, x - across - width)
+    ]
+
+
+def _end_of(box: Any, point: Any) -> Any:
+    """[2] the end of a name that is nearer to its point."""
+    return np.array([box[0] if box[0] > point[0] else box[2], (box[1] + box[3]) / 2.0])
+
+
+def _line_to(box: Any, point: Any) -> Boxes:
+    """Boxes along the line to a name; none beside its point."""
+    way = _end_of(box, point) - point
+    if np.abs(way).max() <= FAR:
+        return np.zeros((0, 4))
+    return boxes_around(point + ALONG * way, 0.003, 0.006)
+
+
+def spread(wanted: Sequence[float], apart: float) -> list[float]:
+    """Places in [0, 1] as near to the wanted ones as they can be when kept a distance apart."""
+    order = np.argsort(wanted, kind="stable")
+    steps = apart * np.arange(len(wanted))
+    lowest = np.maximum.accumulate(np.maximum(np.array(wanted)[order] - steps, 0.0))
+    inside = np.minimum(lowest, 1.0 - steps[-1])
+    places = np.empty(len(wanted))
+    places[order] = np.minimum.accumulate(inside[::-1])[::-1] + steps
+    return [float(place) for place in places]

@@ -15,7 +15,7 @@ import tempfile
 import threading
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
+from concurrent.futures import ThreadPoolExecutor, as_completed
 from contextlib import contextmanager
 from dataclasses import asdict
 from pathlib import Path
@@ -56,13 +56,10 @@ class RunFailed(RuntimeError):
 
 
 class RunFolder:
-    """Finished jobs that share their settings: one file for each.
+    """Finished jobs that share their settings, JSON values: one file for each.
 
     More jobs may join later; jobs with other settings may not.
 
-    Args:
-        path: the folder, made if there is none.
-        settings: JSON values that all jobs share.
     Raises:
         InputError: the folder holds something else, or jobs with other settings.
         OSError: it cannot be written.
@@ -78,8 +75,7 @@ class RunFolder:
     def alone(self) -> Iterator[None]:
         """Keeps other processes from making jobs here, and deletes what killed ones left.
 
-        Raises:
-            InputError: another process makes some.
+        Another process that makes some is an `InputError`.
         """
         with alone_in(self.path, "chart"):
             self.clear()
@@ -111,11 +107,7 @@ class RunFolder:
 
 
 def stored_in(path: Path) -> dict[str, dict[str, Any]]:
-    """The records in a folder by the names of their jobs.
-
-    Raises:
-        InputError: one is damaged.
-    """
+    """The records in a folder by the names of their jobs; a damaged one is an `InputError`."""
     found = {}
     for file in sorted((path / RUNS).glob("*.json")):
         record = read_object(file, DAMAGED)
@@ -131,10 +123,9 @@ def take_folder(
     holds: str = "a chart with another",
     damaged: str = DAMAGED,
 ) -> None:
-    """Makes a folder one of these settings, if it is not one already.
+    """Makes the folder of a file one of the settings in that file, if it is not one already.
 
     Args:
-        file: in the folder, which holds them.
         holds: what is said of a folder before the first setting that is not as wanted.
         damaged: what is said of a damaged file.
     Raises:
@@ -151,11 +142,8 @@ def take_folder(
 
 
 def read_settings(path: Path) -> dict[str, Any] | None:
-    """The settings that the jobs in a folder share; None where there are none.
-
-    Raises:
-        InputError: they cannot be read.
-    """
+    """The settings that the jobs in a folder share; None where there are none. Damaged ones are an
+    `InputError`."""
     file = path / SETTINGS
     return read_object(file, DAMAGED) if file.is_file() else None
 
@@ -170,7 +158,6 @@ def difference(found: Mapping[str, Any], wanted: Mapping[str, Any]) -> str | Non
 
 
 def _short(value: Any) -> str:
-    """A value in a line."""
     if isinstance(value, Mapping):
         value = ", ".join(str(part) for part in value.values())
     text = str(value)
@@ -201,38 +188,31 @@ def make_jobs(
     """
     shares = [0.0] * len(jobs)
 
-    def make(number: int) -> str:
+    def make(number: int) -> str | None:
         def show_share(share: float) -> None:
             shares[number] = share
             show((done + sum(shares)) / (done + len(shares)))
 
+        if not is_wanted(jobs[number]):
+            return None
         show_share(0.0)
         said = make_one(jobs[number], show_share)
         show_share(1.0)
         return said
 
-    wanted = (number for number, job in enumerate(jobs) if is_wanted(job))
     if at_once == 1:
-        for number in wanted:
-            say(make(number))
+        for number in range(len(jobs)):
+            if (said := make(number)) is not None:
+                say(said)
         return
-    under_way: set[Future[str]] = set()
-
-    def collect() -> None:
-        finished, _ = wait(under_way, return_when=FIRST_COMPLETED)
-        under_way.difference_update(finished)
-        for future in finished:
-            say(future.result())
-
     with ThreadPoolExecutor(at_once) as pool:
+        under_way = [pool.submit(make, number) for number in range(len(jobs))]
         try:
-            for number in wanted:
-                under_way.add(pool.submit(make, number))
-                if len(under_way) == at_once:
-                    collect()
-            while under_way:
-                collect()
+            for finished in as_completed(under_way):
+                if (said := finished.result()) is not None:
+                    say(said)
         except BaseException:
+            pool.shutdown(wait=False, cancel_futures=True)
             if stop is not None:
                 stop.set()
             raise
@@ -243,9 +223,8 @@ class ProcessRunner:
 
     Args:
         data, protocol: the scene and a dataclass, written beside the values of the job.
-        folder: in which a job works, and a failed one leaves its log.
         command: what is started; the folder of the job is its last argument.
-        environment: variables that the process has besides those of this one.
+        threads: of a process; None leaves them to it.
         stop: ends the jobs under way when it is set.
     """
 
@@ -255,16 +234,17 @@ class ProcessRunner:
         protocol: Any,
         folder: RunFolder,
         command: Sequence[str],
-        environment: Mapping[str, str] | None = None,
+        threads: int | None = None,
         stop: threading.Event | None = None,
     ) -> None:
         self.shared = {"data": str(data.resolve()), "protocol": asdict(protocol)}
         self.folder, self.command = folder, list(command)
-        self.environment = {**os.environ, **(environment or {})}
+        limit = {} if threads is None else {"OMP_NUM_THREADS": str(threads)}
+        self.environment = {**os.environ, **limit}
         self.stop = stop or threading.Event()
 
     def __call__(self, job: Job, show: Callable[[float], None]) -> dict[str, Any]:
-        """The result of a job. The files of `KEPT` are left beside the records.
+        """The result of a job, whose files of `KEPT` are left beside the records.
 
         Raises:
             RunFailed: the process has failed or was killed.
@@ -328,12 +308,8 @@ def _reason(work: Path, status: int, log: Path) -> str:
 def work_on(folder: Path, make: Callable[..., dict[str, Any]]) -> int:
     """Makes the job in a folder: the other side of `ProcessRunner`, called in its process.
 
-    Leaves the result in the folder, or the reason why there is none.
-
-    Args:
-        make: called with the values of the job and what reports the share that is done.
-    Returns:
-        0, or 1 on failure.
+    `make` is called with the values of the job and what reports the share that is done. Its result
+    is left in the folder, or the reason why there is none; returns 0, or 1 on failure.
     """
     shown = 0.0
 

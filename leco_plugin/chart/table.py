@@ -5,17 +5,15 @@ from __future__ import annotations
 import statistics
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
-from pathlib import Path
 from typing import Any, TypeVar
 
-from leco_plugin.chart.findings.learned import Learned, learned_of
+from leco_plugin.chart.findings.learned import Learned, falls, learned_of, settling
 from leco_plugin.chart.findings.representations import (
     Representation,
     fronts_of,
     never_held_of,
     representations_of,
 )
-from leco_plugin.chart.findings.settling import falls, settling
 from leco_plugin.chart.findings.summary import (
     COSTS,
     LEARNING,
@@ -73,7 +71,8 @@ OCCUPANCY = (
 def rows(header: Sequence[str], cells: Sequence[Sequence[str]]) -> str:
     """A table in Markdown."""
     lines = [header, ["---"] * len(header), *cells]
-    return "\n".join(f"| {' | '.join(line)} |" for line in lines)
+    escaped = [[str(cell).replace("|", "\\|") for cell in line] for line in lines]
+    return "\n".join(f"| {' | '.join(line)} |" for line in escaped)
 
 
 def table_of(things: Sequence[T], columns: Mapping[str, Callable[[T], str]]) -> str:
@@ -106,14 +105,8 @@ def spread(
     return f"{middle} ({min(known):{form}} to {max(known):{form}})"
 
 
-def write_table(results: Mapping[str, Any], path: Path) -> Path:
-    """Writes the table; results without any run give a table without rows."""
-    path.write_text(table(results))
-    return path
-
-
 def table(results: Mapping[str, Any]) -> str:
-    """The whole of `table.md`."""
+    """The whole of `table.md`; results without any run give one without rows."""
     parts = [
         f"# {results['scene']['name']}" + (f": {results['suite']}" if results["suite"] else ""),
         *([results["question"]] if results["question"] else []),
@@ -128,8 +121,7 @@ def table(results: Mapping[str, Any]) -> str:
         parts.append(
             f"Ended in the warm-up of their grid, which asks all cells: {' and '.join(warming)}."
         )
-    duels = rivals(lines, results["protocol"]["seconds"])
-    if duels:
+    if duels := rivals(lines, results["protocol"]["seconds"]):
         parts.append(versus_table(duels))
     if len(lines) > 1 and results["protocol"]["seconds"] is not None:
         parts.append(settling(lines))
@@ -148,16 +140,14 @@ def table(results: Mapping[str, Any]) -> str:
 
 
 def runs_table(lines: Sequence[Line]) -> str:
-    """Means of quality and medians of cost over seeds; bold is on the front of its column.
-
-    Below it a line on figures of quality that no run has.
-    """
+    """Means of quality and medians of cost over seeds, bold on the front of its column; and a line
+    on figures of quality that no run has."""
     level = common_psnr(lines)
     runs = [run for line in lines for run in line.runs]
     measured, missing = {}, []
     for title, (key, form) in QUALITIES.items():
         if any(run.get(key) is not None for run in runs):
-            measured[title] = partial(_quality, key, form)
+            measured[title] = lambda line, key=key, form=form: spread([line.mean(key)], form)
         else:
             missing.append(title)
     fronts = {cost: cost_panel(cost, lines).front() for cost in COSTS}
@@ -179,10 +169,6 @@ def runs_table(lines: Sequence[Line]) -> str:
         },
     )
     return f"{found}\n\nNot measured: {', '.join(missing)}." if missing else found
-
-
-def _quality(key: str, form: str, line: Line) -> str:
-    return spread([line.mean(key)], form)
 
 
 def _median(cost: Cost, line: Line) -> str:
@@ -218,7 +204,7 @@ def failures_table(failures: Sequence[Mapping[str, Any]]) -> str:
         {
             "method": lambda one: one["name"],
             "seed": lambda one: str(one["seed"]),
-            "reason": lambda one: "failed: " + one["reason"].replace("|", "\\|"),
+            "reason": lambda one: "failed: " + one["reason"],
         },
     )
 
@@ -282,9 +268,8 @@ def provenance(results: Mapping[str, Any]) -> str:
     commit = f" at {made['commit']}" if made["commit"] else ""
     said = f"`{made['command']}`, {made['date']}, leco_plugin {made['version']}{commit}."
     if minutes := sum(run.get("wall_seconds") or 0.0 for run in runs) / 60.0:
-        said += (
-            f" All runs together took {minutes / results['protocol'].get('at_once', 1):.0f} min."
-        )
+        at_once = results["protocol"].get("at_once", 1)
+        said += f" All runs together took {minutes / at_once:.0f} min."
     if reused := sum(bool(run.get("reused")) for run in runs):
         said += f" {reused} of the runs were made for other charts."
     by_code: dict[str, dict[str, None]] = {}  # its names, each once and in order

@@ -1,12 +1,17 @@
-"""How pictures look on a light page and on a dark one, and which results they are of."""
+"""How pictures look on a light page and on a dark one, and pages that need no network."""
 
 from __future__ import annotations
 
+import base64
+import gzip
 import hashlib
+import html
 import json
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
+
+from leco_plugin.scenes.whole_files import write_whole
 
 MARKERS = "osD^vPX*<>"
 SOURCE = "Source"
@@ -95,3 +100,44 @@ def save_picture(figure: Any, path: Path, results: Any, dpi: int) -> Path:
 def fingerprint(values: Any) -> str:
     """A digest that tells JSON values from others."""
     return hashlib.sha256(json.dumps(values, sort_keys=True).encode()).hexdigest()
+
+
+PAGE = """<!DOCTYPE html>
+<html><head><meta charset="utf-8"><title>{title}</title>
+<style>
+body {{ margin: 0; overflow-x: hidden }}
+#figure {{ width: 100%; min-height: 100vh }}
+</style></head>
+<body><div id="figure"></div>
+<script type="text/plain" id="library">{library}</script>
+<script type="text/plain" id="shown">{shown}</script>
+<script>
+async function unpack(id) {{
+  const text = atob(document.getElementById(id).textContent);
+  const bytes = Uint8Array.from(text, character => character.charCodeAt(0));
+  const stream = new Blob([bytes]).stream().pipeThrough(new DecompressionStream("gzip"));
+  return new Response(stream).text();
+}}
+async function show() {{
+  const library = document.createElement("script");
+  library.textContent = await unpack("library");
+  document.head.append(library);
+  const figure = JSON.parse(await unpack("shown"));
+  await Plotly.newPlot("figure", figure.data, figure.layout, {{responsive: true}});
+}}
+show().catch(error => document.body.prepend("This page needs a newer browser: " + error));
+</script></body></html>
+"""
+
+
+def write_page_file(figure: Any, path: Path, title: str) -> Path:
+    """Writes a figure of plotly as a page: 2 MB for the library, which take 5 MB as they are."""
+    from plotly.offline import get_plotlyjs
+
+    def packed(text: str) -> str:
+        return base64.b64encode(gzip.compress(text.encode(), 9, mtime=0)).decode()
+
+    parts = {"library": packed(get_plotlyjs()), "shown": packed(figure.to_json())}
+    page = PAGE.format(title=html.escape(title), **parts).encode()
+    write_whole(path, lambda file: file.write(page))
+    return path

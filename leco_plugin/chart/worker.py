@@ -16,8 +16,7 @@ from leco_plugin.chart.runner import die_with_parent, work_on
 if TYPE_CHECKING:
     from nerfstudio.engine.trainer import Trainer, TrainerConfig
 
-    from leco_plugin.chart.contender import Contender
-    from leco_plugin.chart.protocol import Protocol
+    from leco_plugin.chart.contender import Contender, Protocol
 
 WORKER = (sys.executable, "-W", "ignore", "-m", "leco_plugin.chart.worker")
 SMALL_GATES = {
@@ -57,10 +56,9 @@ def train_job(
     *,
     looked_at: bool = True,
 ) -> tuple[dict[str, Any], Trainer]:
-    """Trains, evaluates and measures.
+    """Trains by the contender's config, evaluates and measures.
 
     Args:
-        config: of the contender.
         folder: for the occupancy, if there is one, and for nerfstudio's own files.
         on_progress: called with the share that is done.
         looked_at: False leaves the test images, and all figures of them, to the caller.
@@ -165,7 +163,7 @@ def compare_at_freezing(model: Any, datamanager: Any, contender: Contender) -> d
 
 def _occupancy_of(trainer: Trainer, data: Path, folder: Path) -> dict[str, Any] | None:
     """Facts of the occupancy that a run has left, if any; its file is kept."""
-    from leco_plugin.evaluation.occupancy_facts import occupancy_facts, truth_of
+    from leco_plugin.evaluation.equal_loss import occupancy_facts, truth_of
     from leco_plugin.learning.freezing import FILE_NAME
     from leco_plugin.occupancy import Occupancy
     from leco_plugin.scenes.photographs import folder_of
@@ -180,13 +178,9 @@ def _occupancy_of(trainer: Trainer, data: Path, folder: Path) -> dict[str, Any] 
 
 
 def main(folder: Path, run: Callable[..., dict[str, Any]] = run_job) -> int:
-    """Makes the run that a folder describes; 0, or 1 and a reason in the folder.
-
-    Args:
-        run: makes it; arguments as of `run_job`.
-    """
-    from leco_plugin.chart.contender import Contender
-    from leco_plugin.chart.protocol import Protocol
+    """Makes the run that a folder describes, by a function as `run_job`; 0, or 1 and a reason in
+    the folder."""
+    from leco_plugin.chart.contender import Contender, Protocol
     from leco_plugin.evaluation.report import describe_code
 
     die_with_parent()

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import torch
 
-from leco_plugin.conformance import host_data, host_images, host_training  # noqa: F401 (checks of hosts)
+from leco_plugin.conformance import host_images, host_training  # noqa: F401 (checks of hosts)
 from leco_plugin.conformance.estimators import EstimatorCase
 from leco_plugin.conformance.hosts import HostCase
 from leco_plugin.conformance.proposals import ProposalCase
@@ -34,11 +34,8 @@ def sampler_cases(name: str) -> list[Case]:
         ValueError: there is no such sampler, it serves no seam, or it cannot be built.
     """
     spec = sampler_spec(name)
-    cases: list[SamplerCase] = []
-    if spec.estimator is not None:
-        cases.append(EstimatorCase(name))
-    if spec.proposal is not None:
-        cases.append(ProposalCase(name))
+    kinds = ((spec.estimator, EstimatorCase), (spec.proposal, ProposalCase))
+    cases: list[SamplerCase] = [kind(name) for builder, kind in kinds if builder is not None]
     if not cases:
         raise ValueError(f"sampler {name!r} builds neither an estimator nor a proposal sampler")
     for case in cases:
@@ -60,11 +57,8 @@ def _refuse_what_cannot_be_built(case: SamplerCase) -> None:
 
 
 def host_cases(name: str) -> list[Case]:
-    """A registered method, which can be built on the scene of the kit.
-
-    Raises:
-        InputError: there is no such method, or it cannot be built, or not be guided.
-    """
+    """A registered method; an `InputError` where it cannot be built on the scene of the kit, or not
+    be guided."""
     case = HostCase(name)
     try:
         case.shared()
@@ -77,11 +71,7 @@ def host_cases(name: str) -> list[Case]:
 
 
 def cases_of(name: str) -> list[Case]:
-    """A sampler or a method; of a name that is both, the sampler.
-
-    Raises:
-        ValueError: as `sampler_cases` and `host_cases`, or the name is neither.
-    """
+    """A sampler or a method; of a name that is both, the sampler. `ValueError` for neither."""
     known = samplers()
     if ":" in name or name in known or why_left_out(GROUP, SamplerSpec, name) is not None:
         return sampler_cases(name)
@@ -101,22 +91,16 @@ def pairs(cases: list[Case], rules: tuple[Rule, ...] = RULES) -> list[tuple[Rule
 
 
 def check(name: str) -> Iterator[Verdict]:
-    """Applies the rules for a sampler or a method one after another.
-
-    Raises:
-        ValueError: at once, as `cases_of`.
-    """
-    found = pairs(cases_of(name), RULES)
-    return (apply(rule, case) for rule, case in found)
+    """Applies the rules for a sampler or a method one by one; errors of `cases_of` come at once."""
+    return (apply(rule, case) for rule, case in pairs(cases_of(name)))
 
 
 def with_table(page: str) -> str:
     """A Markdown page with the table of rules between its two marks renewed."""
     rows = ["| rule | seams | why it matters | remedy |", "|---|---|---|---|"]
-    rows += [
-        f"| `{rule.name}` | {', '.join(sorted(rule.checks))} | {rule.reason} | {rule.remedy} |"
-        for rule in RULES
-    ]
+    for rule in RULES:
+        seams = ", ".join(sorted(rule.checks))
+        rows.append(f"| `{rule.name}` | {seams} | {rule.reason} | {rule.remedy} |")
     before, _, rest = page.partition(BEGIN)
     return "\n".join([f"{before}{BEGIN}", *rows, f"{END}{rest.partition(END)[2]}"])
 

@@ -24,6 +24,7 @@ from leco_plugin.conformance.scene import (
     LONG_STEP,
     MANY,
     MARGIN,
+    NOTHING,
     PARTS,
     SLAB,
     STEP,
@@ -85,8 +86,7 @@ class EstimatorCase(SamplerCase):
             f"sampling returned {type(samples).__name__} instead of three tensors "
             "(ray_indices, t_starts, t_ends)",
         )
-        ray_indices, t_starts, t_ends = samples
-        return ray_indices, t_starts, t_ends
+        return samples[0], samples[1], samples[2]
 
     def colours(self, sampler: Any, rays: Rays, field: Field) -> Tensor:
         def sigma_fn(t_starts: Tensor, t_ends: Tensor, ray_indices: Tensor) -> Tensor:
@@ -161,12 +161,11 @@ def packing_consistent(case: EstimatorCase) -> None:
     n_rays = len(rays.origins)
     require(ray_indices.dtype == torch.int64, f"ray_indices is {ray_indices.dtype}, not int64")
     low, high = (int(bound) for bound in ray_indices.aminmax())
+    inside = low >= 0 and high < n_rays
+    require(inside, f"ray_indices go from {low} to {high}; there are {n_rays} rays")
+    fall = bool((ray_indices.diff() < 0).any())
     require(
-        low >= 0 and high < n_rays, f"ray_indices go from {low} to {high}; there are {n_rays} rays"
-    )
-    require(
-        bool((ray_indices[1:] >= ray_indices[:-1]).all()),
-        "ray_indices fall somewhere: samples of a ray must lie together, rays in order",
+        not fall, "ray_indices fall somewhere: samples of a ray must lie together, rays in order"
     )
     counts = pack_info(ray_indices, n_rays)[:, 1]
     unpacked = torch.arange(n_rays, device=counts.device).repeat_interleave(counts)
@@ -189,10 +188,10 @@ def _check_uniform(shares: Tensor) -> None:
 
     By the statistic of Kolmogorov and Smirnov, which for these exceeds 4 / sqrt(N) once in 10^13.
     """
+    from scipy.stats import ks_1samp, uniform
+
     n = len(shares)
-    even = torch.arange(n + 1) / n
-    found = shares.cpu().sort().values
-    apart = float(torch.maximum(found - even[:-1], even[1:] - found).max())
+    apart = float(ks_1samp(shares.cpu().numpy(), uniform.cdf, method="asymp").statistic)
     bound = 4.0 / n**0.5
     require(
         apart <= bound,
@@ -252,11 +251,8 @@ def skips_only_what_it_may(case: EstimatorCase) -> None:
 def _check_skipped_is_not(rays: Rays, samples: Samples, scene: Slab) -> None:
     positions = rays.at(samples[0], (samples[1] + samples[2]) / 2.0)
     outside = scene.depth(positions) < -MARGIN
-    require(
-        not bool(outside.any()),
-        f"{int(outside.sum())} of {len(outside)} samples lie where the occupancy is empty"
-        + _first(positions[outside]),
-    )
+    said = f"{int(outside.sum())} of {len(outside)} samples lie where the occupancy is empty"
+    require(not bool(outside.any()), said + _first(positions[outside]))
 
 
 def _check_kept_is_sampled(
@@ -264,9 +260,7 @@ def _check_kept_is_sampled(
 ) -> None:
     """Raises unless every candidate that lies plainly in a slab is in a sample's interval.
 
-    Args:
-        shifted: whether the samples are: their middles are half a step away then, and the first
-            and last steps of a ray may have none.
+    The middles of shifted samples are half a step away, and the ends of a ray may have none.
     """
     ray_indices, t_starts, t_ends = dense(rays, step=step)
     middles = (t_starts + t_ends) / 2.0
@@ -275,11 +269,9 @@ def _check_kept_is_sampled(
     sought = scene.depth(positions) > MARGIN + shifted * step / 2.0
     sought &= from_ends > shifted * step
     missing = ~covered(ray_indices[sought], middles[sought], samples)
-    require(
-        not bool(missing.any()),
-        f"{int(missing.sum())} of {len(missing)} places are not sampled although they are occupied"
-        + _first(positions[sought][missing]),
-    )
+    places = f"{int(missing.sum())} of {len(missing)} places"
+    said = f"{places} are not sampled although they are occupied"
+    require(not bool(missing.any()), said + _first(positions[sought][missing]))
 
 
 def _first(positions: Tensor) -> str:
@@ -316,26 +308,18 @@ def visibility_pruning(case: EstimatorCase) -> None:
 
 
 def _check_pruned(
-    case: EstimatorCase,
-    sampler: Any,
-    rays: Rays,
-    plain: Samples,
-    early_stop_eps: float,
-    alpha_thre: float,
+    case: EstimatorCase, sampler: Any, rays: Rays, plain: Samples, eps: float, alpha_thre: float
 ) -> None:
     ray_indices, t_starts, t_ends = plain
+    densities = _wall(rays, t_starts, t_ends, ray_indices)
     light, alphas = render_transmittance_from_density(
-        t_starts,
-        t_ends,
-        _wall(rays, t_starts, t_ends, ray_indices),
-        ray_indices=ray_indices,
-        n_rays=len(rays.origins),
+        t_starts, t_ends, densities, ray_indices=ray_indices, n_rays=len(rays.origins)
     )
-    visible = light >= early_stop_eps * (1.0 + SLACK)
+    visible = light >= eps * (1.0 + SLACK)
     visible &= alphas >= alpha_thre * (1.0 + SLACK)
-    dark = light < early_stop_eps * (1.0 - SLACK)
+    dark = light < eps * (1.0 - SLACK)
     faint = alphas < min(alpha_thre, LOWEST_CAP * float(alphas.mean())) * (1.0 - SLACK)
-    limits = {"early_stop_eps": early_stop_eps, "alpha_thre": alpha_thre}
+    limits = {"early_stop_eps": eps, "alpha_thre": alpha_thre}
 
     def alpha_fn(t_starts: Tensor, t_ends: Tensor, ray_indices: Tensor) -> Tensor:
         return 1.0 - torch.exp(-_wall(rays, t_starts, t_ends, ray_indices) * (t_ends - t_starts))
@@ -343,7 +327,7 @@ def _check_pruned(
     for name, function in (("sigma_fn", partial(_wall, rays)), ("alpha_fn", alpha_fn)):
         options: dict[str, Any] = {name: function, "stratified": False, **limits}
         kept = among(plain, case.sample(sampler, rays, **options))
-        given = f"with {name}, early_stop_eps {early_stop_eps} and alpha_thre {alpha_thre}"
+        given = f"with {name}, early_stop_eps {eps} and alpha_thre {alpha_thre}"
         lost = int((visible & ~kept).sum())
         require(lost == 0, f"{given}: {lost} of {int(visible.sum())} visible samples are dropped")
         for kind, dropped in (("in the dark", dark), ("too faint to be seen", faint)):
@@ -363,17 +347,14 @@ def update_while_frozen_is_harmless(case: EstimatorCase) -> None:
     sampler, rays = case.shared(SLAB), crossing()
     before = case.sample(sampler, rays)
     sampler.train()
-    answer = _nothing if case.needs_occupancy else SLAB.density
+    answer = NOTHING.density if case.needs_occupancy else SLAB.density
     thresholds = {"occ_thre": 1e-2, "ema_decay": 0.95, "warmup_steps": 256, "n": 16}
     # as nerfstudio and nerfacc's examples call it; steps in and after nerfacc's warm-up
+    named = {"occ_eval_fn": answer}
     forms: tuple[tuple[str, tuple[Any, ...], dict[str, Any]], ...] = (
-        ("step=, occ_eval_fn=", (), {"step": 16, "occ_eval_fn": answer}),
+        ("step=, occ_eval_fn=", (), {"step": 16, **named}),
         ("step, occ_eval_fn", (272, answer), {}),
-        (
-            "step=, occ_eval_fn=, occ_thre=",
-            (),
-            {"step": 288, "occ_eval_fn": answer, "occ_thre": 1e-2},
-        ),
+        ("step=, occ_eval_fn=, occ_thre=", (), {"step": 288, **named, "occ_thre": 1e-2}),
         ("step, occ_eval_fn and all options", (304, answer), thresholds),
     )
     for form, arguments, options in forms:
@@ -387,7 +368,3 @@ def update_while_frozen_is_harmless(case: EstimatorCase) -> None:
         require(same(before, after), "updates with an empty field changed what is sampled")
     else:
         _check_kept_is_sampled(rays, after)
-
-
-def _nothing(positions: Tensor) -> Tensor:
-    return torch.zeros_like(positions[:, :1])

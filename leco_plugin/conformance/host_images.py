@@ -11,7 +11,6 @@ import torch
 from torch import Tensor, nn
 
 from leco_plugin.conformance.hosts import (
-    NOTHING,
     HostCase,
     batch,
     bundle,
@@ -23,7 +22,7 @@ from leco_plugin.conformance.hosts import (
 from leco_plugin.conformance.proposals import CHORD, INSIDE, NEARBY, chords
 from leco_plugin.conformance.rules import Broken, checks, require
 from leco_plugin.conformance.samplers import check_tensor, devices
-from leco_plugin.conformance.scene import DISTANCE, EVERYTHING, MARGIN, SLAB, Rays, box
+from leco_plugin.conformance.scene import DISTANCE, EVERYTHING, MARGIN, NOTHING, SLAB, Rays, box
 from leco_plugin.hosts.stand_ins import GuidedEstimator, GuidedProposal
 from leco_plugin.samplers.base import DenseEstimator, Estimator
 from leco_plugin.samplers.marching import Samples
@@ -101,18 +100,15 @@ def _noting(seam: GuidedEstimator | GuidedProposal, sampled: list[Tensor]) -> An
 
 @contextmanager
 def sample_densely(model: Model) -> Iterator[None]:
-    """While this lasts, a guided host samples all of the box, or all of each ray.
-
-    So does a packed host with its own estimator.
-    """
+    """While this lasts, a guided host, or a packed one with its own estimator, samples all of the
+    box, or all of each ray."""
     from nerfacc.estimators.base import AbstractEstimator
 
     with ExitStack() as stack:
         for module in model.modules():
             if isinstance(module, GuidedEstimator | AbstractEstimator | Estimator):
-                stack.enter_context(
-                    patch.object(module, "sampling", DenseEstimator(box()).sampling)
-                )
+                everywhere = DenseEstimator(box()).sampling
+                stack.enter_context(patch.object(module, "sampling", everywhere))
             elif isinstance(module, GuidedProposal):
                 stack.enter_context(patch.object(module, "forward", _all_of_each_ray))
         yield
@@ -233,9 +229,8 @@ def _background_of(model: Model) -> Tensor | None:
     renderers = [module for module in model.modules() if isinstance(module, RGBRenderer)]
     if len(renderers) != 1 or renderers[0].background_color in ("random", "last_sample"):
         return None
-    return renderers[0].get_background_color(
-        renderers[0].background_color, (3,), torch.device("cpu")
-    )
+    colour = renderers[0].background_color
+    return renderers[0].get_background_color(colour, (3,), torch.device("cpu"))
 
 
 def _listed(colour: Tensor) -> list[float]:
@@ -282,7 +277,5 @@ def guided_by_everything_is_dense(case: HostCase) -> None:
     for name in CHANNELS:
         largest = float(expected[name].abs().max().clamp(min=1e-6))
         apart = float((found[name] - expected[name]).abs().max()) / largest
-        require(
-            apart <= tolerance,
-            f"{name!r} differs by {apart:.1%} of its largest value from dense sampling",
-        )
+        said = f"{name!r} differs by {apart:.1%} of its largest value from dense sampling"
+        require(apart <= tolerance, said)

@@ -1,21 +1,35 @@
-"""The rules for a guided host over a run: training steps, checkpoints, resuming, two processes."""
+"""The rules for a guided host over a run: steps, checkpoints, two processes, held-out images."""
 
 from __future__ import annotations
 
 import copy
 import functools
+import json
+import random
+from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
 import torch
+from PIL import Image
 from torch import Tensor
 
 from leco_plugin.conformance.host_images import places_asked, rendered, sample_densely
-from leco_plugin.conformance.hosts import HostCase, batch, build, bundle, callbacks, loss_of
+from leco_plugin.conformance.hosts import (
+    HostCase,
+    batch,
+    build,
+    bundle,
+    callbacks,
+    cameras,
+    loss_of,
+    quietly,
+)
 from leco_plugin.conformance.rules import checks, require
 from leco_plugin.conformance.samplers import on_two_ranks, reloaded
-from leco_plugin.conformance.scene import SLAB
+from leco_plugin.conformance.scene import CENTRE, HALF, SLAB
 
 if TYPE_CHECKING:
     from nerfstudio.engine.callbacks import TrainingCallbackLocation
@@ -34,11 +48,8 @@ def samples_shift_in_training(case: HostCase) -> None:
     for seed in (1, 2):
         torch.manual_seed(seed)
         places.append(places_asked(model))
-    one, other = places
-    require(
-        one.shape != other.shape or not one.equal(other),
-        "two training steps ask the field at the same places",
-    )
+    alike = places[0].equal(places[1])
+    require(not alike, "two training steps ask the field at the same places")
 
 
 @checks("teaches-the-host-alone", "host")
@@ -59,9 +70,9 @@ def teaches_the_host_alone(case: HostCase) -> None:
     require(not touched, f"{_some(touched)} of the guide get a gradient")
 
 
-def gradients_of_a_step(model: Model, seed: int = 0) -> dict[str, Tensor]:
+def gradients_of_a_step(model: Model) -> dict[str, Tensor]:
     """Gradients of the batch's loss by parameter, for parameters that it reaches."""
-    torch.manual_seed(seed)
+    torch.manual_seed(0)
     loss = loss_of(model.train(), bundle(), batch())
     require(loss.requires_grad, "the loss has no gradient")
     loss.backward()  # type: ignore[no-untyped-call]
@@ -123,10 +134,8 @@ def state_and_yaml_round_trip(case: HostCase) -> None:
     restored.update_to_step(1)
     restored.load_state_dict(reloaded(model.state_dict()), strict=True)
     for name, value in rendered(restored, bundle()).items():
-        require(
-            value.equal(expected[name]),
-            f"the output {name!r} of a model that was restored is not that of the one it is of",
-        )
+        said = f"the output {name!r} of a model that was restored is not that of the one it is of"
+        require(value.equal(expected[name]), said)
 
 
 class Run:
@@ -251,3 +260,105 @@ def _half_a_batch(model: Any, rank: int, forward: Any = None) -> Tensor:
 def _gradients(model: Any) -> dict[str, Tensor]:
     named = model.named_parameters()
     return {name: parameter.grad for name, parameter in named if parameter.grad is not None}
+
+
+IMAGES, PIXELS, RAYS, STEPS = 16, 16, 64, 2
+"""Images, pixels along each of their sides, rays of a batch, and steps of a run."""
+
+
+class RunOnImages(Run):
+    """A training run with the method's own pipeline and data manager."""
+
+    def __init__(self, config: Any) -> None:
+        from nerfstudio.engine.callbacks import TrainingCallbackAttributes
+        from nerfstudio.engine.optimizers import Optimizers
+
+        self._seed(0)
+        with quietly():
+            self.pipeline = config.pipeline.setup(device="cpu", test_mode="val")
+            self.pipeline.train()
+            self.model = self.pipeline.model
+            groups = self.pipeline.get_param_groups()
+            self.optimizers = Optimizers(copy.deepcopy(config.optimizers), groups)
+            attributes = TrainingCallbackAttributes(self.optimizers, None, self.pipeline, None)
+            self.callbacks = self.pipeline.get_training_callbacks(attributes)
+
+    @staticmethod
+    def _seed(seed: int) -> None:
+        """nerfstudio draws pixels with numbers of all three."""
+        random.seed(seed)
+        np.random.seed(seed)  # noqa: NPY002
+        torch.manual_seed(seed)
+
+    def learned(self) -> dict[str, Tensor]:
+        """Parameters after a few steps."""
+        self._seed(0)
+        with quietly():
+            for step in range(STEPS):
+                self.step(step)
+        return self.parameters()
+
+    def loss(self, step: int) -> Tensor:
+        _, losses, _ = self.pipeline.get_train_loss_dict(step)
+        return torch.stack([loss.sum() for loss in losses.values()]).sum()
+
+    def files(self, split: str) -> set[Path]:
+        """Images of the data manager's `train_dataset` or `eval_dataset`."""
+        dataset = getattr(self.pipeline.datamanager, f"{split}_dataset", None)
+        return set() if dataset is None else {*map(Path, dataset.image_filenames)}
+
+
+@checks("held-out-images-teach-nothing", "host")
+def held_out_images_teach_nothing(case: HostCase) -> None:
+    """With other held-out images, training steps lead to the same parameters. A method whose data
+    manager reads no files is not asked."""
+    if not hasattr(case.config.pipeline.datamanager, "dataparser"):
+        return
+    with TemporaryDirectory() as name:
+        folder = Path(name)
+        write_images(folder)
+        config = reading(case.config, folder)
+        run = RunOnImages(config)
+        held_out, trained = run.files("eval"), run.files("train")
+        both = len(held_out & trained)
+        require(both == 0, f"{both} of {len(held_out)} held-out images are trained on")
+        expected = run.learned()
+        for file in held_out:
+            Image.new("RGB", (PIXELS, PIXELS), "white").save(file)
+        found = RunOnImages(config).learned()
+    for name, value in expected.items():
+        require(value.equal(found[name]), f"what {name} learns depends on held-out images")
+
+
+def reading(config: Any, folder: Path) -> Any:
+    """The config of a method, whose data manager reads a folder in nerfstudio's format."""
+    from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataParserConfig
+
+    config = copy.deepcopy(config)
+    manager = config.pipeline.datamanager
+    parser = manager.dataparser
+    if not isinstance(parser, NerfstudioDataParserConfig):
+        parser = NerfstudioDataParserConfig()
+    still: dict[str, Any] = {"orientation_method": "none", "center_method": "none"}
+    still |= {"auto_scale_poses": False, "scene_scale": 2.0 * (max(map(abs, CENTRE)) + HALF)}
+    manager.dataparser = replace(parser, data=folder, **still)
+    manager.data, manager.train_num_rays_per_batch = folder, RAYS
+    return config
+
+
+def write_images(folder: Path) -> None:
+    """Images of the scene of the kit, from its cameras and from farther off, with their poses."""
+    known = cameras()
+    corner, frames = torch.tensor([[0.0, 0.0, 0.0, 1.0]]), []
+    for number in range(IMAGES):
+        pose = known.camera_to_worlds[number % len(known)].clone()
+        pose[:, 3] += 0.1 * number * pose[:, 2]
+        name = f"{number:02d}.png"
+        shade = 15 * number
+        Image.new("RGB", (PIXELS, PIXELS), (shade, 255 - shade, 128)).save(folder / name)
+        matrix = torch.cat([pose, corner]).tolist()
+        frames.append({"file_path": name, "transform_matrix": matrix})
+    focal = float(known.fx[0]) * PIXELS / float(known.width[0])
+    lens = {"fl_x": focal, "fl_y": focal, "cx": PIXELS / 2, "cy": PIXELS / 2}
+    scene = {**lens, "w": PIXELS, "h": PIXELS, "frames": frames}
+    (folder / "transforms.json").write_text(json.dumps(scene))

@@ -22,15 +22,7 @@ from torch import Tensor
 from torch.nn.functional import normalize
 
 from leco_plugin.conformance.rules import Case
-from leco_plugin.conformance.scene import (
-    CENTRE,
-    DISTANCE,
-    HERE,
-    MOVED,
-    SLAB,
-    Slab,
-    box,
-)
+from leco_plugin.conformance.scene import CENTRE, DISTANCE, HERE, MOVED, SLAB, Slab, box
 from leco_plugin.models.encodings import Kind
 from leco_plugin.occupancy import Occupancy
 from leco_plugin.samplers.boxes import intersect_box
@@ -50,9 +42,6 @@ CAMERAS, SIDE = len(FROM), 4
 """Cameras, and pixels along each side of their images."""
 SEEN = 0.8
 """World units to each side of the box's centre that an image shows: all rays cross the slab."""
-
-NOTHING = Slab((0.0, 0.0, 1.0), -1.0)
-"""A scene in which all is empty."""
 
 
 def cameras() -> Cameras:
@@ -136,9 +125,6 @@ def pipeline_of(model: Any) -> Any:
 class HostCase(Case):
     """A method whose model is guided: as it is, or with its sampler swapped.
 
-    Args:
-        name: of the method, as `ns-train` knows it.
-
     Attributes:
         config: of the method, guided by a file that holds the occupancy of `SLAB`.
 
@@ -167,11 +153,8 @@ class HostCase(Case):
         return scene.occupancy(self._kind, frame)
 
     def shared(self, scene: Slab = SLAB, moved: bool = False) -> Model:
-        """The model as a run has it before its first step, guided in a scene, in evaluation.
-
-        Args:
-            moved: whether its occupancy has other coordinates than the host.
-        """
+        """The model as a run has it before its first step, guided in a scene, in evaluation; moved
+        is by an occupancy of other coordinates than the host's."""
         if self._model is None:
             self._model, self._guided_by = build(self.config.pipeline.model), (SLAB, False)
             callbacks(self._model)
@@ -191,11 +174,8 @@ class HostCase(Case):
 
 
 def guided(name: str, file: Path) -> tuple[TrainerConfig, Kind]:
-    """The config of a method, guided by a file, and the features its gate must be on.
-
-    Raises:
-        InputError: as `HostCase`.
-    """
+    """The config of a method, guided by a file, and the features its gate must be on; errors as of
+    `HostCase`."""
     from leco_plugin.hosts.guided import GuidedModelConfig
     from leco_plugin.models.leco_config import LecoModelConfig
     from leco_plugin.swap import registered, with_sampler_swapped
@@ -237,11 +217,8 @@ def callbacks(model: Model, optimizers: Any = None) -> list[TrainingCallback]:
 
 
 def loss_of(model: Model, rays: RayBundle, batch: dict[str, Tensor], forward: Any = None) -> Tensor:
-    """The loss of a batch, as nerfstudio's pipeline and trainer compute it.
-
-    Args:
-        forward: stands for the model where outputs are asked, as data-parallel training has it.
-    """
+    """The loss of a batch, as nerfstudio's pipeline and trainer compute it; `forward` stands for
+    the model where outputs are asked, as data-parallel training has it."""
     outputs = (forward or model)(rays)
     metrics = model.get_metrics_dict(outputs, batch)
     losses = model.get_loss_dict(outputs, batch, metrics)
@@ -250,11 +227,8 @@ def loss_of(model: Model, rays: RayBundle, batch: dict[str, Tensor], forward: An
 
 @contextmanager
 def quietly() -> Iterator[None]:
-    """While this lasts, nerfstudio prints nothing: verdicts are what is to be read.
-
-    Raises:
-        RuntimeError: nerfstudio ends the process; what it printed last.
-    """
+    """While this lasts, nerfstudio prints nothing: verdicts are what is to be read. Where it ends
+    the process, a `RuntimeError` says what it printed last."""
     from nerfstudio.utils.rich_utils import CONSOLE
 
     printed = CONSOLE.capture()

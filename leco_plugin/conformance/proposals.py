@@ -61,21 +61,15 @@ class ProposalCase(SamplerCase):
     def answer(
         self, sampler: Any, rays: Rays, scene: Slab = SLAB, density: Any = None
     ) -> tuple[Any, Any, Any]:
-        """ray_samples, weights_list and ray_samples_list, as a host gets them.
-
-        Args:
-            density: what each of the host's density_fns is; None is the density of the scene.
-        """
-        density_fns = [scene.density if density is None else density] * LEVELS
-        answer = sampler(ray_bundle(rays), density_fns=density_fns)
-        are_three = isinstance(answer, (tuple, list)) and len(answer) == 3
+        """ray_samples, weights_list and ray_samples_list, as a host gets them whose density_fns are
+        of this density, or that of the scene."""
+        answer = sampler(ray_bundle(rays), density_fns=[density or scene.density] * LEVELS)
         require(
-            are_three,
+            isinstance(answer, (tuple, list)) and len(answer) == 3,
             f"the call returned {type(answer).__name__} instead of ray_samples, weights_list and "
             "ray_samples_list",
         )
-        ray_samples, weights, candidates = answer
-        return ray_samples, weights, candidates
+        return answer[0], answer[1], answer[2]
 
     def sample(
         self, sampler: Any, rays: Rays, scene: Slab = SLAB, *, seed: int = 0, **options: Any
@@ -141,10 +135,8 @@ def signature(case: ProposalCase) -> None:
         require(callable(getattr(sampler, callback, None)), f"it has no method {callback}")
     density = no_density if case.needs_occupancy else None
     ray_samples, weights, candidates = case.answer(sampler, crossing(), density=density)
-    require(
-        hasattr(ray_samples, "frustums"),
-        f"the first of three is {type(ray_samples).__name__}, not RaySamples",
-    )
+    found = type(ray_samples).__name__
+    require(hasattr(ray_samples, "frustums"), f"the first of three is {found}, not RaySamples")
     for name, found in (("weights_list", weights), ("ray_samples_list", candidates)):
         require(isinstance(found, list), f"{name} is {type(found).__name__}; hosts append to it")
 

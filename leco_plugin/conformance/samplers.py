@@ -49,13 +49,7 @@ class SamplerCase(Case):
     """A sampler at one of the two seams.
 
     Building can take seconds: a sampler of a scene is built once and shared by the rules, which
-    leave it as they found it.
-
-    Args:
-        name: of the sampler, as registered.
-
-    Raises:
-        ValueError: there is no sampler of that name.
+    leave it as they found it. `ValueError` where there is no sampler of that name.
     """
 
     def __init__(self, name: str) -> None:
@@ -97,12 +91,8 @@ class SamplerCase(Case):
     def sample(
         self, sampler: Any, rays: Rays, scene: Slab = SLAB, *, seed: int = 0, **options: Any
     ) -> Samples:
-        """What a host gets, with random numbers from `seed`, as packed samples.
-
-        Args:
-            scene: of the sampler, for those that ask the host for densities.
-            options: arguments that are not those of every call.
-        """
+        """What a host gets, with random numbers from `seed`, as packed samples. The scene is for
+        samplers that ask the host for densities."""
 
     @abstractmethod
     def colours(self, sampler: Any, rays: Rays, field: Field) -> Tensor:
@@ -195,10 +185,7 @@ def two_processes(case: SamplerCase) -> None:
 
 
 def samples_after_a_step(kind: type[SamplerCase], name: str, rank: int) -> Samples:
-    """Samples in evaluation after a training step on the rank's own rays.
-
-    Each process finds the sampler by its name.
-    """
+    """Samples in evaluation after a training step on the rank's own rays."""
     case, rays = kind(name), crossing()
     sampler = case.shared(SLAB).train()
     own = Rays(*(tensor[rank::2] for tensor in rays))
@@ -244,11 +231,7 @@ def on_two_ranks(work: Callable[[int], Any], imports: Sequence[str]) -> list[Any
         finally:
             for process in ranks.processes:
                 process.kill()
-        return [torch.load(_result(rank, folder), weights_only=True) for rank in range(2)]
-
-
-def _result(rank: int, folder: str) -> Path:
-    return Path(folder) / f"rank-{rank}.pt"
+        return [torch.load(f"{folder}/rank-{rank}.pt", weights_only=True) for rank in range(2)]
 
 
 def _rank(rank: int, work: Callable[[int], Any], folder: str) -> None:
@@ -265,5 +248,5 @@ def _rank(rank: int, work: Callable[[int], Any], folder: str) -> None:
         world_size=2,
         timeout=timedelta(seconds=PATIENCE_OF_A_RANK),
     )
-    torch.save(work(rank), _result(rank, folder))
+    torch.save(work(rank), f"{folder}/rank-{rank}.pt")
     torch.distributed.destroy_process_group()

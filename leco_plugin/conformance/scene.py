@@ -148,6 +148,8 @@ OTHER = Slab((0.0, 0.0, 1.0), 0.25)
 EVERYTHING = Slab((0.0, 0.0, 1.0), 100.0)
 TWO = Slab((0.48, 0.6, 0.64), 0.15, offset=0.4)
 """Two thin slabs, with a gap between them."""
+NOTHING = Slab((0.0, 0.0, 1.0), -1.0)
+"""A scene in which all is empty."""
 
 
 class Field(nn.Module):
@@ -212,11 +214,8 @@ def slab_gate(normal: Tensor, half_width: float, offset: float, kind: Kind) -> G
 
 
 def write_linear(encoding: Encoding, normal: Tensor) -> Tensor:
-    """Writes into an encoding of `SMALLEST` what makes n.x a weighted sum of its features.
-
-    Returns:
-        the weights, [out_dim].
-    """
+    """Writes into an encoding of `SMALLEST` what makes n.x a weighted sum of its features; returns
+    the weights, [out_dim]."""
     weights = torch.zeros(encoding.out_dim)
     ends = torch.tensor([-1.0, 1.0])
     across = normal[0] * ends + normal[1] * ends[:, None]  # rows are along y, columns along x
@@ -259,22 +258,20 @@ def dense(rays: Rays, cone_angle: float = 0.0, step: float = STEP) -> Samples:
     )
 
 
-def by_ray(samples: Samples) -> Samples:
-    """Samples with rays in order; the samples of a ray stay in theirs."""
-    order = samples[0].argsort(stable=True)
+def _chosen(samples: Samples, order: Tensor) -> Samples:
     ray_indices, t_starts, t_ends = (part[order] for part in samples)
     return ray_indices, t_starts, t_ends
 
 
 def in_order(samples: Samples) -> Samples:
     """Samples sorted by ray, then by where they begin."""
-    order = _keys(samples[0], samples[1]).argsort()
-    ray_indices, t_starts, t_ends = (part[order] for part in samples)
-    return ray_indices, t_starts, t_ends
+    return _chosen(samples, _keys(samples[0], samples[1]).argsort())
 
 
-def among(wanted: Samples, samples: Samples, tolerance: float = 1e-3 * STEP) -> Tensor:
-    """Which of the wanted samples are there, with both ends within a tolerance: bool [n_wanted]."""
+def among(wanted: Samples, samples: Samples) -> Tensor:
+    """Which of the wanted samples are there, with both ends within a thousandth of a step: bool
+    [n_wanted]."""
+    tolerance = 1e-3 * STEP
     if len(samples[0]) == 0:
         return torch.zeros_like(wanted[0], dtype=torch.bool)
     keys, order = _keys(samples[0], samples[1]).sort()
@@ -308,7 +305,7 @@ def check_intervals(rays: Rays, samples: Samples) -> None:
 def check_order(samples: Samples) -> None:
     """Raises unless samples follow one another along each ray."""
     require(len(samples[0]) > 0, "there are no samples on rays that cross what is occupied")
-    _, t_starts, t_ends = samples = by_ray(samples)
+    _, t_starts, t_ends = samples = _chosen(samples, samples[0].argsort(stable=True))
     _hold(t_ends > t_starts, samples, "does not end behind its beginning")
     follows = torch.ones_like(t_starts, dtype=torch.bool)
     follows[1:] = t_starts[1:] >= t_ends[:-1] - ROUNDING

@@ -30,7 +30,6 @@ class Clock:
         self._started: float | None = None
 
     def start(self) -> None:
-        """Goes on from here."""
         synchronize()
         self._started = seconds_now()
 
@@ -64,10 +63,10 @@ def synchronize() -> None:
         torch.cuda.synchronize()
 
 
-def warm_up(device: torch.device | str, seconds: float = 0.2) -> None:
+def warm_up(device: torch.device | str) -> None:
     """Keeps the device busy for a moment, so that the first step does not pay for its start-up."""
     weights = torch.zeros(64, 64, device=device, requires_grad=True)
-    end = time.perf_counter() + seconds
+    end = time.perf_counter() + 0.2
     while time.perf_counter() < end:
         product = torch.ones(4096, 64, device=device) @ weights
         product.relu().sum().backward()
@@ -95,12 +94,8 @@ class Budget:
 
     def share(self, seconds: float, steps: int) -> float:
         """How much of the budget is used, in [0, 1]; at 1 the run is over."""
-        used = 0.0
-        if self.seconds is not None:
-            used = seconds / self.seconds
-        if self.steps is not None:
-            used = max(used, steps / self.steps)
-        return min(1.0, used)
+        of = ((seconds, self.seconds), (steps, self.steps))
+        return min(1.0, max(used / limit for used, limit in of if limit is not None))
 
 
 def peak_process_bytes() -> int:

@@ -1,8 +1,8 @@
-"""Kept volume of occupancy representations at equal lost surface mass.
+"""Figures of an occupancy: its size, what it keeps of an exact city, and what at equal loss.
 
-Each representation has a score: o(x) for a gate, the largest density in a cell for a grid. Its
-threshold is set so that all lose the same share of the weight near surfaces. Only space that rays
-of photographs reach is counted: elsewhere gates and grids are neither taught nor queried.
+At equal loss each representation has a score: o(x) for a gate, the largest density in a cell for a
+grid. Its threshold is set so that all lose the same share of the weight near surfaces. Only space
+that rays of photographs reach is counted: elsewhere gates and grids are neither taught nor queried.
 """
 
 from __future__ import annotations
@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import partial
+from pathlib import Path
 from typing import Any
 
 import torch
@@ -24,10 +25,14 @@ from leco_plugin.evaluation.field_grids import (
     plain_and_dilated,
 )
 from leco_plugin.evaluation.inspection import ViewBox, in_parts, whole_box
+from leco_plugin.evaluation.report import finite_or_null
 from leco_plugin.learning.calibration import CalibrationConfig
 from leco_plugin.learning.dense import dense_reference, evaluating, in_chunks
 from leco_plugin.models.mixture import Mixture
 from leco_plugin.models.rendering import backdrop_of, mapped_middles
+from leco_plugin.occupancy import CALIBRATED_AT, Occupancy
+from leco_plugin.scenes.city.city import DESCRIPTION
+from leco_plugin.scenes.city.truth import CityTruth
 from leco_plugin.scenes.learning_data import held_out_rays
 
 CALIBRATION = CalibrationConfig()
@@ -48,12 +53,7 @@ SPARED = 0.1
 
 
 def threshold_losing(weights: Tensor, scores: Tensor, lost: float) -> float:
-    """The largest score below which samples hold at most a share `lost` of all weight.
-
-    Args:
-        weights: [M] non-negative.
-        scores: [M]; what is below the threshold is skipped.
-    """
+    """The largest score below which samples hold at most a share `lost` of all weight [M] >= 0."""
     ordered, order = scores.double().sort()
     skipped = weights.double()[order].cumsum(0)
     first_too_many = int((skipped <= lost * skipped[-1]).sum())
@@ -195,26 +195,20 @@ def _measured(
 
 def mapped_box(mixture: Mixture) -> ViewBox:
     """The scene's box in mapped coordinates; an unbounded scene fills the cube."""
-    device = mixture.device
-    if mixture.region.space.kind != "box":
-        return ViewBox(-torch.ones(3, device=device), torch.ones(3, device=device))
-    box = whole_box(mixture.occupancy())
-    low, high = mixture.region.space.map(torch.stack([box.low, box.high]).to(device)).clamp(
-        -1.0, 1.0
-    )
-    return ViewBox(low, high)
+    corners = torch.tensor([[-1.0] * 3, [1.0] * 3], device=mixture.device)
+    if mixture.region.space.kind == "box":
+        box = whole_box(mixture.occupancy())
+        ends = torch.stack([box.low, box.high]).to(mixture.device)
+        corners = mixture.region.space.map(ends).clamp(-1.0, 1.0)
+    return ViewBox(*corners)
 
 
 def reached_volume(mixture: Mixture, taught: Tensor, count: int, seed: int = 0) -> Tensor:
     """Mapped positions spread evenly over what rays reach of the scene's box: [P, 3], P <= count.
 
-    Args:
-        taught: [M, 3] mapped candidates of rays.
-        count: positions in the whole box.
+    Rays reach the cells of their mapped candidates `taught` [M, 3].
     """
-    box = whole_box(mixture.occupancy())
-    unit = torch.rand(count, 3, generator=torch.Generator().manual_seed(seed))
-    positions = torch.lerp(box.low, box.high, unit).to(mixture.device)
+    positions = whole_box(mixture.occupancy()).draw(count, seed).to(mixture.device)
     mapped = mixture.region.space.map(positions).clamp(-1.0, 1.0)
     return mapped[reached(taught, mapped)]
 
@@ -232,10 +226,8 @@ def reached(taught: Tensor, mapped: Tensor) -> Tensor:
 
 
 def rays_of_photographs(datamanager: Any, count: int, seed: int = 0) -> RayBundle:
-    """Rays anywhere in the training photographs, whose pixels need not be read.
-
-    Training is not disturbed: its pixels and its random numbers are not used.
-    """
+    """Rays anywhere in the training photographs; pixels and random numbers of training are not
+    touched."""
     cameras = datamanager.train_dataset.cameras.to("cpu")
     generator = torch.Generator().manual_seed(seed)
     numbers = torch.randint(len(cameras), (count, 1), generator=generator)
@@ -256,3 +248,94 @@ def candidates_of(mixture: Mixture, bundle: RayBundle) -> Tensor:
         middles = mapped_middles(mixture.region.space, some, intervals)
         pieces.append(middles[~backdrop_of(intervals, some)])
     return torch.cat(pieces)
+
+
+FROM_REPORT = (
+    *("train_seconds", "empty_fraction", "lost_mass"),
+    *("threshold", "lost_surface_mass", "image_price_db"),
+)
+MOST_SURFACE_POINTS = 100_000
+AIR_POINTS = 50_000
+"""Positions drawn over the city; those in or near matter are then left out."""
+
+
+def truth_of(folder: Path, manager: Any) -> CityTruth | None:
+    """The exact scene in the coordinates of a data manager, where it is a city; None elsewhere."""
+    if not (folder / DESCRIPTION).is_file():
+        return None
+    return CityTruth.from_dataparser(folder, manager.train_dataparser_outputs)
+
+
+def occupancy_facts(
+    occupancy: Occupancy, file: Path, manager: Any, truth: CityTruth | None
+) -> dict[str, Any]:
+    """Sizes, calibration, and the comparison with the exact scene: JSON values, None without one.
+
+    The occupancy, of a file, and the truth are in the coordinates of the data manager.
+    """
+    report = occupancy.report
+    measured: dict[str, Any] = {"kept_surface_recall": None, "free_space_skipped": None}
+    if truth is not None:
+        highest = float(manager.train_dataset.cameras.camera_to_worlds[:, 2, 3].max())
+        box = torch.tensor(report["aabb"])
+        measured = compare_with_truth(occupancy, truth, box, report["step_size"], highest)
+    facts: dict[str, Any] = {"params": occupancy.num_params, "bytes": file.stat().st_size}
+    for name in ("recoveries", CALIBRATED_AT):  # not every file says
+        facts[name] = report.get(name)
+    return finite_or_null(facts | {name: report[name] for name in FROM_REPORT} | measured)
+
+
+def compare_with_truth(
+    occupancy: Occupancy, truth: CityTruth, aabb: Tensor, step_size: float, highest: float
+) -> dict[str, Any]:
+    """What an occupancy keeps of the surfaces of the city, and skips of its air.
+
+    Args:
+        occupancy: on any device.
+        truth: the city in the model's coordinates.
+        aabb: [6] the box in which rays are marched, scene units; far walls are no limit.
+        step_size: of marching, scene units.
+        highest: z of the highest camera, scene units.
+    Returns:
+        `kept_surface_recall`: share of the surface points in the middle of the test pixels that
+        are kept; `free_space_skipped`: share of the points of `free_points` that are skipped. None
+        where there is no such point.
+    """
+    surface = truth.visible_surface("test")
+    order = torch.randperm(len(surface), generator=torch.Generator().manual_seed(0))
+    air = free_points(truth, surface, aabb, step_size, highest)
+    return {
+        "kept_surface_recall": _share(kept(occupancy, surface[order[:MOST_SURFACE_POINTS]])),
+        "free_space_skipped": _share(~kept(occupancy, air)),
+    }
+
+
+def free_points(
+    truth: CityTruth, surface: Tensor, aabb: Tensor, step_size: float, highest: float
+) -> Tensor:
+    """Positions spread evenly over the air of the city, between its ground and its cameras.
+
+    Args:
+        surface: [P, 3] visible surface points, whose extent is that of the city.
+    Returns:
+        [F, 3], all inside `aabb`, outside matter, and farther than a step from every surface.
+    """
+    aabb = aabb.detach().cpu()
+    low, high = surface.amin(dim=0), surface.amax(dim=0)
+    high[2] = max(highest, float(high[2]))
+    low, high = torch.maximum(low, aabb[:3]), torch.minimum(high, aabb[3:])
+    unit = torch.rand(AIR_POINTS, 3, generator=torch.Generator().manual_seed(0))
+    points = low + unit * (high - low)
+    points = points[~truth.occupied(points)]
+    return points[truth.distance(points) * truth.scale > step_size]
+
+
+@torch.no_grad()
+def kept(occupancy: Occupancy, points: Tensor) -> Tensor:
+    """Whether each of the positions [N, 3] is kept: bool [N] on the CPU."""
+    device = occupancy.threshold_value.device
+    return in_parts(lambda part: occupancy.occupied(part.to(device)).cpu(), points)
+
+
+def _share(mask: Tensor) -> float | None:
+    return round(float(mask.double().mean()), 5) if len(mask) else None

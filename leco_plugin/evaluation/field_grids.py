@@ -35,11 +35,9 @@ Density = Callable[[Tensor], Tensor]
 
 
 class FieldGrids:
-    """Grids of one field, from coarse to fine.
+    """Grids of one field in a box of mapped coordinates, from coarse to fine.
 
     Args:
-        density: of the field.
-        box: in mapped coordinates.
         known: mapped positions [M, 3] and densities [M] that count too: hundreds of random places
             miss a surface that fills a thousandth of a cell.
         floor_of: gives, for the scores [nx, ny, nz] of a grid, the score below which a cell and
@@ -63,12 +61,9 @@ class FieldGrids:
         """The time of the last grid, including those that it was refined from."""
 
     def fill(self, sizes: Sequence[int]) -> Tensor | None:
-        """Scores [nx, ny, nz] of the cells of a grid; None where it would ask more than `most`.
+        """Scores [nx, ny, nz] of a grid of so many cells; None where it would ask more than `most`.
 
         The grid filled before is refined if it is half as fine.
-
-        Args:
-            sizes: cells along each axis.
         """
         steps = halvings(sizes, () if self.scores is None else self.scores.shape)
         if self.scores is None or tuple(2 * n for n in self.scores.shape) != steps[0]:
@@ -86,11 +81,7 @@ class FieldGrids:
 
 
 def halvings(sizes: Sequence[int], known: Sequence[int]) -> list[tuple[int, ...]]:
-    """Sizes of the grids to fill on the way to one, from coarse to fine.
-
-    Args:
-        known: cells along each axis of the grid that there is already.
-    """
+    """Sizes of the grids to fill on the way to one, from that of the known grid, coarse to fine."""
     steps = [tuple(sizes)]
     while (
         max(steps[0]) > ASK_ALL
@@ -109,10 +100,8 @@ def cells_to_ask(
 ) -> Tensor:
     """Cells of a grid whose density is not known yet: bool [nx, ny, nz].
 
-    Args:
-        sizes: cells along each axis, twice those of `coarser`.
-        coarser: scores of a grid half as fine; without it every cell is asked.
-        floor: score of the coarser grid below which a cell and all around it are taken for empty.
+    Without scores of a coarser grid, half as fine, that is every cell. A cell below the floor there
+    is taken for empty with all around it.
     """
     if coarser is None:
         return torch.ones(*sizes, dtype=torch.bool, device=device)
@@ -126,19 +115,10 @@ def probes_in_a_cell(sizes: Sequence[int]) -> int:
 
 
 def fill_cells(
-    density: Density,
-    box: ViewBox,
-    asked: Tensor,
-    known: tuple[Tensor, Tensor] | None = None,
+    density: Density, box: ViewBox, asked: Tensor, known: tuple[Tensor, Tensor] | None = None
 ) -> Tensor:
-    """Scores [nx, ny, nz] of the cells of a grid; zero where they are neither asked nor known.
-
-    Args:
-        density: of the field.
-        box: in mapped coordinates.
-        asked: bool [nx, ny, nz].
-        known: mapped positions [M, 3] and densities [M] that count beside those that are asked.
-    """
+    """Scores [nx, ny, nz] of cells, zero where they are neither asked, bool [nx, ny, nz], nor
+    known: mapped positions [M, 3] and densities [M]."""
     device = box.low.device
     scores = torch.zeros(asked.shape, device=device)
     counts = torch.tensor(asked.shape, device=device)

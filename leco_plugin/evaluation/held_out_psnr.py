@@ -33,14 +33,11 @@ TEST_PHOTOGRAPHS = 8
 
 
 class HeldOutPsnr:
-    """Measures the PSNR of a model on pixels of the training photographs that no step trains on.
+    """Measures the PSNR of nerfstudio's model on pixels of the training photographs of its data
+    manager that no step trains on.
 
     The model is trained exactly as it would be without. All measurements but the last are of the
     same pixels.
-
-    Args:
-        model: nerfstudio's, in training.
-        manager: the data manager that it learns from.
 
     Attributes:
         latest: dB, None until it was measured.
@@ -80,14 +77,7 @@ class HeldOutPsnr:
             return 0
         free = SHARE_OF_TIME * (time.monotonic() - self.began) - self.spent
         affordable = int(RAYS * free / self.cost) if self.cost > 0.0 else 0
-        count = max(FEWEST_LAST, min(affordable, MOST_LAST))
-        return self._measure(count)
-
-    def _drawn(self, count: int) -> tuple[RayBundle, Tensor]:
-        """Rays and their true colours [R, 3 or 4]; the same are drawn once."""
-        if self.pixels is None or count != RAYS:
-            self.pixels = held_out_bundle(self.manager, count, share="all")
-        return self.pixels
+        return self._measure(max(FEWEST_LAST, min(affordable, MOST_LAST)))
 
     def _measure(self, count: int) -> int:
         """Measures on so many pixels, or as many as there are; returns how many.
@@ -96,14 +86,14 @@ class HeldOutPsnr:
         build the sampler that the next step takes as well, in seconds.
         """
         began = time.monotonic()
-        bundle, truth = self._drawn(count)
+        if self.pixels is None or count != RAYS:  # of so many, the same are drawn once
+            self.pixels = held_out_bundle(self.manager, count, share="all")
+        bundle, truth = self.pixels
         drawn = time.monotonic()
         self._psnr_of([(bundle[:1], truth[:1])])
         started = time.monotonic()
-        at = range(0, len(truth), FEWEST_LAST)
-        self.latest = self._psnr_of(
-            [(bundle[i : i + FEWEST_LAST], truth[i : i + FEWEST_LAST]) for i in at]
-        )
+        parts = [slice(i, i + FEWEST_LAST) for i in range(0, len(truth), FEWEST_LAST)]
+        self.latest = self._psnr_of([(bundle[part], truth[part]) for part in parts])
         now = time.monotonic()
         self.cost = now - started
         self.spent += drawn - began + self.cost

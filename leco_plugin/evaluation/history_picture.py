@@ -68,12 +68,8 @@ def draw_history(occupancy: Occupancy, folder: Path, path: Path) -> Path:
 def write_film(
     frames: Sequence[Image.Image], path: Path, durations: int | list[int], colours: int
 ) -> None:
-    """Writes a GIF that begins anew at its end.
-
-    Args:
-        durations: milliseconds for which each frame is shown, or all of them.
-        colours: of a frame: few without noise, which GIF cannot compress.
-    """
+    """Writes a GIF that begins anew at its end, with durations in milliseconds, and few colours
+    without noise, which GIF cannot compress."""
     few = [frame.quantize(colours, dither=Image.Dither.NONE) for frame in frames]
     few[0].save(path, save_all=True, append_images=few[1:], duration=durations, loop=0)
 
@@ -157,9 +153,9 @@ class _Film:
             above.plot(steps[:upto], 100.0 * self.shares[:upto, expert], label=label, **style)
             below.plot(steps[:upto], self.densities[:upto, expert], **style)
         above.set(ylabel="share of points, %", ylim=(0, 140), yticks=range(0, 101, 20))
-        below.set_ylabel("mean density, per half extent\n(10⁴: opaque)")
         below.set_yscale("symlog", linthresh=1.0)
-        below.set_ylim(0, 1.5 * max(1.0, float(self.densities.max())))
+        highest = 1.5 * max(1.0, float(self.densities.max()))
+        below.set(ylabel="mean density, per half extent\n(10⁴: opaque)", ylim=(0, highest))
         for axes in (above, below):
             axes.set(xlim=(min(steps), max(steps) or 1), xlabel="step")
             plain(axes, LIGHT)

@@ -1,4 +1,4 @@
-"""What an occupancy file says about itself, and the part of space that is worth looking at."""
+"""What an occupancy says about itself and along rays, and the part of space worth looking at."""
 
 from __future__ import annotations
 
@@ -6,19 +6,25 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
-from leco_plugin.learning.quality import (
-    FIELD,
-    ONE_COLOUR,
-    doubts_of_field,
-    doubts_of_occupancy,
-)
+from leco_plugin.learning.quality import FIELD, ONE_COLOUR, doubts_of_field, doubts_of_occupancy
+from leco_plugin.models.region import cut_rays, marching_rule, within_crop
 from leco_plugin.occupancy import SEEN_CELLS, Occupancy
-from leco_plugin.scenes.coloured_points import camera_places, description_in, description_of_run
+from leco_plugin.samplers import marching
+from leco_plugin.scenes.coloured_points import (
+    ColouredPoints,
+    camera_places,
+    coloured_points,
+    colours_near,
+    description_in,
+    description_of_run,
+)
 from leco_plugin.scenes.frames import found_again, inverse, moved
 from leco_plugin.scenes.input_error import InputError
 
@@ -33,6 +39,11 @@ class ViewBox:
     """[3] scene units."""
     high: Tensor
     """[3] scene units."""
+
+    def draw(self, count: int, seed: int = 0) -> Tensor:
+        """Positions spread evenly over the box, the same for a seed: [count, 3] on the CPU."""
+        unit = torch.rand(count, 3, generator=torch.Generator().manual_seed(seed))
+        return torch.lerp(self.low, self.high, unit)
 
     def cells(self, longest: int) -> tuple[int, int, int]:
         """Numbers of nearly cubic cells, `longest` along the longest side."""
@@ -54,8 +65,7 @@ class ViewBox:
 def describe(occupancy: Occupancy) -> dict[str, Any]:
     """Sizes, space, threshold, kept share of its box, report of calibration: JSON values."""
     box = whole_box(occupancy)
-    points = torch.rand(1 << 16, 3, generator=torch.Generator().manual_seed(0))
-    positions = torch.lerp(box.low, box.high, points)
+    positions = box.draw(1 << 16)
     values = query(occupancy, positions)
     return {
         "format": 1,
@@ -81,11 +91,8 @@ def describe(occupancy: Occupancy) -> dict[str, Any]:
 
 
 def doubts(facts: dict[str, Any]) -> list[str]:
-    """What was said when the occupancy was frozen, if it or its field are of no use.
-
-    Args:
-        facts: of `describe`.
-    """
+    """What was said when the occupancy was frozen, if it or its field are of no use; `facts` are of
+    `describe`."""
     field, one_colour = (facts["report"].get(name) for name in (FIELD, ONE_COLOUR))
     found: list[str] = []
     if isinstance(field, float) and isinstance(one_colour, float):
@@ -126,17 +133,12 @@ def scene_of(occupancy: Occupancy, file: Path, data: Path | None) -> Path | None
     """
     description = description_of_run(file) if data is None else description_in(data)
     known, back = cameras_of(occupancy), to_the_data(occupancy)
-    if (
-        description is None
-        or back is None
-        or not len(known)
-        or "data_frame" not in occupancy.report
-    ):
+    says_where = len(known) > 0 and "data_frame" in occupancy.report
+    if description is None or back is None or not says_where:
         return description
     here = moved(torch.from_numpy(camera_places(description)), inverse(back))
-    found = 0
-    if len(here):
-        found = int(found_again(known, here, float(occupancy.space.half_extent)).sum())
+    reach = float(occupancy.space.half_extent)
+    found = int(found_again(known, here, reach).sum()) if len(here) else 0
     if 2 * found >= len(known):
         return description
     if data is None:
@@ -203,3 +205,86 @@ def exposed(kept: Tensor, beyond: bool = False) -> Tensor:
     skipped = torch.nn.functional.pad(~kept, (1, 1) * 3, value=not beyond)
     shifts = [skipped.roll(step, axis) for axis in range(3) for step in (-1, 1)]
     return kept & torch.stack(shifts).any(dim=0)[1:-1, 1:-1, 1:-1]
+
+
+class SceneColours(NamedTuple):
+    """The scene's sparse points, and how the run lies in their coordinates."""
+
+    points: ColouredPoints
+    back: Tensor
+    """[3, 4] float64, from the run to the data."""
+
+    def at(self, positions: Tensor) -> NDArray[np.uint8]:
+        """Colours [N, 3] of the sparse points nearest to positions [N, 3] of the run."""
+        return colours_near(self.points, moved(positions.double(), self.back).numpy())
+
+
+def scene_colours(occupancy: Occupancy, description: Path | None) -> SceneColours | None:
+    """Colours by a scene's transforms.json; None where points, colours or coordinates are unknown.
+
+    Raises:
+        InputError: the file of the points cannot be read.
+    """
+    points = None if description is None else coloured_points(description)
+    back = to_the_data(occupancy)
+    return None if points is None or back is None else SceneColours(points, back)
+
+
+SKIPPED, KEPT, UNSEEN = 0, 1, 2
+CANDIDATES = 192
+"""Of a ray that crosses the scene."""
+NEAREST, FARTHEST = 0.02, 100.0
+"""Where rays begin and end, half extents of the space."""
+
+
+@torch.no_grad()
+def ray_states(
+    occupancy: Occupancy,
+    origins: Tensor,
+    directions: Tensor,
+    crop: tuple[Tensor | None, Tensor | None] = (None, None),
+) -> Tensor:
+    """The state of each ray: `KEPT` where any candidate is kept; else `UNSEEN` where any lies in
+    space that no training ray crosses; else `SKIPPED`.
+
+    Args:
+        origins, directions: [R, 3] in the occupancy's coordinates, unit vectors.
+        crop: nears and fars of the rays, [R] or [R, 1], scene units; None is no crop.
+    Returns:
+        [R] int64.
+    """
+    of_ray, starts, ends = candidates(occupancy, origins, directions, crop)
+    middles = (0.5 * (starts + ends))[:, None]
+    positions = torch.addcmul(origins[of_ray], directions[of_ray], middles)
+    states = torch.full((len(origins),), SKIPPED, device=origins.device)
+    states[of_ray[occupancy.unseen(positions)]] = UNSEEN
+    states[of_ray[occupancy.query(positions) >= occupancy.threshold_value]] = KEPT
+    return states
+
+
+def candidates(
+    occupancy: Occupancy,
+    origins: Tensor,
+    directions: Tensor,
+    crop: tuple[Tensor | None, Tensor | None] = (None, None),
+    most: int = CANDIDATES,
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Intervals in whose middles an occupancy is asked along rays, the nearest of each ray first.
+
+    Args:
+        origins, directions, crop: as of `ray_states`.
+        most: on a ray that crosses the scene.
+    Returns:
+        The ray [M] int64 of each; starts and ends [M], scene units.
+    """
+    space, half = occupancy.space, float(occupancy.space.half_extent)
+    near, far = NEAREST * half, FARTHEST * half
+    box = occupancy.walls
+    if space.kind == "box":
+        inner = whole_box(occupancy)
+        box = torch.cat([inner.low, inner.high]).to(box)
+    rays = within_crop(
+        cut_rays(origins, directions, box, box.new_tensor(near), box.new_tensor(far)), *crop
+    )
+    rule = marching.March(*marching_rule(space.kind, near, far, most, 2.0 * half))
+    return marching.march(marching.Rays(*rays[:4]), rule)

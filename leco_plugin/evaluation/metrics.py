@@ -22,9 +22,8 @@ if TYPE_CHECKING:
 LpipsBackbone = Literal["alex", "vgg", "squeeze"]
 
 _TORCHVISION_NAMES = {"alex": "alexnet", "vgg": "vgg16", "squeeze": "squeezenet1_1"}
-
-# Below this AlexNet's second pooling has nothing left to pool.
 LPIPS_MINIMUM_SIDE = 31
+"""Below this AlexNet's second pooling has nothing left to pool."""
 
 
 class FigureUnavailable(UserWarning):
@@ -32,19 +31,20 @@ class FigureUnavailable(UserWarning):
 
 
 def image_metrics(predicted: Tensor, truth: Tensor) -> dict[str, float]:
-    """The figures that ns-eval averages over images.
+    """The figures that ns-eval averages over images, of colours in 0..1, both [H, W, 3] float.
 
-    Args:
-        predicted: [H, W, 3] float, colours in 0..1.
-        truth: [H, W, 3] float, colours in 0..1, on the same device.
     Returns:
         `psnr` (dB), `ssim`, and `flip` and `lpips` where they are at hand. The key is absent
-        otherwise, because nerfstudio turns every value into a float and a NaN is no JSON; a
-        report of ours writes null in its place.
+        otherwise: nerfstudio turns every value into a float, and a NaN is no JSON.
     """
     metrics = {"psnr": psnr(predicted, truth), "ssim": ssim(predicted, truth)}
     distances = {"flip": flip(predicted, truth), "lpips": lpips(predicted, truth)}
     return metrics | {name: value for name, value in distances.items() if value is not None}
+
+
+def decibels(squared_error: float) -> float:
+    """The PSNR of a mean squared error of colours in 0..1, at most 120 dB."""
+    return -10.0 * math.log10(max(squared_error, 1e-12))
 
 
 def psnr(predicted: Tensor, truth: Tensor) -> float:
@@ -90,13 +90,8 @@ def ssim(predicted: Tensor, truth: Tensor) -> float:
 
 
 def flip(predicted: Tensor, truth: Tensor) -> float | None:
-    """Mean FLIP of two [H, W, 3] images in 0..1: how much a viewer sees change between them.
-
-    At its own default of 67 pixels per degree of the visual field.
-
-    Returns:
-        0 for equal images, at most 1; None without the package `flip-evaluator`.
-    """
+    """Mean FLIP of two [H, W, 3] images in 0..1, at its own default of 67 pixels per degree: 0 for
+    equal images, at most 1; None without the package `flip-evaluator`."""
     evaluate = flip_evaluator()
     if evaluate is None:
         return None
@@ -122,12 +117,8 @@ def flip_evaluator() -> Callable[..., Any] | None:
 
 
 def lpips(predicted: Tensor, truth: Tensor) -> float | None:
-    """Learned perceptual distance (AlexNet, as in nerfstudio) of two [H, W, 3] images in 0..1.
-
-    Returns:
-        A distance >= 0, or None where its network is not at hand or a side is under
-        `LPIPS_MINIMUM_SIDE` pixels.
-    """
+    """Learned perceptual distance (AlexNet, as in nerfstudio) of two [H, W, 3] images in 0..1; None
+    where its network is not at hand or a side is under `LPIPS_MINIMUM_SIDE` pixels."""
     if min(predicted.shape[:2]) < LPIPS_MINIMUM_SIDE:
         return None
     metric = lpips_metric("alex")
@@ -142,11 +133,7 @@ def lpips(predicted: Tensor, truth: Tensor) -> float | None:
 
 @functools.cache
 def lpips_metric(backbone: LpipsBackbone) -> LearnedPerceptualImagePatchSimilarity | None:
-    """Loads LPIPS from the files on this machine, once a process.
-
-    Returns:
-        torchmetrics' metric, or None after one `FigureUnavailable` warning.
-    """
+    """torchmetrics' LPIPS from the files on this machine, or None after one `FigureUnavailable`."""
     try:
         import torchvision
         from torchmetrics.image.lpip import LearnedPerceptualImagePatchSimilarity

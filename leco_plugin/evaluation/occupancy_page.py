@@ -11,15 +11,20 @@ from numpy.typing import NDArray
 from PIL import Image
 from torch import Tensor
 
-from leco_plugin.chart.page_file import write_page_file
-from leco_plugin.chart.theme import LIGHT
-from leco_plugin.evaluation.inspection import ViewBox, cameras_of, query, seen_at, whole_box
+from leco_plugin.chart.theme import LIGHT, write_page_file
+from leco_plugin.evaluation.inspection import (
+    SceneColours,
+    ViewBox,
+    cameras_of,
+    query,
+    seen_at,
+    whole_box,
+)
 from leco_plugin.evaluation.occupancy_picture import (
     heights_seen_from_above,
     interesting_box,
     title_of,
 )
-from leco_plugin.evaluation.scene_colours import SceneColours
 from leco_plugin.occupancy import Occupancy
 
 CELLS = (128, 96, 72, 48, 32)

@@ -13,6 +13,7 @@ from torch import Tensor
 
 from leco_plugin.chart.theme import new_figure
 from leco_plugin.evaluation.inspection import (
+    SceneColours,
     ViewBox,
     cameras_of,
     exposed,
@@ -20,7 +21,6 @@ from leco_plugin.evaluation.inspection import (
     seen_at,
     whole_box,
 )
-from leco_plugin.evaluation.scene_colours import SceneColours
 from leco_plugin.occupancy import CALIBRATED_AT, Occupancy
 from leco_plugin.scenes.whole_files import write_whole
 
@@ -106,7 +106,6 @@ def draw_slice(
     """One slice of o(x) with the contour of the threshold; returns what a colour bar needs.
 
     Args:
-        axes: of matplotlib.
         normal: 0, 1 or 2, the axis that the slice is perpendicular to.
         at: its position along that axis, scene units.
         cameras: [C, 3] centres to mark.
@@ -124,8 +123,7 @@ def draw_slice(
     values = query(occupancy, positions)
     low, high = box.low.tolist(), box.high.tolist()
     extent = (low[across], high[across], low[up], high[up])
-    longer = FLAT * float(sides[0] / sides[1])
-    longer = longer if longer > 1.0 else 1.0
+    longer = max(1.0, FLAT * float(sides[0] / sides[1]))
     style = {"cmap": COLOURS, "vmin": 0, "vmax": 1, "aspect": longer}
     place = {"origin": "lower", "extent": extent}
     if under is not None:
@@ -144,12 +142,10 @@ def draw_slice(
     if cameras is not None and len(cameras):
         x, y = cameras[:, across], cameras[:, up]
         axes.scatter(x, y, s=9, c=CAMERA, edgecolors="black", linewidths=0.3, label="cameras")
-        axes.set_xlim(extent[:2])
-        axes.set_ylim(extent[2:])
+        axes.set(xlim=extent[:2], ylim=extent[2:])
     drawn = f", {AXES[up]} drawn {longer:.1f} times as long" if longer > 1.0 else ""
     axes.set_title(f"o(x) at {AXES[normal]} = {at:.4g}{drawn}", fontsize=10)
-    axes.set_xlabel(AXES[across])
-    axes.set_ylabel(AXES[up])
+    axes.set(xlabel=AXES[across], ylabel=AXES[up])
     axes.tick_params(labelsize=8)
     return shown
 
@@ -180,10 +176,8 @@ def interesting_box(occupancy: Occupancy, cameras: Tensor) -> ViewBox:
 
 
 def heights_seen_from_above(occupancy: Occupancy, box: ViewBox) -> tuple[float, float]:
-    """Heights, scene units, between which lies nearly all that a view straight down shows.
-
-    They leave out what is kept below the ground, where no camera sees.
-    """
+    """Heights, scene units, between which lies nearly all that a view straight down shows, without
+    what is kept below the ground."""
     _, positions, kept = _kept_cells(occupancy, box, CELLS)
     heights = torch.where(kept, positions[..., 2], -torch.inf).amax(dim=-1)
     heights = heights[heights.isfinite()].sort().values
@@ -197,10 +191,8 @@ def heights_seen_from_above(occupancy: Occupancy, box: ViewBox) -> tuple[float, 
 def differing_heights(
     occupancy: Occupancy, box: ViewBox, low: float, high: float
 ) -> tuple[float, float]:
-    """Two heights between `low` and `high`, scene units, in whose layers most decisions differ.
-
-    Those of `HORIZONTAL` where fewer than two layers both keep and skip.
-    """
+    """Two heights between `low` and `high`, scene units, in whose layers most decisions differ;
+    those of `HORIZONTAL` where fewer than two layers both keep and skip."""
     heights = torch.linspace(low, high, LAYERS)
     x, y = (box.axis(a, count) for a, count in enumerate(box.cells(LAYER_CELLS)[:2]))
     positions = torch.stack(torch.meshgrid(heights, x, y, indexing="ij"), dim=-1)[..., [1, 2, 0]]

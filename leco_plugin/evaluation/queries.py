@@ -1,8 +1,6 @@
 """Counts the positions at which fields and gates are evaluated, and the updates of grids.
 
-Positions for pruning samples and for updating a grid count too. A frozen gate's queries in CUDA
-kernels do not. Classes are wrapped instead of objects, so that a field created during the run is
-counted, such as the one that learns an occupancy for a host.
+Positions for pruning samples and for updating a grid count too.
 """
 
 from __future__ import annotations
@@ -12,8 +10,9 @@ import inspect
 import math
 from collections import Counter
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from typing import Any
+from unittest.mock import patch
 
 from nerfstudio.fields.base_field import Field
 from nerfstudio.fields.density_fields import HashMLPDensityField
@@ -34,9 +33,9 @@ occupancy; a frozen gate, where its cell cache gave no answer."""
 def count_queries(model: nn.Module) -> Iterator[Counter[str]]:
     """Counts, by `KINDS`, the positions at which a model's fields are evaluated in this context.
 
-    Fields that learn an occupancy for the model are counted too. All fields are `nn.Module`s.
-    What a routine in C asks of a field along rays is counted by its answer.
-    nerfstudio's are called by `get_density`, others by `density` or, without it, directly.
+    What a routine in C asks of a field along rays is counted by its answer. Classes are wrapped
+    instead of objects, so that a field created meanwhile is counted, such as the one that learns an
+    occupancy for a host. A frozen gate's queries in CUDA kernels are not counted.
     """
     count = Counter(dict.fromkeys(KINDS, 0))
     own = getattr(getattr(model, "mixture", model), "field", None)
@@ -79,26 +78,14 @@ def count_queries(model: nn.Module) -> Iterator[Counter[str]]:
 
         return ask
 
-    asked = [(owner, name, counting(getattr(owner, name))) for owner, name in methods]
+    asked: list[tuple[Any, str, Callable[..., Any]]] = [
+        (owner, name, counting(getattr(owner, name))) for owner, name in methods
+    ]
     in_c = counting_rays(front_to_back.shade_natively)
-    with _replaced([*asked, (front_to_back, "shade_natively", in_c)]):
+    with ExitStack() as stack:
+        for owner, name, method in [*asked, (front_to_back, "shade_natively", in_c)]:
+            stack.enter_context(patch.object(owner, name, method))
         yield count
-
-
-@contextmanager
-def _replaced(methods: list[tuple[Any, str, Callable[..., Any]]]) -> Iterator[None]:
-    """Puts methods and functions, by owner and name, in the place of others in this context."""
-    before = [(owner, name, vars(owner).get(name)) for owner, name, _ in methods]
-    for owner, name, method in methods:
-        setattr(owner, name, method)
-    try:
-        yield
-    finally:
-        for owner, name, known in before:
-            if known is None:
-                delattr(owner, name)
-            else:
-                setattr(owner, name, known)
 
 
 def _method_of(owner: type) -> str:

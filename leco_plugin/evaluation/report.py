@@ -19,22 +19,13 @@ PACKAGE = Path(__file__).resolve().parents[1]
 
 
 def write_json(path: Path, value: Any) -> None:
-    """Writes `value` to `path`, whole or not at all; parents are made.
-
-    Raises:
-        ValueError: it holds NaN or infinity, which are no JSON.
-        OSError: nothing can be written there.
-    """
+    """Writes JSON whole or not at all; parents are made. NaN and infinity raise `ValueError`."""
     text = json.dumps(value, indent=2, allow_nan=False) + "\n"
     write_whole(path, lambda file: file.write(text.encode()))
 
 
 def read_object(file: Path, else_say: str) -> dict[str, Any]:
-    """The JSON object in a file.
-
-    Raises:
-        InputError: the file is damaged: its name, and `else_say`.
-    """
+    """The JSON object in a file; of a damaged one an `InputError` says its name and `else_say`."""
     try:
         found = json.loads(file.read_text())
     except ValueError:  # no JSON, or no text

@@ -9,7 +9,7 @@ import copy
 import math
 import random
 import statistics
-from collections import Counter
+from collections import Counter, defaultdict
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from typing import Any
@@ -19,6 +19,7 @@ import torch
 from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackLocation
 from nerfstudio.engine.trainer import Trainer, TrainerConfig
 from nerfstudio.utils import writer
+from torch import Tensor
 
 from leco_plugin.evaluation.clock import (
     Budget,
@@ -27,7 +28,7 @@ from leco_plugin.evaluation.clock import (
     peak_process_bytes,
     warm_up,
 )
-from leco_plugin.evaluation.metrics import image_metrics
+from leco_plugin.evaluation.metrics import decibels, image_metrics
 from leco_plugin.evaluation.queries import GridUpdates, count_queries
 from leco_plugin.evaluation.report import finite_or_null
 from leco_plugin.hosts.learn_first import FIRST_TIMED, TIMED_STEPS, keep_within
@@ -171,12 +172,8 @@ def set_up(config: TrainerConfig, budget: Budget, seed: int) -> Trainer:
 
 
 def _never_sharpen(model: Any) -> None:
-    """Whether sharpening pays follows from the steps that are left, which nobody knows here.
-
-    Args:
-        model: config of a model that learns an occupancy itself, or of one that is guided, or of
-            neither; it is changed.
-    """
+    """Changes a model's config where it learns an occupancy: whether sharpening pays follows from
+    the steps that are left, which nobody knows here."""
     occupancy = getattr(model, "occupancy", None)
     learner = getattr(occupancy, "learning", model)
     teaches = getattr(occupancy, "learned", "first") == "along"  # of which it is a part
@@ -310,19 +307,17 @@ def psnr_on_rays(trainer: Trainer, rays: int) -> float:
     return decibels(statistics.fmean(errors_on_rays(trainer, rays)))
 
 
-def decibels(squared_error: float) -> float:
-    """The PSNR of a mean squared error of colours in 0..1."""
-    return -10.0 * math.log10(max(squared_error, 1e-12))
+def render_rays(model: Any, bundle: Any, at_once: int) -> Tensor:
+    """Colours [N, 3] of rays [N], in [0, 1]."""
+    parts = [bundle[i : i + at_once] for i in range(0, len(bundle), at_once)]
+    return torch.cat([model(part)["rgb"] for part in parts]).clamp(0.0, 1.0)
 
 
 @torch.no_grad()
 def errors_on_rays(trainer: Trainer, rays: int) -> list[float]:
-    """Mean squared error of each test image on its share of some pixels: the same at every call.
+    """Mean squared error of each test image on its share of `rays` pixels, the same at every call.
 
     A full image of an unguided method takes minutes on a CPU; some thousand pixels say as much.
-
-    Args:
-        rays: pixels of all images together; each image has equally many.
     """
     pipeline = trainer.pipeline
     pipeline.eval()
@@ -331,16 +326,15 @@ def errors_on_rays(trainer: Trainer, rays: int) -> list[float]:
         raise InputError("the scene has no test image, on which runs could be compared")
     generator = torch.Generator().manual_seed(0)
     per_image = -(-rays // len(dataset))
-    errors = []
+    cameras, errors = dataset.cameras.to("cpu"), []
     for number in range(len(dataset)):
         image = dataset.get_data(number)["image"]
-        rows = torch.randint(image.shape[0], (per_image,), generator=generator)
-        columns = torch.randint(image.shape[1], (per_image,), generator=generator)
+        rows, columns = (
+            torch.randint(size, (per_image,), generator=generator) for size in image.shape[:2]
+        )
         coords = torch.stack([rows, columns], dim=-1) + 0.5
-        camera = dataset.cameras.to("cpu")
-        bundle = camera.generate_rays(camera_indices=number, coords=coords).to(pipeline.device)
-        parts = [bundle[i : i + RAYS_AT_ONCE] for i in range(0, per_image, RAYS_AT_ONCE)]
-        rgb = torch.cat([pipeline.model(part)["rgb"] for part in parts]).clamp(0.0, 1.0)
+        bundle = cameras.generate_rays(camera_indices=number, coords=coords).to(pipeline.device)
+        rgb = render_rays(pipeline.model, bundle, RAYS_AT_ONCE)
         truth = true_colours(pipeline.model, image[rows, columns].to(rgb.device))
         errors.append(float(((rgb - truth) ** 2).mean(dtype=torch.float64)))
     pipeline.train()
@@ -351,10 +345,8 @@ def errors_on_rays(trainer: Trainer, rays: int) -> list[float]:
 def evaluate_images(trainer: Trainer, most_images: int, queries: Counter[str]) -> dict[str, float]:
     """Figures over whole test images, evenly chosen; rendering alone is timed.
 
-    Args:
-        trainer: with a model that has rendered before, so that nothing is built on the way.
-        most_images: fewer where there are fewer.
-        queries: what the model's fields are asked, counted while this lasts.
+    The model has rendered before, so that nothing is built on the way.
+
     Returns:
         Means of `psnr`, `ssim`, `flip` and `lpips` (as `image_metrics` has them),
         `samples_per_ray`, `field_queries_per_ray`, `proposal_queries_per_ray`,
@@ -365,14 +357,14 @@ def evaluate_images(trainer: Trainer, most_images: int, queries: Counter[str]) -
     dataset: Any = pipeline.datamanager.eval_dataset
     count = min(most_images, len(dataset))
     chosen = torch.linspace(0, len(dataset) - 1, count).round().long().tolist()
-    sums: dict[str, float] = {}
+    sums: defaultdict[str, float] = defaultdict(float)
     times = []
     for number in chosen:
         camera = dataset.cameras[number : number + 1].to(pipeline.device)
         before, clock = queries.copy(), Clock()
-        clock.start()
-        outputs = pipeline.model.get_outputs_for_camera(camera)
-        times.append(clock.stop())
+        with clock.running():
+            outputs = pipeline.model.get_outputs_for_camera(camera)
+        times.append(clock.seconds)
         predicted = outputs["rgb"].clamp(0.0, 1.0)
         image = dataset.get_data(number)["image"].to(predicted.device)
         truth = true_colours(pipeline.model, image)
@@ -385,6 +377,6 @@ def evaluate_images(trainer: Trainer, most_images: int, queries: Counter[str]) -
             if name in outputs:
                 figures["samples_per_ray"] = float(outputs[name].float().mean())
         for name, value in figures.items():
-            sums[name] = sums.get(name, 0.0) + value / count
+            sums[name] += value / count
     pipeline.train()
     return sums | {"render_seconds_per_image": statistics.median(times)}

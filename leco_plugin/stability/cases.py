@@ -8,7 +8,7 @@ from typing import Any
 
 from leco_plugin.scenes.input_error import InputError
 from leco_plugin.stability.photographs import STAGES, Capture
-from leco_plugin.stability.samplers import DENSE, GRID, GRIDS, LEARNED, RAYS
+from leco_plugin.stability.plan import DENSE, GRID, GRIDS, LEARNED, RAYS
 
 BOUNDED = (LEARNED, *(f"{GRID}-{cells}" for cells in GRIDS), DENSE)
 """Samplers whose host has bounds: Nerfacto contracts all of space, and has none."""
@@ -56,11 +56,7 @@ class Case:
 
 
 def _learning(name: str, title: str, why: str, *, must_fail: bool = False, **changes: Any) -> Case:
-    """A case that changes how the occupancy is learned, and nothing else.
-
-    Args:
-        changes: by their paths, with two underscores for a dot.
-    """
+    """A case that changes how the occupancy is learned: by paths, two underscores for a dot."""
     prefix = "occupancy.learning."
     paths = {prefix + path.replace("__", "."): value for path, value in changes.items()}
     return Case(name, title, why, changes=paths, only=(LEARNED,), must_fail=must_fail)
@@ -252,11 +248,7 @@ CASES = {
 
 
 def cases_named(names: tuple[str, ...]) -> list[Case]:
-    """The cases of these names, in the table's order; without names, all.
-
-    Raises:
-        InputError: there is no case of a name.
-    """
+    """The cases of names, in the table's order, or all; an `InputError` for an unknown name."""
     unknown = [name for name in names if name not in CASES]
     if unknown:
         raise InputError(f"there is no case {unknown[0]!r}; there are {', '.join(CASES)}")

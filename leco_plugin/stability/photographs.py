@@ -74,10 +74,8 @@ def _poles_and_wires() -> tuple[Shape, ...]:
 def _irregular_floor() -> tuple[Shape, ...]:
     """Plates that leave bays and an island: no box fits the outline."""
     plates = (
-        ((-3.6, -1.0), (-0.4, 1.2)),
-        ((-0.4, -0.2), (1.6, 3.4)),
-        ((-2.0, -3.4), (-0.9, -1.0)),
-        ((2.3, -3.2), (3.5, -1.7)),
+        *(((-3.6, -1.0), (-0.4, 1.2)), ((-0.4, -0.2), (1.6, 3.4))),
+        *(((-2.0, -3.4), (-0.9, -1.0)), ((2.3, -3.2), (3.5, -1.7))),
     )
     return tuple(Box((*low, -0.3), (*high, 0.0), FLOOR.paint) for low, high in plates)
 
@@ -93,15 +91,12 @@ def _hills() -> tuple[Shape, ...]:
     return (plain, *hills)
 
 
-def _room() -> tuple[Shape, ...]:
-    return (
-        Box((-3.5, -3.5, 0.0), (3.5, 3.5, 2.6), grey(0.77, grain=1.6)),
-        Box((-1.0, -0.6, 0.0), (1.0, 0.6, 0.8), BRICK),
-        Box((2.4, -3.2, 0.0), (3.3, -1.4, 2.0), SLATE),
-        Ball((-2.4, 2.3, 0.5), 0.5, LAWN),
-    )
-
-
+_ROOM = (
+    Box((-3.5, -3.5, 0.0), (3.5, 3.5, 2.6), grey(0.77, grain=1.6)),
+    Box((-1.0, -0.6, 0.0), (1.0, 0.6, 0.8), BRICK),
+    Box((2.4, -3.2, 0.0), (3.3, -1.4, 2.0), SLATE),
+    Ball((-2.4, 2.3, 0.5), 0.5, LAWN),
+)
 _AIR = Box((-3.6, -3.6, 0.0), (3.6, 3.6, 2.4), grey(0.76, grain=3.0, contrast=0.15))
 _EVERYWHERE = Box((-6.0, -6.0, -2.0), (6.0, 6.0, 6.0), grey(0.51, 2.4, 0.5))
 _WINDOWS = (
@@ -118,7 +113,7 @@ STAGES: dict[str, Stage] = {
     "all-full": Stage(fog=Fog(_EVERYWHERE, 0.9)),
     "far-terrain": Stage((*YARD.shapes, *_hills()), sky=True),
     "outline": Stage((*_irregular_floor(), Box((-2.6, -0.6, 0.0), (-1.4, 0.6, 1.2), BRICK))),
-    "indoors": Stage(_room()),
+    "indoors": Stage(_ROOM),
 }
 
 
@@ -143,7 +138,6 @@ class Capture:
     test_views: int = 16
     """Held-out pictures."""
     width: int = 64
-    """Of a picture, pixels."""
     height: int = 48
     """Of a picture, pixels."""
     field_of_view: float = 60.0
@@ -280,13 +274,8 @@ def count_views(view: View, others: Sequence[View]) -> NDArray[np.int32]:
 
 
 def write_scene(stage: Stage, capture: Capture, folder: Path) -> Path:
-    """Writes the scene, unless `folder` holds just this one; it appears only when it is complete.
-
-    Returns:
-        `folder`.
-    Raises:
-        InputError: `folder` holds no scene of ours.
-    """
+    """Writes the scene, unless `folder`, which is returned, holds just this one; it appears only
+    when it is complete. A folder that holds no scene of ours is an `InputError`."""
     description = folder / DESCRIPTION
     described = {"digest": digest_of(stage, capture), "capture": asdict(capture)}
     text = json.dumps(described, indent=1) + "\n"
@@ -367,9 +356,6 @@ def _points(image: NDArray[np.uint8], view: View, random: Generator) -> NDArray[
 def _frame(shot: Shot, lens: Lens) -> dict[str, Any]:
     """A picture in transforms.json."""
     matrix = [*shot.written.tolist(), [0.0, 0.0, 0.0, 1.0]]
-    return {
-        "file_path": shot.file,
-        "transform_matrix": matrix,
-        **{"w": lens.width, "h": lens.height, "cx": lens.width / 2, "cy": lens.height / 2},
-        **{"fl_x": lens.focal, "fl_y": lens.focal},
-    }
+    size = {"w": lens.width, "h": lens.height, "cx": lens.width / 2, "cy": lens.height / 2}
+    focal = {"fl_x": lens.focal, "fl_y": lens.focal}
+    return {"file_path": shot.file, "transform_matrix": matrix, **size, **focal}

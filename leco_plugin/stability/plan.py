@@ -1,31 +1,148 @@
-"""Which runs a table needs, each once however many cells share it, and how long they take.
+"""Which samplers are compared, each in a host; which runs a table needs; and how long they take.
 
-Before any run is made, the time comes from stored figures: seconds of one core of the server that
-made the stored table, with one thread.
+The sizes, rays and steps are the same for all samplers. A sampler is held against the dense
+reference of its own host: Instant-NGP for those that ask "is this place occupied?", Nerfacto for
+proposal networks.
 """
 
 from __future__ import annotations
 
+from collections import defaultdict
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from itertools import zip_longest
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 from leco_plugin.chart.contender import Contender, Job
-from leco_plugin.stability.cases import Case
+from leco_plugin.hosts.guided_start import OWN_SAMPLER
+from leco_plugin.scenes.input_error import InputError
 from leco_plugin.stability.photographs import STAGES, YARD, Capture
-from leco_plugin.stability.samplers import (
-    DENSE,
-    DENSE_PROPOSAL,
-    GRID,
-    LEARNED,
-    PROPOSALS,
-    RAYS,
-    Sampler,
-    Sizes,
-    contender_of,
-    with_references,
-)
 from leco_plugin.stability.scene import Stage
+
+if TYPE_CHECKING:
+    from leco_plugin.stability.cases import Case
+
+LEARNED, DENSE, PROPOSALS, GRID = "learned", "dense", "proposal-networks", "grid"
+DENSE_PROPOSAL = "dense-proposal"
+GRIDS = (128, 256)
+DENSE_LEVELS = 5
+"""The reference samples in a box 2^4 times as wide as the one that was guessed."""
+RAYS = "pipeline.datamanager.train_num_rays_per_batch"
+
+
+@dataclass(frozen=True)
+class Sizes:
+    """Of pictures, hosts and runs."""
+
+    steps: int
+    """Training steps of each host; learning an occupancy comes before them."""
+    rays: int
+    """Of a batch."""
+    learn_rays: int
+    """Of a batch while the occupancy is learned."""
+    learn_steps: int
+    """Most steps of learning."""
+    picture: float = 1.0
+    """Multiple of the pictures' width and height."""
+    views: float = 1.0
+    """Multiple of the number of training pictures, where a case does not fix it."""
+    dense_samples: int = 192
+    """Of a ray of the dense reference of proposal hosts."""
+    table: int = 15
+    """Binary logarithm of the entries of the hosts' hash tables."""
+
+    def host(self, in_nerfacto: bool) -> dict[str, Any]:
+        """Nerfacto, or Instant-NGP with steps that grow with the distance: rays end well beyond the
+        scene."""
+        sizes = {"host.log2_hashmap_size": self.table, "host.max_res": 512, "host.far_plane": 20.0}
+        if in_nerfacto:
+            return {**sizes, "host.use_appearance_embedding": False}
+        return {**sizes, "host.grid_levels": 1, "host.cone_angle": 1 / 32}
+
+
+FULL = Sizes(steps=720, rays=96, learn_rays=384, learn_steps=200)
+"""The stored table takes two cores a few hours in these."""
+QUICK = Sizes(
+    steps=40, rays=64, learn_rays=64, learn_steps=20, picture=0.5, views=0.4, dense_samples=48
+)
+"""For a look at whether everything works; its verdicts mean little."""
+
+
+@dataclass(frozen=True)
+class Sampler:
+    """One column of the table."""
+
+    name: str
+    """On the command line."""
+    title: str
+    """In the table."""
+    reference: str | None
+    """The dense reference of its host; None is one."""
+
+
+SAMPLERS = {
+    one.name: one
+    for one in (
+        Sampler(LEARNED, "learned occupancy", DENSE),
+        *(Sampler(f"{GRID}-{n}", f"grid {n}³", DENSE) for n in GRIDS),
+        Sampler(PROPOSALS, "proposal networks", DENSE_PROPOSAL),
+        Sampler(DENSE, "dense (Instant-NGP)", None),
+        Sampler(DENSE_PROPOSAL, "dense (Nerfacto)", None),
+    )
+}
+
+
+def samplers_named(names: tuple[str, ...]) -> list[Sampler]:
+    """The samplers of these names and the references they are held against, in the table's order;
+    an `InputError` for a name that there is not."""
+    unknown = [name for name in names if name not in SAMPLERS]
+    if unknown:
+        raise InputError(f"there is no sampler {unknown[0]!r}; there are {', '.join(SAMPLERS)}")
+    return with_references(set(names or SAMPLERS))
+
+
+def with_references(names: set[str]) -> list[Sampler]:
+    """Samplers and the references they are held against, in the table's order."""
+    references = {SAMPLERS[name].reference for name in names}
+    return [one for one in SAMPLERS.values() if one.name in names | references]
+
+
+def contender_of(
+    sampler: Sampler,
+    sizes: Sizes,
+    changes: Mapping[str, Any],
+    settings: Mapping[str, Any],
+    grid_levels: int = 1,
+) -> Contender:
+    """The sampler in its host under the conditions of a case.
+
+    Changes of the model that are about learning are left out where nothing is learned.
+    """
+    name = sampler.name
+    in_nerfacto = name in (PROPOSALS, DENSE_PROPOSAL)
+    own: dict[str, Any] = {"occupancy.sampler": name}
+    if name == LEARNED:
+        own = {
+            "occupancy.sampler": "learned-occupancy",
+            "occupancy.rays": sizes.learn_rays,
+            "occupancy.learning.schedule.learn_steps": sizes.learn_steps,
+        }
+    elif name == PROPOSALS:
+        own = {"occupancy.sampler": OWN_SAMPLER}
+    elif name == DENSE_PROPOSAL:
+        own["occupancy.options"] = {"samples": sizes.dense_samples}
+    elif name == DENSE:
+        own["occupancy.options"] = {"levels": DENSE_LEVELS}
+    else:
+        cells = int(name.removeprefix(f"{GRID}-"))
+        options = {"resolution": cells, "levels": grid_levels}
+        own = {"occupancy.sampler": "occupancy-grid", "occupancy.options": options}
+    left_out = () if name == LEARNED else ("occupancy.",)
+    asked = {path: value for path, value in changes.items() if not path.startswith(left_out)}
+    host = "leco-nerfacto" if in_nerfacto else "leco-ngp"
+    changes = {**sizes.host(in_nerfacto), **own, **asked}
+    return Contender(sampler.title, host, name, changes, settings={RAYS: sizes.rays, **settings})
+
 
 START_SECONDS = 14.0
 """For a process to start, to read the scene and to build the host."""
@@ -53,8 +170,7 @@ Key = tuple[str, str]
 """Scene and name of a run."""
 
 
-@dataclass(frozen=True)
-class Run:
+class Run(NamedTuple):
     """One run, on the scene of a name."""
 
     scene: str
@@ -68,7 +184,7 @@ class Run:
 
 @dataclass(frozen=True)
 class Entry:
-    """One cell of the table before anything is known of it."""
+    """One cell of the table before anything is known of it, and the runs that it is made of."""
 
     case: Case
     sampler: Sampler
@@ -77,7 +193,6 @@ class Entry:
 
     @property
     def runs(self) -> list[Run]:
-        """Those that it is made of."""
         return [Run(self.case.scene, Job(self.contender, seed)) for seed in self.seeds]
 
 
@@ -103,9 +218,8 @@ def entries_of(
                 one = contender_of(sampler, sizes, case.changes, case.settings, levels)
                 chosen = tuple(dict.fromkeys(seeds))
                 if sampler.name == LEARNED:
-                    missing = case.seeds - len(chosen)
-                    more = (seed for seed in range(case.seeds) if seed not in chosen)
-                    chosen += tuple(more)[: max(missing, 0)]
+                    more = [seed for seed in range(case.seeds) if seed not in chosen]
+                    chosen += tuple(more[: max(case.seeds - len(chosen), 0)])
                 elif beside and sampler.name != DENSE:
                     chosen = tuple(dict.fromkeys(beside))
                 entries.append(Entry(case, sampler, one, chosen))
@@ -114,13 +228,9 @@ def entries_of(
 
 def runs_of(entries: Sequence[Entry]) -> list[Run]:
     """All runs, each once: all cells get their first seed before any gets its second."""
-    most = max((len(entry.seeds) for entry in entries), default=0)
-    found: dict[Key, Run] = {}
-    for number in range(most):
-        for entry in entries:
-            for run in entry.runs[number : number + 1]:
-                found.setdefault(run.key, run)
-    return list(found.values())
+    in_turn = zip_longest(*(entry.runs for entry in entries))
+    runs = (run for one_of_each in in_turn for run in one_of_each if run is not None)
+    return list({run.key: run for run in runs}.values())
 
 
 def scenes_of(cases: Sequence[Case], sizes: Sizes) -> dict[str, tuple[Stage, Capture]]:
@@ -131,8 +241,9 @@ def scenes_of(cases: Sequence[Case], sizes: Sizes) -> dict[str, tuple[Stage, Cap
 def capture_of(case: Case, sizes: Sizes) -> Capture:
     """A case's capture in pictures of the suite's size."""
     capture = case.capture
-    is_fixed = capture.views != Capture.views
-    views = capture.views if is_fixed else round(capture.views * sizes.views)
+    views = capture.views
+    if views == Capture.views:
+        views = round(views * sizes.views)
     return replace(
         capture,
         views=max(4, views),
@@ -143,15 +254,10 @@ def capture_of(case: Case, sizes: Sizes) -> Capture:
 
 
 def core_seconds(runs: Sequence[Run], stored: Sequence[Mapping[str, Any]], sizes: Sizes) -> float:
-    """What some runs take of one core, seconds.
-
-    Args:
-        runs: to be made.
-        stored: records of runs that were made; what they took replaces the stored figures.
-    """
-    measured: dict[str, list[float]] = {}
+    """What runs to be made take of one core, seconds: as long as stored ones of their samplers."""
+    measured: defaultdict[str, list[float]] = defaultdict(list)
     for record in stored:
-        measured.setdefault(record["sampler"], []).append(float(record["processor_seconds"]))
+        measured[record["sampler"]].append(float(record["processor_seconds"]))
     means = {name: sum(seconds) / len(seconds) for name, seconds in measured.items()}
     return sum(means.get(run.job.contender.sampler) or expected_seconds(run, sizes) for run in runs)
 

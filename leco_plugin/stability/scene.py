@@ -62,11 +62,8 @@ class Box:
         return np.minimum(*sides).max(1), np.maximum(*sides).min(1)
 
     def meet(self, origins: Array, directions: Array) -> tuple[Array, Array]:
-        """Where rays [N, 3] first meet the surface.
-
-        Returns:
-            distances [N], metres along unit directions, inf for none; and outward normals [N, 3].
-        """
+        """Where rays [N, 3] first meet the surface: distances [N], metres along unit directions,
+        inf for none; and outward normals [N, 3]."""
         low, high = np.array(self.low), np.array(self.high)
         enters, leaves = self.span(origins, directions)
         t = np.where(enters > _TINY, enters, leaves)
@@ -89,8 +86,7 @@ class Ball:
     def meet(self, origins: Array, directions: Array) -> tuple[Array, Array]:
         """As of `Box`."""
         offsets = origins - np.array(self.centre)
-        half = np.einsum("nk,nk->n", offsets, directions)
-        t = _first_root(half, np.einsum("nk,nk->n", offsets, offsets) - self.radius**2)
+        t = _first_root(_dot(offsets, directions), _dot(offsets, offsets) - self.radius**2)
         return t, _points(offsets, t, directions) / self.radius
 
 
@@ -111,10 +107,9 @@ class Rod:
         offsets = origins - start
         across = directions - np.outer(directions @ axis, axis)
         beside = offsets - np.outer(offsets @ axis, axis)
-        slope = np.maximum(np.einsum("nk,nk->n", across, across), _TINY)
-        half = np.einsum("nk,nk->n", beside, across) / slope
-        rest = (np.einsum("nk,nk->n", beside, beside) - self.radius**2) / slope
-        t = _first_root(half, rest)
+        slope = np.maximum(_dot(across, across), _TINY)
+        rest = (_dot(beside, beside) - self.radius**2) / slope
+        t = _first_root(_dot(beside, across) / slope, rest)
         places = _points(offsets, t, directions)
         height = places @ axis
         t = np.where((height >= 0.0) & (height <= length), t, np.inf)
@@ -124,10 +119,14 @@ class Rod:
 Shape = Box | Ball | Rod
 
 
+def _dot(one: Array, other: Array) -> Array:
+    """Products [N] of vectors [N, 3]."""
+    return np.einsum("nk,nk->n", one, other)
+
+
 def _points(origins: Array, t: Array, directions: Array) -> Array:
     """Points [N, 3] at distances t [N]; the origins where those are infinite."""
-    points: Array = origins + np.where(np.isfinite(t), t, 0.0)[:, None] * directions
-    return points
+    return origins + np.where(np.isfinite(t), t, 0.0)[:, None] * directions
 
 
 def _first_root(half: Array, rest: Array) -> Array:
@@ -182,13 +181,7 @@ class Seen(NamedTuple):
 
 
 def photograph(stage: Stage, camera_to_world: Array, lens: Lens) -> Seen:
-    """Takes one antialiased picture.
-
-    Args:
-        stage: what is there.
-        camera_to_world: [3, 4], metres, OpenGL axes.
-        lens: size and focal length.
-    """
+    """Takes one antialiased picture from a pose [3, 4], metres, OpenGL axes."""
     size = lens.height, lens.width
     total, detail, depth = np.zeros((*size, 4)), np.zeros(size, bool), np.zeros(size)
     for number, place in enumerate(_QUINCUNX):
@@ -206,12 +199,8 @@ def photograph(stage: Stage, camera_to_world: Array, lens: Lens) -> Seen:
 
 
 def look(stage: Stage, origins: Array, directions: Array) -> tuple[Array, Array, NDArray[np.bool_]]:
-    """What rays [N, 3] meet.
-
-    Returns:
-        RGBA with the colour multiplied by alpha [N, 4]; distance to the first surface [N], metres,
-        inf for none; whether that is one of the details, [N].
-    """
+    """What rays [N, 3] meet: RGBA with the colour multiplied by alpha [N, 4]; distance to the first
+    surface [N], metres, inf for none; whether that is one of the details, [N]."""
     colours = np.zeros((len(origins), 4))
     if stage.sky:
         up = np.power(np.clip(directions[:, 2:], 0.0, 1.0), 0.6)
@@ -238,9 +227,8 @@ def _light(paint: Paint, positions: Array, normals: Array) -> Array:
 
 def _lay(front: Array, alpha: Array, behind: Array) -> Array:
     """A colour [N, 3] of opacity [N] before premultiplied RGBA [N, 4]."""
-    laid = np.concatenate([front, np.ones((len(front), 1))], axis=1)
-    result: Array = alpha[:, None] * laid + (1.0 - alpha[:, None]) * behind
-    return result
+    laid = np.pad(front, ((0, 0), (0, 1)), constant_values=1.0)
+    return alpha[:, None] * laid + (1.0 - alpha[:, None]) * behind
 
 
 def _lay_glass(

@@ -14,7 +14,7 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-from leco_plugin.chart.protocol import Protocol, require_seeds, settings_of
+from leco_plugin.chart.contender import Protocol, require_seeds, settings_of
 from leco_plugin.chart.runner import (
     RUNS,
     ProcessRunner,
@@ -25,12 +25,7 @@ from leco_plugin.chart.runner import (
     take_folder,
 )
 from leco_plugin.chart.theme import DARK, LIGHT
-from leco_plugin.evaluation.report import (
-    describe_code,
-    describe_machine,
-    usable_cores,
-    write_json,
-)
+from leco_plugin.evaluation.report import describe_code, describe_machine, usable_cores, write_json
 from leco_plugin.log import bar, console, resumable
 from leco_plugin.occupancy import CALIBRATED_AT
 from leco_plugin.scenes.city.folder import TRANSFORMS
@@ -39,16 +34,20 @@ from leco_plugin.scenes.photographs import describe_scene
 from leco_plugin.stability.cases import Case, cases_named
 from leco_plugin.stability.photographs import digest_of, write_scene
 from leco_plugin.stability.plan import (
+    FULL,
+    QUICK,
     Entry,
     Key,
     Run,
+    Sampler,
+    Sizes,
     core_seconds,
     entries_of,
     in_words,
     runs_of,
+    samplers_named,
     scenes_of,
 )
-from leco_plugin.stability.samplers import FULL, QUICK, Sampler, Sizes, samplers_named
 from leco_plugin.stability.table import draw, draw_side_by_side, table
 from leco_plugin.stability.verdict import judge
 from leco_plugin.studio.run_folder import alone_in
@@ -81,10 +80,8 @@ def make_table(
     """Makes what is missing of a table and draws it.
 
     Args:
-        out: the table's folder.
         cases, samplers: their names; none is all.
         seeds, seeds_beside: of each cell, and of some samplers; see `entries_of`.
-        quick: tiny sizes, for a look at whether everything works.
         minutes: that this may take, about; None is as many as it takes.
         earlier: results whose runs are kept where they would be made here just so.
     Returns:
@@ -119,7 +116,6 @@ class Suite:
     Args:
         out: its folder; `scenes` holds what is photographed, `runs` what was run, by scene.
         cases, samplers, seeds, sizes, beside: as of `entries_of`.
-        command: what made it, for the results.
     Raises:
         ValueError, OSError: nothing to run, no seed, or a folder of something else, of other sizes
             or versions.
@@ -154,22 +150,18 @@ class Suite:
         self.workers = usable_cores() if self.machine["device"] == "cpu" else 1
         scenes = scenes_of(cases, sizes)
         self.digests = {name: digest_of(*scene) for name, scene in scenes.items()}
-        self.data = {
-            name: write_scene(*scene, out / SCENES / name) for name, scene in scenes.items()
-        }
-        self.folders = {name: self._folder(name) for name in self.data}
-
-    def _folder(self, scene: str) -> RunFolder:
-        described = describe_scene(self.data[scene])
+        self.data, self.folders = {}, {}
         machine = {key: fact for key, fact in self.machine.items() if key not in PER_PORTION}
-        settings = settings_of(described, self.protocol, None, machine)
-        return RunFolder(self.out / RUNS / scene, settings | {"sizes": asdict(self.sizes)})
+        for name, scene in scenes.items():
+            self.data[name] = write_scene(*scene, out / SCENES / name)
+            settings = settings_of(describe_scene(self.data[name]), self.protocol, None, machine)
+            self.folders[name] = RunFolder(out / RUNS / name, settings | {"sizes": asdict(sizes)})
 
     def runner(self, scene: str) -> Runner:
         """What makes the runs of a scene, in processes with one thread each."""
-        environment = {"OMP_NUM_THREADS": "1"} if self.workers > 1 else None
+        threads = 1 if self.workers > 1 else None
         place = self.data[scene], self.protocol, self.folders[scene]
-        return ProcessRunner(*place, WORKER, environment, self.stop)
+        return ProcessRunner(*place, WORKER, threads, self.stop)
 
     def stored(self) -> dict[Key, dict[str, Any]]:
         """Records of finished runs."""
@@ -205,10 +197,8 @@ class Suite:
     def make(self, say: Say, show: Callable[[float], None], seconds: float = math.inf) -> None:
         """Makes what is missing; whenever this is stopped, what was finished is kept.
 
-        Args:
-            say, show: as of `make_jobs`.
-            seconds: after which no run is to go on; but for the first ones, what would take longer
-                is left for another time.
+        After so many seconds no run is to go on: but for the first ones, what would take longer is
+        left for another time. `say` and `show` are as of `make_jobs`.
         """
         todo, stored = self.missing(), list(self.stored().values())
         ends = time.monotonic() + seconds
@@ -224,16 +214,9 @@ class Suite:
         for folder in self.folders.values():
             folder.clear()
         self.write()
-        make_jobs(
-            todo,
-            self._make_one,
-            note,
-            show,
-            stop=self.stop,
-            at_once=self.workers,
-            done=len(runs_of(self.entries)) - len(todo),
-            is_wanted=is_in_time,
-        )
+        threads: Any = {"stop": self.stop, "at_once": self.workers, "is_wanted": is_in_time}
+        done = len(runs_of(self.entries)) - len(todo)
+        make_jobs(todo, self._make_one, note, show, done=done, **threads)
 
     def _make_one(self, run: Run, show: Callable[[float], None]) -> str:
         """Makes a run and keeps it, or why there is none; returns a line about it."""
@@ -305,11 +288,8 @@ class Suite:
 
     def reference_of(self, entry: Entry) -> Entry:
         """The cell that a cell is held against."""
-        return next(
-            other
-            for other in self.entries
-            if other.case is entry.case and other.sampler.name == entry.sampler.reference
-        )
+        of_case = {other.sampler.name: other for other in self.entries if other.case is entry.case}
+        return of_case[entry.sampler.reference or entry.sampler.name]
 
     def write(self) -> dict[str, Any]:
         """`stability.json` and `table.md`, as far as there are runs."""

@@ -6,7 +6,7 @@ In a picture colour, sign and words say the same, so that no reader depends on o
 from __future__ import annotations
 
 import textwrap
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -14,8 +14,9 @@ from typing import Any
 import numpy as np
 from PIL import Image
 
+from leco_plugin.chart.table import rows
 from leco_plugin.chart.theme import LIGHT, Theme, new_figure, save_picture
-from leco_plugin.stability.samplers import LEARNED, QUICK
+from leco_plugin.stability.plan import LEARNED, QUICK
 
 NOTHING = "nothing has been run yet"
 QUICKLY = "made with --quick, which shows that everything runs and no more"
@@ -56,7 +57,7 @@ def table(results: Results) -> str:
     made = results["made"]
     reasons = [[row["title"], row["why"]] for row in results["cases"]]
     parts = ["# Stability", headline(results), verdicts(results), failures(results)]
-    parts.append(_rows(["case", "why it is there"], reasons))
+    parts.append(rows(["case", "why it is there"], reasons))
     commit = f" at {made['commit']}" if made["commit"] else ""
     parts.append(f"`{made['command']}`, {made['date']}, leco_plugin {made['version']}{commit}.")
     return "\n\n".join(part for part in parts if part) + "\n"
@@ -65,11 +66,11 @@ def table(results: Results) -> str:
 def verdicts(results: Results) -> str:
     """A row a case, a column a sampler."""
     samplers = results["samplers"]
-    rows = [
+    cells = [
         [row["title"], *(_cell(row["cells"].get(one["name"])) for one in samplers)]
         for row in results["cases"]
     ]
-    return _rows(["case", *(one["title"] for one in samplers)], rows)
+    return rows(["case", *(one["title"] for one in samplers)], cells)
 
 
 def failures(results: Results) -> str:
@@ -80,7 +81,7 @@ def failures(results: Results) -> str:
         for one in results["samplers"]
         if row["cells"].get(one["name"], {}).get("verdict") in ("fail", "degraded")
     ]
-    return _rows(["case", "sampler", "what failed"], broken) if broken else ""
+    return rows(["case", "sampler", "what failed"], broken) if broken else ""
 
 
 def headline(results: Results) -> str:
@@ -142,8 +143,7 @@ def is_unproven(results: Results) -> bool:
 
 
 def figures(cell: Mapping[str, Any]) -> tuple[str, str, str]:
-    """The figures of a cell in short words: its PSNR; what it skips and how often it was healed;
-    and what its seeds say."""
+    """A cell in short words: its PSNR; what it skips and how often it was healed; its seeds."""
     if cell["psnr"] is None:
         return "no result" if cell["verdict"] == "fail" else cell["reason"], "", ""
     first, parts = f"{cell['psnr']:.1f} dB", []
@@ -169,29 +169,14 @@ def _cell(cell: Mapping[str, Any] | None) -> str:
     return f"{SIGNS[cell['verdict']]}: {first}" + (f" ({more})" if more else "")
 
 
-def _rows(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
-    lines = [header, ["---"] * len(header), *rows]
-    return "\n".join(
-        f"| {' | '.join(str(cell).replace('|', chr(92) + '|') for cell in cells)} |"
-        for cells in lines
-    )
-
-
 def draw(results: Results, path: Path, theme: Theme = LIGHT) -> Path:
-    """Draws the results of a table.
-
-    Args:
-        results: as in `stability.json`.
-        path: of the picture.
-        theme: of the page it is meant for.
-    """
-    rows, samplers = results["cases"], results["samplers"]
+    """Draws the results of a table for a page of a theme."""
+    cases, samplers = results["cases"], results["samplers"]
     width = max(NAMES + COLUMN * len(samplers) + 0.2, 8.5)
-    height = HEAD + ROW * len(rows) + FOOT
+    height = HEAD + ROW * len(cases) + FOOT
     figure = new_figure((width, height), theme.page)
     axes: Any = figure.add_axes((0, 0, 1, 1))
-    axes.set_xlim(0, width)
-    axes.set_ylim(height, 0)
+    axes.set(xlim=(0, width), ylim=(height, 0))
     axes.axis("off")
     sentence = textwrap.fill(headline(results), int(width * 8.6))
     bold = {"fontsize": 14 if sentence.count("\n") < 2 else 11.5, "fontweight": "bold"}
@@ -200,7 +185,7 @@ def draw(results: Results, path: Path, theme: Theme = LIGHT) -> Path:
     for number, one in enumerate(samplers):
         middle = NAMES + COLUMN * (number + 0.5)
         axes.text(middle, HEAD - 0.1, one["title"], ha="center", va="bottom", **named)
-    for number, row in enumerate(rows):
+    for number, row in enumerate(cases):
         top = HEAD + ROW * number
         axes.text(0.15, top + ROW / 2, row["title"], va="center", **named)
         for column, one in enumerate(samplers):
@@ -218,11 +203,9 @@ def _draw_cell(
 ) -> None:
     from matplotlib.patches import FancyBboxPatch
 
-    corner, style = (left + GAP, top + GAP), "round,pad=0,rounding_size=0.04"
-    size = COLUMN - 2 * GAP, ROW - 2 * GAP
-    axes.add_patch(
-        FancyBboxPatch(corner, *size, boxstyle=style, facecolor=ground, edgecolor="none")
-    )
+    corner, size = (left + GAP, top + GAP), (COLUMN - 2 * GAP, ROW - 2 * GAP)
+    look: Any = {"boxstyle": "round,pad=0,rounding_size=0.04", "edgecolor": "none"}
+    axes.add_patch(FancyBboxPatch(corner, *size, facecolor=ground, **look))
     first, second, seeds = figures(cell)
     middle = top + ROW / 2
     upper = middle - (0.065 if second else 0.0)

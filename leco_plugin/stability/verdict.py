@@ -73,12 +73,11 @@ class Cell:
 def judge(
     runs: Runs, reference: Runs | None, failures: Sequence[str] = (), missing: int = 0
 ) -> Cell:
-    """The cell of a sampler in a case.
+    """The cell of a sampler in a case, by its finished runs.
 
     Args:
-        runs: its finished runs.
-        reference: those of its dense reference, of which the same seeds count; None where it is
-            one itself.
+        reference: runs of its dense reference, of which the same seeds count; None where it is one
+            itself.
         failures: reasons of its runs that have ended without a result.
         missing: number of its runs that have not been made.
     """
@@ -112,18 +111,14 @@ def judge(
 
 
 def _of_the_same_seeds(some: Runs, others: Runs) -> Runs:
-    """Those whose seeds others have too: medians of different seeds would differ by more than what
-    is compared."""
+    """Those whose seeds others have too: seeds differ by more than what is compared."""
     seeds = {run["seed"] for run in others}
     return [run for run in some if run["seed"] in seeds]
 
 
 def _broken(cell: Cell, bars: Bars, lost: float) -> str:
-    """The first bar that a cell is on the wrong side of, in words.
-
-    Args:
-        lost: share of the surfaces lost beyond the reference's.
-    """
+    """The first bar that a cell is on the wrong side of, in words; `lost` is the share of surfaces
+    beyond the reference's."""
     if cell.gap is not None and cell.gap < -bars.below_reference:
         return f"{-cell.gap:.2f} dB below dense"
     if cell.detail_gap is not None and cell.detail_gap < -bars.detail:

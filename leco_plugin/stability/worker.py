@@ -26,13 +26,14 @@ from numpy.typing import NDArray
 from PIL import Image
 from torch import Tensor
 
-from leco_plugin.chart.contender import Contender, config_of
-from leco_plugin.chart.protocol import Protocol
+from leco_plugin.chart.contender import Contender, Protocol, config_of
 from leco_plugin.chart.worker import main, train_job
+from leco_plugin.evaluation.metrics import decibels
 from leco_plugin.evaluation.report import finite_or_null
+from leco_plugin.evaluation.timed_run import render_rays
 from leco_plugin.samplers.registry import build_estimator
 from leco_plugin.stability.photographs import TRUTH
-from leco_plugin.stability.samplers import DENSE_LEVELS
+from leco_plugin.stability.plan import DENSE_LEVELS
 from leco_plugin.studio.host_models import true_colours
 
 NEAR = 0.03
@@ -107,7 +108,6 @@ def measure(
     """Looks at the held-out pictures of a case's scene, and renders what of them it needs.
 
     Args:
-        pipeline: with a trained host.
         data: folder of the scene, with its truth.
         dense_samples: candidates of a ray of a proposal host's reference.
     Returns:
@@ -134,7 +134,7 @@ def measure(
         samples, candidates = samples + kept, candidates + most
         detail = truth["detail"]
         asked = torch.ones_like(detail) if shown is None else detail | looked_at
-        rgb = render(model, flat[asked.to(pipeline.device)]).cpu()
+        rgb = render_rays(model, flat[asked.to(pipeline.device)], RAYS_AT_ONCE).cpu()
         image = dataset.get_data(number)["image"].reshape(len(flat), -1).to(pipeline.device)
         wanted = true_colours(model, image).float().cpu()
         squared = (rgb - wanted[asked]).square()
@@ -176,26 +176,15 @@ def count_lost(nearest: Tensor, depth: Tensor, shown_by: Tensor) -> tuple[int, i
 
 def psnr(squared_errors: Tensor) -> float:
     """Of any number of squared errors, dB."""
-    return -10.0 * math.log10(max(float(squared_errors.double().mean()), 1e-12))
-
-
-def render(model: Any, bundle: RayBundle) -> Tensor:
-    """Colours [N, 3] of rays, in [0, 1]."""
-    return torch.cat([model(bundle[part])["rgb"] for part in _parts(bundle)]).clamp(0.0, 1.0)
-
-
-def _parts(bundle: RayBundle) -> list[slice]:
-    return [slice(i, i + RAYS_AT_ONCE) for i in range(0, len(bundle), RAYS_AT_ONCE)]
+    return decibels(float(squared_errors.double().mean()))
 
 
 def find_samples(
     model: Any, bundle: RayBundle, depth: Tensor, dense_samples: int
 ) -> tuple[Tensor, int, int]:
-    """Where a host would ask its field along some rays.
+    """Where a packed host or a proposal host would ask its field along some rays [N].
 
     Args:
-        model: a packed host or a proposal host.
-        bundle: rays [N].
         depth: [N] distance of each ray's surface, scene units; inf for none.
         dense_samples: candidates of a ray of a proposal host's reference.
     Returns:
@@ -204,7 +193,8 @@ def find_samples(
     """
     is_packed = not hasattr(model, "proposal_sampler")
     sample = _sample_packed if is_packed else partial(_sample_proposals, dense_samples)
-    found = [sample(model, bundle[part], depth[part]) for part in _parts(bundle)]
+    parts = [slice(i, i + RAYS_AT_ONCE) for i in range(0, len(bundle), RAYS_AT_ONCE)]
+    found = [sample(model, bundle[part], depth[part]) for part in parts]
     nearest, samples, candidates = zip(*found)
     return torch.cat(nearest), sum(samples), sum(candidates)
 

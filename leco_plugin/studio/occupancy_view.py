@@ -19,7 +19,7 @@ from nerfstudio.viewer.viewer_elements import ViewerCheckbox, ViewerSlider, View
 from nerfstudio.viewer_legacy.server.viewer_utils import IOChangeException
 from torch import Tensor, nn
 
-from leco_plugin.evaluation.ray_states import ray_states
+from leco_plugin.evaluation.inspection import ray_states
 from leco_plugin.occupancy import SHOWN, Occupancy
 from leco_plugin.scenes.frames import moved, turned
 from leco_plugin.studio.viewer import FirstView

@@ -12,7 +12,7 @@ import tiny_scene as tiny_scene_writer
 from PIL import Image
 
 from leco_plugin import cli
-from leco_plugin.capacity import command
+from leco_plugin.capacity import measuring
 from leco_plugin.capacity.measuring import VOLUMES
 from leco_plugin.capacity.search import Candidate, gates
 from leco_plugin.chart.theme import SOURCE, fingerprint
@@ -55,15 +55,15 @@ def taught(monkeypatch: pytest.MonkeyPatch) -> Taught:
 
     mixture = SimpleNamespace(num_images=7)
     ground = SimpleNamespace(mixture=mixture, held_out=SimpleNamespace(rays=99))
-    monkeypatch.setattr(command, "prepare", lambda *arguments: ground)
-    monkeypatch.setattr(command, "measure_gate", of_gate)
-    monkeypatch.setattr(command, "measure_grid", of_gate)
+    monkeypatch.setattr(measuring, "prepare", lambda *arguments: ground)
+    monkeypatch.setattr(measuring, "measure_gate", of_gate)
+    monkeypatch.setattr(measuring, "measure_grid", of_gate)
     return done
 
 
 @pytest.fixture
 def undrawn(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(command, "draw", lambda *arguments: None)
+    monkeypatch.setattr(measuring, "draw", lambda *arguments: None)
 
 
 def test_what_was_finished_is_kept(
@@ -146,27 +146,25 @@ def test_a_grid_that_is_asked_for_twice_is_measured_once(
 def test_one_field_teaches_gates_and_grids(
     tiny_scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    from leco_plugin.capacity import measuring
-
     monkeypatch.setattr(measuring, "RAYS", 256)
     monkeypatch.setattr(measuring, "TAUGHT_RAYS", 256)
     monkeypatch.setattr(measuring, "VOLUME_POINTS", 2048)
     monkeypatch.setattr(measuring, "STEPS", 20)
     monkeypatch.setattr("leco_plugin.learning.sharpening.BATCH", 512)
     some = [candidate for candidate in gates() if candidate.bytes < 5000]
-    monkeypatch.setattr(command, "gates", lambda: some)
+    monkeypatch.setattr(measuring, "gates", lambda: some)
     out = tmp_path / "out"
     for _ in range(2):  # the second time from the stored field
-        results = command.capacity(tiny_scene, out, (8, 16), 0.01, 4)
+        results = measuring.capacity(tiny_scene, out, (8, 16), 0.01, 4)
         assert len(results["representations"]) == len(some) + 2
         for file in (out / "points").glob("grid*"):
             file.unlink()
     other = tiny_scene_writer.write(tmp_path / "other" / tiny_scene.name, train=4, test=2)
     with pytest.raises(InputError, match="another scene"):
-        command.capacity(other, out, (8, 16), 0.01, 4)
+        measuring.capacity(other, out, (8, 16), 0.01, 4)
     (out / "field.pt").write_bytes(b"no field")
     with pytest.raises(InputError, match=r"field\.pt cannot be used"):
-        command.capacity(tiny_scene, out, (8, 16), 0.01, 4)
+        measuring.capacity(tiny_scene, out, (8, 16), 0.01, 4)
     assert all(0.0 < row["kept_volume"] <= 1.0 for row in results["representations"])
 
 
@@ -178,7 +176,7 @@ def test_a_grid_that_does_not_fit_the_memory_is_left_out_and_said(
     capsys: pytest.CaptureFixture[str],
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr(command, "fits_memory", lambda cells: cells < 20**3)
+    monkeypatch.setattr(measuring, "fits_memory", lambda cells: cells < 20**3)
     out = tmp_path / "out"
     assert run("capacity", "--data", tiny_scene, "--out", out, "--grids", 8, 16, 32) == 0
     said = " ".join(capsys.readouterr().out.split())

@@ -18,8 +18,8 @@ from tiny_scene import camera_to_world
 
 from leco_plugin import cli
 from leco_plugin.capacity import references, search, shrink, sources
+from leco_plugin.capacity.choice import draw_gates
 from leco_plugin.capacity.evidence import Evidence, gather, loss, unlikely_at
-from leco_plugin.capacity.frontier import draw
 from leco_plugin.capacity.shrink import compare_queries
 from leco_plugin.evaluation.inspection import describe
 from leco_plugin.evaluation.report import describe_code
@@ -116,7 +116,7 @@ def test_without_a_run_it_keeps_to_the_decisions_and_says_so(
     )
     with Image.open(picture) as image:
         assert image.size[0] > 500
-    assert draw(results, tmp_path / "again.png").exists()
+    assert draw_gates(results, tmp_path / "again.png").exists()
 
 
 def test_a_search_that_is_stopped_leaves_the_gates_that_it_tried(

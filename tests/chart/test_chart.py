@@ -14,8 +14,7 @@ import pytest
 
 from leco_plugin.chart import picture
 from leco_plugin.chart.chart import Chart, why_not_shared
-from leco_plugin.chart.contender import Contender, Job
-from leco_plugin.chart.protocol import Protocol
+from leco_plugin.chart.contender import Contender, Job, Protocol
 from leco_plugin.chart.runner import RUNS, RunFailed
 from leco_plugin.scenes.input_error import InputError
 

@@ -15,10 +15,9 @@ import pytest
 from leco_plugin import cli
 from leco_plugin.chart import command
 from leco_plugin.chart.chart import Chart
-from leco_plugin.chart.contender import Job
-from leco_plugin.chart.protocol import Protocol
+from leco_plugin.chart.contender import Job, Protocol
+from leco_plugin.chart.methods import AT_ONCE, SUITES
 from leco_plugin.chart.runner import UNFINISHED, ProcessRunner, RunFailed
-from leco_plugin.chart.suites import AT_ONCE, SUITES
 from leco_plugin.studio.run_folder import alone_in
 
 METHODS = ["--methods", "leco-occupancy", "leco-occupancy-never-frozen"]

@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from page_text import figure_text
 
-from leco_plugin.chart.findings.settling import falls, last_gain, settling, still_rising
+from leco_plugin.chart.findings.learned import falls, last_gain, settling, still_rising
 from leco_plugin.chart.findings.summary import (
     KEPT,
     MEMORY,

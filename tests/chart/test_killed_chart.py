@@ -13,8 +13,7 @@ from pathlib import Path
 import chart_results
 
 from leco_plugin.chart.chart import Chart
-from leco_plugin.chart.contender import Contender
-from leco_plugin.chart.protocol import Protocol
+from leco_plugin.chart.contender import Contender, Protocol
 from leco_plugin.chart.runner import RUNS, UNFINISHED, ProcessRunner
 
 NAMES = ("first", "second", "third")

@@ -11,7 +11,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.text import Text
 
-from leco_plugin.chart.names import Boxes, covered, name_points, spread
+from leco_plugin.chart.picture import Boxes, covered, name_points, spread
 
 
 def panel() -> Any:

@@ -9,11 +9,11 @@ from typing import Any
 
 import pytest
 
-from leco_plugin.chart.contender import Contender
-from leco_plugin.chart.protocol import (
+from leco_plugin.chart.contender import (
     FAST,
     LEARN_SHARE,
     SLOW,
+    Contender,
     Cores,
     Protocol,
     forecast,
@@ -21,7 +21,7 @@ from leco_plugin.chart.protocol import (
     run_seconds,
     settings_of,
 )
-from leco_plugin.chart.suites import SUITES
+from leco_plugin.chart.methods import SUITES
 
 CHARTS = Path(__file__).parents[2] / "benchmarks" / "results" / "charts"
 GUIDED = Contender("guided", "leco-occupancy", "learned-occupancy")

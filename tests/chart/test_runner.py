@@ -10,8 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from leco_plugin.chart.contender import Contender, Job
-from leco_plugin.chart.protocol import Protocol
+from leco_plugin.chart.contender import Contender, Job, Protocol
 from leco_plugin.chart.runner import (
     LOGS,
     RUNS,

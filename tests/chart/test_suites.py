@@ -5,18 +5,16 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
-from suite_minutes import minutes_together
+from suite_minutes import CPU_STEPS, minutes_of, minutes_together, on_two_cores
 
 from leco_plugin import cli
-from leco_plugin.chart.contender import config_of
-from leco_plugin.chart.methods import contenders
-from leco_plugin.chart.protocol import FAST, SLOW, Cores, run_seconds
-from leco_plugin.chart.suites import (
+from leco_plugin.chart.contender import FAST, SLOW, Cores, config_of, run_seconds
+from leco_plugin.chart.methods import (
     AT_ONCE,
-    CPU_STEPS,
     STEPS,
     SUITES,
     SWITCH_CELLS,
+    contenders,
     in_order,
 )
 from leco_plugin.learning.schedule import MOST_EXTENSIONS, steps_of_an_extension
@@ -42,18 +40,18 @@ def test_three_seeds_of_a_suite_take_less_than_45_minutes_of_two_cores(
     found = SUITES[name]
     least = found.seconds or CPU_STEPS * cores.step
     runs = [least + cores.overhead for _ in found.contenders]
-    assert 3 * sum(runs) / 2 / 60 <= found.minutes(cores) < 45
-    assert found.minutes(cores, 1) == pytest.approx(found.minutes(cores) / 3)
+    assert 3 * sum(runs) / 2 / 60 <= minutes_of(found, cores) < 45
+    assert minutes_of(found, cores, 1) == pytest.approx(minutes_of(found, cores) / 3)
 
 
 def test_all_suites_of_a_scene_take_less_than_two_hours_and_the_help_says_how_long() -> None:
     together = [minutes_together(list(SUITES), cores) for cores in (FAST, SLOW)]
-    alone = [sum(one.minutes(cores) for one in SUITES.values()) for cores in (FAST, SLOW)]
+    alone = [sum(minutes_of(one, cores) for one in SUITES.values()) for cores in (FAST, SLOW)]
     assert max(together) <= 2 * 60 and max(alone) < 4 * 60
     said = " ".join(str(cli.chart.__doc__).split())
     assert f"all take {together[0]:.0f} to {together[1]:.0f} minutes" in said
     for name, found in SUITES.items():
-        assert f"{name} {found.minutes(FAST):.0f} to {found.minutes(SLOW):.0f}" in said
+        assert f"{name} {minutes_of(found, FAST):.0f} to {minutes_of(found, SLOW):.0f}" in said
 
 
 @pytest.mark.skipif(ON_GPU, reason="a GPU takes more steps in that time")
@@ -62,16 +60,16 @@ def test_forecasts_are_for_as_many_steps_as_a_run_has() -> None:
 
 
 def test_what_suites_share_is_counted_once() -> None:
-    apart = SUITES["enough-time"].minutes(FAST) + SUITES["grid-resolution"].minutes(FAST)
+    apart = minutes_of(SUITES["enough-time"], FAST) + minutes_of(SUITES["grid-resolution"], FAST)
     shared = [
         c for c in SUITES["grid-resolution"].contenders if c in SUITES["enough-time"].contenders
     ]
-    protocol = SUITES["enough-time"].on_two_cores
+    protocol = on_two_cores(SUITES["enough-time"])
     saved = 3 * sum(run_seconds(one, protocol, FAST) for one in shared) / 2 / 60
     assert shared and minutes_together(["enough-time", "grid-resolution"], FAST) == pytest.approx(
         apart - saved
     )
-    assert minutes_together(["losses"], FAST) == pytest.approx(SUITES["losses"].minutes(FAST))
+    assert minutes_together(["losses"], FAST) == pytest.approx(minutes_of(SUITES["losses"], FAST))
 
 
 def test_a_run_of_a_suite_leaves_time_to_learn_an_occupancy_and_to_use_it() -> None:

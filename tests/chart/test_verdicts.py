@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy import stats
 
-from leco_plugin.chart.findings.verdicts import compare
+from leco_plugin.chart.findings.summary import compare
 
 NAN = math.nan
 SPREAD = st.lists(st.integers(0, 9).map(float), min_size=2, max_size=6)

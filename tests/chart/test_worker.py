@@ -13,10 +13,9 @@ import pytest
 import torch
 
 from leco_plugin.chart import worker
-from leco_plugin.chart.contender import Contender, config_of
-from leco_plugin.chart.protocol import Protocol
+from leco_plugin.chart.contender import Contender, Protocol, config_of
+from leco_plugin.chart.methods import SUITES
 from leco_plugin.chart.runner import FAILURE, JOB, PROGRESS, RESULT
-from leco_plugin.chart.suites import SUITES
 from leco_plugin.chart.worker import main, run_job, train_job
 from leco_plugin.evaluation import equal_loss, timed_run
 

@@ -12,12 +12,7 @@ import pytest
 import torch
 
 from leco_plugin.evaluation import clock as clock_module
-from leco_plugin.evaluation.clock import (
-    Budget,
-    Clock,
-    peak_allocator_bytes,
-    peak_process_bytes,
-)
+from leco_plugin.evaluation.clock import Budget, Clock, peak_allocator_bytes, peak_process_bytes
 
 
 class Time:

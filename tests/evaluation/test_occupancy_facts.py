@@ -8,7 +8,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from leco_plugin.evaluation.occupancy_facts import compare_with_truth, free_points
+from leco_plugin.evaluation.equal_loss import compare_with_truth, free_points
 from leco_plugin.scenes.city.city import CityConfig
 from leco_plugin.scenes.city.folder import CaptureConfig, write_city
 from leco_plugin.scenes.city.truth import CityTruth

@@ -12,10 +12,9 @@ from ball_occupancy import CENTRE, RADIUS, ball
 from browser import needs_chromium, open_page
 from page_text import figure_text
 
-from leco_plugin.evaluation.inspection import ViewBox, whole_box
+from leco_plugin.evaluation.inspection import SceneColours, ViewBox, whole_box
 from leco_plugin.evaluation.occupancy_page import faces_of, write_page
 from leco_plugin.evaluation.occupancy_picture import seen_from_above
-from leco_plugin.evaluation.scene_colours import SceneColours
 from leco_plugin.occupancy import Occupancy
 from leco_plugin.scenes.coloured_points import ColouredPoints
 

@@ -11,15 +11,18 @@ import pytest
 from leco_plugin.chart.contender import config_of
 from leco_plugin.stability.cases import CASES, cases_named
 from leco_plugin.stability.plan import (
+    FULL,
+    QUICK,
+    SAMPLERS,
     Run,
     capture_of,
     core_seconds,
     entries_of,
     expected_seconds,
     runs_of,
+    samplers_named,
     scenes_of,
 )
-from leco_plugin.stability.samplers import FULL, QUICK, SAMPLERS, samplers_named
 from leco_plugin.stability.worker import with_fixed_batches
 
 RESULTS = Path(__file__).parents[2] / "benchmarks" / "results"

@@ -9,7 +9,7 @@ import pytest
 from stability_runs import Runs, make, suite
 
 from leco_plugin.stability.cases import CASES
-from leco_plugin.stability.samplers import SAMPLERS
+from leco_plugin.stability.plan import SAMPLERS
 
 PAGE = Path(__file__).parents[2] / "docs" / "stability.md"
 BEGIN, END = "<!-- cases: generated -->", "<!-- end of the cases -->"

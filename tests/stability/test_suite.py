@@ -13,7 +13,7 @@ from stability_runs import TINY, Runs, make, suite
 
 from leco_plugin.stability import suite as suite_module
 from leco_plugin.stability.cases import cases_named
-from leco_plugin.stability.samplers import samplers_named
+from leco_plugin.stability.plan import samplers_named
 
 SAMPLERS = ("grid-128", "learned")
 

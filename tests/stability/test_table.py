@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 
-from leco_plugin.stability.samplers import FULL, QUICK
+from leco_plugin.stability.plan import FULL, QUICK
 from leco_plugin.stability.table import QUICKLY, blind, headline, is_unproven, table, verdicts_of
 
 SAMPLERS = [

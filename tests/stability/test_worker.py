@@ -9,21 +9,25 @@ from typing import Any
 
 import pytest
 
-from leco_plugin.chart.contender import Contender
-from leco_plugin.chart.protocol import Protocol
+from leco_plugin.chart.contender import Contender, Protocol
 from leco_plugin.samplers import registry
 from leco_plugin.samplers.base import DenseEstimator
 from leco_plugin.samplers.boxes import nested_boxes
 from leco_plugin.samplers.registry import SamplerSpec
 from leco_plugin.stability.photographs import YARD, Capture, write_scene
-from leco_plugin.stability.samplers import DENSE_LEVELS, SAMPLERS, Sizes, contender_of
+from leco_plugin.stability.plan import DENSE_LEVELS, SAMPLERS, Sizes, contender_of
 from leco_plugin.stability.verdict import judge
 from leco_plugin.stability.worker import run_cell
 
 # where a host samples does not depend on what its field has learned
 MICRO = Sizes(steps=3, rays=64, learn_rays=64, learn_steps=20, dense_samples=24, table=8)
 # steps short enough that no surface lies between two middles and near neither
-SMALL = {**MICRO.ngp, "host.cone_angle": 1 / 20, "host.max_res": 32, "host.far_plane": 8.0}
+SMALL = {
+    **MICRO.host(in_nerfacto=False),
+    "host.cone_angle": 1 / 20,
+    "host.max_res": 32,
+    "host.far_plane": 8.0,
+}
 
 
 class SkipsHalf(DenseEstimator):

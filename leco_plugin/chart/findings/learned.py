@@ -1,4 +1,4 @@
-"""The occupancies that were learned, by contender, over the seeds that froze a gate."""
+"""The occupancies that were learned, and what runs still gained in the last third of their time."""
 
 from __future__ import annotations
 
@@ -7,8 +7,9 @@ from collections.abc import Sequence
 from functools import cached_property
 from typing import Any
 
-from leco_plugin.chart.findings.summary import Line, figure_in, middle_of
-from leco_plugin.chart.findings.verdicts import compare
+import numpy as np
+
+from leco_plugin.chart.findings.summary import Line, compare, figure_in, middle_of
 
 OURS = "(ours)"
 """Marks the contender that a suite asks about."""
@@ -85,9 +86,7 @@ class Learned(Line):
 def learned_of(lines: Sequence[Line]) -> list[Learned]:
     """Of each contender that learns an occupancy with a gate, whether it was ever frozen or not;
     none where nothing was."""
-    found = [
-        Learned(line.name, line.method, line.sampler, line.runs) for line in lines if line.learned
-    ]
+    found = [Learned(**vars(line)) for line in lines if line.learned]
     return found if any(one.facts for one in found) else []
 
 
@@ -153,3 +152,71 @@ def _figures(one: Learned) -> str:
 def percent(value: float) -> str:
     """Percent with as many digits as mean something."""
     return f"{value:.1f}%" if value < 10.0 else f"{value:.0f}%"
+
+
+ENOUGH = 0.3
+"""dB in the last third of a run's time: who gains more is still rising."""
+HARDLY_TRAINED = 0.4
+"""Share of its time from which on a run that kept its grid up has hardly trained."""
+FALL = 0.3
+"""dB below the best point of a run's own curve from which on its end is said to have fallen."""
+
+
+def last_gain(line: Line) -> float | None:
+    """Mean over seeds of the PSNR gained in the last third of the training time, dB; None where the
+    curve of one has no point before that."""
+    gains = []
+    for run in line.runs:
+        seconds, psnrs = zip(*run["curve"])
+        before = 2.0 / 3.0 * seconds[-1]
+        if seconds[0] > before:
+            return None
+        gains.append(psnrs[-1] - float(np.interp(before, seconds, psnrs)))
+    return statistics.fmean(gains)
+
+
+def still_rising(lines: Sequence[Line]) -> list[str]:
+    """Names of the lines that have not had enough time.
+
+    These gained more than `ENOUGH` in the last third, or their gain is unknown, or their grid has
+    skipped nothing yet or has taken the time of training.
+    """
+
+    def rises(line: Line) -> bool:
+        gain = last_gain(line)
+        gained = gain is None or round(gain, 1) > ENOUGH
+        return gained or line.warming_up or line.kept_up > HARDLY_TRAINED
+
+    return [line.name for line in lines if rises(line)]
+
+
+def settling(lines: Sequence[Line]) -> str:
+    """The last gain of each line, which lines still rise, and whose grid took the training time."""
+    listed = ", ".join(
+        f"{line.name} {'unknown' if gain is None else f'{gain:+.1f} dB'}"
+        for line in lines
+        for gain in [last_gain(line)]
+    )
+    rising = still_rising(lines)
+    who = "all of them" if len(rising) == len(lines) else " and ".join(rising)
+    said = f"Still rising: {who}; rates" if rising else "Rates"
+    took = [line for line in lines if line.kept_up > HARDLY_TRAINED]
+    hardly = [f"{line.name} for {line.kept_up:.0%} of its time" for line in took]
+    kept_up = f" Updated its grid instead of training: {', '.join(hardly)}." if hardly else ""
+    return (
+        f"Gained in the last third of the time: {listed}. {said} fall to a tenth over the time "
+        f"that is given, so that all may gain by more of it.{kept_up}"
+    )
+
+
+def falls(lines: Sequence[Line]) -> str | None:
+    """Which lines have runs that end more than `FALL` below their own best point, in how many runs,
+    and by how much at most; None without any."""
+    fallen = []
+    for line in lines:
+        below = [max(psnr for _, psnr in run["curve"]) - run["curve"][-1][1] for run in line.runs]
+        if count := sum(fall > FALL for fall in below):
+            by = f"{'up to ' if count > 1 else ''}{max(below):.1f} dB"
+            of_all = f" in {count} of {len(below)} runs" if len(below) > 1 else ""
+            fallen.append(f"{line.name} fell by {by} from its best{of_all}")
+    return "; ".join(fallen) or None

@@ -1,4 +1,4 @@
-"""What the runs of a chart say together: a line for each contender, fronts, pairs of lines."""
+"""What the runs of a chart say together: lines, verdicts on pairs of them, and fronts."""
 
 from __future__ import annotations
 
@@ -6,14 +6,66 @@ import math
 import statistics
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.special import stdtrit
 
-from leco_plugin.chart.contender import shared_method, short_names
-from leco_plugin.chart.findings.verdicts import Verdict, compare
-from leco_plugin.chart.protocol import Protocol
+from leco_plugin.chart.contender import Protocol, shared_method, short_names
+
+CONFIDENCE = 0.95
+"""Of the interval around a difference of means; of each comparison alone, however many are made."""
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """A difference of means, and what its interval over seeds says."""
+
+    word: Literal["ahead", "level", "behind"] | None
+    """Ahead is more. None where a side has one seed, or a figure is no number."""
+    difference: float
+    margin: float | None
+    """Half the interval's width; None where there is none."""
+    seeds: tuple[int, int]
+
+    @property
+    def by(self) -> str:
+        """The number of seeds, or why there is no verdict."""
+        if self.margin is None:
+            return "one seed: no verdict" if min(self.seeds) < 2 else "not a number: no verdict"
+        ours, theirs = self.seeds
+        return f"{ours} seeds" if ours == theirs else f"{ours} and {theirs} seeds"
+
+    def said(self, unit: str = "dB", form: str = ".2f") -> str:
+        """The whole verdict, such as "ahead: +1.50 ± 0.42 dB, 3 seeds"."""
+        word = f"{self.word}: " if self.word else ""
+        margin = "" if self.margin is None else f" ± {self.margin:{form}}"
+        return f"{word}{self.difference:+{form}}{margin} {unit}, {self.by}"
+
+
+def compare(ours: Sequence[float], theirs: Sequence[float]) -> Verdict:
+    """Compares a figure of each run of two contenders by the 95% interval of Welch's t around the
+    difference of their means: level where that holds zero. Swap the two for a cost.
+
+    Runs with the same seed share nothing but its number, so that they are no pairs, and two
+    contenders need not scatter alike. `ValueError` where one of them has no run.
+    """
+    if not ours or not theirs:
+        raise ValueError(f"{len(ours)} runs cannot be compared with {len(theirs)}")
+    counts = len(ours), len(theirs)
+    difference = statistics.fmean(ours) - statistics.fmean(theirs)
+    if min(counts) < 2 or not math.isfinite(difference):
+        return Verdict(None, difference, None, counts)
+    errors = [statistics.variance(values) / len(values) for values in (ours, theirs)]
+    squared = sum(errors)
+    margin = 0.0
+    if squared > 0.0:
+        freedom = squared**2 / sum(e**2 / (n - 1) for e, n in zip(errors, counts))
+        margin = float(stdtrit(freedom, 0.5 + CONFIDENCE / 2)) * math.sqrt(squared)
+    word: Any = "ahead" if difference > 0.0 else "behind"
+    return Verdict("level" if abs(difference) <= margin else word, difference, margin, counts)
+
 
 LOST_SURFACE_MASS = 1e-3
 """Loss at which `evaluation.equal_loss` compares occupancies."""
@@ -158,9 +210,8 @@ def common_psnr(lines: Sequence[Line]) -> float:
 
 def front(points: Sequence[tuple[float, float]]) -> list[int]:
     """Which points (cost, gain) no other one beats in both: their numbers, by rising cost."""
-    order = sorted(range(len(points)), key=lambda i: (points[i][0], -points[i][1]))
     found: list[int] = []
-    for i in order:
+    for i in sorted(range(len(points)), key=lambda i: (points[i][0], -points[i][1])):
         if not found or points[i][1] > points[found[-1]][1]:
             found.append(i)
     return found
@@ -182,11 +233,11 @@ def headline(results: Mapping[str, Any]) -> str:
         return f"{ranked[0].name}: {ranked[0].psnr:.1f} dB"
     best, second = ranked[:2]
     found = compare(best.psnrs, second.psnrs)
-    figures = f"{best.psnr:.1f} and {second.psnr:.1f} dB"
     if found.margin is None:
         return f"{best.name} {best.psnr:.1f} dB, {second.name} {second.psnr:.1f} dB ({found.by})"
     apart = f"{found.difference:.2f} ± {found.margin:.2f}"
     if found.word == "level":
+        figures = f"{best.psnr:.1f} and {second.psnr:.1f} dB"
         return f"{best.name} and {second.name} are level: {figures}, {apart} apart ({found.by})"
     said = f"{best.name} is ahead: {best.psnr:.1f} dB, {apart} more than {second.name} ({found.by})"
     return f"{said}, whose grid is still in its warm-up" if second.warming_up else said
@@ -226,11 +277,7 @@ class Versus:
 
 
 def versus(ours: Line, theirs: Line, seconds: float | None) -> Versus:
-    """Compares the runs of two contenders.
-
-    Args:
-        seconds: training time that each was given; a last step beyond it does not count.
-    """
+    """Compares the runs of two contenders; a last step beyond `seconds` of each does not count."""
     most = seconds or math.inf
     curves = [run["curve"] for run in theirs.runs]
     last = statistics.fmean(curve[-1][1] for curve in curves)
