@@ -40,7 +40,7 @@ from scene_files import change, described, write_colmap, write_ply
 from leco_plugin.scenes.data_manager import LecoDataManagerConfig
 from leco_plugin.scenes.frames import data_frame_of, frame_of, inverse, moved
 from leco_plugin.scenes.mega_nerf import MegaNerfDataParserConfig
-from leco_plugin.scenes.mega_nerf_format.files import Coordinates
+from leco_plugin.scenes.mega_nerf_files import Coordinates
 from leco_plugin.scenes.photographs import POINTS, LecoPhotographsDataParserConfig
 from leco_plugin.scenes.survey import points_in, survey
 

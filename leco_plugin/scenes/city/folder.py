@@ -9,7 +9,7 @@ depths/*.npy       float32 [h, w], millimetres along the viewing axis, 0 where n
 transforms.json    cameras and splits
 sparse_pc.ply      some visible surface points, like those of structure from motion
 
-As a Mega-NeRF scene: see `mega_nerf_format.files`.
+As a Mega-NeRF scene: see `mega_nerf_files`.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ import leco_plugin
 from leco_plugin.scenes.city.cameras import CaptureConfig, Lens, View, views_of
 from leco_plugin.scenes.city.city import DESCRIPTION, City, CityConfig, read_description
 from leco_plugin.scenes.input_error import one_line
-from leco_plugin.scenes.mega_nerf_format.files import (
+from leco_plugin.scenes.mega_nerf_files import (
     Coordinates,
     Split,
     around,

@@ -18,7 +18,7 @@ from torch import Tensor
 
 from leco_plugin.scenes.city.city import City, read_description
 from leco_plugin.scenes.city.folder import CaptureConfig, read_transforms
-from leco_plugin.scenes.mega_nerf_format.files import TO_DRB
+from leco_plugin.scenes.mega_nerf_files import TO_DRB
 
 
 @dataclass

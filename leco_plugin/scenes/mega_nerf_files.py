@@ -26,8 +26,8 @@ from PIL import Image
 from leco_plugin.scenes.city.shapes import Array
 from leco_plugin.scenes.frames import SKEW, distance_from_rotations
 from leco_plugin.scenes.input_error import InputError
-from leco_plugin.scenes.mega_nerf_format.pt_file import describe, read_pt
 from leco_plugin.scenes.photograph_files import open_image
+from leco_plugin.scenes.pt_file import describe, read_pt
 from leco_plugin.scenes.whole_files import write_whole
 
 Split = Literal["train", "val"]
@@ -96,10 +96,8 @@ def wrong_axis(poses: Array) -> str | None:
     rights, tops, looks = poses[:, :, 0], poses[:, :, 1], -poses[:, :, 2]
 
     def upright(axis: int, sign: float) -> float:
-        level = np.abs(rights[:, axis]) < 0.35
-        return float(
-            np.mean(level & (sign * looks[:, axis] > -0.35) & (sign * tops[:, axis] < 0.35))
-        )
+        level, down = np.abs(rights[:, axis]) < 0.35, sign * looks[:, axis] > -0.35
+        return float(np.mean(level & down & (sign * tops[:, axis] < 0.35)))
 
     shares = {name: upright(*where) for name, where in _DIRECTIONS.items()}
     # Of directions that fit equally well, down is the one that cameras look along.
@@ -169,13 +167,10 @@ class MegaNerfScene:
 def read_scene(
     folder: Path, check_axes: bool = True, progress: Callable[[float], None] = lambda share: None
 ) -> MegaNerfScene:
-    """Reads and checks everything but pixels.
+    """Reads and checks everything but pixels; `progress` is told the share of files that are read.
 
-    Args:
-        check_axes: whether to refuse a world whose first axis does not point down.
-        progress: told the share of the files that are read.
-    Raises:
-        InputError: one line that names a file and what is wrong with it.
+    `check_axes` refuses a world whose first axis does not point down. InputError, in one line,
+    names a file and what is wrong with it.
     """
     if not folder.is_dir():
         raise InputError(f"there is no folder {folder}; give one with --data")
