@@ -12,7 +12,7 @@ from leco_plugin.evaluation.inspection import in_parts
 from leco_plugin.evaluation.report import finite_or_null
 from leco_plugin.occupancy import CALIBRATED_AT, Occupancy
 from leco_plugin.scenes.city.city import DESCRIPTION
-from leco_plugin.scenes.city.truth import CityTruth
+from leco_plugin.scenes.city.folder import CityTruth
 
 FROM_REPORT = (
     "train_seconds",

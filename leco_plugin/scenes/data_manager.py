@@ -25,15 +25,13 @@ from rich.markup import escape
 from torch import Tensor
 
 from leco_plugin.log import say
-from leco_plugin.scenes.frames import UP_IS_KNOWN
+from leco_plugin.scenes.frames import UP_IS_KNOWN, turn_outputs, turn_to_upright
 from leco_plugin.scenes.input_error import InputError
 from leco_plugin.scenes.photograph_files import names_what_it_cannot_read
-from leco_plugin.scenes.pixels.held_out_pixels import HeldOutPixelSampler
-from leco_plugin.scenes.pixels.lattice import Lattice, lattice_for
+from leco_plugin.scenes.pixels.held_out_pixels import HeldOutPixelSampler, Lattice, lattice_for
 from leco_plugin.scenes.pixels.stored_pictures import picture_sizes, store_pictures
 from leco_plugin.scenes.reading import read_checked
 from leco_plugin.scenes.survey import CAMERAS, points_in
-from leco_plugin.scenes.upright import turn_to_upright, turned
 from leco_plugin.studio.run_folder import keeps_all_images
 
 MOST_OF_MEMORY = 0.4
@@ -209,7 +207,7 @@ def upright_outputs(read: Callable[..., DataparserOutputs]) -> Callable[..., Dat
             training = outputs if split == "train" else read(split="train", **kwargs)
             known.append(_turn_of(training))
         turn = known[0]
-        return outputs if turn is None else turned(outputs, turn)
+        return outputs if turn is None else turn_outputs(outputs, turn)
 
     return outputs_of
 

@@ -19,6 +19,8 @@ from leco_plugin.scenes.bounds import BoundsConfig
 from leco_plugin.scenes.frames import data_frame_of, frame_of
 from leco_plugin.scenes.pixels.held_out_pixels import (
     HeldOutPixelSampler,
+    Lattice,
+    Share,
     held_out_sampler,
     some_images,
 )
@@ -28,7 +30,6 @@ from leco_plugin.scenes.pixels.known_distances import (
     sampler_here,
     sparse_pixels,
 )
-from leco_plugin.scenes.pixels.lattice import Lattice, Share
 from leco_plugin.scenes.survey import Survey, covering_rays, sparse_points, survey
 from leco_plugin.seen import rays_a_side
 

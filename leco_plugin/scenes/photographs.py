@@ -9,13 +9,14 @@ from __future__ import annotations
 import hashlib
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 import torch
 from nerfstudio.data.dataparsers.base_dataparser import DataparserOutputs
 from nerfstudio.data.dataparsers.nerfstudio_dataparser import Nerfstudio, NerfstudioDataParserConfig
 from nerfstudio.plugins.registry_dataparser import DataParserSpecification
+from numpy.typing import NDArray
 from rich.markup import escape
 from torch import Tensor
 
@@ -23,6 +24,7 @@ from leco_plugin.log import say
 from leco_plugin.scenes.coloured_points import GREY, CloudFile, read_cloud
 from leco_plugin.scenes.frames import (
     METRES_PER_UNIT,
+    POINTS,
     UP_IS_KNOWN,
     applied_in,
     from_file,
@@ -34,11 +36,7 @@ from leco_plugin.scenes.large_coordinates import ReadsNear
 from leco_plugin.scenes.photograph_files import check_images, find_file
 from leco_plugin.scenes.reading import CheckedReader
 from leco_plugin.scenes.scene_file import load_json, scene_file_of
-from leco_plugin.scenes.stretch import stretch_of
 
-POINTS = "points3D_xyz"
-"""Key of the dataset's metadata with the sparse points [P, 3] in model coordinates, as nerfstudio's
-own readers have it."""
 COLOURS = "points3D_rgb"
 """That of their colours, uint8 [P, 3]. nerfstudio's pipelines want both or neither."""
 HeldOut = Literal["spread", "stretch"]
@@ -196,12 +194,6 @@ def read_ply(path: Path, dtype: torch.dtype = torch.float32) -> Tensor:
     return torch.from_numpy(read_cloud(path).positions).to(dtype)
 
 
-leco_photographs_dataparser = DataParserSpecification(
-    config=LecoPhotographsDataParserConfig(),
-    description="A scene in nerfstudio's format, checked, upright, with its sparse points.",
-)
-
-
 def describe_held_out(data: Path, kind: HeldOut) -> dict[str, Any]:
     """Which photographs of a scene are tested, as JSON values: the `kind`, and of a stretch the
     names of those of `test` and of those `beside` it. InputError if none can be held out."""
@@ -217,3 +209,103 @@ def describe_scene(data: Path) -> dict[str, Any]:
     digest = hashlib.sha256(description.read_bytes()).hexdigest()
     name = folder_of(data).resolve().name
     return {"name": name, "images": len(meta["frames"]), "digest": digest[:16]}
+
+
+Array = NDArray[np.float64]
+LEAST, WANTED, MOST = 1 / 12, 1 / 8, 1 / 4
+"""Shares of all cameras that a stretch may have, and the one that it has where nothing decides."""
+CLEAR = 0.8
+"""Share of the widest gap behind a stretch from which on another gap is as clear an end."""
+BESIDE = 1.5
+"""A camera stands beside a stretch up to so many times the usual distance between neighbours."""
+FEWEST = 12
+"""Cameras of which a stretch can be held out."""
+TRAINED = 0.5
+"""Least share of the cameras that is still trained on."""
+
+
+class Stretch(NamedTuple):
+    """Which cameras are held out, and which are neither tested nor trained on."""
+
+    held_out: list[int]
+    beside: list[int]
+
+
+def find_stretch(positions: Array) -> Stretch:
+    """The stretch of cameras near the middle that ends with the widest gap.
+
+    It grows from the camera next to the middle, by the nearest camera each time, and so follows a
+    line or an arc whose cameras are nearer to each other than to those of the next line.
+
+    Args:
+        positions: [C, 3], in any units.
+    Returns:
+        Numbers of cameras, in their order.
+    Raises:
+        ValueError: there are too few cameras, or they stand too close together.
+    """
+    count = len(positions)
+    if count < FEWEST:
+        raise ValueError(
+            f"there are {count} cameras, and a stretch is held out of {FEWEST} or more"
+        )
+    order, gaps = _grow(positions)
+    low, high = max(2, round(LEAST * count)), round(MOST * count)
+    behind = gaps[low - 1 : high]  # behind a stretch of `low` cameras, and so on
+    sizes = np.flatnonzero(behind >= CLEAR * behind.max()) + low
+    size = int(sizes[np.abs(sizes - WANTED * count).argmin()])
+    held_out, rest = order[:size], order[size:]
+    away = np.full(len(rest), np.inf)
+    for number in held_out:
+        away = np.minimum(away, np.linalg.norm(positions[rest] - positions[number], axis=1))
+    apart = gaps[gaps > 1e-6 * gaps.max()]
+    beside = rest[away <= BESIDE * np.median(apart)] if len(apart) else rest
+    if count - size - len(beside) < TRAINED * count:
+        raise ValueError(
+            f"beside a stretch of {size} of {count} cameras there are {len(beside)} others, too "
+            "many to leave them out of training"
+        )
+    return Stretch(sorted(held_out.tolist()), sorted(beside.tolist()))
+
+
+def _grow(positions: Array) -> tuple[NDArray[np.int64], Array]:
+    """All cameras [C], each the nearest to those before it, and how far it is from them [C - 1]."""
+    left = np.linalg.norm(positions - positions.mean(axis=0), axis=1)
+    order, gaps = [int(left.argmin())], []
+    away = np.full(len(positions), np.inf)
+    for _ in range(len(positions) - 1):
+        away = np.minimum(away, np.linalg.norm(positions - positions[order[-1]], axis=1))
+        away[order] = np.inf
+        order.append(int(away.argmin()))
+        gaps.append(float(away[order[-1]]))
+    return np.array(order), np.array(gaps)
+
+
+def stretch_of(meta: dict[str, Any], scene: str) -> dict[str, list[str]]:
+    """Names of the photographs of a transforms.json, by what they are for.
+
+    Args:
+        meta: what the file says.
+        scene: named in the error.
+    Returns:
+        `train`, `test`, and `beside`: left out, as they stand next to the tested ones.
+    Raises:
+        InputError: no stretch can be held out of it.
+    """
+    poses = np.array([frame["transform_matrix"] for frame in meta["frames"]], dtype=float)
+    try:
+        found = find_stretch(poses[:, :3, 3])
+    except ValueError as error:
+        raise InputError(f"{scene}: {error}; hold out photographs of the spread instead") from None
+    names: dict[str, list[str]] = {"train": [], "test": [], "beside": []}
+    for number, frame in enumerate(meta["frames"]):
+        kind = "test" if number in found.held_out else "beside"
+        kind = kind if number in found.held_out + found.beside else "train"
+        names[kind].append(str(frame["file_path"]))
+    return names
+
+
+leco_photographs_dataparser = DataParserSpecification(
+    config=LecoPhotographsDataParserConfig(),
+    description="A scene in nerfstudio's format, checked, upright, with its sparse points.",
+)

@@ -27,7 +27,6 @@ from rich.markup import escape
 from leco_plugin.log import bar, say
 from leco_plugin.scenes.frames import check_poses
 from leco_plugin.scenes.input_error import InputError, one_line
-from leco_plugin.scenes.known_folders import READERS, command_with, has_model, remedy_for
 from leco_plugin.scenes.large_coordinates import near_bases
 from leco_plugin.scenes.lenses import Lens, set_lenses
 from leco_plugin.scenes.photograph_files import (
@@ -42,11 +41,15 @@ from leco_plugin.scenes.photograph_files import (
     is_turned,
 )
 from leco_plugin.scenes.scene_file import (
+    READERS,
     SceneFile,
+    command_with,
     description_of,
     factors_of,
     frames_of,
+    has_model,
     own_target,
+    remedy_for,
     say_unused,
     scene_file_of,
 )

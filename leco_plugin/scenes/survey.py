@@ -21,10 +21,9 @@ from leco_plugin.scenes.bounds import (
     usable_points,
     with_range,
 )
-from leco_plugin.scenes.frames import ALTITUDES, DatasetUnits, units_of
+from leco_plugin.scenes.frames import ALTITUDES, POINTS, DatasetUnits, units_of
 from leco_plugin.scenes.input_error import InputError
 from leco_plugin.scenes.large_coordinates import rounded_by
-from leco_plugin.scenes.photographs import POINTS
 
 SIDE = 8
 """A grid of this many rays a side covers each image, its corners included."""

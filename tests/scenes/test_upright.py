@@ -15,9 +15,9 @@ from torch import Tensor
 
 from leco_plugin.scenes.city.cameras import look_at
 from leco_plugin.scenes.data_manager import LecoDataManagerConfig, upright_outputs
+from leco_plugin.scenes.frames import _vertical_of, turn_to_upright
 from leco_plugin.scenes.photographs import LecoPhotographsDataParserConfig, read_ply
 from leco_plugin.scenes.survey import survey
-from leco_plugin.scenes.upright import _vertical_of, turn_to_upright
 
 UP = torch.tensor([0.0, 0.0, 1.0])
 

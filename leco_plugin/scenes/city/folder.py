@@ -10,6 +10,9 @@ transforms.json    cameras and splits
 sparse_pc.ply      some visible surface points, like those of structure from motion
 
 As a Mega-NeRF scene: see `mega_nerf_files`.
+
+`CityTruth` reads it as a model sees it. nerfstudio moves and shrinks a scene before: x_model =
+scale * (R x + t), with [R | t] the dataparser's transform. There the way back is taken.
 """
 
 from __future__ import annotations
@@ -19,20 +22,24 @@ import hashlib
 import json
 import shutil
 from abc import ABC, abstractmethod
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
 from PIL import Image
+from torch import Tensor
 
 import leco_plugin
 from leco_plugin.scenes.city.cameras import CaptureConfig, Lens, View, views_of
 from leco_plugin.scenes.city.city import DESCRIPTION, City, CityConfig, read_description
 from leco_plugin.scenes.input_error import one_line
 from leco_plugin.scenes.mega_nerf_files import (
+    TO_DRB,
     Coordinates,
     Split,
     around,
@@ -304,3 +311,74 @@ def read_transforms(folder: Path) -> dict[str, Any]:
         message = f"{folder} is damaged: {TRANSFORMS}: {one_line(error)}"
         raise ValueError(message) from error
     return dict(transforms)
+
+
+@dataclass
+class CityTruth:
+    """A city seen through a dataparser's transform."""
+
+    city: City
+    folder: Path
+    transform: Tensor
+    """[3, 4] from metres to model axes, before scaling."""
+    scale: float
+    """Model units in a metre."""
+
+    @classmethod
+    def from_dataparser(cls, folder: Path | str, outputs: Any) -> CityTruth:
+        """From a city's folder and nerfstudio's `DataparserOutputs` for it. ValueError or OSError
+        if the folder holds no city."""
+        folder = Path(folder)
+        transform = outputs.dataparser_transform.double().cpu()
+        if read_description(folder)["layout"] == "mega-nerf":
+            turn = torch.from_numpy(TO_DRB)  # that reader begins at (down, right, back)
+            transform = torch.cat([transform[:, :3] @ turn, transform[:, 3:]], dim=1)
+        return cls(City.from_folder(folder), folder, transform, float(outputs.dataparser_scale))
+
+    def to_metres(self, positions: Tensor) -> NDArray[np.float64]:
+        """Model positions [..., 3] in metres: float64 [..., 3]."""
+        rotation, shift = self.transform[:, :3], self.transform[:, 3]
+        return (
+            (positions.detach().double().cpu() / self.scale - shift) @ torch.linalg.inv(rotation).T
+        ).numpy()
+
+    def to_model(self, positions: NDArray[np.floating]) -> Tensor:
+        """Positions [..., 3] in metres as model positions: float32 [..., 3]."""
+        metres = torch.as_tensor(positions, dtype=torch.float64)
+        return (self.scale * (metres @ self.transform[:, :3].T + self.transform[:, 3])).float()
+
+    def occupied(self, positions: Tensor) -> Tensor:
+        """Whether model positions [..., 3] lie inside solid matter: bool [...]."""
+        return self._ask(self.city.occupied, positions)
+
+    def distance(self, positions: Tensor) -> Tensor:
+        """Distance from model positions [..., 3] to the nearest surface, in metres: float32 [...].
+
+        Times `scale`, it is in model units.
+        """
+        return self._ask(self.city.distance, positions).float()
+
+    def _ask(self, question: Callable[[NDArray[Any]], NDArray[Any]], positions: Tensor) -> Tensor:
+        """What the city answers at model positions [..., 3]: [...]."""
+        metres = self.to_metres(positions)
+        answers = question(metres.reshape(-1, 3)).reshape(metres.shape[:-1])
+        return torch.from_numpy(answers).to(positions.device)
+
+    def visible_surface(self, split: Literal["train", "val", "test"] = "test") -> Tensor:
+        """The surface point at the middle of each pixel of a split's pictures, where there is one.
+
+        Returns:
+            [P, 3] float32, model coordinates.
+        """
+        lens = CaptureConfig(**read_description(self.folder)["capture"]).lens
+        transforms = read_transforms(self.folder)
+        wanted = set(transforms[f"{split}_filenames"])
+        found = []
+        for frame in transforms["frames"]:
+            if frame["file_path"] in wanted:
+                depth = lens.along_ray(
+                    np.load(self.folder / frame["depth_file_path"], allow_pickle=False)
+                )
+                points = lens.points(np.array(frame["transform_matrix"])[:3], depth)
+                found.append(self.to_model(points[np.isfinite(depth)]))
+        return torch.cat(found)

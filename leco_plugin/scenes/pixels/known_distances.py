@@ -13,10 +13,10 @@ from torch import Tensor
 from leco_plugin.scenes.pixels.held_out_pixels import (
     HeldOutPixelSampler,
     HeldOutPixelSamplerConfig,
+    Lattice,
     look_up,
     sizes_of,
 )
-from leco_plugin.scenes.pixels.lattice import Lattice
 
 NEARER = 0.9
 """A point hides its neighbours in the image that are farther than it by more than this factor."""

@@ -13,20 +13,25 @@ import numpy as np
 
 from leco_plugin.log import bar, resumable
 from leco_plugin.scenes.input_error import InputError, require
-from leco_plugin.scenes.poses.georeference import Placement, local_places, place, upright
+from leco_plugin.scenes.poses.georeference import (
+    Placement,
+    local_places,
+    place,
+    points_of,
+    poses_of,
+    transforms_of,
+    upright,
+    write_scene,
+)
 from leco_plugin.scenes.poses.originals import Photograph, copy_photographs, find_photographs
-from leco_plugin.scenes.poses.pairs import choose_pairs
 from leco_plugin.scenes.poses.reconstruction import (
     DATABASE,
     ENTERED,
     Lens,
     Reconstructor,
     available_threads,
+    choose_pairs,
     load_pycolmap,
-    points_of,
-    poses_of,
-    transforms_of,
-    write_scene,
 )
 from leco_plugin.scenes.whole_files import remove_parts, write_whole
 

@@ -30,15 +30,14 @@ from leco_plugin.scenes.photograph_files import (
     seen_pixels,
 )
 from leco_plugin.scenes.photographs import LecoPhotographsDataParserConfig, folder_of, read_points
+from leco_plugin.scenes.poses.georeference import points_of, write_sparse_points
 from leco_plugin.scenes.poses.originals import FEWEST, Exif, Photograph
-from leco_plugin.scenes.poses.pairs import choose_posed_pairs
 from leco_plugin.scenes.poses.reconstruction import (
     MASKS,
     Reconstructor,
     available_threads,
+    choose_posed_pairs,
     load_pycolmap,
-    points_of,
-    write_sparse_points,
 )
 from leco_plugin.scenes.scene_file import SceneFile, scene_file_of
 from leco_plugin.scenes.whole_files import write_whole
