@@ -55,10 +55,8 @@ def description_of_run(file: Path) -> Path | None:
 
 
 def _data_named_in(config: Path) -> Path | None:
-    """The data that a run's config.yml names; None where it cannot be read.
-
-    Nothing in it is executed, and classes that this version lacks do not matter.
-    """
+    """The data that a run's config.yml names; None where it cannot be read. Nothing in it is
+    executed, and classes that this version lacks do not matter."""
     import yaml
 
     class Plain(yaml.SafeLoader):
@@ -79,11 +77,7 @@ def _data_named_in(config: Path) -> Path | None:
 
 
 def description_in(data: Path) -> Path:
-    """The transforms.json that `data` means: itself, or that in the folder.
-
-    Raises:
-        InputError: there is none.
-    """
+    """The transforms.json that `data` means: itself, or that in the folder. InputError for none."""
     file = _file_in(data)
     if not file.is_file():
         raise InputError(f"--data {data}: there is no transforms.json; give a nerfstudio scene")
@@ -95,11 +89,7 @@ def _file_in(data: Path) -> Path:
 
 
 def read_cloud(path: Path) -> CloudFile:
-    """The vertices of a .ply, without those that are not finite.
-
-    Raises:
-        InputError: the file cannot be read as points.
-    """
+    """The finite vertices of a .ply. InputError if the file cannot be read as points."""
     import trimesh
 
     try:
@@ -118,11 +108,8 @@ def read_cloud(path: Path) -> CloudFile:
 
 
 def coloured_points(description: Path) -> ColouredPoints | None:
-    """Sparse points with colours that a transforms.json names; None where it names none.
-
-    Raises:
-        InputError: the file of the points cannot be read.
-    """
+    """Sparse points with colours that a transforms.json names, or None. InputError if they cannot
+    be read."""
     name = load_json(description).get("ply_file_path")
     path = description.parent / str(name)
     if name is None or not path.is_file():

@@ -98,10 +98,8 @@ class LecoDataManager(VanillaDataManager):  # type: ignore[type-arg]
         return dataset
 
     def _get_pixel_sampler(self, dataset: Any, num_rays_per_batch: int) -> Any:
-        """nerfstudio's choice; of small scenes more pixels are held out.
-
-        The radius of a fisheye's circle is given by hand, or that of the full-size image.
-        """
+        """nerfstudio's choice; of small scenes more pixels are held out, and the radius of a
+        fisheye's circle is given by hand, or that of the full-size image."""
         by_hand = self.config.pixel_sampler.fisheye_crop_radius
         sampler = super()._get_pixel_sampler(dataset, num_rays_per_batch)
         of_scene = (dataset.cameras.metadata or {}).get("fisheye_crop_radius")
@@ -227,13 +225,8 @@ def _turn_of(outputs: DataparserOutputs) -> Tensor | None:
 
 
 def read_in_words(data: Path, training: Any, tests: int) -> str:
-    """What was read of a scene, in one line.
-
-    Args:
-        data: its folder or file.
-        training: the dataset of training photographs.
-        tests: how many test photographs there are.
-    """
+    """What was read of a scene (folder or file, training dataset, number of test photographs): one
+    line."""
     sizes = picture_sizes(training)
     height, width = sizes.amax(dim=0).tolist()
     size = f"{'' if bool((sizes == sizes[0]).all()) else 'up to '}{width} x {height}"

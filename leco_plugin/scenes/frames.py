@@ -23,11 +23,9 @@ from leco_plugin.scenes.input_error import InputError
 
 
 def frame_of(datamanager: Any) -> list[list[float]] | None:
-    """What took the scene's coordinates to the model's: [3, 4], JSON values; None is not known.
-
-    The scene's are those of its reconstruction, before any `applied_transform` of its file, so that
-    all readers of it mean the same.
-    """
+    """What took the scene's coordinates to the model's: [3, 4], JSON values; None is not known. The
+    scene's are those of its reconstruction, before any `applied_transform`, so that all readers of
+    it mean the same."""
     outputs = getattr(datamanager, "train_dataparser_outputs", None)
     if outputs is None:
         return None
@@ -36,10 +34,8 @@ def frame_of(datamanager: Any) -> list[list[float]] | None:
 
 
 def data_frame_of(datamanager: Any) -> list[list[float]] | None:
-    """What took positions as the data's own files have them to the model's: [3, 4], JSON values.
-
-    It differs from `frame_of` where a transforms.json has an `applied_transform`.
-    """
+    """What took positions in the data's own files to the model's: [3, 4], JSON values. It differs
+    from `frame_of` where a transforms.json has an `applied_transform`."""
     frame = frame_of(datamanager)
     if frame is None:
         return None
@@ -119,13 +115,8 @@ def from_file(
 
 
 def between(host: list[list[float]], other: list[list[float]]) -> Tensor:
-    """Takes positions of the host to those of the other: [3, 4] float32.
-
-    Args:
-        host, other: [3, 4] each, from one scene's coordinates, as of `frame_of`.
-    Returns:
-        The identity, exactly, where the two agree to a millionth.
-    """
+    """Takes positions of the host to those of the other: [3, 4] float32, of two frames [3, 4] from
+    one scene's coordinates; exactly the identity where they agree to a millionth."""
     a, b = (torch.tensor(frame, dtype=torch.float64) for frame in (host, other))
     turn = b[:, :3] @ torch.linalg.inv(a[:, :3])
     frame = torch.cat([turn, (b[:, 3] - turn @ a[:, 3])[:, None]], dim=1).float()
@@ -196,10 +187,8 @@ class DatasetUnits:
 
 def units_of(datamanager: Any, metres_per_unit: float | None = None) -> DatasetUnits | None:
     """The units of a data manager's dataset; None where its dataparser does not say what it did.
-
-    `metres_per_unit`, of the dataset's own poses, is positive, or InputError; None takes what the
-    dataparser knows.
-    """
+    InputError unless `metres_per_unit` of its poses is positive, or None: what the dataparser
+    knows."""
     outputs = getattr(datamanager, "train_dataparser_outputs", None)
     scale = float(getattr(outputs, "dataparser_scale", 0.0))
     if outputs is None or not 0.0 < scale < math.inf:
@@ -225,10 +214,8 @@ SKEW = 0.05
 
 
 def distance_from_rotations(matrices: NDArray[np.floating]) -> NDArray[np.floating]:
-    """How far [C, 3, 3] are from rotations: the largest error of R R^T = 1 and of det R = 1, [C].
-
-    A mirrored rotation has 2. The matrices are finite.
-    """
+    """How far finite [C, 3, 3] are from rotations: the largest error of R R^T = 1 and of det R = 1,
+    [C]; a mirrored rotation has 2."""
     errors = np.abs(matrices @ matrices.swapaxes(1, 2) - np.eye(3)).max(axis=(1, 2))
     return np.maximum(errors, np.abs(np.linalg.det(matrices) - 1.0))
 
@@ -274,12 +261,8 @@ holds all photographs alike, are closer together."""
 def turn_to_upright(poses: Tensor, points: Tensor | None) -> Tensor | None:
     """The rotation [3, 3] that sets a survey from the air upright; None if it is, or is no survey.
 
-    What is up is where the cameras are over a flat ground, where their right axes are level, or
-    where they fly in a layer, whichever is known.
-
-    Args:
-        poses: [C, 3, 4] OpenGL camera to world.
-        points: [P, 3] sparse points in the same coordinates, or None.
+    Up is where the cameras are over a flat ground, where their right axes are level, or where they
+    fly in a layer, whichever is known. Poses are [C, 3, 4] OpenGL's, points [P, 3] or None.
     """
     poses = poses.detach().double().cpu()
     looks, places = -poses[:, :, 2], poses[:, :, 3]

@@ -89,9 +89,8 @@ def around(positions: Array) -> Coordinates:
 def wrong_axis(poses: Array) -> str | None:
     """Why the poses [C, 3, 4] of a scene are not (down, right, back), or None if they may be.
 
-    A camera is taken to be upright: its right axis is level, it does not look far above the
-    horizon, and its top is not below. Whichever direction is down, nearly all cameras of a survey
-    agree on it.
+    An upright camera's right axis is level, it does not look far above the horizon, and its top is
+    not below. Whichever direction is down, nearly all cameras of a survey agree on it.
     """
     rights, tops, looks = poses[:, :, 0], poses[:, :, 1], -poses[:, :, 2]
 
@@ -333,13 +332,8 @@ def write_view(
     pose: Array,
     intrinsics: tuple[float, float, float, float],
 ) -> None:
-    """Writes a picture and then its metadata.
-
-    Args:
-        image: [H, W, 3] or, with transparency, [H, W, 4].
-        pose: [3, 4] camera to world as the file holds it: `Coordinates.to_file`.
-        intrinsics: fx, fy, cx, cy in pixels.
-    """
+    """Writes a picture [H, W, 3 or 4] and then its metadata: a pose [3, 4] as `Coordinates.to_file`
+    has it, and fx, fy, cx, cy in pixels."""
     metadata: dict[str, Any] = {
         "H": image.shape[0],
         "W": image.shape[1],

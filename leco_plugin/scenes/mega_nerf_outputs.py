@@ -67,10 +67,8 @@ def read(config: MegaNerfDataParserConfig) -> MegaNerfScene:
 def outputs_of(
     config: MegaNerfDataParserConfig, scene: MegaNerfScene, training: bool
 ) -> DataparserOutputs:
-    """The pictures that are trained on, or those that are scored, as nerfstudio takes them.
-
-    InputError if a picture, a mask or the file of points is wrong.
-    """
+    """The pictures that are trained on, or scored, as nerfstudio takes them. InputError if a
+    picture, a mask or the file of points is wrong."""
     half = config.protocol == "half"
     splits = ("train", "val") if training and half else ("train",) if training else ("val",)
     frames = [frame for frame in scene.frames if frame.split in splits]

@@ -169,12 +169,8 @@ def points_of(meta: dict[str, Any], folder: Path) -> CloudFile | None:
 
 
 def points_in_model(points: CloudFile, frame: Tensor) -> dict[str, Tensor]:
-    """Sparse points and their colours as nerfstudio's own readers return them: splatfacto starts
-    there, from grey ones where the file has no colours.
-
-    Args:
-        frame: [3, 4] takes them to model coordinates.
-    """
+    """Sparse points and colours, taken to the model by a frame [3, 4], as nerfstudio's own readers
+    return them: splatfacto starts there, from grey ones where the file has no colours."""
     colours = points.colours
     if colours is None:
         colours = np.full(points.positions.shape, GREY, np.uint8)
@@ -232,17 +228,11 @@ class Stretch(NamedTuple):
 
 
 def find_stretch(positions: Array) -> Stretch:
-    """The stretch of cameras near the middle that ends with the widest gap.
+    """The stretch of cameras at [C, 3] near the middle that ends with the widest gap, by number.
 
     It grows from the camera next to the middle, by the nearest camera each time, and so follows a
-    line or an arc whose cameras are nearer to each other than to those of the next line.
-
-    Args:
-        positions: [C, 3], in any units.
-    Returns:
-        Numbers of cameras, in their order.
-    Raises:
-        ValueError: there are too few cameras, or they stand too close together.
+    line or an arc whose cameras are nearer to each other than to those of the next line. ValueError
+    if there are too few cameras, or they stand too close together.
     """
     count = len(positions)
     if count < FEWEST:
@@ -282,16 +272,8 @@ def _grow(positions: Array) -> tuple[NDArray[np.int64], Array]:
 
 
 def stretch_of(meta: dict[str, Any], scene: str) -> dict[str, list[str]]:
-    """Names of the photographs of a transforms.json, by what they are for.
-
-    Args:
-        meta: what the file says.
-        scene: named in the error.
-    Returns:
-        `train`, `test`, and `beside`: left out, as they stand next to the tested ones.
-    Raises:
-        InputError: no stretch can be held out of it.
-    """
+    """Names of the photographs of a transforms.json: `train`, `test`, and `beside`, left out as
+    they stand next to the tested ones. InputError, with `scene`, if no stretch can be held out."""
     poses = np.array([frame["transform_matrix"] for frame in meta["frames"]], dtype=float)
     try:
         found = find_stretch(poses[:, :3, 3])

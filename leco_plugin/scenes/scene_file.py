@@ -53,10 +53,8 @@ class SceneFile:
 
 
 def load_json(path: Path) -> Any:
-    """What a JSON file says, with or without a byte order mark.
-
-    What is null in a frame is left out, and a pose of three rows has the fourth.
-    """
+    """What a JSON file says, with or without a byte order mark; nulls of frames are left out, and
+    poses of three rows have the fourth."""
     said = _parsed(path.read_bytes())
     if not isinstance(said, dict):
         return said
@@ -81,12 +79,8 @@ def _completed(frame: Any) -> Any:
 
 
 def read_scene_file(path: Path, split: str, folder: Path) -> SceneFile:
-    """A transforms.json. InputError if its poses and lenses are none that cameras have.
-
-    Args:
-        split: that is read; only the cameras of training need more places than one.
-        folder: to which names of pictures are relative.
-    """
+    """A transforms.json, whose pictures are relative to `folder`. InputError if its poses and
+    lenses are none that cameras have, or all cameras of a training split are in one place."""
     try:
         meta = load_json(path)
         frames = [frame for name in FRAMES for frame in meta.get(name, [])]
@@ -138,10 +132,8 @@ def description_of(config: Any, split: str) -> Path | None:
 
 
 def scene_file_of(config: Any, split: str) -> SceneFile | None:
-    """The transforms.json that a reader is about to read; None where it reads others.
-
-    InputError if it is not there, or nerfstudio would fail at it or read it wrongly.
-    """
+    """The transforms.json that a reader is about to read; None where it reads others. InputError if
+    it is not there, or nerfstudio would fail at it or read it wrongly."""
     data, file = Path(config.data), description_of(config, split)
     if file is None:
         return None
@@ -177,9 +169,7 @@ def _add(scene: SceneFile, data: Path) -> str:
 
 def frames_of(images: list[Path], scene: SceneFile) -> list[int | None]:
     """The number of the frame of each picture, which may be a smaller one of the same name.
-
-    InputError if frames of different folders would have one smaller picture.
-    """
+    InputError if frames of different folders would have one smaller picture."""
     places = [str(frame["file_path"]).replace("\\", "/") for frame in scene.frames]
     named: dict[str, list[int]] = {}
     for number, place in enumerate(places):
@@ -206,11 +196,8 @@ def frames_of(images: list[Path], scene: SceneFile) -> list[int | None]:
 def factors_of(
     scene: SceneFile, numbers: list[int | None], config: Any, cameras: Cameras
 ) -> list[int]:
-    """By which whole number a reader has made each camera smaller than its lens says.
-
-    nerfstudio's own has one factor for the scene; that of Blender's scenes takes the size of the
-    first picture for all, and the others take the pictures as they are.
-    """
+    """By which whole number a reader has made each camera smaller than its lens says: nerfstudio's
+    own by one factor for the scene, Blender's by the size of the first picture, others by none."""
     known = [(row, number) for row, number in enumerate(numbers) if number is not None]
     if not known or not (hasattr(config, "downscale_factor") or hasattr(config, "alpha_color")):
         return [1] * len(numbers)

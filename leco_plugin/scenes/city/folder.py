@@ -125,10 +125,8 @@ class NerfstudioLayout(Layout):
         }
 
     def _points(self, folder: Path) -> NDArray[Any]:
-        """Some surface points of each view, [N] rows of `xyz` (metres) and `rgb`.
-
-        They are read back from its files, so that what a killed run wrote counts too.
-        """
+        """Some surface points of each view, [N] rows of `xyz` (metres) and `rgb`; read back from
+        its files, so that what a killed run wrote counts too."""
         random = np.random.default_rng([self.seed, 13])
         rows = []
         for view in self.views:
@@ -192,18 +190,12 @@ def write_city(
     progress: bool = True,
     layout: LayoutName = "nerfstudio",
 ) -> Path:
-    """Writes the city as a scene, unless `out_dir` already holds just that.
+    """Writes the city as a scene into `out_dir`, unless it already holds just that; returns it.
 
     The folder appears under its name only when it is complete. Until then the pictures lie in a
     hidden folder beside it; a run that was killed is taken up there, and several may work on it.
-
-    Args:
-        out_dir: the folder to write, which is returned; its parents are made.
-        capture: how it is photographed, by default about 60 small aerial pictures for 3 blocks.
-        progress: whether to show a bar.
-    Raises:
-        FileExistsError: `out_dir` holds something else, and is left alone.
-        ValueError: `out_dir` holds a damaged city, and is left alone.
+    Without `capture` there are about 60 small aerial pictures for 3 blocks. FileExistsError if
+    `out_dir` holds something else, ValueError if it holds a damaged city; both leave it alone.
     """
     out_dir, capture = Path(out_dir), capture or CaptureConfig()
     parts = {"city": dataclasses.asdict(config), "capture": dataclasses.asdict(capture)}
@@ -352,10 +344,7 @@ class CityTruth:
         return self._ask(self.city.occupied, positions)
 
     def distance(self, positions: Tensor) -> Tensor:
-        """Distance from model positions [..., 3] to the nearest surface, in metres: float32 [...].
-
-        Times `scale`, it is in model units.
-        """
+        """Metres from model positions [..., 3] to the nearest surface: float32 [...]."""
         return self._ask(self.city.distance, positions).float()
 
     def _ask(self, question: Callable[[NDArray[Any]], NDArray[Any]], positions: Tensor) -> Tensor:
@@ -365,11 +354,7 @@ class CityTruth:
         return torch.from_numpy(answers).to(positions.device)
 
     def visible_surface(self, split: Literal["train", "val", "test"] = "test") -> Tensor:
-        """The surface point at the middle of each pixel of a split's pictures, where there is one.
-
-        Returns:
-            [P, 3] float32, model coordinates.
-        """
+        """Surface points in the middles of a split's pixels: [P, 3] float32, model coordinates."""
         lens = CaptureConfig(**read_description(self.folder)["capture"]).lens
         transforms = read_transforms(self.folder)
         wanted = set(transforms[f"{split}_filenames"])

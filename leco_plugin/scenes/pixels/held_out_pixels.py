@@ -99,13 +99,8 @@ TRIES = 100
 
 
 def look_up(source: Any, which: Tensor, places: Tensor) -> Tensor:
-    """Values of pixels: [K, ...].
-
-    Args:
-        source: images [P, H, W, ...], a list of one or more [H, W, ...], or stored ones.
-        which: [K] int64, number of the image in `source`.
-        places: [K, 2] int64, row and column.
-    """
+    """Values [K, ...] of pixels at rows and columns [K, 2] of pictures numbered [K], int64, in
+    images [P, H, W, ...], a list of one or more [H, W, ...], or stored ones."""
     if isinstance(source, StoredPictures):
         return source.read(which, places)
     rows, columns = places.unbind(dim=-1)
@@ -214,12 +209,9 @@ class HeldOutPixelSampler(PixelSampler):
         return batch
 
     def shown(self, pixels: Tensor, sizes: Tensor, numbers: Tensor | None = None) -> Tensor:
-        """Whether a fisheye shows pixels (image, row, column) [N, 3] as a whole: bool [N].
-
-        Args:
-            sizes: [2] or [N, 2], height and width of their pictures.
-            numbers: those in the dataset, where pixels name pictures by their place in a batch.
-        """
+        """Whether a fisheye shows pixels (image, row, column) [N, 3] as a whole: bool [N]. Sizes
+        (height, width) are [2] or [N, 2]; `numbers` are the dataset's, where pixels name pictures
+        by their place in a batch."""
         radius: Any = self.config.fisheye_crop_radius
         if self.radii is not None:
             images = pixels[:, 0].cpu()
@@ -250,14 +242,8 @@ class HeldOutPixelSampler(PixelSampler):
         numbers: Tensor | None = None,
     ) -> Tensor:
         """Drawn pixels [count, 3], those drawn anew that a fisheye does not show, or whose pictures
-        are set aside.
-
-        Args:
-            sizes: as of `shown`, or [P, 2] of all pictures.
-            numbers: as of `shown`.
-        Raises:
-            InputError: it shows none of those that were drawn.
-        """
+        are set aside. `sizes` as of `shown`, or [P, 2] of all pictures. InputError if none of those
+        drawn is shown."""
         pixels = draw(count)
         for _ in range(TRIES):
             each = sizes if sizes.dim() == 1 else sizes[pixels[:, 0]]
@@ -317,17 +303,12 @@ class HeldOutPixelSampler(PixelSampler):
     def sample_held_out(
         self, images: dict[str, Any], count: int, seed: int, share: Share = "all"
     ) -> dict[str, Tensor]:
-        """A batch of held-out pixels, as `sample` returns it for training; the same for a seed.
+        """Up to `count` held-out pixels, each once, as `sample` returns them: `image` [N, C] and
+        `indices` [N, 3] int64 (image, row, column); the same for a seed.
 
-        Args:
-            images: a batch of the image data loader: `image` [K, H, W, C] (or a list of [H, W, C]),
-                `image_idx` [K], and `mask` where there are masks.
-            count: pixels wanted; fewer come back where there are fewer, or masks leave fewer.
-            seed: of the draw.
-            share: of the held-out pixels; all where images are so tiny, or masks hide so much, that
-                none of it is left.
-        Returns:
-            `image` [N, C] and `indices` [N, 3] int64 (image, row, column), each pixel once.
+        Of a batch of the image loader: `image` [K, H, W, C] or a list of [H, W, C], `image_idx`
+        [K], and `mask` if any. Where images are so tiny, or masks hide so much, that none of the
+        share is left, of all shares.
         """
         which, within = self._held_out(images, count, seed, share)
         numbers = torch.as_tensor(images["image_idx"]).cpu()[which]
@@ -339,12 +320,8 @@ class HeldOutPixelSampler(PixelSampler):
     def sample_pictures(
         self, images: dict[str, Any], chosen: Tensor, count: int, seed: int
     ) -> dict[str, Tensor]:
-        """A batch of random pixels of chosen pictures, as of `sample_held_out`, in their order.
-
-        Args:
-            chosen: [K] numbers in the dataset; all are in the batch of images.
-            count: pixels of each; fewer come back where masks leave fewer.
-        """
+        """Up to `count` random pixels of each of the chosen pictures [K], numbers in the dataset
+        that the batch has, in their order; as of `sample_held_out`."""
         numbers, sizes = torch.as_tensor(images["image_idx"]).cpu(), sizes_of(images["image"])
         generator = torch.Generator().manual_seed(seed)
         found = []

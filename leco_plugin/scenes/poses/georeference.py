@@ -60,15 +60,8 @@ class Placement:
 def local_places(
     pycolmap: Any, positions: Sequence[Position | None]
 ) -> tuple[Position | None, Array]:
-    """Positions in metres east, north and up of an origin at sea level.
-
-    Args:
-        pycolmap: the module, for its ellipsoid (WGS 84).
-        positions: None is not known. Of a nan altitude the median of the others is taken, or 0.
-    Returns:
-        The origin, the median of the positions, or None where none is known; and places [N, 3],
-        nan where nothing is known.
-    """
+    """Positions in metres east, north and up [N, 3] of an origin at sea level, their median; nan
+    and None where nothing is known. A nan altitude is the median of the others, or 0."""
     places = np.array([each or (np.nan,) * 3 for each in positions], dtype=float).reshape(-1, 3)
     there = np.isfinite(places[:, 0])
     if not there.any():
@@ -84,14 +77,11 @@ def local_places(
 
 
 def upright(poses: Array, points: Array) -> Array:
-    """The direction [3] that is up in a reconstruction.
+    """The direction [3] that is up in a reconstruction of poses [C, 3, 4], OpenGL's, and points [P,
+    3].
 
     Of surveys from the air it is seen from ground and cameras. Of others it is the mean of the
     photographs' top edges, or against the mean view where these point in all directions.
-
-    Args:
-        poses: [C, 3, 4] OpenGL camera to world.
-        points: [P, 3] sparse points.
     """
     # a survey that lies within 20 degrees of upright is not turned: laid down, it is
     for base in (np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]]), np.eye(3)):
@@ -106,11 +96,8 @@ def upright(poses: Array, points: Array) -> Array:
 def place(pycolmap: Any, centres: Array, gps: Array, up: Array) -> Placement:
     """The similarity that takes a reconstruction to metres, or a rotation that sets it upright.
 
-    Args:
-        pycolmap: the module, for its robust estimate.
-        centres: [C, 3] of the cameras, in the reconstruction.
-        gps: [C, 3] their positions in metres, nan where not known.
-        up: [3] in the reconstruction, which a flight along one line needs.
+    Of camera centres [C, 3] with positions by GPS [C, 3] in metres, nan where not known; a flight
+    along one line also needs what is up [3] in the reconstruction.
     """
     known = np.isfinite(gps).all(axis=1)
     if known.sum() < FEWEST:
@@ -151,11 +138,8 @@ def tolerance(spread: float) -> float:
 
 
 def roll_upright(turn: Array, places: Array, up: Array, width: float) -> Array:
-    """A rotation [3, 3], rolled about the line of flight so that `up` goes up.
-
-    Places [N, 3] on a line say nothing of that roll. Of places that are wider than `width` metres
-    across, the rotation stays as it is.
-    """
+    """A rotation [3, 3], rolled about the line of flight so that `up` goes up: places [N, 3] on a
+    line say nothing of that roll. It stays for places wider than `width` metres across."""
     away = places - places.mean(axis=0)
     _, lengths, axes = np.linalg.svd(away, full_matrices=False)
     across = lengths[1] / np.sqrt(len(places))
@@ -209,13 +193,8 @@ def points_of(model: Any) -> tuple[Array, NDArray[np.uint8]]:
 def transforms_of(
     model: Any, placement: Placement, origin: tuple[float, float, float] | None
 ) -> dict[str, Any]:
-    """What transforms.json says of a model that already is in world coordinates.
-
-    Args:
-        model: of pycolmap.
-        placement: by which it came there: whether coordinates are metres.
-        origin: latitude, longitude and altitude of the world's origin, if they are.
-    """
+    """What transforms.json says of a model that a placement has put into the world, whose origin
+    has this latitude, longitude and altitude if coordinates are metres."""
     lenses = {number: intrinsics(camera) for number, camera in model.cameras.items()}
     names, poses = poses_of(model)
     used = [model.find_image_with_name(name).camera_id for name in names]

@@ -64,12 +64,8 @@ class Reconstructor:
         self.photographs, self.threads = photographs, threads
 
     def extract(self, lens: Lens, size: int) -> None:
-        """Finds features in the photographs that have none in the database.
-
-        Args:
-            lens: kind of all lenses.
-            size: longest side in pixels to which a photograph is made smaller for it.
-        """
+        """Finds features in the photographs that have none in the database, made smaller to a
+        longest side of `size` pixels."""
         pycolmap = self.pycolmap
         self._enter(lens)
         options = pycolmap.FeatureExtractionOptions()
@@ -144,10 +140,8 @@ class Reconstructor:
                 show(at / count)
 
     def map(self) -> list[Any]:
-        """COLMAP's models, the one with the most photographs first.
-
-        InputError if no photographs overlap.
-        """
+        """COLMAP's models, that with the most photographs first. InputError if no photographs
+        overlap."""
         pycolmap, folder = self.pycolmap, self.folder / "models"
         whole = folder / "all"
         if not whole.exists():
@@ -230,13 +224,8 @@ class Pairs(NamedTuple):
 
 
 def choose_pairs(names: Sequence[str], exifs: Sequence[Exif], places: NDArray[np.float64]) -> Pairs:
-    """The pairs to compare.
-
-    Args:
-        names: of the photographs, which may count them.
-        exifs: what EXIF says of each.
-        places: [N, 3] metres, nan where EXIF has no position.
-    """
+    """The pairs to compare, of photographs by name, EXIF and place [N, 3] in metres, nan where
+    unknown."""
     count = len(names)
     everything = list(combinations(range(count), 2))
     if count <= FEW:
@@ -262,11 +251,7 @@ def choose_pairs(names: Sequence[str], exifs: Sequence[Exif], places: NDArray[np
 
 
 def choose_posed_pairs(poses: NDArray[np.float64]) -> Pairs:
-    """The pairs to compare of photographs whose poses are known.
-
-    Args:
-        poses: [N, 3, 4] OpenGL camera to world.
-    """
+    """The pairs to compare of photographs with known poses [N, 3, 4], OpenGL camera to world."""
     count = len(poses)
     if count <= FEW:
         return Pairs(list(combinations(range(count), 2)), "all pairs")
@@ -277,10 +262,8 @@ def choose_posed_pairs(poses: NDArray[np.float64]) -> Pairs:
 
 
 def capture_order(names: Sequence[str], exifs: Sequence[Exif]) -> list[int] | None:
-    """Numbers of the photographs as they were taken: by EXIF's time, or as names count them.
-
-    None where neither tells.
-    """
+    """Numbers of the photographs as they were taken, by EXIF's time or as names count; None if
+    neither tells."""
     times = [each.time for each in exifs if each.time is not None]
     if len(times) == len(names) and 2 * len(set(times)) > len(names):
         return sorted(range(len(names)), key=lambda number: (exifs[number].time, names[number]))
@@ -298,12 +281,8 @@ def capture_order(names: Sequence[str], exifs: Sequence[Exif]) -> list[int] | No
 def _near(
     places: NDArray[np.float64], ranks: NDArray[np.int64], ahead: NDArray[np.float64] | None = None
 ) -> set[tuple[int, int]]:
-    """Pairs of each photograph with others near to its place [N, 2 or 3].
-
-    Args:
-        ranks: which of the others, ordered by distance.
-        ahead: [N, 3] where each looks; those that look another way are left out.
-    """
+    """Pairs of each photograph with others near to its place [N, 2 or 3], by `ranks` of distance;
+    those that look another way, [N, 3] if given, are left out."""
     found = set()
     for row in range(len(places)):
         distances = ((places - places[row]) ** 2).sum(axis=1)
