@@ -40,7 +40,6 @@ OVER_CAMERAS = 0.06
 """Share of the way from the ground to the highest camera by which raised bounds end above it."""
 NEAR_CAMERAS = 0.04
 """Share of the farthest distance at which rays begin in raised bounds."""
-FROM_ABOVE = "photographed from above"
 
 
 @dataclass(frozen=True)
@@ -100,7 +99,7 @@ def find_bounds(
         # far below, so that a flat picture on the lower plane is plainly wrong from two places
         ground = float(low[2]) - max(0.5 * relief, 0.2 * far)
         top = float(high[2]) + 0.3 * relief
-        why = f"{FROM_ABOVE} ({seen}): bounded"
+        why = f"photographed from above ({seen}): bounded"
         found = _slab(poses, directions, (ground, top), (near, far), why)
         return replace(found, from_above=True)
     if config.space == "box":

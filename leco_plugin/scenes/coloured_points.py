@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from leco_plugin.scenes.input_error import InputError, one_line
-from leco_plugin.scenes.scene_file import load_json
+from leco_plugin.scenes.scene_file import file_in, load_json
 
 CONFIG = "config.yml"
 NEAREST = 3
@@ -47,10 +47,10 @@ def description_of_run(file: Path) -> Path | None:
     data = _data_named_in(config)
     if data is None:
         return None
-    found = _file_in(data)
+    found = file_in(data)
     if not found.is_file():
         there = found_around(data, config.parent)
-        found = found if there is None else _file_in(there)
+        found = found if there is None else file_in(there)
     return found if found.is_file() else None
 
 
@@ -78,14 +78,10 @@ def _data_named_in(config: Path) -> Path | None:
 
 def description_in(data: Path) -> Path:
     """The transforms.json that `data` means: itself, or that in the folder. InputError for none."""
-    file = _file_in(data)
+    file = file_in(data)
     if not file.is_file():
         raise InputError(f"--data {data}: there is no transforms.json; give a nerfstudio scene")
     return file
-
-
-def _file_in(data: Path) -> Path:
-    return data if data.suffix == ".json" else data / "transforms.json"
 
 
 def read_cloud(path: Path) -> CloudFile:

@@ -84,12 +84,12 @@ class LecoDataManager(VanillaDataManager):  # type: ignore[type-arg]
     def create_eval_dataset(self) -> Any:
         """The test photographs; there may be none."""
         dataset = names_what_it_cannot_read(super().create_eval_dataset())
+        count = len(self.train_dataset)
         if self.test_mode == "val":
             say(read_in_words(self.get_datapath(), self.train_dataset, len(dataset)))
-        if len(dataset) == 0:
-            if self.test_mode == "val":
-                count = len(self.train_dataset)
+            if len(dataset) == 0:
                 say(f"no test image: the run trains on all {count} and evaluates nothing")
+        if len(dataset) == 0:
             none: Any = NoTestImages(
                 f"{self.get_datapath()} has no test image in this run, and nothing can be "
                 "evaluated; ns-render shows what it has learned"
@@ -126,7 +126,11 @@ class LecoDataManager(VanillaDataManager):  # type: ignore[type-arg]
         wanted = getattr(config, "images", "auto")
         if wanted == "memory" or not keeps_all_images(config, len(self.train_dataset)):
             return False
-        obstacle = self._obstacle()
+        obstacle = None
+        if not issubclass(config.pixel_sampler._target, HeldOutPixelSampler):
+            obstacle = "the pixel sampler draws from images in memory only; use leco's own"
+        elif self.train_dataset.mask_color:
+            obstacle = "the scene's mask_color is painted over images in memory only"
         if wanted == "disk":
             if obstacle is not None:
                 raise InputError(f"photographs on disk: {obstacle}")
@@ -135,14 +139,6 @@ class LecoDataManager(VanillaDataManager):  # type: ignore[type-arg]
         free = free_memory()
         needed *= max(1, self.world_size)  # each process decodes its own
         return obstacle is None and free is not None and needed > MOST_OF_MEMORY * free
-
-    def _obstacle(self) -> str | None:
-        """Why pixels cannot be read from files, if they cannot."""
-        if not issubclass(self.config.pixel_sampler._target, HeldOutPixelSampler):
-            return "the pixel sampler draws from images in memory only; use leco's own"
-        if self.train_dataset.mask_color:
-            return "the scene's mask_color is painted over images in memory only"
-        return None
 
     def _store(self, dataset: Any, what: str) -> Any:
         """An endless iterator over the one batch of images that there is."""
@@ -159,9 +155,8 @@ class LecoDataManager(VanillaDataManager):  # type: ignore[type-arg]
         gigabytes = decoded_bytes(self.train_dataset) / 1e9
         say(f"{len(self.train_dataset)} photographs, {gigabytes:.1f} GB decoded, stay on disk")
         self.iter_train_image_dataloader = self._store(self.train_dataset, "photographs")
-        self.train_pixel_sampler = self._get_pixel_sampler(
-            self.train_dataset, self.config.train_num_rays_per_batch
-        )
+        rays = self.config.train_num_rays_per_batch
+        self.train_pixel_sampler = self._get_pixel_sampler(self.train_dataset, rays)
         self.train_ray_generator = RayGenerator(self.train_dataset.cameras.to(self.device))
 
     def setup_eval(self) -> None:
@@ -170,16 +165,12 @@ class LecoDataManager(VanillaDataManager):  # type: ignore[type-arg]
             super().setup_eval()
             return
         self.iter_eval_image_dataloader = self._store(self.eval_dataset, "test photographs")
-        self.eval_pixel_sampler = self._get_pixel_sampler(
-            self.eval_dataset, self.config.eval_num_rays_per_batch
-        )
+        rays = self.config.eval_num_rays_per_batch
+        self.eval_pixel_sampler = self._get_pixel_sampler(self.eval_dataset, rays)
         self.eval_ray_generator = RayGenerator(self.eval_dataset.cameras.to(self.device))
-        self.fixed_indices_eval_dataloader = FixedIndicesEvalDataloader(
-            input_dataset=self.eval_dataset, device=self.device
-        )
-        self.eval_dataloader = RandIndicesEvalDataloader(
-            input_dataset=self.eval_dataset, device=self.device
-        )
+        given: dict[str, Any] = {"input_dataset": self.eval_dataset, "device": self.device}
+        self.fixed_indices_eval_dataloader = FixedIndicesEvalDataloader(**given)
+        self.eval_dataloader = RandIndicesEvalDataloader(**given)
 
 
 @dataclass
@@ -204,8 +195,7 @@ def upright_outputs(read: Callable[..., DataparserOutputs]) -> Callable[..., Dat
         if not known:
             training = outputs if split == "train" else read(split="train", **kwargs)
             known.append(_turn_of(training))
-        turn = known[0]
-        return outputs if turn is None else turn_outputs(outputs, turn)
+        return outputs if known[0] is None else turn_outputs(outputs, known[0])
 
     return outputs_of
 

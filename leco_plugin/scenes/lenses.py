@@ -57,16 +57,14 @@ class Lens:
     ) -> tuple[float, float] | tuple[None, None]:
         """Both focal lengths in pixels of a picture of that size, smaller by `factor` than the lens
         is for; None where nothing is said."""
-        width = width if self.width is None else self.width / factor
-        height = height if self.height is None else self.height / factor
-        fx = None if self.fx is None else self.fx / factor
-        fy = None if self.fy is None else self.fy / factor
-        if self.angle_x is not None:
-            fx = 0.5 * width / math.tan(0.5 * self.angle_x)
-        if self.angle_y is not None:
-            fy = 0.5 * height / math.tan(0.5 * self.angle_y)
-        one = fx or fy
-        return (None, None) if one is None else (fx or one, fy or one)
+        across = self.fx, self.angle_x, width if self.width is None else self.width / factor
+        down = self.fy, self.angle_y, height if self.height is None else self.height / factor
+        found = [
+            0.5 * side / math.tan(0.5 * angle) if angle else focal and focal / factor
+            for focal, angle, side in (across, down)
+        ]
+        one = found[0] or found[1]
+        return (None, None) if one is None else (found[0] or one, found[1] or one)
 
 
 def lens_of(meta: dict[str, Any], frame: dict[str, Any], where: str) -> Lens:

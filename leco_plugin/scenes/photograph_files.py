@@ -79,8 +79,7 @@ def find_file(path: Path) -> Path:
 
 def check_images(paths: list[Path]) -> None:
     """InputError if an image is not there."""
-    missing = [path for path in paths if not path.exists()]
-    if missing:
+    if missing := [path for path in paths if not path.exists()]:
         raise InputError(
             f"{len(missing)} of {len(paths)} images are not there, the first is "
             f"{missing[0]}{remedy_for_missing(missing[0])}"

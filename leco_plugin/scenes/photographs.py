@@ -35,7 +35,7 @@ from leco_plugin.scenes.input_error import InputError, one_line
 from leco_plugin.scenes.large_coordinates import ReadsNear
 from leco_plugin.scenes.photograph_files import check_images, find_file
 from leco_plugin.scenes.reading import CheckedReader
-from leco_plugin.scenes.scene_file import load_json, scene_file_of
+from leco_plugin.scenes.scene_file import file_in, load_json, scene_file_of
 
 COLOURS = "points3D_rgb"
 """That of their colours, uint8 [P, 3]. nerfstudio's pipelines want both or neither."""
@@ -63,7 +63,7 @@ class LecoPhotographs(CheckedReader, ReadsNear, Nerfstudio):
         self, split: str = "train", **kwargs: Any
     ) -> DataparserOutputs:
         data = self.config.data
-        meta = load_json(data if data.suffix == ".json" else data / "transforms.json")
+        meta = load_json(file_in(data))
         check_images([find_file(folder_of(data) / each["file_path"]) for each in meta["frames"]])
         up_is_known = self._knows_up(meta)
         if up_is_known and "orientation_override" not in meta:
@@ -71,15 +71,22 @@ class LecoPhotographs(CheckedReader, ReadsNear, Nerfstudio):
             self.config.orientation_method = "none"
         outputs: DataparserOutputs = super()._generate_dataparser_outputs(split)
         if len(outputs.image_filenames) == 0 and split == "train":
-            raise InputError(f"{self.config.data}: no image is left for the split {split!r}")
-        frame, applied_scale = self._frame_of_file(outputs, meta)
-        points = points_of(meta, folder_of(self.config.data))
+            raise InputError(f"{data}: no image is left for the split {split!r}")
+        try:
+            applied, applied_scale = applied_in(meta, data)
+            frame = from_file(parsed_frame(outputs), applied, applied_scale, torch.float64)
+        except (ValueError, TypeError, RuntimeError) as error:
+            raise InputError(f"{data} cannot be read: {one_line(error, 120)}") from None
+        points = points_of(meta, folder_of(data))
         if points is not None:
             outputs.metadata |= points_in_model(points, frame)
         if up_is_known:
             outputs.metadata[UP_IS_KNOWN] = True
         if "metres_per_unit" in meta:
-            outputs.metadata[METRES_PER_UNIT] = applied_scale * _metres(meta, self.config.data)
+            metres = meta["metres_per_unit"]
+            if not isinstance(metres, int | float) or not 0.0 < metres < float("inf"):
+                raise InputError(f"{data}: metres_per_unit is {metres!r}, not a positive number")
+            outputs.metadata[METRES_PER_UNIT] = applied_scale * float(metres)
         return outputs
 
     def _near(self, meta: dict[str, Any]) -> dict[str, Any]:
@@ -104,16 +111,6 @@ class LecoPhotographs(CheckedReader, ReadsNear, Nerfstudio):
     def _load_3D_points(self, *_: Any) -> None:
         """Nothing: nerfstudio reads a .ply by open3d, which needs system libraries."""
 
-    def _frame_of_file(
-        self, outputs: DataparserOutputs, meta: dict[str, Any]
-    ) -> tuple[Tensor, float]:
-        """What took positions in the file to the model's [3, 4], and what had scaled them."""
-        try:
-            applied, scale = applied_in(meta, self.config.data)
-            return from_file(parsed_frame(outputs), applied, scale, torch.float64), scale
-        except (ValueError, TypeError, RuntimeError) as error:
-            raise InputError(f"{self.config.data} cannot be read: {one_line(error, 120)}") from None
-
     def _knows_up(self, meta: dict[str, Any]) -> bool:
         """Whether z is up in the file already: it says so, or its cameras look down along it."""
         if "orientation_override" in meta:
@@ -122,17 +119,9 @@ class LecoPhotographs(CheckedReader, ReadsNear, Nerfstudio):
         return self.config.orientation_method in ("up", "none") and taken_from_above(poses)
 
 
-def _metres(meta: dict[str, Any], data: Path) -> float:
-    """What a scene says of its units: metres in one."""
-    metres = meta["metres_per_unit"]
-    if not isinstance(metres, int | float) or not 0.0 < metres < float("inf"):
-        raise InputError(f"{data}: metres_per_unit is {metres!r}, not a positive number")
-    return float(metres)
-
-
 def folder_of(data: Path) -> Path:
     """The folder that a scene's paths are relative to; `data` is it, or the json file in it."""
-    return data.parent if data.suffix == ".json" else data
+    return file_in(data).parent
 
 
 def taken_from_above(poses: np.ndarray) -> bool:
@@ -171,23 +160,17 @@ def points_of(meta: dict[str, Any], folder: Path) -> CloudFile | None:
 def points_in_model(points: CloudFile, frame: Tensor) -> dict[str, Tensor]:
     """Sparse points and colours, taken to the model by a frame [3, 4], as nerfstudio's own readers
     return them: splatfacto starts there, from grey ones where the file has no colours."""
-    colours = points.colours
+    positions, colours = points
     if colours is None:
-        colours = np.full(points.positions.shape, GREY, np.uint8)
-    positions = torch.from_numpy(points.positions)
-    return {POINTS: moved(positions, frame.double()).float(), COLOURS: torch.from_numpy(colours)}
+        colours = np.full(positions.shape, GREY, np.uint8)
+    in_model = moved(torch.from_numpy(positions), frame.double()).float()
+    return {POINTS: in_model, COLOURS: torch.from_numpy(colours)}
 
 
 def read_points(meta: dict[str, Any], folder: Path) -> Tensor | None:
     """Those of `points_of` without colours [P, 3] float64, or None."""
     points = points_of(meta, folder)
     return None if points is None else torch.from_numpy(points.positions)
-
-
-def read_ply(path: Path, dtype: torch.dtype = torch.float32) -> Tensor:
-    """The vertices [P, 3] of a file; coordinates as large as UTM's need float64. InputError if it
-    cannot be read as points."""
-    return torch.from_numpy(read_cloud(path).positions).to(dtype)
 
 
 def describe_held_out(data: Path, kind: HeldOut) -> dict[str, Any]:
@@ -201,8 +184,7 @@ def describe_scene(data: Path) -> dict[str, Any]:
     """Name, number of images, and what tells the scene from another: JSON values. InputError if it
     cannot be read."""
     meta = check_scene(data)
-    description = data if data.suffix == ".json" else data / "transforms.json"
-    digest = hashlib.sha256(description.read_bytes()).hexdigest()
+    digest = hashlib.sha256(file_in(data).read_bytes()).hexdigest()
     name = folder_of(data).resolve().name
     return {"name": name, "images": len(meta["frames"]), "digest": digest[:16]}
 
@@ -280,10 +262,9 @@ def stretch_of(meta: dict[str, Any], scene: str) -> dict[str, list[str]]:
     except ValueError as error:
         raise InputError(f"{scene}: {error}; hold out photographs of the spread instead") from None
     names: dict[str, list[str]] = {"train": [], "test": [], "beside": []}
+    kinds = dict.fromkeys(found.held_out, "test") | dict.fromkeys(found.beside, "beside")
     for number, frame in enumerate(meta["frames"]):
-        kind = "test" if number in found.held_out else "beside"
-        kind = kind if number in found.held_out + found.beside else "train"
-        names[kind].append(str(frame["file_path"]))
+        names[kinds.get(number, "train")].append(str(frame["file_path"]))
     return names
 
 

@@ -52,6 +52,11 @@ class SceneFile:
         return [find_file(self.folder / frame["file_path"]) for frame in self.frames]
 
 
+def file_in(data: Path) -> Path:
+    """The transforms.json that `data` means: itself, or that in the folder."""
+    return data if data.suffix == ".json" else data / "transforms.json"
+
+
 def load_json(path: Path) -> Any:
     """What a JSON file says, with or without a byte order mark; nulls of frames are left out, and
     poses of three rows have the fourth."""
@@ -125,7 +130,7 @@ def description_of(config: Any, split: str) -> Path | None:
     data = Path(config.data)
     target = own_target(config)
     if issubclass(target, Nerfstudio | InstantNGP):
-        return data if data.suffix == ".json" else data / "transforms.json"
+        return file_in(data)
     if issubclass(target, ScanNetpp):
         return data / Path(config.transforms_path)
     return data / f"transforms_{split}.json" if issubclass(target, Blender | DNeRF) else None

@@ -31,8 +31,6 @@ MOST_CAMERAS = 256
 WORTH_IT = 0.005
 """Share of all rays that must go beyond a scene photographed from above and show something there
 for its bounds to be raised."""
-
-
 MOST_PICTURES = 16
 """Pictures that are opened to see what lies beyond: those with the most rays that miss."""
 
@@ -62,21 +60,17 @@ class Survey:
     def lines(self) -> list[str]:
         """For the log: what was chosen and why, the range in scene units and beside it in metres,
         and how many rays meet it."""
-        bounds, heights = self.bounds, self.positions[:, 2]
-        rows = [("near", bounds.near, False), ("far", bounds.far, False)]
+        bounds, heights, units = self.bounds, self.positions[:, 2], self.units
+        lengths, levels = {"near": bounds.near, "far": bounds.far}, {}
         if bounds.kind == "box":
-            ground, top = float(bounds.aabb[2]), float(bounds.aabb[5])
-            rows += [("ground, z", ground, True), ("top, z", top, True)]
-            lowest, highest = float(heights.min()), float(heights.max())
-            rows += [("lowest camera, z", lowest, True), ("highest camera, z", highest, True)]
+            levels = {"ground, z": bounds.aabb[2], "top, z": bounds.aabb[5]}
+            levels |= {"lowest camera, z": heights.min(), "highest camera, z": heights.max()}
         else:
-            rows.append(("inner cube, half", bounds.half_extent, False))
-        units = self.units
-        head = f"{'':18}{'scene units':>12}" + (f"{units.name:>12}" if units else "")
-        table = [head] + [
-            f"{name:18}{value:12.3f}" + (f"{_in(units, value, level):12.2f}" if units else "")
-            for name, value, level in rows
-        ]
+            lengths["inner cube, half"] = bounds.half_extent
+        table = [f"{'':18}{'scene units':>12}" + (f"{units.name:>12}" if units else "")]
+        for name, value in (lengths | levels).items():
+            there = units and _in(units, float(value), name in levels)
+            table.append(f"{name:18}{float(value):12.3f}" + (f"{there:12.2f}" if units else ""))
         if units is not None and not units.metric:
             table.append(
                 "data units are those of the poses; bounds.metres-per-unit says the metres"
@@ -105,11 +99,6 @@ def _in(units: DatasetUnits, value: float, level: bool) -> float:
     return units.altitude(value) if level else units.per_scene_unit * value
 
 
-def sparse_points(dataset: Any) -> Tensor | None:
-    """Sparse points [P, 3] in model coordinates of a dataset of any reader, or None."""
-    return points_in(getattr(dataset, "metadata", {}) or {})
-
-
 def places_of(metadata: dict[str, Any]) -> Tensor | None:
     """[N, 3] scene units, where the photographs of a dataset were taken, if that is known."""
     cameras = metadata.get(CAMERAS)
@@ -120,6 +109,11 @@ def points_in(metadata: dict[str, Any]) -> Tensor | None:
     """Sparse points [P, 3] in model coordinates in what a reader says of a dataset, or None."""
     points = metadata.get(POINTS)
     return None if points is None else torch.as_tensor(points)
+
+
+def sparse_points(dataset: Any) -> Tensor | None:
+    """The same of a dataset of any reader."""
+    return points_in(getattr(dataset, "metadata", {}) or {})
 
 
 def with_known_altitudes(config: BoundsConfig | None, metadata: dict[str, Any]) -> BoundsConfig:

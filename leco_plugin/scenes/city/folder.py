@@ -100,13 +100,11 @@ class NerfstudioLayout(Layout):
 
     def _transforms(self) -> dict[str, Any]:
         frames: list[dict[str, Any]] = []
-        names: dict[bool, list[str]] = {False: [], True: []}
         for view in self.views:
-            frame: dict[str, Any] = dict(zip(FILE_FIELDS, self.files(view)))
             matrix = [*view.pose.tolist(), [0.0, 0.0, 0.0, 1.0]]
-            frames.append(frame | {"transform_matrix": matrix})
-            names[view.held_out].append(frame["file_path"])
-        lens = self.lens
+            frames.append(dict(zip(FILE_FIELDS, self.files(view))) | {"transform_matrix": matrix})
+        pictures = [(self.files(view)[0], view.held_out) for view in self.views]
+        tested, lens = [name for name, held_out in pictures if held_out], self.lens
         return {
             "camera_model": "OPENCV",
             "w": lens.width,
@@ -119,9 +117,9 @@ class NerfstudioLayout(Layout):
             "ply_file_path": POINTS,
             "metres_per_unit": 1.0,
             "frames": frames,
-            "train_filenames": names[False],
-            "val_filenames": names[True],
-            "test_filenames": names[True],
+            "train_filenames": [name for name, held_out in pictures if not held_out],
+            "val_filenames": tested,
+            "test_filenames": tested,
         }
 
     def _points(self, folder: Path) -> NDArray[Any]:
@@ -150,25 +148,22 @@ class MegaNerfLayout(Layout):
         return around(np.stack([view.pose[:, 3] for view in self.views]))
 
     def files(self, view: View) -> list[str]:
-        return [f"{_split(view)}/{part}/{_stem(view)}.{ending}" for part, ending in PARTS]
+        split, stem = self._place(view)
+        return [f"{split}/{part}/{stem}.{ending}" for part, ending in PARTS]
 
     def write(self, folder: Path, view: View, image: Image8, depth: NDArray[np.float32]) -> None:
         lens = self.lens
         intrinsics = lens.focal, lens.focal, lens.width / 2, lens.height / 2
         pose = self.coordinates.to_file(view.pose[None])[0]
-        write_view(folder, _split(view), _stem(view), image, pose, intrinsics)
+        write_view(folder, *self._place(view), image, pose, intrinsics)
 
     def finish(self, folder: Path) -> None:
         write_coordinates(folder, self.coordinates)
-        write_mappings(folder, {f"{view.name}.png": _stem(view) for view in self.views})
+        write_mappings(folder, {f"{each.name}.png": self._place(each)[1] for each in self.views})
 
-
-def _split(view: View) -> Split:
-    return "val" if view.held_out else "train"
-
-
-def _stem(view: View) -> str:
-    return f"{view.number:06d}"
+    def _place(self, view: View) -> tuple[Split, str]:
+        """Its split, and the stem of its files."""
+        return "val" if view.held_out else "train", f"{view.number:06d}"
 
 
 LAYOUTS: dict[LayoutName, type[Layout]] = {

@@ -10,8 +10,9 @@ from typing import Any
 import numpy as np
 import pytest
 from PIL import Image
+from scene_files import read_ply
 
-from leco_plugin.scenes.photographs import LecoPhotographsDataParserConfig, read_ply
+from leco_plugin.scenes.photographs import LecoPhotographsDataParserConfig
 from leco_plugin.scenes.poses.georeference import Placement, intrinsics, transforms_of, write_scene
 from leco_plugin.scenes.scene_file import unused_fields
 
