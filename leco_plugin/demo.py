@@ -28,8 +28,7 @@ from leco_plugin.log import bar
 from leco_plugin.method_configs import leco_occupancy
 from leco_plugin.occupancy import Occupancy
 from leco_plugin.scenes.city.city import CityConfig
-from leco_plugin.scenes.city.folder import CaptureConfig, write_city
-from leco_plugin.scenes.city.truth import CityTruth
+from leco_plugin.scenes.city.folder import CaptureConfig, CityTruth, write_city
 from leco_plugin.studio.host_models import true_colours
 
 SECONDS = 130.0

@@ -12,7 +12,7 @@ import numpy as np
 import torch
 
 from leco_plugin.scenes.city.cameras import look_at
-from leco_plugin.scenes.mega_nerf_format.files import (
+from leco_plugin.scenes.mega_nerf_files import (
     Coordinates,
     write_coordinates,
     write_mappings,

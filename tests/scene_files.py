@@ -10,8 +10,10 @@ from typing import Any
 
 import numpy as np
 import pytest
+import torch
 from scipy.spatial.transform import Rotation
 
+from leco_plugin.scenes.coloured_points import read_cloud
 from leco_plugin.scenes.input_error import InputError
 
 
@@ -60,3 +62,8 @@ def write_colmap(scene: Path, model: Path, camera: str, points: np.ndarray) -> N
     places = (" ".join(f"{value:.9f}" for value in point) for point in points)
     rows = [f"{number + 1} {place} 9 9 9 0.5 1 0\n" for number, place in enumerate(places)]
     (model / "points3D.txt").write_text("".join(rows))
+
+
+def read_ply(path: Path, dtype: torch.dtype = torch.float32) -> torch.Tensor:
+    """The vertices [P, 3] of a file of points."""
+    return torch.from_numpy(read_cloud(path).positions).to(dtype)

@@ -32,7 +32,7 @@ from leco_plugin.models.mixture import Mixture
 from leco_plugin.models.rendering import backdrop_of, mapped_middles
 from leco_plugin.occupancy import CALIBRATED_AT, Occupancy
 from leco_plugin.scenes.city.city import DESCRIPTION
-from leco_plugin.scenes.city.truth import CityTruth
+from leco_plugin.scenes.city.folder import CityTruth
 from leco_plugin.scenes.learning_data import held_out_rays
 
 CALIBRATION = CalibrationConfig()

@@ -113,18 +113,9 @@ class Heard(NamedTuple):
 
 
 class Along:
-    """Stands around the steps of a packed host that teaches its own gate.
-
-    Args:
-        host: what trains.
-        guide: of the host.
-        config: how a gate is taught and calibrated; its field is not built.
-        pipeline: nerfstudio's.
-        run: what is around the steps.
-    Raises:
-        InputError: the host draws a fixed number of samples, several processes train it, or
-            sharpening is off.
-    """
+    """Stands around the steps of a packed host that teaches its own gate, as its config says, whose
+    field is not built. InputError if the host draws a fixed number of samples, several processes
+    train it, or sharpening is off."""
 
     def __init__(
         self, host: Any, guide: Guide, config: LecoModelConfig, pipeline: Any, run: Run

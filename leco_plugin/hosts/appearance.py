@@ -62,8 +62,8 @@ def begin_with_small_codes(host: Model, places: Tensor | None = None) -> None:
     """Has the codes of a host's photographs begin at zero, scaled down, and other views take those
     of the photographs nearby.
 
-    Of a host that is neither nerfstudio's nor ours, the log says what was done; where its codes are
-    of a kind that is not known here, it says that they stay.
+    Of a host that is neither nerfstudio's nor ours, the log says what was done, or that codes of a
+    kind that is not known here stay.
     """
     count: Any = getattr(host, "num_train_data", None)
     known = {
@@ -107,11 +107,8 @@ def _drawn_at_random(host: Model, count: Any) -> list[str]:
 
 
 def show_from(host: nn.Module, origins: Tensor | None) -> None:
-    """Tells the codes of a host from where a view is shown.
-
-    Args:
-        origins: [..., 3] of its rays; None in training, where each ray has a photograph.
-    """
+    """Tells the codes of a host from where rays [..., 3] of a view begin; None in training, where
+    each ray has a photograph."""
     for codes in host.modules():
         if isinstance(codes, SmallCodes):
             views = None if origins is None else origins.reshape(-1, 3).unique(dim=0)

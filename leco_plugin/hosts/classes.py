@@ -47,11 +47,8 @@ class Host(_Model):
         return outputs
 
     def get_outputs_for_camera_ray_bundle(self, *args: Any, **kwargs: Any) -> dict[str, Tensor]:
-        """Images whose counts are floating-point numbers.
-
-        ns-render and the viewer end with an exception at an image of integers, such as the samples
-        per ray of nerfstudio's own `instant-ngp`.
-        """
+        """Images whose counts are floats: ns-render and the viewer end with an exception at
+        integers, such as the samples per ray of nerfstudio's own `instant-ngp`."""
         images = super().get_outputs_for_camera_ray_bundle(*args, **kwargs)
         return {
             name: image if image.is_floating_point() or image.dtype == torch.bool else image.float()
@@ -81,11 +78,8 @@ class GuidedHost(DrawnInViewer, Host):
     leco_occupancy: OccupancyConfig
 
     def begin_guided(self, guide: Guide, config: OccupancyConfig) -> None:
-        """Puts the guide where the host had its own sampling.
-
-        Raises:
-            InputError: the host has no seam that is known, or the sampler does not fit it.
-        """
+        """Puts the guide where the host had its own sampling. InputError if the host has no seam
+        that is known, or the sampler does not fit it."""
         self.leco_guide, self.leco_occupancy = guide, config
         if guide.needs_occupancy:
             self.leco_view = OccupancyView()
@@ -115,11 +109,8 @@ class GuidedHost(DrawnInViewer, Host):
             guide.cropped = False
 
     def get_loss_dict(self, outputs: Any, batch: Any, *args: Any, **kwargs: Any) -> dict[str, Any]:
-        """As the host's, without losses of proposal networks that are gone.
-
-        Raises:
-            FloatingPointError: a loss is not finite; no step is taken with it.
-        """
+        """As the host's, without losses of proposal networks that are gone. FloatingPointError if a
+        loss is not finite; no step is taken with it."""
         losses = super().get_loss_dict(outputs, batch, *args, **kwargs)  # type: ignore[safe-super]
         if not self.training:
             return losses
@@ -130,11 +121,8 @@ class GuidedHost(DrawnInViewer, Host):
         return losses
 
     def get_param_groups(self) -> dict[str, list[nn.Parameter]]:
-        """As the host's, without the gate; an optimizer takes no empty group.
-
-        A gate among its parameters would be one more of them in a run that was given a file than in
-        the same run resumed without.
-        """
+        """As the host's, without the gate, which a run that was given a file would have more than
+        the same run resumed without; an optimizer takes no empty group."""
         groups = super().get_param_groups()  # type: ignore[safe-super]
         frozen = {id(parameter) for parameter in self.leco_guide.parameters()}
         trained = {
@@ -187,15 +175,8 @@ T = TypeVar("T", bound=Host)
 
 
 def set_up_host(config: ModelConfig, kind: type[T], **arguments: Any) -> T:
-    """A host as its config builds it, as a subclass of its own kind, without a network.
-
-    Args:
-        config: of the host; it stays as it is.
-        kind: what is changed of it.
-        arguments: what nerfstudio gives a model.
-    Raises:
-        InputError: the config builds no nerfstudio model.
-    """
+    """A host as its config builds it, as a subclass of its own kind, without a network. InputError
+    if the config builds no nerfstudio model."""
     target = config._target
     if not (isinstance(target, type) and issubclass(target, Model)):
         raise InputError(f"{type(config).__name__} builds no nerfstudio model that could be guided")

@@ -98,11 +98,8 @@ class Guide(nn.Module):
 
     @property
     def needs_occupancy(self) -> bool:
-        """Whether the sampler asks a gate at all; a grid does not.
-
-        Raises:
-            InputError: there is no such sampler.
-        """
+        """Whether the sampler asks a gate at all; a grid does not. InputError if there is no such
+        one."""
         return self._spec().needs_occupancy
 
     def _spec(self, kind: str | None = None) -> SamplerSpec:
@@ -132,11 +129,7 @@ class Guide(nn.Module):
         self.changed()
 
     def the_occupancy(self) -> Occupancy:
-        """The occupancy.
-
-        Raises:
-            NoOccupancyYet: there is none yet.
-        """
+        """The occupancy. NoOccupancyYet if there is none yet."""
         if self.occupancy is None:
             raise NoOccupancyYet(
                 "this model has no occupancy yet: train it, load a checkpoint, or give a file with "
@@ -145,11 +138,7 @@ class Guide(nn.Module):
         return self.occupancy
 
     def followed(self) -> Occupancy:
-        """The occupancy with the threshold that samplers follow for now.
-
-        Raises:
-            NoOccupancyYet: there is none yet.
-        """
+        """The occupancy with the threshold that samplers follow now. NoOccupancyYet for none."""
         occupancy, shown = self.the_occupancy(), SHOWN.get()
         threshold = self.watched.lower if shown is None else shown
         return occupancy if threshold is None else occupancy.with_threshold(threshold)
@@ -176,11 +165,8 @@ class Guide(nn.Module):
 
     @torch.no_grad()
     def lacks_backdrop(self, origins: Tensor, directions: Tensor) -> Tensor:
-        """Whether training has never seen the backdrop of rays: bool [R].
-
-        Args:
-            origins, directions: [R, 3] in the occupancy's coordinates, directions of any length.
-        """
+        """Whether training has never seen the backdrop of rays: bool [R]. Origins and directions
+        [R, 3], of any length, are in the occupancy's coordinates."""
         unit = torch.nn.functional.normalize(directions.float(), dim=-1)
         region: Region = self._region()
         cut = region.cut(origins.float(), unit)
@@ -204,14 +190,8 @@ class Guide(nn.Module):
         return self.built(build_estimator, aabb=aabb, occupancy=None)
 
     def built(self, build: Callable[..., nn.Module], **given: Any) -> nn.Module:
-        """The sampler that this host calls, with its options.
-
-        Args:
-            build: the registry's `build_estimator` or `build_proposal`.
-            given: what a host gives a builder.
-        Raises:
-            InputError: it cannot be built so.
-        """
+        """The sampler that the registry builds of what this host gives, with its options.
+        InputError if it cannot be built so."""
         # cells would be made anew for each threshold that the viewer shows
         without_cells = SHOWN.get() is not None and self.sampler in OURS
         uncached = {"cache_bytes": 0} if without_cells else {}
@@ -249,11 +229,8 @@ class Guide(nn.Module):
         }
 
     def set_extra_state(self, state: dict[str, Any]) -> None:
-        """Makes an occupancy of the checkpoint's shape; torch then reads its weights.
-
-        Raises:
-            InputError: the state is of another version of this package.
-        """
+        """Makes an occupancy of the checkpoint's shape; torch then reads its weights. InputError if
+        the state is of another version of this package."""
         if state == {}:
             return
         with state_of_this_version():

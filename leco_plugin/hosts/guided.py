@@ -51,15 +51,9 @@ class GuidedModelConfig(ModelConfig):
 
 
 def set_up_guided(config: GuidedModelConfig, **arguments: Any) -> Model:
-    """Builds the host, swaps its sampler, and returns the host.
-
-    Args:
-        config: host and occupancy.
-        arguments: what nerfstudio gives a model (scene_box, num_train_data, metadata, device, ...).
-    Raises:
-        InputError: the host has no seam that is known, or there is no such sampler for it, or none
-            with these options.
-    """
+    """Builds the host of what nerfstudio gives a model, swaps its sampler, and returns the host.
+    InputError if it has no seam that is known, or there is no such sampler for it, or none with
+    these options."""
     allow_checkpoint_globals()
     evaluate_whole_checkpoints()
     install_for(arguments.get("device"))

@@ -82,10 +82,8 @@ class OccupancyConfig:
 
 
 def occupancy_file(path: Path | None) -> Path | None:
-    """The file that `path` means: itself, or the newest occupancy in the folder of a run.
-
-    Without an error where there is none: a checkpoint brings its own.
-    """
+    """The file that `path` means: itself, or the newest occupancy in the folder of a run. No error
+    where there is none: a checkpoint brings its own."""
     if path is None or not path.is_dir():
         return path
     found = sorted(path.rglob(FILE_NAME), key=lambda file: file.stat().st_mtime)
@@ -93,11 +91,7 @@ def occupancy_file(path: Path | None) -> Path | None:
 
 
 def load_occupancy(path: Path) -> Occupancy:
-    """The occupancy that `path` means.
-
-    Raises:
-        InputError: there is none, or it cannot be read.
-    """
+    """The occupancy that `path` means. InputError if there is none, or it cannot be read."""
     file = occupancy_file(path)
     assert file is not None
     try:
@@ -112,19 +106,12 @@ def load_occupancy(path: Path) -> Occupancy:
 
 
 class GuidedStart:
-    """The start of one training run of a guided host.
+    """The start of one training run of a guided host. A guide has an occupancy already where a file
+    or a checkpoint gave one; without a run no file is left, and a teacher leaves its own.
 
-    Args:
-        host: what is guided.
-        guide: of the host; it has an occupancy already where a file or a checkpoint gave one.
-        config: where else to get one.
-        pipeline: nerfstudio's.
-        run: what is around the steps; None leaves no file.
-        teacher: of a host that teaches its own gate; it leaves the file.
-    Raises:
-        InputError: the file is not there or cannot be read; its occupancy keeps nothing that the
-            cameras see, and this run has not begun with it; its gate is none that the sampler asks;
-            or nothing can be learned in the time or with the rays that are given.
+    InputError if the file is not there or cannot be read; its occupancy keeps nothing that the
+    cameras see, and this run has not begun with it; its gate is none that the sampler asks; or
+    nothing can be learned in the time or with the rays that are given.
     """
 
     def __init__(
@@ -155,10 +142,8 @@ class GuidedStart:
         self.along = None if guide.occupancy is None else self._fit(guide.occupancy)
 
     def before_step(self, step: int) -> None:
-        """Learns the occupancy if there is none yet, and leaves its file in the run's folder.
-
-        A packed host begins carefully, and opaque.
-        """
+        """Learns the occupancy if there is none yet, and leaves its file in the run's folder. A
+        packed host begins carefully, and opaque."""
         if self.begun:
             return
         self.begun = True
@@ -225,18 +210,13 @@ class GuidedStart:
 def refuse_another_scene(
     occupancy: Occupancy, manager: Any, frame: Tensor, insists: bool = False
 ) -> None:
-    """Says so where hardly any camera that an occupancy was learned on is among a run's.
+    """Says so where hardly any camera that an occupancy was learned on is among a run's, to whose
+    coordinates the frame [3, 4] leads back. InputError if it is certainly of another scene, unless
+    one `insists`.
 
     Test photographs count too, so that another split is no other scene; so do photographs that were
     added or taken away since. A file names `MOST_CAMERAS` at most: of so many, some photographs may
     have none. Their sparse points then say whether it is another scene.
-
-    Args:
-        manager: nerfstudio's data manager of the run.
-        frame: [3, 4] from the run's coordinates to those of the occupancy.
-        insists: whether a scene that is certainly another one is warned of too.
-    Raises:
-        InputError: it is certainly of another scene.
     """
     known = cameras_of(occupancy)
     sets = (manager.train_dataset, getattr(manager, "eval_dataset", None))
@@ -293,11 +273,8 @@ class AlongRays(NamedTuple):
 
 @torch.no_grad()
 def along_rays(guide: Guide, occupancy: Occupancy, cameras: Any) -> AlongRays:
-    """An occupancy along rays through its box.
-
-    Args:
-        guide: says how the occupancy lies in the host.
-    """
+    """An occupancy along the cameras' rays through its box, which lies in the host as its guide
+    says."""
     frame = guide.frame
     origins, directions = (part.reshape(-1, 3).to(frame) for part in covering_rays(cameras))
     origins, directions = moved(origins, frame), turned(directions, frame)

@@ -36,13 +36,8 @@ SCALE = "average_init_density"
 
 
 def begin_opaque(host: nn.Module, guide: Guide, kept_lengths: Tensor) -> None:
-    """Raises the density with which a packed host's field begins, where its kept stretches need it.
-
-    Args:
-        host: before its first step; one that has no such density to set stays as it is.
-        guide: remembers the density for checkpoints.
-        kept_lengths: [R] kept of each ray, scene units of the host; those of 0 are left out.
-    """
+    """Raises the density with which a packed host's field begins, before its first step, where the
+    kept stretches [R] of its rays, scene units, need it; the guide remembers it for checkpoints."""
     scales = [float(getattr(module, SCALE)) for module in _scaled(host)]
     if not scales:
         return
@@ -83,10 +78,7 @@ ANYTHING = 1e-30
 
 def begin_carefully(host: nn.Module, guide: Guide, skipped: Callable[[Occupancy], float]) -> bool:
     """Has a packed host follow a lower threshold for the beginning; returns whether it does.
-
-    Args:
-        skipped: share of what the cameras see that an occupancy skips.
-    """
+    `skipped` says what share of what the cameras see an occupancy skips."""
     if not any(isinstance(module, GuidedEstimator) for module in host.modules()):
         return False
     occupancy = guide.the_occupancy()
@@ -131,13 +123,7 @@ steps, says if it is low enough."""
 
 
 class HostWatch:
-    """Stands around the steps of a guided host.
-
-    Args:
-        config: bounds and how often they are measured.
-        pipeline: nerfstudio's.
-        run: what is around the steps.
-    """
+    """Stands around the steps of a guided host, and measures the price bounds of a config."""
 
     def __init__(
         self, host: Any, guide: Guide, config: CalibrationConfig, pipeline: Any, run: Run

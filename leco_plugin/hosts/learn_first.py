@@ -39,13 +39,8 @@ def learn_occupancy(
     rate: float = 1.0,
     guides: float = 0.0,
 ) -> Occupancy:
-    """Trains an HMoE on the pipeline's data until its gate is frozen and calibrated.
-
-    Arguments and errors as for `learn_model`, with options named as they are given to a host.
-
-    Returns:
-        The occupancy, in the coordinates of the pipeline's model.
-    """
+    """As `learn_model`, with options named in errors as they are given to a host; returns the
+    occupancy, in the coordinates of the pipeline's model."""
     try:
         model = learn_model(config, pipeline, rays, seconds, rate, guides)
     except InputError as error:
@@ -140,11 +135,7 @@ def _batches_of(rays: int, manager: Any) -> Iterator[None]:
 
 
 def check_budget(rays: int, seconds: float | None, rate: float) -> None:
-    """Whether something can be learned so; arguments as for `learn_model`.
-
-    Raises:
-        InputError: not so.
-    """
+    """InputError if nothing can be learned so; arguments as for `learn_model`."""
     if seconds is not None and not 0.0 < seconds < math.inf:
         raise InputError(f"an occupancy is learned in a positive number of seconds, not {seconds}")
     if rays < 1:
@@ -154,10 +145,8 @@ def check_budget(rays: int, seconds: float | None, rate: float) -> None:
 
 
 def keep_within(progress: Progress, more: float, done: int) -> None:
-    """Shortens learning to so many more steps, which fit into the time that is left.
-
-    What does not fit of the further steps that a gate gets when it has not settled, it has had.
-    """
+    """Shortens learning to so many more steps, which fit into the time that is left. What does not
+    fit of the further steps that a gate gets when it has not settled, it has had."""
     fit = max(FEWEST_STEPS, done + int(more))
     progress.learn_steps = min(progress.learn_steps, fit)
     progress.phase = min(progress.phase or fit, fit)  # of which recoveries take their share
@@ -172,11 +161,8 @@ def _train(
     seconds: float | None,
     show: Callable[[float], None],
 ) -> None:
-    """Steps until the gate is frozen.
-
-    Args:
-        trained: the model, or what averages its gradients over processes.
-    """
+    """Steps until the gate is frozen; `trained` is the model, or what averages its gradients over
+    processes."""
     progress, manager = learner.progress, learner.data.manager
     started = time.monotonic()
     step, timed_from = 0, started

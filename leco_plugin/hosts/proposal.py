@@ -29,16 +29,8 @@ Answer = tuple[RaySamples, list[Tensor], list[RaySamples]]
 
 
 class _ProposalSampler(nn.Module):
-    """What a host of nerfstudio calls in place of its `ProposalNetworkSampler`.
-
-    Args:
-        initial_sampler: lays the candidates; None is nerfstudio's default for proposal hosts.
-        single_jitter: shift all samples of a ray by the same random share.
-        sizes: samples and candidates of each ray, by name.
-
-    Raises:
-        ValueError: there is not even one sample or candidate.
-    """
+    """What a host of nerfstudio calls in place of its `ProposalNetworkSampler`, with sizes by name.
+    ValueError if there is not even one sample or candidate."""
 
     def __init__(self, initial_sampler: Sampler | None, single_jitter: bool, **sizes: int) -> None:
         super().__init__()
@@ -55,19 +47,12 @@ class _ProposalSampler(nn.Module):
         ray_bundle: RayBundle | None = None,
         density_fns: list[Callable[..., Any]] | None = None,
     ) -> Answer:
-        """Samples for a host.
+        """The samples [n_rays, n_samples], sorted and between near and far; and for each level the
+        weights of the candidates [n_rays, n_candidates, 1], and the candidates.
 
-        Args:
-            ray_bundle: rays with nears and fars, [n_rays].
-            density_fns: the host's proposal densities. They are not called; their number tells how
-                many levels of weights the host's losses and depth outputs expect.
-
-        Returns:
-            the samples [n_rays, n_samples], sorted and between near and far; and for each level
-            the weights of the candidates [n_rays, n_candidates, 1], and the candidates.
-
-        Raises:
-            ValueError: there are no rays to sample, or they have no nears and fars.
+        The host's proposal densities are not called; their number tells how many levels of weights
+        its losses and depth outputs expect. ValueError if there are no rays, or none with nears and
+        fars.
         """
         samples, weights, candidates = self._draw(_clamp_ends(ray_bundle))
         levels = 1 if density_fns is None else len(density_fns)
@@ -83,14 +68,11 @@ class _ProposalSampler(nn.Module):
 
 
 def _clamp_ends(ray_bundle: RayBundle | None) -> RayBundle:
-    """The rays with nears and fars between which samples can be laid.
+    """The rays with nears and fars between which samples can be laid. ValueError if there are none.
 
     A ray that ends before it begins, or at no number, has samples without length, all where it
     begins; that is its origin if it is no finite number. A ray without end is followed as far as a
     spacing in disparity, 1 - 1/(2t), can be told from 1: 4 million units in float32, 512 in half.
-
-    Raises:
-        ValueError: there are no rays, or they have no nears and fars.
     """
     if ray_bundle is None or ray_bundle.nears is None or ray_bundle.fars is None:
         raise ValueError("samples need a ray bundle with nears and fars (set by a collider)")
@@ -184,10 +166,8 @@ class LearnedOccupancySampler(_ProposalSampler):
 
     @torch.no_grad()
     def worth(self, positions: Tensor) -> Tensor:
-        """o at occupied positions, 0 elsewhere; positions [..., 3] to [..., 1].
-
-        The cache decides first, so that the gate is asked only where it lets something through.
-        """
+        """o at occupied positions [..., 3], 0 elsewhere: [..., 1]. The cache decides first, so that
+        the gate is asked only where it lets something through."""
         flat = self._in_its_frame(positions)
         kept = self.estimator.occupied(flat).nonzero()[:, 0]
         worth = positions.new_zeros(len(flat))

@@ -60,10 +60,7 @@ def adapters() -> dict[str, HostAdapter]:
 
 def swap_sampler(host: Model, guide: Guide) -> str:
     """Replaces the host's sampling by the guide's; returns the name of the adapter that did.
-
-    Raises:
-        InputError: the host has no seam that any adapter knows.
-    """
+    InputError if the host has no seam that any adapter knows."""
     install_for(None)
     known = adapters()
     for name, adapter in known.items():
@@ -172,10 +169,7 @@ PROPOSAL = HostAdapter(
 
 def no_density(*_: Any, **__: Any) -> None:
     """Stands in a host's list of proposal densities: their number is asked for, not they.
-
-    Raises:
-        RuntimeError: it is called after all.
-    """
+    RuntimeError if it is called after all."""
     raise RuntimeError("a guided host has no proposal networks to ask for a density")
 
 
@@ -190,10 +184,8 @@ def _density_lists(host: nn.Module) -> Iterator[tuple[str, list[Any] | tuple[Any
 
 
 def _remove_density_networks(host: nn.Module) -> None:
-    """Drops the proposal networks from memory, state dict and parameter groups.
-
-    An empty module takes their places: a host may go on listing their parameters.
-    """
+    """Drops the proposal networks from memory, state dict and parameter groups. An empty module
+    takes their places: a host may go on listing their parameters."""
     field = getattr(host, "field", None)
     for name, densities in list(_density_lists(host)):
         for network in {density.__self__ for density in densities} - {field}:

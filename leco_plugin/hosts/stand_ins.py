@@ -75,18 +75,11 @@ def _ending_in_a_backdrop(
     crop: tuple[Tensor | None, Tensor | None],
     cut_off: Tensor | None,
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Packed samples whose rays end in one interval that no gate skips.
+    """Packed samples whose rays, some without any, end in one interval that no gate skips.
 
     The gate was learned before such a backdrop, and skips what that shows: a host without one would
-    have no place for the sky.
-
-    Args:
-        samples: of a sampler, in which rays may have none.
-        options: of its `sampling`.
-        walls: [6] of the occupancy: where a ray leaves them its backdrop begins; one that misses
-            them has it at its end.
-        crop: where each ray begins and ends in it, [R] each; a ray that it ends has no backdrop.
-        cut_off: bool [R], rays without a backdrop in any case; None is no ray.
+    have no place for the sky. It begins where a ray leaves the occupancy's walls [6], or, of one
+    that misses them, at its end; a ray that a crop ends, or that is cut off [R], has none.
     """
     options = _DEFAULTS | options
     ends = rays_o.new_full((len(rays_o),), float(options["far_plane"]))
@@ -159,11 +152,8 @@ class GuidedEstimator(_StandIn):
         return build_estimator("dense", aabb=box).to(self.guide.frame.device).train(self.training)
 
     def _with_an_end(self, rays_o: Tensor, rays_d: Tensor, given: dict[str, Any]) -> dict[str, Any]:
-        """The options of `sampling`; rays that would go on for ever end at the host's box.
-
-        A host whose steps do not grow relies on the box of its own estimator, and an unbounded
-        occupancy has none.
-        """
+        """The options of `sampling`; rays that would go on for ever end at the host's box, on which
+        a host whose steps do not grow relies, and an unbounded occupancy has none."""
         if not self._is_endless() or self._outermost is None or given.get("cone_angle"):
             return given
         _, leaves = intersect_box(rays_o, rays_d, self._outermost.to(rays_o))
@@ -230,11 +220,9 @@ class GuidedProposal(_StandIn, Sampler):
         return guide.built(build_proposal, **options)
 
     def forward(self, *args: Any, **kwargs: Any) -> Any:
-        """As of the sampler behind this.
-
-        Rendered rays that meet nothing occupied, and whose backdrop training has never seen, have
-        samples without length: the field has learned nothing there.
-        """
+        """As of the sampler behind this. Rendered rays that meet nothing occupied, and whose
+        backdrop training has never seen, have samples without length: the field has learned nothing
+        there."""
         guide = self.guide
         made, guide.without_backdrop = self.sampler(*args, **kwargs), None
         if self.training or not guide.needs_occupancy:

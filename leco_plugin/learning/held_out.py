@@ -22,7 +22,7 @@ from leco_plugin.models.rendering import Rays
 
 if TYPE_CHECKING:
     from leco_plugin.scenes.learning_data import LearningData
-    from leco_plugin.scenes.pixels.lattice import Share
+    from leco_plugin.scenes.pixels.held_out_pixels import Share
 
 
 class HeldOut:

@@ -40,7 +40,6 @@ OVER_CAMERAS = 0.06
 """Share of the way from the ground to the highest camera by which raised bounds end above it."""
 NEAR_CAMERAS = 0.04
 """Share of the farthest distance at which rays begin in raised bounds."""
-FROM_ABOVE = "photographed from above"
 
 
 @dataclass(frozen=True)
@@ -72,14 +71,9 @@ def find_bounds(
 ) -> SceneBounds:
     """Bounds from camera poses, some of the cameras' rays, and sparse points.
 
-    Args:
-        camera_to_worlds: [C, 3, 4] OpenGL poses, scene units.
-        directions: [C, K, 3] unit directions of rays that cover each image, its corners included.
-        points: [P, 3] sparse scene points, or None.
-        config: what is not to be found.
-    Raises:
-        InputError: there are no cameras, a pose is not finite, no camera sees a point, or the
-            configured altitudes are no range that rays go down to.
+    Poses [C, 3, 4] are OpenGL's, in scene units; unit directions [C, K, 3] cover each image, its
+    corners included; points are [P, 3] or None. InputError if there are no cameras, a pose is not
+    finite, no camera sees a point, or configured altitudes are no range that rays go down to.
     """
     config = config or BoundsConfig()
     poses, directions = (part.detach().float().cpu() for part in (camera_to_worlds, directions))
@@ -105,7 +99,7 @@ def find_bounds(
         # far below, so that a flat picture on the lower plane is plainly wrong from two places
         ground = float(low[2]) - max(0.5 * relief, 0.2 * far)
         top = float(high[2]) + 0.3 * relief
-        why = f"{FROM_ABOVE} ({seen}): bounded"
+        why = f"photographed from above ({seen}): bounded"
         found = _slab(poses, directions, (ground, top), (near, far), why)
         return replace(found, from_above=True)
     if config.space == "box":
@@ -136,14 +130,11 @@ def with_range(bounds: SceneBounds, near: float | None, far: float | None) -> Sc
 
 
 def raise_to_cameras(bounds: SceneBounds, heights: Tensor, seen: float) -> SceneBounds:
-    """The bounds of a scene from above, raised to its cameras.
+    """The bounds of a scene from above, raised to its cameras, of heights z [C].
 
-    For pictures that show something where rays miss what the sparse points bound: fog, which has no
-    points, or a sky, which a cube with walls at its sides holds before its backdrop.
-
-    Args:
-        heights: [C] z of the cameras.
-        seen: share of the rays that miss the bounds and show something.
+    For pictures that show something (`seen`, a share of the rays) where rays miss what the sparse
+    points bound: fog, which has no points, or a sky, which a cube with walls holds before its
+    backdrop.
     """
     ground, highest = float(bounds.aabb[2]), float(heights.max())
     top = max(float(bounds.aabb[5]), highest + OVER_CAMERAS * (highest - ground))
@@ -267,10 +258,8 @@ MOSTLY_ABOVE, MOSTLY_DOWN = 0.75, 0.9
 
 
 def _seen_from_above(poses: Tensor, directions: Tensor, points: Tensor) -> tuple[bool, str]:
-    """Whether a scene is seen from above, and its two shares in words.
-
-    It is if nearly all rays go down and most cameras are above nearly all points.
-    """
+    """Whether nearly all rays go down and most cameras are above nearly all points, and both shares
+    in words."""
     above = float((poses[:, 2, 3] > _quantiles(points[:, 2], 0.95)).float().mean())
     down = float(_go_down(directions).float().mean())
     words = f"{down:.0%} of rays go down, {above:.0%} of cameras are above the points"

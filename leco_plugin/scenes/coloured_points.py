@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from leco_plugin.scenes.input_error import InputError, one_line
-from leco_plugin.scenes.scene_file import load_json
+from leco_plugin.scenes.scene_file import file_in, load_json
 
 CONFIG = "config.yml"
 NEAREST = 3
@@ -47,18 +47,16 @@ def description_of_run(file: Path) -> Path | None:
     data = _data_named_in(config)
     if data is None:
         return None
-    found = _file_in(data)
+    found = file_in(data)
     if not found.is_file():
         there = found_around(data, config.parent)
-        found = found if there is None else _file_in(there)
+        found = found if there is None else file_in(there)
     return found if found.is_file() else None
 
 
 def _data_named_in(config: Path) -> Path | None:
-    """The data that a run's config.yml names; None where it cannot be read.
-
-    Nothing in it is executed, and classes that this version lacks do not matter.
-    """
+    """The data that a run's config.yml names; None where it cannot be read. Nothing in it is
+    executed, and classes that this version lacks do not matter."""
     import yaml
 
     class Plain(yaml.SafeLoader):
@@ -79,27 +77,15 @@ def _data_named_in(config: Path) -> Path | None:
 
 
 def description_in(data: Path) -> Path:
-    """The transforms.json that `data` means: itself, or that in the folder.
-
-    Raises:
-        InputError: there is none.
-    """
-    file = _file_in(data)
+    """The transforms.json that `data` means: itself, or that in the folder. InputError for none."""
+    file = file_in(data)
     if not file.is_file():
         raise InputError(f"--data {data}: there is no transforms.json; give a nerfstudio scene")
     return file
 
 
-def _file_in(data: Path) -> Path:
-    return data if data.suffix == ".json" else data / "transforms.json"
-
-
 def read_cloud(path: Path) -> CloudFile:
-    """The vertices of a .ply, without those that are not finite.
-
-    Raises:
-        InputError: the file cannot be read as points.
-    """
+    """The finite vertices of a .ply. InputError if the file cannot be read as points."""
     import trimesh
 
     try:
@@ -118,11 +104,8 @@ def read_cloud(path: Path) -> CloudFile:
 
 
 def coloured_points(description: Path) -> ColouredPoints | None:
-    """Sparse points with colours that a transforms.json names; None where it names none.
-
-    Raises:
-        InputError: the file of the points cannot be read.
-    """
+    """Sparse points with colours that a transforms.json names, or None. InputError if they cannot
+    be read."""
     name = load_json(description).get("ply_file_path")
     path = description.parent / str(name)
     if name is None or not path.is_file():

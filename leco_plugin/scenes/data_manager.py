@@ -25,15 +25,13 @@ from rich.markup import escape
 from torch import Tensor
 
 from leco_plugin.log import say
-from leco_plugin.scenes.frames import UP_IS_KNOWN
+from leco_plugin.scenes.frames import UP_IS_KNOWN, turn_outputs, turn_to_upright
 from leco_plugin.scenes.input_error import InputError
 from leco_plugin.scenes.photograph_files import names_what_it_cannot_read
-from leco_plugin.scenes.pixels.held_out_pixels import HeldOutPixelSampler
-from leco_plugin.scenes.pixels.lattice import Lattice, lattice_for
+from leco_plugin.scenes.pixels.held_out_pixels import HeldOutPixelSampler, Lattice, lattice_for
 from leco_plugin.scenes.pixels.stored_pictures import picture_sizes, store_pictures
 from leco_plugin.scenes.reading import read_checked
 from leco_plugin.scenes.survey import CAMERAS, points_in
-from leco_plugin.scenes.upright import turn_to_upright, turned
 from leco_plugin.studio.run_folder import keeps_all_images
 
 MOST_OF_MEMORY = 0.4
@@ -86,12 +84,12 @@ class LecoDataManager(VanillaDataManager):  # type: ignore[type-arg]
     def create_eval_dataset(self) -> Any:
         """The test photographs; there may be none."""
         dataset = names_what_it_cannot_read(super().create_eval_dataset())
+        count = len(self.train_dataset)
         if self.test_mode == "val":
             say(read_in_words(self.get_datapath(), self.train_dataset, len(dataset)))
-        if len(dataset) == 0:
-            if self.test_mode == "val":
-                count = len(self.train_dataset)
+            if len(dataset) == 0:
                 say(f"no test image: the run trains on all {count} and evaluates nothing")
+        if len(dataset) == 0:
             none: Any = NoTestImages(
                 f"{self.get_datapath()} has no test image in this run, and nothing can be "
                 "evaluated; ns-render shows what it has learned"
@@ -100,10 +98,8 @@ class LecoDataManager(VanillaDataManager):  # type: ignore[type-arg]
         return dataset
 
     def _get_pixel_sampler(self, dataset: Any, num_rays_per_batch: int) -> Any:
-        """nerfstudio's choice; of small scenes more pixels are held out.
-
-        The radius of a fisheye's circle is given by hand, or that of the full-size image.
-        """
+        """nerfstudio's choice; of small scenes more pixels are held out, and the radius of a
+        fisheye's circle is given by hand, or that of the full-size image."""
         by_hand = self.config.pixel_sampler.fisheye_crop_radius
         sampler = super()._get_pixel_sampler(dataset, num_rays_per_batch)
         of_scene = (dataset.cameras.metadata or {}).get("fisheye_crop_radius")
@@ -130,7 +126,11 @@ class LecoDataManager(VanillaDataManager):  # type: ignore[type-arg]
         wanted = getattr(config, "images", "auto")
         if wanted == "memory" or not keeps_all_images(config, len(self.train_dataset)):
             return False
-        obstacle = self._obstacle()
+        obstacle = None
+        if not issubclass(config.pixel_sampler._target, HeldOutPixelSampler):
+            obstacle = "the pixel sampler draws from images in memory only; use leco's own"
+        elif self.train_dataset.mask_color:
+            obstacle = "the scene's mask_color is painted over images in memory only"
         if wanted == "disk":
             if obstacle is not None:
                 raise InputError(f"photographs on disk: {obstacle}")
@@ -139,14 +139,6 @@ class LecoDataManager(VanillaDataManager):  # type: ignore[type-arg]
         free = free_memory()
         needed *= max(1, self.world_size)  # each process decodes its own
         return obstacle is None and free is not None and needed > MOST_OF_MEMORY * free
-
-    def _obstacle(self) -> str | None:
-        """Why pixels cannot be read from files, if they cannot."""
-        if not issubclass(self.config.pixel_sampler._target, HeldOutPixelSampler):
-            return "the pixel sampler draws from images in memory only; use leco's own"
-        if self.train_dataset.mask_color:
-            return "the scene's mask_color is painted over images in memory only"
-        return None
 
     def _store(self, dataset: Any, what: str) -> Any:
         """An endless iterator over the one batch of images that there is."""
@@ -163,9 +155,8 @@ class LecoDataManager(VanillaDataManager):  # type: ignore[type-arg]
         gigabytes = decoded_bytes(self.train_dataset) / 1e9
         say(f"{len(self.train_dataset)} photographs, {gigabytes:.1f} GB decoded, stay on disk")
         self.iter_train_image_dataloader = self._store(self.train_dataset, "photographs")
-        self.train_pixel_sampler = self._get_pixel_sampler(
-            self.train_dataset, self.config.train_num_rays_per_batch
-        )
+        rays = self.config.train_num_rays_per_batch
+        self.train_pixel_sampler = self._get_pixel_sampler(self.train_dataset, rays)
         self.train_ray_generator = RayGenerator(self.train_dataset.cameras.to(self.device))
 
     def setup_eval(self) -> None:
@@ -174,16 +165,12 @@ class LecoDataManager(VanillaDataManager):  # type: ignore[type-arg]
             super().setup_eval()
             return
         self.iter_eval_image_dataloader = self._store(self.eval_dataset, "test photographs")
-        self.eval_pixel_sampler = self._get_pixel_sampler(
-            self.eval_dataset, self.config.eval_num_rays_per_batch
-        )
+        rays = self.config.eval_num_rays_per_batch
+        self.eval_pixel_sampler = self._get_pixel_sampler(self.eval_dataset, rays)
         self.eval_ray_generator = RayGenerator(self.eval_dataset.cameras.to(self.device))
-        self.fixed_indices_eval_dataloader = FixedIndicesEvalDataloader(
-            input_dataset=self.eval_dataset, device=self.device
-        )
-        self.eval_dataloader = RandIndicesEvalDataloader(
-            input_dataset=self.eval_dataset, device=self.device
-        )
+        given: dict[str, Any] = {"input_dataset": self.eval_dataset, "device": self.device}
+        self.fixed_indices_eval_dataloader = FixedIndicesEvalDataloader(**given)
+        self.eval_dataloader = RandIndicesEvalDataloader(**given)
 
 
 @dataclass
@@ -208,8 +195,7 @@ def upright_outputs(read: Callable[..., DataparserOutputs]) -> Callable[..., Dat
         if not known:
             training = outputs if split == "train" else read(split="train", **kwargs)
             known.append(_turn_of(training))
-        turn = known[0]
-        return outputs if turn is None else turned(outputs, turn)
+        return outputs if known[0] is None else turn_outputs(outputs, known[0])
 
     return outputs_of
 
@@ -229,13 +215,8 @@ def _turn_of(outputs: DataparserOutputs) -> Tensor | None:
 
 
 def read_in_words(data: Path, training: Any, tests: int) -> str:
-    """What was read of a scene, in one line.
-
-    Args:
-        data: its folder or file.
-        training: the dataset of training photographs.
-        tests: how many test photographs there are.
-    """
+    """What was read of a scene (folder or file, training dataset, number of test photographs): one
+    line."""
     sizes = picture_sizes(training)
     height, width = sizes.amax(dim=0).tolist()
     size = f"{'' if bool((sizes == sizes[0]).all()) else 'up to '}{width} x {height}"

@@ -1,4 +1,4 @@
-"""The coordinates of a scene: frames of its readers, lengths and altitudes of its data, and poses.
+"""The coordinates of a scene: frames of its readers, lengths and altitudes, poses, what is up.
 
 nerfstudio's readers turn, move and scale a scene, each in its own way. What was learned in the
 coordinates of one is asked in those of another, and what a reader says it did leads back to the
@@ -14,27 +14,18 @@ from typing import Any
 
 import numpy as np
 import torch
+from nerfstudio.cameras.camera_utils import rotation_matrix_between
+from nerfstudio.data.dataparsers.base_dataparser import DataparserOutputs
 from numpy.typing import NDArray
 from torch import Tensor
 
 from leco_plugin.scenes.input_error import InputError
 
 
-def rotation(turn: NDArray[np.floating]) -> NDArray[np.float64]:
-    """The matrix [3, 3] of a turn around an axis [3] by its length in radians (Rodrigues)."""
-    angle = float(np.linalg.norm(turn))
-    x, y, z = turn / max(angle, 1e-12)
-    cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
-    matrix = np.eye(3) + np.sin(angle) * cross + (1.0 - np.cos(angle)) * cross @ cross
-    return np.asarray(matrix)
-
-
 def frame_of(datamanager: Any) -> list[list[float]] | None:
-    """What took the scene's coordinates to the model's: [3, 4], JSON values; None is not known.
-
-    The scene's are those of its reconstruction, before any `applied_transform` of its file, so that
-    all readers of it mean the same.
-    """
+    """What took the scene's coordinates to the model's: [3, 4], JSON values; None is not known. The
+    scene's are those of its reconstruction, before any `applied_transform`, so that all readers of
+    it mean the same."""
     outputs = getattr(datamanager, "train_dataparser_outputs", None)
     if outputs is None:
         return None
@@ -43,10 +34,8 @@ def frame_of(datamanager: Any) -> list[list[float]] | None:
 
 
 def data_frame_of(datamanager: Any) -> list[list[float]] | None:
-    """What took positions as the data's own files have them to the model's: [3, 4], JSON values.
-
-    It differs from `frame_of` where a transforms.json has an `applied_transform`.
-    """
+    """What took positions in the data's own files to the model's: [3, 4], JSON values. It differs
+    from `frame_of` where a transforms.json has an `applied_transform`."""
     frame = frame_of(datamanager)
     if frame is None:
         return None
@@ -65,6 +54,9 @@ def parsed_frame(outputs: Any) -> Tensor:
     return float(outputs.dataparser_scale) * transform
 
 
+POINTS = "points3D_xyz"
+"""Key of the dataset's metadata with the sparse points [P, 3] in model coordinates, as nerfstudio's
+own readers have it."""
 APPLIED = "leco_applied"
 """Key of a dataparser's metadata: `applied_transform`, or None, and `applied_scale` of its file."""
 APPLIED_EARLIER = [[0.0, 1.0, 0.0, 0.0], [1.0, 0.0, 0.0, 0.0], [0.0, 0.0, -1.0, 0.0]]
@@ -123,13 +115,8 @@ def from_file(
 
 
 def between(host: list[list[float]], other: list[list[float]]) -> Tensor:
-    """Takes positions of the host to those of the other: [3, 4] float32.
-
-    Args:
-        host, other: [3, 4] each, from one scene's coordinates, as of `frame_of`.
-    Returns:
-        The identity, exactly, where the two agree to a millionth.
-    """
+    """Takes positions of the host to those of the other: [3, 4] float32, of two frames [3, 4] from
+    one scene's coordinates; exactly the identity where they agree to a millionth."""
     a, b = (torch.tensor(frame, dtype=torch.float64) for frame in (host, other))
     turn = b[:, :3] @ torch.linalg.inv(a[:, :3])
     frame = torch.cat([turn, (b[:, 3] - turn @ a[:, 3])[:, None]], dim=1).float()
@@ -172,7 +159,8 @@ ALTITUDES = "leco_altitudes"
 UP_IS_KNOWN = "leco_up_is_known"
 """Key of a dataparser's metadata: there where z is up in the dataset already."""
 UPRIGHT = 0.94
-"""Cosine of 20 degrees. An axis of the dataset that is this near to the model's z is up there."""
+"""Cosine of 20 degrees: an axis of the dataset that is nearer to the model's z is up there, and
+what is nearer to z in a survey may be the slope of a hill."""
 
 
 @dataclass(frozen=True)
@@ -199,10 +187,8 @@ class DatasetUnits:
 
 def units_of(datamanager: Any, metres_per_unit: float | None = None) -> DatasetUnits | None:
     """The units of a data manager's dataset; None where its dataparser does not say what it did.
-
-    `metres_per_unit`, of the dataset's own poses, is positive, or InputError; None takes what the
-    dataparser knows.
-    """
+    InputError unless `metres_per_unit` of its poses is positive, or None: what the dataparser
+    knows."""
     outputs = getattr(datamanager, "train_dataparser_outputs", None)
     scale = float(getattr(outputs, "dataparser_scale", 0.0))
     if outputs is None or not 0.0 < scale < math.inf:
@@ -228,10 +214,8 @@ SKEW = 0.05
 
 
 def distance_from_rotations(matrices: NDArray[np.floating]) -> NDArray[np.floating]:
-    """How far [C, 3, 3] are from rotations: the largest error of R R^T = 1 and of det R = 1, [C].
-
-    A mirrored rotation has 2. The matrices are finite.
-    """
+    """How far finite [C, 3, 3] are from rotations: the largest error of R R^T = 1 and of det R = 1,
+    [C]; a mirrored rotation has 2."""
     errors = np.abs(matrices @ matrices.swapaxes(1, 2) - np.eye(3)).max(axis=(1, 2))
     return np.maximum(errors, np.abs(np.linalg.det(matrices) - 1.0))
 
@@ -252,3 +236,105 @@ def check_poses(poses: NDArray[np.floating], names: list[str]) -> None:
         raise InputError(
             f"{worst} is no rotation: remove its scale, shear or mirroring, or leave its image out"
         )
+
+
+# Structure from motion does not know what is down, and nerfstudio takes the photographs' top edges
+# for up: of cameras that look straight down these are level, and point in any direction.
+
+FEWEST_CAMERAS, FEWEST_POINTS = 4, 32
+DOWN, MOSTLY = -0.3, 0.9
+"""Height of a unit vector that goes down, and the share of cameras of a survey that look so."""
+ABOVE = 0.75
+"""Share of a survey's cameras that are above nearly all points."""
+FLAT = 0.35
+"""Thickness of the ground, and of the layer in which cameras fly, of its lesser width."""
+TURNED, LEVEL = 0.3, 0.15
+"""Cosines (root mean square) of the cameras' right axes with the second direction in which they
+point, if they are turned at all, and with the vertical, if they are level."""
+ONE_HEADING = 0.7
+"""Length of the mean of the cameras' top axes: with more, all are held alike."""
+WIDE = 0.3
+"""Spread of cameras over a survey, of their height: those of somebody who stands before a wall, and
+holds all photographs alike, are closer together."""
+
+
+def turn_to_upright(poses: Tensor, points: Tensor | None) -> Tensor | None:
+    """The rotation [3, 3] that sets a survey from the air upright; None if it is, or is no survey.
+
+    Up is where the cameras are over a flat ground, where their right axes are level, or where they
+    fly in a layer, whichever is known. Poses are [C, 3, 4] OpenGL's, points [P, 3] or None.
+    """
+    poses = poses.detach().double().cpu()
+    looks, places = -poses[:, :, 2], poses[:, :, 3]
+    if len(poses) < FEWEST_CAMERAS:
+        return None
+    if points is not None:
+        points = _without_strays(points.detach().double().cpu())
+    candidates = (
+        _normal_of_layer(points) if points is not None else None,
+        _vertical_of(poses[:, :, 0]),
+        _normal_of_layer(places),
+    )
+    ups = [
+        -found if float((looks @ found).mean()) > 0.0 else found
+        for found in candidates
+        if found is not None
+    ]
+    ups = [up for up in ups if float((looks @ up < DOWN).double().mean()) >= MOSTLY]
+    ups = [up for up in ups if _fly_over(poses, points, up)]
+    if not ups or any(float(up[2]) > UPRIGHT for up in ups):
+        return None
+    return rotation_matrix_between(ups[0].float(), torch.tensor([0.0, 0.0, 1.0]))
+
+
+def turn_outputs(outputs: DataparserOutputs, turn: Tensor) -> DataparserOutputs:
+    """What a dataparser says of a scene, turned: cameras, sparse points, and the way back."""
+    poses, transform = outputs.cameras.camera_to_worlds, outputs.dataparser_transform[:3]
+    outputs.cameras.camera_to_worlds = turn.to(poses) @ poses
+    outputs.dataparser_transform = turn.to(transform) @ transform
+    if outputs.metadata.get(POINTS) is not None:
+        points = torch.as_tensor(outputs.metadata[POINTS])
+        outputs.metadata[POINTS] = points @ turn.to(points).T
+    return outputs
+
+
+def _fly_over(poses: Tensor, points: Tensor | None, up: Tensor) -> bool:
+    """Whether cameras are above the points, and those that are held alike far from one another."""
+    alike = float(poses[:, :, 1].mean(dim=0).norm()) > ONE_HEADING
+    if points is None:
+        return not alike
+    heights, ground = poses[:, :, 3] @ up, points @ up
+    above = float((heights > ground.quantile(0.95)).double().mean()) >= ABOVE
+    clearance = float(heights.median() - ground.median())
+    spread = float(_spreads(poses[:, :, 3])[0][1])
+    return above and (not alike or spread >= WIDE * clearance)
+
+
+def _without_strays(points: Tensor) -> Tensor | None:
+    """The nine tenths of points [P, 3] that are nearest to their middle; None of too few."""
+    points = points[points.isfinite().all(dim=-1)]
+    points = points[:: max(1, len(points) // 100_000)]
+    if len(points) < FEWEST_POINTS:
+        return None
+    distances = (points - points.median(dim=0).values).norm(dim=-1)
+    return points[distances <= distances.quantile(0.9)]
+
+
+def _spreads(places: Tensor) -> tuple[Tensor, Tensor]:
+    """Standard deviations [3] of places [N, 3] along their principal axes, least first, and the
+    axes as columns [3, 3]."""
+    values, axes = torch.linalg.eigh(torch.cov(places.T))
+    return values.clamp(min=0.0).sqrt(), axes
+
+
+def _normal_of_layer(places: Tensor) -> Tensor | None:
+    """The direction [3] across places [N, 3] that lie in a flat layer."""
+    spreads, axes = _spreads(places)
+    return axes[:, 0] if bool(spreads[0] < FLAT * spreads[1]) else None
+
+
+def _vertical_of(rights: Tensor) -> Tensor | None:
+    """The direction [3] to which the cameras' right axes [C, 3] are level, if they turn enough."""
+    _, lengths, directions = torch.linalg.svd(rights, full_matrices=False)
+    cosines = lengths / len(rights) ** 0.5
+    return directions[2] if bool((cosines[1] > TURNED) & (cosines[2] < LEVEL)) else None

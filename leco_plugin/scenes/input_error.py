@@ -22,11 +22,7 @@ ANOTHER_VERSION = (
 
 @contextmanager
 def state_of_this_version() -> Iterator[None]:
-    """While the state of a checkpoint is read: one that lacks or has other keys is refused.
-
-    Raises:
-        InputError: that, in one line.
-    """
+    """While the state of a checkpoint is read: InputError for one that lacks or has other keys."""
     try:
         yield
     except (KeyError, TypeError, AttributeError) as error:
@@ -40,13 +36,8 @@ def require_keys(values: Mapping[str, object], wanted: Iterable[str]) -> None:
 
 
 def require(holds: bool, option: str, value: object, wanted: str) -> None:
-    """InputError if the value of an option will not do.
-
-    Args:
-        holds: whether it will.
-        option: as it is given, without the dashes before it.
-        wanted: the values that will do, as `at least 1`.
-    """
+    """InputError unless the value of an option (named without dashes) is as `wanted`, say `at least
+    1`."""
     if not holds:
         raise InputError(f"{option} is {value}; it must be {wanted}")
 

@@ -159,10 +159,8 @@ def near_bases(kind: type[DataParser]) -> tuple[type[DataParser], ...]:
 
 
 def rounded_by(datamanager: Any) -> str | None:
-    """A line on the large coordinates that a data manager's reader has rounded; None if it has not.
-
-    A reader with a float64 `dataparser_transform` has not.
-    """
+    """A line on the large coordinates that a data manager's reader has rounded; None if it has not,
+    as one with a float64 `dataparser_transform`."""
     outputs = getattr(datamanager, "train_dataparser_outputs", None)
     if outputs is None or not 0.0 < float(outputs.dataparser_scale) < np.inf:
         return None

@@ -19,6 +19,8 @@ from leco_plugin.scenes.bounds import BoundsConfig
 from leco_plugin.scenes.frames import data_frame_of, frame_of
 from leco_plugin.scenes.pixels.held_out_pixels import (
     HeldOutPixelSampler,
+    Lattice,
+    Share,
     held_out_sampler,
     some_images,
 )
@@ -28,7 +30,6 @@ from leco_plugin.scenes.pixels.known_distances import (
     sampler_here,
     sparse_pixels,
 )
-from leco_plugin.scenes.pixels.lattice import Lattice, Share
 from leco_plugin.scenes.survey import Survey, covering_rays, sparse_points, survey
 from leco_plugin.seen import rays_a_side
 
@@ -41,14 +42,9 @@ SHARE_THAT_VOUCHES = 4
 
 
 class LearningData:
-    """A data manager as a learner sees it.
-
-    Args:
-        manager: nerfstudio's, or one with its interface.
-        bounds, near, far: what of the scene's place is set by hand.
-    Raises:
-        InputError: the data manager hands out whole images, or no ray meets the scene.
-    """
+    """A data manager, nerfstudio's or one with its interface, as a learner sees it. Bounds, near
+    and far are what is set by hand. InputError if it hands out whole images, or no ray meets the
+    scene."""
 
     def __init__(
         self, manager: Any, bounds: BoundsConfig, near: float | None, far: float | None
@@ -75,13 +71,9 @@ class LearningData:
         region.see(rays[0].reshape(-1, 3), rays[1].reshape(-1, 3))
 
     def prepare_batch(self, factor: float, distances: bool, set_aside: int = 0) -> None:
-        """Sets the next batch; one that is drawn elsewhere stays as it is.
-
-        Args:
-            factor: its rays as a multiple of those of the config.
-            distances: whether pixels whose distance is known are drawn too.
-            set_aside: of how many photographs nothing is drawn, see `vouching`.
-        """
+        """Sets the next batch; one that is drawn elsewhere stays as it is. It has `factor` times
+        the config's rays, pixels of known distance if asked, and none of `set_aside` photographs
+        (`vouching`)."""
         sampler = sampler_here(self.manager)
         if isinstance(sampler, HeldOutPixelSampler):
             sampler.set_aside = None
@@ -203,16 +195,12 @@ def training_bundles(manager: Any, count: int) -> Iterator[Any]:
 def held_out_bundle(
     manager: Any, count: int, seed: int = 0, share: Share = "calibration"
 ) -> tuple[RayBundle, Tensor]:
-    """Rays of training pixels that are never trained on, and their true colours [R, 3 or 4].
+    """Up to `count` rays of training pixels that are never trained on, and true colours [R, 3 or
+    4].
 
     They are of training images, whose appearance is known: an exposure that the mean of all does
     not show would stand in every error, and hide what skipping adds to it. A data manager without
     held-out pixels gives ordinary training rays; the report says so.
-
-    Args:
-        count: rays wanted; fewer come back where there are fewer.
-        seed: of the draw.
-        share: of the held-out pixels.
     """
     sampler = held_out_sampler(manager)
     if sampler is None:

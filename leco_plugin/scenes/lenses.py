@@ -55,28 +55,21 @@ class Lens:
     def focal_lengths(
         self, width: float, height: float, factor: int
     ) -> tuple[float, float] | tuple[None, None]:
-        """Both focal lengths in pixels of a picture of that size; None where nothing is said.
-
-        Args:
-            factor: by which the picture is smaller than the size that the lens is for.
-        """
-        width = width if self.width is None else self.width / factor
-        height = height if self.height is None else self.height / factor
-        fx = None if self.fx is None else self.fx / factor
-        fy = None if self.fy is None else self.fy / factor
-        if self.angle_x is not None:
-            fx = 0.5 * width / math.tan(0.5 * self.angle_x)
-        if self.angle_y is not None:
-            fy = 0.5 * height / math.tan(0.5 * self.angle_y)
-        one = fx or fy
-        return (None, None) if one is None else (fx or one, fy or one)
+        """Both focal lengths in pixels of a picture of that size, smaller by `factor` than the lens
+        is for; None where nothing is said."""
+        across = self.fx, self.angle_x, width if self.width is None else self.width / factor
+        down = self.fy, self.angle_y, height if self.height is None else self.height / factor
+        found = [
+            0.5 * side / math.tan(0.5 * angle) if angle else focal and focal / factor
+            for focal, angle, side in (across, down)
+        ]
+        one = found[0] or found[1]
+        return (None, None) if one is None else (found[0] or one, found[1] or one)
 
 
 def lens_of(meta: dict[str, Any], frame: dict[str, Any], where: str) -> Lens:
-    """The lens of a frame. What the frame says goes before what the scene says.
-
-    InputError, with `where` that is, if a number is none or the lens is not one of nerfstudio's.
-    """
+    """The lens of a frame, which goes before what the scene says. InputError, with `where` that is,
+    for a number that is none or a lens that is not nerfstudio's."""
 
     def said(name: str, positive: bool = True) -> float | None:
         value = frame.get(name, meta.get(name))
@@ -102,12 +95,8 @@ def lens_of(meta: dict[str, Any], frame: dict[str, Any], where: str) -> Lens:
 
 
 def set_lenses(cameras: Cameras, lenses: list[Lens | None], factors: list[int]) -> None:
-    """Gives each camera its lens; of None it keeps its own.
-
-    Args:
-        cameras: of the pictures' sizes; changed in place.
-        factors: by which pictures are smaller than the sizes that lenses are for.
-    """
+    """Gives each camera of the pictures' sizes its lens, in place; of None it keeps its own.
+    Pictures are smaller by `factors` than lenses are for."""
     for name in ("fx", "fy", "cx", "cy", "camera_type", "distortion_params"):
         shared = getattr(cameras, name)  # by all cameras, where they were given one value
         own = None if shared is None else shared.expand(len(lenses), -1).clone()

@@ -17,7 +17,7 @@ from nerfstudio.data.dataparsers.base_dataparser import (
 from nerfstudio.plugins.registry_dataparser import DataParserSpecification
 
 if TYPE_CHECKING:
-    from leco_plugin.scenes.mega_nerf_format.files import MegaNerfScene
+    from leco_plugin.scenes.mega_nerf_files import MegaNerfScene
 
 
 @dataclass
@@ -59,7 +59,7 @@ class MegaNerf(DataParser):
     def _generate_dataparser_outputs(
         self, split: str = "train", **kwargs: Any
     ) -> DataparserOutputs:
-        from leco_plugin.scenes.mega_nerf_format.outputs import outputs_of, read
+        from leco_plugin.scenes.mega_nerf_outputs import outputs_of, read
 
         self._scene = self._scene or read(self.config)
         return outputs_of(self.config, self._scene, split == "train")

@@ -79,8 +79,7 @@ def find_file(path: Path) -> Path:
 
 def check_images(paths: list[Path]) -> None:
     """InputError if an image is not there."""
-    missing = [path for path in paths if not path.exists()]
-    if missing:
+    if missing := [path for path in paths if not path.exists()]:
         raise InputError(
             f"{len(missing)} of {len(paths)} images are not there, the first is "
             f"{missing[0]}{remedy_for_missing(missing[0])}"
@@ -161,14 +160,11 @@ def names_what_it_cannot_read(dataset: Any) -> Any:
 
 
 class DerivedImages:
-    """A folder of PNG files that are made when they are first asked for.
-
-    A file's name depends on its source (path, size, time of its last change) and on what was made
-    of it, so that a changed source is never taken for the old one.
-    """
+    """A folder of PNG files that are made when they are first asked for. Names depend on the source
+    (path, size, time of change) and the recipe, so that a changed source is never taken for the old
+    one. `remedy` is for where nothing can be written."""
 
     def __init__(self, folder: Path, remedy: str = ANOTHER_FOLDER) -> None:
-        """With what to do where nothing can be written."""
         self.folder, self.remedy = folder, remedy
 
     def get(self, source: Path, recipe: str, make: Callable[[], Image.Image]) -> Path:
@@ -219,13 +215,8 @@ def convert_masks(
 ) -> list[Path]:
     """Files of the masks in which every pixel that is seen is light, and every other is 0.
 
-    Args:
-        images: that they are of.
-        sizes: width and height of these.
-        derived: where a mask goes that nerfstudio would read otherwise.
-        speak: whether to say what was taken for seen.
-    Raises:
-        InputError: one line, about the mask.
+    A mask that nerfstudio would read otherwise goes into `derived`; `sizes` are width and height of
+    its images; `speak` says what was taken for seen. InputError, in one line, about the mask.
     """
     found, shown, grey = [], [], []
     for wanted, image, size in zip(masks, images, sizes):
@@ -260,11 +251,8 @@ def convert_masks(
 
 
 def seen_pixels(mask: Path, image: Path, size: tuple[int, int]) -> NDArray[np.bool_]:
-    """The pixels [H, W] of an image that its mask shows. InputError, one line, about the mask.
-
-    Args:
-        size: width and height of the image.
-    """
+    """The pixels [H, W] that a mask shows of an image of a width and height. InputError, one line,
+    about it."""
     path = _found(mask, image)
     return _fit(_is_seen(_values(path)), size, path)
 

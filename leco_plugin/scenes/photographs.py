@@ -9,13 +9,14 @@ from __future__ import annotations
 import hashlib
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 import torch
 from nerfstudio.data.dataparsers.base_dataparser import DataparserOutputs
 from nerfstudio.data.dataparsers.nerfstudio_dataparser import Nerfstudio, NerfstudioDataParserConfig
 from nerfstudio.plugins.registry_dataparser import DataParserSpecification
+from numpy.typing import NDArray
 from rich.markup import escape
 from torch import Tensor
 
@@ -23,6 +24,7 @@ from leco_plugin.log import say
 from leco_plugin.scenes.coloured_points import GREY, CloudFile, read_cloud
 from leco_plugin.scenes.frames import (
     METRES_PER_UNIT,
+    POINTS,
     UP_IS_KNOWN,
     applied_in,
     from_file,
@@ -33,12 +35,8 @@ from leco_plugin.scenes.input_error import InputError, one_line
 from leco_plugin.scenes.large_coordinates import ReadsNear
 from leco_plugin.scenes.photograph_files import check_images, find_file
 from leco_plugin.scenes.reading import CheckedReader
-from leco_plugin.scenes.scene_file import load_json, scene_file_of
-from leco_plugin.scenes.stretch import stretch_of
+from leco_plugin.scenes.scene_file import file_in, load_json, scene_file_of
 
-POINTS = "points3D_xyz"
-"""Key of the dataset's metadata with the sparse points [P, 3] in model coordinates, as nerfstudio's
-own readers have it."""
 COLOURS = "points3D_rgb"
 """That of their colours, uint8 [P, 3]. nerfstudio's pipelines want both or neither."""
 HeldOut = Literal["spread", "stretch"]
@@ -65,7 +63,7 @@ class LecoPhotographs(CheckedReader, ReadsNear, Nerfstudio):
         self, split: str = "train", **kwargs: Any
     ) -> DataparserOutputs:
         data = self.config.data
-        meta = load_json(data if data.suffix == ".json" else data / "transforms.json")
+        meta = load_json(file_in(data))
         check_images([find_file(folder_of(data) / each["file_path"]) for each in meta["frames"]])
         up_is_known = self._knows_up(meta)
         if up_is_known and "orientation_override" not in meta:
@@ -73,15 +71,22 @@ class LecoPhotographs(CheckedReader, ReadsNear, Nerfstudio):
             self.config.orientation_method = "none"
         outputs: DataparserOutputs = super()._generate_dataparser_outputs(split)
         if len(outputs.image_filenames) == 0 and split == "train":
-            raise InputError(f"{self.config.data}: no image is left for the split {split!r}")
-        frame, applied_scale = self._frame_of_file(outputs, meta)
-        points = points_of(meta, folder_of(self.config.data))
+            raise InputError(f"{data}: no image is left for the split {split!r}")
+        try:
+            applied, applied_scale = applied_in(meta, data)
+            frame = from_file(parsed_frame(outputs), applied, applied_scale, torch.float64)
+        except (ValueError, TypeError, RuntimeError) as error:
+            raise InputError(f"{data} cannot be read: {one_line(error, 120)}") from None
+        points = points_of(meta, folder_of(data))
         if points is not None:
             outputs.metadata |= points_in_model(points, frame)
         if up_is_known:
             outputs.metadata[UP_IS_KNOWN] = True
         if "metres_per_unit" in meta:
-            outputs.metadata[METRES_PER_UNIT] = applied_scale * _metres(meta, self.config.data)
+            metres = meta["metres_per_unit"]
+            if not isinstance(metres, int | float) or not 0.0 < metres < float("inf"):
+                raise InputError(f"{data}: metres_per_unit is {metres!r}, not a positive number")
+            outputs.metadata[METRES_PER_UNIT] = applied_scale * float(metres)
         return outputs
 
     def _near(self, meta: dict[str, Any]) -> dict[str, Any]:
@@ -106,16 +111,6 @@ class LecoPhotographs(CheckedReader, ReadsNear, Nerfstudio):
     def _load_3D_points(self, *_: Any) -> None:
         """Nothing: nerfstudio reads a .ply by open3d, which needs system libraries."""
 
-    def _frame_of_file(
-        self, outputs: DataparserOutputs, meta: dict[str, Any]
-    ) -> tuple[Tensor, float]:
-        """What took positions in the file to the model's [3, 4], and what had scaled them."""
-        try:
-            applied, scale = applied_in(meta, self.config.data)
-            return from_file(parsed_frame(outputs), applied, scale, torch.float64), scale
-        except (ValueError, TypeError, RuntimeError) as error:
-            raise InputError(f"{self.config.data} cannot be read: {one_line(error, 120)}") from None
-
     def _knows_up(self, meta: dict[str, Any]) -> bool:
         """Whether z is up in the file already: it says so, or its cameras look down along it."""
         if "orientation_override" in meta:
@@ -124,17 +119,9 @@ class LecoPhotographs(CheckedReader, ReadsNear, Nerfstudio):
         return self.config.orientation_method in ("up", "none") and taken_from_above(poses)
 
 
-def _metres(meta: dict[str, Any], data: Path) -> float:
-    """What a scene says of its units: metres in one."""
-    metres = meta["metres_per_unit"]
-    if not isinstance(metres, int | float) or not 0.0 < metres < float("inf"):
-        raise InputError(f"{data}: metres_per_unit is {metres!r}, not a positive number")
-    return float(metres)
-
-
 def folder_of(data: Path) -> Path:
     """The folder that a scene's paths are relative to; `data` is it, or the json file in it."""
-    return data.parent if data.suffix == ".json" else data
+    return file_in(data).parent
 
 
 def taken_from_above(poses: np.ndarray) -> bool:
@@ -171,35 +158,19 @@ def points_of(meta: dict[str, Any], folder: Path) -> CloudFile | None:
 
 
 def points_in_model(points: CloudFile, frame: Tensor) -> dict[str, Tensor]:
-    """Sparse points and their colours as nerfstudio's own readers return them: splatfacto starts
-    there, from grey ones where the file has no colours.
-
-    Args:
-        frame: [3, 4] takes them to model coordinates.
-    """
-    colours = points.colours
+    """Sparse points and colours, taken to the model by a frame [3, 4], as nerfstudio's own readers
+    return them: splatfacto starts there, from grey ones where the file has no colours."""
+    positions, colours = points
     if colours is None:
-        colours = np.full(points.positions.shape, GREY, np.uint8)
-    positions = torch.from_numpy(points.positions)
-    return {POINTS: moved(positions, frame.double()).float(), COLOURS: torch.from_numpy(colours)}
+        colours = np.full(positions.shape, GREY, np.uint8)
+    in_model = moved(torch.from_numpy(positions), frame.double()).float()
+    return {POINTS: in_model, COLOURS: torch.from_numpy(colours)}
 
 
 def read_points(meta: dict[str, Any], folder: Path) -> Tensor | None:
     """Those of `points_of` without colours [P, 3] float64, or None."""
     points = points_of(meta, folder)
     return None if points is None else torch.from_numpy(points.positions)
-
-
-def read_ply(path: Path, dtype: torch.dtype = torch.float32) -> Tensor:
-    """The vertices [P, 3] of a file; coordinates as large as UTM's need float64. InputError if it
-    cannot be read as points."""
-    return torch.from_numpy(read_cloud(path).positions).to(dtype)
-
-
-leco_photographs_dataparser = DataParserSpecification(
-    config=LecoPhotographsDataParserConfig(),
-    description="A scene in nerfstudio's format, checked, upright, with its sparse points.",
-)
 
 
 def describe_held_out(data: Path, kind: HeldOut) -> dict[str, Any]:
@@ -213,7 +184,91 @@ def describe_scene(data: Path) -> dict[str, Any]:
     """Name, number of images, and what tells the scene from another: JSON values. InputError if it
     cannot be read."""
     meta = check_scene(data)
-    description = data if data.suffix == ".json" else data / "transforms.json"
-    digest = hashlib.sha256(description.read_bytes()).hexdigest()
+    digest = hashlib.sha256(file_in(data).read_bytes()).hexdigest()
     name = folder_of(data).resolve().name
     return {"name": name, "images": len(meta["frames"]), "digest": digest[:16]}
+
+
+Array = NDArray[np.float64]
+LEAST, WANTED, MOST = 1 / 12, 1 / 8, 1 / 4
+"""Shares of all cameras that a stretch may have, and the one that it has where nothing decides."""
+CLEAR = 0.8
+"""Share of the widest gap behind a stretch from which on another gap is as clear an end."""
+BESIDE = 1.5
+"""A camera stands beside a stretch up to so many times the usual distance between neighbours."""
+FEWEST = 12
+"""Cameras of which a stretch can be held out."""
+TRAINED = 0.5
+"""Least share of the cameras that is still trained on."""
+
+
+class Stretch(NamedTuple):
+    """Which cameras are held out, and which are neither tested nor trained on."""
+
+    held_out: list[int]
+    beside: list[int]
+
+
+def find_stretch(positions: Array) -> Stretch:
+    """The stretch of cameras at [C, 3] near the middle that ends with the widest gap, by number.
+
+    It grows from the camera next to the middle, by the nearest camera each time, and so follows a
+    line or an arc whose cameras are nearer to each other than to those of the next line. ValueError
+    if there are too few cameras, or they stand too close together.
+    """
+    count = len(positions)
+    if count < FEWEST:
+        raise ValueError(
+            f"there are {count} cameras, and a stretch is held out of {FEWEST} or more"
+        )
+    order, gaps = _grow(positions)
+    low, high = max(2, round(LEAST * count)), round(MOST * count)
+    behind = gaps[low - 1 : high]  # behind a stretch of `low` cameras, and so on
+    sizes = np.flatnonzero(behind >= CLEAR * behind.max()) + low
+    size = int(sizes[np.abs(sizes - WANTED * count).argmin()])
+    held_out, rest = order[:size], order[size:]
+    away = np.full(len(rest), np.inf)
+    for number in held_out:
+        away = np.minimum(away, np.linalg.norm(positions[rest] - positions[number], axis=1))
+    apart = gaps[gaps > 1e-6 * gaps.max()]
+    beside = rest[away <= BESIDE * np.median(apart)] if len(apart) else rest
+    if count - size - len(beside) < TRAINED * count:
+        raise ValueError(
+            f"beside a stretch of {size} of {count} cameras there are {len(beside)} others, too "
+            "many to leave them out of training"
+        )
+    return Stretch(sorted(held_out.tolist()), sorted(beside.tolist()))
+
+
+def _grow(positions: Array) -> tuple[NDArray[np.int64], Array]:
+    """All cameras [C], each the nearest to those before it, and how far it is from them [C - 1]."""
+    left = np.linalg.norm(positions - positions.mean(axis=0), axis=1)
+    order, gaps = [int(left.argmin())], []
+    away = np.full(len(positions), np.inf)
+    for _ in range(len(positions) - 1):
+        away = np.minimum(away, np.linalg.norm(positions - positions[order[-1]], axis=1))
+        away[order] = np.inf
+        order.append(int(away.argmin()))
+        gaps.append(float(away[order[-1]]))
+    return np.array(order), np.array(gaps)
+
+
+def stretch_of(meta: dict[str, Any], scene: str) -> dict[str, list[str]]:
+    """Names of the photographs of a transforms.json: `train`, `test`, and `beside`, left out as
+    they stand next to the tested ones. InputError, with `scene`, if no stretch can be held out."""
+    poses = np.array([frame["transform_matrix"] for frame in meta["frames"]], dtype=float)
+    try:
+        found = find_stretch(poses[:, :3, 3])
+    except ValueError as error:
+        raise InputError(f"{scene}: {error}; hold out photographs of the spread instead") from None
+    names: dict[str, list[str]] = {"train": [], "test": [], "beside": []}
+    kinds = dict.fromkeys(found.held_out, "test") | dict.fromkeys(found.beside, "beside")
+    for number, frame in enumerate(meta["frames"]):
+        names[kinds.get(number, "train")].append(str(frame["file_path"]))
+    return names
+
+
+leco_photographs_dataparser = DataParserSpecification(
+    config=LecoPhotographsDataParserConfig(),
+    description="A scene in nerfstudio's format, checked, upright, with its sparse points.",
+)

@@ -27,7 +27,6 @@ from rich.markup import escape
 from leco_plugin.log import bar, say
 from leco_plugin.scenes.frames import check_poses
 from leco_plugin.scenes.input_error import InputError, one_line
-from leco_plugin.scenes.known_folders import READERS, command_with, has_model, remedy_for
 from leco_plugin.scenes.large_coordinates import near_bases
 from leco_plugin.scenes.lenses import Lens, set_lenses
 from leco_plugin.scenes.photograph_files import (
@@ -42,11 +41,15 @@ from leco_plugin.scenes.photograph_files import (
     is_turned,
 )
 from leco_plugin.scenes.scene_file import (
+    READERS,
     SceneFile,
+    command_with,
     description_of,
     factors_of,
     frames_of,
+    has_model,
     own_target,
+    remedy_for,
     say_unused,
     scene_file_of,
 )
@@ -66,11 +69,7 @@ class CheckedReader(DataParser):
         """The first picture with transparency and the first without, each with its split."""
 
     def get_dataparser_outputs(self, split: str = "train", **options: Any) -> DataparserOutputs:
-        """As the reader's.
-
-        Raises:
-            InputError: one line.
-        """
+        """As the reader's. InputError, in one line, for whatever goes wrong."""
         config: Any = self.config
         require_data(Path(config.data))
         scene = scene_file_of(config, split)
@@ -187,15 +186,11 @@ def _lacks_its_file(error: BaseException, config: Any) -> bool:
 def checked(
     outputs: DataparserOutputs, config: Any, split: str, scene: SceneFile | None
 ) -> DataparserOutputs:
-    """What a reader returned, with every picture, mask and lens such as the files say.
+    """What a reader returned, with every picture, mask and lens such as the files, and the scene's
+    own one, say. InputError, in one line.
 
     Pictures and masks that nerfstudio would read wrongly are converted into `leco-cache/pictures`
     beside the data, or refused.
-
-    Args:
-        scene: the file that it was read from.
-    Raises:
-        InputError: one line.
     """
     outputs.metadata = dict(outputs.metadata)
     if not outputs.image_filenames:
@@ -255,13 +250,8 @@ def _check_focal_lengths(cameras: Cameras, images: list[Path]) -> None:
 def _size_of(
     path: Path, header: Header, lens: Lens | None, wanted: list[int], factor: int
 ) -> tuple[int, int]:
-    """Width and height of a picture as it will be read.
-
-    Args:
-        wanted: of its camera, by its reader.
-    Raises:
-        InputError: they are not those of its lens or, where that is not known, of its camera.
-    """
+    """Width and height of a picture as it will be read. InputError unless they are those of its
+    lens or, where that is not known, those `wanted` for its camera."""
     slack = 1
     if lens is not None and lens.width is not None and lens.height is not None:
         wanted = [int(lens.width) // factor, int(lens.height) // factor]

@@ -1,8 +1,11 @@
-"""A transforms.json, read and checked in one way for every reader of one."""
+"""A transforms.json, read and checked in one way for every reader of one; or, of a folder without
+one, which reader or converter of nerfstudio it is for."""
 
 from __future__ import annotations
 
 import json
+import shlex
+import sys
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
@@ -15,7 +18,6 @@ from rich.markup import escape
 from leco_plugin.log import say
 from leco_plugin.scenes.frames import check_poses
 from leco_plugin.scenes.input_error import InputError, one_line
-from leco_plugin.scenes.known_folders import command_with, remedy_for
 from leco_plugin.scenes.lenses import (
     ANGLES,
     LENS_FIELDS,
@@ -50,11 +52,14 @@ class SceneFile:
         return [find_file(self.folder / frame["file_path"]) for frame in self.frames]
 
 
-def load_json(path: Path) -> Any:
-    """What a JSON file says, with or without a byte order mark.
+def file_in(data: Path) -> Path:
+    """The transforms.json that `data` means: itself, or that in the folder."""
+    return data if data.suffix == ".json" else data / "transforms.json"
 
-    What is null in a frame is left out, and a pose of three rows has the fourth.
-    """
+
+def load_json(path: Path) -> Any:
+    """What a JSON file says, with or without a byte order mark; nulls of frames are left out, and
+    poses of three rows have the fourth."""
     said = _parsed(path.read_bytes())
     if not isinstance(said, dict):
         return said
@@ -79,12 +84,8 @@ def _completed(frame: Any) -> Any:
 
 
 def read_scene_file(path: Path, split: str, folder: Path) -> SceneFile:
-    """A transforms.json. InputError if its poses and lenses are none that cameras have.
-
-    Args:
-        split: that is read; only the cameras of training need more places than one.
-        folder: to which names of pictures are relative.
-    """
+    """A transforms.json, whose pictures are relative to `folder`. InputError if its poses and
+    lenses are none that cameras have, or all cameras of a training split are in one place."""
     try:
         meta = load_json(path)
         frames = [frame for name in FRAMES for frame in meta.get(name, [])]
@@ -129,17 +130,15 @@ def description_of(config: Any, split: str) -> Path | None:
     data = Path(config.data)
     target = own_target(config)
     if issubclass(target, Nerfstudio | InstantNGP):
-        return data if data.suffix == ".json" else data / "transforms.json"
+        return file_in(data)
     if issubclass(target, ScanNetpp):
         return data / Path(config.transforms_path)
     return data / f"transforms_{split}.json" if issubclass(target, Blender | DNeRF) else None
 
 
 def scene_file_of(config: Any, split: str) -> SceneFile | None:
-    """The transforms.json that a reader is about to read; None where it reads others.
-
-    InputError if it is not there, or nerfstudio would fail at it or read it wrongly.
-    """
+    """The transforms.json that a reader is about to read; None where it reads others. InputError if
+    it is not there, or nerfstudio would fail at it or read it wrongly."""
     data, file = Path(config.data), description_of(config, split)
     if file is None:
         return None
@@ -175,9 +174,7 @@ def _add(scene: SceneFile, data: Path) -> str:
 
 def frames_of(images: list[Path], scene: SceneFile) -> list[int | None]:
     """The number of the frame of each picture, which may be a smaller one of the same name.
-
-    InputError if frames of different folders would have one smaller picture.
-    """
+    InputError if frames of different folders would have one smaller picture."""
     places = [str(frame["file_path"]).replace("\\", "/") for frame in scene.frames]
     named: dict[str, list[int]] = {}
     for number, place in enumerate(places):
@@ -204,11 +201,8 @@ def frames_of(images: list[Path], scene: SceneFile) -> list[int | None]:
 def factors_of(
     scene: SceneFile, numbers: list[int | None], config: Any, cameras: Cameras
 ) -> list[int]:
-    """By which whole number a reader has made each camera smaller than its lens says.
-
-    nerfstudio's own has one factor for the scene; that of Blender's scenes takes the size of the
-    first picture for all, and the others take the pictures as they are.
-    """
+    """By which whole number a reader has made each camera smaller than its lens says: nerfstudio's
+    own by one factor for the scene, Blender's by the size of the first picture, others by none."""
     known = [(row, number) for row, number in enumerate(numbers) if number is not None]
     if not known or not (hasattr(config, "downscale_factor") or hasattr(config, "alpha_color")):
         return [1] * len(numbers)
@@ -220,44 +214,17 @@ def factors_of(
 
 
 READ = LENS_FIELDS | {
-    "applied_scale",
-    "applied_transform",
-    "file_path",
-    "frames",
-    "has_mask",
-    "mask_path",
-    "metres_per_unit",
-    "orientation_override",
-    "ply_file_path",
-    "test_filenames",
-    "test_frames",
-    "train_filenames",
-    "transform_matrix",
-    "transform_matrix_end",
-    "transform_matrix_start",
+    *("applied_scale", "applied_transform", "file_path", "frames", "has_mask", "mask_path"),
+    *("metres_per_unit", "orientation_override", "ply_file_path", "test_filenames", "test_frames"),
+    *("train_filenames", "transform_matrix", "transform_matrix_end", "transform_matrix_start"),
     "val_filenames",
 }
 """By leco's own reader, or held against what another reader has made of them."""
 NEEDLESS = {
-    "aabb",
-    "aabb_scale",
-    "blur_score",
-    "colmap_im_id",
-    "colmap_image_id",
-    "depth_file_path",
-    "depth_path",
-    "depth_unit_scale_factor",
-    "enable_depth_loading",
-    "enable_ray_loading",
-    "geographic_origin",
-    "importance_sampling",
-    "integer_depth_scale",
-    "n_extra_learnable_dims",
-    "offset",
-    "render_aabb",
-    "scale",
-    "sharpness",
-    "timestamp",
+    *("aabb", "aabb_scale", "blur_score", "colmap_im_id", "colmap_image_id", "depth_file_path"),
+    *("depth_path", "depth_unit_scale_factor", "enable_depth_loading", "enable_ray_loading"),
+    *("geographic_origin", "importance_sampling", "integer_depth_scale", "n_extra_learnable_dims"),
+    *("offset", "render_aabb", "scale", "sharpness", "timestamp"),
 }
 """Neither geometry nor colour depends on them: our bounds come from cameras and points, and our
 methods learn without depths."""
@@ -283,3 +250,104 @@ def say_unused(meta: dict[str, Any], file: Path) -> None:
     unused += [kind for kind in beside if any(folder.glob(kind))]
     if unused:
         say(f"{escape(str(file))}: not used: {escape(', '.join(unused)[:300])}")
+
+
+COLMAP = ("colmap/sparse/0", "sparse/0", "sparse", "colmap/sparse", "0", ".")
+"""Where COLMAP's own files lie, in the order they are looked for."""
+READERS = {
+    "transforms.json": "leco-photographs",
+    "transforms_train.json": "blender-data",
+    "coordinates.pt": "mega-nerf",
+    "dslr/nerfstudio/transforms.json": "scannetpp-data",
+    "intrinsic/intrinsic_color.txt": "scannet-data",
+    "meta_data.json": "sdfstudio-data",
+    "scene.json": "dycheck-data",
+    "train.npz": "minimal-parser",
+}
+PICTURES = "*.[jJpP][pPnN]*[gG]"
+CONVERTERS = {
+    "keyframes": "polycam",
+    "opensfm": "odm",
+    "odm_report": "odm",
+    "rgb": "record3d",
+    "EXR_RGBD": "record3d",
+    "*.xml": "metashape --xml FILE.xml",
+    "*.csv": "realitycapture --csv FILE.csv",
+    PICTURES: "images",
+    "images": "images",
+}
+"""What lies in a folder, and which of ns-process-data's commands is for it."""
+METHOD = "leco-occupancy"
+"""Named where none was typed."""
+
+
+def command_with(reader: str, data: Path) -> str | None:
+    """The command that was typed, with a reader of this name and its options; None where the
+    command takes no reader."""
+    program, typed = Path(sys.argv[0]).name, sys.argv[1:]
+    given = f"--data {shlex.quote(str(data))} {reader}"
+    if program == "leco":
+        if typed[:1] != ["swap"]:
+            return None
+        own = typed[: typed.index("--")] if "--" in typed else typed
+        return f"{shlex.join(['leco', *own])} -- {given}"
+    if program.startswith("ns-") and program != "ns-train":
+        return None
+    named = program == "ns-train" and typed and typed[0][:1] != "-"
+    return f"ns-train {shlex.quote(typed[0]) if named else METHOD} {given}"
+
+
+def has_model(folder: Path) -> bool:
+    """Whether a folder holds a model of COLMAP."""
+    return any((folder / f"cameras.{ending}").is_file() for ending in ("bin", "txt"))
+
+
+def _readers_for(folder: Path) -> list[str]:
+    """Readers that may read a folder, each with its options."""
+    found = [reader for sign, reader in READERS.items() if (folder / sign).is_file()]
+    for place in COLMAP:
+        if has_model(folder / place):
+            path = "" if place == COLMAP[0] else f" --colmap-path {place}"
+            return [*found, f"colmap{path}{_images_option(folder)}"]
+    return found
+
+
+def _images_option(folder: Path) -> str:
+    """Where the pictures of a model of COLMAP are, if not in `images`."""
+    if (folder / "images").is_dir():
+        return ""
+    beside = [folder, *sorted(each for each in folder.iterdir() if each.is_dir())]
+    place = next((each for each in beside if any(each.glob(PICTURES))), None)
+    return "" if place is None else f" --images-path {shlex.quote(str(place.relative_to(folder)))}"
+
+
+def _converter_for(data: Path) -> str | None:
+    """The command that makes a scene of a folder; None where none is known."""
+    if not data.is_dir():
+        return None
+    for sign, kind in CONVERTERS.items():
+        if any(data.glob(sign)):
+            source = data / "images" if sign == "images" else data
+            command, *options = kind.split()
+            place = next((each for each in COLMAP if (data / each / "cameras.bin").is_file()), None)
+            if command == "images" and place is None:
+                return f"leco poses {shlex.quote(str(source))} --out SCENE"
+            given = [command, "--data", shlex.quote(str(source)), *options]
+            if command == "images" and place is not None:
+                model = shlex.quote(str((data / place).resolve()))
+                given += ["--skip-colmap", "--colmap-model-path", model]
+            return " ".join(["ns-process-data", *given, "--output-dir", "SCENE"])
+    return None
+
+
+def remedy_for(data: Path) -> str | None:
+    """What to do about a folder that lacks the files of the reader it was given to; None where
+    nothing is known."""
+    known = [(reader, folder) for folder in (data, data.parent) for reader in _readers_for(folder)]
+    for reader, folder in known:
+        if command := command_with(reader, folder):
+            return f"`{command}` reads it"
+    if known and "colmap" not in known[0][0]:
+        return f"it is for the reader {known[0][0]}, and this command reads a transforms.json only"
+    converter = _converter_for(data)
+    return None if converter is None else f"`{converter}` makes a scene of it"

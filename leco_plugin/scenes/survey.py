@@ -21,10 +21,9 @@ from leco_plugin.scenes.bounds import (
     usable_points,
     with_range,
 )
-from leco_plugin.scenes.frames import ALTITUDES, DatasetUnits, units_of
+from leco_plugin.scenes.frames import ALTITUDES, POINTS, DatasetUnits, units_of
 from leco_plugin.scenes.input_error import InputError
 from leco_plugin.scenes.large_coordinates import rounded_by
-from leco_plugin.scenes.photographs import POINTS
 
 SIDE = 8
 """A grid of this many rays a side covers each image, its corners included."""
@@ -32,8 +31,6 @@ MOST_CAMERAS = 256
 WORTH_IT = 0.005
 """Share of all rays that must go beyond a scene photographed from above and show something there
 for its bounds to be raised."""
-
-
 MOST_PICTURES = 16
 """Pictures that are opened to see what lies beyond: those with the most rays that miss."""
 
@@ -63,21 +60,17 @@ class Survey:
     def lines(self) -> list[str]:
         """For the log: what was chosen and why, the range in scene units and beside it in metres,
         and how many rays meet it."""
-        bounds, heights = self.bounds, self.positions[:, 2]
-        rows = [("near", bounds.near, False), ("far", bounds.far, False)]
+        bounds, heights, units = self.bounds, self.positions[:, 2], self.units
+        lengths, levels = {"near": bounds.near, "far": bounds.far}, {}
         if bounds.kind == "box":
-            ground, top = float(bounds.aabb[2]), float(bounds.aabb[5])
-            rows += [("ground, z", ground, True), ("top, z", top, True)]
-            lowest, highest = float(heights.min()), float(heights.max())
-            rows += [("lowest camera, z", lowest, True), ("highest camera, z", highest, True)]
+            levels = {"ground, z": bounds.aabb[2], "top, z": bounds.aabb[5]}
+            levels |= {"lowest camera, z": heights.min(), "highest camera, z": heights.max()}
         else:
-            rows.append(("inner cube, half", bounds.half_extent, False))
-        units = self.units
-        head = f"{'':18}{'scene units':>12}" + (f"{units.name:>12}" if units else "")
-        table = [head] + [
-            f"{name:18}{value:12.3f}" + (f"{_in(units, value, level):12.2f}" if units else "")
-            for name, value, level in rows
-        ]
+            lengths["inner cube, half"] = bounds.half_extent
+        table = [f"{'':18}{'scene units':>12}" + (f"{units.name:>12}" if units else "")]
+        for name, value in (lengths | levels).items():
+            there = units and _in(units, float(value), name in levels)
+            table.append(f"{name:18}{float(value):12.3f}" + (f"{there:12.2f}" if units else ""))
         if units is not None and not units.metric:
             table.append(
                 "data units are those of the poses; bounds.metres-per-unit says the metres"
@@ -106,11 +99,6 @@ def _in(units: DatasetUnits, value: float, level: bool) -> float:
     return units.altitude(value) if level else units.per_scene_unit * value
 
 
-def sparse_points(dataset: Any) -> Tensor | None:
-    """Sparse points [P, 3] in model coordinates of a dataset of any reader, or None."""
-    return points_in(getattr(dataset, "metadata", {}) or {})
-
-
 def places_of(metadata: dict[str, Any]) -> Tensor | None:
     """[N, 3] scene units, where the photographs of a dataset were taken, if that is known."""
     cameras = metadata.get(CAMERAS)
@@ -121,6 +109,11 @@ def points_in(metadata: dict[str, Any]) -> Tensor | None:
     """Sparse points [P, 3] in model coordinates in what a reader says of a dataset, or None."""
     points = metadata.get(POINTS)
     return None if points is None else torch.as_tensor(points)
+
+
+def sparse_points(dataset: Any) -> Tensor | None:
+    """The same of a dataset of any reader."""
+    return points_in(getattr(dataset, "metadata", {}) or {})
 
 
 def with_known_altitudes(config: BoundsConfig | None, metadata: dict[str, Any]) -> BoundsConfig:
@@ -136,14 +129,9 @@ def survey(
     near: float | None = None,
     far: float | None = None,
 ) -> Survey:
-    """Looks at the training cameras of any nerfstudio data manager.
-
-    Args:
-        config: what is not to be found from the data.
-        near, far: where rays begin and end, scene units; None is found from the data.
-    Raises:
-        InputError: no cameras, no ray meets the scene, or what is configured is no range.
-    """
+    """Looks at the training cameras of any nerfstudio data manager; near and far, scene units, are
+    found from the data where they are None. InputError if there are no cameras, no ray meets the
+    scene, or what is configured is no range."""
     if hasattr(datamanager, "train_unseen_cameras"):
         raise InputError(
             f"{type(datamanager).__name__} hands out whole images, and this method trains on rays; "
@@ -208,13 +196,8 @@ def chosen_cameras(count: int, most: int = MOST_CAMERAS) -> Tensor:
 def covering_rays(
     cameras: Cameras, side: int = SIDE, most: int = MOST_CAMERAS
 ) -> tuple[Tensor, Tensor]:
-    """Rays that cover the images of up to `most` cameras.
-
-    Args:
-        side: rays along each side of an image.
-    Returns:
-        origins and unit directions, [C, side * side, 3] float32 on the CPU.
-    """
+    """Rays, `side` along each side of an image, of up to `most` cameras: origins and unit
+    directions, [C, side * side, 3] float32 on the CPU."""
     cameras = cameras.to("cpu")
     chosen = chosen_cameras(len(cameras), most)
     sizes = torch.cat([cameras.height, cameras.width], dim=1)[chosen].float() - 1.0
@@ -229,13 +212,8 @@ def covering_rays(
 
 
 def seen_beyond(dataset: Any, numbers: Tensor, misses: Tensor) -> float:
-    """Share of the rays that miss the scene but still show something.
-
-    Args:
-        dataset: nerfstudio's `InputDataset`.
-        numbers: [C] of the pictures that the rays cover.
-        misses: bool [C, side, side], which rays of a grid over each picture miss.
-    """
+    """Share of the rays that miss the scene but still show something, of `InputDataset` pictures
+    [C] with bool [C, side, side] of the rays of a grid that miss."""
     counts = misses.flatten(1).sum(dim=1)
     most = counts.argsort(descending=True)[:MOST_PICTURES]
     shown = [bright(dataset.get_data(int(numbers[i])), misses[i]) for i in most if counts[i] > 0]
@@ -245,12 +223,9 @@ def seen_beyond(dataset: Any, numbers: Tensor, misses: Tensor) -> float:
 
 
 def bright(data: dict[str, Any], chosen: Tensor) -> Tensor:
-    """Whether chosen pixels of a picture show something that no mask hides: bool [N].
-
-    Args:
-        data: of the dataset: `image` [H, W, 3 or 4] in [0, 1], and `mask` [H, W, 1] if any.
-        chosen: bool [side, side], of a grid from corner to corner.
-    """
+    """Whether chosen pixels, bool [side, side] of a grid from corner to corner, of a picture show
+    something that no mask hides: bool [N]. The data are a dataset's, `image` [H, W, 3 or 4] in [0,
+    1]."""
     image = data["image"]
     height, width = image.shape[:2]
     places = chosen.nonzero() / (len(chosen) - 1) * torch.tensor([height - 1, width - 1])
@@ -286,15 +261,8 @@ class SceneDetail:
 def detail_of(
     cameras: Cameras, points: Tensor | None = None, config: BoundsConfig | None = None
 ) -> SceneDetail:
-    """The size of the scene that these cameras see.
-
-    Args:
-        cameras: of the training photographs.
-        points: [P, 3] sparse points in the same coordinates, or None.
-        config: where the scene lies, where the data do not say it.
-    Raises:
-        InputError: there are no cameras, none sees a point, or what is configured is no range.
-    """
+    """The size of the scene that these cameras see, by sparse points [P, 3] if there are any.
+    InputError if there are no cameras, none sees a point, or what is configured is no range."""
     if len(cameras) == 0:
         raise InputError("the scene has no training cameras")
     cameras = cameras.to("cpu")
@@ -320,14 +288,9 @@ def detail_of(
 
 
 def _pixels_on_surface(places: Tensor, density: Tensor, size: float) -> float:
-    """The density of pixels [P], integrated over the surface on which places [P, 3] lie.
-
-    The surface is as large as one side of each of the cubic cells that it passes through, which
-    are just large enough for most to hold `NEIGHBOURS` places.
-
-    Args:
-        size: of the smallest cells.
-    """
+    """The density of pixels [P], integrated over the surface on which places [P, 3] lie: as large
+    as one side of each cubic cell that it passes through, of at least `size`, and just large enough
+    for most to hold `NEIGHBOURS` places."""
     low = places.amin(dim=0)
     widest = max(size, float((places.amax(dim=0) - low).max()))
     while True:
@@ -341,15 +304,9 @@ def _pixels_on_surface(places: Tensor, density: Tensor, size: float) -> float:
 
 
 def _pixel_density(places: Tensor, pose: Tensor, rays: Tensor, width: int) -> Tensor:
-    """Pixels of a camera for a unit of area of a surface that faces it, at places [P, 3].
-
-    Args:
-        pose: [3, 4].
-        rays: [K, 3] unit directions that cover its image.
-        width: of the image in pixels.
-    Returns:
-        [P], one over the square of a pixel's footprint; 0 where a place is not in the image.
-    """
+    """Pixels of a camera with a pose [3, 4], unit rays [K, 3] that cover its image and a width in
+    pixels, for a unit of area that faces it at places [P, 3]: one over the square of a pixel's
+    footprint, [P]; 0 outside of the image."""
     turn = pose[:, :3]
     local = rays @ turn
     # behind a fisheye's axis there is no tangent

@@ -16,10 +16,8 @@ PLY_TYPES = {"f4": "float", "f8": "double", "u1": "uchar"}
 
 
 def write_whole(path: Path, write: Callable[[BinaryIO], object]) -> None:
-    """Lets `write` fill a file beside `path` and then moves it there; folders are made.
-
-    Several processes may do the same at once: the last one wins.
-    """
+    """Lets `write` fill a file beside `path` and then moves it there; folders are made. Of several
+    processes at once the last one wins."""
     path.parent.mkdir(parents=True, exist_ok=True)
     part = path.with_name(f".{path.name}.{os.getpid()}-{threading.get_ident()}{PART}")
     try:

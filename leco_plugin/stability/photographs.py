@@ -25,10 +25,10 @@ import numpy as np
 from numpy.random import Generator
 from numpy.typing import NDArray
 from PIL import Image
+from scipy.spatial.transform import Rotation
 
 from leco_plugin.scenes.city.cameras import Lens, look_at
 from leco_plugin.scenes.city.folder import POINTS, TRANSFORMS
-from leco_plugin.scenes.frames import rotation
 from leco_plugin.scenes.input_error import InputError
 from leco_plugin.scenes.whole_files import write_points
 from leco_plugin.stability.scene import (
@@ -206,7 +206,8 @@ def shots_of(capture: Capture) -> list[Shot]:
         trained = number - sum(other < number for other in held_out)
         if trained < capture.stray:
             pose = np.column_stack([pose[:, :3], pose[:, 3] * (STRAY_RADIUS / RADIUS)])
-        turned = rotation(np.deg2rad(capture.turn) * noise.standard_normal(3)) @ pose[:, :3]
+        turn = Rotation.from_rotvec(np.deg2rad(capture.turn) * noise.standard_normal(3))
+        turned = turn.as_matrix() @ pose[:, :3]
         misjudged = np.column_stack([turned, pose[:, 3]])
         misjudged = _shift(misjudged, capture.shift * noise.standard_normal(3))
         written = _shift(misjudged, capture.origin)

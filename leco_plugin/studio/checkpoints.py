@@ -35,9 +35,9 @@ _FLOAT64_SCALAR: list[Any] = [
 def allow_checkpoint_globals() -> None:
     """Allows `torch.load` to read float64 numpy scalars, and nothing else, in this process.
 
-    Called by every model of this package when it is built, which is before nerfstudio loads a
-    checkpoint. Calling it again changes nothing. Older releases of torch load nerfstudio's
-    checkpoints as they are, and do not take names beside their list's entries.
+    Called by every model of this package when it is built, before nerfstudio loads a checkpoint.
+    Older releases of torch load nerfstudio's checkpoints as they are, and do not take names beside
+    their list's entries.
     """
     if torch.__version__ >= "2.6":
         torch.serialization.add_safe_globals(_FLOAT64_SCALAR)
@@ -48,11 +48,8 @@ PREVIOUS = "previous"
 
 
 def refuse_earlier(state_dict: dict[str, Any], prefix: str, name: str) -> None:
-    """Refuses the state of a module of before: one that has anything, but not a name of today.
-
-    Raises:
-        InputError: that, in one line.
-    """
+    """InputError for the state of a module of before: one that has anything, but not a name of
+    today."""
     names = [key for key in state_dict if key.startswith(prefix)]
     if names and f"{prefix}{name}" not in names:
         raise InputError(f"the checkpoint {ANOTHER_VERSION}")
@@ -64,10 +61,8 @@ def previous_of(checkpoints: Path) -> Path:
 
 
 def damage_of(path: Path) -> str | None:
-    """What is wrong with a checkpoint, in a few words; None is nothing.
-
-    torch reads a flipped bit without complaint, although its files carry checksums.
-    """
+    """What is wrong with a checkpoint, in a few words; None is nothing. torch reads a flipped bit
+    without complaint, although its files carry checksums."""
     try:
         with zipfile.ZipFile(path) as archive:
             part = archive.testzip()
@@ -83,13 +78,8 @@ def step_of(path: Path) -> int:
 
 
 def newest_whole(checkpoints: Path) -> tuple[Path, list[str]]:
-    """The newest checkpoint of a folder, or the one before it, that is whole.
-
-    Returns:
-        Its path, and a line for each newer one that is damaged.
-    Raises:
-        InputError: there is none.
-    """
+    """The newest checkpoint of a folder, or the one before it, that is whole, and a line for each
+    newer one that is damaged. InputError if there is none."""
     damaged: list[str] = []
     for folder in (checkpoints, previous_of(checkpoints)):
         found = [path for path in folder.glob("*.ckpt") if step_of(path) >= 0]
@@ -115,10 +105,8 @@ def first_not_finite(module: nn.Module) -> str | None:
 
 
 def config_in_use() -> Path | None:
-    """The config.yml that nerfstudio's `eval_setup` is loading; None outside of it.
-
-    `eval_setup` hands this path to nobody, so that it is read where it is called.
-    """
+    """The config.yml that nerfstudio's `eval_setup` is loading; None outside of it. It hands this
+    path to nobody, so that it is read where it is called."""
     frame = inspect.currentframe()
     while frame is not None:
         path = frame.f_locals.get("config_path") if frame.f_code.co_name == "eval_setup" else None
@@ -129,13 +117,8 @@ def config_in_use() -> Path | None:
 
 
 def follow_data(config: Any) -> None:
-    """Has a config that is being loaded for evaluation name its data where they are now.
-
-    A config whose data are nowhere stays as it is: nerfstudio may be about to name others.
-
-    Args:
-        config: a `TrainerConfig`, just read from its file.
-    """
+    """Has a `TrainerConfig` that is being loaded for evaluation name its data where they are now;
+    one whose data are nowhere stays as it is: nerfstudio may be about to name others."""
     path = config_in_use()
     manager: Any = getattr(getattr(config, "pipeline", None), "datamanager", None)
     parser = getattr(manager, "dataparser", None)
@@ -152,11 +135,7 @@ def follow_data(config: Any) -> None:
 
 
 def require_data(named: Path) -> None:
-    """Called where data are read.
-
-    Raises:
-        InputError: a run is being loaded for evaluation, and its data are not there.
-    """
+    """InputError where a run is being loaded for evaluation, and its data are not there."""
     path = config_in_use()
     if path is not None and not os.path.exists(named):
         raise InputError(
@@ -188,10 +167,7 @@ def found_around(named: Path, folder: Path) -> Path | None:
 
 def checkpoints_of(config: Any) -> Path:
     """The folder of a run's checkpoints: that beside the config in use, or the one it names.
-
-    Raises:
-        InputError: neither holds a checkpoint.
-    """
+    InputError if neither holds a checkpoint."""
     named, path = Path(config.load_dir), config_in_use()
     if path is None:
         return named
@@ -210,11 +186,7 @@ EVAL_UTILS = "nerfstudio.utils.eval_utils"
 
 def evaluate_whole_checkpoints() -> None:
     """Has nerfstudio, where its loading of runs is imported, load the newest checkpoint that is
-    whole.
-
-    Called by every model of this package when it is built, which is before nerfstudio loads a
-    checkpoint. Calling it again changes nothing.
-    """
+    whole; called by every model of this package when it is built, which is before."""
     utils: Any = sys.modules.get(EVAL_UTILS)
     if utils is None or hasattr(utils.eval_load_checkpoint, "__wrapped__"):
         return
@@ -222,13 +194,11 @@ def evaluate_whole_checkpoints() -> None:
 
 
 def from_whole(load: Callable[..., tuple[Path, int]]) -> Callable[..., tuple[Path, int]]:
-    """nerfstudio's `eval_load_checkpoint`, given the place of a whole file.
+    """nerfstudio's `eval_load_checkpoint`, given the place of a whole file; what is returned raises
+    InputError where the run has none.
 
     A step that a config names is taken where the folder has it. Where it has not, it is the one
     that the run was itself resumed from, in another folder.
-
-    Raises:
-        InputError: by what is returned, where the run has no whole checkpoint.
     """
 
     @functools.wraps(load)
@@ -244,13 +214,8 @@ def from_whole(load: Callable[..., tuple[Path, int]]) -> Callable[..., tuple[Pat
 
 
 def whole_of(checkpoints: Path, then: str = "{} is loaded instead") -> Path:
-    """The newest whole checkpoint of a run, with a line about each newer one that is damaged.
-
-    Args:
-        then: what becomes of it, where there is a damaged one.
-    Raises:
-        InputError: there is none.
-    """
+    """The newest whole checkpoint of a run, with a line about each newer one that is damaged, and
+    what becomes of it `then`. InputError if there is none."""
     path, damaged = newest_whole(checkpoints)
     for line in damaged:
         say(line)

@@ -24,20 +24,15 @@ PACKAGE = "leco_plugin"
 
 
 def is_ns_command(program: str) -> bool:
-    """Whether a program, `sys.argv[0]`, is a command of nerfstudio.
-
-    It is `ns-train` and the like, or, with `python -m`, a file of `nerfstudio/scripts`.
-    """
+    """Whether a program, `sys.argv[0]`, is nerfstudio's: `ns-train` and the like, or, with `python
+    -m`, a file of `nerfstudio/scripts`."""
     path = Path(program)
     folders = path.parts[:-1]
     return path.name.startswith("ns-") or ("nerfstudio", "scripts") in pairwise(folders)
 
 
 def show_one_line_in_ns_commands() -> None:
-    """In a process of such a command, an uncaught error that a user can act on is its line alone.
-
-    Calling it again changes nothing.
-    """
+    """In a process of such a command, uncaught errors that a user can act on are one line."""
     otherwise = sys.excepthook
     if hasattr(otherwise, "of_leco_plugin") or not any(map(is_ns_command, sys.argv[:1])):
         return
@@ -54,10 +49,8 @@ def show_one_line_in_ns_commands() -> None:
 
 
 def render_images_without_ffmpeg() -> None:
-    """In `ns-render`, only a film needs ffmpeg. nerfstudio asks for it before images, too.
-
-    Where a film is asked for and ffmpeg is missing, an InputError says so.
-    """
+    """In `ns-render`, only a film needs ffmpeg, and an InputError says so where it is missing;
+    nerfstudio asks for it before images, too."""
     program = Path(*sys.argv[:1])
     if not is_ns_command(str(program)) or program.stem not in ("ns-render", "render"):
         return
@@ -98,8 +91,8 @@ def quiet_imports_of_our_methods() -> None:
     """Hides warnings that a user can do nothing about, in every command of nerfstudio but
     `ns-train` of a method that is not ours.
 
-    Called by the first module of this package that nerfstudio imports, its readers, before its
-    models. What it warns of earlier cannot be kept from the screen.
+    Called by the first module of this package that nerfstudio imports, its readers. What it warns
+    of earlier cannot be kept from the screen.
     """
     program = Path(*sys.argv[:1]).name
     trains = program.startswith(("ns-train", "train"))

@@ -29,10 +29,8 @@ int32, which wraps around without a word."""
 
 
 def speed_up_hash_encodings(model: nn.Module) -> None:
-    """Puts a `CpuHashEncoding` wherever a model holds one that nerfstudio computes in torch.
-
-    Names in the state dict stay. What else still holds the old one shares its table and its hooks.
-    """
+    """Puts a `CpuHashEncoding` wherever a model holds one that nerfstudio computes in torch. Names
+    in the state dict stay; what else holds the old one shares its table and its hooks."""
     made: dict[nn.Module, CpuHashEncoding] = {}
     for parent in list(model.modules()):
         for name, child in list(parent._modules.items()):
@@ -46,10 +44,8 @@ class CpuHashEncoding(HashEncoding):
     """`HashEncoding` with another way to compute it; made by `speed_up_hash_encodings`."""
 
     def pytorch_fwd(self, in_tensor: Tensor) -> Tensor:
-        """[..., 3] positions in [0, 1] to [..., levels * features]; differentiable in both.
-
-        What is not float32 on a CPU is left to nerfstudio.
-        """
+        """[..., 3] positions in [0, 1] to [..., levels * features]; differentiable in both. What is
+        not float32 on a CPU is left to nerfstudio."""
         table = self.hash_table
         if in_tensor.device.type != "cpu" or {in_tensor.dtype, table.dtype} != {torch.float32}:
             return super().pytorch_fwd(in_tensor)
@@ -170,13 +166,8 @@ def _between(sides: Tensor, places: Tensor) -> Tensor:
 
 
 def _worth(columns: Tensor, rows: Tensor, gradient: Tensor) -> Tensor:
-    """What the features of each corner, whole, would add to the loss: [N, 8].
-
-    Args:
-        columns: [features, rows] of the table.
-        rows: [N, 8] of the corners.
-        gradient: [N, features].
-    """
+    """What the features of each corner, whole, would add to the loss: [N, 8], of columns [features,
+    rows] of the table, rows [N, 8] of the corners, and gradients [N, features]."""
     flat, worth = rows.view(-1), torch.zeros(rows.shape)
     for column, of_column in zip(columns, gradient.unbind(dim=-1)):
         worth.addcmul_(column.index_select(0, flat).view_as(rows), of_column[:, None])

@@ -15,9 +15,7 @@ from leco_plugin.evaluation.metrics import LPIPS_MINIMUM_SIDE, LpipsBackbone, lp
 
 class LazyLpipsNetwork(nn.Module):
     """Stands where torchmetrics keeps its LPIPS network, and loads that network when it is called.
-
-    It holds no parameters, so that a checkpoint is the same whether or not LPIPS was ever computed.
-    """
+    It has no parameters: a checkpoint is the same whether or not LPIPS was ever computed."""
 
     def __init__(self, net: LpipsBackbone = "alex", **_: Any) -> None:
         super().__init__()
@@ -35,11 +33,8 @@ class LazyLpipsNetwork(nn.Module):
 
 @contextmanager
 def lazy_lpips() -> Iterator[None]:
-    """While this lasts, every `LearnedPerceptualImagePatchSimilarity` that is made loads lazily.
-
-    The network's class is exchanged rather than the metric's, so that it also reaches a host that
-    imported the metric long before.
-    """
+    """While this lasts, every `LearnedPerceptualImagePatchSimilarity` that is made loads lazily:
+    its network's class is exchanged, which reaches hosts that imported the metric long before."""
     from torchmetrics.image import lpip
 
     eager_network = lpip._NoTrainLpips
@@ -51,26 +46,20 @@ def lazy_lpips() -> Iterator[None]:
 
 
 def true_colours(host: Any, image: Tensor) -> Tensor:
-    """What the host should show of pixels [..., 3 or 4]: before its own background, [..., 3].
-
-    nerfstudio's models render premultiplied colours, and photographs have straight ones.
-    """
+    """What the host should show of pixels [..., 3 or 4]: before its own background, [..., 3]. Its
+    models render premultiplied colours, and photographs have straight ones."""
     blend = getattr(getattr(host, "renderer_rgb", None), "blend_background", None)
     blended: Tensor = image[..., :3] if blend is None else blend(image)
     return blended
 
 
 def outputs_of(dataset: Any) -> Any:
-    """The `DataparserOutputs` that an `InputDataset` was made of.
-
-    Its masks and its alpha colour stand nowhere else; its data manager's are of the training split.
-    """
+    """The `DataparserOutputs` that an `InputDataset` was made of: its masks and its alpha colour
+    stand nowhere else, and its data manager's are of the training split."""
     return dataset._dataparser_outputs
 
 
 def leave_out_the_end(trainer: Any) -> None:
-    """Has a trainer end after its last step, without a last checkpoint, a banner and a viewer.
-
-    No option of `TrainerConfig` turns them off together.
-    """
+    """Has a trainer end after its last step, without a last checkpoint, a banner and a viewer,
+    which no option of `TrainerConfig` turns off together."""
     trainer._after_train = lambda: None

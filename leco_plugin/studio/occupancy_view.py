@@ -53,12 +53,8 @@ def is_viewer_drawing() -> bool:
 
 
 def stop_drawing_for_nobody() -> None:
-    """Ends a picture of the viewer whose page is closed. nerfstudio finishes it, and no step of
-    training is taken meanwhile.
-
-    Raises:
-        IOChangeException: to the viewer, which expects it.
-    """
+    """Raises the IOChangeException that nerfstudio's viewer expects, in a picture whose page is
+    closed: else it is finished, and no step of training is taken meanwhile."""
     thread = threading.current_thread()
     if isinstance(thread, RenderStateMachine) and not thread.running:
         raise IOChangeException
@@ -101,12 +97,8 @@ class OccupancyView(nn.Module):
     def draw(
         self, drawn: Drawn, rays: Any, render: Callable[[Any], dict[str, Any]]
     ) -> dict[str, Any]:
-        """Outputs of rays as the controls have them.
-
-        Args:
-            rays: a bundle [R] of nerfstudio, without limits but those of a crop.
-            render: of the model.
-        """
+        """Outputs of rays, a bundle [R] without limits but those of a crop, that a model renders as
+        the controls have them."""
         self.follow(drawn.occupancy.threshold)
         threshold = self.chosen()
         SHOWN.set(threshold)
@@ -134,11 +126,8 @@ def with_states(rgb: Tensor, drawn: Drawn, rays: Any) -> Tensor:
 
 
 class DrawnInViewer(_Model):
-    """Stands before a model whose occupancy nerfstudio's viewer shows.
-
-    Attributes:
-        leco_view: the controls; a model without them has no occupancy to show.
-    """
+    """Stands before a model whose occupancy nerfstudio's viewer shows; one without `leco_view`, the
+    controls, has none to show."""
 
     leco_view: OccupancyView
 

@@ -49,11 +49,7 @@ class DataParallelTrainerConfig(TrainerConfig):
 
     def set_timestamp(self) -> None:
         """Prepares the launcher too: of a config, nothing else is called before processes start.
-
-        Raises:
-            InputError: the processes that are asked for cannot be started, or find each other;
-                there is no step to take, or a folder is not there.
-        """
+        InputError if they cannot start or find each other, there is no step, or no such folder."""
         super().set_timestamp()
         self._require_what_is_named()
         require_startable(self.machine)
@@ -61,11 +57,8 @@ class DataParallelTrainerConfig(TrainerConfig):
             prepare_launcher(on_cpu=self.machine.device_type == "cpu")
 
     def _require_what_is_named(self) -> None:
-        """Before anything of a run is written.
-
-        Raises:
-            InputError: there is no step to take, or a folder or file is not there.
-        """
+        """InputError, before anything of a run is written, if there is no step to take, or no such
+        folder or file."""
         if self.max_num_iterations < 1:
             raise InputError(
                 f"--max-num-iterations is {self.max_num_iterations}; a run needs at least one step"
@@ -98,12 +91,8 @@ class DataParallelTrainerConfig(TrainerConfig):
 
 
 def require_startable(machine: MachineConfig) -> None:
-    """Refuses what nerfstudio would refuse in a process that it has started.
-
-    Raises:
-        InputError: there are fewer GPUs than processes here, or several machines do not know of
-            each other.
-    """
+    """InputError for what nerfstudio would refuse in a process that it has started: fewer GPUs than
+    processes here, or several machines that do not know of each other."""
     devices, machines = machine.num_devices, machine.num_machines
     if machine.device_type == "cuda" and devices > 1:
         there = torch.cuda.device_count()
@@ -125,13 +114,8 @@ def require_startable(machine: MachineConfig) -> None:
 
 
 def prepare_launcher(on_cpu: bool) -> None:
-    """Has nerfstudio's next launch of processes end in one line when one is lost.
-
-    After it, or an error in it, the launcher is nerfstudio's own again.
-
-    Args:
-        on_cpu: whether `process` is started in place of nerfstudio's own function.
-    """
+    """Has nerfstudio's next launch of processes end in one line when one is lost, or on a CPU start
+    `process` in place of its own; after it, or an error in it, the launcher is its own again."""
     for name in ("nerfstudio.scripts.train", "__main__"):
         launcher: Any = sys.modules.get(name)
         if hasattr(launcher, "launch") and hasattr(launcher, "_distributed_worker"):
@@ -176,11 +160,7 @@ def _with_one_line(launch: Any) -> Any:
 
 
 def _stop(which: str, how: str, config: Any) -> None:
-    """Ends the launcher because a process is gone.
-
-    Raises:
-        TrainingStopped: always; the message says what is left.
-    """
+    """Ends the launcher because a process is gone: TrainingStopped, which says what is left."""
     folder = config.get_checkpoint_dir()
     saved = any(folder.glob("*.ckpt"))
     left = f"nothing that was saved is lost: go on with --load-dir {folder}"
@@ -191,12 +171,8 @@ def _stop(which: str, how: str, config: Any) -> None:
 
 
 def process(local_rank: int, *arguments: Any) -> None:
-    """One of the processes of a run, from its first line to its last.
-
-    Args:
-        local_rank: number of the process on this machine.
-        arguments: as nerfstudio's launcher gives them to its own function.
-    """
+    """One of the processes of a run, from its first line to its last, by its number on this machine
+    and what nerfstudio's launcher gives its own function."""
     train, world_size, here, machine_rank, address, config, timeout, device_type = arguments
     if device_type != "cpu":
         from nerfstudio.scripts.train import _distributed_worker

@@ -47,13 +47,8 @@ _held: dict[Path, int] = {}
 
 
 def claim(folder: Path, checkpoints: Path, load_from: Path | None) -> str | None:
-    """Takes a folder for the run of this process until it ends; returns why it cannot be had.
-
-    Args:
-        folder: of the run; made where it is missing.
-        checkpoints: where the run saves.
-        load_from: folder or file that the run resumes from; None is a new run.
-    """
+    """Takes a folder for the run of this process until it ends; returns why it cannot be had. It
+    saves in `checkpoints`, and resumes from the folder or file `load_from`, if from any."""
     place = folder.resolve()
     if place not in _held:
         folder.mkdir(parents=True, exist_ok=True)
@@ -87,14 +82,8 @@ def _release_all(process: int) -> None:
 
 @contextmanager
 def alone_in(folder: Path, work: str) -> Iterator[None]:
-    """Keeps a folder from every other process that would make the same runs in it.
-
-    Args:
-        folder: made where it is missing.
-        work: what is made there, for the message.
-    Raises:
-        InputError: another process is at work there, or it is no folder.
-    """
+    """Keeps a folder, made where it is missing, from other processes that would make the same
+    `work` in it. InputError if one is at work there, or it is no folder."""
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except (FileExistsError, NotADirectoryError):
@@ -150,11 +139,8 @@ CONFIG = "config.yml"
 
 
 def checkpoint_of(config: Any) -> Path | None:
-    """The checkpoint that training goes on from: of a folder, the newest that is whole.
-
-    Raises:
-        InputError: the folder holds none.
-    """
+    """The checkpoint that training goes on from: of a folder, the newest that is whole. InputError
+    if the folder holds none."""
     if config.load_dir is None:
         path: Path | None = config.load_checkpoint
         return path
@@ -164,13 +150,8 @@ def checkpoint_of(config: Any) -> Path | None:
 
 
 def with_sizes_of(config: Any, checkpoint: Path | None) -> Any:
-    """A trainer's config with the sizes of the run that is gone on with.
-
-    Args:
-        checkpoint: that training goes on from; None, or one that is not there, changes nothing.
-    Raises:
-        InputError: a size has been set by hand, and the run has another one.
-    """
+    """A trainer's config with the sizes of the run that is gone on with, if its checkpoint is
+    there. InputError if a size has been set by hand, and the run has another one."""
     from leco_plugin.models.leco_config import LecoModelConfig
 
     model = config.pipeline.model
@@ -184,11 +165,8 @@ def with_sizes_of(config: Any, checkpoint: Path | None) -> Any:
 
 
 def keep_sizes(config: Any, model: Any, asked: Any) -> Any:
-    """A trainer's config with the sizes that its model has, also in the run's `config.yml`.
-
-    Args:
-        asked: the model's config as the command gave it, which is what is stored so far.
-    """
+    """A trainer's config with the sizes that its model has, also in the run's `config.yml`, which
+    so far has those of the model's config as `asked` for."""
     if not _has_mixture(model) or asked.sizes == model.config.sizes:
         return config
     config = _with_model(config, model.config)
@@ -200,11 +178,8 @@ def keep_sizes(config: Any, model: Any, asked: Any) -> Any:
 
 
 def check_photographs(pipeline: Any) -> None:
-    """Whether a run that is gone on with still has the photographs that it was begun with.
-
-    Raises:
-        InputError: there are more or fewer; their codes would go to others.
-    """
+    """InputError if a run that is gone on with has more or fewer photographs than it was begun
+    with: their codes would go to others."""
     model: Any = getattr(pipeline, "model", None)
     if not _has_mixture(model):
         return
@@ -255,12 +230,8 @@ def iterations_until(end: int, done: int) -> int:
 
 
 def keeps_all_images(config: Any, photographs: int) -> bool:
-    """Whether a data manager loads all training photographs at once.
-
-    Args:
-        config: of the data manager; the release says so by -1, and main by infinity.
-        photographs: how many there are.
-    """
+    """Whether a data manager loads all training photographs at once; the release says so by -1, and
+    main by infinity."""
     some = config.train_num_images_to_sample_from
     return bool(some == -1 or some >= photographs)
 
@@ -271,11 +242,7 @@ def run_of(trainer: Any) -> Run:
 
 
 class TrainerRun:
-    """A run of nerfstudio's trainer.
-
-    Args:
-        trainer: set up, with its checkpoint loaded.
-    """
+    """A run of nerfstudio's trainer, which is set up, with its checkpoint loaded."""
 
     goes_on = True
 
@@ -307,11 +274,8 @@ class TrainerRun:
 
 
 def drop_missing_parameters(optimizers: Optimizers, groups: dict[str, list[Parameter]]) -> None:
-    """Drops the parameters that a model no longer has from its optimizers, with their state.
-
-    Args:
-        groups: the model's parameters by optimizer name; optimizers of other names do not change.
-    """
+    """Drops the parameters that a model no longer has from its optimizers, with their state, by the
+    model's parameters of each name; optimizers of other names do not change."""
     for name, parameters in groups.items():
         optimizer, there = optimizers.optimizers[name], {id(p) for p in parameters}
         # in place: others hold on to the same groups

@@ -52,11 +52,7 @@ def is_short(config: Any) -> bool:
 
 
 def short_screen(config: Any) -> AbstractContextManager[None]:
-    """While it lasts, only what the package says is on the screen of a run.
-
-    Args:
-        config: of the trainer; where its screen is not to be short, nothing changes.
-    """
+    """While it lasts, only what the package says is on the screen of a run that has a short one."""
     return _short(config.get_base_dir() / LOG) if is_short(config) else nullcontext()
 
 
@@ -124,12 +120,8 @@ OF_TRAINING = "on training pixels"
 
 
 class RunProgress:
-    """Stands around the steps of a run: a bar with PSNR, and in the end where everything lies.
-
-    Args:
-        trainer: set up.
-        end: steps of the run when it ends.
-    """
+    """Stands around the steps of a run until its `end`: a bar with PSNR, and then where everything
+    lies."""
 
     def __init__(self, trainer: Any, end: int) -> None:
         self.trainer, self.end = trainer, end
@@ -153,10 +145,8 @@ class RunProgress:
         self._bar.close()
 
     def after_step(self, step: int) -> None:
-        """Measures where that is due, and shows how far the run is.
-
-        The bar begins after the first step: before it, what learns first has one of its own.
-        """
+        """Measures where that is due, and shows how far the run is. The bar begins after the first
+        step: before it, what learns first has one of its own."""
         self.steps += 1
         if self._show is None:
             self.psnr.begin()
@@ -197,13 +187,8 @@ class RunProgress:
 
 
 def next_commands(folder: Path, occupancy: bool, tests: bool) -> list[str]:
-    """What to run after a run: to look at it, to measure it, and to take its occupancy elsewhere.
-
-    Args:
-        folder: of the run.
-        occupancy: whether it has left one.
-        tests: whether there are photographs to measure it by.
-    """
+    """What to run after a run: to look at it, to measure it if there are photographs for `tests`,
+    and to take its occupancy elsewhere if it has left one."""
     config = shlex.quote(str(folder / CONFIG))
 
     def out(name: str) -> str:

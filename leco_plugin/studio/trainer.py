@@ -43,10 +43,8 @@ HEARD = "\nstopping after this step; Ctrl-C once more stops at once\n"
 
 @contextmanager
 def catch_first_interrupt() -> Iterator[threading.Event]:
-    """An event that the first Ctrl-C sets; the second raises `KeyboardInterrupt` as usual.
-
-    Changes nothing outside of the main thread, or where another handler is already installed.
-    """
+    """An event that the first Ctrl-C sets; the second raises `KeyboardInterrupt` as usual. Changes
+    nothing outside of the main thread, or where another handler is already installed."""
     asked = threading.Event()
     before: Any = signal.getsignal(signal.SIGINT)
     in_main = threading.current_thread() is threading.main_thread()
@@ -68,23 +66,15 @@ def catch_first_interrupt() -> Iterator[threading.Event]:
 
 
 class PrunedOptimizers(Optimizers):
-    """Optimizers without the parameters that a loaded model has dropped.
-
-    Args:
-        config: of each parameter group.
-        pipeline: says which parameters there are.
-    """
+    """Optimizers without the parameters that a loaded model has dropped."""
 
     def __init__(self, config: dict[str, Any], pipeline: Any) -> None:
         super().__init__(config, pipeline.get_param_groups())
         self.pipeline = pipeline
 
     def load_optimizers(self, loaded_state: dict[str, Any]) -> None:
-        """As nerfstudio's, for the parameters that the model has now.
-
-        Raises:
-            InputError: the model came back with other photographs than the scene has.
-        """
+        """As nerfstudio's, for the parameters that the model has now. InputError if it came back
+        with other photographs than the scene has."""
         check_photographs(self.pipeline)
         drop_missing_parameters(self, self.pipeline.get_param_groups())
         super().load_optimizers(loaded_state)
@@ -120,10 +110,9 @@ class AtomicTrainer(Trainer):
         """As nerfstudio's, in the sizes of the run that is gone on with; then checkpoints are also
         saved by the clock.
 
-        Raises:
-            InputError: there is no whole checkpoint to go on from, or no step left; its sizes are
-                not those that are set by hand, the scene has other photographs now, or there is no
-                kernel of a name that is to be off.
+        InputError if there is no whole checkpoint to go on from, or no step left; if sizes are not
+        those set by hand, the scene has other photographs now, or no kernel has a name that is to
+        be off.
         """
         with short_screen(self.config):
             self._setup(*arguments, **options)
@@ -174,11 +163,7 @@ class AtomicTrainer(Trainer):
             self.save_checkpoint(step)
 
     def stop_if_asked(self, step: int) -> None:
-        """Saves, and ends the run, after Ctrl-C.
-
-        Raises:
-            TrainingStopped: says how to go on.
-        """
+        """After Ctrl-C, saves and ends the run by a TrainingStopped that says how to go on."""
         if self.asked_to_stop is None or not self.asked_to_stop.is_set():
             return
         if self.config.steps_per_save > 0:
@@ -194,9 +179,8 @@ class AtomicTrainer(Trainer):
     def train(self) -> None:
         """Trains to the last step, and then stays while somebody looks into the viewer.
 
-        Raises:
-            TrainingStopped: a loss is not finite, and the step was not taken; the gate has
-                collapsed more often than it may; or somebody has pressed Ctrl-C.
+        TrainingStopped if a loss is not finite, and the step was not taken; if the gate has
+        collapsed more often than it may; or if somebody has pressed Ctrl-C.
         """
         with short_screen(self.config), self.progress or nullcontext():
             if self.world_size > 1:  # its processes would not stop after the same step
@@ -226,11 +210,8 @@ class AtomicTrainer(Trainer):
         return "no checkpoint was saved yet"
 
     def _load_checkpoint(self) -> None:
-        """As nerfstudio's, from the newest checkpoint of a folder that is whole.
-
-        Raises:
-            InputError: there is none.
-        """
+        """As nerfstudio's, from the newest checkpoint of a folder that is whole. InputError for
+        none."""
         config, folder = self.config, self.config.load_dir
         if folder is None or config.load_step is not None:
             super()._load_checkpoint()
@@ -247,10 +228,8 @@ class AtomicTrainer(Trainer):
         """Writes the checkpoint of `step` beside the folder of checkpoints, then moves it in.
 
         The one before stays in a folder of its own. A disk that is full costs this checkpoint, and
-        a state that is not finite is not saved; training goes on.
-
-        Raises:
-            TrainingStopped: so it was with the last checkpoint of a run.
+        a state that is not finite is not saved; training goes on, but TrainingStopped ends a run
+        that is over.
         """
         bad = first_not_finite(self.pipeline)
         reason = f"{bad} is not finite" if bad is not None else self._doubts()
@@ -278,11 +257,8 @@ class AtomicTrainer(Trainer):
         return "the gate looks collapsed" if doubted else None
 
     def _save_whole(self, step: int) -> None:
-        """Beside, because nerfstudio reads a step out of every file name in its folder.
-
-        Raises:
-            OSError, RuntimeError: it cannot be written; what was there before is there.
-        """
+        """Beside, because nerfstudio reads a step out of every file name in its folder. OSError or
+        RuntimeError if it cannot be written; what was there before is there."""
         checkpoints = self.checkpoint_dir
         beside = checkpoints.with_name(f"{checkpoints.name}.unfinished")
         self.checkpoint_dir = beside

@@ -58,11 +58,8 @@ class View(NamedTuple):
 
 
 def middle_view(poses: Tensor) -> int:
-    """The training view in the middle; of a survey from the air, of those that look most down.
-
-    Args:
-        poses: [C, 3, 4] OpenGL camera to world, z up.
-    """
+    """The training view in the middle, of OpenGL poses [C, 3, 4] with z up; of a survey from the
+    air, of those that look most down."""
     places = poses[:, :, 3]
     distances = (places - places.median(dim=0).values).norm(dim=-1)
     if taken_from_above(poses.numpy()):
@@ -72,13 +69,8 @@ def middle_view(poses: Tensor) -> int:
 
 
 def first_view(cameras: Cameras, points: Tensor | None, frustum: float) -> View:
-    """Where the viewer opens.
-
-    Args:
-        cameras: of training.
-        points: [P, 3] sparse points, scene units, or None.
-        frustum: cube root of the volume of a camera's pyramid, scene units.
-    """
+    """Where the viewer opens, by training cameras, sparse points [P, 3] or None, and the cube root
+    of the volume of a camera's pyramid, all in scene units."""
     poses = cameras.camera_to_worlds.cpu().float()
     number = middle_view(poses)
     pose = poses[number]
@@ -104,12 +96,8 @@ def first_view(cameras: Cameras, points: Tensor | None, frustum: float) -> View:
 
 
 def upright_look(pose: Tensor) -> Tensor:
-    """The look [3] of a camera, or one close to it that shows the ground with the same top, for
-    controls that keep z upright.
-
-    Args:
-        pose: [3, 4] OpenGL camera to world, z up.
-    """
+    """The look [3] of a camera with an OpenGL pose [3, 4], z up, or one close to it that shows the
+    ground with the same top, for controls that keep z upright."""
     look, level = -pose[:, 2], pose[:2, 1]
     if look[2] > DOWNWARD or float(level.norm()) == 0.0:
         return look
@@ -155,13 +143,11 @@ class FirstView(ViewerControl):
 
 
 def stay_open(viewer: Any) -> None:
-    """Returns when the last page of a viewer is closed, or after Ctrl-C.
+    """Returns when the last page of nerfstudio's viewer, if there is one, is closed, or after
+    Ctrl-C.
 
     nerfstudio 1.1.5 either ends with training, whoever is looking, or waits for Ctrl-C even where
     nobody is (`viewer.quit_on_train_completion`).
-
-    Args:
-        viewer: nerfstudio's; None, or that of an old version, is none that stays.
     """
     server = getattr(viewer, "viser_server", None)
     if not isinstance(server, viser.ViserServer):

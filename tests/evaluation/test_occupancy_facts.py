@@ -10,8 +10,7 @@ from torch import Tensor
 
 from leco_plugin.evaluation.equal_loss import compare_with_truth, free_points
 from leco_plugin.scenes.city.city import CityConfig
-from leco_plugin.scenes.city.folder import CaptureConfig, write_city
-from leco_plugin.scenes.city.truth import CityTruth
+from leco_plugin.scenes.city.folder import CaptureConfig, CityTruth, write_city
 
 SCALE, STEP, HIGHEST = 0.02, 0.01, 1.2
 NO_WALLS = torch.tensor([-1e6] * 3 + [1e6] * 3)

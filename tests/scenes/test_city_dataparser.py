@@ -10,10 +10,9 @@ from nerfstudio.data.dataparsers.base_dataparser import DataparserOutputs
 from nerfstudio.plugins.registry_dataparser import DataParserSpecification
 from scene_files import refused
 
-from leco_plugin.scenes.city.truth import CityTruth
+from leco_plugin.scenes.city.folder import CityTruth
 from leco_plugin.scenes.city_dataparser import LecoCityDataParserConfig, leco_city_dataparser
-from leco_plugin.scenes.frames import METRES_PER_UNIT
-from leco_plugin.scenes.photographs import POINTS
+from leco_plugin.scenes.frames import METRES_PER_UNIT, POINTS
 
 
 @pytest.fixture(scope="module")

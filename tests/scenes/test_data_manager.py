@@ -32,8 +32,8 @@ from leco_plugin.scenes.data_manager import (
 )
 from leco_plugin.scenes.learning_data import held_out_bundle
 from leco_plugin.scenes.photographs import LecoPhotographsDataParserConfig
+from leco_plugin.scenes.pixels.held_out_pixels import Lattice, lattice_for
 from leco_plugin.scenes.pixels.known_distances import KnownDistancePixelSamplerConfig, sampler_here
-from leco_plugin.scenes.pixels.lattice import Lattice, lattice_for
 from leco_plugin.scenes.pixels.stored_pictures import StoredPictures, picture_sizes
 from leco_plugin.scenes.survey import survey
 

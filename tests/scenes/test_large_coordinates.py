@@ -38,10 +38,10 @@ from nerfstudio.data.utils.colmap_parsing_utils import (
 from scene_files import change, described, write_colmap, write_ply
 
 from leco_plugin.scenes.data_manager import LecoDataManagerConfig
-from leco_plugin.scenes.frames import data_frame_of, frame_of, inverse, moved
+from leco_plugin.scenes.frames import POINTS, data_frame_of, frame_of, inverse, moved
 from leco_plugin.scenes.mega_nerf import MegaNerfDataParserConfig
-from leco_plugin.scenes.mega_nerf_format.files import Coordinates
-from leco_plugin.scenes.photographs import POINTS, LecoPhotographsDataParserConfig
+from leco_plugin.scenes.mega_nerf_files import Coordinates
+from leco_plugin.scenes.photographs import LecoPhotographsDataParserConfig
 from leco_plugin.scenes.survey import points_in, survey
 
 UTM = np.array([500_000.25, 5_200_000.5, 300.0])

@@ -20,9 +20,8 @@ from scene_files import refused, write_ply
 
 from leco_plugin.scenes.bounds import BoundsConfig
 from leco_plugin.scenes.data_manager import LecoDataManagerConfig
-from leco_plugin.scenes.frames import ALTITUDES, METRES_PER_UNIT, between, frame_of
+from leco_plugin.scenes.frames import ALTITUDES, METRES_PER_UNIT, POINTS, between, frame_of
 from leco_plugin.scenes.mega_nerf import MegaNerfDataParserConfig, mega_nerf_dataparser
-from leco_plugin.scenes.photographs import POINTS
 from leco_plugin.scenes.survey import survey
 
 

@@ -27,8 +27,8 @@ from mega_nerf_scene import rebuilt, saved, zipped
 from PIL import Image
 
 from leco_plugin.scenes.input_error import InputError
-from leco_plugin.scenes.mega_nerf_format.files import read_coordinates, read_frame
-from leco_plugin.scenes.mega_nerf_format.outputs import picture_of, read_mask
+from leco_plugin.scenes.mega_nerf_files import read_coordinates, read_frame
+from leco_plugin.scenes.mega_nerf_outputs import picture_of, read_mask
 from leco_plugin.scenes.photograph_files import DerivedImages
 
 SECONDS = 2.0

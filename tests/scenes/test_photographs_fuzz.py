@@ -12,9 +12,10 @@ from typing import Any
 import numpy as np
 import pytest
 from damaged_bytes import cut, flip, splice
+from scene_files import read_ply
 
 from leco_plugin.scenes.input_error import InputError
-from leco_plugin.scenes.photographs import check_scene, read_ply
+from leco_plugin.scenes.photographs import check_scene
 
 SECONDS = 2.0
 

@@ -23,10 +23,10 @@ from nerfstudio.data.dataparsers.sdfstudio_dataparser import SDFStudioDataParser
 from PIL import Image
 from scene_files import change, described, refused, write_colmap
 
-from leco_plugin.scenes.known_folders import remedy_for
 from leco_plugin.scenes.mega_nerf import MegaNerfDataParserConfig
 from leco_plugin.scenes.photographs import LecoPhotographsDataParserConfig
 from leco_plugin.scenes.reading import read_checked
+from leco_plugin.scenes.scene_file import remedy_for
 
 Edit = Callable[[dict[str, Any]], object]
 

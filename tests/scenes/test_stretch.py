@@ -10,8 +10,15 @@ import pytest
 import tiny_scene as tiny
 from scene_files import change, described, refused
 
-from leco_plugin.scenes.photographs import LecoPhotographsDataParserConfig, describe_held_out
-from leco_plugin.scenes.stretch import BESIDE, LEAST, MOST, find_stretch, stretch_of
+from leco_plugin.scenes.photographs import (
+    BESIDE,
+    LEAST,
+    MOST,
+    LecoPhotographsDataParserConfig,
+    describe_held_out,
+    find_stretch,
+    stretch_of,
+)
 
 Array = np.ndarray
 

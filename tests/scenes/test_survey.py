@@ -16,8 +16,9 @@ from leco_plugin.scenes.bounds import BoundsConfig
 from leco_plugin.scenes.city.cameras import CaptureConfig
 from leco_plugin.scenes.city.city import CityConfig
 from leco_plugin.scenes.city.folder import write_city
+from leco_plugin.scenes.frames import POINTS
 from leco_plugin.scenes.mega_nerf import MegaNerfDataParserConfig
-from leco_plugin.scenes.photographs import POINTS, LecoPhotographsDataParserConfig
+from leco_plugin.scenes.photographs import LecoPhotographsDataParserConfig
 from leco_plugin.scenes.survey import (
     MOST_CAMERAS,
     SIDE,

@@ -10,14 +10,14 @@ import numpy as np
 import pytest
 import torch
 from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataParserConfig
-from scene_files import change, described, write_ply
+from scene_files import change, described, read_ply, write_ply
 from torch import Tensor
 
 from leco_plugin.scenes.city.cameras import look_at
 from leco_plugin.scenes.data_manager import LecoDataManagerConfig, upright_outputs
-from leco_plugin.scenes.photographs import LecoPhotographsDataParserConfig, read_ply
+from leco_plugin.scenes.frames import _vertical_of, turn_to_upright
+from leco_plugin.scenes.photographs import LecoPhotographsDataParserConfig
 from leco_plugin.scenes.survey import survey
-from leco_plugin.scenes.upright import _vertical_of, turn_to_upright
 
 UP = torch.tensor([0.0, 0.0, 1.0])
 

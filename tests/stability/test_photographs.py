@@ -11,7 +11,7 @@ import pytest
 from PIL import Image
 
 from leco_plugin.scenes.city.cameras import Lens, look_at
-from leco_plugin.scenes.frames import distance_from_rotations, rotation
+from leco_plugin.scenes.frames import distance_from_rotations
 from leco_plugin.scenes.photographs import check_scene, read_points
 from leco_plugin.stability.photographs import (
     STAGES,
@@ -74,12 +74,6 @@ def test_noise_has_the_size_that_was_asked_for() -> None:
     assert shifts.std() == pytest.approx(0.05, rel=0.15)
     assert np.sqrt((angles**2).mean() / 3) == pytest.approx(2.0, rel=0.15)
     assert distance_from_rotations(np.stack([s.written[:, :3] for s in shots])).max() < 1e-9
-
-
-def test_a_quarter_turn() -> None:
-    turned = rotation(np.array([0.0, 0.0, np.pi / 2])) @ np.array([1.0, 0.0, 0.0])
-    assert turned == pytest.approx([0.0, 1.0, 0.0])
-    assert rotation(np.zeros(3)).tolist() == np.eye(3).tolist()
 
 
 def test_the_origin_moves_what_is_written_and_nothing_else() -> None:

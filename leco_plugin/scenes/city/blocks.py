@@ -59,9 +59,8 @@ class Block:
 
     def pick(self, colours: list[Colour]) -> Colour:
         """One of the colours, slightly varied, so that no two houses are quite the same."""
-        colour = np.array(colours[self.random.integers(len(colours))]) * self.random.uniform(
-            0.88, 1.08
-        )
+        colour = np.array(colours[self.random.integers(len(colours))])
+        colour *= self.random.uniform(0.88, 1.08)
         red, green, blue = np.clip(colour + self.random.normal(0, 0.015, 3), 0.03, 0.97)
         return float(red), float(green), float(blue)
 

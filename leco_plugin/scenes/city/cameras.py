@@ -31,10 +31,8 @@ def look_at(position: Array, target: Array) -> Array:
 
 
 def aerial_cameras(city: City, count: int, seed: int) -> Array:
-    """Poses [count, 3, 4] above the roofs: a third nearly straight down, the rest at 45 degrees.
-
-    Each looks at a place in a block, all blocks in turn, from each side in turn.
-    """
+    """Poses [count, 3, 4] above the roofs, a third nearly straight down, the rest at 45 degrees: at
+    a place in each block in turn, from each side in turn."""
     random = np.random.default_rng([seed, 11])
     blocks = city.centres[city.built]
     size = city.config.block_size
@@ -91,11 +89,8 @@ class Lens:
     focal: float
 
     def directions(self, offset: tuple[float, float] = (0.5, 0.5)) -> Array:
-        """Unit directions [height, width, 3] through all pixels, OpenGL camera axes.
-
-        `offset` is the place in the pixel, in pixels from its upper left corner; (0.5, 0.5) is
-        its middle.
-        """
+        """Unit directions [height, width, 3], OpenGL camera axes, through a place in each pixel, in
+        pixels from its upper left corner."""
         rows, columns = np.mgrid[: self.height, : self.width]
         x = (columns + offset[0] - self.width / 2) / self.focal
         y = (self.height / 2 - rows - offset[1]) / self.focal
@@ -175,8 +170,8 @@ def views_of(city: City, capture: CaptureConfig) -> list[View]:
     blocks, seed = int(city.built.sum()), city.config.seed
     aerial = aerial_cameras(city, round(capture.aerial_per_block * blocks), seed)
     street = street_cameras(city, round(capture.street_per_block * blocks), seed)
-    names = [f"aerial_{i:05d}" for i in range(len(aerial))]
-    names += [f"street_{i:05d}" for i in range(len(street))]
+    sets = {"aerial": aerial, "street": street}
+    names = [f"{kind}_{i:05d}" for kind, poses in sets.items() for i in range(len(poses))]
     if len(names) < 2:
         raise ValueError(
             f"{len(names)} pictures are too few: at least one is trained on and one held out"

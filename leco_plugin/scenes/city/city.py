@@ -29,10 +29,8 @@ _PAIRS = 1 << 15
 def _groups(
     points: Array, shapes: int, prune: Callable[[Array, Array, Indices], Indices]
 ) -> Iterator[tuple[Indices, Indices]]:
-    """Splits points [N, 3] into groups; yields their indices and those of the shapes that matter.
-
-    `prune(low, high, candidates)` keeps the shapes that matter to some point of a box.
-    """
+    """Splits points [N, 3] into groups; yields their indices and those of the shapes that matter,
+    which `prune(low, high, candidates)` keeps for a box."""
     stack = [(np.arange(len(points)), np.arange(shapes))] if len(points) else []
     while stack:
         group, candidates = stack.pop()
@@ -83,12 +81,8 @@ class Solids:
 
 
 class Faces:
-    """The surface of some shapes: rectangles, then triangles.
-
-    Args:
-        rectangles: [R, 2, 3] low and high corners of axis-aligned ones.
-        triangles: [T, 3, 3].
-    """
+    """The surface of some shapes: axis-aligned rectangles [R, 2, 3], low and high corners, then
+    triangles [T, 3, 3]."""
 
     def __init__(self, rectangles: Array, triangles: Array) -> None:
         self.first, self.triangles = len(rectangles), triangles
@@ -149,10 +143,8 @@ class Faces:
 
 
 def squared_to_triangles(points: Array, triangles: Array) -> Array:
-    """Squared distances [M] from points [M, 3] to triangles [M, 3, 3].
-
-    Over a triangle's inside the height above its plane counts, elsewhere the nearest edge.
-    """
+    """Squared distances [M] from points [M, 3] to triangles [M, 3, 3]: over a triangle's inside the
+    height above its plane counts, elsewhere the nearest edge."""
     start, away = triangles[:, 0], points - triangles[:, 0]
     u, v = triangles[:, 1] - start, triangles[:, 2] - start
     uu, uv, vv = _dot(u, u), _dot(u, v), _dot(v, v)

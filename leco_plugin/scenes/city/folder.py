@@ -9,7 +9,10 @@ depths/*.npy       float32 [h, w], millimetres along the viewing axis, 0 where n
 transforms.json    cameras and splits
 sparse_pc.ply      some visible surface points, like those of structure from motion
 
-As a Mega-NeRF scene: see `mega_nerf_format.files`.
+As a Mega-NeRF scene: see `mega_nerf_files`.
+
+`CityTruth` reads it as a model sees it. nerfstudio moves and shrinks a scene before: x_model =
+scale * (R x + t), with [R | t] the dataparser's transform. There the way back is taken.
 """
 
 from __future__ import annotations
@@ -19,20 +22,24 @@ import hashlib
 import json
 import shutil
 from abc import ABC, abstractmethod
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
 from PIL import Image
+from torch import Tensor
 
 import leco_plugin
 from leco_plugin.scenes.city.cameras import CaptureConfig, Lens, View, views_of
 from leco_plugin.scenes.city.city import DESCRIPTION, City, CityConfig, read_description
 from leco_plugin.scenes.input_error import one_line
-from leco_plugin.scenes.mega_nerf_format.files import (
+from leco_plugin.scenes.mega_nerf_files import (
+    TO_DRB,
     Coordinates,
     Split,
     around,
@@ -93,13 +100,11 @@ class NerfstudioLayout(Layout):
 
     def _transforms(self) -> dict[str, Any]:
         frames: list[dict[str, Any]] = []
-        names: dict[bool, list[str]] = {False: [], True: []}
         for view in self.views:
-            frame: dict[str, Any] = dict(zip(FILE_FIELDS, self.files(view)))
             matrix = [*view.pose.tolist(), [0.0, 0.0, 0.0, 1.0]]
-            frames.append(frame | {"transform_matrix": matrix})
-            names[view.held_out].append(frame["file_path"])
-        lens = self.lens
+            frames.append(dict(zip(FILE_FIELDS, self.files(view))) | {"transform_matrix": matrix})
+        pictures = [(self.files(view)[0], view.held_out) for view in self.views]
+        tested, lens = [name for name, held_out in pictures if held_out], self.lens
         return {
             "camera_model": "OPENCV",
             "w": lens.width,
@@ -112,16 +117,14 @@ class NerfstudioLayout(Layout):
             "ply_file_path": POINTS,
             "metres_per_unit": 1.0,
             "frames": frames,
-            "train_filenames": names[False],
-            "val_filenames": names[True],
-            "test_filenames": names[True],
+            "train_filenames": [name for name, held_out in pictures if not held_out],
+            "val_filenames": tested,
+            "test_filenames": tested,
         }
 
     def _points(self, folder: Path) -> NDArray[Any]:
-        """Some surface points of each view, [N] rows of `xyz` (metres) and `rgb`.
-
-        They are read back from its files, so that what a killed run wrote counts too.
-        """
+        """Some surface points of each view, [N] rows of `xyz` (metres) and `rgb`; read back from
+        its files, so that what a killed run wrote counts too."""
         random = np.random.default_rng([self.seed, 13])
         rows = []
         for view in self.views:
@@ -145,25 +148,22 @@ class MegaNerfLayout(Layout):
         return around(np.stack([view.pose[:, 3] for view in self.views]))
 
     def files(self, view: View) -> list[str]:
-        return [f"{_split(view)}/{part}/{_stem(view)}.{ending}" for part, ending in PARTS]
+        split, stem = self._place(view)
+        return [f"{split}/{part}/{stem}.{ending}" for part, ending in PARTS]
 
     def write(self, folder: Path, view: View, image: Image8, depth: NDArray[np.float32]) -> None:
         lens = self.lens
         intrinsics = lens.focal, lens.focal, lens.width / 2, lens.height / 2
         pose = self.coordinates.to_file(view.pose[None])[0]
-        write_view(folder, _split(view), _stem(view), image, pose, intrinsics)
+        write_view(folder, *self._place(view), image, pose, intrinsics)
 
     def finish(self, folder: Path) -> None:
         write_coordinates(folder, self.coordinates)
-        write_mappings(folder, {f"{view.name}.png": _stem(view) for view in self.views})
+        write_mappings(folder, {f"{each.name}.png": self._place(each)[1] for each in self.views})
 
-
-def _split(view: View) -> Split:
-    return "val" if view.held_out else "train"
-
-
-def _stem(view: View) -> str:
-    return f"{view.number:06d}"
+    def _place(self, view: View) -> tuple[Split, str]:
+        """Its split, and the stem of its files."""
+        return "val" if view.held_out else "train", f"{view.number:06d}"
 
 
 LAYOUTS: dict[LayoutName, type[Layout]] = {
@@ -185,18 +185,12 @@ def write_city(
     progress: bool = True,
     layout: LayoutName = "nerfstudio",
 ) -> Path:
-    """Writes the city as a scene, unless `out_dir` already holds just that.
+    """Writes the city as a scene into `out_dir`, unless it already holds just that; returns it.
 
     The folder appears under its name only when it is complete. Until then the pictures lie in a
     hidden folder beside it; a run that was killed is taken up there, and several may work on it.
-
-    Args:
-        out_dir: the folder to write, which is returned; its parents are made.
-        capture: how it is photographed, by default about 60 small aerial pictures for 3 blocks.
-        progress: whether to show a bar.
-    Raises:
-        FileExistsError: `out_dir` holds something else, and is left alone.
-        ValueError: `out_dir` holds a damaged city, and is left alone.
+    Without `capture` there are about 60 small aerial pictures for 3 blocks. FileExistsError if
+    `out_dir` holds something else, ValueError if it holds a damaged city; both leave it alone.
     """
     out_dir, capture = Path(out_dir), capture or CaptureConfig()
     parts = {"city": dataclasses.asdict(config), "capture": dataclasses.asdict(capture)}
@@ -304,3 +298,67 @@ def read_transforms(folder: Path) -> dict[str, Any]:
         message = f"{folder} is damaged: {TRANSFORMS}: {one_line(error)}"
         raise ValueError(message) from error
     return dict(transforms)
+
+
+@dataclass
+class CityTruth:
+    """A city seen through a dataparser's transform."""
+
+    city: City
+    folder: Path
+    transform: Tensor
+    """[3, 4] from metres to model axes, before scaling."""
+    scale: float
+    """Model units in a metre."""
+
+    @classmethod
+    def from_dataparser(cls, folder: Path | str, outputs: Any) -> CityTruth:
+        """From a city's folder and nerfstudio's `DataparserOutputs` for it. ValueError or OSError
+        if the folder holds no city."""
+        folder = Path(folder)
+        transform = outputs.dataparser_transform.double().cpu()
+        if read_description(folder)["layout"] == "mega-nerf":
+            turn = torch.from_numpy(TO_DRB)  # that reader begins at (down, right, back)
+            transform = torch.cat([transform[:, :3] @ turn, transform[:, 3:]], dim=1)
+        return cls(City.from_folder(folder), folder, transform, float(outputs.dataparser_scale))
+
+    def to_metres(self, positions: Tensor) -> NDArray[np.float64]:
+        """Model positions [..., 3] in metres: float64 [..., 3]."""
+        rotation, shift = self.transform[:, :3], self.transform[:, 3]
+        return (
+            (positions.detach().double().cpu() / self.scale - shift) @ torch.linalg.inv(rotation).T
+        ).numpy()
+
+    def to_model(self, positions: NDArray[np.floating]) -> Tensor:
+        """Positions [..., 3] in metres as model positions: float32 [..., 3]."""
+        metres = torch.as_tensor(positions, dtype=torch.float64)
+        return (self.scale * (metres @ self.transform[:, :3].T + self.transform[:, 3])).float()
+
+    def occupied(self, positions: Tensor) -> Tensor:
+        """Whether model positions [..., 3] lie inside solid matter: bool [...]."""
+        return self._ask(self.city.occupied, positions)
+
+    def distance(self, positions: Tensor) -> Tensor:
+        """Metres from model positions [..., 3] to the nearest surface: float32 [...]."""
+        return self._ask(self.city.distance, positions).float()
+
+    def _ask(self, question: Callable[[NDArray[Any]], NDArray[Any]], positions: Tensor) -> Tensor:
+        """What the city answers at model positions [..., 3]: [...]."""
+        metres = self.to_metres(positions)
+        answers = question(metres.reshape(-1, 3)).reshape(metres.shape[:-1])
+        return torch.from_numpy(answers).to(positions.device)
+
+    def visible_surface(self, split: Literal["train", "val", "test"] = "test") -> Tensor:
+        """Surface points in the middles of a split's pixels: [P, 3] float32, model coordinates."""
+        lens = CaptureConfig(**read_description(self.folder)["capture"]).lens
+        transforms = read_transforms(self.folder)
+        wanted = set(transforms[f"{split}_filenames"])
+        found = []
+        for frame in transforms["frames"]:
+            if frame["file_path"] in wanted:
+                depth = lens.along_ray(
+                    np.load(self.folder / frame["depth_file_path"], allow_pickle=False)
+                )
+                points = lens.points(np.array(frame["transform_matrix"])[:3], depth)
+                found.append(self.to_model(points[np.isfinite(depth)]))
+        return torch.cat(found)

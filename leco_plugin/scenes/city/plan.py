@@ -11,6 +11,7 @@ from itertools import pairwise
 import numpy as np
 from numpy.random import Generator
 from numpy.typing import NDArray
+from scipy import ndimage
 
 from leco_plugin.scenes.city.blocks import GROUND_DEPTH, KERB, KINDS, Block
 from leco_plugin.scenes.city.shapes import (
@@ -33,10 +34,8 @@ _EDGE_PARTS = 3
 
 
 def choose_blocks(blocks: int, seed: int) -> NDArray[np.bool_]:
-    """Which cells of the [blocks, blocks] square are built.
-
-    The rim of a city has gaps; from `LARGE` on its outline has bays and headlands instead.
-    """
+    """Which cells of the [blocks, blocks] square are built: the rim has gaps, and from `LARGE` on
+    the outline has bays and headlands instead."""
     built = np.ones((blocks, blocks), bool)
     if blocks < 3:
         return built
@@ -64,21 +63,8 @@ def _wandering(blocks: int, seed: int) -> NDArray[np.bool_]:
     for waves, depth in ((3, 0.08), (5, 0.06), (9, 0.05)):
         reach -= depth * (1 + np.sin(waves * turn + random.uniform(0, 2 * np.pi)))
     # between a circle and a square
-    inside: NDArray[np.bool_] = (x**6 + y**6) ** (1 / 6) <= reach
-    return _around_the_middle(inside)
-
-
-def _around_the_middle(cells: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """The cells that are connected, side by side, with the middle one."""
-    found = np.zeros_like(cells)
-    found[len(cells) // 2, len(cells) // 2] = True
-    while True:
-        padded = np.pad(found, 1)
-        beside = padded[:-2, 1:-1] | padded[2:, 1:-1] | padded[1:-1, :-2] | padded[1:-1, 2:]
-        wider = cells & (found | beside)
-        if np.array_equal(wider, found):
-            return found
-        found = wider
+    islands, _ = ndimage.label((x**6 + y**6) ** (1 / 6) <= reach)
+    return np.asarray(islands == islands[blocks // 2, blocks // 2])
 
 
 def centres(built: NDArray[np.bool_], size: float) -> Array:
@@ -141,19 +127,14 @@ def _pavement(block: Block, lamp: int) -> None:
         pole = [(radius, 0.0, block.metal), (radius, 9.9, block.metal)]
         block.turned(line, along, pole, block.earth)
         block.turned(along, -line, [*pole[:1], (radius, 8.7, block.metal)], block.earth)
-        post = [
-            (0.08, 0.0, block.metal),
-            (0.08, 5.2, block.metal),
-            (0.35, 5.35, lamp),
-            (0.3, 5.6, lamp),
-        ]
+        rod, head = [(0.08, 0.0), (0.08, 5.2)], [(0.35, 5.35), (0.3, 5.6)]
+        post = [(*ring, block.metal) for ring in rod] + [(*ring, lamp) for ring in head]
         block.turned(-line, along, post, block.earth)
         block.turned(along, line, post, block.earth)
     for along in (-0.18 * block.lot, 0.0, 0.18 * block.lot):
-        if block.random.random() < 0.75:
-            block.tree(-line - 0.1, along, block.random.uniform(0.8, 1.1))
-        if block.random.random() < 0.75:
-            block.tree(along, line + 0.1, block.random.uniform(0.8, 1.1))
+        for place in ((-line - 0.1, along), (along, line + 0.1)):
+            if block.random.random() < 0.75:
+                block.tree(*place, block.random.uniform(0.8, 1.1))
 
 
 def _streets(block: Block, size: float, street: int) -> None:

@@ -38,10 +38,8 @@ def _noise(u: Array, v: Array) -> Colours:
 
 
 def _covered(position: Array, period: Spacing, width: Spacing, pixel: Array) -> Colours:
-    """Share of a pixel (metres wide) that stripes of `width` cover, repeating every `period`.
-
-    The exact integral of the stripes over the pixel, so that they blur instead of flickering.
-    """
+    """Share of a pixel (metres wide) that stripes of `width` cover, repeating every `period`: the
+    exact integral, so that they blur instead of flickering."""
 
     def integral(x: Array) -> Array:
         whole = np.floor(x / period)
@@ -55,16 +53,10 @@ def _covered(position: Array, period: Spacing, width: Spacing, pixel: Array) -> 
 def paint_surface(
     city: City, positions: Array, normals: Array, paint: NDArray[np.int64], pixel: Array
 ) -> Colours:
-    """Reflectance (RGB in 0..1) of surface points.
+    """Reflectance (RGB in 0..1) [N, 3] float32 of surface points.
 
-    Args:
-        city: gives the palette.
-        positions: [N, 3] metres.
-        normals: [N, 3] unit, outward.
-        paint: [N] rows of the palette.
-        pixel: [N] width of a pixel at the point, metres.
-    Returns:
-        [N, 3] float32.
+    Of positions [N, 3] in metres with unit normals [N, 3] outward, rows of the city's palette [N],
+    and the width of a pixel there [N] in metres.
     """
     material = city.material[paint]
     colour = city.colour[paint].copy()
@@ -137,9 +129,8 @@ def _streets(colour: Colours, chosen: NDArray, local: Array, size: Array, pixel:
     far, near = np.maximum(x, y), np.minimum(x, y)
     in_street = near < lot
     dash = _covered(near, 4.0, 2.2, pixel)
-    line = np.clip((0.12 - (middle - far)) / np.maximum(pixel, 0.02) + 0.5, 0, 1) * np.minimum(
-        0.24 / pixel, 1
-    )
+    line = np.clip((0.12 - (middle - far)) / np.maximum(pixel, 0.02) + 0.5, 0, 1)
+    line *= np.minimum(0.24 / pixel, 1)
     white = dash * line * (near < lot - 3.5)
     bars = _covered(far - lot, 1.0, 0.5, pixel)
     white = np.maximum(white, bars * ((near > lot - 3.0) & (near < lot - 0.6)))
@@ -149,9 +140,8 @@ def _streets(colour: Colours, chosen: NDArray, local: Array, size: Array, pixel:
 
 def _hills(colour: Colours, chosen: NDArray, height: Array, slope: Array) -> None:
     """Rock where it is steep or high."""
-    rock = np.clip((0.93 - slope[chosen]) * 6 + height[chosen] / 150, 0, 1).astype(np.float32)[
-        :, None
-    ]
+    steep_or_high = (0.93 - slope[chosen]) * 6 + height[chosen] / 150
+    rock = np.clip(steep_or_high, 0, 1).astype(np.float32)[:, None]
     colour[chosen] = colour[chosen] * (1 - rock) + np.array([0.48, 0.45, 0.42], np.float32) * rock
 
 
@@ -179,21 +169,13 @@ class Tracer:
         corners = city.triangles.reshape(-1, 3)
         faces = np.arange(len(corners)).reshape(-1, 3)
         self.mesh = trimesh.Trimesh(corners, faces, process=False, validate=False)
-        normals = np.cross(
-            city.triangles[:, 1] - city.triangles[:, 0], city.triangles[:, 2] - city.triangles[:, 0]
-        )
+        first, second, third = city.triangles.swapaxes(0, 1)
+        normals = np.cross(second - first, third - first)
         self.normals = normals / np.linalg.norm(normals, axis=1, keepdims=True)
 
     def cast(self, origins: Array, directions: Array) -> tuple[NDArray[np.int64], Array]:
-        """The first face each ray meets.
-
-        Args:
-            origins: [N, 3] metres.
-            directions: [N, 3] unit.
-        Returns:
-            faces: [N] int, -1 for a ray that meets none.
-            depths: [N] metres along the ray, inf for a ray that meets none.
-        """
+        """The first face [N] that each ray meets, -1 for none, and its depth [N] in metres along
+        the ray, inf for none; origins [N, 3] in metres, unit directions [N, 3]."""
         faces = np.asarray(self.mesh.ray.intersects_first(origins, directions), dtype=np.int64)
         depths = np.full(len(faces), np.inf)
         hit = faces >= 0
@@ -205,21 +187,19 @@ class Tracer:
         depths[hit] = height / np.where(np.abs(slant) < 1e-12, 1e-12, slant)
         return faces, depths
 
-    def colour(
-        self, origins: Array, directions: Array, pixel_angle: float
-    ) -> tuple[Colours, Array]:
-        """Light and depth along rays [N, 3]: RGB in 0..1, [N, 3], and metres, [N]."""
+    def colour(self, origins: Array, directions: Array, angle: float) -> tuple[Colours, Array]:
+        """Light and depth along rays [N, 3] whose pixels have this angle: RGB in 0..1, [N, 3], and
+        metres, [N]."""
         faces, depths = self.cast(origins, directions)
-        colours = (
-            sky(directions) if self.city.config.sky else np.zeros(directions.shape, np.float32)
-        )
+        has_sky = self.city.config.sky
+        colours = sky(directions) if has_sky else np.zeros(directions.shape, np.float32)
         hit = np.flatnonzero(faces >= 0)
         if not len(hit):
             return colours, depths
         positions = origins[hit] + depths[hit, None] * directions[hit]
         normals = self.normals[faces[hit]]
         slant = np.abs(np.einsum("nk,nk->n", normals, directions[hit]))
-        pixel = depths[hit] * pixel_angle / np.sqrt(np.maximum(slant, 0.05))
+        pixel = depths[hit] * angle / np.sqrt(np.maximum(slant, 0.05))
         albedo = paint_surface(self.city, positions, normals, self.city.paint[faces[hit]], pixel)
         sunlit = np.maximum(normals @ SUN, 0).astype(np.float32)
         facing = np.flatnonzero(sunlit > 0)
@@ -230,7 +210,7 @@ class Tracer:
         openness = 0.55 + 0.3 * normals[:, 2] + 0.15 * np.clip(positions[:, 2] / 12, 0, 1)
         light = sunlit[:, None] * _SUNLIGHT + openness.astype(np.float32)[:, None] * _SKYLIGHT
         colours[hit] = albedo * light
-        if self.city.config.sky:
+        if has_sky:
             haze = 1 - np.exp(-depths[hit, None].astype(np.float32) / _SIGHT)
             colours[hit] = colours[hit] * (1 - haze) + _HORIZON * haze
         return np.clip(colours, 0, 1), depths
@@ -238,15 +218,10 @@ class Tracer:
     def photograph(
         self, camera_to_world: Array, lens: Lens
     ) -> tuple[NDArray[np.uint8], NDArray[np.float32]]:
-        """Takes one antialiased picture.
+        """Takes one antialiased picture from a pose [3, 4] in metres, OpenGL axes.
 
-        Args:
-            camera_to_world: [3, 4], metres, OpenGL axes (x right, y up, looking along -z).
-            lens: size and focal length.
-        Returns:
-            image: [height, width, 3] sRGB.
-            depth: [height, width] metres along the ray through the pixel's middle; inf where
-                it meets nothing.
+        Returns the image [height, width, 3] sRGB, and the depth [height, width] in metres along the
+        ray through the pixel's middle, inf where it meets nothing.
         """
         size = lens.height, lens.width
         image, depth = np.zeros((*size, 3), np.float32), np.zeros(size, np.float32)

@@ -69,13 +69,9 @@ class Shapes:
         open_sides: list[bool] | None = None,
         shared: int = 0,
     ) -> None:
-        """Adds the convex solid between two rings [V, 3], and its sides.
-
-        Args:
-            first, second: counter-clockwise where the first is seen from outside.
-            open_sides: whether the side from corner i to i + 1 touches air; None: all do.
-            shared: corner of a side that both of its triangles have, counted from the first ring.
-        """
+        """Adds the convex solid between two rings [V, 3], counter-clockwise where the first is seen
+        from outside, and those sides from corner i to i + 1 that are open to the air (None: all).
+        Both triangles of a side have its corner `shared`, counted from the first ring."""
         count = len(first)
         corners = np.concatenate([first, second])
         sides = [[i, count + i, count + (i + 1) % count, (i + 1) % count] for i in range(count)]
@@ -94,22 +90,18 @@ def add_roof(
     paint: int,
     gable: int,
 ) -> None:
-    """Adds a pitched roof on a rectangle; the ridge follows its longer side.
-
-    `hip` is how far (metres) the ridge's ends stand back: 0 gives upright gables, painted `gable`.
-    """
+    """Adds a pitched roof on a rectangle, its ridge along the longer side; the ridge's ends stand
+    back by `hip` metres: 0 gives upright gables, painted `gable`."""
     x0, x1, y0, y1 = rounded(bounds)
     along_x = x1 - x0 >= y1 - y0
     base, top = round(float(base), 2), round(float(base + rise), 2)
     if along_x:
         ridge = [[x0 + hip, (y0 + y1) / 2, top], [x1 - hip, (y0 + y1) / 2, top]]
-    else:
-        ridge = [[(x0 + x1) / 2, y1 - hip, top], [(x0 + x1) / 2, y0 + hip, top]]
-    corners = np.array([[x0, y0, base], [x1, y0, base], [x1, y1, base], [x0, y1, base], *ridge])
-    if along_x:
         slopes, ends = [[0, 1, 5, 4], [2, 3, 4, 5]], [[1, 2, 5], [3, 0, 4]]
     else:
+        ridge = [[(x0 + x1) / 2, y1 - hip, top], [(x0 + x1) / 2, y0 + hip, top]]
         slopes, ends = [[1, 2, 4, 5], [3, 0, 5, 4]], [[2, 3, 4], [0, 1, 5]]
+    corners = np.array([[x0, y0, base], [x1, y0, base], [x1, y1, base], [x0, y1, base], *ridge])
     for face in slopes:
         shapes.add_polygon(corners[face], paint)
     for face in ends:
@@ -126,11 +118,11 @@ def add_turned(
     foot: int,
     sides: int = 8,
 ) -> None:
-    """Stands a turned solid (pole, tree, tank) on the canvas at x, y, on a low square foot.
+    """Stands a turned solid (pole, tree, tank) on the canvas at x, y, on a low square foot, which
+    keeps the hidden face under it simple: a square without a regular polygon.
 
-    `profile` lists radius and height above the foot in metres, from the foot up, with the paint
-    of the stretch that ends there; `sides` is a multiple of 4. The foot keeps the hidden face
-    under the solid simple: a square without a regular polygon.
+    `profile` lists radius and height above the foot in metres, from the foot up, with the paint of
+    the stretch that ends there; `sides` is a multiple of 4.
     """
     reach = round(profile[0][0] + 0.12, 2)
     x, y = round(float(x), 2), round(float(y), 2)
@@ -154,10 +146,8 @@ def add_turned(
 
 
 def add_wire(shapes: Shapes, path: Array, radius: float, paint: int, sides: int = 4) -> None:
-    """Hangs a wire along `path` [V, 3], which runs straight in plan; `radius` in metres.
-
-    The rings stand upright across the path, so neighbouring pieces share a whole face.
-    """
+    """Hangs a wire along `path` [V, 3], straight in plan; `radius` in metres. The rings stand
+    upright across the path, so that neighbouring pieces share a whole face."""
     along = (path[-1] - path[0]) * [1, 1, 0]
     across = np.cross(along / np.linalg.norm(along), [0.0, 0.0, 1.0])
     turn = 2 * np.pi * np.arange(sides) / sides
@@ -171,10 +161,8 @@ def add_wire(shapes: Shapes, path: Array, radius: float, paint: int, sides: int 
 def add_prism(
     shapes: Shapes, top: Array, bottom: float, paint: int, open_sides: list[bool], side: int
 ) -> None:
-    """Adds a solid under a convex polygon [V, 3] (counter-clockwise from above) down to z = bottom.
-
-    `open_sides` is as of `Shapes.add_between`; those walls are painted `side`.
-    """
+    """Adds a solid under a convex polygon [V, 3] (counter-clockwise from above) down to z = bottom;
+    those walls of `open_sides`, as of `Shapes.add_between`, are painted `side`."""
     below = np.column_stack([top[:, :2], np.full(len(top), bottom)])
     shapes.add_polygon(top, paint)
     shapes.add_polygon(below[::-1], side)
@@ -298,12 +286,8 @@ class Palette(list[tuple[Material, Colour, Colour, tuple[float, float]]]):
         anchor: tuple[float, float, float] = (0.0, 0.0, 0.0),
         pitch: tuple[float, float] = (3.0, 3.0),
     ) -> int:
-        """Returns the number of the new paint.
-
-        Args:
-            anchor: where its pattern starts, metres.
-            pitch: spacing of the windows along x and along y, metres.
-        """
+        """Returns the number of the new paint; its pattern starts at `anchor` (metres), and windows
+        are `pitch` apart along x and y (metres)."""
         self.append((material, colour, anchor, pitch))
         return len(self) - 1
 

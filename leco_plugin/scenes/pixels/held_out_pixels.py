@@ -1,23 +1,96 @@
 """Training pixels that are never trained on: what the threshold of the gate is calibrated with.
 
-A thin lattice of pixels of the training images is left out of every batch.
+A thin lattice of pixels of the training images is left out of every batch. It needs no memory, and
+is the same on every process and after every resume.
 """
 
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from functools import partial
-from typing import Any
+from typing import Any, Literal
 
 import torch
 from nerfstudio.data.pixel_samplers import PixelSampler, PixelSamplerConfig
 from torch import Tensor
 
 from leco_plugin.scenes.input_error import InputError
-from leco_plugin.scenes.pixels.lattice import Lattice, Share
 from leco_plugin.scenes.pixels.stored_pictures import StoredPictures
+
+PERIODS = (11, 9, 7, 5)
+"""Pixels between two that are held out, in both directions: 1 in 121 where pictures have enough, 1
+in 25 at most."""
+WANTED = 12_000
+"""Held-out pixels of all pictures together: some more than calibrating and checking ask for."""
+Share = Literal["calibration", "recheck", "all"]
+"""Which held-out pixels: those that the threshold is calibrated with, those that it is checked with
+later, a quarter of all, or either."""
+
+
+@dataclass(frozen=True)
+class Lattice:
+    """One pixel of `period` x `period`."""
+
+    period: int = PERIODS[0]
+
+    def __post_init__(self) -> None:
+        if self.period < 2:
+            raise InputError(
+                f"of {self.period} pixels in both directions none is left to train on; "
+                "held-out-period is 2 or more"
+            )
+
+    @property
+    def offset(self) -> int:
+        """Row and column of a picture's first held-out pixel."""
+        return self.period // 2
+
+    def holds_out(self, pixels: Tensor) -> Tensor:
+        """Whether pixels (image, row, column) [N, 3] are held out: bool [N]."""
+        return (pixels[:, 1:] % self.period == self.offset).all(dim=-1)
+
+    def is_of(self, pixels: Tensor, share: Share) -> Tensor:
+        """Whether held-out pixels (image, row, column) [N, 3] belong to a share: bool [N]."""
+        if share == "all":
+            return torch.ones(len(pixels), dtype=torch.bool)
+        checks = (pixels[:, 1:] // self.period).sum(dim=-1) % 4 == 3
+        return checks if share == "recheck" else ~checks
+
+    def counts(self, sizes: Tensor) -> Tensor:
+        """Held-out pixels of pictures of sizes [P, 2] (height, width): [P, 2] (rows, columns). Of
+        a picture that is too small for one, its last counts."""
+        return ((sizes - self.offset - 1) // self.period + 1).clamp(min=1)
+
+    def draw(self, sizes: Tensor, count: int, generator: torch.Generator) -> Tensor:
+        """Held-out pixels [N, 3] int64 (image, row, column) in random order, each once: up to so
+        many of pictures of sizes [P, 2] (height, width)."""
+        counts = self.counts(sizes)
+        ends = counts.prod(dim=-1).cumsum(dim=0)
+        total = int(ends[-1])
+        if total <= count:
+            numbers = torch.randperm(total, generator=generator)
+        else:
+            numbers = torch.randint(total, (count,), generator=generator).unique()
+            numbers = numbers[torch.randperm(len(numbers), generator=generator)]
+        which = torch.searchsorted(ends, numbers, right=True)
+        numbers = numbers - (ends - counts.prod(dim=-1))[which]
+        columns = counts[which, 1]
+        places = torch.stack([numbers // columns, numbers % columns], dim=-1)
+        places = torch.minimum(places * self.period + self.offset, sizes[which] - 1)
+        return torch.cat([which[:, None], places], dim=-1)
+
+
+def lattice_for(sizes: Sequence[Sequence[int]] | Tensor) -> Lattice:
+    """The thinnest lattice that holds out as many pixels as are wanted, of pictures of sizes [P, 2]
+    (height, width); the densest where none does."""
+    sizes = torch.as_tensor(sizes)
+    for period in PERIODS:
+        if int(Lattice(period).counts(sizes).prod(dim=-1).sum()) >= WANTED:
+            return Lattice(period)
+    return Lattice(PERIODS[-1])
+
 
 DRAWN = 8
 """Times as many pixels as are wanted are drawn, before some are left out."""
@@ -26,13 +99,8 @@ TRIES = 100
 
 
 def look_up(source: Any, which: Tensor, places: Tensor) -> Tensor:
-    """Values of pixels: [K, ...].
-
-    Args:
-        source: images [P, H, W, ...], a list of one or more [H, W, ...], or stored ones.
-        which: [K] int64, number of the image in `source`.
-        places: [K, 2] int64, row and column.
-    """
+    """Values [K, ...] of pixels at rows and columns [K, 2] of pictures numbered [K], int64, in
+    images [P, H, W, ...], a list of one or more [H, W, ...], or stored ones."""
     if isinstance(source, StoredPictures):
         return source.read(which, places)
     rows, columns = places.unbind(dim=-1)
@@ -141,12 +209,9 @@ class HeldOutPixelSampler(PixelSampler):
         return batch
 
     def shown(self, pixels: Tensor, sizes: Tensor, numbers: Tensor | None = None) -> Tensor:
-        """Whether a fisheye shows pixels (image, row, column) [N, 3] as a whole: bool [N].
-
-        Args:
-            sizes: [2] or [N, 2], height and width of their pictures.
-            numbers: those in the dataset, where pixels name pictures by their place in a batch.
-        """
+        """Whether a fisheye shows pixels (image, row, column) [N, 3] as a whole: bool [N]. Sizes
+        (height, width) are [2] or [N, 2]; `numbers` are the dataset's, where pixels name pictures
+        by their place in a batch."""
         radius: Any = self.config.fisheye_crop_radius
         if self.radii is not None:
             images = pixels[:, 0].cpu()
@@ -177,14 +242,8 @@ class HeldOutPixelSampler(PixelSampler):
         numbers: Tensor | None = None,
     ) -> Tensor:
         """Drawn pixels [count, 3], those drawn anew that a fisheye does not show, or whose pictures
-        are set aside.
-
-        Args:
-            sizes: as of `shown`, or [P, 2] of all pictures.
-            numbers: as of `shown`.
-        Raises:
-            InputError: it shows none of those that were drawn.
-        """
+        are set aside. `sizes` as of `shown`, or [P, 2] of all pictures. InputError if none of those
+        drawn is shown."""
         pixels = draw(count)
         for _ in range(TRIES):
             each = sizes if sizes.dim() == 1 else sizes[pixels[:, 0]]
@@ -244,17 +303,12 @@ class HeldOutPixelSampler(PixelSampler):
     def sample_held_out(
         self, images: dict[str, Any], count: int, seed: int, share: Share = "all"
     ) -> dict[str, Tensor]:
-        """A batch of held-out pixels, as `sample` returns it for training; the same for a seed.
+        """Up to `count` held-out pixels, each once, as `sample` returns them: `image` [N, C] and
+        `indices` [N, 3] int64 (image, row, column); the same for a seed.
 
-        Args:
-            images: a batch of the image data loader: `image` [K, H, W, C] (or a list of [H, W, C]),
-                `image_idx` [K], and `mask` where there are masks.
-            count: pixels wanted; fewer come back where there are fewer, or masks leave fewer.
-            seed: of the draw.
-            share: of the held-out pixels; all where images are so tiny, or masks hide so much, that
-                none of it is left.
-        Returns:
-            `image` [N, C] and `indices` [N, 3] int64 (image, row, column), each pixel once.
+        Of a batch of the image loader: `image` [K, H, W, C] or a list of [H, W, C], `image_idx`
+        [K], and `mask` if any. Where images are so tiny, or masks hide so much, that none of the
+        share is left, of all shares.
         """
         which, within = self._held_out(images, count, seed, share)
         numbers = torch.as_tensor(images["image_idx"]).cpu()[which]
@@ -266,12 +320,8 @@ class HeldOutPixelSampler(PixelSampler):
     def sample_pictures(
         self, images: dict[str, Any], chosen: Tensor, count: int, seed: int
     ) -> dict[str, Tensor]:
-        """A batch of random pixels of chosen pictures, as of `sample_held_out`, in their order.
-
-        Args:
-            chosen: [K] numbers in the dataset; all are in the batch of images.
-            count: pixels of each; fewer come back where masks leave fewer.
-        """
+        """Up to `count` random pixels of each of the chosen pictures [K], numbers in the dataset
+        that the batch has, in their order; as of `sample_held_out`."""
         numbers, sizes = torch.as_tensor(images["image_idx"]).cpu(), sizes_of(images["image"])
         generator = torch.Generator().manual_seed(seed)
         found = []

@@ -13,10 +13,10 @@ from torch import Tensor
 from leco_plugin.scenes.pixels.held_out_pixels import (
     HeldOutPixelSampler,
     HeldOutPixelSamplerConfig,
+    Lattice,
     look_up,
     sizes_of,
 )
-from leco_plugin.scenes.pixels.lattice import Lattice
 
 NEARER = 0.9
 """A point hides its neighbours in the image that are farther than it by more than this factor."""
@@ -39,13 +39,8 @@ class SparsePixels(NamedTuple):
 
 
 def sparse_pixels(cameras: Cameras, points: Tensor, lattice: Lattice) -> SparsePixels:
-    """Projects sparse points into the cameras and keeps what is seen; held-out pixels are left out.
-
-    Args:
-        cameras: of the training images, poses in scene units. Only perspective cameras are used.
-        points: [P, 3] in the same coordinates.
-        lattice: of the held-out pixels.
-    """
+    """Projects sparse points [P, 3] into the perspective cameras of one frame and keeps what is
+    seen; held-out pixels are left out."""
     cameras = cameras.to("cpu")
     points = _at_most(MOST_POINTS, points.detach().float().cpu())
     for_each_image = MOST_PIXELS // max(len(cameras), 1)
@@ -92,10 +87,8 @@ def project(cameras: Cameras, number: int, points: Tensor) -> tuple[Tensor, Tens
 
 
 def distort(x: Tensor, y: Tensor, params: Tensor) -> tuple[Tensor, Tensor]:
-    """Radial and tangential distortion of normalised image places (OpenCV: k1 k2 k3 k4 p1 p2).
-
-    The polynomial is meant for the field of view only; far outside of it places are left unbent.
-    """
+    """Radial and tangential distortion of normalised image places (OpenCV: k1 k2 k3 k4 p1 p2),
+    meant for the field of view only: far outside of it places are left unbent."""
     k1, k2, k3, k4, p1, p2 = params.tolist()
     r = x * x + y * y
     radial = 1.0 + r * (k1 + r * (k2 + r * (k3 + r * k4)))
@@ -106,12 +99,8 @@ def distort(x: Tensor, y: Tensor, params: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def hidden(pixels: Tensor, lengths: Tensor, height: int, width: int) -> Tensor:
-    """Which points of one image lie plainly behind a neighbour there: bool [P].
-
-    Args:
-        pixels: [P, 2] int64, row and column.
-        lengths: [P] distances.
-    """
+    """Which points at pixels [P, 2] (row, column) and distances [P] of one image lie plainly behind
+    a neighbour there: bool [P]."""
     cell = max(1, round(math.sqrt(POINTS_PER_CELL * height * width / max(len(pixels), 1))))
     rows, columns = -(-height // cell), -(-width // cell)
     places = pixels[:, 0] // cell * columns + pixels[:, 1] // cell
@@ -136,10 +125,8 @@ class KnownDistancePixelSamplerConfig(HeldOutPixelSamplerConfig):
 
 
 def sampler_here(datamanager: Any) -> Any:
-    """The sampler that training batches are drawn with, if that happens in this process.
-
-    nerfstudio's parallel data manager draws in others, which hold copies of it.
-    """
+    """The sampler that training batches are drawn with, if in this process: nerfstudio's parallel
+    data manager draws in others, which hold copies of it."""
     if hasattr(datamanager, "data_procs"):
         return None
     return getattr(datamanager, "train_pixel_sampler", None)

@@ -25,13 +25,7 @@ from leco_plugin.studio.host_models import outputs_of
 
 
 class StoredPictures:
-    """Pictures of equal or different sizes as files of bytes, [H, W, C] each.
-
-    Args:
-        files: one for each picture.
-        sizes: [P, 2] int64 height and width.
-        channels: bytes of a pixel.
-    """
+    """Pictures of height and width [P, 2] int64, each a file of bytes [H, W, channels]."""
 
     def __init__(self, files: list[Path], sizes: Tensor, channels: int) -> None:
         self.files, self.sizes, self.channels = files, sizes, channels
@@ -41,11 +35,8 @@ class StoredPictures:
         return len(self.files)
 
     def draw(self, count: int, by_solid_angle: bool = False) -> Tensor:
-        """Pixels, each of all pictures as likely as any other: [count, 3] picture, row, column.
-
-        Args:
-            by_solid_angle: in panoramas, pixels are as likely as the solid angle they show.
-        """
+        """Pixels [count, 3] (picture, row, column), each of all pictures as likely as any other; of
+        panoramas, as likely as the solid angle that they show, if asked."""
         total = int(self._pixels_until[-1])
         drawn = torch.randint(total, (count,))
         which = torch.searchsorted(self._pixels_until, drawn, right=True)
@@ -75,16 +66,11 @@ class StoredPictures:
 
 
 def store_pictures(dataset: Any, folder: Path, what: str = "photographs") -> dict[str, Any]:
-    """Decodes what a dataset has not yet decoded into `folder`.
+    """Decodes what a dataset (nerfstudio's `InputDataset`) has not yet decoded into `folder`.
 
-    Args:
-        dataset: nerfstudio's `InputDataset`.
-        folder: made if it is missing; pictures that are there already are not decoded again.
-    Returns:
-        As a batch of nerfstudio's image loader: `image` and, if there are masks, `mask`, both
-        `StoredPictures`, and `image_idx` [P].
-    Raises:
-        InputError: nothing can be written there, or the pictures have no common form.
+    Returns a batch as of nerfstudio's image loader: `image` and, if there are masks, `mask`, both
+    `StoredPictures`, and `image_idx` [P]. InputError if nothing can be written there, or the
+    pictures have no common form.
     """
     sizes = picture_sizes(dataset)
     masked = outputs_of(dataset).mask_filenames is not None

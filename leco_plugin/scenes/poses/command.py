@@ -13,20 +13,25 @@ import numpy as np
 
 from leco_plugin.log import bar, resumable
 from leco_plugin.scenes.input_error import InputError, require
-from leco_plugin.scenes.poses.georeference import Placement, local_places, place, upright
+from leco_plugin.scenes.poses.georeference import (
+    Placement,
+    local_places,
+    place,
+    points_of,
+    poses_of,
+    transforms_of,
+    upright,
+    write_scene,
+)
 from leco_plugin.scenes.poses.originals import Photograph, copy_photographs, find_photographs
-from leco_plugin.scenes.poses.pairs import choose_pairs
 from leco_plugin.scenes.poses.reconstruction import (
     DATABASE,
     ENTERED,
     Lens,
     Reconstructor,
     available_threads,
+    choose_pairs,
     load_pycolmap,
-    points_of,
-    poses_of,
-    transforms_of,
-    write_scene,
 )
 from leco_plugin.scenes.whole_files import remove_parts, write_whole
 
@@ -43,17 +48,9 @@ def make_scene(
 ) -> dict[str, Any]:
     """Makes a scene of photographs, unless `out` already holds it; returns the report.
 
-    A run that was killed goes on where it ended when the same is asked for again.
-
-    Args:
-        folder: of the photographs, which are only read.
-        out: folder of the scene.
-        lens: kind of all lenses.
-        size: longest side in pixels at which features are looked for.
-        threads: of the CPU; 0 takes all.
-    Raises:
-        InputError: `out` holds something else, or the photographs cannot be used.
-        ImportError: pycolmap is missing.
+    A run that was killed goes on where it ended when the same is asked for again. Features are
+    looked for at a longest side of `size` pixels; 0 threads are all of the CPU. InputError if `out`
+    holds something else, or the photographs cannot be used; ImportError without pycolmap.
     """
     require(size >= 100, "size", size, "100 pixels or more")
     require(threads >= 0, "threads", threads, "0 for all, or a number of them")
@@ -90,10 +87,8 @@ def make_scene(
 def _take_up(
     out: Path, photographs: list[Photograph], asked: dict[str, Any]
 ) -> dict[str, Any] | None:
-    """Begins a scene or goes on with it; returns the report of one that is finished.
-
-    InputError if the folder holds something else.
-    """
+    """Begins a scene or goes on with it; returns the report of one that is finished. InputError if
+    the folder holds something else."""
     known = [(each.name, each.path.stat().st_size) for each in photographs]
     digest = hashlib.blake2b(json.dumps(known).encode(), digest_size=8).hexdigest()
     wanted = {"format": 1, "photographs": len(photographs), "digest": digest, **asked}

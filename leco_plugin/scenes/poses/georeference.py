@@ -1,17 +1,23 @@
-"""Which way is up in a reconstruction, and how it lies in metres where GPS is known."""
+"""What becomes of a reconstruction: set upright, in metres where GPS is known, and a scene on disk.
+
+A placed model is written as transforms.json, sparse points and COLMAP's own files.
+"""
 
 from __future__ import annotations
 
+import json
 from collections.abc import Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
-from leco_plugin.scenes.frames import rotation
-from leco_plugin.scenes.upright import turn_to_upright
+from leco_plugin.scenes.frames import turn_to_upright
+from leco_plugin.scenes.whole_files import write_points, write_whole
 
 Array = NDArray[np.float64]
 TOLERANCE, TOLERATED = 10.0, 0.1
@@ -54,15 +60,8 @@ class Placement:
 def local_places(
     pycolmap: Any, positions: Sequence[Position | None]
 ) -> tuple[Position | None, Array]:
-    """Positions in metres east, north and up of an origin at sea level.
-
-    Args:
-        pycolmap: the module, for its ellipsoid (WGS 84).
-        positions: None is not known. Of a nan altitude the median of the others is taken, or 0.
-    Returns:
-        The origin, the median of the positions, or None where none is known; and places [N, 3],
-        nan where nothing is known.
-    """
+    """Positions in metres east, north and up [N, 3] of an origin at sea level, their median; nan
+    and None where nothing is known. A nan altitude is the median of the others, or 0."""
     places = np.array([each or (np.nan,) * 3 for each in positions], dtype=float).reshape(-1, 3)
     there = np.isfinite(places[:, 0])
     if not there.any():
@@ -78,14 +77,11 @@ def local_places(
 
 
 def upright(poses: Array, points: Array) -> Array:
-    """The direction [3] that is up in a reconstruction.
+    """The direction [3] that is up in a reconstruction of poses [C, 3, 4], OpenGL's, and points [P,
+    3].
 
     Of surveys from the air it is seen from ground and cameras. Of others it is the mean of the
     photographs' top edges, or against the mean view where these point in all directions.
-
-    Args:
-        poses: [C, 3, 4] OpenGL camera to world.
-        points: [P, 3] sparse points.
     """
     # a survey that lies within 20 degrees of upright is not turned: laid down, it is
     for base in (np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]]), np.eye(3)):
@@ -100,11 +96,8 @@ def upright(poses: Array, points: Array) -> Array:
 def place(pycolmap: Any, centres: Array, gps: Array, up: Array) -> Placement:
     """The similarity that takes a reconstruction to metres, or a rotation that sets it upright.
 
-    Args:
-        pycolmap: the module, for its robust estimate.
-        centres: [C, 3] of the cameras, in the reconstruction.
-        gps: [C, 3] their positions in metres, nan where not known.
-        up: [3] in the reconstruction, which a flight along one line needs.
+    Of camera centres [C, 3] with positions by GPS [C, 3] in metres, nan where not known; a flight
+    along one line also needs what is up [3] in the reconstruction.
     """
     known = np.isfinite(gps).all(axis=1)
     if known.sum() < FEWEST:
@@ -145,11 +138,8 @@ def tolerance(spread: float) -> float:
 
 
 def roll_upright(turn: Array, places: Array, up: Array, width: float) -> Array:
-    """A rotation [3, 3], rolled about the line of flight so that `up` goes up.
-
-    Places [N, 3] on a line say nothing of that roll. Of places that are wider than `width` metres
-    across, the rotation stays as it is.
-    """
+    """A rotation [3, 3], rolled about the line of flight so that `up` goes up: places [N, 3] on a
+    line say nothing of that roll. It stays for places wider than `width` metres across."""
     away = places - places.mean(axis=0)
     _, lengths, axes = np.linalg.svd(away, full_matrices=False)
     across = lengths[1] / np.sqrt(len(places))
@@ -160,7 +150,7 @@ def roll_upright(turn: Array, places: Array, up: Array, width: float) -> Array:
     if min(np.linalg.norm(wanted), np.linalg.norm(is_up)) < WANDERING:
         return turn
     angle = np.arctan2(line @ np.cross(is_up, wanted), is_up @ wanted)
-    return rotation(angle * line) @ turn
+    return Rotation.from_rotvec(angle * line).as_matrix() @ turn
 
 
 def _by_direction(up: Array, reason: str) -> Placement:
@@ -168,4 +158,90 @@ def _by_direction(up: Array, reason: str) -> Placement:
     axis = np.cross(up, [0.0, 0.0, 1.0])
     angle = np.arctan2(np.linalg.norm(axis), up[2])
     axis = axis / np.linalg.norm(axis) if np.linalg.norm(axis) > 1e-9 else np.eye(3)[0]
-    return Placement(1.0, rotation(angle * axis), np.zeros(3), reason=reason)
+    turn = Rotation.from_rotvec(angle * axis).as_matrix()
+    return Placement(1.0, turn, np.zeros(3), reason=reason)
+
+
+LARGE = 1e4
+"""Coordinates, as of UTM, from which on points are written in float64."""
+POINTS, MODEL = "sparse_pc.ply", "colmap/sparse/0"
+"""In the folder of the scene, under the names that ns-process-data has for them."""
+PARAMETERS = {
+    "OPENCV": ("fl_x", "fl_y", "cx", "cy", "k1", "k2", "p1", "p2"),
+    "OPENCV_FISHEYE": ("fl_x", "fl_y", "cx", "cy", "k1", "k2", "k3", "k4"),
+    "SIMPLE_RADIAL": ("fl_x", "cx", "cy", "k1"),
+    "SIMPLE_RADIAL_FISHEYE": ("fl_x", "cx", "cy", "k1"),
+}
+"""Parameters of COLMAP's lens models, in their order, as nerfstudio names them."""
+
+
+def poses_of(model: Any) -> tuple[list[str], Array]:
+    """Names of a model's photographs, sorted, and their poses [C, 3, 4], OpenGL camera to world."""
+    images = sorted((model.images[each] for each in model.reg_image_ids()), key=lambda i: i.name)
+    found = [image.cam_from_world().inverse().matrix() for image in images]
+    poses = np.array(found).reshape(-1, 3, 4) * np.array([1.0, -1.0, -1.0, 1.0])
+    return [image.name for image in images], poses
+
+
+def points_of(model: Any) -> tuple[Array, NDArray[np.uint8]]:
+    """Sparse points [P, 3] of a model, and their colours [P, 3]."""
+    points = list(model.points3D.values())
+    places = np.array([point.xyz for point in points], dtype=float).reshape(-1, 3)
+    return places, np.array([point.color for point in points], dtype=np.uint8).reshape(-1, 3)
+
+
+def transforms_of(
+    model: Any, placement: Placement, origin: tuple[float, float, float] | None
+) -> dict[str, Any]:
+    """What transforms.json says of a model that a placement has put into the world, whose origin
+    has this latitude, longitude and altitude if coordinates are metres."""
+    lenses = {number: intrinsics(camera) for number, camera in model.cameras.items()}
+    names, poses = poses_of(model)
+    used = [model.find_image_with_name(name).camera_id for name in names]
+    fisheye = any("FISHEYE" in camera.model_name for camera in model.cameras.values())
+    one = len({*used}) == 1
+    meta: dict[str, Any] = {"camera_model": "OPENCV_FISHEYE" if fisheye else "OPENCV"}
+    meta |= lenses[used[0]] if one else {}
+    meta |= {"orientation_override": "none", "ply_file_path": POINTS}  # +z is up already
+    meta["applied_transform"] = np.eye(3, 4).tolist()  # COLMAP's model has the same coordinates
+    if placement.residuals is not None and origin is not None:
+        meta["metres_per_unit"] = 1.0
+        place = zip(("latitude", "longitude", "altitude"), origin)
+        meta["geographic_origin"] = {**dict(place), "axes": "east, north, up"}
+    meta["frames"] = [
+        {
+            "file_path": f"images/{name}",
+            **({} if one else lenses[number]),
+            "transform_matrix": [*pose.tolist(), [0.0, 0.0, 0.0, 1.0]],
+        }
+        for name, number, pose in zip(names, used, poses)
+    ]
+    return meta
+
+
+def intrinsics(camera: Any) -> dict[str, float]:
+    """Intrinsics of a camera of pycolmap, as transforms.json has them."""
+    found = dict(zip(PARAMETERS[camera.model_name], map(float, camera.params)))
+    found.setdefault("fl_y", found["fl_x"])
+    return {"w": camera.width, "h": camera.height, **found}
+
+
+def write_scene(
+    scene: Path, model: Any, meta: dict[str, Any], report: dict[str, Any], report_name: str
+) -> None:
+    """Writes points, COLMAP's model, the report and, last of all, transforms.json."""
+    folder = scene / MODEL
+    folder.mkdir(parents=True, exist_ok=True)
+    model.write(folder)
+    write_sparse_points(scene / POINTS, *points_of(model))
+    for name, said in ((report_name, report), ("transforms.json", meta)):
+        text = json.dumps(said, indent=1).encode()
+        write_whole(scene / name, lambda file, text=text: file.write(text))  # type: ignore[misc]
+
+
+def write_sparse_points(path: Path, places: Array, colours: NDArray[np.uint8]) -> None:
+    """Writes sparse points [P, 3] with their colours [P, 3] as a PLY file."""
+    kind = "<f8" if np.abs(places).max(initial=0.0) > LARGE else "<f4"
+    rows = np.zeros(len(places), dtype=[("xyz", kind, 3), ("rgb", "u1", 3)])
+    rows["xyz"], rows["rgb"] = places, colours
+    write_points(path, rows)

@@ -58,13 +58,9 @@ def read_exif(image: Image.Image) -> Exif:
 
 
 def focal_length(details: Mapping[int, Any], size: tuple[int, int]) -> float | None:
-    """Focal length over the longest side of a picture.
-
-    Args:
-        details: EXIF's own tags. The equivalent for 35 mm goes before the resolution of the
-            sensor, which is that of the picture as it was taken, not of one made smaller.
-        size: width and height of the picture.
-    """
+    """Focal length over the longest side of a picture of a width and height, by EXIF's own tags;
+    the 35 mm equivalent goes before the sensor's resolution, which is that of the picture as taken,
+    not of one made smaller."""
     diagonal = math.hypot(*size) / max(size)
     equivalent = _number(details.get(ExifTags.Base.FocalLengthIn35mmFilm))
     found = diagonal * equivalent / FILM_DIAGONAL
@@ -161,11 +157,8 @@ class Photograph:
 
 
 def find_photographs(folder: Path, out: Path) -> list[Photograph]:
-    """The photographs in a folder and those below it, by name; what lies in `out` is left aside.
-
-    Raises:
-        InputError: there is no such folder, it has fewer than three, or one cannot be used.
-    """
+    """The photographs in a folder and below it, by name, but for what lies in `out`. InputError if
+    there is no such folder, it has fewer than three, or one cannot be used."""
     if not folder.is_dir():
         raise InputError(f"there is no folder {folder}: give the one with the photographs")
     if folder.is_relative_to(out):
@@ -242,10 +235,8 @@ def _refuse_mixed_alpha(photographs: list[Photograph]) -> None:
 def copy_photographs(
     photographs: list[Photograph], folder: Path, show: Callable[[float], None]
 ) -> None:
-    """Writes those copies that are not there yet; `show` takes the share that is done.
-
-    InputError, with its name, for a photograph whose pixels cannot be decoded.
-    """
+    """Writes those copies that are not there yet; `show` takes the share that is done. InputError
+    names a photograph whose pixels cannot be decoded."""
     for number, photograph in enumerate(photographs):
         if not (folder / photograph.name).is_file():
             _copy(photograph, folder / photograph.name)

@@ -30,15 +30,14 @@ from leco_plugin.scenes.photograph_files import (
     seen_pixels,
 )
 from leco_plugin.scenes.photographs import LecoPhotographsDataParserConfig, folder_of, read_points
+from leco_plugin.scenes.poses.georeference import points_of, write_sparse_points
 from leco_plugin.scenes.poses.originals import FEWEST, Exif, Photograph
-from leco_plugin.scenes.poses.pairs import choose_posed_pairs
 from leco_plugin.scenes.poses.reconstruction import (
     MASKS,
     Reconstructor,
     available_threads,
+    choose_posed_pairs,
     load_pycolmap,
-    points_of,
-    write_sparse_points,
 )
 from leco_plugin.scenes.scene_file import SceneFile, scene_file_of
 from leco_plugin.scenes.whole_files import write_whole
@@ -54,19 +53,12 @@ photographs, 12 to 15% where their poses are shuffled."""
 
 
 def find_points(data: Path, size: int = 1600, threads: int = 0) -> dict[str, Any]:
-    """Gives a scene sparse points, unless it has some; returns the report.
+    """Gives a scene (folder, or json file) sparse points, unless it has some; returns `points`,
+    `photographs`, `file` and `done`: False for a scene that had points.
 
-    Test photographs are left out where the scene lists those for training.
-
-    Args:
-        data: folder of the scene, or the json file in it.
-        size: longest side in pixels at which features are looked for.
-        threads: of the CPU; 0 takes all.
-    Returns:
-        `points`, `photographs`, `file` and `done`: False for a scene that had points.
-    Raises:
-        InputError: the scene cannot be read, or no points are found.
-        ImportError: pycolmap is missing.
+    Test photographs are left out where the scene lists those for training. Features are looked for
+    at a longest side of `size` pixels; 0 threads are all. InputError if the scene cannot be read,
+    or no points are found; ImportError without pycolmap.
     """
     require(size >= 100, "size", size, "100 pixels or more")
     require(threads >= 0, "threads", threads, "0 for all, or a number of them")
@@ -111,13 +103,8 @@ def training_frames(scene: SceneFile) -> list[int]:
 
 
 def _triangulate(reconstructor: Reconstructor, cameras: Sequence[Any], poses: Array) -> Any:
-    """A model of pycolmap with points, in the coordinates of given poses.
-
-    Args:
-        reconstructor: that has found features.
-        cameras: [C] of its photographs.
-        poses: [C, 3, 4] of them, OpenGL camera to world.
-    """
+    """A model of pycolmap with points, in the coordinates of given OpenGL poses [C, 3, 4] with
+    cameras [C], of a reconstructor that has found features."""
     pycolmap, work = reconstructor.pycolmap, reconstructor.folder / "triangulated"
     given = pycolmap.Reconstruction()
     with pycolmap.Database.open(reconstructor.database) as database:
@@ -178,13 +165,8 @@ def _refuse_few(model: Any, matched: int, path: Path) -> None:
 def _copies(
     scene: SceneFile, chosen: Sequence[int], folder: Path, size: int
 ) -> tuple[list[Photograph], list[Any]]:
-    """Photographs as their lenses mean them, made smaller, in a folder; and their cameras.
-
-    What masks and opacity hide goes to the folder MASKS beside that one.
-
-    Args:
-        size: longest side in pixels of a copy.
-    """
+    """Photographs as their lenses mean them, in a folder, with a longest side of `size` pixels; and
+    their cameras. What masks and opacity hide goes to the folder MASKS beside."""
     masks = folder.with_name(MASKS)
     folder.mkdir()
     photographs, cameras = [], []
@@ -224,16 +206,9 @@ def _seen(scene: SceneFile, number: int, path: Path, image: Image.Image) -> Imag
 
 
 def camera_of(lens: Lens, full: tuple[int, int], size: tuple[int, int], where: str) -> Any:
-    """A camera of pycolmap.
-
-    Args:
-        lens: in pixels of its full size.
-        full: width and height of that.
-        size: width and height in pixels of the copy, to which the camera is scaled.
-        where: of the photograph, for the error.
-    Raises:
-        InputError: the lens is neither a perspective nor a fisheye one, or has no focal length.
-    """
+    """A camera of pycolmap: a lens in pixels of its full size (width, height), scaled to the size
+    of a copy. InputError, with `where`, if it is neither perspective nor fisheye, or has no focal
+    length."""
     kinds = {None, CameraType.PERSPECTIVE, CameraType.FISHEYE}
     focal = lens.focal_lengths(*full, factor=1)
     if lens.kind not in kinds or focal[0] is None or focal[1] is None:

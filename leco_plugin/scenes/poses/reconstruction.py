@@ -1,29 +1,27 @@
 """Structure from motion by pycolmap: features, matches and models, each kept once it is made.
 
 All of it runs on the CPU. The database keeps features and matches, so that a run that was killed
-goes on with what is missing; only the last part, the mapping, begins anew. A placed model is
-written as transforms.json, sparse points and COLMAP's own files.
+goes on with what is missing; only the last part, the mapping, begins anew. Compared are photographs
+that are near by GPS, next ones in order, or all.
 """
 
 from __future__ import annotations
 
-import json
 import os
+import re
 import shutil
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from importlib import import_module
+from itertools import combinations
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from leco_plugin.log import bar
 from leco_plugin.scenes.input_error import InputError
-from leco_plugin.scenes.poses.georeference import Placement
-from leco_plugin.scenes.poses.originals import FEWEST, Photograph
-from leco_plugin.scenes.poses.pairs import Pairs
-from leco_plugin.scenes.whole_files import write_points, write_whole
+from leco_plugin.scenes.poses.originals import FEWEST, Exif, Photograph
 
 Lens = Literal["perspective", "fisheye"]
 SIMPLE: dict[Lens, str] = {"perspective": "SIMPLE_RADIAL", "fisheye": "SIMPLE_RADIAL_FISHEYE"}
@@ -66,12 +64,8 @@ class Reconstructor:
         self.photographs, self.threads = photographs, threads
 
     def extract(self, lens: Lens, size: int) -> None:
-        """Finds features in the photographs that have none in the database.
-
-        Args:
-            lens: kind of all lenses.
-            size: longest side in pixels to which a photograph is made smaller for it.
-        """
+        """Finds features in the photographs that have none in the database, made smaller to a
+        longest side of `size` pixels."""
         pycolmap = self.pycolmap
         self._enter(lens)
         options = pycolmap.FeatureExtractionOptions()
@@ -146,10 +140,8 @@ class Reconstructor:
                 show(at / count)
 
     def map(self) -> list[Any]:
-        """COLMAP's models, the one with the most photographs first.
-
-        InputError if no photographs overlap.
-        """
+        """COLMAP's models, that with the most photographs first. InputError if no photographs
+        overlap."""
         pycolmap, folder = self.pycolmap, self.folder / "models"
         whole = folder / "all"
         if not whole.exists():
@@ -212,92 +204,97 @@ def available_threads() -> int:
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
-Array = NDArray[np.float64]
-LARGE = 1e4
-"""Coordinates, as of UTM, from which on points are written in float64."""
-POINTS, MODEL = "sparse_pc.ply", "colmap/sparse/0"
-"""In the folder of the scene, under the names that ns-process-data has for them."""
-PARAMETERS = {
-    "OPENCV": ("fl_x", "fl_y", "cx", "cy", "k1", "k2", "p1", "p2"),
-    "OPENCV_FISHEYE": ("fl_x", "fl_y", "cx", "cy", "k1", "k2", "k3", "k4"),
-    "SIMPLE_RADIAL": ("fl_x", "cx", "cy", "k1"),
-    "SIMPLE_RADIAL_FISHEYE": ("fl_x", "cx", "cy", "k1"),
-}
-"""Parameters of COLMAP's lens models, in their order, as nerfstudio names them."""
+FEW = 40
+"""Up to so many photographs are all compared: 780 pairs, two minutes of one core."""
+NEIGHBOURS = 16
+"""Nearest photographs by position that each is compared with."""
+WIDE = 20.0
+"""Metres from their middle, root mean square, from which on positions tell who sees the same."""
+NEXT = 10
+"""Photographs in order that each is compared with, and one at each power of two beyond."""
+ANCHORS = 100
+"""Of an ordered survey, so many photographs, evenly spread, are all compared: they close loops."""
 
 
-def poses_of(model: Any) -> tuple[list[str], Array]:
-    """Names of a model's photographs, sorted, and their poses [C, 3, 4], OpenGL camera to world."""
-    images = sorted((model.images[each] for each in model.reg_image_ids()), key=lambda i: i.name)
-    found = [image.cam_from_world().inverse().matrix() for image in images]
-    poses = np.array(found).reshape(-1, 3, 4) * np.array([1.0, -1.0, -1.0, 1.0])
-    return [image.name for image in images], poses
+class Pairs(NamedTuple):
+    """Pairs of photographs that are compared, by number, and why those."""
+
+    pairs: list[tuple[int, int]]
+    reason: str
 
 
-def points_of(model: Any) -> tuple[Array, NDArray[np.uint8]]:
-    """Sparse points [P, 3] of a model, and their colours [P, 3]."""
-    points = list(model.points3D.values())
-    places = np.array([point.xyz for point in points], dtype=float).reshape(-1, 3)
-    return places, np.array([point.color for point in points], dtype=np.uint8).reshape(-1, 3)
+def choose_pairs(names: Sequence[str], exifs: Sequence[Exif], places: NDArray[np.float64]) -> Pairs:
+    """The pairs to compare, of photographs by name, EXIF and place [N, 3] in metres, nan where
+    unknown."""
+    count = len(names)
+    everything = list(combinations(range(count), 2))
+    if count <= FEW:
+        return Pairs(everything, "all pairs")
+    order = capture_order(names, exifs)
+    steps = {*range(1, NEXT + 1), *(2**power for power in range(count.bit_length()))}
+    known = np.isfinite(places[:, 0])
+    apart = places[known, :2] - np.median(places[known, :2], axis=0) if known.any() else 0.0
+    if known.mean() >= 0.5 and np.sqrt(2.0 * np.mean(np.square(apart))) >= WIDE:
+        numbers = known.nonzero()[0]
+        near = _near(places[numbers, :2], np.arange(NEIGHBOURS))
+        found = {(int(numbers[one]), int(numbers[other])) for one, other in near}
+        found |= _in_order(order or [], (1, 2))
+        lost = [number for number in range(count) if not known[number]]
+        around = _in_order(order, steps) if order else set(everything)
+        found |= {pair for pair in around if {*pair} & {*lost}}
+        return Pairs(sorted(found), f"{NEIGHBOURS} nearest by GPS")
+    if order is None or count <= ANCHORS:
+        return Pairs(everything, "all pairs")
+    anchors = order[:: -(-count // ANCHORS)]
+    loops = {(min(pair), max(pair)) for pair in combinations(anchors, 2)}
+    return Pairs(sorted(_in_order(order, steps) | loops), f"{NEXT} next in order, and loops")
 
 
-def transforms_of(
-    model: Any, placement: Placement, origin: tuple[float, float, float] | None
-) -> dict[str, Any]:
-    """What transforms.json says of a model that already is in world coordinates.
-
-    Args:
-        model: of pycolmap.
-        placement: by which it came there: whether coordinates are metres.
-        origin: latitude, longitude and altitude of the world's origin, if they are.
-    """
-    lenses = {number: intrinsics(camera) for number, camera in model.cameras.items()}
-    names, poses = poses_of(model)
-    used = [model.find_image_with_name(name).camera_id for name in names]
-    fisheye = any("FISHEYE" in camera.model_name for camera in model.cameras.values())
-    one = len({*used}) == 1
-    meta: dict[str, Any] = {"camera_model": "OPENCV_FISHEYE" if fisheye else "OPENCV"}
-    meta |= lenses[used[0]] if one else {}
-    meta |= {"orientation_override": "none", "ply_file_path": POINTS}  # +z is up already
-    meta["applied_transform"] = np.eye(3, 4).tolist()  # COLMAP's model has the same coordinates
-    if placement.residuals is not None and origin is not None:
-        meta["metres_per_unit"] = 1.0
-        place = zip(("latitude", "longitude", "altitude"), origin)
-        meta["geographic_origin"] = {**dict(place), "axes": "east, north, up"}
-    meta["frames"] = [
-        {
-            "file_path": f"images/{name}",
-            **({} if one else lenses[number]),
-            "transform_matrix": [*pose.tolist(), [0.0, 0.0, 0.0, 1.0]],
-        }
-        for name, number, pose in zip(names, used, poses)
-    ]
-    return meta
+def choose_posed_pairs(poses: NDArray[np.float64]) -> Pairs:
+    """The pairs to compare of photographs with known poses [N, 3, 4], OpenGL camera to world."""
+    count = len(poses)
+    if count <= FEW:
+        return Pairs(list(combinations(range(count), 2)), "all pairs")
+    places, ahead = poses[:, :, 3], -poses[:, :, 2]
+    ranks = np.array(sorted({*range(NEIGHBOURS // 2), *(2**power for power in range(3, 7))}))
+    found = _near(places, ranks, ahead)
+    return Pairs(sorted(found), "near ones by pose that look the same way")
 
 
-def intrinsics(camera: Any) -> dict[str, float]:
-    """Intrinsics of a camera of pycolmap, as transforms.json has them."""
-    found = dict(zip(PARAMETERS[camera.model_name], map(float, camera.params)))
-    found.setdefault("fl_y", found["fl_x"])
-    return {"w": camera.width, "h": camera.height, **found}
+def capture_order(names: Sequence[str], exifs: Sequence[Exif]) -> list[int] | None:
+    """Numbers of the photographs as they were taken, by EXIF's time or as names count; None if
+    neither tells."""
+    times = [each.time for each in exifs if each.time is not None]
+    if len(times) == len(names) and 2 * len(set(times)) > len(names):
+        return sorted(range(len(names)), key=lambda number: (exifs[number].time, names[number]))
+    counted = [re.findall(r"\d+", name.rsplit(".", 1)[0]) for name in names]
+    if not all(counted) or len({parts[-1] for parts in counted}) * 2 <= len(names):
+        return None
+
+    def by_value(number: int) -> list[tuple[int, str]]:
+        parts = re.split(r"(\d+)", names[number])
+        return [(int(part), "") if part.isdecimal() else (-1, part) for part in parts]
+
+    return sorted(range(len(names)), key=by_value)
 
 
-def write_scene(
-    scene: Path, model: Any, meta: dict[str, Any], report: dict[str, Any], report_name: str
-) -> None:
-    """Writes points, COLMAP's model, the report and, last of all, transforms.json."""
-    folder = scene / MODEL
-    folder.mkdir(parents=True, exist_ok=True)
-    model.write(folder)
-    write_sparse_points(scene / POINTS, *points_of(model))
-    for name, said in ((report_name, report), ("transforms.json", meta)):
-        text = json.dumps(said, indent=1).encode()
-        write_whole(scene / name, lambda file, text=text: file.write(text))  # type: ignore[misc]
+def _near(
+    places: NDArray[np.float64], ranks: NDArray[np.int64], ahead: NDArray[np.float64] | None = None
+) -> set[tuple[int, int]]:
+    """Pairs of each photograph with others near to its place [N, 2 or 3], by `ranks` of distance;
+    those that look another way, [N, 3] if given, are left out."""
+    found = set()
+    for row in range(len(places)):
+        distances = ((places - places[row]) ** 2).sum(axis=1)
+        if ahead is not None:
+            distances[ahead @ ahead[row] <= 0.0] = np.inf
+        distances[row] = np.inf
+        order = np.argsort(distances, kind="stable")[ranks[ranks < len(places)]]
+        found |= {(min(row, o), max(row, o)) for o in order.tolist() if distances[o] < np.inf}
+    return found
 
 
-def write_sparse_points(path: Path, places: Array, colours: NDArray[np.uint8]) -> None:
-    """Writes sparse points [P, 3] with their colours [P, 3] as a PLY file."""
-    kind = "<f8" if np.abs(places).max(initial=0.0) > LARGE else "<f4"
-    rows = np.zeros(len(places), dtype=[("xyz", kind, 3), ("rgb", "u1", 3)])
-    rows["xyz"], rows["rgb"] = places, colours
-    write_points(path, rows)
+def _in_order(order: Sequence[int], steps: Iterable[int]) -> set[tuple[int, int]]:
+    """Pairs of photographs that are so many steps apart in an order."""
+    pairs = ((order[at], order[at + step]) for step in steps for at in range(len(order) - step))
+    return {(min(pair), max(pair)) for pair in pairs}

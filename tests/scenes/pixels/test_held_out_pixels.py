@@ -8,11 +8,13 @@ from scene_files import refused
 
 from leco_plugin.scenes.pixels import held_out_pixels
 from leco_plugin.scenes.pixels.held_out_pixels import (
+    PERIODS,
     HeldOutPixelSampler,
     HeldOutPixelSamplerConfig,
+    Lattice,
+    Share,
     look_up,
 )
-from leco_plugin.scenes.pixels.lattice import PERIODS, Lattice, Share
 
 THIN = Lattice()
 

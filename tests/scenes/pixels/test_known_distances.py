@@ -8,6 +8,7 @@ import pytest
 import torch
 from nerfstudio.cameras.cameras import Cameras, CameraType
 
+from leco_plugin.scenes.pixels.held_out_pixels import Lattice
 from leco_plugin.scenes.pixels.known_distances import (
     DISTANCE,
     FEWEST_POINTS,
@@ -17,7 +18,6 @@ from leco_plugin.scenes.pixels.known_distances import (
     hidden,
     sparse_pixels,
 )
-from leco_plugin.scenes.pixels.lattice import Lattice
 
 WIDTH, HEIGHT = 160, 120
 

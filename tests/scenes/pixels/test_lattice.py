@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 import torch
 
-from leco_plugin.scenes.pixels.lattice import PERIODS, WANTED, Lattice, lattice_for
+from leco_plugin.scenes.pixels.held_out_pixels import PERIODS, WANTED, Lattice, lattice_for
 
 
 def pixels_of(height: int, width: int) -> torch.Tensor:

@@ -17,9 +17,9 @@ from scene_files import refused
 from leco_plugin.scenes.pixels.held_out_pixels import (
     HeldOutPixelSampler,
     HeldOutPixelSamplerConfig,
+    Lattice,
     some_images,
 )
-from leco_plugin.scenes.pixels.lattice import Lattice
 from leco_plugin.scenes.pixels.stored_pictures import store_pictures
 
 SIZES = [(30, 40), (24, 36), (50, 20)]

@@ -21,10 +21,11 @@ from rendered_survey import (
     grid,
     write_survey,
 )
+from scene_files import read_ply
 
 from leco_plugin import cli
 from leco_plugin.scenes.input_error import InputError
-from leco_plugin.scenes.photographs import LecoPhotographsDataParserConfig, read_ply
+from leco_plugin.scenes.photographs import LecoPhotographsDataParserConfig
 from leco_plugin.scenes.poses.command import make_scene, summary
 
 pytestmark = pytest.mark.xdist_group("poses")

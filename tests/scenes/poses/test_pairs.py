@@ -7,7 +7,7 @@ import pytest
 from rendered_survey import grid
 
 from leco_plugin.scenes.poses.originals import Exif
-from leco_plugin.scenes.poses.pairs import (
+from leco_plugin.scenes.poses.reconstruction import (
     ANCHORS,
     FEW,
     NEIGHBOURS,

@@ -14,13 +14,13 @@ import torch
 from nerfstudio.cameras.cameras import CameraType
 from PIL import Image
 from rendered_survey import BLOCKS
+from scene_files import read_ply
 
 from leco_plugin import cli
 from leco_plugin.scenes.input_error import InputError
 from leco_plugin.scenes.lenses import lens_of
-from leco_plugin.scenes.photographs import read_ply
-from leco_plugin.scenes.poses.pairs import FEW, choose_posed_pairs
 from leco_plugin.scenes.poses.points import BEFORE, FILE, camera_of, find_points, training_frames
+from leco_plugin.scenes.poses.reconstruction import FEW, choose_posed_pairs
 
 FAR_AWAY = np.array([500_000.0, 4_600_000.0, 0.0])
 """Metres, as UTM has them."""

@@ -10,10 +10,10 @@ from typing import Any
 import numpy as np
 import pytest
 from PIL import Image
+from scene_files import read_ply
 
-from leco_plugin.scenes.photographs import LecoPhotographsDataParserConfig, read_ply
-from leco_plugin.scenes.poses.georeference import Placement
-from leco_plugin.scenes.poses.reconstruction import intrinsics, transforms_of, write_scene
+from leco_plugin.scenes.photographs import LecoPhotographsDataParserConfig
+from leco_plugin.scenes.poses.georeference import Placement, intrinsics, transforms_of, write_scene
 from leco_plugin.scenes.scene_file import unused_fields
 
 IN_METRES = Placement(1.0, np.eye(3), np.zeros(3), residuals=np.zeros(3))

@@ -11,8 +11,7 @@ import torch
 from PIL import Image
 
 from leco_plugin.scenes.city.city import CityConfig
-from leco_plugin.scenes.city.folder import CaptureConfig, read_transforms, write_city
-from leco_plugin.scenes.city.truth import CityTruth
+from leco_plugin.scenes.city.folder import CaptureConfig, CityTruth, read_transforms, write_city
 from leco_plugin.scenes.mega_nerf import MegaNerfDataParserConfig
 
 CITY = CityConfig(blocks=1, seed=5)

@@ -18,7 +18,7 @@ from mega_nerf_scene import rebuilt, saved, zipped
 from scene_files import refused
 
 from leco_plugin.scenes.input_error import InputError
-from leco_plugin.scenes.mega_nerf_format.pt_file import load, read_pt
+from leco_plugin.scenes.pt_file import load, read_pt
 
 VALUES = {
     "c2w": torch.arange(12.0).view(3, 4),

@@ -23,11 +23,8 @@ class Refused(Exception):
 
 
 def read_pt(path: Path, most_bytes: int = 1 << 20) -> Any:
-    """What a .pt file holds.
-
-    InputError if it cannot be read, is damaged, is larger than `most_bytes`, or holds anything but
-    tensors, numbers, strings and containers of them.
-    """
+    """What a .pt file holds. InputError if it cannot be read, is damaged or too large, or holds
+    anything but tensors, numbers, strings and containers of them."""
     return load(read_bytes(path, most_bytes), str(path))
 
 

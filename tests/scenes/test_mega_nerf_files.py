@@ -16,7 +16,7 @@ from PIL import Image
 from scene_files import refused
 
 from leco_plugin.scenes.city.cameras import look_at
-from leco_plugin.scenes.mega_nerf_format.files import TO_DRB, around, read_scene, wrong_axis
+from leco_plugin.scenes.mega_nerf_files import TO_DRB, around, read_scene, wrong_axis
 from leco_plugin.studio.checkpoints import allow_checkpoint_globals
 
 

@@ -26,8 +26,8 @@ from PIL import Image
 from leco_plugin.scenes.city.shapes import Array
 from leco_plugin.scenes.frames import SKEW, distance_from_rotations
 from leco_plugin.scenes.input_error import InputError
-from leco_plugin.scenes.mega_nerf_format.pt_file import describe, read_pt
 from leco_plugin.scenes.photograph_files import open_image
+from leco_plugin.scenes.pt_file import describe, read_pt
 from leco_plugin.scenes.whole_files import write_whole
 
 Split = Literal["train", "val"]
@@ -89,17 +89,14 @@ def around(positions: Array) -> Coordinates:
 def wrong_axis(poses: Array) -> str | None:
     """Why the poses [C, 3, 4] of a scene are not (down, right, back), or None if they may be.
 
-    A camera is taken to be upright: its right axis is level, it does not look far above the
-    horizon, and its top is not below. Whichever direction is down, nearly all cameras of a survey
-    agree on it.
+    An upright camera's right axis is level, it does not look far above the horizon, and its top is
+    not below. Whichever direction is down, nearly all cameras of a survey agree on it.
     """
     rights, tops, looks = poses[:, :, 0], poses[:, :, 1], -poses[:, :, 2]
 
     def upright(axis: int, sign: float) -> float:
-        level = np.abs(rights[:, axis]) < 0.35
-        return float(
-            np.mean(level & (sign * looks[:, axis] > -0.35) & (sign * tops[:, axis] < 0.35))
-        )
+        level, down = np.abs(rights[:, axis]) < 0.35, sign * looks[:, axis] > -0.35
+        return float(np.mean(level & down & (sign * tops[:, axis] < 0.35)))
 
     shares = {name: upright(*where) for name, where in _DIRECTIONS.items()}
     # Of directions that fit equally well, down is the one that cameras look along.
@@ -169,13 +166,10 @@ class MegaNerfScene:
 def read_scene(
     folder: Path, check_axes: bool = True, progress: Callable[[float], None] = lambda share: None
 ) -> MegaNerfScene:
-    """Reads and checks everything but pixels.
+    """Reads and checks everything but pixels; `progress` is told the share of files that are read.
 
-    Args:
-        check_axes: whether to refuse a world whose first axis does not point down.
-        progress: told the share of the files that are read.
-    Raises:
-        InputError: one line that names a file and what is wrong with it.
+    `check_axes` refuses a world whose first axis does not point down. InputError, in one line,
+    names a file and what is wrong with it.
     """
     if not folder.is_dir():
         raise InputError(f"there is no folder {folder}; give one with --data")
@@ -338,13 +332,8 @@ def write_view(
     pose: Array,
     intrinsics: tuple[float, float, float, float],
 ) -> None:
-    """Writes a picture and then its metadata.
-
-    Args:
-        image: [H, W, 3] or, with transparency, [H, W, 4].
-        pose: [3, 4] camera to world as the file holds it: `Coordinates.to_file`.
-        intrinsics: fx, fy, cx, cy in pixels.
-    """
+    """Writes a picture [H, W, 3 or 4] and then its metadata: a pose [3, 4] as `Coordinates.to_file`
+    has it, and fx, fy, cx, cy in pixels."""
     metadata: dict[str, Any] = {
         "H": image.shape[0],
         "W": image.shape[1],

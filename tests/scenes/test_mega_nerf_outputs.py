@@ -14,8 +14,8 @@ from mega_nerf_scene import pack, write_mask, zipped
 from PIL import Image
 from scene_files import refused
 
-from leco_plugin.scenes.mega_nerf_format.files import Frame, read_scene
-from leco_plugin.scenes.mega_nerf_format.outputs import mask_of, picture_of, read_mask, scaled
+from leco_plugin.scenes.mega_nerf_files import Frame, read_scene
+from leco_plugin.scenes.mega_nerf_outputs import mask_of, picture_of, read_mask, scaled
 from leco_plugin.scenes.photograph_files import DerivedImages, open_image
 
 

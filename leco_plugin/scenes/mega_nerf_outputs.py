@@ -25,12 +25,11 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from leco_plugin.log import bar, console
-from leco_plugin.scenes.coloured_points import CloudFile, read_cloud
+from leco_plugin.scenes.coloured_points import read_cloud
 from leco_plugin.scenes.frames import ALTITUDES, METRES_PER_UNIT, UP_IS_KNOWN
 from leco_plugin.scenes.input_error import InputError, one_line
 from leco_plugin.scenes.large_coordinates import far_origin, with_transform
-from leco_plugin.scenes.mega_nerf_format.files import Frame, MegaNerfScene, read_scene
-from leco_plugin.scenes.mega_nerf_format.pt_file import describe, load, read_bytes
+from leco_plugin.scenes.mega_nerf_files import Frame, MegaNerfScene, read_scene
 from leco_plugin.scenes.photograph_files import (
     DerivedImages,
     check_kind,
@@ -40,14 +39,14 @@ from leco_plugin.scenes.photograph_files import (
     plain,
 )
 from leco_plugin.scenes.photographs import points_in_model
+from leco_plugin.scenes.pt_file import describe, load, read_bytes
 
 if TYPE_CHECKING:
     from leco_plugin.scenes.mega_nerf import MegaNerfDataParserConfig
 
 
 def read(config: MegaNerfDataParserConfig) -> MegaNerfScene:
-    """The scene without its pixels, and a line in the log that says what it is. InputError if an
-    option or a file is wrong."""
+    """The scene without its pixels, described in the log. InputError for a wrong option or file."""
     if min(config.train_scale_factor, config.val_scale_factor) < 1:
         raise InputError("train_scale_factor and val_scale_factor are whole numbers from 1 on")
     if config.ray_altitude_range is not None:
@@ -68,16 +67,11 @@ def read(config: MegaNerfDataParserConfig) -> MegaNerfScene:
 def outputs_of(
     config: MegaNerfDataParserConfig, scene: MegaNerfScene, training: bool
 ) -> DataparserOutputs:
-    """The pictures that are trained on, or those that are scored, as nerfstudio takes them.
-
-    InputError if a picture, a mask or the file of points is wrong.
-    """
+    """The pictures that are trained on, or scored, as nerfstudio takes them. InputError if a
+    picture, a mask or the file of points is wrong."""
     half = config.protocol == "half"
-    frames = [
-        frame
-        for frame in scene.frames
-        if frame.split == ("train" if training else "val") or (training and half)
-    ]
+    splits = ("train", "val") if training and half else ("train",) if training else ("val",)
+    frames = [frame for frame in scene.frames if frame.split in splits]
     factor = config.train_scale_factor if training else config.val_scale_factor
     derived = DerivedImages(config.cache or config.data / "leco-cache")
     masks: list[Path] | None = None
@@ -92,11 +86,13 @@ def outputs_of(
     # the poses, scaled back, are in metres
     metadata: dict[str, Any] = {METRES_PER_UNIT: 1.0, UP_IS_KNOWN: True}
     if config.ray_altitude_range is not None:
-        top, ground = config.ray_altitude_range
-        metadata[ALTITUDES] = coordinates.height_of(ground), coordinates.height_of(top)
-    points = _points(config)
-    if points is not None:
-        metadata |= points_in_model(points, transform / coordinates.metres)
+        top, ground = map(coordinates.height_of, config.ray_altitude_range)
+        metadata[ALTITUDES] = ground, top
+    points = config.points or config.data / "points.ply"
+    if points.is_file():
+        metadata |= points_in_model(read_cloud(points), transform / coordinates.metres)
+    elif config.points is not None:
+        raise InputError(f"there is no file {points} with sparse points")
     outputs = DataparserOutputs(
         image_filenames=images,
         cameras=_cameras(scene, frames, factor, right),
@@ -139,16 +135,6 @@ def _for_each(what: str, frames: list[Frame], make: Callable[[Frame], Any]) -> l
     return made
 
 
-def _points(config: MegaNerfDataParserConfig) -> CloudFile | None:
-    """Sparse points as the file has them, if there is one."""
-    path = config.points or config.data / "points.ply"
-    if path.is_file():
-        return read_cloud(path)
-    if config.points is not None:
-        raise InputError(f"there is no file {path} with sparse points")
-    return None
-
-
 def _cameras(scene: MegaNerfScene, frames: list[Frame], factor: int, right_half: bool) -> Cameras:
     """Cameras of pictures divided by a factor, or of their right halves."""
     poses = scene.coordinates.to_model(np.stack([frame.pose for frame in frames]))
@@ -173,8 +159,7 @@ _MORE = 1 << 16
 
 
 def scaled(frame: Frame, factor: int) -> tuple[int, int]:
-    """Width and height of a picture divided by a factor. InputError if it does not divide them, or
-    the file is smaller than that."""
+    """Width and height of a picture divided by a factor. InputError if that cannot be."""
     if frame.width % factor or frame.height % factor:
         raise InputError(
             f"{frame.image} has metadata for {frame.width} x {frame.height} pixels, "
@@ -209,12 +194,8 @@ def picture_of(frame: Frame, factor: int, right_half: bool, derived: DerivedImag
 def mask_of(
     frame: Frame, factor: int, left_half: bool, masks: Path | None, derived: DerivedImages
 ) -> Path | None:
-    """A file with the pixels to train on, or None if there are none.
-
-    Args:
-        left_half: whether the right half of the picture is left out.
-        masks: folder of the scene's masks, if it has any.
-    """
+    """A file with the pixels to train on, or None if there are none; `left_half` leaves out the
+    right half of the picture, `masks` is the folder of the scene's masks, if it has any."""
     size = scaled(frame, factor)
     if masks is None:
         part = "left" if left_half else "whole"
@@ -247,8 +228,7 @@ def _cut(mask: Image.Image, left_half: bool) -> Image.Image:
 
 
 def read_mask(path: Path, width: int, height: int) -> NDArray[np.bool_]:
-    """Which pixels of a picture to keep: bool [height, width]. InputError if there is no such file,
-    or no mask of that size in it."""
+    """Pixels of a picture to keep: bool [height, width]. InputError without such a mask there."""
     most = width * height + _MORE
     mask = load(_unpack(path, read_bytes(path, most), most), str(path))
     if not isinstance(mask, torch.Tensor) or mask.dtype != torch.bool or mask.dim() != 2:

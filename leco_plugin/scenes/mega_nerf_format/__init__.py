@@ -1,1 +1,0 @@
-"""Mega-NeRF's files: read without running what is in them, checked, and written."""
