@@ -47,6 +47,8 @@ without it stands beside, to show what the gift is worth.
 - **Codes**: small ones begin at zero. Those of nerfstudio cost test views several dB.
 - **Front to back**: images leave out what lies behind opaque surfaces. *guided*: where that is
   faster.
+- **Loss of colours**: `leco-occupancy` in all its rows weighs errors in hue eight times, each host
+  keeps its own loss in all of its rows.
 
 This page is generated: `python benchmarks/reference_pages.py`.
 """
