@@ -208,8 +208,8 @@ def write_city(
         _photograph(city, files, unfinished, progress)
         files.finish(unfinished)
         write_whole(unfinished / DESCRIPTION, lambda file: file.write(text.encode()))
-        remove_parts(unfinished)
         unfinished.replace(out_dir)
+        remove_parts(out_dir)  # not before: who loses a part to another finds the city there
     except OSError:
         # Somebody else may have finished the same city in the meantime.
         if not _holds(out_dir, wanted):

@@ -11,7 +11,6 @@ from itertools import pairwise
 import numpy as np
 from numpy.random import Generator
 from numpy.typing import NDArray
-from scipy import ndimage
 
 from leco_plugin.scenes.city.blocks import GROUND_DEPTH, KERB, KINDS, Block
 from leco_plugin.scenes.city.shapes import (
@@ -56,6 +55,8 @@ def choose_blocks(blocks: int, seed: int) -> NDArray[np.bool_]:
 
 def _wandering(blocks: int, seed: int) -> NDArray[np.bool_]:
     """A connected city with bays and headlands, about 4/5 of its square."""
+    from scipy import ndimage  # the GPU suite, which photographs no such city, does without
+
     random = np.random.default_rng([seed, blocks, 6])
     x, y = np.moveaxis((np.indices((blocks, blocks)) + 0.5) / blocks * 2 - 1, 0, 0)
     turn = np.arctan2(y, x)
