@@ -24,17 +24,16 @@ from leco_plugin.chart.findings.summary import RENDERING, Line, lines_of
 from leco_plugin.chart.methods import SUITES
 from leco_plugin.chart.panels import asks_what_was_learned, title_of
 
-HEAD = """## The reviewers' questions, answered
+HEAD = """## The answers with their figures
 
 What each suite of `leco chart --suite` found on each scene. Costs, spread over seeds, pictures and
-commands are on [a page of their own](suites.md); a chart marked (*) was made before a mend that is
-named there.
+commands are below; a chart marked (*) was made before a mend that is named there.
 """
 KEPT = """Volume kept, of what rays reach, where each loses 0.1% of the surface mass, and the size
 of the occupancy: less is better in both, and what is on the front is so in the median over seeds.
 Grids, and a small gate of each kind, are made from the field that learned with our gate; more sizes
-of all are [below](#how-much-a-scene-needs-gates-and-grids-at-equal-loss). Sizes are those of the
-numbers in bfloat16, and of a grid's cells in bits.
+of all are [elsewhere](measurements.md#how-much-a-scene-needs-gates-and-grids-at-equal-loss). Sizes
+are those of the numbers in bfloat16, and of a grid's cells in bits.
 """
 LEARNED = """Space that each gate keeps, of what rays reach, where it loses 0.1% of the surface, and
 PSNR after equally many steps. A gate that was frozen with the last of them has guided nothing.
@@ -64,6 +63,20 @@ def answers_section() -> list[str]:
     return [HEAD, *parts, *minutes_section(shown)] if parts else []
 
 
+def short_answers() -> list[str]:
+    """Suite by suite the question, and a line for each scene."""
+    parts, noted = [], notes()
+    for suite, its in SUITES.items():
+        if charts := list(by_scene(suite).values()):
+            parts.append(f"- **{its.question}**")
+            parts += [
+                f"    - {_link(results, 'suites.md')}{' (*)' if name in noted else ''}: "
+                f"{_answer_of(results)}."
+                for name, results in charts
+            ]
+    return [*parts, ""]
+
+
 def _answer(charts: Sequence[tuple[str, dict[str, Any]]]) -> list[str]:
     noted = notes()
     kinds = [_kind(results) for _, results in charts]
@@ -79,9 +92,9 @@ def _answer(charts: Sequence[tuple[str, dict[str, Any]]]) -> list[str]:
     return [figures, *table(f"scene | {' | '.join(columns)} |", rows), "", *counted]
 
 
-def _link(results: Mapping[str, Any]) -> str:
+def _link(results: Mapping[str, Any], page: str = "") -> str:
     scene = results["scene"]["name"]
-    return f"[{scene}](suites.md#suite-{results['suite']}-on-{scene})"
+    return f"[{scene}]({page}#suite-{results['suite']}-on-{scene})"
 
 
 def _kind(results: Mapping[str, Any]) -> tuple[str, Callable[[Sequence[Line]], dict[str, str]]]:

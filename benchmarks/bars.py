@@ -28,8 +28,9 @@ Values = Sequence[float | None]
 HEAD = """What `leco-occupancy` was to reach on two CPU cores, set before it was built. Each figure
 is read from the stored result named beside it: the median over seeds, with the least and the most.
 *Yes* is with every seed, *in the median* not with all of them. PSNR beside a rival is a difference
-of means with its 95% interval: ahead, level or behind. A chart marked (*) was made before a
-mend that is named with it."""
+of means with its 95% interval: ahead, level or behind. A *candidate* is a place on a ray at which a
+model that skips nothing would ask its network. The *price* is what skipping costs held-out pixels,
+*lost surface mass* what it leaves out of the weight near surfaces."""
 
 
 @dataclass(frozen=True)

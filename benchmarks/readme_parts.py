@@ -22,9 +22,13 @@ OURS = "leco-occupancy"
 def readme(text: str) -> str:
     """The README with its tables renewed."""
     text = between(text, DEMO, demo_table(json.loads((RESULTS / "demo.json").read_text())))
+    return between(text, GAIN, gain())
+
+
+def gain() -> str:
+    """What a learned occupancy gains, and what is to be known of that chart."""
     chart = json.loads((RESULTS / "charts" / f"{GAIN_CHART}.json").read_text())
-    gain = [gain_table(chart), *filter(None, [noted(RESULTS).get(GAIN_CHART)])]
-    return between(text, GAIN, "\n\n".join(gain))
+    return "\n\n".join([gain_table(chart), *filter(None, [noted(RESULTS).get(GAIN_CHART)])])
 
 
 def demo_table(report: dict[str, Any]) -> str:

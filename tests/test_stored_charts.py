@@ -60,7 +60,7 @@ def test_it_is_said_for_every_scene_whether_ours_is_on_the_fronts(store: Store) 
     store("representations", "fox", *representations(other_seconds=8.0))
     text = answered()
     assert "Of 2 scenes, MLP (ours) is on the front of size on 2 and of learning time on 1." in text
-    link = "suites.md#suite-representations-on-city"
+    link = "#suite-representations-on-city"
     kept = "| 12.5%, 50 kB | 30.0%, 33 kB | 10.0%, 4.0 MB |"
     assert (
         f"| [city]({link}) {kept} MLP (ours) is the soonest learned and on the front of size"
@@ -150,7 +150,7 @@ def test_a_contender_that_a_scene_lacks_has_no_figure_there(store: Store) -> Non
 def test_a_chart_with_a_note_is_marked(store: Store, tmp_path: Path) -> None:
     store("freeze", "city", run("A"))
     (tmp_path / "notes.json").write_text('{"city-freeze": "Made before."}')
-    assert "[city](suites.md#suite-freeze-on-city) (*) |" in answered()
+    assert "[city](#suite-freeze-on-city) (*) |" in answered()
 
 
 def test_the_gain_is_that_over_the_best_host_without_one() -> None:
