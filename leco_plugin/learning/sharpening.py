@@ -42,7 +42,7 @@ from leco_plugin.models.rendering import Intervals, Rays, Shaded, backdrop_of, m
 from leco_plugin.occupancy import CAMERAS_THAT_VOUCH, Precision, gate_precision
 from leco_plugin.scenes.input_error import require
 
-BATCH = 1 << 14
+BATCH = 1 << 13
 LAST_RATE = 0.05
 """Of the learning rate, after a half cosine."""
 
@@ -136,7 +136,7 @@ class SharpeningConfig:
     """When and how a small gate is taught by the field."""
 
     steps: int = 500
-    """Of teaching, each with 16,384 positions; 0 never sharpens."""
+    """Of teaching, each with 8,192 positions; 0 never sharpens."""
     least_steps: int = 1000
     """Guided steps that pay for it: a gate is sharpened when it is frozen if so many are left, and
     at the end of a run that has had so many."""
@@ -252,7 +252,7 @@ def sharpen(
         before = measure(*rendering, float(mixture.threshold))
         asked = asked_by(mixture, gate, in_chunks(rays, at_once), rendering)
         of_cameras = [
-            _said_by(mixture, gate, of_one, _rendered(mixture, of_one, seen)[0])
+            _said_by(mixture, gate, of_one, _rendered(mixture, of_one, seen))
             for of_one, _ in cameras
         ]
         measured = calibrate(*asked, calibration, cameras=of_cameras)
@@ -273,10 +273,12 @@ def lesson_by(
     """
     lessons = []
     for chunk in in_chunks(rays, rays_at_once):
-        reference, mapped = _rendered(mixture, chunk, seen)
-        before = ~reference.always_kept
-        of_rays = reference.intervals.ray_indices[before]
-        lessons.append(lesson_of(mapped[before], reference.weights[before], of_rays, losses))
+        asked = _asked(mixture, chunk, seen)
+        before = ~backdrop_of(asked.intervals, chunk)
+        weights = torch.zeros_like(asked.occupancies)
+        weights[asked.drawn] = mixture.weigh(chunk, asked.some)
+        of_rays = asked.intervals.ray_indices[before]
+        lessons.append(lesson_of(asked.mapped[before], weights[before], of_rays, losses))
     return Lesson(*(torch.cat(parts) for parts in zip(*lessons)))
 
 
@@ -286,7 +288,7 @@ def seen_rendering(
     """As `dense_rendering`, where candidates below a share of the threshold are not rendered and
     have no weight. Guided training has not taught the field what is there."""
     chunks = in_chunks(rays, rays_at_once)
-    references = [_rendered(mixture, chunk, seen)[0] for chunk in chunks]
+    references = [_rendered(mixture, chunk, seen) for chunk in chunks]
 
     @torch.no_grad()
     def render_kept(number: int, mask: Tensor) -> Tensor:
@@ -296,22 +298,41 @@ def seen_rendering(
     return DenseRendering(references, list(truth.split(rays_at_once)), render_kept)
 
 
+class _Asked(NamedTuple):
+    """The candidates of rays, and which of them the field is asked about."""
+
+    intervals: Intervals
+    mapped: Tensor
+    """[M, 3] in [-1, 1], where they lie."""
+    occupancies: Tensor
+    """[M] o(x)."""
+    drawn: Tensor
+    """[M] bool: those that are rendered."""
+
+    @property
+    def some(self) -> Intervals:
+        """Those."""
+        return Intervals(*(part[self.drawn] for part in self.intervals))
+
+
 @torch.no_grad()
-def _rendered(mixture: Mixture, rays: Rays, seen: float) -> tuple[Reference, Tensor]:
-    """All candidates of rays with the weights of those that are seen; and where they lie, [M, 3]
-    in [-1, 1]."""
+def _asked(mixture: Mixture, rays: Rays, seen: float) -> _Asked:
     intervals = mixture.with_backdrops(rays, mixture.candidates(rays))
     mapped = mapped_middles(mixture.region.space, rays, intervals)
     occupancies = mixture.occupancies(mapped)
-    is_backdrop = backdrop_of(intervals, rays)
-    drawn = (occupancies >= seen * mixture.threshold) | is_backdrop
-    some = Intervals(*(part[drawn] for part in intervals))
-    shaded: Shaded = mixture.shade(rays, some)
-    small = reference_of(shaded, some, rays)
-    weights = torch.zeros_like(occupancies)
-    surface = torch.zeros_like(drawn)
+    drawn = (occupancies >= seen * mixture.threshold) | backdrop_of(intervals, rays)
+    return _Asked(intervals, mapped, occupancies, drawn)
+
+
+@torch.no_grad()
+def _rendered(mixture: Mixture, rays: Rays, seen: float) -> Reference:
+    """All candidates of rays with the weights of those that are seen."""
+    intervals, _, occupancies, drawn = asked = _asked(mixture, rays, seen)
+    small = reference_of(mixture.shade(rays, asked.some), asked.some, rays)
+    weights, surface = torch.zeros_like(occupancies), torch.zeros_like(drawn)
     weights[drawn], surface[drawn] = small.weights.float(), small.near_surface
-    return Reference(intervals, weights, occupancies, surface, small.rgb, is_backdrop), mapped
+    backdrops = backdrop_of(intervals, rays)
+    return Reference(intervals, weights, occupancies, surface, small.rgb, backdrops)
 
 
 def asked_by(

@@ -21,8 +21,11 @@ from leco_plugin.models.rendering import (
     Routing,
     Scene,
     Shaded,
+    ask,
+    backdrop_of,
     mapped_middles,
     shade,
+    weigh,
     with_backdrop,
 )
 from leco_plugin.models.sizing.sizes import SIZES, Sizes, stored_in, to_store
@@ -185,6 +188,14 @@ class Mixture(nn.Module):
         """Renders intervals; no gradient reaches a frozen gate."""
         with gate_precision(self.device.type, self.precision):
             return shade(self.scene(), rays, intervals, freeze_gate=bool(self.frozen))
+
+    @torch.no_grad()
+    def weigh(self, rays: Rays, intervals: Intervals) -> Tensor:
+        """The rendering weights [M] of intervals, whose colours nobody wants."""
+        with gate_precision(self.device.type, self.precision):
+            sigmas = ask(self.scene(), rays, intervals, freeze_gate=True).sigmas
+        backdrops, half_extent = backdrop_of(intervals, rays), self.region.space.half_extent
+        return weigh(sigmas, backdrops, intervals, half_extent, len(rays.origins))[0]
 
     def scene(self) -> Scene:
         """Whom renderings ask."""

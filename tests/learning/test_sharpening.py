@@ -138,10 +138,10 @@ def test_a_small_gate_skips_what_the_large_one_keeps_of_free_space() -> None:
 
 def test_guided_only_what_is_shown_now_is_taught(monkeypatch) -> None:
     shares: list[float] = []
-    real = sharpening._rendered
+    real = sharpening._asked
     monkeypatch.setattr(
         sharpening,
-        "_rendered",
+        "_asked",
         lambda m, rays, seen, *of: shares.append(seen) or real(m, rays, seen, *of),
     )
     mixture = a_mixture()
