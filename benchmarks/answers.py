@@ -18,11 +18,12 @@ from leco_plugin.chart.findings.learned import (
     ours_of,
     percent,
     still_rising,
+    words_of,
 )
 from leco_plugin.chart.findings.representations import COSTS, fronts_of, representations_of
-from leco_plugin.chart.findings.summary import RENDERING, Line, lines_of
+from leco_plugin.chart.findings.summary import RENDERING, Line, compare, lines_of, sentence
 from leco_plugin.chart.methods import SUITES
-from leco_plugin.chart.panels import asks_what_was_learned, title_of
+from leco_plugin.chart.panels import asks_what_was_learned, finding_of
 
 HEAD = """## The answers with their figures
 
@@ -64,11 +65,11 @@ def answers_section() -> list[str]:
 
 
 def short_answers() -> list[str]:
-    """Suite by suite the question, and a line for each scene."""
+    """Suite by suite the question, an answer over all scenes, and a line for each scene."""
     parts, noted = [], notes()
     for suite, its in SUITES.items():
         if charts := list(by_scene(suite).values()):
-            parts.append(f"- **{its.question}**")
+            parts.append(f"- **{its.question}** {_in_short([results for _, results in charts])}")
             parts += [
                 f"    - {_link(results, 'suites.md')}{' (*)' if name in noted else ''}: "
                 f"{_answer_of(results)}."
@@ -88,8 +89,42 @@ def _answer(charts: Sequence[tuple[str, dict[str, Any]]]) -> list[str]:
         scene = _link(results) + (" (*)" if name in noted else "")
         shown = [row.get(column, "-") for column in columns]
         rows.append([scene, *shown, _answer_of(results)])
-    counted = [_fronts([results for _, results in charts])] if figures == KEPT else []
-    return [figures, *table(f"scene | {' | '.join(columns)} |", rows), "", *counted]
+    counted = f"{_in_short([results for _, results in charts])}\n"
+    return [figures, *table(f"scene | {' | '.join(columns)} |", rows), "", counted]
+
+
+def _in_short(charts: Sequence[Mapping[str, Any]]) -> str:
+    """One sentence over the scenes of a suite, whose first contender is ours."""
+    figures = {_kind(results)[0] for results in charts}
+    if KEPT in figures:
+        return _fronts(charts)
+    of = f"{len(charts)} scene{'s' if len(charts) > 1 else ''}"
+    if LEARNED in figures:
+        best = sum(_none_is_better(learned_of(lines_of(results))) for results in charts)
+        return f"On {best} of {of}, no other is better than ours in space kept and in PSNR."
+    words = [_word(lines_of(results)) for results in charts]
+    ahead, level, behind = map(words.count, ("ahead", "level", "behind"))
+    ours = sentence(lines_of(charts[0])[0].name)
+    said = f"*{ours}* is ahead of the best other on {ahead} of {of}, level with it on {level}"
+    return f"{said}, behind it on {behind or 'none'}."
+
+
+def _none_is_better(learned: Sequence[Learned]) -> bool:
+    """Whether ours was measured and no other is ahead in space and PSNR, or in one and level."""
+    ours = ours_of(learned)
+    if ours is None or not ours.is_measured:
+        return False
+    rivals = [one for one in learned if one is not ours and one.is_measured]
+    return not any(
+        "ahead" in (said := words_of(one, ours)) and "behind" not in said for one in rivals
+    )
+
+
+def _word(lines: Sequence[Line]) -> str | None:
+    """How the PSNR of the first contender compares with that of the best other."""
+    ours, *others = lines
+    best = max(others, key=lambda line: line.psnr, default=ours)
+    return compare(ours.psnrs, best.psnrs).word
 
 
 def _link(results: Mapping[str, Any], page: str = "") -> str:
@@ -151,7 +186,7 @@ def _fronts(charts: Sequence[Mapping[str, Any]]) -> str:
         for who, its in counts.items()
     ]
     scenes = f"{len(charts)} scene{'s' if len(charts) > 1 else ''}"
-    return f"Of {scenes}, {'; '.join(said)}.\n"
+    return f"Of {scenes}, {'; '.join(said)}."
 
 
 def _level(learned: Sequence[Learned]) -> str:
@@ -167,8 +202,8 @@ def _answer_of(results: Mapping[str, Any]) -> str:
     """The title of a chart, and who is level with ours, still rising, or has fallen."""
     lines = lines_of(results)
     if asks_what_was_learned(results) and not representations_of(lines):
-        return title_of(results) + _level(learned_of(lines))
-    said = [title_of(results)]
+        return finding_of(results) + _level(learned_of(lines))
+    said = [finding_of(results)]
     if results["protocol"]["seconds"] is not None:
         rising = still_rising(lines)
         who = "all" if len(rising) == len(lines) else ", ".join(rising)

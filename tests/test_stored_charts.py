@@ -14,6 +14,9 @@ import readme_parts as parts
 from chart_results import occupancy, results, run
 from results_page import sampling_section
 
+from leco_plugin.chart.panels import title_of
+
+ROOT = Path(__file__).resolve().parents[1]
 STEPS = {"protocol": {"seconds": None, "steps": 400}}
 
 Store = Callable[..., None]
@@ -249,3 +252,11 @@ def test_a_sampling_section_says_when_and_of_which_code_it_is() -> None:
     title, line, _ = sampling_section(report)
     assert title == "## Sampling: a processor, 2026-11-23\n"
     assert line.endswith("within one run. leco_plugin 0.1.0 at 0123456789ab.\n")
+
+
+def test_every_picture_says_its_finding_in_ten_words() -> None:
+    """Numbers count, signs do not."""
+    for path in sorted((ROOT / "benchmarks" / "results" / "charts").glob("*.json")):
+        title = title_of(json.loads(path.read_text()))
+        words = [word for word in title.split() if any(map(str.isalnum, word))]
+        assert len(words) <= 10, f"{path.stem}: {title}"

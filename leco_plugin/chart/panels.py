@@ -11,6 +11,7 @@ from leco_plugin.chart.findings.representations import (
     Representation,
     never_held_of,
     representations_of,
+    shortest_verdict,
     verdict,
 )
 from leco_plugin.chart.findings.summary import (
@@ -29,6 +30,16 @@ HELD_COSTS = {"size": "size of the occupancy, kB", "learn_seconds": LEARNING.tit
 
 
 def title_of(results: Mapping[str, Any]) -> str:
+    """What a picture of results shows, in about ten words; `finding_of` has all figures."""
+    lines = lines_of(results)
+    if held := representations_of(lines):
+        return sentence(shortest_verdict(held))
+    if asks_what_was_learned(results):
+        return sentence(learned_headline(learned_of(lines), short=True))
+    return sentence(headline(results, short=True))
+
+
+def finding_of(results: Mapping[str, Any]) -> str:
     """One sentence, without a full stop, about results that hold at least one run."""
     lines = lines_of(results)
     held = representations_of(lines)

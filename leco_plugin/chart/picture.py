@@ -20,7 +20,7 @@ from leco_plugin.chart.findings.summary import (
     best_so_far,
     circumstances,
 )
-from leco_plugin.chart.panels import Panel, Point, Shown, shown_of, title_of
+from leco_plugin.chart.panels import Panel, Point, Shown, finding_of, shown_of, title_of
 from leco_plugin.chart.theme import (
     LIGHT,
     Theme,
@@ -38,11 +38,11 @@ BAR = 0.032
 """Height of a bar at the foot of a panel, as a share of the panel's."""
 WIDE_RANGE = 8.0
 """Ratio of costs from which on their axis is logarithmic."""
-TITLE_WIDTH = 66
+TITLE_WIDTH, TEXT_WIDTH = 66, 120
 CHARACTER = 0.0098
 """Width of a letter, as a share of the figure's."""
-TOP, LINE_HEIGHT = 0.985, 0.04
-"""Top and line height of the title, as shares of the figure's height."""
+TOP, LINE_HEIGHT, SMALL_LINE_HEIGHT = 0.985, 0.04, 0.0235
+"""Top of the title, and line heights of it and of the text below, shares of the figure's height."""
 COSTS_BELOW = "What it costs. Up and left is better; nothing is better in both than the grey line."
 PSNR_BELOW = "PSNR on unseen photographs, dB, against what it costs. Up and left is better:"
 KEPT_SPACE = f"Space that must be sampled where each loses {LOST_SURFACE_MASS:.1%} of the surface"
@@ -57,7 +57,10 @@ def draw(results: Mapping[str, Any], path: Path, theme: Theme = LIGHT) -> Path:
         title = balanced(title_of(results))
         figure.text(0.015, TOP, title, va="top", fontsize=17, fontweight="bold")
         below = TOP - 0.01 - LINE_HEIGHT * (title.count("\n") + 1)
-        figure.text(0.015, below, circumstances(results), va="top", fontsize=11.5)
+        said = [f"{finding_of(results)}.", circumstances(results)]
+        said = [line for one in said for line in textwrap.wrap(one, TEXT_WIDTH)]
+        figure.text(0.015, below, "\n".join(said), va="top", fontsize=11.5)
+        below -= SMALL_LINE_HEIGHT * (len(said) - 1)
         if shown.space:
             _draw_occupancies(figure, below, shown, theme)
         else:

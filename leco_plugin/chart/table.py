@@ -26,7 +26,7 @@ from leco_plugin.chart.findings.summary import (
     rivals,
     sentence,
 )
-from leco_plugin.chart.panels import cost_panel, title_of
+from leco_plugin.chart.panels import cost_panel, finding_of
 
 T = TypeVar("T")
 
@@ -116,7 +116,7 @@ def table(results: Mapping[str, Any]) -> str:
         made = len(results["runs"])
         parts.append(f"**{made} of {made + missing} runs so far**: what is said here may change.")
     if lines:
-        parts += [f"{title_of(results)}. {circumstances(results)}.", runs_table(lines)]
+        parts += [f"{finding_of(results)}. {circumstances(results)}.", runs_table(lines)]
     if warming := [line.name for line in lines if line.warming_up]:
         parts.append(
             f"Ended in the warm-up of their grid, which asks all cells: {' and '.join(warming)}."

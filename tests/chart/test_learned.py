@@ -10,7 +10,7 @@ from PIL import Image
 
 from leco_plugin.chart.findings.learned import learned_headline, learned_of, level_with
 from leco_plugin.chart.findings.summary import lines_of
-from leco_plugin.chart.panels import title_of
+from leco_plugin.chart.panels import finding_of
 from leco_plugin.chart.picture import draw
 from leco_plugin.chart.table import table
 
@@ -52,10 +52,10 @@ OURS = keeping("A (ours)", (0.05, 21.0), (0.06, 20.0), (0.05, 21.0))
 
 
 def title(*others: list[dict]) -> str:
-    return title_of(results(*OURS, *(run for of in others for run in of), **BY_STEPS))
+    return finding_of(results(*OURS, *(run for of in others for run in of), **BY_STEPS))
 
 
-def test_the_title_of_a_suite_by_steps_is_of_space_kept_at_equal_loss_and_of_psnr() -> None:
+def test_the_finding_of_a_suite_by_steps_is_of_space_kept_at_equal_loss_and_of_psnr() -> None:
     worse = keeping("B", (0.5, 19.0), (0.4, 18.5), (0.6, 19.0))
     wasteful = keeping("C", *[(0.9, 22.0)] * 3)
     assert title(worse) == (
@@ -70,7 +70,7 @@ def test_the_title_of_a_suite_by_steps_is_of_space_kept_at_equal_loss_and_of_psn
     of_time = [
         run(name, seed, psnr) for name, psnr in (("A", 22.0), ("B", 20.0)) for seed in (0, 1)
     ]
-    assert "ahead" in title_of(results(*of_time, suite="freeze"))
+    assert "ahead" in finding_of(results(*of_time, suite="freeze"))
     assert learned_headline(learned_of(lines_of(results(*skipping("C", None, 0.9))))) == (
         "no gate was frozen with every seed"
     )
@@ -83,7 +83,7 @@ def test_what_is_better_in_both_leads_the_title() -> None:
     once_worse = keeping("B", (0.03, 22.5), (0.03, 22.5), (0.055, 22.5))
     assert "none is better in both (3 seeds); the others keep 3.0%" in title(once_worse)
     alone = keeping("A (ours)", (0.05, 21.0)) + keeping("B", (0.04, 22.0))
-    assert title_of(results(*alone, **BY_STEPS)).endswith(
+    assert finding_of(results(*alone, **BY_STEPS)).endswith(
         ": one seed: no verdict; the others keep 4.0%"
     )
 
@@ -91,7 +91,7 @@ def test_what_is_better_in_both_leads_the_title() -> None:
 def test_a_title_without_ours_says_so() -> None:
     other = keeping("B", *[(0.04, 22.0)] * 3)
     never = skipping("A (ours)", 0.8, None, 0.8)
-    assert title_of(results(*never, *other, **BY_STEPS)) == "Ours was not frozen with every seed"
+    assert finding_of(results(*never, *other, **BY_STEPS)) == "Ours was not frozen with every seed"
 
 
 def test_those_that_seeds_do_not_tell_apart_in_both_are_level() -> None:

@@ -16,7 +16,7 @@ from leco_plugin.chart.findings.representations import (
     verdict,
 )
 from leco_plugin.chart.findings.summary import lines_of
-from leco_plugin.chart.panels import title_of
+from leco_plugin.chart.panels import finding_of
 from leco_plugin.chart.table import table
 
 GRIDS = [grid(64, 0.3), grid(128, 0.2)]
@@ -145,7 +145,7 @@ def test_a_gate_that_was_not_always_frozen_is_named() -> None:
         run(f"gate{kind}", sampler=kind, occupancy=occupancy(9, 0.1)) for kind in (ours, hashed)
     ]
     made = results(*runs, run("planes", sampler=planes))
-    assert title_of(made).endswith("; 1 not always frozen")
+    assert finding_of(made).endswith("; 1 not always frozen")
     assert "Left out, for not frozen with every seed: planes." in table(made)
 
 

@@ -90,9 +90,10 @@ def learned_of(lines: Sequence[Line]) -> list[Learned]:
     return found if any(one.facts for one in found) else []
 
 
-def learned_headline(learned: Sequence[Learned]) -> str:
+def learned_headline(learned: Sequence[Learned], short: bool = False) -> str:
     """Space kept at equal loss and PSNR of ours, or of the first that always froze, and which
-    other is better in both: medians of space and means of PSNR."""
+    other is better in both: medians of space and means of PSNR. What is short leaves out the rest
+    of the others."""
     known = [one for one in learned if one.is_measured]
     if not known:
         return "no gate was frozen with every seed"
@@ -101,22 +102,24 @@ def learned_headline(learned: Sequence[Learned]) -> str:
             return "ours was not frozen with every seed"
         ours = known[0]
     others = [one for one in known if one is not ours]
-    if better := [one for one in others if _words(one, ours) == {"ahead"}]:
+    if better := [one for one in others if words_of(one, ours) == {"ahead"}]:
         best = min(better, key=lambda one: one.kept)
         by = compare(best.psnrs, ours.psnrs).by
+        if short:
+            return f"{best.name} keeps less than {ours.name}, at more dB"
         return f"{best.name} keeps {_figures(best)}, {ours.name} {_figures(ours)} ({by})"
     said = f"{ours.name} keeps {_figures(ours)}"
-    if others:
+    if others and not short:
         kept = sorted(one.kept for one in others)
         shares = " to ".join(dict.fromkeys(percent(share) for share in (kept[0], kept[-1])))
         said += f": {_standing_of(ours, others)}; the others keep {shares}"
     never = len(learned) - len(known)
-    return said + (f"; {never} not always frozen" if never else "")
+    return said + (f"; {never} not always frozen" if never and not short else "")
 
 
 def _standing_of(one: Learned, others: Sequence[Learned]) -> str:
     """The standing of one that no other beats in both."""
-    found = [_words(one, other) for other in others]
+    found = [words_of(one, other) for other in others]
     fewest = min(others, key=lambda other: other.seeds)
     by = compare(one.psnrs, fewest.psnrs).by
     if any(None in words for words in found):
@@ -125,7 +128,7 @@ def _standing_of(one: Learned, others: Sequence[Learned]) -> str:
     return f"{'the least, at the highest PSNR' if best else 'none is better in both'} ({by})"
 
 
-def _words(one: Learned, other: Learned) -> set[str | None]:
+def words_of(one: Learned, other: Learned) -> set[str | None]:
     """The verdicts on space, of which less is better, and on PSNR: one where they agree."""
     mine, theirs = (list(some.kept_by_seed.values()) for some in (one, other))
     return {compare(theirs, mine).word, compare(one.psnrs, other.psnrs).word}
@@ -141,7 +144,7 @@ def level_with(one: Learned, others: Sequence[Learned]) -> list[Learned]:
     return [
         other
         for other in others
-        if other is not one and other.is_measured and _words(one, other) == {"level"}
+        if other is not one and other.is_measured and words_of(one, other) == {"level"}
     ]
 
 

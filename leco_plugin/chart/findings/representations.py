@@ -169,6 +169,26 @@ def verdict(representations: Sequence[Representation]) -> str:
     return f"{'; '.join([*said, place])} ({learned.against(learned, 'kept').by})"
 
 
+def shortest_verdict(representations: Sequence[Representation]) -> str:
+    """The best that holds for one of ours."""
+    ours = [one for one in representations if one.ours]
+    if not ours:
+        return "our own gate was not frozen with every seed"
+    for one in ours:
+        others = [other for other in representations if other is not one]
+        if all(one.kept <= other.kept for other in others):
+            return f"{one.name} keeps least space, {one.kept:.1f}%"
+    for one in ours:
+        others = [other for other in representations if other is not one]
+        if _is_cheapest(one, others, "size"):
+            return f"{one.name} is the smallest occupancy: {one.median('size'):.0f} kB"
+    for one in ours:
+        if fronts := fronts_of(one, representations):
+            return f"{one.name} is on the front of {' and of '.join(fronts)}"
+    leader = _best_ahead(ours[0], representations, "size")
+    return f"{ours[0].name} keeps more space than {leader}"
+
+
 def _place_of(one: Representation, all_of_them: Sequence[Representation]) -> str:
     """What leads on the fronts that a representation is on; empty if it is on none."""
     others = [other for other in all_of_them if other is not one]

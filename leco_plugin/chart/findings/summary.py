@@ -226,8 +226,8 @@ def best_so_far(lines: Sequence[Line]) -> tuple[NDArray[np.float64], NDArray[np.
     return times, np.maximum.accumulate(np.max(reached, axis=0))
 
 
-def headline(results: Mapping[str, Any]) -> str:
-    """What the chart shows of accuracy, in one sentence."""
+def headline(results: Mapping[str, Any], short: bool = False) -> str:
+    """What the chart shows of accuracy, in one sentence, or only who is ahead and by how much."""
     ranked = sorted(lines_of(results), key=lambda line: -line.psnr)
     if len(ranked) < 2:
         return f"{ranked[0].name}: {ranked[0].psnr:.1f} dB"
@@ -236,6 +236,9 @@ def headline(results: Mapping[str, Any]) -> str:
     if found.margin is None:
         return f"{best.name} {best.psnr:.1f} dB, {second.name} {second.psnr:.1f} dB ({found.by})"
     apart = f"{found.difference:.2f} ± {found.margin:.2f}"
+    if short:
+        ahead = f"{best.name} is ahead by {apart} dB"
+        return f"{best.name} is level with the next best" if found.word == "level" else ahead
     if found.word == "level":
         figures = f"{best.psnr:.1f} and {second.psnr:.1f} dB"
         return f"{best.name} and {second.name} are level: {figures}, {apart} apart ({found.by})"
