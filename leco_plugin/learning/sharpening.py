@@ -38,7 +38,7 @@ from leco_plugin.models.gate import Gate, GateConfig, occupancy_logit
 from leco_plugin.models.losses import widen
 from leco_plugin.models.mixture import Mixture
 from leco_plugin.models.objective import GateLossConfig
-from leco_plugin.models.rendering import Intervals, Rays, Shaded, backdrop_of, mapped_middles
+from leco_plugin.models.rendering import Intervals, Rays, backdrop_of, mapped_middles
 from leco_plugin.occupancy import CAMERAS_THAT_VOUCH, Precision, gate_precision
 from leco_plugin.scenes.input_error import require
 
