@@ -56,14 +56,17 @@ def make_scene(
     require(threads >= 0, "threads", threads, "0 for all, or a number of them")
     pycolmap = load_pycolmap()
     out, began = out.absolute(), time.monotonic()
-    photographs = find_photographs(folder.absolute(), out)
-    if finished := _take_up(out, photographs, {"lens": lens, "size": size}):
+    found = find_photographs(folder.absolute(), out)
+    if finished := _take_up(out, found.photographs, {"lens": lens, "size": size}):
         print(f"{out} already holds this scene: nothing is done")
         return finished
-    _require_disk(out, photographs)
+    _require_disk(out, found.photographs)
     with resumable(print):
         with bar("copying photographs") as show:
-            copy_photographs(photographs, out / "images", show)
+            found = copy_photographs(found, out / "images", show)
+        for line in list(found.refused.values())[:NAMED]:
+            print(f"left out: {line}")
+        photographs = found.photographs
         exifs = [each.exif for each in photographs]
         origin, places = local_places(pycolmap, [exif.position for exif in exifs])
         chosen = choose_pairs([each.name for each in photographs], exifs, places)
@@ -75,7 +78,9 @@ def make_scene(
     gps = {each.name: gps for each, gps in zip(photographs, places)}
     placement = _put_in_the_world(pycolmap, models[0], gps)
     sources = {each.name: str(each.path.relative_to(folder.absolute())) for each in photographs}
+    refused = sorted(str(path.relative_to(folder.absolute())) for path in found.refused)
     report = _report(models, sources, placement) | {
+        "not_read": refused,
         "pairs": len(chosen.pairs),
         "pairs_by": chosen.reason,
         "seconds": round(time.monotonic() - began, 1),
@@ -166,6 +171,8 @@ def summary(report: dict[str, Any]) -> list[str]:
         f"{placed} of {count} photographs are placed, with {report['points']} points "
         f"({report['reprojection_error']:.2f} pixels mean error)"
     ]
+    if unread := report["not_read"]:
+        lines.append(f"left out, as they cannot be read: {_some(unread)}")
     if lost := report["not_placed"]:
         lines.append(f"not placed: {_some(lost)}")
     if blocks := report["other_blocks"]:

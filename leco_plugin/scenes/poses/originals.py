@@ -14,7 +14,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from datetime import datetime
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 from PIL import ExifTags, Image
 
@@ -22,6 +22,7 @@ from leco_plugin.scenes.input_error import InputError, one_line
 from leco_plugin.scenes.photograph_files import Header, check_kind, decode, header_of, is_plain
 from leco_plugin.scenes.whole_files import write_whole
 
+T = TypeVar("T")
 INCH, CENTIMETRE = 25.4, 10.0
 UNITS = {2: INCH, 3: CENTIMETRE, 4: 1.0}
 """EXIF's FocalPlaneResolutionUnit, in millimetres."""
@@ -156,9 +157,17 @@ class Photograph:
         return upright and self.path.suffix.lower() in COPIED
 
 
-def find_photographs(folder: Path, out: Path) -> list[Photograph]:
+class Found(NamedTuple):
+    """What a folder holds."""
+
+    photographs: list[Photograph]
+    refused: dict[Path, str]
+    """Files that cannot be used, each with a line that says why."""
+
+
+def find_photographs(folder: Path, out: Path) -> Found:
     """The photographs in a folder and below it, by name, but for what lies in `out`. InputError if
-    there is no such folder, it has fewer than three, or one cannot be used."""
+    there is no such folder, or it has fewer than three that can be used."""
     if not folder.is_dir():
         raise InputError(f"there is no folder {folder}: give the one with the photographs")
     if folder.is_relative_to(out):
@@ -181,15 +190,36 @@ def find_photographs(folder: Path, out: Path) -> list[Photograph]:
             remedy = f"give the folder that holds them; files that end in {kinds} are read"
         raise InputError(f"{folder} has {number}, and {FEWEST} or more are needed: {remedy}")
     _allow_heic([path for path in found if path.suffix.lower() in HEIC])
-    photographs = [_read(path, folder) for path in found]
+    refused: dict[Path, str] = {}
+    photographs = [each for path in found if (each := _or_why(_read, path, folder, refused))]
     _refuse_mixed_alpha(photographs)
-    if len({photograph.name.lower() for photograph in photographs}) == len(photographs):
-        return photographs
-    digits = len(str(len(photographs)))
-    return [
-        replace(each, name=f"{number:0{digits}}_{each.name}")
-        for number, each in enumerate(photographs)
-    ]
+    if len({photograph.name.lower() for photograph in photographs}) < len(photographs):
+        digits = len(str(len(photographs)))
+        photographs = [
+            replace(each, name=f"{number:0{digits}}_{each.name}")
+            for number, each in enumerate(photographs)
+        ]
+    return _enough(Found(photographs, refused))
+
+
+def _enough(found: Found) -> Found:
+    """What was found. InputError if too much of it cannot be used."""
+    used, refused = len(found.photographs), len(found.refused)
+    if used < FEWEST:
+        left = f"{used} of {used + refused} photographs can be used, and {FEWEST} are needed"
+        raise InputError(f"{next(iter(found.refused.values()))} ({left})")
+    return found
+
+
+def _or_why(
+    use: Callable[[Path, Any], T], path: Path, how: Any, refused: dict[Path, str]
+) -> T | None:
+    """What `use` makes of a file; None, and the reason is noted, where it raises InputError."""
+    try:
+        return use(path, how)
+    except InputError as error:
+        refused[path] = str(error)
+        return None
 
 
 def _read(path: Path, folder: Path) -> Photograph:
@@ -232,19 +262,23 @@ def _refuse_mixed_alpha(photographs: list[Photograph]) -> None:
         )
 
 
-def copy_photographs(
-    photographs: list[Photograph], folder: Path, show: Callable[[float], None]
-) -> None:
-    """Writes those copies that are not there yet; `show` takes the share that is done. InputError
-    names a photograph whose pixels cannot be decoded."""
-    for number, photograph in enumerate(photographs):
-        if not (folder / photograph.name).is_file():
-            _copy(photograph, folder / photograph.name)
-        show((number + 1) / len(photographs))
+def copy_photographs(found: Found, folder: Path, show: Callable[[float], None]) -> Found:
+    """Writes those copies that are not there yet; `show` takes the share that is done. Returns what
+    was found without the photographs whose pixels cannot be decoded. InputError if fewer than three
+    are left, or a copy cannot be written."""
+    photographs, refused = [], dict(found.refused)
+    for number, photograph in enumerate(found.photographs):
+        copy = folder / photograph.name
+        # plain copies are decoded too: it shows which are cut off
+        if not copy.is_file() and (image := _or_why(decode, photograph.path, True, refused)):
+            _write(photograph, image, copy)
+        if photograph.path not in refused:
+            photographs.append(photograph)
+        show((number + 1) / len(found.photographs))
+    return _enough(Found(photographs, refused))
 
 
-def _copy(photograph: Photograph, path: Path) -> None:
-    image = decode(photograph.path, turn=True)  # also of plain copies: it names those cut off
+def _write(photograph: Photograph, image: Image.Image, path: Path) -> None:
     try:
         if photograph.is_copied:
             with photograph.path.open("rb") as source:

@@ -188,11 +188,13 @@ def test_the_summary_names_some_and_counts_the_rest() -> None:
     report = {
         **{"photographs": 20, "placed": 8, "points": 9, "reprojection_error": 0.5},
         "not_placed": [f"{number}.jpg" for number in range(12)],
+        "not_read": ["cut.jpg"],
         "other_blocks": [],
         "gps": {"used": True, "photographs": 8, "median_metres": 1.234, "most_metres": 5.0},
     }
     assert summary(report) == [
         "8 of 20 photographs are placed, with 9 points (0.50 pixels mean error)",
+        "left out, as they cannot be read: cut.jpg",
         "not placed: 0.jpg, 1.jpg, 2.jpg, 3.jpg, 4.jpg and 7 more",
         "more overlap between neighbours places more photographs",
         "in metres by the GPS of 8 photographs: they are off by 1.23 m (median) and 5.00 m at most",
@@ -206,18 +208,25 @@ def test_commands_to_copy_hold_names_with_blanks_together() -> None:
 
 
 def test_a_photograph_that_is_mended_before_features_are_sought_begins_anew(
-    pycolmap: Any, photos: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    pycolmap: Any,
+    photos: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
 ) -> None:
     folder, out = tmp_path / "photos", tmp_path / "out"
     shutil.copytree(photos, folder)
     last = sorted(folder.iterdir())[-1]
     whole = last.read_bytes()
     last.write_bytes(whole[:-200])
-    with pytest.raises(InputError, match="is the file whole"):
-        make_scene(folder, out)
-    last.write_bytes(whole)
     stopped = InputError("at the features")
     monkeypatch.setattr(pycolmap, "import_images", lambda *_: (_ for _ in ()).throw(stopped))
+    with pytest.raises(InputError, match="at the features"):
+        make_scene(folder, out)
+    said = capsys.readouterr().out
+    assert f"left out: {last} cannot be read" in said and "is the file whole" in said
+    assert not (out / "images" / last.name).exists()
+    last.write_bytes(whole)
     with pytest.raises(InputError, match="at the features"):
         make_scene(folder, out)
     assert (out / "images" / last.name).read_bytes() == whole

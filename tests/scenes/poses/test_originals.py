@@ -47,12 +47,13 @@ def test_a_turned_photograph_is_copied_upright_with_its_exif(folder: Path, tmp_p
     with Image.open(folder / "IMG_1.jpg") as image:
         image.rotate(90, expand=True).save(folder / "IMG_3.jpg", quality=95, exif=exif)
         upright = np.asarray(image, dtype=float)
-    found = {each.path.name: each for each in find_photographs(folder, tmp_path / "out")}
+    photographs = find_photographs(folder, tmp_path / "out").photographs
+    found = {each.path.name: each for each in photographs}
     assert found["IMG_3.jpg"].size == (32, 24)
     copy = copies(folder, tmp_path / "out")["IMG_3.jpg"]
     assert copy.size == (32, 24) and copy.getexif()[0x0112] == 1
     assert np.abs(np.asarray(copy, dtype=float) - upright).mean() < 20.0
-    again = find_photographs(tmp_path / "out" / "images", tmp_path / "x")
+    again = find_photographs(tmp_path / "out" / "images", tmp_path / "x").photographs
     assert [each.exif.position for each in again][3] == found["IMG_3.jpg"].exif.position
 
 
@@ -78,7 +79,7 @@ def test_photographs_of_other_folders_and_names_do_not_collide(
     for place in ("a/b.jpg", "a_b.jpg", "more of it/IMG 0.JPG"):
         (folder / place).parent.mkdir(exist_ok=True)
         (folder / place).write_bytes((folder / "IMG_0.jpg").read_bytes())
-    names = [each.name for each in find_photographs(folder, tmp_path / "out")]
+    names = [each.name for each in find_photographs(folder, tmp_path / "out").photographs]
     assert len({name.lower() for name in names}) == 6
     assert not any(" " in name or "/" in name for name in names)
     assert sum(name.endswith("more_of_it_IMG_0.JPG") for name in names) == 1
@@ -87,7 +88,7 @@ def test_photographs_of_other_folders_and_names_do_not_collide(
 def test_a_number_that_tells_two_apart_is_nobody_elses_name(tmp_path: Path) -> None:
     for number, name in enumerate(("1_x_y.jpg", "x y.jpg", "x_y.jpg")):
         Image.new("RGB", (20, 20), (60 * number, 0, 0)).save(tmp_path / name)
-    names = [each.name for each in find_photographs(tmp_path, tmp_path / "out")]
+    names = [each.name for each in find_photographs(tmp_path, tmp_path / "out").photographs]
     assert len(set(names)) == 3
 
 
@@ -99,7 +100,7 @@ def test_a_scene_that_would_hold_the_photographs_is_refused(folder: Path) -> Non
 
 def test_a_scene_inside_the_folder_is_left_aside(folder: Path) -> None:
     copies(folder, folder / "scene")
-    assert len(find_photographs(folder, folder / "scene")) == 3
+    assert len(find_photographs(folder, folder / "scene").photographs) == 3
 
 
 def test_thumbnails_in_hidden_folders_are_left_aside(folder: Path, tmp_path: Path) -> None:
@@ -107,13 +108,13 @@ def test_thumbnails_in_hidden_folders_are_left_aside(folder: Path, tmp_path: Pat
     hidden.mkdir(parents=True)
     (hidden / "IMG_0.jpg").write_bytes((folder / "IMG_0.jpg").read_bytes())
     (folder / "._IMG_0.jpg").write_bytes(b"of another system")
-    assert len(find_photographs(folder, tmp_path / "out")) == 3
+    assert len(find_photographs(folder, tmp_path / "out").photographs) == 3
 
 
 def test_photographs_of_one_lens_and_size_share_it(folder: Path, tmp_path: Path) -> None:
     with Image.open(folder / "IMG_0.jpg") as image:
         image.crop((0, 0, 20, 20)).save(folder / "IMG_3.jpg")
-    lenses = [each.lens for each in find_photographs(folder, tmp_path / "out")]
+    lenses = [each.lens for each in find_photographs(folder, tmp_path / "out").photographs]
     assert lenses[0] == lenses[1] == lenses[2] != lenses[3]
 
 
@@ -127,12 +128,8 @@ def test_what_cannot_be_used_is_named_with_a_remedy(folder: Path, tmp_path: Path
     (folder / "IMG_0.jpg").write_bytes(whole[:-100])
     refused(r"IMG_0.jpg cannot be read .*: is the file whole")
     (folder / "IMG_0.jpg").write_bytes(b"no image")
-    refused(r"IMG_0.jpg cannot be read as an image: .*save it as JPEG")
+    refused(r"IMG_0.jpg cannot be read as an image: .*save it as JPEG.*2 of 3 photographs can be")
     (folder / "IMG_0.jpg").write_bytes(whole)
-    deep = np.zeros((24, 32), dtype=np.uint16)
-    Image.fromarray(deep).save(folder / "deep.png")
-    refused(r"deep.png .*8 bits a channel")
-    (folder / "deep.png").unlink()
     Image.new("RGBA", (32, 24)).save(folder / "clear.png")
     refused(r"1 of 4 photographs have an alpha channel, .*clear.png: give it to all")
     (folder / "clear.png").unlink()
@@ -140,11 +137,35 @@ def test_what_cannot_be_used_is_named_with_a_remedy(folder: Path, tmp_path: Path
     refused("has 2 photographs, and 3 or more are needed: take more")
 
 
+def test_a_photograph_of_many_that_cannot_be_used_is_left_out(folder: Path, tmp_path: Path) -> None:
+    whole = (folder / "IMG_0.jpg").read_bytes()
+    (folder / "cut.jpg").write_bytes(whole[:-100])
+    (folder / "none.jpg").write_bytes(b"")
+    Image.fromarray(np.zeros((24, 32), dtype=np.uint16)).save(folder / "deep.png")
+    found = find_photographs(folder, tmp_path / "out")
+    assert len(found.photographs) == 4  # what is cut off shows when it is decoded
+    shares: list[float] = []
+    left = copy_photographs(found, tmp_path / "out" / "images", shares.append)
+    names = [each.name for each in left.photographs]
+    assert names == ["IMG_0.jpg", "IMG_1.jpg", "IMG_2.jpg"] and shares[-1] == 1.0
+    assert sorted(path.name for path in (tmp_path / "out" / "images").iterdir()) == names
+    reasons = {path.name: line for path, line in left.refused.items()}
+    assert reasons.keys() == {"cut.jpg", "none.jpg", "deep.png"}
+    assert "is the file whole" in reasons["cut.jpg"]
+    assert "8 bits a channel" in reasons["deep.png"]
+
+
+def test_a_copy_that_cannot_be_written_ends_the_work(folder: Path, tmp_path: Path) -> None:
+    (tmp_path / "out").write_bytes(b"a file where the folder should be")
+    with pytest.raises(InputError, match="cannot be written"):
+        copies(folder, tmp_path / "out")
+
+
 def test_damaged_exif_is_no_reason_to_refuse(folder: Path, tmp_path: Path) -> None:
     damaged = b"Exif\0\0MM\0*\0\0\0\x08\xff\xff" + 9 * b"\xfe"
     with Image.open(folder / "IMG_0.jpg") as image:
         image.save(folder / "IMG_3.jpg", exif=damaged)
-    found = find_photographs(folder, tmp_path / "out")
+    found = find_photographs(folder, tmp_path / "out").photographs
     assert [each.exif.position is None for each in found] == [False, False, False, True]
 
 
