@@ -38,7 +38,7 @@ from leco_plugin.evaluation.report import (
     write_json,
 )
 from leco_plugin.evaluation.timed_run import RAYS_AT_ONCE, run_training, set_up
-from leco_plugin.models import rendering
+from leco_plugin.models import front_to_back, rendering
 from leco_plugin.models.compute.device import fast_precision
 from leco_plugin.models.gate import Gate
 from leco_plugin.models.leco import LecoModel
@@ -102,6 +102,7 @@ def name_mixture(parts: Parts, model: LecoModel) -> None:
     parts.name_everywhere(rendering.weigh, "weights", floors.of_weights)
     for function in (rendering.composite, rendering.sum_up):
         parts.name_everywhere(function, "weights")
+    parts.name_everywhere(front_to_back.shade_natively, "front to back", floors.of_shaded)
     name_gates(parts, "gate")
 
 

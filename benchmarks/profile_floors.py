@@ -69,6 +69,11 @@ def of_samples(result: Any, *_: Any, **__: Any) -> Work:
     return Work(bytes=kept * (INTERVAL + POSITION))
 
 
+def of_shaded(result: Any, *_: Any, **__: Any) -> Work:
+    """A rendering in one routine, which says what it has shaded and how much; no floor is known."""
+    return Work(samples=len(result[1].t_starts))
+
+
 def of_gate(result: Tensor, asked: Any, positions: Tensor, *_: Any, **__: Any) -> Work:
     """`Gate.forward`, or what an `Occupancy` asks its gate."""
     gate, places = getattr(asked, "gate", asked), number_of(positions)

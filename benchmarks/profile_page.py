@@ -9,7 +9,7 @@ from page_parts import machine_line, made_line, table
 
 PARTS = (
     *("data", "candidates", "sampling", "gate", "encoding", "experts", "field", "colour"),
-    *("weights", "loss", "optimizer", "rest"),
+    *("weights", "front to back", "loss", "optimizer", "rest"),
 )
 """In the order of a step."""
 BUSY = 0.5
@@ -29,7 +29,8 @@ def profile_sections(report: dict[str, Any]) -> list[str]:
         "A backward operation belongs to the part whose forward has made its node. The *floor* is "
         "what a part's bytes and operations take at the speed at which this machine copies and "
         "multiplies matrices, each value moved once: a part far above its floor has room. "
-        "What fits a cache may be faster.\n",
+        "What fits a cache may be faster. *Front to back* is one routine in C for encoding, experts, "
+        "colour and weights of a view.\n",
     ]
     for scene, methods in report["scenes"].items():
         for method, row in methods.items():
