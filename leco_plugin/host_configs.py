@@ -116,3 +116,16 @@ leco_switch_nerf = MethodSpecification(
     config=_switch_nerf("leco-switch-nerf", guided(switch_nerf_host)),
     description="Switch-NeRF, guided by learned occupancy instead of coarse and fine samples.",
 )
+
+mega_nerf_host = replace(
+    switch_nerf_host,
+    sizes=replace(
+        switch_nerf_host.sizes, field=replace(switch_nerf_host.sizes.field, routing="nearest")
+    ),
+    balance=0.0,
+)
+
+leco_mega_nerf = MethodSpecification(
+    config=_switch_nerf("leco-mega-nerf", guided(mega_nerf_host)),
+    description="Mega-NeRF's fixed shares of the ground, guided by learned occupancy.",
+)

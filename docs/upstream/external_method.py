@@ -37,6 +37,10 @@ To enable LeCO-NeRF, you must install it first by running:
                 "Switch-NeRF, guided by learned occupancy instead of coarse and fine samples.",
             ),
             (
+                "leco-mega-nerf",
+                "Mega-NeRF's fixed shares of the ground, guided by learned occupancy.",
+            ),
+            (
                 "switch-nerf",
                 "Switch-NeRF, unguided: coarse and fine samples, a gate among equal experts.",
             ),

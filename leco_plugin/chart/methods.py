@@ -68,6 +68,7 @@ METHOD_NAMES = {
     "leco-ngp": "Instant-NGP",
     "leco-nerfacto": "Nerfacto",
     "leco-switch-nerf": "Switch-NeRF",
+    "leco-mega-nerf": "Mega-NeRF",
 }
 """Names beside that of a sampler; other methods keep their own."""
 

@@ -27,7 +27,13 @@ from leco_plugin.models.rendering import (
     mapped_middles,
     with_backdrop,
 )
-from leco_plugin.models.switch.field import NEW_DENSITY, Answers, SwitchField, SwitchNerfModelConfig
+from leco_plugin.models.switch.field import (
+    NEW_DENSITY,
+    Answers,
+    NearestOnTheGround,
+    SwitchField,
+    SwitchNerfModelConfig,
+)
 from leco_plugin.models.switch.rendering import (
     coarse_and_fine,
     keep_candidates,
@@ -146,6 +152,9 @@ class SwitchNerfModel(Model):
         rule = marching_rule(bounds.kind, bounds.near, bounds.far, candidates, median_length)
         self.step.fill_(rule[0])
         self.cone.fill_(rule[1])
+        if isinstance(self.field.gate, NearestOnTheGround):
+            corners = self.region.space.map(self.region.aabb.view(2, 3)).clamp(-1.0, 1.0)
+            self.field.gate.spread(corners[0, :2], corners[1, :2])
         if isinstance(self.occupancy_grid, OccupancyGridEstimator):
             self._sample_with_grid(1 if bounds.kind == "box" else self.config.grid_levels)
 

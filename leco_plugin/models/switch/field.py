@@ -1,5 +1,7 @@
 """The field of Switch-NeRF: one projection, a gate, equal experts, shared heads (section 3).
 
+With fixed shares in place of the gate it is that of Mega-NeRF, but for what experts share.
+
 The paper's network between expert and colour has one more linear layer without activation before
 another linear layer; the two are one here. The settings of `switch-nerf` stand below.
 """
@@ -35,6 +37,9 @@ class SwitchFieldConfig:
     """Octaves of the encoding of the mapped position."""
     experts: int = 8
     """Number of experts."""
+    routing: Literal["learned", "nearest"] = "learned"
+    """Who has a point: the expert that a gate chooses, or the nearest on the ground, as in
+    Mega-NeRF."""
     width: int = 256
     """Units of each layer of an expert and of the gate."""
     layers: int = 7
@@ -82,8 +87,36 @@ class SwitchGate(nn.Module):
         return logits_of(features, self.norm, self.head)
 
 
+class NearestOnTheGround(nn.Module):
+    """Fixed shares in place of a gate, as in Mega-NeRF: centroids stand in rows and columns on the
+    ground, and a point belongs to the nearest one."""
+
+    centroids: Tensor
+    """[experts, 2] x and y of mapped positions."""
+
+    def __init__(self, experts: int) -> None:
+        super().__init__()
+        self.register_buffer("centroids", torch.empty(experts, 2))
+        self.spread(torch.tensor([-1.0, -1.0]), torch.tensor([1.0, 1.0]))
+
+    def spread(self, low: Tensor, high: Tensor) -> None:
+        """Places the centroids in the middles of equal parts, as square as can be, of the ground
+        between two corners, x and y of mapped positions."""
+        experts, (width, depth) = len(self.centroids), (high - low).tolist()
+        divisors = [count for count in range(1, experts + 1) if experts % count == 0]
+        columns = min(divisors, key=lambda c: abs(math.log((width / c) / (depth / (experts // c)))))
+        counts = columns, experts // columns
+        x, y = ((torch.arange(count) + 0.5) / count for count in counts)
+        shares = torch.cartesian_prod(x, y).to(low)
+        self.centroids.copy_(low + shares * (high - low))
+
+    def forward(self, mapped: Tensor) -> Tensor:
+        """[N, 3] in [-1, 1] to [N, experts] float32, the negative squares of the distances."""
+        return -torch.cdist(mapped[:, :2].float(), self.centroids).square()
+
+
 class SwitchField(nn.Module):
-    """Density and colour of mapped positions, each from the expert that the gate chose.
+    """Density and colour of mapped positions, each from the expert that has them.
 
     Attributes:
         density_scale: factor of the density, 1 in the paper; see `hosts/host_watch.py`.
@@ -95,7 +128,11 @@ class SwitchField(nn.Module):
         self.density_scale = 1.0
         self.encoding = FrequencyEncoding(config.octaves)
         self.projection = nn.Linear(self.encoding.out_dim, config.width)
-        self.gate = SwitchGate(config.width, config.gate_layers, config.experts)
+        self.gate: SwitchGate | NearestOnTheGround = (
+            SwitchGate(config.width, config.gate_layers, config.experts)
+            if config.routing == "learned"
+            else NearestOnTheGround(config.experts)
+        )
         self.experts = nn.ModuleList(
             Expert(config.width, config.layers, config.skip) for _ in range(config.experts)
         )
@@ -121,14 +158,21 @@ class SwitchField(nn.Module):
         """
         count = len(mapped)
         projected = self.projection(self.encoding(pad_to_steady_size(mapped)))
-        logits = self.gate(projected)[:count]
-        gate_values, routes = logits.softmax(dim=-1).max(dim=-1)
+        logits, gate_values, routes = self._route(mapped, projected)
         features = self._mixture(projected[:count], routes, gate_values, capacity_factor)
         raw = self.density_head(pad_to_steady_size(features))[:count, 0].float()
         if noise > 0.0:
             raw = raw + noise * torch.randn_like(raw)
         sigmas = self.density_scale * nn.functional.softplus(raw + SHIFT)
         return Answers(sigmas, features, logits, routes)
+
+    def _route(self, mapped: Tensor, projected: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Logits [N, experts], and the factor and expert [N] of each point."""
+        if isinstance(self.gate, NearestOnTheGround):
+            logits = self.gate(mapped)
+            return logits, torch.ones_like(logits[:, 0]), logits.argmax(dim=-1)
+        logits = self.gate(projected)[: len(mapped)]
+        return logits, *logits.softmax(dim=-1).max(dim=-1)
 
     def _mixture(
         self, projected: Tensor, routes: Tensor, gate_values: Tensor, capacity_factor: float | None

@@ -218,7 +218,7 @@ def switch_losses(shaded: Shaded, truth: Tensor, balance: float) -> dict[str, Te
         balance: weight of the balanced gate loss.
     """
     losses = {"rgb_loss": torch.nn.functional.mse_loss(shaded.rgb, truth)}
-    if len(shaded.routes) > 0:
+    if balance > 0.0 and len(shaded.routes) > 0:
         probabilities = shaded.logits.softmax(dim=-1)
         losses["gate_loss"] = balance * balance_loss(probabilities, shaded.routes)
     return losses
