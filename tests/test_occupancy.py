@@ -263,6 +263,18 @@ def test_a_header_of_nonsense_is_refused_in_one_line(key: str, sound, tmp_path: 
     assert is_refused_or_the_same(path, tensors)
 
 
+@pytest.mark.parametrize("key", ["report", "precision"])
+def test_a_sound_header_that_is_not_the_saved_one_is_refused(key, sound, tmp_path: Path) -> None:
+    """What was declared is under the checksum as the weights are."""
+    header, tensors = parts(sound, tmp_path)
+    other = {"report": json.dumps({"image_price_db": 0.0}), "precision": "bfloat16"}[key]
+    assert header[key] != other
+    path = tmp_path / "o.safetensors"
+    path.write_bytes(save(tensors, metadata=header | {key: other}))
+    with pytest.raises(ValueError, match="do not match its checksum"):
+        Occupancy.load(path)
+
+
 @pytest.mark.parametrize("kind", GATES)
 def test_a_header_that_claims_another_gate_is_refused(kind: str, tmp_path: Path) -> None:
     saved = occupancy(kind)

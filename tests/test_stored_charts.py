@@ -14,6 +14,8 @@ import readme_parts as parts
 from chart_results import occupancy, results, run
 from results_page import sampling_section
 
+from leco_plugin.chart.findings.learned import learned_of
+from leco_plugin.chart.findings.summary import lines_of
 from leco_plugin.chart.panels import title_of
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -91,11 +93,12 @@ def test_one_that_keeps_less_in_the_median_only_is_named_as_level(store: Store) 
 def test_minutes_are_those_of_runs_two_at_a_time_and_shared_ones_count_once(store: Store) -> None:
     two = {"protocol": {"seconds": 60.0, "at_once": 2}}
     shared = run("A", wall_seconds=120.0)
-    store("enough-time", "fox", shared, run("B", wall_seconds=240.0), **two)
+    store("enough-time", "fox", shared, run("B", wall_seconds=300.0), **two)
     store("grid-resolution", "fox", {**shared, "reused": True}, run("C", wall_seconds=60.0), **two)
     store("freeze", "city", run("A", wall_seconds=60.0), run("B"), **two)
     text = answered()
-    assert "| fox | - | - | - | - | 3 | 2 | 4 |" in text  # 1.5 of the last: 3.0 and 0.5 of its own
+    # 3.5 and 1.5 rounded to even; together 3.5 and 0.5 of its own, with the shared one twice 5
+    assert "| fox | - | - | - | - | 4 | 2 | 4 |" in text
     assert "| city | - | - | - | - | - | - | - |" in text
 
 
@@ -260,3 +263,18 @@ def test_every_picture_says_its_finding_in_ten_words() -> None:
         title = title_of(json.loads(path.read_text()))
         words = [word for word in title.split() if any(map(str.isalnum, word))]
         assert len(words) <= 10, f"{path.stem}: {title}"
+
+
+def test_a_rival_is_better_only_where_it_is_ahead_in_one_and_not_behind_in_the_other() -> None:
+    def answer(kept: float, psnr: float) -> bool:
+        shares = {"A (ours)": 0.1, "B": kept}
+        runs = [
+            run(name, seed, occupancy=occupancy(51_000, share + 1e-3 * seed), psnr=db + 0.1 * seed)
+            for (name, share), db in zip(shares.items(), (20.0, psnr))
+            for seed in range(3)
+        ]
+        return answers._none_is_better(learned_of(lines_of(results(*runs, **STEPS))))
+
+    assert answer(0.1, 20.0), "who is level is not better"
+    assert answer(0.3, 22.0) and answer(0.02, 18.0), "who pays for what it gains is not better"
+    assert not answer(0.1, 22.0) and not answer(0.02, 20.0) and not answer(0.02, 22.0)

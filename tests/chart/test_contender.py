@@ -143,3 +143,9 @@ def test_a_setting_that_the_method_has_not_is_named() -> None:
     wrong = replace(contenders(["leco-occupancy"])[0], changes={"sizes.gates": 1})
     with pytest.raises(ValueError, match="'gates'"):
         config_of(wrong, DATA, FOLDER)
+
+
+def test_a_learning_time_of_a_contenders_own_is_not_the_charts() -> None:
+    one = replace(contenders(["leco-ngp"])[0], changes={"occupancy.seconds": 3.0})
+    config: Any = config_of(one, DATA, FOLDER, learn_seconds=7.0)
+    assert config.pipeline.model.occupancy.seconds == 3.0

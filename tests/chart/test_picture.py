@@ -81,6 +81,14 @@ def test_the_front_of_the_curves_is_the_best_that_anybody_has_reached_by_then() 
     assert (np.diff(best) >= 0.0).all()
 
 
+def test_nobody_has_reached_anything_before_the_first_point_of_a_curve() -> None:
+    early = run("A", curve=[[2.0, 10.0], [8.0, 14.0]])
+    late = run("B", curve=[[6.0, 13.5], [8.0, 16.0]])
+    times, best = best_so_far(lines_of(results(early, late)))
+    assert np.interp(4.0, times, best) == pytest.approx(11.3, abs=0.1)
+    assert np.interp(6.1, times, best) == pytest.approx(13.6, abs=0.1)
+
+
 def test_one_run_with_one_point_is_drawn(tmp_path: Path) -> None:
     alone = run("A", curve=[[9.0, 20.0]], learn_seconds=None, field_queries_per_ray=0.0)
     assert draw(results(alone), tmp_path / "chart.png").stat().st_size > 10_000

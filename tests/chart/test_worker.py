@@ -7,10 +7,12 @@ import json
 from collections.abc import Callable
 from dataclasses import asdict, replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
 import torch
+from small_learner import small_mixture
 
 from leco_plugin.chart import worker
 from leco_plugin.chart.contender import Contender, Protocol, config_of
@@ -18,6 +20,7 @@ from leco_plugin.chart.methods import SUITES
 from leco_plugin.chart.runner import FAILURE, JOB, PROGRESS, RESULT
 from leco_plugin.chart.worker import main, run_job, train_job
 from leco_plugin.evaluation import equal_loss, timed_run
+from leco_plugin.models.gate import Gate, GateConfig
 
 SMALL = {
     "sizes.field.encoding.levels": 2,
@@ -242,3 +245,23 @@ def test_every_contender_of_every_suite_can_be_trained(
     run = run_job(smaller(one), 0, tiny_scene, short, tmp_path)
     assert run["steps"] == 6 and run["psnr"] > 0.0
     assert (run["occupancy"] is not None) == one.sampler.startswith("learned-occupancy")
+
+
+def test_what_is_measured_at_freezing_is_the_gate_of_then_and_no_small_one(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    mixture = small_mixture()
+    at_freezing = worker._weights_of(mixture)
+    small, head = Gate(GateConfig(width=8, layers=1)), mixture.gate.head.bias.detach().clone()
+    mixture.sharpen(small, 0.3, {})
+    mixture.gate.head.bias.add_(1.0)
+
+    def compared(model: Any, *_: Any) -> dict[str, Any]:
+        assert model.mixture.small is None and torch.equal(model.mixture.gate.head.bias, head)
+        return {"grids": []}
+
+    monkeypatch.setattr(worker, "compare_at_freezing", compared)
+    pipeline = SimpleNamespace(model=SimpleNamespace(mixture=mixture), datamanager=None)
+    trainer: Any = SimpleNamespace(pipeline=pipeline)
+    assert worker._at_freezing(trainer, at_freezing, ONE) == {"grids": []}
+    assert mixture.small is small and torch.equal(mixture.gate.head.bias, head + 1.0)

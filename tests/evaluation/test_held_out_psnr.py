@@ -90,3 +90,21 @@ def test_at_the_end_test_photographs_are_looked_at() -> None:
     assert psnr.look_at_tests() == pytest.approx(20.0, abs=1e-4)  # 0.9 + 0.1 is not above white
     assert host.training and psnr.of_one_colour == pytest.approx(10.6, abs=0.3)
     assert HeldOutPsnr(host, SimpleNamespace(train_dataset=host)).look_at_tests() is None
+
+
+def test_drawing_the_pixels_is_counted_as_time_that_measuring_takes(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    clock = Clock()
+
+    def draw(_: Any, count: int, share: str) -> tuple[torch.Tensor, torch.Tensor]:
+        clock.now += 5.0
+        return torch.zeros(count, 3), torch.rand(count, 3)
+
+    monkeypatch.setattr(held_out_psnr, "time", clock)
+    monkeypatch.setattr(held_out_psnr, "true_colours", lambda model, truth: truth)
+    monkeypatch.setattr(held_out_psnr, "held_out_bundle", draw)
+    psnr = HeldOutPsnr(Host(clock, 0.5), None)
+    for spent in (5.5, 6.0):  # the second time of the same pixels
+        psnr._measure(held_out_psnr.RAYS)
+        assert psnr.spent == pytest.approx(spent) and psnr.cost == pytest.approx(0.5)

@@ -145,6 +145,13 @@ def test_teaching_takes_its_share_of_the_time(made: Any, monkeypatch: pytest.Mon
     assert taught[0] == 1 and 3 <= len(taught) <= 4, "a tenth of the time"
 
 
+def test_a_gate_is_said_to_have_cost_all_the_teaching_until_then(made: Any) -> None:
+    made.teacher.spent = 100.0
+    made.teacher._teach(1)
+    assert made.guide.the_occupancy().threshold > OPEN
+    assert 100.0 < made.guide.the_occupancy().report["train_seconds"] < 200.0
+
+
 @pytest.mark.parametrize("why", ["no densities", "one process", "sharpening.steps 0"])
 def test_who_cannot_teach_is_told_what_to_do(made: Any, why: str) -> None:
     host: nn.Module = nn.Linear(1, 1) if why == "no densities" else made.host

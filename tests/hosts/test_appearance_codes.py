@@ -14,7 +14,7 @@ from nerfstudio.models.nerfacto import NerfactoModelConfig
 from small_hosts import what_a_model_gets
 from torch import nn
 
-from leco_plugin.hosts.appearance import SmallCodes
+from leco_plugin.hosts.appearance import SmallCodes, show_from
 from leco_plugin.hosts.guided import GuidedModelConfig
 from leco_plugin.hosts.guided_start import OccupancyConfig
 from leco_plugin.models.field import codes_nearby
@@ -125,3 +125,14 @@ def test_a_host_of_another_package_gets_a_line_about_what_was_done_and_what_not(
     built(config, "own")
     built(HOSTS["instant-ngp"])
     assert "codes" not in capsys.readouterr().out
+
+
+def test_rays_of_several_views_at_once_have_the_mean_code() -> None:
+    small = SmallCodes(2, 8)
+    nn.init.normal_(small.embedding.weight, std=30.0)
+    small.places = torch.tensor([[0.0, 0.0, 0.0], [9.0, 0.0, 0.0]])
+    mean = 0.1 * small.embedding.weight.mean(dim=0)
+    show_from(small, small.places[:1].expand(5, 3))
+    assert not torch.allclose(small.mean(), mean, atol=0.1)
+    show_from(small, small.places)
+    torch.testing.assert_close(small.mean(), mean)

@@ -9,6 +9,7 @@ from typing import Any
 import pytest
 import torch
 from ball_occupancy import ball_of_the_tiny_scene
+from nerfstudio.cameras.cameras import Cameras
 from nerfstudio.cameras.rays import RayBundle
 from nerfstudio.data.datamanagers.base_datamanager import VanillaDataManagerConfig
 from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataParserConfig
@@ -331,3 +332,16 @@ def test_a_full_disk_does_not_end_a_run_that_has_its_occupancy(
     begun.before_step(0)
     said = " ".join(capsys.readouterr().out.split())
     assert "could not be written" in said and "No space left on device" in said
+
+
+@pytest.mark.parametrize(("kind", "reach"), [("box", 1.0), ("contraction", 8.0)])
+def test_of_an_unbounded_scene_rays_are_looked_at_far_beyond_its_inner_cube(
+    kind: Any, reach: float
+) -> None:
+    """Most of what a street shows lies there."""
+    gate, eye = Gate(GateConfig(EncodingConfig(octaves=1), 8, 1, 2)), torch.eye(3, 4)[None]
+    occupancy = Occupancy(gate, Space(kind, (0.0, 0.0, 0.0), 0.5), 0.0).eval()
+    camera = Cameras(eye, 1000.0, 1000.0, 1.0, 1.0, 2, 2)  # along -z, from the middle
+    found = along_rays(Guide(), occupancy, camera)
+    torch.testing.assert_close(found.lengths, torch.full_like(found.lengths, 0.5 * reach))
+    assert found.share_kept(0.0) == pytest.approx(1.0)

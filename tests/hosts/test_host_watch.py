@@ -129,6 +129,14 @@ def test_a_price_beyond_its_bound_lowers_the_threshold_until_it_is_not(watched: 
     assert len(watched.asked) == measured  # nothing is skipped, nothing is lost
 
 
+def test_figures_stay_those_of_the_calibrated_threshold_however_often_it_is_lowered() -> None:
+    once = host_watch._lowered({"empty_fraction": 0.8, "threshold": 0.4}, 0.4, 100, 0.1)
+    twice = host_watch._lowered(once, 0.1, 200, 0.025)
+    assert once[CALIBRATED_AT] == twice[CALIBRATED_AT] == 0.4
+    assert twice["threshold"] == 0.025 and twice["empty_fraction"] == 0.8
+    assert twice["lowered"] == [[100, 0.1], [200, 0.025]]
+
+
 def test_photographs_with_alpha_are_compared_as_the_host_renders_them(watched: Watched) -> None:
     """White under transparent pixels is black before the black that a random background is when a
     host renders; as it stands in the file it would be an error that hides the price of skipping."""

@@ -13,6 +13,7 @@ from nerfstudio.cameras.rays import RayBundle
 from nerfstudio.viewer.utils import parse_object
 from nerfstudio.viewer.viewer_elements import ViewerElement
 
+from leco_plugin.hosts import stand_ins
 from leco_plugin.hosts.guide import Guide
 from leco_plugin.hosts.host_watch import begin_carefully, end_probation
 from leco_plugin.occupancy import BACKDROP_PRICE, Occupancy
@@ -227,3 +228,18 @@ def test_the_viewer_does_not_ask_a_gate_when_it_looks_for_its_elements(guide: Gu
     host.guide, host.grid = guide, guide.estimator(BOX)
     parse_object(host, ViewerElement, "Custom Elements")
     assert host.grid._built == {}
+
+
+def test_the_backdrop_of_a_ray_whose_back_is_to_the_scene_lies_at_its_end() -> None:
+    """As that of one that misses the walls beside it; one that looks at them ends behind them."""
+    origins = torch.tensor([[0.0, 0.0, 3.0]]).expand(3, 3)
+    directions = torch.tensor([[0.0, 0.0, -1.0], [0.0, 0.0, 1.0], [1.0, 0.0, 0.0]])
+    nothing = torch.zeros(0, dtype=torch.int64), torch.zeros(0), torch.zeros(0)
+    options = {"near_plane": 0.1, "far_plane": 9.0, "render_step_size": 0.5}
+    walls = torch.tensor([-1.0] * 3 + [1.0] * 3)
+    of_rays, starts, ends = stand_ins._ending_in_a_backdrop(
+        nothing, origins, directions, options, walls, (None, None), None
+    )
+    assert of_rays.tolist() == [0, 1, 2]
+    torch.testing.assert_close(ends, torch.tensor([4.0, 9.0, 9.0]))
+    torch.testing.assert_close(starts, ends - 0.5)

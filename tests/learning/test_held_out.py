@@ -15,6 +15,8 @@ from small_learner import SMALLEST, NoPixels, small_mixture
 from leco_plugin.learning.calibration import CalibrationConfig
 from leco_plugin.learning.dense import dense_rendering, evaluating
 from leco_plugin.learning.held_out import HeldOut
+from leco_plugin.learning.sharpening import SharpeningConfig
+from leco_plugin.models.objective import GateLossConfig
 from leco_plugin.scenes import learning_data
 from leco_plugin.scenes.learning_data import count_held_out, held_out_bundle, held_out_rays
 from leco_plugin.scenes.pixels.held_out_pixels import HeldOutPixelSampler, HeldOutPixelSamplerConfig
@@ -117,3 +119,17 @@ def test_prices_are_measured_in_the_appearance_of_each_image() -> None:
         of_the_mean = mixture.shade(unknown, intervals).rgb
     torch.testing.assert_close(of_the_mean[0], of_the_mean[1], atol=1e-6, rtol=0.0)
     assert float((reference.rgb[0] - reference.rgb[1]).abs().max()) > 0.05
+
+
+def test_photographs_that_vouch_do_not_teach_the_small_gate_either() -> None:
+    def training_rays(mixture: Any, count: int, set_aside: int = 0) -> None:
+        raise Asked(count, set_aside)
+
+    data: Any = NoPixels()
+    data.training_rays = training_rays
+    config = CalibrationConfig(cameras=5)
+    with pytest.raises(Asked) as found:
+        HeldOut(small_mixture(), data, config, restarted=False).sharpened(
+            GateLossConfig(), SharpeningConfig(rays=123), guided=False
+        )
+    assert found.value.args == (123, 5)

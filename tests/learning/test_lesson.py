@@ -6,10 +6,11 @@ import pytest
 import torch
 from ball_occupancy import ENCODINGS
 
-from leco_plugin.learning.sharpening import Lesson, round_weights, teach
+from leco_plugin.learning.sharpening import Lesson, lesson_of, round_weights, teach
 from leco_plugin.models.encodings import EncodingConfig
 from leco_plugin.models.gate import Gate, GateConfig, occupancy_logit
 from leco_plugin.models.losses import contribution_loss
+from leco_plugin.models.objective import GateLossConfig
 
 
 def ball_lesson(count: int = 40_000) -> Lesson:
@@ -58,3 +59,19 @@ def test_rounded_weights_are_held_by_bfloat16() -> None:
     gate = Gate(GateConfig()).requires_grad_(False)
     round_weights(gate)
     assert all(torch.equal(p, p.bfloat16().float()) for p in gate.parameters())
+
+
+def test_the_targets_of_a_lesson_are_those_of_the_contribution_loss() -> None:
+    """Of two rays, whose neighbours share the larger weight and whose ends do not."""
+    losses = GateLossConfig(weight_at_full=0.2, emphasis=6.0)
+    weights = torch.tensor([0.0, 0.04, 0.01, 0.0, 0.3, 0.1])
+    of_rays = torch.tensor([0, 0, 0, 1, 1, 1])
+    wide = torch.tensor([0.04, 0.04, 0.04, 0.3, 0.3, 0.3])
+    lesson = lesson_of(torch.zeros(6, 3), weights, of_rays, losses)
+    target = torch.tensor([0.2, 0.2, 0.2, 1.0, 1.0, 1.0])
+    torch.testing.assert_close(lesson.keep, 6.0 * target)
+    torch.testing.assert_close(lesson.skip, 1.0 - target)
+    logits = torch.randn(6, 3)
+    occupied, softplus = occupancy_logit(logits), torch.nn.functional.softplus
+    found = (lesson.keep * softplus(-occupied) + lesson.skip * softplus(occupied)).mean()
+    torch.testing.assert_close(found, contribution_loss(logits, wide, 0.2, 6.0))

@@ -6,6 +6,7 @@ import math
 
 import pytest
 import torch
+from small_learner import small_mixture
 
 from leco_plugin.evaluation.inspection import doubts
 from leco_plugin.learning.quality import (
@@ -13,6 +14,7 @@ from leco_plugin.learning.quality import (
     ONE_COLOUR,
     doubts_of_field,
     doubts_of_occupancy,
+    kept_of_seen,
     psnr_of_one_colour,
 )
 
@@ -43,3 +45,17 @@ def test_inspection_repeats_what_was_said() -> None:
     facts = {"report": {FIELD: 20.0, ONE_COLOUR: 10.4}, **{k: 0.1 for k in facts if "share" in k}}
     facts["seen_share_of_box"] = 0.5
     assert doubts(facts) == []
+
+
+def test_of_a_contraction_only_the_inner_cube_says_what_is_kept_of_what_is_seen() -> None:
+    """Here the gate keeps all of the inner cube, and nothing beyond it."""
+    mixture = small_mixture()
+    mixture.freeze(0.5, {})
+    mixture.occupancies = lambda mapped: (mapped.abs().amax(dim=-1) <= 0.5).float()  # type: ignore
+    assert kept_of_seen(mixture) == 1.0
+    mixture.region.space.set("box", torch.zeros(3), 4.0)
+    assert kept_of_seen(mixture) == pytest.approx(1 / 8, abs=0.02)
+    mixture.region.seen.cells[16:] = False  # a quarter is seen, at the side, of which none is kept
+    assert kept_of_seen(mixture) == 0.0
+    mixture.region.seen.cells[:] = False
+    assert kept_of_seen(mixture) == 0.0

@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+import math
 from types import SimpleNamespace
 from typing import Any
 
 import pytest
 import torch
 
+from leco_plugin.learning.calibration import CalibrationConfig, Measured
 from leco_plugin.learning.quality import views_in_words
+from leco_plugin.learning.sharpening import Sharpened, SharpeningConfig
+from leco_plugin.models.gate import Gate
 from leco_plugin.occupancy import CAMERAS_THAT_VOUCH
 from leco_plugin.scenes import learning_data
 from leco_plugin.scenes.bounds import BoundsConfig
@@ -60,3 +64,29 @@ def test_what_views_may_lose_is_said_in_a_line() -> None:
     line = views_in_words({CAMERAS_THAT_VOUCH: said})
     assert "0.12%" in line and "0.20%, with 90%" in line
     assert "may lose more" in views_in_words({}) == views_in_words({CAMERAS_THAT_VOUCH: None})
+
+
+@pytest.mark.parametrize("guided", [False, True])
+def test_what_views_lose_twice_is_declared_as_a_sum(guided: bool) -> None:
+    """A small gate that is calibrated on a field trained guided loses on top of the large one."""
+    said = {"count": 9, "worst_surface_mass": 0.001, "bound": 0.002, "confidence": 0.9}
+    skipped = Measured(0.5, 0.0, 0.0, 0.0, 0.5)._asdict()
+    before = {"params": 7, **skipped, CAMERAS_THAT_VOUCH: said | {"worst_surface_mass": 0.0005}}
+    config = SharpeningConfig().gate
+    sharpened = Sharpened(Gate(config), Measured(**skipped), Measured(**skipped), said)
+    found = sharpened.report(before, config, guided)[CAMERAS_THAT_VOUCH]
+    earlier = 0.0005 if guided else 0.0
+    assert found["worst_surface_mass"] == pytest.approx(0.001 + earlier)
+    assert found["bound"] == pytest.approx(0.002 + earlier)
+    assert sharpened.promised == said  # which nothing has changed
+
+
+@pytest.mark.parametrize(("times", "fits"), [(9.9, True), (10.1, False)])
+def test_no_error_excuses_a_price_of_more_than_ten_times_its_bound(times, fits: bool) -> None:
+    config, endless = CalibrationConfig(), math.inf
+    for name, bound in (
+        ("lost_surface_mass", config.lost_surface_mass),
+        ("image_price_db", config.image_price_db),
+    ):
+        sure = Measured(0.5, 0.0, 0.0, 0.0, 0.5, endless, endless)
+        assert sure._replace(**{name: times * bound}).within(config) == fits

@@ -7,6 +7,7 @@ from dataclasses import replace
 import pytest
 import torch
 
+from leco_plugin.models.gate import occupancy_from_logits
 from leco_plugin.models.losses import density_loss, imbalanced_gate_loss
 from leco_plugin.models.objective import GateLossConfig, gate_losses
 from leco_plugin.models.rendering import Intervals, Rays, Shaded, backdrop_of
@@ -89,3 +90,14 @@ def test_each_weight_scales_its_own_loss(form: str) -> None:
         changed = [name for name in before if not torch.equal(before[name], after[name])]
         assert len(changed) == 1
         torch.testing.assert_close(after[changed[0]], 2.0 * before[changed[0]])
+
+
+def test_what_the_field_gives_up_is_a_mean_over_rays_not_over_samples() -> None:
+    shaded, intervals = batch()
+    torch.manual_seed(1)
+    weights = torch.rand(10)
+    config = GateLossConfig(agreement=3.0, empty_below=0.9)
+    found = losses_of(config, shaded._replace(weights=weights), intervals)["agreement_loss"]
+    occupied = occupancy_from_logits(shaded.logits.detach())
+    doubt = (1.0 - occupied / 0.9).clamp(min=0.0) * ~ON_BACKDROP
+    torch.testing.assert_close(found.detach(), 3.0 * (weights * doubt).sum() / len(RAYS.origins))

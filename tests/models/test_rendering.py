@@ -18,6 +18,7 @@ from leco_plugin.models.rendering import (
     Routing,
     Shaded,
     backdrop_of,
+    backdrop_starts,
     composite,
     gate_values_and_routes,
     mapped_middles,
@@ -242,3 +243,14 @@ def test_intervals_are_asked_in_their_middles() -> None:
     )
     middles = torch.tensor([[0.0, 0.0, 0.5], [1.0, 1.5, 0.0], [1.0, 3.0, 0.0]])
     torch.testing.assert_close(mapped_middles(space, rays, intervals), middles / 8.0)
+
+
+def test_the_backdrop_of_a_ray_shorter_than_a_step_begins_where_the_ray_does() -> None:
+    """Where some rays are cut off, by a crop, the others keep to where they enter."""
+    rays = some_rays(3)._replace(
+        t_mins=torch.tensor([1.0, 1.0, 1.0]),
+        t_maxs=torch.tensor([1.02, 3.0, 3.0]),
+        cut_off=torch.tensor([False, False, True]),
+    )
+    starts = backdrop_starts(rays, step_size=0.5, cone_angle=0.0)
+    torch.testing.assert_close(starts, torch.tensor([1.0, 2.5, 3.0]))

@@ -170,6 +170,19 @@ def test_the_stretch_bounds_the_mapping_everywhere(cache, balls):
     assert (cells <= bound * (1.0 + 1e-4) + 1e-4).all()
 
 
+def test_the_stretch_bounds_the_mapping_where_it_is_steepest(cache, balls):
+    """Beside an edge of the cubes around the centre, outward along one axis and inward along the
+    other: there the bound is nearly reached, and it grows to 3/2 half extents."""
+    away, half = torch.linspace(1.0, 3.0, 200), float(balls.space.half_extent)
+    along = torch.stack([away, away * (1.0 - 1e-4), 0.0 * away], dim=-1) * half
+    positions, radii = balls.space.center + along, torch.full((200,), 0.04 * half)
+    offset = radii[:, None] * torch.tensor([1.0, -1.0, 0.0])
+    moved = balls.space.map(positions + offset) - balls.space.map(positions)
+    cells = moved.abs().amax(dim=-1) * cache.resolution / 2.0
+    bound = cache._stretch(positions, radii) * radii
+    assert (cells <= bound * (1.0 + 1e-4)).all() and float((cells / bound).max()) > 0.95
+
+
 @pytest.mark.parametrize("constant", [0.0, 1.0])
 def test_a_constant_gate_needs_no_bricks(constant):
     balls = Balls()

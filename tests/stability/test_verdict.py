@@ -137,3 +137,12 @@ def test_seeds_that_are_missing_are_counted() -> None:
     assert judge(runs(25.0), DENSE, missing=2).missing == 2
     assert judge([], DENSE, missing=3).missing == 3
     assert judge([], DENSE, ["out of memory"], missing=2).missing == 2
+
+
+def test_only_surfaces_beyond_the_worst_seed_of_the_reference_count_as_lost() -> None:
+    reference = [run(seed, 25.0, lost_mass=lost) for seed, lost in enumerate((0.0, 0.03, 0.01))]
+    ours = [run(seed, 25.0, lost_mass=lost) for seed, lost in enumerate((0.035, 0.0, 0.0))]
+    cell = judge(ours, reference)
+    assert cell.verdict == "pass" and cell.lost_mass == 0.035
+    ours[0]["measured"]["lost_mass"] = 0.045
+    assert judge(ours, reference).reason == "1.5% of surfaces lost"

@@ -208,3 +208,13 @@ def test_no_estimate_is_a_contradiction() -> None:
     gps = survey(0)[0][:, :, 3]
     placed = place(estimates(None), gps, gps, np.array([0.0, 0.0, 1.0]))
     assert placed.residuals is None and ": 0 of 24 positions agree within 5.0 m" in placed.reason
+
+
+@pytest.mark.parametrize("first", [179.9999, -179.9999])
+def test_the_origin_of_places_around_the_180th_meridian_is_among_them(first: float) -> None:
+    pycolmap = pytest.importorskip("pycolmap")
+    given = [(-17.0, each, 5.0) for each in (first, -first)]
+    origin, places = local_places(pycolmap, given)
+    assert origin is not None and abs(origin[1]) == pytest.approx(180.0)
+    assert np.abs(places[:, :2]).max() < 25.0  # metres east and north of it
+    np.testing.assert_allclose(places[:, 2], 5.0, atol=1e-3)

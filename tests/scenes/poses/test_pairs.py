@@ -14,6 +14,7 @@ from leco_plugin.scenes.poses.reconstruction import (
     NEXT,
     capture_order,
     choose_pairs,
+    choose_posed_pairs,
 )
 
 NOWHERE = np.full(3, np.nan)
@@ -75,3 +76,15 @@ def test_time_goes_before_names_and_numbers_count_by_value() -> None:
     assert capture_order(["IMG_1.jpg", "IMG_2.jpg"], timed) == [1, 0]
     assert capture_order(["b.jpg", "a.jpg"], [Exif()] * 2) is None
     assert capture_order(["b7.jpg", "a7.jpg"], [Exif()] * 2) is None
+
+
+def test_photographs_that_look_another_way_are_not_compared_however_near() -> None:
+    """Two rows, back to back: half of each photograph's nearest look away."""
+    poses = np.tile(np.eye(3, 4), (2 * FEW, 1, 1))
+    poses[:, 0, 3] = np.repeat(np.arange(FEW), 2)
+    angles = np.where(np.arange(2 * FEW) % 2, 1.7, 0.0)  # beyond a right angle, no half turn
+    poses[:, 0, 0] = poses[:, 2, 2] = np.cos(angles)
+    poses[:, 0, 2], poses[:, 2, 0] = np.sin(angles), -np.sin(angles)
+    pairs = choose_posed_pairs(poses).pairs
+    assert {one % 2 for one, _ in pairs} == {0, 1}
+    assert all(one % 2 == other % 2 for one, other in pairs)

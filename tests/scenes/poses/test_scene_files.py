@@ -12,8 +12,14 @@ import pytest
 from PIL import Image
 from scene_files import read_ply
 
-from leco_plugin.scenes.photographs import LecoPhotographsDataParserConfig
-from leco_plugin.scenes.poses.georeference import Placement, intrinsics, transforms_of, write_scene
+from leco_plugin.scenes.photographs import LecoPhotographsDataParserConfig, read_points
+from leco_plugin.scenes.poses.georeference import (
+    Placement,
+    intrinsics,
+    transforms_of,
+    write_scene,
+    write_sparse_points,
+)
 from leco_plugin.scenes.scene_file import unused_fields
 
 IN_METRES = Placement(1.0, np.eye(3), np.zeros(3), residuals=np.zeros(3))
@@ -122,3 +128,12 @@ def test_what_is_written_is_read(tmp_path: Path) -> None:
     outputs = config.setup().get_dataparser_outputs("train")
     assert len(outputs.image_filenames) == 3
     assert float(outputs.cameras.camera_to_worlds[0, 2, 2]) == 1.0
+
+
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+def test_points_with_large_coordinates_keep_their_digits(sign: float, tmp_path: Path) -> None:
+    places = sign * np.array([[500_000.123, 4_600_000.456, 10.0], [500_000.623, 4_600_001.0, 9.0]])
+    write_sparse_points(tmp_path / "points.ply", places, np.zeros((2, 3), np.uint8))
+    found = read_points({"ply_file_path": "points.ply"}, tmp_path)
+    assert found is not None
+    np.testing.assert_allclose(found.numpy(), places, rtol=0.0, atol=1e-6)
