@@ -29,8 +29,8 @@ def profile_sections(report: dict[str, Any]) -> list[str]:
         "A backward operation belongs to the part whose forward has made its node. The *floor* is "
         "what a part's bytes and operations take at the speed at which this machine copies and "
         "multiplies matrices, each value moved once: a part far above its floor has room. "
-        "What fits a cache may be faster. *Front to back* is one routine in C for encoding, experts, "
-        "colour and weights of a view.\n",
+        "What fits a cache may be faster. *Front to back* is one routine in C for encoding, "
+        "experts, colour and weights of a view.\n",
     ]
     for scene, methods in report["scenes"].items():
         for method, row in methods.items():

@@ -91,6 +91,7 @@ def taught_by(source: Source, mixture: Mixture, guided: bool) -> tuple[dict[str,
             mixture,
             taught,
             (held_out.rays, on_black(held_out.truth)),
+            [],  # no photograph vouches: test rays say what a new view loses
             model.config.gate_loss,
             model.config.calibration,
             SharpeningConfig(),

@@ -90,8 +90,9 @@ class Measured(NamedTuple):
     @property
     def line(self) -> str:
         """In the words of the log."""
+        price = round(self.image_price_db, 3) + 0.0  # no minus before zero
         return (
-            f"skips {self.empty_fraction:.1%} for {self.image_price_db:+.3f} dB and "
+            f"skips {self.empty_fraction:.1%} for {price:+.3f} dB and "
             f"{self.lost_surface_mass:.2e} of the surface mass"
         )
 
