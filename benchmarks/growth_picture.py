@@ -54,7 +54,10 @@ def _line(
     if not rows:
         return
     exponent = report["exponents_with_area"][name]["all"]
-    label: str | None = what if exponent is None else f"{what}: as area to the {exponent:.2f}"
+    of = "" if len(rows) == len(report["rows"]) else f", in {len(rows)} of {len(report['rows'])}"
+    label: str | None = what
+    if exponent is not None:
+        label = f"{what}: as area to the {exponent:.2f}{of}"
     for seed in sorted({row["seed"] for row in rows}):
         points = [(row["area_square_metres"], row[name]) for row in rows if row["seed"] == seed]
         axes.plot(*zip(*points), label=label, **style(number, theme))
