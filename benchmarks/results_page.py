@@ -71,12 +71,15 @@ MEASUREMENTS_HEAD = """# Measurements
 Generated as [Results](results.md) is, which says in one page what was found. Times are seconds of
 training, evaluation left out. Nothing here is from the paper but what is called so.
 
-To make a chart again, add `--out FOLDER` to its command; `city` is the one that
-`leco demo` leaves in `runs/demo/city`, or `leco city --aerial-only` writes, `city-4` that of `leco
-city --blocks 4 --aerial-only`,
-`caliterra` 75 drone photographs of a building site, from OpenDroneMap's `odm_data_caliterra` (CC0),
-at 480 x 360 with poses from COLMAP, and `fox` the 50 photographs of that name that come with
-NVIDIA's instant-ngp.
+To make a chart again, add `--out FOLDER` to its command. Its scenes:
+
+- `city`: `leco city --aerial-only --out city`, as `leco demo` leaves in `runs/demo/city`.
+- `city-4`: `leco city --blocks 4 --aerial-only --out city-4`.
+- `caliterra`: 75 drone photographs of a building site (CC0). `git clone
+  https://github.com/OpenDroneMap/odm_data_caliterra`, then `leco poses odm_data_caliterra/images
+  --out caliterra`. Ours had its poses from COLMAP at 1600 pixels, and photographs of 480 x 360 with
+  every eighth for tests: figures will be near ours, not the same.
+- `fox`: the 50 photographs of that name that come with NVIDIA's instant-ngp.
 
 *Never frozen* is the same model, whose gate goes on learning: it renders without skipping. *Equal
 experts, no gate* has as many scene experts, none for empty space, as Switch-NeRF, and never skips.
