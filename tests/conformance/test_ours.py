@@ -121,7 +121,16 @@ def test_a_sampler_that_serves_no_seam_is_refused(monkeypatch):
 
 @in_forks
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ["leco-ngp", "leco-nerfacto", "leco-switch-nerf", "switch-nerf"])
+@pytest.mark.parametrize(
+    "name",
+    [
+        "leco-ngp",
+        "leco-nerfacto",
+        "leco-switch-nerf",
+        "leco-mega-nerf",
+        "switch-nerf",
+    ],
+)
 def test_our_hosts_keep_every_rule(name: str) -> None:
     verdicts = list(check(name))
     assert [verdict.line() for verdict in verdicts if not verdict.passed] == []
