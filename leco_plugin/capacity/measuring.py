@@ -5,7 +5,6 @@ from __future__ import annotations
 import copy
 import functools
 import random
-import time
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -22,6 +21,7 @@ from leco_plugin.capacity.search import Candidate, find_threshold, gates, grids
 from leco_plugin.capacity.sources import Source, draw_held_out, draw_training_rays
 from leco_plugin.chart.runner import SETTINGS, make_jobs, take_folder
 from leco_plugin.chart.theme import DARK, LIGHT
+from leco_plugin.evaluation.clock import seconds_now
 from leco_plugin.evaluation.equal_loss import kept_shares, mapped_box, reached_volume
 from leco_plugin.evaluation.field_grids import fits_memory, largest_in_cells, plain_and_dilated
 from leco_plugin.evaluation.inspection import ViewBox, in_parts
@@ -151,7 +151,7 @@ def measure(evidence: Evidence, scores: Tensor, of_volume: Tensor, lost: float) 
 def measure_gate(taught: Taught, candidate: Candidate, lost: float) -> dict[str, Any]:
     """Teaches a gate and measures it, as it would be stored and asked."""
     assert candidate.gate is not None
-    started = time.monotonic()
+    started = seconds_now()
     score = taught_score(candidate.gate, taught.lesson, taught.mixture.precision)
     scores, of_volume = in_parts(score, taught.mapped), in_parts(score, taught.volume)
     return _row(candidate, started, measure(taught.held_out, scores, of_volume, lost))
@@ -176,7 +176,7 @@ def taught_score(
 def measure_grid(taught: Taught, candidate: Candidate, lost: float) -> dict[str, Any]:
     """Teaches a grid and measures it, dilated by a cell where it keeps less so."""
     assert candidate.resolution is not None
-    started, box = time.monotonic(), mapped_box(taught.mixture)
+    started, box = seconds_now(), mapped_box(taught.mixture)
     scores = taught_grid(taught.lesson, box, candidate.resolution)
     both = [
         measure(taught.held_out, of_rays, of_volume, lost)
@@ -193,7 +193,7 @@ def taught_grid(lesson: Lesson, box: ViewBox, cells: int) -> Tensor:
 
 
 def _row(candidate: Candidate, started: float, found: dict[str, Any]) -> dict[str, Any]:
-    seconds = round(time.monotonic() - started, 2)
+    seconds = round(seconds_now() - started, 2)
     named = {"family": candidate.family, "size": candidate.size, "bytes": candidate.bytes}
     return {**named, "seconds": seconds, **found}
 

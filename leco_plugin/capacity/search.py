@@ -8,7 +8,6 @@ is measured on others.
 from __future__ import annotations
 
 import math
-import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
@@ -19,6 +18,7 @@ from torch import Tensor
 
 from leco_plugin.capacity.evidence import Evidence, Loss, unlikely_at
 from leco_plugin.capacity.references import Bounds, Ground, Reference, Rung, verify
+from leco_plugin.evaluation.clock import seconds_now
 from leco_plugin.evaluation.field_grids import in_parts
 from leco_plugin.evaluation.inspection import whole_box
 from leco_plugin.learning.calibration import THRESHOLDS
@@ -184,7 +184,7 @@ def search(
     looks = 0
     show = on_progress or (lambda share: None)
     for number, config in enumerate(gates):
-        started = time.monotonic()
+        started = seconds_now()
         parts = [(number + done) / len(gates) for done in (0.0, 1.0 / (1 + LONGER), 1.0)]
         for times, (first, last) in zip((1, LONGER), pairwise(parts)):
 
@@ -198,7 +198,7 @@ def search(
             if rung.verdict == "chosen" or not nearly:
                 break
         show(parts[-1])
-        rung.seconds = round(time.monotonic() - started, 2)
+        rung.seconds = round(seconds_now() - started, 2)
         rungs.append(rung)
         if on_rung is not None:
             on_rung(rung)

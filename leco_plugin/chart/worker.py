@@ -141,20 +141,21 @@ def compare_at_freezing(model: Any, datamanager: Any, contender: Contender) -> d
     from leco_plugin.capacity.measuring import lesson_of, taught_score
     from leco_plugin.capacity.search import gates
     from leco_plugin.capacity.sources import Source
+    from leco_plugin.evaluation.clock import seconds_now
     from leco_plugin.learning.dense import evaluating
 
     known = {gate.key: gate for gate in gates()}
-    started = time.monotonic()
+    started = seconds_now()
     with evaluating(model):
         lesson = lesson_of(Source(datamanager, model), model.config.gate_loss)
-    of_lesson = time.monotonic() - started
+    of_lesson = seconds_now() - started
     scores, rows = {}, []
     for name, key in SMALL_GATES.items():
         gate = known[key].gate
         assert gate is not None
-        started = time.monotonic()
+        started = seconds_now()
         scores[name] = taught_score(gate, lesson, model.mixture.precision)
-        seconds = round(of_lesson + time.monotonic() - started, 2)
+        seconds = round(of_lesson + seconds_now() - started, 2)
         rows.append({"name": name, "bytes": known[key].bytes, "seconds": seconds})
     found = at_equal_loss(model.mixture, datamanager, contender.grids, others=scores)
     kept = found.pop("others")

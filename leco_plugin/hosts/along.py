@@ -8,7 +8,6 @@ bounds. Weights are read at the seam of packed hosts, which ask for densities wh
 
 from __future__ import annotations
 
-import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from functools import cached_property
@@ -17,6 +16,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
+from leco_plugin.evaluation.clock import seconds_now
 from leco_plugin.hosts.guide import Guide
 from leco_plugin.hosts.host_watch import squared_errors
 from leco_plugin.hosts.stand_ins import GuidedEstimator
@@ -128,7 +128,7 @@ class Along:
             raise InputError(f"a host that teaches its own gate trains in one process: {INSTEAD}")
         self.host, self.guide, self.config, self.run = host, guide, config, run
         self.manager = pipeline.datamanager
-        self.steps, self.began, self.spent = 0, time.monotonic(), 0.0
+        self.steps, self.began, self.spent = 0, seconds_now(), 0.0
 
     def begin(self) -> None:
         """Guides the host by bounds alone, where it has no occupancy yet."""
@@ -143,16 +143,16 @@ class Along:
         allows, and at the end of a run."""
         self.steps += 1
         last = step + 1 >= self.run.end
-        passed = time.monotonic() - self.began
+        passed = seconds_now() - self.began
         due = self.steps == FIRST if self.spent == 0.0 else self.spent < SHARE_OF_TIME * passed
         if due or (last and self.steps > FIRST):
-            started = time.monotonic()
+            started = seconds_now()
             self._teach(step)
-            self.spent += time.monotonic() - started
+            self.spent += seconds_now() - started
 
     def _teach(self, step: int) -> None:
         """Teaches and calibrates a gate; follows it where it skips more."""
-        config, before, started = self.config, self.guide.the_occupancy(), time.monotonic()
+        config, before, started = self.config, self.guide.the_occupancy(), seconds_now()
         with torch.random.fork_rng(devices=[]):  # batches are those of a run that teaches nothing
             torch.manual_seed(step)
             taught = self._hear(training_bundles(self.manager, config.sharpening.rays))
@@ -169,7 +169,7 @@ class Along:
             )
             round_weights(gate)
             found = self._calibrated(gate, held_out, bundle, truth)
-        seconds = time.monotonic() - started
+        seconds = seconds_now() - started
         skipped = 1.0 - float(held_out.kept.float().mean())
         what = f"step {step}: a gate taught by the host in {seconds:.0f} s"
         if found is None or found.empty_fraction <= skipped:

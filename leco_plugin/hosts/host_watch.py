@@ -8,13 +8,13 @@ what is bounded. Hosts that draw a fixed number of samples skip none, and are no
 from __future__ import annotations
 
 import math
-import time
 from collections.abc import Callable
 from typing import Any
 
 import torch
 from torch import Tensor, nn
 
+from leco_plugin.evaluation.clock import seconds_now
 from leco_plugin.hosts.guide import Guide
 from leco_plugin.hosts.stand_ins import GuidedEstimator
 from leco_plugin.learning.calibration import THRESHOLDS, CalibrationConfig, Measured
@@ -138,11 +138,11 @@ class HostWatch:
 
     def before_step(self, step: int) -> None:
         """Called after everything else that happens before a step."""
-        self.started = time.monotonic()
+        self.started = seconds_now()
 
     def after_step(self, step: int) -> None:
         """Measures again where that is due; skips less where it has come to cost too much."""
-        seconds, guide = time.monotonic() - self.started, self.guide
+        seconds, guide = seconds_now() - self.started, self.guide
         if guide.kept is None or self.config.recheck_rays == 0:
             return
         self.watch.state, self.ended_probation = guide.watched, None

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Any
@@ -11,6 +10,7 @@ from typing import Any
 import torch
 from torch import nn
 
+from leco_plugin.evaluation.clock import seconds_now
 from leco_plugin.evaluation.held_out_psnr import HeldOutPsnr
 from leco_plugin.learning.learner import Learner
 from leco_plugin.learning.run import LearningOnly, Progress
@@ -164,11 +164,11 @@ def _train(
     """Steps until the gate is frozen; `trained` is the model, or what averages its gradients over
     processes."""
     progress, manager = learner.progress, learner.data.manager
-    started = time.monotonic()
+    started = seconds_now()
     step, timed_from = 0, started
     while not bool(model.mixture.frozen):
         model.plan = learner.before_step(step)
-        began = time.monotonic()
+        began = seconds_now()
         bundle, batch = manager.next_train(step)
         losses = model.get_loss_dict(trained(bundle), batch)
         for optimizer in learner.run.optimizers():
@@ -178,13 +178,13 @@ def _train(
             optimizer.step()
         step += 1
         if step == FIRST_TIMED:
-            timed_from = time.monotonic()
+            timed_from = seconds_now()
         if seconds is not None and step >= TIMED_STEPS and progress.recoveries == 0:
-            left = mean(seconds - (time.monotonic() - started), model.device)
+            left = mean(seconds - (seconds_now() - started), model.device)
             if step == TIMED_STEPS:
-                a_step = mean(time.monotonic() - timed_from, model.device) / (step - FIRST_TIMED)
+                a_step = mean(seconds_now() - timed_from, model.device) / (step - FIRST_TIMED)
                 keep_within(progress, left / a_step, step)
             elif left <= 0.0:  # steps have become slower
                 keep_within(progress, 0.0, step)
-        learner.after_step(step - 1, time.monotonic() - began, model.kept_per_ray)
+        learner.after_step(step - 1, seconds_now() - began, model.kept_per_ray)
         show(min(1.0, step / progress.learn_steps))

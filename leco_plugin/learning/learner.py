@@ -6,12 +6,12 @@ The learner knows no trainer. The training loop calls it at each step; a `Run` s
 from __future__ import annotations
 
 import math
-import time
 from functools import cached_property
 from typing import TYPE_CHECKING
 
 from torch import Tensor
 
+from leco_plugin.evaluation.clock import seconds_now
 from leco_plugin.learning.collapse import STEPS_PER_LOOK, LearnerConfig, StepPlan, is_dense, plan_of
 from leco_plugin.learning.freezing import advice_on, carry_over, leave_field, leave_file
 from leco_plugin.learning.held_out import HeldOut
@@ -308,7 +308,7 @@ class Learner:
             steps: that are to pay for it.
             guided: whether the field has been trained guided since the gate was frozen.
         """
-        mixture, config, started = self.mixture, self.config, time.monotonic()
+        mixture, config, started = self.mixture, self.config, seconds_now()
         if config.sharpening.steps == 0 or steps < config.sharpening.least_steps:
             return
         kind = config.sharpening.gate.encoding.kind
@@ -320,7 +320,7 @@ class Learner:
         )
         if found is None:
             return
-        seconds = time.monotonic() - started
+        seconds = seconds_now() - started
         say(
             f"step {step}: a gate of {found.params:,} values, taught in {seconds:.0f} s, "
             f"{found.line}"

@@ -8,12 +8,12 @@ its bounds, or when the gate keeps nothing at all. The caller decides what to do
 from __future__ import annotations
 
 import math
-import time
 from typing import Literal, NamedTuple, Protocol
 
 import torch
 from torch import Tensor
 
+from leco_plugin.evaluation.clock import seconds_now
 from leco_plugin.learning.calibration import CalibrationConfig
 from leco_plugin.learning.collapse import SUSPECTED_STEPS
 from leco_plugin.learning.run import WatchState
@@ -136,11 +136,11 @@ class PriceWatch:
 
     @torch.no_grad()
     def _measure(self, step: int) -> Finding:
-        state, started = self.state, time.monotonic()
+        state, started = self.state, seconds_now()
         self.source.prepare()
         state.evidence = from_first(self._evidence, self.device)
         state.rechecks += 1
-        seconds, a_step = time.monotonic() - started, self.seconds / self.steps
+        seconds, a_step = seconds_now() - started, self.seconds / self.steps
         state.due = step + from_first(
             lambda: steps_until_next(self.config, seconds, a_step), self.device
         )

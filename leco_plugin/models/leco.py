@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from dataclasses import replace
 from typing import Any
 
@@ -17,6 +16,7 @@ from nerfstudio.model_components.renderers import RGBRenderer
 from nerfstudio.models.base_model import Model
 from torch import Tensor, nn
 
+from leco_plugin.evaluation.clock import seconds_now
 from leco_plugin.learning.collapse import StepPlan, annealed
 from leco_plugin.learning.learner import Learner
 from leco_plugin.learning.run import Progress, Run
@@ -107,15 +107,15 @@ class LecoModel(DrawnInViewer, Model):
             TrainingCallbackLocation.BEFORE_TRAIN_ITERATION,
             TrainingCallbackLocation.AFTER_TRAIN_ITERATION,
         )
-        started = time.monotonic()
+        started = seconds_now()
 
         def before_step(step: int) -> None:
             nonlocal started
             self.plan = learner.before_step(step)
-            started = time.monotonic()
+            started = seconds_now()
 
         def after_step(step: int) -> None:
-            learner.after_step(step, time.monotonic() - started, self.kept_per_ray)
+            learner.after_step(step, seconds_now() - started, self.kept_per_ray)
 
         return [TrainingCallback([before], before_step), TrainingCallback([after], after_step)]
 

@@ -131,7 +131,7 @@ def test_what_costs_too_much_in_the_image_is_not_followed(made: Any) -> None:
 
 def test_teaching_takes_its_share_of_the_time(made: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     now, taught = [0.0], []
-    monkeypatch.setattr(along.time, "monotonic", lambda: now[0])
+    monkeypatch.setattr(along, "seconds_now", lambda: now[0])
     made.teacher.began = 0.0
 
     def teach(step: int) -> None:

@@ -82,7 +82,7 @@ def watched(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Watched:
     occupancy.report = {"threshold": occupancy.threshold, "empty_fraction": 0.8, "params": 5}
     guide.set_occupancy(occupancy)
     host = Host(guide)
-    monkeypatch.setattr(host_watch.time, "monotonic", lambda: now[0])
+    monkeypatch.setattr(host_watch, "seconds_now", lambda: now[0])
 
     def held_out_bundle(_: Any, count: int, seed: int, share: str) -> Any:
         assert share == "recheck"

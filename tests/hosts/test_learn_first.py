@@ -61,7 +61,7 @@ def test_the_gate_is_sharpened_where_it_guides_enough_steps(
 
 def test_a_budget_sets_the_number_of_steps(pipeline, monkeypatch: pytest.MonkeyPatch):
     clock = iter(range(10_000))
-    monkeypatch.setattr("leco_plugin.hosts.learn_first.time.monotonic", lambda: next(clock))
+    monkeypatch.setattr("leco_plugin.hosts.learn_first.seconds_now", lambda: next(clock))
     # training asks the clock twice a step, and once in front of the steps
     occupancy = learn_occupancy(config(5000), pipeline, rays=32, seconds=1.0)
     assert occupancy.report["step"] == FEWEST_STEPS - 1
@@ -83,9 +83,20 @@ def test_steps_that_become_slower_do_not_outlast_the_budget(
 
     give = pipeline.datamanager.next_train
     monkeypatch.setattr(type(pipeline.datamanager), "next_train", next_train)
-    monkeypatch.setattr("leco_plugin.hosts.learn_first.time.monotonic", clock)
+    monkeypatch.setattr("leco_plugin.hosts.learn_first.seconds_now", clock)
     occupancy = learn_occupancy(config(5000), pipeline, rays=32, seconds=75.0)
     assert occupancy.report["step"] == 34  # the 35th ends at 80 s
+
+
+def test_time_that_other_processes_take_shortens_nothing(
+    pipeline, monkeypatch: pytest.MonkeyPatch
+):
+    wall = iter(range(0, 10**9, 1000))
+    for clock in ("monotonic", "perf_counter"):
+        monkeypatch.setattr(f"time.{clock}", lambda: float(next(wall)))
+    monkeypatch.setattr("torch.get_num_threads", lambda: 1)
+    occupancy = learn_occupancy(config(30), pipeline, rays=32, seconds=500.0)
+    assert occupancy.report["step"] >= 29
 
 
 BUDGETS = {"seconds": [0.0, -3.0, float("nan"), float("inf")], "rays": [0, -1], "rate": [0.0, -1.0]}
