@@ -267,7 +267,8 @@ def provenance(results: Mapping[str, Any]) -> str:
     made, runs = results["made"], results["runs"]
     commit = f" at {made['commit']}" if made["commit"] else ""
     said = f"`{made['command']}`, {made['date']}, leco_plugin {made['version']}{commit}."
-    if minutes := sum(run.get("wall_seconds") or 0.0 for run in runs) / 60.0:
+    spent = [run.get("wall_seconds") for run in runs]
+    if all(spent) and (minutes := sum(spent) / 60.0):
         at_once = results["protocol"].get("at_once", 1)
         said += f" All runs together took {minutes / at_once:.0f} min."
     if reused := sum(bool(run.get("reused")) for run in runs):

@@ -6,7 +6,6 @@ import copy
 import math
 import shutil
 import sys
-import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -182,15 +181,16 @@ def main(folder: Path, run: Callable[..., dict[str, Any]] = run_job) -> int:
     """Makes the run that a folder describes, by a function as `run_job`; 0, or 1 and a reason in
     the folder."""
     from leco_plugin.chart.contender import Contender, Protocol
+    from leco_plugin.evaluation.clock import seconds_now
     from leco_plugin.evaluation.report import describe_code
 
     die_with_parent()
-    code, started = describe_code(), time.monotonic()  # as this process has loaded it
+    code, started = describe_code(), seconds_now()  # as this process has loaded it
 
     def make(job: dict[str, Any], show: Callable[[float], None]) -> dict[str, Any]:
         contender, protocol = Contender.from_dict(job["contender"]), Protocol(**job["protocol"])
         found = run(contender, job["seed"], Path(job["data"]), protocol, folder, show)
-        return {**found, "code": code, "wall_seconds": round(time.monotonic() - started, 1)}
+        return {**found, "code": code, "wall_seconds": round(seconds_now() - started, 1)}
 
     return work_on(folder, make)
 

@@ -88,9 +88,7 @@ def test_steps_that_become_slower_do_not_outlast_the_budget(
     assert occupancy.report["step"] == 34  # the 35th ends at 80 s
 
 
-def test_time_that_other_processes_take_shortens_nothing(
-    pipeline, monkeypatch: pytest.MonkeyPatch
-):
+def test_time_that_other_processes_take_shortens_nothing(pipeline, monkeypatch: pytest.MonkeyPatch):
     wall = iter(range(0, 10**9, 1000))
     for clock in ("monotonic", "perf_counter"):
         monkeypatch.setattr(f"time.{clock}", lambda: float(next(wall)))
