@@ -25,6 +25,7 @@ from scene_files import read_ply
 
 from leco_plugin import cli
 from leco_plugin.scenes.input_error import InputError
+from leco_plugin.scenes.locks import alone_in
 from leco_plugin.scenes.photographs import LecoPhotographsDataParserConfig
 from leco_plugin.scenes.poses.command import make_scene, summary
 
@@ -123,6 +124,42 @@ def test_a_run_that_was_killed_goes_on_with_what_is_missing(
         pycolmap.Database.open(killed / "colmap/database.db").num_matched_image_pairs() == matched
     )
     assert not [*killed.rglob("*.part")]
+
+
+@pytest.mark.slow
+def test_a_survey_whose_gps_is_mended_is_placed_anew_from_its_matches(
+    pycolmap: Any,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    """Mending EXIF leaves the sizes of files as they were."""
+    folder, out, places = tmp_path / "photos", tmp_path / "out", grid(3, 2)
+    paths = write_survey(folder, places)
+    right, size = [path.read_bytes() for path in paths], 1 << 17
+    for path, wrong in zip(paths, np.random.default_rng(1).permutation(6)):
+        with Image.open(path) as image:
+            image.save(path, quality=95, exif=exif_of(places[wrong]))
+        path.write_bytes(path.read_bytes().ljust(size, b"\0"))
+    assert not make_scene(folder, out, threads=1)["gps"]["used"]
+    for path, content in zip(paths, right):
+        path.write_bytes(content.ljust(size, b"\0"))
+    monkeypatch.setattr(pycolmap, "extract_features", None)
+    report = make_scene(folder, out, threads=1)
+    assert "EXIF has other GPS than before" in capsys.readouterr().out
+    assert report["gps"]["used"] and report["gps"]["most_metres"] < 1.0
+    assert meta_of(out)["metres_per_unit"] == 1.0
+    assert "metres_per_unit" not in json.loads((out / "transforms.before_gps.json").read_text())
+    assert make_scene(folder, out, threads=1) == report
+    assert "nothing is done" in capsys.readouterr().out
+
+
+def test_two_processes_do_not_make_one_scene_at_once(
+    pycolmap: Any, photos: Path, tmp_path: Path
+) -> None:
+    """pycolmap would abort one of them in the middle."""
+    with alone_in(tmp_path / "out", "scene"), pytest.raises(InputError, match="another process"):
+        make_scene(photos, tmp_path / "out")
 
 
 @pytest.mark.slow
