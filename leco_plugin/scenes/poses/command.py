@@ -43,6 +43,8 @@ GPS, BEFORE = "gps", "transforms.before_gps.json"
 """What of it says the photographs' GPS; and transforms.json as it was, where that was mended."""
 BYTES_A_PHOTOGRAPH = 1_000_000
 """Of disk for features and matches: a survey of 800 pixels took 0.74 million."""
+WRONG = 50.0
+"""Metres from its pose beyond which a position by GPS is no scatter, and its photograph is named."""
 NAMED = 5
 """Photographs that are named in a line; the report names all."""
 
@@ -181,9 +183,11 @@ def _report(models: list[Any], sources: dict[str, str], placement: Placement) ->
     blocks = [{sources[name] for name in poses_of(model)[0]} for model in models]
     lost = sorted({*sources.values()} - blocks[0])
     residuals = placement.residuals
-    known = [] if residuals is None else residuals[np.isfinite(residuals)]
     gps: dict[str, Any] = {"used": residuals is not None, "reason": placement.reason}
-    if len(known):
+    if residuals is not None:
+        names = [sources[name] for name in poses_of(models[0])[0]]
+        gps["contradicted"] = [name for name, off in zip(names, residuals) if off > WRONG]
+        known = residuals[residuals <= WRONG]
         gps |= {"photographs": len(known), "median_metres": round(float(np.median(known)), 3)}
         gps |= {"most_metres": round(float(np.max(known)), 3)}
     return {
@@ -223,6 +227,11 @@ def summary(report: dict[str, Any]) -> list[str]:
             f"in metres by the GPS of {gps['photographs']} photographs: they are off by "
             f"{gps['median_metres']:.2f} m (median) and {gps['most_metres']:.2f} m at most"
         )
+        if wrong := gps.get("contradicted"):
+            lines.append(
+                f"GPS contradicts the poses by more than {WRONG:.0f} m, and is not used, of "
+                f"{_some(wrong)}"
+            )
     else:
         lines.append(f"no metres: {gps['reason']}")
     return lines

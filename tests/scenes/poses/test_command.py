@@ -27,7 +27,8 @@ from leco_plugin import cli
 from leco_plugin.scenes.input_error import InputError
 from leco_plugin.scenes.locks import alone_in
 from leco_plugin.scenes.photographs import LecoPhotographsDataParserConfig
-from leco_plugin.scenes.poses.command import make_scene, summary
+from leco_plugin.scenes.poses.command import _report, make_scene, summary
+from leco_plugin.scenes.poses.georeference import Placement
 
 pytestmark = pytest.mark.xdist_group("poses")
 
@@ -236,6 +237,28 @@ def test_the_summary_names_some_and_counts_the_rest() -> None:
         "more overlap between neighbours places more photographs",
         "in metres by the GPS of 8 photographs: they are off by 1.23 m (median) and 5.00 m at most",
     ]
+
+
+def test_photographs_whose_gps_contradicts_their_poses_are_named() -> None:
+    model: Any = SimpleNamespace(
+        images={number: photographed(f"{number}.jpg") for number in range(5)},
+        reg_image_ids=lambda: range(5),
+        num_points3D=lambda: 9,
+        compute_mean_reprojection_error=lambda: 0.5,
+    )
+    off = np.array([1.0, 2.0, 6e6, 3.0, np.nan])
+    placement = Placement(1.0, np.eye(3), np.zeros(3), off)
+    report = _report([model], {f"{number}.jpg": f"{number}.jpg" for number in range(5)}, placement)
+    assert report["gps"]["photographs"] == 3 and report["gps"]["most_metres"] == 3.0
+    assert report["gps"]["contradicted"] == ["2.jpg"]
+    said = summary(report | {"not_read": []})
+    assert said[-1] == "GPS contradicts the poses by more than 50 m, and is not used, of 2.jpg"
+
+
+def photographed(name: str) -> Any:
+    """An image of pycolmap's, at the origin."""
+    pose = SimpleNamespace(inverse=lambda: SimpleNamespace(matrix=lambda: np.eye(3, 4)))
+    return SimpleNamespace(name=name, cam_from_world=lambda: pose)
 
 
 def test_commands_to_copy_hold_names_with_blanks_together() -> None:
