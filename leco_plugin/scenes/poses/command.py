@@ -44,7 +44,7 @@ GPS, BEFORE = "gps", "transforms.before_gps.json"
 BYTES_A_PHOTOGRAPH = 1_000_000
 """Of disk for features and matches: a survey of 800 pixels took 0.74 million."""
 WRONG = 50.0
-"""Metres from its pose beyond which a position by GPS is no scatter, and its photograph is named."""
+"""Metres from its pose beyond which a position by GPS is no scatter: its photograph is named."""
 NAMED = 5
 """Photographs that are named in a line; the report names all."""
 
