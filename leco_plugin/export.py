@@ -42,6 +42,7 @@ from leco_plugin.export_surface import (
     mapped_box,
     photograph_colours,
     require_few,
+    require_not_its_own,
     write_ply,
     write_splat_init,
     write_volume,
@@ -108,6 +109,8 @@ def export(
         facts = _export_volume(occupancy, out, resolution, back)
     else:
         description = scene_of(occupancy, file, data)
+        if description is not None:
+            require_not_its_own(out, description)
         if format == "splat-init" and description is None:
             raise ValueError("a start for splats copies transforms.json: give --data SCENE")
         surface = surface or surface_of(occupancy, resolution)

@@ -235,12 +235,8 @@ def write_splat_init(
     """
     if out.suffix != ".json":
         raise InputError(f"--out {out}: a start for splats is a copy of transforms.json; end it so")
-    if out.resolve() == description.resolve():
-        raise InputError(f"--out {out} is the scene's own file: give another name beside it")
     points, meta = out.with_suffix(".ply"), load_json(description)
-    own = meta.get("ply_file_path")
-    if isinstance(own, str) and points.resolve() == (description.parent / own).resolve():
-        raise InputError(f"--out {out}: {points} holds the scene's own points; give another name")
+    require_not_its_own(points, description)
     places, known = surface.double().numpy(), coloured_points(description)
     if known is None:
         colours = np.full((len(places), 3), GREY, np.uint8)
@@ -257,6 +253,16 @@ def write_splat_init(
     text = json.dumps(copy | {"ply_file_path": points.name}, indent=1).encode()
     write_whole(out, lambda file: file.write(text))
     return {"points": len(places), "sparse_points": sparse, "photograph_colours": known is not None}
+
+
+def require_not_its_own(out: Path, description: Path) -> None:
+    """InputError if a file to write is a scene's own transforms.json, or its sparse points."""
+    own = load_json(description).get("ply_file_path")
+    files = {description.resolve(): description.name}
+    if isinstance(own, str):
+        files[(description.parent / own).resolve()] = "points"
+    if kind := files.get(out.resolve()):
+        raise InputError(f"--out {out} is the scene's own {kind}: give another name")
 
 
 def _from_elsewhere(meta: dict[str, Any], scene: Path, folder: Path) -> dict[str, Any]:

@@ -23,7 +23,7 @@ from typing import Any, Protocol
 
 from leco_plugin.evaluation.report import read_object, write_json
 from leco_plugin.scenes.input_error import InputError, one_line
-from leco_plugin.studio.run_folder import LOCK, alone_in
+from leco_plugin.scenes.locks import LOCK, alone_in
 
 SETTINGS, RESULTS = "settings.json", "results.json"
 RUNS, UNFINISHED, LOGS = "runs", "unfinished", "logs"

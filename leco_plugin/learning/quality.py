@@ -68,8 +68,8 @@ def doubts_of_field(field: float, one_colour: float) -> list[str]:
     return [
         f"this scene was not learned: {field:.1f} dB on unseen pixels, where one colour "
         f"for all has {one_colour:.1f} dB",
-        "what helps: more photographs, sparse points (`leco points SCENE`), or poses that fit them "
-        "(`leco poses PHOTOS --out SCENE`)",
+        "what helps: more photographs, poses that fit them (`leco poses PHOTOS --out SCENE`), or "
+        "sparse points where the scene has none (`leco points SCENE`)",
     ]
 
 
@@ -83,6 +83,6 @@ def doubts_of_occupancy(kept: float) -> list[str]:
         return []
     return [
         f"this occupancy is of little use: it keeps {kept:.0%} of the space that photographs show",
-        "what helps: sparse points (`leco points SCENE`), more photographs, or more steps of "
-        "learning (schedule.learn-steps)",
+        "what helps: more photographs, more steps of learning (schedule.learn-steps), or sparse "
+        "points where the scene has none (`leco points SCENE`)",
     ]

@@ -30,6 +30,7 @@ from leco_plugin.log import bar, console, resumable
 from leco_plugin.occupancy import CALIBRATED_AT
 from leco_plugin.scenes.city.folder import TRANSFORMS
 from leco_plugin.scenes.input_error import InputError
+from leco_plugin.scenes.locks import alone_in
 from leco_plugin.scenes.photographs import describe_scene
 from leco_plugin.stability.cases import Case, cases_named
 from leco_plugin.stability.photographs import digest_of, write_scene
@@ -50,7 +51,6 @@ from leco_plugin.stability.plan import (
 )
 from leco_plugin.stability.table import draw, draw_side_by_side, table
 from leco_plugin.stability.verdict import judge
-from leco_plugin.studio.run_folder import alone_in
 
 WORKER = (sys.executable, "-W", "ignore", "-m", "leco_plugin.stability.worker")
 SIZES = "sizes.json"

@@ -79,6 +79,8 @@ NO_USE: tuple[tuple[str, type[Warning], str], ...] = (
     (r"Converting a tensor with requires_grad=True", UserWarning, r"nerfstudio"),
     # nerfstudio asks for four workers to cache images, however few cores there are
     (r"This DataLoader will create 4 worker processes", UserWarning, r"torch"),
+    # nerfstudio's ns-eval asks how the figures of a single test photograph scatter
+    (r"std_mean\(\): degrees of freedom is <= 0", UserWarning, r"nerfstudio"),
     # torchmetrics warns of an import that nerfstudio's models cause in it
     (r"Importing `spectral_angle_mapper`", FutureWarning, r""),
     # viser 0.2.7, which nerfstudio pins, uses addresses that websockets has renamed

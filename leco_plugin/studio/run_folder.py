@@ -11,8 +11,6 @@ import functools
 import inspect
 import os
 import re
-from collections.abc import Iterator
-from contextlib import contextmanager, suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -27,20 +25,10 @@ from torch.optim import Optimizer
 from leco_plugin.learning.run import LearningOnly, Run
 from leco_plugin.models.compute.ranks import is_first
 from leco_plugin.models.sizing.sizes import sizes_in, sizes_to_resume
-from leco_plugin.scenes.input_error import InputError
+from leco_plugin.scenes.input_error import InputError, one_line
+from leco_plugin.scenes.locks import lock, unlock
 from leco_plugin.scenes.whole_files import write_whole
 from leco_plugin.studio.checkpoints import allow_checkpoint_globals, newest_whole, step_of
-
-try:
-    import fcntl as _fcntl
-
-    fcntl: Any = _fcntl
-except ImportError:  # Windows has no such locks: there only checkpoints are looked for
-    fcntl = None
-
-LOCK = ".running"
-"""File that a run holds locked; the system lets go of it however the run ends, and one that ends by
-itself takes it away where there are such locks."""
 
 _held: dict[Path, int] = {}
 """Descriptors of this process's locks, by folder."""
@@ -48,11 +36,18 @@ _held: dict[Path, int] = {}
 
 def claim(folder: Path, checkpoints: Path, load_from: Path | None) -> str | None:
     """Takes a folder for the run of this process until it ends; returns why it cannot be had. It
-    saves in `checkpoints`, and resumes from the folder or file `load_from`, if from any."""
+    saves in `checkpoints`, and resumes from the folder or file `load_from`, if from any. InputError
+    if nothing can be written there."""
     place = folder.resolve()
     if place not in _held:
-        folder.mkdir(parents=True, exist_ok=True)
-        held = lock(folder)
+        try:
+            folder.mkdir(parents=True, exist_ok=True)
+            held = lock(folder)
+        except OSError as error:
+            raise InputError(
+                f"nothing can be written into {folder} ({error.strerror or one_line(error)}): name "
+                "another folder with --output-dir"
+            ) from None
         if held is None:
             return f"another run is going on in {folder}"
         if not _held:
@@ -70,7 +65,7 @@ def release(folder: Path) -> None:
     """Lets go of a folder before the process ends."""
     held = _held.pop(folder.resolve(), None)
     if held is not None:
-        _unlock(folder, held)
+        unlock(folder, held)
 
 
 def _release_all(process: int) -> None:
@@ -78,61 +73,6 @@ def _release_all(process: int) -> None:
     if os.getpid() == process:
         for folder in list(_held):
             release(folder)
-
-
-@contextmanager
-def alone_in(folder: Path, work: str) -> Iterator[None]:
-    """Keeps a folder, made where it is missing, from other processes that would make the same
-    `work` in it. InputError if one is at work there, or it is no folder."""
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except (FileExistsError, NotADirectoryError):
-        raise InputError(f"{folder} is no folder; name another one with --out") from None
-    held = lock(folder)
-    if held is None:
-        raise InputError(
-            f"another process makes the {work} in {folder}; wait for it, or name another folder "
-            "with --out"
-        )
-    try:
-        yield
-    finally:
-        _unlock(folder, held)
-
-
-def lock(folder: Path, tries: int = 5) -> int | None:
-    """An open file in a folder that is locked until it is closed, which the system does for a
-    process that ends; None where another process has locked it."""
-    held = os.open(folder / LOCK, os.O_CREAT | os.O_RDWR, 0o644)
-    if fcntl is None:
-        return held
-    try:
-        fcntl.flock(held, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except BlockingIOError:
-        os.close(held)
-        return None
-    except OSError:
-        return held  # a file system without locks
-    if tries > 1 and not _lies_in(folder, held):  # taken away by who held it, or never the same
-        os.close(held)
-        return lock(folder, tries - 1)
-    return held
-
-
-def _lies_in(folder: Path, held: int) -> bool:
-    """Whether the folder's lock is still this open file."""
-    try:
-        return os.path.samestat(os.stat(folder / LOCK), os.fstat(held))
-    except FileNotFoundError:
-        return False
-
-
-def _unlock(folder: Path, held: int) -> None:
-    """Takes the lock away while it is held, so that nobody else's is taken away."""
-    with suppress(OSError):
-        if fcntl is not None and _lies_in(folder, held):
-            (folder / LOCK).unlink()
-    os.close(held)
 
 
 CONFIG = "config.yml"

@@ -18,7 +18,7 @@ from leco_plugin.chart.chart import Chart
 from leco_plugin.chart.contender import Job, Protocol
 from leco_plugin.chart.methods import AT_ONCE, SUITES
 from leco_plugin.chart.runner import UNFINISHED, ProcessRunner, RunFailed
-from leco_plugin.studio.run_folder import alone_in
+from leco_plugin.scenes.locks import alone_in
 
 METHODS = ["--methods", "leco-occupancy", "leco-occupancy-never-frozen"]
 TIME = ["--seconds", 3]

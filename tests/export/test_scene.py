@@ -111,7 +111,8 @@ def test_what_does_not_go_together_is_refused_in_one_line(
 ) -> None:
     own = scene / "transforms.json"
     for options, said in (
-        (("splat-init", own, 24, None, None, scene), "the scene's own file"),
+        (("splat-init", own, 24, None, None, scene), "the scene's own transforms.json"),
+        (("ply", scene / "points.ply", 24, None, None, scene), "the scene's own points"),
         (("splat-init", scene / "points.json", 24, None, None, scene), "the scene's own points"),
         (("splat-init", tmp_path / "t.ply", 24, None, None, scene), "end it so"),
         (("splat-init", tmp_path / "t.json", 24), "give --data"),

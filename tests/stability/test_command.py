@@ -8,8 +8,8 @@ import pytest
 from stability_runs import Runs
 
 from leco_plugin import cli
+from leco_plugin.scenes.locks import alone_in
 from leco_plugin.stability import suite
-from leco_plugin.studio.run_folder import alone_in
 
 
 @pytest.fixture

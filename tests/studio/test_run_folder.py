@@ -11,7 +11,8 @@ from pathlib import Path
 import pytest
 
 from leco_plugin.method_configs import leco_occupancy
-from leco_plugin.studio import run_folder
+from leco_plugin.scenes import locks
+from leco_plugin.scenes.input_error import InputError
 from leco_plugin.studio.run_folder import claim, release
 
 HOLD = """
@@ -55,7 +56,7 @@ def test_a_run_that_ends_by_itself_leaves_no_lock_and_one_that_has_it_keeps_it(
     assert claim(folder, folder / "checkpoints", None) is None
     refused = subprocess.run([sys.executable, "-c", code, str(folder)], capture_output=True)
     assert b"another run is going on" in refused.stdout
-    assert [path.name for path in folder.iterdir()] == [run_folder.LOCK]
+    assert [path.name for path in folder.iterdir()] == [locks.LOCK]
     release(folder)
     assert list(folder.iterdir()) == []
 
@@ -64,19 +65,19 @@ def test_a_lock_that_is_taken_away_while_it_is_opened_is_made_anew(
     folder: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     folder.mkdir()
-    flock, opened = run_folder.fcntl.flock, []
+    flock, opened = locks.fcntl.flock, []
 
     def late(held: int, how: int) -> None:
         opened.append(held)
         if len(opened) == 1:  # who held it ends between this one's opening and locking
-            (folder / run_folder.LOCK).unlink()
+            (folder / locks.LOCK).unlink()
         flock(held, how)
 
-    monkeypatch.setattr(run_folder.fcntl, "flock", late)
-    held = run_folder.lock(folder)
+    monkeypatch.setattr(locks.fcntl, "flock", late)
+    held = locks.lock(folder)
     assert len(opened) == 2 and held is not None
-    assert os.path.samestat(os.stat(folder / run_folder.LOCK), os.fstat(held))
-    assert run_folder.lock(folder) is None
+    assert os.path.samestat(os.stat(folder / locks.LOCK), os.fstat(held))
+    assert locks.lock(folder) is None
     os.close(held)
 
 
@@ -84,10 +85,17 @@ def test_a_lock_is_held_where_files_are_never_the_same(
     folder: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     folder.mkdir()
-    monkeypatch.setattr(run_folder, "_lies_in", lambda *_: False)
-    held = run_folder.lock(folder)
-    assert held is not None and run_folder.lock(folder) is None
+    monkeypatch.setattr(locks, "_lies_in", lambda *_: False)
+    held = locks.lock(folder)
+    assert held is not None and locks.lock(folder) is None
     os.close(held)
+
+
+def test_a_folder_in_which_nothing_can_be_written_is_said_in_one_line(folder: Path) -> None:
+    folder.parent.joinpath("file").touch()
+    beneath = folder.parent / "file" / "run"
+    with pytest.raises(InputError, match=r"nothing can be written into .*name another folder with"):
+        claim(beneath, beneath / "checkpoints", None)
 
 
 def test_a_new_run_does_not_take_a_folder_with_checkpoints(folder: Path) -> None:

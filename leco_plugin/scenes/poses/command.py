@@ -13,6 +13,7 @@ import numpy as np
 
 from leco_plugin.log import bar, resumable
 from leco_plugin.scenes.input_error import InputError, require
+from leco_plugin.scenes.locks import LOCK, alone_in
 from leco_plugin.scenes.poses.georeference import (
     Placement,
     local_places,
@@ -27,6 +28,7 @@ from leco_plugin.scenes.poses.originals import Photograph, copy_photographs, fin
 from leco_plugin.scenes.poses.reconstruction import (
     DATABASE,
     ENTERED,
+    MODELS,
     Lens,
     Reconstructor,
     available_threads,
@@ -37,8 +39,12 @@ from leco_plugin.scenes.whole_files import remove_parts, write_whole
 
 ASKED, REPORT = "colmap/asked.json", "poses.json"
 """What was asked for, before the work, and what came of it, in the folder of the scene."""
+GPS, BEFORE = "gps", "transforms.before_gps.json"
+"""What of it says the photographs' GPS; and transforms.json as it was, where that was mended."""
 BYTES_A_PHOTOGRAPH = 1_000_000
 """Of disk for features and matches: a survey of 800 pixels took 0.74 million."""
+WRONG = 50.0
+"""Metres from its pose beyond which a position by GPS is no scatter: its photograph is named."""
 NAMED = 5
 """Photographs that are named in a line; the report names all."""
 
@@ -57,11 +63,13 @@ def make_scene(
     pycolmap = load_pycolmap()
     out, began = out.absolute(), time.monotonic()
     found = find_photographs(folder.absolute(), out)
-    if finished := _take_up(out, found.photographs, {"lens": lens, "size": size}):
+    asked = _asked(found.photographs, lens, size)
+    if finished := _finished(out, asked):
         print(f"{out} already holds this scene: nothing is done")
         return finished
-    _require_disk(out, found.photographs)
-    with resumable(print):
+    with alone_in(out, "scene"), resumable(print):
+        _begin(out, asked)
+        _require_disk(out, found.photographs)
         with bar("copying photographs") as show:
             found = copy_photographs(found, out / "images", show)
         for line in list(found.refused.values())[:NAMED]:
@@ -75,46 +83,74 @@ def make_scene(
         work.match(chosen)
         models = work.map()
         work.refine(models[0], lens)
-    gps = {each.name: gps for each, gps in zip(photographs, places)}
-    placement = _put_in_the_world(pycolmap, models[0], gps)
-    sources = {each.name: str(each.path.relative_to(folder.absolute())) for each in photographs}
-    refused = sorted(str(path.relative_to(folder.absolute())) for path in found.refused)
-    report = _report(models, sources, placement) | {
-        "not_read": refused,
-        "pairs": len(chosen.pairs),
-        "pairs_by": chosen.reason,
-        "seconds": round(time.monotonic() - began, 1),
-    }
-    write_scene(out, models[0], transforms_of(models[0], placement, origin), report, REPORT)
+        gps = {each.name: gps for each, gps in zip(photographs, places)}
+        placement = _put_in_the_world(pycolmap, models[0], gps)
+        sources = {each.name: str(each.path.relative_to(folder.absolute())) for each in photographs}
+        refused = sorted(str(path.relative_to(folder.absolute())) for path in found.refused)
+        report = _report(models, sources, placement) | {
+            "not_read": refused,
+            "pairs": len(chosen.pairs),
+            "pairs_by": chosen.reason,
+            "seconds": round(time.monotonic() - began, 1),
+        }
+        write_scene(out, models[0], transforms_of(models[0], placement, origin), report, REPORT)
     return report
 
 
-def _take_up(
-    out: Path, photographs: list[Photograph], asked: dict[str, Any]
-) -> dict[str, Any] | None:
-    """Begins a scene or goes on with it; returns the report of one that is finished. InputError if
-    the folder holds something else."""
+def _asked(photographs: list[Photograph], lens: Lens, size: int) -> dict[str, Any]:
+    """What is asked for: JSON values, those of photographs and of their GPS as digests."""
     known = [(each.name, each.path.stat().st_size) for each in photographs]
-    digest = hashlib.blake2b(json.dumps(known).encode(), digest_size=8).hexdigest()
-    wanted = {"format": 1, "photographs": len(photographs), "digest": digest, **asked}
-    if out.exists() and (not out.is_dir() or any(out.iterdir())):
-        if not (out / ASKED).is_file():
+    positions = [each.exif.position for each in photographs]
+    asked = {"format": 1, "photographs": len(photographs), "digest": _digest(known)}
+    return {**asked, GPS: _digest(positions), "lens": lens, "size": size}
+
+
+def _digest(value: Any) -> str:
+    return hashlib.blake2b(json.dumps(value).encode(), digest_size=8).hexdigest()
+
+
+def _begun(out: Path, asked: dict[str, Any]) -> dict[str, Any] | None:
+    """What a scene was begun with; None where there is none. Its GPS is that of now where an
+    earlier version has not noted it."""
+    if not (out / ASKED).is_file():
+        return None
+    found: dict[str, Any] = {GPS: asked[GPS]} | json.loads((out / ASKED).read_text())
+    return found
+
+
+def _finished(out: Path, asked: dict[str, Any]) -> dict[str, Any] | None:
+    """The report of a scene that is finished; None of one that is to be made or to go on.
+    InputError if the folder holds something else."""
+    found = _begun(out, asked)
+    if found is None:
+        if out.exists() and (not out.is_dir() or {each.name for each in out.iterdir()} - {LOCK}):
             raise InputError(f"--out {out} holds something else: give another folder")
-        found = json.loads((out / ASKED).read_text())
-        if found != wanted and not (out / ENTERED).exists():
-            shutil.rmtree(out / "images", ignore_errors=True)  # nothing but copies were made
-        elif found != wanted:
-            other = [name for name in wanted if found.get(name) != wanted[name]]
-            what = " and ".join(sorted({"photographs" if n == "digest" else n for n in other}))
-            raise InputError(
-                f"--out {out} was begun with other {what}: give another folder, or delete it"
-            )
-    if (out / "transforms.json").is_file():
-        report: dict[str, Any] = json.loads((out / REPORT).read_text())
-        return report
-    write_whole(out / ASKED, lambda file: file.write(json.dumps(wanted).encode()))
+        return None
+    other = [name for name in asked if name != GPS and found.get(name) != asked[name]]
+    if other and (out / ENTERED).exists():
+        what = " and ".join(sorted({"photographs" if n == "digest" else n for n in other}))
+        raise InputError(
+            f"--out {out} was begun with other {what}: give another folder, or delete it"
+        )
+    if found != asked or not (out / "transforms.json").is_file():
+        return None
+    report: dict[str, Any] = json.loads((out / REPORT).read_text())
+    return report
+
+
+def _begin(out: Path, asked: dict[str, Any]) -> None:
+    """Begins a scene or goes on with it. Where GPS was mended since, or nothing but copies were
+    made of other photographs, what follows from them is made anew; features and matches stay."""
+    found = _begun(out, asked)
+    if found is not None and found != asked:
+        if (out / ENTERED).exists():
+            print("EXIF has other GPS than before: photographs are placed anew")
+        if (out / "transforms.json").exists():
+            (out / "transforms.json").replace(out / BEFORE)
+        shutil.rmtree(out / "images", ignore_errors=True)
+        shutil.rmtree(out / MODELS, ignore_errors=True)
+    write_whole(out / ASKED, lambda file: file.write(json.dumps(asked).encode()))
     remove_parts(out)
-    return None
 
 
 def _require_disk(out: Path, photographs: list[Photograph]) -> None:
@@ -147,9 +183,11 @@ def _report(models: list[Any], sources: dict[str, str], placement: Placement) ->
     blocks = [{sources[name] for name in poses_of(model)[0]} for model in models]
     lost = sorted({*sources.values()} - blocks[0])
     residuals = placement.residuals
-    known = [] if residuals is None else residuals[np.isfinite(residuals)]
     gps: dict[str, Any] = {"used": residuals is not None, "reason": placement.reason}
-    if len(known):
+    if residuals is not None:
+        names = [sources[name] for name in poses_of(models[0])[0]]
+        gps["contradicted"] = [name for name, off in zip(names, residuals) if off > WRONG]
+        known = residuals[residuals <= WRONG]
         gps |= {"photographs": len(known), "median_metres": round(float(np.median(known)), 3)}
         gps |= {"most_metres": round(float(np.max(known)), 3)}
     return {
@@ -189,6 +227,11 @@ def summary(report: dict[str, Any]) -> list[str]:
             f"in metres by the GPS of {gps['photographs']} photographs: they are off by "
             f"{gps['median_metres']:.2f} m (median) and {gps['most_metres']:.2f} m at most"
         )
+        if wrong := gps.get("contradicted"):
+            lines.append(
+                f"GPS contradicts the poses by more than {WRONG:.0f} m, and is not used, of "
+                f"{_some(wrong)}"
+            )
     else:
         lines.append(f"no metres: {gps['reason']}")
     return lines

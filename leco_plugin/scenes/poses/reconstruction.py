@@ -35,6 +35,8 @@ CHUNK, PAIRS_A_CHUNK = 4, 100
 DATABASE, ENTERED = "colmap/database.db", "colmap/entered"
 """In the folder of the scene: features and matches, and a file that says all photographs are known
 there."""
+MODELS = "colmap/models"
+"""COLMAP's models, in the folder of the scene."""
 MASKS = "masks"
 """Folder of masks, named NAME.png for a photograph NAME; what is black in one has no features."""
 EXTRA = "pip install 'leco_plugin[poses]'"
@@ -142,7 +144,7 @@ class Reconstructor:
     def map(self) -> list[Any]:
         """COLMAP's models, that with the most photographs first. InputError if no photographs
         overlap."""
-        pycolmap, folder = self.pycolmap, self.folder / "models"
+        pycolmap, folder = self.pycolmap, self.folder / Path(MODELS).name
         whole = folder / "all"
         if not whole.exists():
             shutil.rmtree(folder, ignore_errors=True)  # of a run that was killed

@@ -25,8 +25,10 @@ from scene_files import read_ply
 
 from leco_plugin import cli
 from leco_plugin.scenes.input_error import InputError
+from leco_plugin.scenes.locks import alone_in
 from leco_plugin.scenes.photographs import LecoPhotographsDataParserConfig
-from leco_plugin.scenes.poses.command import make_scene, summary
+from leco_plugin.scenes.poses.command import _report, make_scene, summary
+from leco_plugin.scenes.poses.georeference import Placement
 
 pytestmark = pytest.mark.xdist_group("poses")
 
@@ -126,6 +128,42 @@ def test_a_run_that_was_killed_goes_on_with_what_is_missing(
 
 
 @pytest.mark.slow
+def test_a_survey_whose_gps_is_mended_is_placed_anew_from_its_matches(
+    pycolmap: Any,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    """Mending EXIF leaves the sizes of files as they were."""
+    folder, out, places = tmp_path / "photos", tmp_path / "out", grid(3, 2)
+    paths = write_survey(folder, places)
+    right, size = [path.read_bytes() for path in paths], 1 << 17
+    for path, wrong in zip(paths, np.random.default_rng(1).permutation(6)):
+        with Image.open(path) as image:
+            image.save(path, quality=95, exif=exif_of(places[wrong]))
+        path.write_bytes(path.read_bytes().ljust(size, b"\0"))
+    assert not make_scene(folder, out, threads=1)["gps"]["used"]
+    for path, content in zip(paths, right):
+        path.write_bytes(content.ljust(size, b"\0"))
+    monkeypatch.setattr(pycolmap, "extract_features", None)
+    report = make_scene(folder, out, threads=1)
+    assert "EXIF has other GPS than before" in capsys.readouterr().out
+    assert report["gps"]["used"] and report["gps"]["most_metres"] < 1.0
+    assert meta_of(out)["metres_per_unit"] == 1.0
+    assert "metres_per_unit" not in json.loads((out / "transforms.before_gps.json").read_text())
+    assert make_scene(folder, out, threads=1) == report
+    assert "nothing is done" in capsys.readouterr().out
+
+
+def test_two_processes_do_not_make_one_scene_at_once(
+    pycolmap: Any, photos: Path, tmp_path: Path
+) -> None:
+    """pycolmap would abort one of them in the middle."""
+    with alone_in(tmp_path / "out", "scene"), pytest.raises(InputError, match="another process"):
+        make_scene(photos, tmp_path / "out")
+
+
+@pytest.mark.slow
 def test_of_two_blocks_the_largest_is_written_and_wrong_gps_is_not_used(
     pycolmap: Any, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -199,6 +237,28 @@ def test_the_summary_names_some_and_counts_the_rest() -> None:
         "more overlap between neighbours places more photographs",
         "in metres by the GPS of 8 photographs: they are off by 1.23 m (median) and 5.00 m at most",
     ]
+
+
+def test_photographs_whose_gps_contradicts_their_poses_are_named() -> None:
+    model: Any = SimpleNamespace(
+        images={number: photographed(f"{number}.jpg") for number in range(5)},
+        reg_image_ids=lambda: range(5),
+        num_points3D=lambda: 9,
+        compute_mean_reprojection_error=lambda: 0.5,
+    )
+    off = np.array([1.0, 2.0, 6e6, 3.0, np.nan])
+    placement = Placement(1.0, np.eye(3), np.zeros(3), off)
+    report = _report([model], {f"{number}.jpg": f"{number}.jpg" for number in range(5)}, placement)
+    assert report["gps"]["photographs"] == 3 and report["gps"]["most_metres"] == 3.0
+    assert report["gps"]["contradicted"] == ["2.jpg"]
+    said = summary(report | {"not_read": []})
+    assert said[-1] == "GPS contradicts the poses by more than 50 m, and is not used, of 2.jpg"
+
+
+def photographed(name: str) -> Any:
+    """An image of pycolmap's, at the origin."""
+    pose = SimpleNamespace(inverse=lambda: SimpleNamespace(matrix=lambda: np.eye(3, 4)))
+    return SimpleNamespace(name=name, cam_from_world=lambda: pose)
 
 
 def test_commands_to_copy_hold_names_with_blanks_together() -> None:
