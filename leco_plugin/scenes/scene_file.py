@@ -27,6 +27,7 @@ from leco_plugin.scenes.lenses import (
     lens_of,
 )
 from leco_plugin.scenes.photograph_files import check_masked, find_file
+from leco_plugin.scenes.poses import ASKED
 
 FRAMES = ("frames", "test_frames")
 """Lists of frames; the second is ScanNet++'s."""
@@ -349,5 +350,7 @@ def remedy_for(data: Path) -> str | None:
             return f"`{command}` reads it"
     if known and "colmap" not in known[0][0]:
         return f"it is for the reader {known[0][0]}, and this command reads a transforms.json only"
+    if (data / ASKED).is_file():
+        return "`leco poses` has not finished it: give the same command again"
     converter = _converter_for(data)
     return None if converter is None else f"`{converter}` makes a scene of it"

@@ -329,6 +329,10 @@ def test_a_folder_of_another_reader_names_it(scene: Path, tmp_path: Path) -> Non
         (folder / sign).write_text("{}")
         assert wanted in str(remedy_for(folder))
     assert remedy_for(tmp_path / "nowhere" / "at" / "all") is None
+    (tmp_path / "begun" / "colmap").mkdir(parents=True)
+    (tmp_path / "begun" / "images").mkdir()
+    (tmp_path / "begun" / "colmap" / "asked.json").write_text("{}")
+    assert "has not finished it: give the same command again" in str(remedy_for(tmp_path / "begun"))
 
 
 @pytest.mark.parametrize("windows", [True, False])

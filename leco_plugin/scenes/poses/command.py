@@ -14,6 +14,7 @@ import numpy as np
 from leco_plugin.log import bar, resumable
 from leco_plugin.scenes.input_error import InputError, require
 from leco_plugin.scenes.locks import LOCK, alone_in
+from leco_plugin.scenes.poses import ASKED
 from leco_plugin.scenes.poses.georeference import (
     Placement,
     local_places,
@@ -37,8 +38,8 @@ from leco_plugin.scenes.poses.reconstruction import (
 )
 from leco_plugin.scenes.whole_files import remove_parts, write_whole
 
-ASKED, REPORT = "colmap/asked.json", "poses.json"
-"""What was asked for, before the work, and what came of it, in the folder of the scene."""
+REPORT = "poses.json"
+"""In the folder of the scene: what came of what was asked for."""
 GPS, BEFORE = "gps", "transforms.before_gps.json"
 """What of it says the photographs' GPS; and transforms.json as it was, where that was mended."""
 BYTES_A_PHOTOGRAPH = 1_000_000
@@ -89,6 +90,7 @@ def make_scene(
         refused = sorted(str(path.relative_to(folder.absolute())) for path in found.refused)
         report = _report(models, sources, placement) | {
             "not_read": refused,
+            "altitudes": any(each.position and np.isfinite(each.position[2]) for each in exifs),
             "pairs": len(chosen.pairs),
             "pairs_by": chosen.reason,
             "seconds": round(time.monotonic() - began, 1),
@@ -227,6 +229,8 @@ def summary(report: dict[str, Any]) -> list[str]:
             f"in metres by the GPS of {gps['photographs']} photographs: they are off by "
             f"{gps['median_metres']:.2f} m (median) and {gps['most_metres']:.2f} m at most"
         )
+        if not report.get("altitudes", True):
+            lines.append("EXIF gives no altitude: heights count from the cameras, not the sea")
         if wrong := gps.get("contradicted"):
             lines.append(
                 f"GPS contradicts the poses by more than {WRONG:.0f} m, and is not used, of "

@@ -125,6 +125,8 @@ RAW = (".dng", ".cr2", ".cr3", ".nef", ".arw", ".raf", ".rw2", ".orf")
 COPIED = (".jpg", ".jpeg", ".png")
 """Kinds that are copied byte by byte where their colours need no change."""
 FEWEST = 3
+LONGEST = 80
+"""Letters of a copy's name, its last ones: of 255 bytes that one may have, each takes up to 3."""
 QUALITY = 95
 """Of a JPEG that is written anew."""
 
@@ -230,7 +232,7 @@ def _read(path: Path, folder: Path) -> Photograph:
         check_kind(path, header)
         with Image.open(path) as image:
             exif = read_exif(image)
-    name = re.sub(r"[^\w.\-]+", "_", "_".join(path.relative_to(folder).parts))
+    name = re.sub(r"[^\w.\-]+", "_", "_".join(path.relative_to(folder).parts))[-LONGEST:]
     photograph = Photograph(path, name, header, exif)
     if photograph.is_copied or path.suffix.lower() in (".jpg", ".jpeg"):
         return photograph

@@ -227,6 +227,7 @@ def test_the_summary_names_some_and_counts_the_rest() -> None:
         **{"photographs": 20, "placed": 8, "points": 9, "reprojection_error": 0.5},
         "not_placed": [f"{number}.jpg" for number in range(12)],
         "not_read": ["cut.jpg"],
+        "altitudes": False,
         "other_blocks": [],
         "gps": {"used": True, "photographs": 8, "median_metres": 1.234, "most_metres": 5.0},
     }
@@ -236,6 +237,7 @@ def test_the_summary_names_some_and_counts_the_rest() -> None:
         "not placed: 0.jpg, 1.jpg, 2.jpg, 3.jpg, 4.jpg and 7 more",
         "more overlap between neighbours places more photographs",
         "in metres by the GPS of 8 photographs: they are off by 1.23 m (median) and 5.00 m at most",
+        "EXIF gives no altitude: heights count from the cameras, not the sea",
     ]
 
 

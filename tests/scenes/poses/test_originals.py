@@ -155,6 +155,18 @@ def test_a_photograph_of_many_that_cannot_be_used_is_left_out(folder: Path, tmp_
     assert "8 bits a channel" in reasons["deep.png"]
 
 
+def test_long_names_of_folders_are_cut_to_what_a_file_may_have(
+    folder: Path, tmp_path: Path
+) -> None:
+    deep = folder / ("a" * 150) / ("b" * 150)
+    deep.mkdir(parents=True)
+    for number in range(2):
+        (folder / f"IMG_{number}.jpg").rename(deep / f"IMG_{number}.jpg")
+    names = sorted(copies(folder, tmp_path / "out"))
+    assert [name[-9:] for name in names] == ["IMG_2.jpg", "IMG_0.jpg", "IMG_1.jpg"]
+    assert len(names[1]) <= 80
+
+
 def test_a_copy_that_cannot_be_written_ends_the_work(folder: Path, tmp_path: Path) -> None:
     (tmp_path / "out").write_bytes(b"a file where the folder should be")
     with pytest.raises(InputError, match="cannot be written"):
