@@ -13,7 +13,13 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from leco_plugin.learning.quality import FIELD, ONE_COLOUR, doubts_of_field, doubts_of_occupancy
+from leco_plugin.learning.quality import (
+    FIELD,
+    ON_TESTS,
+    ONE_COLOUR,
+    doubts_of_field,
+    doubts_of_occupancy,
+)
 from leco_plugin.models.region import cut_rays, marching_rule, within_crop
 from leco_plugin.occupancy import SEEN_CELLS, Occupancy
 from leco_plugin.samplers import marching
@@ -91,12 +97,14 @@ def describe(occupancy: Occupancy) -> dict[str, Any]:
 
 
 def doubts(facts: dict[str, Any]) -> list[str]:
-    """What was said when the occupancy was frozen, if it or its field are of no use; `facts` are of
-    `describe`."""
-    field, one_colour = (facts["report"].get(name) for name in (FIELD, ONE_COLOUR))
+    """What was said when the occupancy was frozen, or at the end of its run, if it or its field are
+    of no use; `facts` are of `describe`."""
     found: list[str] = []
-    if isinstance(field, float) and isinstance(one_colour, float):
-        found = doubts_of_field(field, one_colour)
+    for report in (facts["report"], facts["report"].get(ON_TESTS)):
+        figures = report if isinstance(report, dict) else {}
+        field, one_colour = (figures.get(name) for name in (FIELD, ONE_COLOUR))
+        if isinstance(field, float) and isinstance(one_colour, float):
+            found = found or doubts_of_field(field, one_colour)
     kept = facts["kept_share_of_box"] / max(facts["seen_share_of_box"], 1e-12)
     return found or doubts_of_occupancy(kept)
 

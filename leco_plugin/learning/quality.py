@@ -20,6 +20,8 @@ LEAST_GAIN_DB = 1.0
 """PSNR by which a field that has learned something is above one colour for all pixels."""
 FIELD, ONE_COLOUR = "field_psnr_db", "one_colour_psnr_db"
 """Names in a report: PSNR on the calibration rays, of the field and of their mean colour."""
+ON_TESTS = "on_tests"
+"""Name in the report of a run that failed: the same two on test photographs, at its end."""
 PLACES = 1 << 14
 
 

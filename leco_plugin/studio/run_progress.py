@@ -35,7 +35,10 @@ from torch import Tensor, nn
 from leco_plugin.evaluation.held_out_psnr import OF, HeldOutPsnr
 from leco_plugin.evaluation.metrics import FigureUnavailable
 from leco_plugin.learning.freezing import FILE_NAME
+from leco_plugin.learning.quality import FIELD, ON_TESTS, ONE_COLOUR
 from leco_plugin.log import Show, bar, details_in, on_screen, say, say_all, spell
+from leco_plugin.models.compute.ranks import is_first
+from leco_plugin.occupancy import Occupancy
 from leco_plugin.studio.commands import hide_warnings_of_no_use
 from leco_plugin.studio.run_folder import CONFIG
 
@@ -174,9 +177,12 @@ class RunProgress:
         tested = self.psnr.look_at_tests()
         of_tests = "" if tested is None else f"{tested:.1f} dB on test photographs"
         say(", ".join(filter(None, [line, reached, of_tests])))
-        say_all(self.psnr.doubts(self.psnr.latest if tested is None else tested))
         folder = Path(self.trainer.base_dir)
         occupancy = folder / FILE_NAME
+        if doubted := self.psnr.doubts(self.psnr.latest if tested is None else tested):
+            say_all(doubted)
+            if tested is not None and occupancy.exists():
+                note_failure(occupancy, tested, self.psnr.of_one_colour)
         say(f"  run        {escape(str(folder))}")
         if occupancy.exists():
             say(f"  occupancy  {escape(str(occupancy))}, {occupancy.stat().st_size / 1e3:.0f} kB")
@@ -184,6 +190,15 @@ class RunProgress:
         tested = bool(self.trainer.pipeline.datamanager.eval_dataset)
         for command in next_commands(folder, occupancy.exists(), tested):
             say(f"  {escape(command)}")
+
+
+def note_failure(path: Path, field: float, one_colour: float) -> None:
+    """Keeps what test photographs say of a run that failed in the report of its occupancy, whose
+    inspection repeats it. All processes may come here; the first writes."""
+    if is_first():
+        occupancy = Occupancy.load(path)
+        occupancy.report = {**occupancy.report, ON_TESTS: {FIELD: field, ONE_COLOUR: one_colour}}
+        occupancy.save(path)
 
 
 def next_commands(folder: Path, occupancy: bool, tests: bool) -> list[str]:
