@@ -11,7 +11,13 @@
 #include "routines.h"
 
 #define BLOCK 48
+#ifdef __AVX512F__ /* a register holds 16 values, and there are 32 of them in place of 16 */
+#define LANES 16
+#define ROWS 8
+#else
 #define LANES 8
+#define ROWS 4
+#endif
 #define WIDEST 512 /* features that a block has room for */
 
 typedef float Lanes __attribute__((vector_size(4 * LANES)));
@@ -25,15 +31,15 @@ outputs_of(const float *weights, const float *biases, int inputs, const float (*
            float (*out)[BLOCK], const int rows, int then)
 {
     for (int b = 0; b < BLOCK; b += 3 * LANES) {
-        Lanes sums[4][3];
-#pragma GCC unroll 4
+        Lanes sums[ROWS][3];
+#pragma GCC unroll 8
         for (int r = 0; r < rows; r++)
 #pragma GCC unroll 3
             for (int v = 0; v < 3; v++)
                 sums[r][v] = (Lanes){0} + biases[r];
         for (int k = 0; k < inputs; k++) {
             const Lanes *x = (const Lanes *)&in[k][b];
-#pragma GCC unroll 4
+#pragma GCC unroll 8
             for (int r = 0; r < rows; r++) {
                 float weight = weights[(int64_t)r * inputs + k];
 #pragma GCC unroll 3
@@ -41,7 +47,7 @@ outputs_of(const float *weights, const float *biases, int inputs, const float (*
                     sums[r][v] += weight * x[v];
             }
         }
-#pragma GCC unroll 4
+#pragma GCC unroll 8
         for (int r = 0; r < rows; r++)
 #pragma GCC unroll 3
             for (int v = 0; v < 3; v++) {
@@ -60,9 +66,9 @@ static void linear(const float *weights, const float *biases, int inputs, int ou
                    const float (*in)[BLOCK], float (*out)[BLOCK], int then)
 {
     int o = 0;
-#define FROM(ROWS) outputs_of(weights + (int64_t)o * inputs, biases + o, inputs, in, out + o, ROWS, then)
-    for (; o + 4 <= outputs; o += 4)
-        FROM(4);
+#define FROM(COUNT) outputs_of(weights + (int64_t)o * inputs, biases + o, inputs, in, out + o, COUNT, then)
+    for (; o + ROWS <= outputs; o += ROWS)
+        FROM(ROWS);
     for (; o < outputs; o++)
         FROM(1);
 #undef FROM
