@@ -100,8 +100,8 @@ def name_mixture(parts: Parts, model: LecoModel) -> None:
     parts.name(field.encoding, "forward", "encoding", floors.of_encoding(field.encoding))
     parts.name(field.color, "forward", "colour", floors.of_colour(field.color))
     parts.name_everywhere(rendering.weigh, "weights", floors.of_weights)
-    for function in (rendering.composite, rendering.sum_up):
-        parts.name_everywhere(function, "weights")
+    parts.name_everywhere(rendering.composite, "colour", floors.of_composite)
+    parts.name_everywhere(rendering.sum_up, "weights")
     parts.name_everywhere(front_to_back.shade_natively, "front to back", floors.of_shaded)
     name_gates(parts, "gate")
 

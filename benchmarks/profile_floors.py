@@ -27,6 +27,7 @@ from profile_parts import Work
 from torch import Tensor, nn
 
 from leco_plugin.evaluation.queries import number_of
+from leco_plugin.models import rendering
 from leco_plugin.models.encodings import HashEncoding
 
 REAL = 4
@@ -136,6 +137,16 @@ def of_colour(color: Any) -> Any:
         return both_ways(result.requires_grad, moved, 2.0 * len(features) * weights)
 
     return work
+
+
+def of_composite(result: Tensor, color: Any, features: Tensor, weights: Tensor, *_: Any) -> Work:
+    """`rendering.composite`, whose visible samples are coloured by routines in C."""
+    if not color.suits_native(features, weights):
+        return Work()  # `ColorHead.forward` has it
+    visible = int((weights > rendering.VISIBLE).sum())
+    moved = visible * features.shape[1] * features.element_size() + result.numel() * REAL
+    per_sample = linear_weights(color.of_features) + linear_weights(color.out)
+    return both_ways(result.requires_grad, moved, 2.0 * visible * per_sample)
 
 
 def of_weights(result: tuple[Tensor, Tensor], *_: Any, **__: Any) -> Work:

@@ -10,6 +10,7 @@ from torch import Tensor, nn
 
 from leco_plugin.models.compute import native
 from leco_plugin.models.compute.dispatch import pad_to_steady_size
+from leco_plugin.models.compute.learned import FieldDensities
 from leco_plugin.models.encodings import EncodingConfig, FrequencyEncoding, build_encoding
 from leco_plugin.models.hmoe import HMoE, HMoEConfig
 
@@ -130,6 +131,12 @@ class ColorHead(nn.Module):
             of_rays.append(APPEARANCE_SCALE * code)
         return self.of_ray(torch.cat(of_rays, dim=-1))
 
+    def suits_native(self, features: Tensor, weights: Tensor) -> bool:
+        """Whether `networks.c` gives the colours of rays, and `gradients.c` what they teach."""
+        widest = max(features.shape[-1], self.out.in_features)
+        known = widest <= native.WIDEST and not torch.is_autocast_enabled("cpu")
+        return known and native.suits(features, weights, self.out.weight)
+
     def native_parts(self) -> list[Tensor]:
         """Weights and biases of both layers, the last one's for red, green and blue."""
         out = self.out.weight, self.out.bias
@@ -197,10 +204,12 @@ class HMoEField(nn.Module):
         Returns:
             sigmas [N] float32, per half extent of the scene; features [N, width].
         """
-        if native.answers_without_graph(mapped, self.projection.weight) and self.suits_native():
+        parts = self.native_parts() if self.suits_native() else []
+        asked = mapped, gate_values, *(part for part in parts if part is not None)
+        if parts and (native.answers_without_graph(*asked) or native.learns(*asked)):
             features, layers = self.encoding(mapped), self.config.experts.layers
-            factors, parts = gate_values.float(), self.native_parts()
-            hidden, raw = native.field_densities(features, routes, factors, parts, layers)
+            given = features, routes, gate_values, layers, *parts
+            hidden, raw = FieldDensities.apply(*given)
             return self._sigmas(raw, routes), hidden
         count = len(mapped)
         projected = self.projection(self.encoding(pad_to_steady_size(mapped)))

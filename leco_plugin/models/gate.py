@@ -15,6 +15,7 @@ from torch import Tensor, nn
 
 from leco_plugin.models.compute import native
 from leco_plugin.models.compute.dispatch import pad_to_steady_size
+from leco_plugin.models.compute.learned import GateLogits
 from leco_plugin.models.encodings import (
     FRESH,
     EncodingConfig,
@@ -124,20 +125,28 @@ class Gate(nn.Module):
 
     def forward(self, mapped: Tensor) -> Tensor:
         """Mapped positions [N, 3] in [-1, 1] to logits [N, 1 + n] float32; 0 is emptiness."""
-        if self.answers_natively(mapped):
+        if self.answers_natively(mapped) or self.learns_natively(mapped):
             scales: Tensor = self.encoding.scales  # type: ignore[union-attr, assignment]
-            parts = self.native_parts()
-            return native.gate_logits(mapped, scales, FRESH[torch.float32], parts, self.norm.eps)
+            given = mapped, scales, FRESH[torch.float32], self.norm.eps, *self.native_parts()
+            logits: Tensor = GateLogits.apply(*given)
+            return logits
         features = self.encoding(pad_to_steady_size(mapped))
         for layer in self.hidden:
             features = torch.relu(layer(features))
         return logits_of(features, self.norm, self.head)[: len(mapped)]
 
     def answers_natively(self, mapped: Tensor) -> bool:
-        """Whether `networks.c` is asked about these positions now."""
+        """Whether `networks.c` is asked about these positions now, without a graph."""
+        return self._suits_native() and native.answers_without_graph(mapped, self.head.weight)
+
+    def learns_natively(self, mapped: Tensor) -> bool:
+        """Whether it is, and `gradients.c` differentiates it. Positions want no gradient."""
+        known = self._suits_native() and not mapped.requires_grad
+        return known and native.learns(mapped, *self.native_parts())
+
+    def _suits_native(self) -> bool:
         widest = max(self.encoding.out_dim, self.config.width, 1 + self.config.scene_experts)
-        known = isinstance(self.encoding, FrequencyEncoding) and widest <= native.WIDEST
-        return known and native.answers_without_graph(mapped, self.head.weight)
+        return isinstance(self.encoding, FrequencyEncoding) and widest <= native.WIDEST
 
     def native_parts(self) -> list[Tensor]:
         """Weights and biases as `networks.c` takes them."""

@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from leco_plugin.models.compute.dispatch import select_rows
+from leco_plugin.models.compute.learned import Colors
 from leco_plugin.models.field import ColorHead, HMoEField
 from leco_plugin.models.gate import EMPTY, Gate, route
 from leco_plugin.samplers.packed import (
@@ -129,6 +130,8 @@ def _of_all_experts(logits: Tensor, routing: Routing) -> tuple[Tensor, Tensor]:
     if routing.empty_below is None and not routing.homogeneous:
         routes = route(logits, None)
         return logits.softmax(dim=-1).gather(1, routes[:, None])[:, 0], routes
+    if not logits.requires_grad and not routing.homogeneous:  # one, or NaN where a logit is
+        return 1.0 + 0.0 * logits.sum(dim=-1), route(logits, routing.empty_below)
     scene = logits[:, 1:]
     best = scene.argmax(dim=-1)
     share = scene.softmax(dim=-1).gather(1, best[:, None])[:, 0]
@@ -284,6 +287,11 @@ def composite(
 ) -> Tensor:
     """Colours of rays [R, 3], without background; only visible samples are coloured."""
     visible = (weights.detach() > VISIBLE).nonzero()[:, 0]
+    if isinstance(color, ColorHead) and color.suits_native(features, weights):
+        of_rays = color.hidden_of_rays(rays.directions, rays.images, rays.origins)
+        given = features, weights, intervals.ray_indices, visible, of_rays
+        rgb: Tensor = Colors.apply(*given, *color.native_parts())
+        return rgb
     rays_seen = intervals.ray_indices.index_select(0, visible)
     colors = color(
         select_rows(features, visible), rays_seen, rays.directions, rays.images, rays.origins

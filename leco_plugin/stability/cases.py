@@ -214,8 +214,7 @@ CASES = {
         _learning(
             "bf16",
             "bfloat16",
-            "eight bits of mantissa decide what is kept; the default where a processor has such "
-            "products",
+            "eight bits of mantissa decide what is kept; the default on GPUs and with AMX",
             precision="bfloat16",
         ),
         _learning(

@@ -7,24 +7,24 @@ import sys
 
 import torch
 
+from leco_plugin.models.compute.native import has_native
 from leco_plugin.occupancy import Precision
 
 
 def fast_precision(device: torch.device | str) -> Precision:
     """bfloat16 where the hardware multiplies it faster than float32.
 
-    On CUDA that is Ampere and later; on x86 it is what has AMX (9 times faster there) or AVX-512
-    with bfloat16 (2.7 times); elsewhere it is emulated and slower.
+    On CUDA that is Ampere and later. On x86 it is what has AMX (9 times faster in torch), and what
+    has AVX-512 with bfloat16 (2.7 times) unless routines in C do the work: those are faster still,
+    in float32. Elsewhere it is emulated and slower.
     """
     kind = torch.device(device).type
     if kind == "cuda":
         return "bfloat16" if torch.cuda.is_bf16_supported(including_emulation=False) else "float32"
     if kind == "cpu":
-        return "bfloat16" if any(_has(feature) for feature in HALF_ON_X86) else "float32"
+        half = _has("amx_tile") or (_has("avx512_bf16") and not has_native())
+        return "bfloat16" if half else "float32"
     return "float32"
-
-
-HALF_ON_X86 = ("amx_tile", "avx512_bf16")
 
 
 def _has(feature: str) -> bool:

@@ -27,7 +27,10 @@ from torch import Tensor
 from leco_plugin.samplers.kernels import kernels_off
 
 SOURCES = sorted(Path(__file__).parent.glob("*.c"))
-FLAGS = ("-O3", "-march=native", "-fno-math-errno", "-fno-trapping-math", "-shared", "-fPIC")
+FLAGS = (
+    *("-O3", "-march=native", "-fno-math-errno", "-fno-trapping-math", "-fopenmp-simd"),
+    *("-shared", "-fPIC"),
+)
 COMPILERS = ("cc", "gcc", "clang")
 """Tried in this order, after the one that the environment variable CC names."""
 SECONDS = 60
@@ -78,6 +81,12 @@ def suits(*tensors: Tensor) -> bool:
     return known and has_native()
 
 
+def learns(*tensors: Tensor) -> bool:
+    """Whether networks may learn in C: somebody wants a gradient, and no products in halves."""
+    graph = torch.is_grad_enabled() and any(one.requires_grad for one in tensors)
+    return graph and not torch.is_autocast_enabled("cpu") and suits(*tensors)
+
+
 def answers_without_graph(*tensors: Tensor) -> bool:
     """Whether networks may be asked in C: nobody wants a gradient, or the products in halves."""
     graph = torch.is_grad_enabled() and any(one.requires_grad for one in tensors)
@@ -97,15 +106,15 @@ def hash_sums(positions: Tensor, resolutions: Tensor, table: Tensor, corners: in
     """
     levels, (rows, features) = len(resolutions), table.shape
     out = positions.new_empty(len(positions), levels * features)
-    routine = _routine("hash_sums")
+    routine = routine_of("hash_sums")
     positions, resolutions = positions.contiguous(), resolutions.float().contiguous()
-    pointers = _pointers(positions, resolutions, table, out)
+    pointers = pointers_to(positions, resolutions, table, out)
     sizes = (levels, log2_of(rows // levels), features, corners)
 
     def work(begin: int, end: int) -> None:
         routine(*pointers, ctypes.c_int64(begin), ctypes.c_int64(end), *sizes)
 
-    _in_threads(work, len(positions), len(positions) // FEWEST)
+    in_threads(work, len(positions), len(positions) // FEWEST)
     return out
 
 
@@ -121,16 +130,16 @@ def hash_gradients(
     levels = len(resolutions)
     features = gradient.shape[-1] // levels
     table = gradient.new_zeros(rows, features)
-    routine = _routine("hash_gradients")
+    routine = routine_of("hash_gradients")
     positions, resolutions = positions.contiguous(), resolutions.float().contiguous()
     gradient = gradient.contiguous()
-    pointers = _pointers(positions, resolutions, gradient, table)
+    pointers = pointers_to(positions, resolutions, gradient, table)
     points, sizes = ctypes.c_int64(len(positions)), (levels, log2_of(rows // levels))
 
     def work(begin: int, end: int) -> None:
         routine(*pointers, points, begin, end, *sizes, features, corners)
 
-    _in_threads(work, levels, len(positions) // FEWEST)
+    in_threads(work, levels, len(positions) // FEWEST)
     return table
 
 
@@ -150,21 +159,26 @@ def gate_logits(
     width, outputs = len(parts[0]), len(parts[-1])
     layers = len(parts) // 2 - 2
     logits = mapped.new_empty(len(mapped), outputs)
-    routine, addresses = _routine("gate_logits"), _addresses(parts)
-    pointers = _pointers(mapped, scales)
+    routine, addresses = routine_of("gate_logits"), addresses_of(parts)
+    pointers = pointers_to(mapped, scales)
     strides = ctypes.c_int64(mapped.stride(1)), ctypes.c_int64(mapped.stride(0))
     sizes = (len(scales), fresh, layers, width, outputs, ctypes.c_float(epsilon))
 
     def work(begin: int, end: int) -> None:
         part = ctypes.c_int64(begin), ctypes.c_int64(end)
-        routine(*pointers, addresses, *_pointers(logits), *part, *strides, *sizes)
+        routine(*pointers, addresses, *pointers_to(logits), *part, *strides, *sizes)
 
-    _in_threads(work, len(mapped), len(mapped) // FEWEST)
+    in_threads(work, len(mapped), len(mapped) // FEWEST)
     return logits
 
 
 def field_densities(
-    features: Tensor, routes: Tensor, factors: Tensor, parts: list[Tensor | None], layers: int
+    features: Tensor,
+    routes: Tensor,
+    factors: Tensor,
+    parts: Sequence[Tensor | None],
+    layers: int,
+    order: Tensor | None = None,
 ) -> tuple[Tensor, Tensor]:
     """Hidden features [N, width] and raw densities [N] of a field of experts, without a graph.
 
@@ -175,20 +189,22 @@ def field_densities(
         parts: weights and biases of the projection and of the density, then those of each expert's
             layers; None for those of an expert that adds nothing.
         layers: of an expert.
+        order: [N] int64, points in the order of their routes; None sorts them.
     """
     width = len(parts[1])  # type: ignore[arg-type]
     hidden, raw = features.new_empty(len(features), width), features.new_empty(len(features))
-    routine, addresses = _routine("field_densities"), _addresses(parts)
+    routine, addresses = routine_of("field_densities"), addresses_of(parts)
     routes = routes.long().contiguous()
-    order, features, factors = routes.argsort(), features.contiguous(), factors.contiguous()
-    pointers = _pointers(features, order, routes, factors)
+    order = routes.argsort() if order is None else order
+    features, factors = features.contiguous(), factors.contiguous()
+    pointers = pointers_to(features, order, routes, factors)
 
     def work(begin: int, end: int) -> None:
         part = ctypes.c_int64(begin), ctypes.c_int64(end)
         sizes = features.shape[1], width, layers
-        routine(*pointers, addresses, *_pointers(hidden, raw), *part, *sizes)
+        routine(*pointers, addresses, *pointers_to(hidden, raw), *part, *sizes)
 
-    _in_threads(work, len(features), len(features) // FEWEST)
+    in_threads(work, len(features), len(features) // FEWEST)
     return hidden, raw
 
 
@@ -221,7 +237,7 @@ def _of_rays(name: str, given: Sequence[Values], rooms: Any) -> list[slice]:
     Args:
         rooms: [R] int64, where the samples of each ray have room.
     """
-    routine = _routine(name)
+    routine = routine_of(name)
     routine.restype = ctypes.c_int64  # type: ignore[attr-defined]
     structures = [_structure(values) for values in given]
     pointers = [ctypes.byref(one) for one in structures]
@@ -230,7 +246,7 @@ def _of_rays(name: str, given: Sequence[Values], rooms: Any) -> list[slice]:
     def work(begin: int, end: int) -> None:
         found[begin] = routine(*pointers, ctypes.c_int64(begin), ctypes.c_int64(end))
 
-    _in_threads(work, len(rooms), len(rooms) // RAYS_AT_ONCE, RAYS_AT_ONCE)
+    in_threads(work, len(rooms), len(rooms) // RAYS_AT_ONCE, RAYS_AT_ONCE)
     if min(found.values()) < 0:
         raise MemoryError("no memory for a batch of rays")
     firsts = rooms[sorted(found)].tolist()
@@ -244,7 +260,7 @@ def _structure(values: Values) -> ctypes.Structure:
         if value is None or isinstance(value, Tensor):
             made[name] = ctypes.c_void_p, None if value is None else value.data_ptr()
         elif isinstance(value, Sequence):
-            made[name] = ctypes.POINTER(ctypes.c_void_p), _addresses(value)
+            made[name] = ctypes.POINTER(ctypes.c_void_p), addresses_of(value)
         else:
             made[name] = ctypes.c_int if isinstance(value, int) else ctypes.c_float, value
     fields = [(name, kind) for name, (kind, _) in made.items()]
@@ -252,21 +268,21 @@ def _structure(values: Values) -> ctypes.Structure:
     return structure(**{name: value for name, (_, value) in made.items()})
 
 
-def _addresses(parts: Sequence[Tensor | None]) -> ctypes.Array[ctypes.c_void_p]:
+def addresses_of(parts: Sequence[Tensor | None]) -> ctypes.Array[ctypes.c_void_p]:
     """Of contiguous tensors, which the caller keeps alive."""
     return (ctypes.c_void_p * len(parts))(
         *(None if one is None else one.data_ptr() for one in parts)
     )
 
 
-def _routine(name: str) -> Callable[..., None]:
+def routine_of(name: str) -> Callable[..., None]:
     library = _library()
     assert library is not None
     routine: Callable[..., None] = getattr(library, name)
     return routine
 
 
-def _pointers(*tensors: Tensor) -> list[ctypes.c_void_p]:
+def pointers_to(*tensors: Tensor) -> list[ctypes.c_void_p]:
     """Of contiguous tensors, which the caller keeps alive."""
     return [ctypes.c_void_p(one.data_ptr()) for one in tensors]
 
@@ -276,7 +292,7 @@ def log2_of(size: int) -> int:
     return size.bit_length() - 1
 
 
-def _in_threads(
+def in_threads(
     work: Callable[[int, int], None], count: int, most: int, at_once: int | None = None
 ) -> None:
     """Calls `work` on consecutive parts of range(count), in as many threads as torch has.

@@ -10,7 +10,6 @@
 
 #include "routines.h"
 
-#define BLOCK 48
 #ifdef __AVX512F__ /* a register holds 16 values, and there are 32 of them in place of 16 */
 #define LANES 16
 #define ROWS 8
@@ -98,7 +97,7 @@ static void waves(const float *angles, float *sines, float *cosines)
 }
 
 /* x, sines, cosines: rows [3 + 6 octaves]; in between fresh ones octaves follow by doubling. */
-static void frequencies(const float *scales, int octaves, int fresh, float (*rows)[BLOCK])
+void frequencies(const float *scales, int octaves, int fresh, float (*rows)[BLOCK])
 {
     for (int octave = 0; octave < octaves; octave++)
         for (int axis = 0; axis < 3; axis++) {
@@ -135,11 +134,6 @@ static void layer_norm(const float *scale, const float *shift, float epsilon, in
     for (int k = 0; k < width; k++)
         for (int b = 0; b < BLOCK; b++)
             rows[k][b] = (rows[k][b] - mean[b]) * square[b] * scale[k] + shift[k];
-}
-
-static inline int in_block(int64_t first, int64_t last)
-{
-    return last - first < BLOCK ? (int)(last - first) : BLOCK;
 }
 
 /* logits[points, outputs] of points `begin` to `end` of positions, in [-1, 1], whose coordinates

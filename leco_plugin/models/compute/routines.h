@@ -1,6 +1,15 @@
 /* What the files in C call of each other. */
 #include <stdint.h>
 
+#define BLOCK 48 /* points that go through a network together */
+
+static inline int in_block(int64_t first, int64_t last)
+{
+    return last - first < BLOCK ? (int)(last - first) : BLOCK;
+}
+
+void frequencies(const float *scales, int octaves, int fresh, float (*rows)[BLOCK]);
+
 void hash_sums(const float *positions, const float *resolutions, const float *table, float *out,
                int64_t begin, int64_t end, int levels, int log2, int features, int corners);
 

@@ -7,6 +7,7 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
+from leco_plugin.models.compute import device
 from leco_plugin.models.compute.device import fast_precision
 from leco_plugin.models.compute.dispatch import SIZES_PER_OCTAVE, pad_to_steady_size, steady_size
 from leco_plugin.models.field import FieldConfig, HMoEField
@@ -77,13 +78,22 @@ def test_filling_changes_neither_answers_nor_gradients(monkeypatch: pytest.Monke
         assert torch.allclose(mine, plain, rtol=2e-2, atol=1e-2 * scale)
 
 
-@pytest.mark.parametrize("feature", ["amx_tile", "avx512_bf16"])
-def test_half_precision_where_the_processor_multiplies_it(
-    feature: str, monkeypatch: pytest.MonkeyPatch
+@pytest.mark.parametrize(
+    ("feature", "in_c", "precision"),
+    [
+        ("amx_tile", True, "bfloat16"),
+        ("amx_tile", False, "bfloat16"),
+        ("avx512_bf16", False, "bfloat16"),
+        ("avx512_bf16", True, "float32"),
+    ],
+)
+def test_half_precision_where_it_is_the_fastest(
+    feature: str, in_c: bool, precision: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    monkeypatch.setattr(device, "has_native", lambda: in_c)
     for other in ("amx_tile", "avx512_bf16"):
         supported = f"_is_{other}_supported"
         monkeypatch.setattr(torch.cpu, supported, lambda: False, raising=False)
     assert fast_precision("cpu") == "float32"
     monkeypatch.setattr(torch.cpu, f"_is_{feature}_supported", lambda: True, raising=False)
-    assert fast_precision("cpu") == "bfloat16"
+    assert fast_precision("cpu") == precision

@@ -1,0 +1,231 @@
+"""Small networks that learn on a CPU: forward by `networks.c`, backward by `gradients.c`.
+
+Each function stands for what torch does in `models/gate.py`, `models/field.py` and
+`models/rendering.py`, in a half to a third of the time. A gradient of a gradient is refused.
+"""
+
+from __future__ import annotations
+
+import ctypes
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import torch
+from torch import Tensor
+from torch.autograd.function import once_differentiable
+
+from leco_plugin.models.compute import native
+
+PADDED = 16
+"""Rows of matrices and features are padded to a multiple of this, as `gradients.c` has it."""
+
+Parts = Sequence[Tensor | None]
+
+
+def _padded(matrix: Tensor) -> Tensor:
+    """With zeros in new rows and columns."""
+    rows, columns = (-size % PADDED for size in matrix.shape)
+    return torch.nn.functional.pad(matrix, (0, columns, 0, rows))
+
+
+def _layers(parts: Parts) -> list[Tensor | None]:
+    """Weights, the same turned and biases of layers, padded; from weights and biases."""
+    made: list[Tensor | None] = []
+    for weight, bias in zip(parts[::2], parts[1::2], strict=True):
+        if weight is None or bias is None:
+            made += [None] * 3
+            continue
+        whole = _padded(weight)
+        made += [whole, whole.t().contiguous(), _padded(bias[None])[0].contiguous()]
+    return made
+
+
+class _Sums:
+    """Room for the gradients of parts, of each thread by itself.
+
+    Args:
+        parts: weights, biases and other vectors; None has no gradient.
+    """
+
+    def __init__(self, parts: Parts) -> None:
+        self.parts = parts
+        self.of_threads: dict[int, list[Tensor | None]] = {}
+
+    def of(self, begin: int) -> list[Tensor | None]:
+        """Zeros, padded, for the thread that begins there."""
+        found: list[Tensor | None] = []
+        for part in self.parts:
+            padded = None if part is None else _padded(part if part.dim() > 1 else part[None])
+            found.append(None if padded is None else torch.zeros_like(padded))
+        self.of_threads[begin] = found
+        return found
+
+    def total(self) -> list[Tensor | None]:
+        """Shaped as the parts, in an order that does not depend on which thread was first."""
+        sums: list[Tensor | None] = []
+        for number, part in enumerate(self.parts):
+            if part is None:
+                sums.append(None)
+                continue
+            ordered = [found[number] for _, found in sorted(self.of_threads.items())]
+            whole = torch.stack(ordered).sum(dim=0)  # type: ignore[arg-type]
+            rows = whole[0, : len(part)] if part.dim() == 1 else whole[: len(part), : part.shape[1]]
+            sums.append(rows.contiguous())
+        return sums
+
+
+def _run(
+    name: str, sums: _Sums, call: Callable[[Any, list[Tensor | None], int, int], int], count: int
+) -> list[Tensor | None]:
+    """Calls a routine on parts of its points; returns the gradients of its parts."""
+    routine = native.routine_of(name)
+    failed = []
+
+    def work(begin: int, end: int) -> None:
+        failed.append(call(routine, sums.of(begin), begin, end))
+
+    native.in_threads(work, count, count // native.FEWEST)
+    if any(failed):
+        raise MemoryError("no memory for the gradients of a batch")
+    return sums.total()
+
+
+class GateLogits(torch.autograd.Function):
+    """`native.gate_logits` of a gate that learns; positions receive no gradient."""
+
+    @staticmethod
+    def forward(
+        ctx: Any, mapped: Tensor, scales: Tensor, fresh: int, epsilon: float, *parts: Tensor
+    ) -> Tensor:
+        ctx.save_for_backward(mapped, scales, *parts)
+        ctx.fresh, ctx.epsilon = fresh, epsilon
+        return native.gate_logits(mapped, scales, fresh, parts, epsilon)
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, given: Tensor) -> tuple[Tensor | None, ...]:
+        mapped, scales, *parts = ctx.saved_tensors
+        layers, width, given = len(parts) // 2 - 2, len(parts[0]), given.contiguous()
+        norm = parts[-4:-2]
+        of_norm = [_padded(each[None])[0].contiguous() for each in norm]
+        whole = [*_layers(parts[:-4]), *of_norm, *_layers(parts[-2:])]
+        given_parts = native.addresses_of(whole)
+        pointers = native.pointers_to(mapped, scales)
+        strides = ctypes.c_int64(mapped.stride(1)), ctypes.c_int64(mapped.stride(0))
+        sizes = len(scales), ctx.fresh, layers, width, given.shape[-1], ctypes.c_float(ctx.epsilon)
+
+        def call(routine: Any, found: list[Tensor | None], begin: int, end: int) -> int:
+            part = ctypes.c_int64(begin), ctypes.c_int64(end), *strides
+            places = *native.pointers_to(given), native.addresses_of(found)
+            made: int = routine(*pointers, given_parts, *places, *part, *sizes)
+            return made
+
+        found = _run("gate_gradients", _Sums(parts), call, len(mapped))
+        return (None, None, None, None, *found)
+
+
+class FieldDensities(torch.autograd.Function):
+    """`native.field_densities` of a field that learns."""
+
+    @staticmethod
+    def forward(
+        ctx: Any, features: Tensor, routes: Tensor, factors: Tensor, layers: int, *parts: Tensor
+    ) -> tuple[Tensor, Tensor]:
+        routes = routes.long().contiguous()
+        order = routes.argsort()
+        features, factors = features.contiguous(), factors.contiguous()
+        ctx.save_for_backward(features, order, routes, factors, *parts)
+        ctx.layers = layers
+        return native.field_densities(features, routes, factors, parts, layers, order)
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, of_hidden: Tensor, of_raw: Tensor) -> tuple[Tensor | None, ...]:
+        features, order, routes, factors, *parts = ctx.saved_tensors
+        of_features, of_factors = torch.empty_like(features), torch.empty_like(factors)
+        kept = _layers(parts)
+        whole = native.addresses_of(kept)
+        read = native.pointers_to(features, order, routes, factors)
+        given = of_hidden.contiguous(), of_raw.contiguous()
+        rest = native.pointers_to(*given, of_features, of_factors)
+        sizes = features.shape[-1], len(parts[1]), ctx.layers
+
+        def call(routine: Any, found: list[Tensor | None], begin: int, end: int) -> int:
+            part = ctypes.c_int64(begin), ctypes.c_int64(end)
+            made: int = routine(*read, whole, *rest, native.addresses_of(found), *part, *sizes)
+            return made
+
+        asked, each = set(routes.unique().tolist()), 2 * ctx.layers
+        for expert in range((len(parts) - 4) // each):
+            if expert not in asked:  # no gradient, rather than one of zeros that Adam acts on
+                parts[4 + each * expert : 4 + each * (expert + 1)] = [None] * each
+        found = _run("field_gradients", _Sums(parts), call, len(order))
+        return (of_features, None, of_factors, None, *found)
+
+
+class Colors(torch.autograd.Function):
+    """Colours of rays [R, 3] from samples that are seen, summed up by weight.
+
+    Args of `apply`:
+        hidden: [M, width] features. weights: [M]. ray_indices: [M] int64, in order.
+        chosen: [V] int64, the samples that are seen, in order.
+        of_rays: [R, units], what direction and code of rays add to the hidden layer.
+        parts: weights and biases of the hidden layer, and of the last before the sigmoid.
+    """
+
+    @staticmethod
+    def forward(
+        ctx: Any,
+        hidden: Tensor,
+        weights: Tensor,
+        ray_indices: Tensor,
+        chosen: Tensor,
+        of_rays: Tensor,
+        *parts: Tensor,
+    ) -> Tensor:
+        hidden, weights, of_rays = (each.contiguous() for each in (hidden, weights, of_rays))
+        parts = tuple(each.contiguous() for each in parts)
+        rays, numbers = ray_indices.contiguous(), chosen.to(torch.int32)
+        ctx.save_for_backward(hidden, weights, rays, numbers, of_rays, *parts)
+        rgb = hidden.new_zeros(len(of_rays), 3)
+        routine, addresses = native.routine_of("add_colors"), native.addresses_of(parts)
+        read, written = native.pointers_to(hidden, weights, rays), native.pointers_to(of_rays)
+        sizes = hidden.shape[1], of_rays.shape[1]
+        of_chosen = ray_indices.index_select(0, chosen)
+
+        def work(begin: int, end: int) -> None:
+            some = _of_rays(numbers, of_chosen, begin, end)
+            routine(*read, *native.pointers_to(some), len(some), *written, addresses,
+                    *native.pointers_to(rgb), *sizes)  # fmt: skip
+
+        native.in_threads(work, len(of_rays), len(chosen) // native.FEWEST)
+        return rgb
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, of_rgb: Tensor) -> tuple[Tensor | None, ...]:
+        hidden, weights, rays, numbers, of_rays, *parts = ctx.saved_tensors
+        of_hidden, of_weights = torch.zeros_like(hidden), torch.zeros_like(weights)
+        of_of_rays = torch.zeros_like(of_rays)
+        of_rgb, kept = of_rgb.contiguous(), _layers(parts)
+        whole = native.addresses_of(kept)
+        read, added = native.pointers_to(hidden, weights, rays), native.pointers_to(of_rays)
+        rest = native.pointers_to(of_rgb, of_hidden, of_weights, of_of_rays)
+        sizes = hidden.shape[1], of_rays.shape[1]
+        of_chosen = rays.index_select(0, numbers.long())
+
+        def call(routine: Any, found: list[Tensor | None], begin: int, end: int) -> int:
+            some = _of_rays(numbers, of_chosen, begin, end)
+            places = *native.pointers_to(some), len(some), *added, whole, *rest
+            made: int = routine(*read, *places, native.addresses_of(found), *sizes)
+            return made
+
+        found = _run("color_gradients", _Sums(parts), call, len(of_rays))
+        return (of_hidden, of_weights, None, None, of_of_rays, *found)
+
+
+def _of_rays(chosen: Tensor, of_chosen: Tensor, begin: int, end: int) -> Tensor:
+    """Those of the chosen samples that lie on rays `begin` to `end`; rays are in order."""
+    ends = torch.searchsorted(of_chosen, torch.tensor([begin, end], device=of_chosen.device))
+    first, last = ends.tolist()
+    return chosen[first:last]
