@@ -40,7 +40,8 @@ without it stands beside, to show what the gift is worth.
 
 - **Distances**: while an occupancy is learned, rays end at the sparse points that they lead to.
 - **Bounds**: the scene's walls are found from sparse points.
-- **Opaque start**: the field begins with a density that makes what is kept of a ray opaque.
+- **Opaque start**: the field begins with a density that makes what is kept of a ray opaque. A grid
+  keeps the whole box at first, and is opaque by itself.
 - **Careful start**: skipping begins at a lower threshold, and its price is watched.
 - **Warm-up**: a grid asks all of its cells at first, for at most 1/{1 / WARM_UP:.0f} of a run.
 - **Rates** and **batch**: learning rates of the host, and what it shades in a step.

@@ -16,6 +16,8 @@ DEMO = "<!-- demo table: generated -->", "<!-- end of the demo table -->"
 GAIN = "<!-- gain: generated -->", "<!-- end of the gain -->"
 GAIN_CHART = "caliterra-hosts"
 """Each host with its own sampling and with a learned occupancy, in benchmarks/results/charts."""
+GIFTS_CHART = "caliterra-gifts"
+"""A host with a learned occupancy, with and without what else it gets, and with its own grid."""
 OURS = "leco-occupancy"
 
 
@@ -89,6 +91,22 @@ def gain_table(results: Mapping[str, Any]) -> str:
     said += " *Small* queries are those of proposal networks and gates."
     columns = f"{head} | PSNR | to render an image | queries a ray"
     return "\n".join([*table(columns, rows), "", said])
+
+
+def gifts_sentence(results: Mapping[str, Any], anchor: str) -> str:
+    """What a learned row gets beside its gate is worth, seed by seed."""
+    learned, without, own = (
+        ", ".join(f"{psnr:.1f}" for psnr in sorted(line.psnrs, reverse=True))
+        for line in lines_of(results)
+    )
+    return (
+        "The learned row of Instant-NGP gets more than a gate: an opaque start, a careful one, and "
+        f"distances of sparse points. [Seed by seed](measurements.md#{anchor}), after "
+        f"{results['protocol']['seconds']:g} s: {learned} dB with all of it, {without} without, "
+        f"{own} with its own grid. A host that begins transparent may never find a surface: that "
+        "is what the opaque start is for. A grid keeps the whole box at first, and is opaque by "
+        "itself. [Who gets what](gifts.md)."
+    )
 
 
 def _beside(ours: Line, rival: Line) -> str:

@@ -22,7 +22,7 @@ from learning import sentence as learning_sentence
 from page_parts import RESULTS, ROOT, machine_line, made_line, picture, section, table
 from page_pictures import GROWTH, LEARNING, draw_pictures, is_stale, pictures
 from profile_page import profile_sections
-from readme_parts import GAIN_CHART, demo_table, gain, readme
+from readme_parts import GAIN_CHART, GIFTS_CHART, demo_table, gain, gifts_sentence, readme
 from sharpening import sharpening_sections
 from sizes_sections import scene_results, sizes_sections
 from sizes_tables import where_it_pays
@@ -49,7 +49,11 @@ chart marked (*) was made before a mend that is named beside it.
 """
 GAIN_NOTE = """The picture shows the same runs over time ([figures](measurements.md#{anchor})):
 learning what is empty takes part of the time, and wins it back. A query asks a network about one
-point. The demo's city is known exactly, which photographs never are:
+point.
+
+{gifts}
+
+The demo's city is known exactly, which photographs never are:
 """
 QUESTIONS = """## The reviewers' questions, answered
 
@@ -209,7 +213,10 @@ def page() -> str:
     """The whole of `docs/results.md`."""
     demo = json.loads((RESULTS / "demo.json").read_text())
     anchor = heading_anchor(titles()[GAIN_CHART])
-    parts = [HEAD, f"{gain()}\n", f"{picture(GAIN_CHART)}\n", GAIN_NOTE.format(anchor=anchor)]
+    chart = json.loads((RESULTS / "charts" / f"{GIFTS_CHART}.json").read_text())
+    gifts = gifts_sentence(chart, heading_anchor(titles()[GIFTS_CHART]))
+    note = GAIN_NOTE.format(anchor=anchor, gifts=gifts)
+    parts = [HEAD, f"{gain()}\n", f"{picture(GAIN_CHART)}\n", note]
     parts += [f"{demo_table(demo)}\n", *bars_section(RESULTS), QUESTIONS, *short_answers()]
     stability = json.loads((RESULTS / "stability.json").read_text())
     found = {
