@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import re
 import subprocess
 import sys
@@ -52,6 +53,16 @@ def test_every_entry_point_loads(group: str) -> None:
     assert ours
     for entry in ours:
         entry.load()
+
+
+def test_a_wheel_has_every_file_of_the_package() -> None:
+    """`routines.h` once was left out: whoever installed a wheel had no routines in C."""
+    listed = re.search(r"^leco_plugin = (\[.*\])$", (ROOT / "pyproject.toml").read_text(), re.M)
+    assert listed is not None
+    package = ROOT / "leco_plugin"
+    packed = {path for name in json.loads(listed[1]) for path in package.glob(name)}
+    known = [path for path in package.rglob("*") if path.is_file() and path.suffix != ".pyc"]
+    assert packed and {path for path in known if path.suffix != ".py"} == packed
 
 
 def test_the_citation_and_the_changelog_name_this_version() -> None:

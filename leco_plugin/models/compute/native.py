@@ -71,7 +71,7 @@ def _library() -> ctypes.CDLL | None:
         except (OSError, subprocess.SubprocessError) as error:
             said = getattr(error, "stderr", None) or str(error).encode()
             why = (said.decode(errors="replace").strip().splitlines() or [type(error).__name__])[0]
-            _log.info("%s fails, torch answers in place of routines in C: %s", compiler[0], why)
+            _log.warning("%s fails: torch does all the work, more slowly: %s", compiler[0], why)
             return None
 
 
