@@ -91,3 +91,16 @@ def test_an_original_is_measured_where_all_candidates_are_rendered() -> None:
     declared = itself.verified["lost_surface_mass_bound"]
     assert declared == pytest.approx(max(searched.bound, unseen.bound))
     assert float(fourth.verified["lost_surface_mass_bound"] or 0.0) > float(declared or 1.0)
+
+
+def test_its_image_price_is_the_worst_that_any_reference_measures() -> None:
+    here = ground(True)
+    seen = here.references[0]
+    part = Part(seen.search.evidence, [object()])  # rendered: the original guides, so none is asked
+    known = [
+        seen._replace(mixture=object(), price_before=price, search=part)
+        for price in (0.01, 0.05, 0.03)
+    ]
+    several = here._replace(references=known)
+    assert several.price(several.original, "search") == 0.05
+    assert several.price(several.original, "search", absolute=True) is None

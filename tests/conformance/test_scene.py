@@ -8,6 +8,7 @@ import pytest
 import torch
 
 from leco_plugin.conformance import scene
+from leco_plugin.conformance.proposals import chords, cut_short
 from leco_plugin.models.encodings import Kind
 from leco_plugin.occupancy import Occupancy
 
@@ -55,3 +56,16 @@ def test_rays_cross_the_slab_or_have_nothing_to_sample():
         missing.origins[:, None] + missing.directions[:, None] * t[:, None]
     )
     assert (depths < 0.0).all()
+
+
+def test_a_chord_ends_where_the_slab_does_to_a_hundredth():
+    rays = cut_short()
+    enters, leaves = chords(rays)
+    met = leaves > enters
+    assert met.any()
+
+    def depth(t):
+        return scene.SLAB.depth(rays.origins + rays.directions * t[:, None])[met]
+
+    assert (depth(enters) >= 0.0).all() and (depth(leaves) >= 0.0).all()
+    assert (depth(enters - 0.0101) < 0.0).all() and (depth(leaves + 0.0101) < 0.0).all()
