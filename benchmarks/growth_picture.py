@@ -1,82 +1,155 @@
-"""Draws `growth.json`: bytes of gate and grid, and seconds to learn, against the built area."""
+"""How gates and grids grow with a city, of the cities that `leco capacity` has measured."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
-from leco_plugin.chart.theme import LIGHT, SOURCE, Theme, fingerprint, plain, style, themed
+import checkout  # noqa: F401
+from page_parts import table
 
-PANELS = (
-    (
-        "bytes of the occupancy",
-        (("gate_bytes", "gate, by its rule"), ("grid_bytes", "grid, a bit a cell")),
-    ),
-    (
-        "seconds",
-        (("seconds", "learning the gate"), ("grid_seconds", "filling the grid from that field")),
-    ),
+from leco_plugin.capacity.choice import Row, choose, kilobytes
+from leco_plugin.chart.theme import (
+    LIGHT,
+    Theme,
+    log_axis,
+    new_figure,
+    plain,
+    save_picture,
+    style,
+    themed,
 )
+from leco_plugin.scenes.city.city import City, CityConfig
+
+Reports = Mapping[str, Any]
+"""Results of `leco capacity`, by the name of their scene."""
+CITY = "city-"
+"""How names of cities begin; the blocks a side follow."""
+LINES = ("gate, the chosen one", "grid, the best one")
 
 
-def draw(path: Path, report: dict[str, Any], theme: Theme = LIGHT) -> Path:
-    """Two panels with logarithmic axes; a figure that is not there is left out.
+class Grown(NamedTuple):
+    """A city with what occupies it."""
+
+    blocks: int
+    name: str
+    """Of its report."""
+    area: float
+    """Built, square metres."""
+    photographs: int
+    gate: Row
+    grid: Row
+    """The grid that keeps least; of those within 5% of it, the smallest."""
+
+    @property
+    def times(self) -> float:
+        """How many times the gate's volume the grid keeps."""
+        return float(self.grid["kept_volume"] / self.gate["kept_volume"])
+
+
+def cities(reports: Reports) -> list[Grown]:
+    """The cities among the reports, from small to large."""
+    found = []
+    for name, report in reports.items():
+        blocks = name.removeprefix(CITY)
+        if name == blocks or not blocks.isdigit():
+            continue
+        rows = report["representations"]
+        grids = [row for row in rows if row["family"] == "grid"]
+        least = 1.05 * min(row["kept_volume"] for row in grids)
+        grid = min((row for row in grids if row["kept_volume"] <= least), key=_bytes)
+        gate = choose([row for row in rows if row["family"] != "grid"])
+        config = CityConfig(int(blocks))
+        area = float(City(config).built.sum()) * config.block_size**2
+        found.append(Grown(int(blocks), name, area, report["scene"]["train_images"], gate, grid))
+    return sorted(found)
+
+
+def _bytes(row: Row) -> int:
+    """Of a gate, or of a grid as an octree."""
+    return int(row.get("octree_bytes", row["bytes"]))
+
+
+def growth_table(reports: Reports) -> str:
+    """A row a city, and the finding below."""
+    grown = cities(reports)
+    cells = [
+        (
+            f"{one.blocks}",
+            f"{one.area:,.0f}",
+            f"{one.photographs}",
+            f"{one.gate['family']} {one.gate['size']}",
+            f"{one.gate['bytes'] / 1000:.1f}",
+            f"{one.gate['kept_volume']:.2%}",
+            f"{one.grid['size']}^3",
+            kilobytes(one.grid),
+            f"{_bytes(one.grid) / 1000:,.1f}",
+            f"{one.grid['kept_volume']:.2%}",
+            f"{one.times:.1f}",
+        )
+        for one in grown
+    ]
+    header = (
+        "blocks a side | built, m2 | photographs | gate | kB | keeps | grid | a bit a cell "
+        "| as an octree, kB | keeps | times the gate's"
+    )
+    return "\n".join([*table(header, cells), "", finding(grown)])
+
+
+def finding(grown: Sequence[Grown]) -> str:
+    """What the cities show, in two sentences."""
+    first, last = grown[0], grown[-1]
+    kept = f"{_span([100 * one.gate['kept_volume'] for one in grown])}% of the volume"
+    times = f"{_span([one.times for one in grown])} times as much"
+    return (
+        f"From {first.blocks} to {last.blocks} blocks a side the gate takes "
+        f"{_span([one.gate['bytes'] / 1000 for one in grown])} kB and keeps {kept}. The best grid "
+        f"keeps {times} and takes {_span([_bytes(one.grid) / 1000 for one in grown])} kB as an "
+        "octree."
+    )
+
+
+def headline(grown: Sequence[Grown]) -> str:
+    """The finding in ten words at most."""
+    return f"In every city, grids keep {_span([one.times for one in grown])} times a gate's volume"
+
+
+def _span(values: Sequence[float]) -> str:
+    low, high = (f"{value:,.1f}" for value in (min(values), max(values)))
+    return low if low == high else f"{low} to {high}"
+
+
+def draw(path: Path, reports: Reports, theme: Theme = LIGHT) -> Path:
+    """Volume kept and bytes of gate and grid, against the built area.
 
     Args:
         path: of the picture.
-        report: as in `growth.json`.
+        reports: two cities among them at least.
         theme: of the page it is meant for.
     """
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
-
+    grown = cities(reports)
+    areas = [one.area / 1e4 for one in grown]
+    pairs = [(one.gate, one.grid) for one in grown]
+    panels = (
+        ("volume kept, %", [[100 * row["kept_volume"] for row in pair] for pair in pairs]),
+        ("kB, grids as octrees", [[_bytes(row) / 1000 for row in pair] for pair in pairs]),
+    )
     with themed(theme, 11.5):
-        figure = Figure(figsize=(10.0, 4.4), facecolor=theme.page, layout="constrained")
-        FigureCanvasAgg(figure)
-        for axes, (label, lines) in zip(figure.subplots(1, 2), PANELS):
-            for number, (name, what) in enumerate(lines):
-                _line(axes, report, name, what, number, theme)
-            axes.set_xscale("log")
-            axes.set_yscale("log")
-            axes.set_xlabel("built area, square metres")
-            axes.set_ylabel(label)
+        figure = new_figure((10.0, 4.6), theme.page)
+        figure.text(0.02, 0.965, headline(grown), va="top", fontsize=15, fontweight="bold")
+        for number, (label, values) in enumerate(panels):
+            axes: Any = figure.add_axes((0.075 + 0.5 * number, 0.14, 0.4, 0.64))
+            for line, name in enumerate(LINES):
+                heights = [pair[line] for pair in values]
+                axes.plot(areas, heights, label=name, markersize=8, **style(line, theme))
+            axes.set(xscale="log", yscale="log", xlabel="built area, hectares")
+            axes.set_title(label, fontsize=12, loc="left")
+            log_axis(axes, "x", (1.0,))
+            log_axis(axes, "y", (1.0, 2.0, 5.0) if number == 0 else (1.0,))
             plain(axes, theme)
-            if axes.get_legend_handles_labels()[1]:
-                axes.legend(frameon=False, loc="lower left", bbox_to_anchor=(0.0, 1.0))
-        figure.savefig(path, dpi=140, metadata={SOURCE: fingerprint(report)})
-    return path
-
-
-def _line(
-    axes: Any, report: dict[str, Any], name: str, what: str, number: int, theme: Theme
-) -> None:
-    rows = [row for row in report["rows"] if row[name]]
-    if not rows:
-        return
-    exponent = report["exponents_with_area"][name]["all"]
-    of = "" if len(rows) == len(report["rows"]) else f", in {len(rows)} of {len(report['rows'])}"
-    label: str | None = what
-    if exponent is not None:
-        label = f"{what}: as area to the {exponent:.2f}{of}"
-    for seed in sorted({row["seed"] for row in rows}):
-        points = [(row["area_square_metres"], row[name]) for row in rows if row["seed"] == seed]
-        axes.plot(*zip(*points), label=label, **style(number, theme))
-        label = None
-    if name == "grid_bytes":
-        _without_a_grid(axes, report, number, theme)
-
-
-def _without_a_grid(axes: Any, report: dict[str, Any], number: int, theme: Theme) -> None:
-    """Arrows from the largest grid that was tried, where none keeps as little as the gate."""
-    missing = [
-        (row["area_square_metres"], max(grid["bytes"] for grid in row["grids"]))
-        for row in report["rows"]
-        if row["grid_bytes"] is None and row["grids"]
-    ]
-    colour = theme.colours[number % len(theme.colours)]
-    for place, (area, most) in enumerate(missing):
-        arrow = {"arrowstyle": "<-", "color": colour, "linewidth": 1.6}
-        axes.annotate("", (area, most), (area, 3.0 * most), arrowprops=arrow)
-        said = None if place else "no grid up to here keeps as little"
-        axes.plot([area], [most], "_", color=colour, markersize=12, label=said)
-        axes.plot([area], [4.0 * most], alpha=0.0)
+        handles, labels = axes.get_legend_handles_labels()
+        figure.legend(
+            handles, labels, loc="upper left", ncols=2, frameon=False, bbox_to_anchor=(0.01, 0.91)
+        )
+        return save_picture(figure, path, dict(reports), dpi=140)

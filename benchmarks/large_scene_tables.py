@@ -1,4 +1,4 @@
-"""Tables of what was measured for large scenes: growth, bounds and photographs on disk."""
+"""Tables of what was measured for large scenes: bounds and photographs on disk."""
 
 from __future__ import annotations
 
@@ -8,57 +8,6 @@ from dataclasses import dataclass
 from typing import Any
 
 Report = dict[str, Any]
-
-
-def growth_table(report: Report) -> str:
-    """A row a city; the exponents of growth below, and whether the gates were large enough."""
-    lines = [
-        "| blocks a side (seed) | built, m2 | photographs | gate, kB | grid, kB | volume kept, % "
-        "| learned in, s | steps | grid filled in, s | held-out PSNR |",
-        "|" + "---|" * 10,
-    ]
-    for row in report["rows"]:
-        largest = max((grid["bytes"] for grid in row["grids"]), default=0)
-        grid = f"over {largest / 1000:.0f}" if row["grid_bytes"] is None else _kb(row["grid_bytes"])
-        lines.append(
-            f"| {row['blocks']} ({row['seed']}) | {row['area_square_metres']:,.0f} "
-            f"| {row['photographs']} | {_kb(row['gate_bytes'])} | {grid} "
-            f"| {100 * row['kept_reached_volume']:.1f} "
-            f"| {_or_dash(row['seconds'], '.0f')} | {row['steps']} of {row['schedule']} "
-            f"| {_or_dash(row['grid_seconds'], '.1f')} | {row['psnr_held_out']:.1f} dB |"
-        )
-    lines += [
-        "",
-        "| grows as a power of (each seed) | gate's bytes, by construction | grid's bytes "
-        "| learning the gate, s | filling the grid, s |",
-        "|" + "---|" * 5,
-    ]
-    for what in ("area", "volume"):
-        found = report[f"exponents_with_{what}"]
-        cells = (_exponent(value, name, report["rows"]) for name, value in found.items())
-        lines.append(f"| {what} | {' | '.join(cells)} |")
-    gate = report["exponents_with_area"]["gate_bytes"]["all"]
-    unlearned = [f"{row['blocks']} ({row['seed']})" for row in report["rows"] if not row["learned"]]
-    if gate is not None:
-        enough = "**no**" if unlearned else "yes"
-        lines += [
-            "",
-            "The gate's size is a rule and no finding: by construction its bytes grow as the area "
-            f"to the {gate:.2f}. Measured is whether such a gate learns each city: {enough}.",
-        ]
-    if unlearned:
-        lines += ["", f"Not learned in any schedule: {', '.join(unlearned)} blocks a side."]
-    return "\n".join(lines)
-
-
-def _exponent(found: dict[str, Any], name: str, rows: list[dict[str, Any]]) -> str:
-    """An exponent, and of how many rows it is where some have no figure."""
-    if found["all"] is None:
-        return "-"
-    each = ", ".join(f"{one:.2f}" for one in found["each"])
-    known = sum(bool(row[name]) for row in rows)
-    of = "" if known == len(rows) else f", of {known} of {len(rows)} rows"
-    return f"{found['all']:.2f} ({each}){of}"
 
 
 def bounds_table(report: Report) -> str:
@@ -104,17 +53,6 @@ def memory_table(report: Report) -> str:
     return "\n".join(lines)
 
 
-def _growth_note(report: Report) -> str:
-    return (
-        " The gate is that of the device, with so many octaves more when the side doubles, from "
-        f"four blocks on: {report['settings']['octaves_per_doubling']}. Learned: "
-        f"{report['settings']['kept']:.0%} of the candidates or fewer are kept where "
-        f"{report['lost_surface_mass']:.1%} of the weight near surfaces is lost. The grid is filled"
-        " from the same field, loses as much and keeps the same share of the volume that rays "
-        f"reach; its bytes are interpolated between grids."
-    )
-
-
 def _bounds_note(report: Report) -> str:
     settings = report["settings"]
     return (
@@ -157,12 +95,6 @@ def _memory_command(report: Report) -> str:
 
 
 LARGE_SCENES = {
-    "growth": Shown(
-        "How occupancy grows with a city",
-        lambda report: "python benchmarks/growth.py",
-        growth_table,
-        _growth_note,
-    ),
     "bounds": Shown(
         "Automatic bounds against near and far set by hand",
         _bounds_command,
@@ -172,11 +104,3 @@ LARGE_SCENES = {
     "image-memory": Shown("Photographs on disk", _memory_command, memory_table, _memory_note),
 }
 """By the names of the stored results, in the order of the page."""
-
-
-def _kb(size: float) -> str:
-    return f"{size / 1000:.0f}" if size >= 10_000 else f"{size / 1000:.1f}"
-
-
-def _or_dash(value: float | None, form: str) -> str:
-    return "-" if value is None else format(value, form)

@@ -8,6 +8,7 @@ from typing import Any
 
 import checkout  # noqa: F401
 from chart_sections import stored, titles
+from growth_picture import cities
 from growth_picture import draw as draw_growth
 from learning import draw as draw_learning
 from page_parts import RESULTS, ROOT
@@ -36,11 +37,14 @@ def pictures() -> dict[Path, Any]:
     for name in titles():
         results = stored(name)
         found |= {CHARTS / f"{name}.png": results, CHARTS / f"{name}-dark.png": results}
-    for path in (GROWTH, LEARNING, STABILITY):
+    for path in (LEARNING, STABILITY):
         if (file := RESULTS / f"{path.stem}.json").exists():
             report = json.loads(file.read_text())
             found |= {path: report, path.with_stem(f"{path.stem}-dark"): report}
-    for name, results in scene_results("capacity").items():
+    measured = scene_results("capacity")
+    if len(grown := {one.name: measured[one.name] for one in cities(measured)}) > 1:
+        found |= {GROWTH: grown, GROWTH.with_stem("growth-dark"): grown}
+    for name, results in measured.items():
         path = CHARTS / f"{CAPACITY}{name}.png"
         found |= {path: results, path.with_stem(f"{path.stem}-dark"): results}
     return found

@@ -8,146 +8,58 @@ from pathlib import Path
 from typing import Any
 
 import bounds
-import growth
 import pytest
-from growth_figures import bytes_for, exponents, grid_for, slope
-from growth_picture import draw
-from large_scene_tables import bounds_table, growth_table, memory_table
+from growth_picture import cities, draw, growth_table
+from large_scene_tables import bounds_table, memory_table
 from page_parts import RESULTS
 from PIL import Image
 
 from leco_plugin.chart.theme import DARK, SOURCE, fingerprint
-from leco_plugin.models.gate import GateConfig
 
 ALONE, WITH_PLANES = "near and far alone", "near and far, planes from the data"
 
 
-def test_an_exponent_is_that_of_a_power_and_missing_values_are_left_out() -> None:
-    assert slope([1.0, 2.0, 8.0], [3.0, 6.0 * 2.0**0.5, None]) == pytest.approx(1.5)
-    assert slope([1.0, 2.0, 8.0], [5.0] * 3) == pytest.approx(0.0)
-    assert slope([1.0, 2.0], [3.0, None]) is None
-    assert slope([], []) is None
-
-
-def test_the_grid_that_keeps_a_volume_lies_between_those_measured() -> None:
-    rows = [{"bytes": 10**k, "kept_reached_volume": 0.8 / 2**k} for k in range(4)]
-    assert bytes_for(0.2, rows) == pytest.approx(100.0)
-    assert bytes_for(0.2 * 2**0.5, rows) == pytest.approx(10**1.5)
-    assert bytes_for(0.9, rows) == 1.0
-    assert bytes_for(0.01, rows) is None and grid_for(0.01, rows) is None
-    assert grid_for(0.3, rows) == rows[2]
-    stumbling = [*rows[:2], {"bytes": 30, "kept_reached_volume": 0.99}, *rows[2:]]
-    assert bytes_for(0.2 * 2**0.5, stumbling) == pytest.approx(10**1.5)
-    level = [{"bytes": 8, "kept_reached_volume": 0.5}, {"bytes": 64, "kept_reached_volume": 0.5}]
-    assert bytes_for(0.5, level) == 8.0
-
-
-def test_a_gate_has_an_octave_more_when_the_side_doubles() -> None:
-    octaves = [growth.gate_of(GateConfig(), blocks, 1).encoding.octaves for blocks in (2, 4, 8, 16)]
-    first = GateConfig().encoding.octaves
-    assert octaves == [first, first, first + 1, first + 2]
-
-
-def test_growth_is_told_with_area_and_with_volume() -> None:
+def report(grid: float, gate: float = 0.02) -> dict[str, Any]:
+    """Results of `leco capacity`: a gate, a fine grid that keeps least, and a coarser one."""
     rows = [
-        {"area": n**2, "volume": n**4, "gate_bytes": 7, "grid_bytes": n**4, "seconds": None}
-        for n in (1, 2, 4)
+        {"family": "frequency", "size": "6-32-2", "bytes": 4932, "kept_volume": gate},
+        {"family": "grid", "size": "64", "bytes": 32768, "octree_bytes": 9000, "kept_volume": grid},
+        {"family": "grid", "size": "512", "bytes": 1 << 24, "octree_bytes": 1 << 18}
+        | {"kept_volume": 0.96 * grid},
     ]
-    first = [row | {"grid_seconds": 1.0, "seed": 0} for row in rows]
-    second = [row | {"seed": 1, "grid_bytes": row["area"]} for row in first]
-    grids = exponents([*first, *second], "area")["grid_bytes"]
-    assert grids["all"] == pytest.approx(1.5) and grids["each"] == pytest.approx([2.0, 1.0])
-    found = exponents(first, "volume")
-    assert found["grid_bytes"]["all"] == pytest.approx(1.0)
-    assert found["gate_bytes"]["all"] == pytest.approx(0.0)
-    assert found["seconds"] == {"all": None, "each": []}
+    return {"representations": rows, "scene": {"train_images": 34}}
 
 
-def test_a_city_begins_with_the_schedule_of_the_next_smaller_one() -> None:
-    options = growth.Options(schedules=(10, 20, 40))
-    rows = [{"blocks": 2, "schedule": 10}, {"blocks": 4, "schedule": 20}]
-    rows = [row | {"seed": 0} for row in rows] + [{"blocks": 4, "schedule": 40, "seed": 1}]
-    assert [growth.first_schedule(rows, blocks, 0, options) for blocks in (1, 3, 8)] == [0, 0, 1]
-    assert [growth.first_schedule(rows, blocks, 1, options) for blocks in (4, 8)] == [0, 2]
+REPORTS = {"fox": report(0.5), "city-8": report(0.06), "city-2": report(0.03), "city": report(0.9)}
 
 
-def test_rows_of_another_field_are_not_gone_on_with(tmp_path: Path) -> None:
-    out = tmp_path / "growth.json"
-    settings = growth.settings_of(growth.Options())
-    assert settings["sizes"]["field"]["encoding"]["log2_table"] > 0
-    assert settings == growth.settings_of(growth.Options(blocks=(2,), seeds=(5,), out=out))
-    assert growth.stored_rows(out, settings) == []
-    out.write_text(json.dumps({"settings": settings, "rows": [{"blocks": 2}]}))
-    assert growth.stored_rows(out, settings) == [{"blocks": 2}]
-    with pytest.raises(SystemExit, match="other settings or sizes"):
-        growth.stored_rows(out, settings | {"sizes": {}})
+def test_growth_is_told_of_cities_from_small_to_large_with_the_smallest_of_the_best_grids() -> None:
+    grown = cities(REPORTS)
+    assert [(one.blocks, one.grid["size"], one.times) for one in grown] == [
+        (2, "64", pytest.approx(1.5)),
+        (8, "64", pytest.approx(3.0)),
+    ]
+    assert grown[0].area < grown[1].area
+    finer = cities({"city-2": report(0.03), "city-4": report(0.06, gate=0.06)})
+    assert finer[1].times == pytest.approx(1.0)
 
 
-def test_looks_lie_in_the_second_half_and_the_last_at_the_end() -> None:
-    assert growth.look_steps(100, 4) == {63, 75, 88, 100}
-    assert growth.look_steps(5, 2) == {4, 5}
-
-
-def growth_report(grid_bytes: float | None = 4e6, learned: bool = True) -> dict[str, Any]:
-    row = {
-        "blocks": 2,
-        "seed": 0,
-        "area_square_metres": 6400.0,
-        "photographs": 34,
-        "gate_bytes": 51_000,
-        "grid_bytes": 9_400.0,
-        "grids": [{"bytes": 4_096, "kept_reached_volume": 0.2}],
-        "kept_reached_volume": 0.0812,
-        "seconds": 11.3,
-        "steps": 75,
-        "schedule": 100,
-        "grid_seconds": 1.26,
-        "psnr_held_out": 19.13,
-        "learned": True,
-    }
-    large = row | {
-        "blocks": 16,
-        "area_square_metres": 409_600.0,
-        "grid_bytes": grid_bytes,
-        "grid_seconds": None if grid_bytes is None else 60.0,
-        "learned": learned,
-        "seconds": 100.0 if learned else None,
-    }
-    figures = {"gate_bytes": 0.05, "grid_bytes": 1.04, "seconds": None, "grid_seconds": 0.9}
-    both = {
-        name: {"all": one, "each": [] if one is None else [one, one + 0.1]}
-        for name, one in figures.items()
-    }
-    return {
-        "exponents_with_area": both,
-        "exponents_with_volume": both,
-        "rows": [row, large],
-    }
-
-
-def test_growth_says_each_city_and_that_the_gates_size_is_a_rule() -> None:
-    table = growth_table(growth_report())
-    assert "| 2 (0) | 6,400 | 34 | 51 | 9.4 | 8.1 | 11 | 75 of 100 | 1.3 | 19.1 dB |" in table
-    assert "| area | 0.05 (0.05, 0.15) | 1.04 (1.04, 1.14) | - | 0.90 (0.90, 1.00) |" in table
-    assert "by construction its bytes grow as the area to the 0.05." in table
-    assert "learns each city: yes." in table
-
-
-def test_growth_without_a_grid_that_does_says_how_large_one_did_not() -> None:
-    assert "| 16 (0) | 409,600 | 34 | 51 | over 4 | 8.1 |" in growth_table(growth_report(None))
-
-
-def test_a_gate_that_has_not_learned_is_said_to_be_too_small() -> None:
-    table = growth_table(growth_report(learned=False))
-    assert "learns each city: **no**." in table
-    assert "Not learned in any schedule: 16 (0) blocks a side." in table
+def test_the_growth_table_has_bytes_of_bits_and_of_octrees() -> None:
+    table = growth_table(REPORTS)
+    assert (
+        "| 8 | 99,200 | 34 | frequency 6-32-2 | 4.9 | 2.00% | 64^3 | 32.8 kB | 9.0 | 6.00% | 3.0 |"
+        in table
+    )
+    assert table.splitlines()[-1] == (
+        "From 2 to 8 blocks a side the gate takes 4.9 kB and keeps 2.0% of the volume. The best "
+        "grid keeps 1.5 to 3.0 times as much and takes 9.0 kB as an octree."
+    )
 
 
 def test_growth_is_drawn_with_what_it_was_drawn_from(tmp_path: Path) -> None:
-    report = growth_report(None, learned=False)
-    path = draw(tmp_path / "growth.png", report, DARK)
+    path = draw(tmp_path / "growth.png", REPORTS, DARK)
     with Image.open(path) as image:
-        assert image.info[SOURCE] == fingerprint(report)
+        assert image.info[SOURCE] == fingerprint(REPORTS)
         assert image.convert("RGB").getpixel((2, 2)) == (0x0D, 0x11, 0x17)
 
 
@@ -166,25 +78,6 @@ def test_memory_is_told_in_megabytes() -> None:
         "| disk | 562 | 501 | 531 | 2,124 |",
         "| memory | **over the allowance** | | | |",
     ]
-
-
-@pytest.mark.slow
-@pytest.mark.long
-def test_a_dry_run_passes_and_is_not_done_twice(
-    run_script: Callable[..., str], tmp_path: Path
-) -> None:
-    out = tmp_path / "growth.json"
-    command = ["growth.py", "--dry-run", "--out", out, "--cities", tmp_path / "cities"]
-    run_script(*command)
-    report = json.loads(out.read_text())
-    assert [row["blocks"] for row in report["rows"]] == [1, 2]
-    for row in report["rows"]:
-        assert 1 <= len(row["grids"]) <= 2  # none behind one that keeps as little as the gate
-        assert row["gate_bytes"] > 0
-        assert 0.0 < row["kept_reached_volume"] <= 1.0 and row["psnr_held_out"] > 3.0
-        assert row["schedule"] == 8 and not row["learned"]
-    assert "Not learned in any schedule: 1 (0), 2 (0)" in growth_table(report)
-    assert run_script(*command).count("stored already") == 2
 
 
 def rows_of(

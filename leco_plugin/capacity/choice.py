@@ -91,10 +91,10 @@ def verdict(rows: Sequence[Row]) -> str:
             "field the two are not told apart, and a grid may suffice."
         )
     if large := smallest_grid(rows, chosen):
-        return (
-            f"{said} A grid that keeps as little takes {large['size']}^3 cells, "
-            f"{large['bytes'] / chosen['bytes']:.0f} times as many bytes."
-        )
+        times = f"{large['bytes'] / chosen['bytes']:.0f} times as many bytes"
+        if "octree_bytes" in large:
+            times += f" ({large['octree_bytes'] / chosen['bytes']:.1f} times as an octree)"
+        return f"{said} A grid that keeps as little takes {large['size']}^3 cells, {times}."
     return f"{said} No grid up to {max(sizes)}^3 keeps as little."
 
 

@@ -22,8 +22,19 @@ from leco_plugin.capacity.sources import Source, draw_held_out, draw_training_ra
 from leco_plugin.chart.runner import SETTINGS, make_jobs, take_folder
 from leco_plugin.chart.theme import DARK, LIGHT
 from leco_plugin.evaluation.clock import seconds_now
-from leco_plugin.evaluation.equal_loss import kept_shares, mapped_box, reached_volume
-from leco_plugin.evaluation.field_grids import fits_memory, largest_in_cells, plain_and_dilated
+from leco_plugin.evaluation.equal_loss import (
+    kept_shares,
+    mapped_box,
+    reached_volume,
+    threshold_losing,
+)
+from leco_plugin.evaluation.field_grids import (
+    dilate,
+    fits_memory,
+    largest_in_cells,
+    look_up_scores,
+    octree_bytes,
+)
 from leco_plugin.evaluation.inspection import ViewBox, in_parts
 from leco_plugin.evaluation.report import (
     describe_code,
@@ -178,10 +189,14 @@ def measure_grid(taught: Taught, candidate: Candidate, lost: float) -> dict[str,
     assert candidate.resolution is not None
     started, box = seconds_now(), mapped_box(taught.mixture)
     scores = taught_grid(taught.lesson, box, candidate.resolution)
-    both = [
-        measure(taught.held_out, of_rays, of_volume, lost)
-        for of_rays, of_volume in plain_and_dilated(scores, box, taught.mapped, taught.volume)
-    ]
+    both = []
+    for cells in (scores, dilate(scores)):
+        of_rays, of_volume = (
+            look_up_scores(cells, box, places) for places in (taught.mapped, taught.volume)
+        )
+        kept = cells >= threshold_losing(taught.held_out.worth, of_rays, lost)
+        found = measure(taught.held_out, of_rays, of_volume, lost)
+        both.append(found | {"octree_bytes": octree_bytes(kept)})
     return _row(candidate, started, min(both, key=lambda one: one["kept_volume"]))
 
 

@@ -12,7 +12,7 @@ from collections.abc import Callable, Iterator, Sequence
 import psutil
 import torch
 from torch import Tensor
-from torch.nn.functional import max_pool3d
+from torch.nn.functional import max_pool3d, pad
 
 from leco_plugin.evaluation.clock import Clock
 from leco_plugin.evaluation.inspection import ViewBox, in_parts
@@ -165,6 +165,22 @@ def plain_and_dilated(
 
 def _cells(scores: Tensor, box: ViewBox, mapped: Tensor) -> tuple[Tensor, Tensor]:
     return cells_of((1, *scores.shape), torch.cat([box.low, box.high]), mapped)
+
+
+def octree_bytes(kept: Tensor) -> int:
+    """Bytes of the octree that holds the kept cells, bool [n, n, n], without pointers.
+
+    A node of which some cells are kept says which of its eight children keep any, and above the
+    last level also which of them keep all: one byte on the last level, two above it.
+    """
+    side = 1 << (len(kept) - 1).bit_length()
+    some = pad(kept.float(), (0, side - len(kept)) * 3)[None]
+    every, total, of_node = some, 0, 1
+    while some.shape[-1] > 1:
+        some, every = max_pool3d(some, 2), -max_pool3d(-every, 2)
+        total += of_node * int((some > every).sum())
+        of_node = 2
+    return total
 
 
 def fits_memory(cells: int) -> bool:

@@ -16,6 +16,7 @@ from leco_plugin.evaluation.field_grids import (
     fits_memory,
     halvings,
     look_up_scores,
+    octree_bytes,
 )
 from leco_plugin.evaluation.inspection import ViewBox
 
@@ -155,3 +156,29 @@ def test_a_grid_that_asks_more_than_it_may_is_filled_only_from_a_coarser_one() -
     assert FieldGrids(ball, BOX, None, lambda scores: 0.5, most).fill(FINE) is None
     grids = FieldGrids(ball, BOX, None, lambda scores: 0.5, most)
     assert grids.fill(CUBE) is not None and grids.fill(FINE) is not None
+
+
+def node_bytes(kept: Tensor) -> int:
+    """What a node of kept cells and all below it take, one after another."""
+    if len(kept) == 1 or kept.all() or not kept.any():
+        return 0
+    half = len(kept) // 2
+    if half == 1:
+        return 1
+    sides = (slice(0, half), slice(half, None))
+    return 2 + sum(node_bytes(kept[x, y, z]) for x, y, z in itertools.product(sides, repeat=3))
+
+
+@pytest.mark.parametrize("share", [0.0, 0.001, 0.1, 0.9, 1.0])
+def test_an_octree_takes_what_its_nodes_take_one_after_another(share: float) -> None:
+    coarse = torch.rand(4, 4, 4) < share  # whole nodes are full
+    kept = coarse.repeat_interleave(4, 0).repeat_interleave(4, 1).repeat_interleave(4, 2)
+    kept |= torch.rand(16, 16, 16) < share / 10.0
+    assert octree_bytes(kept) == node_bytes(kept)
+
+
+def test_an_octree_of_cells_that_are_no_power_of_two_is_that_of_the_next() -> None:
+    kept = torch.rand(5, 5, 5) < 0.3
+    padded = torch.zeros(8, 8, 8, dtype=torch.bool)
+    padded[:5, :5, :5] = kept
+    assert octree_bytes(kept) == octree_bytes(padded) == node_bytes(padded) > 0
