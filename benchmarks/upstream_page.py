@@ -38,7 +38,7 @@ def page(text: str) -> str:
         for line in (guided, other):
             rows.append([f"`{method}`{mark}", *_cells(line)])
             seeds.add(len(line.runs))
-    (count,) = seeds
+    count = " or ".join(str(some) for some in sorted(seeds))
     return between(text, MARKS, "\n".join([*table(HEAD, rows), BELOW.format(seeds=count)]))
 
 
