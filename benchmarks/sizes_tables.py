@@ -176,7 +176,7 @@ def capacity_table(reports: Mapping[str, Report]) -> str:
 
 
 def where_it_pays(reports: Mapping[str, Report]) -> str:
-    """For which scenes a grid suffices, may suffice, and learned occupancy pays."""
+    """For which scenes a taught grid suffices, may suffice, and keeps more than a gate."""
     grids: list[str] = []
     open_: list[str] = []
     gates: list[str] = []
@@ -190,9 +190,10 @@ def where_it_pays(reports: Mapping[str, Report]) -> str:
             gates.append(scene)
     grid, nearly, gate = (", ".join(names) or "none" for names in (grids, open_, gates))
     return (
-        f"A grid of {USUAL_GRID}^3 cells or fewer keeps as little as what is chosen, and suffices, "
-        f"for: {grid}. It keeps more, but less than {TOLD_APART:g} times as much, which one field "
-        f"does not tell apart, for: {nearly}. Learned occupancy pays for: {gate}."
+        f"If the lesson that teaches a gate fills it, a grid of {USUAL_GRID}^3 cells or fewer "
+        f"keeps as little as the gate that is chosen, for: {grid}. It keeps more, but less than "
+        f"{TOLD_APART:g} times as much, which one field does not tell apart, for: {nearly}. The "
+        f"gate keeps less for: {gate}. No host fills its own grid by that lesson."
     )
 
 

@@ -38,7 +38,7 @@ BAR = 0.032
 """Height of a bar at the foot of a panel, as a share of the panel's."""
 WIDE_RANGE = 8.0
 """Ratio of costs from which on their axis is logarithmic."""
-TITLE_WIDTH, TEXT_WIDTH = 66, 120
+TITLE_WIDTH, TEXT_WIDTH = 66, 104
 CHARACTER = 0.0098
 """Width of a letter, as a share of the figure's."""
 TOP, LINE_HEIGHT, SMALL_LINE_HEIGHT = 0.985, 0.04, 0.0235

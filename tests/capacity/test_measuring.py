@@ -5,8 +5,10 @@ from __future__ import annotations
 import pytest
 import torch
 
+from leco_plugin.capacity import measuring
 from leco_plugin.capacity.evidence import Evidence
 from leco_plugin.capacity.measuring import VOLUMES, measure, taught_grid
+from leco_plugin.capacity.search import grids
 from leco_plugin.evaluation.inspection import ViewBox
 from leco_plugin.learning.sharpening import Lesson
 
@@ -45,3 +47,10 @@ def test_a_cell_of_a_grid_has_the_largest_target_of_the_lesson_in_it() -> None:
     expected = torch.zeros(2, 2, 2)
     expected[0, 1, 1], expected[1, 0, 0] = 0.7, 0.4
     torch.testing.assert_close(scores, expected)
+
+
+def test_a_row_says_how_long_a_representation_took(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(measuring, "seconds_now", lambda: 12.5)
+    (grid,) = grids((4,))
+    row = measuring._row(grid, 10.0, {"kept_volume": 0.5})
+    assert row == {"family": "grid", "size": "4", "bytes": 8, "seconds": 2.5, "kept_volume": 0.5}

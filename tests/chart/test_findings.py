@@ -91,6 +91,17 @@ def test_the_headline_names_the_leader_and_its_lead_beyond_the_spread_of_seeds()
     assert headline(results(*other[:1], *best)) == "b 21.5 dB, a 20.0 dB (one seed: no verdict)"
 
 
+def test_where_two_that_learn_are_level_the_headline_says_what_they_lead_the_others_by() -> None:
+    both = of("A", 21.4, 21.5, 21.6) + of("B", 21.3, 21.5, 21.6)
+    dense, grid = {"sampler": "dense"}, {"sampler": "own"}
+    ahead = results(*both, *of("C", 20.0, 20.1, 19.9, **dense), *of("D", 19.0, 19.1, 18.9, **grid))
+    assert headline(ahead, short=True) == "learned occupancy leads all others by 1.50 ± 0.23 dB"
+    assert headline(ahead).endswith("; C, the best of the others, is 1.50 ± 0.23 behind")
+    close = results(*both, *of("C", 18.0, 22.0, 23.0, **dense))
+    assert headline(close, short=True) == "A is level with the next best"
+    assert "behind" not in headline(close)
+
+
 def test_the_method_that_all_share_is_named_once_and_with_the_scene() -> None:
     shared = results(run("NGP + a", psnr=20.0), run("NGP + b", psnr=21.5))
     assert circumstances(shared) == "NGP on city, 10 s of training on 2 CPU cores, one seed"

@@ -106,6 +106,10 @@ def test_sizes_out_of_range_are_refused(resolution: int, levels: int) -> None:
         grid_buffers(ball(), resolution, levels)
 
 
+def test_a_grid_may_have_one_cell() -> None:
+    assert bool(grid_buffers(ball(), 1, 1)["binaries"].all())
+
+
 def test_the_box_of_a_bounded_scene_ends_at_its_walls() -> None:
     box = innermost_box(walled())
     assert box[2] == 0.0 and box[5] == 2.0

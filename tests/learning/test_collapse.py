@@ -150,6 +150,13 @@ def test_a_gate_that_was_opened_again_late_is_healed_as_quickly_as_an_early_one(
     assert (progress.learn_steps, progress.dense_until) == (19_101, 19_051)
 
 
+def test_a_gate_that_begins_anew_learns_on_dense_samples_for_a_quarter_of_its_phase() -> None:
+    progress, head = Progress(learn_steps=200, configured=200, healed_at=50), head_of([0.0] * 3)
+    losses = GateLossConfig(form="logit")
+    heal(head, progress, Collapse("the gate calls all space empty"), SPREAD, 199, losses)
+    assert (progress.learn_steps, progress.dense_until) == (400, 250)
+
+
 @pytest.mark.parametrize(
     ("kept", "shares", "has_learned", "cause"),
     [

@@ -47,6 +47,7 @@ def test_a_gate_that_changes_its_mind_at_the_step_limit_learns_on_twice() -> Non
     ]
     assert not is_unsettled(999, SCHEDULE.settled, SCHEDULE, 0)
     assert not is_unsettled(4 * SCHEDULE.steps_per_check - 2, below, SCHEDULE, 0)  # a short run
+    assert is_unsettled(4 * SCHEDULE.steps_per_check - 1, below, SCHEDULE, 0)
 
 
 def test_agreement_is_the_share_of_equal_decisions() -> None:

@@ -5,7 +5,16 @@ from __future__ import annotations
 import pytest
 import torch
 
-from leco_plugin.models.field import APPEARANCE_SCALE, ColorHead, codes_nearby
+from leco_plugin.models.encodings import EncodingConfig
+from leco_plugin.models.field import (
+    APPEARANCE_SCALE,
+    OPPONENT,
+    ColorHead,
+    FieldConfig,
+    HMoEField,
+    codes_nearby,
+)
+from leco_plugin.models.hmoe import HMoEConfig
 
 
 def inputs(samples: int = 20, rays: int = 5) -> tuple[torch.Tensor, ...]:
@@ -85,3 +94,16 @@ def test_rays_of_one_batch_have_the_codes_of_their_own_places() -> None:
         )
         torch.testing.assert_close(found[mine], alone)
     assert not torch.allclose(found, color(features, ray_indices, directions, None), atol=1e-3)
+
+
+def test_brightness_and_the_two_hues_are_orthonormal() -> None:
+    torch.testing.assert_close(OPPONENT @ OPPONENT.T, torch.eye(3))
+    torch.testing.assert_close(OPPONENT.sum(dim=1)[1:], torch.zeros(2))  # grey has no hue
+
+
+def test_without_an_empty_expert_points_routed_to_it_have_no_density() -> None:
+    experts = HMoEConfig(2, 8, 1, empty_expert="none")
+    field = HMoEField(FieldConfig(EncodingConfig("hash", levels=2, log2_table=8), experts), 1)
+    routes = torch.tensor([0, 1, 2, 0])
+    sigmas, _ = field.density(torch.rand(4, 3), routes, torch.ones(4))
+    assert torch.equal(sigmas > 0.0, routes > 0)

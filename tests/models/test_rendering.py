@@ -138,6 +138,17 @@ def test_routes_are_experts_and_factors_teach_the_gate(routing: Routing) -> None
     assert logits.grad is not None and bool(logits.grad[routes > 0].any(dim=-1).all())
 
 
+def test_by_threshold_the_factor_is_one_with_the_gradient_of_the_logarithm_of_the_share() -> None:
+    torch.manual_seed(0)
+    logits = torch.randn(200, 4, dtype=torch.float64, requires_grad=True)
+    values, routes = gate_values_and_routes(logits, ROUTINGS["threshold"])
+    assert bool((values == 1.0).all())
+    (found,) = torch.autograd.grad(values.sum(), logits)
+    shares = logits[:, 1:].log_softmax(dim=-1).amax(dim=-1)
+    (expected,) = torch.autograd.grad(shares[routes > 0].sum(), logits)
+    torch.testing.assert_close(found, expected)
+
+
 @pytest.mark.parametrize("name", ["threshold", "paper"])
 def test_points_of_a_dropped_expert_go_to_the_next_best_and_no_other_point_changes(
     name: str,
