@@ -174,12 +174,12 @@ def _draw_panel(panel: Any, rows: Sequence[Row], values: list[float], theme: The
 def circumstances(results: Mapping[str, Any]) -> str:
     """What was measured, in a line or two."""
     machine, scene = results["machine"], results["scene"]
-    grids = "" if "grids" in results else " filled by density"
     where = f"{machine['cores']} CPU cores" if machine["device"] == "cpu" else machine["device"]
     return (
         f"{scene['name']}, {scene['train_images']} photographs; one field of "
-        f"{results['learn_steps']} steps teaches all; {results['rays']} held-out rays; {where}.\n"
-        f"Gates in bfloat16, grids{grids} one bit a cell; down and left is better. "
+        f"{results['learn_steps']} steps teaches all; {results['rays']} rays of "
+        f"{results['rays_of']}; {where}.\n"
+        "Gates in bfloat16, grids one bit a cell; down and left is better. "
         "Ten times the bytes of the chosen save less than a third."
     )
 
