@@ -62,7 +62,7 @@ from leco_plugin.scenes.whole_files import write_whole
 FIELD = "field.pt"
 RAYS, TAUGHT_RAYS = 8192, 1 << 15
 VOLUME_POINTS = 1 << 17
-STEPS = 1000
+STEPS = 3000
 """With which each gate is taught. After 300 small ones still keep two to nine times what they keep
 after 1000 (docs/decisions.md)."""
 

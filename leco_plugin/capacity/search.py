@@ -141,7 +141,7 @@ def name_of(config: GateConfig) -> str:
     return f"{sizes[encoding.kind]}, {config.layers} x {config.width}"
 
 
-STEPS, LONGER, NEARLY = 1200, 3, 3.0
+STEPS, LONGER, NEARLY = 3000, 3, 3.0
 """Steps of teaching. A gate whose loss is at most `NEARLY` times what the search allows is taught
 again, `LONGER` times as long."""
 EMPHASIS, WEIGHT_AT_FULL = 8.0, 0.05

@@ -42,7 +42,8 @@ from leco_plugin.models.rendering import Intervals, Rays, backdrop_of, mapped_mi
 from leco_plugin.occupancy import CAMERAS_THAT_VOUCH, Precision, gate_precision
 from leco_plugin.scenes.input_error import require
 
-BATCH = 1 << 13
+BATCH = 1 << 11
+"""Positions of a step. In the same time many steps of few teach more than few of many."""
 LAST_RATE = 0.05
 """Of the learning rate, after a half cosine."""
 
@@ -135,8 +136,8 @@ ERRORS = ("surface_error", "price_error_db")
 class SharpeningConfig:
     """When and how a small gate is taught by the field."""
 
-    steps: int = 500
-    """Of teaching, each with 8,192 positions; 0 never sharpens."""
+    steps: int = 2000
+    """Of teaching, each with 2,048 positions; 0 never sharpens."""
     least_steps: int = 1000
     """Guided steps that pay for it: a gate is sharpened when it is frozen if so many are left, and
     at the end of a run that has had so many."""
@@ -145,8 +146,11 @@ class SharpeningConfig:
     seen: float = 0.125
     """Share of the threshold from which a candidate is rendered to teach: what lies below it counts
     as empty, and saves half of the time."""
+    caution: float = 0.125
+    """Share of the calibrated threshold that is taken at freezing. What the field has not found by
+    then must not be skipped, or it never will be found. At the end of a run all of it is taken."""
     gate: GateConfig = field(
-        default_factory=lambda: GateConfig(EncodingConfig(octaves=6), 32, 2, 1, normed=False)
+        default_factory=lambda: GateConfig(EncodingConfig(octaves=6), 64, 2, 1, normed=False)
     )
     """The small gate."""
 
@@ -155,6 +159,7 @@ class SharpeningConfig:
         require(self.least_steps >= 0, "sharpening.least-steps", self.least_steps, "at least 0")
         require(self.rays >= 1, "sharpening.rays", self.rays, "at least 1")
         require(0.0 <= self.seen <= 1.0, "sharpening.seen", self.seen, "from 0 to 1")
+        require(0.0 < self.caution <= 1.0, "sharpening.caution", self.caution, "above 0, at most 1")
 
 
 def added_costs(found: dict[str, Any], before: dict[str, Any]) -> dict[str, float]:
@@ -256,6 +261,8 @@ def sharpen(
             for of_one, _ in cameras
         ]
         measured = calibrate(*asked, calibration, cameras=of_cameras)
+        if not guided:
+            measured = measure(*asked, config.caution * measured.threshold)
         promised = promise(of_cameras, measured, calibration)
     return Sharpened(gate, measured, before, promised)
 

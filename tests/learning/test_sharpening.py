@@ -136,6 +136,23 @@ def test_a_small_gate_skips_what_the_large_one_keeps_of_free_space() -> None:
     assert all(torch.equal(p, p.bfloat16().float()) for p in found.gate.parameters())
 
 
+def test_at_freezing_a_share_of_the_threshold_is_taken_and_at_the_end_all_of_it() -> None:
+    mixture = a_mixture()
+    data = some_rays(mixture, 200), (some_rays(mixture, 50), torch.ones(50, 3))
+    bold, careful = (SharpeningConfig(steps=20, gate=GATE, caution=share) for share in (1.0, 0.25))
+
+    def found(config: SharpeningConfig, guided: bool) -> Measured:
+        of = mixture, *data, [], LOSSES, CalibrationConfig(), config, guided
+        sharpened = sharpen(*of)
+        assert sharpened is not None
+        return sharpened.measured
+
+    whole, share = found(bold, False), found(careful, False)
+    assert share.threshold == pytest.approx(0.25 * whole.threshold)
+    assert share.empty_fraction < whole.empty_fraction, "what is said is of that threshold"
+    assert found(careful, True) == found(bold, True)
+
+
 def test_guided_only_what_is_shown_now_is_taught(monkeypatch) -> None:
     shares: list[float] = []
     real = sharpening._asked
@@ -299,7 +316,8 @@ def test_prices_of_a_sharpened_mixture_are_of_the_small_gate() -> None:
 
 
 @pytest.mark.parametrize(
-    ("option", "value"), [("steps", -1), ("rays", 0), ("seen", 1.5), ("least_steps", -1)]
+    ("option", "value"),
+    [("steps", -1), ("rays", 0), ("seen", 1.5), ("least_steps", -1), ("caution", 0.0)],
 )
 def test_settings_that_make_no_sense_are_refused(option: str, value: float) -> None:
     with pytest.raises(InputError, match=f"sharpening.{option.replace('_', '-')}"):
