@@ -219,9 +219,10 @@ def growth_section() -> list[str]:
     command = "leco city --blocks K --aerial-only --out city-K; leco capacity --data city-K ..."
     note = (
         f" Each representation loses {grown[0]['lost_surface_mass']:.1%} of the weight near "
-        "surfaces; kept is a share of the volume that rays reach. One field teaches all of a "
-        f"city, learned in {grown[0]['learn_steps']} steps. The best grid is the smallest of those "
-        "that keep least, within 5%; an octree holds the same cells."
+        "surfaces along rays of test photographs; kept is a share of the volume that training "
+        "rays reach. One field teaches all of a city, learned in "
+        f"{grown[0]['learn_steps']} steps. The best grid is the smallest of those that keep "
+        "least, within 5%; an octree holds the same cells."
     )
     title = "How occupancy grows with a city"
     head, *rest = section(title, command, grown[0], growth_table(measured), note)

@@ -61,9 +61,10 @@ def sizes_sections() -> list[str]:
         first = next(iter(measured.values()))
         rows = [row for report in measured.values() for row in report["representations"]]
         note = (
-            f" Each loses {first['lost_surface_mass']:.1%} of the weight near surfaces; kept is a "
-            "share of the volume that rays reach. The last column: whether such a gate keeps no "
-            f"more than the grid. Rows {made_line(rows)}."
+            f" Each loses {first['lost_surface_mass']:.1%} of the weight near surfaces along rays "
+            "of test photographs; kept is a share of the volume that training rays reach. The "
+            "last column: whether such a gate keeps no more than the grid. "
+            f"Rows {made_line(rows)}."
         )
         command = "leco capacity --data SCENE --out DIR --json results/capacity/SCENE.json"
         title = "How much a scene needs: gates and grids at equal loss"

@@ -20,9 +20,9 @@ from torch import Tensor
 from leco_plugin.evaluation.field_grids import (
     FieldGrids,
     density_of,
+    dilate,
     fits_memory,
     look_up_scores,
-    plain_and_dilated,
 )
 from leco_plugin.evaluation.inspection import ViewBox, in_parts, whole_box
 from leco_plugin.evaluation.report import finite_or_null
@@ -81,7 +81,6 @@ def at_equal_loss(
     mixture: Mixture,
     datamanager: Any,
     grids: Sequence[Resolution] = (),
-    until_as_little: bool = False,
     others: Mapping[str, Callable[[Tensor], Tensor]] | None = None,
     config: CalibrationConfig = CALIBRATION,
 ) -> dict[str, Any]:
@@ -93,7 +92,6 @@ def at_equal_loss(
     Args:
         mixture: whose gate is frozen; it is left as it was.
         datamanager: with held-out training pixels.
-        until_as_little: whether to end with the first grid that keeps as little as the gate.
         others: further representations by name, each a score of mapped positions [N, 3]: [N].
     Returns:
         `lost_surface_mass`; `reached_volume`, the share of the scene's box that rays reach;
@@ -122,12 +120,11 @@ def at_equal_loss(
             if scores is None:
                 left_out.append(row["resolution"])
                 continue
-            pairs = plain_and_dilated(scores, mapped_box(mixture), mapped, volume)
-            both = [{"dilated": bool(i), **kept_by(*pair)} for i, pair in enumerate(pairs)]
-            least = min(both, key=lambda one: one["kept_reached_volume"])
-            rows.append(row | least)
-            if until_as_little and least["kept_reached_volume"] <= kept["kept_reached_volume"]:
-                break
+            both = []
+            for dilated, cells in enumerate((scores, dilate(scores))):
+                look_up = partial(look_up_scores, cells, mapped_box(mixture))
+                both.append({"dilated": bool(dilated), **kept_by(look_up(mapped), look_up(volume))})
+            rows.append(row | min(both, key=lambda one: one["kept_reached_volume"]))
     return {
         "lost_surface_mass": LOST_SURFACE_MASS,
         "reached_volume": round(len(volume) / VOLUME_POINTS, 5),

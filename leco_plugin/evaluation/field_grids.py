@@ -7,7 +7,7 @@ out. The time for 512^3 cells therefore depends on how much surface they hold.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 
 import psutil
 import torch
@@ -153,14 +153,6 @@ def look_up_scores(scores: Tensor, box: ViewBox, mapped: Tensor) -> Tensor:
     """Scores of the cells that hold mapped positions [N, 3]; zero outside: [N]."""
     index, inside = _cells(scores, box, mapped)
     return scores.view(-1).index_select(0, index) * inside
-
-
-def plain_and_dilated(
-    scores: Tensor, box: ViewBox, *places: Tensor
-) -> Iterator[tuple[Tensor, ...]]:
-    """Scores [N] of several sets of mapped positions [N, 3]: of the grid as it is, then dilated."""
-    for some in (scores, dilate(scores)):
-        yield tuple(look_up_scores(some, box, mapped) for mapped in places)
 
 
 def _cells(scores: Tensor, box: ViewBox, mapped: Tensor) -> tuple[Tensor, Tensor]:

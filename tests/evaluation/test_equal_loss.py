@@ -120,12 +120,6 @@ def test_a_grid_of_another_size_along_each_axis_is_measured_too(mixture: Mixture
     assert row["bytes"] == 3 and row["kept_reached_volume"] == pytest.approx(0.5, abs=0.01)
 
 
-def test_grids_end_with_the_first_that_keeps_as_little_as_the_gate(mixture: Mixture) -> None:
-    found = at_equal_loss(mixture, None, grids=(5, 4, 8), until_as_little=True, config=FEW)
-    assert [row["resolution"] for row in found["grids"]] == [5, 4]
-    assert found["grids"][-1]["kept_reached_volume"] == found["kept_reached_volume"]
-
-
 def test_a_coarse_grid_hears_of_a_surface_that_random_places_miss(
     mixture: Mixture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
