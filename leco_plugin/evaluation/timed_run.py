@@ -43,6 +43,8 @@ CURVE_RAYS = 8192
 PRICES = ("threshold", "empty_fraction", "lost_mass", "lost_surface_mass", "image_price_db")
 ENDLESS = 10_000_000
 """Steps that no run reaches before its time is over."""
+SHARPENED_FROM = 150.0
+"""Seconds for which a gate guides that pay for sharpening it (docs/decisions.md)."""
 
 
 @dataclass
@@ -154,7 +156,7 @@ def set_up(config: TrainerConfig, budget: Budget, seed: int) -> Trainer:
     config = copy.deepcopy(config)
     config.machine.seed = seed
     config.max_num_iterations = budget.steps or ENDLESS
-    if budget.steps is None:
+    if (budget.seconds or math.inf) - (budget.learn_seconds or 0.0) < SHARPENED_FROM:
         _never_sharpen(config.pipeline.model)
     config.vis = "tensorboard"
     config.steps_per_save = config.steps_per_eval_image = config.steps_per_eval_batch = 0
@@ -172,8 +174,7 @@ def set_up(config: TrainerConfig, budget: Budget, seed: int) -> Trainer:
 
 
 def _never_sharpen(model: Any) -> None:
-    """Changes a model's config where it learns an occupancy: whether sharpening pays follows from
-    the steps that are left, which nobody knows here."""
+    """Changes a model's config where it learns an occupancy."""
     occupancy = getattr(model, "occupancy", None)
     learner = getattr(occupancy, "learning", model)
     teaches = getattr(occupancy, "learned", "first") == "along"  # of which it is a part

@@ -23,7 +23,6 @@ from leco_plugin.evaluation.metrics import psnr
 from leco_plugin.evaluation.timed_run import (
     TimedRun,
     _Course,
-    _never_sharpen,
     errors_on_rays,
     evaluate_images,
     psnr_on_rays,
@@ -81,12 +80,43 @@ def test_rates_of_a_model_that_goes_on_with_what_it_learned_decay_over_all_of_it
     assert rate_at(course, group, 50.0, 51) == pytest.approx(RATE * 0.1**0.5)
 
 
-def test_whoever_learns_an_occupancy_is_not_sharpened_in_a_time() -> None:
-    own, guided = LecoModelConfig(), SimpleNamespace(occupancy=OccupancyConfig())
-    for model in (own, guided, SimpleNamespace()):
-        _never_sharpen(model)
-    assert own.sharpening.steps == guided.occupancy.learning.sharpening.steps == 0
+@pytest.mark.parametrize(
+    ("budget", "sharpened"),
+    [
+        (Budget(120.0, learn_seconds=48.0), False),
+        (Budget(120.0, steps=5000, learn_seconds=48.0), False),
+        (Budget(300.0, learn_seconds=120.0), True),
+        (Budget(steps=400), True),
+    ],
+)
+def test_whoever_learns_an_occupancy_is_sharpened_where_time_pays_for_it(
+    budget: Budget, sharpened: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(module, "warm_up", lambda device: None)
+    for model in (LecoModelConfig(), SimpleNamespace(occupancy=OccupancyConfig())):
+        config: Any = SetUp(model)
+        made: Any = set_up(config, budget, 0).config.pipeline.model
+        learner = made if hasattr(made, "sharpening") else made.occupancy.learning
+        assert (learner.sharpening.steps > 0) == sharpened
     assert LecoModelConfig().sharpening.steps > 0
+    set_up(SetUp(SimpleNamespace()), budget, 0)
+
+
+class SetUp(SimpleNamespace):
+    """As nerfstudio's config of a trainer, of a model's config."""
+
+    def __init__(self, model: Any = None, draw: Callable[[], None] = lambda: None) -> None:
+        super().__init__(
+            machine=SimpleNamespace(seed=42),
+            logging=SimpleNamespace(local_writer=SimpleNamespace()),
+            pipeline=SimpleNamespace(model=model),
+            optimizers={},
+            set_timestamp=lambda: None,
+        )
+        self.draw = draw
+
+    def setup(self, **_: Any) -> Any:
+        return SimpleNamespace(setup=self.draw, device="cpu", config=self)
 
 
 class Time:
@@ -354,17 +384,7 @@ def test_a_seed_decides_all_random_numbers_of_a_run(
 
     monkeypatch.setattr(module, "warm_up", lambda device: None)
 
-    class Config(SimpleNamespace):
-        def setup(self, **_: Any) -> Any:
-            return SimpleNamespace(setup=draw, device="cpu", config=self)
-
-    config: Any = Config(
-        machine=SimpleNamespace(seed=42),
-        logging=SimpleNamespace(local_writer=SimpleNamespace()),
-        pipeline=SimpleNamespace(model=None),
-        optimizers={},
-        set_timestamp=lambda: None,
-    )
+    config: Any = SetUp(None, draw)
     made = set_up(config, Budget(1.0), seed)
     assert (made.config.machine.seed, config.machine.seed) == (seed, 42)
     generator = torch.Generator().manual_seed(seed)
