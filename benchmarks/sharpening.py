@@ -1,16 +1,15 @@
 """What sharpening brings: `python benchmarks/sharpening.py RUN=SCENE ...`.
 
-Of runs of `leco-occupancy` that were not sharpened (`--pipeline.model.sharpening.steps 0`). Two
-fields teach: the one of the moment of freezing, and the one at the end, which was trained guided.
-Small gates are taught with three seeds, each on other training rays. At the calibrated thresholds:
-candidates skipped, and what that loses on held-out pixels and on rays of test photographs, which
-nothing was calibrated on. At equal loss, of the field at freezing: volume kept, beside grids that
-the same lesson teaches. Stored in `results/sharpening.json`.
+Of runs of `leco-occupancy` that were not sharpened (`--pipeline.model.sharpening.steps 0`). Small
+gates are taught with three seeds, each on other training rays. By the field at the end, at the
+calibrated thresholds: candidates skipped, and what that loses on held-out pixels and on rays of
+test photographs, which nothing was calibrated on. By the field at freezing, which also knows what
+is skipped later: volume kept at equal loss, beside grids that the same lesson teaches. Stored in
+`results/sharpening.json`.
 """
 
 from __future__ import annotations
 
-import statistics
 import time
 from collections.abc import Callable
 from functools import partial
@@ -45,12 +44,16 @@ from leco_plugin.learning.sharpening import (
     SharpeningConfig,
     asked_by,
     lesson_by,
+    round_weights,
     seen_rendering,
     sharpen,
+    teach,
 )
 from leco_plugin.models.gate import Gate
 from leco_plugin.models.leco import LecoModel
 from leco_plugin.models.mixture import Mixture
+from leco_plugin.models.rendering import Rays
+from leco_plugin.occupancy import Occupancy
 from leco_plugin.scenes.learning_data import on_black
 
 SEEDS = 3
@@ -66,26 +69,24 @@ def shown(measured: Measured) -> dict[str, float]:
     return {name: round(float(getattr(measured, name)), 6) for name in SHOWN}
 
 
-def on_rays(mixture: Mixture, gate: Gate, threshold: float, seen: Seen, guided: bool) -> Measured:
+def on_rays(mixture: Mixture, gate: Gate, threshold: float, seen: Seen) -> Measured:
     """What a gate skips and loses along some rays, of what is rendered as prices are."""
-    truth = on_black(seen.truth)
-    rendering = seen_rendering(mixture, seen.rays, truth, 1.0 if guided else 0.0, 1024)
+    rendering = seen_rendering(mixture, seen.rays, on_black(seen.truth), 1024)
     asked = asked_by(mixture, gate, in_chunks(seen.rays, 1024), rendering)
     return measure(*asked, threshold)
 
 
-def taught_by(source: Source, mixture: Mixture, guided: bool) -> tuple[dict[str, Any], list[Gate]]:
-    """Small gates of three seeds by one field, beside what guided until then; and the gates."""
+def taught_by(source: Source, mixture: Mixture) -> dict[str, Any]:
+    """Small gates of three seeds by a field that was trained guided, beside what guided it."""
     model = source.model
     assert model is not None
     occupancy = mixture.occupancy().eval()
     held_out = draw_held_out(source, occupancy, RAYS, parts=1)[0]
     tests = draw_test_rays(source, occupancy, RAYS)
     assert tests is not None
-    rows, gates = [], []
+    rows = []
     for seed in range(SEEDS):
-        torch.manual_seed(seed)
-        taught = draw_training_rays(source, occupancy, SharpeningConfig().rays).rays
+        taught = rays_that_teach(source, occupancy, seed)
         started = time.process_time()
         found = sharpen(
             mixture,
@@ -95,21 +96,22 @@ def taught_by(source: Source, mixture: Mixture, guided: bool) -> tuple[dict[str,
             model.config.gate_loss,
             model.config.calibration,
             SharpeningConfig(),
-            guided,
         )
         assert found is not None
         seconds = time.process_time() - started
-        after = on_rays(mixture, found.gate, found.measured.threshold, tests, guided)
-        gates.append(found.gate)
+        after = on_rays(mixture, found.gate, found.measured.threshold, tests)
         rows.append(
             {"seconds": round(seconds, 1), "held_out": shown(found.measured), "test": shown(after)}
         )
         print(f"  seed {seed}: {rows[-1]}", flush=True)
-    before = on_rays(mixture, mixture.gate, float(mixture.threshold), tests, guided)
-    return {
-        "before": {"held_out": shown(found.before), "test": shown(before)},
-        "small": rows,
-    }, gates
+    before = on_rays(mixture, mixture.gate, float(mixture.threshold), tests)
+    return {"before": {"held_out": shown(found.before), "test": shown(before)}, "small": rows}
+
+
+def rays_that_teach(source: Source, occupancy: Occupancy, seed: int) -> Rays:
+    """Training rays, others for each seed."""
+    torch.manual_seed(seed)
+    return draw_training_rays(source, occupancy, SharpeningConfig().rays).rays
 
 
 def grid_score(
@@ -122,14 +124,16 @@ def grid_score(
     return lambda mapped: look_up_scores(filled, box, mapped)
 
 
-def at_equal_loss(source: Source, mixture: Mixture, gates: list[Gate]) -> list[dict[str, Any]]:
+def at_equal_loss(source: Source, mixture: Mixture) -> list[dict[str, Any]]:
     """Volume that is kept where `LOST` of the surface mass is lost, on two kinds of rays."""
-    model = source.model
+    model, config = source.model, SharpeningConfig()
     assert model is not None
     occupancy = mixture.occupancy().eval()
-    torch.manual_seed(0)
-    taught = draw_training_rays(source, occupancy, SharpeningConfig().rays).rays
-    lesson = lesson_by(mixture, taught, model.config.gate_loss, SharpeningConfig().seen, 1024)
+    losses = model.config.gate_loss
+    lesson, *others = (
+        lesson_by(mixture, rays_that_teach(source, occupancy, seed), losses, 0.0, 1024)
+        for seed in range(SEEDS)
+    )
     tests = draw_test_rays(source, occupancy, RAYS)
     assert tests is not None
     evidence: dict[str, Evidence] = {
@@ -140,7 +144,9 @@ def at_equal_loss(source: Source, mixture: Mixture, gates: list[Gate]) -> list[d
     rivals = {
         "learned gate": (2 * occupancy.num_params, partial(mixture.occupancies, gate=mixture.gate))
     }
-    for seed, gate in enumerate(gates):
+    for seed, heard in enumerate((lesson, *others)):
+        gate = teach(config.gate, heard, config.steps, mixture.precision)
+        round_weights(gate)
         size = 2 * sum(p.numel() for p in gate.parameters())
         rivals[f"small gate, seed {seed}"] = (size, partial(mixture.occupancies, gate=gate))
     for n in GRIDS:
@@ -168,14 +174,10 @@ def row_of(run: Path, data: Path) -> dict[str, Any]:
         raise SystemExit(
             f"{run} is sharpened already: train with --pipeline.model.sharpening.steps 0"
         )
-    at_freezing, gates = taught_by(source, source.frozen, guided=False)
-    at_end, _ = taught_by(source, source.model.mixture.eval(), guided=True)
     return {
         "learned_params": sum(p.numel() for p in source.frozen.gate.parameters()),
-        "at_freezing": at_freezing,
-        "at_end": at_end,
-        "at_equal_loss": at_equal_loss(source, source.frozen, gates),
-        "seconds": statistics.median(row["seconds"] for row in at_freezing["small"]),
+        "at_end": taught_by(source, source.model.mixture.eval()),
+        "at_equal_loss": at_equal_loss(source, source.frozen),
     }
 
 
@@ -183,9 +185,8 @@ def sharpening_sections(report: dict[str, Any]) -> list[str]:
     """The stored figures as a part of `docs/results.md`."""
     scenes = report["scenes"].items()
     guided = table(
-        "scene | field | skipped by the learned gate | by small gates | surface lost on test rays: "
-        "learned gate | small gates | s",
-        [row for scene, found in scenes for row in _guided_rows(scene, found)],
+        "scene | skipped by the learned gate | by small gates | surface lost on test rays | s",
+        [_guided_row(scene, found["at_end"]) for scene, found in scenes],
     )
     equal = table(
         "scene | learned gate | small gate | best grid up to 256³, taught alike",
@@ -196,10 +197,9 @@ def sharpening_sections(report: dict[str, Any]) -> list[str]:
         "`python benchmarks/sharpening.py RUN=SCENE ...`, of runs of `ns-train leco-occupancy "
         "--max-num-iterations 700 --pipeline.model.sharpening.steps 0`; "
         f"{machine_line(report)}. Rows {made_line(report['scenes'].values())}.\n",
-        "The field teaches small gates, each of three on other training rays. Shares are of "
-        "candidates on held-out rays, at the calibrated thresholds; at the end of a run, losses "
-        "are of what the gate kept until then. Seconds of one core are for teaching and "
-        "calibrating.\n",
+        "The field at the end teaches small gates, each of three on other training rays. Shares "
+        "are of candidates on held-out rays, at the calibrated thresholds; losses are of what the "
+        "learned gate keeps. Seconds of one core are for teaching and calibrating.\n",
         *guided,
         f"\nAt {LOST:g} of the surface lost *on test rays*: volume kept of what rays reach, by "
         "the field at freezing. Grids are as they are or dilated, whichever keeps less.\n",
@@ -208,24 +208,15 @@ def sharpening_sections(report: dict[str, Any]) -> list[str]:
     ]
 
 
-def _guided_rows(scene: str, found: dict[str, Any]) -> list[list[str]]:
-    rows = []
-    for key, name in (("at_freezing", "at freezing"), ("at_end", "at the end")):
-        before, small = found[key]["before"], found[key]["small"]
-        skipped = [row["held_out"]["empty_fraction"] for row in small]
-        lost = [row["test"]["lost_surface_mass"] for row in small]
-        rows.append(
-            [
-                scene,
-                name,
-                f"{before['held_out']['empty_fraction']:.1%}",
-                spread(skipped, ".1%"),
-                f"{before['test']['lost_surface_mass']:.1e}",
-                spread(lost, ".1e"),
-                spread([row["seconds"] for row in small], ".0f"),
-            ]
-        )
-    return rows
+def _guided_row(scene: str, found: dict[str, Any]) -> list[str]:
+    small = found["small"]
+    return [
+        scene,
+        f"{found['before']['held_out']['empty_fraction']:.1%}",
+        spread([row["held_out"]["empty_fraction"] for row in small], ".1%"),
+        spread([row["test"]["lost_surface_mass"] for row in small], ".1e"),
+        spread([row["seconds"] for row in small], ".0f"),
+    ]
 
 
 def _equal_row(scene: str, found: dict[str, Any]) -> list[str]:

@@ -78,10 +78,6 @@ class ARun(LearningOnly):
         self.start, self.end = start, end
         self.saved: list[int] = []
 
-    def left(self, step: int) -> float:
-        """Those up to the last one."""
-        return self.end - step - 1
-
     def save(self, step: int) -> None:
         """Notes the step."""
         self.saved.append(step)

@@ -11,7 +11,7 @@ import random
 import statistics
 from collections import Counter, defaultdict
 from collections.abc import Callable
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -43,8 +43,6 @@ CURVE_RAYS = 8192
 PRICES = ("threshold", "empty_fraction", "lost_mass", "lost_surface_mass", "image_price_db")
 ENDLESS = 10_000_000
 """Steps that no run reaches before its time is over."""
-SHARPENED_FROM = 150.0
-"""Seconds for which a gate guides that pay for sharpening it (docs/decisions.md)."""
 
 
 @dataclass
@@ -156,8 +154,6 @@ def set_up(config: TrainerConfig, budget: Budget, seed: int) -> Trainer:
     config = copy.deepcopy(config)
     config.machine.seed = seed
     config.max_num_iterations = budget.steps or ENDLESS
-    if (budget.seconds or math.inf) - (budget.learn_seconds or 0.0) < SHARPENED_FROM:
-        _never_sharpen(config.pipeline.model)
     config.vis = "tensorboard"
     config.steps_per_save = config.steps_per_eval_image = config.steps_per_eval_batch = 0
     config.steps_per_eval_all_images = 0
@@ -171,15 +167,6 @@ def set_up(config: TrainerConfig, budget: Budget, seed: int) -> Trainer:
     trainer.setup()
     warm_up(trainer.device)
     return trainer
-
-
-def _never_sharpen(model: Any) -> None:
-    """Changes a model's config where it learns an occupancy."""
-    occupancy = getattr(model, "occupancy", None)
-    learner = getattr(occupancy, "learning", model)
-    teaches = getattr(occupancy, "learned", "first") == "along"  # of which it is a part
-    if hasattr(learner, "sharpening") and not teaches:
-        learner.sharpening = replace(learner.sharpening, steps=0)
 
 
 class _Course:

@@ -154,10 +154,8 @@ class GuidedStart:
 
             say(LEARNING)
             config = self.config
-            # a limit of seconds is no time for sharpening
-            guides = self.run.left(step) if config.seconds is None else 0.0
             occupancy = learn_occupancy(
-                config.learning, self.pipeline, config.rays, config.seconds, config.rate, guides
+                config.learning, self.pipeline, config.rays, config.seconds, config.rate
             )
             self.guide.set_occupancy(occupancy)
         self.guide.look(self.pipeline.datamanager.train_dataset.cameras)

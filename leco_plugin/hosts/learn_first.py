@@ -37,12 +37,11 @@ def learn_occupancy(
     rays: int,
     seconds: float | None = None,
     rate: float = 1.0,
-    guides: float = 0.0,
 ) -> Occupancy:
     """As `learn_model`, with options named in errors as they are given to a host; returns the
     occupancy, in the coordinates of the pipeline's model."""
     try:
-        model = learn_model(config, pipeline, rays, seconds, rate, guides)
+        model = learn_model(config, pipeline, rays, seconds, rate)
     except InputError as error:
         raise InputError(str(error).replace(OF_LEARNER, OF_HOST)) from None
     occupancy: Occupancy = model.mixture.occupancy()
@@ -55,7 +54,6 @@ def learn_model(
     rays: int,
     seconds: float | None = None,
     rate: float = 1.0,
-    guides: float = 0.0,
 ) -> LecoModel:
     """Trains an HMoE on the pipeline's data until its gate is frozen, field and all.
 
@@ -68,7 +66,6 @@ def learn_model(
         rays: of a batch.
         seconds: how long this may take at most, about; None takes the config's learning steps.
         rate: multiple of the learning rates.
-        guides: steps that the occupancy will guide; its gate is sharpened where they pay for it.
     Returns:
         The model as it is at the moment of freezing.
     Raises:
@@ -93,7 +90,7 @@ def learn_model(
     trained = averaging(model, model.device)
     groups = model.get_param_groups()
     run = LearningOnly(
-        [FusedAdamConfig(lr=rate * RATES[name]).setup(p) for name, p in groups.items()], guides
+        [FusedAdamConfig(lr=rate * RATES[name]).setup(p) for name, p in groups.items()]
     )
     with _batches_of(rays, manager):
         learner = model.learner(manager, run)

@@ -90,13 +90,11 @@ class HeldOut:
         """See `price_watch.PriceSource`."""
         return self.data.count_held_out(limit)
 
-    def sharpened(
-        self, losses: GateLossConfig, config: SharpeningConfig, guided: bool
-    ) -> Sharpened | None:
+    def sharpened(self, losses: GateLossConfig, config: SharpeningConfig) -> Sharpened | None:
         """A small gate that training pixels teach and these calibrate; see `sharpen`."""
         taught = self.data.training_rays(self.mixture, config.rays, self.config.cameras)
         rays, cameras = self.rays(self.config.rays), self.cameras()
-        return sharpen(self.mixture, taught, rays, cameras, losses, self.config, config, guided)
+        return sharpen(self.mixture, taught, rays, cameras, losses, self.config, config)
 
     def unneeded(self, count: int, bound: float) -> Merging:
         """Scene experts without which the image loses no more than `bound` dB."""

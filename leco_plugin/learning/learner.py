@@ -187,7 +187,7 @@ class Learner:
             if step + 1 >= self.run.end and bool(self.mixture.frozen):
                 last, _ = self.mixture.report.get("sharpened", [[0, 0.0]])[-1]
                 began = max(last, self.mixture.report["step"])
-                self._sharpen(step, step - began, guided=True)
+                self._sharpen(step, step - began)
         else:
             self.progress.learn_seconds += seconds
             self._after_learning_step(step)
@@ -279,10 +279,8 @@ class Learner:
         if self.run.folder is not None:
             leave_file(mixture.occupancy(), self.run.folder)
             leave_field(mixture, self.run.folder)
-        if not schedule.restart:
-            if self.run.goes_on:
-                self._merge()
-            self._sharpen(step, self.run.left(step), guided=False)
+        if not schedule.restart and self.run.goes_on:
+            self._merge()
         self._say_doubts()
         self.data.prepare_batch(1.0, distances=False)  # from now on all photographs train
         progress.watch = self.watch.state = WatchState()
@@ -301,12 +299,11 @@ class Learner:
         found = doubts_of_field(report.get(FIELD, math.inf), report.get(ONE_COLOUR, math.inf))
         say_all(found or doubts_of_occupancy(kept_of_seen(self.mixture)))
 
-    def _sharpen(self, step: int, steps: float, guided: bool) -> None:
+    def _sharpen(self, step: int, steps: int) -> None:
         """Has a small gate skip in place of the learned one where it skips more, and says so.
 
         Args:
-            steps: that are to pay for it.
-            guided: whether the field has been trained guided since the gate was frozen.
+            steps: for which the field has been trained guided since the last time.
         """
         mixture, config, started = self.mixture, self.config, seconds_now()
         if config.sharpening.steps == 0 or steps < config.sharpening.least_steps:
@@ -315,7 +312,7 @@ class Learner:
         if mixture.gate.config.encoding.kind != kind:
             return  # samplers are made for the kind that was asked for
         found = from_first(
-            lambda: self.held_out.sharpened(config.gate_loss, config.sharpening, guided),
+            lambda: self.held_out.sharpened(config.gate_loss, config.sharpening),
             mixture.device,
         )
         if found is None:
@@ -327,7 +324,7 @@ class Learner:
         )
         if not found.pays:
             return
-        report = found.report(mixture.report, mixture.gate.config, guided)
+        report = found.report(mixture.report, mixture.gate.config)
         report["sharpened"] = [*report.get("sharpened", []), [step, round(seconds, 2)]]
         mixture.sharpen(found.gate.to(mixture.device), found.measured.threshold, report)
         self.watch.state.evidence = {}  # of what guided before

@@ -35,9 +35,6 @@ class Run(Protocol):
     def optimizers(self) -> list[Optimizer]:
         """All optimizers of the mixture's parameters."""
 
-    def left(self, step: int) -> float:
-        """Steps after this one that its gate will guide."""
-
     def save(self, step: int) -> None:
         """Saves a checkpoint, if it saves any."""
 
@@ -46,26 +43,18 @@ class Run(Protocol):
 
 
 class LearningOnly:
-    """A run that ends when the gate is frozen, and leaves no file.
-
-    Args:
-        guides: steps of a host that the gate then guides.
-    """
+    """A run that ends when the gate is frozen, and leaves no file."""
 
     goes_on, start, end = False, 0, math.inf
     folder: Path | None = None
     resumed_from: Path | None = None
 
-    def __init__(self, optimizers: list[Optimizer] | None = None, guides: float = 0.0) -> None:
-        self._optimizers, self._guides = optimizers or [], guides
+    def __init__(self, optimizers: list[Optimizer] | None = None) -> None:
+        self._optimizers = optimizers or []
 
     def optimizers(self) -> list[Optimizer]:
         """Those that it was given."""
         return self._optimizers
-
-    def left(self, step: int) -> float:
-        """Those of the host."""
-        return self._guides
 
     def save(self, step: int) -> None:
         """Nothing: it is over in minutes."""

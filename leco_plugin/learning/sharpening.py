@@ -1,9 +1,9 @@
 """Sharpening: a small gate that the field teaches anew, and that skips more than the learned one.
 
-While a gate is learned, haze teaches it too, and it also has to route points to experts. Once it is
-frozen the field knows better: its rendering weights along training rays teach a fresh gate of a few
-thousand values, which only has to say what is empty. It is calibrated like the first one, and
-guides from then on where it skips more. The large gate goes on routing. A `Lesson` says where a
+While a gate is learned, haze teaches it too, and it also has to route points to experts. At the end
+of a run the field knows better: its rendering weights along training rays teach a fresh gate of a
+few thousand values, which only has to say what is empty. It is calibrated like the first one, and
+skips in its place where it skips more. The large gate goes on routing. A `Lesson` says where a
 gate should keep and skip; a gate alone is taught by it, in seconds.
 """
 
@@ -139,16 +139,10 @@ class SharpeningConfig:
     steps: int = 2000
     """Of teaching, each with 2,048 positions; 0 never sharpens."""
     least_steps: int = 1000
-    """Guided steps that pay for it: a gate is sharpened when it is frozen if so many are left, and
-    at the end of a run that has had so many."""
+    """Guided steps from which on it pays: a gate is sharpened at the end of a run that has had so
+    many. At freezing the field would have the gate skip what it has not found yet."""
     rays: int = 1 << 15
     """Training rays that teach. With a quarter of them a gate learns the rays, not the scene."""
-    seen: float = 0.125
-    """Share of the threshold from which a candidate is rendered to teach: what lies below it counts
-    as empty, and saves half of the time."""
-    caution: float = 0.125
-    """Share of the calibrated threshold that is taken at freezing. What the field has not found by
-    then must not be skipped, or it never will be found. At the end of a run all of it is taken."""
     gate: GateConfig = field(
         default_factory=lambda: GateConfig(EncodingConfig(octaves=6), 64, 2, 1, normed=False)
     )
@@ -158,8 +152,6 @@ class SharpeningConfig:
         require(self.steps >= 0, "sharpening.steps", self.steps, "at least 0")
         require(self.least_steps >= 0, "sharpening.least-steps", self.least_steps, "at least 0")
         require(self.rays >= 1, "sharpening.rays", self.rays, "at least 1")
-        require(0.0 <= self.seen <= 1.0, "sharpening.seen", self.seen, "from 0 to 1")
-        require(0.0 < self.caution <= 1.0, "sharpening.caution", self.caution, "above 0, at most 1")
 
 
 def added_costs(found: dict[str, Any], before: dict[str, Any]) -> dict[str, float]:
@@ -197,20 +189,19 @@ class Sharpened(NamedTuple):
         end = "" if self.pays else "; that is no more, and the gate stays"
         return f"{self.measured.line}, where {self.before.empty_fraction:.1%} were skipped{end}"
 
-    def report(self, before: dict[str, Any], learned: GateConfig, guided: bool) -> dict[str, Any]:
+    def report(self, before: dict[str, Any], learned: GateConfig) -> dict[str, Any]:
         """The report of an occupancy of this gate.
 
         Args:
-            before: of what has guided so far; where the field was trained guided, the losses that
-                it declares are added.
+            before: of what has guided so far. The losses that it declares are added, for the field
+                has been trained without what it skips.
             learned: the gate that routes. It stays in the report, with what it did, as `learned`.
         """
         found = self.measured._asdict()
-        if guided:
-            found |= added_costs(found, before)
+        found |= added_costs(found, before)
         if self.promised is not None:
             found[CAMERAS_THAT_VOUCH] = dict(self.promised)
-            if guided and (earlier := before.get(CAMERAS_THAT_VOUCH)) is not None:
+            if (earlier := before.get(CAMERAS_THAT_VOUCH)) is not None:
                 for name in ("worst_surface_mass", "bound"):
                     found[CAMERAS_THAT_VOUCH][name] += earlier["worst_surface_mass"]
         kept = {name: before[name] for name in ("threshold", "params", "empty_fraction", *LOSSES)}
@@ -230,10 +221,12 @@ def sharpen(
     losses: GateLossConfig,
     calibration: CalibrationConfig,
     config: SharpeningConfig,
-    guided: bool,
 ) -> Sharpened | None:
-    """Teaches a small gate by a frozen mixture's field, and calibrates it; changes nothing.
-    None where no ray has a candidate to teach with.
+    """Teaches a small gate by the field of a mixture that was trained guided, and calibrates it;
+    changes nothing. None where no ray has a candidate to teach with.
+
+    The field knows only what has been kept, so the rest counts as empty, and prices are of skipping
+    more than before.
 
     Args:
         taught: training rays, cut to the region.
@@ -241,28 +234,22 @@ def sharpen(
         cameras: the same of each photograph that vouches.
         losses: whose contribution loss teaches.
         calibration: what skipping may cost.
-        guided: whether the field has been trained guided. It then knows only what is kept, and
-            prices are of skipping more than before; else they are of all skipping.
     """
     at_once = calibration.rays_at_once
     with evaluating(mixture):
-        lesson = lesson_by(mixture, taught, losses, 1.0 if guided else config.seen, at_once)
+        lesson = lesson_by(mixture, taught, losses, 1.0, at_once)
         if not len(lesson.mapped):
             return None
         gate = teach(config.gate, lesson, config.steps, mixture.precision)
         round_weights(gate)
         rays, truth = held_out
-        seen = 1.0 if guided else 0.0
-        rendering = seen_rendering(mixture, rays, truth, seen, at_once)
+        rendering = seen_rendering(mixture, rays, truth, at_once)
         before = measure(*rendering, float(mixture.threshold))
         asked = asked_by(mixture, gate, in_chunks(rays, at_once), rendering)
         of_cameras = [
-            _said_by(mixture, gate, of_one, _rendered(mixture, of_one, seen))
-            for of_one, _ in cameras
+            _said_by(mixture, gate, of_one, _rendered(mixture, of_one)) for of_one, _ in cameras
         ]
         measured = calibrate(*asked, calibration, cameras=of_cameras)
-        if not guided:
-            measured = measure(*asked, config.caution * measured.threshold)
         promised = promise(of_cameras, measured, calibration)
     return Sharpened(gate, measured, before, promised)
 
@@ -290,12 +277,12 @@ def lesson_by(
 
 
 def seen_rendering(
-    mixture: Mixture, rays: Rays, truth: Tensor, seen: float, rays_at_once: int
+    mixture: Mixture, rays: Rays, truth: Tensor, rays_at_once: int
 ) -> DenseRendering:
-    """As `dense_rendering`, where candidates below a share of the threshold are not rendered and
-    have no weight. Guided training has not taught the field what is there."""
+    """As `dense_rendering`, where candidates below the threshold are not rendered and have no
+    weight. Guided training has not taught the field what is there."""
     chunks = in_chunks(rays, rays_at_once)
-    references = [_rendered(mixture, chunk, seen) for chunk in chunks]
+    references = [_rendered(mixture, chunk) for chunk in chunks]
 
     @torch.no_grad()
     def render_kept(number: int, mask: Tensor) -> Tensor:
@@ -332,9 +319,9 @@ def _asked(mixture: Mixture, rays: Rays, seen: float) -> _Asked:
 
 
 @torch.no_grad()
-def _rendered(mixture: Mixture, rays: Rays, seen: float) -> Reference:
-    """All candidates of rays with the weights of those that are seen."""
-    intervals, _, occupancies, drawn = asked = _asked(mixture, rays, seen)
+def _rendered(mixture: Mixture, rays: Rays) -> Reference:
+    """All candidates of rays with the weights of those that are kept."""
+    intervals, _, occupancies, drawn = asked = _asked(mixture, rays, 1.0)
     small = reference_of(mixture.shade(rays, asked.some), asked.some, rays)
     weights, surface = torch.zeros_like(occupancies), torch.zeros_like(drawn)
     weights[drawn], surface[drawn] = small.weights.float(), small.near_surface

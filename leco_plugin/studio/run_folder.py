@@ -198,10 +198,6 @@ class TrainerRun:
         """Those of all parameter groups."""
         return list(self.trainer.optimizers.optimizers.values())
 
-    def left(self, step: int) -> float:
-        """Those up to the last one."""
-        return self.end - step - 1
-
     def save(self, step: int) -> None:
         """A checkpoint, where the run saves any."""
         if self.trainer.config.steps_per_save > 0:

@@ -29,8 +29,6 @@ from leco_plugin.evaluation.timed_run import (
     set_up,
     timed_run,
 )
-from leco_plugin.hosts.guided_start import OccupancyConfig
-from leco_plugin.models.leco_config import LecoModelConfig
 
 RATE = 0.01
 
@@ -78,28 +76,6 @@ def test_rates_of_a_model_that_goes_on_with_what_it_learned_decay_over_all_of_it
     course.begun(50)
     assert course.run.learn_seconds == pytest.approx(40.0, abs=1.0)
     assert rate_at(course, group, 50.0, 51) == pytest.approx(RATE * 0.1**0.5)
-
-
-@pytest.mark.parametrize(
-    ("budget", "sharpened"),
-    [
-        (Budget(120.0, learn_seconds=48.0), False),
-        (Budget(120.0, steps=5000, learn_seconds=48.0), False),
-        (Budget(300.0, learn_seconds=120.0), True),
-        (Budget(steps=400), True),
-    ],
-)
-def test_whoever_learns_an_occupancy_is_sharpened_where_time_pays_for_it(
-    budget: Budget, sharpened: bool, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(module, "warm_up", lambda device: None)
-    for model in (LecoModelConfig(), SimpleNamespace(occupancy=OccupancyConfig())):
-        config: Any = SetUp(model)
-        made: Any = set_up(config, budget, 0).config.pipeline.model
-        learner = made if hasattr(made, "sharpening") else made.occupancy.learning
-        assert (learner.sharpening.steps > 0) == sharpened
-    assert LecoModelConfig().sharpening.steps > 0
-    set_up(SetUp(SimpleNamespace()), budget, 0)
 
 
 class SetUp(SimpleNamespace):

@@ -11,12 +11,8 @@ from nerfstudio.pipelines.base_pipeline import VanillaPipelineConfig
 
 from leco_plugin.hosts.guided_start import OccupancyConfig
 from leco_plugin.hosts.learn_first import FEWEST_STEPS, keep_within, learn_occupancy
-from leco_plugin.learning.calibration import Measured
-from leco_plugin.learning.held_out import HeldOut
 from leco_plugin.learning.run import Progress
 from leco_plugin.learning.schedule import MOST_EXTENSIONS, ScheduleConfig
-from leco_plugin.learning.sharpening import Sharpened, SharpeningConfig
-from leco_plugin.models.gate import Gate, GateConfig
 from leco_plugin.models.leco_config import LecoModelConfig
 from leco_plugin.models.sizing.sizes import SMALL
 from leco_plugin.occupancy import Occupancy
@@ -44,19 +40,6 @@ def test_it_is_frozen_and_calibrated_and_the_batch_is_as_before(pipeline):
     assert occupancy.report["frame"] is not None
     assert pipeline.datamanager.train_pixel_sampler.num_rays_per_batch == 77
     assert not any(p.requires_grad for p in occupancy.parameters())
-
-
-@pytest.mark.parametrize(("guides", "sharpened"), [(30.0, True), (29.0, False)])
-def test_the_gate_is_sharpened_where_it_guides_enough_steps(
-    pipeline, guides: float, sharpened: bool, monkeypatch: pytest.MonkeyPatch
-):
-    less, more = (Measured(0.5, 0.0, 0.0, 0.0, skipped) for skipped in (0.5, 0.6))
-    small = Gate(GateConfig(width=8, scene_experts=1))
-    monkeypatch.setattr(HeldOut, "sharpened", lambda *_: Sharpened(small, more, less, None))
-    options = replace(config(8), sharpening=SharpeningConfig(least_steps=30))
-    occupancy = learn_occupancy(options, pipeline, rays=64, guides=guides)
-    assert (occupancy.gate.config == small.config) == sharpened
-    assert (occupancy.report["empty_fraction"] == 0.6) == sharpened
 
 
 def test_a_budget_sets_the_number_of_steps(pipeline, monkeypatch: pytest.MonkeyPatch):

@@ -130,6 +130,6 @@ def test_photographs_that_vouch_do_not_teach_the_small_gate_either() -> None:
     config = CalibrationConfig(cameras=5)
     with pytest.raises(Asked) as found:
         HeldOut(small_mixture(), data, config, restarted=False).sharpened(
-            GateLossConfig(), SharpeningConfig(rays=123), guided=False
+            GateLossConfig(), SharpeningConfig(rays=123)
         )
     assert found.value.args == (123, 5)

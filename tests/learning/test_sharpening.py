@@ -117,7 +117,7 @@ def test_what_is_not_seen_has_no_weight_and_is_a_candidate_still() -> None:
     mixture.gate.walls = 0.5  # type: ignore[assignment]
     rays, truth = some_rays(mixture, 10), torch.ones(10, 3)
     dense = dense_rendering(mixture, rays, truth, 10).references[0]
-    seen = seen_rendering(mixture, rays, truth, 1.0, 10).references[0]
+    seen = seen_rendering(mixture, rays, truth, 10).references[0]
     assert len(seen.weights) == len(dense.weights)
     below = seen.occupancies < 0.5
     assert not seen.weights[below & ~seen.always_kept].any() and dense.weights[below].any()
@@ -127,46 +127,27 @@ def test_a_small_gate_skips_what_the_large_one_keeps_of_free_space() -> None:
     mixture = a_mixture()
     taught, held_out = some_rays(mixture, 400), (some_rays(mixture, 100), torch.ones(100, 3))
     config = SharpeningConfig(steps=150, gate=GATE)
-    found = sharpen(
-        mixture, taught, held_out, [], LOSSES, CalibrationConfig(), config, guided=False
-    )
+    found = sharpen(mixture, taught, held_out, [], LOSSES, CalibrationConfig(), config)
     assert found.pays and found.measured.empty_fraction > found.before.empty_fraction + 0.1
     assert found.measured.within(CalibrationConfig()) and found.measured.threshold > 0.0
     assert mixture.small is None, "it only says what would be"
     assert all(torch.equal(p, p.bfloat16().float()) for p in found.gate.parameters())
 
 
-def test_at_freezing_a_share_of_the_threshold_is_taken_and_at_the_end_all_of_it() -> None:
-    mixture = a_mixture()
-    data = some_rays(mixture, 200), (some_rays(mixture, 50), torch.ones(50, 3))
-    bold, careful = (SharpeningConfig(steps=20, gate=GATE, caution=share) for share in (1.0, 0.25))
-
-    def found(config: SharpeningConfig, guided: bool) -> Measured:
-        of = mixture, *data, [], LOSSES, CalibrationConfig(), config, guided
-        sharpened = sharpen(*of)
-        assert sharpened is not None
-        return sharpened.measured
-
-    whole, share = found(bold, False), found(careful, False)
-    assert share.threshold == pytest.approx(0.25 * whole.threshold)
-    assert share.empty_fraction < whole.empty_fraction, "what is said is of that threshold"
-    assert found(careful, True) == found(bold, True)
-
-
-def test_guided_only_what_is_shown_now_is_taught(monkeypatch) -> None:
+def test_only_what_is_kept_is_taught_and_rendered(monkeypatch: pytest.MonkeyPatch) -> None:
     shares: list[float] = []
     real = sharpening._asked
-    monkeypatch.setattr(
-        sharpening,
-        "_asked",
-        lambda m, rays, seen, *of: shares.append(seen) or real(m, rays, seen, *of),
-    )
+
+    def noted(mixture: Mixture, rays: Rays, seen: float) -> Any:
+        shares.append(seen)
+        return real(mixture, rays, seen)
+
+    monkeypatch.setattr(sharpening, "_asked", noted)
     mixture = a_mixture()
     data = some_rays(mixture, 30), (some_rays(mixture, 10), torch.ones(10, 3))
-    config = SharpeningConfig(steps=1, gate=GATE, seen=0.25)
-    for guided in (False, True):
-        sharpen(mixture, *data, [], LOSSES, CalibrationConfig(), config, guided)
-    assert shares == [0.25, 0.0, 1.0, 1.0], "the lesson, then prices"
+    config = SharpeningConfig(steps=1, gate=GATE)
+    sharpen(mixture, *data, [], LOSSES, CalibrationConfig(), config)
+    assert shares == [1.0, 1.0], "the lesson, then prices"
 
 
 class Pixels:
@@ -262,7 +243,6 @@ def test_prices_of_guided_sharpening_are_sums_of_costs() -> None:
     report = Sharpened(Gate(GATE), found, before, vouched(3e-4, 2e-3)).report(
         {"params": 7, **before._asdict(), CAMERAS_THAT_VOUCH: vouched(1e-4, 2e-3)},
         SMALLEST.gate,
-        guided=True,
     )
     assert report["image_price_db"] == 0.03 and report["price_error_db"] == pytest.approx(0.005)
     assert report["lost_surface_mass"] == pytest.approx(3e-4)
@@ -317,7 +297,7 @@ def test_prices_of_a_sharpened_mixture_are_of_the_small_gate() -> None:
 
 @pytest.mark.parametrize(
     ("option", "value"),
-    [("steps", -1), ("rays", 0), ("seen", 1.5), ("least_steps", -1), ("caution", 0.0)],
+    [("steps", -1), ("rays", 0), ("least_steps", -1)],
 )
 def test_settings_that_make_no_sense_are_refused(option: str, value: float) -> None:
     with pytest.raises(InputError, match=f"sharpening.{option.replace('_', '-')}"):
