@@ -201,8 +201,9 @@ def sharpening_sections(report: dict[str, Any]) -> list[str]:
         "are of candidates on held-out rays, at the calibrated thresholds; losses are of what the "
         "learned gate keeps. Seconds of one core are for teaching and calibrating.\n",
         *guided,
-        f"\nAt {LOST:g} of the surface lost *on test rays*: volume kept of what rays reach, by "
-        "the field at freezing. Grids are as they are or dilated, whichever keeps less.\n",
+        f"\nAt {LOST:g} of the surface lost *on test rays*, by the field at freezing: volume kept "
+        "of what rays reach; candidates kept on those rays; bytes. Grids are as they are or dilated, "
+        "whichever keeps less.\n",
         *equal,
         "",
     ]
@@ -226,14 +227,19 @@ def _equal_row(scene: str, found: dict[str, Any]) -> list[str]:
         (row for name, row in rows.items() if name.startswith("grid")),
         key=lambda row: row["test"]["volume"],
     )
-    learned = rows["learned gate"]
     return [
         scene,
-        f"{learned['test']['volume']:.1%}, {size(learned['bytes'] / 1e3)}",
-        f"{spread([row['test']['volume'] for row in small], '.1%')}, "
-        f"{size(small[0]['bytes'] / 1e3)}",
-        f"{best['test']['volume']:.1%}, {size(best['bytes'] / 1e3)} ({best['name'][5:]})",
+        _kept([rows["learned gate"]]),
+        _kept(small),
+        f"{_kept([best])} ({best['name'][5:]})",
     ]
+
+
+def _kept(rows: list[dict[str, Any]]) -> str:
+    volume, candidates = (
+        spread([row["test"][name] for row in rows], ".1%") for name in ("volume", "candidates")
+    )
+    return f"{volume}; {candidates}; {size(rows[0]['bytes'] / 1e3)}"
 
 
 if __name__ == "__main__":
