@@ -219,7 +219,7 @@ def growth_section() -> list[str]:
     command = "leco city --blocks K --aerial-only --out city-K; leco capacity --data city-K ..."
     note = (
         f" Each representation loses {grown[0]['lost_surface_mass']:.1%} of the weight near "
-        "surfaces along rays of test photographs; kept is a share of the volume that training "
+        "surfaces along held-out rays; kept is a share of the volume that training "
         "rays reach. One field teaches all of a city, learned in "
         f"{grown[0]['learn_steps']} steps. The best grid is the smallest of those that keep "
         "least, within 5%; an octree holds the same cells."

@@ -202,8 +202,8 @@ def sharpening_sections(report: dict[str, Any]) -> list[str]:
         "learned gate keeps. Seconds of one core are for teaching and calibrating.\n",
         *guided,
         f"\nAt {LOST:g} of the surface lost *on test rays*, by the field at freezing: volume kept "
-        "of what rays reach; candidates kept on those rays; bytes. Grids are as they are or dilated, "
-        "whichever keeps less.\n",
+        "of what rays reach; candidates kept on those rays; bytes. Grids are as they are or "
+        "dilated, whichever keeps less.\n",
         *equal,
         "",
     ]

@@ -61,8 +61,8 @@ def sizes_sections() -> list[str]:
         first = next(iter(measured.values()))
         rows = [row for report in measured.values() for row in report["representations"]]
         note = (
-            f" Each loses {first['lost_surface_mass']:.1%} of the weight near surfaces along rays "
-            "of test photographs; kept is a share of the volume that training rays reach. The "
+            f" Each loses {first['lost_surface_mass']:.1%} of the weight near surfaces along "
+            "held-out rays; kept is a share of the volume that training rays reach. The "
             "last column: whether such a gate keeps no more than the grid. "
             f"Rows {made_line(rows)}."
         )

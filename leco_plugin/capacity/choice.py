@@ -177,8 +177,7 @@ def circumstances(results: Mapping[str, Any]) -> str:
     where = f"{machine['cores']} CPU cores" if machine["device"] == "cpu" else machine["device"]
     return (
         f"{scene['name']}, {scene['train_images']} photographs; one field of "
-        f"{results['learn_steps']} steps teaches all; {results['rays']} rays of "
-        f"{results['rays_of']}; {where}.\n"
+        f"{results['learn_steps']} steps teaches all; {results['rays']} held-out rays; {where}.\n"
         "Gates in bfloat16, grids one bit a cell; down and left is better. "
         "Ten times the bytes of the chosen save less than a third."
     )

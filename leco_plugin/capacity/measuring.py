@@ -18,12 +18,7 @@ from torch import Tensor
 from leco_plugin.capacity.choice import VOLUMES, choose, draw, kilobytes, verdict
 from leco_plugin.capacity.evidence import RAYS_AT_ONCE, Evidence, gather
 from leco_plugin.capacity.search import Candidate, find_threshold, gates, grids
-from leco_plugin.capacity.sources import (
-    Source,
-    draw_held_out,
-    draw_test_rays,
-    draw_training_rays,
-)
+from leco_plugin.capacity.sources import Source, draw_held_out, draw_training_rays
 from leco_plugin.chart.runner import SETTINGS, make_jobs, take_folder
 from leco_plugin.chart.theme import DARK, LIGHT
 from leco_plugin.evaluation.clock import seconds_now
@@ -72,10 +67,8 @@ class Taught(NamedTuple):
 
     mixture: Mixture
     lesson: Lesson
-    unseen: Evidence
-    """Dense candidates along rays that nothing was trained on."""
-    rays_of: str
-    """Whose rays those are."""
+    held_out: Evidence
+    """Dense candidates of pixels that nothing was trained on."""
     mapped: Tensor
     """[M, 3] of those candidates, in [-1, 1]."""
     volume: Tensor
@@ -129,19 +122,16 @@ def _render_rays(source: Source, model: LecoModel) -> Taught:
     torch.manual_seed(1)  # the same rays also where the field was loaded
     mixture = model.mixture
     lesson = lesson_of(source, model.config.gate_loss)
-    occupancy, rays_of = mixture.occupancy().eval(), "test photographs"
-    rays = draw_test_rays(source, occupancy, RAYS)  # a grid can learn the rays of training cameras
-    if rays is None:
-        rays, rays_of = draw_held_out(source, occupancy, RAYS, parts=1)[0], "held-out pixels"
+    rays = draw_held_out(source, mixture.occupancy().eval(), RAYS, parts=1)[0]
     evidence, _ = gather(mixture, None, rays)
     if not bool(evidence.worth.any()):
         raise InputError(
-            f"the field shows nothing along rays of {rays_of}, so no loss can be measured: let it "
+            "the field shows nothing along held-out rays, so that no loss can be measured: let one "
             "learn longer, with a larger --learn-steps and a new folder at --out"
         )
     volume = reached_volume(mixture, lesson.mapped, VOLUME_POINTS, seed=5)
     mapped = mixture.region.space.map(evidence.positions).clamp(-1.0, 1.0)
-    return Taught(mixture, lesson, evidence, rays_of, mapped, volume)
+    return Taught(mixture, lesson, evidence, mapped, volume)
 
 
 def lesson_of(source: Source, losses: GateLossConfig) -> Lesson:
@@ -175,7 +165,7 @@ def measure_gate(taught: Taught, candidate: Candidate, lost: float) -> dict[str,
     started = seconds_now()
     score = taught_score(candidate.gate, taught.lesson, taught.mixture.precision)
     scores, of_volume = in_parts(score, taught.mapped), in_parts(score, taught.volume)
-    return _row(candidate, started, measure(taught.unseen, scores, of_volume, lost))
+    return _row(candidate, started, measure(taught.held_out, scores, of_volume, lost))
 
 
 def taught_score(
@@ -204,8 +194,8 @@ def measure_grid(taught: Taught, candidate: Candidate, lost: float) -> dict[str,
         of_rays, of_volume = (
             look_up_scores(cells, box, places) for places in (taught.mapped, taught.volume)
         )
-        kept = cells >= threshold_losing(taught.unseen.worth, of_rays, lost)
-        found = measure(taught.unseen, of_rays, of_volume, lost)
+        kept = cells >= threshold_losing(taught.held_out.worth, of_rays, lost)
+        found = measure(taught.held_out, of_rays, of_volume, lost)
         both.append(found | {"octree_bytes": octree_bytes(kept)})
     return _row(candidate, started, min(both, key=lambda one: one["kept_volume"]))
 
@@ -255,7 +245,6 @@ def capacity(
         "learn_steps": learn_steps,
         "teach_steps": STEPS,
         "grids": "by the lesson of the gates",
-        "losses": "on test photographs, where there are some",
     }
     _take_folder(out, {"scene": scene, **settings}, data)
     say = functools.partial(console().print, markup=False, highlight=False)
@@ -267,8 +256,7 @@ def capacity(
         "machine": machine,
         "scene": {**scene, "train_images": taught.mixture.num_images},
         **settings,
-        "rays": taught.unseen.rays,
-        "rays_of": taught.rays_of,
+        "rays": taught.held_out.rays,
         "representations": rows,
         "chosen": dict(choose(rows)),
         "verdict": verdict(rows),

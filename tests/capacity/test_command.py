@@ -54,8 +54,7 @@ def taught(monkeypatch: pytest.MonkeyPatch) -> Taught:
         return row_of(candidate)
 
     mixture = SimpleNamespace(num_images=7)
-    unseen = SimpleNamespace(rays=99)
-    ground = SimpleNamespace(mixture=mixture, unseen=unseen, rays_of="test photographs")
+    ground = SimpleNamespace(mixture=mixture, held_out=SimpleNamespace(rays=99))
     monkeypatch.setattr(measuring, "prepare", lambda *arguments: ground)
     monkeypatch.setattr(measuring, "measure_gate", of_gate)
     monkeypatch.setattr(measuring, "measure_grid", of_gate)
