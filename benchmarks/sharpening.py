@@ -44,7 +44,6 @@ from leco_plugin.learning.sharpening import (
     SharpeningConfig,
     asked_by,
     lesson_by,
-    round_weights,
     seen_rendering,
     sharpen,
     teach,
@@ -130,10 +129,11 @@ def at_equal_loss(source: Source, mixture: Mixture) -> list[dict[str, Any]]:
     assert model is not None
     occupancy = mixture.occupancy().eval()
     losses = model.config.gate_loss
-    lesson, *others = (
+    lessons = [
         lesson_by(mixture, rays_that_teach(source, occupancy, seed), losses, 0.0, 1024)
         for seed in range(SEEDS)
-    )
+    ]
+    lesson = lessons[0]
     tests = draw_test_rays(source, occupancy, RAYS)
     assert tests is not None
     evidence: dict[str, Evidence] = {
@@ -144,9 +144,8 @@ def at_equal_loss(source: Source, mixture: Mixture) -> list[dict[str, Any]]:
     rivals = {
         "learned gate": (2 * occupancy.num_params, partial(mixture.occupancies, gate=mixture.gate))
     }
-    for seed, heard in enumerate((lesson, *others)):
+    for seed, heard in enumerate(lessons):
         gate = teach(config.gate, heard, config.steps, mixture.precision)
-        round_weights(gate)
         size = 2 * sum(p.numel() for p in gate.parameters())
         rivals[f"small gate, seed {seed}"] = (size, partial(mixture.occupancies, gate=gate))
     for n in GRIDS:

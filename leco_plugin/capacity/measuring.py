@@ -43,7 +43,7 @@ from leco_plugin.evaluation.report import (
     read_object,
     write_json,
 )
-from leco_plugin.learning.sharpening import Lesson, lesson_by, round_weights, teach
+from leco_plugin.learning.sharpening import Lesson, lesson_by, teach
 from leco_plugin.log import bar, console
 from leco_plugin.models.gate import GateConfig, occupancy_logit
 from leco_plugin.models.leco import LecoModel
@@ -174,7 +174,6 @@ def taught_score(
     """The logit of a gate that is taught now, as it would be stored and asked: of mapped positions
     [N, 3], [N]."""
     gate = teach(config, lesson, STEPS, precision)
-    round_weights(gate)
 
     @torch.no_grad()
     def score(mapped: Tensor) -> Tensor:

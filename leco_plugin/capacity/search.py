@@ -22,7 +22,7 @@ from leco_plugin.evaluation.clock import seconds_now
 from leco_plugin.evaluation.field_grids import in_parts
 from leco_plugin.evaluation.inspection import whole_box
 from leco_plugin.learning.calibration import THRESHOLDS
-from leco_plugin.learning.sharpening import Lesson, round_weights, teach
+from leco_plugin.learning.sharpening import Lesson, teach
 from leco_plugin.models.encodings import EncodingConfig
 from leco_plugin.models.gate import Gate, GateConfig
 from leco_plugin.occupancy import Occupancy
@@ -216,7 +216,6 @@ def _teach_in_place(
 ) -> Occupancy:
     """A gate in the original's place, without a threshold of its own yet."""
     gate = teach(config, lesson, steps, original.precision, on_progress=on_progress)
-    round_weights(gate)
     said = (0.5, original.precision, None)
     smaller = Occupancy(gate, original.space, *said, original.walls, original.seen)
     return smaller.to(original.threshold_value.device).eval()

@@ -36,7 +36,6 @@ from leco_plugin.learning.sharpening import (
     SharpeningConfig,
     added_costs,
     lesson_of,
-    round_weights,
     teach,
 )
 from leco_plugin.log import note, say
@@ -167,7 +166,6 @@ class Along:
                 before.precision,
                 seed=step,
             )
-            round_weights(gate)
             found = self._calibrated(gate, held_out, bundle, truth)
         seconds = seconds_now() - started
         skipped = 1.0 - float(held_out.kept.float().mean())

@@ -185,9 +185,7 @@ class Learner:
         if bool(self.mixture.frozen):
             self._watch(step, seconds, kept)
             if step + 1 >= self.run.end and bool(self.mixture.frozen):
-                last, _ = self.mixture.report.get("sharpened", [[0, 0.0]])[-1]
-                began = max(last, self.mixture.report["step"])
-                self._sharpen(step, step - began)
+                self._sharpen(step)
         else:
             self.progress.learn_seconds += seconds
             self._after_learning_step(step)
@@ -299,14 +297,15 @@ class Learner:
         found = doubts_of_field(report.get(FIELD, math.inf), report.get(ONE_COLOUR, math.inf))
         say_all(found or doubts_of_occupancy(kept_of_seen(self.mixture)))
 
-    def _sharpen(self, step: int, steps: int) -> None:
+    def _sharpen(self, step: int) -> None:
         """Has a small gate skip in place of the learned one where it skips more, and says so.
 
-        Args:
-            steps: for which the field has been trained guided since the last time.
+        The field must have been trained guided long enough, since freezing or the last time.
         """
         mixture, config, started = self.mixture, self.config, seconds_now()
-        if config.sharpening.steps == 0 or steps < config.sharpening.least_steps:
+        last, _ = mixture.report.get("sharpened", [[0, 0.0]])[-1]
+        guided = step - max(last, mixture.report["step"])
+        if config.sharpening.steps == 0 or guided < config.sharpening.least_steps:
             return
         kind = config.sharpening.gate.encoding.kind
         if mixture.gate.config.encoding.kind != kind:

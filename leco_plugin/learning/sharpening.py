@@ -82,7 +82,8 @@ def teach(
     rate: float = 2.0 * RATES["gate"],
     on_progress: Callable[[float], None] | None = None,
 ) -> Gate:
-    """A gate that was taught by a lesson, in the precision of its later queries.
+    """A gate that was taught by a lesson, in the precision of its later queries, and rounded as it
+    is stored.
 
     Minimises mean[-keep log o - skip log(1 - o)], the contribution loss with given targets.
 
@@ -116,7 +117,8 @@ def teach(
         schedule.step()
         if on_progress is not None:
             on_progress((step + 1) / steps)
-    return gate.requires_grad_(False).eval()
+    round_weights(gate.requires_grad_(False))
+    return gate.eval()
 
 
 @torch.no_grad()
@@ -241,7 +243,6 @@ def sharpen(
         if not len(lesson.mapped):
             return None
         gate = teach(config.gate, lesson, config.steps, mixture.precision)
-        round_weights(gate)
         rays, truth = held_out
         rendering = seen_rendering(mixture, rays, truth, at_once)
         before = measure(*rendering, float(mixture.threshold))

@@ -100,6 +100,8 @@ def test_where_two_that_learn_are_level_the_headline_says_what_they_lead_the_oth
     close = results(*both, *of("C", 18.0, 22.0, 23.0, **dense))
     assert headline(close, short=True) == "A is level with the next best"
     assert "behind" not in headline(close)
+    one_run = results(*both, *of("C", 20.0, **dense))
+    assert headline(one_run, short=True) == "A is level with the next best"
 
 
 def test_the_method_that_all_share_is_named_once_and_with_the_scene() -> None:

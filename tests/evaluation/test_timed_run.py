@@ -78,23 +78,6 @@ def test_rates_of_a_model_that_goes_on_with_what_it_learned_decay_over_all_of_it
     assert rate_at(course, group, 50.0, 51) == pytest.approx(RATE * 0.1**0.5)
 
 
-class SetUp(SimpleNamespace):
-    """As nerfstudio's config of a trainer, of a model's config."""
-
-    def __init__(self, model: Any = None, draw: Callable[[], None] = lambda: None) -> None:
-        super().__init__(
-            machine=SimpleNamespace(seed=42),
-            logging=SimpleNamespace(local_writer=SimpleNamespace()),
-            pipeline=SimpleNamespace(model=model),
-            optimizers={},
-            set_timestamp=lambda: None,
-        )
-        self.draw = draw
-
-    def setup(self, **_: Any) -> Any:
-        return SimpleNamespace(setup=self.draw, device="cpu", config=self)
-
-
 class Time:
     """The seconds that a run counts."""
 
@@ -360,7 +343,17 @@ def test_a_seed_decides_all_random_numbers_of_a_run(
 
     monkeypatch.setattr(module, "warm_up", lambda device: None)
 
-    config: Any = SetUp(None, draw)
+    class Config(SimpleNamespace):
+        def setup(self, **_: Any) -> Any:
+            return SimpleNamespace(setup=draw, device="cpu", config=self)
+
+    config: Any = Config(
+        machine=SimpleNamespace(seed=42),
+        logging=SimpleNamespace(local_writer=SimpleNamespace()),
+        pipeline=SimpleNamespace(model=None),
+        optimizers={},
+        set_timestamp=lambda: None,
+    )
     made = set_up(config, Budget(1.0), seed)
     assert (made.config.machine.seed, config.machine.seed) == (seed, 42)
     generator = torch.Generator().manual_seed(seed)

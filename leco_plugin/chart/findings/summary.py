@@ -236,19 +236,18 @@ def headline(results: Mapping[str, Any], short: bool = False) -> str:
     if found.margin is None:
         return f"{best.name} {best.psnr:.1f} dB, {second.name} {second.psnr:.1f} dB ({found.by})"
     apart = f"{found.difference:.2f} ± {found.margin:.2f}"
-    others = [line for line in ranked if not line.learned]
-    lead = (
-        compare(best.psnrs, others[0].psnrs) if best.learned and second.learned and others else None
-    )
     if found.word == "level":
         figures = f"{best.psnr:.1f} and {second.psnr:.1f} dB"
         said = f"{best.name} and {second.name} are level: {figures}, {apart} apart ({found.by})"
-        if lead is None or lead.word != "ahead":
-            return f"{best.name} is level with the next best" if short else said
-        beyond = f"{lead.difference:.2f} ± {lead.margin:.2f}"
-        if short:
-            return f"learned occupancy leads all others by {beyond} dB"
-        return f"{said}; {others[0].name}, the best of the others, is {beyond} behind"
+        others = [line for line in ranked if not line.learned]
+        if best.learned and second.learned and others:
+            lead = compare(best.psnrs, others[0].psnrs)
+            if lead.word == "ahead":  # then it has a margin
+                beyond = f"{lead.difference:.2f} ± {lead.margin:.2f}"
+                if short:
+                    return f"learned occupancy leads all others by {beyond} dB"
+                return f"{said}; {others[0].name}, the best of the others, is {beyond} behind"
+        return f"{best.name} is level with the next best" if short else said
     if short:
         return f"{best.name} is ahead by {apart} dB"
     said = f"{best.name} is ahead: {best.psnr:.1f} dB, {apart} more than {second.name} ({found.by})"
