@@ -14,7 +14,6 @@ from leco_plugin.chart.findings.learned import (
     Learned,
     falls,
     learned_of,
-    level_with,
     ours_of,
     percent,
     still_rising,
@@ -194,7 +193,8 @@ def _level(learned: Sequence[Learned]) -> str:
     ours = ours_of(learned)
     if ours is None or not ours.is_measured:
         return ""
-    names = [one.name for one in level_with(ours, learned)]
+    others = [one for one in learned if one is not ours and one.is_measured]
+    names = [one.name for one in others if words_of(ours, one) == {"level"}]
     return f"; level with it: {', '.join(names)}" if names else ""
 
 

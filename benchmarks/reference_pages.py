@@ -1,4 +1,5 @@
-"""Writes `docs/commands.md`, `docs/options.md` and `docs/gifts.md` from the code itself.
+"""Writes `docs/commands.md`, `docs/options.md`, `docs/gifts.md` and the rules of
+`docs/conformance.md` from the code itself.
 
 python benchmarks/reference_pages.py
 """
@@ -17,9 +18,10 @@ from typing import Annotated, Any, Literal, get_args, get_origin, get_type_hints
 import checkout  # noqa: F401
 import gifts_page
 import tyro
-from page_parts import ROOT, table
+from page_parts import ROOT, between, table
 
 from leco_plugin.cli import COMMANDS
+from leco_plugin.conformance.cases import RULES
 from leco_plugin.host_configs import leco_ngp, leco_switch_nerf
 from leco_plugin.method_configs import leco_occupancy
 from leco_plugin.scenes.city_dataparser import leco_city_dataparser
@@ -27,6 +29,8 @@ from leco_plugin.scenes.mega_nerf import mega_nerf_dataparser
 from leco_plugin.scenes.photographs import leco_photographs_dataparser
 
 COMMANDS_PAGE, OPTIONS_PAGE = ROOT / "docs" / "commands.md", ROOT / "docs" / "options.md"
+RULES_PAGE = ROOT / "docs" / "conformance.md"
+RULES_MARKS = "<!-- rules: generated -->", "<!-- end of the rules -->"
 COMMANDS_HEAD = """# Commands
 
 Every command prints its help with `-h`. It exits with 0, with 2 for bad input and with 1 for a
@@ -151,6 +155,13 @@ def _said_of_fields(kind: type) -> dict[str, str]:
     return {name: text for name, text in said.items() if not name.startswith("_")}
 
 
+def rules_page() -> str:
+    """The page of the rules, with their table."""
+    rows = [(f"`{r.name}`", ", ".join(sorted(r.checks)), r.reason, r.remedy) for r in RULES]
+    body = "\n".join(table("rule | seams | why it matters | remedy", rows))
+    return between(RULES_PAGE.read_text(), RULES_MARKS, body)
+
+
 def _kind(hint: Any) -> str:
     """A type in words: choices, or the names of types."""
     if get_origin(hint) is Annotated:
@@ -180,5 +191,6 @@ def _line(text: str) -> str:
 if __name__ == "__main__":
     COMMANDS_PAGE.write_text(commands_page())
     OPTIONS_PAGE.write_text(options_page())
+    RULES_PAGE.write_text(rules_page())
     gifts_page.PAGE.write_text(gifts_page.page())
     sys.exit(0)

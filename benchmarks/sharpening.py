@@ -38,13 +38,13 @@ from leco_plugin.evaluation.equal_loss import kept_shares, mapped_box, reached_v
 from leco_plugin.evaluation.field_grids import dilate, look_up_scores
 from leco_plugin.evaluation.inspection import in_parts
 from leco_plugin.learning.calibration import Measured, measure
-from leco_plugin.learning.dense import in_chunks
+from leco_plugin.learning.dense import dense_rendering, in_chunks
 from leco_plugin.learning.sharpening import (
     Lesson,
     SharpeningConfig,
     asked_by,
     lesson_by,
-    seen_rendering,
+    seen_reference,
     sharpen,
     teach,
 )
@@ -70,7 +70,7 @@ def shown(measured: Measured) -> dict[str, float]:
 
 def on_rays(mixture: Mixture, gate: Gate, threshold: float, seen: Seen) -> Measured:
     """What a gate skips and loses along some rays, of what is rendered as prices are."""
-    rendering = seen_rendering(mixture, seen.rays, on_black(seen.truth), 1024)
+    rendering = dense_rendering(mixture, seen.rays, on_black(seen.truth), 1024, seen_reference)
     asked = asked_by(mixture, gate, in_chunks(seen.rays, 1024), rendering)
     return measure(*asked, threshold)
 

@@ -55,7 +55,7 @@ def of_table(results: dict[str, Any]) -> str:
         '<img alt="cases by samplers" src="images/stability.png"></picture>'
     )
     circumstances = (
-        f"`python benchmarks/stability.py`: {len(runs)} runs, {seconds / 3600:.1f} hours of one "
+        f"`{results['made']['command']}`: {len(runs)} runs, {seconds / 3600:.1f} hours of one "
         f"core; {', '.join(made['cpu'])}; leco_plugin {', '.join(made['version'])} at "
         f"{', '.join(made['commit'])}; {results['made']['date']}."
     )

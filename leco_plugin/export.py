@@ -20,6 +20,7 @@ from torch.nn.functional import max_pool3d
 
 from leco_plugin.cli_reports import check_place
 from leco_plugin.evaluation.inspection import (
+    cameras_of,
     describe,
     doubts,
     numbers,
@@ -260,12 +261,8 @@ def innermost_box(occupancy: Occupancy) -> Tensor:
 def reaching_levels(occupancy: Occupancy) -> int:
     """Levels with which the outermost box holds the rays of all cameras, 2 to `MOST_LEVELS`."""
     far = numbers([occupancy.report.get("far")])
-    listed = occupancy.report.get("cameras")
-    rows = [numbers(row) for row in listed] if isinstance(listed, list) else []
-    center = occupancy.space.center.tolist()
-    reach = max(
-        (abs(x - c) for row in rows if len(row) == 3 for x, c in zip(row, center)), default=0.0
-    )
+    cameras = cameras_of(occupancy)
+    reach = float((cameras - occupancy.space.center.cpu()).abs().max()) if len(cameras) else 0.0
     if not far:
         return MOST_LEVELS
     widest = (reach + max(far[0], 0.0)) / float(occupancy.space.half_extent)

@@ -109,7 +109,7 @@ def kept_surface(
         met = []
         for number, part in enumerate(places.split(CELLS_AT_ONCE >> 4)):
             met.append(_first_met(occupancy, part, cameras, cell, round(REACH * resolution)))
-            on_progress(0.3 + 0.7 * (number + 1) * (CELLS_AT_ONCE >> 4) / len(places))
+            on_progress(0.3 + 0.7 * min(1.0, (number + 1) * (CELLS_AT_ONCE >> 4) / len(places)))
         places = places[torch.cat(met)]
         chosen = chosen.masked_scatter(kept, torch.cat(met))
     return KeptSurface(_unmap(occupancy, places), values[chosen])

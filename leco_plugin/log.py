@@ -14,9 +14,7 @@ from functools import cache
 from typing import Protocol, TextIO
 
 from rich.console import Console
-from rich.markup import escape
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
-from rich.text import Text
 from torch import distributed
 
 from leco_plugin.models.compute.ranks import is_first
@@ -70,18 +68,17 @@ def _screen() -> Console:
 def say(line: str) -> None:
     """A line on the screen, said once for all processes; also in the run's log file.
 
-    Args:
-        line: with rich's markup.
+    It is shown as it is: brackets and colons in the name of a file mean nothing.
     """
     if is_first() and _details is not None:
-        console().print(line, soft_wrap=True)
+        console().print(line, markup=False, emoji=False, soft_wrap=True)
     note(line, offset=3)
 
 
 def say_all(lines: Iterable[str]) -> None:
-    """Says lines that hold no markup."""
+    """Says each of some lines."""
     for line in lines:
-        say(escape(line))
+        say(line)
 
 
 def note(line: str, offset: int = 2) -> None:
@@ -93,7 +90,7 @@ def note(line: str, offset: int = 2) -> None:
     if not is_first():
         return
     if _details is None:
-        console().log(f"\\[leco] {line}", _stack_offset=offset)
+        console().log(f"[leco] {line}", markup=False, emoji=False, _stack_offset=offset)
     else:
         _write(line)
 
@@ -108,19 +105,20 @@ def summarize(summary: Iterable[str], details: Iterable[str]) -> None:
 
 def _write(line: str) -> None:
     assert _details is not None
-    print(time.strftime("%H:%M:%S"), Text.from_markup(line).plain, file=_details, flush=True)
+    print(time.strftime("%H:%M:%S"), line, file=_details, flush=True)
 
 
 class _Says(logging.Handler):
     """Says what samplers and experts warn of, and notes what else they log."""
 
     def emit(self, record: logging.LogRecord) -> None:
-        line = escape(record.getMessage())
+        line = record.getMessage()
         warns = record.levelno >= logging.WARNING
         if is_first():
             (say if warns else note)(line)
         elif warns and record.name in OF_A_DEVICE:
-            console().log(f"\\[leco] process {distributed.get_rank()}: {line}")
+            process = f"[leco] process {distributed.get_rank()}"
+            console().log(f"{process}: {line}", markup=False, emoji=False)
 
 
 def say_what_is_logged() -> None:
@@ -149,10 +147,10 @@ def bar(what: str) -> Iterator[Show]:
         yield lambda share, figures="": None
         return
     if not (console().is_terminal or console().is_jupyter):
-        yield _Lines(what, _print)
+        yield _Lines(what, put)
         return
     columns = (TextColumn("{task.description}", markup=False), BarColumn(), TimeElapsedColumn())
-    in_file = _Lines(what, lambda line: None if _details is None else _write(escape(line)))
+    in_file = _Lines(what, lambda line: None if _details is None else _write(line))
     with Progress(*columns, TimeRemainingColumn(), console=console(), transient=True) as progress:
         task = progress.add_task(what, total=1.0)
 
@@ -186,10 +184,11 @@ class _Lines:
         self.put(f"{self.what}: " + ", ".join(filter(None, [reached, figures, left])))
 
 
-def _print(line: str) -> None:
-    console().print(line, markup=False, highlight=False, soft_wrap=True)
+def put(line: str) -> None:
+    """A line of a command's own on the screen, as it is; also in a run's log file."""
+    console().print(line, markup=False, emoji=False, highlight=False, soft_wrap=True)
     if _details is not None:
-        _write(escape(line))
+        _write(line)
 
 
 def spell(seconds: float) -> str:
@@ -202,10 +201,10 @@ def spell(seconds: float) -> str:
 
 
 @contextmanager
-def resumable(say: Callable[[str], None]) -> Iterator[None]:
-    """A context for resumable work: Ctrl-C logs that finished parts are kept."""
+def resumable() -> Iterator[None]:
+    """A context for resumable work: Ctrl-C says that finished parts are kept."""
     try:
         yield
     except KeyboardInterrupt:
-        say("stopped; what is finished is kept, and the same command goes on with the rest")
+        put("stopped; what is finished is kept, and the same command goes on with the rest")
         raise

@@ -30,7 +30,7 @@ def test_in_a_log_it_is_a_line_early_then_one_a_minute_and_a_twentieth(
 def test_details_go_to_the_file_and_the_rest_to_both(capsys: pytest.CaptureFixture[str]) -> None:
     file = io.StringIO()
     with log.details_in(file):
-        log.note("a table of \\[wide] things")
+        log.note("a table of [wide] things")
         log.say("a result")
         log.summarize(["in short"], ["at length"])
     log.note("afterwards")
@@ -39,6 +39,19 @@ def test_details_go_to_the_file_and_the_rest_to_both(capsys: pytest.CaptureFixtu
     assert [line[9:] for line in in_file.splitlines()] == [
         *("a table of [wide] things", "a result", "at length", "in short")
     ]
+
+
+@pytest.mark.parametrize("line", ["wrote /runs/scene [v2]/gate.pt", "/runs/[/x]", "/a:smile:/b"])
+def test_names_of_files_are_said_as_they_are(line: str, capsys: pytest.CaptureFixture[str]) -> None:
+    file = io.StringIO()
+    for tell in (log.say, log.note, log.put):
+        tell(line)
+        assert line in capsys.readouterr().out
+    with log.details_in(file):
+        for tell in (log.say, log.note, log.put):
+            tell(line)
+    assert file.getvalue().count(line) == 3
+    assert capsys.readouterr().out.count(line) == 2, "a note is for the file alone"
 
 
 def test_on_a_terminal_it_is_a_bar(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -202,6 +202,7 @@ def test_the_published_tables_are_those_of_the_stored_results() -> None:
 def test_pages_of_commands_and_options_are_those_of_the_code() -> None:
     assert TEXTS["commands"] == reference_pages.commands_page()
     assert TEXTS["options"] == reference_pages.options_page()
+    assert TEXTS["conformance"] == reference_pages.rules_page()
     assert TEXTS["gifts"] == gifts_page.page()
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import copy
-import functools
 import random
 from collections.abc import Callable, Sequence
 from dataclasses import replace
@@ -44,7 +43,7 @@ from leco_plugin.evaluation.report import (
     write_json,
 )
 from leco_plugin.learning.sharpening import Lesson, lesson_by, teach
-from leco_plugin.log import bar, console
+from leco_plugin.log import bar, put
 from leco_plugin.models.gate import GateConfig, occupancy_logit
 from leco_plugin.models.leco import LecoModel
 from leco_plugin.models.mixture import Mixture
@@ -246,10 +245,9 @@ def capacity(
         "grids": "by the lesson of the gates",
     }
     _take_folder(out, {"scene": scene, **settings}, data)
-    say = functools.partial(console().print, markup=False, highlight=False)
-    candidates = [*gates(), *_grids_that_fit(resolutions, say)]
+    candidates = [*gates(), *_grids_that_fit(resolutions)]
     taught = prepare(data, out, learn_steps)
-    rows = _measure_missing(out, taught, candidates, lost_surface_mass, code, say)
+    rows = _measure_missing(out, taught, candidates, lost_surface_mass, code)
     results = {
         "format": 1,
         "machine": machine,
@@ -283,7 +281,6 @@ def _measure_missing(
     candidates: Sequence[Candidate],
     lost_surface_mass: float,
     code: dict[str, Any],
-    say: Callable[[str], None],
 ) -> list[dict[str, Any]]:
     rows = {one.key: row for one in candidates if (row := _stored(out, one)) is not None}
     todo = [one for one in candidates if one.key not in rows]
@@ -295,7 +292,7 @@ def _measure_missing(
         return line_of(row)
 
     with bar("Teaching representations") as show:
-        make_jobs(todo, measure_one, say, show, done=len(rows))
+        make_jobs(todo, measure_one, put, show, done=len(rows))
     return [rows[one.key] for one in candidates]
 
 
@@ -309,14 +306,14 @@ def _take_folder(out: Path, settings: dict[str, Any], data: Path) -> None:
     take_folder(file, settings, "points with another", DAMAGED)
 
 
-def _grids_that_fit(resolutions: Sequence[int], say: Callable[[str], None]) -> list[Candidate]:
+def _grids_that_fit(resolutions: Sequence[int]) -> list[Candidate]:
     """The grids that fit the memory; says which do not."""
     found = []
     for one in grids(tuple(set(resolutions))):
         if fits_memory(int(one.size) ** 3):
             found.append(one)
         else:
-            say(f"a grid of {one.size}^3 cells does not fit the free memory; it is left out")
+            put(f"a grid of {one.size}^3 cells does not fit the free memory; it is left out")
     return found
 
 

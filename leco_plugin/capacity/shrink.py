@@ -12,7 +12,6 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from nerfstudio.utils.rich_utils import CONSOLE
 
 from leco_plugin.capacity.choice import line_of, line_of_lowered, line_of_original
 from leco_plugin.capacity.evidence import gather
@@ -45,7 +44,7 @@ from leco_plugin.evaluation.inspection import whole_box
 from leco_plugin.evaluation.report import describe_code, describe_machine, made_by
 from leco_plugin.learning.freezing import HARDLY_ANYTHING
 from leco_plugin.learning.sharpening import round_weights
-from leco_plugin.log import bar
+from leco_plugin.log import bar, put
 from leco_plugin.occupancy import BACKDROP_PRICE, Occupancy
 from leco_plugin.scenes.pixels.held_out_pixels import held_out_sampler
 
@@ -93,7 +92,7 @@ def shrink(
     }
 
     def tell(rung: Rung) -> None:
-        _say(line_of(rung))
+        put(line_of(rung))
         results["rungs"].append(asdict(rung))
         keep(results)
 
@@ -138,17 +137,17 @@ def _meet_bounds(
     drawn = draw_rays(source, original)
     ground = prepare(source, original, *drawn)
     itself = measure_original(ground, bounds)
-    _say(line_of_original(itself, ground.measures_original))
+    put(line_of_original(itself, ground.measures_original))
     lower = lower_threshold(ground, bounds)
     if lower is None:
         if itself.verdict != HOLDS:
-            _say("no threshold is within them, and no smaller gate is looked for")
+            put("no threshold is within them, and no smaller gate is looked for")
         return ground, itself, None
     more = round(kept_of_box(lower) / max(kept_of_box(original), 1e-12), 4)
     lowered = {"from": original.threshold, "to": lower.threshold, "kept_volume": more}
     ground = prepare(source, lower, *drawn)
     itself = measure_original(ground, bounds)
-    _say(line_of_lowered(itself, lowered))
+    put(line_of_lowered(itself, lowered))
     skipped = 1.0 - float(ground.references[0].search.evidence.kept.double().mean())
     if skipped < HARDLY_ANYTHING:
         raise ValueError(
@@ -350,7 +349,3 @@ def compare_queries(original: Occupancy, smaller: Occupancy) -> tuple[float, lis
     pairs = [(seconds(original), seconds(smaller)) for _ in range(TIMED_ROUNDS)][2:]
     ratio = statistics.median(before / after for before, after in pairs)
     return round(ratio, 2), [round(1e3 * statistics.median(times), 3) for times in zip(*pairs)]
-
-
-def _say(line: str) -> None:
-    CONSOLE.print(line, markup=False, highlight=False)

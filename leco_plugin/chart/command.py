@@ -2,21 +2,18 @@
 
 from __future__ import annotations
 
-import functools
 import shlex
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-from nerfstudio.utils.rich_utils import CONSOLE
-
 from leco_plugin.chart.chart import Chart, why_not_shared
 from leco_plugin.chart.contender import Protocol
 from leco_plugin.chart.methods import SUITES, contenders, in_order
 from leco_plugin.chart.runner import ProcessRunner, Runner
 from leco_plugin.chart.worker import WORKER
-from leco_plugin.log import bar, resumable
+from leco_plugin.log import bar, put, resumable
 from leco_plugin.scenes.input_error import InputError
 from leco_plugin.scenes.photographs import HeldOut
 
@@ -146,11 +143,10 @@ def _chart_of(
 
 def _make(chart: Chart, runner_for: Callable[[Chart], Runner]) -> dict[str, Any]:
     """Makes what is missing of a chart, and draws all of it; returns its results."""
-    say = functools.partial(CONSOLE.print, markup=False, highlight=False)
     suite = f"{chart.suite}, " if chart.suite else ""
     title = f"{chart.scene['name']}, {suite}{chart.protocol.describe()} a run"
-    with resumable(say), bar(title) as show:
-        chart.make(runner_for(chart), say, show)
+    with resumable(), bar(title) as show:
+        chart.make(runner_for(chart), put, show)
     return chart.draw()
 
 

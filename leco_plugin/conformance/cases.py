@@ -1,13 +1,8 @@
-"""Which rules apply to a name, and applying them: what the command and the tests share.
-
-`python -m leco_plugin.conformance.cases docs/conformance.md` renews the table of rules there.
-"""
+"""Which rules apply to a name, and applying them: what the command and the tests share."""
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Iterator
-from pathlib import Path
 
 import torch
 
@@ -24,7 +19,6 @@ from leco_plugin.scenes.input_error import InputError
 
 HOST_RULES = tuple(rule for rule in RULES if HostCase.seam in rule.checks)
 SAMPLER_RULES = tuple(rule for rule in RULES if rule not in HOST_RULES)
-BEGIN, END = "<!-- rules: generated -->", "<!-- end of the rules -->"
 
 
 def sampler_cases(name: str) -> list[Case]:
@@ -93,18 +87,3 @@ def pairs(cases: list[Case], rules: tuple[Rule, ...] = RULES) -> list[tuple[Rule
 def check(name: str) -> Iterator[Verdict]:
     """Applies the rules for a sampler or a method one by one; errors of `cases_of` come at once."""
     return (apply(rule, case) for rule, case in pairs(cases_of(name)))
-
-
-def with_table(page: str) -> str:
-    """A Markdown page with the table of rules between its two marks renewed."""
-    rows = ["| rule | seams | why it matters | remedy |", "|---|---|---|---|"]
-    for rule in RULES:
-        seams = ", ".join(sorted(rule.checks))
-        rows.append(f"| `{rule.name}` | {seams} | {rule.reason} | {rule.remedy} |")
-    before, _, rest = page.partition(BEGIN)
-    return "\n".join([f"{before}{BEGIN}", *rows, f"{END}{rest.partition(END)[2]}"])
-
-
-if __name__ == "__main__":
-    path = Path(sys.argv[1])
-    path.write_text(with_table(path.read_text()))

@@ -9,13 +9,13 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 
-import psutil
 import torch
 from torch import Tensor
 from torch.nn.functional import max_pool3d, pad
 
 from leco_plugin.evaluation.clock import Clock
 from leco_plugin.evaluation.inspection import ViewBox, in_parts
+from leco_plugin.models.compute.device import free_memory
 from leco_plugin.models.mixture import Mixture
 from leco_plugin.models.rendering import gate_values_and_routes
 from leco_plugin.occupancy import gate_precision
@@ -177,7 +177,8 @@ def octree_bytes(kept: Tensor) -> int:
 
 def fits_memory(cells: int) -> bool:
     """Whether a grid of so many cells can be filled in half of the memory that is free."""
-    return BYTES_A_CELL * cells < psutil.virtual_memory().available / 2
+    free = free_memory()
+    return free is None or BYTES_A_CELL * cells < free / 2
 
 
 @torch.no_grad()

@@ -41,6 +41,8 @@ CURVE_RAYS = 8192
 """Test pixels behind each point of a curve."""
 
 PRICES = ("threshold", "empty_fraction", "lost_mass", "lost_surface_mass", "image_price_db")
+RECENT = 100
+"""Steps by which it is foreseen how many are left."""
 ENDLESS = 10_000_000
 """Steps that no run reaches before its time is over."""
 
@@ -232,6 +234,7 @@ class _Course:
         run.steps = step + 1
         if run.steps == TIMED_STEPS or self._learning_time_left() <= 0.0:
             self._keep_to_learning_time()
+        self._foresee_the_end()
         share = self.budget.share(clock.seconds, run.steps)
         if self.on_progress is not None:
             self.on_progress(share)
@@ -272,6 +275,15 @@ class _Course:
     def _learning_time_left(self) -> float:
         """Seconds of it; without end where there is no such limit."""
         return (self.budget.learn_seconds or math.inf) - self.clock.seconds
+
+    def _foresee_the_end(self) -> None:
+        """For a model that learns itself, which sharpens its gate towards the end."""
+        seconds, steps, config = self.budget.seconds, self.run.steps, self.trainer.config
+        mixture = getattr(self.trainer.pipeline.model, "mixture", None)
+        if seconds is None or mixture is None or not (bool(mixture.frozen) and self.step_times):
+            return
+        left = max(0.0, seconds - self.clock.seconds) / statistics.fmean(self.step_times[-RECENT:])
+        config.max_num_iterations = min(self.budget.steps or ENDLESS, steps + math.ceil(left))
 
     def _keep_to_learning_time(self) -> None:
         """As a host that learns first does: a model that learns itself freezes in time."""

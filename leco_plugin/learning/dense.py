@@ -138,16 +138,21 @@ def evaluating(model: nn.Module) -> Iterator[None]:
 
 @torch.no_grad()
 def dense_rendering(
-    mixture: Mixture, rays: Rays, truth: Tensor, rays_at_once: int
+    mixture: Mixture,
+    rays: Rays,
+    truth: Tensor,
+    rays_at_once: int,
+    refer: Callable[[Mixture, Rays], Reference] | None = None,
 ) -> DenseRendering:
     """All candidates of given rays rendered, in chunks.
 
     Args:
         rays: cut to the mixture's region.
         truth: [R, 3] their true colours.
+        refer: makes the reference of a chunk; None is `dense_reference`.
     """
     chunks = in_chunks(rays, rays_at_once)
-    references = [dense_reference(mixture, chunk) for chunk in chunks]
+    references = [(refer or dense_reference)(mixture, chunk) for chunk in chunks]
 
     def render_kept(number: int, mask: Tensor) -> Tensor:
         kept = Intervals(*(part[mask] for part in references[number].intervals))

@@ -47,6 +47,9 @@ if TYPE_CHECKING:
 FEWEST_KEPT = 0.5
 """An occupancy that is expected to keep fewer samples a ray than this may rightly keep none in a
 batch: no alarm then."""
+SHARPENED_FROM = 0.9
+"""Share of a run at which a small gate is taught. In what is left the field grows used to it, and
+the price watch sees what it costs."""
 NEARLY_ALL = 0.95
 """Share of the probe positions above which a gate has found nothing empty yet."""
 
@@ -184,7 +187,7 @@ class Learner:
             return
         if bool(self.mixture.frozen):
             self._watch(step, seconds, kept)
-            if step + 1 >= self.run.end and bool(self.mixture.frozen):
+            if step + 1 >= SHARPENED_FROM * self.run.end and bool(self.mixture.frozen):
                 self._sharpen(step)
         else:
             self.progress.learn_seconds += seconds
@@ -303,10 +306,10 @@ class Learner:
         The field must have been trained guided long enough, since freezing or the last time.
         """
         mixture, config, started = self.mixture, self.config, seconds_now()
-        last, _ = mixture.report.get("sharpened", [[0, 0.0]])[-1]
-        guided = step - max(last, mixture.report["step"])
+        guided = step - max(self.progress.sharpened_at, mixture.report["step"])
         if config.sharpening.steps == 0 or guided < config.sharpening.least_steps:
             return
+        self.progress.sharpened_at = step
         kind = config.sharpening.gate.encoding.kind
         if mixture.gate.config.encoding.kind != kind:
             return  # samplers are made for the kind that was asked for

@@ -25,8 +25,11 @@ class Run(Protocol):
     """Whether the field goes on after freezing; else it is left behind."""
     start: int
     """Its first step: not 0 where it was resumed."""
-    end: float
-    """The step after its last one; infinity where freezing ends it."""
+
+    @property
+    def end(self) -> float:
+        """The step after its last one; infinity where freezing ends it."""
+
     folder: Path | None
     """Where it leaves its files; None leaves none."""
     resumed_from: Path | None
@@ -149,6 +152,8 @@ class Progress:
     """Whether the gate, after recoveries, is taught in logit form although the paper's is asked."""
     learning_kept: float = 1.0
     """Share of candidates that are shaded while the gate is learned, a running mean."""
+    sharpened_at: int = -1
+    """Step at which a small gate was last taught; -1 is none."""
     left_occupied: bool = False
     """Whether a gate that calls everything occupied after all its recoveries is left so."""
     decisions: Tensor = field(default_factory=lambda: torch.zeros(0, dtype=torch.bool))

@@ -28,6 +28,7 @@ from leco_plugin.learning.calibration import (
 from leco_plugin.learning.dense import (
     DenseRendering,
     Reference,
+    dense_rendering,
     evaluating,
     in_chunks,
     reference_of,
@@ -140,9 +141,9 @@ class SharpeningConfig:
 
     steps: int = 2000
     """Of teaching, each with 2,048 positions; 0 never sharpens."""
-    least_steps: int = 1000
-    """Guided steps from which on it pays: a gate is sharpened at the end of a run that has had so
-    many. At freezing the field would have the gate skip what it has not found yet."""
+    least_steps: int = 1500
+    """Guided steps from which on it pays: a gate is sharpened when nine tenths of a run are over,
+    if the field has had so many. Earlier it would have skipped what the field has not found yet."""
     rays: int = 1 << 15
     """Training rays that teach. With a quarter of them a gate learns the rays, not the scene."""
     gate: GateConfig = field(
@@ -244,12 +245,11 @@ def sharpen(
             return None
         gate = teach(config.gate, lesson, config.steps, mixture.precision)
         rays, truth = held_out
-        rendering = seen_rendering(mixture, rays, truth, at_once)
+        rendering = dense_rendering(mixture, rays, truth, at_once, seen_reference)
         before = measure(*rendering, float(mixture.threshold))
         asked = asked_by(mixture, gate, in_chunks(rays, at_once), rendering)
-        of_cameras = [
-            _said_by(mixture, gate, of_one, _rendered(mixture, of_one)) for of_one, _ in cameras
-        ]
+        of_each = [of_one for of_one, _ in cameras]
+        of_cameras = [_said_by(mixture, gate, one, seen_reference(mixture, one)) for one in of_each]
         measured = calibrate(*asked, calibration, cameras=of_cameras)
         promised = promise(of_cameras, measured, calibration)
     return Sharpened(gate, measured, before, promised)
@@ -275,22 +275,6 @@ def lesson_by(
         of_rays = asked.intervals.ray_indices[before]
         lessons.append(lesson_of(asked.mapped[before], weights[before], of_rays, losses))
     return Lesson(*(torch.cat(parts) for parts in zip(*lessons)))
-
-
-def seen_rendering(
-    mixture: Mixture, rays: Rays, truth: Tensor, rays_at_once: int
-) -> DenseRendering:
-    """As `dense_rendering`, where candidates below the threshold are not rendered and have no
-    weight. Guided training has not taught the field what is there."""
-    chunks = in_chunks(rays, rays_at_once)
-    references = [_rendered(mixture, chunk) for chunk in chunks]
-
-    @torch.no_grad()
-    def render_kept(number: int, mask: Tensor) -> Tensor:
-        kept = Intervals(*(part[mask] for part in references[number].intervals))
-        return mixture.shade(chunks[number], kept).rgb
-
-    return DenseRendering(references, list(truth.split(rays_at_once)), render_kept)
 
 
 class _Asked(NamedTuple):
@@ -320,8 +304,9 @@ def _asked(mixture: Mixture, rays: Rays, seen: float) -> _Asked:
 
 
 @torch.no_grad()
-def _rendered(mixture: Mixture, rays: Rays) -> Reference:
-    """All candidates of rays with the weights of those that are kept."""
+def seen_reference(mixture: Mixture, rays: Rays) -> Reference:
+    """As `dense_reference`, where candidates below the threshold are not rendered and have no
+    weight. Guided training has not taught the field what is there."""
     intervals, _, occupancies, drawn = asked = _asked(mixture, rays, 1.0)
     small = reference_of(mixture.shade(rays, asked.some), asked.some, rays)
     weights, surface = torch.zeros_like(occupancies), torch.zeros_like(drawn)

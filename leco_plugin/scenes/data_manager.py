@@ -21,10 +21,10 @@ from nerfstudio.data.utils.dataloaders import (
     RandIndicesEvalDataloader,
 )
 from nerfstudio.model_components.ray_generators import RayGenerator
-from rich.markup import escape
 from torch import Tensor
 
 from leco_plugin.log import say
+from leco_plugin.models.compute.device import free_memory
 from leco_plugin.scenes.frames import UP_IS_KNOWN, turn_outputs, turn_to_upright
 from leco_plugin.scenes.input_error import InputError
 from leco_plugin.scenes.photograph_files import names_what_it_cannot_read
@@ -222,7 +222,7 @@ def read_in_words(data: Path, training: Any, tests: int) -> str:
     size = f"{'' if bool((sizes == sizes[0]).all()) else 'up to '}{width} x {height}"
     points = points_in(training.metadata)
     found = "no sparse points" if points is None else f"{len(points):,} sparse points"
-    name = escape((data if data.is_dir() else data.parent).resolve().name)
+    name = (data if data.is_dir() else data.parent).resolve().name
     return (
         f"{name}: {len(training)} photographs to learn from, {tests} to test with, {size}; {found}"
     )
@@ -231,32 +231,3 @@ def read_in_words(data: Path, training: Any, tests: int) -> str:
 def decoded_bytes(dataset: Any) -> int:
     """What all photographs of a dataset take in memory as nerfstudio decodes them, float32."""
     return 12 * int(picture_sizes(dataset).prod(dim=-1).sum())
-
-
-def free_memory(
-    meminfo: Path = Path("/proc/meminfo"), group: Path = Path("/sys/fs/cgroup")
-) -> int | None:
-    """Bytes that this process may still take, a container's limit included; None if unknown."""
-    limits = []
-    try:
-        fields = (line.split() for line in meminfo.read_text().splitlines())
-        limits += [int(field[1]) * 1024 for field in fields if field[:1] == ["MemAvailable:"]]
-    except OSError:
-        pass
-    try:
-        most = (group / "memory.max").read_text().strip()
-        if most != "max":
-            taken = int((group / "memory.current").read_text()) - _given_back(group)
-            limits.append(int(most) - taken)
-    except (OSError, ValueError):
-        pass
-    return min(limits) if limits else None
-
-
-def _given_back(group: Path) -> int:
-    """Bytes that a container has in the cache of files, and the system takes back when asked."""
-    try:
-        fields = (line.split() for line in (group / "memory.stat").read_text().splitlines())
-        return sum(int(value) for name, value in fields if name in ("active_file", "inactive_file"))
-    except (OSError, ValueError):
-        return 0

@@ -24,7 +24,7 @@ from nerfstudio.data.dataparsers.base_dataparser import DataparserOutputs
 from numpy.typing import NDArray
 from PIL import Image
 
-from leco_plugin.log import bar, console
+from leco_plugin.log import bar, note
 from leco_plugin.scenes.coloured_points import read_cloud
 from leco_plugin.scenes.frames import ALTITUDES, METRES_PER_UNIT, UP_IS_KNOWN
 from leco_plugin.scenes.input_error import InputError, one_line
@@ -60,7 +60,7 @@ def read(config: MegaNerfDataParserConfig) -> MegaNerfScene:
         raise InputError(f"there is no folder {config.masks} with masks")
     with bar("Reading the scene") as progress:
         scene = read_scene(config.data, config.check_axes, progress)
-    console().log(scene.describe())
+    note(scene.describe())
     return scene
 
 

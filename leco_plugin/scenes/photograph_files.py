@@ -17,7 +17,6 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 from PIL import ExifTags, Image, ImageOps
-from rich.markup import escape
 
 from leco_plugin.log import say
 from leco_plugin.scenes.input_error import InputError, one_line
@@ -245,7 +244,7 @@ def convert_masks(
     if grey and speak:
         say(
             f"{len(grey)} masks have greys between black and white, of which those from {HALF} on "
-            f"are seen; the first is {escape(str(grey[0]))}"
+            f"are seen; the first is {grey[0]}"
         )
     return found
 

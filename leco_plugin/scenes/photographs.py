@@ -17,7 +17,6 @@ from nerfstudio.data.dataparsers.base_dataparser import DataparserOutputs
 from nerfstudio.data.dataparsers.nerfstudio_dataparser import Nerfstudio, NerfstudioDataParserConfig
 from nerfstudio.plugins.registry_dataparser import DataParserSpecification
 from numpy.typing import NDArray
-from rich.markup import escape
 from torch import Tensor
 
 from leco_plugin.log import say
@@ -84,7 +83,7 @@ class LecoPhotographs(CheckedReader, ReadsNear, Nerfstudio):
             outputs.metadata[UP_IS_KNOWN] = True
         if "metres_per_unit" in meta:
             metres = meta["metres_per_unit"]
-            if not isinstance(metres, int | float) or not 0.0 < metres < float("inf"):
+            if type(metres) not in (int, float) or not 0.0 < metres < float("inf"):
                 raise InputError(f"{data}: metres_per_unit is {metres!r}, not a positive number")
             outputs.metadata[METRES_PER_UNIT] = applied_scale * float(metres)
         return outputs
@@ -152,7 +151,7 @@ def points_of(meta: dict[str, Any], folder: Path) -> CloudFile | None:
         return None
     path = find_file(folder / str(name))
     if not path.is_file():
-        say(f"the scene names sparse points that are not there: {escape(str(path))}")
+        say(f"the scene names sparse points that are not there: {path}")
         return None
     return read_cloud(path)
 

@@ -22,7 +22,6 @@ from nerfstudio.data.dataparsers.base_dataparser import (
     DataparserOutputs,
 )
 from PIL import UnidentifiedImageError
-from rich.markup import escape
 
 from leco_plugin.log import bar, say
 from leco_plugin.scenes.frames import check_poses
@@ -232,7 +231,7 @@ def checked(
         paths = [Path(path) for path in outputs.mask_filenames]
         outputs.mask_filenames = convert_masks(paths, images, sizes, derived, speak)
     elif speak and getattr(config, "masks_path", False) is None and (data / "masks").is_dir():
-        say(f"{escape(str(data / 'masks'))} is not used: `--masks-path masks` would")
+        say(f"{data / 'masks'} is not used: `--masks-path masks` would")
     return outputs
 
 
@@ -295,11 +294,11 @@ def _plain_pictures(
             f"{transparent[0]}: {SAVE_ALIKE}"
         )
     for what, count in converted.items() if speak else ():
-        say(f"{count} photographs {what} are converted into {escape(str(derived.folder))}")
+        say(f"{count} photographs {what} are converted into {derived.folder}")
     if as_stored and speak:
         say(
             f"{len(as_stored)} photographs are used as they are stored, though EXIF turns them: "
-            f"that is what their intrinsics are for; the first is {escape(str(as_stored[0]))}. "
+            f"that is what their intrinsics are for; the first is {as_stored[0]}. "
             "Where renders are turned, `mogrify -auto-orient` them and make the scene anew"
         )
     return paths

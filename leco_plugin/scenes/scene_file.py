@@ -13,7 +13,6 @@ from typing import Any
 
 import numpy as np
 from nerfstudio.cameras.cameras import Cameras
-from rich.markup import escape
 
 from leco_plugin.log import say
 from leco_plugin.scenes.frames import check_poses
@@ -250,7 +249,7 @@ def say_unused(meta: dict[str, Any], file: Path) -> None:
     beside = ("dynamic_mask_*", "rays_*.dat", "*.alpha.*")
     unused += [kind for kind in beside if any(folder.glob(kind))]
     if unused:
-        say(f"{escape(str(file))}: not used: {escape(', '.join(unused)[:300])}")
+        say(f"{file}: not used: {', '.join(unused)[:300]}")
 
 
 COLMAP = ("colmap/sparse/0", "sparse/0", "sparse", "colmap/sparse", "0", ".")

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import datetime
-import functools
 import json
 import math
 import sys
@@ -26,7 +25,7 @@ from leco_plugin.chart.runner import (
 )
 from leco_plugin.chart.theme import DARK, LIGHT
 from leco_plugin.evaluation.report import describe_code, describe_machine, usable_cores, write_json
-from leco_plugin.log import bar, console, resumable
+from leco_plugin.log import bar, put, resumable
 from leco_plugin.occupancy import CALIBRATED_AT
 from leco_plugin.scenes.city.folder import TRANSFORMS
 from leco_plugin.scenes.input_error import InputError
@@ -75,7 +74,6 @@ def make_table(
     seeds_beside: Sequence[int] = (),
     quick: bool = False,
     minutes: float | None = None,
-    earlier: Mapping[str, Any] | None = None,
 ) -> dict[str, Any]:
     """Makes what is missing of a table and draws it.
 
@@ -83,7 +81,6 @@ def make_table(
         cases, samplers: their names; none is all.
         seeds, seeds_beside: of each cell, and of some samplers; see `entries_of`.
         minutes: that this may take, about; None is as many as it takes.
-        earlier: results whose runs are kept where they would be made here just so.
     Returns:
         The results, as in `stability.json`.
     Raises:
@@ -92,7 +89,6 @@ def make_table(
     if minutes is not None and not 0.0 < minutes < math.inf:
         raise InputError(f"a table is made in a positive number of minutes, not {minutes}")
     chosen, compared = cases_named(tuple(cases)), samplers_named(tuple(samplers))
-    say = functools.partial(console().print, markup=False, highlight=False)
     named = {"cases": cases, "samplers": samplers, "seeds": seeds, "seeds-beside": seeds_beside}
     words = [word for name, given in named.items() if given for word in (f"--{name}", *given)]
     words = ["leco stability --out DIR", *words, *(["--quick"] if quick else [])]
@@ -100,13 +96,11 @@ def make_table(
     with alone_in(out, "table"):
         sizes = QUICK if quick else FULL
         suite = Suite(out, chosen, compared, seeds, sizes, command, seeds_beside)
-        if earlier is not None:
-            say(f"{suite.take_over(earlier)} runs of earlier results are taken over")
-        say(suite.estimate())
-        with resumable(say), bar(f"{len(chosen)} cases") as show:
-            suite.make(say, show, math.inf if minutes is None else 60.0 * minutes)
+        put(suite.estimate())
+        with resumable(), bar(f"{len(chosen)} cases") as show:
+            suite.make(put, show, math.inf if minutes is None else 60.0 * minutes)
         if left := len(suite.missing()):
-            say(f"{left} runs are left or have failed; the same command goes on with them")
+            put(f"{left} runs are left or have failed; the same command goes on with them")
         return suite.draw()
 
 
@@ -230,27 +224,6 @@ class Suite:
         folder.store(run.job, record | {"made": self.made})
         psnr = "no PSNR" if record["psnr"] is None else f"{record['psnr']:.2f} dB"
         return f"{title}: {psnr} after {record['processor_seconds']:.0f} s"
-
-    def take_over(self, results: Mapping[str, Any]) -> int:
-        """Keeps the runs of another table that would be made here just so; returns how many.
-
-        They are of the same sizes and scenes, and of the same version of this package.
-        """
-        if results["sizes"] != asdict(self.sizes):
-            return 0
-        found = {
-            (row["scene"]["name"], run["name"]): run
-            for row in results["cases"]
-            if self.digests.get(row["scene"]["name"]) == row["scene"]["digest"]
-            for cell in row["cells"].values()
-            for run in cell["runs"]
-            if run["made"]["version"] == self.made["version"]
-        }
-        new = found.keys() - self.stored().keys()
-        runs = [run for run in runs_of(self.entries) if run.key in new]
-        for run in runs:
-            self.folders[run.scene].store(run.job, found[run.key])
-        return len(runs)
 
     def results(self) -> dict[str, Any]:
         """The table, as in `stability.json`: every cell with its verdict and its runs' figures."""

@@ -188,11 +188,16 @@ class TrainerRun:
 
     def __init__(self, trainer: Any) -> None:
         self.trainer = trainer
-        self.start, self.end = int(trainer._start_step), float(end_of(trainer))
+        self.start = int(trainer._start_step)
         self.folder = Path(trainer.base_dir) if is_first() else None
         config = trainer.config
         resumed = config.load_checkpoint or config.load_dir
         self.resumed_from = None if resumed is None else Path(resumed)
+
+    @property
+    def end(self) -> float:
+        """Of the trainer's config as it is now: a run of fixed time knows it only on the way."""
+        return float(end_of(self.trainer))
 
     def optimizers(self) -> list[Optimizer]:
         """Those of all parameter groups."""

@@ -29,7 +29,6 @@ import rich
 from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackLocation
 from nerfstudio.utils.rich_utils import CONSOLE
 from rich.console import Console
-from rich.markup import escape
 from torch import Tensor, nn
 
 from leco_plugin.evaluation.held_out_psnr import OF, HeldOutPsnr
@@ -137,7 +136,7 @@ class RunProgress:
         trainer.callbacks.append(TrainingCallback([where.AFTER_TRAIN_ITERATION], self.after_step))
         trainer.callbacks.append(TrainingCallback([where.AFTER_TRAIN], self.finish))
         folder, viewer = trainer.base_dir, trainer.viewer_state
-        say(f"run: {escape(str(folder))}" + (f", details in {LOG}" if on_screen() else ""))
+        say(f"run: {folder}" + (f", details in {LOG}" if on_screen() else ""))
         say_all(getattr(viewer, "viewer_info", None) or ())
 
     def __enter__(self) -> RunProgress:
@@ -183,13 +182,13 @@ class RunProgress:
             say_all(doubted)
             if tested is not None and occupancy.exists():
                 note_failure(occupancy, tested, self.psnr.of_one_colour)
-        say(f"  run        {escape(str(folder))}")
+        say(f"  run        {folder}")
         if occupancy.exists():
-            say(f"  occupancy  {escape(str(occupancy))}, {occupancy.stat().st_size / 1e3:.0f} kB")
+            say(f"  occupancy  {occupancy}, {occupancy.stat().st_size / 1e3:.0f} kB")
         say("next:")
         tested = bool(self.trainer.pipeline.datamanager.eval_dataset)
         for command in next_commands(folder, occupancy.exists(), tested):
-            say(f"  {escape(command)}")
+            say(f"  {command}")
 
 
 def note_failure(path: Path, field: float, one_colour: float) -> None:

@@ -8,7 +8,7 @@ import pytest
 from chart_results import occupancy, results, run
 from PIL import Image
 
-from leco_plugin.chart.findings.learned import learned_headline, learned_of, level_with
+from leco_plugin.chart.findings.learned import learned_headline, learned_of, words_of
 from leco_plugin.chart.findings.summary import lines_of
 from leco_plugin.chart.panels import finding_of
 from leco_plugin.chart.picture import draw
@@ -99,7 +99,7 @@ def test_those_that_seeds_do_not_tell_apart_in_both_are_level() -> None:
     more = keeping("more", (0.055, 25.0), (0.07, 25.0), (0.08, 25.0))
     wide = keeping("wide", (0.25, 20.5), (0.3, 20.5), (0.35, 20.5))
     learned = learned_of(lines_of(results(*OURS, *near, *more, *wide, *skipping("never", 0.5))))
-    assert [one.name for one in level_with(learned[0], learned)] == ["near"]
+    assert [one.name for one in learned[1:] if words_of(learned[0], one) == {"level"}] == ["near"]
 
 
 def test_a_gate_that_was_frozen_with_the_last_step_has_guided_nothing() -> None:

@@ -9,6 +9,7 @@ import pytest
 import torch
 from torch import Tensor
 
+from leco_plugin.evaluation import field_grids
 from leco_plugin.evaluation.field_grids import (
     FieldGrids,
     cells_to_ask,
@@ -79,8 +80,11 @@ def test_a_known_surface_is_never_missed_by_a_coarse_cell() -> None:
     assert float(fill_cells(film, BOX, cells_to_ask((8, 8, 8))).sum()) == 0.0
 
 
-def test_memory_is_looked_at_before_a_grid_is_filled() -> None:
+def test_memory_is_looked_at_before_a_grid_is_filled(monkeypatch: pytest.MonkeyPatch) -> None:
     assert fits_memory(8**3) and not fits_memory(1 << 45)
+    for free, fits in ((None, True), (2 * field_grids.BYTES_A_CELL * 1000, False), (1 << 40, True)):
+        monkeypatch.setattr(field_grids, "free_memory", lambda free=free: free)
+        assert fits_memory(1000) is fits
 
 
 def slow_refined(coarse: Tensor, floor: float, density: Tensor) -> Tensor:

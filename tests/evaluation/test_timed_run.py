@@ -245,6 +245,7 @@ class Run:
         monkeypatch.setattr(module, "errors_on_rays", self.look)
         where = TrainingCallbackLocation
         self.trainer: Any = SimpleNamespace(
+            config=SimpleNamespace(max_num_iterations=module.ENDLESS),
             pipeline=SimpleNamespace(model=model),
             optimizers=SimpleNamespace(optimizers={}),
             callbacks=[
@@ -318,6 +319,25 @@ def test_a_step_is_timed_once_there_is_an_occupancy(
     run.ends = freeze
     record = run.record()
     assert (record.freeze_seconds, record.step_seconds, record.steps) == (36.0, 1.0, 7)
+
+
+def test_a_model_that_learns_itself_knows_how_many_steps_are_left_of_its_time(
+    time: Time, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    model = nn.Module()
+    model.mixture = nn.Module()
+    model.mixture.field, model.mixture.frozen = Fog(), False
+    run = Run(time, model, [9.0, 9.0, 9.0, 2.0, 4.0, 4.0, 3.0], monkeypatch)
+    ends = []
+
+    def freeze(step: int) -> None:
+        ends.append(run.trainer.config.max_num_iterations)
+        model.mixture.frozen = step >= 2
+
+    run.ends = freeze
+    assert run.record().steps == 7
+    # nothing is known before the fourth step, which leaves 11 s for steps of 2 s each
+    assert ends == [module.ENDLESS] * 4 + [4 + 6, 5 + 3, 6 + 1]
 
 
 def test_updates_of_a_grid_are_its_learning_time(

@@ -20,7 +20,7 @@ from leco_plugin.learning.sharpening import (
     Sharpened,
     SharpeningConfig,
     lesson_by,
-    seen_rendering,
+    seen_reference,
     sharpen,
 )
 from leco_plugin.models.encodings import EncodingConfig
@@ -117,7 +117,7 @@ def test_what_is_not_seen_has_no_weight_and_is_a_candidate_still() -> None:
     mixture.gate.walls = 0.5  # type: ignore[assignment]
     rays, truth = some_rays(mixture, 10), torch.ones(10, 3)
     dense = dense_rendering(mixture, rays, truth, 10).references[0]
-    seen = seen_rendering(mixture, rays, truth, 10).references[0]
+    seen = seen_reference(mixture, rays)
     assert len(seen.weights) == len(dense.weights)
     below = seen.occupancies < 0.5
     assert not seen.weights[below & ~seen.always_kept].any() and dense.weights[below].any()
@@ -197,6 +197,7 @@ def test_it_is_sharpened_at_the_end_of_a_run_that_pays_for_it(
     assert mixture.small is None
     learner.after_step(last, 0.1, 5.0)
     assert (mixture.small is not None) == sharpened
+    assert learner.progress.sharpened_at == (last if sharpened else -1)
     if not sharpened:
         return
     file = Occupancy.load(tmp_path / "occupancy.safetensors")
@@ -207,6 +208,18 @@ def test_it_is_sharpened_at_the_end_of_a_run_that_pays_for_it(
     assert report["learned"]["empty_fraction"] == 0.6 and report["learned"]["params"] == 7
     assert report["sharpened"][0][0] == last
     assert as_learned(file).gate.config == SMALLEST.gate and as_learned(file).threshold == 0.5
+
+
+def test_a_tenth_of_a_run_is_trained_with_the_small_gate(monkeypatch: pytest.MonkeyPatch) -> None:
+    mixture, run = a_mixture(), ARun(end=200)
+    options = SharpeningConfig(steps=5, least_steps=10, rays=50, gate=GATE)
+    pixels = Pixels(mixture)
+    learner = small_learner(run, mixture, pixels, sharpening=options, calibration=NEVER_AGAIN)
+    asked: list[int] = []
+    monkeypatch.setattr(learner.held_out, "sharpened", lambda *_: asked.append(step))
+    for step in range(170, 200):  # a gate that skips no more is not taught again and again
+        learner.after_step(step, 0.1, 5.0)
+    assert asked == [179, 189, 199], "least_steps apart"
 
 
 NEVER_AGAIN = CalibrationConfig(recheck_rays=0)
@@ -224,9 +237,10 @@ def test_a_gate_that_learns_again_at_the_last_step_is_not_sharpened() -> None:
 def test_steps_that_pay_are_counted_from_the_last_time() -> None:
     mixture = a_mixture()
     options = SharpeningConfig(steps=5, least_steps=20, rays=50, gate=GATE)
-    mixture.report["sharpened"] = [[15, 1.0]]
-    end_a_run(mixture, options)
-    assert mixture.small is None and len(mixture.report["sharpened"]) == 1
+    learner = small_learner(ARun(end=31), mixture, Pixels(mixture), sharpening=options)
+    learner.progress.sharpened_at = 15
+    learner.after_step(30, 0.1, 5.0)
+    assert mixture.small is None
 
 
 def test_a_gate_of_a_kind_that_was_asked_for_stays() -> None:

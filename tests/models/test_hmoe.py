@@ -8,8 +8,9 @@ from collections.abc import Callable
 
 import pytest
 import torch
+from dense_hmoe import dense_hmoe
 
-from leco_plugin.models.hmoe import Expert, HMoE, HMoEConfig, dense_hmoe
+from leco_plugin.models.hmoe import Expert, HMoE, HMoEConfig
 
 
 def mixture(**sizes) -> HMoE:

@@ -28,7 +28,6 @@ from leco_plugin.scenes.data_manager import (
     LecoDataManager,
     LecoDataManagerConfig,
     decoded_bytes,
-    free_memory,
 )
 from leco_plugin.scenes.learning_data import held_out_bundle
 from leco_plugin.scenes.photographs import LecoPhotographsDataParserConfig
@@ -132,20 +131,6 @@ def test_a_sampler_that_needs_images_in_memory_is_named(tiny_scene: Path, tmp_pa
     config = on_disk(tiny_scene, tmp_path, pixel_sampler=PixelSamplerConfig())
     with refused("pixel sampler"):
         config.setup(device="cpu")
-
-
-def test_free_memory_is_the_smaller_of_machine_and_container(tmp_path: Path) -> None:
-    machine = tmp_path / "meminfo"
-    machine.write_text("MemTotal: 900 kB\nMemAvailable: 500 kB\n")
-    assert free_memory(machine, tmp_path) == 500 * 1024
-    (tmp_path / "memory.max").write_text("100000\n")
-    (tmp_path / "memory.current").write_text("40000\n")
-    assert free_memory(machine, tmp_path) == 60000
-    (tmp_path / "memory.stat").write_text("anon 9\nactive_file 5000\ninactive_file 20000\n")
-    assert free_memory(machine, tmp_path) == 85000  # of the cache, the system makes room
-    (tmp_path / "memory.max").write_text("max\n")
-    assert free_memory(machine, tmp_path) == 500 * 1024
-    assert free_memory(tmp_path / "none", tmp_path / "none") is None
 
 
 class PlainManager:

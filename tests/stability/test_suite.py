@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import copy
 import json
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import pytest
 from stability_runs import TINY, Runs, make, suite
@@ -78,31 +76,6 @@ def test_a_failure_stands_until_the_run_is_made(tmp_path: Path) -> None:
     assert tried == {"grid-128"} and len(longer.missing()) == 5  # what has failed comes last
     cells = make(later, Runs())["cases"][0]["cells"]
     assert cells["grid-128"]["verdict"] == "pass" and not later.failures()
-
-
-def test_runs_of_another_table_are_taken_over_where_they_are_of_the_same_settings(
-    tmp_path: Path,
-) -> None:
-    there = make(suite(tmp_path / "there", ("yard", "glass"), SAMPLERS), Runs({"dense": 25.2}))
-    here = suite(tmp_path / "here", ("yard", "glass", "fog"), SAMPLERS)
-    assert here.take_over(there) == 6 and here.take_over(there) == 0
-    later = Runs()
-    whole = make(here, later)
-    assert {scene for scene, _, _ in later.made} == {"fog"}
-    assert whole["cases"][:2] == there["cases"]
-
-    assert suite(tmp_path / "other", ("yard",), SAMPLERS).take_over(_another("sizes", there)) == 0
-    assert suite(tmp_path / "other", ("yard",), SAMPLERS).take_over(_another("scene", there)) == 0
-
-
-def _another(what: str, results: dict[str, Any]) -> dict[str, Any]:
-    """The same results, of other sizes or scenes."""
-    changed = copy.deepcopy(results)
-    if what == "sizes":
-        changed["sizes"]["steps"] += 1
-    for row in changed["cases"] if what == "scene" else ():
-        row["scene"]["digest"] = "another"
-    return changed
 
 
 def test_a_run_that_renders_no_number_fails_and_the_others_go_on(tmp_path: Path) -> None:

@@ -139,15 +139,6 @@ def ours_of(learned: Sequence[Learned]) -> Learned | None:
     return next((one for one in learned if OURS in one.name), None)
 
 
-def level_with(one: Learned, others: Sequence[Learned]) -> list[Learned]:
-    """Those that are level with one in the space that they keep and in PSNR."""
-    return [
-        other
-        for other in others
-        if other is not one and other.is_measured and words_of(one, other) == {"level"}
-    ]
-
-
 def _figures(one: Learned) -> str:
     return f"{percent(one.kept)} of the space at {one.psnr:.1f} dB"
 

@@ -1,14 +1,19 @@
-"""The fastest precision and memory settings of a device."""
+"""A device: its fastest precision, its memory, and how freed memory is kept."""
 
 from __future__ import annotations
 
 import ctypes
+import os
 import sys
+from pathlib import Path
 
 import torch
 
 from leco_plugin.models.compute.native import has_native
 from leco_plugin.occupancy import Precision
+
+GROUP = Path("/sys/fs/cgroup")
+"""Where a container's limits stand."""
 
 
 def fast_precision(device: torch.device | str) -> Precision:
@@ -52,3 +57,47 @@ def keep_freed_memory(device: torch.device | str = "cpu") -> None:
     mallopt(m_mmap_threshold, 1 << 30)
     mallopt(m_trim_threshold, (1 << 31) - 1)
     mallopt(m_arena_max, 1)
+
+
+def memory_of(device: torch.device | str, group: Path = GROUP) -> int | None:
+    """Total bytes of a device's memory, used or free; on a CPU within a container's limit.
+
+    None where it is not known.
+    """
+    device = torch.device(device)
+    if device.type == "cuda":
+        return int(torch.cuda.get_device_properties(device).total_memory)
+    if device.type != "cpu":
+        return None
+    memory = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
+    try:
+        return min(memory, int((group / "memory.max").read_text()))
+    except (OSError, ValueError):  # no container, or one without a limit
+        return memory
+
+
+def free_memory(meminfo: Path = Path("/proc/meminfo"), group: Path = GROUP) -> int | None:
+    """Bytes that this process may still take, a container's limit included; None if unknown."""
+    limits = []
+    try:
+        fields = (line.split() for line in meminfo.read_text().splitlines())
+        limits += [int(field[1]) * 1024 for field in fields if field[:1] == ["MemAvailable:"]]
+    except OSError:
+        pass
+    try:
+        most = (group / "memory.max").read_text().strip()
+        if most != "max":
+            taken = int((group / "memory.current").read_text()) - _given_back(group)
+            limits.append(int(most) - taken)
+    except (OSError, ValueError):
+        pass
+    return min(limits) if limits else None
+
+
+def _given_back(group: Path) -> int:
+    """Bytes that a container has in the cache of files, and the system takes back when asked."""
+    try:
+        fields = (line.split() for line in (group / "memory.stat").read_text().splitlines())
+        return sum(int(value) for name, value in fields if name in ("active_file", "inactive_file"))
+    except (OSError, ValueError):
+        return 0

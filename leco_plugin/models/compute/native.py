@@ -15,8 +15,8 @@ import shlex
 import shutil
 import subprocess
 import tempfile
-import threading
 from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -310,13 +310,9 @@ def in_threads(
         for part in left:
             work(*part)
 
-    others = [threading.Thread(target=take) for _ in range(threads - 1)]
-    started = []
-    try:
-        for other in others:
-            other.start()
-            started.append(other)
+    # leaving waits for all: nothing is freed that a thread still writes
+    with ThreadPoolExecutor(threads) as pool:
+        others = [pool.submit(take) for _ in range(threads - 1)]
         take()
-    finally:  # nothing is freed that a thread still writes
-        for other in started:
-            other.join()
+    for other in others:
+        other.result()

@@ -14,6 +14,7 @@ from typing import Any
 import torch
 
 from leco_plugin.log import summarize
+from leco_plugin.models.compute.device import memory_of
 from leco_plugin.models.encodings import EncodingConfig
 from leco_plugin.models.gate import GateConfig
 from leco_plugin.models.sizing.sizes import (
@@ -21,7 +22,6 @@ from leco_plugin.models.sizing.sizes import (
     check,
     check_memory,
     left_open,
-    memory_of,
     size_at,
     sizes_for,
     state_bytes,

@@ -289,22 +289,3 @@ def _check_field(sizes: Sizes) -> None:
                 f"{encoding.levels} levels of 2^{encoding.log2_table} entries are more than rows "
                 f"can be numbered: lower {CLI}.field.encoding.log2-table"
             )
-
-
-def memory_of(device: torch.device | str, group: Path = Path("/sys/fs/cgroup")) -> int | None:
-    """Total bytes of a device's memory, used or free; on a CPU within a container's limit.
-
-    None where it is not known.
-    """
-    device = torch.device(device)
-    if device.type == "cuda":
-        return int(torch.cuda.get_device_properties(device).total_memory)
-    if device.type != "cpu":
-        return None
-    import psutil  # absent where only the GPU suite runs
-
-    memory = int(psutil.virtual_memory().total)
-    try:
-        return min(memory, int((group / "memory.max").read_text()))
-    except (OSError, ValueError):  # no container, or one without a limit
-        return memory

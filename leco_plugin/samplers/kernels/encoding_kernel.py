@@ -1,6 +1,6 @@
 """Encodings of mapped positions as the fused gate forms them.
 
-The torch twins are in `models/encodings.py` and `models/planes.py`.
+The torch twins are in `models/encodings.py`.
 
 A tile holds a feature of a position at each place, [ROWS, COLUMNS]; columns beyond the features
 are padding, which the rows of the first matrix beyond them, all zero, leave without effect.

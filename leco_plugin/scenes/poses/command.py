@@ -68,7 +68,7 @@ def make_scene(
     if finished := _finished(out, asked):
         print(f"{out} already holds this scene: nothing is done")
         return finished
-    with alone_in(out, "scene"), resumable(print):
+    with alone_in(out, "scene"), resumable():
         _begin(out, asked)
         _require_disk(out, found.photographs)
         with bar("copying photographs") as show:

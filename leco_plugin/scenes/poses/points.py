@@ -183,7 +183,7 @@ def _copies(
             copy.save(folder / name, compress_level=1)
             if seen is not None:
                 masks.mkdir(exist_ok=True)
-                seen.resize(copy.size).save(masks / f"{name}.png")
+                seen.resize(copy.size, Image.Resampling.NEAREST).save(masks / f"{name}.png")
             camera = camera_of(lens, full, copy.size, str(path))
             lens_name = str(sorted(camera.todict().items(), key=str))  # shared by equal ones
             header = header_of(folder / name)

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import pytest
 import torch
+from dense_hmoe import dense_hmoe
 from waits import Waits
 
 from leco_plugin.models.compute.grouped import grouped_dispatch, may_group
-from leco_plugin.models.hmoe import Expert, HMoE, HMoEConfig, dense_hmoe
+from leco_plugin.models.hmoe import Expert, HMoE, HMoEConfig
 
 pytestmark = pytest.mark.skipif(
     not hasattr(torch.nn.functional, "grouped_mm"), reason="this torch has no grouped_mm"
