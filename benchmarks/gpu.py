@@ -32,8 +32,8 @@ from leco_plugin.evaluation.report import (
     describe_code,
     describe_machine,
     digest_of_sources,
-    write_json,
 )
+from leco_plugin.scenes.whole_files import write_json
 
 ROOT = Path(__file__).resolve().parent.parent
 RESULTS = ROOT / "benchmarks" / "results"

@@ -30,9 +30,10 @@ from typing import Any
 import checkout  # noqa: F401
 import psutil
 
-from leco_plugin.evaluation.report import describe_machine, write_json
+from leco_plugin.evaluation.report import describe_machine
 from leco_plugin.occupancy import Occupancy
 from leco_plugin.scenes.input_error import InputError
+from leco_plugin.scenes.whole_files import write_json
 from leco_plugin.studio.checkpoints import (
     allow_checkpoint_globals,
     newest_whole,

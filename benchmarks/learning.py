@@ -19,9 +19,10 @@ import checkout  # noqa: F401
 from leco_plugin.chart.theme import LIGHT, SOURCE, Theme, fingerprint, plain, themed
 from leco_plugin.cli_reports import occupancy_of
 from leco_plugin.evaluation.history_picture import OPAQUE
-from leco_plugin.evaluation.report import describe_machine, write_json
+from leco_plugin.evaluation.report import describe_machine
 from leco_plugin.learning.history import FILE_NAME, GateHistory, as_learned
 from leco_plugin.occupancy import Occupancy
+from leco_plugin.scenes.whole_files import write_json
 
 OUT = Path(__file__).resolve().parent / "results" / "learning.json"
 LATE = 0.5

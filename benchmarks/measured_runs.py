@@ -15,8 +15,8 @@ from leco_plugin.evaluation.report import (
     describe_machine,
     made_by,
     read_object,
-    write_json,
 )
+from leco_plugin.scenes.whole_files import write_json
 
 
 @dataclass

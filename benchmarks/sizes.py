@@ -22,7 +22,7 @@ import tyro
 from sizes_figures import AUTOMATIC, bars, verdict
 
 from leco_plugin.evaluation.clock import Budget
-from leco_plugin.evaluation.report import describe_code, describe_machine, made_by, write_json
+from leco_plugin.evaluation.report import describe_code, describe_machine, made_by
 from leco_plugin.evaluation.timed_run import timed_run
 from leco_plugin.method_configs import best_device, leco_occupancy
 from leco_plugin.models.sizing.scene_sizes import complete
@@ -40,6 +40,7 @@ from leco_plugin.scenes.city.cameras import CaptureConfig
 from leco_plugin.scenes.city.city import CityConfig
 from leco_plugin.scenes.city.folder import write_city
 from leco_plugin.scenes.survey import CAMERAS, detail_of, points_in
+from leco_plugin.scenes.whole_files import write_json
 
 DEVICE = "the device's"
 FEWEST = 40

@@ -72,6 +72,6 @@ def check_picture(option: str, path: Path | None, moving: bool = False) -> None:
 def write_json(path: Path | None, value: Any) -> None:
     """Writes a report where one was asked for."""
     if path is not None:
-        from leco_plugin.evaluation.report import write_json as write
+        from leco_plugin.scenes.whole_files import write_json as write
 
         write(path, value)

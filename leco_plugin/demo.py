@@ -21,7 +21,7 @@ from leco_plugin.evaluation.clock import Budget
 from leco_plugin.evaluation.equal_loss import occupancy_facts, truth_of
 from leco_plugin.evaluation.inspection import ViewBox
 from leco_plugin.evaluation.occupancy_picture import draw_slice
-from leco_plugin.evaluation.report import describe_code, describe_machine, write_json
+from leco_plugin.evaluation.report import describe_code, describe_machine
 from leco_plugin.evaluation.timed_run import timed_run
 from leco_plugin.learning.freezing import FILE_NAME
 from leco_plugin.log import bar
@@ -29,6 +29,7 @@ from leco_plugin.method_configs import leco_occupancy
 from leco_plugin.occupancy import Occupancy
 from leco_plugin.scenes.city.city import CityConfig
 from leco_plugin.scenes.city.folder import CaptureConfig, CityTruth, write_city
+from leco_plugin.scenes.whole_files import write_json
 from leco_plugin.studio.host_models import true_colours
 
 SECONDS = 130.0

@@ -39,7 +39,7 @@ from leco_plugin.scenes.frames import inverse, moved
 from leco_plugin.scenes.input_error import InputError
 from leco_plugin.scenes.photograph_files import find_file
 from leco_plugin.scenes.scene_file import load_json
-from leco_plugin.scenes.whole_files import write_points, write_whole
+from leco_plugin.scenes.whole_files import write_json, write_points, write_whole
 
 CELLS = 128
 """Along each side of a cube."""
@@ -250,8 +250,7 @@ def write_splat_init(
     rows["xyz"], rows["rgb"] = places, colours
     write_points(points, rows, comments_of(description))
     copy = _from_elsewhere(meta, description.parent, out.parent)
-    text = json.dumps(copy | {"ply_file_path": points.name}, indent=1).encode()
-    write_whole(out, lambda file: file.write(text))
+    write_json(out, copy | {"ply_file_path": points.name}, indent=1)
     return {"points": len(places), "sparse_points": sparse, "photograph_colours": known is not None}
 
 

@@ -40,7 +40,6 @@ from leco_plugin.evaluation.report import (
     describe_machine,
     made_by,
     read_object,
-    write_json,
 )
 from leco_plugin.learning.sharpening import Lesson, lesson_by, teach
 from leco_plugin.log import bar, put
@@ -51,7 +50,7 @@ from leco_plugin.models.objective import GateLossConfig
 from leco_plugin.occupancy import Precision, gate_precision
 from leco_plugin.scenes.input_error import InputError, one_line, require_folder
 from leco_plugin.scenes.photographs import describe_scene
-from leco_plugin.scenes.whole_files import write_whole
+from leco_plugin.scenes.whole_files import write_json, write_whole
 
 FIELD = "field.pt"
 RAYS, TAUGHT_RAYS = 8192, 1 << 15

@@ -32,9 +32,10 @@ from leco_plugin.chart.runner import (
     stored_in,
 )
 from leco_plugin.chart.table import table
-from leco_plugin.evaluation.report import describe_code, describe_machine, write_json
+from leco_plugin.evaluation.report import describe_code, describe_machine
 from leco_plugin.scenes.input_error import InputError
 from leco_plugin.scenes.photographs import describe_held_out, describe_scene
+from leco_plugin.scenes.whole_files import write_json
 
 Say = Callable[[str], None]
 

@@ -21,9 +21,10 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any, Protocol
 
-from leco_plugin.evaluation.report import read_object, write_json
+from leco_plugin.evaluation.report import read_object
 from leco_plugin.scenes.input_error import InputError, one_line
 from leco_plugin.scenes.locks import LOCK, alone_in
+from leco_plugin.scenes.whole_files import write_json
 
 SETTINGS, RESULTS = "settings.json", "results.json"
 RUNS, UNFINISHED, LOGS = "runs", "unfinished", "logs"

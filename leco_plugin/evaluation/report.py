@@ -13,15 +13,8 @@ from pathlib import Path
 from typing import Any
 
 from leco_plugin.scenes.input_error import InputError
-from leco_plugin.scenes.whole_files import write_whole
 
 PACKAGE = Path(__file__).resolve().parents[1]
-
-
-def write_json(path: Path, value: Any) -> None:
-    """Writes JSON whole or not at all; parents are made. NaN and infinity raise `ValueError`."""
-    text = json.dumps(value, indent=2, allow_nan=False) + "\n"
-    write_whole(path, lambda file: file.write(text.encode()))
 
 
 def read_object(file: Path, else_say: str) -> dict[str, Any]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import threading
 from collections.abc import Callable, Sequence
@@ -26,6 +27,12 @@ def write_whole(path: Path, write: Callable[[BinaryIO], object]) -> None:
         part.replace(path)
     finally:
         part.unlink(missing_ok=True)
+
+
+def write_json(path: Path, value: Any, indent: int = 2) -> None:
+    """Writes JSON whole or not at all; parents are made. NaN and infinity raise `ValueError`."""
+    text = json.dumps(value, indent=indent, allow_nan=False) + "\n"
+    write_whole(path, lambda file: file.write(text.encode()))
 
 
 def remove_parts(folder: Path) -> None:

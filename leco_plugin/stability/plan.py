@@ -11,6 +11,7 @@ from collections import defaultdict
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import zip_longest
+from statistics import fmean
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from leco_plugin.chart.contender import Contender, Job
@@ -144,26 +145,8 @@ def contender_of(
     return Contender(sampler.title, host, name, changes, settings={RAYS: sizes.rays, **settings})
 
 
-START_SECONDS = 14.0
-"""For a process to start, to read the scene and to build the host."""
-RAY_SECONDS: Mapping[str, float] = {
-    LEARNED: 1.8e-4,
-    GRID: 5.1e-4,
-    PROPOSALS: 8.2e-4,
-    DENSE: 13.0e-4,
-    DENSE_PROPOSAL: 11.2e-4,
-}
-"""Of training, a ray of a step, where steps have two hundred."""
-STEP_SECONDS = 0.042
-"""Of a step of a guided host, however few its rays are; in the above for those that skip least."""
-RENDERED, RENDERING = 18_500, 0.45
-"""Rays that are looked at after a run in full sizes, each for this share of a ray of training."""
-LEARNED_RAY_SECONDS, FREEZE_SECONDS = 3.0e-4, 5.0
-"""A ray of a step of learning; to calibrate a gate and to build its cell cache."""
-FIRST_CELL_SECONDS, CELL_SECONDS = 1.2e-5, 3.3e-6
-"""To ask the field about a cell of an occupancy grid for the first time, and later."""
-STEPS_PER_UPDATE, FULL_UPDATES, LATER_SHARE = 16, 16, 0.3
-"""An occupancy grid asks about every cell so many times, then about so large a share of them."""
+A_RUN = 60.0
+"""Seconds of a run, as long as none was made."""
 
 
 Key = tuple[str, str]
@@ -253,37 +236,11 @@ def capture_of(case: Case, sizes: Sizes) -> Capture:
     )
 
 
-def core_seconds(runs: Sequence[Run], stored: Sequence[Mapping[str, Any]], sizes: Sizes) -> float:
-    """What runs to be made take of one core, seconds: as long as stored ones of their samplers."""
+def core_seconds(runs: Sequence[Run], stored: Sequence[Mapping[str, Any]]) -> float:
+    """What runs to be made take of one core, seconds: as long as stored ones of their samplers,
+    else as any that is stored."""
     measured: defaultdict[str, list[float]] = defaultdict(list)
     for record in stored:
         measured[record["sampler"]].append(float(record["processor_seconds"]))
-    means = {name: sum(seconds) / len(seconds) for name, seconds in measured.items()}
-    return sum(means.get(run.job.contender.sampler) or expected_seconds(run, sizes) for run in runs)
-
-
-def expected_seconds(run: Run, sizes: Sizes) -> float:
-    """What a run takes before any like it was made."""
-    contender = run.job.contender
-    kind = GRID if contender.sampler.startswith(f"{GRID}-") else contender.sampler
-    rays = sizes.steps * contender.settings[RAYS] + RENDERED * sizes.picture**2 * RENDERING
-    seconds = START_SECONDS + rays * RAY_SECONDS[kind]
-    if kind == LEARNED:
-        learning = contender.changes["occupancy.rays"] * sizes.learn_steps
-        seconds += FREEZE_SECONDS + learning * LEARNED_RAY_SECONDS + sizes.steps * STEP_SECONDS
-    if kind == GRID:
-        options = contender.changes["occupancy.options"]
-        cells = options["levels"] * options["resolution"] ** 3
-        updates = -(-sizes.steps // STEPS_PER_UPDATE)
-        full = min(updates, FULL_UPDATES)
-        again = full - 1 + LATER_SHARE * (updates - full)
-        seconds += cells * (FIRST_CELL_SECONDS + again * CELL_SECONDS)
-    return float(seconds)
-
-
-def in_words(seconds: float) -> str:
-    """A time for people."""
-    minutes = seconds / 60.0
-    if minutes < 2.0:
-        return f"{seconds:.0f} s"
-    return f"{minutes:.0f} minutes" if minutes < 120.0 else f"{minutes / 60.0:.1f} hours"
+    every = [seconds for some in measured.values() for seconds in some] or [A_RUN]
+    return sum(fmean(measured.get(run.job.contender.sampler, every)) for run in runs)

@@ -24,13 +24,14 @@ from leco_plugin.chart.runner import (
     take_folder,
 )
 from leco_plugin.chart.theme import DARK, LIGHT
-from leco_plugin.evaluation.report import describe_code, describe_machine, usable_cores, write_json
-from leco_plugin.log import bar, put, resumable
+from leco_plugin.evaluation.report import describe_code, describe_machine, usable_cores
+from leco_plugin.log import bar, put, resumable, spell
 from leco_plugin.occupancy import CALIBRATED_AT
 from leco_plugin.scenes.city.folder import TRANSFORMS
 from leco_plugin.scenes.input_error import InputError
 from leco_plugin.scenes.locks import alone_in
 from leco_plugin.scenes.photographs import describe_scene
+from leco_plugin.scenes.whole_files import write_json
 from leco_plugin.stability.cases import Case, cases_named
 from leco_plugin.stability.photographs import digest_of, write_scene
 from leco_plugin.stability.plan import (
@@ -43,7 +44,6 @@ from leco_plugin.stability.plan import (
     Sizes,
     core_seconds,
     entries_of,
-    in_words,
     runs_of,
     samplers_named,
     scenes_of,
@@ -182,10 +182,10 @@ class Suite:
     def estimate(self) -> str:
         """How long what is missing takes, in words."""
         todo, stored = self.missing(), list(self.stored().values())
-        seconds = core_seconds(todo, stored, self.sizes) / self.workers
+        seconds = core_seconds(todo, stored) / self.workers
         return (
             f"{len(todo)} of {len(runs_of(self.entries))} runs are to be made, {self.workers} at a "
-            f"time: about {in_words(seconds)}"
+            f"time: about {spell(seconds)}"
         )
 
     def make(self, say: Say, show: Callable[[float], None], seconds: float = math.inf) -> None:
@@ -198,7 +198,7 @@ class Suite:
         ends = time.monotonic() + seconds
 
         def is_in_time(run: Run) -> bool:
-            expected = core_seconds([run], stored, self.sizes)
+            expected = core_seconds([run], stored)
             return run in todo[: self.workers] or time.monotonic() + expected <= ends
 
         def note(line: str) -> None:

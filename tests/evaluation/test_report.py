@@ -9,7 +9,8 @@ from pathlib import Path
 
 import pytest
 
-from leco_plugin.evaluation.report import describe_code, describe_machine, made_by, write_json
+from leco_plugin.evaluation.report import describe_code, describe_machine, made_by
+from leco_plugin.scenes.whole_files import write_json
 
 
 def test_the_machine_is_described_without_its_name() -> None:

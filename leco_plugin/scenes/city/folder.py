@@ -47,7 +47,7 @@ from leco_plugin.scenes.mega_nerf_files import (
     write_mappings,
     write_view,
 )
-from leco_plugin.scenes.whole_files import remove_parts, write_points, write_whole
+from leco_plugin.scenes.whole_files import remove_parts, write_json, write_points, write_whole
 
 Image8 = NDArray[np.uint8]
 LayoutName = Literal["nerfstudio", "mega-nerf"]
@@ -95,8 +95,7 @@ class NerfstudioLayout(Layout):
 
     def finish(self, folder: Path) -> None:
         write_points(folder / POINTS, self._points(folder))
-        transforms = json.dumps(self._transforms(), indent=1) + "\n"
-        write_whole(folder / TRANSFORMS, lambda f: f.write(transforms.encode()))
+        write_json(folder / TRANSFORMS, self._transforms(), indent=1)
 
     def _transforms(self) -> dict[str, Any]:
         frames: list[dict[str, Any]] = []

@@ -36,7 +36,7 @@ from leco_plugin.scenes.poses.reconstruction import (
     choose_pairs,
     load_pycolmap,
 )
-from leco_plugin.scenes.whole_files import remove_parts, write_whole
+from leco_plugin.scenes.whole_files import remove_parts, write_json
 
 REPORT = "poses.json"
 """In the folder of the scene: what came of what was asked for."""
@@ -151,7 +151,7 @@ def _begin(out: Path, asked: dict[str, Any]) -> None:
             (out / "transforms.json").replace(out / BEFORE)
         shutil.rmtree(out / "images", ignore_errors=True)
         shutil.rmtree(out / MODELS, ignore_errors=True)
-    write_whole(out / ASKED, lambda file: file.write(json.dumps(asked).encode()))
+    write_json(out / ASKED, asked)
     remove_parts(out)
 
 

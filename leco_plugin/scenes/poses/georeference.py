@@ -5,7 +5,6 @@ A placed model is written as transforms.json, sparse points and COLMAP's own fil
 
 from __future__ import annotations
 
-import json
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -17,7 +16,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from leco_plugin.scenes.frames import turn_to_upright
-from leco_plugin.scenes.whole_files import write_points, write_whole
+from leco_plugin.scenes.whole_files import write_json, write_points
 
 Array = NDArray[np.float64]
 TOLERANCE, TOLERATED = 10.0, 0.1
@@ -235,8 +234,7 @@ def write_scene(
     model.write(folder)
     write_sparse_points(scene / POINTS, *points_of(model))
     for name, said in ((report_name, report), ("transforms.json", meta)):
-        text = json.dumps(said, indent=1).encode()
-        write_whole(scene / name, lambda file, text=text: file.write(text))  # type: ignore[misc]
+        write_json(scene / name, said, indent=1)
 
 
 def write_sparse_points(path: Path, places: Array, colours: NDArray[np.uint8]) -> None:

@@ -40,7 +40,7 @@ from leco_plugin.scenes.poses.reconstruction import (
     load_pycolmap,
 )
 from leco_plugin.scenes.scene_file import SceneFile, scene_file_of
-from leco_plugin.scenes.whole_files import write_whole
+from leco_plugin.scenes.whole_files import write_json, write_whole
 
 Array = NDArray[np.float64]
 FILE, BEFORE = "leco_points.ply", "transforms.before_points.json"
@@ -238,4 +238,4 @@ def _name_points(path: Path) -> None:
     if not path.with_name(BEFORE).exists():
         write_whole(path.with_name(BEFORE), lambda file: file.write(before))
     meta = json.loads(before.decode("utf-8-sig")) | {"ply_file_path": FILE}
-    write_whole(path, lambda file: file.write(json.dumps(meta, indent=1).encode()))
+    write_json(path, meta, indent=1)
