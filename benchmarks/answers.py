@@ -181,11 +181,12 @@ def _fronts(charts: Sequence[Mapping[str, Any]]) -> str:
             for name in fronts_of(one, held):
                 its[name] += 1
     said = [
-        f"{who} is on the front {' and '.join(f'of {name} on {n}' for name, n in its.items())}"
+        f"{who} is unbeaten {' and '.join(f'in {name} on {n}' for name, n in its.items())}"
         for who, its in counts.items()
     ]
     scenes = f"{len(charts)} scene{'s' if len(charts) > 1 else ''}"
-    return f"Of {scenes}, {'; '.join(said)}."
+    meant = "*Unbeaten*: nothing keeps less space for less of that."
+    return f"Of {scenes}, {'; '.join(said)}. {meant}"
 
 
 def _level(learned: Sequence[Learned]) -> str:

@@ -83,12 +83,13 @@ def gain_table(results: Mapping[str, Any]) -> str:
     best = max(plain, key=lambda line: line.psnr)
     host = max((line for line in plain if line.method != OURS), key=lambda line: line.psnr)
     said = (
-        f"Of the rows without a learned occupancy, {best.name} is the best. Beside it, `{OURS}` is "
+        "A query asks a network about one point; *small* ones ask a proposal network or a gate. "
+        "*LeCO* is the paper's model: several small networks, the *experts*. Of the rows without a "
+        f"learned occupancy, *{best.name}* is the best. Beside it, {ours.name} is "
     )
     said += _beside(ours, best)
     if host is not best:
-        said += f" Beside the best host, {host.name}, it is {_beside(ours, host)}"
-    said += " *Small* queries are those of proposal networks and gates."
+        said += f" Beside the best host, *{host.name}*, it is {_beside(ours, host)}"
     columns = f"{head} | PSNR | to render an image | queries a ray"
     return "\n".join([*table(columns, rows), "", said])
 

@@ -194,7 +194,7 @@ def demo(
 ) -> None:
     """Learn the occupancy of a small city, go on guided, and compare with never freezing.
 
-    Writes report.json, chart.png, picture.png and occupancy.safetensors. About six minutes on two
+    Writes report.json, chart.png, picture.png and occupancy.safetensors. About five minutes on two
     CPU cores.
 
     Args:

@@ -378,7 +378,7 @@ def _part(folder: Path, name: str, write: Callable[[], Facts], use: Callable[[Fa
 
 
 def _points_in_words(facts: Facts) -> str:
-    colours = "of the photographs" if facts["photograph_colours"] else "o(x)"
+    colours = "of the sparse points" if facts["photograph_colours"] else "o(x)"
     where = "in the coordinates of the data"
     if facts["frame"] == "run":
         where = "in the coordinates of the run, which does not say how it moved the data"

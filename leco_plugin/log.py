@@ -179,7 +179,8 @@ class _Lines:
             return
         self.due, self.next_share = now + SECONDS_A_LINE, share + SHARE_A_LINE
         done, elapsed = share - self.share_before, now - self.began
-        left = f"about {spell(elapsed / done * (1.0 - share))} left" if done > 0.0 else ""
+        known = done >= 0.01  # of less nobody can tell how long the rest takes
+        left = f"about {spell(elapsed / done * (1.0 - share))} left" if known else ""
         reached = f"{share:.0%} after {spell(elapsed)}"
         self.put(f"{self.what}: " + ", ".join(filter(None, [reached, figures, left])))
 

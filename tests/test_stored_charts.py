@@ -64,7 +64,7 @@ def test_it_is_said_for_every_scene_whether_ours_is_on_the_fronts(store: Store) 
     store("representations", "city", *representations(other_seconds=10.0))
     store("representations", "fox", *representations(other_seconds=8.0))
     text = answered()
-    assert "Of 2 scenes, MLP (ours) is on the front of size on 2 and of learning time on 1." in text
+    assert "Of 2 scenes, MLP (ours) is unbeaten in size on 2 and in learning time on 1." in text
     link = "#suite-representations-on-city"
     kept = "| 12.5%, 50 kB | 30.0%, 33 kB | 10.0%, 4.0 MB |"
     assert (
