@@ -43,8 +43,8 @@ HEAD = """# Results
 What was found, in one page. Behind it are [Measurements](measurements.md), every chart and table
 with [how to read them](measurements.md#how-to-read-a-table), [Suites](suites.md), the charts of the
 reviewers' questions, and [Who gets what](gifts.md) in a comparison. All is made from
-`benchmarks/results/*.json` by `python benchmarks/results_page.py`; a test fails when they differ. (*)
-marks what older code has made; the page of its figures says what has changed since.
+`benchmarks/results/*.json` by `python benchmarks/results_page.py`; a test fails when they differ.
+(*) marks what older code has made; the page of its figures says what has changed since.
 
 ## What is gained in the same time
 """
