@@ -136,31 +136,6 @@ def evaluating(model: nn.Module) -> Iterator[None]:
         model.train(was_training)
 
 
-@torch.no_grad()
-def dense_rendering(
-    mixture: Mixture,
-    rays: Rays,
-    truth: Tensor,
-    rays_at_once: int,
-    refer: Callable[[Mixture, Rays], Reference] | None = None,
-) -> DenseRendering:
-    """All candidates of given rays rendered, in chunks.
-
-    Args:
-        rays: cut to the mixture's region.
-        truth: [R, 3] their true colours.
-        refer: makes the reference of a chunk; None is `dense_reference`.
-    """
-    chunks = in_chunks(rays, rays_at_once)
-    references = [(refer or dense_reference)(mixture, chunk) for chunk in chunks]
-
-    def render_kept(number: int, mask: Tensor) -> Tensor:
-        kept = Intervals(*(part[mask] for part in references[number].intervals))
-        return mixture.shade(chunks[number], kept).rgb
-
-    return DenseRendering(references, list(truth.split(rays_at_once)), render_kept)
-
-
 def dense_reference(mixture: Mixture, rays: Rays) -> Reference:
     """All candidates of some rays rendered, as the reference that skipping is measured against."""
     intervals = mixture.with_backdrops(rays, mixture.candidates(rays))
@@ -169,6 +144,32 @@ def dense_reference(mixture: Mixture, rays: Rays) -> Reference:
         return reference
     mapped = mapped_middles(mixture.region.space, rays, intervals)
     return reference._replace(occupancies=mixture.occupancies(mapped))
+
+
+@torch.no_grad()
+def dense_rendering(
+    mixture: Mixture,
+    rays: Rays,
+    truth: Tensor,
+    rays_at_once: int,
+    refer: Callable[[Mixture, Rays], Reference] = dense_reference,
+) -> DenseRendering:
+    """All candidates of given rays rendered, in chunks.
+
+    Args:
+        rays: cut to the mixture's region.
+        truth: [R, 3] their true colours.
+        refer: makes the reference of a chunk.
+    """
+    chunks = in_chunks(rays, rays_at_once)
+    references = [refer(mixture, chunk) for chunk in chunks]
+
+    @torch.no_grad()  # it is called later
+    def render_kept(number: int, mask: Tensor) -> Tensor:
+        kept = Intervals(*(part[mask] for part in references[number].intervals))
+        return mixture.shade(chunks[number], kept).rgb
+
+    return DenseRendering(references, list(truth.split(rays_at_once)), render_kept)
 
 
 def in_chunks(rays: Rays, at_once: int) -> list[Rays]:
