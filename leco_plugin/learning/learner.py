@@ -187,7 +187,7 @@ class Learner:
             return
         if bool(self.mixture.frozen):
             self._watch(step, seconds, kept)
-            if step + 1 >= SHARPENED_FROM * self.run.end and bool(self.mixture.frozen):
+            if self._is_time_to_sharpen(step):
                 self._sharpen(step)
         else:
             self.progress.learn_seconds += seconds
@@ -300,15 +300,18 @@ class Learner:
         found = doubts_of_field(report.get(FIELD, math.inf), report.get(ONE_COLOUR, math.inf))
         say_all(found or doubts_of_occupancy(kept_of_seen(self.mixture)))
 
-    def _sharpen(self, step: int) -> None:
-        """Has a small gate skip in place of the learned one where it skips more, and says so.
+    def _is_time_to_sharpen(self, step: int) -> bool:
+        """Whether so much of the run is over, and the field was guided for long enough by then,
+        since freezing or the last time."""
+        mixture, config, when = self.mixture, self.config.sharpening, SHARPENED_FROM * self.run.end
+        if config.steps == 0 or step + 1 < when or not bool(mixture.frozen):
+            return False
+        since = max(self.progress.sharpened_at, mixture.report["step"])
+        return when - since >= config.least_steps
 
-        The field must have been trained guided long enough, since freezing or the last time.
-        """
+    def _sharpen(self, step: int) -> None:
+        """Has a small gate skip in place of the learned one where it skips more, and says so."""
         mixture, config, started = self.mixture, self.config, seconds_now()
-        guided = step - max(self.progress.sharpened_at, mixture.report["step"])
-        if config.sharpening.steps == 0 or guided < config.sharpening.least_steps:
-            return
         self.progress.sharpened_at = step
         kind = config.sharpening.gate.encoding.kind
         if mixture.gate.config.encoding.kind != kind:
