@@ -220,7 +220,7 @@ def bars_section(folder: Path) -> list[str]:
         folder: of stored results.
     """
     tests = [
-        [asked, f"tested by `tests/{file}`; no figure is stored", "-", "-"]
+        [asked, f"not stored; tested by `tests/{file}`", "-", "-"]
         for asked, file in CLAIMED.items()
     ]
     cells = [*(bar.cells(folder) for bar in BARS), of_kills(folder), *tests, of_cards(folder)]

@@ -78,7 +78,7 @@ def test_a_grid_that_is_smaller_and_keeps_less_is_named(store: Store) -> None:
     store("representations", "city", *representations(10.0, grid_kept=(0.05,)), **STEPS)
     text = answered()
     assert (
-        "on the front of size on 0" in text
+        "unbeaten in size on 0" in text
         and "behind grid 64³ in size (one seed: no verdict) |" in text
     )
 
@@ -86,7 +86,7 @@ def test_a_grid_that_is_smaller_and_keeps_less_is_named(store: Store) -> None:
 def test_one_that_keeps_less_in_the_median_only_is_named_as_level(store: Store) -> None:
     store("representations", "city", *representations(10.0, grid_kept=(0.05, 0.05, 0.3)), **STEPS)
     text = answered()
-    assert "of size on 0 and of learning time on 1." in text
+    assert "in size on 0 and in learning time on 1." in text
     assert "behind grid 64³ (level in space) in size (3 seeds) |" in text
 
 
@@ -187,15 +187,17 @@ def test_the_gain_is_that_over_the_best_row_and_the_best_host_without_one() -> N
         "| **leco-occupancy + learned-occupancy** | 28.0 dB (28.0 to 28.0) | 2.0 s | 15 + 5 small |"
     )
     assert said == (
-        "Of the rows without a learned occupancy, leco-occupancy + dense is the best. Beside it, "
-        "`leco-occupancy` is -1.0 dB, one seed: no verdict; it renders 2.0 times as fast, with 2.7 "
-        "times fewer queries of the field. Beside the best host, leco-nerfacto + own, it is "
+        "A query asks a network about one point; *small* ones ask a proposal network or a gate. "
+        "*LeCO* is the paper's model: several small networks, the *experts*. Of the rows without a "
+        "learned occupancy, *leco-occupancy + dense* is the best. Beside it, leco-occupancy + "
+        "learned-occupancy is -1.0 dB, one seed: no verdict; it renders 2.0 times as fast, with "
+        "2.7 times fewer queries of the field. Beside the best host, *leco-nerfacto + own*, it is "
         "+3.0 dB, one seed: no verdict; it renders 4.0 times as fast, with 2.1 times fewer queries "
-        "of the field. *Small* queries are those of proposal networks and gates."
+        "of the field."
     )
     best = of("leco-nerfacto", "own", 30.0, (32.0, 48.0, 0.0))
     *_, said = parts.gain_table(chart | {"runs": [*runs[:3], best]}).splitlines()
-    assert "leco-nerfacto + own is the best" in said and "best host" not in said
+    assert "*leco-nerfacto + own* is the best" in said and "best host" not in said
 
 
 def test_the_readme_says_that_its_chart_was_made_before_a_mend(

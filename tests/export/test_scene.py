@@ -143,7 +143,7 @@ def test_a_folder_has_everything_and_says_what_each_part_is_for(
     assert [part.name for part in parts if part.facts] == names and not doubted
     assert {path.name for path in folder.iterdir()} == {*names, "splats.ply"}
     said = "\n".join(in_words(folder, parts, doubted))
-    for words in ("colours: of the photographs", "origin on earth", "leco-photographs"):
+    for words in ("colours: of the sparse points", "origin on earth", "leco-photographs"):
         assert words in said
     assert "not written" not in said
 

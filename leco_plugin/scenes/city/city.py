@@ -143,11 +143,32 @@ class Faces:
 
 
 def squared_to_triangles(points: Array, triangles: Array) -> Array:
-    """Squared distances [M] from points [M, 3] to triangles [M, 3, 3]."""
-    from trimesh.triangles import closest_point  # slow to import
-
-    squared: Array = np.square(points - closest_point(triangles, points)).sum(axis=-1)
+    """Squared distances [M] from points [M, 3] to triangles [M, 3, 3]: over a triangle's inside the
+    height above its plane counts, elsewhere the nearest edge. A machine that has torch alone, as of
+    the GPU suite, lacks trimesh, which could do this."""
+    start, away = triangles[:, 0], points - triangles[:, 0]
+    u, v = triangles[:, 1] - start, triangles[:, 2] - start
+    uu, uv, vv = _dot(u, u), _dot(u, v), _dot(v, v)
+    pu, pv = _dot(away, u), _dot(away, v)
+    area = uu * vv - uv**2
+    b, c = (vv * pu - uv * pv) / area, (uu * pv - uv * pu) / area
+    over = (b >= 0) & (c >= 0) & (b + c <= 1)
+    height = away - b[:, None] * u - c[:, None] * v
+    squared = np.where(over, _dot(height, height), np.inf)
+    third, from_second = v - u, away - u
+    for offset, edge, along in (
+        (away, u, pu / uu),
+        (away, v, pv / vv),
+        (from_second, third, _dot(from_second, third) / _dot(third, third)),
+    ):
+        rest = offset - np.clip(along, 0, 1)[:, None] * edge
+        squared = np.minimum(squared, _dot(rest, rest))
     return squared
+
+
+def _dot(a: Array, b: Array) -> Array:
+    """Scalar products of rows: [M, 3], [M, 3] -> [M]."""
+    return np.einsum("mk,mk->m", a, b)
 
 
 DESCRIPTION = "city.json"
