@@ -33,7 +33,7 @@ from leco_plugin.scenes.whole_files import write_json
 from leco_plugin.studio.host_models import true_colours
 
 SECONDS = 130.0
-"""Training time of each run: about six minutes in all on two cores."""
+"""Training time of each run: about five minutes in all on two cores."""
 FULL_LEARNING = 150.0
 """Training time from which on the occupancy learns for the method's own number of steps."""
 MOST_LEARNING = 0.5

@@ -250,7 +250,7 @@ def write_splat_init(
     rows["xyz"], rows["rgb"] = places, colours
     write_points(points, rows, comments_of(description))
     copy = _from_elsewhere(meta, description.parent, out.parent)
-    write_json(out, copy | {"ply_file_path": points.name}, indent=1)
+    write_json(out, copy | {"ply_file_path": points.name}, indent=1, allow_nan=True)
     return {"points": len(places), "sparse_points": sparse, "photograph_colours": known is not None}
 
 

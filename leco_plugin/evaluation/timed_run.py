@@ -280,10 +280,13 @@ class _Course:
         """For a model that learns itself, which sharpens its gate towards the end."""
         seconds, steps, config = self.budget.seconds, self.run.steps, self.trainer.config
         mixture = getattr(self.trainer.pipeline.model, "mixture", None)
-        if seconds is None or mixture is None or not (bool(mixture.frozen) and self.step_times):
+        if seconds is None or mixture is None:
             return
-        left = max(0.0, seconds - self.clock.seconds) / statistics.fmean(self.step_times[-RECENT:])
-        config.max_num_iterations = min(self.budget.steps or ENDLESS, steps + math.ceil(left))
+        config.max_num_iterations = self.budget.steps or ENDLESS
+        if bool(mixture.frozen) and self.step_times:
+            left = (seconds - self.clock.seconds) / statistics.fmean(self.step_times[-RECENT:])
+            foreseen = steps + math.ceil(max(0.0, left))
+            config.max_num_iterations = min(config.max_num_iterations, foreseen)
 
     def _keep_to_learning_time(self) -> None:
         """As a host that learns first does: a model that learns itself freezes in time."""

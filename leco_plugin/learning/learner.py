@@ -48,8 +48,7 @@ FEWEST_KEPT = 0.5
 """An occupancy that is expected to keep fewer samples a ray than this may rightly keep none in a
 batch: no alarm then."""
 SHARPENED_FROM = 0.9
-"""Share of a run at which a small gate is taught. In what is left the field grows used to it, and
-the price watch sees what it costs."""
+"""Share of a run at which a small gate is taught; in what is left the field grows used to it."""
 NEARLY_ALL = 0.95
 """Share of the probe positions above which a gate has found nothing empty yet."""
 
@@ -306,8 +305,9 @@ class Learner:
         mixture, config, when = self.mixture, self.config.sharpening, SHARPENED_FROM * self.run.end
         if config.steps == 0 or step + 1 < when or not bool(mixture.frozen):
             return False
-        since = max(self.progress.sharpened_at, mixture.report["step"])
-        return when - since >= config.least_steps
+        last = self.progress.sharpened_at
+        enough = when - max(last, mixture.report["step"]) >= config.least_steps
+        return enough and last + 1 < when  # once in a run, however few are enough
 
     def _sharpen(self, step: int) -> None:
         """Has a small gate skip in place of the learned one where it skips more, and says so."""
@@ -335,6 +335,7 @@ class Learner:
         self.watch.state.evidence = {}  # of what guided before
         if self.run.folder is not None:
             leave_file(mixture.occupancy(), self.run.folder)
+        self.run.save(step)  # what is killed from now on goes on with the gate of the file
 
     def _merge(self) -> None:
         """Drops the scene experts that a frozen mixture does not need, and says so.

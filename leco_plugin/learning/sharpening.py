@@ -1,8 +1,8 @@
 """Sharpening: a small gate that the field teaches anew, and that skips more than the learned one.
 
-While a gate is learned, haze teaches it too, and it also has to route points to experts. At the end
-of a run the field knows better: its rendering weights along training rays teach a fresh gate of a
-few thousand values, which only has to say what is empty. It is calibrated like the first one, and
+While a gate is learned, haze teaches it too, and it also has to route points to experts. Later in a
+run the field knows better: its rendering weights along training rays teach a fresh gate of seven
+thousand values, which only has to say what is empty. It is calibrated like the first one, and
 skips in its place where it skips more. The large gate goes on routing. A `Lesson` says where a
 gate should keep and skip; a gate alone is taught by it, in seconds.
 """

@@ -1,7 +1,6 @@
-"""Volume rendering of packed samples: weights, transmittance, accumulation.
+"""Volume rendering of packed samples: weights, transmittance, visibility, accumulation.
 
-nerfacc's names and argument order, on any device and in plain torch. Its functions of visibility
-and of weights by opacity are plain torch over these. Samples lie flat, [n_samples]
+nerfacc's names and argument order, on any device and in plain torch. Samples lie flat, [n_samples]
 with `ray_indices`, or batched, [n_rays, n_samples]. With tau_i = sigma_i (t_end - t_start):
 alpha_i = 1 - exp(-tau_i), T_i = exp(-sum_{j<i} tau_j), w_i = T_i alpha_i (Max 1995; NeRF eq. 3).
 Half-precision inputs are taken to float32 first: results never have less.
@@ -34,6 +33,9 @@ __all__ = [
     "pack_info",
     "render_transmittance_from_alpha",
     "render_transmittance_from_density",
+    "render_visibility_from_alpha",
+    "render_visibility_from_density",
+    "render_weight_from_alpha",
     "render_weight_from_density",
 ]
 
@@ -173,6 +175,57 @@ def render_transmittance_from_alpha(
         packed_info = pack_info(ray_indices, n_rays)
     trans = exclusive_prod(1.0 - alphas, packed_info, ray_indices)
     return trans if prefix_trans is None else trans * prefix_trans
+
+
+def render_weight_from_alpha(
+    alphas: Tensor,
+    packed_info: Tensor | None = None,
+    ray_indices: Tensor | None = None,
+    n_rays: int | None = None,
+    prefix_trans: Tensor | None = None,
+) -> tuple[Tensor, Tensor]:
+    """Weights T alpha and transmittance T; arguments as above."""
+    trans = render_transmittance_from_alpha(alphas, packed_info, ray_indices, n_rays, prefix_trans)
+    return trans * alphas, trans
+
+
+@torch.no_grad()
+def render_visibility_from_density(
+    t_starts: Tensor,
+    t_ends: Tensor,
+    sigmas: Tensor,
+    packed_info: Tensor | None = None,
+    ray_indices: Tensor | None = None,
+    n_rays: int | None = None,
+    early_stop_eps: float = 1e-4,
+    alpha_thre: float = 0.0,
+    prefix_trans: Tensor | None = None,
+) -> Tensor:
+    """Which samples are worth shading: T >= early_stop_eps and alpha >= alpha_thre, bool."""
+    trans, alphas = render_transmittance_from_density(
+        t_starts, t_ends, sigmas, packed_info, ray_indices, n_rays, prefix_trans
+    )
+    return _visible(trans, alphas, early_stop_eps, alpha_thre)
+
+
+@torch.no_grad()
+def render_visibility_from_alpha(
+    alphas: Tensor,
+    packed_info: Tensor | None = None,
+    ray_indices: Tensor | None = None,
+    n_rays: int | None = None,
+    early_stop_eps: float = 1e-4,
+    alpha_thre: float = 0.0,
+    prefix_trans: Tensor | None = None,
+) -> Tensor:
+    """Which samples are worth shading: T >= early_stop_eps and alpha >= alpha_thre, bool."""
+    trans = render_transmittance_from_alpha(alphas, packed_info, ray_indices, n_rays, prefix_trans)
+    return _visible(trans, alphas, early_stop_eps, alpha_thre)
+
+
+def _visible(trans: Tensor, alphas: Tensor, early_stop_eps: float, alpha_thre: float) -> Tensor:
+    visible = trans >= early_stop_eps
+    return visible & (alphas >= alpha_thre) if alpha_thre > 0 else visible
 
 
 def accumulate_along_rays(

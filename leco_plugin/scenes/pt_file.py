@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import pickle
+import pickletools
 import re
 import zipfile
 from pathlib import Path
@@ -12,6 +13,9 @@ from typing import Any
 import torch
 
 from leco_plugin.scenes.input_error import InputError, one_line
+
+MOST_RECORDS, LONGEST_PICKLE = 256, 1 << 14
+"""Records of an archive, and bytes of its pickle: that of a picture's metadata has about 500."""
 
 
 class Refused(Exception):
@@ -58,12 +62,33 @@ def load(data: bytes, name: str) -> Any:
 
 
 def _check_sizes(data: bytes) -> None:
-    """Refuses an archive that would take more memory than its bytes are worth."""
+    """Refuses an archive that would take more memory or time than its bytes are worth."""
     if not data.startswith(b"PK"):
         raise Refused("is not a file of torch.save (of torch 1.6 or newer)")
     with zipfile.ZipFile(io.BytesIO(data)) as archive:
-        if sum(entry.file_size for entry in archive.infolist()) > len(data):
+        entries = archive.infolist()
+        pickles = [entry for entry in entries if entry.filename.endswith("/data.pkl")]
+        if len(pickles) != 1 or len(entries) > MOST_RECORDS:
+            raise Refused("is a zip, but not one of torch.save")
+        if any(entry.compress_type != zipfile.ZIP_STORED for entry in entries):
+            raise Refused("holds compressed records, which torch.save does not write")
+        if sum(entry.file_size for entry in entries) > len(data):
             raise Refused("claims more bytes than it has")
+        pickled = archive.read(pickles[0])
+    if len(pickled) > LONGEST_PICKLE:
+        raise Refused(f"describes its contents in {len(pickled)} bytes, far too many")
+    _check_tuples(pickled)
+
+
+def _check_tuples(pickled: bytes) -> None:
+    """Refuses tuples that are used twice: of pairs of pairs of them, a key takes years to hash."""
+    tuples, last = set(), ""
+    for opcode, argument, _ in pickletools.genops(pickled):
+        if opcode.name in ("BINPUT", "LONG_BINPUT") and "TUPLE" in last:
+            tuples.add(argument)
+        if opcode.name in ("BINGET", "LONG_BINGET") and argument in tuples:
+            raise Refused("describes its contents in a way that torch does not")
+        last = opcode.name
 
 
 def _check_value(value: Any) -> None:

@@ -29,9 +29,10 @@ def write_whole(path: Path, write: Callable[[BinaryIO], object]) -> None:
         part.unlink(missing_ok=True)
 
 
-def write_json(path: Path, value: Any, indent: int = 2) -> None:
-    """Writes JSON whole or not at all; parents are made. NaN and infinity raise `ValueError`."""
-    text = json.dumps(value, indent=indent, allow_nan=False) + "\n"
+def write_json(path: Path, value: Any, indent: int = 2, allow_nan: bool = False) -> None:
+    """Writes JSON whole or not at all; parents are made. NaN and infinity raise `ValueError`, but
+    in the copy of a user's file."""
+    text = json.dumps(value, indent=indent, allow_nan=allow_nan) + "\n"
     write_whole(path, lambda file: file.write(text.encode()))
 
 

@@ -145,7 +145,7 @@ def contender_of(
     return Contender(sampler.title, host, name, changes, settings={RAYS: sizes.rays, **settings})
 
 
-A_RUN = 60.0
+A_RUN = 120.0
 """Seconds of a run, as long as none was made."""
 
 
@@ -238,9 +238,9 @@ def capture_of(case: Case, sizes: Sizes) -> Capture:
 
 def core_seconds(runs: Sequence[Run], stored: Sequence[Mapping[str, Any]]) -> float:
     """What runs to be made take of one core, seconds: as long as stored ones of their samplers,
-    else as any that is stored."""
+    else as the longest of any."""
     measured: defaultdict[str, list[float]] = defaultdict(list)
     for record in stored:
         measured[record["sampler"]].append(float(record["processor_seconds"]))
-    every = [seconds for some in measured.values() for seconds in some] or [A_RUN]
-    return sum(fmean(measured.get(run.job.contender.sampler, every)) for run in runs)
+    longest = [max((seconds for some in measured.values() for seconds in some), default=A_RUN)]
+    return sum(fmean(measured.get(run.job.contender.sampler, longest)) for run in runs)

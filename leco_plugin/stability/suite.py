@@ -194,11 +194,10 @@ class Suite:
         After so many seconds no run is to go on: but for the first ones, what would take longer is
         left for another time. `say` and `show` are as of `make_jobs`.
         """
-        todo, stored = self.missing(), list(self.stored().values())
-        ends = time.monotonic() + seconds
+        todo, ends = self.missing(), time.monotonic() + seconds
 
         def is_in_time(run: Run) -> bool:
-            expected = core_seconds([run], stored)
+            expected = core_seconds([run], list(self.stored().values()))
             return run in todo[: self.workers] or time.monotonic() + expected <= ends
 
         def note(line: str) -> None:

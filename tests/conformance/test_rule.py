@@ -10,8 +10,6 @@ import torch
 
 from leco_plugin.conformance.rules import Rule, apply, require
 
-PAGE = Path(__file__).resolve().parents[2] / "docs" / "conformance.md"
-
 
 class Case:
     """One thing to check."""

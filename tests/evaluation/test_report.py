@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import datetime
 import json
+import math
 import platform
 from pathlib import Path
 
@@ -25,6 +26,11 @@ def test_a_figure_says_what_made_it_and_when() -> None:
     assert code == describe_code() and len(code["sources"]) == 12
     made = made_by(code)
     assert made["code"] == code and datetime.date.fromisoformat(made["date"])
+
+
+def test_a_copy_of_a_users_file_has_what_it_had(tmp_path: Path) -> None:
+    write_json(tmp_path / "copy.json", {"sharpness": math.nan}, allow_nan=True)
+    assert math.isnan(json.loads((tmp_path / "copy.json").read_text())["sharpness"])
 
 
 def test_what_is_no_json_leaves_no_file(tmp_path: Path) -> None:

@@ -332,12 +332,13 @@ def test_a_model_that_learns_itself_knows_how_many_steps_are_left_of_its_time(
 
     def freeze(step: int) -> None:
         ends.append(run.trainer.config.max_num_iterations)
-        model.mixture.frozen = step >= 2
+        model.mixture.frozen = 2 <= step < 5
 
     run.ends = freeze
     assert run.record().steps == 7
-    # nothing is known before the fourth step, which leaves 11 s for steps of 2 s each
-    assert ends == [module.ENDLESS] * 4 + [4 + 6, 5 + 3, 6 + 1]
+    # nothing is known before the fourth step, which leaves 11 s for steps of 2 s each, nor when the
+    # gate learns again
+    assert ends == [module.ENDLESS] * 4 + [4 + 6, 5 + 3, module.ENDLESS]
 
 
 def test_updates_of_a_grid_are_its_learning_time(

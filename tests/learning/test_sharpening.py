@@ -199,6 +199,7 @@ def test_it_is_sharpened_at_the_end_of_a_run_that_pays_for_it(
     learner.after_step(last, 0.1, 5.0)
     assert (mixture.small is not None) == sharpened
     assert learner.progress.sharpened_at == (last if sharpened else -1)
+    assert run.saved == ([last] if sharpened else [])
     if not sharpened:
         return
     file = Occupancy.load(tmp_path / "occupancy.safetensors")
@@ -211,9 +212,12 @@ def test_it_is_sharpened_at_the_end_of_a_run_that_pays_for_it(
     assert as_learned(file).gate.config == SMALLEST.gate and as_learned(file).threshold == 0.5
 
 
-def test_a_tenth_of_a_run_is_trained_with_the_small_gate(monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize("least_steps", [0, 1, 10])
+def test_a_tenth_of_a_run_is_trained_with_the_small_gate(
+    least_steps: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
     mixture, run = a_mixture(), ARun(end=200)
-    options = SharpeningConfig(steps=5, least_steps=10, rays=50, gate=GATE)
+    options = SharpeningConfig(steps=5, least_steps=least_steps, rays=50, gate=GATE)
     pixels = Pixels(mixture)
     learner = small_learner(run, mixture, pixels, sharpening=options, calibration=NEVER_AGAIN)
     asked: list[int] = []

@@ -34,8 +34,9 @@ def test_weights_follow_the_definition(seed):
         for output, slow in zip(outputs, expected, strict=True):
             assert output.tolist() == pytest.approx(slow, abs=1e-12)
     alphas = torch.tensor(expected[2], dtype=torch.float64)
-    trans = packed.render_transmittance_from_alpha(alphas, **BY_RAY)
-    assert trans.tolist() == pytest.approx(expected[1], abs=1e-12)
+    outputs = packed.render_weight_from_alpha(alphas, **BY_RAY)
+    for output, slow in zip(outputs, expected[:2], strict=True):
+        assert output.tolist() == pytest.approx(slow, abs=1e-12)
 
 
 def test_batched_samples_render_like_packed_ones():
@@ -97,12 +98,12 @@ def test_a_packed_product_says_that_it_has_no_second_gradient():
         gradient.sum().backward()
 
 
-def test_transmittance_has_exact_gradients_at_opaque_samples():
+def test_alpha_weights_have_exact_gradients_at_opaque_samples():
     alphas = torch.rand(10, dtype=torch.float64)
     alphas[[1, 5, 7, 9]] = 1.0
     alphas.requires_grad_()
     assert torch.autograd.gradcheck(
-        lambda a: packed.render_transmittance_from_alpha(a, **BY_RAY),
+        lambda a: packed.render_weight_from_alpha(a, **BY_RAY),
         alphas,
         eps=1e-7,
     )
@@ -161,7 +162,7 @@ def test_what_a_bad_sample_does_to_gradients_stays_on_its_ray(by, bad):
         if by == "density":
             outputs = packed.render_weight_from_density(t_starts, t_ends, inputs, **BY_RAY)
         else:
-            outputs = (packed.render_transmittance_from_alpha(inputs, **BY_RAY),)
+            outputs = packed.render_weight_from_alpha(inputs, **BY_RAY)
         sum((output * t_ends).sum() for output in outputs).backward()
         return inputs.grad
 
@@ -179,6 +180,16 @@ def test_prefix_transmittance_scales_weights():
     )
     torch.testing.assert_close(scaled[0], plain[0] * prefix)
     torch.testing.assert_close(scaled[1], plain[1] * prefix)
+
+
+def test_visibility_is_two_comparisons():
+    t_starts, t_ends, sigmas = random_samples()
+    _, trans, alphas = packed.render_weight_from_density(t_starts, t_ends, sigmas, **BY_RAY)
+    expected = (trans >= 0.5) & (alphas >= 0.4)
+    limits = {"early_stop_eps": 0.5, "alpha_thre": 0.4}
+    by_density = packed.render_visibility_from_density(t_starts, t_ends, sigmas, **BY_RAY, **limits)
+    assert by_density.equal(expected)
+    assert packed.render_visibility_from_alpha(alphas, **BY_RAY, **limits).equal(expected)
 
 
 @pytest.mark.parametrize("dtype", [torch.bfloat16, torch.float16])
@@ -211,13 +222,13 @@ def test_rendering_and_its_gradients_wait_for_no_device():
     sigmas.requires_grad_()
     rays = {"ray_indices": RAYS.to("meta"), "n_rays": N_RAYS}
     weights, _, alphas = packed.render_weight_from_density(t_starts, t_ends, sigmas, **rays)
-    trans = packed.render_transmittance_from_alpha(alphas, **rays)
-    colors = packed.accumulate_along_rays(
-        weights + trans * alphas, torch.rand(10, 3).to("meta"), **rays
-    )
+    by_alpha, trans = packed.render_weight_from_alpha(alphas, **rays)
+    colors = packed.accumulate_along_rays(weights + by_alpha, torch.rand(10, 3).to("meta"), **rays)
     sums = packed.inclusive_sum(trans, packed.pack_info(rays["ray_indices"], N_RAYS))
     (colors.sum() + sums.sum()).backward()
     assert sigmas.grad.shape == (10,)
+    seen = packed.render_visibility_from_density(t_starts, t_ends, sigmas, **rays, alpha_thre=0.1)
+    assert seen.shape == (10,)
 
 
 def test_shapes_that_do_not_fit_are_named():

@@ -63,10 +63,9 @@ def test_pruning_is_two_comparisons(scene):
     samples = march(scene, March(STEP))
     ray_indices, t_starts, t_ends = samples
     sigmas = sigma_fn(t_starts, t_ends, ray_indices)
-    trans, opacities = packed.render_transmittance_from_density(
-        t_starts, t_ends, sigmas, None, ray_indices, N_RAYS
+    expected = packed.render_visibility_from_density(
+        t_starts, t_ends, sigmas, None, ray_indices, N_RAYS, early_stop_eps=0.01, alpha_thre=0.1
     )
-    expected = (trans >= 0.01) & (opacities >= 0.1)
     limits = {"early_stop_eps": 0.01, "alpha_thre": 0.1}
     by_density = prune(samples, N_RAYS, sigma_fn=sigma_fn, **limits)
     alphas = 1.0 - torch.exp(-sigmas * (t_ends - t_starts))

@@ -69,7 +69,10 @@ def memory_of(device: torch.device | str, group: Path = GROUP) -> int | None:
         return int(torch.cuda.get_device_properties(device).total_memory)
     if device.type != "cpu":
         return None
-    memory = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
+    try:
+        memory = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
+    except (AttributeError, ValueError, OSError):  # a system without these names
+        return None
     try:
         return min(memory, int((group / "memory.max").read_text()))
     except (OSError, ValueError):  # no container, or one without a limit

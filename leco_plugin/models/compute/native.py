@@ -310,6 +310,9 @@ def in_threads(
         for part in left:
             work(*part)
 
+    if threads == 1:
+        take()
+        return
     # leaving waits for all: nothing is freed that a thread still writes
     with ThreadPoolExecutor(threads) as pool:
         others = [pool.submit(take) for _ in range(threads - 1)]

@@ -238,4 +238,4 @@ def _name_points(path: Path) -> None:
     if not path.with_name(BEFORE).exists():
         write_whole(path.with_name(BEFORE), lambda file: file.write(before))
     meta = json.loads(before.decode("utf-8-sig")) | {"ply_file_path": FILE}
-    write_json(path, meta, indent=1)
+    write_json(path, meta, indent=1, allow_nan=True)
