@@ -71,8 +71,9 @@ def say(line: str) -> None:
     It is shown as it is: brackets and colons in the name of a file mean nothing.
     """
     if is_first() and _details is not None:
-        console().print(line, markup=False, emoji=False, soft_wrap=True)
-    note(line, offset=3)
+        put(line)
+    else:
+        note(line, offset=3)
 
 
 def say_all(lines: Iterable[str]) -> None:
@@ -104,8 +105,9 @@ def summarize(summary: Iterable[str], details: Iterable[str]) -> None:
 
 
 def _write(line: str) -> None:
-    assert _details is not None
-    print(time.strftime("%H:%M:%S"), line, file=_details, flush=True)
+    """Into the run's log file, where there is one."""
+    if _details is not None:
+        print(time.strftime("%H:%M:%S"), line, file=_details, flush=True)
 
 
 class _Says(logging.Handler):
@@ -150,7 +152,7 @@ def bar(what: str) -> Iterator[Show]:
         yield _Lines(what, put)
         return
     columns = (TextColumn("{task.description}", markup=False), BarColumn(), TimeElapsedColumn())
-    in_file = _Lines(what, lambda line: None if _details is None else _write(line))
+    in_file = _Lines(what, _write)
     with Progress(*columns, TimeRemainingColumn(), console=console(), transient=True) as progress:
         task = progress.add_task(what, total=1.0)
 
@@ -188,8 +190,7 @@ class _Lines:
 def put(line: str) -> None:
     """A line of a command's own on the screen, as it is; also in a run's log file."""
     console().print(line, markup=False, emoji=False, highlight=False, soft_wrap=True)
-    if _details is not None:
-        _write(line)
+    _write(line)
 
 
 def spell(seconds: float) -> str:

@@ -242,5 +242,6 @@ def core_seconds(runs: Sequence[Run], stored: Sequence[Mapping[str, Any]]) -> fl
     measured: defaultdict[str, list[float]] = defaultdict(list)
     for record in stored:
         measured[record["sampler"]].append(float(record["processor_seconds"]))
-    longest = [max((seconds for some in measured.values() for seconds in some), default=A_RUN)]
-    return sum(fmean(measured.get(run.job.contender.sampler, longest)) for run in runs)
+    means = {name: fmean(seconds) for name, seconds in measured.items()}
+    longest = max(map(max, measured.values()), default=A_RUN)
+    return sum(means.get(run.job.contender.sampler, longest) for run in runs)

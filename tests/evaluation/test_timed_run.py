@@ -305,12 +305,18 @@ def test_learning_an_occupancy_is_training_time_and_looking_is_not(
     assert record.train_queries["field"] == 6 * 5
 
 
+def learning_model() -> Any:
+    """A model that learns its occupancy itself, not frozen yet."""
+    model: Any = nn.Module()
+    model.mixture = nn.Module()
+    model.mixture.field, model.mixture.frozen = Fog(), False
+    return model
+
+
 def test_a_step_is_timed_once_there_is_an_occupancy(
     time: Time, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    model = nn.Module()
-    model.mixture = nn.Module()
-    model.mixture.field, model.mixture.frozen = Fog(), False
+    model = learning_model()
     run = Run(time, model, [9.0, 9.0, 9.0, 9.0, 2.0, 1.0, 1.0], monkeypatch)
 
     def freeze(step: int) -> None:
@@ -324,9 +330,7 @@ def test_a_step_is_timed_once_there_is_an_occupancy(
 def test_a_model_that_learns_itself_knows_how_many_steps_are_left_of_its_time(
     time: Time, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    model = nn.Module()
-    model.mixture = nn.Module()
-    model.mixture.field, model.mixture.frozen = Fog(), False
+    model = learning_model()
     run = Run(time, model, [9.0, 9.0, 9.0, 2.0, 4.0, 4.0, 3.0], monkeypatch)
     ends = []
 

@@ -314,7 +314,7 @@ def in_threads(
         take()
         return
     # leaving waits for all: nothing is freed that a thread still writes
-    with ThreadPoolExecutor(threads) as pool:
+    with ThreadPoolExecutor(threads - 1) as pool:
         others = [pool.submit(take) for _ in range(threads - 1)]
         take()
     for other in others:
