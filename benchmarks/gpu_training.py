@@ -131,9 +131,9 @@ class Run:
                 shaded,
                 intervals,
                 rays,
-                homogeneous=self.routing.homogeneous,
+                self.space.half_extent,
+                self.routing.homogeneous,
                 ramped=self.ramped,
-                half_extent=self.space.half_extent,
             )
         loss = torch.stack(list(losses.values())).sum()
         self.optimizer.zero_grad()

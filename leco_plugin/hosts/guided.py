@@ -23,7 +23,7 @@ from leco_plugin.models.compute.device import keep_freed_memory
 from leco_plugin.samplers.nerfacc_cpu import install_for
 from leco_plugin.scenes.input_error import InputError
 from leco_plugin.scenes.survey import places_of
-from leco_plugin.studio.checkpoints import allow_checkpoint_globals, evaluate_whole_checkpoints
+from leco_plugin.studio.checkpoints import prepare_checkpoints
 from leco_plugin.studio.hash_encoding import speed_up_hash_encodings
 
 
@@ -54,8 +54,7 @@ def set_up_guided(config: GuidedModelConfig, **arguments: Any) -> Model:
     """Builds the host of what nerfstudio gives a model, swaps its sampler, and returns the host.
     InputError if it has no seam that is known, or there is no such sampler for it, or none with
     these options."""
-    allow_checkpoint_globals()
-    evaluate_whole_checkpoints()
+    prepare_checkpoints()
     install_for(arguments.get("device"))
     keep_freed_memory(arguments.get("device", "cpu"))
     host_config, occupancy = copy.deepcopy(config.host), config.occupancy

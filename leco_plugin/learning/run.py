@@ -172,6 +172,10 @@ class Progress:
         """Whether the gate is suspected of having stopped to decide."""
         return self.suspected_since >= 0 or self.watch.nothing_since >= 0
 
+    def has_shaded(self, share: float) -> None:
+        """Takes in which share of a batch's candidates was shaded while the gate is learned."""
+        self.learning_kept = 0.9 * self.learning_kept + 0.1 * share
+
     def begin(self, configured: int, most: int) -> None:
         """Sets `learn_steps`, unless a checkpoint did so under the same config.
 

@@ -7,11 +7,7 @@ from typing import Any
 
 import torch
 from nerfstudio.cameras.rays import RayBundle
-from nerfstudio.engine.callbacks import (
-    TrainingCallback,
-    TrainingCallbackAttributes,
-    TrainingCallbackLocation,
-)
+from nerfstudio.engine import callbacks
 from nerfstudio.model_components.renderers import RGBRenderer
 from nerfstudio.models.base_model import Model
 from torch import Tensor, nn
@@ -33,17 +29,8 @@ from leco_plugin.scenes.input_error import state_of_this_version
 from leco_plugin.scenes.learning_data import LearningData
 from leco_plugin.scenes.pixels.known_distances import DISTANCE
 from leco_plugin.scenes.survey import places_of
-from leco_plugin.studio.checkpoints import (
-    allow_checkpoint_globals,
-    evaluate_whole_checkpoints,
-    refuse_earlier,
-)
-from leco_plugin.studio.occupancy_view import (
-    Drawn,
-    DrawnInViewer,
-    OccupancyView,
-    is_viewer_drawing,
-)
+from leco_plugin.studio.checkpoints import prepare_checkpoints, refuse_earlier
+from leco_plugin.studio.occupancy_view import Drawn, DrawnInViewer, OccupancyView, is_viewer_drawing
 from leco_plugin.studio.run_folder import run_of
 
 
@@ -63,8 +50,7 @@ class LecoModel(DrawnInViewer, Model):
     def populate_modules(self) -> None:
         """Builds the mixture, in sizes of the scene where none are given."""
         super().populate_modules()
-        allow_checkpoint_globals()
-        evaluate_whole_checkpoints()
+        prepare_checkpoints()
         config, device = self.config, self.kwargs.get("device", "cpu")
         keep_freed_memory(device)
         metadata = self.kwargs.get("metadata") or {}
@@ -96,17 +82,14 @@ class LecoModel(DrawnInViewer, Model):
         return {name: group or [self.device_indicator_param] for name, group in groups.items()}
 
     def get_training_callbacks(
-        self, training_callback_attributes: TrainingCallbackAttributes
-    ) -> list[TrainingCallback]:
+        self, training_callback_attributes: callbacks.TrainingCallbackAttributes
+    ) -> list[callbacks.TrainingCallback]:
         """Finds the scene's bounds now, and returns what runs around each step."""
         attributes = training_callback_attributes
         assert attributes.pipeline is not None
         learner = self.learner(attributes.pipeline.datamanager, run_of(attributes.trainer))
         learner.begin()
-        before, after = (
-            TrainingCallbackLocation.BEFORE_TRAIN_ITERATION,
-            TrainingCallbackLocation.AFTER_TRAIN_ITERATION,
-        )
+        where, around = callbacks.TrainingCallbackLocation, callbacks.TrainingCallback
         started = seconds_now()
 
         def before_step(step: int) -> None:
@@ -117,7 +100,10 @@ class LecoModel(DrawnInViewer, Model):
         def after_step(step: int) -> None:
             learner.after_step(step, seconds_now() - started, self.kept_per_ray)
 
-        return [TrainingCallback([before], before_step), TrainingCallback([after], after_step)]
+        return [
+            around([where.BEFORE_TRAIN_ITERATION], before_step),
+            around([where.AFTER_TRAIN_ITERATION], after_step),
+        ]
 
     def learner(self, manager: Any, run: Run) -> Learner:
         """What carries the mixture through a run on the data of a data manager."""
@@ -147,16 +133,14 @@ class LecoModel(DrawnInViewer, Model):
         mixture, plan = self.mixture, self.plan
         coarse = self.training and plan.coarse
         jitter = torch.rand_like(rays.t_mins) if self.training else None
-        if mixture.skips:
-            return mixture.with_backdrops(rays, mixture.kept(rays, coarse, jitter), coarse)
-        intervals = mixture.candidates(rays, coarse, jitter)
-        if plan.following is not None and (self.training or is_viewer_drawing()):
-            likely = mixture.follow(rays, intervals, plan.following)
+        intervals = mixture.kept(rays, coarse, jitter)
+        following = None if mixture.skips else plan.following
+        if following is not None and (self.training or is_viewer_drawing()):
+            candidates = len(intervals.t_starts)
+            intervals = mixture.follow(rays, intervals, following)
             if self.training:
-                share = len(likely.t_starts) / max(len(intervals.t_starts), 1)
-                self.progress.learning_kept = 0.9 * self.progress.learning_kept + 0.1 * share
-            intervals = likely
-        if not self.training:
+                self.progress.has_shaded(len(intervals.t_starts) / max(candidates, 1))
+        if not (self.training or mixture.skips):
             intervals = mixture.seen(rays, intervals)
         return mixture.with_backdrops(rays, intervals, coarse)
 
@@ -203,17 +187,15 @@ class LecoModel(DrawnInViewer, Model):
             FloatingPointError: a loss is not finite; the step was not taken.
         """
         shaded: Shaded = outputs["shaded"]
-        intervals, rays = outputs["intervals"], outputs["rays"]
-        region, plan = self.mixture.region, self.plan
+        batch_of = shaded, outputs["intervals"], outputs["rays"]
+        config, region, plan = self.config, self.mixture.region, self.plan
         image = batch["image"].to(self.device)
         if len(image) == 0:
             raise ValueError("a training batch holds no rays: are all pixels masked?")
         known = batch.get(DISTANCE)
         losses = field_losses(
-            self.config,
-            shaded,
-            intervals,
-            rays,
+            config,
+            *batch_of,
             self.renderer_rgb.blend_background(image),
             image[:, 3] if image.shape[-1] == 4 else None,
             None if known is None else known.to(self.device),
@@ -223,15 +205,8 @@ class LecoModel(DrawnInViewer, Model):
             ramped=plan.ramped,
         )
         if plan.gate_loss is not None and not bool(self.mixture.frozen):
-            losses |= gate_losses(
-                plan.gate_loss,
-                shaded,
-                intervals,
-                rays,
-                homogeneous=self.config.homogeneous,
-                ramped=plan.ramped,
-                half_extent=region.space.half_extent,
-            )
+            unit, equal = region.space.half_extent, config.homogeneous
+            losses |= gate_losses(plan.gate_loss, *batch_of, unit, equal, ramped=plan.ramped)
         require_finite(losses, self, outputs, image)
         return losses
 

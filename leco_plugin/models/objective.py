@@ -136,17 +136,17 @@ def gate_losses(
     shaded: Shaded,
     intervals: Intervals,
     rays: Rays,
-    *,
-    homogeneous: bool,
-    ramped: float,
     half_extent: Tensor,
+    homogeneous: bool,
+    *,
+    ramped: float,
 ) -> dict[str, Tensor]:
     """Weighted losses of one batch, by name.
 
     Args:
+        half_extent: scalar, scene units in the unit of density.
         homogeneous: only the balance among the scene experts.
         ramped: how far the distortion loss has come in, in [0, 1]; agreement comes in with it.
-        half_extent: scalar, scene units in the unit of density.
     """
     logits, routes = shaded.logits, shaded.routes
     on_scene = (routes > 0).nonzero()[:, 0]

@@ -48,7 +48,7 @@ from leco_plugin.scenes.input_error import InputError
 from leco_plugin.scenes.learning_data import LearningData
 from leco_plugin.scenes.survey import announce, places_of
 from leco_plugin.space import Space
-from leco_plugin.studio.checkpoints import allow_checkpoint_globals, evaluate_whole_checkpoints
+from leco_plugin.studio.checkpoints import prepare_checkpoints
 
 
 def scene_grid(space: Space, aabb: Tensor, resolution: int, levels: int) -> OccupancyGridEstimator:
@@ -88,8 +88,7 @@ class SwitchNerfModel(Model):
                 f"capacity_factor must be positive, got {self.config.capacity_factor}; "
                 "leave it out for dropless routing"
             )
-        allow_checkpoint_globals()
-        evaluate_whole_checkpoints()
+        prepare_checkpoints()
         device = self.kwargs.get("device", "cpu")
         keep_freed_memory(device)
         self.precision = fast_precision(device)

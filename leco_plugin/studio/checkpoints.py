@@ -35,7 +35,6 @@ _FLOAT64_SCALAR: list[Any] = [
 def allow_checkpoint_globals() -> None:
     """Allows `torch.load` to read float64 numpy scalars, and nothing else, in this process.
 
-    Called by every model of this package when it is built, before nerfstudio loads a checkpoint.
     Older releases of torch load nerfstudio's checkpoints as they are, and do not take names beside
     their list's entries.
     """
@@ -184,9 +183,15 @@ def checkpoints_of(config: Any) -> Path:
 EVAL_UTILS = "nerfstudio.utils.eval_utils"
 
 
+def prepare_checkpoints() -> None:
+    """Has checkpoints of this process read safely and whole; every model of this package calls it
+    when it is built, which is before nerfstudio loads one."""
+    allow_checkpoint_globals()
+    evaluate_whole_checkpoints()
+
+
 def evaluate_whole_checkpoints() -> None:
-    """Has nerfstudio, where its loading of runs is imported, load the newest checkpoint that is
-    whole; called by every model of this package when it is built, which is before."""
+    """Has nerfstudio, where its loading of runs is imported, load the newest whole checkpoint."""
     utils: Any = sys.modules.get(EVAL_UTILS)
     if utils is None or hasattr(utils.eval_load_checkpoint, "__wrapped__"):
         return

@@ -34,9 +34,7 @@ def batch() -> tuple[Shaded, Intervals]:
 
 def losses_of(config: GateLossConfig, shaded: Shaded, intervals: Intervals):
     half_extent = torch.tensor(2.0)
-    return gate_losses(
-        config, shaded, intervals, RAYS, homogeneous=False, ramped=1.0, half_extent=half_extent
-    )
+    return gate_losses(config, shaded, intervals, RAYS, half_extent, homogeneous=False, ramped=1.0)
 
 
 @pytest.mark.parametrize("form", ["logit", "paper"])
