@@ -333,6 +333,7 @@ class Learner:
         report["sharpened"] = [*report.get("sharpened", []), [step, round(seconds, 2)]]
         mixture.sharpen(found.gate.to(mixture.device), found.measured.threshold, report)
         self.watch.state.evidence = {}  # of what guided before
+        self.watch.put_off(step)
         if self.run.folder is not None:
             leave_file(mixture.occupancy(), self.run.folder)
         self.run.save(step)  # what is killed from now on goes on with the gate of the file

@@ -200,6 +200,8 @@ def test_it_is_sharpened_at_the_end_of_a_run_that_pays_for_it(
     assert (mixture.small is not None) == sharpened
     assert learner.progress.sharpened_at == (last if sharpened else -1)
     assert run.saved == ([last] if sharpened else [])
+    soon = last + NEVER_AGAIN.steps_per_recheck
+    assert learner.watch.state.due == (soon if sharpened else 0), "its price is measured soon"
     if not sharpened:
         return
     file = Occupancy.load(tmp_path / "occupancy.safetensors")
