@@ -78,7 +78,8 @@ def kept_surface(
         resolution: cells along the longest side of the space in which the gate was taught. Those of
             an unbounded scene grow with distance, as its mapping has it.
     Raises:
-        ValueError: the resolution is below 2 or makes too many cells, or nothing is kept.
+        ValueError: the resolution is below 2 or makes too many cells, nothing is kept, or no camera sees
+            its surface.
     """
     if resolution < 2:
         raise ValueError(f"a surface takes at least 2 cells along a side, not {resolution}")
@@ -111,6 +112,11 @@ def kept_surface(
             met.append(_first_met(occupancy, part, cameras, cell, round(REACH * resolution)))
             on_progress(0.3 + 0.7 * min(1.0, (number + 1) * (CELLS_AT_ONCE >> 4) / len(places)))
         places = places[torch.cat(met)]
+        if not len(places):
+            raise ValueError(
+                "no camera sees a surface of what is kept: all of them lie inside it; look at it "
+                "with leco inspect"
+            )
         chosen = chosen.masked_scatter(kept, torch.cat(met))
     return KeptSurface(_unmap(occupancy, places), values[chosen])
 

@@ -35,7 +35,8 @@ def codes_nearby(codes: Tensor, places: Tensor, origins: Tensor) -> Tensor:
     """Codes of views from those of the photographs nearby: exposure drifts along a flight.
 
     Weights fall with the square of the distance, as a bell; far from all photographs the nearest
-    one counts.
+    one counts. Where neighbours do not tell the code of a photograph between them, as where each has
+    an exposure of its own, they do not tell that of a view: it has the mean of all.
 
     Args:
         codes: [N, D] of photographs.
@@ -44,12 +45,20 @@ def codes_nearby(codes: Tensor, places: Tensor, origins: Tensor) -> Tensor:
     Returns:
         [R, D].
     """
+    mean = codes.mean(dim=0)
+    if len(places) < 2:
+        return mean.expand(len(origins), -1)
     views, of_view = origins.unique(dim=0, return_inverse=True)
     between = torch.cdist(places, places).fill_diagonal_(torch.inf)
-    spacing = between.amin(dim=1).nanmedian() if len(places) > 1 else places.new_ones(())
-    reach = NEARBY * spacing.clamp(min=1e-6)
-    weights = torch.softmax(-(torch.cdist(views, places) / reach).square(), dim=1)
-    return (weights @ codes).index_select(0, of_view)
+    reach = NEARBY * between.amin(dim=1).nanmedian().clamp(min=1e-6)
+
+    def beside_the_mean(distances: Tensor) -> Tensor:
+        return torch.softmax(-(distances / reach).square(), dim=1) @ codes - mean
+
+    told, own = beside_the_mean(between), codes - mean
+    share = ((told * own).sum() / told.square().sum().clamp(min=1e-20)).clamp(0.0, 1.0)
+    found = mean + share * beside_the_mean(torch.cdist(views, places))
+    return found.index_select(0, of_view)
 
 
 class ColorHead(nn.Module):

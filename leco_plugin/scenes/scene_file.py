@@ -143,9 +143,7 @@ def scene_file_of(config: Any, split: str) -> SceneFile | None:
     if file is None:
         return None
     if not data.exists():
-        raise InputError(
-            f"there is no folder {data}: put it, or a link, there, or give another with --data"
-        )
+        raise InputError(f"there is no folder {data}: put it, or a link, there, or give another")
     if not file.exists():
         beside = sorted(file.parent.glob("transforms_*.json"))
         instead = remedy_for(data) or (

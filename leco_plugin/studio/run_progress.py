@@ -32,6 +32,7 @@ from rich.console import Console
 from torch import Tensor, nn
 
 from leco_plugin.evaluation.held_out_psnr import OF, HeldOutPsnr
+from leco_plugin.evaluation.inspection import describe, doubts
 from leco_plugin.evaluation.metrics import FigureUnavailable
 from leco_plugin.learning.freezing import FILE_NAME
 from leco_plugin.learning.quality import FIELD, ON_TESTS, ONE_COLOUR
@@ -182,6 +183,8 @@ class RunProgress:
             say_all(doubted)
             if tested is not None and occupancy.exists():
                 note_failure(occupancy, tested, self.psnr.of_one_colour)
+        elif occupancy.exists():
+            say_all(doubts(describe(Occupancy.load(occupancy))))
         say(f"  run        {folder}")
         if occupancy.exists():
             say(f"  occupancy  {occupancy}, {occupancy.stat().st_size / 1e3:.0f} kB")

@@ -76,6 +76,14 @@ def test_an_occupancy_that_keeps_nothing_is_refused_in_one_line() -> None:
         kept_surface(ball(), 1)
 
 
+def test_a_surface_that_no_camera_sees_is_refused_in_one_line() -> None:
+    inside = ball()
+    inside.report = {**inside.report, "cameras": [list(CENTRE)]}
+    with pytest.raises(ValueError, match="no camera sees .* lie inside it") as error:
+        kept_surface(inside, 16)
+    assert "\n" not in str(error.value)
+
+
 def test_slabs_do_not_change_the_surface(monkeypatch: pytest.MonkeyPatch) -> None:
     whole = kept_surface(ball(), 20)
     monkeypatch.setattr("leco_plugin.export_surface.CELLS_AT_ONCE", 1000)

@@ -30,6 +30,10 @@ HOSTS = {
 }
 
 
+PAIRS = torch.tensor([0.0, 1.0, 50.0, 51.0])
+"""Where photographs are taken two by two, so that neighbours tell each other's codes."""
+
+
 def built(host: Any, codes: Any = "small", sampler: str = "own", **given: Any) -> Any:
     config = GuidedModelConfig(host=host, occupancy=OccupancyConfig(sampler=sampler), codes=codes)
     return config.setup(**what_a_model_gets() | given)
@@ -62,13 +66,14 @@ def test_codes_part_slowly_and_their_mean_is_scaled_alike() -> None:
 @pytest.mark.parametrize("name", HOSTS)
 @torch.no_grad()
 def test_a_view_is_shown_in_the_light_of_the_photographs_nearby(name: str) -> None:
-    cameras = Cameras(torch.eye(4)[:3].repeat(2, 1, 1), 10.0, 10.0, 2.0, 2.0)
-    cameras.camera_to_worlds[1, 0, 3] = 9.0
-    host = built(HOSTS[name], metadata={CAMERAS: cameras}).eval()
+    cameras = Cameras(torch.eye(4)[:3].repeat(4, 1, 1), 10.0, 10.0, 2.0, 2.0)
+    cameras.camera_to_worlds[:, 0, 3] = PAIRS
+    host = built(HOSTS[name], metadata={CAMERAS: cameras}, num_train_data=4).eval()
     codes = host.field.embedding_appearance
     nn.init.normal_(codes.embedding.weight, std=30.0)
+    codes.embedding.weight[1::2] = codes.embedding.weight[::2]
     table = codes.embedding.weight
-    for one in (0, 1):
+    for one in (0, 3):
         host.get_outputs_for_camera(cameras[one : one + 1])
         expected = codes_nearby(table, cameras.camera_to_worlds[:, :, 3], codes.origin)[0]
         assert torch.equal(codes.origin, cameras.camera_to_worlds[one : one + 1, :, 3])
@@ -128,9 +133,10 @@ def test_a_host_of_another_package_gets_a_line_about_what_was_done_and_what_not(
 
 
 def test_rays_of_several_views_at_once_have_the_mean_code() -> None:
-    small = SmallCodes(2, 8)
-    nn.init.normal_(small.embedding.weight, std=30.0)
-    small.places = torch.tensor([[0.0, 0.0, 0.0], [9.0, 0.0, 0.0]])
+    small = SmallCodes(4, 8)
+    small.embedding.weight = nn.Parameter(30.0 * torch.randn(2, 8).repeat_interleave(2, dim=0))
+    small.places = torch.zeros(4, 3)
+    small.places[:, 0] = PAIRS
     mean = 0.1 * small.embedding.weight.mean(dim=0)
     show_from(small, small.places[:1].expand(5, 3))
     assert not torch.allclose(small.mean(), mean, atol=0.1)

@@ -62,17 +62,27 @@ def test_the_image_decides_the_colour_and_rendering_takes_the_mean_code() -> Non
 
 def test_a_view_takes_the_codes_of_the_photographs_nearby() -> None:
     places = torch.tensor([[0.0, 0, 0], [1, 0, 0], [2, 0, 0], [3, 0, 0]], dtype=torch.float32)
-    codes = torch.eye(4)
+    codes = torch.stack([places[:, 0], 5.0 - places[:, 0]], dim=1)  # as light drifts on a flight
     at, between, away = codes_nearby(
         codes, places, torch.tensor([[0.0, 0, 0], [1.5, 0, 0], [90, 0, 0]])
     )
-    assert at.argmax() == 0 and torch.allclose(
-        at, torch.softmax(-((torch.arange(4) / 1.5) ** 2), 0)
-    )
-    torch.testing.assert_close(between, between.flip(0))
+    torch.testing.assert_close(at, torch.softmax(-((torch.arange(4) / 1.5) ** 2), 0) @ codes)
+    torch.testing.assert_close(between, codes.mean(dim=0))
     torch.testing.assert_close(away, codes[3])
-    moved = codes_nearby(codes, 100.0 * places, torch.tensor([[150.0, 0, 0]]))[0]
-    torch.testing.assert_close(moved, between)  # whatever the units are
+    moved = codes_nearby(codes, 100.0 * places, torch.tensor([[0.0, 0, 0]]))[0]
+    torch.testing.assert_close(moved, at)  # whatever the units are
+
+
+def test_neighbours_count_as_far_as_they_tell_each_others_codes() -> None:
+    torch.manual_seed(0)
+    places, view = torch.zeros(400, 3), torch.tensor([[7.2, 0, 0]])
+    places[:, 0] = torch.arange(400.0)
+    alike, mixed = torch.sin(places[:, :1] / 20.0), torch.randn(400, 1)
+    of_a_drift = codes_nearby(alike, places, view)
+    torch.testing.assert_close(of_a_drift, torch.sin(view[:, :1] / 20.0), atol=0.02, rtol=0.0)
+    of_chance = codes_nearby(mixed, places, view) - mixed.mean()
+    nearest = torch.softmax(-((places - view).norm(dim=1) / 1.5).square(), dim=0) @ mixed
+    assert float(of_chance.abs()) < 0.2 * float((nearest - mixed.mean()).abs())
 
 
 @pytest.mark.parametrize("count", [1, 3])
@@ -84,7 +94,11 @@ def test_photographs_from_one_place_count_alike(count: int) -> None:
 
 def test_rays_of_one_batch_have_the_codes_of_their_own_places() -> None:
     color, (features, ray_indices, directions) = head(), inputs()
-    color.places = 5.0 * torch.eye(3)
+    assert color.appearance is not None
+    color.appearance = torch.nn.Embedding.from_pretrained(
+        color.appearance.weight[[0, 0, 1, 1]].detach()
+    )
+    color.places = torch.tensor([[0.0, 0, 0], [1, 0, 0], [50, 0, 0], [51, 0, 0]])
     origins = color.places[[2, 0, 1, 1, 2]]
     found = color(features, ray_indices, directions, None, origins)
     for ray in range(5):

@@ -71,6 +71,25 @@ def test_the_screen_fits_and_ends_with_what_to_do_next(
     assert "\x1b" not in log
 
 
+@pytest.mark.parametrize("by_tests", [True, False])
+def test_a_scene_that_fails_is_said_to_fail_before_at_freezing_and_at_the_end(
+    by_tests: bool,
+    tiny_scene: Path,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Where PSNR at the end is no reason, what is known of the occupancy still is."""
+    if not by_tests:
+        monkeypatch.setattr(held_out_psnr.HeldOutPsnr, "doubts", lambda *_: [])
+    screen = "\n".join(run(watched(tiny_scene, tmp_path), capsys)[0])
+    before, at_freezing = screen.split("occupancy learned in")
+    at_freezing, at_the_end = at_freezing.split("finished:")
+    assert "training photographs are few" in before and "bounds are guessed" in before
+    for part in (at_freezing, at_the_end):
+        assert part.count("this scene was not learned") == part.count("what helps: more") == 1
+
+
 def test_a_guided_host_shows_psnr_while_it_learns_and_after(
     tiny_scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

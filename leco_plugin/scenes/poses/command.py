@@ -46,6 +46,8 @@ BYTES_A_PHOTOGRAPH = 1_000_000
 """Of disk for features and matches: a survey of 800 pixels took 0.74 million."""
 WRONG = 50.0
 """Metres from its pose beyond which a position by GPS is no scatter: its photograph is named."""
+FEW_PLACED = 0.8
+"""Share of the photographs up to which a line says what places more."""
 NAMED = 5
 """Photographs that are named in a line; the report names all."""
 
@@ -221,7 +223,7 @@ def summary(report: dict[str, Any]) -> list[str]:
             f"with the rest: {'; '.join(_some(block) for block in blocks[:NAMED])}; their models "
             "stay in colmap/models, and leco poses on a block alone makes it a scene"
         )
-    if 2 * placed < count:
+    if placed <= FEW_PLACED * count:
         lines.append("more overlap between neighbours places more photographs")
     gps = report["gps"]
     if gps["used"]:

@@ -122,6 +122,7 @@ def _number(value: Any, otherwise: float = 0.0) -> float:
 HEIC = (".heic", ".heif")
 KINDS = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".webp", ".bmp", *HEIC)
 RAW = (".dng", ".cr2", ".cr3", ".nef", ".arw", ".raf", ".rw2", ".orf")
+FILMS = (".mp4", ".mov", ".avi", ".mkv", ".m4v")
 COPIED = (".jpg", ".jpeg", ".png")
 """Kinds that are copied byte by byte where their colours need no change."""
 FEWEST = 3
@@ -187,6 +188,9 @@ def find_photographs(folder: Path, out: Path) -> Found:
         remedy = "take more, from different places, whose pictures overlap by two thirds"
         if raw:
             remedy = f"{raw} raw files are not read, save them as JPEG"
+        elif films := sum(path.suffix.lower() in FILMS for path in files):
+            remedy = f"{films} videos are not read: take pictures out of them, two a second, as by "
+            remedy += "ffmpeg -i FILM -vf fps=2 PHOTOS/%05d.jpg"
         elif not found:
             kinds = ", ".join(sorted(KINDS))
             remedy = f"give the folder that holds them; files that end in {kinds} are read"

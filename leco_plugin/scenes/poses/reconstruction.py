@@ -211,7 +211,10 @@ FEW = 40
 NEIGHBOURS = 16
 """Nearest photographs by position that each is compared with."""
 WIDE = 20.0
-"""Metres from their middle, root mean square, from which on positions tell who sees the same."""
+"""Metres from their middle, in the median, from which on positions tell who sees the same."""
+ASTRAY = 0.7
+"""Median distance of one photograph to the next in order, as a multiple of that of any two, from
+which on order and GPS contradict each other."""
 NEXT = 10
 """Photographs in order that each is compared with, and one at each power of two beyond."""
 ANCHORS = 100
@@ -235,21 +238,37 @@ def choose_pairs(names: Sequence[str], exifs: Sequence[Exif], places: NDArray[np
     order = capture_order(names, exifs)
     steps = {*range(1, NEXT + 1), *(2**power for power in range(count.bit_length()))}
     known = np.isfinite(places[:, 0])
-    apart = places[known, :2] - np.median(places[known, :2], axis=0) if known.any() else 0.0
-    if known.mean() >= 0.5 and np.sqrt(2.0 * np.mean(np.square(apart))) >= WIDE:
-        numbers = known.nonzero()[0]
+    numbers = known.nonzero()[0]
+    if known.mean() >= 0.5 and _spread(places[known, :2]) >= WIDE:
         near = _near(places[numbers, :2], np.arange(NEIGHBOURS))
         found = {(int(numbers[one]), int(numbers[other])) for one, other in near}
-        found |= _in_order(order or [], (1, 2))
+        contradict = order is not None and _is_astray(places[order, :2])
+        found |= _in_order(order or [], steps if contradict else (1, 2))
         lost = [number for number in range(count) if not known[number]]
         around = _in_order(order, steps) if order else set(everything)
         found |= {pair for pair in around if {*pair} & {*lost}}
-        return Pairs(sorted(found), f"{NEIGHBOURS} nearest by GPS")
+        also = ", and next in order, which GPS contradicts" if contradict else ""
+        return Pairs(sorted(found), f"{NEIGHBOURS} nearest by GPS{also}")
     if order is None or count <= ANCHORS:
         return Pairs(everything, "all pairs")
     anchors = order[:: -(-count // ANCHORS)]
     loops = {(min(pair), max(pair)) for pair in combinations(anchors, 2)}
     return Pairs(sorted(_in_order(order, steps) | loops), f"{NEXT} next in order, and loops")
+
+
+def _spread(places: NDArray[np.float64]) -> float:
+    """Median distance of places [N, 2] from their middle."""
+    return float(np.median(np.linalg.norm(places - np.median(places, axis=0), axis=1)))
+
+
+def _is_astray(places: NDArray[np.float64]) -> bool:
+    """Whether photographs at places [N, 2], in order, are hardly nearer to the next than to any."""
+    known = places[np.isfinite(places[:, 0])]
+    if len(known) < 3:
+        return False
+    of_next = np.linalg.norm(np.diff(known, axis=0), axis=1)
+    between = np.linalg.norm(known[:, None] - known[None], axis=2)
+    return bool(np.median(of_next) > ASTRAY * np.median(between[np.triu_indices(len(known), 1)]))
 
 
 def choose_posed_pairs(poses: NDArray[np.float64]) -> Pairs:

@@ -241,6 +241,16 @@ def test_the_summary_names_some_and_counts_the_rest() -> None:
     ]
 
 
+@pytest.mark.parametrize(("placed", "advised"), [(8, True), (9, False)])
+def test_more_overlap_is_advised_where_a_fifth_is_not_placed(placed: int, advised: bool) -> None:
+    report = {
+        **{"photographs": 10, "placed": placed, "points": 9, "reprojection_error": 0.5},
+        **{"not_placed": ["lost.jpg"], "not_read": [], "other_blocks": []},
+        "gps": {"used": False, "reason": "no photograph has GPS"},
+    }
+    assert any("more overlap" in line for line in summary(report)) == advised
+
+
 def test_photographs_whose_gps_contradicts_their_poses_are_named() -> None:
     model: Any = SimpleNamespace(
         images={number: photographed(f"{number}.jpg") for number in range(5)},

@@ -61,6 +61,22 @@ def test_gps_decides_only_where_it_is_finer_than_the_survey(spread: float) -> No
     assert (found.reason == "all pairs") == (spread < 1.0)
 
 
+def test_gps_that_contradicts_the_order_does_not_decide_alone() -> None:
+    places = np.array(grid(30, 20, step=20.0))
+    shuffled = places[np.random.default_rng(0).permutation(600)]
+    found = choose_pairs(names(600), [Exif()] * 600, shuffled)
+    assert "which GPS contradicts" in found.reason
+    assert {(number, number + 10) for number in range(590)} <= {*found.pairs}
+    unordered = choose_pairs(["a.jpg"] * 600, [Exif()] * 600, shuffled)
+    assert unordered.reason == f"{NEIGHBOURS} nearest by GPS", "no order tells anything"
+
+
+def test_one_wrong_position_does_not_make_a_small_place_wide() -> None:
+    places = 2.0 * np.random.default_rng(0).normal(size=(60, 3))
+    places[7, :2] = 5000.0
+    assert choose_pairs(names(60), [Exif()] * 60, places).reason == "all pairs"
+
+
 def test_an_ordered_survey_without_gps_grows_with_its_length() -> None:
     count = 2000
     found = choose_pairs(names(count), [Exif()] * count, nothing(count))
