@@ -23,7 +23,6 @@ from leco_plugin.stability.table import draw as draw_stability
 
 CHARTS = ROOT / "docs" / "images" / "charts"
 GROWTH, LEARNING = CHARTS / "growth.png", CHARTS / "learning.png"
-DEMO_CHART = ROOT / "docs" / "images" / "demo-chart.png"
 COLOURS = 128
 """Of a picture in the repository."""
 
@@ -31,9 +30,6 @@ COLOURS = 128
 def pictures() -> dict[Path, Any]:
     """Every picture that is drawn from stored results, and those results."""
     found: dict[Path, Any] = {}
-    if (RESULTS / "demo.json").exists():
-        runs = json.loads((RESULTS / "demo.json").read_text())["runs"]
-        found |= {DEMO_CHART: runs, DEMO_CHART.with_stem("demo-chart-dark"): runs}
     for name in titles():
         results = stored(name)
         found |= {CHARTS / f"{name}.png": results, CHARTS / f"{name}-dark.png": results}
@@ -52,17 +48,13 @@ def pictures() -> dict[Path, Any]:
 
 def draw_pictures(redraw: bool) -> None:
     """All of `pictures`, or those that are of other results."""
-    from leco_plugin.demo import draw_chart
-
     CHARTS.mkdir(parents=True, exist_ok=True)
     for path, results in pictures().items():
         if not (redraw or is_stale(path, results)):
             continue
         theme = DARK if path.stem.endswith("-dark") else LIGHT
         name = path.stem.removesuffix("-dark")
-        if name == DEMO_CHART.stem:
-            draw_chart(json.loads((RESULTS / "demo.json").read_text()), path, theme)
-        elif name == GROWTH.stem:
+        if name == GROWTH.stem:
             draw_growth(path, results, theme)
         elif name == LEARNING.stem:
             draw_learning(path, results, theme)

@@ -66,8 +66,7 @@ MORE = """## Further
 
 - **Is a grid enough?** {capacity} [Gates and grids at equal
   loss](measurements.md#how-much-a-scene-needs-gates-and-grids-at-equal-loss).
-- **Does it fail, and when?** (*) {stability} [Stability](stability.md) shows each case. Its
-  table is older than the small appearance codes of hosts, which all samplers lacked alike.
+- **Does it fail, and when?** {stability} [Stability](stability.md) shows each case.
 - **How does it grow with a city?** {growth}
   [Growth](measurements.md#how-occupancy-grows-with-a-city).
 - **Where does the time of a step go?** [A profile](measurements.md#where-the-time-of-a-step-goes).

@@ -78,8 +78,8 @@ def kept_surface(
         resolution: cells along the longest side of the space in which the gate was taught. Those of
             an unbounded scene grow with distance, as its mapping has it.
     Raises:
-        ValueError: the resolution is below 2 or makes too many cells, nothing is kept, or no camera sees
-            its surface.
+        ValueError: the resolution is below 2 or makes too many cells, nothing is kept, or no camera
+            sees its surface.
     """
     if resolution < 2:
         raise ValueError(f"a surface takes at least 2 cells along a side, not {resolution}")

@@ -35,8 +35,8 @@ def codes_nearby(codes: Tensor, places: Tensor, origins: Tensor) -> Tensor:
     """Codes of views from those of the photographs nearby: exposure drifts along a flight.
 
     Weights fall with the square of the distance, as a bell; far from all photographs the nearest
-    one counts. Where neighbours do not tell the code of a photograph between them, as where each has
-    an exposure of its own, they do not tell that of a view: it has the mean of all.
+    one counts. Where neighbours do not tell each other's codes, as where each photograph has an
+    exposure of its own, they do not tell that of a view: it has the mean of all.
 
     Args:
         codes: [N, D] of photographs.

@@ -187,7 +187,7 @@ def test_a_folder_of_raw_files_says_what_to_do(tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"no photographs, .*give the folder .*\.jpg"):
         find_photographs(tmp_path, tmp_path / "out")
     (tmp_path / "DJI_0001.MP4").write_bytes(b"film")
-    with pytest.raises(InputError, match="no photographs, .*1 videos are not read: .* ffmpeg -i"):
+    with pytest.raises(InputError, match=r"no photographs, .*1 videos are not read: .* ffmpeg -i"):
         find_photographs(tmp_path, tmp_path / "out")
     (tmp_path / "DJI_0001.DNG").write_bytes(b"raw")
     with pytest.raises(InputError, match=r"no photographs, .*1 raw files are not read, save them"):
