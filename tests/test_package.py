@@ -74,3 +74,18 @@ def test_every_python_that_is_declared_is_tried_before_a_release() -> None:
     declared = re.findall(r"Python :: (3\.\d+)", (ROOT / "pyproject.toml").read_text())
     jobs = yaml.safe_load((ROOT / ".github" / "workflows" / "release.yml").read_text())["jobs"]
     assert declared and jobs["try"]["strategy"]["matrix"]["python"] == declared
+
+
+def test_the_sdist_has_every_file_that_git_keeps() -> None:
+    """`make dist` and the release refuse one that lacks any; setuptools adds some by itself."""
+    listed = subprocess.run(
+        ["git", "ls-files"], cwd=ROOT, capture_output=True, text=True, check=False
+    )
+    if listed.returncode or not (ROOT / ".git").exists():
+        pytest.skip("no clone")
+    rules = [line.split() for line in (ROOT / "MANIFEST.in").read_text().splitlines()]
+    folders = {"leco_plugin", *(words[1] for words in rules if words[:1] == ["graft"])}
+    named = {name for words in rules if words[:1] == ["include"] for name in words[1:]}
+    named |= {"README.md", "LICENSE", "NOTICE", "MANIFEST.in", "pyproject.toml", ".gitignore"}
+    files = listed.stdout.splitlines()
+    assert [f for f in files if f.split("/")[0] not in folders and f not in named] == []
