@@ -59,8 +59,9 @@ The demo's city is known exactly, which photographs never are:
 """
 QUESTIONS = """## The reviewers' questions, answered
 
-Questions of the paper's reviewers, each on every scene of its suite. A scene's name leads to its
-chart; the [tables](suites.md#the-answers-with-their-figures) have all contenders.
+Questions of the paper's reviewers, each on every scene of its suite; in the last two the host is
+Switch-NeRF, in the others the paper's model. A scene's name leads to its chart; the
+[tables](suites.md#the-answers-with-their-figures) have all contenders.
 """
 MORE = """## Further
 

@@ -68,10 +68,10 @@ def test_it_is_said_for_every_scene_whether_ours_is_on_the_fronts(store: Store) 
     link = "#suite-representations-on-city"
     kept = "| 12.5%, 50 kB | 30.0%, 33 kB | 10.0%, 4.0 MB |"
     assert (
-        f"| [city]({link}) {kept} MLP (ours) is the soonest learned and on the front of size"
+        f"| [city]({link}) {kept} MLP (ours) is the soonest learned and unbeaten in size"
         in text
     )
-    assert "MLP (ours) is on the front of size, behind hash grid in learning time" in text
+    assert "MLP (ours) is unbeaten in size, behind hash grid in learning time" in text
 
 
 def test_a_grid_that_is_smaller_and_keeps_less_is_named(store: Store) -> None:

@@ -98,7 +98,7 @@ def test_the_soonest_learned_is_so_beyond_the_spread_of_seeds() -> None:
     assert verdict([ours, slower]) == "ours is the smallest and the soonest learned (3 seeds)"
     hardly = Representation("hardly", {i: Held(60.0, 7.0 + 3.0 * i, 9.0) for i in range(3)})
     assert verdict([ours, hardly]) == (
-        "ours is the smallest and on the front of learning time (3 seeds)"
+        "ours is the smallest and unbeaten in learning time (3 seeds)"
     )
 
 
@@ -203,7 +203,7 @@ GATES = {
         ),
         ("faster smaller", "our own gate was not frozen with every seed"),
         ("wide less", "MLP (ours) is the smallest and the soonest learned"),
-        ("wide less least", "MLP (ours) is the soonest learned and on the front of size"),
+        ("wide less least", "MLP (ours) is the soonest learned and unbeaten in size"),
     ],
 )
 def test_the_verdict_says_where_ours_stands_and_what_is_ahead(names: str, said: str) -> None:

@@ -184,7 +184,7 @@ def shortest_verdict(representations: Sequence[Representation]) -> str:
             return f"{one.name} is the smallest occupancy: {one.median('size'):.0f} kB"
     for one in ours:
         if fronts := fronts_of(one, representations):
-            return f"{one.name} is on the front of {' and of '.join(fronts)}"
+            return f"{one.name} is unbeaten in {' and in '.join(fronts)}"
     leader = _best_ahead(ours[0], representations, "size")
     return f"{ours[0].name} keeps more space than {leader}"
 
@@ -201,7 +201,7 @@ def _place_of(one: Representation, all_of_them: Sequence[Representation]) -> str
     by_space = [name for name in fronts if name not in by_cost]
     said_of = [f"the {CHEAPEST[name]}" for name in by_cost]
     if by_space:
-        said_of.append("on both fronts" if len(by_space) > 1 else f"on the front of {by_space[0]}")
+        said_of.append(f"unbeaten in {' and in '.join(by_space)}")
     return f"{one.name} is {' and '.join(said_of)}" if said_of else ""
 
 
