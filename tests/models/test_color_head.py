@@ -75,9 +75,9 @@ def test_a_view_takes_the_codes_of_the_photographs_nearby() -> None:
 
 def test_neighbours_count_as_far_as_they_tell_each_others_codes() -> None:
     torch.manual_seed(0)
-    places, view = torch.zeros(400, 3), torch.tensor([[7.2, 0, 0]])
-    places[:, 0] = torch.arange(400.0)
-    alike, mixed = torch.sin(places[:, :1] / 20.0), torch.randn(400, 1)
+    places, view = torch.zeros(2000, 3), torch.tensor([[7.2, 0, 0]])
+    places[:, 0] = torch.arange(2000.0)
+    alike, mixed = torch.sin(places[:, :1] / 20.0), torch.randn(2000, 1)
     of_a_drift = codes_nearby(alike, places, view)
     torch.testing.assert_close(of_a_drift, torch.sin(view[:, :1] / 20.0), atol=0.02, rtol=0.0)
     of_chance = codes_nearby(mixed, places, view) - mixed.mean()
