@@ -67,10 +67,7 @@ def test_it_is_said_for_every_scene_whether_ours_is_on_the_fronts(store: Store) 
     assert "Of 2 scenes, MLP (ours) is unbeaten in size on 2 and in learning time on 1." in text
     link = "#suite-representations-on-city"
     kept = "| 12.5%, 50 kB | 30.0%, 33 kB | 10.0%, 4.0 MB |"
-    assert (
-        f"| [city]({link}) {kept} MLP (ours) is the soonest learned and unbeaten in size"
-        in text
-    )
+    assert f"| [city]({link}) {kept} MLP (ours) is the soonest learned and unbeaten in size" in text
     assert "MLP (ours) is unbeaten in size, behind hash grid in learning time" in text
 
 

@@ -178,9 +178,11 @@ def draw(results: Results, path: Path, theme: Theme = LIGHT) -> Path:
     axes: Any = figure.add_axes((0, 0, 1, 1))
     axes.set(xlim=(0, width), ylim=(height, 0))
     axes.axis("off")
-    sentence = textwrap.fill(headline(results), int(width * 8.6))
-    bold = {"fontsize": 14 if sentence.count("\n") < 2 else 11.5, "fontweight": "bold"}
-    axes.text(0.15, 0.12, sentence, va="top", color=theme.ink, **bold)
+    title, _, others = headline(results).partition("; ")
+    title, below = textwrap.fill(title, int(width * 8.6)), textwrap.fill(others, int(width * 11))
+    axes.text(0.15, 0.12, title, va="top", color=theme.ink, fontsize=14, fontweight="bold")
+    low = 0.12 + 0.28 * (title.count("\n") + 1)
+    axes.text(0.15, low, below, va="top", color=theme.ink, fontsize=11)
     named = {"fontsize": 10.5, "color": theme.ink}
     for number, one in enumerate(samplers):
         middle = NAMES + COLUMN * (number + 0.5)
