@@ -34,8 +34,8 @@ RULES_MARKS = "<!-- rules: generated -->", "<!-- end of the rules -->"
 COMMANDS_HEAD = """# Commands
 
 Every command prints its help with `-h`. It exits with 0, with 2 for bad input and with 1 for a
-failure; each error is one line. `--json FILE` also writes the result as JSON. An option that is on
-is turned off by `--no-NAME`.
+failure; each error is one line, but for a wrong option, which is shown in a box. `--json FILE` also
+writes the result as JSON. An option that is on is turned off by `--no-NAME`.
 
 `ns-train`, `ns-eval`, `ns-render`, `ns-export` and `ns-viewer` are
 [nerfstudio's](https://docs.nerf.studio). [Options](options.md) lists what our methods add to
