@@ -24,14 +24,14 @@ OURS = "leco-occupancy"
 def readme(text: str) -> str:
     """The README with its tables renewed."""
     text = between(text, DEMO, demo_table(json.loads((RESULTS / "demo.json").read_text())))
-    return between(text, GAIN, gain())
+    gifts = json.loads((RESULTS / "charts" / f"{GIFTS_CHART}.json").read_text())
+    return between(text, GAIN, gain(f" {without_gifts(gifts)}"))
 
 
-def gain() -> str:
+def gain(also: str = "") -> str:
     """What a learned occupancy gains, and what is to be known of that chart."""
     chart = json.loads((RESULTS / "charts" / f"{GAIN_CHART}.json").read_text())
-    gifts = json.loads((RESULTS / "charts" / f"{GIFTS_CHART}.json").read_text())
-    said = f"{gain_table(chart)} {without_gifts(gifts)}"
+    said = gain_table(chart) + also
     return "\n\n".join([said, *filter(None, [noted(RESULTS).get(GAIN_CHART)])])
 
 

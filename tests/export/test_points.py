@@ -77,8 +77,9 @@ def test_an_occupancy_that_keeps_nothing_is_refused_in_one_line() -> None:
 
 
 def test_a_surface_that_no_camera_sees_is_refused_in_one_line() -> None:
-    inside = ball()
-    inside.report = {**inside.report, "cameras": [list(CENTRE)]}
+    known = ball()
+    cameras = {"cameras": [list(CENTRE)]}
+    inside = Occupancy(known.gate, known.space, known.threshold, report=cameras).eval()
     with pytest.raises(ValueError, match=r"no camera sees .* lie inside it") as error:
         kept_surface(inside, 16)
     assert "\n" not in str(error.value)
