@@ -37,7 +37,7 @@ def gain(also: str = "") -> str:
 
 def without_gifts(results: Mapping[str, Any]) -> str:
     """What a learned row of the gain has without what else it gets beside its gate."""
-    without = ", ".join(f"{psnr:.1f}" for psnr in sorted(lines_of(results)[1].psnrs, reverse=True))
+    without = _psnrs(lines_of(results)[1])
     return (
         "Instant-NGP learns with more than a gate; without its opaque start and distances of "
         f"sparse points, runs have {without} dB "
@@ -109,10 +109,7 @@ def gain_table(results: Mapping[str, Any]) -> str:
 
 def gifts_sentence(results: Mapping[str, Any], anchor: str) -> str:
     """What a learned row gets beside its gate is worth, seed by seed."""
-    learned, without, own = (
-        ", ".join(f"{psnr:.1f}" for psnr in sorted(line.psnrs, reverse=True))
-        for line in lines_of(results)
-    )
+    learned, without, own = map(_psnrs, lines_of(results))
     return (
         "The learned row of Instant-NGP gets more than a gate: an opaque start, a careful one, and "
         f"distances of sparse points. [Seed by seed](measurements.md#{anchor}), after "
@@ -133,6 +130,11 @@ def _beside(ours: Line, rival: Line) -> str:
         f"{compare(ours.psnrs, rival.psnrs).said(form='.1f')}. It renders {times:.1f} times as "
         f"fast and asks the field {queries:.1f} times less often."
     )
+
+
+def _psnrs(line: Line) -> str:
+    """Of each run, the best first."""
+    return ", ".join(f"{psnr:.1f}" for psnr in sorted(line.psnrs, reverse=True))
 
 
 def _queries(line: Line) -> str:

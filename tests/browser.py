@@ -109,3 +109,14 @@ def open_page(url: str, profile: Path, size: tuple[int, int] = (1280, 800)) -> I
                 yield page
         finally:
             browser.kill()  # a page that draws does not hear SIGTERM in time
+
+
+def text_of_what_asks_nobody(file: Path, profile: Path, ready: str) -> str:
+    """The text of a page in a file, once it shows an element `ready`; its scripts run without an
+    error, and it asks no other machine for anything."""
+    with open_page(file.as_uri(), profile) as page:
+        page.wait_for(f"document.querySelectorAll('{ready}').length")
+        shown = str(page.evaluate("document.body.innerText"))
+        assert page.errors == []
+        assert all(url.startswith(("file:", "blob:", "data:")) for url in page.asked)
+    return shown

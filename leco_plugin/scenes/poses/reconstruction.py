@@ -267,8 +267,9 @@ def _is_astray(places: NDArray[np.float64]) -> bool:
     if len(known) < 3:
         return False
     of_next = np.linalg.norm(np.diff(known, axis=0), axis=1)
-    between = np.linalg.norm(known[:, None] - known[None], axis=2)
-    return bool(np.median(of_next) > ASTRAY * np.median(between[np.triu_indices(len(known), 1)]))
+    others = np.random.default_rng(0).permutation(len(known))  # all pairs are too many to hold
+    of_any = np.linalg.norm(known - known[others], axis=1)
+    return bool(np.median(of_next) > ASTRAY * np.median(of_any))
 
 
 def choose_posed_pairs(poses: NDArray[np.float64]) -> Pairs:
