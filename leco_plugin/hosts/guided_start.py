@@ -9,12 +9,12 @@ from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 import torch
 from torch import Tensor, nn
 
-from leco_plugin.evaluation.inspection import cameras_of
+from leco_plugin.evaluation.inspection import cameras_of, describe, doubts
 from leco_plugin.hosts.guide import Guide
 from leco_plugin.hosts.host_watch import begin_carefully, begin_opaque
 from leco_plugin.learning.freezing import FILE_NAME, leave_file
 from leco_plugin.learning.run import LearningOnly, Run
-from leco_plugin.log import say
+from leco_plugin.log import say, say_all
 from leco_plugin.models.leco_config import LecoModelConfig
 from leco_plugin.models.sizing.sizes import SMALL, learning_only
 from leco_plugin.occupancy import Occupancy
@@ -201,6 +201,7 @@ class GuidedStart:
         if seen.rounded:
             say(seen.rounded)
         say(f"guided by an occupancy that keeps {share:.1%} along the rays of these cameras")
+        say_all(doubts(describe(occupancy)))
         return along
 
 

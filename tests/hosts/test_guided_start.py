@@ -28,6 +28,7 @@ from leco_plugin.hosts.guided_start import (
     along_rays,
 )
 from leco_plugin.hosts.stand_ins import GuidedEstimator
+from leco_plugin.learning.quality import FIELD, ONE_COLOUR
 from leco_plugin.learning.run import LearningOnly
 from leco_plugin.models.encodings import EncodingConfig
 from leco_plugin.models.gate import Gate, GateConfig
@@ -305,6 +306,24 @@ def test_with_a_file_nothing_is_said_of_bounds_for_learning_one(
     started(lopsided(data), data)
     (line,) = said
     assert line.startswith("guided by an occupancy that keeps ")
+
+
+def test_a_host_hears_that_the_occupancy_it_is_given_is_of_little_use(
+    data: Data, balls_guide: Guide, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    said: list[str] = []
+    monkeypatch.setattr(guided_start, "say_all", said.extend)
+    start(data, balls_guide)
+    assert said == []
+    keeps_all, unlearned = ball_of_the_tiny_scene(), ball_of_the_tiny_scene()
+    keeps_all.threshold_value.zero_()
+    unlearned.report = {**unlearned.report, FIELD: 7.0, ONE_COLOUR: 10.4}
+    for occupancy, first in ((keeps_all, "of little use"), (unlearned, "was not learned")):
+        guide = Guide()
+        guide.set_occupancy(occupancy)
+        start(data, guide)
+        assert len(said) == 2 and first in said[0] and "leco points" in said[1]
+        said.clear()
 
 
 def test_a_range_that_no_ray_meets_is_refused_before_the_first_step(data: Data) -> None:
