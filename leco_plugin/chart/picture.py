@@ -38,6 +38,8 @@ BAR = 0.032
 """Height of a bar at the foot of a panel, as a share of the panel's."""
 WIDE_RANGE = 8.0
 """Ratio of costs from which on their axis is logarithmic."""
+HIDDEN, RIM = 4.0, 4.0
+"""Points between two markers up to which one would hide the other, and by which that is larger."""
 TITLE_WIDTH, TEXT_WIDTH = 66, 104
 CHARACTER = 0.0098
 """Width of a letter, as a share of the figure's."""
@@ -136,14 +138,23 @@ def draw_panel(axes: Any, panel: Panel, theme: Theme) -> None:
                 axes.plot(*seed, alpha=0.45, markersize=6, **look)
         else:
             axes.plot(*zip(*one.seeds), color=look["color"])
-        size = {"markersize": 18 if one.ours else 11, "markeredgecolor": theme.page}
-        axes.plot(one.x, one.y, zorder=3, **(size | look))
     plain(axes, theme)
     _scale(axes, panel)
     axes.set_title(panel.title, fontsize=11.5, loc="left")
     if panel.less:
         axes.invert_yaxis()
+    for one, rim in zip(panel.points, rims(axes, [(one.x, one.y) for one in panel.points])):
+        size = {"markersize": rim + (18 if one.ours else 11), "markeredgecolor": theme.page}
+        axes.plot(one.x, one.y, zorder=3, **(size | look_of(one, theme)))
     _draw_front(axes, panel, theme)
+
+
+def rims(axes: Any, places: Sequence[tuple[float, float]]) -> list[float]:
+    """Points by which a marker is larger, so that those on it, drawn later, leave a rim of it."""
+    axes.get_xlim(), axes.get_ylim()  # else they are not yet scaled
+    at = axes.transData.transform(np.reshape(places, (-1, 2))) * 72.0 / axes.figure.dpi
+    far = np.linalg.norm(at[:, None] - at[None], axis=-1)
+    return [RIM * float(count) for count in np.triu(far < HIDDEN, k=1).sum(axis=1)]
 
 
 def look_of(one: Point, theme: Theme) -> dict[str, Any]:
@@ -192,15 +203,17 @@ def draw_curves(axes: Any, lines: Sequence[Line], theme: Theme, small: bool = Fa
         look = style(i, theme)
         seconds, mean, low, high = line.curve()
         dashes = "-" if line.learned else (0, (5, 2))
-        width, size = (1.6, 6) if small else (2.6, 9)
+        width = 1.6 if small else 2.6
         axes.plot(seconds, mean, linestyle=dashes, linewidth=width, color=look["color"])
         axes.fill_between(seconds, low, high, color=look["color"], alpha=0.16, linewidth=0)
-        axes.plot(seconds[-1], mean[-1], markersize=size, **look)
     times, best = best_so_far(lines)
     axes.plot(times, best, color=theme.ink, alpha=0.25, linewidth=5 if small else 9, zorder=1)
     plain(axes, theme)
     axes.set_xlim(0.0, 1.02 * max(run["train_seconds"] for line in lines for run in line.runs))
     axes.margins(y=0.05)
+    ends = [(times[-1], means[-1]) for times, means, *_ in (line.curve() for line in lines)]
+    for i, (end, rim) in enumerate(zip(ends, rims(axes, ends))):
+        axes.plot(*end, markersize=rim + (6 if small else 9), **style(i, theme))
 
 
 def name_ends(axes: Any, lines: Sequence[Line], theme: Theme, apart: float = CLOSE) -> None:

@@ -19,6 +19,7 @@ from leco_plugin.chart.picture import (
     balanced,
     draw,
     name_ends,
+    rims,
 )
 from leco_plugin.chart.theme import DARK, LIGHT, SOURCE, Theme, fingerprint
 
@@ -88,6 +89,14 @@ def test_nobody_has_reached_anything_before_the_first_point_of_a_curve() -> None
     times, best = best_so_far(lines_of(results(early, late)))
     assert np.interp(4.0, times, best) == pytest.approx(11.3, abs=0.1)
     assert np.interp(6.1, times, best) == pytest.approx(13.6, abs=0.1)
+
+
+def test_a_marker_that_others_lie_on_is_larger_than_they_are() -> None:
+    axes = Figure(figsize=(5, 5)).add_subplot()
+    axes.set(xlim=(0.0, 100.0), ylim=(0.0, 100.0))
+    under, on, beside, far = rims(axes, [(50.0, 50.0), (50.5, 50.0), (53.0, 50.0), (90.0, 50.0)])
+    assert under > on == beside == far == 0.0
+    assert rims(axes, []) == []
 
 
 def test_one_run_with_one_point_is_drawn(tmp_path: Path) -> None:
