@@ -112,7 +112,7 @@ def finding(grown: Sequence[Grown]) -> str:
 
 def headline(grown: Sequence[Grown]) -> str:
     """The finding in ten words at most."""
-    return f"In every city, grids keep {_span([one.times for one in grown])} times a gate's volume"
+    return f"Grids keep {_span([one.times for one in grown])} times a gate's volume"
 
 
 def _span(values: Sequence[float]) -> str:

@@ -72,13 +72,16 @@ def late_means(report: dict[str, Any]) -> tuple[float, float, float]:
     )
 
 
+def headline(report: dict[str, Any]) -> str:
+    """The finding in ten words at most."""
+    return f"The empty-space expert takes {late_means(report)[0]:.0%} of the points"
+
+
 def sentence(report: dict[str, Any]) -> str:
     """What the picture shows."""
-    share, empty, scene = late_means(report)
-    return (
-        f"The empty-space expert takes {share:.0%} of the points, "
-        f"about {float(f'{scene / empty:.1g}'):,.0f} times less dense than the rest"
-    )
+    _, empty, scene = late_means(report)
+    times = float(f"{scene / empty:.1g}")
+    return f"{headline(report)}, about {times:,.0f} times less dense than the rest"
 
 
 def draw(path: Path, report: dict[str, Any], theme: Theme = LIGHT) -> Path:
@@ -95,7 +98,7 @@ def draw(path: Path, report: dict[str, Any], theme: Theme = LIGHT) -> Path:
     with themed(theme, 11.5):
         figure = Figure(figsize=(10.0, 4.4), facecolor=theme.page, layout="constrained")
         FigureCanvasAgg(figure)
-        figure.suptitle(sentence(report), fontsize=13, fontweight="bold", x=0.01, ha="left")
+        figure.suptitle(headline(report), fontsize=15, fontweight="bold", x=0.01, ha="left")
         shares, densities = figure.subplots(1, 2)
         steps = report["steps"]
         known = {"shares": report["shares"], "densities": without_none(report)}

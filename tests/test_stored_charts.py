@@ -9,11 +9,14 @@ from typing import Any
 
 import answers
 import chart_sections as sections
+import growth_picture
+import learning
 import pytest
 import readme_parts as parts
 from chart_results import occupancy, results, run
 from results_page import sampling_section
 
+from leco_plugin.capacity import choice
 from leco_plugin.chart.findings.learned import learned_of
 from leco_plugin.chart.findings.summary import lines_of
 from leco_plugin.chart.panels import title_of
@@ -263,10 +266,21 @@ def test_a_sampling_section_says_when_and_of_which_code_it_is() -> None:
 
 def test_every_picture_says_its_finding_in_ten_words() -> None:
     """Numbers count, signs do not."""
-    for path in sorted((ROOT / "benchmarks" / "results" / "charts").glob("*.json")):
-        title = title_of(json.loads(path.read_text()))
+    results = ROOT / "benchmarks" / "results"
+    titles = {
+        path.stem: title_of(json.loads(path.read_text()))
+        for path in sorted((results / "charts").glob("*.json"))
+    }
+    reports = {
+        path.stem: json.loads(path.read_text()) for path in (results / "capacity").glob("*.json")
+    }
+    for name, report in reports.items():
+        titles[name] = choice.title_of(report["representations"])
+    titles["growth"] = growth_picture.headline(growth_picture.cities(reports))
+    titles["learning"] = learning.headline(json.loads((results / "learning.json").read_text()))
+    for name, title in titles.items():
         words = [word for word in title.split() if any(map(str.isalnum, word))]
-        assert len(words) <= 10, f"{path.stem}: {title}"
+        assert len(words) <= 10, f"{name}: {title}"
 
 
 def test_a_rival_is_better_only_where_it_is_ahead_in_one_and_not_behind_in_the_other() -> None:

@@ -72,6 +72,15 @@ def grid_that_nearly_suffices(rows: Sequence[Row]) -> Row | None:
     return grid_that_suffices(rows, TOLD_APART) if grid_that_suffices(rows) is None else None
 
 
+def title_of(rows: Sequence[Row]) -> str:
+    """What the scene needs, in ten words at most."""
+    chosen = choose(rows)
+    if grid := chosen if chosen["family"] == "grid" else grid_that_suffices(rows):
+        return f"A grid suffices: {grid['size']}³ cells, {kilobytes(grid)}"
+    may = "; perhaps a grid" if grid_that_nearly_suffices(rows) else ""
+    return f"A gate of {kilobytes(chosen)} suffices{may}"
+
+
 def verdict(rows: Sequence[Row]) -> str:
     """What the scene needs, in a sentence or two."""
     chosen = choose(rows)
@@ -122,10 +131,10 @@ def draw(results: Mapping[str, Any], path: Path, theme: Theme = LIGHT) -> Path:
     lost = [max(row["lost_at_volumes"][volume], LEAST) for row in rows]
     with themed(theme):
         figure = new_figure((11, 5.9), theme.page)
-        title = textwrap.fill(verdict(rows), 84)
-        figure.text(0.015, 0.975, title, va="top", fontsize=15, fontweight="bold")
-        figure.text(0.015, 0.862, circumstances(results), va="top", fontsize=11)
-        panels = [figure.add_axes((0.065 + 0.485 * i, 0.2, 0.435, 0.55)) for i in range(2)]
+        figure.text(0.015, 0.975, title_of(rows), va="top", fontsize=17, fontweight="bold")
+        said = f"{textwrap.fill(verdict(rows), 120)}\n{circumstances(results)}"
+        figure.text(0.015, 0.9, said, va="top", fontsize=11)
+        panels = [figure.add_axes((0.065 + 0.485 * i, 0.2, 0.435, 0.5)) for i in range(2)]
         share = results["lost_surface_mass"]
         titles = (
             f"volume kept, %, when {share:.1%} of the surface mass is lost",

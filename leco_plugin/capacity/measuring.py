@@ -149,12 +149,23 @@ def measure(evidence: Evidence, scores: Tensor, of_volume: Tensor, lost: float) 
         lost: share of the weight near surfaces.
     """
     volume, candidates = kept_shares(evidence.worth, scores, of_volume, lost)
-    total = float(evidence.worth.double().sum())
-    losses = [
-        float(evidence.worth[scores < find_threshold(of_volume, share)].double().sum()) / total
-        for share in VOLUMES
-    ]
+    losses = [lost_where(evidence.worth, scores, of_volume, share) for share in VOLUMES]
     return {"kept_volume": volume, "kept_candidates": candidates, "lost_at_volumes": losses}
+
+
+def lost_where(worth: Tensor, scores: Tensor, of_volume: Tensor, share: float) -> float:
+    """Share of the worth [M] of candidates that is lost where just so much of the volume is kept.
+
+    Of what has the score of the threshold, as many cells of a grid may have, a part is kept, drawn
+    by lot: all of it would be more than is asked for.
+    """
+    threshold = find_threshold(of_volume, share)
+    above, at = (
+        float(part.double().mean()) for part in (of_volume > threshold, of_volume == threshold)
+    )
+    drawn = min(max((share - above) / at, 0.0), 1.0)
+    lost = worth.double() @ ((scores < threshold).double() + (1.0 - drawn) * (scores == threshold))
+    return float(lost / worth.double().sum())
 
 
 def measure_gate(taught: Taught, candidate: Candidate, lost: float) -> dict[str, Any]:

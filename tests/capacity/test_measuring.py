@@ -7,7 +7,7 @@ import torch
 
 from leco_plugin.capacity import measuring
 from leco_plugin.capacity.evidence import Evidence
-from leco_plugin.capacity.measuring import VOLUMES, measure, taught_grid
+from leco_plugin.capacity.measuring import VOLUMES, lost_where, measure, taught_grid
 from leco_plugin.capacity.search import grids
 from leco_plugin.evaluation.inspection import ViewBox
 from leco_plugin.learning.sharpening import Lesson
@@ -37,6 +37,14 @@ def test_losses_at_volumes_are_those_of_the_skipped() -> None:
     expected = [(1.0 - share) ** 2 for share in VOLUMES]
     assert losses == pytest.approx(expected, abs=0.03)
     assert losses == sorted(losses, reverse=True)
+
+
+def test_a_grid_that_cannot_tell_its_cells_apart_keeps_no_more_than_is_asked_for() -> None:
+    """Half of the volume has one score: of a quarter of the volume, that is half of those cells."""
+    worth, scores = torch.ones(100), torch.full((100,), 0.5)
+    of_volume = (torch.arange(1000) < 500) * 0.5
+    found = [lost_where(worth, scores, of_volume, share) for share in (0.1, 0.25, 0.5, 0.75)]
+    assert found == pytest.approx([0.8, 0.5, 0.0, 0.0], abs=1e-6)
 
 
 def test_a_cell_of_a_grid_has_the_largest_target_of_the_lesson_in_it() -> None:
